@@ -1,0 +1,74 @@
+"""Safe elementary functions and every epsilon of the project, by name.
+
+Each function is finite, and has a finite gradient, on *all* finite input, row by row: the argument
+is made safe first and the result selected second, so that an unselected branch cannot put a NaN
+into the gradient of its neighbours.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+LENGTH_EPSILON = 1e-20
+"""Vectors shorter than this have no direction; also the smallest divisor of `safe_divide`."""
+
+COSINE_EPSILON = 1e-4
+"""Smallest cosine used as a divisor in shading."""
+
+
+def clamp_away_from_zero(x: Float[Array, "..."], smallest: float) -> Float[Array, "..."]:
+    """Push values towards infinity until their magnitude is at least ``smallest``.
+
+    Zero is treated as positive. The gradient is 1 where the value is kept and 0 where it is moved.
+    """
+    moved = jnp.where(x < 0, -smallest, smallest).astype(x.dtype)
+    return jnp.where(jnp.abs(x) < smallest, moved, x)
+
+
+def safe_divide(
+    numerator: Float[Array, "..."],
+    denominator: Float[Array, "..."],
+    *,
+    smallest: float = LENGTH_EPSILON,
+    otherwise: float = 0.0,
+) -> Float[Array, "..."]:
+    """Divide, returning ``otherwise`` (with zero gradient) where ``|denominator| < smallest``."""
+    usable = jnp.abs(denominator) >= smallest
+    quotient = numerator / jnp.where(usable, denominator, 1.0)
+    return jnp.where(usable, quotient, otherwise)
+
+
+def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Square root of the positive part; zero with zero gradient where ``x <= 0``."""
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+
+
+def safe_log(x: Float[Array, "..."], *, smallest: float = LENGTH_EPSILON) -> Float[Array, "..."]:
+    """Logarithm of ``max(x, smallest)``; the gradient is zero where the floor is active."""
+    above = x > smallest
+    return jnp.log(jnp.where(above, x, smallest))
+
+
+def safe_norm(
+    x: Float[Array, "..."], *, axis: int = -1, keepdims: bool = False
+) -> Float[Array, "..."]:
+    """Euclidean length along ``axis``; zero with zero gradient for a zero vector.
+
+    Lengths are computed relative to the largest component, so that squares neither overflow nor
+    underflow over the whole range of the dtype.
+    """
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True))
+    has_length = largest > 0
+    scale = jnp.where(has_length, largest, 1.0)
+    squared = jnp.sum((x / scale) ** 2, axis=axis, keepdims=True)
+    length = scale * safe_sqrt(squared)
+    return length if keepdims else jnp.squeeze(length, axis=axis)
+
+
+def safe_normalize(
+    x: Float[Array, "..."], *, axis: int = -1, smallest: float = LENGTH_EPSILON
+) -> Float[Array, "..."]:
+    """Scale to unit length along ``axis``; zero with zero gradient below length ``smallest``."""
+    length = safe_norm(x, axis=axis, keepdims=True)
+    return safe_divide(x, length, smallest=smallest)
