@@ -144,7 +144,7 @@ def _body(points: Array) -> Array:
 def _body_albedo(points: Array) -> Array:
     p = _mirrored(points)
     belly = 1.0 - _smoothstep(0.30, 0.34, _length((p - [0.0, 0.0, -1.0]) * [0.75, 1.0, 0.6]))
-    albedo = _mix((0.86, 0.56, 0.04), (0.84, 0.76, 0.52), belly)
+    albedo = _mix((0.82, 0.52, 0.035), (0.84, 0.76, 0.52), belly)
     cheek = HEAD_CENTRE + HEAD_RADIUS * _unit(0.70, 0.70, -0.22)
     blush = 0.85 * (1.0 - _smoothstep(0.05, 0.13, _length(p - cheek)))
     return _mix(albedo, (0.86, 0.22, 0.16), blush)
@@ -160,14 +160,14 @@ def _wings(points: Array) -> Array:
 
 def _wing_albedo(points: Array) -> Array:
     tip = 1.0 - _smoothstep(-0.40, -0.25, points[:, 0])
-    return _mix((0.84, 0.47, 0.025), (0.84, 0.76, 0.52), tip)
+    return _mix((0.80, 0.43, 0.022), (0.84, 0.76, 0.52), tip)
 
 
 def _beak(points: Array) -> Array:
     p = _mirrored(points)
     local = (p - np.float32([0.85, 0.0, 0.35])) @ _rotation(0.0, -0.16)
     upper = _ellipsoid(local, (0.0, 0.0, 0.0), (0.28, 0.25, 0.11))
-    lower = _ellipsoid(p, (0.80, 0.0, 0.225), (0.21, 0.19, 0.09))
+    lower = _ellipsoid(p, (0.77, 0.0, 0.23), (0.21, 0.18, 0.085))
     return _smooth_union(upper, lower, 0.025)
 
 
@@ -206,7 +206,7 @@ def _ring_albedo(points: Array) -> Array:
     x, y = points[:, 0] + 0.02, points[:, 1]
     angle = np.arctan2(y / RING_RADII[1], x / RING_RADII[0])
     wave = np.cos(7.0 * angle)
-    return _mix((0.82, 0.80, 0.74), (0.015, 0.36, 0.42), _smoothstep(-0.06, 0.06, wave))
+    return _mix((0.78, 0.76, 0.71), (0.015, 0.36, 0.42), _smoothstep(-0.06, 0.06, wave))
 
 
 def _crown_frame(points: Array) -> Array:
@@ -257,7 +257,7 @@ def _ermine_albedo(points: Array) -> Array:
     p = _crown_frame(points)
     outside = _fold_crown(p, 10, 0.5) - np.float32([0.44, 0.0, 0.0])
     spot = 1.0 - _smoothstep(0.040, 0.056, _length(outside * np.float32([0.5, 1.0, 0.8])))
-    return _mix((0.82, 0.80, 0.76), (0.03, 0.025, 0.025), spot)
+    return _mix((0.78, 0.76, 0.72), (0.03, 0.025, 0.025), spot)
 
 
 ORANGE = (0.83, 0.21, 0.015)
@@ -320,7 +320,9 @@ def materials(points: Array) -> Materials:
     distances = np.stack([part.distance(p) for part in PARTS.values()])
     weights = np.maximum(1.0 - (distances - distances.min(0)) / BLEND_WIDTH, 0.0)
     weights = weights / weights.sum(0)
-    albedo = sum(w[:, None] * part.albedo(p) for w, part in zip(weights, PARTS.values(), strict=True))
+    albedo = sum(
+        w[:, None] * part.albedo(p) for w, part in zip(weights, PARTS.values(), strict=True)
+    )
     roughness = weights.T @ np.array([part.roughness for part in PARTS.values()])
     metallic = weights.T @ np.array([part.metallic for part in PARTS.values()])
     return Materials(*(x.astype(np.float32) for x in (albedo, roughness, metallic)))

@@ -17,13 +17,17 @@ from numpy.typing import NDArray
 Array = NDArray[np.float32]
 
 
+# Chosen so that few pixels of the duck reach 1 in any view: clipped pixels teach nothing.
+EXPOSURE = {"studio": 0.70, "sunset": 0.38, "party": 0.46}
+
+
 def directions_from_uv(u: Array, v: Array) -> Array:
     """Map lat-long coordinates to unit directions (..., 3) of the z-up world."""
     azimuth = (0.5 - u) * 2.0 * np.pi
     sine = np.sin(np.pi * v)
-    return np.stack(
-        [sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(np.pi * v)], -1
-    ).astype(np.float32)
+    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.cos(np.pi * v)], -1).astype(
+        np.float32
+    )
 
 
 def uv_from_directions(directions: Array) -> tuple[Array, Array]:
@@ -105,26 +109,26 @@ def studio(d: Array) -> Array:
     """Photo studio: a large warm key at the front left, a cool fill, a rosy rim, pale floor."""
     up = 0.5 + 0.5 * d[..., 2]
     room = _rgb(up, (0.40, 0.42, 0.46)) + _rgb(1.0 - up, (0.30, 0.27, 0.24))
-    key = _rgb(_softbox(d, 48.0, 42.0, 30.0, 26.0), (4.6, 4.1, 3.4))
+    key = _rgb(_softbox(d, 48.0, 42.0, 30.0, 26.0), (4.0, 3.55, 2.95))
     fill = _rgb(_softbox(d, -62.0, 18.0, 22.0, 34.0), (0.9, 1.4, 2.1))
     rim = _rgb(_softbox(d, 188.0, 30.0, 34.0, 14.0), (2.6, 1.7, 1.7))
     floor = _rgb(_lobe(d, 20.0, -70.0, 34.0), (0.45, 0.42, 0.38))
-    return room + key + fill + rim + floor
+    return EXPOSURE["studio"] * (room + key + fill + rim + floor)
 
 
 def sunset(d: Array) -> Array:
-    """Evening at the pond: a low sun at the right, an orange horizon, a violet sky, dark water."""
+    """Evening at the pond: a low sun front right, orange horizon, violet sky, dark water."""
     z = d[..., 2]
-    toward_sun = 0.5 + 0.5 * (d @ _unit(-50.0, 4.0))
+    toward_sun = 0.5 + 0.5 * (d @ _unit(-28.0, 4.0))
     height = np.clip(z, 0.0, 1.0)
-    zenith = _rgb(height**0.6, (0.16, 0.22, 0.52))
-    glow = _rgb(np.exp(-height / 0.22) * (0.25 + 0.75 * toward_sun**2), (1.25, 0.50, 0.20))
-    sky = zenith + glow + _rgb(_lobe(d, -50.0, 13.0, 20.0), (1.7, 0.75, 0.22))
-    sun = _rgb(_lobe(d, -50.0, 15.0, 3.6), (170.0, 88.0, 34.0))
+    zenith = _rgb(height**0.6, (0.26, 0.32, 0.72))
+    glow = _rgb(np.exp(-height / 0.22) * (0.25 + 0.75 * toward_sun**2), (1.9, 0.80, 0.36))
+    sky = zenith + glow + _rgb(_lobe(d, -28.0, 13.0, 20.0), (1.7, 0.75, 0.22))
+    sun = _rgb(_lobe(d, -28.0, 15.0, 3.6), (330.0, 180.0, 72.0))
     water = _rgb(np.ones_like(z), (0.05, 0.08, 0.12))
-    water = water + _rgb(_lobe(d, -50.0, -12.0, 14.0), (0.9, 0.40, 0.14))
+    water = water + _rgb(_lobe(d, -28.0, -12.0, 14.0), (0.9, 0.40, 0.14))
     blend = np.clip(z / 0.04 + 0.5, 0.0, 1.0)[..., None]
-    return (sky + sun) * blend + water * (1.0 - blend)
+    return EXPOSURE["sunset"] * ((sky + sun) * blend + water * (1.0 - blend))
 
 
 def party(d: Array) -> Array:
@@ -135,7 +139,8 @@ def party(d: Array) -> Array:
     lime = _rgb(_softbox(d, 180.0, 35.0, 22.0, 14.0), (2.6, 4.6, 0.5))
     lamp = _rgb(_lobe(d, 8.0, 62.0, 15.0), (7.5, 6.0, 3.6))
     bulbs = sum(_lobe(d, 30.0 * k + 15.0, 8.0, 3.2) for k in range(12))
-    return night + magenta + cyan + lime + lamp + _rgb(bulbs, (7.0, 4.4, 1.8))
+    lights = magenta + cyan + lime + lamp + _rgb(bulbs, (7.0, 4.4, 1.8))
+    return EXPOSURE["party"] * (night + lights)
 
 
 # The first is the light of the training pictures, the others are for relighting.
@@ -152,7 +157,9 @@ def write_hdr(path: Path, image: Array) -> None:
     """Write a Radiance `.hdr` file (RGBE: eight bits a channel, one common exponent)."""
     height, width, channels = image.shape
     output = oiio.ImageOutput.create(str(path))
-    if output is None or not output.open(str(path), oiio.ImageSpec(width, height, channels, "float")):
+    if output is None or not output.open(
+        str(path), oiio.ImageSpec(width, height, channels, "float")
+    ):
         raise OSError(f"cannot write {path}: {oiio.geterror()}")
     output.write_image(np.ascontiguousarray(image, np.float32))
     output.close()

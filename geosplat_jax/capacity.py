@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields, replace
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Int, UInt
 
 _LADDER_RATIO = 1.25
 _LADDER_STEP = 128
@@ -128,3 +128,55 @@ def compact(
     empty = jnp.full((capacity,), size, jnp.int32)
     index = empty.at[target].set(jnp.arange(size, dtype=jnp.int32), mode="drop")
     return index, count
+
+
+def _popcount(words: UInt[Array, "..."]) -> Int[Array, "..."]:
+    return jax.lax.population_count(words).astype(jnp.int32)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class BitSet:
+    """A large mask packed 32 to a word, with the running count of its true entries.
+
+    Where few of many entries are true, `BitSet.first` is several times faster than `compact`,
+    because neither a prefix sum nor a scatter touches every entry; `BitSet.rank` inverts it.
+
+    Attributes
+    ----------
+    words : (W,) uint32, entry ``32 w + b`` in bit b of word w.
+    before : (W,) int32 number of true entries in the words before.
+    count : () int32 number of true entries.
+    """
+
+    words: UInt[Array, " W"]
+    before: Int[Array, " W"]
+    count: Int[Array, ""]
+
+    def first(self, *, capacity: int) -> Int[Array, " capacity"]:
+        """Find the indices of the first true entries, in order; rows past the count are 0."""
+        wanted = jnp.arange(capacity, dtype=jnp.int32)
+        word = jnp.searchsorted(self.before, wanted, side="right").astype(jnp.int32) - 1
+        bits, rest = self.words[word], wanted - self.before[word]
+        position = 32 * word
+        for width in (16, 8, 4, 2, 1):
+            lower = _popcount(bits & jnp.uint32((1 << width) - 1))
+            is_above = rest >= lower
+            rest = jnp.where(is_above, rest - lower, rest)
+            bits = jnp.where(is_above, bits >> width, bits)
+            position = jnp.where(is_above, position + width, position)
+        return jnp.where(wanted < self.count, position, 0)
+
+    def rank(self, index: Int[Array, "..."]) -> Int[Array, "..."]:
+        """Count the true entries before each index: the row of a true entry in `first`."""
+        word, bit = index >> 5, (index & 31).astype(jnp.uint32)
+        below = (jnp.uint32(1) << bit) - jnp.uint32(1)
+        return self.before[word] + _popcount(self.words[word] & below)
+
+
+def bit_set(mask: Bool[Array, " n"]) -> BitSet:
+    """Pack a mask of any length; entries past its end are false."""
+    bits = jnp.pad(mask, (0, -mask.shape[0] % 32)).reshape(-1, 32).astype(jnp.uint32)
+    words = jnp.sum(bits << jnp.arange(32, dtype=jnp.uint32)[None, :], axis=1, dtype=jnp.uint32)
+    through = jnp.cumsum(_popcount(words), dtype=jnp.int32)
+    return BitSet(words=words, before=through - _popcount(words), count=through[-1])

@@ -128,12 +128,12 @@ class Mesh:
     @property
     def face_mask(self) -> Bool[Array, " Cf"]:
         """True for real faces."""
-        return jnp.arange(self.faces.shape[0]) < self.face_count
+        return jnp.arange(self.faces.shape[0], dtype=jnp.int32) < self.face_count
 
     @property
     def vertex_mask(self) -> Bool[Array, " Cv"]:
         """True for real vertices."""
-        return jnp.arange(self.vertices.shape[0]) < self.vertex_count
+        return jnp.arange(self.vertices.shape[0], dtype=jnp.int32) < self.vertex_count
 
 
 @jax.tree_util.register_dataclass
@@ -158,7 +158,7 @@ class Gaussians:
     @property
     def mask(self) -> Bool[Array, " N"]:
         """True for real rows."""
-        return jnp.arange(self.means.shape[0]) < self.count
+        return jnp.arange(self.means.shape[0], dtype=jnp.int32) < self.count
 
 
 @jax.tree_util.register_dataclass

@@ -1,0 +1,189 @@
+"""MGadapter: turn every triangle into six Gaussians, or every vertex into one (Eq. 8-12).
+
+Differentiable in vertices and vertex normals. The number of Gaussians is static (six a face row,
+or one a vertex row); rows beyond the mesh's counts are inert padding.
+"""
+
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from geosplat_jax.geometry import face_normals_and_areas
+from geosplat_jax.numerics import safe_divide, safe_norm, safe_normalize, safe_sqrt
+from geosplat_jax.rotation import frame_from_normal, matrix_to_quaternion
+from geosplat_jax.scene import Gaussians, Mesh
+
+GAUSSIANS_PER_FACE = 6
+
+
+@dataclass(frozen=True)
+class AdapterConstants:
+    """Constants of the face sampling; static and hashable.
+
+    Attributes
+    ----------
+    u, v : barycentric coordinate of the outer and the inner triple of points, below 1/3.
+    alpha : (outer, inner) ratio of S_x to half the length of the sampled segment.
+    beta : (outer, inner) divisor of S_y.
+    thickness : S_z in world units.
+    opacity : opacity of every Gaussian.
+    shading_frame : orient by the interpolated normal (the paper's text) instead of the face's
+        (the authors' code).
+    vertex_area_divisor : the k in ``S = sqrt(area / k)`` of the vertex sampling.
+    """
+
+    u: float = 0.07
+    v: float = 0.22
+    alpha: tuple[float, float] = (0.80, 2.08)
+    beta: tuple[float, float] = (15.0, 13.0)
+    thickness: float = 4.54e-5
+    opacity: float = 0.99
+    shading_frame: bool = False
+    vertex_area_divisor: float = 2.5
+
+    def __post_init__(self) -> None:
+        """Refuse constants that give flipped or negative Gaussians."""
+        if not (0 <= self.u < 1 / 3 and 0 <= self.v < 1 / 3):
+            raise ValueError(f"u and v must lie in [0, 1/3), got {self.u} and {self.v}")
+        if min(*self.alpha, *self.beta, self.thickness, self.vertex_area_divisor) <= 0:
+            raise ValueError("alpha, beta, thickness and vertex_area_divisor must be positive")
+        if not 0 < self.opacity <= 1:
+            raise ValueError(f"opacity must lie in (0, 1], got {self.opacity}")
+
+
+PAPER = AdapterConstants(opacity=1.0, shading_frame=True)
+CODE = AdapterConstants(u=1 / 9 - 1 / 24, v=2 / 9)
+
+
+def _inert(gaussians: Gaussians) -> Gaussians:
+    """Overwrite the rows past the count with harmless values."""
+    real = gaussians.mask
+    dtype = gaussians.means.dtype
+    unit_quat = jnp.array([[1.0, 0.0, 0.0, 0.0]], dtype)
+    return replace(
+        gaussians,
+        means=jnp.where(real[:, None], gaussians.means, 0.0),
+        quats=jnp.where(real[:, None], gaussians.quats, unit_quat),
+        scales=jnp.where(real[:, None], gaussians.scales, 1.0),
+        opacities=jnp.where(real, gaussians.opacities, 0.0),
+        normals=jnp.where(real[:, None], gaussians.normals, 0.0),
+    )
+
+
+def _midpoint_weights(corner: float, dtype: jnp.dtype) -> Float[Array, "3 3"]:
+    """Barycentric midpoints m12, m23, m31 of the triple of points with coordinate ``corner``."""
+    side = 0.5 * (1.0 - corner)
+    rows = [[corner, side, side], [side, side, corner], [side, corner, side]]
+    return jnp.array(rows, dtype)
+
+
+def face_gaussians(
+    mesh: Mesh, normals: Float[Array, "Cv 3"], *, constants: AdapterConstants
+) -> Gaussians:
+    """Sample six Gaussians a face (Eq. 8-11): rows ``6 f`` to ``6 f + 5`` belong to face ``f``.
+
+    The first three sit at the midpoints of the outer triple of barycentric points, the others at
+    those of the inner triple. Differentiable in the mesh's vertices and in ``normals``; a triangle
+    without area gives finite Gaussians of zero width.
+
+    Parameters
+    ----------
+    mesh : faces to sample; rows past ``face_count`` become inert Gaussians.
+    normals : (Cv, 3) unit vertex normals.
+    constants : see `AdapterConstants`.
+    """
+    corners = mesh.vertices[mesh.faces]
+    corner_normals = normals[mesh.faces]
+    face_normal, area = face_normals_and_areas(mesh)
+    # Inner and outer segments are parallel to the same three edges: P2-P3, P1-P2, P3-P1.
+    p1, p2, p3 = corners[:, 0], corners[:, 1], corners[:, 2]
+    edges = jnp.stack([p2 - p3, p1 - p2, p3 - p1], axis=1)
+    edge_lengths = safe_norm(edges)
+
+    means, shading_normals, scales = [], [], []
+    for ring, corner in enumerate((constants.u, constants.v)):
+        weights = _midpoint_weights(corner, corners.dtype)
+        means.append(jnp.einsum("kq,fqi->fki", weights, corners))
+        shading_normals.append(safe_normalize(jnp.einsum("kq,fqi->fki", weights, corner_normals)))
+        segment = (1.0 - 3.0 * corner) * edge_lengths
+        along = 0.5 * constants.alpha[ring] * segment
+        across = safe_divide(2.0 * area[:, None], constants.beta[ring] * segment)
+        scales.append(jnp.stack([along, across, jnp.full_like(along, constants.thickness)], -1))
+
+    shading = jnp.concatenate(shading_normals, axis=1)
+    if constants.shading_frame:
+        quats = _frames(jnp.concatenate([edges, edges], axis=1), shading)
+    else:
+        face_axis = jnp.broadcast_to(face_normal[:, None, :], edges.shape)
+        quats = jnp.tile(_frames(edges, face_axis), (1, 2, 1))
+    count = mesh.face_count * GAUSSIANS_PER_FACE
+    rows = mesh.faces.shape[0] * GAUSSIANS_PER_FACE
+    gaussians = Gaussians(
+        means=jnp.concatenate(means, axis=1).reshape(rows, 3),
+        quats=quats.reshape(rows, 4),
+        scales=jnp.concatenate(scales, axis=1).reshape(rows, 3),
+        opacities=jnp.full((rows,), constants.opacity, corners.dtype),
+        normals=shading.reshape(rows, 3),
+        count=count,
+    )
+    return _inert(gaussians)
+
+
+def _frames(along: Float[Array, "F k 3"], up: Float[Array, "F k 3"]) -> Float[Array, "F k 4"]:
+    """Quaternions whose x axis follows ``along`` (made orthogonal to ``up``) and z is ``up``."""
+    x = safe_normalize(along - jnp.sum(along * up, axis=-1, keepdims=True) * up)
+    y = jnp.cross(up, x)
+    return matrix_to_quaternion(jnp.stack([x, y, up], axis=-1))
+
+
+def vertex_gaussians(
+    mesh: Mesh, normals: Float[Array, "Cv 3"], *, constants: AdapterConstants
+) -> Gaussians:
+    """Sample one round Gaussian a vertex (Eq. 12), for the first steps on a rough surface.
+
+    The footprint follows the area of the faces around the vertex, projected along its normal.
+    Differentiable in vertices and normals. The tangent frame (and so the quaternion) is arbitrary
+    about the normal and jumps where ``n_z`` changes sign, which the round footprint hides.
+    """
+    face_normal, area = face_normals_and_areas(mesh)
+    corner_normals = normals[mesh.faces]
+    facing = jnp.sum(face_normal[:, None, :] * corner_normals, axis=-1)
+    share = jnp.where(mesh.face_mask[:, None], 2.0 * area[:, None] * facing / 6.0, 0.0)
+    zero = jnp.zeros((mesh.vertices.shape[0],), mesh.vertices.dtype)
+    star_area = zero.at[mesh.faces.reshape(-1)].add(share.reshape(-1))
+    radius = safe_sqrt(star_area / constants.vertex_area_divisor)
+    tangent, bitangent = frame_from_normal(normals)
+    gaussians = Gaussians(
+        means=mesh.vertices,
+        quats=matrix_to_quaternion(jnp.stack([tangent, bitangent, normals], axis=-1)),
+        scales=jnp.stack([radius, radius, jnp.full_like(radius, constants.thickness)], axis=-1),
+        opacities=jnp.full_like(radius, constants.opacity),
+        normals=normals,
+        count=mesh.vertex_count,
+    )
+    return _inert(gaussians)
+
+
+def shift_inwards(
+    gaussians: Gaussians,
+    face_normal: Float[Array, "F 3"],
+    face_area: Float[Array, " F"],
+    fraction: Float[Array, " N"],
+) -> Gaussians:
+    """Move face-sampled Gaussians below their face: ``mean -= normal * sqrt(area) * fraction``.
+
+    Splats are wider than the triangles they stand for, so the silhouette swells by part of a
+    pixel; a learned fraction in (0, 1) takes that back. Face normal and area carry *no* gradient.
+
+    Parameters
+    ----------
+    gaussians : N = 6 F rows of `face_gaussians`.
+    face_normal, face_area : of the F faces.
+    fraction : (N,) how far, in units of the root of the face's area.
+    """
+    step = jax.lax.stop_gradient(face_normal * safe_sqrt(face_area)[:, None])
+    per_row = jnp.repeat(step, GAUSSIANS_PER_FACE, axis=0)
+    moved = gaussians.means - per_row * fraction[:, None]
+    return replace(gaussians, means=jnp.where(gaussians.mask[:, None], moved, gaussians.means))

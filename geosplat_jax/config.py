@@ -1,0 +1,377 @@
+"""Settings of a run: frozen, validated, serialisable; presets and quality levels by name.
+
+A preset says *which method* (``paper``, ``code``, ``default``), a quality level *how much work*
+(``draft``, ``standard``, ``high``). `make_config` combines them and applies overrides written as
+``section.field=value``.
+"""
+
+import json
+import tomllib
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from typing import Any
+
+from geosplat_jax import adapter as adapter_module
+from geosplat_jax.adapter import AdapterConstants
+from geosplat_jax.hashgrid import HashGridSpec
+from geosplat_jax.losses import LossWeights, Objective
+from geosplat_jax.materials import INITIAL_LOGITS, MaterialSpec
+from geosplat_jax.render import Model
+
+PRESETS = ("default", "paper", "code")
+QUALITIES = ("draft", "standard", "high")
+
+
+@dataclass(frozen=True)
+class GeometryConfig:
+    """The isosurface's grid and where it starts.
+
+    Attributes
+    ----------
+    resolution : cells along the longest side of the box around the object.
+    initial : ``"hull"`` (visual hull of the masks), ``"sphere"`` or ``"random"`` (the paper).
+    vertex_fraction : share of the steps that sample vertices instead of faces (Eq. 12).
+    max_quads : a surface with more quads than this is taken to have exploded.
+    """
+
+    resolution: int = 48
+    initial: str = "hull"
+    vertex_fraction: float = 0.05
+    max_quads: int = 400_000
+
+    def __post_init__(self) -> None:
+        """Validate every field."""
+        if self.resolution < 4:
+            raise ValueError(f"geometry.resolution must be at least 4, got {self.resolution}")
+        if self.initial not in ("hull", "sphere", "random"):
+            raise ValueError(
+                f'geometry.initial must be "hull", "sphere" or "random", got {self.initial!r}'
+            )
+        if not 0 <= self.vertex_fraction < 1:
+            raise ValueError(
+                f"geometry.vertex_fraction must lie in [0, 1), got {self.vertex_fraction}"
+            )
+
+
+@dataclass(frozen=True)
+class RateConfig:
+    """Adam's learning rates by parameter group; all halve every ``half_life`` steps.
+
+    Adam is invariant to the scale of a gradient, so the gradient multipliers of the authors' code
+    (hash tables x16, light x64) have no counterpart here.
+
+    Attributes
+    ----------
+    sdf, deform, weights : the isosurface.
+    albedo, shine, shift : heads and tables of albedo, of roughness and metallic, of the shift.
+    light, exposure : radiometry.
+    half_life : steps after which all rates have halved.
+    """
+
+    sdf: float = 1e-2
+    deform: float = 1e-2
+    weights: float = 1e-2
+    albedo: float = 3e-3
+    shine: float = 1.5e-3
+    shift: float = 3e-3
+    light: float = 1e-2
+    exposure: float = 5e-3
+    half_life: float = 800.0
+
+    def __post_init__(self) -> None:
+        """Validate every field."""
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if not value >= 0:
+                raise ValueError(f"rates.{f.name} must not be negative, got {value}")
+        if self.half_life <= 0:
+            raise ValueError(f"rates.half_life must be positive, got {self.half_life}")
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the terms (see `LossWeights`) at the first step, and the schedule of Eq. 14.
+
+    Attributes
+    ----------
+    entropy, entropy_end : the entropy's weight falls linearly between them by
+        ``entropy_end_fraction`` of the run and stays there.
+    """
+
+    l1: float = 0.8
+    ssim: float = 0.2
+    mask: float = 5.0
+    entropy: float = 0.2
+    entropy_end: float = 0.01
+    entropy_end_fraction: float = 0.5
+    deviation: float = 0.5
+    weights: float = 0.1
+    smoothness: float = 0.03
+    light: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Validate every field."""
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if not value >= 0:
+                raise ValueError(f"loss.{f.name} must not be negative, got {value}")
+
+    def at(self, progress: float) -> LossWeights:
+        """Weights at ``progress`` in [0, 1] through the run."""
+        blend = min(progress / max(self.entropy_end_fraction, 1e-9), 1.0)
+        return LossWeights(
+            l1=self.l1,
+            ssim=self.ssim,
+            mask=self.mask,
+            entropy=self.entropy + blend * (self.entropy_end - self.entropy),
+            deviation=self.deviation,
+            weights=self.weights,
+            smoothness=self.smoothness,
+            light=self.light,
+        )
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """How long, how many views at a time, how often something is written.
+
+    Attributes
+    ----------
+    steps : optimiser steps.
+    batch_views : full views a step.
+    seed : of every random choice.
+    checkpoint_every, preview_every : steps; 0 turns previews off.
+    initial_light : radiance of every texel at the start.
+    smallest_light : texels are kept at or above this.
+    """
+
+    steps: int = 500
+    batch_views: int = 4
+    seed: int = 0
+    checkpoint_every: int = 100
+    preview_every: int = 100
+    initial_light: float = 0.5
+    smallest_light: float = 0.01
+
+    def __post_init__(self) -> None:
+        """Validate every field."""
+        for name in ("steps", "batch_views", "checkpoint_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"run.{name} must be at least 1, got {getattr(self, name)}")
+        if self.preview_every < 0:
+            raise ValueError(f"run.preview_every must not be negative, got {self.preview_every}")
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything a run depends on beside the scene."""
+
+    preset: str = "default"
+    quality: str = "standard"
+    kind: str = "hybrid"
+    geometry: GeometryConfig = field(default_factory=GeometryConfig)
+    model: Model = field(default_factory=Model)
+    objective: Objective = field(default_factory=Objective)
+    loss: LossConfig = field(default_factory=LossConfig)
+    rates: RateConfig = field(default_factory=RateConfig)
+    run: RunConfig = field(default_factory=RunConfig)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain nested dictionary, ready for JSON."""
+        return asdict(self)
+
+
+def _from_dict(kind: type, values: dict[str, Any], where: str) -> Any:
+    """Build a dataclass from plain values; unknown keys and wrong types are errors."""
+    default = kind()
+    known = {f.name for f in fields(kind)}
+    unknown = sorted(set(values) - known)
+    if unknown:
+        raise ValueError(f"unknown setting {where}{unknown[0]}; expected one of {sorted(known)}")
+    made = {}
+    for name, value in values.items():
+        now = getattr(default, name)
+        if is_dataclass(now):
+            if not isinstance(value, dict):
+                raise ValueError(f"{where}{name} is a section, got {value!r}")
+            made[name] = _from_dict(type(now), value, f"{where}{name}.")
+        else:
+            made[name] = _coerce(value, now, f"{where}{name}")
+    return kind(**made)
+
+
+def _coerce(value: Any, like: Any, where: str) -> Any:
+    """Return ``value`` with the type of the default ``like``, or raise."""
+    if isinstance(like, bool):
+        if isinstance(value, bool):
+            return value
+    elif isinstance(like, int):
+        if isinstance(value, int) and not isinstance(value, bool):
+            return value
+    elif isinstance(like, float):
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            return float(value)
+    elif isinstance(like, tuple):
+        if isinstance(value, list | tuple) and len(value) == len(like):
+            return tuple(_coerce(v, d, where) for v, d in zip(value, like, strict=True))
+    elif isinstance(value, type(like)):
+        return value
+    raise ValueError(f"{where} must be of type {type(like).__name__} like {like!r}, got {value!r}")
+
+
+def config_from_dict(values: dict[str, Any]) -> Config:
+    """Rebuild a `Config` from `Config.to_dict` (after a trip through JSON)."""
+    return _from_dict(Config, values, "")
+
+
+def _merge(base: dict[str, Any], changes: dict[str, Any], where: str = "") -> dict[str, Any]:
+    """Overlay nested ``changes`` on ``base``; a name that ``base`` lacks is an error."""
+    merged = dict(base)
+    for name, value in changes.items():
+        if name not in base:
+            raise ValueError(f"unknown setting {where}{name}; expected one of {sorted(base)}")
+        if isinstance(base[name], dict) and isinstance(value, dict):
+            merged[name] = _merge(base[name], value, f"{where}{name}.")
+        else:
+            merged[name] = value
+    return merged
+
+
+def parse_override(text: str) -> dict[str, Any]:
+    """Turn ``section.field=value`` into a nested dictionary; the value is TOML, or a bare word."""
+    name, equals, value = text.partition("=")
+    if not equals or not name.strip():
+        raise ValueError(f"an override reads section.field=value, got {text!r}")
+    try:
+        parsed = tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        parsed = value.strip()
+    nested: Any = parsed
+    for part in reversed(name.strip().split(".")):
+        nested = {part: nested}
+    return nested
+
+
+# What each quality level spends: measured in docs/quality.md.
+_QUALITY: dict[str, dict[str, Any]] = {
+    "draft": {
+        "geometry": {"resolution": 32},
+        "run": {"steps": 200, "batch_views": 2, "checkpoint_every": 100},
+        "rates": {"half_life": 100.0},
+        "model": {
+            "material": {"grid": {"levels": 6, "features": 4, "log2_entries": 14, "finest": 128}},
+        },
+    },
+    "standard": {},
+    "high": {
+        "geometry": {"resolution": 80},
+        "run": {"steps": 1000, "batch_views": 6},
+        "rates": {"half_life": 400.0},
+    },
+}
+
+
+def _preset(name: str) -> Config:
+    """Return the settings that define a preset, at standard quality."""
+    if name == "paper":
+        return Config(
+            preset=name,
+            geometry=GeometryConfig(resolution=96, initial="random"),
+            model=Model(
+                adapter=adapter_module.PAPER,
+                material=MaterialSpec(
+                    grid=HashGridSpec(
+                        levels=16, features=2, log2_entries=19, coarsest=32, finest=4096
+                    ),
+                    shared=False,
+                    has_shift=False,
+                ),
+            ),
+            loss=LossConfig(l1=1.0, entropy_end=0.01),
+            objective=Objective(entropy_reduction="sum"),
+            run=RunConfig(batch_views=8),
+            rates=RateConfig(half_life=800.0),
+        )
+    if name == "code":
+        return Config(
+            preset=name,
+            geometry=GeometryConfig(resolution=96, initial="random"),
+            model=Model(
+                adapter=adapter_module.CODE,
+                material=MaterialSpec(
+                    grid=HashGridSpec(
+                        levels=16, features=2, log2_entries=18, coarsest=16, finest=4096
+                    ),
+                    shared=False,
+                    has_shift=True,
+                ),
+                baked_diffuse=True,
+            ),
+            loss=LossConfig(entropy_end=0.12, entropy_end_fraction=1.0),
+            run=RunConfig(batch_views=8),
+            rates=RateConfig(half_life=800.0),
+        )
+    return Config(
+        preset="default",
+        model=Model(adapter=AdapterConstants(), material=MaterialSpec(shared=True)),
+    )
+
+
+def make_config(
+    preset: str = "default",
+    quality: str = "standard",
+    *,
+    kind: str = "hybrid",
+    overrides: tuple[str, ...] = (),
+) -> Config:
+    """Combine a preset, a quality level and overrides into a validated `Config`.
+
+    Parameters
+    ----------
+    preset : one of `PRESETS`.
+    quality : one of `QUALITIES`; changes nothing of the presets ``paper`` and ``code`` but what
+        ``overrides`` says, since their numbers are the point of them.
+    kind : guess about the material (see `materials.INITIAL_LOGITS`).
+    overrides : ``section.field=value`` strings, applied last.
+
+    Raises
+    ------
+    ValueError
+        On an unknown name, a value of the wrong type or out of range.
+    """
+    if preset not in PRESETS:
+        raise ValueError(f"preset must be one of {PRESETS}, got {preset!r}")
+    if quality not in QUALITIES:
+        raise ValueError(f"quality must be one of {QUALITIES}, got {quality!r}")
+    if kind not in INITIAL_LOGITS:
+        raise ValueError(f"kind must be one of {sorted(INITIAL_LOGITS)}, got {kind!r}")
+    roughness_logit, metallic_logit = INITIAL_LOGITS[kind]
+    config = replace(_preset(preset), quality=quality, kind=kind)
+    material = replace(
+        config.model.material,
+        initial_roughness_logit=float(roughness_logit),
+        initial_metallic_logit=float(metallic_logit),
+    )
+    config = replace(config, model=replace(config.model, material=material))
+    values = config.to_dict()
+    if preset == "default":
+        values = _merge(values, _QUALITY[quality])
+    for override in overrides:
+        values = _merge(values, parse_override(override))
+    return config_from_dict(values)
+
+
+def differences(first: Config, second: Config) -> list[str]:
+    """Name every setting in which two configurations differ, with both values."""
+
+    def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+        found = {}
+        for name, value in values.items():
+            if isinstance(value, dict):
+                found |= flat(value, f"{prefix}{name}.")
+            else:
+                found[prefix + name] = value
+        return found
+
+    one, two = (flat(json.loads(json.dumps(c.to_dict()))) for c in (first, second))
+    names = sorted(set(one) | set(two))
+    return [f"{n}: {one.get(n)!r} -> {two.get(n)!r}" for n in names if one.get(n) != two.get(n)]

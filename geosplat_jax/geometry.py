@@ -1,0 +1,453 @@
+"""Differentiable isosurface (FlexiCubes) on a box of cubic cells.
+
+Dual marching cubes: every patch that the surface cuts out of a cell gives a dual vertex, every
+interior grid edge it crosses gives a quad between the four cells around it. On a regular grid both
+follow from index arithmetic. Only tests of signs visit the whole volume; all else is done for
+the cells at the surface, so that the cost grows with its area.
+
+Edges on the border of the grid have fewer than four cells and make no quad: a surface that runs
+into the border is open there. Keep the outermost vertices positive for a closed one.
+
+Reference: Shen et al., "Flexible Isosurface Extraction for Gradient-Based Mesh Optimization", 2023.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt
+
+from geosplat_jax._flexicubes_tables import (
+    CORNERS,
+    PATCH_COUNT,
+    PATCH_EDGES,
+    PATCH_OF_EDGE,
+    PROBLEM_OFFSET,
+    QUAD_CELLS,
+    QUAD_EDGES,
+)
+from geosplat_jax.capacity import BitSet, Capacities, Usage, bit_set, usage
+from geosplat_jax.grids import (
+    deformed_vertices,
+    grid_vertices,
+    initial_geometry,
+    random_sdf,
+    resample,
+    sdf_entropy,
+    sphere_sdf,
+    weight_magnitude,
+)
+from geosplat_jax.mesh_ops import face_normals_and_areas, vertex_normals
+from geosplat_jax.numerics import safe_norm
+from geosplat_jax.scene import Geometry, Grid, Mesh
+
+__all__ = [
+    "Surface",
+    "deformed_vertices",
+    "edge_deviations",
+    "face_normals_and_areas",
+    "grid_vertices",
+    "initial_geometry",
+    "isosurface",
+    "random_sdf",
+    "resample",
+    "sdf_entropy",
+    "sphere_sdf",
+    "vertex_normals",
+    "weight_magnitude",
+]
+
+_WEIGHT_SCALE = 0.99
+_SDF_EPSILON = 1e-12
+"""Where both ends of an edge are closer to zero than this the crossing is its midpoint, without
+gradient: the true gradient grows as 1 / |sdf| and would leave the range of float32."""
+
+_SPLIT_EPSILON = 1e-8
+"""Added to the weights of the two diagonals by the original, kept for equality with it."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Surface:
+    """An extracted isosurface.
+
+    Attributes
+    ----------
+    mesh : triangles; vertex rows are the dual vertices, then in training the centres of the quads.
+    deviation : () mean absolute deviation of the distances between the crossing points of a patch
+        and its dual vertex (FlexiCubes Eq. 8), world units; 0 for an empty surface.
+    usage : true counts of surface cells, dual vertices and quads.
+    vertex_cells : (dual vertices,) grid cell of each dual vertex; 0 on padding.
+    quads : (quads, 4) vertex rows, counter-clockwise seen from outside; 0 on padding.
+    """
+
+    mesh: Mesh
+    deviation: Float[Array, ""]
+    usage: Usage
+    vertex_cells: Int[Array, " Cd"]
+    quads: Int[Array, "Cq 4"]
+
+
+# --- the grid -----------------------------------------------------------------------------------
+
+
+def _rows(array: Array, index: Int[Array, "..."]) -> Array:
+    """Gather rows; indices out of range (only in padding or after overflow) are clamped."""
+    return array.at[index].get(mode="clip")
+
+
+def _cell_coordinates(index: Int[Array, " n"], grid: Grid) -> Int[Array, "3 n"]:
+    """Coordinates (i, j, k) of cells numbered with i fastest."""
+    nx, ny, _ = grid.shape
+    return jnp.stack([index % nx, index // nx % ny, index // (nx * ny)])
+
+
+# --- cells at the surface -----------------------------------------------------------------------
+
+
+class _Cells(NamedTuple):
+    """The cells that the surface passes through, in the order of their number."""
+
+    index: Int[Array, " Ck"]
+    coordinates: Int[Array, "3 Ck"]
+    signs: Int[Array, " Ck"]  # 8-bit set of inside corners; 0 on padding
+    case: Int[Array, " Ck"]  # the case whose patches are used (see `_resolved_case`)
+    first_vertex: Int[Array, " Ck"]
+    bits: BitSet
+    vertex_count: Int[Array, ""]
+    quad_count: Int[Array, ""]
+
+
+def _sign_grid(sdf: Float[Array, " G"], grid: Grid) -> UInt[Array, " K"]:
+    """8-bit set of the corners with negative SDF for every cell; zero counts as outside."""
+    nx, ny, nz = grid.shape
+    inside = (sdf < 0).reshape(nz + 1, ny + 1, nx + 1).astype(jnp.uint8)
+    signs = jnp.zeros((nz, ny, nx), jnp.uint8)
+    for corner, (x, y, z) in enumerate(CORNERS.tolist()):
+        signs = signs | inside[z : z + nz, y : y + ny, x : x + nx] << corner
+    return signs.reshape(-1)
+
+
+def _resolved_case(
+    signs: Int[Array, " n"],
+    coordinates: Int[Array, "3 n"],
+    sign_grid: UInt[Array, " K"],
+    grid: Grid,
+) -> Int[Array, " n"]:
+    """Case whose patches a cell uses: its complement where two C16 or C19 cells would clash.
+
+    Depends on signs only and carries no gradient.
+    """
+    nx, ny, nz = grid.shape
+    is_problem = jnp.asarray(np.any(PROBLEM_OFFSET != 0, axis=1))
+    step = _rows(jnp.asarray(PROBLEM_OFFSET.astype(np.int32)), signs).T
+    neighbour = coordinates + step
+    limit = jnp.asarray(grid.shape, jnp.int32)[:, None]
+    exists = jnp.all((neighbour >= 0) & (neighbour < limit), axis=0)
+    number = neighbour[0] + nx * (neighbour[1] + ny * neighbour[2])
+    clashes = exists & _rows(is_problem, _rows(sign_grid, number).astype(jnp.int32))
+    return jnp.where(_rows(is_problem, signs) & clashes, 255 - signs, signs)
+
+
+def _owned_crossings(signs: Int[Array, " n"], coordinates: Int[Array, "3 n"]) -> Bool[Array, "n 3"]:
+    """Whether the surface crosses the interior edge that leaves the lowest corner along x, y, z.
+
+    Every interior edge leaves the lowest corner of exactly one cell, which owns its quad.
+    """
+    inner = coordinates > 0
+    columns = []
+    for axis in range(3):
+        is_crossed = (signs ^ signs >> (1 << axis)) & 1 == 1
+        columns.append(is_crossed & inner[(axis + 1) % 3] & inner[(axis + 2) % 3])
+    return jnp.stack(columns, axis=1)
+
+
+def _surface_cells(sdf: Float[Array, " G"], grid: Grid, *, capacity: int) -> _Cells:
+    """Compact the cells whose corners differ in sign, and count what they will produce."""
+    sign_grid = _sign_grid(sdf, grid)
+    bits = bit_set((sign_grid != 0) & (sign_grid != 255))
+    patch_count = jnp.asarray(PATCH_COUNT.astype(np.int32))
+
+    def describe(index: Int[Array, " n"]) -> tuple[Array, Array, Array]:
+        coordinates = _cell_coordinates(index, grid)
+        signs = _rows(sign_grid, index).astype(jnp.int32)
+        return coordinates, signs, _resolved_case(signs, coordinates, sign_grid, grid)
+
+    def count(coordinates: Array, signs: Array, case: Array) -> tuple[Array, Array]:
+        vertices = jnp.sum(_rows(patch_count, case), dtype=jnp.int32)
+        return vertices, jnp.sum(_owned_crossings(signs, coordinates), dtype=jnp.int32)
+
+    index = bits.first(capacity=capacity)
+    is_real = jnp.arange(capacity, dtype=jnp.int32) < bits.count
+    coordinates, signs, case = describe(index)
+    signs, case = jnp.where(is_real, signs, 0), jnp.where(is_real, case, 0)
+    through = jnp.cumsum(_rows(patch_count, case), dtype=jnp.int32)
+    # After an overflow the compacted cells do not tell the true needs, so the volume is asked.
+    vertex_count, quad_count = jax.lax.cond(
+        bits.count > capacity,
+        lambda: count(*describe(jnp.arange(grid.cube_count, dtype=jnp.int32))),
+        lambda: count(coordinates, signs, case),
+    )
+    return _Cells(
+        index=index,
+        coordinates=coordinates,
+        signs=signs,
+        case=case,
+        first_vertex=through - _rows(patch_count, case),
+        bits=bits,
+        vertex_count=vertex_count,
+        quad_count=quad_count,
+    )
+
+
+# --- dual vertices ------------------------------------------------------------------------------
+
+
+class _Duals(NamedTuple):
+    """Dual vertices, relative to the centre of the grid, and what belongs to them."""
+
+    points: Float[Array, "3 Cd"]
+    gamma: Float[Array, " Cd"]
+    cells: Int[Array, " Cd"]
+    deviations: Float[Array, "12 Cd"]
+    crosses: Bool[Array, "12 Cd"]
+
+
+def _edge_ends(corners: Float[Array, "*b 8 n"]) -> tuple[Array, Array]:
+    """Values at the lower and upper ends of the 12 edges, in the order of the tables."""
+    count = corners.shape[-1]
+    cube = corners.reshape(*corners.shape[:-2], 2, 2, 2, count)  # z, y, x
+
+    def at_side(side: int) -> Array:
+        along = (cube[..., :, :, side, :], cube[..., :, side, :, :], cube[..., side, :, :, :])
+        return jnp.concatenate(
+            [part.reshape(*cube.shape[:-4], 4, count) for part in along], axis=-2
+        )
+
+    return at_side(0), at_side(1)
+
+
+def _crossing_fraction(
+    lower: Float[Array, "12 n"], upper: Float[Array, "12 n"], crosses: Bool[Array, "12 n"]
+) -> Float[Array, "12 n"]:
+    """Zero of the linear interpolant along each crossed edge, as a fraction from its lower end."""
+    size = jax.lax.stop_gradient(jnp.maximum(jnp.abs(lower), jnp.abs(upper)))
+    usable = crosses & (size > _SDF_EPSILON)
+    # The fraction does not change when both ends are scaled; unit size keeps squares in range.
+    scale = jnp.where(usable, size, 1.0)
+    low = jnp.where(usable, lower / scale, -1.0)
+    high = jnp.where(usable, upper / scale, 1.0)
+    return low / (low - high)
+
+
+def _corner_values(
+    geometry: Geometry, grid: Grid, coordinates: Int[Array, "3 n"]
+) -> tuple[Float[Array, "8 n"], Float[Array, "3 8 n"]]:
+    """SDF and deformed positions, in cells from the centre of the grid, of the cells' corners."""
+    dtype = geometry.sdf.dtype
+    vx, vy, _ = grid.vertex_shape
+    steps = CORNERS @ np.array([1, vx, vx * vy], np.int32)
+    base = coordinates[0] + vx * (coordinates[1] + vy * coordinates[2])
+    vertex = base[None, :] + jnp.asarray(steps)[:, None]
+    moved = jnp.moveaxis(0.5 * jnp.tanh(_rows(geometry.deform, vertex)), -1, 0)
+    centre = jnp.asarray(np.array(grid.shape) / 2, dtype)
+    corner = jnp.asarray(CORNERS.T, dtype)[:, :, None]
+    rest = (coordinates.astype(dtype) - centre[:, None])[:, None, :] + corner
+    return _rows(geometry.sdf, vertex), rest + moved
+
+
+def _dual_vertices(geometry: Geometry, grid: Grid, cells: _Cells, *, capacity: int) -> _Duals:
+    """Place one vertex for every patch of the surface in a cell."""
+    row_number = jnp.arange(capacity, dtype=jnp.int32)
+    row = jnp.searchsorted(cells.first_vertex, row_number, side="right").astype(jnp.int32) - 1
+    is_real = row_number < cells.vertex_count
+    slot = row_number - cells.first_vertex[row]
+    patch = _rows(jnp.asarray(PATCH_EDGES.astype(np.int32).reshape(-1)), cells.case[row] * 4 + slot)
+    crosses = (patch[None, :] >> jnp.arange(12, dtype=jnp.int32)[:, None]) & 1 == 1
+    crosses = crosses & is_real[None, :]
+    index = cells.index[row]
+
+    sdf, corners = _corner_values(geometry, grid, cells.coordinates[:, row])
+    alpha = jnp.tanh(_rows(geometry.alpha, index).T) * _WEIGHT_SCALE + 1.0
+    beta = jnp.tanh(_rows(geometry.beta, index).T) * _WEIGHT_SCALE + 1.0
+    gamma = jax.nn.sigmoid(_rows(geometry.gamma, index))
+    gamma = gamma * _WEIGHT_SCALE + 0.5 * (1.0 - _WEIGHT_SCALE)
+
+    start, end = _edge_ends(corners)
+    along = end - start
+    # FlexiCubes Eq. 3: crossings of the alpha-scaled field, Eq. 4: their beta-weighted mean.
+    fraction = _crossing_fraction(*_edge_ends(sdf * alpha), crosses)
+    weight = jnp.where(crosses, beta, 0.0)
+    total = jnp.where(is_real, jnp.sum(weight, axis=0), 1.0)
+    crossing = start + fraction[None, :, :] * along
+    points = jnp.sum(weight[None, :, :] * crossing, axis=1) / total[None, :]
+    # FlexiCubes Eq. 8 measures the plain crossings, without alpha.
+    plain = start + _crossing_fraction(*_edge_ends(sdf), crosses)[None, :, :] * along
+    deviations = _deviations(plain - points[:, None, :], crosses)
+    points = jnp.where(is_real[None, :], points, 0.0)
+    return _Duals(
+        points=points * grid.cell_size,
+        gamma=gamma,
+        cells=jnp.where(is_real, index, 0),
+        deviations=deviations * grid.cell_size,
+        crosses=crosses,
+    )
+
+
+def _deviations(
+    offsets: Float[Array, "3 12 n"], crosses: Bool[Array, "12 n"]
+) -> Float[Array, "12 n"]:
+    """Deviation of the length of each patch's offsets from their mean; 0 where none crosses."""
+    lengths = jnp.where(crosses, safe_norm(offsets, axis=0), 0.0)
+    count = jnp.maximum(jnp.sum(crosses, axis=0, dtype=jnp.int32), 1).astype(lengths.dtype)
+    mean = jnp.sum(lengths, axis=0) / count
+    return jnp.where(crosses, jnp.abs(lengths - mean[None, :]), 0.0)
+
+
+# --- quads and triangles ------------------------------------------------------------------------
+
+
+class _Quads(NamedTuple):
+    """Quads between dual vertices, one a crossed interior edge of the grid."""
+
+    corners: Int[Array, "4 Cq"]  # counter-clockwise seen from outside
+    prefers_first_on_tie: Bool[Array, " Cq"]
+    mask: Bool[Array, " Cq"]
+
+
+def _quads(grid: Grid, cells: _Cells, *, capacity: int) -> _Quads:
+    """Join the dual vertices of the four cells around every crossed interior edge."""
+    owned = _owned_crossings(cells.signs, cells.coordinates)
+    owner = bit_set(owned.reshape(-1)).first(capacity=capacity)
+    row, axis = owner // 3, owner % 3
+    is_real = jnp.arange(capacity, dtype=jnp.int32) < cells.quad_count
+
+    nx, ny, _ = grid.shape
+    steps = QUAD_CELLS @ np.array([1, nx, nx * ny], np.int32)
+    number = cells.index[row][None, :] + _rows(jnp.asarray(steps), axis).T
+    around = cells.bits.rank(jnp.clip(number, 0, grid.cube_count - 1))
+    edge = _rows(jnp.asarray(QUAD_EDGES), axis).T
+    patch_of_edge = jnp.asarray(PATCH_OF_EDGE.astype(np.int32).reshape(-1))
+    slot = _rows(patch_of_edge, _rows(cells.case, around) * 12 + edge)
+    corners = _rows(cells.first_vertex, around) + slot
+
+    # The surface faces the positive side: along the axis if its lower end is inside.
+    is_inside = cells.signs[row] & 1 == 1
+    corners = jnp.where(is_inside[None, :], corners, corners[np.array([0, 3, 2, 1])])
+    # The original compares diagonals in an order that depends on the sign of the first end of an
+    # edge, and lists edges along y from their upper end. It matters for equal weights only.
+    prefers_first = is_inside ^ (axis == 1)
+    corners = jnp.where(is_real[None, :], corners, 0)
+    return _Quads(corners=corners, prefers_first_on_tie=prefers_first, mask=is_real)
+
+
+def _diagonal_weights(gamma: Float[Array, "4 Cq"]) -> tuple[Array, Array]:
+    """Weights of the diagonals 0-2 and 1-3."""
+    return gamma[0] * gamma[2], gamma[1] * gamma[3]
+
+
+def _quad_centres(
+    points: Float[Array, "3 Cd"], gamma: Float[Array, " Cd"], quads: _Quads
+) -> Float[Array, "Cq 3"]:
+    """Blend the middles of the two diagonals by gamma (FlexiCubes Eq. 5); zero on padding."""
+    rows = jnp.concatenate([points, gamma[None, :]]).T
+    corner = jnp.moveaxis(_rows(rows, quads.corners), -1, 0)
+    first, second = _diagonal_weights(corner[3])
+    middle_first = 0.5 * (corner[:3, 0] + corner[:3, 2])
+    middle_second = 0.5 * (corner[:3, 1] + corner[:3, 3])
+    blended = middle_first * first[None, :] + middle_second * second[None, :]
+    centres = blended / (first + second + _SPLIT_EPSILON)[None, :]
+    return jnp.where(quads.mask[None, :], centres, 0.0).T
+
+
+def _fan_faces(quads: _Quads, first_centre: Int[Array, ""]) -> Int[Array, "F 3"]:
+    """Four triangles a quad, from each side to the centre."""
+    capacity = quads.corners.shape[1]
+    centre = first_centre + jnp.arange(capacity, dtype=jnp.int32)
+    sides = jnp.stack([quads.corners, jnp.roll(quads.corners, -1, axis=0)], axis=-1)
+    faces = jnp.concatenate([sides, jnp.broadcast_to(centre[None, :, None], (4, capacity, 1))], -1)
+    faces = jnp.where(quads.mask[None, :, None], faces, 0)
+    return jnp.swapaxes(faces, 0, 1).reshape(-1, 3)
+
+
+def _split_faces(gamma: Float[Array, " Cd"], quads: _Quads) -> Int[Array, "F 3"]:
+    """Two triangles a quad, along the diagonal with the larger weight."""
+    first, second = _diagonal_weights(_rows(gamma, quads.corners))
+    takes_first = (first > second) | ((first == second) & quads.prefers_first_on_tie)
+    along_first = quads.corners[np.array([0, 1, 2, 0, 2, 3])]
+    along_second = quads.corners[np.array([0, 1, 3, 3, 1, 2])]
+    return jnp.where(takes_first[None, :], along_first, along_second).T.reshape(-1, 3)
+
+
+def isosurface(
+    geometry: Geometry, grid: Grid, *, capacities: Capacities, training: bool
+) -> Surface:
+    """Extract the surface where the SDF changes sign, as a watertight manifold mesh.
+
+    Vertex positions and the deviation are differentiable with respect to every array of
+    ``geometry`` and to the grid's origin and cell size. Signs, cases, faces and, in evaluation,
+    the choice of a diagonal are piecewise constant and carry no gradient. An SDF of one sign
+    gives an empty mesh and zero gradients. Only the weights and deformations of cells at the
+    surface receive a gradient.
+
+    Parameters
+    ----------
+    geometry : raw SDF, deformations and weights (see `Geometry`).
+    grid : box of cells they live on.
+    capacities : static sizes; `Capacities.surface_cubes`, `dual_vertices` and `quads` are used.
+        If ``usage`` exceeds them the mesh is wrong and must be discarded (see `capacity`).
+    training : static. True: four triangles a quad around a centre that blends both diagonals by
+        gamma, which lets gamma learn. False: two triangles, split along the heavier diagonal.
+
+    Returns
+    -------
+    `Surface`, whose mesh has ``dual_vertices`` (+ ``quads`` in training) vertex rows and
+    ``2 (4) * quads`` face rows, padded with zeros. Faces are outward (towards positive SDF).
+    """
+    cells = _surface_cells(geometry.sdf, grid, capacity=capacities.surface_cubes)
+    duals = _dual_vertices(geometry, grid, cells, capacity=capacities.dual_vertices)
+    quads = _quads(grid, cells, capacity=capacities.quads)
+
+    vertices, vertex_count = duals.points.T, cells.vertex_count
+    if training:
+        centres = _quad_centres(duals.points, duals.gamma, quads)
+        padded = jnp.concatenate([vertices, jnp.zeros_like(centres)])
+        vertices = jax.lax.dynamic_update_slice_in_dim(padded, centres, vertex_count, axis=0)
+        faces = _fan_faces(quads, vertex_count)
+        vertex_count = vertex_count + cells.quad_count
+    else:
+        faces = _split_faces(duals.gamma, quads)
+    faces_each = 4 if training else 2
+
+    centre = grid.origin + grid.cell_size * 0.5 * jnp.asarray(grid.shape, grid.origin.dtype)
+    is_vertex = jnp.arange(vertices.shape[0], dtype=jnp.int32) < vertex_count
+    mesh = Mesh(
+        vertices=jnp.where(is_vertex[:, None], vertices + centre[None, :], 0.0),
+        faces=faces,
+        vertex_count=vertex_count,
+        face_count=faces_each * cells.quad_count,
+    )
+    needed = usage(
+        surface_cubes=cells.bits.count, dual_vertices=cells.vertex_count, quads=cells.quad_count
+    )
+    elements = jnp.maximum(jnp.sum(duals.crosses, dtype=jnp.int32), 1).astype(
+        duals.deviations.dtype
+    )
+    return Surface(
+        mesh=mesh,
+        deviation=jnp.sum(duals.deviations) / elements,
+        usage=needed,
+        vertex_cells=duals.cells,
+        quads=quads.corners.T,
+    )
+
+
+def edge_deviations(
+    geometry: Geometry, grid: Grid, *, capacities: Capacities
+) -> tuple[Float[Array, "12 Cd"], Bool[Array, "12 Cd"]]:
+    """Return the terms whose mean is `Surface.deviation`, and which of them are real."""
+    cells = _surface_cells(geometry.sdf, grid, capacity=capacities.surface_cubes)
+    duals = _dual_vertices(geometry, grid, cells, capacity=capacities.dual_vertices)
+    return duals.deviations, duals.crosses

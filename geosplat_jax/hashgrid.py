@@ -1,0 +1,379 @@
+"""Multi-resolution hash encoding (Mueller et al. 2022) and the tiny MLP that reads it.
+
+A point in the unit cube is looked up in several cubic grids of growing resolution; each gives the
+trilinear interpolation of its vertices' feature rows, and the results are concatenated. Grids that
+fit into the table are *dense* (one row a vertex); the others share rows by a spatial hash.
+
+Layout. All levels live in one array, level after level: one gather and one scatter serve them all.
+Along x, neighbouring vertices always own neighbouring rows: a level's row is ``x + offset(y, z)``,
+with the offset of a grid line either its dense position or a hash of (y, z). The eight corners of
+a cell are therefore four pairs of adjacent rows, which halves the hashing and the scattered rows.
+
+Gradients. `encode` has a hand-written reverse mode, 3 times faster on a CPU than autodiff of
+`_reference_encode`; forward mode and second derivatives are not available. Gradients of hash tables
+are small and sparse: the method scales them up (x16, REFERENCE 2.6) in the optimiser, never here.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+_HASH_Y = np.uint32(2654435761)
+_HASH_Z = np.uint32(805459861)
+_HASH_FINAL = np.uint32(0x2C1B3C6D)
+
+_INITIAL_SCALE = 1e-4
+"""Half-width of the uniform distribution that tables start from."""
+
+_BACKWARD_CHUNK = 8192
+"""Points a step of the backward pass: large enough to hide the cost of a step, small enough that
+the scattered rows (4 x 2 x features floats a point and level) stay in cache and off the heap."""
+
+
+@dataclass(frozen=True)
+class HashGridSpec:
+    """Static shape of an encoding; hashable, so that it can be a static jit argument.
+
+    Level ``l`` has ``floor(coarsest * growth**l)`` cells along an axis, with ``growth`` such that
+    the last level has ``finest``. A level is dense when its ``(cells + 1)**3`` vertices fit into
+    ``2**log2_entries`` rows; otherwise it has exactly that many rows.
+
+    Attributes
+    ----------
+    levels : number of grids.
+    features : numbers a vertex holds in each of them.
+    log2_entries : base-2 logarithm of the largest table.
+    coarsest, finest : cells along an axis of the first and of the last level.
+
+    Raises
+    ------
+    ValueError
+        When a size is below one, ``finest < coarsest``, or a hashed level has so many cells
+        that one grid line takes more than half of the table.
+    """
+
+    levels: int = 8
+    features: int = 4
+    log2_entries: int = 15
+    coarsest: int = 16
+    finest: int = 512
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        if min(self.levels, self.features, self.log2_entries, self.coarsest) < 1:
+            raise ValueError(f"levels, features, log2_entries and coarsest must be >= 1: {self}")
+        if self.finest < self.coarsest:
+            raise ValueError(f"finest must be at least coarsest: {self}")
+        if not all(self.is_dense) and 2 * self.finest > 2**self.log2_entries:
+            raise ValueError(
+                f"a grid line of {self.finest} cells takes more than half of "
+                f"2**{self.log2_entries} rows; raise log2_entries or lower finest"
+            )
+
+    @property
+    def resolutions(self) -> tuple[int, ...]:
+        """Cells along an axis, a level."""
+        steps = max(self.levels - 1, 1)
+        growth = math.exp((math.log(self.finest) - math.log(self.coarsest)) / steps)
+        # The epsilon keeps the last level at `finest` where the power rounds below it.
+        return tuple(int(self.coarsest * growth**level + 1e-6) for level in range(self.levels))
+
+    @property
+    def is_dense(self) -> tuple[bool, ...]:
+        """Whether a level is free of collisions, a level."""
+        return tuple((cells + 1) ** 3 <= 2**self.log2_entries for cells in self.resolutions)
+
+    @property
+    def entries(self) -> tuple[int, ...]:
+        """Rows of the table, a level."""
+        return tuple(
+            (cells + 1) ** 3 if dense else 2**self.log2_entries
+            for cells, dense in zip(self.resolutions, self.is_dense, strict=True)
+        )
+
+    @property
+    def first_rows(self) -> tuple[int, ...]:
+        """First row of a level in the common table, a level."""
+        return tuple(sum(self.entries[:level]) for level in range(self.levels))
+
+    @property
+    def total_entries(self) -> int:
+        """Rows of the common table."""
+        return sum(self.entries)
+
+    @property
+    def width(self) -> int:
+        """Features of an encoded point, all levels together."""
+        return self.levels * self.features
+
+
+class _Cells(NamedTuple):
+    """Where points lie in every level: row pairs along x of the four (y, z) edges of a cell."""
+
+    rows: tuple[Int[Array, "N L"], ...]
+    fractions: tuple[Float[Array, "N L"], ...]
+
+
+def init_tables(key: Key[Array, ""], spec: HashGridSpec) -> Float[Array, "E F"]:
+    """Draw feature rows of all levels, level after level, uniform in ±1e-4."""
+    shape = (spec.total_entries, spec.features)
+    return jax.random.uniform(key, shape, minval=-_INITIAL_SCALE, maxval=_INITIAL_SCALE)
+
+
+def level_rows(table: Float[Array, "E F"], spec: HashGridSpec) -> list[Float[Array, "E_l F"]]:
+    """Split the common table into the tables of its levels."""
+    return [
+        table[first : first + count]
+        for first, count in zip(spec.first_rows, spec.entries, strict=True)
+    ]
+
+
+def _hash_line(
+    y: Int[Array, "N L"], z: Int[Array, "N L"], offset_count: Float[np.ndarray, "1 L"]
+) -> Int[Array, "N L"]:
+    """First row of the grid line (y, z) in a hashed level, below ``offset_count``.
+
+    The upper 24 bits of the hash scale an interval; float32 holds them exactly and the product
+    never rounds up to ``offset_count``. (An integer remainder would not vectorise.)
+    """
+    mixed = (y.astype(jnp.uint32) * _HASH_Y) ^ (z.astype(jnp.uint32) * _HASH_Z)
+    mixed = (mixed ^ (mixed >> 15)) * _HASH_FINAL
+    fraction = (mixed >> 8).astype(jnp.float32)
+    return (fraction * (offset_count * np.float32(2.0**-24))).astype(jnp.int32)
+
+
+def _locate(points: Float[Array, "N 3"], spec: HashGridSpec) -> _Cells:
+    """Find every point's cell in every level, as table rows and fractions within the cell.
+
+    Rows are in bounds for *any* input, NaN included; fractions of a NaN are NaN.
+    """
+    cells = np.asarray(spec.resolutions, np.int32)[None, :]
+    first_rows = np.asarray(spec.first_rows, np.int32)[None, :]
+    is_dense = np.asarray(spec.is_dense)[None, :]
+    # A line occupies cells + 1 rows, so this many offsets keep it inside the level's table.
+    offset_count = np.float32(2**spec.log2_entries) - cells.astype(np.float32)
+
+    scaled = jnp.clip(points, 0.0, 1.0)[:, :, None] * jnp.asarray(cells, points.dtype)[:, None, :]
+    corner = jnp.clip(scaled.astype(jnp.int32), 0, cells[:, None, :] - 1)
+    fraction = scaled - corner.astype(points.dtype)
+    x, y, z = corner[:, 0], corner[:, 1], corner[:, 2]
+
+    rows = []
+    for dz, dy in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        dense_line = ((z + dz) * (cells + 1) + (y + dy)) * (cells + 1)
+        line = jnp.where(is_dense, dense_line, _hash_line(y + dy, z + dz, offset_count))
+        rows.append(first_rows + line + x)
+    located = _Cells(tuple(rows), (fraction[:, 0], fraction[:, 1], fraction[:, 2]))
+    # Without the barrier XLA repeats the hashing for every feature of every corner (x1.6 time).
+    return jax.lax.optimization_barrier(located)
+
+
+def _line_weights(cells: _Cells) -> list[Float[Array, "N L"]]:
+    """Bilinear weights in (y, z) of the four row pairs, in their order."""
+    _, ty, tz = cells.fractions
+    return [wz * wy for wz in (1 - tz, tz) for wy in (1 - ty, ty)]
+
+
+def _take(table: Float[Array, "E F"], rows: Int[Array, "N L"]) -> Float[Array, "N L F"]:
+    return table.at[rows].get(mode="promise_in_bounds")
+
+
+def _interpolate(table: Float[Array, "E F"], cells: _Cells) -> Float[Array, "N L F"]:
+    """Trilinear interpolation of every level's rows."""
+    tx = cells.fractions[0][..., None]
+    weights = _line_weights(cells)
+    features = jnp.zeros((), table.dtype)
+    for rows, weight in zip(cells.rows, weights, strict=True):
+        along_x = _take(table, rows) * (1 - tx) + _take(table, rows + 1) * tx
+        features = features + weight[..., None] * along_x
+    return features
+
+
+def _reference_encode(
+    table: Float[Array, "E F"], points: Float[Array, "N 3"], spec: HashGridSpec
+) -> Float[Array, "N W"]:
+    """Encode with plain operations, differentiated by autodiff: the meaning of `encode`."""
+    is_inside = (points >= 0) & (points <= 1)
+    clamped = jnp.where(is_inside, points, jnp.clip(jax.lax.stop_gradient(points), 0.0, 1.0))
+    sizes = [jnp.asarray(n, points.dtype) for n in spec.resolutions]
+    located = _locate(jax.lax.stop_gradient(points), spec)
+    fractions = []
+    for axis in range(3):
+        scaled = jnp.stack([clamped[:, axis] * n for n in sizes], axis=1)
+        corner = jnp.stack(
+            [
+                jnp.clip(jax.lax.stop_gradient(scaled[:, k]).astype(jnp.int32), 0, n - 1)
+                for k, n in enumerate(spec.resolutions)
+            ],
+            axis=1,
+        )
+        fractions.append(scaled - corner.astype(points.dtype))
+    features = _interpolate(table, _Cells(located.rows, tuple(fractions)))
+    return features.reshape(points.shape[0], spec.width)
+
+
+def _scatter_rows(
+    gradient: Float[Array, "E F"], cells: _Cells, cotangent: Float[Array, "N L F"]
+) -> Float[Array, "E F"]:
+    """Add the cotangent, times its weight, to the rows of all corners."""
+    tx = cells.fractions[0]
+    updates = [
+        jnp.stack([(w * (1 - tx))[..., None] * cotangent, (w * tx)[..., None] * cotangent], axis=-2)
+        for w in _line_weights(cells)
+    ]
+    pair_shape = (2, gradient.shape[1])
+    # One window of two adjacent rows a pair.
+    numbers = jax.lax.ScatterDimensionNumbers(
+        update_window_dims=(1, 2), inserted_window_dims=(), scatter_dims_to_operand_dims=(0,)
+    )
+    return jax.lax.scatter_add(
+        gradient,
+        jnp.stack(cells.rows).reshape(-1, 1),
+        jnp.stack(updates).reshape(-1, *pair_shape),
+        numbers,
+        mode="promise_in_bounds",
+    )
+
+
+def _point_gradient(
+    table: Float[Array, "E F"],
+    points: Float[Array, "N 3"],
+    cells: _Cells,
+    cotangent: Float[Array, "N L F"],
+    spec: HashGridSpec,
+) -> Float[Array, "N 3"]:
+    """Differentiate along the axes of a point; zero along those on which it was clamped."""
+    tx, ty, tz = cells.fractions
+    # Products of the cotangent with each corner's row, over the features of a level.
+    low, high = [], []
+    for rows in cells.rows:
+        low.append(jnp.sum(_take(table, rows) * cotangent, axis=-1))
+        high.append(jnp.sum(_take(table, rows + 1) * cotangent, axis=-1))
+    line = [a * (1 - tx) + b * tx for a, b in zip(low, high, strict=True)]
+    weights = _line_weights(cells)
+    along_x = sum(
+        (w * (b - a) for w, a, b in zip(weights, low, high, strict=True)), start=jnp.zeros_like(tx)
+    )
+    along_y = (line[1] - line[0]) * (1 - tz) + (line[3] - line[2]) * tz
+    along_z = (line[2] - line[0]) * (1 - ty) + (line[3] - line[1]) * ty
+    per_level = jnp.stack([along_x, along_y, along_z], axis=-1)
+    sizes = jnp.asarray(spec.resolutions, points.dtype)
+    gradient = jnp.sum(per_level * sizes[None, :, None], axis=1)
+    return jnp.where((points >= 0) & (points <= 1), gradient, 0.0)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+def _encode(table, points, spec, position_gradient):
+    features = _interpolate(table, _locate(points, spec))
+    return features.reshape(points.shape[0], spec.width)
+
+
+def _encode_forward(table, points, spec, position_gradient):
+    return _encode(table, points, spec, position_gradient), (table, points)
+
+
+def _encode_backward(spec, position_gradient, residuals, cotangent):
+    """Scatter a chunk of points at a time; cells are found again instead of stored."""
+    table, points = residuals
+    count = points.shape[0]
+    chunk = min(_BACKWARD_CHUNK, max(count, 1))
+    padding = ((0, -count % chunk), (0, 0))  # zero cotangents: padding adds nothing
+
+    def step(gradient, slices):
+        chunk_points, chunk_cotangent = slices
+        cells = _locate(chunk_points, spec)
+        chunk_cotangent = chunk_cotangent.reshape(-1, spec.levels, spec.features)
+        gradient = _scatter_rows(gradient, cells, chunk_cotangent)
+        if not position_gradient:
+            return gradient, None
+        return gradient, _point_gradient(table, chunk_points, cells, chunk_cotangent, spec)
+
+    chunks = (
+        jnp.pad(points, padding).reshape(-1, chunk, 3),
+        jnp.pad(cotangent, padding).reshape(-1, chunk, spec.width),
+    )
+    gradient, point_gradients = jax.lax.scan(step, jnp.zeros_like(table), chunks)
+    if not position_gradient:
+        return gradient, jnp.zeros_like(points)
+    return gradient, point_gradients.reshape(-1, 3)[:count]
+
+
+_encode.defvjp(_encode_forward, _encode_backward)
+
+
+def encode(
+    table: Float[Array, "E F"],
+    points: Float[Array, "N 3"],
+    *,
+    spec: HashGridSpec,
+    position_gradient: bool = False,
+) -> Float[Array, "N W"]:
+    """Encode points of the unit cube as the interpolated features of every level.
+
+    Parameters
+    ----------
+    table : (E, F) feature rows of all levels, see `init_tables`.
+    points : (N, 3) in [0, 1]; values outside are clamped.
+    spec : static shape of the encoding.
+    position_gradient : whether points receive a gradient. It is exact inside cells, one-sided on
+        their faces and zero along a clamped axis; it costs a second pass over the table.
+
+    Returns
+    -------
+    (N, levels * features), the levels one after another.
+
+    Notes
+    -----
+    Without ``position_gradient`` the points' gradient is zero. Rows of padding need no care: a
+    zero cotangent adds nothing to the table. A NaN in a point gives NaN features of that row.
+    """
+    points = points if position_gradient else jax.lax.stop_gradient(points)
+    return _encode(table, points, spec, position_gradient)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Layer:
+    """Affine map: ``x @ weights + bias``.
+
+    Attributes
+    ----------
+    weights : (inputs, outputs).
+    bias : (outputs,) or None, which holds no parameter.
+    """
+
+    weights: Float[Array, "I O"]
+    bias: Float[Array, " O"] | None
+
+
+def init_mlp(key: Key[Array, ""], widths: tuple[int, ...], *, bias: bool) -> tuple[Layer, ...]:
+    """Draw Kaiming-uniform weights (He et al. 2015, ``±sqrt(6 / inputs)``); biases start at zero.
+
+    Parameters
+    ----------
+    widths : inputs, hidden widths and outputs.
+    """
+    layers = []
+    keys = jax.random.split(key, len(widths) - 1)
+    for layer_key, inputs, outputs in zip(keys, widths[:-1], widths[1:], strict=True):
+        bound = math.sqrt(6.0 / inputs)
+        weights = jax.random.uniform(layer_key, (inputs, outputs), minval=-bound, maxval=bound)
+        layers.append(Layer(weights, jnp.zeros((outputs,), weights.dtype) if bias else None))
+    return tuple(layers)
+
+
+def apply_mlp(layers: tuple[Layer, ...], x: Float[Array, "N I"]) -> Float[Array, "N O"]:
+    """Evaluate an MLP with rectified hidden layers and a linear output."""
+    for index, layer in enumerate(layers):
+        x = x @ layer.weights
+        if layer.bias is not None:
+            x = x + layer.bias[None, :]
+        if index + 1 < len(layers):
+            x = jax.nn.relu(x)
+    return x

@@ -1,0 +1,288 @@
+"""Checkpoints: a pytree of arrays in one ``.npz`` file, bit for bit, without pickle.
+
+Each leaf is a member named by its path in the tree (``['params'].geometry.sdf.npy``); one more
+member holds JSON: the step, the caller's metadata, and each leaf's shape and type. Types that
+NumPy does not know (bfloat16) travel as unsigned integers, typed PRNG keys as their data and the
+name of their generator. A file is written aside, flushed to the disk, read back, and only then
+renamed and its elders removed: at any moment the last good checkpoint is whole.
+"""
+
+import json
+import os
+import re
+import warnings
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+FORMAT = 1
+"""Version of the file's own layout."""
+
+_META = "__meta__"
+_NAME = re.compile(r"checkpoint_(\d{8,})\.npz")
+_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError, OSError)
+_CARRIERS = {1: np.uint8, 2: np.uint16, 4: np.uint32, 8: np.uint64}
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint cannot be written, read, or does not fit; the message says why."""
+
+
+def save_checkpoint(folder: str | Path, step: int, *, tree: Any, meta: dict, keep: int = 2) -> Path:
+    """Write a checkpoint and remove the ones it makes superfluous.
+
+    Parameters
+    ----------
+    folder : made when missing.
+    step : names the file; an existing file of this step is replaced.
+    tree : pytree of arrays, typed PRNG keys and Python numbers.
+    meta : anything JSON can hold; read back by `read_meta` and `load_checkpoint`.
+    keep : how many checkpoints up to this step stay, this one included.
+
+    Returns
+    -------
+    Path of the file.
+
+    Raises
+    ------
+    CheckpointError : the disk is full or not writable (earlier checkpoints are then untouched and
+        nothing partial is left), or a leaf is no array.
+    """
+    if step < 0 or keep < 1:
+        raise CheckpointError(f"step must be >= 0 and keep >= 1, got {step} and {keep}")
+    folder = Path(folder)
+    path = folder / f"checkpoint_{step:08d}.npz"
+    aside = folder / f".{path.name}.partial"
+    members, leaves = _pack(tree)
+    try:
+        header = json.dumps({"format": FORMAT, "step": step, "meta": meta, "leaves": leaves})
+    except (TypeError, ValueError) as error:
+        raise CheckpointError(f"the metadata is not JSON: {error}") from error
+    members[_META] = np.frombuffer(header.encode(), np.uint8)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_npz(aside, members)
+        problem = _damage(aside)
+        if problem:
+            raise OSError(f"reading it back failed: {problem}")
+        os.replace(aside, path)
+        _sync_folder(folder)
+    except OSError as error:
+        _remove(aside)
+        raise CheckpointError(
+            f"cannot write checkpoint {path}: {error}; earlier checkpoints are untouched. Free "
+            "disk space or choose another folder, then resume"
+        ) from error
+    except BaseException:
+        _remove(aside)
+        raise
+    earlier = [old for old in _listed(folder) if _step(old) < step]
+    for old in earlier[keep - 1 :]:
+        _remove(old)
+    return path
+
+
+def load_checkpoint(path: str | Path, *, like: Any) -> tuple[Any, dict]:
+    """Read a checkpoint into the structure of ``like``.
+
+    Parameters
+    ----------
+    path : file written by `save_checkpoint`.
+    like : pytree of the same structure, whose leaves give the shapes and types: arrays, typed
+        PRNG keys, Python numbers or `jax.ShapeDtypeStruct`. Values are not read.
+
+    Returns
+    -------
+    tree : NumPy leaves where ``like`` has them, else JAX arrays; bitwise what was saved.
+    meta : the caller's metadata.
+
+    Raises
+    ------
+    CheckpointError : missing or damaged file, or a leaf that is missing, superfluous or of another
+        shape or type, as when the configuration has changed.
+    """
+    path = Path(path)
+    header = _header(path)
+    named, structure = jax.tree_util.tree_flatten_with_path(like)
+    wanted = {_leaf_name(key_path): leaf for key_path, leaf in named}
+    _require_same_leaves(path, set(header["leaves"]), set(wanted))
+    try:
+        with zipfile.ZipFile(path) as archive:
+            leaves = [
+                _unpack(path, name, header["leaves"][name], _read_member(archive, name), leaf)
+                for name, leaf in wanted.items()
+            ]
+    except _DAMAGE as error:
+        raise CheckpointError(f"checkpoint {path} is damaged ({error}); use another") from error
+    return jax.tree_util.tree_unflatten(structure, leaves), header["meta"]
+
+
+def latest_checkpoint(folder: str | Path) -> Path | None:
+    """Find the newest checkpoint that is whole, or None.
+
+    Every file is read through. Damaged ones are passed over with a `RuntimeWarning`.
+    """
+    for path in _listed(Path(folder)):
+        problem = _damage(path)
+        if problem is None:
+            return path
+        warnings.warn(
+            f"checkpoint {path} is damaged ({problem}); falling back to an earlier one",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    return None
+
+
+def read_meta(path: str | Path) -> dict:
+    """Read the caller's metadata of a checkpoint, without its arrays.
+
+    Raises
+    ------
+    CheckpointError : missing or damaged file.
+    """
+    return _header(Path(path))["meta"]
+
+
+def read_step(path: str | Path) -> int:
+    """Read the step a checkpoint was saved at.
+
+    Raises
+    ------
+    CheckpointError : missing or damaged file.
+    """
+    return _header(Path(path))["step"]
+
+
+def _leaf_name(key_path) -> str:
+    return jax.tree_util.keystr(key_path) or "."
+
+
+def _is_key(leaf: Any) -> bool:
+    return hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _pack(tree: Any) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
+    """Turn leaves into plain arrays, and describe them."""
+    members, described = {}, {}
+    for key_path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+        name = _leaf_name(key_path)
+        if _is_key(leaf):
+            generator = str(jax.random.key_impl(leaf))
+            array = np.asarray(jax.random.key_data(leaf))
+            described[name] = {"key": generator, "shape": list(leaf.shape)}
+        else:
+            array = np.asarray(leaf)
+            if array.dtype.hasobject or array.dtype.kind in "USmM":
+                raise CheckpointError(f"leaf {name} must be an array of numbers, got {leaf!r}")
+            described[name] = {"dtype": array.dtype.name, "shape": list(array.shape)}
+            if array.dtype.kind == "V":  # an extension type such as bfloat16
+                array = array.view(_CARRIERS[array.dtype.itemsize])
+        members[name] = array
+    return members, described
+
+
+def _unpack(path: Path, name: str, described: dict, array: np.ndarray, like: Any) -> Any:
+    """Turn a plain array back into a leaf, checking it against ``like``."""
+    wanted = {"shape": list(np.shape(like))}
+    if _is_key(like):
+        wanted["key"] = str(jax.random.key_impl(like)) if isinstance(like, jax.Array) else None
+    else:
+        wanted["dtype"] = np.dtype(getattr(like, "dtype", np.asarray(like).dtype)).name
+    for what in ("key", "dtype", "shape"):
+        is_open = what == "key" and what in wanted and wanted[what] is None
+        if not is_open and wanted.get(what) != described.get(what):
+            raise CheckpointError(
+                f"leaf {name} of {path} has {what} {described.get(what)}, but the run has "
+                f"{wanted.get(what)}; resume with the configuration the checkpoint was made with"
+            )
+    if "key" in described:
+        return jax.random.wrap_key_data(jnp.asarray(array), impl=described["key"])
+    array = array.view(np.dtype(jnp.dtype(described["dtype"]))).reshape(described["shape"])
+    if isinstance(like, bool | int | float | complex):
+        return array.item()
+    return array if isinstance(like, np.ndarray | np.generic) else jnp.asarray(array)
+
+
+def _require_same_leaves(path: Path, stored: set[str], wanted: set[str]) -> None:
+    missing, extra = sorted(wanted - stored), sorted(stored - wanted)
+    if missing or extra:
+        parts = [
+            f"{word} {len(names)} leaves ({', '.join(names[:3])}{', ...' if names[3:] else ''})"
+            for word, names in (("lacks", missing), ("has besides", extra))
+            if names
+        ]
+        raise CheckpointError(
+            f"checkpoint {path} does not fit the run: it {' and '.join(parts)}; resume with the "
+            "configuration it was made with"
+        )
+
+
+def _write_npz(path: Path, members: dict[str, np.ndarray]) -> None:
+    """Write like `numpy.savez`, which however reserves some names, and flush to the disk."""
+    with open(path, "wb") as file:
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
+            for name, array in members.items():
+                with archive.open(name + ".npy", "w", force_zip64=True) as member:
+                    np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _read_member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    with archive.open(name + ".npy") as member:
+        return np.lib.format.read_array(member, allow_pickle=False)
+
+
+def _header(path: Path) -> dict:
+    if not path.is_file():
+        raise CheckpointError(f"checkpoint {path} does not exist")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            header = json.loads(_read_member(archive, _META).tobytes())
+    except _DAMAGE as error:
+        raise CheckpointError(f"checkpoint {path} is damaged ({error}); use another") from error
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise CheckpointError(f"{path} is no checkpoint of format {FORMAT}")
+    return header
+
+
+def _damage(path: Path) -> str | None:
+    """Read the whole file and check its sums; None where it is good."""
+    try:
+        _header(path)
+        with zipfile.ZipFile(path) as archive:
+            bad = archive.testzip()
+    except (CheckpointError, *_DAMAGE) as error:
+        return str(error)
+    return None if bad is None else f"checksum of {bad}"
+
+
+def _listed(folder: Path) -> list[Path]:
+    """Checkpoints of a folder, newest step first."""
+    if not folder.is_dir():
+        return []
+    return sorted((p for p in folder.iterdir() if _NAME.fullmatch(p.name)), key=_step, reverse=True)
+
+
+def _step(path: Path) -> int:
+    return int(_NAME.fullmatch(path.name)[1])
+
+
+def _remove(path: Path) -> None:
+    path.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Flush the rename itself, where the system lets a folder be opened."""
+    if os.name == "posix":
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -1,0 +1,247 @@
+"""Scenes in memory: one type for every layout, found out by itself and checked on the way in."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from geosplat_jax.hull import hull_bounds
+from geosplat_jax.io.frames import Frame, Listing
+from geosplat_jax.io.images import MissingFileError, SceneError
+from geosplat_jax.io.nerf_synthetic import (
+    is_nerf_synthetic,
+    is_shiny_blender,
+    list_nerf_synthetic,
+    list_shiny_blender,
+)
+from geosplat_jax.io.synthetic4relight import is_synthetic4relight, list_synthetic4relight
+from geosplat_jax.io.tensoir import is_tensoir, list_tensoir
+from geosplat_jax.io.views import COVERED, Views, load_views
+
+
+class Layout(NamedTuple):
+    """How to recognise a layout and how to list its frames."""
+
+    recognise: Callable[[Path], bool]
+    list_frames: Callable[..., Listing]
+
+
+# The most specific first.
+LAYOUTS: dict[str, Layout] = {
+    "tensoir": Layout(is_tensoir, list_tensoir),
+    "synthetic4relight": Layout(is_synthetic4relight, list_synthetic4relight),
+    "shiny_blender": Layout(is_shiny_blender, list_shiny_blender),
+    "nerf_synthetic": Layout(is_nerf_synthetic, list_nerf_synthetic),
+}
+
+_UNSUPPORTED = {
+    "transforms.json": "an instant-ngp or nerfstudio capture",
+    "sparse/0": "a COLMAP reconstruction",
+    "train_mask": "a Stanford-ORB scene",
+}
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A scene: views for training and testing, and what is known about it.
+
+    Attributes
+    ----------
+    name : of the folder; layout : one of `LAYOUTS`; root : the folder.
+    train, test : views.
+    lights : environment maps found on disk, by light (lat-long in the z-up world, see `EnvLight`).
+    train_light : light of the training images, where the layout names lights.
+    background : ``white`` or ``black``, what the usual evaluation composites on.
+    bounds : lo (3,) and hi (3,), a world box around the object.
+    warnings : what looks wrong but does not stop the work.
+    """
+
+    name: str
+    layout: str
+    root: Path
+    train: Views
+    test: Views
+    lights: Mapping[str, Path]
+    train_light: str | None
+    background: str
+    bounds: tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
+    warnings: tuple[str, ...] = ()
+
+
+def load_dataset(
+    path: str | Path,
+    *,
+    layout: str | None = None,
+    downscale: int = 1,
+    light: str | None = None,
+    bounds: tuple[Sequence[float], Sequence[float]] | None = None,
+    train_views: int | None = None,
+    test_views: int | None = None,
+) -> Dataset:
+    """Load a scene folder.
+
+    Parameters
+    ----------
+    path : the scene folder.
+    layout : one of `LAYOUTS`; recognised when not given.
+    downscale : integer factor that images and intrinsics are reduced by.
+    light : training light, where the layout has a choice.
+    bounds : lo and hi of a box around the object; by default that of the visual hull.
+    train_views, test_views : at most this many views, spread evenly over the list.
+
+    Raises
+    ------
+    MissingFileError : the folder or a file in it is not there.
+    SceneError : anything in it cannot be used; the message says what, why and the cure.
+    """
+    root = Path(path).expanduser()
+    if not root.is_dir():
+        raise MissingFileError(f"scene folder {root} does not exist")
+    layout = recognise_layout(root) if layout is None else layout
+    if layout not in LAYOUTS:
+        raise SceneError(f"layout must be one of {sorted(LAYOUTS)}, got {layout!r}")
+    listing = LAYOUTS[layout].list_frames(root, light=light)
+    warnings: list[str] = []
+    splits = []
+    for split, frames, limit in (
+        ("train", listing.train, train_views),
+        ("test", listing.test, test_views),
+    ):
+        chosen = _spread(frames, limit, f"{split}_views")
+        views, problems = load_views(chosen, factor=downscale, listing=listing)
+        _check_masks(views, split, warnings)
+        warnings += [f"{split}: {problem}" for problem in problems]
+        splits.append(views)
+    train, test = splits
+    box = object_bounds(train) if bounds is None else _checked_bounds(bounds)
+    for views in splits:
+        _check_cameras_outside(views, box)
+    return Dataset(
+        name=root.resolve().name,
+        layout=layout,
+        root=root,
+        train=train,
+        test=test,
+        lights=listing.lights,
+        train_light=listing.train_light,
+        background=listing.background,
+        bounds=box,
+        warnings=tuple(warnings),
+    )
+
+
+def recognise_layout(root: Path) -> str:
+    """Tell the layout of a scene folder by the files that are there.
+
+    Raises
+    ------
+    SceneError : none of the layouts fits.
+    """
+    for name, layout in LAYOUTS.items():
+        if layout.recognise(root):
+            return name
+    kind = next((kind for mark, kind in _UNSUPPORTED.items() if (root / mark).exists()), None)
+    looks = f"looks like {kind}, which cannot be read" if kind else "has no known layout"
+    raise SceneError(
+        f"{root} {looks}; expected transforms_train.json (NeRF-synthetic, Shiny Blender, "
+        "Synthetic4Relight) or folders train_000, test_000, ... (TensoIR)"
+    )
+
+
+def object_bounds(
+    views: Views, *, margin: float = 0.02
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    """Box around the visual hull of the views; see `hull.hull_bounds`.
+
+    Raises
+    ------
+    SceneError : the masks and cameras do not bound a volume.
+    """
+    try:
+        return hull_bounds(
+            views.world_to_camera, views.intrinsics, views.images[..., 3], margin=margin
+        )
+    except ValueError as error:
+        raise SceneError(f"cannot find the object: {error}") from error
+
+
+def describe(dataset: Dataset) -> str:
+    """Summarise a dataset as lines of text."""
+    lines = [f"{dataset.name}: {dataset.layout} scene in {dataset.root}"]
+    for split, views in (("train", dataset.train), ("test", dataset.test)):
+        coverage = views.masks.mean((1, 2))
+        lines.append(
+            f"  {split + ':':<12}{len(views)} views of {views.width} x {views.height}, mask covers "
+            f"{coverage.mean():.1%} ({coverage.min():.1%} to {coverage.max():.1%})"
+        )
+        if views.truth:
+            lines.append(f"  {'':<12}ground truth: {', '.join(views.truth)}")
+        if views.relight:
+            lines.append(f"  {'':<12}relit: {', '.join(views.relight)}")
+    lines.append(f"  {'light:':<12}{dataset.train_light or 'unnamed'}")
+    maps = ", ".join(f"{name} ({path.name})" for name, path in dataset.lights.items())
+    lines.append(f"  {'maps:':<12}{maps or 'none found'}")
+    lo, hi = dataset.bounds
+    lines.append(f"  {'bounds:':<12}{_numbers(lo)} to {_numbers(hi)}, size {_numbers(hi - lo)}")
+    lines.append(f"  {'background:':<12}{dataset.background}")
+    lines += [f"  warning: {warning}" for warning in dataset.warnings]
+    return "\n".join(lines)
+
+
+def _check_masks(views: Views, split: str, warnings: list[str]) -> None:
+    covered = views.masks.any((1, 2))
+    if not covered.any():
+        raise SceneError(
+            f"the mask of every {split} view is empty (no alpha above {COVERED}); check the alpha "
+            "channel of the images, or the mask files"
+        )
+    if not covered.all():
+        empty = [name for name, has in zip(views.names, covered, strict=True) if not has]
+        warnings.append(f"{split}: the mask of {len(empty)} views is empty, {_some(empty)}")
+    if views.masks.all():
+        warnings.append(f"{split}: every mask is full; the images may not be cut out at all")
+
+
+def _check_cameras_outside(views: Views, bounds: tuple[np.ndarray, np.ndarray]) -> None:
+    lo, hi = bounds
+    centers = views.camera_to_world[:, :3, 3]
+    inside = ((centers > lo) & (centers < hi)).all(1)
+    if inside.any():
+        names = [name for name, is_in in zip(views.names, inside, strict=True) if is_in]
+        raise SceneError(
+            f"{len(names)} cameras are inside the object's bounds, {_some(names)} (the first at "
+            f"{_numbers(centers[inside][0])}, bounds {_numbers(lo)} to {_numbers(hi)}); check the "
+            "scale of the poses, or give tighter bounds"
+        )
+
+
+def _checked_bounds(bounds) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        lo, hi = (np.asarray(corner, np.float64) for corner in bounds)
+        is_box = lo.shape == hi.shape == (3,) and bool((lo < hi).all())
+    except (TypeError, ValueError):
+        is_box = False
+    if not is_box or not np.isfinite([lo, hi]).all():
+        raise SceneError(f"bounds must be lo (x, y, z) below hi (x, y, z), got {bounds!r}")
+    return lo, hi
+
+
+def _spread(frames: Sequence[Frame], limit: int | None, name: str) -> Sequence[Frame]:
+    """At most ``limit`` frames, evenly over the list, since neighbours are often similar."""
+    if limit is None or limit >= len(frames):
+        return frames
+    if limit < 1:
+        raise SceneError(f"{name} must be at least 1, got {limit}")
+    chosen = np.round(np.linspace(0, len(frames) - 1, limit)).astype(int)
+    return [frames[index] for index in chosen]
+
+
+def _some(names: Sequence[str], count: int = 3) -> str:
+    return ", ".join(names[:count]) + (", ..." if len(names) > count else "")
+
+
+def _numbers(values: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"

@@ -1,0 +1,315 @@
+"""Assets that other programs open: GLB meshes with PBR textures, Gaussian PLY, light EXR.
+
+Every file is written beside its destination and then renamed, so that an interrupted export leaves
+the previous file whole.
+"""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Array, Float, Int
+from PIL import Image
+from trimesh.exchange.gltf import export_glb
+from trimesh.visual.material import PBRMaterial
+
+from geosplat_jax.io.images import encode_srgb, write_exr, written_aside
+from geosplat_jax.io.meshes import (
+    fill_gutters,
+    is_closed,
+    nondegenerate,
+    rasterize_charts,
+    signed_volume,
+    unwrap,
+    z_up_to_y_up,
+)
+
+SampleMaterials = Callable[[Float[np.ndarray, "N 3"]], tuple[Any, Any, Any]]
+"""Positions (N, 3) in the world -> albedo (N, 3) linear, roughness (N,), metallic (N,)."""
+
+_SAMPLES_PER_CALL = 1 << 16
+_SH_DC = 0.28209479177387814
+_SMALLEST_SCALE = 1e-10
+_OPACITY_MARGIN = 1e-6
+
+
+def _evaluate_materials(
+    sample_materials: SampleMaterials, points: Float[np.ndarray, "N 3"]
+) -> Float[np.ndarray, "N 5"]:
+    """Evaluate albedo, roughness and metallic in calls of one shape, clipped to [0, 1].
+
+    The last call is padded with repeated points, so that a jitted function compiles once.
+    """
+    count = len(points)
+    size = min(count, _SAMPLES_PER_CALL)
+    values = np.empty((count, 5), np.float32)
+    for first in range(0, count, size):
+        rows = np.minimum(np.arange(first, first + size), count - 1)
+        albedo, roughness, metallic = (np.asarray(x) for x in sample_materials(points[rows]))
+        if albedo.shape != (size, 3) or roughness.shape != (size,) or metallic.shape != (size,):
+            raise ValueError(
+                f"sample_materials must return albedo ({size}, 3), roughness ({size},) and "
+                f"metallic ({size},), got {albedo.shape}, {roughness.shape}, {metallic.shape}"
+            )
+        kept = min(size, count - first)
+        block = np.concatenate([albedo, roughness[:, None], metallic[:, None]], axis=-1)
+        values[first : first + kept] = block[:kept]
+    if not np.all(np.isfinite(values)):
+        raise ValueError("sample_materials returned values that are not finite")
+    return np.clip(values, 0.0, 1.0)
+
+
+def _to_bytes(values: Float[np.ndarray, "..."]) -> np.ndarray:
+    """Round values in [0, 1] to 8 bits."""
+    return np.round(np.clip(values, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def _textures(materials: Float[np.ndarray, "S S 5"]) -> tuple[Image.Image, Image.Image]:
+    """Encode glTF's base-colour (sRGB) and metallic-roughness (linear; G, B) images."""
+    base_color = _to_bytes(encode_srgb(materials[..., :3]))
+    # Red is the occlusion channel of the usual shared map: 1, unoccluded.
+    packed = np.ones((*materials.shape[:2], 3), np.float32)
+    packed[..., 1:] = materials[..., 3:5]
+    return Image.fromarray(base_color), Image.fromarray(_to_bytes(packed))
+
+
+def _checked_mesh(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    normals: Float[np.ndarray, "V 3"],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    """Drop degenerate faces and unused vertices; turn a closed inside-out mesh outward."""
+    if vertices.shape != normals.shape:
+        raise ValueError(
+            f"normals must be one a vertex {vertices.shape}, got {normals.shape}; "
+            "pass geometry.vertex_normals without its padding"
+        )
+    if not np.all(np.isfinite(vertices[faces])):
+        raise ValueError("vertices must be finite, some used by a face are not")
+    kept = faces[nondegenerate(vertices, faces)] if len(faces) else faces
+    if len(kept) == 0:
+        raise ValueError(
+            f"the mesh must have a face of positive area, got {len(faces)} faces; "
+            "an empty surface cannot be exported"
+        )
+    closed = is_closed(kept)
+    flipped = closed and signed_volume(vertices, kept) < 0
+    if flipped:
+        kept = kept[:, ::-1]
+    used, rows = np.unique(kept, return_inverse=True)
+    info = {"dropped_faces": len(faces) - len(kept), "closed": closed, "flipped": flipped}
+    return vertices[used], rows.reshape(-1, 3).astype(np.int32), normals[used], info
+
+
+def _write_glb(
+    path: str | Path,
+    mesh: trimesh.Trimesh,
+    tree_postprocessor: Callable[[dict], None] | None = None,
+) -> None:
+    """Serialise one mesh with its normals."""
+    data = export_glb(
+        trimesh.Scene({"mesh": mesh}), include_normals=True, tree_postprocessor=tree_postprocessor
+    )
+    with written_aside(path) as aside:
+        aside.write_bytes(data)
+
+
+def _standardize_vertex_color(tree: dict) -> None:
+    """Give the colour attribute its standard name; trimesh alone would round it to 8 bits."""
+    for primitive in (p for mesh in tree["meshes"] for p in mesh["primitives"]):
+        primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_COLOR_0")
+
+
+def _vertex_colored(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    normals: np.ndarray,
+    sample_materials: SampleMaterials,
+    double_sided: bool,
+) -> trimesh.Trimesh:
+    """Mesh with linear albedo on its vertices; roughness and metallic as constants and extras."""
+    materials = _evaluate_materials(sample_materials, vertices)
+    material = PBRMaterial(
+        name="material",
+        baseColorFactor=[255, 255, 255, 255],
+        roughnessFactor=float(np.median(materials[:, 3])),
+        metallicFactor=float(np.median(materials[:, 4])),
+        alphaMode="OPAQUE",
+        doubleSided=double_sided,
+    )
+    return trimesh.Trimesh(
+        z_up_to_y_up(vertices),
+        faces,
+        vertex_normals=z_up_to_y_up(normals),
+        visual=trimesh.visual.TextureVisuals(material=material),
+        vertex_attributes={
+            "_COLOR_0": materials[:, :3],
+            "_ROUGHNESS": materials[:, 3],
+            "_METALLIC": materials[:, 4],
+        },
+        process=False,
+    )
+
+
+def _textured(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    normals: np.ndarray,
+    sample_materials: SampleMaterials,
+    double_sided: bool,
+    texture_size: int,
+) -> tuple[trimesh.Trimesh, dict[str, Any]]:
+    """Mesh with baked textures, and what the baking took."""
+    charts = unwrap(vertices, faces, normals, texture_size=texture_size)
+    start = time.perf_counter()
+    face_rows, barycentrics = rasterize_charts(charts.uv, charts.faces, texture_size=texture_size)
+    covered = face_rows >= 0
+    corners = vertices[charts.vertex_rows][charts.faces[face_rows[covered]]]
+    points = np.einsum("nk,nkd->nd", barycentrics[covered], corners).astype(np.float32)
+    baked = np.zeros((texture_size, texture_size, 5), np.float32)
+    baked[covered] = _evaluate_materials(sample_materials, points)
+    base_color, metallic_roughness = _textures(fill_gutters(baked, covered))
+    material = PBRMaterial(
+        name="material",
+        baseColorFactor=[255, 255, 255, 255],
+        baseColorTexture=base_color,
+        metallicRoughnessTexture=metallic_roughness,
+        roughnessFactor=1.0,
+        metallicFactor=1.0,
+        alphaMode="OPAQUE",
+        doubleSided=double_sided,
+    )
+    # trimesh keeps OpenGL's v upwards and flips it when it writes glTF, whose v runs down.
+    uv = charts.uv * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)
+    mesh = trimesh.Trimesh(
+        z_up_to_y_up(vertices[charts.vertex_rows]),
+        charts.faces,
+        vertex_normals=z_up_to_y_up(normals[charts.vertex_rows]),
+        visual=trimesh.visual.TextureVisuals(uv=uv, material=material),
+        process=False,
+    )
+    return mesh, {
+        "charts": charts.chart_count,
+        "texture_coverage": float(covered.mean()),
+        "unwrap_seconds": charts.seconds,
+        "bake_seconds": time.perf_counter() - start,
+    }
+
+
+def export_mesh_glb(
+    path: str | Path,
+    vertices: Float[Array | np.ndarray, "V 3"],
+    faces: Int[Array | np.ndarray, "F 3"],
+    normals: Float[Array | np.ndarray, "V 3"],
+    sample_materials: SampleMaterials,
+    *,
+    vertex_colors: bool = False,
+    texture_size: int = 1024,
+) -> dict[str, Any]:
+    """Write a mesh and its materials as a binary glTF 2.0 file.
+
+    The z-up world becomes glTF's y-up. Textures hold the materials at texel centres: base colour
+    sRGB-encoded, metallic-roughness linear (green, blue), gutters filled. With ``vertex_colors``
+    nothing is unwrapped: the linear albedo goes to ``COLOR_0``, the medians of roughness and
+    metallic to the material, their values to the attributes ``_ROUGHNESS`` and ``_METALLIC``.
+    Degenerate faces are dropped; a closed mesh is turned outward and made single-sided.
+
+    Parameters
+    ----------
+    path : destination, ``*.glb``.
+    vertices : (V, 3) world positions, z up, without padding.
+    faces : (F, 3) rows of ``vertices``, counter-clockwise from outside.
+    normals : (V, 3) unit shading normals.
+    sample_materials : maps world points (N, 3) to albedo (N, 3) linear, roughness (N,) and
+        metallic (N,); called with one N throughout.
+    vertex_colors : colours on the vertices instead of textures.
+    texture_size : width and height of the textures.
+
+    Returns
+    -------
+    dict with the counts of ``vertices``, ``faces`` and ``dropped_faces``, whether the mesh is
+    ``closed`` and was ``flipped``, the ``seconds`` taken and, for textures, ``charts``,
+    ``texture_coverage``, ``unwrap_seconds`` and ``bake_seconds``.
+
+    Raises
+    ------
+    ValueError
+        If the mesh is empty or not finite, or ``sample_materials`` returns a wrong shape.
+    """
+    start = time.perf_counter()
+    vertices, faces, normals, info = _checked_mesh(
+        np.asarray(vertices, np.float32),
+        np.asarray(faces, np.int32),
+        np.asarray(normals, np.float32),
+    )
+    double_sided = not info["closed"]
+    if vertex_colors:
+        mesh = _vertex_colored(vertices, faces, normals, sample_materials, double_sided)
+        _write_glb(path, mesh, _standardize_vertex_color)
+    else:
+        mesh, baking = _textured(
+            vertices, faces, normals, sample_materials, double_sided, texture_size
+        )
+        _write_glb(path, mesh)
+        info |= baking
+    info |= {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+    return info | {"seconds": time.perf_counter() - start}
+
+
+def export_gaussians_ply(
+    path: str | Path,
+    means: Float[Array | np.ndarray, "N 3"],
+    quats: Float[Array | np.ndarray, "N 4"],
+    scales: Float[Array | np.ndarray, "N 3"],
+    opacities: Float[Array | np.ndarray, " N"],
+    rgb: Float[Array | np.ndarray, "N 3"],
+    normals: Float[Array | np.ndarray, "N 3"],
+) -> None:
+    """Write Gaussians in the binary PLY layout of 3D Gaussian Splatting, which viewers open.
+
+    Scales are stored as logarithms, opacities as logits, the colour as the constant spherical
+    harmonic ``(rgb - 0.5) / 0.28209``, quaternions as (w, x, y, z) of unit length; there are no
+    higher harmonics. Pass real rows only, no padding.
+
+    Parameters
+    ----------
+    path : destination, ``*.ply``.
+    means : (N, 3) world; quats : (N, 4) wxyz; scales : (N, 3) standard deviations;
+        opacities : (N,) in [0, 1], kept 1e-6 away from both ends.
+    rgb : (N, 3) *display* colour in [0, 1], that is sRGB-encoded.
+    normals : (N, 3).
+
+    Raises
+    ------
+    ValueError
+        If a value is not finite or a quaternion is zero.
+    """
+    means, quats, scales, opacities, rgb, normals = (
+        np.asarray(x, np.float64) for x in (means, quats, scales, opacities, rgb, normals)
+    )
+    lengths = np.sqrt((quats**2).sum(-1, keepdims=True))
+    if not np.all(lengths > 0):
+        raise ValueError("quats must not be zero; drop the padding rows first")
+    opacities = np.clip(opacities, _OPACITY_MARGIN, 1.0 - _OPACITY_MARGIN)
+    logits = np.log(opacities) - np.log1p(-opacities)
+    harmonics = (rgb - 0.5) / _SH_DC
+    log_scales = np.log(np.maximum(scales, _SMALLEST_SCALE))
+    table = np.concatenate(
+        [means, normals, harmonics, logits[:, None], log_scales, quats / lengths], axis=-1
+    )
+    if not np.all(np.isfinite(table)):
+        raise ValueError("Gaussians must be finite, some values are not")
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+    names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    header += [f"property float {name}" for name in names] + ["end_header\n"]
+    with written_aside(path) as aside:
+        aside.write_bytes("\n".join(header).encode("ascii") + table.astype("<f4").tobytes())
+
+
+def export_light_exr(path: str | Path, radiance: Float[Array | np.ndarray, "H W 3"]) -> None:
+    """Write a lat-long environment map (linear radiance, `EnvLight` layout) as a float EXR."""
+    write_exr(path, np.asarray(radiance, np.float32))

@@ -1,0 +1,231 @@
+"""What every dataset layout is reduced to before a pixel is read: lists of frames, checked.
+
+A layout reader returns a `Listing`: for each view its pose, its lens and which files hold what.
+Here live the checks that all layouts share: JSON, keys, poses, and paths that must stay inside the
+scene folder.
+"""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from geosplat_jax.io.images import MissingFileError, SceneError
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff")
+MAP_SUFFIXES = (".hdr", ".exr")
+
+_RIGID_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One view: its camera, and the files that belong to it.
+
+    Attributes
+    ----------
+    name : unique within its split.
+    camera_to_world : (4, 4) rigid, OpenGL/Blender axes.
+    angle_x : horizontal field of view in radians.
+    image : colour, with alpha unless there is a ``mask``.
+    mask : coverage in channel 0, or None.
+    truth : files of the ground truth, by ``albedo | normal | roughness | metallic``.
+    relight : files of the same view under other lights, by light.
+    """
+
+    name: str
+    camera_to_world: Float[np.ndarray, "4 4"]
+    angle_x: float
+    image: Path
+    mask: Path | None = None
+    truth: Mapping[str, Path] = field(default_factory=dict)
+    relight: Mapping[str, Path] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Listing:
+    """All that a layout reader finds without reading pixels.
+
+    Attributes
+    ----------
+    train, test : frames in the order of the scene.
+    lights : environment maps that were found, by light.
+    train_light : the light of the training images, where the layout names lights.
+    albedo_is_srgb : how the albedo files encode their values.
+    background : what the layout's evaluation composites on, ``white`` or ``black``.
+    """
+
+    train: tuple[Frame, ...]
+    test: tuple[Frame, ...]
+    lights: Mapping[str, Path] = field(default_factory=dict)
+    train_light: str | None = None
+    albedo_is_srgb: bool = True
+    background: str = "white"
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises
+    ------
+    MissingFileError : no such file.
+    SceneError : not JSON, or not an object.
+    """
+    if not path.is_file():
+        raise MissingFileError(f"{path} does not exist; check the scene folder is complete")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path} is not JSON ({error}); write it again") from error
+    if not isinstance(content, dict):
+        raise SceneError(f"{path} must hold a JSON object, got {type(content).__name__}")
+    return content
+
+
+def require(content: Mapping[str, Any], key: str, where: Path | str) -> Any:
+    """Value of a key that must be there; `SceneError` otherwise."""
+    if key not in content:
+        raise SceneError(f"{where} has no key {key!r}; it has {sorted(content)}")
+    return content[key]
+
+
+def read_transforms(path: Path) -> list[tuple[str, np.ndarray, float]]:
+    """Read a ``transforms_*.json`` of Blender: file path, pose and angle of each frame.
+
+    Raises
+    ------
+    MissingFileError, SceneError : not JSON, missing keys, no frames, an unusable pose or angle.
+    """
+    content = read_json(path)
+    frames = require(content, "frames", path)
+    if not isinstance(frames, list) or not frames:
+        raise SceneError(f"{path} has no frames; 'frames' must be a list with at least one view")
+    shared_angle = content.get("camera_angle_x")
+    listed = []
+    for number, frame in enumerate(frames):
+        where = f"frame {number} of {path}"
+        if not isinstance(frame, dict):
+            raise SceneError(f"{where} must be an object, got {type(frame).__name__}")
+        file_path = require(frame, "file_path", where)
+        if not isinstance(file_path, str) or not file_path:
+            raise SceneError(f"'file_path' of {where} must be a name, got {file_path!r}")
+        angle = frame.get("camera_angle_x", shared_angle)
+        if angle is None:
+            require(content, "camera_angle_x", path)
+        pose = checked_pose(require(frame, "transform_matrix", where), where)
+        listed.append((file_path, pose, checked_angle(angle, where)))
+    return listed
+
+
+def checked_angle(angle: Any, where: str) -> float:
+    """Return a horizontal field of view in radians, between 0 and pi."""
+    is_number = isinstance(angle, int | float) and not isinstance(angle, bool)
+    if not is_number or not 0.0 < angle < math.pi:
+        raise SceneError(f"the camera angle of {where} must be in (0, pi) radians, got {angle!r}")
+    return float(angle)
+
+
+def checked_pose(matrix: Any, where: str) -> Float[np.ndarray, "4 4"]:
+    """Return a camera-to-world matrix that is a rigid motion, exactly orthonormal.
+
+    Rounding up to 1e-3 is repaired: the nearest rotation is taken.
+
+    Raises
+    ------
+    SceneError : wrong shape, not finite, singular, scaled, sheared or mirrored.
+    """
+    try:
+        pose = np.asarray(matrix, np.float64)
+    except (TypeError, ValueError) as error:
+        raise SceneError(f"the pose of {where} must be 4 x 4 numbers, got {matrix!r}") from error
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise SceneError(f"the pose of {where} must be 4 x 4 finite numbers, got {pose.tolist()}")
+    if np.abs(pose[3] - np.array([0.0, 0.0, 0.0, 1.0])).max() > _RIGID_TOLERANCE:
+        raise SceneError(
+            f"the last row of the pose of {where} must be 0 0 0 1, got {pose[3].tolist()}; "
+            "the matrix may be transposed"
+        )
+    left, stretch, right = np.linalg.svd(pose[:3, :3])
+    if stretch[2] < 1e-8:
+        raise SceneError(f"the pose of {where} is singular; it must be a rotation and a position")
+    if np.abs(stretch - 1.0).max() > _RIGID_TOLERANCE:
+        raise SceneError(
+            f"the pose of {where} is not rigid: it stretches by {np.round(stretch, 4).tolist()} "
+            "where 1 is expected; remove scale and shear from the camera"
+        )
+    rotation = left @ right
+    if np.linalg.det(rotation) < 0.0:
+        raise SceneError(
+            f"the pose of {where} mirrors space (determinant -1); negate one column, or convert "
+            "the axes to x right, y up, z backwards"
+        )
+    rigid = np.eye(4)
+    rigid[:3, :3], rigid[:3, 3] = rotation, pose[:3, 3]
+    return rigid
+
+
+def inside_scene(root: Path, relative: str, where: Path | str) -> Path:
+    """Join a path that a scene file names, refusing one that leaves the scene folder.
+
+    Raises
+    ------
+    SceneError : the path is absolute, climbs with ``..``, or follows a link out of the folder.
+    """
+    # Both notations, since scenes travel between systems.
+    parts = PurePosixPath(relative).parts + PureWindowsPath(relative).parts
+    is_rooted = PurePosixPath(relative).is_absolute() or PureWindowsPath(relative).anchor
+    path = root / relative.replace("\\", "/")
+    if is_rooted or ".." in parts or not path.resolve().is_relative_to(root.resolve()):
+        raise SceneError(
+            f"{relative!r}, named in {where}, leaves the scene folder; use paths relative to "
+            f"{root.name}/ and copy the files there"
+        )
+    return path
+
+
+def image_stem(root: Path, relative: str, where: Path | str) -> Path:
+    """Path of a frame without an image suffix, as the layouts append their own endings."""
+    path = inside_scene(root, relative, where)
+    return path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
+
+
+def existing(root: Path, candidates: list[Path], what: str) -> Path:
+    """Return the first path that exists and, links followed, lies within ``root``.
+
+    Raises
+    ------
+    MissingFileError : none exists.
+    SceneError : it leads out of the scene folder.
+    """
+    for path in candidates:
+        if path.is_file():
+            return inside_scene(root, str(path.relative_to(root)), what)
+    names = " or ".join(path.name for path in candidates)
+    raise MissingFileError(
+        f"{what} has no file {names} in {candidates[0].parent}; add it, or remove the frame"
+    )
+
+
+def optional_files(root: Path, candidates: Mapping[str, Path]) -> dict[str, Path]:
+    """Return those of the named files that exist."""
+    return {
+        key: inside_scene(root, str(path.relative_to(root)), key)
+        for key, path in candidates.items()
+        if path.is_file()
+    }
+
+
+def find_lights(folders: list[Path], names: list[str]) -> dict[str, Path]:
+    """Find environment maps by name in the first folder that has them."""
+    found = {}
+    for name in names:
+        candidates = [folder / f"{name}{suffix}" for folder in folders for suffix in MAP_SUFFIXES]
+        path = next((path for path in candidates if path.is_file()), None)
+        if path is not None:
+            found[name] = path
+    return found

@@ -1,0 +1,292 @@
+"""Images on disk: reading, writing and reducing, with alpha and transfer curve accounted for.
+
+Conventions. Arrays are float32, (H, W, C), row 0 at the top. Alpha is *straight* (colour is not
+multiplied by it), as PNG stores it; OpenEXR stores premultiplied colour, which `read_linear`
+divides out and `write_exr` multiplies in. Every file is written aside and then renamed, so that a
+reader never meets half a file and a full disk never destroys the previous one.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import OpenImageIO as oiio
+from jaxtyping import Float
+
+from geosplat_jax.color import linear_to_srgb, srgb_to_linear
+
+LINEAR_FORMATS = frozenset({".exr", ".hdr"})
+"""Suffixes of the formats that hold linear light; every other one is taken as sRGB."""
+
+_SMALLEST_ALPHA = 1e-6
+
+
+class SceneError(ValueError):
+    """Input that cannot be used: names the value, what was expected, and the cure."""
+
+
+class MissingFileError(SceneError, FileNotFoundError):
+    """A file that the scene needs is not there."""
+
+
+class ImageReadError(SceneError):
+    """A file is there, but it is not a readable image."""
+
+
+@contextmanager
+def written_aside(path: str | Path) -> Iterator[Path]:
+    """Provide a path to write to, and rename it to ``path`` when the block ends without error.
+
+    The name aside lies in the same folder and keeps the suffix, from which image libraries tell
+    the format. On any error it is removed and a previous ``path`` stays as it was.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    try:
+        yield aside
+        os.replace(aside, path)
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def read_image(path: str | Path) -> Float[np.ndarray, "H W C"]:
+    """Read an image as stored: no transfer curve, no premultiplication.
+
+    Integer formats are scaled to [0, 1]; float formats keep their values, NaN included.
+
+    Returns
+    -------
+    (H, W, C) float32.
+
+    Raises
+    ------
+    MissingFileError, ImageReadError
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MissingFileError(f"image {path} does not exist; check the scene folder is complete")
+    # Without this hint the library multiplies colour by alpha on reading.
+    hint = oiio.ImageSpec()
+    hint.attribute("oiio:UnassociatedAlpha", 1)
+    source = oiio.ImageInput.open(str(path), hint)
+    if source is None:
+        raise ImageReadError(f"{path} is not a readable image ({_last_error()}); replace the file")
+    try:
+        pixels = source.read_image(format=oiio.FLOAT)
+        problem = source.geterror()
+    finally:
+        source.close()
+    if pixels is None or problem:
+        raise ImageReadError(
+            f"{path} is damaged or truncated ({problem.strip()}); replace the file"
+        )
+    return np.ascontiguousarray(pixels, np.float32)
+
+
+def read_linear(path: str | Path, *, is_srgb: bool | None = None) -> Float[np.ndarray, "H W C"]:
+    """Read an image as linear values with straight alpha.
+
+    Parameters
+    ----------
+    path : the file.
+    is_srgb : whether to decode the sRGB curve. By default EXR and HDR are taken as linear and every
+        other format (PNG, JPEG) is decoded. Pass False for data in PNG: normals, roughness,
+        linear albedo. Alpha (channel 2 of 2, or 4 of 4) is never decoded.
+
+    Returns
+    -------
+    (H, W, C) float32, finite and non-negative. Premultiplied EXR colour is divided by alpha;
+    it is zero where alpha is.
+
+    Raises
+    ------
+    MissingFileError, ImageReadError
+    SceneError : a pixel is negative, NaN or infinite.
+    """
+    path = Path(path)
+    pixels = read_image(path)
+    _require_radiance(pixels, path)
+    colors = _color_channels(pixels)
+    if path.suffix.lower() == ".exr" and colors < pixels.shape[-1]:
+        pixels[..., :colors] = _unpremultiplied(pixels[..., :colors], pixels[..., colors:])
+    if is_srgb is None:
+        is_srgb = path.suffix.lower() not in LINEAR_FORMATS
+    if is_srgb:
+        pixels[..., :colors] = decode_srgb(pixels[..., :colors])
+    return pixels
+
+
+def write_png(
+    path: str | Path, pixels: Float[np.ndarray, "H W C"], *, bits: int = 8, is_linear: bool = False
+) -> None:
+    """Write values in [0, 1] to PNG, straight alpha as it is; values outside are clipped.
+
+    Parameters
+    ----------
+    path : the file; its folder is made when missing.
+    pixels : (H, W, C) with 1 to 4 channels.
+    bits : 8 or 16.
+    is_linear : encode colour with the sRGB curve first; alpha is never encoded.
+
+    Raises
+    ------
+    SceneError : NaN, or an unusable shape or bit depth.
+    OSError : the file cannot be written.
+    """
+    formats = {8: oiio.UINT8, 16: oiio.UINT16}
+    if bits not in formats:
+        raise SceneError(f"PNG has 8 or 16 bits, got {bits}")
+    values = np.asarray(pixels, np.float32)
+    _require_finite(values, Path(path))
+    if is_linear:
+        colors = _color_channels(values)
+        values = np.concatenate([encode_srgb(values[..., :colors]), values[..., colors:]], -1)
+    # Rounded here, because libraries differ in how they round and dither.
+    largest = 2**bits - 1
+    integers = np.rint(np.clip(values, 0.0, 1.0) * largest).astype(f"uint{bits}")
+    _write(path, integers, formats[bits], suffix=".png")
+
+
+def write_exr(path: str | Path, pixels: Float[np.ndarray, "H W C"], *, half: bool = False) -> None:
+    """Write linear values to OpenEXR (float32, or float16 with ``half``), losslessly compressed.
+
+    Colour of two- and four-channel images is stored multiplied by the last channel, their straight
+    alpha, as the format demands; `read_linear` undoes it.
+
+    Raises
+    ------
+    SceneError : NaN or infinite values, or an unusable shape.
+    OSError : the file cannot be written.
+    """
+    values = np.asarray(pixels, np.float32)
+    _require_finite(values, Path(path))
+    colors = _color_channels(values)
+    if colors < values.shape[-1]:
+        alpha = values[..., colors:]
+        values = np.concatenate([values[..., :colors] * alpha, alpha], -1)
+    _write(path, values, oiio.HALF if half else oiio.FLOAT, suffix=".exr")
+
+
+def write_hdr(path: str | Path, pixels: Float[np.ndarray, "H W 3"]) -> None:
+    """Write linear RGB to Radiance HDR: one shared exponent a pixel, about 1 % precision.
+
+    Raises
+    ------
+    SceneError : NaN, infinite or negative values, which the format cannot hold.
+    OSError : the file cannot be written.
+    """
+    values = np.asarray(pixels, np.float32)
+    _require_radiance(values, Path(path))
+    _write(path, values, oiio.FLOAT, suffix=".hdr")
+
+
+def downscale(pixels: Float[np.ndarray, "H W C"], factor: int) -> Float[np.ndarray, "h w C"]:
+    """Reduce linear pixels by an integer factor, each result the mean over its block.
+
+    Colour of two- and four-channel images is weighted by alpha (the mean of premultiplied colour,
+    divided by the mean alpha), so that what lies behind the mask does not bleed in; it is zero
+    where the whole block is transparent. Where the size is no multiple of the factor, the last
+    rows and columns, fewer than ``factor``, are cut off: pixel coordinates then scale by exactly
+    ``1 / factor``, and so do the intrinsics.
+
+    Raises
+    ------
+    SceneError : a factor below one, or larger than the image.
+    """
+    height, width, channels = pixels.shape
+    if factor < 1 or factor > min(height, width):
+        raise SceneError(
+            f"downscale factor must be between 1 and the image size, got {factor} for an image of "
+            f"{width} x {height}"
+        )
+    if factor == 1:
+        return pixels
+    h, w = height // factor, width // factor
+    blocks = pixels[: h * factor, : w * factor].reshape(h, factor, w, factor, channels)
+    colors = _color_channels(pixels)
+    if colors == channels:
+        return blocks.mean((1, 3))
+    alpha = blocks[..., colors:].mean((1, 3))
+    premultiplied = (blocks[..., :colors] * blocks[..., colors:]).mean((1, 3))
+    return np.concatenate([_unpremultiplied(premultiplied, alpha), alpha], -1)
+
+
+def decode_srgb(encoded: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Decode sRGB values to linear light on the host (see `color.srgb_to_linear`)."""
+    return np.asarray(_jitted(srgb_to_linear)(jnp.asarray(encoded)))
+
+
+def encode_srgb(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Encode linear light with the sRGB curve on the host (see `color.linear_to_srgb`)."""
+    return np.asarray(_jitted(linear_to_srgb)(jnp.asarray(linear)))
+
+
+@cache
+def _jitted(function):
+    return jax.jit(function)
+
+
+def _color_channels(pixels: np.ndarray) -> int:
+    """Count the channels that are colour; the one after them, if any, is alpha."""
+    if pixels.ndim != 3 or not 1 <= pixels.shape[-1] <= 4:
+        raise SceneError(f"an image is (H, W, C) with 1 to 4 channels, got shape {pixels.shape}")
+    return {1: 1, 2: 1, 3: 3, 4: 3}[pixels.shape[-1]]
+
+
+def _unpremultiplied(premultiplied: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    visible = alpha > _SMALLEST_ALPHA
+    return np.where(visible, premultiplied / np.where(visible, alpha, 1.0), 0.0)
+
+
+def _require_finite(pixels: np.ndarray, path: Path) -> None:
+    is_bad = ~np.isfinite(pixels)
+    if is_bad.any():
+        row, column, channel = (int(i) for i in np.argwhere(is_bad)[0])
+        raise SceneError(
+            f"{path} has {int(is_bad.sum())} values that are not finite, the first "
+            f"{pixels[row, column, channel]} at row {row}, column {column}, channel {channel}; "
+            "render or convert it again"
+        )
+
+
+def _require_radiance(pixels: np.ndarray, path: Path) -> None:
+    _require_finite(pixels, path)
+    is_bad = pixels < 0.0
+    if is_bad.any():
+        row, column, channel = (int(i) for i in np.argwhere(is_bad)[0])
+        raise SceneError(
+            f"{path} has {int(is_bad.sum())} negative values, the first "
+            f"{pixels[row, column, channel]} at row {row}, column {column}, channel {channel}; "
+            "light is not negative: clip it, or check the filter that made it"
+        )
+
+
+def _write(path: str | Path, pixels: np.ndarray, pixel_format, *, suffix: str) -> None:
+    """Write ``pixels`` in ``pixel_format``, aside first."""
+    path = Path(path)
+    if path.suffix.lower() != suffix:
+        raise SceneError(f"the file must end in {suffix}, got {path.name}")
+    _color_channels(pixels)
+    with written_aside(path) as aside:
+        height, width, channels = pixels.shape
+        spec = oiio.ImageSpec(width, height, channels, pixel_format)
+        spec.attribute("oiio:UnassociatedAlpha", int(suffix == ".png"))
+        if suffix == ".exr":
+            spec.attribute("compression", "zip")
+        sink = oiio.ImageOutput.create(str(aside))
+        if sink is None:
+            raise OSError(f"cannot write {path}: {_last_error()}")
+        ok = sink.open(str(aside), spec) and sink.write_image(np.ascontiguousarray(pixels))
+        ok = sink.close() and ok  # buffered data reaches the disk, or fails to, only here
+        if not ok:
+            raise OSError(f"cannot write {path}: {sink.geterror().strip() or _last_error()}")
+
+
+def _last_error() -> str:
+    return oiio.geterror().strip() or "unknown format"

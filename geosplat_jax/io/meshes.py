@@ -1,0 +1,282 @@
+"""Triangle meshes on the host: reading, cleaning, unwrapping, texel positions and previews.
+
+Vertices are (V, 3) world positions and faces (F, 3) rows of them; outward faces are
+counter-clockwise. Texture coordinates are those of an image with row 0 at the top: ``u`` runs
+right, ``v`` runs *down*, a texel's centre lies at ``(column + 0.5) / size``.
+"""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+import xatlas
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+
+from geosplat_jax.scene import Camera, Mesh
+
+# A face thinner than this share of the bounding box's diagonal has no usable normal or chart.
+_DEGENERATE_HEIGHT = 1e-7
+# Texels between charts: room for bilinear taps and for two mipmap levels.
+_CHART_PADDING = 4
+# Charts may grow four times as costly as xatlas' default of 2 allows: the fastest of the settings
+# tried on noisy isosurfaces, with fewer charts and so fewer seams.
+_CHART_COST = 8.0
+# Pairs of a triangle and a pixel examined at once: bounds memory at about 100 MB.
+_PAIRS_PER_CHUNK = 1 << 20
+# Faces that come nearer to the camera than this, in world units, are not drawn.
+_NEAR = 1e-3
+# Pixel centres this far outside a face (in barycentric units) still count as covered.
+_COVERAGE_SLACK = 1e-4
+
+
+@dataclass(frozen=True)
+class Unwrapped:
+    """A mesh cut into charts of a texture atlas.
+
+    Attributes
+    ----------
+    vertex_rows : (W,) row of the original mesh's vertex for each vertex after cutting.
+    faces : (F, 3) rows of the cut vertices.
+    uv : (W, 2) in [0, 1], ``v`` downwards.
+    chart_count : number of charts; seconds : time spent.
+    """
+
+    vertex_rows: Int[np.ndarray, " W"]
+    faces: Int[np.ndarray, "F 3"]
+    uv: Float[np.ndarray, "W 2"]
+    chart_count: int
+    seconds: float
+
+
+def read_mesh(
+    path: str | Path,
+) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
+    """Read the triangles of a mesh file (PLY, OBJ, GLB, STL, ...) in its own axes.
+
+    Several parts are concatenated; vertices keep their order and number.
+
+    Raises
+    ------
+    ValueError
+        If the file holds no triangle.
+    """
+    loaded = trimesh.load(path, process=False)
+    mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise ValueError(f"{path} must hold a triangle mesh, found no triangle in it")
+    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
+
+
+def unpadded(mesh: Mesh) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
+    """Copy the real rows of a padded `Mesh` to the host: vertices and faces."""
+    vertex_count, face_count = int(mesh.vertex_count), int(mesh.face_count)
+    return np.asarray(mesh.vertices)[:vertex_count], np.asarray(mesh.faces)[:face_count]
+
+
+def nondegenerate(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Bool[np.ndarray, " F"]:
+    """Tell which faces have three distinct corners and a height above 1e-7 of the mesh's size."""
+    corners = np.asarray(vertices, np.float64)[faces]
+    edges = corners[:, [1, 2, 0]] - corners
+    longest = np.sqrt((edges**2).sum(-1).max(-1))
+    double_area = np.sqrt((np.cross(edges[:, 0], edges[:, 1]) ** 2).sum(-1))
+    size = np.sqrt((np.ptp(vertices, axis=0).astype(np.float64) ** 2).sum())
+    return double_area > _DEGENERATE_HEIGHT * size * longest
+
+
+def is_closed(faces: Int[np.ndarray, "F 3"]) -> bool:
+    """Whether every directed edge is matched by exactly one opposite edge."""
+    start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel().astype(np.int64)
+    stride = int(faces.max(initial=0)) + 1
+    edges, opposite = np.sort(start * stride + end), np.sort(end * stride + start)
+    return bool(np.array_equal(edges, opposite) and np.all(edges[1:] != edges[:-1]))
+
+
+def signed_volume(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> float:
+    """Enclosed volume of a closed mesh, positive when its faces are outward."""
+    a, b, c = np.moveaxis(np.asarray(vertices, np.float64)[faces], 1, 0)
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+
+def z_up_to_y_up(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+    """Turn positions or normals of the z-up world into glTF's y-up axes: (x, z, -y)."""
+    return np.stack([vectors[:, 0], vectors[:, 2], -vectors[:, 1]], axis=-1)
+
+
+def unwrap(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    normals: Float[np.ndarray, "V 3"],
+    *,
+    texture_size: int,
+) -> Unwrapped:
+    """Cut a mesh into charts and pack them into one square texture (xatlas).
+
+    Faces must not be degenerate (`nondegenerate`). Charts stay a few texels apart. Deterministic.
+    """
+    start = time.perf_counter()
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(
+        np.ascontiguousarray(vertices, np.float32),
+        np.ascontiguousarray(faces, np.uint32),
+        np.ascontiguousarray(normals, np.float32),
+    )
+    charts, packing = xatlas.ChartOptions(), xatlas.PackOptions()
+    charts.max_cost = _CHART_COST
+    packing.resolution = texture_size
+    packing.padding = _CHART_PADDING
+    packing.bilinear = True
+    atlas.generate(charts, packing)
+    rows, cut_faces, uv = atlas[0]
+    return Unwrapped(
+        vertex_rows=rows.astype(np.int32),
+        faces=cut_faces.astype(np.int32),
+        uv=uv.astype(np.float32),
+        chart_count=int(atlas.chart_count),
+        seconds=time.perf_counter() - start,
+    )
+
+
+def _covered_in_blocks(
+    corners: Float[np.ndarray, "n 3 2"], low: Int[np.ndarray, "n 2"], side: int
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, "m 2"], Float[np.ndarray, "m 3"]]:
+    """Test a ``side`` x ``side`` block of pixels, from ``low``, for each triangle.
+
+    Returns, for each covered pair, the triangle, the pixel (column, row) and its barycentrics.
+    """
+    steps = np.arange(side)
+    block = np.stack(np.meshgrid(steps, steps, indexing="xy"), -1).reshape(1, -1, 2)
+    pixels = low[:, None] + block
+    offset = pixels + 0.5 - corners[:, None, 0]
+    edge_b = corners[:, None, 1] - corners[:, None, 0]
+    edge_c = corners[:, None, 2] - corners[:, None, 0]
+    area = edge_b[..., 0] * edge_c[..., 1] - edge_b[..., 1] * edge_c[..., 0]
+    inverse = np.divide(1.0, area, out=np.zeros_like(area), where=area != 0)
+    b = (offset[..., 0] * edge_c[..., 1] - offset[..., 1] * edge_c[..., 0]) * inverse
+    c = (edge_b[..., 0] * offset[..., 1] - edge_b[..., 1] * offset[..., 0]) * inverse
+    weights = np.stack([1.0 - b - c, b, c], axis=-1)
+    is_covered = np.all(weights >= -_COVERAGE_SLACK, axis=-1) & (area != 0)
+    triangle, pixel = np.nonzero(is_covered)
+    return triangle, pixels[triangle, pixel], weights[triangle, pixel]
+
+
+def _covered_pixels(
+    corners: Float[np.ndarray, "F 3 2"], *, height: int, width: int
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield row, column, triangle and barycentrics of covered pixel centres, in chunks.
+
+    Triangles are taken in groups whose bounding boxes have about the same size, so that each group
+    is a few dense array operations.
+    """
+    # The first and last pixel centres that a triangle's bounding box can hold.
+    low = np.maximum(np.ceil(corners.min(axis=1) - 0.5 - _COVERAGE_SLACK), 0).astype(np.int64)
+    high = np.floor(corners.max(axis=1) - 0.5 + _COVERAGE_SLACK)
+    high = np.minimum(high, [width - 1, height - 1]).astype(np.int64)
+    extent = high - low + 1
+    side = np.where(extent.min(axis=1) > 0, extent.max(axis=1), 0)
+    exponent = np.ceil(np.log2(np.maximum(side, 1))).astype(np.int64)
+    for level in np.unique(exponent[side > 0]):
+        members = np.flatnonzero((exponent == level) & (side > 0))
+        step = max(1, _PAIRS_PER_CHUNK >> (2 * int(level)))
+        for first in range(0, len(members), step):
+            chosen = members[first : first + step]
+            triangle, pixel, weights = _covered_in_blocks(
+                corners[chosen], low[chosen], 1 << int(level)
+            )
+            is_inside = (pixel[:, 0] < width) & (pixel[:, 1] < height)
+            column, row = pixel[is_inside].T
+            yield row, column, chosen[triangle[is_inside]], weights[is_inside]
+
+
+def rasterize_charts(
+    uv: Float[np.ndarray, "W 2"], faces: Int[np.ndarray, "F 3"], *, texture_size: int
+) -> tuple[Int[np.ndarray, "S S"], Float[np.ndarray, "S S 3"]]:
+    """Find the face and the barycentric coordinates at every texel centre.
+
+    Returns
+    -------
+    face_rows : (S, S) face seen by a texel, -1 outside all charts.
+    barycentrics : (S, S, 3), zero outside.
+    """
+    face_rows = np.full((texture_size, texture_size), -1, np.int32)
+    barycentrics = np.zeros((texture_size, texture_size, 3), np.float32)
+    corners = uv.astype(np.float64)[faces] * texture_size
+    for row, column, face, weights in _covered_pixels(
+        corners, height=texture_size, width=texture_size
+    ):
+        face_rows[row, column] = face
+        barycentrics[row, column] = weights
+    return face_rows, barycentrics
+
+
+def render_mesh_normals(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    normals: Float[np.ndarray, "V 3"],
+    camera: Camera,
+    *,
+    supersampling: int = 2,
+) -> tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W"]]:
+    """Draw the interpolated vertex normals of a mesh with a depth buffer, on the host.
+
+    For previews and for the mesh's own normal error. Faces that reach behind the camera are left
+    out; both sides of a face are drawn. An empty mesh gives an empty picture.
+
+    Parameters
+    ----------
+    vertices, normals : (V, 3) in the world; faces : (F, 3).
+    camera : one view (V = 1).
+    supersampling : samples a pixel along each axis.
+
+    Returns
+    -------
+    normals : (H, W, 3) unit, in *OpenCV camera axes* (x right, y down, z forward); zero outside.
+    alpha : (H, W) covered share of each pixel.
+    """
+    height, width = camera.height * supersampling, camera.width * supersampling
+    world_to_camera = np.asarray(camera.world_to_camera[0], np.float64)
+    intrinsics = np.asarray(camera.intrinsics[0], np.float64)
+    points = np.asarray(vertices, np.float64) @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    faces = faces[np.all(points[faces, 2] > _NEAR, axis=1)]
+    inverse_depth = 1.0 / np.maximum(points[:, 2], _NEAR)
+    pixels = (points @ intrinsics.T)[:, :2] * inverse_depth[:, None] * supersampling
+    nearest = np.zeros((height, width))
+    drawn = np.zeros((height, width, 3))
+    turned = np.asarray(normals, np.float64) @ world_to_camera[:3, :3].T
+    for row, column, face, weights in _covered_pixels(pixels[faces], height=height, width=width):
+        # 1/z is linear on the screen, and weights divided by z interpolate in perspective.
+        weights = weights * inverse_depth[faces[face]]
+        closeness = weights.sum(axis=-1)
+        order = np.argsort(closeness, kind="stable")
+        order = order[closeness[order] > nearest[row[order], column[order]]]
+        row, column = row[order], column[order]
+        # Of repeated pixels the last assignment, the nearest, stays.
+        nearest[row, column] = closeness[order]
+        drawn[row, column] = np.einsum("nk,nkd->nd", weights[order], turned[faces[face[order]]])
+    blocks = (camera.height, supersampling, camera.width, supersampling)
+    lengths = np.sqrt((drawn**2).sum(-1, keepdims=True))
+    unit = drawn / np.where(lengths > 0, lengths, 1.0)
+    mean = unit.reshape(*blocks, 3).mean(axis=(1, 3))
+    lengths = np.sqrt((mean**2).sum(-1, keepdims=True))
+    mean = mean / np.where(lengths > 0, lengths, 1.0)
+    alpha = (nearest > 0).reshape(blocks).mean(axis=(1, 3))
+    return mean.astype(np.float32), alpha.astype(np.float32)
+
+
+def fill_gutters(
+    texture: Float[np.ndarray, "S S C"], covered: Bool[np.ndarray, "S S"]
+) -> Float[np.ndarray, "S S C"]:
+    """Give every texel outside the charts the value of the nearest texel inside one.
+
+    Bilinear taps and mipmaps across a chart's border then see the chart's own colour, so that no
+    dark seam shows at any distance.
+    """
+    if covered.all() or not covered.any():
+        return texture
+    nearest = ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)
+    return texture[nearest[0], nearest[1]]

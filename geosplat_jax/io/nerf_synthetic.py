@@ -1,0 +1,86 @@
+"""NeRF-synthetic and Shiny Blender: ``transforms_{train,test}.json`` and RGBA images.
+
+Images are sRGB with straight alpha; the world is z-up. Shiny Blender adds, for each image, a
+normal map in world axes (``r_0_normal.png``, n = 2v - 1) and a mask (``r_0_alpha.png``), which is
+used where the image itself has no alpha. NeRF-synthetic keeps its normals in camera-dependent
+files of another kind (``r_0_normal_0001.png``), which are not ground truth in world axes and are
+left alone, as is its validation split.
+"""
+
+from pathlib import Path
+
+from geosplat_jax.io.frames import (
+    IMAGE_SUFFIXES,
+    Frame,
+    Listing,
+    existing,
+    image_stem,
+    inside_scene,
+    optional_files,
+    read_transforms,
+)
+from geosplat_jax.io.images import SceneError
+
+
+def is_nerf_synthetic(root: Path) -> bool:
+    """Whether the folder holds the transforms that this layout is made of."""
+    return (root / "transforms_train.json").is_file()
+
+
+def is_shiny_blender(root: Path) -> bool:
+    """Whether it is NeRF-synthetic with maps named after the images."""
+    maps = ("*_normal.png", "*_alpha.png")
+    folders = [root / "train", root / "test"]
+    return is_nerf_synthetic(root) and any(
+        any(folder.glob(pattern)) for folder in folders for pattern in maps
+    )
+
+
+def list_nerf_synthetic(root: Path, *, light: str | None = None) -> Listing:
+    """List the frames of a NeRF-synthetic scene.
+
+    Raises
+    ------
+    SceneError : see `read_transforms`; a light is asked for, but the layout has a single one.
+    """
+    return _list(root, light, has_maps=False)
+
+
+def list_shiny_blender(root: Path, *, light: str | None = None) -> Listing:
+    """List the frames of a Shiny Blender scene, with normals as ground truth.
+
+    Raises
+    ------
+    SceneError : see `read_transforms`; a light is asked for, but the layout has a single one.
+    """
+    return _list(root, light, has_maps=True)
+
+
+def _list(root: Path, light: str | None, *, has_maps: bool) -> Listing:
+    if light is not None:
+        raise SceneError(f"this layout has one unnamed light, got light={light!r}; leave it out")
+    return Listing(
+        train=_frames(root, "train", has_maps=has_maps),
+        test=_frames(root, "test", has_maps=has_maps),
+    )
+
+
+def _frames(root: Path, split: str, *, has_maps: bool) -> tuple[Frame, ...]:
+    where = root / f"transforms_{split}.json"
+    frames = []
+    for file_path, pose, angle in read_transforms(where):
+        stem = image_stem(root, file_path, where)
+        candidates = [stem.with_name(stem.name + suffix) for suffix in IMAGE_SUFFIXES]
+        asked = inside_scene(root, file_path, where)
+        image = existing(
+            root, [asked] if asked != stem else candidates[:3], f"{file_path} of {where.name}"
+        )
+        maps = {}
+        if has_maps:
+            names = {"normal": "_normal.png", "mask": "_alpha.png"}
+            maps = optional_files(
+                root, {key: stem.with_name(stem.name + end) for key, end in names.items()}
+            )
+        mask = maps.pop("mask", None)
+        frames.append(Frame(stem.name, pose, angle, image, mask=mask, truth=maps))
+    return tuple(frames)

@@ -1,0 +1,262 @@
+"""Material attributes as a field over space: hash encodings with small heads.
+
+The number of Gaussians changes at every step, so their attributes are not parameters but values of
+a function of position (REFERENCE 2.6). The paper uses two encodings, one for albedo and one for
+roughness, metallic and the inward shift; `MaterialSpec.shared` lets one encoding feed every head,
+at half the cost.
+"""
+
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from geosplat_jax.hashgrid import (
+    HashGridSpec,
+    Layer,
+    apply_mlp,
+    encode,
+    init_mlp,
+    init_tables,
+)
+from geosplat_jax.numerics import safe_divide
+from geosplat_jax.scene import Materials
+
+ROUGHNESS_MINIMUM = 0.1
+"""The field's roughness lies in [0.1, 1] (REFERENCE 2.5): lower ones are mirrors, which a handful
+of light samples cannot resolve."""
+
+SMOOTHNESS_STD = 0.01
+"""Standard deviation of the displacement in Eq. 15-17, world units."""
+
+INITIAL_LOGITS: dict[str, tuple[float, float]] = {
+    "outdoor": (0.0, 0.0),
+    "diffuse": (0.0, -3.0),
+    "hybrid": (-3.0, -3.0),
+    "specular": (-3.0, 0.0),
+    "glossy": (-3.0, 0.0),
+}
+"""Initial (roughness, metallic) logits of a kind of material, REFERENCE 2.6 `initial_guess`.
+
+A logit of 0 starts at roughness 0.55 or metallic 0.5; one of -3 at roughness 0.14 or metallic 0.05.
+"""
+
+
+@dataclass(frozen=True)
+class MaterialSpec:
+    """Static shape of a material field.
+
+    Attributes
+    ----------
+    grid : the encodings' shape.
+    albedo_hidden : hidden widths of the albedo head and of the indirect head.
+    surface_hidden : hidden widths of the roughness/metallic head and of the shift head.
+    shared : one encoding for all heads instead of one for albedo and indirect light and one for
+        roughness, metallic and shift.
+    bias : whether the heads' layers have biases.
+    initial_roughness_logit, initial_metallic_logit : added to the raw outputs, so that training
+        starts at a plausible material; see `INITIAL_LOGITS`.
+    has_metallic : without it metallic is zero and has no parameters.
+    has_shift : whether there is a head for the inward shift of Gaussians.
+    has_indirect : whether there is a head for indirect light (6 numbers a point).
+    """
+
+    grid: HashGridSpec = HashGridSpec()
+    albedo_hidden: tuple[int, ...] = (32, 32)
+    surface_hidden: tuple[int, ...] = (32,)
+    shared: bool = False
+    bias: bool = False
+    initial_roughness_logit: float = 0.0
+    initial_metallic_logit: float = 0.0
+    has_metallic: bool = True
+    has_shift: bool = True
+    has_indirect: bool = False
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class MaterialField:
+    """Parameters of a material field; a head that the model lacks is None and holds none.
+
+    Attributes
+    ----------
+    albedo_table : (E, F) encoding of albedo and indirect light, or of everything when shared.
+    surface_table : (E, F) encoding of roughness, metallic and shift; None when shared.
+    albedo_head : 3 outputs. surface_head : roughness and, with metallic, 2 outputs.
+    shift_head : 1 output or None. indirect_head : 6 outputs or None.
+    """
+
+    albedo_table: Float[Array, "E F"]
+    surface_table: Float[Array, "E F"] | None
+    albedo_head: tuple[Layer, ...]
+    surface_head: tuple[Layer, ...]
+    shift_head: tuple[Layer, ...] | None = field(default=None)
+    indirect_head: tuple[Layer, ...] | None = field(default=None)
+
+
+def init_materials(key: Key[Array, ""], spec: MaterialSpec) -> MaterialField:
+    """Draw the parameters of a field: nearly constant attributes at the initial logits."""
+    names = ("albedo_table", "surface_table", "albedo", "surface", "shift", "indirect")
+    keys = dict(zip(names, jax.random.split(key, len(names)), strict=True))
+    width = spec.grid.width
+
+    def head(name: str, hidden: tuple[int, ...], outputs: int) -> tuple[Layer, ...]:
+        return init_mlp(keys[name], (width, *hidden, outputs), bias=spec.bias)
+
+    return MaterialField(
+        albedo_table=init_tables(keys["albedo_table"], spec.grid),
+        surface_table=None if spec.shared else init_tables(keys["surface_table"], spec.grid),
+        albedo_head=head("albedo", spec.albedo_hidden, 3),
+        surface_head=head("surface", spec.surface_hidden, 2 if spec.has_metallic else 1),
+        shift_head=head("shift", spec.surface_hidden, 1) if spec.has_shift else None,
+        indirect_head=head("indirect", spec.albedo_hidden, 6) if spec.has_indirect else None,
+    )
+
+
+def to_unit_cube(
+    points: Float[Array, "N 3"], center: Float[Array, " 3"], half_extent: Float[Array, ""]
+) -> Float[Array, "N 3"]:
+    """Map world points to [0, 1], clamped to the cube of ``half_extent`` about ``center``."""
+    local = (points - center[None, :]) / half_extent
+    return 0.5 * jnp.clip(local, -1.0, 1.0) + 0.5
+
+
+def _surface_table(params: MaterialField) -> Float[Array, "E F"]:
+    return params.albedo_table if params.surface_table is None else params.surface_table
+
+
+def materials_at(
+    params: MaterialField,
+    points: Float[Array, "N 3"],
+    *,
+    spec: MaterialSpec,
+    center: Float[Array, " 3"],
+    half_extent: Float[Array, ""],
+    position_gradient: bool = False,
+) -> Materials:
+    """Evaluate albedo, roughness and metallic at points of the world.
+
+    Parameters
+    ----------
+    params : the field.
+    points : (N, 3) world; points outside the cube take the value at its border.
+    spec : static shape of the field.
+    center, half_extent : (3,) and () the cube that the encodings cover, world units.
+    position_gradient : static; whether points receive a gradient (see `hashgrid.encode`). Off, the
+        field moves with the surface: attributes do not pull on the geometry.
+
+    Returns
+    -------
+    `Materials` with albedo in (0, 1), roughness in [0.1, 1] and metallic in (0, 1), or 0 for a
+    field without metallic.
+    """
+    unit = to_unit_cube(points, center, half_extent)
+    features = encode(
+        params.albedo_table, unit, spec=spec.grid, position_gradient=position_gradient
+    )
+    albedo = jax.nn.sigmoid(apply_mlp(params.albedo_head, features))
+    if params.surface_table is not None:
+        features = encode(
+            params.surface_table, unit, spec=spec.grid, position_gradient=position_gradient
+        )
+    raw = apply_mlp(params.surface_head, features)
+    roughness = jax.nn.sigmoid(raw[:, 0] + spec.initial_roughness_logit)
+    # REFERENCE 2.5: roughness = rho_hat (1 - .1) + .1
+    roughness = roughness * (1 - ROUGHNESS_MINIMUM) + ROUGHNESS_MINIMUM
+    if spec.has_metallic:
+        metallic = jax.nn.sigmoid(raw[:, 1] + spec.initial_metallic_logit)
+    else:
+        metallic = jnp.zeros_like(roughness)
+    return Materials(albedo=albedo, roughness=roughness, metallic=metallic)
+
+
+def inward_shift(
+    params: MaterialField,
+    points: Float[Array, "N 3"],
+    *,
+    spec: MaterialSpec,
+    center: Float[Array, " 3"],
+    half_extent: Float[Array, ""],
+) -> Float[Array, " N"]:
+    """Share of ``sqrt(face area)`` by which a Gaussian sinks below its face (REFERENCE 2.1).
+
+    ``sigmoid(z(mu))`` in (0, 1). The points carry no gradient. Starts near 1/2.
+
+    Raises
+    ------
+    ValueError
+        When the field has no shift head.
+    """
+    if params.shift_head is None:
+        raise ValueError("the field has no shift head; build it from a spec with has_shift=True")
+    unit = to_unit_cube(jax.lax.stop_gradient(points), center, half_extent)
+    features = encode(_surface_table(params), unit, spec=spec.grid)
+    return jax.nn.sigmoid(apply_mlp(params.shift_head, features)[:, 0])
+
+
+def indirect_logits(
+    params: MaterialField,
+    points: Float[Array, "N 3"],
+    *,
+    spec: MaterialSpec,
+    center: Float[Array, " 3"],
+    half_extent: Float[Array, ""],
+) -> Float[Array, "N 6"]:
+    """Raw indirect light (diffuse rgb, specular rgb) at points; shading gives it its range.
+
+    Raises
+    ------
+    ValueError
+        When the field has no indirect head.
+    """
+    if params.indirect_head is None:
+        raise ValueError("the field has no indirect head; build it with has_indirect=True")
+    unit = to_unit_cube(jax.lax.stop_gradient(points), center, half_extent)
+    return apply_mlp(params.indirect_head, encode(params.albedo_table, unit, spec=spec.grid))
+
+
+def smoothness(
+    params: MaterialField,
+    points: Float[Array, "M 3"],
+    mask: Bool[Array, " M"],
+    key: Key[Array, ""],
+    *,
+    spec: MaterialSpec,
+    center: Float[Array, " 3"],
+    half_extent: Float[Array, ""],
+    std: float | Float[Array, ""] = SMOOTHNESS_STD,
+    weights: tuple[float | Float[Array, ""], ...] = (1.0, 1.0, 1.0),
+) -> Float[Array, ""]:
+    """Mean change of the attributes under a small random displacement (Eq. 15-17).
+
+    ``w_a |a - a'|_1 + w_r |rho - rho'|_1 + w_m |m - m'|_1`` with ``'`` at ``mu + N(0, std^2)``,
+    averaged over the points of the mask; zero when there are none. Any random subset of the
+    Gaussians gives an unbiased estimate. Points carry no gradient.
+
+    Parameters
+    ----------
+    points : (M, 3) world. mask : (M,) false for padding.
+    key : for the displacements.
+    spec, center, half_extent : see `materials_at`.
+    std : world units.
+    weights : of albedo, roughness and metallic.
+    """
+    points = jax.lax.stop_gradient(points)
+    moved = points + std * jax.random.normal(key, points.shape, points.dtype)
+    both = materials_at(
+        params,
+        jnp.concatenate([points, moved]),
+        spec=spec,
+        center=center,
+        half_extent=half_extent,
+    )
+    count = points.shape[0]
+    albedo = jnp.sum(jnp.abs(both.albedo[:count] - both.albedo[count:]), axis=-1)  # Eq. 15
+    roughness = jnp.abs(both.roughness[:count] - both.roughness[count:])  # Eq. 16
+    change = weights[0] * albedo + weights[1] * roughness
+    if spec.has_metallic:
+        metallic = jnp.abs(both.metallic[:count] - both.metallic[count:])  # Eq. 17
+        change = change + weights[2] * metallic
+    total = jnp.sum(jnp.where(mask, change, 0.0))
+    return safe_divide(total, jnp.sum(mask).astype(total.dtype))

@@ -1,0 +1,93 @@
+"""Configurations: presets, overrides, validation, serialisation."""
+
+import json
+
+import pytest
+
+from geosplat_jax.config import (
+    PRESETS,
+    QUALITIES,
+    RateConfig,
+    config_from_dict,
+    differences,
+    make_config,
+    parse_override,
+)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("quality", QUALITIES)
+def test_every_preset_and_quality_survives_json(preset, quality):
+    config = make_config(preset, quality)
+    again = config_from_dict(json.loads(json.dumps(config.to_dict())))
+    assert again == config
+    assert hash(again.model) == hash(config.model)
+    assert differences(config, again) == []
+
+
+def test_presets_carry_the_numbers_of_the_reference():
+    paper, code = make_config("paper"), make_config("code")
+    assert (paper.model.adapter.u, paper.model.adapter.v) == (0.07, 0.22)
+    assert code.model.adapter.u == pytest.approx(0.069444, abs=1e-6)
+    assert code.model.adapter.opacity == 0.99
+    assert code.model.baked_diffuse
+    assert not paper.model.material.has_shift
+    assert code.model.material.has_shift
+    assert paper.model.material.grid.log2_entries == 19
+    assert code.model.material.grid.coarsest == 16
+
+
+def test_overrides_reach_nested_fields_and_keep_types():
+    config = make_config(
+        overrides=("rates.sdf=0.5", "run.steps=7", "geometry.initial=sphere", "rates.light=1")
+    )
+    assert config.rates.sdf == 0.5
+    assert config.run.steps == 7
+    assert config.geometry.initial == "sphere"
+    assert config.rates.light == 1.0
+    assert isinstance(config.rates.light, float)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("rates.sfd=1", "unknown setting rates.sfd"),
+        ("nothing.at.all=1", "unknown setting nothing"),
+        ("run.steps=1.5", "run.steps must be of type int"),
+        ("run.steps=0", "run.steps must be at least 1"),
+        ("rates.sdf=-1.0", "rates.sdf must not be negative"),
+        ("rates.sdf", "section.field=value"),
+        ("geometry.initial=cube", "geometry.initial must be"),
+        ("model.adapter.alpha=[1.0]", "model.adapter.alpha must be"),
+    ],
+)
+def test_bad_overrides_say_what_is_wrong(override, message):
+    with pytest.raises(ValueError, match=message):
+        make_config(overrides=(override,))
+
+
+def test_unknown_names_are_refused():
+    for arguments in (("fast",), ("default", "ultra")):
+        with pytest.raises(ValueError, match="must be one of"):
+            make_config(*arguments)
+    with pytest.raises(ValueError, match="kind must be one of"):
+        make_config(kind="wet")
+
+
+def test_an_override_is_toml_or_a_bare_word():
+    assert parse_override("a.b=[1, 2]") == {"a": {"b": [1, 2]}}
+    assert parse_override("a=true") == {"a": True}
+    assert parse_override("a=word") == {"a": "word"}
+
+
+def test_entropy_weight_falls_linearly_and_stays():
+    loss = make_config("paper").loss
+    assert loss.at(0.0).entropy == pytest.approx(0.2)
+    assert loss.at(0.25).entropy == pytest.approx(0.105)
+    assert loss.at(0.5).entropy == pytest.approx(0.01)
+    assert loss.at(1.0).entropy == pytest.approx(0.01)
+
+
+def test_differences_name_the_setting_and_both_values():
+    first, second = make_config(), make_config(overrides=("rates.sdf=0.25",))
+    assert differences(first, second) == [f"rates.sdf: {RateConfig().sdf!r} -> 0.25"]

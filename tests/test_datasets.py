@@ -1,0 +1,595 @@
+"""Every layout loads as written, and every kind of bad input is named."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from geosplat_jax.io.dataset import describe, load_dataset
+from geosplat_jax.io.images import (
+    ImageReadError,
+    MissingFileError,
+    SceneError,
+    encode_srgb,
+    write_exr,
+    write_hdr,
+    write_png,
+)
+
+SHARED = Path(__file__).parents[2] / "shared"
+SIZE, ANGLE, RADIUS, DISTANCE = 24, 0.7, 0.8, 4.0
+ALBEDO, RADIANCE = np.array([0.8, 0.2, 0.05]), np.array([0.5, 0.25, 0.1])
+ROUGHNESS = 0.4
+COUNTS = {"train": 8, "test": 3}
+STEP = 1 / 255  # of eight bits
+
+BOX = (np.full(3, -1.0), np.full(3, 1.0))
+
+
+def poses(count, *, phase=0.0):
+    """Blender camera-to-world matrices on a Fibonacci sphere, looking at the origin."""
+    k = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * k / count
+    angle = np.pi * (1.0 + 5.0**0.5) * k + phase
+    ring = np.sqrt(1.0 - z * z)
+    matrices = np.tile(np.eye(4), (count, 1, 1))
+    matrices[:, :3, 2] = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], -1)
+    for matrix in matrices:
+        right = np.cross([0.0, 0.0, 1.0], matrix[:3, 2])
+        matrix[:3, 0] = right / np.linalg.norm(right)
+        matrix[:3, 1] = np.cross(matrix[:3, 2], matrix[:3, 0])
+        matrix[:3, 3] = DISTANCE * matrix[:3, 2]
+    return matrices
+
+
+def sphere_view(pose):
+    """Alpha (H, W, 1) and world normals (H, W, 3) of the sphere at the origin."""
+    focal = 0.5 * SIZE / np.tan(0.5 * ANGLE)
+    pixel = (np.arange(SIZE) + 0.5 - SIZE / 2) / focal
+    x, y = np.meshgrid(pixel, -pixel)
+    rays = np.stack([x, y, -np.ones_like(x)], -1) @ pose[:3, :3].T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    along = -rays @ pose[:3, 3]
+    inside = RADIUS**2 - DISTANCE**2 + along**2
+    alpha = (inside > 0.0).astype(np.float32)[..., None]
+    depth = along - np.sqrt(np.maximum(inside, 0.0))
+    normals = (pose[:3, 3] + depth[..., None] * rays) / RADIUS
+    return alpha, np.where(alpha > 0, normals, 0.0).astype(np.float32)
+
+
+def constant(alpha, color):
+    """RGBA of one colour; what is behind the mask is white, to see whether it leaks."""
+    rgb = np.where(alpha > 0, np.asarray(color, np.float32), 1.0)
+    return np.concatenate([rgb, alpha], -1).astype(np.float32)
+
+
+def transforms(root, split, paths, matrices):
+    frames = [
+        {"file_path": path, "transform_matrix": matrix.tolist()}
+        for path, matrix in zip(paths, matrices, strict=True)
+    ]
+    content = {"camera_angle_x": ANGLE, "frames": frames}
+    (root / f"transforms_{split}.json").write_text(json.dumps(content))
+
+
+def split_poses(split):
+    return poses(COUNTS[split], phase=0.3 * (split == "test"))
+
+
+def encoded(color):
+    return encode_srgb(np.asarray(color, np.float32))
+
+
+def write_blender(root, *, shiny=False):
+    for split in COUNTS:
+        matrices = split_poses(split)
+        for i, pose in enumerate(matrices):
+            alpha, normals = sphere_view(pose)
+            rgba = constant(alpha, encoded(RADIANCE))
+            image = rgba[..., :3] if shiny else rgba
+            write_png(root / split / f"r_{i}.png", image)
+            if shiny:
+                write_png(root / split / f"r_{i}_alpha.png", alpha)
+                write_png(root / split / f"r_{i}_normal.png", 0.5 * normals + 0.5)
+        transforms(root, split, [f"./{split}/r_{i}" for i in range(len(matrices))], matrices)
+
+
+def write_tensoir(root, *, with_transforms=True, with_scene=True):
+    for split in COUNTS:
+        matrices = split_poses(split)
+        for i, pose in enumerate(matrices):
+            folder = root / f"{split}_{i:03d}"
+            alpha, normals = sphere_view(pose)
+            for light, gain in (("noon", 1.0), ("night", 0.5)):
+                if split == "test" or light == "noon":
+                    image = constant(alpha, encoded(gain * RADIANCE))
+                    write_png(folder / f"rgba_{light}.png", image)
+            if split == "test":
+                write_png(folder / "albedo.png", constant(alpha, ALBEDO))
+                write_png(folder / "roughness.png", constant(alpha, [ROUGHNESS] * 3))
+                write_png(folder / "normal.png", np.concatenate([0.5 * normals + 0.5, alpha], -1))
+            camera = ",".join(str(number) for number in pose.reshape(-1))
+            content = {"imw": SIZE, "imh": SIZE, "cam_angle_x": ANGLE, "cam_transform_mat": camera}
+            (folder / "metadata.json").write_text(json.dumps(content))
+        if with_transforms:
+            paths = [f"./{split}_{i:03d}/rgba" for i in range(len(matrices))]
+            transforms(root, split, paths, matrices)
+    if with_scene:
+        (root / "scene.json").write_text(json.dumps({"train_light": "noon"}))
+    write_hdr(root.parent / "noon.hdr", np.ones((4, 8, 3), np.float32))
+    write_hdr(root.parent / "night.hdr", np.ones((4, 8, 3), np.float32))
+
+
+def write_synthetic4relight(root):
+    for split in COUNTS:
+        matrices = split_poses(split)
+        for i, pose in enumerate(matrices):
+            alpha, _ = sphere_view(pose)
+            stem = f"{split}/{i:03d}"
+            if split == "train":
+                write_exr(root / f"{stem}_rgb.exr", constant(alpha, 4.0 * RADIANCE)[..., :3])
+                write_png(root / f"{stem}_mask.png", alpha)
+                continue
+            write_png(root / f"{stem}_rgba.png", constant(alpha, encoded(RADIANCE)))
+            write_png(root / f"{stem}_albedo.png", constant(alpha, encoded(ALBEDO)))
+            write_png(root / f"{stem}_rough.png", constant(alpha, [ROUGHNESS, 0.0, 0.0]))
+            for light, gain in (("envmap6", 0.5), ("envmap12", 0.25)):
+                image = constant(alpha, encoded(gain * RADIANCE))[..., :3]
+                write_png(root / "test_rli" / f"{light}_{i:03d}.png", image)
+        transforms(root, split, [f"{split}/{i:03d}" for i in range(len(matrices))], matrices)
+    for name in ("envmap3", "envmap6", "envmap12"):
+        write_exr(root.parent / f"{name}.exr", np.ones((4, 8, 3), np.float32))
+
+
+WRITERS = {
+    "nerf_synthetic": write_blender,
+    "shiny_blender": lambda root: write_blender(root, shiny=True),
+    "tensoir": write_tensoir,
+    "synthetic4relight": write_synthetic4relight,
+}
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    """One pristine scene of each layout."""
+    made = {}
+    for layout, write in WRITERS.items():
+        root = tmp_path_factory.mktemp(layout) / "ball"
+        root.mkdir()
+        write(root)
+        made[layout] = root
+    return made
+
+
+@pytest.fixture
+def blender(scenes, tmp_path):
+    """A NeRF-synthetic scene to spoil."""
+    return shutil.copytree(scenes["nerf_synthetic"], tmp_path / "ball")
+
+
+@pytest.fixture
+def tensoir(scenes, tmp_path):
+    """A TensoIR scene to spoil."""
+    return shutil.copytree(scenes["tensoir"], tmp_path / "ball")
+
+
+def load(root, **settings):
+    """Load with given bounds, which the tests of bad input do not need found."""
+    return load_dataset(root, **{"bounds": BOX, **settings})
+
+
+def edit(root, change, *, name="transforms_train.json"):
+    content = json.loads((root / name).read_text())
+    change(content)
+    (root / name).write_text(json.dumps(content))
+
+
+def color_on_mask(image):
+    return image[image[..., -1] > 0.5][:, :3].mean(0)
+
+
+@pytest.mark.parametrize("layout", list(WRITERS))
+def test_every_layout_is_recognised_and_read_as_it_was_written(scenes, layout):
+    dataset = load(scenes[layout])
+    assert (dataset.layout, dataset.name, dataset.warnings) == (layout, "ball", ())
+    for split, views in (("train", dataset.train), ("test", dataset.test)):
+        expected = split_poses(split)
+        assert len(views) == COUNTS[split]
+        np.testing.assert_allclose(views.camera_to_world, expected, atol=1e-9)
+        alpha = np.stack([sphere_view(pose)[0][..., 0] for pose in expected])
+        np.testing.assert_array_equal(views.images[..., 3], alpha)
+        gain = 4.0 if layout == "synthetic4relight" and split == "train" else 1.0
+        np.testing.assert_allclose(color_on_mask(views.images), gain * RADIANCE, atol=3 * STEP)
+        assert (views.images[views.images[..., 3] == 0.0] == 0.0).all()
+        assert views.images.dtype == np.float32
+
+
+def test_cameras_use_opencv_axes_and_the_formula_of_blender(scenes):
+    views = load(scenes["nerf_synthetic"]).test
+    camera = views.camera([2, 0])
+    assert (camera.height, camera.width) == (SIZE, SIZE)
+    focal = 0.5 * SIZE / np.tan(0.5 * ANGLE)
+    np.testing.assert_allclose(camera.intrinsics[0, 0], [focal, 0.0, SIZE / 2], rtol=1e-6)
+    np.testing.assert_allclose(camera.centers, views.camera_to_world[[2, 0], :3, 3], atol=1e-5)
+    origin = np.asarray(camera.world_to_camera)[:, :3, 3]
+    np.testing.assert_allclose(origin, [[0.0, 0.0, DISTANCE]] * 2, atol=1e-5)
+    up = np.asarray(camera.world_to_camera)[:, :3, 2]
+    assert (up[:, 1] < 0.0).all()  # up in the world is against y, which points down
+
+
+@pytest.mark.parametrize("layout", ["tensoir", "shiny_blender"])
+def test_normals_are_unit_and_in_world_axes(scenes, layout):
+    normal = load(scenes[layout]).test.truth["normal"]
+    for read, pose in zip(normal, split_poses("test"), strict=True):
+        alpha, exact = sphere_view(pose)
+        np.testing.assert_allclose(read, exact, atol=2.5 * STEP)
+        np.testing.assert_allclose(np.linalg.norm(read, axis=-1), alpha[..., 0], atol=1e-5)
+
+
+@pytest.mark.parametrize("layout", ["tensoir", "synthetic4relight"])
+def test_materials_are_linear_whatever_the_encoding(scenes, layout):
+    truth = load(scenes[layout]).test.truth
+    mask = load(scenes[layout]).test.masks
+    expected = np.broadcast_to(ALBEDO, truth["albedo"][mask].shape)
+    np.testing.assert_allclose(truth["albedo"][mask], expected, atol=STEP)
+    np.testing.assert_allclose(truth["roughness"][mask], ROUGHNESS, atol=STEP)
+    assert truth["roughness"].shape[-1] == 1
+    assert (truth["albedo"][~mask] == 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("layout", "gains"),
+    [("tensoir", {"night": 0.5}), ("synthetic4relight", {"envmap6": 0.5, "envmap12": 0.25})],
+)
+def test_relit_views_have_colour_and_alpha(scenes, layout, gains):
+    test = load(scenes[layout]).test
+    assert set(test.relight) == set(gains)
+    for light, gain in gains.items():
+        np.testing.assert_array_equal(test.relight[light][..., 3], test.images[..., 3])
+        found = color_on_mask(test.relight[light])
+        np.testing.assert_allclose(found, gain * RADIANCE, atol=2 * STEP)
+
+
+def test_environment_maps_and_lights_are_found(scenes):
+    tensoir = load(scenes["tensoir"])
+    assert tensoir.train_light == "noon"
+    assert {name: path.name for name, path in tensoir.lights.items()} == {
+        "noon": "noon.hdr",
+        "night": "night.hdr",
+    }
+    relight = load(scenes["synthetic4relight"])
+    assert relight.train_light == "envmap3"
+    assert list(relight.lights) == ["envmap3", "envmap6", "envmap12"]
+    assert load(scenes["nerf_synthetic"]).train_light is None
+
+
+def test_tensoir_needs_no_transforms_and_no_scene_file(scenes, tmp_path):
+    root = tmp_path / "ball"
+    root.mkdir()
+    write_tensoir(root, with_transforms=False, with_scene=False)
+    found, listed = load(root), load(scenes["tensoir"])
+    np.testing.assert_allclose(found.train.camera_to_world, listed.train.camera_to_world)
+    np.testing.assert_array_equal(found.test.images, listed.test.images)
+    assert found.train.names == listed.train.names
+    assert found.train_light == "noon"
+
+
+def test_bounds_are_those_of_the_object(scenes):
+    lo, hi = load_dataset(scenes["nerf_synthetic"]).bounds
+    assert (lo < -RADIUS + 0.05).all()
+    assert (hi > RADIUS - 0.05).all()
+    assert ((hi - lo) < 3.2 * RADIUS).all()
+
+
+def test_reduced_views_are_the_same_cameras(scenes):
+    full, half = (load(scenes["tensoir"], downscale=factor) for factor in (1, 2))
+    assert half.train.images.shape == (COUNTS["train"], SIZE // 2, SIZE // 2, 4)
+    scale = np.array([[2.0], [2.0], [1.0]])
+    np.testing.assert_allclose(half.train.intrinsics * scale, full.train.intrinsics)
+    np.testing.assert_allclose(
+        half.train.images[..., 3].mean(), full.train.images[..., 3].mean(), rtol=1e-6
+    )
+    for key, values in half.test.truth.items():
+        assert values.shape[:3] == half.test.images.shape[:3], key
+    length = np.linalg.norm(half.test.truth["normal"], axis=-1)
+    np.testing.assert_allclose(length[half.test.masks], 1.0, atol=1e-5)
+
+
+def test_a_size_that_does_not_divide_is_cut_and_said(scenes):
+    dataset = load(scenes["nerf_synthetic"], downscale=5)
+    assert dataset.train.images.shape[1:3] == (4, 4)
+    assert dataset.train.intrinsics[0, 0, 2] == SIZE / 2 / 5
+    assert any("cut to a multiple of the downscale factor 5" in w for w in dataset.warnings)
+
+
+def test_limits_spread_over_the_views(scenes):
+    dataset = load(scenes["nerf_synthetic"], train_views=3, test_views=1)
+    assert dataset.train.names == ("r_0", "r_4", "r_7")
+    assert dataset.test.names == ("r_0",)
+    with pytest.raises(SceneError, match="train_views must be at least 1, got 0"):
+        load(scenes["nerf_synthetic"], train_views=0)
+
+
+def test_describe_tells_what_a_user_asks(scenes):
+    text = describe(load(scenes["tensoir"]))
+    for part in ("8 views of 24 x 24", "albedo, normal, roughness", "night.hdr", "bounds", "noon"):
+        assert part in text
+
+
+def test_ground_truth_is_read_when_first_asked_for(tensoir):
+    (tensoir / "test_001" / "albedo.png").write_text("no image")
+    truth = load(tensoir).test.truth
+    assert truth["normal"] is truth["normal"]
+    with pytest.raises(ImageReadError, match="not a readable image"):
+        truth["albedo"]
+
+
+def test_ground_truth_of_some_views_only_is_left_out_and_said(tensoir):
+    (tensoir / "test_001" / "albedo.png").unlink()
+    dataset = load(tensoir)
+    assert "albedo" not in dataset.test.truth
+    assert any("'albedo' is left out: only 2 of 3" in warning for warning in dataset.warnings)
+
+
+def test_a_folder_that_is_no_scene_says_what_was_expected(tmp_path):
+    with pytest.raises(SceneError, match=r"no known layout; expected transforms_train\.json"):
+        load_dataset(tmp_path)
+    (tmp_path / "transforms.json").write_text("{}")
+    with pytest.raises(SceneError, match="looks like an instant-ngp or nerfstudio capture"):
+        load_dataset(tmp_path)
+    with pytest.raises(MissingFileError, match="scene folder .* does not exist"):
+        load_dataset(tmp_path / "nowhere")
+    with pytest.raises(SceneError, match="layout must be one of"):
+        load_dataset(tmp_path, layout="colmap")
+
+
+def test_a_missing_image_names_the_frame(blender):
+    (blender / "train" / "r_3.png").unlink()
+    with pytest.raises(MissingFileError, match=r"train/r_3 of transforms_train\.json has no file"):
+        load(blender)
+
+
+def test_an_unreadable_image_is_named(blender):
+    (blender / "train" / "r_3.png").write_bytes(b"\x89PNG\r\n\x1a\n broken")
+    with pytest.raises(ImageReadError, match=r"r_3\.png"):
+        load(blender)
+
+
+def test_missing_test_views_are_named(blender):
+    (blender / "transforms_test.json").unlink()
+    with pytest.raises(MissingFileError, match=r"transforms_test\.json does not exist"):
+        load(blender)
+
+
+def test_images_of_another_size_are_named(blender):
+    write_png(blender / "train" / "r_3.png", np.ones((SIZE, SIZE + 2, 4), np.float32))
+    with pytest.raises(SceneError, match=r"r_3\.png is 26 x 24 pixels, but .*r_0\.png is 24 x 24"):
+        load(blender)
+
+
+def test_a_mask_of_another_size_is_named(scenes, tmp_path):
+    root = shutil.copytree(scenes["synthetic4relight"], tmp_path / "ball")
+    write_png(root / "train" / "002_mask.png", np.ones((3, 4, 1), np.float32))
+    with pytest.raises(SceneError, match=r"mask .*002_mask\.png is 4 x 3 pixels"):
+        load(root)
+
+
+def test_truth_of_another_size_is_named(tensoir):
+    write_png(tensoir / "test_001" / "albedo.png", np.ones((3, 4, 4), np.float32))
+    truth = load(tensoir).test.truth
+    with pytest.raises(SceneError, match=r"albedo\.png is 4 x 3 pixels"):
+        truth["albedo"]
+
+
+def test_images_without_alpha_and_mask_are_refused(blender):
+    write_png(blender / "train" / "r_3.png", np.ones((SIZE, SIZE, 3), np.float32))
+    with pytest.raises(SceneError, match=r"r_3\.png has no alpha channel and there is no mask"):
+        load(blender)
+
+
+def test_one_empty_mask_warns_and_only_empty_masks_stop(blender):
+    empty = np.zeros((SIZE, SIZE, 4), np.float32)
+    write_png(blender / "train" / "r_3.png", empty)
+    assert any("mask of 1 views is empty, r_3" in warning for warning in load(blender).warnings)
+    assert load_dataset(blender).bounds[1][0] > 0.5
+    for i in range(COUNTS["train"]):
+        write_png(blender / "train" / f"r_{i}.png", empty)
+    with pytest.raises(SceneError, match="mask of every train view is empty"):
+        load(blender)
+
+
+def test_images_that_were_not_cut_out_warn(blender):
+    for i in range(COUNTS["train"]):
+        write_png(blender / "train" / f"r_{i}.png", np.ones((SIZE, SIZE, 4), np.float32))
+    assert any("every mask is full" in warning for warning in load(blender).warnings)
+
+
+@pytest.mark.parametrize(("value", "message"), [(np.nan, "not finite"), (-1.0, "negative")])
+def test_exr_pixels_that_are_no_light_are_located(scenes, tmp_path, value, message):
+    root = shutil.copytree(scenes["synthetic4relight"], tmp_path / "ball")
+    path = str(root / "train" / "002_rgb.exr")
+    sink = oiio.ImageOutput.create(path)
+    assert sink.open(path, oiio.ImageSpec(SIZE, SIZE, 3, oiio.FLOAT))
+    assert sink.write_image(np.full((SIZE, SIZE, 3), value, np.float32))
+    assert sink.close()
+    with pytest.raises(SceneError, match=rf"002_rgb\.exr has .* {message}"):
+        load(root)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda m: np.diag([1.0, 1.0, 0.0, 1.0]) @ m, "singular"),
+        (lambda m: np.diag([2.0, 2.0, 2.0, 1.0]) @ m, r"not rigid: it stretches by \[2.0"),
+        (lambda m: m @ np.array([[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]), "n"),
+        (lambda m: m @ np.diag([-1.0, 1.0, 1.0, 1.0]), "mirrors space"),
+        (lambda m: m.T, "transposed"),
+        (lambda m: m * np.nan, "4 x 4 finite numbers"),
+        (lambda m: m[:3], "4 x 4 finite numbers"),
+        (lambda m: np.full((4, 4), "x"), "4 x 4 numbers"),
+    ],
+)
+def test_poses_that_are_no_rigid_motion_are_named(blender, spoil, message):
+    def change(content):
+        frame = content["frames"][2]
+        frame["transform_matrix"] = spoil(np.array(frame["transform_matrix"])).tolist()
+
+    edit(blender, change)
+    with pytest.raises(SceneError, match=f"pose of frame 2 of .*{message}"):
+        load(blender)
+
+
+def test_rounded_poses_become_exactly_rigid(blender):
+    def change(content):
+        for frame in content["frames"]:
+            frame["transform_matrix"] = np.round(frame["transform_matrix"], 4).tolist()
+
+    edit(blender, change)
+    rotation = load(blender).train.camera_to_world[:, :3, :3]
+    identity = np.broadcast_to(np.eye(3), rotation.shape)
+    np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), identity, atol=1e-12)
+
+
+def test_a_camera_inside_the_object_is_named(blender):
+    def change(content):
+        content["frames"][2]["transform_matrix"][0][3] = 0.0
+        content["frames"][2]["transform_matrix"][1][3] = 0.1
+        content["frames"][2]["transform_matrix"][2][3] = 0.0
+
+    edit(blender, change)
+    with pytest.raises(SceneError, match="1 cameras are inside the object's bounds, r_2"):
+        load(blender)
+
+
+def test_bounds_are_checked(blender):
+    for bounds in (((0, 0, 0), (1, 1, -1)), ((0, 0), (1, 1)), ((0, 0, 0), (1, 1, np.nan)), (1,)):
+        with pytest.raises(SceneError, match="bounds must be lo"):
+            load(blender, bounds=bounds)
+
+
+def test_cameras_that_look_past_each_other_say_so(blender):
+    def change(content):
+        for frame in content["frames"]:
+            matrix = np.array(frame["transform_matrix"])
+            matrix[:3, :3] = matrix[:3, :3] @ np.diag([1.0, -1.0, -1.0])  # look outwards
+            frame["transform_matrix"] = matrix.tolist()
+
+    edit(blender, change)
+    with pytest.raises(SceneError, match="cannot find the object"):
+        load_dataset(blender)
+
+
+def test_json_that_is_not_json_is_named(blender):
+    (blender / "transforms_train.json").write_text('{"frames": [')
+    with pytest.raises(SceneError, match=r"transforms_train\.json is not JSON"):
+        load(blender)
+    (blender / "transforms_train.json").write_text("[1]")
+    with pytest.raises(SceneError, match="must hold a JSON object, got list"):
+        load(blender)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c.pop("frames"), "has no key 'frames'"),
+        (lambda c: c.pop("camera_angle_x"), "has no key 'camera_angle_x'"),
+        (lambda c: c["frames"][1].pop("file_path"), "frame 1 of .* has no key 'file_path'"),
+        (lambda c: c["frames"][1].pop("transform_matrix"), "has no key 'transform_matrix'"),
+        (lambda c: c["frames"].clear(), "has no frames"),
+        (lambda c: c["frames"].insert(0, 3), "frame 0 of .* must be an object, got int"),
+        (lambda c: c["frames"][0].update(file_path=7), "must be a name, got 7"),
+        (lambda c: c.update(camera_angle_x=40), r"must be in \(0, pi\) radians, got 40"),
+        (lambda c: c.update(camera_angle_x="wide"), "radians, got 'wide'"),
+    ],
+)
+def test_missing_and_wrong_keys_are_named(blender, change, message):
+    edit(blender, change)
+    with pytest.raises(SceneError, match=message):
+        load(blender)
+
+
+@pytest.mark.parametrize(
+    "path", ["../outside", "train/../../outside", "/etc/hostname", "C:\\outside", "..\\outside"]
+)
+def test_paths_that_climb_out_of_the_scene_are_refused(blender, path):
+    write_png(blender.parent / "outside.png", np.ones((SIZE, SIZE, 4), np.float32))
+    edit(blender, lambda content: content["frames"][0].update(file_path=path))
+    with pytest.raises(SceneError, match="leaves the scene folder"):
+        load(blender)
+
+
+def test_links_that_lead_out_of_the_scene_are_refused(blender):
+    outside = blender.parent / "outside.png"
+    write_png(outside, np.ones((SIZE, SIZE, 4), np.float32))
+    (blender / "train" / "r_3.png").unlink()
+    (blender / "train" / "r_3.png").symlink_to(outside)
+    with pytest.raises(SceneError, match="leaves the scene folder"):
+        load(blender)
+
+
+def test_a_linked_scene_folder_is_fine(blender):
+    link = blender.parent / "link"
+    link.symlink_to(blender, target_is_directory=True)
+    assert len(load(link).train) == COUNTS["train"]
+
+
+def test_the_choice_of_light_is_checked(tensoir, blender_light="noon"):
+    with pytest.raises(MissingFileError, match=r"no image under the light 'dawn'.*\['noon'\]"):
+        load(tensoir, light="dawn")
+    edit(tensoir, lambda content: content.update(train_light="dawn"), name="scene.json")
+    with pytest.raises(SceneError, match="names the training light 'dawn'"):
+        load(tensoir)
+    assert load(tensoir, light=blender_light).train_light == "noon"
+
+
+def test_an_open_choice_of_light_asks_for_one(tensoir):
+    (tensoir / "scene.json").unlink()
+    source = tensoir / "train_000" / "rgba_noon.png"
+    shutil.copy(source, tensoir / "train_000" / "rgba_dusk.png")
+    with pytest.raises(SceneError, match=r"under the lights \['dusk', 'noon'\]; choose one"):
+        load(tensoir)
+
+
+@pytest.mark.parametrize("layout", ["nerf_synthetic", "shiny_blender", "synthetic4relight"])
+def test_layouts_with_one_light_refuse_a_choice(scenes, layout):
+    with pytest.raises(SceneError, match="light='noon'"):
+        load(scenes[layout], light="noon")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c.pop("cam_transform_mat"), "has no key 'cam_transform_mat'"),
+        (lambda c: c.update(cam_transform_mat="1,2,x"), "must be numbers"),
+        (lambda c: c.update(cam_transform_mat="1,2,3"), "must be 16 numbers, got 3"),
+        (lambda c: c.pop("cam_angle_x"), "has no key 'cam_angle_x'"),
+    ],
+)
+def test_metadata_of_tensoir_is_checked(tensoir, change, message):
+    (tensoir / "transforms_train.json").unlink()
+    edit(tensoir, change, name="train_001/metadata.json")
+    with pytest.raises(SceneError, match=message):
+        load(tensoir)
+
+
+@pytest.mark.parametrize(
+    ("name", "layout", "counts"),
+    [
+        ("scenes/spot", "tensoir", (64, 10)),
+        ("scenes/flighthelmet", "tensoir", (64, 10)),
+        ("real/lego", "nerf_synthetic", (87, 13)),
+    ],
+)
+def test_real_scenes_load(name, layout, counts):
+    root = SHARED / name
+    if not root.is_dir():
+        pytest.skip("the shared scenes are not here")
+    dataset = load_dataset(root, downscale=2)
+    assert dataset.layout == layout
+    assert (len(dataset.train), len(dataset.test)) == counts
+    assert dataset.warnings == ()
+    lo, hi = dataset.bounds
+    assert (hi - lo).max() < 3.0

@@ -1,0 +1,260 @@
+"""The visual hull of a sphere is known: its distance, its box, and what masks may do to it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from geosplat_jax.hull import (
+    fit_grid,
+    grid_points,
+    hull_bounds,
+    hull_distance,
+    hull_sdf,
+    visual_hull,
+)
+from geosplat_jax.io.dataset import load_dataset
+
+SHARED = Path(__file__).parents[2] / "shared"
+VIEW_COUNT, SIZE, FOCAL, DISTANCE, RADIUS = 40, 64, 90.0, 4.0, 0.9
+BACKGROUND = (0.5, 0.5, 0.5)
+
+
+def cameras_around(center, *, scale=1.0, count=VIEW_COUNT):
+    """OpenCV cameras on a Fibonacci sphere, looking at the centre."""
+    k = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * k / count
+    angle = np.pi * (1.0 + 5.0**0.5) * k
+    ring = np.sqrt(1.0 - z * z)
+    backward = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], -1)
+    poses = np.zeros((count, 4, 4))
+    for pose, axis in zip(poses, backward, strict=True):
+        forward = -axis
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        pose[:3, :3] = rotation
+        pose[:3, 3] = -rotation @ (np.asarray(center) + scale * DISTANCE * axis)
+        pose[3, 3] = 1.0
+    pinhole = np.array([[FOCAL, 0.0, SIZE / 2], [0.0, FOCAL, SIZE / 2], [0.0, 0.0, 1.0]])
+    return poses, np.tile(pinhole, (count, 1, 1))
+
+
+def sphere_coverage(poses, intrinsics, center, radius, *, samples=4):
+    """Antialiased masks of a sphere, from samples x samples rays a pixel."""
+    steps = (np.arange(SIZE * samples) + 0.5) / samples
+    masks = []
+    for pose, pinhole in zip(poses, intrinsics, strict=True):
+        c = pose[:3, :3] @ np.asarray(center) + pose[:3, 3]
+        u, v = np.meshgrid(steps, steps)
+        rays = np.stack(
+            [
+                (u - pinhole[0, 2]) / pinhole[0, 0],
+                (v - pinhole[1, 2]) / pinhole[1, 1],
+                np.ones_like(u),
+            ],
+            -1,
+        )
+        along = rays @ c
+        is_hit = along**2 > (rays**2).sum(-1) * (c @ c - radius**2)
+        masks.append(is_hit.reshape(SIZE, samples, SIZE, samples).mean((1, 3)))
+    return np.stack(masks).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    poses, intrinsics = cameras_around(np.zeros(3))
+    return poses, intrinsics, sphere_coverage(poses, intrinsics, np.zeros(3), RADIUS)
+
+
+def test_hull_encloses_the_object_and_little_more(sphere):
+    directions = np.random.default_rng(0).normal(size=(2000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    assert visual_hull(*sphere, 0.97 * RADIUS * directions, tolerance=0.0).all()
+    assert not visual_hull(*sphere, 1.12 * RADIUS * directions).any()
+
+
+def test_distance_at_the_surface_is_accurate_to_a_fraction_of_a_pixel(sphere):
+    # The silhouette of view v touches the sphere where the line of sight is tangent.
+    poses, _, _ = sphere
+    pixel = DISTANCE / FOCAL
+    for pose in poses[::7]:
+        backward = -pose[2, :3]
+        across = np.cross(backward, np.random.default_rng(1).normal(size=(50, 3)))
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        sine = RADIUS / DISTANCE
+        tangent = RADIUS * (sine * backward[None] + np.sqrt(1.0 - sine**2) * across)
+        distance = hull_distance(*sphere, tangent, tolerance=0.0)
+        assert np.abs(distance).max() < 0.35 * pixel
+
+
+def test_sdf_is_a_distance_in_cells_everywhere(sphere):
+    grid = fit_grid((np.full(3, -1.2), np.full(3, 1.2)), 24)
+    sdf = hull_sdf(*sphere, grid, tolerance=0.0)
+    exact = (np.linalg.norm(grid_points(grid), axis=1) - RADIUS) / float(grid.cell_size)
+    inner = np.abs(exact) < 3.0
+    # The hull of forty views exceeds the sphere by up to half a cell.
+    assert np.abs(sdf - exact)[inner].max() < 0.8
+    assert np.abs(sdf - exact)[inner].mean() < 0.25
+    field = sdf.reshape(25, 25, 25)
+    slopes = np.stack([np.abs(np.diff(field, axis=axis)).max() for axis in range(3)])
+    assert slopes.max() < 2.0
+    assert sdf.dtype == np.float32
+
+
+def test_sdf_numbers_vertices_with_x_fastest():
+    center = np.array([0.5, -0.2, 0.3])
+    poses, intrinsics = cameras_around(center)
+    masks = sphere_coverage(poses, intrinsics, center, 0.4)
+    grid = fit_grid((np.array([-0.5, -0.7, -0.2]), np.array([1.2, 0.6, 0.8])), 20)
+    deepest = grid_points(grid)[np.argmin(hull_sdf(poses, intrinsics, masks, grid))]
+    assert np.abs(deepest - center).max() < 2.0 * float(grid.cell_size)
+    first, second = grid_points(grid)[:2]
+    np.testing.assert_allclose(second - first, [float(grid.cell_size), 0.0, 0.0], atol=1e-7)
+
+
+def test_sdf_is_closed_even_where_the_grid_cuts_the_object(sphere):
+    grid = fit_grid((np.full(3, -0.5), np.full(3, 0.5)), 12)
+    field = hull_sdf(*sphere, grid).reshape(13, 13, 13)
+    border = np.ones_like(field, bool)
+    border[1:-1, 1:-1, 1:-1] = False
+    assert (field[border] > 0.0).all()
+    assert (field < 0.0).any()
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("center", [(0.0, 0.0, 0.0), (7.0, -30.0, 11.0)])
+def test_bounds_follow_the_object_wherever_and_however_large(scale, center):
+    center = scale * np.asarray(center)
+    poses, intrinsics = cameras_around(center, scale=scale)
+    masks = sphere_coverage(poses, intrinsics, center, scale * RADIUS, samples=2)
+    lo, hi = hull_bounds(poses, intrinsics, masks)
+    assert (lo < center - scale * RADIUS).all()
+    assert (hi > center + scale * RADIUS).all()
+    assert ((hi - lo) < 2.5 * scale * RADIUS).all()
+
+
+def test_bounds_find_an_object_far_smaller_than_the_first_search_cell():
+    poses, intrinsics = cameras_around(np.zeros(3))
+    center, radius = np.array([0.3, 0.5, -0.4]), 0.06
+    masks = sphere_coverage(poses, intrinsics, center, radius)
+    lo, hi = hull_bounds(poses, intrinsics, masks)
+    assert (lo < center - radius).all()
+    assert (hi > center + radius).all()
+    assert ((hi - lo) < 4.0 * radius).all()
+
+
+def test_one_wrong_mask_does_not_carve_the_object(sphere):
+    poses, intrinsics, masks = sphere
+    torn = masks.copy()
+    torn[3, SIZE // 2 :] = 0.0
+    points = np.random.default_rng(2).uniform(-0.4, 0.4, (500, 3))
+    assert not visual_hull(poses, intrinsics, torn, points, tolerance=0.0).all()
+    assert visual_hull(poses, intrinsics, torn, points, tolerance=1 / VIEW_COUNT).all()
+
+
+def test_a_view_with_an_empty_mask_is_ignored(sphere):
+    poses, intrinsics, masks = sphere
+    blank = masks.copy()
+    blank[5] = 0.0
+    assert visual_hull(poses, intrinsics, blank, np.zeros((1, 3)), tolerance=0.0).all()
+    with pytest.raises(ValueError, match="every mask is empty"):
+        visual_hull(poses, intrinsics, 0.0 * masks, np.zeros((1, 3)))
+
+
+def test_a_view_says_nothing_about_what_it_does_not_see(sphere):
+    poses, intrinsics, masks = sphere
+    shifted, cropped = intrinsics.copy(), masks.copy()
+    shifted[0, 0, 2] -= SIZE / 2  # the left half of the object leaves the image
+    cropped[0] = np.pad(masks[0, :, SIZE // 2 :], ((0, 0), (0, SIZE // 2)))
+    points = np.random.default_rng(3).uniform(-0.5, 0.5, (200, 3))
+    assert visual_hull(poses, shifted, cropped, points, tolerance=0.0).all()
+
+
+def test_a_point_that_few_views_see_is_outside(sphere):
+    far = np.array([[0.0, 0.0, 50.0], [30.0, 0.0, 0.0]])
+    distance = hull_distance(*sphere, far)
+    assert (distance > 0.0).all()
+    poses, _, _ = sphere
+    eye = -poses[0, :3, :3].T @ poses[0, :3, 3]
+    assert not visual_hull(*sphere, eye[None]).any()
+
+
+def test_bool_masks_and_full_masks_are_masks_too(sphere):
+    poses, intrinsics, masks = sphere
+    assert visual_hull(poses, intrinsics, masks > 0.5, np.zeros((1, 3))).all()
+    assert visual_hull(poses, intrinsics, np.ones_like(masks), np.zeros((1, 3))).all()
+
+
+def test_large_masks_are_reduced_without_moving_the_edge():
+    poses, intrinsics = cameras_around(np.zeros(3), count=8)
+    masks = sphere_coverage(poses, intrinsics, np.zeros(3), RADIUS)
+    large = np.repeat(np.repeat(masks, 7, 1), 7, 2)[:, :-3]  # 445 x 448: no multiple of two
+    scaled = intrinsics * np.array([[7.0], [7.0], [1.0]])
+    points = np.random.default_rng(4).uniform(-1.2, 1.2, (3000, 3))
+    first, second = (
+        hull_distance(poses, *views, points, tolerance=0.0)
+        for views in ((intrinsics, masks), (scaled, large))
+    )
+    near = np.abs(first) < 0.1
+    assert near.sum() > 50
+    assert np.abs(first - second)[near].max() < DISTANCE / FOCAL
+
+
+def test_views_that_bound_nothing_are_refused(sphere):
+    poses, intrinsics, masks = sphere
+    with pytest.raises(ValueError, match="parallel or there is only one view"):
+        hull_bounds(poses[:1], intrinsics[:1], masks[:1])
+    turned = poses.copy()
+    turned[::2, :3, :3] = -turned[::2, :3, :3] * np.array([[1.0], [-1.0], [1.0]])
+    turned[::2, :3, 3] = -turned[::2, :3, 3] * np.array([1.0, -1.0, 1.0])
+    with pytest.raises(ValueError, match="no volume in common"):
+        hull_bounds(turned, intrinsics, masks, tolerance=0.0)
+
+
+def test_a_grid_beside_the_object_is_refused(sphere):
+    grid = fit_grid((np.full(3, 1.3), np.full(3, 1.6)), 8)
+    with pytest.raises(ValueError, match="holds no vertex of the grid"):
+        hull_sdf(*sphere, grid)
+
+
+def test_fitted_grid_is_cubic_tight_and_holds_its_margins():
+    lo, hi = np.array([-0.3, 1.0, 2.0]), np.array([0.7, 1.4, 4.0])
+    grid = fit_grid((lo, hi), 32, margin_cells=2)
+    cell = float(grid.cell_size)
+    assert max(grid.shape) == grid.shape[2] == 32
+    low = np.asarray(grid.origin)
+    high = low + cell * np.asarray(grid.shape)
+    assert (lo - low > 1.99 * cell).all()
+    assert (high - hi > 1.99 * cell).all()
+    assert (lo - low < 2.51 * cell).all()
+
+
+@pytest.mark.parametrize(
+    ("bounds", "resolution", "message"),
+    [
+        (([0, 0, 0], [1, 1, 0]), 32, "lo < hi"),
+        (([0, 0, 0], [1, 1, np.inf]), 32, "lo < hi"),
+        (([0, 0, 0], [1, 1, 1]), 4, "exceed twice the margin"),
+    ],
+)
+def test_a_grid_that_cannot_be_is_refused(bounds, resolution, message):
+    lo, hi = (np.asarray(corner, float) for corner in bounds)
+    with pytest.raises(ValueError, match=message):
+        fit_grid((lo, hi), resolution)
+
+
+@pytest.mark.parametrize("name", ["spot", "knight"])
+def test_hull_of_a_path_traced_scene_encloses_its_true_mesh(name):
+    root = SHARED / "scenes" / name
+    if not root.is_dir():
+        pytest.skip("the shared scenes are not here")
+    trimesh = pytest.importorskip("trimesh")
+    train = load_dataset(root, test_views=1).train
+    vertices = np.asarray(trimesh.load(root / "mesh_gt.ply", process=False).vertices, float)
+    extent = json.loads((root / "scene.json").read_text())["object_half_extent"]
+    distance = hull_distance(
+        train.world_to_camera, train.intrinsics, train.images[..., 3], vertices
+    )
+    assert distance.max() < 0.005 * extent

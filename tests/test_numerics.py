@@ -1,0 +1,152 @@
+"""Safe functions: right over 40 decades, finite at the edges, rows independent of one another."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import double_precision
+
+from geosplat_jax.numerics import (
+    LENGTH_EPSILON,
+    clamp_away_from_zero,
+    safe_divide,
+    safe_log,
+    safe_norm,
+    safe_normalize,
+    safe_sqrt,
+)
+
+RELATIVE = 1e-5  # a few roundings of float32
+DECADES = np.arange(-19, 20)
+EXTREMES = np.concatenate([[0.0], 10.0 ** np.arange(-37, 38, 2), -(10.0 ** np.arange(-37, 38, 2))])
+
+
+def _vectors_over_decades(seed=0):
+    rng = np.random.default_rng(seed)
+    unit = rng.standard_normal((DECADES.size, 3))
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    return unit, unit * 10.0 ** DECADES[:, None]
+
+
+def test_norm_and_its_gradient_are_exact_over_40_decades():
+    unit, x = _vectors_over_decades()
+    x32 = jnp.asarray(x, jnp.float32)
+    np.testing.assert_allclose(safe_norm(x32), 10.0**DECADES, rtol=RELATIVE)
+    gradient = jax.grad(lambda v: jnp.sum(safe_norm(v)))(x32)
+    np.testing.assert_allclose(gradient, unit, atol=RELATIVE)
+
+
+def test_normalize_and_its_gradient_are_exact_over_40_decades():
+    unit, x = _vectors_over_decades(1)
+    x32, cotangent = jnp.asarray(x, jnp.float32), np.array([0.3, -1.0, 0.7])
+    np.testing.assert_allclose(safe_normalize(x32), unit, atol=RELATIVE)
+    gradient = jax.grad(lambda v: jnp.sum(safe_normalize(v) @ jnp.asarray(cotangent, jnp.float32)))
+    expected = cotangent - unit * (unit @ cotangent)[:, None]
+    np.testing.assert_allclose(gradient(x32) * 10.0 ** DECADES[:, None], expected, atol=RELATIVE)
+
+
+@pytest.mark.parametrize("function", [safe_norm, safe_normalize])
+def test_a_zero_row_is_zero_and_does_not_disturb_the_others(function):
+    _, x = _vectors_over_decades(2)
+    keep = np.arange(len(x)) != 7
+    with_zero = np.where(keep[:, None], x, 0.0)
+    value = lambda v: jnp.sum(jnp.sin(function(v)))  # noqa: E731
+    full, holed = jnp.asarray(x, jnp.float32), jnp.asarray(with_zero, jnp.float32)
+    np.testing.assert_array_equal(function(full)[keep], function(holed)[keep])
+    full_gradient, holed_gradient = jax.grad(value)(full), jax.grad(value)(holed)
+    np.testing.assert_array_equal(full_gradient[keep], holed_gradient[keep])
+    np.testing.assert_array_equal(function(holed)[7], 0.0)
+    np.testing.assert_array_equal(holed_gradient[7], 0.0)
+
+
+def test_norm_keeps_the_shape_asked_for():
+    x = jnp.ones((2, 4, 3))
+    assert safe_norm(x).shape == (2, 4)
+    assert safe_norm(x, keepdims=True).shape == (2, 4, 1)
+    assert safe_norm(x, axis=1).shape == (2, 3)
+
+
+def test_vectors_without_direction_normalize_to_zero():
+    x = jnp.asarray([[0.1 * LENGTH_EPSILON, 0, 0], [0, 0, 0]], jnp.float32)
+    np.testing.assert_array_equal(safe_normalize(x), 0.0)
+    np.testing.assert_array_equal(jax.grad(lambda v: jnp.sum(safe_normalize(v)))(x), 0.0)
+
+
+def test_divide_and_its_gradients_are_exact_over_40_decades():
+    denominator = jnp.asarray(np.concatenate([10.0**DECADES, -(10.0**DECADES)]), jnp.float32)
+    numerator = 3.0 * denominator
+    np.testing.assert_allclose(safe_divide(numerator, denominator), 3.0, rtol=RELATIVE)
+    by_numerator, by_denominator = jax.grad(
+        lambda n, d: jnp.sum(safe_divide(n, d)), argnums=(0, 1)
+    )(numerator, denominator)
+    np.testing.assert_allclose(by_numerator * denominator, 1.0, rtol=RELATIVE)
+    np.testing.assert_allclose(by_denominator * denominator, -3.0, rtol=RELATIVE)
+
+
+def test_divide_of_zero_by_something_tiny_has_a_finite_gradient():
+    numerator, denominator = jnp.zeros(3), jnp.asarray([LENGTH_EPSILON, 1e-19, -1e-19], jnp.float32)
+    gradients = jax.grad(lambda n, d: jnp.sum(safe_divide(n, d)), argnums=(0, 1))(
+        numerator, denominator
+    )
+    assert np.all(np.isfinite(gradients))
+
+
+def test_divide_by_zero_returns_the_alternative_and_leaves_the_other_rows():
+    numerator, denominator = jnp.asarray([1.0, 2.0, 0.0]), jnp.asarray([0.0, 4.0, 0.0])
+    np.testing.assert_array_equal(
+        safe_divide(numerator, denominator, otherwise=7.0), [7.0, 0.5, 7.0]
+    )
+    gradients = jax.grad(lambda n, d: jnp.sum(safe_divide(n, d)), argnums=(0, 1))(
+        numerator, denominator
+    )
+    np.testing.assert_array_equal(gradients, [[0.0, 0.25, 0.0], [0.0, -0.125, 0.0]])
+
+
+def test_square_root_is_exact_and_flat_below_zero():
+    x = jnp.asarray([-1.0, 0.0, 1e-36, 4.0, 1e36], jnp.float32)
+    np.testing.assert_allclose(safe_sqrt(x), [0, 0, 1e-18, 2, 1e18], rtol=RELATIVE)
+    gradient = jax.grad(lambda v: jnp.sum(safe_sqrt(v)))(x)
+    np.testing.assert_allclose(gradient, [0, 0, 5e17, 0.25, 5e-19], rtol=RELATIVE)
+
+
+def test_logarithm_is_exact_above_its_floor_and_flat_below():
+    x = jnp.asarray([-1.0, 0.0, 1e-10, 1.0, 1e30], jnp.float32)
+    floor = np.log(LENGTH_EPSILON)
+    expected = [floor, floor, np.log(1e-10), 0.0, np.log(1e30)]
+    np.testing.assert_allclose(safe_log(x), expected, rtol=RELATIVE)
+    gradient = jax.grad(lambda v: jnp.sum(safe_log(v)))(x)
+    np.testing.assert_allclose(gradient, [0, 0, 1e10, 1.0, 1e-30], rtol=RELATIVE)
+
+
+def test_clamp_away_from_zero_keeps_the_sign_and_large_values():
+    x = jnp.asarray([-2.0, -1e-5, 0.0, 1e-5, 2.0])
+    clamped = clamp_away_from_zero(x, 1e-3)
+    np.testing.assert_allclose(clamped, [-2, -1e-3, 1e-3, 1e-3, 2])
+    gradient = jax.grad(lambda v: jnp.sum(clamp_away_from_zero(v, 1e-3)))(x)
+    np.testing.assert_array_equal(gradient, [1, 0, 0, 0, 1])
+
+
+@pytest.mark.parametrize("function", [safe_sqrt, safe_log])
+def test_scalar_functions_are_finite_on_every_magnitude(function):
+    x = jnp.asarray(EXTREMES, jnp.float32)
+    assert np.all(np.isfinite(function(x)))
+    assert np.all(np.isfinite(jax.grad(lambda v: jnp.sum(function(v)))(x)))
+
+
+def test_precision_in_is_precision_out():
+    with double_precision():
+        for dtype in (jnp.float32, jnp.float64):
+            x = jnp.ones((2, 3), dtype)
+            results = [safe_norm(x), safe_normalize(x), safe_sqrt(x), safe_log(x)]
+            results += [safe_divide(x, x), clamp_away_from_zero(x, 0.1)]
+            assert all(result.dtype == dtype for result in results)
+            assert jax.grad(lambda v: jnp.sum(safe_normalize(v)))(x).dtype == dtype
+
+
+def test_second_derivatives_of_the_norm_are_right():
+    with double_precision():
+        x = jnp.asarray([0.3, -1.2, 0.7])
+        length = float(np.linalg.norm(x))
+        unit = np.asarray(x) / length
+        expected = (np.eye(3) - np.outer(unit, unit)) / length
+        np.testing.assert_allclose(jax.hessian(safe_norm)(x), expected, atol=1e-12)
