@@ -35,41 +35,29 @@ def _pixel_offsets(tile_size: int, dtype) -> tuple[Float[Array, " P"], Float[Arr
     return jnp.tile(offset, tile_size), jnp.repeat(offset, tile_size)
 
 
-def _alphas(rows: Float[Array, "columns G K"], tile_size: int) -> Float[Array, "G P K"]:
+def _alphas(rows: Float[Array, "G K columns"], tile_size: int) -> Float[Array, "G K P"]:
     """Alpha of every Gaussian of a chunk in every pixel of its tile."""
     u, v = _pixel_offsets(tile_size, rows.dtype)
-    x, y, xx, xy, yy, log_opacity = rows[:GEOMETRY_COLUMNS, :, None, :]
-    dx, dy = u[None, :, None] - x, v[None, :, None] - y
+    x, y, xx, xy, yy, log_opacity = (rows[..., i, None] for i in range(GEOMETRY_COLUMNS))
+    dx, dy = u[None, None] - x, v[None, None] - y
     log_alpha = log_opacity - (0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy)
     alpha = jnp.minimum(jnp.exp(log_alpha), MAX_ALPHA)
     return jnp.where(alpha >= MIN_ALPHA, alpha, 0.0)
 
 
-def _sum_over_pixels(values: Float[Array, "G P K"], weights: list) -> Float[Array, "G K"]:
-    """Weighted sum over the pixels of a tile, unrolled so that XLA vectorises over chunks."""
-    return sum(weights[p] * values[:, p] for p in range(values.shape[1]))
-
-
 def _geometry_vjp(
-    rows: Float[Array, "columns G K"], d_log_alpha: Float[Array, "G P K"], tile_size: int
+    rows: Float[Array, "G K columns"], d_log_alpha: Float[Array, "G K P"], tile_size: int
 ) -> list[Float[Array, "G K"]]:
     """Cotangents of the geometry columns of ``rows`` from that of log alpha.
 
-    They are six moments of ``d_log_alpha`` over the tile, moved from the centre of the tile to the
-    mean of the Gaussian.
+    They are six moments of ``d_log_alpha`` over the tile, one matrix product, moved from the
+    centre of the tile to the mean of the Gaussian.
     """
-    offset = [i - 0.5 * (tile_size - 1) for i in range(tile_size)]
-    u, v = offset * tile_size, [b for b in offset for _ in offset]
-    monomials = [
-        [1.0 for _ in u],
-        u,
-        v,
-        [a * a for a in u],
-        [a * b for a, b in zip(u, v, strict=True)],
-        [b * b for b in v],
-    ]
-    m, mu, mv, muu, muv, mvv = (_sum_over_pixels(d_log_alpha, w) for w in monomials)
-    x, y, xx, xy, yy = rows[:5]
+    u, v = _pixel_offsets(tile_size, rows.dtype)
+    basis = jnp.stack([jnp.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+    moments = jnp.einsum("gkp,pm->gkm", d_log_alpha, basis)
+    m, mu, mv, muu, muv, mvv = (moments[..., i] for i in range(6))
+    x, y, xx, xy, yy = (rows[..., i] for i in range(5))
     du, dv = mu - x * m, mv - y * m
     return [
         xx * du + xy * dv,
@@ -82,8 +70,8 @@ def _geometry_vjp(
 
 
 def _local_weights(
-    alpha: Float[Array, "G P K"],
-) -> tuple[Float[Array, "G P K"], Float[Array, "P K"]]:
+    alpha: Float[Array, "G K P"],
+) -> tuple[Float[Array, "G K P"], Float[Array, "K P"]]:
     """Weights ``alpha_i prod_{j<i} (1 - alpha_j)`` within a chunk, and what passes through."""
     passing = jnp.ones_like(alpha[0])
     weights = []
@@ -105,54 +93,48 @@ def _place_in_run(labels: Int[Array, " K"], *, reverse: bool = False) -> Int[Arr
     return last - place
 
 
-def _shift(
-    x: Float[Array, "P K"], step: Int[Array, ""], *, fill: float, reverse: bool = False
-) -> Float[Array, "P K"]:
-    """Move columns ``step`` places to the right (in reverse, left), filling what is uncovered."""
-    filler = jnp.full_like(x, fill)
-    wide = jnp.concatenate([x, filler] if reverse else [filler, x], axis=1)
-    start = step if reverse else x.shape[1] - step
-    return jax.lax.dynamic_slice_in_dim(wide, start, x.shape[1], axis=1)
-
-
 def _transmittance_before(
-    passing: Float[Array, "P K"], place: Int[Array, " K"]
-) -> Float[Array, "P K"]:
+    passing: Float[Array, "K P"], place: Int[Array, " K"]
+) -> Float[Array, "K P"]:
     """Product of ``passing`` over the earlier chunks of each chunk's tile.
 
     Doubling (Hillis and Steele 1986): as many steps as the longest list has binary digits.
     """
+    chunk = jnp.arange(passing.shape[0], dtype=jnp.int32)
 
     def shifted(x, step):
-        return jnp.where((place >= step)[None, :], _shift(x, step, fill=1.0), 1.0)
+        return jnp.where((place >= step)[:, None], x[jnp.maximum(chunk - step, 0)], 1.0)
 
     def double(state):
         step, x = state
         return 2 * step, x * shifted(x, step)
 
-    one, longest = jnp.ones((), jnp.int32), jnp.max(place)
-    _, inclusive = jax.lax.while_loop(lambda state: state[0] <= longest, double, (one, passing))
-    return shifted(inclusive, one)
+    longest = jnp.max(place)
+    _, inclusive = jax.lax.while_loop(
+        lambda state: state[0] <= longest, double, (jnp.ones((), jnp.int32), passing)
+    )
+    return shifted(inclusive, 1)
 
 
 def _seen_behind(
-    seen: Float[Array, "P K"], passing: Float[Array, "P K"], place: Int[Array, " K"]
-) -> Float[Array, "P K"]:
+    seen: Float[Array, "K P"], passing: Float[Array, "K P"], place: Int[Array, " K"]
+) -> Float[Array, "K P"]:
     """Compose the maps ``x -> seen + passing x`` of all later chunks of the tile, at zero."""
-
-    def shifted(x, step, fill):
-        return jnp.where((place >= step)[None, :], _shift(x, step, fill=fill, reverse=True), fill)
+    chunk_count = passing.shape[0]
+    chunk = jnp.arange(chunk_count, dtype=jnp.int32)
 
     def double(state):
         step, offset, factor = state
-        offset = offset + factor * shifted(offset, step, 0.0)
-        return 2 * step, offset, factor * shifted(factor, step, 1.0)
+        source = jnp.minimum(chunk + step, chunk_count - 1)
+        has = (place >= step)[:, None]
+        offset = offset + factor * jnp.where(has, offset[source], 0.0)
+        return 2 * step, offset, factor * jnp.where(has, factor[source], 1.0)
 
-    one, longest = jnp.ones((), jnp.int32), jnp.max(place)
+    longest = jnp.max(place)
     _, inclusive, _ = jax.lax.while_loop(
-        lambda state: state[0] <= longest, double, (one, seen, passing)
+        lambda state: state[0] <= longest, double, (jnp.ones((), jnp.int32), seen, passing)
     )
-    return shifted(inclusive, one, 0.0)
+    return jnp.where((place >= 1)[:, None], inclusive[jnp.minimum(chunk + 1, chunk_count - 1)], 0.0)
 
 
 def _chunk_rows(
@@ -161,16 +143,16 @@ def _chunk_rows(
     chunk_tiles: Int[Array, " K"],
     tile_size: int,
     columns: int,
-) -> Float[Array, "columns G K"]:
+) -> Float[Array, "G K columns"]:
     """Gather the rows of each chunk, with means relative to the centre of the chunk's tile.
 
     Padding slots get a row that is transparent everywhere.
     """
     padding = jnp.zeros((1, table.shape[1]), table.dtype).at[0, 5].set(_LOG_NOTHING)
-    rows = jnp.concatenate([table, padding]).T[:, chunk_ranks]
-    tile_xy = jnp.stack([chunk_tiles % columns, chunk_tiles // columns])
+    rows = jnp.concatenate([table, padding])[chunk_ranks]
+    tile_xy = jnp.stack([chunk_tiles % columns, chunk_tiles // columns], axis=-1)
     centers = (tile_xy.astype(table.dtype) + 0.5) * tile_size
-    return rows.at[:2].add(-centers[:, None])
+    return rows.at[..., :2].add(-centers[None])
 
 
 def _composite_forward(tile_size, grid, table, chunk_ranks, chunk_tiles):
@@ -179,12 +161,12 @@ def _composite_forward(tile_size, grid, table, chunk_ranks, chunk_tiles):
     weights, passing = _local_weights(alpha)
     before = _transmittance_before(passing, _place_in_run(chunk_tiles))
     channels = [
-        before * sum(w * feature[None] for w, feature in zip(weights, slots, strict=True))
-        for slots in rows[GEOMETRY_COLUMNS:]
+        before * sum(weights[g] * rows[g, :, c, None] for g in range(alpha.shape[0]))
+        for c in range(GEOMETRY_COLUMNS, table.shape[1])
     ]
     channels.append(before * (1.0 - passing))
     tiles = [
-        jax.ops.segment_sum(channel.T, chunk_tiles, grid[0] * grid[1], indices_are_sorted=True)
+        jax.ops.segment_sum(channel, chunk_tiles, grid[0] * grid[1], indices_are_sorted=True)
         for channel in channels
     ]
     return jnp.stack(tiles), (table, chunk_ranks, chunk_tiles, before)
@@ -214,10 +196,10 @@ def _composite_backward(tile_size, grid, residuals, cotangent):
     rows = _chunk_rows(table, chunk_ranks, chunk_tiles, tile_size, grid[1])
     alpha = _alphas(rows, tile_size)
     weights, passing = _local_weights(alpha)
-    arriving = [c.at[chunk_tiles].get(mode="fill", fill_value=0.0).T for c in cotangent]
+    arriving = [c.at[chunk_tiles].get(mode="fill", fill_value=0.0) for c in cotangent]
     gain = arriving[-1][None]
-    for feature, channel in zip(rows[GEOMETRY_COLUMNS:], arriving[:-1], strict=True):
-        gain = gain + feature[:, None] * channel[None]
+    for c, channel in enumerate(arriving[:-1]):
+        gain = gain + rows[..., GEOMETRY_COLUMNS + c, None] * channel[None]
     slots = alpha.shape[0]
     seen = sum(weights[g] * gain[g] for g in range(slots))
     behind = _seen_behind(seen, passing, _place_in_run(chunk_tiles, reverse=True))
@@ -228,10 +210,13 @@ def _composite_backward(tile_size, grid, residuals, cotangent):
         d_log_alpha[g] = jnp.where(is_free, before * weights[g] * contrast, 0.0)
         behind = behind + alpha[g] * contrast
     d_columns = _geometry_vjp(rows, jnp.stack(d_log_alpha), tile_size)
-    for channel in arriving[:-1]:
-        d_columns.append(_sum_over_pixels(weights, list(before * channel)))
-    d_rows = jnp.stack(d_columns, axis=-1).reshape(-1, table.shape[1])
-    d_table = jnp.zeros_like(table).at[chunk_ranks.reshape(-1)].add(d_rows, mode="drop")
+    arriving = jnp.stack([before * channel for channel in arriving[:-1]], axis=-1)
+    d_features = jnp.einsum("gkp,kpc->gkc", weights, arriving)
+    d_rows = jnp.concatenate([jnp.stack(d_columns, axis=-1), d_features], axis=-1)
+    d_table = jnp.zeros_like(table)
+    d_table = d_table.at[chunk_ranks.reshape(-1)].add(
+        d_rows.reshape(-1, table.shape[1]), mode="drop"
+    )
     return d_table, None, None
 
 

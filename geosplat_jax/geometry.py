@@ -226,7 +226,8 @@ def _edge_ends(corners: Float[Array, "*b 8 n"]) -> tuple[Array, Array]:
             [part.reshape(*cube.shape[:-4], 4, count) for part in along], axis=-2
         )
 
-    return at_side(0), at_side(1)
+    # Without the barrier XLA recomputes each edge's gradient for all of a corner's three edges.
+    return jax.lax.optimization_barrier((at_side(0), at_side(1)))
 
 
 def _crossing_fraction(

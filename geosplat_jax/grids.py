@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from geosplat_jax._flexicubes_tables import CORNERS
 from geosplat_jax.numerics import safe_norm
 from geosplat_jax.scene import Geometry, Grid
 
@@ -66,7 +67,7 @@ def _interpolate(
     for corner in CORNERS.tolist():
         index = i + corner[0] + vx * (j + corner[1] + vy * (k + corner[2]))
         sides = [part[:, a] if corner[a] else 1.0 - part[:, a] for a in range(3)]
-        result = result + (sides[0] * sides[1] * sides[2])[:, None] * _rows(values, index)
+        result = result + (sides[0] * sides[1] * sides[2])[:, None] * values[index]
     return result
 
 

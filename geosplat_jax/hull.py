@@ -27,7 +27,7 @@ TOLERANCE = 0.02
 SEEN_FRACTION = 0.5
 """A point that fewer of the views see is outside: few cones meet far away, where nobody looks."""
 
-_POINTS_AT_ONCE = 1 << 17
+_POINTS_AT_ONCE = 1 << 15  # what a pass holds then stays in the cache
 _MASK_PIXELS = 400  # larger masks are reduced first; the hull is never sampled that finely
 _COVERED = 0.5
 _FULL, _EMPTY = 1.0 - 1e-3, 1e-3  # coverage beyond these is a whole pixel
@@ -85,7 +85,7 @@ def hull_distance(
     ------
     ValueError : every mask is empty.
     """
-    view = _silhouettes(world_to_camera, intrinsics, masks)
+    view = _Silhouettes(world_to_camera, intrinsics, masks)
     return _evaluate(view, points, tolerance=tolerance, seen_fraction=seen_fraction)
 
 
@@ -105,7 +105,8 @@ def hull_bounds(
 
     Parameters
     ----------
-    margin : added on every side, as a fraction of the longest side.
+    margin : added on every side, as a fraction of the longest side; at least one pixel at the
+        object's distance.
 
     Returns
     -------
@@ -115,7 +116,7 @@ def hull_bounds(
     ------
     ValueError : the lines of sight do not meet, or no point lies on all masks.
     """
-    view = _silhouettes(world_to_camera, intrinsics, masks)
+    view = _Silhouettes(world_to_camera, intrinsics, masks)
     settings = {"tolerance": tolerance, "seen_fraction": seen_fraction}
     center, reach = _common_target(view, intrinsics, masks)
     lo, hi = center - reach, center + reach
@@ -138,7 +139,8 @@ def hull_bounds(
     inside = points[_evaluate(view, points, **settings) < 0.5 * cell.min()]
     if inside.shape[0]:
         lo, hi = np.maximum(inside.min(0) - cell, lo), np.minimum(inside.max(0) + cell, hi)
-    pad = margin * (hi - lo).max()
+    # Where the object is a few pixels wide, its silhouette is only known to about one.
+    pad = max(margin * (hi - lo).max(), reach * view.pixel_angle)
     return lo - pad, hi + pad
 
 
@@ -165,7 +167,7 @@ def hull_sdf(
     """
     points = grid_points(grid)
     cell = float(grid.cell_size)
-    view = _silhouettes(world_to_camera, intrinsics, masks)
+    view = _Silhouettes(world_to_camera, intrinsics, masks)
     near = _evaluate(view, points, tolerance=tolerance, seen_fraction=seen_fraction) / cell
     lo = np.asarray(grid.origin, np.float64)
     hi = lo + cell * np.asarray(grid.shape)
@@ -238,7 +240,6 @@ class _Silhouettes:
         poses = np.asarray(world_to_camera, np.float64)[used]
         centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
         self.used = used
-        self.factor = factor
         self.rotations = poses[:, :3, :3]
         self.centers = centers
         # Capture coordinates may be large; relative to the cameras float32 suffices.
@@ -248,11 +249,8 @@ class _Silhouettes:
         self.intrinsics = np.asarray(intrinsics, np.float64)[used] / np.array(
             [[factor], [factor], [1.0]]
         )
+        self.pixel_angle = 1.0 / float(np.median(self.intrinsics[:, 0, 0]))
         self.distances = np.stack([_signed_pixels(image) for image in coverage])
-
-
-def _silhouettes(world_to_camera, intrinsics, masks) -> _Silhouettes:
-    return _Silhouettes(world_to_camera, intrinsics, masks)
 
 
 def _reduced(coverage: np.ndarray, factor: int) -> np.ndarray:
@@ -263,6 +261,15 @@ def _reduced(coverage: np.ndarray, factor: int) -> np.ndarray:
     return padded.reshape(
         padded.shape[0] // factor, factor, padded.shape[1] // factor, factor
     ).mean((1, 3))
+
+
+def _nearest(target: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    """Distance of every element to the nearest one in ``target``, and the index of that one."""
+    shape = target.shape
+    steps = np.empty(shape)
+    index = np.empty((target.ndim, *shape), np.int32)
+    distance_transform_edt(~target, return_indices=True, distances=steps, indices=index)
+    return steps, tuple(np.asarray(axis) for axis in index)
 
 
 def _signed_pixels(coverage: np.ndarray) -> np.ndarray:
@@ -277,8 +284,8 @@ def _signed_pixels(coverage: np.ndarray) -> np.ndarray:
         if whole.all():
             return np.full(coverage.shape, sign * beyond, np.float32)
         if whole.any():
-            steps, (row, column) = distance_transform_edt(whole, return_indices=True)
-            further = sign * steps + coverage[row, column] - 0.5
+            steps, nearest = _nearest(~whole)
+            further = sign * steps + coverage[nearest] - 0.5
             signed = np.where(whole, further, signed)
     return signed.astype(np.float32)
 
@@ -322,7 +329,8 @@ def _worst_distance(
 
     def look(carry, view):
         largest, seen = carry
-        value, is_seen = _distance_in_view(*view, points)
+        pinhole, matrix, distance = view
+        value, is_seen = _distance_in_view(pinhole, matrix, distance, points)
         kept = []
         for current in largest:
             kept.append(jnp.maximum(current, value))
@@ -350,10 +358,16 @@ def _distance_in_view(pinhole, intrinsics, distances, points):
     row = jnp.clip(v - 0.5, 0.0, height - 1.0)
     left = jnp.minimum(column.astype(jnp.int32), max(width - 2, 0))
     top = jnp.minimum(row.astype(jnp.int32), max(height - 2, 0))
-    right, bottom = jnp.minimum(left + 1, width - 1), jnp.minimum(top + 1, height - 1)
+    right, down = min(1, width - 1), width * min(1, height - 1)
     s, t = column - left.astype(column.dtype), row - top.astype(row.dtype)
-    upper = (1.0 - s) * distances[top, left] + s * distances[top, right]
-    lower = (1.0 - s) * distances[bottom, left] + s * distances[bottom, right]
+    # The clips above keep every index in bounds, so the gathers need not check.
+    corner = top * width + left
+    flat = distances.reshape(-1).at
+    upper_left, upper_right, lower_left, lower_right = (
+        flat[corner + step].get(mode="promise_in_bounds") for step in (0, right, down, right + down)
+    )
+    upper = (1.0 - s) * upper_left + s * upper_right
+    lower = (1.0 - s) * lower_left + s * lower_right
     pixels = (1.0 - t) * upper + t * lower
     world = -pixels * depth * 2.0 / (fx + fy)
     return jnp.where(seen, world, -jnp.inf), seen
@@ -403,7 +417,7 @@ def _extend(near: Float[np.ndarray, "Z Y X"]) -> Float[np.ndarray, "Z Y X"]:
         is_far = value > _BAND_CELLS
         if not in_band.any() or not is_far.any():
             continue
-        steps, index = distance_transform_edt(~in_band, return_indices=True)
-        further = side * (steps + value[tuple(index)])
+        steps, nearest = _nearest(in_band)
+        further = side * (steps + value[nearest])
         signed = np.where(is_far, further, signed)
     return np.where(np.isfinite(signed), signed, _BAND_CELLS).astype(np.float32)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from geosplat_jax.numerics import safe_sqrt
+from geosplat_jax.numerics import fast_arctan2, safe_sqrt
 from geosplat_jax.scene import EnvLight
 
 POLE_EPSILON = 1e-3
@@ -131,7 +131,7 @@ def _texel_directions(height: int, width: int) -> np.ndarray:
 @jax.custom_jvp
 def _spherical_angles(x, y, z):
     """Azimuth in [-pi, pi] and polar angle in [0, pi]; zero input gives zeros."""
-    return jnp.arctan2(y, x), jnp.arctan2(safe_sqrt(x * x + y * y), z)
+    return fast_arctan2(y, x), fast_arctan2(safe_sqrt(x * x + y * y), z)
 
 
 @_spherical_angles.defjvp
@@ -191,10 +191,10 @@ def _footprint(directions: Float[Array, "N 3"], height: int, width: int) -> _Foo
     x0 = left.astype(jnp.int32) % width
     y0 = jnp.clip(top.astype(jnp.int32), 0, height - 1)
     x1, y1 = (x0 + 1) % width, jnp.minimum(y0 + 1, height - 1)
-    return _Footprint(
-        (y0 * width + x0, y0 * width + x1, y1 * width + x0, y1 * width + x1),
-        ((1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy),
-    )
+    indices = (y0 * width + x0, y0 * width + x1, y1 * width + x0, y1 * width + x1)
+    weights = ((1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy)
+    # Without the barrier XLA fuses all of the above into, and repeats it for, every gather.
+    return _Footprint(*jax.lax.optimization_barrier((indices, weights)))
 
 
 def _gather(

@@ -61,17 +61,20 @@ def directional_albedo(
     -------
     (..., 2) float64 scale and bias; their sum never exceeds 1.
     """
-    cos_v = np.asarray(n_dot_v, np.float64)[..., None, None]
-    alpha = np.asarray(roughness, np.float64)[..., None, None] ** 2
+    # The floors select the limit of a mirror at exactly grazing view, which is 1.
+    cos_v = np.maximum(np.asarray(n_dot_v, np.float64)[..., None, None], 1e-4)
+    alpha = np.maximum(np.asarray(roughness, np.float64)[..., None, None] ** 2, 1e-6)
     unit = (np.arange(samples) + 0.5) / samples
-    azimuth, height = np.pi * unit[:, None], unit[None, :]  # the other half circle mirrors this
+    azimuth = np.pi * unit[:, None]  # the other half circle mirrors this one
+    # Cosine spacing in height absorbs the square root at both ends of the cap.
+    height = 0.5 - 0.5 * np.cos(np.pi * unit)[None, :]
+    mass = np.sin(np.pi * unit)[None, :] / (samples * np.sin(np.pi * unit).sum())
 
     def smith(cosine):  # cos * sqrt(1 + alpha^2 tan^2), free of the division
         return np.sqrt(alpha**2 + (1 - alpha**2) * cosine**2)
 
     sin_v = np.sqrt(1 - cos_v**2)
-    stretched = smith(cos_v) + (alpha == 0) * 1e-12
-    vx, vz = alpha * sin_v / stretched, cos_v / stretched
+    vx, vz = alpha * sin_v / smith(cos_v), cos_v / smith(cos_v)
     cz = (1 - height) * (1 + vz) - vz
     radius = np.sqrt(np.maximum(1 - cz**2, 0))
     hx, hy = alpha * (radius * np.cos(azimuth) + vx), alpha * radius * np.sin(azimuth)
@@ -82,12 +85,11 @@ def directional_albedo(
     lit = cos_l > 0
     cos_l = np.where(lit, cos_l, 1.0)
     # G2 / G1 of the height-correlated Smith function, with n.v cancelled.
-    weight = cos_l * (cos_v + smith(cos_v)) / (cos_v * smith(cos_l) + cos_l * smith(cos_v) + 1e-30)
-    weight = np.where(lit, weight, 0.0)
+    weight = cos_l * (cos_v + smith(cos_v)) / (cos_v * smith(cos_l) + cos_l * smith(cos_v))
+    weight = np.where(lit, weight, 0.0) * mass
     fresnel = (1 - v_dot_h) ** 5
-    return np.stack(
-        [(weight * (1 - fresnel)).mean((-2, -1)), (weight * fresnel).mean((-2, -1))], axis=-1
-    )
+    split = [weight * (1 - fresnel), weight * fresnel]
+    return np.stack([part.sum((-2, -1)) for part in split], axis=-1)
 
 
 @lru_cache(maxsize=4)
@@ -97,7 +99,7 @@ def _fg_values(cosines: int, roughnesses: int) -> np.ndarray:
     return np.stack(rows, axis=1).astype(np.float32)
 
 
-def fg_table(*, cosines: int = 64, roughnesses: int = 32) -> Float[Array, "V R 2"]:
+def fg_table(*, cosines: int = 128, roughnesses: int = 32) -> Float[Array, "V R 2"]:
     """Tabulate `directional_albedo` over n.v in [0, 1] and roughness in [0, 1], ends included."""
     return jnp.asarray(_fg_values(cosines, roughnesses))
 
@@ -113,17 +115,21 @@ def fg_lookup(
     y = jnp.clip(n_dot_v, 0.0, 1.0) * (rows - 1)
     x = jnp.clip(roughness, 0.0, 1.0) * (columns - 1)
     y0, x0 = jnp.clip(jnp.floor(y), 0.0, rows - 2.0), jnp.clip(jnp.floor(x), 0.0, columns - 2.0)
-    fy, fx = (y - y0)[:, None], (x - x0)[:, None]
+    fy, fx = y - y0, x - x0
     index = y0.astype(jnp.int32) * columns + x0.astype(jnp.int32)
     flat = table.reshape(-1, 2).astype(n_dot_v.dtype)
+    corners = [
+        flat.at[index + offset].get(mode="promise_in_bounds")
+        for offset in (0, 1, columns, columns + 1)
+    ]
 
-    def corner(offset):
-        return flat.at[index + offset].get(mode="promise_in_bounds")
+    # One column at a time: sums over an axis of 2 in the backward pass would be slow.
+    def blend(channel):
+        a, b, c, d = (corner[:, channel] for corner in corners)
+        near, far = a + (b - a) * fx, c + (d - c) * fx
+        return near + (far - near) * fy
 
-    near = corner(0) * (1 - fx) + corner(1) * fx
-    far = corner(columns) * (1 - fx) + corner(columns + 1) * fx
-    both = near * (1 - fy) + far * fy
-    return both[:, 0], both[:, 1]
+    return blend(0), blend(1)
 
 
 def split_sum(

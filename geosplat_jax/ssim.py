@@ -1,7 +1,5 @@
 """Structural similarity, fast in both directions on a CPU."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -42,17 +40,19 @@ def _reference_blur(maps: Float[Array, "M h wc"], channels: int) -> Float[Array,
 # the barriers XLA fuses the passes into one of 121 taps, and autodiff would add eleven padded
 # copies: 200 ms where this takes 5 (four views of 200 x 200). Dense Toeplitz matrix products take
 # 24, blocked ones 22, a depthwise convolution 400.
-@functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
-def _blur(maps: Float[Array, "M h wc"], channels: int) -> Float[Array, "M h2 wc2"]:
+def _blur_primal(maps: Float[Array, "M h wc"], channels: int) -> Float[Array, "M h2 wc2"]:
     barrier = jax.lax.optimization_barrier
     rows = barrier(_blur_axis(barrier(maps), -2, 1))
     return barrier(_blur_axis(rows, -1, channels))
 
 
+_blur = jax.custom_vjp(_blur_primal, nondiff_argnums=(1,))
+
+
 def _blur_forward(
     maps: Float[Array, "M h wc"], channels: int
 ) -> tuple[Float[Array, "M h2 wc2"], None]:
-    return _blur(maps, channels), None
+    return _blur_primal(maps, channels), None
 
 
 def _blur_backward(
@@ -61,7 +61,7 @@ def _blur_backward(
     """Apply the transpose: a symmetric window is its own adjoint, on a zero border."""
     border = 2 * _RADIUS
     widths = ((0, 0), (border, border), (border * channels, border * channels))
-    return (_blur(jnp.pad(cotangent, widths), channels),)
+    return (_blur_primal(jnp.pad(cotangent, widths), channels),)
 
 
 _blur.defvjp(_blur_forward, _blur_backward)

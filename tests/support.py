@@ -4,7 +4,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
+
+from geosplat_jax.config import make_config
+from geosplat_jax.io.dataset import Dataset
+from geosplat_jax.io.views import Views
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
@@ -25,3 +30,92 @@ def shared_path(*parts):
     if not path.exists():
         pytest.skip(f"{'/'.join(parts)} is not on this machine")
     return path
+
+
+def look_at_poses(count, *, distance=3.0):
+    """Camera-to-world matrices (Blender axes) spread over a sphere, looking at the origin."""
+    poses = []
+    for k in range(count):
+        height = 1 - 2 * (k + 0.5) / count
+        angle = k * np.pi * (3 - 5**0.5)
+        ring = np.sqrt(1 - height**2)
+        back = np.array([ring * np.cos(angle), ring * np.sin(angle), height])
+        right = np.cross([0.0, 0.0, 1.0], back)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+        pose[:3, 3] = distance * back
+        poses.append(pose)
+    return np.stack(poses)
+
+
+def sphere_views(count=6, *, size=24, radius=0.5, field_of_view=0.6):
+    """Views of a sphere whose colour shows its normal, with exact masks and true normals."""
+    poses = look_at_poses(count)
+    focal = 0.5 * size / np.tan(0.5 * field_of_view)
+    steps = np.arange(size) + 0.5 - size / 2
+    x, y = np.meshgrid(steps / focal, -steps / focal)
+    rays = np.stack([x, y, -np.ones_like(x)], axis=-1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    images, normals = [], []
+    for pose in poses:
+        towards = rays @ pose[:3, :3].T
+        along = towards @ pose[:3, 3]
+        root = along**2 - (pose[:3, 3] @ pose[:3, 3] - radius**2)
+        hit = root > 0
+        travelled = -along - np.sqrt(np.where(hit, root, 0.0))
+        normal = (pose[:3, 3] + travelled[..., None] * towards) / radius
+        normal = np.where(hit[..., None], normal, 0.0)
+        color = np.where(hit[..., None], 0.5 + 0.4 * normal, 0.0)
+        images.append(np.concatenate([color, hit[..., None]], axis=-1))
+        normals.append(normal)
+    intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
+    return Views(
+        names=tuple(f"view_{k}" for k in range(count)),
+        camera_to_world=poses,
+        intrinsics=np.repeat(intrinsics[None], count, axis=0),
+        images=np.stack(images).astype(np.float32),
+        truth={"normal": np.stack(normals).astype(np.float32)},
+    )
+
+
+def sphere_dataset(**kwargs):
+    """Return the views of `sphere_views` as training and test split of a dataset."""
+    views = sphere_views(**kwargs)
+    return Dataset(
+        name="sphere",
+        layout="memory",
+        root=Path(),
+        train=views,
+        test=views,
+        lights={},
+        train_light=None,
+        background="white",
+        bounds=(np.full(3, -0.6), np.full(3, 0.6)),
+    )
+
+
+TINY = (
+    "geometry.resolution=10",
+    "geometry.vertex_fraction=0.0",
+    "run.steps=4",
+    "run.batch_views=1",
+    "run.checkpoint_every=2",
+    "run.preview_every=0",
+    "model.material.grid.levels=2",
+    "model.material.grid.features=2",
+    "model.material.grid.log2_entries=10",
+    "model.material.grid.finest=24",
+    "model.material.albedo_hidden=[8, 8]",
+    "model.material.surface_hidden=[8]",
+    "model.light.height=8",
+    "model.light.width=16",
+    "model.light.roughness=[0.0, 0.1, 0.2, 0.3, 0.4, 0.55, 0.75, 1.0]",
+    "objective.smoothness_samples=64",
+)
+"""Overrides that make a run small enough for a test."""
+
+
+def tiny_config(*overrides):
+    """Return a configuration for tests; later overrides win."""
+    return make_config(overrides=(*TINY, *overrides))

@@ -176,7 +176,7 @@ def test_another_configuration_is_refused_by_leaf(tmp_path):
 
 
 def test_what_cannot_be_stored_is_refused(tmp_path):
-    with pytest.raises(CheckpointError, match=r"leaf \['name'\] .* must be an array of numbers"):
+    with pytest.raises(CheckpointError, match=r"leaf \['name'\] must be an array of numbers"):
         save_checkpoint(tmp_path, 1, tree={"name": "text"}, meta={})
     with pytest.raises(CheckpointError, match="metadata is not JSON"):
         save_checkpoint(tmp_path, 1, tree={}, meta={"x": object()})

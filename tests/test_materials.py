@@ -8,21 +8,19 @@ import numpy as np
 import pytest
 from support import double_precision
 
+from geosplat_jax import materials
 from geosplat_jax.hashgrid import HashGridSpec
-from geosplat_jax.materials import (
-    INITIAL_LOGITS,
-    MaterialSpec,
-    indirect_logits,
-    init_materials,
-    inward_shift,
-    materials_at,
-    smoothness,
-    to_unit_cube,
-)
+from geosplat_jax.materials import INITIAL_LOGITS, MaterialSpec, init_materials, to_unit_cube
 
 GRID = HashGridSpec(levels=3, features=2, log2_entries=8, coarsest=2, finest=8)
 CENTER = jnp.asarray([0.5, -1.0, 2.0])
 HALF_EXTENT = jnp.asarray(1.5)
+
+# One compilation costs less than a hundred eager operations.
+materials_at = jax.jit(materials.materials_at, static_argnames=("spec", "position_gradient"))
+inward_shift = jax.jit(materials.inward_shift, static_argnames="spec")
+indirect_logits = jax.jit(materials.indirect_logits, static_argnames="spec")
+smoothness = jax.jit(materials.smoothness, static_argnames="spec")
 
 WHERE = {"center": CENTER, "half_extent": HALF_EXTENT}
 
@@ -109,7 +107,7 @@ def test_every_parameter_receives_a_gradient(shared):
         total = total + jnp.sum(inward_shift(params, points, spec=spec, **WHERE) ** 2)
         return total + jnp.sum(indirect_logits(params, points, spec=spec, **WHERE) ** 2)
 
-    for leaf in jax.tree.leaves(jax.grad(value)(params)):
+    for leaf in jax.tree.leaves(jax.jit(jax.grad(value))(params)):
         assert bool(jnp.all(jnp.isfinite(leaf)))
         assert float(jnp.max(jnp.abs(leaf))) > 0
 
@@ -138,7 +136,7 @@ def test_position_gradients_are_a_choice_and_agree_with_differences():
             return jnp.sum(found.albedo**2) + jnp.sum(jnp.sin(found.roughness + found.metallic))
 
         along = jnp.asarray(rng.standard_normal(points.shape))
-        derivative = jnp.vdot(jax.grad(value)(points, True), along)
+        derivative = jnp.vdot(jax.jit(jax.grad(value), static_argnums=1)(points, True), along)
         change = value(points + step * along, True) - value(points - step * along, True)
         np.testing.assert_allclose(derivative, change / (2 * step), rtol=1e-6)
         np.testing.assert_array_equal(jax.grad(value)(points, False), 0.0)
@@ -169,7 +167,7 @@ def test_smoothness_is_zero_for_a_constant_field_and_positive_otherwise():
     params, points = _lively(spec), _points()
     mask, key = jnp.ones(60, bool), jax.random.key(2)
     measure = partial(smoothness, spec=spec, **WHERE)
-    assert float(measure(_constant(params), points, mask, key)) == 0.0
+    assert float(measure(_constant(params), points, mask, key)) < 1e-6  # weights sum to 1 rounded
     assert float(measure(params, points, mask, key)) > 1e-3
 
 
@@ -207,7 +205,7 @@ def test_smoothness_without_points_is_zero_with_zero_gradient():
 def test_jit_equals_eager():
     spec = _spec(shared=True)
     params, points = _lively(spec), _points()
-    found = partial(materials_at, spec=spec, **WHERE)
+    found = partial(materials.materials_at, spec=spec, **WHERE)
     for a, b in zip(
         jax.tree.leaves(found(params, points)),
         jax.tree.leaves(jax.jit(found)(params, points)),

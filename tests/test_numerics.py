@@ -9,6 +9,7 @@ from support import double_precision
 from geosplat_jax.numerics import (
     LENGTH_EPSILON,
     clamp_away_from_zero,
+    fast_arctan2,
     safe_divide,
     safe_log,
     safe_norm,
@@ -150,3 +151,18 @@ def test_second_derivatives_of_the_norm_are_right():
         unit = np.asarray(x) / length
         expected = (np.eye(3) - np.outer(unit, unit)) / length
         np.testing.assert_allclose(jax.hessian(safe_norm)(x), expected, atol=1e-12)
+
+
+def test_fast_angle_agrees_with_the_library_in_every_quadrant():
+    angle = np.linspace(-np.pi + 1e-3, np.pi - 1e-3, 2001)
+    y, x = np.sin(angle), np.cos(angle)
+    for scale in (1e-15, 1.0, 1e15):
+        measured = fast_arctan2(
+            jnp.asarray(scale * y, jnp.float32), jnp.asarray(scale * x, jnp.float32)
+        )
+        np.testing.assert_allclose(measured, angle, atol=5e-7)
+    axes = fast_arctan2(jnp.asarray([0.0, 0, 1, -1, 0]), jnp.asarray([0.0, 1, 0, 0, -1]))
+    np.testing.assert_allclose(axes, [0, 0, np.pi / 2, -np.pi / 2, np.pi], atol=5e-7)
+    with double_precision():
+        measured = fast_arctan2(jnp.asarray(y), jnp.asarray(x))
+        np.testing.assert_allclose(measured, angle, atol=1e-14)

@@ -189,7 +189,7 @@ def _pack(tree: Any) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
 
 def _unpack(path: Path, name: str, described: dict, array: np.ndarray, like: Any) -> Any:
     """Turn a plain array back into a leaf, checking it against ``like``."""
-    wanted = {"shape": list(np.shape(like))}
+    wanted: dict[str, Any] = {"shape": list(np.shape(like))}
     if _is_key(like):
         wanted["key"] = str(jax.random.key_impl(like)) if isinstance(like, jax.Array) else None
     else:
@@ -271,7 +271,7 @@ def _listed(folder: Path) -> list[Path]:
 
 
 def _step(path: Path) -> int:
-    return int(_NAME.fullmatch(path.name)[1])
+    return int(path.stem.removeprefix("checkpoint_"))
 
 
 def _remove(path: Path) -> None:

@@ -77,7 +77,7 @@ def load_dataset(
     layout: str | None = None,
     downscale: int = 1,
     light: str | None = None,
-    bounds: tuple[Sequence[float], Sequence[float]] | None = None,
+    bounds: Sequence[Sequence[float | int] | np.ndarray] | None = None,
     train_views: int | None = None,
     test_views: int | None = None,
 ) -> Dataset:
@@ -220,13 +220,13 @@ def _check_cameras_outside(views: Views, bounds: tuple[np.ndarray, np.ndarray]) 
 
 def _checked_bounds(bounds) -> tuple[np.ndarray, np.ndarray]:
     try:
-        lo, hi = (np.asarray(corner, np.float64) for corner in bounds)
-        is_box = lo.shape == hi.shape == (3,) and bool((lo < hi).all())
+        corners = np.asarray(bounds, np.float64)
     except (TypeError, ValueError):
-        is_box = False
-    if not is_box or not np.isfinite([lo, hi]).all():
+        corners = np.empty(0)
+    is_box = corners.shape == (2, 3) and np.isfinite(corners).all()
+    if not is_box or not (corners[0] < corners[1]).all():
         raise SceneError(f"bounds must be lo (x, y, z) below hi (x, y, z), got {bounds!r}")
-    return lo, hi
+    return corners[0], corners[1]
 
 
 def _spread(frames: Sequence[Frame], limit: int | None, name: str) -> Sequence[Frame]:

@@ -79,7 +79,7 @@ def _textures(materials: Float[np.ndarray, "S S 5"]) -> tuple[Image.Image, Image
 def _checked_mesh(
     vertices: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
-    normals: Float[np.ndarray, "V 3"],
+    normals: Float[np.ndarray, "W 3"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
     """Drop degenerate faces and unused vertices; turn a closed inside-out mesh outward."""
     if vertices.shape != normals.shape:
@@ -203,7 +203,7 @@ def export_mesh_glb(
     path: str | Path,
     vertices: Float[Array | np.ndarray, "V 3"],
     faces: Int[Array | np.ndarray, "F 3"],
-    normals: Float[Array | np.ndarray, "V 3"],
+    normals: Float[Array | np.ndarray, "W 3"],
     sample_materials: SampleMaterials,
     *,
     vertex_colors: bool = False,

@@ -22,9 +22,10 @@ from geosplat_jax.scene import Camera, Mesh
 _DEGENERATE_HEIGHT = 1e-7
 # Texels between charts: room for bilinear taps and for two mipmap levels.
 _CHART_PADDING = 4
-# Charts may grow four times as costly as xatlas' default of 2 allows: the fastest of the settings
-# tried on noisy isosurfaces, with fewer charts and so fewer seams.
-_CHART_COST = 8.0
+# A chart holds at most this share of the area, and on average this many faces: the time to flatten
+# a chart grows faster than its size (33k faces in 5 s where unbounded charts took 57).
+_CHART_AREA_SHARE = 1 / 64
+_FACES_PER_CHART = 512
 # Pairs of a triangle and a pixel examined at once: bounds memory at about 100 MB.
 _PAIRS_PER_CHUNK = 1 << 20
 # Faces that come nearer to the camera than this, in world units, are not drawn.
@@ -103,6 +104,12 @@ def signed_volume(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
 
+def surface_area(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> float:
+    """Total area of the faces."""
+    a, b, c = np.moveaxis(np.asarray(vertices, np.float64)[faces], 1, 0)
+    return float(0.5 * np.sqrt((np.cross(b - a, c - a) ** 2).sum(-1)).sum())
+
+
 def z_up_to_y_up(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
     """Turn positions or normals of the z-up world into glTF's y-up axes: (x, z, -y)."""
     return np.stack([vectors[:, 0], vectors[:, 2], -vectors[:, 1]], axis=-1)
@@ -127,7 +134,8 @@ def unwrap(
         np.ascontiguousarray(normals, np.float32),
     )
     charts, packing = xatlas.ChartOptions(), xatlas.PackOptions()
-    charts.max_cost = _CHART_COST
+    share = min(_CHART_AREA_SHARE, _FACES_PER_CHART / len(faces))
+    charts.max_chart_area = share * surface_area(vertices, faces)
     packing.resolution = texture_size
     packing.padding = _CHART_PADDING
     packing.bilinear = True

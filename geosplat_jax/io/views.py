@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -48,8 +48,8 @@ class Views:
     camera_to_world: Float[np.ndarray, "V 4 4"]
     intrinsics: Float[np.ndarray, "V 3 3"]
     images: Float[np.ndarray, "V H W 4"]
-    truth: Mapping[str, np.ndarray] = field(default_factory=dict)
-    relight: Mapping[str, np.ndarray] = field(default_factory=dict)
+    truth: Mapping[str, Any] = field(default_factory=dict)
+    relight: Mapping[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Count the views."""
@@ -195,7 +195,7 @@ def _truth(
     factor: int,
     albedo_is_srgb: bool,
     problems: list[str],
-) -> Mapping[str, np.ndarray]:
+) -> Mapping[str, Any]:
     def maker(key: str) -> Callable[[], np.ndarray]:
         def read(index: int) -> np.ndarray:
             is_srgb = albedo_is_srgb and key == "albedo"
@@ -221,7 +221,7 @@ def _read_truth(path: Path, key: str, image: np.ndarray, factor: int, is_srgb: b
 
 def _relight(
     frames: Sequence[Frame], images: np.ndarray, factor: int, problems: list[str]
-) -> Mapping[str, np.ndarray]:
+) -> Mapping[str, Any]:
     def maker(light: str) -> Callable[[], np.ndarray]:
         def read(index: int) -> np.ndarray:
             path = frames[index].relight[light]

@@ -1,0 +1,159 @@
+"""The order of the modules, the purity of the jitted ones, docstrings on all that is public."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import geosplat_jax
+
+PACKAGE = Path(geosplat_jax.__file__).parent
+NAME = "geosplat_jax"
+
+# Lowest first: a module imports only modules above its own line. `io` is one layer; within it,
+# modules may import each other without a cycle.
+ORDER = [
+    "numerics",
+    "rotation",
+    "color",
+    "ssim",
+    "capacity",
+    "scene",
+    "metrics",
+    "mesh_ops",
+    "grids",
+    "_flexicubes_tables",
+    "geometry",
+    "hull",
+    "adapter",
+    "hashgrid",
+    "bsdf",
+    "materials",
+    "light",
+    "trace",
+    "shading",
+    "projection",
+    "_tiles",
+    "_composite",
+    "rasterize",
+    "render",
+    "losses",
+    "config",
+    "step",
+    "io",
+    "train",
+    "evaluate",
+    "assets",
+    "cli",
+]
+
+# Everything below `io` may run inside jit; of these, what stands before `config` takes plain
+# arguments and knows no configuration (the order enforces that).
+JITTED = ORDER[: ORDER.index("io")]
+HOST_ONLY = {"OpenImageIO", "trimesh", "skimage", "xatlas", "PIL", "rich"}
+
+
+def module_name(path):
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+SOURCES = {
+    module_name(path): ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+    for path in sorted(PACKAGE.rglob("*.py"))
+}
+MODULES = sorted(name for name in SOURCES if name)
+
+
+def layer(module):
+    return module.split(".")[0]
+
+
+def resolve(dotted):
+    """Longest prefix of a dotted name that is a module of the package, or None."""
+    parts = dotted.split(".")
+    names = (".".join(parts[:end]) for end in range(len(parts), 0, -1))
+    return next((name for name in names if name in SOURCES), None)
+
+
+def imports(module):
+    """Modules of this package, and foreign top-level packages, that a module imports anywhere."""
+    own, foreign = set(), set()
+    for node in ast.walk(SOURCES[module]):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, (
+                f"{module}:{node.lineno} imports relatively; name {NAME} instead"
+            )
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        for name in names:
+            if layer(name) != NAME:
+                foreign.add(layer(name))
+            elif "." in name and (target := resolve(name.split(".", 1)[1])):
+                own.add(target)
+    return own, foreign
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_every_module_has_its_place_in_the_order(module):
+    assert layer(module) in ORDER, (
+        f"{NAME}.{module} has no place in the architecture: add {layer(module)!r} to ORDER in "
+        "tests/test_architecture.py (below all that it imports) and to docs/architecture.md"
+    )
+
+
+@pytest.mark.parametrize("module", [m for m in MODULES if layer(m) in ORDER])
+def test_imports_go_only_to_lower_modules(module):
+    rank = ORDER.index(layer(module))
+    upward = {
+        other
+        for other in imports(module)[0]
+        if layer(other) != layer(module)
+        and (layer(other) not in ORDER or ORDER.index(layer(other)) >= rank)
+    }
+    assert not upward, f"{module} imports {sorted(upward)}, not below it in ORDER"
+
+
+@pytest.mark.parametrize("module", [m for m in MODULES if layer(m) in JITTED])
+def test_jitted_modules_import_no_host_library(module):
+    forbidden = imports(module)[1] & HOST_ONLY
+    assert not forbidden, f"{module} may run inside jit; move its use of {sorted(forbidden)} to io"
+
+
+def test_modules_of_one_layer_have_no_import_cycle():
+    finished, path = set(), []
+
+    def visit(module):
+        assert module not in path, f"import cycle: {' -> '.join([*path, module])}"
+        if module in finished:
+            return
+        path.append(module)
+        for other in sorted(imports(module)[0] - {module}):
+            visit(other)
+        path.pop()
+        finished.add(module)
+
+    for module in MODULES:
+        visit(module)
+
+
+def public_definitions(module):
+    """Yield (name, node) of a module, its public functions and classes, and their methods."""
+    tree = SOURCES[module]
+    yield module, tree
+    definitions = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+    for node in tree.body:
+        if isinstance(node, definitions) and not node.name.startswith("_"):
+            yield f"{module}.{node.name}", node
+            for member in node.body if isinstance(node, ast.ClassDef) else ():
+                if isinstance(member, definitions) and not member.name.startswith("_"):
+                    yield f"{module}.{node.name}.{member.name}", member
+
+
+@pytest.mark.parametrize("module", [m for m in MODULES if SOURCES[m].body])
+def test_public_functions_and_classes_have_docstrings(module):
+    bare = [name for name, node in public_definitions(module) if not ast.get_docstring(node)]
+    assert not bare, f"without a docstring: {bare}"

@@ -1,0 +1,390 @@
+import json
+import struct
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from scipy import ndimage
+
+from geosplat_jax.io import export, meshes
+from geosplat_jax.io.images import read_linear
+from geosplat_jax.scene import Camera, Mesh
+
+# Half a texel across a chart's border, where a filled gutter is constant; 8 bits are far finer.
+COLOR_TOLERANCE = 0.03
+MEAN_COLOR_TOLERANCE = 0.004
+TEXTURE = 256
+
+
+def sphere(subdivisions=3, radius=0.8):
+    mesh = trimesh.creation.icosphere(subdivisions, radius)
+    vertices = np.asarray(mesh.vertices, np.float32)
+    return vertices, np.asarray(mesh.faces, np.int32), vertices / np.float32(radius)
+
+
+def materials(points):
+    """Smooth, and different on all six sides of the world."""
+    points = np.asarray(points)
+    albedo = 0.5 + 0.45 * np.sin(points * np.array([1.0, 1.7, 2.3]) + np.array([0.3, 1.1, 2.0]))
+    return albedo, 0.5 + 0.4 * points[:, 2], 0.5 - 0.5 * points[:, 0]
+
+
+def only_mesh(path):
+    scene = trimesh.load(path, process=False)
+    (mesh,) = scene.geometry.values()
+    return mesh
+
+
+def glb_tree(path):
+    data = path.read_bytes()
+    length = struct.unpack("<I", data[12:16])[0]
+    return json.loads(data[20 : 20 + length])
+
+
+def to_z_up(vectors):
+    return np.stack([vectors[:, 0], -vectors[:, 2], vectors[:, 1]], -1)
+
+
+def sample(image, uv):
+    """Bilinear lookup as a renderer does it; ``uv`` is trimesh's, v upwards."""
+    pixels = np.asarray(image, np.float64) / 255.0
+    height, width = pixels.shape[:2]
+    rows = (1 - uv[:, 1]) * height - 0.5
+    columns = uv[:, 0] * width - 0.5
+    return np.stack(
+        [
+            ndimage.map_coordinates(pixels[..., k], [rows, columns], order=1, mode="nearest")
+            for k in range(3)
+        ],
+        axis=-1,
+    )
+
+
+def srgb_to_linear(v):
+    return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
+
+
+@pytest.fixture(scope="module")
+def textured(tmp_path_factory):
+    path = tmp_path_factory.mktemp("glb") / "sphere.glb"
+    vertices, faces, normals = sphere()
+    info = export.export_mesh_glb(path, vertices, faces, normals, materials, texture_size=TEXTURE)
+    return path, info
+
+
+def test_glb_texture_shows_the_materials_at_every_vertex_and_face_centre(textured):
+    mesh = only_mesh(textured[0])
+    corners = np.asarray(mesh.vertices)[mesh.faces].mean(1)
+    points = to_z_up(np.concatenate([mesh.vertices, corners]))
+    uv = np.concatenate([mesh.visual.uv, mesh.visual.uv[mesh.faces].mean(1)])
+    albedo, roughness, metallic = materials(points)
+    material = mesh.visual.material
+    seen = srgb_to_linear(sample(material.baseColorTexture, uv))
+    np.testing.assert_allclose(seen, albedo, atol=COLOR_TOLERANCE)
+    assert np.abs(seen - albedo).mean() < MEAN_COLOR_TOLERANCE
+    flipped = srgb_to_linear(sample(material.baseColorTexture, uv * [1, -1] + [0, 1]))
+    assert np.abs(flipped - albedo).mean() > 10 * MEAN_COLOR_TOLERANCE
+    packed = sample(material.metallicRoughnessTexture, uv)
+    np.testing.assert_allclose(packed[:, 1], roughness, atol=COLOR_TOLERANCE)
+    np.testing.assert_allclose(packed[:, 2], metallic, atol=COLOR_TOLERANCE)
+
+
+def test_glb_base_color_is_srgb_and_roughness_is_linear(tmp_path):
+    vertices, faces, normals = sphere(1)
+
+    def constant(points):
+        ones = np.ones(len(points))
+        return 0.2 * np.ones((len(points), 3)), 0.2 * ones, 0.6 * ones
+
+    export.export_mesh_glb(tmp_path / "a.glb", vertices, faces, normals, constant, texture_size=32)
+    material = only_mesh(tmp_path / "a.glb").visual.material
+    # Filled gutters: no texel, in or out of the charts, is anything else.
+    assert np.unique(np.asarray(material.baseColorTexture)).tolist() == [124]
+    assert np.unique(np.asarray(material.metallicRoughnessTexture)[..., 1]).tolist() == [51]
+    assert np.unique(np.asarray(material.metallicRoughnessTexture)[..., 2]).tolist() == [153]
+
+
+def test_glb_keeps_the_closed_surface_its_volume_and_its_normals(textured):
+    path, info = textured
+    mesh = only_mesh(path)
+    normals = np.array(mesh.vertex_normals)
+    expected = to_z_up(mesh.vertices) / 0.8
+    np.testing.assert_allclose(to_z_up(normals), expected, atol=1e-3)
+    welded = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    welded.merge_vertices(merge_tex=True, merge_norm=True)
+    vertices, faces, _ = sphere()
+    assert welded.is_watertight
+    assert welded.volume == pytest.approx(meshes.signed_volume(vertices, faces), rel=1e-5)
+    assert info["closed"]
+    assert not info["flipped"]
+    assert info["faces"] == len(faces)
+
+
+def test_glb_material_is_opaque_and_single_sided_when_closed(textured):
+    tree = glb_tree(textured[0])
+    (material,) = tree["materials"]
+    assert material["alphaMode"] == "OPAQUE"
+    assert not material.get("doubleSided", False)
+    assert all(image["mimeType"] == "image/png" for image in tree["images"])
+    factors = material["pbrMetallicRoughness"]
+    assert factors["metallicFactor"] == factors["roughnessFactor"] == 1.0
+
+
+def test_world_up_becomes_gltf_up():
+    np.testing.assert_array_equal(
+        meshes.z_up_to_y_up(np.eye(3)), [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    )
+
+
+def test_vertex_colors_are_linear_floats(tmp_path):
+    vertices, faces, normals = sphere(2)
+    path = tmp_path / "colored.glb"
+    export.export_mesh_glb(path, vertices, faces, normals, materials, vertex_colors=True)
+    tree = glb_tree(path)
+    attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+    accessor = tree["accessors"][attributes["COLOR_0"]]
+    assert accessor["componentType"] == 5126
+    assert accessor["type"] == "VEC3"
+    mesh = only_mesh(path)
+    albedo, roughness, _ = materials(vertices)
+    np.testing.assert_allclose(mesh.visual.vertex_attributes["color"], albedo, atol=1e-6)
+    written = np.ravel(mesh.vertex_attributes["_ROUGHNESS"])
+    np.testing.assert_allclose(written, roughness, atol=1e-6)
+    assert mesh.visual.material.roughnessFactor == pytest.approx(np.median(roughness), abs=1e-6)
+
+
+def test_inside_out_meshes_are_turned_and_open_ones_are_double_sided(tmp_path):
+    vertices, faces, normals = sphere(1)
+    arguments = (normals, materials)
+    turned = export.export_mesh_glb(
+        tmp_path / "in.glb", vertices, faces[:, ::-1], *arguments, vertex_colors=True
+    )
+    assert turned["flipped"]
+    assert only_mesh(tmp_path / "in.glb").volume > 0
+    opened = export.export_mesh_glb(
+        tmp_path / "open.glb", vertices, faces[:-1], *arguments, vertex_colors=True
+    )
+    assert not opened["closed"]
+    assert glb_tree(tmp_path / "open.glb")["materials"][0]["doubleSided"]
+
+
+def test_degenerate_faces_are_dropped_before_unwrapping(tmp_path):
+    vertices, faces, normals = sphere(1)
+    bad = np.array([[0, 0, 1], [2, 3, 2], [5, 5, 5]], np.int32)
+    info = export.export_mesh_glb(
+        tmp_path / "a.glb",
+        vertices,
+        np.concatenate([bad, faces]),
+        normals,
+        materials,
+        texture_size=64,
+    )
+    assert info["dropped_faces"] == 3
+    assert info["faces"] == len(faces)
+    assert info["closed"]
+
+
+def test_unusable_meshes_are_refused_and_leave_no_file(tmp_path):
+    vertices, faces, normals = sphere(1)
+    path = tmp_path / "a.glb"
+    with pytest.raises(ValueError, match="empty surface"):
+        export.export_mesh_glb(path, vertices, faces[:0], normals, materials)
+    with pytest.raises(ValueError, match="finite"):
+        export.export_mesh_glb(path, np.nan * vertices, faces, normals, materials)
+    with pytest.raises(ValueError, match="one a vertex"):
+        export.export_mesh_glb(path, vertices, faces, normals[:-1], materials)
+    with pytest.raises(ValueError, match="sample_materials must return"):
+        export.export_mesh_glb(
+            path, vertices, faces, normals, lambda p: (p, p, p), vertex_colors=True
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_materials_are_sampled_with_one_shape(monkeypatch):
+    monkeypatch.setattr(export, "_SAMPLES_PER_CALL", 100)
+    sizes = []
+
+    def recording(points):
+        sizes.append(len(points))
+        return materials(points)
+
+    points = np.random.default_rng(0).uniform(-1, 1, (250, 3)).astype(np.float32)
+    values = export._evaluate_materials(recording, points)
+    assert sizes == [100, 100, 100]
+    albedo, roughness, metallic = materials(points)
+    expected = np.concatenate([albedo, roughness[:, None], metallic[:, None]], -1)
+    np.testing.assert_allclose(values, np.clip(expected, 0, 1), atol=1e-6)
+
+
+def test_chart_rasterisation_equals_brute_force():
+    rng = np.random.default_rng(3)
+    cells = np.stack(np.meshgrid(np.arange(4), np.arange(4)), -1).reshape(-1, 1, 2) / 4
+    uv = (cells + rng.uniform(0, 0.25, (16, 3, 2))).reshape(-1, 2).astype(np.float32)
+    faces = np.arange(48, dtype=np.int32).reshape(16, 3)
+    face_rows, barycentrics = meshes.rasterize_charts(uv, faces, texture_size=40)
+    centers = (np.stack(np.meshgrid(np.arange(40), np.arange(40)), -1) + 0.5) / 40
+    expected = np.full((40, 40), -1)
+    for row, face in enumerate(faces):
+        a, b, c = uv[face].astype(np.float64)
+        solved = np.linalg.solve(np.stack([b - a, c - a], -1), (centers - a)[..., None])[..., 0]
+        inside = np.all(solved > 0, -1) & (solved.sum(-1) < 1)
+        expected[inside] = row
+    assert (expected >= 0).sum() > 100
+    np.testing.assert_array_equal(face_rows, expected)
+    covered = face_rows >= 0
+    rebuilt = np.einsum("nk,nkd->nd", barycentrics[covered], uv[faces[face_rows[covered]]])
+    np.testing.assert_allclose(rebuilt, centers[covered], atol=1e-5)
+
+
+def test_gutters_take_the_nearest_covered_texel():
+    texture = np.arange(25, dtype=np.float32).reshape(5, 5, 1)
+    covered = np.zeros((5, 5), bool)
+    covered[1, 1] = covered[4, 4] = True
+    filled = meshes.fill_gutters(texture, covered)
+    assert filled[0, 0] == filled[1, 1] == 6
+    assert filled[4, 3] == 24
+
+
+def camera_at_distance_three(size=64):
+    world_to_camera = np.eye(4, dtype=np.float32)[None].copy()
+    world_to_camera[0, 2, 3] = 3.0
+    focal = 1.2 * size
+    intrinsics = np.array([[[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]]], np.float32)
+    return Camera(jnp.asarray(world_to_camera), jnp.asarray(intrinsics), size, size)
+
+
+def test_rendered_normals_of_a_sphere_are_exact():
+    vertices, faces, normals = sphere(4)
+    camera = camera_at_distance_three()
+    drawn, alpha = meshes.render_mesh_normals(vertices, faces, normals, camera)
+    grid = (np.stack(np.meshgrid(np.arange(64), np.arange(64)), -1) + 0.5 - 32) / (1.2 * 64)
+    rays = np.concatenate([grid, np.ones((64, 64, 1))], -1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    along = 3 * rays[..., 2]
+    discriminant = along**2 - (9 - 0.64)
+    hit = discriminant > 0.05
+    points = rays * (along - np.sqrt(np.maximum(discriminant, 0)))[..., None] - [0, 0, 3]
+    cosine = (drawn * points / 0.8).sum(-1)
+    assert np.rad2deg(np.arccos(np.clip(cosine[hit], -1, 1))).max() < 1.0
+    assert np.all(alpha[hit] == 1)
+    assert np.all(alpha[discriminant < -0.1] == 0)
+    assert np.all(drawn[alpha == 0] == 0)
+
+
+def test_the_nearest_of_two_surfaces_is_drawn_whatever_their_order():
+    quad = np.array([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], np.float32)
+    vertices = np.concatenate([quad, quad + np.float32([0, 0, 1])])
+    normals = np.repeat(np.float32([[0, 0, -1], [1, 0, 0]]), 4, axis=0)
+    near = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    for faces in (np.concatenate([near, near + 4]), np.concatenate([near + 4, near])):
+        drawn, alpha = meshes.render_mesh_normals(
+            vertices, faces, normals, camera_at_distance_three(16)
+        )
+        assert np.all(alpha == 1)
+        np.testing.assert_allclose(drawn, np.broadcast_to([0.0, 0, -1], (16, 16, 3)), atol=1e-6)
+
+
+def test_an_empty_or_hidden_mesh_gives_an_empty_picture():
+    vertices, faces, normals = sphere(1)
+    camera = camera_at_distance_three(8)
+    for chosen in (faces[:0], faces):
+        moved = vertices - np.float32([0, 0, 10])
+        drawn, alpha = meshes.render_mesh_normals(moved, chosen, normals, camera)
+        assert not drawn.any()
+        assert not alpha.any()
+
+
+def test_mesh_files_and_padding_round_trip(tmp_path):
+    vertices, faces, _ = sphere(1)
+    trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "a.ply")
+    read_vertices, read_faces = meshes.read_mesh(tmp_path / "a.ply")
+    np.testing.assert_allclose(read_vertices, vertices, atol=1e-6)
+    np.testing.assert_array_equal(read_faces, faces)
+    padded = Mesh(
+        jnp.concatenate([jnp.asarray(vertices), jnp.zeros((7, 3))]),
+        jnp.concatenate([jnp.asarray(faces), jnp.zeros((5, 3), jnp.int32)]),
+        jnp.asarray(len(vertices), jnp.int32),
+        jnp.asarray(len(faces), jnp.int32),
+    )
+    np.testing.assert_array_equal(meshes.unpadded(padded)[0], vertices)
+    np.testing.assert_array_equal(meshes.unpadded(padded)[1], faces)
+    trimesh.PointCloud(vertices).export(tmp_path / "points.ply")
+    with pytest.raises(ValueError, match="no triangle"):
+        meshes.read_mesh(tmp_path / "points.ply")
+
+
+def gaussians(count=17):
+    rng = np.random.default_rng(5)
+    return {
+        "means": rng.standard_normal((count, 3)),
+        "quats": rng.standard_normal((count, 4)),
+        "scales": np.exp(rng.uniform(-9, 1, (count, 3))),
+        "opacities": np.linspace(0, 1, count),
+        "rgb": rng.uniform(size=(count, 3)),
+        "normals": rng.standard_normal((count, 3)),
+    }
+
+
+def read_ply(path):
+    """Independent reader: names and rows of a binary table of floats."""
+    header, body = path.read_bytes().split(b"end_header\n", 1)
+    lines = header.decode().splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    names = [line.split()[-1] for line in lines if line.startswith("property float ")]
+    rows = np.frombuffer(body, "<f4").reshape(-1, len(names))
+    assert f"element vertex {len(rows)}" in lines
+    return dict(zip(names, rows.T, strict=True))
+
+
+def test_gaussian_ply_decodes_to_what_was_written(tmp_path):
+    given = gaussians()
+    export.export_gaussians_ply(tmp_path / "g.ply", **given)
+    table = read_ply(tmp_path / "g.ply")
+    order = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2".split()
+    assert list(table) == [*order, "rot_0", "rot_1", "rot_2", "rot_3"]
+
+    def columns(*names):
+        return np.stack([table[name] for name in names], -1).astype(np.float64)
+
+    np.testing.assert_allclose(columns("x", "y", "z"), given["means"], atol=1e-6)
+    np.testing.assert_allclose(columns("nx", "ny", "nz"), given["normals"], atol=1e-6)
+    scales = np.exp(columns("scale_0", "scale_1", "scale_2"))
+    np.testing.assert_allclose(scales, given["scales"], rtol=1e-5)
+    opacity = 1 / (1 + np.exp(-columns("opacity")[:, 0]))
+    np.testing.assert_allclose(opacity, given["opacities"], atol=2e-6)
+    rgb = 0.5 + 0.28209479177387814 * columns("f_dc_0", "f_dc_1", "f_dc_2")
+    np.testing.assert_allclose(rgb, given["rgb"], atol=1e-6)
+    quats = columns("rot_0", "rot_1", "rot_2", "rot_3")
+    unit = given["quats"] / np.linalg.norm(given["quats"], axis=-1, keepdims=True)
+    np.testing.assert_allclose(quats, unit, atol=1e-6)
+
+
+def test_broken_gaussians_are_refused(tmp_path):
+    broken = gaussians()
+    broken["means"][3, 1] = np.inf
+    with pytest.raises(ValueError, match="finite"):
+        export.export_gaussians_ply(tmp_path / "g.ply", **broken)
+    broken = gaussians()
+    broken["quats"][0] = 0
+    with pytest.raises(ValueError, match="quats"):
+        export.export_gaussians_ply(tmp_path / "g.ply", **broken)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failed_export_keeps_the_previous_file(tmp_path):
+    path = tmp_path / "g.ply"
+    export.export_gaussians_ply(path, **gaussians())
+    before = path.read_bytes()
+    broken = gaussians()
+    broken["rgb"][0] = np.nan
+    with pytest.raises(ValueError, match="finite"):
+        export.export_gaussians_ply(path, **broken)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_light_survives_exr_exactly(tmp_path):
+    radiance = np.random.default_rng(0).uniform(0, 1e5, (8, 16, 3)).astype(np.float32)
+    export.export_light_exr(tmp_path / "light.exr", radiance)
+    np.testing.assert_array_equal(read_linear(tmp_path / "light.exr"), radiance)

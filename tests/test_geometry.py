@@ -1,0 +1,579 @@
+"""Laws of the isosurface, of its tables and of the fields on its grid."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from support import double_precision, shared_path
+
+from geosplat_jax._flexicubes_tables import (
+    CORNERS,
+    EDGES,
+    PATCH_COUNT,
+    PATCH_EDGES,
+    PATCH_OF_EDGE,
+    PROBLEM_OFFSET,
+)
+from geosplat_jax.capacity import Capacities, bit_set, compact, fits, grow
+from geosplat_jax.geometry import (
+    deformed_vertices,
+    edge_deviations,
+    face_normals_and_areas,
+    grid_vertices,
+    initial_geometry,
+    isosurface,
+    random_sdf,
+    resample,
+    sdf_entropy,
+    sphere_sdf,
+    vertex_normals,
+    weight_magnitude,
+)
+from geosplat_jax.numerics import safe_norm
+from geosplat_jax.scene import Geometry, Grid, Mesh
+
+ORACLE_TOLERANCE = 1e-9  # float64, sums of some thousand terms
+DIFFERENCE_TOLERANCE = 2e-6  # relative, central differences of step 1e-6 in float64
+ROOM = Capacities(surface_cubes=2048, dual_vertices=2048, quads=2048)
+# Corner pairs in the order in which the original stores the weights of edges.
+ORIGINAL_EDGES = [(0, 1), (1, 5), (4, 5), (0, 4), (2, 3), (3, 7)]
+ORIGINAL_EDGES += [(6, 7), (2, 6), (0, 2), (1, 3), (5, 7), (4, 6)]
+BETA_ORDER = np.array([ORIGINAL_EDGES.index(tuple(edge)) for edge in EDGES.tolist()])
+
+extract = jax.jit(isosurface, static_argnames=("capacities", "training"))
+
+
+def make_grid(shape, *, size=2.0, dtype=jnp.float32):
+    cell = size / max(shape)
+    return Grid(
+        origin=jnp.asarray(-0.5 * cell * np.array(shape), dtype),
+        cell_size=jnp.asarray(cell, dtype),
+        shape=shape,
+    )
+
+
+def noisy_geometry(grid, *, seed=0, closed=True):
+    """White noise in every array, with a positive border when closed."""
+    rng = np.random.default_rng(seed)
+    dtype = grid.origin.dtype
+
+    def noise(*shape):
+        return jnp.asarray(rng.normal(size=shape), dtype)
+
+    geometry = Geometry(
+        sdf=noise(grid.vertex_count),
+        deform=noise(grid.vertex_count, 3),
+        alpha=noise(grid.cube_count, 8),
+        beta=noise(grid.cube_count, 12),
+        gamma=noise(grid.cube_count),
+    )
+    if not closed:
+        return geometry
+    sdf = np.asarray(geometry.sdf).reshape(grid.vertex_shape[::-1]).copy()
+    for axis in range(3):
+        for side in (0, -1):
+            border = np.moveaxis(sdf, axis, 0)
+            border[side] = np.abs(border[side])
+    return replace(geometry, sdf=jnp.asarray(sdf.reshape(-1), dtype))
+
+
+def to_trimesh(mesh):
+    """The real rows, with vertices and faces as they are."""
+    return trimesh.Trimesh(
+        np.asarray(mesh.vertices, np.float64)[: int(mesh.vertex_count)],
+        np.asarray(mesh.faces)[: int(mesh.face_count)],
+        process=False,
+    )
+
+
+def volume_and_moment(mesh):
+    corners = mesh.vertices[mesh.faces]
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    cross, centroids = jnp.cross(first, second), jnp.mean(corners, axis=1)
+    direction = jnp.asarray([0.3, -0.7, 1.1], cross.dtype)
+    waves = safe_norm(cross) * jnp.sin(centroids @ direction)
+    return jnp.sum(centroids * cross) / 6, jnp.sum(waves)
+
+
+def probe(geometry, grid, capacities, training):
+    """A scalar that depends on every differentiable output."""
+    surface = isosurface(geometry, grid, capacities=capacities, training=training)
+    volume, moment = volume_and_moment(surface.mesh)
+    normals = vertex_normals(surface.mesh)
+    shape = jnp.sum(normals * jnp.cos(3 * surface.mesh.vertices))
+    return volume + moment + surface.deviation + 0.01 * shape
+
+
+probe_gradient = jax.jit(jax.value_and_grad(probe), static_argnums=(2, 3))
+
+
+# Tables
+
+
+@pytest.mark.parametrize("case", range(256))
+def test_patches_partition_the_crossing_edges(case):
+    crossing = sum(1 << e for e, (a, b) in enumerate(EDGES.tolist()) if (case >> a ^ case >> b) & 1)
+    patches = [int(bits) for bits in PATCH_EDGES[case] if bits]
+    assert len(patches) == PATCH_COUNT[case] <= 4
+    assert sum(patches) == crossing  # disjoint, since each edge would otherwise carry over
+    assert all(bits.bit_count() >= 3 for bits in patches)
+    for slot, bits in enumerate(patches):
+        assert all(PATCH_OF_EDGE[case, e] == slot for e in range(12) if bits >> e & 1)
+
+
+def test_patch_counts_are_those_of_dual_marching_cubes():
+    # Independent statement: an isolated corner is a patch of its own ...
+    assert PATCH_COUNT[[0b1, 0b1001, 0b10000001, 0b01101001]].tolist() == [1, 2, 2, 4]
+    # ... and by Euler's formula few cases have many patches.
+    assert np.bincount(PATCH_COUNT).tolist() == [2, 162, 82, 8, 2]
+
+
+def test_tables_are_symmetric_under_rotations_and_reflections():
+    for permutation in ([1, 0, 2], [0, 2, 1], [2, 0, 1]):
+        for flip in ([0, 0, 0], [1, 0, 0]):
+            moved = (CORNERS[:, permutation] ^ np.array(flip)) @ np.array([1, 2, 4])
+            image = [sum(1 << int(moved[c]) for c in range(8) if k >> c & 1) for k in range(256)]
+            assert np.array_equal(PATCH_COUNT[image], PATCH_COUNT)
+            is_problem = np.any(PROBLEM_OFFSET, axis=1)
+            assert np.array_equal(is_problem[image], is_problem)
+
+
+def test_clashing_cases_have_one_ambiguous_face_and_their_complements_separate_it():
+    is_problem = np.any(PROBLEM_OFFSET, axis=1)
+    assert is_problem.sum() == 36  # C16 (24 orientations) and C19 (12)
+    for case in np.flatnonzero(is_problem):
+        ambiguous = []
+        for axis in range(3):
+            for side in range(2):
+                face = [c for c in range(8) if CORNERS[c, axis] == side]
+                inside = [c for c in face if case >> c & 1]
+                if len(inside) == 2 and (CORNERS[inside[0]] ^ CORNERS[inside[1]]).sum() == 2:
+                    ambiguous.append((axis, 2 * side - 1))
+        ((axis, side),) = ambiguous
+        assert PROBLEM_OFFSET[case, axis] == side
+        face_edges = [e for e in range(12) if (CORNERS[EDGES[e], axis] == (side + 1) // 2).all()]
+        assert len(set(PATCH_OF_EDGE[case, face_edges])) == 1
+        assert len(set(PATCH_OF_EDGE[255 - case, face_edges])) == 2
+
+
+def test_bit_set_agrees_with_compact():
+    rng = np.random.default_rng(0)
+    for size in (1, 31, 32, 33, 1000):
+        for density in (0.0, 0.05, 0.9, 1.0):
+            mask = jnp.asarray(rng.random(size) < density)
+            bits = bit_set(mask)
+            index, count = compact(mask, capacity=64)
+            kept = min(int(count), 64)
+            assert int(bits.count) == int(count)
+            first = bits.first(capacity=64)
+            np.testing.assert_array_equal(first[:kept], index[:kept])
+            np.testing.assert_array_equal(first[kept:], 0)
+            np.testing.assert_array_equal(bits.rank(first[:kept]), np.arange(kept))
+
+
+# Agreement with the original implementation
+
+
+def load_oracle(name):
+    """The oracle's arrays in our order, and the chain-rule factor of the deformation.
+
+    The original rounds rest positions to five decimals; the difference is put into `deform`.
+    """
+    data = np.load(shared_path("oracles", f"flexicubes_{name}.npz"))
+    resolution = int(data["res"])
+    order = np.lexsort(np.round((data["grid_vertices"] + 1) * resolution / 2).T)
+    cells = np.argsort(np.argsort(order)[data["cube_vertices"][:, 0]])
+    positions = data["grid_vertices"][order]
+    rest = np.round((positions + 1) * resolution / 2) * 2 / resolution - 1
+    moved = np.tanh(data["deform"][order])
+    absorbed = moved + (positions - rest) * resolution
+    weights = data["grad_weights"][cells]
+    geometry = Geometry(
+        sdf=jnp.asarray(data["sdf"][order]),
+        deform=jnp.asarray(np.arctanh(absorbed)),
+        alpha=jnp.asarray(data["alpha"][cells]),
+        beta=jnp.asarray(data["beta"][cells][:, BETA_ORDER]),
+        gamma=jnp.asarray(data["gamma"][cells]),
+    )
+    gradient = Geometry(
+        sdf=data["grad_sdf"][order],
+        deform=data["grad_deform"][order] * ((1 - absorbed**2) / (1 - moved**2)),
+        alpha=weights[:, 12:20],
+        beta=weights[:, :12][:, BETA_ORDER],
+        gamma=weights[:, 20],
+    )
+    return data, geometry, gradient
+
+
+def face_set(faces):
+    """Faces as oriented triples that start at their smallest row."""
+    starts = np.argmin(faces, axis=1)[:, None] + np.arange(3)
+    return {tuple(row) for row in np.take_along_axis(faces, starts % 3, axis=1).tolist()}
+
+
+@pytest.mark.parametrize(
+    "name", ["sphere_r8", "noise_r12", "noise_r20", "torus_r16", "torus_r16_eval"]
+)
+def test_equals_the_original_in_values_and_gradients(name):
+    with double_precision():
+        data, geometry, expected = load_oracle(name)
+        grid = make_grid((int(data["res"]),) * 3, dtype=jnp.float64)
+        room = Capacities(surface_cubes=4096, dual_vertices=4096, quads=4096)
+
+        @jax.jit
+        @jax.value_and_grad
+        def scalar(geometry):
+            surface = isosurface(geometry, grid, capacities=room, training=bool(data["training"]))
+            deviations, _ = edge_deviations(geometry, grid, capacities=room)
+            return sum(volume_and_moment(surface.mesh)) + jnp.sum(deviations)
+
+        surface = extract(geometry, grid, capacities=room, training=bool(data["training"]))
+        mesh = to_trimesh(surface.mesh)
+        value, gradient = scalar(geometry)
+        deviations, is_real = edge_deviations(geometry, grid, capacities=room)
+    distance, row = trimesh.proximity.cKDTree(mesh.vertices).query(data["vertices"])
+    assert len(mesh.vertices) == len(data["vertices"]) == len(set(row))
+    assert distance.max() < ORACLE_TOLERANCE
+    assert face_set(row[data["faces"]]) == face_set(mesh.faces)
+    np.testing.assert_allclose(
+        np.sort(np.asarray(deviations)[np.asarray(is_real)]),
+        np.sort(data["l_dev"]),
+        atol=ORACLE_TOLERANCE,
+    )
+    np.testing.assert_allclose(surface.deviation, data["l_dev"].mean(), atol=ORACLE_TOLERANCE)
+    np.testing.assert_allclose(value, data["scalar"], rtol=ORACLE_TOLERANCE)
+    for leaf, wanted in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected), strict=True):
+        scale = max(1.0, np.abs(wanted).max())
+        np.testing.assert_allclose(leaf, wanted, atol=ORACLE_TOLERANCE * scale)
+
+
+# Topology and orientation
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_noise_gives_a_watertight_manifold_facing_outwards(training):
+    grid = make_grid((12, 11, 10))
+    for seed in range(4):
+        geometry = noisy_geometry(grid, seed=seed)
+        surface = extract(geometry, grid, capacities=ROOM, training=training)
+        assert bool(fits(surface.usage, ROOM))
+        mesh = to_trimesh(surface.mesh)
+        edges = np.sort(mesh.edges, axis=1)
+        _, uses = np.unique(edges, axis=0, return_counts=True)
+        assert (uses == 2).all()
+        assert mesh.is_watertight
+        assert mesh.is_winding_consistent
+        assert len(np.unique(mesh.faces)) == len(mesh.vertices)
+
+
+def test_noise_contains_the_clashing_pairs():
+    grid = make_grid((12, 11, 10))
+    count = 0
+    for seed in range(4):
+        inside = np.asarray(noisy_geometry(grid, seed=seed).sdf < 0)
+        inside = inside.reshape(grid.vertex_shape[::-1])
+        case = np.zeros(grid.shape[::-1], int)
+        for corner, (x, y, z) in enumerate(CORNERS.tolist()):
+            case += inside[z : z + 10, y : y + 11, x : x + 12].astype(int) << corner
+        is_problem = PROBLEM_OFFSET[case].any(axis=-1)
+        steps = PROBLEM_OFFSET[case][is_problem][:, ::-1]
+        neighbour = np.argwhere(is_problem) + steps
+        valid = ((neighbour >= 0) & (neighbour < case.shape)).all(axis=1)
+        count += is_problem[tuple(neighbour[valid].T)].sum()
+    assert count >= 4
+
+
+def test_surface_is_open_at_the_border_of_the_grid():
+    grid = make_grid((6, 5, 4))
+    z = grid_vertices(grid)[:, 2] / grid.cell_size
+    surface = extract(initial_geometry(grid, z - 0.25), grid, capacities=ROOM, training=False)
+    mesh = to_trimesh(surface.mesh)
+    assert len(mesh.faces) == 2 * 5 * 4  # interior edges along z
+    np.testing.assert_allclose(mesh.face_normals, [[0, 0, 1]] * len(mesh.faces), atol=1e-6)
+    np.testing.assert_allclose(mesh.vertices[:, 2], 0.25 * grid.cell_size, atol=1e-6)
+
+
+def test_area_and_volume_of_a_sphere_converge_at_second_order():
+    radius, errors = 0.6, []
+    for resolution in (8, 16, 32):
+        grid = make_grid((resolution,) * 3)
+        room = Capacities(surface_cubes=4096, dual_vertices=4096, quads=4096)
+        sdf = sphere_sdf(grid, radius=radius)
+        surface = extract(initial_geometry(grid, sdf), grid, capacities=room, training=True)
+        mesh = to_trimesh(surface.mesh)
+        assert mesh.volume > 0
+        errors.append(
+            [
+                abs(mesh.volume / (4 / 3 * np.pi * radius**3) - 1),
+                abs(mesh.area / (4 * np.pi * radius**2) - 1),
+            ]
+        )
+    order = np.log2(np.array(errors[0]) / np.array(errors[2])) / 2
+    assert (order > 1.7).all(), (order, errors)
+    assert max(errors[2]) < 0.01
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 1, 3), (2, 2, 2), (3, 3, 3)])
+def test_tiny_grids_work(shape):
+    grid = make_grid(shape)
+    room = Capacities(surface_cubes=128, dual_vertices=128, quads=128)
+    for geometry in (noisy_geometry(grid), initial_geometry(grid, sphere_sdf(grid, radius=0.6))):
+        value, gradient = probe_gradient(geometry, grid, room, True)
+        assert np.isfinite(value)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+
+
+# Buffers
+
+
+def test_padding_changes_neither_values_nor_gradients():
+    grid = make_grid((7, 6, 5))
+    geometry = noisy_geometry(grid, seed=1)
+    needed = extract(geometry, grid, capacities=ROOM, training=True).usage
+    fitting = Capacities(
+        surface_cubes=int(needed.surface_cubes),
+        dual_vertices=int(needed.dual_vertices),
+        quads=int(needed.quads),
+    )
+    exact = extract(geometry, grid, capacities=fitting, training=True)
+    padded = extract(geometry, grid, capacities=ROOM, training=True)
+    vertices, faces = int(exact.mesh.vertex_count), int(exact.mesh.face_count)
+    assert exact.mesh.vertices.shape[0] == vertices
+    np.testing.assert_allclose(padded.mesh.vertices[:vertices], exact.mesh.vertices, atol=1e-7)
+    np.testing.assert_array_equal(padded.mesh.faces[:faces], exact.mesh.faces)
+    np.testing.assert_array_equal(padded.mesh.vertices[vertices:], 0)
+    np.testing.assert_array_equal(padded.mesh.faces[faces:], 0)
+    first = probe_gradient(geometry, grid, fitting, True)
+    second = probe_gradient(geometry, grid, ROOM, True)
+    for one, two in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+        np.testing.assert_allclose(one, two, rtol=2e-5, atol=2e-5)
+
+
+def test_overflow_reports_the_true_counts():
+    grid = make_grid((12, 11, 10))
+    geometry = noisy_geometry(grid, seed=2)
+    truth = extract(geometry, grid, capacities=ROOM, training=True).usage
+    assert bool(fits(truth, ROOM))
+    for name in ("surface_cubes", "dual_vertices", "quads"):
+        small = replace(ROOM, **{name: 128})
+        reported = extract(geometry, grid, capacities=small, training=True).usage
+        assert not bool(fits(reported, small))
+        assert jax.tree.map(int, reported) == jax.tree.map(int, truth)
+        assert bool(fits(truth, grow(small, reported)))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_surface_of_one_sign_is_empty_with_zero_gradients(sign):
+    grid = make_grid((5, 4, 3))
+    geometry = noisy_geometry(grid)
+    geometry = replace(geometry, sdf=sign * (jnp.abs(geometry.sdf) + 0.1))
+    room = Capacities(surface_cubes=128, dual_vertices=128, quads=128)
+    surface = extract(geometry, grid, capacities=room, training=True)
+    assert int(surface.mesh.vertex_count) == int(surface.mesh.face_count) == 0
+    assert float(surface.deviation) == 0
+    value, gradient = probe_gradient(geometry, grid, room, True)
+    assert np.isfinite(value)
+    assert all((np.asarray(leaf) == 0).all() for leaf in jax.tree.leaves(gradient))
+    entropy, gradient = jax.value_and_grad(sdf_entropy)(geometry, grid)
+    assert float(entropy) == 0
+    assert all((np.asarray(leaf) == 0).all() for leaf in jax.tree.leaves(gradient))
+
+
+def test_jit_equals_eager():
+    grid = make_grid((5, 4, 6))
+    geometry = noisy_geometry(grid)
+    room = Capacities(surface_cubes=128, dual_vertices=256, quads=256)
+    jitted = extract(geometry, grid, capacities=room, training=True)
+    eager = isosurface(geometry, grid, capacities=room, training=True)
+    for one, two in zip(jax.tree.leaves(jitted), jax.tree.leaves(eager), strict=True):
+        np.testing.assert_allclose(one, two, atol=1e-6)
+
+
+def test_dtype_in_is_dtype_out():
+    def check(dtype):
+        grid = make_grid((3, 3, 3), dtype=dtype)
+        geometry = noisy_geometry(grid)
+        room = Capacities(surface_cubes=128, dual_vertices=128, quads=128)
+        surface = extract(geometry, grid, capacities=room, training=True)
+        outputs = [surface, vertex_normals(surface.mesh), face_normals_and_areas(surface.mesh)]
+        outputs += [sdf_entropy(geometry, grid), weight_magnitude(geometry)]
+        outputs += [resample(geometry, grid, grid), deformed_vertices(geometry, grid)]
+        for leaf in jax.tree.leaves(outputs):
+            assert leaf.dtype in (dtype, jnp.int32)
+
+    check(jnp.float32)
+    with double_precision():
+        check(jnp.float64)
+
+
+# Gradients
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_gradients_agree_with_finite_differences(training):
+    with double_precision():
+        grid = make_grid((5, 6, 4), dtype=jnp.float64)
+        geometry = noisy_geometry(grid, seed=3)
+        # Away from zero, so that a small step changes no sign.
+        sdf = geometry.sdf + jnp.where(geometry.sdf < 0, -0.2, 0.2)
+        geometry = replace(geometry, sdf=sdf)
+        room = Capacities(surface_cubes=128, dual_vertices=256, quads=256)
+        _, gradient = probe_gradient(geometry, grid, room, training)
+        rng = np.random.default_rng(0)
+        for name in ("sdf", "deform", "alpha", "beta", "gamma"):
+            value = getattr(geometry, name)
+            direction = jnp.asarray(rng.normal(size=value.shape))
+
+            def moved(step, name=name, value=value, direction=direction):
+                point = replace(geometry, **{name: value + step * direction})
+                return float(probe_gradient(point, grid, room, training)[0])
+
+            numeric = (moved(1e-6) - moved(-1e-6)) / 2e-6
+            analytic = float(jnp.sum(getattr(gradient, name) * direction))
+            if name == "gamma" and not training:
+                assert numeric == analytic == 0
+            else:
+                np.testing.assert_allclose(analytic, numeric, rtol=DIFFERENCE_TOLERANCE, atol=1e-8)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-38, 1e-30, 1e-12, 1e-6, 1e30])
+def test_extreme_values_stay_finite(size):
+    grid = make_grid((4, 4, 4))
+    geometry = noisy_geometry(grid)
+    sdf = jnp.where(geometry.sdf < 0, -size, size).astype(jnp.float32)
+    mixed = sdf.at[::3].set(geometry.sdf[::3])
+    room = Capacities(surface_cubes=128, dual_vertices=128, quads=128)
+    for values in (sdf, mixed):
+        for scale in (0.0, 100.0):
+            extreme = jax.tree.map(lambda leaf, scale=scale: scale * leaf, geometry)
+            extreme = replace(extreme, sdf=values)
+            value, gradient = probe_gradient(extreme, grid, room, True)
+            assert np.isfinite(value)
+            assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+
+
+# Normals
+
+
+def test_normals_and_areas_of_a_sphere():
+    grid = make_grid((16, 16, 16))
+    geometry = initial_geometry(grid, sphere_sdf(grid, radius=0.7))
+    mesh = extract(geometry, grid, capacities=ROOM, training=True).mesh
+    normals, count = np.asarray(vertex_normals(mesh)), int(mesh.vertex_count)
+    directions = np.asarray(mesh.vertices)[:count]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    cosine = np.sum(normals[:count] * directions, axis=1)
+    assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 4.0
+    np.testing.assert_array_equal(normals[count:], 0)
+    face_normals, areas = face_normals_and_areas(mesh)
+    reference, faces = to_trimesh(mesh), int(mesh.face_count)
+    np.testing.assert_allclose(face_normals[:faces], reference.face_normals, atol=1e-4)
+    np.testing.assert_allclose(areas[:faces], reference.area_faces, rtol=1e-4)
+    np.testing.assert_array_equal(face_normals[faces:], 0)
+    np.testing.assert_array_equal(areas[faces:], 0)
+
+
+def test_normals_of_degenerate_faces_are_zero_with_finite_gradients():
+    def total(vertices):
+        mesh = Mesh(
+            vertices=vertices,
+            faces=jnp.asarray([[0, 1, 2], [0, 0, 3], [0, 0, 0]], jnp.int32),
+            vertex_count=jnp.asarray(4, jnp.int32),
+            face_count=jnp.asarray(2, jnp.int32),
+        )
+        normals, areas = face_normals_and_areas(mesh)
+        return jnp.sum(vertex_normals(mesh)) + jnp.sum(normals) + jnp.sum(areas)
+
+    for vertices in (jnp.zeros((4, 3)), jnp.eye(4, 3), 1e-18 * jnp.eye(4, 3)):
+        value, gradient = jax.value_and_grad(total)(vertices)
+        assert np.isfinite(value)
+        assert np.isfinite(gradient).all()
+
+
+# Fields on the grid
+
+
+def test_grid_vertices_run_along_x_first():
+    grid = make_grid((3, 2, 1))
+    points = np.asarray(grid_vertices(grid)).reshape(2, 3, 4, 3)
+    step = float(grid.cell_size)
+    np.testing.assert_allclose(
+        points[1, 2, 3], np.asarray(grid.origin) + step * np.array([3, 2, 1])
+    )
+    np.testing.assert_allclose(points[0, 0, 1] - points[0, 0, 0], [step, 0, 0], atol=1e-6)
+
+
+def test_deformation_moves_by_at_most_half_a_cell():
+    grid = make_grid((3, 2, 1))
+    geometry = replace(noisy_geometry(grid), deform=1e3 * jnp.ones((grid.vertex_count, 3)))
+    moves = deformed_vertices(geometry, grid) - grid_vertices(grid)
+    np.testing.assert_allclose(moves, 0.5 * float(grid.cell_size), rtol=1e-5)
+
+
+@pytest.mark.parametrize("reduction", ["mean", "sum"])
+def test_entropy_equals_its_definition(reduction):
+    grid = make_grid((4, 3, 2))
+    geometry = noisy_geometry(grid, closed=False)
+    sdf = np.asarray(geometry.sdf, np.float64).reshape(grid.vertex_shape[::-1])
+
+    def cross_entropy(logit, target):
+        probability = 1 / (1 + np.exp(-logit))
+        return -np.log(np.where(target, probability, 1 - probability))
+
+    terms = []
+    for axis in range(3):
+        low, high = (
+            np.take(sdf, np.arange(sdf.shape[axis])[s], axis) for s in (np.s_[:-1], np.s_[1:])
+        )
+        differ = (low < 0) != (high < 0)
+        low, high = low[differ], high[differ]
+        terms.append(cross_entropy(low, high > 0) + cross_entropy(high, low > 0))
+    expected = getattr(np.concatenate(terms), reduction)()
+    actual = sdf_entropy(geometry, grid, reduction=reduction)
+    np.testing.assert_allclose(actual, expected, rtol=1e-5)
+
+
+def test_weight_magnitude_is_the_mean_over_all_weights():
+    grid = make_grid((2, 2, 2))
+    geometry = noisy_geometry(grid)
+    weights = [np.asarray(getattr(geometry, n)).ravel() for n in ("alpha", "beta", "gamma")]
+    expected = np.abs(np.concatenate(weights)).mean()
+    np.testing.assert_allclose(weight_magnitude(geometry), expected, rtol=1e-5)
+
+
+def test_resampling_keeps_a_sphere_a_sphere():
+    grid, finer = make_grid((12, 12, 12)), make_grid((18, 16, 20), size=2.2)
+    geometry = initial_geometry(grid, sphere_sdf(grid, radius=0.6))
+    deform = jnp.asarray(np.random.default_rng(0).normal(size=geometry.deform.shape), jnp.float32)
+    wobbly = replace(geometry, deform=0.4 * deform)
+    # The same sphere on the deformed grid.
+    sdf = (safe_norm(deformed_vertices(wobbly, grid)) - 0.6) / grid.cell_size
+    for source in (geometry, replace(wobbly, sdf=sdf)):
+        fresh = resample(source, grid, finer)
+        np.testing.assert_allclose(
+            fresh.sdf * finer.cell_size, sphere_sdf(finer, radius=0.6) * finer.cell_size, atol=0.06
+        )
+        mesh = to_trimesh(extract(fresh, finer, capacities=ROOM, training=False).mesh)
+        radii = np.linalg.norm(mesh.vertices, axis=1)
+        assert mesh.is_watertight
+        assert abs(radii.mean() - 0.6) < 0.01
+        assert np.abs(radii - 0.6).max() < 0.03
+
+
+def test_resampling_to_the_same_grid_is_the_identity():
+    grid = make_grid((4, 5, 3))
+    geometry = initial_geometry(grid, noisy_geometry(grid).sdf)
+    np.testing.assert_allclose(resample(geometry, grid, grid).sdf, geometry.sdf, atol=1e-4)
+
+
+def test_random_sdf_is_mostly_outside():
+    sdf = random_sdf(jax.random.key(0), make_grid((8, 8, 8)))
+    assert 0.05 < float(jnp.mean(sdf < 0)) < 0.15
+
+
+def test_initial_geometry_states_the_expected_size():
+    with pytest.raises(ValueError, match="27 grid vertices"):
+        initial_geometry(make_grid((2, 2, 2)), jnp.zeros(8))

@@ -1,0 +1,476 @@
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from geosplat_jax._tiles import _sort_hits, _stable_argsort
+from geosplat_jax.capacity import Capacities, fits, overflowed
+from geosplat_jax.projection import Splats, project
+from geosplat_jax.rasterize import (
+    MAX_ALPHA,
+    MIN_ALPHA,
+    _reference_composite,
+    composite,
+    find_visible,
+    gather_visible,
+    rasterize,
+)
+
+ORACLES = Path(__file__).parents[2] / "shared" / "oracles"
+# float64; a few hundred products deep, the oracle's own rounding included.
+ORACLE_TOLERANCE = 1e-11
+# The compositor against dense autodiff, both float64.
+REFERENCE_TOLERANCE = 1e-11
+AMPLE = Capacities(visible=512, hits=8192, chunks=2048)
+
+
+@pytest.fixture
+def x64():
+    enable = getattr(jax, "enable_x64", None)
+    if enable is None:
+        from jax.experimental import enable_x64 as enable
+    with enable(True):
+        yield
+
+
+def camera(dtype, height, width):
+    world_to_camera = np.eye(4)
+    world_to_camera[2, 3] = 3.0
+    size = max(height, width)
+    intrinsics = np.array([[1.2 * size, 0, width / 2], [0, 1.2 * size, height / 2], [0, 0, 1]])
+    return {
+        "world_to_camera": jnp.asarray(world_to_camera, dtype),
+        "intrinsics": jnp.asarray(intrinsics, dtype),
+        "height": height,
+        "width": width,
+    }
+
+
+def scene(seed, count, dtype, *, opacity=(0.0, 1.0), channels=3, extent=1.2):
+    """Means, quats, scales, opacities, features: from needles to blobs, some out of view."""
+    rng = np.random.default_rng(seed)
+    arrays = (
+        rng.uniform(-extent, extent, (count, 3)),
+        rng.normal(size=(count, 4)),
+        np.exp(rng.uniform(-5, -1, (count, 3))),
+        rng.uniform(*opacity, count),
+        rng.uniform(size=(count, channels)),
+    )
+    return tuple(jnp.asarray(a, dtype) for a in arrays)
+
+
+def draw(inputs, settings, *, capacities=AMPLE, tile_size=4, eligible=None):
+    if eligible is None:
+        eligible = jnp.ones(inputs[0].shape[0], bool)
+    return rasterize(*inputs, eligible, capacities=capacities, tile_size=tile_size, **settings)
+
+
+def dense(inputs, settings):
+    """Depth sort everything in front and composite it in every pixel."""
+    depths = jax.lax.stop_gradient(project(*inputs[:3], **settings).depths)
+    order = jnp.argsort(depths, stable=True)
+    means, quats, scales, opacities, features = (x[order] for x in inputs)
+    splats = project(means, quats, scales, **settings)
+    opacities = jnp.where(splats.is_in_front, opacities, 0.0)
+    shape = {k: settings[k] for k in ("height", "width")}
+    return _reference_composite(splats, opacities, features, **shape)
+
+
+def scalar(image, alpha, seed=0):
+    """A random linear functional of image and alpha."""
+    rng = np.random.default_rng(seed)
+    weight = jnp.asarray(rng.normal(size=(*alpha.shape, image.shape[-1] + 1)), image.dtype)
+    return jnp.sum(weight[..., :-1] * image) + jnp.sum(weight[..., -1] * alpha)
+
+
+def assert_close_gradients(got, expected, *, relative, cosine):
+    for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
+        a, b = np.asarray(a, np.float64).ravel(), np.asarray(b, np.float64).ravel()
+        scale = np.linalg.norm(b)
+        assert np.linalg.norm(a - b) <= relative * scale + 1e-300
+        if scale > 0:
+            assert a @ b >= (1 - cosine) * np.linalg.norm(a) * scale
+
+
+def all_finite(tree):
+    return all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(tree))
+
+
+@pytest.mark.parametrize("name", ["large", "opaque_small", "soft"])
+def test_image_and_gradients_match_the_oracle(name, x64):
+    path = ORACLES / f"splat_{name}.npz"
+    if not path.exists():
+        pytest.skip("the shared oracles are not here")
+    data = {k: jnp.asarray(v) for k, v in np.load(path).items()}
+    keys = ("means", "quats", "scales", "opacities", "colors")
+    settings = {
+        "world_to_camera": data["viewmat"],
+        "intrinsics": data["K"],
+        "height": int(data["height"]),
+        "width": int(data["width"]),
+    }
+    capacities = Capacities(visible=2048, hits=16384, chunks=4096)
+
+    def loss(inputs):
+        image, alpha, needed = draw(inputs, settings, capacities=capacities)
+        value = jnp.sum(image * data["cotangent_image"])
+        return value + jnp.sum(alpha * data["cotangent_alpha"]), (image, alpha, needed)
+
+    inputs = tuple(data[k] for k in keys)
+    gradient, (image, alpha, needed) = jax.jit(jax.grad(loss, has_aux=True))(inputs)
+    assert overflowed(needed, capacities) == []
+    np.testing.assert_allclose(image, data["image"], atol=ORACLE_TOLERANCE)
+    np.testing.assert_allclose(alpha, data["alpha"], atol=ORACLE_TOLERANCE)
+    expected = tuple(data[f"grad_{k}"] for k in keys)
+    assert_close_gradients(gradient, expected, relative=ORACLE_TOLERANCE, cosine=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "tile_size", "channels"),
+    [(24, 24, 4, 3), (17, 30, 8, 1), (13, 9, 5, 7), (1, 1, 4, 3), (1, 23, 4, 2), (20, 20, 16, 3)],
+)
+def test_equals_dense_compositing(height, width, tile_size, channels, x64):
+    settings = camera(jnp.float64, height, width)
+    inputs = scene(1, 120, jnp.float64, channels=channels)
+
+    def loss(render):
+        return lambda inputs: scalar(*render(inputs)[:2])
+
+    tiled = partial(draw, settings=settings, tile_size=tile_size)
+    reference = partial(dense, settings=settings)
+    image, alpha, needed = jax.jit(tiled)(inputs)
+    assert overflowed(needed, AMPLE) == []
+    expected_image, expected_alpha = reference(inputs)
+    np.testing.assert_allclose(image, expected_image, atol=REFERENCE_TOLERANCE)
+    np.testing.assert_allclose(alpha, expected_alpha, atol=REFERENCE_TOLERANCE)
+    got = jax.jit(jax.grad(loss(tiled)))(inputs)
+    expected = jax.jit(jax.grad(loss(reference)))(inputs)
+    assert_close_gradients(got, expected, relative=1e-10, cosine=1e-12)
+
+
+def test_custom_vjp_equals_autodiff_for_every_input_of_the_compositor(x64):
+    settings = camera(jnp.float64, 16, 16)
+    shape = {"height": 16, "width": 16}
+    means, quats, scales, opacities, features = scene(2, 60, jnp.float64)
+    everything = project(means, quats, scales, **settings)
+    lists = find_visible(
+        everything, opacities, jnp.ones(60, bool), tile_size=4, capacities=AMPLE, **shape
+    )
+    rows = [gather_visible(lists.index, x) for x in (means, quats, scales, opacities, features)]
+    splats = project(*rows[:3], **settings)
+
+    def loss(render, arguments):
+        splats, opacities, features = arguments
+        return scalar(*render(splats, opacities, features))
+
+    def tiled(*a):
+        return composite(*a, lists, tile_size=4, **shape)
+
+    def floats(splats):
+        return splats.means2d, splats.conics, splats.compensation
+
+    arguments = (splats, rows[3], rows[4])
+    gradient = partial(jax.grad, allow_int=True)
+    got = jax.jit(gradient(partial(loss, tiled)))(arguments)
+    expected = jax.jit(gradient(partial(loss, partial(_reference_composite, **shape))))(arguments)
+    assert_close_gradients(
+        (*floats(got[0]), got[1], got[2]),
+        (*floats(expected[0]), expected[1], expected[2]),
+        relative=1e-10,
+        cosine=1e-12,
+    )
+
+
+def test_gradients_match_finite_differences_along_random_directions(x64):
+    # Soft and overlapping, so that no pixel crosses a threshold within a step.
+    settings = camera(jnp.float64, 10, 12)
+    means, quats, _, _, features = scene(3, 6, jnp.float64, extent=0.4)
+    rng = np.random.default_rng(5)
+    scales = jnp.asarray(rng.uniform(1.0, 1.5, (6, 3)))
+    inputs = (means, quats, scales, jnp.asarray(rng.uniform(0.3, 0.6, 6)), features)
+
+    @jax.jit
+    def loss(inputs, matrices):
+        return scalar(*draw(inputs, settings | matrices)[:2])
+
+    matrices = {k: settings[k] for k in ("world_to_camera", "intrinsics")}
+    arguments = (inputs, matrices)
+    gradient = jax.grad(loss, argnums=(0, 1))(*arguments)
+    for _ in range(4):
+        direction = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), arguments)
+        step = 1e-6
+        ahead = loss(*jax.tree.map(lambda x, d: x + step * d, arguments, direction))
+        behind = loss(*jax.tree.map(lambda x, d: x - step * d, arguments, direction))
+        products = jax.tree.map(lambda g, d: jnp.sum(g * d), gradient, direction)
+        expected = (ahead - behind) / (2 * step)
+        np.testing.assert_allclose(sum(jax.tree.leaves(products)), expected, rtol=1e-6)
+
+
+def test_float32_gradients_stay_close_behind_opaque_layers():
+    # Twenty nearly opaque sheets: dividing by 1 - alpha or subtracting prefix sums fails here.
+    count, settings = 20, camera(jnp.float32, 8, 8)
+    rng = np.random.default_rng(6)
+    means = np.stack([np.zeros(count), np.zeros(count), np.linspace(0, 1, count)], -1)
+    arrays = (
+        means,
+        np.tile([1.0, 0, 0, 0], (count, 1)),
+        np.full((count, 3), 3.0),
+        np.full(count, 0.97),
+        rng.uniform(size=(count, 3)),
+    )
+    inputs = tuple(jnp.asarray(a, jnp.float32) for a in arrays)
+    got = jax.jit(jax.grad(lambda x: scalar(*draw(x, settings)[:2])))(inputs)
+    expected = jax.jit(jax.grad(lambda x: scalar(*dense(x, settings))))(inputs)
+    visible = np.abs(np.asarray(expected[4])) > 0
+    assert visible.all()
+    # Relative to each row: the last sheet sees 1e-28 of the light and must still be right.
+    np.testing.assert_allclose(got[4], expected[4], rtol=1e-3)
+    assert_close_gradients(got[3], expected[3], relative=1e-4, cosine=1e-6)
+
+
+def test_padding_does_not_change_image_or_gradients():
+    settings = camera(jnp.float32, 20, 20)
+    inputs = scene(7, 100, jnp.float32)
+    double = Capacities(visible=1024, hits=16384, chunks=4096)
+
+    def result(capacities):
+        def loss(inputs):
+            image, alpha, _ = draw(inputs, settings, capacities=capacities)
+            return scalar(image, alpha), (image, alpha)
+
+        return jax.jit(jax.value_and_grad(loss, has_aux=True))(inputs)
+
+    (_, images), gradients = result(AMPLE)
+    (_, other_images), other_gradients = result(double)
+    for a, b in zip(jax.tree.leaves(images), jax.tree.leaves(other_images), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert_close_gradients(gradients, other_gradients, relative=1e-5, cosine=1e-9)
+
+
+def test_ineligible_rows_are_inert_whatever_they_hold():
+    settings = camera(jnp.float32, 12, 12)
+    inputs = scene(8, 40, jnp.float32)
+    eligible = jnp.arange(40) < 25
+    broken = tuple(x.at[25:].set(jnp.inf) for x in inputs)
+
+    def loss(inputs, eligible=eligible):
+        return scalar(*draw(inputs, settings, eligible=eligible)[:2])
+
+    value, gradient = jax.value_and_grad(loss)(broken)
+    expected, expected_gradient = jax.value_and_grad(partial(loss, eligible=None))(
+        tuple(x[:25] for x in inputs)
+    )
+    np.testing.assert_allclose(value, expected, rtol=1e-6)
+    assert_close_gradients(
+        [g[:25] for g in gradient], list(expected_gradient), relative=1e-5, cosine=1e-6
+    )
+    assert all(bool(jnp.all(g[25:] == 0)) for g in gradient)
+
+
+def test_overflow_is_reported_with_true_counts():
+    settings = camera(jnp.float32, 24, 24)
+    inputs = scene(9, 200, jnp.float32, opacity=(0.5, 1.0))
+    needed = draw(inputs, settings)[2]
+    assert bool(fits(needed, AMPLE))
+    small = Capacities(visible=128, hits=128, chunks=128)
+    for buffer in ("hits", "chunks"):
+        tight = Capacities(**{"visible": 512, "hits": 8192, "chunks": 2048, buffer: 128})
+        reported = draw(inputs, settings, capacities=tight)[2]
+        assert int(getattr(reported, buffer)) == int(getattr(needed, buffer))
+        assert overflowed(reported, tight) == [buffer]
+    reported = draw(inputs, settings, capacities=small)[2]
+    assert int(reported.visible) == int(needed.visible) > 128
+    assert "visible" in overflowed(reported, small)
+
+
+def test_an_astronomic_number_of_hits_saturates_instead_of_wrapping():
+    count, size = 40_000, 512
+    splats = Splats(
+        means2d=jnp.full((count, 2), 256.0),
+        covariances2d=jnp.tile(jnp.array([1e9, 0.0, 1e9]), (count, 1)),
+        conics=jnp.tile(jnp.array([1e-9, 0.0, 1e-9]), (count, 1)),
+        depths=jnp.ones(count),
+        compensation=jnp.ones(count),
+        is_in_front=jnp.ones(count, bool),
+    )
+    capacities = Capacities(visible=count, hits=1024, chunks=512)
+    lists = find_visible(
+        splats,
+        jnp.ones(count),
+        jnp.ones(count, bool),
+        height=size,
+        width=size,
+        tile_size=2,
+        capacities=capacities,
+    )
+    assert int(lists.usage.hits) == 2**31 - 1
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_depth_order_is_exact_and_ties_keep_row_order(dtype, x64):
+    rng = np.random.default_rng(10)
+    # Neighbouring floats, repeated: only an exact, stable sort gets these right.
+    base = np.nextafter(np.full(50, 2.0, dtype), np.inf, dtype=dtype)
+    depths = np.concatenate([base, np.full(50, 2.0), rng.uniform(0.02, 1e6, 100)]).astype(dtype)
+    depths = rng.permutation(depths)
+    count = len(depths)
+    splats = Splats(
+        means2d=jnp.full((count, 2), 4.0, dtype),
+        covariances2d=jnp.tile(jnp.array([1.0, 0.0, 1.0], dtype), (count, 1)),
+        conics=jnp.tile(jnp.array([1.0, 0.0, 1.0], dtype), (count, 1)),
+        depths=jnp.asarray(depths),
+        compensation=jnp.ones(count, dtype),
+        is_in_front=jnp.ones(count, bool),
+    )
+    lists = find_visible(
+        splats,
+        jnp.ones(count, dtype),
+        jnp.ones(count, bool),
+        height=8,
+        width=8,
+        tile_size=4,
+        capacities=AMPLE,
+    )
+    np.testing.assert_array_equal(lists.index[:count], np.argsort(depths, kind="stable"))
+    assert bool(jnp.all(lists.index[count:] == count))
+
+
+@pytest.mark.parametrize("bits", [1, 9, 16, 31, 32])
+@pytest.mark.parametrize("count", [1, 7, 70_000])
+def test_packed_argsort_is_stable(bits, count):
+    rng = np.random.default_rng(11)
+    keys = rng.integers(0, 2**bits, count, dtype=np.uint64).astype(np.uint32)
+    order = jax.jit(_stable_argsort, static_argnums=1)(jnp.asarray(keys), bits)
+    np.testing.assert_array_equal(order, np.argsort(keys, kind="stable"))
+
+
+@pytest.mark.parametrize("rank_count", [2**10, 2**20])
+def test_hits_sort_alike_whether_or_not_tile_and_rank_fit_one_word(rank_count):
+    rng = np.random.default_rng(12)
+    tile_count = 40_000
+    ranks = np.sort(rng.integers(0, rank_count, 3000)).astype(np.int32)
+    # Pairs of a tile and a rank are unique.
+    tiles = rng.permutation(tile_count)[:3000].astype(np.int32) // 7
+    sorted_tiles, sorted_ranks = _sort_hits(
+        jnp.asarray(tiles), jnp.asarray(ranks), tile_count, rank_count
+    )
+    order = np.lexsort([ranks, tiles])
+    np.testing.assert_array_equal(sorted_tiles, tiles[order])
+    np.testing.assert_array_equal(sorted_ranks, ranks[order])
+
+
+def test_nothing_visible_gives_an_empty_image_and_zero_gradients():
+    settings = camera(jnp.float32, 9, 9)
+    inputs = scene(13, 30, jnp.float32)
+    cases = {
+        "behind": inputs[0] - jnp.array([[0.0, 0.0, 10.0]]),
+        "far outside": inputs[0] + jnp.array([[1e4, 0.0, 0.0]]),
+    }
+    for means in cases.values():
+        arguments = (means, *inputs[1:])
+        image, alpha, needed = draw(arguments, settings)
+        assert int(needed.visible) == int(needed.hits) == int(needed.chunks) == 0
+        assert not bool(jnp.any(image))
+        assert not bool(jnp.any(alpha))
+        gradient = jax.grad(lambda x: scalar(*draw(x, settings)[:2]))(arguments)
+        assert all(not bool(jnp.any(leaf)) for leaf in jax.tree.leaves(gradient))
+    empty = tuple(x[:0] for x in inputs)
+    image, alpha, needed = draw(empty, settings)
+    assert int(needed.visible) == 0
+    assert not bool(jnp.any(alpha))
+
+
+def test_opacity_zero_is_culled_and_opacity_one_is_clamped():
+    settings = camera(jnp.float32, 5, 5)
+    wide = (
+        jnp.zeros((2, 3)),
+        jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (2, 1)),
+        jnp.full((2, 3), 1e3),
+        jnp.array([0.0, 1.0]),
+        jnp.ones((2, 1)),
+    )
+    image, alpha, needed = draw(wide, settings)
+    assert int(needed.visible) == 1
+    np.testing.assert_allclose(alpha, MAX_ALPHA, rtol=1e-6)
+    np.testing.assert_allclose(image[..., 0], MAX_ALPHA, rtol=1e-6)
+    gradient = jax.grad(lambda x: scalar(*draw(x, settings)[:2]))(wide)
+    assert all_finite(gradient)
+    assert not bool(jnp.any(gradient[3]))
+
+
+def test_an_opacity_just_above_the_threshold_is_kept(x64):
+    settings = camera(jnp.float64, 3, 3)
+    for factor, is_kept in ((1.0 + 1e-9, True), (1.0 - 1e-9, False)):
+        splat = (
+            jnp.zeros((1, 3)),
+            jnp.array([[1.0, 0.0, 0.0, 0.0]]),
+            jnp.full((1, 3), 1e6),
+            jnp.array([MIN_ALPHA * factor]),
+            jnp.ones((1, 1)),
+        )
+        assert bool(draw(splat, settings)[1][1, 1] > 0) == is_kept
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1e-3, 1.0, 1e4])
+def test_extreme_gaussians_give_finite_images_and_gradients(scale):
+    settings = camera(jnp.float32, 12, 12)
+    means = jnp.array(
+        [[0, 0, 0], [0.1, 0, -2.985], [0.1, 0, -2.995], [50, 0, -2.9], [0, 0, 1e5]], jnp.float32
+    )
+    quats = jnp.array(
+        [[1, 0, 0, 0], [0, 0, 0, 0], [0.5, 0.5, 0.5, 0.5], [1e-12, 0, 0, 0], [3, 1, 2, 9]],
+        jnp.float32,
+    )
+    scales = jnp.array(
+        [[scale] * 3, [scale, 1e-8, 1e-8], [scale] * 3, [scale, scale, 1e-8], [scale, 1e4, 1e4]],
+        jnp.float32,
+    )
+    inputs = (means, quats, scales, jnp.ones(5), jnp.ones((5, 2)))
+    loss = jax.jit(jax.value_and_grad(lambda x: scalar(*draw(x, settings)[:2])))
+    assert all_finite(loss(inputs))
+
+
+def test_alpha_is_the_composite_of_a_constant_feature(x64):
+    settings = camera(jnp.float64, 15, 11)
+    inputs = scene(14, 80, jnp.float64)
+    ones = (*inputs[:4], jnp.ones((80, 1)))
+    image, alpha, _ = draw(ones, settings)
+    np.testing.assert_allclose(image[..., 0], alpha, atol=1e-13)
+    assert float(alpha.min()) >= 0.0
+    assert float(alpha.max()) <= 1.0
+
+
+def test_tile_size_does_not_change_the_image(x64):
+    settings = camera(jnp.float64, 21, 18)
+    inputs = scene(15, 90, jnp.float64)
+    images = [draw(inputs, settings, tile_size=size)[0] for size in (2, 4, 8)]
+    for image in images[1:]:
+        np.testing.assert_allclose(image, images[0], atol=1e-13)
+
+
+def test_jit_equals_eager_and_float32_stays_float32():
+    settings = camera(jnp.float32, 12, 14)
+    inputs = scene(16, 50, jnp.float32)
+    eager = draw(inputs, settings)
+    compiled = jax.jit(partial(draw, settings=settings))(inputs)
+    assert eager[0].dtype == eager[1].dtype == jnp.float32
+    for a, b in zip(eager[:2], compiled[:2], strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5)
+    assert int(eager[2].hits) == int(compiled[2].hits)
+
+
+def test_vmap_and_scan_over_views_equal_the_loop():
+    settings = camera(jnp.float32, 10, 10)
+    matrices = settings.pop("world_to_camera")
+    views = jnp.stack([matrices, matrices.at[0, 3].add(0.3), matrices.at[2, 3].add(1.0)])
+    inputs = scene(17, 30, jnp.float32)
+
+    def one(view):
+        return draw(inputs, settings | {"world_to_camera": view})[0]
+
+    expected = jnp.stack([one(view) for view in views])
+    np.testing.assert_allclose(jax.lax.map(one, views), expected, atol=1e-5)
+    np.testing.assert_allclose(jax.vmap(one)(views), expected, atol=1e-5)
