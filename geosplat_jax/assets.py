@@ -14,8 +14,8 @@ from geosplat_jax import capacity as capacity_module
 from geosplat_jax.capacity import Capacities
 from geosplat_jax.config import Config
 from geosplat_jax.evaluate import Renderer
-from geosplat_jax.io.export import export_gaussians_ply, export_light_exr
-from geosplat_jax.io.meshes import export_mesh_glb
+from geosplat_jax.io.export import export_gaussians_ply, export_light_exr, export_mesh_glb
+from geosplat_jax.io.images import encode_srgb
 from geosplat_jax.materials import materials_at
 from geosplat_jax.render import Asset, Context, Params, grid_center_and_extent, reconstruct
 
@@ -109,7 +109,7 @@ def export_assets(
         for name in ("means", "quats", "scales", "opacities", "normals")
     }
     albedo = np.asarray(asset.materials.albedo)[:count]
-    export_gaussians_ply(folder / "gaussians.ply", rgb=albedo, **rows)
+    export_gaussians_ply(folder / "gaussians.ply", rgb=encode_srgb(albedo), **rows)
     export_light_exr(folder / "light.exr", np.asarray(params.light.radiance))
     height, width = params.light.radiance.shape[:2]
     return {

@@ -200,13 +200,15 @@ def _footprint(directions: Float[Array, "N 3"], height: int, width: int) -> _Foo
 def _gather(
     rows: Float[Array, "T C"], footprint: _Footprint, offset: Int[Array, " N"] | int = 0
 ) -> Float[Array, "N C"]:
-    # Four plain gathers fuse into one parallel loop; a table of packed 2x2 neighbourhoods has
-    # fewer gathers but measured slower forward and no faster backward, because it must be built.
-    total = jnp.zeros((), rows.dtype)
-    for index, weight in zip(footprint.indices, footprint.weights, strict=True):
-        values = rows.at[index + offset].get(mode="promise_in_bounds")
-        total = total + values * weight[:, None]
-    return total
+    # Four plain gathers: a table of packed 2x2 neighbourhoods halves their number, but building it
+    # costs more. One channel at a time, because broadcasting weights over a minor axis of 3, and
+    # summing over it in the backward pass, does not vectorise (measured 1.4 times slower).
+    corners = [rows.at[index + offset].get(mode="promise_in_bounds") for index in footprint.indices]
+    channels = [
+        sum(c[:, k] * weight for c, weight in zip(corners, footprint.weights, strict=True))
+        for k in range(rows.shape[1])
+    ]
+    return jnp.stack(channels, axis=-1)
 
 
 def lookup(texels: Float[Array, "H W C"], directions: Float[Array, "N 3"]) -> Float[Array, "N C"]:

@@ -72,8 +72,13 @@ def _reference_prefilter(texels, direction, roughness, factor):
     return kernel @ _reference_lookup(texels, *_reference_uv(fine)) / kernel.sum()
 
 
+_compiled_prefilter = jax.jit(prefilter)
+
+
 def _prefiltered(texels, spec=SMALL):
-    return prefilter(EnvLight(jnp.asarray(texels, jnp.float32)), prefilter_operators(spec))
+    return _compiled_prefilter(
+        EnvLight(jnp.asarray(texels, jnp.float32)), prefilter_operators(spec)
+    )
 
 
 def test_four_colours_lie_in_the_four_world_directions():
@@ -174,7 +179,8 @@ def test_lookup_gradients_match_finite_differences():
         texels, directions = jnp.asarray(_texels()), jnp.asarray(_unit(40, seed=4))
         weights = jnp.asarray(_unit(40, seed=5))
         target = lambda t, d: jnp.sum(weights * jnp.sin(3 * lookup(t, d)))  # noqa: E731
-        gradients = jax.grad(target, argnums=(0, 1))(texels, directions)
+        gradients = jax.jit(jax.grad(target, argnums=(0, 1)))(texels, directions)
+        target = jax.jit(target)
         rng, step = np.random.default_rng(6), 1e-7
         moves = [jnp.asarray(rng.standard_normal(a.shape)) for a in (texels, directions)]
         for which in (0, 1):
@@ -370,7 +376,8 @@ def test_filtered_lookup_gradients_match_finite_differences():
             prefiltered = prefilter(EnvLight(texels), operators)
             return jnp.sum(prefiltered_specular(prefiltered, directions, roughness) ** 2)
 
-        gradients = jax.grad(target, argnums=(0, 1, 2))(*arguments)
+        gradients = jax.jit(jax.grad(target, argnums=(0, 1, 2)))(*arguments)
+        target = jax.jit(target)
         rng, step = np.random.default_rng(22), 1e-7
         for which, gradient in enumerate(gradients):
             move = jnp.asarray(rng.standard_normal(gradient.shape))

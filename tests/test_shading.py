@@ -31,6 +31,10 @@ FG_QUADRATURE = 1e-3  # 64 x 64 midpoint rule
 FG_TABLE = 4e-3  # bilinear interpolation in 128 x 32 entries, n.v >= .02
 SPEC = LightSpec(16, 32, (0.0, 0.3, 0.6, 1.0))
 
+# Compiled once a shape: eager execution compiles every operation by itself.
+prefiltered = jax.jit(prefilter)
+shade = jax.jit(split_sum, static_argnames=("two_sided", "baked_diffuse"))
+
 
 def _unit(count, seed=0):
     directions = np.random.default_rng(seed).standard_normal((count, 3))
@@ -134,20 +138,20 @@ def test_white_furnace():
     count = 200
     normals, views = jnp.asarray(_unit(count), jnp.float32), jnp.asarray(_unit(count, 1))
     views = views.astype(jnp.float32)
-    light = prefilter(init_light(SPEC.height, value=1.0), prefilter_operators(SPEC))
-    mirror = split_sum(_constant(count, metallic=1.0), normals, views, light, fg_table())
+    light = prefiltered(init_light(SPEC.height, value=1.0), prefilter_operators(SPEC))
+    mirror = shade(_constant(count, metallic=1.0), normals, views, light, fg_table())
     np.testing.assert_allclose(mirror.rgb, 1.0, atol=5 * ROUNDING)
     for roughness in (0.08, 0.3, 1.0):
         white = _constant(count, roughness=roughness, metallic=1.0)
-        rgb = np.asarray(split_sum(white, normals, views, light, fg_table()).rgb)
+        rgb = np.asarray(shade(white, normals, views, light, fg_table()).rgb)
         assert rgb.max() <= 1 + ROUNDING
         assert rgb.min() > 0.3
 
 
 def test_a_smooth_dielectric_seen_head_on_reflects_four_percent():
-    light = prefilter(init_light(SPEC.height, value=2.0), prefilter_operators(SPEC))
+    light = prefiltered(init_light(SPEC.height, value=2.0), prefilter_operators(SPEC))
     up = jnp.asarray([[0.0, 0.0, 1.0]])
-    shaded = split_sum(_constant(1, albedo=0.5), up, up, light, fg_table())
+    shaded = shade(_constant(1, albedo=0.5), up, up, light, fg_table())
     np.testing.assert_allclose(shaded.specular, 2 * DIELECTRIC_F0, atol=ROUNDING)
     np.testing.assert_allclose(shaded.diffuse, 1.0, atol=ROUNDING)
     np.testing.assert_allclose(shaded.rgb, shaded.diffuse + shaded.specular, atol=ROUNDING)
@@ -157,11 +161,11 @@ def test_a_mirror_shows_the_environment_along_the_reflected_view():
     light, normals, views = _light(), _unit(300, 2), _unit(300, 3)
     cosine = np.sum(normals * views, axis=1, keepdims=True)
     reflected = 2 * cosine * normals - views
-    shaded = split_sum(
+    shaded = shade(
         _constant(300, metallic=1.0),
         jnp.asarray(normals, jnp.float32),
         jnp.asarray(views, jnp.float32),
-        prefilter(light, prefilter_operators(SPEC)),
+        prefiltered(light, prefilter_operators(SPEC)),
         fg_table(),
     )
     expected = lookup(light.radiance, jnp.asarray(reflected, jnp.float32))
@@ -178,11 +182,11 @@ def test_a_diffuse_sphere_equals_direct_integration():
     radiance = np.asarray(lookup(light.radiance, jnp.asarray(fine, jnp.float32)), np.float64)
     radiance *= np.asarray(texel_solid_angles(128, 256), np.float64).reshape(-1, 1)
     expected = 0.6 * np.maximum(normals @ fine.T, 0) @ radiance / np.pi
-    shaded = split_sum(
+    shaded = shade(
         _constant(len(normals), albedo=0.6, roughness=1.0),
         jnp.asarray(normals, jnp.float32),
         jnp.asarray(normals, jnp.float32),
-        prefilter(light, prefilter_operators(spec)),
+        prefiltered(light, prefilter_operators(spec)),
         fg_table(),
     )
     np.testing.assert_allclose(shaded.diffuse, expected, atol=3e-3)
@@ -200,11 +204,11 @@ def test_split_sum_is_close_to_the_rendering_integral_under_smooth_light(roughne
         brdf, fresnel = _specular_brdf(local, view, roughness)
         reflectance = 0.8 + 0.2 * fresnel
         expected = (brdf * reflectance * weights) @ radiance(local @ frame.T)
-        shaded = split_sum(
+        shaded = shade(
             _constant(1, albedo=0.8, roughness=roughness, metallic=1.0),
             jnp.asarray(frame[:, 2][None], jnp.float32),
             jnp.asarray((frame @ view)[None], jnp.float32),
-            prefilter(light, prefilter_operators(spec)),
+            prefiltered(light, prefilter_operators(spec)),
             fg_table(),
         )
         # The approximation itself: lobes are not stretched. Head on it is nearly exact.
@@ -215,11 +219,11 @@ def test_normals_facing_away_are_flipped_only_when_two_sided():
     count = 50
     materials, normals, views = _materials(count), _unit(count, 6), _unit(count, 7)
     normals = np.where(np.sum(normals * views, axis=1, keepdims=True) < 0, -normals, normals)
-    light = prefilter(_light(8), prefilter_operators(SPEC))
+    light = prefiltered(_light(8), prefilter_operators(SPEC))
 
     def run(normals, **settings):
         normals, towards = jnp.asarray(normals, jnp.float32), jnp.asarray(views, jnp.float32)
-        return split_sum(materials, normals, towards, light, fg_table(), **settings).rgb
+        return shade(materials, normals, towards, light, fg_table(), **settings).rgb
 
     np.testing.assert_allclose(run(normals), run(-normals), atol=ROUNDING)
     np.testing.assert_allclose(run(normals), run(normals, two_sided=False), atol=ROUNDING)
@@ -231,9 +235,9 @@ def test_normals_facing_away_are_flipped_only_when_two_sided():
 def test_baked_diffuse_is_not_multiplied_by_the_light():
     materials = _materials(20)
     normals, views = (jnp.asarray(_unit(20, seed), jnp.float32) for seed in (9, 10))
-    light = prefilter(_light(11), prefilter_operators(SPEC))
-    lit = split_sum(materials, normals, views, light, fg_table())
-    baked = split_sum(materials, normals, views, light, fg_table(), baked_diffuse=True)
+    light = prefiltered(_light(11), prefilter_operators(SPEC))
+    lit = shade(materials, normals, views, light, fg_table())
+    baked = shade(materials, normals, views, light, fg_table(), baked_diffuse=True)
     dielectric = (1 - materials.metallic)[:, None]
     np.testing.assert_allclose(baked.diffuse, materials.albedo * dielectric, atol=ROUNDING)
     np.testing.assert_allclose(
@@ -290,7 +294,7 @@ def test_everything_is_finite_at_the_extremes():
     materials = Materials(jnp.repeat(albedo[:, None], 3, axis=1), roughness, albedo)
     radiance = jnp.zeros((SPEC.height, SPEC.width, 3)).at[2, 3].set(1e5)
     arguments = (materials, normals, views, radiance)
-    value, gradients = jax.value_and_grad(_loss, argnums=(0, 1, 2, 3))(
+    value, gradients = jax.jit(jax.value_and_grad(_loss, argnums=(0, 1, 2, 3)))(
         *arguments, prefilter_operators(SPEC), fg_table()
     )
     assert np.isfinite(value)
@@ -299,14 +303,14 @@ def test_everything_is_finite_at_the_extremes():
 
 def test_padding_rows_do_not_disturb_the_others():
     count = 10
-    materials, light = _materials(2 * count), prefilter(_light(16), prefilter_operators(SPEC))
+    materials, light = _materials(2 * count), prefiltered(_light(16), prefilter_operators(SPEC))
     normals, views = _unit(2 * count, 17), _unit(2 * count, 18)
     normals[count:] = 0.0
     rows = jax.tree.map(lambda leaf: leaf[:count], materials)
     normals, views = jnp.asarray(normals, jnp.float32), jnp.asarray(views, jnp.float32)
-    run = lambda m, n, v: jnp.sum(split_sum(m, n, v, light, fg_table()).rgb[:count])  # noqa: E731
-    padded = jax.grad(run, argnums=(0, 1))(materials, normals, views)
-    plain = jax.grad(run, argnums=(0, 1))(rows, normals[:count], views[:count])
+    run = lambda m, n, v: jnp.sum(shade(m, n, v, light, fg_table()).rgb[:count])  # noqa: E731
+    padded = jax.jit(jax.grad(run, argnums=(0, 1)))(materials, normals, views)
+    plain = jax.jit(jax.grad(run, argnums=(0, 1)))(rows, normals[:count], views[:count])
     for with_padding, without in zip(jax.tree.leaves(padded), jax.tree.leaves(plain), strict=True):
         np.testing.assert_allclose(with_padding[:count], without, atol=ROUNDING)
         np.testing.assert_array_equal(with_padding[count:], 0.0)

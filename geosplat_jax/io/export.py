@@ -14,6 +14,7 @@ import trimesh
 from jaxtyping import Array, Float, Int
 from PIL import Image
 from trimesh.exchange.gltf import export_glb
+from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from geosplat_jax.io.images import encode_srgb, write_exr, written_aside
@@ -144,7 +145,7 @@ def _vertex_colored(
         z_up_to_y_up(vertices),
         faces,
         vertex_normals=z_up_to_y_up(normals),
-        visual=trimesh.visual.TextureVisuals(material=material),
+        visual=TextureVisuals(material=material),
         vertex_attributes={
             "_COLOR_0": materials[:, :3],
             "_ROUGHNESS": materials[:, 3],
@@ -188,7 +189,7 @@ def _textured(
         z_up_to_y_up(vertices[charts.vertex_rows]),
         charts.faces,
         vertex_normals=z_up_to_y_up(normals[charts.vertex_rows]),
-        visual=trimesh.visual.TextureVisuals(uv=uv, material=material),
+        visual=TextureVisuals(uv=uv, material=material),
         process=False,
     )
     return mesh, {

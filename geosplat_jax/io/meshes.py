@@ -286,5 +286,7 @@ def fill_gutters(
     """
     if covered.all() or not covered.any():
         return texture
-    nearest = ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)
-    return texture[nearest[0], nearest[1]]
+    rows, columns = np.asarray(
+        ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)
+    )
+    return texture[rows, columns]
