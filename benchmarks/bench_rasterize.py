@@ -5,6 +5,7 @@ and backward at 200 x 200 with 71k Gaussians, 1.9 s for 297k at 800 x 800, on tw
 """
 
 import argparse
+import ctypes
 import json
 import statistics
 import time
@@ -24,6 +25,20 @@ YARDSTICK_MS = {"torus_71k_200": 132.0, "torus_297k_800": 1900.0}
 # (u, alpha, beta) of the outer and inner Gaussians of a face, REFERENCE values of the method.
 _ADAPTER_RINGS = ((0.07, 0.80, 15.0), (0.22, 2.08, 13.0))
 _THICKNESS = 4.54e-5
+
+
+def retain_freed_memory() -> bool:
+    """Make glibc reuse freed memory instead of returning it; False where that is impossible.
+
+    XLA allocates the temporaries of a program anew for every call. Above 32 MiB glibc maps and
+    unmaps them each time, and the page faults can cost as much as the computation.
+    """
+    try:
+        libc = ctypes.CDLL("libc.so.6")
+    except OSError:
+        return False
+    trim_threshold, mmap_max = -1, -4
+    return bool(libc.mallopt(mmap_max, 0)) and bool(libc.mallopt(trim_threshold, 2**31 - 1))
 
 
 def torus(major_count: int, minor_count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -212,8 +227,11 @@ if __name__ == "__main__":
     parser.add_argument("--repeats", type=int, default=11)
     parser.add_argument("--tile-size", type=int, default=DEFAULT_TILE_SIZE)
     parser.add_argument("--small", action="store_true", help="only the 200 x 200 scene")
-    options = parser.parse_args()
-    measured = run(
-        repeats=options.repeats, large=not options.small, tile_size=options.tile_size
+    parser.add_argument(
+        "--retain", action="store_true", help="keep freed memory, see retain_freed_memory"
     )
+    options = parser.parse_args()
+    if options.retain:
+        retain_freed_memory()
+    measured = run(repeats=options.repeats, large=not options.small, tile_size=options.tile_size)
     print(json.dumps(measured, indent=1))

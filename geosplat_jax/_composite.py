@@ -45,17 +45,19 @@ def _alphas(rows: Float[Array, "G K columns"], tile_size: int) -> Float[Array, "
     return jnp.where(alpha >= MIN_ALPHA, alpha, 0.0)
 
 
-def _geometry_vjp(
-    rows: Float[Array, "G K columns"], d_log_alpha: Float[Array, "G K P"], tile_size: int
-) -> list[Float[Array, "G K"]]:
-    """Cotangents of the geometry columns of ``rows`` from that of log alpha.
+def _moment_basis(tile_size: int, dtype) -> Float[Array, "P 6"]:
+    """Monomials 1, u, v, uu, uv, vv of the pixel offsets."""
+    u, v = _pixel_offsets(tile_size, dtype)
+    return jnp.stack([jnp.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
 
-    They are six moments of ``d_log_alpha`` over the tile, one matrix product, moved from the
-    centre of the tile to the mean of the Gaussian.
+
+def _geometry_from_moments(
+    rows: Float[Array, "G K columns"], moments: Float[Array, "G K 6"]
+) -> list[Float[Array, "G K"]]:
+    """Cotangents of the geometry columns from the moments of that of log alpha over a tile.
+
+    The moments are about the centre of the tile; here they move to the mean of the Gaussian.
     """
-    u, v = _pixel_offsets(tile_size, rows.dtype)
-    basis = jnp.stack([jnp.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
-    moments = jnp.einsum("gkp,pm->gkm", d_log_alpha, basis)
     m, mu, mv, muu, muv, mvv = (moments[..., i] for i in range(6))
     x, y, xx, xy, yy = (rows[..., i] for i in range(5))
     du, dv = mu - x * m, mv - y * m
@@ -67,18 +69,6 @@ def _geometry_vjp(
         0.5 * (y * (mv + dv) - mvv),
         m,
     ]
-
-
-def _local_weights(
-    alpha: Float[Array, "G K P"],
-) -> tuple[Float[Array, "G K P"], Float[Array, "K P"]]:
-    """Weights ``alpha_i prod_{j<i} (1 - alpha_j)`` within a chunk, and what passes through."""
-    passing = jnp.ones_like(alpha[0])
-    weights = []
-    for slot in alpha:
-        weights.append(slot * passing)
-        passing = passing * (1.0 - slot)
-    return jnp.stack(weights), passing
 
 
 def _place_in_run(labels: Int[Array, " K"], *, reverse: bool = False) -> Int[Array, " K"]:
@@ -157,17 +147,20 @@ def _chunk_rows(
 
 def _composite_forward(tile_size, grid, table, chunk_ranks, chunk_tiles):
     rows = _chunk_rows(table, chunk_ranks, chunk_tiles, tile_size, grid[1])
-    alpha = _alphas(rows, tile_size)
-    weights, passing = _local_weights(alpha)
+    # Without the barriers XLA evaluates the exponential again for every channel.
+    alphas = jax.lax.optimization_barrier(_alphas(rows, tile_size))
+    passing = jnp.ones_like(alphas[0])
+    seen = [jnp.zeros_like(passing)] * (table.shape[1] - GEOMETRY_COLUMNS)
+    for alpha, slot in zip(alphas, rows, strict=True):
+        weight = alpha * passing
+        passing = passing * (1.0 - alpha)
+        seen = [x + weight * slot[:, GEOMETRY_COLUMNS + c, None] for c, x in enumerate(seen)]
     before = _transmittance_before(passing, _place_in_run(chunk_tiles))
-    channels = [
-        before * sum(weights[g] * rows[g, :, c, None] for g in range(alpha.shape[0]))
-        for c in range(GEOMETRY_COLUMNS, table.shape[1])
-    ]
-    channels.append(before * (1.0 - passing))
     tiles = [
-        jax.ops.segment_sum(channel, chunk_tiles, grid[0] * grid[1], indices_are_sorted=True)
-        for channel in channels
+        jax.ops.segment_sum(
+            before * channel, chunk_tiles, grid[0] * grid[1], indices_are_sorted=True
+        )
+        for channel in [*seen, 1.0 - passing]
     ]
     return jnp.stack(tiles), (table, chunk_ranks, chunk_tiles, before)
 
@@ -194,29 +187,41 @@ def composite_tiles(
 def _composite_backward(tile_size, grid, residuals, cotangent):
     table, chunk_ranks, chunk_tiles, before = residuals
     rows = _chunk_rows(table, chunk_ranks, chunk_tiles, tile_size, grid[1])
-    alpha = _alphas(rows, tile_size)
-    weights, passing = _local_weights(alpha)
-    arriving = [c.at[chunk_tiles].get(mode="fill", fill_value=0.0) for c in cotangent]
-    gain = arriving[-1][None]
-    for c, channel in enumerate(arriving[:-1]):
-        gain = gain + rows[..., GEOMETRY_COLUMNS + c, None] * channel[None]
-    slots = alpha.shape[0]
-    seen = sum(weights[g] * gain[g] for g in range(slots))
+    alphas = jax.lax.optimization_barrier(_alphas(rows, tile_size))
+    by_tile = jnp.swapaxes(cotangent, 0, 1)
+    arriving = by_tile.at[chunk_tiles].get(mode="fill", fill_value=0.0)
+
+    def gain_of(slot):
+        gain = arriving[:, -1]
+        for c in range(arriving.shape[1] - 1):
+            gain = gain + slot[:, GEOMETRY_COLUMNS + c, None] * arriving[:, c]
+        return gain
+
+    def front_to_back(state, slot):
+        (passing, seen), (alpha, row) = state, slot
+        seen = seen + alpha * passing * gain_of(row)
+        return (passing * (1.0 - alpha), seen), passing
+
+    one = jnp.ones_like(before)
+    (passing, seen), reaching = jax.lax.scan(front_to_back, (one, 0.0 * one), (alphas, rows))
     behind = _seen_behind(seen, passing, _place_in_run(chunk_tiles, reverse=True))
-    d_log_alpha = [None] * slots
-    for g in reversed(range(slots)):
-        contrast = gain[g] - behind
-        is_free = alpha[g] < MAX_ALPHA
-        d_log_alpha[g] = jnp.where(is_free, before * weights[g] * contrast, 0.0)
-        behind = behind + alpha[g] * contrast
-    d_columns = _geometry_vjp(rows, jnp.stack(d_log_alpha), tile_size)
-    arriving = jnp.stack([before * channel for channel in arriving[:-1]], axis=-1)
-    d_features = jnp.einsum("gkp,kpc->gkc", weights, arriving)
-    d_rows = jnp.concatenate([jnp.stack(d_columns, axis=-1), d_features], axis=-1)
-    d_table = jnp.zeros_like(table)
-    d_table = d_table.at[chunk_ranks.reshape(-1)].add(
-        d_rows.reshape(-1, table.shape[1]), mode="drop"
+    weighted = before[:, None] * arriving[:, :-1]
+    basis = _moment_basis(tile_size, table.dtype)
+
+    def back_to_front(behind, slot):
+        alpha, row, passing = slot
+        weight, contrast = alpha * passing, gain_of(row) - behind
+        d_log_alpha = jnp.where(alpha < MAX_ALPHA, before * weight * contrast, 0.0)
+        moments = jnp.matmul(d_log_alpha, basis, precision=jax.lax.Precision.HIGHEST)
+        d_features = jnp.einsum("kcp,kp->kc", weighted, weight, precision="highest")
+        return behind + alpha * contrast, (moments, d_features)
+
+    _, (moments, d_features) = jax.lax.scan(
+        back_to_front, behind, (alphas, rows, reaching), reverse=True
     )
+    d_geometry = jnp.stack(_geometry_from_moments(rows, moments), axis=-1)
+    d_rows = jnp.concatenate([d_geometry, d_features], axis=-1).reshape(-1, table.shape[1])
+    d_table = jnp.zeros_like(table).at[chunk_ranks.reshape(-1)].add(d_rows, mode="drop")
     return d_table, None, None
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from geosplat_jax.geometry import face_normals_and_areas
 from geosplat_jax.numerics import safe_divide, safe_norm, safe_normalize, safe_sqrt
-from geosplat_jax.rotation import frame_from_normal, matrix_to_quaternion
+from geosplat_jax.rotation import axes_to_quaternion, frame_from_normal, matrix_to_quaternion
 from geosplat_jax.scene import Gaussians, Mesh
 
 GAUSSIANS_PER_FACE = 6
@@ -72,11 +72,17 @@ def _inert(gaussians: Gaussians) -> Gaussians:
     )
 
 
-def _midpoint_weights(corner: float, dtype: jnp.dtype) -> Float[Array, "3 3"]:
-    """Barycentric midpoints m12, m23, m31 of the triple of points with coordinate ``corner``."""
+def _blend(
+    corners: Float[Array, "3 3 F"], corner: float
+) -> tuple[Float[Array, "3 F"], Float[Array, "3 F"], Float[Array, "3 F"]]:
+    """Blend corner values at the midpoints m12, m23, m31 of the triple with ``corner``."""
+    p1, p2, p3 = corners
     side = 0.5 * (1.0 - corner)
-    rows = [[corner, side, side], [side, side, corner], [side, corner, side]]
-    return jnp.array(rows, dtype)
+    return (
+        corner * p1 + side * (p2 + p3),
+        corner * p3 + side * (p1 + p2),
+        corner * p2 + side * (p1 + p3),
+    )
 
 
 def face_gaussians(
@@ -94,48 +100,51 @@ def face_gaussians(
     normals : (Cv, 3) unit vertex normals.
     constants : see `AdapterConstants`.
     """
-    corners = mesh.vertices[mesh.faces]
-    corner_normals = normals[mesh.faces]
-    face_normal, area = face_normals_and_areas(mesh)
-    # Inner and outer segments are parallel to the same three edges: P2-P3, P1-P2, P3-P1.
-    p1, p2, p3 = corners[:, 0], corners[:, 1], corners[:, 2]
-    edges = jnp.stack([p2 - p3, p1 - p2, p3 - p1], axis=1)
-    edge_lengths = safe_norm(edges)
+    # Components come first, (corner, xyz, face): the arithmetic runs along contiguous faces.
+    both = jnp.concatenate([mesh.vertices, normals], axis=1)[mesh.faces.T].transpose(0, 2, 1)
+    corners, corner_normals = both[:, :3], both[:, 3:]
+    face_normal, area = (x.T for x in face_normals_and_areas(mesh))
+    # The segments of both rings are parallel to the same three edges: P2-P3, P1-P2, P3-P1.
+    p1, p2, p3 = corners
+    edges = (p2 - p3, p1 - p2, p3 - p1)
+    lengths = [safe_norm(edge, axis=0) for edge in edges]
+    if not constants.shading_frame:
+        frames = [_frame(edge, face_normal) for edge in edges]
 
-    means, shading_normals, scales = [], [], []
+    means, shading, scales, quats = [], [], [], []
     for ring, corner in enumerate((constants.u, constants.v)):
-        weights = _midpoint_weights(corner, corners.dtype)
-        means.append(jnp.einsum("kq,fqi->fki", weights, corners))
-        shading_normals.append(safe_normalize(jnp.einsum("kq,fqi->fki", weights, corner_normals)))
-        segment = (1.0 - 3.0 * corner) * edge_lengths
-        along = 0.5 * constants.alpha[ring] * segment
-        across = safe_divide(2.0 * area[:, None], constants.beta[ring] * segment)
-        scales.append(jnp.stack([along, across, jnp.full_like(along, constants.thickness)], -1))
+        means += _blend(corners, corner)
+        ring_normals = [safe_normalize(n, axis=0) for n in _blend(corner_normals, corner)]
+        shading += ring_normals
+        for edge, length, normal in zip(edges, lengths, ring_normals, strict=True):
+            segment = (1.0 - 3.0 * corner) * length
+            along = 0.5 * constants.alpha[ring] * segment  # Eq. 9
+            across = safe_divide(2.0 * area, constants.beta[ring] * segment)
+            scales.append(jnp.stack([along, across, jnp.full_like(along, constants.thickness)]))
+            if constants.shading_frame:
+                quats.append(_frame(edge, normal))
+        if not constants.shading_frame:
+            quats += frames
 
-    shading = jnp.concatenate(shading_normals, axis=1)
-    if constants.shading_frame:
-        quats = _frames(jnp.concatenate([edges, edges], axis=1), shading)
-    else:
-        face_axis = jnp.broadcast_to(face_normal[:, None, :], edges.shape)
-        quats = jnp.tile(_frames(edges, face_axis), (1, 2, 1))
-    count = mesh.face_count * GAUSSIANS_PER_FACE
-    rows = mesh.faces.shape[0] * GAUSSIANS_PER_FACE
+    def rows(parts: list[Float[Array, "c F"]]) -> Float[Array, "N c"]:
+        stacked = jnp.stack(parts)  # (6, c, F)
+        return stacked.transpose(2, 0, 1).reshape(-1, stacked.shape[1])
+
     gaussians = Gaussians(
-        means=jnp.concatenate(means, axis=1).reshape(rows, 3),
-        quats=quats.reshape(rows, 4),
-        scales=jnp.concatenate(scales, axis=1).reshape(rows, 3),
-        opacities=jnp.full((rows,), constants.opacity, corners.dtype),
-        normals=shading.reshape(rows, 3),
-        count=count,
+        means=rows(means),
+        quats=rows(quats),
+        scales=rows(scales),
+        opacities=jnp.full((6 * area.shape[0],), constants.opacity, area.dtype),
+        normals=rows(shading),
+        count=mesh.face_count * GAUSSIANS_PER_FACE,
     )
     return _inert(gaussians)
 
 
-def _frames(along: Float[Array, "F k 3"], up: Float[Array, "F k 3"]) -> Float[Array, "F k 4"]:
+def _frame(along: Float[Array, "3 F"], up: Float[Array, "3 F"]) -> Float[Array, "4 F"]:
     """Quaternions whose x axis follows ``along`` (made orthogonal to ``up``) and z is ``up``."""
-    x = safe_normalize(along - jnp.sum(along * up, axis=-1, keepdims=True) * up)
-    y = jnp.cross(up, x)
-    return matrix_to_quaternion(jnp.stack([x, y, up], axis=-1))
+    x = safe_normalize(along - jnp.sum(along * up, axis=0, keepdims=True) * up, axis=0)
+    return axes_to_quaternion(x, jnp.cross(up, x, axis=0), up)
 
 
 def vertex_gaussians(

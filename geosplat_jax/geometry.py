@@ -278,7 +278,7 @@ def _dual_vertices(geometry: Geometry, grid: Grid, cells: _Cells, *, capacity: i
 
     start, end = _edge_ends(corners)
     along = end - start
-    # FlexiCubes Eq. 3: crossings of the alpha-scaled field, Eq. 4: their beta-weighted mean.
+    # Flexible weights: crossings of the alpha-scaled field, then their beta-weighted mean.
     fraction = _crossing_fraction(*_edge_ends(sdf * alpha), crosses)
     weight = jnp.where(crosses, beta, 0.0)
     total = jnp.where(is_real, jnp.sum(weight, axis=0), 1.0)
@@ -352,7 +352,7 @@ def _diagonal_weights(gamma: Float[Array, "4 Cq"]) -> tuple[Array, Array]:
 def _quad_centres(
     points: Float[Array, "3 Cd"], gamma: Float[Array, " Cd"], quads: _Quads
 ) -> Float[Array, "Cq 3"]:
-    """Blend the middles of the two diagonals by gamma (FlexiCubes Eq. 5); zero on padding."""
+    """Blend the middles of the two diagonals by gamma; zero on padding."""
     rows = jnp.concatenate([points, gamma[None, :]]).T
     corner = jnp.moveaxis(_rows(rows, quads.corners), -1, 0)
     first, second = _diagonal_weights(corner[3])

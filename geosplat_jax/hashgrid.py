@@ -159,17 +159,21 @@ def _locate(points: Float[Array, "N 3"], spec: HashGridSpec) -> _Cells:
     # A line occupies cells + 1 rows, so this many offsets keep it inside the level's table.
     offset_count = np.float32(2**spec.log2_entries) - cells.astype(np.float32)
 
-    scaled = jnp.clip(points, 0.0, 1.0)[:, :, None] * jnp.asarray(cells, points.dtype)[:, None, :]
-    corner = jnp.clip(scaled.astype(jnp.int32), 0, cells[:, None, :] - 1)
-    fraction = scaled - corner.astype(points.dtype)
-    x, y, z = corner[:, 0], corner[:, 1], corner[:, 2]
+    sizes = jnp.asarray(cells, points.dtype)
+    corners, fractions = [], []
+    for axis in range(3):  # three (N, L) arrays vectorise 4 times better than one (N, 3, L)
+        scaled = jnp.clip(points[:, axis], 0.0, 1.0)[:, None] * sizes
+        corner = jnp.clip(scaled.astype(jnp.int32), 0, cells - 1)
+        corners.append(corner)
+        fractions.append(scaled - corner.astype(points.dtype))
+    x, y, z = corners
 
     rows = []
     for dz, dy in ((0, 0), (0, 1), (1, 0), (1, 1)):
         dense_line = ((z + dz) * (cells + 1) + (y + dy)) * (cells + 1)
         line = jnp.where(is_dense, dense_line, _hash_line(y + dy, z + dz, offset_count))
         rows.append(first_rows + line + x)
-    located = _Cells(tuple(rows), (fraction[:, 0], fraction[:, 1], fraction[:, 2]))
+    located = _Cells(tuple(rows), tuple(fractions))
     # Without the barrier XLA repeats the hashing for every feature of every corner (x1.6 time).
     return jax.lax.optimization_barrier(located)
 
@@ -180,7 +184,8 @@ def _line_weights(cells: _Cells) -> list[Float[Array, "N L"]]:
     return [wz * wy for wz in (1 - tz, tz) for wy in (1 - ty, ty)]
 
 
-def _take(table: Float[Array, "E F"], rows: Int[Array, "N L"]) -> Float[Array, "N L F"]:
+def _take(table: Float[Array, "E ..."], rows: Int[Array, "N L"]) -> Float[Array, "N L ..."]:
+    """Rows, or entries of a column, that are known to be in bounds."""
     return table.at[rows].get(mode="promise_in_bounds")
 
 
@@ -201,19 +206,14 @@ def _reference_encode(
     """Encode with plain operations, differentiated by autodiff: the meaning of `encode`."""
     is_inside = (points >= 0) & (points <= 1)
     clamped = jnp.where(is_inside, points, jnp.clip(jax.lax.stop_gradient(points), 0.0, 1.0))
-    sizes = [jnp.asarray(n, points.dtype) for n in spec.resolutions]
     located = _locate(jax.lax.stop_gradient(points), spec)
+    cells = jnp.asarray(spec.resolutions, points.dtype)[None, :]
     fractions = []
     for axis in range(3):
-        scaled = jnp.stack([clamped[:, axis] * n for n in sizes], axis=1)
-        corner = jnp.stack(
-            [
-                jnp.clip(jax.lax.stop_gradient(scaled[:, k]).astype(jnp.int32), 0, n - 1)
-                for k, n in enumerate(spec.resolutions)
-            ],
-            axis=1,
-        )
-        fractions.append(scaled - corner.astype(points.dtype))
+        scaled = clamped[:, axis, None] * cells
+        # The same fractions again, now with a derivative: the corner is constant.
+        corner = jax.lax.stop_gradient(scaled) - located.fractions[axis]
+        fractions.append(scaled - corner)
     features = _interpolate(table, _Cells(located.rows, tuple(fractions)))
     return features.reshape(points.shape[0], spec.width)
 
@@ -244,28 +244,36 @@ def _scatter_rows(
 def _point_gradient(
     table: Float[Array, "E F"],
     points: Float[Array, "N 3"],
-    cells: _Cells,
     cotangent: Float[Array, "N L F"],
     spec: HashGridSpec,
 ) -> Float[Array, "N 3"]:
-    """Differentiate along the axes of a point; zero along those on which it was clamped."""
+    """Differentiate along the axes of a point; zero along those on which it was clamped.
+
+    Entries of the table's columns summed in one unrolled chain take half the time of rows reduced
+    over so short an axis.
+    """
+    cells = _locate(points, spec)
     tx, ty, tz = cells.fractions
-    # Products of the cotangent with each corner's row, over the features of a level.
-    low, high = [], []
-    for rows in cells.rows:
-        low.append(jnp.sum(_take(table, rows) * cotangent, axis=-1))
-        high.append(jnp.sum(_take(table, rows + 1) * cotangent, axis=-1))
+    columns = [table[:, index] for index in range(spec.features)]
+
+    def dot_rows(rows: Int[Array, "N L"]) -> Float[Array, "N L"]:
+        """Product of the cotangent with a corner's row, over the features of a level."""
+        product = jnp.zeros((), cotangent.dtype)
+        for index, column in enumerate(columns):
+            product = product + _take(column, rows) * cotangent[:, :, index]
+        return product
+
+    low = [dot_rows(rows) for rows in cells.rows]
+    high = [dot_rows(rows + 1) for rows in cells.rows]
     line = [a * (1 - tx) + b * tx for a, b in zip(low, high, strict=True)]
-    weights = _line_weights(cells)
-    along_x = sum(
-        (w * (b - a) for w, a, b in zip(weights, low, high, strict=True)), start=jnp.zeros_like(tx)
-    )
+    weighted = zip(_line_weights(cells), low, high, strict=True)
+    along_x = sum((w * (b - a) for w, a, b in weighted), start=jnp.zeros_like(tx))
     along_y = (line[1] - line[0]) * (1 - tz) + (line[3] - line[2]) * tz
     along_z = (line[2] - line[0]) * (1 - ty) + (line[3] - line[1]) * ty
-    per_level = jnp.stack([along_x, along_y, along_z], axis=-1)
-    sizes = jnp.asarray(spec.resolutions, points.dtype)
-    gradient = jnp.sum(per_level * sizes[None, :, None], axis=1)
-    return jnp.where((points >= 0) & (points <= 1), gradient, 0.0)
+    # The chain rule of scaling a point to a level's cells.
+    sizes = jnp.asarray(spec.resolutions, points.dtype)[None, :]
+    gradient = [jnp.sum(along * sizes, axis=1) for along in (along_x, along_y, along_z)]
+    return jnp.where((points >= 0) & (points <= 1), jnp.stack(gradient, axis=-1), 0.0)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(2, 3))
@@ -285,23 +293,22 @@ def _encode_backward(spec, position_gradient, residuals, cotangent):
     chunk = min(_BACKWARD_CHUNK, max(count, 1))
     padding = ((0, -count % chunk), (0, 0))  # zero cotangents: padding adds nothing
 
+    def by_level(rows):
+        return rows.reshape(-1, spec.levels, spec.features)
+
     def step(gradient, slices):
         chunk_points, chunk_cotangent = slices
         cells = _locate(chunk_points, spec)
-        chunk_cotangent = chunk_cotangent.reshape(-1, spec.levels, spec.features)
-        gradient = _scatter_rows(gradient, cells, chunk_cotangent)
-        if not position_gradient:
-            return gradient, None
-        return gradient, _point_gradient(table, chunk_points, cells, chunk_cotangent, spec)
+        return _scatter_rows(gradient, cells, by_level(chunk_cotangent)), None
 
     chunks = (
         jnp.pad(points, padding).reshape(-1, chunk, 3),
         jnp.pad(cotangent, padding).reshape(-1, chunk, spec.width),
     )
-    gradient, point_gradients = jax.lax.scan(step, jnp.zeros_like(table), chunks)
+    gradient, _ = jax.lax.scan(step, jnp.zeros_like(table), chunks)
     if not position_gradient:
         return gradient, jnp.zeros_like(points)
-    return gradient, point_gradients.reshape(-1, 3)[:count]
+    return gradient, _point_gradient(table, points, by_level(cotangent), spec)
 
 
 _encode.defvjp(_encode_forward, _encode_backward)

@@ -36,7 +36,9 @@ class LightSpec:
     height, width : texels of the environment map.
     roughness : increasing perceptual roughness of the levels (GGX alpha is its square). A first
         level 0 is the map itself. The last must be 1, whose lobe is exactly the clamped cosine
-        and therefore doubles as the diffuse level.
+        and therefore doubles as the diffuse level. Blending halfway between the default levels
+        errs by at most 1 % (relative L2) from .08 upwards for a noise map and 10 % for one
+        single-texel sun; more levels cost little.
 
     Raises
     ------
@@ -47,7 +49,7 @@ class LightSpec:
 
     height: int = 64
     width: int = 128
-    roughness: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.55, 0.75, 1.0)
+    roughness: tuple[float, ...] = (0.0, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45, 0.6, 0.8, 1.0)
 
     def __post_init__(self):
         if self.height < 2 or self.width < 2 or self.width % 2:
@@ -200,9 +202,10 @@ def _footprint(directions: Float[Array, "N 3"], height: int, width: int) -> _Foo
 def _gather(
     rows: Float[Array, "T C"], footprint: _Footprint, offset: Int[Array, " N"] | int = 0
 ) -> Float[Array, "N C"]:
-    # Four plain gathers: a table of packed 2x2 neighbourhoods halves their number, but building it
-    # costs more. One channel at a time, because broadcasting weights over a minor axis of 3, and
-    # summing over it in the backward pass, does not vectorise (measured 1.4 times slower).
+    # Four plain gathers: a table of packed 2x2 neighbourhoods needs fewer but must be built, and
+    # measured slower forward and no faster backward. One channel at a time, because broadcasting
+    # weights over a minor axis of 3, and summing over it in the backward pass, does not vectorise
+    # (the whole split sum is then 1.3 times slower).
     corners = [rows.at[index + offset].get(mode="promise_in_bounds") for index in footprint.indices]
     channels = [
         sum(c[:, k] * weight for c, weight in zip(corners, footprint.weights, strict=True))
@@ -335,7 +338,7 @@ def prefilter_operators(spec: LightSpec) -> PrefilterOperators:
     Each output texel's lobe is cut into rings and spokes finer than the texels, and every piece
     deposits its exact mass on the four texels that the bilinear lookup would read. Rows therefore
     sum to one: constant light is preserved. Memory is ``4 K H^2 (W/2+1)`` bytes for K filtered
-    levels: 7 MB at 64 x 128, 59 MB at 128 x 256 with the default levels.
+    levels: 10 MB at 64 x 128, 76 MB at 128 x 256 with the default levels.
     """
     return PrefilterOperators(jnp.asarray(_zonal_matrices(spec)), spec)
 

@@ -12,10 +12,10 @@ so that the differentiable work grows with the visible Gaussians, not with all o
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from geosplat_jax._composite import MAX_ALPHA, composite_tiles
-from geosplat_jax._tiles import MIN_ALPHA, TileLists, find_visible, tile_grid
+from geosplat_jax._tiles import MIN_ALPHA, TileLists, find_visible, gather_visible, tile_grid
 from geosplat_jax.capacity import Capacities, Usage
 from geosplat_jax.numerics import safe_log
 from geosplat_jax.projection import Splats, project
@@ -33,16 +33,6 @@ __all__ = [
 
 DEFAULT_TILE_SIZE = 4
 """Side of a tile in pixels; small, because a mesh's Gaussians are small (measured)."""
-
-
-def gather_visible(
-    index: Int[Array, " M"], values: Float[Array, "N ..."], *, padding: float = 0.0
-) -> Float[Array, "M ..."]:
-    """Rows of ``values`` in the order of `TileLists.index`; ``padding`` where index is N.
-
-    Differentiable in ``values``; padding rows give no gradient to any row.
-    """
-    return values.at[index].get(mode="fill", fill_value=padding)
 
 
 def _tiles_to_image(
@@ -112,8 +102,8 @@ def _reference_composite(
     width: int,
 ) -> tuple[Float[Array, "H W C"], Float[Array, "H W"]]:
     """Composite rows that are in depth order, every Gaussian in every pixel, by plain autodiff."""
-    x, y = jnp.meshgrid(jnp.arange(width) + 0.5, jnp.arange(height) + 0.5)
-    pixels = jnp.stack([x, y], axis=-1).reshape(1, -1, 2).astype(features.dtype)
+    x, y = jnp.meshgrid(*(jnp.arange(n, dtype=features.dtype) + 0.5 for n in (width, height)))
+    pixels = jnp.stack([x, y], axis=-1).reshape(1, -1, 2)
     offset = pixels - splats.means2d[:, None, :]
     xx, xy, yy = (splats.conics[:, None, i] for i in range(3))
     dx, dy = offset[..., 0], offset[..., 1]

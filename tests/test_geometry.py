@@ -221,9 +221,10 @@ def face_set(faces):
     return {tuple(row) for row in np.take_along_axis(faces, starts % 3, axis=1).tolist()}
 
 
-@pytest.mark.parametrize(
-    "name", ["sphere_r8", "noise_r12", "noise_r20", "torus_r16", "torus_r16_eval"]
-)
+SLOW_ORACLES = [pytest.param(n, marks=pytest.mark.slow) for n in ("torus_r16", "noise_r20")]
+
+
+@pytest.mark.parametrize("name", ["sphere_r8", "noise_r12", "torus_r16_eval", *SLOW_ORACLES])
 def test_equals_the_original_in_values_and_gradients(name):
     with double_precision():
         data, geometry, expected = load_oracle(name)
@@ -402,9 +403,10 @@ def test_dtype_in_is_dtype_out():
             surface = isosurface(geometry, grid, capacities=SMALL_ROOM, training=False)
             results = [surface, vertex_normals(surface.mesh), face_normals_and_areas(surface.mesh)]
             results += [sdf_entropy(geometry, grid), weight_magnitude(geometry)]
-            return [*results, resample(geometry, grid, grid), deformed_vertices(geometry, grid)]
+            results += [resample(geometry, grid, grid), deformed_vertices(geometry, grid)]
+            return jax.tree.leaves(results)
 
-        for leaf in jax.tree.leaves(jax.eval_shape(outputs, geometry)):
+        for leaf in jax.eval_shape(outputs, geometry):
             assert leaf.dtype in (dtype, jnp.int32)
 
     check(jnp.float32)
@@ -555,13 +557,15 @@ def test_resampling_keeps_a_sphere_a_sphere():
     sdf = (safe_norm(deformed_vertices(wobbly, grid)) - 0.6) / grid.cell_size
     for source in (geometry, replace(wobbly, sdf=sdf)):
         fresh = carry(source, grid, finer)
+        truth = sphere_sdf(finer, radius=0.6) * finer.cell_size
+        is_near = jnp.abs(truth) < 0.2
         np.testing.assert_allclose(
-            fresh.sdf * finer.cell_size, sphere_sdf(finer, radius=0.6) * finer.cell_size, atol=0.06
+            (fresh.sdf * finer.cell_size)[is_near], truth[is_near], atol=0.05
         )
         mesh = to_trimesh(extract(fresh, finer, capacities=ROOM, training=False).mesh)
         radii = np.linalg.norm(mesh.vertices, axis=1)
         assert mesh.is_watertight
-        assert abs(radii.mean() - 0.6) < 0.01
+        assert abs(radii.mean() - 0.6) < 0.02
         assert np.abs(radii - 0.6).max() < 0.03
 
 

@@ -99,34 +99,33 @@ def test_conic_inverts_the_covariance(x64):
 
 
 def test_flat_gaussians_keep_their_digits_in_float32():
-    means, quats, scales = random_gaussians(2, 200, np.float64)
-    flat = jnp.asarray(np.asarray(scales) * np.array([1.0, 1.0, 1e-4]), jnp.float32)
-    low = project(means.astype(jnp.float32), quats.astype(jnp.float32), flat, **camera(jnp.float32))
-    rows = np.asarray(low.compensation)
-    rotation = np.asarray(quaternion_to_matrix(quats.astype(jnp.float32)), np.float64)
-    settings = jax.tree.map(lambda x: np.asarray(x, np.float64), camera(jnp.float32))
-    point = np.asarray(means, np.float64) + np.array([0, 0, 3.0])
-    focal = settings["intrinsics"][[0, 1], [0, 1]]
+    means, quats, scales = random_gaussians(2, 200, jnp.float32)
+    flat = scales * jnp.array([[1.0, 1.0, 1e-4]], jnp.float32)
+    settings = camera(jnp.float32)
+    splats = project(means, quats, flat, **settings)
+    # The same from float64 numpy, with the determinant as a cross product.
+    rotation = np.asarray(quaternion_to_matrix(quats), np.float64)
     axes = rotation * np.asarray(flat, np.float64)[:, None, :]
+    point = np.asarray(means, np.float64) + np.array([0, 0, 3.0])
+    focal = np.asarray(settings["intrinsics"], np.float64)[[0, 1], [0, 1]]
     slope = point[:, :2] / point[:, 2:]
     row = (focal / point[:, 2:])[..., None] * (axes[:, :2] - slope[..., None] * axes[:, 2:])
     sharp = np.sum(np.cross(row[:, 0], row[:, 1]) ** 2, -1)
     trace = np.sum(row**2, axis=(1, 2))
     expected = np.sqrt(sharp / (sharp + LOW_PASS_VARIANCE * trace + LOW_PASS_VARIANCE**2))
-    np.testing.assert_allclose(rows, expected, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(splats.compensation, expected, rtol=1e-4, atol=1e-6)
 
 
 def test_gradients_match_finite_differences_along_random_directions(x64):
     inputs = random_gaussians(3, 8, jnp.float64)
     rng = np.random.default_rng(4)
-    weights = None
+    weights = [rng.normal(size=s) for s in ((8, 2), (8, 3), (8,), (8,))]
 
     def value(inputs, settings):
         splats = project(*inputs, **settings)
         leaves = [splats.means2d, splats.conics, splats.depths, splats.compensation]
         return sum(jnp.sum(w * leaf) for w, leaf in zip(weights, leaves, strict=True))
 
-    weights = [rng.normal(size=s) for s in ((8, 2), (8, 3), (8,), (8,))]
     static = {"height": 64, "width": 64}
     matrices = {k: v for k, v in camera(jnp.float64).items() if k not in static}
 
@@ -135,9 +134,9 @@ def test_gradients_match_finite_differences_along_random_directions(x64):
 
     arguments = (inputs, matrices)
     gradient = jax.grad(full)(arguments)
+    step = 1e-6
     for _ in range(3):
         direction = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), arguments)
-        step = 1e-6
         forward = full(jax.tree.map(lambda x, d: x + step * d, arguments, direction))
         backward = full(jax.tree.map(lambda x, d: x - step * d, arguments, direction))
         products = jax.tree.map(lambda g, d: jnp.sum(g * d), gradient, direction)
