@@ -37,7 +37,7 @@ class LightSpec:
     roughness : increasing perceptual roughness of the levels (GGX alpha is its square). A first
         level 0 is the map itself. The last must be 1, whose lobe is exactly the clamped cosine
         and therefore doubles as the diffuse level. Blending halfway between the default levels
-        errs by at most 1 % (relative L2) from .08 upwards for a noise map and 10 % for one
+        errs by about 1 % (relative L2) above .08 for a noise map and 10 % for one
         single-texel sun; more levels cost little.
 
     Raises

@@ -122,11 +122,7 @@ def to_unit_cube(
     return 0.5 * jnp.clip(local, -1.0, 1.0) + 0.5
 
 
-def _surface_table(params: MaterialField) -> Float[Array, "E F"]:
-    return params.albedo_table if params.surface_table is None else params.surface_table
-
-
-def materials_at(
+def attributes_at(
     params: MaterialField,
     points: Float[Array, "N 3"],
     *,
@@ -134,8 +130,8 @@ def materials_at(
     center: Float[Array, " 3"],
     half_extent: Float[Array, ""],
     position_gradient: bool = False,
-) -> Materials:
-    """Evaluate albedo, roughness and metallic at points of the world.
+) -> tuple[Materials, Float[Array, " N"] | None]:
+    """Evaluate every attribute of a field at points of the world, each encoding once.
 
     Parameters
     ----------
@@ -148,8 +144,10 @@ def materials_at(
 
     Returns
     -------
-    `Materials` with albedo in (0, 1), roughness in [0.1, 1] and metallic in (0, 1), or 0 for a
-    field without metallic.
+    materials : albedo in (0, 1), roughness in [0.1, 1] and metallic in (0, 1), or 0 for a field
+        without metallic.
+    shift : (N,) share in (0, 1) of ``sqrt(face area)`` by which a Gaussian sinks below its face
+        (REFERENCE 2.1), ``sigmoid(z(mu))``, starting near 1/2; None for a field without shift.
     """
     unit = to_unit_cube(points, center, half_extent)
     features = encode(
@@ -168,7 +166,31 @@ def materials_at(
         metallic = jax.nn.sigmoid(raw[:, 1] + spec.initial_metallic_logit)
     else:
         metallic = jnp.zeros_like(roughness)
-    return Materials(albedo=albedo, roughness=roughness, metallic=metallic)
+    shift = None
+    if params.shift_head is not None:
+        shift = jax.nn.sigmoid(apply_mlp(params.shift_head, features)[:, 0])
+    return Materials(albedo=albedo, roughness=roughness, metallic=metallic), shift
+
+
+def materials_at(
+    params: MaterialField,
+    points: Float[Array, "N 3"],
+    *,
+    spec: MaterialSpec,
+    center: Float[Array, " 3"],
+    half_extent: Float[Array, ""],
+    position_gradient: bool = False,
+) -> Materials:
+    """Evaluate albedo, roughness and metallic at points of the world; see `attributes_at`."""
+    materials, _ = attributes_at(
+        params,
+        points,
+        spec=spec,
+        center=center,
+        half_extent=half_extent,
+        position_gradient=position_gradient,
+    )
+    return materials
 
 
 def inward_shift(
@@ -179,20 +201,23 @@ def inward_shift(
     center: Float[Array, " 3"],
     half_extent: Float[Array, ""],
 ) -> Float[Array, " N"]:
-    """Share of ``sqrt(face area)`` by which a Gaussian sinks below its face (REFERENCE 2.1).
-
-    ``sigmoid(z(mu))`` in (0, 1). The points carry no gradient. Starts near 1/2.
+    """Evaluate the inward shift alone; see `attributes_at`. The points carry no gradient.
 
     Raises
     ------
     ValueError
         When the field has no shift head.
     """
-    if params.shift_head is None:
+    _, shift = attributes_at(
+        params,
+        jax.lax.stop_gradient(points),
+        spec=spec,
+        center=center,
+        half_extent=half_extent,
+    )
+    if shift is None:
         raise ValueError("the field has no shift head; build it from a spec with has_shift=True")
-    unit = to_unit_cube(jax.lax.stop_gradient(points), center, half_extent)
-    features = encode(_surface_table(params), unit, spec=spec.grid)
-    return jax.nn.sigmoid(apply_mlp(params.shift_head, features)[:, 0])
+    return shift
 
 
 def indirect_logits(

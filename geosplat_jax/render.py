@@ -21,7 +21,7 @@ from geosplat_jax.adapter import (
 from geosplat_jax.capacity import Capacities, Usage
 from geosplat_jax.geometry import face_normals_and_areas, isosurface, vertex_normals
 from geosplat_jax.light import LightSpec, PrefilteredLight, PrefilterOperators, prefilter
-from geosplat_jax.materials import MaterialField, MaterialSpec, inward_shift, materials_at
+from geosplat_jax.materials import MaterialField, MaterialSpec, attributes_at
 from geosplat_jax.numerics import safe_normalize
 from geosplat_jax.projection import project
 from geosplat_jax.rasterize import (
@@ -181,13 +181,17 @@ def reconstruct(
     mesh = surface.mesh
     gaussians, outward = _sample(mesh, model=model, sampling=sampling)
     center, half_extent = grid_center_and_extent(context.grid)
-    place = {"spec": model.material, "center": center, "half_extent": half_extent}
     # Attributes belong to the face, where a baked texture will be looked up, not to the shifted
     # splat.
-    materials = materials_at(params.material, gaussians.means, **place)
-    if model.material.has_shift and sampling == "face":
-        fraction = inward_shift(params.material, gaussians.means, **place)
-        gaussians = shift_inwards(gaussians, *face_normals_and_areas(mesh), fraction)
+    materials, shift = attributes_at(
+        params.material,
+        gaussians.means,
+        spec=model.material,
+        center=center,
+        half_extent=half_extent,
+    )
+    if shift is not None and sampling == "face":
+        gaussians = shift_inwards(gaussians, *face_normals_and_areas(mesh), shift)
     return Asset(mesh, gaussians, outward, materials, surface.deviation, surface.usage)
 
 

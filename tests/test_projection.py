@@ -5,9 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from geosplat_jax.projection import LOW_PASS_VARIANCE, project
+from geosplat_jax import projection
+from geosplat_jax.projection import LOW_PASS_VARIANCE
 from geosplat_jax.rotation import quaternion_to_matrix
 
+# Compiled once a shape; op-by-op dispatch would compile every small operation on its own.
+project = jax.jit(projection.project, static_argnames=("height", "width"))
 ORACLES = Path(__file__).parents[2] / "shared" / "oracles"
 # float64 on both sides, some hundred operations deep.
 EXACT = 1e-12
@@ -133,7 +136,7 @@ def test_gradients_match_finite_differences_along_random_directions(x64):
         return value(arguments[0], arguments[1] | static)
 
     arguments = (inputs, matrices)
-    gradient = jax.grad(full)(arguments)
+    gradient = jax.jit(jax.grad(full))(arguments)
     step = 1e-6
     for _ in range(3):
         direction = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), arguments)
@@ -156,7 +159,7 @@ def test_extreme_scales_are_finite_in_float32(scale, depth):
         splats = project(*inputs, **camera(jnp.float32, size=800))
         return jnp.sum(splats.means2d) + jnp.sum(splats.conics) + jnp.sum(splats.compensation)
 
-    value, gradient = jax.value_and_grad(total)((means, quats, scales))
+    value, gradient = jax.jit(jax.value_and_grad(total))((means, quats, scales))
     assert all_finite((value, gradient))
 
 
@@ -201,8 +204,8 @@ def test_rows_at_or_behind_the_near_plane_are_finite_and_marked(depth):
 def test_float32_in_float32_out_and_jit_equals_eager():
     inputs = random_gaussians(8, 10, jnp.float32)
     settings = camera(jnp.float32)
-    eager = project(*inputs, **settings)
-    compiled = jax.jit(lambda *a: project(*a, **settings))(*inputs)
+    eager = projection.project(*inputs, **settings)
+    compiled = project(*inputs, **settings)
     for a, b in zip(jax.tree.leaves(eager), jax.tree.leaves(compiled), strict=True):
         assert a.dtype in (jnp.float32, bool)
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)

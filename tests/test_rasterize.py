@@ -62,10 +62,17 @@ def scene(seed, count, dtype, *, opacity=(0.0, 1.0), channels=3, extent=1.2):
     return tuple(jnp.asarray(a, dtype) for a in arrays)
 
 
+STATIC = ("height", "width", "capacities", "tile_size")
+# Compiled once a shape; op-by-op dispatch would compile every small operation on its own.
+compiled_rasterize = jax.jit(rasterize, static_argnames=STATIC)
+
+
 def draw(inputs, settings, *, capacities=AMPLE, tile_size=4, eligible=None):
     if eligible is None:
         eligible = jnp.ones(inputs[0].shape[0], bool)
-    return rasterize(*inputs, eligible, capacities=capacities, tile_size=tile_size, **settings)
+    return compiled_rasterize(
+        *inputs, eligible, capacities=capacities, tile_size=tile_size, **settings
+    )
 
 
 def dense(inputs, settings):
@@ -143,7 +150,7 @@ def test_equals_dense_compositing(height, width, tile_size, channels, x64):
     reference = partial(dense, settings=settings)
     image, alpha, needed = jax.jit(tiled)(inputs)
     assert overflowed(needed, AMPLE) == []
-    expected_image, expected_alpha = reference(inputs)
+    expected_image, expected_alpha = jax.jit(reference)(inputs)
     np.testing.assert_allclose(image, expected_image, atol=REFERENCE_TOLERANCE)
     np.testing.assert_allclose(alpha, expected_alpha, atol=REFERENCE_TOLERANCE)
     got = jax.jit(jax.grad(loss(tiled)))(inputs)
@@ -156,7 +163,7 @@ def test_custom_vjp_equals_autodiff_for_every_input_of_the_compositor(x64):
     shape = {"height": 16, "width": 16}
     means, quats, scales, opacities, features = scene(2, 60, jnp.float64)
     everything = project(means, quats, scales, **settings)
-    lists = find_visible(
+    lists = jax.jit(find_visible, static_argnames=STATIC)(
         everything, opacities, jnp.ones(60, bool), tile_size=4, capacities=AMPLE, **shape
     )
     rows = [gather_visible(lists.index, x) for x in (means, quats, scales, opacities, features)]
@@ -198,7 +205,7 @@ def test_gradients_match_finite_differences_along_random_directions(x64):
 
     matrices = {k: settings[k] for k in ("world_to_camera", "intrinsics")}
     arguments = (inputs, matrices)
-    gradient = jax.grad(loss, argnums=(0, 1))(*arguments)
+    gradient = jax.jit(jax.grad(loss, argnums=(0, 1)))(*arguments)
     step = 1e-6
     for _ in range(4):
         direction = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), arguments)
@@ -259,8 +266,8 @@ def test_ineligible_rows_are_inert_whatever_they_hold():
     def loss(inputs, eligible=eligible):
         return scalar(*draw(inputs, settings, eligible=eligible)[:2])
 
-    value, gradient = jax.value_and_grad(loss)(broken)
-    expected, expected_gradient = jax.value_and_grad(partial(loss, eligible=None))(
+    value, gradient = jax.jit(jax.value_and_grad(loss))(broken)
+    expected, expected_gradient = jax.jit(jax.value_and_grad(partial(loss, eligible=None)))(
         tuple(x[:25] for x in inputs)
     )
     np.testing.assert_allclose(value, expected, rtol=1e-6)
@@ -297,7 +304,7 @@ def test_an_astronomic_number_of_hits_saturates_instead_of_wrapping():
         is_in_front=jnp.ones(count, bool),
     )
     capacities = Capacities(visible=count, hits=1024, chunks=512)
-    lists = find_visible(
+    lists = jax.jit(find_visible, static_argnames=STATIC)(
         splats,
         jnp.ones(count),
         jnp.ones(count, bool),
@@ -325,7 +332,7 @@ def test_depth_order_is_exact_and_ties_keep_row_order(dtype, x64):
         compensation=jnp.ones(count, dtype),
         is_in_front=jnp.ones(count, bool),
     )
-    lists = find_visible(
+    lists = jax.jit(find_visible, static_argnames=STATIC)(
         splats,
         jnp.ones(count, dtype),
         jnp.ones(count, bool),
@@ -354,7 +361,7 @@ def test_hits_sort_alike_whether_or_not_tile_and_rank_fit_one_word(rank_count):
     ranks = np.sort(rng.integers(0, rank_count, 3000)).astype(np.int32)
     # Pairs of a tile and a rank are unique.
     tiles = rng.permutation(tile_count)[:3000].astype(np.int32) // 7
-    sorted_tiles, sorted_ranks = _sort_hits(
+    sorted_tiles, sorted_ranks = jax.jit(_sort_hits, static_argnums=(2, 3))(
         jnp.asarray(tiles), jnp.asarray(ranks), tile_count, rank_count
     )
     order = np.lexsort([ranks, tiles])
@@ -369,13 +376,14 @@ def test_nothing_visible_gives_an_empty_image_and_zero_gradients():
         "behind": inputs[0] - jnp.array([[0.0, 0.0, 10.0]]),
         "far outside": inputs[0] + jnp.array([[1e4, 0.0, 0.0]]),
     }
+    gradient_of = jax.jit(jax.grad(lambda x: scalar(*draw(x, settings)[:2])))
     for means in cases.values():
         arguments = (means, *inputs[1:])
         image, alpha, needed = draw(arguments, settings)
         assert int(needed.visible) == int(needed.hits) == int(needed.chunks) == 0
         assert not bool(jnp.any(image))
         assert not bool(jnp.any(alpha))
-        gradient = jax.grad(lambda x: scalar(*draw(x, settings)[:2]))(arguments)
+        gradient = gradient_of(arguments)
         assert all(not bool(jnp.any(leaf)) for leaf in jax.tree.leaves(gradient))
     empty = tuple(x[:0] for x in inputs)
     image, alpha, needed = draw(empty, settings)
@@ -396,7 +404,7 @@ def test_opacity_zero_is_culled_and_opacity_one_is_clamped():
     assert int(needed.visible) == 1
     np.testing.assert_allclose(alpha, MAX_ALPHA, rtol=1e-6)
     np.testing.assert_allclose(image[..., 0], MAX_ALPHA, rtol=1e-6)
-    gradient = jax.grad(lambda x: scalar(*draw(x, settings)[:2]))(wide)
+    gradient = jax.jit(jax.grad(lambda x: scalar(*draw(x, settings)[:2])))(wide)
     assert all_finite(gradient)
     assert not bool(jnp.any(gradient[3]))
 
@@ -454,8 +462,8 @@ def test_tile_size_does_not_change_the_image(x64):
 def test_jit_equals_eager_and_float32_stays_float32():
     settings = camera(jnp.float32, 12, 14)
     inputs = scene(16, 50, jnp.float32)
-    eager = draw(inputs, settings)
-    compiled = jax.jit(partial(draw, settings=settings))(inputs)
+    compiled = draw(inputs, settings)
+    eager = rasterize(*inputs, jnp.ones(50, bool), capacities=AMPLE, tile_size=4, **settings)
     assert eager[0].dtype == eager[1].dtype == jnp.float32
     for a, b in zip(eager[:2], compiled[:2], strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
