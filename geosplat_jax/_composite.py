@@ -35,31 +35,40 @@ def _pixel_offsets(tile_size: int, dtype) -> tuple[Float[Array, " P"], Float[Arr
     return jnp.tile(offset, tile_size), jnp.repeat(offset, tile_size)
 
 
-def _alphas(rows: Float[Array, "G K columns"], tile_size: int) -> Float[Array, "G K P"]:
-    """Alpha of every Gaussian of a chunk in every pixel of its tile."""
+def _slot_rows(
+    table: Float[Array, "M columns"], ranks: Int[Array, " K"], centers: Float[Array, "K 2"]
+) -> Float[Array, "K columns"]:
+    """Gather one row a chunk, with the mean relative to the centre of the chunk's tile."""
+    return table[ranks].at[:, :2].add(-centers)
+
+
+def _alpha(rows: Float[Array, "K columns"], tile_size: int) -> Float[Array, "K P"]:
+    """Alpha of one Gaussian a chunk in every pixel of the chunk's tile."""
     u, v = _pixel_offsets(tile_size, rows.dtype)
-    x, y, xx, xy, yy, log_opacity = (rows[..., i, None] for i in range(GEOMETRY_COLUMNS))
-    dx, dy = u[None, None] - x, v[None, None] - y
+    x, y, xx, xy, yy, log_opacity = (rows[:, i, None] for i in range(GEOMETRY_COLUMNS))
+    dx, dy = u[None] - x, v[None] - y
     log_alpha = log_opacity - (0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy)
     alpha = jnp.minimum(jnp.exp(log_alpha), MAX_ALPHA)
-    return jnp.where(alpha >= MIN_ALPHA, alpha, 0.0)
+    # Without the barrier XLA evaluates the exponential again in every consumer.
+    return jax.lax.optimization_barrier(jnp.where(alpha >= MIN_ALPHA, alpha, 0.0))
 
 
-def _moment_basis(tile_size: int, dtype) -> Float[Array, "P 6"]:
-    """Monomials 1, u, v, uu, uv, vv of the pixel offsets."""
-    u, v = _pixel_offsets(tile_size, dtype)
-    return jnp.stack([jnp.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+def _moments(d_log_alpha: Float[Array, "K P"], tile_size: int) -> Float[Array, "K 6"]:
+    """Sum 1, u, v, uu, uv, vv times ``d_log_alpha`` over the pixels of the tile."""
+    u, v = _pixel_offsets(tile_size, d_log_alpha.dtype)
+    basis = jnp.stack([jnp.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+    return jnp.matmul(d_log_alpha, basis, precision=jax.lax.Precision.HIGHEST)
 
 
-def _geometry_from_moments(
-    rows: Float[Array, "G K columns"], moments: Float[Array, "G K 6"]
-) -> list[Float[Array, "G K"]]:
-    """Cotangents of the geometry columns from the moments of that of log alpha over a tile.
+def _geometry_vjp(
+    rows: Float[Array, "K columns"], moments: Float[Array, "K 6"]
+) -> list[Float[Array, " K"]]:
+    """Cotangents of the geometry columns from the moments of that of log alpha.
 
     The moments are about the centre of the tile; here they move to the mean of the Gaussian.
     """
-    m, mu, mv, muu, muv, mvv = (moments[..., i] for i in range(6))
-    x, y, xx, xy, yy = (rows[..., i] for i in range(5))
+    m, mu, mv, muu, muv, mvv = (moments[:, i] for i in range(6))
+    x, y, xx, xy, yy = (rows[:, i] for i in range(5))
     du, dv = mu - x * m, mv - y * m
     return [
         xx * du + xy * dv,
@@ -127,42 +136,40 @@ def _seen_behind(
     return jnp.where((place >= 1)[:, None], inclusive[jnp.minimum(chunk + 1, chunk_count - 1)], 0.0)
 
 
-def _chunk_rows(
-    table: Float[Array, "M columns"],
-    chunk_ranks: Int[Array, "G K"],
-    chunk_tiles: Int[Array, " K"],
-    tile_size: int,
-    columns: int,
-) -> Float[Array, "G K columns"]:
-    """Gather the rows of each chunk, with means relative to the centre of the chunk's tile.
+def _tile_centers(
+    chunk_tiles: Int[Array, " K"], columns: int, tile_size: int, dtype
+) -> Float[Array, "K 2"]:
+    """Pixel coordinates of the centres of the chunks' tiles."""
+    xy = jnp.stack([chunk_tiles % columns, chunk_tiles // columns], axis=-1)
+    return (xy.astype(dtype) + 0.5) * tile_size
 
-    Padding slots get a row that is transparent everywhere.
-    """
+
+def _with_padding_row(table: Float[Array, "M columns"]) -> Float[Array, "M+1 columns"]:
+    """Append the row of padding slots, transparent everywhere."""
     padding = jnp.zeros((1, table.shape[1]), table.dtype).at[0, 5].set(_LOG_NOTHING)
-    rows = jnp.concatenate([table, padding])[chunk_ranks]
-    tile_xy = jnp.stack([chunk_tiles % columns, chunk_tiles // columns], axis=-1)
-    centers = (tile_xy.astype(table.dtype) + 0.5) * tile_size
-    return rows.at[..., :2].add(-centers[None])
+    return jnp.concatenate([table, padding])
 
 
 def _composite_forward(tile_size, grid, table, chunk_ranks, chunk_tiles):
-    rows = _chunk_rows(table, chunk_ranks, chunk_tiles, tile_size, grid[1])
-    # Without the barriers XLA evaluates the exponential again for every channel.
-    alphas = jax.lax.optimization_barrier(_alphas(rows, tile_size))
-    passing = jnp.ones_like(alphas[0])
-    seen = [jnp.zeros_like(passing)] * (table.shape[1] - GEOMETRY_COLUMNS)
-    for alpha, slot in zip(alphas, rows, strict=True):
-        weight = alpha * passing
-        passing = passing * (1.0 - alpha)
-        seen = [x + weight * slot[:, GEOMETRY_COLUMNS + c, None] for c, x in enumerate(seen)]
+    padded = _with_padding_row(table)
+    centers = _tile_centers(chunk_tiles, grid[1], tile_size, table.dtype)
+    shape = (chunk_tiles.shape[0], tile_size * tile_size)
+    channels = table.shape[1] - GEOMETRY_COLUMNS
+
+    def front_to_back(state, ranks):
+        passing, seen = state
+        rows = _slot_rows(padded, ranks, centers)
+        alpha = _alpha(rows, tile_size)
+        seen = seen + (alpha * passing)[:, None] * rows[:, GEOMETRY_COLUMNS:, None]
+        return (passing * (1.0 - alpha), seen), None
+
+    clear = jnp.ones(shape, table.dtype)
+    nothing = jnp.zeros((shape[0], channels, shape[1]), table.dtype)
+    (passing, seen), _ = jax.lax.scan(front_to_back, (clear, nothing), chunk_ranks, unroll=True)
     before = _transmittance_before(passing, _place_in_run(chunk_tiles))
-    tiles = [
-        jax.ops.segment_sum(
-            before * channel, chunk_tiles, grid[0] * grid[1], indices_are_sorted=True
-        )
-        for channel in [*seen, 1.0 - passing]
-    ]
-    return jnp.stack(tiles), (table, chunk_ranks, chunk_tiles, before)
+    seen = jnp.concatenate([seen, (1.0 - passing)[:, None]], axis=1) * before[:, None]
+    tiles = jax.ops.segment_sum(seen, chunk_tiles, grid[0] * grid[1], indices_are_sorted=True)
+    return tiles, (table, chunk_ranks, chunk_tiles, before)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -172,7 +179,7 @@ def composite_tiles(
     table: Float[Array, "M columns"],
     chunk_ranks: Int[Array, "G K"],
     chunk_tiles: Int[Array, " K"],
-) -> Float[Array, "channels tiles P"]:
+) -> Float[Array, "tiles channels P"]:
     """Composite every tile: features and, as the last channel, coverage.
 
     Parameters
@@ -186,42 +193,44 @@ def composite_tiles(
 
 def _composite_backward(tile_size, grid, residuals, cotangent):
     table, chunk_ranks, chunk_tiles, before = residuals
-    rows = _chunk_rows(table, chunk_ranks, chunk_tiles, tile_size, grid[1])
-    alphas = jax.lax.optimization_barrier(_alphas(rows, tile_size))
-    by_tile = jnp.swapaxes(cotangent, 0, 1)
-    arriving = by_tile.at[chunk_tiles].get(mode="fill", fill_value=0.0)
+    padded = _with_padding_row(table)
+    centers = _tile_centers(chunk_tiles, grid[1], tile_size, table.dtype)
+    arriving = cotangent.at[chunk_tiles].get(mode="fill", fill_value=0.0)
+    weighted = before[:, None] * arriving[:, :-1]
 
-    def gain_of(slot):
+    def gain_of(rows):
         gain = arriving[:, -1]
         for c in range(arriving.shape[1] - 1):
-            gain = gain + slot[:, GEOMETRY_COLUMNS + c, None] * arriving[:, c]
+            gain = gain + rows[:, GEOMETRY_COLUMNS + c, None] * arriving[:, c]
         return gain
 
-    def front_to_back(state, slot):
-        (passing, seen), (alpha, row) = state, slot
-        seen = seen + alpha * passing * gain_of(row)
-        return (passing * (1.0 - alpha), seen), passing
+    def front_to_back(state, ranks):
+        passing, seen = state
+        rows = _slot_rows(padded, ranks, centers)
+        alpha = _alpha(rows, tile_size)
+        return (passing * (1.0 - alpha), seen + alpha * passing * gain_of(rows)), None
 
-    one = jnp.ones_like(before)
-    (passing, seen), reaching = jax.lax.scan(front_to_back, (one, 0.0 * one), (alphas, rows))
+    state = (jnp.ones_like(before), jnp.zeros_like(before))
+    (passing, seen), _ = jax.lax.scan(front_to_back, state, chunk_ranks, unroll=True)
     behind = _seen_behind(seen, passing, _place_in_run(chunk_tiles, reverse=True))
-    weighted = before[:, None] * arriving[:, :-1]
-    basis = _moment_basis(tile_size, table.dtype)
 
-    def back_to_front(behind, slot):
-        alpha, row, passing = slot
-        weight, contrast = alpha * passing, gain_of(row) - behind
+    def back_to_front(state, ranks):
+        passing, behind, d_table = state
+        rows = _slot_rows(padded, ranks, centers)
+        alpha = _alpha(rows, tile_size)
+        # The inverse of the step above, to rounding: `CHUNK_SIZE` factors never underflow.
+        passing = jax.lax.optimization_barrier(passing / (1.0 - alpha))
+        weight, contrast = alpha * passing, gain_of(rows) - behind
         d_log_alpha = jnp.where(alpha < MAX_ALPHA, before * weight * contrast, 0.0)
-        moments = jnp.matmul(d_log_alpha, basis, precision=jax.lax.Precision.HIGHEST)
+        d_geometry = _geometry_vjp(rows, _moments(d_log_alpha, tile_size))
         d_features = jnp.einsum("kcp,kp->kc", weighted, weight, precision="highest")
-        return behind + alpha * contrast, (moments, d_features)
+        d_rows = jnp.concatenate([jnp.stack(d_geometry, axis=-1), d_features], axis=-1)
+        d_table = d_table.at[ranks].add(d_rows, mode="drop")
+        behind = jax.lax.optimization_barrier(behind + alpha * contrast)
+        return (passing, behind, d_table), None
 
-    _, (moments, d_features) = jax.lax.scan(
-        back_to_front, behind, (alphas, rows, reaching), reverse=True
-    )
-    d_geometry = jnp.stack(_geometry_from_moments(rows, moments), axis=-1)
-    d_rows = jnp.concatenate([d_geometry, d_features], axis=-1).reshape(-1, table.shape[1])
-    d_table = jnp.zeros_like(table).at[chunk_ranks.reshape(-1)].add(d_rows, mode="drop")
+    state = (passing, behind, jnp.zeros_like(table))
+    (_, _, d_table), _ = jax.lax.scan(back_to_front, state, chunk_ranks, reverse=True, unroll=True)
     return d_table, None, None
 
 

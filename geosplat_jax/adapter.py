@@ -36,8 +36,8 @@ class AdapterConstants:
 
     u: float = 0.07
     v: float = 0.22
-    alpha: tuple[float, float] = (0.80, 2.08)
-    beta: tuple[float, float] = (15.0, 13.0)
+    alpha: tuple[float, ...] = (0.80, 2.08)
+    beta: tuple[float, ...] = (15.0, 13.0)
     thickness: float = 4.54e-5
     opacity: float = 0.99
     shading_frame: bool = False
@@ -47,6 +47,10 @@ class AdapterConstants:
         """Refuse constants that give flipped or negative Gaussians."""
         if not (0 <= self.u < 1 / 3 and 0 <= self.v < 1 / 3):
             raise ValueError(f"u and v must lie in [0, 1/3), got {self.u} and {self.v}")
+        if len(self.alpha) != 2 or len(self.beta) != 2:
+            raise ValueError(
+                f"alpha and beta need an outer and an inner value, got {self.alpha}, {self.beta}"
+            )
         if min(*self.alpha, *self.beta, self.thickness, self.vertex_area_divisor) <= 0:
             raise ValueError("alpha, beta, thickness and vertex_area_divisor must be positive")
         if not 0 < self.opacity <= 1:
@@ -125,6 +129,9 @@ def face_gaussians(
                 quats.append(_frame(edge, normal))
         if not constants.shading_frame:
             quats += frames
+
+    # Materialised here: fused into the stacks below, every chain would be compiled several times.
+    means, shading, scales, quats = jax.lax.optimization_barrier((means, shading, scales, quats))
 
     def rows(parts: list[Float[Array, "c F"]]) -> Float[Array, "N c"]:
         stacked = jnp.stack(parts)  # (6, c, F)

@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt
 
+from geosplat_jax.pytree import register_pytree
+
 _LADDER_RATIO = 1.25
 _LADDER_STEP = 128
 _SHRINK_BELOW = 0.5
@@ -39,7 +41,7 @@ class Capacities:
     chunks: int = 2048
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Usage:
     """True int32 needs of every bounded buffer (see `Capacities`); 0 where a buffer is unused."""
@@ -134,7 +136,7 @@ def _popcount(words: UInt[Array, "..."]) -> Int[Array, "..."]:
     return jax.lax.population_count(words).astype(jnp.int32)
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class BitSet:
     """A large mask packed 32 to a word, with the running count of its true entries.

@@ -211,8 +211,9 @@ def _coerce(value: Any, like: Any, where: str) -> Any:
         if isinstance(value, int | float) and not isinstance(value, bool):
             return float(value)
     elif isinstance(like, tuple):
-        if isinstance(value, list | tuple) and len(value) == len(like):
-            return tuple(_coerce(v, d, where) for v, d in zip(value, like, strict=True))
+        # Tuples hold values of one kind; what lengths are legal is for the owner to say.
+        if isinstance(value, list | tuple) and like:
+            return tuple(_coerce(v, like[0], where) for v in value)
     elif isinstance(value, type(like)):
         return value
     raise ValueError(f"{where} must be of type {type(like).__name__} like {like!r}, got {value!r}")

@@ -41,6 +41,7 @@ from geosplat_jax.grids import (
 )
 from geosplat_jax.mesh_ops import face_normals_and_areas, vertex_normals
 from geosplat_jax.numerics import safe_norm
+from geosplat_jax.pytree import register_pytree
 from geosplat_jax.scene import Geometry, Grid, Mesh
 
 __all__ = [
@@ -68,7 +69,7 @@ _SPLIT_EPSILON = 1e-8
 """Added to the weights of the two diagonals by the original, kept for equality with it."""
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Surface:
     """An extracted isosurface.

@@ -24,6 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
+from geosplat_jax.pytree import register_pytree
+
 _HASH_Y = np.uint32(2654435761)
 _HASH_Z = np.uint32(805459861)
 _HASH_FINAL = np.uint32(0x2C1B3C6D)
@@ -344,7 +346,7 @@ def encode(
     return _encode(table, points, spec, position_gradient)
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Layer:
     """Affine map: ``x @ weights + bias``.

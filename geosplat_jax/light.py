@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from geosplat_jax.numerics import fast_arctan2, safe_sqrt
+from geosplat_jax.pytree import register_pytree
 from geosplat_jax.scene import EnvLight
 
 POLE_EPSILON = 1e-3
@@ -66,7 +67,7 @@ class LightSpec:
             )
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class PrefilterOperators:
     """Constant matrices of `prefilter`; pass them as an argument of jitted functions.
@@ -84,7 +85,7 @@ class PrefilterOperators:
     spec: LightSpec = field(metadata={"static": True})
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class PrefilteredLight:
     """GGX-filtered radiance for increasing roughness; linear in the light.

@@ -15,6 +15,7 @@ from geosplat_jax.color import linear_to_srgb, tone_map
 from geosplat_jax.geometry import sdf_entropy, weight_magnitude
 from geosplat_jax.materials import smoothness
 from geosplat_jax.numerics import safe_log
+from geosplat_jax.pytree import register_pytree
 from geosplat_jax.render import (
     Context,
     Model,
@@ -29,7 +30,7 @@ from geosplat_jax.ssim import ssim
 _DECIBEL = 10.0 / 2.302585092994046
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class LossWeights:
     """Weights of the terms of Eq. 19; traced, so that schedules cost no compilation.
@@ -94,7 +95,7 @@ class Objective:
             raise ValueError(f"smoothness_samples must be >= 1, got {self.smoothness_samples}")
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class LossReport:
     """What a step says about itself.
@@ -207,8 +208,8 @@ def loss(
     center, half_extent = grid_center_and_extent(context.grid)
     count = asset.gaussians.count
     shine = 1.0 if objective.smooth_shine else 0.0
-    drawn = jax.random.uniform(pick_key, (objective.smoothness_samples,))
-    picked = jnp.floor(drawn * count).astype(jnp.int32)
+    drawn = jax.random.uniform(pick_key, (objective.smoothness_samples,), jnp.float32)
+    picked = jnp.floor(drawn * count.astype(jnp.float32)).astype(jnp.int32)
     terms["smoothness"] = smoothness(
         params.material,
         asset.gaussians.means[picked],

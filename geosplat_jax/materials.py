@@ -21,6 +21,7 @@ from geosplat_jax.hashgrid import (
     init_tables,
 )
 from geosplat_jax.numerics import safe_divide
+from geosplat_jax.pytree import register_pytree
 from geosplat_jax.scene import Materials
 
 ROUGHNESS_MINIMUM = 0.1
@@ -74,7 +75,7 @@ class MaterialSpec:
     has_indirect: bool = False
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class MaterialField:
     """Parameters of a material field; a head that the model lacks is None and holds none.

@@ -8,11 +8,11 @@ made of, lose no digits in float32.
 
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from geosplat_jax.numerics import safe_normalize, safe_sqrt
+from geosplat_jax.pytree import register_pytree
 
 LOW_PASS_VARIANCE = 0.3
 """Variance of the screen-space low-pass filter, square pixels."""
@@ -24,7 +24,7 @@ _FIELD_OF_VIEW_MARGIN = 0.3
 """The Jacobian is taken at most this share of the half field of view outside the image."""
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Splats:
     """Screen-space footprints of N Gaussians in one view.

@@ -36,13 +36,13 @@ DEFAULT_TILE_SIZE = 4
 
 
 def _tiles_to_image(
-    tiles: Float[Array, "C tiles P"], height: int, width: int, tile_size: int
+    tiles: Float[Array, "tiles C P"], height: int, width: int, tile_size: int
 ) -> Float[Array, "H W C"]:
     """Lay tiles out as an image and crop what overhangs it."""
     rows, columns = tile_grid(height, width, tile_size)
-    channels = tiles.shape[0]
-    blocks = tiles.reshape(channels, rows, columns, tile_size, tile_size)
-    image = blocks.transpose(1, 3, 2, 4, 0)
+    channels = tiles.shape[1]
+    blocks = tiles.reshape(rows, columns, channels, tile_size, tile_size)
+    image = blocks.transpose(0, 3, 1, 4, 2)
     return image.reshape(rows * tile_size, columns * tile_size, channels)[:height, :width]
 
 

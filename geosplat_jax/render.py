@@ -24,6 +24,7 @@ from geosplat_jax.light import LightSpec, PrefilteredLight, PrefilterOperators, 
 from geosplat_jax.materials import MaterialField, MaterialSpec, attributes_at
 from geosplat_jax.numerics import safe_normalize
 from geosplat_jax.projection import project
+from geosplat_jax.pytree import register_pytree
 from geosplat_jax.rasterize import (
     DEFAULT_TILE_SIZE,
     TileLists,
@@ -37,7 +38,7 @@ from geosplat_jax.shading import split_sum
 AOV_NAMES = ("albedo", "roughness", "metallic", "normal", "depth", "diffuse", "specular")
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Params:
     """Everything that is learned, and nothing else; the only differentiated argument of `loss`.
@@ -80,7 +81,7 @@ class Model:
     near: float = 0.01
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Context:
     """Arrays that rendering needs and training does not change.
@@ -97,7 +98,7 @@ class Context:
     fg_table: Float[Array, "n m 2"]
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Asset:
     """The view-independent half of a render: surface, splats and their materials.
@@ -120,7 +121,7 @@ class Asset:
     usage: Usage
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class RenderOutput:
     """Images of V views, premultiplied by alpha.
@@ -153,11 +154,9 @@ def _sample(mesh: Mesh, *, model: Model, sampling: str) -> tuple[Gaussians, Floa
     if sampling == "vertex":
         gaussians = vertex_gaussians(mesh, normals, constants=model.adapter)
         return gaussians, gaussians.normals
-    if sampling == "face":
-        gaussians = face_gaussians(mesh, normals, constants=model.adapter)
-        face_normal, _ = face_normals_and_areas(mesh)
-        return gaussians, jnp.repeat(face_normal, GAUSSIANS_PER_FACE, axis=0)
-    raise ValueError(f'sampling must be "face" or "vertex", got {sampling!r}')
+    gaussians = face_gaussians(mesh, normals, constants=model.adapter)
+    face_normal, _ = face_normals_and_areas(mesh)
+    return gaussians, jnp.repeat(face_normal, GAUSSIANS_PER_FACE, axis=0)
 
 
 def reconstruct(
@@ -177,6 +176,8 @@ def reconstruct(
     ValueError
         If ``sampling`` is neither.
     """
+    if sampling not in ("face", "vertex"):
+        raise ValueError(f'sampling must be "face" or "vertex", got {sampling!r}')
     surface = isosurface(params.geometry, context.grid, capacities=capacities, training=True)
     mesh = surface.mesh
     gaussians, outward = _sample(mesh, model=model, sampling=sampling)

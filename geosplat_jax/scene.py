@@ -8,12 +8,13 @@ so that every function is finite on them.
 
 from dataclasses import dataclass, field
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from geosplat_jax.pytree import register_pytree
 
-@jax.tree_util.register_dataclass
+
+@register_pytree
 @dataclass(frozen=True)
 class Camera:
     """Pinhole cameras of V views that share one static image size.
@@ -37,7 +38,7 @@ class Camera:
         return -jnp.einsum("vji,vj->vi", rotation, translation)
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Batch:
     """What one training step sees; all randomness of the step derives from ``key``.
@@ -54,7 +55,7 @@ class Batch:
     key: Key[Array, ""]
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Grid:
     """A box of cubic cells; vertices are numbered with x fastest.
@@ -89,7 +90,7 @@ class Grid:
         return nx * ny * nz
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Geometry:
     """Learnable isosurface: raw values, before `tanh` and `sigmoid` bound them.
@@ -109,7 +110,7 @@ class Geometry:
     gamma: Float[Array, " K"]
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Mesh:
     """Triangles with padding; outward faces are counter-clockwise.
@@ -136,7 +137,7 @@ class Mesh:
         return jnp.arange(self.vertices.shape[0], dtype=jnp.int32) < self.vertex_count
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Gaussians:
     """Oriented anisotropic Gaussians; row i is real when ``i < count``.
@@ -161,7 +162,7 @@ class Gaussians:
         return jnp.arange(self.means.shape[0], dtype=jnp.int32) < self.count
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Materials:
     """Surface attributes at N points.
@@ -177,7 +178,7 @@ class Materials:
     metallic: Float[Array, " N"]
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class EnvLight:
     """Environment light as a lat-long map in the z-up world.

@@ -11,19 +11,19 @@ exact for constant light.
 from dataclasses import dataclass
 from functools import lru_cache
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from geosplat_jax.light import PrefilteredLight, prefiltered_diffuse, prefiltered_specular
+from geosplat_jax.pytree import register_pytree
 from geosplat_jax.scene import Materials
 
 DIELECTRIC_F0 = 0.04
 """Reflectance at normal incidence of every dielectric (index of refraction 1.5)."""
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Shaded:
     """Outgoing radiance of N points and the light it was made from.

@@ -13,11 +13,12 @@ from geosplat_jax import capacity as capacity_module
 from geosplat_jax.capacity import Capacities
 from geosplat_jax.config import RateConfig
 from geosplat_jax.losses import LossReport, LossWeights, Objective, loss
+from geosplat_jax.pytree import register_pytree
 from geosplat_jax.render import Context, Model, Params
 from geosplat_jax.scene import Batch
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class TrainState:
     """What a step reads and writes.
@@ -34,7 +35,7 @@ class TrainState:
     step: Int[Array, ""]
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class StepReport:
     """Outcome of a step.
@@ -134,7 +135,8 @@ def train_step(
         capacities=capacities,
         sampling=sampling,
     )
-    updates, optimizer = make_optimizer(rates).update(gradient, state.optimizer, state.params)
+    with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integer powers
+        updates, optimizer = make_optimizer(rates).update(gradient, state.optimizer, state.params)
     params = _project(optax.apply_updates(state.params, updates), smallest_light)
     finite = jnp.isfinite(total) & jnp.all(
         jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient)])

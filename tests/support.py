@@ -110,7 +110,6 @@ TINY = (
     "model.material.surface_hidden=[8]",
     "model.light.height=8",
     "model.light.width=16",
-    "model.light.roughness=[0.0, 0.1, 0.2, 0.3, 0.4, 0.55, 0.75, 1.0]",
     "objective.smoothness_samples=64",
 )
 """Overrides that make a run small enough for a test."""

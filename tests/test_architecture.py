@@ -13,6 +13,7 @@ NAME = "geosplat_jax"
 # Lowest first: a module imports only modules above its own line. `io` is one layer; within it,
 # modules may import each other without a cycle.
 ORDER = [
+    "pytree",
     "numerics",
     "rotation",
     "color",

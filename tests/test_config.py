@@ -58,7 +58,8 @@ def test_overrides_reach_nested_fields_and_keep_types():
         ("rates.sdf=-1.0", "rates.sdf must not be negative"),
         ("rates.sdf", "section.field=value"),
         ("geometry.initial=cube", "geometry.initial must be"),
-        ("model.adapter.alpha=[1.0]", "model.adapter.alpha must be"),
+        ("model.adapter.alpha=[1.0]", "alpha and beta need an outer and an inner value"),
+        ("model.adapter.alpha=3", "model.adapter.alpha must be of type tuple"),
     ],
 )
 def test_bad_overrides_say_what_is_wrong(override, message):

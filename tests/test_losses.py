@@ -94,11 +94,10 @@ def test_padding_changes_neither_loss_nor_gradient(setting):
     # Longer buffers are summed in another order: equal up to float32 rounding.
     assert float(first) == pytest.approx(float(second), rel=1e-5)
 
-    def compare(a, b):
+    leaves = (jax.tree.leaves(g) for g in (first_gradient, second_gradient))
+    for a, b in zip(*leaves, strict=True):
         difference = float(safe_norm((a - b).reshape(-1)))
-        assert difference <= 2e-3 * float(safe_norm(a.reshape(-1))) + 1e-7
-
-    jax.tree.map(compare, first_gradient, second_gradient)
+        assert difference <= 1e-4 * float(safe_norm(a.reshape(-1))) + 1e-9
 
 
 def test_an_empty_surface_shows_the_background_and_has_zero_photometric_gradient(setting):

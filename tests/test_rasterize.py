@@ -1,3 +1,4 @@
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -75,6 +76,33 @@ def draw(inputs, settings, *, capacities=AMPLE, tile_size=4, eligible=None):
     )
 
 
+@partial(jax.jit, static_argnames=STATIC)
+def loss_and_gradient(inputs, eligible, **settings):
+    """Value of `scalar`, (image, alpha, usage), gradient; one compilation for most tests."""
+
+    def loss(inputs):
+        image, alpha, needed = rasterize(*inputs, eligible, **settings)
+        return scalar(image, alpha), (image, alpha, needed)
+
+    (value, images), gradient = jax.value_and_grad(loss, has_aux=True)(inputs)
+    return value, images, gradient
+
+
+def differentiate(inputs, *, eligible=None, capacities=AMPLE):
+    """Differentiate 40 float32 Gaussians of 3 channels in a 12 x 12 image."""
+    if eligible is None:
+        eligible = jnp.ones(40, bool)
+    settings = camera(jnp.float32, 12, 12)
+    return loss_and_gradient(inputs, eligible, capacities=capacities, tile_size=4, **settings)
+
+
+def padded(*rows):
+    """Repeat the first row up to 40 rows, with the mask of the given ones."""
+    count = rows[0].shape[0]
+    filled = tuple(jnp.concatenate([x, jnp.repeat(x[:1], 40 - count, axis=0)]) for x in rows)
+    return filled, jnp.arange(40) < count
+
+
 def dense(inputs, settings):
     """Depth sort everything in front and composite it in every pixel."""
     depths = jax.lax.stop_gradient(project(*inputs[:3], **settings).depths)
@@ -136,25 +164,26 @@ def test_image_and_gradients_match_the_oracle(name, x64):
 
 
 @pytest.mark.parametrize(
-    ("height", "width", "tile_size", "channels"),
-    [(24, 24, 4, 3), (17, 30, 8, 1), (13, 9, 5, 7), (1, 1, 4, 3), (1, 23, 4, 2), (20, 20, 16, 3)],
+    ("height", "width", "tile_size", "channels"), [(13, 9, 5, 7), (1, 1, 4, 3)]
 )
 def test_equals_dense_compositing(height, width, tile_size, channels, x64):
     settings = camera(jnp.float64, height, width)
     inputs = scene(1, 120, jnp.float64, channels=channels)
 
-    def loss(render):
-        return lambda inputs: scalar(*render(inputs)[:2])
+    def loss(render, inputs):
+        image, alpha, *usage = render(inputs)
+        return scalar(image, alpha), (image, alpha, usage)
 
     tiled = partial(draw, settings=settings, tile_size=tile_size)
-    reference = partial(dense, settings=settings)
-    image, alpha, needed = jax.jit(tiled)(inputs)
+    results = [
+        jax.jit(jax.value_and_grad(partial(loss, render), has_aux=True))(inputs)
+        for render in (tiled, partial(dense, settings=settings))
+    ]
+    (_, (image, alpha, [needed])), got = results[0]
+    (_, (expected_image, expected_alpha, _)), expected = results[1]
     assert overflowed(needed, AMPLE) == []
-    expected_image, expected_alpha = jax.jit(reference)(inputs)
     np.testing.assert_allclose(image, expected_image, atol=REFERENCE_TOLERANCE)
     np.testing.assert_allclose(alpha, expected_alpha, atol=REFERENCE_TOLERANCE)
-    got = jax.jit(jax.grad(loss(tiled)))(inputs)
-    expected = jax.jit(jax.grad(loss(reference)))(inputs)
     assert_close_gradients(got, expected, relative=1e-10, cosine=1e-12)
 
 
@@ -169,26 +198,20 @@ def test_custom_vjp_equals_autodiff_for_every_input_of_the_compositor(x64):
     rows = [gather_visible(lists.index, x) for x in (means, quats, scales, opacities, features)]
     splats = project(*rows[:3], **settings)
 
+    names = ("means2d", "conics", "compensation")
+
     def loss(render, arguments):
-        splats, opacities, features = arguments
-        return scalar(*render(splats, opacities, features))
+        *fields, opacities, features = arguments
+        changed = replace(splats, **dict(zip(names, fields, strict=True)))
+        return scalar(*render(changed, opacities, features))
 
     def tiled(*a):
         return composite(*a, lists, tile_size=4, **shape)
 
-    def floats(splats):
-        return splats.means2d, splats.conics, splats.compensation
-
-    arguments = (splats, rows[3], rows[4])
-    gradient = partial(jax.grad, allow_int=True)
-    got = jax.jit(gradient(partial(loss, tiled)))(arguments)
-    expected = jax.jit(gradient(partial(loss, partial(_reference_composite, **shape))))(arguments)
-    assert_close_gradients(
-        (*floats(got[0]), got[1], got[2]),
-        (*floats(expected[0]), expected[1], expected[2]),
-        relative=1e-10,
-        cosine=1e-12,
-    )
+    arguments = (*(getattr(splats, name) for name in names), rows[3], rows[4])
+    got = jax.jit(jax.grad(partial(loss, tiled)))(arguments)
+    expected = jax.jit(jax.grad(partial(loss, partial(_reference_composite, **shape))))(arguments)
+    assert_close_gradients(got, expected, relative=1e-10, cosine=1e-12)
 
 
 def test_gradients_match_finite_differences_along_random_directions(x64):
@@ -239,58 +262,54 @@ def test_float32_gradients_stay_close_behind_opaque_layers():
 
 
 def test_padding_does_not_change_image_or_gradients():
-    settings = camera(jnp.float32, 20, 20)
-    inputs = scene(7, 100, jnp.float32)
+    inputs = scene(7, 40, jnp.float32)
     double = Capacities(visible=1024, hits=16384, chunks=4096)
-
-    def result(capacities):
-        def loss(inputs):
-            image, alpha, _ = draw(inputs, settings, capacities=capacities)
-            return scalar(image, alpha), (image, alpha)
-
-        return jax.jit(jax.value_and_grad(loss, has_aux=True))(inputs)
-
-    (_, images), gradients = result(AMPLE)
-    (_, other_images), other_gradients = result(double)
-    for a, b in zip(jax.tree.leaves(images), jax.tree.leaves(other_images), strict=True):
+    _, images, gradients = differentiate(inputs)
+    _, other_images, other_gradients = differentiate(inputs, capacities=double)
+    for a, b in zip(images[:2], other_images[:2], strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
     assert_close_gradients(gradients, other_gradients, relative=1e-5, cosine=1e-9)
 
 
 def test_ineligible_rows_are_inert_whatever_they_hold():
-    settings = camera(jnp.float32, 12, 12)
     inputs = scene(8, 40, jnp.float32)
     eligible = jnp.arange(40) < 25
-    broken = tuple(x.at[25:].set(jnp.inf) for x in inputs)
-
-    def loss(inputs, eligible=eligible):
-        return scalar(*draw(inputs, settings, eligible=eligible)[:2])
-
-    value, gradient = jax.jit(jax.value_and_grad(loss))(broken)
-    expected, expected_gradient = jax.jit(jax.value_and_grad(partial(loss, eligible=None)))(
-        tuple(x[:25] for x in inputs)
+    value, _, gradient = differentiate(
+        tuple(x.at[25:].set(jnp.inf) for x in inputs), eligible=eligible
     )
-    np.testing.assert_allclose(value, expected, rtol=1e-6)
-    assert_close_gradients(
-        [g[:25] for g in gradient], list(expected_gradient), relative=1e-5, cosine=1e-6
-    )
-    assert all(bool(jnp.all(g[25:] == 0)) for g in gradient)
+    expected, _, expected_gradient = differentiate(inputs, eligible=eligible)
+    np.testing.assert_array_equal(value, expected)
+    for a, b in zip(gradient, expected_gradient, strict=True):
+        np.testing.assert_array_equal(a, b)
+        assert not bool(jnp.any(a[25:]))
 
 
 def test_overflow_is_reported_with_true_counts():
-    settings = camera(jnp.float32, 24, 24)
-    inputs = scene(9, 200, jnp.float32, opacity=(0.5, 1.0))
-    needed = draw(inputs, settings)[2]
+    inputs, settings = scene(9, 200, jnp.float32, opacity=(0.5, 1.0)), camera(jnp.float32, 24, 24)
+    splats = project(*inputs[:3], **settings)
+    find = partial(
+        jax.jit(find_visible, static_argnames=STATIC),
+        splats,
+        inputs[3],
+        jnp.ones(200, bool),
+        height=24,
+        width=24,
+        tile_size=4,
+    )
+    needed = find(capacities=AMPLE).usage
     assert bool(fits(needed, AMPLE))
-    small = Capacities(visible=128, hits=128, chunks=128)
-    for buffer in ("hits", "chunks"):
-        tight = Capacities(**{"visible": 512, "hits": 8192, "chunks": 2048, buffer: 128})
-        reported = draw(inputs, settings, capacities=tight)[2]
-        assert int(getattr(reported, buffer)) == int(getattr(needed, buffer))
-        assert overflowed(reported, tight) == [buffer]
-    reported = draw(inputs, settings, capacities=small)[2]
-    assert int(reported.visible) == int(needed.visible) > 128
-    assert "visible" in overflowed(reported, small)
+    tight = replace(AMPLE, hits=64)
+    reported = find(capacities=tight).usage
+    assert int(reported.hits) == int(needed.hits)
+    assert overflowed(reported, tight) == ["hits"]
+    tight = replace(AMPLE, chunks=64)
+    reported = find(capacities=tight).usage
+    assert int(reported.chunks) == int(needed.chunks)
+    assert overflowed(reported, tight) == ["chunks"]
+    tight = replace(AMPLE, visible=64)
+    reported = find(capacities=tight).usage
+    assert int(reported.visible) == int(needed.visible) > 64
+    assert "visible" in overflowed(reported, tight)
 
 
 def test_an_astronomic_number_of_hits_saturates_instead_of_wrapping():
@@ -345,8 +364,7 @@ def test_depth_order_is_exact_and_ties_keep_row_order(dtype, x64):
     assert bool(jnp.all(lists.index[count:] == count))
 
 
-@pytest.mark.parametrize("bits", [1, 9, 16, 31, 32])
-@pytest.mark.parametrize("count", [1, 7, 70_000])
+@pytest.mark.parametrize(("bits", "count"), [(1, 1), (9, 7), (16, 70_000), (32, 70_000)])
 def test_packed_argsort_is_stable(bits, count):
     rng = np.random.default_rng(11)
     keys = rng.integers(0, 2**bits, count, dtype=np.uint64).astype(np.uint32)
@@ -369,42 +387,37 @@ def test_hits_sort_alike_whether_or_not_tile_and_rank_fit_one_word(rank_count):
     np.testing.assert_array_equal(sorted_ranks, ranks[order])
 
 
-def test_nothing_visible_gives_an_empty_image_and_zero_gradients():
-    settings = camera(jnp.float32, 9, 9)
-    inputs = scene(13, 30, jnp.float32)
-    cases = {
-        "behind": inputs[0] - jnp.array([[0.0, 0.0, 10.0]]),
-        "far outside": inputs[0] + jnp.array([[1e4, 0.0, 0.0]]),
-    }
-    gradient_of = jax.jit(jax.grad(lambda x: scalar(*draw(x, settings)[:2])))
-    for means in cases.values():
-        arguments = (means, *inputs[1:])
-        image, alpha, needed = draw(arguments, settings)
-        assert int(needed.visible) == int(needed.hits) == int(needed.chunks) == 0
-        assert not bool(jnp.any(image))
-        assert not bool(jnp.any(alpha))
-        gradient = gradient_of(arguments)
-        assert all(not bool(jnp.any(leaf)) for leaf in jax.tree.leaves(gradient))
-    empty = tuple(x[:0] for x in inputs)
-    image, alpha, needed = draw(empty, settings)
+@pytest.mark.parametrize("shift", [(0.0, 0.0, -10.0), (1e4, 0.0, 0.0)])
+def test_nothing_visible_gives_an_empty_image_and_zero_gradients(shift):
+    inputs = scene(13, 40, jnp.float32)
+    moved = (inputs[0] + jnp.array([shift], jnp.float32), *inputs[1:])
+    _, (image, alpha, needed), gradient = differentiate(moved)
+    assert int(needed.visible) == int(needed.hits) == int(needed.chunks) == 0
+    for leaf in (image, alpha, *gradient):
+        assert not bool(jnp.any(leaf))
+
+
+@pytest.mark.slow
+def test_no_gaussians_at_all_is_legal():
+    empty = tuple(x[:0] for x in scene(13, 1, jnp.float32))
+    image, alpha, needed = draw(empty, camera(jnp.float32, 9, 9))
     assert int(needed.visible) == 0
+    assert not bool(jnp.any(image))
     assert not bool(jnp.any(alpha))
 
 
 def test_opacity_zero_is_culled_and_opacity_one_is_clamped():
-    settings = camera(jnp.float32, 5, 5)
-    wide = (
+    inputs, eligible = padded(
         jnp.zeros((2, 3)),
         jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (2, 1)),
         jnp.full((2, 3), 1e3),
         jnp.array([0.0, 1.0]),
-        jnp.ones((2, 1)),
+        jnp.ones((2, 3)),
     )
-    image, alpha, needed = draw(wide, settings)
+    _, (image, alpha, needed), gradient = differentiate(inputs, eligible=eligible)
     assert int(needed.visible) == 1
     np.testing.assert_allclose(alpha, MAX_ALPHA, rtol=1e-6)
-    np.testing.assert_allclose(image[..., 0], MAX_ALPHA, rtol=1e-6)
-    gradient = jax.jit(jax.grad(lambda x: scalar(*draw(x, settings)[:2])))(wide)
+    np.testing.assert_allclose(image, MAX_ALPHA, rtol=1e-6)
     assert all_finite(gradient)
     assert not bool(jnp.any(gradient[3]))
 
@@ -422,9 +435,7 @@ def test_an_opacity_just_above_the_threshold_is_kept(x64):
         assert bool(draw(splat, settings)[1][1, 1] > 0) == is_kept
 
 
-@pytest.mark.parametrize("scale", [1e-8, 1e-3, 1.0, 1e4])
-def test_extreme_gaussians_give_finite_images_and_gradients(scale):
-    settings = camera(jnp.float32, 12, 12)
+def test_extreme_gaussians_give_finite_images_and_gradients():
     means = jnp.array(
         [[0, 0, 0], [0.1, 0, -2.985], [0.1, 0, -2.995], [50, 0, -2.9], [0, 0, 1e5]], jnp.float32
     )
@@ -432,13 +443,13 @@ def test_extreme_gaussians_give_finite_images_and_gradients(scale):
         [[1, 0, 0, 0], [0, 0, 0, 0], [0.5, 0.5, 0.5, 0.5], [1e-12, 0, 0, 0], [3, 1, 2, 9]],
         jnp.float32,
     )
-    scales = jnp.array(
-        [[scale] * 3, [scale, 1e-8, 1e-8], [scale] * 3, [scale, scale, 1e-8], [scale, 1e4, 1e4]],
-        jnp.float32,
-    )
-    inputs = (means, quats, scales, jnp.ones(5), jnp.ones((5, 2)))
-    loss = jax.jit(jax.value_and_grad(lambda x: scalar(*draw(x, settings)[:2])))
-    assert all_finite(loss(inputs))
+    for s in (1e-8, 1e-3, 1.0, 1e4):
+        rows = [[s, s, s], [s, 1e-8, 1e-8], [s, s, s], [s, s, 1e-8], [s, 1e4, 1e4]]
+        inputs, eligible = padded(
+            means, quats, jnp.array(rows, jnp.float32), jnp.ones(5), jnp.ones((5, 3))
+        )
+        value, images, gradient = differentiate(inputs, eligible=eligible)
+        assert all_finite((value, images, gradient)), s
 
 
 def test_alpha_is_the_composite_of_a_constant_feature(x64):
@@ -451,25 +462,28 @@ def test_alpha_is_the_composite_of_a_constant_feature(x64):
     assert float(alpha.max()) <= 1.0
 
 
+@pytest.mark.slow
 def test_tile_size_does_not_change_the_image(x64):
     settings = camera(jnp.float64, 21, 18)
     inputs = scene(15, 90, jnp.float64)
-    images = [draw(inputs, settings, tile_size=size)[0] for size in (2, 4, 8)]
+    images = [draw(inputs, settings, tile_size=size)[0] for size in (2, 16)]
     for image in images[1:]:
         np.testing.assert_allclose(image, images[0], atol=1e-13)
 
 
 def test_jit_equals_eager_and_float32_stays_float32():
-    settings = camera(jnp.float32, 12, 14)
-    inputs = scene(16, 50, jnp.float32)
-    compiled = draw(inputs, settings)
-    eager = rasterize(*inputs, jnp.ones(50, bool), capacities=AMPLE, tile_size=4, **settings)
+    settings = camera(jnp.float32, 12, 12)
+    inputs = scene(16, 40, jnp.float32)
+    _, compiled, gradient = differentiate(inputs)
+    assert all(leaf.dtype == jnp.float32 for leaf in gradient)
+    eager = rasterize(*inputs, jnp.ones(40, bool), capacities=AMPLE, tile_size=4, **settings)
     assert eager[0].dtype == eager[1].dtype == jnp.float32
     for a, b in zip(eager[:2], compiled[:2], strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
     assert int(eager[2].hits) == int(compiled[2].hits)
 
 
+@pytest.mark.slow
 def test_vmap_and_scan_over_views_equal_the_loop():
     settings = camera(jnp.float32, 10, 10)
     matrices = settings.pop("world_to_camera")

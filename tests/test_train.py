@@ -41,9 +41,9 @@ def _lines(folder):
 
 
 def _assert_same(first, second):
-    jax.tree.map(
-        lambda a, b: np.testing.assert_array_equal(np.asarray(a), np.asarray(b)), first, second
-    )
+    assert jax.tree.structure(first) == jax.tree.structure(second)
+    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
 
 
 def test_training_reports_every_step_and_lowers_the_loss(finished):
