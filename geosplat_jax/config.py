@@ -29,13 +29,14 @@ class GeometryConfig:
     ----------
     resolution : cells along the longest side of the box around the object.
     initial : ``"hull"`` (visual hull of the masks), ``"sphere"`` or ``"random"`` (the paper).
-    vertex_fraction : share of the steps that sample vertices instead of faces (Eq. 12).
+    vertex_fraction : share of the steps that sample vertices instead of faces (Eq. 12). It spares
+        memory while a random first surface is rough; a visual hull needs none of it.
     max_quads : a surface with more quads than this is taken to have exploded.
     """
 
     resolution: int = 48
     initial: str = "hull"
-    vertex_fraction: float = 0.05
+    vertex_fraction: float = 0.0
     max_quads: int = 400_000
 
     def __post_init__(self) -> None:
@@ -276,7 +277,7 @@ def _preset(name: str) -> Config:
     if name == "paper":
         return Config(
             preset=name,
-            geometry=GeometryConfig(resolution=96, initial="random"),
+            geometry=GeometryConfig(resolution=96, initial="random", vertex_fraction=0.05),
             model=Model(
                 adapter=adapter_module.PAPER,
                 material=MaterialSpec(
@@ -295,7 +296,7 @@ def _preset(name: str) -> Config:
     if name == "code":
         return Config(
             preset=name,
-            geometry=GeometryConfig(resolution=96, initial="random"),
+            geometry=GeometryConfig(resolution=96, initial="random", vertex_fraction=0.1),
             model=Model(
                 adapter=adapter_module.CODE,
                 material=MaterialSpec(

@@ -210,7 +210,7 @@ class _Loop:
     sampling: str = ""
     peak: Usage | None = None
     recoveries: int = 0
-    fallback_sdf: jax.Array | None = None
+    fallback_sdf: np.ndarray | None = None
     last_checkpoint: Path | None = None
 
     def meta(self) -> dict[str, Any]:
@@ -312,7 +312,7 @@ class _Loop:
             )
         self.recoveries += 1
         params = replace(
-            self.state.params, geometry=initial_geometry(self.context.grid, self.fallback_sdf)
+            self.state.params, geometry=initial_geometry(self.context.grid, jnp.asarray(self.fallback_sdf))
         )
         fresh = initial_state(params, self.config.rates)
         self.state = replace(fresh, step=self.state.step)
@@ -325,7 +325,7 @@ def usage_to_dict(usage: Usage) -> dict[str, int]:
 
 def usage_from_dict(values: dict[str, int]) -> Usage:
     """Inverse of `usage_to_dict`."""
-    return Usage(**{name: np.int32(count) for name, count in values.items()})
+    return Usage(**{name: jnp.int32(count) for name, count in values.items()})
 
 
 @contextmanager
@@ -370,7 +370,7 @@ def _start(dataset: Dataset, config: Config, folder: Path) -> _Loop:
         context=make_context(grid, config.model),
         folder=folder,
         state=initial_state(params, config.rates),
-        fallback_sdf=sdf,
+        fallback_sdf=np.array(sdf),  # on the host: the step consumes its buffers
     )
 
 

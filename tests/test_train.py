@@ -176,7 +176,7 @@ def test_a_number_that_is_not_finite_stops_and_names_step_term_and_checkpoint(
     monkeypatch.setattr(train_module, "make_batch", spoiled)
     with pytest.raises(TrainingError, match=r"step 2: the term .*l1.* not finite") as caught:
         fit(dataset, tiny_config(), tmp_path)
-    assert "step_" in str(caught.value)
+    assert "checkpoint_00000002" in str(caught.value)
     _, params, _, _, meta = load_run(tmp_path)
     assert meta["step"] == 2
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(params))
@@ -208,6 +208,17 @@ def test_views_come_in_shuffled_epochs_that_depend_on_seed_and_step_alone():
 def test_vertices_are_sampled_first_and_faces_later():
     config = tiny_config("geometry.vertex_fraction=0.5")
     assert [sampling_of_step(s, config) for s in range(4)] == ["vertex"] * 2 + ["face"] * 2
+
+
+@pytest.mark.slow
+def test_a_random_start_samples_vertices_and_then_faces(dataset, tmp_path):
+    config = tiny_config("geometry.initial=random", "geometry.vertex_fraction=0.5")
+    fit(dataset, config, tmp_path)
+    lines = _lines(tmp_path)
+    ratios = [line["gaussians"] / line["faces"] for line in lines]
+    assert all(ratio < 1 for ratio in ratios[:2])
+    assert ratios[2:] == [6.0, 6.0]
+    assert all(np.isfinite(line["loss"]) for line in lines)
 
 
 def test_every_parameter_has_a_rate(finished):
