@@ -5,7 +5,6 @@ and backward at 200 x 200 with 71k Gaussians, 1.9 s for 297k at 800 x 800, on tw
 """
 
 import argparse
-import ctypes
 import json
 import statistics
 import time
@@ -16,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from geosplat_jax.capacity import Capacities, grow, overflowed
+from geosplat_jax.process import retain_freed_memory
 from geosplat_jax.projection import project
 from geosplat_jax.rasterize import DEFAULT_TILE_SIZE, find_visible, rasterize
 from geosplat_jax.rotation import matrix_to_quaternion
@@ -25,20 +25,6 @@ YARDSTICK_MS = {"torus_71k_200": 132.0, "torus_297k_800": 1900.0}
 # (u, alpha, beta) of the outer and inner Gaussians of a face, REFERENCE values of the method.
 _ADAPTER_RINGS = ((0.07, 0.80, 15.0), (0.22, 2.08, 13.0))
 _THICKNESS = 4.54e-5
-
-
-def retain_freed_memory() -> bool:
-    """Make glibc reuse freed memory instead of returning it; False where that is impossible.
-
-    XLA allocates the temporaries of a program anew for every call. Above 32 MiB glibc maps and
-    unmaps them each time, and the page faults can cost as much as the computation.
-    """
-    try:
-        libc = ctypes.CDLL("libc.so.6")
-    except OSError:
-        return False
-    trim_threshold, mmap_max = -1, -4
-    return bool(libc.mallopt(mmap_max, 0)) and bool(libc.mallopt(trim_threshold, 2**31 - 1))
 
 
 def torus(major_count: int, minor_count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -5,13 +5,9 @@ import shutil
 import time
 from pathlib import Path
 
-from geosplat_jax.cli import (
-    enable_compilation_cache,
-    evaluate_command,
-    export_command,
-    train_command,
-)
+from geosplat_jax.cli import evaluate_command, export_command, train_command
 from geosplat_jax.config import make_config
+from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
 
 SCENE = Path(__file__).resolve().parents[1] / "examples" / "duck"
 
@@ -22,6 +18,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("demo"))
     arguments = parser.parse_args()
     enable_compilation_cache()
+    retain_freed_memory()
     run = arguments.output
     if (run / "run.json").exists():
         shutil.rmtree(run)

@@ -1,11 +1,8 @@
 """The ``geosplat-jax`` command: info, train, evaluate, render, export."""
 
 import argparse
-import hashlib
 import importlib.metadata
 import json
-import os
-import platform
 import sys
 import time
 from pathlib import Path
@@ -17,37 +14,13 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from geosplat_jax.config import PRESETS, QUALITIES, Config, make_config
 from geosplat_jax.io.dataset import Dataset, describe, load_dataset
 from geosplat_jax.io.images import SceneError, write_png
+from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
 
 _console = Console(stderr=True, highlight=False)
 
 
 class UsageError(ValueError):
     """A command cannot run as it was called; the message says what to change."""
-
-
-def enable_compilation_cache() -> None:
-    """Keep compiled programs between runs, apart for every jaxlib and every kind of processor.
-
-    ``JAX_COMPILATION_CACHE_DIR`` overrides the place.
-    """
-    import jax
-
-    if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
-        return
-    host = f"{platform.machine()} {platform.processor()} {_cpu_flags()}"
-    key = f"{importlib.metadata.version('jaxlib')}-{hashlib.sha256(host.encode()).hexdigest()[:12]}"
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    jax.config.update("jax_compilation_cache_dir", str(base / "geosplat_jax" / key))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-
-
-def _cpu_flags() -> str:
-    """Return the features of the processor, where the system tells: compiled code needs them."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return ""
-    return next((line for line in lines if line.startswith(("flags", "Features"))), "")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -392,6 +365,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line; errors that a user can cure print one line and return 2."""
     arguments = _parser().parse_args(argv)
     enable_compilation_cache()
+    retain_freed_memory()
     from geosplat_jax.io.checkpoints import CheckpointError
     from geosplat_jax.train import Interrupted, TrainingError
 

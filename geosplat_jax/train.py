@@ -312,7 +312,8 @@ class _Loop:
             )
         self.recoveries += 1
         params = replace(
-            self.state.params, geometry=initial_geometry(self.context.grid, jnp.asarray(self.fallback_sdf))
+            self.state.params,
+            geometry=initial_geometry(self.context.grid, jnp.asarray(self.fallback_sdf)),
         )
         fresh = initial_state(params, self.config.rates)
         self.state = replace(fresh, step=self.state.step)

@@ -42,6 +42,7 @@ ORDER = [
     "config",
     "step",
     "io",
+    "process",
     "train",
     "evaluate",
     "assets",

@@ -1,0 +1,1 @@
+"""Timings of the stages and of whole runs, as ratios to a calibration kernel."""

@@ -1,0 +1,90 @@
+"""Run every benchmark; print ratios to the calibration kernels; compare with the baseline.
+
+    python -m benchmarks.suite                  # table
+    python -m benchmarks.suite --gate 1.6       # exit 1 where a ratio grew by more than 1.6
+    python -m benchmarks.suite --save           # write benchmarks/baseline.json
+
+Machines differ and are shared, so the figure that travels is the ratio of a median to the median
+of ``sum(exp(x))`` over 16M float32, timed right before and right after in the same process.
+"""
+
+import argparse
+import json
+import platform
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+
+from benchmarks import bench_geometry, bench_hashgrid, bench_rasterize, bench_step
+from benchmarks.calibration import calibrate
+from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
+
+BASELINE = Path(__file__).with_name("baseline.json")
+
+
+def _flat(values: dict, prefix: str = "") -> dict[str, float]:
+    """Flatten nested results to the entries that are median wall times in milliseconds."""
+    found = {}
+    for name, value in values.items():
+        if isinstance(value, dict):
+            found |= _flat(value, f"{prefix}{name}.")
+        elif name.endswith("_ms") and not name.endswith(
+            ("min_ms", "processor_ms", "exp_ms", "sort_ms", "yardstick_ms")
+        ):
+            found[prefix + name] = float(value)
+    return found
+
+
+def measure(name: str, benchmark: Callable[[], dict]) -> dict[str, dict[str, float]]:
+    """Run one benchmark between two calibrations; milliseconds and ratio of each median."""
+    before = calibrate()["exp_ms"]
+    results = _flat(benchmark())
+    reference = 0.5 * (before + calibrate()["exp_ms"])
+    return {
+        f"{name}.{key}": {"ms": round(value, 2), "ratio": round(value / reference, 2)}
+        for key, value in results.items()
+    }
+
+
+def main() -> int:
+    """Run the suite."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", help="run the benchmarks whose name contains this")
+    parser.add_argument("--gate", type=float, help="largest growth of a ratio that passes")
+    parser.add_argument("--save", action="store_true", help="make this the baseline")
+    parser.add_argument("--whole", action="store_true", help="time a whole draft run as well")
+    options = parser.parse_args()
+    enable_compilation_cache()
+    retain_freed_memory()
+    benchmarks = {
+        "rasterize": bench_rasterize.run,
+        "geometry": bench_geometry.run,
+        "hashgrid": bench_hashgrid.run,
+        "step": bench_step.run,
+    }
+    if options.whole:
+        benchmarks["run"] = bench_step.run_whole
+    baseline = json.loads(BASELINE.read_text())["results"] if BASELINE.exists() else {}
+    results, worse = {}, []
+    print(f"{'benchmark':58s} {'ms':>10s} {'ratio':>9s} {'baseline':>9s}")
+    for name, benchmark in benchmarks.items():
+        if options.only and options.only not in name:
+            continue
+        for key, entry in measure(name, benchmark).items():
+            results[key] = entry
+            known = baseline.get(key, {}).get("ratio")
+            print(f"{key:58s} {entry['ms']:10.1f} {entry['ratio']:9.2f} {known or '-':>9}")
+            if options.gate and known and entry["ratio"] > options.gate * known:
+                worse.append(f"{key}: ratio {entry['ratio']} against {known}")
+    if options.save:
+        machine = {"jax": jax.__version__, "python": platform.python_version()}
+        BASELINE.write_text(json.dumps({"machine": machine, "results": results}, indent=1) + "\n")
+    for line in worse:
+        print(f"slower: {line}", file=sys.stderr)
+    return 1 if worse else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,39 @@
+"""Process settings: the cache's place, and an allocator call that never fails loudly."""
+
+import sys
+
+import jax
+import pytest
+
+from geosplat_jax import process
+
+
+@pytest.fixture
+def cache_setting():
+    before = jax.config.jax_compilation_cache_dir
+    yield
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def test_the_cache_is_kept_apart_by_version_and_processor(monkeypatch, tmp_path, cache_setting):
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    places = []
+    for flags in ("flags: avx2", "flags: avx512"):
+        monkeypatch.setattr(process, "_cpu_flags", lambda flags=flags: flags)
+        process.enable_compilation_cache()
+        places.append(jax.config.jax_compilation_cache_dir)
+    assert places[0] != places[1]
+    assert all(place.startswith(str(tmp_path)) for place in places)
+
+
+def test_a_cache_chosen_by_the_user_is_respected(monkeypatch, cache_setting):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/elsewhere")
+    before = jax.config.jax_compilation_cache_dir
+    process.enable_compilation_cache()
+    assert jax.config.jax_compilation_cache_dir == before
+
+
+def test_retaining_memory_is_for_linux_only(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert process.retain_freed_memory() is False
