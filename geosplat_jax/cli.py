@@ -319,6 +319,7 @@ def export_command(
     from geosplat_jax.assets import export_assets
     from geosplat_jax.train import load_run
 
+    _recorded(run)
     config, params, context, capacities, _ = load_run(run)
     folder = output or run / "export"
     folder.mkdir(parents=True, exist_ok=True)
@@ -376,7 +377,7 @@ def main(argv: list[str] | None = None) -> int:
         return 130
     except (SceneError, UsageError, TrainingError, CheckpointError, OSError, ValueError) as error:
         _console.print("[bold red]error:[/]", end=" ")
-        _console.print(str(error), markup=False)
+        _console.print(str(error), markup=False, soft_wrap=True)
         return 2
     return 0
 

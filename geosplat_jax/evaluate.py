@@ -18,10 +18,10 @@ import numpy as np
 
 from geosplat_jax import capacity as capacity_module
 from geosplat_jax.capacity import Capacities
-from geosplat_jax.color import linear_to_srgb, tone_map
+from geosplat_jax.color import tone_map
 from geosplat_jax.config import Config
 from geosplat_jax.geometry import isosurface, vertex_normals
-from geosplat_jax.io.images import write_png
+from geosplat_jax.io.images import encode_srgb, write_png
 from geosplat_jax.io.meshes import render_mesh_normals
 from geosplat_jax.io.sheets import normals_to_rgb, overview_sheet, shade_mesh_preview
 from geosplat_jax.io.views import Views
@@ -123,7 +123,7 @@ def over_background(rgb: np.ndarray, alpha: np.ndarray, background: float) -> np
 
 def _encode(linear: np.ndarray) -> np.ndarray:
     """Return sRGB in [0, 1] on the host."""
-    return np.clip(np.asarray(linear_to_srgb(np.clip(linear, 0.0, 1.0))), 0.0, 1.0)
+    return np.clip(encode_srgb(np.clip(linear, 0.0, 1.0)), 0.0, 1.0)
 
 
 def _view_figures(view: RenderedView, image: np.ndarray, truth_normal: np.ndarray | None) -> dict:
