@@ -112,23 +112,21 @@ def face_gaussians(
     p1, p2, p3 = corners
     edges = (p2 - p3, p1 - p2, p3 - p1)
     lengths = [safe_norm(edge, axis=0) for edge in edges]
-    if not constants.shading_frame:
-        frames = [_frame(edge, face_normal) for edge in edges]
 
-    means, shading, scales, quats = [], [], [], []
+    means, shading, scales = [], [], []
     for ring, corner in enumerate((constants.u, constants.v)):
         means += _blend(corners, corner)
         ring_normals = [safe_normalize(n, axis=0) for n in _blend(corner_normals, corner)]
         shading += ring_normals
-        for edge, length, normal in zip(edges, lengths, ring_normals, strict=True):
+        for length in lengths:
             segment = (1.0 - 3.0 * corner) * length
             along = 0.5 * constants.alpha[ring] * segment  # Eq. 9
             across = safe_divide(2.0 * area, constants.beta[ring] * segment)
             scales.append(jnp.stack([along, across, jnp.full_like(along, constants.thickness)]))
-            if constants.shading_frame:
-                quats.append(_frame(edge, normal))
-        if not constants.shading_frame:
-            quats += frames
+    if constants.shading_frame:
+        quats = [_frame(edge, n) for edge, n in zip(edges * 2, shading, strict=True)]
+    else:
+        quats = [_frame(edge, face_normal) for edge in edges] * 2
 
     # Materialised here: fused into the stacks below, every chain would be compiled several times.
     means, shading, scales, quats = jax.lax.optimization_barrier((means, shading, scales, quats))

@@ -111,7 +111,7 @@ def _cell_coordinates(index: Int[Array, " n"], grid: Grid) -> Int[Array, "3 n"]:
 class _Cells(NamedTuple):
     """The cells that the surface passes through, in the order of their number."""
 
-    index: Int[Array, " Ck"]
+    number: Int[Array, " Ck"]
     coordinates: Int[Array, "3 Ck"]
     signs: Int[Array, " Ck"]  # 8-bit set of inside corners; 0 on padding
     case: Int[Array, " Ck"]  # the case whose patches are used (see `_resolved_case`)
@@ -192,7 +192,7 @@ def _surface_cells(sdf: Float[Array, " G"], grid: Grid, *, capacity: int) -> _Ce
         lambda: count(coordinates, signs, case),
     )
     return _Cells(
-        index=index,
+        number=index,
         coordinates=coordinates,
         signs=signs,
         case=case,
@@ -269,7 +269,7 @@ def _dual_vertices(geometry: Geometry, grid: Grid, cells: _Cells, *, capacity: i
     patch = _rows(jnp.asarray(PATCH_EDGES.astype(np.int32).reshape(-1)), cells.case[row] * 4 + slot)
     crosses = (patch[None, :] >> jnp.arange(12, dtype=jnp.int32)[:, None]) & 1 == 1
     crosses = crosses & is_real[None, :]
-    index = cells.index[row]
+    index = cells.number[row]
 
     sdf, corners = _corner_values(geometry, grid, cells.coordinates[:, row])
     alpha = jnp.tanh(_rows(geometry.alpha, index).T) * _WEIGHT_SCALE + 1.0
@@ -328,7 +328,7 @@ def _quads(grid: Grid, cells: _Cells, *, capacity: int) -> _Quads:
 
     nx, ny, _ = grid.shape
     steps = QUAD_CELLS @ np.array([1, nx, nx * ny], np.int32)
-    number = cells.index[row][None, :] + _rows(jnp.asarray(steps), axis).T
+    number = cells.number[row][None, :] + _rows(jnp.asarray(steps), axis).T
     around = cells.bits.rank(jnp.clip(number, 0, grid.cube_count - 1))
     edge = _rows(jnp.asarray(QUAD_EDGES), axis).T
     patch_of_edge = jnp.asarray(PATCH_OF_EDGE.astype(np.int32).reshape(-1))

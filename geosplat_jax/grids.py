@@ -120,5 +120,5 @@ def sdf_entropy(
 def weight_magnitude(geometry: Geometry) -> Float[Array, ""]:
     """Mean magnitude of all raw alpha, beta and gamma weights; its minimum is plain dual cubes."""
     weights = (geometry.alpha, geometry.beta, geometry.gamma)
-    total = sum(jnp.sum(jnp.abs(weight)) for weight in weights)
+    total = jnp.sum(jnp.stack([jnp.sum(jnp.abs(weight)) for weight in weights]))
     return total / sum(weight.size for weight in weights)

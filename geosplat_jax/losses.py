@@ -5,6 +5,7 @@ topology of the isosurface, the random background, the noise of the smoothness t
 """
 
 from dataclasses import dataclass, fields
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -78,7 +79,7 @@ class Objective:
     smooth_shine: bool = True
     background: str = "pixel"
     srgb: bool = False
-    entropy_reduction: str = "mean"
+    entropy_reduction: Literal["mean", "sum"] = "mean"
     with_light: bool = False
 
     def __post_init__(self) -> None:
@@ -230,7 +231,8 @@ def loss(
     if objective.with_light:
         terms["light"] = light_term(output.aovs["diffuse"], output.aovs["specular"], batch.image)
 
-    total = sum(getattr(weights, name) * terms[name] for name in TERM_NAMES)
+    weighted = [getattr(weights, name) * terms[name] for name in TERM_NAMES]  # Eq. 19
+    total = jnp.sum(jnp.stack(weighted))
     report = LossReport(
         terms=terms,
         psnr=-_DECIBEL * safe_log(mse),

@@ -98,8 +98,17 @@ class MaterialField:
 
 def init_materials(key: Key[Array, ""], spec: MaterialSpec) -> MaterialField:
     """Draw the parameters of a field: nearly constant attributes at the initial logits."""
-    names = ("albedo_table", "surface_table", "albedo", "surface", "shift", "indirect")
-    keys = dict(zip(names, jax.random.split(key, len(names)), strict=True))
+    names: tuple[str, ...] = (
+        "albedo_table",
+        "surface_table",
+        "albedo",
+        "surface",
+        "shift",
+        "indirect",
+    )
+    keys: dict[str, Key[Array, ""]] = dict(
+        zip(names, jax.random.split(key, len(names)), strict=True)
+    )
     width = spec.grid.width
 
     def head(name: str, hidden: tuple[int, ...], outputs: int) -> tuple[Layer, ...]:

@@ -74,9 +74,11 @@ def make_optimizer(rates: RateConfig) -> optax.GradientTransformation:
         return optax.adam(schedule, eps=1e-15)
 
     names = ("sdf", "deform", "weights", "albedo", "shine", "shift", "light", "exposure")
-    groups = {name: group(getattr(rates, name)) for name in names}
+    groups: dict[Any, optax.GradientTransformation] = {
+        name: group(getattr(rates, name)) for name in names
+    }
 
-    def labels(params: Params) -> Any:
+    def labels(params: Any) -> Any:
         return jax.tree_util.tree_map_with_path(lambda path, _: parameter_group(path), params)
 
     return optax.multi_transform(groups, labels)
@@ -84,7 +86,8 @@ def make_optimizer(rates: RateConfig) -> optax.GradientTransformation:
 
 def initial_state(params: Params, rates: RateConfig) -> TrainState:
     """Build the state before the first step."""
-    return TrainState(params, make_optimizer(rates).init(params), jnp.zeros((), jnp.int32))
+    tree: Any = params
+    return TrainState(params, make_optimizer(rates).init(tree), jnp.zeros((), jnp.int32))
 
 
 def _project(params: Params, smallest_light: float) -> Params:
@@ -136,8 +139,9 @@ def train_step(
         sampling=sampling,
     )
     with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integer powers
-        updates, optimizer = make_optimizer(rates).update(gradient, state.optimizer, state.params)
-    params = _project(optax.apply_updates(state.params, updates), smallest_light)
+        tree: Any = state.params
+        updates, optimizer = make_optimizer(rates).update(gradient, state.optimizer, tree)
+    params = _project(jax.tree.map(jnp.add, state.params, updates), smallest_light)
     finite = jnp.isfinite(total) & jnp.all(
         jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient)])
     )
