@@ -108,26 +108,22 @@ def _info(arguments: argparse.Namespace) -> None:
     print(describe(_load(arguments.scene, _scene_options(arguments))))
 
 
-def _prepare_folder(folder: Path, record: dict[str, Any], *, resume: bool) -> None:
-    """Create a run folder, or check that the one to resume belongs to the same scene."""
+def _check_folder(folder: Path, record: dict[str, Any], *, resume: bool) -> None:
+    """Refuse a folder that holds something else, or a run of another scene."""
     path = folder / "run.json"
-    if resume:
-        if not path.exists():
-            raise UsageError(f"{folder} is not a run (it has no run.json); leave out --resume")
-        before = json.loads(path.read_text())
-        for name in ("scene", "dataset"):
-            if before[name] != record[name]:
-                raise UsageError(
-                    f"{folder} was trained with {name} {before[name]}, not {record[name]}; "
-                    "resume with the same, or choose another --output"
-                )
+    if not resume:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise UsageError(
+                f"{folder} exists already; choose another --output, or --resume to continue it"
+            )
         return
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UsageError(
-            f"{folder} exists already; choose another --output, or --resume to continue it"
-        )
-    folder.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(record, indent=2) + "\n")
+    before = _recorded(folder)
+    for name in ("scene", "dataset"):
+        if before[name] != record[name]:
+            raise UsageError(
+                f"{path} says that the run was trained with {name} {before[name]}, not "
+                f"{record[name]}; resume with the same, or choose another --output"
+            )
 
 
 def _config_from(arguments: argparse.Namespace) -> Config:
@@ -158,15 +154,12 @@ def train_command(
     from geosplat_jax.train import fit
 
     record = {"scene": str(scene.resolve()), "dataset": options, "config": config.to_dict()}
-    _prepare_folder(folder, record, resume=resume)
+    _check_folder(folder, record, resume=resume)
     began = time.perf_counter()
-    try:
-        dataset = _load(scene, options)
-    except Exception:
-        if not resume:
-            (folder / "run.json").unlink()
-            folder.rmdir()
-        raise
+    dataset = _load(scene, options)
+    if not resume:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "run.json").write_text(json.dumps(record, indent=2) + "\n")
     for warning in dataset.warnings:
         _console.print(f"[yellow]warning:[/] {warning}")
     _console.print(

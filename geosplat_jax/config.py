@@ -272,50 +272,50 @@ _QUALITY: dict[str, dict[str, Any]] = {
 }
 
 
+def _original(
+    name: str,
+    *,
+    adapter: AdapterConstants,
+    grid: HashGridSpec,
+    vertex_fraction: float,
+    has_shift: bool,
+    baked_diffuse: bool,
+) -> Config:
+    """Return what the paper and the authors share: 96 cells, a random start, 8 views a step."""
+    material = MaterialSpec(grid=grid, shared=False, has_shift=has_shift)
+    return Config(
+        preset=name,
+        geometry=GeometryConfig(resolution=96, initial="random", vertex_fraction=vertex_fraction),
+        model=Model(adapter=adapter, material=material, baked_diffuse=baked_diffuse),
+        run=RunConfig(batch_views=8),
+        rates=RateConfig(half_life=800.0),
+    )
+
+
 def _preset(name: str) -> Config:
     """Return the settings that define a preset, at standard quality."""
     if name == "paper":
-        return Config(
-            preset=name,
-            geometry=GeometryConfig(resolution=96, initial="random", vertex_fraction=0.05),
-            model=Model(
-                adapter=adapter_module.PAPER,
-                material=MaterialSpec(
-                    grid=HashGridSpec(
-                        levels=16, features=2, log2_entries=19, coarsest=32, finest=4096
-                    ),
-                    shared=False,
-                    has_shift=False,
-                ),
-            ),
-            loss=LossConfig(l1=1.0, entropy_end=0.01),
-            objective=Objective(entropy_reduction="sum"),
-            run=RunConfig(batch_views=8),
-            rates=RateConfig(half_life=800.0),
+        paper = _original(
+            name,
+            adapter=adapter_module.PAPER,
+            grid=HashGridSpec(levels=16, features=2, log2_entries=19, coarsest=32, finest=4096),
+            vertex_fraction=0.05,
+            has_shift=False,
+            baked_diffuse=False,
         )
+        objective = Objective(entropy_reduction="sum")
+        return replace(paper, loss=LossConfig(l1=1.0), objective=objective)
     if name == "code":
-        return Config(
-            preset=name,
-            geometry=GeometryConfig(resolution=96, initial="random", vertex_fraction=0.1),
-            model=Model(
-                adapter=adapter_module.CODE,
-                material=MaterialSpec(
-                    grid=HashGridSpec(
-                        levels=16, features=2, log2_entries=18, coarsest=16, finest=4096
-                    ),
-                    shared=False,
-                    has_shift=True,
-                ),
-                baked_diffuse=True,
-            ),
-            loss=LossConfig(entropy_end=0.12, entropy_end_fraction=1.0),
-            run=RunConfig(batch_views=8),
-            rates=RateConfig(half_life=800.0),
+        code = _original(
+            name,
+            adapter=adapter_module.CODE,
+            grid=HashGridSpec(levels=16, features=2, log2_entries=18, coarsest=16, finest=4096),
+            vertex_fraction=0.1,
+            has_shift=True,
+            baked_diffuse=True,
         )
-    return Config(
-        preset="default",
-        model=Model(adapter=AdapterConstants(), material=MaterialSpec(shared=True)),
-    )
+        return replace(code, loss=LossConfig(entropy_end=0.12, entropy_end_fraction=1.0))
+    return Config(preset="default", model=Model(material=MaterialSpec(shared=True)))
 
 
 def make_config(
