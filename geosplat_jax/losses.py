@@ -5,7 +5,6 @@ topology of the isosurface, the random background, the noise of the smoothness t
 """
 
 from dataclasses import dataclass, fields
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -79,7 +78,7 @@ class Objective:
     smooth_shine: bool = True
     background: str = "pixel"
     srgb: bool = False
-    entropy_reduction: Literal["mean", "sum"] = "mean"
+    entropy_reduction: str = "mean"
     with_light: bool = False
 
     def __post_init__(self) -> None:
@@ -223,7 +222,9 @@ def loss(
         weights=(1.0, shine, shine),
     )
     terms["entropy"] = sdf_entropy(
-        params.geometry, context.grid, reduction=objective.entropy_reduction
+        params.geometry,
+        context.grid,
+        reduction="sum" if objective.entropy_reduction == "sum" else "mean",
     )
     terms["deviation"] = asset.deviation
     terms["weights"] = weight_magnitude(params.geometry)
