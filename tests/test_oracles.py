@@ -1,0 +1,299 @@
+"""Agreement with the stored results of the slow references in `tests/references`.
+
+`tests/data/make.py` writes them; they keep these tests independent of any other data.
+"""
+
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from references import bsdf as slow_bsdf
+from references import flexicubes, splatting
+from references.cases import CASES, SPLAT_FRAME, adapter_outputs, unpacked
+from references.lanes import contract, difference
+from scipy.spatial import cKDTree
+from support import double_precision
+
+from geosplat_jax._flexicubes_tables import EDGES, PATCH_EDGES, PROBLEM_OFFSET
+from geosplat_jax.adapter import CODE, PAPER, face_gaussians, vertex_gaussians
+from geosplat_jax.bsdf import evaluate_lobes
+from geosplat_jax.capacity import Capacities, fits
+from geosplat_jax.geometry import isosurface
+from geosplat_jax.mesh_ops import vertex_normals
+from geosplat_jax.numerics import safe_normalize
+from geosplat_jax.projection import project
+from geosplat_jax.rasterize import rasterize
+from geosplat_jax.rotation import quaternion_to_matrix
+from geosplat_jax.scene import Geometry, Grid, Materials, Mesh
+
+DATA = Path(__file__).parent / "data"
+# float64 on both sides, some hundred operations deep; the largest values have order 10 to 1e3.
+VALUE_TOLERANCE = 1e-10
+# The stored gradients come from complex steps, so they are as exact as the values.
+GRADIENT_TOLERANCE = 1e-9
+# Another machine may round otherwise; the smoothest lobe amplifies that some ten thousand times.
+REPRODUCTION_TOLERANCE = 1e-10
+# Central differences, extrapolated twice: truncation and rounding are both below. The step is small
+# against the distance to every kink and threshold, and against the width of the sharpest lobe.
+DIFFERENCE_TOLERANCE = 1e-7
+DIFFERENCE_STEP = {"splats_small": 1e-5, "bsdf_rows": 1e-4}
+ROOM = Capacities(
+    surface_cubes=128, dual_vertices=128, quads=128, visible=32, hits=1024, chunks=256
+)
+ISOSURFACES = ["isosurface_blob", "isosurface_blob_eval", "isosurface_clash"]
+
+
+def load(name):
+    with np.load(DATA / f"{name}.npz") as data:
+        return dict(data)
+
+
+def relative(got, expected):
+    """Relative L2 distance."""
+    return np.linalg.norm(np.asarray(got) - expected) / np.linalg.norm(expected)
+
+
+def assert_gradients(got, data):
+    """Compare a dictionary of gradients with the stored ones, array by array."""
+    expected = unpacked(data, "grad")
+    assert got.keys() == expected.keys()
+    for name, wanted in expected.items():
+        if not wanted.any():
+            np.testing.assert_array_equal(got[name], 0.0, err_msg=name)
+            continue
+        assert relative(got[name], wanted) < GRADIENT_TOLERANCE, name
+
+
+def pull_back(function, inputs, cotangents):
+    """Values of a function of a dictionary, and the gradient of their contraction."""
+
+    def scalar(inputs, cotangents):
+        outputs = function(inputs)
+        return sum(jnp.sum(outputs[k] * c) for k, c in cotangents.items()), outputs
+
+    inputs = {k: jnp.asarray(v) for k, v in inputs.items()}
+    cotangents = {k: jnp.asarray(c) for k, c in cotangents.items()}
+    (_, outputs), gradient = jax.jit(jax.value_and_grad(scalar, has_aux=True))(inputs, cotangents)
+    return outputs, gradient
+
+
+# The references themselves
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_stored_files_are_what_the_references_say(name):
+    stored, made = load(name), CASES[name]()
+    assert stored.keys() == made.keys()
+    for key, value in made.items():
+        scale = max(1.0, np.abs(value).max(initial=0.0))
+        np.testing.assert_allclose(
+            stored[key], value, rtol=0, atol=REPRODUCTION_TOLERANCE * scale, err_msg=key
+        )
+
+
+def reference_scalar(name, data):
+    """Return the contraction that a file stores the gradient of, as a function of its inputs."""
+    if name in ISOSURFACES:
+        settings = {"shape": tuple(data["shape"]), "training": bool(data["training"])}
+        function = partial(flexicubes.isosurface, **settings)
+    else:
+        function = {
+            "splats_small": partial(splatting.render, **SPLAT_FRAME),
+            "adapter_faces": adapter_outputs,
+            "bsdf_rows": slow_bsdf.evaluate_rows,
+        }[name]
+    return lambda **inputs: contract(unpacked(data, "cotangent"), function(**inputs))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_complex_steps_agree_with_differences(name):
+    data, random = load(name), np.random.RandomState(0)
+    inputs, gradients = unpacked(data, "in"), unpacked(data, "grad")
+    scalar = reference_scalar(name, data)
+    for key, gradient in gradients.items():
+        directions = {k: np.zeros(x.shape) for k, x in inputs.items()}
+        directions[key] = random.normal(size=gradient.shape)
+        directions[key] /= np.linalg.norm(directions[key])
+        expected = difference(scalar, inputs, directions, step=DIFFERENCE_STEP.get(name, 1e-3))
+        got = np.sum(gradient * directions[key])
+        scale = max(np.linalg.norm(gradient), 1e-3)
+        assert abs(got - expected) < DIFFERENCE_TOLERANCE * scale, key
+
+
+# Isosurface
+
+
+def test_patches_of_all_cases_are_the_closed_lines_on_the_cell():
+    edges = [tuple(edge) for edge in EDGES.tolist()]
+    assert edges == flexicubes.EDGES
+    for case in range(256):
+        inside = [bool(case >> c & 1) for c in range(8)]
+        for cut_around, row in ((True, case), (False, 255 - case)):
+            walked = {frozenset(loop) for loop in flexicubes.patches(inside, cut_around)}
+            tabled = {
+                frozenset(edges[e] for e in range(12) if bits >> e & 1)
+                for bits in PATCH_EDGES[row].tolist()
+                if bits
+            }
+            assert walked == tabled, case
+        steps = [(a, (s + 1) // 2) for a, s in enumerate(PROBLEM_OFFSET[case].tolist()) if s]
+        assert flexicubes.pinched_faces(inside) == steps, case
+
+
+def face_set(faces):
+    """Faces as oriented triples that start at their smallest row."""
+    starts = np.argmin(faces, axis=1)[:, None] + np.arange(3)
+    return {tuple(row) for row in np.take_along_axis(faces, starts % 3, axis=1).tolist()}
+
+
+def extract(inputs, shape, training):
+    grid = Grid(origin=inputs["origin"], cell_size=inputs["cell_size"], shape=shape)
+    names = ("sdf", "deform", "alpha", "beta", "gamma")
+    geometry = Geometry(**{name: inputs[name] for name in names})
+    return isosurface(geometry, grid, capacities=ROOM, training=training)
+
+
+@pytest.mark.parametrize("name", ISOSURFACES)
+def test_isosurface_equals_the_slow_one(name):
+    data = load(name)
+    shape, training = tuple(data["shape"].tolist()), bool(data["training"])
+    inputs, count = unpacked(data, "in"), len(data["out_vertices"])
+    with double_precision():
+
+        def outputs(inputs):
+            surface = extract(inputs, shape, training)
+            mesh = surface.mesh
+            return {"vertices": mesh.vertices, "deviation": surface.deviation, "surface": surface}
+
+        # Pair the rows of the package with those of the reference by position.
+        surface = jax.jit(outputs)({k: jnp.asarray(v) for k, v in inputs.items()})["surface"]
+        assert bool(fits(surface.usage, ROOM))
+        assert int(surface.mesh.vertex_count) == count
+        vertices = np.asarray(surface.mesh.vertices)
+        distance, row = cKDTree(vertices[:count]).query(data["out_vertices"])
+        assert distance.max() < VALUE_TOLERANCE
+        assert len(set(row)) == count
+        cotangents = unpacked(data, "cotangent")
+        placed = np.zeros(vertices.shape)
+        placed[row] = cotangents["vertices"]
+        _, gradient = pull_back(outputs, inputs, cotangents | {"vertices": placed})
+    assert int(surface.usage.dual_vertices) == int(data["out_dual_count"])
+    assert set(row[: int(data["out_dual_count"])]) == set(range(int(data["out_dual_count"])))
+    faces = np.asarray(surface.mesh.faces)[: int(surface.mesh.face_count)]
+    assert len(faces) == len(data["out_faces"])
+    assert face_set(faces) == face_set(row[data["out_faces"]])
+    np.testing.assert_allclose(surface.deviation, data["out_deviation"], rtol=VALUE_TOLERANCE)
+    assert_gradients(gradient, data)
+
+
+def test_the_clashing_cells_are_there_and_the_mesh_is_a_manifold_with_border():
+    data = load("isosurface_clash")
+    assert len(data["changed"]) == 4
+    assert set(flexicubes.uses_of_edges(data["out_faces"])) == {1, 2}
+
+
+# Splats
+
+
+def test_projection_equals_the_slow_one():
+    data = load("splats_small")
+    inputs, visible = unpacked(data, "in"), data["visible"]
+    assert set(data["out_clamped_axes"]) == {0, 1, 2}  # the field of view is left in each way
+    with double_precision():
+        splats = jax.jit(partial(project, **SPLAT_FRAME))(
+            *(jnp.asarray(inputs[k]) for k in ("means", "quats", "scales")),
+            world_to_camera=jnp.asarray(inputs["world_to_camera"]),
+            intrinsics=jnp.asarray(inputs["intrinsics"]),
+        )
+    np.testing.assert_array_equal(np.flatnonzero(splats.is_in_front), visible)
+    for name in ("means2d", "conics", "depths", "compensation"):
+        got = np.asarray(getattr(splats, name))[visible]
+        scale = max(1.0, np.abs(data[f"out_{name}"]).max())
+        np.testing.assert_allclose(got, data[f"out_{name}"], rtol=0, atol=VALUE_TOLERANCE * scale)
+
+
+def test_image_and_its_gradients_equal_the_slow_ones():
+    data = load("splats_small")
+    # All three branches of the thresholds occur, and no rounding can change the branch.
+    assert min(data["kept"], data["cut"], data["clamped"]) > 0
+    assert min(data["gap_cut"], data["gap_clamp"]) > 1e-6
+
+    def draw(inputs):
+        image, alpha, needed = rasterize(
+            **inputs,
+            is_eligible=jnp.ones(inputs["means"].shape[0], bool),
+            capacities=ROOM,
+            **SPLAT_FRAME,
+        )
+        return {"image": image, "alpha": alpha, "usage": needed}
+
+    with double_precision():
+        values, gradient = pull_back(draw, unpacked(data, "in"), unpacked(data, "cotangent"))
+    assert bool(fits(values["usage"], ROOM))
+    np.testing.assert_allclose(values["image"], data["out_image"], rtol=0, atol=VALUE_TOLERANCE)
+    np.testing.assert_allclose(values["alpha"], data["out_alpha"], rtol=0, atol=VALUE_TOLERANCE)
+    assert_gradients(gradient, data)
+
+
+# Adapter and reflectance
+
+
+def assert_values(got, data):
+    for name, wanted in unpacked(data, "out").items():
+        np.testing.assert_allclose(
+            got[name], wanted, rtol=VALUE_TOLERANCE, atol=VALUE_TOLERANCE, err_msg=name
+        )
+
+
+def test_gaussians_of_a_mesh_equal_the_slow_ones():
+    data = load("adapter_faces")
+
+    def outputs(inputs):
+        faces = jnp.asarray(data["faces"], jnp.int32)
+        mesh = Mesh(inputs["vertices"], faces, jnp.int32(5), jnp.int32(len(data["faces"])))
+        result = {"vertex_normals": vertex_normals(mesh)}
+        for preset, constants in (("paper", PAPER), ("code", CODE)):
+            gaussians = face_gaussians(mesh, inputs["normals"], constants=constants)
+            result |= {
+                f"{preset}_means": gaussians.means,
+                f"{preset}_rotations": quaternion_to_matrix(gaussians.quats),
+                f"{preset}_scales": gaussians.scales,
+                f"{preset}_normals": gaussians.normals,
+            }
+        rounds = vertex_gaussians(mesh, inputs["normals"], constants=CODE)
+        return result | {"vertex_radii": rounds.scales[:, 0]}
+
+    with double_precision():
+        values, gradient = pull_back(outputs, unpacked(data, "in"), unpacked(data, "cotangent"))
+    assert_values(values, data)
+    assert_gradients(gradient, data)
+
+
+def test_reflectance_equals_the_slow_one():
+    data = load("bsdf_rows")
+
+    def outputs(inputs):
+        materials = Materials(inputs["albedo"], inputs["roughness"], inputs["metallic"])
+        # Normalised here, so that both sides extend the model alike off the unit sphere.
+        directions = [safe_normalize(inputs[k]) for k in ("normals", "wi", "wo")]
+        diffuse, specular = evaluate_lobes(materials, *directions)
+        return {"diffuse": diffuse, "specular": specular}
+
+    with double_precision():
+        values, gradient = pull_back(outputs, unpacked(data, "in"), unpacked(data, "cotangent"))
+    is_lit = data["out_specular"].any(axis=1)
+    is_below_floor = data["in_roughness"] < slow_bsdf.ROUGHNESS_FLOOR
+    assert 40 < is_lit.sum() < 64
+    assert (is_lit & is_below_floor).any()
+    np.testing.assert_array_equal(gradient["roughness"][is_below_floor], 0.0)
+    assert_values(values, data)
+    assert_gradients(gradient, data)
+    # Mirrors dominate the norm; every row by itself must agree too.
+    for name in gradient:
+        for got, wanted in zip(np.asarray(gradient[name]), data[f"grad_{name}"], strict=True):
+            assert np.linalg.norm(got - wanted) <= GRADIENT_TOLERANCE * max(
+                1.0, np.linalg.norm(wanted)
+            )
