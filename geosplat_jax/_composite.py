@@ -167,7 +167,10 @@ def _composite_forward(tile_size, grid, table, chunk_ranks, chunk_tiles):
     nothing = jnp.zeros((shape[0], channels, shape[1]), table.dtype)
     (passing, seen), _ = jax.lax.scan(front_to_back, (clear, nothing), chunk_ranks, unroll=True)
     before = _transmittance_before(passing, _place_in_run(chunk_tiles))
-    seen = jnp.concatenate([seen, (1.0 - passing)[:, None]], axis=1) * before[:, None]
+    # Coverage comes from the last chunk of a tile alone: a sum over chunks may round to above 1.
+    is_last = jnp.concatenate([chunk_tiles[1:] != chunk_tiles[:-1], jnp.ones((1,), bool)])
+    coverage = jnp.where(is_last[:, None], 1.0 - before * passing, 0.0)
+    seen = jnp.concatenate([seen * before[:, None], coverage[:, None]], axis=1)
     tiles = jax.ops.segment_sum(seen, chunk_tiles, grid[0] * grid[1], indices_are_sorted=True)
     return tiles, (table, chunk_ranks, chunk_tiles, before)
 

@@ -27,7 +27,7 @@ class AdapterConstants:
     u, v : barycentric coordinate of the outer and the inner triple of points, below 1/3.
     alpha : (outer, inner) ratio of S_x to half the length of the sampled segment.
     beta : (outer, inner) divisor of S_y.
-    thickness : S_z in world units.
+    thickness : S_z in half the longest side of the scene's box (the paper's box is [-1, 1]^3).
     opacity : opacity of every Gaussian.
     shading_frame : orient by the interpolated normal (the paper's text) instead of the face's
         (the authors' code).
@@ -90,7 +90,11 @@ def _blend(
 
 
 def face_gaussians(
-    mesh: Mesh, normals: Float[Array, "Cv 3"], *, constants: AdapterConstants
+    mesh: Mesh,
+    normals: Float[Array, "Cv 3"],
+    *,
+    constants: AdapterConstants,
+    unit: Float[Array, ""] | float = 1.0,
 ) -> Gaussians:
     """Sample six Gaussians a face (Eq. 8-11): rows ``6 f`` to ``6 f + 5`` belong to face ``f``.
 
@@ -102,7 +106,7 @@ def face_gaussians(
     ----------
     mesh : faces to sample; rows past ``face_count`` become inert Gaussians.
     normals : (Cv, 3) unit vertex normals.
-    constants : see `AdapterConstants`.
+    constants, unit : see `AdapterConstants`; world length of one unit of its thickness.
     """
     # Components come first, (corner, xyz, face): the arithmetic runs along contiguous faces.
     both = jnp.concatenate([mesh.vertices, normals], axis=1)[mesh.faces.T].transpose(0, 2, 1)
@@ -122,7 +126,8 @@ def face_gaussians(
             segment = (1.0 - 3.0 * corner) * length
             along = 0.5 * constants.alpha[ring] * segment  # Eq. 9
             across = safe_divide(2.0 * area, constants.beta[ring] * segment)
-            scales.append(jnp.stack([along, across, jnp.full_like(along, constants.thickness)]))
+            thickness = jnp.full_like(along, constants.thickness * unit)
+            scales.append(jnp.stack([along, across, thickness]))
     if constants.shading_frame:
         quats = [_frame(edge, n) for edge, n in zip(edges * 2, shading, strict=True)]
     else:
@@ -148,18 +153,26 @@ def face_gaussians(
 
 def _frame(along: Float[Array, "3 F"], up: Float[Array, "3 F"]) -> Float[Array, "4 F"]:
     """Quaternions whose x axis follows ``along`` (made orthogonal to ``up``) and z is ``up``."""
-    x = safe_normalize(along - jnp.sum(along * up, axis=0, keepdims=True) * up, axis=0)
+    # Twice: where the two are nearly parallel, little but rounding is left after the first time.
+    for _ in range(2):
+        along = along - jnp.sum(along * up, axis=0, keepdims=True) * up
+    x = safe_normalize(along, axis=0)
     return axes_to_quaternion(x, jnp.cross(up, x, axis=0), up)
 
 
 def vertex_gaussians(
-    mesh: Mesh, normals: Float[Array, "Cv 3"], *, constants: AdapterConstants
+    mesh: Mesh,
+    normals: Float[Array, "Cv 3"],
+    *,
+    constants: AdapterConstants,
+    unit: Float[Array, ""] | float = 1.0,
 ) -> Gaussians:
     """Sample one round Gaussian a vertex (Eq. 12), for the first steps on a rough surface.
 
     The footprint follows the area of the faces around the vertex, projected along its normal.
     Differentiable in vertices and normals. The tangent frame (and so the quaternion) is arbitrary
     about the normal and jumps where ``n_z`` changes sign, which the round footprint hides.
+    ``unit`` : world length of one unit of thickness.
     """
     face_normal, area = face_normals_and_areas(mesh)
     corner_normals = normals[mesh.faces]
@@ -168,11 +181,12 @@ def vertex_gaussians(
     zero = jnp.zeros((mesh.vertices.shape[0],), mesh.vertices.dtype)
     star_area = zero.at[mesh.faces.reshape(-1)].add(share.reshape(-1))
     radius = safe_sqrt(star_area / constants.vertex_area_divisor)
+    thickness = constants.thickness * unit
     tangent, bitangent = frame_from_normal(normals)
     gaussians = Gaussians(
         means=mesh.vertices,
         quats=matrix_to_quaternion(jnp.stack([tangent, bitangent, normals], axis=-1)),
-        scales=jnp.stack([radius, radius, jnp.full_like(radius, constants.thickness)], axis=-1),
+        scales=jnp.stack([radius, radius, jnp.full_like(radius, thickness)], axis=-1),
         opacities=jnp.full_like(radius, constants.opacity),
         normals=normals,
         count=mesh.vertex_count,

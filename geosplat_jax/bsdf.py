@@ -108,7 +108,9 @@ def evaluate_lobes(
     cosine_i, cosine_o, is_above = _cosines(normals, wi, wo)
     alpha = ggx_alpha(materials.roughness)
     half = safe_normalize(wi + wo)
-    fresnel = schlick(specular_f0(materials.albedo, materials.metallic), _dot(wi, half))
+    # wi . half = wo . half, but for the rounding of nearly opposite directions: take their mean.
+    cosine = 0.5 * _dot(wi + wo, half)
+    fresnel = schlick(specular_f0(materials.albedo, materials.metallic), cosine)
     strength = ggx_distribution(half, normals, alpha) * smith_visibility(cosine_i, cosine_o, alpha)
     specular = fresnel * strength[:, None]
     diffuse = materials.albedo * ((1 - materials.metallic) / math.pi)[:, None]
@@ -162,7 +164,8 @@ def pdf(
     samples below the surface, where `evaluate` is zero. Requires ``wo`` above the surface.
     """
     alpha = ggx_alpha(materials.roughness)
-    cosine_o = jnp.maximum(_dot(normals, wo), COSINE_EPSILON)
+    # No floor above zero here nor in `sample`: the root is at least alpha, and the two must agree.
+    cosine_o = jnp.maximum(_dot(normals, wo), 0.0)
     half = safe_normalize(wi + wo)
     # G1(wo) D / (4 n.wo), Heitz 2018 Eq. 3 and 17, with G1 = 2 n.wo / (n.wo + root).
     visible = ggx_distribution(half, normals, alpha) / (
@@ -217,7 +220,7 @@ def sample(
     materials, normals, wo = jax.lax.stop_gradient((materials, normals, wo))
     tangent, bitangent = frame_from_normal(normals)
     local = jnp.stack([_dot(wo, tangent), _dot(wo, bitangent), _dot(wo, normals)], axis=-1)
-    local = local.at[:, 2].max(COSINE_EPSILON)
+    local = local.at[:, 2].max(0.0)
     half = _sample_visible_normal(local, ggx_alpha(materials.roughness), uniforms[:, 1:])
     mirrored = 2 * _dot(local, half)[:, None] * half - local
     is_specular = uniforms[:, 0] < specular_probability(materials, normals, wo)

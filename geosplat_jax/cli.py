@@ -1,4 +1,4 @@
-"""The ``geosplat-jax`` command: info, train, evaluate, render, export."""
+"""The ``geosplat-jax`` command: info, train, evaluate, render, export, gradcheck."""
 
 import argparse
 import importlib.metadata
@@ -12,11 +12,25 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from geosplat_jax.config import PRESETS, QUALITIES, Config, make_config
+from geosplat_jax.gradcheck.report import (
+    SINGLE_TOLERANCE,
+    STAGES,
+    TOLERANCE,
+    check_stage,
+    passes,
+    summary,
+    table,
+    to_records,
+)
 from geosplat_jax.io.dataset import Dataset, describe, load_dataset
 from geosplat_jax.io.images import SceneError, write_png
 from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
 
 _console = Console(stderr=True, highlight=False)
+
+
+class GradientError(RuntimeError):
+    """A gradient disagrees with differences; the message says where."""
 
 
 class UsageError(ValueError):
@@ -66,6 +80,16 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--output", type=Path, help="folder (default: RUN/export)")
     export.add_argument("--vertex-colors", action="store_true", help="instead of textures")
     export.add_argument("--texture-size", type=int, default=1024)
+
+    gradcheck = commands.add_parser(
+        "gradcheck", help="prove the gradients: float64 differences of every stage"
+    )
+    gradcheck.add_argument(
+        "stages", nargs="*", metavar="STAGE", help=f"some of {', '.join(STAGES)} (default: all)"
+    )
+    gradcheck.add_argument("--sweep", action="store_true", help="show the error at every step size")
+    gradcheck.add_argument("--seed", type=int, default=0, help="of numbers, samples, directions")
+    gradcheck.add_argument("--json", type=Path, help="also write every comparison to this file")
     return parser
 
 
@@ -330,6 +354,36 @@ def export_command(
     return info
 
 
+def gradcheck_command(
+    stages: list[str], *, sweep: bool, seed: int, output: Path | None
+) -> dict[str, Any]:
+    """Compare the stages' gradients with float64 differences and print the tables.
+
+    Raises
+    ------
+    GradientError
+        If a comparison exceeds its tolerance.
+    """
+    names = list(dict.fromkeys(stages)) or list(STAGES)
+    unknown = [name for name in names if name not in STAGES]
+    if unknown:
+        raise UsageError(f"unknown stage {unknown[0]!r}; expected some of {', '.join(STAGES)}")
+    checked = {}
+    for name in names:
+        checked[name] = check_stage(name, seed=seed)
+        print(f"{table(checked[name], sweep=sweep)}\n", flush=True)
+    print(summary(checked))
+    if output is not None:
+        output.write_text(json.dumps(to_records(checked), indent=1), encoding="utf-8")
+    failed = [row for rows in checked.values() for row in rows if not passes(row)]
+    if failed:
+        raise GradientError(
+            f"{len(failed)} comparisons exceed {TOLERANCE:g} (float64) or {SINGLE_TOLERANCE:g} "
+            f"(float32); the first: {failed[0].problem}, {failed[0].worst}"
+        )
+    return {name: len(rows) for name, rows in checked.items()}
+
+
 def _run(arguments: argparse.Namespace) -> None:
     """Dispatch a command."""
     if arguments.command == "info":
@@ -346,6 +400,13 @@ def _run(arguments: argparse.Namespace) -> None:
         evaluate_command(arguments.run)
     elif arguments.command == "render":
         render_command(arguments.run, arguments.views, arguments.output)
+    elif arguments.command == "gradcheck":
+        gradcheck_command(
+            arguments.stages,
+            sweep=arguments.sweep,
+            seed=arguments.seed,
+            output=arguments.json,
+        )
     else:
         export_command(
             arguments.run,
@@ -368,6 +429,9 @@ def main(argv: list[str] | None = None) -> int:
     except Interrupted as stop:
         _console.print(str(stop))
         return 130
+    except GradientError as error:
+        _console.print(str(error), markup=False, soft_wrap=True)
+        return 1
     except (SceneError, UsageError, TrainingError, CheckpointError, OSError, ValueError) as error:
         _console.print("[bold red]error:[/]", end=" ")
         _console.print(str(error), markup=False, soft_wrap=True)

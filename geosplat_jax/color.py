@@ -9,6 +9,9 @@ from geosplat_jax.numerics import safe_log
 _SRGB_KNEE_LINEAR = 0.0031308
 _SRGB_KNEE_ENCODED = 0.04045
 
+_LARGEST_LOG_EXPOSURE = 60.0
+"""Beyond it exposed radiance of 1e5 would leave float32 (e^60 = 1e26)."""
+
 
 def linear_to_srgb(linear: Float[Array, "..."]) -> Float[Array, "..."]:
     """Encode linear values with the sRGB transfer curve (IEC 61966-2-1); negatives stay linear."""
@@ -41,8 +44,8 @@ def tone_map(
     Parameters
     ----------
     rgb : (..., 3) linear radiance.
-    log_exposure : () natural logarithm of the exposure.
+    log_exposure : () natural logarithm of the exposure; held, with zero gradient, above 60.
     sharpness : the beta of the softplus.
     """
-    headroom = 1.0 - jnp.exp(log_exposure) * rgb
+    headroom = 1.0 - jnp.exp(jnp.minimum(log_exposure, _LARGEST_LOG_EXPOSURE)) * rgb
     return 1.0 - jax.nn.softplus(sharpness * headroom) / sharpness

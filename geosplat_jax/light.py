@@ -34,7 +34,7 @@ class LightSpec:
 
     Attributes
     ----------
-    height, width : texels of the environment map.
+    height, width : texels of the environment map; one row is a light without elevation.
     roughness : increasing perceptual roughness of the levels (GGX alpha is its square). A first
         level 0 is the map itself. The last must be 1, whose lobe is exactly the clamped cosine
         and therefore doubles as the diffuse level. Blending halfway between the default levels
@@ -53,9 +53,9 @@ class LightSpec:
     roughness: tuple[float, ...] = (0.0, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45, 0.6, 0.8, 1.0)
 
     def __post_init__(self):
-        if self.height < 2 or self.width < 2 or self.width % 2:
+        if self.height < 1 or self.width < 2 or self.width % 2:
             raise ValueError(
-                f"a light map needs at least 2 rows and an even width, got "
+                f"a light map needs at least 1 row and an even width, got "
                 f"{self.height} x {self.width}; use e.g. 64 x 128"
             )
         levels = self.roughness

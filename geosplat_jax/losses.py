@@ -120,7 +120,9 @@ def _background(key: jax.Array, shape: tuple[int, ...], dtype: jnp.dtype, kind: 
     if kind == "black":
         return jnp.zeros(shape, dtype)
     drawn = shape if kind == "pixel" else (shape[0], 1, 1, 3)
-    return jnp.broadcast_to(jax.random.uniform(key, drawn, dtype), shape)
+    # Drawn in float32 at any precision, so that a run in float64 sees the same numbers.
+    colors = jax.random.uniform(key, drawn, jnp.float32).astype(dtype)
+    return jnp.broadcast_to(colors, shape)
 
 
 def photometric_terms(
@@ -218,8 +220,9 @@ def loss(
         spec=model.material,
         center=center,
         half_extent=half_extent,
-        std=objective.smoothness_radius * half_extent,
+        std=objective.smoothness_radius,
         weights=(1.0, shine, shine),
+        position_gradient=model.attribute_gradient,
     )
     terms["entropy"] = sdf_entropy(
         params.geometry,

@@ -29,7 +29,7 @@ ROUGHNESS_MINIMUM = 0.1
 of light samples cannot resolve."""
 
 SMOOTHNESS_STD = 0.01
-"""Standard deviation of the displacement in Eq. 15-17, world units."""
+"""Standard deviation of the displacement in Eq. 15-17, in half the longest side of the box."""
 
 INITIAL_LOGITS: dict[str, tuple[float, float]] = {
     "outdoor": (0.0, 0.0),
@@ -262,29 +262,33 @@ def smoothness(
     half_extent: Float[Array, ""],
     std: float | Float[Array, ""] = SMOOTHNESS_STD,
     weights: tuple[float | Float[Array, ""], ...] = (1.0, 1.0, 1.0),
+    position_gradient: bool = False,
 ) -> Float[Array, ""]:
     """Mean change of the attributes under a small random displacement (Eq. 15-17).
 
     ``w_a |a - a'|_1 + w_r |rho - rho'|_1 + w_m |m - m'|_1`` with ``'`` at ``mu + N(0, std^2)``,
     averaged over the points of the mask; zero when there are none. Any random subset of the
-    Gaussians gives an unbiased estimate. Points carry no gradient.
+    Gaussians gives an unbiased estimate.
 
     Parameters
     ----------
     points : (M, 3) world. mask : (M,) false for padding.
     key : for the displacements.
     spec, center, half_extent : see `materials_at`.
-    std : world units.
+    std : in units of ``half_extent``.
     weights : of albedo, roughness and metallic.
+    position_gradient : static; whether points receive a gradient (see `attributes_at`).
     """
-    points = jax.lax.stop_gradient(points)
-    moved = points + std * jax.random.normal(key, points.shape, points.dtype)
+    # Drawn in float32 at any precision, so that a run in float64 sees the same numbers.
+    noise = jax.random.normal(key, points.shape, jnp.float32).astype(points.dtype)
+    moved = points + std * half_extent * noise
     both = materials_at(
         params,
         jnp.concatenate([points, moved]),
         spec=spec,
         center=center,
         half_extent=half_extent,
+        position_gradient=position_gradient,
     )
     count = points.shape[0]
     albedo = jnp.sum(jnp.abs(both.albedo[:count] - both.albedo[count:]), axis=-1)  # Eq. 15

@@ -16,7 +16,10 @@ def _doubled_area_vectors(mesh: Mesh) -> Float[Array, "3 Cf"]:
     a, b, c = jnp.moveaxis(corners, -1, 1)
     (ux, uy, uz), (vx, vy, vz) = b - a, c - a
     cross = jnp.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx])
-    return jnp.where(mesh.face_mask[None, :], cross, 0.0)
+    # Where b = c the compiler's fused multiply-add leaves the rounding of one product, and with it
+    # a random normal; where another two coincide an edge is zero, and so is every product.
+    is_real = mesh.face_mask & jnp.any(b != c, axis=0)
+    return jnp.where(is_real[None, :], cross, 0.0)
 
 
 def face_normals_and_areas(

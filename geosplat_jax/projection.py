@@ -91,7 +91,7 @@ def project(
     intrinsics: Float[Array, "3 3"],
     height: int,
     width: int,
-    near: float = 0.01,
+    near: Float[Array, ""] | float = 0.01,
 ) -> Splats:
     """Project Gaussians to the image of one pinhole camera with OpenCV axes.
 

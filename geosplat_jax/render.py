@@ -66,16 +66,19 @@ class Model:
     adapter, material, light : constants of the stages.
     baked_diffuse : the authors' stage 1, where the albedo field *is* the diffuse radiance and is
         not multiplied by irradiance.
+    attribute_gradient : let the attributes pull on the geometry: the fields are differentiated in
+        the Gaussians' positions. Off, as in the authors' code, they move with the surface.
     cull_backfaces : leave out Gaussians whose face looks away from the camera. Half the work on a
         closed surface; the far side no longer shines through the gaps between splats.
     tile_size : edge of the rasteriser's square tiles, pixels.
-    near : near plane, world units.
+    near : near plane, in half the longest side of the grid's box.
     """
 
     adapter: AdapterConstants = AdapterConstants()
     material: MaterialSpec = MaterialSpec()
     light: LightSpec = LightSpec()
     baked_diffuse: bool = False
+    attribute_gradient: bool = False
     cull_backfaces: bool = True
     tile_size: int = DEFAULT_TILE_SIZE
     near: float = 0.01
@@ -109,7 +112,7 @@ class Asset:
     gaussians : N splats that sit on it.
     outward : (N, 3) geometric normal behind each splat, for culling.
     materials : attributes of the N splats.
-    deviation : () mean L_dev of the isosurface.
+    deviation : () mean L_dev of the isosurface, in half the longest side of the grid's box.
     usage : true needs of the isosurface's buffers.
     """
 
@@ -148,13 +151,16 @@ def grid_center_and_extent(grid: Grid) -> tuple[Float[Array, " 3"], Float[Array,
     return grid.origin + half, jnp.max(half)
 
 
-def _sample(mesh: Mesh, *, model: Model, sampling: str) -> tuple[Gaussians, Float[Array, "N 3"]]:
+def _sample(
+    mesh: Mesh, grid: Grid, *, model: Model, sampling: str
+) -> tuple[Gaussians, Float[Array, "N 3"]]:
     """Run the adapter; return the Gaussians and the geometric normal behind each of them."""
     normals = vertex_normals(mesh)
+    _, half_extent = grid_center_and_extent(grid)
     if sampling == "vertex":
-        gaussians = vertex_gaussians(mesh, normals, constants=model.adapter)
+        gaussians = vertex_gaussians(mesh, normals, constants=model.adapter, unit=half_extent)
         return gaussians, gaussians.normals
-    gaussians = face_gaussians(mesh, normals, constants=model.adapter)
+    gaussians = face_gaussians(mesh, normals, constants=model.adapter, unit=half_extent)
     face_normal, _ = face_normals_and_areas(mesh)
     return gaussians, jnp.repeat(face_normal, GAUSSIANS_PER_FACE, axis=0)
 
@@ -180,7 +186,7 @@ def reconstruct(
         raise ValueError(f'sampling must be "face" or "vertex", got {sampling!r}')
     surface = isosurface(params.geometry, context.grid, capacities=capacities, training=True)
     mesh = surface.mesh
-    gaussians, outward = _sample(mesh, model=model, sampling=sampling)
+    gaussians, outward = _sample(mesh, context.grid, model=model, sampling=sampling)
     center, half_extent = grid_center_and_extent(context.grid)
     # Attributes belong to the face, where a baked texture will be looked up, not to the shifted
     # splat.
@@ -190,10 +196,12 @@ def reconstruct(
         spec=model.material,
         center=center,
         half_extent=half_extent,
+        position_gradient=model.attribute_gradient,
     )
     if shift is not None and sampling == "face":
         gaussians = shift_inwards(gaussians, *face_normals_and_areas(mesh), shift)
-    return Asset(mesh, gaussians, outward, materials, surface.deviation, surface.usage)
+    deviation = surface.deviation / half_extent
+    return Asset(mesh, gaussians, outward, materials, deviation, surface.usage)
 
 
 def _shade(
@@ -224,11 +232,18 @@ def _camera_center(world_to_camera: Float[Array, "4 4"]) -> Float[Array, " 3"]:
     return -jnp.einsum("ji,j->i", world_to_camera[:3, :3], world_to_camera[:3, 3])
 
 
+def _near_plane(grid: Grid, model: Model) -> Float[Array, ""]:
+    """Depth of the near plane, world units."""
+    _, half_extent = grid_center_and_extent(grid)
+    return model.near * half_extent
+
+
 def _visible_in_view(
     gaussians: Gaussians,
     outward: Float[Array, "N 3"],
     world_to_camera: Float[Array, "4 4"],
     intrinsics: Float[Array, "3 3"],
+    grid: Grid,
     *,
     model: Model,
     capacities: Capacities,
@@ -249,7 +264,7 @@ def _visible_in_view(
         intrinsics=intrinsics,
         height=height,
         width=width,
-        near=model.near,
+        near=_near_plane(grid, model),
     )
     return find_visible(
         splats,
@@ -281,6 +296,7 @@ def _render_view(
         asset.outward,
         world_to_camera,
         intrinsics,
+        context.grid,
         model=model,
         capacities=capacities,
         image_shape=image_shape,
@@ -303,7 +319,7 @@ def _render_view(
         intrinsics=intrinsics,
         height=height,
         width=width,
-        near=model.near,
+        near=_near_plane(context.grid, model),
     )
     channels = {
         "albedo": materials.albedo,
@@ -415,13 +431,14 @@ def visibility_usage(
     those of the truncated surface wherever an earlier stage overflowed, so grow and call again.
     """
     surface = isosurface(params.geometry, context.grid, capacities=capacities, training=True)
-    gaussians, outward = _sample(surface.mesh, model=model, sampling=sampling)
+    gaussians, outward = _sample(surface.mesh, context.grid, model=model, sampling=sampling)
 
     def one_view(pose: tuple[Float[Array, "4 4"], Float[Array, "3 3"]]) -> Usage:
         lists = _visible_in_view(
             gaussians,
             outward,
             *pose,
+            context.grid,
             model=model,
             capacities=capacities,
             image_shape=(camera.height, camera.width),

@@ -98,7 +98,8 @@ def ssim(
 
     Returns
     -------
-    () in [-1, 1].
+    () in [-1, 1]. In float32, flat parts with values above some tens of ``data_range`` compare
+    rounding errors; values up to 1e9 are finite.
     """
     a, b = (_pad_to_window(jnp.asarray(image)) for image in (image_a, image_b))
     height, width, channels = a.shape
@@ -110,8 +111,10 @@ def ssim(
     product = mean_a * mean_b
     luminance_floor, contrast_floor = (_K1 * data_range) ** 2, (_K2 * data_range) ** 2
     # Wang et al. 2004, Eq. 13; both divisors are at least their positive floor.
-    similarity = (2 * product + luminance_floor) * (2 * (mean_product - product) + contrast_floor)
-    divisor = (squares + luminance_floor) * (
-        jnp.maximum(mean_squares - squares, 0.0) + contrast_floor
-    )
+    variances = jnp.maximum(mean_squares - squares, 0.0)
+    # Twice the covariance is at most the sum of the variances: in flat parts far brighter than
+    # the data range both are rounding, which the bound keeps from being amplified.
+    covariance = jnp.clip(mean_product - product, -0.5 * variances, 0.5 * variances)
+    similarity = (2 * product + luminance_floor) * (2 * covariance + contrast_floor)
+    divisor = (squares + luminance_floor) * (variances + contrast_floor)
     return jnp.mean(similarity / divisor)

@@ -97,10 +97,11 @@ def initial_sdf(grid: Grid, views: Views, config: Config, key: jax.Array) -> jax
 
 def initial_params(sdf: jax.Array, grid: Grid, config: Config, key: jax.Array) -> Params:
     """Build the parameters before the first step."""
+    light = config.model.light
     return Params(
         geometry=initial_geometry(grid, sdf),
         material=init_materials(key, config.model.material),
-        light=init_light(config.model.light.height, value=config.run.initial_light),
+        light=init_light(light.height, width=light.width, value=config.run.initial_light),
         log_exposure=jnp.zeros((), jnp.float32),
     )
 

@@ -46,6 +46,7 @@ ORDER = [
     "train",
     "evaluate",
     "assets",
+    "gradcheck",
     "cli",
 ]
 

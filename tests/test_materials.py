@@ -174,7 +174,7 @@ def test_smoothness_is_zero_for_a_constant_field_and_positive_otherwise():
 def test_smoothness_is_the_weighted_mean_of_absolute_changes():
     spec = _spec()
     params, points, key = _lively(spec), _points(), jax.random.key(2)
-    moved = points + 0.05 * jax.random.normal(key, points.shape)
+    moved = points + 0.05 * HALF_EXTENT * jax.random.normal(key, points.shape)
     here = materials_at(params, points, spec=spec, **WHERE)
     there = materials_at(params, moved, spec=spec, **WHERE)
     mask = np.arange(60) < 40

@@ -33,7 +33,8 @@ SampleMaterials = Callable[[Float[np.ndarray, "N 3"]], tuple[Any, Any, Any]]
 
 _SAMPLES_PER_CALL = 1 << 16
 _SH_DC = 0.28209479177387814
-_SMALLEST_SCALE = 1e-10
+# Keeps the logarithm of a flat Gaussian finite, whatever the size of the scene.
+_SMALLEST_SCALE = float(np.finfo(np.float32).tiny)
 _OPACITY_MARGIN = 1e-6
 
 

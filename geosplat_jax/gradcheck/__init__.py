@@ -1,0 +1,1 @@
+"""Proof of the gradients: finite differences of every stage against reverse mode."""

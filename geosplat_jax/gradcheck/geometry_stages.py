@@ -1,0 +1,148 @@
+"""Problems of the surface: isosurface, its regularisers, and the adapter."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from geosplat_jax.adapter import (
+    CODE,
+    PAPER,
+    AdapterConstants,
+    face_gaussians,
+    shift_inwards,
+    vertex_gaussians,
+)
+from geosplat_jax.capacity import Capacities
+from geosplat_jax.geometry import (
+    face_normals_and_areas,
+    isosurface,
+    sdf_entropy,
+    vertex_normals,
+    weight_magnitude,
+)
+from geosplat_jax.gradcheck.differences import Problem
+from geosplat_jax.grids import grid_vertices
+from geosplat_jax.scene import Gaussians, Geometry, Grid, Mesh
+
+_SHAPE = (3, 3, 4)
+
+
+def _grid(dtype: Any = jnp.float64) -> Grid:
+    """Build a box of cubic cells about the origin."""
+    cell = 0.25
+    origin = -0.5 * cell * jnp.asarray(_SHAPE, dtype)
+    return Grid(origin=origin, cell_size=jnp.asarray(cell, dtype), shape=_SHAPE)
+
+
+def _blob(rng: np.random.Generator, grid: Grid) -> np.ndarray:
+    """Signed values of a rough ball: closed, with vertices near neither zero nor each other."""
+    points = np.asarray(grid_vertices(grid))
+    values = (np.sqrt(np.sum(points**2, axis=1)) - 0.36) / float(grid.cell_size)
+    values = values + rng.uniform(-0.25, 0.25, values.shape)
+    return np.where(np.abs(values) < 0.05, np.copysign(0.05, values), values)
+
+
+def isosurface_problems(rng: np.random.Generator) -> list[Problem]:
+    """Positions, normals and regularisers in all that shapes the surface."""
+    grid = _grid()
+    cells, vertices = grid.cube_count, grid.vertex_count
+    inputs = {
+        "sdf": _blob(rng, grid),
+        "deform": rng.uniform(-0.4, 0.4, (vertices, 3)),
+        "alpha": rng.uniform(-0.6, 0.6, (cells, 8)),
+        "beta": rng.uniform(-0.6, 0.6, (cells, 12)),
+        "gamma": rng.uniform(-0.6, 0.6, (cells,)),
+    }
+    capacities = Capacities(surface_cubes=64, dual_vertices=64, quads=64)
+
+    def surface(training: bool) -> Problem:
+        def function(inputs: dict[str, Any], constants: Grid) -> dict[str, Any]:
+            geometry = Geometry(**inputs)
+            found = isosurface(geometry, constants, capacities=capacities, training=training)
+            return {
+                "vertices": found.mesh.vertices,
+                "normals": vertex_normals(found.mesh),
+                "L_dev": found.deviation,
+                "entropy": sdf_entropy(geometry, constants),
+                "weight magnitude": weight_magnitude(geometry),
+            }
+
+        name = "isosurface, training" if training else "isosurface, evaluation"
+        return Problem(name, function, inputs, grid, full=500)
+
+    return [surface(True), surface(False)]
+
+
+def _tetrahedron(rng: np.random.Generator) -> dict[str, Any]:
+    """Vertices and unit vertex normals of an irregular tetrahedron."""
+    corners = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    vertices = 0.5 * corners + rng.uniform(-0.2, 0.2, corners.shape)
+    normals = corners + rng.uniform(-0.3, 0.3, corners.shape)
+    normals /= np.sqrt(np.sum(normals**2, axis=1, keepdims=True))
+    return {"vertices": vertices, "normals": normals}
+
+
+_FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+
+
+def _mesh(vertices: Any) -> Mesh:
+    """Close the four vertices to a solid, with one row of padding."""
+    faces = np.concatenate([_FACES, np.zeros((1, 3), np.int32)])
+    return Mesh(vertices, jnp.asarray(faces), jnp.int32(4), jnp.int32(4))
+
+
+def _splats(gaussians: Gaussians) -> dict[str, Any]:
+    """Name what an adapter makes."""
+    return {
+        "means": gaussians.means,
+        "scales": gaussians.scales,
+        "quats": gaussians.quats,
+        "normals": gaussians.normals,
+        "opacities": gaussians.opacities,
+    }
+
+
+def adapter_problems(rng: np.random.Generator) -> list[Problem]:
+    """Both samplings in vertices and normals, and the inward shift."""
+    inputs = _tetrahedron(rng)
+
+    def faces(name: str, preset: AdapterConstants) -> Problem:
+        def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
+            mesh = _mesh(inputs["vertices"])
+            return _splats(face_gaussians(mesh, inputs["normals"], constants=preset))
+
+        return Problem(f"adapter, faces ({name})", function, inputs)
+
+    def vertices(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
+        mesh = _mesh(inputs["vertices"])
+        return _splats(vertex_gaussians(mesh, inputs["normals"], constants=CODE))
+
+    def normals(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
+        mesh = _mesh(inputs["vertices"])
+        face_normal, area = face_normals_and_areas(mesh)
+        return {"vertex normals": vertex_normals(mesh), "face normals": face_normal, "areas": area}
+
+    def shift(inputs: dict[str, Any], constants: dict[str, Any]) -> dict[str, Any]:
+        mesh = _mesh(constants["vertices"])
+        gaussians = face_gaussians(mesh, constants["normals"], constants=CODE)
+        moved = Gaussians(
+            means=gaussians.means + inputs["means"],
+            quats=gaussians.quats,
+            scales=gaussians.scales,
+            opacities=gaussians.opacities,
+            normals=gaussians.normals,
+            count=gaussians.count,
+        )
+        face_normal, area = face_normals_and_areas(mesh)
+        return {"means": shift_inwards(moved, face_normal, area, inputs["fraction"]).means}
+
+    rows = 6 * (len(_FACES) + 1)
+    shifted = {"means": np.zeros((rows, 3)), "fraction": rng.uniform(0.2, 0.8, rows)}
+    return [
+        faces("paper", PAPER),
+        faces("code", CODE),
+        Problem("adapter, vertices", vertices, inputs),
+        Problem("mesh normals", normals, {"vertices": inputs["vertices"]}),
+        Problem("adapter, inward shift", shift, shifted, inputs),
+    ]

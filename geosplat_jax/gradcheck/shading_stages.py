@@ -1,0 +1,171 @@
+"""Problems of the appearance: hash grid, material fields, BRDF, light and split sum."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from geosplat_jax import bsdf
+from geosplat_jax.gradcheck.differences import Problem
+from geosplat_jax.hashgrid import HashGridSpec, encode
+from geosplat_jax.light import (
+    LightSpec,
+    lookup,
+    prefilter,
+    prefilter_operators,
+    prefiltered_diffuse,
+    prefiltered_specular,
+)
+from geosplat_jax.materials import MaterialField, MaterialSpec, attributes_at, init_materials
+from geosplat_jax.scene import EnvLight, Materials
+from geosplat_jax.shading import fg_table, split_sum
+
+_GRID = HashGridSpec(levels=3, features=2, log2_entries=6, coarsest=2, finest=11)
+"""One dense level and two hashed ones."""
+
+_LIGHT = LightSpec(height=6, width=8, roughness=(0.0, 0.3, 0.6, 1.0))
+
+
+def unit_vectors(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Random directions, (count, 3)."""
+    vectors = rng.standard_normal((count, 3))
+    return vectors / np.sqrt(np.sum(vectors**2, axis=1, keepdims=True))
+
+
+def hash_grid_problems(rng: np.random.Generator) -> list[Problem]:
+    """Features in the tables and in the points."""
+
+    def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
+        features = encode(inputs["table"], inputs["points"], spec=_GRID, position_gradient=True)
+        return {"features": features}
+
+    inputs = {
+        "table": rng.uniform(-1, 1, (_GRID.total_entries, _GRID.features)),
+        "points": rng.uniform(0.02, 0.98, (11, 3)),
+    }
+    return [Problem("hash grid", function, inputs)]
+
+
+def material_problems(rng: np.random.Generator) -> list[Problem]:
+    """Attributes of a field in its tables, its MLPs and the points; one encoding, and two."""
+    points = rng.uniform(-0.9, 0.9, (7, 3))
+
+    def field(shared: bool) -> Problem:
+        spec = MaterialSpec(
+            grid=_GRID,
+            albedo_hidden=(5, 4),
+            surface_hidden=(5,),
+            shared=shared,
+            bias=True,
+            initial_roughness_logit=-0.5,
+            initial_metallic_logit=0.5,
+        )
+        template = init_materials(jax.random.key(0), spec)
+        leaves, structure = jax.tree.flatten(template)
+        drawn = [rng.uniform(-1, 1, leaf.shape) for leaf in leaves]
+        params = jax.tree.unflatten(structure, drawn)
+
+        def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
+            materials, shift = attributes_at(
+                MaterialField(
+                    albedo_table=inputs["tables"]["albedo"],
+                    surface_table=inputs["tables"]["surface"],
+                    albedo_head=inputs["albedo MLP"],
+                    surface_head=inputs["surface MLP"],
+                    shift_head=inputs["shift MLP"],
+                ),
+                inputs["points"],
+                spec=spec,
+                center=jnp.zeros((3,), inputs["points"].dtype),
+                half_extent=jnp.ones((), inputs["points"].dtype),
+                position_gradient=True,
+            )
+            return {
+                "albedo": materials.albedo,
+                "roughness": materials.roughness,
+                "metallic": materials.metallic,
+                "shift": shift,
+            }
+
+        inputs = {
+            "tables": {"albedo": params.albedo_table, "surface": params.surface_table},
+            "albedo MLP": params.albedo_head,
+            "surface MLP": params.surface_head,
+            "shift MLP": params.shift_head,
+            "points": points,
+        }
+        name = "materials, one encoding" if shared else "materials, two encodings"
+        return Problem(name, function, inputs)
+
+    return [field(True), field(False)]
+
+
+def _surface_points(rng: np.random.Generator, count: int) -> dict[str, Any]:
+    """Materials, normals and a viewer in front of them."""
+    normals, wo = unit_vectors(rng, count), unit_vectors(rng, count)
+    wo = np.where(np.sum(normals * wo, axis=1, keepdims=True) < 0, -wo, wo)
+    return {
+        "albedo": rng.uniform(0.1, 0.9, (count, 3)),
+        "roughness": rng.uniform(0.15, 0.9, count),
+        "metallic": rng.uniform(0.1, 0.9, count),
+        "normals": normals,
+        "wo": wo,
+    }
+
+
+def _materials(inputs: dict[str, Any]) -> Materials:
+    return Materials(inputs["albedo"], inputs["roughness"], inputs["metallic"])
+
+
+def bsdf_problems(rng: np.random.Generator) -> list[Problem]:
+    """Reflectance, both lobes, and the density of samples, in every argument."""
+    inputs = _surface_points(rng, 9)
+    wi = unit_vectors(rng, 9)
+    inputs["wi"] = np.where(np.sum(inputs["normals"] * wi, axis=1, keepdims=True) < 0, -wi, wi)
+
+    def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
+        arguments = (_materials(inputs), inputs["normals"], inputs["wi"], inputs["wo"])
+        diffuse, specular = bsdf.evaluate_lobes(*arguments)
+        return {"diffuse": diffuse, "specular": specular, "density": bsdf.pdf(*arguments)}
+
+    return [Problem("BRDF", function, inputs)]
+
+
+def light_problems(rng: np.random.Generator) -> list[Problem]:
+    """Lookup and prefiltered lookups in texels, directions and roughness."""
+    operators = prefilter_operators(_LIGHT)
+
+    def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
+        light = prefilter(EnvLight(inputs["texels"]), constants)
+        return {
+            "lookup": lookup(inputs["texels"], inputs["directions"]),
+            "diffuse": prefiltered_diffuse(light, inputs["directions"]),
+            "specular": prefiltered_specular(light, inputs["directions"], inputs["roughness"]),
+        }
+
+    inputs = {
+        "texels": rng.uniform(0.1, 2.0, (_LIGHT.height, _LIGHT.width, 3)),
+        "directions": unit_vectors(rng, 9),
+        "roughness": rng.uniform(0.05, 0.95, 9),
+    }
+    return [Problem("environment light", function, inputs, operators)]
+
+
+def split_sum_problems(rng: np.random.Generator) -> list[Problem]:
+    """Outgoing radiance in materials, normals, view directions and the light's texels."""
+    constants = (prefilter_operators(_LIGHT), fg_table(cosines=9, roughnesses=9))
+
+    def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
+        operators, table = constants
+        light = prefilter(EnvLight(inputs["texels"]), operators)
+        shaded = split_sum(_materials(inputs), inputs["normals"], inputs["wo"], light, table)
+        return {
+            "rgb": shaded.rgb,
+            "diffuse light": shaded.diffuse_light,
+            "specular light": shaded.specular_light,
+        }
+
+    inputs = _surface_points(rng, 9)
+    inputs["texels"] = rng.uniform(0.1, 2.0, (_LIGHT.height, _LIGHT.width, 3))
+    return [Problem("split sum", function, inputs, constants)]
