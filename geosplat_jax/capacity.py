@@ -31,6 +31,7 @@ class Capacities:
     visible : Gaussians that one view can see.
     hits : pairs of a visible Gaussian and a tile it may touch, in one view.
     chunks : groups of consecutive hits of one tile, in one view.
+    cell_patches : pairs of a grid cell and a quad that may touch it, for tracing rays.
     """
 
     surface_cubes: int = 1024
@@ -39,6 +40,7 @@ class Capacities:
     visible: int = 4096
     hits: int = 8192
     chunks: int = 2048
+    cell_patches: int = 8192
 
 
 @register_pytree
@@ -52,6 +54,7 @@ class Usage:
     visible: Int[Array, ""]
     hits: Int[Array, ""]
     chunks: Int[Array, ""]
+    cell_patches: Int[Array, ""]
 
 
 def usage(**counts: Int[Array, ""]) -> Usage:

@@ -28,8 +28,8 @@ _CHART_AREA_SHARE = 1 / 64
 _FACES_PER_CHART = 512
 # Pairs of a triangle and a pixel examined at once: bounds memory at about 100 MB.
 _PAIRS_PER_CHUNK = 1 << 20
-# Faces that come nearer to the camera than this, in world units, are not drawn.
-_NEAR = 1e-3
+# Faces that come nearer to the camera than this share of the mesh's extent are not drawn.
+_NEAR_SHARE = 1e-3
 # Pixel centres this far outside a face (in barycentric units) still count as covered.
 _COVERAGE_SLACK = 1e-4
 
@@ -250,8 +250,10 @@ def render_mesh_normals(
     world_to_camera = np.asarray(camera.world_to_camera[0], np.float64)
     intrinsics = np.asarray(camera.intrinsics[0], np.float64)
     points = np.asarray(vertices, np.float64) @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
-    faces = faces[np.all(points[faces, 2] > _NEAR, axis=1)]
-    inverse_depth = 1.0 / np.maximum(points[:, 2], _NEAR)
+    extent = float(np.max(np.ptp(points, axis=0))) if len(points) else 0.0
+    near = max(_NEAR_SHARE * extent, np.finfo(np.float64).tiny)
+    faces = faces[np.all(points[faces, 2] > near, axis=1)]
+    inverse_depth = 1.0 / np.maximum(points[:, 2], near)
     pixels = (points @ intrinsics.T)[:, :2] * inverse_depth[:, None] * supersampling
     nearest = np.zeros((height, width))
     drawn = np.zeros((height, width, 3))
