@@ -280,6 +280,7 @@ def _advance(lanes: _Lanes, accelerator: Accelerator, *, two_sided: bool) -> _La
         border = jnp.where(d > 0, c + skip, c - skip + 1).astype(dtype)
         leave.append(jnp.where(jnp.isinf(inverse), jnp.inf, (border - o) * inverse))
     exit_distance = jnp.minimum(jnp.minimum(leave[0], leave[1]), leave[2])
+    leave, exit_distance, skip = jax.lax.optimization_barrier((leave, exit_distance, skip))
 
     # The axis of the exit is stepped exactly; the others follow from the position, in bounds.
     is_open = jnp.ones_like(is_moving)
@@ -330,6 +331,7 @@ def _test(lanes: _Lanes, accelerator: Accelerator, *, two_sided: bool, any_hit: 
     moment = _cross(lanes.direction, points[4])
     spokes = [_dot(points[i], moment) for i in range(4)]  # d.(c x a)
     distance, face = lanes.distance, lanes.face
+    is_blocked = jnp.zeros_like(is_testing)
     for i in range(4):
         j = (i + 1) % 4
         normal = _cross(points[i], points[j])
@@ -342,15 +344,19 @@ def _test(lanes: _Lanes, accelerator: Accelerator, *, two_sided: bool, any_hit: 
             is_hit = is_hit | ((parts[0] >= 0) & (parts[1] >= 0) & (parts[2] >= 0))
         is_hit = is_hit & (total != 0) & is_testing & (4 * patch + i != lanes.source)
         at = volume / jnp.where(total == 0, 1.0, total)
-        is_nearer = is_hit & (at > T_MIN) & (at < distance)
+        is_hit = is_hit & (at > T_MIN)
+        is_blocked = is_blocked | is_hit
+        is_nearer = is_hit & (at < distance)
         distance = jnp.where(is_nearer, at, distance)
         face = jnp.where(is_nearer, 4 * patch + i, face)
-    is_over = (face >= 0) if any_hit else jnp.zeros_like(is_testing)
+    lanes = lanes._replace(tested=lanes.tested + is_testing.astype(jnp.int32))
+    if not any_hit:
+        return lanes._replace(distance=distance, face=face)
+    # Every array that leaves here costs the whole computation once more, so only one does.
+    is_blocked = jax.lax.optimization_barrier(is_blocked)
     return lanes._replace(
-        tested=lanes.tested + is_testing.astype(jnp.int32),
-        distance=distance,
-        face=face,
-        is_travelling=lanes.is_travelling & ~is_over,
+        face=jnp.where(is_blocked, 0, lanes.face),
+        is_travelling=lanes.is_travelling & ~is_blocked,
     )
 
 
@@ -359,6 +365,7 @@ def _start(
     directions: Float[Array, "n 3"],
     source: Int[Array, " n"],
     is_active: Bool[Array, " n"],
+    *,
     accelerator: Accelerator,
     two_sided: bool,
 ) -> _Lanes:
@@ -459,11 +466,11 @@ def _trace(
         widths = ((0, rows * chunk - count),) + ((0, 0),) * (values.ndim - 1)
         return jnp.pad(values, widths).reshape(rows, chunk, *values.shape[1:])
 
-    def one(parts: tuple[Array, ...]) -> tuple[Array, Array]:
-        lanes = _start(*parts, accelerator, two_sided)
+    def one(parts: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
+        lanes = _start(*parts, accelerator=accelerator, two_sided=two_sided)
         return _trace_chunk(accelerator, lanes, two_sided=two_sided, any_hit=any_hit)
 
-    found = jax.lax.map(one, tuple(map(chunks, (local, directions, source, mask))))
+    found = jax.lax.map(one, (chunks(local), chunks(directions), chunks(source), chunks(mask)))
     distance, face = (x.reshape(-1)[:count] for x in found)
     return distance * grid.cell_size, face
 
