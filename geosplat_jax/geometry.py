@@ -40,7 +40,7 @@ from geosplat_jax.grids import (
     weight_magnitude,
 )
 from geosplat_jax.mesh_ops import face_normals_and_areas, vertex_normals
-from geosplat_jax.numerics import safe_norm
+from geosplat_jax.numerics import absolute, safe_norm
 from geosplat_jax.pytree import register_pytree
 from geosplat_jax.scene import Geometry, Grid, Mesh
 
@@ -305,7 +305,7 @@ def _deviations(
     lengths = jnp.where(crosses, safe_norm(offsets, axis=0), 0.0)
     count = jnp.maximum(jnp.sum(crosses, axis=0, dtype=jnp.int32), 1).astype(lengths.dtype)
     mean = jnp.sum(lengths, axis=0) / count
-    return jnp.where(crosses, jnp.abs(lengths - mean[None, :]), 0.0)
+    return jnp.where(crosses, absolute(lengths - mean[None, :]), 0.0)
 
 
 # --- quads and triangles ------------------------------------------------------------------------

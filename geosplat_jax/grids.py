@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from geosplat_jax._flexicubes_tables import CORNERS
-from geosplat_jax.numerics import safe_norm
+from geosplat_jax.numerics import absolute, safe_norm
 from geosplat_jax.scene import Geometry, Grid
 
 
@@ -118,7 +118,10 @@ def sdf_entropy(
 
 
 def weight_magnitude(geometry: Geometry) -> Float[Array, ""]:
-    """Mean magnitude of all raw alpha, beta and gamma weights; its minimum is plain dual cubes."""
+    """Mean magnitude of all raw alpha, beta and gamma weights.
+
+    Its minimum, where its gradient is zero, is plain dual cubes, from which training starts.
+    """
     weights = (geometry.alpha, geometry.beta, geometry.gamma)
-    total = jnp.sum(jnp.stack([jnp.sum(jnp.abs(weight)) for weight in weights]))
+    total = jnp.sum(jnp.stack([jnp.sum(absolute(weight)) for weight in weights]))
     return total / sum(weight.size for weight in weights)

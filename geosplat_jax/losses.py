@@ -14,7 +14,7 @@ from geosplat_jax.capacity import Capacities, Usage
 from geosplat_jax.color import linear_to_srgb, tone_map
 from geosplat_jax.geometry import sdf_entropy, weight_magnitude
 from geosplat_jax.materials import smoothness
-from geosplat_jax.numerics import safe_log
+from geosplat_jax.numerics import absolute, safe_log
 from geosplat_jax.pytree import register_pytree
 from geosplat_jax.render import (
     Context,
@@ -147,7 +147,7 @@ def photometric_terms(
     if srgb:
         predicted, target = linear_to_srgb(predicted), linear_to_srgb(target)
     terms = {
-        "l1": jnp.mean(jnp.abs(predicted - target)),
+        "l1": jnp.mean(absolute(predicted - target)),
         "ssim": 1.0 - jnp.mean(jax.vmap(ssim)(predicted, target)),
         "mask": jnp.mean((alpha - mask) ** 2),
     }
@@ -163,7 +163,7 @@ def light_term(
     light = jnp.mean(diffuse + specular, axis=-1)
     mask = image[..., 3]
     value = mask * jnp.max(image[..., :3], axis=-1)
-    return jnp.mean(mask * jnp.abs(light - value))
+    return jnp.mean(mask * absolute(light - value))
 
 
 def loss(

@@ -20,7 +20,7 @@ from geosplat_jax.hashgrid import (
     init_mlp,
     init_tables,
 )
-from geosplat_jax.numerics import safe_divide
+from geosplat_jax.numerics import absolute, safe_divide
 from geosplat_jax.pytree import register_pytree
 from geosplat_jax.scene import Materials
 
@@ -291,11 +291,11 @@ def smoothness(
         position_gradient=position_gradient,
     )
     count = points.shape[0]
-    albedo = jnp.sum(jnp.abs(both.albedo[:count] - both.albedo[count:]), axis=-1)  # Eq. 15
-    roughness = jnp.abs(both.roughness[:count] - both.roughness[count:])  # Eq. 16
+    albedo = jnp.sum(absolute(both.albedo[:count] - both.albedo[count:]), axis=-1)  # Eq. 15
+    roughness = absolute(both.roughness[:count] - both.roughness[count:])  # Eq. 16
     change = weights[0] * albedo + weights[1] * roughness
     if spec.has_metallic:
-        metallic = jnp.abs(both.metallic[:count] - both.metallic[count:])  # Eq. 17
+        metallic = absolute(both.metallic[:count] - both.metallic[count:])  # Eq. 17
         change = change + weights[2] * metallic
     total = jnp.sum(jnp.where(mask, change, 0.0))
     return safe_divide(total, jnp.sum(mask).astype(total.dtype))

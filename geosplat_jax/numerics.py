@@ -55,6 +55,15 @@ def safe_divide(
     return jnp.where(usable, quotient, otherwise)
 
 
+def absolute(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Magnitude, with gradient 0 at 0, in the middle of both slopes.
+
+    JAX gives +1 there, so that whatever starts at exactly zero, like the weights of an isosurface,
+    is pushed to the negative side by its own magnitude.
+    """
+    return x * jax.lax.stop_gradient(jnp.sign(x))
+
+
 def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """Square root of the positive part; zero with zero gradient where ``x <= 0``."""
     positive = x > 0

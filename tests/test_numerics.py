@@ -8,6 +8,7 @@ from support import double_precision
 
 from geosplat_jax.numerics import (
     LENGTH_EPSILON,
+    absolute,
     clamp_away_from_zero,
     fast_arctan2,
     safe_divide,
@@ -166,3 +167,10 @@ def test_fast_angle_agrees_with_the_library_in_every_quadrant():
     with double_precision():
         measured = fast_arctan2(jnp.asarray(y), jnp.asarray(x))
         np.testing.assert_allclose(measured, angle, atol=1e-14)
+
+
+def test_the_magnitude_has_no_slope_at_zero():
+    x = jnp.array([-2.0, -1e-30, 0.0, 1e-30, 3.0])
+    np.testing.assert_array_equal(absolute(x), jnp.abs(x))
+    slopes = jax.vmap(jax.grad(absolute))(x)
+    np.testing.assert_array_equal(slopes, jnp.array([-1.0, -1.0, 0.0, 1.0, 1.0]))

@@ -1,0 +1,600 @@
+"""How much the points without a derivative matter in one real step of training.
+
+    python experiments/kinks.py RUN [--step-from start last] [--json FILE]
+
+Loads a run (and builds its first state again), makes one optimiser step on the next batch and
+counts which discrete states changed: signs, quads, depth order, cells, thresholds. Then it follows
+the loss along the update and compares it with what the gradient predicts:
+
+- *first order*: gradient times update;
+- *along the path*: the gradient integrated over sixteen pieces of the update. Kinks and curvature
+  are inside it; what it misses of the true change are the jumps, which no gradient sees.
+
+The tables of the bundled scene stand in docs/gradients.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from geosplat_jax import capacity
+from geosplat_jax.adapter import GAUSSIANS_PER_FACE, face_gaussians
+from geosplat_jax.bsdf import ROUGHNESS_FLOOR
+from geosplat_jax.capacity import Capacities
+from geosplat_jax.color import tone_map
+from geosplat_jax.config import Config
+from geosplat_jax.geometry import vertex_normals
+from geosplat_jax.hashgrid import Layer, encode
+from geosplat_jax.hull import fit_grid
+from geosplat_jax.io.checkpoints import latest_checkpoint, load_checkpoint
+from geosplat_jax.io.dataset import load_dataset
+from geosplat_jax.light import direction_to_uv, level_of_roughness
+from geosplat_jax.losses import TERM_NAMES, loss
+from geosplat_jax.materials import to_unit_cube
+from geosplat_jax.numerics import safe_normalize
+from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.projection import project
+from geosplat_jax.rasterize import MAX_ALPHA, MIN_ALPHA, find_visible
+from geosplat_jax.render import (
+    Asset,
+    Context,
+    Model,
+    Params,
+    grid_center_and_extent,
+    reconstruct,
+    render_views,
+)
+from geosplat_jax.scene import Batch, Grid
+from geosplat_jax.step import StepReport, TrainState, initial_state, train_step
+from geosplat_jax.train import initial_params, initial_sdf, load_run, make_batch, sampling_of_step
+
+SEGMENTS = 16
+SHOWN = (1, 4, 16)
+PER_QUAD = 4 * GAUSSIANS_PER_FACE
+
+GROUPS = {
+    "everything": ("",),
+    "SDF": (".geometry.sdf",),
+    "deformation, weights": tuple(f".geometry.{n}" for n in ("deform", "alpha", "beta", "gamma")),
+    "material": (".material",),
+    "light, exposure": (".light", ".log_exposure"),
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """How often a discrete state changed.
+
+    Attributes
+    ----------
+    name, unit : the kind of point and what is counted.
+    population : how many there are.
+    changed : how many differ after the step.
+    near : how many lie within the step's motion of the point, on either side; None if not asked.
+    """
+
+    name: str
+    unit: str
+    population: int
+    changed: int
+    near: int | None
+
+
+# --- what is computed on the device -------------------------------------------------------------
+
+
+def _hidden_inputs(layers: tuple[Layer, ...], features: jax.Array) -> jax.Array:
+    """Lay the inputs of all rectifiers of an MLP side by side."""
+    found = []
+    for layer in layers[:-1]:
+        features = features @ layer.weights
+        if layer.bias is not None:
+            features = features + layer.bias[None, :]
+        found.append(features)
+        features = jax.nn.relu(features)
+    return jnp.concatenate(found, axis=-1)
+
+
+def _rectifier_inputs(params: Params, points: jax.Array, model: Model) -> jax.Array:
+    """Evaluate the inputs of the rectifiers of every head at points of the unit cube."""
+    material = params.material
+    first = encode(material.albedo_table, points, spec=model.material.grid)
+    second = first
+    if material.surface_table is not None:
+        second = encode(material.surface_table, points, spec=model.material.grid)
+    heads = [_hidden_inputs(material.albedo_head, first)]
+    heads.append(_hidden_inputs(material.surface_head, second))
+    if material.shift_head is not None:
+        heads.append(_hidden_inputs(material.shift_head, second))
+    return jnp.concatenate(heads, axis=-1)
+
+
+def _observe_view(
+    asset: Asset, batch: Batch, view: int, near: jax.Array, model: Model, capacities: Capacities
+) -> dict[str, jax.Array]:
+    """Evaluate what depends on one view."""
+    camera, gaussians = batch.camera, asset.gaussians
+    frame = {"height": camera.height, "width": camera.width}
+    towards = camera.centers[view][None, :] - gaussians.means
+    outward = jnp.sum(asset.outward * towards, axis=-1)
+    splats = project(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        world_to_camera=camera.world_to_camera[view],
+        intrinsics=camera.intrinsics[view],
+        near=near,
+        **frame,
+    )
+    is_eligible = gaussians.mask & ((outward > 0) | (not model.cull_backfaces))
+    sizes = {"tile_size": model.tile_size, "capacities": capacities}
+    lists = find_visible(splats, gaussians.opacities, is_eligible, **sizes, **frame)
+    viewer = safe_normalize(towards)
+    cosine = jnp.sum(gaussians.normals * viewer, axis=-1)
+    return {
+        "outward": outward,
+        "cosine": cosine,
+        "reflected": direction_to_uv(2 * cosine[:, None] * gaussians.normals - viewer),
+        "means2d": splats.means2d,
+        "conics": splats.conics,
+        "opacity": gaussians.opacities * splats.compensation,
+        "depths": splats.depths,
+        "index": lists.index,
+        "chunk_ranks": lists.chunk_ranks,
+        "chunk_tiles": lists.chunk_tiles,
+    }
+
+
+def _residual(rgb: jax.Array, alpha: jax.Array, batch: Batch, background: str) -> jax.Array:
+    """Subtract the composited photographs from the composited images, as the loss does."""
+    mask = batch.image[..., 3]
+    behind = jnp.zeros_like(rgb)
+    if background != "black":
+        # As the loss draws it: the first of the step's three keys.
+        drawn = rgb.shape if background == "pixel" else (rgb.shape[0], 1, 1, 3)
+        behind = jax.random.uniform(jax.random.split(batch.key, 3)[0], drawn, jnp.float32)
+    predicted = rgb + (1 - alpha)[..., None] * behind
+    target = mask[..., None] * batch.image[..., :3] + (1 - mask)[..., None] * behind
+    return predicted - target
+
+
+@partial(jax.jit, static_argnames=("model", "capacities", "background"))
+def observe(
+    params: Params,
+    batch: Batch,
+    context: Context,
+    *,
+    model: Model,
+    capacities: Capacities,
+    background: str,
+) -> dict[str, Any]:
+    """Evaluate everything whose discrete state is counted."""
+    build = {"model": model, "capacities": capacities}
+    asset = reconstruct(params, context, sampling="face", **build)
+    output = render_views(asset, params.light, batch.camera, context, **build)
+    center, half_extent = grid_center_and_extent(context.grid)
+    # Attributes are read on the face, before the Gaussian sinks below it.
+    unshifted = face_gaussians(
+        asset.mesh, vertex_normals(asset.mesh), constants=model.adapter, unit=half_extent
+    )
+    points = to_unit_cube(unshifted.means, center, half_extent)
+    near = model.near * half_extent
+    views = range(batch.camera.world_to_camera.shape[0])
+    rgb = tone_map(output.rgb, params.log_exposure)
+    return {
+        "points": points,
+        "roughness": asset.materials.roughness,
+        "level": level_of_roughness(asset.materials.roughness, levels=model.light.roughness),
+        "normal_uv": direction_to_uv(asset.gaussians.normals),
+        "rectifiers": _rectifier_inputs(params, points, model),
+        "residual": _residual(rgb, output.alpha, batch, background),
+        "views": [_observe_view(asset, batch, v, near, model, capacities) for v in views],
+        "usage": output.usage,
+    }
+
+
+_value_and_gradient = jax.jit(
+    jax.value_and_grad(loss, has_aux=True),
+    static_argnames=("model", "objective", "capacities", "sampling"),
+)
+
+
+# --- counting, on the host ----------------------------------------------------------------------
+
+
+def _near_border(position: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Whether an integer lies within ``step`` of ``position``, on either side."""
+    return np.floor(position - np.abs(step)) != np.floor(position + np.abs(step))
+
+
+def _crossing(name: str, unit: str, before: np.ndarray, after: np.ndarray) -> Row:
+    """Count changes of sign of a quantity."""
+    near = np.abs(before) <= np.abs(after - before)
+    return Row(name, unit, before.size, int(np.sum((before < 0) != (after < 0))), int(near.sum()))
+
+
+def _cells(name: str, unit: str, before: np.ndarray, after: np.ndarray) -> Row:
+    """Count rows (n, axes) whose integer part changed along any axis."""
+    changed = np.any(np.floor(before) != np.floor(after), axis=1)
+    near = np.any(_near_border(before, after - before), axis=1)
+    return Row(name, unit, len(before), int(changed.sum()), int(near.sum()))
+
+
+def quad_keys(sdf: np.ndarray, grid: Grid) -> np.ndarray:
+    """Names of the quads, in their order: grid edge and side, alike before and after a step."""
+    nx, ny, nz = grid.shape
+    inside = sdf.reshape(nz + 1, ny + 1, nx + 1) < 0
+    lower = inside[:-1, :-1, :-1]
+    k, j, i = np.indices((nz, ny, nx))
+    inner = {0: i > 0, 1: j > 0, 2: k > 0}
+    upper = (inside[:-1, :-1, 1:], inside[:-1, 1:, :-1], inside[1:, :-1, :-1])
+    crossed = np.stack(
+        [(lower != upper[a]) & inner[(a + 1) % 3] & inner[(a + 2) % 3] for a in range(3)],
+        axis=-1,
+    )
+    owners = np.flatnonzero(crossed)
+    return 2 * owners + lower.reshape(-1)[owners // 3]
+
+
+def _surface_vertices(sdf: np.ndarray, grid: Grid) -> np.ndarray:
+    """Flat mask of the grid vertices that end a crossed edge."""
+    nx, ny, nz = grid.shape
+    inside = sdf.reshape(nz + 1, ny + 1, nx + 1) < 0
+    touched = np.zeros(inside.shape, bool)
+    for axis in range(3):
+        changes = np.diff(inside, axis=axis)
+        padding = [(0, 0)] * 3
+        for side in ((1, 0), (0, 1)):
+            padding[axis] = side
+            touched |= np.pad(changes, padding)
+    return touched.reshape(-1)
+
+
+def _hits(view: dict[str, np.ndarray], gaussian_count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Tile and Gaussian of every hit, tile by tile, front to back."""
+    ranks = view["chunk_ranks"]
+    tiles = np.repeat(view["chunk_tiles"], ranks.shape[0])
+    ranks = ranks.T.reshape(-1)
+    real = ranks < len(view["index"])
+    rows = view["index"][ranks[real]]
+    assert np.all(rows < gaussian_count)
+    return tiles[real], rows
+
+
+def _alpha(view: dict, rows: np.ndarray, tiles: np.ndarray, columns: int, size: int) -> np.ndarray:
+    """Alpha before clamp and cut of Gaussians in all pixels of tiles, (n, pixels)."""
+    v, u = (x.reshape(-1) + 0.5 for x in np.indices((size, size)))
+    x = (tiles % columns * size)[:, None] + u - view["means2d"][rows, 0, None]
+    y = (tiles // columns * size)[:, None] + v - view["means2d"][rows, 1, None]
+    xx, xy, yy = view["conics"][rows].T[:, :, None]
+    sigma = 0.5 * (xx * x * x + yy * y * y) + xy * x * y
+    return view["opacity"][rows, None] * np.exp(-sigma)
+
+
+def _count_view(
+    before: dict, after: dict, rows: tuple[np.ndarray, np.ndarray], model: Model, width: int
+) -> list[Row]:
+    """Count what depends on one view; ``rows`` are the Gaussians that both states have."""
+    first, second = rows
+    partner = np.full(len(before["depths"]), -1)
+    partner[first] = second
+    lit = np.intersect1d(before["index"], first)
+    kept = partner[lit]
+    one, two = before["outward"][first], after["outward"][second]
+    found = [_crossing("back-face culling", "Gaussians", one, two)]
+    one, two = before["cosine"][lit], after["cosine"][kept]
+    found.append(_crossing("flip of the shading normal", "visible Gaussians", one, two))
+    tiles, hit = _hits(before, len(partner))
+    adjacent = (tiles[1:] == tiles[:-1]) & (partner[hit[1:]] >= 0) & (partner[hit[:-1]] >= 0)
+    front, back = hit[:-1][adjacent], hit[1:][adjacent]
+    gap = before["depths"][back] - before["depths"][front]
+    gap_after = after["depths"][partner[back]] - after["depths"][partner[front]]
+    found.append(_crossing("depth order", "neighbours in a tile's list", gap, gap_after))
+    swapped = (gap < 0) != (gap_after < 0)
+    close = (front // PER_QUAD == back // PER_QUAD)[swapped]
+    found.append(Row("swapped within one quad", "swapped pairs", close.size, int(close.sum()), 0))
+
+    size, columns = model.tile_size, -(-width // model.tile_size)
+    back_to = np.full(len(after["depths"]), -1)
+    back_to[second] = first
+    later = _hits(after, len(back_to))
+    pairs = [np.stack([tiles, hit])[:, partner[hit] >= 0]]
+    pairs.append(np.stack([later[0], back_to[later[1]]])[:, back_to[later[1]] >= 0])
+    tiles, hit = np.unique(np.concatenate(pairs, axis=1), axis=1)
+    one = _alpha(before, hit, tiles, columns, size)
+    two = _alpha(after, partner[hit], tiles, columns, size)
+    seen = (one >= MIN_ALPHA) | (two >= MIN_ALPHA)
+    one, two = np.log(one[seen]), np.log(two[seen])
+    for name, limit in (("alpha threshold 1/255", MIN_ALPHA), ("alpha clamp .999", MAX_ALPHA)):
+        found.append(
+            _crossing(name, "(Gaussian, pixel) pairs", one - np.log(limit), two - np.log(limit))
+        )
+    texels = np.array([model.light.width, model.light.height])
+    one, two = before["reflected"][lit] * texels - 0.5, after["reflected"][kept] * texels - 0.5
+    found.append(_cells("texel of the reflected view", "visible Gaussians", one, two))
+    one, two = (127 * np.abs(x)[:, None] for x in (before["cosine"][lit], after["cosine"][kept]))
+    found.append(_cells("cell of the FG table in n.v", "visible Gaussians", one, two))
+    return found
+
+
+def _count_geometry(before: Params, after: Params, grid: Grid) -> list[Row]:
+    """Count signs, quads and weights."""
+    one, two = (np.asarray(p.geometry.sdf) for p in (before, after))
+    ends = _surface_vertices(one, grid)
+    keys, later = quad_keys(one, grid), quad_keys(two, grid)
+    found = [_crossing("sign of the SDF", "ends of crossed edges", one[ends], two[ends])]
+    died, born = len(np.setdiff1d(keys, later)), len(np.setdiff1d(later, keys))
+    found.append(Row("quads that died", "quads", len(keys), died, None))
+    found.append(Row("quads that were born", "quads", len(keys), born, None))
+
+    def weights(params: Params) -> np.ndarray:
+        geometry = params.geometry
+        parts = (geometry.alpha, geometry.beta, geometry.gamma)
+        return np.concatenate([np.asarray(x).reshape(-1) for x in parts])
+
+    raw, moved = weights(before), weights(after)
+    zero = int(np.sum(raw == 0))
+    found.append(Row("raw weights at exactly 0", "weights", raw.size, zero, None))
+    found.append(_crossing("sign of a raw weight", "weights", raw[raw != 0], moved[raw != 0]))
+    return found
+
+
+def _count_fields(one: dict, two: dict, rows: tuple[np.ndarray, ...], model: Model) -> list[Row]:
+    """Count what depends on the Gaussians alone."""
+    names = ("points", "rectifiers", "level", "roughness", "normal_uv")
+    pair = {name: (one[name][rows[0]], two[name][rows[1]]) for name in names}
+    found = []
+    for level, cells in enumerate(model.material.grid.resolutions):
+        name = f"hash cell, level {level} ({cells})"
+        found.append(_cells(name, "Gaussians", *(x * cells for x in pair["points"])))
+    found.append(
+        _crossing("rectifiers of the heads", "(Gaussian, unit) pairs", *pair["rectifiers"])
+    )
+    found.append(_cells("level of roughness", "Gaussians", *(x[:, None] for x in pair["level"])))
+    above = (x - ROUGHNESS_FLOOR for x in pair["roughness"])
+    found.append(_crossing("roughness floor .08", "Gaussians", *above))
+    texels = np.array([model.light.width, model.light.height])
+    at = (x * texels - 0.5 for x in pair["normal_uv"])
+    found.append(_cells("texel of the normal", "Gaussians", *at))
+    return found
+
+
+def count_changes(
+    before: Params, after: Params, seen: list[dict], config: Config, context: Context, width: int
+) -> list[Row]:
+    """Count every kind of point; ``seen`` is what `observe` returns before and after."""
+    rows = _count_geometry(before, after, context.grid)
+    keys = [quad_keys(np.asarray(p.geometry.sdf), context.grid) for p in (before, after)]
+    for key, state in zip(keys, seen, strict=True):
+        assert len(key) == int(state["usage"].quads)
+    _, *quads = np.intersect1d(*keys, assume_unique=True, return_indices=True)
+    both = tuple((q[:, None] * PER_QUAD + np.arange(PER_QUAD)).reshape(-1) for q in quads)
+    views = [
+        _count_view(a, b, both, config.model, width)
+        for a, b in zip(seen[0]["views"], seen[1]["views"], strict=True)
+    ]
+    for parts in zip(*views, strict=True):
+        sums = {n: sum(getattr(p, n) for p in parts) for n in ("population", "changed", "near")}
+        rows.append(replace(parts[0], **sums))
+    rows += _count_fields(*seen, both, config.model)
+    one, two = (state["residual"].reshape(-1) for state in seen)
+    some = (one != 0) | (two != 0)
+    rows.append(_crossing("sign of the L1 residual", "pixel channels", one[some], two[some]))
+    zero = int(np.sum(~some))
+    rows.append(Row("L1 residual at exactly 0", "pixel channels", one.size, zero, None))
+    light = np.asarray(after.light.radiance)
+    floor = int(np.sum(light <= np.float32(config.run.smallest_light)))
+    rows.append(Row("texels put back to their floor", "texel channels", light.size, floor, None))
+    return rows
+
+
+# --- the loss along the update ------------------------------------------------------------------
+
+
+def _chosen(update: Params, wanted: tuple[str, ...]) -> Params:
+    """Keep the update of one group and set the others to zero."""
+
+    def pick(path: Any, leaf: jax.Array) -> jax.Array:
+        kept = jax.tree_util.keystr(path).startswith(wanted)
+        return leaf if kept else jnp.zeros_like(leaf)
+
+    return jax.tree_util.tree_map_with_path(pick, update)
+
+
+def _product(gradient: Params, update: Params) -> float:
+    """Inner product of two sets of parameters, accumulated in double precision."""
+    pairs = zip(jax.tree.leaves(gradient), jax.tree.leaves(update), strict=True)
+    return float(sum(np.sum(np.asarray(a, np.float64) * np.asarray(b)) for a, b in pairs))
+
+
+def _move(params: Params, update: Params, fraction: float) -> Params:
+    """Go a fraction of the update."""
+    return jax.tree.map(lambda p, u: p + fraction * u, params, update)
+
+
+def follow(
+    params: Params, update: Params, evaluate: Callable[[Params], tuple[float, dict, Params]]
+) -> list[dict[str, Any]]:
+    """Compare the loss along the update of every group with what gradients say."""
+    value, terms, gradient = evaluate(params)
+    found = []
+    for name, wanted in GROUPS.items():
+        part = _chosen(update, wanted)
+        slope, path = _product(gradient, part), 0.0
+        for segment in range(SEGMENTS):
+            # The middle of a piece stands for it: right also where the path starts on a kink.
+            moved = _move(params, part, (segment + 0.5) / SEGMENTS)
+            path += _product(evaluate(moved)[2], part) / SEGMENTS
+            fraction = (segment + 1) / SEGMENTS
+            if segment + 1 not in SHOWN:
+                continue
+            there, last_terms, _ = evaluate(_move(params, part, fraction))
+            found.append(
+                {
+                    "group": name,
+                    "fraction": fraction,
+                    "change": there - value,
+                    "first_order": fraction * slope,
+                    "path": path,
+                    "jumps": there - value - path,
+                }
+            )
+        found[-1]["terms"] = {key: last_terms[key] - terms[key] for key in terms}
+    return found
+
+
+# --- the command --------------------------------------------------------------------------------
+
+
+def _first_state(dataset: Any, config: Config, context: Context) -> TrainState:
+    """Build the state before the first step, as training does."""
+    sdf_key, field_key = jax.random.split(jax.random.key(config.run.seed))
+    grid = fit_grid(dataset.bounds, config.geometry.resolution)
+    if grid.shape != context.grid.shape:
+        raise SystemExit(f"the scene gives a grid {grid.shape}, the run has {context.grid.shape}")
+    sdf = initial_sdf(context.grid, dataset.train, config, sdf_key)
+    return initial_state(initial_params(sdf, context.grid, config, field_key), config.rates)
+
+
+def _last_state(run: Path, config: Config, params: Params, context: Context) -> TrainState:
+    """Read the optimiser beside the parameters."""
+    path = latest_checkpoint(run / "checkpoints")
+    assert path is not None
+    like = {"state": jax.eval_shape(lambda: initial_state(params, config.rates))}
+    like["grid"] = jax.eval_shape(lambda: context.grid)
+    tree, _ = load_checkpoint(path, like=like)
+    return tree["state"]
+
+
+def _advance(
+    state: TrainState, fixed: tuple[Any, ...], config: Config, capacities: Capacities
+) -> tuple[TrainState, StepReport, Capacities]:
+    """Make the step, with larger buffers as often as needed."""
+    settings = {"rates": config.rates, "smallest_light": config.run.smallest_light}
+    static = {"model": config.model, "sampling": "face", "objective": config.objective}
+    while True:
+        copied = jax.tree.map(jnp.copy, state)  # the step consumes it
+        after, report = train_step(copied, *fixed, capacities=capacities, **static, **settings)
+        if bool(report.fits):
+            return after, report, capacities
+        capacities = capacity.grow(capacities, jax.device_get(report.loss.usage), headroom=1.2)
+
+
+def study(
+    state: TrainState, dataset: Any, config: Config, context: Context, capacities: Capacities
+) -> dict[str, Any]:
+    """Make one step from ``state``, count and follow the loss."""
+    step = int(state.step)
+    if sampling_of_step(step, config) != "face":
+        raise SystemExit(f"step {step} samples vertices; only face sampling is counted here")
+    batch = make_batch(dataset.train, step, config)
+    weights = config.loss.at(step / config.run.steps)
+    before, fixed = state.params, (batch, context, weights)
+    advanced, report, capacities = _advance(state, fixed, config, capacities)
+    after = advanced.params
+    build = {"model": config.model, "capacities": capacities}
+    objective = config.objective
+
+    def look(params: Params) -> dict[str, Any]:
+        seen = observe(params, batch, context, background=objective.background, **build)
+        assert bool(capacity.fits(seen["usage"], capacities))
+        return jax.device_get(seen)
+
+    def evaluate(params: Params) -> tuple[float, dict[str, float], Params]:
+        (total, found), gradient = _value_and_gradient(
+            params, *fixed, objective=objective, sampling="face", **build
+        )
+        assert bool(capacity.fits(found.usage, capacities))
+        terms = {n: float(getattr(weights, n)) * float(found.terms[n]) for n in TERM_NAMES}
+        return float(total), terms, gradient
+
+    seen = [look(before), look(after)]
+    rows = count_changes(before, after, seen, config, context, batch.camera.width)
+    update = jax.tree.map(jnp.subtract, after, before)
+    return {
+        "step": step,
+        "loss": float(report.total),
+        "parameters": sum(leaf.size for leaf in jax.tree.leaves(before)),
+        "parameters_moved": sum(int(jnp.sum(leaf != 0)) for leaf in jax.tree.leaves(update)),
+        "counts": [vars(row) for row in rows],
+        "along": follow(before, update, evaluate),
+    }
+
+
+def show(result: dict[str, Any]) -> None:
+    """Print both tables of one step."""
+    print(
+        f"\nstep {result['step']}: loss {result['loss']:.6f}, {result['parameters']} parameters, "
+        f"{result['parameters_moved']} of them moved"
+    )
+    print(f"{'point':<34} {'of':<28} {'number':>9} {'changed':>9} {'share':>8} {'near':>8}")
+    for row in result["counts"]:
+        size = max(row["population"], 1)
+        near = "" if row["near"] is None else f"{row['near'] / size:8.3%}"
+        print(
+            f"{row['name']:<34} {row['unit']:<28} {row['population']:>9} {row['changed']:>9} "
+            f"{row['changed'] / size:8.3%} {near:>8}"
+        )
+    print(
+        f"\n{'update of':<22} {'fraction':>8} {'change':>11} {'first order':>11} {'path':>11} "
+        f"{'jumps':>11} {'change / first order':>21}"
+    )
+    for row in result["along"]:
+        ratio = row["change"] / row["first_order"] if row["first_order"] else float("nan")
+        print(
+            f"{row['group']:<22} {row['fraction']:8.4f} {row['change']:11.3e} "
+            f"{row['first_order']:11.3e} {row['path']:11.3e} {row['jumps']:11.3e} {ratio:21.3f}"
+        )
+        if "terms" in row:
+            parts = ", ".join(f"{n} {v:+.1e}" for n, v in row["terms"].items() if v)
+            print(f"    by term: {parts}")
+
+
+def main() -> None:
+    """Study the asked states of a run and write what was found."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path)
+    parser.add_argument(
+        "--step-from", nargs="+", choices=("start", "last"), default=["start", "last"]
+    )
+    parser.add_argument("--scene", type=Path, help="where the scene lies now, if it was moved")
+    parser.add_argument("--json", type=Path, help="default: kinks.json in the run")
+    arguments = parser.parse_args()
+    enable_compilation_cache()
+    retain_freed_memory()
+
+    config, params, context, capacities, _ = load_run(arguments.run)
+    record = json.loads((arguments.run / "run.json").read_text())
+    options = record["dataset"]
+    bounds = options.get("bounds")
+    dataset = load_dataset(
+        arguments.scene or Path(record["scene"]),
+        downscale=options.get("downscale", 1),
+        light=options.get("light"),
+        bounds=None if bounds is None else (tuple(bounds[:3]), tuple(bounds[3:])),
+    )
+    results = {}
+    for which in arguments.step_from:
+        if which == "start":
+            state = _first_state(dataset, config, context)
+        else:
+            state = _last_state(arguments.run, config, params, context)
+        results[which] = study(state, dataset, config, context, capacities)
+        show(results[which])
+    path = arguments.json or arguments.run / "kinks.json"
+    path.write_text(json.dumps(results, indent=1) + "\n")
+    print(f"\nfigures: {path}")
+
+
+if __name__ == "__main__":
+    main()
