@@ -31,6 +31,7 @@ ORDER = [
     "bsdf",
     "materials",
     "light",
+    "light_sampling",
     "trace",
     "shading",
     "projection",

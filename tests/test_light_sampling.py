@@ -1,0 +1,154 @@
+"""Sampling of environment maps: the density is that of the samples, and covers the light."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from support import double_precision
+
+from geosplat_jax.light import lookup, texel_solid_angles
+from geosplat_jax.light_sampling import light_density, light_sampler, sample_light
+from geosplat_jax.scene import EnvLight
+
+
+def random_light(height=6, width=10, seed=0):
+    rng = np.random.default_rng(seed)
+    return EnvLight(jnp.asarray(rng.uniform(0, 1, (height, width, 3)) ** 4, jnp.float32))
+
+
+def sun(height=16, width=32, radiance=1e5):
+    return EnvLight(jnp.zeros((height, width, 3)).at[3, 7].set(radiance))
+
+
+def grid_uniforms(count, rows=None):
+    """A regular grid of points of the unit square."""
+    rows = rows or count
+    x, y = np.meshgrid((np.arange(count) + 0.5) / count, (np.arange(rows) + 0.5) / rows)
+    return jnp.asarray(np.stack([x.ravel(), y.ravel()], axis=1), jnp.float32)
+
+
+LIGHTS = {
+    "random": random_light(),
+    "sun": sun(),
+    "black": EnvLight(jnp.zeros((4, 8, 3))),
+    "one row": random_light(1, 4),
+    "flat": EnvLight(jnp.full((5, 6, 3), 0.3)),
+}
+
+
+@pytest.mark.parametrize("name", LIGHTS)
+def test_the_density_integrates_to_one(name):
+    sampler = light_sampler(LIGHTS[name])
+    total = jnp.sum(sampler.density * texel_solid_angles(*sampler.density.shape))
+    assert float(total) == pytest.approx(1.0, abs=1e-5)
+    assert float(sampler.cumulative[-1]) == 1.0
+    assert bool(jnp.all(jnp.diff(sampler.cumulative) >= 0))
+
+
+@pytest.mark.parametrize("name", LIGHTS)
+def test_samples_are_unit_and_report_the_density_of_their_direction(name):
+    sampler = light_sampler(LIGHTS[name])
+    directions, density = sample_light(sampler, grid_uniforms(60))
+    lengths = np.linalg.norm(np.asarray(directions, np.float64), axis=1)
+    np.testing.assert_allclose(lengths, 1.0, atol=2e-6)
+    assert float(jnp.min(density)) > 0
+    # Samples within rounding of a texel's border may be looked up in its neighbour.
+    same = np.isclose(light_density(sampler, directions), density, rtol=1e-5)
+    assert same.mean() > 0.99
+
+
+def test_samples_follow_their_density():
+    """Chi-square over the texels, each split in four."""
+    light = random_light()
+    sampler = light_sampler(light)
+    height, width = sampler.density.shape
+    count = 200_000
+    uniforms = jax.random.uniform(jax.random.key(0), (count, 2))
+    directions, _ = sample_light(sampler, uniforms)
+    x, y, z = np.asarray(directions, np.float64).T
+    column = np.floor((0.5 - np.arctan2(y, x) / (2 * np.pi)) * 2 * width).astype(int) % (2 * width)
+    row = np.clip(np.floor(np.arccos(np.clip(z, -1, 1)) / np.pi * 2 * height), 0, 2 * height - 1)
+    found = np.bincount(row.astype(int) * 2 * width + column, minlength=4 * height * width)
+    edges = np.cos(np.pi * np.arange(2 * height + 1) / (2 * height))
+    fine = np.broadcast_to(
+        (edges[:-1] - edges[1:])[:, None] * np.pi / width, (2 * height, 2 * width)
+    )
+    density = np.repeat(np.repeat(np.asarray(sampler.density), 2, 0), 2, 1)
+    expected = count * (density * fine).ravel()
+    kept = expected > 5
+    statistic = np.sum((found[kept] - expected[kept]) ** 2 / expected[kept])
+    assert chi2.sf(statistic, kept.sum() - 1) > 1e-3
+    assert found[~kept].sum() < 5 * (~kept).sum() + 50
+
+
+def test_the_density_is_positive_wherever_light_arrives():
+    light = sun()
+    sampler = light_sampler(light)
+    rng = np.random.default_rng(1)
+    directions = rng.normal(size=(20_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = jnp.asarray(directions, jnp.float32)
+    radiance = np.asarray(lookup(light.radiance, directions))[:, 0]
+    density = np.asarray(light_density(sampler, directions))
+    lit = radiance > 0
+    assert lit.sum() > 20
+    # The weight of a sample is bounded: no fireflies from light between texels.
+    weight = radiance[lit] / density[lit]
+    mean = float(jnp.sum(light.radiance[..., 0] * texel_solid_angles(16, 32)))
+    assert weight.max() < 4.5 * mean
+
+
+@pytest.mark.parametrize("name", ["random", "sun", "flat"])
+def test_a_sampled_flux_is_that_of_quadrature(name):
+    light = LIGHTS[name]
+    sampler = light_sampler(light)
+    directions, density = sample_light(sampler, grid_uniforms(20_000, 40))
+    found = jnp.mean(lookup(light.radiance, directions) / density[:, None], axis=0)
+    # Midpoints, far finer than the texels, of the bilinear map.
+    rows, columns = 600, 1200
+    polar = (np.arange(rows) + 0.5) / rows * np.pi
+    azimuth = (np.arange(columns) + 0.5) / columns * 2 * np.pi
+    sine, cosine = np.sin(polar)[:, None], np.cos(polar)[:, None]
+    points = np.stack(
+        [sine * np.cos(azimuth), sine * np.sin(azimuth), np.broadcast_to(cosine, (rows, columns))],
+        axis=-1,
+    )
+    values = np.asarray(lookup(light.radiance, jnp.asarray(points.reshape(-1, 3), jnp.float32)))
+    weights = np.broadcast_to(sine * (np.pi / rows) * (2 * np.pi / columns), (rows, columns))
+    expected = np.sum(values.astype(np.float64) * weights.reshape(-1, 1), axis=0)
+    np.testing.assert_allclose(found, expected, rtol=2e-3)
+
+
+def test_the_ends_of_the_unit_interval_are_legal():
+    sampler = light_sampler(random_light())
+    ends = jnp.asarray([0.0, 1.0 - 2.0**-24, 1.0])
+    x, y = jnp.meshgrid(ends, ends)
+    directions, density = sample_light(sampler, jnp.stack([x.ravel(), y.ravel()], axis=1))
+    assert bool(jnp.all(jnp.isfinite(directions)))
+    assert bool(jnp.all(density > 0))
+
+
+def test_sampling_carries_no_gradient():
+    def total(radiance):
+        sampler = light_sampler(EnvLight(radiance))
+        directions, density = sample_light(sampler, grid_uniforms(4))
+        return jnp.sum(directions) + jnp.sum(density)
+
+    np.testing.assert_array_equal(jax.grad(total)(random_light().radiance), 0.0)
+
+
+def test_precision_in_is_precision_out_and_jit_equals_eager():
+    uniforms = grid_uniforms(8)
+    eager = sample_light(light_sampler(random_light()), uniforms)
+    compiled = jax.jit(lambda light, u: sample_light(light_sampler(light), u))(
+        random_light(), uniforms
+    )
+    np.testing.assert_allclose(compiled[0], eager[0], atol=1e-5)
+    assert eager[0].dtype == eager[1].dtype == jnp.float32
+    with double_precision():
+        light = EnvLight(jnp.asarray(np.asarray(random_light().radiance), jnp.float64))
+        directions, density = sample_light(
+            light_sampler(light), jnp.asarray(np.asarray(uniforms), jnp.float64)
+        )
+        assert directions.dtype == density.dtype == jnp.float64
