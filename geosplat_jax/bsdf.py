@@ -98,13 +98,19 @@ def _cosines(
     )
 
 
-def evaluate_lobes(
+def evaluate_factors(
     materials: Materials,
     normals: Float[Array, "N 3"],
     wi: Float[Array, "N 3"],
     wo: Float[Array, "N 3"],
-) -> tuple[Float[Array, "N 3"], Float[Array, "N 3"]]:
-    """Diffuse and specular reflectance per solid angle, without the cosine; see `evaluate`."""
+) -> tuple[Float[Array, " N"], Float[Array, "N 3"], Float[Array, " N"]]:
+    """Split the reflectance into ``base albedo (1 - m) + fresnel strength``; see `evaluate`.
+
+    Returns
+    -------
+    base : (N,) ``1 / pi``, and fresnel : (N, 3), strength : (N,) ``D G / (4 (n.wi)(n.wo))``. Base
+    and strength are zero where either direction lies below the surface.
+    """
     cosine_i, cosine_o, is_above = _cosines(normals, wi, wo)
     alpha = ggx_alpha(materials.roughness)
     half = safe_normalize(wi + wo)
@@ -112,10 +118,20 @@ def evaluate_lobes(
     cosine = 0.5 * _dot(wi + wo, half)
     fresnel = schlick(specular_f0(materials.albedo, materials.metallic), cosine)
     strength = ggx_distribution(half, normals, alpha) * smith_visibility(cosine_i, cosine_o, alpha)
-    specular = fresnel * strength[:, None]
-    diffuse = materials.albedo * ((1 - materials.metallic) / math.pi)[:, None]
-    above = is_above[:, None]
-    return jnp.where(above, diffuse, 0.0), jnp.where(above, specular, 0.0)
+    base = jnp.where(is_above, jnp.asarray(1 / math.pi, strength.dtype), 0.0)
+    return base, fresnel, jnp.where(is_above, strength, 0.0)
+
+
+def evaluate_lobes(
+    materials: Materials,
+    normals: Float[Array, "N 3"],
+    wi: Float[Array, "N 3"],
+    wo: Float[Array, "N 3"],
+) -> tuple[Float[Array, "N 3"], Float[Array, "N 3"]]:
+    """Diffuse and specular reflectance per solid angle, without the cosine; see `evaluate`."""
+    base, fresnel, strength = evaluate_factors(materials, normals, wi, wo)
+    diffuse = materials.albedo * ((1 - materials.metallic) * base)[:, None]
+    return diffuse, fresnel * strength[:, None]
 
 
 def evaluate(

@@ -34,6 +34,7 @@ ORDER = [
     "light_sampling",
     "trace",
     "shading",
+    "monte_carlo",
     "projection",
     "_tiles",
     "_composite",
