@@ -17,7 +17,7 @@ from pathlib import Path
 
 import jax
 
-from benchmarks import bench_geometry, bench_hashgrid, bench_rasterize, bench_step
+from benchmarks import bench_geometry, bench_hashgrid, bench_rasterize, bench_step, bench_trace
 from benchmarks.calibration import calibrate
 from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
 
@@ -63,6 +63,7 @@ def main() -> int:
         "geometry": bench_geometry.run,
         "hashgrid": bench_hashgrid.run,
         "step": bench_step.run,
+        "trace": bench_trace.run,
     }
     if options.whole:
         benchmarks["run"] = bench_step.run_whole
