@@ -1,0 +1,382 @@
+"""Measures of experiments/precision.py, and its figure."""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from geosplat_jax import hashgrid
+from geosplat_jax.capacity import Capacities
+from geosplat_jax.config import Config
+from geosplat_jax.evaluate import Renderer, over_background
+from geosplat_jax.gradcheck.differences import double_precision
+from geosplat_jax.hashgrid import HashGridSpec, encode
+from geosplat_jax.io.images import encode_srgb
+from geosplat_jax.io.views import Views
+from geosplat_jax.metrics import normal_mae_deg, psnr
+from geosplat_jax.projection import Splats
+from geosplat_jax.rasterize import MAX_ALPHA, MIN_ALPHA, TileLists
+from geosplat_jax.render import Context, Params
+from geosplat_jax.scene import Camera
+
+GROUPS = ("geometry", "tables", "heads", "light", "exposure")
+UNDECIDED = 1e-4
+"""An alpha so close to 1/255, relative, may be cut in one precision and not in the other."""
+
+
+def cast(tree: Any, dtype: Any) -> Any:
+    """Convert the floating-point leaves of a tree; keys and integers stay."""
+
+    def convert(leaf: Any) -> Any:
+        is_float = jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
+        return jnp.asarray(leaf, dtype) if is_float else leaf
+
+    return jax.tree.map(convert, tree)
+
+
+@dataclass
+class Outcome:
+    """What a run leaves: losses, host copies of the parameters at some steps, renders."""
+
+    losses: list[float]
+    snapshots: dict[int, Params]
+    images: np.ndarray
+    figures: dict[str, float]
+    seconds_per_step: float
+
+
+def group_of(path: tuple[Any, ...]) -> str:
+    """Which of `GROUPS` a leaf of the parameters belongs to."""
+    names = [str(getattr(key, "name", "")) for key in path]
+    if names[0] == "material":
+        return "tables" if names[1].endswith("_table") else "heads"
+    return "exposure" if names[0] == "log_exposure" else names[0]
+
+
+def errors(single: Any, double: Any) -> dict[str, float]:
+    """Compare trees: relative L2, largest error over largest value, entries off, signs lost.
+
+    Entries count where the double one is not zero; they are off by their own relative error.
+    """
+    flat = [
+        np.concatenate([np.ravel(np.asarray(x, np.float64)) for x in jax.tree.leaves(tree)])
+        for tree in (single, double)
+    ]
+    a, b = flat
+    error, size, counted = np.abs(a - b), np.abs(b), b != 0
+    return {
+        "l2": float(np.sqrt(np.sum(error**2) / max(np.sum(b**2), 1e-300))),
+        "worst": float(np.max(error) / max(np.max(size), 1e-300)),
+        "off": float(np.mean(error[counted] > 1e-3 * size[counted])) if counted.any() else 0.0,
+        "sign": float(np.mean(np.sign(a[counted]) != np.sign(b[counted])))
+        if counted.any()
+        else 0.0,
+        "spurious": float(np.mean((a != 0) & ~counted)),
+    }
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A differentiable function of named groups with named outputs, and where to evaluate it."""
+
+    name: str
+    function: Callable[[Any, Any], dict[str, Any]]
+    inputs: dict[str, Any]
+    constants: Any = ()
+
+
+def measure(stage: Stage) -> dict[str, Any]:
+    """Errors of values and gradients in float32 on inputs that both precisions share."""
+    inputs, constants = cast((stage.inputs, stage.constants), np.float32)
+    rng = np.random.default_rng(0)
+
+    def cotangent(out: Any) -> Any:
+        if out.ndim == 0:
+            return np.float32(1)
+        return np.float32(rng.standard_normal(out.shape))
+
+    def run(inputs: Any, constants: Any, cotangents: Any) -> Any:
+        values, pull = jax.vjp(lambda x: stage.function(x, constants), inputs)
+        return values, pull(cotangents)[0]
+
+    shapes = jax.eval_shape(stage.function, *cast((inputs, constants), np.float32))
+    cotangents = jax.tree.map(cotangent, shapes)
+    arguments = (inputs, constants, cotangents)
+    single = jax.device_get(jax.jit(run)(*arguments))
+    with double_precision():
+        double = jax.device_get(jax.jit(run)(*cast(arguments, np.float64)))
+    return {
+        part: {
+            **{name: errors(one[name], other[name]) for name in one},
+            "all": max((errors(one[n], other[n]) for n in one), key=lambda e: e["l2"]),
+        }
+        for part, one, other in zip(("values", "gradients"), single, double, strict=True)
+    }
+
+
+def raw_alphas(splats: Splats, opacities: Any, lists: TileLists, tile: int, width: int) -> Any:
+    """Compute alphas before cut and clamp in the pixels of each hit's tile, and those pixels."""
+    real = lists.chunk_ranks < len(lists.index)
+    ranks = np.where(real, lists.chunk_ranks, 0)
+    columns = -(-width // tile)
+    corner = tile * np.stack([lists.chunk_tiles % columns, lists.chunk_tiles // columns], -1)
+    inside = np.stack(np.meshgrid(np.arange(tile), np.arange(tile)), -1).reshape(-1, 2) + 0.5
+    pixels = np.broadcast_to(corner[:, None] + inside, (*ranks.shape, tile * tile, 2))
+    offset = pixels - np.asarray(splats.means2d)[ranks][:, :, None]
+    dx, dy = offset[..., 0], offset[..., 1]
+    xx, xy, yy = np.moveaxis(np.asarray(splats.conics)[ranks][..., None], 2, 0)
+    sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
+    alphas = (opacities * splats.compensation)[ranks][..., None] * np.exp(-sigma)
+    return alphas[real], pixels[real]
+
+
+def undecided(got: dict, tile: int, camera: Camera) -> np.ndarray:
+    """Mark the pixels of which some alpha lies at the cut, (H, W)."""
+    alphas, pixels = raw_alphas(got["splats"], got["opacities"], got["lists"], tile, camera.width)
+    close = np.abs(alphas - MIN_ALPHA) < UNDECIDED * MIN_ALPHA
+    mark = np.zeros((camera.height, camera.width), bool)
+    x, y = pixels[close].astype(int).T
+    inside = (x < camera.width) & (y < camera.height)
+    mark[y[inside], x[inside]] = True
+    return mark
+
+
+def decisions(one: dict, shared: dict, two: dict, config: Config, camera: Camera) -> dict[str, Any]:
+    """Count the discrete choices that differ between precisions, and how many there are."""
+    first, second = one["lists"], two["lists"]
+    count = int(two["gaussians"].count)
+    rows = [lists.index[lists.index < count] for lists in (first, second)]
+    rank = np.full(count, -1)
+    rank[rows[0]] = np.arange(len(rows[0]))
+    order = rank[rows[1]]
+    hits = []
+    for lists in (first, second):
+        real = lists.chunk_ranks < len(lists.index)
+        owner = lists.index[np.where(real, lists.chunk_ranks, 0)].astype(np.int64)
+        hits.append((lists.chunk_tiles[None, :] * (count + 1) + owner)[real])
+    tile = config.model.tile_size
+    a, b = (
+        raw_alphas(x["splats"], x["opacities"], second, tile, camera.width)[0]
+        for x in (shared, two)
+    )
+    cells = np.array(config.model.material.grid.resolutions, np.float32)
+    corners = [np.floor(x["unit"][:count, None, :] * cells[None, :, None]) for x in (one, two)]
+    active = [x["active"][:count] for x in (one, two)]
+    return {
+        "faces": (int(np.sum(one["mesh"].faces != two["mesh"].faces)), two["mesh"].faces.size),
+        "visible Gaussians": (len(np.setxor1d(*rows)), len(rows[1])),
+        "neighbours in depth": (int(np.sum(np.diff(order[order >= 0]) < 0)), len(rows[1])),
+        "tile hits": (len(np.setxor1d(*hits)), len(hits[1])),
+        "alpha cuts": (int(np.sum((a >= MIN_ALPHA) != (b >= MIN_ALPHA))), a.size),
+        "undecided pixels": (int(np.sum(undecided(two, tile, camera))), two["alpha"].size),
+        "alpha clamps": (int(np.sum((a < MAX_ALPHA) != (b < MAX_ALPHA))), a.size),
+        "hash cells": (int(np.sum(np.any(corners[0] != corners[1], -1))), corners[0][..., 0].size),
+        "ReLUs": (int(np.sum(active[0] != active[1])), active[0].size),
+    }
+
+
+def accumulated(one: dict, shared: dict, two: dict) -> dict[str, Any]:
+    """Errors of every intermediate of a chain in float32; per splat and ``same`` on one order."""
+    read = {
+        "vertices": (one, lambda x: x["mesh"].vertices),
+        "vertex normals": (one, lambda x: x["vertex normals"]),
+        "Gaussian means": (one, lambda x: x["gaussians"].means),
+        "Gaussian quats": (one, lambda x: x["gaussians"].quats),
+        "Gaussian scales": (one, lambda x: x["gaussians"].scales),
+        "hash features": (one, lambda x: x["encoded"]),
+        "materials": (one, lambda x: x["materials"]),
+        "light levels": (one, lambda x: x["light"].specular),
+        "splat colours": (shared, lambda x: x["colours"]),
+        "means2d": (shared, lambda x: x["splats"].means2d),
+        "conics": (shared, lambda x: x["splats"].conics[x["lists"].index < len(x["shift"])]),
+        "image, same lists": (shared, lambda x: x["image"]),
+        "image, own lists": (one, lambda x: x["image"]),
+        "alpha, own lists": (one, lambda x: x["alpha"]),
+    }
+    return {name: errors(get(run), get(two)) for name, (run, get) in read.items()}
+
+
+def snapshot_steps(steps: int) -> list[int]:
+    """List the steps after which parameters are compared, dense at first."""
+    ladder = (0, 1, 2, 3, 5, 8, 12, 20, 30, 45, 65, 90, 120, 160, 200, 260, 350)
+    return sorted({k for k in ladder if k < steps} | {steps})
+
+
+def drift(one: dict[int, Params], other: dict[int, Params]) -> dict[str, list[float]]:
+    """Distance of two runs in units of how far the second has come, by group and step."""
+    steps = sorted(set(one) & set(other) - {0})
+    curves: dict[str, list[float]] = {"step": steps}
+    for step in steps:
+        apart, travelled = dict.fromkeys(GROUPS, 0.0), dict.fromkeys(GROUPS, 0.0)
+        leaves = (
+            jax.tree_util.tree_leaves_with_path(t) for t in (one[step], other[step], other[0])
+        )
+        for (path, a), (_, b), (_, first) in zip(*leaves, strict=True):
+            group = group_of(path)
+            a, b, first = (np.asarray(x, np.float64) for x in (a, b, first))
+            apart[group] += float(np.sum((a - b) ** 2))
+            travelled[group] += float(np.sum((b - first) ** 2))
+        for group in GROUPS:
+            distance = np.sqrt(apart[group] / max(travelled[group], 1e-300))
+            curves.setdefault(group, []).append(float(distance))
+    return curves
+
+
+def compare_runs(outcome: Outcome, reference: Outcome) -> dict[str, Any]:
+    """Figures of a run, and its distance from the reference."""
+    a, b = np.array(outcome.losses), np.array(reference.losses)
+    error = np.mean((outcome.images - reference.images) ** 2)
+    return {
+        **outcome.figures,
+        "final_loss": float(np.mean(a[-20:])),
+        "loss_distance": float(np.mean(np.abs(a - b)) / np.mean(b)),
+        "first_step_above_1e-3": int(np.argmax(np.abs(a - b) > 1e-3 * b))
+        if np.any(np.abs(a - b) > 1e-3 * b)
+        else -1,
+        "renders_psnr": float(-10 * np.log10(error)) if error > 0 else float("inf"),
+        "seconds_per_step": outcome.seconds_per_step,
+        "losses": outcome.losses,
+        "drift": drift(outcome.snapshots, reference.snapshots),
+    }
+
+
+def held_out(
+    params: Params, context: Context, config: Config, room: Capacities, test: Views
+) -> tuple[np.ndarray, dict[str, float]]:
+    """Render test views in float32 from the parameters as stored; PSNR and normal error."""
+    renderer = Renderer(config, params, context, room)
+    images, scores, angles = [], [], []
+    for index in range(len(test)):
+        view, image = renderer(test.camera(np.array([index]))), test.images[index]
+        mask = image[..., 3]
+        truth = encode_srgb(
+            np.clip(over_background(image[..., :3] * mask[..., None], mask, 1), 0, 1)
+        )
+        shown = encode_srgb(np.clip(over_background(view.rgb, view.alpha, 1.0), 0, 1))
+        images.append(np.asarray(shown))
+        scores.append(float(psnr(shown, truth)))
+        if "normal" in test.truth:
+            normal = test.truth["normal"][index]
+            angles.append(float(normal_mae_deg(view.aovs["normal"], normal, mask)))
+    figures = {"psnr": float(np.mean(scores))}
+    if angles:
+        figures["normal_deg"] = float(np.mean(angles))
+    return np.stack(images), figures
+
+
+def half_times(points: Any, spec: HashGridSpec, repeats: int = 21) -> dict[str, Any]:
+    """Time encoding and its table gradient with float32 and bfloat16 tables, interleaved."""
+    table = jax.random.normal(jax.random.key(0), (spec.total_entries, spec.features))
+    points = jnp.asarray(points, jnp.float32)
+    pull = jax.random.normal(jax.random.key(1), (len(points), spec.levels, spec.features))
+    chunks = 8192
+
+    def gradient(points: Any, pull: Any, dtype: Any) -> jax.Array:
+        def step(total: Any, part: Any) -> Any:
+            cells = hashgrid._locate(part[0], spec)
+            return hashgrid._scatter_rows(total, cast(cells, dtype), part[1].astype(dtype)), None
+
+        count = len(points) // chunks * chunks
+        parts = [x[:count].reshape(-1, chunks, *x.shape[1:]) for x in (points, pull)]
+        return jax.lax.scan(step, jnp.zeros(table.shape, dtype), tuple(parts))[0]
+
+    half = table.astype(jnp.bfloat16)
+    forward = jax.jit(partial(encode, spec=spec))
+    back = jax.jit(gradient, static_argnames="dtype")
+    jobs = {
+        "forward, float32": lambda: forward(table, points),
+        "forward, bfloat16 table": lambda: forward(half, points),
+        "table gradient, float32": lambda: back(points, pull, jnp.float32),
+        "table gradient, bfloat16": lambda: back(points, pull, jnp.bfloat16),
+    }
+    times: dict[str, list[float]] = {name: [] for name in jobs}
+    for _ in range(repeats + 1):
+        for name, job in jobs.items():
+            began = time.perf_counter()
+            jax.block_until_ready(job())
+            times[name].append(1e3 * (time.perf_counter() - began))
+    summed = [np.asarray(back(points, pull, d), np.float64) for d in (jnp.bfloat16, jnp.float32)]
+    return {
+        "points": len(points),
+        "table_mb": table.size * 4 / 2**20,
+        "milliseconds": {name: float(np.median(t[1:])) for name, t in times.items()},
+        "gradient summed in bfloat16": errors(*summed)["l2"],
+    }
+
+
+def draw_errors(axis: Any, stages: dict[str, Any]) -> None:
+    """Bars of the relative L2 error of values and gradients, a pair a stage."""
+    names = [name for name in stages if not name.startswith("-")]
+    place = np.arange(len(names))
+    for shift, part, colour in ((-0.2, "values", "#4c72b0"), (0.2, "gradients", "#dd8452")):
+        sizes = [max(stages[name][part]["all"]["l2"], 1e-9) for name in names]
+        axis.barh(place + shift, sizes, height=0.4, color=colour, label=part)
+    axis.axvline(float(np.finfo(np.float32).eps) / 2, color="grey", linewidth=0.8, linestyle=":")
+    axis.set_yticks(place, names)
+    axis.invert_yaxis()
+    axis.set(xscale="log", xlim=(2e-9, 1e-3), xlabel="relative L2 error, float32 against float64")
+    axis.set_title("Each stage on the same inputs", fontsize=10)
+    axis.legend(loc="upper right", fontsize=8)
+
+
+def draw_drift(axis: Any, runs: dict[str, Any], shown: dict[str, tuple[str, str]]) -> None:
+    """Draw how the geometry departs from float64, or from float32 for the nudged run."""
+    for name, (colour, style) in shown.items():
+        is_nudged = "rounding" in name
+        curve = (runs[name]["from float32"] if is_nudged else runs[name])["drift"]
+        label = "one rounding off, from float32" if is_nudged else name
+        axis.plot(curve["step"], curve["geometry"], style, color=colour, label=label, linewidth=1.4)
+    axis.set(xscale="log", yscale="log", xlabel="training step", ylim=(2e-7, 2))
+    axis.set_ylabel("distance / distance travelled")
+    axis.set_title("Geometry: apart from the float64 run", fontsize=10)
+    axis.legend(loc="lower right", fontsize=8)
+
+
+def draw_quality(axis: Any, runs: dict[str, Any]) -> None:
+    """Points of the held-out quality of every run."""
+    names = list(runs)
+    values = [runs[name]["psnr"] for name in names]
+    axis.plot(values, names, "o", color="#4c72b0", markersize=5)
+    seeds = [runs[name]["psnr"] for name in names if "seed" in name] + [runs["float32"]["psnr"]]
+    axis.axvspan(min(seeds), max(seeds), color="grey", alpha=0.2)
+    axis.invert_yaxis()
+    axis.set(xlabel="held-out PSNR, dB", xlim=(min(values) - 0.2, max(values) + 0.2))
+    axis.set_title("Quality at the end (grey: three seeds)", fontsize=10)
+
+
+def save(path: Path, record: Any) -> None:
+    """Write a record."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(record, indent=1) + "\n")
+
+
+def figure(folder: Path, path: Path) -> None:
+    """Draw the records of a study."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    stages = json.loads((folder / "stages.json").read_text())["stages"]
+    runs = json.loads((folder / "train.json").read_text())
+    shown = {
+        "another seed": ("#7f7f7f", "-"),
+        "bfloat16: everything": ("#c44e52", "-"),
+        "bfloat16: light": ("#dd8452", "-"),
+        "float32": ("#4c72b0", "-"),
+        "first SDF one rounding off": ("#55a868", "--"),
+    }
+    drawn, axes = plt.subplots(1, 3, figsize=(13, 4.6), width_ratios=(1.1, 1, 0.8))
+    draw_errors(axes[0], stages)
+    draw_drift(axes[1], runs, shown)
+    draw_quality(axes[2], runs)
+    drawn.tight_layout()
+    drawn.savefig(path, dpi=95)
+    plt.close(drawn)
