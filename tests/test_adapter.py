@@ -164,6 +164,7 @@ def test_inward_shift_moves_against_the_normal_and_keeps_geometry_detached():
     np.testing.assert_array_equal(jax.grad(offset)(area), 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("constants", [PAPER, CODE], ids=["paper", "code"])
 def test_gradient_equals_finite_differences(constants):
     with double_precision():

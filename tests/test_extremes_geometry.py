@@ -119,6 +119,7 @@ def reference_duals(geometry, grid, surface, crosses):
 EXPONENTS = st.floats(-30, 10)
 
 
+@pytest.mark.slow
 @FEW
 @example(exponents=(-30.0, -30.0), zeros=0.0, weight=50.0, deform=50.0, seed=1)
 @example(exponents=(10.0, 10.0), zeros=0.0, weight=-50.0, deform=0.0, seed=2)
@@ -155,6 +156,7 @@ def test_dual_vertices_are_the_weighted_mean_of_crossings_over_40_decades(
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
+@pytest.mark.slow
 def test_gradients_over_40_decades_equal_those_in_float64():
     cases = []
     grid = make_grid(SHAPE)
@@ -486,6 +488,7 @@ def lengths_and_doubled_areas(triangles):
     return sides, np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sample", "constants"), SAMPLINGS)
 def test_needles_and_specks_with_exact_edges_equal_float64(sample, constants):
     triangles = exact_triangles()

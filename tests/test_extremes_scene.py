@@ -264,6 +264,7 @@ def run_of(scale, folder):
     return [json.loads(line) for line in lines]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", DECIMALS)
 def test_training_takes_the_same_steps_in_any_unit(unit_run, scale, tmp_path):
     for mine, theirs in zip(run_of(scale, tmp_path), unit_run, strict=True):

@@ -296,6 +296,7 @@ def test_a_map_of_one_row_is_constant_in_elevation():
 # Split sum
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(1, 2), (8, 16)])
 def test_split_sum_is_that_of_float64_at_every_extreme(size):
     cosine, roughness, albedo, metallic = columns(

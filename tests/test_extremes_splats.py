@@ -273,6 +273,7 @@ def test_length_of_a_quaternion_changes_nothing_and_its_gradient_inversely(power
     )
 
 
+@pytest.mark.slow
 def test_a_zero_quaternion_is_the_identity_without_gradient_among_others():
     inputs = scene(4)
     zero = inputs[1].at[::3].set(0.0)
@@ -388,6 +389,7 @@ def thousands_at_one_depth():
     return inputs, camera(8, 8), Capacities(visible=4096, hits=16384, chunks=2048)
 
 
+@pytest.mark.slow
 def test_thousands_at_one_depth_are_composited_in_row_order():
     inputs, settings, room = thousands_at_one_depth()
     image, alpha, needed, gradient = render(inputs, settings, capacities=room)
@@ -502,6 +504,7 @@ def test_narrow_and_wide_views_equal_dense_compositing(field_of_view):
     assert_sane(image, alpha, features)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1e-3, 1e3, 2.0**10])
 def test_the_unit_of_the_world_does_not_matter(factor):
     inputs, settings = scene(10), camera()

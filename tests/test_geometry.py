@@ -302,6 +302,7 @@ def test_surface_is_open_at_the_border_of_the_grid():
     np.testing.assert_allclose(mesh.vertices[:, 2], 0.25 * grid.cell_size, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_area_and_volume_of_a_sphere_converge_at_second_order():
     radius, errors = 0.6, []
     for resolution in (8, 16, 32):
@@ -334,6 +335,7 @@ def test_tiny_grids_work(shape):
 # Buffers
 
 
+@pytest.mark.slow
 def test_padding_changes_neither_values_nor_gradients():
     grid = make_grid(SMALL_SHAPE)
     geometry = noisy_geometry(grid, closed=False)
@@ -356,6 +358,7 @@ def test_padding_changes_neither_values_nor_gradients():
         np.testing.assert_allclose(one, two, rtol=1e-4, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_overflow_reports_the_true_counts():
     grid = make_grid((12, 11, 10))
     geometry = noisy_geometry(grid, seed=2)
@@ -385,6 +388,7 @@ def test_surface_of_one_sign_is_empty_with_zero_gradients(sign):
     assert all((np.asarray(leaf) == 0).all() for leaf in jax.tree.leaves(gradient))
 
 
+@pytest.mark.slow
 def test_jit_equals_eager():
     grid = make_grid(SMALL_SHAPE)
     geometry = noisy_geometry(grid)
@@ -547,6 +551,7 @@ def test_weight_magnitude_is_the_mean_over_all_weights():
     np.testing.assert_allclose(weight_magnitude(geometry), expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_resampling_keeps_a_sphere_a_sphere():
     grid, finer = make_grid((12, 12, 12)), make_grid((18, 16, 20), size=2.2)
     geometry = initial_geometry(grid, sphere_sdf(grid, radius=0.6))

@@ -275,6 +275,7 @@ def test_prefilter_of_a_sun_equals_brute_force_quadrature():
     assert levels.min() > -1e-6 * 1e5
 
 
+@pytest.mark.slow
 def test_the_sharpest_lobe_of_the_default_levels_is_resolved():
     spec = LightSpec(16, 32, (0.08, 1.0))
     texels = _texels(seed=10)
@@ -387,6 +388,7 @@ def test_filtered_lookup_gradients_match_finite_differences():
             np.testing.assert_allclose(jnp.sum(gradient * move), difference, rtol=2e-6)
 
 
+@pytest.mark.slow
 def test_compiled_equals_eager_and_precision_in_is_precision_out():
     operators = prefilter_operators(SMALL)
     directions, roughness = _unit(50, seed=23), np.linspace(0, 1, 50)

@@ -141,6 +141,7 @@ def test_the_error_falls_with_the_samples():
     assert many < 0.6 * more
 
 
+@pytest.mark.slow
 def test_combining_is_never_much_worse_than_the_better_technique():
     """A glossy metal under a broad light, and a diffuse point under a sun."""
     points, materials, wo, light = scene()
@@ -219,6 +220,7 @@ def ball():
     return build_accelerator(surface, grid, capacities=capacities)
 
 
+@pytest.mark.slow
 def test_a_ball_overhead_takes_its_solid_angle_of_the_light():
     """Under constant light, irradiance / pi is one less sin^2 of the ball's half angle."""
     accelerator = ball()
@@ -265,6 +267,7 @@ def _fixed_samples(points, materials, wo, light, samples=9):
     return directions, weights, is_blocked(points, directions, None)
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_the_sum_over_fixed_samples():
     """Against central differences in float64, in everything that is differentiable."""
     with double_precision():
@@ -323,6 +326,7 @@ def test_the_gradient_estimates_the_derivative_of_the_integral():
         assert float(jnp.sqrt(jnp.sum((a - b) ** 2))) < 0.06 * size
 
 
+@pytest.mark.slow
 def test_sampling_itself_carries_no_gradient():
     points, materials, wo, light = scene()
 

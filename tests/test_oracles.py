@@ -248,6 +248,7 @@ def assert_values(got, data):
         )
 
 
+@pytest.mark.slow
 def test_gaussians_of_a_mesh_equal_the_slow_ones():
     data = load("adapter_faces")
 

@@ -176,6 +176,7 @@ def _rays(count, seed=2):
     return origins, directions, jnp.full((count,), -1, jnp.int32), jnp.ones((count,), bool)
 
 
+@pytest.mark.slow
 def test_masked_rays_hit_nothing_and_leave_the_others():
     _, accelerator = traced(bumpy_torus(torus_grid()), torus_grid())
     origins, directions, source, everything = _rays(700)
@@ -186,6 +187,7 @@ def test_masked_rays_hit_nothing_and_leave_the_others():
     assert bool(jnp.any(whole & ~mask))
 
 
+@pytest.mark.slow
 def test_rays_in_many_chunks_equal_rays_in_one(monkeypatch):
     from geosplat_jax import trace
 
@@ -227,6 +229,7 @@ def test_a_ray_never_hits_the_face_it_starts_from():
     assert not np.any(np.asarray(with_source) == np.asarray(source))
 
 
+@pytest.mark.slow
 def test_overflow_reports_the_true_need_and_growing_cures_it():
     grid = torus_grid()
     geometry = bumpy_torus(grid)
@@ -256,6 +259,7 @@ def test_a_scene_of_any_scale_gives_the_same_hits():
         np.testing.assert_array_equal(far, distance * scale)
 
 
+@pytest.mark.slow
 def test_rays_carry_no_gradient():
     grid = torus_grid(6)
     geometry = bumpy_torus(grid)
@@ -271,6 +275,7 @@ def test_rays_carry_no_gradient():
         np.testing.assert_array_equal(gradient, 0.0)
 
 
+@pytest.mark.slow
 def test_agrees_with_embree_on_a_hundred_thousand_rays():
     """An independent tracer; it is single precision too, so rays through edges may differ."""
     pytest.importorskip("embreex", reason="no Embree for this platform")

@@ -90,6 +90,7 @@ def test_resuming_without_a_checkpoint_is_an_error(dataset, tmp_path):
         fit(dataset, tiny_config(), tmp_path, resume=True)
 
 
+@pytest.mark.slow
 def test_an_overflowing_step_is_repeated_and_equals_one_with_ample_room(
     dataset, finished, tmp_path, monkeypatch
 ):
