@@ -1,27 +1,26 @@
 """Shared by the tests: double precision, and where the optional shared data lies."""
 
-from contextlib import contextmanager
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 
 from geosplat_jax.config import make_config
+from geosplat_jax.gradcheck.differences import double_precision
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.views import Views
 
+__all__ = [
+    "TINY",
+    "double_precision",
+    "look_at_poses",
+    "shared_path",
+    "sphere_dataset",
+    "sphere_views",
+    "tiny_config",
+]
+
 SHARED = Path(__file__).resolve().parents[2] / "shared"
-
-
-@contextmanager
-def double_precision():
-    """Enable float64 inside the block, on every supported version of jax."""
-    enable = getattr(jax, "enable_x64", None)
-    if enable is None:
-        from jax.experimental import enable_x64 as enable
-    with enable(True):
-        yield
 
 
 def shared_path(*parts):
