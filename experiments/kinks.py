@@ -55,8 +55,9 @@ from geosplat_jax.render import (
     render_views,
 )
 from geosplat_jax.scene import Batch, Grid
+from geosplat_jax.stages import initial_params, initial_sdf, make_batch, sampling_of_step
 from geosplat_jax.step import StepReport, TrainState, initial_state, train_step
-from geosplat_jax.train import initial_params, initial_sdf, load_run, make_batch, sampling_of_step
+from geosplat_jax.train import load_run
 
 SEGMENTS = 16
 SHOWN = (1, 4, 16)

@@ -48,15 +48,9 @@ from geosplat_jax.rasterize import TileLists, composite, gather_visible
 from geosplat_jax.render import Context, Params, grid_center_and_extent
 from geosplat_jax.scene import Batch, Camera, EnvLight, Grid, Materials, Mesh
 from geosplat_jax.shading import split_sum
+from geosplat_jax.stages import initial_params, initial_sdf, make_batch, make_context
 from geosplat_jax.step import make_optimizer
-from geosplat_jax.train import (
-    initial_params,
-    initial_sdf,
-    load_run,
-    make_batch,
-    make_context,
-    plan_capacities,
-)
+from geosplat_jax.train import load_run, plan_capacities
 
 STORED = (
     "hash tables",

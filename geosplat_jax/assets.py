@@ -10,30 +10,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from geosplat_jax import capacity as capacity_module
 from geosplat_jax.capacity import Capacities
 from geosplat_jax.config import Config
-from geosplat_jax.evaluate import Renderer
 from geosplat_jax.io.export import export_gaussians_ply, export_light_exr, export_mesh_glb
 from geosplat_jax.io.images import encode_srgb
 from geosplat_jax.materials import materials_at
-from geosplat_jax.render import Asset, Context, Params, grid_center_and_extent, reconstruct
+from geosplat_jax.render import Context, Params, grid_center_and_extent
+from geosplat_jax.renderer import Renderer, build_asset
 
 _MATERIAL_CHUNK = 65_536
 
-_reconstruct = partial(jax.jit, static_argnames=("model", "capacities", "sampling"))(reconstruct)
 _materials_at = partial(jax.jit, static_argnames=("spec",))(materials_at)
-
-
-def build_asset(config: Config, params: Params, context: Context, capacities: Capacities) -> Asset:
-    """Run the view-independent stages, growing buffers as needed."""
-    while True:
-        asset = _reconstruct(
-            params, context, model=config.model, capacities=capacities, sampling="face"
-        )
-        if not capacity_module.overflowed(asset.usage, capacities):
-            return asset
-        capacities = capacity_module.grow(capacities, asset.usage)
 
 
 class MaterialSampler:

@@ -11,6 +11,7 @@ by itself returns at most 1.
 """
 
 import math
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from geosplat_jax.color import luminance
 from geosplat_jax.numerics import COSINE_EPSILON, safe_divide, safe_normalize, safe_sqrt
+from geosplat_jax.pytree import register_pytree
 from geosplat_jax.rotation import frame_from_normal
 from geosplat_jax.scene import Materials
 
@@ -27,12 +29,27 @@ ROUGHNESS_FLOOR = 0.08
 DIELECTRIC_F0 = 0.04
 """Normal reflectance of a non-metal: refractive index 1.5."""
 
+_OPPOSITE = 1e-6
+"""Directions whose sum is shorter are opposite: no half vector, and nothing is reflected."""
+
 _LOBE_PROBABILITY_FLOOR = 0.1
 """Least share of samples for the specular lobe: bounds the weight of a sample it would miss."""
 
 
+Components = tuple[Array, ...]
+"""The x, y and z of vectors, each an array of its own."""
+
+
 def _dot(first: Float[Array, "N 3"], second: Float[Array, "N 3"]) -> Float[Array, " N"]:
     return jnp.sum(first * second, axis=-1)
+
+
+def _components(vectors: Float[Array, "N 3"]) -> Components:
+    return vectors[:, 0], vectors[:, 1], vectors[:, 2]
+
+
+def _along(first: Components, second: Components) -> Array:
+    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
 def ggx_alpha(roughness: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -54,6 +71,23 @@ def schlick(f0: Float[Array, "N 3"], cosine: Float[Array, " N"]) -> Float[Array,
     return f0 + (1 - f0) * (rest**5)[:, None]
 
 
+def _cross_squared(first: Components, second: Components) -> Array:
+    """Squared length of a cross product."""
+    x = first[1] * second[2] - first[2] * second[1]
+    y = first[2] * second[0] - first[0] * second[2]
+    z = first[0] * second[1] - first[1] * second[0]
+    return x * x + y * y + z * z
+
+
+def _distribution(cosine: Array, sine_squared: Array, alpha: Array) -> Array:
+    """GGX density of microfacet normals; see `ggx_distribution`."""
+    alpha_squared = jnp.square(alpha)
+    spread = jnp.square(cosine) * alpha_squared + sine_squared
+    is_facing = cosine > 0
+    density = alpha_squared / (math.pi * jnp.square(jnp.where(is_facing, spread, 1.0)))
+    return jnp.where(is_facing, density, 0.0)
+
+
 def ggx_distribution(
     half: Float[Array, "N 3"], normals: Float[Array, "N 3"], alpha: Float[Array, " N"]
 ) -> Float[Array, " N"]:
@@ -62,13 +96,8 @@ def ggx_distribution(
     ``alpha^2 / (pi (cos^2 alpha^2 + sin^2)^2)``, with the sine from the cross product: the usual
     ``cos^2 (alpha^2 - 1) + 1`` loses all digits at the peak of a smooth surface in float32.
     """
-    cosine = _dot(half, normals)
-    sine_squared = jnp.sum(jnp.cross(half, normals) ** 2, axis=-1)
-    alpha_squared = jnp.square(alpha)
-    spread = jnp.square(cosine) * alpha_squared + sine_squared
-    is_facing = cosine > 0
-    density = alpha_squared / (math.pi * jnp.square(jnp.where(is_facing, spread, 1.0)))
-    return jnp.where(is_facing, density, 0.0)
+    sine_squared = _cross_squared(_components(half), _components(normals))
+    return _distribution(_dot(half, normals), sine_squared, alpha)
 
 
 def _smith_root(cosine: Float[Array, " N"], alpha: Float[Array, " N"]) -> Float[Array, " N"]:
@@ -85,16 +114,55 @@ def smith_visibility(
     return 0.5 / spread
 
 
-def _cosines(
-    normals: Float[Array, "N 3"], wi: Float[Array, "N 3"], wo: Float[Array, "N 3"]
-) -> tuple[Float[Array, " N"], Float[Array, " N"], Bool[Array, " N"]]:
-    """Clamped cosines of both directions and whether both lie above the surface."""
-    cosine_i, cosine_o = _dot(normals, wi), _dot(normals, wo)
+@register_pytree
+@dataclass(frozen=True)
+class Lobe:
+    """What the specular lobe of a pair of directions consists of, any shape.
+
+    Attributes
+    ----------
+    cosine : ``max(n.wi, 0)``.
+    strength : ``D G / (4 (n.wi)(n.wo))``, zero where either direction lies below the surface.
+    grazing : ``(1 - wi.half)^5``: the Fresnel reflectance is ``f0 + (1 - f0) grazing``.
+    is_above : whether both directions lie above the surface.
+    density : of `sample_specular` per steradian.
+    """
+
+    cosine: Float[Array, "..."]
+    strength: Float[Array, "..."]
+    grazing: Float[Array, "..."]
+    is_above: Bool[Array, "..."]
+    density: Float[Array, "..."]
+
+
+def specular_lobe(normals: Components, wi: Components, wo: Components, alpha: Array) -> Lobe:
+    """Evaluate the specular lobe on vectors given by components, which may broadcast.
+
+    Components in arrays of their own vectorise; rows of three do not. Unit vectors; ``alpha`` from
+    `ggx_alpha`. Differentiable in everything except that test of signs.
+    """
+    cosine_i, cosine_o = _along(normals, wi), _along(normals, wo)
     is_above = (cosine_i > 0) & (cosine_o > 0)
-    return (
-        jnp.maximum(cosine_i, COSINE_EPSILON),
-        jnp.maximum(cosine_o, COSINE_EPSILON),
-        is_above,
+    floored_i = jnp.maximum(cosine_i, COSINE_EPSILON)
+    floored_o = jnp.maximum(cosine_o, COSINE_EPSILON)
+    between = tuple(a + b for a, b in zip(wi, wo, strict=True))
+    length = safe_sqrt(_along(between, between))
+    inverse = safe_divide(jnp.ones_like(length), length, smallest=_OPPOSITE)
+    cosine_h = _along(normals, between) * inverse
+    sine_squared = _cross_squared(between, normals) * jnp.square(inverse)
+    distribution = _distribution(cosine_h, sine_squared, alpha)
+    strength = distribution * smith_visibility(floored_i, floored_o, alpha)
+    # wi . half = wo . half = |wi + wo| / 2.
+    rest = 1 - jnp.minimum(0.5 * length, 1.0)
+    # G1(wo) D / (4 n.wo), Heitz 2018 Eq. 3 and 17, with G1 = 2 n.wo / (n.wo + root). No floor above
+    # zero here nor in the sampling: the root is at least alpha, and both must agree.
+    seen = jnp.maximum(cosine_o, 0.0)
+    return Lobe(
+        cosine=jnp.maximum(cosine_i, 0.0),
+        strength=jnp.where(is_above, strength, 0.0),
+        grazing=rest**5,
+        is_above=is_above,
+        density=distribution / (2 * (seen + _smith_root(seen, alpha))),
     )
 
 
@@ -111,15 +179,12 @@ def evaluate_factors(
     base : (N,) ``1 / pi``, and fresnel : (N, 3), strength : (N,) ``D G / (4 (n.wi)(n.wo))``. Base
     and strength are zero where either direction lies below the surface.
     """
-    cosine_i, cosine_o, is_above = _cosines(normals, wi, wo)
     alpha = ggx_alpha(materials.roughness)
-    half = safe_normalize(wi + wo)
-    # wi . half = wo . half, but for the rounding of nearly opposite directions: take their mean.
-    cosine = 0.5 * _dot(wi + wo, half)
-    fresnel = schlick(specular_f0(materials.albedo, materials.metallic), cosine)
-    strength = ggx_distribution(half, normals, alpha) * smith_visibility(cosine_i, cosine_o, alpha)
-    base = jnp.where(is_above, jnp.asarray(1 / math.pi, strength.dtype), 0.0)
-    return base, fresnel, jnp.where(is_above, strength, 0.0)
+    lobe = specular_lobe(_components(normals), _components(wi), _components(wo), alpha)
+    f0 = specular_f0(materials.albedo, materials.metallic)
+    fresnel = f0 + (1 - f0) * lobe.grazing[:, None]
+    base = jnp.where(lobe.is_above, jnp.asarray(1 / math.pi, fresnel.dtype), 0.0)
+    return base, fresnel, lobe.strength
 
 
 def evaluate_lobes(
@@ -168,28 +233,36 @@ def specular_probability(
     return jnp.maximum(share, _LOBE_PROBABILITY_FLOOR)
 
 
+def cosine_pdf(normals: Float[Array, "N 3"], wi: Float[Array, "N 3"]) -> Float[Array, " N"]:
+    """Density per solid angle of `sample_cosine`: cosine / pi above the surface."""
+    return jnp.maximum(_dot(normals, wi), 0.0) / math.pi
+
+
+def specular_pdf(
+    roughness: Float[Array, " N"],
+    normals: Float[Array, "N 3"],
+    wi: Float[Array, "N 3"],
+    wo: Float[Array, "N 3"],
+) -> Float[Array, " N"]:
+    """Density per solid angle of `sample_specular`; requires ``wo`` above the surface.
+
+    It integrates to one over the whole sphere: visible normals seen at a slant reflect some
+    samples below the surface, where `evaluate` is zero.
+    """
+    vectors = (_components(normals), _components(wi), _components(wo))
+    return specular_lobe(*vectors, ggx_alpha(roughness)).density
+
+
 def pdf(
     materials: Materials,
     normals: Float[Array, "N 3"],
     wi: Float[Array, "N 3"],
     wo: Float[Array, "N 3"],
 ) -> Float[Array, " N"]:
-    """Density per solid angle of `sample` at ``wi``.
-
-    It integrates to one over the whole sphere: visible normals seen at a slant reflect some
-    samples below the surface, where `evaluate` is zero. Requires ``wo`` above the surface.
-    """
-    alpha = ggx_alpha(materials.roughness)
-    # No floor above zero here nor in `sample`: the root is at least alpha, and the two must agree.
-    cosine_o = jnp.maximum(_dot(normals, wo), 0.0)
-    half = safe_normalize(wi + wo)
-    # G1(wo) D / (4 n.wo), Heitz 2018 Eq. 3 and 17, with G1 = 2 n.wo / (n.wo + root).
-    visible = ggx_distribution(half, normals, alpha) / (
-        2 * (cosine_o + _smith_root(cosine_o, alpha))
-    )
-    cosine = jnp.maximum(_dot(normals, wi), 0.0) / math.pi
+    """Density per solid angle of `sample` at ``wi``: both lobes' by their shares."""
     share = specular_probability(materials, normals, wo)
-    return share * visible + (1 - share) * cosine
+    specular = specular_pdf(materials.roughness, normals, wi, wo)
+    return share * specular + (1 - share) * cosine_pdf(normals, wi)
 
 
 def _sample_visible_normal(
@@ -206,12 +279,39 @@ def _sample_visible_normal(
     return safe_normalize((cap + view) * stretch)
 
 
-def _sample_cosine(uniforms: Float[Array, "N 2"]) -> Float[Array, "N 3"]:
-    """Draw a direction with density cosine / pi, in the local frame."""
+def _to_world(local: Float[Array, "N 3"], normals: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
+    """Turn unit vectors from the frame about a normal into the world."""
+    tangent, bitangent = frame_from_normal(normals)
+    world = local[:, :1] * tangent + local[:, 1:2] * bitangent + local[:, 2:] * normals
+    return safe_normalize(world)
+
+
+def sample_cosine(
+    normals: Float[Array, "N 3"], uniforms: Float[Array, "N 2"]
+) -> Float[Array, "N 3"]:
+    """Draw unit directions with density `cosine_pdf` about unit normals; no gradients."""
+    normals = jax.lax.stop_gradient(normals)
     azimuth = 2 * math.pi * uniforms[:, 0]
     radius = safe_sqrt(uniforms[:, 1])
     height = safe_sqrt(1 - uniforms[:, 1])
-    return jnp.stack([radius * jnp.cos(azimuth), radius * jnp.sin(azimuth), height], axis=-1)
+    local = jnp.stack([radius * jnp.cos(azimuth), radius * jnp.sin(azimuth), height], axis=-1)
+    return jax.lax.stop_gradient(_to_world(local, normals))
+
+
+def sample_specular(
+    roughness: Float[Array, " N"],
+    normals: Float[Array, "N 3"],
+    wo: Float[Array, "N 3"],
+    uniforms: Float[Array, "N 2"],
+) -> Float[Array, "N 3"]:
+    """Mirror the view at a visible microfacet normal: density `specular_pdf`; no gradients."""
+    roughness, normals, wo = jax.lax.stop_gradient((roughness, normals, wo))
+    tangent, bitangent = frame_from_normal(normals)
+    local = jnp.stack([_dot(wo, tangent), _dot(wo, bitangent), _dot(wo, normals)], axis=-1)
+    local = local.at[:, 2].max(0.0)
+    half = _sample_visible_normal(local, ggx_alpha(roughness), uniforms)
+    mirrored = 2 * _dot(local, half)[:, None] * half - local
+    return jax.lax.stop_gradient(_to_world(mirrored, normals))
 
 
 def sample(
@@ -233,13 +333,7 @@ def sample(
     (N, 3) unit directions with density `pdf`; some may lie below the surface. Carries **no
     gradient**: estimators differentiate `evaluate` at fixed samples.
     """
-    materials, normals, wo = jax.lax.stop_gradient((materials, normals, wo))
-    tangent, bitangent = frame_from_normal(normals)
-    local = jnp.stack([_dot(wo, tangent), _dot(wo, bitangent), _dot(wo, normals)], axis=-1)
-    local = local.at[:, 2].max(0.0)
-    half = _sample_visible_normal(local, ggx_alpha(materials.roughness), uniforms[:, 1:])
-    mirrored = 2 * _dot(local, half)[:, None] * half - local
-    is_specular = uniforms[:, 0] < specular_probability(materials, normals, wo)
-    chosen = jnp.where(is_specular[:, None], mirrored, _sample_cosine(uniforms[:, 1:]))
-    world = chosen[:, :1] * tangent + chosen[:, 1:2] * bitangent + chosen[:, 2:] * normals
-    return jax.lax.stop_gradient(safe_normalize(world))
+    share = jax.lax.stop_gradient(specular_probability(materials, normals, wo))
+    mirrored = sample_specular(materials.roughness, normals, wo, uniforms[:, 1:])
+    scattered = sample_cosine(normals, uniforms[:, 1:])
+    return jnp.where((uniforms[:, 0] < share)[:, None], mirrored, scattered)

@@ -1,4 +1,4 @@
-"""The ``geosplat-jax`` command: info, train, evaluate, render, export, gradcheck."""
+"""The ``geosplat-jax`` command: info, train, evaluate, render, relight, export, gradcheck."""
 
 import argparse
 import importlib.metadata
@@ -25,8 +25,14 @@ from geosplat_jax.gradcheck.report import (
 from geosplat_jax.io.dataset import Dataset, describe, load_dataset
 from geosplat_jax.io.images import SceneError, write_png
 from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.protocols import PROTOCOLS
+from geosplat_jax.relight import BACKGROUNDS
+from geosplat_jax.renderer import DEFAULT_SAMPLES
 
 _console = Console(stderr=True, highlight=False)
+
+
+_SHEETS = ("overview.png", "materials.png", "relight.png")
 
 
 class GradientError(RuntimeError):
@@ -67,13 +73,29 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--seed", type=int, help="seed of every random choice")
     train.add_argument("--resume", action="store_true", help="continue from the last checkpoint")
 
+    train.add_argument(
+        "--stage-1", type=Path, metavar="RUN", help="take over stage 1 of another run of the scene"
+    )
+
     evaluate = commands.add_parser("evaluate", help="figures and overview.png of a run")
     evaluate.add_argument("run", type=Path)
+    evaluate.add_argument("--protocol", choices=PROTOCOLS, default=PROTOCOLS[0])
+    evaluate.add_argument(
+        "--samples", type=int, default=DEFAULT_SAMPLES, help="rays a splat (default: %(default)s)"
+    )
+    evaluate.add_argument(
+        "--relight-indirect",
+        choices=("traced", "none"),
+        default="traced",
+        help="light between surfaces under new lights (default: %(default)s)",
+    )
 
     render = commands.add_parser("render", help="render a run's test or training views")
     render.add_argument("run", type=Path)
     render.add_argument("--views", choices=("test", "train"), default="test")
     render.add_argument("--output", type=Path, help="folder (default: RUN/renders)")
+
+    _add_relight(commands.add_parser("relight", help="show a run under another light"))
 
     export = commands.add_parser("export", help="mesh.glb, gaussians.ply and light.exr of a run")
     export.add_argument("run", type=Path)
@@ -91,6 +113,34 @@ def _parser() -> argparse.ArgumentParser:
     gradcheck.add_argument("--seed", type=int, default=0, help="of numbers, samples, directions")
     gradcheck.add_argument("--json", type=Path, help="also write every comparison to this file")
     return parser
+
+
+def _add_relight(relight: argparse.ArgumentParser) -> None:
+    """Describe the relight command."""
+    relight.add_argument("run", type=Path)
+    relight.add_argument(
+        "--env", type=Path, required=True, help="lat-long environment map: .hdr, .exr or an image"
+    )
+    relight.add_argument("--output", type=Path, help="folder (default: RUN/relight_NAME)")
+    relight.add_argument(
+        "--turntable", type=int, default=0, metavar="N", help="movie of N frames around the object"
+    )
+    relight.add_argument(
+        "--rotate-env", type=int, default=0, metavar="N", help="movie of N frames, the light turns"
+    )
+    relight.add_argument("--fps", type=float, default=24.0, help="frames a second of the movies")
+    relight.add_argument("--movie", choices=("gif", "mp4"), help="(default: mp4 if it can be made)")
+    relight.add_argument(
+        "--background", choices=BACKGROUNDS, default="light", help="(default: %(default)s)"
+    )
+    relight.add_argument("--intensity", type=float, default=1.0, help="factor of the light")
+    relight.add_argument(
+        "--albedo-scale", type=float, nargs=3, default=(1.0, 1.0, 1.0), metavar=("R", "G", "B")
+    )
+    relight.add_argument(
+        "--samples", type=int, default=DEFAULT_SAMPLES, help="rays a splat (default: %(default)s)"
+    )
+    relight.add_argument("--indirect", choices=("traced", "none"), default="traced")
 
 
 def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
@@ -134,19 +184,23 @@ def _info(arguments: argparse.Namespace) -> None:
 
 def _check_folder(folder: Path, record: dict[str, Any], *, resume: bool) -> None:
     """Refuse a folder that holds something else, or a run of another scene."""
-    path = folder / "run.json"
     if not resume:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise UsageError(
                 f"{folder} exists already; choose another --output, or --resume to continue it"
             )
         return
+    _check_same_scene(folder, record)
+
+
+def _check_same_scene(folder: Path, record: dict[str, Any]) -> None:
+    """Refuse a run of another scene, or of the same read in another way."""
     before = _recorded(folder)
     for name in ("scene", "dataset"):
         if before[name] != record[name]:
             raise UsageError(
-                f"{path} says that the run was trained with {name} {before[name]}, not "
-                f"{record[name]}; resume with the same, or choose another --output"
+                f"{folder / 'run.json'} says that the run was trained with {name} {before[name]}, "
+                f"not {record[name]}; take the same, or another folder"
             )
 
 
@@ -167,6 +221,7 @@ def train_command(
     options: dict[str, Any],
     *,
     resume: bool = False,
+    stage_1: Path | None = None,
 ) -> None:
     """Train a scene into a run folder, with progress on the terminal.
 
@@ -181,6 +236,8 @@ def train_command(
     _check_folder(folder, record, resume=resume)
     began = time.perf_counter()
     dataset = _load(scene, options)
+    if stage_1 is not None:
+        _check_same_scene(stage_1, record)
     if not resume:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "run.json").write_text(json.dumps(record, indent=2) + "\n")
@@ -189,9 +246,17 @@ def train_command(
     _console.print(
         f"{dataset.name}: {len(dataset.train.names)} views, {dataset.layout}; compiling ..."
     )
-    preview = _Preview(dataset, config, folder / "previews")
-    with _progress_display(config.run.steps) as show:
-        fit(dataset, config, folder, resume=resume, on_step=show, on_preview=preview)
+    preview = _Preview(dataset, folder / "previews")
+    with _progress_display(config.total_steps) as show:
+        fit(
+            dataset,
+            config,
+            folder,
+            resume=resume,
+            stage_1=stage_1,
+            on_step=show,
+            on_preview=preview,
+        )
     seconds = time.perf_counter() - began
     summary = {"seconds_total": round(seconds, 2)}
     (folder / "training.json").write_text(json.dumps(summary, indent=2) + "\n")
@@ -241,7 +306,8 @@ class _progress_display:
             )
         elif progress.step % 50 == 0 or progress.step in (1, progress.steps):
             _console.print(
-                f"step {progress.step}/{progress.steps}  loss {progress.total:.4f}  "
+                f"stage {progress.stage}, step {progress.step}/{progress.steps}  "
+                f"loss {progress.total:.4f}  "
                 f"{progress.psnr:.2f} dB  {progress.gaussian_count:,} Gaussians  "
                 f"{progress.seconds:.0f} s, {progress.seconds_left:.0f} s left"
             )
@@ -250,17 +316,16 @@ class _progress_display:
 class _Preview:
     """Write truth, render and normals of one view side by side while training."""
 
-    def __init__(self, dataset: Dataset, config: Config, folder: Path) -> None:
+    def __init__(self, dataset: Dataset, folder: Path) -> None:
         self._views = dataset.test if dataset.test.names else dataset.train
-        self._config = config
         self._folder = folder
 
-    def __call__(self, params, context, capacities, step: int) -> None:
+    def __call__(self, config, params, context, capacities, step: int) -> None:
         """Render and write one preview."""
         from geosplat_jax.evaluate import preview_image
 
         self._folder.mkdir(exist_ok=True)
-        image = preview_image(self._config, params, context, capacities, self._views)
+        image = preview_image(config, params, context, capacities, self._views)
         write_png(self._folder / f"step_{step:06d}.png", image)
 
 
@@ -272,9 +337,16 @@ def _recorded(run: Path) -> dict[str, Any]:
     return json.loads(path.read_text())
 
 
-def evaluate_command(run: Path) -> dict[str, Any]:
+def evaluate_command(
+    run: Path,
+    *,
+    protocol: str = PROTOCOLS[0],
+    samples: int = DEFAULT_SAMPLES,
+    relight_indirect: str = "traced",
+) -> dict[str, Any]:
     """Evaluate a run on its scene's test views and print the means."""
     from geosplat_jax.evaluate import evaluate_run
+    from geosplat_jax.relight import load_light
     from geosplat_jax.train import load_run
 
     record = _recorded(run)
@@ -287,14 +359,63 @@ def evaluate_command(run: Path) -> dict[str, Any]:
         "scene": record["scene"],
         "dataset": record["dataset"],
         "step": meta["step"],
+        "stage": meta["stage"],
         "training": json.loads(training.read_text()) if training.exists() else None,
         "training_peak_memory_mb": _peak_memory(run),
     }
-    figures = evaluate_run(config, params, context, capacities, dataset.test, run, meta=extra)
+    lights = {name: load_light(path) for name, path in dataset.lights.items()}
+    figures = evaluate_run(
+        config,
+        params,
+        context,
+        capacities,
+        dataset.test,
+        run,
+        meta=extra,
+        protocol=protocol,
+        lights=lights,
+        train_light=lights.get(dataset.train_light or ""),
+        samples=samples,
+        relight_indirect=relight_indirect,
+    )
+    print(f"protocol: {protocol}")
     for name, value in figures["mean"].items():
-        print(f"{name:24s} {value:8.4f}")
-    print(f"figures: {run / 'metrics.json'}\npictures: {run / 'overview.png'}")
+        print(f"{name:36s} {value:9.4f}")
+    for note in figures["notes"]:
+        print(f"note: {note}")
+    pictures = [name for name in _SHEETS if (run / name).exists()]
+    print(f"figures: {run / 'metrics.json'}\npictures: {', '.join(pictures)} in {run}")
     return figures
+
+
+def relight_command(arguments: argparse.Namespace) -> list[Path]:
+    """Render the test views, and movies, of a run under another light."""
+    from geosplat_jax.relight import RelightOptions, load_light, relight_views
+    from geosplat_jax.renderer import Renderer
+    from geosplat_jax.scene import EnvLight
+    from geosplat_jax.train import load_run
+
+    run = arguments.run
+    record = _recorded(run)
+    light = load_light(arguments.env)
+    light = EnvLight(arguments.intensity * light.radiance)
+    dataset = _load(record["scene"], record["dataset"])
+    views = dataset.test if dataset.test.names else dataset.train
+    config, params, context, capacities, _ = load_run(run)
+    renderer = Renderer(config, params, context, capacities, samples=arguments.samples)
+    relit = renderer.relit(light, albedo_scale=arguments.albedo_scale, indirect=arguments.indirect)
+    folder = arguments.output or run / f"relight_{arguments.env.stem}"
+    folder.mkdir(parents=True, exist_ok=True)
+    options = RelightOptions(
+        turntable=arguments.turntable,
+        rotate_env=arguments.rotate_env,
+        background=arguments.background,
+        suffix=f".{arguments.movie}" if arguments.movie else None,
+        frames_per_second=arguments.fps,
+    )
+    written = relight_views(relit, light, views, folder, options)
+    print(f"{len(written)} files: {folder}")
+    return written
 
 
 def _peak_memory(run: Path) -> int | None:
@@ -310,8 +431,8 @@ def render_command(run: Path, views: str, output: Path | None) -> None:
     """Render every view of a split into ``rgb_*.png`` with straight alpha, and its normals."""
     import numpy as np
 
-    from geosplat_jax.evaluate import Renderer, straight_rgba
     from geosplat_jax.io.sheets import normals_to_rgb
+    from geosplat_jax.renderer import Renderer, straight_rgba
     from geosplat_jax.train import load_run
 
     record = _recorded(run)
@@ -395,9 +516,17 @@ def _run(arguments: argparse.Namespace) -> None:
             _config_from(arguments),
             _scene_options(arguments),
             resume=arguments.resume,
+            stage_1=arguments.stage_1,
         )
     elif arguments.command == "evaluate":
-        evaluate_command(arguments.run)
+        evaluate_command(
+            arguments.run,
+            protocol=arguments.protocol,
+            samples=arguments.samples,
+            relight_indirect=arguments.relight_indirect,
+        )
+    elif arguments.command == "relight":
+        relight_command(arguments)
     elif arguments.command == "render":
         render_command(arguments.run, arguments.views, arguments.output)
     elif arguments.command == "gradcheck":

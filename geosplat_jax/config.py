@@ -13,9 +13,11 @@ from typing import Any
 from geosplat_jax import adapter as adapter_module
 from geosplat_jax.adapter import AdapterConstants
 from geosplat_jax.hashgrid import HashGridSpec
+from geosplat_jax.indirect import COEFFICIENTS
 from geosplat_jax.losses import LossWeights, Objective
 from geosplat_jax.materials import INITIAL_LOGITS, MaterialSpec
 from geosplat_jax.render import Model
+from geosplat_jax.transport import Transport
 
 PRESETS = ("default", "paper", "code")
 QUALITIES = ("draft", "standard", "high")
@@ -63,9 +65,11 @@ class RateConfig:
     Attributes
     ----------
     sdf, deform, weights : the isosurface.
-    albedo, shine, shift : heads and tables of albedo, of roughness and metallic, of the shift.
+    albedo, shine, shift, indirect : heads and tables of albedo, of roughness and metallic, of the
+        shift, of indirect light.
     light, exposure : radiometry.
     half_life : steps after which all rates have halved.
+    warmup : steps over which the isosurface's rates rise from zero, quadratically.
     """
 
     sdf: float = 1e-2
@@ -74,9 +78,11 @@ class RateConfig:
     albedo: float = 3e-3
     shine: float = 1.5e-3
     shift: float = 3e-3
+    indirect: float = 1e-2
     light: float = 1e-2
     exposure: float = 5e-3
     half_life: float = 800.0
+    warmup: int = 0
 
     def __post_init__(self) -> None:
         """Validate every field."""
@@ -108,6 +114,7 @@ class LossConfig:
     weights: float = 0.1
     smoothness: float = 0.03
     light: float = 0.0
+    indirect: float = 0.0
 
     def __post_init__(self) -> None:
         """Validate every field."""
@@ -128,6 +135,7 @@ class LossConfig:
             weights=self.weights,
             smoothness=self.smoothness,
             light=self.light,
+            indirect=self.indirect,
         )
 
 
@@ -162,9 +170,53 @@ class RunConfig:
             raise ValueError(f"run.preview_every must not be negative, got {self.preview_every}")
 
 
+def _stage_2_rates() -> RateConfig:
+    """Rates of REFERENCE 2.7: a slower surface, faster materials."""
+    return RateConfig(
+        sdf=3e-3, deform=3e-3, weights=3e-3, albedo=1e-2, shine=2e-3, half_life=800.0, warmup=50
+    )
+
+
+def _stage_2_loss() -> LossConfig:
+    """Weights of stage 2."""
+    return LossConfig(entropy=0.2, entropy_end=0.01, light=0.15, indirect=0.001)
+
+
+@dataclass(frozen=True)
+class TransportConfig:
+    """Stage 2: what is light, what is material, by tracing shadows (Monte Carlo shading).
+
+    Attributes
+    ----------
+    steps : optimiser steps after those of stage 1; 0 leaves the stage out.
+    batch_views : full views a step.
+    fresh_albedo : start with a new albedo field; the preset `code` must, since its stage 1 stores
+        radiance there.
+    shading : see `Transport`.
+    rates, loss : as in stage 1, with Adam started afresh and schedules counted from here.
+    """
+
+    steps: int = 300
+    batch_views: int = 4
+    fresh_albedo: bool = False
+    shading: Transport = Transport(method="monte_carlo", indirect="constant")
+    rates: RateConfig = field(default_factory=_stage_2_rates)
+    loss: LossConfig = field(default_factory=_stage_2_loss)
+
+    def __post_init__(self) -> None:
+        """Validate every field."""
+        if self.steps < 0:
+            raise ValueError(f"transport.steps must not be negative, got {self.steps}")
+        if self.batch_views < 1:
+            raise ValueError(f"transport.batch_views must be at least 1, got {self.batch_views}")
+
+
 @dataclass(frozen=True)
 class Config:
-    """Everything a run depends on beside the scene."""
+    """Everything a run depends on beside the scene.
+
+    What stands outside ``transport`` is stage 1 (see `stage`).
+    """
 
     preset: str = "default"
     quality: str = "standard"
@@ -175,6 +227,43 @@ class Config:
     loss: LossConfig = field(default_factory=LossConfig)
     rates: RateConfig = field(default_factory=RateConfig)
     run: RunConfig = field(default_factory=RunConfig)
+    transport: TransportConfig = field(default_factory=TransportConfig)
+
+    @property
+    def total_steps(self) -> int:
+        """Steps of all stages."""
+        return self.run.steps + self.transport.steps
+
+    def first_step(self, number: int) -> int:
+        """Step that stage 1 or 2 starts at."""
+        return 0 if number == 1 else self.run.steps
+
+    def stage(self, number: int) -> "Config":
+        """Return the settings of stage 1, or those of stage 2 in their places.
+
+        Raises
+        ------
+        ValueError
+            For another number.
+        """
+        if number == 1:
+            return self
+        if number != 2:
+            raise ValueError(f"a run has stages 1 and 2, not {number}")
+        later = self.transport
+        learned = COEFFICIENTS[later.shading.indirect]
+        material = replace(self.model.material, indirect_outputs=learned)
+        return replace(
+            self,
+            geometry=replace(self.geometry, vertex_fraction=0.0),
+            model=replace(
+                self.model, material=material, transport=later.shading, baked_diffuse=False
+            ),
+            objective=replace(self.objective, with_light=later.loss.light > 0),
+            loss=later.loss,
+            rates=later.rates,
+            run=replace(self.run, steps=max(later.steps, 1), batch_views=later.batch_views),
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionary, ready for JSON."""
@@ -259,6 +348,11 @@ _QUALITY: dict[str, dict[str, Any]] = {
         "geometry": {"resolution": 32},
         "run": {"steps": 200, "batch_views": 2, "checkpoint_every": 100},
         "rates": {"half_life": 100.0},
+        "transport": {
+            "steps": 100,
+            "batch_views": 2,
+            "rates": {"half_life": 50.0, "warmup": 20},
+        },
         "model": {
             "material": {"grid": {"levels": 6, "features": 4, "log2_entries": 14, "finest": 128}},
         },
@@ -268,6 +362,7 @@ _QUALITY: dict[str, dict[str, Any]] = {
         "geometry": {"resolution": 80},
         "run": {"steps": 1000, "batch_views": 6},
         "rates": {"half_life": 400.0},
+        "transport": {"steps": 600, "batch_views": 6, "shading": {"light": 8, "diffuse": 8}},
     },
 }
 
@@ -292,6 +387,18 @@ def _original(
     )
 
 
+def _original_transport(indirect: str, *, light: float, fresh_albedo: bool) -> TransportConfig:
+    """Return what the paper and the authors share in stage 2: 64 samples of either kind."""
+    shading = Transport(method="monte_carlo", light=64, diffuse=32, specular=32, indirect=indirect)
+    return TransportConfig(
+        steps=500,
+        batch_views=8,
+        fresh_albedo=fresh_albedo,
+        shading=shading,
+        loss=LossConfig(light=light, indirect=0.001),
+    )
+
+
 def _preset(name: str) -> Config:
     """Return the settings that define a preset, at standard quality."""
     if name == "paper":
@@ -304,7 +411,8 @@ def _preset(name: str) -> Config:
             baked_diffuse=False,
         )
         objective = Objective(entropy_reduction="sum")
-        return replace(paper, loss=LossConfig(l1=1.0), objective=objective)
+        transport = _original_transport("harmonics", light=0.15, fresh_albedo=True)
+        return replace(paper, loss=LossConfig(l1=1.0), objective=objective, transport=transport)
     if name == "code":
         code = _original(
             name,
@@ -314,7 +422,9 @@ def _preset(name: str) -> Config:
             has_shift=True,
             baked_diffuse=True,
         )
-        return replace(code, loss=LossConfig(entropy_end=0.12, entropy_end_fraction=1.0))
+        transport = _original_transport("constant", light=0.0, fresh_albedo=True)
+        first = LossConfig(entropy_end=0.12, entropy_end_fraction=1.0)
+        return replace(code, loss=first, transport=transport)
     return Config(preset="default", model=Model(material=MaterialSpec(shared=True)))
 
 

@@ -1,6 +1,6 @@
-"""Evaluation of a run on test views: named protocol, figures, and one sheet to look at.
+"""Evaluation of a run on test views: named protocols, figures, and sheets to look at.
 
-Everything here runs on the host around the jitted `render.render`.
+Everything here runs on the host around `renderer.Renderer`.
 """
 
 import importlib.metadata
@@ -8,20 +8,16 @@ import json
 import platform
 import resource
 import time
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
-from geosplat_jax import capacity as capacity_module
+from geosplat_jax import protocols
 from geosplat_jax.capacity import Capacities
-from geosplat_jax.color import tone_map
 from geosplat_jax.config import Config
-from geosplat_jax.geometry import isosurface, vertex_normals
-from geosplat_jax.io.images import encode_srgb, write_png
+from geosplat_jax.io.images import write_png
 from geosplat_jax.io.meshes import render_mesh_normals
 from geosplat_jax.io.sheets import normals_to_rgb, overview_sheet, shade_mesh_preview
 from geosplat_jax.io.views import Views
@@ -31,106 +27,26 @@ from geosplat_jax.metrics import (
     psnr,
     ssim,
 )
-from geosplat_jax.render import Context, Params, render
-from geosplat_jax.scene import Camera, Mesh
+from geosplat_jax.protocols import Protocol
+from geosplat_jax.render import Context, Params
+from geosplat_jax.renderer import (
+    DEFAULT_SAMPLES,
+    RenderedView,
+    Renderer,
+    over_background,
+    to_picture,
+)
+from geosplat_jax.scene import EnvLight
 
-_EVALUATION_AOVS = ("albedo", "roughness", "metallic", "normal")
 _PACKAGES = ("jax", "jaxlib", "numpy", "optax", "geosplat_jax")
-
-_render = partial(jax.jit, static_argnames=("model", "capacities", "sampling", "aov_names"))(render)
-_isosurface = partial(jax.jit, static_argnames=("capacities", "training"))(isosurface)
-_vertex_normals = jax.jit(vertex_normals)
-
-
-@dataclass(frozen=True)
-class RenderedView:
-    """One rendered view on the host: premultiplied by alpha, float32.
-
-    Attributes
-    ----------
-    rgb : (H, W, 3) linear, exposed and tone mapped.
-    alpha : (H, W).
-    aovs : albedo, roughness, metallic, normal; (H, W, c) each.
-    """
-
-    rgb: np.ndarray
-    alpha: np.ndarray
-    aovs: dict[str, np.ndarray]
-
-
-class Renderer:
-    """Render views of fixed parameters one at a time, growing buffers as needed."""
-
-    def __init__(
-        self, config: Config, params: Params, context: Context, capacities: Capacities
-    ) -> None:
-        self._config = config
-        self._params = params
-        self._context = context
-        self._capacities = capacities
-
-    def __call__(self, camera: Camera) -> RenderedView:
-        """Render the single view of ``camera``, with every AOV of the evaluation."""
-        while True:
-            output = _render(
-                self._params,
-                camera,
-                self._context,
-                model=self._config.model,
-                capacities=self._capacities,
-                aov_names=_EVALUATION_AOVS,
-            )
-            if not capacity_module.overflowed(output.usage, self._capacities):
-                break
-            self._capacities = capacity_module.grow(self._capacities, output.usage)
-        rgb = tone_map(output.rgb[0], self._params.log_exposure)
-        return RenderedView(
-            np.asarray(rgb),
-            np.asarray(output.alpha[0]),
-            {name: np.asarray(image[0]) for name, image in output.aovs.items()},
-        )
-
-    def mesh(self, *, training: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Extract the surface: vertices (n, 3), faces (m, 3) and vertex normals (n, 3)."""
-        while True:
-            surface = _isosurface(
-                self._params.geometry,
-                self._context.grid,
-                capacities=self._capacities,
-                training=training,
-            )
-            if not capacity_module.overflowed(surface.usage, self._capacities):
-                break
-            self._capacities = capacity_module.grow(self._capacities, surface.usage)
-        return trim_mesh(surface.mesh)
-
-
-def trim_mesh(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Drop padding: vertices, faces and vertex normals on the host."""
-    normals = np.asarray(_vertex_normals(mesh))
-    vertex_count, face_count = int(mesh.vertex_count), int(mesh.face_count)
-    return (
-        np.asarray(mesh.vertices)[:vertex_count],
-        np.asarray(mesh.faces)[:face_count],
-        normals[:vertex_count],
-    )
-
-
-def over_background(rgb: np.ndarray, alpha: np.ndarray, background: float) -> np.ndarray:
-    """Lay premultiplied colour over a grey background."""
-    return rgb + (1.0 - alpha[..., None]) * background
-
-
-def _encode(linear: np.ndarray) -> np.ndarray:
-    """Return sRGB in [0, 1] on the host."""
-    return np.clip(encode_srgb(np.clip(linear, 0.0, 1.0)), 0.0, 1.0)
+_MATERIALS = ("roughness", "metallic")
 
 
 def _view_figures(view: RenderedView, image: np.ndarray, truth_normal: np.ndarray | None) -> dict:
     """Figures of one view; ``image`` is (H, W, 4) linear with straight alpha."""
     mask = image[..., 3]
-    predicted = _encode(over_background(view.rgb, view.alpha, 1.0))
-    wanted = _encode(over_background(image[..., :3] * mask[..., None], mask, 1.0))
+    predicted = to_picture(over_background(view.rgb, view.alpha, 1.0))
+    wanted = to_picture(over_background(image[..., :3] * mask[..., None], mask, 1.0))
     figures = {
         "nvs.psnr": float(psnr(predicted, wanted)),
         "nvs.ssim": float(ssim(predicted, wanted)),
@@ -146,6 +62,58 @@ def _view_figures(view: RenderedView, image: np.ndarray, truth_normal: np.ndarra
     return figures
 
 
+def _stacked(rendered: list[RenderedView], name: str) -> np.ndarray:
+    """Return an AOV of all views, (V, H, W, c), or (V, H, W) for one channel."""
+    maps = np.stack([view.aovs[name] for view in rendered])
+    return maps[..., 0] if maps.shape[-1] == 1 else maps
+
+
+def _material_figures(
+    protocol: Protocol, rendered: list[RenderedView], views: Views
+) -> tuple[dict[str, Any], np.ndarray]:
+    """Figures of albedo, roughness and metallic where there is truth, and the albedo's scale."""
+    alpha = np.stack([view.alpha for view in rendered])
+    mask = views.images[..., 3]
+    figures: dict[str, Any] = {}
+    scale = np.ones(3)
+    if "albedo" in views.truth:
+        truth = views.truth["albedo"] * mask[..., None]
+        albedo = _stacked(rendered, "albedo")
+        scale = protocols.albedo_scale(protocol, albedo, alpha, truth, mask)
+        figures |= protocols.albedo_figures(protocol, albedo, alpha, truth, mask, scale)
+        figures |= {f"albedo.scale_{c}": float(x) for c, x in zip("rgb", scale, strict=True)}
+    known = {name: views.truth[name][..., 0] * mask for name in _MATERIALS if name in views.truth}
+    if known:
+        found = {name: _stacked(rendered, name) for name in _MATERIALS}
+        figures |= protocols.material_figures(found, alpha, known, mask)
+    return figures, scale
+
+
+def _relight_figures(
+    protocol: Protocol,
+    renderer: Renderer,
+    views: Views,
+    lights: Mapping[str, EnvLight],
+    albedo_scale: np.ndarray,
+    indirect: str,
+) -> tuple[dict[str, float], dict[str, list[RenderedView]]]:
+    """Figures of the views under every light that has true images and a map, and the renders."""
+    figures: dict[str, float] = {}
+    renders: dict[str, list[RenderedView]] = {}
+    for name in sorted(set(views.relight) & set(lights)):
+        relit = renderer.relit(lights[name], albedo_scale=albedo_scale, indirect=indirect)
+        renders[name] = [relit(views.camera(np.array([i]))) for i in range(len(views))]
+        rgb = np.stack([view.rgb for view in renders[name]])
+        alpha = np.stack([view.alpha for view in renders[name]])
+        found = protocols.relight_figures(protocol, rgb, alpha, views.relight[name])
+        figures |= {f"relight.{name}.{key}": value for key, value in found.items()}
+    if renders:
+        for key in ("psnr", "ssim", "psnr_masked", "ssim_masked"):
+            values = [figures[f"relight.{name}.{key}"] for name in renders]
+            figures[f"relight.mean.{key}"] = float(np.mean(values))
+    return figures, renders
+
+
 def evaluate_run(
     config: Config,
     params: Params,
@@ -155,24 +123,36 @@ def evaluate_run(
     folder: Path,
     *,
     meta: dict[str, Any],
+    protocol: str = "geosplatting",
+    lights: Mapping[str, EnvLight] | None = None,
+    train_light: EnvLight | None = None,
+    samples: int = DEFAULT_SAMPLES,
+    relight_indirect: str = "traced",
     sheet_views: int = 5,
 ) -> dict[str, Any]:
-    """Render every test view, write ``metrics.json`` and ``overview.png``, return the figures.
+    """Render every test view, write figures and sheets, return the figures.
 
-    Protocol ``geosplatting``: sRGB, white background, mean over the images of the measure of each
-    whole image; normals once over the mask's pixels and once over all of them, with (0, 0, 1)
-    behind the object.
+    Writes ``metrics.json``, ``overview.png`` and, where the scene has the truth of them,
+    ``materials.png`` and ``relight.png``. New views are always compared in sRGB on white, as the
+    mean over the images of the measure of each; normals once over the mask's pixels and once over
+    all of them, with (0, 0, 1) behind the object. See `protocols` for the rest.
 
     Parameters
     ----------
     config, params, context, capacities : see `train.load_run`.
-    views : test views; figures need ``truth`` only where it exists.
-    folder : receives the two files.
+    views : test views; figures need ``truth`` and ``relight`` only where they exist.
+    folder : receives the files.
     meta : recorded with the figures (step, scene, training seconds).
-    sheet_views : number of views on the sheet, spread evenly.
+    protocol : one of `protocols.PROTOCOLS`.
+    lights : environment maps by the names of ``views.relight``.
+    train_light : true light of the training images, to compare the recovered one with.
+    samples : rays a splat of the images.
+    relight_indirect : see `Renderer.relit`.
+    sheet_views : number of views on the sheets, spread evenly.
     """
     began = time.perf_counter()
-    renderer = Renderer(config, params, context, capacities)
+    chosen_protocol = protocols.protocol(protocol)
+    renderer = Renderer(config, params, context, capacities, samples=samples)
     rendered, per_view = [], []
     for index, name in enumerate(views.names):
         view = renderer(views.camera(np.array([index])))
@@ -180,10 +160,22 @@ def evaluate_run(
         per_view.append({"view": name, **_view_figures(view, views.images[index], normal)})
         rendered.append(view)
     names = [key for key in per_view[0] if key != "view"]
+    mean = {key: float(np.mean([line[key] for line in per_view])) for key in names}
+    materials, scale = _material_figures(chosen_protocol, rendered, views)
+    relights, relit = _relight_figures(
+        chosen_protocol, renderer, views, lights or {}, scale, relight_indirect
+    )
+    mean |= materials | relights
+    radiance = np.asarray(params.light.radiance)
+    if train_light is not None:
+        found = protocols.light_figures(radiance, np.asarray(train_light.radiance))
+        mean |= {key: value for key, value in found.items() if isinstance(value, int | float)}
     figures = {
-        "protocol": "geosplatting",
-        "mean": {key: float(np.mean([line[key] for line in per_view])) for key in names},
+        "protocol": protocol,
+        "notes": [protocols.lpips_note(chosen_protocol)],
+        "mean": mean,
         "views": per_view,
+        "samples": samples,
         "seconds": round(time.perf_counter() - began, 2),
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
         "versions": {
@@ -196,14 +188,58 @@ def evaluate_run(
     }
     (folder / "metrics.json").write_text(json.dumps(figures, indent=2) + "\n")
     chosen = np.unique(np.linspace(0, len(rendered) - 1, sheet_views).round().astype(int))
-    sheet = _overview(renderer, params, views, rendered, chosen)
-    write_png(folder / "overview.png", sheet)
+    write_png(folder / "overview.png", _overview(renderer, radiance, views, rendered, chosen))
+    if materials:
+        write_png(folder / "materials.png", _materials_sheet(views, rendered, chosen, scale))
+    if relit:
+        write_png(folder / "relight.png", _relight_sheet(views, relit, chosen))
     return figures
+
+
+def _materials_sheet(
+    views: Views, rendered: list[RenderedView], chosen: np.ndarray, scale: np.ndarray
+) -> np.ndarray:
+    """Compose a sheet of attributes beside the truth, the albedo in its scale."""
+    rows = []
+    for index in chosen:
+        mask, row = views.images[index][..., 3:], {}
+        for name in ("albedo", "roughness", "metallic", "normal"):
+            if name not in views.truth:
+                continue
+            true, found = views.truth[name][index], rendered[index].aovs[name]
+            if name == "albedo":
+                pair = to_picture(found * scale), to_picture(true * mask)
+            elif name == "normal":
+                alpha = rendered[index].alpha
+                pair = normals_to_rgb(found, alpha), normals_to_rgb(true, mask[..., 0])
+            else:
+                pair = tuple(np.clip(np.repeat(x, 3, axis=-1), 0, 1) for x in (found, true * mask))
+            row[name], row[f"true {name}"] = pair
+        rows.append(row)
+    return overview_sheet(rows)
+
+
+def _relight_sheet(
+    views: Views, relit: Mapping[str, list[RenderedView]], chosen: np.ndarray
+) -> np.ndarray:
+    """Compose a sheet of relit views beside the truth."""
+    rows = []
+    for index in chosen:
+        row = {}
+        for name, renders in relit.items():
+            view, image = renders[index], views.relight[name][index]
+            mask = image[..., 3]
+            row[name] = to_picture(over_background(view.rgb, view.alpha, 1.0))
+            row[f"true {name}"] = to_picture(
+                over_background(image[..., :3] * mask[..., None], mask, 1.0)
+            )
+        rows.append(row)
+    return overview_sheet(rows)
 
 
 def _overview(
     renderer: Renderer,
-    params: Params,
+    radiance: np.ndarray,
     views: Views,
     rendered: list[RenderedView],
     chosen: np.ndarray,
@@ -215,10 +251,10 @@ def _overview(
         view, image = rendered[index], views.images[index]
         mask = image[..., 3]
         row = {
-            "truth": _encode(over_background(image[..., :3] * mask[..., None], mask, 1.0)),
-            "render": _encode(over_background(view.rgb, view.alpha, 1.0)),
+            "truth": to_picture(over_background(image[..., :3] * mask[..., None], mask, 1.0)),
+            "render": to_picture(over_background(view.rgb, view.alpha, 1.0)),
             "normal": normals_to_rgb(view.aovs["normal"], view.alpha),
-            "albedo": _encode(view.aovs["albedo"]),
+            "albedo": to_picture(view.aovs["albedo"]),
             "roughness": np.repeat(view.aovs["roughness"], 3, axis=-1),
             "metallic": np.repeat(view.aovs["metallic"], 3, axis=-1),
         }
@@ -226,7 +262,6 @@ def _overview(
         mesh_normals, mesh_alpha = render_mesh_normals(vertices, faces, normals, camera)
         row["mesh"] = shade_mesh_preview(mesh_normals, mesh_alpha)
         rows.append(row)
-    radiance = np.asarray(params.light.radiance)
     return overview_sheet(rows, light=radiance)
 
 
@@ -234,19 +269,12 @@ def preview_image(
     config: Config, params: Params, context: Context, capacities: Capacities, views: Views
 ) -> np.ndarray:
     """Put truth, render and normals of the first view side by side, (H, 3 W, 3) sRGB."""
-    view = Renderer(config, params, context, capacities)(views.camera(np.array([0])))
+    view = Renderer(config, params, context, capacities, samples=64)(views.camera(np.array([0])))
     image = views.images[0]
     mask = image[..., 3]
     parts = [
-        _encode(over_background(image[..., :3] * mask[..., None], mask, 1.0)),
-        _encode(over_background(view.rgb, view.alpha, 1.0)),
+        to_picture(over_background(image[..., :3] * mask[..., None], mask, 1.0)),
+        to_picture(over_background(view.rgb, view.alpha, 1.0)),
         normals_to_rgb(view.aovs["normal"], view.alpha),
     ]
     return np.concatenate(parts, axis=1)
-
-
-def straight_rgba(view: RenderedView) -> np.ndarray:
-    """Return sRGB with straight alpha, (H, W, 4); colour is zero where nothing was hit."""
-    alpha = view.alpha[..., None]
-    straight = np.where(alpha > 0, view.rgb / np.where(alpha > 0, alpha, 1.0), 0.0)
-    return np.concatenate([_encode(straight), np.clip(alpha, 0.0, 1.0)], axis=-1)

@@ -14,9 +14,10 @@ from geosplat_jax.capacity import Capacities, Usage
 from geosplat_jax.color import linear_to_srgb, tone_map
 from geosplat_jax.geometry import sdf_entropy, weight_magnitude
 from geosplat_jax.materials import smoothness
-from geosplat_jax.numerics import absolute, safe_log
+from geosplat_jax.numerics import absolute, safe_divide, safe_log
 from geosplat_jax.pytree import register_pytree
 from geosplat_jax.render import (
+    Asset,
     Context,
     Model,
     Params,
@@ -28,6 +29,8 @@ from geosplat_jax.scene import Batch
 from geosplat_jax.ssim import ssim
 
 _DECIBEL = 10.0 / 2.302585092994046
+_LIGHT_STREAM = 3
+"""Number of the random stream of the light samples; 0 to 2 are those of the loss itself."""
 
 
 @register_pytree
@@ -42,6 +45,7 @@ class LossWeights:
     deviation, weights : FlexiCubes regularisers.
     smoothness : material smoothness, Eq. 15-17.
     light : demodulated light against image brightness, Eq. 18.
+    indirect : mean magnitude of the learned indirect light.
     """
 
     l1: Float[Array, ""] | float = 0.8
@@ -52,6 +56,7 @@ class LossWeights:
     weights: Float[Array, ""] | float = 0.1
     smoothness: Float[Array, ""] | float = 0.03
     light: Float[Array, ""] | float = 0.0
+    indirect: Float[Array, ""] | float = 0.0
 
 
 TERM_NAMES = tuple(f.name for f in fields(LossWeights))
@@ -166,6 +171,16 @@ def light_term(
     return jnp.mean(mask * absolute(light - value))
 
 
+def indirect_magnitude(asset: Asset) -> Float[Array, ""]:
+    """Mean magnitude of an asset's learned indirect light, as logits; 0 where none is learned."""
+    if asset.coefficients is None:
+        return jnp.zeros_like(asset.deviation)
+    mask = asset.gaussians.mask
+    total = jnp.sum(jnp.where(mask[:, None], absolute(asset.coefficients), 0.0))
+    count = jnp.sum(mask).astype(total.dtype) * asset.coefficients.shape[1]
+    return safe_divide(total, count)
+
+
 def loss(
     params: Params,
     batch: Batch,
@@ -192,6 +207,7 @@ def loss(
     report : see `LossReport`.
     """
     background_key, pick_key, noise_key = jax.random.split(batch.key, 3)
+    light_key = jax.random.fold_in(batch.key, _LIGHT_STREAM)
     build = {"model": model, "capacities": capacities}
     asset = reconstruct(params, context, sampling=sampling, **build)
     output = render_views(
@@ -200,6 +216,7 @@ def loss(
         batch.camera,
         context,
         aov_names=("diffuse", "specular") if objective.with_light else (),
+        key=light_key,
         **build,
     )
     rgb = tone_map(output.rgb, params.log_exposure)
@@ -232,6 +249,7 @@ def loss(
     terms["deviation"] = asset.deviation
     terms["weights"] = weight_magnitude(params.geometry)
     terms["light"] = jnp.zeros_like(mse)
+    terms["indirect"] = indirect_magnitude(asset)
     if objective.with_light:
         terms["light"] = light_term(output.aovs["diffuse"], output.aovs["specular"], batch.image)
 

@@ -60,7 +60,8 @@ class MaterialSpec:
         starts at a plausible material; see `INITIAL_LOGITS`.
     has_metallic : without it metallic is zero and has no parameters.
     has_shift : whether there is a head for the inward shift of Gaussians.
-    has_indirect : whether there is a head for indirect light (6 numbers a point).
+    indirect_outputs : learned numbers of indirect light a point (`indirect.COEFFICIENTS`); 0 for
+        no such head.
     """
 
     grid: HashGridSpec = HashGridSpec()
@@ -72,7 +73,7 @@ class MaterialSpec:
     initial_metallic_logit: float = 0.0
     has_metallic: bool = True
     has_shift: bool = True
-    has_indirect: bool = False
+    indirect_outputs: int = 0
 
 
 @register_pytree
@@ -85,7 +86,7 @@ class MaterialField:
     albedo_table : (E, F) encoding of albedo and indirect light, or of everything when shared.
     surface_table : (E, F) encoding of roughness, metallic and shift; None when shared.
     albedo_head : 3 outputs. surface_head : roughness and, with metallic, 2 outputs.
-    shift_head : 1 output or None. indirect_head : 6 outputs or None.
+    shift_head : 1 output or None. indirect_head : ``indirect_outputs`` outputs or None.
     """
 
     albedo_table: Float[Array, "E F"]
@@ -120,8 +121,16 @@ def init_materials(key: Key[Array, ""], spec: MaterialSpec) -> MaterialField:
         albedo_head=head("albedo", spec.albedo_hidden, 3),
         surface_head=head("surface", spec.surface_hidden, 2 if spec.has_metallic else 1),
         shift_head=head("shift", spec.surface_hidden, 1) if spec.has_shift else None,
-        indirect_head=head("indirect", spec.albedo_hidden, 6) if spec.has_indirect else None,
+        indirect_head=init_indirect_head(keys["indirect"], spec),
     )
+
+
+def init_indirect_head(key: Key[Array, ""], spec: MaterialSpec) -> tuple[Layer, ...] | None:
+    """Draw the head of indirect light; None for a spec without one."""
+    if not spec.indirect_outputs:
+        return None
+    widths = (spec.grid.width, *spec.albedo_hidden, spec.indirect_outputs)
+    return init_mlp(key, widths, bias=spec.bias)
 
 
 def to_unit_cube(
@@ -237,8 +246,8 @@ def indirect_logits(
     spec: MaterialSpec,
     center: Float[Array, " 3"],
     half_extent: Float[Array, ""],
-) -> Float[Array, "N 6"]:
-    """Raw indirect light (diffuse rgb, specular rgb) at points; shading gives it its range.
+) -> Float[Array, "N c"]:
+    """Raw indirect light at points (see `indirect`); shading gives it its range.
 
     Raises
     ------
@@ -246,7 +255,7 @@ def indirect_logits(
         When the field has no indirect head.
     """
     if params.indirect_head is None:
-        raise ValueError("the field has no indirect head; build it with has_indirect=True")
+        raise ValueError("the field has no indirect head; build it with indirect_outputs")
     unit = to_unit_cube(jax.lax.stop_gradient(points), center, half_extent)
     return apply_mlp(params.indirect_head, encode(params.albedo_table, unit, spec=spec.grid))
 

@@ -4,14 +4,16 @@ Arrays may be NumPy or JAX. Images are (H, W, C) in whatever encoding the protoc
 are boolean or fractional coverage, where ``> 0.5`` is inside.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Shaped
 
 from geosplat_jax.numerics import safe_divide, safe_log, safe_normalize
 from geosplat_jax.rotation import angle_between
-from geosplat_jax.ssim import ssim
+from geosplat_jax.ssim import WINDOW_SIZE, ssim
 
 __all__ = [
+    "MASK_THRESHOLD",
     "albedo_scale_least_squares",
     "albedo_scale_median",
     "composite",
@@ -19,18 +21,22 @@ __all__ = [
     "mse",
     "normal_mae_deg",
     "psnr",
+    "psnr_of_mse",
     "ssim",
+    "ssim_masked",
 ]
 
-_MASK_THRESHOLD = 0.5
+MASK_THRESHOLD = 0.5
+"""A pixel lies inside a fractional mask where its coverage exceeds this."""
+
 _RATIO_FLOOR = 1e-4
 _BACKGROUND_NORMAL = (0.0, 0.0, 1.0)
 
 
-def _inside(mask: Shaped[ArrayLike, "H W"]) -> Bool[Array, "H W"]:
+def _inside(mask: Shaped[ArrayLike, "*size"]) -> Bool[Array, "*size"]:
     """Booleans of a boolean or fractional mask."""
     mask = jnp.asarray(mask)
-    return mask if mask.dtype == jnp.bool_ else mask > _MASK_THRESHOLD
+    return mask if mask.dtype == jnp.bool_ else mask > MASK_THRESHOLD
 
 
 def mse(
@@ -48,6 +54,17 @@ def mse(
     return safe_divide(jnp.sum(weight * squared), jnp.sum(weight))
 
 
+def psnr_of_mse(error: Float[ArrayLike, ""]) -> Float[Array, ""]:
+    """Peak signal-to-noise ratio in decibels of a mean squared error relative to the range.
+
+    The error is floored at 1e-20: equal images give 200 dB, not infinity. NaN stays NaN.
+    """
+    error = jnp.asarray(error)
+    decibels = (-10.0 / jnp.log(jnp.asarray(10.0, error.dtype))) * safe_log(error)
+    # The floor would make an image of NaN the best of all.
+    return jnp.where(jnp.isnan(error), error, decibels)
+
+
 def psnr(
     image: Float[ArrayLike, "*size"],
     truth: Float[ArrayLike, "*size"],
@@ -58,10 +75,32 @@ def psnr(
     """Peak signal-to-noise ratio in decibels, ``-10 log10(MSE / data_range^2)``.
 
     The mean runs over all pixels with their background, or over the pixels inside ``mask``. The
-    error is floored at 1e-20 of the squared range: equal images give 200 dB, not infinity.
+    error is floored as in `psnr_of_mse`.
     """
-    error = mse(image, truth, mask) / data_range**2
-    return (-10.0 / jnp.log(jnp.asarray(10.0, error.dtype))) * safe_log(error)
+    return psnr_of_mse(mse(image, truth, mask) / data_range**2)
+
+
+def ssim_masked(
+    image: Float[ArrayLike, "H W C"],
+    truth: Float[ArrayLike, "H W C"],
+    mask: Shaped[ArrayLike, "H W"],
+) -> Float[Array, ""]:
+    """Mean structural similarity over the windows that touch the mask; 1 for an empty mask.
+
+    Pixels outside the mask are black in both images, so that the background says nothing; the edge
+    of the mask, which is then equal in both, raises the figure of small objects. The windows are
+    those of `ssim`: 11 pixels wide and wholly inside the image.
+    """
+    inside = _inside(mask)
+    # Windows without a pixel of the mask are equal and count exactly one, so the mean over the
+    # others follows from the mean over all of them.
+    cut = [jnp.where(inside[..., None], jnp.asarray(x), 0.0) for x in (image, truth)]
+    missing = [(0, max(0, WINDOW_SIZE - size)) for size in inside.shape]
+    padded = jnp.pad(inside, missing, mode="edge").astype(jnp.float32)
+    window = (WINDOW_SIZE, WINDOW_SIZE)
+    touches = jax.lax.reduce_window(padded, 0.0, jax.lax.max, window, (1, 1), "valid")
+    dissimilarity = 1.0 - ssim(*cut)
+    return 1.0 - safe_divide(dissimilarity, jnp.mean(touches).astype(dissimilarity.dtype))
 
 
 def mask_iou(mask: Shaped[ArrayLike, "H W"], truth: Shaped[ArrayLike, "H W"]) -> Float[Array, ""]:

@@ -1,14 +1,15 @@
 """The composition: parameters and cameras in, images out; the only module that sees every stage.
 
-`reconstruct` runs what does not depend on the view (isosurface, adapter, materials), `render_views`
-what does (visibility, shading, rasterisation). `render` is the two in a row.
+`reconstruct` runs what depends neither on the light nor on the view (isosurface, adapter,
+materials), `illuminate_asset` what does not depend on the view, `render_lit` the rest (visibility,
+shading, rasterisation). `render_views` is the last two in a row, `render` all three.
 """
 
 from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Key
 
 from geosplat_jax import capacity as capacity_module
 from geosplat_jax.adapter import (
@@ -20,8 +21,8 @@ from geosplat_jax.adapter import (
 )
 from geosplat_jax.capacity import Capacities, Usage
 from geosplat_jax.geometry import face_normals_and_areas, isosurface, vertex_normals
-from geosplat_jax.light import LightSpec, PrefilteredLight, PrefilterOperators, prefilter
-from geosplat_jax.materials import MaterialField, MaterialSpec, attributes_at
+from geosplat_jax.light import LightSpec, PrefilterOperators
+from geosplat_jax.materials import MaterialField, MaterialSpec, attributes_at, indirect_logits
 from geosplat_jax.numerics import safe_normalize
 from geosplat_jax.projection import project
 from geosplat_jax.pytree import register_pytree
@@ -33,9 +34,28 @@ from geosplat_jax.rasterize import (
     gather_visible,
 )
 from geosplat_jax.scene import Camera, EnvLight, Gaussians, Geometry, Grid, Materials, Mesh
-from geosplat_jax.shading import split_sum
+from geosplat_jax.shading import Shaded
+from geosplat_jax.trace import Accelerator, build_accelerator
+from geosplat_jax.transport import (
+    DENOISER_INPUTS,
+    Illumination,
+    Receivers,
+    Transport,
+    denoised,
+    illuminate,
+    shade_rows,
+)
 
-AOV_NAMES = ("albedo", "roughness", "metallic", "normal", "depth", "diffuse", "specular")
+AOV_NAMES = (
+    "albedo",
+    "roughness",
+    "metallic",
+    "normal",
+    "depth",
+    "diffuse",
+    "specular",
+    "specular_radiance",
+)
 
 
 @register_pytree
@@ -63,7 +83,7 @@ class Model:
 
     Attributes
     ----------
-    adapter, material, light : constants of the stages.
+    adapter, material, light, transport : constants of the stages.
     baked_diffuse : the authors' stage 1, where the albedo field *is* the diffuse radiance and is
         not multiplied by irradiance.
     attribute_gradient : let the attributes pull on the geometry: the fields are differentiated in
@@ -77,6 +97,7 @@ class Model:
     adapter: AdapterConstants = AdapterConstants()
     material: MaterialSpec = MaterialSpec()
     light: LightSpec = LightSpec()
+    transport: Transport = Transport()
     baked_diffuse: bool = False
     attribute_gradient: bool = False
     cull_backfaces: bool = True
@@ -113,7 +134,10 @@ class Asset:
     outward : (N, 3) geometric normal behind each splat, for culling.
     materials : attributes of the N splats.
     deviation : () mean L_dev of the isosurface, in half the longest side of the grid's box.
-    usage : true needs of the isosurface's buffers.
+    usage : true needs of the buffers so far.
+    anchors : (N, 3) where the splats' rays start, on the faces; None for the means.
+    accelerator : what rays are traced against; None where none are.
+    coefficients : (N, c) learned indirect light, or None.
     """
 
     mesh: Mesh
@@ -122,6 +146,21 @@ class Asset:
     materials: Materials
     deviation: Float[Array, ""]
     usage: Usage
+    anchors: Float[Array, "N 3"] | None = None
+    accelerator: Accelerator | None = None
+    coefficients: Float[Array, "N c"] | None = None
+
+    def receivers(self, mask: Bool[Array, " N"] | None = None) -> Receivers:
+        """Return the splats as light sees them: all, or those of a mask."""
+        return Receivers(
+            anchors=self.gaussians.means if self.anchors is None else self.anchors,
+            normals=self.gaussians.normals,
+            outward=self.outward,
+            mask=self.gaussians.mask if mask is None else self.gaussians.mask & mask,
+            materials=self.materials,
+            coefficients=self.coefficients,
+            accelerator=self.accelerator,
+        )
 
 
 @register_pytree
@@ -180,10 +219,12 @@ def reconstruct(
     Raises
     ------
     ValueError
-        If ``sampling`` is neither.
+        If ``sampling`` is neither, or vertices are to be shaded by Monte Carlo.
     """
     if sampling not in ("face", "vertex"):
         raise ValueError(f'sampling must be "face" or "vertex", got {sampling!r}')
+    if sampling == "vertex" and model.transport.method != "split_sum":
+        raise ValueError("Monte Carlo shading needs face sampling, whose splats lie on a face")
     surface = isosurface(params.geometry, context.grid, capacities=capacities, training=True)
     mesh = surface.mesh
     gaussians, outward = _sample(mesh, context.grid, model=model, sampling=sampling)
@@ -198,33 +239,32 @@ def reconstruct(
         half_extent=half_extent,
         position_gradient=model.attribute_gradient,
     )
+    anchors, coefficients = jax.lax.stop_gradient(gaussians.means), None
+    if model.transport.method == "monte_carlo" and model.material.indirect_outputs:
+        coefficients = indirect_logits(
+            params.material,
+            anchors,
+            spec=model.material,
+            center=center,
+            half_extent=half_extent,
+        )
     if shift is not None and sampling == "face":
         gaussians = shift_inwards(gaussians, *face_normals_and_areas(mesh), shift)
-    deviation = surface.deviation / half_extent
-    return Asset(mesh, gaussians, outward, materials, deviation, surface.usage)
-
-
-def _shade(
-    means: Float[Array, "n 3"],
-    normals: Float[Array, "n 3"],
-    materials: Materials,
-    camera_center: Float[Array, " 3"],
-    light: PrefilteredLight,
-    context: Context,
-    *,
-    model: Model,
-) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "n 3"]]:
-    """Radiance of splats towards the camera, and its demodulated diffuse and specular light."""
-    towards_viewer = safe_normalize(camera_center[None, :] - means)
-    shaded = split_sum(
-        materials,
-        normals,
-        towards_viewer,
-        light,
-        context.fg_table,
-        baked_diffuse=model.baked_diffuse,
+    needed, accelerator = surface.usage, None
+    if model.transport.is_traced:
+        accelerator = build_accelerator(surface, context.grid, capacities=capacities)
+        needed = capacity_module.combine(needed, accelerator.usage)
+    return Asset(
+        mesh=mesh,
+        gaussians=gaussians,
+        outward=outward,
+        materials=materials,
+        deviation=surface.deviation / half_extent,
+        usage=needed,
+        anchors=anchors,
+        accelerator=accelerator,
+        coefficients=coefficients,
     )
-    return shaded.rgb, shaded.diffuse_light, shaded.specular_light
 
 
 def _camera_center(world_to_camera: Float[Array, "4 4"]) -> Float[Array, " 3"]:
@@ -277,42 +317,85 @@ def _visible_in_view(
     )
 
 
-def _render_view(
+def _lists_of_views(
+    asset: Asset, camera: Camera, context: Context, *, model: Model, capacities: Capacities
+) -> list[TileLists]:
+    """List what every view can see."""
+    # Unrolled: independent views let XLA run their single-threaded sorts side by side.
+    return [
+        _visible_in_view(
+            asset.gaussians,
+            asset.outward,
+            camera.world_to_camera[view],
+            camera.intrinsics[view],
+            context.grid,
+            model=model,
+            capacities=capacities,
+            image_shape=(camera.height, camera.width),
+        )
+        for view in range(camera.world_to_camera.shape[0])
+    ]
+
+
+def _shade_views(
+    key: Key[Array, ""] | None,
     asset: Asset,
-    light: PrefilteredLight,
+    illumination: Illumination,
+    lists: list[TileLists],
+    camera: Camera,
     context: Context,
-    world_to_camera: Float[Array, "4 4"],
-    intrinsics: Float[Array, "3 3"],
     *,
     model: Model,
-    capacities: Capacities,
+) -> list[Shaded]:
+    """Shade the visible splats of all views in one go."""
+    index = jnp.concatenate([view.index for view in lists])
+    sizes = [view.index.shape[0] for view in lists]
+    centers = jnp.concatenate(
+        [
+            jnp.broadcast_to(_camera_center(pose)[None, :], (size, 3))
+            for pose, size in zip(camera.world_to_camera, sizes, strict=True)
+        ]
+    )
+    means = gather_visible(index, asset.gaussians.means)
+    shaded = shade_rows(
+        key,
+        asset.receivers(),
+        index,
+        safe_normalize(centers - means),
+        jax.tree.map(lambda x: gather_visible(index, x), asset.materials),
+        illumination,
+        context.fg_table,
+        transport=model.transport,
+        baked_diffuse=model.baked_diffuse,
+    )
+    starts = [sum(sizes[:view]) for view in range(len(sizes))]
+    return [
+        jax.tree.map(lambda x, a=start, n=size: x[a : a + n], shaded)
+        for start, size in zip(starts, sizes, strict=True)
+    ]
+
+
+def _composite_view(
+    asset: Asset,
+    shaded: Shaded,
+    lists: TileLists,
+    world_to_camera: Float[Array, "4 4"],
+    intrinsics: Float[Array, "3 3"],
+    context: Context,
+    *,
+    model: Model,
     image_shape: tuple[int, int],
     aov_names: tuple[str, ...],
-) -> tuple[Float[Array, "H W c"], Float[Array, "H W"], Usage]:
-    """Cull, shade and rasterise one view; the channels are rgb and then the AOVs in order."""
+) -> tuple[Float[Array, "H W c"], Float[Array, "H W"]]:
+    """Rasterise one view; the channels are rgb and then the AOVs in order."""
     height, width = image_shape
-    lists = _visible_in_view(
-        asset.gaussians,
-        asset.outward,
-        world_to_camera,
-        intrinsics,
-        context.grid,
-        model=model,
-        capacities=capacities,
-        image_shape=image_shape,
-    )
 
     def seen(values: Float[Array, "N ..."], padding: float = 0.0) -> Float[Array, "M ..."]:
         return gather_visible(lists.index, values, padding=padding)
 
     gaussians = asset.gaussians
-    means, normals = seen(gaussians.means), seen(gaussians.normals)
-    materials = jax.tree.map(seen, asset.materials)
-    rgb, diffuse, specular = _shade(
-        means, normals, materials, _camera_center(world_to_camera), light, context, model=model
-    )
     splats = project(
-        means,
+        seen(gaussians.means),
         seen(gaussians.quats),
         seen(gaussians.scales, padding=1.0),
         world_to_camera=world_to_camera,
@@ -322,16 +405,17 @@ def _render_view(
         near=_near_plane(context.grid, model),
     )
     channels = {
-        "albedo": materials.albedo,
-        "roughness": materials.roughness[:, None],
-        "metallic": materials.metallic[:, None],
-        "normal": normals,
-        "depth": splats.depths[:, None],
-        "diffuse": diffuse,
-        "specular": specular,
+        "albedo": lambda: seen(asset.materials.albedo),
+        "roughness": lambda: seen(asset.materials.roughness)[:, None],
+        "metallic": lambda: seen(asset.materials.metallic)[:, None],
+        "normal": lambda: seen(gaussians.normals),
+        "depth": lambda: splats.depths[:, None],
+        "diffuse": lambda: shaded.diffuse_light,
+        "specular": lambda: shaded.specular_light,
+        "specular_radiance": lambda: shaded.specular,
     }
-    features = jnp.concatenate([rgb] + [channels[name] for name in aov_names], axis=-1)
-    image, alpha = composite(
+    features = jnp.concatenate([shaded.rgb] + [channels[name]() for name in aov_names], axis=-1)
+    return composite(
         splats,
         seen(gaussians.opacities),
         features,
@@ -340,7 +424,102 @@ def _render_view(
         width=width,
         tile_size=model.tile_size,
     )
-    return image, alpha, lists.usage
+
+
+def _named(stacked: Float[Array, "... c"], aov_names: tuple[str, ...]) -> dict[str, jax.Array]:
+    """Cut the channels after rgb into AOVs."""
+    widths = {"roughness": 1, "metallic": 1, "depth": 1}
+    aovs, start = {}, 3
+    for name in aov_names:
+        stop = start + widths.get(name, 3)
+        aovs[name] = stacked[..., start:stop]
+        start = stop
+    return aovs
+
+
+def illuminate_asset(
+    asset: Asset,
+    light: EnvLight,
+    context: Context,
+    *,
+    model: Model,
+    key: Key[Array, ""] | None = None,
+    mask: Bool[Array, " N"] | None = None,
+) -> Illumination:
+    """Prepare a light for all views of an asset; Monte Carlo needs a key (see `illuminate`).
+
+    Parameters
+    ----------
+    mask : (N,) splats that some view will see; all by default.
+    """
+    receivers = asset.receivers(mask)
+    return illuminate(key, receivers, light, context.operators, transport=model.transport)
+
+
+def _render_listed(
+    asset: Asset,
+    illumination: Illumination,
+    lists: list[TileLists],
+    camera: Camera,
+    context: Context,
+    *,
+    model: Model,
+    aov_names: tuple[str, ...],
+    key: Key[Array, ""] | None,
+) -> RenderOutput:
+    """Shade and composite what the lists hold."""
+    shaded = _shade_views(key, asset, illumination, lists, camera, context, model=model)
+    transport, asked = model.transport, aov_names
+    if transport.is_denoised:
+        aov_names = tuple(dict.fromkeys(asked + DENOISER_INPUTS))
+    views, alphas = [], []
+    for view, (parts, listed) in enumerate(zip(shaded, lists, strict=True)):
+        image, alpha = _composite_view(
+            asset,
+            parts,
+            listed,
+            camera.world_to_camera[view],
+            camera.intrinsics[view],
+            context,
+            model=model,
+            image_shape=(camera.height, camera.width),
+            aov_names=aov_names,
+        )
+        images = {"rgb": image[..., :3], **_named(image, aov_names)}
+        if transport.is_denoised:
+            focal = camera.intrinsics[view, 0, 0]
+            images = denoised(images, alpha, spec=transport.denoise, focal=focal)
+        views.append({name: images[name] for name in ("rgb", *asked)})
+        alphas.append(alpha)
+    stacked = jax.tree.map(lambda *parts: jnp.stack(parts), *views)
+    usage = capacity_module.combine(asset.usage, *(listed.usage for listed in lists))
+    return RenderOutput(stacked.pop("rgb"), jnp.stack(alphas), stacked, usage)
+
+
+def _require_known(aov_names: tuple[str, ...]) -> None:
+    """Refuse unknown AOVs."""
+    unknown = set(aov_names) - set(AOV_NAMES)
+    if unknown:
+        raise ValueError(f"unknown AOVs {sorted(unknown)}; expected some of {AOV_NAMES}")
+
+
+def render_lit(
+    asset: Asset,
+    illumination: Illumination,
+    camera: Camera,
+    context: Context,
+    *,
+    model: Model,
+    capacities: Capacities,
+    aov_names: tuple[str, ...] = (),
+    key: Key[Array, ""] | None = None,
+) -> RenderOutput:
+    """Render an asset under a prepared light from every camera; see `render_views`."""
+    _require_known(aov_names)
+    lists = _lists_of_views(asset, camera, context, model=model, capacities=capacities)
+    return _render_listed(
+        asset, illumination, lists, camera, context, model=model, aov_names=aov_names, key=key
+    )
 
 
 def render_views(
@@ -352,45 +531,34 @@ def render_views(
     model: Model,
     capacities: Capacities,
     aov_names: tuple[str, ...] = (),
+    key: Key[Array, ""] | None = None,
 ) -> RenderOutput:
     """Render an asset under a light from every camera.
 
-    Visibility and depth order carry no gradient; everything else does.
+    Visibility, depth order and samples carry no gradient; everything else does.
+
+    Parameters
+    ----------
+    key : of all samples; the split sum needs none.
 
     Raises
     ------
     ValueError
-        If an AOV is not one of `AOV_NAMES`.
+        If an AOV is not one of `AOV_NAMES`, or Monte Carlo gets no key.
     """
-    unknown = set(aov_names) - set(AOV_NAMES)
-    if unknown:
-        raise ValueError(f"unknown AOVs {sorted(unknown)}; expected some of {AOV_NAMES}")
-    prefiltered = prefilter(light, context.operators)
-    images, alphas, usages = [], [], [asset.usage]
-    # Unrolled: independent views let XLA run their single-threaded sorts side by side.
-    for view in range(camera.world_to_camera.shape[0]):
-        image, alpha, usage = _render_view(
-            asset,
-            prefiltered,
-            context,
-            camera.world_to_camera[view],
-            camera.intrinsics[view],
-            model=model,
-            capacities=capacities,
-            image_shape=(camera.height, camera.width),
-            aov_names=aov_names,
-        )
-        images.append(image)
-        alphas.append(alpha)
-        usages.append(usage)
-    stacked = jnp.stack(images)
-    widths = {"roughness": 1, "metallic": 1, "depth": 1}
-    aovs, start = {}, 3
-    for name in aov_names:
-        stop = start + widths.get(name, 3)
-        aovs[name] = stacked[..., start:stop]
-        start = stop
-    return RenderOutput(stacked[..., :3], jnp.stack(alphas), aovs, capacity_module.combine(*usages))
+    _require_known(aov_names)
+    lists = _lists_of_views(asset, camera, context, model=model, capacities=capacities)
+    light_key, view_key = (None, None) if key is None else jax.random.split(key)
+    # What no view of the batch sees needs no light of its own.
+    seen = jnp.zeros((asset.outward.shape[0],), bool)
+    for listed in lists:
+        seen = seen.at[listed.index].set(True, mode="drop")
+    # Traced indirect light comes from splats that no view sees, too.
+    mask = None if model.transport.finds_nearest else seen
+    illumination = illuminate_asset(asset, light, context, model=model, key=light_key, mask=mask)
+    return _render_listed(
+        asset, illumination, lists, camera, context, model=model, aov_names=aov_names, key=view_key
+    )
 
 
 def render(
@@ -402,6 +570,7 @@ def render(
     capacities: Capacities,
     sampling: str = "face",
     aov_names: tuple[str, ...] = (),
+    key: Key[Array, ""] | None = None,
 ) -> RenderOutput:
     """Render parameters from every camera: `reconstruct`, then `render_views`."""
     asset = reconstruct(params, context, model=model, capacities=capacities, sampling=sampling)
@@ -413,6 +582,7 @@ def render(
         model=model,
         capacities=capacities,
         aov_names=aov_names,
+        key=key,
     )
 
 
@@ -446,4 +616,7 @@ def visibility_usage(
         return lists.usage
 
     views = jax.lax.map(one_view, (camera.world_to_camera, camera.intrinsics))
-    return capacity_module.combine(surface.usage, jax.tree.map(jnp.max, views))
+    parts = [surface.usage, jax.tree.map(jnp.max, views)]
+    if model.transport.is_traced:
+        parts.append(build_accelerator(surface, context.grid, capacities=capacities).usage)
+    return capacity_module.combine(*parts)

@@ -62,6 +62,8 @@ def parameter_group(path: tuple[Any, ...]) -> str:
     if names[0] == "material":
         if names[1] == "shift_head":
             return "shift"
+        if names[1] == "indirect_head":
+            return "indirect"
         return "shine" if names[1].startswith("surface") else "albedo"
     return {"light": "light", "log_exposure": "exposure"}[names[0]]
 
@@ -69,13 +71,21 @@ def parameter_group(path: tuple[Any, ...]) -> str:
 def make_optimizer(rates: RateConfig) -> optax.GradientTransformation:
     """Adam (epsilon 1e-15) with one exponentially decaying rate a parameter group."""
 
-    def group(rate: float) -> optax.GradientTransformation:
-        schedule = optax.exponential_decay(rate, 1, 0.5 ** (1.0 / rates.half_life))
+    def group(rate: float, warmup: int) -> optax.GradientTransformation:
+        decay = optax.exponential_decay(rate, 1, 0.5 ** (1.0 / rates.half_life))
+        if not warmup:
+            return optax.adam(decay, eps=1e-15)
+
+        def schedule(count: Any) -> Any:
+            return decay(count) * jnp.minimum((count + 1) / warmup, 1.0) ** 2
+
         return optax.adam(schedule, eps=1e-15)
 
-    names = ("sdf", "deform", "weights", "albedo", "shine", "shift", "light", "exposure")
+    surface = ("sdf", "deform", "weights")
+    others = ("albedo", "shine", "shift", "indirect", "light", "exposure")
     groups: dict[Any, optax.GradientTransformation] = {
-        name: group(getattr(rates, name)) for name in names
+        name: group(getattr(rates, name), rates.warmup if name in surface else 0)
+        for name in surface + others
     }
 
     def labels(params: Any) -> Any:

@@ -5,6 +5,7 @@ Everything here runs on the host around `step.train_step`. A run is a folder::
     run.json              scene, configuration, versions
     metrics.jsonl         one line a step
     checkpoints/          parameters, optimiser, step, capacities
+    stage_1/              the checkpoint that stage 2 started from
     previews/             truth, render and normals while training
 """
 
@@ -27,8 +28,8 @@ import numpy as np
 from geosplat_jax import capacity as capacity_module
 from geosplat_jax.capacity import Capacities, Usage
 from geosplat_jax.config import Config, config_from_dict, differences
-from geosplat_jax.geometry import initial_geometry, random_sdf, sphere_sdf
-from geosplat_jax.hull import fit_grid, hull_sdf
+from geosplat_jax.geometry import initial_geometry
+from geosplat_jax.hull import fit_grid
 from geosplat_jax.io.checkpoints import (
     latest_checkpoint,
     load_checkpoint,
@@ -37,18 +38,23 @@ from geosplat_jax.io.checkpoints import (
 )
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.views import Views
-from geosplat_jax.light import init_light, prefilter_operators
-from geosplat_jax.materials import init_materials
 from geosplat_jax.render import Context, Model, Params, visibility_usage
-from geosplat_jax.scene import Batch, Camera, Grid
-from geosplat_jax.shading import fg_table
+from geosplat_jax.scene import Camera, Grid
+from geosplat_jax.stages import (
+    begin_stage_2,
+    initial_params,
+    initial_sdf,
+    make_batch,
+    make_context,
+    sampling_of_step,
+)
 from geosplat_jax.step import StepReport, TrainState, initial_state, train_step
 
 _RECOVERIES_ALLOWED = 3
 _SHRINK_EVERY = 100
+_STAGE_2_STREAM = 2**31 - 1
+"""Number of the random stream that stage 2 starts from; steps take theirs from 0 on."""
 _HEADROOM = 1.2
-_SDF_REACH = 2.0
-"""The first SDF is clipped to so many cells, so that the surface can be moved in few steps."""
 
 
 class TrainingError(RuntimeError):
@@ -65,75 +71,12 @@ class Progress:
 
     step: int
     steps: int
+    stage: int
     total: float
     psnr: float
     gaussian_count: int
     seconds: float
     seconds_left: float
-
-
-def make_context(grid: Grid, model: Model) -> Context:
-    """Build the constants of rendering for a grid."""
-    return Context(grid, prefilter_operators(model.light), fg_table())
-
-
-def initial_sdf(grid: Grid, views: Views, config: Config, key: jax.Array) -> jax.Array:
-    """First signed values on the grid, as the configuration asks."""
-    kind = config.geometry.initial
-    if kind == "random":
-        return random_sdf(key, grid)
-    if kind == "sphere":
-        longest = max(grid.shape)
-        return sphere_sdf(grid, radius=0.35 * float(grid.cell_size) * longest)
-    camera = views.camera()
-    sdf = hull_sdf(
-        np.asarray(camera.world_to_camera, np.float64),
-        np.asarray(camera.intrinsics, np.float64),
-        views.images[..., 3],
-        grid,
-    )
-    return jnp.clip(jnp.asarray(sdf), -_SDF_REACH, _SDF_REACH)
-
-
-def initial_params(sdf: jax.Array, grid: Grid, config: Config, key: jax.Array) -> Params:
-    """Build the parameters before the first step."""
-    light = config.model.light
-    return Params(
-        geometry=initial_geometry(grid, sdf),
-        material=init_materials(key, config.model.material),
-        light=init_light(light.height, width=light.width, value=config.run.initial_light),
-        log_exposure=jnp.zeros((), jnp.float32),
-    )
-
-
-def view_indices(step: int, *, view_count: int, batch_views: int, seed: int) -> np.ndarray:
-    """Choose the views of a step: shuffled epochs, a function of ``seed`` and ``step`` alone."""
-    batch_views = min(batch_views, view_count)
-    first = step * batch_views
-    chosen = []
-    for position in range(first, first + batch_views):
-        epoch, offset = divmod(position, view_count)
-        order = np.random.default_rng([seed, epoch]).permutation(view_count)
-        chosen.append(order[offset])
-    return np.array(chosen)
-
-
-def make_batch(views: Views, step: int, config: Config) -> Batch:
-    """Gather the views of a step; the key depends on seed and step alone."""
-    index = view_indices(
-        step,
-        view_count=len(views.names),
-        batch_views=config.run.batch_views,
-        seed=config.run.seed,
-    )
-    key = jax.random.fold_in(jax.random.key(config.run.seed), step)
-    return Batch(views.camera(index), jnp.asarray(views.images[index]), key)
-
-
-def sampling_of_step(step: int, config: Config) -> str:
-    """Vertex sampling at first (Eq. 12), face sampling afterwards."""
-    is_early = step < config.geometry.vertex_fraction * config.run.steps
-    return "vertex" if is_early else "face"
 
 
 _usage_of = partial(jax.jit, static_argnames=("model", "capacities", "sampling"))(visibility_usage)
@@ -200,13 +143,18 @@ def _check_size(quads: int, max_quads: int) -> None:
 
 @dataclass
 class _Loop:
-    """Mutable bookkeeping of a run; everything but the clock goes into checkpoints."""
+    """Mutable bookkeeping of a run; everything but the clock goes into checkpoints.
 
+    ``config`` are the settings of the stage that runs, ``run_config`` those of all stages.
+    """
+
+    run_config: Config
     config: Config
     views: Views
     context: Context
     folder: Path
     state: TrainState
+    stage: int = 1
     capacities: Capacities | None = None
     sampling: str = ""
     peak: Usage | None = None
@@ -218,7 +166,8 @@ class _Loop:
         """Everything of a checkpoint that is not an array."""
         assert self.capacities is not None
         return {
-            "config": self.config.to_dict(),
+            "config": self.run_config.to_dict(),
+            "stage": self.stage,
             "grid_shape": list(self.context.grid.shape),
             "capacities": asdict(self.capacities),
             "sampling": self.sampling,
@@ -239,7 +188,9 @@ class _Loop:
         return self.last_checkpoint
 
     def prepare(self, step: int) -> None:
-        """Choose capacities at the start and whenever the sampling changes."""
+        """Begin the next stage when it is time; choose capacities when the sampling changes."""
+        if self.stage == 1 and step >= self.run_config.first_step(2):
+            self._begin_stage_2()
         sampling = sampling_of_step(step, self.config)
         if sampling != self.sampling or self.capacities is None:
             self.sampling = sampling
@@ -253,10 +204,26 @@ class _Loop:
                 max_quads=self.config.geometry.max_quads,
             )
 
+    def _begin_stage_2(self) -> None:
+        """Change settings, parameters and optimiser; the surface needs buffers for rays."""
+        if self.capacities is not None:
+            step = int(self.state.step)
+            save_checkpoint(
+                self.folder / "stage_1", step, tree=self.tree(), meta=self.meta(), keep=1
+            )
+        self.stage = 2
+        self.config = self.run_config.stage(2)
+        key = jax.random.fold_in(jax.random.key(self.config.run.seed), _STAGE_2_STREAM)
+        params = begin_stage_2(self.state.params, self.run_config, key)
+        fresh = initial_state(params, self.config.rates)
+        self.state = replace(fresh, step=self.state.step)
+        self.capacities = None
+
     def advance(self, step: int) -> StepReport:
         """Make step ``step``, repeating the same batch with larger buffers as often as needed."""
         batch = make_batch(self.views, step, self.config)
-        weights = self.config.loss.at(step / self.config.run.steps)
+        since = step - self.run_config.first_step(self.stage)
+        weights = self.config.loss.at(since / self.config.run.steps)
         while True:
             assert self.capacities is not None
             self.state, report = train_step(
@@ -367,7 +334,8 @@ def _start(dataset: Dataset, config: Config, folder: Path) -> _Loop:
         )
     params = initial_params(sdf, grid, config, field_key)
     return _Loop(
-        config=config,
+        run_config=config,
+        config=config.stage(1),
         views=dataset.train,
         context=make_context(grid, config.model),
         folder=folder,
@@ -376,15 +344,16 @@ def _start(dataset: Dataset, config: Config, folder: Path) -> _Loop:
     )
 
 
-def _template(config: Config, grid_shape: tuple[int, int, int]) -> dict[str, Any]:
-    """Return a checkpoint's arrays as shapes only."""
+def _template(config: Config, grid_shape: tuple[int, int, int], stage: int) -> dict[str, Any]:
+    """Return a checkpoint's arrays as shapes only; ``config`` is that of all stages."""
 
     def build() -> dict[str, Any]:
         grid = Grid(jnp.zeros(3), jnp.ones(()), grid_shape)
-        params = initial_params(
-            jnp.zeros(grid.vertex_count), grid, config, jax.random.key(config.run.seed)
-        )
-        return {"state": initial_state(params, config.rates), "grid": grid}
+        key = jax.random.key(config.run.seed)
+        params = initial_params(jnp.zeros(grid.vertex_count), grid, config, key)
+        if stage == 2:
+            params = begin_stage_2(params, config, key)
+        return {"state": initial_state(params, config.stage(stage).rates), "grid": grid}
 
     return jax.eval_shape(build)
 
@@ -401,8 +370,10 @@ def _continue(dataset: Dataset, config: Config, folder: Path) -> _Loop:
             "cannot resume with another configuration; start a new run, or undo: "
             + "; ".join(changed)
         )
-    tree, _ = load_checkpoint(path, like=_template(config, tuple(meta["grid_shape"])))
+    like = _template(config, tuple(meta["grid_shape"]), meta["stage"])
+    tree, _ = load_checkpoint(path, like=like)
     loop = _start(dataset, config, folder)
+    loop.stage, loop.config = meta["stage"], config.stage(meta["stage"])
     loop.context = replace(loop.context, grid=tree["grid"])
     loop.state = tree["state"]
     loop.capacities = Capacities(**meta["capacities"])
@@ -413,13 +384,42 @@ def _continue(dataset: Dataset, config: Config, folder: Path) -> _Loop:
     return loop
 
 
+def _adopt(dataset: Dataset, config: Config, folder: Path, source: Path) -> _Loop:
+    """Build the loop of a run whose stage 1 is that of another run."""
+    path = latest_checkpoint(source / "stage_1") or latest_checkpoint(source / "checkpoints")
+    if path is None:
+        raise TrainingError(f"{source} holds no checkpoint to take stage 1 from")
+    meta = read_meta(path)
+    theirs = config_from_dict(meta["config"])
+    changed = differences(replace(theirs, transport=config.transport), config)
+    if changed:
+        raise TrainingError(
+            f"stage 1 of {source} had other settings: {'; '.join(changed)}; train it anew"
+        )
+    like = _template(theirs, tuple(meta["grid_shape"]), meta["stage"])
+    tree, _ = load_checkpoint(path, like=like)
+    done = int(tree["state"].step)
+    if meta["stage"] != 1 or done != config.first_step(2):
+        raise TrainingError(
+            f"{path} is at step {done} of stage {meta['stage']}, not at the end of stage 1 "
+            f"({config.first_step(2)} steps)"
+        )
+    loop = _start(dataset, config, folder)
+    loop.context = replace(loop.context, grid=tree["grid"])
+    loop.state = tree["state"]
+    loop.capacities = Capacities(**meta["capacities"])
+    loop.sampling = meta["sampling"]
+    return loop
+
+
 def load_run(folder: Path) -> tuple[Config, Params, Context, Capacities, dict[str, Any]]:
     """Read the last good checkpoint of a run for rendering.
 
     Returns
     -------
-    config, params, context, capacities : as they were.
-    meta : the checkpoint's meta data, with ``step``.
+    config, params, context, capacities : as they were; ``config`` holds the settings of the stage
+        that the checkpoint was written in.
+    meta : the checkpoint's meta data, with ``step``, ``stage`` and the whole run's ``config``.
 
     Raises
     ------
@@ -430,17 +430,22 @@ def load_run(folder: Path) -> tuple[Config, Params, Context, Capacities, dict[st
     if path is None:
         raise TrainingError(f"{folder} holds no checkpoint; is it the output of a training run?")
     meta = read_meta(path)
-    config = config_from_dict(meta["config"])
-    tree, _ = load_checkpoint(path, like=_template(config, tuple(meta["grid_shape"])))
+    whole = config_from_dict(meta["config"])
+    like = _template(whole, tuple(meta["grid_shape"]), meta["stage"])
+    tree, _ = load_checkpoint(path, like=like)
+    config = whole.stage(meta["stage"])
     meta["step"] = int(tree["state"].step)
     context = make_context(tree["grid"], config.model)
     return config, tree["state"].params, context, Capacities(**meta["capacities"]), meta
 
 
-def _record(report: StepReport, step: int, seconds: float, capacities: Capacities) -> dict:
+def _record(
+    report: StepReport, step: int, stage: int, seconds: float, capacities: Capacities
+) -> dict[str, Any]:
     """Return one line of metrics.jsonl."""
     return {
         "step": step,
+        "stage": stage,
         "loss": float(report.total),
         "psnr": float(report.loss.psnr),
         **{f"term.{name}": float(value) for name, value in report.loss.terms.items()},
@@ -466,9 +471,10 @@ def fit(
     folder: Path,
     *,
     resume: bool = False,
+    stage_1: Path | None = None,
     stop_after: int | None = None,
     on_step: Callable[[Progress], None] | None = None,
-    on_preview: Callable[[Params, Context, Capacities, int], None] | None = None,
+    on_preview: Callable[[Config, Params, Context, Capacities, int], None] | None = None,
 ) -> TrainState:
     """Train on a dataset and leave a run folder.
 
@@ -478,6 +484,8 @@ def fit(
     config : see `config.make_config`.
     folder : run folder; it exists already.
     resume : continue from the last good checkpoint; equals the uninterrupted run bit for bit.
+    stage_1 : run folder whose stage 1 to take over; its scene and settings, those of stage 2
+        aside, must be the same.
     stop_after : stop, with a checkpoint, once so many steps are done (for tests and schedulers).
     on_step, on_preview : called after every step, and every ``run.preview_every`` steps.
 
@@ -489,10 +497,15 @@ def fit(
     Interrupted
         After Ctrl-C or SIGTERM; a checkpoint has been written.
     """
-    loop = (_continue if resume else _start)(dataset, config, folder)
+    if resume:
+        loop = _continue(dataset, config, folder)
+    elif stage_1 is not None:
+        loop = _adopt(dataset, config, folder, stage_1)
+    else:
+        loop = _start(dataset, config, folder)
     metrics_path = folder / "metrics.jsonl"
     _keep_lines_before(metrics_path, int(loop.state.step))
-    last = min(config.run.steps, stop_after or config.run.steps)
+    last = min(config.total_steps, stop_after or config.total_steps)
     began = time.perf_counter()
     first = int(loop.state.step)
     with metrics_path.open("a") as metrics, _stop_requests() as stop_requested:
@@ -502,16 +515,17 @@ def fit(
             report = loop.advance(step)
             now = time.perf_counter()
             assert loop.capacities is not None
-            line = _record(report, step, now - step_began, loop.capacities)
+            line = _record(report, step, loop.stage, now - step_began, loop.capacities)
             metrics.write(json.dumps(line) + "\n")
             metrics.flush()
             done = step + 1
             if on_step is not None:
-                left = (now - began) / (done - first) * (config.run.steps - done)
+                left = (now - began) / (done - first) * (config.total_steps - done)
                 on_step(
                     Progress(
                         step=done,
-                        steps=config.run.steps,
+                        steps=config.total_steps,
+                        stage=loop.stage,
                         total=line["loss"],
                         psnr=line["psnr"],
                         gaussian_count=line["gaussians"],
@@ -526,5 +540,5 @@ def fit(
                 raise Interrupted(f"stopped at step {done}; continue with --resume")
             every = config.run.preview_every
             if on_preview is not None and every and done % every == 0:
-                on_preview(loop.state.params, loop.context, loop.capacities, done)
+                on_preview(loop.config, loop.state.params, loop.context, loop.capacities, done)
     return loop.state

@@ -98,6 +98,7 @@ TINY = (
     "geometry.resolution=10",
     "geometry.vertex_fraction=0.0",
     "run.steps=4",
+    "transport.steps=0",
     "run.batch_views=1",
     "run.checkpoint_every=2",
     "run.preview_every=0",

@@ -85,7 +85,7 @@ def test_resuming_checks_the_scene_and_the_configuration(run, capsys):
     same += ["--set", "run.preview_every=4", "--resume"]
     assert main(same) == 0
     assert main([*same[:5], "2", *same[6:]]) == 2
-    assert "resume with the same" in capsys.readouterr().err
+    assert "take the same, or another folder" in capsys.readouterr().err
     assert main([*same, "--seed", "5"]) == 2
     assert "run.seed: 0 -> 5" in capsys.readouterr().err
 

@@ -23,7 +23,8 @@ from geosplat_jax.losses import LossWeights, loss
 from geosplat_jax.numerics import safe_norm
 from geosplat_jax.render import render
 from geosplat_jax.scene import Batch
-from geosplat_jax.train import fit, initial_params, load_run, make_context
+from geosplat_jax.stages import initial_params, make_context
+from geosplat_jax.train import fit, load_run
 
 CONFIG = tiny_config()
 AMPLE = Capacities(1024, 1024, 1024, 16384, 16384, 4096)

@@ -19,7 +19,8 @@ from geosplat_jax.losses import LossWeights, loss
 from geosplat_jax.numerics import safe_norm
 from geosplat_jax.render import reconstruct, render
 from geosplat_jax.scene import Batch, Camera
-from geosplat_jax.train import fit, initial_params, make_context
+from geosplat_jax.stages import initial_params, make_context
+from geosplat_jax.train import fit
 
 CONFIG = tiny_config("geometry.resolution=8", "objective.with_light=true")
 ROOM = Capacities(256, 256, 256, 2048, 4096, 1024)

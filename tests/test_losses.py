@@ -21,7 +21,7 @@ from geosplat_jax.losses import (
 from geosplat_jax.numerics import safe_norm
 from geosplat_jax.render import render
 from geosplat_jax.scene import Batch
-from geosplat_jax.train import initial_params, make_context
+from geosplat_jax.stages import initial_params, make_context
 
 AMPLE = Capacities(1024, 1024, 1024, 16384, 16384, 4096)
 DOUBLE = Capacities(2048, 2048, 2048, 32768, 32768, 8192)

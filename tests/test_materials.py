@@ -81,7 +81,7 @@ def test_a_field_holds_only_what_the_model_uses():
     assert count() == 2 + 3 + 2 + 2  # two tables, then the weights of three heads
     assert count(shared=True) == 1 + 3 + 2 + 2
     assert count(has_shift=False) == 2 + 3 + 2
-    assert count(has_indirect=True) == 2 + 3 + 2 + 2 + 3
+    assert count(indirect_outputs=6) == 2 + 3 + 2 + 2 + 3
     assert count(bias=True) == 2 + 2 * (3 + 2 + 2)
     plain = init_materials(jax.random.key(0), _spec(has_metallic=False, has_shift=False))
     assert plain.surface_head[-1].weights.shape[1] == 1
@@ -97,7 +97,7 @@ def test_a_field_without_metallic_is_not_metallic():
 
 @pytest.mark.parametrize("shared", [False, True])
 def test_every_parameter_receives_a_gradient(shared):
-    spec = _spec(shared=shared, bias=True, has_indirect=True)
+    spec = _spec(shared=shared, bias=True, indirect_outputs=6)
     params, points = _lively(spec), _points()
 
     def value(params):

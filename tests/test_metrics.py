@@ -211,3 +211,53 @@ def test_composite_blends_by_alpha_for_every_kind_of_background():
     )
     np.testing.assert_allclose(white[0, 0], 1.0, atol=1e-6)
     np.testing.assert_allclose(white[-1, -1], rgb[-1, -1], atol=1e-6)
+
+
+def test_psnr_of_nan_is_not_the_best_of_all():
+    a, b = images(12, 12)
+    a[3, 4, 0] = np.nan
+    assert np.isnan(float(metrics.psnr(a, b)))
+    assert float(metrics.psnr_of_mse(0.01)) == pytest.approx(20.0, abs=1e-4)
+
+
+def windows_touching(mask):
+    views = np.lib.stride_tricks.sliding_window_view(mask, (11, 11))
+    return views.any(axis=(2, 3))
+
+
+def test_masked_ssim_is_the_mean_over_the_windows_that_touch_the_mask():
+    a, b = images(30, 34)
+    mask = np.zeros((30, 34), bool)
+    mask[4:9, 20:27] = True
+    cut_a, cut_b = (np.where(mask[..., None], x, 0).astype(np.float64) for x in (a, b))
+    _, full = structural_similarity(
+        cut_a,
+        cut_b,
+        channel_axis=-1,
+        data_range=1.0,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
+    )
+    expected = full[5:-5, 5:-5][windows_touching(mask)].mean()
+    assert float(metrics.ssim_masked(a, b, mask)) == pytest.approx(expected, abs=2e-5)
+
+
+def test_masked_ssim_ignores_the_background():
+    a, b = images(20, 24)
+    mask = np.zeros((20, 24), np.float32)
+    mask[5:12, 6:15] = 0.9
+    value = float(metrics.ssim_masked(a, b, mask))
+    spoiled = np.where(mask[..., None] > 0.5, a, np.float32(0.7))
+    assert float(metrics.ssim_masked(spoiled, b, mask)) == pytest.approx(value, abs=1e-6)
+    assert 0.5 < value < 1.0
+    assert float(metrics.ssim_masked(a, b, 0 * mask)) == 1.0
+    assert float(metrics.ssim_masked(a[:4, :4], a[:4, :4], mask[:4, :4] + 1)) == pytest.approx(1.0)
+
+
+def test_median_scale_takes_all_views_at_once():
+    albedo, _ = images(10, 10)
+    views = np.stack([albedo, albedo]) + np.float32(0.1)
+    mask = np.ones((2, 10, 10), bool)
+    np.testing.assert_allclose(metrics.albedo_scale_median(views, 3 * views, mask), 3.0, rtol=1e-5)

@@ -13,15 +13,9 @@ from support import sphere_dataset, tiny_config
 from geosplat_jax import train as train_module
 from geosplat_jax.capacity import Capacities
 from geosplat_jax.scene import Geometry
+from geosplat_jax.stages import sampling_of_step, view_indices
 from geosplat_jax.step import parameter_group, train_step
-from geosplat_jax.train import (
-    Interrupted,
-    TrainingError,
-    fit,
-    load_run,
-    sampling_of_step,
-    view_indices,
-)
+from geosplat_jax.train import Interrupted, TrainingError, fit, load_run
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from geosplat_jax.losses import TERM_NAMES, LossWeights, loss
 from geosplat_jax.materials import MaterialField, init_materials, smoothness
 from geosplat_jax.render import Context, Model, Params
 from geosplat_jax.scene import Batch, Camera, EnvLight, Geometry, Grid
-from geosplat_jax.train import make_context
+from geosplat_jax.stages import make_context
 
 _SIZE = 14
 _SETTINGS = (

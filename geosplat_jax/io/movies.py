@@ -1,0 +1,219 @@
+"""Films of rendered frames: animated GIF, and H.264 in MP4 where ``ffmpeg`` is installed.
+
+Frames are display-referred sRGB in [0, 1], row 0 at the top. Files are written aside and then
+renamed, as images are.
+"""
+
+import contextlib
+import math
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import ArrayLike, UInt8
+from PIL import Image
+
+from geosplat_jax.io.images import SceneError, written_aside
+
+FORMATS = (".gif", ".mp4")
+"""Suffixes that `write_movie` knows."""
+
+_ENCODER = "ffmpeg"
+
+# Viewers slow down GIF frames that last less than two hundredths of a second.
+_MAX_GIF_RATE, _MAX_MP4_RATE = 50.0, 1000.0
+
+# GIF counts hundredths of a second in sixteen bits.
+_MIN_RATE = 0.1
+
+# The shared palette is made from at most so many pixels, spread over the whole film.
+_PALETTE_PIXELS = 1_000_000
+
+_ERROR_LENGTH = 600
+
+
+class MissingEncoderError(SceneError):
+    """The program that writes this format is not installed."""
+
+
+def has_encoder(suffix: str) -> bool:
+    """Tell whether `write_movie` can write files with this suffix (``".gif"``) on this machine."""
+    suffix = suffix.lower()
+    return suffix == ".gif" or (suffix == ".mp4" and shutil.which(_ENCODER) is not None)
+
+
+def _checked(frames: Sequence[ArrayLike]) -> list[UInt8[np.ndarray, "H W 3"]]:
+    """Check all frames and reduce them to eight bits."""
+    reduced = []
+    for index, frame in enumerate(frames):
+        values = np.asarray(frame)
+        if values.ndim != 3 or values.shape[-1] != 3 or values.size == 0:
+            raise SceneError(f"frame {index} must be (H, W, 3) sRGB, got shape {values.shape}")
+        if not np.issubdtype(values.dtype, np.floating):
+            raise SceneError(
+                f"frame {index} must be floats in [0, 1], got {values.dtype}; divide bytes by 255"
+            )
+        if reduced and values.shape != reduced[0].shape:
+            raise SceneError(
+                f"all frames must have one size, got {values.shape} for frame {index} after "
+                f"{reduced[0].shape}; render them with one camera size"
+            )
+        if not np.isfinite(values).all():
+            raise SceneError(
+                f"frame {index} has {int((~np.isfinite(values)).sum())} values that are not "
+                "finite; render it again"
+            )
+        reduced.append(np.rint(np.clip(values, 0.0, 1.0) * 255).astype(np.uint8))
+    if not reduced:
+        raise SceneError("a movie needs at least one frame, got none")
+    return reduced
+
+
+def _shared_palette(frames: list[UInt8[np.ndarray, "H W 3"]]) -> Image.Image:
+    """Choose 256 colours for the whole film.
+
+    One palette, lest still parts flicker. Maximum coverage reaches the extremes between which
+    dithering mixes: after a slight blur its error is less than half that of median cut.
+    """
+    height, width, _ = frames[0].shape
+    stride = -(-len(frames) * height * width // _PALETTE_PIXELS)
+    while math.gcd(stride, width) > 1:  # lest it meets the same columns in every row
+        stride += 1
+    sample = np.concatenate([frame.reshape(-1, 3)[::stride] for frame in frames])
+    return Image.fromarray(sample[None]).quantize(256, method=Image.Quantize.MAXCOVERAGE)
+
+
+def _gif_durations(count: int, rate: float) -> list[int]:
+    """Milliseconds of each frame, whole hundredths, whose sums follow the exact times."""
+    ends = np.rint(np.arange(count + 1) * (100.0 / rate)).astype(int)
+    return [10 * int(hundredths) for hundredths in np.diff(ends)]
+
+
+def _write_gif(path: Path, frames: list[UInt8[np.ndarray, "H W 3"]], rate: float) -> None:
+    palette = _shared_palette(frames)
+
+    def indexed() -> Iterator[Image.Image]:
+        for frame in frames:
+            yield Image.fromarray(frame).quantize(
+                palette=palette, dither=Image.Dither.FLOYDSTEINBERG
+            )
+
+    images = indexed()
+    with written_aside(path) as aside:
+        next(images).save(
+            aside,
+            format="GIF",
+            save_all=True,
+            append_images=images,
+            duration=_gif_durations(len(frames), rate),
+            loop=0,
+            optimize=False,
+        )
+
+
+def _even(frame: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Repeat the last row and column of odd sizes: H.264 halves the resolution of colour."""
+    height, width, _ = frame.shape
+    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+
+
+def _encoder_command(encoder: str, path: Path, width: int, height: int, rate: float) -> list[str]:
+    """Arguments that encode raw RGB from standard input.
+
+    The colour space is named, since players otherwise guess it from the image size; as options too,
+    for releases of the program that forget what the filters say.
+    """
+    colors = "range=tv:colorspace=bt709:color_primaries=bt709:color_trc=iec61966-2-1"
+    convert = f"scale=out_color_matrix=bt709:out_range=tv,format=yuv420p,setparams={colors}"
+    return [
+        *(encoder, "-y", "-loglevel", "error"),
+        *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"),
+        *("-framerate", f"{rate:.10g}", "-i", "pipe:0"),
+        *("-vf", convert),
+        *("-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p"),
+        *("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "iec61966-2-1"),
+        *("-color_range", "tv", "-movflags", "+faststart", "-f", "mp4"),
+        f"file:{path}",
+    ]
+
+
+def _feed(process: subprocess.Popen[bytes], frames: list[UInt8[np.ndarray, "H W 3"]]) -> None:
+    """Send all frames and wait for the end; an encoder that stops early says why by its status."""
+    assert process.stdin is not None
+    with contextlib.suppress(BrokenPipeError), process.stdin:
+        for frame in frames:
+            process.stdin.write(_even(frame).tobytes())
+    process.wait()
+
+
+def _write_mp4(path: Path, frames: list[UInt8[np.ndarray, "H W 3"]], rate: float) -> None:
+    encoder = shutil.which(_ENCODER)
+    if encoder is None:
+        raise MissingEncoderError(
+            f"writing {path.name} needs the program {_ENCODER}, which is not on the PATH; install "
+            f"it (for instance `apt install {_ENCODER}` or `brew install {_ENCODER}`), or write "
+            f"{path.stem}.gif instead"
+        )
+    height, width, _ = _even(frames[0]).shape
+    # Messages go to a file: a full pipe would stop the encoder while frames are being written.
+    with written_aside(path) as aside, tempfile.TemporaryFile() as messages:
+        command = _encoder_command(encoder, aside, width, height, rate)
+        process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=messages
+        )
+        try:
+            _feed(process, frames)
+        except BaseException:
+            process.kill()
+            process.wait()
+            raise
+        if process.returncode != 0 or not aside.is_file():
+            messages.seek(0)
+            said = messages.read().decode(errors="replace").strip()[-_ERROR_LENGTH:]
+            raise OSError(
+                f"cannot write {path}: {_ENCODER} ended with status {process.returncode} "
+                f"({said or 'no message'}); check that it has libx264, or write a .gif instead"
+            )
+
+
+def write_movie(
+    path: str | Path,
+    frames: Sequence[ArrayLike],
+    *,
+    frames_per_second: float | int,
+) -> None:
+    """Write frames to an animated GIF or to H.264 in MP4, by suffix.
+
+    GIF: loops for ever, one palette of 256 colours for the film, Floyd-Steinberg dithering; frames
+    last whole hundredths of a second, chosen so that the whole film has its true length, and equal
+    consecutive frames become one that lasts longer. MP4: needs ``ffmpeg``; 4:2:0 colour, so sizes
+    that are odd grow by a repeated row or column.
+
+    Parameters
+    ----------
+    path : file ending in ``.gif`` or ``.mp4``; its folder is made when missing.
+    frames : one or more (H, W, 3) of one size, sRGB; values outside [0, 1] are clipped.
+    frames_per_second : 0.1 to 50 for GIF, to 1000 for MP4.
+
+    Raises
+    ------
+    SceneError : an unknown suffix, an unusable rate, no frames, or a frame of a wrong shape or
+        type, of another size, or with values that are not finite.
+    MissingEncoderError : MP4 without ``ffmpeg``.
+    OSError : the file cannot be written.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
+        raise SceneError(f"a movie must end in {' or '.join(FORMATS)}, got {path.name}")
+    fastest = _MAX_GIF_RATE if suffix == ".gif" else _MAX_MP4_RATE
+    if not _MIN_RATE <= frames_per_second <= fastest:
+        raise SceneError(
+            f"{suffix} movies have {_MIN_RATE:g} to {fastest:g} frames per second, got "
+            f"{frames_per_second}"
+        )
+    write = _write_gif if suffix == ".gif" else _write_mp4
+    write(path, _checked(frames), float(frames_per_second))

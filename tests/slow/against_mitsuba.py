@@ -1,0 +1,597 @@
+"""Direct light by `geosplat_jax.monte_carlo` against Mitsuba 3, an independent renderer.
+
+One mesh that shadows itself, one camera, two environment maps, two materials: a diffuse one, and a
+GGX metal (`principled` in Mitsuba). Both renderers see the same triangles, vertex normals and
+light, filter pixels by a box, and stop after one bounce. For every pair this prints how well the
+images agree, what their noise alone would give, and the bias, and it writes both images and their
+difference.
+
+What differs by design and stays in the figures:
+
+* Masking. Mitsuba's is separable, ``G1(wi) G1(wo)``; ours is height-correlated and so at least as
+  large, the more so for rough surfaces seen or lit at a slant. Distribution, the width
+  ``roughness**2`` and Schlick's Fresnel are the same for a metal.
+* Shading normals that face away from the viewer. Mitsuba returns black; we flip them. It happens
+  within a fraction of a pixel of the silhouette.
+
+Light that arrives from below the face but above the shading normal is blocked in both: here by a
+test, in Mitsuba because the shadow ray then starts inside a closed mesh.
+"""
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from trimesh.exchange.ply import export_ply
+
+from geosplat_jax.capacity import Capacities, combine, grow, overflowed
+from geosplat_jax.geometry import (
+    Surface,
+    face_normals_and_areas,
+    grid_vertices,
+    initial_geometry,
+    isosurface,
+    vertex_normals,
+)
+from geosplat_jax.io.images import write_png
+from geosplat_jax.light import light_directions, lookup
+from geosplat_jax.metrics import psnr, psnr_of_mse
+from geosplat_jax.monte_carlo import SampleCounts, SurfacePoints, shade
+from geosplat_jax.scene import EnvLight, Grid, Materials
+from geosplat_jax.trace import Accelerator, build_accelerator, nearest
+
+FIELD_OF_VIEW = 0.62
+"""Horizontal and vertical, radians."""
+
+ALBEDO = (0.8, 0.55, 0.35)
+"""Of both materials; the reflectance at normal incidence of the metal."""
+
+PERCENTILE = 99.0
+"""Of Mitsuba's radiance over the object's pixels: what counts as white, and where values clip."""
+
+DIFFERENCE_GAIN = 8.0
+
+_POINTS_AT_ONCE = 65_536
+
+# A z-up world in Mitsuba's y-up envmap: local = (y, z, x).
+_ENVMAP_TO_WORLD = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
+
+_VARIANTS = ("llvm_ad_rgb", "scalar_rgb")
+"""Fastest first."""
+
+# Run in a process of its own: an LLVM that lacks an instruction aborts instead of raising.
+_PROBE = """
+import sys, mitsuba as mi, numpy as np
+mi.set_variant(sys.argv[1])
+light = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32))}
+ball = {"type": "sphere", "center": [0, 0, 5], "bsdf": {"type": "principled", "metallic": 1.0}}
+sensor = {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}}
+parts = {"integrator": {"type": "direct"}, "sensor": sensor, "light": light, "ball": ball}
+assert np.isfinite(np.array(mi.render(mi.load_dict({"type": "scene", **parts}), spp=4))).all()
+"""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Static sizes of one comparison.
+
+    Attributes
+    ----------
+    size : height and width of the images. resolution : cells of the grid along each axis.
+    strata : our primary rays a pixel and pass are its square. passes : independent halves and more
+        of our image, at least 2. counts : samples a primary hit.
+    mitsuba_samples, mitsuba_passes : primary rays a pixel and pass, and passes, at least 2.
+    roughness : of the metal. seed : of all random numbers.
+    """
+
+    size: int = 128
+    resolution: int = 28
+    strata: int = 8
+    passes: int = 2
+    counts: SampleCounts = field(default_factory=lambda: SampleCounts(16, 16, 16))
+    mitsuba_samples: int = 256
+    mitsuba_passes: int = 8
+    roughness: float = 0.4
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What both renderers see, and the tracer of ours."""
+
+    surface: Surface
+    accelerator: Accelerator
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    camera_to_world: np.ndarray
+
+
+@dataclass(frozen=True)
+class Image:
+    """Linear radiance (H, W, 3) on black, the coverage (H, W) of its pixels, and its noise.
+
+    ``noise`` (H, W, 3) is half the difference of two independent halves of the samples: as large,
+    on average, as the error of their mean.
+    """
+
+    radiance: np.ndarray
+    coverage: np.ndarray
+    noise: np.ndarray
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well two images agree: decibels over the object's pixels, over all, and by noise alone.
+
+    ``bias`` is the difference of the object's mean radiance, ours less Mitsuba's, relative to
+    Mitsuba's, ``bias_error`` its standard error, and ``white`` the radiance that counts as 1.
+    """
+
+    object_psnr: float
+    image_psnr: float
+    noise_psnr: float
+    bias: float
+    bias_error: float
+    white: float
+
+
+# --- the scene ----------------------------------------------------------------------------------
+
+
+def _distances(points: np.ndarray) -> np.ndarray:
+    """Distance to a ball within a torus below a smaller ball: each shadows the others."""
+    x, y, z = points.T
+    torus = np.hypot(np.hypot(x, y) - 0.68, z + 0.12) - 0.19
+    ball = np.sqrt(x**2 + y**2 + z**2) - 0.36
+    moon = np.sqrt((x - 0.3) ** 2 + (y + 0.2) ** 2 + (z - 0.55) ** 2) - 0.17
+    return np.minimum(np.minimum(torus, ball), moon)
+
+
+def look_at(position: tuple[float, float, float]) -> np.ndarray:
+    """Camera-to-world matrix (Blender axes) of a camera that looks at the origin."""
+    back = np.asarray(position) / np.linalg.norm(position)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+    pose[:3, 3] = position
+    return pose
+
+
+_extract = partial(jax.jit, static_argnames=("capacities", "training"))(isosurface)
+_build = partial(jax.jit, static_argnames=("capacities",))(build_accelerator)
+
+
+def make_scene(resolution: int) -> Scene:
+    """Extract the mesh on a grid of so many cells along each axis, and build its tracer."""
+    cell = 2.2 / resolution
+    shape = (resolution, resolution, resolution)
+    grid = Grid(jnp.full((3,), -1.1), jnp.asarray(cell, jnp.float32), shape)
+    distances = _distances(np.asarray(grid_vertices(grid)))
+    geometry = initial_geometry(grid, jnp.asarray(distances / cell, jnp.float32))
+    capacities = Capacities(4096, 4096, 4096, cell_patches=65_536)
+    while True:
+        surface = _extract(geometry, grid, capacities=capacities, training=True)
+        accelerator = _build(surface, grid, capacities=capacities)
+        needed = combine(surface.usage, accelerator.usage)
+        if not overflowed(needed, capacities):
+            break
+        capacities = grow(capacities, needed)
+    mesh = surface.mesh
+    count = int(mesh.vertex_count)
+    return Scene(
+        surface=surface,
+        accelerator=accelerator,
+        vertices=np.asarray(mesh.vertices)[:count],
+        faces=np.asarray(mesh.faces)[: int(mesh.face_count)],
+        normals=np.asarray(vertex_normals(mesh))[:count],
+        camera_to_world=look_at((1.6, -2.2, 1.5)),
+    )
+
+
+def make_lights(height: int = 32) -> dict[str, EnvLight]:
+    """Two maps: a smooth sky whose horizon has four colours, and a dim one with a small sun."""
+    directions = np.asarray(light_directions(height, 2 * height), np.float64)
+    x, y, z = np.moveaxis(directions, -1, 0)
+    horizon = np.exp(-((z / 0.4) ** 2))[..., None]
+    up = np.clip(0.5 + 0.5 * z, 0, 1)[..., None]
+    sky = up * np.array([0.35, 0.5, 0.8]) + (1 - up) * np.array([0.25, 0.2, 0.15])
+    sides = ((x, (2, 0.2, 0.1)), (y, (0.1, 1.6, 0.3)), (-x, (0.2, 0.3, 2)), (-y, (2, 2, 0.2)))
+    for towards, color in sides:
+        facing = np.maximum(towards, 0.0)[..., None] ** 3
+        sky = sky + horizon * facing * np.array(color)
+    sun = np.broadcast_to(0.3 * up * np.array([0.5, 0.7, 1.0]), sky.shape).copy()
+    row, column = height // 4, height // 2 + height // 8
+    sun[row : row + 2, column : column + 2] += np.array([90.0, 80.0, 60.0])
+    return {name: EnvLight(jnp.asarray(v, jnp.float32)) for name, v in (("sky", sky), ("sun", sun))}
+
+
+# --- our image ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Where primary rays meet the surface: pixel and face (M,), the others (M, 3)."""
+
+    pixels: np.ndarray
+    faces: np.ndarray
+    positions: np.ndarray
+    normals: np.ndarray
+    outward: np.ndarray
+    wo: np.ndarray
+
+
+def _primary_rays(
+    rng: np.random.Generator, settings: Settings, pose: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels, origins and unit directions of jittered rays, one a stratum of every pixel."""
+    size, strata = settings.size, settings.strata
+    row, column, i, j = np.indices((size, size, strata, strata)).reshape(4, -1)
+    jitter = rng.uniform(size=(2, row.size))
+    half = np.tan(0.5 * FIELD_OF_VIEW)
+    x = ((column + (j + jitter[0]) / strata) / size * 2 - 1) * half
+    y = (1 - (row + (i + jitter[1]) / strata) / size * 2) * half
+    directions = np.stack([x, y, -np.ones_like(x)], axis=1) @ pose[:3, :3].T
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return row * size + column, np.broadcast_to(pose[:3, 3], directions.shape), directions
+
+
+def _primary_hits(scene: Scene, settings: Settings, rng: np.random.Generator) -> Hits:
+    pixels, origins, directions = _primary_rays(rng, settings, scene.camera_to_world)
+    distance, face = nearest(
+        scene.accelerator,
+        jnp.asarray(origins, jnp.float32),
+        jnp.asarray(directions, jnp.float32),
+        jnp.full((len(pixels),), -1, jnp.int32),
+        jnp.ones((len(pixels),), bool),
+    )
+    is_hit = np.asarray(face) >= 0
+    pixels, directions = pixels[is_hit], directions[is_hit]
+    faces = np.asarray(face)[is_hit]
+    points = origins[is_hit] + np.asarray(distance, np.float64)[is_hit, None] * directions
+    corners = scene.vertices.astype(np.float64)[scene.faces[faces]]
+    a, b, c = np.moveaxis(corners, 1, 0)
+    area = np.cross(b - a, c - a)
+    squared = np.sum(area**2, axis=1)
+    of_b = np.sum(np.cross(points - a, c - a) * area, axis=1) / squared
+    of_c = np.sum(np.cross(b - a, points - a) * area, axis=1) / squared
+    weights = np.clip(np.stack([1 - of_b - of_c, of_b, of_c], axis=1), 0, 1)
+    weights /= weights.sum(axis=1, keepdims=True)
+    normals = np.einsum("nk,nkd->nd", weights, scene.normals[scene.faces[faces]])
+    return Hits(
+        pixels=pixels,
+        faces=faces,
+        positions=np.einsum("nk,nkd->nd", weights, corners),
+        normals=normals / np.linalg.norm(normals, axis=1, keepdims=True),
+        outward=np.asarray(face_normals_and_areas(scene.surface.mesh)[0])[faces],
+        wo=-directions,
+    )
+
+
+def all_passes(scene: Scene, settings: Settings) -> list[Hits]:
+    """Trace the primary rays of all passes; normals are interpolated between the vertices."""
+    rng = np.random.default_rng(settings.seed)
+    return [_primary_hits(scene, settings, rng) for _ in range(settings.passes)]
+
+
+@partial(jax.jit, static_argnames=("counts",))
+def shaded_lobes(key, points, materials, wo, light, accelerator, *, counts):
+    """Our estimator, and the only call of it: diffuse and specular radiance, (N, 3) each."""
+    shaded = shade(key, points, materials, wo, light, accelerator, counts=counts)
+    return shaded.diffuse, shaded.specular
+
+
+def _shade_hits(
+    hits: Hits,
+    light: EnvLight,
+    accelerator: Accelerator | None,
+    settings: Settings,
+    key: jax.Array,
+    *,
+    material: str,
+) -> np.ndarray:
+    """Radiance (M, 3) of the hits, in blocks of one size that compile once."""
+    count, block = len(hits.pixels), _POINTS_AT_ONCE
+    metallic = {"diffuse": 0.0, "metal": 1.0}[material]
+    materials = Materials(
+        albedo=jnp.broadcast_to(jnp.asarray(ALBEDO, jnp.float32), (block, 3)),
+        roughness=jnp.full((block,), settings.roughness, jnp.float32),
+        metallic=jnp.full((block,), metallic, jnp.float32),
+    )
+    found = []
+    for first in range(0, count, block):
+        rows = np.minimum(np.arange(first, first + block), count - 1)
+        key, this = jax.random.split(key)
+        vectors = (hits.positions, hits.normals, hits.outward)
+        points = SurfacePoints(
+            *(jnp.asarray(x[rows], jnp.float32) for x in vectors),
+            faces=jnp.asarray(hits.faces[rows], jnp.int32),
+            mask=jnp.asarray(np.arange(first, first + block) < count),
+        )
+        wo = jnp.asarray(hits.wo[rows], jnp.float32)
+        diffuse, specular = shaded_lobes(
+            this, points, materials, wo, light, accelerator, counts=settings.counts
+        )
+        found.append(np.asarray(diffuse if material == "diffuse" else specular))
+    return np.concatenate(found)[:count] if found else np.zeros((0, 3), np.float32)
+
+
+def our_image(
+    scene: Scene,
+    passes: list[Hits],
+    light: EnvLight,
+    settings: Settings,
+    *,
+    material: str,
+    occlusion: bool = True,
+) -> Image:
+    """Render ``material`` ("diffuse" or "metal") by our estimator from passes of primary hits."""
+    accelerator = scene.accelerator if occlusion else None
+    total = settings.size**2
+    images, coverages = [], []
+    keys = jax.random.split(jax.random.key(settings.seed), len(passes))
+    for key, hits in zip(keys, passes, strict=True):
+        radiance = _shade_hits(hits, light, accelerator, settings, key, material=material)
+        channels = radiance.astype(np.float64).T
+        sums = [np.bincount(hits.pixels, channel, total) for channel in channels]
+        images.append(np.stack(sums, axis=-1) / settings.strata**2)
+        coverages.append(np.bincount(hits.pixels, minlength=total) / settings.strata**2)
+    return _combined(images, coverages, settings.size)
+
+
+def _combined(images: list[np.ndarray], coverages: list[np.ndarray], size: int) -> Image:
+    """Average passes; their noise is half the difference of those at even and odd places."""
+    stack = np.stack(images).reshape(-1, size, size, 3)
+    even = len(images) // 2 * 2  # of an odd number the last says nothing about noise
+    halves = np.mean(stack[:even:2], axis=0) - np.mean(stack[1:even:2], axis=0)
+    coverage = np.mean(np.stack(coverages).reshape(-1, size, size), axis=0)
+    return Image(np.mean(stack, axis=0), coverage, 0.5 * halves)
+
+
+# --- Mitsuba's image ----------------------------------------------------------------------------
+
+
+def choose_variant() -> str:
+    """Set the fastest variant of Mitsuba that renders on this machine, and name it.
+
+    Raises
+    ------
+    RuntimeError
+        If none does; the message holds what the last one printed.
+    """
+    import mitsuba
+
+    last = ""
+    for variant in _VARIANTS:
+        if variant not in mitsuba.variants():
+            continue
+        command = [sys.executable, "-c", _PROBE, variant]
+        found = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+        if found.returncode == 0:
+            mitsuba.set_variant(variant)
+            return variant
+        last = found.stderr[-2000:]
+    raise RuntimeError(f"no variant of {_VARIANTS} renders here; the last one said: {last}")
+
+
+def _envmap_texels(light: EnvLight, *, column_offset: float) -> np.ndarray:
+    """Texels of a Mitsuba envmap that is the same function of direction as our light.
+
+    Its rows lie at ``j / (rows - 1)``, its columns at ``(i + column_offset) / columns``. Our texel
+    centres are among these nodes, and a bilinear function stays itself on a finer grid.
+    """
+    height, width, _ = light.radiance.shape
+    columns = width if column_offset == 0.5 else 2 * width
+    u = (np.arange(columns) + column_offset) / columns
+    # Beyond the first and last row centre our map is constant along a meridian, and at the pole
+    # itself the azimuth would be lost.
+    v = np.clip(np.arange(2 * height + 1) / (2 * height), 0.25 / height, 1 - 0.25 / height)
+    azimuth, polar = np.meshgrid((0.5 - u) * 2 * np.pi, v * np.pi)
+    directions = np.stack(
+        [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1
+    )
+    found = lookup(light.radiance, jnp.asarray(directions.reshape(-1, 3), jnp.float32))
+    # A copy: Mitsuba takes no array that is read-only.
+    return np.array(found, np.float32).reshape(2 * height + 1, columns, 3)
+
+
+def light_error(emitter, light: EnvLight) -> float:
+    """Largest difference of a Mitsuba emitter from our light, relative to its brightest texel."""
+    import mitsuba as mi
+
+    directions = np.random.default_rng(0).normal(size=(200, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    found = []
+    for direction in directions:
+        interaction = mi.SurfaceInteraction3f()
+        interaction.wi = mi.Vector3f(*(-float(x) for x in direction))
+        found.append(np.array(emitter.eval(interaction)).reshape(-1))
+    ours = np.asarray(lookup(light.radiance, jnp.asarray(directions, jnp.float32)))
+    return float(np.max(np.abs(np.stack(found) - ours)) / np.max(np.asarray(light.radiance)))
+
+
+def mitsuba_light(light: EnvLight):
+    """Build the envmap of a light, on whichever of both column conventions is in use here.
+
+    Raises
+    ------
+    RuntimeError
+        If neither gives the same light in the same directions.
+    """
+    import mitsuba as mi
+
+    errors = {}
+    for column_offset in (0.5, 0.0):
+        texels = _envmap_texels(light, column_offset=column_offset)
+        to_world = mi.ScalarTransform4f(_ENVMAP_TO_WORLD)
+        bitmap = mi.Bitmap(texels)
+        emitter = mi.load_dict({"type": "envmap", "bitmap": bitmap, "to_world": to_world})
+        errors[column_offset] = light_error(emitter, light)
+        if errors[column_offset] < 1e-3:
+            return emitter
+    raise RuntimeError(f"Mitsuba's envmap differs from our light, by column offset: {errors}")
+
+
+def mitsuba_mesh(scene: Scene, settings: Settings, *, material: str):
+    """Hand the triangles and vertex normals to Mitsuba, with one of both materials.
+
+    Raises
+    ------
+    RuntimeError
+        If Mitsuba changed positions, faces or normals.
+    """
+    import mitsuba as mi
+
+    color = {"type": "rgb", "value": list(ALBEDO)}
+    bsdf = {"type": "diffuse", "reflectance": color}
+    if material == "metal":
+        metal = {"base_color": color, "roughness": settings.roughness, "metallic": 1.0}
+        bsdf = {"type": "principled", **metal}
+    mesh = trimesh.Trimesh(scene.vertices, scene.faces, vertex_normals=scene.normals, process=False)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "mesh.ply"
+        path.write_bytes(export_ply(mesh, vertex_normal=True))
+        shape = mi.load_dict({"type": "ply", "filename": str(path), "bsdf": bsdf})
+    params = mi.traverse(shape)
+    given = {"vertex_positions": scene.vertices, "vertex_normals": scene.normals}
+    for name, ours in {**given, "faces": scene.faces}.items():
+        theirs = np.array(params[name]).reshape(-1, 3)
+        if theirs.shape != ours.shape or not np.allclose(theirs, ours, atol=1e-6):
+            raise RuntimeError(f"Mitsuba's mesh has other {name} than ours")
+    return shape
+
+
+def mitsuba_image(scene: Scene, light: EnvLight, settings: Settings, *, material: str) -> Image:
+    """Render the scene by Mitsuba: direct light only, black background, box filter."""
+    import mitsuba as mi
+
+    to_world = scene.camera_to_world @ np.diag([-1.0, 1.0, -1.0, 1.0])
+    size, samples = settings.size, settings.mitsuba_samples
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
+    film |= {"pixel_format": "rgba", "component_format": "float32"}
+    sensor = {
+        "type": "perspective",
+        "fov": float(np.degrees(FIELD_OF_VIEW)),
+        "to_world": mi.ScalarTransform4f(to_world),
+        "film": film,
+        "sampler": {"type": "multijitter", "sample_count": samples},
+    }
+    parts = {
+        "integrator": {"type": "direct", "hide_emitters": True},
+        "sensor": sensor,
+        "light": mitsuba_light(light),
+        "object": mitsuba_mesh(scene, settings, material=material),
+    }
+    loaded = mi.load_dict({"type": "scene", **parts})
+    seeds = range(settings.seed, settings.seed + settings.mitsuba_passes)
+    passes = [np.array(mi.render(loaded, spp=samples, seed=k)) for k in seeds]
+    images = [x[..., :3].astype(np.float64) for x in passes]
+    return _combined(images, [x[..., 3].astype(np.float64) for x in passes], size)
+
+
+# --- the comparison -----------------------------------------------------------------------------
+
+
+def _normalized(values: np.ndarray, white: float) -> np.ndarray:
+    return np.clip(values / white, 0.0, 1.0).astype(np.float32)
+
+
+def compare(ours: Image, reference: Image) -> Agreement:
+    """Measure agreement on linear radiance, divided by `PERCENTILE` of the reference and clipped.
+
+    The object's pixels are those that either renderer covers, if only in part. The bias is of
+    radiance that is not clipped.
+    """
+    white = float(np.percentile(reference.radiance[reference.coverage > 0], PERCENTILE))
+    mask = (ours.coverage > 0) | (reference.coverage > 0)
+    pair = [_normalized(x.radiance, white) for x in (ours, reference)]
+    is_clipped = np.minimum(*pair) >= 1.0
+    noise = np.square(ours.noise) + np.square(reference.noise)
+    visible = np.where(is_clipped, 0.0, noise / white**2)[mask]
+    mean = float(np.mean(reference.radiance[mask]))
+    difference = float(np.mean(ours.radiance[mask] - reference.radiance[mask]))
+    # The noise of a pixel's three channels is one and the same path's.
+    spread = np.sqrt(np.sum(np.mean(np.sqrt(noise[mask]), axis=-1) ** 2)) / mask.sum()
+    return Agreement(
+        object_psnr=float(psnr(*pair, mask=mask)),
+        image_psnr=float(psnr(*pair)),
+        noise_psnr=float(psnr_of_mse(np.float32(np.mean(visible)))),
+        bias=difference / mean,
+        bias_error=float(spread) / mean,
+        white=white,
+    )
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Both renderers' images of one material under one light."""
+
+    name: str
+    ours: Image
+    reference: Image
+    agreement: Agreement
+
+    def __str__(self) -> str:
+        found = self.agreement
+        return (
+            f"{self.name}: object {found.object_psnr:.1f} dB, whole image {found.image_psnr:.1f} "
+            f"dB, noise alone {found.noise_psnr:.1f} dB, bias {found.bias:+.3%} +- "
+            f"{found.bias_error:.3%}, white {found.white:.3f}"
+        )
+
+
+def comparisons(scene: Scene, passes: list[Hits], settings: Settings) -> Iterator[Comparison]:
+    """Render and compare both materials under both lights; needs `choose_variant` before."""
+    for light_name, light in make_lights().items():
+        for material in ("diffuse", "metal"):
+            ours = our_image(scene, passes, light, settings, material=material)
+            reference = mitsuba_image(scene, light, settings, material=material)
+            name, agreement = f"{light_name}_{material}", compare(ours, reference)
+            yield Comparison(name, ours, reference, agreement)
+
+
+def save_images(folder: Path, found: Comparison) -> None:
+    """Write both images, sRGB with `PERCENTILE` as white, and their amplified difference."""
+    white = found.agreement.white
+    pair = [_normalized(x.radiance, white) for x in (found.ours, found.reference)]
+    write_png(folder / f"{found.name}_ours.png", pair[0], is_linear=True)
+    write_png(folder / f"{found.name}_mitsuba.png", pair[1], is_linear=True)
+    difference = DIFFERENCE_GAIN * np.abs(pair[0] - pair[1])
+    write_png(folder / f"{found.name}_difference_x{DIFFERENCE_GAIN:g}.png", difference)
+
+
+def main() -> None:
+    """Parse the command line and run."""
+    parser = argparse.ArgumentParser(description="Direct light against Mitsuba 3.")
+    parser.add_argument("--output", type=Path, required=True, help="folder of the images")
+    for name in ("size", "resolution", "strata", "passes", "mitsuba_samples", "mitsuba_passes"):
+        default = getattr(Settings(), name)
+        parser.add_argument(f"--{name.replace('_', '-')}", type=int, default=default)
+    parser.add_argument("--roughness", type=float, default=Settings.roughness)
+    parser.add_argument("--samples", type=int, default=16, help="of each technique, a primary hit")
+    options = vars(parser.parse_args())
+    output, samples = options.pop("output"), options.pop("samples")
+    settings = Settings(counts=SampleCounts(samples, samples, samples), **options)
+
+    print(f"Mitsuba variant {choose_variant()}, {settings}", flush=True)
+    scene = make_scene(settings.resolution)
+    passes = all_passes(scene, settings)
+    away = np.mean(np.concatenate([np.sum(h.normals * h.wo, axis=1) < 0 for h in passes]))
+    print(f"{len(scene.faces)} faces; {away:.2%} of hits have a shading normal that faces away")
+    for found in comparisons(scene, passes, settings):
+        print(found, flush=True)
+        save_images(output, found)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,541 @@
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from geosplat_jax import metrics, protocols
+from geosplat_jax.light import (
+    downsample_light,
+    init_light,
+    light_directions,
+    rotate_light,
+    texel_solid_angles,
+)
+from geosplat_jax.protocols import PROTOCOL, PROTOCOLS, protocol
+from geosplat_jax.scene import EnvLight
+
+# Decibels of float32 images.
+DECIBELS = 2e-3
+GEOSPLATTING, TENSOIR, IRGS = (PROTOCOL[name] for name in PROTOCOLS)
+GAIN = np.array([0.5, 2.0, 1.25])
+
+
+def decibels(error):
+    return -10 * np.log10(error)
+
+
+def srgb(linear):
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def flat(value, shape=(1, 4, 4)):
+    """A map of one value, (V, H, W) or (V, H, W, 3)."""
+    value = np.asarray(value, np.float32)
+    return np.broadcast_to(value, (*shape, *value.shape)).copy()
+
+
+def left_half(shape=(1, 4, 4)):
+    mask = np.zeros(shape, np.float32)
+    mask[..., : shape[2] // 2] = 1
+    return mask
+
+
+def scene(views=3, size=14, seed=0):
+    """Random albedo, truth (premultiplied), alpha and mask of a disc."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:size, :size] - (size - 1) / 2
+    mask = np.broadcast_to((x**2 + y**2 < (0.4 * size) ** 2), (views, size, size))
+    mask = mask.astype(np.float32)
+    truth = rng.uniform(0.1, 0.6, (views, size, size, 3)).astype(np.float32) * mask[..., None]
+    noise = rng.uniform(0.8, 1.2, truth.shape).astype(np.float32)
+    return (truth * noise / GAIN).astype(np.float32), mask.copy(), truth, mask
+
+
+def same(figures, others, **kwargs):
+    assert figures.keys() == others.keys()
+    for name, value in figures.items():
+        assert value == pytest.approx(others[name], **kwargs), name
+
+
+def test_unknown_protocols_are_refused_by_name():
+    assert PROTOCOLS == ("geosplatting", "tensoir", "irgs")
+    assert [protocol(name).name for name in PROTOCOLS] == list(PROTOCOLS)
+    with pytest.raises(ValueError, match="'nerf'.*geosplatting, tensoir, irgs"):
+        protocol("nerf")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        GEOSPLATTING.name = "other"
+
+
+def test_the_lpips_note_names_the_nets():
+    assert "alex" in protocols.lpips_note(GEOSPLATTING)
+    assert "vgg" not in protocols.lpips_note(GEOSPLATTING)
+    assert "alex and vgg" in protocols.lpips_note(TENSOIR)
+    assert "alex" not in protocols.lpips_note(IRGS)
+
+
+def test_tensoir_takes_the_scale_from_twenty_views():
+    np.testing.assert_array_equal(protocols.scale_views(TENSOIR, 200), np.arange(20) * 10)
+    np.testing.assert_array_equal(protocols.scale_views(TENSOIR, 39), np.arange(20))
+    np.testing.assert_array_equal(protocols.scale_views(TENSOIR, 7), np.arange(7))
+    np.testing.assert_array_equal(protocols.scale_views(IRGS, 200), np.arange(200))
+    # A view between the twenty has no say under tensoir, and has under irgs.
+    truth = flat([0.5, 0.5, 0.5], (41, 1, 1))
+    truth[1::2] = 1.0
+    ones = np.ones((41, 1, 1), np.float32)
+    albedo = flat([0.25, 0.25, 0.25], (41, 1, 1))
+    truth[40] = 1.0
+    np.testing.assert_allclose(protocols.albedo_scale(TENSOIR, albedo, ones, truth, ones), 2.0)
+    np.testing.assert_allclose(protocols.albedo_scale(IRGS, albedo, ones, truth, ones), 4.0)
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_scale_recovers_a_gain_of_every_channel(name):
+    _, alpha, truth, mask = scene()
+    scale = protocols.albedo_scale(
+        protocol(name), (truth / GAIN).astype(np.float32), alpha, truth, mask
+    )
+    np.testing.assert_allclose(scale, GAIN, rtol=1e-5)
+
+
+def test_least_squares_scale_is_the_mean_over_views_with_an_object():
+    albedo, truth = flat([0.5, 0.5, 0.5], (3, 2, 2)), flat([0.5, 0.5, 0.5], (3, 2, 2))
+    # Two values in one view: s = (1 * .25 + .5 * .5) / (1 + .25) = .4, by hand.
+    albedo[0, 0], albedo[0, 1] = 1.0, 0.5
+    truth[0, 0], truth[0, 1] = 0.25, 0.5
+    mask = np.ones((3, 2, 2), np.float32)
+    mask[2], truth[2] = 0, 0
+    scale = protocols.albedo_scale(GEOSPLATTING, albedo, mask, truth, mask)
+    np.testing.assert_allclose(scale, (0.4 + 1.0) / 2, rtol=1e-6)
+    albedo[1, ..., 0] = 0  # one channel of one view is black: that view says nothing about it
+    scale = protocols.albedo_scale(GEOSPLATTING, albedo, mask, truth, mask)
+    np.testing.assert_allclose(scale, [0.4, 0.7, 0.7], rtol=1e-6)
+
+
+def test_least_squares_sees_spill_outside_the_mask_and_the_median_does_not():
+    mask = left_half()
+    truth = flat([0.4, 0.4, 0.4]) * mask[..., None]
+    albedo = flat([0.4, 0.4, 0.4])
+    alpha = np.ones_like(mask)
+    least = protocols.albedo_scale(GEOSPLATTING, albedo, alpha, truth, mask)
+    np.testing.assert_allclose(least, 0.5, rtol=1e-6)
+    for row in (TENSOIR, IRGS):
+        np.testing.assert_allclose(
+            protocols.albedo_scale(row, albedo, alpha, truth, mask), 1.0, rtol=1e-6
+        )
+
+
+def test_median_scale_is_of_straight_values_and_robust():
+    mask = flat(0.8)
+    alpha = flat(0.6)
+    truth = flat([0.4, 0.4, 0.4]) * mask[..., None]
+    albedo = flat([0.2, 0.2, 0.2]) * alpha[..., None]
+    albedo[0, 0] = 0.6  # four of sixteen pixels are outliers
+    alpha[0, 1, :2] = albedo[0, 1, :2] = 0  # nothing was drawn in two others
+    scale = protocols.albedo_scale(IRGS, albedo, alpha, truth, mask)
+    np.testing.assert_allclose(scale, 2.0, rtol=1e-5)
+    nothing = protocols.albedo_scale(IRGS, 0 * albedo, 0 * alpha, truth, mask)
+    np.testing.assert_array_equal(nothing, np.ones(3))
+    black = protocols.albedo_scale(GEOSPLATTING, 0 * albedo, 0 * alpha, truth, mask)
+    np.testing.assert_array_equal(black, np.ones(3))
+
+
+def test_albedo_figures_by_hand():
+    mask = left_half()
+    truth = flat([0.5, 0.5, 0.5]) * mask[..., None]
+    albedo = flat([0.1, 0.1, 0.1]) * mask[..., None]
+    scale = np.array([2.0, 2.0, 2.0])
+    # Half of the image errs; the encoding is the protocol's.
+    for row, encode in (
+        (GEOSPLATTING, srgb),
+        (TENSOIR, lambda v: v ** (1 / 2.2)),
+        (IRGS, lambda v: v),
+    ):
+        error = (encode(0.2) - encode(0.5)) ** 2
+        figures = protocols.albedo_figures(row, albedo, mask, truth, mask, scale)
+        assert figures["albedo.psnr"] == pytest.approx(decibels(error / 2), abs=DECIBELS)
+        assert figures["albedo.psnr_masked"] == pytest.approx(decibels(error), abs=DECIBELS)
+
+
+def test_only_geosplatting_counts_albedo_beside_the_object():
+    mask = left_half()
+    truth = flat([0.5, 0.5, 0.5]) * mask[..., None]
+    albedo = flat([0.5, 0.5, 0.5])
+    alpha = np.ones_like(mask)
+    figures = [
+        protocols.albedo_figures(row, albedo, alpha, truth, mask, np.ones(3))["albedo.psnr"]
+        for row in (GEOSPLATTING, TENSOIR, IRGS)
+    ]
+    assert figures[0] == pytest.approx(decibels(srgb(0.5) ** 2 / 2), abs=DECIBELS)
+    assert figures[1:] == pytest.approx([200.0, 200.0], abs=DECIBELS)
+
+
+def test_backgrounds_differ_where_coverage_is_partial():
+    # Truth covers all of it, the prediction of the same colour 60 %: black or white shows through.
+    mask, alpha = flat(1.0), flat(0.6)
+    truth = flat([0.5, 0.5, 0.5])
+    albedo = truth * alpha[..., None]
+    figures = protocols.albedo_figures(GEOSPLATTING, albedo, alpha, truth, mask, np.ones(3))
+    expected = decibels((0.4 * srgb(0.5)) ** 2)
+    assert figures["albedo.psnr"] == pytest.approx(expected, abs=DECIBELS)
+    image = np.concatenate([truth, mask[..., None]], -1)
+    white = decibels((0.4 * (1 - srgb(0.5))) ** 2)
+    psnr = [
+        protocols.relight_figures(row, albedo, alpha, image)["psnr"] for row in PROTOCOL.values()
+    ]
+    # `tensoir` shows it whole above one half, `irgs` cuts by the true mask.
+    assert psnr == pytest.approx([white, 200.0, 200.0], abs=DECIBELS)
+    alpha[:] = 0.4
+    thin = protocols.relight_figures(TENSOIR, truth * 0.4, alpha, image)["psnr"]
+    assert thin == pytest.approx(decibels((1 - 0.5 ** (1 / 2.2)) ** 2), abs=DECIBELS)
+
+
+def test_albedo_similarity_sees_the_background():
+    albedo, alpha, truth, mask = scene(views=1)
+    inside = mask[0, ..., None] > 0.5
+    for row, behind, encode in (
+        (GEOSPLATTING, 0.0, srgb),
+        (TENSOIR, 1.0, lambda v: v ** (1 / 2.2)),
+        (IRGS, 0.0, lambda v: v),
+    ):
+        pictures = [
+            np.where(inside, encode(np.clip(x[0], 0, 1)), behind).astype(np.float32)
+            for x in (albedo, truth)
+        ]
+        figures = protocols.albedo_figures(row, albedo, alpha, truth, mask, np.ones(3))
+        expected = float(metrics.ssim(*map(jnp.asarray, pictures)))
+        assert figures["albedo.ssim"] == pytest.approx(expected, abs=1e-5)
+
+
+def test_pooled_and_mean_of_images_differ():
+    mask = np.ones((2, 4, 4), np.float32)
+    mask[1, :2] = 0
+    truth = flat([0.5, 0.5, 0.5], (2, 4, 4)) * mask[..., None]
+    albedo = truth.copy()
+    albedo[0] = 0.6
+    albedo[1] = 0.9 * mask[1][..., None]
+    linear = dataclasses.replace(IRGS, albedo_is_pooled=True)
+    args = (albedo, mask, truth, mask, np.ones(3))
+    mean, pooled = protocols.albedo_figures(IRGS, *args), protocols.albedo_figures(linear, *args)
+    assert mean["albedo.psnr"] == pytest.approx(
+        (decibels(0.01) + decibels(0.16 / 2)) / 2, abs=DECIBELS
+    )
+    assert mean["albedo.psnr_masked"] == pytest.approx(
+        (decibels(0.01) + decibels(0.16)) / 2, abs=DECIBELS
+    )
+    assert pooled["albedo.psnr"] == pytest.approx(decibels((0.01 + 0.08) / 2), abs=DECIBELS)
+    assert pooled["albedo.psnr_masked"] == pytest.approx(
+        decibels((16 * 0.01 + 8 * 0.16) / 24), abs=DECIBELS
+    )
+    assert (TENSOIR.albedo_is_pooled, GEOSPLATTING.albedo_is_pooled) == (True, False)
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_a_gain_of_the_prediction_changes_nothing_after_the_scale(name):
+    albedo, alpha, truth, mask = scene()
+    row = protocol(name)
+    figures = []
+    for gain in (np.ones(3), np.array([0.3, 1.0, 4.0])):
+        predicted = (albedo * gain).astype(np.float32)
+        scale = protocols.albedo_scale(row, predicted, alpha, truth, mask)
+        figures.append(protocols.albedo_figures(row, predicted, alpha, truth, mask, scale))
+    same(*figures, rel=1e-4)
+    assert 15 < figures[0]["albedo.psnr_masked"] < 40
+    assert figures[0]["albedo.psnr"] > figures[0]["albedo.psnr_masked"]
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_masked_figures_ignore_the_background(name):
+    albedo, alpha, truth, mask = scene(views=1)
+    outside = mask < 0.5
+    spoiled, spilled = albedo.copy(), alpha.copy()
+    spoiled[outside], spilled[outside] = 0.7, 1.0
+    row = protocol(name)
+    image = np.concatenate([truth, mask[..., None]], -1)
+    for clean, dirty in (
+        (
+            protocols.albedo_figures(row, albedo, alpha, truth, mask, GAIN),
+            protocols.albedo_figures(row, spoiled, spilled, truth, mask, GAIN),
+        ),
+        (
+            protocols.relight_figures(row, albedo, alpha, image),
+            protocols.relight_figures(row, spoiled, spilled, image),
+        ),
+    ):
+        for key in (key for key in clean if key.endswith("_masked")):
+            assert dirty[key] == pytest.approx(clean[key], abs=1e-4), key
+        whole = next(key for key in clean if key.endswith("psnr"))
+        is_cut = name == "irgs" or (name == "tensoir" and whole == "albedo.psnr")
+        assert (dirty[whole] == pytest.approx(clean[whole], abs=1e-4)) == is_cut
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_perfect_predictions_are_perfect(name):
+    _, _, truth, mask = scene(views=2)
+    mask[:, 7, :3], truth[:, 7, :3] = 0.3, 0.15  # partial coverage, too
+    image = np.concatenate([np.where(mask[..., None] > 0, truth, 0), mask[..., None]], -1)
+    image[:, 7, :3, :3] /= 0.3
+    row = protocol(name)
+    albedo = protocols.albedo_figures(row, truth, mask, truth, mask, np.ones(3))
+    relight = protocols.relight_figures(row, truth, mask, image)
+    if name == "tensoir":
+        # It cuts the prediction at one half, and blends the truth.
+        assert relight.pop("psnr") < 60
+        assert relight.pop("ssim") < 1
+    for key, value in (albedo | relight).items():
+        if "psnr" in key:
+            assert value > 120, key
+        else:
+            assert value == pytest.approx(1, abs=1e-5), key
+
+
+def test_relit_values_are_clipped_before_encoding():
+    mask = flat(1.0)
+    image = flat([3.0, 1.0, 0.5, 1.0])
+    rgb = flat([1.0, 7.0, 0.5])
+    for row in PROTOCOL.values():
+        assert protocols.relight_figures(row, rgb, mask, image)["psnr"] > 150
+    # In linear light the third channel alone errs.
+    rgb[..., 2] = 0.25
+    row = dataclasses.replace(IRGS, relight=protocols.Look("linear", 0.0, "mask"))
+    psnr = protocols.relight_figures(row, rgb, mask, image)["psnr"]
+    assert psnr == pytest.approx(decibels(0.25**2 / 3), abs=DECIBELS)
+
+
+def test_relight_encodings_by_hand():
+    mask = left_half()
+    image = np.concatenate([flat([0.5, 0.5, 0.5]) * mask[..., None], mask[..., None]], -1)
+    rgb = flat([0.2, 0.2, 0.2]) * mask[..., None]
+    for row, encode in ((GEOSPLATTING, srgb), (TENSOIR, lambda v: v ** (1 / 2.2)), (IRGS, srgb)):
+        error = (encode(0.2) - encode(0.5)) ** 2
+        figures = protocols.relight_figures(row, rgb, mask, image)
+        assert figures["psnr"] == pytest.approx(decibels(error / 2), abs=DECIBELS)
+        assert figures["psnr_masked"] == pytest.approx(decibels(error), abs=DECIBELS)
+
+
+def test_material_figures_by_hand():
+    mask, alpha = left_half((2, 4, 4)), flat(0.5, (2, 4, 4))
+    materials = {"roughness": flat(0.2, (2, 4, 4)), "metallic": flat(0.0, (2, 4, 4))}
+    truth = {"roughness": 0.6 * mask}
+    figures = protocols.material_figures(materials, alpha, truth, mask)
+    assert figures == {
+        # Straight .4 against .6 inside; premultiplied .2 against .6 and, outside, 0.
+        "roughness.mse": pytest.approx(0.04),
+        "roughness.mse_full": pytest.approx((0.16 + 0.04) / 2),
+    }
+    mask[1] = truth["roughness"][1] = 0
+    figures = protocols.material_figures(materials, alpha, truth, mask)
+    assert figures["roughness.mse"] == pytest.approx(0.04)
+    truth["metallic"] = mask * 1.0
+    figures = protocols.material_figures(materials, alpha, truth, mask)
+    assert figures["metallic.mse"] == pytest.approx(1.0)
+    assert figures["metallic.mse_full"] == pytest.approx(0.25)
+    with pytest.raises(ValueError, match="no predicted one"):
+        protocols.material_figures({}, alpha, truth, mask)
+
+
+def test_empty_views_are_left_out():
+    albedo, alpha, truth, mask = scene(views=2)
+    mask[1] = truth[1] = 0
+    for row in PROTOCOL.values():
+        one = protocols.albedo_figures(row, albedo[:1], alpha[:1], truth[:1], mask[:1], GAIN)
+        two = protocols.albedo_figures(row, albedo, alpha, truth, mask, GAIN)
+        for key in ("albedo.psnr_masked", "albedo.ssim_masked"):
+            assert two[key] == pytest.approx(one[key], abs=1e-4)
+        np.testing.assert_allclose(
+            protocols.albedo_scale(row, albedo, alpha, truth, mask),
+            protocols.albedo_scale(row, albedo[:1], alpha[:1], truth[:1], mask[:1]),
+            rtol=1e-6,
+        )
+
+
+def test_views_without_any_object_are_refused():
+    albedo, alpha, truth, mask = scene(views=2)
+    nothing, image = 0 * mask, np.zeros((*mask.shape, 4), np.float32)
+    calls = [
+        lambda: protocols.albedo_scale(TENSOIR, albedo, alpha, truth, nothing),
+        lambda: protocols.albedo_figures(IRGS, albedo, alpha, truth, nothing, GAIN),
+        lambda: protocols.relight_figures(GEOSPLATTING, albedo, alpha, image),
+        lambda: protocols.material_figures({}, alpha, {}, nothing),
+    ]
+    for call in calls:
+        with pytest.raises(ValueError, match="no pixel of the 2 views"):
+            call()
+
+
+def test_boolean_masks_equal_fractional_ones():
+    albedo, alpha, truth, mask = scene(views=1)
+    for row in PROTOCOL.values():
+        args = albedo, alpha, truth
+        np.testing.assert_array_equal(
+            protocols.albedo_scale(row, *args, mask > 0.5), protocols.albedo_scale(row, *args, mask)
+        )
+        same(
+            protocols.albedo_figures(row, *args, mask > 0.5, GAIN),
+            protocols.albedo_figures(row, *args, mask, GAIN),
+        )
+
+
+def test_wrong_shapes_and_values_that_are_not_finite_are_refused():
+    albedo, alpha, truth, mask = scene(views=2)
+    with pytest.raises(ValueError, match=r"mask must be \(V, H, W\) = \(2, 14, 14\)"):
+        protocols.albedo_scale(IRGS, albedo, alpha, truth, mask[:1])
+    with pytest.raises(ValueError, match=r"image must be \(V, H, W, C\).*got \(2, 14, 14, 3\)"):
+        protocols.relight_figures(IRGS, albedo, alpha, truth)
+    with pytest.raises(ValueError, match="at least one view"):
+        protocols.albedo_scale(IRGS, albedo[:0], alpha[:0], truth[:0], mask[:0])
+    with pytest.raises(ValueError, match="predicted roughness must be"):
+        protocols.material_figures({"roughness": mask[..., None]}, alpha, {"roughness": mask}, mask)
+    albedo[0, 3, 3] = np.nan
+    with pytest.raises(ValueError, match="albedo has 3 values that are not finite"):
+        protocols.albedo_figures(IRGS, albedo, alpha, truth, mask, GAIN)
+
+
+FOUR_COLORS = np.array([[4.0, 0.2, 0.1], [0.1, 1.0, 0.2], [0.2, 0.1, 0.5], [0.6, 0.6, 0.1]])
+
+
+def four_sides(height=8, width=16):
+    """A light whose four sides have four colours, brighter upwards; never its own mirror image."""
+    sides = np.repeat(FOUR_COLORS, width // 4, axis=0)
+    slope = np.linspace(1.5, 0.5, height)
+    return (slope[:, None, None] * sides).astype(np.float32)
+
+
+def test_equal_lights_are_equal_up_to_one_scale_a_channel():
+    truth = four_sides()
+    figures = protocols.light_figures((truth / GAIN).astype(np.float32), truth)
+    np.testing.assert_allclose(figures["light.scale"], GAIN, rtol=1e-5)
+    assert figures["light.psnr"] > 120
+    assert figures["light.correlation"] == pytest.approx(1.0, abs=1e-6)
+    assert figures["light.direction_error_deg"] == pytest.approx(0.0, abs=1e-4)
+    assert figures["light.yaw_error_deg"] == 0.0
+    assert figures["light.yaw_correlation"] == pytest.approx(1.0, abs=1e-6)
+    assert figures["light.mirrored_correlation"] < 0.99
+    assert figures["light.is_mirrored"] is False
+
+
+@pytest.mark.parametrize("degrees", [45.0, -90.0, 180.0])
+def test_a_turned_light_shows_the_turn_that_undoes_it(degrees):
+    truth = four_sides()
+    angle = np.deg2rad(degrees)
+    cos, sin = np.cos(angle), np.sin(angle)
+    rotation = jnp.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], jnp.float32)
+    turned = np.asarray(rotate_light(EnvLight(jnp.asarray(truth)), rotation).radiance)
+    figures = protocols.light_figures(turned, truth)
+    expected = 180.0 if degrees == 180 else -degrees
+    assert figures["light.yaw_error_deg"] == pytest.approx(expected)
+    assert figures["light.yaw_correlation"] == pytest.approx(1.0, abs=1e-5)
+    assert figures["light.is_mirrored"] is False
+    assert figures["light.correlation"] < 0.9
+    assert figures["light.direction_error_deg"] > 10
+
+
+def test_a_mirrored_light_is_found_at_any_turn():
+    truth = four_sides()
+    for shift in (0, 3):
+        figures = protocols.light_figures(np.roll(truth[:, ::-1], shift, axis=1).copy(), truth)
+        assert figures["light.is_mirrored"] is True
+        assert figures["light.mirrored_correlation"] == pytest.approx(1.0, abs=1e-5)
+
+
+def test_a_sun_does_not_hide_a_flip():
+    # One texel outshines everything; what tells the sides apart is the dim rest.
+    truth = four_sides(16, 32)
+    truth[3, 5] = 2000.0
+    noise = np.random.default_rng(3).lognormal(0.0, 0.2, truth.shape)
+    noisy = (truth * noise).astype(np.float32)
+    right = protocols.light_figures(noisy, truth)
+    flipped = protocols.light_figures(noisy[:, ::-1].copy(), truth)
+    assert right["light.is_mirrored"] is False
+    assert right["light.yaw_error_deg"] == 0.0
+    assert flipped["light.is_mirrored"] is True
+
+
+def test_a_symmetric_light_is_not_called_mirrored():
+    half = np.random.default_rng(4).uniform(0.1, 2.0, (8, 8, 3))
+    light = np.concatenate([half, half[:, ::-1]], axis=1).astype(np.float32)
+    figures = protocols.light_figures(light, light)
+    assert figures["light.is_mirrored"] is False
+    assert figures["light.mirrored_correlation"] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_lights_without_direction_are_finite():
+    truth = four_sides()
+    uniform = np.asarray(init_light(8).radiance)
+    for a, b in ((uniform, truth), (truth, uniform), (0 * uniform, truth), (uniform, 0 * uniform)):
+        figures = protocols.light_figures(a, b)
+        assert np.all(np.isfinite(list(figures.values())[1:]))
+        assert figures["light.direction_error_deg"] == 90.0
+        assert figures["light.correlation"] == 0.0
+        assert figures["light.yaw_error_deg"] == 0.0
+        assert figures["light.is_mirrored"] is False
+    assert protocols.light_figures(0 * uniform, truth)["light.scale"] == (1.0, 1.0, 1.0)
+
+
+def test_light_psnr_and_scale_by_hand():
+    # One row: two texels of equal solid angle.
+    recovered = np.array([[[1.0] * 3, [2.0] * 3]], np.float32)
+    truth = np.array([[[1.0] * 3, [1.0] * 3]], np.float32)
+    figures = protocols.light_figures(recovered, truth)
+    scale = (1 + 2) / (1 + 4)
+    np.testing.assert_allclose(figures["light.scale"], scale, rtol=1e-6)
+    errors = [scale / (1 + scale) - 0.5, 2 * scale / (1 + 2 * scale) - 0.5]
+    assert figures["light.psnr"] == pytest.approx(
+        decibels(np.mean(np.square(errors))), abs=DECIBELS
+    )
+
+
+def test_direction_error_is_the_angle_between_two_suns():
+    directions = np.asarray(light_directions(16, 32))
+    maps = []
+    for row, column in ((4, 5), (10, 20)):
+        light = np.zeros((16, 32, 3), np.float32)
+        light[row, column] = 100.0
+        maps.append(light)
+    expected = np.rad2deg(np.arccos(directions[4, 5] @ directions[10, 20]))
+    figures = protocols.light_figures(maps[0] + np.float32(0.01), maps[1])
+    assert figures["light.direction_error_deg"] == pytest.approx(expected, abs=0.1)
+
+
+@pytest.mark.parametrize("size", [(4, 8), (3, 5), (8, 16), (11, 7)])
+def test_resized_lights_keep_their_flux(size):
+    light = np.random.default_rng(1).uniform(0, 5, (8, 16, 3))
+    small = protocols.resize_light(light, *size)
+    flux = [
+        np.einsum("hw,hwc->c", np.asarray(texel_solid_angles(*x.shape[:2]), float), x)
+        for x in (light, small)
+    ]
+    np.testing.assert_allclose(*flux, rtol=1e-6)
+    uniform = protocols.resize_light(np.ones((8, 16, 3)), *size)
+    np.testing.assert_allclose(uniform, 1.0, atol=1e-12)
+
+
+def test_resizing_by_whole_factors_is_downsampling():
+    light = np.random.default_rng(2).uniform(0, 5, (8, 16, 3)).astype(np.float32)
+    expected = downsample_light(EnvLight(jnp.asarray(light)), factor=2).radiance
+    np.testing.assert_allclose(protocols.resize_light(light, 4, 8), expected, rtol=1e-5)
+
+
+def test_the_truth_may_have_any_size():
+    truth = four_sides(32, 64)
+    small = protocols.resize_light(truth, 8, 16).astype(np.float32)
+    figures = protocols.light_figures(small, truth)
+    assert figures["light.psnr"] > 120
+    assert figures["light.yaw_error_deg"] == 0.0
+
+
+def test_bad_lights_are_refused():
+    light = four_sides()
+    with pytest.raises(ValueError, match=r"recovered light must be \(H, W, 3\)"):
+        protocols.light_figures(light[..., :2], light)
+    with pytest.raises(ValueError, match="true light must be finite and not negative"):
+        protocols.light_figures(light, light - 1)
+    with pytest.raises(ValueError, match="recovered light must be finite"):
+        protocols.light_figures(light * np.nan, light)
+
+
+def test_masked_ssim_is_what_the_protocols_print():
+    albedo, alpha, truth, mask = scene(views=1)
+    figures = protocols.albedo_figures(IRGS, albedo, alpha, truth, mask, np.ones(3))
+    expected = metrics.ssim_masked(np.clip(albedo[0], 0, 1), truth[0], mask[0])
+    assert figures["albedo.ssim_masked"] == pytest.approx(float(expected), abs=1e-5)
