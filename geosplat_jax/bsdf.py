@@ -100,15 +100,15 @@ def ggx_distribution(
     return _distribution(_dot(half, normals), sine_squared, alpha)
 
 
-def _smith_root(cosine: Float[Array, " N"], alpha: Float[Array, " N"]) -> Float[Array, " N"]:
+def _smith_root(cosine: Float[Array, "..."], alpha: Float[Array, "..."]) -> Float[Array, "..."]:
     """``sqrt(alpha^2 + (1 - alpha^2) cos^2)``: ``cos * sqrt(1 + tan^2 alpha^2)``, finite at 90°."""
     alpha_squared = jnp.square(alpha)
     return safe_sqrt(alpha_squared + (1 - alpha_squared) * jnp.square(cosine))
 
 
 def smith_visibility(
-    cosine_i: Float[Array, " N"], cosine_o: Float[Array, " N"], alpha: Float[Array, " N"]
-) -> Float[Array, " N"]:
+    cosine_i: Float[Array, "..."], cosine_o: Float[Array, "..."], alpha: Float[Array, "..."]
+) -> Float[Array, "..."]:
     """Height-correlated masking and shadowing, divided by ``4 (n.wi)(n.wo)`` (Heitz 2014)."""
     spread = cosine_i * _smith_root(cosine_o, alpha) + cosine_o * _smith_root(cosine_i, alpha)
     return 0.5 / spread

@@ -331,11 +331,12 @@ def _specular_sums(
     Rays are directions, what they bring, and the density of the light's samples there.
     """
     wi, radiance, light_density = rays
-    alpha = bsdf.ggx_alpha(materials.roughness)
-    lobe = bsdf.specular_lobe(tuple(normals.T), tuple(wi), tuple(wo.T), alpha)
+    alpha = bsdf.ggx_alpha(materials.roughness)[None, :]
+    normal, view = (tuple(vectors.T[:, None, :]) for vectors in (normals, wo))
+    lobe = bsdf.specular_lobe(normal, tuple(wi), view, alpha)
     density = counts.light * light_density
     density = density + counts.specular * jax.lax.stop_gradient(lobe.density)
-    weight = jnp.where(mask, safe_divide(jnp.ones_like(density), density), 0.0)
+    weight = jnp.where(mask[None, :], safe_divide(jnp.ones_like(density), density), 0.0)
     share = weight * lobe.strength * lobe.cosine
     # The Fresnel factor is f0 + (1 - f0) grazing, and f0 does not depend on the direction.
     bare = jnp.stack([jnp.sum(share * channel, axis=0) for channel in radiance], axis=-1)

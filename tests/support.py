@@ -1,23 +1,34 @@
 """Shared by the tests: double precision, and where the optional shared data lies."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from geosplat_jax.config import make_config
+from geosplat_jax.geometry import sphere_sdf
 from geosplat_jax.gradcheck.differences import double_precision
+from geosplat_jax.hull import fit_grid
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.views import Views
+from geosplat_jax.materials import ROUGHNESS_MINIMUM
+from geosplat_jax.stages import initial_params, make_context
 
 __all__ = [
+    "STAGE_2",
     "TINY",
+    "ball_of_one_material",
     "double_precision",
     "look_at_poses",
     "shared_path",
     "sphere_dataset",
     "sphere_views",
     "tiny_config",
+    "views_from",
+    "with_constant_material",
 ]
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
@@ -118,3 +129,69 @@ TINY = (
 def tiny_config(*overrides):
     """Return a configuration for tests; later overrides win."""
     return make_config(overrides=(*TINY, *overrides))
+
+
+STAGE_2 = (
+    "transport.steps=3",
+    "transport.batch_views=1",
+    "transport.shading.light=1",
+    "transport.shading.diffuse=1",
+    "transport.shading.specular=1",
+)
+"""Overrides that add a stage 2 to `TINY`, small enough for a test."""
+
+
+def views_from(eyes, *, size=16, field_of_view=0.5):
+    """Black views from points of the world (none on the vertical axis) towards the origin."""
+    poses = []
+    for eye in np.asarray(eyes, float):
+        back = eye / np.linalg.norm(eye)
+        right = np.cross([0.0, 0.0, 1.0], back)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+        pose[:3, 3] = eye
+        poses.append(pose)
+    focal = 0.5 * size / np.tan(0.5 * field_of_view)
+    intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
+    return Views(
+        names=tuple(f"view_{k}" for k in range(len(poses))),
+        camera_to_world=np.stack(poses),
+        intrinsics=np.repeat(intrinsics[None], len(poses), axis=0),
+        images=np.zeros((len(poses), size, size, 4), np.float32),
+    )
+
+
+def with_constant_material(params, spec, *, albedo, roughness, metallic):
+    """Return parameters whose heads (with biases) give the same attributes everywhere."""
+
+    def constant(head, logits):
+        layers = [jax.tree.map(jnp.zeros_like, layer) for layer in head]
+        logits = jnp.broadcast_to(jnp.asarray(logits, jnp.float32), layers[-1].bias.shape)
+        return (*layers[:-1], replace(layers[-1], bias=logits))
+
+    def logit(share):
+        share = np.clip(share, 1e-7, 1 - 1e-7)
+        return np.log(share / (1 - share))
+
+    rough = logit((roughness - ROUGHNESS_MINIMUM) / (1 - ROUGHNESS_MINIMUM))
+    surface = [
+        rough - spec.initial_roughness_logit,
+        logit(metallic) - spec.initial_metallic_logit,
+    ]
+    material = replace(
+        params.material,
+        albedo_head=constant(params.material.albedo_head, logit(np.asarray(albedo))),
+        surface_head=constant(params.material.surface_head, surface),
+    )
+    return replace(params, material=material)
+
+
+def ball_of_one_material(config, *, albedo, roughness, metallic, radius=0.4):
+    """Parameters and context of a ball; ``config`` must give the heads biases."""
+    grid = fit_grid((np.full(3, -0.6), np.full(3, 0.6)), config.geometry.resolution)
+    params = initial_params(sphere_sdf(grid, radius=radius), grid, config, jax.random.key(0))
+    params = with_constant_material(
+        params, config.model.material, albedo=albedo, roughness=roughness, metallic=metallic
+    )
+    return params, make_context(grid, config.model)

@@ -9,10 +9,11 @@ difference.
 What differs by design and stays in the figures:
 
 * Masking. Mitsuba's is separable, ``G1(wi) G1(wo)``; ours is height-correlated and so at least as
-  large, the more so for rough surfaces seen or lit at a slant. Distribution, the width
-  ``roughness**2`` and Schlick's Fresnel are the same for a metal.
-* Shading normals that face away from the viewer. Mitsuba returns black; we flip them. It happens
-  within a fraction of a pixel of the silhouette.
+  large, the more so for rough surfaces seen or lit at a slant: under the sky by a thousandth of
+  the mean at roughness 0.4, by 3% at 0.8. Distribution, the width ``roughness**2`` and Schlick's
+  Fresnel are the same for a metal.
+* Shading normals that face away from the viewer, of 0.3% of the hits, at the silhouette. Mitsuba
+  returns black; we flip them.
 
 Light that arrives from below the face but above the shading normal is blocked in both: here by a
 test, in Mitsuba because the shadow ray then starts inside a closed mesh.
@@ -384,15 +385,14 @@ def choose_variant() -> str:
     raise RuntimeError(f"no variant of {_VARIANTS} renders here; the last one said: {last}")
 
 
-def _envmap_texels(light: EnvLight, *, column_offset: float) -> np.ndarray:
+def _envmap_texels(light: EnvLight) -> np.ndarray:
     """Texels of a Mitsuba envmap that is the same function of direction as our light.
 
-    Its rows lie at ``j / (rows - 1)``, its columns at ``(i + column_offset) / columns``. Our texel
-    centres are among these nodes, and a bilinear function stays itself on a finer grid.
+    Columns lie at half integers in both. Mitsuba's rows lie at ``j / (rows - 1)``: of twice as many
+    and one, every other is one of ours, and a bilinear function stays itself on a finer grid.
     """
     height, width, _ = light.radiance.shape
-    columns = width if column_offset == 0.5 else 2 * width
-    u = (np.arange(columns) + column_offset) / columns
+    u = (np.arange(width) + 0.5) / width
     # Beyond the first and last row centre our map is constant along a meridian, and at the pole
     # itself the azimuth would be lost.
     v = np.clip(np.arange(2 * height + 1) / (2 * height), 0.25 / height, 1 - 0.25 / height)
@@ -402,7 +402,7 @@ def _envmap_texels(light: EnvLight, *, column_offset: float) -> np.ndarray:
     )
     found = lookup(light.radiance, jnp.asarray(directions.reshape(-1, 3), jnp.float32))
     # A copy: Mitsuba takes no array that is read-only.
-    return np.array(found, np.float32).reshape(2 * height + 1, columns, 3)
+    return np.array(found, np.float32).reshape(2 * height + 1, width, 3)
 
 
 def light_error(emitter, light: EnvLight) -> float:
@@ -421,25 +421,21 @@ def light_error(emitter, light: EnvLight) -> float:
 
 
 def mitsuba_light(light: EnvLight):
-    """Build the envmap of a light, on whichever of both column conventions is in use here.
+    """Build the envmap of a light.
 
     Raises
     ------
     RuntimeError
-        If neither gives the same light in the same directions.
+        If it gives other light in the same directions: Mitsuba changed its conventions.
     """
     import mitsuba as mi
 
-    errors = {}
-    for column_offset in (0.5, 0.0):
-        texels = _envmap_texels(light, column_offset=column_offset)
-        to_world = mi.ScalarTransform4f(_ENVMAP_TO_WORLD)
-        bitmap = mi.Bitmap(texels)
-        emitter = mi.load_dict({"type": "envmap", "bitmap": bitmap, "to_world": to_world})
-        errors[column_offset] = light_error(emitter, light)
-        if errors[column_offset] < 1e-3:
-            return emitter
-    raise RuntimeError(f"Mitsuba's envmap differs from our light, by column offset: {errors}")
+    bitmap, to_world = mi.Bitmap(_envmap_texels(light)), mi.ScalarTransform4f(_ENVMAP_TO_WORLD)
+    emitter = mi.load_dict({"type": "envmap", "bitmap": bitmap, "to_world": to_world})
+    error = light_error(emitter, light)
+    if error > 1e-3:
+        raise RuntimeError(f"Mitsuba's envmap differs from our light by {error} of its brightest")
+    return emitter
 
 
 def mitsuba_mesh(scene: Scene, settings: Settings, *, material: str):

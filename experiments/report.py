@@ -1,0 +1,442 @@
+"""Write a sweep's tables and curves from the figures that its runs left.
+
+``python experiments/report.py DIR --output docs/NAME.md --plots docs/images``, where
+``experiments/run.py`` wrote ``DIR``. Runs that are missing, failed or have other settings than
+``DIR/sweep.json`` are listed as such. Curves need matplotlib (the extra ``plots``).
+"""
+
+import argparse
+import importlib.util
+import json
+import math
+import os
+import re
+import shlex
+import statistics
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from geosplat_jax.config import config_from_dict, differences
+
+_UP = ("psnr", "ssim", "iou", "correlation")
+_DOWN = ("mse", "mae", "direction_error")
+_COSTS = ("stage 2, s", "s a step", "memory, MB")
+_NONE = "–"
+_LONGEST = 240
+"""Characters of an error's last line."""
+
+
+class ReportError(ValueError):
+    """There is nothing to report on; the message says why."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One run on one scene.
+
+    Attributes
+    ----------
+    figures : as in the ``mean`` of ``metrics.json``; empty where ``problem`` says why.
+    costs : some of `_COSTS`.
+    problem : what is wrong, or an empty text.
+    notes : what does not spoil the figures but belongs to them.
+    """
+
+    figures: dict[str, float]
+    costs: dict[str, float]
+    problem: str = ""
+    notes: tuple[str, ...] = ()
+
+
+def arrow(figure: str) -> str:
+    """Say which way a figure is better: an arrow, or nothing where neither way is."""
+    last = figure.split(".")[-1]
+    if last.startswith("mirrored"):
+        return ""
+    if any(part in last for part in _UP):
+        return " ↑"
+    return " ↓" if last.startswith(_DOWN) else ""
+
+
+def digits(figure: str, value: float, *, signed: bool = False) -> str:
+    """Write a figure with as many digits as mean something; a difference with its sign."""
+    last = figure.split(".")[-1]
+    if not math.isfinite(value):
+        return f"{value:+g}" if signed else f"{value:g}"
+    places = 2 if "psnr" in last or last.endswith("_deg") else 4
+    text = f"{value:{'+' if signed else ''}.{places}f}"
+    return text.replace("-", "−")
+
+
+def _cost_digits(name: str, value: float) -> str:
+    """Write seconds with three digits and memory as a whole number."""
+    if name == "memory, MB" or value >= 100:
+        return f"{value:.0f}"
+    return f"{value:.{1 if value >= 10 else 2 if value >= 1 else 3}f}"
+
+
+def _without_places(text: str) -> str:
+    """Shorten absolute paths to their last part: a report is read on other machines."""
+    return re.sub(r"(?<![\w.])(?:/[\w.@+-]+)+/([\w.@+-]+)", r"\1", text)
+
+
+def command_line(script: str, *parts: str | tuple[Path, str]) -> str:
+    """Write a command as it can be called from the working folder.
+
+    A place is a path and the name that stands for it where it lies outside.
+    """
+    said = ["python", script]
+    for part in parts:
+        if isinstance(part, tuple):
+            path, otherwise = part[0].resolve(), part[1]
+            here = Path.cwd()
+            part = path.relative_to(here).as_posix() if path.is_relative_to(here) else otherwise
+        said.append(part)
+    return shlex.join(said)
+
+
+def _cell(text: str) -> str:
+    """Make a text safe inside a markdown table."""
+    return text.replace("|", "\\|").replace("\n", " ")
+
+
+def _last_line(path: Path) -> str:
+    """Return the last line of an error that says something, marked where it is cut."""
+    lines = [line.strip() for line in path.read_text(errors="replace").splitlines()]
+    last = _without_places(next((line for line in reversed(lines) if line), "no message"))
+    return last if len(last) <= _LONGEST else last[:_LONGEST] + " […]"
+
+
+def _costs(folder: Path, figures: dict[str, Any], steps: int) -> tuple[dict[str, float], list[str]]:
+    """Seconds of stage 2 and the largest memory; notes on what is not known."""
+    costs, notes = {}, []
+    memory = figures.get("training_peak_memory_mb")
+    if memory is not None:
+        costs["memory, MB"] = float(memory)
+    path = folder / "metrics.jsonl"
+    lines = [json.loads(x) for x in path.read_text().splitlines()] if path.exists() else []
+    seconds = [float(line["seconds"]) for line in lines if line["stage"] == 2]
+    if len(seconds) != steps:
+        notes.append(f"metrics.jsonl has {len(seconds)} of {steps} steps of stage 2")
+    elif seconds:
+        costs["stage 2, s"] = sum(seconds)
+        costs["s a step"] = statistics.median(seconds)
+    return costs, notes
+
+
+def read_entry(folder: Path, run: dict[str, Any]) -> Entry:
+    """Read what one run left, and check that it is the run that the sweep wants.
+
+    Parameters
+    ----------
+    folder : run folder.
+    run : the run in ``sweep.json``.
+    """
+    if (folder / "error.txt").exists():
+        return Entry({}, {}, f"failed: {_last_line(folder / 'error.txt')}")
+    if not (folder / "metrics.json").exists():
+        state = "not evaluated" if (folder / "run.json").exists() else "missing"
+        return Entry({}, {}, state)
+    try:
+        record = json.loads((folder / "metrics.json").read_text())
+        config = config_from_dict(run["config"])
+        recorded = config_from_dict(record["config"])
+        changed = differences(recorded, config.stage(record["stage"]))
+        if changed:
+            problem = f"other settings than the sweep (recorded -> wanted): {'; '.join(changed)}"
+            return Entry({}, {}, problem)
+        if record["step"] != config.total_steps:
+            return Entry({}, {}, f"evaluated at step {record['step']} of {config.total_steps}")
+        costs, notes = _costs(folder, record, config.transport.steps)
+        figures = {name: float(value) for name, value in record["mean"].items()}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        return Entry({}, {}, f"unreadable: {_without_places(repr(error))}")
+    if record.get("samples") != run["evaluate"]["samples"]:
+        notes.append(f"evaluated with {record.get('samples')} samples")
+    return Entry(figures, costs, "", tuple(notes))
+
+
+def read_entries(folder: Path, sweep: dict[str, Any]) -> dict[str, dict[str, Entry]]:
+    """Read all runs, by scene and name; a run that equals another one has the other's figures."""
+    return {
+        scene: {
+            run["name"]: read_entry(folder / scene / (run["same_as"] or run["name"]), run)
+            for run in sweep["runs"]
+        }
+        for scene in sweep["scenes"]
+    }
+
+
+def _table(rows: list[list[str]]) -> list[str]:
+    """Lay out a markdown table; the first row is the header, the first column holds names."""
+    head, *body = [[_cell(cell) for cell in row] for row in rows]
+    rule = ["---", *["---:"] * (len(head) - 1)]
+    return [f"| {' | '.join(row)} |" for row in (head, rule, *body)]
+
+
+def _header(sweep: dict[str, Any]) -> list[str]:
+    """Return the header that all tables share."""
+    return ["run", *(f"{name}{arrow(name)}" for name in sweep["figures"]), *_COSTS]
+
+
+def scene_table(sweep: dict[str, Any], entries: dict[str, Entry]) -> list[str]:
+    """Tabulate the runs of one scene."""
+    rows = [_header(sweep)]
+    for name, entry in entries.items():
+        row = [name]
+        for figure in sweep["figures"]:
+            value = entry.figures.get(figure)
+            row.append(_NONE if value is None else digits(figure, value))
+        row += [
+            _cost_digits(cost, entry.costs[cost]) if cost in entry.costs else _NONE
+            for cost in _COSTS
+        ]
+        rows.append(row)
+    return _table(rows)
+
+
+def _pairs(
+    entries: dict[str, dict[str, Entry]], name: str, reference: str, figure: str
+) -> tuple[list[tuple[float, float]], int]:
+    """Values of a run and of the reference where both are known, and how often the latter is."""
+    field = "costs" if figure in _COSTS else "figures"
+    found = [
+        tuple(getattr(runs[which], field).get(figure) for which in (name, reference))
+        for runs in entries.values()
+    ]
+    known = sum(second is not None for _, second in found)
+    return [(a, b) for a, b in found if a is not None and b is not None], known
+
+
+def summary_table(sweep: dict[str, Any], entries: dict[str, dict[str, Entry]]) -> list[str]:
+    """Means over the scenes: the reference's values, and how the other runs differ from them.
+
+    A difference takes in the scenes where both runs have the figure and says how many these are
+    where some lack. Seconds and memory are ratios.
+    """
+    reference = sweep["runs"][0]["name"]
+    rows = [_header(sweep)]
+    for run in sweep["runs"]:
+        name = run["name"]
+        row = [f"{name} (reference)" if name == reference else name]
+        for figure in (*sweep["figures"], *_COSTS):
+            pairs, known = _pairs(entries, name, reference, figure)
+            if not pairs:
+                row.append(_NONE)
+                continue
+            ours, theirs = (statistics.fmean(values) for values in zip(*pairs, strict=True))
+            is_cost = figure in _COSTS
+            if name == reference:
+                cell = _cost_digits(figure, ours) if is_cost else digits(figure, ours)
+                known = len(entries)
+            elif is_cost:
+                cell = f"×{ours / theirs:.2f}" if theirs > 0 else _NONE
+            else:
+                change = statistics.fmean(a - b for a, b in pairs)
+                cell = digits(figure, change, signed=True)
+            if len(pairs) < known:
+                cell += f" ({len(pairs)} of {known} scenes)"
+            row.append(cell)
+        rows.append(row)
+    return _table(rows)
+
+
+def curves(
+    sweep: dict[str, Any], entries: dict[str, dict[str, Entry]], group: str, figure: str
+) -> dict[str, list[tuple[float, float, float | None]]]:
+    """Points of a figure along a group, by scene: x, mean, and the spread of several seeds.
+
+    The spread is the standard deviation of the sample, None for one seed.
+    """
+    found: dict[str, list[tuple[float, float, float | None]]] = {}
+    for scene, runs in entries.items():
+        values: dict[float, list[float]] = {}
+        for run in sweep["runs"]:
+            value = runs[run["name"]].figures.get(figure)
+            if run["x"] is not None and run["group"] == group and value is not None:
+                values.setdefault(run["x"], []).append(value)
+        points = [
+            (x, statistics.fmean(v), statistics.stdev(v) if len(v) > 1 else None)
+            for x, v in sorted(values.items())
+        ]
+        if points:
+            found[scene] = points
+    return found
+
+
+def draw(
+    path: Path, sweep: dict[str, Any], entries: dict[str, dict[str, Entry]], group: str
+) -> None:
+    """Draw every figure of the sweep against x, a panel a figure and a line a scene."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    names = sweep["figures"]
+    columns = min(len(names), 3)
+    rows = math.ceil(len(names) / columns)
+    size = (4 * columns, 3.2 * rows)
+    drawn, axes = plt.subplots(rows, columns, figsize=size, squeeze=False)
+    xs = [run["x"] for run in sweep["runs"] if run["x"] is not None and run["group"] == group]
+    is_wide = min(xs) > 0 and max(xs) >= 8 * min(xs)
+    for axis, figure in zip(axes.flat, names, strict=False):
+        for scene, points in curves(sweep, entries, group, figure).items():
+            x, mean, spread = zip(*points, strict=True)
+            (line,) = axis.plot(x, mean, "o-", markersize=4, label=scene)
+            repeated = [k for k, width in enumerate(spread) if width is not None]
+            if repeated:
+                at, middle, width = ([part[k] for k in repeated] for part in (x, mean, spread))
+                axis.errorbar(at, middle, width, fmt="none", capsize=3, color=line.get_color())
+        if is_wide:
+            axis.set_xscale("log", base=2)
+            axis.set_xticks(sorted(set(xs)), [f"{x:g}" for x in sorted(set(xs))])
+        axis.set(xlabel=group, title=f"{figure}{arrow(figure)}")
+        if axis.lines:
+            axis.legend(fontsize=8)
+        else:
+            axis.text(0.5, 0.5, "no figures", ha="center", transform=axis.transAxes)
+    for axis in axes.flat[len(names) :]:
+        axis.remove()
+    drawn.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    drawn.savefig(path, dpi=95)
+    plt.close(drawn)
+
+
+def write_plots(
+    sweep: dict[str, Any], entries: dict[str, dict[str, Entry]], folder: Path, stem: str
+) -> list[Path]:
+    """Draw all groups into ``folder/STEM_GROUP.png`` and list the files."""
+    groups = dict.fromkeys(run["group"] for run in sweep["runs"] if run["x"] is not None)
+    paths = []
+    for group in groups:
+        paths.append(folder / f"{stem}_{group}.png")
+        draw(paths[-1], sweep, entries, group)
+    return paths
+
+
+def _describe_runs(sweep: dict[str, Any]) -> list[str]:
+    """Say what every run changes, and where its evaluation is not that of the reference."""
+    usual = sweep["runs"][0]["evaluate"]
+    rows = [["run", "what it is", "settings"]]
+    for run in sweep["runs"]:
+        title = run["title"]
+        if run["same_as"]:
+            title += f" (the same settings as {run['same_as']}, trained once)"
+        other = [f"{k} = {v}" for k, v in run["evaluate"].items() if v != usual.get(k)]
+        if other:
+            title += f" (evaluated with {', '.join(other)})"
+        changes = ", ".join(f"`{override}`" for override in run["overrides"])
+        rows.append([run["name"], title, changes or _NONE])
+    lines = _table(rows)
+    lines[1] = "| --- | --- | --- |"
+    common = ", ".join(f"`{override}`" for override in sweep["overrides"])
+    start = f"Preset {sweep['preset']}, quality {sweep['quality']}, kind {sweep['kind']}, images "
+    start += f"reduced by {sweep['downscale']}, " if sweep["downscale"] > 1 else "as they are, "
+    start += f"{usual['samples']} samples for evaluation, protocol {usual['protocol']}"
+    return [start + (f"; all runs: {common}." if common else "."), "", *lines]
+
+
+def problems(sweep: dict[str, Any], entries: dict[str, dict[str, Entry]]) -> list[str]:
+    """List runs without figures, figures that finished runs lack, and notes."""
+    lines = []
+    for scene, runs in entries.items():
+        for name, entry in runs.items():
+            if entry.problem:
+                lines.append(f"- {scene}/{name}: {entry.problem}")
+                continue
+            absent = [figure for figure in sweep["figures"] if figure not in entry.figures]
+            said = [*entry.notes, *([f"has no {', '.join(absent)}"] if absent else [])]
+            lines += [f"- {scene}/{name}: {note}" for note in said]
+    return lines
+
+
+def compose(
+    sweep: dict[str, Any],
+    entries: dict[str, dict[str, Entry]],
+    *,
+    plots: list[str],
+    notes: list[str],
+    command: str,
+) -> str:
+    """Put the report together as markdown.
+
+    Parameters
+    ----------
+    sweep, entries : from ``sweep.json`` and `read_entries`.
+    plots : links to the curves.
+    notes : said beside missing and failed runs.
+    command : the one that writes the report.
+    """
+    about = [sweep["about"], ""] if sweep["about"] else []
+    lines = [f"# {sweep['title']}", "", *about, *_describe_runs(sweep), ""]
+    lines += ["## Summary", "", f"Means over {', '.join(sweep['scenes'])}: values of the first "]
+    lines[-1] += "run, differences of the others from it, and ratios of seconds and memory."
+    lines += ["", *summary_table(sweep, entries), ""]
+    for scene, runs in entries.items():
+        lines += [f"## {scene}", "", *scene_table(sweep, runs), ""]
+    lines += [
+        "Arrows point to the better side. Seconds are those of stage 2 with its compilation; "
+    ]
+    lines[-1] += "a step is the median. Memory is the training process's largest, which is less "
+    lines[-1] += "where a run took over its stage 1."
+    lines.append("")
+    if plots:
+        lines += ["## Curves", "", *(f"![{Path(link).stem}]({link})" for link in plots), ""]
+    missing = [*problems(sweep, entries), *(f"- {note}" for note in notes)]
+    if missing:
+        lines += ["## Missing and failed", "", *missing, ""]
+    lines += ["## How this was made", "", "```", *sweep["commands"], command, "```", ""]
+    return "\n".join(lines)
+
+
+def _read_sweep(folder: Path) -> dict[str, Any]:
+    """Read what experiments/run.py recorded."""
+    try:
+        return json.loads((folder / "sweep.json").read_text())
+    except (OSError, ValueError) as error:
+        raise ReportError(
+            f"{folder} holds no readable sweep.json ({error}); experiments/run.py writes it"
+        ) from error
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Write a report; 0, or 2 where there is no sweep."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("folder", type=Path, help="output of experiments/run.py")
+    parser.add_argument("--output", type=Path, required=True, help="markdown file to write")
+    parser.add_argument("--plots", type=Path, help="folder for curves (default: none are drawn)")
+    arguments = parser.parse_args(argv)
+    try:
+        sweep = _read_sweep(arguments.folder)
+    except ReportError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    entries = read_entries(arguments.folder, sweep)
+    links, notes = [], []
+    has_curves = any(run["x"] is not None for run in sweep["runs"])
+    if has_curves and arguments.plots is None:
+        notes.append("curves were not drawn: --plots was not given")
+    elif has_curves and importlib.util.find_spec("matplotlib") is None:
+        notes.append("curves were not drawn: matplotlib is not installed (the extra `plots`)")
+    elif has_curves:
+        stem = arguments.output.stem
+        for path in write_plots(sweep, entries, arguments.plots, stem):
+            links.append(Path(os.path.relpath(path, arguments.output.parent)).as_posix())
+    places = [(arguments.folder, "RUNS"), "--output", (arguments.output, arguments.output.name)]
+    if arguments.plots is not None:
+        places += ["--plots", (arguments.plots, "IMAGES")]
+    command = command_line("experiments/report.py", *places)
+    text = compose(sweep, entries, plots=links, notes=notes, command=command)
+    arguments.output.parent.mkdir(parents=True, exist_ok=True)
+    arguments.output.write_text(text, encoding="utf-8")
+    for line in [*problems(sweep, entries), *(f"- {note}" for note in notes)]:
+        print(line, file=sys.stderr)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

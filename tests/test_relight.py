@@ -1,0 +1,339 @@
+"""A run under another light: its orientation, the cameras' way round, files and errors."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+from support import ball_of_one_material, tiny_config, views_from
+
+from geosplat_jax.capacity import Capacities
+from geosplat_jax.io.images import SceneError, encode_srgb, write_hdr, write_png
+from geosplat_jax.light import lookup, rotate_light
+from geosplat_jax.relight import (
+    BACKGROUNDS,
+    RelightOptions,
+    about_z,
+    load_light,
+    orbit,
+    picture,
+    relight_views,
+)
+from geosplat_jax.renderer import RenderedView, Renderer
+from geosplat_jax.scene import EnvLight
+
+AMPLE = Capacities(1024, 1024, 1024, 16384, 16384, 4096, 8192)
+RED, GREEN, BLUE, YELLOW = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0.0]])
+SIDES = {"+x": RED, "-y": GREEN, "-x": BLUE, "+y": YELLOW}
+AXES = {
+    "+x": np.array([1.0, 0, 0]),
+    "-y": np.array([0, -1.0, 0]),
+    "-x": np.array([-1.0, 0, 0]),
+    "+y": np.array([0, 1.0, 0]),
+}
+SIZE = 16
+
+
+def four_colours(height=16):
+    """Red at +x, green at -y, blue at -x, yellow at +y; white above and black below."""
+    width = 2 * height
+    polar = (np.arange(height) + 0.5) / height * np.pi
+    # Written out once more, so that the test does not lean on what it tests.
+    azimuth = (0.5 - (np.arange(width) + 0.5) / width) * 2 * np.pi
+    texels = np.zeros((height, width, 3))
+    for column, angle in enumerate(azimuth):
+        towards = np.array([np.cos(angle), np.sin(angle), 0.0])
+        side = max(AXES, key=lambda name, towards=towards: towards @ AXES[name])
+        texels[:, column] = SIDES[side]
+    texels[polar < np.pi / 6] = 1.0
+    texels[polar > 5 * np.pi / 6] = 0.0
+    return texels.astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def light():
+    return EnvLight(jnp.asarray(four_colours()))
+
+
+def relit_ball(light, **material):
+    config = tiny_config("model.material.bias=true")
+    params, context = ball_of_one_material(config, **material)
+    # What was trained on is black: nothing but the new light may show.
+    params = replace(params, light=EnvLight(jnp.zeros_like(params.light.radiance)))
+    renderer = Renderer(config, params, context, AMPLE, samples=64)
+    return renderer.relit(light, indirect="none")
+
+
+@pytest.fixture(scope="module")
+def matt(light):
+    return relit_ball(light, albedo=0.95, roughness=1.0, metallic=0.0)
+
+
+@pytest.fixture(scope="module")
+def mirror(light):
+    return relit_ball(light, albedo=0.98, roughness=0.1, metallic=1.0)
+
+
+def hue(colour):
+    """Colour with its white part taken out, and of unit length."""
+    bare = np.asarray(colour, float) - np.min(colour)
+    return bare / np.linalg.norm(bare)
+
+
+def where_the_surface_faces(view, direction):
+    """Straight colour of the two covered pixels whose normals are closest to a direction."""
+    normal = view.aovs["normal"] @ direction
+    score = np.where(view.alpha > 0.9, normal / np.maximum(view.alpha, 0.5), -np.inf)
+    rows = np.argsort(score.reshape(-1))[-2:]
+    assert np.all(score.reshape(-1)[rows] > 0.6)
+    return np.mean(view.rgb.reshape(-1, 3)[rows] / view.alpha.reshape(-1)[rows, None], axis=0)
+
+
+def camera_from(eye, **kwargs):
+    return views_from([eye], size=SIZE, **kwargs).camera()
+
+
+@pytest.mark.parametrize("kind", ["matt", "mirror"])
+def test_every_side_of_a_ball_has_the_colour_that_shines_on_it(kind, request):
+    """Seen straight on: the ball's +x side is red, and so on round."""
+    relit = request.getfixturevalue(kind)
+    for side, axis in AXES.items():
+        view = relit(camera_from(3 * axis))
+        found = where_the_surface_faces(view, axis)
+        assert hue(found) @ hue(SIDES[side]) > 0.97, side
+        assert np.max(found) > 0.5
+
+
+def test_a_camera_between_two_sides_sees_both_where_they_are(matt):
+    """The side is the world's, whatever the camera: right of a view from -y lies +x."""
+    for eye in ([2.2, -2.2, 0.5], [2.2, -2.2, 0.0]):
+        view = matt(camera_from(eye))
+        for side in ("+x", "-y"):
+            found = where_the_surface_faces(view, AXES[side])
+            assert hue(found) @ hue(SIDES[side]) > 0.9, side
+        right, left = view.rgb[:, SIZE // 2 :].sum((0, 1)), view.rgb[:, : SIZE // 2].sum((0, 1))
+        assert right[0] > 1.3 * left[0]
+        assert left[1] > 1.3 * right[1]
+
+
+def test_a_mirror_shows_the_sky_above_and_the_dark_ground_below(mirror):
+    view = mirror(camera_from([3.0, 0.01, 0.0]))
+    covered = view.alpha > 0.9
+    rows = np.flatnonzero(covered.any(axis=1))
+    straight = view.rgb / np.maximum(view.alpha, 0.5)[..., None]
+    middle = SIZE // 2
+
+    # A surface that leans 45 degrees towards the zenith mirrors it into a level view.
+    def at(lean):
+        normal = np.array([np.cos(lean), 0.0, np.sin(lean)])
+        score = np.where(covered, view.aovs["normal"] @ normal, -np.inf)
+        return straight.reshape(-1, 3)[np.argmax(score)]
+
+    assert rows[0] < middle < rows[-1]
+    assert np.min(at(np.pi / 4)) > 0.6
+    assert np.max(at(-np.pi / 4)) < 0.3
+
+
+def test_turning_the_light_by_a_quarter_moves_red_from_x_to_y(light, matt):
+    turned = rotate_light(light, jnp.asarray(about_z(np.pi / 2), jnp.float32))
+    seen = lookup(turned.radiance, jnp.asarray(np.stack(list(AXES.values())), jnp.float32))
+    for name, colour in zip(AXES, seen, strict=True):
+        came_from = about_z(-np.pi / 2) @ AXES[name]
+        side = max(AXES, key=lambda n, d=came_from: d @ AXES[n])
+        np.testing.assert_allclose(colour, SIDES[side], atol=1e-3)
+    np.testing.assert_allclose(seen[list(AXES).index("+y")], RED, atol=1e-3)
+    view = matt.under(turned)(camera_from([0.0, 3.0, 0.0]))
+    assert hue(where_the_surface_faces(view, AXES["+y"])) @ hue(RED) > 0.97
+    # The renderer that it came from still shows yellow there.
+    before = matt(camera_from([0.0, 3.0, 0.0]))
+    assert hue(where_the_surface_faces(before, AXES["+y"])) @ hue(YELLOW) > 0.97
+
+
+def nothing(size=SIZE):
+    """A view without any object."""
+    return RenderedView(np.zeros((size, size, 3), np.float32), np.zeros((size, size)), {})
+
+
+@pytest.mark.parametrize("side", AXES)
+def test_the_background_towards_a_side_has_its_colour(light, side):
+    camera = camera_from(-3 * AXES[side], field_of_view=0.6)
+    np.testing.assert_allclose(
+        picture(nothing(), camera, light, "light"),
+        np.broadcast_to(SIDES[side], (SIZE, SIZE, 3)),
+        atol=2e-3,
+    )
+
+
+def test_the_background_is_upright_and_not_mirrored(light):
+    """Towards +x, 120 degrees wide: yellow (+y) lies left, green (-y) right, white above."""
+    camera = camera_from([-3.0, 0.0, 0.0], field_of_view=2 * np.arctan(np.sqrt(3)))
+    shown = picture(nothing(), camera, light, "light")
+    middle = SIZE // 2
+    np.testing.assert_allclose(shown[middle, 0], YELLOW, atol=2e-3)
+    np.testing.assert_allclose(shown[middle, -1], GREEN, atol=2e-3)
+    np.testing.assert_allclose(shown[middle, middle], RED, atol=2e-3)
+    steep = camera_from([-0.5, 0.0, -3.0])
+    np.testing.assert_allclose(picture(nothing(), steep, light, "light"), 1.0, atol=2e-3)
+
+
+def test_the_background_is_the_environment_in_the_direction_of_every_pixel(light):
+    camera = camera_from([1.0, -2.0, 0.7], field_of_view=1.2)
+    shown = picture(nothing(), camera, light, "light")
+    pose = views_from([[1.0, -2.0, 0.7]], size=SIZE, field_of_view=1.2).camera_to_world[0]
+    for row, column in ((0, 0), (3, 12), (15, 7)):
+        focal = float(camera.intrinsics[0, 0, 0])
+        ray = np.array([(column + 0.5 - SIZE / 2) / focal, -(row + 0.5 - SIZE / 2) / focal, -1.0])
+        ray = pose[:3, :3] @ ray / np.linalg.norm(ray)
+        expected = lookup(light.radiance, jnp.asarray(ray[None], jnp.float32))[0]
+        np.testing.assert_allclose(shown[row, column], encode_srgb(np.asarray(expected)), atol=2e-3)
+
+
+def test_pictures_lie_over_white_and_black_and_refuse_other_names(light):
+    camera = camera_from([3.0, 0.0, 0.0])
+    view = RenderedView(np.full((SIZE, SIZE, 3), 0.1, np.float32), np.full((SIZE, SIZE), 0.5), {})
+    for name, value in (("white", 0.6), ("black", 0.1)):
+        expected = encode_srgb(np.full((SIZE, SIZE, 3), value))
+        np.testing.assert_allclose(picture(view, camera, light, name), expected, atol=1e-6)
+    with pytest.raises(ValueError, match="background must be one of.*got 'grey'"):
+        picture(view, camera, light, "grey")
+    assert "light" in BACKGROUNDS
+
+
+def test_a_written_map_is_read_back_the_right_way_round(tmp_path):
+    write_hdr(tmp_path / "four.hdr", 3 * four_colours())
+    found = load_light(tmp_path / "four.hdr").radiance
+    assert found.dtype == jnp.float32
+    seen = lookup(found, jnp.asarray(np.stack([*AXES.values(), [0, 0, 1.0], [0, 0, -1.0]]), "f4"))
+    # RGBE has eight bits; radiance above one must survive.
+    np.testing.assert_allclose(
+        seen, 3 * np.stack([*SIDES.values(), np.ones(3), np.zeros(3)]), atol=0.05
+    )
+
+
+def test_large_maps_are_reduced_in_place_and_keep_their_flux(tmp_path):
+    rng = np.random.default_rng(0)
+    write_hdr(tmp_path / "four.hdr", four_colours(32) * rng.uniform(0.5, 1.5, (32, 64, 1)))
+    whole, small = (load_light(tmp_path / "four.hdr", largest=n).radiance for n in (32, 8))
+    assert small.shape == (8, 16, 3)
+    for side, axis in AXES.items():
+        seen = lookup(small, jnp.asarray(axis[None], jnp.float32))[0]
+        assert hue(seen) @ hue(SIDES[side]) > 0.999
+    flux = [
+        np.sum(
+            np.asarray(x) * np.sin((np.arange(len(x)) + 0.5) * np.pi / len(x))[:, None, None],
+            (0, 1),
+        )
+        * (np.pi / len(x)) ** 2
+        for x in (whole, small)
+    ]
+    np.testing.assert_allclose(flux[1], flux[0], rtol=0.02)
+
+
+def test_a_map_that_cannot_be_an_environment_is_refused(tmp_path):
+    write_hdr(tmp_path / "square.hdr", np.ones((4, 4, 3), np.float32))
+    with pytest.raises(SceneError, match=r"square.hdr has shape \(4, 4, 3\).*twice as wide"):
+        load_light(tmp_path / "square.hdr")
+    write_png(tmp_path / "grey.png", np.ones((4, 8), np.float32))
+    with pytest.raises(SceneError, match="three channels"):
+        load_light(tmp_path / "grey.png")
+    with pytest.raises((SceneError, OSError), match="absent.hdr"):
+        load_light(tmp_path / "absent.hdr")
+    (tmp_path / "broken.hdr").write_bytes(b"no picture")
+    with pytest.raises(SceneError, match="broken.hdr"):
+        load_light(tmp_path / "broken.hdr")
+
+
+@pytest.mark.parametrize("value", [-1.0, np.inf, np.nan])
+def test_radiance_that_is_not_radiance_is_refused(tmp_path, monkeypatch, value):
+    pixels = np.ones((4, 8, 3), np.float32)
+    pixels[1, 2, 0] = value
+    monkeypatch.setattr("geosplat_jax.relight.read_image", lambda path: pixels)
+    with pytest.raises(SceneError, match="negative or not finite"):
+        load_light(tmp_path / "any.hdr")
+
+
+def test_the_orbit_goes_counter_clockwise_and_keeps_distance_and_view():
+    center = np.array([0.2, -0.1, 0.3])
+    eye = center + [2.0, 0.0, 1.0]
+    camera = camera_from(eye)
+    for angle in (0.0, 0.3, np.pi / 2, np.pi):
+        moved = orbit(camera, center, angle)
+        expected = center + about_z(angle) @ (eye - center)
+        np.testing.assert_allclose(moved.centers[0], expected, atol=1e-5)
+        assert np.linalg.norm(moved.centers[0] - center) == pytest.approx(np.sqrt(5), rel=1e-5)
+        # The centre stays where it was in the camera's axes.
+        point = jnp.asarray([*center, 1.0], jnp.float32)
+        np.testing.assert_allclose(
+            moved.world_to_camera[0] @ point, camera.world_to_camera[0] @ point, atol=1e-5
+        )
+    # From +x to +y, seen from above.
+    quarter = orbit(camera_from([3.0, 0.0, 0.0]), np.zeros(3), np.pi / 2)
+    np.testing.assert_allclose(quarter.centers[0], [0, 3, 0], atol=1e-5)
+
+
+def test_the_orbit_of_camera_and_light_together_changes_no_background(light):
+    camera = camera_from([2.0, 1.0, 0.4], field_of_view=1.0)
+    angle = np.pi / 4  # four columns of the map: nothing is interpolated
+    turned = rotate_light(light, jnp.asarray(about_z(angle), jnp.float32))
+    first = picture(nothing(), camera, light, "light")
+    second = picture(nothing(), orbit(camera, np.zeros(3), angle), turned, "light")
+    np.testing.assert_allclose(second, first, atol=5e-3)
+
+
+def test_relighting_writes_stills_and_movies(light, matt, tmp_path):
+    views = replace(
+        views_from([[3.0, 0.0, 0.5], [0.0, 3.0, 0.5]], size=SIZE), names=("a/first", "second")
+    )
+    options = RelightOptions(turntable=2, rotate_env=2, suffix=".gif", frames_per_second=10.0)
+    written = relight_views(matt, light, views, tmp_path, options)
+    assert [path.name for path in written] == [
+        "a_first_rgba.png",
+        "a_first.png",
+        "second_rgba.png",
+        "second.png",
+        "turntable.gif",
+        "rotate_env.gif",
+    ]
+    assert all(path.parent == tmp_path for path in written)
+    rgba = np.asarray(Image.open(written[0]))
+    shown = np.asarray(Image.open(written[1]), float) / 255
+    assert rgba.shape == (SIZE, SIZE, 4)
+    assert rgba[0, 0, 3] == 0
+    assert rgba[SIZE // 2, SIZE // 2, 3] > 200
+    # Towards -x: blue behind, the red side in front.
+    assert hue(shown[0, 0]) @ hue(BLUE) > 0.97
+    assert hue(shown[SIZE // 2, SIZE // 2]) @ hue(RED) > 0.9
+    for path in written[4:]:
+        with Image.open(path) as film:
+            assert film.n_frames == 2
+            frames = []
+            for k in range(2):
+                film.seek(k)
+                frames.append(np.asarray(film.convert("RGB"), float) / 255)
+        # Half a turn of camera or light: the ball's other side is seen, or lit.
+        first, second = (frame[SIZE // 2, SIZE // 2] for frame in frames)
+        assert hue(first) @ hue(RED) > 0.9
+        assert hue(second) @ hue(BLUE) > 0.9
+
+
+def test_without_movies_only_stills_are_written(light, matt, tmp_path):
+    views = views_from([[3.0, 0.0, 0.5]], size=SIZE)
+    written = relight_views(matt, light, views, tmp_path, RelightOptions(background="white"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(p.name for p in written)
+    assert len(written) == 2
+    assert np.all(np.asarray(Image.open(written[1]))[0, 0] == 255)
+
+
+def test_the_movie_is_an_mp4_only_where_one_can_be_made(monkeypatch):
+    for found, expected in ((True, ".mp4"), (False, ".gif")):
+        monkeypatch.setattr("geosplat_jax.relight.has_encoder", lambda suffix, f=found: f)
+        assert RelightOptions().movie_suffix() == expected
+    assert RelightOptions(suffix=".gif").movie_suffix() == ".gif"
+
+
+def test_turning_by_a_full_circle_changes_nothing():
+    np.testing.assert_allclose(about_z(2 * np.pi), np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(about_z(np.pi / 2) @ [1.0, 0, 0], [0, 1, 0], atol=1e-12)
+    assert jax.tree.leaves(EnvLight(jnp.zeros((2, 4, 3))))[0].shape == (2, 4, 3)

@@ -1,0 +1,504 @@
+"""Sweeps: strict files, one shared stage 1, going on after a stop, and a report that hides nothing.
+
+Training and evaluation are replaced by functions that write the files the real ones write; one
+slow test runs a sweep for real.
+"""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "experiments"))
+
+import report  # noqa: E402
+import run as runner  # noqa: E402
+
+from geosplat_jax.config import make_config  # noqa: E402
+from geosplat_jax.io.checkpoints import save_checkpoint  # noqa: E402
+
+SWEEPS = ROOT / "experiments" / "sweeps"
+SWEEP = """
+title = "A sweep"
+about = "What it is about."
+quality = "draft"
+scenes = ["one", "two"]
+set = ["transport.steps=3"]
+figures = ["nvs.psnr", "roughness.mse"]
+
+[[run]]
+name = "full"
+
+[[run]]
+name = "no-shadow"
+set = ["transport.shading.occlusion=false"]
+evaluate = { relight_indirect = "none" }
+
+[[run]]
+name = "coarse"
+set = ["geometry.resolution=8"]
+
+[[run]]
+name = "few"
+set = ["transport.shading.light=1"]
+x = 1
+group = "light"
+
+[[run]]
+name = "many"
+set = ["transport.shading.light=16"]
+x = 16
+group = "light"
+"""
+
+
+def _write(folder, text=SWEEP):
+    path = folder / "sweep.toml"
+    path.write_text(text)
+    for scene in ("one", "two"):
+        (folder / "scenes" / scene).mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def _arguments(folder, *more):
+    sweep, scenes, output = folder / "sweep.toml", folder / "scenes", folder / "runs"
+    return [str(sweep), "--scenes", str(scenes), "--output", str(output), *more]
+
+
+class Fakes:
+    """Stand-ins that leave a run folder, note their calls, and fail where they are told to."""
+
+    def __init__(self, *, broken=()):
+        self.trained, self.evaluated, self.broken = [], [], set(broken)
+
+    def train(self, scene, folder, config, options, *, resume, stage_1):
+        label = f"{scene.name}/{folder.name}"
+        if not resume:
+            assert not folder.exists() or not any(folder.iterdir())
+            folder.mkdir(parents=True, exist_ok=True)
+            record = {"scene": str(scene), "dataset": options, "config": config.to_dict()}
+            (folder / "run.json").write_text(json.dumps(record))
+        self.trained.append((label, resume, stage_1 and stage_1.name))
+        if label in self.broken:
+            raise RuntimeError(f"no luck with {label}")
+        first = config.run.steps if stage_1 else 0
+        lines = [
+            {"step": k, "stage": 1 if k < config.run.steps else 2, "seconds": 0.5}
+            for k in range(first, config.total_steps)
+        ]
+        text = "".join(json.dumps(line) + "\n" for line in lines)
+        (folder / "metrics.jsonl").write_text(text)
+        (folder / "training.json").write_text('{"seconds_total": 1.5}')
+
+    def evaluate(self, folder, *, protocol, samples, relight_indirect):
+        self.evaluated.append((f"{folder.parent.name}/{folder.name}", relight_indirect))
+        record = json.loads((folder / "run.json").read_text())
+        config = runner.config_from_dict(record["config"])
+        figures = {
+            "mean": {"nvs.psnr": 30.0, "roughness.mse": 0.01},
+            "config": config.stage(2).to_dict(),
+            "stage": 2,
+            "step": config.total_steps,
+            "samples": samples,
+            "protocol": protocol,
+            "training_peak_memory_mb": 1234,
+        }
+        (folder / "metrics.json").write_text(json.dumps(figures))
+
+    def start(self, job):
+        runner.execute(job, train=self.train, evaluate=self.evaluate)
+
+
+def _run(folder, fakes, *more):
+    return runner.main(_arguments(folder, *more), start=fakes.start)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('quality = "draft"', 'qualty = "draft"', "unknown key 'qualty'"),
+        ('quality = "draft"', 'quality = "drafty"', "quality must be one of"),
+        ('title = "A sweep"', "", "'title' is missing"),
+        ('title = "A sweep"', "title = 3", "title must be a text, got 3"),
+        ('["one", "two"]', '["one", "One"]', "the scene 'One' appears twice"),
+        ('["one", "two"]', "[]", "scenes must not be empty"),
+        ('["one", "two"]', '["a/b"]', "'a/b' is no folder name"),
+        ('name = "coarse"', 'name = "full"', "the run 'full' appears twice"),
+        ('name = "coarse"', 'name = "_stage_1"', "'_stage_1' is no folder name"),
+        ('name = "coarse"', 'name = ".."', "'..' is no folder name"),
+        ('name = "coarse"', 'name = "coarse"\nsets = []', "unknown key 'sets'"),
+        ("geometry.resolution=8", "geometry.resolutoin=8", "run 'coarse': unknown setting"),
+        ("geometry.resolution=8", "geometry.resolution=2", "must be at least 4"),
+        ("transport.steps=3", "transport.steps", "section.field=value"),
+        ('relight_indirect = "none"', 'relight_indirect = "some"', "relight_indirect must be one"),
+        ('relight_indirect = "none"', 'lights = "none"', "unknown key 'lights'"),
+        ("x = 16", "x = true", "x must be a finite number"),
+        ("x = 16", "x = nan", "x must be a finite number"),
+        ("x = 16", "", "group names the curve"),
+        ("x = 16", "x = 1", "both at x = 1"),
+        ('group = "light"', 'group = "a/b"', "the group 'a/b' is no folder name"),
+        ('"roughness.mse"', '"nvs.psnr"', "must not name one twice"),
+        ("[[run]]", "[[run", "cannot read the sweep"),
+    ],
+)
+def test_a_bad_sweep_is_one_error_before_anything_is_trained(tmp_path, capsys, old, new, said):
+    assert old in SWEEP
+    _write(tmp_path, SWEEP.replace(old, new, 1 if old == "[[run]]" else -1))
+    fakes = Fakes()
+    assert _run(tmp_path, fakes) == 2
+    assert said in capsys.readouterr().err
+    assert fakes.trained == []
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--only", "fll"], "--only fll: the sweep has only full"),
+        (["--scene", "three"], "--scene three"),
+        (["--set", "run.stps=1"], "unknown setting run.stps"),
+    ],
+)
+def test_a_bad_call_is_one_error(tmp_path, capsys, more, said):
+    _write(tmp_path)
+    assert _run(tmp_path, Fakes(), *more) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_scene_that_is_not_there_is_named(tmp_path, capsys):
+    _write(tmp_path)
+    (tmp_path / "scenes" / "two").rmdir()
+    assert _run(tmp_path, Fakes()) == 2
+    assert "has no folder 'two'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("override", "shares"),
+    [
+        ("transport.shading.light=1", True),
+        ("transport.loss.light=0", True),
+        ("transport.steps=7", True),
+        ("transport.steps=0", False),
+        ("model.cull_backfaces=false", False),
+        ("run.seed=1", False),
+        ("loss.mask=1.0", False),
+    ],
+)
+def test_stage_1_is_shared_where_only_stage_2_differs(override, shares):
+    base = make_config(quality="draft")
+    config = make_config(quality="draft", overrides=(override,))
+    assert runner.shares_stage_1(config, base) is shares
+
+
+def test_every_run_of_every_scene_is_trained_and_evaluated_once(tmp_path):
+    _write(tmp_path)
+    fakes = Fakes()
+    assert _run(tmp_path, fakes) == 0
+    for scene in ("one", "two"):
+        assert [call for call in fakes.trained if call[0].startswith(scene)] == [
+            (f"{scene}/_stage_1", False, None),
+            (f"{scene}/full", False, "_stage_1"),
+            (f"{scene}/no-shadow", False, "_stage_1"),
+            (f"{scene}/coarse", False, None),
+            (f"{scene}/few", False, "_stage_1"),
+            (f"{scene}/many", False, "_stage_1"),
+        ]
+    assert ("one/no-shadow", "none") in fakes.evaluated
+    assert ("one/full", "traced") in fakes.evaluated
+    assert len(fakes.evaluated) == 10
+    first = json.loads((tmp_path / "runs" / "one" / "_stage_1" / "run.json").read_text())
+    assert first["config"]["transport"]["steps"] == 0
+
+
+def test_a_finished_sweep_does_nothing_and_only_the_chosen_runs_are_made(tmp_path):
+    _write(tmp_path)
+    first, second, third = Fakes(), Fakes(), Fakes()
+    assert _run(tmp_path, first, "--only", "coarse", "--scene", "two") == 0
+    assert [label for label, *_ in first.trained] == ["two/coarse"]
+    assert _run(tmp_path, second) == 0
+    assert "two/coarse" not in [label for label, *_ in second.trained]
+    assert len(second.evaluated) == 9
+    assert _run(tmp_path, third) == 0
+    assert third.trained == third.evaluated == []
+
+
+def test_runs_with_the_same_settings_are_made_once(tmp_path):
+    again = SWEEP + '\n[[run]]\nname = "again"\nset = ["transport.shading.occlusion=true"]\n'
+    _write(tmp_path, again)
+    fakes = Fakes()
+    assert _run(tmp_path, fakes, "--only", "again", "--scene", "one") == 0
+    assert [label for label, *_ in fakes.trained] == ["one/_stage_1", "one/full"]
+    record = json.loads((tmp_path / "runs" / "sweep.json").read_text())
+    assert {r["name"]: r["same_as"] for r in record["runs"]}["again"] == "full"
+    # Another evaluation makes it another run.
+    other = again + 'evaluate = { relight_indirect = "none" }\n'
+    sweep = runner.read_sweep(_write(tmp_path, other))
+    assert runner.homes(sweep)["again"] == "again"
+
+
+def test_finished_runs_with_other_settings_stop_the_sweep_and_say_so(tmp_path, capsys):
+    _write(tmp_path)
+    assert _run(tmp_path, Fakes(), "--only", "few", "--scene", "one") == 0
+    fakes = Fakes()
+    assert _run(tmp_path, fakes, "--set", "transport.batch_views=3") == 2
+    said = capsys.readouterr().err
+    assert "one/few: transport.batch_views: 2 -> 3" in said
+    assert "Take another --output" in said
+    assert fakes.trained == []
+    path = tmp_path / "runs" / "one" / "few" / "metrics.json"
+    figures = json.loads(path.read_text())
+    path.write_text(json.dumps(figures | {"samples": 3}))
+    assert _run(tmp_path, fakes) == 2
+    assert "evaluate.samples: 3 -> " in capsys.readouterr().err
+
+
+def test_settings_of_stage_2_leave_the_shared_stage_1_as_it_is(tmp_path):
+    _write(tmp_path)
+    assert _run(tmp_path, Fakes(), "--only", "few", "--scene", "one") == 0
+    more = ["--set", "transport.batch_views=3", "--only", "many", "--scene", "one"]
+    fakes = Fakes()
+    assert _run(tmp_path, fakes, *more) == 0
+    assert fakes.trained == [("one/many", False, "_stage_1")]
+
+
+def test_an_interrupted_run_goes_on_from_its_checkpoint_or_starts_anew(tmp_path):
+    _write(tmp_path)
+    broken = Fakes(broken=["one/full", "one/few"])
+    assert _run(tmp_path, broken, "--scene", "one") == 1
+    full = tmp_path / "runs" / "one" / "full"
+    save_checkpoint(full / "checkpoints", 2, tree={"x": np.zeros(2)}, meta={})
+    (tmp_path / "runs" / "one" / "few" / "metrics.jsonl").write_text("{}\n")
+    fakes = Fakes()
+    assert _run(tmp_path, fakes, "--scene", "one") == 0
+    assert fakes.trained == [("one/full", True, None), ("one/few", False, "_stage_1")]
+    assert not (full / "error.txt").exists()
+
+
+def test_an_interrupted_evaluation_is_repeated_without_training(tmp_path):
+    _write(tmp_path)
+    assert _run(tmp_path, Fakes(), "--only", "full", "--scene", "one") == 0
+    (tmp_path / "runs" / "one" / "full" / "evaluation.json").unlink()
+    fakes = Fakes()
+    assert _run(tmp_path, fakes, "--only", "full", "--scene", "one") == 0
+    assert fakes.trained == []
+    assert fakes.evaluated == [("one/full", "traced")]
+
+
+def test_files_that_no_run_wrote_are_left_alone(tmp_path):
+    _write(tmp_path)
+    precious = tmp_path / "runs" / "one" / "full" / "previews" / "precious.png"
+    precious.parent.mkdir(parents=True)
+    precious.write_text("data")
+    assert _run(tmp_path, Fakes(), "--only", "full", "--scene", "one") == 1
+    assert precious.read_text() == "data"
+
+
+def test_a_failed_run_stops_only_those_that_need_it(tmp_path, capsys):
+    _write(tmp_path)
+    fakes = Fakes(broken=["one/_stage_1", "two/no-shadow"])
+    assert _run(tmp_path, fakes) == 1
+    runs = tmp_path / "runs"
+    assert "no luck with one/_stage_1" in (runs / "one" / "_stage_1" / "error.txt").read_text()
+    assert "stage 1 failed" in (runs / "one" / "full" / "error.txt").read_text()
+    assert "no luck with two/no-shadow" in (runs / "two" / "no-shadow" / "error.txt").read_text()
+    done = {label for label, _ in fakes.evaluated}
+    assert done == {"one/coarse", "two/full", "two/coarse", "two/few", "two/many"}
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("6 of 12 failed: one/_stage_1, one/full")
+
+
+def test_ctrl_c_ends_the_sweep_with_its_own_status(tmp_path, capsys):
+    _write(tmp_path)
+
+    def stop(job):
+        raise KeyboardInterrupt
+
+    assert runner.main(_arguments(tmp_path), start=stop) == 130
+    assert "goes on from the last checkpoint" in capsys.readouterr().err
+    assert not list((tmp_path / "runs").rglob("error.txt"))
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        ("print('last words'); raise SystemExit(3)", "status 3\nlast words"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "signal 9"),
+    ],
+)
+def test_a_process_that_dies_is_a_failed_run(tmp_path, monkeypatch, code, said):
+    script = tmp_path / "script.py"
+    script.write_text(code)
+    monkeypatch.setattr(runner, "__file__", str(script))
+    job = runner.Job("one/full", "scene", str(tmp_path / "full"), {}, {}, None, None)
+    with pytest.raises(runner.RunFailed, match=said):
+        runner.in_a_process(job)
+    assert runner.run_jobs([job]) == [job]
+    assert said.split("\n")[0] in (tmp_path / "full" / "error.txt").read_text()
+
+
+def test_the_bundled_sweeps_are_sound():
+    sweep = runner.read_sweep(SWEEPS / "transport.toml")
+    base, configs = sweep.config(), {run.name: sweep.config(run) for run in sweep.runs}
+    assert configs["full"] == base
+    assert [n for n, c in configs.items() if not runner.shares_stage_1(c, base)] == ["no-culling"]
+    points = {run.x: configs[run.name].transport.shading for run in sweep.runs if run.x}
+    assert list(points) == [2, 8, 32, 128]
+    for x, shading in points.items():
+        assert (shading.light + shading.diffuse, 2 * shading.specular) == (x, x)
+    assert configs["no-occlusion"].transport.shading.is_traced is False
+    assert configs["no-light-regulariser"].stage(2).objective.with_light is False
+    assert configs["denoiser"].transport.shading.is_denoised is True
+    assert runner.read_sweep(SWEEPS / "smoke.toml").scenes == ("duck",)
+
+
+def _hand_made(folder):
+    """Write a sweep of two scenes with figures that are easy to add up."""
+    _write(folder)
+    assert _run(folder, Fakes()) == 0
+    runs = folder / "runs"
+    psnr = {"full": 30.0, "no-shadow": 28.5, "coarse": 31.25, "few": 27.0, "many": 30.5}
+    for scene, shift in (("one", 0.0), ("two", 1.0)):
+        for name, value in psnr.items():
+            path = runs / scene / name / "metrics.json"
+            figures = json.loads(path.read_text())
+            mean = {"nvs.psnr": value + shift, "roughness.mse": 0.02 - 0.01 * shift}
+            path.write_text(json.dumps(figures | {"mean": mean}))
+    return runs
+
+
+def _rows(text, heading):
+    """Read the table below a heading as {first cell: other cells}."""
+    lines = text.split(f"## {heading}\n")[1].split("\n## ")[0].splitlines()
+    cells = [[c.strip() for c in line.strip("|").split("|")] for line in lines if "|" in line]
+    return {row[0]: row[1:] for row in cells}
+
+
+def _report(folder, *more):
+    output = folder / "docs" / "study.md"
+    assert report.main([str(folder / "runs"), "--output", str(output), *more]) == 0
+    return output.read_text()
+
+
+def test_the_report_has_the_figures_and_their_differences(tmp_path):
+    _hand_made(tmp_path)
+    text = _report(tmp_path)
+    one, summary = _rows(text, "one"), _rows(text, "Summary")
+    assert one["run"][:3] == ["nvs.psnr ↑", "roughness.mse ↓", "stage 2, s"]
+    assert one["full"] == ["30.00", "0.0200", "1.50", "0.500", "1234"]
+    assert _rows(text, "two")["no-shadow"][:2] == ["29.50", "0.0100"]
+    assert summary["full (reference)"] == ["30.50", "0.0150", "1.50", "0.500", "1234"]
+    assert summary["no-shadow"] == ["−1.50", "+0.0000", "×1.00", "×1.00", "×1.00"]
+    assert summary["coarse"][0] == "+1.25"
+    assert "What it is about." in text
+    assert "evaluated with relight_indirect = none" in text
+    assert "Missing and failed" in text  # the curves were not asked for
+    assert "python experiments/run.py sweep.toml --scenes SCENES --output RUNS" in text
+    assert "python experiments/report.py RUNS --output study.md" in text
+    assert str(tmp_path) not in text
+
+
+def test_missing_failed_and_changed_runs_are_listed(tmp_path):
+    runs = _hand_made(tmp_path)
+    (runs / "one" / "few" / "error.txt").write_text("Traceback\nTrainingError: in /a/b/c.py | x\n")
+    for name in ("metrics.json", "run.json"):
+        (runs / "one" / "many" / name).unlink()
+    (runs / "one" / "no-shadow" / "metrics.json").write_text("{")
+    path = runs / "two" / "coarse" / "metrics.json"
+    figures = json.loads(path.read_text())
+    figures["config"]["geometry"]["resolution"] = 9
+    path.write_text(json.dumps(figures))
+    (runs / "two" / "few" / "metrics.jsonl").write_text("")
+    path = runs / "two" / "many" / "metrics.json"
+    figures = json.loads(path.read_text())
+    del figures["mean"]["roughness.mse"]
+    path.write_text(json.dumps(figures))
+    text = _report(tmp_path)
+    for line in (
+        "- one/few: failed: TrainingError: in c.py | x",
+        "- one/many: missing",
+        "- one/no-shadow: unreadable: JSONDecodeError",
+        "- two/coarse: other settings than the sweep (recorded -> wanted): "
+        "geometry.resolution: 9 -> 8",
+        "- two/few: metrics.jsonl has 0 of 3 steps of stage 2",
+        "- two/many: has no roughness.mse",
+    ):
+        assert line in text
+    assert _rows(text, "one")["few"] == ["–"] * 5
+    assert _rows(text, "two")["few"][2:4] == ["–", "–"]
+    summary = _rows(text, "Summary")
+    assert summary["few"][0] == "−3.00 (1 of 2 scenes)"
+    assert summary["many"][:2] == ["+0.50 (1 of 2 scenes)", "–"]
+
+
+def test_without_the_reference_there_are_no_differences(tmp_path):
+    runs = _hand_made(tmp_path)
+    for scene in ("one", "two"):
+        (runs / scene / "full" / "metrics.json").unlink()
+    text = _report(tmp_path)
+    assert _rows(text, "Summary")["coarse"] == ["–"] * 5
+    assert _rows(text, "one")["coarse"][0] == "31.25"
+    assert "- one/full: not evaluated" in text
+
+
+def test_a_folder_without_a_sweep_is_an_error(tmp_path, capsys):
+    assert report.main([str(tmp_path), "--output", str(tmp_path / "x.md")]) == 2
+    assert "no readable sweep.json" in capsys.readouterr().err
+    assert not (tmp_path / "x.md").exists()
+
+
+def test_only_repeated_seeds_have_a_spread():
+    runs = [
+        {"name": name, "x": x, "group": "samples"}
+        for name, x in (("a", 8.0), ("b", 8.0), ("c", 2.0), ("d", None))
+    ]
+    values = {"a": 30.0, "b": 32.0, "c": 20.0, "d": 99.0}
+    entries = {"one": {n: report.Entry({"nvs.psnr": v}, {}) for n, v in values.items()}}
+    points = report.curves({"runs": runs}, entries, "samples", "nvs.psnr")
+    assert points == {"one": [(2.0, 20.0, None), (8.0, 31.0, pytest.approx(2**0.5))]}
+
+
+@pytest.mark.parametrize(
+    ("figure", "way", "value", "text"),
+    [
+        ("relight.mean.psnr", " ↑", -0.256, "−0.26"),
+        ("normal.mae_masked_deg", " ↓", 3.14159, "+3.14"),
+        ("metallic.mse", " ↓", 0.01234, "+0.0123"),
+        ("light.mirrored_correlation", "", 0.5, "+0.5000"),
+        ("albedo.scale_r", "", 1.0, "+1.0000"),
+    ],
+)
+def test_figures_have_a_better_side_and_sensible_digits(figure, way, value, text):
+    assert report.arrow(figure) == way
+    assert report.digits(figure, value, signed=True) == text
+
+
+def test_curves_are_drawn_and_linked(tmp_path):
+    pytest.importorskip("matplotlib")
+    _hand_made(tmp_path)
+    text = _report(tmp_path, "--plots", str(tmp_path / "docs" / "images"))
+    assert "![study_light](images/study_light.png)" in text
+    picture = tmp_path / "docs" / "images" / "study_light.png"
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert "Missing and failed" not in text
+
+
+@pytest.mark.slow
+def test_the_smoke_sweep_runs_for_real(tmp_path):
+    runs, output = tmp_path / "runs", tmp_path / "smoke.md"
+    command = [sys.executable, str(ROOT / "experiments" / "run.py"), str(SWEEPS / "smoke.toml")]
+    command += ["--scenes", str(ROOT / "examples"), "--output", str(runs)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    lines = (runs / "duck" / "more-samples" / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["stage"] for line in lines] == [2, 2]
+    again = subprocess.run(command, capture_output=True, text=True)
+    assert again.returncode == 0
+    assert again.stderr.count("finished already") == 3
+    assert report.main([str(runs), "--output", str(output)]) == 0
+    summary = _rows(output.read_text(), "Summary")
+    assert float(summary["full (reference)"][0]) > 5
+    assert all(cell != "–" for row in summary.values() for cell in row)
