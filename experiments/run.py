@@ -56,10 +56,8 @@ _RUN_KEYS = {
     "evaluate": "a table",
     "x": "a finite number",
 }
-_EVALUATE_KEYS = {
-    **dict.fromkeys(("protocol", "relight_indirect"), "a text"),
-    "samples": "a positive integer",
-}
+_EVALUATE_KEYS = {"protocol": "a text", "relight_indirect": "a text"}
+_EVALUATE_KEYS["samples"] = "a positive integer"
 
 
 class SweepError(ValueError):
@@ -332,10 +330,13 @@ def _changes(job: Job) -> list[str]:
     found = []
     if (folder / "run.json").exists():
         record = json.loads((folder / "run.json").read_text())
-        found += differences(config_from_dict(record["config"]), wanted)
-        for name, now in (("scene", job.scene), ("dataset", job.options)):
-            if record[name] != now:
-                found.append(f"{name}: {record[name]!r} -> {now!r}")
+        recorded = config_from_dict(record["config"])
+        if job.evaluate is None and is_trained(job):
+            # Defaults of stage 2 have no part in a shared stage 1.
+            recorded = replace(recorded, transport=wanted.transport)
+        found += differences(recorded, wanted)
+        read = {"scene": job.scene, "dataset": job.options}
+        found += [f"{k}: {record[k]!r} -> {v!r}" for k, v in read.items() if record[k] != v]
     if found or not is_finished(job) or job.evaluate is None:
         return found
     figures = json.loads((folder / "metrics.json").read_text())
@@ -412,7 +413,7 @@ def execute(
 
 
 def _say(text: str) -> None:
-    """Show progress."""
+    """Report progress."""
     print(text, file=sys.stderr, flush=True)
 
 
@@ -493,8 +494,8 @@ def run_jobs(jobs: list[Job], *, start: Callable[[Job], None] = in_a_process) ->
         try:
             start(job)
         except Exception as error:
-            told = str(error) if isinstance(error, RunFailed) else traceback.format_exc()
-            _note_failure(job, told)
+            is_told = isinstance(error, RunFailed)
+            _note_failure(job, str(error) if is_told else traceback.format_exc())
             failed.append(job)
     return failed
 
@@ -545,9 +546,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--output", type=Path, required=True, help="folder of all runs")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these runs")
     parser.add_argument("--scene", nargs="+", default=[], metavar="NAME", help="only these scenes")
-    parser.add_argument(
-        "--set", dest="overrides", action="append", default=[], metavar="SECTION.FIELD=VALUE"
-    )
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="S.F=VALUE")
     return parser
 
 

@@ -39,6 +39,9 @@ T_MIN = 1e-3
 
 _CHUNK = 32_768
 _STAGES = 6
+_STRANDS = 2
+"""A loop runs on one core; so many of them are offered to the machine at once."""
+
 _LARGEST_SKIP = 15
 _COUNT_BITS = 8
 """Bits of a cell's count. It lists at most 144 patches: 3 axes of 3 x 4 x 4 edges in reach."""
@@ -455,10 +458,11 @@ def _trace(
     two_sided: bool,
     any_hit: bool,
 ) -> tuple[Float[Array, " N"], Int[Array, " N"]]:
-    """Trace chunk after chunk."""
+    """Trace chunk after chunk, in strands that run side by side."""
     count = origins.shape[0]
-    chunk = min(_CHUNK, max(256, -(-count // 256) * 256))
-    rows = -(-max(count, 1) // chunk)
+    strands = _STRANDS if count >= _CHUNK else 1
+    chunk = min(_CHUNK, max(256, -(-count // (256 * strands)) * 256))
+    rows = -(-max(count, 1) // (chunk * strands)) * strands
     grid = accelerator.grid
     local = (origins - grid.origin[None, :]) / grid.cell_size
 
@@ -470,8 +474,15 @@ def _trace(
         lanes = _start(*parts, accelerator=accelerator, two_sided=two_sided)
         return _trace_chunk(accelerator, lanes, two_sided=two_sided, any_hit=any_hit)
 
-    found = jax.lax.map(one, (chunks(local), chunks(directions), chunks(source), chunks(mask)))
-    distance, face = (x.reshape(-1)[:count] for x in found)
+    parts = (chunks(local), chunks(directions), chunks(source), chunks(mask))
+    found = [
+        jax.lax.map(one, jax.tree.map(lambda x, k=strand: x[k::strands], parts))
+        for strand in range(strands)
+    ]
+    distance, face = (
+        jnp.stack(strand, axis=1).reshape(rows * chunk)[:count]
+        for strand in zip(*found, strict=True)
+    )
     return distance * grid.cell_size, face
 
 

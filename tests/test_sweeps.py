@@ -27,7 +27,7 @@ title = "A sweep"
 about = "What it is about."
 quality = "draft"
 scenes = ["one", "two"]
-set = ["transport.steps=3"]
+set = ["transport.steps=3", "transport.batch_views=2"]
 figures = ["nvs.psnr", "roughness.mse"]
 
 [[run]]
@@ -256,13 +256,25 @@ def test_finished_runs_with_other_settings_stop_the_sweep_and_say_so(tmp_path, c
     assert "evaluate.samples: 3 -> " in capsys.readouterr().err
 
 
-def test_settings_of_stage_2_leave_the_shared_stage_1_as_it_is(tmp_path):
+def test_settings_of_stage_2_leave_the_shared_stage_1_as_it_is(tmp_path, capsys):
     _write(tmp_path)
     assert _run(tmp_path, Fakes(), "--only", "few", "--scene", "one") == 0
     more = ["--set", "transport.batch_views=3", "--only", "many", "--scene", "one"]
     fakes = Fakes()
     assert _run(tmp_path, fakes, *more) == 0
     assert fakes.trained == [("one/many", False, "_stage_1")]
+    # Neither do other defaults of stage 2, by then; those of stage 1 do.
+    path = tmp_path / "runs" / "one" / "_stage_1" / "run.json"
+    record = json.loads(path.read_text())
+    record["config"]["transport"]["rates"]["sdf"] = 0.5
+    path.write_text(json.dumps(record))
+    fakes = Fakes()
+    assert _run(tmp_path, fakes, "--only", "no-shadow", "--scene", "one") == 0
+    assert fakes.trained == [("one/no-shadow", False, "_stage_1")]
+    record["config"]["rates"]["sdf"] = 0.5
+    path.write_text(json.dumps(record))
+    assert _run(tmp_path, fakes, "--only", "full", "--scene", "one") == 2
+    assert "one/_stage_1: rates.sdf: 0.5 -> " in capsys.readouterr().err
 
 
 def test_an_interrupted_run_goes_on_from_its_checkpoint_or_starts_anew(tmp_path):
@@ -309,6 +321,18 @@ def test_a_failed_run_stops_only_those_that_need_it(tmp_path, capsys):
     assert done == {"one/coarse", "two/full", "two/coarse", "two/few", "two/many"}
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith("6 of 12 failed: one/_stage_1, one/full")
+
+
+def test_a_trained_run_is_evaluated_without_its_stage_1(tmp_path):
+    _write(tmp_path)
+    assert _run(tmp_path, Fakes(), "--only", "full", "--scene", "one") == 0
+    folder = tmp_path / "runs" / "one"
+    (folder / "full" / "evaluation.json").unlink()
+    (folder / "_stage_1" / "training.json").unlink()
+    fakes = Fakes(broken=["one/_stage_1"])
+    assert _run(tmp_path, fakes, "--only", "full", "few", "--scene", "one") == 1
+    assert fakes.evaluated == [("one/full", "traced")]
+    assert "stage 1 failed" in (folder / "few" / "error.txt").read_text()
 
 
 def test_ctrl_c_ends_the_sweep_with_its_own_status(tmp_path, capsys):
@@ -491,14 +515,17 @@ def test_the_smoke_sweep_runs_for_real(tmp_path):
     runs, output = tmp_path / "runs", tmp_path / "smoke.md"
     command = [sys.executable, str(ROOT / "experiments" / "run.py"), str(SWEEPS / "smoke.toml")]
     command += ["--scenes", str(ROOT / "examples"), "--output", str(runs)]
+    command += ["--only", "full", "more-samples"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     lines = (runs / "duck" / "more-samples" / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["stage"] for line in lines] == [2, 2]
     again = subprocess.run(command, capture_output=True, text=True)
     assert again.returncode == 0
-    assert again.stderr.count("finished already") == 3
+    assert again.stderr.count("finished already") == 2
     assert report.main([str(runs), "--output", str(output)]) == 0
-    summary = _rows(output.read_text(), "Summary")
+    text = output.read_text()
+    summary = _rows(text, "Summary")
     assert float(summary["full (reference)"][0]) > 5
-    assert all(cell != "–" for row in summary.values() for cell in row)
+    assert "–" not in summary["full (reference)"] + summary["more-samples"]
+    assert "- duck/no-occlusion: missing" in text
