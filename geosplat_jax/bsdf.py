@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from geosplat_jax.color import luminance
-from geosplat_jax.numerics import COSINE_EPSILON, safe_divide, safe_normalize, safe_sqrt
+from geosplat_jax.numerics import COSINE_EPSILON, LENGTH_EPSILON, safe_divide, safe_sqrt
 from geosplat_jax.pytree import register_pytree
 from geosplat_jax.rotation import frame_from_normal
 from geosplat_jax.scene import Materials
@@ -265,37 +265,67 @@ def pdf(
     return share * specular + (1 - share) * cosine_pdf(normals, wi)
 
 
-def _sample_visible_normal(
-    wo: Float[Array, "N 3"], alpha: Float[Array, " N"], uniforms: Float[Array, "N 2"]
-) -> Float[Array, "N 3"]:
-    """Draw a microfacet normal as seen from ``wo``, in the local frame (Dupuy, Benyoub 2023)."""
-    stretch = jnp.stack([alpha, alpha, jnp.ones_like(alpha)], axis=-1)
-    view = safe_normalize(wo * stretch)
-    azimuth = 2 * math.pi * uniforms[:, 0]
+def _unit(vectors: Components) -> Components:
+    """Scale vectors of about unit length to exactly that."""
+    inverse = jax.lax.rsqrt(jnp.maximum(_along(vectors, vectors), LENGTH_EPSILON))
+    return tuple(component * inverse for component in vectors)
+
+
+def _frame(normals: Components) -> tuple[Components, Components]:
+    """Tangents of `rotation.frame_from_normal`, by components."""
+    tangent, bitangent = frame_from_normal(jnp.stack(normals, axis=-1))
+    return tuple(jnp.moveaxis(tangent, -1, 0)), tuple(jnp.moveaxis(bitangent, -1, 0))
+
+
+def _to_world(local: Components, frame: tuple[Components, Components, Components]) -> Components:
+    """Turn vectors from the frame (tangent, bitangent, normal) into the world, to unit length."""
+    along_axes = zip(*frame, strict=True)
+    return _unit(tuple(local[0] * t + local[1] * b + local[2] * n for t, b, n in along_axes))
+
+
+def cosine_directions(normals: Components, first: Array, second: Array) -> Components:
+    """Draw directions with density `cosine_pdf` from two uniform numbers each; no gradients.
+
+    Components may broadcast against the numbers.
+    """
+    normals = jax.lax.stop_gradient(normals)
+    azimuth, radius = 2 * math.pi * first, safe_sqrt(second)
+    local = (radius * jnp.cos(azimuth), radius * jnp.sin(azimuth), safe_sqrt(1 - second))
+    # Without the barrier XLA computes all of the above once for each component of the result.
+    local = jax.lax.optimization_barrier(local)
+    return jax.lax.stop_gradient(_to_world(local, (*_frame(normals), normals)))
+
+
+def specular_directions(
+    alpha: Array, normals: Components, wo: Components, first: Array, second: Array
+) -> Components:
+    """Draw directions with density `specular_pdf` from two uniform numbers each; no gradients.
+
+    The view is mirrored at a visible microfacet normal, which is drawn by way of a uniform point
+    of a spherical cap (Dupuy, Benyoub 2023). Components may broadcast against the numbers.
+    """
+    alpha, normals, wo = jax.lax.stop_gradient((alpha, normals, wo))
+    tangent, bitangent = _frame(normals)
+    up = jnp.maximum(_along(wo, normals), 0.0)
+    local = (_along(wo, tangent), _along(wo, bitangent), up)
+    view = _unit((alpha * local[0], alpha * local[1], up))
+    azimuth = 2 * math.pi * first
     # A uniform point of the spherical cap that a mirror hemisphere reflects the view into.
-    z = (1 - uniforms[:, 1]) * (1 + view[:, 2]) - view[:, 2]
+    z = (1 - second) * (1 + view[2]) - view[2]
     radius = safe_sqrt(1 - z * z)
-    cap = jnp.stack([radius * jnp.cos(azimuth), radius * jnp.sin(azimuth), z], axis=-1)
-    return safe_normalize((cap + view) * stretch)
-
-
-def _to_world(local: Float[Array, "N 3"], normals: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
-    """Turn unit vectors from the frame about a normal into the world."""
-    tangent, bitangent = frame_from_normal(normals)
-    world = local[:, :1] * tangent + local[:, 1:2] * bitangent + local[:, 2:] * normals
-    return safe_normalize(world)
+    cap = (radius * jnp.cos(azimuth) + view[0], radius * jnp.sin(azimuth) + view[1], z + view[2])
+    half = jax.lax.optimization_barrier(_unit((alpha * cap[0], alpha * cap[1], cap[2])))
+    twice = 2 * _along(local, half)
+    mirrored = tuple(twice * h - v for h, v in zip(half, local, strict=True))
+    return jax.lax.stop_gradient(_to_world(mirrored, (tangent, bitangent, normals)))
 
 
 def sample_cosine(
     normals: Float[Array, "N 3"], uniforms: Float[Array, "N 2"]
 ) -> Float[Array, "N 3"]:
     """Draw unit directions with density `cosine_pdf` about unit normals; no gradients."""
-    normals = jax.lax.stop_gradient(normals)
-    azimuth = 2 * math.pi * uniforms[:, 0]
-    radius = safe_sqrt(uniforms[:, 1])
-    height = safe_sqrt(1 - uniforms[:, 1])
-    local = jnp.stack([radius * jnp.cos(azimuth), radius * jnp.sin(azimuth), height], axis=-1)
-    return jax.lax.stop_gradient(_to_world(local, normals))
+    found = cosine_directions(_components(normals), uniforms[:, 0], uniforms[:, 1])
+    return jnp.stack(found, axis=-1)
 
 
 def sample_specular(
@@ -305,13 +335,9 @@ def sample_specular(
     uniforms: Float[Array, "N 2"],
 ) -> Float[Array, "N 3"]:
     """Mirror the view at a visible microfacet normal: density `specular_pdf`; no gradients."""
-    roughness, normals, wo = jax.lax.stop_gradient((roughness, normals, wo))
-    tangent, bitangent = frame_from_normal(normals)
-    local = jnp.stack([_dot(wo, tangent), _dot(wo, bitangent), _dot(wo, normals)], axis=-1)
-    local = local.at[:, 2].max(0.0)
-    half = _sample_visible_normal(local, ggx_alpha(roughness), uniforms)
-    mirrored = 2 * _dot(local, half)[:, None] * half - local
-    return jax.lax.stop_gradient(_to_world(mirrored, normals))
+    vectors = (_components(normals), _components(wo))
+    numbers = (uniforms[:, 0], uniforms[:, 1])
+    return jnp.stack(specular_directions(ggx_alpha(roughness), *vectors, *numbers), axis=-1)
 
 
 def sample(

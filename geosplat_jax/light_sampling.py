@@ -67,8 +67,9 @@ def light_sampler(light: EnvLight) -> LightSampler:
 def _texel_of(sampler: LightSampler, uniforms: Float[Array, " N"]) -> tuple[Array, Array]:
     """Texel that a number in [0, 1) falls into, and where in [0, 1) of its share."""
     count = sampler.cumulative.shape[0]
-    texel = jnp.searchsorted(sampler.cumulative, uniforms, side="right").astype(jnp.int32)
-    texel = jnp.minimum(texel, count - 1)
+    texel = jnp.searchsorted(sampler.cumulative, uniforms, side="right")
+    # Without the barrier XLA searches once for each use of the texel.
+    texel = jax.lax.optimization_barrier(jnp.minimum(texel.astype(jnp.int32), count - 1))
     upper = sampler.cumulative[texel]
     lower = jnp.where(texel > 0, sampler.cumulative[jnp.maximum(texel - 1, 0)], 0.0)
     width = upper - lower

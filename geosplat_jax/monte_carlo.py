@@ -44,7 +44,7 @@ OPEN = -1
 BLOCKED = -2
 """A ray that does not; by what is not known."""
 
-_RAYS_AT_ONCE = 65_536
+_RAYS_AT_ONCE = 4_194_304
 
 
 @dataclass(frozen=True)
@@ -145,9 +145,9 @@ def _low_discrepancy(
     return jnp.minimum(turned - jnp.floor(turned), 1 - 2.0**-24).astype(dtype)
 
 
-def _offsets(key: Key[Array, ""], count: int) -> Float[Array, "N 4"]:
+def _offsets(key: Key[Array, ""], count: int, numbers: int) -> Float[Array, "N k"]:
     """Draw the points' random numbers, in float32 at any precision."""
-    return jax.random.uniform(key, (count, 4), jnp.float32)
+    return jax.random.uniform(key, (count, numbers), jnp.float32)
 
 
 def _in_chunks(
@@ -247,7 +247,9 @@ def draw_samples(
             drawn.append(found.reshape(counts.light, -1, 3))
         if counts.diffuse:
             uniforms = _low_discrepancy(offsets[:, 2:], counts.diffuse, dtype)
-            drawn.append(jax.vmap(lambda u: bsdf.sample_cosine(points.normals, u))(uniforms))
+            normals = tuple(points.normals.T[:, None, :])
+            found = bsdf.cosine_directions(normals, uniforms[..., 0], uniforms[..., 1])
+            drawn.append(jnp.stack(found, axis=-1))
         directions = jnp.concatenate(drawn)
         flat = directions.reshape(-1, 3)
         light = light_density(sampler, flat).reshape(directions.shape[:2])
@@ -258,7 +260,7 @@ def draw_samples(
         return Samples(jnp.moveaxis(directions, 0, 1), weights.T, hits.T, light[: counts.light].T)
 
     samples = counts.light + counts.diffuse
-    return _in_chunks(one_chunk, (points, _offsets(key, count)), points.mask, samples)
+    return _in_chunks(one_chunk, (points, _offsets(key, count, 4)), points.mask, samples)
 
 
 def _arriving(
@@ -362,13 +364,16 @@ def _draw_specular(
     def one_chunk(parts: tuple) -> tuple[Array, Array, Array]:
         points, roughness, wo, offsets = parts
         uniforms = _low_discrepancy(offsets[:, :2], counts.specular, wo.dtype)
-        drawn = jax.vmap(lambda u: bsdf.sample_specular(roughness, points.normals, wo, u))(uniforms)
+        alpha = bsdf.ggx_alpha(roughness)[None, :]
+        vectors = (tuple(x.T[:, None, :]) for x in (points.normals, wo))
+        numbers = (uniforms[..., 0], uniforms[..., 1])
+        drawn = jnp.stack(bsdf.specular_directions(alpha, *vectors, *numbers), axis=-1)
         hits = cast(points, drawn, accelerator, finds_nearest=finds_nearest)
         density = light_density(sampler, drawn.reshape(-1, 3)).reshape(hits.shape)
         return jnp.moveaxis(drawn, 0, 1), hits.T, density.T
 
     count = wo.shape[0]
-    arguments = (points, roughness, wo, _offsets(key, count))
+    arguments = (points, roughness, wo, _offsets(key, count, 2))
     return _in_chunks(one_chunk, jax.lax.stop_gradient(arguments), points.mask, counts.specular)
 
 

@@ -13,12 +13,18 @@ from support import STAGE_2, ball_of_one_material, tiny_config, views_from
 from geosplat_jax.capacity import Capacities
 from geosplat_jax.evaluate import evaluate_run, preview_image
 from geosplat_jax.protocols import PROTOCOLS
-from geosplat_jax.renderer import Renderer
+from geosplat_jax.renderer import RELIGHT_BOUNCES, Renderer
 from geosplat_jax.scene import EnvLight
 from geosplat_jax.stages import begin_stage_2
 
-AMPLE = Capacities(1024, 1024, 1024, 16384, 16384, 4096, 8192)
-CONFIG = tiny_config("model.material.bias=true", *STAGE_2)
+AMPLE = Capacities(256, 256, 256, 4096, 8192, 2048, 4096)
+# As under a new light, so that both share their programs.
+CONFIG = tiny_config(
+    "model.material.bias=true",
+    *STAGE_2,
+    "transport.shading.indirect=traced",
+    f"transport.shading.bounces={RELIGHT_BOUNCES}",
+)
 SAMPLES = 32
 SCALE = np.array([0.5, 0.8, 0.9])
 FIGURES = ("psnr", "ssim", "psnr_masked", "ssim_masked")

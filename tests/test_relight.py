@@ -24,7 +24,7 @@ from geosplat_jax.relight import (
 from geosplat_jax.renderer import RenderedView, Renderer
 from geosplat_jax.scene import EnvLight
 
-AMPLE = Capacities(1024, 1024, 1024, 16384, 16384, 4096, 8192)
+AMPLE = Capacities(256, 256, 256, 4096, 8192, 2048, 4096)
 RED, GREEN, BLUE, YELLOW = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0.0]])
 SIDES = {"+x": RED, "-y": GREEN, "-x": BLUE, "+y": YELLOW}
 AXES = {

