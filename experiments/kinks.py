@@ -41,19 +41,12 @@ from geosplat_jax.io.dataset import load_dataset
 from geosplat_jax.light import direction_to_uv, level_of_roughness
 from geosplat_jax.losses import TERM_NAMES, loss
 from geosplat_jax.materials import to_unit_cube
+from geosplat_jax.model import Context, Model, Params
 from geosplat_jax.numerics import safe_normalize
 from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
 from geosplat_jax.projection import project
 from geosplat_jax.rasterize import MAX_ALPHA, MIN_ALPHA, find_visible
-from geosplat_jax.render import (
-    Asset,
-    Context,
-    Model,
-    Params,
-    grid_center_and_extent,
-    reconstruct,
-    render_views,
-)
+from geosplat_jax.render import Asset, grid_center_and_extent, reconstruct, render_views
 from geosplat_jax.scene import Batch, Grid
 from geosplat_jax.stages import initial_params, initial_sdf, make_batch, sampling_of_step
 from geosplat_jax.step import StepReport, TrainState, initial_state, train_step

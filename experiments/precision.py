@@ -41,11 +41,12 @@ from geosplat_jax.materials import (
     smoothness,
     to_unit_cube,
 )
+from geosplat_jax.model import Context, Params
 from geosplat_jax.numerics import safe_normalize
 from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
 from geosplat_jax.projection import project
 from geosplat_jax.rasterize import TileLists, composite, gather_visible
-from geosplat_jax.render import Context, Params, grid_center_and_extent
+from geosplat_jax.render import grid_center_and_extent
 from geosplat_jax.scene import Batch, Camera, EnvLight, Grid, Materials, Mesh
 from geosplat_jax.shading import split_sum
 from geosplat_jax.stages import initial_params, initial_sdf, make_batch, make_context

@@ -21,9 +21,9 @@ from geosplat_jax.hashgrid import HashGridSpec, encode
 from geosplat_jax.io.images import encode_srgb
 from geosplat_jax.io.views import Views
 from geosplat_jax.metrics import normal_mae_deg, psnr
+from geosplat_jax.model import Context, Params
 from geosplat_jax.projection import Splats
 from geosplat_jax.rasterize import MAX_ALPHA, MIN_ALPHA, TileLists
-from geosplat_jax.render import Context, Params
 from geosplat_jax.scene import Camera
 
 GROUPS = ("geometry", "tables", "heads", "light", "exposure")

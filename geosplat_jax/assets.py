@@ -15,7 +15,8 @@ from geosplat_jax.config import Config
 from geosplat_jax.io.export import export_gaussians_ply, export_light_exr, export_mesh_glb
 from geosplat_jax.io.images import encode_srgb
 from geosplat_jax.materials import materials_at
-from geosplat_jax.render import Context, Params, grid_center_and_extent
+from geosplat_jax.model import Context, Params
+from geosplat_jax.render import grid_center_and_extent
 from geosplat_jax.renderer import Renderer, build_asset
 
 _MATERIAL_CHUNK = 65_536

@@ -5,6 +5,7 @@ import importlib.metadata
 import json
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from geosplat_jax.io.dataset import Dataset, describe, load_dataset
 from geosplat_jax.io.images import SceneError, write_png
 from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
 from geosplat_jax.protocols import PROTOCOLS
-from geosplat_jax.relight import BACKGROUNDS
+from geosplat_jax.relight import BACKGROUNDS, RelightOptions
 from geosplat_jax.renderer import DEFAULT_SAMPLES
 
 _console = Console(stderr=True, highlight=False)
@@ -388,34 +389,60 @@ def evaluate_command(
     return figures
 
 
-def relight_command(arguments: argparse.Namespace) -> list[Path]:
-    """Render the test views, and movies, of a run under another light."""
-    from geosplat_jax.relight import RelightOptions, load_light, relight_views
+def relight_command(
+    run: Path,
+    env: Path,
+    output: Path | None = None,
+    *,
+    options: RelightOptions | None = None,
+    intensity: float = 1.0,
+    albedo_scale: Sequence[float] = (1.0, 1.0, 1.0),
+    samples: int = DEFAULT_SAMPLES,
+    indirect: str = "traced",
+) -> list[Path]:
+    """Render the test views, and movies, of a run under another light; return the files."""
+    from geosplat_jax.relight import load_light, relight_views
     from geosplat_jax.renderer import Renderer
     from geosplat_jax.scene import EnvLight
     from geosplat_jax.train import load_run
 
-    run = arguments.run
     record = _recorded(run)
-    light = load_light(arguments.env)
-    light = EnvLight(arguments.intensity * light.radiance)
+    light = EnvLight(intensity * load_light(env).radiance)
     dataset = _load(record["scene"], record["dataset"])
     views = dataset.test if dataset.test.names else dataset.train
     config, params, context, capacities, _ = load_run(run)
-    renderer = Renderer(config, params, context, capacities, samples=arguments.samples)
-    relit = renderer.relit(light, albedo_scale=arguments.albedo_scale, indirect=arguments.indirect)
-    folder = arguments.output or run / f"relight_{arguments.env.stem}"
+    renderer = Renderer(config, params, context, capacities, samples=samples)
+    relit = renderer.relit(light, albedo_scale=albedo_scale, indirect=indirect)
+    folder = output or run / f"relight_{env.stem}"
     folder.mkdir(parents=True, exist_ok=True)
-    options = RelightOptions(
-        turntable=arguments.turntable,
-        rotate_env=arguments.rotate_env,
-        background=arguments.background,
-        suffix=f".{arguments.movie}" if arguments.movie else None,
-        frames_per_second=arguments.fps,
-    )
-    written = relight_views(relit, light, views, folder, options)
+    written = relight_views(relit, light, views, folder, options or RelightOptions())
     print(f"{len(written)} files: {folder}")
     return written
+
+
+def _relight(arguments: argparse.Namespace) -> None:
+    """Run the relight command from its arguments."""
+    if arguments.intensity < 0:
+        raise UsageError(f"--intensity must not be negative, got {arguments.intensity}")
+    for name in ("turntable", "rotate_env"):
+        if getattr(arguments, name) < 0:
+            raise UsageError(f"--{name.replace('_', '-')} must not be negative")
+    relight_command(
+        arguments.run,
+        arguments.env,
+        arguments.output,
+        options=RelightOptions(
+            turntable=arguments.turntable,
+            rotate_env=arguments.rotate_env,
+            background=arguments.background,
+            suffix=f".{arguments.movie}" if arguments.movie else None,
+            frames_per_second=arguments.fps,
+        ),
+        intensity=arguments.intensity,
+        albedo_scale=arguments.albedo_scale,
+        samples=arguments.samples,
+        indirect=arguments.indirect,
+    )
 
 
 def _peak_memory(run: Path) -> int | None:
@@ -526,7 +553,7 @@ def _run(arguments: argparse.Namespace) -> None:
             relight_indirect=arguments.relight_indirect,
         )
     elif arguments.command == "relight":
-        relight_command(arguments)
+        _relight(arguments)
     elif arguments.command == "render":
         render_command(arguments.run, arguments.views, arguments.output)
     elif arguments.command == "gradcheck":

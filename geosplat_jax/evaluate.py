@@ -27,8 +27,8 @@ from geosplat_jax.metrics import (
     psnr,
     ssim,
 )
+from geosplat_jax.model import Context, Params
 from geosplat_jax.protocols import Protocol
-from geosplat_jax.render import Context, Params
 from geosplat_jax.renderer import (
     DEFAULT_SAMPLES,
     RenderedView,

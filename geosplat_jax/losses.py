@@ -14,17 +14,10 @@ from geosplat_jax.capacity import Capacities, Usage
 from geosplat_jax.color import linear_to_srgb, tone_map
 from geosplat_jax.geometry import sdf_entropy, weight_magnitude
 from geosplat_jax.materials import smoothness
+from geosplat_jax.model import Context, Model, Params
 from geosplat_jax.numerics import absolute, safe_divide, safe_log
 from geosplat_jax.pytree import register_pytree
-from geosplat_jax.render import (
-    Asset,
-    Context,
-    Model,
-    Params,
-    grid_center_and_extent,
-    reconstruct,
-    render_views,
-)
+from geosplat_jax.render import Asset, grid_center_and_extent, reconstruct, render_views
 from geosplat_jax.scene import Batch
 from geosplat_jax.ssim import ssim
 

@@ -365,9 +365,9 @@ def _draw_specular(
         points, roughness, wo, offsets = parts
         uniforms = _low_discrepancy(offsets[:, :2], counts.specular, wo.dtype)
         alpha = bsdf.ggx_alpha(roughness)[None, :]
-        vectors = (tuple(x.T[:, None, :]) for x in (points.normals, wo))
-        numbers = (uniforms[..., 0], uniforms[..., 1])
-        drawn = jnp.stack(bsdf.specular_directions(alpha, *vectors, *numbers), axis=-1)
+        normals, views = (tuple(x.T[:, None, :]) for x in (points.normals, wo))
+        found = bsdf.specular_directions(alpha, normals, views, uniforms[..., 0], uniforms[..., 1])
+        drawn = jnp.stack(found, axis=-1)
         hits = cast(points, drawn, accelerator, finds_nearest=finds_nearest)
         density = light_density(sampler, drawn.reshape(-1, 3)).reshape(hits.shape)
         return jnp.moveaxis(drawn, 0, 1), hits.T, density.T

@@ -14,33 +14,30 @@ from jaxtyping import Array, Bool, Float, Key
 from geosplat_jax import capacity as capacity_module
 from geosplat_jax.adapter import (
     GAUSSIANS_PER_FACE,
-    AdapterConstants,
     face_gaussians,
     shift_inwards,
     vertex_gaussians,
 )
 from geosplat_jax.capacity import Capacities, Usage
 from geosplat_jax.geometry import face_normals_and_areas, isosurface, vertex_normals
-from geosplat_jax.light import LightSpec, PrefilterOperators
-from geosplat_jax.materials import MaterialField, MaterialSpec, attributes_at, indirect_logits
+from geosplat_jax.materials import attributes_at, indirect_logits
+from geosplat_jax.model import Context, Model, Params
 from geosplat_jax.numerics import safe_normalize
 from geosplat_jax.projection import project
 from geosplat_jax.pytree import register_pytree
 from geosplat_jax.rasterize import (
-    DEFAULT_TILE_SIZE,
     TileLists,
     composite,
     find_visible,
     gather_visible,
 )
-from geosplat_jax.scene import Camera, EnvLight, Gaussians, Geometry, Grid, Materials, Mesh
+from geosplat_jax.scene import Camera, EnvLight, Gaussians, Grid, Materials, Mesh
 from geosplat_jax.shading import Shaded
 from geosplat_jax.trace import Accelerator, build_accelerator
 from geosplat_jax.transport import (
     DENOISER_INPUTS,
     Illumination,
     Receivers,
-    Transport,
     denoised,
     illuminate,
     shade_rows,
@@ -56,70 +53,6 @@ AOV_NAMES = (
     "specular",
     "specular_radiance",
 )
-
-
-@register_pytree
-@dataclass(frozen=True)
-class Params:
-    """Everything that is learned, and nothing else; the only differentiated argument of `loss`.
-
-    Attributes
-    ----------
-    geometry : isosurface on the grid.
-    material : attribute fields.
-    light : environment map.
-    log_exposure : () natural logarithm of the exposure before the tone map.
-    """
-
-    geometry: Geometry
-    material: MaterialField
-    light: EnvLight
-    log_exposure: Float[Array, ""]
-
-
-@dataclass(frozen=True)
-class Model:
-    """Static description of what `Params` mean and how they are rendered; hashable.
-
-    Attributes
-    ----------
-    adapter, material, light, transport : constants of the stages.
-    baked_diffuse : the authors' stage 1, where the albedo field *is* the diffuse radiance and is
-        not multiplied by irradiance.
-    attribute_gradient : let the attributes pull on the geometry: the fields are differentiated in
-        the Gaussians' positions. Off, as in the authors' code, they move with the surface.
-    cull_backfaces : leave out Gaussians whose face looks away from the camera. Half the work on a
-        closed surface; the far side no longer shines through the gaps between splats.
-    tile_size : edge of the rasteriser's square tiles, pixels.
-    near : near plane, in half the longest side of the grid's box.
-    """
-
-    adapter: AdapterConstants = AdapterConstants()
-    material: MaterialSpec = MaterialSpec()
-    light: LightSpec = LightSpec()
-    transport: Transport = Transport()
-    baked_diffuse: bool = False
-    attribute_gradient: bool = False
-    cull_backfaces: bool = True
-    tile_size: int = DEFAULT_TILE_SIZE
-    near: float = 0.01
-
-
-@register_pytree
-@dataclass(frozen=True)
-class Context:
-    """Arrays that rendering needs and training does not change.
-
-    Attributes
-    ----------
-    grid : where the isosurface lives.
-    operators : linear maps that prefilter the light.
-    fg_table : the split sum's precomputed BRDF integral.
-    """
-
-    grid: Grid
-    operators: PrefilterOperators
-    fg_table: Float[Array, "n m 2"]
 
 
 @register_pytree

@@ -21,11 +21,10 @@ from geosplat_jax.config import Config
 from geosplat_jax.denoise import DenoiseSpec
 from geosplat_jax.geometry import isosurface, vertex_normals
 from geosplat_jax.io.images import encode_srgb
+from geosplat_jax.model import Context, Model, Params
 from geosplat_jax.render import (
     Asset,
-    Context,
-    Model,
-    Params,
+    RenderOutput,
     grid_center_and_extent,
     illuminate_asset,
     reconstruct,
@@ -35,10 +34,13 @@ from geosplat_jax.scene import Camera, EnvLight, Mesh
 from geosplat_jax.transport import Illumination, Transport
 
 EVALUATION_AOVS = ("albedo", "roughness", "metallic", "normal")
-DEFAULT_SAMPLES = 256
+DEFAULT_SAMPLES = 128
 """Rays a splat, over all passes, in images that people look at and figures are made from."""
 
 _PASS_SAMPLES = 16
+_SPECULAR_PASSES = 4
+"""Passes that specular light is averaged over; each keeps its samples of the light in memory."""
+
 RELIGHT_BOUNCES = 2
 """How often light goes from surface to surface under a new light."""
 
@@ -90,7 +92,9 @@ class Renderer:
     Parameters
     ----------
     config, params, context, capacities : see `train.load_run`.
-    samples : rays a splat, where the model traces any. The noise falls as the square root.
+    samples : rays a splat, where the model traces any. The noise of the diffuse light falls as
+        the square root; the specular lobe, which every view integrates anew, takes a quarter of
+        128 rays at most, and the splats of a pixel average it further.
     seed : of the samples.
     """
 
@@ -117,7 +121,7 @@ class Renderer:
         self._albedo_scale = np.ones(3, np.float32)
         self._model = self._for_images(config.model)
         self._asset: Asset | None = None
-        self._illumination: Illumination | None = None
+        self._illuminations: list[Illumination] = []
 
     @staticmethod
     def _for_images(model: Model) -> Model:
@@ -163,7 +167,7 @@ class Renderer:
         """Return a renderer that differs in the light alone; the surface is not built again."""
         other = copy.copy(self)
         other._light = light
-        other._illumination = None
+        other._illuminations = []
         return other
 
     def center(self) -> np.ndarray:
@@ -176,16 +180,16 @@ class Renderer:
         if self._asset is None:
             config = replace(self._config, model=self._model)
             asset = build_asset(config, self._params, self._context, self._capacities)
-            albedo = asset.materials.albedo * self._albedo_scale
+            albedo = asset.materials.albedo * self._albedo_scale[None, :]
             self._asset = replace(asset, materials=replace(asset.materials, albedo=albedo))
         return self._asset
 
-    def _illuminated(self) -> Illumination:
-        """Gather the light, once; the mean of all passes."""
-        if self._illumination is not None:
-            return self._illumination
+    def _illuminated(self) -> list[Illumination]:
+        """Gather the light, once: the mean of all passes, with the light's samples of a few."""
+        if self._illuminations:
+            return self._illuminations
         passes = 1 if self._model.transport.method == "split_sum" else self._passes
-        total = None
+        total, kept = None, []
         for number in range(passes):
             found = _illuminate(
                 self.asset(),
@@ -195,13 +199,15 @@ class Renderer:
                 key=jax.random.fold_in(self._key, number),
             )
             total = found if total is None else _added(total, found)
+            if number < _SPECULAR_PASSES:
+                kept.append(found)
         assert total is not None
-        self._illumination = _scaled(total, 1.0 / passes)
-        return self._illumination
+        mean = _averaged_parts(_scaled(total, 1.0 / passes))
+        self._illuminations = [_with_parts(one, mean) for one in kept]
+        return self._illuminations
 
-    def __call__(self, camera: Camera) -> RenderedView:
-        """Render the single view of ``camera``, with every AOV of the evaluation."""
-        illumination = self._illuminated()
+    def _render(self, camera: Camera, illumination: Illumination, number: int) -> RenderOutput:
+        """Render one pass of a view, growing buffers as needed."""
         while True:
             output = _render_lit(
                 self.asset(),
@@ -211,17 +217,26 @@ class Renderer:
                 model=self._model,
                 capacities=self._capacities,
                 aov_names=EVALUATION_AOVS,
-                key=jax.random.fold_in(self._key, self._passes),
+                key=jax.random.fold_in(self._key, self._passes + number),
             )
             view_needs = _without_surface(output.usage)
             if not capacity_module.overflowed(view_needs, self._capacities):
-                break
+                return output
             self._capacities = capacity_module.grow(self._capacities, view_needs)
-        rgb = tone_map(output.rgb[0], self._log_exposure)
+
+    def __call__(self, camera: Camera) -> RenderedView:
+        """Render the single view of ``camera``, with every AOV of the evaluation."""
+        outputs = [
+            self._render(camera, illumination, number)
+            for number, illumination in enumerate(self._illuminated())
+        ]
+        linear = jnp.mean(jnp.stack([output.rgb[0] for output in outputs]), axis=0)
+        rgb = tone_map(linear, self._log_exposure)
+        first = outputs[0]
         return RenderedView(
             np.asarray(rgb),
-            np.asarray(output.alpha[0]),
-            {name: np.asarray(image[0]) for name, image in output.aovs.items()},
+            np.asarray(first.alpha[0]),
+            {name: np.asarray(image[0]) for name, image in first.aovs.items()},
         )
 
     def mesh(self, *, training: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from geosplat_jax.hull import hull_sdf
 from geosplat_jax.io.views import Views
 from geosplat_jax.light import init_light, prefilter_operators
 from geosplat_jax.materials import MaterialField, init_indirect_head, init_materials
-from geosplat_jax.render import Context, Model, Params
+from geosplat_jax.model import Context, Model, Params
 from geosplat_jax.scene import Batch, Grid
 from geosplat_jax.shading import fg_table
 

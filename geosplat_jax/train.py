@@ -38,7 +38,8 @@ from geosplat_jax.io.checkpoints import (
 )
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.views import Views
-from geosplat_jax.render import Context, Model, Params, visibility_usage
+from geosplat_jax.model import Context, Model, Params
+from geosplat_jax.render import visibility_usage
 from geosplat_jax.scene import Camera, Grid
 from geosplat_jax.stages import (
     begin_stage_2,

@@ -42,6 +42,7 @@ ORDER = [
     "_composite",
     "rasterize",
     "transport",
+    "model",
     "render",
     "losses",
     "config",

@@ -39,13 +39,6 @@ def sky(seed):
 LIGHTS = {name: sky(seed) for seed, name in enumerate(LIGHT_NAMES)}
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _rank_promotion():
-    """The renderer's product of albedo and scale still promotes ranks; see `test_renderer.py`."""
-    with jax.numpy_rank_promotion("allow"):
-        yield
-
-
 @pytest.fixture(scope="module")
 def run():
     """Settings, parameters, context of a ball in stage 2 whose materials vary in space."""

@@ -30,9 +30,10 @@ from geosplat_jax.light import (
     prefilter_operators,
 )
 from geosplat_jax.materials import MaterialSpec, init_materials, smoothness
+from geosplat_jax.model import Context, Model, Params
 from geosplat_jax.projection import Splats, project
 from geosplat_jax.rasterize import MAX_ALPHA, MIN_ALPHA, composite, find_visible, gather_visible
-from geosplat_jax.render import Asset, Context, Model, Params, reconstruct, render_views
+from geosplat_jax.render import Asset, reconstruct, render_views
 from geosplat_jax.scene import Camera, EnvLight, Gaussians, Grid, Materials, Mesh
 from geosplat_jax.shading import fg_table
 from geosplat_jax.ssim import ssim

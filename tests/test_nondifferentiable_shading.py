@@ -32,8 +32,8 @@ from geosplat_jax.light import (
     prefiltered_specular,
 )
 from geosplat_jax.materials import MaterialSpec, init_materials
+from geosplat_jax.model import Params
 from geosplat_jax.numerics import COSINE_EPSILON
-from geosplat_jax.render import Params
 from geosplat_jax.scene import EnvLight
 from geosplat_jax.shading import fg_lookup, fg_table, split_sum
 from geosplat_jax.step import _project

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -34,13 +33,6 @@ AXES = {
     "+y": np.array([0, 1.0, 0]),
 }
 SIZE = 16
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _rank_promotion():
-    """The renderer's product of albedo and scale still promotes ranks; see `test_renderer.py`."""
-    with jax.numpy_rank_promotion("allow"):
-        yield
 
 
 def four_colours(height=16):

@@ -37,13 +37,6 @@ SIZE = 12
 draw = partial(jax.jit, static_argnames=("model", "capacities", "aov_names"))(render)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _rank_promotion():
-    """The renderer's product of albedo and scale still promotes ranks; see `test_renderer.py`."""
-    with jax.numpy_rank_promotion("allow"):
-        yield
-
-
 def sky(scale=1.0, seed=0):
     """A dim map with a few brighter texels: nothing reaches the knee of the tone map."""
     texels = np.random.default_rng(seed).uniform(0, 1, (8, 16, 3))
@@ -114,16 +107,6 @@ def test_too_small_buffers_grow_and_change_no_pixel(matt, camera):
         np.testing.assert_allclose(grown.aovs[name], ample.aovs[name], atol=2e-6)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=ValueError,
-    reason="`Renderer.asset` multiplies (N, 3) albedo by a (3,) scale without a leading axis",
-)
-def test_no_ranks_are_promoted(matt):
-    with jax.numpy_rank_promotion("raise"):
-        Renderer(CONFIG, *matt, AMPLE).asset()
-
-
 def test_no_samples_are_refused(matt):
     with pytest.raises(ValueError, match="at least 1 sample a splat, got 0"):
         Renderer(CONFIG, *matt, AMPLE, samples=0)
@@ -148,10 +131,6 @@ def test_the_noise_of_matt_surfaces_falls_with_the_samples(matt, camera):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True,
-    reason="passes average the diffuse light alone; the specular lobe always has those of one pass",
-)
 def test_the_noise_of_metals_falls_with_the_samples(matt, camera):
     metal, context = ball_of_one_material(CONFIG, albedo=0.9, roughness=0.5, metallic=1.0)
     params = replace(metal, light=sky())

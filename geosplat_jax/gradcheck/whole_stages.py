@@ -14,7 +14,7 @@ from geosplat_jax.gradcheck.differences import Problem
 from geosplat_jax.hull import fit_grid
 from geosplat_jax.losses import TERM_NAMES, LossWeights, loss
 from geosplat_jax.materials import MaterialField, init_materials, smoothness
-from geosplat_jax.render import Context, Model, Params
+from geosplat_jax.model import Context, Model, Params
 from geosplat_jax.scene import Batch, Camera, EnvLight, Geometry, Grid
 from geosplat_jax.stages import make_context
 
