@@ -68,8 +68,6 @@ class RateConfig:
     albedo, shine, shift, indirect : heads and tables of albedo, of roughness and metallic, of the
         shift, of indirect light.
     light, exposure : radiometry.
-    relative_light : the light's rate is one of its logarithm: radiance is multiplied by a factor,
-        so that a sun can outshine the sky by orders of magnitude.
     half_life : steps after which all rates have halved.
     warmup : steps over which the isosurface's rates rise from zero, quadratically.
     """
@@ -82,7 +80,6 @@ class RateConfig:
     shift: float = 3e-3
     indirect: float = 1e-2
     light: float = 1e-2
-    relative_light: bool = False
     exposure: float = 5e-3
     half_life: float = 800.0
     warmup: int = 0
@@ -91,7 +88,7 @@ class RateConfig:
         """Validate every field."""
         for f in fields(self):
             value = getattr(self, f.name)
-            if not float(value) >= 0:
+            if not value >= 0:
                 raise ValueError(f"rates.{f.name} must not be negative, got {value}")
         if self.half_life <= 0:
             raise ValueError(f"rates.half_life must be positive, got {self.half_life}")

@@ -100,21 +100,6 @@ def initial_state(params: Params, rates: RateConfig) -> TrainState:
     return TrainState(params, make_optimizer(rates).init(tree), jnp.zeros((), jnp.int32))
 
 
-def _in_logarithm(gradient: Params, params: Params) -> Params:
-    """Turn the gradient in the light's radiance into that in its logarithm."""
-    scaled = gradient.light.radiance * params.light.radiance
-    return replace(gradient, light=replace(gradient.light, radiance=scaled))
-
-
-def _updated(params: Params, updates: Params, *, relative_light: bool) -> Params:
-    """Add updates; multiply the light by the exponential of its own where it is relative."""
-    moved = jax.tree.map(jnp.add, params, updates)
-    if not relative_light:
-        return moved
-    radiance = params.light.radiance * jnp.exp(updates.light.radiance)
-    return replace(moved, light=replace(params.light, radiance=radiance))
-
-
 def _project(params: Params, smallest_light: float) -> Params:
     """Return to the feasible set: no texel of the light below its floor."""
     radiance = jnp.maximum(params.light.radiance, smallest_light)
@@ -165,13 +150,8 @@ def train_step(
     )
     with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integer powers
         tree: Any = state.params
-        slopes: Any = gradient
-        if rates.relative_light:
-            slopes = _in_logarithm(gradient, state.params)
-        updates: Any
-        updates, optimizer = make_optimizer(rates).update(slopes, state.optimizer, tree)
-    params = _updated(state.params, updates, relative_light=rates.relative_light)
-    params = _project(params, smallest_light)
+        updates, optimizer = make_optimizer(rates).update(gradient, state.optimizer, tree)
+    params = _project(jax.tree.map(jnp.add, state.params, updates), smallest_light)
     finite = jnp.isfinite(total) & jnp.all(
         jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient)])
     )
