@@ -28,7 +28,7 @@ BACKGROUNDS = ("light", "white", "black")
 _lookup = jax.jit(lookup)
 
 
-def load_light(path: Path, *, largest: int = LARGEST_LIGHT) -> EnvLight:
+def load_light(path: str | Path, *, largest: int = LARGEST_LIGHT) -> EnvLight:
     """Read a lat-long environment map of linear radiance (HDR, EXR or any image).
 
     The layout is that of `EnvLight`: z up, ``u = 0.5 - atan2(y, x) / (2 pi)``. Maps with more than
