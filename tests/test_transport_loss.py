@@ -22,7 +22,7 @@ from geosplat_jax.render import (
     reconstruct,
     render,
 )
-from geosplat_jax.scene import Batch
+from geosplat_jax.scene import Batch, EnvLight
 from geosplat_jax.stages import begin_stage_2, initial_params, make_context
 from geosplat_jax.step import initial_state, train_step
 from geosplat_jax.transport import illuminate, shade_rows
@@ -45,6 +45,12 @@ TIGHT = Capacities(512, 512, 512, 6144, 8192, 2048, 4096)
 evaluate = partial(jax.jit, static_argnames=("model", "objective", "capacities"))(
     jax.value_and_grad(loss, has_aux=True)
 )
+
+
+def sky(seed=0):
+    """Return a map of random radiance with a few bright texels."""
+    texels = np.random.default_rng(seed).uniform(0, 1, (8, 16, 3))
+    return EnvLight(jnp.asarray(0.2 + 2 * texels**4, jnp.float32))
 
 
 def problem(*overrides):
