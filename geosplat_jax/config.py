@@ -201,7 +201,7 @@ class TransportConfig:
 
     steps: int = 300
     batch_views: int = 4
-    fresh_albedo: bool = False
+    fresh_albedo: bool = True
     shading: Transport = Transport(
         method="monte_carlo", light=2, diffuse=2, specular=2, indirect="constant"
     )
