@@ -29,7 +29,7 @@ ROUGHNESS_FLOOR = 0.08
 DIELECTRIC_F0 = 0.04
 """Normal reflectance of a non-metal: refractive index 1.5."""
 
-_OPPOSITE = 1e-6
+_OPPOSITE = 1e-10
 """Directions whose sum is shorter are opposite: no half vector, and nothing is reflected."""
 
 _LOBE_PROBABILITY_FLOOR = 0.1
