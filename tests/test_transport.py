@@ -261,7 +261,9 @@ def test_without_occlusion_it_is_the_estimator_without_a_surface(ball):
 
     expected = by_hand(receivers)
     for name in ("rgb", "diffuse_light", "specular_light"):
-        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-4)
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(expected, name), rtol=1e-4, atol=1e-6
+        )
     assert float(jnp.max(found.rgb)) > 0.1
 
 
