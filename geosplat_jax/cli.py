@@ -167,7 +167,7 @@ def _scene_options(arguments: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _load(scene: str | Path, options: dict[str, Any]) -> Dataset:
+def load_recorded(scene: str | Path, options: dict[str, Any]) -> Dataset:
     """Load a dataset from recorded options."""
     bounds = options.get("bounds")
     return load_dataset(
@@ -180,7 +180,7 @@ def _load(scene: str | Path, options: dict[str, Any]) -> Dataset:
 
 def _info(arguments: argparse.Namespace) -> None:
     """Print what was recognised."""
-    print(describe(_load(arguments.scene, _scene_options(arguments))))
+    print(describe(load_recorded(arguments.scene, _scene_options(arguments))))
 
 
 def _check_folder(folder: Path, record: dict[str, Any], *, resume: bool) -> None:
@@ -236,7 +236,7 @@ def train_command(
     record = {"scene": str(scene.resolve()), "dataset": options, "config": config.to_dict()}
     _check_folder(folder, record, resume=resume)
     began = time.perf_counter()
-    dataset = _load(scene, options)
+    dataset = load_recorded(scene, options)
     if stage_1 is not None:
         _check_same_scene(stage_1, record)
     if not resume:
@@ -310,7 +310,8 @@ class _progress_display:
                 f"stage {progress.stage}, step {progress.step}/{progress.steps}  "
                 f"loss {progress.total:.4f}  "
                 f"{progress.psnr:.2f} dB  {progress.gaussian_count:,} Gaussians  "
-                f"{progress.seconds:.0f} s, {progress.seconds_left:.0f} s left"
+                f"{progress.seconds:.0f} s, {progress.seconds_left:.0f} s left",
+                soft_wrap=True,
             )
 
 
@@ -351,7 +352,7 @@ def evaluate_command(
     from geosplat_jax.train import load_run
 
     record = _recorded(run)
-    dataset = _load(record["scene"], record["dataset"])
+    dataset = load_recorded(record["scene"], record["dataset"])
     if not dataset.test.names:
         raise UsageError(f"{record['scene']} has no test views to evaluate on")
     config, params, context, capacities, meta = load_run(run)
@@ -408,7 +409,7 @@ def relight_command(
 
     record = _recorded(run)
     light = EnvLight(intensity * load_light(env).radiance)
-    dataset = _load(record["scene"], record["dataset"])
+    dataset = load_recorded(record["scene"], record["dataset"])
     views = dataset.test if dataset.test.names else dataset.train
     config, params, context, capacities, _ = load_run(run)
     renderer = Renderer(config, params, context, capacities, samples=samples)
@@ -463,7 +464,7 @@ def render_command(run: Path, views: str, output: Path | None) -> None:
     from geosplat_jax.train import load_run
 
     record = _recorded(run)
-    dataset = _load(record["scene"], record["dataset"])
+    dataset = load_recorded(record["scene"], record["dataset"])
     chosen = dataset.test if views == "test" else dataset.train
     config, params, context, capacities, _ = load_run(run)
     renderer = Renderer(config, params, context, capacities)

@@ -68,8 +68,10 @@ class RateConfig:
     albedo, shine, shift, indirect : heads and tables of albedo, of roughness and metallic, of the
         shift, of indirect light.
     light, exposure : radiometry.
+    light_knee : radiance above which the light's steps grow with its brightness; 0 is never.
     half_life : steps after which all rates have halved.
     warmup : steps over which the isosurface's rates rise from zero, quadratically.
+    albedo_warmup : the same for the albedo: light is asked first to explain what it can.
     """
 
     sdf: float = 1e-2
@@ -80,9 +82,11 @@ class RateConfig:
     shift: float = 3e-3
     indirect: float = 1e-2
     light: float = 1e-2
+    light_knee: float = 0.5
     exposure: float = 5e-3
     half_life: float = 800.0
     warmup: int = 0
+    albedo_warmup: int = 0
 
     def __post_init__(self) -> None:
         """Validate every field."""
@@ -176,13 +180,20 @@ def _stage_2_rates() -> RateConfig:
     The surface moves a third as fast as there: few samples make noisy gradients.
     """
     return RateConfig(
-        sdf=1e-3, deform=1e-3, weights=1e-3, albedo=1e-2, shine=4e-3, half_life=150.0, warmup=50
+        sdf=1e-3,
+        deform=1e-3,
+        weights=1e-3,
+        albedo=1e-2,
+        shine=4e-3,
+        half_life=150.0,
+        warmup=50,
+        albedo_warmup=150,
     )
 
 
 def _stage_2_loss() -> LossConfig:
     """Weights of stage 2."""
-    return LossConfig(entropy=0.01, entropy_end=0.01, light=0.15, indirect=0.001)
+    return LossConfig(entropy=0.01, entropy_end=0.01, light=0.05, indirect=0.001)
 
 
 @dataclass(frozen=True)
@@ -199,7 +210,7 @@ class TransportConfig:
     rates, loss : as in stage 1, with Adam started afresh and schedules counted from here.
     """
 
-    steps: int = 300
+    steps: int = 200
     batch_views: int = 4
     fresh_albedo: bool = True
     shading: Transport = Transport(
@@ -356,7 +367,7 @@ _QUALITY: dict[str, dict[str, Any]] = {
         "transport": {
             "steps": 100,
             "batch_views": 2,
-            "rates": {"half_life": 60.0, "warmup": 20},
+            "rates": {"half_life": 60.0, "warmup": 20, "albedo_warmup": 75},
         },
         "model": {
             "material": {"grid": {"levels": 6, "features": 4, "log2_entries": 14, "finest": 128}},
@@ -367,7 +378,12 @@ _QUALITY: dict[str, dict[str, Any]] = {
         "geometry": {"resolution": 80},
         "run": {"steps": 1000, "batch_views": 6},
         "rates": {"half_life": 400.0},
-        "transport": {"steps": 600, "batch_views": 6, "shading": {"light": 8, "diffuse": 8}},
+        "transport": {
+            "steps": 500,
+            "batch_views": 6,
+            "shading": {"light": 8, "diffuse": 8},
+            "rates": {"half_life": 300.0, "albedo_warmup": 300},
+        },
     },
 }
 
@@ -388,7 +404,7 @@ def _original(
         geometry=GeometryConfig(resolution=96, initial="random", vertex_fraction=vertex_fraction),
         model=Model(adapter=adapter, material=material, baked_diffuse=baked_diffuse),
         run=RunConfig(batch_views=8),
-        rates=RateConfig(half_life=800.0),
+        rates=RateConfig(half_life=800.0, light_knee=0.0),
     )
 
 
@@ -400,6 +416,7 @@ def _original_transport(indirect: str, *, light: float, fresh_albedo: bool) -> T
         batch_views=8,
         fresh_albedo=fresh_albedo,
         shading=shading,
+        rates=replace(_stage_2_rates(), light_knee=0.0, albedo_warmup=0),
         loss=LossConfig(light=light, indirect=0.001),
     )
 

@@ -68,6 +68,23 @@ def parameter_group(path: tuple[Any, ...]) -> str:
     return {"light": "light", "log_exposure": "exposure"}[names[0]]
 
 
+def scale_by_brightness(knee: float) -> optax.GradientTransformation:
+    """Multiply an update by ``1 + value / knee``: absolute steps below the knee, relative above.
+
+    A sun is thousands of times brighter than its sky, and Adam's steps know nothing of that.
+    """
+
+    def update(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
+        scaled = jax.tree.map(lambda step, value: step * (1.0 + value / knee), updates, params)
+        return scaled, state
+
+    def init(params: Any) -> optax.EmptyState:
+        del params
+        return optax.EmptyState()
+
+    return optax.GradientTransformation(init, update)
+
+
 def make_optimizer(rates: RateConfig) -> optax.GradientTransformation:
     """Adam (epsilon 1e-15) with one exponentially decaying rate a parameter group."""
 
@@ -83,10 +100,12 @@ def make_optimizer(rates: RateConfig) -> optax.GradientTransformation:
 
     surface = ("sdf", "deform", "weights")
     others = ("albedo", "shine", "shift", "indirect", "light", "exposure")
+    warmup = {**dict.fromkeys(surface, rates.warmup), "albedo": rates.albedo_warmup}
     groups: dict[Any, optax.GradientTransformation] = {
-        name: group(getattr(rates, name), rates.warmup if name in surface else 0)
-        for name in surface + others
+        name: group(getattr(rates, name), warmup.get(name, 0)) for name in surface + others
     }
+    if rates.light_knee > 0:
+        groups["light"] = optax.chain(groups["light"], scale_by_brightness(rates.light_knee))
 
     def labels(params: Any) -> Any:
         return jax.tree_util.tree_map_with_path(lambda path, _: parameter_group(path), params)

@@ -25,7 +25,7 @@ from geosplat_jax.scene import EnvLight
 from geosplat_jax.stages import begin_stage_2
 
 AMPLE = Capacities(256, 256, 256, 4096, 8192, 2048, 4096)
-CONFIG = tiny_config("model.material.bias=true", *STAGE_2)
+CONFIG = tiny_config("model.material.bias=true", "transport.fresh_albedo=false", *STAGE_2)
 # As under a new light without indirect light, so that both share their programs.
 DIRECT = tiny_config(
     "model.material.bias=true",

@@ -135,15 +135,20 @@ def test_rates_of_the_surface_warm_up_and_all_rates_decay():
         *STAGE_2,
         "geometry.resolution=6",
         "transport.rates.warmup=4",
+        "transport.rates.albedo_warmup=6",
         "transport.rates.half_life=5.0",
         "transport.rates.sdf=0.01",
         "transport.rates.indirect=0.03",
         "transport.rates.albedo=0.02",
+        "transport.rates.light=0.04",
+        "transport.rates.light_knee=0.5",
     )
     rates = config.stage(2).rates
     grid = fit_grid((np.full(3, -0.6), np.full(3, 0.6)), 6)
     params = initial_params(sphere_sdf(grid, radius=0.4), grid, config, jax.random.key(0))
     params = begin_stage_2(params, config, jax.random.key(1))
+    radiance = params.light.radiance.at[0, 0].set(20.0).at[1, 1].set(0.0)
+    params = replace(params, light=replace(params.light, radiance=radiance))
     optimizer = make_optimizer(rates)
     state = optimizer.init(params)
     gradient = jax.tree.map(lambda x: jnp.full_like(x, 0.25), params)
@@ -161,7 +166,11 @@ def test_rates_of_the_surface_warm_up_and_all_rates_decay():
         head = updates.material.indirect_head[-1].weights
         np.testing.assert_allclose(head, -0.03 * decay, rtol=1e-4)
         head = updates.material.albedo_head[-1].weights
-        np.testing.assert_allclose(head, -0.02 * decay, rtol=1e-4)
+        ramp = min((step + 1) / 6, 1) ** 2
+        np.testing.assert_allclose(head, -0.02 * decay * ramp, rtol=1e-4)
+        # Twice at the knee what it is in the dark, and in proportion far above.
+        change = -0.04 * decay * (1 + params.light.radiance / 0.5)
+        np.testing.assert_allclose(updates.light.radiance, change, rtol=1e-4)
 
 
 def test_schedules_of_the_loss_are_counted_from_the_start_of_the_stage():
