@@ -71,7 +71,7 @@ class RateConfig:
     light_knee : radiance above which the light's steps grow with its brightness; 0 is never.
     half_life : steps after which all rates have halved.
     warmup : steps over which the isosurface's rates rise from zero, quadratically.
-    albedo_warmup : the same for the albedo: light is asked first to explain what it can.
+    albedo_warmup, shine_warmup : the same for materials: light is to explain first what it can.
     """
 
     sdf: float = 1e-2
@@ -87,6 +87,7 @@ class RateConfig:
     half_life: float = 800.0
     warmup: int = 0
     albedo_warmup: int = 0
+    shine_warmup: int = 0
 
     def __post_init__(self) -> None:
         """Validate every field."""
@@ -175,25 +176,28 @@ class RunConfig:
 
 
 def _stage_2_rates() -> RateConfig:
-    """Rates of REFERENCE 2.7: a slower surface, faster materials.
+    """Rates of stage 2: a slower surface, and materials that wait for the light.
 
-    The surface moves a third as fast as there: few samples make noisy gradients.
+    Materials learn faster than light, and what they have explained, shadows included, light has no
+    reason to explain again. The surface moves a third as fast as in REFERENCE 2.7: few samples make
+    noisy gradients.
     """
     return RateConfig(
         sdf=1e-3,
         deform=1e-3,
         weights=1e-3,
-        albedo=1e-2,
+        albedo=5e-3,
         shine=4e-3,
         half_life=150.0,
         warmup=50,
-        albedo_warmup=150,
+        albedo_warmup=200,
+        shine_warmup=200,
     )
 
 
 def _stage_2_loss() -> LossConfig:
     """Weights of stage 2."""
-    return LossConfig(entropy=0.01, entropy_end=0.01, light=0.05, indirect=0.001)
+    return LossConfig(entropy=0.01, entropy_end=0.01, indirect=0.001)
 
 
 @dataclass(frozen=True)
@@ -367,7 +371,14 @@ _QUALITY: dict[str, dict[str, Any]] = {
         "transport": {
             "steps": 100,
             "batch_views": 2,
-            "rates": {"half_life": 60.0, "warmup": 20, "albedo_warmup": 75},
+            "rates": {
+                "albedo": 1e-2,
+                "shine": 8e-3,
+                "half_life": 75.0,
+                "warmup": 25,
+                "albedo_warmup": 100,
+                "shine_warmup": 100,
+            },
         },
         "model": {
             "material": {"grid": {"levels": 6, "features": 4, "log2_entries": 14, "finest": 128}},
@@ -382,7 +393,7 @@ _QUALITY: dict[str, dict[str, Any]] = {
             "steps": 500,
             "batch_views": 6,
             "shading": {"light": 8, "diffuse": 8},
-            "rates": {"half_life": 300.0, "albedo_warmup": 300},
+            "rates": {"half_life": 375.0, "albedo_warmup": 500, "shine_warmup": 500},
         },
     },
 }
@@ -416,7 +427,9 @@ def _original_transport(indirect: str, *, light: float, fresh_albedo: bool) -> T
         batch_views=8,
         fresh_albedo=fresh_albedo,
         shading=shading,
-        rates=replace(_stage_2_rates(), light_knee=0.0, albedo_warmup=0),
+        rates=replace(
+            _stage_2_rates(), albedo=1e-2, light_knee=0.0, albedo_warmup=0, shine_warmup=0
+        ),
         loss=LossConfig(light=light, indirect=0.001),
     )
 

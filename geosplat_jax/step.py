@@ -100,7 +100,8 @@ def make_optimizer(rates: RateConfig) -> optax.GradientTransformation:
 
     surface = ("sdf", "deform", "weights")
     others = ("albedo", "shine", "shift", "indirect", "light", "exposure")
-    warmup = {**dict.fromkeys(surface, rates.warmup), "albedo": rates.albedo_warmup}
+    warmup = dict.fromkeys(surface, rates.warmup)
+    warmup |= {"albedo": rates.albedo_warmup, "shine": rates.shine_warmup}
     groups: dict[Any, optax.GradientTransformation] = {
         name: group(getattr(rates, name), warmup.get(name, 0)) for name in surface + others
     }
