@@ -29,7 +29,7 @@ from geosplat_jax.config import Config, config_from_dict, differences, make_conf
 from geosplat_jax.io.checkpoints import latest_checkpoint
 from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
 from geosplat_jax.protocols import PROTOCOLS
-from geosplat_jax.renderer import DEFAULT_SAMPLES
+from geosplat_jax.renderer import DEFAULT_SAMPLES, RELIGHT_KINDS
 from geosplat_jax.train import Interrupted
 
 STAGE_1 = "_stage_1"
@@ -169,7 +169,7 @@ def _read_run(values: dict[str, Any], where: str) -> Run:
     where = f"{where} {values['name']!r}"
     evaluate = values.get("evaluate", {})
     _check_keys(evaluate, _EVALUATE_KEYS, (), f"{where}, evaluate")
-    for key, choices in (("protocol", PROTOCOLS), ("relight_indirect", ("traced", "none"))):
+    for key, choices in (("protocol", PROTOCOLS), ("relight_indirect", RELIGHT_KINDS)):
         if evaluate.get(key, choices[0]) not in choices:
             raise SweepError(
                 f"{where}, evaluate: {key} must be one of {tuple(choices)}, got {evaluate[key]!r}"

@@ -28,7 +28,7 @@ from geosplat_jax.io.images import SceneError, write_png
 from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
 from geosplat_jax.protocols import PROTOCOLS
 from geosplat_jax.relight import BACKGROUNDS, RelightOptions
-from geosplat_jax.renderer import DEFAULT_SAMPLES
+from geosplat_jax.renderer import DEFAULT_SAMPLES, RELIGHT_KINDS
 
 _console = Console(stderr=True, highlight=False)
 
@@ -86,9 +86,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     evaluate.add_argument(
         "--relight-indirect",
-        choices=("traced", "none"),
+        choices=RELIGHT_KINDS,
         default="traced",
-        help="light between surfaces under new lights (default: %(default)s)",
+        help="light from blocked directions under new lights (default: %(default)s)",
     )
 
     render = commands.add_parser("render", help="render a run's test or training views")
@@ -141,7 +141,7 @@ def _add_relight(relight: argparse.ArgumentParser) -> None:
     relight.add_argument(
         "--samples", type=int, default=DEFAULT_SAMPLES, help="rays a splat (default: %(default)s)"
     )
-    relight.add_argument("--indirect", choices=("traced", "none"), default="traced")
+    relight.add_argument("--indirect", choices=RELIGHT_KINDS, default="traced")
 
 
 def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:

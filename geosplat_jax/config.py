@@ -208,8 +208,8 @@ class TransportConfig:
     ----------
     steps : optimiser steps after those of stage 1; 0 leaves the stage out.
     batch_views : full views a step.
-    fresh_albedo : start with a new albedo field; the preset `code` must, since its stage 1 stores
-        radiance there.
+    fresh_albedo : start with a new albedo field of one colour, the mean of stage 1; the preset
+        `code` starts grey, since its stage 1 stores radiance there.
     shading : see `Transport`.
     rates, loss : as in stage 1, with Adam started afresh and schedules counted from here.
     """

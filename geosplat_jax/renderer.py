@@ -44,6 +44,9 @@ _SPECULAR_PASSES = 4
 RELIGHT_BOUNCES = 2
 """How often light goes from surface to surface under a new light."""
 
+RELIGHT_KINDS = ("traced", "none", "unshadowed")
+"""How blocked directions look under a new light: see `relight_transport`."""
+
 _reconstruct = partial(jax.jit, static_argnames=("model", "capacities", "sampling"))(reconstruct)
 _illuminate = partial(jax.jit, static_argnames=("model",))(illuminate_asset)
 _render_lit = partial(jax.jit, static_argnames=("model", "capacities", "aov_names"))(render_lit)
@@ -81,9 +84,18 @@ def build_asset(config: Config, params: Params, context: Context, capacities: Ca
 def relight_transport(indirect: str = "traced") -> Transport:
     """Return the light transport under a light that was never trained on.
 
-    What was learned of indirect light does not hold there, so it is traced, or left out.
+    What was learned of indirect light does not hold there: blocked directions bring traced light or
+    none. Unshadowed, only a splat's own face blocks, as for those who do not trace rays.
     """
-    return Transport(method="monte_carlo", indirect=indirect, bounces=RELIGHT_BOUNCES)
+    if indirect not in RELIGHT_KINDS:
+        raise ValueError(f"indirect must be one of {RELIGHT_KINDS}, got {indirect!r}")
+    is_shadowed = indirect != "unshadowed"
+    return Transport(
+        method="monte_carlo",
+        occlusion=is_shadowed,
+        indirect=indirect if is_shadowed else "none",
+        bounces=RELIGHT_BOUNCES,
+    )
 
 
 class Renderer:
@@ -149,7 +161,7 @@ class Renderer:
         ----------
         light : in the layout of `EnvLight`, of any size.
         albedo_scale : (3,) factors of the albedo, which photographs leave open.
-        indirect : ``"traced"`` or ``"none"``.
+        indirect : one of `RELIGHT_KINDS`.
         """
         other = Renderer(self._config, self._params, self._context, self._capacities)
         other._key, other._passes = self._key, self._passes

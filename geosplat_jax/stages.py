@@ -1,23 +1,38 @@
 """What every stage of a run starts from, and the views of its steps."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from geosplat_jax.config import Config
 from geosplat_jax.geometry import initial_geometry, random_sdf, sphere_sdf
+from geosplat_jax.grids import grid_vertices
+from geosplat_jax.hashgrid import Layer
 from geosplat_jax.hull import hull_sdf
 from geosplat_jax.io.views import Views
 from geosplat_jax.light import init_light, prefilter_operators
-from geosplat_jax.materials import MaterialField, init_indirect_head, init_materials
+from geosplat_jax.materials import (
+    MaterialField,
+    MaterialSpec,
+    init_indirect_head,
+    init_materials,
+    materials_at,
+)
 from geosplat_jax.model import Context, Model, Params
-from geosplat_jax.scene import Batch, Grid
+from geosplat_jax.render import grid_center_and_extent
+from geosplat_jax.scene import Batch, Geometry, Grid
 from geosplat_jax.shading import fg_table
 
 _SDF_REACH = 2.0
 """The first SDF is clipped to so many cells, so that the surface can be moved in few steps."""
+
+_GREY = 0.5
+_DARKEST = 0.02
+"""A first albedo lies between this and its complement, where the sigmoid still has a slope."""
 
 
 def make_context(grid: Grid, model: Model) -> Context:
@@ -54,23 +69,65 @@ def initial_params(sdf: jax.Array, grid: Grid, config: Config, key: jax.Array) -
     )
 
 
-def begin_stage_2(params: Params, config: Config, key: jax.Array) -> Params:
+def _beside_surface(geometry: Geometry, grid: Grid) -> jax.Array:
+    """Mark the grid vertices with a neighbour on the other side of the surface, (vertices,)."""
+    vx, vy, vz = grid.vertex_shape
+    is_inside = (geometry.sdf < 0).reshape(vz, vy, vx)
+    beside = jnp.zeros_like(is_inside)
+    for axis in range(3):
+        crossed = jnp.diff(is_inside, axis=axis)
+        before = [(0, 0)] * 3
+        after = [(0, 0)] * 3
+        before[axis], after[axis] = (1, 0), (0, 1)
+        beside = beside | jnp.pad(crossed, before) | jnp.pad(crossed, after)
+    return beside.reshape(-1)
+
+
+@partial(jax.jit, static_argnames=("spec",))
+def mean_albedo(params: Params, grid: Grid, *, spec: MaterialSpec) -> Float[Array, " 3"]:
+    """Average the albedo field over the grid vertices beside the surface.
+
+    Grey where there is no surface. Not meant to be differentiated.
+    """
+    center, half_extent = grid_center_and_extent(grid)
+    found = materials_at(
+        params.material, grid_vertices(grid), spec=spec, center=center, half_extent=half_extent
+    )
+    share = _beside_surface(params.geometry, grid).astype(found.albedo.dtype)
+    total = jnp.sum(found.albedo * share[:, None], axis=0)
+    count = jnp.sum(share)
+    return jnp.where(count > 0, total / jnp.maximum(count, 1.0), _GREY)
+
+
+def _one_colour(head: tuple[Layer, ...], albedo: Float[Array, " 3"]) -> tuple[Layer, ...]:
+    """Return the albedo head with a last layer that gives one colour everywhere."""
+    *hidden, last = head
+    albedo = jnp.clip(albedo, _DARKEST, 1.0 - _DARKEST)
+    logits = jnp.log(albedo) - jnp.log1p(-albedo)
+    return (*hidden, Layer(jnp.zeros_like(last.weights), logits))
+
+
+def begin_stage_2(params: Params, grid: Grid, config: Config, key: jax.Array) -> Params:
     """Turn the parameters that stage 1 ends with into those that stage 2 starts with.
 
-    Surface, light and exposure stay. The albedo field stays or is drawn afresh, as
-    ``config.transport`` says; where one encoding feeds all heads, only its head is. Indirect light
-    gets a head of its own.
+    Surface, light and exposure stay. The albedo field stays, or starts afresh as its own mean, so
+    that no shadow is left in it and light keeps its colour and brightness; as grey where stage 1
+    stored radiance. Where one encoding feeds all heads, only the albedo's head is drawn anew.
+    Indirect light gets a head of its own.
 
     Parameters
     ----------
-    config : settings of the whole run. key : of what is drawn.
+    grid : of the surface. config : settings of the whole run. key : of what is drawn.
     """
     spec = config.stage(2).model.material
     albedo_key, indirect_key = jax.random.split(key)
     field: MaterialField = params.material
     if config.transport.fresh_albedo:
+        mean = jnp.full((3,), _GREY)
+        if not config.model.baked_diffuse:
+            mean = mean_albedo(params, grid, spec=config.model.material)
         fresh = init_materials(albedo_key, spec)
-        field = replace(field, albedo_head=fresh.albedo_head)
+        field = replace(field, albedo_head=_one_colour(fresh.albedo_head, mean))
         if not spec.shared:
             field = replace(field, albedo_table=fresh.albedo_table)
     field = replace(field, indirect_head=init_indirect_head(indirect_key, spec))

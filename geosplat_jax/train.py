@@ -215,7 +215,7 @@ class _Loop:
         self.stage = 2
         self.config = self.run_config.stage(2)
         key = jax.random.fold_in(jax.random.key(self.config.run.seed), _STAGE_2_STREAM)
-        params = begin_stage_2(self.state.params, self.run_config, key)
+        params = begin_stage_2(self.state.params, self.context.grid, self.run_config, key)
         fresh = initial_state(params, self.config.rates)
         self.state = replace(fresh, step=self.state.step)
         self.capacities = None
@@ -353,7 +353,7 @@ def _template(config: Config, grid_shape: tuple[int, int, int], stage: int) -> d
         key = jax.random.key(config.run.seed)
         params = initial_params(jnp.zeros(grid.vertex_count), grid, config, key)
         if stage == 2:
-            params = begin_stage_2(params, config, key)
+            params = begin_stage_2(params, grid, config, key)
         return {"state": initial_state(params, config.stage(stage).rates), "grid": grid}
 
     return jax.eval_shape(build)

@@ -43,7 +43,7 @@ LIGHTS = {name: sky(seed) for seed, name in enumerate(LIGHT_NAMES)}
 def run():
     """Settings, parameters, context of a ball in stage 2 whose materials vary in space."""
     params, context = ball_of_one_material(CONFIG, albedo=0.6, roughness=0.5, metallic=0.3)
-    params = begin_stage_2(replace(params, light=sky(7)), CONFIG, jax.random.key(1))
+    params = begin_stage_2(replace(params, light=sky(7)), context.grid, CONFIG, jax.random.key(1))
     rng = np.random.default_rng(0)
     table = params.material.albedo_table
     field = replace(

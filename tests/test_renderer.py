@@ -52,7 +52,7 @@ def matt():
 @pytest.fixture(scope="module")
 def in_stage_2(matt):
     """Settings and parameters of stage 2, with bright indirect light."""
-    params = begin_stage_2(matt[0], CONFIG, jax.random.key(1))
+    params = begin_stage_2(matt[0], matt[1].grid, CONFIG, jax.random.key(1))
     *first, last = params.material.indirect_head
     head = (*first, replace(last, bias=jnp.full_like(last.bias, 4.0)))
     return CONFIG.stage(2), replace(params, material=replace(params.material, indirect_head=head))
@@ -211,6 +211,9 @@ def test_light_for_relighting_is_traced_and_learns_nothing():
     assert transport.indirect == "traced"
     assert transport.bounces == RELIGHT_BOUNCES
     assert relight_transport("none").indirect == "none"
+    assert not relight_transport("unshadowed").is_traced
+    with pytest.raises(ValueError, match="indirect must be one of .*, got 'constant'"):
+        relight_transport("constant")
 
 
 def test_the_mesh_is_trimmed_and_lies_on_the_ball(relit):

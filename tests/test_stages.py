@@ -17,8 +17,11 @@ from support import (
 from geosplat_jax.capacity import Capacities
 from geosplat_jax.config import config_from_dict, differences, make_config
 from geosplat_jax.geometry import sphere_sdf
+from geosplat_jax.grids import grid_vertices
 from geosplat_jax.hull import fit_grid
+from geosplat_jax.materials import materials_at
 from geosplat_jax.render import (
+    grid_center_and_extent,
     reconstruct,
     render,
 )
@@ -100,7 +103,7 @@ def test_stage_2_keeps_or_redraws_the_albedo_as_asked(shared, fresh):
     )
     grid = fit_grid((np.full(3, -0.6), np.full(3, 0.6)), 6)
     params = initial_params(sphere_sdf(grid, radius=0.4), grid, config, jax.random.key(0))
-    begun = begin_stage_2(params, config, jax.random.key(1))
+    begun = begin_stage_2(params, grid, config, jax.random.key(1))
 
     def same(a, b):
         pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
@@ -119,14 +122,62 @@ def test_stage_2_keeps_or_redraws_the_albedo_as_asked(shared, fresh):
     )
     assert before.indirect_head is None
     assert after.indirect_head[-1].weights.shape[1] == 6
-    assert same(begin_stage_2(params, config, jax.random.key(1)), begun)
+    assert same(begin_stage_2(params, grid, config, jax.random.key(1)), begun)
+
+
+def _small_ball(*overrides, radius=0.4):
+    """Settings, grid and parameters whose albedo varies in space."""
+    config = tiny_config(*STAGE_2, "geometry.resolution=12", *overrides)
+    grid = fit_grid((np.full(3, -0.6), np.full(3, 0.6)), 12)
+    params = initial_params(sphere_sdf(grid, radius=radius), grid, config, jax.random.key(0))
+    table = params.material.albedo_table
+    noise = jnp.asarray(np.random.default_rng(3).normal(size=table.shape), jnp.float32)
+    material = replace(params.material, albedo_table=noise)
+    return config, grid, replace(params, material=material)
+
+
+def _albedo(params, points, config, grid):
+    center, half_extent = grid_center_and_extent(grid)
+    look = partial(jax.jit, static_argnames=("spec",))(materials_at)
+    found = look(
+        params.material,
+        jnp.asarray(points, jnp.float32),
+        spec=config.model.material,
+        center=center,
+        half_extent=half_extent,
+    )
+    return np.asarray(found.albedo)
+
+
+def test_a_fresh_albedo_is_the_mean_of_stage_1_around_the_surface():
+    config, grid, params = _small_ball()
+    begun = begin_stage_2(params, grid, config, jax.random.key(1))
+    points = np.asarray(grid_vertices(grid))
+    inside = np.asarray(params.geometry.sdf) < 0
+    near = np.linalg.norm(points[:, None] - points[None], axis=-1) < 1.01 * float(grid.cell_size)
+    beside = np.any(near & (inside[:, None] != inside[None]), axis=1)
+    assert 20 < beside.sum() < len(points) - 20
+    before = _albedo(params, points, config, grid)
+    assert np.std(before[beside], axis=0).min() > 0.01
+    after = _albedo(begun, np.random.default_rng(0).uniform(-0.6, 0.6, (50, 3)), config, grid)
+    np.testing.assert_allclose(after, np.tile(before[beside].mean(axis=0), (50, 1)), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("override", "radius"), [("model.baked_diffuse=true", 0.4), ("run.seed=0", -1.0)]
+)
+def test_a_fresh_albedo_is_grey_where_stage_1_has_none(override, radius):
+    """Radiance is no albedo, and there is no mean over an empty surface."""
+    config, grid, params = _small_ball(override, radius=radius)
+    begun = begin_stage_2(params, grid, config, jax.random.key(1))
+    np.testing.assert_allclose(_albedo(begun, np.zeros((4, 3)), config, grid), 0.5, rtol=1e-6)
 
 
 def test_traced_indirect_light_learns_nothing():
     config = tiny_config(*STAGE_2, "geometry.resolution=6", "transport.shading.indirect=traced")
     grid = fit_grid((np.full(3, -0.6), np.full(3, 0.6)), 6)
     params = initial_params(sphere_sdf(grid, radius=0.4), grid, config, jax.random.key(0))
-    assert begin_stage_2(params, config, jax.random.key(1)).material.indirect_head is None
+    assert begin_stage_2(params, grid, config, jax.random.key(1)).material.indirect_head is None
 
 
 def test_rates_of_the_surface_warm_up_and_all_rates_decay():
@@ -146,7 +197,7 @@ def test_rates_of_the_surface_warm_up_and_all_rates_decay():
     rates = config.stage(2).rates
     grid = fit_grid((np.full(3, -0.6), np.full(3, 0.6)), 6)
     params = initial_params(sphere_sdf(grid, radius=0.4), grid, config, jax.random.key(0))
-    params = begin_stage_2(params, config, jax.random.key(1))
+    params = begin_stage_2(params, grid, config, jax.random.key(1))
     radiance = params.light.radiance.at[0, 0].set(20.0).at[1, 1].set(0.0)
     params = replace(params, light=replace(params.light, radiance=radiance))
     optimizer = make_optimizer(rates)

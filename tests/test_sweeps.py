@@ -374,7 +374,8 @@ def test_the_bundled_sweeps_are_sound():
     for x, shading in points.items():
         assert (shading.light + shading.diffuse, 2 * shading.specular) == (x, x)
     assert configs["no-occlusion"].transport.shading.is_traced is False
-    assert configs["no-light-regulariser"].stage(2).objective.with_light is False
+    assert configs["full"].stage(2).objective.with_light is False
+    assert configs["light-regulariser"].stage(2).objective.with_light is True
     assert configs["denoiser"].transport.shading.is_denoised is True
     assert runner.read_sweep(SWEEPS / "smoke.toml").scenes == ("duck",)
 

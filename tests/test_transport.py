@@ -214,7 +214,7 @@ def test_without_occlusion_it_is_the_estimator_without_a_surface(ball):
     material = replace(
         params.material,
         indirect_head=begin_stage_2(
-            params, tiny_config(*BIASED, *STAGE_2), jax.random.key(0)
+            params, context.grid, tiny_config(*BIASED, *STAGE_2), jax.random.key(0)
         ).material.indirect_head,
     )
     asset = build(

@@ -62,7 +62,7 @@ def problem(*overrides):
     sdf = np.asarray(sphere_sdf(grid, radius=0.4)) + rng.uniform(-0.15, 0.15, grid.vertex_count)
     sdf = np.where(np.abs(sdf) < 0.03, np.copysign(0.03, sdf), sdf)
     params = initial_params(jnp.asarray(sdf, jnp.float32), grid, run_config, jax.random.key(0))
-    params = begin_stage_2(params, run_config, jax.random.key(1))
+    params = begin_stage_2(params, grid, run_config, jax.random.key(1))
 
     def varied(leaf):
         return leaf + jnp.asarray(rng.uniform(-0.5, 0.5, leaf.shape), leaf.dtype)
