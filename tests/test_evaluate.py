@@ -22,6 +22,7 @@ AMPLE = Capacities(256, 256, 256, 4096, 8192, 2048, 4096)
 CONFIG = tiny_config(
     "model.material.bias=true",
     *STAGE_2,
+    "transport.fresh_albedo=false",
     "transport.shading.indirect=traced",
     f"transport.shading.bounces={RELIGHT_BOUNCES}",
 )
