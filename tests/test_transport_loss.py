@@ -40,6 +40,7 @@ SMALL = (
     "geometry.resolution=8",
     "model.material.shared=false",
     "objective.smoothness_samples=16",
+    "transport.loss.light=0.15",
 )
 TIGHT = Capacities(512, 512, 512, 6144, 8192, 2048, 4096)
 evaluate = partial(jax.jit, static_argnames=("model", "objective", "capacities"))(
