@@ -239,7 +239,7 @@ def test_schedules_of_the_loss_are_counted_from_the_start_of_the_stage():
     assert (schedule.at(0.3).light, schedule.at(0.3).indirect) == (0.15, 0.001)
 
 
-RUN = (*STAGE_2, "run.steps=3")
+RUN = (*STAGE_2, "run.steps=3", "transport.loss.light=0.15")
 
 
 def lines_of(folder):
