@@ -90,8 +90,13 @@ def mean_albedo(params: Params, grid: Grid, *, spec: MaterialSpec) -> Float[Arra
     Grey where there is no surface. Not meant to be differentiated.
     """
     center, half_extent = grid_center_and_extent(grid)
+    dtype = params.material.albedo_table.dtype
     found = materials_at(
-        params.material, grid_vertices(grid), spec=spec, center=center, half_extent=half_extent
+        params.material,
+        grid_vertices(grid).astype(dtype),
+        spec=spec,
+        center=center.astype(dtype),
+        half_extent=half_extent.astype(dtype),
     )
     share = _beside_surface(params.geometry, grid).astype(found.albedo.dtype)
     total = jnp.sum(found.albedo * share[:, None], axis=0)
@@ -102,7 +107,7 @@ def mean_albedo(params: Params, grid: Grid, *, spec: MaterialSpec) -> Float[Arra
 def _one_colour(head: tuple[Layer, ...], albedo: Float[Array, " 3"]) -> tuple[Layer, ...]:
     """Return the albedo head with a last layer that gives one colour everywhere."""
     *hidden, last = head
-    albedo = jnp.clip(albedo, _DARKEST, 1.0 - _DARKEST)
+    albedo = jnp.clip(albedo.astype(last.weights.dtype), _DARKEST, 1.0 - _DARKEST)
     logits = jnp.log(albedo) - jnp.log1p(-albedo)
     return (*hidden, Layer(jnp.zeros_like(last.weights), logits))
 
