@@ -1,8 +1,8 @@
 """Measure what every shortcut of stage 2 costs: bias and noise of images and gradients, and time.
 
 ``python experiments/shortcuts.py RUN --output shortcuts.json`` takes a trained run and evaluates
-the loss and its gradient on one batch of training views with many seeds, for every shortcut in
-`SHORTCUTS`, against a reference without any.
+the loss and its gradient on one batch of training views with many seeds, for every setting of
+`shortcuts`, against a reference without any.
 """
 
 import argparse
@@ -23,10 +23,10 @@ from jax.flatten_util import ravel_pytree
 
 from geosplat_jax import capacity
 from geosplat_jax.capacity import Capacities
-from geosplat_jax.cli import load_recorded
 from geosplat_jax.color import tone_map
 from geosplat_jax.denoise import DenoiseSpec
-from geosplat_jax.losses import photometric_terms
+from geosplat_jax.io.dataset import load_recorded
+from geosplat_jax.losses import LossWeights, photometric_terms
 from geosplat_jax.model import Context, Model, Params
 from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
 from geosplat_jax.render import reconstruct, render_views
@@ -36,6 +36,8 @@ from geosplat_jax.train import load_run
 
 REFERENCE_SAMPLES = 24
 """Samples of each kind in a pass of the reference."""
+
+_WEIGHTS = LossWeights()
 
 
 def _shading(model: Model, **changes: Any) -> Model:
@@ -112,8 +114,8 @@ def _evaluate(
         output = render_views(asset, params.light, camera, context, key=key, **build)
         rgb = tone_map(output.rgb, params.log_exposure)
         terms, _ = photometric_terms(rgb, output.alpha, image, jnp.zeros_like(rgb), srgb=False)
-        total = 0.8 * terms["l1"] + 0.2 * terms["ssim"] + 5.0 * terms["mask"]
-        return total, (rgb, output.usage)
+        total = sum(getattr(_WEIGHTS, name) * value for name, value in terms.items())
+        return jnp.asarray(total), (rgb, output.usage)
 
     (_, (rgb, usage)), gradient = jax.value_and_grad(objective, has_aux=True)(params)
     return rgb, gradient, usage
@@ -165,7 +167,7 @@ def measure(scene: Scene, model: Model, seeds: range, reference: tuple[Any, Any]
     result: dict[str, Any] = {
         "one step, dB": _decibels(float(np.mean((pixels - truth[solid]) ** 2))),
         "bias, dB": _decibels(bias),
-        "s a gradient": statistics.median(seconds),
+        "seconds": statistics.median(seconds),
     }
     for group in true_gradient:
         rows = np.stack([gradient[group] for gradient in gradients])

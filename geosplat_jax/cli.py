@@ -23,7 +23,7 @@ from geosplat_jax.gradcheck.report import (
     table,
     to_records,
 )
-from geosplat_jax.io.dataset import Dataset, describe, load_dataset
+from geosplat_jax.io.dataset import Dataset, describe, load_recorded
 from geosplat_jax.io.images import SceneError, write_png
 from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
 from geosplat_jax.protocols import PROTOCOLS
@@ -165,17 +165,6 @@ def _scene_options(arguments: argparse.Namespace) -> dict[str, Any]:
         "light": arguments.light,
         "bounds": arguments.bounds,
     }
-
-
-def load_recorded(scene: str | Path, options: dict[str, Any]) -> Dataset:
-    """Load a dataset from recorded options."""
-    bounds = options.get("bounds")
-    return load_dataset(
-        Path(scene),
-        downscale=options.get("downscale", 1),
-        light=options.get("light"),
-        bounds=None if bounds is None else (tuple(bounds[:3]), tuple(bounds[3:])),
-    )
 
 
 def _info(arguments: argparse.Namespace) -> None:

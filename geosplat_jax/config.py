@@ -419,17 +419,17 @@ def _original(
     )
 
 
-def _original_transport(indirect: str, *, light: float, fresh_albedo: bool) -> TransportConfig:
+def _original_transport(indirect: str, *, light: float) -> TransportConfig:
     """Return what the paper and the authors share in stage 2: 64 samples of either kind."""
     shading = Transport(method="monte_carlo", light=64, diffuse=32, specular=32, indirect=indirect)
+    rates = RateConfig(
+        sdf=3e-3, deform=3e-3, weights=3e-3, warmup=50, albedo=1e-2, shine=2e-3, light_knee=0.0
+    )
     return TransportConfig(
         steps=500,
         batch_views=8,
-        fresh_albedo=fresh_albedo,
         shading=shading,
-        rates=replace(
-            _stage_2_rates(), albedo=1e-2, light_knee=0.0, albedo_warmup=0, shine_warmup=0
-        ),
+        rates=rates,
         loss=LossConfig(light=light, indirect=0.001),
     )
 
@@ -446,7 +446,7 @@ def _preset(name: str) -> Config:
             baked_diffuse=False,
         )
         objective = Objective(entropy_reduction="sum")
-        transport = _original_transport("harmonics", light=0.15, fresh_albedo=True)
+        transport = _original_transport("harmonics", light=0.15)
         return replace(paper, loss=LossConfig(l1=1.0), objective=objective, transport=transport)
     if name == "code":
         code = _original(
@@ -457,7 +457,7 @@ def _preset(name: str) -> Config:
             has_shift=True,
             baked_diffuse=True,
         )
-        transport = _original_transport("constant", light=0.0, fresh_albedo=True)
+        transport = _original_transport("constant", light=0.0)
         first = LossConfig(entropy_end=0.12, entropy_end_fraction=1.0)
         return replace(code, loss=first, transport=transport)
     return Config(preset="default", model=Model(material=MaterialSpec(shared=True)))

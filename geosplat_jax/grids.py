@@ -5,7 +5,7 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from geosplat_jax._flexicubes_tables import CORNERS
 from geosplat_jax.numerics import absolute, safe_norm
@@ -89,6 +89,19 @@ def resample(geometry: Geometry, grid: Grid, new_grid: Grid) -> Geometry:
     return initial_geometry(new_grid, sdf * (grid.cell_size / new_grid.cell_size))
 
 
+def crossed_edges(sdf: Float[Array, " G"], grid: Grid) -> Int[Array, " G"]:
+    """Count the grid edges at every vertex whose ends differ in sign; zero counts as outside."""
+    nx, ny, nz = grid.shape
+    inside = sdf.reshape(nz + 1, ny + 1, nx + 1) < 0
+    crossings = jnp.zeros(inside.shape, jnp.int32)
+    for axis in range(3):
+        changes = jnp.diff(inside, axis=axis).astype(jnp.int32)
+        before = [(1, 0) if i == axis else (0, 0) for i in range(3)]
+        after = [(0, 1) if i == axis else (0, 0) for i in range(3)]
+        crossings = crossings + jnp.pad(changes, before) + jnp.pad(changes, after)
+    return crossings.reshape(-1)
+
+
 def sdf_entropy(
     geometry: Geometry, grid: Grid, *, reduction: Literal["mean", "sum"] = "mean"
 ) -> Float[Array, ""]:
@@ -97,24 +110,14 @@ def sdf_entropy(
     ``BCE(sigmoid(a), sign(b)) + BCE(sigmoid(b), sign(a))`` summed, or averaged over those edges.
     Zero counts as outside. An SDF of one sign gives 0 with zero gradient.
     """
-    nx, ny, nz = grid.shape
-    sdf = geometry.sdf.reshape(nz + 1, ny + 1, nx + 1)
-    inside = sdf < 0
-    crossings = jnp.zeros(sdf.shape, jnp.int32)
-    edge_count = jnp.zeros((), jnp.int32)
-    for axis in range(3):
-        changes = jnp.diff(inside, axis=axis).astype(jnp.int32)
-        before = [(1, 0) if i == axis else (0, 0) for i in range(3)]
-        after = [(0, 1) if i == axis else (0, 0) for i in range(3)]
-        crossings = crossings + jnp.pad(changes, before) + jnp.pad(changes, after)
-        edge_count = edge_count + jnp.sum(changes, dtype=jnp.int32)
     # Ends of opposite sign: BCE(sigmoid(a), sign(b)) = softplus(|a|), so that the sum over edges
     # is one over vertices, each weighted with the number of its crossed edges.
-    size = jnp.where(inside, -sdf, sdf)
-    total = jnp.sum(crossings.astype(sdf.dtype) * jax.nn.softplus(size))
+    crossings = crossed_edges(geometry.sdf, grid)
+    size = jnp.where(geometry.sdf < 0, -geometry.sdf, geometry.sdf)
+    total = jnp.sum(crossings.astype(size.dtype) * jax.nn.softplus(size))
     if reduction == "sum":
         return total
-    return total / jnp.maximum(edge_count, 1).astype(sdf.dtype)
+    return total / jnp.maximum(jnp.sum(crossings, dtype=jnp.int32) // 2, 1).astype(size.dtype)
 
 
 def weight_magnitude(geometry: Geometry) -> Float[Array, ""]:

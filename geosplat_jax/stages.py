@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from geosplat_jax.config import Config
 from geosplat_jax.geometry import initial_geometry, random_sdf, sphere_sdf
-from geosplat_jax.grids import grid_vertices
+from geosplat_jax.grids import crossed_edges, grid_vertices
 from geosplat_jax.hashgrid import Layer
 from geosplat_jax.hull import hull_sdf
 from geosplat_jax.io.views import Views
@@ -24,7 +24,7 @@ from geosplat_jax.materials import (
 )
 from geosplat_jax.model import Context, Model, Params
 from geosplat_jax.render import grid_center_and_extent
-from geosplat_jax.scene import Batch, Geometry, Grid
+from geosplat_jax.scene import Batch, Grid
 from geosplat_jax.shading import fg_table
 
 _SDF_REACH = 2.0
@@ -69,20 +69,6 @@ def initial_params(sdf: jax.Array, grid: Grid, config: Config, key: jax.Array) -
     )
 
 
-def _beside_surface(geometry: Geometry, grid: Grid) -> jax.Array:
-    """Mark the grid vertices with a neighbour on the other side of the surface, (vertices,)."""
-    vx, vy, vz = grid.vertex_shape
-    is_inside = (geometry.sdf < 0).reshape(vz, vy, vx)
-    beside = jnp.zeros_like(is_inside)
-    for axis in range(3):
-        crossed = jnp.diff(is_inside, axis=axis)
-        before = [(0, 0)] * 3
-        after = [(0, 0)] * 3
-        before[axis], after[axis] = (1, 0), (0, 1)
-        beside = beside | jnp.pad(crossed, before) | jnp.pad(crossed, after)
-    return beside.reshape(-1)
-
-
 @partial(jax.jit, static_argnames=("spec",))
 def mean_albedo(params: Params, grid: Grid, *, spec: MaterialSpec) -> Float[Array, " 3"]:
     """Average the albedo field over the grid vertices beside the surface.
@@ -98,7 +84,7 @@ def mean_albedo(params: Params, grid: Grid, *, spec: MaterialSpec) -> Float[Arra
         center=center.astype(dtype),
         half_extent=half_extent.astype(dtype),
     )
-    share = _beside_surface(params.geometry, grid).astype(found.albedo.dtype)
+    share = (crossed_edges(params.geometry.sdf, grid) > 0).astype(dtype)
     total = jnp.sum(found.albedo * share[:, None], axis=0)
     count = jnp.sum(share)
     return jnp.where(count > 0, total / jnp.maximum(count, 1.0), _GREY)

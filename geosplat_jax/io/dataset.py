@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -130,6 +130,21 @@ def load_dataset(
         background=listing.background,
         bounds=box,
         warnings=tuple(warnings),
+    )
+
+
+def load_recorded(path: str | Path, options: Mapping[str, Any]) -> Dataset:
+    """Load a scene folder as a run read it, by the options in its record.
+
+    ``options`` may have ``downscale``, ``light`` and ``bounds`` (six numbers, lo then hi); see
+    `load_dataset`.
+    """
+    bounds = options.get("bounds")
+    return load_dataset(
+        path,
+        downscale=options.get("downscale", 1),
+        light=options.get("light"),
+        bounds=None if bounds is None else (bounds[:3], bounds[3:]),
     )
 
 
