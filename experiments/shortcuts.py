@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
@@ -26,18 +25,19 @@ from geosplat_jax.capacity import Capacities
 from geosplat_jax.color import tone_map
 from geosplat_jax.denoise import DenoiseSpec
 from geosplat_jax.io.dataset import load_recorded
-from geosplat_jax.losses import LossWeights, photometric_terms
+from geosplat_jax.losses import LossWeights, Objective, loss
 from geosplat_jax.model import Context, Model, Params
 from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
 from geosplat_jax.render import reconstruct, render_views
-from geosplat_jax.scene import Camera
+from geosplat_jax.scene import Batch, Camera
 from geosplat_jax.stages import make_batch
 from geosplat_jax.train import load_run
 
 REFERENCE_SAMPLES = 24
 """Samples of each kind in a pass of the reference."""
 
-_WEIGHTS = LossWeights()
+PHOTOMETRIC = LossWeights(entropy=0.0, deviation=0.0, weights=0.0, smoothness=0.0)
+"""Eq. 13 alone: the other terms have no samples of light."""
 
 
 def _shading(model: Model, **changes: Any) -> Model:
@@ -45,13 +45,14 @@ def _shading(model: Model, **changes: Any) -> Model:
 
 
 def _samples(model: Model, count: int) -> Model:
-    return _shading(model, light=count, diffuse=count, specular=count)
+    return _shading(model, light=count, diffuse=count, specular=count, residual=count)
 
 
 def shortcuts(model: Model) -> dict[str, Model]:
-    """Every setting by what a table calls it, the defaults first."""
+    """Return every setting by what a table calls it, the defaults first."""
     models = {
         "defaults": model,
+        "residual from the same samples": _shading(model, residual=0),
         "own samples in every view": _shading(model, shares_views=False),
         "no back-face culling": replace(model, cull_backfaces=False),
         "1 sample of each kind": _samples(model, 1),
@@ -107,18 +108,21 @@ def _evaluate(
     capacities: Capacities,
 ) -> tuple[jax.Array, Params, capacity.Usage]:
     """Return tone-mapped images, gradient of Eq. 13 over black, and what the buffers need."""
-
-    def objective(params: Params) -> tuple[jax.Array, tuple[jax.Array, capacity.Usage]]:
-        build = {"model": model, "capacities": capacities}
-        asset = reconstruct(params, context, sampling="face", **build)
-        output = render_views(asset, params.light, camera, context, key=key, **build)
-        rgb = tone_map(output.rgb, params.log_exposure)
-        terms, _ = photometric_terms(rgb, output.alpha, image, jnp.zeros_like(rgb), srgb=False)
-        total = sum(getattr(_WEIGHTS, name) * value for name, value in terms.items())
-        return jnp.asarray(total), (rgb, output.usage)
-
-    (_, (rgb, usage)), gradient = jax.value_and_grad(objective, has_aux=True)(params)
-    return rgb, gradient, usage
+    asset = reconstruct(params, context, sampling="face", model=model, capacities=capacities)
+    output = render_views(
+        asset, params.light, camera, context, key=key, model=model, capacities=capacities
+    )
+    rgb = tone_map(output.rgb, params.log_exposure)
+    gradient, report = jax.grad(loss, has_aux=True)(
+        params,
+        Batch(camera, image, jax.random.fold_in(key, 1)),
+        context,
+        PHOTOMETRIC,
+        model=model,
+        objective=Objective(background="black"),
+        capacities=capacities,
+    )
+    return rgb, gradient, report.usage
 
 
 def evaluations(scene: Scene, model: Model, seeds: range) -> Iterator[tuple[Any, Any, float]]:

@@ -218,7 +218,7 @@ class TransportConfig:
     batch_views: int = 4
     fresh_albedo: bool = True
     shading: Transport = Transport(
-        method="monte_carlo", light=2, diffuse=2, specular=2, indirect="constant"
+        method="monte_carlo", light=2, diffuse=2, specular=2, residual=2, indirect="constant"
     )
     rates: RateConfig = field(default_factory=_stage_2_rates)
     loss: LossConfig = field(default_factory=_stage_2_loss)
@@ -392,7 +392,7 @@ _QUALITY: dict[str, dict[str, Any]] = {
         "transport": {
             "steps": 500,
             "batch_views": 6,
-            "shading": {"light": 8, "diffuse": 8},
+            "shading": {"light": 8, "diffuse": 8, "residual": 4},
             "rates": {"half_life": 375.0, "albedo_warmup": 500, "shine_warmup": 500},
         },
     },

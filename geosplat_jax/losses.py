@@ -4,7 +4,7 @@ Differentiable in ``params`` only. Not differentiable by contract: visibility an
 topology of the isosurface, the random background, the noise of the smoothness term.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,8 @@ from geosplat_jax.ssim import ssim
 
 _DECIBEL = 10.0 / 2.302585092994046
 _LIGHT_STREAM = 3
-"""Number of the random stream of the light samples; 0 to 2 are those of the loss itself."""
+_RESIDUAL_STREAM = 4
+"""Numbers of the random streams of the light's samples; 0 to 2 are those of the loss itself."""
 
 
 @register_pytree
@@ -174,6 +175,36 @@ def indirect_magnitude(asset: Asset) -> Float[Array, ""]:
     return safe_divide(total, count)
 
 
+def _judged_apart(
+    rgb: Float[Array, "V H W 3"],
+    asset: Asset,
+    params: Params,
+    batch: Batch,
+    context: Context,
+    *,
+    model: Model,
+    capacities: Capacities,
+) -> Float[Array, "V H W 3"]:
+    """Return the values of an image drawn with other samples, with the derivative of ``rgb``.
+
+    The gradient of a distance is residual times derivative. From the same samples the two depend on
+    each other: the mean of the product is not the product of the means, and descent lowers whatever
+    makes noise, the sun above all (docs/transport.md). From different samples it is.
+    """
+    second = replace(model, transport=model.transport.for_residual())
+    output = render_views(
+        jax.lax.stop_gradient(asset),
+        jax.lax.stop_gradient(params.light),
+        batch.camera,
+        context,
+        key=jax.random.fold_in(batch.key, _RESIDUAL_STREAM),
+        model=second,
+        capacities=capacities,
+    )
+    value = tone_map(output.rgb, params.log_exposure)
+    return rgb + jax.lax.stop_gradient(value - rgb)
+
+
 def loss(
     params: Params,
     batch: Batch,
@@ -213,6 +244,8 @@ def loss(
         **build,
     )
     rgb = tone_map(output.rgb, params.log_exposure)
+    if model.transport.judges_apart:
+        rgb = _judged_apart(rgb, asset, params, batch, context, **build)
     behind = _background(background_key, rgb.shape, rgb.dtype, objective.background)
     terms, mse = photometric_terms(rgb, output.alpha, batch.image, behind, srgb=objective.srgb)
 

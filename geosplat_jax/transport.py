@@ -56,6 +56,8 @@ class Transport:
     ----------
     method : one of `METHODS`; what follows concerns ``"monte_carlo"`` only.
     light, diffuse, specular : samples a splat, see `SampleCounts`.
+    residual : samples of each kind of a second image, from which a loss takes its residual; with 0
+        it takes that of the image that it differentiates, which biases the gradient.
     occlusion : trace rays against the surface; without it only directions below a splat's own
         face are dark.
     indirect : light from blocked directions, one of `indirect.INDIRECT_KINDS`.
@@ -69,6 +71,7 @@ class Transport:
     light: int = 4
     diffuse: int = 4
     specular: int = 4
+    residual: int = 0
     occlusion: bool = True
     indirect: str = "none"
     bounces: int = 1
@@ -85,7 +88,20 @@ class Transport:
             )
         if self.bounces < 1:
             raise ValueError(f"transport.bounces must be at least 1, got {self.bounces}")
+        if self.residual < 0:
+            raise ValueError(f"transport.residual must not be negative, got {self.residual}")
         SampleCounts(self.light, self.diffuse, self.specular)
+
+    @property
+    def judges_apart(self) -> bool:
+        """Whether a loss takes its residual from an image with samples of its own."""
+        return self.method == "monte_carlo" and self.residual > 0
+
+    def for_residual(self) -> "Transport":
+        """Return the transport of that image."""
+        return replace(
+            self, light=self.residual, diffuse=self.residual, specular=self.residual, residual=0
+        )
 
     @property
     def counts(self) -> SampleCounts:

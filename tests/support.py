@@ -137,6 +137,7 @@ STAGE_2 = (
     "transport.shading.light=1",
     "transport.shading.diffuse=1",
     "transport.shading.specular=1",
+    "transport.shading.residual=0",
 )
 """Overrides that add a stage 2 to `TINY`, small enough for a test."""
 

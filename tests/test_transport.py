@@ -105,6 +105,7 @@ def test_transport_names_what_it_refuses():
         ({"indirect": "some"}, "transport.indirect must be one of"),
         ({"bounces": 0}, "transport.bounces must be at least 1, got 0"),
         ({"light": -1}, "must not be negative"),
+        ({"residual": -1}, "transport.residual must not be negative, got -1"),
         ({"light": 0, "diffuse": 0}, "at least one sample"),
         ({"light": 0, "specular": 0}, "at least one sample"),
     ]:
@@ -122,6 +123,10 @@ def test_what_a_transport_needs_follows_from_its_choices():
     assert not few(indirect="constant").finds_nearest
     assert few(denoise=DenoiseSpec(iterations=1)).is_denoised
     assert few(light=3).counts.total == 5
+    assert not few().judges_apart
+    assert not Transport(residual=2).judges_apart
+    assert few(residual=2).judges_apart
+    assert few(residual=2).for_residual() == few(light=2, diffuse=2, specular=2)
 
 
 def test_monte_carlo_without_a_key_is_refused_and_the_split_sum_needs_none(ball):

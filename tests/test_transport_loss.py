@@ -17,7 +17,7 @@ from support import (
 from geosplat_jax.capacity import Capacities, fits, grow, overflowed
 from geosplat_jax.geometry import sphere_sdf
 from geosplat_jax.hull import fit_grid
-from geosplat_jax.losses import loss
+from geosplat_jax.losses import LossWeights, loss
 from geosplat_jax.render import (
     reconstruct,
     render,
@@ -131,6 +131,69 @@ def test_the_key_decides_every_sample(second):
     # Light has its own samples; the surface has none.
     assert float(other[0][1].terms["light"]) != float(first[0][1].terms["light"])
     assert float(other[0][1].terms["mask"]) == float(first[0][1].terms["mask"])
+
+
+@pytest.mark.slow
+def test_a_residual_of_its_own_has_its_own_samples(second):
+    """The loss has the value of the second image; what has no samples keeps its gradient."""
+    config, params, context, batch = second
+    (total, report), gradient = evaluated(*second)
+    shading = replace(config.model.transport, residual=1)
+    apart = replace(config, model=replace(config.model, transport=shading))
+    (other_total, other), other_gradient = evaluated(apart, params, context, batch)
+    assert float(other.terms["l1"]) != float(report.terms["l1"])
+    assert float(other_total) != float(total)
+    # Eq. 18 and the mask are of the image that is differentiated.
+    for name in ("light", "mask"):
+        assert float(other.terms[name]) == pytest.approx(float(report.terms[name]), rel=1e-6)
+    for name, group in groups_of(other_gradient).items():
+        before = np.concatenate([np.ravel(x) for x in jax.tree.leaves(groups_of(gradient)[name])])
+        after = np.concatenate([np.ravel(x) for x in jax.tree.leaves(group)])
+        assert np.all(np.isfinite(after)), name
+        assert np.any(before != after), name
+
+
+@pytest.mark.slow
+def test_a_residual_of_its_own_takes_the_bias_from_the_gradient(second):
+    """Where the mean image is the photograph, nothing should pull on the brightness of the light.
+
+    Residuals from the samples of the derivative pull it down, since less light makes less noise.
+    """
+    config, params, context, batch = second
+    params = replace(params, light=EnvLight(0.3 * params.light.radiance))
+    rendered = partial(draw, params, batch.camera, context, capacities=TIGHT)
+    keys = jax.random.split(jax.random.key(9), 120)
+    many = replace(config.model.transport, light=32, diffuse=32, specular=32)
+    exact = replace(config.model, transport=many)
+    images = [rendered(model=exact, sampling="face", key=key) for key in keys[:24]]
+    alpha = images[0].alpha
+    mean = jnp.mean(jnp.stack([image.rgb for image in images]), axis=0)
+    mean = jnp.exp(params.log_exposure) * mean / jnp.maximum(alpha[..., None], 1e-6)
+    assert float(jnp.max(mean)) < 1.0  # nothing is clipped
+    photograph = jnp.concatenate([mean, alpha[..., None]], axis=-1)
+    weights = LossWeights(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    weights = replace(weights, l1=1.0)
+
+    def pulls(residual):
+        transport = replace(config.model.transport, residual=residual)
+        model = replace(config.model, transport=transport)
+        found = []
+        for key in keys:
+            _, gradient = evaluate(
+                params,
+                replace(batch, image=photograph, key=key),
+                context,
+                weights,
+                model=model,
+                objective=replace(config.objective, background="black"),
+                capacities=TIGHT,
+            )
+            found.append(float(jnp.sum(params.light.radiance * gradient.light.radiance)))
+        return np.array(found)
+
+    same, apart = pulls(0), pulls(1)
+    error = np.sqrt((same.var() + apart.var()) / len(keys))
+    assert same.mean() - abs(apart.mean()) > 3 * error
 
 
 def test_vertices_cannot_be_shaded_by_monte_carlo(second):
