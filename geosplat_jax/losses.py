@@ -1,7 +1,9 @@
 """The training objective (Eq. 13-19): one pure ``loss(params, batch, ...)``.
 
 Differentiable in ``params`` only. Not differentiable by contract: visibility and depth order, the
-topology of the isosurface, the random background, the noise of the smoothness term.
+topology of the isosurface, the random background, the noise of the smoothness term. In stage 2 the
+gradient is not that of the returned value but of its mean over the samples of light, as nearly as
+an estimate can be (`_judged_apart`).
 """
 
 from dataclasses import dataclass, fields, replace
