@@ -188,10 +188,10 @@ def _stage_2_rates() -> RateConfig:
         weights=1e-3,
         albedo=5e-3,
         shine=4e-3,
-        half_life=150.0,
+        half_life=225.0,
         warmup=50,
-        albedo_warmup=200,
-        shine_warmup=200,
+        albedo_warmup=150,
+        shine_warmup=150,
     )
 
 
@@ -214,7 +214,7 @@ class TransportConfig:
     rates, loss : as in stage 1, with Adam started afresh and schedules counted from here.
     """
 
-    steps: int = 200
+    steps: int = 300
     batch_views: int = 4
     fresh_albedo: bool = True
     shading: Transport = Transport(
@@ -369,15 +369,15 @@ _QUALITY: dict[str, dict[str, Any]] = {
         "run": {"steps": 200, "batch_views": 2, "checkpoint_every": 100},
         "rates": {"half_life": 100.0},
         "transport": {
-            "steps": 100,
+            "steps": 150,
             "batch_views": 2,
             "rates": {
                 "albedo": 1e-2,
                 "shine": 8e-3,
-                "half_life": 75.0,
+                "half_life": 110.0,
                 "warmup": 25,
-                "albedo_warmup": 100,
-                "shine_warmup": 100,
+                "albedo_warmup": 75,
+                "shine_warmup": 75,
             },
         },
         "model": {
@@ -393,7 +393,7 @@ _QUALITY: dict[str, dict[str, Any]] = {
             "steps": 500,
             "batch_views": 6,
             "shading": {"light": 8, "diffuse": 8, "residual": 4},
-            "rates": {"half_life": 375.0, "albedo_warmup": 500, "shine_warmup": 500},
+            "rates": {"half_life": 375.0, "albedo_warmup": 250, "shine_warmup": 250},
         },
     },
 }
