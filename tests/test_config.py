@@ -37,6 +37,19 @@ def test_presets_carry_the_numbers_of_the_reference():
     assert code.model.material.grid.coarsest == 16
 
 
+@pytest.mark.parametrize("preset", ["paper", "code"])
+def test_stage_2_of_the_originals_has_the_schedule_of_the_reference(preset):
+    transport = make_config(preset).transport
+    rates = transport.rates
+    assert (rates.sdf, rates.deform, rates.weights, rates.warmup) == (3e-3, 3e-3, 3e-3, 50)
+    assert (rates.albedo, rates.shine, rates.shift, rates.indirect) == (1e-2, 2e-3, 3e-3, 1e-2)
+    assert (rates.light, rates.exposure, rates.half_life) == (1e-2, 5e-3, 800.0)
+    assert rates.light_knee == rates.albedo_warmup == rates.shine_warmup == 0
+    assert (transport.steps, transport.batch_views, transport.shading.residual) == (500, 8, 0)
+    assert transport.loss.at(0.0).entropy == pytest.approx(0.2)
+    assert transport.loss.at(1.0).entropy == pytest.approx(0.01)
+
+
 def test_overrides_reach_nested_fields_and_keep_types():
     config = make_config(
         overrides=("rates.sdf=0.5", "run.steps=7", "geometry.initial=sphere", "rates.light=1")
