@@ -153,8 +153,9 @@ def read_entry(folder: Path, run: dict[str, Any]) -> Entry:
         figures = {name: float(value) for name, value in record["mean"].items()}
     except (OSError, ValueError, KeyError, TypeError) as error:
         return Entry({}, {}, f"unreadable: {_without_places(repr(error))}")
-    if record.get("samples") != run["evaluate"]["samples"]:
-        notes.append(f"evaluated with {record.get('samples')} samples")
+    for name, wanted in run["evaluate"].items():
+        if record.get(name) != wanted:
+            notes.append(f"evaluated with {name} = {record.get(name)}")
     return Entry(figures, costs, "", tuple(notes))
 
 

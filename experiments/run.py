@@ -342,7 +342,7 @@ def _changes(job: Job) -> list[str]:
     figures = json.loads((folder / "metrics.json").read_text())
     found += differences(config_from_dict(figures["config"]), wanted.stage(figures["stage"]))
     evaluated = json.loads((folder / "evaluation.json").read_text())
-    evaluated |= {name: figures[name] for name in ("protocol", "samples")}
+    evaluated |= {name: figures[name] for name in job.evaluate}
     return found + [
         f"evaluate.{name}: {evaluated.get(name)!r} -> {now!r}"
         for name, now in job.evaluate.items()

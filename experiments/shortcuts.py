@@ -1,16 +1,21 @@
 """Measure what every shortcut of stage 2 costs: bias and noise of images and gradients, and time.
 
 ``python experiments/shortcuts.py RUN --output shortcuts.json`` takes a trained run and evaluates
-the loss and its gradient on one batch of training views with many seeds, for every setting of
-`shortcuts`, against a reference without any.
+an image and the gradient of the loss on one batch of training views with many seeds, for every
+setting of `shortcuts`, against a reference without any.
+
+Means over few seeds are themselves noisy, those of the reference too. Whatever is compared is
+therefore freed of that noise (`squared_bias`), and where a bias does not exceed twice its standard
+error, the table says what it is below.
 """
 
 import argparse
 import json
+import math
 import statistics
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,10 +24,10 @@ from typing import Any
 import jax
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Float
 
 from geosplat_jax import capacity
 from geosplat_jax.capacity import Capacities
-from geosplat_jax.color import tone_map
 from geosplat_jax.denoise import DenoiseSpec
 from geosplat_jax.io.dataset import load_recorded
 from geosplat_jax.losses import LossWeights, Objective, loss
@@ -36,8 +41,10 @@ from geosplat_jax.train import load_run
 REFERENCE_SAMPLES = 16
 """Samples of each kind in a pass of the reference."""
 
-PHOTOMETRIC = LossWeights(entropy=0.0, deviation=0.0, weights=0.0, smoothness=0.0)
-"""Eq. 13 alone: the other terms have no samples of light."""
+IN_COLOUR = LossWeights(
+    mask=0.0, entropy=0.0, deviation=0.0, weights=0.0, smoothness=0.0, light=0.0, indirect=0.0
+)
+"""L1 and SSIM of Eq. 13 alone: the other terms have no samples of light."""
 
 
 def _shading(model: Model, **changes: Any) -> Model:
@@ -49,9 +56,9 @@ def _samples(model: Model, count: int) -> Model:
 
 
 def shortcuts(model: Model) -> dict[str, Model]:
-    """Return every setting by what a table calls it, the defaults first."""
+    """Return every setting by what a table calls it, those of the run first."""
     models = {
-        "defaults": model,
+        "as trained": model,
         "residual from the same samples": _shading(model, residual=0),
         "own samples in every view": _shading(model, shares_views=False),
         "no back-face culling": replace(model, cull_backfaces=False),
@@ -72,7 +79,8 @@ def without_shortcuts(model: Model) -> Model:
     Views still share samples, which correlates their noise but changes no mean; many samples for
     every view would not fit into memory.
     """
-    return _samples(replace(model, cull_backfaces=False), REFERENCE_SAMPLES)
+    exact = _samples(replace(model, cull_backfaces=False), REFERENCE_SAMPLES)
+    return _shading(exact, occlusion=True, denoise=DenoiseSpec(iterations=0))
 
 
 @dataclass(frozen=True)
@@ -84,6 +92,7 @@ class Scene:
     camera: Camera
     image: jax.Array
     model: Model
+    objective: Objective
     capacities: Capacities
 
 
@@ -96,96 +105,161 @@ def load_scene(run: Path, views: int) -> Scene:
     data = load_recorded(description["scene"], description["dataset"])
     config = replace(config, run=replace(config.run, batch_views=views))
     batch = make_batch(data.train, meta["step"], config)
-    return Scene(params, context, batch.camera, batch.image, config.model, capacities)
+    # Random colours behind the object are noise of another kind.
+    objective = replace(config.objective, background="black")
+    return Scene(params, context, batch.camera, batch.image, config.model, objective, capacities)
 
 
 @partial(jax.jit, static_argnames=("model", "capacities"))
-def _evaluate(
-    params: Params,
-    context: Context,
-    camera: Camera,
-    image: jax.Array,
+def _image(
+    scene: tuple[Params, Context, Camera],
     key: jax.Array,
     *,
     model: Model,
     capacities: Capacities,
-) -> tuple[jax.Array, Params, capacity.Usage]:
-    """Return tone-mapped images, gradient of Eq. 13 over black, and what the buffers need."""
+) -> tuple[jax.Array, capacity.Usage]:
+    """Return linear images, before the tone map, which is not linear, and the buffers' needs."""
+    params, context, camera = scene
     asset = reconstruct(params, context, sampling="face", model=model, capacities=capacities)
     output = render_views(
         asset, params.light, camera, context, key=key, model=model, capacities=capacities
     )
-    rgb = tone_map(output.rgb, params.log_exposure)
-    gradient, report = jax.grad(loss, has_aux=True)(
+    return output.rgb, output.usage
+
+
+@partial(jax.jit, static_argnames=("model", "objective", "capacities"))
+def _gradient(
+    params: Params,
+    batch: Batch,
+    context: Context,
+    *,
+    model: Model,
+    objective: Objective,
+    capacities: Capacities,
+) -> dict[str, jax.Array]:
+    """Return the gradient of the colours, by groups."""
+    gradient, _ = jax.grad(loss, has_aux=True)(
         params,
-        Batch(camera, image, jax.random.fold_in(key, 1)),
+        batch,
         context,
-        PHOTOMETRIC,
+        IN_COLOUR,
         model=model,
-        objective=Objective(background="black"),
+        objective=objective,
         capacities=capacities,
     )
-    return rgb, gradient, report.usage
+    groups = {"geometry": gradient.geometry, "material": gradient.material, "light": gradient.light}
+    return {name: ravel_pytree(tree)[0] for name, tree in groups.items()}
 
 
-def evaluations(scene: Scene, model: Model, seeds: range) -> Iterator[tuple[Any, Any, float]]:
-    """Yield images, the gradient by groups, and seconds; buffers grow before the first."""
-    capacities = scene.capacities
-    arguments = (scene.params, scene.context, scene.camera, scene.image)
+@dataclass(frozen=True)
+class Estimates:
+    """What K seeds gave: images on covered pixels (K, P), gradients by group (K, n), seconds."""
+
+    image: Float[np.ndarray, "K P"]
+    gradients: dict[str, Float[np.ndarray, "K n"]]
+    seconds: float
+
+
+def estimate(scene: Scene, model: Model, seeds: range) -> Estimates:
+    """Draw images and gradients with every seed; buffers grow first, and nothing else is timed."""
+    capacities, place = scene.capacities, (scene.params, scene.context, scene.camera)
     while True:
-        usage = _evaluate(*arguments, jax.random.key(0), model=model, capacities=capacities)[2]
+        usage = _image(place, jax.random.key(0), model=model, capacities=capacities)[1]
         if not capacity.overflowed(usage, capacities):
             break
         capacities = capacity.grow(capacities, usage)
+    solid = np.asarray(scene.image[..., 3]) > 0.5
+    options = {"model": model, "objective": scene.objective, "capacities": capacities}
+
+    def descend(seed: int) -> dict[str, np.ndarray]:
+        batch = Batch(scene.camera, scene.image, jax.random.key(seed))
+        return jax.device_get(_gradient(scene.params, batch, scene.context, **options))
+
+    descend(seeds[0])  # compiles
+    images, gradients, seconds = [], [], []
     for seed in seeds:
+        rgb, _ = _image(place, jax.random.key(seed), model=model, capacities=capacities)
+        images.append(np.asarray(rgb, np.float64)[solid].ravel())
         start = time.perf_counter()
-        rgb, gradient, _ = _evaluate(
-            *arguments, jax.random.key(seed), model=model, capacities=capacities
-        )
-        jax.block_until_ready(gradient)
-        seconds = time.perf_counter() - start
-        groups = {
-            "geometry": gradient.geometry,
-            "material": gradient.material,
-            "light": gradient.light,
-        }
-        flat = {
-            name: np.asarray(ravel_pytree(tree)[0], np.float64) for name, tree in groups.items()
-        }
-        yield np.asarray(rgb, np.float64), flat, seconds
+        gradients.append(descend(seed))
+        seconds.append(time.perf_counter() - start)
+    groups = {
+        name: np.stack([found[name] for found in gradients]).astype(np.float64)
+        for name in gradients[0]
+    }
+    return Estimates(np.stack(images), groups, statistics.median(seconds))
+
+
+def squared_bias(rows: Float[np.ndarray, "K n"], exact: Float[np.ndarray, "R n"]) -> float:
+    """Estimate the squared distance of two means from noisy copies of either; unbiased.
+
+    Below zero by chance where there is none.
+    """
+    noise = sum(float(x.var(axis=0, ddof=1).sum()) / len(x) for x in (rows, exact))
+    return float(np.sum((rows.mean(axis=0) - exact.mean(axis=0)) ** 2)) - noise
+
+
+def jackknife(
+    function: Callable[[np.ndarray, np.ndarray], float],
+    rows: Float[np.ndarray, "K n"],
+    exact: Float[np.ndarray, "R n"],
+) -> tuple[float, float]:
+    """Return a statistic of two samples and its standard error, from leaving out one row each.
+
+    For a squared bias the error is up to 1.4 times too large where there is none.
+    """
+    total = 0.0
+    for number, sample in enumerate((rows, exact)):
+        left = []
+        for index in range(len(sample)):
+            both = [rows, exact]
+            both[number] = np.delete(sample, index, axis=0)
+            left.append(function(*both))
+        total += (len(left) - 1) * float(np.var(left))
+    return function(rows, exact), math.sqrt(total)
 
 
 def _decibels(squared: float) -> float:
-    return float(-10 * np.log10(max(squared, 1e-12)))
+    return -10 * math.log10(max(squared, 1e-30))
 
 
-def measure(scene: Scene, model: Model, seeds: range, reference: tuple[Any, Any]) -> dict[str, Any]:
-    """Compare the mean and the spread over seeds with the reference, on covered pixels.
-
-    The squared error of the mean is corrected for the noise that is left in it.
-    """
-    solid = np.asarray(scene.image[..., 3]) > 0.5
-    truth, true_gradient = reference
-    images, gradients, seconds = zip(*evaluations(scene, model, seeds), strict=True)
-    pixels = np.stack([image[solid] for image in images])
-    mean = pixels.mean(axis=0)
-    noise = float(pixels.var(axis=0, ddof=1).mean())
-    bias = float(np.mean((mean - truth[solid]) ** 2)) - noise / len(pixels)
+def compare(found: Estimates, exact: Estimates) -> dict[str, Any]:
+    """Bias and noise of images, and of gradients in units of the length of one of the reference."""
+    pixels = found.image.shape[1]
+    bias, error = jackknife(squared_bias, found.image, exact.image)
     result: dict[str, Any] = {
-        "one step, dB": _decibels(float(np.mean((pixels - truth[solid]) ** 2))),
-        "bias, dB": _decibels(bias),
-        "seconds": statistics.median(seconds),
+        "noise of a step, dB": _decibels(float(found.image.var(axis=0, ddof=1).mean())),
+        "bias": {"squared": bias / pixels, "error": error / pixels},
     }
-    for group in true_gradient:
-        rows = np.stack([gradient[group] for gradient in gradients])
-        center = rows.mean(axis=0)
-        length = max(float(np.linalg.norm(center)), 1e-30)
-        spread = float(np.sqrt(rows.var(axis=0, ddof=1).sum()))
-        other = true_gradient[group]
-        cosine = float(center @ other / max(length * np.linalg.norm(other), 1e-30))
-        result[f"{group}: noise / gradient"] = spread / length
-        result[f"{group}: cosine"] = cosine
-    return result
+    for name, true in exact.gradients.items():
+        rows = found.gradients[name]
+        length = float(np.mean(np.sum(true**2, axis=1)))
+        spread = float(rows.var(axis=0, ddof=1).sum())
+        off, error = jackknife(squared_bias, rows, true)
+        result[f"{name}, noise"] = math.sqrt(spread / length)
+        result[f"{name}, bias"] = {"squared": off / length, "error": error / length}
+    return result | {"seconds": found.seconds}
+
+
+def bias_text(bias: dict[str, float], *, decibels: bool) -> str:
+    """Write a bias, or the most that it could be where it does not exceed twice its error."""
+    is_chance = bias["squared"] <= 2 * bias["error"]
+    squared = bias["squared"] + 2 * bias["error"] if is_chance else bias["squared"]
+    squared = max(squared, 1e-30)
+    if decibels:
+        return f"{'> ' * is_chance}{_decibels(squared):.1f}"
+    return f"{'< ' * is_chance}{math.sqrt(squared):.2f}"
+
+
+def row_text(row: dict[str, Any]) -> str:
+    """Write a row of the table."""
+    cells = []
+    for name, value in row.items():
+        if isinstance(value, dict):
+            cells.append(bias_text(value, decibels=name == "bias"))
+        else:
+            cells.append(f"{value:.3g}")
+    return " | ".join(cells)
 
 
 def main() -> int:
@@ -196,22 +270,20 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=12, help="evaluations of each (default: 12)")
     parser.add_argument("--output", type=Path, help="write all figures as JSON")
     options = parser.parse_args()
+    if options.seeds < 3:
+        parser.error(f"noise needs at least 3 seeds, got {options.seeds}")
     enable_compilation_cache()
     retain_freed_memory()
     scene = load_scene(options.run, options.views)
-    exact = [*evaluations(scene, without_shortcuts(scene.model), range(1000, 1000 + options.seeds))]
-    truth = sum(image for image, _, _ in exact) / len(exact)
-    gradient = {
-        group: sum(found[group] for _, found, _ in exact) / len(exact) for group in exact[0][1]
-    }
+    reference = without_shortcuts(scene.model)
+    exact = estimate(scene, reference, range(1000, 1000 + options.seeds))
     table: dict[str, dict[str, Any]] = {}
     for name, model in shortcuts(scene.model).items():
-        table[name] = measure(scene, model, range(options.seeds), (truth, gradient))
+        table[name] = compare(estimate(scene, model, range(options.seeds)), exact)
         if len(table) == 1:
             print("| shortcut | " + " | ".join(table[name]) + " |")
             print("|---|" + "---|" * len(table[name]))
-        print(f"| {name} | " + " | ".join(f"{x:.3g}" for x in table[name].values()) + " |")
-        sys.stdout.flush()
+        print(f"| {name} | {row_text(table[name])} |", flush=True)
     if options.output is not None:
         options.output.write_text(json.dumps(table, indent=1) + "\n")
     return 0

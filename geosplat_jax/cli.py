@@ -12,7 +12,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from geosplat_jax.config import PRESETS, QUALITIES, Config, make_config
+from geosplat_jax.config import PRESETS, QUALITIES, Config, doubts, make_config
 from geosplat_jax.gradcheck.report import (
     SINGLE_TOLERANCE,
     STAGES,
@@ -72,9 +72,9 @@ def _parser() -> argparse.ArgumentParser:
         "--set", dest="overrides", action="append", default=[], metavar="SECTION.FIELD=VALUE"
     )
     train.add_argument("--seed", type=int, help="seed of every random choice")
-    train.add_argument("--resume", action="store_true", help="continue from the last checkpoint")
-
-    train.add_argument(
+    start = train.add_mutually_exclusive_group()
+    start.add_argument("--resume", action="store_true", help="continue from the last checkpoint")
+    start.add_argument(
         "--stage-1", type=Path, metavar="RUN", help="take over stage 1 of another run of the scene"
     )
 
@@ -220,7 +220,7 @@ def train_command(
     SceneError, UsageError, TrainingError, Interrupted
         See the functions that raise them.
     """
-    from geosplat_jax.train import fit
+    from geosplat_jax.train import TrainingError, fit
 
     record = {"scene": str(scene.resolve()), "dataset": options, "config": config.to_dict()}
     _check_folder(folder, record, resume=resume)
@@ -231,22 +231,27 @@ def train_command(
     if not resume:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "run.json").write_text(json.dumps(record, indent=2) + "\n")
-    for warning in dataset.warnings:
+    for warning in (*dataset.warnings, *doubts(config)):
         _console.print(f"[yellow]warning:[/] {warning}")
     _console.print(
         f"{dataset.name}: {len(dataset.train.names)} views, {dataset.layout}; compiling ..."
     )
     preview = _Preview(dataset, folder / "previews")
-    with _progress_display(config.total_steps) as show:
-        fit(
-            dataset,
-            config,
-            folder,
-            resume=resume,
-            stage_1=stage_1,
-            on_step=show,
-            on_preview=preview,
-        )
+    try:
+        with _progress_display(config.total_steps) as show:
+            fit(
+                dataset,
+                config,
+                folder,
+                resume=resume,
+                stage_1=stage_1,
+                on_step=show,
+                on_preview=preview,
+            )
+    except TrainingError:
+        if not resume and not (folder / "metrics.jsonl").exists():
+            (folder / "run.json").unlink()  # nothing was begun: the folder is free again
+        raise
     seconds = time.perf_counter() - began
     summary = {"seconds_total": round(seconds, 2)}
     (folder / "training.json").write_text(json.dumps(summary, indent=2) + "\n")
@@ -412,8 +417,10 @@ def relight_command(
 
 def _relight(arguments: argparse.Namespace) -> None:
     """Run the relight command from its arguments."""
-    if arguments.intensity < 0:
-        raise UsageError(f"--intensity must not be negative, got {arguments.intensity}")
+    factors = {"intensity": [arguments.intensity], "albedo-scale": arguments.albedo_scale}
+    for name, values in factors.items():
+        if not all(0 <= value < float("inf") for value in values):
+            raise UsageError(f"--{name} must be finite and not negative, got {values}")
     for name in ("turntable", "rotate_env"):
         if getattr(arguments, name) < 0:
             raise UsageError(f"--{name.replace('_', '-')} must not be negative")

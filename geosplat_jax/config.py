@@ -206,7 +206,8 @@ class TransportConfig:
 
     Attributes
     ----------
-    steps : optimiser steps after those of stage 1; 0 leaves the stage out.
+    steps : optimiser steps after those of stage 1; 0 leaves the stage out. The half-life and the
+        waits of ``rates`` are steps too and do not follow; half of the stage is usual for a wait.
     batch_views : full views a step.
     fresh_albedo : start with a new albedo field of one colour, the mean of stage 1; the preset
         `code` starts grey, since its stage 1 stores radiance there.
@@ -266,10 +267,11 @@ class Config:
         ValueError
             For another number.
         """
-        if number == 1:
-            return self
-        if number != 2:
+        if number not in (1, 2):
             raise ValueError(f"a run has stages 1 and 2, not {number}")
+        if number == 1:
+            with_light = self.objective.with_light or self.loss.light > 0
+            return replace(self, objective=replace(self.objective, with_light=with_light))
         later = self.transport
         learned = COEFFICIENTS[later.shading.indirect]
         material = replace(self.model.material, indirect_outputs=learned)
@@ -306,7 +308,19 @@ def _from_dict(kind: type, values: dict[str, Any], where: str) -> Any:
             made[name] = _from_dict(type(now), value, f"{where}{name}.")
         else:
             made[name] = _coerce(value, now, f"{where}{name}")
-    return kind(**made)
+    try:
+        return kind(**made)
+    except ValueError as error:
+        raise ValueError(_located(str(error), where, known)) from None
+
+
+def _located(message: str, where: str, known: set[str]) -> str:
+    """Name a setting in a message by its whole path: both stages have settings of one class."""
+    name, _, rest = message.partition(" ")
+    name = name.rpartition(".")[2]
+    if name in known:
+        return f"{where}{name} {rest}"
+    return f"{where.rstrip('.')}: {message}" if where else message
 
 
 def _coerce(value: Any, like: Any, where: str) -> Any:
@@ -362,7 +376,7 @@ def parse_override(text: str) -> dict[str, Any]:
     return nested
 
 
-# What each quality level spends: measured in docs/quality.md.
+# What each quality level spends.
 _QUALITY: dict[str, dict[str, Any]] = {
     "draft": {
         "geometry": {"resolution": 32},
@@ -419,7 +433,7 @@ def _original(
     )
 
 
-def _original_transport(indirect: str, *, light: float) -> TransportConfig:
+def _original_transport(indirect: str, *, l1: float, light: float) -> TransportConfig:
     """Return what the paper and the authors share in stage 2: 64 samples of either kind."""
     shading = Transport(method="monte_carlo", light=64, diffuse=32, specular=32, indirect=indirect)
     rates = RateConfig(
@@ -430,7 +444,7 @@ def _original_transport(indirect: str, *, light: float) -> TransportConfig:
         batch_views=8,
         shading=shading,
         rates=rates,
-        loss=LossConfig(light=light, indirect=0.001),
+        loss=LossConfig(l1=l1, light=light, indirect=0.001),
     )
 
 
@@ -446,8 +460,9 @@ def _preset(name: str) -> Config:
             baked_diffuse=False,
         )
         objective = Objective(entropy_reduction="sum")
-        transport = _original_transport("harmonics", light=0.15)
-        return replace(paper, loss=LossConfig(l1=1.0), objective=objective, transport=transport)
+        loss = LossConfig(l1=1.0)
+        transport = _original_transport("harmonics", l1=loss.l1, light=0.15)
+        return replace(paper, loss=loss, objective=objective, transport=transport)
     if name == "code":
         code = _original(
             name,
@@ -457,9 +472,9 @@ def _preset(name: str) -> Config:
             has_shift=True,
             baked_diffuse=True,
         )
-        transport = _original_transport("constant", light=0.0)
-        first = LossConfig(entropy_end=0.12, entropy_end_fraction=1.0)
-        return replace(code, loss=first, transport=transport)
+        loss = LossConfig(entropy_end=0.12, entropy_end_fraction=1.0)
+        transport = _original_transport("constant", l1=loss.l1, light=0.0)
+        return replace(code, loss=loss, transport=transport)
     return Config(preset="default", model=Model(material=MaterialSpec(shared=True)))
 
 
@@ -505,6 +520,29 @@ def make_config(
     for override in overrides:
         values = _merge(values, parse_override(override))
     return config_from_dict(values)
+
+
+def doubts(config: Config) -> list[str]:
+    """Say what of a configuration has no effect, or hardly one, though it was asked for."""
+    found = []
+    for name, number in (("", 1), ("transport.", 2)):
+        stage, steps = config.stage(number), config.stage(number).run.steps
+        for wait in ("albedo_warmup", "shine_warmup"):
+            length = getattr(stage.rates, wait)
+            if length > steps and not (number == 2 and config.transport.steps == 0):
+                found.append(
+                    f"{name}rates.{wait} = {length} is longer than the stage's {steps} steps: the "
+                    "material will not reach its full rate; half of the stage is usual"
+                )
+    if config.loss.indirect > 0 and config.model.material.indirect_outputs == 0:
+        found.append("loss.indirect has no effect: stage 1 learns no indirect light")
+    shading = config.transport.shading
+    if shading.indirect == "traced" and not shading.occlusion:
+        found.append(
+            "transport.shading.indirect = traced has no effect without occlusion: blocked "
+            "directions are black"
+        )
+    return found
 
 
 def differences(first: Config, second: Config) -> list[str]:

@@ -176,6 +176,8 @@ def evaluate_run(
         "mean": mean,
         "views": per_view,
         "samples": samples,
+        "samples_drawn": renderer.samples,
+        "relight_indirect": relight_indirect,
         "seconds": round(time.perf_counter() - began, 2),
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
         "versions": {

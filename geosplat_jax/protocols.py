@@ -407,7 +407,7 @@ def relight_figures(
     ----------
     protocol : its ``relight`` decides.
     rgb : (V, H, W, 3) linear, premultiplied by ``alpha``, lit with the albedo times its
-        `albedo_scale`, at exposure 1 and without a tone map; clipped here.
+        `albedo_scale`, at exposure 1; clipped here.
     alpha : (V, H, W) predicted coverage.
     image : (V, H, W, 4) true image, linear, *straight* alpha, which is the mask.
 

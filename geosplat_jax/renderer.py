@@ -38,6 +38,8 @@ DEFAULT_SAMPLES = 128
 """Rays a splat, over all passes, in images that people look at and figures are made from."""
 
 _PASS_SAMPLES = 16
+"""Samples of each kind in a pass, at most."""
+
 _SPECULAR_PASSES = 4
 """Passes that specular light is averaged over; each keeps its samples of the light in memory."""
 
@@ -104,9 +106,11 @@ class Renderer:
     Parameters
     ----------
     config, params, context, capacities : see `train.load_run`.
-    samples : rays a splat, where the model traces any. The noise of the diffuse light falls as
-        the square root; the specular lobe, which every view integrates anew, takes a quarter of
-        128 rays at most, and the splats of a pixel average it further.
+    samples : rays a splat for the diffuse light, half of them towards the light and half after the
+        cosine, where the model traces any; rounded up to equal passes of at most 32, see
+        `samples`. The noise falls as the square root. The specular lobe, which every view
+        integrates anew, has half as many of its own, from four passes at most, and the splats of
+        a pixel average it further.
     seed : of the samples.
     """
 
@@ -128,6 +132,7 @@ class Renderer:
         self._capacities = capacities
         self._key = jax.random.key(seed)
         self._passes = -(-samples // (2 * _PASS_SAMPLES))
+        self._pass_samples = -(-samples // (2 * self._passes))
         self._light = params.light
         self._log_exposure = params.log_exposure
         self._albedo_scale = np.ones(3, np.float32)
@@ -135,12 +140,16 @@ class Renderer:
         self._asset: Asset | None = None
         self._illuminations: list[Illumination] = []
 
-    @staticmethod
-    def _for_images(model: Model) -> Model:
+    @property
+    def samples(self) -> int:
+        """Rays a splat that are traced for the diffuse light, over all passes."""
+        return 2 * self._passes * self._pass_samples
+
+    def _for_images(self, model: Model) -> Model:
         """Return the model with the samples of one pass, and without shortcuts of training."""
         if model.transport.method == "split_sum":
             return model
-        counts = {"light": _PASS_SAMPLES, "diffuse": _PASS_SAMPLES, "specular": _PASS_SAMPLES}
+        counts = dict.fromkeys(("light", "diffuse", "specular"), self._pass_samples)
         transport = replace(
             model.transport, shares_views=True, denoise=DenoiseSpec(iterations=0), **counts
         )
@@ -163,8 +172,10 @@ class Renderer:
         albedo_scale : (3,) factors of the albedo, which photographs leave open.
         indirect : one of `RELIGHT_KINDS`.
         """
-        other = Renderer(self._config, self._params, self._context, self._capacities)
-        other._key, other._passes = self._key, self._passes
+        other = Renderer(
+            self._config, self._params, self._context, self._capacities, samples=self.samples
+        )
+        other._key = self._key
         other._light = light
         other._log_exposure = jnp.zeros(())
         other._albedo_scale = np.asarray(albedo_scale, np.float32)

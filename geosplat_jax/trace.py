@@ -46,6 +46,9 @@ _LARGEST_SKIP = 15
 _COUNT_BITS = 8
 """Bits of a cell's count. It lists at most 144 patches: 3 axes of 3 x 4 x 4 edges in reach."""
 
+_LARGEST_LIST = 1 << (31 - _COUNT_BITS)
+"""The other bits of a word say where a cell's list begins."""
+
 _SLACK = 1e-4
 """Enlargement of patches in cells, so that rounding along a ray never passes one by."""
 
@@ -202,7 +205,17 @@ def build_accelerator(surface: Surface, grid: Grid, *, capacities: Capacities) -
     surface : from `isosurface` with ``training=True``, that is, with a centre in every quad.
     grid : the grid it was extracted from.
     capacities : static; `Capacities.cell_patches` is used.
+
+    Raises
+    ------
+    ValueError
+        If ``cell_patches`` is more than 8.4 million, which the words cannot count.
     """
+    if capacities.cell_patches > _LARGEST_LIST:
+        raise ValueError(
+            f"an accelerator lists at most {_LARGEST_LIST} patches, not "
+            f"{capacities.cell_patches}: lower geometry.resolution or geometry.max_quads"
+        )
     surface, grid = jax.lax.stop_gradient((surface, grid))
     padded = Grid(
         origin=grid.origin - grid.cell_size,

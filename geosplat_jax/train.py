@@ -28,7 +28,6 @@ import numpy as np
 from geosplat_jax import capacity as capacity_module
 from geosplat_jax.capacity import Capacities, Usage
 from geosplat_jax.config import Config, config_from_dict, differences
-from geosplat_jax.geometry import initial_geometry
 from geosplat_jax.hull import fit_grid
 from geosplat_jax.io.checkpoints import (
     latest_checkpoint,
@@ -40,7 +39,7 @@ from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.views import Views
 from geosplat_jax.model import Context, Model, Params
 from geosplat_jax.render import visibility_usage
-from geosplat_jax.scene import Camera, Grid
+from geosplat_jax.scene import Camera, Geometry, Grid
 from geosplat_jax.stages import (
     begin_stage_2,
     initial_params,
@@ -146,7 +145,9 @@ def _check_size(quads: int, max_quads: int) -> None:
 class _Loop:
     """Mutable bookkeeping of a run; everything but the clock goes into checkpoints.
 
-    ``config`` are the settings of the stage that runs, ``run_config`` those of all stages.
+    ``config`` are the settings of the stage that runs, ``run_config`` those of all stages;
+    ``fallback`` is the surface that the stage began with, on the host, since the step consumes its
+    buffers.
     """
 
     run_config: Config
@@ -160,7 +161,7 @@ class _Loop:
     sampling: str = ""
     peak: Usage | None = None
     recoveries: int = 0
-    fallback_sdf: np.ndarray | None = None
+    fallback: Geometry | None = None
     last_checkpoint: Path | None = None
 
     def meta(self) -> dict[str, Any]:
@@ -214,6 +215,7 @@ class _Loop:
             )
         self.stage = 2
         self.config = self.run_config.stage(2)
+        self.fallback = _on_host(self.state.params.geometry)
         key = jax.random.fold_in(jax.random.key(self.config.run.seed), _STAGE_2_STREAM)
         params = begin_stage_2(self.state.params, self.context.grid, self.run_config, key)
         fresh = initial_state(params, self.config.rates)
@@ -268,24 +270,33 @@ class _Loop:
         where = self.last_checkpoint or "none was written yet"
         return (
             f"step {step}: {what} is not finite. Parameters were left as before the step; the "
-            f"last good checkpoint: {where}. Lower the rates (--set rates.sdf=...) and resume."
+            f"last good checkpoint: {where}. Start a new run with lower rates: {self._lower()}."
         )
 
+    def _lower(self) -> str:
+        """Say how to start again with lower rates of the stage that runs."""
+        if self.stage == 1:
+            return "--set rates.sdf=..."
+        return f"--stage-1 {self.folder} --set transport.rates.sdf=..."
+
     def _recover(self, step: int) -> None:
-        """Put the first surface back after every face has vanished."""
-        if self.recoveries >= _RECOVERIES_ALLOWED or self.fallback_sdf is None:
+        """Put the stage's first surface back after every face has vanished."""
+        if self.recoveries >= _RECOVERIES_ALLOWED or self.fallback is None:
             raise TrainingError(
                 f"step {step}: the surface is empty (its SDF has one sign everywhere) for the "
                 f"{self.recoveries + 1}th time. Check that the masks are not inverted and that "
-                "the bounds hold the object (geosplat-jax info), or lower rates.sdf."
+                "the bounds hold the object (geosplat-jax info), or start a new run with lower "
+                f"rates: {self._lower()}."
             )
         self.recoveries += 1
-        params = replace(
-            self.state.params,
-            geometry=initial_geometry(self.context.grid, jnp.asarray(self.fallback_sdf)),
-        )
+        params = replace(self.state.params, geometry=jax.tree.map(jnp.asarray, self.fallback))
         fresh = initial_state(params, self.config.rates)
         self.state = replace(fresh, step=self.state.step)
+
+
+def _on_host(geometry: Geometry) -> Geometry:
+    """Copy a geometry out of buffers that the step will consume."""
+    return jax.tree.map(np.array, geometry)
 
 
 def usage_to_dict(usage: Usage) -> dict[str, int]:
@@ -341,7 +352,7 @@ def _start(dataset: Dataset, config: Config, folder: Path) -> _Loop:
         context=make_context(grid, config.model),
         folder=folder,
         state=initial_state(params, config.rates),
-        fallback_sdf=np.array(sdf),  # on the host: the step consumes its buffers
+        fallback=_on_host(params.geometry),
     )
 
 
@@ -382,11 +393,17 @@ def _continue(dataset: Dataset, config: Config, folder: Path) -> _Loop:
     loop.peak = None if meta["peak"] is None else usage_from_dict(meta["peak"])
     loop.recoveries = meta["recoveries"]
     loop.last_checkpoint = path
+    before = latest_checkpoint(folder / "stage_1")
+    if loop.stage == 2 and before is not None:
+        like = _template(config, tuple(meta["grid_shape"]), 1)
+        loop.fallback = _on_host(load_checkpoint(before, like=like)[0]["state"].params.geometry)
     return loop
 
 
 def _adopt(dataset: Dataset, config: Config, folder: Path, source: Path) -> _Loop:
     """Build the loop of a run whose stage 1 is that of another run."""
+    if config.transport.steps == 0:
+        raise TrainingError("nothing to train: stage 1 is taken over and transport.steps is 0")
     path = latest_checkpoint(source / "stage_1") or latest_checkpoint(source / "checkpoints")
     if path is None:
         raise TrainingError(f"{source} holds no checkpoint to take stage 1 from")
@@ -485,19 +502,23 @@ def fit(
     config : see `config.make_config`.
     folder : run folder; it exists already.
     resume : continue from the last good checkpoint; equals the uninterrupted run bit for bit.
-    stage_1 : run folder whose stage 1 to take over; its scene and settings, those of stage 2
-        aside, must be the same.
+    stage_1 : run folder whose stage 1 to take over, in a new run; its scene and settings, those of
+        stage 2 aside, must be the same.
     stop_after : stop, with a checkpoint, once so many steps are done (for tests and schedulers).
     on_step, on_preview : called after every step, and every ``run.preview_every`` steps.
 
     Raises
     ------
+    ValueError
+        If ``resume`` and ``stage_1`` are both given.
     TrainingError
-        When a number is not finite, the surface vanishes or explodes for good, or the resumed run
-        had another configuration.
+        When a number is not finite, the surface vanishes or explodes for good, or the run to
+        resume or to take stage 1 from does not fit.
     Interrupted
         After Ctrl-C or SIGTERM; a checkpoint has been written.
     """
+    if resume and stage_1 is not None:
+        raise ValueError("a run that is resumed has its stage 1 already; leave stage_1 out")
     if resume:
         loop = _continue(dataset, config, folder)
     elif stage_1 is not None:

@@ -104,6 +104,28 @@ def test_a_failed_start_leaves_no_folder_behind(tmp_path, capsys):
     assert not folder.exists()
 
 
+def test_a_stage_1_that_does_not_fit_leaves_the_folder_free(tmp_path, capsys):
+    arguments = ["train", str(DUCK), "--downscale", "4", *SETTINGS, "--set", "transport.steps=1"]
+    other, folder = tmp_path / "other", tmp_path / "run"
+    other.mkdir()
+    options = {"downscale": 4, "light": None, "bounds": None}
+    (other / "run.json").write_text(json.dumps({"scene": str(DUCK), "dataset": options}))
+    for _ in range(2):
+        assert main([*arguments, "--output", str(folder), "--stage-1", str(other)]) == 2
+        assert "holds no checkpoint to take stage 1 from" in capsys.readouterr().err
+        assert list(folder.iterdir()) == []
+    with pytest.raises(SystemExit):
+        main([*arguments, "--output", str(folder), "--stage-1", str(other), "--resume"])
+    assert "not allowed with argument" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("name", "value"), [("--intensity", "nan"), ("--albedo-scale", "-1")])
+def test_factors_of_a_light_are_checked(tmp_path, capsys, name, value):
+    values = [value] * (3 if name == "--albedo-scale" else 1)
+    assert main(["relight", str(tmp_path), "--env", "x.hdr", name, *values]) == 2
+    assert f"{name} must be finite and not negative" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("command", ["evaluate", "export", "render"])
 def test_commands_on_something_that_is_not_a_run_say_so(tmp_path, capsys, command):
     assert main([command, str(tmp_path)]) == 2

@@ -10,6 +10,7 @@ from geosplat_jax.config import (
     RateConfig,
     config_from_dict,
     differences,
+    doubts,
     make_config,
     parse_override,
 )
@@ -46,6 +47,7 @@ def test_stage_2_of_the_originals_has_the_schedule_of_the_reference(preset):
     assert (rates.light, rates.exposure, rates.half_life) == (1e-2, 5e-3, 800.0)
     assert rates.light_knee == rates.albedo_warmup == rates.shine_warmup == 0
     assert (transport.steps, transport.batch_views, transport.shading.residual) == (500, 8, 0)
+    assert transport.loss.l1 == make_config(preset).loss.l1
     assert transport.loss.at(0.0).entropy == pytest.approx(0.2)
     assert transport.loss.at(1.0).entropy == pytest.approx(0.01)
 
@@ -68,7 +70,12 @@ def test_overrides_reach_nested_fields_and_keep_types():
         ("nothing.at.all=1", "unknown setting nothing"),
         ("run.steps=1.5", "run.steps must be of type int"),
         ("run.steps=0", "run.steps must be at least 1"),
-        ("rates.sdf=-1.0", "rates.sdf must not be negative"),
+        ("rates.sdf=-1.0", "^rates.sdf must not be negative"),
+        ("transport.rates.sdf=-1.0", "^transport.rates.sdf must not be negative"),
+        ("transport.loss.l1=-1.0", "^transport.loss.l1 must not be negative"),
+        ("transport.shading.bounces=0", "^transport.shading.bounces must be at least 1"),
+        ("transport.shading.light=-1", "^transport.shading: counts of samples"),
+        ("objective.background=red", "^objective.background must be"),
         ("rates.sdf", "section.field=value"),
         ("geometry.initial=cube", "geometry.initial must be"),
         ("model.adapter.alpha=[1.0]", "alpha and beta need an outer and an inner value"),
@@ -105,3 +112,41 @@ def test_entropy_weight_falls_linearly_and_stays():
 def test_differences_name_the_setting_and_both_values():
     first, second = make_config(), make_config(overrides=("rates.sdf=0.25",))
     assert differences(first, second) == [f"rates.sdf: {RateConfig().sdf!r} -> 0.25"]
+
+
+@pytest.mark.parametrize("preset", ["default", "paper", "code"])
+@pytest.mark.parametrize("quality", ["draft", "standard", "high"])
+def test_the_settings_that_are_offered_raise_no_doubts(preset, quality):
+    assert doubts(make_config(preset, quality)) == []
+
+
+@pytest.mark.parametrize(
+    ("overrides", "told"),
+    [
+        (
+            ("transport.steps=100",),
+            ["transport.rates.albedo_warmup = 150", "transport.rates.shine"],
+        ),
+        (
+            ("rates.albedo_warmup=501",),
+            ["rates.albedo_warmup = 501 is longer than the stage's 500"],
+        ),
+        (("loss.indirect=1.0",), ["loss.indirect has no effect"]),
+        (
+            ("transport.shading.indirect=traced", "transport.shading.occlusion=false"),
+            ["blocked directions are black"],
+        ),
+        (("transport.steps=0",), []),
+    ],
+)
+def test_settings_without_effect_are_told(overrides, told):
+    found = doubts(make_config(overrides=overrides))
+    assert len(found) == len(told)
+    assert all(words in text for words, text in zip(told, found, strict=True))
+
+
+def test_a_weight_of_eq_18_switches_it_on_in_either_stage():
+    config = make_config(overrides=("loss.light=0.1",))
+    assert (config.stage(1).objective.with_light, config.stage(2).objective.with_light) == (1, 0)
+    config = make_config(overrides=("transport.loss.light=0.1",))
+    assert (config.stage(1).objective.with_light, config.stage(2).objective.with_light) == (0, 1)

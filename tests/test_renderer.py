@@ -112,6 +112,13 @@ def test_no_samples_are_refused(matt):
         Renderer(CONFIG, *matt, AMPLE, samples=0)
 
 
+@pytest.mark.parametrize(("asked", "drawn"), [(1, 2), (16, 16), (33, 36), (128, 128), (130, 130)])
+def test_samples_are_rounded_up_to_equal_passes(matt, asked, drawn):
+    renderer = Renderer(CONFIG, *matt, AMPLE, samples=asked)
+    assert renderer.samples == drawn
+    assert renderer.relit(sky(seed=3)).samples == drawn
+
+
 def noise(config, params, context, camera, samples):
     """Standard deviation over seeds, averaged over the pixels of the object."""
     views = [

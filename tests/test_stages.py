@@ -2,47 +2,30 @@
 
 import json
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import (
-    STAGE_2,
-    sphere_dataset,
-    tiny_config,
-)
+from support import STAGE_2, sphere_dataset, tiny_config
 
-from geosplat_jax.capacity import Capacities
+from geosplat_jax import train as train_module
 from geosplat_jax.config import config_from_dict, differences, make_config
 from geosplat_jax.geometry import sphere_sdf
 from geosplat_jax.grids import grid_vertices
 from geosplat_jax.hull import fit_grid
 from geosplat_jax.materials import materials_at
-from geosplat_jax.render import (
-    grid_center_and_extent,
-    reconstruct,
-    render,
-)
+from geosplat_jax.render import grid_center_and_extent
 from geosplat_jax.stages import begin_stage_2, initial_params
 from geosplat_jax.step import make_optimizer
 from geosplat_jax.train import TrainingError, fit, load_run
-from geosplat_jax.transport import illuminate, shade_rows
-
-AMPLE = Capacities(1024, 1024, 1024, 16384, 16384, 4096, 8192)
-BIASED = ("model.material.bias=true",)
-build = partial(jax.jit, static_argnames=("model", "capacities", "sampling"))(reconstruct)
-prepare = partial(jax.jit, static_argnames=("transport",))(illuminate)
-shine = partial(jax.jit, static_argnames=("transport", "baked_diffuse"))(shade_rows)
-draw = partial(jax.jit, static_argnames=("model", "capacities", "sampling", "aov_names"))(render)
 
 
 @pytest.mark.parametrize("preset", ["default", "paper", "code"])
 def test_the_settings_of_stage_2_stand_where_those_of_stage_1_stood(preset):
     whole = make_config(preset)
     first, second = whole.stage(1), whole.stage(2)
-    assert first is whole
+    assert first == whole
     assert second.model.transport == whole.transport.shading
     assert second.model.transport.method == "monte_carlo"
     learned = {"constant": 6, "harmonics": 27}[whole.transport.shading.indirect]
@@ -336,6 +319,35 @@ def test_another_stage_1_is_refused_by_name(dataset, whole, tmp_path):
     other.mkdir()
     with pytest.raises(TrainingError, match="at step 2 of stage 1, not at the end of stage 1"):
         fit(dataset, tiny_config(*RUN), other, stage_1=tmp_path)
+
+
+def test_taking_over_everything_there_is_to_train_is_refused(dataset, tmp_path):
+    with pytest.raises(TrainingError, match=r"nothing to train: .* transport\.steps is 0"):
+        fit(dataset, tiny_config(), tmp_path, stage_1=tmp_path)
+    with pytest.raises(ValueError, match="has its stage 1 already"):
+        fit(dataset, tiny_config(*RUN), tmp_path, stage_1=tmp_path, resume=True)
+
+
+@pytest.mark.slow
+def test_a_surface_that_vanishes_in_stage_2_is_that_of_stage_1_again(
+    dataset, whole, tmp_path, monkeypatch
+):
+    advance, emptied = train_module._Loop.advance, []
+
+    def sabotage(self, step):
+        if step == 3 and not emptied:
+            emptied.append(self.state.params.geometry)
+            gone = replace(emptied[0], sdf=jnp.abs(emptied[0].sdf) + 1.0)
+            # A copy: the step consumes the buffers of what it is given.
+            emptied[0] = jax.tree.map(np.array, emptied[0])
+            self.state = replace(self.state, params=replace(self.state.params, geometry=gone))
+        return advance(self, step)
+
+    monkeypatch.setattr(train_module._Loop, "advance", sabotage)
+    state = fit(dataset, tiny_config(*RUN), tmp_path, stage_1=whole[0], stop_after=4)
+    assert_same(state.params.geometry, emptied[0])
+    resumed = train_module._continue(dataset, tiny_config(*RUN), tmp_path)
+    assert_same(resumed.fallback, emptied[0])
 
 
 @pytest.mark.slow

@@ -105,6 +105,7 @@ class Fakes:
             "step": config.total_steps,
             "samples": samples,
             "protocol": protocol,
+            "relight_indirect": relight_indirect,
             "training_peak_memory_mb": 1234,
         }
         (folder / "metrics.json").write_text(json.dumps(figures))

@@ -245,6 +245,13 @@ def test_overflow_reports_the_true_need_and_growing_cures_it():
     np.testing.assert_array_equal(occluded(cured, *_rays(500)), occluded(ample, *_rays(500)))
 
 
+def test_a_list_too_long_to_be_counted_is_refused():
+    grid = torus_grid()
+    surface, _ = traced(bumpy_torus(grid), grid)
+    with pytest.raises(ValueError, match="at most 8388608 patches, not 8388609"):
+        build(surface, grid, capacities=replace(AMPLE, cell_patches=2**23 + 1))
+
+
 def test_a_scene_of_any_scale_gives_the_same_hits():
     grid = torus_grid()
     geometry = bumpy_torus(grid)

@@ -19,6 +19,7 @@ from geosplat_jax.gradcheck.shading_stages import (
     light_problems,
     material_problems,
     split_sum_problems,
+    transport_problems,
 )
 from geosplat_jax.gradcheck.whole_stages import loss_problems, smoothness_problems
 
@@ -37,6 +38,7 @@ STAGES: dict[str, Callable[[np.random.Generator], list[Problem]]] = {
     "bsdf": bsdf_problems,
     "light": light_problems,
     "splitsum": split_sum_problems,
+    "transport": transport_problems,
     "projection": projection_problems,
     "rasterizer": rasteriser_problems,
     "terms": loss_term_problems,

@@ -1,5 +1,6 @@
-"""Problems of the appearance: hash grid, material fields, BRDF, light and split sum."""
+"""Problems of the appearance: hash grid, materials, BRDF, light, split sum, Monte Carlo shading."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 from geosplat_jax import bsdf
 from geosplat_jax.gradcheck.differences import Problem
 from geosplat_jax.hashgrid import HashGridSpec, encode
+from geosplat_jax.indirect import COEFFICIENTS, Indirect
 from geosplat_jax.light import (
     LightSpec,
     lookup,
@@ -17,7 +19,16 @@ from geosplat_jax.light import (
     prefiltered_diffuse,
     prefiltered_specular,
 )
+from geosplat_jax.light_sampling import light_sampler
 from geosplat_jax.materials import MaterialField, MaterialSpec, attributes_at, init_materials
+from geosplat_jax.monte_carlo import (
+    BLOCKED,
+    SampleCounts,
+    SurfacePoints,
+    draw_samples,
+    gather,
+    reflect,
+)
 from geosplat_jax.scene import EnvLight, Materials
 from geosplat_jax.shading import fg_table, split_sum
 
@@ -169,3 +180,51 @@ def split_sum_problems(rng: np.random.Generator) -> list[Problem]:
     inputs = _surface_points(rng, 9)
     inputs["texels"] = rng.uniform(0.1, 2.0, (_LIGHT.height, _LIGHT.width, 3))
     return [Problem("split sum", function, inputs, constants)]
+
+
+def transport_problems(rng: np.random.Generator) -> list[Problem]:
+    """Monte Carlo shading over fixed samples, by kind of indirect light.
+
+    Samples of the light and the cosine, some of them blocked; none of the microfacets, whose
+    directions follow the roughness and are constants of a step by contract.
+    """
+    count, faces, counts = 7, 4, SampleCounts(light=5, diffuse=4, specular=0)
+    dtype = jnp.zeros(0).dtype
+    inputs = _surface_points(rng, count)
+    inputs["texels"] = rng.uniform(0.1, 2.0, (_LIGHT.height, _LIGHT.width, 3))
+    normals = jnp.asarray(inputs["normals"], dtype)
+    none, every = jnp.full(count, -1, jnp.int32), jnp.ones(count, bool)
+    points = SurfacePoints(jnp.zeros_like(normals), normals, normals, none, every)
+    sampler = light_sampler(EnvLight(jnp.asarray(inputs["texels"], dtype)))
+    drawn = draw_samples(jax.random.key(0), points, sampler, None, counts=counts)
+    ends = rng.integers(BLOCKED, faces, drawn.hits.shape)
+    samples = replace(drawn, hits=jnp.asarray(ends, jnp.int32))
+
+    def problem(kind: str) -> Problem:
+        def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
+            points, samples, sampler = constants
+            points = replace(points, normals=inputs["normals"])
+            light, indirect = EnvLight(inputs["texels"]), Indirect(inputs["indirect"], kind)
+            shaded = reflect(
+                jax.random.key(1),
+                points,
+                _materials(inputs),
+                inputs["wo"],
+                gather(points, samples, light, indirect),
+                light,
+                sampler,
+                None,
+                indirect,
+                counts=counts,
+            )
+            return {
+                "rgb": shaded.rgb,
+                "diffuse light": shaded.diffuse_light,
+                "specular light": shaded.specular_light,
+            }
+
+        shape = (faces, 3) if kind == "traced" else (count, COEFFICIENTS[kind])
+        varied = {**inputs, "indirect": rng.uniform(0.2, 1.0, shape)}
+        return Problem(f"transport, indirect {kind}", function, varied, (points, samples, sampler))
+
+    return [problem(kind) for kind in ("constant", "harmonics", "traced")]

@@ -1,0 +1,80 @@
+"""The study of shortcuts: what noise leaves in means is taken out of biases."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "experiments"))
+
+import shortcuts  # noqa: E402
+
+from geosplat_jax.config import make_config  # noqa: E402
+
+SIZE, SEEDS = 40, 8
+
+
+def _draws(rng, mean, noise):
+    return mean + noise * rng.standard_normal((SEEDS, SIZE))
+
+
+@pytest.mark.parametrize("true", [0.0, 2.0])
+def test_a_bias_is_found_on_average_and_its_error_is_not_too_small(true):
+    rng = np.random.default_rng(0)
+    offset = np.full(SIZE, true / np.sqrt(SIZE))
+    found = [
+        shortcuts.jackknife(
+            shortcuts.squared_bias, _draws(rng, offset, 1.0), _draws(rng, np.zeros(SIZE), 0.5)
+        )
+        for _ in range(400)
+    ]
+    values, errors = np.array(found).T
+    spread = float(values.std(ddof=1))
+    assert abs(float(values.mean()) - true**2) < 4 * spread / np.sqrt(len(values))
+    # A plain distance of the means would be larger by the noise of both: 40 (1 + .25) / 8.
+    assert abs(float(values.mean()) - true**2) < 0.2 * 6.25
+    # Twice the variance where there is no bias: errors err on the safe side.
+    assert 0.8 * spread < float(np.median(errors)) < 1.7 * spread
+
+
+def test_a_bias_within_its_error_is_written_as_a_bound():
+    chance, sure = {"squared": -1e-4, "error": 1e-4}, {"squared": 1e-2, "error": 1e-4}
+    assert shortcuts.bias_text(chance, decibels=True) == "> 40.0"
+    assert shortcuts.bias_text(sure, decibels=True) == "20.0"
+    assert shortcuts.bias_text(chance, decibels=False) == "< 0.01"
+    assert shortcuts.bias_text(sure, decibels=False) == "0.10"
+
+
+def test_estimates_are_compared_in_units_of_the_reference():
+    rng = np.random.default_rng(1)
+    direction = np.full(SIZE, 10.0 / np.sqrt(SIZE))
+    exact = shortcuts.Estimates(
+        _draws(rng, np.zeros(SIZE), 1e-3), {"light": _draws(rng, direction, 1e-3)}, 2.0
+    )
+    found = shortcuts.Estimates(
+        _draws(rng, np.full(SIZE, 0.1), 1e-3), {"light": _draws(rng, 1.5 * direction, 0.1)}, 1.0
+    )
+    row = shortcuts.compare(found, exact)
+    assert row["noise of a step, dB"] == pytest.approx(60.0, abs=1.0)
+    assert row["bias"]["squared"] == pytest.approx(0.01, rel=0.02)
+    assert row["light, bias"]["squared"] == pytest.approx(0.25, rel=0.05)
+    assert row["light, noise"] == pytest.approx(0.1 * np.sqrt(SIZE) / 10, rel=0.2)
+    assert row["seconds"] == 1.0
+
+
+def test_every_shortcut_differs_from_the_run_and_the_reference_has_none():
+    model = make_config(
+        overrides=(
+            "transport.shading.occlusion=false",
+            "transport.shading.denoise.iterations=2",
+        )
+    ).stage(2)
+    exact = shortcuts.without_shortcuts(model.model)
+    assert exact.transport.is_traced
+    assert not exact.transport.is_denoised
+    assert not exact.cull_backfaces
+    models = shortcuts.shortcuts(make_config().stage(2).model)
+    assert len(set(models.values())) == len(models)
+    assert shortcuts.without_shortcuts(model.model) not in models.values()
