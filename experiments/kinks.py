@@ -37,7 +37,7 @@ from geosplat_jax.geometry import vertex_normals
 from geosplat_jax.hashgrid import Layer, encode
 from geosplat_jax.hull import fit_grid
 from geosplat_jax.io.checkpoints import latest_checkpoint, load_checkpoint
-from geosplat_jax.io.dataset import load_dataset
+from geosplat_jax.io.dataset import load_recorded
 from geosplat_jax.light import direction_to_uv, level_of_roughness
 from geosplat_jax.losses import TERM_NAMES, loss
 from geosplat_jax.materials import to_unit_cube
@@ -567,16 +567,11 @@ def main() -> None:
     enable_compilation_cache()
     retain_freed_memory()
 
-    config, params, context, capacities, _ = load_run(arguments.run)
+    config, params, context, capacities, meta = load_run(arguments.run)
+    if meta["stage"] != 1:
+        parser.error(f"{arguments.run} ended in stage 2; train it with --set transport.steps=0")
     record = json.loads((arguments.run / "run.json").read_text())
-    options = record["dataset"]
-    bounds = options.get("bounds")
-    dataset = load_dataset(
-        arguments.scene or Path(record["scene"]),
-        downscale=options.get("downscale", 1),
-        light=options.get("light"),
-        bounds=None if bounds is None else (tuple(bounds[:3]), tuple(bounds[3:])),
-    )
+    dataset = load_recorded(arguments.scene or Path(record["scene"]), record["dataset"])
     results = {}
     for which in arguments.step_from:
         if which == "start":

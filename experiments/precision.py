@@ -521,6 +521,10 @@ def half_rows(params: Params, batch: Batch, context: Context, config: Config, ro
 def stages_command(arguments: argparse.Namespace) -> None:
     """Measure every stage on a trained run, the whole chain, and what bfloat16 would do."""
     config, params, context, room, meta = load_run(arguments.run_folder)
+    if meta["stage"] != 1:
+        raise SystemExit(
+            f"{arguments.run_folder} ended in stage 2; train it with --set transport.steps=0"
+        )
     dataset = load_dataset(arguments.scene)
     batch = make_batch(dataset.train, meta["step"], config)
     camera = jax.tree.map(lambda x: x[:1], batch.camera)

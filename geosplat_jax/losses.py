@@ -2,8 +2,8 @@
 
 Differentiable in ``params`` only. Not differentiable by contract: visibility and depth order, the
 topology of the isosurface, the random background, the noise of the smoothness term. In stage 2 the
-gradient is not that of the returned value but of its mean over the samples of light, as nearly as
-an estimate can be (`_judged_apart`).
+samples of light are constants too, and the gradient is not that of the returned, noisy value
+(`_judged_apart`).
 """
 
 from dataclasses import dataclass, fields, replace
@@ -191,7 +191,9 @@ def _judged_apart(
 
     The gradient of a distance is residual times derivative. From the same samples the two depend on
     each other: the mean of the product is not the product of the means, and descent lowers whatever
-    makes noise, the sun above all (docs/transport.md). From different samples it is.
+    makes noise, the sun above all (docs/transport.md). From different samples it is, which for a
+    squared distance is the gradient at the mean image, and for L1 and SSIM comes close. Eq. 18
+    keeps the first image.
     """
     second = replace(model, transport=model.transport.for_residual())
     output = render_views(

@@ -56,10 +56,10 @@ class Transport:
     ----------
     method : one of `METHODS`; what follows concerns ``"monte_carlo"`` only.
     light, diffuse, specular : samples a splat, see `SampleCounts`.
-    residual : samples of each kind of a second image, from which a loss takes its residual; with 0
+    residual : samples of each kind of a second image, from which Eq. 13 takes its residual; with 0
         it takes that of the image that it differentiates, which biases the gradient.
     occlusion : trace rays against the surface; without it only directions below a splat's own
-        face are dark.
+        face are blocked.
     indirect : light from blocked directions, one of `indirect.INDIRECT_KINDS`.
     bounces : for traced indirect light, how often light goes from surface to surface.
     shares_views : all views of a batch use the same samples of light and cosine, which are then
