@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -60,9 +61,9 @@ def test_a_run_without_stage_2_ends_with_stage_1():
     [
         ("transport.steps=-1", "transport.steps must not be negative, got -1"),
         ("transport.batch_views=0", "transport.batch_views must be at least 1, got 0"),
-        ("transport.shading.indirect=much", "transport.indirect must be one of"),
-        ("transport.shading.method=photons", "transport.method must be one of"),
-        ("transport.shading.bounces=0", "transport.bounces must be at least 1"),
+        ("transport.shading.indirect=much", "transport.shading.indirect must be one of"),
+        ("transport.shading.method=photons", "transport.shading.method must be one of"),
+        ("transport.shading.bounces=0", "transport.shading.bounces must be at least 1"),
         ("transport.shading.denoise.iterations=9", "denoise.iterations must lie in 0 to 8"),
         ("transport.rates.sdf=-1.0", "must not be negative"),
         ("transport.loss.light=-1.0", "must not be negative"),
