@@ -66,8 +66,8 @@ def export_assets(
     """Write ``mesh.glb``, ``gaussians.ply`` and ``light.exr``; return a line about each.
 
     The mesh uses the evaluation triangulation (two triangles a quad) and carries base colour,
-    roughness and metallic. The Gaussians carry the albedo as display colour, since their shaded
-    colour depends on the view.
+    roughness and metallic. The light has the exposure that was learned multiplied in. The Gaussians
+    carry the albedo as display colour, since their shaded colour depends on the view.
 
     Parameters
     ----------
@@ -98,10 +98,12 @@ def export_assets(
     }
     albedo = np.asarray(asset.materials.albedo)[:count]
     export_gaussians_ply(folder / "gaussians.ply", rgb=encode_srgb(albedo), **rows)
-    export_light_exr(folder / "light.exr", np.asarray(params.light.radiance))
+    # Exposed, so that mesh and light together are as bright as the photographs.
+    radiance = np.asarray(params.light.radiance) * np.exp(float(params.log_exposure))
+    export_light_exr(folder / "light.exr", radiance)
     height, width = params.light.radiance.shape[:2]
     return {
         str(folder / "mesh.glb"): ", ".join(f"{k} {v}" for k, v in mesh_info.items()),
         str(folder / "gaussians.ply"): f"{count} Gaussians",
-        str(folder / "light.exr"): f"{width} x {height} lat-long, z-up",
+        str(folder / "light.exr"): f"{width} x {height} lat-long, z-up, exposure included",
     }

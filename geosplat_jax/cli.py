@@ -402,6 +402,8 @@ def relight_command(
     from geosplat_jax.train import load_run
 
     record = _recorded(run)
+    options = options or RelightOptions()
+    options.check()
     light = EnvLight(intensity * load_light(env).radiance)
     dataset = load_recorded(record["scene"], record["dataset"])
     views = dataset.test if dataset.test.names else dataset.train
@@ -410,7 +412,7 @@ def relight_command(
     relit = renderer.relit(light, albedo_scale=albedo_scale, indirect=indirect)
     folder = output or run / f"relight_{env.stem}"
     folder.mkdir(parents=True, exist_ok=True)
-    written = relight_views(relit, light, views, folder, options or RelightOptions())
+    written = relight_views(relit, light, views, folder, options)
     print(f"{len(written)} files: {folder}")
     return written
 
@@ -452,7 +454,7 @@ def _peak_memory(run: Path) -> int | None:
 
 
 def render_command(run: Path, views: str, output: Path | None) -> None:
-    """Render every view of a split into ``rgb_*.png`` with straight alpha, and its normals."""
+    """Render views of a split: ``NAME_rgba.png`` with straight alpha, and ``NAME_normal.png``."""
     import numpy as np
 
     from geosplat_jax.io.sheets import normals_to_rgb

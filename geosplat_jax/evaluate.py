@@ -6,7 +6,6 @@ Everything here runs on the host around `renderer.Renderer`.
 import importlib.metadata
 import json
 import platform
-import resource
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,13 +20,10 @@ from geosplat_jax.io.images import write_png
 from geosplat_jax.io.meshes import render_mesh_normals
 from geosplat_jax.io.sheets import normals_to_rgb, overview_sheet, shade_mesh_preview
 from geosplat_jax.io.views import Views
-from geosplat_jax.metrics import (
-    mask_iou,
-    normal_mae_deg,
-    psnr,
-    ssim,
-)
+from geosplat_jax.light_figures import light_figures
+from geosplat_jax.metrics import MASK_THRESHOLD, mask_iou, normal_mae_deg
 from geosplat_jax.model import Context, Params
+from geosplat_jax.process import peak_memory_mb
 from geosplat_jax.protocols import Protocol
 from geosplat_jax.renderer import (
     DEFAULT_SAMPLES,
@@ -43,17 +39,15 @@ _MATERIALS = ("roughness", "metallic")
 
 
 def _view_figures(view: RenderedView, image: np.ndarray, truth_normal: np.ndarray | None) -> dict:
-    """Figures of one view; ``image`` is (H, W, 4) linear with straight alpha."""
+    """Figures of one view; ``image`` is (H, W, 4) linear with straight alpha.
+
+    Figures of the mask's pixels are left out where it has none.
+    """
     mask = image[..., 3]
-    predicted = to_picture(over_background(view.rgb, view.alpha, 1.0))
-    wanted = to_picture(over_background(image[..., :3] * mask[..., None], mask, 1.0))
-    figures = {
-        "nvs.psnr": float(psnr(predicted, wanted)),
-        "nvs.ssim": float(ssim(predicted, wanted)),
-        "mask.iou": float(mask_iou(view.alpha, mask)),
-    }
+    figures = protocols.new_view_figures(view.rgb, view.alpha, image)
+    figures["mask.iou"] = float(mask_iou(view.alpha, mask))
     if truth_normal is not None:
-        for name in ("masked", "full"):
+        for name in ("masked", "full") if np.any(mask > MASK_THRESHOLD) else ("full",):
             figures[f"normal.mae_{name}_deg"] = float(
                 normal_mae_deg(
                     view.aovs["normal"], truth_normal, mask, view.alpha, full=name == "full"
@@ -96,22 +90,33 @@ def _relight_figures(
     lights: Mapping[str, EnvLight],
     albedo_scale: np.ndarray,
     indirect: str,
-) -> tuple[dict[str, float], dict[str, list[RenderedView]]]:
-    """Figures of the views under every light that has true images and a map, and the renders."""
+    chosen: np.ndarray,
+) -> tuple[dict[str, float], list[dict[str, np.ndarray]]]:
+    """Figures of the views under every light that has true images and a map, and rows of a sheet.
+
+    One light is in memory at a time, and of its renders only what is compared.
+    """
     figures: dict[str, float] = {}
-    renders: dict[str, list[RenderedView]] = {}
-    for name in sorted(set(views.relight) & set(lights)):
+    rows: list[dict[str, np.ndarray]] = [{} for _ in chosen]
+    names = sorted(set(views.relight) & set(lights))
+    for name in names:
         relit = renderer.relit(lights[name], albedo_scale=albedo_scale, indirect=indirect)
-        renders[name] = [relit(views.camera(np.array([i]))) for i in range(len(views))]
-        rgb = np.stack([view.rgb for view in renders[name]])
-        alpha = np.stack([view.alpha for view in renders[name]])
-        found = protocols.relight_figures(protocol, rgb, alpha, views.relight[name])
+        rgb, alpha = np.empty((*views.masks.shape, 3), np.float32), np.empty(views.masks.shape)
+        for index in range(len(views)):
+            view = relit(views.camera(np.array([index])))
+            rgb[index], alpha[index] = view.rgb, view.alpha
+        images = views.relight[name]
+        found = protocols.relight_figures(protocol, rgb, alpha, images)
         figures |= {f"relight.{name}.{key}": value for key, value in found.items()}
-    if renders:
+        for row, index in zip(rows, chosen, strict=True):
+            true, mask = images[index][..., :3], images[index][..., 3]
+            row[name] = to_picture(over_background(rgb[index], alpha[index], 1.0))
+            row[f"true {name}"] = to_picture(over_background(true * mask[..., None], mask, 1.0))
+    if names:
         for key in ("psnr", "ssim", "psnr_masked", "ssim_masked"):
-            values = [figures[f"relight.{name}.{key}"] for name in renders]
+            values = [figures[f"relight.{name}.{key}"] for name in names]
             figures[f"relight.mean.{key}"] = float(np.mean(values))
-    return figures, renders
+    return figures, rows if names else []
 
 
 def evaluate_run(
@@ -159,27 +164,31 @@ def evaluate_run(
         normal = views.truth["normal"][index] if "normal" in views.truth else None
         per_view.append({"view": name, **_view_figures(view, views.images[index], normal)})
         rendered.append(view)
-    names = [key for key in per_view[0] if key != "view"]
-    mean = {key: float(np.mean([line[key] for line in per_view])) for key in names}
+    names = dict.fromkeys(key for line in per_view for key in line if key != "view")
+    mean = {key: float(np.mean([line[key] for line in per_view if key in line])) for key in names}
     materials, scale = _material_figures(chosen_protocol, rendered, views)
+    chosen = np.unique(np.linspace(0, len(rendered) - 1, sheet_views).round().astype(int))
     relights, relit = _relight_figures(
-        chosen_protocol, renderer, views, lights or {}, scale, relight_indirect
+        chosen_protocol, renderer, views, lights or {}, scale, relight_indirect, chosen
     )
+    no_map = sorted(set(views.relight) - set(lights or {}))
+    notes = [protocols.lpips_note(chosen_protocol)]
+    notes += [f"{name}: images but no environment map, so no relit figures" for name in no_map]
     mean |= materials | relights
     radiance = np.asarray(params.light.radiance)
     if train_light is not None:
-        found = protocols.light_figures(radiance, np.asarray(train_light.radiance))
+        found = light_figures(radiance, np.asarray(train_light.radiance))
         mean |= {key: value for key, value in found.items() if isinstance(value, int | float)}
     figures = {
         "protocol": protocol,
-        "notes": [protocols.lpips_note(chosen_protocol)],
+        "notes": notes,
         "mean": mean,
         "views": per_view,
         "samples": samples,
         "samples_drawn": renderer.samples,
         "relight_indirect": relight_indirect,
         "seconds": round(time.perf_counter() - began, 2),
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
+        "peak_memory_mb": peak_memory_mb(),
         "versions": {
             "python": platform.python_version(),
             **{package: importlib.metadata.version(package) for package in _PACKAGES},
@@ -189,12 +198,11 @@ def evaluate_run(
         **meta,
     }
     (folder / "metrics.json").write_text(json.dumps(figures, indent=2) + "\n")
-    chosen = np.unique(np.linspace(0, len(rendered) - 1, sheet_views).round().astype(int))
     write_png(folder / "overview.png", _overview(renderer, radiance, views, rendered, chosen))
     if materials:
         write_png(folder / "materials.png", _materials_sheet(views, rendered, chosen, scale))
     if relit:
-        write_png(folder / "relight.png", _relight_sheet(views, relit, chosen))
+        write_png(folder / "relight.png", overview_sheet(relit))
     return figures
 
 
@@ -217,24 +225,6 @@ def _materials_sheet(
             else:
                 pair = tuple(np.clip(np.repeat(x, 3, axis=-1), 0, 1) for x in (found, true * mask))
             row[name], row[f"true {name}"] = pair
-        rows.append(row)
-    return overview_sheet(rows)
-
-
-def _relight_sheet(
-    views: Views, relit: Mapping[str, list[RenderedView]], chosen: np.ndarray
-) -> np.ndarray:
-    """Compose a sheet of relit views beside the truth."""
-    rows = []
-    for index in chosen:
-        row = {}
-        for name, renders in relit.items():
-            view, image = renders[index], views.relight[name][index]
-            mask = image[..., 3]
-            row[name] = to_picture(over_background(view.rgb, view.alpha, 1.0))
-            row[f"true {name}"] = to_picture(
-                over_background(image[..., :3] * mask[..., None], mask, 1.0)
-            )
         rows.append(row)
     return overview_sheet(rows)
 

@@ -161,7 +161,7 @@ def direction_to_uv(directions: Float[Array, "... 3"]) -> Float[Array, "... 2"]:
     return jnp.stack([0.5 - azimuth / (2 * np.pi), polar / np.pi], axis=-1)
 
 
-def z_up_to_y_up(directions: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+def to_y_up_map(directions: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
     """Turn z-up (Blender) directions into the y-up world whose lat-long map is the same image.
 
     In that world ``u = 0.5 + atan2(x, -z) / (2 pi)`` and ``v = acos(y) / pi``; the image of an
@@ -171,8 +171,8 @@ def z_up_to_y_up(directions: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
     return jnp.stack([-y, z, -x], axis=-1)
 
 
-def y_up_to_z_up(directions: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
-    """Invert `z_up_to_y_up`."""
+def from_y_up_map(directions: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+    """Invert `to_y_up_map`."""
     x, y, z = jnp.moveaxis(directions, -1, 0)
     return jnp.stack([-z, -x, y], axis=-1)
 

@@ -33,6 +33,16 @@ def retain_freed_memory() -> bool:
     return all(libc.mallopt(name, value) for name, value in _RETAINING.items())
 
 
+def peak_memory_mb() -> int:
+    """Largest resident memory of this process so far, MB; 0 where the system does not tell."""
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return 0
+    largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return largest // (1024 * 1024 if sys.platform == "darwin" else 1024)
+
+
 def _cpu_flags() -> str:
     """Return the features of the processor, where the system tells: compiled code needs them."""
     try:

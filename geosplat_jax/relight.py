@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from geosplat_jax.io.images import SceneError, read_image, write_png
-from geosplat_jax.io.movies import has_encoder, write_movie
+from geosplat_jax.io.images import SceneError, read_linear, write_png
+from geosplat_jax.io.movies import check_movie, has_encoder, write_movie
 from geosplat_jax.io.views import Views
 from geosplat_jax.light import lookup, rotate_light
-from geosplat_jax.protocols import resize_light
+from geosplat_jax.light_figures import resize_light
 from geosplat_jax.renderer import RenderedView, Renderer, straight_rgba, to_picture
 from geosplat_jax.scene import Camera, EnvLight
 
@@ -29,7 +29,7 @@ _lookup = jax.jit(lookup)
 
 
 def load_light(path: str | Path, *, largest: int = LARGEST_LIGHT) -> EnvLight:
-    """Read a lat-long environment map of linear radiance (HDR, EXR or any image).
+    """Read a lat-long environment map: linear radiance from HDR or EXR, sRGB from other images.
 
     The layout is that of `EnvLight`: z up, ``u = 0.5 - atan2(y, x) / (2 pi)``. Maps with more than
     ``largest`` rows are reduced by averaging over solid angle.
@@ -40,15 +40,13 @@ def load_light(path: str | Path, *, largest: int = LARGEST_LIGHT) -> EnvLight:
         If the file cannot be read, is not twice as wide as high, or holds negative or infinite
         radiance.
     """
-    pixels = read_image(path)
+    pixels = read_linear(path)
     if pixels.ndim != 3 or pixels.shape[-1] < 3 or pixels.shape[1] != 2 * pixels.shape[0]:
         raise SceneError(
             f"{path} has shape {pixels.shape}; an environment map is twice as wide as high and has "
             "three channels (a lat-long map)"
         )
     radiance = pixels[..., :3]
-    if not np.all(np.isfinite(radiance)) or np.any(radiance < 0):
-        raise SceneError(f"{path} holds radiance that is negative or not finite")
     if radiance.shape[0] > largest:
         radiance = resize_light(radiance, largest, 2 * largest)
     return EnvLight(jnp.asarray(radiance, jnp.float32))
@@ -123,6 +121,16 @@ class RelightOptions:
             return self.suffix
         return ".mp4" if has_encoder(".mp4") else ".gif"
 
+    def check(self) -> None:
+        """Refuse movies that could not be written, before anything is rendered.
+
+        Raises
+        ------
+        SceneError, MissingEncoderError : see `io.movies.check_movie`.
+        """
+        if self.turntable or self.rotate_env:
+            check_movie(self.movie_suffix(), self.frames_per_second)
+
 
 def relight_views(
     relit: Renderer, light: EnvLight, views: Views, folder: Path, options: RelightOptions
@@ -135,7 +143,12 @@ def relight_views(
     views : their cameras; the movies start from the first one.
     folder : existing; receives ``NAME_rgba.png`` with straight alpha, ``NAME.png`` over the
         background, ``turntable`` and ``rotate_env``.
+
+    Raises
+    ------
+    SceneError, MissingEncoderError : see `RelightOptions.check`.
     """
+    options.check()
     written = []
     for index, name in enumerate(views.names):
         camera = views.camera(np.array([index]))

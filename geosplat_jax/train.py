@@ -11,7 +11,6 @@ Everything here runs on the host around `step.train_step`. A run is a folder::
 
 import dataclasses
 import json
-import resource
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -38,6 +37,7 @@ from geosplat_jax.io.checkpoints import (
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.views import Views
 from geosplat_jax.model import Context, Model, Params
+from geosplat_jax.process import peak_memory_mb
 from geosplat_jax.render import visibility_usage
 from geosplat_jax.scene import Camera, Geometry, Grid
 from geosplat_jax.stages import (
@@ -470,7 +470,7 @@ def _record(
         "gaussians": int(report.loss.gaussian_count),
         "faces": int(report.loss.face_count),
         "seconds": round(seconds, 4),
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
+        "peak_memory_mb": peak_memory_mb(),
         "usage": usage_to_dict(report.loss.usage),
         "capacities": asdict(capacities),
     }

@@ -52,6 +52,7 @@ ORDER = [
     "stages",
     "train",
     "renderer",
+    "light_figures",
     "protocols",
     "evaluate",
     "relight",

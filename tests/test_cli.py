@@ -10,6 +10,7 @@ from support import TINY
 
 from geosplat_jax.cli import main
 from geosplat_jax.io.images import read_image
+from geosplat_jax.train import load_run
 
 DUCK = Path(__file__).resolve().parents[1] / "examples" / "duck"
 SETTINGS = [part for override in TINY for part in ("--set", override)]
@@ -69,7 +70,11 @@ def test_export_writes_assets_that_load(run, tmp_path, style):
     header = (tmp_path / "gaussians.ply").read_bytes()[:400].decode("ascii", "replace")
     assert header.startswith("ply")
     assert "f_dc_0" in header
-    assert read_image(tmp_path / "light.exr").shape == (8, 16, 3)
+    params = load_run(run)[1]
+    exposed = np.exp(float(params.log_exposure)) * np.asarray(params.light.radiance)
+    assert exposed.shape == (8, 16, 3)
+    assert float(params.log_exposure) != 0
+    np.testing.assert_allclose(read_image(tmp_path / "light.exr"), exposed, rtol=1e-5)
 
 
 @pytest.mark.slow

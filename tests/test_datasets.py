@@ -14,6 +14,7 @@ from geosplat_jax.io.images import (
     MissingFileError,
     SceneError,
     encode_srgb,
+    read_linear,
     write_exr,
     write_hdr,
     write_png,
@@ -358,9 +359,51 @@ def test_an_unreadable_image_is_named(blender):
         load(blender)
 
 
-def test_missing_test_views_are_named(blender):
+def test_a_capture_may_have_no_test_views(blender):
     (blender / "transforms_test.json").unlink()
-    with pytest.raises(MissingFileError, match=r"transforms_test\.json does not exist"):
+    dataset = load(blender)
+    assert len(dataset.test) == 0
+    assert len(dataset.train) > 0
+    assert dataset.test.images.shape[1:] == dataset.train.images.shape[1:]
+    assert any("no test views" in warning for warning in dataset.warnings)
+    assert "none" in describe(dataset)
+
+
+def test_missing_training_views_are_named(blender):
+    listing = (blender / "transforms_train.json").read_text().replace("r_0", "r_99")
+    (blender / "transforms_train.json").write_text(listing)
+    with pytest.raises(MissingFileError, match=r"r_99\.png or r_99\.jpg.* or r_99\.exr"):
+        load(blender)
+
+
+@pytest.mark.parametrize(
+    ("lens", "message"),
+    [
+        ({"k1": 0.1}, r"lens distortion \(k1\); undistort"),
+        ({"cx": 3.0, "w": SIZE}, "principal point of frame 0 .* -9.0 pixels off the centre"),
+        ({"fl_x": 10.0, "fl_y": 12.0}, "focal lengths 10.0 and 12.0"),
+    ],
+)
+def test_lenses_that_are_not_pinholes_are_refused(blender, lens, message):
+    path = blender / "transforms_train.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | lens))
+    with pytest.raises(SceneError, match=message):
+        load(blender)
+
+
+def test_a_plain_lens_may_be_spelled_out(blender):
+    path = blender / "transforms_train.json"
+    lens = {"k1": 0.0, "cx": SIZE / 2, "w": SIZE, "fl_x": 9.0, "fl_y": 9.0}
+    path.write_text(json.dumps(json.loads(path.read_text()) | lens))
+    assert len(load(blender).train) > 0
+
+
+def test_two_views_of_one_name_are_refused(blender):
+    path = blender / "transforms_train.json"
+    content = json.loads(path.read_text())
+    content["frames"].append(content["frames"][0])
+    path.write_text(json.dumps(content))
+    with pytest.raises(SceneError, match="1 image names stand for several views .* 'r_0'"):
         load(blender)
 
 
@@ -598,3 +641,17 @@ def test_real_scenes_load(name, layout, counts):
     assert dataset.warnings == ()
     lo, hi = dataset.bounds
     assert (hi - lo).max() < 3.0
+
+
+def test_truth_without_an_alpha_is_reduced_within_the_mask(scenes, tmp_path):
+    """Background that was averaged into the rim would turn its normals."""
+    root = shutil.copytree(scenes["shiny_blender"], tmp_path / "ball")
+    normal = np.array([0.6, 0.0, 0.8], np.float32)
+    for path in root.glob("test/*_normal.png"):
+        covered = read_linear(path.with_name(path.name.replace("_normal", "_alpha"))) > 0
+        shown = np.where(covered, 0.5 + 0.5 * normal, 0.0).astype(np.float32)
+        write_png(path, shown)
+    views = load(root, downscale=2).test
+    found = views.truth["normal"][views.images[..., 3] > 0]
+    assert len(found) > 20
+    np.testing.assert_allclose(found, np.broadcast_to(normal, found.shape), atol=0.01)

@@ -30,6 +30,7 @@ SAMPLES = 32
 SCALE = np.array([0.5, 0.8, 0.9])
 FIGURES = ("psnr", "ssim", "psnr_masked", "ssim_masked")
 LIGHT_NAMES = ("evening", "noon")
+NEW_VIEWS = {"nvs.psnr", "nvs.ssim", "nvs.psnr_masked", "nvs.ssim_masked", "mask.iou"}
 
 
 def sky(seed):
@@ -141,7 +142,7 @@ def test_every_documented_figure_is_there_and_is_a_number(perfect):
     expected |= {
         f"{name}.{key}" for name in ("roughness", "metallic") for key in ("mse", "mse_full")
     }
-    expected |= {"nvs.psnr", "nvs.ssim", "mask.iou"}
+    expected |= NEW_VIEWS
     assert expected <= set(mean)
     assert all(np.isfinite(value) for value in mean.values())
     for key in FIGURES:
@@ -170,7 +171,7 @@ def test_the_files_are_written(perfect):
 def test_without_truth_there_are_no_figures_of_it(run, views, tmp_path):
     bare = replace(views, truth={}, relight={})
     figures = evaluate(run, bare, tmp_path)
-    assert set(figures["mean"]) == {"nvs.psnr", "nvs.ssim", "mask.iou"}
+    assert set(figures["mean"]) == NEW_VIEWS
     assert {path.name for path in tmp_path.iterdir()} == {"metrics.json", "overview.png"}
 
 
@@ -184,7 +185,7 @@ def test_relit_truth_without_its_map_is_left_out(run, views, tmp_path):
 def test_a_part_of_the_truth_gives_its_part_of_the_figures(run, views, tmp_path):
     part = replace(views, truth={"roughness": views.truth["roughness"]}, relight={})
     mean = evaluate(run, part, tmp_path)["mean"]
-    assert set(mean) == {"nvs.psnr", "nvs.ssim", "mask.iou", "roughness.mse", "roughness.mse_full"}
+    assert set(mean) == NEW_VIEWS | {"roughness.mse", "roughness.mse_full"}
     # Without a true albedo nothing is scaled.
     assert "albedo.scale_r" not in mean
 
@@ -224,6 +225,18 @@ def test_protocols_change_their_looks_and_nothing_else(run, views, perfect, tmp_
     for mean in by_name.values():
         assert mean["albedo.psnr"] > 45
         np.testing.assert_allclose([mean[f"albedo.scale_{c}"] for c in "rgb"], SCALE, rtol=1e-3)
+
+
+def test_a_view_without_an_object_has_no_part_in_masked_figures(run, views, tmp_path):
+    images = np.array(views.images)
+    images[1] = 0.0
+    figures = evaluate(run, replace(views, images=images, relight={}), tmp_path)
+    with_object, empty = figures["views"]
+    masked = {key for key in with_object if "masked" in key}
+    assert masked == {"nvs.psnr_masked", "nvs.ssim_masked", "normal.mae_masked_deg"}
+    assert not masked & set(empty)
+    for key in masked:
+        assert figures["mean"][key] == with_object[key]
 
 
 def test_an_unknown_protocol_is_refused_before_any_work(run, views, tmp_path):

@@ -133,7 +133,7 @@ def test_glb_material_is_opaque_and_single_sided_when_closed(textured):
 
 def test_world_up_becomes_gltf_up():
     np.testing.assert_array_equal(
-        meshes.z_up_to_y_up(np.eye(3)), [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+        meshes.to_gltf_axes(np.eye(3)), [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
     )
 
 
@@ -152,6 +152,18 @@ def test_vertex_colors_are_linear_floats(tmp_path):
     written = np.ravel(mesh.vertex_attributes["_ROUGHNESS"])
     np.testing.assert_allclose(written, roughness, atol=1e-6)
     assert mesh.visual.material.roughnessFactor == pytest.approx(np.median(roughness), abs=1e-6)
+
+
+@pytest.mark.parametrize("sign", [1, -1], ids=["outward", "inward"])
+def test_normals_of_a_turned_mesh_look_outward(tmp_path, sign):
+    vertices, faces, normals = sphere(1)
+    inside_out = faces[:, ::-1]
+    path = tmp_path / "in.glb"
+    export.export_mesh_glb(
+        path, vertices, inside_out, sign * normals, materials, vertex_colors=True
+    )
+    mesh = only_mesh(path)
+    assert np.all(np.sum(mesh.vertex_normals * mesh.vertices, axis=-1) > 0)
 
 
 def test_inside_out_meshes_are_turned_and_open_ones_are_double_sided(tmp_path):

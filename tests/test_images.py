@@ -209,3 +209,32 @@ def test_a_failed_write_keeps_the_previous_file(tmp_path, monkeypatch):
 def test_writing_makes_the_folder(tmp_path):
     write_png(tmp_path / "new" / "deep" / "a.png", np.ones((1, 1, 3), np.float32))
     assert read_image(tmp_path / "new" / "deep" / "a.png").shape == (1, 1, 3)
+
+
+def _write_exr(path, pixels, names, *, frame=None):
+    """Write an EXR with channels of any name, as a part of a larger frame if one is given."""
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, oiio.FLOAT)
+    spec.channelnames = names
+    if frame is not None:
+        spec.full_width, spec.full_height = frame
+    sink = oiio.ImageOutput.create(str(path))
+    assert sink.open(str(path), spec)
+    assert sink.write_image(pixels)
+    assert sink.close()
+
+
+def test_a_fourth_channel_that_is_no_alpha_is_refused(tmp_path):
+    pixels = np.full((4, 6, 4), 0.5, np.float32)
+    _write_exr(tmp_path / "depth.exr", pixels, ("R", "G", "B", "Z"))
+    with pytest.raises(ImageReadError, match="channels R, G, B, Z, of which the last is no alpha"):
+        read_linear(tmp_path / "depth.exr")
+    _write_exr(tmp_path / "alpha.exr", pixels, ("R", "G", "B", "A"))
+    np.testing.assert_allclose(read_linear(tmp_path / "alpha.exr")[..., :3], 1.0)
+
+
+def test_a_part_of_a_frame_is_refused(tmp_path):
+    pixels = np.full((4, 6, 3), 0.5, np.float32)
+    _write_exr(tmp_path / "part.exr", pixels, ("R", "G", "B"), frame=(12, 8))
+    with pytest.raises(ImageReadError, match=r"the part \(0, 0, 6, 4\) .* frame \(0, 0, 12, 8\)"):
+        read_linear(tmp_path / "part.exr")

@@ -10,6 +10,7 @@ from geosplat_jax.light import (
     LightSpec,
     direction_to_uv,
     downsample_light,
+    from_y_up_map,
     ggx_lobe,
     init_light,
     level_of_roughness,
@@ -21,8 +22,7 @@ from geosplat_jax.light import (
     prefiltered_specular,
     rotate_light,
     texel_solid_angles,
-    y_up_to_z_up,
-    z_up_to_y_up,
+    to_y_up_map,
 )
 from geosplat_jax.scene import EnvLight
 
@@ -101,13 +101,13 @@ def test_uv_follows_the_z_up_convention():
 
 def test_y_up_and_z_up_worlds_share_the_image():
     directions = _unit(500, seed=1)
-    rotated = z_up_to_y_up(jnp.asarray(directions, jnp.float32))
+    rotated = to_y_up_map(jnp.asarray(directions, jnp.float32))
     x, y, z = np.asarray(rotated, np.float64).T
     np.testing.assert_array_equal(rotated[:, 0], -jnp.asarray(directions[:, 1], jnp.float32))
     u = 0.5 + np.arctan2(x, -z) / (2 * np.pi)
     v = np.arccos(np.clip(y, -1, 1)) / np.pi
     np.testing.assert_allclose(np.stack(_reference_uv(directions)), [u, v], atol=ROUNDING)
-    np.testing.assert_array_equal(y_up_to_z_up(rotated), directions.astype(np.float32))
+    np.testing.assert_array_equal(from_y_up_map(rotated), directions.astype(np.float32))
 
 
 def test_texel_directions_invert_uv_and_read_their_own_texel():

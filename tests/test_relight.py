@@ -273,9 +273,23 @@ def test_a_map_that_cannot_be_an_environment_is_refused(tmp_path):
 def test_radiance_that_is_not_radiance_is_refused(tmp_path, monkeypatch, value):
     pixels = np.ones((4, 8, 3), np.float32)
     pixels[1, 2, 0] = value
-    monkeypatch.setattr("geosplat_jax.relight.read_image", lambda path: pixels)
-    with pytest.raises(SceneError, match="negative or not finite"):
-        load_light(tmp_path / "any.hdr")
+    path = tmp_path / "any.exr"
+    monkeypatch.setattr("geosplat_jax.io.images.read_image", lambda path: pixels.copy())
+    with pytest.raises(SceneError, match=r"any\.exr has 1 .*values.* row 1, column 2, channel 0"):
+        load_light(path)
+
+
+def test_an_image_of_eight_bits_is_taken_as_srgb(tmp_path):
+    write_png(tmp_path / "grey.png", np.full((4, 8, 3), 0.5, np.float32))
+    found = load_light(tmp_path / "grey.png").radiance
+    np.testing.assert_allclose(found, (0.502 + 0.055) ** 2.4 / 1.055**2.4, atol=1e-3)
+
+
+def test_movies_that_cannot_be_written_are_refused_before_anything_is_rendered(tmp_path):
+    options = RelightOptions(turntable=3, suffix=".gif", frames_per_second=60.0)
+    with pytest.raises(SceneError, match="50 frames per second, got 60"):
+        options.check()
+    replace(options, turntable=0).check()
 
 
 def test_the_orbit_goes_counter_clockwise_and_keeps_distance_and_view():

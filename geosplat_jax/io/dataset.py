@@ -19,7 +19,7 @@ from geosplat_jax.io.nerf_synthetic import (
 )
 from geosplat_jax.io.synthetic4relight import is_synthetic4relight, list_synthetic4relight
 from geosplat_jax.io.tensoir import is_tensoir, list_tensoir
-from geosplat_jax.io.views import COVERED, Views, load_views
+from geosplat_jax.io.views import COVERED, Views, load_views, no_views
 
 
 class Layout(NamedTuple):
@@ -54,7 +54,6 @@ class Dataset:
     train, test : views.
     lights : environment maps found on disk, by light (lat-long in the z-up world, see `EnvLight`).
     train_light : light of the training images, where the layout names lights.
-    background : ``white`` or ``black``, what the usual evaluation composites on.
     bounds : lo (3,) and hi (3,), a world box around the object.
     warnings : what looks wrong but does not stop the work.
     """
@@ -66,7 +65,6 @@ class Dataset:
     test: Views
     lights: Mapping[str, Path]
     train_light: str | None
-    background: str
     bounds: tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
     warnings: tuple[str, ...] = ()
 
@@ -111,6 +109,10 @@ def load_dataset(
         ("test", listing.test, test_views),
     ):
         chosen = _spread(frames, limit, f"{split}_views")
+        if not chosen and split == "test":
+            warnings.append("there are no test views; nothing can be evaluated")
+            splits.append(no_views(splits[0]))
+            continue
         views, problems = load_views(chosen, factor=downscale, listing=listing)
         _check_masks(views, split, warnings)
         warnings += [f"{split}: {problem}" for problem in problems]
@@ -127,7 +129,6 @@ def load_dataset(
         test=test,
         lights=listing.lights,
         train_light=listing.train_light,
-        background=listing.background,
         bounds=box,
         warnings=tuple(warnings),
     )
@@ -187,6 +188,9 @@ def describe(dataset: Dataset) -> str:
     """Summarise a dataset as lines of text."""
     lines = [f"{dataset.name}: {dataset.layout} scene in {dataset.root}"]
     for split, views in (("train", dataset.train), ("test", dataset.test)):
+        if not len(views):
+            lines.append(f"  {split + ':':<12}none")
+            continue
         coverage = views.masks.mean((1, 2))
         lines.append(
             f"  {split + ':':<12}{len(views)} views of {views.width} x {views.height}, mask covers "
@@ -201,7 +205,6 @@ def describe(dataset: Dataset) -> str:
     lines.append(f"  {'maps:':<12}{maps or 'none found'}")
     lo, hi = dataset.bounds
     lines.append(f"  {'bounds:':<12}{_numbers(lo)} to {_numbers(hi)}, size {_numbers(hi - lo)}")
-    lines.append(f"  {'background:':<12}{dataset.background}")
     lines += [f"  warning: {warning}" for warning in dataset.warnings]
     return "\n".join(lines)
 

@@ -24,8 +24,8 @@ from geosplat_jax.io.meshes import (
     nondegenerate,
     rasterize_charts,
     signed_volume,
+    to_gltf_axes,
     unwrap,
-    z_up_to_y_up,
 )
 
 SampleMaterials = Callable[[Float[np.ndarray, "N 3"]], tuple[Any, Any, Any]]
@@ -78,6 +78,12 @@ def _textures(materials: Float[np.ndarray, "S S 5"]) -> tuple[Image.Image, Image
     return Image.fromarray(base_color), Image.fromarray(_to_bytes(packed))
 
 
+def _agrees(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> bool:
+    """Whether normals lie on the side that the faces look to, by area."""
+    a, b, c = np.moveaxis(np.asarray(vertices, np.float64)[faces], 1, 0)
+    return bool(np.sum(np.cross(b - a, c - a) * normals[faces].sum(1)) >= 0)
+
+
 def _checked_mesh(
     vertices: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
@@ -101,6 +107,8 @@ def _checked_mesh(
     flipped = closed and signed_volume(vertices, kept) < 0
     if flipped:
         kept = kept[:, ::-1]
+        # Normals made from the faces point inward with them; those that were right stay.
+        normals = np.where(_agrees(vertices, kept, normals), normals, -normals)
     used, rows = np.unique(kept, return_inverse=True)
     info = {"dropped_faces": len(faces) - len(kept), "closed": closed, "flipped": flipped}
     return vertices[used], rows.reshape(-1, 3).astype(np.int32), normals[used], info
@@ -143,9 +151,9 @@ def _vertex_colored(
         doubleSided=double_sided,
     )
     return trimesh.Trimesh(
-        z_up_to_y_up(vertices),
+        to_gltf_axes(vertices),
         faces,
-        vertex_normals=z_up_to_y_up(normals),
+        vertex_normals=to_gltf_axes(normals),
         visual=TextureVisuals(material=material),
         vertex_attributes={
             "_COLOR_0": materials[:, :3],
@@ -187,9 +195,9 @@ def _textured(
     # trimesh keeps OpenGL's v upwards and flips it when it writes glTF, whose v runs down.
     uv = charts.uv * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)
     mesh = trimesh.Trimesh(
-        z_up_to_y_up(vertices[charts.vertex_rows]),
+        to_gltf_axes(vertices[charts.vertex_rows]),
         charts.faces,
-        vertex_normals=z_up_to_y_up(normals[charts.vertex_rows]),
+        vertex_normals=to_gltf_axes(normals[charts.vertex_rows]),
         visual=TextureVisuals(uv=uv, material=material),
         process=False,
     )

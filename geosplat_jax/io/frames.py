@@ -21,6 +21,10 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff")
 MAP_SUFFIXES = (".hdr", ".exr")
 
 _RIGID_TOLERANCE = 1e-3
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_CENTER_TOLERANCE = 1.0
+"""Pixels that a principal point may lie off the middle of the image."""
+_FOCAL_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,6 @@ class Listing:
     lights : environment maps that were found, by light.
     train_light : the light of the training images, where the layout names lights.
     albedo_is_srgb : how the albedo files encode their values.
-    background : what the layout's evaluation composites on, ``white`` or ``black``.
     """
 
     train: tuple[Frame, ...]
@@ -65,7 +68,6 @@ class Listing:
     lights: Mapping[str, Path] = field(default_factory=dict)
     train_light: str | None = None
     albedo_is_srgb: bool = True
-    background: str = "white"
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -114,12 +116,36 @@ def read_transforms(path: Path) -> list[tuple[str, np.ndarray, float]]:
         file_path = require(frame, "file_path", where)
         if not isinstance(file_path, str) or not file_path:
             raise SceneError(f"'file_path' of {where} must be a name, got {file_path!r}")
+        _require_plain_lens({**content, **frame}, where)
         angle = frame.get("camera_angle_x", shared_angle)
         if angle is None:
             require(content, "camera_angle_x", path)
         pose = checked_pose(require(frame, "transform_matrix", where), where)
         listed.append((file_path, pose, checked_angle(angle, where)))
     return listed
+
+
+def _require_plain_lens(lens: Mapping[str, Any], where: str) -> None:
+    """Refuse lenses that `Frame` cannot hold: distorted, off centre, or with unequal focals."""
+    bent = [key for key in _DISTORTION if lens.get(key, 0)]
+    if bent:
+        raise SceneError(f"{where} has lens distortion ({', '.join(bent)}); undistort the images")
+    for center, size in (("cx", "w"), ("cy", "h")):
+        if center in lens and size in lens:
+            off = float(lens[center]) - 0.5 * float(lens[size])
+            if abs(off) > _CENTER_TOLERANCE:
+                raise SceneError(
+                    f"the principal point of {where} is {off:+.1f} pixels off the centre "
+                    f"({center} = {lens[center]}, {size} = {lens[size]}); crop the images to be "
+                    "centred"
+                )
+    if "fl_x" in lens and "fl_y" in lens:
+        ratio = float(lens["fl_y"]) / float(lens["fl_x"])
+        if abs(ratio - 1.0) > _FOCAL_TOLERANCE:
+            raise SceneError(
+                f"{where} has focal lengths {lens['fl_x']} and {lens['fl_y']}; resample the images "
+                "to square pixels"
+            )
 
 
 def checked_angle(angle: Any, where: str) -> float:

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -78,6 +79,7 @@ def read_image(path: str | Path) -> Float[np.ndarray, "H W C"]:
     if source is None:
         raise ImageReadError(f"{path} is not a readable image ({_last_error()}); replace the file")
     try:
+        layout = _layout(source.spec())
         pixels = source.read_image(format=oiio.FLOAT)
         problem = source.geterror()
     finally:
@@ -86,7 +88,41 @@ def read_image(path: str | Path) -> Float[np.ndarray, "H W C"]:
         raise ImageReadError(
             f"{path} is damaged or truncated ({problem.strip()}); replace the file"
         )
+    _require_plain(layout, path)
     return np.ascontiguousarray(pixels, np.float32)
+
+
+class _Layout(NamedTuple):
+    """Names of the channels, which of them is alpha, and windows as (x, y, width, height)."""
+
+    channels: tuple[str, ...]
+    alpha: int
+    shown: tuple[int, int, int, int]
+    whole: tuple[int, int, int, int]
+
+
+def _layout(spec: oiio.ImageSpec) -> _Layout:
+    return _Layout(
+        tuple(spec.channelnames),
+        spec.alpha_channel,
+        (spec.x, spec.y, spec.width, spec.height),
+        (spec.full_x, spec.full_y, spec.full_width, spec.full_height),
+    )
+
+
+def _require_plain(layout: _Layout, path: Path) -> None:
+    """Refuse a last channel that is no alpha, and an image that shows a part of its frame only."""
+    count = len(layout.channels)
+    if count in (2, 4) and layout.alpha != count - 1:
+        raise ImageReadError(
+            f"{path} has the channels {', '.join(layout.channels)}, of which the last is no "
+            "alpha; write grey, RGB, or either with alpha"
+        )
+    if layout.shown != layout.whole:
+        raise ImageReadError(
+            f"{path} holds the part {layout.shown} (x, y, width, height) of a frame "
+            f"{layout.whole}; write the whole frame"
+        )
 
 
 def read_linear(path: str | Path, *, is_srgb: bool | None = None) -> Float[np.ndarray, "H W C"]:

@@ -110,7 +110,7 @@ def surface_area(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3
     return float(0.5 * np.sqrt((np.cross(b - a, c - a) ** 2).sum(-1)).sum())
 
 
-def z_up_to_y_up(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+def to_gltf_axes(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
     """Turn positions or normals of the z-up world into glTF's y-up axes: (x, z, -y)."""
     return np.stack([vectors[:, 0], vectors[:, 2], -vectors[:, 1]], axis=-1)
 

@@ -150,13 +150,7 @@ def _feed(process: subprocess.Popen[bytes], frames: list[UInt8[np.ndarray, "H W 
 
 
 def _write_mp4(path: Path, frames: list[UInt8[np.ndarray, "H W 3"]], rate: float) -> None:
-    encoder = shutil.which(_ENCODER)
-    if encoder is None:
-        raise MissingEncoderError(
-            f"writing {path.name} needs the program {_ENCODER}, which is not on the PATH; install "
-            f"it (for instance `apt install {_ENCODER}` or `brew install {_ENCODER}`), or write "
-            f"{path.stem}.gif instead"
-        )
+    encoder = shutil.which(_ENCODER) or _ENCODER
     height, width, _ = _even(frames[0]).shape
     # Messages go to a file: a full pipe would stop the encoder while frames are being written.
     with written_aside(path) as aside, tempfile.TemporaryFile() as messages:
@@ -177,6 +171,30 @@ def _write_mp4(path: Path, frames: list[UInt8[np.ndarray, "H W 3"]], rate: float
                 f"cannot write {path}: {_ENCODER} ended with status {process.returncode} "
                 f"({said or 'no message'}); check that it has libx264, or write a .gif instead"
             )
+
+
+def check_movie(suffix: str, frames_per_second: float | int) -> None:
+    """Refuse a kind of movie, or a rate, that cannot be written here.
+
+    Raises
+    ------
+    SceneError : an unknown suffix, an unusable rate.
+    MissingEncoderError : MP4 without ``ffmpeg``.
+    """
+    if suffix not in FORMATS:
+        raise SceneError(f"a movie must end in {' or '.join(FORMATS)}, got {suffix!r}")
+    fastest = _MAX_GIF_RATE if suffix == ".gif" else _MAX_MP4_RATE
+    if not _MIN_RATE <= frames_per_second <= fastest:
+        raise SceneError(
+            f"{suffix} movies have {_MIN_RATE:g} to {fastest:g} frames per second, got "
+            f"{frames_per_second}"
+        )
+    if suffix == ".mp4" and shutil.which(_ENCODER) is None:
+        raise MissingEncoderError(
+            f"writing .mp4 needs the program {_ENCODER}, which is not on the PATH; install it "
+            f"(for instance `apt install {_ENCODER}` or `brew install {_ENCODER}`), or write .gif "
+            "instead"
+        )
 
 
 def write_movie(
@@ -207,13 +225,6 @@ def write_movie(
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix not in FORMATS:
-        raise SceneError(f"a movie must end in {' or '.join(FORMATS)}, got {path.name}")
-    fastest = _MAX_GIF_RATE if suffix == ".gif" else _MAX_MP4_RATE
-    if not _MIN_RATE <= frames_per_second <= fastest:
-        raise SceneError(
-            f"{suffix} movies have {_MIN_RATE:g} to {fastest:g} frames per second, got "
-            f"{frames_per_second}"
-        )
+    check_movie(suffix, frames_per_second)
     write = _write_gif if suffix == ".gif" else _write_mp4
     write(path, _checked(frames), float(frames_per_second))

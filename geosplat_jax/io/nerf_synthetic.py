@@ -67,13 +67,15 @@ def _list(root: Path, light: str | None, *, has_maps: bool) -> Listing:
 
 def _frames(root: Path, split: str, *, has_maps: bool) -> tuple[Frame, ...]:
     where = root / f"transforms_{split}.json"
+    if split == "test" and not where.exists():
+        return ()
     frames = []
     for file_path, pose, angle in read_transforms(where):
         stem = image_stem(root, file_path, where)
         candidates = [stem.with_name(stem.name + suffix) for suffix in IMAGE_SUFFIXES]
         asked = inside_scene(root, file_path, where)
         image = existing(
-            root, [asked] if asked != stem else candidates[:3], f"{file_path} of {where.name}"
+            root, [asked] if asked != stem else candidates, f"{file_path} of {where.name}"
         )
         maps = {}
         if has_maps:

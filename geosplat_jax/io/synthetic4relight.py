@@ -51,6 +51,8 @@ def list_synthetic4relight(root: Path, *, light: str | None = None) -> Listing:
 def _listed(root: Path, split: str):
     """Yield stem, pose and angle; a file path may or may not end in ``_rgb`` or ``_rgba``."""
     where = root / f"transforms_{split}.json"
+    if split == "test" and not where.exists():
+        return
     for file_path, pose, angle in read_transforms(where):
         stem = image_stem(root, file_path, where)
         ending = next((end for end in _ENDINGS if stem.name.endswith(end)), "")

@@ -80,7 +80,7 @@ def _views(root: Path, split: str) -> list[tuple[Path, np.ndarray, float]]:
             for file_path, pose, angle in read_transforms(transforms)
         ]
     folders = [folder for folder in _folders(root) if folder.name.startswith(f"{split}_")]
-    if not folders:
+    if not folders and split == "train":
         raise SceneError(
             f"{root} has neither {transforms.name} nor folders {split}_000, {split}_001, ...; "
             "check the scene folder is complete"

@@ -6,6 +6,7 @@ training never touches them.
 """
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -41,7 +42,7 @@ class Views:
     images : (V, H, W, 4) float32 linear RGB, straight alpha; colour is zero where alpha is.
     truth : (V, H, W, C) by ``albedo`` (linear), ``normal`` (unit, world), ``roughness``,
         ``metallic``; zero on the background.
-    relight : (V, H, W, 4) linear, by light.
+    relight : (V, H, W, 4) linear, by light; read anew each time, since they are large.
     """
 
     names: tuple[str, ...]
@@ -87,6 +88,11 @@ class Views:
         )
 
 
+def no_views(like: Views) -> Views:
+    """Return a split without views, of the same image size."""
+    return Views((), like.camera_to_world[:0], like.intrinsics[:0], like.images[:0])
+
+
 def load_views(
     frames: Sequence[Frame], *, factor: int, listing: Listing
 ) -> tuple[Views, list[str]]:
@@ -96,6 +102,7 @@ def load_views(
     ------
     MissingFileError, SceneError : see `load_dataset`.
     """
+    _require_distinct([frame.name for frame in frames])
     first = _read_frame(frames[0], factor)
     images = np.empty((len(frames), *first.pixels.shape), np.float32)
     problems = []
@@ -135,17 +142,31 @@ def load_views(
     return views, problems
 
 
-class _FirstUse(Mapping[str, np.ndarray]):
-    """A mapping whose values are computed when first asked for, and then kept."""
+def _require_distinct(names: Sequence[str]) -> None:
+    """Refuse two views of one name: what is written of one would overwrite the other."""
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise SceneError(
+            f"{len(twice)} image names stand for several views of a split, the first "
+            f"{twice[0]!r}; rename the files, folders do not tell them apart"
+        )
 
-    def __init__(self, makers: dict[str, Callable[[], np.ndarray]]):
+
+class _OnDemand(Mapping[str, np.ndarray]):
+    """A mapping whose values are read when they are asked for, and kept only where that is said."""
+
+    def __init__(self, makers: dict[str, Callable[[], np.ndarray]], *, keeps: bool):
         self._makers = makers
+        self._keeps = keeps
         self._made: dict[str, np.ndarray] = {}
 
     def __getitem__(self, key: str) -> np.ndarray:
-        if key not in self._made:
-            self._made[key] = self._makers[key]()
-        return self._made[key]
+        if key in self._made:
+            return self._made[key]
+        made = self._makers[key]()
+        if self._keeps:
+            self._made[key] = made
+        return made
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._makers)
@@ -161,6 +182,12 @@ class _Read(NamedTuple):
 
 def _read_frame(frame: Frame, factor: int) -> _Read:
     """Read one view as linear RGBA and reduce it."""
+    rgba = _read_rgba(frame)
+    return _Read(downscale(rgba, factor), rgba.shape[:2])
+
+
+def _read_rgba(frame: Frame) -> np.ndarray:
+    """Read one view as linear RGBA, as large as it is."""
     pixels = _as_rgba_or_rgb(read_linear(frame.image))
     rgb, alpha = pixels[..., :3], pixels[..., 3:]
     if frame.mask is not None and (alpha.size == 0 or alpha.min() == 1.0):
@@ -174,12 +201,13 @@ def _read_frame(frame: Frame, factor: int) -> _Read:
     if alpha.size == 0:
         raise SceneError(
             f"{frame.image} has no alpha channel and there is no mask file beside it; the object "
-            "must be cut out: write RGBA images, or add masks as the layout names them"
+            "must be cut out: write RGBA images, or add masks as the layout names them (NAME_alpha"
+            ".png beside NAME.jpg for transforms of Blender, NAME_mask.png for Synthetic4Relight)"
         )
     if alpha.max() > 1.0 + 1e-3:
         raise SceneError(f"the alpha of {frame.image} must be in [0, 1], got {alpha.max()}")
     rgba = np.concatenate([np.where(alpha > 0.0, rgb, 0.0), np.minimum(alpha, 1.0)], -1)
-    return _Read(downscale(rgba.astype(np.float32), factor), rgba.shape[:2])
+    return rgba.astype(np.float32)
 
 
 def _as_rgba_or_rgb(pixels: np.ndarray) -> np.ndarray:
@@ -199,16 +227,24 @@ def _truth(
     def maker(key: str) -> Callable[[], np.ndarray]:
         def read(index: int) -> np.ndarray:
             is_srgb = albedo_is_srgb and key == "albedo"
-            return _read_truth(frames[index].truth[key], key, images[index], factor, is_srgb)
+            return _read_truth(frames[index], key, images[index], factor, is_srgb)
 
         return lambda: np.stack(_in_parallel(read, range(len(frames))))
 
     listed = [frame.truth for frame in frames]
-    return _FirstUse({key: maker(key) for key in _in_all(listed, "ground truth", problems)})
+    keys = _in_all(listed, "ground truth", problems)
+    return _OnDemand({key: maker(key) for key in keys}, keeps=True)
 
 
-def _read_truth(path: Path, key: str, image: np.ndarray, factor: int, is_srgb: bool) -> np.ndarray:
+def _read_truth(
+    frame: Frame, key: str, image: np.ndarray, factor: int, is_srgb: bool
+) -> np.ndarray:
+    path = frame.truth[key]
     pixels = _as_rgba_or_rgb(read_linear(path, is_srgb=is_srgb))
+    if factor > 1 and pixels.shape[-1] == 3:
+        # Without an alpha of its own, the background would be averaged into the rim.
+        alpha = _same_size(_read_rgba(frame), pixels, frame.image)[..., 3:]
+        pixels = np.concatenate([pixels, alpha], -1)
     if key == "normal":
         pixels[..., :3] = 2.0 * pixels[..., :3] - 1.0
     values = _same_size(downscale(pixels, factor), image, path)[..., : TRUTH_CHANNELS[key]]
@@ -235,7 +271,8 @@ def _relight(
         return lambda: np.stack(_in_parallel(read, range(len(frames))))
 
     listed = [frame.relight for frame in frames]
-    return _FirstUse({light: maker(light) for light in _in_all(listed, "light", problems)})
+    keys = _in_all(listed, "light", problems)
+    return _OnDemand({light: maker(light) for light in keys}, keeps=False)
 
 
 def _in_all(listed: list[Mapping[str, Path]], what: str, problems: list[str]) -> list[str]:
