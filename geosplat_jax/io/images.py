@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -101,7 +101,8 @@ class _Layout(NamedTuple):
     whole: tuple[int, int, int, int]
 
 
-def _layout(spec: oiio.ImageSpec) -> _Layout:
+def _layout(spec: Any) -> _Layout:
+    """Copy what is needed of the library's specification of an image."""
     return _Layout(
         tuple(spec.channelnames),
         spec.alpha_channel,
