@@ -22,7 +22,7 @@ SCENE = Path(__file__).resolve().parents[1] / "examples" / "duck"
 
 
 def main() -> None:
-    """Run the demo; five to six minutes on two cores."""
+    """Run the demo; about ten minutes on two cores."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=Path("demo"))
     arguments = parser.parse_args()
