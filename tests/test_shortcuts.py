@@ -74,7 +74,7 @@ def test_every_shortcut_differs_from_the_run_and_the_reference_has_none():
     exact = shortcuts.without_shortcuts(model.model)
     assert exact.transport.is_traced
     assert not exact.transport.is_denoised
-    assert not exact.cull_backfaces
+    assert exact.cull_backfaces == model.model.cull_backfaces
     models = shortcuts.shortcuts(make_config().stage(2).model)
     assert len(set(models.values())) == len(models)
     assert shortcuts.without_shortcuts(model.model) not in models.values()
