@@ -77,4 +77,5 @@ def test_every_shortcut_differs_from_the_run_and_the_reference_has_none():
     assert exact.cull_backfaces == model.model.cull_backfaces
     models = shortcuts.shortcuts(make_config().stage(2).model)
     assert len(set(models.values())) == len(models)
-    assert shortcuts.without_shortcuts(model.model) not in models.values()
+    # With other seeds, this row shows what chance alone does.
+    assert models["16 samples"] == exact
