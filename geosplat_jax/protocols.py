@@ -298,6 +298,21 @@ def _compare(
     return figures
 
 
+def _compare_images(
+    rgb: np.ndarray, alpha: np.ndarray, image: np.ndarray, look: Look
+) -> dict[str, float]:
+    """Compare premultiplied renders with straight RGBA images, (V, H, W, 3 and 4)."""
+    _require(alpha.shape, alpha=alpha, rgb=(rgb, 3), image=(image, 4))
+    return _compare(
+        (_straight(color, drawn) for color, drawn in zip(rgb, alpha, strict=True)),
+        alpha,
+        image[..., :3],
+        image[..., 3],
+        look=look,
+        is_pooled=False,
+    )
+
+
 def new_view_figures(
     rgb: Float[np.ndarray, "..."],
     alpha: Float[np.ndarray, "..."],
@@ -320,15 +335,7 @@ def new_view_figures(
     ------
     ValueError : shapes that do not agree, values that are not finite.
     """
-    _require((1, *alpha.shape), alpha=alpha[None], rgb=(rgb[None], 3), image=(image[None], 4))
-    figures = _compare(
-        [_straight(rgb, alpha)],
-        alpha[None],
-        [image[..., :3]],
-        image[None, ..., 3],
-        look=NEW_VIEWS,
-        is_pooled=False,
-    )
+    figures = _compare_images(rgb[None], alpha[None], image[None], NEW_VIEWS)
     return {f"nvs.{name}": value for name, value in figures.items()}
 
 
@@ -445,13 +452,6 @@ def relight_figures(
     ------
     ValueError : shapes that do not agree, values that are not finite, no object in the views.
     """
-    _require(alpha.shape, alpha=alpha, rgb=(rgb, 3), image=(image, 4))
+    figures = _compare_images(rgb, alpha, image, protocol.relight)
     _require_object(image[..., 3] > MASK_THRESHOLD)
-    return _compare(
-        (_straight(color, drawn) for color, drawn in zip(rgb, alpha, strict=True)),
-        alpha,
-        image[..., :3],
-        image[..., 3],
-        look=protocol.relight,
-        is_pooled=False,
-    )
+    return figures
