@@ -245,8 +245,9 @@ def compare(found: Estimates, exact: Estimates) -> dict[str, Any]:
 def bias_text(bias: dict[str, float], *, decibels: bool) -> str:
     """Write a bias, or the most that it could be where it does not exceed twice its error."""
     is_chance = bias["squared"] <= 2 * bias["error"]
-    squared = bias["squared"] + 2 * bias["error"] if is_chance else bias["squared"]
-    squared = max(squared, 1e-30)
+    squared = bias["squared"]
+    if is_chance:
+        squared = max(squared, 0.0) + 2 * bias["error"]
     if decibels:
         return f"{'> ' * is_chance}{_decibels(squared):.1f}"
     return f"{'< ' * is_chance}{math.sqrt(squared):.2f}"
