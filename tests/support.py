@@ -100,7 +100,6 @@ def sphere_dataset(**kwargs):
         test=views,
         lights={},
         train_light=None,
-        background="white",
         bounds=(np.full(3, -0.6), np.full(3, 0.6)),
     )
 
