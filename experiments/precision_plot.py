@@ -15,15 +15,14 @@ import numpy as np
 from geosplat_jax import hashgrid
 from geosplat_jax.capacity import Capacities
 from geosplat_jax.config import Config
-from geosplat_jax.evaluate import Renderer, over_background
 from geosplat_jax.gradcheck.differences import double_precision
 from geosplat_jax.hashgrid import HashGridSpec, encode
-from geosplat_jax.io.images import encode_srgb
 from geosplat_jax.io.views import Views
 from geosplat_jax.metrics import normal_mae_deg, psnr
 from geosplat_jax.model import Context, Params
 from geosplat_jax.projection import Splats
 from geosplat_jax.rasterize import MAX_ALPHA, MIN_ALPHA, TileLists
+from geosplat_jax.renderer import Renderer, photograph_on_white, render_on_white
 from geosplat_jax.scene import Camera
 
 GROUPS = ("geometry", "tables", "heads", "light", "exposure")
@@ -255,16 +254,12 @@ def held_out(
     images, scores, angles = [], [], []
     for index in range(len(test)):
         view, image = renderer(test.camera(np.array([index]))), test.images[index]
-        mask = image[..., 3]
-        truth = encode_srgb(
-            np.clip(over_background(image[..., :3] * mask[..., None], mask, 1), 0, 1)
-        )
-        shown = encode_srgb(np.clip(over_background(view.rgb, view.alpha, 1.0), 0, 1))
-        images.append(np.asarray(shown))
+        truth, shown = photograph_on_white(image), render_on_white(view.rgb, view.alpha)
+        images.append(shown)
         scores.append(float(psnr(shown, truth)))
         if "normal" in test.truth:
             normal = test.truth["normal"][index]
-            angles.append(float(normal_mae_deg(view.aovs["normal"], normal, mask)))
+            angles.append(float(normal_mae_deg(view.aovs["normal"], normal, image[..., 3])))
     figures = {"psnr": float(np.mean(scores))}
     if angles:
         figures["normal_deg"] = float(np.mean(angles))

@@ -525,11 +525,12 @@ def make_config(
 def doubts(config: Config) -> list[str]:
     """Say what of a configuration has no effect, or hardly one, though it was asked for."""
     found = []
-    for name, number in (("", 1), ("transport.", 2)):
+    stages = {"": 1, "transport.": 2} if config.transport.steps else {"": 1}
+    for name, number in stages.items():
         stage, steps = config.stage(number), config.stage(number).run.steps
         for wait in ("albedo_warmup", "shine_warmup"):
             length = getattr(stage.rates, wait)
-            if length > steps and not (number == 2 and config.transport.steps == 0):
+            if length > steps:
                 found.append(
                     f"{name}rates.{wait} = {length} is longer than the stage's {steps} steps: the "
                     "material will not reach its full rate; half of the stage is usual"

@@ -29,7 +29,8 @@ from geosplat_jax.renderer import (
     DEFAULT_SAMPLES,
     RenderedView,
     Renderer,
-    over_background,
+    photograph_on_white,
+    render_on_white,
     to_picture,
 )
 from geosplat_jax.scene import EnvLight
@@ -109,9 +110,8 @@ def _relight_figures(
         found = protocols.relight_figures(protocol, rgb, alpha, images)
         figures |= {f"relight.{name}.{key}": value for key, value in found.items()}
         for row, index in zip(rows, chosen, strict=True):
-            true, mask = images[index][..., :3], images[index][..., 3]
-            row[name] = to_picture(over_background(rgb[index], alpha[index], 1.0))
-            row[f"true {name}"] = to_picture(over_background(true * mask[..., None], mask, 1.0))
+            row[name] = render_on_white(rgb[index], alpha[index])
+            row[f"true {name}"] = photograph_on_white(images[index])
     if names:
         for key in ("psnr", "ssim", "psnr_masked", "ssim_masked"):
             values = [figures[f"relight.{name}.{key}"] for name in names]
@@ -240,11 +240,10 @@ def _overview(
     vertices, faces, normals = renderer.mesh()
     rows = []
     for index in chosen:
-        view, image = rendered[index], views.images[index]
-        mask = image[..., 3]
+        view = rendered[index]
         row = {
-            "truth": to_picture(over_background(image[..., :3] * mask[..., None], mask, 1.0)),
-            "render": to_picture(over_background(view.rgb, view.alpha, 1.0)),
+            "truth": photograph_on_white(views.images[index]),
+            "render": render_on_white(view.rgb, view.alpha),
             "normal": normals_to_rgb(view.aovs["normal"], view.alpha),
             "albedo": to_picture(view.aovs["albedo"]),
             "roughness": np.repeat(view.aovs["roughness"], 3, axis=-1),
@@ -262,11 +261,9 @@ def preview_image(
 ) -> np.ndarray:
     """Put truth, render and normals of the first view side by side, (H, 3 W, 3) sRGB."""
     view = Renderer(config, params, context, capacities, samples=64)(views.camera(np.array([0])))
-    image = views.images[0]
-    mask = image[..., 3]
     parts = [
-        to_picture(over_background(image[..., :3] * mask[..., None], mask, 1.0)),
-        to_picture(over_background(view.rgb, view.alpha, 1.0)),
+        photograph_on_white(views.images[0]),
+        render_on_white(view.rgb, view.alpha),
         normals_to_rgb(view.aovs["normal"], view.alpha),
     ]
     return np.concatenate(parts, axis=1)

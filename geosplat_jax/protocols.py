@@ -269,7 +269,10 @@ def _compare(
     look: Look,
     is_pooled: bool,
 ) -> dict[str, float]:
-    """PSNR and SSIM, whole and masked, of straight linear images, view by view."""
+    """PSNR and SSIM, whole and masked, view by view, of linear images.
+
+    Predictions are premultiplied by ``alpha``, truths straight.
+    """
     errors, similarities, masked_errors, masked_similarities, counts = [], [], [], [], []
     for prediction, drawn, truth, covered in zip(predictions, alpha, truths, mask, strict=True):
         shown = {
@@ -277,7 +280,7 @@ def _compare(
             "solid": drawn > MASK_THRESHOLD,
             "mask": covered,
         }
-        predicted = _picture(prediction, shown[look.silhouette], look)
+        predicted = _picture(_straight(prediction, drawn), shown[look.silhouette], look)
         true = _picture(truth, covered, look)
         errors.append(float(_mse(predicted, true)))
         similarities.append(float(_ssim(predicted, true)))
@@ -303,14 +306,7 @@ def _compare_images(
 ) -> dict[str, float]:
     """Compare premultiplied renders with straight RGBA images, (V, H, W, 3 and 4)."""
     _require(alpha.shape, alpha=alpha, rgb=(rgb, 3), image=(image, 4))
-    return _compare(
-        (_straight(color, drawn) for color, drawn in zip(rgb, alpha, strict=True)),
-        alpha,
-        image[..., :3],
-        image[..., 3],
-        look=look,
-        is_pooled=False,
-    )
+    return _compare(rgb, alpha, image[..., :3], image[..., 3], look=look, is_pooled=False)
 
 
 def new_view_figures(
@@ -368,7 +364,7 @@ def albedo_figures(
     _require_object(mask > MASK_THRESHOLD)
     factor = np.asarray(scale, np.float32)
     figures = _compare(
-        (_straight(a, drawn) * factor for a, drawn in zip(albedo, alpha, strict=True)),
+        (view * factor for view in albedo),
         alpha,
         (_straight(t, covered) for t, covered in zip(truth, mask, strict=True)),
         mask,

@@ -328,14 +328,19 @@ def trim_mesh(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     )
 
 
-def over_background(rgb: np.ndarray, alpha: np.ndarray, background: float) -> np.ndarray:
-    """Lay premultiplied colour over a grey background."""
-    return rgb + (1.0 - alpha[..., None]) * background
-
-
 def to_picture(linear: np.ndarray) -> np.ndarray:
     """Return sRGB in [0, 1] on the host."""
     return np.clip(encode_srgb(np.clip(linear, 0.0, 1.0)), 0.0, 1.0)
+
+
+def render_on_white(rgb: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Show linear colour that is premultiplied by ``alpha`` on white, in sRGB."""
+    return to_picture(rgb + (1.0 - alpha[..., None]))
+
+
+def photograph_on_white(image: np.ndarray) -> np.ndarray:
+    """Show (H, W, 4) linear colour with straight alpha on white, in sRGB."""
+    return render_on_white(image[..., :3] * image[..., 3:], image[..., 3])
 
 
 def straight_rgba(view: RenderedView) -> np.ndarray:

@@ -17,9 +17,11 @@ from geosplat_jax.renderer import (
     RELIGHT_BOUNCES,
     RenderedView,
     Renderer,
-    over_background,
+    photograph_on_white,
     relight_transport,
+    render_on_white,
     straight_rgba,
+    to_picture,
 )
 from geosplat_jax.scene import EnvLight
 from geosplat_jax.stages import begin_stage_2
@@ -243,4 +245,12 @@ def test_pictures_have_straight_alpha_and_no_colour_behind_nothing():
     np.testing.assert_array_equal(found[0, :, 3], alpha[0])
     np.testing.assert_array_equal(found[0, 0, :3], 0.0)
     np.testing.assert_allclose(found[0, 1, :3], found[0, 2, :3], rtol=1e-6)
-    np.testing.assert_allclose(over_background(rgb, alpha, 1.0)[0, :, 0], [1.0, 0.75, 0.5])
+
+
+def test_renders_and_photographs_are_shown_on_white_alike():
+    alpha = np.array([[0.0, 0.5, 1.0]], np.float32)
+    straight = np.full((1, 3, 3), 0.5, np.float32)
+    shown = render_on_white(straight * alpha[..., None], alpha)
+    np.testing.assert_array_equal(shown[0, :, 0], to_picture(np.array([1.0, 0.75, 0.5])))
+    photograph = np.concatenate([straight, alpha[..., None]], axis=-1)
+    np.testing.assert_array_equal(photograph_on_white(photograph), shown)
