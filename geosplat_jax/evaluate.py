@@ -9,7 +9,7 @@ import platform
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -57,29 +57,55 @@ def _view_figures(view: RenderedView, image: np.ndarray, truth_normal: np.ndarra
     return figures
 
 
-def _stacked(rendered: list[RenderedView], name: str) -> np.ndarray:
-    """Return an AOV of all views, (V, H, W, c), or (V, H, W) for one channel."""
-    maps = np.stack([view.aovs[name] for view in rendered])
-    return maps[..., 0] if maps.shape[-1] == 1 else maps
+class _Rendered(NamedTuple):
+    """What is kept of all test views.
+
+    Attributes
+    ----------
+    figures : of every view.
+    alpha : (V, H, W) coverage.
+    maps : (V, H, W, c) by name, those of the materials that there is truth to compare with.
+    shown : whole views, by index, for the sheets.
+    """
+
+    figures: list[dict[str, Any]]
+    alpha: np.ndarray
+    maps: dict[str, np.ndarray]
+    shown: dict[int, RenderedView]
+
+
+def _render_all(renderer: Renderer, views: Views, chosen: np.ndarray) -> _Rendered:
+    """Render every view once, and keep of it no more than is needed: views may be many."""
+    figures, shown, alpha = [], {}, []
+    maps = {name: [] for name in ("albedo", *_MATERIALS) if name in views.truth}
+    for index, name in enumerate(views.names):
+        view = renderer(views.camera(np.array([index])))
+        normal = views.truth["normal"][index] if "normal" in views.truth else None
+        figures.append({"view": name, **_view_figures(view, views.images[index], normal)})
+        alpha.append(view.alpha)
+        for key, kept in maps.items():
+            kept.append(view.aovs[key])
+        if index in chosen:
+            shown[index] = view
+    stacked = {name: np.stack(kept) for name, kept in maps.items()}
+    return _Rendered(figures, np.stack(alpha), stacked, shown)
 
 
 def _material_figures(
-    protocol: Protocol, rendered: list[RenderedView], views: Views
+    protocol: Protocol, rendered: _Rendered, views: Views
 ) -> tuple[dict[str, Any], np.ndarray]:
     """Figures of albedo, roughness and metallic where there is truth, and the albedo's scale."""
-    alpha = np.stack([view.alpha for view in rendered])
-    mask = views.images[..., 3]
+    alpha, maps, mask = rendered.alpha, rendered.maps, views.images[..., 3]
     figures: dict[str, Any] = {}
     scale = np.ones(3)
-    if "albedo" in views.truth:
+    if "albedo" in maps:
         truth = views.truth["albedo"] * mask[..., None]
-        albedo = _stacked(rendered, "albedo")
-        scale = protocols.albedo_scale(protocol, albedo, alpha, truth, mask)
-        figures |= protocols.albedo_figures(protocol, albedo, alpha, truth, mask, scale)
+        scale = protocols.albedo_scale(protocol, maps["albedo"], alpha, truth, mask)
+        figures |= protocols.albedo_figures(protocol, maps["albedo"], alpha, truth, mask, scale)
         figures |= {f"albedo.scale_{c}": float(x) for c, x in zip("rgb", scale, strict=True)}
-    known = {name: views.truth[name][..., 0] * mask for name in _MATERIALS if name in views.truth}
+    known = {name: views.truth[name][..., 0] * mask for name in _MATERIALS if name in maps}
     if known:
-        found = {name: _stacked(rendered, name) for name in _MATERIALS}
+        found = {name: maps[name][..., 0] for name in known}
         figures |= protocols.material_figures(found, alpha, known, mask)
     return figures, scale
 
@@ -158,16 +184,12 @@ def evaluate_run(
     began = time.perf_counter()
     chosen_protocol = protocols.protocol(protocol)
     renderer = Renderer(config, params, context, capacities, samples=samples)
-    rendered, per_view = [], []
-    for index, name in enumerate(views.names):
-        view = renderer(views.camera(np.array([index])))
-        normal = views.truth["normal"][index] if "normal" in views.truth else None
-        per_view.append({"view": name, **_view_figures(view, views.images[index], normal)})
-        rendered.append(view)
-    names = dict.fromkeys(key for line in per_view for key in line if key != "view")
-    mean = {key: float(np.mean([line[key] for line in per_view if key in line])) for key in names}
+    chosen = np.unique(np.linspace(0, len(views) - 1, sheet_views).round().astype(int))
+    rendered = _render_all(renderer, views, chosen)
+    lines = rendered.figures
+    names = dict.fromkeys(key for line in lines for key in line if key != "view")
+    mean = {key: float(np.mean([line[key] for line in lines if key in line])) for key in names}
     materials, scale = _material_figures(chosen_protocol, rendered, views)
-    chosen = np.unique(np.linspace(0, len(rendered) - 1, sheet_views).round().astype(int))
     relights, relit = _relight_figures(
         chosen_protocol, renderer, views, lights or {}, scale, relight_indirect, chosen
     )
@@ -183,7 +205,7 @@ def evaluate_run(
         "protocol": protocol,
         "notes": notes,
         "mean": mean,
-        "views": per_view,
+        "views": lines,
         "samples": samples,
         "samples_drawn": renderer.samples,
         "relight_indirect": relight_indirect,
@@ -198,30 +220,29 @@ def evaluate_run(
         **meta,
     }
     (folder / "metrics.json").write_text(json.dumps(figures, indent=2) + "\n")
-    write_png(folder / "overview.png", _overview(renderer, radiance, views, rendered, chosen))
+    write_png(folder / "overview.png", _overview(renderer, radiance, views, rendered.shown))
     if materials:
-        write_png(folder / "materials.png", _materials_sheet(views, rendered, chosen, scale))
+        write_png(folder / "materials.png", _materials_sheet(views, rendered.shown, scale))
     if relit:
         write_png(folder / "relight.png", overview_sheet(relit))
     return figures
 
 
 def _materials_sheet(
-    views: Views, rendered: list[RenderedView], chosen: np.ndarray, scale: np.ndarray
+    views: Views, shown: Mapping[int, RenderedView], scale: np.ndarray
 ) -> np.ndarray:
     """Compose a sheet of attributes beside the truth, the albedo in its scale."""
     rows = []
-    for index in chosen:
+    for index, view in shown.items():
         mask, row = views.images[index][..., 3:], {}
         for name in ("albedo", "roughness", "metallic", "normal"):
             if name not in views.truth:
                 continue
-            true, found = views.truth[name][index], rendered[index].aovs[name]
+            true, found = views.truth[name][index], view.aovs[name]
             if name == "albedo":
                 pair = to_picture(found * scale), to_picture(true * mask)
             elif name == "normal":
-                alpha = rendered[index].alpha
-                pair = normals_to_rgb(found, alpha), normals_to_rgb(true, mask[..., 0])
+                pair = normals_to_rgb(found, view.alpha), normals_to_rgb(true, mask[..., 0])
             else:
                 pair = tuple(np.clip(np.repeat(x, 3, axis=-1), 0, 1) for x in (found, true * mask))
             row[name], row[f"true {name}"] = pair
@@ -233,14 +254,12 @@ def _overview(
     renderer: Renderer,
     radiance: np.ndarray,
     views: Views,
-    rendered: list[RenderedView],
-    chosen: np.ndarray,
+    shown: Mapping[int, RenderedView],
 ) -> np.ndarray:
     """Compose the sheet: a row a view, and the light."""
     vertices, faces, normals = renderer.mesh()
     rows = []
-    for index in chosen:
-        view = rendered[index]
+    for index, view in shown.items():
         row = {
             "truth": photograph_on_white(views.images[index]),
             "render": render_on_white(view.rgb, view.alpha),
