@@ -32,7 +32,11 @@ from geosplat_jax.denoise import DenoiseSpec
 from geosplat_jax.io.dataset import load_recorded
 from geosplat_jax.losses import LossWeights, Objective, loss
 from geosplat_jax.model import Context, Model, Params
-from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.process import (
+    enable_compilation_cache,
+    release_programs_when_crowded,
+    retain_freed_memory,
+)
 from geosplat_jax.render import reconstruct, render_views
 from geosplat_jax.scene import Batch, Camera
 from geosplat_jax.stages import make_batch
@@ -286,6 +290,7 @@ def main() -> int:
             print("| shortcut | " + " | ".join(table[name]) + " |")
             print("|---|" + "---|" * len(table[name]))
         print(f"| {name} | {row_text(table[name])} |", flush=True)
+        release_programs_when_crowded()
     if options.output is not None:
         options.output.write_text(json.dumps(table, indent=1) + "\n")
     return 0

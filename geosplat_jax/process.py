@@ -15,6 +15,8 @@ import jax
 
 # Parameters of glibc's mallopt: one arena, never mmap, never give memory back, grow in large steps.
 _RETAINING = {-8: 1, -4: 0, -1: 2**31 - 1, -2: 1 << 28}
+_CROWDED = 0.5
+"""Share of the memory maps from which programs are forgotten."""
 
 
 def retain_freed_memory() -> bool:
@@ -31,6 +33,23 @@ def retain_freed_memory() -> bool:
     except OSError:
         return False
     return all(libc.mallopt(name, value) for name, value in _RETAINING.items())
+
+
+def release_programs_when_crowded() -> bool:
+    """Forget compiled programs if they hold half of the memory maps of this process; tell if so.
+
+    XLA maps the parts of a program apart, some thousands for a training step, and Linux grants a
+    process 65,530 maps; beyond them the compiler crashes. What is needed again is compiled again.
+    """
+    try:
+        granted = int(Path("/proc/sys/vm/max_map_count").read_text())
+        held = Path("/proc/self/maps").read_bytes().count(b"\n")
+    except OSError:  # not on Linux
+        return False
+    if held < _CROWDED * granted:
+        return False
+    jax.clear_caches()
+    return True
 
 
 def peak_memory_mb() -> int:

@@ -37,7 +37,7 @@ from geosplat_jax.io.checkpoints import (
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.views import Views
 from geosplat_jax.model import Context, Model, Params
-from geosplat_jax.process import peak_memory_mb
+from geosplat_jax.process import peak_memory_mb, release_programs_when_crowded
 from geosplat_jax.render import visibility_usage
 from geosplat_jax.scene import Camera, Geometry, Grid
 from geosplat_jax.stages import (
@@ -245,16 +245,21 @@ class _Loop:
             _check_size(int(needed.quads), self.config.geometry.max_quads)
             if bool(report.fits):
                 break
-            self.capacities = capacity_module.grow(self.capacities, needed)
+            self._resize(capacity_module.grow(self.capacities, needed))
         if not bool(report.finite):
             raise TrainingError(self._not_finite(step, report))
         self._remember(needed)
         if int(needed.quads) == 0:
             self._recover(step)
         elif int(self.state.step) % _SHRINK_EVERY == 0 and self.peak is not None:
-            self.capacities = capacity_module.shrink(self.capacities, self.peak)
+            self._resize(capacity_module.shrink(self.capacities, self.peak))
             self.peak = None
         return report
+
+    def _resize(self, capacities: Capacities) -> None:
+        """Change the buffers, which takes a new program; the old ones may be too many to keep."""
+        self.capacities = capacities
+        release_programs_when_crowded()
 
     def _remember(self, needed: Usage) -> None:
         """Track the largest need since buffers were last resized."""

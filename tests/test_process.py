@@ -37,3 +37,13 @@ def test_a_cache_chosen_by_the_user_is_respected(monkeypatch, cache_setting):
 def test_retaining_memory_is_for_linux_only(monkeypatch):
     monkeypatch.setattr(sys, "platform", "darwin")
     assert process.retain_freed_memory() is False
+
+
+def test_programs_are_forgotten_when_they_hold_too_many_maps(monkeypatch):
+    double = jax.jit(lambda x: 2 * x)
+    double(jax.numpy.ones(3))
+    assert process.release_programs_when_crowded() is False
+    assert double._cache_size() == 1
+    monkeypatch.setattr(process, "_CROWDED", 0.0)
+    assert process.release_programs_when_crowded() is sys.platform.startswith("linux")
+    assert double._cache_size() == (0 if sys.platform.startswith("linux") else 1)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support import sphere_dataset, tiny_config
 
+from geosplat_jax import process
 from geosplat_jax import train as train_module
 from geosplat_jax.capacity import Capacities
 from geosplat_jax.scene import Geometry
@@ -88,8 +89,12 @@ def test_resuming_without_a_checkpoint_is_an_error(dataset, tmp_path):
 def test_an_overflowing_step_is_repeated_and_equals_one_with_ample_room(
     dataset, finished, tmp_path, monkeypatch
 ):
-    """The run that had to grow its buffers makes the same steps on the same batches."""
+    """The run that had to grow its buffers makes the same steps on the same batches.
+
+    Also where programs are forgotten at every growth.
+    """
     folder, _ = finished
+    monkeypatch.setattr(process, "_CROWDED", 0.0)
     plan = train_module.plan_capacities
     monkeypatch.setattr(
         train_module, "plan_capacities", lambda *a, **k: replace(plan(*a, **k), hits=128)
