@@ -12,7 +12,9 @@ import time
 import jax
 import jax.numpy as jnp
 
-from geosplat_jax.capacity import Capacities, grow
+from geosplat_jax.core.capacity import Capacities, grow
+from geosplat_jax.core.numerics import safe_norm
+from geosplat_jax.core.types import Geometry, Grid
 from geosplat_jax.geometry import (
     face_normals_and_areas,
     grid_vertices,
@@ -21,8 +23,6 @@ from geosplat_jax.geometry import (
     sdf_entropy,
     vertex_normals,
 )
-from geosplat_jax.numerics import safe_norm
-from geosplat_jax.scene import Geometry, Grid
 
 RESOLUTIONS = (48, 96)
 YARDSTICK_MS = {48: 203.0, 96: 956.0}

@@ -14,11 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from geosplat_jax.capacity import Capacities, grow, overflowed
-from geosplat_jax.process import retain_freed_memory
-from geosplat_jax.projection import project
-from geosplat_jax.rasterize import DEFAULT_TILE_SIZE, find_visible, rasterize
-from geosplat_jax.rotation import matrix_to_quaternion
+from geosplat_jax.core.capacity import Capacities, grow, overflowed
+from geosplat_jax.core.rotation import matrix_to_quaternion
+from geosplat_jax.fit.runtime import retain_freed_memory
+from geosplat_jax.splats.projection import project
+from geosplat_jax.splats.rasterize import DEFAULT_TILE_SIZE, find_visible, rasterize
 
 YARDSTICK_MS = {"torus_71k_200": 132.0, "torus_297k_800": 1900.0}
 

@@ -7,10 +7,10 @@ import tempfile
 import time
 from pathlib import Path
 
-from geosplat_jax.config import make_config
+from geosplat_jax.fit.config import make_config
+from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.train import fit
 from geosplat_jax.io.dataset import load_dataset
-from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
-from geosplat_jax.train import fit
 
 SCENE = Path(__file__).resolve().parents[1] / "examples" / "duck"
 _WARM_UP = 3

@@ -16,10 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from geosplat_jax.capacity import Capacities, grow, overflowed
+from geosplat_jax.core.capacity import Capacities, grow, overflowed
+from geosplat_jax.core.types import Grid
 from geosplat_jax.geometry import grid_vertices, initial_geometry, isosurface
-from geosplat_jax.scene import Grid
-from geosplat_jax.trace import build_accelerator, nearest, occluded
+from geosplat_jax.rays.grid_index import build_accelerator, nearest, occluded
 
 RESOLUTIONS = (48, 96)
 RAYS = 200_000

@@ -6,9 +6,9 @@ import time
 from pathlib import Path
 
 from geosplat_jax.cli import evaluate_command, export_command, relight_command, train_command
-from geosplat_jax.config import make_config
-from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
-from geosplat_jax.relight import RelightOptions
+from geosplat_jax.fit.config import make_config
+from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.report.relight import RelightOptions
 
 # Between draft and standard: the crown's points need cells of their own.
 OVERRIDES = (

@@ -27,30 +27,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from geosplat_jax import capacity
 from geosplat_jax.adapter import GAUSSIANS_PER_FACE, face_gaussians
-from geosplat_jax.bsdf import ROUGHNESS_FLOOR
-from geosplat_jax.capacity import Capacities
-from geosplat_jax.color import tone_map
-from geosplat_jax.config import Config
+from geosplat_jax.core import capacity
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.color import tone_map
+from geosplat_jax.core.numerics import safe_normalize
+from geosplat_jax.core.types import Batch, Grid
+from geosplat_jax.fit.config import Config
+from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.stages import initial_params, initial_sdf, make_batch, sampling_of_step
+from geosplat_jax.fit.step import StepReport, TrainState, initial_state, train_step
+from geosplat_jax.fit.train import load_run
 from geosplat_jax.geometry import vertex_normals
 from geosplat_jax.hashgrid import Layer, encode
-from geosplat_jax.hull import fit_grid
 from geosplat_jax.io.checkpoints import latest_checkpoint, load_checkpoint
 from geosplat_jax.io.dataset import load_recorded
-from geosplat_jax.light import direction_to_uv, level_of_roughness
 from geosplat_jax.losses import TERM_NAMES, loss
 from geosplat_jax.materials import to_unit_cube
 from geosplat_jax.model import Context, Model, Params
-from geosplat_jax.numerics import safe_normalize
-from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
-from geosplat_jax.projection import project
-from geosplat_jax.rasterize import MAX_ALPHA, MIN_ALPHA, find_visible
 from geosplat_jax.render import Asset, grid_center_and_extent, reconstruct, render_views
-from geosplat_jax.scene import Batch, Grid
-from geosplat_jax.stages import initial_params, initial_sdf, make_batch, sampling_of_step
-from geosplat_jax.step import StepReport, TrainState, initial_state, train_step
-from geosplat_jax.train import load_run
+from geosplat_jax.splats.projection import project
+from geosplat_jax.splats.rasterize import MAX_ALPHA, MIN_ALPHA, find_visible
+from geosplat_jax.surface.hull import fit_grid
+from geosplat_jax.transport.bsdf import ROUGHNESS_FLOOR
+from geosplat_jax.transport.environment import direction_to_uv, level_of_roughness
 
 SEGMENTS = 16
 SHOWN = (1, 4, 16)

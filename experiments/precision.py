@@ -18,21 +18,25 @@ import numpy as np
 import precision_plot as measures
 from precision_plot import GROUPS, Outcome, Stage, cast, errors, save
 
-from geosplat_jax import capacity as capacity_module
 from geosplat_jax import render as render_module
 from geosplat_jax.adapter import GAUSSIANS_PER_FACE, face_gaussians, shift_inwards
-from geosplat_jax.capacity import Capacities
-from geosplat_jax.color import tone_map
-from geosplat_jax.config import Config, make_config
+from geosplat_jax.core import capacity as capacity_module
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.color import tone_map
+from geosplat_jax.core.numerics import safe_normalize
+from geosplat_jax.core.types import Batch, Camera, EnvLight, Grid, Materials, Mesh
+from geosplat_jax.fit.config import Config, make_config
+from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.stages import initial_params, initial_sdf, make_batch, make_context
+from geosplat_jax.fit.step import make_optimizer
+from geosplat_jax.fit.train import load_run, plan_capacities
 from geosplat_jax.geometry import face_normals_and_areas, isosurface, sdf_entropy, vertex_normals
 from geosplat_jax.gradcheck.differences import double_precision
 from geosplat_jax.gradcheck.whole_stages import _from_groups, _groups
 from geosplat_jax.hashgrid import HashGridSpec, Layer, encode
-from geosplat_jax.hull import fit_grid
 from geosplat_jax.io.dataset import load_dataset
 from geosplat_jax.io.images import encode_srgb
 from geosplat_jax.io.views import Views
-from geosplat_jax.light import prefilter
 from geosplat_jax.losses import light_term, loss, photometric_terms
 from geosplat_jax.materials import (
     ROUGHNESS_MINIMUM,
@@ -42,16 +46,12 @@ from geosplat_jax.materials import (
     to_unit_cube,
 )
 from geosplat_jax.model import Context, Params
-from geosplat_jax.numerics import safe_normalize
-from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
-from geosplat_jax.projection import project
-from geosplat_jax.rasterize import TileLists, composite, gather_visible
 from geosplat_jax.render import grid_center_and_extent
-from geosplat_jax.scene import Batch, Camera, EnvLight, Grid, Materials, Mesh
-from geosplat_jax.shading import split_sum
-from geosplat_jax.stages import initial_params, initial_sdf, make_batch, make_context
-from geosplat_jax.step import make_optimizer
-from geosplat_jax.train import load_run, plan_capacities
+from geosplat_jax.splats.projection import project
+from geosplat_jax.splats.rasterize import TileLists, composite, gather_visible
+from geosplat_jax.surface.hull import fit_grid
+from geosplat_jax.transport.environment import prefilter
+from geosplat_jax.transport.split_sum import split_sum
 
 STORED = (
     "hash tables",

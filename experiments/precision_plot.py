@@ -13,17 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from geosplat_jax import hashgrid
-from geosplat_jax.capacity import Capacities
-from geosplat_jax.config import Config
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.types import Camera
+from geosplat_jax.fit.config import Config
 from geosplat_jax.gradcheck.differences import double_precision
 from geosplat_jax.hashgrid import HashGridSpec, encode
 from geosplat_jax.io.views import Views
-from geosplat_jax.metrics import normal_mae_deg, psnr
 from geosplat_jax.model import Context, Params
-from geosplat_jax.projection import Splats
-from geosplat_jax.rasterize import MAX_ALPHA, MIN_ALPHA, TileLists
-from geosplat_jax.renderer import Renderer, photograph_on_white, render_on_white
-from geosplat_jax.scene import Camera
+from geosplat_jax.report.metrics import normal_mae_deg, psnr
+from geosplat_jax.report.renderer import Renderer, photograph_on_white, render_on_white
+from geosplat_jax.splats.projection import Splats
+from geosplat_jax.splats.rasterize import MAX_ALPHA, MIN_ALPHA, TileLists
 
 GROUPS = ("geometry", "tables", "heads", "light", "exposure")
 UNDECIDED = 1e-4

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from geosplat_jax.config import config_from_dict, differences
+from geosplat_jax.fit.config import config_from_dict, differences
 
 _UP = ("psnr", "ssim", "iou", "correlation")
 _DOWN = ("mse", "mae", "direction_error")

@@ -25,12 +25,12 @@ from typing import Any
 from report import command_line
 
 from geosplat_jax.cli import evaluate_command, train_command
-from geosplat_jax.config import Config, config_from_dict, differences, make_config
+from geosplat_jax.fit.config import Config, config_from_dict, differences, make_config
+from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.train import Interrupted
 from geosplat_jax.io.checkpoints import latest_checkpoint
-from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
-from geosplat_jax.protocols import PROTOCOLS
-from geosplat_jax.renderer import DEFAULT_SAMPLES, RELIGHT_KINDS
-from geosplat_jax.train import Interrupted
+from geosplat_jax.report.protocols import PROTOCOLS
+from geosplat_jax.report.renderer import DEFAULT_SAMPLES, RELIGHT_KINDS
 
 STAGE_1 = "_stage_1"
 """Folder of a scene's shared stage 1; names of runs start with a letter or a digit."""

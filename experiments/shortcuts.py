@@ -26,21 +26,21 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
-from geosplat_jax import capacity
-from geosplat_jax.capacity import Capacities
-from geosplat_jax.denoise import DenoiseSpec
-from geosplat_jax.io.dataset import load_recorded
-from geosplat_jax.losses import LossWeights, Objective, loss
-from geosplat_jax.model import Context, Model, Params
-from geosplat_jax.process import (
+from geosplat_jax.core import capacity
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.types import Batch, Camera
+from geosplat_jax.fit.runtime import (
     enable_compilation_cache,
     release_programs_when_crowded,
     retain_freed_memory,
 )
+from geosplat_jax.fit.stages import make_batch
+from geosplat_jax.fit.train import load_run
+from geosplat_jax.io.dataset import load_recorded
+from geosplat_jax.losses import LossWeights, Objective, loss
+from geosplat_jax.model import Context, Model, Params
 from geosplat_jax.render import reconstruct, render_views
-from geosplat_jax.scene import Batch, Camera
-from geosplat_jax.stages import make_batch
-from geosplat_jax.train import load_run
+from geosplat_jax.transport.denoise import DenoiseSpec
 
 REFERENCE_SAMPLES = 16
 """Samples of each kind in a pass of the reference."""

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from geosplat_jax.core.numerics import safe_divide, safe_norm, safe_normalize, safe_sqrt
+from geosplat_jax.core.rotation import axes_to_quaternion, frame_from_normal, matrix_to_quaternion
+from geosplat_jax.core.types import Gaussians, Mesh
 from geosplat_jax.geometry import face_normals_and_areas
-from geosplat_jax.numerics import safe_divide, safe_norm, safe_normalize, safe_sqrt
-from geosplat_jax.rotation import axes_to_quaternion, frame_from_normal, matrix_to_quaternion
-from geosplat_jax.scene import Gaussians, Mesh
 
 GAUSSIANS_PER_FACE = 6
 

@@ -12,7 +12,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from geosplat_jax.config import PRESETS, QUALITIES, Config, doubts, make_config
+from geosplat_jax.fit.config import PRESETS, QUALITIES, Config, doubts, make_config
+from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
 from geosplat_jax.gradcheck.report import (
     SINGLE_TOLERANCE,
     STAGES,
@@ -25,10 +26,9 @@ from geosplat_jax.gradcheck.report import (
 )
 from geosplat_jax.io.dataset import Dataset, describe, load_recorded
 from geosplat_jax.io.images import SceneError, write_png
-from geosplat_jax.process import enable_compilation_cache, retain_freed_memory
-from geosplat_jax.protocols import PROTOCOLS
-from geosplat_jax.relight import BACKGROUNDS, RelightOptions
-from geosplat_jax.renderer import DEFAULT_SAMPLES, RELIGHT_KINDS
+from geosplat_jax.report.protocols import PROTOCOLS
+from geosplat_jax.report.relight import BACKGROUNDS, RelightOptions
+from geosplat_jax.report.renderer import DEFAULT_SAMPLES, RELIGHT_KINDS
 
 _console = Console(stderr=True, highlight=False)
 
@@ -220,7 +220,7 @@ def train_command(
     SceneError, UsageError, TrainingError, Interrupted
         See the functions that raise them.
     """
-    from geosplat_jax.train import TrainingError, fit
+    from geosplat_jax.fit.train import TrainingError, fit
 
     record = {"scene": str(scene.resolve()), "dataset": options, "config": config.to_dict()}
     _check_folder(folder, record, resume=resume)
@@ -318,7 +318,7 @@ class _Preview:
 
     def __call__(self, config, params, context, capacities, step: int) -> None:
         """Render and write one preview."""
-        from geosplat_jax.evaluate import preview_image
+        from geosplat_jax.report.evaluate import preview_image
 
         self._folder.mkdir(exist_ok=True)
         image = preview_image(config, params, context, capacities, self._views)
@@ -341,9 +341,9 @@ def evaluate_command(
     relight_indirect: str = "traced",
 ) -> dict[str, Any]:
     """Evaluate a run on its scene's test views and print the means."""
-    from geosplat_jax.evaluate import evaluate_run
-    from geosplat_jax.relight import load_light
-    from geosplat_jax.train import load_run
+    from geosplat_jax.fit.train import load_run
+    from geosplat_jax.report.evaluate import evaluate_run
+    from geosplat_jax.report.relight import load_light
 
     record = _recorded(run)
     dataset = load_recorded(record["scene"], record["dataset"])
@@ -396,10 +396,10 @@ def relight_command(
     indirect: str = "traced",
 ) -> list[Path]:
     """Render the test views, and movies, of a run under another light; return the files."""
-    from geosplat_jax.relight import load_light, relight_views
-    from geosplat_jax.renderer import Renderer
-    from geosplat_jax.scene import EnvLight
-    from geosplat_jax.train import load_run
+    from geosplat_jax.core.types import EnvLight
+    from geosplat_jax.fit.train import load_run
+    from geosplat_jax.report.relight import load_light, relight_views
+    from geosplat_jax.report.renderer import Renderer
 
     record = _recorded(run)
     options = options or RelightOptions()
@@ -457,9 +457,9 @@ def render_command(run: Path, views: str, output: Path | None) -> None:
     """Render views of a split: ``NAME_rgba.png`` with straight alpha, and ``NAME_normal.png``."""
     import numpy as np
 
-    from geosplat_jax.io.sheets import normals_to_rgb
-    from geosplat_jax.renderer import Renderer, straight_rgba
-    from geosplat_jax.train import load_run
+    from geosplat_jax.fit.train import load_run
+    from geosplat_jax.report.pictures import normals_to_rgb
+    from geosplat_jax.report.renderer import Renderer, straight_rgba
 
     record = _recorded(run)
     dataset = load_recorded(record["scene"], record["dataset"])
@@ -480,8 +480,8 @@ def export_command(
     run: Path, output: Path | None, *, vertex_colors: bool, texture_size: int
 ) -> dict[str, Any]:
     """Export the reconstructed asset: ``mesh.glb``, ``gaussians.ply``, ``light.exr``."""
-    from geosplat_jax.assets import export_assets
-    from geosplat_jax.train import load_run
+    from geosplat_jax.fit.train import load_run
+    from geosplat_jax.report.assets import export_assets
 
     _recorded(run)
     config, params, context, capacities, _ = load_run(run)
@@ -576,8 +576,8 @@ def main(argv: list[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     enable_compilation_cache()
     retain_freed_memory()
+    from geosplat_jax.fit.train import Interrupted, TrainingError
     from geosplat_jax.io.checkpoints import CheckpointError
-    from geosplat_jax.train import Interrupted, TrainingError
 
     try:
         _run(arguments)

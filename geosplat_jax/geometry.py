@@ -11,15 +11,19 @@ into the border is open there. Keep the outermost vertices positive for a closed
 Reference: Shen et al., "Flexible Isosurface Extraction for Gradient-Based Mesh Optimization", 2023.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
 
-from geosplat_jax._flexicubes_tables import (
+from geosplat_jax.core.capacity import BitSet, Capacities, Usage, bit_set, usage
+from geosplat_jax.core.mesh import face_normals_and_areas, vertex_normals
+from geosplat_jax.core.numerics import absolute, safe_norm
+from geosplat_jax.core.types import Geometry, Grid, Mesh
+from geosplat_jax.surface.flexicubes_tables import (
     CORNERS,
     PATCH_COUNT,
     PATCH_EDGES,
@@ -28,8 +32,7 @@ from geosplat_jax._flexicubes_tables import (
     QUAD_CELLS,
     QUAD_EDGES,
 )
-from geosplat_jax.capacity import BitSet, Capacities, Usage, bit_set, usage
-from geosplat_jax.grids import (
+from geosplat_jax.surface.grids import (
     deformed_vertices,
     grid_vertices,
     initial_geometry,
@@ -39,10 +42,6 @@ from geosplat_jax.grids import (
     sphere_sdf,
     weight_magnitude,
 )
-from geosplat_jax.mesh_ops import face_normals_and_areas, vertex_normals
-from geosplat_jax.numerics import absolute, safe_norm
-from geosplat_jax.pytree import register_pytree
-from geosplat_jax.scene import Geometry, Grid, Mesh
 
 __all__ = [
     "Surface",
@@ -69,9 +68,7 @@ _SPLIT_EPSILON = 1e-8
 """Added to the weights of the two diagonals by the original, kept for equality with it."""
 
 
-@register_pytree
-@dataclass(frozen=True)
-class Surface:
+class Surface(eqx.Module):
     """An extracted isosurface.
 
     Attributes

@@ -19,12 +19,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
-
-from geosplat_jax.pytree import register_pytree
 
 _HASH_Y = np.uint32(2654435761)
 _HASH_Z = np.uint32(805459861)
@@ -346,9 +345,7 @@ def encode(
     return _encode(table, points, spec, position_gradient)
 
 
-@register_pytree
-@dataclass(frozen=True)
-class Layer:
+class Layer(eqx.Module):
     """Affine map: ``x @ weights + bias``.
 
     Attributes

@@ -8,20 +8,20 @@ samples of light are constants too, and the gradient is not that of the returned
 
 from dataclasses import dataclass, fields, replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from geosplat_jax.capacity import Capacities, Usage
-from geosplat_jax.color import linear_to_srgb, tone_map
+from geosplat_jax.core.capacity import Capacities, Usage
+from geosplat_jax.core.color import linear_to_srgb, tone_map
+from geosplat_jax.core.numerics import absolute, safe_divide, safe_log
+from geosplat_jax.core.ssim import ssim
+from geosplat_jax.core.types import Batch
 from geosplat_jax.geometry import sdf_entropy, weight_magnitude
 from geosplat_jax.materials import smoothness
 from geosplat_jax.model import Context, Model, Params
-from geosplat_jax.numerics import absolute, safe_divide, safe_log
-from geosplat_jax.pytree import register_pytree
 from geosplat_jax.render import Asset, grid_center_and_extent, reconstruct, render_views
-from geosplat_jax.scene import Batch
-from geosplat_jax.ssim import ssim
 
 _DECIBEL = 10.0 / 2.302585092994046
 _LIGHT_STREAM = 3
@@ -29,9 +29,7 @@ _RESIDUAL_STREAM = 4
 """Numbers of the random streams of the light's samples; 0 to 2 are those of the loss itself."""
 
 
-@register_pytree
-@dataclass(frozen=True)
-class LossWeights:
+class LossWeights(eqx.Module):
     """Weights of the terms of Eq. 19; traced, so that schedules cost no compilation.
 
     Attributes
@@ -96,9 +94,7 @@ class Objective:
             raise ValueError(f"smoothness_samples must be >= 1, got {self.smoothness_samples}")
 
 
-@register_pytree
-@dataclass(frozen=True)
-class LossReport:
+class LossReport(eqx.Module):
     """What a step says about itself.
 
     Attributes

@@ -8,10 +8,13 @@ at half the cost.
 
 from dataclasses import dataclass, field
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from geosplat_jax.core.numerics import absolute, safe_divide
+from geosplat_jax.core.types import Materials
 from geosplat_jax.hashgrid import (
     HashGridSpec,
     Layer,
@@ -20,9 +23,6 @@ from geosplat_jax.hashgrid import (
     init_mlp,
     init_tables,
 )
-from geosplat_jax.numerics import absolute, safe_divide
-from geosplat_jax.pytree import register_pytree
-from geosplat_jax.scene import Materials
 
 ROUGHNESS_MINIMUM = 0.1
 """The field's roughness lies in [0.1, 1] (REFERENCE 2.5): lower ones are mirrors, which a handful
@@ -76,9 +76,7 @@ class MaterialSpec:
     indirect_outputs: int = 0
 
 
-@register_pytree
-@dataclass(frozen=True)
-class MaterialField:
+class MaterialField(eqx.Module):
     """Parameters of a material field; a head that the model lacks is None and holds none.
 
     Attributes

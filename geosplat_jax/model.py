@@ -2,20 +2,18 @@
 
 from dataclasses import dataclass
 
+import equinox as eqx
 from jaxtyping import Array, Float
 
 from geosplat_jax.adapter import AdapterConstants
-from geosplat_jax.light import LightSpec, PrefilterOperators
+from geosplat_jax.core.types import EnvLight, Geometry, Grid
 from geosplat_jax.materials import MaterialField, MaterialSpec
-from geosplat_jax.pytree import register_pytree
-from geosplat_jax.rasterize import DEFAULT_TILE_SIZE
-from geosplat_jax.scene import EnvLight, Geometry, Grid
-from geosplat_jax.transport import Transport
+from geosplat_jax.splats.rasterize import DEFAULT_TILE_SIZE
+from geosplat_jax.transport.base import Transport
+from geosplat_jax.transport.environment import LightSpec, PrefilterOperators
 
 
-@register_pytree
-@dataclass(frozen=True)
-class Params:
+class Params(eqx.Module):
     """Everything that is learned, and nothing else; the only differentiated argument of `loss`.
 
     Attributes
@@ -60,9 +58,7 @@ class Model:
     near: float = 0.01
 
 
-@register_pytree
-@dataclass(frozen=True)
-class Context:
+class Context(eqx.Module):
     """Arrays that rendering needs and training does not change.
 
     Attributes

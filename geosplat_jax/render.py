@@ -5,36 +5,33 @@ materials), `illuminate_asset` what does not depend on the view, `render_lit` th
 shading, rasterisation). `render_views` is the last two in a row, `render` all three.
 """
 
-from dataclasses import dataclass
-
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from geosplat_jax import capacity as capacity_module
 from geosplat_jax.adapter import (
     GAUSSIANS_PER_FACE,
     face_gaussians,
     shift_inwards,
     vertex_gaussians,
 )
-from geosplat_jax.capacity import Capacities, Usage
+from geosplat_jax.core import capacity as capacity_module
+from geosplat_jax.core.capacity import Capacities, Usage
+from geosplat_jax.core.numerics import safe_normalize
+from geosplat_jax.core.types import Camera, EnvLight, Gaussians, Grid, Materials, Mesh
 from geosplat_jax.geometry import face_normals_and_areas, isosurface, vertex_normals
 from geosplat_jax.materials import attributes_at, indirect_logits
 from geosplat_jax.model import Context, Model, Params
-from geosplat_jax.numerics import safe_normalize
-from geosplat_jax.projection import project
-from geosplat_jax.pytree import register_pytree
-from geosplat_jax.rasterize import (
+from geosplat_jax.rays.grid_index import Accelerator, build_accelerator
+from geosplat_jax.splats.projection import project
+from geosplat_jax.splats.rasterize import (
     TileLists,
     composite,
     find_visible,
     gather_visible,
 )
-from geosplat_jax.scene import Camera, EnvLight, Gaussians, Grid, Materials, Mesh
-from geosplat_jax.shading import Shaded
-from geosplat_jax.trace import Accelerator, build_accelerator
-from geosplat_jax.transport import (
+from geosplat_jax.transport.base import (
     DENOISER_INPUTS,
     Illumination,
     Receivers,
@@ -42,6 +39,7 @@ from geosplat_jax.transport import (
     illuminate,
     shade_rows,
 )
+from geosplat_jax.transport.split_sum import Shaded
 
 AOV_NAMES = (
     "albedo",
@@ -55,9 +53,7 @@ AOV_NAMES = (
 )
 
 
-@register_pytree
-@dataclass(frozen=True)
-class Asset:
+class Asset(eqx.Module):
     """The view-independent half of a render: surface, splats and their materials.
 
     Attributes
@@ -96,9 +92,7 @@ class Asset:
         )
 
 
-@register_pytree
-@dataclass(frozen=True)
-class RenderOutput:
+class RenderOutput(eqx.Module):
     """Images of V views, premultiplied by alpha.
 
     Attributes

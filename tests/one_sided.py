@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from geosplat_jax.core.types import Grid, Materials
 from geosplat_jax.geometry import initial_geometry, sphere_sdf
 from geosplat_jax.hashgrid import HashGridSpec
-from geosplat_jax.scene import Grid, Materials
 
 # One-sided differences err by curvature, which falls with their step, and by rounding.
 STEP = 1e-7

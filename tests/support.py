@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from geosplat_jax.config import make_config
+from geosplat_jax.fit.config import make_config
+from geosplat_jax.fit.stages import initial_params, make_context
 from geosplat_jax.geometry import sphere_sdf
 from geosplat_jax.gradcheck.differences import double_precision
-from geosplat_jax.hull import fit_grid
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.views import Views
 from geosplat_jax.materials import ROUGHNESS_MINIMUM
-from geosplat_jax.stages import initial_params, make_context
+from geosplat_jax.surface.hull import fit_grid
 
 __all__ = [
     "STAGE_2",

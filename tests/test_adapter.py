@@ -14,9 +14,9 @@ from geosplat_jax.adapter import (
     shift_inwards,
     vertex_gaussians,
 )
+from geosplat_jax.core.rotation import quaternion_to_matrix
+from geosplat_jax.core.types import Mesh
 from geosplat_jax.geometry import face_normals_and_areas, vertex_normals
-from geosplat_jax.rotation import quaternion_to_matrix
-from geosplat_jax.scene import Mesh
 
 TOLERANCE = 2e-6  # a few float32 roundings of unit-size geometry
 

@@ -10,59 +10,30 @@ import geosplat_jax
 PACKAGE = Path(geosplat_jax.__file__).parent
 NAME = "geosplat_jax"
 
-# Lowest first: a module imports only modules above its own line. `io` is one layer; within it,
+# Lowest first: a module imports only modules above its own line. A folder is one layer; within it,
 # modules may import each other without a cycle.
 ORDER = [
-    "pytree",
-    "numerics",
-    "rotation",
-    "color",
-    "ssim",
-    "capacity",
-    "scene",
-    "metrics",
-    "mesh_ops",
-    "_flexicubes_tables",
-    "grids",
+    "core",
+    "surface",
     "geometry",
-    "hull",
     "adapter",
     "hashgrid",
-    "bsdf",
     "materials",
-    "light",
-    "light_sampling",
-    "trace",
-    "indirect",
-    "shading",
-    "monte_carlo",
-    "denoise",
-    "projection",
-    "_tiles",
-    "_composite",
-    "rasterize",
+    "splats",
+    "rays",
     "transport",
     "model",
     "render",
     "losses",
-    "config",
-    "step",
     "io",
-    "process",
-    "stages",
-    "train",
-    "renderer",
-    "light_figures",
-    "protocols",
-    "evaluate",
-    "relight",
-    "assets",
+    "fit",
+    "report",
     "gradcheck",
     "cli",
 ]
 
-# Everything below `io` may run inside jit; of these, what stands before `config` takes plain
-# arguments and knows no configuration (the order enforces that).
+# Everything below `io` may run inside jit, takes plain arguments and knows no settings of a run
+# (the order enforces that).
 JITTED = ORDER[: ORDER.index("io")]
 HOST_ONLY = {"OpenImageIO", "trimesh", "skimage", "xatlas", "PIL", "rich"}
 

@@ -9,9 +9,9 @@ import pytest
 from scipy.stats import chi2
 from support import double_precision
 
-from geosplat_jax import bsdf
-from geosplat_jax.bsdf import ggx_alpha, ggx_distribution, schlick, specular_probability
-from geosplat_jax.scene import Materials
+from geosplat_jax.core.types import Materials
+from geosplat_jax.transport import bsdf
+from geosplat_jax.transport.bsdf import ggx_alpha, ggx_distribution, schlick, specular_probability
 
 # One compilation costs less than a hundred eager operations.
 evaluate, evaluate_lobes = jax.jit(bsdf.evaluate), jax.jit(bsdf.evaluate_lobes)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from geosplat_jax.capacity import (
+from geosplat_jax.core.capacity import (
     BitSet,
     Capacities,
     bit_set,

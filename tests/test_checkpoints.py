@@ -9,7 +9,8 @@ import numpy as np
 import optax
 import pytest
 
-from geosplat_jax.capacity import usage
+from geosplat_jax.core.capacity import usage
+from geosplat_jax.core.types import Grid
 from geosplat_jax.io import checkpoints
 from geosplat_jax.io.checkpoints import (
     CheckpointError,
@@ -19,7 +20,6 @@ from geosplat_jax.io.checkpoints import (
     read_step,
     save_checkpoint,
 )
-from geosplat_jax.scene import Grid
 
 
 def example_tree(value=1.0):

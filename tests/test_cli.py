@@ -9,8 +9,8 @@ import trimesh
 from support import TINY
 
 from geosplat_jax.cli import main
+from geosplat_jax.fit.train import load_run
 from geosplat_jax.io.images import read_image
-from geosplat_jax.train import load_run
 
 DUCK = Path(__file__).resolve().parents[1] / "examples" / "duck"
 SETTINGS = [part for override in TINY for part in ("--set", override)]

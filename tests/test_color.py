@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from support import double_precision
 
-from geosplat_jax.color import linear_to_srgb, luminance, srgb_to_linear, tone_map
+from geosplat_jax.core.color import linear_to_srgb, luminance, srgb_to_linear, tone_map
 
 ROUNDING = 2e-6  # float32 through one exp and one log
 

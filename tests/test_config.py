@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from geosplat_jax.config import (
+from geosplat_jax.fit.config import (
     PRESETS,
     QUALITIES,
     RateConfig,

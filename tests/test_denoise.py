@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support import double_precision
 
-from geosplat_jax.denoise import (
+from geosplat_jax.transport.denoise import (
     _HALF_OF_TAPS,
     DenoiseSpec,
     _gather,

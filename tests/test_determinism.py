@@ -16,15 +16,15 @@ import numpy as np
 import pytest
 from support import sphere_dataset, sphere_views, tiny_config
 
-from geosplat_jax.capacity import Capacities
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.numerics import safe_norm
+from geosplat_jax.core.types import Batch
+from geosplat_jax.fit.stages import initial_params, make_context
+from geosplat_jax.fit.train import fit, load_run
 from geosplat_jax.geometry import sphere_sdf
-from geosplat_jax.hull import fit_grid
 from geosplat_jax.losses import LossWeights, loss
-from geosplat_jax.numerics import safe_norm
 from geosplat_jax.render import render
-from geosplat_jax.scene import Batch
-from geosplat_jax.stages import initial_params, make_context
-from geosplat_jax.train import fit, load_run
+from geosplat_jax.surface.hull import fit_grid
 
 CONFIG = tiny_config()
 AMPLE = Capacities(1024, 1024, 1024, 16384, 16384, 4096)
@@ -127,7 +127,7 @@ from pathlib import Path
 import jax
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 from support import sphere_dataset, tiny_config
-from geosplat_jax.train import fit
+from geosplat_jax.fit.train import fit
 fit(sphere_dataset(), tiny_config(), Path(sys.argv[2]))
 """
 

@@ -10,12 +10,12 @@ import pytest
 from PIL import Image
 from support import STAGE_2, ball_of_one_material, tiny_config, views_from
 
-from geosplat_jax.capacity import Capacities
-from geosplat_jax.evaluate import evaluate_run, preview_image
-from geosplat_jax.protocols import PROTOCOLS
-from geosplat_jax.renderer import RELIGHT_BOUNCES, Renderer
-from geosplat_jax.scene import EnvLight
-from geosplat_jax.stages import begin_stage_2
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.types import EnvLight
+from geosplat_jax.fit.stages import begin_stage_2
+from geosplat_jax.report.evaluate import evaluate_run, preview_image
+from geosplat_jax.report.protocols import PROTOCOLS
+from geosplat_jax.report.renderer import RELIGHT_BOUNCES, Renderer
 
 AMPLE = Capacities(256, 256, 256, 4096, 8192, 2048, 4096)
 # As under a new light, so that both share their programs.

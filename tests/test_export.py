@@ -7,9 +7,9 @@ import pytest
 import trimesh
 from scipy import ndimage
 
+from geosplat_jax.core.types import Camera, Mesh
 from geosplat_jax.io import export, meshes
 from geosplat_jax.io.images import read_linear
-from geosplat_jax.scene import Camera, Mesh
 
 # Half a texel across a chart's border, where a filled gutter is constant; 8 bits are far finer.
 COLOR_TOLERANCE = 0.03

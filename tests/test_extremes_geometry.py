@@ -14,9 +14,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support import double_precision
 
-from geosplat_jax._flexicubes_tables import CORNERS, EDGES
 from geosplat_jax.adapter import CODE, PAPER, face_gaussians, vertex_gaussians
-from geosplat_jax.capacity import Capacities, fits
+from geosplat_jax.core.capacity import Capacities, fits
+from geosplat_jax.core.rotation import quaternion_to_matrix
+from geosplat_jax.core.types import Geometry, Grid, Mesh
 from geosplat_jax.geometry import (
     deformed_vertices,
     edge_deviations,
@@ -29,8 +30,7 @@ from geosplat_jax.geometry import (
     sphere_sdf,
     vertex_normals,
 )
-from geosplat_jax.rotation import quaternion_to_matrix
-from geosplat_jax.scene import Geometry, Grid, Mesh
+from geosplat_jax.surface.flexicubes_tables import CORNERS, EDGES
 
 ROUNDING = float(np.finfo(np.float32).eps)
 POSITION = 20 * ROUNDING  # of cells, in a grid of some cells: a few dozen operations

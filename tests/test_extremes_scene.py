@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from support import look_at_poses, sphere_dataset, sphere_views, tiny_config
 
-from geosplat_jax.capacity import Capacities, fits
-from geosplat_jax.hull import fit_grid, hull_bounds, hull_sdf
+from geosplat_jax.core.capacity import Capacities, fits
+from geosplat_jax.core.numerics import safe_norm
+from geosplat_jax.core.types import Batch, Camera
+from geosplat_jax.fit.stages import initial_params, make_context
+from geosplat_jax.fit.train import fit
 from geosplat_jax.io.export import export_gaussians_ply
 from geosplat_jax.io.views import Views
-from geosplat_jax.light import init_light, prefilter, prefilter_operators
 from geosplat_jax.losses import LossWeights, loss
-from geosplat_jax.numerics import safe_norm
 from geosplat_jax.render import reconstruct, render
-from geosplat_jax.scene import Batch, Camera
-from geosplat_jax.stages import initial_params, make_context
-from geosplat_jax.train import fit
+from geosplat_jax.surface.hull import fit_grid, hull_bounds, hull_sdf
+from geosplat_jax.transport.environment import init_light, prefilter, prefilter_operators
 
 CONFIG = tiny_config("geometry.resolution=8", "objective.with_light=true")
 ROOM = Capacities(256, 256, 256, 2048, 4096, 1024)

@@ -12,10 +12,13 @@ import numpy as np
 import pytest
 from support import double_precision
 
-from geosplat_jax import bsdf
-from geosplat_jax.color import linear_to_srgb, srgb_to_linear, tone_map
+from geosplat_jax.core.color import linear_to_srgb, srgb_to_linear, tone_map
+from geosplat_jax.core.ssim import ssim
+from geosplat_jax.core.types import EnvLight, Materials
 from geosplat_jax.hashgrid import HashGridSpec, encode, init_tables
-from geosplat_jax.light import (
+from geosplat_jax.materials import MaterialSpec, attributes_at, init_materials, smoothness
+from geosplat_jax.transport import bsdf
+from geosplat_jax.transport.environment import (
     LightSpec,
     downsample_light,
     init_light,
@@ -26,10 +29,7 @@ from geosplat_jax.light import (
     rotate_light,
     texel_solid_angles,
 )
-from geosplat_jax.materials import MaterialSpec, attributes_at, init_materials, smoothness
-from geosplat_jax.scene import EnvLight, Materials
-from geosplat_jax.shading import fg_lookup, fg_table, split_sum
-from geosplat_jax.ssim import ssim
+from geosplat_jax.transport.split_sum import fg_lookup, fg_table, split_sum
 
 ROUNDING = 2e-6  # a handful of float32 operations
 COSINES = [1.0, 0.5, 1e-2, 3e-4, 1e-6, 0.0, -1e-6, -0.5, -1.0]  # off the kink at 1e-4

@@ -10,9 +10,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support import double_precision
 
-from geosplat_jax.capacity import Capacities, overflowed
-from geosplat_jax.projection import LOW_PASS_VARIANCE, project
-from geosplat_jax.rasterize import MAX_ALPHA, MIN_ALPHA, _reference_composite, rasterize
+from geosplat_jax.core.capacity import Capacities, overflowed
+from geosplat_jax.splats.projection import LOW_PASS_VARIANCE, project
+from geosplat_jax.splats.rasterize import MAX_ALPHA, MIN_ALPHA, _reference_composite, rasterize
 
 ROUNDING = float(np.finfo(np.float32).eps)
 FIELD = 1e-5  # float32 rendering against float64, a dozen layers deep

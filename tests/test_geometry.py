@@ -9,15 +9,9 @@ import pytest
 import trimesh
 from support import double_precision, shared_path
 
-from geosplat_jax._flexicubes_tables import (
-    CORNERS,
-    EDGES,
-    PATCH_COUNT,
-    PATCH_EDGES,
-    PATCH_OF_EDGE,
-    PROBLEM_OFFSET,
-)
-from geosplat_jax.capacity import Capacities, bit_set, compact, fits, grow
+from geosplat_jax.core.capacity import Capacities, bit_set, compact, fits, grow
+from geosplat_jax.core.numerics import safe_norm
+from geosplat_jax.core.types import Geometry, Grid, Mesh
 from geosplat_jax.geometry import (
     deformed_vertices,
     edge_deviations,
@@ -32,8 +26,14 @@ from geosplat_jax.geometry import (
     vertex_normals,
     weight_magnitude,
 )
-from geosplat_jax.numerics import safe_norm
-from geosplat_jax.scene import Geometry, Grid, Mesh
+from geosplat_jax.surface.flexicubes_tables import (
+    CORNERS,
+    EDGES,
+    PATCH_COUNT,
+    PATCH_EDGES,
+    PATCH_OF_EDGE,
+    PROBLEM_OFFSET,
+)
 
 ORACLE_TOLERANCE = 1e-9  # float64, sums of some thousand terms
 DIFFERENCE_TOLERANCE = 2e-6  # relative, central differences of step 1e-6 in float64

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from geosplat_jax.hull import (
+from geosplat_jax.io.dataset import load_dataset
+from geosplat_jax.surface.hull import (
     fit_grid,
     grid_points,
     hull_bounds,
@@ -14,7 +15,6 @@ from geosplat_jax.hull import (
     hull_sdf,
     visual_hull,
 )
-from geosplat_jax.io.dataset import load_dataset
 
 SHARED = Path(__file__).parents[2] / "shared"
 VIEW_COUNT, SIZE, FOCAL, DISTANCE, RADIUS = 40, 64, 90.0, 4.0, 0.9

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from support import double_precision
 
-from geosplat_jax.indirect import (
+from geosplat_jax.core.types import Materials
+from geosplat_jax.transport.indirect import (
     COEFFICIENTS,
     INDIRECT_KINDS,
     NO_INDIRECT,
@@ -17,8 +18,7 @@ from geosplat_jax.indirect import (
     incoming,
     outgoing,
 )
-from geosplat_jax.monte_carlo import BLOCKED, OPEN
-from geosplat_jax.scene import Materials
+from geosplat_jax.transport.monte_carlo import BLOCKED, OPEN
 
 ROUNDING = 1e-6  # float32, values of order one
 RAYS = 7

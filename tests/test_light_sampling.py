@@ -7,9 +7,9 @@ import pytest
 from scipy.stats import chi2
 from support import double_precision
 
-from geosplat_jax.light import lookup, texel_solid_angles
-from geosplat_jax.light_sampling import light_density, light_sampler, sample_light
-from geosplat_jax.scene import EnvLight
+from geosplat_jax.core.types import EnvLight
+from geosplat_jax.transport.environment import lookup, texel_solid_angles
+from geosplat_jax.transport.light_sampling import light_density, light_sampler, sample_light
 
 
 def random_light(height=6, width=10, seed=0):

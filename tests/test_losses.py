@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from support import sphere_views, tiny_config
 
-from geosplat_jax.capacity import Capacities
-from geosplat_jax.hull import fit_grid
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.numerics import safe_norm
+from geosplat_jax.core.types import Batch
+from geosplat_jax.fit.stages import initial_params, make_context
 from geosplat_jax.losses import (
     TERM_NAMES,
     LossWeights,
@@ -18,10 +20,8 @@ from geosplat_jax.losses import (
     loss,
     photometric_terms,
 )
-from geosplat_jax.numerics import safe_norm
 from geosplat_jax.render import render
-from geosplat_jax.scene import Batch
-from geosplat_jax.stages import initial_params, make_context
+from geosplat_jax.surface.hull import fit_grid
 
 AMPLE = Capacities(1024, 1024, 1024, 16384, 16384, 4096)
 DOUBLE = Capacities(2048, 2048, 2048, 32768, 32768, 8192)

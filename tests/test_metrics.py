@@ -5,8 +5,8 @@ import pytest
 from jax.test_util import check_grads
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from geosplat_jax import metrics
-from geosplat_jax.ssim import _blur, _reference_blur
+from geosplat_jax.core.ssim import _blur, _reference_blur
+from geosplat_jax.report import metrics
 
 # float32 means of ten thousand windows; skimage filters in float64.
 SSIM_TOLERANCE = 2e-6

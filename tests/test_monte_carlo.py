@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from support import double_precision
 
-from geosplat_jax import bsdf, monte_carlo
-from geosplat_jax.capacity import Capacities
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.types import EnvLight, Grid, Materials
 from geosplat_jax.geometry import initial_geometry, isosurface, sphere_sdf
-from geosplat_jax.indirect import Indirect
-from geosplat_jax.light import lookup
-from geosplat_jax.light_sampling import light_sampler
-from geosplat_jax.monte_carlo import (
+from geosplat_jax.rays.grid_index import build_accelerator
+from geosplat_jax.transport import bsdf, monte_carlo
+from geosplat_jax.transport.environment import lookup
+from geosplat_jax.transport.indirect import Indirect
+from geosplat_jax.transport.light_sampling import light_sampler
+from geosplat_jax.transport.monte_carlo import (
     BLOCKED,
     OPEN,
     SampleCounts,
@@ -26,8 +28,6 @@ from geosplat_jax.monte_carlo import (
     reflect,
     shade,
 )
-from geosplat_jax.scene import EnvLight, Grid, Materials
-from geosplat_jax.trace import build_accelerator
 
 POINTS = 12
 shade_jitted = partial(jax.jit, static_argnames=("counts",))(shade)

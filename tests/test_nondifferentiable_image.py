@@ -22,21 +22,27 @@ from one_sided import (
 )
 from support import double_precision
 
-from geosplat_jax import bsdf
-from geosplat_jax.capacity import Capacities, usage
-from geosplat_jax.color import linear_to_srgb, srgb_to_linear, tone_map
-from geosplat_jax.light import (
+from geosplat_jax.core.capacity import Capacities, usage
+from geosplat_jax.core.color import linear_to_srgb, srgb_to_linear, tone_map
+from geosplat_jax.core.ssim import ssim
+from geosplat_jax.core.types import Camera, EnvLight, Gaussians, Grid, Materials, Mesh
+from geosplat_jax.materials import MaterialSpec, init_materials, smoothness
+from geosplat_jax.model import Context, Model, Params
+from geosplat_jax.render import Asset, reconstruct, render_views
+from geosplat_jax.splats.projection import Splats, project
+from geosplat_jax.splats.rasterize import (
+    MAX_ALPHA,
+    MIN_ALPHA,
+    composite,
+    find_visible,
+    gather_visible,
+)
+from geosplat_jax.transport import bsdf
+from geosplat_jax.transport.environment import (
     LightSpec,
     prefilter_operators,
 )
-from geosplat_jax.materials import MaterialSpec, init_materials, smoothness
-from geosplat_jax.model import Context, Model, Params
-from geosplat_jax.projection import Splats, project
-from geosplat_jax.rasterize import MAX_ALPHA, MIN_ALPHA, composite, find_visible, gather_visible
-from geosplat_jax.render import Asset, reconstruct, render_views
-from geosplat_jax.scene import Camera, EnvLight, Gaussians, Grid, Materials, Mesh
-from geosplat_jax.shading import fg_table
-from geosplat_jax.ssim import ssim
+from geosplat_jax.transport.split_sum import fg_table
 
 ROOM = Capacities(surface_cubes=256, dual_vertices=256, quads=256)
 

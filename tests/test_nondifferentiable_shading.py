@@ -20,8 +20,13 @@ from one_sided import (
 )
 from support import double_precision
 
-from geosplat_jax import bsdf
-from geosplat_jax.light import (
+from geosplat_jax.core.numerics import COSINE_EPSILON, safe_normalize
+from geosplat_jax.core.types import EnvLight
+from geosplat_jax.fit.step import _project
+from geosplat_jax.materials import MaterialSpec, init_materials
+from geosplat_jax.model import Params
+from geosplat_jax.transport import bsdf
+from geosplat_jax.transport.environment import (
     POLE_EPSILON,
     LightSpec,
     PrefilteredLight,
@@ -31,12 +36,7 @@ from geosplat_jax.light import (
     prefilter_operators,
     prefiltered_specular,
 )
-from geosplat_jax.materials import MaterialSpec, init_materials
-from geosplat_jax.model import Params
-from geosplat_jax.numerics import COSINE_EPSILON, safe_normalize
-from geosplat_jax.scene import EnvLight
-from geosplat_jax.shading import fg_lookup, fg_table, split_sum
-from geosplat_jax.step import _project
+from geosplat_jax.transport.split_sum import fg_lookup, fg_table, split_sum
 
 
 @pytest.fixture(autouse=True)

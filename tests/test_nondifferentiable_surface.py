@@ -27,7 +27,10 @@ from geosplat_jax.adapter import (
     shift_inwards,
     vertex_gaussians,
 )
-from geosplat_jax.capacity import Capacities
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.mesh import face_normals_and_areas
+from geosplat_jax.core.rotation import axes_to_quaternion, frame_from_normal, quaternion_to_matrix
+from geosplat_jax.core.types import Grid, Mesh
 from geosplat_jax.geometry import (
     _SDF_EPSILON,
     _crossing_fraction,
@@ -40,10 +43,7 @@ from geosplat_jax.geometry import (
 from geosplat_jax.hashgrid import apply_mlp, encode
 from geosplat_jax.losses import light_term, photometric_terms
 from geosplat_jax.materials import MaterialSpec, init_materials, smoothness, to_unit_cube
-from geosplat_jax.mesh_ops import face_normals_and_areas
-from geosplat_jax.projection import project
-from geosplat_jax.rotation import axes_to_quaternion, frame_from_normal, quaternion_to_matrix
-from geosplat_jax.scene import Grid, Mesh
+from geosplat_jax.splats.projection import project
 
 AT_ZERO_OF_ABS = 0.0
 """Slope of `numerics.absolute` at 0, between both sides; JAX itself gives that of the right."""

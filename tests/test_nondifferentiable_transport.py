@@ -12,8 +12,9 @@ import pytest
 from one_sided import STEP, assert_kink, material
 from support import double_precision
 
-from geosplat_jax.light_sampling import light_sampler
-from geosplat_jax.monte_carlo import (
+from geosplat_jax.core.types import EnvLight
+from geosplat_jax.transport.light_sampling import light_sampler
+from geosplat_jax.transport.monte_carlo import (
     OPEN,
     SampleCounts,
     Samples,
@@ -22,7 +23,6 @@ from geosplat_jax.monte_carlo import (
     gather,
     reflect,
 )
-from geosplat_jax.scene import EnvLight
 
 RADIANCE = 2.0
 COUNTS = SampleCounts(light=2, diffuse=0, specular=0)

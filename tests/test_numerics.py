@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support import double_precision
 
-from geosplat_jax.numerics import (
+from geosplat_jax.core.numerics import (
     LENGTH_EPSILON,
     absolute,
     clamp_away_from_zero,

@@ -17,17 +17,17 @@ from references.lanes import contract, difference
 from scipy.spatial import cKDTree
 from support import double_precision
 
-from geosplat_jax._flexicubes_tables import EDGES, PATCH_EDGES, PROBLEM_OFFSET
 from geosplat_jax.adapter import CODE, PAPER, face_gaussians, vertex_gaussians
-from geosplat_jax.bsdf import evaluate_lobes
-from geosplat_jax.capacity import Capacities, fits
+from geosplat_jax.core.capacity import Capacities, fits
+from geosplat_jax.core.mesh import vertex_normals
+from geosplat_jax.core.numerics import safe_normalize
+from geosplat_jax.core.rotation import quaternion_to_matrix
+from geosplat_jax.core.types import Geometry, Grid, Materials, Mesh
 from geosplat_jax.geometry import isosurface
-from geosplat_jax.mesh_ops import vertex_normals
-from geosplat_jax.numerics import safe_normalize
-from geosplat_jax.projection import project
-from geosplat_jax.rasterize import rasterize
-from geosplat_jax.rotation import quaternion_to_matrix
-from geosplat_jax.scene import Geometry, Grid, Materials, Mesh
+from geosplat_jax.splats.projection import project
+from geosplat_jax.splats.rasterize import rasterize
+from geosplat_jax.surface.flexicubes_tables import EDGES, PATCH_EDGES, PROBLEM_OFFSET
+from geosplat_jax.transport.bsdf import evaluate_lobes
 
 DATA = Path(__file__).parent / "data"
 # float64 on both sides, some hundred operations deep; the largest values have order 10 to 1e3.

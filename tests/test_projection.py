@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from geosplat_jax import projection
-from geosplat_jax.projection import LOW_PASS_VARIANCE
-from geosplat_jax.rotation import quaternion_to_matrix
+from geosplat_jax.core.rotation import quaternion_to_matrix
+from geosplat_jax.splats import projection
+from geosplat_jax.splats.projection import LOW_PASS_VARIANCE
 
 # Compiled once a shape; op-by-op dispatch would compile every small operation on its own.
 project = jax.jit(projection.project, static_argnames=("height", "width"))

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from geosplat_jax import metrics, protocols
-from geosplat_jax.protocols import PROTOCOL, PROTOCOLS, protocol
+from geosplat_jax.report import metrics, protocols
+from geosplat_jax.report.protocols import PROTOCOL, PROTOCOLS, protocol
 
 # Decibels of float32 images.
 DECIBELS = 2e-3

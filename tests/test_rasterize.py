@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from geosplat_jax._tiles import _sort_hits, _stable_argsort
-from geosplat_jax.capacity import Capacities, fits, overflowed
-from geosplat_jax.projection import Splats, project
-from geosplat_jax.rasterize import (
+from geosplat_jax.core.capacity import Capacities, fits, overflowed
+from geosplat_jax.splats.projection import Splats, project
+from geosplat_jax.splats.rasterize import (
     MAX_ALPHA,
     MIN_ALPHA,
     _reference_composite,
@@ -19,6 +18,7 @@ from geosplat_jax.rasterize import (
     gather_visible,
     rasterize,
 )
+from geosplat_jax.splats.tiles import _sort_hits, _stable_argsort
 
 ORACLES = Path(__file__).parents[2] / "shared" / "oracles"
 # float64; a few hundred products deep, the oracle's own rounding included.

@@ -8,10 +8,10 @@ import pytest
 from PIL import Image
 from support import ball_of_one_material, tiny_config, views_from
 
-from geosplat_jax.capacity import Capacities
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.types import EnvLight
 from geosplat_jax.io.images import SceneError, encode_srgb, write_hdr, write_png
-from geosplat_jax.light import lookup, rotate_light
-from geosplat_jax.relight import (
+from geosplat_jax.report.relight import (
     BACKGROUNDS,
     RelightOptions,
     about_z,
@@ -20,8 +20,8 @@ from geosplat_jax.relight import (
     picture,
     relight_views,
 )
-from geosplat_jax.renderer import RenderedView, Renderer
-from geosplat_jax.scene import EnvLight
+from geosplat_jax.report.renderer import RenderedView, Renderer
+from geosplat_jax.transport.environment import lookup, rotate_light
 
 AMPLE = Capacities(256, 256, 256, 4096, 8192, 2048, 4096)
 RED, GREEN, BLUE, YELLOW = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0.0]])
@@ -366,7 +366,7 @@ def test_without_movies_only_stills_are_written(light, matt, tmp_path):
 
 def test_the_movie_is_an_mp4_only_where_one_can_be_made(monkeypatch):
     for found, expected in ((True, ".mp4"), (False, ".gif")):
-        monkeypatch.setattr("geosplat_jax.relight.has_encoder", lambda suffix, f=found: f)
+        monkeypatch.setattr("geosplat_jax.report.relight.has_encoder", lambda suffix, f=found: f)
         assert RelightOptions().movie_suffix() == expected
     assert RelightOptions(suffix=".gif").movie_suffix() == ".gif"
 

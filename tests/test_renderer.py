@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from support import STAGE_2, ball_of_one_material, tiny_config, views_from
 
-from geosplat_jax.capacity import Capacities
-from geosplat_jax.color import tone_map
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.color import tone_map
+from geosplat_jax.core.types import EnvLight
+from geosplat_jax.fit.stages import begin_stage_2
 from geosplat_jax.render import render
-from geosplat_jax.renderer import (
+from geosplat_jax.report.renderer import (
     EVALUATION_AOVS,
     RELIGHT_BOUNCES,
     RenderedView,
@@ -23,8 +25,6 @@ from geosplat_jax.renderer import (
     straight_rgba,
     to_picture,
 )
-from geosplat_jax.scene import EnvLight
-from geosplat_jax.stages import begin_stage_2
 
 AMPLE = Capacities(256, 256, 256, 4096, 8192, 2048, 4096)
 CONFIG = tiny_config("model.material.bias=true", "transport.fresh_albedo=false", *STAGE_2)

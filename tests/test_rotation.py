@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from support import double_precision
 
-from geosplat_jax.rotation import (
+from geosplat_jax.core.rotation import (
     angle_between,
     frame_from_normal,
     matrix_to_quaternion,

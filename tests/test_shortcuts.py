@@ -11,7 +11,7 @@ sys.path.insert(0, str(ROOT / "experiments"))
 
 import shortcuts  # noqa: E402
 
-from geosplat_jax.config import make_config  # noqa: E402
+from geosplat_jax.fit.config import make_config  # noqa: E402
 
 SIZE, SEEDS = 40, 8
 

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from support import STAGE_2, sphere_dataset, tiny_config
 
-from geosplat_jax import train as train_module
-from geosplat_jax.config import config_from_dict, differences, make_config
+from geosplat_jax.fit import train as train_module
+from geosplat_jax.fit.config import config_from_dict, differences, make_config
+from geosplat_jax.fit.stages import begin_stage_2, initial_params
+from geosplat_jax.fit.step import make_optimizer
+from geosplat_jax.fit.train import TrainingError, fit, load_run
 from geosplat_jax.geometry import sphere_sdf
-from geosplat_jax.grids import grid_vertices
-from geosplat_jax.hull import fit_grid
 from geosplat_jax.materials import materials_at
 from geosplat_jax.render import grid_center_and_extent
-from geosplat_jax.stages import begin_stage_2, initial_params
-from geosplat_jax.step import make_optimizer
-from geosplat_jax.train import TrainingError, fit, load_run
+from geosplat_jax.surface.grids import grid_vertices
+from geosplat_jax.surface.hull import fit_grid
 
 
 @pytest.mark.parametrize("preset", ["default", "paper", "code"])

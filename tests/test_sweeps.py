@@ -18,7 +18,7 @@ sys.path.insert(0, str(ROOT / "experiments"))
 import report  # noqa: E402
 import run as runner  # noqa: E402
 
-from geosplat_jax.config import make_config  # noqa: E402
+from geosplat_jax.fit.config import make_config  # noqa: E402
 from geosplat_jax.io.checkpoints import save_checkpoint  # noqa: E402
 
 SWEEPS = ROOT / "experiments" / "sweeps"

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from support import sphere_dataset, tiny_config
 
-from geosplat_jax import process
-from geosplat_jax import train as train_module
-from geosplat_jax.capacity import Capacities
-from geosplat_jax.scene import Geometry
-from geosplat_jax.stages import sampling_of_step, view_indices
-from geosplat_jax.step import parameter_group, train_step
-from geosplat_jax.train import Interrupted, TrainingError, fit, load_run
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.types import Geometry
+from geosplat_jax.fit import runtime as process
+from geosplat_jax.fit import train as train_module
+from geosplat_jax.fit.stages import sampling_of_step, view_indices
+from geosplat_jax.fit.step import parameter_group, train_step
+from geosplat_jax.fit.train import Interrupted, TrainingError, fit, load_run
 
 
 @pytest.fixture(scope="module")

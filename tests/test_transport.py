@@ -14,21 +14,21 @@ from support import (
     views_from,
 )
 
-from geosplat_jax import monte_carlo
-from geosplat_jax.capacity import Capacities
-from geosplat_jax.denoise import DenoiseSpec
-from geosplat_jax.hull import fit_grid
-from geosplat_jax.light_sampling import light_sampler
-from geosplat_jax.monte_carlo import draw_samples, gather, reflect
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.types import EnvLight, Materials
+from geosplat_jax.fit.stages import begin_stage_2, initial_params, make_context
 from geosplat_jax.render import (
     illuminate_asset,
     reconstruct,
     render,
     render_lit,
 )
-from geosplat_jax.scene import EnvLight, Materials
-from geosplat_jax.stages import begin_stage_2, initial_params, make_context
-from geosplat_jax.transport import Transport, denoised, illuminate, shade_rows
+from geosplat_jax.surface.hull import fit_grid
+from geosplat_jax.transport import monte_carlo
+from geosplat_jax.transport.base import Transport, denoised, illuminate, shade_rows
+from geosplat_jax.transport.denoise import DenoiseSpec
+from geosplat_jax.transport.light_sampling import light_sampler
+from geosplat_jax.transport.monte_carlo import draw_samples, gather, reflect
 
 AMPLE = Capacities(1024, 1024, 1024, 16384, 16384, 4096, 8192)
 BIASED = ("model.material.bias=true",)

@@ -14,18 +14,18 @@ from support import (
     tiny_config,
 )
 
-from geosplat_jax.capacity import Capacities, fits, grow, overflowed
+from geosplat_jax.core.capacity import Capacities, fits, grow, overflowed
+from geosplat_jax.core.types import Batch, EnvLight
+from geosplat_jax.fit.stages import begin_stage_2, initial_params, make_context
+from geosplat_jax.fit.step import initial_state, train_step
 from geosplat_jax.geometry import sphere_sdf
-from geosplat_jax.hull import fit_grid
 from geosplat_jax.losses import LossWeights, loss
 from geosplat_jax.render import (
     reconstruct,
     render,
 )
-from geosplat_jax.scene import Batch, EnvLight
-from geosplat_jax.stages import begin_stage_2, initial_params, make_context
-from geosplat_jax.step import initial_state, train_step
-from geosplat_jax.transport import illuminate, shade_rows
+from geosplat_jax.surface.hull import fit_grid
+from geosplat_jax.transport.base import illuminate, shade_rows
 
 AMPLE = Capacities(1024, 1024, 1024, 16384, 16384, 4096, 8192)
 BIASED = ("model.material.bias=true",)

@@ -13,7 +13,8 @@ from geosplat_jax.adapter import (
     shift_inwards,
     vertex_gaussians,
 )
-from geosplat_jax.capacity import Capacities
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.types import Gaussians, Geometry, Grid, Mesh
 from geosplat_jax.geometry import (
     face_normals_and_areas,
     isosurface,
@@ -22,8 +23,7 @@ from geosplat_jax.geometry import (
     weight_magnitude,
 )
 from geosplat_jax.gradcheck.differences import Problem
-from geosplat_jax.grids import grid_vertices
-from geosplat_jax.scene import Gaussians, Geometry, Grid, Mesh
+from geosplat_jax.surface.grids import grid_vertices
 
 _SHAPE = (3, 3, 4)
 

@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from geosplat_jax.capacity import Capacities
-from geosplat_jax.color import linear_to_srgb, tone_map
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.color import linear_to_srgb, tone_map
 from geosplat_jax.gradcheck.differences import Problem
 from geosplat_jax.losses import light_term, photometric_terms
-from geosplat_jax.projection import project
-from geosplat_jax.rasterize import rasterize
+from geosplat_jax.splats.projection import project
+from geosplat_jax.splats.rasterize import rasterize
 
 _HEIGHT, _WIDTH = 9, 11
 _CAPACITIES = Capacities(visible=128, hits=512, chunks=128)

@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from geosplat_jax import bsdf
+from geosplat_jax.core.types import EnvLight, Materials
 from geosplat_jax.gradcheck.differences import Problem
 from geosplat_jax.hashgrid import HashGridSpec, encode
-from geosplat_jax.indirect import COEFFICIENTS, Indirect
-from geosplat_jax.light import (
+from geosplat_jax.materials import MaterialField, MaterialSpec, attributes_at, init_materials
+from geosplat_jax.transport import bsdf
+from geosplat_jax.transport.environment import (
     LightSpec,
     lookup,
     prefilter,
@@ -19,9 +20,9 @@ from geosplat_jax.light import (
     prefiltered_diffuse,
     prefiltered_specular,
 )
-from geosplat_jax.light_sampling import light_sampler
-from geosplat_jax.materials import MaterialField, MaterialSpec, attributes_at, init_materials
-from geosplat_jax.monte_carlo import (
+from geosplat_jax.transport.indirect import COEFFICIENTS, Indirect
+from geosplat_jax.transport.light_sampling import light_sampler
+from geosplat_jax.transport.monte_carlo import (
     BLOCKED,
     SampleCounts,
     SurfacePoints,
@@ -29,8 +30,7 @@ from geosplat_jax.monte_carlo import (
     gather,
     reflect,
 )
-from geosplat_jax.scene import EnvLight, Materials
-from geosplat_jax.shading import fg_table, split_sum
+from geosplat_jax.transport.split_sum import fg_table, split_sum
 
 _GRID = HashGridSpec(levels=3, features=2, log2_entries=6, coarsest=2, finest=11)
 """One dense level and two hashed ones."""

@@ -7,16 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from geosplat_jax.capacity import Capacities
-from geosplat_jax.config import Config, make_config
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.types import Batch, Camera, EnvLight, Geometry, Grid
+from geosplat_jax.fit.config import Config, make_config
+from geosplat_jax.fit.stages import make_context
 from geosplat_jax.geometry import initial_geometry, sphere_sdf
 from geosplat_jax.gradcheck.differences import Problem
-from geosplat_jax.hull import fit_grid
 from geosplat_jax.losses import TERM_NAMES, LossWeights, loss
 from geosplat_jax.materials import MaterialField, init_materials, smoothness
 from geosplat_jax.model import Context, Model, Params
-from geosplat_jax.scene import Batch, Camera, EnvLight, Geometry, Grid
-from geosplat_jax.stages import make_context
+from geosplat_jax.surface.hull import fit_grid
 
 _SIZE = 14
 _SETTINGS = (

@@ -8,18 +8,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from geosplat_jax.hull import hull_bounds
 from geosplat_jax.io.frames import Frame, Listing
 from geosplat_jax.io.images import MissingFileError, SceneError
-from geosplat_jax.io.nerf_synthetic import (
+from geosplat_jax.io.layouts.nerf_synthetic import (
     is_nerf_synthetic,
     is_shiny_blender,
     list_nerf_synthetic,
     list_shiny_blender,
 )
-from geosplat_jax.io.synthetic4relight import is_synthetic4relight, list_synthetic4relight
-from geosplat_jax.io.tensoir import is_tensoir, list_tensoir
+from geosplat_jax.io.layouts.synthetic4relight import is_synthetic4relight, list_synthetic4relight
+from geosplat_jax.io.layouts.tensoir import is_tensoir, list_tensoir
 from geosplat_jax.io.views import COVERED, Views, load_views, no_views
+from geosplat_jax.surface.hull import hull_bounds
 
 
 class Layout(NamedTuple):

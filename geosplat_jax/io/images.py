@@ -19,7 +19,7 @@ import numpy as np
 import OpenImageIO as oiio
 from jaxtyping import Float
 
-from geosplat_jax.color import linear_to_srgb, srgb_to_linear
+from geosplat_jax.core.color import linear_to_srgb, srgb_to_linear
 
 LINEAR_FORMATS = frozenset({".exr", ".hdr"})
 """Suffixes of the formats that hold linear light; every other one is taken as sRGB."""

@@ -16,7 +16,7 @@ import xatlas
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from geosplat_jax.scene import Camera, Mesh
+from geosplat_jax.core.types import Camera, Mesh
 
 # A face thinner than this share of the bounding box's diagonal has no usable normal or chart.
 _DEGENERATE_HEIGHT = 1e-7

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from geosplat_jax.core.types import Camera
 from geosplat_jax.io.frames import Frame, Listing
 from geosplat_jax.io.images import SceneError, downscale, read_linear
-from geosplat_jax.scene import Camera
 
 COVERED = 0.5
 """A pixel belongs to the object where its alpha exceeds this."""

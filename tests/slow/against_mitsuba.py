@@ -1,4 +1,4 @@
-"""Direct light by `geosplat_jax.monte_carlo` against Mitsuba 3, an independent renderer.
+"""Direct light by `geosplat_jax.transport.monte_carlo` against Mitsuba 3, an independent renderer.
 
 One mesh that shadows itself, one camera, two environment maps, two materials: a diffuse one, and a
 GGX metal (`principled` in Mitsuba). Both renderers see the same triangles, vertex normals and
@@ -34,7 +34,8 @@ import numpy as np
 import trimesh
 from trimesh.exchange.ply import export_ply
 
-from geosplat_jax.capacity import Capacities, combine, grow, overflowed
+from geosplat_jax.core.capacity import Capacities, combine, grow, overflowed
+from geosplat_jax.core.types import EnvLight, Grid, Materials
 from geosplat_jax.geometry import (
     Surface,
     face_normals_and_areas,
@@ -44,11 +45,10 @@ from geosplat_jax.geometry import (
     vertex_normals,
 )
 from geosplat_jax.io.images import write_png
-from geosplat_jax.light import light_directions, lookup
-from geosplat_jax.metrics import psnr, psnr_of_mse
-from geosplat_jax.monte_carlo import SampleCounts, SurfacePoints, shade
-from geosplat_jax.scene import EnvLight, Grid, Materials
-from geosplat_jax.trace import Accelerator, build_accelerator, nearest
+from geosplat_jax.rays.grid_index import Accelerator, build_accelerator, nearest
+from geosplat_jax.report.metrics import psnr, psnr_of_mse
+from geosplat_jax.transport.environment import light_directions, lookup
+from geosplat_jax.transport.monte_carlo import SampleCounts, SurfacePoints, shade
 
 FIELD_OF_VIEW = 0.62
 """Horizontal and vertical, radians."""

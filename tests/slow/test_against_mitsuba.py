@@ -9,7 +9,7 @@ pytest.importorskip("mitsuba")
 
 import against_mitsuba as against  # noqa: E402
 
-from geosplat_jax.scene import EnvLight  # noqa: E402
+from geosplat_jax.core.types import EnvLight  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

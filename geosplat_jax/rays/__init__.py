@@ -1,0 +1,1 @@
+"""Rays against surfaces: occlusion and nearest hits."""

@@ -1,0 +1,453 @@
+"""Figures of the three evaluation protocols of the field, as pure functions on the host.
+
+Numbers of papers with different protocols are not comparable, so a protocol is named and is data:
+one row of a table a name (`PROTOCOL`).
+
+Conventions. Maps are NumPy, V views of one size. Predicted *and* true maps are premultiplied by
+their coverage (predicted ``alpha``, true ``mask``), hence zero on the background; the truth of
+`io.views.Views` is straight and is multiplied by the mask first. Only ``image`` of
+`relight_figures` is straight RGBA, as `Views.relight` holds it. Where coverage is partial, the
+straight colour is clipped to [0, 1], encoded, and then laid over the background: so do the public
+codes with the PNG files of the data sets, and so is truth and prediction treated here.
+
+Every ``*_masked`` figure compares the same pictures over the pixels of the true mask only; views
+without an object have no part in it. SSIM is always the mean over images.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+
+from geosplat_jax.io.images import encode_srgb
+from geosplat_jax.report.metrics import (
+    MASK_THRESHOLD,
+    albedo_scale_least_squares,
+    albedo_scale_median,
+    composite,
+    mse,
+    psnr_of_mse,
+    ssim,
+    ssim_masked,
+)
+
+_SMALLEST_ALPHA = 1e-6
+_MATERIALS = ("roughness", "metallic")
+
+
+@dataclass(frozen=True)
+class Look:
+    """How pictures are made of linear colour before they are compared.
+
+    Attributes
+    ----------
+    encoding : ``linear``, ``srgb`` or ``gamma22``, value^(1/2.2).
+    background : grey behind the object, encoded.
+    silhouette : where the prediction lies over the background. ``alpha`` blends it by its own
+        alpha; ``solid`` shows it unblended where its alpha exceeds one half; ``mask`` blends it by
+        the true mask, so that what was drawn beside the object does not count. The truth is always
+        blended by its mask.
+    """
+
+    encoding: Literal["linear", "srgb", "gamma22"]
+    background: float
+    silhouette: Literal["alpha", "solid", "mask"]
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """The choices that make the figures of different papers incomparable.
+
+    Attributes
+    ----------
+    name : as in `PROTOCOLS`.
+    albedo_scale : ``least_squares`` a view, averaged over the views, or ``median`` of all pixels;
+        always a channel, in linear colour.
+    scale_views : number of views, spread evenly, that the scale is taken from; None for all.
+    albedo, relight : looks of albedo and of relit images.
+    albedo_is_pooled : one PSNR of the error over all images; otherwise, and for relit images
+        always, the mean of the PSNR of every image.
+    lpips_nets : networks of the perceptual distance; see `lpips_note`.
+    """
+
+    name: str
+    albedo_scale: Literal["least_squares", "median"]
+    scale_views: int | None
+    albedo: Look
+    albedo_is_pooled: bool
+    relight: Look
+    lpips_nets: tuple[str, ...]
+
+
+PROTOCOL: Mapping[str, Protocol] = {
+    row.name: row
+    for row in (
+        Protocol(
+            name="geosplatting",
+            albedo_scale="least_squares",
+            scale_views=None,
+            albedo=Look("srgb", 0.0, "alpha"),
+            albedo_is_pooled=False,
+            relight=Look("srgb", 1.0, "alpha"),
+            lpips_nets=("alex",),
+        ),
+        Protocol(
+            name="tensoir",
+            albedo_scale="median",
+            scale_views=20,
+            albedo=Look("gamma22", 1.0, "mask"),
+            albedo_is_pooled=True,
+            relight=Look("srgb", 1.0, "solid"),
+            lpips_nets=("alex", "vgg"),
+        ),
+        Protocol(
+            name="irgs",
+            albedo_scale="median",
+            scale_views=None,
+            albedo=Look("linear", 0.0, "mask"),
+            albedo_is_pooled=False,
+            relight=Look("srgb", 0.0, "mask"),
+            lpips_nets=("vgg",),
+        ),
+    )
+}
+"""The protocols by name."""
+
+NEW_VIEWS = Look("srgb", 1.0, "alpha")
+"""How new views under the training light are compared in every protocol."""
+
+PROTOCOLS = tuple(PROTOCOL)
+"""Names of the protocols, the default first."""
+
+
+def protocol(name: str) -> Protocol:
+    """Look a protocol up.
+
+    Raises
+    ------
+    ValueError : there is none of that name.
+    """
+    if name not in PROTOCOL:
+        raise ValueError(f"there is no protocol {name!r}; choose one of {', '.join(PROTOCOLS)}")
+    return PROTOCOL[name]
+
+
+def lpips_note(protocol: Protocol) -> str:
+    """Say which networks the protocol's perceptual distance would use, and why it is missing."""
+    nets = " and ".join(protocol.lpips_nets)
+    return (
+        f"LPIPS is left out: protocol {protocol.name!r} measures it with the trained weights of "
+        f"{nets}, which are a download and no part of this package"
+    )
+
+
+def scale_views(protocol: Protocol, count: int) -> Int[np.ndarray, " K"]:
+    """Choose the views, of ``count``, that the albedo scale is taken from.
+
+    Every ``count // scale_views``-th view from the first on; all where there are no more of them.
+    """
+    wanted = min(count, protocol.scale_views or count)
+    return np.arange(wanted) * (count // max(wanted, 1))
+
+
+def _require(shape: tuple[int, ...], **maps: np.ndarray | tuple[np.ndarray, int]) -> None:
+    """Check that maps have the (V, H, W) of alpha, then their channels, and finite values."""
+    for name, entry in maps.items():
+        values, *channels = entry if isinstance(entry, tuple) else (entry,)
+        wanted = (*shape, *channels)
+        if len(shape) != 3 or 0 in shape or values.shape != wanted:
+            raise ValueError(
+                f"{name} must be (V, H, W{', C' * len(channels)}) = {wanted}, at least one view of "
+                f"the size of alpha, got {values.shape}; render and load the same views"
+            )
+        bad = int(np.size(values) - np.count_nonzero(np.isfinite(values)))
+        if bad:
+            raise ValueError(
+                f"{name} has {bad} values that are not finite; figures of it would mean nothing: "
+                "render again from a sound checkpoint"
+            )
+
+
+def _require_object(inside: Bool[np.ndarray, "V H W"]) -> None:
+    if not inside.any():
+        raise ValueError(
+            f"no pixel of the {inside.shape[0]} views lies inside the mask (coverage above "
+            f"{MASK_THRESHOLD}); check the alpha of the test images"
+        )
+
+
+def _straight(
+    premultiplied: Float[np.ndarray, "..."], coverage: Shaped[np.ndarray, "..."]
+) -> Float[np.ndarray, "..."]:
+    """Divide by coverage; zero where nothing is covered."""
+    coverage = coverage.reshape(coverage.shape + (1,) * (premultiplied.ndim - coverage.ndim))
+    covered = coverage > _SMALLEST_ALPHA
+    divisor = np.where(covered, coverage, 1).astype(premultiplied.dtype)
+    return np.where(covered, premultiplied / divisor, 0).astype(premultiplied.dtype)
+
+
+def albedo_scale(
+    protocol: Protocol,
+    albedo: Float[np.ndarray, "..."],
+    alpha: Float[np.ndarray, "..."],
+    truth: Float[np.ndarray, "..."],
+    mask: Shaped[np.ndarray, "..."],
+) -> Float[np.ndarray, " 3"]:
+    """Fit one factor a channel that takes the predicted albedo to the true one.
+
+    Albedo and light share a factor that no photograph can tell apart, so albedo is compared, and
+    relit, after this one is multiplied in.
+
+    Parameters
+    ----------
+    protocol : its ``albedo_scale`` and ``scale_views`` decide. ``least_squares`` fits the
+        premultiplied maps, which is on black; ``median`` takes the ratio of *straight* values over
+        the pixels of the mask where something was drawn.
+    albedo : (V, H, W, 3) linear, premultiplied by ``alpha``.
+    alpha : (V, H, W) predicted coverage.
+    truth : (V, H, W, 3) linear, premultiplied by ``mask``.
+    mask : (V, H, W) true coverage, fraction or boolean.
+
+    Returns
+    -------
+    (3,) float64. Views without an object have no part in it; nor, for least squares, has a channel
+    of a view that was predicted black. A channel without any evidence gets 1.
+
+    Raises
+    ------
+    ValueError : shapes that do not agree, values that are not finite, no object in the views.
+    """
+    _require(alpha.shape, alpha=alpha, mask=mask, albedo=(albedo, 3), truth=(truth, 3))
+    chosen = scale_views(protocol, len(alpha))
+    inside = mask[chosen] > MASK_THRESHOLD
+    _require_object(inside)
+    if protocol.albedo_scale == "least_squares":
+        return _mean_least_squares(albedo[chosen], truth[chosen], inside)
+    known = inside & (alpha[chosen] > _SMALLEST_ALPHA)
+    if not known.any():
+        return np.ones(3)
+    predicted = _straight(albedo[chosen][known], alpha[chosen][known])
+    true = _straight(truth[chosen][known], mask[chosen][known])
+    return np.asarray(albedo_scale_median(predicted, true, np.ones(len(true), bool)), float)
+
+
+def _mean_least_squares(
+    albedo: np.ndarray, truth: np.ndarray, inside: Bool[np.ndarray, "K H W"]
+) -> Float[np.ndarray, " 3"]:
+    """Average the scale of every view over the views that know it."""
+    scales = np.array(
+        [albedo_scale_least_squares(a, t) for a, t in zip(albedo, truth, strict=True)]
+    )
+    known = inside.any(axis=(1, 2))[:, None] & (albedo != 0).any(axis=(1, 2))
+    count = known.sum(axis=0)
+    total = np.where(known, scales, 0.0).sum(axis=0, dtype=float)
+    return np.where(count > 0, total / np.maximum(count, 1), 1.0)
+
+
+def _picture(straight: np.ndarray, coverage: np.ndarray, look: Look) -> Float[np.ndarray, "H W 3"]:
+    """Clip and encode straight linear colour, and lay it over the background."""
+    encoded = np.clip(straight, 0.0, 1.0).astype(np.float32)
+    if look.encoding == "srgb":
+        encoded = np.clip(encode_srgb(encoded), 0.0, 1.0)
+    elif look.encoding == "gamma22":
+        encoded = np.power(encoded, np.float32(1 / 2.2))
+    return np.asarray(composite(encoded, coverage.astype(np.float32), look.background))
+
+
+_mse, _ssim, _ssim_masked = jax.jit(mse), jax.jit(ssim), jax.jit(ssim_masked)
+
+
+def _compare(
+    predictions: Iterable[np.ndarray],
+    alpha: np.ndarray,
+    truths: Iterable[np.ndarray],
+    mask: np.ndarray,
+    *,
+    look: Look,
+    is_pooled: bool,
+) -> dict[str, float]:
+    """PSNR and SSIM, whole and masked, view by view, of linear images.
+
+    Predictions are premultiplied by ``alpha``, truths straight.
+    """
+    errors, similarities, masked_errors, masked_similarities, counts = [], [], [], [], []
+    for prediction, drawn, truth, covered in zip(predictions, alpha, truths, mask, strict=True):
+        shown = {
+            "alpha": np.clip(drawn, 0.0, 1.0),
+            "solid": drawn > MASK_THRESHOLD,
+            "mask": covered,
+        }
+        predicted = _picture(_straight(prediction, drawn), shown[look.silhouette], look)
+        true = _picture(truth, covered, look)
+        errors.append(float(_mse(predicted, true)))
+        similarities.append(float(_ssim(predicted, true)))
+        inside = covered > MASK_THRESHOLD
+        if inside.any():
+            masked_errors.append(float(_mse(predicted, true, inside)))
+            masked_similarities.append(float(_ssim_masked(predicted, true, inside)))
+            counts.append(int(inside.sum()))
+
+    def decibels(values: list[float], weights: list[int] | None) -> float:
+        pooled = [float(np.average(values, weights=weights))] if is_pooled else values
+        return float(np.mean([float(psnr_of_mse(value)) for value in pooled]))
+
+    figures = {"psnr": decibels(errors, None), "ssim": float(np.mean(similarities))}
+    if counts:
+        figures["psnr_masked"] = decibels(masked_errors, counts)
+        figures["ssim_masked"] = float(np.mean(masked_similarities))
+    return figures
+
+
+def _compare_images(
+    rgb: np.ndarray, alpha: np.ndarray, image: np.ndarray, look: Look
+) -> dict[str, float]:
+    """Compare premultiplied renders with straight RGBA images, (V, H, W, 3 and 4)."""
+    _require(alpha.shape, alpha=alpha, rgb=(rgb, 3), image=(image, 4))
+    return _compare(rgb, alpha, image[..., :3], image[..., 3], look=look, is_pooled=False)
+
+
+def new_view_figures(
+    rgb: Float[np.ndarray, "..."],
+    alpha: Float[np.ndarray, "..."],
+    image: Float[np.ndarray, "..."],
+) -> dict[str, float]:
+    """Compare one view under the training light with its photograph, as `NEW_VIEWS` says.
+
+    Parameters
+    ----------
+    rgb : (H, W, 3) linear, exposed and tone mapped, premultiplied by ``alpha``; clipped here.
+    alpha : (H, W) predicted coverage.
+    image : (H, W, 4) photograph, linear, *straight* alpha, which is the mask.
+
+    Returns
+    -------
+    ``nvs.psnr`` (dB) and ``nvs.ssim`` of the whole image; ``nvs.psnr_masked`` and
+    ``nvs.ssim_masked`` of the pixels of the mask, where it has any.
+
+    Raises
+    ------
+    ValueError : shapes that do not agree, values that are not finite.
+    """
+    figures = _compare_images(rgb[None], alpha[None], image[None], NEW_VIEWS)
+    return {f"nvs.{name}": value for name, value in figures.items()}
+
+
+def albedo_figures(
+    protocol: Protocol,
+    albedo: Float[np.ndarray, "..."],
+    alpha: Float[np.ndarray, "..."],
+    truth: Float[np.ndarray, "..."],
+    mask: Shaped[np.ndarray, "..."],
+    scale: Float[np.ndarray, " 3"],
+) -> dict[str, float]:
+    """Compare albedo in the protocol's encoding, silhouette and background.
+
+    Parameters
+    ----------
+    protocol, albedo, alpha, truth, mask : see `albedo_scale`.
+    scale : (3,) factor of the prediction, from `albedo_scale`.
+
+    Returns
+    -------
+    ``albedo.psnr`` (dB) and ``albedo.ssim`` of whole images, ``albedo.psnr_masked`` and
+    ``albedo.ssim_masked`` of the pixels of the mask. A pixel of the mask where nothing was drawn
+    shows the background, or black where the protocol cuts by the true mask.
+
+    Raises
+    ------
+    ValueError : shapes that do not agree, values that are not finite, no object in the views.
+    """
+    _require(alpha.shape, alpha=alpha, mask=mask, albedo=(albedo, 3), truth=(truth, 3))
+    _require_object(mask > MASK_THRESHOLD)
+    factor = np.asarray(scale, np.float32)
+    figures = _compare(
+        (view * factor for view in albedo),
+        alpha,
+        (_straight(t, covered) for t, covered in zip(truth, mask, strict=True)),
+        mask,
+        look=protocol.albedo,
+        is_pooled=protocol.albedo_is_pooled,
+    )
+    return {f"albedo.{name}": value for name, value in figures.items()}
+
+
+def material_figures(
+    materials: Mapping[str, Float[np.ndarray, "..."]],
+    alpha: Float[np.ndarray, "..."],
+    truth: Mapping[str, Float[np.ndarray, "..."]],
+    mask: Shaped[np.ndarray, "..."],
+) -> dict[str, float]:
+    """Mean squared errors of roughness and metallic; the same in all protocols.
+
+    Values are *mapped*: what the shading uses, roughness after its floor, and no raw output of a
+    network. No scale is fitted.
+
+    Parameters
+    ----------
+    materials : predicted (V, H, W) by ``roughness`` and ``metallic``, premultiplied by ``alpha``.
+    alpha : (V, H, W) predicted coverage.
+    truth : (V, H, W) by either name or both, premultiplied by ``mask``; what is missing here is
+        left out of the figures.
+    mask : (V, H, W) true coverage, fraction or boolean.
+
+    Returns
+    -------
+    ``roughness.mse`` of straight values over the pixels of the mask, a pixel where nothing was
+    drawn counting as zero, and ``roughness.mse_full`` of premultiplied values over the whole
+    image, black behind both, which is smaller by about the object's share of it. Both are means
+    over the images, the first over those with an object. Likewise ``metallic``.
+
+    Raises
+    ------
+    ValueError : shapes that do not agree, values that are not finite, no object in the views, a
+        material with a truth but without a prediction.
+    """
+    figures = {}
+    _require(alpha.shape, alpha=alpha, mask=mask)
+    inside = mask > MASK_THRESHOLD
+    _require_object(inside)
+    for name in (name for name in _MATERIALS if name in truth):
+        if name not in materials:
+            raise ValueError(f"there is a true {name} but no predicted one; render it too")
+        predicted, true = materials[name], truth[name]
+        _require(alpha.shape, **{f"predicted {name}": predicted, f"true {name}": true})
+        squared = (_straight(predicted, alpha) - _straight(true, mask)) ** 2
+        views = [
+            np.mean(x[i], dtype=float) for x, i in zip(squared, inside, strict=True) if i.any()
+        ]
+        figures[f"{name}.mse"] = float(np.mean(views))
+        figures[f"{name}.mse_full"] = float(np.mean((predicted - true) ** 2, dtype=float))
+    return figures
+
+
+def relight_figures(
+    protocol: Protocol,
+    rgb: Float[np.ndarray, "..."],
+    alpha: Float[np.ndarray, "..."],
+    image: Float[np.ndarray, "..."],
+) -> dict[str, float]:
+    """Compare images under one new light, in the protocol's encoding, silhouette and background.
+
+    Parameters
+    ----------
+    protocol : its ``relight`` decides.
+    rgb : (V, H, W, 3) linear, premultiplied by ``alpha``, lit with the albedo times its
+        `albedo_scale`, at exposure 1; clipped here.
+    alpha : (V, H, W) predicted coverage.
+    image : (V, H, W, 4) true image, linear, *straight* alpha, which is the mask.
+
+    Returns
+    -------
+    ``psnr`` (dB) and ``ssim`` of whole images, ``psnr_masked`` and ``ssim_masked`` of the pixels
+    of the mask, all means over the images.
+
+    Raises
+    ------
+    ValueError : shapes that do not agree, values that are not finite, no object in the views.
+    """
+    figures = _compare_images(rgb, alpha, image, protocol.relight)
+    _require_object(image[..., 3] > MASK_THRESHOLD)
+    return figures

@@ -1,0 +1,181 @@
+"""A trained run under another environment light: stills, a turntable, a turning light.
+
+Host side, around `renderer.Renderer`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from geosplat_jax.core.types import Camera, EnvLight
+from geosplat_jax.io.images import SceneError, read_linear, write_png
+from geosplat_jax.io.movies import check_movie, has_encoder, write_movie
+from geosplat_jax.io.views import Views
+from geosplat_jax.report.light_metrics import resize_light
+from geosplat_jax.report.renderer import RenderedView, Renderer, straight_rgba, to_picture
+from geosplat_jax.transport.environment import lookup, rotate_light
+
+LARGEST_LIGHT = 256
+"""Rows of an environment map for lighting; finer detail is averaged, since it is only noise to a
+few hundred samples."""
+
+BACKGROUNDS = ("light", "white", "black")
+
+_lookup = jax.jit(lookup)
+
+
+def load_light(path: str | Path, *, largest: int = LARGEST_LIGHT) -> EnvLight:
+    """Read a lat-long environment map: linear radiance from HDR or EXR, sRGB from other images.
+
+    The layout is that of `EnvLight`: z up, ``u = 0.5 - atan2(y, x) / (2 pi)``. Maps with more than
+    ``largest`` rows are reduced by averaging over solid angle.
+
+    Raises
+    ------
+    SceneError
+        If the file cannot be read, is not twice as wide as high, or holds negative or infinite
+        radiance.
+    """
+    pixels = read_linear(path)
+    if pixels.ndim != 3 or pixels.shape[-1] < 3 or pixels.shape[1] != 2 * pixels.shape[0]:
+        raise SceneError(
+            f"{path} has shape {pixels.shape}; an environment map is twice as wide as high and has "
+            "three channels (a lat-long map)"
+        )
+    radiance = pixels[..., :3]
+    if radiance.shape[0] > largest:
+        radiance = resize_light(radiance, largest, 2 * largest)
+    return EnvLight(jnp.asarray(radiance, jnp.float32))
+
+
+def about_z(angle: float) -> np.ndarray:
+    """Rotation by an angle in radians, counter-clockwise seen from above, (3, 3)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def orbit(camera: Camera, center: np.ndarray, angle: float) -> Camera:
+    """Carry a single camera around the vertical axis through ``center`` (3,)."""
+    turned = np.eye(4)
+    turned[:3, :3] = about_z(angle)
+    turned[:3, 3] = center - turned[:3, :3] @ center
+    pose = np.asarray(camera.world_to_camera[0], np.float64) @ np.linalg.inv(turned)
+    return replace(camera, world_to_camera=jnp.asarray(pose[None], jnp.float32))
+
+
+def _behind(camera: Camera, light: EnvLight) -> np.ndarray:
+    """Environment as a single camera sees it, (H, W, 3) linear."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    inverse = np.linalg.inv(np.asarray(camera.intrinsics[0], np.float64))
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ inverse.T
+    # Rows of d^T R are R^T d: from camera axes back to the world.
+    rays = rays @ np.asarray(camera.world_to_camera[0, :3, :3], np.float64)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    found = _lookup(light.radiance, jnp.asarray(rays.reshape(-1, 3), jnp.float32))
+    return np.asarray(found).reshape(camera.height, camera.width, 3)
+
+
+def picture(view: RenderedView, camera: Camera, light: EnvLight, background: str) -> np.ndarray:
+    """Lay a rendered view over its background; sRGB in [0, 1], (H, W, 3).
+
+    Raises
+    ------
+    ValueError
+        If the background is not one of `BACKGROUNDS`.
+    """
+    if background not in BACKGROUNDS:
+        raise ValueError(f"background must be one of {BACKGROUNDS}, got {background!r}")
+    if background == "light":
+        behind = np.clip(_behind(camera, light), 0.0, 1.0)
+    else:
+        behind = np.full(view.rgb.shape, float(background == "white"))
+    return to_picture(view.rgb + (1.0 - view.alpha[..., None]) * behind)
+
+
+@dataclass(frozen=True)
+class RelightOptions:
+    """What to render under the new light.
+
+    Attributes
+    ----------
+    turntable : frames of a camera that goes round; 0 for none.
+    rotate_env : frames of a light that turns; 0 for none.
+    background : of the pictures in movies, one of `BACKGROUNDS`.
+    suffix : ``".mp4"`` or ``".gif"``; None for MP4 where an encoder is found.
+    frames_per_second : of movies.
+    """
+
+    turntable: int = 0
+    rotate_env: int = 0
+    background: str = "light"
+    suffix: str | None = None
+    frames_per_second: float = 24.0
+
+    def movie_suffix(self) -> str:
+        """Kind of movie that will be written."""
+        if self.suffix is not None:
+            return self.suffix
+        return ".mp4" if has_encoder(".mp4") else ".gif"
+
+    def check(self) -> None:
+        """Refuse movies that could not be written, before anything is rendered.
+
+        Raises
+        ------
+        SceneError, MissingEncoderError : see `io.movies.check_movie`.
+        """
+        if self.turntable or self.rotate_env:
+            check_movie(self.movie_suffix(), self.frames_per_second)
+
+
+def relight_views(
+    relit: Renderer, light: EnvLight, views: Views, folder: Path, options: RelightOptions
+) -> list[Path]:
+    """Write stills of every view and the movies that were asked for; return the files.
+
+    Parameters
+    ----------
+    relit : from `Renderer.relit` with ``light``.
+    views : their cameras; the movies start from the first one.
+    folder : existing; receives ``NAME_rgba.png`` with straight alpha, ``NAME.png`` over the
+        background, ``turntable`` and ``rotate_env``.
+
+    Raises
+    ------
+    SceneError, MissingEncoderError : see `RelightOptions.check`.
+    """
+    options.check()
+    written = []
+    for index, name in enumerate(views.names):
+        camera = views.camera(np.array([index]))
+        view = relit(camera)
+        stem = name.replace("/", "_").strip("._")
+        written.append(folder / f"{stem}_rgba.png")
+        write_png(written[-1], straight_rgba(view))
+        written.append(folder / f"{stem}.png")
+        write_png(written[-1], picture(view, camera, light, options.background))
+    first = views.camera(np.array([0]))
+    center = relit.center()
+
+    def on_turntable(angle: float) -> np.ndarray:
+        camera = orbit(first, center, angle)
+        return picture(relit(camera), camera, light, options.background)
+
+    def under_turning_light(angle: float) -> np.ndarray:
+        turned = rotate_light(light, jnp.asarray(about_z(angle), jnp.float32))
+        return picture(relit.under(turned)(first), first, turned, options.background)
+
+    movies: list[tuple[str, int, Callable[[float], np.ndarray]]] = [
+        ("turntable", options.turntable, on_turntable),
+        ("rotate_env", options.rotate_env, under_turning_light),
+    ]
+    for name, count, frame in movies:
+        if count:
+            frames = [frame(2 * np.pi * k / count) for k in range(count)]
+            written.append((folder / name).with_suffix(options.movie_suffix()))
+            write_movie(written[-1], frames, frames_per_second=options.frames_per_second)
+    return written

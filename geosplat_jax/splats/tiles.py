@@ -1,0 +1,230 @@
+"""Which Gaussians a view can see, in depth order, and which tiles of the image they touch.
+
+Everything here is integer bookkeeping without gradients. The lists are sparse: one *hit* for each
+pair of a Gaussian and a tile that it may touch, sorted by tile and then from front to back, and cut
+into *chunks* of at most `CHUNK_SIZE` hits of one tile, the unit of work of the compositor.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Shaped, UInt
+
+from geosplat_jax.core.capacity import Capacities, Usage, compact, usage
+from geosplat_jax.core.numerics import safe_log, safe_sqrt
+from geosplat_jax.splats.projection import Splats
+
+MIN_ALPHA = 1.0 / 255.0
+"""A Gaussian leaves no trace in a pixel where its alpha is below this."""
+
+CHUNK_SIZE = 12
+"""Hits in a chunk; shorter chunks waste less padding but need more joining (measured).
+
+At most 12: the compositor relies on ``(1 - 0.999)**CHUNK_SIZE`` being a normal float32.
+"""
+
+_EXTENT_SLACK = 1e-4
+"""Relative and absolute (pixels) enlargement of extents, so that rounding never loses a pixel."""
+
+_LARGEST_COUNT = 2**31 - 1
+
+
+class TileLists(eqx.Module):
+    """Visible Gaussians of one view in depth order and the tiles they touch; no gradients.
+
+    Attributes
+    ----------
+    index : (visible capacity,) rows of the visible Gaussians, front to back, equal depths in row
+        order; N, the number of Gaussians, on padding.
+    chunk_ranks : (`CHUNK_SIZE`, chunk capacity) positions in ``index``, front to back within a
+        tile; the visible capacity on padding.
+    chunk_tiles : (chunk capacity,) row-major tile of each chunk, ascending; the number of tiles
+        on padding.
+    usage : true needs of the buffers visible, hits and chunks. Where one exceeds its capacity,
+        the lists are incomplete and the image must be discarded.
+    """
+
+    index: Int[Array, " visible"]
+    chunk_ranks: Int[Array, "slots chunks"]
+    chunk_tiles: Int[Array, " chunks"]
+    usage: Usage
+
+
+def gather_visible(
+    index: Int[Array, " M"], values: Shaped[Array, "N ..."], *, padding: float = 0.0
+) -> Shaped[Array, "M ..."]:
+    """Gather rows of ``values`` in the order of `TileLists.index`; ``padding`` where index is N.
+
+    Differentiable in ``values``; padding rows give no gradient to any row.
+    """
+    if values.shape[0] == 0:
+        return jnp.full((index.shape[0], *values.shape[1:]), padding, values.dtype)
+    return values.at[index].get(mode="fill", fill_value=padding)
+
+
+def tile_grid(height: int, width: int, tile_size: int) -> tuple[int, int]:
+    """Count the tile rows and columns that cover an image."""
+    return -(-height // tile_size), -(-width // tile_size)
+
+
+def _bit_count(size: int) -> int:
+    """Bits that hold every integer in [0, size)."""
+    return max(size - 1, 1).bit_length()
+
+
+def _stable_argsort(keys: UInt[Array, " n"], key_bits: int) -> Int[Array, " n"]:
+    """Argsort unsigned keys, ties in order, by sorting single packed integers.
+
+    XLA on CPU sorts one uint32 operand three to six times faster than a key and a payload. Each
+    pass packs as many key bits as fit above the position, least significant first.
+    """
+    n = keys.shape[0]
+    position_bits = _bit_count(n)
+    pass_bits = 32 - position_bits
+    position = jnp.arange(n, dtype=jnp.uint32)
+    order = position
+    for low in range(0, key_bits, pass_bits):
+        digit = (keys if low == 0 else keys[order] >> low) & jnp.uint32((1 << pass_bits) - 1)
+        packed = jnp.sort((digit << position_bits) | position)
+        step = packed & jnp.uint32((1 << position_bits) - 1)
+        order = step if low == 0 else order[step]
+    return order.astype(jnp.int32)
+
+
+def _depth_order(depths: Float[Array, " n"]) -> Int[Array, " n"]:
+    """Stable order of positive depths (infinity on padding), nearest first."""
+    if depths.dtype == jnp.float32:
+        # Positive IEEE floats order as their bit patterns do; the sign bit is zero.
+        return _stable_argsort(jax.lax.bitcast_convert_type(depths, jnp.uint32), 31)
+    return jnp.argsort(depths, stable=True).astype(jnp.int32)
+
+
+def _pixel_bounds(
+    splats: Splats, opacities: Float[Array, " N"], height: int, width: int
+) -> tuple[Int[Array, "N 2"], Int[Array, "N 2"]]:
+    """First and last pixel (x, y) whose centre may see alpha >= 1/255, clipped to the image.
+
+    The box of the ellipse where ``opacity exp(-sigma) = 1/255``: half-sizes are
+    ``sqrt(2 log(255 opacity) covariance)``. Last precedes first where no pixel is touched.
+    """
+    reach = safe_sqrt(2.0 * safe_log(opacities / MIN_ALPHA))
+    variances = jnp.stack([splats.covariances2d[:, 0], splats.covariances2d[:, 2]], axis=-1)
+    extent = reach[:, None] * safe_sqrt(variances) * (1.0 + _EXTENT_SLACK) + _EXTENT_SLACK
+    sizes = jnp.array([width, height], extent.dtype)[None, :]
+    first = jnp.ceil(splats.means2d - extent - 0.5)
+    last = jnp.floor(splats.means2d + extent - 0.5)
+    # Clip as floats: a huge extent does not fit an integer.
+    first = jnp.clip(first, 0.0, sizes).astype(jnp.int32)
+    return first, jnp.clip(last, -1.0, sizes - 1.0).astype(jnp.int32)
+
+
+def _runs(
+    starts: Int[Array, " n"], counts: Int[Array, " n"], capacity: int
+) -> Int[Array, " capacity"]:
+    """Owner of each of ``capacity`` slots, when owner i fills ``counts[i]`` slots from its start.
+
+    Slots past the end belong to the last owner with a slot.
+    """
+    target = jnp.where(counts > 0, starts, capacity)
+    owners = jnp.arange(starts.shape[0], dtype=jnp.int32)
+    marks = jnp.zeros((capacity,), jnp.int32).at[target].max(owners, mode="drop")
+    return jax.lax.cummax(marks)
+
+
+def _saturating_sum(counts: Int[Array, " n"]) -> Int[Array, ""]:
+    """Sum of non-negative counts that stops at the largest int32 instead of wrapping."""
+    approximate = jnp.sum(counts.astype(jnp.float32))
+    return jnp.where(
+        approximate < 2.0e9, jnp.sum(counts, dtype=jnp.int32), jnp.int32(_LARGEST_COUNT)
+    )
+
+
+def _sort_hits(
+    tiles: Int[Array, " h"], ranks: Int[Array, " h"], tile_count: int, rank_count: int
+) -> tuple[Int[Array, " h"], Int[Array, " h"]]:
+    """Sort hits, given in rank order, by tile; padding has tile ``tile_count`` and goes last."""
+    rank_bits, tile_bits = _bit_count(rank_count), _bit_count(tile_count + 1)
+    if rank_bits + tile_bits <= 32:
+        packed = (tiles.astype(jnp.uint32) << rank_bits) | ranks.astype(jnp.uint32)
+        packed = jnp.sort(packed)
+        sorted_ranks = packed & jnp.uint32((1 << rank_bits) - 1)
+        return (packed >> rank_bits).astype(jnp.int32), sorted_ranks.astype(jnp.int32)
+    order = _stable_argsort(tiles.astype(jnp.uint32), tile_bits)
+    return tiles[order], ranks[order]
+
+
+def _chunk_lists(
+    tiles: Int[Array, " h"], ranks: Int[Array, " h"], tile_count: int, pad_rank: int, capacity: int
+) -> tuple[Int[Array, "slots chunks"], Int[Array, " chunks"], Int[Array, ""]]:
+    """Cut sorted hits into chunks of one tile each; also return the true number of chunks."""
+    ends = jnp.searchsorted(tiles, jnp.arange(tile_count + 1, dtype=jnp.int32)).astype(jnp.int32)
+    starts, hits = ends[:-1], ends[1:] - ends[:-1]
+    chunks = -(-hits // CHUNK_SIZE)
+    first_chunk = jnp.cumsum(chunks, dtype=jnp.int32) - chunks
+    total = jnp.sum(chunks, dtype=jnp.int32)
+    tile = _runs(first_chunk, chunks, capacity)
+    chunk = jnp.arange(capacity, dtype=jnp.int32)
+    is_chunk = chunk < total
+    begin = starts[tile] + (chunk - first_chunk[tile]) * CHUNK_SIZE
+    slot = begin[None, :] + jnp.arange(CHUNK_SIZE, dtype=jnp.int32)[:, None]
+    is_hit = (slot < ends[tile + 1][None, :]) & is_chunk[None, :]
+    slot_rank = ranks[jnp.clip(slot, 0, ranks.shape[0] - 1)]
+    chunk_ranks = jnp.where(is_hit, slot_rank, pad_rank)
+    return chunk_ranks, jnp.where(is_chunk, tile, tile_count), total
+
+
+def find_visible(
+    splats: Splats,
+    opacities: Float[Array, " N"],
+    is_eligible: Bool[Array, " N"],
+    *,
+    height: int,
+    width: int,
+    tile_size: int,
+    capacities: Capacities,
+) -> TileLists:
+    """Find the Gaussians that touch a pixel of one view, and the tiles they touch.
+
+    Not differentiable: gradients of all inputs are stopped. A Gaussian is visible when it is
+    eligible, in front of the near plane, and some pixel centre of the image lies in the bounding
+    box of the ellipse where its alpha is at least 1/255.
+
+    Parameters
+    ----------
+    splats : projection of all N Gaussians, in any order.
+    opacities : (N,) in [0, 1], before the antialiasing compensation.
+    is_eligible : (N,) False on padding rows and on what the caller culls, such as back faces.
+    height, width, tile_size : static pixels.
+    capacities : static sizes; ``visible``, ``hits`` and ``chunks`` are used here.
+    """
+    splats, opacities = jax.lax.stop_gradient((splats, opacities))
+    rows, columns = tile_grid(height, width, tile_size)
+    first, last = _pixel_bounds(splats, opacities * splats.compensation, height, width)
+    is_bright = opacities * splats.compensation >= MIN_ALPHA
+    is_touching = jnp.all(first <= last, axis=-1)
+    is_visible = is_eligible & splats.is_in_front & is_bright & is_touching
+    found, visible_count = compact(is_visible, capacity=capacities.visible)
+
+    depths = gather_visible(found, splats.depths, padding=float("inf"))
+    index = found[_depth_order(depths)]
+    bounds = jnp.concatenate([first, last], axis=-1) // tile_size
+    low, high = jnp.split(gather_visible(index, bounds), 2, axis=-1)
+    is_row = jnp.arange(capacities.visible, dtype=jnp.int32) < visible_count
+    size = jnp.where(is_row[:, None], high - low + 1, 0)
+
+    counts = size[:, 0] * size[:, 1]
+    starts = jnp.cumsum(counts, dtype=jnp.int32) - counts
+    hit_count = _saturating_sum(counts)
+    ranks = _runs(starts, counts, capacities.hits)
+    hit = jnp.arange(capacities.hits, dtype=jnp.int32)
+    rows_of_hits = jnp.stack([starts, low[:, 0], low[:, 1], size[:, 0]], axis=-1)[ranks]
+    within, hit_columns = hit - rows_of_hits[:, 0], jnp.maximum(rows_of_hits[:, 3], 1)
+    tile_y = rows_of_hits[:, 2] + within // hit_columns
+    tile_x = rows_of_hits[:, 1] + within % hit_columns
+    tiles = jnp.where(hit < hit_count, tile_y * columns + tile_x, rows * columns)
+    tiles, ranks = _sort_hits(tiles, ranks, rows * columns, capacities.visible)
+    chunk_ranks, chunk_tiles, chunk_count = _chunk_lists(
+        tiles, ranks, rows * columns, capacities.visible, capacities.chunks
+    )
+    needed = usage(visible=visible_count, hits=hit_count, chunks=chunk_count)
+    return TileLists(index=index, chunk_ranks=chunk_ranks, chunk_tiles=chunk_tiles, usage=needed)

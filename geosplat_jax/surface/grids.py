@@ -1,0 +1,130 @@
+"""Fields on the vertices of a box of cubic cells: positions, initial shapes, change of grid."""
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from geosplat_jax.core.numerics import absolute, safe_norm
+from geosplat_jax.core.types import Geometry, Grid
+from geosplat_jax.surface.flexicubes_tables import CORNERS
+
+
+def grid_vertices(grid: Grid) -> Float[Array, "G 3"]:
+    """Rest positions of the grid vertices, (vertices, 3) world, x fastest."""
+    vx, vy, vz = grid.vertex_shape
+    k, j, i = np.indices((vz, vy, vx), dtype=np.int32).reshape(3, -1)
+    steps = jnp.asarray(np.stack([i, j, k], axis=1), grid.origin.dtype)
+    return grid.origin[None, :] + grid.cell_size * steps
+
+
+def deformed_vertices(geometry: Geometry, grid: Grid) -> Float[Array, "G 3"]:
+    """Positions of the grid vertices, each moved by at most half a cell along every axis."""
+    return grid_vertices(grid) + grid.cell_size * 0.5 * jnp.tanh(geometry.deform)
+
+
+def initial_geometry(grid: Grid, sdf: Float[Array, " G"]) -> Geometry:
+    """Geometry with this SDF (in units of a cell), no deformation and neutral weights."""
+    if sdf.shape != (grid.vertex_count,):
+        raise ValueError(
+            f"sdf must have one value for each of the {grid.vertex_count} grid vertices, "
+            f"got shape {sdf.shape}"
+        )
+    cells, dtype = grid.cube_count, sdf.dtype
+    return Geometry(
+        sdf=sdf,
+        deform=jnp.zeros((grid.vertex_count, 3), dtype),
+        alpha=jnp.zeros((cells, 8), dtype),
+        beta=jnp.zeros((cells, 12), dtype),
+        gamma=jnp.zeros((cells,), dtype),
+    )
+
+
+def sphere_sdf(grid: Grid, *, radius: float | Float[Array, ""]) -> Float[Array, " G"]:
+    """Signed distance, in cells, to a sphere of ``radius`` world units about the grid's centre."""
+    centre = 0.5 * jnp.asarray(grid.shape, grid.origin.dtype) * grid.cell_size + grid.origin
+    return (safe_norm(grid_vertices(grid) - centre[None, :]) - radius) / grid.cell_size
+
+
+def random_sdf(key: Key[Array, ""], grid: Grid) -> Float[Array, " G"]:
+    """Uniform noise in [-0.1, 0.9): scattered small components all over the volume."""
+    return jax.random.uniform(key, (grid.vertex_count,), grid.origin.dtype) - 0.1
+
+
+def _interpolate(
+    values: Float[Array, "G c"], grid: Grid, coordinates: Float[Array, "n 3"]
+) -> Float[Array, "n c"]:
+    """Trilinear values at points given in cells from the grid's origin, clamped to the box."""
+    vx, vy, _ = grid.vertex_shape
+    last = jnp.asarray(grid.shape, coordinates.dtype)[None, :]
+    inside = jnp.clip(coordinates, 0.0, last)
+    lowest = jnp.minimum(jnp.floor(inside), last - 1.0)
+    part = inside - lowest
+    i, j, k = lowest.astype(jnp.int32).T
+    result = jnp.zeros((coordinates.shape[0], values.shape[1]), values.dtype)
+    for corner in CORNERS.tolist():
+        index = i + corner[0] + vx * (j + corner[1] + vy * (k + corner[2]))
+        sides = [part[:, a] if corner[a] else 1.0 - part[:, a] for a in range(3)]
+        result = result + (sides[0] * sides[1] * sides[2])[:, None] * values[index]
+    return result
+
+
+def resample(geometry: Geometry, grid: Grid, new_grid: Grid) -> Geometry:
+    """Carry the shape to another grid: trilinear SDF there, no deformation, neutral weights.
+
+    The deformation of the old grid is taken into account by three fixed-point steps of its
+    inverse. SDF values are rescaled to the new cell. Outside the old box the nearest value there
+    plus the distance to it is used, so that a surface that is closed stays closed.
+    """
+    world = (grid_vertices(new_grid) - grid.origin[None, :]) / grid.cell_size
+    moves = 0.5 * jnp.tanh(geometry.deform)
+    rest = world
+    for _ in range(3):
+        rest = world - _interpolate(moves, grid, rest)
+    last = jnp.asarray(grid.shape, world.dtype)[None, :]
+    outside = safe_norm(world - jnp.clip(world, 0.0, last))
+    sdf = _interpolate(geometry.sdf[:, None], grid, rest)[:, 0] + outside
+    return initial_geometry(new_grid, sdf * (grid.cell_size / new_grid.cell_size))
+
+
+def crossed_edges(sdf: Float[Array, " G"], grid: Grid) -> Int[Array, " G"]:
+    """Count the grid edges at every vertex whose ends differ in sign; zero counts as outside."""
+    nx, ny, nz = grid.shape
+    inside = sdf.reshape(nz + 1, ny + 1, nx + 1) < 0
+    crossings = jnp.zeros(inside.shape, jnp.int32)
+    for axis in range(3):
+        changes = jnp.diff(inside, axis=axis).astype(jnp.int32)
+        before = [(1, 0) if i == axis else (0, 0) for i in range(3)]
+        after = [(0, 1) if i == axis else (0, 0) for i in range(3)]
+        crossings = crossings + jnp.pad(changes, before) + jnp.pad(changes, after)
+    return crossings.reshape(-1)
+
+
+def sdf_entropy(
+    geometry: Geometry, grid: Grid, *, reduction: Literal["mean", "sum"] = "mean"
+) -> Float[Array, ""]:
+    """Cross entropy of signs over the grid edges whose ends differ in sign (paper Eq. 14).
+
+    ``BCE(sigmoid(a), sign(b)) + BCE(sigmoid(b), sign(a))`` summed, or averaged over those edges.
+    Zero counts as outside. An SDF of one sign gives 0 with zero gradient.
+    """
+    # Ends of opposite sign: BCE(sigmoid(a), sign(b)) = softplus(|a|), so that the sum over edges
+    # is one over vertices, each weighted with the number of its crossed edges.
+    crossings = crossed_edges(geometry.sdf, grid)
+    size = jnp.where(geometry.sdf < 0, -geometry.sdf, geometry.sdf)
+    total = jnp.sum(crossings.astype(size.dtype) * jax.nn.softplus(size))
+    if reduction == "sum":
+        return total
+    return total / jnp.maximum(jnp.sum(crossings, dtype=jnp.int32) // 2, 1).astype(size.dtype)
+
+
+def weight_magnitude(geometry: Geometry) -> Float[Array, ""]:
+    """Mean magnitude of all raw alpha, beta and gamma weights.
+
+    Its minimum, where its gradient is zero, is plain dual cubes, from which training starts.
+    """
+    weights = (geometry.alpha, geometry.beta, geometry.gamma)
+    total = jnp.sum(jnp.stack([jnp.sum(absolute(weight)) for weight in weights]))
+    return total / sum(weight.size for weight in weights)

@@ -1,0 +1,423 @@
+"""The visual hull of masks: where the object can be, and a first signed distance field.
+
+A point is inside the hull when it lies on the mask in every view that sees it. Rather than carving
+voxels, each mask becomes a signed distance image with sub-pixel edges (its coverage, when
+antialiased, says where the edge crosses the pixel); a point looks its distance up in every view,
+scaled from pixels to world units at its depth, and keeps the worst. That is the distance to an
+intersection of cones: sub-pixel accurate at the surface from one sample a grid vertex, where
+binary carving needs many. All of this is host-side preparation and not differentiable.
+
+Cameras are rigid world-to-camera transforms to OpenCV axes; masks are bool, or coverage in [0, 1].
+A view whose mask is empty is taken as a failed mask and ignored.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Shaped
+from scipy.ndimage import distance_transform_edt
+
+from geosplat_jax.core.types import Grid
+
+TOLERANCE = 0.02
+"""Fraction of the views whose mask may miss a point of the object."""
+
+SEEN_FRACTION = 0.5
+"""A point that fewer of the views see is outside: few cones meet far away, where nobody looks."""
+
+_POINTS_AT_ONCE = 1 << 15  # what a pass holds then stays in the cache
+_MASK_PIXELS = 400  # larger masks are reduced first; the hull is never sampled that finely
+_COVERED = 0.5
+_FULL, _EMPTY = 1.0 - 1e-3, 1e-3  # coverage beyond these is a whole pixel
+_BAND_CELLS = 1.5  # the looked-up distance is trusted this far from the surface
+_SEARCH_POINTS = 48  # along each side, while the bounds close in on the hull
+_SEARCH_STEPS = 8
+
+
+def visual_hull(
+    world_to_camera: Float[np.ndarray, "V 4 4"],
+    intrinsics: Float[np.ndarray, "V 3 3"],
+    masks: Shaped[np.ndarray, "V H W"],
+    points: Float[np.ndarray, "N 3"],
+    *,
+    tolerance: float = TOLERANCE,
+    seen_fraction: float = SEEN_FRACTION,
+) -> Bool[np.ndarray, " N"]:
+    """Tell which points lie inside the visual hull; see `hull_distance` for the parameters."""
+    distance = hull_distance(
+        world_to_camera,
+        intrinsics,
+        masks,
+        points,
+        tolerance=tolerance,
+        seen_fraction=seen_fraction,
+    )
+    return distance < 0.0
+
+
+def hull_distance(
+    world_to_camera: Float[np.ndarray, "V 4 4"],
+    intrinsics: Float[np.ndarray, "V 3 3"],
+    masks: Shaped[np.ndarray, "V H W"],
+    points: Float[np.ndarray, "N 3"],
+    *,
+    tolerance: float = TOLERANCE,
+    seen_fraction: float = SEEN_FRACTION,
+) -> Float[np.ndarray, " N"]:
+    """Signed distance of points to the hull, negative inside, accurate near its surface.
+
+    Parameters
+    ----------
+    world_to_camera : (V, 4, 4); intrinsics : (V, 3, 3) pixels.
+    masks : (V, H, W) bool, or coverage in [0, 1].
+    points : (N, 3) world.
+    tolerance : a point is inside when the masks of all but ``floor(tolerance * V)`` views agree.
+    seen_fraction : points seen by a smaller fraction of the views are outside.
+
+    Returns
+    -------
+    (N,) float32, world units; ``inf`` where too few views see the point. Outside, far from the
+    surface, it is a lower bound.
+
+    Raises
+    ------
+    ValueError : every mask is empty.
+    """
+    view = _Silhouettes(world_to_camera, intrinsics, masks)
+    return _evaluate(view, points, tolerance=tolerance, seen_fraction=seen_fraction)
+
+
+def hull_bounds(
+    world_to_camera: Float[np.ndarray, "V 4 4"],
+    intrinsics: Float[np.ndarray, "V 3 3"],
+    masks: Shaped[np.ndarray, "V H W"],
+    *,
+    margin: float = 0.02,
+    tolerance: float = TOLERANCE,
+    seen_fraction: float = SEEN_FRACTION,
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    """Find the box around the hull, wherever in the world the cameras look.
+
+    The search starts from a cube about the point nearest to the lines of sight through the masks'
+    centroids, as large as the cameras' distance, and closes in on the hull.
+
+    Parameters
+    ----------
+    margin : added on every side, as a fraction of the longest side; at least one pixel at the
+        object's distance.
+
+    Returns
+    -------
+    lo, hi : (3,) float64 world corners.
+
+    Raises
+    ------
+    ValueError : the lines of sight do not meet, or no point lies on all masks.
+    """
+    view = _Silhouettes(world_to_camera, intrinsics, masks)
+    settings = {"tolerance": tolerance, "seen_fraction": seen_fraction}
+    center, reach = _common_target(view, intrinsics, masks)
+    lo, hi = center - reach, center + reach
+    for _ in range(_SEARCH_STEPS):
+        points, cell = _box_points(lo, hi)
+        # A cell may hold part of the hull when its centre is closer than its half diagonal.
+        near = _evaluate(view, points, **settings) < 0.5 * np.linalg.norm(cell)
+        if not near.any():
+            raise ValueError(
+                "the masks and cameras have no volume in common: check that the poses are "
+                "camera-to-world with Blender axes and match the images, or give the bounds"
+            )
+        closer_lo = np.maximum(points[near].min(0) - cell, lo)
+        closer_hi = np.minimum(points[near].max(0) + cell, hi)
+        shrunk = 1.0 - (closer_hi - closer_lo) / (hi - lo)
+        lo, hi = closer_lo, closer_hi
+        if shrunk.max() < 0.1:
+            break
+    points, cell = _box_points(lo, hi)
+    inside = points[_evaluate(view, points, **settings) < 0.5 * cell.min()]
+    if inside.shape[0]:
+        lo, hi = np.maximum(inside.min(0) - cell, lo), np.minimum(inside.max(0) + cell, hi)
+    # Where the object is a few pixels wide, its silhouette is only known to about one.
+    pad = max(margin * (hi - lo).max(), reach * view.pixel_angle)
+    return lo - pad, hi + pad
+
+
+def hull_sdf(
+    world_to_camera: Float[np.ndarray, "V 4 4"],
+    intrinsics: Float[np.ndarray, "V 3 3"],
+    masks: Shaped[np.ndarray, "V H W"],
+    grid: Grid,
+    *,
+    tolerance: float = TOLERANCE,
+    seen_fraction: float = SEEN_FRACTION,
+) -> Float[np.ndarray, " G"]:
+    """Signed distance of the grid's vertices to the hull, in cells: a first SDF to optimise.
+
+    The hull is cut one cell inside the grid's box, so that its surface is closed.
+
+    Returns
+    -------
+    (grid vertices,) float32, x fastest, negative inside.
+
+    Raises
+    ------
+    ValueError : no vertex, or every vertex, lies inside.
+    """
+    points = grid_points(grid)
+    cell = float(grid.cell_size)
+    view = _Silhouettes(world_to_camera, intrinsics, masks)
+    near = _evaluate(view, points, tolerance=tolerance, seen_fraction=seen_fraction) / cell
+    lo = np.asarray(grid.origin, np.float64)
+    hi = lo + cell * np.asarray(grid.shape)
+    outside_box = np.maximum(lo - points, points - hi).max(1) / cell + 1.0
+    near = np.maximum(near, outside_box).astype(np.float32)
+    if not (near < 0.0).any():
+        raise ValueError(
+            "the visual hull holds no vertex of the grid: the object is thinner than a cell, or "
+            "the grid lies elsewhere; raise the resolution or use the bounds of the scene"
+        )
+    vx, vy, vz = grid.vertex_shape
+    return _extend(near.reshape(vz, vy, vx)).reshape(-1)
+
+
+def fit_grid(
+    bounds: tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]],
+    resolution: int,
+    *,
+    margin_cells: int = 2,
+) -> Grid:
+    """Lay cubic cells around a box: ``resolution`` of them along its longest side.
+
+    Margins are included in the count, at least ``margin_cells`` on each side; the box is centred.
+
+    Raises
+    ------
+    ValueError : the box is empty or not finite, or the margins leave no cell.
+    """
+    lo, hi = (np.asarray(corner, np.float64) for corner in bounds)
+    extent = hi - lo
+    if lo.shape != (3,) or not np.isfinite(extent).all() or not (extent > 0.0).all():
+        raise ValueError(f"bounds must be (lo, hi) with lo < hi on every axis, got {lo} and {hi}")
+    inner = resolution - 2 * margin_cells
+    if inner < 1:
+        raise ValueError(
+            f"resolution must exceed twice the margin of {margin_cells} cells, got {resolution}"
+        )
+    cell = extent.max() / inner
+    cells = np.ceil(extent / cell - 1e-6).astype(int) + 2 * margin_cells
+    origin = 0.5 * (lo + hi) - 0.5 * cell * cells
+    nx, ny, nz = (int(n) for n in cells)
+    return Grid(jnp.asarray(origin, jnp.float32), jnp.asarray(cell, jnp.float32), (nx, ny, nz))
+
+
+def grid_points(grid: Grid) -> Float[np.ndarray, "G 3"]:
+    """World positions of the grid's vertices, x fastest, float64 on the host."""
+    origin, cell = np.asarray(grid.origin, np.float64), float(grid.cell_size)
+    axes = [origin[i] + cell * np.arange(grid.vertex_shape[i]) for i in range(3)]
+    z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
+    return np.stack([x, y, z], -1).reshape(-1, 3)
+
+
+def _box_points(lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres of a regular division of the box, and the size of a cell."""
+    cell = (hi - lo) / _SEARCH_POINTS
+    axes = [lo[i] + cell[i] * (np.arange(_SEARCH_POINTS) + 0.5) for i in range(3)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3), cell
+
+
+class _Silhouettes:
+    """Views ready for lookup: distance images, and cameras recentred for float32."""
+
+    def __init__(self, world_to_camera, intrinsics, masks):
+        coverage = np.asarray(masks, np.float32)
+        used = (coverage > _COVERED).any((1, 2))
+        if not used.any():
+            raise ValueError("every mask is empty; check the alpha channel or the mask files")
+        factor = max(1, -(-max(coverage.shape[1:]) // _MASK_PIXELS))
+        coverage = np.stack([_reduced(image, factor) for image in coverage[used]])
+        poses = np.asarray(world_to_camera, np.float64)[used]
+        centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+        self.used = used
+        self.rotations = poses[:, :3, :3]
+        self.centers = centers
+        # Capture coordinates may be large; relative to the cameras float32 suffices.
+        self.origin = centers.mean(0)
+        shifted = np.einsum("vij,vj->vi", self.rotations, self.origin - centers)
+        self.pinholes = np.concatenate([self.rotations, shifted[..., None]], -1)
+        self.intrinsics = np.asarray(intrinsics, np.float64)[used] / np.array(
+            [[factor], [factor], [1.0]]
+        )
+        self.pixel_angle = 1.0 / float(np.median(self.intrinsics[:, 0, 0]))
+        self.distances = np.stack([_signed_pixels(image) for image in coverage])
+
+
+def _reduced(coverage: np.ndarray, factor: int) -> np.ndarray:
+    """Mean over blocks; the last incomplete rows and columns repeat the edge."""
+    height, width = coverage.shape
+    padding = ((0, -height % factor), (0, -width % factor))
+    padded = np.pad(coverage, padding, mode="edge")
+    return padded.reshape(
+        padded.shape[0] // factor, factor, padded.shape[1] // factor, factor
+    ).mean((1, 3))
+
+
+def _nearest(target: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    """Distance of every element to the nearest one in ``target``, and the index of that one."""
+    shape = target.shape
+    steps = np.empty(shape)
+    index = np.empty((target.ndim, *shape), np.int32)
+    distance_transform_edt(~target, return_indices=True, distances=steps, indices=index)
+    return steps, tuple(np.asarray(axis) for axis in index)
+
+
+def _signed_pixels(coverage: np.ndarray) -> np.ndarray:
+    """Signed distance to the silhouette in pixels, *positive* on the mask, at pixel centres.
+
+    Within a partly covered pixel the edge lies ``coverage - 1/2`` from its centre (exact along the
+    axes); every other pixel adds its distance to the nearest pixel that the edge may cross.
+    """
+    beyond = float(sum(coverage.shape))
+    signed = coverage - 0.5
+    for whole, sign in ((coverage >= _FULL, 1.0), (coverage <= _EMPTY, -1.0)):
+        if whole.all():
+            return np.full(coverage.shape, sign * beyond, np.float32)
+        if whole.any():
+            steps, nearest = _nearest(~whole)
+            further = sign * steps + coverage[nearest] - 0.5
+            signed = np.where(whole, further, signed)
+    return signed.astype(np.float32)
+
+
+def _evaluate(
+    view: _Silhouettes, points: np.ndarray, *, tolerance: float, seen_fraction: float
+) -> np.ndarray:
+    """Look the points up in every view, a fixed number at a time (one compilation)."""
+    view_count = view.distances.shape[0]
+    tolerated = int(tolerance * view_count)
+    least_seen = max(1, int(np.ceil(seen_fraction * view_count)))
+    pinholes, intrinsics, distances = (
+        jnp.asarray(x, jnp.float32) for x in (view.pinholes, view.intrinsics, view.distances)
+    )
+    results = []
+    for start in range(0, points.shape[0], _POINTS_AT_ONCE):
+        part = points[start : start + _POINTS_AT_ONCE] - view.origin
+        padded = np.zeros((_POINTS_AT_ONCE, 3), np.float32)
+        padded[: part.shape[0]] = part
+        worst, seen = _worst_distance(
+            pinholes, intrinsics, distances, jnp.asarray(padded), tolerated=tolerated
+        )
+        kept = np.where(np.asarray(seen) >= least_seen, np.asarray(worst), np.inf)
+        results.append(kept[: part.shape[0]].astype(np.float32))
+    return np.concatenate(results) if results else np.zeros(0, np.float32)
+
+
+@partial(jax.jit, static_argnames="tolerated")
+def _worst_distance(
+    pinholes: Float[Array, "V 3 4"],
+    intrinsics: Float[Array, "V 3 3"],
+    distances: Float[Array, "V H W"],
+    points: Float[Array, "N 3"],
+    *,
+    tolerated: int,
+):
+    """Find the largest distance over the views but for ``tolerated`` larger ones, and seen counts.
+
+    The ``tolerated + 1`` largest values are kept sorted while passing once over the views.
+    """
+
+    def look(carry, view):
+        largest, seen = carry
+        pinhole, matrix, distance = view
+        value, is_seen = _distance_in_view(pinhole, matrix, distance, points)
+        kept = []
+        for current in largest:
+            kept.append(jnp.maximum(current, value))
+            value = jnp.minimum(current, value)
+        return (tuple(kept), seen + is_seen.astype(jnp.int32)), None
+
+    nothing = jnp.full(points.shape[:1], -jnp.inf, points.dtype)
+    start = ((nothing,) * (tolerated + 1), jnp.zeros(points.shape[:1], jnp.int32))
+    (largest, seen), _ = jax.lax.scan(look, start, (pinholes, intrinsics, distances))
+    return largest[-1], seen
+
+
+def _distance_in_view(pinhole, intrinsics, distances, points):
+    """World distance of points to one silhouette cone, negative inside; -inf where unseen."""
+    height, width = distances.shape
+    x, y, z = jnp.moveaxis(points @ pinhole[:, :3].T + pinhole[None, :, 3], -1, 0)
+    ahead = z > 0.0
+    depth = jnp.where(ahead, z, 1.0)
+    fx, fy = intrinsics[0, 0], intrinsics[1, 1]
+    u = fx * x / depth + intrinsics[0, 2]
+    v = fy * y / depth + intrinsics[1, 2]
+    seen = ahead & (u >= 0.0) & (u < width) & (v >= 0.0) & (v < height)
+    # Pixel centres lie at + 0.5; within half a pixel of the border the edge value is used.
+    column = jnp.clip(u - 0.5, 0.0, width - 1.0)
+    row = jnp.clip(v - 0.5, 0.0, height - 1.0)
+    left = jnp.minimum(column.astype(jnp.int32), max(width - 2, 0))
+    top = jnp.minimum(row.astype(jnp.int32), max(height - 2, 0))
+    right, down = min(1, width - 1), width * min(1, height - 1)
+    s, t = column - left.astype(column.dtype), row - top.astype(row.dtype)
+    # The clips above keep every index in bounds, so the gathers need not check.
+    corner = top * width + left
+    flat = distances.reshape(-1).at
+    upper_left, upper_right, lower_left, lower_right = (
+        flat[corner + step].get(mode="promise_in_bounds") for step in (0, right, down, right + down)
+    )
+    upper = (1.0 - s) * upper_left + s * upper_right
+    lower = (1.0 - s) * lower_left + s * lower_right
+    pixels = (1.0 - t) * upper + t * lower
+    world = -pixels * depth * 2.0 / (fx + fy)
+    return jnp.where(seen, world, -jnp.inf), seen
+
+
+def _common_target(view: _Silhouettes, intrinsics, masks) -> tuple[np.ndarray, float]:
+    """Point nearest to the lines of sight through the masks' centroids, and how far to search."""
+    coverage = np.asarray(masks, np.float32)[view.used]
+    pinhole = np.asarray(intrinsics, np.float64)[view.used]
+    rows = np.arange(coverage.shape[1]) + 0.5
+    columns = np.arange(coverage.shape[2]) + 0.5
+    total = coverage.sum((1, 2))
+    u = coverage.sum(1) @ columns / total
+    v = coverage.sum(2) @ rows / total
+    sight = np.stack(
+        [
+            (u - pinhole[:, 0, 2]) / pinhole[:, 0, 0],
+            (v - pinhole[:, 1, 2]) / pinhole[:, 1, 1],
+            np.ones_like(u),
+        ],
+        -1,
+    )
+    sight = np.einsum("vji,vj->vi", view.rotations, sight)
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    # Normal equations of min Σ |(I - d dᵀ)(x - c)|².
+    across = np.eye(3)[None] - sight[:, :, None] * sight[:, None, :]
+    matrix = across.sum(0)
+    if np.linalg.cond(matrix) > 1e6:
+        raise ValueError(
+            "the lines of sight are parallel or there is only one view, so the masks do not bound "
+            "a volume; give the bounds"
+        )
+    center = np.linalg.solve(matrix, np.einsum("vij,vj->i", across, view.centers))
+    return center, float(np.median(np.linalg.norm(view.centers - center[None], axis=1)))
+
+
+def _extend(near: Float[np.ndarray, "Z Y X"]) -> Float[np.ndarray, "Z Y X"]:
+    """Turn values that are right near the surface into a distance everywhere, in cells.
+
+    Past the trusted band a vertex takes its distance to the nearest vertex of the band on its own
+    side, plus that vertex's value.
+    """
+    signed = near
+    for side in (1.0, -1.0):
+        value = side * near
+        in_band = (value >= 0.0) & (value <= _BAND_CELLS)
+        is_far = value > _BAND_CELLS
+        if not in_band.any() or not is_far.any():
+            continue
+        steps, nearest = _nearest(in_band)
+        further = side * (steps + value[nearest])
+        signed = np.where(is_far, further, signed)
+    return np.where(np.isfinite(signed), signed, _BAND_CELLS).astype(np.float32)

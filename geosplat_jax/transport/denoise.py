@@ -1,0 +1,284 @@
+"""Edge-avoiding wavelet filter in the image, for light that Monte Carlo integration left noisy.
+
+Dammertz et al. 2010: the taps of a 5 x 5 B3 spline, spread twice as far in every iteration, each
+weighed by how alike the surfaces in both pixels are. As in SVGF (Schied et al. 2017) surfaces are
+compared by normal, depth and albedo, the guides, and never by the light itself: the filter is
+linear in the light, so that noise of mean zero stays of mean zero, in values and in gradients.
+
+Filter light *before* it is multiplied by albedo; texture then survives, whatever its contrast.
+
+Every pair of pixels has one weight, the same seen from either: ``w(p, q) = w(q, p)``. Half of the
+24 weights a pixel are therefore computed, and the transpose that the gradient needs is the filter
+itself.
+"""
+
+import math
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from geosplat_jax.core.numerics import safe_divide, safe_log, safe_normalize
+
+_B3 = (3 / 8, 1 / 4, 1 / 16)
+"""The B3 spline at distances 0, 1 and 2 (Dammertz et al. 2010, section 2)."""
+
+_MAX_ITERATIONS = 8
+
+# Squares of guides divided by these stay within float32, whatever the image.
+_SMALLEST_SIGMA, _LARGEST_SHARPNESS = 1e-4, 1e6
+
+# One offset (rows, columns) of each of the twelve pairs of opposite taps.
+_HALF_OF_TAPS = tuple((dy, dx) for dy in range(3) for dx in range(-2, 3) if dy > 0 or dx > 0)
+
+
+@dataclass(frozen=True)
+class DenoiseSpec:
+    """Static settings of the filter; hashable.
+
+    Attributes
+    ----------
+    iterations : filter passes, 0 to 8; pass ``k`` reaches ``2 * 2^k`` pixels. 0 is the identity. On
+        a flat surface the variance of white noise falls to 0.075 after one pass, 0.015 after two,
+        0.0036 after three.
+    normal_sharpness : weights fall by ``exp(-sharpness * (1 - cos))`` with the angle between unit
+        normals, close to the power ``cos^sharpness``; 0 ignores normals. At 64 the weight is 0.37
+        at 10 degrees and 2e-4 at 30.
+    depth_sigma : distance of a neighbouring pixel from the surface's tangent plane where the weight
+        is 0.37, in widths of a pixel on the surface; it grows with the square root of the pixels
+        between. The unit of length does not enter. Infinity ignores depth.
+    albedo_sigma : distance of linear RGB albedos where the weight is 0.37; infinity ignores albedo.
+    """
+
+    iterations: int = 2
+    normal_sharpness: float = 64.0
+    depth_sigma: float = 1.0
+    albedo_sigma: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Validate every field."""
+        if not 0 <= self.iterations <= _MAX_ITERATIONS:
+            raise ValueError(
+                f"denoise.iterations must lie in 0 to {_MAX_ITERATIONS}, got {self.iterations}"
+            )
+        if not 0 <= self.normal_sharpness <= _LARGEST_SHARPNESS:
+            raise ValueError(
+                f"denoise.normal_sharpness must lie in 0 to {_LARGEST_SHARPNESS:g}, got "
+                f"{self.normal_sharpness}"
+            )
+        for name in ("depth_sigma", "albedo_sigma"):
+            if not getattr(self, name) >= _SMALLEST_SIGMA:
+                raise ValueError(
+                    f"denoise.{name} must be at least {_SMALLEST_SIGMA:g}, got "
+                    f"{getattr(self, name)}"
+                )
+
+
+def _shifted(maps: Float[Array, "... H W"], dy: int, dx: int) -> Float[Array, "... H W"]:
+    """Values ``(dy, dx)`` further on; zero outside the image."""
+    height, width = maps.shape[-2:]
+    none = [(0, 0)] * (maps.ndim - 2)
+    sides = [*none, (max(-dy, 0), max(dy, 0)), (max(-dx, 0), max(dx, 0))]
+    padded = jnp.pad(maps, sides)
+    top, left = max(dy, 0), max(dx, 0)
+    return padded[..., top : top + height, left : left + width]
+
+
+def _gradient(
+    values: Float[Array, "H W"], is_visible: Float[Array, "H W"], axis: int
+) -> Float[Array, "H W"]:
+    """Slope along an axis: the smaller of both one-sided differences, 0 where they disagree.
+
+    A jump on one side does not count, nor does a neighbour without a surface.
+    """
+    step = (1, 0) if axis == 0 else (0, 1)
+    back = (-step[0], -step[1])
+    forward = _shifted(values, *step) - values
+    backward = values - _shifted(values, *back)
+    has_next, has_previous = _shifted(is_visible, *step) > 0, _shifted(is_visible, *back) > 0
+    forward, backward = (
+        jnp.where(has_next, forward, jnp.where(has_previous, backward, 0.0)),
+        jnp.where(has_previous, backward, jnp.where(has_next, forward, 0.0)),
+    )
+    smaller = jnp.where(jnp.abs(forward) < jnp.abs(backward), forward, backward)
+    return jnp.where(forward * backward > 0, smaller, 0.0)
+
+
+def _guide_maps(
+    alpha: Float[Array, "H W"],
+    normals: Float[Array, "H W 3"],
+    depth: Float[Array, "H W"],
+    albedo: Float[Array, "H W 3"],
+    focal: Float[Array, ""],
+    spec: DenoiseSpec,
+) -> tuple[Float[Array, "6 H W"], Float[Array, "4 H W"]]:
+    """Prepare what weights are made of: features, whose squared distance counts, and depth.
+
+    Depth enters as ``focal * log(depth)``: its change from pixel to pixel is the slope of the
+    surface against the image plane, whatever the unit of length. The maps of the second result are
+    this height, its two gradients, and the squared cosine between surface and image plane, divided
+    by the square of its sigma.
+    """
+    is_visible = (alpha > 0).astype(alpha.dtype)
+    unit = safe_normalize(normals)
+    straight = safe_divide(albedo, alpha[..., None])
+    # |n - m|^2 / 2 = 1 - cos.
+    features = jnp.concatenate(
+        [math.sqrt(0.5 * spec.normal_sharpness) * unit, straight / spec.albedo_sigma], axis=-1
+    )
+    height = focal * safe_log(safe_divide(depth, alpha))
+    slope_y = _gradient(height, is_visible, 0)
+    slope_x = _gradient(height, is_visible, 1)
+    cosine_squared = 1.0 / (1.0 + slope_y * slope_y + slope_x * slope_x)
+    heights = jnp.stack([height, slope_y, slope_x, cosine_squared / spec.depth_sigma**2])
+    return jnp.moveaxis(features, -1, 0), heights
+
+
+def _pad(maps: Float[Array, "... H W"], spread: int) -> Float[Array, "... H2 W2"]:
+    """Add a border of zeros that every tap inside the image's extent fits into."""
+    borders = [min(2 * spread, size) for size in maps.shape[-2:]]
+    widths = [(0, 0)] * (maps.ndim - 2) + [(border, border) for border in borders]
+    # Unless it is a buffer of its own, every tap asks anew whether it reads the border.
+    return jax.lax.optimization_barrier(jnp.pad(maps, widths))
+
+
+def _window(
+    padded: Float[Array, "... H2 W2"], shape: tuple[int, int], dy: int, dx: int, spread: int
+) -> Float[Array, "... H W"]:
+    """Read an image of ``shape`` out of a padded one, ``(dy, dx) * spread`` further on."""
+    top = min(2 * spread, shape[0]) + dy * spread
+    left = min(2 * spread, shape[1]) + dx * spread
+    return padded[..., top : top + shape[0], left : left + shape[1]]
+
+
+def _taps(shape: tuple[int, int], spread: int) -> list[tuple[int, int]]:
+    """Half of the taps, those with a partner inside the image."""
+    return [
+        (dy, dx)
+        for dy, dx in _HALF_OF_TAPS
+        if abs(dy) * spread < shape[0] and abs(dx) * spread < shape[1]
+    ]
+
+
+def _harmonic_mean(a: Float[Array, "H W"], b: Float[Array, "H W"]) -> Float[Array, "H W"]:
+    """Average two slopes by van Leer's limiter: 0 where signs differ, at most twice the smaller.
+
+    Where they agree it is as accurate as the mean. Where one pixel lies astride a jump, its slope
+    is large and wrong, and the other one's counts.
+    """
+    agree = a * b > 0
+    return jnp.where(agree, 2 * a * b / jnp.where(agree, a + b, 1.0), 0.0)
+
+
+def _pair_weights(
+    features: Float[Array, "6 H W"], heights: Float[Array, "4 H W"], spread: int
+) -> Float[Array, "taps H W"]:
+    """Weights between each pixel and the one that lies a tap further on; zero outside."""
+    shape = features.shape[1], features.shape[2]
+    inside = jnp.ones((1, *shape), features.dtype)
+    maps = jax.lax.optimization_barrier(jnp.concatenate([features, heights, inside]))
+    padded = _pad(maps, spread)
+    weights = []
+    for dy, dx in _taps(shape, spread):
+        other = _window(padded, shape, dy, dx, spread)
+        distance = sum((other[k] - maps[k]) ** 2 for k in range(6))
+        rise = _harmonic_mean(
+            spread * (dy * maps[7] + dx * maps[8]), spread * (dy * other[7] + dx * other[8])
+        )
+        off = other[6] - maps[6] - rise
+        # The less tilted of both: a pixel astride a jump looks steep, and must not excuse itself.
+        stiffness = jnp.maximum(other[9], maps[9]) / (spread * math.hypot(dy, dx))
+        kernel = _B3[abs(dy)] * _B3[abs(dx)]
+        weights.append(kernel * other[10] * jnp.exp(-(distance + off * off * stiffness)))
+    if not weights:
+        return jnp.zeros((0, *shape), features.dtype)
+    return jax.lax.optimization_barrier(jnp.stack(weights))
+
+
+def _gather_primal(
+    values: Float[Array, "C H W"], weights: Float[Array, "taps H W"], spread: int
+) -> Float[Array, "C H W"]:
+    """Sum over the taps of every pixel, each pair of pixels with its one weight."""
+    shape = values.shape[1], values.shape[2]
+    padded, padded_weights = _pad(values, spread), _pad(weights, spread)
+    total = _B3[0] * _B3[0] * values
+    for k, (dy, dx) in enumerate(_taps(shape, spread)):
+        ahead = _window(padded, shape, dy, dx, spread)
+        behind = _window(padded, shape, -dy, -dx, spread)
+        weight_behind = _window(padded_weights[k], shape, -dy, -dx, spread)
+        total = total + weights[k][None] * ahead + weight_behind[None] * behind
+    return jax.lax.optimization_barrier(total)
+
+
+# Autodiff would transpose each of the 24 reads into a padded copy of the image.
+_gather = jax.custom_vjp(_gather_primal, nondiff_argnums=(2,))
+
+
+def _gather_forward(
+    values: Float[Array, "C H W"], weights: Float[Array, "taps H W"], spread: int
+) -> tuple[Float[Array, "C H W"], Float[Array, "taps H W"]]:
+    return _gather_primal(values, weights, spread), weights
+
+
+def _gather_backward(
+    spread: int, weights: Float[Array, "taps H W"], cotangent: Float[Array, "C H W"]
+) -> tuple[Float[Array, "C H W"], None]:
+    """Apply the transpose, which is the sum itself; weights are constants (None is zero)."""
+    return _gather_primal(cotangent, weights, spread), None
+
+
+_gather.defvjp(_gather_forward, _gather_backward)
+
+
+def denoise(
+    light: Float[Array, "H W C"],
+    alpha: Float[Array, "H W"],
+    normals: Float[Array, "H W 3"],
+    depth: Float[Array, "H W"],
+    albedo: Float[Array, "H W 3"],
+    *,
+    spec: DenoiseSpec,
+    focal: Float[ArrayLike, ""] | None = None,
+) -> Float[Array, "H W C"]:
+    """Smooth light within surfaces, across noise but not across their edges.
+
+    ``out_p = alpha_p * sum_q w(p, q) light_q / sum_q w(p, q) alpha_q`` in every pass, so that what
+    is not covered neither bleeds in nor darkens the edge of what is.
+
+    Linear in the light, and keeps constants: light that is alpha times a constant stays. The total
+    of the light is not kept exactly, for the divisor differs from pixel to pixel.
+
+    Reverse mode only. The gradient in the light is the transpose; alpha has its gradient as
+    coverage, in the formula above. The weights are constants: normals, depth, albedo and the focal
+    length have zero gradient, and so has alpha where it divides them.
+
+    Parameters
+    ----------
+    light : (H, W, C) any linear quantity that arrives, times alpha. Ignored where alpha is 0.
+    alpha : (H, W) coverage, not negative.
+    normals : (H, W, 3) blended unit normals, in any frame.
+    depth : (H, W) blended positive depth along the camera's axis, times alpha.
+    albedo : (H, W, 3) linear, times alpha.
+    spec : static.
+    focal : focal length in pixels, against which the depth's slope is measured; by default the
+        longer side of the image, a field of view of 53 degrees. No gradient.
+
+    Returns
+    -------
+    (H, W, C), times alpha; zero where alpha is. The light itself, bit by bit, for no iterations.
+    """
+    if spec.iterations == 0 or light.size == 0:
+        return light
+    if focal is None:
+        focal = float(max(alpha.shape))
+    focal = jnp.asarray(focal, light.dtype)
+    guides = jax.lax.stop_gradient((alpha, normals, depth, albedo, focal))
+    features, heights = _guide_maps(*guides, spec)
+    values = jnp.moveaxis(jnp.where(alpha[..., None] > 0, light, 0.0), -1, 0)
+    for iteration in range(spec.iterations):
+        spread = 2**iteration
+        weights = _pair_weights(features, heights, spread)
+        sums = _gather(jnp.concatenate([values, alpha[None]]), weights, spread)
+        values = alpha[None] * safe_divide(sums[:-1], sums[-1:])
+    return jnp.moveaxis(values, 0, -1)

@@ -1,0 +1,179 @@
+"""Shading of surface points: the split-sum approximation (stage 1).
+
+``f_r = albedo (1 - m) / pi + D G F / (4 (n.l)(n.v))`` with GGX D of alpha = roughness^2,
+height-correlated Smith G and Schlick F of ``F0 = 0.04 (1 - m) + albedo m``. The split sum replaces
+the integral of light times specular BRDF by the product of two integrals: the light filtered by
+the lobe (`environment.prefilter`) and the directional albedo ``F0 * scale + bias`` of
+`fg_table` (Karis 2013). It ignores occlusion and the stretching of lobes at grazing angles, and is
+exact for constant light.
+"""
+
+from functools import lru_cache
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from geosplat_jax.core.types import Materials
+from geosplat_jax.transport.environment import (
+    PrefilteredLight,
+    prefiltered_diffuse,
+    prefiltered_specular,
+)
+
+DIELECTRIC_F0 = 0.04
+"""Reflectance at normal incidence of every dielectric (index of refraction 1.5)."""
+
+
+class Shaded(eqx.Module):
+    """Outgoing radiance of N points and the light it was made from.
+
+    Attributes
+    ----------
+    rgb : (N, 3) ``diffuse + specular``, linear.
+    diffuse, specular : (N, 3) the two parts, materials included.
+    diffuse_light : (N, 3) irradiance / pi: what a white Lambertian point would send out.
+    specular_light : (N, 3) radiance filtered by the lobe, before the BRDF's directional albedo:
+        what a lossless white reflector of this roughness would send out.
+    """
+
+    rgb: Float[Array, "N 3"]
+    diffuse: Float[Array, "N 3"]
+    specular: Float[Array, "N 3"]
+    diffuse_light: Float[Array, "N 3"]
+    specular_light: Float[Array, "N 3"]
+
+
+def directional_albedo(
+    n_dot_v: np.ndarray, roughness: np.ndarray, *, samples: int = 64
+) -> np.ndarray:
+    """Integrate the specular BRDF over all light directions, split as ``F0 * scale + bias`` (host).
+
+    A midpoint rule over the distribution of visible normals (spherical caps; Dupuy & Benyoub
+    2023): the weight ``G2 / G1`` is smooth and at most 1, so 64 x 64 points reach about 1e-4.
+
+    Parameters
+    ----------
+    n_dot_v : (...,) cosines in [0, 1]; roughness : (...,) perceptual, same shape.
+    samples : points along each of the two dimensions.
+
+    Returns
+    -------
+    (..., 2) float64 scale and bias; their sum never exceeds 1.
+    """
+    # The floors select the limit of a mirror at exactly grazing view, which is 1.
+    cos_v = np.maximum(np.asarray(n_dot_v, np.float64)[..., None, None], 1e-4)
+    alpha = np.maximum(np.asarray(roughness, np.float64)[..., None, None] ** 2, 1e-6)
+    unit = (np.arange(samples) + 0.5) / samples
+    azimuth = np.pi * unit[:, None]  # the other half circle mirrors this one
+    # Cosine spacing in height absorbs the square root at both ends of the cap.
+    height = 0.5 - 0.5 * np.cos(np.pi * unit)[None, :]
+    mass = np.sin(np.pi * unit)[None, :] / (samples * np.sin(np.pi * unit).sum())
+
+    def smith(cosine):  # cos * sqrt(1 + alpha^2 tan^2), free of the division
+        return np.sqrt(alpha**2 + (1 - alpha**2) * cosine**2)
+
+    sin_v = np.sqrt(1 - cos_v**2)
+    vx, vz = alpha * sin_v / smith(cos_v), cos_v / smith(cos_v)
+    cz = (1 - height) * (1 + vz) - vz
+    radius = np.sqrt(np.maximum(1 - cz**2, 0))
+    hx, hy = alpha * (radius * np.cos(azimuth) + vx), alpha * radius * np.sin(azimuth)
+    hz = np.maximum(cz + vz, 1e-12)
+    length = np.sqrt(hx**2 + hy**2 + hz**2)
+    v_dot_h = np.clip((sin_v * hx + cos_v * hz) / length, 0, 1)
+    cos_l = 2 * v_dot_h * hz / length - cos_v
+    lit = cos_l > 0
+    cos_l = np.where(lit, cos_l, 1.0)
+    # G2 / G1 of the height-correlated Smith function, with n.v cancelled.
+    weight = cos_l * (cos_v + smith(cos_v)) / (cos_v * smith(cos_l) + cos_l * smith(cos_v))
+    weight = np.where(lit, weight, 0.0) * mass
+    fresnel = (1 - v_dot_h) ** 5
+    split = [weight * (1 - fresnel), weight * fresnel]
+    return np.stack([part.sum((-2, -1)) for part in split], axis=-1)
+
+
+@lru_cache(maxsize=4)
+def _fg_values(cosines: int, roughnesses: int) -> np.ndarray:
+    cosine = np.linspace(0, 1, cosines)
+    rows = [directional_albedo(cosine, np.full(cosines, r)) for r in np.linspace(0, 1, roughnesses)]
+    return np.stack(rows, axis=1).astype(np.float32)
+
+
+def fg_table(*, cosines: int = 128, roughnesses: int = 32) -> Float[Array, "V R 2"]:
+    """Tabulate `directional_albedo` over n.v in [0, 1] and roughness in [0, 1], ends included."""
+    return jnp.asarray(_fg_values(cosines, roughnesses))
+
+
+def fg_lookup(
+    table: Float[Array, "V R 2"], n_dot_v: Float[Array, " N"], roughness: Float[Array, " N"]
+) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
+    """Interpolate the scale and bias of the directional albedo bilinearly.
+
+    Arguments outside [0, 1] are clamped, with zero gradient. Differentiable in all arguments.
+    """
+    rows, columns, _ = table.shape
+    y = jnp.clip(n_dot_v, 0.0, 1.0) * (rows - 1)
+    x = jnp.clip(roughness, 0.0, 1.0) * (columns - 1)
+    y0, x0 = jnp.clip(jnp.floor(y), 0.0, rows - 2.0), jnp.clip(jnp.floor(x), 0.0, columns - 2.0)
+    fy, fx = y - y0, x - x0
+    index = y0.astype(jnp.int32) * columns + x0.astype(jnp.int32)
+    flat = table.reshape(-1, 2).astype(n_dot_v.dtype)
+    corners = [
+        flat.at[index + offset].get(mode="promise_in_bounds")
+        for offset in (0, 1, columns, columns + 1)
+    ]
+
+    # One column at a time: sums over an axis of 2 in the backward pass would be slow.
+    def blend(channel):
+        a, b, c, d = (corner[:, channel] for corner in corners)
+        near, far = a + (b - a) * fx, c + (d - c) * fx
+        return near + (far - near) * fy
+
+    return blend(0), blend(1)
+
+
+def split_sum(
+    materials: Materials,
+    normals: Float[Array, "N 3"],
+    view_directions: Float[Array, "N 3"],
+    prefiltered: PrefilteredLight,
+    table: Float[Array, "V R 2"],
+    *,
+    two_sided: bool = True,
+    baked_diffuse: bool = False,
+) -> Shaded:
+    """Shade N points with the split-sum approximation.
+
+    Parameters
+    ----------
+    materials : `Materials` of the N points.
+    normals : (N, 3) unit shading normals, world.
+    view_directions : (N, 3) unit, from the point towards the viewer.
+    prefiltered : from `environment.prefilter`.
+    table : from `fg_table`.
+    two_sided : flip normals that face away from the viewer. Otherwise such points keep their
+        normal and are shaded as at a grazing angle (n.v = 0).
+    baked_diffuse : the diffuse part is ``albedo * (1 - metallic)``, not multiplied by the light:
+        the albedo field then stores baked radiance (preset `code`, stage 1).
+
+    Returns
+    -------
+    Shaded, differentiable in materials, normals, view directions and light. The flip is piecewise
+    constant. Zero normals (padding) give finite values and gradients.
+    """
+    cosine = jnp.sum(normals * view_directions, axis=-1)
+    if two_sided:
+        facing = jnp.where(cosine < 0, -1.0, 1.0).astype(normals.dtype)
+        normals, cosine = normals * facing[:, None], cosine * facing
+    reflected = 2 * cosine[:, None] * normals - view_directions
+    dielectric = (1 - materials.metallic)[:, None]
+    f0 = DIELECTRIC_F0 * dielectric + materials.albedo * materials.metallic[:, None]
+
+    diffuse_light = prefiltered_diffuse(prefiltered, normals)
+    specular_light = prefiltered_specular(prefiltered, reflected, materials.roughness)
+    scale, bias = fg_lookup(table, cosine, materials.roughness)
+    base = materials.albedo * dielectric
+    diffuse = base if baked_diffuse else base * diffuse_light
+    specular = specular_light * (f0 * scale[:, None] + bias[:, None])
+    return Shaded(diffuse + specular, diffuse, specular, diffuse_light, specular_light)

@@ -1,0 +1,311 @@
+"""Rays against the isosurface: equal to testing every triangle, whatever the ray."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from geosplat_jax.core.capacity import Capacities, fits, grow, overflowed
+from geosplat_jax.core.types import Grid
+from geosplat_jax.geometry import grid_vertices, initial_geometry, isosurface
+from geosplat_jax.rays.grid_index import T_MIN, build_accelerator, nearest, occluded
+
+AMPLE = Capacities(surface_cubes=1024, dual_vertices=1024, quads=1024, cell_patches=16384)
+extract = partial(jax.jit, static_argnames=("capacities", "training"))(isosurface)
+build = partial(jax.jit, static_argnames=("capacities",))(build_accelerator)
+
+# A float32 ray passes an edge on either side within this share of the triangle; such rays are told
+# apart and left out (and must be few).
+EDGE = 1e-4
+
+
+def torus_grid(resolution=12):
+    cell = 2.2 / resolution
+    return Grid(jnp.full((3,), -1.1), jnp.asarray(cell, jnp.float32), (resolution,) * 3)
+
+
+def bumpy_torus(grid, *, deform=0.0, seed=0):
+    """A torus with bumps: concave, so that it shadows itself."""
+    rng = np.random.default_rng(seed)
+    x, y, z = np.asarray(grid_vertices(grid), np.float64).T
+    ring = np.sqrt(x**2 + y**2) - 0.6
+    values = np.sqrt(ring**2 + z**2) - 0.27 + 0.05 * np.sin(9 * x) * np.sin(8 * y)
+    geometry = initial_geometry(grid, jnp.asarray(values / float(grid.cell_size), jnp.float32))
+    moved = rng.uniform(-deform, deform, geometry.deform.shape)
+    return replace(geometry, deform=jnp.asarray(moved, jnp.float32))
+
+
+def noise(grid, *, deform=0.0, seed=0):
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=(grid.vertex_count,))
+    geometry = initial_geometry(grid, jnp.asarray(values, jnp.float32))
+    moved = rng.uniform(-deform, deform, geometry.deform.shape)
+    return replace(geometry, deform=jnp.asarray(moved, jnp.float32))
+
+
+def traced(geometry, grid, capacities=AMPLE):
+    surface = extract(geometry, grid, capacities=capacities, training=True)
+    return surface, build(surface, grid, capacities=capacities)
+
+
+def triangles(surface):
+    faces = np.asarray(surface.mesh.faces)[: int(surface.mesh.face_count)]
+    return np.asarray(surface.mesh.vertices, np.float64)[faces]
+
+
+def brute_force(surface, origins, directions, source, *, two_sided, t_min):
+    """Nearest distance and face of every ray in float64, and rays too close to call."""
+    corners = triangles(surface)
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    normal = np.cross(b - a, c - a)
+    distance = np.full(len(origins), np.inf)
+    face = np.full(len(origins), -1)
+    unclear = np.zeros(len(origins), bool)
+    origins, directions = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
+    for ray, (o, d) in enumerate(zip(origins, directions, strict=True)):
+        along = normal @ d
+        size = np.linalg.norm(normal, axis=1)
+        usable = np.abs(along) > 1e-12 * size
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = np.where(usable, np.sum(normal * (a - o), axis=1) / along, np.inf)
+            p = o + np.where(np.isfinite(t), t, 0)[:, None] * d
+            squared = np.sum(normal**2, axis=1)
+            w = np.stack(
+                [
+                    np.sum(np.cross(c - b, p - b) * normal, axis=1),
+                    np.sum(np.cross(a - c, p - c) * normal, axis=1),
+                    np.sum(np.cross(b - a, p - a) * normal, axis=1),
+                ]
+            ) / np.where(squared > 0, squared, 1)
+        margin = np.min(w, axis=0)
+        # Seen at a slant, an error across the ray moves the point of a triangle further.
+        slack = EDGE * size / np.maximum(np.abs(along), 1e-12 * size)
+        ahead = np.isfinite(t) & (t > 0.5 * t_min) & (np.arange(len(a)) != source[ray])
+        allowed = np.ones(len(a), bool) if two_sided else along < 0
+        hit = ahead & allowed & (margin >= 0) & (t > t_min)
+        close = ahead & (np.abs(margin) < slack) & (np.max(np.abs(w), axis=0) < 1 + slack)
+        close |= ahead & (margin > -slack) & (np.abs(t - t_min) < 0.05 * t_min)
+        close |= (np.abs(along) < 1e-3 * size) & (margin > -1)
+        if hit.any():
+            face[ray] = np.argmin(np.where(hit, t, np.inf))
+            distance[ray] = t[face[ray]]
+        unclear[ray] = np.any(close & (t <= distance[ray] * (1 + 1e-5) + 1e-6))
+    return distance, face, unclear
+
+
+def unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def rays_of_kind(kind, surface, rng, count=300):
+    """Origins, directions and source faces."""
+    corners = triangles(surface)
+    nowhere = np.full(count, -1)
+    if kind == "through the box":
+        return rng.uniform(-1.5, 1.5, (count, 3)), unit(rng.normal(size=(count, 3))), nowhere
+    if kind == "along axes":
+        axis = np.eye(3)[rng.integers(0, 3, count)] * rng.choice([-1.0, 1.0], (count, 1))
+        return rng.uniform(-1.0, 1.0, (count, 3)) - 2.0 * axis, axis, nowhere
+    if kind == "along planes":
+        directions = rng.normal(size=(count, 3))
+        directions[np.arange(count), rng.integers(0, 3, count)] = 0.0
+        directions = unit(directions)
+        return rng.uniform(-0.8, 0.8, (count, 3)) - 1.5 * directions, directions, nowhere
+    faces = rng.integers(0, len(corners), count)
+    weights = rng.dirichlet([1, 1, 1], count)
+    origins = np.einsum("nk,nkd->nd", weights, corners[faces])
+    normals = np.cross(corners[faces, 1] - corners[faces, 0], corners[faces, 2] - corners[faces, 0])
+    normals = unit(normals)
+    directions = unit(rng.normal(size=(count, 3)))
+    directions *= np.where(np.sum(directions * normals, axis=1) < 0, -1, 1)[:, None]
+    if kind == "grazing":
+        flat = directions - np.sum(directions * normals, axis=1, keepdims=True) * normals
+        directions = unit(unit(flat) + 0.02 * normals)
+    return origins, directions, faces
+
+
+KINDS = ["through the box", "along axes", "along planes", "from the surface", "grazing"]
+
+
+@pytest.fixture(scope="module", params=[("torus", 0.0), ("torus", 1.5), ("noise", 1.5)], ids=str)
+def scene(request):
+    shape, deform = request.param
+    grid = torus_grid() if shape == "torus" else torus_grid(6)
+    make = bumpy_torus if shape == "torus" else noise
+    surface, accelerator = traced(make(grid, deform=deform), grid)
+    assert not overflowed(accelerator.usage, AMPLE)
+    assert not overflowed(surface.usage, AMPLE)
+    return surface, accelerator
+
+
+@pytest.mark.parametrize("two_sided", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_ray_equals_brute_force(scene, kind, two_sided):
+    surface, accelerator = scene
+    origins, directions, source = rays_of_kind(kind, surface, np.random.default_rng(1))
+    arguments = (
+        jnp.asarray(origins, jnp.float32),
+        jnp.asarray(directions, jnp.float32),
+        jnp.asarray(source, jnp.int32),
+        jnp.ones((len(origins),), bool),
+    )
+    t_min = T_MIN * float(accelerator.grid.cell_size)
+    distance, face, unclear = brute_force(
+        surface, *arguments[:2], source, two_sided=two_sided, t_min=t_min
+    )
+    clear = ~unclear
+    assert clear.mean() > (0.5 if kind == "grazing" else 0.8)
+    found, hit = nearest(accelerator, *arguments, two_sided=two_sided)
+    np.testing.assert_array_equal(np.asarray(hit)[clear] >= 0, face[clear] >= 0)
+    is_hit = clear & (face >= 0)
+    np.testing.assert_allclose(np.asarray(found)[is_hit], distance[is_hit], rtol=2e-4, atol=2e-5)
+    np.testing.assert_array_equal(np.asarray(hit)[is_hit], face[is_hit])
+    any_hit = np.asarray(occluded(accelerator, *arguments, two_sided=two_sided))
+    np.testing.assert_array_equal(any_hit[clear], face[clear] >= 0)
+    assert 0.02 < np.mean(face >= 0) < 1.0
+    assert np.all(np.isinf(np.asarray(found)[np.asarray(hit) < 0]))
+
+
+def _rays(count, seed=2):
+    rng = np.random.default_rng(seed)
+    origins = jnp.asarray(rng.uniform(-1.5, 1.5, (count, 3)), jnp.float32)
+    directions = jnp.asarray(unit(rng.normal(size=(count, 3))), jnp.float32)
+    return origins, directions, jnp.full((count,), -1, jnp.int32), jnp.ones((count,), bool)
+
+
+@pytest.mark.slow
+def test_masked_rays_hit_nothing_and_leave_the_others():
+    _, accelerator = traced(bumpy_torus(torus_grid()), torus_grid())
+    origins, directions, source, everything = _rays(700)
+    mask = jnp.asarray(np.random.default_rng(0).random(700) < 0.5)
+    whole = occluded(accelerator, origins, directions, source, everything)
+    part = occluded(accelerator, origins, directions, source, mask)
+    np.testing.assert_array_equal(part, whole & mask)
+    assert bool(jnp.any(whole & ~mask))
+
+
+@pytest.mark.slow
+def test_rays_in_many_chunks_equal_rays_in_one(monkeypatch):
+
+    _, accelerator = traced(bumpy_torus(torus_grid()), torus_grid())
+    rays = _rays(1500)
+    whole = nearest(accelerator, *rays)
+    monkeypatch.setattr(trace, "_CHUNK", 512)
+    again = jax.jit(grid_index._trace, static_argnames=("two_sided", "any_hit"))
+    parts = again(accelerator, *rays, two_sided=False, any_hit=False)
+    np.testing.assert_array_equal(whole[1], parts[1])
+    np.testing.assert_array_equal(whole[0], parts[0])
+
+
+def test_no_rays_and_no_surface_are_legal():
+    grid = torus_grid()
+    empty = initial_geometry(grid, jnp.ones((grid.vertex_count,)))
+    _, accelerator = traced(empty, grid)
+    distance, face = nearest(accelerator, *_rays(64))
+    assert bool(jnp.all(jnp.isinf(distance)))
+    assert bool(jnp.all(face == -1))
+    assert occluded(accelerator, *_rays(0)).shape == (0,)
+
+
+def test_a_ray_never_hits_the_face_it_starts_from():
+    surface, accelerator = traced(bumpy_torus(torus_grid()), torus_grid())
+    corners = triangles(surface)
+    centres = corners.mean(axis=1)
+    normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    source = jnp.arange(len(corners), dtype=jnp.int32)
+    # From just below the face, through it: its own face is in the way, and must not be.
+    start = jnp.asarray(centres - 0.02 * normals, jnp.float32)
+    arguments = (start, jnp.asarray(normals, jnp.float32))
+    everything = jnp.ones((len(corners),), bool)
+    _, with_source = nearest(accelerator, *arguments, source, everything, two_sided=True)
+    _, without = nearest(
+        accelerator, *arguments, jnp.full_like(source, -1), everything, two_sided=True
+    )
+    assert np.mean(np.asarray(without) == np.asarray(source)) > 0.9
+    assert not np.any(np.asarray(with_source) == np.asarray(source))
+
+
+@pytest.mark.slow
+def test_overflow_reports_the_true_need_and_growing_cures_it():
+    grid = torus_grid()
+    geometry = bumpy_torus(grid)
+    tight = replace(AMPLE, cell_patches=256)
+    _, accelerator = traced(geometry, grid, tight)
+    assert not bool(fits(accelerator.usage, tight))
+    assert overflowed(accelerator.usage, tight) == ["cell_patches"]
+    enough = grow(tight, accelerator.usage)
+    _, cured = traced(geometry, grid, enough)
+    assert int(cured.usage.cell_patches) == int(accelerator.usage.cell_patches)
+    assert bool(fits(cured.usage, enough))
+    _, ample = traced(geometry, grid)
+    np.testing.assert_array_equal(occluded(cured, *_rays(500)), occluded(ample, *_rays(500)))
+
+
+def test_a_list_too_long_to_be_counted_is_refused():
+    grid = torus_grid()
+    surface, _ = traced(bumpy_torus(grid), grid)
+    with pytest.raises(ValueError, match="at most 8388608 patches, not 8388609"):
+        build(surface, grid, capacities=replace(AMPLE, cell_patches=2**23 + 1))
+
+
+def test_a_scene_of_any_scale_gives_the_same_hits():
+    grid = torus_grid()
+    geometry = bumpy_torus(grid)
+    _, accelerator = traced(geometry, grid)
+    origins, directions, source, mask = _rays(500)
+    distance, face = nearest(accelerator, origins, directions, source, mask)
+    for scale in (2.0**-10, 2.0**10):
+        scaled = Grid(grid.origin * scale, grid.cell_size * scale, grid.shape)
+        _, other = traced(geometry, scaled)
+        far, same = nearest(other, origins * scale, directions, source, mask)
+        np.testing.assert_array_equal(same, face)
+        np.testing.assert_array_equal(far, distance * scale)
+
+
+@pytest.mark.slow
+def test_rays_carry_no_gradient():
+    grid = torus_grid(6)
+    geometry = bumpy_torus(grid)
+    origins, directions, source, mask = _rays(64)
+
+    def total(sdf, origins):
+        _, accelerator = traced(replace(geometry, sdf=sdf), grid)
+        distance, _ = nearest(accelerator, origins, directions, source, mask)
+        return jnp.sum(jnp.where(jnp.isfinite(distance), distance, 0.0))
+
+    gradients = jax.grad(total, argnums=(0, 1))(geometry.sdf, origins)
+    for gradient in gradients:
+        np.testing.assert_array_equal(gradient, 0.0)
+
+
+@pytest.mark.slow
+def test_agrees_with_embree_on_a_hundred_thousand_rays():
+    """An independent tracer; it is single precision too, so rays through edges may differ."""
+    pytest.importorskip("embreex", reason="no Embree for this platform")
+    import trimesh
+    from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+    grid = torus_grid(24)
+    ample = Capacities(surface_cubes=4096, dual_vertices=4096, quads=4096, cell_patches=32768)
+    surface, accelerator = traced(bumpy_torus(grid, deform=0.5), grid, ample)
+    assert bool(fits(accelerator.usage, ample))
+    vertices = np.asarray(surface.mesh.vertices)
+    faces = np.asarray(surface.mesh.faces)[: int(surface.mesh.face_count)]
+    tracer = RayMeshIntersector(trimesh.Trimesh(vertices, faces, process=False))
+    rng = np.random.default_rng(3)
+    origins, directions, source = rays_of_kind("from the surface", surface, rng, 100_000)
+    start = origins + 1e-3 * float(grid.cell_size) * directions
+    expected = tracer.intersects_any(start, directions)
+    found = occluded(
+        accelerator,
+        jnp.asarray(origins, jnp.float32),
+        jnp.asarray(directions, jnp.float32),
+        jnp.asarray(source, jnp.int32),
+        jnp.ones((100_000,), bool),
+        two_sided=True,
+    )
+    assert 0.05 < expected.mean() < 0.5
+    assert np.mean(np.asarray(found) == expected) > 0.9985
