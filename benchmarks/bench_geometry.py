@@ -13,16 +13,11 @@ import jax
 import jax.numpy as jnp
 
 from geosplat_jax.core.capacity import Capacities, grow
+from geosplat_jax.core.mesh import face_normals_and_areas, vertex_normals
 from geosplat_jax.core.numerics import safe_norm
 from geosplat_jax.core.types import Geometry, Grid
-from geosplat_jax.geometry import (
-    face_normals_and_areas,
-    grid_vertices,
-    initial_geometry,
-    isosurface,
-    sdf_entropy,
-    vertex_normals,
-)
+from geosplat_jax.geometry import isosurface
+from geosplat_jax.surface.grids import grid_vertices, initial_geometry, sdf_entropy
 
 RESOLUTIONS = (48, 96)
 YARDSTICK_MS = {48: 203.0, 96: 956.0}

@@ -1,4 +1,4 @@
-"""Time the hash encoding, forward and backward, on the Gaussians of a torus in grid order.
+"""Time the hash encoding, forward and backward, on the splats of a torus in grid order.
 
 Plain autodiff of `_reference_encode` is timed beside the hand-written reverse mode. The prototype
 took 14 / 87 / 280 ms (forward, gradient of the table, of table and points) for 8 levels x 4
@@ -24,19 +24,19 @@ SPECS = {
 }
 
 _GRID_CELLS = 48
-_GAUSSIANS_PER_CELL = 24
+_POINTS_PER_CELL = 24
 
 
 def torus_points(count: int) -> jax.Array:
     """Points near a torus in the unit cube, in the order an isosurface gives them: (count, 3)."""
     rng = np.random.default_rng(0)
-    cells = -(-count // _GAUSSIANS_PER_CELL)
+    cells = -(-count // _POINTS_PER_CELL)
     major, minor = rng.uniform(0.0, 2 * np.pi, (2, cells))
     ring = 0.55 + 0.3 * np.cos(minor)
     centers = np.stack([ring * np.cos(major), ring * np.sin(major), 0.3 * np.sin(minor)], -1)
     x, y, z = np.floor(0.5 * (centers + 1) * _GRID_CELLS).T
     centers = centers[np.lexsort((x, y, z))]
-    spread = rng.standard_normal((cells, _GAUSSIANS_PER_CELL, 3)) / (2 * _GRID_CELLS)
+    spread = rng.standard_normal((cells, _POINTS_PER_CELL, 3)) / (2 * _GRID_CELLS)
     points = (centers[:, None] + spread).reshape(-1, 3)[:count]
     return jnp.asarray(0.5 * (points + 1), jnp.float32)
 

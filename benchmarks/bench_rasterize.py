@@ -1,7 +1,7 @@
-"""Time the rasteriser, forward and backward, on the Gaussians of a torus mesh.
+"""Time the rasteriser, forward and backward, on the splats of a torus mesh.
 
 The yardstick is OpenSplat's C++ CPU rasteriser on the same scene: 132 ms for projection, forward
-and backward at 200 x 200 with 71k Gaussians, 1.9 s for 297k at 800 x 800, on two idle cores.
+and backward at 200 x 200 with 71k splats, 1.9 s for 297k at 800 x 800, on two idle cores.
 """
 
 import argparse
@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from geosplat_jax.core.capacity import Capacities, grow, overflowed
+from geosplat_jax.core.capacity import Capacities, retry
 from geosplat_jax.core.rotation import matrix_to_quaternion
 from geosplat_jax.fit.runtime import retain_freed_memory
 from geosplat_jax.splats.projection import project
@@ -22,7 +22,7 @@ from geosplat_jax.splats.rasterize import DEFAULT_TILE_SIZE, find_visible, raste
 
 YARDSTICK_MS = {"torus_71k_200": 132.0, "torus_297k_800": 1900.0}
 
-# (u, alpha, beta) of the outer and inner Gaussians of a face, REFERENCE values of the method.
+# (u, alpha, beta) of the outer and inner splats of a face: constants of the method.
 _ADAPTER_RINGS = ((0.07, 0.80, 15.0), (0.22, 2.08, 13.0))
 _THICKNESS = 4.54e-5
 
@@ -45,8 +45,8 @@ def torus(major_count: int, minor_count: int) -> tuple[np.ndarray, np.ndarray]:
     return vertices.reshape(-1, 3), faces
 
 
-def mesh_gaussians(vertices: np.ndarray, faces: np.ndarray) -> dict[str, jax.Array]:
-    """Six Gaussians a face (Eq. 8-11), with random colours."""
+def mesh_splats(vertices: np.ndarray, faces: np.ndarray) -> dict[str, jax.Array]:
+    """Make six splats per face (Eq. 8-11), with random colours."""
     points = vertices[faces]
     doubled = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
     length = np.linalg.norm(doubled, axis=1, keepdims=True)
@@ -112,11 +112,11 @@ def _front_facing(scene, center):
 @partial(jax.jit, static_argnames=("size", "capacities", "tile_size"))
 def lists_only(inputs, eligible, camera, *, size, capacities, tile_size):
     """Projection without gradients, visibility, sorting and binning."""
-    splats = project(
+    footprints = project(
         *inputs[:3], world_to_camera=camera[0], intrinsics=camera[1], height=size, width=size
     )
     return find_visible(
-        splats,
+        footprints,
         inputs[3],
         eligible,
         height=size,
@@ -156,14 +156,14 @@ def forward_backward(inputs, eligible, camera, *, size, capacities, tile_size):
 
 def fitted_capacities(inputs, eligible, camera, *, size, tile_size) -> Capacities:
     """Grow from small capacities until every buffer fits."""
-    capacities = Capacities()
-    while True:
+
+    def attempt(capacities: Capacities):
         lists = lists_only(
             inputs, eligible, camera, size=size, capacities=capacities, tile_size=tile_size
         )
-        if not overflowed(lists.usage, capacities):
-            return capacities
-        capacities = grow(capacities, lists.usage)
+        return lists, lists.usage
+
+    return retry(attempt, Capacities())[1]
 
 
 def milliseconds(function, *args, repeats: int, **settings) -> tuple[list[float], list[float]]:
@@ -179,17 +179,17 @@ def milliseconds(function, *args, repeats: int, **settings) -> tuple[list[float]
 
 
 def _measure(major, minor, size, repeats, tile_size) -> dict:
-    scene = mesh_gaussians(*torus(major, minor))
+    scene = mesh_splats(*torus(major, minor))
     *camera, center = view(size)
     inputs, eligible = _inputs(scene), _front_facing(scene, center)
     capacities = fitted_capacities(inputs, eligible, camera, size=size, tile_size=tile_size)
     settings = {"size": size, "capacities": capacities, "tile_size": tile_size}
     used = lists_only(inputs, eligible, camera, **settings).usage
     result = {
-        "gaussians": int(scene["means"].shape[0]),
-        "visible": int(used.visible),
-        "hits": int(used.hits),
-        "chunks": int(used.chunks),
+        "splats": int(scene["means"].shape[0]),
+        "visible": int(used["visible"]),
+        "hits": int(used["hits"]),
+        "chunks": int(used["chunks"]),
     }
     for function in (lists_only, forward, forward_backward):
         wall, processor = milliseconds(

@@ -1,6 +1,6 @@
 """Time occlusion rays against a bumpy torus, and Embree on the same rays where it is installed.
 
-Rays start on random triangles, sorted by triangle as Gaussians are, and leave into the outer half
+Rays start on random triangles, sorted by triangle as splats are, and leave into the outer half
 space: what shading asks for. Embree runs its own occlusion query on one core (it has no other
 mode from Python); ours uses the cores that XLA gives it.
 """
@@ -16,20 +16,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from geosplat_jax.core.capacity import Capacities, grow, overflowed
+from geosplat_jax.core.capacity import Capacities, combine, retry
 from geosplat_jax.core.types import Grid
 from geosplat_jax.geometry import grid_vertices, initial_geometry, isosurface
-from geosplat_jax.rays.grid_index import build_accelerator, nearest, occluded
+from geosplat_jax.rays.grid_index import build_grid_index
 
 RESOLUTIONS = (48, 96)
 RAYS = 200_000
 
 _extract = partial(jax.jit, static_argnames=("capacities", "training"))(isosurface)
-_build = partial(jax.jit, static_argnames=("capacities",))(build_accelerator)
+_build = partial(jax.jit, static_argnames=("capacities",))(build_grid_index)
 
 
 def _scene(resolution: int):
-    """Build a torus with bumps, its accelerator, and the capacities that hold both."""
+    """Build a torus with bumps, its index, and the capacities that hold both."""
     grid = Grid(jnp.full((3,), -1.0), jnp.asarray(2.0 / resolution), (resolution,) * 3)
     x, y, z = np.asarray(grid_vertices(grid)).T
     ring = np.sqrt(x**2 + y**2) - 0.6
@@ -38,14 +38,14 @@ def _scene(resolution: int):
     rng = np.random.default_rng(0)
     moved = jnp.asarray(rng.uniform(-0.3, 0.3, geometry.deform.shape), jnp.float32)
     geometry = type(geometry)(geometry.sdf, moved, geometry.alpha, geometry.beta, geometry.gamma)
-    capacities = Capacities()
-    while True:
+
+    def attempt(capacities: Capacities):
         surface = _extract(geometry, grid, capacities=capacities, training=True)
-        accelerator = _build(surface, grid, capacities=capacities)
-        grown = grow(grow(capacities, surface.usage), accelerator.usage)
-        if not overflowed(surface.usage, capacities) and grown == capacities:
-            return surface, accelerator, grid, capacities
-        capacities = grown
+        index = _build(surface, grid, capacities=capacities)
+        return (surface, index), combine(surface.usage, index.usage)
+
+    (surface, index), capacities = retry(attempt, Capacities())
+    return surface, index, grid, capacities
 
 
 def _rays(surface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -87,15 +87,15 @@ def run() -> dict[str, float]:
     """Medians, interleaved: milliseconds for all rays, millions of rays a second, and the ratio."""
     results: dict[str, float] = {}
     for resolution in RESOLUTIONS:
-        surface, accelerator, grid, capacities = _scene(resolution)
+        surface, index, grid, capacities = _scene(resolution)
         origins, directions, source, normals = _rays(surface)
         everything = jnp.ones((RAYS,), bool)
         arguments = (*map(jnp.asarray, (origins, directions, source)), everything)
         offset = 1e-3 * float(grid.cell_size) * normals.astype(np.float32)
         functions: dict[str, Callable[[], object]] = {
             "build": lambda s=surface, g=grid, c=capacities: _build(s, g, capacities=c),
-            "occluded": lambda a=accelerator, r=arguments: occluded(a, *r),
-            "nearest": lambda a=accelerator, r=arguments: nearest(a, *r),
+            "occluded": lambda i=index, r=arguments: i.occluded(*r),
+            "nearest": lambda i=index, r=arguments: i.nearest(*r),
         }
         embree = _embree(surface, origins + offset, directions)
         if embree is not None:

@@ -18,11 +18,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from geosplat_jax.fit.config import config_from_dict, differences
+from geosplat_jax.fit.config import Config, config_from_dict, differences
 
 _UP = ("psnr", "ssim", "iou", "correlation")
 _DOWN = ("mse", "mae", "direction_error")
-_COSTS = ("stage 2, s", "s a step", "memory, MB")
+_MEMORY = "memory, MB"
 _NONE = "–"
 _LONGEST = 240
 """Characters of an error's last line."""
@@ -39,7 +39,7 @@ class Entry:
     Attributes
     ----------
     figures : as in the ``mean`` of ``metrics.json``; empty where ``problem`` says why.
-    costs : some of `_COSTS`.
+    costs : some of `cost_names`.
     problem : what is wrong, or an empty text.
     notes : what does not spoil the figures but belongs to them.
     """
@@ -72,7 +72,7 @@ def digits(figure: str, value: float, *, signed: bool = False) -> str:
 
 def _cost_digits(name: str, value: float) -> str:
     """Write seconds with three digits and memory as a whole number."""
-    if name == "memory, MB" or value >= 100:
+    if name == _MEMORY or value >= 100:
         return f"{value:.0f}"
     return f"{value:.{1 if value >= 10 else 2 if value >= 1 else 3}f}"
 
@@ -109,20 +109,40 @@ def _last_line(path: Path) -> str:
     return last if len(last) <= _LONGEST else last[:_LONGEST] + " […]"
 
 
-def _costs(folder: Path, figures: dict[str, Any], steps: int) -> tuple[dict[str, float], list[str]]:
-    """Seconds of stage 2 and the largest memory; notes on what is not known."""
+def cost_names(sweep: dict[str, Any]) -> list[str]:
+    """Name the columns of costs: seconds of the stages that runs end with, and memory."""
+    lasts = [config_from_dict(run["config"]).active_stages[-1].name for run in sweep["runs"]]
+    return [*(name for last in dict.fromkeys(lasts) for name in _seconds_of(last)), _MEMORY]
+
+
+def _seconds_of(stage: str) -> tuple[str, str]:
+    """Columns of a stage: all of its seconds, and the median step."""
+    return f"{stage}, s", f"{stage}, s per step"
+
+
+def _costs(
+    folder: Path, figures: dict[str, Any], config: Config
+) -> tuple[dict[str, float], list[str]]:
+    """Seconds of the stages and the largest memory; notes on what is not known.
+
+    A run that took its first stages over has no seconds of these.
+    """
     costs, notes = {}, []
     memory = figures.get("training_peak_memory_mb")
     if memory is not None:
-        costs["memory, MB"] = float(memory)
+        costs[_MEMORY] = float(memory)
     path = folder / "metrics.jsonl"
     lines = [json.loads(x) for x in path.read_text().splitlines()] if path.exists() else []
-    seconds = [float(line["seconds"]) for line in lines if line["stage"] == 2]
-    if len(seconds) != steps:
-        notes.append(f"metrics.jsonl has {len(seconds)} of {steps} steps of stage 2")
-    elif seconds:
-        costs["stage 2, s"] = sum(seconds)
-        costs["s a step"] = statistics.median(seconds)
+    *_, last = config.active_stages
+    for stage in config.active_stages:
+        seconds = [float(line["seconds"]) for line in lines if line["stage"] == stage.name]
+        if not seconds and stage != last:
+            continue
+        if len(seconds) != stage.steps:
+            notes.append(f"metrics.jsonl has {len(seconds)} of {stage.steps} steps of {stage.name}")
+            continue
+        whole, step = _seconds_of(stage.name)
+        costs[whole], costs[step] = sum(seconds), statistics.median(seconds)
     return costs, notes
 
 
@@ -143,13 +163,13 @@ def read_entry(folder: Path, run: dict[str, Any]) -> Entry:
         record = json.loads((folder / "metrics.json").read_text())
         config = config_from_dict(run["config"])
         recorded = config_from_dict(record["config"])
-        changed = differences(recorded, config.stage(record["stage"]))
+        changed = differences(recorded, config)
         if changed:
             problem = f"other settings than the sweep (recorded -> wanted): {'; '.join(changed)}"
             return Entry({}, {}, problem)
         if record["step"] != config.total_steps:
             return Entry({}, {}, f"evaluated at step {record['step']} of {config.total_steps}")
-        costs, notes = _costs(folder, record, config.transport.steps)
+        costs, notes = _costs(folder, record, config)
         figures = {name: float(value) for name, value in record["mean"].items()}
     except (OSError, ValueError, KeyError, TypeError) as error:
         return Entry({}, {}, f"unreadable: {_without_places(repr(error))}")
@@ -179,12 +199,12 @@ def _table(rows: list[list[str]]) -> list[str]:
 
 def _header(sweep: dict[str, Any]) -> list[str]:
     """Return the header that all tables share."""
-    return ["run", *(f"{name}{arrow(name)}" for name in sweep["figures"]), *_COSTS]
+    return ["run", *(f"{name}{arrow(name)}" for name in sweep["figures"]), *cost_names(sweep)]
 
 
 def scene_table(sweep: dict[str, Any], entries: dict[str, Entry]) -> list[str]:
     """Tabulate the runs of one scene."""
-    rows = [_header(sweep)]
+    rows, costs = [_header(sweep)], cost_names(sweep)
     for name, entry in entries.items():
         row = [name]
         for figure in sweep["figures"]:
@@ -192,7 +212,7 @@ def scene_table(sweep: dict[str, Any], entries: dict[str, Entry]) -> list[str]:
             row.append(_NONE if value is None else digits(figure, value))
         row += [
             _cost_digits(cost, entry.costs[cost]) if cost in entry.costs else _NONE
-            for cost in _COSTS
+            for cost in costs
         ]
         rows.append(row)
     return _table(rows)
@@ -202,9 +222,10 @@ def _pairs(
     entries: dict[str, dict[str, Entry]], name: str, reference: str, figure: str
 ) -> tuple[list[tuple[float, float]], int]:
     """Values of a run and of the reference where both are known, and how often the latter is."""
-    field = "costs" if figure in _COSTS else "figures"
     found = [
-        tuple(getattr(runs[which], field).get(figure) for which in (name, reference))
+        tuple(
+            {**runs[which].figures, **runs[which].costs}.get(figure) for which in (name, reference)
+        )
         for runs in entries.values()
     ]
     known = sum(second is not None for _, second in found)
@@ -218,17 +239,17 @@ def summary_table(sweep: dict[str, Any], entries: dict[str, dict[str, Entry]]) -
     where some lack. Seconds and memory are ratios.
     """
     reference = sweep["runs"][0]["name"]
-    rows = [_header(sweep)]
+    rows, costs = [_header(sweep)], cost_names(sweep)
     for run in sweep["runs"]:
         name = run["name"]
         row = [f"{name} (reference)" if name == reference else name]
-        for figure in (*sweep["figures"], *_COSTS):
+        for figure in (*sweep["figures"], *costs):
             pairs, known = _pairs(entries, name, reference, figure)
             if not pairs:
                 row.append(_NONE)
                 continue
             ours, theirs = (statistics.fmean(values) for values in zip(*pairs, strict=True))
-            is_cost = figure in _COSTS
+            is_cost = figure in costs
             if name == reference:
                 cell = _cost_digits(figure, ours) if is_cost else digits(figure, ours)
                 known = len(entries)
@@ -335,7 +356,8 @@ def _describe_runs(sweep: dict[str, Any]) -> list[str]:
     lines = _table(rows)
     lines[1] = "| --- | --- | --- |"
     common = ", ".join(f"`{override}`" for override in sweep["overrides"])
-    start = f"Preset {sweep['preset']}, quality {sweep['quality']}, kind {sweep['kind']}, images "
+    start = f"Preset {sweep['preset']}, quality {sweep['quality']}, material prior "
+    start += f"{sweep['material_prior']}, images "
     start += f"reduced by {sweep['downscale']}, " if sweep["downscale"] > 1 else "as they are, "
     start += f"{usual['samples']} samples for evaluation, protocol {usual['protocol']}"
     return [start + (f"; all runs: {common}." if common else "."), "", *lines]
@@ -380,10 +402,10 @@ def compose(
     for scene, runs in entries.items():
         lines += [f"## {scene}", "", *scene_table(sweep, runs), ""]
     lines += [
-        "Arrows point to the better side. Seconds are those of stage 2 with its compilation; "
+        "Arrows point to the better side. Seconds are those of a stage with its compilation; "
     ]
-    lines[-1] += "a step is the median. Memory is the training process's largest, which is less "
-    lines[-1] += "where a run took over its stage 1."
+    lines[-1] += "that of a step is the median. Memory is the training process's largest, which "
+    lines[-1] += "is less where a run took over its first stages."
     lines.append("")
     if plots:
         lines += ["## Curves", "", *(f"![{Path(link).stem}]({link})" for link in plots), ""]
@@ -397,11 +419,14 @@ def compose(
 def _read_sweep(folder: Path) -> dict[str, Any]:
     """Read what experiments/run.py recorded."""
     try:
-        return json.loads((folder / "sweep.json").read_text())
-    except (OSError, ValueError) as error:
+        sweep = json.loads((folder / "sweep.json").read_text())
+        for run in sweep["runs"]:
+            config_from_dict(run["config"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise ReportError(
             f"{folder} holds no readable sweep.json ({error}); experiments/run.py writes it"
         ) from error
+    return sweep
 
 
 def main(argv: list[str] | None = None) -> int:

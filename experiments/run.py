@@ -1,4 +1,4 @@
-"""Run a sweep: train and evaluate many settings on many scenes, sharing stage 1 where possible.
+"""Run a sweep: train and evaluate many settings on many scenes; stages that runs share, once.
 
 ``python experiments/run.py SWEEP.toml --scenes ROOT --output DIR`` leaves a run folder
 ``DIR/SCENE/NAME`` for every run, and ``DIR/sweep.json`` for ``experiments/report.py``. The same
@@ -10,7 +10,6 @@ import json
 import math
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -24,16 +23,14 @@ from typing import Any
 
 from report import command_line
 
-from geosplat_jax.cli import evaluate_command, train_command
-from geosplat_jax.fit.config import Config, config_from_dict, differences, make_config
+from geosplat_jax.fit.config import Config, config_from_dict, differences
+from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
 from geosplat_jax.fit.train import Interrupted
 from geosplat_jax.io.checkpoints import latest_checkpoint
 from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.renderer import DEFAULT_SAMPLES, RELIGHT_KINDS
-
-STAGE_1 = "_stage_1"
-"""Folder of a scene's shared stage 1; names of runs start with a letter or a digit."""
+from geosplat_jax.run import Run, train
 
 _FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _KINDS: dict[str, Callable[[Any], bool]] = {
@@ -45,7 +42,7 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
     "a finite number": lambda x: type(x) in (int, float) and math.isfinite(x),
 }
 _SWEEP_KEYS = {
-    **dict.fromkeys(("title", "about", "preset", "quality", "kind"), "a text"),
+    **dict.fromkeys(("title", "about", "preset", "quality", "material_prior"), "a text"),
     **dict.fromkeys(("scenes", "set", "figures"), "a list of texts"),
     **dict.fromkeys(("samples", "downscale"), "a positive integer"),
     "run": "a list of tables",
@@ -69,7 +66,7 @@ class RunFailed(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Run:
+class SweepRun:
     """One setting of a sweep; see `read_sweep`."""
 
     name: str
@@ -89,25 +86,24 @@ class Sweep:
     about: str
     preset: str
     quality: str
-    kind: str
+    material_prior: str
     scenes: tuple[str, ...]
     overrides: tuple[str, ...]
     figures: tuple[str, ...]
     samples: int
     downscale: int
-    runs: tuple[Run, ...]
+    runs: tuple[SweepRun, ...]
 
-    def config(self, run: Run | None = None) -> Config:
-        """Return the settings of a run, or those that all runs start from."""
-        overrides = (*self.overrides, *(run.overrides if run else ()))
-        return make_config(self.preset, self.quality, kind=self.kind, overrides=overrides)
+    def config(self, run: SweepRun) -> Config:
+        """Return the settings of a run."""
+        return make_config(
+            self.preset,
+            self.quality,
+            material_prior=self.material_prior,
+            overrides=(*self.overrides, *run.overrides),
+        )
 
-    def stage_1(self) -> Config:
-        """Return the settings of the shared stage 1, which no setting of stage 2 has a part in."""
-        later = make_config(self.preset, self.quality, kind=self.kind).transport
-        return replace(self.config(), transport=replace(later, steps=0))
-
-    def evaluation(self, run: Run) -> dict[str, Any]:
+    def evaluation(self, run: SweepRun) -> dict[str, Any]:
         """Return all keyword arguments of a run's evaluation."""
         usual = {"protocol": PROTOCOLS[0], "samples": self.samples, "relight_indirect": "traced"}
         return usual | run.evaluate
@@ -121,9 +117,10 @@ class Job:
     ----------
     label : ``scene/name``, for messages.
     scene, folder : where the scene lies, where the run goes.
-    config, options : see `cli.train_command`.
-    stage_1 : run folder whose stage 1 to take over, or None.
-    evaluate : keyword arguments of `cli.evaluate_command`; None leaves evaluation out.
+    config, options : see `geosplat_jax.run.train`, whose ``reading`` the options are.
+    source, first_stage : run folder whose stages to take over, and the first one to train; None
+        to train all of them.
+    evaluate : keyword arguments of `Run.evaluate`; None leaves evaluation out.
     """
 
     label: str
@@ -131,7 +128,8 @@ class Job:
     folder: str
     config: dict[str, Any]
     options: dict[str, Any]
-    stage_1: str | None
+    source: str | None
+    first_stage: str | None
     evaluate: dict[str, Any] | None
 
 
@@ -163,7 +161,7 @@ def _check_names(names: Iterable[str], what: str, where: str) -> None:
         seen[name.lower()] = name
 
 
-def _read_run(values: dict[str, Any], where: str) -> Run:
+def _read_run(values: dict[str, Any], where: str) -> SweepRun:
     """Read one [[run]] table."""
     _check_keys(values, _RUN_KEYS, ("name",), where)
     where = f"{where} {values['name']!r}"
@@ -176,7 +174,7 @@ def _read_run(values: dict[str, Any], where: str) -> Run:
             )
     if "group" in values and "x" not in values:
         raise SweepError(f"{where}: group names the curve of a run with x, and there is no x")
-    return Run(
+    return SweepRun(
         name=values["name"],
         title=values.get("title", values["name"]),
         overrides=tuple(values.get("set", ())),
@@ -187,16 +185,18 @@ def _read_run(values: dict[str, Any], where: str) -> Run:
 
 
 def _check_settings(sweep: Sweep, where: str) -> None:
-    """Build all settings, of both stages, so that a bad override is found before training.
+    """Build all settings, so that a bad override is found before training.
 
     Runs at the same place of a curve are repetitions, which may differ in their seeds alone.
     """
     for run in sweep.runs:
         try:
-            sweep.config(run).stage(2)
+            config = sweep.config(run)
         except ValueError as error:
             raise SweepError(f"{where}, run {run.name!r}: {error}") from error
-    points: dict[tuple[str, float], list[Run]] = {}
+        if not config.active_stages:
+            raise SweepError(f"{where}, run {run.name!r}: nothing to train: no stage has steps")
+    points: dict[tuple[str, float], list[SweepRun]] = {}
     for run in sweep.runs:
         if run.x is not None:
             points.setdefault((run.group, run.x), []).append(run)
@@ -218,11 +218,11 @@ def read_sweep(path: Path, *, overrides: Iterable[str] = ()) -> Sweep:
 
     Parameters
     ----------
-    path : TOML with ``title``, ``about``, ``preset``, ``quality``, ``kind`` (see
-        `config.make_config`), ``scenes`` (folder names), ``set`` (overrides of every run),
+    path : TOML with ``title``, ``about``, ``preset``, ``quality``, ``material_prior``
+        (see `presets.make_config`), ``scenes`` (folder names), ``set`` (overrides of every run),
         ``figures`` (names of ``metrics.json`` to tabulate), ``samples`` of the evaluation,
         ``downscale`` of the images, and tables ``[[run]]`` with ``name``, ``title``, ``set``,
-        ``evaluate`` (keyword arguments of `cli.evaluate_command`), ``x`` (the run is a point of a
+        ``evaluate`` (keyword arguments of `Run.evaluate`), ``x`` (the run is a point of a
         curve) and ``group`` (which curve). The first run is the reference. Required are ``title``,
         ``scenes``, ``figures``, one run, and each run's ``name``.
     overrides : applied to every run after ``set`` and before its own.
@@ -250,7 +250,7 @@ def read_sweep(path: Path, *, overrides: Iterable[str] = ()) -> Sweep:
         about=values.get("about", "").strip(),
         preset=values.get("preset", "default"),
         quality=values.get("quality", "standard"),
-        kind=values.get("kind", "hybrid"),
+        material_prior=values.get("material_prior", "hybrid"),
         scenes=tuple(values["scenes"]),
         overrides=(*values.get("set", ()), *overrides),
         figures=tuple(values["figures"]),
@@ -264,15 +264,6 @@ def read_sweep(path: Path, *, overrides: Iterable[str] = ()) -> Sweep:
     return sweep
 
 
-def shares_stage_1(config: Config, base: Config) -> bool:
-    """Whether a run can take over the stage 1 that was trained with ``base``.
-
-    It can where only settings of stage 2 differ. A run without stage 2 cannot: nothing would be
-    left to train, and so no checkpoint would be written.
-    """
-    return config.transport.steps > 0 and replace(config, transport=base.transport) == base
-
-
 def homes(sweep: Sweep) -> dict[str, str]:
     """Name for every run the first one with the same settings and evaluation: it is run once."""
     settings = {run.name: (sweep.config(run), sweep.evaluation(run)) for run in sweep.runs}
@@ -280,36 +271,142 @@ def homes(sweep: Sweep) -> dict[str, str]:
     return {name: next(n for n in names if settings[n] == settings[name]) for name in names}
 
 
+def beginning(config: Config, count: int) -> Config:
+    """Return the settings of a run's first stages; no setting of a later stage has a part in it."""
+    return replace(config, stages=config.active_stages[:count])
+
+
+def shared_stages(config: Config, others: Iterable[Config]) -> Config | None:
+    """Return the longest beginning that a run shares with another one and does not end with.
+
+    Stages are shared where they, all before them and whatever is common to all stages have equal
+    settings. The last stage of a run is always its own: nothing would be left to train. Those who
+    go on where this run ends do not count, since they take over from the run itself.
+    """
+    count = len(config.active_stages)
+    partners = [x for x in others if len(x.active_stages) <= count or not _begins(config, x)]
+    for length in range(count - 1, 0, -1):
+        first = beginning(config, length)
+        if any(_begins(first, other) for other in partners):
+            return first
+    return None
+
+
+def _begins(first: Config, config: Config) -> bool:
+    """Whether a run starts with all stages of another."""
+    count = len(first.active_stages)
+    return beginning(config, count) == beginning(first, count)
+
+
+@dataclass(frozen=True)
+class Part:
+    """What is trained of a sweep in every scene: a run, or stages that several runs share.
+
+    Attributes
+    ----------
+    folder : name of its folder in the scene's.
+    config : settings.
+    source : folder of the part whose stages it takes over; None for none.
+    first_stage : name of the first stage that it trains itself; None with ``source``.
+    run : None for stages that several runs share.
+    """
+
+    folder: str
+    config: Config
+    source: str | None
+    first_stage: str | None
+    run: SweepRun | None
+
+
+def parts_of(sweep: Sweep) -> dict[str, Part]:
+    """List the parts of a sweep by folder, sources first.
+
+    Shared stages lie in ``_RUN.STAGE``: the first run that has them, and the last of them; names of
+    runs start with a letter or a digit. A run that ends with the shared stages is a source itself.
+    """
+    where = homes(sweep)
+    runs = [run for run in sweep.runs if where[run.name] == run.name]
+    configs = {run.name: sweep.config(run) for run in runs}
+    wanted: list[Config] = []
+    for name, config in configs.items():
+        others = [other for key, other in configs.items() if key != name]
+        first = shared_stages(config, others)
+        if first is not None and first not in wanted:
+            wanted.append(first)
+    folders = [_folder_of(first, configs) for first in wanted]
+
+    def part(folder: str, config: Config, run: SweepRun | None) -> Part:
+        count = len(config.active_stages)
+        before = [
+            (len(first.stages), name)
+            for first, name in zip(wanted, folders, strict=True)
+            if len(first.stages) < count and _begins(first, config)
+        ]
+        if not before:
+            return Part(folder, config, None, None, run)
+        length, source = max(before)
+        return Part(folder, config, source, config.active_stages[length].name, run)
+
+    shared = [
+        part(folder, first, None)
+        for first, folder in zip(wanted, folders, strict=True)
+        if folder not in configs
+    ]
+    found = [*shared, *(part(run.name, configs[run.name], run) for run in runs)]
+    # A source has fewer stages than those who need it; otherwise the order is the sweep's.
+    parts: dict[str, Part] = {}
+
+    def add(one: Part) -> None:
+        if one.source is not None and one.source not in parts:
+            add(next(other for other in found if other.folder == one.source))
+        parts.setdefault(one.folder, one)
+
+    for one in found:
+        if one.run is not None:
+            add(one)
+    return parts
+
+
+def _folder_of(first: Config, configs: dict[str, Config]) -> str:
+    """Name the folder of shared stages: that of a run that ends with them, if there is one."""
+    having = [name for name, config in configs.items() if _begins(first, config)]
+    ending = [n for n in having if len(configs[n].active_stages) == len(first.stages)]
+    return ending[0] if ending else f"_{having[0]}.{first.stages[-1].name}"
+
+
 def plan(
     sweep: Sweep, root: Path, output: Path, *, scenes: Iterable[str], names: Iterable[str]
 ) -> list[Job]:
     """List what there is to do for some scenes and runs, in the order to do it.
 
-    A scene's shared stage 1 comes before the runs that take it over, and is left out where all
-    of these are trained already.
+    Stages that runs share come before the runs that take them over, and are left out where all of
+    these are trained already.
     """
-    where, base, jobs = homes(sweep), sweep.config(), []
+    where, parts, jobs = homes(sweep), parts_of(sweep), []
     wanted = {where[name] for name in names}
     options = {"downscale": sweep.downscale, "light": None, "bounds": None}
     for scene in scenes:
-        place, shared = str((root / scene).resolve()), output / scene / STAGE_1
-        runs = [
-            Job(
-                label=f"{scene}/{run.name}",
-                scene=place,
-                folder=str(output / scene / run.name),
-                config=sweep.config(run).to_dict(),
+
+        def job(part: Part, scene: str = scene) -> Job:
+            is_wanted = part.folder in wanted
+            return Job(
+                label=f"{scene}/{part.folder}",
+                scene=str((root / scene).resolve()),
+                folder=str(output / scene / part.folder),
+                config=part.config.to_dict(),
                 options=options,
-                stage_1=str(shared) if shares_stage_1(sweep.config(run), base) else None,
-                evaluate=sweep.evaluation(run),
+                source=None if part.source is None else str(output / scene / part.source),
+                first_stage=part.first_stage,
+                evaluate=sweep.evaluation(part.run) if part.run and is_wanted else None,
             )
-            for run in sweep.runs
-            if run.name in wanted
-        ]
-        if any(job.stage_1 and not is_trained(job) for job in runs):
-            first, label = sweep.stage_1().to_dict(), f"{scene}/{STAGE_1}"
-            jobs.append(Job(label, place, str(shared), first, options, None, None))
-        jobs += runs
+
+        all_jobs = {name: job(part) for name, part in parts.items()}
+        needed = set(wanted)
+        for name in reversed(parts):
+            source = parts[name].source
+            if source is not None and name in needed and not is_trained(all_jobs[name]):
+                needed.add(source)
+        jobs += [one for name, one in all_jobs.items() if name in needed]
     return jobs
 
 
@@ -331,16 +428,13 @@ def _changes(job: Job) -> list[str]:
     if (folder / "run.json").exists():
         record = json.loads((folder / "run.json").read_text())
         recorded = config_from_dict(record["config"])
-        if job.evaluate is None and is_trained(job):
-            # Defaults of stage 2 have no part in a shared stage 1.
-            recorded = replace(recorded, transport=wanted.transport)
         found += differences(recorded, wanted)
         read = {"scene": job.scene, "dataset": job.options}
         found += [f"{k}: {record[k]!r} -> {v!r}" for k, v in read.items() if record[k] != v]
     if found or not is_finished(job) or job.evaluate is None:
         return found
     figures = json.loads((folder / "metrics.json").read_text())
-    found += differences(config_from_dict(figures["config"]), wanted.stage(figures["stage"]))
+    found += differences(config_from_dict(figures["config"]), wanted)
     evaluated = json.loads((folder / "evaluation.json").read_text())
     evaluated |= {name: figures[name] for name in job.evaluate}
     return found + [
@@ -375,36 +469,38 @@ def check_folders(jobs: Iterable[Job]) -> None:
         )
 
 
+def _evaluate(folder: Path, **arguments: Any) -> None:
+    """Evaluate the run in a folder."""
+    Run(folder).evaluate(**arguments)
+
+
 def execute(
     job: Job,
     *,
-    train: Callable[..., Any] = train_command,
-    evaluate: Callable[..., Any] = evaluate_command,
+    train: Callable[..., Any] = train,
+    evaluate: Callable[..., Any] = _evaluate,
 ) -> None:
     """Train a run, from its last checkpoint if it has one, and evaluate it.
 
     Parameters
     ----------
     job : see `Job`; `check_folders` has agreed to its folder.
-    train, evaluate : `cli.train_command` and `cli.evaluate_command`.
+    train, evaluate : `geosplat_jax.run.train`; and `Run.evaluate` of the run in a folder.
     """
     folder = Path(job.folder)
     if not is_trained(job):
         resume = latest_checkpoint(folder / "checkpoints") is not None
-        if not resume and (folder / "run.json").exists():
-            # A start that came to no whole checkpoint; run.json goes last, as it says whose it is.
-            for name in ("checkpoints", "previews", "stage_1"):
-                shutil.rmtree(folder / name, ignore_errors=True)
-            for name in ("metrics.jsonl", "run.json"):
-                (folder / name).unlink(missing_ok=True)
         train(
             Path(job.scene),
             folder,
             config_from_dict(job.config),
-            job.options,
             resume=resume,
-            # A resumed run has its stage 1 already.
-            stage_1=None if resume or job.stage_1 is None else Path(job.stage_1),
+            # A start that came to no whole checkpoint is replaced.
+            force=not resume and (folder / "run.json").exists(),
+            # A resumed run has its first stages already.
+            source=None if resume or job.source is None else Path(job.source),
+            first_stage=None if resume else job.first_stage,
+            **job.options,
         )
     if job.evaluate is not None:
         evaluate(folder, **job.evaluate)
@@ -476,7 +572,7 @@ def run_jobs(jobs: list[Job], *, start: Callable[[Job], None] = in_a_process) ->
     """Do the jobs one after the other and return those that failed.
 
     A failure is written to ``error.txt`` of the run's folder and stops nothing but the runs that
-    need its stage 1.
+    take stages over from it.
     """
     failed: list[Job] = []
     for number, job in enumerate(jobs, 1):
@@ -485,8 +581,10 @@ def run_jobs(jobs: list[Job], *, start: Callable[[Job], None] = in_a_process) ->
             _say(f"{head}: finished already")
             (Path(job.folder) / "error.txt").unlink(missing_ok=True)
             continue
-        if job.stage_1 in {bad.folder for bad in failed} and not is_trained(job):
-            _note_failure(job, f"the shared stage 1 failed; see ../{STAGE_1}/error.txt")
+        source = next((bad for bad in failed if bad.folder == job.source), None)
+        if source is not None and not is_trained(job) and not is_trained(source):
+            name = Path(source.folder).name
+            _note_failure(job, f"the stages to take over failed; see ../{name}/error.txt")
             failed.append(job)
             continue
         _say(f"{head}: {'evaluating' if is_trained(job) else 'training'}")

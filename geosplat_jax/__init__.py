@@ -1,3 +1,44 @@
-"""Inverse rendering on any machine: photographs in; mesh, PBR materials and light out."""
+"""Inverse rendering on any machine: photographs in; mesh, PBR materials and light out.
 
-__version__ = "0.1.0"
+::
+
+    import geosplat_jax as gs
+
+    run = gs.train("examples/duck", "runs/duck", quality="draft")
+    view = run.renderer()(run.dataset.test.camera([0]))
+"""
+
+from geosplat_jax.core.types import Batch, Camera, EnvLight
+from geosplat_jax.fit.config import Config, Stage
+from geosplat_jax.fit.folder import RunError
+from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.train import Interrupted, Progress, TrainingError
+from geosplat_jax.io.dataset import Dataset, load_dataset
+from geosplat_jax.io.images import SceneError
+from geosplat_jax.pipeline import Pipeline
+from geosplat_jax.render import Params
+from geosplat_jax.report.relight import load_light
+from geosplat_jax.report.renderer import Renderer
+from geosplat_jax.run import Run, train
+
+__all__ = [
+    "Batch",
+    "Camera",
+    "Config",
+    "Dataset",
+    "EnvLight",
+    "Interrupted",
+    "Params",
+    "Pipeline",
+    "Progress",
+    "Renderer",
+    "Run",
+    "RunError",
+    "SceneError",
+    "Stage",
+    "TrainingError",
+    "load_dataset",
+    "load_light",
+    "make_config",
+    "train",
+]

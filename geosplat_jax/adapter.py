@@ -1,78 +1,76 @@
-"""MGadapter: turn every triangle into six Gaussians, or every vertex into one (Eq. 8-12).
+"""MGadapter: turn every triangle into six splats, or every vertex into one (Eq. 8-12).
 
-Differentiable in vertices and vertex normals. The number of Gaussians is static (six a face row,
-or one a vertex row); rows beyond the mesh's counts are inert padding.
+Differentiable in vertices and vertex normals. The number of splats is static (six per face row, or
+one per vertex row); rows beyond the mesh's counts are inert padding.
 """
 
+import abc
 from dataclasses import dataclass, replace
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+from pydantic import Field
 
+from geosplat_jax.core.mesh import face_normals_and_areas, vertex_normals
 from geosplat_jax.core.numerics import safe_divide, safe_norm, safe_normalize, safe_sqrt
 from geosplat_jax.core.rotation import axes_to_quaternion, frame_from_normal, matrix_to_quaternion
-from geosplat_jax.core.types import Gaussians, Mesh
-from geosplat_jax.geometry import face_normals_and_areas
+from geosplat_jax.core.settings import Positive, Variant, settings
+from geosplat_jax.core.types import Box, Mesh, Splats
+from geosplat_jax.materials import Attributes
+from geosplat_jax.surface.base import Surface
 
-GAUSSIANS_PER_FACE = 6
+SPLATS_PER_FACE = 6
 
 
-@dataclass(frozen=True)
+@settings
 class AdapterConstants:
-    """Constants of the face sampling; static and hashable.
-
-    Attributes
-    ----------
-    u, v : barycentric coordinate of the outer and the inner triple of points, below 1/3.
-    alpha : (outer, inner) ratio of S_x to half the length of the sampled segment.
-    beta : (outer, inner) divisor of S_y.
-    thickness : S_z in half the longest side of the scene's box (the paper's box is [-1, 1]^3).
-    opacity : opacity of every Gaussian.
-    shading_frame : orient by the interpolated normal (the paper's text) instead of the face's
-        (the authors' code).
-    vertex_area_divisor : the k in ``S = sqrt(area / k)`` of the vertex sampling.
-    """
+    """Constants of the sampling; static and hashable."""
 
     u: float = 0.07
+    """Barycentric coordinate of the outer triple of points, in [0, 1/3)."""
     v: float = 0.22
-    alpha: tuple[float, ...] = (0.80, 2.08)
-    beta: tuple[float, ...] = (15.0, 13.0)
-    thickness: float = 4.54e-5
-    opacity: float = 0.99
+    """Barycentric coordinate of the inner triple of points, in [0, 1/3)."""
+    alpha: tuple[Positive, Positive] = (0.80, 2.08)
+    """(outer, inner) ratio of S_x to half the length of the sampled segment."""
+    beta: tuple[Positive, Positive] = (15.0, 13.0)
+    """(outer, inner) divisor of S_y."""
+    thickness: Positive = 4.54e-5
+    """S_z in half the longest side of the scene's box (the paper's box is [-1, 1]^3). The paper
+    prints 4.5e-7; the authors' code has exp(-10), which is this."""
+    opacity: Annotated[float, Field(gt=0, le=1)] = 0.99
+    """Opacity of every splat."""
     shading_frame: bool = False
-    vertex_area_divisor: float = 2.5
+    """Orient by the interpolated normal (the paper's text) instead of the face's (the authors'
+    code)."""
+    vertex_area_divisor: Positive = 2.5
+    """The k in ``S = sqrt(area / k)`` of the vertex sampling."""
 
     def __post_init__(self) -> None:
-        """Refuse constants that give flipped or negative Gaussians."""
+        """Refuse constants that flip a triple of points."""
         if not (0 <= self.u < 1 / 3 and 0 <= self.v < 1 / 3):
             raise ValueError(f"u and v must lie in [0, 1/3), got {self.u} and {self.v}")
-        if len(self.alpha) != 2 or len(self.beta) != 2:
-            raise ValueError(
-                f"alpha and beta need an outer and an inner value, got {self.alpha}, {self.beta}"
-            )
-        if min(*self.alpha, *self.beta, self.thickness, self.vertex_area_divisor) <= 0:
-            raise ValueError("alpha, beta, thickness and vertex_area_divisor must be positive")
-        if not 0 < self.opacity <= 1:
-            raise ValueError(f"opacity must lie in (0, 1], got {self.opacity}")
 
 
 PAPER = AdapterConstants(opacity=1.0, shading_frame=True)
 CODE = AdapterConstants(u=1 / 9 - 1 / 24, v=2 / 9)
 
 
-def _inert(gaussians: Gaussians) -> Gaussians:
+def _inert(splats: Splats) -> Splats:
     """Overwrite the rows past the count with harmless values."""
-    real = gaussians.mask
-    dtype = gaussians.means.dtype
+    real = splats.mask
+    dtype = splats.means.dtype
     unit_quat = jnp.array([[1.0, 0.0, 0.0, 0.0]], dtype)
+    means = jnp.where(real[:, None], splats.means, 0.0)
     return replace(
-        gaussians,
-        means=jnp.where(real[:, None], gaussians.means, 0.0),
-        quats=jnp.where(real[:, None], gaussians.quats, unit_quat),
-        scales=jnp.where(real[:, None], gaussians.scales, 1.0),
-        opacities=jnp.where(real, gaussians.opacities, 0.0),
-        normals=jnp.where(real[:, None], gaussians.normals, 0.0),
+        splats,
+        means=means,
+        quats=jnp.where(real[:, None], splats.quats, unit_quat),
+        scales=jnp.where(real[:, None], splats.scales, 1.0),
+        opacities=jnp.where(real, splats.opacities, 0.0),
+        normals=jnp.where(real[:, None], splats.normals, 0.0),
+        anchors=means,
     )
 
 
@@ -89,22 +87,22 @@ def _blend(
     )
 
 
-def face_gaussians(
+def face_splats(
     mesh: Mesh,
     normals: Float[Array, "Cv 3"],
     *,
     constants: AdapterConstants,
     unit: Float[Array, ""] | float = 1.0,
-) -> Gaussians:
-    """Sample six Gaussians a face (Eq. 8-11): rows ``6 f`` to ``6 f + 5`` belong to face ``f``.
+) -> Splats:
+    """Sample six splats per face (Eq. 8-11), one face after the other.
 
     The first three sit at the midpoints of the outer triple of barycentric points, the others at
     those of the inner triple. Differentiable in the mesh's vertices and in ``normals``; a triangle
-    without area gives finite Gaussians of zero width.
+    without area gives finite splats of zero width.
 
     Parameters
     ----------
-    mesh : faces to sample; rows past ``face_count`` become inert Gaussians.
+    mesh : faces to sample; rows past ``face_count`` become inert splats.
     normals : (Cv, 3) unit vertex normals.
     constants, unit : see `AdapterConstants`; world length of one unit of its thickness.
     """
@@ -124,7 +122,7 @@ def face_gaussians(
         shading += ring_normals
         for length in lengths:
             segment = (1.0 - 3.0 * corner) * length
-            along = 0.5 * constants.alpha[ring] * segment  # Eq. 9
+            along = 0.5 * constants.alpha[ring] * segment  # Eq. 10
             across = safe_divide(2.0 * area, constants.beta[ring] * segment)
             thickness = jnp.full_like(along, constants.thickness * unit)
             scales.append(jnp.stack([along, across, thickness]))
@@ -140,15 +138,20 @@ def face_gaussians(
         stacked = jnp.stack(parts)  # (6, c, F)
         return stacked.transpose(2, 0, 1).reshape(-1, stacked.shape[1])
 
-    gaussians = Gaussians(
-        means=rows(means),
+    means = rows(means)
+    faces = jnp.arange(area.shape[0], dtype=jnp.int32)
+    splats = Splats(
+        means=means,
         quats=rows(quats),
         scales=rows(scales),
-        opacities=jnp.full((6 * area.shape[0],), constants.opacity, area.dtype),
+        opacities=jnp.full((SPLATS_PER_FACE * area.shape[0],), constants.opacity, area.dtype),
         normals=rows(shading),
-        count=mesh.face_count * GAUSSIANS_PER_FACE,
+        outward=jnp.repeat(face_normal.T, SPLATS_PER_FACE, axis=0),
+        anchors=means,
+        parents=jnp.repeat(faces, SPLATS_PER_FACE),
+        count=mesh.face_count * SPLATS_PER_FACE,
     )
-    return _inert(gaussians)
+    return _inert(splats)
 
 
 def _frame(along: Float[Array, "3 F"], up: Float[Array, "3 F"]) -> Float[Array, "4 F"]:
@@ -160,16 +163,17 @@ def _frame(along: Float[Array, "3 F"], up: Float[Array, "3 F"]) -> Float[Array, 
     return axes_to_quaternion(x, jnp.cross(up, x, axis=0), up)
 
 
-def vertex_gaussians(
+def vertex_splats(
     mesh: Mesh,
     normals: Float[Array, "Cv 3"],
     *,
     constants: AdapterConstants,
     unit: Float[Array, ""] | float = 1.0,
-) -> Gaussians:
-    """Sample one round Gaussian a vertex (Eq. 12), for the first steps on a rough surface.
+) -> Splats:
+    """Sample one round splat per vertex (Eq. 12), for the first steps on a rough surface.
 
-    The footprint follows the area of the faces around the vertex, projected along its normal.
+    The footprint follows the area of the faces around the vertex, projected along its normal, as
+    in the authors' code: the paper's sum has no such cosine. The splats belong to no face.
     Differentiable in vertices and normals. The tangent frame (and so the quaternion) is arbitrary
     about the normal and jumps where ``n_z`` changes sign, which the round footprint hides.
     ``unit`` : world length of one unit of thickness.
@@ -183,35 +187,117 @@ def vertex_gaussians(
     radius = safe_sqrt(star_area / constants.vertex_area_divisor)
     thickness = constants.thickness * unit
     tangent, bitangent = frame_from_normal(normals)
-    gaussians = Gaussians(
+    splats = Splats(
         means=mesh.vertices,
         quats=matrix_to_quaternion(jnp.stack([tangent, bitangent, normals], axis=-1)),
         scales=jnp.stack([radius, radius, jnp.full_like(radius, thickness)], axis=-1),
         opacities=jnp.full_like(radius, constants.opacity),
         normals=normals,
+        outward=normals,
+        anchors=mesh.vertices,
+        parents=jnp.full(radius.shape, -1, jnp.int32),
         count=mesh.vertex_count,
     )
-    return _inert(gaussians)
+    return _inert(splats)
 
 
-def shift_inwards(
-    gaussians: Gaussians,
-    face_normal: Float[Array, "F 3"],
-    face_area: Float[Array, " F"],
-    fraction: Float[Array, " N"],
-) -> Gaussians:
-    """Move face-sampled Gaussians below their face: ``mean -= normal * sqrt(area) * fraction``.
+def shift_inwards(splats: Splats, mesh: Mesh, fraction: Float[Array, " N"]) -> Splats:
+    """Move splats below their face: ``mean -= normal * sqrt(area) * fraction``.
 
     Splats are wider than the triangles they stand for, so the silhouette swells by part of a
     pixel; a learned fraction in (0, 1) takes that back. Face normal and area carry *no* gradient.
+    The anchors stay on the face, and splats without a face where they are.
 
     Parameters
     ----------
-    gaussians : N = 6 F rows of `face_gaussians`.
-    face_normal, face_area : of the F faces.
+    splats : N rows. mesh : that their parents are faces of.
     fraction : (N,) how far, in units of the root of the face's area.
     """
-    step = jax.lax.stop_gradient(face_normal * safe_sqrt(face_area)[:, None])
-    per_row = jnp.repeat(step, GAUSSIANS_PER_FACE, axis=0)
-    moved = gaussians.means - per_row * fraction[:, None]
-    return replace(gaussians, means=jnp.where(gaussians.mask[:, None], moved, gaussians.means))
+    normal, area = face_normals_and_areas(mesh)
+    step = jax.lax.stop_gradient(normal * safe_sqrt(area)[:, None])
+    per_row = step.at[splats.parents].get(mode="clip")
+    moves = splats.mask & (splats.parents >= 0)
+    moved = splats.means - per_row * fraction[:, None]
+    return replace(splats, means=jnp.where(moves[:, None], moved, splats.means))
+
+
+class SplatModel(abc.ABC):
+    """A way to put splats on a surface; static and hashable."""
+
+    @abc.abstractmethod
+    def place(self, surface: Surface, parameters: Any, box: Box) -> Splats:
+        """Build the splats of a surface.
+
+        Parameters
+        ----------
+        surface : from `SurfaceModel.extract`.
+        parameters : what the splats themselves have learned; None for those that follow the mesh.
+        box : of the scene; its half extent is the unit of length.
+        """
+
+    def settle(self, splats: Splats, surface: Surface, attributes: Attributes) -> Splats:
+        """Move the splats as their attributes say."""
+        del surface, attributes
+        return splats
+
+
+@dataclass(frozen=True)
+class FaceSplats(SplatModel):
+    """Six splats per face, Eq. 8-11."""
+
+    constants: AdapterConstants = AdapterConstants()
+
+    def place(self, surface: Surface, parameters: Any, box: Box) -> Splats:
+        """See `face_splats`."""
+        normals = vertex_normals(surface.mesh)
+        return face_splats(surface.mesh, normals, constants=self.constants, unit=box.half_extent)
+
+    def settle(self, splats: Splats, surface: Surface, attributes: Attributes) -> Splats:
+        """Sink below the faces, where a shift is learned; see `shift_inwards`."""
+        if attributes.shift is None:
+            return splats
+        return shift_inwards(splats, surface.mesh, attributes.shift)
+
+
+@dataclass(frozen=True)
+class VertexSplats(SplatModel):
+    """One splat per vertex, Eq. 12."""
+
+    constants: AdapterConstants = AdapterConstants()
+
+    def place(self, surface: Surface, parameters: Any, box: Box) -> Splats:
+        """See `vertex_splats`."""
+        normals = vertex_normals(surface.mesh)
+        return vertex_splats(surface.mesh, normals, constants=self.constants, unit=box.half_extent)
+
+
+@settings
+class SplatSettings(Variant, abc.ABC):
+    """Settings of a splat model; every kind of them is a subclass."""
+
+    @property
+    def rate_groups(self) -> tuple[str, ...]:
+        """Names of the learning rates of what the splats themselves learn."""
+        return ()
+
+    @abc.abstractmethod
+    def build(self, constants: AdapterConstants) -> SplatModel:
+        """Make the model."""
+
+
+@settings
+class FaceSplatSettings(SplatSettings, kind="face"):
+    """Six splats per face."""
+
+    def build(self, constants: AdapterConstants) -> FaceSplats:
+        """Make the model."""
+        return FaceSplats(constants)
+
+
+@settings
+class VertexSplatSettings(SplatSettings, kind="vertex"):
+    """One splat per vertex."""
+
+    def build(self, constants: AdapterConstants) -> VertexSplats:
+        """Make the model."""
+        return VertexSplats(constants)

@@ -1,19 +1,23 @@
-"""The ``geosplat-jax`` command: info, train, evaluate, render, relight, export, gradcheck."""
+"""The ``geosplat-jax`` command: a thin layer over `run.train` and `run.Run`."""
 
 import argparse
 import importlib.metadata
 import json
 import sys
-import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Table
+from rich.text import Text
 
-from geosplat_jax.fit.config import PRESETS, QUALITIES, Config, doubts, make_config
+from geosplat_jax.fit.config import Config, all_settings, config_warnings
+from geosplat_jax.fit.folder import RunError
+from geosplat_jax.fit.presets import PRESETS, QUALITIES, make_config
 from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.train import Interrupted, TrainingError
+from geosplat_jax.fit.train import Progress as StepProgress
 from geosplat_jax.gradcheck.report import (
     SINGLE_TOLERANCE,
     STAGES,
@@ -24,14 +28,17 @@ from geosplat_jax.gradcheck.report import (
     table,
     to_records,
 )
-from geosplat_jax.io.dataset import Dataset, describe, load_recorded
-from geosplat_jax.io.images import SceneError, write_png
+from geosplat_jax.io.checkpoints import CheckpointError
+from geosplat_jax.io.dataset import describe, load_recorded
+from geosplat_jax.io.images import SceneError
+from geosplat_jax.materials import MATERIAL_PRIORS
 from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.relight import BACKGROUNDS, RelightOptions
 from geosplat_jax.report.renderer import DEFAULT_SAMPLES, RELIGHT_KINDS
+from geosplat_jax.run import Run
+from geosplat_jax.run import train as train_run
 
 _console = Console(stderr=True, highlight=False)
-
 
 _SHEETS = ("overview.png", "materials.png", "relight.png")
 
@@ -42,6 +49,11 @@ class GradientError(RuntimeError):
 
 class UsageError(ValueError):
     """A command cannot run as it was called; the message says what to change."""
+
+
+def _say(text: str, *, style: str = "", label: str = "") -> None:
+    """Print a message as it is: what looks like markup may be a path."""
+    _console.print(Text.assemble((label, style), text), soft_wrap=True)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -61,29 +73,24 @@ def _parser() -> argparse.ArgumentParser:
     train = commands.add_parser("train", help="reconstruct a scene")
     _add_scene_arguments(train)
     train.add_argument("--output", type=Path, help="run folder (default: runs/SCENE)")
-    train.add_argument("--preset", choices=PRESETS, default="default")
-    train.add_argument("--quality", choices=QUALITIES, default="standard")
-    train.add_argument(
-        "--kind",
-        default="hybrid",
-        help="guess about the material: outdoor, diffuse, hybrid, specular or glossy",
-    )
-    train.add_argument(
-        "--set", dest="overrides", action="append", default=[], metavar="SECTION.FIELD=VALUE"
-    )
-    train.add_argument("--seed", type=int, help="seed of every random choice")
+    _add_config_arguments(train)
     start = train.add_mutually_exclusive_group()
-    start.add_argument("--resume", action="store_true", help="continue from the last checkpoint")
     start.add_argument(
-        "--stage-1", type=Path, metavar="RUN", help="take over stage 1 of another run of the scene"
+        "--resume", action="store_true", help="continue from the last checkpoint, or start again"
     )
+    start.add_argument("--force", action="store_true", help="replace the run in the output folder")
+    start.add_argument(
+        "--from", dest="source", type=Path, metavar="RUN", help="take the first stages from a run"
+    )
+    train.add_argument("--stage", metavar="NAME", help="with --from: the stage to begin with")
 
-    evaluate = commands.add_parser("evaluate", help="figures and overview.png of a run")
-    evaluate.add_argument("run", type=Path)
+    settings = commands.add_parser("settings", help="list every setting: default, range, meaning")
+    settings.add_argument("prefix", nargs="?", default="", help="of the settings to list")
+    _add_config_arguments(settings)
+
+    evaluate = _run_parser(commands, "evaluate", "metrics and pictures of a run's test views")
     evaluate.add_argument("--protocol", choices=PROTOCOLS, default=PROTOCOLS[0])
-    evaluate.add_argument(
-        "--samples", type=int, default=DEFAULT_SAMPLES, help="rays a splat (default: %(default)s)"
-    )
+    _add_samples(evaluate)
     evaluate.add_argument(
         "--relight-indirect",
         choices=RELIGHT_KINDS,
@@ -91,24 +98,22 @@ def _parser() -> argparse.ArgumentParser:
         help="light from blocked directions under new lights (default: %(default)s)",
     )
 
-    render = commands.add_parser("render", help="render a run's test or training views")
-    render.add_argument("run", type=Path)
+    render = _run_parser(commands, "render", "render a run's test or training views")
     render.add_argument("--views", choices=("test", "train"), default="test")
     render.add_argument("--output", type=Path, help="folder (default: RUN/renders)")
 
-    _add_relight(commands.add_parser("relight", help="show a run under another light"))
+    _add_relight(_run_parser(commands, "relight", "show a run under another light"))
 
-    export = commands.add_parser("export", help="mesh.glb, gaussians.ply and light.exr of a run")
-    export.add_argument("run", type=Path)
+    export = _run_parser(commands, "export", "mesh.glb, gaussians.ply and light.exr of a run")
     export.add_argument("--output", type=Path, help="folder (default: RUN/export)")
     export.add_argument("--vertex-colors", action="store_true", help="instead of textures")
     export.add_argument("--texture-size", type=int, default=1024)
 
     gradcheck = commands.add_parser(
-        "gradcheck", help="prove the gradients: float64 differences of every stage"
+        "gradcheck", help="prove the gradients: float64 differences of every part"
     )
     gradcheck.add_argument(
-        "stages", nargs="*", metavar="STAGE", help=f"some of {', '.join(STAGES)} (default: all)"
+        "stages", nargs="*", metavar="PART", help=f"some of {', '.join(STAGES)} (default: all)"
     )
     gradcheck.add_argument("--sweep", action="store_true", help="show the error at every step size")
     gradcheck.add_argument("--seed", type=int, default=0, help="of numbers, samples, directions")
@@ -116,9 +121,43 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _run_parser(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
+    """Add a command that works on a run."""
+    parser = commands.add_parser(name, help=text)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--scene", type=Path, help="where the run's scene is now, if it has moved")
+    return parser
+
+
+def _add_samples(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--samples", type=int, default=DEFAULT_SAMPLES, help="rays per splat (default: %(default)s)"
+    )
+
+
+def _add_config_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what chooses the settings of a run."""
+    parser.add_argument("--preset", choices=PRESETS, default="default")
+    parser.add_argument("--quality", choices=QUALITIES, default="standard")
+    parser.add_argument(
+        "--material-prior",
+        choices=sorted(MATERIAL_PRIORS),
+        default="hybrid",
+        help="where roughness and metallic start (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--set",
+        dest="overrides",
+        action="append",
+        default=[],
+        metavar="SECTION.FIELD=VALUE",
+        help="change a setting; geosplat-jax settings lists them",
+    )
+    parser.add_argument("--seed", type=int, help="seed of every random choice")
+
+
 def _add_relight(relight: argparse.ArgumentParser) -> None:
     """Describe the relight command."""
-    relight.add_argument("run", type=Path)
     relight.add_argument(
         "--env", type=Path, required=True, help="lat-long environment map: .hdr, .exr or an image"
     )
@@ -138,9 +177,7 @@ def _add_relight(relight: argparse.ArgumentParser) -> None:
     relight.add_argument(
         "--albedo-scale", type=float, nargs=3, default=(1.0, 1.0, 1.0), metavar=("R", "G", "B")
     )
-    relight.add_argument(
-        "--samples", type=int, default=DEFAULT_SAMPLES, help="rays a splat (default: %(default)s)"
-    )
+    _add_samples(relight)
     relight.add_argument("--indirect", choices=RELIGHT_KINDS, default="traced")
 
 
@@ -172,93 +209,45 @@ def _info(arguments: argparse.Namespace) -> None:
     print(describe(load_recorded(arguments.scene, _scene_options(arguments))))
 
 
-def _check_folder(folder: Path, record: dict[str, Any], *, resume: bool) -> None:
-    """Refuse a folder that holds something else, or a run of another scene."""
-    if not resume:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise UsageError(
-                f"{folder} exists already; choose another --output, or --resume to continue it"
-            )
-        return
-    _check_same_scene(folder, record)
-
-
-def _check_same_scene(folder: Path, record: dict[str, Any]) -> None:
-    """Refuse a run of another scene, or of the same read in another way."""
-    before = _recorded(folder)
-    for name in ("scene", "dataset"):
-        if before[name] != record[name]:
-            raise UsageError(
-                f"{folder / 'run.json'} says that the run was trained with {name} {before[name]}, "
-                f"not {record[name]}; take the same, or another folder"
-            )
-
-
 def _config_from(arguments: argparse.Namespace) -> Config:
     """Return the configuration that the arguments ask for."""
     overrides = list(arguments.overrides)
     if arguments.seed is not None:
         overrides.append(f"run.seed={arguments.seed}")
     return make_config(
-        arguments.preset, arguments.quality, kind=arguments.kind, overrides=tuple(overrides)
+        arguments.preset,
+        arguments.quality,
+        material_prior=arguments.material_prior,
+        overrides=tuple(overrides),
     )
 
 
-def train_command(
-    scene: Path,
-    folder: Path,
-    config: Config,
-    options: dict[str, Any],
-    *,
-    resume: bool = False,
-    stage_1: Path | None = None,
-) -> None:
-    """Train a scene into a run folder, with progress on the terminal.
-
-    Raises
-    ------
-    SceneError, UsageError, TrainingError, Interrupted
-        See the functions that raise them.
-    """
-    from geosplat_jax.fit.train import TrainingError, fit
-
-    record = {"scene": str(scene.resolve()), "dataset": options, "config": config.to_dict()}
-    _check_folder(folder, record, resume=resume)
-    began = time.perf_counter()
-    dataset = load_recorded(scene, options)
-    if stage_1 is not None:
-        _check_same_scene(stage_1, record)
-    if not resume:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "run.json").write_text(json.dumps(record, indent=2) + "\n")
-    for warning in (*dataset.warnings, *doubts(config)):
-        _console.print(f"[yellow]warning:[/] {warning}")
-    _console.print(
-        f"{dataset.name}: {len(dataset.train.names)} views, {dataset.layout}; compiling ..."
-    )
-    preview = _Preview(dataset, folder / "previews")
-    try:
-        with _progress_display(config.total_steps) as show:
-            fit(
-                dataset,
-                config,
-                folder,
-                resume=resume,
-                stage_1=stage_1,
-                on_step=show,
-                on_preview=preview,
-            )
-    except TrainingError:
-        if not resume and not (folder / "metrics.jsonl").exists():
-            (folder / "run.json").unlink()  # nothing was begun: the folder is free again
-        raise
-    seconds = time.perf_counter() - began
-    summary = {"seconds_total": round(seconds, 2)}
-    (folder / "training.json").write_text(json.dumps(summary, indent=2) + "\n")
-    _console.print(f"trained in {seconds:.0f} s; next: geosplat-jax evaluate {folder}")
+def _train(arguments: argparse.Namespace) -> None:
+    """Train a scene into a run's folder, with progress on the terminal."""
+    if (arguments.source is None) != (arguments.stage is None):
+        raise UsageError("--from RUN and --stage NAME belong together")
+    config = _config_from(arguments)
+    folder = arguments.output or Path("runs") / arguments.scene.resolve().name
+    dataset = load_recorded(arguments.scene, _scene_options(arguments))
+    for warning in (*dataset.warnings, *config_warnings(config)):
+        _say(warning, label="warning: ", style="yellow")
+    _say(f"{dataset.name}: {len(dataset.train)} views, {dataset.layout}; compiling ...")
+    with _ProgressDisplay(config.total_steps) as display:
+        run = train_run(
+            dataset,
+            folder,
+            config,
+            resume=arguments.resume,
+            force=arguments.force,
+            source=arguments.source,
+            first_stage=arguments.stage,
+            on_step=display.show,
+        )
+    seconds = (run.folder.training() or {})["seconds_total"]
+    _say(f"trained in {seconds:.0f} s; next: geosplat-jax evaluate {folder}")
 
 
-class _progress_display:
+class _ProgressDisplay:
     """A bar on a terminal, a line every fiftieth step elsewhere."""
 
     def __init__(self, steps: int) -> None:
@@ -266,155 +255,90 @@ class _progress_display:
         self._bar = None
         if _console.is_terminal:
             self._bar = Progress(
+                TextColumn("{task.fields[stage]}"),
                 TextColumn("{task.completed:.0f}/{task.total:.0f}"),
                 BarColumn(),
                 TextColumn("loss {task.fields[loss]:.4f}"),
                 TextColumn("{task.fields[psnr]:.2f} dB"),
-                TextColumn("{task.fields[gaussians]:,} Gaussians"),
-                TimeRemainingColumn(),
+                TextColumn("{task.fields[splats]:,} splats"),
+                TextColumn("{task.fields[left]}"),
                 console=_console,
             )
 
-    def __enter__(self):
+    def __enter__(self) -> "_ProgressDisplay":
         """Start the bar."""
         if self._bar is not None:
             self._bar.start()
             self._task = self._bar.add_task(
-                "", total=self._steps, loss=float("nan"), psnr=0.0, gaussians=0
+                "",
+                total=self._steps,
+                stage="",
+                loss=float("nan"),
+                psnr=0.0,
+                splats=0,
+                left="compiling",
             )
-        return self.show
+        return self
 
     def __exit__(self, *unused: object) -> None:
         """Stop the bar."""
         if self._bar is not None:
             self._bar.stop()
 
-    def show(self, progress) -> None:
+    def show(self, progress: StepProgress) -> None:
         """Display one step."""
+        left = progress.seconds_left
+        remaining = "compiling" if left is None else f"{left:.0f} s left"
         if self._bar is not None:
             self._bar.update(
                 self._task,
                 completed=progress.step,
+                stage=progress.stage,
                 loss=progress.total,
                 psnr=progress.psnr,
-                gaussians=progress.gaussian_count,
+                splats=progress.splat_count,
+                left=remaining,
             )
         elif progress.step % 50 == 0 or progress.step in (1, progress.steps):
-            _console.print(
-                f"stage {progress.stage}, step {progress.step}/{progress.steps}  "
+            _say(
+                f"{progress.stage}, step {progress.step}/{progress.steps}  "
                 f"loss {progress.total:.4f}  "
-                f"{progress.psnr:.2f} dB  {progress.gaussian_count:,} Gaussians  "
-                f"{progress.seconds:.0f} s, {progress.seconds_left:.0f} s left",
-                soft_wrap=True,
+                f"{progress.psnr:.2f} dB  {progress.splat_count:,} splats  "
+                f"{progress.seconds:.0f} s, {remaining}"
             )
 
 
-class _Preview:
-    """Write truth, render and normals of one view side by side while training."""
-
-    def __init__(self, dataset: Dataset, folder: Path) -> None:
-        self._views = dataset.test if dataset.test.names else dataset.train
-        self._folder = folder
-
-    def __call__(self, config, params, context, capacities, step: int) -> None:
-        """Render and write one preview."""
-        from geosplat_jax.report.evaluate import preview_image
-
-        self._folder.mkdir(exist_ok=True)
-        image = preview_image(config, params, context, capacities, self._views)
-        write_png(self._folder / f"step_{step:06d}.png", image)
-
-
-def _recorded(run: Path) -> dict[str, Any]:
-    """Read what a run folder says about itself."""
-    path = run / "run.json"
-    if not path.exists():
-        raise UsageError(f"{run} is not a run (it has no run.json)")
-    return json.loads(path.read_text())
+def _settings(arguments: argparse.Namespace) -> None:
+    """List settings with their values under the chosen preset and quality."""
+    table = Table(box=None, pad_edge=False)
+    for title in ("setting", "value", "range", "meaning"):
+        table.add_column(title, overflow="fold")
+    rows = [
+        row for row in all_settings(_config_from(arguments)) if row[0].startswith(arguments.prefix)
+    ]
+    if not rows:
+        raise UsageError(f"no setting begins with {arguments.prefix!r}")
+    for path, value, limits, meaning in rows:
+        table.add_row(*map(Text, (path, json.dumps(value), limits, meaning)))
+    Console(highlight=False).print(table)
 
 
-def evaluate_command(
-    run: Path,
-    *,
-    protocol: str = PROTOCOLS[0],
-    samples: int = DEFAULT_SAMPLES,
-    relight_indirect: str = "traced",
-) -> dict[str, Any]:
+def _evaluate(arguments: argparse.Namespace) -> None:
     """Evaluate a run on its scene's test views and print the means."""
-    from geosplat_jax.fit.train import load_run
-    from geosplat_jax.report.evaluate import evaluate_run
-    from geosplat_jax.report.relight import load_light
-
-    record = _recorded(run)
-    dataset = load_recorded(record["scene"], record["dataset"])
-    if not dataset.test.names:
-        raise UsageError(f"{record['scene']} has no test views to evaluate on")
-    config, params, context, capacities, meta = load_run(run)
-    training = run / "training.json"
-    extra = {
-        "scene": record["scene"],
-        "dataset": record["dataset"],
-        "step": meta["step"],
-        "stage": meta["stage"],
-        "training": json.loads(training.read_text()) if training.exists() else None,
-        "training_peak_memory_mb": _peak_memory(run),
-    }
-    lights = {name: load_light(path) for name, path in dataset.lights.items()}
-    figures = evaluate_run(
-        config,
-        params,
-        context,
-        capacities,
-        dataset.test,
-        run,
-        meta=extra,
-        protocol=protocol,
-        lights=lights,
-        train_light=lights.get(dataset.train_light or ""),
-        samples=samples,
-        relight_indirect=relight_indirect,
+    run = Run(arguments.run, scene=arguments.scene)
+    metrics = run.evaluate(
+        protocol=arguments.protocol,
+        samples=arguments.samples,
+        relight_indirect=arguments.relight_indirect,
     )
-    print(f"protocol: {protocol}")
-    for name, value in figures["mean"].items():
+    print(f"protocol: {arguments.protocol}")
+    for name, value in metrics["mean"].items():
         print(f"{name:36s} {value:9.4f}")
-    for note in figures["notes"]:
+    for note in metrics["notes"]:
         print(f"note: {note}")
-    pictures = [name for name in _SHEETS if (run / name).exists()]
-    print(f"figures: {run / 'metrics.json'}\npictures: {', '.join(pictures)} in {run}")
-    return figures
-
-
-def relight_command(
-    run: Path,
-    env: Path,
-    output: Path | None = None,
-    *,
-    options: RelightOptions | None = None,
-    intensity: float = 1.0,
-    albedo_scale: Sequence[float] = (1.0, 1.0, 1.0),
-    samples: int = DEFAULT_SAMPLES,
-    indirect: str = "traced",
-) -> list[Path]:
-    """Render the test views, and movies, of a run under another light; return the files."""
-    from geosplat_jax.core.types import EnvLight
-    from geosplat_jax.fit.train import load_run
-    from geosplat_jax.report.relight import load_light, relight_views
-    from geosplat_jax.report.renderer import Renderer
-
-    record = _recorded(run)
-    options = options or RelightOptions()
-    options.check()
-    light = EnvLight(intensity * load_light(env).radiance)
-    dataset = load_recorded(record["scene"], record["dataset"])
-    views = dataset.test if dataset.test.names else dataset.train
-    config, params, context, capacities, _ = load_run(run)
-    renderer = Renderer(config, params, context, capacities, samples=samples)
-    relit = renderer.relit(light, albedo_scale=albedo_scale, indirect=indirect)
-    folder = output or run / f"relight_{env.stem}"
-    folder.mkdir(parents=True, exist_ok=True)
-    written = relight_views(relit, light, views, folder, options)
-    print(f"{len(written)} files: {folder}")
-    return written
+    folder = run.folder.path
+    pictures = [name for name in _SHEETS if (folder / name).exists()]
+    print(f"metrics: {folder / 'metrics.json'}\npictures: {', '.join(pictures)} in {folder}")
 
 
 def _relight(arguments: argparse.Namespace) -> None:
@@ -426,8 +350,7 @@ def _relight(arguments: argparse.Namespace) -> None:
     for name in ("turntable", "rotate_env"):
         if getattr(arguments, name) < 0:
             raise UsageError(f"--{name.replace('_', '-')} must not be negative")
-    relight_command(
-        arguments.run,
+    written = Run(arguments.run, scene=arguments.scene).relight(
         arguments.env,
         arguments.output,
         options=RelightOptions(
@@ -442,133 +365,67 @@ def _relight(arguments: argparse.Namespace) -> None:
         samples=arguments.samples,
         indirect=arguments.indirect,
     )
+    print(f"{len(written)} files: {written[0].parent}")
 
 
-def _peak_memory(run: Path) -> int | None:
-    """Largest resident memory that training noted, in MB."""
-    path = run / "metrics.jsonl"
-    if not path.exists():
-        return None
-    lines = path.read_text().splitlines()
-    return max((json.loads(line)["peak_memory_mb"] for line in lines), default=None)
+def _render(arguments: argparse.Namespace) -> None:
+    """Render the views of a split."""
+    written = Run(arguments.run, scene=arguments.scene).render(arguments.views, arguments.output)
+    print(f"{len(written) // 2} views: {written[0].parent}")
 
 
-def render_command(run: Path, views: str, output: Path | None) -> None:
-    """Render views of a split: ``NAME_rgba.png`` with straight alpha, and ``NAME_normal.png``."""
-    import numpy as np
-
-    from geosplat_jax.fit.train import load_run
-    from geosplat_jax.report.pictures import normals_to_rgb
-    from geosplat_jax.report.renderer import Renderer, straight_rgba
-
-    record = _recorded(run)
-    dataset = load_recorded(record["scene"], record["dataset"])
-    chosen = dataset.test if views == "test" else dataset.train
-    config, params, context, capacities, _ = load_run(run)
-    renderer = Renderer(config, params, context, capacities)
-    folder = output or run / "renders"
-    folder.mkdir(parents=True, exist_ok=True)
-    for index, name in enumerate(chosen.names):
-        view = renderer(chosen.camera(np.array([index])))
-        stem = name.replace("/", "_").strip("._")
-        write_png(folder / f"{stem}_rgba.png", straight_rgba(view))
-        write_png(folder / f"{stem}_normal.png", normals_to_rgb(view.aovs["normal"], view.alpha))
-    print(f"{len(chosen.names)} views: {folder}")
-
-
-def export_command(
-    run: Path, output: Path | None, *, vertex_colors: bool, texture_size: int
-) -> dict[str, Any]:
-    """Export the reconstructed asset: ``mesh.glb``, ``gaussians.ply``, ``light.exr``."""
-    from geosplat_jax.fit.train import load_run
-    from geosplat_jax.report.assets import export_assets
-
-    _recorded(run)
-    config, params, context, capacities, _ = load_run(run)
-    folder = output or run / "export"
-    folder.mkdir(parents=True, exist_ok=True)
-    info = export_assets(
-        config,
-        params,
-        context,
-        capacities,
-        folder,
-        vertex_colors=vertex_colors,
-        texture_size=texture_size,
+def _export(arguments: argparse.Namespace) -> None:
+    """Export the reconstructed asset."""
+    lines = Run(arguments.run, scene=arguments.scene).export(
+        arguments.output,
+        vertex_colors=arguments.vertex_colors,
+        texture_size=arguments.texture_size,
     )
-    for name, text in info.items():
+    for name, text in lines.items():
         print(f"{name}: {text}")
-    return info
 
 
-def gradcheck_command(
-    stages: list[str], *, sweep: bool, seed: int, output: Path | None
-) -> dict[str, Any]:
-    """Compare the stages' gradients with float64 differences and print the tables.
-
-    Raises
-    ------
-    GradientError
-        If a comparison exceeds its tolerance.
-    """
-    names = list(dict.fromkeys(stages)) or list(STAGES)
+def _gradcheck(arguments: argparse.Namespace) -> None:
+    """Compare gradients with float64 differences and print the tables."""
+    names = list(dict.fromkeys(arguments.stages)) or list(STAGES)
     unknown = [name for name in names if name not in STAGES]
     if unknown:
-        raise UsageError(f"unknown stage {unknown[0]!r}; expected some of {', '.join(STAGES)}")
+        raise UsageError(f"unknown part {unknown[0]!r}; expected some of {', '.join(STAGES)}")
     checked = {}
     for name in names:
-        checked[name] = check_stage(name, seed=seed)
-        print(f"{table(checked[name], sweep=sweep)}\n", flush=True)
+        checked[name] = check_stage(name, seed=arguments.seed)
+        print(f"{table(checked[name], sweep=arguments.sweep)}\n", flush=True)
     print(summary(checked))
-    if output is not None:
-        output.write_text(json.dumps(to_records(checked), indent=1), encoding="utf-8")
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(to_records(checked), indent=1), encoding="utf-8")
     failed = [row for rows in checked.values() for row in rows if not passes(row)]
     if failed:
         raise GradientError(
             f"{len(failed)} comparisons exceed {TOLERANCE:g} (float64) or {SINGLE_TOLERANCE:g} "
             f"(float32); the first: {failed[0].problem}, {failed[0].worst}"
         )
-    return {name: len(rows) for name, rows in checked.items()}
 
 
-def _run(arguments: argparse.Namespace) -> None:
-    """Dispatch a command."""
-    if arguments.command == "info":
-        _info(arguments)
-    elif arguments.command == "train":
-        train_command(
-            arguments.scene,
-            arguments.output or Path("runs") / arguments.scene.resolve().name,
-            _config_from(arguments),
-            _scene_options(arguments),
-            resume=arguments.resume,
-            stage_1=arguments.stage_1,
-        )
-    elif arguments.command == "evaluate":
-        evaluate_command(
-            arguments.run,
-            protocol=arguments.protocol,
-            samples=arguments.samples,
-            relight_indirect=arguments.relight_indirect,
-        )
-    elif arguments.command == "relight":
-        _relight(arguments)
-    elif arguments.command == "render":
-        render_command(arguments.run, arguments.views, arguments.output)
-    elif arguments.command == "gradcheck":
-        gradcheck_command(
-            arguments.stages,
-            sweep=arguments.sweep,
-            seed=arguments.seed,
-            output=arguments.json,
-        )
-    else:
-        export_command(
-            arguments.run,
-            arguments.output,
-            vertex_colors=arguments.vertex_colors,
-            texture_size=arguments.texture_size,
-        )
+_COMMANDS = {
+    "info": _info,
+    "train": _train,
+    "settings": _settings,
+    "evaluate": _evaluate,
+    "render": _render,
+    "relight": _relight,
+    "export": _export,
+    "gradcheck": _gradcheck,
+}
+
+_CURABLE = (
+    SceneError,
+    UsageError,
+    RunError,
+    TrainingError,
+    CheckpointError,
+    OSError,
+    ValueError,
+)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -576,20 +433,16 @@ def main(argv: list[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     enable_compilation_cache()
     retain_freed_memory()
-    from geosplat_jax.fit.train import Interrupted, TrainingError
-    from geosplat_jax.io.checkpoints import CheckpointError
-
     try:
-        _run(arguments)
+        _COMMANDS[arguments.command](arguments)
     except Interrupted as stop:
-        _console.print(str(stop))
+        _say(str(stop))
         return 130
     except GradientError as error:
-        _console.print(str(error), markup=False, soft_wrap=True)
+        _say(str(error))
         return 1
-    except (SceneError, UsageError, TrainingError, CheckpointError, OSError, ValueError) as error:
-        _console.print("[bold red]error:[/]", end=" ")
-        _console.print(str(error), markup=False, soft_wrap=True)
+    except _CURABLE as error:
+        _say(str(error), label="error: ", style="bold red")
         return 2
     return 0
 

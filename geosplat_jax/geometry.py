@@ -11,7 +11,7 @@ into the border is open there. Keep the outermost vertices positive for a closed
 Reference: Shen et al., "Flexible Isosurface Extraction for Gradient-Based Mesh Optimization", 2023.
 """
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,10 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
 
-from geosplat_jax.core.capacity import BitSet, Capacities, Usage, bit_set, usage
+from geosplat_jax.core.capacity import BitSet, Capacities, bit_set, bucket, usage
 from geosplat_jax.core.mesh import face_normals_and_areas, vertex_normals
 from geosplat_jax.core.numerics import absolute, safe_norm
-from geosplat_jax.core.types import Geometry, Grid, Mesh
+from geosplat_jax.core.types import Box, Geometry, Grid, Mesh
+from geosplat_jax.rays.grid_index import GridIndex, build_grid_index
+from geosplat_jax.surface.base import Surface, SurfaceModel
 from geosplat_jax.surface.flexicubes_tables import (
     CORNERS,
     PATCH_COUNT,
@@ -33,6 +35,7 @@ from geosplat_jax.surface.flexicubes_tables import (
     QUAD_EDGES,
 )
 from geosplat_jax.surface.grids import (
+    crossed_edges,
     deformed_vertices,
     grid_vertices,
     initial_geometry,
@@ -44,7 +47,8 @@ from geosplat_jax.surface.grids import (
 )
 
 __all__ = [
-    "Surface",
+    "FlexiCubes",
+    "IsoSurface",
     "deformed_vertices",
     "edge_deviations",
     "face_normals_and_areas",
@@ -68,27 +72,25 @@ _SPLIT_EPSILON = 1e-8
 """Added to the weights of the two diagonals by the original, kept for equality with it."""
 
 
-class Surface(eqx.Module):
+class IsoSurface(Surface):
     """An extracted isosurface.
 
     Attributes
     ----------
     mesh : triangles; vertex rows are the dual vertices, then in training the centres of the quads.
+        In training quad q has the faces 4 q to 4 q + 3.
+    usage : true counts of surface cells, dual vertices and quads.
     deviation : () mean absolute deviation of the distances between the crossing points of a patch
         and its dual vertex (FlexiCubes Eq. 8), world units; 0 for an empty surface.
-    usage : true counts of surface cells, dual vertices and quads.
     vertex_cells : (dual vertices,) grid cell of each dual vertex; 0 on padding.
     quads : (quads, 4) vertex rows, counter-clockwise seen from outside; 0 on padding.
+    centers : (quads,) vertex rows of the quads' centres; 0 on padding, and without training.
     """
 
-    mesh: Mesh
     deviation: Float[Array, ""]
-    usage: Usage
     vertex_cells: Int[Array, " Cd"]
     quads: Int[Array, "Cq 4"]
-
-
-# --- the grid -----------------------------------------------------------------------------------
+    centers: Int[Array, " Cq"]
 
 
 def _rows(array: Array, index: Int[Array, "..."]) -> Array:
@@ -100,9 +102,6 @@ def _cell_coordinates(index: Int[Array, " n"], grid: Grid) -> Int[Array, "3 n"]:
     """Coordinates (i, j, k) of cells numbered with i fastest."""
     nx, ny, _ = grid.shape
     return jnp.stack([index % nx, index // nx % ny, index // (nx * ny)])
-
-
-# --- cells at the surface -----------------------------------------------------------------------
 
 
 class _Cells(NamedTuple):
@@ -200,9 +199,6 @@ def _surface_cells(sdf: Float[Array, " G"], grid: Grid, *, capacity: int) -> _Ce
     )
 
 
-# --- dual vertices ------------------------------------------------------------------------------
-
-
 class _Duals(NamedTuple):
     """Dual vertices, relative to the centre of the grid, and what belongs to them."""
 
@@ -250,7 +246,7 @@ def _corner_values(
     steps = CORNERS @ np.array([1, vx, vx * vy], np.int32)
     base = coordinates[0] + vx * (coordinates[1] + vy * coordinates[2])
     vertex = base[None, :] + jnp.asarray(steps)[:, None]
-    moved = jnp.moveaxis(0.5 * jnp.tanh(_rows(geometry.deform, vertex)), -1, 0)
+    moved = jnp.moveaxis(grid.reach * jnp.tanh(_rows(geometry.deform, vertex)), -1, 0)
     centre = jnp.asarray(np.array(grid.shape) / 2, dtype)
     corner = jnp.asarray(CORNERS.T, dtype)[:, :, None]
     rest = (coordinates.astype(dtype) - centre[:, None])[:, None, :] + corner
@@ -303,9 +299,6 @@ def _deviations(
     count = jnp.maximum(jnp.sum(crosses, axis=0, dtype=jnp.int32), 1).astype(lengths.dtype)
     mean = jnp.sum(lengths, axis=0) / count
     return jnp.where(crosses, absolute(lengths - mean[None, :]), 0.0)
-
-
-# --- quads and triangles ------------------------------------------------------------------------
 
 
 class _Quads(NamedTuple):
@@ -382,7 +375,7 @@ def _split_faces(gamma: Float[Array, " Cd"], quads: _Quads) -> Int[Array, "F 3"]
 
 def isosurface(
     geometry: Geometry, grid: Grid, *, capacities: Capacities, training: bool
-) -> Surface:
+) -> IsoSurface:
     """Extract the surface where the SDF changes sign, as a watertight manifold mesh.
 
     Vertex positions and the deviation are differentiable with respect to every array of
@@ -395,19 +388,19 @@ def isosurface(
     ----------
     geometry : raw SDF, deformations and weights (see `Geometry`).
     grid : box of cells they live on.
-    capacities : static sizes; `Capacities.surface_cubes`, `dual_vertices` and `quads` are used.
+    capacities : static sizes; ``surface_cubes``, ``dual_vertices`` and ``quads`` are used.
         If ``usage`` exceeds them the mesh is wrong and must be discarded (see `capacity`).
     training : static. True: four triangles a quad around a centre that blends both diagonals by
         gamma, which lets gamma learn. False: two triangles, split along the heavier diagonal.
 
     Returns
     -------
-    `Surface`, whose mesh has ``dual_vertices`` (+ ``quads`` in training) vertex rows and
+    `IsoSurface`, whose mesh has ``dual_vertices`` (+ ``quads`` in training) vertex rows and
     ``2 (4) * quads`` face rows, padded with zeros. Faces are outward (towards positive SDF).
     """
-    cells = _surface_cells(geometry.sdf, grid, capacity=capacities.surface_cubes)
-    duals = _dual_vertices(geometry, grid, cells, capacity=capacities.dual_vertices)
-    quads = _quads(grid, cells, capacity=capacities.quads)
+    cells = _surface_cells(geometry.sdf, grid, capacity=capacities["surface_cubes"])
+    duals = _dual_vertices(geometry, grid, cells, capacity=capacities["dual_vertices"])
+    quads = _quads(grid, cells, capacity=capacities["quads"])
 
     vertices, vertex_count = duals.points.T, cells.vertex_count
     if training:
@@ -415,9 +408,12 @@ def isosurface(
         padded = jnp.concatenate([vertices, jnp.zeros_like(centres)])
         vertices = jax.lax.dynamic_update_slice_in_dim(padded, centres, vertex_count, axis=0)
         faces = _fan_faces(quads, vertex_count)
+        row = vertex_count + jnp.arange(quads.mask.shape[0], dtype=jnp.int32)
+        quad_centers = jnp.where(quads.mask, row, 0)
         vertex_count = vertex_count + cells.quad_count
     else:
         faces = _split_faces(duals.gamma, quads)
+        quad_centers = jnp.zeros(quads.mask.shape, jnp.int32)
     faces_each = 4 if training else 2
 
     centre = grid.origin + grid.cell_size * 0.5 * jnp.asarray(grid.shape, grid.origin.dtype)
@@ -434,19 +430,72 @@ def isosurface(
     elements = jnp.maximum(jnp.sum(duals.crosses, dtype=jnp.int32), 1).astype(
         duals.deviations.dtype
     )
-    return Surface(
+    return IsoSurface(
         mesh=mesh,
-        deviation=jnp.sum(duals.deviations) / elements,
         usage=needed,
+        deviation=jnp.sum(duals.deviations) / elements,
         vertex_cells=duals.cells,
         quads=quads.corners.T,
+        centers=quad_centers,
     )
 
 
 def edge_deviations(
     geometry: Geometry, grid: Grid, *, capacities: Capacities
 ) -> tuple[Float[Array, "12 Cd"], Bool[Array, "12 Cd"]]:
-    """Return the terms whose mean is `Surface.deviation`, and which of them are real."""
-    cells = _surface_cells(geometry.sdf, grid, capacity=capacities.surface_cubes)
-    duals = _dual_vertices(geometry, grid, cells, capacity=capacities.dual_vertices)
+    """Return the terms whose mean is `IsoSurface.deviation`, and which of them are real."""
+    cells = _surface_cells(geometry.sdf, grid, capacity=capacities["surface_cubes"])
+    duals = _dual_vertices(geometry, grid, cells, capacity=capacities["dual_vertices"])
     return duals.deviations, duals.crosses
+
+
+class FlexiCubes(SurfaceModel):
+    """Isosurface of values on a grid, with the regularisers of FlexiCubes and Eq. 14.
+
+    Attributes
+    ----------
+    grid : where the values live.
+    entropy_reduction : static; ``"mean"`` over the edges of Eq. 14 or their ``"sum"``, as printed.
+        The sum grows with the number of crossed edges and soon outweighs the picture.
+    """
+
+    grid: Grid
+    entropy_reduction: Literal["mean", "sum"] = eqx.field(static=True, default="mean")
+
+    @property
+    def box(self) -> Box:
+        """The cube around the grid."""
+        return self.grid.box
+
+    def extract(
+        self, shape: Geometry, *, capacities: Capacities, final: bool = False
+    ) -> IsoSurface:
+        """Extract the isosurface: four triangles a quad, two in the final mesh."""
+        return isosurface(shape, self.grid, capacities=capacities, training=not final)
+
+    def penalties(self, shape: Geometry, surface: IsoSurface) -> dict[str, Float[Array, ""]]:
+        """Evaluate ``entropy`` (Eq. 14), ``deviation`` (L_dev, in half boxes) and ``weights``."""
+        return {
+            "entropy": sdf_entropy(shape, self.grid, reduction=self.entropy_reduction),
+            "deviation": surface.deviation / self.box.half_extent,
+            "weights": weight_magnitude(shape),
+        }
+
+    def ray_index(self, surface: IsoSurface, *, capacities: Capacities) -> GridIndex:
+        """List the patches of every cell; see `build_grid_index`."""
+        return build_grid_index(surface, self.grid, capacities=capacities)
+
+    def nearby_points(self, shape: Geometry) -> tuple[Float[Array, "G 3"], Float[Array, " G"]]:
+        """Return the grid's vertices, those with an edge that the surface crosses weighing one."""
+        points = grid_vertices(self.grid).astype(shape.sdf.dtype)
+        return points, (crossed_edges(shape.sdf, self.grid) > 0).astype(points.dtype)
+
+    def first_capacities(self, shape: Geometry) -> Capacities:
+        """Guess sizes from the number of sign changes along grid edges."""
+        vx, vy, vz = self.grid.vertex_shape
+        inside = (np.asarray(shape.sdf) < 0).reshape(vz, vy, vx)
+        quads = sum(int(np.sum(np.diff(inside, axis=axis))) for axis in range(3))
+        vertices = bucket(int(1.3 * quads))
+        return Capacities(
+            surface_cubes=vertices, dual_vertices=vertices, quads=bucket(int(1.2 * quads))
+        )

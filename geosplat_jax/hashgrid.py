@@ -2,7 +2,7 @@
 
 A point in the unit cube is looked up in several cubic grids of growing resolution; each gives the
 trilinear interpolation of its vertices' feature rows, and the results are concatenated. Grids that
-fit into the table are *dense* (one row a vertex); the others share rows by a spatial hash.
+fit into the table are *dense* (one row per vertex); the others share rows by a spatial hash.
 
 Layout. All levels live in one array, level after level: one gather and one scatter serve them all.
 Along x, neighbouring vertices always own neighbouring rows: a level's row is ``x + offset(y, z)``,
@@ -11,19 +11,21 @@ a cell are therefore four pairs of adjacent rows, which halves the hashing and t
 
 Gradients. `encode` has a hand-written reverse mode, 3 times faster on a CPU than autodiff of
 `_reference_encode`; forward mode and second derivatives are not available. Gradients of hash tables
-are small and sparse: the method scales them up (x16, REFERENCE 2.6) in the optimiser, never here.
+are small and sparse; the authors scale them up by 16, to which Adam is indifferent.
 """
 
 import math
-from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
+from pydantic import Field
+
+from geosplat_jax.core.settings import PositiveCount, settings
 
 _HASH_Y = np.uint32(2654435761)
 _HASH_Z = np.uint32(805459861)
@@ -37,7 +39,7 @@ _BACKWARD_CHUNK = 8192
 the scattered rows (4 x 2 x features floats a point and level) stay in cache and off the heap."""
 
 
-@dataclass(frozen=True)
+@settings
 class HashGridSpec:
     """Static shape of an encoding; hashable, so that it can be a static jit argument.
 
@@ -45,30 +47,26 @@ class HashGridSpec:
     the last level has ``finest``. A level is dense when its ``(cells + 1)**3`` vertices fit into
     ``2**log2_entries`` rows; otherwise it has exactly that many rows.
 
-    Attributes
-    ----------
-    levels : number of grids.
-    features : numbers a vertex holds in each of them.
-    log2_entries : base-2 logarithm of the largest table.
-    coarsest, finest : cells along an axis of the first and of the last level.
-
     Raises
     ------
     ValueError
-        When a size is below one, ``finest < coarsest``, or a hashed level has so many cells
-        that one grid line takes more than half of the table.
+        When ``finest < coarsest``, or a hashed level has so many cells that one grid line takes
+        more than half of the table.
     """
 
-    levels: int = 8
-    features: int = 4
-    log2_entries: int = 15
-    coarsest: int = 16
-    finest: int = 512
+    levels: PositiveCount = 8
+    """Number of grids."""
+    features: PositiveCount = 4
+    """Numbers that a vertex holds in each of them."""
+    log2_entries: Annotated[int, Field(ge=1, le=30)] = 15
+    """Base-2 logarithm of the rows of the largest table."""
+    coarsest: PositiveCount = 16
+    """Cells along an axis of the first level."""
+    finest: PositiveCount = 512
+    """Cells along an axis of the last level."""
 
     def __post_init__(self) -> None:
         """Check the sizes."""
-        if min(self.levels, self.features, self.log2_entries, self.coarsest) < 1:
-            raise ValueError(f"levels, features, log2_entries and coarsest must be >= 1: {self}")
         if self.finest < self.coarsest:
             raise ValueError(f"finest must be at least coarsest: {self}")
         if not all(self.is_dense) and 2 * self.finest > 2**self.log2_entries:
@@ -79,7 +77,7 @@ class HashGridSpec:
 
     @property
     def resolutions(self) -> tuple[int, ...]:
-        """Cells along an axis, a level."""
+        """Cells along an axis, per level."""
         steps = max(self.levels - 1, 1)
         growth = math.exp((math.log(self.finest) - math.log(self.coarsest)) / steps)
         # The epsilon keeps the last level at `finest` where the power rounds below it.
@@ -87,12 +85,12 @@ class HashGridSpec:
 
     @property
     def is_dense(self) -> tuple[bool, ...]:
-        """Whether a level is free of collisions, a level."""
+        """Whether each level is free of collisions."""
         return tuple((cells + 1) ** 3 <= 2**self.log2_entries for cells in self.resolutions)
 
     @property
     def entries(self) -> tuple[int, ...]:
-        """Rows of the table, a level."""
+        """Rows of the table, per level."""
         return tuple(
             (cells + 1) ** 3 if dense else 2**self.log2_entries
             for cells, dense in zip(self.resolutions, self.is_dense, strict=True)
@@ -100,7 +98,7 @@ class HashGridSpec:
 
     @property
     def first_rows(self) -> tuple[int, ...]:
-        """First row of a level in the common table, a level."""
+        """First row of each level in the common table."""
         return tuple(sum(self.entries[:level]) for level in range(self.levels))
 
     @property

@@ -1,119 +1,157 @@
-"""The training objective (Eq. 13-19): one pure ``loss(params, batch, ...)``.
+"""The terms of the training objective (Eq. 13-19), as a table: name and function.
 
-Differentiable in ``params`` only. Not differentiable by contract: visibility and depth order, the
-topology of the isosurface, the random background, the noise of the smoothness term. In stage 2 the
-samples of light are constants too, and the gradient is not that of the returned, noisy value
-(`_judged_apart`).
+`evaluate` computes what is asked for by name and nothing else. Each term is a function of
+`LossInputs`; a surface adds penalties of its own (`SurfaceModel.penalties`). Weights are not known
+here: `pipeline.Pipeline.loss` sums the terms (Eq. 19).
+
+Differentiable in the parameters only. Not differentiable by contract: visibility and depth order,
+topology, the random background, the noise of the smoothness term, samples of light.
 """
 
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Any, Literal, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Key
+from pydantic import Field
 
-from geosplat_jax.core.capacity import Capacities, Usage
 from geosplat_jax.core.color import linear_to_srgb, tone_map
-from geosplat_jax.core.numerics import absolute, safe_divide, safe_log
+from geosplat_jax.core.numerics import absolute, safe_divide
+from geosplat_jax.core.settings import NonNegative, PositiveCount, settings
 from geosplat_jax.core.ssim import ssim
 from geosplat_jax.core.types import Batch
-from geosplat_jax.geometry import sdf_entropy, weight_magnitude
-from geosplat_jax.materials import smoothness
-from geosplat_jax.model import Context, Model, Params
-from geosplat_jax.render import Asset, grid_center_and_extent, reconstruct, render_views
-
-_DECIBEL = 10.0 / 2.302585092994046
-_LIGHT_STREAM = 3
-_RESIDUAL_STREAM = 4
-"""Numbers of the random streams of the light's samples; 0 to 2 are those of the loss itself."""
+from geosplat_jax.materials import SMOOTHNESS_STD, Changes, MaterialSpec, smoothness
+from geosplat_jax.render import Asset, Params, RenderOutput
+from geosplat_jax.surface.base import SurfaceModel
 
 
-class LossWeights(eqx.Module):
-    """Weights of the terms of Eq. 19; traced, so that schedules cost no compilation.
+@settings
+class Schedule:
+    """A weight over a stage: constant, or a line from ``value`` to ``end``."""
+
+    value: NonNegative = 0.0
+    """Weight at the start of the stage."""
+    end: NonNegative | None = None
+    """Weight at ``until`` and after it; none for a constant."""
+    until: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Share of the stage in which the weight moves to ``end``."""
+
+    def at(self, progress: float) -> float:
+        """Weight at ``progress`` in [0, 1] through the stage."""
+        if self.end is None:
+            return self.value
+        return self.value + min(progress / self.until, 1.0) * (self.end - self.value)
+
+    @property
+    def is_zero(self) -> bool:
+        """Whether the term never counts."""
+        return self.value == 0 and not self.end
+
+
+@settings
+class Objective:
+    """Static choices of the objective; hashable."""
+
+    smoothness_samples: PositiveCount = 4096
+    """Splats on which Eq. 15-17 are estimated in one step."""
+    smoothness_radius: NonNegative = SMOOTHNESS_STD
+    """Standard deviation of the displacement of Eq. 16, in half the side of the box."""
+    background: Literal["pixel", "view", "black"] = "pixel"
+    """Behind both images: one random colour per pixel (as the authors), one per view, or black."""
+    srgb: bool = False
+    """Compare encoded instead of linear colours."""
+
+
+class Comparison(NamedTuple):
+    """A render and a photograph over one background, and how much they differ.
 
     Attributes
     ----------
-    l1, ssim, mask : the photometric terms of Eq. 13.
-    entropy : SDF entropy, Eq. 14.
-    deviation, weights : FlexiCubes regularisers.
-    smoothness : material smoothness, Eq. 15-17.
-    light : demodulated light against image brightness, Eq. 18.
-    indirect : mean magnitude of the learned indirect light.
+    predicted, target : (V, H, W, 3) as they are compared.
+    alpha, mask : (V, H, W) coverage, and what it should be.
+    valid : (V, H, W) pixels that count, or None.
+    mse : () mean squared difference of the linear images.
     """
 
-    l1: Float[Array, ""] | float = 0.8
-    ssim: Float[Array, ""] | float = 0.2
-    mask: Float[Array, ""] | float = 5.0
-    entropy: Float[Array, ""] | float = 0.2
-    deviation: Float[Array, ""] | float = 0.5
-    weights: Float[Array, ""] | float = 0.1
-    smoothness: Float[Array, ""] | float = 0.03
-    light: Float[Array, ""] | float = 0.0
-    indirect: Float[Array, ""] | float = 0.0
-
-
-TERM_NAMES = tuple(f.name for f in fields(LossWeights))
+    predicted: Float[Array, "V H W 3"]
+    target: Float[Array, "V H W 3"]
+    alpha: Float[Array, "V H W"]
+    mask: Float[Array, "V H W"]
+    valid: Float[Array, "V H W"] | None
+    mse: Float[Array, ""]
 
 
 @dataclass(frozen=True)
-class Objective:
-    """Static choices of the objective; hashable.
+class LossInputs:
+    """What the terms are made from.
 
     Attributes
     ----------
-    smoothness_samples : Gaussians on which Eq. 15-17 are estimated in one step.
-    smoothness_radius : standard deviation of the perturbation, in units of half the box.
-    smooth_shine : include roughness and metallic (Eq. 16-17) beside albedo (Eq. 15).
-    background : ``"pixel"`` (one random colour a pixel, as the authors), ``"view"`` (one random
-        colour a view) or ``"black"``, behind both images.
-    srgb : compare encoded instead of linear colours.
-    entropy_reduction : ``"mean"`` over sign-changing edges, or ``"sum"`` as printed in Eq. 14.
-    with_light : evaluate Eq. 18, which needs more channels; off, the term is zero.
+    params, batch : as given to the loss.
+    asset, output : what was reconstructed and rendered.
+    rgb : (V, H, W, 3) premultiplied, exposed and tone mapped.
+    surface, fields, objective : as in the pipeline.
     """
 
-    smoothness_samples: int = 4096
-    smoothness_radius: float = 0.01
-    smooth_shine: bool = True
-    background: str = "pixel"
-    srgb: bool = False
-    entropy_reduction: str = "mean"
-    with_light: bool = False
+    params: Params
+    batch: Batch
+    asset: Asset
+    output: RenderOutput
+    rgb: Float[Array, "V H W 3"]
+    surface: SurfaceModel
+    fields: MaterialSpec
+    objective: Objective
 
-    def __post_init__(self) -> None:
-        """Refuse unknown names and empty sample sets."""
-        if self.background not in ("pixel", "view", "black"):
-            raise ValueError(
-                f'background must be "pixel", "view" or "black", got {self.background!r}'
-            )
-        if self.entropy_reduction not in ("mean", "sum"):
-            raise ValueError(
-                f'entropy_reduction must be "mean" or "sum", got {self.entropy_reduction!r}'
-            )
-        if self.smoothness_samples < 1:
-            raise ValueError(f"smoothness_samples must be >= 1, got {self.smoothness_samples}")
+    @cached_property
+    def keys(self) -> tuple[Key[Array, ""], ...]:
+        """Keys of the background, of the choice of splats and of their displacement."""
+        return tuple(jax.random.split(self.batch.key, 3))
+
+    @cached_property
+    def comparison(self) -> Comparison:
+        """Both images over one background."""
+        objective = self.objective
+        background = random_background(
+            self.keys[0], self.rgb.shape, self.rgb.dtype, objective.background
+        )
+        return compare(
+            self.rgb,
+            self.output.alpha,
+            self.batch.image,
+            background,
+            self.batch.valid,
+            srgb=objective.srgb,
+        )
+
+    @cached_property
+    def changes(self) -> Changes:
+        """Eq. 15-17 on a random subset of the splats: unbiased, at a fraction of the cost."""
+        splats, objective = self.asset.splats, self.objective
+        drawn = jax.random.uniform(self.keys[1], (objective.smoothness_samples,), jnp.float32)
+        picked = jnp.floor(drawn * splats.count.astype(jnp.float32)).astype(jnp.int32)
+        return smoothness(
+            self.params.material,
+            splats.anchors[picked],
+            jnp.broadcast_to(splats.count > 0, picked.shape),
+            self.keys[2],
+            self.surface.box,
+            spec=self.fields,
+            std=objective.smoothness_radius,
+        )
+
+    @cached_property
+    def penalties(self) -> dict[str, Float[Array, ""]]:
+        """Terms of the surface itself."""
+        return self.surface.penalties(self.params.geometry, self.asset.surface)
 
 
-class LossReport(eqx.Module):
-    """What a step says about itself.
-
-    Attributes
-    ----------
-    terms : unweighted value of every term, by the names of `LossWeights`.
-    psnr : () decibels of the composited training images, tone mapped, linear.
-    gaussian_count, face_count : () int32.
-    usage : true needs of every buffer.
-    """
-
-    terms: dict[str, Float[Array, ""]]
-    psnr: Float[Array, ""]
-    gaussian_count: Int[Array, ""]
-    face_count: Int[Array, ""]
-    usage: Usage
-
-
-def _background(key: jax.Array, shape: tuple[int, ...], dtype: jnp.dtype, kind: str) -> jax.Array:
-    """Background colours behind both images, broadcast to ``shape`` (V, H, W, 3)."""
+def random_background(
+    key: Key[Array, ""], shape: tuple[int, ...], dtype: Any, kind: str
+) -> Float[Array, "V H W 3"]:
+    """Colours behind both images, by `Objective.background`."""
     if kind == "black":
         return jnp.zeros(shape, dtype)
     drawn = shape if kind == "pixel" else (shape[0], 1, 1, 3)
@@ -122,170 +160,156 @@ def _background(key: jax.Array, shape: tuple[int, ...], dtype: jnp.dtype, kind: 
     return jnp.broadcast_to(colors, shape)
 
 
-def photometric_terms(
+def compare(
     rgb: Float[Array, "V H W 3"],
     alpha: Float[Array, "V H W"],
     image: Float[Array, "V H W 4"],
     background: Float[Array, "V H W 3"],
+    valid: Float[Array, "V H W"] | None,
     *,
     srgb: bool,
-) -> tuple[dict[str, Float[Array, ""]], Float[Array, ""]]:
-    """Compare tone-mapped, premultiplied ``rgb`` with photographs (Eq. 13).
-
-    Returns
-    -------
-    terms : ``l1``, ``ssim`` (as 1 - SSIM) and ``mask`` (mean squared error of alpha).
-    mse : () mean squared error of the composited linear images.
-    """
+) -> Comparison:
+    """Lay premultiplied ``rgb`` and a photograph with straight alpha over one background."""
     mask = image[..., 3]
     predicted = rgb + (1.0 - alpha)[..., None] * background
     target = mask[..., None] * image[..., :3] + (1.0 - mask)[..., None] * background
-    mse = jnp.mean((predicted - target) ** 2)
+    mse = _mean((predicted - target) ** 2, valid)
     if srgb:
         predicted, target = linear_to_srgb(predicted), linear_to_srgb(target)
-    terms = {
-        "l1": jnp.mean(absolute(predicted - target)),
-        "ssim": 1.0 - jnp.mean(jax.vmap(ssim)(predicted, target)),
-        "mask": jnp.mean((alpha - mask) ** 2),
-    }
-    return terms, mse
+    return Comparison(predicted, target, alpha, mask, valid, mse)
 
 
-def light_term(
-    diffuse: Float[Array, "V H W 3"],
-    specular: Float[Array, "V H W 3"],
-    image: Float[Array, "V H W 4"],
+def _mean(
+    values: Float[Array, "V H W *c"], valid: Float[Array, "V H W"] | None
 ) -> Float[Array, ""]:
-    """Tie the mean of the demodulated light to the image's value (Eq. 18), inside the mask."""
-    light = jnp.mean(diffuse + specular, axis=-1)
-    mask = image[..., 3]
-    value = mask * jnp.max(image[..., :3], axis=-1)
-    return jnp.mean(mask * absolute(light - value))
+    """Average over the pixels that count."""
+    if valid is None:
+        return jnp.mean(values)
+    weights = valid.reshape(valid.shape + (1,) * (values.ndim - 3))
+    channels = values.size // valid.size
+    return safe_divide(jnp.sum(values * weights), channels * jnp.sum(valid))
 
 
-def indirect_magnitude(asset: Asset) -> Float[Array, ""]:
-    """Mean magnitude of an asset's learned indirect light, as logits; 0 where none is learned."""
-    if asset.coefficients is None:
-        return jnp.zeros_like(asset.deviation)
-    mask = asset.gaussians.mask
-    total = jnp.sum(jnp.where(mask[:, None], absolute(asset.coefficients), 0.0))
-    count = jnp.sum(mask).astype(total.dtype) * asset.coefficients.shape[1]
-    return safe_divide(total, count)
+def image_l1(images: Comparison) -> Float[Array, ""]:
+    """Mean absolute difference of the images (Eq. 13)."""
+    return _mean(absolute(images.predicted - images.target), images.valid)
 
 
-def _judged_apart(
-    rgb: Float[Array, "V H W 3"],
-    asset: Asset,
-    params: Params,
-    batch: Batch,
-    context: Context,
-    *,
-    model: Model,
-    capacities: Capacities,
-) -> Float[Array, "V H W 3"]:
-    """Return the values of an image drawn with other samples, with the derivative of ``rgb``.
+def image_dissimilarity(images: Comparison) -> Float[Array, ""]:
+    """One minus the structural similarity of the images (Eq. 13).
 
-    The gradient of a distance is residual times derivative. From the same samples the two depend on
-    each other: the mean of the product is not the product of the means, and descent lowers whatever
-    makes noise, the sun above all (docs/transport.md). From different samples it is, which for a
-    squared distance is the gradient at the mean image, and for L1 and SSIM comes close. Eq. 18
-    keeps the first image.
+    Pixels that do not count are black in both images, hence equal; the mean is over the others.
     """
-    second = replace(model, transport=model.transport.for_residual())
-    output = render_views(
-        jax.lax.stop_gradient(asset),
-        jax.lax.stop_gradient(params.light),
-        batch.camera,
-        context,
-        key=jax.random.fold_in(batch.key, _RESIDUAL_STREAM),
-        model=second,
-        capacities=capacities,
-    )
-    value = tone_map(output.rgb, params.log_exposure)
-    return rgb + jax.lax.stop_gradient(value - rgb)
+    predicted, target, valid = images.predicted, images.target, images.valid
+    if valid is None:
+        return 1.0 - jnp.mean(jax.vmap(ssim)(predicted, target))
+    weights = valid[..., None]
+    unlike = 1.0 - jnp.mean(jax.vmap(ssim)(predicted * weights, target * weights))
+    return safe_divide(unlike, jnp.mean(valid))
 
 
-def loss(
-    params: Params,
-    batch: Batch,
-    context: Context,
-    weights: LossWeights,
-    *,
-    model: Model,
-    objective: Objective,
-    capacities: Capacities,
-    sampling: str = "face",
-) -> tuple[Float[Array, ""], LossReport]:
-    """Evaluate Eq. 19 on a batch of views; differentiate in ``params`` with ``has_aux=True``.
+def mask_error(images: Comparison) -> Float[Array, ""]:
+    """Mean squared difference of coverage and mask (Eq. 13)."""
+    return _mean((images.alpha - images.mask) ** 2, images.valid)
+
+
+def light_agreement(
+    diffuse: Float[Array, "V H W 3"],
+    specular_radiance: Float[Array, "V H W 3"],
+    log_exposure: Float[Array, ""],
+    image: Float[Array, "V H W 4"],
+    valid: Float[Array, "V H W"] | None = None,
+) -> Float[Array, ""]:
+    """Tie the demodulated light to the image's value inside the mask (Eq. 18).
 
     Parameters
     ----------
-    params : learned parameters.
-    batch : views, photographs and the key of the step's randomness.
-    context, weights : traced constants.
-    model, objective, capacities, sampling : static.
-
-    Returns
-    -------
-    total : () weighted sum of the terms. Valid only where ``fits(report.usage, capacities)``.
-    report : see `LossReport`.
+    diffuse : diffuse light without albedo.
+    specular_radiance : what the specular lobe adds, its Fresnel factor and tint included.
+    log_exposure : the sum is exposed and tone mapped as the render is.
+    image : photograph with straight alpha. valid : pixels that count.
     """
-    background_key, pick_key, noise_key = jax.random.split(batch.key, 3)
-    light_key = jax.random.fold_in(batch.key, _LIGHT_STREAM)
-    build = {"model": model, "capacities": capacities}
-    asset = reconstruct(params, context, sampling=sampling, **build)
-    output = render_views(
-        asset,
-        params.light,
-        batch.camera,
-        context,
-        aov_names=("diffuse", "specular") if objective.with_light else (),
-        key=light_key,
-        **build,
-    )
-    rgb = tone_map(output.rgb, params.log_exposure)
-    if model.transport.judges_apart:
-        rgb = _judged_apart(rgb, asset, params, batch, context, **build)
-    behind = _background(background_key, rgb.shape, rgb.dtype, objective.background)
-    terms, mse = photometric_terms(rgb, output.alpha, batch.image, behind, srgb=objective.srgb)
+    light = jnp.mean(tone_map(diffuse + specular_radiance, log_exposure), axis=-1)
+    mask = image[..., 3]
+    value = mask * jnp.max(image[..., :3], axis=-1)
+    return _mean(mask * absolute(light - value), valid)
 
-    # Eq. 15-17 on a random subset: an unbiased estimate at a fraction of the cost.
-    center, half_extent = grid_center_and_extent(context.grid)
-    count = asset.gaussians.count
-    shine = 1.0 if objective.smooth_shine else 0.0
-    drawn = jax.random.uniform(pick_key, (objective.smoothness_samples,), jnp.float32)
-    picked = jnp.floor(drawn * count.astype(jnp.float32)).astype(jnp.int32)
-    terms["smoothness"] = smoothness(
-        params.material,
-        asset.gaussians.means[picked],
-        jnp.broadcast_to(count > 0, picked.shape),
-        noise_key,
-        spec=model.material,
-        center=center,
-        half_extent=half_extent,
-        std=objective.smoothness_radius,
-        weights=(1.0, shine, shine),
-        position_gradient=model.attribute_gradient,
-    )
-    terms["entropy"] = sdf_entropy(
-        params.geometry,
-        context.grid,
-        reduction="sum" if objective.entropy_reduction == "sum" else "mean",
-    )
-    terms["deviation"] = asset.deviation
-    terms["weights"] = weight_magnitude(params.geometry)
-    terms["light"] = jnp.zeros_like(mse)
-    terms["indirect"] = indirect_magnitude(asset)
-    if objective.with_light:
-        terms["light"] = light_term(output.aovs["diffuse"], output.aovs["specular"], batch.image)
 
-    weighted = [getattr(weights, name) * terms[name] for name in TERM_NAMES]  # Eq. 19
-    total = jnp.sum(jnp.stack(weighted))
-    report = LossReport(
-        terms=terms,
-        psnr=-_DECIBEL * safe_log(mse),
-        gaussian_count=count,
-        face_count=asset.mesh.face_count,
-        usage=output.usage,
-    )
-    return total, report
+def indirect_magnitude(asset: Asset) -> Float[Array, ""]:
+    """Mean magnitude of the learned indirect light, as logits; 0 where none is learned."""
+    values, mask = asset.attributes.indirect, asset.splats.mask
+    if values is None:
+        return jnp.zeros((), asset.splats.means.dtype)
+    total = jnp.sum(jnp.where(mask[:, None], absolute(values), 0.0))
+    return safe_divide(total, jnp.sum(mask).astype(total.dtype) * values.shape[1])
+
+
+def white_balance(radiance: Float[Array, "H W 3"]) -> Float[Array, ""]:
+    """Mean absolute distance of the light's texels from grey, as in the authors' code."""
+    return jnp.mean(absolute(radiance - jnp.mean(radiance, axis=-1, keepdims=True)))
+
+
+def normal_smoothness(
+    normals: Float[Array, "V H W 3"],
+    image: Float[Array, "V H W 4"],
+    valid: Float[Array, "V H W"] | None = None,
+) -> Float[Array, ""]:
+    """Differences of neighbouring normals inside the mask, where the photograph has no edge."""
+    inside = image[..., 3] if valid is None else image[..., 3] * valid
+    terms = []
+    for axis in (1, 2):
+        ends = (slice(None),) * axis
+        first, second = (*ends, slice(None, -1)), (*ends, slice(1, None))
+        edge = jnp.mean(absolute(image[first] - image[second])[..., :3], axis=-1)
+        weight = inside[first] * inside[second]
+        change = jnp.sum(absolute(normals[first] - normals[second]), axis=-1)
+        terms.append(safe_divide(jnp.sum(weight * jnp.exp(-edge) * change), jnp.sum(weight)))
+    return terms[0] + terms[1]
+
+
+TERMS: dict[str, Callable[[LossInputs], Float[Array, ""]]] = {
+    "l1": lambda x: image_l1(x.comparison),  # Eq. 13
+    "ssim": lambda x: image_dissimilarity(x.comparison),
+    "mask": lambda x: mask_error(x.comparison),
+    "smoothness_albedo": lambda x: x.changes.albedo,  # Eq. 15-17
+    "smoothness_roughness_metallic": lambda x: x.changes.roughness + x.changes.metallic,
+    "light": lambda x: light_agreement(  # Eq. 18
+        x.output.aovs["diffuse"],
+        x.output.aovs["specular_radiance"],
+        x.params.log_exposure,
+        x.batch.image,
+        x.batch.valid,
+    ),
+    "indirect": lambda x: indirect_magnitude(x.asset),
+    "white_balance": lambda x: white_balance(x.params.light.radiance),
+    "normal_smoothness": lambda x: normal_smoothness(
+        x.output.aovs["normal"], x.batch.image, x.batch.valid
+    ),
+}
+"""Every term that is not a penalty of the surface, by the name of its weight."""
+
+TERM_AOVS: dict[str, tuple[str, ...]] = {
+    "light": ("diffuse", "specular_radiance"),
+    "normal_smoothness": ("normal",),
+}
+"""Extra images that a term looks at."""
+
+
+def evaluate(x: LossInputs, names: Iterable[str]) -> dict[str, Float[Array, ""]]:
+    """Compute terms by name, unweighted.
+
+    Raises
+    ------
+    ValueError
+        For a name that neither the table nor the surface knows.
+    """
+    terms = {}
+    for name in names:
+        if name in TERMS:
+            terms[name] = TERMS[name](x)
+        elif name in x.penalties:
+            terms[name] = x.penalties[name]
+        else:
+            known = sorted((*TERMS, *x.penalties))
+            raise ValueError(f"unknown term of the loss {name!r}; expected some of {known}")
+    return terms

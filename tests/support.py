@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from geosplat_jax.fit.config import make_config
-from geosplat_jax.fit.stages import initial_params, make_context
-from geosplat_jax.geometry import sphere_sdf
+from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.stages import begin_stage, build_pipeline, initial_params
+from geosplat_jax.geometry import FlexiCubes, initial_geometry, sphere_sdf
 from geosplat_jax.gradcheck.differences import double_precision
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.views import Views
@@ -18,8 +18,9 @@ from geosplat_jax.materials import ROUGHNESS_MINIMUM
 from geosplat_jax.surface.hull import fit_grid
 
 __all__ = [
-    "STAGE_2",
+    "MONTE_CARLO",
     "TINY",
+    "ball",
     "ball_of_one_material",
     "double_precision",
     "look_at_poses",
@@ -106,23 +107,32 @@ def sphere_dataset(**kwargs):
 
 TINY = (
     "geometry.resolution=10",
-    "geometry.vertex_fraction=0.0",
-    "run.steps=4",
-    "transport.steps=0",
-    "run.batch_views=1",
+    "stages.split_sum.steps=4",
+    "stages.split_sum.batch_views=1",
+    "stages.monte_carlo.steps=0",
     "run.checkpoint_every=2",
     "run.preview_every=0",
-    "model.material.grid.levels=2",
-    "model.material.grid.features=2",
-    "model.material.grid.log2_entries=10",
-    "model.material.grid.finest=24",
-    "model.material.albedo_hidden=[8, 8]",
-    "model.material.surface_hidden=[8]",
-    "model.light.height=8",
-    "model.light.width=16",
+    "material.grid.levels=2",
+    "material.grid.features=2",
+    "material.grid.log2_entries=10",
+    "material.grid.finest=24",
+    "material.albedo_hidden=[8, 8]",
+    "material.surface_hidden=[8]",
+    "light.height=8",
+    "light.width=16",
     "objective.smoothness_samples=64",
 )
 """Overrides that make a run small enough for a test."""
+
+MONTE_CARLO = (
+    "stages.monte_carlo.steps=3",
+    "stages.monte_carlo.batch_views=1",
+    "stages.monte_carlo.transport.light_count=1",
+    "stages.monte_carlo.transport.diffuse_count=1",
+    "stages.monte_carlo.transport.specular_count=1",
+    "stages.monte_carlo.transport.residual_count=0",
+)
+"""Overrides that add a second stage to `TINY`, small enough for a test."""
 
 
 def tiny_config(*overrides):
@@ -130,15 +140,22 @@ def tiny_config(*overrides):
     return make_config(overrides=(*TINY, *overrides))
 
 
-STAGE_2 = (
-    "transport.steps=3",
-    "transport.batch_views=1",
-    "transport.shading.light=1",
-    "transport.shading.diffuse=1",
-    "transport.shading.specular=1",
-    "transport.shading.residual=0",
-)
-"""Overrides that add a stage 2 to `TINY`, small enough for a test."""
+def ball(config, *, radius=0.4, stage=None):
+    """Return pipeline and first parameters of a ball in the box [-0.6, 0.6]^3.
+
+    ``stage`` : name of the stage (default: the first one). The pipeline has room for the ball.
+    """
+    grid = fit_grid((np.full(3, -0.6), np.full(3, 0.6)), config.geometry.resolution)
+    surface = FlexiCubes(grid)
+    params = initial_params(
+        initial_geometry(grid, sphere_sdf(grid, radius=radius)), config, jax.random.key(0)
+    )
+    chosen = config.active_stages[0] if stage is None else config.stage(stage)
+    pipeline = build_pipeline(config, config.active_stages[0], surface)
+    if chosen != config.active_stages[0]:
+        params = begin_stage(params, pipeline, config, chosen)
+        pipeline = build_pipeline(config, chosen, surface)
+    return replace(pipeline, capacities=surface.first_capacities(params.geometry)), params
 
 
 def views_from(eyes, *, size=16, field_of_view=0.5):
@@ -187,11 +204,10 @@ def with_constant_material(params, spec, *, albedo, roughness, metallic):
     return replace(params, material=material)
 
 
-def ball_of_one_material(config, *, albedo, roughness, metallic, radius=0.4):
-    """Parameters and context of a ball; ``config`` must give the heads biases."""
-    grid = fit_grid((np.full(3, -0.6), np.full(3, 0.6)), config.geometry.resolution)
-    params = initial_params(sphere_sdf(grid, radius=radius), grid, config, jax.random.key(0))
+def ball_of_one_material(config, *, albedo, roughness, metallic, radius=0.4, stage=None):
+    """Pipeline and parameters of a ball (see `ball`); ``config`` must give the heads biases."""
+    pipeline, params = ball(config, radius=radius, stage=stage)
     params = with_constant_material(
-        params, config.model.material, albedo=albedo, roughness=roughness, metallic=metallic
+        params, config.material, albedo=albedo, roughness=roughness, metallic=metallic
     )
-    return params, make_context(grid, config.model)
+    return pipeline, params

@@ -14,20 +14,21 @@ NAME = "geosplat_jax"
 # modules may import each other without a cycle.
 ORDER = [
     "core",
+    "rays",
     "surface",
     "geometry",
-    "adapter",
     "hashgrid",
     "materials",
+    "adapter",
     "splats",
-    "rays",
     "transport",
-    "model",
     "render",
     "losses",
+    "pipeline",
     "io",
     "fit",
     "report",
+    "run",
     "gradcheck",
     "cli",
 ]
@@ -48,6 +49,7 @@ SOURCES = {
     for path in sorted(PACKAGE.rglob("*.py"))
 }
 MODULES = sorted(name for name in SOURCES if name)
+"""All but the package itself, which imports the names that it exports."""
 
 
 def layer(module):

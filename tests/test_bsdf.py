@@ -267,34 +267,6 @@ def test_samples_carry_no_gradient():
         np.testing.assert_array_equal(leaf, 0.0)
 
 
-def test_gradients_agree_with_differences():
-    step = 1e-6
-    with double_precision():
-        rng = np.random.default_rng(0)
-        wi, wo = (jnp.asarray(_hemisphere(30, seed) * 0.8 + 0.2 * UP) for seed in (3, 4))
-        wi, wo = (v / jnp.linalg.norm(v, axis=1, keepdims=True) for v in (wi, wo))
-        point = (
-            _materials(30, roughness=0.4, metallic=0.3, dtype=jnp.float64),
-            _rows(UP, 30, jnp.float64),
-            wi,
-            wo,
-        )
-        along = jax.tree.map(lambda leaf: jnp.asarray(rng.standard_normal(leaf.shape)), point)
-
-        def value(point):
-            return jnp.sum(jnp.sin(evaluate(*point)))
-
-        def moved(sign):
-            return jax.tree.map(lambda a, b: a + sign * step * b, point, along)
-
-        gradient = jax.tree.leaves(jax.jit(jax.grad(value))(point))
-        derivative = sum(
-            np.vdot(a, b) for a, b in zip(gradient, jax.tree.leaves(along), strict=True)
-        )
-        change = value(moved(1)) - value(moved(-1))
-        np.testing.assert_allclose(derivative, change / (2 * step), rtol=1e-6)
-
-
 def test_jit_equals_eager():
     wi, wo = (jnp.asarray(_hemisphere(20, seed), jnp.float32) for seed in (0, 1))
     arguments = (_materials(20), _rows(UP, 20), wi, wo)

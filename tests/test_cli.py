@@ -1,26 +1,48 @@
 """The command line on the bundled scene: every command once, and errors that say what to do."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from support import TINY
+from support import MONTE_CARLO, TINY
 
 from geosplat_jax.cli import main
-from geosplat_jax.fit.train import load_run
+from geosplat_jax.fit.folder import RunError
+from geosplat_jax.fit.train import load_trained
 from geosplat_jax.io.images import read_image
+from geosplat_jax.run import Run
 
 DUCK = Path(__file__).resolve().parents[1] / "examples" / "duck"
 SETTINGS = [part for override in TINY for part in ("--set", override)]
+REDUCED = ["--downscale", "4", *SETTINGS]
+FEW = ["--samples", "4"]
+
+
+def train(folder, *arguments, scene=DUCK):
+    return main(["train", str(scene), "--output", str(folder), *arguments])
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def scene(tmp_path_factory):
+    """Every fourth training view of the bundled scene, two test views, and the maps."""
+    root = tmp_path_factory.mktemp("scene") / "duck"
+    for folder in sorted(DUCK.glob("train_*"))[::4] + sorted(DUCK.glob("test_*"))[:2]:
+        shutil.copytree(folder, root / folder.name)
+    shutil.copy(DUCK / "scene.json", root)
+    for path in DUCK.parent.glob("*.hdr"):
+        shutil.copy(path, root.parent)
+    return root
+
+
+@pytest.fixture(scope="module")
+def run(scene, tmp_path_factory):
+    """A run of a few steps; that of a folder without one begins, also with ``--resume``."""
     folder = tmp_path_factory.mktemp("cli") / "run"
-    arguments = ["train", str(DUCK), "--output", str(folder), "--downscale", "4", *SETTINGS]
-    assert main([*arguments, "--set", "run.preview_every=4"]) == 0
+    arguments = [*REDUCED, "--set", "run.preview_every=4", "--resume"]
+    assert train(folder, *arguments, scene=scene) == 0
     return folder
 
 
@@ -31,21 +53,35 @@ def test_info_says_what_was_recognised(capsys):
         assert word in said
 
 
+def test_settings_lists_values_under_the_choices(capsys):
+    assert main(["settings", "run.seed", "--seed", "7"]) == 0
+    line = next(line for line in capsys.readouterr().out.splitlines() if "run.seed" in line)
+    assert "7" in line
+    assert main(["settings", "nonsense"]) == 2
+    assert "no setting begins with 'nonsense'" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_training_leaves_a_complete_run_folder(run):
-    assert json.loads((run / "run.json").read_text())["dataset"]["downscale"] == 4
+    record = json.loads((run / "run.json").read_text())
+    assert record["dataset"] == {"downscale": 4, "light": None, "bounds": None}
     assert len((run / "metrics.jsonl").read_text().splitlines()) == 4
     assert read_image(run / "previews" / "step_000004.png").shape == (32, 96, 3)
     assert len(list((run / "checkpoints").glob("*.npz"))) == 2
+    assert json.loads((run / "training.json").read_text())["seconds_total"] > 0
 
 
 @pytest.mark.slow
-def test_evaluate_writes_figures_and_the_sheet(run, capsys):
-    assert main(["evaluate", str(run)]) == 0
+def test_evaluate_writes_metrics_and_the_sheet(run, capsys):
+    with pytest.raises(RunError, match="has not been evaluated"):
+        Run(run).metrics  # noqa: B018
+    assert main(["evaluate", str(run), *FEW, "--relight-indirect", "unshadowed"]) == 0
     said = capsys.readouterr().out
-    figures = json.loads((run / "metrics.json").read_text())
-    assert figures["protocol"] == "geosplatting"
-    assert len(figures["views"]) == 8
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["protocol"] == "geosplatting"
+    assert metrics["samples"] == 4
+    assert metrics["stage"] == "split_sum"
+    assert len(metrics["views"]) == 2
     for name in (
         "nvs.psnr",
         "nvs.ssim",
@@ -53,24 +89,32 @@ def test_evaluate_writes_figures_and_the_sheet(run, capsys):
         "normal.mae_masked_deg",
         "normal.mae_full_deg",
     ):
-        values = [view[name] for view in figures["views"]]
-        assert figures["mean"][name] == pytest.approx(np.mean(values))
+        values = [view[name] for view in metrics["views"]]
+        assert metrics["mean"][name] == pytest.approx(np.mean(values))
         assert name in said
+    for name in ("albedo.psnr", "relight.party.psnr", "relight.sunset.psnr", "light.psnr"):
+        assert name in metrics["mean"]
     for name in ("seconds", "peak_memory_mb", "versions", "seed", "config", "scene", "step"):
-        assert name in figures
-    assert read_image(run / "overview.png").ndim == 3
+        assert name in metrics
+    for sheet in ("overview.png", "materials.png", "relight.png"):
+        assert read_image(run / sheet).ndim == 3
+        assert sheet in said
+    assert Run(run).metrics == metrics
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("style", [["--texture-size", "64"], ["--vertex-colors"]])
-def test_export_writes_assets_that_load(run, tmp_path, style):
+def test_export_writes_assets_that_load(run, tmp_path, style, capsys):
     assert main(["export", str(run), "--output", str(tmp_path), *style]) == 0
+    said = capsys.readouterr().out
+    assert "16 x 8 lat-long" in said
     mesh = trimesh.load(tmp_path / "mesh.glb", force="mesh")
-    assert len(mesh.faces) > 100
+    assert len(mesh.faces) > 50
+    assert f"faces {len(mesh.faces)}," in said
     header = (tmp_path / "gaussians.ply").read_bytes()[:400].decode("ascii", "replace")
     assert header.startswith("ply")
     assert "f_dc_0" in header
-    params = load_run(run)[1]
+    params = load_trained(run).params
     exposed = np.exp(float(params.log_exposure)) * np.asarray(params.light.radiance)
     assert exposed.shape == (8, 16, 3)
     assert float(params.log_exposure) != 0
@@ -78,50 +122,92 @@ def test_export_writes_assets_that_load(run, tmp_path, style):
 
 
 @pytest.mark.slow
-def test_render_writes_every_view(run, tmp_path):
-    assert main(["render", str(run), "--output", str(tmp_path)]) == 0
-    assert len(list(tmp_path.glob("*_rgba.png"))) == 8
-    assert read_image(next(iter(tmp_path.glob("*_rgba.png")))).shape == (32, 32, 4)
+@pytest.mark.parametrize(("split", "count"), [("test", 2), ("train", 10)])
+def test_render_writes_every_view(run, tmp_path, split, count):
+    assert main(["render", str(run), "--views", split, "--output", str(tmp_path)]) == 0
+    pictures = sorted(path.name for path in tmp_path.glob("*_rgba.png"))
+    assert len(pictures) == len(list(tmp_path.glob("*_normal.png"))) == count
+    assert all(name.startswith(split) for name in pictures)
+    assert read_image(tmp_path / pictures[0]).shape == (32, 32, 4)
 
 
 @pytest.mark.slow
-def test_resuming_checks_the_scene_and_the_configuration(run, capsys):
-    same = ["train", str(DUCK), "--output", str(run), "--downscale", "4", *SETTINGS]
-    same += ["--set", "run.preview_every=4", "--resume"]
-    assert main(same) == 0
-    assert main([*same[:5], "2", *same[6:]]) == 2
+def test_relight_writes_stills_beside_the_run(run, capsys):
+    env = DUCK.parent / "sunset.hdr"
+    arguments = ["relight", str(run), "--env", str(env), *FEW, "--indirect", "unshadowed"]
+    pictures = []
+    for factor in ("1", "2"):
+        assert main([*arguments, "--intensity", factor]) == 0
+        assert "4 files" in capsys.readouterr().out
+        folder = run / "relight_sunset"
+        assert sorted(path.name for path in folder.iterdir()) == [
+            f"test_{number}{end}.png" for number in ("000", "001") for end in ("", "_rgba")
+        ]
+        pictures.append(read_image(folder / "test_000_rgba.png"))
+    np.testing.assert_array_equal(pictures[0][..., 3], pictures[1][..., 3])
+    assert pictures[1].mean() > pictures[0].mean()
+
+
+@pytest.mark.slow
+def test_resuming_checks_the_scene_and_the_configuration(run, scene, capsys):
+    same = [*REDUCED, "--set", "run.preview_every=4", "--resume"]
+    assert train(run, *same, scene=scene) == 0
+    assert train(run, "--downscale", "2", *same[2:], scene=scene) == 2
     assert "take the same, or another folder" in capsys.readouterr().err
-    assert main([*same, "--seed", "5"]) == 2
+    assert train(run, *same, "--seed", "5", scene=scene) == 2
     assert "run.seed: 0 -> 5" in capsys.readouterr().err
+    assert train(run, *REDUCED, scene=scene) == 2
+    assert "holds a run; continue it with --resume, replace it with --force" in (
+        capsys.readouterr().err
+    )
+    assert len((run / "metrics.jsonl").read_text().splitlines()) == 4
+
+
+@pytest.mark.slow
+def test_a_run_finds_its_scene_where_it_was_moved_to(run, scene, tmp_path, capsys):
+    moved = shutil.copytree(run, tmp_path / "run")
+    record = json.loads((moved / "run.json").read_text())
+    (moved / "run.json").write_text(json.dumps({**record, "scene": str(tmp_path / "gone")}))
+    assert main(["export", str(moved), "--vertex-colors"]) == 0
+    assert main(["render", str(moved)]) == 2
+    assert "is not at" in capsys.readouterr().err
+    opened = Run(moved, scene=scene)
+    assert opened.folder.record()["scene"] == str(scene.resolve())
+    assert Run(moved).dataset.train.fingerprint() == opened.dataset.train.fingerprint()
+    assert Run(moved).batch(3).image.shape == (1, 32, 32, 4)
 
 
 def test_an_existing_output_folder_is_not_touched(tmp_path, capsys):
     (tmp_path / "precious.txt").write_text("data")
-    assert main(["train", str(DUCK), "--output", str(tmp_path)]) == 2
-    assert "exists already" in capsys.readouterr().err
-    assert [p.name for p in tmp_path.iterdir()] == ["precious.txt"]
+    assert train(tmp_path, "--downscale", "4") == 2
+    assert "holds other files, precious.txt for one" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["precious.txt"]
 
 
 def test_a_failed_start_leaves_no_folder_behind(tmp_path, capsys):
     folder = tmp_path / "run"
-    assert main(["train", str(tmp_path / "nothing"), "--output", str(folder)]) == 2
+    assert train(folder, scene=tmp_path / "nothing") == 2
     assert "nothing" in capsys.readouterr().err
     assert not folder.exists()
 
 
-def test_a_stage_1_that_does_not_fit_leaves_the_folder_free(tmp_path, capsys):
-    arguments = ["train", str(DUCK), "--downscale", "4", *SETTINGS, "--set", "transport.steps=1"]
+def test_a_first_stage_that_does_not_fit_leaves_the_folder_free(scene, tmp_path, capsys):
+    settings = [part for override in MONTE_CARLO for part in ("--set", override)]
     other, folder = tmp_path / "other", tmp_path / "run"
     other.mkdir()
     options = {"downscale": 4, "light": None, "bounds": None}
-    (other / "run.json").write_text(json.dumps({"scene": str(DUCK), "dataset": options}))
+    record = {"scene": str(scene), "dataset": options, "config": {}}
+    (other / "run.json").write_text(json.dumps(record))
+    arguments = [*REDUCED, *settings, "--from", str(other), "--stage", "monte_carlo"]
     for _ in range(2):
-        assert main([*arguments, "--output", str(folder), "--stage-1", str(other)]) == 2
-        assert "holds no checkpoint to take stage 1 from" in capsys.readouterr().err
-        assert list(folder.iterdir()) == []
+        assert train(folder, *arguments, scene=scene) == 2
+        assert "holds no checkpoint to take the stage split_sum from" in capsys.readouterr().err
+        assert [path.name for path in folder.iterdir() if path.name != ".lock"] == []
     with pytest.raises(SystemExit):
-        main([*arguments, "--output", str(folder), "--stage-1", str(other), "--resume"])
+        train(folder, *arguments, "--resume", scene=scene)
     assert "not allowed with argument" in capsys.readouterr().err
+    assert train(folder, *arguments[:-2], scene=scene) == 2
+    assert "--from RUN and --stage NAME belong together" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("name", "value"), [("--intensity", "nan"), ("--albedo-scale", "-1")])
@@ -137,13 +223,17 @@ def test_commands_on_something_that_is_not_a_run_say_so(tmp_path, capsys, comman
     assert "is not a run" in capsys.readouterr().err
 
 
-def test_resuming_nothing_is_an_error(tmp_path, capsys):
-    arguments = ["train", str(DUCK), "--output", str(tmp_path / "x"), "--resume"]
-    assert main(arguments) == 2
-    assert "is not a run" in capsys.readouterr().err
-
-
-def test_a_bad_setting_is_one_line(tmp_path, capsys):
-    arguments = ["train", str(DUCK), "--output", str(tmp_path / "x"), "--set", "rates.sfd=1"]
-    assert main(arguments) == 2
-    assert "unknown setting rates.sfd" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("stages.split_sum.rates.sfd=1", "unknown setting stages.split_sum.rates.sfd"),
+        ("rates.sdf=1", "the setting rates.sdf is now stages.split_sum.rates.sdf"),
+        ("stages.split_sum.steps=-1", "stages.split_sum.steps"),
+    ],
+)
+def test_a_bad_setting_is_one_line(tmp_path, capsys, setting, message):
+    assert train(tmp_path / "x", "--set", setting) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "x").exists()

@@ -5,81 +5,216 @@ import json
 import pytest
 
 from geosplat_jax.fit.config import (
-    PRESETS,
-    QUALITIES,
-    RateConfig,
+    Config,
+    Rate,
+    Stage,
+    all_settings,
     config_from_dict,
+    config_warnings,
     differences,
-    doubts,
-    make_config,
+    moved_setting,
     parse_override,
 )
+from geosplat_jax.fit.presets import PRESETS, QUALITIES, make_config
+from geosplat_jax.losses import Schedule
+from geosplat_jax.materials import MATERIAL_PRIORS
+from geosplat_jax.transport.monte_carlo import MonteCarloSettings
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("quality", QUALITIES)
-def test_every_preset_and_quality_survives_json(preset, quality):
+def test_every_preset_and_quality_survives_json_and_raises_no_warning(preset, quality):
     config = make_config(preset, quality)
     again = config_from_dict(json.loads(json.dumps(config.to_dict())))
     assert again == config
-    assert hash(again.model) == hash(config.model)
     assert differences(config, again) == []
+    assert config_warnings(config) == []
 
 
-def test_presets_carry_the_numbers_of_the_reference():
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_setting_says_what_it_means(preset):
+    lines = all_settings(make_config(preset))
+    assert len({path for path, *_ in lines}) == len(lines) > 100
+    assert [path for path, _, _, meaning in lines if not meaning] == []
+
+
+def test_presets_carry_the_numbers_of_the_paper_and_of_the_authors_code():
     paper, code = make_config("paper"), make_config("code")
-    assert (paper.model.adapter.u, paper.model.adapter.v) == (0.07, 0.22)
-    assert code.model.adapter.u == pytest.approx(0.069444, abs=1e-6)
-    assert code.model.adapter.opacity == 0.99
-    assert code.model.baked_diffuse
-    assert not paper.model.material.has_shift
-    assert code.model.material.has_shift
-    assert paper.model.material.grid.log2_entries == 19
-    assert code.model.material.grid.coarsest == 16
+    assert (paper.adapter.u, paper.adapter.v) == (0.07, 0.22)
+    assert code.adapter.u == pytest.approx(0.069444, abs=1e-6)
+    assert code.adapter.v == pytest.approx(2 / 9)
+    assert (paper.adapter.opacity, code.adapter.opacity) == (1.0, 0.99)
+    assert (paper.adapter.shading_frame, code.adapter.shading_frame) == (True, False)
+    assert (paper.material.has_shift, code.material.has_shift) == (False, True)
+    assert (paper.material.grid.log2_entries, paper.material.grid.coarsest) == (19, 32)
+    assert (code.material.grid.log2_entries, code.material.grid.coarsest) == (18, 16)
+    assert code.stages[0].transport.baked_diffuse
+    assert not paper.stages[0].transport.baked_diffuse
+    assert paper.stages[1].transport.indirect == "harmonics"
+    assert code.stages[1].transport.indirect == "constant"
+    for config in (paper, code):
+        assert config.geometry.resolution == 96
+        assert config.geometry.cubic
+        assert config.geometry.reach == 0.25
+        # The sum of Eq. 14 outweighs the picture and empties the surface.
+        assert config.geometry.entropy_reduction == "mean"
+        assert not config.raster.cull_backfaces
+        assert config.material.position_gradient
+        assert not config.material.shared
 
 
 @pytest.mark.parametrize("preset", ["paper", "code"])
-def test_stage_2_of_the_originals_has_the_schedule_of_the_reference(preset):
-    transport = make_config(preset).transport
-    rates = transport.rates
-    assert (rates.sdf, rates.deform, rates.weights, rates.warmup) == (3e-3, 3e-3, 3e-3, 50)
-    assert (rates.albedo, rates.shine, rates.shift, rates.indirect) == (1e-2, 2e-3, 3e-3, 1e-2)
-    assert (rates.light, rates.exposure, rates.half_life) == (1e-2, 5e-3, 800.0)
-    assert rates.light_knee == rates.albedo_warmup == rates.shine_warmup == 0
-    assert (transport.steps, transport.batch_views, transport.shading.residual) == (500, 8, 0)
-    assert transport.loss.l1 == make_config(preset).loss.l1
-    assert transport.loss.at(0.0).entropy == pytest.approx(0.2)
-    assert transport.loss.at(1.0).entropy == pytest.approx(0.01)
+def test_the_originals_have_the_schedule_of_the_authors_code(preset):
+    split_sum, monte_carlo = make_config(preset).stages
+    for stage in (split_sum, monte_carlo):
+        assert (stage.steps, stage.batch_views, stage.half_life) == (500, 8, 800.0)
+        assert stage.light_knee == 0
+        assert stage.rates["light"] == Rate(1e-2)
+        assert stage.rates["exposure"] == Rate(5e-3)
+        assert stage.rates["shift"] == Rate(3e-3)
+    # 5 % of the whole training.
+    assert split_sum.vertex_fraction * split_sum.steps == 50
+    for name in ("sdf", "deform", "weights"):
+        assert split_sum.rates[name] == Rate(1e-2)
+        assert monte_carlo.rates[name] == Rate(3e-3, 50)
+    assert (split_sum.rates["albedo"], monte_carlo.rates["albedo"]) == (Rate(3e-3), Rate(1e-2))
+    assert split_sum.rates["roughness_metallic"] == Rate(1.5e-3)
+    assert monte_carlo.rates["roughness_metallic"] == Rate(2e-3)
+    assert monte_carlo.rates["indirect"] == Rate(1e-2)
+    transport = monte_carlo.transport
+    assert isinstance(transport, MonteCarloSettings)
+    # 8 x 8 strata with a sample of the light and one of the BRDF each.
+    assert transport.light_count == 64
+    assert transport.diffuse_count + transport.specular_count == 64
+    assert transport.residual_count == 0
 
 
-def test_overrides_reach_nested_fields_and_keep_types():
-    config = make_config(
-        overrides=("rates.sdf=0.5", "run.steps=7", "geometry.initial=sphere", "rates.light=1")
+def test_the_weights_of_the_entropy_and_the_smoothness_follow_paper_and_code():
+    split_sum, monte_carlo = make_config("paper").stages
+    whole = [s.weights_at(n)["entropy"] for s in (split_sum, monte_carlo) for n in (0, 250, 500)]
+    assert whole == pytest.approx([0.2, 0.105, 0.01, 0.01, 0.01, 0.01])
+    assert split_sum.weights_at(0)["smoothness_albedo"] == 0.03
+    assert split_sum.weights_at(0)["light"] == monte_carlo.weights_at(0)["light"] == 0.15
+    split_sum, monte_carlo = make_config("code").stages
+    assert [split_sum.weights_at(n)["entropy"] for n in (0, 500)] == pytest.approx([0.2, 0.12])
+    assert [monte_carlo.weights_at(n)["entropy"] for n in (0, 500)] == pytest.approx([0.2, 0.01])
+    # Means over channels there, sums here.
+    assert split_sum.weights_at(0)["smoothness_albedo"] == 0
+    assert split_sum.weights_at(500)["smoothness_albedo"] == pytest.approx(0.03 / 3)
+    assert split_sum.weights_at(500)["smoothness_roughness_metallic"] == pytest.approx(0.001 / 2)
+    assert split_sum.weights_at(0)["white_balance"] == 0.002
+    assert "light" not in monte_carlo.weights_at(0)
+
+
+def test_priors_of_shiny_materials_change_the_rates_of_the_authors_code():
+    hybrid, glossy, specular = (
+        make_config("code", material_prior=prior) for prior in ("hybrid", "glossy", "specular")
     )
-    assert config.rates.sdf == 0.5
-    assert config.run.steps == 7
+    assert [c.stages[0].rates["sdf"].value for c in (hybrid, glossy, specular)] == [
+        0.01,
+        0.01,
+        0.05,
+    ]
+    assert [c.stages[0].rates["light"].value for c in (hybrid, glossy, specular)] == pytest.approx(
+        [0.01, 0.03, 0.03]
+    )
+    assert specular.stages[0].weights_at(0)["smoothness_albedo"] == pytest.approx(0.5 / 3)
+    assert specular.stages[1].weights_at(0)["normal_smoothness"] == 0.03
+    assert "normal_smoothness" not in hybrid.stages[1].weights_at(0)
+    assert specular.stages[1].steps == 1000
+
+
+def test_a_draft_of_the_originals_is_smaller_and_keeps_their_method():
+    for preset in ("paper", "code"):
+        whole, draft = make_config(preset), make_config(preset, "draft")
+        assert draft.geometry.resolution < whole.geometry.resolution
+        assert draft.total_steps < whole.total_steps
+        assert draft.adapter == whole.adapter
+        assert draft.raster == whole.raster
+        assert [s.weights for s in draft.stages] == [s.weights for s in whole.stages]
+
+
+def test_overrides_reach_nested_settings_and_keep_types():
+    config = make_config(
+        overrides=(
+            "stages.split_sum.steps=7",
+            "geometry.initial=sphere",
+            "stages.monte_carlo.half_life=1",
+            "stages.monte_carlo.enter=[]",
+            "stages.monte_carlo.transport.light_count=3",
+        )
+    )
+    assert config.stages[0].steps == 7
     assert config.geometry.initial == "sphere"
-    assert config.rates.light == 1.0
-    assert isinstance(config.rates.light, float)
+    assert isinstance(config.stages[1].half_life, float)
+    assert config.stages[1].enter == ()
+    assert config.stages[1].transport.light_count == 3
+
+
+def test_a_number_sets_the_value_of_a_rate_or_a_weight_and_leaves_the_rest():
+    before = make_config()
+    after = make_config(
+        overrides=(
+            "stages.monte_carlo.rates.albedo=0.5",
+            "stages.split_sum.weights.entropy=0.3",
+            "stages.split_sum.weights.light=0.15",
+            "stages.split_sum.weights.indirect.end=0.25",
+        )
+    )
+    assert after.stages[1].rates["albedo"] == Rate(0.5, before.stages[1].rates["albedo"].warmup)
+    assert after.stages[0].weights["entropy"] == Schedule(0.3, 0.01, 0.5)
+    assert after.stages[0].weights["light"] == Schedule(0.15)
+    assert after.stages[0].weights["indirect"] == Schedule(0.0, 0.25)
+
+
+def test_another_kind_replaces_a_section():
+    config = make_config(overrides=('stages.monte_carlo.transport={kind="split_sum"}',))
+    assert config.stages[1].transport.kind == "split_sum"
 
 
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("rates.sfd=1", "unknown setting rates.sfd"),
+        ("geometry.resolutoin=8", "unknown setting geometry.resolutoin"),
         ("nothing.at.all=1", "unknown setting nothing"),
-        ("run.steps=1.5", "run.steps must be of type int"),
-        ("run.steps=0", "run.steps must be at least 1"),
-        ("rates.sdf=-1.0", "^rates.sdf must not be negative"),
-        ("transport.rates.sdf=-1.0", "^transport.rates.sdf must not be negative"),
-        ("transport.loss.l1=-1.0", "^transport.loss.l1 must not be negative"),
-        ("transport.shading.bounces=0", "^transport.shading.bounces must be at least 1"),
-        ("transport.shading.light=-1", "^transport.shading: counts of samples"),
-        ("objective.background=red", "^objective.background must be"),
-        ("rates.sdf", "section.field=value"),
-        ("geometry.initial=cube", "geometry.initial must be"),
-        ("model.adapter.alpha=[1.0]", "alpha and beta need an outer and an inner value"),
-        ("model.adapter.alpha=3", "model.adapter.alpha must be of type tuple"),
+        ("stages.third.steps=1", "unknown setting stages.third"),
+        (
+            "stages.split_sum.steps=1.5",
+            r"split_sum\.steps must be a valid integer, got 1.5",
+        ),
+        ("stages.split_sum.steps=-1", r"stages\.split_sum\.steps must be greater than or equal"),
+        ("stages.monte_carlo.rates.sdf=-1.0", r"^stages\.monte_carlo\.rates\.sdf\.value must be"),
+        ("stages.split_sum.rates.sdf=nan", r"rates\.sdf\.value must be a finite number"),
+        ("stages.split_sum.weights.l1=-1.0", r"^stages\.split_sum\.weights\.l1\.value must be"),
+        (
+            "stages.split_sum.weights.lihgt=1.0",
+            r"unknown setting stages.*weights\.lihgt",
+        ),
+        ("stages.split_sum.rates.colour=1.0", r"unknown setting stages.*rates\.colour"),
+        (
+            "stages.monte_carlo.transport.bounces=0",
+            r"monte_carlo\.transport\.bounces must",
+        ),
+        ("stages.monte_carlo.transport.light_count=-1", r"transport\.light_count must be"),
+        ("stages.monte_carlo.transport.indirect=much", r"transport\.indirect must be 'none'"),
+        ("stages.monte_carlo.transport.denoise.iterations=9", r"denoise\.iterations must be less"),
+        (
+            "stages.monte_carlo.transport.shadows=true",
+            "unknown setting stages.*shadows",
+        ),
+        ("objective.background=red", r"^objective\.background must be"),
+        ("geometry.initial=cube", r"geometry\.initial must be"),
+        ("geometry.resolution=3", r"geometry\.resolution must be greater"),
+        ("adapter.alpha=[1.0]", r"^adapter\.alpha"),
+        ("adapter.u=0.4", "u and v must lie in"),
+        ("raster.near=nan", r"raster\.near must be a finite number"),
+        ("raster.tile_size=0", r"raster\.tile_size must be greater"),
+        ("run.seed=-1", r"run\.seed must be greater"),
+        ("run.initial_light=-1.0", r"run\.initial_light must be greater"),
+        ("run.seed", "section.field=value"),
+        ("quality=draft", "quality is chosen with --quality"),
+        ("preset=paper", "preset is chosen with --preset"),
+        ("material_prior=diffuse", "material_prior is chosen with --material-prior"),
     ],
 )
 def test_bad_overrides_say_what_is_wrong(override, message):
@@ -87,12 +222,53 @@ def test_bad_overrides_say_what_is_wrong(override, message):
         make_config(overrides=(override,))
 
 
+@pytest.mark.parametrize(
+    ("old", "now"),
+    [
+        ("run.steps", "stages.split_sum.steps"),
+        ("run.batch_views", "stages.split_sum.batch_views"),
+        ("transport.steps", "stages.monte_carlo.steps"),
+        ("rates.sdf", "stages.split_sum.rates.sdf"),
+        ("rates.shine_warmup", "stages.split_sum.rates.roughness_metallic.warmup"),
+        ("transport.rates.shine", "stages.monte_carlo.rates.roughness_metallic"),
+        ("transport.loss.light", "stages.monte_carlo.weights.light"),
+        ("loss.entropy_end", "stages.split_sum.weights.entropy.end"),
+        ("transport.shading.light", "stages.monte_carlo.transport.light_count"),
+        ("transport.shading.occlusion", "stages.monte_carlo.transport.occlusion"),
+        ("model.material.grid.levels", "material.grid.levels"),
+        ("model.attribute_gradient", "material.position_gradient"),
+        ("objective.entropy_reduction", "geometry.entropy_reduction"),
+        ("kind", "material_prior"),
+        ("geometry.resolution", None),
+        ("stages.split_sum.steps", None),
+    ],
+)
+def test_settings_of_earlier_versions_are_refused_with_their_new_names(old, now):
+    assert moved_setting(old) == now
+    if now is not None:
+        with pytest.raises(ValueError, match=f"the setting {old} is now {now}"):
+            parse_override(f"{old}=1")
+
+
+def test_a_run_of_an_earlier_version_is_refused_with_the_first_new_name():
+    old = {"preset": "default", "rates": {"sdf": 0.01}, "run": {"steps": 5}, "kind": "hybrid"}
+    with pytest.raises(ValueError, match=r"3 settings are of an earlier version, the first: rates"):
+        config_from_dict(old)
+
+
 def test_unknown_names_are_refused():
     for arguments in (("fast",), ("default", "ultra")):
         with pytest.raises(ValueError, match="must be one of"):
             make_config(*arguments)
-    with pytest.raises(ValueError, match="kind must be one of"):
-        make_config(kind="wet")
+    with pytest.raises(ValueError, match="material_prior must be one of"):
+        make_config(material_prior="wet")
+
+
+@pytest.mark.parametrize("prior", MATERIAL_PRIORS)
+def test_a_prior_sets_the_first_roughness_and_metallic(prior):
+    material = make_config(material_prior=prior).material
+    logits = (material.initial_roughness_logit, material.initial_metallic_logit)
+    assert logits == MATERIAL_PRIORS[prior]
 
 
 def test_an_override_is_toml_or_a_bare_word():
@@ -101,52 +277,68 @@ def test_an_override_is_toml_or_a_bare_word():
     assert parse_override("a=word") == {"a": "word"}
 
 
-def test_entropy_weight_falls_linearly_and_stays():
-    loss = make_config("paper").loss
-    assert loss.at(0.0).entropy == pytest.approx(0.2)
-    assert loss.at(0.25).entropy == pytest.approx(0.105)
-    assert loss.at(0.5).entropy == pytest.approx(0.01)
-    assert loss.at(1.0).entropy == pytest.approx(0.01)
+def test_schedules_are_lines_that_stay_at_their_end():
+    line = Schedule(0.2, 0.01, 0.5)
+    assert [line.at(p) for p in (0.0, 0.25, 0.5, 1.0)] == pytest.approx([0.2, 0.105, 0.01, 0.01])
+    assert Schedule(0.3).at(0.7) == 0.3
+    assert Schedule().is_zero
+    assert not Schedule(0.0, 0.1).is_zero
+    stage = Stage(steps=10, weights={"l1": Schedule(0.0), "mask": Schedule(0.0, 1.0)})
+    assert stage.weights_at(5) == {"mask": 0.5}
+
+
+def test_rates_warm_up_quadratically_and_halve():
+    stage = Stage(half_life=5.0, rates={"sdf": Rate(0.01, 4), "light": Rate(0.04, 0, 2.0)})
+    for step in range(7):
+        ramp = min((step + 1) / 4, 1) ** 2
+        assert stage.rates_at(step)["sdf"] == pytest.approx(0.01 * 0.5 ** (step / 5) * ramp)
+        assert stage.rates_at(step)["light"] == pytest.approx(0.04 * 0.5 ** (step / 2))
+    assert Stage(rates={"sdf": Rate(0.0), "light": Rate(0.1)}).frozen == ("sdf",)
+
+
+def test_steps_belong_to_stages_and_a_stage_without_steps_is_left_out():
+    stages = tuple(Stage(name=name, steps=n) for name, n in (("a", 3), ("b", 0), ("c", 2)))
+    config = Config(stages=stages)
+    assert config.total_steps == 5
+    assert [config.stage_at(step).name for step in range(6)] == ["a"] * 3 + ["c"] * 3
+    assert [config.first_step(name) for name in "abc"] == [0, 3, 3]
+    assert [stage.name for stage in config.active_stages] == ["a", "c"]
+    with pytest.raises(ValueError, match="there is no stage 'd'"):
+        config.stage("d")
+
+
+def test_stages_of_one_name_are_refused():
+    with pytest.raises(ValueError, match="names of their own"):
+        Config(stages=(Stage(name="a"), Stage(name="a")))
 
 
 def test_differences_name_the_setting_and_both_values():
-    first, second = make_config(), make_config(overrides=("rates.sdf=0.25",))
-    assert differences(first, second) == [f"rates.sdf: {RateConfig().sdf!r} -> 0.25"]
-
-
-@pytest.mark.parametrize("preset", ["default", "paper", "code"])
-@pytest.mark.parametrize("quality", ["draft", "standard", "high"])
-def test_the_settings_that_are_offered_raise_no_doubts(preset, quality):
-    assert doubts(make_config(preset, quality)) == []
+    first = make_config()
+    second = make_config(overrides=("stages.monte_carlo.rates.sdf=0.25",))
+    found = differences(first, second)
+    assert found == ["stages.monte_carlo.rates.sdf.value: 0.001 -> 0.25"]
+    assert differences(first, second, stages=["split_sum"]) == []
 
 
 @pytest.mark.parametrize(
     ("overrides", "told"),
     [
         (
-            ("transport.steps=100",),
-            ["transport.rates.albedo_warmup = 150", "transport.rates.shine"],
+            ("stages.monte_carlo.steps=100",),
+            ["stages.monte_carlo.rates.albedo.warmup = 150", "rates.roughness_metallic.warmup"],
         ),
+        (("stages.split_sum.weights.indirect=1.0",), ["learns no indirect light"]),
         (
-            ("rates.albedo_warmup=501",),
-            ["rates.albedo_warmup = 501 is longer than the stage's 500"],
+            (
+                "stages.monte_carlo.transport.indirect=traced",
+                "stages.monte_carlo.transport.occlusion=false",
+            ),
+            ["stages.monte_carlo.weights.indirect has no effect", "blocked directions are black"],
         ),
-        (("loss.indirect=1.0",), ["loss.indirect has no effect"]),
-        (
-            ("transport.shading.indirect=traced", "transport.shading.occlusion=false"),
-            ["blocked directions are black"],
-        ),
-        (("transport.steps=0",), []),
+        (("stages.monte_carlo.steps=0",), []),
     ],
 )
 def test_settings_without_effect_are_told(overrides, told):
-    found = doubts(make_config(overrides=overrides))
+    found = config_warnings(make_config(overrides=overrides))
     assert len(found) == len(told)
     assert all(words in text for words, text in zip(told, found, strict=True))
-
-
-def test_a_weight_of_eq_18_switches_it_on_in_either_stage():
-    config = make_config(overrides=("loss.light=0.1",))
-    assert (config.stage(1).objective.with_light, config.stage(2).objective.with_light) == (1, 0)
-    config = make_config(overrides=("transport.loss.light=0.1",))
-    assert (config.stage(1).objective.with_light, config.stage(2).objective.with_light) == (0, 1)

@@ -2,13 +2,15 @@
 
 import json
 import shutil
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from support import shared_path
 
-from geosplat_jax.io.dataset import describe, load_dataset
+from geosplat_jax.io.dataset import describe, load_dataset, load_recorded
+from geosplat_jax.io.frames import AngleLens, PinholeLens
 from geosplat_jax.io.images import (
     ImageReadError,
     MissingFileError,
@@ -20,7 +22,6 @@ from geosplat_jax.io.images import (
     write_png,
 )
 
-SHARED = Path(__file__).parents[2] / "shared"
 SIZE, ANGLE, RADIUS, DISTANCE = 24, 0.7, 0.8, 4.0
 ALBEDO, RADIANCE = np.array([0.8, 0.2, 0.05]), np.array([0.5, 0.25, 0.1])
 ROUGHNESS = 0.4
@@ -376,26 +377,162 @@ def test_missing_training_views_are_named(blender):
         load(blender)
 
 
-@pytest.mark.parametrize(
-    ("lens", "message"),
-    [
-        ({"k1": 0.1}, r"lens distortion \(k1\); undistort"),
-        ({"cx": 3.0, "w": SIZE}, "principal point of frame 0 .* -9.0 pixels off the centre"),
-        ({"fl_x": 10.0, "fl_y": 12.0}, "focal lengths 10.0 and 12.0"),
-    ],
-)
-def test_lenses_that_are_not_pinholes_are_refused(blender, lens, message):
-    path = blender / "transforms_train.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | lens))
-    with pytest.raises(SceneError, match=message):
+LENS = {"fl_x": 40.0, "fl_y": 30.0, "cx": 13.5, "cy": 10.25, "w": SIZE, "h": SIZE}
+INTRINSICS = np.array([[40.0, 0.0, 13.5], [0.0, 30.0, 10.25], [0.0, 0.0, 1.0]])
+
+
+def with_lens(root, lens, *, split="train"):
+    """Put a lens in the place of the angle."""
+
+    def change(content):
+        del content["camera_angle_x"]
+        content.update(lens)
+
+    edit(root, change, name=f"transforms_{split}.json")
+    return root
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_a_lens_off_the_centre_reaches_the_cameras_exactly(blender, factor):
+    views = load(with_lens(blender, LENS), downscale=factor).train
+    expected = INTRINSICS / np.array([[factor], [factor], [1]])
+    np.testing.assert_array_equal(views.intrinsics, np.stack([expected] * COUNTS["train"]))
+    # Halves of these numbers are exact in float32, too.
+    np.testing.assert_array_equal(views.camera([3]).intrinsics[0], expected)
+
+
+@pytest.mark.parametrize("layout", ["tensoir", "synthetic4relight"])
+def test_every_layout_with_transforms_takes_a_whole_lens(scenes, tmp_path, layout):
+    root = shutil.copytree(scenes[layout], tmp_path / "ball")
+    for split in COUNTS:
+        with_lens(root, LENS, split=split)
+    dataset = load(root)
+    for views in (dataset.train, dataset.test):
+        np.testing.assert_array_equal(views.intrinsics, np.stack([INTRINSICS] * len(views)))
+
+
+def test_a_frame_may_have_a_lens_of_its_own(blender):
+    edit(with_lens(blender, LENS), lambda c: c["frames"][2].update(fl_x=50.0, cx=11.0))
+    found = load(blender).train.intrinsics
+    np.testing.assert_array_equal(found[2], [[50.0, 0, 11.0], [0, 30.0, 10.25], [0, 0, 1.0]])
+    np.testing.assert_array_equal(found[[1, 3]], np.stack([INTRINSICS] * 2))
+
+
+def test_a_lens_of_larger_images_is_scaled_to_those_on_disk(blender):
+    lens = {"fl_x": 80.0, "fl_y": 90.0, "cx": 27.0, "cy": 30.75, "w": 2 * SIZE, "h": 3 * SIZE}
+    found = load(with_lens(blender, lens)).train.intrinsics[0]
+    np.testing.assert_array_equal(found, INTRINSICS)
+
+
+def test_what_a_lens_leaves_out_is_square_and_centred(blender):
+    lens = {"fl_x": 40.0, "w": SIZE, "h": SIZE, "k1": 0.0, "p2": 0}
+    found = load(with_lens(blender, lens)).train.intrinsics[0]
+    middle = SIZE / 2
+    np.testing.assert_array_equal(found, [[40.0, 0, middle], [0, 40.0, middle], [0, 0, 1.0]])
+
+
+def test_an_angle_gives_the_focal_length_that_a_lens_lacks(blender):
+    edit(blender, lambda content: content.update(cx=9.0, w=SIZE, h=SIZE))
+    focal = 0.5 * SIZE / np.tan(0.5 * ANGLE)
+    found = load(blender).train.intrinsics[0]
+    np.testing.assert_allclose(found, [[focal, 0, 9.0], [0, focal, SIZE / 2], [0, 0, 1.0]])
+
+
+@pytest.mark.parametrize("error", [-0.009, 0.009])
+def test_a_lens_that_spells_out_the_angle_is_taken_at_its_word(blender, error):
+    focal = (1 + error) * 0.5 * SIZE / np.tan(0.5 * ANGLE)
+    edit(blender, lambda content: content.update(LENS, fl_x=focal))
+    assert load(blender).train.intrinsics[0, 0, 0] == focal
+
+
+@pytest.mark.parametrize("error", [-0.011, 0.011])
+def test_a_lens_that_contradicts_the_angle_is_refused(blender, error):
+    focal = (1 + error) * 0.5 * SIZE / np.tan(0.5 * ANGLE)
+    edit(blender, lambda content: content["frames"][1].update(LENS, fl_x=focal))
+    with pytest.raises(SceneError, match="frame 1 of .* contradicts itself: with w = 24, fl_x is"):
         load(blender)
 
 
-def test_a_plain_lens_may_be_spelled_out(blender):
-    path = blender / "transforms_train.json"
-    lens = {"k1": 0.0, "cx": SIZE / 2, "w": SIZE, "fl_x": 9.0, "fl_y": 9.0}
-    path.write_text(json.dumps(json.loads(path.read_text()) | lens))
-    assert len(load(blender).train) > 0
+@pytest.mark.parametrize("key", ["k1", "p2"])
+def test_lens_distortion_is_refused(blender, key):
+    edit(with_lens(blender, LENS), lambda content: content.update({key: 0.1}))
+    with pytest.raises(SceneError, match=rf"frame 0 .* has lens distortion \({key}\); undistort"):
+        load(blender)
+
+
+@pytest.mark.parametrize("key", list(LENS))
+def test_every_number_of_a_lens_is_checked(blender, key):
+    where = r"frame 2 of .*transforms_train\.json must be a positive"
+    with_lens(blender, LENS)
+    wrong = [0, -3.0, np.nan, np.inf, "wide", None, True, [1.0], 10**400]
+    for value in [*wrong, SIZE + 0.5] if key in ("w", "h") else wrong:
+        edit(blender, lambda content, v=value: content["frames"][2].update({key: v}))
+        with pytest.raises(SceneError, match=f"'{key}' of {where}") as caught:
+            load(blender)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_lens_needs_the_size_of_its_image_and_a_focal_length(blender):
+    angle = json.loads((blender / "transforms_train.json").read_text())["camera_angle_x"]
+    with_lens(blender, {"fl_x": 40.0, "cx": 12.0})
+    with pytest.raises(SceneError, match="lens of frame 0 of .* has fl_x, cx but no w and no h"):
+        load(blender)
+    edit(blender, lambda content: content.update(camera_angle_x=angle, w=SIZE))
+    with pytest.raises(SceneError, match="lens of frame 0 of .* has fl_x, cx, w but no h"):
+        load(blender)
+    with_lens(blender, {"fl_y": 40.0, "h": SIZE})
+    edit(blender, lambda content: content.pop("fl_x"))
+    with pytest.raises(SceneError, match="has no key 'camera_angle_x'"):
+        load(blender)
+
+
+def test_an_angle_is_the_pinhole_lens_that_it_describes():
+    angle = AngleLens(ANGLE)
+    for width, height in ((SIZE, SIZE), (30, 20)):
+        focal = 0.5 * width / np.tan(0.5 * ANGLE)
+        spelled = PinholeLens(focal, focal, width / 2, height / 2, width, height)
+        for factor in (1, 3):
+            size = (factor * width, factor * height)
+            np.testing.assert_allclose(spelled.intrinsics(*size), angle.intrinsics(*size))
+    assert hash(angle) == hash(AngleLens(ANGLE))
+
+
+def test_equal_views_have_one_fingerprint_and_others_another(scenes):
+    views = load(scenes["nerf_synthetic"]).test
+    text = views.fingerprint()
+    assert load(scenes["nerf_synthetic"]).test.fingerprint() == text
+    moved = views.camera_to_world.copy()
+    moved[1, 0, 3] += 1e-9
+    longer = views.intrinsics.copy()
+    longer[2, 0, 0] += 1e-9
+    others = [
+        replace(views, camera_to_world=moved),
+        replace(views, intrinsics=longer),
+        replace(views, names=("r_0", "r_2", "r_1")),
+        replace(views, images=views.images[:, :-1]),
+        replace(views, images=views.images[:, :, :-1]),
+        load(scenes["nerf_synthetic"]).train,
+    ]
+    assert len({text, *(other.fingerprint() for other in others)}) == len(others) + 1
+
+
+def test_a_dataset_remembers_how_it_was_read(scenes):
+    corners = ((-1, -1.5, -1), (1, 1, np.float64(2.0)))
+    read = load_dataset(scenes["tensoir"], downscale=2, light="noon", bounds=corners)
+    options = {"downscale": 2, "light": "noon", "bounds": [-1.0, -1.5, -1.0, 1.0, 1.0, 2.0]}
+    assert read.options == options
+    # As a run keeps it, through JSON.
+    again = load_recorded(scenes["tensoir"], json.loads(json.dumps(dict(read.options))))
+    assert again.options == options
+    assert again.train.fingerprint() == read.train.fingerprint()
+    np.testing.assert_array_equal(again.bounds, read.bounds)
+
+
+def test_the_options_of_a_plain_reading_leave_everything_open(blender):
+    dataset = load_dataset(blender)
+    assert dataset.options == {"downscale": 1, "light": None, "bounds": None}
+    for options in (dataset.options, {}):
+        np.testing.assert_array_equal(load_recorded(blender, options).bounds, dataset.bounds)
 
 
 def test_two_views_of_one_name_are_refused(blender):
@@ -632,10 +769,7 @@ def test_metadata_of_tensoir_is_checked(tensoir, change, message):
     ],
 )
 def test_real_scenes_load(name, layout, counts):
-    root = SHARED / name
-    if not root.is_dir():
-        pytest.skip("the shared scenes are not here")
-    dataset = load_dataset(root, downscale=2)
+    dataset = load_dataset(shared_path(*name.split("/")), downscale=2)
     assert dataset.layout == layout
     assert (len(dataset.train), len(dataset.test)) == counts
     assert dataset.warnings == ()

@@ -1,3 +1,5 @@
+"""The wavelet filter: its formulas, its gradient, edges that it keeps, noise that it removes."""
+
 from functools import cache
 
 import jax
@@ -362,11 +364,10 @@ def test_order_of_rows_and_columns_does_not_matter():
 
 
 @pytest.mark.parametrize("shape", [(0, 5), (5, 0), (1, 1), (1, 6), (2, 3)])
-@pytest.mark.parametrize("iterations", [1, 8])
-def test_tiny_and_empty_images_are_finite(shape, iterations):
+def test_tiny_and_empty_images_are_finite(shape):
     alpha, normals, depth, albedo = flat_guides(*shape)
     light = np.full((*shape, 2), 0.5, np.float32)
-    spec = DenoiseSpec(iterations)
+    spec = DenoiseSpec(iterations=8)
     found = run(light, [alpha, normals, depth, albedo], spec)
     np.testing.assert_allclose(found, light, atol=ROUNDING)
 
@@ -427,7 +428,7 @@ def test_views_of_a_batch_equal_single_ones_and_precision_is_kept():
     ],
 )
 def test_unusable_settings_are_named(field, value):
-    with pytest.raises(ValueError, match=f"denoise.{field}"):
+    with pytest.raises(ValueError, match=field):
         DenoiseSpec(**{field: value})
 
 

@@ -7,6 +7,7 @@ import pytest
 from support import double_precision
 
 from geosplat_jax.core.types import EnvLight
+from geosplat_jax.transport import environment
 from geosplat_jax.transport.environment import (
     LightSpec,
     direction_to_uv,
@@ -16,15 +17,16 @@ from geosplat_jax.transport.environment import (
     init_light,
     level_of_roughness,
     light_directions,
-    lookup,
     prefilter,
     prefilter_operators,
-    prefiltered_diffuse,
-    prefiltered_specular,
-    rotate_light,
     texel_solid_angles,
     to_y_up_map,
 )
+
+# One compilation costs less than a dozen eager operations.
+lookup, rotate_light = jax.jit(environment.lookup), jax.jit(environment.rotate_light)
+prefiltered_specular = jax.jit(environment.prefiltered_specular)
+prefiltered_diffuse = jax.jit(environment.prefiltered_diffuse)
 
 ROUNDING = 5e-6  # float32 coordinates, and values between neighbouring texels
 QUADRATURE = 2e-3  # rings and spokes of the operators against brute force on noise
@@ -155,9 +157,8 @@ def test_directions_on_poles_seam_and_zero_have_finite_gradients(count):
     edges = np.concatenate([AXES, [[0, 0, 0], [1e-20, 0, 1], [1e-6, 1e-6, -1], [-1, -0.0, 0]]])
     directions = jnp.asarray(np.tile(edges, (count, 1)), jnp.float32)
     texels = jnp.asarray(_texels(), jnp.float32)
-    by_texels, by_direction = jax.grad(lambda t, d: jnp.sum(jnp.sin(lookup(t, d))), argnums=(0, 1))(
-        texels, directions
-    )
+    total = lambda t, d: jnp.sum(jnp.sin(lookup(t, d)))  # noqa: E731
+    by_texels, by_direction = jax.jit(jax.grad(total, argnums=(0, 1)))(texels, directions)
     assert np.all(np.isfinite(by_texels))
     assert np.all(np.isfinite(by_direction))
     assert np.max(np.abs(by_direction)) < 1e5
@@ -166,30 +167,12 @@ def test_directions_on_poles_seam_and_zero_have_finite_gradients(count):
 
 def test_a_direction_at_the_pole_does_not_disturb_other_gradients():
     texels, directions = jnp.asarray(_texels(), jnp.float32), _unit(20, seed=3)
-    gradient = jax.grad(lambda d: jnp.sum(jnp.sin(lookup(texels, d))))
+    gradient = jax.jit(jax.grad(lambda d: jnp.sum(jnp.sin(lookup(texels, d)))))
     plain = gradient(jnp.asarray(directions, jnp.float32))
     directions[4] = [0, 0, 1]
     mixed = gradient(jnp.asarray(directions, jnp.float32))
     others = np.arange(20) != 4
     np.testing.assert_array_equal(plain[others], mixed[others])
-
-
-def test_lookup_gradients_match_finite_differences():
-    with double_precision():
-        texels, directions = jnp.asarray(_texels()), jnp.asarray(_unit(40, seed=4))
-        weights = jnp.asarray(_unit(40, seed=5))
-        target = lambda t, d: jnp.sum(weights * jnp.sin(3 * lookup(t, d)))  # noqa: E731
-        gradients = jax.jit(jax.grad(target, argnums=(0, 1)))(texels, directions)
-        target = jax.jit(target)
-        rng, step = np.random.default_rng(6), 1e-7
-        moves = [jnp.asarray(rng.standard_normal(a.shape)) for a in (texels, directions)]
-        for which in (0, 1):
-            move = moves[which]
-            ahead = [texels, directions]
-            behind = [texels, directions]
-            ahead[which], behind[which] = ahead[which] + step * move, behind[which] - step * move
-            difference = (target(*ahead) - target(*behind)) / (2 * step)
-            np.testing.assert_allclose(jnp.sum(gradients[which] * move), difference, rtol=1e-6)
 
 
 def test_a_quarter_turn_about_z_rolls_the_map():
@@ -319,12 +302,12 @@ def test_prefilter_is_linear_and_its_gradient_is_the_adjoint():
     operators = prefilter_operators(SMALL)
     with double_precision():
         first, second = jnp.asarray(_texels(seed=14)), jnp.asarray(_texels(seed=15))
-        run = lambda t: prefilter(EnvLight(t), operators).specular  # noqa: E731
+        run = jax.jit(lambda t: prefilter(EnvLight(t), operators).specular)
         np.testing.assert_allclose(
             run(2 * first - second), 2 * run(first) - run(second), atol=1e-12
         )
         weights = jnp.asarray(np.random.default_rng(16).standard_normal((4, 16, 32, 3)))
-        gradient = jax.grad(lambda t: jnp.sum(weights * run(t)))(first)
+        gradient = jax.jit(jax.grad(lambda t: jnp.sum(weights * run(t))))(first)
         np.testing.assert_allclose(
             jnp.sum(gradient * second), jnp.sum(weights * run(second)), rtol=1e-12
         )
@@ -340,7 +323,7 @@ def test_operators_refuse_a_light_of_another_size():
     [(0, 2), (16, 31), (16, 32, (0.0, 0.5)), (16, 32, (0.5, 0.2, 1.0)), (16, 32, (-0.1, 1.0))],
 )
 def test_impossible_specs_are_refused(arguments):
-    with pytest.raises(ValueError, match=r"row|increase"):
+    with pytest.raises(ValueError, match=r"greater than or equal to 1|even width|increase"):
         LightSpec(*arguments)
 
 
@@ -365,27 +348,6 @@ def test_filtered_lookup_reads_its_levels_and_blends_between_them():
     np.testing.assert_allclose(
         prefiltered_diffuse(prefiltered, directions), by_level[-1], atol=ROUNDING
     )
-
-
-def test_filtered_lookup_gradients_match_finite_differences():
-    with double_precision():
-        operators = prefilter_operators(SMALL)
-        roughness = jnp.asarray(np.random.default_rng(19).uniform(0.05, 0.95, 30))
-        arguments = (jnp.asarray(_texels(seed=20)), jnp.asarray(_unit(30, seed=21)), roughness)
-
-        def target(texels, directions, roughness):
-            prefiltered = prefilter(EnvLight(texels), operators)
-            return jnp.sum(prefiltered_specular(prefiltered, directions, roughness) ** 2)
-
-        gradients = jax.jit(jax.grad(target, argnums=(0, 1, 2)))(*arguments)
-        target = jax.jit(target)
-        rng, step = np.random.default_rng(22), 1e-7
-        for which, gradient in enumerate(gradients):
-            move = jnp.asarray(rng.standard_normal(gradient.shape))
-            ahead, behind = list(arguments), list(arguments)
-            ahead[which], behind[which] = ahead[which] + step * move, behind[which] - step * move
-            difference = (target(*ahead) - target(*behind)) / (2 * step)
-            np.testing.assert_allclose(jnp.sum(gradient * move), difference, rtol=2e-6)
 
 
 @pytest.mark.slow

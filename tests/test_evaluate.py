@@ -3,32 +3,39 @@
 import json
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
-from support import STAGE_2, ball_of_one_material, tiny_config, views_from
+from support import MONTE_CARLO, ball_of_one_material, tiny_config, views_from
 
 from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.core.types import EnvLight
-from geosplat_jax.fit.stages import begin_stage_2
+from geosplat_jax.fit.train import Trained
 from geosplat_jax.report.evaluate import evaluate_run, preview_image
 from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.renderer import RELIGHT_BOUNCES, Renderer
 
-AMPLE = Capacities(256, 256, 256, 4096, 8192, 2048, 4096)
+AMPLE = Capacities(
+    surface_cubes=256,
+    dual_vertices=256,
+    quads=256,
+    visible=4096,
+    hits=8192,
+    chunks=2048,
+    cell_patches=4096,
+)
 # As under a new light, so that both share their programs.
 CONFIG = tiny_config(
-    "model.material.bias=true",
-    *STAGE_2,
-    "transport.fresh_albedo=false",
-    "transport.shading.indirect=traced",
-    f"transport.shading.bounces={RELIGHT_BOUNCES}",
+    "material.bias=true",
+    *MONTE_CARLO,
+    "stages.monte_carlo.enter=[]",
+    "stages.monte_carlo.transport.indirect=traced",
+    f"stages.monte_carlo.transport.bounces={RELIGHT_BOUNCES}",
 )
 SAMPLES = 32
 SCALE = np.array([0.5, 0.8, 0.9])
-FIGURES = ("psnr", "ssim", "psnr_masked", "ssim_masked")
+MEASURES = ("psnr", "ssim", "psnr_masked", "ssim_masked")
 LIGHT_NAMES = ("evening", "noon")
 NEW_VIEWS = {"nvs.psnr", "nvs.ssim", "nvs.psnr_masked", "nvs.ssim_masked", "mask.iou"}
 
@@ -43,9 +50,10 @@ LIGHTS = {name: sky(seed) for seed, name in enumerate(LIGHT_NAMES)}
 
 @pytest.fixture(scope="module")
 def run():
-    """Settings, parameters, context of a ball in stage 2 whose materials vary in space."""
-    params, context = ball_of_one_material(CONFIG, albedo=0.6, roughness=0.5, metallic=0.3)
-    params = begin_stage_2(replace(params, light=sky(7)), context.grid, CONFIG, jax.random.key(1))
+    """A ball in the second stage, whose materials vary in space."""
+    pipeline, params = ball_of_one_material(
+        CONFIG, albedo=0.6, roughness=0.5, metallic=0.3, stage="monte_carlo"
+    )
     rng = np.random.default_rng(0)
     table = params.material.albedo_table
     field = replace(
@@ -61,7 +69,13 @@ def run():
     field = replace(
         field, albedo_head=varied(field.albedo_head), surface_head=varied(field.surface_head)
     )
-    return CONFIG.stage(2), replace(params, material=field), context
+    return Trained(
+        config=CONFIG,
+        stage=CONFIG.stage("monte_carlo"),
+        params=replace(params, light=sky(7), material=field),
+        pipeline=replace(pipeline, capacities=AMPLE),
+        step=3,
+    )
 
 
 def straight(values, alpha):
@@ -76,8 +90,7 @@ def views(run):
     The true albedo is the parameters' times `SCALE`, and so are the relit pictures.
     """
     cameras = views_from([[2.2, -1.8, 1.0], [-2.0, 0.5, 1.5]], size=16)
-    config, params, context = run
-    renderer = Renderer(config, params, context, AMPLE, samples=SAMPLES)
+    renderer = Renderer.of(run, samples=SAMPLES)
 
     def pictures(renderer):
         found = [renderer(cameras.camera([k])) for k in range(len(cameras))]
@@ -105,18 +118,18 @@ def views(run):
 
 def evaluate(run, views, folder, **kwargs):
     options = {"lights": LIGHTS, "meta": {"step": 7}, "samples": SAMPLES, **kwargs}
-    return evaluate_run(*run, AMPLE, views, folder, **options)
+    return evaluate_run(run, views, folder, **options)
 
 
 @pytest.fixture(scope="module")
 def perfect(run, views, tmp_path_factory):
     folder = tmp_path_factory.mktemp("perfect")
-    return folder, evaluate(run, views, folder, train_light=run[1].light)
+    return folder, evaluate(run, views, folder, train_light=run.params.light)
 
 
 def test_truth_of_the_own_making_is_met(perfect):
-    _, figures = perfect
-    mean = figures["mean"]
+    _, metrics = perfect
+    mean = metrics["mean"]
     assert mean["nvs.psnr"] > 60
     assert mean["nvs.ssim"] > 0.9999
     assert mean["mask.iou"] == 1.0
@@ -134,24 +147,24 @@ def test_truth_of_the_own_making_is_met(perfect):
     assert mean["light.yaw_error_deg"] == 0.0
 
 
-def test_every_documented_figure_is_there_and_is_a_number(perfect):
-    folder, figures = perfect
-    mean = figures["mean"]
-    expected = {f"albedo.{key}" for key in FIGURES}
-    expected |= {f"relight.{n}.{key}" for n in (*LIGHT_NAMES, "mean") for key in FIGURES}
+def test_every_documented_metric_is_there_and_is_a_number(perfect):
+    folder, metrics = perfect
+    mean = metrics["mean"]
+    expected = {f"albedo.{key}" for key in MEASURES}
+    expected |= {f"relight.{n}.{key}" for n in (*LIGHT_NAMES, "mean") for key in MEASURES}
     expected |= {
         f"{name}.{key}" for name in ("roughness", "metallic") for key in ("mse", "mse_full")
     }
     expected |= NEW_VIEWS
     assert expected <= set(mean)
     assert all(np.isfinite(value) for value in mean.values())
-    for key in FIGURES:
+    for key in MEASURES:
         by_light = [mean[f"relight.{name}.{key}"] for name in LIGHT_NAMES]
         assert mean[f"relight.mean.{key}"] == pytest.approx(np.mean(by_light))
-    assert [line["view"] for line in figures["views"]] == ["view_0", "view_1"]
-    assert figures["step"] == 7
-    assert figures["samples"] == SAMPLES
-    assert json.loads((folder / "metrics.json").read_text()) == json.loads(json.dumps(figures))
+    assert [line["view"] for line in metrics["views"]] == ["view_0", "view_1"]
+    assert metrics["step"] == 7
+    assert metrics["samples"] == SAMPLES
+    assert json.loads((folder / "metrics.json").read_text()) == json.loads(json.dumps(metrics))
 
 
 def test_the_files_are_written(perfect):
@@ -168,21 +181,21 @@ def test_the_files_are_written(perfect):
         assert np.ptp(pixels) > 100
 
 
-def test_without_truth_there_are_no_figures_of_it(run, views, tmp_path):
+def test_without_truth_there_are_no_metrics_of_it(run, views, tmp_path):
     bare = replace(views, truth={}, relight={})
-    figures = evaluate(run, bare, tmp_path)
-    assert set(figures["mean"]) == NEW_VIEWS
+    metrics = evaluate(run, bare, tmp_path)
+    assert set(metrics["mean"]) == NEW_VIEWS
     assert {path.name for path in tmp_path.iterdir()} == {"metrics.json", "overview.png"}
 
 
 def test_relit_truth_without_its_map_is_left_out(run, views, tmp_path):
-    figures = evaluate(run, views, tmp_path, lights={"noon": LIGHTS["noon"], "other": sky(9)})
-    mean = figures["mean"]
+    metrics = evaluate(run, views, tmp_path, lights={"noon": LIGHTS["noon"], "other": sky(9)})
+    mean = metrics["mean"]
     assert {key.split(".")[1] for key in mean if key.startswith("relight.")} == {"noon", "mean"}
     assert mean["relight.mean.psnr"] == mean["relight.noon.psnr"]
 
 
-def test_a_part_of_the_truth_gives_its_part_of_the_figures(run, views, tmp_path):
+def test_a_part_of_the_truth_gives_its_part_of_the_metrics(run, views, tmp_path):
     part = replace(views, truth={"roughness": views.truth["roughness"]}, relight={})
     mean = evaluate(run, part, tmp_path)["mean"]
     assert set(mean) == NEW_VIEWS | {"roughness.mse", "roughness.mse_full"}
@@ -227,16 +240,16 @@ def test_protocols_change_their_looks_and_nothing_else(run, views, perfect, tmp_
         np.testing.assert_allclose([mean[f"albedo.scale_{c}"] for c in "rgb"], SCALE, rtol=1e-3)
 
 
-def test_a_view_without_an_object_has_no_part_in_masked_figures(run, views, tmp_path):
+def test_a_view_without_an_object_has_no_part_in_masked_metrics(run, views, tmp_path):
     images = np.array(views.images)
     images[1] = 0.0
-    figures = evaluate(run, replace(views, images=images, relight={}), tmp_path)
-    with_object, empty = figures["views"]
+    metrics = evaluate(run, replace(views, images=images, relight={}), tmp_path)
+    with_object, empty = metrics["views"]
     masked = {key for key in with_object if "masked" in key}
     assert masked == {"nvs.psnr_masked", "nvs.ssim_masked", "normal.mae_masked_deg"}
     assert not masked & set(empty)
     for key in masked:
-        assert figures["mean"][key] == with_object[key]
+        assert metrics["mean"][key] == with_object[key]
 
 
 def test_an_unknown_protocol_is_refused_before_any_work(run, views, tmp_path):
@@ -246,8 +259,7 @@ def test_an_unknown_protocol_is_refused_before_any_work(run, views, tmp_path):
 
 
 def test_the_preview_shows_truth_render_and_normals(run, views):
-    config, params, context = run
-    shown = preview_image(config, params, context, AMPLE, views)
+    shown = preview_image(run, views)
     assert shown.shape == (16, 48, 3)
     np.testing.assert_allclose(shown[:, :16], shown[:, 16:32], atol=0.2)
     assert np.ptp(shown[:, 32:]) > 0.3

@@ -1,3 +1,5 @@
+"""Exported meshes, Gaussians and lights hold what was given; broken input leaves no file."""
+
 import json
 import struct
 

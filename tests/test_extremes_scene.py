@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,20 +9,23 @@ import numpy as np
 import pytest
 from support import look_at_poses, sphere_dataset, sphere_views, tiny_config
 
+from geosplat_jax.adapter import FaceSplats, VertexSplats
 from geosplat_jax.core.capacity import Capacities, fits
 from geosplat_jax.core.numerics import safe_norm
 from geosplat_jax.core.types import Batch, Camera
-from geosplat_jax.fit.stages import initial_params, make_context
+from geosplat_jax.fit.stages import build_pipeline, initial_params
 from geosplat_jax.fit.train import fit
+from geosplat_jax.geometry import FlexiCubes, initial_geometry
 from geosplat_jax.io.export import export_gaussians_ply
 from geosplat_jax.io.views import Views
-from geosplat_jax.losses import LossWeights, loss
-from geosplat_jax.render import reconstruct, render
+from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.surface.hull import fit_grid, hull_bounds, hull_sdf
 from geosplat_jax.transport.environment import init_light, prefilter, prefilter_operators
 
-CONFIG = tiny_config("geometry.resolution=8", "objective.with_light=true")
-ROOM = Capacities(256, 256, 256, 2048, 4096, 1024)
+CONFIG = tiny_config("geometry.resolution=8")
+ROOM = Capacities(
+    surface_cubes=256, dual_vertices=256, quads=256, visible=2048, hits=4096, chunks=1024
+)
 SIZE = (13, 7)  # no tile divides it
 FIELD_OF_VIEW = 0.6
 POWERS = [2.0**-20, 2.0**20]  # exact in float32: every rounding is the same
@@ -45,8 +47,12 @@ def scaled_bounds(scale):
     return np.full(3, -OBJECT * scale), np.full(3, OBJECT * scale)
 
 
-def scaled_context(scale):
-    return make_context(fit_grid(scaled_bounds(scale), CONFIG.geometry.resolution), CONFIG.model)
+def scaled_pipeline(scale):
+    """The first stage in a world ``scale`` times as large, with the term of the light as well."""
+    grid = fit_grid(scaled_bounds(scale), CONFIG.geometry.resolution)
+    pipeline = build_pipeline(CONFIG, CONFIG.stage("split_sum"), FlexiCubes(grid))
+    weights = pipeline.weights | {"light": jnp.float32(0.1)}
+    return replace(pipeline, capacities=ROOM, weights=weights)
 
 
 def camera_of(size, *, field_of_view=FIELD_OF_VIEW, scale=1.0, distance=3.0) -> Camera:
@@ -77,17 +83,18 @@ def make_batch(size, *, key=1, **settings) -> Batch:
 def make_params(sdf=None):
     """A sphere of radius .4 with materials and light that vary."""
     rng = np.random.default_rng(0)
-    grid = scaled_context(1.0).grid
+    grid = scaled_pipeline(1.0).surface.grid
     if sdf is None:
         steps = np.moveaxis(np.indices(grid.vertex_shape)[::-1], 0, -1).reshape(-1, 3)
         away = np.linalg.norm(steps - 0.5 * np.array(grid.shape), axis=-1)
         sdf = away - 0.4 / float(grid.cell_size)
-    params = initial_params(jnp.asarray(sdf, jnp.float32), grid, CONFIG, jax.random.key(0))
+    geometry = initial_geometry(grid, jnp.asarray(sdf, jnp.float32))
+    params = initial_params(geometry, CONFIG, jax.random.key(0))
 
     def vary(leaf, width):
         return leaf + jnp.asarray(rng.uniform(-width, width, leaf.shape), jnp.float32)
 
-    light = init_light(CONFIG.model.light.height, width=CONFIG.model.light.width)
+    light = init_light(CONFIG.light.height, width=CONFIG.light.width)
     return replace(
         params,
         geometry=jax.tree.map(lambda leaf: vary(leaf, 0.05), params.geometry),
@@ -96,21 +103,18 @@ def make_params(sdf=None):
     )
 
 
-STATIC = {"model": CONFIG.model, "capacities": ROOM}
 # Compiling takes far longer than running: half the time without these passes.
 FAST = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 
 
-def _evaluate(params, batch, context):
-    (total, report), gradient = jax.value_and_grad(loss, has_aux=True)(
-        params, batch, context, LossWeights(light=0.1), objective=CONFIG.objective, **STATIC
-    )
+def _evaluate(pipeline, params, batch):
+    (total, report), gradient = jax.value_and_grad(pipeline.loss, has_aux=True)(params, batch)
     return total, report, gradient
 
 
-def _everything(params, batch, context):
-    output = render(params, batch.camera, context, aov_names=("normal", "depth"), **STATIC)
-    return *_evaluate(params, batch, context), output
+def _everything(pipeline, params, batch):
+    output = pipeline.render(params, batch.camera, aov_names=("normal", "depth"))
+    return *_evaluate(pipeline, params, batch), output
 
 
 evaluate = jax.jit(_evaluate, compiler_options=FAST)  # loss, its report and gradient
@@ -136,7 +140,7 @@ def norm(leaf):
 
 @pytest.fixture(scope="module")
 def unit_scene():
-    return everything(make_params(), make_batch(SIZE), scaled_context(1.0))
+    return everything(scaled_pipeline(1.0), make_params(), make_batch(SIZE))
 
 
 def test_a_scene_in_the_unit_world_is_a_sphere_with_gradients_everywhere(unit_scene):
@@ -152,7 +156,7 @@ def test_a_scene_in_the_unit_world_is_a_sphere_with_gradients_everywhere(unit_sc
 @pytest.mark.parametrize("scale", POWERS)
 def test_a_world_scaled_by_a_power_of_two_gives_the_same_bits(unit_scene, scale):
     *scaled, picture = everything(
-        make_params(), make_batch(SIZE, scale=scale), scaled_context(scale)
+        scaled_pipeline(scale), make_params(), make_batch(SIZE, scale=scale)
     )
     lengths = {"depth": picture.aovs["depth"] / np.float32(scale)}  # all else has no unit
     picture = replace(picture, aovs=picture.aovs | lengths)
@@ -165,7 +169,7 @@ def test_a_world_scaled_by_a_power_of_two_gives_the_same_bits(unit_scene, scale)
 @pytest.mark.parametrize("scale", DECIMALS)
 def test_a_world_of_any_unit_gives_the_same_loss_picture_and_gradient(unit_scene, scale):
     total, report, gradient, output = everything(
-        make_params(), make_batch(SIZE, scale=scale), scaled_context(scale)
+        scaled_pipeline(scale), make_params(), make_batch(SIZE, scale=scale)
     )
     assert float(total) == pytest.approx(float(unit_scene[0]), rel=ROUNDING)
     for name, value in unit_scene[1].terms.items():
@@ -179,21 +183,27 @@ def test_a_world_of_any_unit_gives_the_same_loss_picture_and_gradient(unit_scene
 
 @pytest.mark.parametrize("sampling", ["face", "vertex"])
 def test_splats_grow_with_the_world(sampling):
-    build = jax.jit(partial(reconstruct, sampling=sampling, **STATIC), compiler_options=FAST)
-    one, two = (build(make_params(), scaled_context(s)) for s in (1.0, 2.0**10))
-    count = int(one.gaussians.count)
-    assert count > 50
-    for name in ("means", "scales"):
-        small, large = (np.asarray(getattr(x.gaussians, name))[:count] for x in (one, two))
-        np.testing.assert_array_equal(large, small * np.float32(2.0**10))
-    assert float(one.gaussians.scales[0, 2]) == pytest.approx(
-        CONFIG.model.adapter.thickness * 0.5 * 8 * float(scaled_context(1.0).grid.cell_size)
+    build = jax.jit(Pipeline.reconstruct, compiler_options=FAST)
+    splats = {"face": FaceSplats, "vertex": VertexSplats}[sampling](CONFIG.adapter)
+    one, two = (
+        build(replace(scaled_pipeline(s), splats=splats), make_params()) for s in (1.0, 2.0**10)
     )
-    for part in ("materials", "deviation", "outward"):
-        for a, b in zip(
-            jax.tree.leaves(getattr(one, part)), jax.tree.leaves(getattr(two, part)), strict=True
-        ):
-            np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+    count = int(one.splats.count)
+    assert count > 50
+    for name in ("means", "scales", "anchors"):
+        small, large = (np.asarray(getattr(x.splats, name))[:count] for x in (one, two))
+        np.testing.assert_array_equal(large, small * np.float32(2.0**10))
+    assert float(one.splats.scales[0, 2]) == pytest.approx(
+        CONFIG.adapter.thickness * float(scaled_pipeline(1.0).surface.box.half_extent)
+    )
+    parts = [
+        (x.attributes, x.splats.outward, x.splats.normals, x.splats.parents) for x in (one, two)
+    ]
+    for a, b in zip(*map(jax.tree.leaves, parts), strict=True):
+        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+    # The mean deviation of the surface is a length.
+    deviations = [float(x.surface.deviation) for x in (one, two)]
+    assert deviations[1] == deviations[0] * 2.0**10
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
@@ -217,15 +227,11 @@ def test_the_hull_starts_from_the_same_cells_in_any_unit(scale):
 
 
 def test_the_first_light_has_the_size_of_the_model():
-    config = tiny_config("model.light.height=1", "model.light.width=6")
-    grid = scaled_context(1.0).grid
-    params = initial_params(jnp.zeros(grid.vertex_count), grid, config, jax.random.key(0))
+    config = tiny_config("light.height=1", "light.width=6")
+    params = initial_params(make_params().geometry, config, jax.random.key(0))
     assert params.light.radiance.shape == (1, 6, 3)
-    assert prefilter(params.light, prefilter_operators(config.model.light)).diffuse.shape == (
-        1,
-        6,
-        3,
-    )
+    filtered = prefilter(params.light, prefilter_operators(config.light))
+    assert filtered.diffuse.shape == (1, 6, 3)
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e-12, 1e12])
@@ -260,19 +266,36 @@ def run_of(scale, folder):
     views = replace(dataset.train, camera_to_world=poses)
     lo, hi = dataset.bounds
     dataset = replace(dataset, train=views, test=views, bounds=(lo * scale, hi * scale))
-    fit(dataset, tiny_config("run.steps=2"), folder)
+    fit(dataset, tiny_config("stages.split_sum.steps=2"), folder)
     lines = (folder / "metrics.jsonl").read_text().splitlines()
     return [json.loads(line) for line in lines]
+
+
+def numbers(line):
+    """What a step says about the loss."""
+    return {k: v for k, v in line.items() if k in ("loss", "psnr", "faces") or k[:5] == "term."}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", POWERS)
+def test_training_takes_the_very_same_steps_in_units_of_a_power_of_two(unit_run, scale, tmp_path):
+    assert list(map(numbers, run_of(scale, tmp_path))) == list(map(numbers, unit_run))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", DECIMALS)
 def test_training_takes_the_same_steps_in_any_unit(unit_run, scale, tmp_path):
-    for mine, theirs in zip(run_of(scale, tmp_path), unit_run, strict=True):
-        assert mine["faces"] == theirs["faces"]
+    """Up to rounding, which decides where the first step moves what has hardly any gradient.
+
+    That step goes by the sign of the gradient, hence entries of the encodings may go the other way,
+    which shows in the smoothness after it and nowhere else.
+    """
+    for step, (mine, theirs) in enumerate(zip(run_of(scale, tmp_path), unit_run, strict=True)):
+        mine, theirs = numbers(mine), numbers(theirs)
+        assert mine.keys() == theirs.keys()
         for name, value in theirs.items():
-            if name in ("loss", "psnr") or name.startswith("term."):
-                assert mine[name] == pytest.approx(value, rel=1e-3, abs=1e-6)
+            share = 0.1 if step > 0 and "smoothness" in name else 1e-3
+            assert mine[name] == pytest.approx(value, rel=share, abs=1e-6), (step, name)
 
 
 # Lenses and images
@@ -289,19 +312,21 @@ def disc_area(size, field_of_view, distance, radius=0.4):
 )
 def test_coverage_is_the_disc_of_the_sphere_through_any_lens(degrees, distance):
     lens = {"field_of_view": np.radians(degrees), "distance": distance}
-    result = everything(make_params(), make_batch(SIZE, **lens), scaled_context(1.0))
+    result = everything(scaled_pipeline(1.0), make_params(), make_batch(SIZE, **lens))
     assert_sound(*result)
     covered = float(np.sum(result[-1].alpha))
     assert covered == pytest.approx(disc_area(SIZE, **lens), rel=0.25)
     assert norm(result[2].geometry.sdf) > 0.0
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 20), pytest.param((3, 5), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("size", [(1, 1), pytest.param((1, 20), marks=pytest.mark.slow)])
 def test_one_small_view_has_a_finite_loss_and_gradient(size):
     lens = {"field_of_view": 2 * np.arctan(0.5 * min(size) / 30.0)}  # a focal length of 30 pixels
-    total, report, gradient = evaluate(make_params(), make_batch(size, **lens), scaled_context(1.0))
+    total, report, gradient = evaluate(
+        scaled_pipeline(1.0), make_params(), make_batch(size, **lens)
+    )
     assert_sound(total, report, gradient)
-    assert int(report.usage.visible) > 0
+    assert int(report.usage["visible"]) > 0
     for term in ("l1", "mask"):
         assert 0.0 < float(report.terms[term]) <= 1.0
     assert 0.0 < float(report.terms["ssim"]) <= 2.0
@@ -315,16 +340,17 @@ def test_one_small_view_has_a_finite_loss_and_gradient(size):
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_field_of_one_sign_has_no_surface_and_nothing_but_the_background(unit_scene, sign):
     rng = np.random.default_rng(1)
-    count = scaled_context(1.0).grid.vertex_count
+    count = scaled_pipeline(1.0).surface.grid.vertex_count
     params = make_params(sign * rng.uniform(1.0, 3.0, count))
-    result = everything(params, make_batch(SIZE), scaled_context(1.0))
+    result = everything(scaled_pipeline(1.0), params, make_batch(SIZE))
     assert_sound(*result)
     _, report, gradient, output = result
     assert int(report.face_count) == 0
-    assert int(report.gaussian_count) == 0
-    for name in ("entropy", "deviation", "smoothness", "light"):
-        expected = 0.0 if name != "light" else float(_light_of_black())
-        assert float(report.terms[name]) == pytest.approx(expected, rel=1e-5)
+    assert int(report.splat_count) == 0
+    empty = ("entropy", "deviation", "smoothness_albedo", "smoothness_roughness_metallic")
+    for name in empty:
+        assert float(report.terms[name]) == 0.0
+    assert float(report.terms["light"]) == pytest.approx(float(_light_of_black()), rel=1e-5)
     for image in jax.tree.leaves((output.rgb, output.alpha, output.aovs)):
         np.testing.assert_array_equal(np.asarray(image), 0.0)
     seen = (gradient.geometry.sdf, gradient.geometry.deform, gradient.material, gradient.light)
@@ -340,19 +366,19 @@ def _light_of_black():
 
 def test_a_single_quad_is_rendered_and_differentiated():
     """One negative vertex on a side of the box: its edge inwards is the only one with a quad."""
-    grid = scaled_context(1.0).grid
+    grid = scaled_pipeline(1.0).surface.grid
     sdf = np.ones(grid.vertex_shape[::-1])
     pose = look_at_poses(5)[1]
     axis = int(np.argmax(np.abs(pose[:3, 2])))  # the side that faces the camera most
     index = [4, 4, 4]
     index[axis] = 8 if pose[axis, 2] < 0 else 0
     sdf[tuple(index[::-1])] = -1.0
-    result = everything(make_params(sdf.reshape(-1)), make_batch(SIZE), scaled_context(1.0))
+    result = everything(scaled_pipeline(1.0), make_params(sdf.reshape(-1)), make_batch(SIZE))
     assert_sound(*result)
     _, report, gradient, output = result
-    assert int(report.usage.quads) == 1
+    assert int(report.usage["quads"]) == 1
     assert int(report.face_count) == 4
-    assert int(report.gaussian_count) == 24
+    assert int(report.splat_count) == 24
     assert 0.05 < float(np.max(output.alpha)) <= 1.0
     assert 0 < np.count_nonzero(gradient.geometry.sdf) <= 18  # the corners of the four cells
 
@@ -362,7 +388,7 @@ def test_a_single_quad_is_rendered_and_differentiated():
 
 def test_a_black_exposure_leaves_only_the_coverage(unit_scene):
     params = replace(make_params(), log_exposure=jnp.float32(-20.0))
-    result = everything(params, make_batch(SIZE), scaled_context(1.0))
+    result = everything(scaled_pipeline(1.0), params, make_batch(SIZE))
     assert_sound(*result)
     np.testing.assert_array_equal(result[-1].rgb, unit_scene[-1].rgb)  # before the exposure
     assert 0.0 < abs(float(result[2].log_exposure)) < 1e-8  # e^-20 is 2e-9
@@ -371,7 +397,7 @@ def test_a_black_exposure_leaves_only_the_coverage(unit_scene):
 
 def test_a_burnt_out_exposure_keeps_the_gradient_of_the_coverage(unit_scene):
     params = replace(make_params(), log_exposure=jnp.float32(20.0))
-    result = everything(params, make_batch(SIZE), scaled_context(1.0))
+    result = everything(scaled_pipeline(1.0), params, make_batch(SIZE))
     assert_sound(*result)
     assert float(result[1].terms["mask"]) == float(unit_scene[1].terms["mask"])
     assert norm(result[2].geometry.sdf) > 1e-3

@@ -14,7 +14,7 @@ from support import double_precision
 
 from geosplat_jax.core.color import linear_to_srgb, srgb_to_linear, tone_map
 from geosplat_jax.core.ssim import ssim
-from geosplat_jax.core.types import EnvLight, Materials
+from geosplat_jax.core.types import Box, EnvLight, Materials
 from geosplat_jax.hashgrid import HashGridSpec, encode, init_tables
 from geosplat_jax.materials import MaterialSpec, attributes_at, init_materials, smoothness
 from geosplat_jax.transport import bsdf
@@ -78,9 +78,6 @@ def assert_rows_close(single, double, *, rtol, atol=0.0):
     bound = rtol * np.linalg.norm(double, axis=1) + atol
     worst = int(np.argmax(error - bound))
     assert error[worst] <= bound[worst], (worst, single[worst], double[worst])
-
-
-# Reflectance
 
 
 @pytest.fixture(scope="module")
@@ -156,6 +153,15 @@ def test_the_coat_returns_at_most_what_the_visible_normals_send(pairs):
     assert np.all(returned <= np.asarray(sent) * (1 + 1e-5))
 
 
+@jax.jit
+def draw(materials, normals, wo, uniforms):
+    """Sampled directions, the light that they reflect and their density."""
+    wi = bsdf.sample(materials, normals, wo, uniforms)
+    value = bsdf.evaluate(materials, normals, wi, wo)
+    density = bsdf.pdf(materials, normals, wi, wo)
+    return wi, value * jnp.sum(wi * normals, axis=-1, keepdims=True), density
+
+
 @pytest.mark.parametrize("normal", [[0, 0, 1], [0.48, -0.6, 0.64], [0, 0, -1]])
 def test_samples_are_unit_directions_of_bounded_weight(normal):
     cosine_o, roughness, albedo, metallic, lobe, u, v = columns(
@@ -176,13 +182,6 @@ def test_samples_are_unit_directions_of_bounded_weight(normal):
     normals = jnp.broadcast_to(jnp.asarray(normal, jnp.float32), wo.shape)
     uniforms = jnp.asarray(np.stack([lobe, u, v], -1), jnp.float32)
 
-    @jax.jit
-    def draw(materials, normals, wo, uniforms):
-        wi = bsdf.sample(materials, normals, wo, uniforms)
-        value = bsdf.evaluate(materials, normals, wi, wo)
-        density = bsdf.pdf(materials, normals, wi, wo)
-        return wi, value * jnp.sum(wi * normals, axis=-1, keepdims=True), density
-
     wi, value, density = (np.asarray(x, np.float64) for x in draw(materials, normals, wo, uniforms))
     np.testing.assert_allclose(np.linalg.norm(wi, axis=-1), 1.0, atol=ROUNDING)
     assert np.isfinite(density).all()
@@ -194,9 +193,7 @@ def test_samples_are_unit_directions_of_bounded_weight(normal):
     assert density[above].min() > 0.0
 
 
-# Light
-
-TINY = [(1, 2), (1, 8), (2, 2), (3, 4), (8, 16)]
+TINY = [(1, 2), (3, 4), (8, 16)]
 LEVELS = (0.0, 0.15, 0.5, 1.0)
 SUN = 1e5
 POINTS = np.array(
@@ -293,9 +290,6 @@ def test_a_map_of_one_row_is_constant_in_elevation():
     np.testing.assert_allclose(levels, 0.7, rtol=ROUNDING)
 
 
-# Split sum
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [(1, 2), (8, 16)])
 def test_split_sum_is_that_of_float64_at_every_extreme(size):
@@ -349,8 +343,6 @@ def test_black_light_and_black_metal_shade_black():
     _, bias = fg_lookup(fg_table(), jnp.abs(views[:, 2]), jnp.full((count,), 0.5))
     np.testing.assert_allclose(shaded.rgb[:, 0], bias, atol=ROUNDING)  # Fresnel at the rim only
 
-
-# Hash grid and materials
 
 GRID = HashGridSpec(levels=3, features=2, log2_entries=8, coarsest=4, finest=32)
 
@@ -419,25 +411,23 @@ def test_saturated_attributes_are_at_their_limits_and_no_longer_learn(logit):
     names = ("albedo_head", "surface_head", "shift_head")
     field = replace(field, **{name: saturate(getattr(field, name)) for name in names})
     points = jnp.asarray(np.random.default_rng(6).uniform(-1.2, 1.2, (40, 3)), jnp.float32)
-    where = {"spec": spec, "center": jnp.zeros(3), "half_extent": jnp.ones(())}
+    box = Box(jnp.zeros(3), jnp.ones(()))
 
     def total(field):
-        materials, shift = attributes_at(field, points, **where)
-        parts = (materials.albedo, materials.roughness, materials.metallic, shift)
-        rough = smoothness(field, points, jnp.ones(40, bool), jax.random.key(2), **where)
-        return sum(jnp.sum(part) for part in parts) + rough, (materials, shift, rough)
+        found = attributes_at(field, points, box, spec=spec)
+        changes = smoothness(field, points, jnp.ones(40, bool), jax.random.key(2), box, spec=spec)
+        parts = jax.tree.leaves((found, changes))
+        return sum(jnp.sum(part) for part in parts), (found, changes)
 
-    gradient, (materials, shift, rough) = jax.jit(jax.grad(total, has_aux=True))(field)
+    gradient, (found, changes) = jax.jit(jax.grad(total, has_aux=True))(field)
+    materials = found.materials
     limit = 1.0 if logit > 0 else 0.0
-    for values in (materials.albedo, materials.metallic, shift):
+    for values in (materials.albedo, materials.metallic, found.shift):
         np.testing.assert_allclose(values, limit, atol=1e-20)
     np.testing.assert_allclose(materials.roughness, 0.1 + 0.9 * limit, rtol=ROUNDING)
-    assert float(rough) <= 1e-20
+    assert all(float(change) <= 1e-20 for change in changes)
     for leaf in jax.tree.leaves(gradient):
         np.testing.assert_allclose(leaf, 0.0, atol=1e-17)
-
-
-# Colour
 
 
 def test_transfer_curves_are_those_of_float64_from_black_to_the_sun():
@@ -473,8 +463,6 @@ def test_the_tone_map_is_bounded_and_flat_where_nothing_is_left_to_see(log_expos
         expected = np.exp(log_exposure) * np.minimum(rgb, 0)
         np.testing.assert_allclose(below, expected, rtol=1e-4, atol=ROUNDING)
 
-
-# Structural similarity
 
 FLAT = [0.0, 1e-6, 0.5, 1.0, 10.0, 1e5]
 

@@ -75,9 +75,9 @@ def draw_dense(inputs, eligible, **settings):
         depths = jax.lax.stop_gradient(project(*inputs[:3], **settings).depths)
         order = jnp.argsort(depths, stable=True)
         means, quats, scales, opacities, features = (x[order] for x in inputs)
-        splats = project(means, quats, scales, **settings)
-        opacities = jnp.where(splats.is_in_front & eligible[order], opacities, 0.0)
-        image, alpha = _reference_composite(splats, opacities, features, **shape)
+        footprints = project(means, quats, scales, **settings)
+        opacities = jnp.where(footprints.is_in_front & eligible[order], opacities, 0.0)
+        image, alpha = _reference_composite(footprints, opacities, features, **shape)
         return scalar(image, alpha), (image, alpha)
 
     (_, outputs), gradient = jax.value_and_grad(loss, has_aux=True)(inputs)
@@ -116,7 +116,7 @@ def rows(*columns):
 
 
 def one(mean, scale, opacity=1.0, *, quat=(1, 0, 0, 0), feature=(1.0, 1.0, 1.0)):
-    """A single Gaussian among masked copies."""
+    """A single splat among masked copies."""
     scale = np.broadcast_to(np.float32(scale), 3)
     return rows([mean], [quat], [scale], [opacity], [feature])
 
@@ -126,7 +126,7 @@ def all_finite(tree):
 
 
 def assert_sane(image, alpha, features):
-    """The laws of coverage: what any set of Gaussians may do to a pixel."""
+    """The laws of coverage: what any set of splats may do to a pixel."""
     assert float(alpha.min()) >= 0.0
     assert float(alpha.max()) <= 1.0
     assert float(image.min()) >= 0.0
@@ -149,24 +149,14 @@ def assert_equals_dense(inputs, settings=None, *, gradient_tolerance=1e-3, **opt
 forward = jax.jit(rasterize, static_argnames=STATIC)
 
 
-@partial(jax.jit, static_argnames=("height", "width"))
-def forward_dense(inputs, **settings):
-    shape = {k: settings[k] for k in ("height", "width")}
-    order = jnp.argsort(project(*inputs[:3], **settings).depths, stable=True)
-    means, quats, scales, opacities, features = (x[order] for x in inputs)
-    splats = project(means, quats, scales, **settings)
-    opacities = jnp.where(splats.is_in_front, opacities, 0.0)
-    return _reference_composite(splats, opacities, features, **shape)
-
-
-def assert_equals_dense_forward(inputs, settings, *, tile_size=4):
-    """Compare images alone: gradients of every shape would take long to compile."""
+def assert_equals_textbook(inputs, settings, *, tile_size=4):
+    """Compare images with NumPy: gradients of every shape would take long to compile."""
     eligible = jnp.ones(inputs[0].shape[0], bool)
     image, alpha, needed = forward(
         *inputs, eligible, capacities=AMPLE, tile_size=tile_size, **settings
     )
     assert overflowed(needed, AMPLE) == []
-    expected = forward_dense(inputs, **settings)
+    expected = numpy_image(inputs, settings)
     np.testing.assert_allclose(image, expected[0], atol=FIELD)
     np.testing.assert_allclose(alpha, expected[1], atol=FIELD)
     return image, alpha
@@ -209,17 +199,39 @@ def numpy_projection(inputs, settings):
     return slope * focal + center, point[:, 2], covariance, reach
 
 
+def numpy_image(inputs, settings):
+    """Image and alpha in float64: every splat in every pixel, nearest first."""
+    pixels, depths, covariance, _ = numpy_projection(inputs, settings)
+    sharp = np.linalg.det(covariance - LOW_PASS_VARIANCE * np.eye(2))
+    compensation = np.sqrt(np.maximum(sharp, 0) / np.linalg.det(covariance))
+    opacities, features = (np.asarray(x, np.float64) for x in inputs[3:])
+    shape = settings["height"], settings["width"]
+    y, x = np.indices(shape) + 0.5
+    image, before = np.zeros((*shape, features.shape[1])), np.ones(shape)
+    for row in np.argsort(depths, kind="stable"):
+        if depths[row] <= 0.01:
+            continue
+        offset = np.stack([x, y], axis=-1) - pixels[row]
+        inverse = np.linalg.inv(covariance[row])
+        sigma = 0.5 * np.einsum("hwi,ij,hwj->hw", offset, inverse, offset)
+        raw = opacities[row] * compensation[row] * np.exp(-sigma)
+        alpha = np.where(raw < MIN_ALPHA, 0.0, np.minimum(raw, MAX_ALPHA))
+        image += (alpha * before)[..., None] * features[row]
+        before *= 1 - alpha
+    return image, 1 - before
+
+
 @partial(jax.jit, static_argnames=("height", "width"))
 def project_and_differentiate(inputs, **settings):
     def total(inputs):
-        splats = project(*inputs[:3], **settings)
-        parts = (splats.means2d, splats.conics, splats.compensation[:, None])
+        footprints = project(*inputs[:3], **settings)
+        parts = (footprints.means2d, footprints.conics, footprints.compensation[:, None])
         rng = np.random.default_rng(1)
         weights = [jnp.asarray(rng.normal(size=p.shape), p.dtype) for p in parts]
-        return sum(jnp.sum(w * p) for w, p in zip(weights, parts, strict=True)), splats
+        return sum(jnp.sum(w * p) for w, p in zip(weights, parts, strict=True)), footprints
 
-    gradient, splats = jax.grad(total, has_aux=True)(inputs[:3])
-    return splats, gradient
+    gradient, footprints = jax.grad(total, has_aux=True)(inputs[:3])
+    return footprints, gradient
 
 
 @FEW
@@ -242,21 +254,21 @@ def test_projection_equals_the_textbook_in_float64(field_of_view, exponents, dep
     means *= 10.0**depth
     scales = 10.0 ** (exponents[0] + rng.random(means.shape) * (exponents[1] - exponents[0]))
     inputs = tuple(jnp.asarray(np.float32(x)) for x in (means, quats, scales, *rest))
-    splats, gradient = project_and_differentiate(inputs, **settings)
+    footprints, gradient = project_and_differentiate(inputs, **settings)
     pixels, depths, covariance, reach = numpy_projection(inputs, settings)
-    np.testing.assert_allclose(splats.depths, depths, rtol=1e-6)
-    np.testing.assert_allclose(splats.means2d, pixels, rtol=1e-5, atol=1e-5 * SIZE)
+    np.testing.assert_allclose(footprints.depths, depths, rtol=1e-6)
+    np.testing.assert_allclose(footprints.means2d, pixels, rtol=1e-5, atol=1e-5 * SIZE)
     xx, xy, yy = (covariance[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     # A projected axis errs by roundings of its whole length, foreshortened as it may be.
     for got, wanted, square in zip(
-        splats.covariances2d.T, (xx, xy, yy), (xx, np.sqrt(xx * yy), yy), strict=True
+        footprints.covariances2d.T, (xx, xy, yy), (xx, np.sqrt(xx * yy), yy), strict=True
     ):
         limit = 1e-5 * square + 20 * ROUNDING * reach * np.sqrt(np.maximum(xx, yy))
         assert (np.abs(np.asarray(got, np.float64) - wanted) <= limit).all()
-    compensation = np.asarray(splats.compensation)
+    compensation = np.asarray(footprints.compensation)
     assert (compensation >= 0).all()
     assert (compensation <= 1 + 2 * ROUNDING).all()
-    assert all_finite((splats, gradient))
+    assert all_finite((footprints, gradient))
 
 
 @pytest.mark.parametrize("power", [-20, -10, 0, 10, 20])
@@ -265,9 +277,9 @@ def test_length_of_a_quaternion_changes_nothing_and_its_gradient_inversely(power
     quats = inputs[1] / jnp.linalg.norm(inputs[1], axis=1, keepdims=True)
     length = np.float32(1.1 * 10.0**power)
     changed = (inputs[0], quats * length, inputs[2])
-    splats, gradient = project_and_differentiate((inputs[0], quats, inputs[2]), **settings)
+    footprints, gradient = project_and_differentiate((inputs[0], quats, inputs[2]), **settings)
     other, other_gradient = project_and_differentiate(changed, **settings)
-    np.testing.assert_allclose(other.conics, splats.conics, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(other.conics, footprints.conics, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(
         np.asarray(other_gradient[1], np.float64) * length, gradient[1], rtol=1e-3, atol=1e-3
     )
@@ -289,11 +301,9 @@ def test_a_zero_quaternion_is_the_identity_without_gradient_among_others():
 # Images
 
 
-@pytest.mark.parametrize(
-    ("height", "width", "tile_size"), [(1, 1, 4), (1, 9, 4), (9, 1, 4), (11, 11, 16)]
-)
-def test_images_of_any_shape_equal_dense_compositing(height, width, tile_size):
-    image, alpha = assert_equals_dense_forward(scene(5), camera(height, width), tile_size=tile_size)
+@pytest.mark.parametrize(("height", "width", "tile_size"), [(1, 9, 4), (9, 1, 4), (11, 11, 16)])
+def test_images_of_any_shape_equal_the_textbook(height, width, tile_size):
+    image, alpha = assert_equals_textbook(scene(5), camera(height, width), tile_size=tile_size)
     assert float(alpha.max()) > 0.3
     assert_sane(image, alpha, np.ones(3))
 
@@ -308,7 +318,7 @@ def test_an_image_that_no_tile_divides_has_the_gradient_of_dense_compositing():
     place=st.sampled_from(["anywhere", "corner", "border", "outside", "near plane"]),
     seed=st.integers(0, 99),
 )
-def test_gaussians_of_every_size_and_place_equal_dense_compositing(power, place, seed):
+def test_splats_of_every_size_and_place_equal_dense_compositing(power, place, seed):
     rng = np.random.default_rng(seed)
     means, quats, _, opacities, features = (np.asarray(x) for x in scene(seed))
     means = np.array(means)
@@ -333,7 +343,7 @@ def test_gaussians_of_every_size_and_place_equal_dense_compositing(power, place,
     assert_sane(image, alpha, features)
     assert all_finite(gradient)
     expected_image, expected_alpha, _ = dense_float64(inputs)
-    # A Gaussian whose alpha is within a rounding of 1/255 may be there or not.
+    # A splat whose alpha is within a rounding of 1/255 may be there or not.
     np.testing.assert_allclose(image, expected_image, atol=1.1 * MIN_ALPHA)
     error = np.abs(np.asarray(alpha) - expected_alpha)
     assert np.median(error) < 10 * FIELD
@@ -357,7 +367,7 @@ def test_a_needle_errs_by_roundings_of_its_squared_length_over_width(distance):
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.5])
-def test_a_gaussian_on_a_pixel_centre_or_border_is_symmetric(offset):
+def test_a_splat_on_a_pixel_centre_or_border_is_symmetric(offset):
     # A pixel is one unit wide at the depth of the mean; the centre of the image is the centre of
     # its middle pixel, and half a pixel away is the corner of that pixel.
     settings = camera(focal=100.0, distance=100.0)
@@ -375,7 +385,7 @@ def test_a_gaussian_on_a_pixel_centre_or_border_is_symmetric(offset):
 
 
 def thousands_at_one_depth():
-    """4096 Gaussians in one plane before an image of 8 x 8 pixels, and room for them."""
+    """4096 splats in one plane before an image of 8 x 8 pixels, and room for them."""
     count, rng = 4096, np.random.default_rng(6)
     means = np.concatenate([rng.uniform(-1.5, 1.5, (count, 2)), np.zeros((count, 1))], axis=1)
     arrays = (
@@ -393,7 +403,7 @@ def thousands_at_one_depth():
 def test_thousands_at_one_depth_are_composited_in_row_order():
     inputs, settings, room = thousands_at_one_depth()
     image, alpha, needed, gradient = render(inputs, settings, capacities=room)
-    assert int(needed.visible) > 2000
+    assert int(needed["visible"]) > 2000
     expected_image, expected_alpha, expected = dense_float64(inputs, settings)
     np.testing.assert_allclose(image, expected_image, atol=10 * FIELD)
     np.testing.assert_allclose(alpha, expected_alpha, atol=10 * FIELD)
@@ -426,7 +436,7 @@ def test_opacity_at_its_borders(factor, is_seen):
     # So large that neither the low-pass filter nor the distance from the mean is felt.
     inputs, eligible = one([0, 0, 0.0], 1e4, np.float32(MIN_ALPHA) * factor)
     _, alpha, needed, gradient = render(inputs, eligible=eligible)
-    assert int(needed.visible) == int(is_seen)
+    assert int(needed["visible"]) == int(is_seen)
     expected = min(MIN_ALPHA * factor, MAX_ALPHA) if is_seen else 0.0
     np.testing.assert_allclose(alpha, expected, rtol=1e-5)
     if factor in (0.0, 0.99999, 255.0):
@@ -443,7 +453,7 @@ def test_opacity_at_its_borders(factor, is_seen):
     z=st.floats(-3.5, 100.0),
     opacity=st.floats(0.0, 1.0, width=32),
 )
-def test_one_gaussian_never_covers_more_than_the_largest_alpha(power, x, y, z, opacity):
+def test_one_splat_never_covers_more_than_the_largest_alpha(power, x, y, z, opacity):
     inputs, eligible = one([x, y, z], 10.0**power, opacity, feature=(1.0, 0.0, 7.0))
     image, alpha, _, gradient = render(inputs, eligible=eligible)
     assert float(alpha.max()) <= min(np.float32(MAX_ALPHA), opacity * (1 + 4 * ROUNDING) + 1e-9)
@@ -480,10 +490,10 @@ def test_nothing_eligible_and_nothing_at_all_give_an_empty_image_and_no_gradient
     assert not any(np.any(leaf) for leaf in (image, alpha))
 
 
-def test_one_row_equals_dense_compositing():
+def test_one_splat_alone_equals_the_textbook():
     inputs = tuple(x[:1] for x in scene(8))
     inputs = (inputs[0] * 0.1, *inputs[1:3], jnp.array([0.7]), inputs[4])
-    _, alpha = assert_equals_dense_forward(inputs, camera())
+    _, alpha = assert_equals_textbook(inputs, camera())
     assert float(alpha.max()) > 0.05
 
 

@@ -13,7 +13,15 @@ from geosplat_jax.gradcheck import report
 from geosplat_jax.gradcheck.differences import STEPS, Problem, compare, double_precision
 from geosplat_jax.gradcheck.report import STAGES, check_stage, passes, summary, table
 
-SLOW_STAGES = {"loss", "isosurface", "rasterizer", "adapter", "projection", "materials"}
+SLOW_STAGES = {
+    "adapter",
+    "isosurface",
+    "loss",
+    "materials",
+    "projection",
+    "rasterizer",
+    "transport",
+}
 
 
 @pytest.mark.parametrize(

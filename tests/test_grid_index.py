@@ -11,15 +11,17 @@ import pytest
 from geosplat_jax.core.capacity import Capacities, fits, grow, overflowed
 from geosplat_jax.core.types import Grid
 from geosplat_jax.geometry import grid_vertices, initial_geometry, isosurface
-from geosplat_jax.rays.grid_index import T_MIN, build_accelerator, nearest, occluded
+from geosplat_jax.rays import grid_index
+from geosplat_jax.rays.grid_index import T_MIN, build_grid_index
 
 AMPLE = Capacities(surface_cubes=1024, dual_vertices=1024, quads=1024, cell_patches=16384)
 extract = partial(jax.jit, static_argnames=("capacities", "training"))(isosurface)
-build = partial(jax.jit, static_argnames=("capacities",))(build_accelerator)
+build = partial(jax.jit, static_argnames=("capacities",))(build_grid_index)
 
 # A float32 ray passes an edge on either side within this share of the triangle; such rays are told
 # apart and left out (and must be few).
 EDGE = 1e-4
+RAYS = 256  # a chunk; one number of rays and one grid for most tests, so that they compile once
 
 
 def torus_grid(resolution=12):
@@ -39,9 +41,11 @@ def bumpy_torus(grid, *, deform=0.0, seed=0):
 
 
 def noise(grid, *, deform=0.0, seed=0):
+    """White noise in a corner of the grid, where the surface is cut open by the border."""
     rng = np.random.default_rng(seed)
-    values = rng.normal(size=(grid.vertex_count,))
-    geometry = initial_geometry(grid, jnp.asarray(values, jnp.float32))
+    values = np.ones(grid.vertex_shape[::-1])
+    values[:7, :7, :7] = rng.normal(size=(7, 7, 7))
+    geometry = initial_geometry(grid, jnp.asarray(values.reshape(-1), jnp.float32))
     moved = rng.uniform(-deform, deform, geometry.deform.shape)
     return replace(geometry, deform=jnp.asarray(moved, jnp.float32))
 
@@ -100,7 +104,7 @@ def unit(vectors):
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def rays_of_kind(kind, surface, rng, count=300):
+def rays_of_kind(kind, surface, rng, count=RAYS):
     """Origins, directions and source faces."""
     corners = triangles(surface)
     nowhere = np.full(count, -1)
@@ -130,21 +134,29 @@ def rays_of_kind(kind, surface, rng, count=300):
 KINDS = ["through the box", "along axes", "along planes", "from the surface", "grazing"]
 
 
+@pytest.fixture(scope="module")
+def torus():
+    """The surface that most tests ask about, and its index."""
+    surface, index = traced(bumpy_torus(torus_grid()), torus_grid())
+    assert not overflowed(index.usage, AMPLE)
+    return surface, index
+
+
 @pytest.fixture(scope="module", params=[("torus", 0.0), ("torus", 1.5), ("noise", 1.5)], ids=str)
 def scene(request):
     shape, deform = request.param
-    grid = torus_grid() if shape == "torus" else torus_grid(6)
+    grid = torus_grid()
     make = bumpy_torus if shape == "torus" else noise
-    surface, accelerator = traced(make(grid, deform=deform), grid)
-    assert not overflowed(accelerator.usage, AMPLE)
+    surface, index = traced(make(grid, deform=deform), grid)
+    assert not overflowed(index.usage, AMPLE)
     assert not overflowed(surface.usage, AMPLE)
-    return surface, accelerator
+    return surface, index
 
 
 @pytest.mark.parametrize("two_sided", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_ray_equals_brute_force(scene, kind, two_sided):
-    surface, accelerator = scene
+    surface, index = scene
     origins, directions, source = rays_of_kind(kind, surface, np.random.default_rng(1))
     arguments = (
         jnp.asarray(origins, jnp.float32),
@@ -152,24 +164,24 @@ def test_every_ray_equals_brute_force(scene, kind, two_sided):
         jnp.asarray(source, jnp.int32),
         jnp.ones((len(origins),), bool),
     )
-    t_min = T_MIN * float(accelerator.grid.cell_size)
+    t_min = T_MIN * float(index.grid.cell_size)
     distance, face, unclear = brute_force(
         surface, *arguments[:2], source, two_sided=two_sided, t_min=t_min
     )
     clear = ~unclear
     assert clear.mean() > (0.5 if kind == "grazing" else 0.8)
-    found, hit = nearest(accelerator, *arguments, two_sided=two_sided)
+    found, hit = index.nearest(*arguments, two_sided=two_sided)
     np.testing.assert_array_equal(np.asarray(hit)[clear] >= 0, face[clear] >= 0)
     is_hit = clear & (face >= 0)
     np.testing.assert_allclose(np.asarray(found)[is_hit], distance[is_hit], rtol=2e-4, atol=2e-5)
     np.testing.assert_array_equal(np.asarray(hit)[is_hit], face[is_hit])
-    any_hit = np.asarray(occluded(accelerator, *arguments, two_sided=two_sided))
+    any_hit = np.asarray(index.occluded(*arguments, two_sided=two_sided))
     np.testing.assert_array_equal(any_hit[clear], face[clear] >= 0)
     assert 0.02 < np.mean(face >= 0) < 1.0
     assert np.all(np.isinf(np.asarray(found)[np.asarray(hit) < 0]))
 
 
-def _rays(count, seed=2):
+def _rays(count=RAYS, seed=2):
     rng = np.random.default_rng(seed)
     origins = jnp.asarray(rng.uniform(-1.5, 1.5, (count, 3)), jnp.float32)
     directions = jnp.asarray(unit(rng.normal(size=(count, 3))), jnp.float32)
@@ -177,25 +189,24 @@ def _rays(count, seed=2):
 
 
 @pytest.mark.slow
-def test_masked_rays_hit_nothing_and_leave_the_others():
-    _, accelerator = traced(bumpy_torus(torus_grid()), torus_grid())
-    origins, directions, source, everything = _rays(700)
-    mask = jnp.asarray(np.random.default_rng(0).random(700) < 0.5)
-    whole = occluded(accelerator, origins, directions, source, everything)
-    part = occluded(accelerator, origins, directions, source, mask)
+def test_masked_rays_hit_nothing_and_leave_the_others(torus):
+    _, index = torus
+    origins, directions, source, everything = _rays()
+    mask = jnp.asarray(np.random.default_rng(0).random(RAYS) < 0.5)
+    whole = index.occluded(origins, directions, source, everything)
+    part = index.occluded(origins, directions, source, mask)
     np.testing.assert_array_equal(part, whole & mask)
     assert bool(jnp.any(whole & ~mask))
 
 
 @pytest.mark.slow
-def test_rays_in_many_chunks_equal_rays_in_one(monkeypatch):
-
-    _, accelerator = traced(bumpy_torus(torus_grid()), torus_grid())
+def test_rays_in_many_chunks_equal_rays_in_one(torus, monkeypatch):
+    _, index = torus
     rays = _rays(1500)
-    whole = nearest(accelerator, *rays)
-    monkeypatch.setattr(trace, "_CHUNK", 512)
+    whole = index.nearest(*rays)
+    monkeypatch.setattr(grid_index, "_CHUNK", 512)
     again = jax.jit(grid_index._trace, static_argnames=("two_sided", "any_hit"))
-    parts = again(accelerator, *rays, two_sided=False, any_hit=False)
+    parts = again(index, *rays, two_sided=False, any_hit=False)
     np.testing.assert_array_equal(whole[1], parts[1])
     np.testing.assert_array_equal(whole[0], parts[0])
 
@@ -203,82 +214,88 @@ def test_rays_in_many_chunks_equal_rays_in_one(monkeypatch):
 def test_no_rays_and_no_surface_are_legal():
     grid = torus_grid()
     empty = initial_geometry(grid, jnp.ones((grid.vertex_count,)))
-    _, accelerator = traced(empty, grid)
-    distance, face = nearest(accelerator, *_rays(64))
+    _, index = traced(empty, grid)
+    distance, face = index.nearest(*_rays())
     assert bool(jnp.all(jnp.isinf(distance)))
     assert bool(jnp.all(face == -1))
-    assert occluded(accelerator, *_rays(0)).shape == (0,)
+    assert index.occluded(*_rays(0)).shape == (0,)
 
 
-def test_a_ray_never_hits_the_face_it_starts_from():
-    surface, accelerator = traced(bumpy_torus(torus_grid()), torus_grid())
+def test_a_ray_never_hits_the_face_it_starts_from(torus):
+    surface, index = torus
     corners = triangles(surface)
+    chosen = np.random.default_rng(4).choice(len(corners), RAYS, replace=False)
+    corners = corners[chosen]
     centres = corners.mean(axis=1)
     normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-    source = jnp.arange(len(corners), dtype=jnp.int32)
+    source = jnp.asarray(chosen, jnp.int32)
     # From just below the face, through it: its own face is in the way, and must not be.
     start = jnp.asarray(centres - 0.02 * normals, jnp.float32)
     arguments = (start, jnp.asarray(normals, jnp.float32))
     everything = jnp.ones((len(corners),), bool)
-    _, with_source = nearest(accelerator, *arguments, source, everything, two_sided=True)
-    _, without = nearest(
-        accelerator, *arguments, jnp.full_like(source, -1), everything, two_sided=True
-    )
+    _, with_source = index.nearest(*arguments, source, everything, two_sided=True)
+    _, without = index.nearest(*arguments, jnp.full_like(source, -1), everything, two_sided=True)
     assert np.mean(np.asarray(without) == np.asarray(source)) > 0.9
     assert not np.any(np.asarray(with_source) == np.asarray(source))
 
 
 @pytest.mark.slow
-def test_overflow_reports_the_true_need_and_growing_cures_it():
+def test_overflow_reports_the_true_need_and_growing_cures_it(torus):
     grid = torus_grid()
     geometry = bumpy_torus(grid)
-    tight = replace(AMPLE, cell_patches=256)
-    _, accelerator = traced(geometry, grid, tight)
-    assert not bool(fits(accelerator.usage, tight))
-    assert overflowed(accelerator.usage, tight) == ["cell_patches"]
-    enough = grow(tight, accelerator.usage)
+    tight = AMPLE.resized(cell_patches=256)
+    _, index = traced(geometry, grid, tight)
+    assert not bool(fits(index.usage, tight))
+    assert overflowed(index.usage, tight) == ["cell_patches"]
+    enough = grow(tight, index.usage)
     _, cured = traced(geometry, grid, enough)
-    assert int(cured.usage.cell_patches) == int(accelerator.usage.cell_patches)
+    assert int(cured.usage["cell_patches"]) == int(index.usage["cell_patches"])
     assert bool(fits(cured.usage, enough))
-    _, ample = traced(geometry, grid)
-    np.testing.assert_array_equal(occluded(cured, *_rays(500)), occluded(ample, *_rays(500)))
+    _, ample = torus
+    np.testing.assert_array_equal(cured.occluded(*_rays()), ample.occluded(*_rays()))
 
 
-def test_a_list_too_long_to_be_counted_is_refused():
-    grid = torus_grid()
-    surface, _ = traced(bumpy_torus(grid), grid)
+def test_a_list_too_long_to_be_counted_is_refused(torus):
+    surface, _ = torus
     with pytest.raises(ValueError, match="at most 8388608 patches, not 8388609"):
-        build(surface, grid, capacities=replace(AMPLE, cell_patches=2**23 + 1))
+        build(surface, torus_grid(), capacities=AMPLE.resized(cell_patches=2**23 + 1))
 
 
-def test_a_scene_of_any_scale_gives_the_same_hits():
+def test_a_scene_of_any_scale_gives_the_same_hits(torus):
     grid = torus_grid()
     geometry = bumpy_torus(grid)
-    _, accelerator = traced(geometry, grid)
-    origins, directions, source, mask = _rays(500)
-    distance, face = nearest(accelerator, origins, directions, source, mask)
+    _, index = torus
+    origins, directions, source, mask = _rays()
+    distance, face = index.nearest(origins, directions, source, mask)
     for scale in (2.0**-10, 2.0**10):
         scaled = Grid(grid.origin * scale, grid.cell_size * scale, grid.shape)
         _, other = traced(geometry, scaled)
-        far, same = nearest(other, origins * scale, directions, source, mask)
+        far, same = other.nearest(origins * scale, directions, source, mask)
         np.testing.assert_array_equal(same, face)
         np.testing.assert_array_equal(far, distance * scale)
 
 
 @pytest.mark.slow
 def test_rays_carry_no_gradient():
-    grid = torus_grid(6)
+    grid = torus_grid()
     geometry = bumpy_torus(grid)
-    origins, directions, source, mask = _rays(64)
+    origins, directions, source, mask = _rays()
 
     def total(sdf, origins):
-        _, accelerator = traced(replace(geometry, sdf=sdf), grid)
-        distance, _ = nearest(accelerator, origins, directions, source, mask)
+        _, index = traced(replace(geometry, sdf=sdf), grid)
+        distance, _ = index.nearest(origins, directions, source, mask)
         return jnp.sum(jnp.where(jnp.isfinite(distance), distance, 0.0))
 
+    # The hits do depend on both.
+    assert float(total(geometry.sdf, origins)) != float(total(geometry.sdf + 0.1, origins))
     gradients = jax.grad(total, argnums=(0, 1))(geometry.sdf, origins)
     for gradient in gradients:
         np.testing.assert_array_equal(gradient, 0.0)
+
+
+def test_the_faces_that_an_index_knows_are_those_of_the_mesh(torus):
+    surface, index = torus
+    assert index.face_capacity == surface.mesh.faces.shape[0]
 
 
 @pytest.mark.slow
@@ -290,8 +307,8 @@ def test_agrees_with_embree_on_a_hundred_thousand_rays():
 
     grid = torus_grid(24)
     ample = Capacities(surface_cubes=4096, dual_vertices=4096, quads=4096, cell_patches=32768)
-    surface, accelerator = traced(bumpy_torus(grid, deform=0.5), grid, ample)
-    assert bool(fits(accelerator.usage, ample))
+    surface, index = traced(bumpy_torus(grid, deform=0.5), grid, ample)
+    assert bool(fits(index.usage, ample))
     vertices = np.asarray(surface.mesh.vertices)
     faces = np.asarray(surface.mesh.faces)[: int(surface.mesh.face_count)]
     tracer = RayMeshIntersector(trimesh.Trimesh(vertices, faces, process=False))
@@ -299,8 +316,7 @@ def test_agrees_with_embree_on_a_hundred_thousand_rays():
     origins, directions, source = rays_of_kind("from the surface", surface, rng, 100_000)
     start = origins + 1e-3 * float(grid.cell_size) * directions
     expected = tracer.intersects_any(start, directions)
-    found = occluded(
-        accelerator,
+    found = index.occluded(
         jnp.asarray(origins, jnp.float32),
         jnp.asarray(directions, jnp.float32),
         jnp.asarray(source, jnp.int32),

@@ -98,7 +98,7 @@ def test_levels_that_fit_are_dense_and_the_others_have_full_tables():
     ],
 )
 def test_impossible_sizes_are_refused(sizes):
-    with pytest.raises(ValueError, match=r"must be|takes more than"):
+    with pytest.raises(ValueError, match=r"greater than or equal to 1|must be|takes more than"):
         HashGridSpec(**sizes)
 
 
@@ -184,13 +184,6 @@ def _assert_equal_pullbacks(table, points, cotangent):
         assert _relative(a, b) < EXACT
 
 
-def test_gradients_equal_those_of_autodiff():
-    with double_precision():
-        table, points = _table(SMALL, dtype=jnp.float64), _points(dtype=jnp.float64)
-        cotangent = jnp.asarray(np.random.default_rng(3).standard_normal((50, SMALL.width)))
-        _assert_equal_pullbacks(table, points, cotangent)
-
-
 def test_the_full_jacobian_of_a_tiny_grid_equals_that_of_autodiff():
     spec = HashGridSpec(levels=2, features=1, log2_entries=4, coarsest=1, finest=3)
     with double_precision():
@@ -204,29 +197,6 @@ def test_the_full_jacobian_of_a_tiny_grid_equals_that_of_autodiff():
             np.testing.assert_allclose(a, b, atol=EXACT)
 
 
-def test_gradients_agree_with_differences_inside_cells():
-    step = 1e-6
-    with double_precision():
-        rng = np.random.default_rng(4)
-        table = _table(SMALL, dtype=jnp.float64)
-        # Fractions within the middle of every level's cell: resolutions are powers of two.
-        cells = rng.integers(0, 16, (40, 3))
-        points = jnp.asarray((cells + rng.uniform(0.1, 0.9, (40, 3))) / 16)
-        towards = jnp.asarray(rng.standard_normal(table.shape))
-        along = jnp.asarray(rng.standard_normal(points.shape))
-        mixing = jnp.asarray(rng.standard_normal((40, SMALL.width)))
-
-        def value(table, points):
-            features = encode(table, points, spec=SMALL, position_gradient=True)
-            return jnp.sum(jnp.sin(features) * mixing)
-
-        gradients = jax.jit(jax.grad(value, argnums=(0, 1)))(table, points)
-        derivative = jnp.vdot(gradients[0], towards) + jnp.vdot(gradients[1], along)
-        ahead = value(table + step * towards, points + step * along)
-        behind = value(table - step * towards, points - step * along)
-        np.testing.assert_allclose(derivative, (ahead - behind) / (2 * step), rtol=1e-6)
-
-
 def test_gradients_over_several_chunks_equal_those_of_autodiff(monkeypatch):
     monkeypatch.setattr("geosplat_jax.hashgrid._BACKWARD_CHUNK", 16)
     with double_precision():
@@ -236,7 +206,8 @@ def test_gradients_over_several_chunks_equal_those_of_autodiff(monkeypatch):
 
 
 def test_points_without_position_gradient_receive_zero():
-    gradient = jax.grad(lambda p: jnp.sum(encode(_table(SMALL), p, spec=SMALL)))(_points())
+    total = lambda p: jnp.sum(encode(_table(SMALL), p, spec=SMALL))  # noqa: E731
+    gradient = jax.jit(jax.grad(total))(_points())
     np.testing.assert_array_equal(gradient, 0.0)
 
 
@@ -246,8 +217,8 @@ def test_points_outside_are_clamped_and_receive_no_gradient_along_that_axis():
     clamped = jnp.clip(points, 0.0, 1.0)
     values = encode(table, points, spec=SMALL)
     np.testing.assert_array_equal(values, encode(table, clamped, spec=SMALL))
-    gradient = jax.grad(
-        lambda p: jnp.sum(encode(table, p, spec=SMALL, position_gradient=True) ** 2)
+    gradient = jax.jit(
+        jax.grad(lambda p: jnp.sum(encode(table, p, spec=SMALL, position_gradient=True) ** 2))
     )(points)
     is_outside = np.asarray(points != clamped)
     np.testing.assert_array_equal(np.asarray(gradient)[is_outside], 0.0)
@@ -274,6 +245,7 @@ def test_a_point_that_is_not_a_number_spoils_only_its_own_row():
 def test_rows_with_zero_cotangent_leave_no_trace():
     table, points = _table(SMALL), _points(20)
 
+    @jax.jit
     def gradient(points):
         mask = (jnp.arange(points.shape[0]) < 20)[:, None]
         return jax.grad(

@@ -1,6 +1,4 @@
-"""Indirect light: the harmonics, the four kinds and their ranges, what faces send out."""
-
-from functools import partial
+"""Indirect light: the harmonics, the four models and their ranges, what faces send out."""
 
 import jax
 import jax.numpy as jnp
@@ -8,20 +6,26 @@ import numpy as np
 import pytest
 from support import double_precision
 
-from geosplat_jax.core.types import Materials
+from geosplat_jax.core.types import Materials, SurfacePoints
 from geosplat_jax.transport.indirect import (
-    COEFFICIENTS,
-    INDIRECT_KINDS,
+    INDIRECT_MODELS,
     NO_INDIRECT,
-    Indirect,
+    ConstantIndirect,
+    HarmonicIndirect,
+    NoIndirect,
+    TracedIndirect,
     harmonics,
-    incoming,
-    outgoing,
 )
-from geosplat_jax.transport.monte_carlo import BLOCKED, OPEN
+from geosplat_jax.transport.indirect import outgoing as eager_outgoing
+from geosplat_jax.transport.sampling import BLOCKED, OPEN
 
 ROUNDING = 1e-6  # float32, values of order one
 RAYS = 7
+HITS = jnp.asarray([0, 3, BLOCKED, 2, 2, OPEN, 1], jnp.int32)
+
+# One compilation costs less than a handful of eager operations.
+outgoing = jax.jit(eager_outgoing, static_argnames="face_count")
+incoming = jax.jit(lambda model, directions, hits: model.incoming(directions, hits))
 
 
 def unit(count, seed=0):
@@ -40,11 +44,10 @@ def sphere_rule(rows=12, columns=24):
     return nodes.reshape(-1, 3), np.repeat(weights * 2 * np.pi / columns, columns)
 
 
-def values_of(kind, seed=1):
-    """Random values: a row a ray, or four faces."""
-    rows = 4 if kind == "traced" else RAYS
-    columns = 3 if kind == "traced" else COEFFICIENTS[kind]
-    return np.random.default_rng(seed).uniform(-2, 2, (rows, columns))
+def values_of(model, seed=1):
+    """Random values: a row for each ray, or for each of four faces."""
+    shape = (RAYS, model.outputs) if model.outputs else (4, 3)
+    return np.random.default_rng(seed).uniform(-2, 2, shape)
 
 
 def test_harmonics_are_orthonormal():
@@ -76,103 +79,93 @@ def test_harmonics_have_their_known_values_in_the_usual_order():
     np.testing.assert_allclose(found, expected, atol=ROUNDING)
 
 
-def test_kinds_and_their_learned_numbers_agree():
-    assert set(COEFFICIENTS) == set(INDIRECT_KINDS)
-    assert COEFFICIENTS["harmonics"] == 3 * harmonics(jnp.zeros((1, 3))).shape[1]
-    assert [Indirect(None, kind).belongs_to_points for kind in INDIRECT_KINDS] == [
-        COEFFICIENTS[kind] > 0 for kind in INDIRECT_KINDS
-    ]
+def test_learned_numbers_are_those_that_a_model_reads():
+    assert {name: model.outputs for name, model in INDIRECT_MODELS.items()} == {
+        "none": 0,
+        "constant": 2 * 3,
+        "harmonics": 3 * harmonics(jnp.zeros((1, 3))).shape[1],
+        "traced": 0,
+    }
+    for model in (ConstantIndirect, HarmonicIndirect):
+        assert model(jnp.zeros((2, model.outputs))).belongs_to_points
+    assert not TracedIndirect(jnp.zeros((2, 3))).belongs_to_points
+    assert not NO_INDIRECT.belongs_to_points
 
 
-def arriving(kind, values, directions=None, hits=None):
-    directions = unit(RAYS) if directions is None else directions
-    hits = np.full(RAYS, BLOCKED) if hits is None else hits
+def arriving(model, values, directions=None, hits=None):
     return incoming(
-        Indirect(None if values is None else jnp.asarray(values, jnp.float32), kind),
-        jnp.asarray(directions, jnp.float32),
-        jnp.asarray(hits, jnp.int32),
+        model(jnp.asarray(values, jnp.float32)),
+        jnp.asarray(unit(RAYS) if directions is None else directions, jnp.float32),
+        jnp.full((RAYS,), BLOCKED, jnp.int32) if hits is None else hits,
     )
 
 
 def test_without_indirect_light_blocked_directions_are_black():
-    for lobe in incoming(
-        NO_INDIRECT, jnp.asarray(unit(RAYS), jnp.float32), jnp.full((RAYS,), BLOCKED, jnp.int32)
-    ):
+    assert INDIRECT_MODELS["none"] is NoIndirect
+    for lobe in incoming(NO_INDIRECT, jnp.asarray(unit(RAYS), jnp.float32), HITS):
         np.testing.assert_array_equal(lobe, np.zeros((RAYS, 3)))
 
 
 def test_constant_light_has_a_radiance_for_each_lobe_and_no_direction():
-    values = values_of("constant")
+    values = values_of(ConstantIndirect)
     expected = 1 / (1 + np.exp(3 - values))
     for seed in (0, 5):
-        diffuse, specular = arriving("constant", values, unit(RAYS, seed))
+        diffuse, specular = arriving(ConstantIndirect, values, unit(RAYS, seed))
         np.testing.assert_allclose(diffuse, expected[:, :3], atol=ROUNDING)
         np.testing.assert_allclose(specular, expected[:, 3:], atol=ROUNDING)
 
 
 def test_harmonic_light_varies_with_the_direction_colour_by_colour():
-    values, directions = values_of("harmonics"), unit(RAYS, 3)
+    values, directions = values_of(HarmonicIndirect), unit(RAYS, 3)
     basis = np.asarray(harmonics(jnp.asarray(directions, jnp.float32)), float)
     raw = np.einsum("ncb,nb->nc", values.reshape(RAYS, 3, 9), basis)
-    diffuse, specular = arriving("harmonics", values, directions)
+    diffuse, specular = arriving(HarmonicIndirect, values, directions)
     np.testing.assert_allclose(diffuse, 1 / (1 + np.exp(3 - raw)), atol=ROUNDING)
     np.testing.assert_array_equal(diffuse, specular)
-    assert float(jnp.max(jnp.abs(diffuse - arriving("harmonics", values)[0]))) > 0.01
+    other, _ = arriving(HarmonicIndirect, values)
+    assert np.max(np.abs(np.asarray(diffuse) - np.asarray(other))) > 0.01
 
 
 def test_traced_light_is_what_the_face_sends_and_black_where_none_is_known():
-    values = np.abs(values_of("traced"))
-    hits = np.array([0, 3, BLOCKED, 2, 2, OPEN, 1])
-    diffuse, specular = arriving("traced", values, hits=hits)
+    values, hits = np.abs(values_of(TracedIndirect)), np.asarray(HITS)
+    diffuse, specular = arriving(TracedIndirect, values, hits=HITS)
     expected = np.where((hits >= 0)[:, None], values[np.maximum(hits, 0)], 0.0)
     np.testing.assert_allclose(diffuse, expected, atol=ROUNDING)
     np.testing.assert_array_equal(diffuse, specular)
 
 
-@pytest.mark.parametrize("kind", ["constant", "harmonics"])
-def test_learned_light_starts_small_and_stays_between_zero_and_one(kind):
-    start = arriving(kind, np.zeros((RAYS, COEFFICIENTS[kind])))
-    for lobe in start:
+@pytest.mark.parametrize("model", [ConstantIndirect, HarmonicIndirect])
+def test_learned_light_starts_small_and_stays_between_zero_and_one(model):
+    for lobe in arriving(model, np.zeros((RAYS, model.outputs))):
         np.testing.assert_allclose(lobe, 1 / (1 + np.exp(3.0)), atol=ROUNDING)
     for size in (-1e4, 1e4):
-        for lobe in arriving(kind, np.full((RAYS, COEFFICIENTS[kind]), size)):
-            assert bool(jnp.all((lobe >= 0) & (lobe <= 1)))
+        for lobe in map(np.asarray, arriving(model, np.full((RAYS, model.outputs), size))):
+            assert np.all((lobe >= 0) & (lobe <= 1))
 
 
-@pytest.mark.parametrize("kind", ["constant", "harmonics", "traced"])
-def test_the_gradient_in_the_values_agrees_with_differences(kind):
+@pytest.mark.parametrize("model", [ConstantIndirect, HarmonicIndirect, TracedIndirect])
+def test_the_gradient_is_that_of_the_values_alone(model):
+    """In the values it agrees with central differences of every entry; directions have none."""
+    step = 1e-5
     with double_precision():
-        values, directions = jnp.asarray(values_of(kind)), jnp.asarray(unit(RAYS))
-        hits = jnp.asarray([0, 3, BLOCKED, 2, 2, OPEN, 1], jnp.int32)
+        values, directions = jnp.asarray(values_of(model)), jnp.asarray(unit(RAYS))
         rng = np.random.default_rng(2)
         first, second = (jnp.asarray(rng.normal(size=(RAYS, 3))) for _ in range(2))
 
-        @jax.jit
-        def total(values):
-            diffuse, specular = incoming(Indirect(values, kind), directions, hits)
+        def total(values, directions):
+            diffuse, specular = model(values).incoming(directions, HITS)
             return jnp.sum(first * diffuse) + jnp.sum(second * specular)
 
-        gradient = jax.jit(jax.grad(total))(values)
-        step = 1e-5
+        @jax.jit
+        def run(values, directions):
+            moves = step * jnp.eye(values.size).reshape(-1, *values.shape)
+            at = jax.vmap(lambda move: total(values + move, directions))
+            gradient = jax.grad(total, argnums=(0, 1))(values, directions)
+            return gradient, (at(moves) - at(-moves)) / (2 * step)
 
-        def difference(index):
-            moved = jnp.zeros(values.size).at[index].set(step).reshape(values.shape)
-            return (total(values + moved) - total(values - moved)) / (2 * step)
-
-        expected = jnp.stack([difference(index) for index in range(values.size)])
-        np.testing.assert_allclose(gradient.reshape(-1), expected, atol=1e-10, rtol=1e-8)
-
-
-def test_directions_carry_no_gradient():
-    values = jnp.asarray(values_of("harmonics"), jnp.float32)
-
-    def total(directions):
-        return jnp.sum(
-            incoming(Indirect(values, "harmonics"), directions, jnp.full((RAYS,), BLOCKED))[0]
-        )
-
-    gradient = jax.grad(total)(jnp.asarray(unit(RAYS), jnp.float32))
-    np.testing.assert_array_equal(gradient, 0.0)
+        (in_values, in_directions), expected = run(values, directions)
+        np.testing.assert_allclose(in_values.reshape(-1), expected, atol=1e-10, rtol=1e-8)
+        np.testing.assert_array_equal(in_directions, 0.0)
 
 
 def random_materials(count, seed=4):
@@ -184,34 +177,82 @@ def random_materials(count, seed=4):
     )
 
 
-def test_a_face_sends_the_mean_of_its_six_points():
-    materials = random_materials(18)
-    light = jnp.asarray(np.random.default_rng(5).uniform(0, 3, (18, 3)), jnp.float32)
-    found = outgoing(materials, light, 6)
-    metallic = np.asarray(materials.metallic)[:, None]
-    albedo = np.asarray(materials.albedo)
-    # Matt share and reflectance at normal incidence, 0.04 for dielectrics (REFERENCE 2.3).
-    reflected = albedo * (1 - metallic) + 0.04 * (1 - metallic) + albedo * metallic
-    np.testing.assert_allclose(
-        found, (reflected * np.asarray(light)).reshape(3, 6, 3).mean(axis=1), rtol=1e-5
+def points_on(faces, mask=None):
+    """Points of these faces; where they lie does not matter."""
+    faces = np.asarray(faces)
+    nowhere = jnp.zeros((len(faces), 3))
+    mask = np.ones(len(faces), bool) if mask is None else mask
+    return SurfacePoints(
+        nowhere, nowhere, nowhere, jnp.asarray(faces, jnp.int32), jnp.asarray(mask)
     )
 
 
-def test_black_points_of_a_face_count_and_other_faces_do_not():
-    materials = random_materials(12)
-    light = jnp.ones((12, 3))
-    whole = outgoing(materials, light, 6)
-    darker = outgoing(materials, light.at[:6].set(0.0), 6)
+def sent_by(materials, light):
+    """What each point sends: matt share and reflectance at normal incidence, .04 without metal."""
+    metallic, albedo = np.asarray(materials.metallic)[:, None], np.asarray(materials.albedo)
+    reflected = albedo * (1 - metallic) + 0.04 * (1 - metallic) + albedo * metallic
+    return reflected * np.asarray(light)
+
+
+def random_light(count, seed=5):
+    return jnp.asarray(np.random.default_rng(seed).uniform(0, 3, (count, 3)), jnp.float32)
+
+
+@pytest.mark.parametrize(
+    "faces",
+    [
+        np.repeat(np.arange(5), 6)[:18],  # three faces of six points, in order, and two of none
+        np.random.default_rng(6).permutation([0] * 3 + [2] * 9 + [3] + [4] * 5),
+        np.array([4, -1, 0, 4, -1, 4, 2, 0, 2, 2, 0, -1, 4, 4, 2, 0, 0, 2]),
+    ],
+    ids=["in order", "in any order, in any number", "with points of no face"],
+)
+def test_a_face_sends_the_mean_of_its_points_in_any_order_and_is_black_without_any(faces):
+    materials, light = random_materials(18), random_light(18)
+    found = np.asarray(outgoing(materials, light, points_on(faces), face_count=5))
+    sent = sent_by(materials, light)
+    for face in range(5):
+        own = sent[faces == face]
+        if len(own):
+            np.testing.assert_allclose(found[face], own.mean(axis=0), rtol=1e-5)
+        else:
+            np.testing.assert_array_equal(found[face], 0.0)
+    assert np.any(np.bincount(faces[faces >= 0], minlength=5) == 0)
+
+
+def test_masked_points_do_not_count_and_black_ones_do():
+    materials, light = random_materials(18), random_light(18)
+    faces = np.random.default_rng(7).permutation(np.repeat([0, 1, 2], 6))
+    mask = np.random.default_rng(8).uniform(size=18) < 0.5
+    mask[faces == 2] = False
+    found = np.asarray(outgoing(materials, light, points_on(faces, mask), face_count=5))
+    dark = light.at[faces == 0].set(0.0)
+    darker = np.asarray(outgoing(materials, dark, points_on(faces, mask), face_count=5))
+    sent = sent_by(materials, light)
+    for face in (0, 1):
+        expected = sent[(faces == face) & mask].mean(axis=0)
+        np.testing.assert_allclose(found[face], expected, rtol=1e-5)
+    np.testing.assert_array_equal(found[2:], 0.0)
     np.testing.assert_array_equal(darker[0], 0.0)
-    np.testing.assert_array_equal(darker[1], whole[1])
+    np.testing.assert_array_equal(darker[1:], found[1:])
+    one = np.flatnonzero((faces == 1) & mask)[0]
+    half = np.asarray(
+        outgoing(materials, light.at[one].set(0.0), points_on(faces, mask), face_count=5)
+    )
+    own = (faces == 1) & mask & (np.arange(18) != one)
+    expected = sent[own].sum(axis=0) / (own.sum() + 1)
+    np.testing.assert_allclose(half[1], expected, rtol=1e-5)
 
 
 def test_outgoing_light_is_differentiable_in_material_and_light():
     materials, light = random_materials(6), jnp.full((6, 3), 0.7)
-    by_light = jax.grad(partial(lambda m, x: jnp.sum(outgoing(m, x, 6)), materials))(light)
-    rest = (materials.roughness, materials.metallic)
-    by_albedo = jax.grad(lambda a: jnp.sum(outgoing(Materials(a, *rest), light, 6)))
+
+    @jax.jit
+    @jax.value_and_grad
+    def run(inputs):
+        return jnp.sum(eager_outgoing(*inputs, points_on([0] * 6), 1))
+
+    total, (by_material, by_light) = run((materials, light))
     # Linear in both: (1 - m) + m is the share of albedo, whatever the metallic.
-    np.testing.assert_allclose(by_albedo(materials.albedo), 0.7 / 6, rtol=1e-5)
-    total = jnp.sum(outgoing(materials, light, 6))
+    np.testing.assert_allclose(by_material.albedo, 0.7 / 6, rtol=1e-5)
     np.testing.assert_allclose(jnp.sum(by_light * light), total, rtol=1e-5)

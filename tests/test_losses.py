@@ -1,60 +1,57 @@
-"""The objective: zero where it should be, independent of padding, finite on an empty surface."""
-
-from functools import partial
+"""The terms of the loss: zero where they should be, exact on small cases, blind where told."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import sphere_views, tiny_config
 
-from geosplat_jax.core.capacity import Capacities
-from geosplat_jax.core.numerics import safe_norm
-from geosplat_jax.core.types import Batch
-from geosplat_jax.fit.stages import initial_params, make_context
+from geosplat_jax.core.color import tone_map
 from geosplat_jax.losses import (
-    TERM_NAMES,
-    LossWeights,
+    Comparison,
     Objective,
-    light_term,
-    loss,
-    photometric_terms,
+    compare,
+    image_dissimilarity,
+    image_l1,
+    light_agreement,
+    mask_error,
+    normal_smoothness,
+    random_background,
+    white_balance,
 )
-from geosplat_jax.render import render
-from geosplat_jax.surface.hull import fit_grid
 
-AMPLE = Capacities(1024, 1024, 1024, 16384, 16384, 4096)
-DOUBLE = Capacities(2048, 2048, 2048, 32768, 32768, 8192)
+SHAPE = (2, 16, 16)
+# One float32 rounding of a mean over a few hundred numbers of order one.
+ROUNDING = 1e-6
 
-CONFIG = tiny_config()
-STATIC = {"model": CONFIG.model, "objective": CONFIG.objective}
-evaluate = partial(jax.jit, static_argnames=("model", "objective", "capacities", "sampling"))(
-    jax.value_and_grad(loss, has_aux=True)
+terms_of = jax.jit(
+    lambda images: (image_l1(images), image_dissimilarity(images), mask_error(images))
 )
-draw = partial(jax.jit, static_argnames=("model", "capacities", "sampling", "aov_names"))(render)
 
 
-@pytest.fixture(scope="module")
-def setting():
-    views = sphere_views(2)
-    grid = fit_grid((np.full(3, -0.6), np.full(3, 0.6)), CONFIG.geometry.resolution)
-    from geosplat_jax.geometry import sphere_sdf
+def uniform(seed, *shape, low=0.0, high=1.0):
+    rng = np.random.default_rng(seed)
+    return jnp.asarray(rng.uniform(low, high, shape), jnp.float32)
 
-    params = initial_params(sphere_sdf(grid, radius=0.4), grid, CONFIG, jax.random.key(0))
-    context = make_context(grid, CONFIG.model)
-    batch = Batch(views.camera([0]), jnp.asarray(views.images[:1]), jax.random.key(1))
-    return params, context, batch
+
+def comparison(valid=None):
+    """Two unlike images over a random background."""
+    image = uniform(2, *SHAPE, 4)
+    return compare(
+        0.8 * uniform(1, *SHAPE, 3),
+        uniform(3, *SHAPE),
+        image,
+        uniform(4, *SHAPE, 3),
+        valid,
+        srgb=False,
+    )
 
 
 def test_identical_images_cost_nothing():
-    rng = np.random.default_rng(0)
-    rgb = jnp.asarray(rng.uniform(size=(2, 16, 16, 3)), jnp.float32)
-    alpha = jnp.ones((2, 16, 16))
-    image = jnp.concatenate([rgb, alpha[..., None]], axis=-1)
-    background = jnp.asarray(rng.uniform(size=rgb.shape), jnp.float32)
-    terms, mse = photometric_terms(rgb, alpha, image, background, srgb=False)
-    assert all(float(value) == pytest.approx(0.0, abs=1e-6) for value in terms.values())
-    assert float(mse) == 0.0
+    rgb = uniform(0, *SHAPE, 3)
+    image = jnp.concatenate([rgb, jnp.ones((*SHAPE, 1))], axis=-1)
+    images = compare(rgb, jnp.ones(SHAPE), image, uniform(5, *SHAPE, 3), None, srgb=False)
+    np.testing.assert_allclose(terms_of(images), 0.0, atol=ROUNDING)
+    assert float(images.mse) == 0.0
 
 
 def test_the_background_shows_only_where_coverage_differs():
@@ -62,86 +59,109 @@ def test_the_background_shows_only_where_coverage_differs():
     rgb = alpha[..., None] * jnp.full((1, 16, 16, 3), 0.3)
     image = jnp.concatenate([jnp.full((1, 16, 16, 3), 0.3), alpha[..., None]], axis=-1)
     for seed in (0, 1):
-        background = jax.random.uniform(jax.random.key(seed), rgb.shape)
-        terms, _ = photometric_terms(rgb, alpha, image, background, srgb=False)
-        assert float(terms["l1"]) == pytest.approx(0.0, abs=1e-7)
+        behind = uniform(seed, *rgb.shape)
+        images = compare(rgb, alpha, image, behind, None, srgb=False)
+        assert float(image_l1(images)) == pytest.approx(0.0, abs=1e-7)
+        np.testing.assert_array_equal(images.predicted[0, 0, 0], behind[0, 0, 0])
 
 
-def test_light_term_compares_mean_light_with_the_largest_channel():
-    image = jnp.zeros((1, 2, 2, 4)).at[0, 0, 0].set(jnp.array([0.2, 0.6, 0.4, 1.0]))
-    diffuse = jnp.full((1, 2, 2, 3), 0.1)
-    specular = jnp.full((1, 2, 2, 3), 0.2)
-    assert float(light_term(diffuse, specular, image)) == pytest.approx(0.3 / 4)
+@pytest.mark.parametrize(("kind", "colours"), [("pixel", 512), ("view", 2), ("black", 1)])
+def test_backgrounds_differ_by_pixel_by_view_or_not_at_all(kind, colours):
+    behind = random_background(jax.random.key(0), (*SHAPE, 3), jnp.float32, kind)
+    assert len(np.unique(np.asarray(behind).reshape(-1, 3), axis=0)) == colours
 
 
-def test_report_names_every_term_and_total_is_their_weighted_sum(setting):
-    params, context, batch = setting
-    weights = LossWeights()
-    (total, report), _ = evaluate(params, batch, context, weights, capacities=AMPLE, **STATIC)
-    assert set(report.terms) == set(TERM_NAMES)
-    expected = sum(getattr(weights, name) * float(report.terms[name]) for name in TERM_NAMES)
-    assert float(total) == pytest.approx(expected, rel=1e-5)
-
-
-def test_padding_changes_neither_loss_nor_gradient(setting):
-    params, context, batch = setting
-    results = [
-        evaluate(params, batch, context, LossWeights(), capacities=c, **STATIC)
-        for c in (AMPLE, DOUBLE)
-    ]
-    (first, _), first_gradient = results[0]
-    (second, _), second_gradient = results[1]
-    # Longer buffers are summed in another order: equal up to float32 rounding.
-    assert float(first) == pytest.approx(float(second), rel=1e-5)
-
-    leaves = (jax.tree.leaves(g) for g in (first_gradient, second_gradient))
-    for a, b in zip(*leaves, strict=True):
-        difference = float(safe_norm((a - b).reshape(-1)))
-        assert difference <= 1e-4 * float(safe_norm(a.reshape(-1))) + 1e-9
-
-
-def test_an_empty_surface_shows_the_background_and_has_zero_photometric_gradient(setting):
-    params, context, batch = setting
-    from dataclasses import replace
-
-    gone = replace(params, geometry=replace(params.geometry, sdf=jnp.abs(params.geometry.sdf) + 1))
-    weights = LossWeights(entropy=0.0, weights=0.0)
-    (total, report), gradient = evaluate(gone, batch, context, weights, capacities=AMPLE, **STATIC)
-    assert np.isfinite(total)
-    assert int(report.gaussian_count) == 0
-    for leaf in jax.tree.leaves(gradient):
-        np.testing.assert_array_equal(np.asarray(leaf), 0.0)
-    output = draw(gone, batch.camera, context, model=CONFIG.model, capacities=AMPLE)
-    np.testing.assert_array_equal(np.asarray(output.alpha), 0.0)
-    np.testing.assert_array_equal(np.asarray(output.rgb), 0.0)
-
-
-def test_rendered_sphere_covers_its_disc_and_normals_face_the_camera(setting):
-    params, context, batch = setting
-    output = draw(
-        params, batch.camera, context, model=CONFIG.model, capacities=AMPLE, aov_names=("normal",)
-    )
-    alpha = np.asarray(output.alpha[0])
-    assert alpha[12, 12] > 0.9
-    assert alpha[0, 0] == 0.0
-    normal = np.asarray(output.aovs["normal"][0, 12, 12]) / alpha[12, 12]
-    towards = np.asarray(batch.camera.centers[0])
-    assert normal @ towards / np.linalg.norm(towards) > 0.95
-
-
-def test_unknown_aovs_and_samplings_are_refused(setting):
-    params, context, batch = setting
-    with pytest.raises(ValueError, match="unknown AOVs"):
-        render(
-            params, batch.camera, context, model=CONFIG.model, capacities=AMPLE, aov_names=("x",)
+def test_encoded_images_are_compared_as_they_are_seen():
+    plain, encoded = (
+        compare(
+            uniform(1, *SHAPE, 3, low=0.0, high=0.1),
+            jnp.ones(SHAPE),
+            jnp.ones((*SHAPE, 4)) * 0.05,
+            jnp.zeros((*SHAPE, 3)),
+            None,
+            srgb=srgb,
         )
-    with pytest.raises(ValueError, match="sampling must be"):
-        render(params, batch.camera, context, model=CONFIG.model, capacities=AMPLE, sampling="edge")
+        for srgb in (False, True)
+    )
+    # Dark differences grow when they are encoded; the mean squared error stays linear.
+    assert float(image_l1(encoded)) > 2 * float(image_l1(plain))
+    assert float(encoded.mse) == float(plain.mse)
+
+
+def test_pixels_that_do_not_count_change_no_term():
+    """Whatever is there, in the render or in the photograph."""
+    valid = jnp.ones(SHAPE).at[:, :5].set(0.0)
+    spoiled = valid[..., None] == 0
+
+    def terms(noise):
+        images = comparison(valid)
+        return terms_of(replace_images(images, jnp.where(spoiled, noise, images.predicted)))
+
+    np.testing.assert_allclose(terms(0.0), terms(7.0), rtol=ROUNDING)
+
+
+def replace_images(images: Comparison, predicted):
+    return images._replace(
+        predicted=predicted, alpha=jnp.where(images.valid == 0, predicted[..., 0], images.alpha)
+    )
+
+
+def test_where_all_pixels_count_a_mask_of_them_changes_nothing():
+    every, none = terms_of(comparison(jnp.ones(SHAPE))), terms_of(comparison(None))
+    np.testing.assert_allclose(every, none, rtol=ROUNDING)
+
+
+def test_the_mean_is_over_the_pixels_that_count():
+    valid = jnp.zeros(SHAPE).at[0, 3, 4].set(1.0)
+    images = comparison(valid)
+    expected = jnp.mean(jnp.abs(images.predicted[0, 3, 4] - images.target[0, 3, 4]))
+    assert float(image_l1(images)) == pytest.approx(float(expected), rel=ROUNDING)
+    assert all(np.isfinite(x) for x in terms_of(comparison(jnp.zeros(SHAPE))))
+
+
+def one_pixel(colour, mask=1.0):
+    return jnp.zeros((1, 2, 2, 4)).at[0, 0, 0].set(jnp.array([*colour, mask]))
+
+
+def test_eq_18_compares_mean_light_with_the_largest_channel():
+    diffuse, specular = jnp.full((1, 2, 2, 3), 0.1), jnp.full((1, 2, 2, 3), 0.2)
+    found = light_agreement(diffuse, specular, jnp.zeros(()), one_pixel((0.2, 0.6, 0.4)))
+    assert float(found) == pytest.approx(0.3 / 4, rel=1e-5)
+
+
+def test_eq_18_looks_at_exposed_and_tone_mapped_light():
+    """Twice the exposure is twice the light, until the tone map clips it."""
+    diffuse, nothing = jnp.full((1, 2, 2, 3), 0.2), jnp.zeros((1, 2, 2, 3))
+    image = one_pixel((0.4, 0.4, 0.4))
+    exposed = light_agreement(diffuse, nothing, jnp.log(2.0), image)
+    assert float(exposed) == pytest.approx(0.0, abs=1e-5)
+    blinding = light_agreement(50 * diffuse, nothing, jnp.zeros(()), one_pixel((1.0, 1.0, 1.0)))
+    clipped = tone_map(jnp.full((1, 3), 10.0), jnp.zeros(()))[0, 0]
+    assert float(blinding) == pytest.approx(abs(float(clipped) - 1) / 4, abs=1e-6)
+
+
+def test_grey_light_is_balanced_and_coloured_light_is_not():
+    grey = jnp.broadcast_to(uniform(0, 4, 8, 1), (4, 8, 3))
+    assert float(white_balance(grey)) == pytest.approx(0.0, abs=1e-7)
+    red = jnp.zeros((4, 8, 3)).at[..., 0].set(0.9)
+    assert float(white_balance(red)) == pytest.approx((0.6 + 0.3 + 0.3) / 3, rel=ROUNDING)
+
+
+def test_normals_may_change_where_the_photograph_does():
+    normals = jnp.zeros((1, 4, 4, 3)).at[:, :, 2:, 0].set(1.0)
+    flat = jnp.ones((1, 4, 4, 4)) * 0.5
+    flat = flat.at[..., 3].set(1.0)
+    edge = flat.at[:, :, 2:, :3].set(1.0)
+    smooth, sharp = (float(normal_smoothness(normals, image)) for image in (flat, edge))
+    # 4 of 12 pairs of columns differ by one.
+    assert smooth == pytest.approx(1 / 3, rel=ROUNDING)
+    assert sharp == pytest.approx(np.exp(-0.5) / 3, rel=ROUNDING)
+    outside = flat.at[..., 3].set(0.0)
+    assert float(normal_smoothness(normals, outside)) == 0.0
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [{"background": "blue"}, {"entropy_reduction": "max"}, {"smoothness_samples": 0}],
+    "wrong", [{"background": "blue"}, {"smoothness_samples": 0}, {"smoothness_radius": -1.0}]
 )
 def test_bad_objectives_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):

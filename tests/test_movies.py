@@ -1,3 +1,5 @@
+"""Films hold their frames, rate and colours; what cannot be written leaves the old file."""
+
 import json
 import os
 import shutil

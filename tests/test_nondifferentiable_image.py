@@ -22,14 +22,14 @@ from one_sided import (
 )
 from support import double_precision
 
-from geosplat_jax.core.capacity import Capacities, usage
+from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.core.color import linear_to_srgb, srgb_to_linear, tone_map
 from geosplat_jax.core.ssim import ssim
-from geosplat_jax.core.types import Camera, EnvLight, Gaussians, Grid, Materials, Mesh
-from geosplat_jax.materials import MaterialSpec, init_materials, smoothness
-from geosplat_jax.model import Context, Model, Params
-from geosplat_jax.render import Asset, reconstruct, render_views
-from geosplat_jax.splats.projection import Splats, project
+from geosplat_jax.core.types import Box, Camera, EnvLight, Grid, Materials, Mesh, Splats
+from geosplat_jax.geometry import FlexiCubes
+from geosplat_jax.materials import Attributes, MaterialSpec, init_materials, smoothness
+from geosplat_jax.render import Asset, Params, RenderPipeline
+from geosplat_jax.splats.projection import Footprints, project
 from geosplat_jax.splats.rasterize import (
     MAX_ALPHA,
     MIN_ALPHA,
@@ -37,12 +37,10 @@ from geosplat_jax.splats.rasterize import (
     find_visible,
     gather_visible,
 )
+from geosplat_jax.surface.base import Surface
 from geosplat_jax.transport import bsdf
-from geosplat_jax.transport.environment import (
-    LightSpec,
-    prefilter_operators,
-)
-from geosplat_jax.transport.split_sum import fg_table
+from geosplat_jax.transport.environment import LightSpec, prefilter_operators
+from geosplat_jax.transport.split_sum import SplitSum, fg_table
 
 ROOM = Capacities(surface_cubes=256, dual_vertices=256, quads=256)
 
@@ -53,7 +51,7 @@ def _double():
         yield
 
 
-# --- projection ---------------------------------------------------------------------------------
+# Projection
 
 
 @jax.jit
@@ -77,7 +75,7 @@ def _quat():
     return IDENTITY.astype(jnp.float64)
 
 
-def test_the_near_plane_ends_a_gaussian_and_its_gradient():
+def test_the_near_plane_ends_a_splat_and_its_gradient():
     def mean(depth):
         return _projected(jnp.asarray(0.1), depth, _quat()).means2d[0, 0]
 
@@ -122,7 +120,7 @@ def test_a_zero_quaternion_is_a_point_without_limit():
     assert jax.grad(conic)(0.0) == 0
 
 
-# --- rasteriser ---------------------------------------------------------------------------------
+# Rasteriser
 
 SMALL = Capacities(visible=128, hits=128, chunks=128)
 
@@ -130,9 +128,9 @@ SMALL = Capacities(visible=128, hits=128, chunks=128)
 @jax.jit
 @partial(jax.value_and_grad, argnums=(0, 1, 2))
 def _composited(opacities, depths, width, chosen):
-    """Two Gaussians on pixel (1, 1) of 4 x 4; ``chosen`` weighs its colour and alpha at (1, 3)."""
+    """Two splats on pixel (1, 1) of 4 x 4; ``chosen`` weighs its colour and alpha at (1, 3)."""
     ones = jnp.broadcast_to(jnp.array([1.0, 0.0, 1.0]), (2, 3))
-    splats = Splats(
+    footprints = Footprints(
         means2d=jnp.full((2, 2), 1.5),
         covariances2d=ones * width,
         conics=ones / width,
@@ -141,9 +139,9 @@ def _composited(opacities, depths, width, chosen):
         is_in_front=depths > 0,
     )
     frame = {"height": 4, "width": 4, "tile_size": 4}
-    lists = find_visible(splats, opacities, jnp.ones((2,), bool), capacities=SMALL, **frame)
+    lists = find_visible(footprints, opacities, jnp.ones((2,), bool), capacities=SMALL, **frame)
     image, alpha = composite(
-        jax.tree.map(partial(gather_visible, lists.index), splats),
+        jax.tree.map(partial(gather_visible, lists.index), footprints),
         gather_visible(lists.index, opacities),
         gather_visible(lists.index, jnp.array([[1.0], [0.25]])),
         lists,
@@ -189,7 +187,7 @@ def test_below_the_alpha_threshold_a_pixel_and_its_gradient_are_zero():
     assert alone(0.0) == alone(1e-4) == (0.0, 0.0)
 
 
-def test_a_gaussian_that_shrinks_leaves_a_pixel_by_a_jump_of_the_threshold():
+def test_a_splat_that_shrinks_leaves_a_pixel_by_a_jump_of_the_threshold():
     def neighbour(width):
         value, (_, _, slope) = seen((0.5, 0.0), width=width, chosen=(0.0, 1.0))
         return value, float(slope)
@@ -215,16 +213,21 @@ def test_the_alpha_clamp_is_continuous_and_passes_nothing_above():
     assert min(slope, abs(slope - 1)) < 1e-9
 
 
-# --- visibility ---------------------------------------------------------------------------------
+# Visibility
+
+
+def _split_sum():
+    """The cheapest transport, with tables of a few entries."""
+    light = LightSpec(height=4, width=8, roughness=(0.0, 1.0))
+    table = fg_table(cosines=4, roughnesses=4).astype(jnp.float64)
+    return SplitSum(prefilter_operators(light), table)
 
 
 @lru_cache
 def _card():
     """Make a scene of one white splat that faces the camera, to be tilted about the y axis."""
-    model = Model(light=LightSpec(height=4, width=8, roughness=(0.0, 1.0)))
     grid = Grid(jnp.full((3,), -1.0), jnp.asarray(0.5), (4, 4, 4))
-    table = fg_table(cosines=4, roughnesses=4).astype(jnp.float64)
-    context = Context(grid, prefilter_operators(model.light), table)
+    pipeline = RenderPipeline(FlexiCubes(grid), _split_sum(), MaterialSpec(), capacities=SMALL)
     pose = jnp.eye(4).at[2, 3].set(3.0)
     camera = Camera(
         pose[None], jnp.array([[[12.0, 0, 4.5], [0, 12.0, 4.5], [0, 0, 1]]]), height=8, width=8
@@ -239,20 +242,21 @@ def _card():
         c, s = jnp.cos(0.5 * tilt), jnp.sin(0.5 * tilt)
         normal = jnp.stack([jnp.sin(tilt), 0 * tilt, -jnp.cos(tilt)])[None]
         outward = jnp.stack([jnp.sin(tilt + extra), 0 * tilt, -jnp.cos(tilt + extra)])[None]
-        gaussians = Gaussians(
+        splats = Splats(
             means=jnp.zeros((1, 3)),
             quats=jnp.stack([c, 0 * c, -s, 0 * c])[None],
             scales=jnp.stack([0.3 + 0 * tilt, 0.3 + 0 * tilt, thickness])[None],
             opacities=jnp.array([0.99]),
             normals=normal,
+            outward=outward,
+            anchors=jnp.zeros((1, 3)),
+            parents=jnp.array([0], jnp.int32),
             count=jnp.int32(1),
         )
-        zero = jnp.zeros((), jnp.int32)
         materials = Materials(jnp.ones((1, 3)), jnp.ones((1,)), jnp.zeros((1,)))
-        asset = Asset(
-            mesh, gaussians, outward, materials, jnp.asarray(0.0), usage(surface_cubes=zero)
-        )
-        output = render_views(asset, light, camera, context, model=model, capacities=SMALL)
+        attributes = Attributes(materials, None, None)
+        asset = Asset(Surface(mesh, {}), splats, attributes, None, {})
+        output = pipeline.render_views(asset, light, camera)
         return jnp.sum(output.alpha)
 
     return coverage
@@ -278,7 +282,6 @@ def test_culling_a_flat_splat_at_right_angles_changes_nothing_that_was_seen():
 
 
 def test_culling_a_thick_splat_jumps_and_its_normal_has_no_gradient():
-
     def thick(tilt, extra=0.0):
         return _card()(jnp.asarray(0.3), jnp.asarray(tilt), jnp.asarray(extra))
 
@@ -292,7 +295,7 @@ def test_culling_a_thick_splat_jumps_and_its_normal_has_no_gradient():
     assert thick(0.0, np.pi)[0] == 0
 
 
-# --- colour and similarity ----------------------------------------------------------------------
+# Colour and similarity
 
 
 def test_the_tone_map_has_no_kink():
@@ -336,41 +339,36 @@ def test_the_floor_of_variances_is_no_kink_of_the_similarity():
         assert_smooth_at(similarity, [0.0, 1e-3], step=1e-8, tolerance=1e-4)
 
 
-# --- detached on purpose ------------------------------------------------------------------------
+# Detached on purpose
 
 
-def _tiny_model(attribute_gradient):
-    material = MaterialSpec(grid=GRID, albedo_hidden=(4,), surface_hidden=(4,), shared=True)
-    return Model(
-        material=material,
-        light=LightSpec(height=4, width=8, roughness=(0.0, 1.0)),
-        attribute_gradient=attribute_gradient,
-    )
-
-
-@pytest.mark.parametrize("attribute_gradient", [False, True])
-def test_attributes_pull_on_the_geometry_only_when_asked(attribute_gradient):
-    model = _tiny_model(attribute_gradient)
-    grid, geometry = make_ball()
-    field = jax.tree.map(
-        lambda x: x.astype(jnp.float64), init_materials(jax.random.key(0), model.material)
-    )
+@lru_cache
+def _varied_field():
+    """A field of attributes that changes from place to place, in float64."""
+    spec = MaterialSpec(grid=GRID, albedo_hidden=(4,), surface_hidden=(4,), shared=True)
+    field = jax.jit(partial(init_materials, spec=spec))(jax.random.key(0))
+    field = jax.tree.map(lambda x: x.astype(jnp.float64), field)
     table = jax.random.normal(jax.random.key(1), field.albedo_table.shape, jnp.float64)
-    field = replace(field, albedo_table=table)
-    context = Context(grid, prefilter_operators(model.light), fg_table(cosines=4, roughnesses=4))
+    return spec, replace(field, albedo_table=table)
+
+
+@pytest.mark.parametrize("position_gradient", [False, True])
+def test_attributes_pull_on_the_geometry_only_when_asked(position_gradient):
+    spec, field = _varied_field()
+    spec = replace(spec, position_gradient=position_gradient)
+    grid, geometry = make_ball()
+    pipeline = RenderPipeline(FlexiCubes(grid), _split_sum(), spec, capacities=ROOM)
     light = EnvLight(jnp.ones((4, 8, 3)))
 
     @jax.jit
     @jax.grad
     def pull(geometry):
         params = Params(geometry, field, light, jnp.asarray(0.0))
-        asset = reconstruct(params, context, model=model, capacities=ROOM, sampling="face")
-        seen = (asset.materials.albedo, asset.materials.roughness, asset.materials.metallic)
-        return sum(jnp.sum(x) for x in seen)
+        return sum(map(jnp.sum, jax.tree.leaves(pipeline.reconstruct(params).attributes.materials)))
 
     gradient = pull(geometry)
     is_pulled = [bool(np.any(np.asarray(leaf))) for leaf in (gradient.sdf, gradient.deform)]
-    assert is_pulled == [attribute_gradient, attribute_gradient]
+    assert is_pulled == [position_gradient, position_gradient]
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
 
 
@@ -378,7 +376,7 @@ def test_lists_carry_no_gradient_from_any_of_their_inputs():
     """Lists are integers; what is gathered through them still has the gradient of its values."""
 
     def through(scale):
-        splats = Splats(
+        footprints = Footprints(
             means2d=jnp.full((2, 2), 1.5) * scale,
             covariances2d=jnp.ones((2, 3)) * scale,
             conics=jnp.ones((2, 3)),
@@ -387,7 +385,7 @@ def test_lists_carry_no_gradient_from_any_of_their_inputs():
             is_in_front=jnp.ones((2,), bool),
         )
         lists = find_visible(
-            splats,
+            footprints,
             jnp.full((2,), 0.5) * scale,
             jnp.ones((2,), bool),
             height=4,
@@ -412,24 +410,16 @@ def test_random_picks_move_with_the_count_and_carry_no_gradient():
 
     assert jax.grad(drawn)(0.5) == 0
     assert float(drawn(jnp.asarray(0.5)) - drawn(jnp.asarray(0.6))) != 0
-    spec = MaterialSpec(grid=GRID, albedo_hidden=(4,), surface_hidden=(4,), shared=True)
-    field = jax.tree.map(lambda x: x.astype(jnp.float64), init_materials(jax.random.key(0), spec))
-    table = jax.random.normal(jax.random.key(1), field.albedo_table.shape, jnp.float64)
-    field = replace(field, albedo_table=table)
+    spec, field = _varied_field()
+    box = Box(jnp.zeros(3), jnp.asarray(2.0))
 
     @partial(jax.jit, static_argnums=1)
-    def term(shift, position_gradient):
+    @jax.grad
+    def slope(shift, position_gradient):
         points = jax.random.uniform(jax.random.key(3), (16, 3), jnp.float64) + shift
-        return smoothness(
-            field,
-            points,
-            jnp.ones((16,), bool),
-            jax.random.key(2),
-            spec=spec,
-            center=jnp.zeros(3),
-            half_extent=jnp.asarray(2.0),
-            position_gradient=position_gradient,
-        )
+        mask, key = jnp.ones((16,), bool), jax.random.key(2)
+        moving = replace(spec, position_gradient=position_gradient)
+        return sum(smoothness(field, points, mask, key, box, spec=moving))
 
-    assert jax.grad(lambda s: term(s, False))(0.0) == 0
-    assert jax.grad(lambda s: term(s, True))(0.0) != 0
+    assert slope(0.0, False) == 0
+    assert slope(0.0, True) != 0

@@ -22,9 +22,9 @@ from support import double_precision
 
 from geosplat_jax.core.numerics import COSINE_EPSILON, safe_normalize
 from geosplat_jax.core.types import EnvLight
-from geosplat_jax.fit.step import _project
+from geosplat_jax.fit.step import UpdateRule, _moved, rate_groups
 from geosplat_jax.materials import MaterialSpec, init_materials
-from geosplat_jax.model import Params
+from geosplat_jax.render import Params
 from geosplat_jax.transport import bsdf
 from geosplat_jax.transport.environment import (
     POLE_EPSILON,
@@ -43,9 +43,6 @@ from geosplat_jax.transport.split_sum import fg_lookup, fg_table, split_sum
 def _double():
     with double_precision():
         yield
-
-
-# --- reflectance --------------------------------------------------------------------------------
 
 
 def test_roughness_has_its_upper_slope_above_the_floor_and_none_on_it():
@@ -85,6 +82,7 @@ def test_the_clamp_of_the_cosine_is_continuous_with_the_mean_of_both_slopes():
     normals = up()
     cosines = jnp.array([0.3])
 
+    @jax.jit
     def visibility(cosine):
         # Of the lobe, masking is what is left once its distribution is divided out.
         arguments = (normals, direction_at(cosine), direction_at(cosines[0]))
@@ -99,8 +97,6 @@ def test_the_clamp_of_the_cosine_is_continuous_with_the_mean_of_both_slopes():
     assert mean == pytest.approx(0.5 * right, rel=1e-4)
     assert_smooth_at(visibility, [0.5 * edge, 2 * edge], step=1e-8)
 
-
-# --- split sum and light ------------------------------------------------------------------------
 
 LIGHT = LightSpec(height=6, width=8, roughness=(0.0, 0.3, 0.6, 1.0))
 EDGES = (0.3, 0.6)
@@ -258,5 +254,8 @@ def test_the_floor_of_the_light_is_a_projection_after_the_step_and_no_kink():
         light=EnvLight(radiance - 0.5),
         log_exposure=jnp.asarray(0.0),
     )
-    moved = _project(params, 0.01).light.radiance
+    still = jax.tree.map(jnp.zeros_like, params)
+    rates = dict.fromkeys(rate_groups(params), jnp.asarray(1.0))
+    rule = UpdateRule(rates, light_knee=jnp.asarray(0.0), smallest_light=jnp.asarray(0.01))
+    moved = _moved(params, still, rule).light.radiance
     np.testing.assert_array_equal(moved, np.maximum(radiance - 0.5, 0.01))

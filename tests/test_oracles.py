@@ -17,7 +17,7 @@ from references.lanes import contract, difference
 from scipy.spatial import cKDTree
 from support import double_precision
 
-from geosplat_jax.adapter import CODE, PAPER, face_gaussians, vertex_gaussians
+from geosplat_jax.adapter import CODE, PAPER, face_splats, vertex_splats
 from geosplat_jax.core.capacity import Capacities, fits
 from geosplat_jax.core.mesh import vertex_normals
 from geosplat_jax.core.numerics import safe_normalize
@@ -67,17 +67,27 @@ def assert_gradients(got, data):
         assert relative(got[name], wanted) < GRADIENT_TOLERANCE, name
 
 
-def pull_back(function, inputs, cotangents):
-    """Values of a function of a dictionary, and the gradient of their contraction."""
+def puller(function):
+    """Compile a function of a dictionary: its values, and the gradient of their contraction."""
 
     def scalar(inputs, cotangents):
         outputs = function(inputs)
         return sum(jnp.sum(outputs[k] * c) for k, c in cotangents.items()), outputs
 
-    inputs = {k: jnp.asarray(v) for k, v in inputs.items()}
-    cotangents = {k: jnp.asarray(c) for k, c in cotangents.items()}
-    (_, outputs), gradient = jax.jit(jax.value_and_grad(scalar, has_aux=True))(inputs, cotangents)
-    return outputs, gradient
+    compiled = jax.jit(jax.value_and_grad(scalar, has_aux=True))
+
+    def pull_back(inputs, cotangents):
+        inputs, cotangents = (
+            {k: jnp.asarray(v) for k, v in group.items()} for group in (inputs, cotangents)
+        )
+        (_, outputs), gradient = compiled(inputs, cotangents)
+        return outputs, gradient
+
+    return pull_back
+
+
+def pull_back(function, inputs, cotangents):
+    return puller(function)(inputs, cotangents)
 
 
 # The references themselves
@@ -169,18 +179,20 @@ def test_isosurface_equals_the_slow_one(name):
             return {"vertices": mesh.vertices, "deviation": surface.deviation, "surface": surface}
 
         # Pair the rows of the package with those of the reference by position.
-        surface = jax.jit(outputs)({k: jnp.asarray(v) for k, v in inputs.items()})["surface"]
+        pull = puller(outputs)
+        cotangents = unpacked(data, "cotangent")
+        rows = ROOM["dual_vertices"] + training * ROOM["quads"]
+        surface = pull(inputs, cotangents | {"vertices": np.zeros((rows, 3))})[0]["surface"]
         assert bool(fits(surface.usage, ROOM))
         assert int(surface.mesh.vertex_count) == count
         vertices = np.asarray(surface.mesh.vertices)
         distance, row = cKDTree(vertices[:count]).query(data["out_vertices"])
         assert distance.max() < VALUE_TOLERANCE
         assert len(set(row)) == count
-        cotangents = unpacked(data, "cotangent")
         placed = np.zeros(vertices.shape)
         placed[row] = cotangents["vertices"]
-        _, gradient = pull_back(outputs, inputs, cotangents | {"vertices": placed})
-    assert int(surface.usage.dual_vertices) == int(data["out_dual_count"])
+        _, gradient = pull(inputs, cotangents | {"vertices": placed})
+    assert int(surface.usage["dual_vertices"]) == int(data["out_dual_count"])
     assert set(row[: int(data["out_dual_count"])]) == set(range(int(data["out_dual_count"])))
     faces = np.asarray(surface.mesh.faces)[: int(surface.mesh.face_count)]
     assert len(faces) == len(data["out_faces"])
@@ -203,14 +215,14 @@ def test_projection_equals_the_slow_one():
     inputs, visible = unpacked(data, "in"), data["visible"]
     assert set(data["out_clamped_axes"]) == {0, 1, 2}  # the field of view is left in each way
     with double_precision():
-        splats = jax.jit(partial(project, **SPLAT_FRAME))(
+        footprints = jax.jit(partial(project, **SPLAT_FRAME))(
             *(jnp.asarray(inputs[k]) for k in ("means", "quats", "scales")),
             world_to_camera=jnp.asarray(inputs["world_to_camera"]),
             intrinsics=jnp.asarray(inputs["intrinsics"]),
         )
-    np.testing.assert_array_equal(np.flatnonzero(splats.is_in_front), visible)
+    np.testing.assert_array_equal(np.flatnonzero(footprints.is_in_front), visible)
     for name in ("means2d", "conics", "depths", "compensation"):
-        got = np.asarray(getattr(splats, name))[visible]
+        got = np.asarray(getattr(footprints, name))[visible]
         scale = max(1.0, np.abs(data[f"out_{name}"]).max())
         np.testing.assert_allclose(got, data[f"out_{name}"], rtol=0, atol=VALUE_TOLERANCE * scale)
 
@@ -249,7 +261,7 @@ def assert_values(got, data):
 
 
 @pytest.mark.slow
-def test_gaussians_of_a_mesh_equal_the_slow_ones():
+def test_splats_of_a_mesh_equal_the_slow_ones():
     data = load("adapter_faces")
 
     def outputs(inputs):
@@ -257,14 +269,14 @@ def test_gaussians_of_a_mesh_equal_the_slow_ones():
         mesh = Mesh(inputs["vertices"], faces, jnp.int32(5), jnp.int32(len(data["faces"])))
         result = {"vertex_normals": vertex_normals(mesh)}
         for preset, constants in (("paper", PAPER), ("code", CODE)):
-            gaussians = face_gaussians(mesh, inputs["normals"], constants=constants)
+            splats = face_splats(mesh, inputs["normals"], constants=constants)
             result |= {
-                f"{preset}_means": gaussians.means,
-                f"{preset}_rotations": quaternion_to_matrix(gaussians.quats),
-                f"{preset}_scales": gaussians.scales,
-                f"{preset}_normals": gaussians.normals,
+                f"{preset}_means": splats.means,
+                f"{preset}_rotations": quaternion_to_matrix(splats.quats),
+                f"{preset}_scales": splats.scales,
+                f"{preset}_normals": splats.normals,
             }
-        rounds = vertex_gaussians(mesh, inputs["normals"], constants=CODE)
+        rounds = vertex_splats(mesh, inputs["normals"], constants=CODE)
         return result | {"vertex_radii": rounds.scales[:, 0]}
 
     with double_precision():

@@ -1,10 +1,12 @@
+"""Sheets show every picture unchanged and in its place; normals, clay and light in colour."""
+
 import numpy as np
 import pytest
 
-from geosplat_jax.report import pictures as sheets
+from geosplat_jax.report import pictures
 
-SHEET = np.asarray(sheets._SHEET_COLOR, np.float32)
-CELL = np.asarray(sheets._CELL_COLOR, np.float32)
+SHEET = np.asarray(pictures._SHEET_COLOR, np.float32)
+CELL = np.asarray(pictures._CELL_COLOR, np.float32)
 
 
 def flat(value, height=40, width=60):
@@ -23,12 +25,12 @@ def test_every_picture_appears_unchanged_in_its_row_and_column():
         {"truth": flat(colors[0]), "render": flat(colors[1])},
         {"truth": flat(colors[2]), "render": flat(colors[3])},
     ]
-    sheet = sheets.overview_sheet(rows)
+    sheet = pictures.overview_sheet(rows)
     boxes = [find(sheet, color) for color in colors]
     assert [(b[1] - b[0], b[3] - b[2]) for b in boxes] == [(40, 60)] * 4
     assert boxes[0][0] == boxes[1][0] < boxes[2][0] == boxes[3][0]
     assert boxes[0][2] == boxes[2][2] < boxes[1][2] == boxes[3][2]
-    assert boxes[1][2] - boxes[0][3] == sheets._GUTTER
+    assert boxes[1][2] - boxes[0][3] == pictures._GUTTER
     assert sheet.dtype == np.float32
     assert sheet.min() >= 0
     assert sheet.max() <= 1
@@ -37,7 +39,7 @@ def test_every_picture_appears_unchanged_in_its_row_and_column():
 
 def test_columns_follow_first_appearance_and_missing_pictures_leave_empty_cells():
     rows = [{"a": flat(0.5)}, {"b": flat(0.9), "a": flat(0.5)}]
-    sheet = sheets.overview_sheet(rows)
+    sheet = pictures.overview_sheet(rows)
     a, b, empty = find(sheet, [0.5] * 3), find(sheet, [0.9] * 3), find(sheet, CELL)
     assert b[2] > a[3]
     assert (empty[2], empty[3]) == (b[2], b[3])
@@ -47,47 +49,47 @@ def test_columns_follow_first_appearance_and_missing_pictures_leave_empty_cells(
 def test_grey_and_eight_bit_pictures_are_accepted():
     grey = np.full((40, 60), 0.25, np.float32)
     bytes_ = np.full((40, 60, 1), 51, np.uint8)
-    sheet = sheets.overview_sheet([{"grey": grey, "bytes": bytes_}])
+    sheet = pictures.overview_sheet([{"grey": grey, "bytes": bytes_}])
     assert find(sheet, [0.25] * 3)[3] < find(sheet, [0.2] * 3)[2]
 
 
 def test_pictures_of_another_size_are_fitted_into_the_cell():
-    sheet = sheets.overview_sheet([{"a": flat(0.5), "b": flat(0.9, 10, 30)}])
+    sheet = pictures.overview_sheet([{"a": flat(0.5), "b": flat(0.9, 10, 30)}])
     b = find(sheet, [0.9] * 3)
     assert (b[1] - b[0], b[3] - b[2]) == (20, 60)
 
 
 def test_titles_labels_notes_and_light_add_room_and_ink():
     rows = [{"truth": flat(0.5, 100, 100), "render": flat(0.7, 100, 100)}] * 3
-    plain = sheets.overview_sheet(rows)
+    plain = pictures.overview_sheet(rows)
     light = np.ones((16, 32, 3), np.float32)
-    full = sheets.overview_sheet(
+    full = pictures.overview_sheet(
         rows, light=light, title="Spot", row_labels=["0", "1", "2"], notes=["PSNR 30"]
     )
     assert full.shape[0] >= plain.shape[0] + 100
     assert full.shape[1] > plain.shape[1]
-    title = full[: sheets._TITLE_HEIGHT, :80]
+    title = full[: pictures._TITLE_HEIGHT, :80]
     assert np.any(title > 0.5)
     np.testing.assert_array_equal(find(full, [0.7] * 3)[1] - find(full, [0.7] * 3)[0], 308)
 
 
 def test_unusable_input_is_named():
     with pytest.raises(ValueError, match="at least one picture"):
-        sheets.overview_sheet([])
+        pictures.overview_sheet([])
     with pytest.raises(ValueError, match="image 'mask'"):
-        sheets.overview_sheet([{"mask": np.zeros((4, 4, 2), np.float32)}])
+        pictures.overview_sheet([{"mask": np.zeros((4, 4, 2), np.float32)}])
     with pytest.raises(ValueError, match="one a row"):
-        sheets.overview_sheet([{"a": flat(0.5)}], row_labels=["x", "y"])
+        pictures.overview_sheet([{"a": flat(0.5)}], row_labels=["x", "y"])
 
 
 def test_normals_map_to_the_usual_colors_at_any_length():
     normals = np.zeros((1, 4, 3), np.float32)
     normals[0, 0], normals[0, 1], normals[0, 2] = [0, 0, 3], [-0.2, 0, 0], [0, 1e-3, 0]
-    colors = sheets.normals_to_rgb(normals)
+    colors = pictures.normals_to_rgb(normals)
     expected = [[0.5, 0.5, 1], [0, 0.5, 0.5], [0.5, 1, 0.5]]
     np.testing.assert_allclose(colors[0, :3], expected, atol=1e-6)
     np.testing.assert_allclose(colors[0, 3], CELL, atol=1e-6)
-    half = sheets.normals_to_rgb(0.5 * normals, np.full((1, 4), 0.5, np.float32))
+    half = pictures.normals_to_rgb(0.5 * normals, np.full((1, 4), 0.5, np.float32))
     np.testing.assert_allclose(half[0, 0], (np.array([0.5, 0.5, 1]) + CELL) / 2, atol=1e-6)
 
 
@@ -100,7 +102,7 @@ def sphere_normals(size=64):
 
 
 def test_clay_is_lit_from_the_upper_left_and_finite():
-    clay = sheets.shade_mesh_preview(*sphere_normals())
+    clay = pictures.shade_mesh_preview(*sphere_normals())
     assert clay[20, 20].mean() > clay[32, 32].mean() - 0.1 > clay[50, 50].mean() - 0.1
     assert clay[20, 20].mean() > clay[50, 50].mean() + 0.1
     np.testing.assert_allclose(clay[0, 0], CELL, atol=1e-6)
@@ -111,9 +113,9 @@ def test_clay_is_lit_from_the_upper_left_and_finite():
 def test_light_display_does_not_depend_on_its_unit(scale):
     rng = np.random.default_rng(0)
     radiance = rng.lognormal(size=(8, 16, 3)).astype(np.float32)
-    shown = sheets.tone_map_light(radiance)
+    shown = pictures.tone_map_light(radiance)
     np.testing.assert_allclose(
-        sheets.tone_map_light(radiance * np.float32(scale)), shown, atol=1e-4
+        pictures.tone_map_light(radiance * np.float32(scale)), shown, atol=1e-4
     )
     assert 0.2 < shown.mean() < 0.8
 
@@ -121,8 +123,8 @@ def test_light_display_does_not_depend_on_its_unit(scale):
 def test_light_display_survives_suns_and_darkness():
     radiance = np.full((8, 16, 3), 0.1, np.float32)
     radiance[2, 3] = 1e5
-    shown = sheets.tone_map_light(radiance)
+    shown = pictures.tone_map_light(radiance)
     assert np.all(np.isfinite(shown))
     assert shown[2, 3].min() == pytest.approx(1.0)
     assert 0.3 < shown[0, 0, 0] < 0.7
-    assert not sheets.tone_map_light(np.zeros((4, 8, 3), np.float32)).any()
+    assert not pictures.tone_map_light(np.zeros((4, 8, 3), np.float32)).any()

@@ -39,7 +39,7 @@ def camera(dtype, *, size=64):
     }
 
 
-def random_gaussians(seed, count, dtype):
+def random_splats(seed, count, dtype):
     rng = np.random.default_rng(seed)
     return (
         jnp.asarray(rng.uniform(-1, 1, (count, 3)), dtype),
@@ -58,22 +58,22 @@ def test_matches_the_oracle(name, x64):
     if not path.exists():
         pytest.skip("the shared oracles are not here")
     data = np.load(path)
-    splats = project(
+    footprints = project(
         *(jnp.asarray(data[key]) for key in ("means", "quats", "scales")),
         world_to_camera=jnp.asarray(data["viewmat"]),
         intrinsics=jnp.asarray(data["K"]),
         height=int(data["height"]),
         width=int(data["width"]),
     )
-    np.testing.assert_allclose(splats.means2d, data["means2d"], rtol=EXACT, atol=EXACT)
-    np.testing.assert_allclose(splats.conics, data["conics"], rtol=1e-11, atol=EXACT)
-    np.testing.assert_allclose(splats.depths, data["depths"], rtol=EXACT)
+    np.testing.assert_allclose(footprints.means2d, data["means2d"], rtol=EXACT, atol=EXACT)
+    np.testing.assert_allclose(footprints.conics, data["conics"], rtol=1e-11, atol=EXACT)
+    np.testing.assert_allclose(footprints.depths, data["depths"], rtol=EXACT)
     # The oracle's determinant cancels; ours does not, so agreement is that of the oracle.
-    np.testing.assert_allclose(splats.compensation, data["compensations"], rtol=1e-9)
+    np.testing.assert_allclose(footprints.compensation, data["compensations"], rtol=1e-9)
 
 
-def test_covariance_is_the_linearised_image_of_the_gaussian(x64):
-    means, quats, scales = random_gaussians(0, 20, jnp.float64)
+def test_covariance_is_the_linearised_image_of_the_splat(x64):
+    means, quats, scales = random_splats(0, 20, jnp.float64)
     settings = camera(jnp.float64)
 
     def pixel(mean):
@@ -81,31 +81,31 @@ def test_covariance_is_the_linearised_image_of_the_gaussian(x64):
         image = settings["intrinsics"] @ point
         return image[:2] / image[2]
 
-    splats = project(means, quats, scales, **settings)
+    footprints = project(means, quats, scales, **settings)
     jacobian = jax.vmap(jax.jacfwd(pixel))(means)
     axes = jacobian @ quaternion_to_matrix(quats) * scales[:, None, :]
     expected = axes @ jnp.swapaxes(axes, 1, 2) + LOW_PASS_VARIANCE * jnp.eye(2)[None]
-    xx, xy, yy = splats.covariances2d.T
+    xx, xy, yy = footprints.covariances2d.T
     np.testing.assert_allclose(xx, expected[:, 0, 0], rtol=1e-10)
     np.testing.assert_allclose(xy, expected[:, 0, 1], rtol=1e-9, atol=1e-10)
     np.testing.assert_allclose(yy, expected[:, 1, 1], rtol=1e-10)
-    np.testing.assert_allclose(splats.means2d, jax.vmap(pixel)(means), rtol=1e-12)
+    np.testing.assert_allclose(footprints.means2d, jax.vmap(pixel)(means), rtol=1e-12)
 
 
 def test_conic_inverts_the_covariance(x64):
-    splats = project(*random_gaussians(1, 50, jnp.float64), **camera(jnp.float64))
-    a, b, c = splats.covariances2d.T
-    p, q, r = splats.conics.T
+    footprints = project(*random_splats(1, 50, jnp.float64), **camera(jnp.float64))
+    a, b, c = footprints.covariances2d.T
+    p, q, r = footprints.conics.T
     np.testing.assert_allclose(a * p + b * q, 1.0, rtol=1e-10)
     np.testing.assert_allclose(a * q + b * r, 0.0, atol=1e-10)
     np.testing.assert_allclose(b * q + c * r, 1.0, rtol=1e-10)
 
 
-def test_flat_gaussians_keep_their_digits_in_float32():
-    means, quats, scales = random_gaussians(2, 200, jnp.float32)
+def test_flat_splats_keep_their_digits_in_float32():
+    means, quats, scales = random_splats(2, 200, jnp.float32)
     flat = scales * jnp.array([[1.0, 1.0, 1e-4]], jnp.float32)
     settings = camera(jnp.float32)
-    splats = project(means, quats, flat, **settings)
+    footprints = project(means, quats, flat, **settings)
     # The same from float64 numpy, with the determinant as a cross product.
     rotation = np.asarray(quaternion_to_matrix(quats), np.float64)
     axes = rotation * np.asarray(flat, np.float64)[:, None, :]
@@ -116,17 +116,17 @@ def test_flat_gaussians_keep_their_digits_in_float32():
     sharp = np.sum(np.cross(row[:, 0], row[:, 1]) ** 2, -1)
     trace = np.sum(row**2, axis=(1, 2))
     expected = np.sqrt(sharp / (sharp + LOW_PASS_VARIANCE * trace + LOW_PASS_VARIANCE**2))
-    np.testing.assert_allclose(splats.compensation, expected, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(footprints.compensation, expected, rtol=1e-4, atol=1e-6)
 
 
 def test_gradients_match_finite_differences_along_random_directions(x64):
-    inputs = random_gaussians(3, 8, jnp.float64)
+    inputs = random_splats(3, 8, jnp.float64)
     rng = np.random.default_rng(4)
     weights = [rng.normal(size=s) for s in ((8, 2), (8, 3), (8,), (8,))]
 
     def value(inputs, settings):
-        splats = project(*inputs, **settings)
-        leaves = [splats.means2d, splats.conics, splats.depths, splats.compensation]
+        footprints = project(*inputs, **settings)
+        leaves = [footprints.means2d, footprints.conics, footprints.depths, footprints.compensation]
         return sum(jnp.sum(w * leaf) for w, leaf in zip(weights, leaves, strict=True))
 
     static = {"height": 64, "width": 64}
@@ -154,8 +154,12 @@ def test_extreme_scales_and_depths_are_finite_in_float32():
     @jax.jit
     @jax.value_and_grad
     def total(inputs):
-        splats = project(*inputs, **camera(jnp.float32, size=800))
-        return jnp.sum(splats.means2d) + jnp.sum(splats.conics) + jnp.sum(splats.compensation)
+        footprints = project(*inputs, **camera(jnp.float32, size=800))
+        return (
+            jnp.sum(footprints.means2d)
+            + jnp.sum(footprints.conics)
+            + jnp.sum(footprints.compensation)
+        )
 
     for scale in (1e-8, 1e-4, 1.0, 1e4):
         scales = jnp.array([[scale, scale, scale], [scale, 1e-8, 1e4]], jnp.float32)
@@ -165,11 +169,11 @@ def test_extreme_scales_and_depths_are_finite_in_float32():
 
 
 def test_zero_quaternion_is_the_identity_with_zero_gradient():
-    means, _, scales = random_gaussians(5, 2, jnp.float32)
+    means, _, scales = random_splats(5, 2, jnp.float32)
     quats = jnp.array([[0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]], jnp.float32)
-    splats = project(means[:1], quats[:1], scales[:1], **camera(jnp.float32))
+    footprints = project(means[:1], quats[:1], scales[:1], **camera(jnp.float32))
     expected = project(means[:1], quats[1:], scales[:1], **camera(jnp.float32))
-    np.testing.assert_array_equal(splats.conics, expected.conics)
+    np.testing.assert_array_equal(footprints.conics, expected.conics)
     gradient = jax.grad(lambda q: project(means, q, scales, **camera(jnp.float32)).conics.sum())(
         quats
     )
@@ -178,7 +182,7 @@ def test_zero_quaternion_is_the_identity_with_zero_gradient():
 
 
 def test_zero_scales_have_zero_compensation_and_finite_gradients():
-    means, quats, scales = random_gaussians(6, 3, jnp.float32)
+    means, quats, scales = random_splats(6, 3, jnp.float32)
 
     def compensation(scales):
         return jnp.sum(project(means, quats, scales, **camera(jnp.float32)).compensation)
@@ -191,19 +195,22 @@ def test_zero_scales_have_zero_compensation_and_finite_gradients():
 @pytest.mark.parametrize("depth", [-2.0, 0.0, 0.01, 0.0101])
 def test_rows_at_or_behind_the_near_plane_are_finite_and_marked(depth):
     means = jnp.array([[0.1, 0.2, depth - 3.0]], jnp.float32)
-    _, quats, scales = random_gaussians(7, 1, jnp.float32)
+    _, quats, scales = random_splats(7, 1, jnp.float32)
 
     def total(inputs):
-        splats = project(*inputs, **camera(jnp.float32))
-        return sum(jnp.sum(leaf) for leaf in (splats.means2d, splats.conics, splats.compensation))
+        footprints = project(*inputs, **camera(jnp.float32))
+        return sum(
+            jnp.sum(leaf)
+            for leaf in (footprints.means2d, footprints.conics, footprints.compensation)
+        )
 
-    splats = project(means, quats, scales, **camera(jnp.float32))
-    assert bool(splats.is_in_front[0]) == (float(splats.depths[0]) > 0.01)
-    assert all_finite((splats, jax.grad(total)((means, quats, scales))))
+    footprints = project(means, quats, scales, **camera(jnp.float32))
+    assert bool(footprints.is_in_front[0]) == (float(footprints.depths[0]) > 0.01)
+    assert all_finite((footprints, jax.grad(total)((means, quats, scales))))
 
 
 def test_float32_in_float32_out_and_jit_equals_eager():
-    inputs = random_gaussians(8, 10, jnp.float32)
+    inputs = random_splats(8, 10, jnp.float32)
     settings = camera(jnp.float32)
     eager = projection.project(*inputs, **settings)
     compiled = project(*inputs, **settings)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -21,9 +22,17 @@ from geosplat_jax.report.relight import (
     relight_views,
 )
 from geosplat_jax.report.renderer import RenderedView, Renderer
-from geosplat_jax.transport.environment import lookup, rotate_light
+from geosplat_jax.transport import environment
 
-AMPLE = Capacities(256, 256, 256, 4096, 8192, 2048, 4096)
+AMPLE = Capacities(
+    surface_cubes=256,
+    dual_vertices=256,
+    quads=256,
+    visible=4096,
+    hits=8192,
+    chunks=2048,
+    cell_patches=4096,
+)
 RED, GREEN, BLUE, YELLOW = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0.0]])
 SIDES = {"+x": RED, "-y": GREEN, "-x": BLUE, "+y": YELLOW}
 AXES = {
@@ -33,6 +42,9 @@ AXES = {
     "+y": np.array([0, 1.0, 0]),
 }
 SIZE = 16
+# Eager, each of their many small operations would be compiled on its own.
+lookup = jax.jit(environment.lookup)
+rotate_light = jax.jit(environment.rotate_light)
 
 
 def four_colours(height=16):
@@ -57,12 +69,12 @@ def light():
 
 
 def relit_ball(light, **material):
-    config = tiny_config("model.material.bias=true")
-    params, context = ball_of_one_material(config, **material)
+    pipeline, params = ball_of_one_material(tiny_config("material.bias=true"), **material)
     # What was trained on is black: nothing but the new light may show.
     params = replace(params, light=EnvLight(jnp.zeros_like(params.light.radiance)))
-    renderer = Renderer(config, params, context, AMPLE, samples=64)
-    return renderer.relit(light, indirect="none")
+    renderer = Renderer(replace(pipeline, capacities=AMPLE), params, samples=64)
+    # A ball shadows nothing but its own far side; without rays the programs are half as large.
+    return renderer.relit(light, indirect="unshadowed")
 
 
 @pytest.fixture(scope="module")

@@ -1,19 +1,19 @@
 """Renderers on the host: what they equal, what they average, and what a new light leaves alone."""
 
 from dataclasses import replace
-from functools import partial
 
-import jax
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import STAGE_2, ball_of_one_material, tiny_config, views_from
+from support import MONTE_CARLO, ball_of_one_material, tiny_config, views_from
 
 from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.core.color import tone_map
 from geosplat_jax.core.types import EnvLight
-from geosplat_jax.fit.stages import begin_stage_2
-from geosplat_jax.render import render
+from geosplat_jax.fit.stages import begin_stage, build_pipeline
+from geosplat_jax.fit.train import Trained
+from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.report.renderer import (
     EVALUATION_AOVS,
     RELIGHT_BOUNCES,
@@ -26,17 +26,20 @@ from geosplat_jax.report.renderer import (
     to_picture,
 )
 
-AMPLE = Capacities(256, 256, 256, 4096, 8192, 2048, 4096)
-CONFIG = tiny_config("model.material.bias=true", "transport.fresh_albedo=false", *STAGE_2)
-# As under a new light without indirect light, so that both share their programs.
+BUFFERS = ("surface_cubes", "dual_vertices", "quads", "visible", "hits", "chunks", "cell_patches")
+AMPLE = Capacities(**dict(zip(BUFFERS, (256, 256, 256, 4096, 8192, 2048, 4096), strict=True)))
+COMMON = ("material.bias=true", "stages.monte_carlo.enter=[]", *MONTE_CARLO)
+CONFIG = tiny_config(*COMMON)
+# As under a new light without shadows, so that both share their programs. Rays double what there is
+# to compile; the evaluation's tests trace them.
 DIRECT = tiny_config(
-    "model.material.bias=true",
-    *STAGE_2,
-    "transport.shading.indirect=none",
-    f"transport.shading.bounces={RELIGHT_BOUNCES}",
+    *COMMON,
+    "stages.monte_carlo.transport.occlusion=false",
+    "stages.monte_carlo.transport.indirect=none",
+    f"stages.monte_carlo.transport.bounces={RELIGHT_BOUNCES}",
 )
 SIZE = 12
-draw = partial(jax.jit, static_argnames=("model", "capacities", "aov_names"))(render)
+draw = eqx.filter_jit(Pipeline.render)
 
 
 def sky(scale=1.0, seed=0):
@@ -45,19 +48,35 @@ def sky(scale=1.0, seed=0):
     return EnvLight(jnp.asarray(scale * (0.1 + 0.6 * texels**6), jnp.float32))
 
 
+def second_stage(config, pipeline):
+    """The pipeline of the second stage, on the surface of another one."""
+    built = build_pipeline(config, config.stage("monte_carlo"), pipeline.surface)
+    return replace(built, capacities=AMPLE)
+
+
 @pytest.fixture(scope="module")
 def matt():
-    params, context = ball_of_one_material(CONFIG, albedo=0.6, roughness=0.9, metallic=0.0)
-    return replace(params, light=sky(), log_exposure=jnp.asarray(0.2)), context
+    """Pipeline and parameters of the first stage, with a light and an exposure of their own."""
+    pipeline, params = ball_of_one_material(CONFIG, albedo=0.6, roughness=0.9, metallic=0.0)
+    params = replace(params, light=sky(), log_exposure=jnp.float32(0.2))
+    return replace(pipeline, capacities=AMPLE), params
 
 
 @pytest.fixture(scope="module")
-def in_stage_2(matt):
-    """Settings and parameters of stage 2, with bright indirect light."""
-    params = begin_stage_2(matt[0], matt[1].grid, CONFIG, jax.random.key(1))
+def direct(matt):
+    """The pipeline of a second stage without shadows and indirect light."""
+    return second_stage(DIRECT, matt[0])
+
+
+@pytest.fixture(scope="module")
+def in_second_stage(matt):
+    """Pipeline and parameters of the second stage, with bright indirect light."""
+    pipeline, params = matt
+    params = begin_stage(params, pipeline, CONFIG, CONFIG.stage("monte_carlo"))
     *first, last = params.material.indirect_head
     head = (*first, replace(last, bias=jnp.full_like(last.bias, 4.0)))
-    return CONFIG.stage(2), replace(params, material=replace(params.material, indirect_head=head))
+    material = replace(params.material, indirect_head=head)
+    return second_stage(CONFIG, pipeline), replace(params, material=material)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +87,7 @@ def camera():
 @pytest.fixture(scope="module")
 def relit(matt):
     """The ball under a light that it was not trained with."""
-    return Renderer(CONFIG, *matt, AMPLE, samples=32).relit(sky(seed=3), indirect="none")
+    return Renderer(*matt, samples=32).relit(sky(seed=3), indirect="unshadowed")
 
 
 def assert_same_view(first, second):
@@ -79,17 +98,11 @@ def assert_same_view(first, second):
         np.testing.assert_array_equal(first.aovs[name], second.aovs[name])
 
 
-def test_the_renderer_of_stage_1_is_the_training_render_tone_mapped(matt, camera):
-    params, context = matt
-    view = Renderer(CONFIG, params, context, AMPLE)(camera)
-    expected = draw(
-        params,
-        camera,
-        context,
-        model=CONFIG.model,
-        capacities=AMPLE,
-        aov_names=EVALUATION_AOVS,
-    )
+def test_the_renderer_of_the_first_stage_is_the_training_render_tone_mapped(matt, camera):
+    pipeline, params = matt
+    trained = Trained(CONFIG, CONFIG.stage("split_sum"), params, pipeline, step=1)
+    view = Renderer.of(trained)(camera)
+    expected = draw(pipeline, params, camera, aov_names=EVALUATION_AOVS)
     rgb = tone_map(expected.rgb[0], params.log_exposure)
     np.testing.assert_allclose(view.rgb, rgb, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(view.alpha, expected.alpha[0], rtol=1e-5, atol=1e-6)
@@ -100,8 +113,11 @@ def test_the_renderer_of_stage_1_is_the_training_render_tone_mapped(matt, camera
 
 @pytest.mark.slow
 def test_too_small_buffers_grow_and_change_no_pixel(matt, camera):
-    tight = Capacities(*[128] * 7)
-    ample, grown = (Renderer(CONFIG, *matt, size)(camera) for size in (AMPLE, tight))
+    pipeline, params = matt
+    tight = Capacities(**dict.fromkeys(BUFFERS, 128))
+    ample, grown = (
+        Renderer(replace(pipeline, capacities=size), params)(camera) for size in (AMPLE, tight)
+    )
     # Programs of other sizes fuse otherwise: the last bit of a float32.
     np.testing.assert_allclose(grown.rgb, ample.rgb, atol=1e-6)
     np.testing.assert_allclose(grown.alpha, ample.alpha, atol=1e-6)
@@ -110,46 +126,44 @@ def test_too_small_buffers_grow_and_change_no_pixel(matt, camera):
 
 
 def test_no_samples_are_refused(matt):
-    with pytest.raises(ValueError, match="at least 1 sample a splat, got 0"):
-        Renderer(CONFIG, *matt, AMPLE, samples=0)
+    with pytest.raises(ValueError, match="at least 1 sample per splat, got 0"):
+        Renderer(*matt, samples=0)
 
 
 @pytest.mark.parametrize(("asked", "drawn"), [(1, 2), (16, 16), (33, 36), (128, 128), (130, 130)])
 def test_samples_are_rounded_up_to_equal_passes(matt, asked, drawn):
-    renderer = Renderer(CONFIG, *matt, AMPLE, samples=asked)
+    renderer = Renderer(*matt, samples=asked)
     assert renderer.samples == drawn
     assert renderer.relit(sky(seed=3)).samples == drawn
 
 
-def noise(config, params, context, camera, samples):
+def noise(pipeline, params, camera, samples):
     """Standard deviation over seeds, averaged over the pixels of the object."""
-    views = [
-        Renderer(config, params, context, AMPLE, samples=samples, seed=seed)(camera)
-        for seed in range(3)
-    ]
+    views = [Renderer(pipeline, params, samples=samples, seed=seed)(camera) for seed in range(3)]
     solid = views[0].alpha > 0.9
     assert solid.sum() > 10
     return float(np.mean(np.std([view.rgb[solid] for view in views], axis=0)))
 
 
-@pytest.mark.slow
-def test_the_noise_of_matt_surfaces_falls_with_the_samples(matt, camera):
-    few, many = (noise(DIRECT.stage(2), *matt, camera, samples) for samples in (32, 128))
+@pytest.mark.parametrize(
+    "material",
+    [
+        {"albedo": 0.6, "roughness": 0.9, "metallic": 0.0},
+        {"albedo": 0.9, "roughness": 0.5, "metallic": 1.0},
+    ],
+    ids=["matt", "metal"],
+)
+def test_the_noise_falls_with_the_samples(direct, camera, material):
+    _, params = ball_of_one_material(CONFIG, **material)
+    params = replace(params, light=sky())
+    few, many = (noise(direct, params, camera, samples) for samples in (32, 128))
     # The inverse root of 4 would be .5.
     assert 0 < many < 0.75 * few
 
 
-@pytest.mark.slow
-def test_the_noise_of_metals_falls_with_the_samples(matt, camera):
-    metal, context = ball_of_one_material(CONFIG, albedo=0.9, roughness=0.5, metallic=1.0)
-    params = replace(metal, light=sky())
-    few, many = (noise(DIRECT.stage(2), params, context, camera, n) for n in (32, 128))
-    assert 0 < many < 0.75 * few
-
-
-def test_the_same_seed_gives_the_same_image_and_another_one_does_not(matt, camera):
+def test_the_same_seed_gives_the_same_image_and_another_one_does_not(direct, matt, camera):
     first, again, other = (
-        Renderer(DIRECT.stage(2), *matt, AMPLE, samples=32, seed=seed)(camera) for seed in (0, 0, 1)
+        Renderer(direct, matt[1], samples=32, seed=seed)(camera) for seed in (0, 0, 1)
     )
     assert_same_view(first, again)
     assert np.any(first.rgb != other.rgb)
@@ -157,13 +171,13 @@ def test_the_same_seed_gives_the_same_image_and_another_one_does_not(matt, camer
 
 
 def test_relighting_does_not_know_the_light_and_exposure_of_the_training(
-    in_stage_2, matt, relit, camera
+    in_second_stage, relit, camera
 ):
-    """Nor what was learned of indirect light, nor whether a run stopped in stage 1 or 2."""
-    config, params = in_stage_2
-    changed = replace(params, light=sky(3.0, seed=9), log_exposure=jnp.asarray(-1.0))
-    learned = Renderer(config, changed, matt[1], AMPLE, samples=32)
-    assert_same_view(relit(camera), learned.relit(sky(seed=3), indirect="none")(camera))
+    """Nor what was learned of indirect light, nor in which stage a run stopped."""
+    pipeline, params = in_second_stage
+    changed = replace(params, light=sky(3.0, seed=9), log_exposure=jnp.float32(-1.0))
+    learned = Renderer(pipeline, changed, samples=32)
+    assert_same_view(relit(camera), learned.relit(sky(seed=3), indirect="unshadowed")(camera))
 
 
 def test_another_light_changes_the_colours_alone(relit, camera):
@@ -179,7 +193,7 @@ def test_another_light_changes_the_colours_alone(relit, camera):
 
 
 def test_another_light_is_the_same_as_relighting_with_it(matt, relit, camera):
-    directly = Renderer(CONFIG, *matt, AMPLE, samples=32).relit(sky(seed=5), indirect="none")
+    directly = Renderer(*matt, samples=32).relit(sky(seed=5), indirect="unshadowed")
     assert_same_view(relit.under(sky(seed=5))(camera), directly(camera))
 
 
@@ -191,7 +205,7 @@ def test_light_enters_linearly_at_exposure_one(relit, camera):
 
 
 def test_a_matt_ball_under_uniform_light_has_the_radiance_of_its_albedo(relit, camera):
-    uniform = EnvLight(jnp.full((4, 8, 3), 0.5))
+    uniform = EnvLight(jnp.full((8, 16, 3), 0.5, jnp.float32))
     view = relit.under(uniform)(camera)
     straight = (view.rgb / np.maximum(view.alpha, 0.5)[..., None])[view.alpha > 0.95]
     # .3 of the diffuse lobe, and a few percent of .5 of the specular one.
@@ -199,10 +213,10 @@ def test_a_matt_ball_under_uniform_light_has_the_radiance_of_its_albedo(relit, c
 
 
 def test_the_scale_multiplies_the_albedo(matt, camera):
-    base = Renderer(CONFIG, *matt, AMPLE, samples=32)
+    base = Renderer(*matt, samples=32)
     scale = np.array([0.5, 1.0, 0.25])
     black, whole, scaled = (
-        base.relit(sky(seed=3), albedo_scale=factors, indirect="none")(camera)
+        base.relit(sky(seed=3), albedo_scale=factors, indirect="unshadowed")(camera)
         for factors in (np.zeros(3), np.ones(3), scale)
     )
     np.testing.assert_allclose(
@@ -216,11 +230,12 @@ def test_the_scale_multiplies_the_albedo(matt, camera):
 
 def test_light_for_relighting_is_traced_and_learns_nothing():
     transport = relight_transport()
-    assert transport.is_traced
+    assert transport.occlusion
+    assert transport.indirect_outputs == 0
     assert transport.indirect == "traced"
     assert transport.bounces == RELIGHT_BOUNCES
     assert relight_transport("none").indirect == "none"
-    assert not relight_transport("unshadowed").is_traced
+    assert not relight_transport("unshadowed").occlusion
     with pytest.raises(ValueError, match="indirect must be one of .*, got 'constant'"):
         relight_transport("constant")
 

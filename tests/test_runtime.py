@@ -5,7 +5,7 @@ import sys
 import jax
 import pytest
 
-from geosplat_jax.fit import runtime as process
+from geosplat_jax.fit import runtime
 
 
 @pytest.fixture
@@ -20,8 +20,8 @@ def test_the_cache_is_kept_apart_by_version_and_processor(monkeypatch, tmp_path,
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     places = []
     for flags in ("flags: avx2", "flags: avx512"):
-        monkeypatch.setattr(process, "_cpu_flags", lambda flags=flags: flags)
-        process.enable_compilation_cache()
+        monkeypatch.setattr(runtime, "_cpu_flags", lambda flags=flags: flags)
+        runtime.enable_compilation_cache()
         places.append(jax.config.jax_compilation_cache_dir)
     assert places[0] != places[1]
     assert all(place.startswith(str(tmp_path)) for place in places)
@@ -30,20 +30,20 @@ def test_the_cache_is_kept_apart_by_version_and_processor(monkeypatch, tmp_path,
 def test_a_cache_chosen_by_the_user_is_respected(monkeypatch, cache_setting):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/elsewhere")
     before = jax.config.jax_compilation_cache_dir
-    process.enable_compilation_cache()
+    runtime.enable_compilation_cache()
     assert jax.config.jax_compilation_cache_dir == before
 
 
 def test_retaining_memory_is_for_linux_only(monkeypatch):
     monkeypatch.setattr(sys, "platform", "darwin")
-    assert process.retain_freed_memory() is False
+    assert runtime.retain_freed_memory() is False
 
 
 def test_programs_are_forgotten_when_they_hold_too_many_maps(monkeypatch):
     double = jax.jit(lambda x: 2 * x)
     double(jax.numpy.ones(3))
-    assert process.release_programs_when_crowded() is False
+    assert runtime.release_programs_when_crowded() is False
     assert double._cache_size() == 1
-    monkeypatch.setattr(process, "_CROWDED", 0.0)
-    assert process.release_programs_when_crowded() is sys.platform.startswith("linux")
+    monkeypatch.setattr(runtime, "_CROWDED", 0.0)
+    assert runtime.release_programs_when_crowded() is sys.platform.startswith("linux")
     assert double._cache_size() == (0 if sys.platform.startswith("linux") else 1)

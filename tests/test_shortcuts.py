@@ -3,15 +3,19 @@
 import sys
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "experiments"))
+sys.path.insert(0, str(ROOT / "experiments" / "studies"))
 
 import shortcuts  # noqa: E402
 
-from geosplat_jax.fit.config import make_config  # noqa: E402
+from geosplat_jax.core.types import Grid  # noqa: E402
+from geosplat_jax.fit.presets import make_config  # noqa: E402
+from geosplat_jax.fit.stages import build_pipeline  # noqa: E402
+from geosplat_jax.geometry import FlexiCubes  # noqa: E402
 
 SIZE, SEEDS = 40, 8
 
@@ -64,18 +68,21 @@ def test_estimates_are_compared_in_units_of_the_reference():
     assert row["seconds"] == 1.0
 
 
+def _pipeline(*overrides):
+    config = make_config(overrides=overrides)
+    grid = Grid(jnp.zeros(3), jnp.ones(()), (2, 2, 2))
+    return build_pipeline(config, config.stage("monte_carlo"), FlexiCubes(grid))
+
+
 def test_every_shortcut_differs_from_the_run_and_the_reference_has_none():
-    model = make_config(
-        overrides=(
-            "transport.shading.occlusion=false",
-            "transport.shading.denoise.iterations=2",
-        )
-    ).stage(2)
-    exact = shortcuts.without_shortcuts(model.model)
-    assert exact.transport.is_traced
-    assert not exact.transport.is_denoised
-    assert exact.cull_backfaces == model.model.cull_backfaces
-    models = shortcuts.shortcuts(make_config().stage(2).model)
-    assert len(set(models.values())) == len(models)
+    transport = "stages.monte_carlo.transport"
+    pipeline = _pipeline(f"{transport}.occlusion=false", f"{transport}.denoise.iterations=2")
+    exact = shortcuts.without_shortcuts(pipeline)
+    assert exact.transport.uses_rays
+    assert exact.transport.settings.denoise.iterations == 0
+    assert exact.raster.cull_backfaces == pipeline.raster.cull_backfaces
+    pipelines = shortcuts.shortcuts(_pipeline())
+    choices = [(p.transport.settings, p.raster) for p in pipelines.values()]
+    assert len(set(choices)) == len(choices)
     # With other seeds, this row shows what chance alone does.
-    assert models["16 samples"] == exact
+    assert pipelines["16 samples"].transport == exact.transport

@@ -1,6 +1,6 @@
-"""Split sum: energy, agreement with direct integration, gradients, and behaviour at the edges."""
+"""Split sum: energy, agreement with direct integration, and behaviour at the edges."""
 
-import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ import pytest
 from support import double_precision
 
 from geosplat_jax.core.types import EnvLight, Materials
+from geosplat_jax.transport.bsdf import DIELECTRIC_F0
 from geosplat_jax.transport.environment import (
     LightSpec,
     init_light,
@@ -19,7 +20,6 @@ from geosplat_jax.transport.environment import (
     texel_solid_angles,
 )
 from geosplat_jax.transport.split_sum import (
-    DIELECTRIC_F0,
     directional_albedo,
     fg_lookup,
     fg_table,
@@ -252,34 +252,6 @@ def _loss(materials, normals, views, radiance, operators, table):
     return jnp.sum(jnp.sin(2 * shaded.rgb)) + jnp.sum(shaded.diffuse_light * shaded.specular_light)
 
 
-def test_gradients_match_finite_differences():
-    operators, table = prefilter_operators(SPEC), fg_table()
-    with double_precision():
-        count = 12
-        normals, views = _unit(count, 12), _unit(count, 13)
-        radiance = jnp.asarray(_light(14).radiance, jnp.float64)
-        arguments = (
-            _materials(count, dtype=jnp.float64),
-            jnp.asarray(normals),
-            jnp.asarray(views),
-            radiance,
-        )
-        loss = jax.jit(_loss)
-        gradients = jax.jit(jax.grad(_loss, argnums=(0, 1, 2, 3)))(*arguments, operators, table)
-        leaves, structure = jax.tree.flatten(arguments)
-        rng, step = np.random.default_rng(15), 1e-7
-        for which, gradient in enumerate(jax.tree.leaves(gradients)):
-            move = jnp.asarray(rng.standard_normal(gradient.shape))
-
-            def at(offset, which=which, move=move):
-                moved = [*leaves]
-                moved[which] = moved[which] + offset * move
-                return loss(*jax.tree.unflatten(structure, moved), operators, table)
-
-            difference = (at(step) - at(-step)) / (2 * step)
-            np.testing.assert_allclose(jnp.sum(gradient * move), difference, rtol=2e-6)
-
-
 def test_everything_is_finite_at_the_extremes():
     up, side = [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]
     cases = [  # normal, view: head on at the pole, grazing, behind, opposite, padding
@@ -306,13 +278,17 @@ def test_padding_rows_do_not_disturb_the_others():
     materials, light = _materials(2 * count), prefiltered(_light(16), prefilter_operators(SPEC))
     normals, views = _unit(2 * count, 17), _unit(2 * count, 18)
     normals[count:] = 0.0
-    rows = jax.tree.map(lambda leaf: leaf[:count], materials)
-    normals, views = jnp.asarray(normals, jnp.float32), jnp.asarray(views, jnp.float32)
-    run = lambda m, n, v: jnp.sum(shade(m, n, v, light, fg_table()).rgb[:count])  # noqa: E731
-    padded = jax.jit(jax.grad(run, argnums=(0, 1)))(materials, normals, views)
-    plain = jax.jit(jax.grad(run, argnums=(0, 1)))(rows, normals[:count], views[:count])
+    others = np.where(np.arange(2 * count)[:, None] < count, normals, _unit(2 * count, 22))
+    padding, others, views = (jnp.asarray(x, jnp.float32) for x in (normals, others, views))
+
+    @jax.jit
+    @partial(jax.grad, argnums=(0, 1))
+    def gradient(materials, normals):
+        return jnp.sum(split_sum(materials, normals, views, light, fg_table()).rgb[:count])
+
+    padded, plain = gradient(materials, padding), gradient(materials, others)
     for with_padding, without in zip(jax.tree.leaves(padded), jax.tree.leaves(plain), strict=True):
-        np.testing.assert_allclose(with_padding[:count], without, atol=ROUNDING)
+        np.testing.assert_allclose(with_padding[:count], without[:count], atol=ROUNDING)
         np.testing.assert_array_equal(with_padding[count:], 0.0)
 
 
@@ -322,17 +298,21 @@ def test_compiled_equals_eager_and_precision_in_is_precision_out():
     def run(materials, normals, views, radiance, operators, table):
         return split_sum(materials, normals, views, prefilter(EnvLight(radiance), operators), table)
 
+    def arguments(dtype):
+        return (
+            _materials(30, dtype=dtype),
+            jnp.asarray(_unit(30, 19), dtype),
+            jnp.asarray(_unit(30, 20), dtype),
+            _light(21).radiance.astype(dtype),
+            operators,
+            table,
+        )
+
+    given = arguments(jnp.float32)
+    eager, compiled = jax.tree.leaves(run(*given)), jax.tree.leaves(jax.jit(run)(*given))
+    for first, second in zip(eager, compiled, strict=True):
+        assert first.dtype == second.dtype == jnp.float32
+        np.testing.assert_allclose(first, second, atol=ROUNDING)
     with double_precision():
-        for dtype in (jnp.float32, jnp.float64):
-            arguments = (
-                _materials(30, dtype=dtype),
-                jnp.asarray(_unit(30, 19), dtype),
-                jnp.asarray(_unit(30, 20), dtype),
-                _light(21).radiance.astype(dtype),
-            )
-            eager = run(*arguments, operators, table)
-            compiled = jax.jit(run)(*arguments, operators, table)
-            for part in dataclasses.fields(eager):
-                first, second = getattr(eager, part.name), getattr(compiled, part.name)
-                assert first.dtype == second.dtype == dtype
-                np.testing.assert_allclose(first, second, atol=ROUNDING)
+        for leaf in jax.tree.leaves(jax.eval_shape(run, *arguments(jnp.float64))):
+            assert leaf.dtype == jnp.float64

@@ -1,4 +1,4 @@
-"""Sweeps: strict files, one shared stage 1, going on after a stop, and a report that hides nothing.
+"""Sweeps: strict files, shared stages, going on after a stop, and a report that hides nothing.
 
 Training and evaluation are replaced by functions that write the files the real ones write; one
 slow test runs a sweep for real.
@@ -18,7 +18,8 @@ sys.path.insert(0, str(ROOT / "experiments"))
 import report  # noqa: E402
 import run as runner  # noqa: E402
 
-from geosplat_jax.fit.config import make_config  # noqa: E402
+from geosplat_jax.fit.config import Config, Stage  # noqa: E402
+from geosplat_jax.fit.presets import make_config  # noqa: E402
 from geosplat_jax.io.checkpoints import save_checkpoint  # noqa: E402
 
 SWEEPS = ROOT / "experiments" / "sweeps"
@@ -27,7 +28,7 @@ title = "A sweep"
 about = "What it is about."
 quality = "draft"
 scenes = ["one", "two"]
-set = ["transport.steps=3", "transport.batch_views=2"]
+set = ["stages.monte_carlo.steps=3", "stages.monte_carlo.batch_views=2"]
 figures = ["nvs.psnr", "roughness.mse"]
 
 [[run]]
@@ -35,7 +36,7 @@ name = "full"
 
 [[run]]
 name = "no-shadow"
-set = ["transport.shading.occlusion=false"]
+set = ["stages.monte_carlo.transport.occlusion=false"]
 evaluate = { relight_indirect = "none" }
 
 [[run]]
@@ -44,16 +45,22 @@ set = ["geometry.resolution=8"]
 
 [[run]]
 name = "few"
-set = ["transport.shading.light=1"]
+set = ["stages.monte_carlo.transport.light_count=1"]
 x = 1
 group = "light"
 
 [[run]]
 name = "many"
-set = ["transport.shading.light=16"]
+set = ["stages.monte_carlo.transport.light_count=16"]
 x = 16
 group = "light"
 """
+
+
+SHARED = "_full.split_sum"
+"""Folder of the stage that all runs but one share."""
+
+NO_STEPS = 'stages.split_sum.steps=0", "stages.monte_carlo.steps=0'
 
 
 def _write(folder, text=SWEEP):
@@ -74,20 +81,22 @@ class Fakes:
 
     def __init__(self, *, broken=()):
         self.trained, self.evaluated, self.broken = [], [], set(broken)
+        self.first_stages = {}
 
-    def train(self, scene, folder, config, options, *, resume, stage_1):
+    def train(self, scene, folder, config, *, resume, force, source, first_stage, **options):
         label = f"{scene.name}/{folder.name}"
         if not resume:
-            assert not folder.exists() or not any(folder.iterdir())
+            assert force or not folder.exists() or not any(folder.iterdir())
             folder.mkdir(parents=True, exist_ok=True)
             record = {"scene": str(scene), "dataset": options, "config": config.to_dict()}
             (folder / "run.json").write_text(json.dumps(record))
-        self.trained.append((label, resume, stage_1 and stage_1.name))
+        self.trained.append((label, resume, source and source.name))
+        self.first_stages[label] = first_stage
         if label in self.broken:
             raise RuntimeError(f"no luck with {label}")
-        first = config.run.steps if stage_1 else 0
+        first = config.first_step(first_stage) if first_stage else 0
         lines = [
-            {"step": k, "stage": 1 if k < config.run.steps else 2, "seconds": 0.5}
+            {"step": k, "stage": config.stage_at(k).name, "seconds": 0.5}
             for k in range(first, config.total_steps)
         ]
         text = "".join(json.dumps(line) + "\n" for line in lines)
@@ -100,8 +109,8 @@ class Fakes:
         config = runner.config_from_dict(record["config"])
         figures = {
             "mean": {"nvs.psnr": 30.0, "roughness.mse": 0.01},
-            "config": config.stage(2).to_dict(),
-            "stage": 2,
+            "config": config.to_dict(),
+            "stage": config.active_stages[-1].name,
             "step": config.total_steps,
             "samples": samples,
             "protocol": protocol,
@@ -129,12 +138,14 @@ def _run(folder, fakes, *more):
         ('["one", "two"]', "[]", "scenes must not be empty"),
         ('["one", "two"]', '["a/b"]', "'a/b' is no folder name"),
         ('name = "coarse"', 'name = "full"', "the run 'full' appears twice"),
-        ('name = "coarse"', 'name = "_stage_1"', "'_stage_1' is no folder name"),
+        ('name = "coarse"', 'name = "_coarse"', "'_coarse' is no folder name"),
         ('name = "coarse"', 'name = ".."', "'..' is no folder name"),
         ('name = "coarse"', 'name = "coarse"\nsets = []', "unknown key 'sets'"),
         ("geometry.resolution=8", "geometry.resolutoin=8", "run 'coarse': unknown setting"),
-        ("geometry.resolution=8", "geometry.resolution=2", "must be at least 4"),
-        ("transport.steps=3", "transport.steps", "section.field=value"),
+        ("geometry.resolution=8", "geometry.resolution=2", "greater than or equal to 4"),
+        ("stages.monte_carlo.steps=3", "stages.monte_carlo.steps", "section.field=value"),
+        ("stages.monte_carlo.steps=3", "transport.steps=3", "is now stages.monte_carlo.steps"),
+        ("geometry.resolution=8", NO_STEPS, "run 'coarse': nothing to train"),
         ('relight_indirect = "none"', 'relight_indirect = "some"', "relight_indirect must be one"),
         ('relight_indirect = "none"', 'lights = "none"', "unknown key 'lights'"),
         ("x = 16", "x = true", "x must be a finite number"),
@@ -180,19 +191,81 @@ def test_a_scene_that_is_not_there_is_named(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("override", "shares"),
     [
-        ("transport.shading.light=1", True),
-        ("transport.loss.light=0", True),
-        ("transport.steps=7", True),
-        ("transport.steps=0", False),
-        ("model.cull_backfaces=false", False),
+        ("stages.monte_carlo.transport.light_count=1", True),
+        ("stages.monte_carlo.weights.light=0.1", True),
+        ("stages.monte_carlo.steps=7", True),
+        ("stages.monte_carlo.steps=0", False),
+        ("raster.cull_backfaces=false", False),
         ("run.seed=1", False),
-        ("loss.mask=1.0", False),
+        ("stages.split_sum.weights.mask=1.0", False),
     ],
 )
-def test_stage_1_is_shared_where_only_stage_2_differs(override, shares):
+def test_a_stage_is_shared_where_only_later_ones_differ(override, shares):
     base = make_config(quality="draft")
     config = make_config(quality="draft", overrides=(override,))
-    assert runner.shares_stage_1(config, base) is shares
+    shared = runner.shared_stages(config, [base])
+    assert shared == (runner.beginning(base, 1) if shares else None)
+
+
+def _several_stages(preset, quality, *, material_prior, overrides):
+    """Stand in for `make_config`: overrides are stages, such as ``a=3`` for three steps of a."""
+    named = [text.split("=") for text in overrides]
+    return Config(stages=tuple(Stage(name=name, steps=int(steps)) for name, steps in named))
+
+
+def _parts(tmp_path, monkeypatch, **runs):
+    """Return the sources and first stages of a sweep of runs given as ``name="a=3 b=1"``."""
+    monkeypatch.setattr(runner, "make_config", _several_stages)
+    tables = [
+        f"[[run]]\nname = {name!r}\nset = {stages.split()}\n" for name, stages in runs.items()
+    ]
+    head = "title = 'x'\nscenes = ['one']\nfigures = ['f']\n"
+    sweep = runner.read_sweep(_write(tmp_path, head + "".join(tables)))
+    return [
+        (part.folder, part.source, part.first_stage, part.run is not None)
+        for part in runner.parts_of(sweep).values()
+    ]
+
+
+def test_runs_share_the_longest_beginning_with_equal_settings(tmp_path, monkeypatch):
+    runs = {"r": "a=1 b=1 c=1", "s": "a=1 b=1 c=2", "t": "a=1 b=2 c=1", "u": "a=2 b=1 c=1"}
+    assert _parts(tmp_path, monkeypatch, **runs) == [
+        ("_r.a", None, None, False),
+        ("_r.b", "_r.a", "b", False),
+        ("r", "_r.b", "c", True),
+        ("s", "_r.b", "c", True),
+        ("t", "_r.a", "b", True),
+        ("u", None, None, True),
+    ]
+
+
+def test_a_run_that_others_go_on_from_is_trained_once(tmp_path, monkeypatch):
+    runs = {"long": "a=1 b=1 c=1", "short": "a=1 b=1", "other": "a=1 b=1 c=0 d=1"}
+    assert _parts(tmp_path, monkeypatch, **runs) == [
+        ("short", None, None, True),
+        ("long", "short", "c", True),
+        ("other", "short", "d", True),
+    ]
+
+
+def test_stages_that_nobody_else_has_are_not_trained_apart(tmp_path, monkeypatch):
+    runs = {"r": "a=1 b=1 c=1", "s": "a=2 b=1 c=1"}
+    assert _parts(tmp_path, monkeypatch, **runs) == [
+        ("r", None, None, True),
+        ("s", None, None, True),
+    ]
+
+
+def test_a_source_that_was_not_asked_for_is_trained_but_not_evaluated(tmp_path):
+    short = '\n[[run]]\nname = "short"\nset = ["stages.monte_carlo.steps=0"]\n'
+    _write(tmp_path, SWEEP + short)
+    fakes = Fakes()
+    assert _run(tmp_path, fakes, "--only", "full", "--scene", "one") == 0
+    assert fakes.trained == [("one/short", False, None), ("one/full", False, "short")]
+    assert fakes.evaluated == [("one/full", "traced")]
+    assert _run(tmp_path, fakes, "--only", "short", "--scene", "one") == 0
+    assert len(fakes.trained) == 2
+    assert fakes.evaluated[1:] == [("one/short", "traced")]
 
 
 def test_every_run_of_every_scene_is_trained_and_evaluated_once(tmp_path):
@@ -201,18 +274,20 @@ def test_every_run_of_every_scene_is_trained_and_evaluated_once(tmp_path):
     assert _run(tmp_path, fakes) == 0
     for scene in ("one", "two"):
         assert [call for call in fakes.trained if call[0].startswith(scene)] == [
-            (f"{scene}/_stage_1", False, None),
-            (f"{scene}/full", False, "_stage_1"),
-            (f"{scene}/no-shadow", False, "_stage_1"),
+            (f"{scene}/{SHARED}", False, None),
+            (f"{scene}/full", False, SHARED),
+            (f"{scene}/no-shadow", False, SHARED),
             (f"{scene}/coarse", False, None),
-            (f"{scene}/few", False, "_stage_1"),
-            (f"{scene}/many", False, "_stage_1"),
+            (f"{scene}/few", False, SHARED),
+            (f"{scene}/many", False, SHARED),
         ]
     assert ("one/no-shadow", "none") in fakes.evaluated
     assert ("one/full", "traced") in fakes.evaluated
     assert len(fakes.evaluated) == 10
-    first = json.loads((tmp_path / "runs" / "one" / "_stage_1" / "run.json").read_text())
-    assert first["config"]["transport"]["steps"] == 0
+    first = json.loads((tmp_path / "runs" / "one" / SHARED / "run.json").read_text())
+    assert list(first["config"]["stages"]) == ["split_sum"]
+    assert fakes.first_stages["one/few"] == "monte_carlo"
+    assert fakes.first_stages["one/coarse"] is None
 
 
 def test_a_finished_sweep_does_nothing_and_only_the_chosen_runs_are_made(tmp_path):
@@ -228,11 +303,13 @@ def test_a_finished_sweep_does_nothing_and_only_the_chosen_runs_are_made(tmp_pat
 
 
 def test_runs_with_the_same_settings_are_made_once(tmp_path):
-    again = SWEEP + '\n[[run]]\nname = "again"\nset = ["transport.shading.occlusion=true"]\n'
+    again = (
+        SWEEP + '\n[[run]]\nname = "again"\nset = ["stages.monte_carlo.transport.occlusion=true"]\n'
+    )
     _write(tmp_path, again)
     fakes = Fakes()
     assert _run(tmp_path, fakes, "--only", "again", "--scene", "one") == 0
-    assert [label for label, *_ in fakes.trained] == ["one/_stage_1", "one/full"]
+    assert [label for label, *_ in fakes.trained] == [f"one/{SHARED}", "one/full"]
     record = json.loads((tmp_path / "runs" / "sweep.json").read_text())
     assert {r["name"]: r["same_as"] for r in record["runs"]}["again"] == "full"
     # Another evaluation makes it another run.
@@ -245,9 +322,9 @@ def test_finished_runs_with_other_settings_stop_the_sweep_and_say_so(tmp_path, c
     _write(tmp_path)
     assert _run(tmp_path, Fakes(), "--only", "few", "--scene", "one") == 0
     fakes = Fakes()
-    assert _run(tmp_path, fakes, "--set", "transport.batch_views=3") == 2
+    assert _run(tmp_path, fakes, "--set", "stages.monte_carlo.batch_views=3") == 2
     said = capsys.readouterr().err
-    assert "one/few: transport.batch_views: 2 -> 3" in said
+    assert "one/few: stages.monte_carlo.batch_views: 2 -> 3" in said
     assert "Take another --output" in said
     assert fakes.trained == []
     path = tmp_path / "runs" / "one" / "few" / "metrics.json"
@@ -257,25 +334,22 @@ def test_finished_runs_with_other_settings_stop_the_sweep_and_say_so(tmp_path, c
     assert "evaluate.samples: 3 -> " in capsys.readouterr().err
 
 
-def test_settings_of_stage_2_leave_the_shared_stage_1_as_it_is(tmp_path, capsys):
+def test_settings_of_later_stages_leave_the_shared_ones_as_they_are(tmp_path, capsys):
     _write(tmp_path)
     assert _run(tmp_path, Fakes(), "--only", "few", "--scene", "one") == 0
-    more = ["--set", "transport.batch_views=3", "--only", "many", "--scene", "one"]
+    more = ["--set", "stages.monte_carlo.batch_views=3", "--only", "many", "--scene", "one"]
     fakes = Fakes()
     assert _run(tmp_path, fakes, *more) == 0
-    assert fakes.trained == [("one/many", False, "_stage_1")]
-    # Neither do other defaults of stage 2, by then; those of stage 1 do.
-    path = tmp_path / "runs" / "one" / "_stage_1" / "run.json"
+    assert fakes.trained == [("one/many", False, SHARED)]
+    # Those of the shared stage itself do not.
+    path = tmp_path / "runs" / "one" / SHARED / "run.json"
     record = json.loads(path.read_text())
-    record["config"]["transport"]["rates"]["sdf"] = 0.5
-    path.write_text(json.dumps(record))
-    fakes = Fakes()
-    assert _run(tmp_path, fakes, "--only", "no-shadow", "--scene", "one") == 0
-    assert fakes.trained == [("one/no-shadow", False, "_stage_1")]
-    record["config"]["rates"]["sdf"] = 0.5
+    record["config"]["stages"]["split_sum"]["rates"]["sdf"]["value"] = 0.5
     path.write_text(json.dumps(record))
     assert _run(tmp_path, fakes, "--only", "full", "--scene", "one") == 2
-    assert "one/_stage_1: rates.sdf: 0.5 -> " in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"one/{SHARED}: stages.split_sum.rates.sdf.value: 0.5 -> " in said
+    assert len(fakes.trained) == 1
 
 
 def test_an_interrupted_run_goes_on_from_its_checkpoint_or_starts_anew(tmp_path):
@@ -287,7 +361,7 @@ def test_an_interrupted_run_goes_on_from_its_checkpoint_or_starts_anew(tmp_path)
     (tmp_path / "runs" / "one" / "few" / "metrics.jsonl").write_text("{}\n")
     fakes = Fakes()
     assert _run(tmp_path, fakes, "--scene", "one") == 0
-    assert fakes.trained == [("one/full", True, None), ("one/few", False, "_stage_1")]
+    assert fakes.trained == [("one/full", True, None), ("one/few", False, SHARED)]
     assert not (full / "error.txt").exists()
 
 
@@ -312,28 +386,28 @@ def test_files_that_no_run_wrote_are_left_alone(tmp_path):
 
 def test_a_failed_run_stops_only_those_that_need_it(tmp_path, capsys):
     _write(tmp_path)
-    fakes = Fakes(broken=["one/_stage_1", "two/no-shadow"])
+    fakes = Fakes(broken=[f"one/{SHARED}", "two/no-shadow"])
     assert _run(tmp_path, fakes) == 1
     runs = tmp_path / "runs"
-    assert "no luck with one/_stage_1" in (runs / "one" / "_stage_1" / "error.txt").read_text()
-    assert "stage 1 failed" in (runs / "one" / "full" / "error.txt").read_text()
+    assert f"no luck with one/{SHARED}" in (runs / "one" / SHARED / "error.txt").read_text()
+    assert "stages to take over failed" in (runs / "one" / "full" / "error.txt").read_text()
     assert "no luck with two/no-shadow" in (runs / "two" / "no-shadow" / "error.txt").read_text()
     done = {label for label, _ in fakes.evaluated}
     assert done == {"one/coarse", "two/full", "two/coarse", "two/few", "two/many"}
     last = capsys.readouterr().err.splitlines()[-1]
-    assert last.startswith("6 of 12 failed: one/_stage_1, one/full")
+    assert last.startswith(f"6 of 12 failed: one/{SHARED}, one/full")
 
 
-def test_a_trained_run_is_evaluated_without_its_stage_1(tmp_path):
+def test_a_trained_run_is_evaluated_without_its_source(tmp_path):
     _write(tmp_path)
     assert _run(tmp_path, Fakes(), "--only", "full", "--scene", "one") == 0
     folder = tmp_path / "runs" / "one"
     (folder / "full" / "evaluation.json").unlink()
-    (folder / "_stage_1" / "training.json").unlink()
-    fakes = Fakes(broken=["one/_stage_1"])
+    (folder / SHARED / "training.json").unlink()
+    fakes = Fakes(broken=[f"one/{SHARED}"])
     assert _run(tmp_path, fakes, "--only", "full", "few", "--scene", "one") == 1
     assert fakes.evaluated == [("one/full", "traced")]
-    assert "stage 1 failed" in (folder / "few" / "error.txt").read_text()
+    assert "stages to take over failed" in (folder / "few" / "error.txt").read_text()
 
 
 def test_ctrl_c_ends_the_sweep_with_its_own_status(tmp_path, capsys):
@@ -358,7 +432,7 @@ def test_a_process_that_dies_is_a_failed_run(tmp_path, monkeypatch, code, said):
     script = tmp_path / "script.py"
     script.write_text(code)
     monkeypatch.setattr(runner, "__file__", str(script))
-    job = runner.Job("one/full", "scene", str(tmp_path / "full"), {}, {}, None, None)
+    job = runner.Job("one/full", "scene", str(tmp_path / "full"), {}, {}, None, None, None)
     with pytest.raises(runner.RunFailed, match=said):
         runner.in_a_process(job)
     assert runner.run_jobs([job]) == [job]
@@ -367,17 +441,23 @@ def test_a_process_that_dies_is_a_failed_run(tmp_path, monkeypatch, code, said):
 
 def test_the_bundled_sweeps_are_sound():
     sweep = runner.read_sweep(SWEEPS / "transport.toml")
-    base, configs = sweep.config(), {run.name: sweep.config(run) for run in sweep.runs}
-    assert configs["full"] == base
-    assert [n for n, c in configs.items() if not runner.shares_stage_1(c, base)] == ["no-culling"]
-    points = {run.x: configs[run.name].transport.shading for run in sweep.runs if run.x}
+    configs = {run.name: sweep.config(run) for run in sweep.runs}
+    assert runner.homes(sweep)["indirect-constant"] == "full"
+    sources = {part.folder: part.source for part in runner.parts_of(sweep).values()}
+    alone = {SHARED, "no-culling"}
+    assert {name for name, source in sources.items() if source is None} == alone
+    assert {sources[name] for name in sources if name not in alone} == {SHARED}
+    stages = {name: config.stage("monte_carlo") for name, config in configs.items()}
+    points = {run.x: stages[run.name].transport for run in sweep.runs if run.x}
     assert sorted(points) == [2, 4, 8, 32, 128]
     for x, shading in points.items():
-        assert (shading.light + shading.diffuse, 2 * shading.specular) == (x, x)
-    assert configs["no-occlusion"].transport.shading.is_traced is False
-    assert configs["full"].stage(2).objective.with_light is False
-    assert configs["light-regulariser"].stage(2).objective.with_light is True
-    assert configs["denoiser"].transport.shading.is_denoised is True
+        assert (shading.light_count + shading.diffuse_count, 2 * shading.specular_count) == (x, x)
+    assert stages["no-occlusion"].transport.occlusion is False
+    assert "light" not in stages["full"].weights_at(0)
+    assert stages["light-regulariser"].weights_at(0)["light"] == 0.15
+    assert stages["denoiser"].transport.denoise.iterations == 2
+    assert stages["materials-at-once"].rates["albedo"].warmup == 0
+    assert stages["albedo-kept"].enter == ()
     assert runner.read_sweep(SWEEPS / "smoke.toml").scenes == ("duck",)
 
 
@@ -413,7 +493,7 @@ def test_the_report_has_the_figures_and_their_differences(tmp_path):
     _hand_made(tmp_path)
     text = _report(tmp_path)
     one, summary = _rows(text, "one"), _rows(text, "Summary")
-    assert one["run"][:3] == ["nvs.psnr ↑", "roughness.mse ↓", "stage 2, s"]
+    assert one["run"][:3] == ["nvs.psnr ↑", "roughness.mse ↓", "monte_carlo, s"]
     assert one["full"] == ["30.00", "0.0200", "1.50", "0.500", "1234"]
     assert _rows(text, "two")["no-shadow"][:2] == ["29.50", "0.0100"]
     assert summary["full (reference)"] == ["30.50", "0.0150", "1.50", "0.500", "1234"]
@@ -449,7 +529,7 @@ def test_missing_failed_and_changed_runs_are_listed(tmp_path):
         "- one/no-shadow: unreadable: JSONDecodeError",
         "- two/coarse: other settings than the sweep (recorded -> wanted): "
         "geometry.resolution: 9 -> 8",
-        "- two/few: metrics.jsonl has 0 of 3 steps of stage 2",
+        "- two/few: metrics.jsonl has 0 of 3 steps of monte_carlo",
         "- two/many: has no roughness.mse",
     ):
         assert line in text
@@ -521,7 +601,7 @@ def test_the_smoke_sweep_runs_for_real(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     lines = (runs / "duck" / "more-samples" / "metrics.jsonl").read_text().splitlines()
-    assert [json.loads(line)["stage"] for line in lines] == [2, 2]
+    assert [json.loads(line)["stage"] for line in lines] == ["monte_carlo"] * 2
     again = subprocess.run(command, capture_output=True, text=True)
     assert again.returncode == 0
     assert again.stderr.count("finished already") == 2

@@ -1,8 +1,8 @@
 """Training: determinism, resume, overflow retry, recovery, and errors that name their cause."""
 
 import json
+from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,13 +10,21 @@ import numpy as np
 import pytest
 from support import sphere_dataset, tiny_config
 
-from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.adapter import FaceSplats, VertexSplats
 from geosplat_jax.core.types import Geometry
-from geosplat_jax.fit import runtime as process
+from geosplat_jax.fit import runtime
 from geosplat_jax.fit import train as train_module
-from geosplat_jax.fit.stages import sampling_of_step, view_indices
-from geosplat_jax.fit.step import parameter_group, train_step
-from geosplat_jax.fit.train import Interrupted, TrainingError, fit, load_run
+from geosplat_jax.fit.folder import RunError
+from geosplat_jax.fit.stages import make_batch, pipeline_at, view_indices
+from geosplat_jax.fit.step import train_step
+from geosplat_jax.fit.train import (
+    Interrupted,
+    Progress,
+    TrainingError,
+    _Clock,
+    fit,
+    load_trained,
+)
 
 
 @pytest.fixture(scope="module")
@@ -26,9 +34,10 @@ def dataset():
 
 @pytest.fixture(scope="module")
 def finished(dataset, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("run")
-    state = fit(dataset, tiny_config(), folder)
-    return folder, state
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    seen = []
+    state = fit(dataset, tiny_config(), folder, on_step=seen.append)
+    return folder, state, seen
 
 
 def _lines(folder):
@@ -42,47 +51,96 @@ def _assert_same(first, second):
 
 
 def test_training_reports_every_step_and_lowers_the_loss(finished):
-    folder, state = finished
+    folder, state, _ = finished
     lines = _lines(folder)
     assert [line["step"] for line in lines] == [0, 1, 2, 3]
     assert int(state.step) == 4
     assert all(np.isfinite(line["loss"]) for line in lines)
-    assert all(line["gaussians"] == 6 * line["faces"] for line in lines)
+    assert all(line["splats"] == 6 * line["faces"] for line in lines)
 
 
 def test_the_same_seed_gives_the_same_parameters(dataset, finished, tmp_path):
-    _, state = finished
+    _, state, _ = finished
     again = fit(dataset, tiny_config(), tmp_path)
     _assert_same(state, again)
 
 
 def test_resuming_equals_the_uninterrupted_run_bit_for_bit(dataset, finished, tmp_path):
-    _, state = finished
+    _, state, _ = finished
     fit(dataset, tiny_config(), tmp_path, stop_after=2)
+    assert load_trained(tmp_path).step == 2
     resumed = fit(dataset, tiny_config(), tmp_path, resume=True)
     _assert_same(state, resumed)
     assert [line["step"] for line in _lines(tmp_path)] == [0, 1, 2, 3]
 
 
+def test_every_step_is_told_with_its_stage(finished):
+    *_, seen = finished
+    assert [(p.step, p.steps, p.stage) for p in seen] == [(k, 4, "split_sum") for k in (1, 2, 3, 4)]
+    assert isinstance(seen[0], Progress)
+    # The first step compiles: of what is left it says nothing.
+    assert seen[0].seconds_left is None
+    assert seen[-1].seconds_left == 0.0
+
+
+def test_the_time_left_comes_from_steps_that_do_not_compile():
+    config = tiny_config("stages.split_sum.steps=10", "stages.monte_carlo.steps=20")
+    clock = _Clock(config)
+    clock.note("split_sum", 60.0)
+    assert clock.left(1) is None
+    clock.note("split_sum", 2.0)
+    assert clock.left(2) == pytest.approx(2.0 * 28)
+    for _ in range(8):
+        clock.note("split_sum", 2.0)
+    clock.note("monte_carlo", 90.0)
+    assert clock.left(11) == pytest.approx(2.0 * 19)
+    clock.note("monte_carlo", 5.0)
+    assert clock.left(12) == pytest.approx(5.0 * 18)
+
+
 def test_a_run_can_be_loaded_for_rendering(finished):
-    folder, state = finished
-    config, params, context, capacities, meta = load_run(folder)
-    assert config == tiny_config()
-    assert meta["step"] == 4
-    assert isinstance(capacities, Capacities)
-    assert context.grid.vertex_count == params.geometry.sdf.shape[0]
-    _assert_same(params, state.params)
+    folder, state, _ = finished
+    trained = load_trained(folder)
+    assert trained.config == tiny_config()
+    assert (trained.step, trained.stage.name) == (4, "split_sum")
+    assert trained.pipeline.surface.grid.vertex_count == trained.params.geometry.sdf.shape[0]
+    assert trained.pipeline.capacities["quads"] > 0
+    _assert_same(trained.params, state.params)
 
 
 def test_resuming_with_another_configuration_names_the_difference(dataset, finished):
-    folder, _ = finished
-    with pytest.raises(TrainingError, match=r"rates\.sdf: .* -> 0\.5"):
-        fit(dataset, tiny_config("rates.sdf=0.5"), folder, resume=True)
+    folder, _, _ = finished
+    changed = tiny_config("stages.split_sum.rates.sdf=0.5")
+    with pytest.raises(TrainingError, match=r"split_sum\.rates\.sdf\.value: .* -> 0\.5"):
+        fit(dataset, changed, folder, resume=True)
 
 
-def test_resuming_without_a_checkpoint_is_an_error(dataset, tmp_path):
-    with pytest.raises(TrainingError, match="no checkpoint"):
-        fit(dataset, tiny_config(), tmp_path, resume=True)
+def test_a_second_training_into_a_folder_is_refused_and_harms_nothing(dataset, finished):
+    folder, state, _ = finished
+    with pytest.raises(RunError, match="--resume"):
+        fit(dataset, tiny_config(), folder)
+    _assert_same(load_trained(folder).params, state.params)
+
+
+def test_a_run_without_a_checkpoint_is_resumed_from_the_start(dataset, finished, tmp_path):
+    """Also one that was interrupted while it compiled, or whose last line is torn."""
+
+    def stopped(progress):
+        raise KeyboardInterrupt
+
+    folder = tmp_path / "run"
+    with pytest.raises(Interrupted, match="--resume"):
+        fit(dataset, tiny_config("run.checkpoint_every=100"), folder, on_step=stopped)
+    assert not (folder / "checkpoints").exists()
+    with (folder / "metrics.jsonl").open("a") as metrics:
+        metrics.write('{"step": 1, "lo')
+    config = tiny_config("run.checkpoint_every=100")
+    _assert_same(finished[1], fit(dataset, config, folder, resume=True))
+    assert [line["step"] for line in _lines(folder)] == [0, 1, 2, 3]
+
+
+def test_resuming_where_there_is_no_run_begins_one(dataset, finished, tmp_path):
+    _assert_same(finished[1], fit(dataset, tiny_config(), tmp_path / "new", resume=True))
 
 
 @pytest.mark.slow
@@ -93,11 +151,11 @@ def test_an_overflowing_step_is_repeated_and_equals_one_with_ample_room(
 
     Also where programs are forgotten at every growth.
     """
-    folder, _ = finished
-    monkeypatch.setattr(process, "_CROWDED", 0.0)
+    folder, _, _ = finished
+    monkeypatch.setattr(runtime, "_CROWDED", 0.0)
     plan = train_module.plan_capacities
     monkeypatch.setattr(
-        train_module, "plan_capacities", lambda *a, **k: replace(plan(*a, **k), hits=128)
+        train_module, "plan_capacities", lambda *a, **k: plan(*a, **k).resized(hits=128)
     )
     fit(dataset, tiny_config(), tmp_path)
     ample, tight = _lines(folder), _lines(tmp_path)
@@ -111,16 +169,8 @@ def test_an_overflowing_step_is_repeated_and_equals_one_with_ample_room(
 def test_a_whole_run_compiles_the_step_once(dataset, tmp_path):
     before = train_step._cache_size()
     fit(dataset, tiny_config("run.seed=3"), tmp_path)
-    after_first = train_step._cache_size()
-    fit(dataset, tiny_config("run.seed=4"), _sibling(tmp_path))
-    assert after_first - before <= 1
-    assert train_step._cache_size() - after_first <= 1
-
-
-def _sibling(path: Path) -> Path:
-    other = path / "other"
-    other.mkdir()
-    return other
+    # Weights and rates change at every step; neither costs a program.
+    assert train_step._cache_size() - before <= 1
 
 
 def test_a_vanished_surface_is_put_back(dataset, tmp_path, monkeypatch):
@@ -165,10 +215,8 @@ def test_an_exploding_surface_is_stopped_with_a_cure(dataset, tmp_path):
 def test_a_number_that_is_not_finite_stops_and_names_step_term_and_checkpoint(
     dataset, tmp_path, monkeypatch
 ):
-    make_batch = train_module.make_batch
-
-    def spoiled(views, step, config):
-        batch = make_batch(views, step, config)
+    def spoiled(views, step, stage, *, seed):
+        batch = make_batch(views, step, stage, seed=seed)
         if step < 2:
             return batch
         return replace(batch, image=batch.image.at[0, 0, 0, 0].set(jnp.nan))
@@ -177,14 +225,12 @@ def test_a_number_that_is_not_finite_stops_and_names_step_term_and_checkpoint(
     with pytest.raises(TrainingError, match=r"step 2: the term .*l1.* not finite") as caught:
         fit(dataset, tiny_config(), tmp_path)
     assert "checkpoint_00000002" in str(caught.value)
-    _, params, _, _, meta = load_run(tmp_path)
-    assert meta["step"] == 2
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(params))
+    trained = load_trained(tmp_path)
+    assert trained.step == 2
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(trained.params))
 
 
 def test_stopping_writes_a_checkpoint(dataset, tmp_path, monkeypatch):
-    from contextlib import contextmanager
-
     asked = iter([False, False, True, True])
 
     @contextmanager
@@ -194,7 +240,7 @@ def test_stopping_writes_a_checkpoint(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(train_module, "_stop_requests", requests)
     with pytest.raises(Interrupted, match="--resume"):
         fit(dataset, tiny_config("run.checkpoint_every=100"), tmp_path)
-    assert load_run(tmp_path)[-1]["step"] == 2
+    assert load_trained(tmp_path).step == 2
 
 
 def test_views_come_in_shuffled_epochs_that_depend_on_seed_and_step_alone():
@@ -205,39 +251,37 @@ def test_views_come_in_shuffled_epochs_that_depend_on_seed_and_step_alone():
     assert view_indices(0, view_count=2, batch_views=8, seed=0).shape == (2,)
 
 
-def test_vertices_are_sampled_first_and_faces_later():
-    config = tiny_config("geometry.vertex_fraction=0.5")
-    assert [sampling_of_step(s, config) for s in range(4)] == ["vertex"] * 2 + ["face"] * 2
+def test_a_batch_knows_its_views_and_the_pixels_that_count(dataset):
+    stage = tiny_config("stages.split_sum.batch_views=3").stages[0]
+    valid = np.zeros((len(dataset.train), 24, 24), np.float32)
+    views = replace(dataset.train, valid=valid)
+    batch = make_batch(views, 1, stage, seed=0)
+    np.testing.assert_array_equal(batch.image, views.images[np.asarray(batch.views)])
+    np.testing.assert_array_equal(batch.valid, 0.0)
+    assert make_batch(dataset.train, 1, stage, seed=0).valid is None
+
+
+def test_vertices_are_sampled_first_and_faces_later(finished):
+    config = tiny_config("stages.split_sum.vertex_fraction=0.5")
+    pipeline = load_trained(finished[0]).pipeline
+    kinds = [
+        type(pipeline_at(pipeline, config, config.stages[0], step).splats) for step in range(4)
+    ]
+    assert kinds == [VertexSplats] * 2 + [FaceSplats] * 2
 
 
 @pytest.mark.slow
 def test_a_random_start_samples_vertices_and_then_faces(dataset, tmp_path):
-    config = tiny_config("geometry.initial=random", "geometry.vertex_fraction=0.5")
+    config = tiny_config("geometry.initial=random", "stages.split_sum.vertex_fraction=0.5")
     fit(dataset, config, tmp_path)
     lines = _lines(tmp_path)
-    ratios = [line["gaussians"] / line["faces"] for line in lines]
+    ratios = [line["splats"] / line["faces"] for line in lines]
     assert all(ratio < 1 for ratio in ratios[:2])
     assert ratios[2:] == [6.0, 6.0]
     assert all(np.isfinite(line["loss"]) for line in lines)
 
 
-def test_every_parameter_has_a_rate(finished):
-    _, state = finished
-    paths = jax.tree_util.tree_flatten_with_path(state.params)[0]
-    groups = {parameter_group(path) for path, _ in paths}
-    assert groups == {
-        "sdf",
-        "deform",
-        "weights",
-        "albedo",
-        "shine",
-        "shift",
-        "light",
-        "exposure",
-    } - (set() if state.params.material.surface_table is None else set())
-
-
 def test_geometry_types_are_the_documented_ones(finished):
-    _, state = finished
+    _, state, _ = finished
     assert isinstance(state.params.geometry, Geometry)
     assert float(jnp.min(state.params.light.radiance)) >= 0.01 - 1e-7

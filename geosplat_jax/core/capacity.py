@@ -6,77 +6,93 @@ reports its *usage* (the true count, traced). Nothing is dropped silently: a cal
 ``not fits(usage, capacities)`` must discard the result, `grow` the capacities and repeat.
 """
 
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterator, Mapping
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Int, UInt
 
 _LADDER_RATIO = 1.25
 _LADDER_STEP = 128
 _SHRINK_BELOW = 0.5
+UNSIZED = 1024
+"""Rows of a buffer that nobody has sized yet."""
 
 
-@dataclass(frozen=True)
-class Capacities:
-    """Static sizes of every bounded buffer; hashable, so that it can be a static jit argument.
+class Capacities(Mapping[str, int]):
+    """Static sizes of bounded buffers by name; hashable, so that it can be a static jit argument.
 
-    Attributes
-    ----------
-    surface_cubes : grid cells that the isosurface passes through.
-    dual_vertices : dual vertices of those cells (one to four a cell).
-    quads : interior grid edges that the isosurface crosses.
-    visible : Gaussians that one view can see.
-    hits : pairs of a visible Gaussian and a tile it may touch, in one view.
-    chunks : groups of consecutive hits of one tile, in one view.
-    cell_patches : pairs of a grid cell and a quad that may touch it, for tracing rays.
+    Whoever compacts names its own buffer and asks for ``capacities[name]``; one that was never
+    sized has `UNSIZED` rows. The package's own:
+
+    - ``surface_cubes`` : grid cells that the isosurface passes through;
+    - ``dual_vertices`` : dual vertices of those cells (one to four per cell);
+    - ``quads`` : interior grid edges that the isosurface crosses;
+    - ``visible`` : splats that one view can see;
+    - ``hits`` : pairs of a visible splat and a tile it may touch, in one view;
+    - ``chunks`` : groups of consecutive hits of one tile, in one view;
+    - ``cell_patches`` : pairs of a grid cell and a quad that may touch it, for tracing rays.
     """
 
-    surface_cubes: int = 1024
-    dual_vertices: int = 1024
-    quads: int = 1024
-    visible: int = 4096
-    hits: int = 8192
-    chunks: int = 2048
-    cell_patches: int = 8192
+    def __init__(self, **sizes: int) -> None:
+        self._sizes = tuple(sorted(sizes.items()))
+
+    def __getitem__(self, name: str) -> int:
+        """Size of a buffer; `UNSIZED` where nobody has sized it."""
+        return dict(self._sizes).get(name, UNSIZED)
+
+    def __iter__(self) -> Iterator[str]:
+        return (name for name, _ in self._sizes)
+
+    def __len__(self) -> int:
+        return len(self._sizes)
+
+    def __hash__(self) -> int:
+        return hash(self._sizes)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Capacities) and self._sizes == other._sizes
+
+    def __repr__(self) -> str:
+        return f"Capacities({', '.join(f'{name}={size}' for name, size in self._sizes)})"
+
+    def resized(self, **sizes: int) -> "Capacities":
+        """Return these capacities with other sizes of some buffers."""
+        return Capacities(**{**self, **sizes})
 
 
-class Usage(eqx.Module):
-    """True int32 needs of every bounded buffer (see `Capacities`); 0 where a buffer is unused."""
+Usage = dict[str, Int[Array, ""]]
+"""True int32 needs of bounded buffers by name (see `Capacities`); a part lists its own only."""
 
-    surface_cubes: Int[Array, ""]
-    dual_vertices: Int[Array, ""]
-    quads: Int[Array, ""]
-    visible: Int[Array, ""]
-    hits: Int[Array, ""]
-    chunks: Int[Array, ""]
-    cell_patches: Int[Array, ""]
+Counts = Mapping[str, Int[Array, ""] | Int[np.ndarray, ""] | int]
+"""The same on the host."""
 
 
 def usage(**counts: Int[Array, ""]) -> Usage:
-    """Build a `Usage` from the counts given by name; every other count is zero."""
-    zero = jnp.zeros((), jnp.int32)
-    names = [field.name for field in fields(Usage)]
-    unknown = set(counts) - set(names)
-    if unknown:
-        raise ValueError(f"unknown buffers {sorted(unknown)}; expected some of {names}")
-    return Usage(**{name: counts.get(name, zero).astype(jnp.int32) for name in names})
+    """Build a `Usage` from counts given by name."""
+    return {name: count.astype(jnp.int32) for name, count in counts.items()}
 
 
 def combine(*usages: Usage) -> Usage:
-    """Elementwise maximum: the need of a computation that runs all parts with one capacity."""
-    return jax.tree.map(lambda *counts: jnp.max(jnp.stack(counts)), *usages)
+    """Largest need of every buffer: that of a computation that runs all parts."""
+    names = sorted({name for part in usages for name in part})
+    return {
+        name: jnp.max(jnp.stack([part[name] for part in usages if name in part])) for name in names
+    }
 
 
 def fits(needed: Usage, capacities: Capacities) -> Bool[Array, ""]:
     """Whether every true count lies within its capacity."""
-    checks = [getattr(needed, f.name) <= getattr(capacities, f.name) for f in fields(Usage)]
-    return jnp.all(jnp.stack(checks))
+    if not needed:
+        return jnp.ones((), bool)
+    return jnp.all(jnp.stack([count <= capacities[name] for name, count in needed.items()]))
 
 
 def bucket(count: int) -> int:
-    """Smallest size on the capacity ladder (ratio about 1.25, multiples of 128) for ``count``."""
+    """Smallest rung of the ladder that holds ``count``: at most 25 % above it, multiples of 128."""
     size = _LADDER_STEP
     while size < count:
         steps = -(-int(size * _LADDER_RATIO) // _LADDER_STEP)
@@ -84,34 +100,55 @@ def bucket(count: int) -> int:
     return size
 
 
-def overflowed(needed: Usage, capacities: Capacities) -> list[str]:
+def overflowed(needed: Counts, capacities: Capacities) -> list[str]:
     """Names of the buffers whose need exceeds their capacity (host side)."""
-    return [
-        f.name for f in fields(Usage) if int(getattr(needed, f.name)) > getattr(capacities, f.name)
-    ]
+    return [name for name, count in needed.items() if int(count) > capacities[name]]
 
 
-def grow(capacities: Capacities, needed: Usage, *, headroom: float = 1.1) -> Capacities:
+def grow(capacities: Capacities, needed: Counts, *, headroom: float = 1.1) -> Capacities:
     """Capacities that hold ``needed`` with some headroom; buffers that fit keep their size."""
-    grown = {
-        name: bucket(int(int(getattr(needed, name)) * headroom))
-        for name in overflowed(needed, capacities)
-    }
-    return replace(capacities, **grown)
+    names = overflowed(needed, capacities)
+    return capacities.resized(**{name: bucket(int(int(needed[name]) * headroom)) for name in names})
 
 
-def shrink(capacities: Capacities, needed: Usage, *, headroom: float = 1.25) -> Capacities:
+def shrink(capacities: Capacities, needed: Counts, *, headroom: float = 1.25) -> Capacities:
     """Capacities with generous buffers cut down, where less than half of them is in use.
 
     Call rarely, with the largest usage seen over many steps: every change costs a compilation.
     """
     smaller = {}
-    for f in fields(Usage):
-        have, need = getattr(capacities, f.name), int(getattr(needed, f.name))
+    for name, count in needed.items():
+        have, need = capacities[name], int(count)
         size = bucket(int(need * headroom))
         if need < _SHRINK_BELOW * have and size < have:
-            smaller[f.name] = size
-    return replace(capacities, **smaller)
+            smaller[name] = size
+    return capacities.resized(**smaller)
+
+
+_Result = TypeVar("_Result")
+
+
+def retry(
+    attempt: Callable[[Capacities], tuple[_Result, Usage]], capacities: Capacities
+) -> tuple[_Result, Capacities]:
+    """Call ``attempt`` with growing capacities until everything it needed fitted (host side).
+
+    Parameters
+    ----------
+    attempt : takes capacities; returns a result, and what it truly needed.
+    capacities : to begin with.
+
+    Returns
+    -------
+    result : of the first attempt that fitted; the others are dropped.
+    capacities : that it ran with.
+    """
+    while True:
+        result, needed = attempt(capacities)
+        needed = jax.device_get(needed)
+        if not overflowed(needed, capacities):
+            return result, capacities
+        capacities = grow(capacities, needed)
 
 
 def compact(

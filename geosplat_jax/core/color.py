@@ -35,7 +35,7 @@ def luminance(rgb: Float[Array, "... 3"]) -> Float[Array, "..."]:
 def tone_map(
     rgb: Float[Array, "... 3"], log_exposure: Float[Array, ""], *, sharpness: float = 100.0
 ) -> Float[Array, "... 3"]:
-    """Expose linear radiance and clip it softly at one (REFERENCE tone map of the method).
+    """Expose linear radiance and clip it softly at one.
 
     ``1 - softplus_beta(1 - exposure * rgb)``: the identity below one, one above, with a knee of
     width ``1 / sharpness`` through which gradients still pass, so that an over-exposed pixel is

@@ -1,4 +1,4 @@
-"""The types that travel between the stages: frozen dataclasses, registered as pytrees.
+"""The types that travel between the parts of the method, as pytrees.
 
 Conventions. World axes are those of the capture (Blender scenes are z-up). Cameras use OpenCV
 axes: x right, y down, z forward; pixel centres lie at integers + 0.5. Colours are linear.
@@ -6,9 +6,22 @@ Rows past a count are padding: opacity 0, scale 1, unit quaternion, zero normal,
 so that every function is finite on them.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
+
+RATE_GROUP = "rate group"
+"""Key of a field's metadata; see `learned`."""
+
+
+def learned(group: str, **options: Any) -> Any:
+    """Declare a field of parameters, and which learning rate moves what is below it.
+
+    A field without a group of its own belongs to that of the nearest field around it.
+    """
+    return eqx.field(metadata={RATE_GROUP: group}, **options)
 
 
 class Camera(eqx.Module):
@@ -32,6 +45,17 @@ class Camera(eqx.Module):
         rotation, translation = self.world_to_camera[:, :3, :3], self.world_to_camera[:, :3, 3]
         return -jnp.einsum("vji,vj->vi", rotation, translation)
 
+    @property
+    def count(self) -> int:
+        """Number of views."""
+        return self.world_to_camera.shape[0]
+
+    def view(self, number: int) -> "Camera":
+        """Return the camera of a single view."""
+        one = slice(number, number + 1)
+        pose, intrinsics = self.world_to_camera[one], self.intrinsics[one]
+        return Camera(pose, intrinsics, self.height, self.width)
+
 
 class Batch(eqx.Module):
     """What one training step sees; all randomness of the step derives from ``key``.
@@ -39,13 +63,32 @@ class Batch(eqx.Module):
     Attributes
     ----------
     camera : `Camera` of V views.
-    image : (V, H, W, 4) linear RGB with straight alpha; alpha is the mask.
+    image : (V, H, W, 4) linear RGB with straight alpha; alpha is the mask of the object.
     key : typed PRNG key.
+    views : (V,) int32 numbers of the views within their split; None where they have none.
+    valid : (V, H, W) pixels that count, 0 or 1; None where all do.
+    carry : what a light transport keeps from one step to the next; None for most.
     """
 
     camera: Camera
     image: Float[Array, "V H W 4"]
     key: Key[Array, ""]
+    views: Int[Array, " V"] | None = None
+    valid: Float[Array, "V H W"] | None = None
+    carry: Any = None
+
+
+class Box(eqx.Module):
+    """The cube that a scene's fields are defined on, around the object.
+
+    Attributes
+    ----------
+    center : (3,) world.
+    half_extent : () half of the cube's side, the world length of one unit of the paper.
+    """
+
+    center: Float[Array, " 3"]
+    half_extent: Float[Array, ""]
 
 
 class Grid(eqx.Module):
@@ -56,11 +99,19 @@ class Grid(eqx.Module):
     origin : (3,) world position of the lowest corner.
     cell_size : () edge length of a cell, world units.
     shape : static (nx, ny, nz), the number of *cells* along each axis.
+    reach : static; a vertex moves by at most this share of a cell along every axis, at most 1/2.
     """
 
     origin: Float[Array, " 3"]
     cell_size: Float[Array, ""]
     shape: tuple[int, int, int] = eqx.field(static=True)
+    reach: float = eqx.field(static=True, default=0.5)
+
+    @property
+    def box(self) -> Box:
+        """Centre of the grid and half of its longest side."""
+        half = 0.5 * self.cell_size * jnp.array(self.shape, self.origin.dtype)
+        return Box(self.origin + half, jnp.max(half))
 
     @property
     def vertex_shape(self) -> tuple[int, int, int]:
@@ -87,16 +138,16 @@ class Geometry(eqx.Module):
     Attributes
     ----------
     sdf : (grid vertices,) signed values, negative inside, in units of a cell.
-    deform : (grid vertices, 3); a vertex moves by ``tanh(deform) * cell_size / 2``.
+    deform : (grid vertices, 3); a vertex moves by ``tanh(deform) * reach`` cells (see `Grid`).
     alpha : (cells, 8) corner weights; beta : (cells, 12) edge weights; gamma : (cells,) split
         weights, all raw.
     """
 
-    sdf: Float[Array, " G"]
-    deform: Float[Array, "G 3"]
-    alpha: Float[Array, "K 8"]
-    beta: Float[Array, "K 12"]
-    gamma: Float[Array, " K"]
+    sdf: Float[Array, " G"] = learned("sdf")
+    deform: Float[Array, "G 3"] = learned("deform")
+    alpha: Float[Array, "K 8"] = learned("weights")
+    beta: Float[Array, "K 12"] = learned("weights")
+    gamma: Float[Array, " K"] = learned("weights")
 
 
 class Mesh(eqx.Module):
@@ -124,13 +175,35 @@ class Mesh(eqx.Module):
         return jnp.arange(self.vertices.shape[0], dtype=jnp.int32) < self.vertex_count
 
 
-class Gaussians(eqx.Module):
+class SurfacePoints(eqx.Module):
+    """N points of a surface where light arrives; all unit vectors in the world.
+
+    Attributes
+    ----------
+    positions : (N, 3) where rays start, on the surface.
+    normals : (N, 3) shading normals. outward : (N, 3) normals of the faces.
+    faces : (N,) face of each point, which its rays never hit; -1 for none.
+    mask : (N,) rows to shade; the others give zero.
+    """
+
+    positions: Float[Array, "N 3"]
+    normals: Float[Array, "N 3"]
+    outward: Float[Array, "N 3"]
+    faces: Int[Array, " N"]
+    mask: Bool[Array, " N"]
+
+
+class Splats(eqx.Module):
     """Oriented anisotropic Gaussians; row i is real when ``i < count``.
 
     Attributes
     ----------
     means : (N, 3) world; quats : (N, 4) unit (w, x, y, z); scales : (N, 3) standard deviations,
         world units; opacities : (N,) in [0, 1]; normals : (N, 3) unit shading normals.
+    outward : (N, 3) unit geometric normals, which say what looks away from a camera.
+    anchors : (N, 3) where the splats' attributes are looked up and their rays start, on the
+        surface.
+    parents : (N,) int32 face that each splat belongs to; -1 for none.
     count : () int32.
     """
 
@@ -139,12 +212,20 @@ class Gaussians(eqx.Module):
     scales: Float[Array, "N 3"]
     opacities: Float[Array, " N"]
     normals: Float[Array, "N 3"]
+    outward: Float[Array, "N 3"]
+    anchors: Float[Array, "N 3"]
+    parents: Int[Array, " N"]
     count: Int[Array, ""]
 
     @property
     def mask(self) -> Bool[Array, " N"]:
         """True for real rows."""
         return jnp.arange(self.means.shape[0], dtype=jnp.int32) < self.count
+
+    def points(self, mask: Bool[Array, " N"] | None = None) -> SurfacePoints:
+        """Return the splats as light sees them: all of them, or those of a mask."""
+        chosen = self.mask if mask is None else self.mask & mask
+        return SurfacePoints(self.anchors, self.normals, self.outward, self.parents, chosen)
 
 
 class Materials(eqx.Module):
@@ -171,4 +252,4 @@ class EnvLight(eqx.Module):
     radiance : (H, W, 3) linear, non-negative.
     """
 
-    radiance: Float[Array, "H W 3"]
+    radiance: Float[Array, "H W 3"] = learned("light")

@@ -1,128 +1,123 @@
-"""What every stage of a run starts from, and the views of its steps."""
+"""What a stage trains: its pipeline, its parameters, the views of its steps."""
 
 from dataclasses import replace
-from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Key
 
-from geosplat_jax.core.types import Batch, Grid
-from geosplat_jax.fit.config import Config
-from geosplat_jax.geometry import initial_geometry, random_sdf, sphere_sdf
-from geosplat_jax.hashgrid import Layer
+from geosplat_jax.adapter import VertexSplatSettings
+from geosplat_jax.core.types import Batch
+from geosplat_jax.fit.config import Config, Stage
+from geosplat_jax.fit.entering import enter_stage
+from geosplat_jax.fit.step import UpdateRule, rate_groups
 from geosplat_jax.io.views import Views
-from geosplat_jax.materials import (
-    MaterialField,
-    MaterialSpec,
-    init_indirect_head,
-    init_materials,
-    materials_at,
-)
-from geosplat_jax.model import Context, Model, Params
-from geosplat_jax.render import grid_center_and_extent
-from geosplat_jax.surface.grids import crossed_edges, grid_vertices
-from geosplat_jax.surface.hull import hull_sdf
-from geosplat_jax.transport.environment import init_light, prefilter_operators
-from geosplat_jax.transport.split_sum import fg_table
+from geosplat_jax.materials import init_materials
+from geosplat_jax.pipeline import Pipeline
+from geosplat_jax.render import Params
+from geosplat_jax.surface.base import SurfaceModel
+from geosplat_jax.transport.environment import init_light
 
-_SDF_REACH = 2.0
-"""The first SDF is clipped to so many cells, so that the surface can be moved in few steps."""
-
-_GREY = 0.5
-_DARKEST = 0.02
-"""A first albedo lies between this and its complement, where the sigmoid still has a slope."""
+_STAGE_STREAM = 2**31
+"""Random streams of the starts of stages count down from here; steps take theirs from 0 on."""
 
 
-def make_context(grid: Grid, model: Model) -> Context:
-    """Build the constants of rendering for a grid."""
-    return Context(grid, prefilter_operators(model.light), fg_table())
-
-
-def initial_sdf(grid: Grid, views: Views, config: Config, key: jax.Array) -> jax.Array:
-    """First signed values on the grid, as the configuration asks."""
-    kind = config.geometry.initial
-    if kind == "random":
-        return random_sdf(key, grid)
-    if kind == "sphere":
-        longest = max(grid.shape)
-        return sphere_sdf(grid, radius=0.35 * float(grid.cell_size) * longest)
-    camera = views.camera()
-    sdf = hull_sdf(
-        np.asarray(camera.world_to_camera, np.float64),
-        np.asarray(camera.intrinsics, np.float64),
-        views.images[..., 3],
-        grid,
+def build_pipeline(config: Config, stage: Stage, surface: SurfaceModel) -> Pipeline:
+    """Assemble the pipeline of a stage, with the weights of its first step."""
+    return Pipeline(
+        surface=surface,
+        transport=stage.transport.build(config.light),
+        fields=config.material,
+        splats=stage.splats.build(config.adapter),
+        domain=stage.domain,
+        raster=config.raster,
+        weights=_arrays(stage.weights_at(0)),
+        objective=config.objective,
     )
-    return jnp.clip(jnp.asarray(sdf), -_SDF_REACH, _SDF_REACH)
 
 
-def initial_params(sdf: jax.Array, grid: Grid, config: Config, key: jax.Array) -> Params:
-    """Build the parameters before the first step."""
-    light = config.model.light
+def pipeline_at(pipeline: Pipeline, config: Config, stage: Stage, step: int) -> Pipeline:
+    """Return a stage's pipeline as it is ``step`` steps after the stage's start."""
+    samples_vertices = step < stage.vertex_fraction * stage.steps
+    splats = VertexSplatSettings() if samples_vertices else stage.splats
+    return replace(
+        pipeline, splats=splats.build(config.adapter), weights=_arrays(stage.weights_at(step))
+    )
+
+
+def update_rule(config: Config, stage: Stage, params: Params, step: int) -> UpdateRule:
+    """Return the learning rates ``step`` steps after a stage's start.
+
+    Raises
+    ------
+    ValueError
+        If a group of parameters has no rate.
+    """
+    missing = sorted(set(rate_groups(params)) - set(stage.rates))
+    if missing:
+        raise ValueError(
+            f"stages.{stage.name}.rates lacks {missing[0]}, the learning rate of some parameters; "
+            "add it (0 freezes them)"
+        )
+    return UpdateRule(
+        rates=_arrays(stage.rates_at(step)),
+        light_knee=jnp.float32(stage.light_knee),
+        smallest_light=jnp.float32(config.run.smallest_light),
+        frozen=stage.frozen,
+    )
+
+
+def _arrays(values: dict[str, float]) -> dict[str, Array]:
+    """Make scalars of numbers, so that a change of value costs no compilation."""
+    return {name: jnp.float32(value) for name, value in values.items()}
+
+
+def initial_params(shape: Any, config: Config, key: Key[Array, ""]) -> Params:
+    """Build the parameters before the first step.
+
+    Parameters
+    ----------
+    shape : of the surface, see `SurfaceSettings.start`.
+    config : settings of the run. key : of the material field.
+    """
+    outputs = config.active_stages[0].transport.indirect_outputs if config.active_stages else 0
     return Params(
-        geometry=initial_geometry(grid, sdf),
-        material=init_materials(key, config.model.material),
-        light=init_light(light.height, width=light.width, value=config.run.initial_light),
+        geometry=shape,
+        material=init_materials(key, config.material, indirect_outputs=outputs),
+        light=init_light(
+            config.light.height, width=config.light.width, value=config.run.initial_light
+        ),
         log_exposure=jnp.zeros((), jnp.float32),
     )
 
 
-@partial(jax.jit, static_argnames=("spec",))
-def mean_albedo(params: Params, grid: Grid, *, spec: MaterialSpec) -> Float[Array, " 3"]:
-    """Average the albedo field over the grid vertices beside the surface.
-
-    Grey where there is no surface. Not meant to be differentiated.
-    """
-    center, half_extent = grid_center_and_extent(grid)
-    dtype = params.material.albedo_table.dtype
-    found = materials_at(
-        params.material,
-        grid_vertices(grid).astype(dtype),
-        spec=spec,
-        center=center.astype(dtype),
-        half_extent=half_extent.astype(dtype),
-    )
-    share = (crossed_edges(params.geometry.sdf, grid) > 0).astype(dtype)
-    total = jnp.sum(found.albedo * share[:, None], axis=0)
-    count = jnp.sum(share)
-    return jnp.where(count > 0, total / jnp.maximum(count, 1.0), _GREY)
-
-
-def _one_colour(head: tuple[Layer, ...], albedo: Float[Array, " 3"]) -> tuple[Layer, ...]:
-    """Return the albedo head with a last layer that gives one colour everywhere."""
-    *hidden, last = head
-    albedo = jnp.clip(albedo.astype(last.weights.dtype), _DARKEST, 1.0 - _DARKEST)
-    logits = jnp.log(albedo) - jnp.log1p(-albedo)
-    return (*hidden, Layer(jnp.zeros_like(last.weights), logits))
-
-
-def begin_stage_2(params: Params, grid: Grid, config: Config, key: jax.Array) -> Params:
-    """Turn the parameters that stage 1 ends with into those that stage 2 starts with.
-
-    Surface, light and exposure stay. The albedo field stays, or starts afresh as its own mean, so
-    that no shadow is left in it and light keeps its colour and brightness; as grey where stage 1
-    stored radiance. Where one encoding feeds all heads, only the albedo's head is drawn anew.
-    Indirect light gets a head of its own.
+def begin_stage(params: Params, pipeline: Pipeline, config: Config, stage: Stage) -> Params:
+    """Turn the parameters of one stage into the first ones of the next.
 
     Parameters
     ----------
-    grid : of the surface. config : settings of the whole run. key : of what is drawn.
+    params, pipeline : of the stage before.
+    config : settings of the run. stage : that begins.
     """
-    spec = config.stage(2).model.material
-    albedo_key, indirect_key = jax.random.split(key)
-    field: MaterialField = params.material
-    if config.transport.fresh_albedo:
-        mean = jnp.full((3,), _GREY)
-        if not config.model.baked_diffuse:
-            mean = mean_albedo(params, grid, spec=config.model.material)
-        fresh = init_materials(albedo_key, spec)
-        field = replace(field, albedo_head=_one_colour(fresh.albedo_head, mean))
-        if not spec.shared:
-            field = replace(field, albedo_table=fresh.albedo_table)
-    field = replace(field, indirect_head=init_indirect_head(indirect_key, spec))
-    return replace(params, material=field)
+    number = config.active_stages.index(stage)
+    key = jax.random.fold_in(jax.random.key(config.run.seed), _STAGE_STREAM - number)
+    return enter_stage(params, pipeline, stage.enter, stage.transport.indirect_outputs, key)
+
+
+def template_params(config: Config, surface: SurfaceModel, shape: Any, stage: Stage) -> Params:
+    """Return parameters as they are in a stage, for their structure and sizes."""
+    params = initial_params(shape, config, jax.random.key(0))
+    before = None
+    for current in config.active_stages:
+        if before is not None:
+            pipeline = build_pipeline(config, before, surface)
+            params = begin_stage(params, pipeline, config, current)
+        if current == stage:
+            break
+        before = current
+    return params
 
 
 def view_indices(step: int, *, view_count: int, batch_views: int, seed: int) -> np.ndarray:
@@ -137,19 +132,15 @@ def view_indices(step: int, *, view_count: int, batch_views: int, seed: int) -> 
     return np.array(chosen)
 
 
-def make_batch(views: Views, step: int, config: Config) -> Batch:
-    """Gather the views of a step; the key depends on seed and step alone."""
+def make_batch(views: Views, step: int, stage: Stage, *, seed: int) -> Batch:
+    """Gather the views of a step of the run; the key depends on seed and step alone."""
     index = view_indices(
-        step,
-        view_count=len(views.names),
-        batch_views=config.run.batch_views,
-        seed=config.run.seed,
+        step, view_count=len(views.names), batch_views=stage.batch_views, seed=seed
     )
-    key = jax.random.fold_in(jax.random.key(config.run.seed), step)
-    return Batch(views.camera(index), jnp.asarray(views.images[index]), key)
-
-
-def sampling_of_step(step: int, config: Config) -> str:
-    """Vertex sampling at first (Eq. 12), face sampling afterwards."""
-    is_early = step < config.geometry.vertex_fraction * config.run.steps
-    return "vertex" if is_early else "face"
+    return Batch(
+        camera=views.camera(index),
+        image=jnp.asarray(views.images[index]),
+        key=jax.random.fold_in(jax.random.key(seed), step),
+        views=jnp.asarray(index, jnp.int32),
+        valid=None if views.valid is None else jnp.asarray(views.valid[index]),
+    )

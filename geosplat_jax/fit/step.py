@@ -1,4 +1,4 @@
-"""One training step: optimiser, gradient, and an update that only happens when it is sound."""
+"""One training step: Adam, and an update that only happens when it is sound."""
 
 from dataclasses import replace
 from functools import partial
@@ -11,11 +11,11 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from geosplat_jax.core import capacity as capacity_module
-from geosplat_jax.core.capacity import Capacities
-from geosplat_jax.core.types import Batch
-from geosplat_jax.fit.config import RateConfig
-from geosplat_jax.losses import LossReport, LossWeights, Objective, loss
-from geosplat_jax.model import Context, Model, Params
+from geosplat_jax.core.types import RATE_GROUP, Batch
+from geosplat_jax.pipeline import LossReport, Pipeline
+from geosplat_jax.render import Params
+
+_ADAM = optax.scale_by_adam(eps=1e-15)
 
 
 class TrainState(eqx.Module):
@@ -24,13 +24,32 @@ class TrainState(eqx.Module):
     Attributes
     ----------
     params : learned parameters.
-    optimizer : state of every group's Adam.
+    optimizer : state of Adam.
     step : () int32, the number of updates made.
+    carry : what the transport keeps from step to step; None for most.
     """
 
     params: Params
     optimizer: Any
     step: Int[Array, ""]
+    carry: Any = None
+
+
+class UpdateRule(eqx.Module):
+    """How far a step goes; all but the frozen groups is traced.
+
+    Attributes
+    ----------
+    rates : learning rate of every group (see `core.types.learned`).
+    light_knee : () radiance above which the light's steps grow with its brightness; 0 is never.
+    smallest_light : () texels are kept at or above this.
+    frozen : static; groups that are not differentiated.
+    """
+
+    rates: dict[str, Float[Array, ""]]
+    light_knee: Float[Array, ""]
+    smallest_light: Float[Array, ""]
+    frozen: tuple[str, ...] = eqx.field(static=True, default=())
 
 
 class StepReport(eqx.Module):
@@ -50,102 +69,77 @@ class StepReport(eqx.Module):
     fits: Bool[Array, ""]
 
 
-def parameter_group(path: tuple[Any, ...]) -> str:
-    """Name of the learning rate (a field of `RateConfig`) that governs the leaf at ``path``."""
-    names = [str(getattr(key, "name", getattr(key, "key", ""))) for key in path]
-    if names[0] == "geometry":
-        return names[1] if names[1] in ("sdf", "deform") else "weights"
-    if names[0] == "material":
-        if names[1] == "shift_head":
-            return "shift"
-        if names[1] == "indirect_head":
-            return "indirect"
-        return "shine" if names[1].startswith("surface") else "albedo"
-    return {"light": "light", "log_exposure": "exposure"}[names[0]]
+def rate_groups(params: Any) -> list[str]:
+    """Name the learning rate of every leaf, in the order of `jax.tree.leaves`.
 
-
-def scale_by_brightness(knee: float) -> optax.GradientTransformation:
-    """Multiply an update by ``1 + value / knee``: absolute steps below the knee, relative above.
-
-    A sun is thousands of times brighter than its sky, and Adam's steps know nothing of that.
+    Raises
+    ------
+    ValueError
+        If a leaf lies below no field that declares one.
     """
-
-    def update(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
-        scaled = jax.tree.map(lambda step, value: step * (1.0 + value / knee), updates, params)
-        return scaled, state
-
-    def init(params: Any) -> optax.EmptyState:
-        del params
-        return optax.EmptyState()
-
-    return optax.GradientTransformation(init, update)
-
-
-def make_optimizer(rates: RateConfig) -> optax.GradientTransformation:
-    """Adam (epsilon 1e-15) with one exponentially decaying rate a parameter group."""
-
-    def group(rate: float, warmup: int) -> optax.GradientTransformation:
-        decay = optax.exponential_decay(rate, 1, 0.5 ** (1.0 / rates.half_life))
-        if not warmup:
-            return optax.adam(decay, eps=1e-15)
-
-        def schedule(count: Any) -> Any:
-            return decay(count) * jnp.minimum((count + 1) / warmup, 1.0) ** 2
-
-        return optax.adam(schedule, eps=1e-15)
-
-    surface = ("sdf", "deform", "weights")
-    others = ("albedo", "shine", "shift", "indirect", "light", "exposure")
-    warmup = dict.fromkeys(surface, rates.warmup)
-    warmup |= {"albedo": rates.albedo_warmup, "shine": rates.shine_warmup}
-    groups: dict[Any, optax.GradientTransformation] = {
-        name: group(getattr(rates, name), warmup.get(name, 0)) for name in surface + others
-    }
-    if rates.light_knee > 0:
-        groups["light"] = optax.chain(groups["light"], scale_by_brightness(rates.light_knee))
-
-    def labels(params: Any) -> Any:
-        return jax.tree_util.tree_map_with_path(lambda path, _: parameter_group(path), params)
-
-    return optax.multi_transform(groups, labels)
+    groups = []
+    for path, _ in jax.tree_util.tree_flatten_with_path(params)[0]:
+        node, group = params, None
+        for key in path:
+            if isinstance(key, jax.tree_util.GetAttrKey):
+                field = type(node).__dataclass_fields__[key.name]
+                group = field.metadata.get(RATE_GROUP, group)
+                node = getattr(node, key.name)
+            else:
+                node = node[getattr(key, "idx", getattr(key, "key", None))]
+        if group is None:
+            raise ValueError(
+                f"the parameter {jax.tree_util.keystr(path)} has no learning rate; declare its "
+                "group with core.types.learned"
+            )
+        groups.append(group)
+    return groups
 
 
-def initial_state(params: Params, rates: RateConfig) -> TrainState:
-    """Build the state before the first step."""
+def initial_state(params: Params, *, step: int = 0, carry: Any = None) -> TrainState:
+    """Build the state before the first step of a stage.
+
+    The parameters are copied: a step consumes the buffers of its state, and a pipeline or the
+    caller may hold the same arrays.
+    """
+    params = jax.tree.map(jnp.array, params)
     tree: Any = params
-    return TrainState(params, make_optimizer(rates).init(tree), jnp.zeros((), jnp.int32))
+    return TrainState(params, _ADAM.init(tree), jnp.asarray(step, jnp.int32), carry)
 
 
-def _project(params: Params, smallest_light: float) -> Params:
-    """Return to the feasible set: no texel of the light below its floor."""
-    radiance = jnp.maximum(params.light.radiance, smallest_light)
-    return replace(params, light=replace(params.light, radiance=radiance))
+def _frozen(params: Params, groups: tuple[str, ...]) -> Params:
+    """Cut the gradient of some groups."""
+    leaves, structure = jax.tree.flatten(params)
+    cut = [
+        jax.lax.stop_gradient(leaf) if name in groups else leaf
+        for leaf, name in zip(leaves, rate_groups(params), strict=True)
+    ]
+    return jax.tree.unflatten(structure, cut)
 
 
-@partial(
-    jax.jit,
-    static_argnames=(
-        "model",
-        "objective",
-        "capacities",
-        "sampling",
-        "rates",
-        "smallest_light",
-    ),
-    donate_argnames=("state",),
-)
+def _moved(params: Params, directions: Params, rule: UpdateRule) -> Params:
+    """Step against the directions, and return to the feasible set."""
+    leaves, structure = jax.tree.flatten(params)
+    moved = [
+        leaf - rule.rates[name].astype(leaf.dtype) * direction
+        for leaf, direction, name in zip(
+            leaves, jax.tree.leaves(directions), rate_groups(params), strict=True
+        )
+    ]
+    params_moved = jax.tree.unflatten(structure, moved)
+    # Absolute steps below the knee, relative ones above: a sun is thousands of times brighter than
+    # its sky, and Adam's steps know nothing of that. No texel falls below its floor.
+    old = params.light.radiance
+    knee = rule.light_knee
+    growth = jnp.where(knee > 0, 1.0 + old / jnp.where(knee > 0, knee, 1.0), 1.0)
+    radiance = old + growth * (params_moved.light.radiance - old)
+    light = replace(params.light, radiance=jnp.maximum(radiance, rule.smallest_light))
+    return replace(params_moved, light=light)
+
+
+@partial(jax.jit, donate_argnames=("state",))
 def train_step(
-    state: TrainState,
-    batch: Batch,
-    context: Context,
-    weights: LossWeights,
-    *,
-    model: Model,
-    objective: Objective,
-    capacities: Capacities,
-    sampling: str,
-    rates: RateConfig,
-    smallest_light: float,
+    state: TrainState, batch: Batch, pipeline: Pipeline, rule: UpdateRule
 ) -> tuple[TrainState, StepReport]:
     """Make one update, or none at all.
 
@@ -153,25 +147,21 @@ def train_step(
     and the report says so; the host then grows the buffers and repeats the batch, or stops.
     ``state`` is donated: use only what is returned.
     """
-    evaluate = jax.value_and_grad(loss, has_aux=True)
-    (total, report), gradient = evaluate(
-        state.params,
-        batch,
-        context,
-        weights,
-        model=model,
-        objective=objective,
-        capacities=capacities,
-        sampling=sampling,
-    )
+
+    def objective(params: Params) -> tuple[Float[Array, ""], LossReport]:
+        carried = replace(batch, carry=state.carry)
+        return pipeline.loss(_frozen(params, rule.frozen), carried)
+
+    (total, report), gradient = jax.value_and_grad(objective, has_aux=True)(state.params)
     with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integer powers
         tree: Any = state.params
-        updates, optimizer = make_optimizer(rates).update(gradient, state.optimizer, tree)
-    params = _project(jax.tree.map(jnp.add, state.params, updates), smallest_light)
+        directions, optimizer = _ADAM.update(gradient, state.optimizer, tree)
+    moved: Any = directions
+    params = _moved(state.params, moved, rule)
     finite = jnp.isfinite(total) & jnp.all(
         jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient)])
     )
-    fits = capacity_module.fits(report.usage, capacities)
-    advanced = TrainState(params, optimizer, state.step + 1)
+    fits = capacity_module.fits(report.usage, pipeline.capacities)
+    advanced = TrainState(params, optimizer, state.step + 1, report.carry)
     chosen = jax.tree.map(lambda new, old: jnp.where(finite & fits, new, old), advanced, state)
-    return chosen, StepReport(total, report, finite, fits)
+    return chosen, StepReport(total, replace(report, carry=None), finite, fits)

@@ -1,22 +1,15 @@
-"""The training loop: capacities, overflow retry, checkpoints, progress, recovery.
+"""The training loop: stages, capacities, repeated steps, checkpoints, recovery.
 
-Everything here runs on the host around `step.train_step`. A run is a folder::
-
-    run.json              scene, configuration, versions
-    metrics.jsonl         one line a step
-    checkpoints/          parameters, optimiser, step, capacities
-    stage_1/              the checkpoint that stage 2 started from
-    previews/             truth, render and normals while training
+Everything here runs on the host around `step.train_step`, and knows stages only as values of
+`Config.stages`. `folder.RunFolder` says what is written where.
 """
 
-import dataclasses
 import json
 import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,16 +19,18 @@ import numpy as np
 
 from geosplat_jax.core import capacity as capacity_module
 from geosplat_jax.core.capacity import Capacities, Usage
-from geosplat_jax.core.types import Camera, Geometry, Grid
-from geosplat_jax.fit.config import Config, config_from_dict, differences
+from geosplat_jax.core.types import Camera
+from geosplat_jax.fit.config import Config, Stage, config_from_dict, differences
+from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.runtime import peak_memory_mb, release_programs_when_crowded
 from geosplat_jax.fit.stages import (
-    begin_stage_2,
+    begin_stage,
+    build_pipeline,
     initial_params,
-    initial_sdf,
     make_batch,
-    make_context,
-    sampling_of_step,
+    pipeline_at,
+    template_params,
+    update_rule,
 )
 from geosplat_jax.fit.step import StepReport, TrainState, initial_state, train_step
 from geosplat_jax.io.checkpoints import (
@@ -46,15 +41,14 @@ from geosplat_jax.io.checkpoints import (
 )
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.views import Views
-from geosplat_jax.model import Context, Model, Params
-from geosplat_jax.render import visibility_usage
-from geosplat_jax.surface.hull import fit_grid
+from geosplat_jax.pipeline import Pipeline
+from geosplat_jax.render import Params
+from geosplat_jax.surface.base import SurfaceModel
 
 _RECOVERIES_ALLOWED = 3
 _SHRINK_EVERY = 100
-_STAGE_2_STREAM = 2**31 - 1
-"""Number of the random stream that stage 2 starts from; steps take theirs from 0 on."""
 _HEADROOM = 1.2
+_SPLATS_PER_QUAD = 24
 
 
 class TrainingError(RuntimeError):
@@ -62,211 +56,205 @@ class TrainingError(RuntimeError):
 
 
 class Interrupted(Exception):
-    """The user stopped the run; a checkpoint has been written."""
+    """The user stopped the run; it can be continued."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """What a progress display needs to know after a step."""
+    """What a display needs to know after a step.
+
+    Attributes
+    ----------
+    step, steps : done, and of all stages.
+    stage : name of the stage.
+    total, psnr, splat_count : of the step.
+    seconds : since the training began or was resumed.
+    seconds_left : estimated; None while a stage has just begun and compiles.
+    """
 
     step: int
     steps: int
-    stage: int
+    stage: str
     total: float
     psnr: float
-    gaussian_count: int
+    splat_count: int
     seconds: float
-    seconds_left: float
+    seconds_left: float | None
 
 
-_usage_of = partial(jax.jit, static_argnames=("model", "capacities", "sampling"))(visibility_usage)
-
-
-def _guess_capacities(sdf: np.ndarray, grid: Grid) -> Capacities:
-    """Guess capacities from the number of sign changes along grid edges."""
-    vx, vy, vz = grid.vertex_shape
-    inside = (np.asarray(sdf) < 0).reshape(vz, vy, vx)
-    quads = sum(int(np.sum(np.diff(inside, axis=axis))) for axis in range(3))
-    gaussians = 24 * quads
-    return Capacities(
-        surface_cubes=capacity_module.bucket(int(1.3 * quads)),
-        dual_vertices=capacity_module.bucket(int(1.3 * quads)),
-        quads=capacity_module.bucket(int(1.2 * quads)),
-        visible=capacity_module.bucket(int(0.6 * gaussians)),
-        hits=capacity_module.bucket(int(2.0 * gaussians)),
-        chunks=capacity_module.bucket(int(0.4 * gaussians)),
-    )
+_needs_of = jax.jit(Pipeline.needs)
 
 
 def plan_capacities(
-    params: Params,
-    camera: Camera,
-    context: Context,
-    *,
-    model: Model,
-    sampling: str,
-    max_quads: int,
-    start: Capacities | None = None,
+    pipeline: Pipeline, params: Params, camera: Camera, *, limits: dict[str, int]
 ) -> Capacities:
     """Choose capacities with some headroom for all the given views.
+
+    Parameters
+    ----------
+    pipeline, params : of the stage; the pipeline's own capacities do not matter.
+    camera : of all views.
+    limits : largest sensible needs, see `SurfaceSettings.limits`.
 
     Raises
     ------
     TrainingError
-        If the surface has more than ``max_quads`` quads.
+        If the surface needs more.
     """
-    capacities = start or _guess_capacities(np.asarray(params.geometry.sdf), context.grid)
-    while True:
-        needed = _usage_of(
-            params, camera, context, model=model, capacities=capacities, sampling=sampling
-        )
-        _check_size(int(needed.quads), max_quads)
-        if not capacity_module.overflowed(needed, capacities):
-            break
-        capacities = capacity_module.grow(capacities, needed)
-    sizes = {
-        f.name: capacity_module.bucket(int(_HEADROOM * int(getattr(needed, f.name))))
-        for f in dataclasses.fields(Usage)
-    }
-    return Capacities(**sizes)
+    first = pipeline.surface.first_capacities(params.geometry)
+    splats = _SPLATS_PER_QUAD * first["quads"]
+    guess = first.resized(
+        visible=capacity_module.bucket(int(0.5 * splats)),
+        hits=capacity_module.bucket(int(1.7 * splats)),
+        chunks=capacity_module.bucket(int(0.33 * splats)),
+    )
+
+    def attempt(capacities: Capacities) -> tuple[Usage, Usage]:
+        needed = _needs_of(replace(pipeline, capacities=capacities), params, camera)
+        check_limits(needed, limits)
+        return needed, needed
+
+    needed, _ = capacity_module.retry(attempt, guess)
+    return Capacities(
+        **{name: capacity_module.bucket(int(_HEADROOM * int(n))) for name, n in needed.items()}
+    )
 
 
-def _check_size(quads: int, max_quads: int) -> None:
-    """Stop before an exploding surface exhausts the memory."""
-    if quads > max_quads:
-        raise TrainingError(
-            f"the surface has {quads} quads, more than geometry.max_quads = {max_quads}: it has "
-            "exploded. Start from --set geometry.initial=hull, lower geometry.resolution or the "
-            "rates, or raise the limit if the memory allows (about 25 KB a quad)."
-        )
+def check_limits(needed: Usage, limits: dict[str, int]) -> None:
+    """Stop before an exploding surface exhausts the memory.
+
+    Raises
+    ------
+    TrainingError
+        If a buffer needs more than its limit.
+    """
+    for name, limit in limits.items():
+        if name in needed and int(needed[name]) > limit:
+            raise TrainingError(
+                f"the surface has {int(needed[name])} {name}, more than geometry.max_{name} = "
+                f"{limit}: it has exploded. Start from --set geometry.initial=hull, lower "
+                "geometry.resolution or the rates, or raise the limit if the memory allows."
+            )
 
 
 @dataclass
 class _Loop:
     """Mutable bookkeeping of a run; everything but the clock goes into checkpoints.
 
-    ``config`` are the settings of the stage that runs, ``run_config`` those of all stages;
-    ``fallback`` is the surface that the stage began with, on the host, since the step consumes its
+    ``fallback`` is the shape that the stage began with, on the host, since the step consumes its
     buffers.
     """
 
-    run_config: Config
     config: Config
     views: Views
-    context: Context
-    folder: Path
+    folder: RunFolder
+    surface: SurfaceModel
+    stage: Stage
+    pipeline: Pipeline
     state: TrainState
-    stage: int = 1
-    capacities: Capacities | None = None
-    sampling: str = ""
-    peak: Usage | None = None
+    planned_for: str | None = None
+    peak: dict[str, int] | None = None
     recoveries: int = 0
-    fallback: Geometry | None = None
+    fallback: Any = None
     last_checkpoint: Path | None = None
+
+    @property
+    def step(self) -> int:
+        """Steps of the run that are done."""
+        return int(self.state.step)
+
+    def _since(self, step: int) -> int:
+        """Count the steps since the start of the stage."""
+        return step - self.config.first_step(self.stage.name)
 
     def meta(self) -> dict[str, Any]:
         """Everything of a checkpoint that is not an array."""
-        assert self.capacities is not None
         return {
-            "config": self.run_config.to_dict(),
-            "stage": self.stage,
-            "grid_shape": list(self.context.grid.shape),
-            "capacities": asdict(self.capacities),
-            "sampling": self.sampling,
-            "peak": None if self.peak is None else usage_to_dict(self.peak),
+            "config": self.config.to_dict(),
+            "stage": self.stage.name,
+            "surface": self.config.geometry.describe(self.surface),
+            "capacities": dict(self.pipeline.capacities),
+            "planned_for": self.planned_for,
+            "peak": self.peak,
             "recoveries": self.recoveries,
         }
 
     def tree(self) -> dict[str, Any]:
         """All arrays of a checkpoint."""
-        return {"state": self.state, "grid": self.context.grid}
+        return {"state": self.state, "surface": self.surface}
 
     def save(self) -> Path:
         """Write a checkpoint of the state as it is."""
-        step = int(self.state.step)
         self.last_checkpoint = save_checkpoint(
-            self.folder / "checkpoints", step, tree=self.tree(), meta=self.meta()
+            self.folder.checkpoints, self.step, tree=self.tree(), meta=self.meta()
         )
         return self.last_checkpoint
 
+    def save_end(self) -> Path:
+        """Keep the state as what the stage ended with."""
+        end = self.folder.end_of(self.stage.name)
+        return save_checkpoint(end, self.step, tree=self.tree(), meta=self.meta(), keep=1)
+
     def prepare(self, step: int) -> None:
-        """Begin the next stage when it is time; choose capacities when the sampling changes."""
-        if self.stage == 1 and step >= self.run_config.first_step(2):
-            self._begin_stage_2()
-        sampling = sampling_of_step(step, self.config)
-        if sampling != self.sampling or self.capacities is None:
-            self.sampling = sampling
-            self.peak = None
-            self.capacities = plan_capacities(
+        """Begin the next stage when it is time; set the weights, and plan the buffers."""
+        stage = self.config.stage_at(step)
+        if stage != self.stage:
+            self._begin(stage)
+        self.pipeline = pipeline_at(self.pipeline, self.config, self.stage, self._since(step))
+        # Another kind of splats, another stage: other needs.
+        planned_for = f"{self.stage.name} {self.pipeline.splats}"
+        if planned_for != self.planned_for:
+            self.planned_for, self.peak = planned_for, None
+            capacities = plan_capacities(
+                self.pipeline,
                 self.state.params,
                 self.views.camera(),
-                self.context,
-                model=self.config.model,
-                sampling=sampling,
-                max_quads=self.config.geometry.max_quads,
+                limits=self.config.geometry.limits,
             )
+            self.pipeline = replace(self.pipeline, capacities=capacities)
 
-    def _begin_stage_2(self) -> None:
-        """Change settings, parameters and optimiser; the surface needs buffers for rays."""
-        if self.capacities is not None:
-            step = int(self.state.step)
-            save_checkpoint(
-                self.folder / "stage_1", step, tree=self.tree(), meta=self.meta(), keep=1
-            )
-        self.stage = 2
-        self.config = self.run_config.stage(2)
-        self.fallback = _on_host(self.state.params.geometry)
-        key = jax.random.fold_in(jax.random.key(self.config.run.seed), _STAGE_2_STREAM)
-        params = begin_stage_2(self.state.params, self.context.grid, self.run_config, key)
-        fresh = initial_state(params, self.config.rates)
-        self.state = replace(fresh, step=self.state.step)
-        self.capacities = None
+    def _begin(self, stage: Stage) -> None:
+        """Change settings, parameters and optimiser; keep what the stage before ended with."""
+        self.save_end()
+        params = begin_stage(self.state.params, self.pipeline, self.config, stage)
+        self.stage = stage
+        self.pipeline = build_pipeline(self.config, stage, self.surface)
+        self._start(params)
+
+    def _start(self, params: Params) -> None:
+        """Begin the stage with these parameters."""
+        self.fallback = _on_host(params.geometry)
+        carry = self.pipeline.transport.first_carry()
+        self.state = initial_state(params, step=self.step, carry=carry)
 
     def advance(self, step: int) -> StepReport:
         """Make step ``step``, repeating the same batch with larger buffers as often as needed."""
-        batch = make_batch(self.views, step, self.config)
-        since = step - self.run_config.first_step(self.stage)
-        weights = self.config.loss.at(since / self.config.run.steps)
-        while True:
-            assert self.capacities is not None
-            self.state, report = train_step(
-                self.state,
-                batch,
-                self.context,
-                weights,
-                model=self.config.model,
-                objective=self.config.objective,
-                capacities=self.capacities,
-                sampling=self.sampling,
-                rates=self.config.rates,
-                smallest_light=self.config.run.smallest_light,
-            )
-            needed = jax.device_get(report.loss.usage)
-            _check_size(int(needed.quads), self.config.geometry.max_quads)
-            if bool(report.fits):
-                break
-            self._resize(capacity_module.grow(self.capacities, needed))
+        batch = make_batch(self.views, step, self.stage, seed=self.config.run.seed)
+        rule = update_rule(self.config, self.stage, self.state.params, self._since(step))
+
+        def attempt(capacities: Capacities) -> tuple[StepReport, Usage]:
+            self._resize(capacities)
+            self.state, report = train_step(self.state, batch, self.pipeline, rule)
+            check_limits(report.loss.usage, self.config.geometry.limits)
+            return report, report.loss.usage
+
+        report, _ = capacity_module.retry(attempt, self.pipeline.capacities)
         if not bool(report.finite):
             raise TrainingError(self._not_finite(step, report))
-        self._remember(needed)
-        if int(needed.quads) == 0:
+        needed = {name: int(count) for name, count in report.loss.usage.items()}
+        self.peak = {n: max(count, (self.peak or {}).get(n, 0)) for n, count in needed.items()}
+        if int(report.loss.face_count) == 0:
             self._recover(step)
-        elif int(self.state.step) % _SHRINK_EVERY == 0 and self.peak is not None:
-            self._resize(capacity_module.shrink(self.capacities, self.peak))
+        elif self.step % _SHRINK_EVERY == 0:
+            self._resize(capacity_module.shrink(self.pipeline.capacities, self.peak))
             self.peak = None
         return report
 
     def _resize(self, capacities: Capacities) -> None:
         """Change the buffers, which takes a new program; the old ones may be too many to keep."""
-        self.capacities = capacities
-        release_programs_when_crowded()
-
-    def _remember(self, needed: Usage) -> None:
-        """Track the largest need since buffers were last resized."""
-        if self.peak is None:
-            self.peak = needed
-        else:
-            self.peak = jax.tree.map(lambda a, b: np.maximum(a, b), self.peak, needed)
+        if capacities != self.pipeline.capacities:
+            self.pipeline = replace(self.pipeline, capacities=capacities)
+            release_programs_when_crowded()
 
     def _not_finite(self, step: int, report: StepReport) -> str:
         """Say which term broke, when, and where the last good state is."""
@@ -280,43 +268,38 @@ class _Loop:
 
     def _lower(self) -> str:
         """Say how to start again with lower rates of the stage that runs."""
-        if self.stage == 1:
-            return "--set rates.sdf=..."
-        return f"--stage-1 {self.folder} --set transport.rates.sdf=..."
+        name = self.stage.name
+        again = f"--set stages.{name}.rates.GROUP=..."
+        is_first = self.stage == self.config.active_stages[0]
+        return again if is_first else f"--from {self.folder} --stage {name} {again}"
 
     def _recover(self, step: int) -> None:
         """Put the stage's first surface back after every face has vanished."""
         if self.recoveries >= _RECOVERIES_ALLOWED or self.fallback is None:
             raise TrainingError(
-                f"step {step}: the surface is empty (its SDF has one sign everywhere) for the "
+                f"step {step}: the surface is empty (no face is left) for the "
                 f"{self.recoveries + 1}th time. Check that the masks are not inverted and that "
                 "the bounds hold the object (geosplat-jax info), or start a new run with lower "
                 f"rates: {self._lower()}."
             )
         self.recoveries += 1
-        params = replace(self.state.params, geometry=jax.tree.map(jnp.asarray, self.fallback))
-        fresh = initial_state(params, self.config.rates)
-        self.state = replace(fresh, step=self.state.step)
+        shape = jax.tree.map(jnp.asarray, self.fallback)
+        self.state = initial_state(
+            replace(self.state.params, geometry=shape), step=self.step, carry=self.state.carry
+        )
 
 
-def _on_host(geometry: Geometry) -> Geometry:
-    """Copy a geometry out of buffers that the step will consume."""
-    return jax.tree.map(np.array, geometry)
-
-
-def usage_to_dict(usage: Usage) -> dict[str, int]:
-    """Plain integers of a usage."""
-    return {f.name: int(getattr(usage, f.name)) for f in dataclasses.fields(Usage)}
-
-
-def usage_from_dict(values: dict[str, int]) -> Usage:
-    """Inverse of `usage_to_dict`."""
-    return Usage(**{name: jnp.int32(count) for name, count in values.items()})
+def _on_host(shape: Any) -> Any:
+    """Copy a shape out of buffers that the step will consume."""
+    return jax.tree.map(np.array, shape)
 
 
 @contextmanager
 def _stop_requests() -> Iterator[Callable[[], bool]]:
-    """Turn Ctrl-C and SIGTERM into a flag that the loop reads between two steps."""
+    """Turn Ctrl-C and SIGTERM into a flag that the loop reads between two steps.
+
+    A second signal does not wait: it raises KeyboardInterrupt wherever the program is.
+    """
     asked = []
 
     def note(number: int, frame: Any) -> None:
@@ -338,234 +321,346 @@ def _stop_requests() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-def _start(dataset: Dataset, config: Config, folder: Path) -> _Loop:
+def _start(dataset: Dataset, config: Config, folder: RunFolder) -> _Loop:
     """Build the loop of a new run."""
-    sdf_key, field_key = jax.random.split(jax.random.key(config.run.seed))
-    grid = fit_grid(dataset.bounds, config.geometry.resolution)
-    sdf = initial_sdf(grid, dataset.train, config, sdf_key)
-    if not bool(jnp.any(sdf < 0)) or not bool(jnp.any(sdf >= 0)):
-        raise TrainingError(
-            f"the first surface (geometry.initial = {config.geometry.initial}) is empty: the "
-            "masks and cameras agree on no point inside the bounds. Check poses and masks with "
-            "geosplat-jax info, give --bounds, or start from geometry.initial=sphere."
-        )
-    params = initial_params(sdf, grid, config, field_key)
-    return _Loop(
-        run_config=config,
-        config=config.stage(1),
+    shape_key, field_key = jax.random.split(jax.random.key(config.run.seed))
+    if not config.active_stages:
+        raise TrainingError("nothing to train: no stage has steps")
+    try:
+        surface, shape = config.geometry.start(dataset, shape_key)
+    except ValueError as error:
+        raise TrainingError(str(error)) from error
+    stage = config.active_stages[0]
+    params = initial_params(shape, config, field_key)
+    pipeline = build_pipeline(config, stage, surface)
+    loop = _Loop(
+        config=config,
         views=dataset.train,
-        context=make_context(grid, config.model),
         folder=folder,
-        state=initial_state(params, config.rates),
-        fallback=_on_host(params.geometry),
+        surface=surface,
+        stage=stage,
+        pipeline=pipeline,
+        state=initial_state(params),
     )
+    loop._start(params)
+    return loop
 
 
-def _template(config: Config, grid_shape: tuple[int, int, int], stage: int) -> dict[str, Any]:
-    """Return a checkpoint's arrays as shapes only; ``config`` is that of all stages."""
+def _template(config: Config, surface: dict[str, Any], stage: Stage) -> dict[str, Any]:
+    """Return a checkpoint's arrays as shapes only; ``surface`` is its description."""
 
     def build() -> dict[str, Any]:
-        grid = Grid(jnp.zeros(3), jnp.ones(()), grid_shape)
-        key = jax.random.key(config.run.seed)
-        params = initial_params(jnp.zeros(grid.vertex_count), grid, config, key)
-        if stage == 2:
-            params = begin_stage_2(params, grid, config, key)
-        return {"state": initial_state(params, config.stage(stage).rates), "grid": grid}
+        model, shape = config.geometry.template(surface)
+        params = template_params(config, model, shape, stage)
+        carry = build_pipeline(config, stage, model).transport.first_carry()
+        return {"state": initial_state(params, carry=carry), "surface": model}
 
     return jax.eval_shape(build)
 
 
-def _continue(dataset: Dataset, config: Config, folder: Path) -> _Loop:
-    """Rebuild the loop of a run from its last good checkpoint."""
-    path = latest_checkpoint(folder / "checkpoints")
-    if path is None:
-        raise TrainingError(f"{folder} holds no checkpoint to resume from")
+def _read(path: Path, config: Config) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read a checkpoint's arrays and the rest; ``config`` is the one it was written with."""
     meta = read_meta(path)
-    changed = differences(config_from_dict(meta["config"]), config)
+    like = _template(config, meta["surface"], config.stage(meta["stage"]))
+    tree, _ = load_checkpoint(path, like=like)
+    return tree, meta
+
+
+def _put(loop: _Loop, tree: dict[str, Any], meta: dict[str, Any]) -> None:
+    """Set a loop to a checkpoint."""
+    loop.surface = tree["surface"]
+    loop.stage = loop.config.stage(meta["stage"])
+    pipeline = build_pipeline(loop.config, loop.stage, loop.surface)
+    loop.pipeline = replace(pipeline, capacities=Capacities(**meta["capacities"]))
+    loop.state = tree["state"]
+    loop.planned_for, loop.peak = meta["planned_for"], meta["peak"]
+    loop.recoveries = meta["recoveries"]
+
+
+def _continue(dataset: Dataset, config: Config, folder: RunFolder) -> _Loop:
+    """Rebuild the loop of a run from its last good checkpoint, or from the start without one."""
+    changed = differences(folder.config(), config)
     if changed:
         raise TrainingError(
             "cannot resume with another configuration; start a new run, or undo: "
             + "; ".join(changed)
         )
-    like = _template(config, tuple(meta["grid_shape"]), meta["stage"])
-    tree, _ = load_checkpoint(path, like=like)
     loop = _start(dataset, config, folder)
-    loop.stage, loop.config = meta["stage"], config.stage(meta["stage"])
-    loop.context = replace(loop.context, grid=tree["grid"])
-    loop.state = tree["state"]
-    loop.capacities = Capacities(**meta["capacities"])
-    loop.sampling = meta["sampling"]
-    loop.peak = None if meta["peak"] is None else usage_from_dict(meta["peak"])
-    loop.recoveries = meta["recoveries"]
+    path = latest_checkpoint(folder.checkpoints)
+    before = [stage.name for stage in config.active_stages]
+    if path is None:
+        # A run that took its first stages over may have been stopped before its own checkpoint.
+        ended = [name for name in before if latest_checkpoint(folder.end_of(name))]
+        if ended:
+            _put(loop, *_read(_require(latest_checkpoint(folder.end_of(ended[-1]))), config))
+        return loop
+    _put(loop, *_read(path, config))
     loop.last_checkpoint = path
-    before = latest_checkpoint(folder / "stage_1")
-    if loop.stage == 2 and before is not None:
-        like = _template(config, tuple(meta["grid_shape"]), 1)
-        loop.fallback = _on_host(load_checkpoint(before, like=like)[0]["state"].params.geometry)
+    number = before.index(loop.stage.name)
+    if number:
+        ended = latest_checkpoint(folder.end_of(before[number - 1]))
+        if ended is not None:
+            loop.fallback = _on_host(_read(ended, config)[0]["state"].params.geometry)
     return loop
 
 
-def _adopt(dataset: Dataset, config: Config, folder: Path, source: Path) -> _Loop:
-    """Build the loop of a run whose stage 1 is that of another run."""
-    if config.transport.steps == 0:
-        raise TrainingError("nothing to train: stage 1 is taken over and transport.steps is 0")
-    path = latest_checkpoint(source / "stage_1") or latest_checkpoint(source / "checkpoints")
+def _require(path: Path | None) -> Path:
+    assert path is not None
+    return path
+
+
+def _adopt(
+    dataset: Dataset, config: Config, folder: RunFolder, source: RunFolder, name: str
+) -> _Loop:
+    """Build the loop of a run whose stages before ``name`` are those of another run."""
+    if not config.stage(name).steps:
+        raise TrainingError(f"nothing to train: stages.{name}.steps is 0")
+    number = [stage.name for stage in config.active_stages].index(name)
+    if number == 0:
+        raise TrainingError(f"{name} is the first stage; there is nothing to take over")
+    last = config.active_stages[number - 1]
+    path = latest_checkpoint(source.end_of(last.name)) or latest_checkpoint(source.checkpoints)
     if path is None:
-        raise TrainingError(f"{source} holds no checkpoint to take stage 1 from")
+        raise TrainingError(f"{source} holds no checkpoint to take the stage {last.name} from")
     meta = read_meta(path)
     theirs = config_from_dict(meta["config"])
-    changed = differences(replace(theirs, transport=config.transport), config)
+    kept = [stage.name for stage in config.active_stages[:number]]
+    changed = differences(theirs, config, stages=kept)
     if changed:
         raise TrainingError(
-            f"stage 1 of {source} had other settings: {'; '.join(changed)}; train it anew"
+            f"up to the stage {last.name}, {source} had other settings: {'; '.join(changed)}; "
+            "train it anew"
         )
-    like = _template(theirs, tuple(meta["grid_shape"]), meta["stage"])
-    tree, _ = load_checkpoint(path, like=like)
-    done = int(tree["state"].step)
-    if meta["stage"] != 1 or done != config.first_step(2):
+    tree, meta = _read(path, theirs)
+    done, end = int(tree["state"].step), config.first_step(name)
+    if meta["stage"] != last.name or done != end:
         raise TrainingError(
-            f"{path} is at step {done} of stage {meta['stage']}, not at the end of stage 1 "
-            f"({config.first_step(2)} steps)"
+            f"{path} is at step {done}, in the stage {meta['stage']}, not at the end of "
+            f"{last.name} ({end} steps)"
         )
     loop = _start(dataset, config, folder)
-    loop.context = replace(loop.context, grid=tree["grid"])
-    loop.state = tree["state"]
-    loop.capacities = Capacities(**meta["capacities"])
-    loop.sampling = meta["sampling"]
+    _put(loop, tree, meta)
     return loop
 
 
-def load_run(folder: Path) -> tuple[Config, Params, Context, Capacities, dict[str, Any]]:
-    """Read the last good checkpoint of a run for rendering.
+@dataclass(frozen=True)
+class Trained:
+    """What a run's last good checkpoint holds, ready to render.
 
-    Returns
-    -------
-    config, params, context, capacities : as they were; ``config`` holds the settings of the stage
-        that the checkpoint was written in.
-    meta : the checkpoint's meta data, with ``step``, ``stage`` and the whole run's ``config``.
+    Attributes
+    ----------
+    config, stage : settings of the run, and the stage that the checkpoint was written in.
+    params, pipeline : of that stage.
+    step : steps that were done.
+    """
+
+    config: Config
+    stage: Stage
+    params: Params
+    pipeline: Pipeline
+    step: int
+
+
+def load_trained(folder: str | Path | RunFolder, *, stage: str | None = None) -> Trained:
+    """Read the last good checkpoint of a run, or the one that a stage ended with.
 
     Raises
     ------
     TrainingError
         If the folder holds no readable checkpoint.
+    RunError
+        If its settings are not those of this version.
     """
-    path = latest_checkpoint(Path(folder) / "checkpoints")
+    run = folder if isinstance(folder, RunFolder) else RunFolder(folder)
+    path = latest_checkpoint(run.checkpoints if stage is None else run.end_of(stage))
     if path is None:
-        raise TrainingError(f"{folder} holds no checkpoint; is it the output of a training run?")
-    meta = read_meta(path)
-    whole = config_from_dict(meta["config"])
-    like = _template(whole, tuple(meta["grid_shape"]), meta["stage"])
-    tree, _ = load_checkpoint(path, like=like)
-    config = whole.stage(meta["stage"])
-    meta["step"] = int(tree["state"].step)
-    context = make_context(tree["grid"], config.model)
-    return config, tree["state"].params, context, Capacities(**meta["capacities"]), meta
+        raise TrainingError(f"{run} holds no checkpoint; is it the output of a training run?")
+    try:
+        config = config_from_dict(read_meta(path)["config"])
+    except ValueError as error:
+        raise RunError(f"{path}: {error}") from None
+    tree, meta = _read(path, config)
+    current = config.stage(meta["stage"])
+    step = int(tree["state"].step)
+    pipeline = build_pipeline(config, current, tree["surface"])
+    pipeline = replace(pipeline, capacities=Capacities(**meta["capacities"]))
+    return Trained(config, current, tree["state"].params, pipeline, step)
 
 
-def _record(
-    report: StepReport, step: int, stage: int, seconds: float, capacities: Capacities
-) -> dict[str, Any]:
+def _record(report: StepReport, step: int, loop: _Loop, seconds: float) -> dict[str, Any]:
     """Return one line of metrics.jsonl."""
     return {
         "step": step,
-        "stage": stage,
+        "stage": loop.stage.name,
         "loss": float(report.total),
         "psnr": float(report.loss.psnr),
         **{f"term.{name}": float(value) for name, value in report.loss.terms.items()},
-        "gaussians": int(report.loss.gaussian_count),
+        "splats": int(report.loss.splat_count),
         "faces": int(report.loss.face_count),
         "seconds": round(seconds, 4),
         "peak_memory_mb": peak_memory_mb(),
-        "usage": usage_to_dict(report.loss.usage),
-        "capacities": asdict(capacities),
+        "usage": {name: int(count) for name, count in report.loss.usage.items()},
+        "capacities": dict(loop.pipeline.capacities),
     }
 
 
-def _keep_lines_before(path: Path, step: int) -> None:
-    """Drop metrics of steps that the checkpoint does not contain."""
-    if path.exists():
-        lines = [line for line in path.read_text().splitlines() if json.loads(line)["step"] < step]
-        path.write_text("".join(line + "\n" for line in lines))
+class _Clock:
+    """Estimates the time left from the steps of each stage, the first of which compiles."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._began = time.perf_counter()
+        self._seconds: dict[str, list[float]] = {}
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the start."""
+        return time.perf_counter() - self._began
+
+    def note(self, stage: str, seconds: float) -> None:
+        """Take a step into account."""
+        self._seconds.setdefault(stage, []).append(seconds)
+
+    def left(self, done: int) -> float | None:
+        """Seconds left after ``done`` steps; None before there is a step without compilation."""
+        total, end, known = 0.0, 0, None
+        for stage in self._config.active_stages:
+            end += stage.steps
+            steps = self._seconds.get(stage.name, [])
+            if len(steps) > 1:
+                known = float(np.median(steps[1:][-50:]))
+            remaining = min(max(end - done, 0), stage.steps)
+            if remaining and known is None:
+                return None
+            total += remaining * (known or 0.0)
+        return total
 
 
 def fit(
     dataset: Dataset,
     config: Config,
-    folder: Path,
+    folder: str | Path,
     *,
     resume: bool = False,
-    stage_1: Path | None = None,
+    replace_run: bool = False,
+    source: str | Path | None = None,
+    first_stage: str | None = None,
     stop_after: int | None = None,
     on_step: Callable[[Progress], None] | None = None,
-    on_preview: Callable[[Config, Params, Context, Capacities, int], None] | None = None,
+    on_preview: Callable[[Trained], None] | None = None,
 ) -> TrainState:
-    """Train on a dataset and leave a run folder.
+    """Train on a dataset and leave a run's folder; see `folder.RunFolder`.
 
     Parameters
     ----------
     dataset : see `io.dataset.load_dataset`.
-    config : see `config.make_config`.
-    folder : run folder; it exists already.
-    resume : continue from the last good checkpoint; equals the uninterrupted run bit for bit.
-    stage_1 : run folder whose stage 1 to take over, in a new run; its scene and settings, those of
-        stage 2 aside, must be the same.
+    config : see `presets.make_config`.
+    folder : of the run; made where it is missing, and held while the training runs.
+    resume : continue from the last good checkpoint, or start again where there is none; equals the
+        uninterrupted run bit for bit.
+    replace_run : begin anew in a folder that holds a run.
+    source, first_stage : run whose stages before ``first_stage`` to take over, in a new run; its
+        scene and their settings must be the same.
     stop_after : stop, with a checkpoint, once so many steps are done (for tests and schedulers).
-    on_step, on_preview : called after every step, and every ``run.preview_every`` steps.
+    on_step : called after every step.
+    on_preview : called every ``run.preview_every`` steps.
 
     Raises
     ------
     ValueError
-        If ``resume`` and ``stage_1`` are both given.
+        If ``resume`` and ``source`` are both given, or ``source`` without ``first_stage``.
+    RunError
+        If the folder is another's, or in use.
     TrainingError
         When a number is not finite, the surface vanishes or explodes for good, or the run to
-        resume or to take stage 1 from does not fit.
+        resume or to take over does not fit.
     Interrupted
-        After Ctrl-C or SIGTERM; a checkpoint has been written.
+        After Ctrl-C or SIGTERM; the run can be resumed.
     """
-    if resume and stage_1 is not None:
-        raise ValueError("a run that is resumed has its stage 1 already; leave stage_1 out")
-    if resume:
-        loop = _continue(dataset, config, folder)
-    elif stage_1 is not None:
-        loop = _adopt(dataset, config, folder, stage_1)
-    else:
-        loop = _start(dataset, config, folder)
-    metrics_path = folder / "metrics.jsonl"
-    _keep_lines_before(metrics_path, int(loop.state.step))
-    last = min(config.total_steps, stop_after or config.total_steps)
-    began = time.perf_counter()
-    first = int(loop.state.step)
-    with metrics_path.open("a") as metrics, _stop_requests() as stop_requested:
-        for step in range(first, last):
-            step_began = time.perf_counter()
+    if resume and source is not None:
+        raise ValueError("a run that is resumed has its first stages already; leave source out")
+    if (source is None) != (first_stage is None):
+        raise ValueError("source and first_stage belong together")
+    run = RunFolder(folder)
+    with run.locked(), _stop_requests() as stop_requested:
+        has_begun = False
+        try:
+            if not (resume and run.exists):
+                run.require_free(replace=replace_run)
+                loop = _new_loop(dataset, config, run, source, first_stage)
+                run.begin(dataset, config, replace=replace_run)
+                has_begun = True
+                if source is not None:
+                    loop.save_end()
+            else:
+                run.repoint(dataset)
+                loop = _continue(dataset, config, run)
+            last = min(config.total_steps, stop_after or config.total_steps)
+            return _train(loop, last, stop_requested, on_step, on_preview)
+        except KeyboardInterrupt:
+            raise Interrupted(
+                f"stopped at once; continue with --resume from the last checkpoint in {run}"
+            ) from None
+        except TrainingError:
+            if has_begun and not run.metric_lines():
+                run.clear()  # not one step was made: the folder is free again
+            raise
+
+
+def _new_loop(
+    dataset: Dataset,
+    config: Config,
+    run: RunFolder,
+    source: str | Path | None,
+    first_stage: str | None,
+) -> _Loop:
+    """Build the loop of a new run, with its first stages from another one where asked."""
+    if source is None or first_stage is None:
+        return _start(dataset, config, run)
+    other = RunFolder(source)
+    other.require_same_scene(dataset)
+    return _adopt(dataset, config, run, other, first_stage)
+
+
+def _train(
+    loop: _Loop,
+    last: int,
+    stop_requested: Callable[[], bool],
+    on_step: Callable[[Progress], None] | None,
+    on_preview: Callable[[Trained], None] | None,
+) -> TrainState:
+    """Make steps until ``last`` are done."""
+    config, clock = loop.config, _Clock(loop.config)
+    loop.folder.keep_lines_before(loop.step)
+    with loop.folder.metrics.open("a", encoding="utf-8") as metrics:
+        for step in range(loop.step, last):
+            began = time.perf_counter()
             loop.prepare(step)
             report = loop.advance(step)
-            now = time.perf_counter()
-            assert loop.capacities is not None
-            line = _record(report, step, loop.stage, now - step_began, loop.capacities)
+            seconds = time.perf_counter() - began
+            line = _record(report, step, loop, seconds)
             metrics.write(json.dumps(line) + "\n")
             metrics.flush()
             done = step + 1
+            clock.note(loop.stage.name, seconds)
             if on_step is not None:
-                left = (now - began) / (done - first) * (config.total_steps - done)
                 on_step(
                     Progress(
                         step=done,
                         steps=config.total_steps,
-                        stage=loop.stage,
+                        stage=loop.stage.name,
                         total=line["loss"],
                         psnr=line["psnr"],
-                        gaussian_count=line["gaussians"],
-                        seconds=now - began,
-                        seconds_left=left,
+                        splat_count=line["splats"],
+                        seconds=clock.elapsed,
+                        seconds_left=clock.left(done),
                     )
                 )
-            is_due = done % config.run.checkpoint_every == 0 or done == last
-            if is_due or stop_requested():
+            if done % config.run.checkpoint_every == 0 or done == last or stop_requested():
                 loop.save()
-            if stop_requested():
+            if stop_requested() and done < last:
                 raise Interrupted(f"stopped at step {done}; continue with --resume")
             every = config.run.preview_every
             if on_preview is not None and every and done % every == 0:
-                on_preview(loop.config, loop.state.params, loop.context, loop.capacities, done)
+                on_preview(Trained(config, loop.stage, loop.state.params, loop.pipeline, done))
     return loop.state

@@ -26,6 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from geosplat_jax.core.types import Box
+
 STEPS = tuple(2.0**-9 * 4.0**-k for k in range(8))
 """The ladder of steps, in units of a group's scale: from 2e-3 down to 1.2e-7."""
 
@@ -35,6 +37,11 @@ _CHUNK = 64
 """Points that one call of a compiled function evaluates; the last call is padded."""
 
 Function = Callable[[dict[str, Any], Any], dict[str, Any]]
+
+
+def unit_box(dtype: Any) -> Box:
+    """Return the box [-1, 1]^3."""
+    return Box(jnp.zeros((3,), dtype), jnp.ones((), dtype))
 
 
 def double_precision() -> AbstractContextManager[Any]:

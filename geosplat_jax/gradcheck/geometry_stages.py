@@ -1,5 +1,6 @@
 """Problems of the surface: isosurface, its regularisers, and the adapter."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,12 +10,12 @@ from geosplat_jax.adapter import (
     CODE,
     PAPER,
     AdapterConstants,
-    face_gaussians,
+    face_splats,
     shift_inwards,
-    vertex_gaussians,
+    vertex_splats,
 )
 from geosplat_jax.core.capacity import Capacities
-from geosplat_jax.core.types import Gaussians, Geometry, Grid, Mesh
+from geosplat_jax.core.types import Geometry, Grid, Mesh, Splats
 from geosplat_jax.geometry import (
     face_normals_and_areas,
     isosurface,
@@ -92,14 +93,14 @@ def _mesh(vertices: Any) -> Mesh:
     return Mesh(vertices, jnp.asarray(faces), jnp.int32(4), jnp.int32(4))
 
 
-def _splats(gaussians: Gaussians) -> dict[str, Any]:
+def _splats(splats: Splats) -> dict[str, Any]:
     """Name what an adapter makes."""
     return {
-        "means": gaussians.means,
-        "scales": gaussians.scales,
-        "quats": gaussians.quats,
-        "normals": gaussians.normals,
-        "opacities": gaussians.opacities,
+        "means": splats.means,
+        "scales": splats.scales,
+        "quats": splats.quats,
+        "normals": splats.normals,
+        "opacities": splats.opacities,
     }
 
 
@@ -110,13 +111,13 @@ def adapter_problems(rng: np.random.Generator) -> list[Problem]:
     def faces(name: str, preset: AdapterConstants) -> Problem:
         def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
             mesh = _mesh(inputs["vertices"])
-            return _splats(face_gaussians(mesh, inputs["normals"], constants=preset))
+            return _splats(face_splats(mesh, inputs["normals"], constants=preset))
 
         return Problem(f"adapter, faces ({name})", function, inputs)
 
     def vertices(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
         mesh = _mesh(inputs["vertices"])
-        return _splats(vertex_gaussians(mesh, inputs["normals"], constants=CODE))
+        return _splats(vertex_splats(mesh, inputs["normals"], constants=CODE))
 
     def normals(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
         mesh = _mesh(inputs["vertices"])
@@ -125,17 +126,9 @@ def adapter_problems(rng: np.random.Generator) -> list[Problem]:
 
     def shift(inputs: dict[str, Any], constants: dict[str, Any]) -> dict[str, Any]:
         mesh = _mesh(constants["vertices"])
-        gaussians = face_gaussians(mesh, constants["normals"], constants=CODE)
-        moved = Gaussians(
-            means=gaussians.means + inputs["means"],
-            quats=gaussians.quats,
-            scales=gaussians.scales,
-            opacities=gaussians.opacities,
-            normals=gaussians.normals,
-            count=gaussians.count,
-        )
-        face_normal, area = face_normals_and_areas(mesh)
-        return {"means": shift_inwards(moved, face_normal, area, inputs["fraction"]).means}
+        splats = face_splats(mesh, constants["normals"], constants=CODE)
+        moved = replace(splats, means=splats.means + inputs["means"])
+        return {"means": shift_inwards(moved, mesh, inputs["fraction"]).means}
 
     rows = 6 * (len(_FACES) + 1)
     shifted = {"means": np.zeros((rows, 3)), "fraction": rng.uniform(0.2, 0.8, rows)}

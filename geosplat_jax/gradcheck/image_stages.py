@@ -9,7 +9,15 @@ import numpy as np
 from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.core.color import linear_to_srgb, tone_map
 from geosplat_jax.gradcheck.differences import Problem
-from geosplat_jax.losses import light_term, photometric_terms
+from geosplat_jax.losses import (
+    compare,
+    image_dissimilarity,
+    image_l1,
+    light_agreement,
+    mask_error,
+    normal_smoothness,
+    white_balance,
+)
 from geosplat_jax.splats.projection import project
 from geosplat_jax.splats.rasterize import rasterize
 
@@ -107,10 +115,15 @@ def loss_term_problems(rng: np.random.Generator) -> list[Problem]:
     def photometric(srgb: bool) -> Problem:
         def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
             rgb = tone_map(inputs["rgb"], inputs["log_exposure"])
-            terms, mse = photometric_terms(
-                rgb, inputs["alpha"], constants["image"], inputs["background"], srgb=srgb
+            images = compare(
+                rgb, inputs["alpha"], constants["image"], inputs["background"], None, srgb=srgb
             )
-            return {**terms, "mse": mse}
+            return {
+                "l1": image_l1(images),
+                "ssim": image_dissimilarity(images),
+                "mask": mask_error(images),
+                "mse": images.mse,
+            }
 
         inputs = {
             "rgb": rng.uniform(0.05, 1.1, (*shape, 3)),
@@ -122,7 +135,13 @@ def loss_term_problems(rng: np.random.Generator) -> list[Problem]:
         return Problem(name, function, inputs, {"image": image})
 
     def light(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
-        return {"light term": light_term(inputs["diffuse"], inputs["specular"], constants["image"])}
+        return {"light term": light_agreement(**inputs, image=constants["image"])}
+
+    def others(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
+        return {
+            "white balance": white_balance(inputs["radiance"]),
+            "normal smoothness": normal_smoothness(inputs["normals"], constants["image"]),
+        }
 
     def curves(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
         mapped = jax.vmap(lambda rgb, exposure: tone_map(rgb, exposure))
@@ -139,7 +158,17 @@ def loss_term_problems(rng: np.random.Generator) -> list[Problem]:
             light,
             {
                 "diffuse": rng.uniform(0, 1, (*shape, 3)),
-                "specular": rng.uniform(0, 1, (*shape, 3)),
+                "specular_radiance": rng.uniform(0, 0.3, (*shape, 3)),
+                "log_exposure": np.array(-0.2),
+            },
+            {"image": image},
+        ),
+        Problem(
+            "priors on light and normals",
+            others,
+            {
+                "radiance": rng.uniform(0, 1, (4, 8, 3)),
+                "normals": rng.uniform(-1, 1, (*shape, 3)),
             },
             {"image": image},
         ),

@@ -9,33 +9,37 @@ import numpy as np
 
 from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.core.types import Batch, Camera, EnvLight, Geometry, Grid
-from geosplat_jax.fit.config import Config, make_config
-from geosplat_jax.fit.stages import make_context
-from geosplat_jax.geometry import initial_geometry, sphere_sdf
-from geosplat_jax.gradcheck.differences import Problem
-from geosplat_jax.losses import TERM_NAMES, LossWeights, loss
+from geosplat_jax.fit.config import Config
+from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.stages import build_pipeline
+from geosplat_jax.geometry import FlexiCubes, initial_geometry, sphere_sdf
+from geosplat_jax.gradcheck.differences import Problem, unit_box
 from geosplat_jax.materials import MaterialField, init_materials, smoothness
-from geosplat_jax.model import Context, Model, Params
+from geosplat_jax.pipeline import Pipeline
+from geosplat_jax.render import Params
 from geosplat_jax.surface.hull import fit_grid
 
 _SIZE = 14
 _SETTINGS = (
     "geometry.resolution=6",
-    "model.material.grid.levels=2",
-    "model.material.grid.features=2",
-    "model.material.grid.log2_entries=7",
-    "model.material.grid.coarsest=3",
-    "model.material.grid.finest=9",
-    "model.material.albedo_hidden=[6, 6]",
-    "model.material.surface_hidden=[6]",
-    "model.light.height=6",
-    "model.light.width=8",
+    "material.grid.levels=2",
+    "material.grid.features=2",
+    "material.grid.log2_entries=7",
+    "material.grid.coarsest=3",
+    "material.grid.finest=9",
+    "material.albedo_hidden=[6, 6]",
+    "material.surface_hidden=[6]",
+    "light.height=6",
+    "light.width=8",
     "objective.smoothness_samples=48",
     "objective.background=black",
-    "objective.with_light=true",
+    "stages.split_sum.weights.light=0.15",
+    "stages.split_sum.weights.white_balance=0.002",
+    "stages.split_sum.weights.normal_smoothness=0.03",
 )
-_OUTPUTS = ("total", *TERM_NAMES)
-_CAPACITIES = Capacities(256, 256, 256, 3072, 6144, 1024)
+_CAPACITIES = Capacities(
+    surface_cubes=256, dual_vertices=256, quads=256, visible=3072, hits=6144, chunks=1024
+)
 
 
 def _params(rng: np.random.Generator, grid: Grid, config: Config) -> Params:
@@ -47,8 +51,8 @@ def _params(rng: np.random.Generator, grid: Grid, config: Config) -> Params:
         return lambda leaf: leaf + rng.uniform(-width, width, leaf.shape)
 
     geometry = jax.tree.map(varied(0.3), initial_geometry(grid, jnp.asarray(sdf)))
-    shape = (config.model.light.height, config.model.light.width, 3)
-    material = jax.tree.map(varied(0.5), init_materials(jax.random.key(0), config.model.material))
+    shape = (config.light.height, config.light.width, 3)
+    material = jax.tree.map(varied(0.5), init_materials(jax.random.key(0), config.material))
     return Params(
         geometry=replace(geometry, sdf=jnp.asarray(sdf)),
         material=material,
@@ -96,29 +100,20 @@ def _from_groups(groups: dict[str, Any]) -> Params:
     )
 
 
-def _loss_problem(
-    name: str, model: Model, config: Config, weights: LossWeights, rng: np.random.Generator
-) -> Problem:
+def _loss_problem(name: str, config: Config, rng: np.random.Generator) -> Problem:
     """Vary every group of parameters of the whole loss and of each of its terms."""
-    config = replace(config, model=model)
     corner = np.full(3, 0.6)
-    grid = fit_grid((-corner, corner), config.geometry.resolution)
+    grid = fit_grid((-corner, corner), 6)
     grid = Grid(jnp.asarray(grid.origin), jnp.asarray(grid.cell_size), grid.shape)
+    pipeline = build_pipeline(config, config.stages[0], FlexiCubes(grid))
+    pipeline = replace(pipeline, capacities=_CAPACITIES)
 
-    def function(inputs: dict[str, Any], constants: tuple[Batch, Context]) -> dict[str, Any]:
-        batch, context = constants
-        total, report = loss(
-            _from_groups(inputs),
-            batch,
-            context,
-            weights,
-            model=model,
-            objective=config.objective,
-            capacities=_CAPACITIES,
-        )
+    def function(inputs: dict[str, Any], constants: tuple[Batch, Pipeline]) -> dict[str, Any]:
+        batch, pipeline = constants
+        total, report = pipeline.loss(_from_groups(inputs), batch)
         return {"total": total, **report.terms}
 
-    constants = (_batch(rng), make_context(grid, model))
+    constants = (_batch(rng), pipeline)
     inputs = _groups(_params(rng, grid, config))
     return Problem(name, function, inputs, constants, full=100, vectorized=False)
 
@@ -128,28 +123,28 @@ def loss_problems(rng: np.random.Generator) -> list[Problem]:
 
     As trained, attributes do not pull on positions and the inward shift takes normal and area as
     given, so that the gradient in the geometry, and that of the smoothness term in the shift, is
-    by design not the whole derivative. With ``attribute_gradient`` and no shift it is.
+    by design not the whole derivative. With ``material.position_gradient`` and no shift it is.
     """
-    config = make_config(overrides=_SETTINGS)
-    model = config.model
-    opened = replace(
-        model, attribute_gradient=True, material=replace(model.material, has_shift=False)
+    off = tuple(
+        f"stages.split_sum.weights.smoothness_{name}=0" for name in ("albedo", "roughness_metallic")
     )
-    detached = {(name, group) for name in _OUTPUTS for group in ("sdf", "deform", "weights")}
-    detached |= {("smoothness", "tables"), ("smoothness", "MLPs")}
-    trained = _loss_problem(
-        "loss, as trained", model, config, LossWeights(light=0.15, smoothness=0.0), rng
+    trained = make_config(overrides=(*_SETTINGS, *off))
+    opened = make_config(
+        overrides=(*_SETTINGS, "material.position_gradient=true", "material.has_shift=false")
     )
+    outputs = ("total", *trained.stages[0].weights)
+    detached = {(name, group) for name in outputs for group in ("sdf", "deform", "weights")}
+    problem = _loss_problem("loss, as trained", trained, rng)
     return [
-        replace(trained, skip=frozenset(detached)),
-        _loss_problem("loss, all paths", opened, config, LossWeights(light=0.15), rng),
+        replace(problem, skip=frozenset(detached)),
+        _loss_problem("loss, all paths", opened, rng),
     ]
 
 
 def smoothness_problems(rng: np.random.Generator) -> list[Problem]:
     """Eq. 15-17 in tables, MLPs and points."""
     config = make_config(overrides=_SETTINGS)
-    spec = config.model.material
+    spec = replace(config.material, position_gradient=True)
     params = jax.tree.map(
         lambda leaf: rng.uniform(-1, 1, leaf.shape), init_materials(jax.random.key(0), spec)
     )
@@ -157,17 +152,15 @@ def smoothness_problems(rng: np.random.Generator) -> list[Problem]:
     def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
         dtype = inputs["points"].dtype
         albedo, surface = inputs["MLPs"]
-        term = smoothness(
+        changes = smoothness(
             MaterialField(inputs["tables"], None, albedo, surface),
             inputs["points"],
             jnp.ones(inputs["points"].shape[:1], bool),
             jax.random.key(1),
+            unit_box(dtype),
             spec=spec,
-            center=jnp.zeros((3,), dtype),
-            half_extent=jnp.ones((), dtype),
-            position_gradient=True,
         )
-        return {"smoothness": term}
+        return changes._asdict()
 
     inputs = {
         "tables": params.albedo_table,

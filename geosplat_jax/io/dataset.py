@@ -1,7 +1,7 @@
 """Scenes in memory: one type for every layout, found out by itself and checked on the way in."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -56,6 +56,7 @@ class Dataset:
     train_light : light of the training images, where the layout names lights.
     bounds : lo (3,) and hi (3,), a world box around the object.
     warnings : what looks wrong but does not stop the work.
+    options : how it was read, for `load_recorded`.
     """
 
     name: str
@@ -67,6 +68,7 @@ class Dataset:
     train_light: str | None
     bounds: tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
     warnings: tuple[str, ...] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 def load_dataset(
@@ -131,6 +133,11 @@ def load_dataset(
         train_light=listing.train_light,
         bounds=box,
         warnings=tuple(warnings),
+        options={
+            "downscale": downscale,
+            "light": light,
+            "bounds": None if bounds is None else np.ravel(bounds).tolist(),
+        },
     )
 
 

@@ -22,9 +22,59 @@ MAP_SUFFIXES = (".hdr", ".exr")
 
 _RIGID_TOLERANCE = 1e-3
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-_CENTER_TOLERANCE = 1.0
-"""Pixels that a principal point may lie off the middle of the image."""
+_LENS_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 _FOCAL_TOLERANCE = 0.01
+"""Share by which a focal length may differ from the one that the camera's angle gives."""
+_LONGEST = 1e9
+"""Pixels; no lens is longer, and no image larger."""
+
+
+@dataclass(frozen=True)
+class AngleLens:
+    """A pinhole lens with square pixels and its axis in the middle of the image.
+
+    Attributes
+    ----------
+    angle_x : horizontal field of view in radians.
+    """
+
+    angle_x: float
+
+    def intrinsics(self, width: int, height: int) -> Float[np.ndarray, "3 3"]:
+        """Return the matrix of an image of this size, in its pixels."""
+        focal = 0.5 * width / np.tan(0.5 * self.angle_x)
+        return _matrix(focal, focal, 0.5 * width, 0.5 * height)
+
+
+@dataclass(frozen=True)
+class PinholeLens:
+    """A pinhole lens, given for images of one size.
+
+    Attributes
+    ----------
+    fx, fy : focal lengths in pixels.
+    cx, cy : principal point in pixels; pixel centres lie at integers + 0.5.
+    width, height : size of the image in pixels.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def intrinsics(self, width: int, height: int) -> Float[np.ndarray, "3 3"]:
+        """Return the matrix of the same view as an image of this size, in its pixels."""
+        x, y = width / self.width, height / self.height
+        return _matrix(self.fx * x, self.fy * y, self.cx * x, self.cy * y)
+
+
+Lens = AngleLens | PinholeLens
+
+
+def _matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
@@ -35,7 +85,7 @@ class Frame:
     ----------
     name : unique within its split.
     camera_to_world : (4, 4) rigid, OpenGL/Blender axes.
-    angle_x : horizontal field of view in radians.
+    lens : see `AngleLens` and `PinholeLens`.
     image : colour, with alpha unless there is a ``mask``.
     mask : coverage in channel 0, or None.
     truth : files of the ground truth, by ``albedo | normal | roughness | metallic``.
@@ -44,7 +94,7 @@ class Frame:
 
     name: str
     camera_to_world: Float[np.ndarray, "4 4"]
-    angle_x: float
+    lens: Lens
     image: Path
     mask: Path | None = None
     truth: Mapping[str, Path] = field(default_factory=dict)
@@ -96,18 +146,21 @@ def require(content: Mapping[str, Any], key: str, where: Path | str) -> Any:
     return content[key]
 
 
-def read_transforms(path: Path) -> list[tuple[str, np.ndarray, float]]:
-    """Read a ``transforms_*.json`` of Blender: file path, pose and angle of each frame.
+def read_transforms(path: Path) -> list[tuple[str, np.ndarray, Lens]]:
+    """Read a ``transforms_*.json`` of Blender: file path, pose and lens of each frame.
+
+    Lenses are ``camera_angle_x``, or ``fl_x, fl_y, cx, cy`` in pixels of an image of ``w`` by
+    ``h``, for all frames or for each. Without ``fl_y`` pixels are square, without ``cx`` or ``cy``
+    the axis is in the middle, and without ``fl_x`` the angle gives it.
 
     Raises
     ------
-    MissingFileError, SceneError : not JSON, missing keys, no frames, an unusable pose or angle.
+    MissingFileError, SceneError : not JSON, missing keys, no frames, an unusable pose or lens.
     """
     content = read_json(path)
     frames = require(content, "frames", path)
     if not isinstance(frames, list) or not frames:
         raise SceneError(f"{path} has no frames; 'frames' must be a list with at least one view")
-    shared_angle = content.get("camera_angle_x")
     listed = []
     for number, frame in enumerate(frames):
         where = f"frame {number} of {path}"
@@ -116,36 +169,64 @@ def read_transforms(path: Path) -> list[tuple[str, np.ndarray, float]]:
         file_path = require(frame, "file_path", where)
         if not isinstance(file_path, str) or not file_path:
             raise SceneError(f"'file_path' of {where} must be a name, got {file_path!r}")
-        _require_plain_lens({**content, **frame}, where)
-        angle = frame.get("camera_angle_x", shared_angle)
-        if angle is None:
+        both = {**content, **frame}
+        if "fl_x" not in both and "camera_angle_x" not in both:
             require(content, "camera_angle_x", path)
         pose = checked_pose(require(frame, "transform_matrix", where), where)
-        listed.append((file_path, pose, checked_angle(angle, where)))
+        listed.append((file_path, pose, _checked_lens(both, where)))
     return listed
 
 
-def _require_plain_lens(lens: Mapping[str, Any], where: str) -> None:
-    """Refuse lenses that `Frame` cannot hold: distorted, off centre, or with unequal focals."""
-    bent = [key for key in _DISTORTION if lens.get(key, 0)]
+def _checked_lens(values: Mapping[str, Any], where: str) -> Lens:
+    """Return the lens of a frame.
+
+    Raises
+    ------
+    SceneError : it is distorted, incomplete, contradicts itself, or a value is no lens's.
+    """
+    bent = [key for key in _DISTORTION if values.get(key, 0)]
     if bent:
         raise SceneError(f"{where} has lens distortion ({', '.join(bent)}); undistort the images")
-    for center, size in (("cx", "w"), ("cy", "h")):
-        if center in lens and size in lens:
-            off = float(lens[center]) - 0.5 * float(lens[size])
-            if abs(off) > _CENTER_TOLERANCE:
-                raise SceneError(
-                    f"the principal point of {where} is {off:+.1f} pixels off the centre "
-                    f"({center} = {lens[center]}, {size} = {lens[size]}); crop the images to be "
-                    "centred"
-                )
-    if "fl_x" in lens and "fl_y" in lens:
-        ratio = float(lens["fl_y"]) / float(lens["fl_x"])
-        if abs(ratio - 1.0) > _FOCAL_TOLERANCE:
+    given = {key: _checked_length(values[key], key, where) for key in _LENS_KEYS if key in values}
+    angle = None
+    if "camera_angle_x" in values:
+        angle = checked_angle(values["camera_angle_x"], where)
+    if angle is not None and not given.keys() - {"w", "h"}:
+        return AngleLens(angle)
+    missing = [key for key in ("w", "h") if key not in given]
+    if missing:
+        raise SceneError(
+            f"the lens of {where} has {', '.join(given)} but no {' and no '.join(missing)}; add "
+            "the size of the images that it is in pixels of"
+        )
+    width, height = given["w"], given["h"]
+    if angle is not None:
+        expected = 0.5 * width / math.tan(0.5 * angle)
+        focal = given.setdefault("fl_x", expected)
+        if abs(focal / expected - 1.0) > _FOCAL_TOLERANCE:
             raise SceneError(
-                f"{where} has focal lengths {lens['fl_x']} and {lens['fl_y']}; resample the images "
-                "to square pixels"
+                f"{where} contradicts itself: with w = {width:g}, fl_x is {focal:g}, but "
+                f"camera_angle_x = {angle:g} makes it {expected:g}; remove the wrong one"
             )
+    return PinholeLens(
+        fx=given["fl_x"],
+        fy=given.get("fl_y", given["fl_x"]),
+        cx=given.get("cx", 0.5 * width),
+        cy=given.get("cy", 0.5 * height),
+        width=int(width),
+        height=int(height),
+    )
+
+
+def _checked_length(value: Any, key: str, where: str) -> float:
+    """Return a length of a lens in pixels: finite and positive, and whole if it is a size."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    is_size = key in ("w", "h")
+    # An integer of JSON may be too large for a float, so it is compared and not converted.
+    if not is_number or not 0 < value < _LONGEST or (is_size and value != int(value)):
+        kind = "a positive whole number" if is_size else "a positive number"
+        raise SceneError(f"{key!r} of {where} must be {kind} of pixels, got {value!r}")
+    return float(value)
 
 
 def checked_angle(angle: Any, where: str) -> float:

@@ -5,6 +5,7 @@ axes in float64. Ground truth and relit images are read when first asked for: th
 training never touches them.
 """
 
+import hashlib
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -43,6 +44,7 @@ class Views:
     truth : (V, H, W, C) by ``albedo`` (linear), ``normal`` (unit, world), ``roughness``,
         ``metallic``; zero on the background.
     relight : (V, H, W, 4) linear, by light; read anew each time, since they are large.
+    valid : (V, H, W) float32 pixels that count, 0 or 1; None where all do.
     """
 
     names: tuple[str, ...]
@@ -51,6 +53,7 @@ class Views:
     images: Float[np.ndarray, "V H W 4"]
     truth: Mapping[str, Any] = field(default_factory=dict)
     relight: Mapping[str, Any] = field(default_factory=dict)
+    valid: Float[np.ndarray, "V H W"] | None = None
 
     def __len__(self) -> int:
         """Count the views."""
@@ -76,6 +79,13 @@ class Views:
         """Rigid transforms to OpenCV camera axes, (V, 4, 4) float64."""
         # Right-multiplied: it turns the camera's own axes, not the world's.
         return _rigid_inverse(self.camera_to_world @ _BLENDER_TO_OPENCV)
+
+    def fingerprint(self) -> str:
+        """Return a short text that tells these views from others: names, cameras, size."""
+        digest = hashlib.sha256(repr((self.names, self.height, self.width)).encode())
+        for array in (self.camera_to_world, self.intrinsics):
+            digest.update(np.ascontiguousarray(array, np.float64).tobytes())
+        return digest.hexdigest()[:16]
 
     def camera(self, indices: Sequence[int] | np.ndarray | None = None) -> Camera:
         """Cameras of all or some views for the renderer, float32 and OpenCV axes."""
@@ -122,15 +132,8 @@ def load_views(
         images[index] = read.pixels
 
     _in_parallel(fill, range(len(frames)))
-    # f = W / 2 / tan(angle / 2), the principal point in the middle of the whole image.
-    intrinsics = np.zeros((len(frames), 3, 3))
-    for matrix, frame in zip(intrinsics, frames, strict=True):
-        focal = 0.5 * width / np.tan(0.5 * frame.angle_x) / factor
-        matrix[:] = [
-            [focal, 0.0, 0.5 * width / factor],
-            [0.0, focal, 0.5 * height / factor],
-            [0.0, 0.0, 1.0],
-        ]
+    intrinsics = np.stack([frame.lens.intrinsics(width, height) for frame in frames])
+    intrinsics[:, :2] /= factor
     views = Views(
         names=tuple(frame.name for frame in frames),
         camera_to_world=np.stack([frame.camera_to_world for frame in frames]),

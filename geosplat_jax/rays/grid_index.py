@@ -20,9 +20,8 @@ of a chunk has finished, the others move together and the loop goes on with half
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,8 +29,8 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 
 from geosplat_jax.core.capacity import Capacities, Usage, bit_set, usage
 from geosplat_jax.core.numerics import safe_normalize
-from geosplat_jax.core.types import Grid
-from geosplat_jax.geometry import Surface
+from geosplat_jax.core.types import Grid, Mesh
+from geosplat_jax.rays.base import RayIndex
 
 T_MIN = 1e-3
 """Hits nearer to the start of a ray than this, in cells, are ignored."""
@@ -61,8 +60,28 @@ _PARALLEL = 1e-12
 """Directions with a smaller component do not move along that axis."""
 
 
-class Accelerator(eqx.Module):
-    """What rays need to know of a surface; all lengths in cells of the padded grid.
+@runtime_checkable
+class PatchMesh(Protocol):
+    """A mesh of patches: quads with a centre, of which patch q has the faces 4 q to 4 q + 3."""
+
+    @property
+    def mesh(self) -> Mesh:
+        """Triangles, four a patch: from each side of the quad, in order, to the centre."""
+        ...
+
+    @property
+    def quads(self) -> Int[Array, "Cq 4"]:
+        """Vertex rows of the corners, counter-clockwise seen from outside."""
+        ...
+
+    @property
+    def centers(self) -> Int[Array, " Cq"]:
+        """Vertex rows of the centres."""
+        ...
+
+
+class GridIndex(RayIndex):
+    """An isosurface as rays see it; all lengths in cells of the padded grid.
 
     Attributes
     ----------
@@ -73,7 +92,7 @@ class Accelerator(eqx.Module):
         byte of sine; see `_faces_away`.
     entries : (entry capacity,) patches, cell after cell.
     patches : (quads, 16) corners and centre.
-    usage : true need of `Capacities.cell_patches`. Where it exceeds the capacity, results are
+    usage : true need of the buffer ``cell_patches``. Where it exceeds the capacity, results are
         wrong and must be discarded.
     """
 
@@ -83,6 +102,35 @@ class Accelerator(eqx.Module):
     entries: Int[Array, " E"]
     patches: Float[Array, "Q 16"]
     usage: Usage
+
+    @property
+    def face_capacity(self) -> int:
+        """Rows of faces: four a patch."""
+        return 4 * self.patches.shape[0]
+
+    def occluded(
+        self,
+        origins: Float[Array, "N 3"],
+        directions: Float[Array, "N 3"],
+        source: Int[Array, " N"],
+        mask: Bool[Array, " N"],
+        *,
+        two_sided: bool = False,
+    ) -> Bool[Array, " N"]:
+        """Tell which rays hit the surface anywhere; see `RayIndex.occluded`."""
+        return _occluded(self, origins, directions, source, mask, two_sided=two_sided)
+
+    def nearest(
+        self,
+        origins: Float[Array, "N 3"],
+        directions: Float[Array, "N 3"],
+        source: Int[Array, " N"],
+        mask: Bool[Array, " N"],
+        *,
+        two_sided: bool = False,
+    ) -> tuple[Float[Array, " N"], Int[Array, " N"]]:
+        """Find the first hit of every ray; see `RayIndex.nearest`."""
+        return _nearest(self, origins, directions, source, mask, two_sided=two_sided)
 
 
 class _Lanes(NamedTuple):
@@ -104,12 +152,10 @@ class _Lanes(NamedTuple):
 # --- building -----------------------------------------------------------------------------------
 
 
-def _patches(surface: Surface, grid: Grid) -> Float[Array, "Q 16"]:
+def _patches(surface: PatchMesh, grid: Grid) -> Float[Array, "Q 16"]:
     """Corners and centre of every quad, in cells of the padded grid."""
     vertices = (surface.mesh.vertices - grid.origin[None, :]) / grid.cell_size
-    # The centre is the last vertex of every face of a training surface.
-    centre = surface.mesh.faces[::4, 2]
-    rows = jnp.concatenate([surface.quads, centre[:, None]], axis=1)
+    rows = jnp.concatenate([surface.quads, surface.centers[:, None]], axis=1)
     points = vertices[rows].reshape(rows.shape[0], 15)
     return jnp.pad(points, ((0, 0), (0, 1)))
 
@@ -194,24 +240,24 @@ def _cones(
     return packed[:cell_count]
 
 
-def build_accelerator(surface: Surface, grid: Grid, *, capacities: Capacities) -> Accelerator:
+def build_grid_index(surface: PatchMesh, grid: Grid, *, capacities: Capacities) -> GridIndex:
     """List the patches of every cell; no gradients.
 
     Parameters
     ----------
-    surface : from `isosurface` with ``training=True``, that is, with a centre in every quad.
+    surface : with a centre in every quad, such as from `isosurface` with ``training=True``.
     grid : the grid it was extracted from.
-    capacities : static; `Capacities.cell_patches` is used.
+    capacities : static; ``cell_patches`` is used.
 
     Raises
     ------
     ValueError
         If ``cell_patches`` is more than 8.4 million, which the words cannot count.
     """
-    if capacities.cell_patches > _LARGEST_LIST:
+    if capacities["cell_patches"] > _LARGEST_LIST:
         raise ValueError(
-            f"an accelerator lists at most {_LARGEST_LIST} patches, not "
-            f"{capacities.cell_patches}: lower geometry.resolution or geometry.max_quads"
+            f"a grid index lists at most {_LARGEST_LIST} patches, not "
+            f"{capacities['cell_patches']}: lower geometry.resolution or geometry.max_quads"
         )
     surface, grid = jax.lax.stop_gradient((surface, grid))
     padded = Grid(
@@ -221,11 +267,11 @@ def build_accelerator(surface: Surface, grid: Grid, *, capacities: Capacities) -
     )
     patches = _patches(surface, padded)
     quads, cell_count = patches.shape[0], padded.cube_count
-    is_real = jnp.arange(quads, dtype=jnp.int32) < surface.usage.quads
+    is_real = 4 * jnp.arange(quads, dtype=jnp.int32) < surface.mesh.face_count
     touches, numbers = _touched_cells(patches, is_real, padded)
 
     found = bit_set(touches.reshape(-1))
-    capacity = capacities.cell_patches
+    capacity = capacities["cell_patches"]
     pair = found.first(capacity=capacity)
     is_entry = jnp.arange(capacity, dtype=jnp.int32) < found.count
     cells = jnp.where(is_entry, numbers.reshape(-1)[pair], cell_count)
@@ -237,7 +283,7 @@ def build_accelerator(surface: Surface, grid: Grid, *, capacities: Capacities) -
     first = (jnp.cumsum(count) - count)[:cell_count]
     count = count[:cell_count]
     distance = _distances(count > 0, padded)
-    return Accelerator(
+    return GridIndex(
         grid=padded,
         words=jnp.where(count > 0, first, distance) << _COUNT_BITS | count,
         cones=_cones(patches, entries, cells, cell_count),
@@ -267,20 +313,20 @@ def _faces_away(cone: UInt[Array, " n"], direction: tuple[Array, ...]) -> Bool[A
 
 
 def _enter(
-    lanes: _Lanes, cell: tuple[Array, ...], accelerator: Accelerator, two_sided: bool
+    lanes: _Lanes, cell: tuple[Array, ...], index: GridIndex, two_sided: bool
 ) -> Int[Array, " n"]:
     """Read the word of a cell; one whose patches all face away is as good as empty."""
-    nx, ny, _ = accelerator.grid.shape
+    nx, ny, _ = index.grid.shape
     number = cell[0] + nx * (cell[1] + ny * cell[2])
-    word = accelerator.words.at[number].get(mode="promise_in_bounds")
+    word = index.words.at[number].get(mode="promise_in_bounds")
     if two_sided:
         return word
-    cone = accelerator.cones.at[number].get(mode="promise_in_bounds")
+    cone = index.cones.at[number].get(mode="promise_in_bounds")
     is_idle = (_count(word) > 0) & _faces_away(cone, lanes.direction)
     return jnp.where(is_idle, 1 << _COUNT_BITS, word)
 
 
-def _advance(lanes: _Lanes, accelerator: Accelerator, *, two_sided: bool) -> _Lanes:
+def _advance(lanes: _Lanes, index: GridIndex, *, two_sided: bool) -> _Lanes:
     """Move the rays that are done with their cell to the next one, across empty ones at once."""
     count = _count(lanes.word)
     is_moving = lanes.is_travelling & (lanes.tested >= count)
@@ -299,7 +345,7 @@ def _advance(lanes: _Lanes, accelerator: Accelerator, *, two_sided: bool) -> _La
     is_open = jnp.ones_like(is_moving)
     is_outside = ~jnp.isfinite(exit_distance)
     cells = []
-    for axis, size in enumerate(accelerator.grid.shape):
+    for axis, size in enumerate(index.grid.shape):
         o, d, c = lanes.origin[axis], lanes.direction[axis], lanes.cell[axis]
         at_exit = jnp.floor(o + jnp.where(is_outside, 0.0, exit_distance) * d).astype(jnp.int32)
         at_exit = jnp.clip(at_exit, c - skip + 1, c + skip - 1)
@@ -310,7 +356,7 @@ def _advance(lanes: _Lanes, accelerator: Accelerator, *, two_sided: bool) -> _La
         cells.append(jnp.where(is_moving, jnp.clip(following, 0, size - 1), c))
     # A hit is final once the ray has left the cells that lie before it.
     is_over = is_moving & (is_outside | (lanes.distance <= exit_distance))
-    word = _enter(lanes, tuple(cells), accelerator, two_sided)
+    word = _enter(lanes, tuple(cells), index, two_sided)
     return lanes._replace(
         cell=tuple(cells),
         word=jnp.where(is_moving, word, lanes.word),
@@ -327,7 +373,7 @@ def _dot(a: tuple[Array, ...], b: tuple[Array, ...]) -> Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _test(lanes: _Lanes, accelerator: Accelerator, *, two_sided: bool, any_hit: bool) -> _Lanes:
+def _test(lanes: _Lanes, index: GridIndex, *, two_sided: bool, any_hit: bool) -> _Lanes:
     """Test the next patch of the cell, four triangles at once, by signed volumes.
 
     With corners a, b and centre c relative to the ray's start, the ray passes on the same side of
@@ -335,9 +381,9 @@ def _test(lanes: _Lanes, accelerator: Accelerator, *, two_sided: bool, any_hit: 
     ``d.n`` of the unnormalised normal n, and the distance ``c.(a x b)`` over that sum.
     """
     is_testing = lanes.is_travelling & (lanes.tested < _count(lanes.word))
-    index = jnp.where(is_testing, (lanes.word >> _COUNT_BITS) + lanes.tested, 0)
-    patch = accelerator.entries.at[index].get(mode="promise_in_bounds")
-    rows = accelerator.patches.at[patch].get(mode="promise_in_bounds")
+    entry = jnp.where(is_testing, (lanes.word >> _COUNT_BITS) + lanes.tested, 0)
+    patch = index.entries.at[entry].get(mode="promise_in_bounds")
+    rows = index.patches.at[patch].get(mode="promise_in_bounds")
     points = [
         tuple(rows[:, 3 * i + axis] - lanes.origin[axis] for axis in range(3)) for i in range(5)
     ]
@@ -379,13 +425,13 @@ def _start(
     source: Int[Array, " n"],
     is_active: Bool[Array, " n"],
     *,
-    accelerator: Accelerator,
+    index: GridIndex,
     two_sided: bool,
 ) -> _Lanes:
     """Put rays into their first cell; those that never meet the box are done at once."""
     origin, direction = tuple(origins.T), tuple(directions.T)
     inverse, near, far = [], jnp.zeros_like(origin[0]), jnp.full_like(origin[0], jnp.inf)
-    for o, d, size in zip(origin, direction, accelerator.grid.shape, strict=True):
+    for o, d, size in zip(origin, direction, index.grid.shape, strict=True):
         is_still = jnp.abs(d) < _PARALLEL
         reciprocal = jnp.where(is_still, jnp.inf, 1.0 / jnp.where(is_still, 1.0, d))
         inverse.append(reciprocal)
@@ -398,7 +444,7 @@ def _start(
     entry = jnp.where(meets, near, 0.0)
     cell = tuple(
         jnp.clip(jnp.floor(o + entry * d).astype(jnp.int32), 0, size - 1)
-        for o, d, size in zip(origin, direction, accelerator.grid.shape, strict=True)
+        for o, d, size in zip(origin, direction, index.grid.shape, strict=True)
     )
     count = origins.shape[0]
     lanes = _Lanes(
@@ -414,7 +460,7 @@ def _start(
         distance=jnp.full((count,), jnp.inf, origins.dtype),
         face=jnp.full((count,), -1, jnp.int32),
     )
-    return lanes._replace(word=_enter(lanes, cell, accelerator, two_sided))
+    return lanes._replace(word=_enter(lanes, cell, index, two_sided))
 
 
 def _halve(lanes: _Lanes, nobody: int) -> _Lanes:
@@ -433,14 +479,14 @@ def _halve(lanes: _Lanes, nobody: int) -> _Lanes:
 
 
 def _trace_chunk(
-    accelerator: Accelerator, lanes: _Lanes, *, two_sided: bool, any_hit: bool
+    index: GridIndex, lanes: _Lanes, *, two_sided: bool, any_hit: bool
 ) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
     """Distance in cells and face of the hit of every lane."""
     distance, face = lanes.distance, lanes.face
 
     def step(lanes: _Lanes) -> _Lanes:
-        lanes = _advance(lanes, accelerator, two_sided=two_sided)
-        return _test(lanes, accelerator, two_sided=two_sided, any_hit=any_hit)
+        lanes = _advance(lanes, index, two_sided=two_sided)
+        return _test(lanes, index, two_sided=two_sided, any_hit=any_hit)
 
     for stage in range(_STAGES):
         size = lanes.ray.shape[0]
@@ -459,7 +505,7 @@ def _trace_chunk(
 
 
 def _trace(
-    accelerator: Accelerator,
+    index: GridIndex,
     origins: Float[Array, "N 3"],
     directions: Float[Array, "N 3"],
     source: Int[Array, " N"],
@@ -473,7 +519,7 @@ def _trace(
     strands = _STRANDS if count >= _CHUNK else 1
     chunk = min(_CHUNK, max(256, -(-count // (256 * strands)) * 256))
     rows = -(-max(count, 1) // (chunk * strands)) * strands
-    grid = accelerator.grid
+    grid = index.grid
     local = (origins - grid.origin[None, :]) / grid.cell_size
 
     def chunks(values: Array) -> Array:
@@ -481,8 +527,8 @@ def _trace(
         return jnp.pad(values, widths).reshape(rows, chunk, *values.shape[1:])
 
     def one(parts: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
-        lanes = _start(*parts, accelerator=accelerator, two_sided=two_sided)
-        return _trace_chunk(accelerator, lanes, two_sided=two_sided, any_hit=any_hit)
+        lanes = _start(*parts, index=index, two_sided=two_sided)
+        return _trace_chunk(index, lanes, two_sided=two_sided, any_hit=any_hit)
 
     parts = (chunks(local), chunks(directions), chunks(source), chunks(mask))
     found = [
@@ -497,46 +543,13 @@ def _trace(
 
 
 @partial(jax.jit, static_argnames=("two_sided",))
-def occluded(
-    accelerator: Accelerator,
-    origins: Float[Array, "N 3"],
-    directions: Float[Array, "N 3"],
-    source: Int[Array, " N"],
-    mask: Bool[Array, " N"],
-    *,
-    two_sided: bool = False,
-) -> Bool[Array, " N"]:
-    """Tell which rays hit the surface anywhere.
-
-    Parameters
-    ----------
-    accelerator : from `build_accelerator`.
-    origins, directions : (N, 3) world; directions are unit.
-    source : (N,) face that a ray starts on and never hits; -1 for none.
-    mask : (N,) rays to trace; the others are not occluded, and cost little.
-    two_sided : static; whether back faces count.
-    """
-    arrays = jax.lax.stop_gradient((accelerator, origins, directions))
+def _occluded(index, origins, directions, source, mask, *, two_sided):
+    arrays = jax.lax.stop_gradient((index, origins, directions))
     _, face = _trace(*arrays, source, mask, two_sided=two_sided, any_hit=True)
     return face >= 0
 
 
 @partial(jax.jit, static_argnames=("two_sided",))
-def nearest(
-    accelerator: Accelerator,
-    origins: Float[Array, "N 3"],
-    directions: Float[Array, "N 3"],
-    source: Int[Array, " N"],
-    mask: Bool[Array, " N"],
-    *,
-    two_sided: bool = False,
-) -> tuple[Float[Array, " N"], Int[Array, " N"]]:
-    """Find the first hit of every ray; arguments as for `occluded`.
-
-    Returns
-    -------
-    distance : (N,) world units, infinite where nothing is hit.
-    face : (N,) face of ``surface.mesh``, -1 where nothing is hit.
-    """
-    arrays = jax.lax.stop_gradient((accelerator, origins, directions))
+def _nearest(index, origins, directions, source, mask, *, two_sided):
+    arrays = jax.lax.stop_gradient((index, origins, directions))
     return _trace(*arrays, source, mask, two_sided=two_sided, any_hit=False)

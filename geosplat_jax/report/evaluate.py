@@ -1,4 +1,4 @@
-"""Evaluation of a run on test views: named protocols, figures, and sheets to look at.
+"""Evaluation of a run on test views: named protocols, metrics, and sheets to look at.
 
 Everything here runs on the host around `renderer.Renderer`.
 """
@@ -13,16 +13,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.core.types import EnvLight
-from geosplat_jax.fit.config import Config
 from geosplat_jax.fit.runtime import peak_memory_mb
+from geosplat_jax.fit.train import Trained
 from geosplat_jax.io.images import write_png
 from geosplat_jax.io.meshes import render_mesh_normals
 from geosplat_jax.io.views import Views
-from geosplat_jax.model import Context, Params
 from geosplat_jax.report import protocols
-from geosplat_jax.report.light_metrics import light_figures
+from geosplat_jax.report.light_metrics import light_metrics
 from geosplat_jax.report.metrics import MASK_THRESHOLD, mask_iou, normal_mae_deg
 from geosplat_jax.report.pictures import normals_to_rgb, overview_sheet, shade_mesh_preview
 from geosplat_jax.report.protocols import Protocol
@@ -39,22 +37,22 @@ _PACKAGES = ("jax", "jaxlib", "numpy", "optax", "geosplat_jax")
 _MATERIALS = ("roughness", "metallic")
 
 
-def _view_figures(view: RenderedView, image: np.ndarray, truth_normal: np.ndarray | None) -> dict:
-    """Figures of one view; ``image`` is (H, W, 4) linear with straight alpha.
+def _view_metrics(view: RenderedView, image: np.ndarray, truth_normal: np.ndarray | None) -> dict:
+    """Metrics of one view; ``image`` is (H, W, 4) linear with straight alpha.
 
-    Figures of the mask's pixels are left out where it has none.
+    Metrics of the mask's pixels are left out where it has none.
     """
     mask = image[..., 3]
-    figures = protocols.new_view_figures(view.rgb, view.alpha, image)
-    figures["mask.iou"] = float(mask_iou(view.alpha, mask))
+    metrics = protocols.new_view_metrics(view.rgb, view.alpha, image)
+    metrics["mask.iou"] = float(mask_iou(view.alpha, mask))
     if truth_normal is not None:
         for name in ("masked", "full") if np.any(mask > MASK_THRESHOLD) else ("full",):
-            figures[f"normal.mae_{name}_deg"] = float(
+            metrics[f"normal.mae_{name}_deg"] = float(
                 normal_mae_deg(
                     view.aovs["normal"], truth_normal, mask, view.alpha, full=name == "full"
                 )
             )
-    return figures
+    return metrics
 
 
 class _Rendered(NamedTuple):
@@ -62,13 +60,13 @@ class _Rendered(NamedTuple):
 
     Attributes
     ----------
-    figures : of every view.
+    metrics : of every view.
     alpha : (V, H, W) coverage.
     maps : (V, H, W, c) by name, those of the materials that there is truth to compare with.
     shown : whole views, by index, for the sheets.
     """
 
-    figures: list[dict[str, Any]]
+    metrics: list[dict[str, Any]]
     alpha: np.ndarray
     maps: dict[str, np.ndarray]
     shown: dict[int, RenderedView]
@@ -76,41 +74,41 @@ class _Rendered(NamedTuple):
 
 def _render_all(renderer: Renderer, views: Views, chosen: np.ndarray) -> _Rendered:
     """Render every view once, and keep of it no more than is needed: views may be many."""
-    figures, shown, alpha = [], {}, []
+    metrics, shown, alpha = [], {}, []
     maps = {name: [] for name in ("albedo", *_MATERIALS) if name in views.truth}
     for index, name in enumerate(views.names):
         view = renderer(views.camera(np.array([index])))
         normal = views.truth["normal"][index] if "normal" in views.truth else None
-        figures.append({"view": name, **_view_figures(view, views.images[index], normal)})
+        metrics.append({"view": name, **_view_metrics(view, views.images[index], normal)})
         alpha.append(view.alpha)
         for key, kept in maps.items():
             kept.append(view.aovs[key])
         if index in chosen:
             shown[index] = view
     stacked = {name: np.stack(kept) for name, kept in maps.items()}
-    return _Rendered(figures, np.stack(alpha), stacked, shown)
+    return _Rendered(metrics, np.stack(alpha), stacked, shown)
 
 
-def _material_figures(
+def _material_metrics(
     protocol: Protocol, rendered: _Rendered, views: Views
 ) -> tuple[dict[str, Any], np.ndarray]:
-    """Figures of albedo, roughness and metallic where there is truth, and the albedo's scale."""
+    """Metrics of albedo, roughness and metallic where there is truth, and the albedo's scale."""
     alpha, maps, mask = rendered.alpha, rendered.maps, views.images[..., 3]
-    figures: dict[str, Any] = {}
+    metrics: dict[str, Any] = {}
     scale = np.ones(3)
     if "albedo" in maps:
         truth = views.truth["albedo"] * mask[..., None]
         scale = protocols.albedo_scale(protocol, maps["albedo"], alpha, truth, mask)
-        figures |= protocols.albedo_figures(protocol, maps["albedo"], alpha, truth, mask, scale)
-        figures |= {f"albedo.scale_{c}": float(x) for c, x in zip("rgb", scale, strict=True)}
+        metrics |= protocols.albedo_metrics(protocol, maps["albedo"], alpha, truth, mask, scale)
+        metrics |= {f"albedo.scale_{c}": float(x) for c, x in zip("rgb", scale, strict=True)}
     known = {name: views.truth[name][..., 0] * mask for name in _MATERIALS if name in maps}
     if known:
         found = {name: maps[name][..., 0] for name in known}
-        figures |= protocols.material_figures(found, alpha, known, mask)
-    return figures, scale
+        metrics |= protocols.material_metrics(found, alpha, known, mask)
+    return metrics, scale
 
 
-def _relight_figures(
+def _relight_metrics(
     protocol: Protocol,
     renderer: Renderer,
     views: Views,
@@ -119,11 +117,11 @@ def _relight_figures(
     indirect: str,
     chosen: np.ndarray,
 ) -> tuple[dict[str, float], list[dict[str, np.ndarray]]]:
-    """Figures of the views under every light that has true images and a map, and rows of a sheet.
+    """Metrics of the views under every light that has true images and a map, and rows of a sheet.
 
     One light is in memory at a time, and of its renders only what is compared.
     """
-    figures: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     rows: list[dict[str, np.ndarray]] = [{} for _ in chosen]
     names = sorted(set(views.relight) & set(lights))
     for name in names:
@@ -133,23 +131,20 @@ def _relight_figures(
             view = relit(views.camera(np.array([index])))
             rgb[index], alpha[index] = view.rgb, view.alpha
         images = views.relight[name]
-        found = protocols.relight_figures(protocol, rgb, alpha, images)
-        figures |= {f"relight.{name}.{key}": value for key, value in found.items()}
+        found = protocols.relight_metrics(protocol, rgb, alpha, images)
+        metrics |= {f"relight.{name}.{key}": value for key, value in found.items()}
         for row, index in zip(rows, chosen, strict=True):
             row[name] = render_on_white(rgb[index], alpha[index])
             row[f"true {name}"] = photograph_on_white(images[index])
     if names:
         for key in ("psnr", "ssim", "psnr_masked", "ssim_masked"):
-            values = [figures[f"relight.{name}.{key}"] for name in names]
-            figures[f"relight.mean.{key}"] = float(np.mean(values))
-    return figures, rows if names else []
+            values = [metrics[f"relight.{name}.{key}"] for name in names]
+            metrics[f"relight.mean.{key}"] = float(np.mean(values))
+    return metrics, rows if names else []
 
 
 def evaluate_run(
-    config: Config,
-    params: Params,
-    context: Context,
-    capacities: Capacities,
+    trained: Trained,
     views: Views,
     folder: Path,
     *,
@@ -161,7 +156,7 @@ def evaluate_run(
     relight_indirect: str = "traced",
     sheet_views: int = 5,
 ) -> dict[str, Any]:
-    """Render every test view, write figures and sheets, return the figures.
+    """Render every test view, write metrics and sheets, return the metrics.
 
     Writes ``metrics.json``, ``overview.png`` and, where the scene has the truth of them,
     ``materials.png`` and ``relight.png``. New views are always compared in sRGB on white, as the
@@ -170,10 +165,10 @@ def evaluate_run(
 
     Parameters
     ----------
-    config, params, context, capacities : see `train.load_run`.
-    views : test views; figures need ``truth`` and ``relight`` only where they exist.
+    trained : see `train.load_trained`.
+    views : test views; metrics need ``truth`` and ``relight`` only where they exist.
     folder : receives the files.
-    meta : recorded with the figures (step, scene, training seconds).
+    meta : recorded with the metrics (step, scene, training seconds).
     protocol : one of `protocols.PROTOCOLS`.
     lights : environment maps by the names of ``views.relight``.
     train_light : true light of the training images, to compare the recovered one with.
@@ -183,25 +178,25 @@ def evaluate_run(
     """
     began = time.perf_counter()
     chosen_protocol = protocols.protocol(protocol)
-    renderer = Renderer(config, params, context, capacities, samples=samples)
+    renderer = Renderer.of(trained, samples=samples)
     chosen = np.unique(np.linspace(0, len(views) - 1, sheet_views).round().astype(int))
     rendered = _render_all(renderer, views, chosen)
-    lines = rendered.figures
+    lines = rendered.metrics
     names = dict.fromkeys(key for line in lines for key in line if key != "view")
     mean = {key: float(np.mean([line[key] for line in lines if key in line])) for key in names}
-    materials, scale = _material_figures(chosen_protocol, rendered, views)
-    relights, relit = _relight_figures(
+    materials, scale = _material_metrics(chosen_protocol, rendered, views)
+    relights, relit = _relight_metrics(
         chosen_protocol, renderer, views, lights or {}, scale, relight_indirect, chosen
     )
     no_map = sorted(set(views.relight) - set(lights or {}))
     notes = [protocols.lpips_note(chosen_protocol)]
-    notes += [f"{name}: images but no environment map, so no relit figures" for name in no_map]
+    notes += [f"{name}: images but no environment map, so no relit metrics" for name in no_map]
     mean |= materials | relights
-    radiance = np.asarray(params.light.radiance)
+    radiance = np.asarray(trained.params.light.radiance)
     if train_light is not None:
-        found = light_figures(radiance, np.asarray(train_light.radiance))
+        found = light_metrics(radiance, np.asarray(train_light.radiance))
         mean |= {key: value for key, value in found.items() if isinstance(value, int | float)}
-    figures = {
+    metrics = {
         "protocol": protocol,
         "notes": notes,
         "mean": mean,
@@ -215,17 +210,17 @@ def evaluate_run(
             "python": platform.python_version(),
             **{package: importlib.metadata.version(package) for package in _PACKAGES},
         },
-        "seed": config.run.seed,
-        "config": config.to_dict(),
+        "seed": trained.config.run.seed,
+        "config": trained.config.to_dict(),
         **meta,
     }
-    (folder / "metrics.json").write_text(json.dumps(figures, indent=2) + "\n")
+    (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
     write_png(folder / "overview.png", _overview(renderer, radiance, views, rendered.shown))
     if materials:
         write_png(folder / "materials.png", _materials_sheet(views, rendered.shown, scale))
     if relit:
         write_png(folder / "relight.png", overview_sheet(relit))
-    return figures
+    return metrics
 
 
 def _materials_sheet(
@@ -275,11 +270,9 @@ def _overview(
     return overview_sheet(rows, light=radiance)
 
 
-def preview_image(
-    config: Config, params: Params, context: Context, capacities: Capacities, views: Views
-) -> np.ndarray:
+def preview_image(trained: Trained, views: Views) -> np.ndarray:
     """Put truth, render and normals of the first view side by side, (H, 3 W, 3) sRGB."""
-    view = Renderer(config, params, context, capacities, samples=64)(views.camera(np.array([0])))
+    view = Renderer.of(trained, samples=64)(views.camera(np.array([0])))
     parts = [
         photograph_on_white(views.images[0]),
         render_on_white(view.rgb, view.alpha),

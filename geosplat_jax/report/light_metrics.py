@@ -1,4 +1,4 @@
-"""Figures of a recovered environment light beside the true one, as pure functions on the host."""
+"""Metrics of a recovered environment light beside the true one, as pure functions on the host."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -100,7 +100,7 @@ def _best_turn(
     return float(-int(shifts[best]) * 360.0 / width), float(by_shift[best])
 
 
-def _direction_figures(
+def _direction_metrics(
     recovered: np.ndarray, truth: np.ndarray, weights: np.ndarray
 ) -> dict[str, float | bool]:
     # Luminance as it is would show the sun alone, and one sun is its own mirror image: of ten
@@ -123,7 +123,7 @@ def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.where(b > 0, a / np.where(b > 0, b, 1.0), 1.0)
 
 
-def light_figures(
+def light_metrics(
     recovered: Float[np.ndarray, "..."], truth: Float[np.ndarray, "..."]
 ) -> dict[str, float | bool | tuple[float, ...]]:
     """Compare a recovered environment map with the true one, up to one scale a channel.
@@ -139,7 +139,7 @@ def light_figures(
     Returns
     -------
     ``light.scale`` : factors, by least squares, that take the recovered light to the true one; 1
-        for a black channel. The next two figures are taken after it, those of directions after
+        for a black channel. The next two metrics are taken after it, those of directions after
         equal flux in every channel, which no turn or flip upsets.
     ``light.psnr`` : dB, of x / (1 + x). Radiance has no largest value, and in a linear measure the
         sun alone would count; this curve has the range [0, 1) that a PSNR needs, a logarithm none.
@@ -180,5 +180,5 @@ def light_figures(
         "light.scale": tuple(scale.tolist()),
         "light.psnr": float(psnr_of_mse(float(np.mean(mean(error**2))))),
         "light.correlation": _correlation(np.log1p(fitted), np.log1p(true_bright), weights),
-        **_direction_figures(bright, true_bright, weights),
+        **_direction_metrics(bright, true_bright, weights),
     }

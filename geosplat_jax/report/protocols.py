@@ -1,4 +1,4 @@
-"""Figures of the three evaluation protocols of the field, as pure functions on the host.
+"""Metrics of the three evaluation protocols of the field, as pure functions on the host.
 
 Numbers of papers with different protocols are not comparable, so a protocol is named and is data:
 one row of a table a name (`PROTOCOL`).
@@ -6,7 +6,7 @@ one row of a table a name (`PROTOCOL`).
 Conventions. Maps are NumPy, V views of one size. Predicted *and* true maps are premultiplied by
 their coverage (predicted ``alpha``, true ``mask``), hence zero on the background; the truth of
 `io.views.Views` is straight and is multiplied by the mask first. Only ``image`` of
-`relight_figures` is straight RGBA, as `Views.relight` holds it. Where coverage is partial, the
+`relight_metrics` is straight RGBA, as `Views.relight` holds it. Where coverage is partial, the
 straight colour is clipped to [0, 1], encoded, and then laid over the background: so do the public
 codes with the PNG files of the data sets, and so is truth and prediction treated here.
 
@@ -59,7 +59,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Protocol:
-    """The choices that make the figures of different papers incomparable.
+    """The choices that make the metrics of different papers incomparable.
 
     Attributes
     ----------
@@ -166,7 +166,7 @@ def _require(shape: tuple[int, ...], **maps: np.ndarray | tuple[np.ndarray, int]
         bad = int(np.size(values) - np.count_nonzero(np.isfinite(values)))
         if bad:
             raise ValueError(
-                f"{name} has {bad} values that are not finite; figures of it would mean nothing: "
+                f"{name} has {bad} values that are not finite; metrics of it would mean nothing: "
                 "render again from a sound checkpoint"
             )
 
@@ -294,11 +294,11 @@ def _compare(
         pooled = [float(np.average(values, weights=weights))] if is_pooled else values
         return float(np.mean([float(psnr_of_mse(value)) for value in pooled]))
 
-    figures = {"psnr": decibels(errors, None), "ssim": float(np.mean(similarities))}
+    metrics = {"psnr": decibels(errors, None), "ssim": float(np.mean(similarities))}
     if counts:
-        figures["psnr_masked"] = decibels(masked_errors, counts)
-        figures["ssim_masked"] = float(np.mean(masked_similarities))
-    return figures
+        metrics["psnr_masked"] = decibels(masked_errors, counts)
+        metrics["ssim_masked"] = float(np.mean(masked_similarities))
+    return metrics
 
 
 def _compare_images(
@@ -309,7 +309,7 @@ def _compare_images(
     return _compare(rgb, alpha, image[..., :3], image[..., 3], look=look, is_pooled=False)
 
 
-def new_view_figures(
+def new_view_metrics(
     rgb: Float[np.ndarray, "..."],
     alpha: Float[np.ndarray, "..."],
     image: Float[np.ndarray, "..."],
@@ -331,11 +331,11 @@ def new_view_figures(
     ------
     ValueError : shapes that do not agree, values that are not finite.
     """
-    figures = _compare_images(rgb[None], alpha[None], image[None], NEW_VIEWS)
-    return {f"nvs.{name}": value for name, value in figures.items()}
+    metrics = _compare_images(rgb[None], alpha[None], image[None], NEW_VIEWS)
+    return {f"nvs.{name}": value for name, value in metrics.items()}
 
 
-def albedo_figures(
+def albedo_metrics(
     protocol: Protocol,
     albedo: Float[np.ndarray, "..."],
     alpha: Float[np.ndarray, "..."],
@@ -363,7 +363,7 @@ def albedo_figures(
     _require(alpha.shape, alpha=alpha, mask=mask, albedo=(albedo, 3), truth=(truth, 3))
     _require_object(mask > MASK_THRESHOLD)
     factor = np.asarray(scale, np.float32)
-    figures = _compare(
+    metrics = _compare(
         (view * factor for view in albedo),
         alpha,
         (_straight(t, covered) for t, covered in zip(truth, mask, strict=True)),
@@ -371,10 +371,10 @@ def albedo_figures(
         look=protocol.albedo,
         is_pooled=protocol.albedo_is_pooled,
     )
-    return {f"albedo.{name}": value for name, value in figures.items()}
+    return {f"albedo.{name}": value for name, value in metrics.items()}
 
 
-def material_figures(
+def material_metrics(
     materials: Mapping[str, Float[np.ndarray, "..."]],
     alpha: Float[np.ndarray, "..."],
     truth: Mapping[str, Float[np.ndarray, "..."]],
@@ -390,7 +390,7 @@ def material_figures(
     materials : predicted (V, H, W) by ``roughness`` and ``metallic``, premultiplied by ``alpha``.
     alpha : (V, H, W) predicted coverage.
     truth : (V, H, W) by either name or both, premultiplied by ``mask``; what is missing here is
-        left out of the figures.
+        left out of the metrics.
     mask : (V, H, W) true coverage, fraction or boolean.
 
     Returns
@@ -405,7 +405,7 @@ def material_figures(
     ValueError : shapes that do not agree, values that are not finite, no object in the views, a
         material with a truth but without a prediction.
     """
-    figures = {}
+    metrics = {}
     _require(alpha.shape, alpha=alpha, mask=mask)
     inside = mask > MASK_THRESHOLD
     _require_object(inside)
@@ -418,12 +418,12 @@ def material_figures(
         views = [
             np.mean(x[i], dtype=float) for x, i in zip(squared, inside, strict=True) if i.any()
         ]
-        figures[f"{name}.mse"] = float(np.mean(views))
-        figures[f"{name}.mse_full"] = float(np.mean((predicted - true) ** 2, dtype=float))
-    return figures
+        metrics[f"{name}.mse"] = float(np.mean(views))
+        metrics[f"{name}.mse_full"] = float(np.mean((predicted - true) ** 2, dtype=float))
+    return metrics
 
 
-def relight_figures(
+def relight_metrics(
     protocol: Protocol,
     rgb: Float[np.ndarray, "..."],
     alpha: Float[np.ndarray, "..."],
@@ -448,6 +448,6 @@ def relight_figures(
     ------
     ValueError : shapes that do not agree, values that are not finite, no object in the views.
     """
-    figures = _compare_images(rgb, alpha, image, protocol.relight)
+    metrics = _compare_images(rgb, alpha, image, protocol.relight)
     _require_object(image[..., 3] > MASK_THRESHOLD)
-    return figures
+    return metrics

@@ -26,6 +26,7 @@ few hundred samples."""
 BACKGROUNDS = ("light", "white", "black")
 
 _lookup = jax.jit(lookup)
+_rotate_light = jax.jit(rotate_light)
 
 
 def load_light(path: str | Path, *, largest: int = LARGEST_LIGHT) -> EnvLight:
@@ -166,7 +167,7 @@ def relight_views(
         return picture(relit(camera), camera, light, options.background)
 
     def under_turning_light(angle: float) -> np.ndarray:
-        turned = rotate_light(light, jnp.asarray(about_z(angle), jnp.float32))
+        turned = _rotate_light(light, jnp.asarray(about_z(angle), jnp.float32))
         return picture(relit.under(turned)(first), first, turned, options.background)
 
     movies: list[tuple[str, int, Callable[[float], np.ndarray]]] = [

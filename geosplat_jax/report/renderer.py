@@ -1,11 +1,10 @@
 """Render trained parameters from any camera and under any light, on the host.
 
-Images average many samples: the light that arrives is gathered once a light, in several passes of
+Images average many samples: the light that arrives is gathered once per light, in several passes of
 a size that fits memory, and serves every view.
 """
 
 import copy
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,27 +14,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from geosplat_jax.core import capacity as capacity_module
-from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.capacity import Capacities, Usage
 from geosplat_jax.core.color import tone_map
+from geosplat_jax.core.mesh import vertex_normals
 from geosplat_jax.core.types import Camera, EnvLight, Mesh
-from geosplat_jax.fit.config import Config
-from geosplat_jax.geometry import isosurface, vertex_normals
+from geosplat_jax.fit.train import Trained
 from geosplat_jax.io.images import encode_srgb
-from geosplat_jax.model import Context, Model, Params
-from geosplat_jax.render import (
-    Asset,
-    RenderOutput,
-    grid_center_and_extent,
-    illuminate_asset,
-    reconstruct,
-    render_lit,
-)
-from geosplat_jax.transport.base import Illumination, Transport
-from geosplat_jax.transport.denoise import DenoiseSpec
+from geosplat_jax.pipeline import Pipeline
+from geosplat_jax.render import Asset, Params, RenderOutput
+from geosplat_jax.surface.base import Surface
+from geosplat_jax.transport.base import Illumination
+from geosplat_jax.transport.environment import LightSpec
+from geosplat_jax.transport.monte_carlo import MonteCarloSettings
 
 EVALUATION_AOVS = ("albedo", "roughness", "metallic", "normal")
 DEFAULT_SAMPLES = 128
-"""Rays a splat, over all passes, in images that people look at and figures are made from."""
+"""Rays per splat, over all passes, in images that people look at and metrics are made from."""
 
 _PASS_SAMPLES = 16
 """Samples of each kind in a pass, at most."""
@@ -49,11 +43,15 @@ RELIGHT_BOUNCES = 2
 RELIGHT_KINDS = ("traced", "none", "unshadowed")
 """How blocked directions look under a new light: see `relight_transport`."""
 
-_reconstruct = partial(jax.jit, static_argnames=("model", "capacities", "sampling"))(reconstruct)
-_illuminate = partial(jax.jit, static_argnames=("model",))(illuminate_asset)
-_render_lit = partial(jax.jit, static_argnames=("model", "capacities", "aov_names"))(render_lit)
-_isosurface = partial(jax.jit, static_argnames=("capacities", "training"))(isosurface)
+_reconstruct = jax.jit(Pipeline.reconstruct)
+_illuminate = jax.jit(Pipeline.illuminate)
+_render_lit = partial(jax.jit, static_argnames=("aov_names",))(Pipeline.render_lit)
 _vertex_normals = jax.jit(vertex_normals)
+
+
+@partial(jax.jit, static_argnames=("final",))
+def _extract(pipeline: Pipeline, params: Params, *, final: bool) -> Surface:
+    return pipeline.surface.extract(params.geometry, capacities=pipeline.capacities, final=final)
 
 
 @dataclass(frozen=True)
@@ -72,30 +70,33 @@ class RenderedView:
     aovs: dict[str, np.ndarray]
 
 
-def build_asset(config: Config, params: Params, context: Context, capacities: Capacities) -> Asset:
-    """Run the stages that depend on neither light nor view, growing buffers as needed."""
-    while True:
-        asset = _reconstruct(
-            params, context, model=config.model, capacities=capacities, sampling="face"
-        )
-        if not capacity_module.overflowed(asset.usage, capacities):
-            return asset
-        capacities = capacity_module.grow(capacities, asset.usage)
+def build_asset(pipeline: Pipeline, params: Params) -> Asset:
+    """Run what depends on neither light nor view, growing buffers as needed."""
+
+    def attempt(capacities: Capacities) -> tuple[Asset, Usage]:
+        asset = _reconstruct(replace(pipeline, capacities=capacities), params)
+        return asset, asset.usage
+
+    return capacity_module.retry(attempt, pipeline.capacities)[0]
 
 
-def relight_transport(indirect: str = "traced") -> Transport:
+def relight_transport(indirect: str = "traced") -> MonteCarloSettings:
     """Return the light transport under a light that was never trained on.
 
     What was learned of indirect light does not hold there: blocked directions bring traced light or
     none. Unshadowed, only a splat's own face blocks, as for those who do not trace rays.
+
+    Raises
+    ------
+    ValueError
+        If ``indirect`` is not one of `RELIGHT_KINDS`.
     """
     if indirect not in RELIGHT_KINDS:
         raise ValueError(f"indirect must be one of {RELIGHT_KINDS}, got {indirect!r}")
     is_shadowed = indirect != "unshadowed"
-    return Transport(
-        method="monte_carlo",
+    return MonteCarloSettings(
         occlusion=is_shadowed,
-        indirect=indirect if is_shadowed else "none",
+        indirect=indirect if is_shadowed else "none",  # pyright: ignore[reportArgumentType]
         bounces=RELIGHT_BOUNCES,
     )
 
@@ -105,9 +106,9 @@ class Renderer:
 
     Parameters
     ----------
-    config, params, context, capacities : see `train.load_run`.
-    samples : rays a splat for the diffuse light, half of them towards the light and half after the
-        cosine, where the model traces any; rounded up to equal passes of at most 32, see
+    pipeline, params : see `train.load_trained`.
+    samples : rays per splat for the diffuse light, half of them towards the light and half after
+        the cosine, where the transport traces any; rounded up to equal passes of at most 32, see
         `samples`. The noise falls as the square root. The specular lobe, which every view
         integrates anew, has half as many of its own, from four passes at most, and the splats of
         a pixel average it further.
@@ -116,44 +117,41 @@ class Renderer:
 
     def __init__(
         self,
-        config: Config,
+        pipeline: Pipeline,
         params: Params,
-        context: Context,
-        capacities: Capacities,
         *,
         samples: int = DEFAULT_SAMPLES,
         seed: int = 0,
     ) -> None:
         if samples < 1:
-            raise ValueError(f"an image needs at least 1 sample a splat, got {samples}")
-        self._config = config
+            raise ValueError(f"an image needs at least 1 sample per splat, got {samples}")
+        self._trained = pipeline
         self._params = params
-        self._context = context
-        self._capacities = capacities
         self._key = jax.random.key(seed)
         self._passes = -(-samples // (2 * _PASS_SAMPLES))
         self._pass_samples = -(-samples // (2 * self._passes))
         self._light = params.light
         self._log_exposure = params.log_exposure
         self._albedo_scale = np.ones(3, np.float32)
-        self._model = self._for_images(config.model)
+        self._pipeline = self._for_images(pipeline)
         self._asset: Asset | None = None
         self._illuminations: list[Illumination] = []
 
+    @classmethod
+    def of(cls, trained: Trained, *, samples: int = DEFAULT_SAMPLES) -> "Renderer":
+        """Return a renderer of a run's parameters as they were trained."""
+        return cls(trained.pipeline, trained.params, samples=samples)
+
     @property
     def samples(self) -> int:
-        """Rays a splat that are traced for the diffuse light, over all passes."""
+        """Rays per splat that are traced for the diffuse light, over all passes."""
         return 2 * self._passes * self._pass_samples
 
-    def _for_images(self, model: Model) -> Model:
-        """Return the model with the samples of one pass, and without shortcuts of training."""
-        if model.transport.method == "split_sum":
-            return model
-        counts = dict.fromkeys(("light", "diffuse", "specular"), self._pass_samples)
-        transport = replace(
-            model.transport, shares_views=True, denoise=DenoiseSpec(iterations=0), **counts
-        )
-        return replace(model, transport=transport)
+    def _for_images(self, pipeline: Pipeline) -> Pipeline:
+        """Return the pipeline with the samples of one pass, and without shortcuts of training."""
+        # The weights of the loss do not matter here; without them programs are shared.
+        transport = pipeline.transport.for_images(self._pass_samples)
+        return replace(pipeline, transport=transport, weights={})
 
     def relit(
         self,
@@ -172,18 +170,17 @@ class Renderer:
         albedo_scale : (3,) factors of the albedo, which photographs leave open.
         indirect : one of `RELIGHT_KINDS`.
         """
+        transport = relight_transport(indirect).build(LightSpec())  # keeps no table of a light
+        material = replace(self._params.material, indirect_head=None)
         other = Renderer(
-            self._config, self._params, self._context, self._capacities, samples=self.samples
+            replace(self._trained, transport=transport),
+            replace(self._params, material=material),
+            samples=self.samples,
         )
         other._key = self._key
         other._light = light
         other._log_exposure = jnp.zeros(())
         other._albedo_scale = np.asarray(albedo_scale, np.float32)
-        material = replace(self._config.model.material, indirect_outputs=0)
-        transport = relight_transport(indirect)
-        other._model = self._for_images(
-            replace(self._config.model, transport=transport, material=material, baked_diffuse=False)
-        )
         return other
 
     def under(self, light: EnvLight) -> "Renderer":
@@ -194,58 +191,51 @@ class Renderer:
         return other
 
     def center(self) -> np.ndarray:
-        """Centre of the grid's box in the world, (3,) float64."""
-        center, _ = grid_center_and_extent(self._context.grid)
-        return np.asarray(center, np.float64)
+        """Centre of the box around the object in the world, (3,) float64."""
+        return np.asarray(self._pipeline.surface.box.center, np.float64)
 
     def asset(self) -> Asset:
         """Build surface and splats, once."""
         if self._asset is None:
-            config = replace(self._config, model=self._model)
-            asset = build_asset(config, self._params, self._context, self._capacities)
-            albedo = asset.materials.albedo * self._albedo_scale[None, :]
-            self._asset = replace(asset, materials=replace(asset.materials, albedo=albedo))
+            asset = build_asset(self._pipeline, self._params)
+            materials = asset.attributes.materials
+            materials = replace(materials, albedo=materials.albedo * self._albedo_scale[None, :])
+            self._asset = replace(asset, attributes=replace(asset.attributes, materials=materials))
         return self._asset
 
     def _illuminated(self) -> list[Illumination]:
         """Gather the light, once: the mean of all passes, with the light's samples of a few."""
         if self._illuminations:
             return self._illuminations
-        passes = 1 if self._model.transport.method == "split_sum" else self._passes
-        total, kept = None, []
+        passes = self._passes if self._pipeline.transport.needs_key else 1
+        total, first = None, []
         for number in range(passes):
-            found = _illuminate(
-                self.asset(),
-                self._light,
-                self._context,
-                model=self._model,
-                key=jax.random.fold_in(self._key, number),
-            )
-            total = found if total is None else _added(total, found)
+            key = jax.random.fold_in(self._key, number)
+            prepared, _ = _illuminate(self._pipeline, self.asset(), self._light, key=key)
+            parts = prepared.averaged_parts()
+            total = parts if total is None else jax.tree.map(jnp.add, total, parts)
             if number < _SPECULAR_PASSES:
-                kept.append(found)
-        assert total is not None
-        mean = _averaged_parts(_scaled(total, 1.0 / passes))
-        self._illuminations = [_with_parts(one, mean) for one in kept]
+                first.append(prepared)
+        mean = jax.tree.map(lambda x: x * (1.0 / passes), total)
+        self._illuminations = [prepared.with_parts(mean) for prepared in first]
         return self._illuminations
 
     def _render(self, camera: Camera, illumination: Illumination, number: int) -> RenderOutput:
         """Render one pass of a view, growing buffers as needed."""
-        while True:
+        key = jax.random.fold_in(self._key, self._passes + number)
+
+        def attempt(capacities: Capacities) -> tuple[RenderOutput, Usage]:
+            pipeline = replace(self._pipeline, capacities=capacities)
             output = _render_lit(
-                self.asset(),
-                illumination,
-                camera,
-                self._context,
-                model=self._model,
-                capacities=self._capacities,
-                aov_names=EVALUATION_AOVS,
-                key=jax.random.fold_in(self._key, self._passes + number),
+                pipeline, self.asset(), illumination, camera, aov_names=EVALUATION_AOVS, key=key
             )
-            view_needs = _without_surface(output.usage)
-            if not capacity_module.overflowed(view_needs, self._capacities):
-                return output
-            self._capacities = capacity_module.grow(self._capacities, view_needs)
+            # The surface's needs are those of an asset that is whole.
+            names = set(output.usage) - set(self.asset().usage)
+            return output, {name: output.usage[name] for name in names}
+
+        output, capacities = capacity_module.retry(attempt, self._pipeline.capacities)
+        self._pipeline = replace(self._pipeline, capacities=capacities)
+        return output
 
     def __call__(self, camera: Camera) -> RenderedView:
         """Render the single view of ``camera``, with every AOV of the evaluation."""
@@ -263,58 +253,17 @@ class Renderer:
         )
 
     def mesh(self, *, training: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Extract the surface: vertices (n, 3), faces (m, 3) and vertex normals (n, 3)."""
-        while True:
-            surface = _isosurface(
-                self._params.geometry,
-                self._context.grid,
-                capacities=self._capacities,
-                training=training,
-            )
-            if not capacity_module.overflowed(surface.usage, self._capacities):
-                break
-            self._capacities = capacity_module.grow(self._capacities, surface.usage)
-        return trim_mesh(surface.mesh)
+        """Extract the surface: vertices (n, 3), faces (m, 3) and vertex normals (n, 3).
 
+        ``training`` : the mesh that splats sit on, instead of the one that is exported.
+        """
 
-def _without_surface(usage: capacity_module.Usage) -> capacity_module.Usage:
-    """Needs of the view alone: `build_asset` has seen to the surface's."""
-    zero = jnp.zeros((), jnp.int32)
-    names = ("surface_cubes", "dual_vertices", "quads", "cell_patches")
-    return dataclasses.replace(usage, **dict.fromkeys(names, zero))
+        def attempt(capacities: Capacities) -> tuple[Surface, Usage]:
+            pipeline = replace(self._pipeline, capacities=capacities)
+            surface = _extract(pipeline, self._params, final=not training)
+            return surface, surface.usage
 
-
-def _averaged_parts(illumination: Illumination) -> tuple:
-    """Return what passes are averaged in: diffuse light, and traced indirect light."""
-    gathered, indirect = illumination.gathered, illumination.indirect
-    traced = indirect is not None and indirect.kind == "traced"
-    return (
-        None if gathered is None else gathered.diffuse_light,
-        indirect.values if traced and indirect is not None else None,
-    )
-
-
-def _with_parts(illumination: Illumination, parts: tuple) -> Illumination:
-    """Put averaged parts back."""
-    diffuse_light, values = parts
-    gathered, indirect = illumination.gathered, illumination.indirect
-    if gathered is not None and diffuse_light is not None:
-        gathered = replace(gathered, diffuse_light=diffuse_light)
-    if indirect is not None and values is not None:
-        indirect = replace(indirect, values=values)
-    return replace(illumination, gathered=gathered, indirect=indirect)
-
-
-def _added(first: Illumination, second: Illumination) -> Illumination:
-    """Sum what is averaged; the samples of the light are those of the first."""
-    parts = jax.tree.map(jnp.add, _averaged_parts(first), _averaged_parts(second))
-    return _with_parts(first, parts)
-
-
-def _scaled(illumination: Illumination, factor: float) -> Illumination:
-    """Multiply what is averaged."""
-    parts = jax.tree.map(lambda x: x * factor, _averaged_parts(illumination))
-    return _with_parts(illumination, parts)
+        return trim_mesh(capacity_module.retry(attempt, self._pipeline.capacities)[0].mesh)
 
 
 def trim_mesh(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -22,7 +22,7 @@ _FIELD_OF_VIEW_MARGIN = 0.3
 """The Jacobian is taken at most this share of the half field of view outside the image."""
 
 
-class Splats(eqx.Module):
+class Footprints(eqx.Module):
     """Screen-space footprints of N Gaussians in one view.
 
     Attributes
@@ -88,7 +88,7 @@ def project(
     height: int,
     width: int,
     near: Float[Array, ""] | float = 0.01,
-) -> Splats:
+) -> Footprints:
     """Project Gaussians to the image of one pinhole camera with OpenCV axes.
 
     Differentiable in ``means``, ``quats``, ``scales`` and both camera matrices. The Jacobian's
@@ -131,7 +131,7 @@ def project(
     blur = LOW_PASS_VARIANCE * (sharp_xx + sharp_yy) + LOW_PASS_VARIANCE**2
     inverse_determinant = 1.0 / (sharp_determinant + blur)
     xx, yy = sharp_xx + LOW_PASS_VARIANCE, sharp_yy + LOW_PASS_VARIANCE
-    return Splats(
+    return Footprints(
         means2d=means2d,
         covariances2d=jnp.stack([xx, xy, yy], axis=-1),
         conics=jnp.stack([yy, -xy, xx], axis=-1) * inverse_determinant[:, None],

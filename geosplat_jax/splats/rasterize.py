@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from geosplat_jax.core.capacity import Capacities, Usage
 from geosplat_jax.core.numerics import safe_log
 from geosplat_jax.splats.composite import MAX_ALPHA, composite_tiles
-from geosplat_jax.splats.projection import Splats, project
+from geosplat_jax.splats.projection import Footprints, project
 from geosplat_jax.splats.tiles import MIN_ALPHA, TileLists, find_visible, gather_visible, tile_grid
 
 __all__ = [
@@ -47,7 +47,7 @@ def _tiles_to_image(
 
 
 def composite(
-    splats: Splats,
+    splats: Footprints,
     opacities: Float[Array, " M"],
     features: Float[Array, "M C"],
     lists: TileLists,
@@ -94,7 +94,7 @@ def composite(
 
 
 def _reference_composite(
-    splats: Splats,
+    splats: Footprints,
     opacities: Float[Array, " M"],
     features: Float[Array, "M C"],
     *,

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped, UInt
 
 from geosplat_jax.core.capacity import Capacities, Usage, compact, usage
 from geosplat_jax.core.numerics import safe_log, safe_sqrt
-from geosplat_jax.splats.projection import Splats
+from geosplat_jax.splats.projection import Footprints
 
 MIN_ALPHA = 1.0 / 255.0
 """A Gaussian leaves no trace in a pixel where its alpha is below this."""
@@ -100,7 +100,7 @@ def _depth_order(depths: Float[Array, " n"]) -> Int[Array, " n"]:
 
 
 def _pixel_bounds(
-    splats: Splats, opacities: Float[Array, " N"], height: int, width: int
+    splats: Footprints, opacities: Float[Array, " N"], height: int, width: int
 ) -> tuple[Int[Array, "N 2"], Int[Array, "N 2"]]:
     """First and last pixel (x, y) whose centre may see alpha >= 1/255, clipped to the image.
 
@@ -174,7 +174,7 @@ def _chunk_lists(
 
 
 def find_visible(
-    splats: Splats,
+    splats: Footprints,
     opacities: Float[Array, " N"],
     is_eligible: Bool[Array, " N"],
     *,
@@ -203,28 +203,28 @@ def find_visible(
     is_bright = opacities * splats.compensation >= MIN_ALPHA
     is_touching = jnp.all(first <= last, axis=-1)
     is_visible = is_eligible & splats.is_in_front & is_bright & is_touching
-    found, visible_count = compact(is_visible, capacity=capacities.visible)
+    found, visible_count = compact(is_visible, capacity=capacities["visible"])
 
     depths = gather_visible(found, splats.depths, padding=float("inf"))
     index = found[_depth_order(depths)]
     bounds = jnp.concatenate([first, last], axis=-1) // tile_size
     low, high = jnp.split(gather_visible(index, bounds), 2, axis=-1)
-    is_row = jnp.arange(capacities.visible, dtype=jnp.int32) < visible_count
+    is_row = jnp.arange(capacities["visible"], dtype=jnp.int32) < visible_count
     size = jnp.where(is_row[:, None], high - low + 1, 0)
 
     counts = size[:, 0] * size[:, 1]
     starts = jnp.cumsum(counts, dtype=jnp.int32) - counts
     hit_count = _saturating_sum(counts)
-    ranks = _runs(starts, counts, capacities.hits)
-    hit = jnp.arange(capacities.hits, dtype=jnp.int32)
+    ranks = _runs(starts, counts, capacities["hits"])
+    hit = jnp.arange(capacities["hits"], dtype=jnp.int32)
     rows_of_hits = jnp.stack([starts, low[:, 0], low[:, 1], size[:, 0]], axis=-1)[ranks]
     within, hit_columns = hit - rows_of_hits[:, 0], jnp.maximum(rows_of_hits[:, 3], 1)
     tile_y = rows_of_hits[:, 2] + within // hit_columns
     tile_x = rows_of_hits[:, 1] + within % hit_columns
     tiles = jnp.where(hit < hit_count, tile_y * columns + tile_x, rows * columns)
-    tiles, ranks = _sort_hits(tiles, ranks, rows * columns, capacities.visible)
+    tiles, ranks = _sort_hits(tiles, ranks, rows * columns, capacities["visible"])
     chunk_ranks, chunk_tiles, chunk_count = _chunk_lists(
-        tiles, ranks, rows * columns, capacities.visible, capacities.chunks
+        tiles, ranks, rows * columns, capacities["visible"], capacities["chunks"]
     )
     needed = usage(visible=visible_count, hits=hit_count, chunks=chunk_count)
     return TileLists(index=index, chunk_ranks=chunk_ranks, chunk_tiles=chunk_tiles, usage=needed)

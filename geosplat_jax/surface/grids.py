@@ -21,8 +21,8 @@ def grid_vertices(grid: Grid) -> Float[Array, "G 3"]:
 
 
 def deformed_vertices(geometry: Geometry, grid: Grid) -> Float[Array, "G 3"]:
-    """Positions of the grid vertices, each moved by at most half a cell along every axis."""
-    return grid_vertices(grid) + grid.cell_size * 0.5 * jnp.tanh(geometry.deform)
+    """Positions of the grid vertices, each moved by at most ``grid.reach`` cells along an axis."""
+    return grid_vertices(grid) + grid.cell_size * grid.reach * jnp.tanh(geometry.deform)
 
 
 def initial_geometry(grid: Grid, sdf: Float[Array, " G"]) -> Geometry:
@@ -79,7 +79,7 @@ def resample(geometry: Geometry, grid: Grid, new_grid: Grid) -> Geometry:
     plus the distance to it is used, so that a surface that is closed stays closed.
     """
     world = (grid_vertices(new_grid) - grid.origin[None, :]) / grid.cell_size
-    moves = 0.5 * jnp.tanh(geometry.deform)
+    moves = grid.reach * jnp.tanh(geometry.deform)
     rest = world
     for _ in range(3):
         rest = world - _interpolate(moves, grid, rest)
@@ -121,10 +121,10 @@ def sdf_entropy(
 
 
 def weight_magnitude(geometry: Geometry) -> Float[Array, ""]:
-    """Mean magnitude of all raw alpha, beta and gamma weights.
+    """Mean magnitude of all raw alpha and beta weights; gamma is free (FlexiCubes).
 
     Its minimum, where its gradient is zero, is plain dual cubes, from which training starts.
     """
-    weights = (geometry.alpha, geometry.beta, geometry.gamma)
+    weights = (geometry.alpha, geometry.beta)
     total = jnp.sum(jnp.stack([jnp.sum(absolute(weight)) for weight in weights]))
     return total / sum(weight.size for weight in weights)

@@ -1,6 +1,6 @@
 """The reflectance model of the method: GGX specular over a Lambertian base.
 
-``f_r = a (1 - m) / pi + D G F / (4 (n.wi)(n.wo))`` (REFERENCE 2.5) with the GGX distribution at
+``f_r = a (1 - m) / pi + D G F / (4 (n.wi)(n.wo))`` with the GGX distribution at
 ``alpha = roughness**2``, height-correlated Smith masking and Schlick's Fresnel. Directions are
 unit, in the world, and point away from the surface: ``wi`` towards the light, ``wo`` towards the
 viewer. Pure functions on rows; a row is one surface point with one pair of directions.
@@ -23,7 +23,7 @@ from geosplat_jax.core.rotation import frame_from_normal
 from geosplat_jax.core.types import Materials
 
 ROUGHNESS_FLOOR = 0.08
-"""Smallest roughness the distribution is evaluated at (REFERENCE 2.5, the floor of the kernel)."""
+"""Smallest roughness that the distribution is evaluated at, as in the authors' kernel."""
 
 DIELECTRIC_F0 = 0.04
 """Normal reflectance of a non-metal: refractive index 1.5."""

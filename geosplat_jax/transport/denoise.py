@@ -13,13 +13,15 @@ itself.
 """
 
 import math
-from dataclasses import dataclass
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
+from pydantic import Field
 
 from geosplat_jax.core.numerics import safe_divide, safe_log, safe_normalize
+from geosplat_jax.core.settings import settings
 
 _B3 = (3 / 8, 1 / 4, 1 / 16)
 """The B3 spline at distances 0, 1 and 2 (Dammertz et al. 2010, section 2)."""
@@ -33,46 +35,27 @@ _SMALLEST_SIGMA, _LARGEST_SHARPNESS = 1e-4, 1e6
 _HALF_OF_TAPS = tuple((dy, dx) for dy in range(3) for dx in range(-2, 3) if dy > 0 or dx > 0)
 
 
-@dataclass(frozen=True)
+_Sigma = Annotated[float, Field(ge=_SMALLEST_SIGMA, allow_inf_nan=True)]
+
+
+@settings
 class DenoiseSpec:
-    """Static settings of the filter; hashable.
+    """Static settings of the filter; hashable."""
 
-    Attributes
-    ----------
-    iterations : filter passes, 0 to 8; pass ``k`` reaches ``2 * 2^k`` pixels. 0 is the identity. On
-        a flat surface the variance of white noise falls to 0.075 after one pass, 0.015 after two,
-        0.0036 after three.
-    normal_sharpness : weights fall by ``exp(-sharpness * (1 - cos))`` with the angle between unit
-        normals, close to the power ``cos^sharpness``; 0 ignores normals. At 64 the weight is 0.37
-        at 10 degrees and 2e-4 at 30.
-    depth_sigma : distance of a neighbouring pixel from the surface's tangent plane where the weight
-        is 0.37, in widths of a pixel on the surface; it grows with the square root of the pixels
-        between. The unit of length does not enter. Infinity ignores depth.
-    albedo_sigma : distance of linear RGB albedos where the weight is 0.37; infinity ignores albedo.
-    """
-
-    iterations: int = 2
-    normal_sharpness: float = 64.0
-    depth_sigma: float = 1.0
-    albedo_sigma: float = 0.1
-
-    def __post_init__(self) -> None:
-        """Validate every field."""
-        if not 0 <= self.iterations <= _MAX_ITERATIONS:
-            raise ValueError(
-                f"denoise.iterations must lie in 0 to {_MAX_ITERATIONS}, got {self.iterations}"
-            )
-        if not 0 <= self.normal_sharpness <= _LARGEST_SHARPNESS:
-            raise ValueError(
-                f"denoise.normal_sharpness must lie in 0 to {_LARGEST_SHARPNESS:g}, got "
-                f"{self.normal_sharpness}"
-            )
-        for name in ("depth_sigma", "albedo_sigma"):
-            if not getattr(self, name) >= _SMALLEST_SIGMA:
-                raise ValueError(
-                    f"denoise.{name} must be at least {_SMALLEST_SIGMA:g}, got "
-                    f"{getattr(self, name)}"
-                )
+    iterations: Annotated[int, Field(ge=0, le=_MAX_ITERATIONS)] = 2
+    """Filter passes; pass ``k`` reaches ``2 * 2^k`` pixels. 0 is the identity. On a flat surface
+    the variance of white noise falls to 0.075 after one pass, 0.015 after two, 0.0036 after
+    three."""
+    normal_sharpness: Annotated[float, Field(ge=0, le=_LARGEST_SHARPNESS)] = 64.0
+    """Weights fall by ``exp(-sharpness * (1 - cos))`` with the angle between unit normals, close to
+    the power ``cos^sharpness``; 0 ignores normals. At 64 the weight is 0.37 at 10 degrees and 2e-4
+    at 30."""
+    depth_sigma: _Sigma = 1.0
+    """Distance of a neighbouring pixel from the surface's tangent plane where the weight is 0.37,
+    in widths of a pixel on the surface; it grows with the square root of the pixels between. The
+    unit of length does not enter. Infinity ignores depth."""
+    albedo_sigma: _Sigma = 0.1
+    """Distance of linear RGB albedos where the weight is 0.37; infinity ignores albedo."""
 
 
 def _shifted(maps: Float[Array, "... H W"], dy: int, dx: int) -> Float[Array, "... H W"]:

@@ -22,41 +22,40 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from geosplat_jax.core.numerics import fast_arctan2, safe_sqrt
+from geosplat_jax.core.settings import PositiveCount, settings
 from geosplat_jax.core.types import EnvLight
 
 POLE_EPSILON = 1e-3
 """Sine of the polar angle below which the gradient of the azimuth stops growing (0.06 degrees)."""
 
 
-@dataclass(frozen=True)
+@settings
 class LightSpec:
     """Static description of a learnable light and of its prefiltered levels; hashable.
-
-    Attributes
-    ----------
-    height, width : texels of the environment map; one row is a light without elevation.
-    roughness : increasing perceptual roughness of the levels (GGX alpha is its square). A first
-        level 0 is the map itself. The last must be 1, whose lobe is exactly the clamped cosine
-        and therefore doubles as the diffuse level. Blending halfway between the default levels
-        errs by about 1 % (relative L2) above .08 for a noise map and 10 % for one
-        single-texel sun; more levels cost little.
 
     Raises
     ------
     ValueError
-        If the width is odd, a size is not positive, or the roughness levels are not increasing
-        from at least 0 to exactly 1.
+        If the width is odd, or the roughness levels are not increasing from at least 0 to exactly
+        1.
     """
 
-    height: int = 64
-    width: int = 128
+    height: PositiveCount = 64
+    """Rows of the environment map; one row is a light without elevation."""
+    width: PositiveCount = 128
+    """Columns of the environment map, an even number."""
     roughness: tuple[float, ...] = (0.0, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45, 0.6, 0.8, 1.0)
+    """Increasing perceptual roughness of the levels (GGX alpha is its square). A first level 0 is
+    the map itself. The last must be 1, whose lobe is exactly the clamped cosine and therefore
+    doubles as the diffuse level. Blending halfway between the default levels errs by about 1 %
+    (relative L2) above .08 for a noise map and 10 % for one single-texel sun; more levels cost
+    little."""
 
     def __post_init__(self):
-        if self.height < 1 or self.width < 2 or self.width % 2:
+        if self.width % 2:
             raise ValueError(
-                f"a light map needs at least 1 row and an even width, got "
-                f"{self.height} x {self.width}; use e.g. 64 x 128"
+                f"a light map needs an even width, got {self.height} x {self.width}; use e.g. "
+                "64 x 128"
             )
         levels = self.roughness
         increasing = all(a < b for a, b in zip(levels, levels[1:], strict=False))

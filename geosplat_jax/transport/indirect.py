@@ -1,52 +1,33 @@
 """Light that arrives from directions in which the surface itself is in the way.
 
-Four models (REFERENCE 2.5), by name:
+Each model is a class:
 
-- ``"none"``: blocked directions are black.
-- ``"constant"``: two learned radiances a point, one for each lobe (the authors' code).
-- ``"harmonics"``: a learned radiance that varies with the direction, by spherical harmonics of
+- `NoIndirect`: blocked directions are black.
+- `ConstantIndirect`: two learned radiances per point, one for each lobe (the authors' code).
+- `HarmonicIndirect`: a learned radiance that varies with the direction, by spherical harmonics of
   degree 2 (the paper).
-- ``"traced"``: what the point that is hit sends out. It learns nothing and holds under any light.
+- `TracedIndirect`: what the point that is hit sends out. It learns nothing and holds under any
+  light.
 
 Learned values are logits; ``sigmoid(x - 3)`` gives them the range of a radiance that starts small.
 """
+
+import abc
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from geosplat_jax.core.types import Materials
+from geosplat_jax.core.numerics import safe_divide
+from geosplat_jax.core.types import Materials, SurfacePoints
 from geosplat_jax.transport.bsdf import specular_f0
-
-INDIRECT_KINDS = ("none", "constant", "harmonics", "traced")
-COEFFICIENTS: dict[str, int] = {"none": 0, "constant": 6, "harmonics": 27, "traced": 0}
-"""Learned numbers a point, by kind."""
 
 _OFFSET = 3.0
 
-
-class Indirect(eqx.Module):
-    """Indirect light of N points, or of F faces.
-
-    Attributes
-    ----------
-    values : by kind, ``"constant"``: (N, 6) logits of the diffuse lobe's radiance and of the
-        specular lobe's; ``"harmonics"``: (N, 27) coefficients, colour by colour; ``"traced"``:
-        (F, 3) radiance that each face sends out; ``"none"``: None.
-    kind : static, one of `INDIRECT_KINDS`.
-    """
-
-    values: Float[Array, "N c"] | None
-    kind: str = eqx.field(static=True)
-
-    @property
-    def belongs_to_points(self) -> bool:
-        """Whether a row of the values is a point."""
-        return self.kind in ("constant", "harmonics")
-
-
-NO_INDIRECT = Indirect(None, "none")
+Lobes = tuple[Float[Array, "N 3"], Float[Array, "N 3"]]
+"""Radiance for the diffuse lobe and for the specular one."""
 
 
 def harmonics(directions: Float[Array, "N 3"]) -> Float[Array, "N 9"]:
@@ -66,49 +47,122 @@ def harmonics(directions: Float[Array, "N 3"]) -> Float[Array, "N 9"]:
     return jnp.stack(values, axis=-1)
 
 
-def incoming(
-    indirect: Indirect, directions: Float[Array, "N 3"], hits: Int[Array, " N"]
-) -> tuple[Float[Array, "N 3"], Float[Array, "N 3"]]:
-    """Radiance that N blocked rays bring, for the diffuse lobe and for the specular one.
+class Indirect(eqx.Module):
+    """A model of indirect light.
 
-    Parameters
+    Attributes
     ----------
-    indirect : with a row for each ray, or, when traced, for each face.
-    directions : (N, 3) unit, away from the point.
-    hits : (N,) face that each ray hits; negative where that is not known, which is black when
-        traced.
-
-    Returns
-    -------
-    diffuse, specular : (N, 3) each. Differentiable in the values only.
+    outputs : learned numbers per point.
+    values : what it knows, or None.
     """
-    values = indirect.values
-    if values is None:
+
+    outputs: ClassVar[int] = 0
+    values: Any
+
+    @property
+    def belongs_to_points(self) -> bool:
+        """Whether a row of the values is a point."""
+        return self.outputs > 0
+
+    @abc.abstractmethod
+    def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
+        """Radiance that N blocked rays bring; differentiable in the values only.
+
+        Where the values belong to points, they must have a row for each ray.
+
+        Parameters
+        ----------
+        directions : (N, 3) unit, away from the point.
+        hits : (N,) face that each ray hits; negative where that is not known, which is black where
+            light is traced.
+        """
+
+
+class NoIndirect(Indirect):
+    """Blocked directions are black."""
+
+    values: None = None
+
+    def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
+        """Return zeros."""
         zero = jnp.zeros_like(directions)
         return zero, zero
-    if indirect.kind == "constant":
-        radiance = jax.nn.sigmoid(values - _OFFSET)
+
+
+class ConstantIndirect(Indirect):
+    """(N, 6) logits: the radiance of the diffuse lobe, then that of the specular lobe."""
+
+    outputs: ClassVar[int] = 6
+    values: Float[Array, "N 6"]
+
+    def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
+        """Return what was learned, whatever the direction."""
+        radiance = jax.nn.sigmoid(self.values - _OFFSET)
         return radiance[:, :3], radiance[:, 3:]
-    if indirect.kind == "harmonics":
+
+
+class HarmonicIndirect(Indirect):
+    """(N, 27) coefficients of spherical harmonics, colour by colour."""
+
+    outputs: ClassVar[int] = 27
+    values: Float[Array, "N 27"]
+
+    def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
+        """Evaluate the harmonics; both lobes see the same."""
         basis = jax.lax.stop_gradient(harmonics(directions))
-        colors = [jnp.sum(values[:, 9 * c : 9 * c + 9] * basis, axis=-1) for c in range(3)]
+        colors = [jnp.sum(self.values[:, 9 * c : 9 * c + 9] * basis, axis=-1) for c in range(3)]
         radiance = jax.nn.sigmoid(jnp.stack(colors, axis=-1) - _OFFSET)
         return radiance, radiance
-    found = values.at[jnp.maximum(hits, 0)].get(mode="clip")
-    radiance = jnp.where((hits >= 0)[:, None], found, 0.0)
-    return radiance, radiance
+
+
+class TracedIndirect(Indirect):
+    """(F, 3) radiance that each face sends out."""
+
+    values: Float[Array, "F 3"]
+
+    def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
+        """Look up the face that is hit."""
+        sent = self.values.at[jnp.maximum(hits, 0)].get(mode="clip")
+        radiance = jnp.where((hits >= 0)[:, None], sent, 0.0)
+        return radiance, radiance
+
+
+INDIRECT_MODELS: dict[str, type[Indirect]] = {
+    "none": NoIndirect,
+    "constant": ConstantIndirect,
+    "harmonics": HarmonicIndirect,
+    "traced": TracedIndirect,
+}
+"""Models by the name that settings use."""
+
+NO_INDIRECT = NoIndirect()
 
 
 def outgoing(
-    materials: Materials, diffuse_light: Float[Array, "N 3"], points_per_face: int
+    materials: Materials,
+    diffuse_light: Float[Array, "N 3"],
+    points: SurfacePoints,
+    face_count: int,
 ) -> Float[Array, "F 3"]:
-    """Radiance that every face sends out, for `Indirect` of kind ``"traced"``.
+    """Radiance that every face sends out, for `TracedIndirect`.
 
     The mean over a face's points of their irradiance / pi times what they reflect at normal
     incidence, both lobes: seen by way of another surface, a glossy point passes for a matt one.
-    Differentiable in both arguments.
+    Faces without points are black. Differentiable in the first two arguments.
+
+    Parameters
+    ----------
+    materials, diffuse_light : of N points. points : which face each belongs to.
+    face_count : static; rows to return.
     """
     matt = materials.albedo * (1 - materials.metallic)[:, None]
     glossy = specular_f0(materials.albedo, materials.metallic)
-    radiance = (matt + glossy) * diffuse_light
-    return jnp.mean(radiance.reshape(-1, points_per_face, 3), axis=1)
+    radiance = jnp.where(points.mask[:, None], (matt + glossy) * diffuse_light, 0.0)
+    row = jnp.where(points.faces < 0, face_count, points.faces)
+    total = jnp.zeros((face_count, 3), radiance.dtype).at[row].add(radiance, mode="drop")
+    count = (
+        jnp.zeros((face_count,), radiance.dtype)
+        .at[row]
+        .add(points.mask.astype(radiance.dtype), mode="drop")
+    )
+    return safe_divide(total, count[:, None])

@@ -1,26 +1,25 @@
-"""One bounce of light by Monte Carlo integration with multiple importance sampling (stage 2).
+"""One bounce of light by Monte Carlo integration with multiple importance sampling.
 
 ``L_o = integral of f_r(wi, wo) L_i(wi) max(n.wi, 0) over wi`` with ``L_i`` the environment where
-nothing is in the way, and indirect light elsewhere (REFERENCE 2.5). The two lobes are integrated
-apart: the diffuse one from samples of the light and of the cosine, the specular one from the same
-samples of the light and from samples of the visible microfacet normals. Each pair is combined by
-the balance heuristic of Veach and Guibas (1995). All samples are of low discrepancy.
+nothing is in the way, and indirect light elsewhere (Eq. 20). The two lobes are integrated apart:
+the diffuse one from samples of the light and of the cosine, the specular one from the same samples
+of the light and from samples of the visible microfacet normals. Each pair is combined by the
+balance heuristic of Veach and Guibas (1995).
 
 What does not depend on the viewer is computed once for all views: `draw_samples` traces, `gather`
-sums up the diffuse light, and `reflect` adds what a viewer sees. `shade` is all three for one view.
+sums up the diffuse light, and `reflect` adds what a viewer sees. `MonteCarlo` is all three.
 
 Gradient semantics. The samples, their densities and what they hit are constants of a step: the
 backward pass evaluates the derivative of ``f_r L_i cos`` at the very samples of the forward pass.
 For fixed densities that is an unbiased estimate of the derivative of the integral, but for what
 moves a shadow's edge: visibility has no gradient.
 
-Unbiased wherever the light is bounded. Memory is bounded by chunks of points, which the backward
-pass computes again.
+Unbiased wherever the light is bounded. The backward pass computes chunks of points again.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -29,90 +28,31 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from geosplat_jax.core.numerics import safe_divide
-from geosplat_jax.core.types import EnvLight, Materials
-from geosplat_jax.rays.grid_index import Accelerator, nearest, occluded
+from geosplat_jax.core.settings import Count, PositiveCount, settings
+from geosplat_jax.core.types import EnvLight, Materials, SurfacePoints
+from geosplat_jax.materials import Attributes
+from geosplat_jax.rays.base import RayIndex
+from geosplat_jax.splats.tiles import gather_visible
 from geosplat_jax.transport import bsdf
-from geosplat_jax.transport import indirect as indirect_light
-from geosplat_jax.transport.environment import lookup
-from geosplat_jax.transport.indirect import NO_INDIRECT, Indirect
-from geosplat_jax.transport.light_sampling import (
-    LightSampler,
-    light_density,
-    light_sampler,
-    sample_light,
+from geosplat_jax.transport.base import Illumination, Shaded, Transport, TransportSettings
+from geosplat_jax.transport.denoise import DenoiseSpec, denoise
+from geosplat_jax.transport.environment import LightSpec, lookup
+from geosplat_jax.transport.indirect import (
+    INDIRECT_MODELS,
+    NO_INDIRECT,
+    Indirect,
+    TracedIndirect,
+    outgoing,
 )
-from geosplat_jax.transport.split_sum import Shaded
-
-OPEN = -1
-"""A ray that reaches the environment."""
-
-BLOCKED = -2
-"""A ray that does not; by what is not known."""
-
-_RAYS_AT_ONCE = 4_194_304
-
-
-@dataclass(frozen=True)
-class SampleCounts:
-    """Static number of samples a point; hashable.
-
-    Attributes
-    ----------
-    light : samples of the environment, for both lobes.
-    diffuse : samples of the cosine, for the diffuse lobe.
-    specular : samples of the visible microfacet normals, for the specular lobe.
-    """
-
-    light: int = 4
-    diffuse: int = 4
-    specular: int = 4
-
-    def __post_init__(self) -> None:
-        """Refuse negative counts and a lobe without samples."""
-        if min(self.light, self.diffuse, self.specular) < 0:
-            raise ValueError(f"counts of samples must not be negative, got {self}")
-        if self.light + min(self.diffuse, self.specular) == 0:
-            raise ValueError(f"each lobe needs at least one sample, got {self}")
-
-    @property
-    def total(self) -> int:
-        """Rays a point."""
-        return self.light + self.diffuse + self.specular
-
-
-class SurfacePoints(eqx.Module):
-    """Where light is gathered: N points, all unit vectors in the world.
-
-    Attributes
-    ----------
-    positions : (N, 3) where rays start, on the surface.
-    normals : (N, 3) shading normals. outward : (N, 3) normals of the faces.
-    faces : (N,) face of each point, which its rays never hit; -1 for none.
-    mask : (N,) rows to shade; the others give zero.
-    """
-
-    positions: Float[Array, "N 3"]
-    normals: Float[Array, "N 3"]
-    outward: Float[Array, "N 3"]
-    faces: Int[Array, " N"]
-    mask: Bool[Array, " N"]
-
-
-class Samples(eqx.Module):
-    """Directions that do not depend on a viewer, those of the light first; no gradients.
-
-    Attributes
-    ----------
-    directions : (N, S, 3) unit.
-    weights : (N, S) ``1 / (n_light p_light + n_cosine p_cosine)``; 0 where the mask is false.
-    hits : (N, S) int32 face that is hit, `OPEN` or `BLOCKED`.
-    light_density : (N, L) density of the light's samples, per steradian.
-    """
-
-    directions: Float[Array, "N S 3"]
-    weights: Float[Array, "N S"]
-    hits: Int[Array, "N S"]
-    light_density: Float[Array, "N L"]
+from geosplat_jax.transport.light_sampling import LightSampler, light_sampler
+from geosplat_jax.transport.sampling import (
+    OPEN,
+    SampleCounts,
+    Samples,
+    draw_samples,
+    draw_specular,
+    in_chunks,
+)
 
 
 class Gathered(eqx.Module):
@@ -131,137 +71,6 @@ class Gathered(eqx.Module):
     density: Float[Array, "N L"]
 
 
-def _low_discrepancy(
-    offsets: Float[Array, "N 2"], samples: int, dtype: jnp.dtype
-) -> Float[Array, "S N 2"]:
-    """Hammersley points, turned on the torus by one random offset a point: uniform, and even."""
-    index = np.arange(samples)
-    bits = (index[:, None] >> np.arange(31)[None, :]) & 1
-    radical = np.sum(bits * 0.5 ** np.arange(1, 32)[None, :], axis=1)
-    points = jnp.asarray(np.stack([index / max(samples, 1), radical], axis=1), jnp.float32)
-    turned = points[:, None, :] + offsets[None]
-    # Below one even where the sum rounds up.
-    return jnp.minimum(turned - jnp.floor(turned), 1 - 2.0**-24).astype(dtype)
-
-
-def _offsets(key: Key[Array, ""], count: int, numbers: int) -> Float[Array, "N k"]:
-    """Draw the points' random numbers, in float32 at any precision."""
-    return jax.random.uniform(key, (count, numbers), jnp.float32)
-
-
-def _in_chunks(
-    function: Callable[[Any], Any], arguments: Any, mask: Bool[Array, " N"], samples: int
-) -> Any:
-    """Map a function of rows over chunks of them, to be computed again in the backward pass.
-
-    Chunks that the mask leaves nothing of give zeros, at no cost.
-    """
-    count = mask.shape[0]
-    chunk = min(max(256, _RAYS_AT_ONCE // max(samples, 1)), max(count, 1))
-    rows = -(-max(count, 1) // chunk)
-
-    def chunks(values: Array) -> Array:
-        widths = ((0, rows * chunk - count),) + ((0, 0),) * (values.ndim - 1)
-        return jnp.pad(values, widths).reshape(rows, chunk, *values.shape[1:])
-
-    def nothing(parts: Any) -> Any:
-        shapes = jax.eval_shape(function, parts)
-        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-
-    def one_chunk(parts: tuple[Array, Any]) -> Any:
-        is_used, arguments = parts
-        return jax.lax.cond(jnp.any(is_used), jax.checkpoint(function), nothing, arguments)
-
-    found = jax.lax.map(one_chunk, jax.tree.map(chunks, (mask, arguments)))
-    return jax.tree.map(lambda x: x.reshape(rows * chunk, *x.shape[2:])[:count], found)
-
-
-def cast(
-    points: SurfacePoints,
-    directions: Float[Array, "S N 3"],
-    accelerator: Accelerator | None,
-    *,
-    finds_nearest: bool = False,
-) -> Int[Array, "S N"]:
-    """Tell where rays end: at a face, `OPEN`, or `BLOCKED` by something; no gradients.
-
-    Directions below a point's own face are blocked. Without an accelerator nothing else is.
-
-    Parameters
-    ----------
-    finds_nearest : static; tell the face that is hit first, which takes longer.
-    """
-    points, directions = jax.lax.stop_gradient((points, directions))
-    is_below = jnp.sum(directions * points.outward[None], axis=-1) <= 0
-    if accelerator is None:
-        return jnp.where(is_below, BLOCKED, OPEN).astype(jnp.int32)
-    samples, count, _ = directions.shape
-
-    def repeated(values: Array) -> Array:
-        return jnp.broadcast_to(values[None], (samples, *values.shape)).reshape(
-            -1, *values.shape[1:]
-        )
-
-    rays = (
-        repeated(points.positions),
-        directions.reshape(-1, 3),
-        repeated(points.faces),
-        (~is_below & points.mask[None]).reshape(-1),
-    )
-    if finds_nearest:
-        _, hits = nearest(accelerator, *rays)
-    else:
-        hits = jnp.where(occluded(accelerator, *rays), BLOCKED, OPEN).astype(jnp.int32)
-    return jnp.where(is_below, BLOCKED, hits.reshape(samples, count))
-
-
-def draw_samples(
-    key: Key[Array, ""],
-    points: SurfacePoints,
-    sampler: LightSampler,
-    accelerator: Accelerator | None,
-    *,
-    counts: SampleCounts,
-    finds_nearest: bool = False,
-) -> Samples:
-    """Draw directions from the light and the cosine, and trace them; no gradients.
-
-    Parameters
-    ----------
-    key : of all random numbers.
-    points : where rays start.
-    sampler : tables of the light.
-    accelerator : the surface that blocks rays; None for no occlusion.
-    counts, finds_nearest : static; see `SampleCounts` and `cast`.
-    """
-    points, sampler = jax.lax.stop_gradient((points, sampler))
-    count, dtype = points.normals.shape[0], points.normals.dtype
-
-    def one_chunk(parts: tuple[SurfacePoints, Array]) -> Samples:
-        points, offsets = parts
-        drawn = []
-        if counts.light:
-            uniforms = _low_discrepancy(offsets[:, :2], counts.light, dtype)
-            found, _ = sample_light(sampler, uniforms.reshape(-1, 2))
-            drawn.append(found.reshape(counts.light, -1, 3))
-        if counts.diffuse:
-            uniforms = _low_discrepancy(offsets[:, 2:], counts.diffuse, dtype)
-            normals = tuple(points.normals.T[:, None, :])
-            found = bsdf.cosine_directions(normals, uniforms[..., 0], uniforms[..., 1])
-            drawn.append(jnp.stack(found, axis=-1))
-        directions = jnp.concatenate(drawn)
-        flat = directions.reshape(-1, 3)
-        light = light_density(sampler, flat).reshape(directions.shape[:2])
-        cosine = jax.vmap(lambda wi: bsdf.cosine_pdf(points.normals, wi))(directions)
-        density = counts.light * light + counts.diffuse * cosine
-        weights = jnp.where(points.mask[None], safe_divide(jnp.ones_like(density), density), 0.0)
-        hits = cast(points, directions, accelerator, finds_nearest=finds_nearest)
-        return Samples(jnp.moveaxis(directions, 0, 1), weights.T, hits.T, light[: counts.light].T)
-
-    samples = counts.light + counts.diffuse
-    return _in_chunks(one_chunk, (points, _offsets(key, count, 4)), points.mask, samples)
-
-
 def _arriving(
     light: EnvLight,
     indirect: Indirect,
@@ -275,7 +84,7 @@ def _arriving(
     if indirect.belongs_to_points and indirect.values is not None:
         values = jnp.broadcast_to(indirect.values[None], (samples, *indirect.values.shape))
         indirect = replace(indirect, values=values.reshape(-1, values.shape[-1]))
-    lobes = indirect_light.incoming(indirect, flat, ends)
+    lobes = indirect.incoming(flat, ends)
     is_open = (ends == OPEN)[:, None]
     diffuse, specular = (
         jnp.where(is_open, direct, radiance).reshape(directions.shape) for radiance in lobes
@@ -315,7 +124,7 @@ def gather(
         return diffuse_light, jnp.where(is_used, jnp.moveaxis(specular[:shared], 0, 1), 0.0)
 
     arguments = (points.normals, samples, rows)
-    diffuse_light, radiance = _in_chunks(one_chunk, arguments, points.mask, total)
+    diffuse_light, radiance = in_chunks(one_chunk, arguments, points.mask, total)
     return Gathered(diffuse_light, samples.directions[:, :shared], radiance, samples.light_density)
 
 
@@ -347,35 +156,6 @@ def _specular_sums(
     return f0 * bare + (1 - f0) * at_grazing, bare
 
 
-def _draw_specular(
-    key: Key[Array, ""],
-    points: SurfacePoints,
-    roughness: Float[Array, " N"],
-    wo: Float[Array, "N 3"],
-    sampler: LightSampler,
-    accelerator: Accelerator | None,
-    *,
-    counts: SampleCounts,
-    finds_nearest: bool,
-) -> tuple[Float[Array, "N S 3"], Int[Array, "N S"], Float[Array, "N S"]]:
-    """Draw and trace visible normals; return directions, hits and the light's density."""
-
-    def one_chunk(parts: tuple) -> tuple[Array, Array, Array]:
-        points, roughness, wo, offsets = parts
-        uniforms = _low_discrepancy(offsets[:, :2], counts.specular, wo.dtype)
-        alpha = bsdf.ggx_alpha(roughness)[None, :]
-        normals, views = (tuple(x.T[:, None, :]) for x in (points.normals, wo))
-        found = bsdf.specular_directions(alpha, normals, views, uniforms[..., 0], uniforms[..., 1])
-        drawn = jnp.stack(found, axis=-1)
-        hits = cast(points, drawn, accelerator, finds_nearest=finds_nearest)
-        density = light_density(sampler, drawn.reshape(-1, 3)).reshape(hits.shape)
-        return jnp.moveaxis(drawn, 0, 1), hits.T, density.T
-
-    count = wo.shape[0]
-    arguments = (points, roughness, wo, _offsets(key, count, 2))
-    return _in_chunks(one_chunk, jax.lax.stop_gradient(arguments), points.mask, counts.specular)
-
-
 def reflect(
     key: Key[Array, ""],
     points: SurfacePoints,
@@ -384,7 +164,7 @@ def reflect(
     gathered: Gathered,
     light: EnvLight,
     sampler: LightSampler,
-    accelerator: Accelerator | None,
+    index: RayIndex | None,
     indirect: Indirect = NO_INDIRECT,
     *,
     counts: SampleCounts,
@@ -399,7 +179,7 @@ def reflect(
         specular lobe flips shading normals that face away from the viewer.
     gathered : of the same points, see `gather`.
     light, sampler : the environment and its tables.
-    accelerator, indirect : see `draw_samples` and `gather`.
+    index, indirect : see `draw_samples` and `gather`.
     counts, finds_nearest : static, as for `draw_samples`.
 
     Returns
@@ -410,13 +190,13 @@ def reflect(
     """
     cosine = jnp.sum(points.normals * wo, axis=-1, keepdims=True)
     points = replace(points, normals=jnp.where(cosine < 0, -points.normals, points.normals))
-    rays = _draw_specular(
+    rays = draw_specular(
         key,
         points,
         materials.roughness,
         wo,
         sampler,
-        accelerator,
+        index,
         counts=counts,
         finds_nearest=finds_nearest,
     )
@@ -434,34 +214,292 @@ def reflect(
 
     samples = counts.light + counts.specular
     arguments = (points, materials, wo, gathered, rays, rows)
-    specular, specular_light = _in_chunks(one_chunk, arguments, points.mask, samples)
+    specular, specular_light = in_chunks(one_chunk, arguments, points.mask, samples)
     diffuse_light = gathered.diffuse_light
     diffuse = materials.albedo * (1 - materials.metallic)[:, None] * diffuse_light
     return Shaded(diffuse + specular, diffuse, specular, diffuse_light, specular_light)
 
 
-def shade(
-    key: Key[Array, ""],
-    points: SurfacePoints,
-    materials: Materials,
-    wo: Float[Array, "N 3"],
-    light: EnvLight,
-    accelerator: Accelerator | None,
-    indirect: Indirect = NO_INDIRECT,
-    *,
-    counts: SampleCounts,
-) -> Shaded:
-    """Estimate what N points send to one viewer each: `draw_samples`, `gather`, `reflect`.
+DENOISER_INPUTS = (
+    "diffuse",
+    "specular",
+    "specular_radiance",
+    "albedo",
+    "metallic",
+    "normal",
+    "depth",
+)
+"""Images that `denoised` needs beside the colours."""
 
-    Arguments and result as for `reflect`; both lobes flip shading normals that face away.
+_DARKEST = 1e-6
+"""Light below this has no tint."""
+
+
+def denoised(
+    images: dict[str, Float[Array, "H W c"]],
+    alpha: Float[Array, "H W"],
+    *,
+    spec: DenoiseSpec,
+    focal: Float[Array, ""],
+) -> dict[str, Float[Array, "H W c"]]:
+    """Filter the light of one view and correct its colours by what the filter changed.
+
+    ``rgb + base (F(L_d) - L_d) + tint (F(L_s) - L_s)``, with the filter F, the demodulated diffuse
+    and specular light L, the albedo of the diffuse lobe and the mean tint of the specular one. A
+    filter that changes nothing leaves the image as it was, to the bit.
+
+    Parameters
+    ----------
+    images : by name, premultiplied by ``alpha``: ``rgb``, ``diffuse`` and ``specular`` (light),
+        ``specular_radiance``, ``albedo``, ``metallic``, ``normal`` and ``depth``.
+    alpha : (H, W) coverage.
+    spec : static. focal : () focal length in pixels.
+
+    Returns
+    -------
+    ``images`` with new ``rgb``, ``diffuse`` and ``specular``. The gradient is that of a filter with
+    constant weights and of a constant tint.
     """
-    cosine = jnp.sum(points.normals * wo, axis=-1, keepdims=True)
-    points = replace(points, normals=jnp.where(cosine < 0, -points.normals, points.normals))
-    sampler = light_sampler(light)
-    how = {"counts": counts, "finds_nearest": indirect.kind == "traced"}
-    shared_key, own_key = jax.random.split(key)
-    samples = draw_samples(shared_key, points, sampler, accelerator, **how)
-    gathered = gather(points, samples, light, indirect)
-    return reflect(
-        own_key, points, materials, wo, gathered, light, sampler, accelerator, indirect, **how
+    light = jnp.concatenate([images["diffuse"], images["specular"]], axis=-1)
+    filtered = denoise(
+        light,
+        alpha,
+        images["normal"],
+        images["depth"][..., 0],
+        images["albedo"],
+        spec=spec,
+        focal=focal,
     )
+    change = filtered - light
+    coverage = alpha[..., None]
+    base = safe_divide(images["albedo"], coverage)
+    base = base * (1 - safe_divide(images["metallic"], coverage))
+    tint = safe_divide(images["specular_radiance"], images["specular"], smallest=_DARKEST)
+    tint = jax.lax.stop_gradient(jnp.clip(tint, 0.0, 1.0))
+    rgb = images["rgb"] + base * change[..., :3] + tint * change[..., 3:]
+    return {**images, "rgb": rgb, "diffuse": filtered[..., :3], "specular": filtered[..., 3:]}
+
+
+class MonteCarloIllumination(Illumination):
+    """Light of N points.
+
+    Attributes
+    ----------
+    light, sampler : environment and its tables.
+    traced : indirect light by face, where it is traced.
+    gathered : what arrives at every point, where views share it.
+    """
+
+    light: EnvLight
+    sampler: LightSampler
+    traced: TracedIndirect | None
+    gathered: Gathered | None
+
+    def take(self, rows: Int[Array, " M"]) -> "MonteCarloIllumination":
+        """Take rows of what was gathered."""
+        gathered = jax.tree.map(lambda x: gather_visible(rows, x), self.gathered)
+        return replace(self, gathered=gathered)
+
+    def averaged_parts(self) -> Any:
+        """Return diffuse light, and traced indirect light."""
+        return (
+            None if self.gathered is None else self.gathered.diffuse_light,
+            None if self.traced is None else self.traced.values,
+        )
+
+    def with_parts(self, parts: Any) -> "MonteCarloIllumination":
+        """Put averaged parts back; the samples of the light stay."""
+        diffuse_light, values = parts
+        gathered, traced = self.gathered, self.traced
+        if gathered is not None:
+            gathered = replace(gathered, diffuse_light=diffuse_light)
+        if traced is not None:
+            traced = replace(traced, values=values)
+        return replace(self, gathered=gathered, traced=traced)
+
+
+@settings
+class MonteCarloSettings(TransportSettings, kind="monte_carlo"):
+    """Sampled light, with shadows traced against the surface."""
+
+    light_count: Count = 4
+    """Samples of the environment per point, for both lobes."""
+    diffuse_count: Count = 4
+    """Samples of the cosine per point, for the diffuse lobe."""
+    specular_count: Count = 4
+    """Samples of the visible microfacet normals per point, for the specular lobe."""
+    residual_count: Count = 0
+    """Samples of each kind of a second image, from which Eq. 13 takes its residual; with 0 it takes
+    that of the image that it differentiates, which biases the gradient."""
+    occlusion: bool = True
+    """Trace rays against the surface; without it only directions below a point's own face are
+    blocked."""
+    indirect: Literal["none", "constant", "harmonics", "traced"] = "none"
+    """Light from blocked directions, see `transport.indirect`."""
+    bounces: PositiveCount = 1
+    """For traced indirect light, how often light goes from surface to surface."""
+    shares_views: bool = True
+    """All views of a batch use the same samples of light and cosine, which are then traced once.
+    The noise of the images is then correlated between views; its mean is the same."""
+    denoise: DenoiseSpec = DenoiseSpec(iterations=0)
+    """Filter of the demodulated light in the image, off by default."""
+
+    def __post_init__(self) -> None:
+        """Refuse a lobe without samples."""
+        if self.light_count + min(self.diffuse_count, self.specular_count) == 0:
+            raise ValueError(
+                "each lobe needs at least one sample: raise light_count, or both diffuse_count and "
+                "specular_count"
+            )
+
+    @property
+    def indirect_outputs(self) -> int:
+        """Learned numbers of indirect light per point."""
+        return INDIRECT_MODELS[self.indirect].outputs
+
+    def warnings(self) -> list[str]:
+        """Say that traced light needs rays."""
+        if self.indirect == "traced" and not self.occlusion:
+            return [
+                "indirect = traced has no effect without occlusion: blocked directions are black"
+            ]
+        return []
+
+    def build(self, light: LightSpec) -> "MonteCarlo":
+        """Make the transport; it has no constants."""
+        del light
+        return MonteCarlo(self)
+
+
+class MonteCarlo(Transport):
+    """One bounce by multiple importance sampling, with traced shadows."""
+
+    settings: MonteCarloSettings = eqx.field(static=True)
+
+    @property
+    def needs_key(self) -> bool:
+        """It draws samples."""
+        return True
+
+    @property
+    def uses_rays(self) -> bool:
+        """Unless nothing blocks them."""
+        return self.settings.occlusion
+
+    @property
+    def needs_every_point(self) -> bool:
+        """Where indirect light is traced."""
+        return self.settings.indirect == "traced" and self.settings.occlusion
+
+    @property
+    def filter_inputs(self) -> tuple[str, ...]:
+        """See `denoised`."""
+        return DENOISER_INPUTS if self.settings.denoise.iterations > 0 else ()
+
+    @property
+    def _counts(self) -> SampleCounts:
+        settings = self.settings
+        return SampleCounts(settings.light_count, settings.diffuse_count, settings.specular_count)
+
+    def _finds_nearest(self, index: RayIndex | None) -> bool:
+        return self.settings.indirect == "traced" and index is not None
+
+    def _learned(self, attributes: Attributes) -> Indirect:
+        """Indirect light that belongs to points."""
+        model = INDIRECT_MODELS[self.settings.indirect]
+        return model(attributes.indirect) if model.outputs else NO_INDIRECT
+
+    def prepare(
+        self,
+        key: Key[Array, ""] | None,
+        points: SurfacePoints,
+        attributes: Attributes,
+        light: EnvLight,
+        index: RayIndex | None,
+        carry: Any = None,
+    ) -> tuple[MonteCarloIllumination, Any]:
+        """Draw and trace what views share, and sum up the diffuse light.
+
+        Raises
+        ------
+        ValueError
+            Without a key.
+        """
+        if key is None:
+            raise ValueError("Monte Carlo shading needs a key for its samples")
+        sampler = light_sampler(light)
+        finds_nearest = self._finds_nearest(index)
+        gathered, traced = None, None
+        if self.settings.shares_views or finds_nearest:
+            samples = draw_samples(
+                key, points, sampler, index, counts=self._counts, finds_nearest=finds_nearest
+            )
+            gathered = gather(points, samples, light, self._learned(attributes))
+            # Traced indirect light is what it was, one bounce ago.
+            for _ in range(self.settings.bounces if finds_nearest else 0):
+                assert index is not None
+                sent = outgoing(
+                    attributes.materials, gathered.diffuse_light, points, index.face_capacity
+                )
+                traced = TracedIndirect(sent)
+                gathered = gather(points, samples, light, traced)
+        if not self.settings.shares_views:
+            gathered = None
+        return MonteCarloIllumination(light, sampler, traced, gathered), carry
+
+    def shade(
+        self,
+        key: Key[Array, ""] | None,
+        points: SurfacePoints,
+        attributes: Attributes,
+        wo: Float[Array, "M 3"],
+        illumination: MonteCarloIllumination,
+        index: RayIndex | None,
+    ) -> Shaded:
+        """Add what each viewer sees; see `reflect`."""
+        assert key is not None
+        light, sampler, gathered = illumination.light, illumination.sampler, illumination.gathered
+        indirect = illumination.traced
+        if indirect is None:
+            indirect = self._learned(attributes)
+        how = {"counts": self._counts, "finds_nearest": self._finds_nearest(index)}
+        own_key, shared_key = jax.random.split(key)
+        if gathered is None:
+            samples = draw_samples(shared_key, points, sampler, index, **how)
+            gathered = gather(points, samples, light, indirect)
+        return reflect(
+            own_key,
+            points,
+            attributes.materials,
+            wo,
+            gathered,
+            light,
+            sampler,
+            index,
+            indirect,
+            **how,
+        )
+
+    def filtered(
+        self,
+        images: dict[str, Float[Array, "H W c"]],
+        alpha: Float[Array, "H W"],
+        focal: Float[Array, ""],
+    ) -> dict[str, Float[Array, "H W c"]]:
+        """Filter the demodulated light; see `denoised`."""
+        if not self.filter_inputs:
+            return images
+        return denoised(images, alpha, spec=self.settings.denoise, focal=focal)
+
+    def for_residual(self) -> "MonteCarlo | None":
+        """Return a transport with ``residual_count`` samples of each kind."""
+        count = self.settings.residual_count
+        return self._with_counts(count, residual_count=0) if count else None
+
+    def for_images(self, sample_count: int) -> "MonteCarlo":
+        """Share the views' samples and leave the filter out."""
+        return self._with_counts(sample_count, shares_views=True, denoise=DenoiseSpec(iterations=0))
+
+    def _with_counts(self, count: int, **others: Any) -> "MonteCarlo":
+        counts = dict.fromkeys(("light_count", "diffuse_count", "specular_count"), count)
+        return MonteCarlo(replace(self.settings, **counts, **others))

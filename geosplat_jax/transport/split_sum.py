@@ -1,4 +1,4 @@
-"""Shading of surface points: the split-sum approximation (stage 1).
+"""Shading of surface points: the split-sum approximation.
 
 ``f_r = albedo (1 - m) / pi + D G F / (4 (n.l)(n.v))`` with GGX D of alpha = roughness^2,
 height-correlated Smith G and Schlick F of ``F0 = 0.04 (1 - m) + albedo m``. The split sum replaces
@@ -9,40 +9,28 @@ exact for constant light.
 """
 
 from functools import lru_cache
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, Key
 
-from geosplat_jax.core.types import Materials
+from geosplat_jax.core.settings import settings
+from geosplat_jax.core.types import EnvLight, Materials, SurfacePoints
+from geosplat_jax.materials import Attributes
+from geosplat_jax.rays.base import RayIndex
+from geosplat_jax.transport.base import Illumination, Shaded, Transport, TransportSettings
+from geosplat_jax.transport.bsdf import specular_f0
 from geosplat_jax.transport.environment import (
+    LightSpec,
     PrefilteredLight,
+    PrefilterOperators,
+    prefilter,
+    prefilter_operators,
     prefiltered_diffuse,
     prefiltered_specular,
 )
-
-DIELECTRIC_F0 = 0.04
-"""Reflectance at normal incidence of every dielectric (index of refraction 1.5)."""
-
-
-class Shaded(eqx.Module):
-    """Outgoing radiance of N points and the light it was made from.
-
-    Attributes
-    ----------
-    rgb : (N, 3) ``diffuse + specular``, linear.
-    diffuse, specular : (N, 3) the two parts, materials included.
-    diffuse_light : (N, 3) irradiance / pi: what a white Lambertian point would send out.
-    specular_light : (N, 3) radiance filtered by the lobe, before the BRDF's directional albedo:
-        what a lossless white reflector of this roughness would send out.
-    """
-
-    rgb: Float[Array, "N 3"]
-    diffuse: Float[Array, "N 3"]
-    specular: Float[Array, "N 3"]
-    diffuse_light: Float[Array, "N 3"]
-    specular_light: Float[Array, "N 3"]
 
 
 def directional_albedo(
@@ -155,7 +143,7 @@ def split_sum(
     two_sided : flip normals that face away from the viewer. Otherwise such points keep their
         normal and are shaded as at a grazing angle (n.v = 0).
     baked_diffuse : the diffuse part is ``albedo * (1 - metallic)``, not multiplied by the light:
-        the albedo field then stores baked radiance (preset `code`, stage 1).
+        the albedo field then stores baked radiance (preset `code`).
 
     Returns
     -------
@@ -168,7 +156,7 @@ def split_sum(
         normals, cosine = normals * facing[:, None], cosine * facing
     reflected = 2 * cosine[:, None] * normals - view_directions
     dielectric = (1 - materials.metallic)[:, None]
-    f0 = DIELECTRIC_F0 * dielectric + materials.albedo * materials.metallic[:, None]
+    f0 = specular_f0(materials.albedo, materials.metallic)
 
     diffuse_light = prefiltered_diffuse(prefiltered, normals)
     specular_light = prefiltered_specular(prefiltered, reflected, materials.roughness)
@@ -177,3 +165,73 @@ def split_sum(
     diffuse = base if baked_diffuse else base * diffuse_light
     specular = specular_light * (f0 * scale[:, None] + bias[:, None])
     return Shaded(diffuse + specular, diffuse, specular, diffuse_light, specular_light)
+
+
+class PrefilteredIllumination(Illumination):
+    """Maps of the split sum, the same for every point."""
+
+    prefiltered: PrefilteredLight
+
+    def take(self, rows: Int[Array, " M"]) -> "PrefilteredIllumination":
+        """Return itself: no part of it belongs to a point."""
+        del rows
+        return self
+
+
+class SplitSum(Transport):
+    """The split-sum approximation: fast, without noise and without shadows.
+
+    Attributes
+    ----------
+    operators : linear maps that prefilter the light.
+    fg_table : the precomputed integral of the BRDF.
+    baked_diffuse : static; see `split_sum`.
+    """
+
+    operators: PrefilterOperators
+    fg_table: Float[Array, "V R 2"]
+    baked_diffuse: bool = eqx.field(static=True, default=False)
+
+    def prepare(
+        self,
+        key: Key[Array, ""] | None,
+        points: SurfacePoints,
+        attributes: Attributes,
+        light: EnvLight,
+        index: RayIndex | None,
+        carry: Any = None,
+    ) -> tuple[PrefilteredIllumination, Any]:
+        """Prefilter the light; nothing else matters."""
+        return PrefilteredIllumination(prefilter(light, self.operators)), carry
+
+    def shade(
+        self,
+        key: Key[Array, ""] | None,
+        points: SurfacePoints,
+        attributes: Attributes,
+        wo: Float[Array, "M 3"],
+        illumination: PrefilteredIllumination,
+        index: RayIndex | None,
+    ) -> Shaded:
+        """See `split_sum`."""
+        return split_sum(
+            attributes.materials,
+            points.normals,
+            wo,
+            illumination.prefiltered,
+            self.fg_table,
+            baked_diffuse=self.baked_diffuse,
+        )
+
+
+@settings
+class SplitSumSettings(TransportSettings, kind="split_sum"):
+    """Prefiltered light, without occlusion."""
+
+    baked_diffuse: bool = False
+    """The albedo field *is* the diffuse radiance and is not multiplied by irradiance, as in the
+    authors' first stage."""
+
+    def build(self, light: LightSpec) -> SplitSum:
+        """Compute the tables of the split sum."""
+        return SplitSum(prefilter_operators(light), fg_table(), self.baked_diffuse)

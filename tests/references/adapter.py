@@ -1,4 +1,4 @@
-"""MGadapter: Gaussians from triangles (Eq. 8-11) and from vertices (Eq. 12), one by one.
+"""MGadapter: splats from triangles (Eq. 8-11) and from vertices (Eq. 12), one by one.
 
 Ye et al., "GeoSplatting", ICCV 2025, appendix; Eq. 10, which the text lacks, as in the authors'
 code.
@@ -19,8 +19,8 @@ def weighted(q, points):
     return q[0] * points[0] + q[1] * points[1] + q[2] * points[2]
 
 
-def face_gaussians(points, normals, *, preset):
-    """Six Gaussians of one triangle: means, rotations (columns R_x R_y R_z), scales, normals.
+def face_splats(points, normals, *, preset):
+    """Six splats of one triangle: means, rotations (columns R_x R_y R_z), scales, normals.
 
     Parameters
     ----------
@@ -54,17 +54,17 @@ def face_gaussians(points, normals, *, preset):
     }
 
 
-def mesh_gaussians(vertices, normals, *, faces, preset):
-    """Gaussians of all faces, six a face in their order."""
+def mesh_splats(vertices, normals, *, faces, preset):
+    """Splats of all faces, six a face in their order."""
     parts = [
-        face_gaussians([vertices[n] for n in face], [normals[n] for n in face], preset=preset)
+        face_splats([vertices[n] for n in face], [normals[n] for n in face], preset=preset)
         for face in faces
     ]
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def vertex_radii(vertices, normals, *, faces):
-    """Radius of the round Gaussian of every vertex: sqrt(a / 2.5), a = sum 2 A (n_F . n_v) / 6."""
+    """Radius of the round splat of every vertex: sqrt(a / 2.5), a = sum 2 A (n_F . n_v) / 6."""
     radii = []
     for n, normal in enumerate(normals):
         area = 0.0

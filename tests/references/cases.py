@@ -85,7 +85,7 @@ SPLAT_FRAME = {"height": 13, "width": 17}
 
 
 def splat_inputs():
-    """Sixteen random Gaussians, and eight at the limits of the rules.
+    """Sixteen random splats, and eight at the limits of the rules.
 
     The seed is one where no alpha comes within 1% of the cut, and no two depths within .003.
     """
@@ -135,9 +135,9 @@ def splat_case():
     random = np.random.RandomState(4)
     cotangents = {k: coarse(random.normal(size=outputs[k].shape)) for k in ("image", "alpha")}
     gradients = gradient(lambda **x: contract(cotangents, draw(**x)), inputs)
-    visible = sorted(outputs["splats"])
+    visible = sorted(outputs["footprints"])
     footprints = {
-        name: np.array([outputs["splats"][n][name] for n in visible])
+        name: np.array([outputs["footprints"][n][name] for n in visible])
         for name in ("means2d", "conics", "depths", "compensation", "clamped_axes")
     }
     values = {k: outputs[k] for k in ("image", "alpha")} | footprints
@@ -162,11 +162,11 @@ def adapter_inputs():
 
 
 def adapter_outputs(vertices, normals):
-    """Gaussians of both presets, the radii of Eq. 12 and the normals of the mesh itself."""
+    """Splats of both presets, the radii of Eq. 12 and the normals of the mesh itself."""
     outputs = {
         f"{preset}_{name}": value
         for preset in adapter.RINGS
-        for name, value in adapter.mesh_gaussians(
+        for name, value in adapter.mesh_splats(
             vertices, normals, faces=FACES, preset=preset
         ).items()
     }

@@ -1,4 +1,4 @@
-"""EWA projection of Gaussians and their dense compositing, one pixel after the other.
+"""EWA projection of splats and their dense compositing, one pixel after the other.
 
 Zwicker et al., "EWA splatting", 2002; the conventions are gsplat's: OpenCV camera axes,
 quaternions (w, x, y, z) of any length, pixel centres at integers + 0.5.
@@ -40,7 +40,7 @@ def clamp(x, low, high):
 
 
 def project(mean, quat, scale, world_to_camera, intrinsics, *, height, width):
-    """Footprint of one Gaussian: means2d, conics (xx, xy, yy), depths, compensation."""
+    """Footprint of one splat: means2d, conics (xx, xy, yy), depths, compensation."""
     turn = world_to_camera[:3, :3]
     x, y, z = (
         sum(turn[i, j] * mean[j] for j in range(3)) + world_to_camera[i, 3] for i in range(3)
@@ -88,17 +88,17 @@ def render(
     width,
     near=0.01,
 ):
-    """Composite every Gaussian in front of the near plane in every pixel, nearest first.
+    """Composite every splat in front of the near plane in every pixel, nearest first.
 
     Equal depths stay in the order of their rows. Returns image (H, W, C), premultiplied; alpha
     (H, W); the footprints of the visible rows; how often the thresholds acted on a pair of a
-    Gaussian and a pixel, and the smallest relative distance to them.
+    splat and a pixel, and the smallest relative distance to them.
     """
     turn, shift = world_to_camera[2, :3], world_to_camera[2, 3]
     depths = [real(sum(turn[j] * mean[j] for j in range(3)) + shift) for mean in means]
     order = [n for n in np.argsort(depths, kind="stable") if depths[n] > near]
     frame = {"height": height, "width": width}
-    splats = {
+    footprints = {
         n: project(means[n], quats[n], scales[n], world_to_camera, intrinsics, **frame)
         for n in order
     }
@@ -108,7 +108,7 @@ def render(
         for column in range(width):
             light, transmittance = 0.0, 1.0
             for n in order:
-                splat = splats[n]
+                splat = footprints[n]
                 dx = column + 0.5 - splat["means2d"][0]
                 dy = row + 0.5 - splat["means2d"][1]
                 xx, xy, yy = splat["conics"]
@@ -131,6 +131,6 @@ def render(
     return {
         "image": image.reshape(height, width, *image.shape[1:]),
         "alpha": coverage.reshape(height, width, *coverage.shape[1:]),
-        "splats": splats,
+        "footprints": footprints,
         "events": events,
     }

@@ -24,7 +24,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -34,21 +34,23 @@ import numpy as np
 import trimesh
 from trimesh.exchange.ply import export_ply
 
-from geosplat_jax.core.capacity import Capacities, combine, grow, overflowed
-from geosplat_jax.core.types import EnvLight, Grid, Materials
+from geosplat_jax.core.capacity import combine, retry
+from geosplat_jax.core.types import EnvLight, Grid, Materials, SurfacePoints
 from geosplat_jax.geometry import (
-    Surface,
+    FlexiCubes,
+    IsoSurface,
     face_normals_and_areas,
     grid_vertices,
     initial_geometry,
-    isosurface,
     vertex_normals,
 )
 from geosplat_jax.io.images import write_png
-from geosplat_jax.rays.grid_index import Accelerator, build_accelerator, nearest
+from geosplat_jax.rays.base import RayIndex
 from geosplat_jax.report.metrics import psnr, psnr_of_mse
 from geosplat_jax.transport.environment import light_directions, lookup
-from geosplat_jax.transport.monte_carlo import SampleCounts, SurfacePoints, shade
+from geosplat_jax.transport.light_sampling import light_sampler
+from geosplat_jax.transport.monte_carlo import gather, reflect
+from geosplat_jax.transport.sampling import SampleCounts, draw_samples
 
 FIELD_OF_VIEW = 0.62
 """Horizontal and vertical, radians."""
@@ -107,10 +109,10 @@ class Settings:
 
 @dataclass(frozen=True)
 class Scene:
-    """What both renderers see, and the tracer of ours."""
+    """What both renderers see, and the surface as rays of ours see it."""
 
-    surface: Surface
-    accelerator: Accelerator
+    surface: IsoSurface
+    index: RayIndex
     vertices: np.ndarray
     faces: np.ndarray
     normals: np.ndarray
@@ -146,9 +148,6 @@ class Agreement:
     white: float
 
 
-# --- the scene ----------------------------------------------------------------------------------
-
-
 def _distances(points: np.ndarray) -> np.ndarray:
     """Distance to a ball within a torus below a smaller ball: each shadows the others."""
     x, y, z = points.T
@@ -169,30 +168,31 @@ def look_at(position: tuple[float, float, float]) -> np.ndarray:
     return pose
 
 
-_extract = partial(jax.jit, static_argnames=("capacities", "training"))(isosurface)
-_build = partial(jax.jit, static_argnames=("capacities",))(build_accelerator)
+_extract = partial(jax.jit, static_argnames=("capacities",))(FlexiCubes.extract)
+_index = partial(jax.jit, static_argnames=("capacities",))(FlexiCubes.ray_index)
 
 
 def make_scene(resolution: int) -> Scene:
-    """Extract the mesh on a grid of so many cells along each axis, and build its tracer."""
+    """Extract the mesh on a grid of so many cells along each axis, and arrange it for rays."""
     cell = 2.2 / resolution
     shape = (resolution, resolution, resolution)
     grid = Grid(jnp.full((3,), -1.1), jnp.asarray(cell, jnp.float32), shape)
     distances = _distances(np.asarray(grid_vertices(grid)))
     geometry = initial_geometry(grid, jnp.asarray(distances / cell, jnp.float32))
-    capacities = Capacities(4096, 4096, 4096, cell_patches=65_536)
-    while True:
-        surface = _extract(geometry, grid, capacities=capacities, training=True)
-        accelerator = _build(surface, grid, capacities=capacities)
-        needed = combine(surface.usage, accelerator.usage)
-        if not overflowed(needed, capacities):
-            break
-        capacities = grow(capacities, needed)
+    model = FlexiCubes(grid)
+
+    def attempt(capacities):
+        surface = _extract(model, geometry, capacities=capacities)
+        index = _index(model, surface, capacities=capacities)
+        return (surface, index), combine(surface.usage, index.usage)
+
+    first = model.first_capacities(geometry).resized(cell_patches=65_536)
+    (surface, index), _ = retry(attempt, first)
     mesh = surface.mesh
     count = int(mesh.vertex_count)
     return Scene(
         surface=surface,
-        accelerator=accelerator,
+        index=index,
         vertices=np.asarray(mesh.vertices)[:count],
         faces=np.asarray(mesh.faces)[: int(mesh.face_count)],
         normals=np.asarray(vertex_normals(mesh))[:count],
@@ -215,9 +215,6 @@ def make_lights(height: int = 32) -> dict[str, EnvLight]:
     row, column = height // 4, height // 2 + height // 8
     sun[row : row + 2, column : column + 2] += np.array([90.0, 80.0, 60.0])
     return {name: EnvLight(jnp.asarray(v, jnp.float32)) for name, v in (("sky", sky), ("sun", sun))}
-
-
-# --- our image ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -249,8 +246,7 @@ def _primary_rays(
 
 def _primary_hits(scene: Scene, settings: Settings, rng: np.random.Generator) -> Hits:
     pixels, origins, directions = _primary_rays(rng, settings, scene.camera_to_world)
-    distance, face = nearest(
-        scene.accelerator,
+    distance, face = scene.index.nearest(
         jnp.asarray(origins, jnp.float32),
         jnp.asarray(directions, jnp.float32),
         jnp.full((len(pixels),), -1, jnp.int32),
@@ -286,16 +282,25 @@ def all_passes(scene: Scene, settings: Settings) -> list[Hits]:
 
 
 @partial(jax.jit, static_argnames=("counts",))
-def shaded_lobes(key, points, materials, wo, light, accelerator, *, counts):
-    """Our estimator, and the only call of it: diffuse and specular radiance, (N, 3) each."""
-    shaded = shade(key, points, materials, wo, light, accelerator, counts=counts)
+def shaded_lobes(key, points, materials, wo, light, index, *, counts):
+    """Our estimator, and the only call of it: diffuse and specular radiance, (N, 3) each.
+
+    Both lobes flip shading normals that face away.
+    """
+    cosine = jnp.sum(points.normals * wo, axis=-1, keepdims=True)
+    points = replace(points, normals=jnp.where(cosine < 0, -points.normals, points.normals))
+    sampler = light_sampler(light)
+    shared_key, own_key = jax.random.split(key)
+    samples = draw_samples(shared_key, points, sampler, index, counts=counts)
+    gathered = gather(points, samples, light)
+    shaded = reflect(own_key, points, materials, wo, gathered, light, sampler, index, counts=counts)
     return shaded.diffuse, shaded.specular
 
 
 def _shade_hits(
     hits: Hits,
     light: EnvLight,
-    accelerator: Accelerator | None,
+    index: RayIndex | None,
     settings: Settings,
     key: jax.Array,
     *,
@@ -321,7 +326,7 @@ def _shade_hits(
         )
         wo = jnp.asarray(hits.wo[rows], jnp.float32)
         diffuse, specular = shaded_lobes(
-            this, points, materials, wo, light, accelerator, counts=settings.counts
+            this, points, materials, wo, light, index, counts=settings.counts
         )
         found.append(np.asarray(diffuse if material == "diffuse" else specular))
     return np.concatenate(found)[:count] if found else np.zeros((0, 3), np.float32)
@@ -337,12 +342,12 @@ def our_image(
     occlusion: bool = True,
 ) -> Image:
     """Render ``material`` ("diffuse" or "metal") by our estimator from passes of primary hits."""
-    accelerator = scene.accelerator if occlusion else None
+    index = scene.index if occlusion else None
     total = settings.size**2
     images, coverages = [], []
     keys = jax.random.split(jax.random.key(settings.seed), len(passes))
     for key, hits in zip(keys, passes, strict=True):
-        radiance = _shade_hits(hits, light, accelerator, settings, key, material=material)
+        radiance = _shade_hits(hits, light, index, settings, key, material=material)
         channels = radiance.astype(np.float64).T
         sums = [np.bincount(hits.pixels, channel, total) for channel in channels]
         images.append(np.stack(sums, axis=-1) / settings.strata**2)
@@ -357,9 +362,6 @@ def _combined(images: list[np.ndarray], coverages: list[np.ndarray], size: int) 
     halves = np.mean(stack[:even:2], axis=0) - np.mean(stack[1:even:2], axis=0)
     coverage = np.mean(np.stack(coverages).reshape(-1, size, size), axis=0)
     return Image(np.mean(stack, axis=0), coverage, 0.5 * halves)
-
-
-# --- Mitsuba's image ----------------------------------------------------------------------------
 
 
 def choose_variant() -> str:
@@ -493,9 +495,6 @@ def mitsuba_image(scene: Scene, light: EnvLight, settings: Settings, *, material
     passes = [np.array(mi.render(loaded, spp=samples, seed=k)) for k in seeds]
     images = [x[..., :3].astype(np.float64) for x in passes]
     return _combined(images, [x[..., 3].astype(np.float64) for x in passes], size)
-
-
-# --- the comparison -----------------------------------------------------------------------------
 
 
 def _normalized(values: np.ndarray, white: float) -> np.ndarray:

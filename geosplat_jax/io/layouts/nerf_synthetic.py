@@ -70,7 +70,7 @@ def _frames(root: Path, split: str, *, has_maps: bool) -> tuple[Frame, ...]:
     if split == "test" and not where.exists():
         return ()
     frames = []
-    for file_path, pose, angle in read_transforms(where):
+    for file_path, pose, lens in read_transforms(where):
         stem = image_stem(root, file_path, where)
         candidates = [stem.with_name(stem.name + suffix) for suffix in IMAGE_SUFFIXES]
         asked = inside_scene(root, file_path, where)
@@ -84,5 +84,5 @@ def _frames(root: Path, split: str, *, has_maps: bool) -> tuple[Frame, ...]:
                 root, {key: stem.with_name(stem.name + end) for key, end in names.items()}
             )
         mask = maps.pop("mask", None)
-        frames.append(Frame(stem.name, pose, angle, image, mask=mask, truth=maps))
+        frames.append(Frame(stem.name, pose, lens, image, mask=mask, truth=maps))
     return tuple(frames)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from geosplat_jax.io.frames import (
     Frame,
+    Lens,
     Listing,
     existing,
     find_lights,
@@ -49,27 +50,27 @@ def list_synthetic4relight(root: Path, *, light: str | None = None) -> Listing:
 
 
 def _listed(root: Path, split: str):
-    """Yield stem, pose and angle; a file path may or may not end in ``_rgb`` or ``_rgba``."""
+    """Yield stem, pose and lens; a file path may or may not end in ``_rgb`` or ``_rgba``."""
     where = root / f"transforms_{split}.json"
     if split == "test" and not where.exists():
         return
-    for file_path, pose, angle in read_transforms(where):
+    for file_path, pose, lens in read_transforms(where):
         stem = image_stem(root, file_path, where)
         ending = next((end for end in _ENDINGS if stem.name.endswith(end)), "")
-        yield stem.with_name(stem.name.removesuffix(ending)), pose, angle
+        yield stem.with_name(stem.name.removesuffix(ending)), pose, lens
 
 
 def _beside(stem: Path, ending: str) -> Path:
     return stem.with_name(stem.name + ending)
 
 
-def _train_frame(root: Path, stem: Path, pose, angle: float) -> Frame:
+def _train_frame(root: Path, stem: Path, pose, lens: Lens) -> Frame:
     image = existing(root, [_beside(stem, "_rgb.exr")], stem.name)
     mask = optional_files(root, {"mask": _beside(stem, "_mask.png")}).get("mask")
-    return Frame(stem.name, pose, angle, image, mask=mask)
+    return Frame(stem.name, pose, lens, image, mask=mask)
 
 
-def _test_frame(root: Path, stem: Path, pose, angle: float) -> Frame:
+def _test_frame(root: Path, stem: Path, pose, lens: Lens) -> Frame:
     image = existing(root, [_beside(stem, "_rgba.png")], stem.name)
     mask = optional_files(root, {"mask": _beside(stem, "_mask.png")}).get("mask")
     truth = {"albedo": _beside(stem, "_albedo.png"), "roughness": _beside(stem, "_rough.png")}
@@ -77,7 +78,7 @@ def _test_frame(root: Path, stem: Path, pose, angle: float) -> Frame:
     return Frame(
         stem.name,
         pose,
-        angle,
+        lens,
         image,
         mask=mask,
         truth=optional_files(root, truth),

@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from geosplat_jax.io.frames import (
+    AngleLens,
     Frame,
+    Lens,
     Listing,
     checked_angle,
     checked_pose,
@@ -71,13 +73,13 @@ def _folders(root: Path) -> list[Path]:
     return sorted(folder for folder in root.iterdir() if folder.is_dir())
 
 
-def _views(root: Path, split: str) -> list[tuple[Path, np.ndarray, float]]:
-    """Folder, pose and angle of each view, from the transforms or from the metadata."""
+def _views(root: Path, split: str) -> list[tuple[Path, np.ndarray, Lens]]:
+    """Folder, pose and lens of each view, from the transforms or from the metadata."""
     transforms = root / f"transforms_{split}.json"
     if transforms.is_file():
         return [
-            (_view_folder(root, file_path, transforms), pose, angle)
-            for file_path, pose, angle in read_transforms(transforms)
+            (_view_folder(root, file_path, transforms), pose, lens)
+            for file_path, pose, lens in read_transforms(transforms)
         ]
     folders = [folder for folder in _folders(root) if folder.name.startswith(f"{split}_")]
     if not folders and split == "train":
@@ -96,7 +98,7 @@ def _view_folder(root: Path, file_path: str, where: Path) -> Path:
     return stem if stem.is_dir() else stem.parent
 
 
-def _metadata_camera(root: Path, folder: Path) -> tuple[np.ndarray, float]:
+def _metadata_camera(root: Path, folder: Path) -> tuple[np.ndarray, Lens]:
     where = existing(root, [folder / "metadata.json"], folder.name)
     content = read_json(where)
     text = require(content, "cam_transform_mat", where)
@@ -107,7 +109,8 @@ def _metadata_camera(root: Path, folder: Path) -> tuple[np.ndarray, float]:
     if len(numbers) != 16:
         raise SceneError(f"'cam_transform_mat' of {where} must be 16 numbers, got {len(numbers)}")
     pose = checked_pose(np.reshape(numbers, (4, 4)), str(where))
-    return pose, checked_angle(require(content, "cam_angle_x", where), str(where))
+    angle = checked_angle(require(content, "cam_angle_x", where), str(where))
+    return pose, AngleLens(angle)
 
 
 def _lights_of(folder: Path) -> list[str]:
@@ -136,7 +139,7 @@ def _train_light(root: Path, folders: list[Path]) -> str:
     return present[0]
 
 
-def _frame(root: Path, folder: Path, pose: np.ndarray, angle: float, light: str) -> Frame:
+def _frame(root: Path, folder: Path, pose: np.ndarray, lens: Lens, light: str) -> Frame:
     present = _lights_of(folder)
     if light not in present:
         raise MissingFileError(
@@ -148,7 +151,7 @@ def _frame(root: Path, folder: Path, pose: np.ndarray, angle: float, light: str)
     return Frame(
         folder.name,
         pose,
-        angle,
+        lens,
         image,
         truth=optional_files(root, {key: folder / f"{key}.png" for key in maps}),
         relight=optional_files(root, {name: folder / f"rgba_{name}.png" for name in others}),

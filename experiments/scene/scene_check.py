@@ -1,6 +1,6 @@
 """Check the conventions of the rendered example scene against independent computations.
 
-    python experiments/scene_check.py --scene examples/duck
+    python experiments/scene/scene_check.py --scene examples/duck
 
 verifies that a mirror ball rendered by Mitsuba shows the environment where the closed formula
 puts it, that the true mesh projects onto the masks and fills them, that normals face the camera

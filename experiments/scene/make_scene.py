@@ -1,7 +1,7 @@
 """Build the bundled example scene: a rubber duck rendered by Mitsuba 3 in the TensoIR layout.
 
     pip install 'geosplat_jax[scene]'
-    python experiments/make_scene.py --output examples
+    python experiments/scene/make_scene.py --output examples
 
 writes `<output>/duck/` and the environment maps `<output>/<light>.hdr` beside it. The pictures
 come from an independent path tracer (8 bounces, Disney principled BSDF), so that whoever trains

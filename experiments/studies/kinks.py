@@ -1,6 +1,6 @@
 """How much the points without a derivative matter in one real step of training.
 
-    python experiments/kinks.py RUN [--step-from start last] [--json FILE]
+    python experiments/studies/kinks.py RUN [--step-from start last] [--json FILE]
 
 Loads a run (and builds its first state again), makes one optimiser step on the next batch and
 counts which discrete states changed: signs, quads, depth order, cells, thresholds. Then it follows
@@ -19,7 +19,6 @@ import argparse
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,34 +26,39 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from geosplat_jax.adapter import GAUSSIANS_PER_FACE, face_gaussians
+from geosplat_jax.adapter import SPLATS_PER_FACE, FaceSplats
 from geosplat_jax.core import capacity
-from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.capacity import Capacities, Usage
 from geosplat_jax.core.color import tone_map
 from geosplat_jax.core.numerics import safe_normalize
 from geosplat_jax.core.types import Batch, Grid
-from geosplat_jax.fit.config import Config
+from geosplat_jax.fit.config import Config, Stage
 from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
-from geosplat_jax.fit.stages import initial_params, initial_sdf, make_batch, sampling_of_step
-from geosplat_jax.fit.step import StepReport, TrainState, initial_state, train_step
-from geosplat_jax.fit.train import load_run
-from geosplat_jax.geometry import vertex_normals
+from geosplat_jax.fit.stages import (
+    build_pipeline,
+    initial_params,
+    make_batch,
+    pipeline_at,
+    update_rule,
+)
+from geosplat_jax.fit.step import StepReport, TrainState, UpdateRule, initial_state, train_step
+from geosplat_jax.geometry import FlexiCubes
 from geosplat_jax.hashgrid import Layer, encode
 from geosplat_jax.io.checkpoints import latest_checkpoint, load_checkpoint
-from geosplat_jax.io.dataset import load_recorded
-from geosplat_jax.losses import TERM_NAMES, loss
+from geosplat_jax.io.dataset import Dataset
+from geosplat_jax.losses import compare, random_background
 from geosplat_jax.materials import to_unit_cube
-from geosplat_jax.model import Context, Model, Params
-from geosplat_jax.render import Asset, grid_center_and_extent, reconstruct, render_views
-from geosplat_jax.splats.projection import project
-from geosplat_jax.splats.rasterize import MAX_ALPHA, MIN_ALPHA, find_visible
-from geosplat_jax.surface.hull import fit_grid
+from geosplat_jax.pipeline import Pipeline
+from geosplat_jax.render import Asset, Params
+from geosplat_jax.run import Run
+from geosplat_jax.splats.rasterize import MAX_ALPHA, MIN_ALPHA
 from geosplat_jax.transport.bsdf import ROUGHNESS_FLOOR
 from geosplat_jax.transport.environment import direction_to_uv, level_of_roughness
+from geosplat_jax.transport.split_sum import SplitSum
 
 SEGMENTS = 16
 SHOWN = (1, 4, 16)
-PER_QUAD = 4 * GAUSSIANS_PER_FACE
+PER_QUAD = 4 * SPLATS_PER_FACE
 
 GROUPS = {
     "everything": ("",),
@@ -84,9 +88,6 @@ class Row:
     near: int | None
 
 
-# --- what is computed on the device -------------------------------------------------------------
-
-
 def _hidden_inputs(layers: tuple[Layer, ...], features: jax.Array) -> jax.Array:
     """Lay the inputs of all rectifiers of an MLP side by side."""
     found = []
@@ -99,13 +100,13 @@ def _hidden_inputs(layers: tuple[Layer, ...], features: jax.Array) -> jax.Array:
     return jnp.concatenate(found, axis=-1)
 
 
-def _rectifier_inputs(params: Params, points: jax.Array, model: Model) -> jax.Array:
+def _rectifier_inputs(params: Params, points: jax.Array, pipeline: Pipeline) -> jax.Array:
     """Evaluate the inputs of the rectifiers of every head at points of the unit cube."""
-    material = params.material
-    first = encode(material.albedo_table, points, spec=model.material.grid)
+    material, spec = params.material, pipeline.fields.grid
+    first = encode(material.albedo_table, points, spec=spec)
     second = first
     if material.surface_table is not None:
-        second = encode(material.surface_table, points, spec=model.material.grid)
+        second = encode(material.surface_table, points, spec=spec)
     heads = [_hidden_inputs(material.albedo_head, first)]
     heads.append(_hidden_inputs(material.surface_head, second))
     if material.shift_head is not None:
@@ -113,97 +114,61 @@ def _rectifier_inputs(params: Params, points: jax.Array, model: Model) -> jax.Ar
     return jnp.concatenate(heads, axis=-1)
 
 
-def _observe_view(
-    asset: Asset, batch: Batch, view: int, near: jax.Array, model: Model, capacities: Capacities
-) -> dict[str, jax.Array]:
+def _observe_view(asset: Asset, batch: Batch, view: int, pipeline: Pipeline) -> dict[str, Any]:
     """Evaluate what depends on one view."""
-    camera, gaussians = batch.camera, asset.gaussians
-    frame = {"height": camera.height, "width": camera.width}
-    towards = camera.centers[view][None, :] - gaussians.means
-    outward = jnp.sum(asset.outward * towards, axis=-1)
-    splats = project(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        world_to_camera=camera.world_to_camera[view],
-        intrinsics=camera.intrinsics[view],
-        near=near,
-        **frame,
-    )
-    is_eligible = gaussians.mask & ((outward > 0) | (not model.cull_backfaces))
-    sizes = {"tile_size": model.tile_size, "capacities": capacities}
-    lists = find_visible(splats, gaussians.opacities, is_eligible, **sizes, **frame)
+    camera, splats = batch.camera.view(view), asset.splats
+    towards = camera.centers - splats.means
+    footprints = pipeline.project(splats.means, splats.quats, splats.scales, camera)
+    lists = pipeline.visible(splats, camera)
     viewer = safe_normalize(towards)
-    cosine = jnp.sum(gaussians.normals * viewer, axis=-1)
+    cosine = jnp.sum(splats.normals * viewer, axis=-1)
     return {
-        "outward": outward,
+        "outward": jnp.sum(splats.outward * towards, axis=-1),
         "cosine": cosine,
-        "reflected": direction_to_uv(2 * cosine[:, None] * gaussians.normals - viewer),
-        "means2d": splats.means2d,
-        "conics": splats.conics,
-        "opacity": gaussians.opacities * splats.compensation,
-        "depths": splats.depths,
+        "reflected": direction_to_uv(2 * cosine[:, None] * splats.normals - viewer),
+        "means2d": footprints.means2d,
+        "conics": footprints.conics,
+        "opacity": splats.opacities * footprints.compensation,
+        "depths": footprints.depths,
         "index": lists.index,
         "chunk_ranks": lists.chunk_ranks,
         "chunk_tiles": lists.chunk_tiles,
     }
 
 
-def _residual(rgb: jax.Array, alpha: jax.Array, batch: Batch, background: str) -> jax.Array:
+def _residual(rgb: jax.Array, alpha: jax.Array, batch: Batch, pipeline: Pipeline) -> jax.Array:
     """Subtract the composited photographs from the composited images, as the loss does."""
-    mask = batch.image[..., 3]
-    behind = jnp.zeros_like(rgb)
-    if background != "black":
-        # As the loss draws it: the first of the step's three keys.
-        drawn = rgb.shape if background == "pixel" else (rgb.shape[0], 1, 1, 3)
-        behind = jax.random.uniform(jax.random.split(batch.key, 3)[0], drawn, jnp.float32)
-    predicted = rgb + (1 - alpha)[..., None] * behind
-    target = mask[..., None] * batch.image[..., :3] + (1 - mask)[..., None] * behind
-    return predicted - target
+    # The first of the step's three keys, see `LossInputs.keys`.
+    key = jax.random.split(batch.key, 3)[0]
+    behind = random_background(key, rgb.shape, rgb.dtype, pipeline.objective.background)
+    images = compare(rgb, alpha, batch.image, behind, batch.valid, srgb=False)
+    return images.predicted - images.target
 
 
-@partial(jax.jit, static_argnames=("model", "capacities", "background"))
-def observe(
-    params: Params,
-    batch: Batch,
-    context: Context,
-    *,
-    model: Model,
-    capacities: Capacities,
-    background: str,
-) -> dict[str, Any]:
+@jax.jit
+def observe(pipeline: Pipeline, params: Params, batch: Batch) -> dict[str, Any]:
     """Evaluate everything whose discrete state is counted."""
-    build = {"model": model, "capacities": capacities}
-    asset = reconstruct(params, context, sampling="face", **build)
-    output = render_views(asset, params.light, batch.camera, context, **build)
-    center, half_extent = grid_center_and_extent(context.grid)
-    # Attributes are read on the face, before the Gaussian sinks below it.
-    unshifted = face_gaussians(
-        asset.mesh, vertex_normals(asset.mesh), constants=model.adapter, unit=half_extent
-    )
-    points = to_unit_cube(unshifted.means, center, half_extent)
-    near = model.near * half_extent
-    views = range(batch.camera.world_to_camera.shape[0])
+    asset = pipeline.reconstruct(params)
+    output = pipeline.render_views(asset, params.light, batch.camera)
+    roughness = asset.attributes.materials.roughness
+    points = to_unit_cube(asset.splats.anchors, pipeline.surface.box)
+    levels = pipeline.transport.operators.spec.roughness
     rgb = tone_map(output.rgb, params.log_exposure)
     return {
         "points": points,
-        "roughness": asset.materials.roughness,
-        "level": level_of_roughness(asset.materials.roughness, levels=model.light.roughness),
-        "normal_uv": direction_to_uv(asset.gaussians.normals),
-        "rectifiers": _rectifier_inputs(params, points, model),
-        "residual": _residual(rgb, output.alpha, batch, background),
-        "views": [_observe_view(asset, batch, v, near, model, capacities) for v in views],
+        "roughness": roughness,
+        "level": level_of_roughness(roughness, levels=levels),
+        "normal_uv": direction_to_uv(asset.splats.normals),
+        "rectifiers": _rectifier_inputs(params, points, pipeline),
+        "residual": _residual(rgb, output.alpha, batch, pipeline),
+        "views": [_observe_view(asset, batch, v, pipeline) for v in range(batch.camera.count)],
         "usage": output.usage,
     }
 
 
 _value_and_gradient = jax.jit(
-    jax.value_and_grad(loss, has_aux=True),
-    static_argnames=("model", "objective", "capacities", "sampling"),
+    lambda pipeline, params, batch: jax.value_and_grad(pipeline.loss, has_aux=True)(params, batch)
 )
-
-
-# --- counting, on the host ----------------------------------------------------------------------
 
 
 def _near_border(position: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -254,19 +219,19 @@ def _surface_vertices(sdf: np.ndarray, grid: Grid) -> np.ndarray:
     return touched.reshape(-1)
 
 
-def _hits(view: dict[str, np.ndarray], gaussian_count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Tile and Gaussian of every hit, tile by tile, front to back."""
+def _hits(view: dict[str, np.ndarray], splat_count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Tile and splat of every hit, tile by tile, front to back."""
     ranks = view["chunk_ranks"]
     tiles = np.repeat(view["chunk_tiles"], ranks.shape[0])
     ranks = ranks.T.reshape(-1)
     real = ranks < len(view["index"])
     rows = view["index"][ranks[real]]
-    assert np.all(rows < gaussian_count)
+    assert np.all(rows < splat_count)
     return tiles[real], rows
 
 
 def _alpha(view: dict, rows: np.ndarray, tiles: np.ndarray, columns: int, size: int) -> np.ndarray:
-    """Alpha before clamp and cut of Gaussians in all pixels of tiles, (n, pixels)."""
+    """Alpha before clamp and cut of splats in all pixels of tiles, (n, pixels)."""
     v, u = (x.reshape(-1) + 0.5 for x in np.indices((size, size)))
     x = (tiles % columns * size)[:, None] + u - view["means2d"][rows, 0, None]
     y = (tiles // columns * size)[:, None] + v - view["means2d"][rows, 1, None]
@@ -276,18 +241,18 @@ def _alpha(view: dict, rows: np.ndarray, tiles: np.ndarray, columns: int, size: 
 
 
 def _count_view(
-    before: dict, after: dict, rows: tuple[np.ndarray, np.ndarray], model: Model, width: int
+    before: dict, after: dict, rows: tuple[np.ndarray, np.ndarray], config: Config, width: int
 ) -> list[Row]:
-    """Count what depends on one view; ``rows`` are the Gaussians that both states have."""
+    """Count what depends on one view; ``rows`` are the splats that both states have."""
     first, second = rows
     partner = np.full(len(before["depths"]), -1)
     partner[first] = second
     lit = np.intersect1d(before["index"], first)
     kept = partner[lit]
     one, two = before["outward"][first], after["outward"][second]
-    found = [_crossing("back-face culling", "Gaussians", one, two)]
+    found = [_crossing("back-face culling", "splats", one, two)]
     one, two = before["cosine"][lit], after["cosine"][kept]
-    found.append(_crossing("flip of the shading normal", "visible Gaussians", one, two))
+    found.append(_crossing("flip of the shading normal", "visible splats", one, two))
     tiles, hit = _hits(before, len(partner))
     adjacent = (tiles[1:] == tiles[:-1]) & (partner[hit[1:]] >= 0) & (partner[hit[:-1]] >= 0)
     front, back = hit[:-1][adjacent], hit[1:][adjacent]
@@ -298,7 +263,8 @@ def _count_view(
     close = (front // PER_QUAD == back // PER_QUAD)[swapped]
     found.append(Row("swapped within one quad", "swapped pairs", close.size, int(close.sum()), 0))
 
-    size, columns = model.tile_size, -(-width // model.tile_size)
+    size = config.raster.tile_size
+    columns = -(-width // size)
     back_to = np.full(len(after["depths"]), -1)
     back_to[second] = first
     later = _hits(after, len(back_to))
@@ -311,13 +277,13 @@ def _count_view(
     one, two = np.log(one[seen]), np.log(two[seen])
     for name, limit in (("alpha threshold 1/255", MIN_ALPHA), ("alpha clamp .999", MAX_ALPHA)):
         found.append(
-            _crossing(name, "(Gaussian, pixel) pairs", one - np.log(limit), two - np.log(limit))
+            _crossing(name, "(splat, pixel) pairs", one - np.log(limit), two - np.log(limit))
         )
-    texels = np.array([model.light.width, model.light.height])
+    texels = np.array([config.light.width, config.light.height])
     one, two = before["reflected"][lit] * texels - 0.5, after["reflected"][kept] * texels - 0.5
-    found.append(_cells("texel of the reflected view", "visible Gaussians", one, two))
+    found.append(_cells("texel of the reflected view", "visible splats", one, two))
     one, two = (127 * np.abs(x)[:, None] for x in (before["cosine"][lit], after["cosine"][kept]))
-    found.append(_cells("cell of the FG table in n.v", "visible Gaussians", one, two))
+    found.append(_cells("cell of the FG table in n.v", "visible splats", one, two))
     return found
 
 
@@ -343,44 +309,42 @@ def _count_geometry(before: Params, after: Params, grid: Grid) -> list[Row]:
     return found
 
 
-def _count_fields(one: dict, two: dict, rows: tuple[np.ndarray, ...], model: Model) -> list[Row]:
-    """Count what depends on the Gaussians alone."""
+def _count_fields(one: dict, two: dict, rows: tuple[np.ndarray, ...], config: Config) -> list[Row]:
+    """Count what depends on the splats alone."""
     names = ("points", "rectifiers", "level", "roughness", "normal_uv")
     pair = {name: (one[name][rows[0]], two[name][rows[1]]) for name in names}
     found = []
-    for level, cells in enumerate(model.material.grid.resolutions):
+    for level, cells in enumerate(config.material.grid.resolutions):
         name = f"hash cell, level {level} ({cells})"
-        found.append(_cells(name, "Gaussians", *(x * cells for x in pair["points"])))
-    found.append(
-        _crossing("rectifiers of the heads", "(Gaussian, unit) pairs", *pair["rectifiers"])
-    )
-    found.append(_cells("level of roughness", "Gaussians", *(x[:, None] for x in pair["level"])))
+        found.append(_cells(name, "splats", *(x * cells for x in pair["points"])))
+    found.append(_crossing("rectifiers of the heads", "(splat, unit) pairs", *pair["rectifiers"]))
+    found.append(_cells("level of roughness", "splats", *(x[:, None] for x in pair["level"])))
     above = (x - ROUGHNESS_FLOOR for x in pair["roughness"])
-    found.append(_crossing("roughness floor .08", "Gaussians", *above))
-    texels = np.array([model.light.width, model.light.height])
+    found.append(_crossing("roughness floor .08", "splats", *above))
+    texels = np.array([config.light.width, config.light.height])
     at = (x * texels - 0.5 for x in pair["normal_uv"])
-    found.append(_cells("texel of the normal", "Gaussians", *at))
+    found.append(_cells("texel of the normal", "splats", *at))
     return found
 
 
 def count_changes(
-    before: Params, after: Params, seen: list[dict], config: Config, context: Context, width: int
+    before: Params, after: Params, seen: list[dict], config: Config, grid: Grid, width: int
 ) -> list[Row]:
     """Count every kind of point; ``seen`` is what `observe` returns before and after."""
-    rows = _count_geometry(before, after, context.grid)
-    keys = [quad_keys(np.asarray(p.geometry.sdf), context.grid) for p in (before, after)]
+    rows = _count_geometry(before, after, grid)
+    keys = [quad_keys(np.asarray(p.geometry.sdf), grid) for p in (before, after)]
     for key, state in zip(keys, seen, strict=True):
-        assert len(key) == int(state["usage"].quads)
+        assert len(key) == int(state["usage"]["quads"])
     _, *quads = np.intersect1d(*keys, assume_unique=True, return_indices=True)
     both = tuple((q[:, None] * PER_QUAD + np.arange(PER_QUAD)).reshape(-1) for q in quads)
     views = [
-        _count_view(a, b, both, config.model, width)
+        _count_view(a, b, both, config, width)
         for a, b in zip(seen[0]["views"], seen[1]["views"], strict=True)
     ]
     for parts in zip(*views, strict=True):
         sums = {n: sum(getattr(p, n) for p in parts) for n in ("population", "changed", "near")}
         rows.append(replace(parts[0], **sums))
-    rows += _count_fields(*seen, both, config.model)
+    rows += _count_fields(*seen, both, config)
     one, two = (state["residual"].reshape(-1) for state in seen)
     some = (one != 0) | (two != 0)
     rows.append(_crossing("sign of the L1 residual", "pixel channels", one[some], two[some]))
@@ -390,9 +354,6 @@ def count_changes(
     floor = int(np.sum(light <= np.float32(config.run.smallest_light)))
     rows.append(Row("texels put back to their floor", "texel channels", light.size, floor, None))
     return rows
-
-
-# --- the loss along the update ------------------------------------------------------------------
 
 
 def _chosen(update: Params, wanted: tuple[str, ...]) -> Params:
@@ -447,73 +408,70 @@ def follow(
     return found
 
 
-# --- the command --------------------------------------------------------------------------------
+def _first_state(dataset: Dataset, config: Config) -> tuple[FlexiCubes, TrainState]:
+    """Build the surface and the state before the first step, as training does."""
+    shape_key, field_key = jax.random.split(jax.random.key(config.run.seed))
+    surface, shape = config.geometry.start(dataset, shape_key)
+    assert isinstance(surface, FlexiCubes)
+    return surface, initial_state(initial_params(shape, config, field_key))
 
 
-def _first_state(dataset: Any, config: Config, context: Context) -> TrainState:
-    """Build the state before the first step, as training does."""
-    sdf_key, field_key = jax.random.split(jax.random.key(config.run.seed))
-    grid = fit_grid(dataset.bounds, config.geometry.resolution)
-    if grid.shape != context.grid.shape:
-        raise SystemExit(f"the scene gives a grid {grid.shape}, the run has {context.grid.shape}")
-    sdf = initial_sdf(context.grid, dataset.train, config, sdf_key)
-    return initial_state(initial_params(sdf, context.grid, config, field_key), config.rates)
-
-
-def _last_state(run: Path, config: Config, params: Params, context: Context) -> TrainState:
+def _last_state(run: Run) -> TrainState:
     """Read the optimiser beside the parameters."""
-    path = latest_checkpoint(run / "checkpoints")
+    path = latest_checkpoint(run.folder.checkpoints)
     assert path is not None
-    like = {"state": jax.eval_shape(lambda: initial_state(params, config.rates))}
-    like["grid"] = jax.eval_shape(lambda: context.grid)
-    tree, _ = load_checkpoint(path, like=like)
-    return tree["state"]
+    like = {
+        "state": jax.eval_shape(lambda: initial_state(run.params)),
+        "surface": jax.eval_shape(lambda: run.pipeline.surface),
+    }
+    return load_checkpoint(path, like=like)[0]["state"]
 
 
 def _advance(
-    state: TrainState, fixed: tuple[Any, ...], config: Config, capacities: Capacities
-) -> tuple[TrainState, StepReport, Capacities]:
+    state: TrainState, batch: Batch, pipeline: Pipeline, rule: UpdateRule
+) -> tuple[TrainState, StepReport, Pipeline]:
     """Make the step, with larger buffers as often as needed."""
-    settings = {"rates": config.rates, "smallest_light": config.run.smallest_light}
-    static = {"model": config.model, "sampling": "face", "objective": config.objective}
-    while True:
+
+    def attempt(capacities: Capacities) -> tuple[tuple[TrainState, StepReport], Usage]:
         copied = jax.tree.map(jnp.copy, state)  # the step consumes it
-        after, report = train_step(copied, *fixed, capacities=capacities, **static, **settings)
-        if bool(report.fits):
-            return after, report, capacities
-        capacities = capacity.grow(capacities, jax.device_get(report.loss.usage), headroom=1.2)
+        sized = replace(pipeline, capacities=capacities)
+        after, report = train_step(copied, batch, sized, rule)
+        return (after, report), report.loss.usage
+
+    (after, report), capacities = capacity.retry(attempt, pipeline.capacities)
+    return after, report, replace(pipeline, capacities=capacities)
 
 
 def study(
-    state: TrainState, dataset: Any, config: Config, context: Context, capacities: Capacities
+    state: TrainState, dataset: Dataset, config: Config, stage: Stage, pipeline: Pipeline
 ) -> dict[str, Any]:
     """Make one step from ``state``, count and follow the loss."""
     step = int(state.step)
-    if sampling_of_step(step, config) != "face":
+    since = step - config.first_step(stage.name)
+    pipeline = pipeline_at(pipeline, config, stage, since)
+    if not isinstance(pipeline.splats, FaceSplats):
         raise SystemExit(f"step {step} samples vertices; only face sampling is counted here")
-    batch = make_batch(dataset.train, step, config)
-    weights = config.loss.at(step / config.run.steps)
-    before, fixed = state.params, (batch, context, weights)
-    advanced, report, capacities = _advance(state, fixed, config, capacities)
+    assert isinstance(pipeline.surface, FlexiCubes)
+    batch = make_batch(dataset.train, step, stage, seed=config.run.seed)
+    before = state.params
+    rule = update_rule(config, stage, before, since)
+    advanced, report, pipeline = _advance(state, batch, pipeline, rule)
     after = advanced.params
-    build = {"model": config.model, "capacities": capacities}
-    objective = config.objective
 
     def look(params: Params) -> dict[str, Any]:
-        seen = observe(params, batch, context, background=objective.background, **build)
-        assert bool(capacity.fits(seen["usage"], capacities))
+        seen = observe(pipeline, params, batch)
+        assert bool(capacity.fits(seen["usage"], pipeline.capacities))
         return jax.device_get(seen)
 
     def evaluate(params: Params) -> tuple[float, dict[str, float], Params]:
-        (total, found), gradient = _value_and_gradient(
-            params, *fixed, objective=objective, sampling="face", **build
-        )
-        assert bool(capacity.fits(found.usage, capacities))
-        terms = {n: float(getattr(weights, n)) * float(found.terms[n]) for n in TERM_NAMES}
+        (total, found), gradient = _value_and_gradient(pipeline, params, batch)
+        assert bool(capacity.fits(found.usage, pipeline.capacities))
+        terms = {n: float(pipeline.weights[n]) * float(value) for n, value in found.terms.items()}
         return float(total), terms, gradient
 
     seen = [look(before), look(after)]
-    rows = count_changes(before, after, seen, config, context, batch.camera.width)
+    grid = pipeline.surface.grid
+    rows = count_changes(before, after, seen, config, grid, batch.camera.width)
     update = jax.tree.map(jnp.subtract, after, before)
     return {
         "step": step,
@@ -567,18 +525,20 @@ def main() -> None:
     enable_compilation_cache()
     retain_freed_memory()
 
-    config, params, context, capacities, meta = load_run(arguments.run)
-    if meta["stage"] != 1:
-        parser.error(f"{arguments.run} ended in stage 2; train it with --set transport.steps=0")
-    record = json.loads((arguments.run / "run.json").read_text())
-    dataset = load_recorded(arguments.scene or Path(record["scene"]), record["dataset"])
+    run = Run(arguments.run, scene=arguments.scene)
+    config, last = run.config, run.trained.stage
+    if not isinstance(run.pipeline.transport, SplitSum):
+        parser.error(f"{arguments.run} ended in {last.name}; train it without that stage's steps")
     results = {}
     for which in arguments.step_from:
         if which == "start":
-            state = _first_state(dataset, config, context)
+            stage = config.active_stages[0]
+            surface, state = _first_state(run.dataset, config)
+            pipeline = build_pipeline(config, stage, surface)
+            pipeline = replace(pipeline, capacities=run.pipeline.capacities)
         else:
-            state = _last_state(arguments.run, config, params, context)
-        results[which] = study(state, dataset, config, context, capacities)
+            stage, pipeline, state = last, run.pipeline, _last_state(run)
+        results[which] = study(state, run.dataset, config, stage, pipeline)
         show(results[which])
     path = arguments.json or arguments.run / "kinks.json"
     path.write_text(json.dumps(results, indent=1) + "\n")

@@ -1,8 +1,8 @@
-"""Measure what every shortcut of stage 2 costs: bias and noise of images and gradients, and time.
+"""Measure what every shortcut of Monte Carlo costs: bias and noise of images and gradients, time.
 
-``python experiments/shortcuts.py RUN --output shortcuts.json`` takes a trained run and evaluates
-an image and the gradient of the loss on one batch of training views with many seeds, for every
-setting of `shortcuts`, against a reference with many samples and shadows.
+``python experiments/studies/shortcuts.py RUN --output shortcuts.json`` takes a trained run and
+evaluates an image and the gradient of the loss on one batch of training views with many seeds, for
+every setting of `shortcuts`, against a reference with many samples and shadows.
 
 Means over few seeds are themselves noisy, those of the reference too. Whatever is compared is
 therefore freed of that noise (`squared_bias`), and where a bias does not exceed twice its standard
@@ -17,74 +17,78 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from geosplat_jax.core import capacity
-from geosplat_jax.core.capacity import Capacities
-from geosplat_jax.core.types import Batch, Camera
+from geosplat_jax.core.capacity import Capacities, Usage
+from geosplat_jax.core.types import Batch
 from geosplat_jax.fit.runtime import (
     enable_compilation_cache,
     release_programs_when_crowded,
     retain_freed_memory,
 )
 from geosplat_jax.fit.stages import make_batch
-from geosplat_jax.fit.train import load_run
-from geosplat_jax.io.dataset import load_recorded
-from geosplat_jax.losses import LossWeights, Objective, loss
-from geosplat_jax.model import Context, Model, Params
-from geosplat_jax.render import reconstruct, render_views
+from geosplat_jax.pipeline import Pipeline
+from geosplat_jax.render import Params, RenderOutput
+from geosplat_jax.run import Run
 from geosplat_jax.transport.denoise import DenoiseSpec
+from geosplat_jax.transport.monte_carlo import MonteCarlo
 
 REFERENCE_SAMPLES = 16
 """Samples of each kind in a pass of the reference."""
 
-IN_COLOUR = LossWeights(
-    mask=0.0, entropy=0.0, deviation=0.0, weights=0.0, smoothness=0.0, light=0.0, indirect=0.0
-)
-"""L1 and SSIM of Eq. 13 alone: the other terms have no samples of light."""
+IN_COLOUR = {"l1": 0.8, "ssim": 0.2}
+"""Weights of L1 and SSIM of Eq. 13 alone: the other terms have no samples of light."""
 
 
-def _shading(model: Model, **changes: Any) -> Model:
-    return replace(model, transport=replace(model.transport, **changes))
+def _shading(pipeline: Pipeline, **changes: Any) -> Pipeline:
+    """Return the pipeline with other settings of its transport."""
+    assert isinstance(pipeline.transport, MonteCarlo)
+    settings = replace(pipeline.transport.settings, **changes)
+    return replace(pipeline, transport=MonteCarlo(settings))
 
 
-def _samples(model: Model, count: int) -> Model:
-    return _shading(model, light=count, diffuse=count, specular=count, residual=count)
+def _samples(pipeline: Pipeline, count: int) -> Pipeline:
+    names = ("light_count", "diffuse_count", "specular_count", "residual_count")
+    return _shading(pipeline, **dict.fromkeys(names, count))
 
 
-def shortcuts(model: Model) -> dict[str, Model]:
+def shortcuts(pipeline: Pipeline) -> dict[str, Pipeline]:
     """Return every setting by what a table calls it, those of the run first."""
-    models = {
-        "as trained": model,
-        "residual from the same samples": _shading(model, residual=0),
-        "own samples in every view": _shading(model, shares_views=False),
-        "back-face culling the other way": replace(model, cull_backfaces=not model.cull_backfaces),
-        "1 sample of each kind": _samples(model, 1),
-        "4 samples": _samples(model, 4),
-        "16 samples": _samples(model, 16),
-        "no occlusion": _shading(model, occlusion=False),
+    raster = pipeline.raster
+    other_way = replace(raster, cull_backfaces=not raster.cull_backfaces)
+    pipelines = {
+        "as trained": pipeline,
+        "residual from the same samples": _shading(pipeline, residual_count=0),
+        "own samples in every view": _shading(pipeline, shares_views=False),
+        "back-face culling the other way": replace(pipeline, raster=other_way),
+        "1 sample of each kind": _samples(pipeline, 1),
+        "4 samples": _samples(pipeline, 4),
+        "16 samples": _samples(pipeline, 16),
+        "no occlusion": _shading(pipeline, occlusion=False),
     }
     for passes in (1, 2, 3):
         denoise = DenoiseSpec(iterations=passes)
-        models[f"denoiser, {passes} pass{'es' * (passes > 1)}"] = _shading(model, denoise=denoise)
-    return models
+        name = f"denoiser, {passes} pass{'es' * (passes > 1)}"
+        pipelines[name] = _shading(pipeline, denoise=denoise)
+    return pipelines
 
 
-def without_shortcuts(model: Model) -> Model:
+def without_shortcuts(pipeline: Pipeline) -> Pipeline:
     """Return the reference: many samples, shadows, no filter.
 
     Culling stays as it was trained: what it hides shaped no image and would be a bias everywhere.
     Views still share samples, which correlates their noise but changes no mean; many samples for
     every view would not fit into memory.
     """
-    exact = _samples(model, REFERENCE_SAMPLES)
+    exact = _samples(pipeline, REFERENCE_SAMPLES)
     return _shading(exact, occlusion=True, denoise=DenoiseSpec(iterations=0))
 
 
@@ -93,65 +97,34 @@ class Scene:
     """A trained run and a batch of its training views."""
 
     params: Params
-    context: Context
-    camera: Camera
-    image: jax.Array
-    model: Model
-    objective: Objective
-    capacities: Capacities
+    batch: Batch
+    pipeline: Pipeline
 
 
-def load_scene(run: Path, views: int) -> Scene:
-    """Read a run that ended in stage 2."""
-    config, params, context, capacities, meta = load_run(run)
-    if config.model.transport.method != "monte_carlo":
-        raise SystemExit(f"{run} ended in stage 1; shortcuts are those of stage 2")
-    description = json.loads((run / "run.json").read_text())
-    data = load_recorded(description["scene"], description["dataset"])
-    config = replace(config, run=replace(config.run, batch_views=views))
-    batch = make_batch(data.train, meta["step"], config)
+def load_scene(folder: Path, views: int) -> Scene:
+    """Read a run that ended in a stage with Monte Carlo."""
+    run = Run(folder)
+    pipeline, stage = run.pipeline, run.trained.stage
+    if not isinstance(pipeline.transport, MonteCarlo):
+        raise SystemExit(f"{folder} ended in the stage {stage.name}, which draws no samples")
+    stage = replace(stage, batch_views=views)
+    batch = make_batch(run.dataset.train, run.trained.step, stage, seed=run.config.run.seed)
     # Random colours behind the object are noise of another kind.
-    objective = replace(config.objective, background="black")
-    return Scene(params, context, batch.camera, batch.image, config.model, objective, capacities)
+    objective = replace(pipeline.objective, background="black")
+    weights = {name: jnp.float32(weight) for name, weight in IN_COLOUR.items()}
+    return Scene(run.params, batch, replace(pipeline, objective=objective, weights=weights))
 
 
-@partial(jax.jit, static_argnames=("model", "capacities"))
-def _image(
-    scene: tuple[Params, Context, Camera],
-    key: jax.Array,
-    *,
-    model: Model,
-    capacities: Capacities,
-) -> tuple[jax.Array, capacity.Usage]:
-    """Return linear images, before the tone map, which is not linear, and the buffers' needs."""
-    params, context, camera = scene
-    asset = reconstruct(params, context, sampling="face", model=model, capacities=capacities)
-    output = render_views(
-        asset, params.light, camera, context, key=key, model=model, capacities=capacities
-    )
-    return output.rgb, output.usage
+@jax.jit
+def _image(pipeline: Pipeline, params: Params, batch: Batch) -> RenderOutput:
+    """Render linear images, before the tone map, which is not linear."""
+    return pipeline.render(params, batch.camera, key=batch.key)
 
 
-@partial(jax.jit, static_argnames=("model", "objective", "capacities"))
-def _gradient(
-    params: Params,
-    batch: Batch,
-    context: Context,
-    *,
-    model: Model,
-    objective: Objective,
-    capacities: Capacities,
-) -> dict[str, jax.Array]:
+@jax.jit
+def _gradient(pipeline: Pipeline, params: Params, batch: Batch) -> dict[str, jax.Array]:
     """Return the gradient of the colours, by groups."""
-    gradient, _ = jax.grad(loss, has_aux=True)(
-        params,
-        batch,
-        context,
-        IN_COLOUR,
-        model=model,
-        objective=objective,
-        capacities=capacities,
-    )
+    gradient, _ = jax.grad(pipeline.loss, has_aux=True)(params, batch)
     groups = {"geometry": gradient.geometry, "material": gradient.material, "light": gradient.light}
     return {name: ravel_pytree(tree)[0] for name, tree in groups.items()}
 
@@ -165,25 +138,27 @@ class Estimates:
     seconds: float
 
 
-def estimate(scene: Scene, model: Model, seeds: range) -> Estimates:
+def estimate(scene: Scene, pipeline: Pipeline, seeds: range) -> Estimates:
     """Draw images and gradients with every seed; buffers grow first, and nothing else is timed."""
-    capacities, place = scene.capacities, (scene.params, scene.context, scene.camera)
-    while True:
-        usage = _image(place, jax.random.key(0), model=model, capacities=capacities)[1]
-        if not capacity.overflowed(usage, capacities):
-            break
-        capacities = capacity.grow(capacities, usage)
-    solid = np.asarray(scene.image[..., 3]) > 0.5
-    options = {"model": model, "objective": scene.objective, "capacities": capacities}
+
+    def drawn(seed: int) -> Batch:
+        return replace(scene.batch, key=jax.random.key(seed))
+
+    def attempt(capacities: Capacities) -> tuple[None, Usage]:
+        sized = replace(pipeline, capacities=capacities)
+        return None, _image(sized, scene.params, drawn(0)).usage
+
+    _, capacities = capacity.retry(attempt, pipeline.capacities)
+    pipeline = replace(pipeline, capacities=capacities)
+    solid = np.asarray(scene.batch.image[..., 3]) > 0.5
 
     def descend(seed: int) -> dict[str, np.ndarray]:
-        batch = Batch(scene.camera, scene.image, jax.random.key(seed))
-        return jax.device_get(_gradient(scene.params, batch, scene.context, **options))
+        return jax.device_get(_gradient(pipeline, scene.params, drawn(seed)))
 
     descend(seeds[0])  # compiles
     images, gradients, seconds = [], [], []
     for seed in seeds:
-        rgb, _ = _image(place, jax.random.key(seed), model=model, capacities=capacities)
+        rgb = _image(pipeline, scene.params, drawn(seed)).rgb
         images.append(np.asarray(rgb, np.float64)[solid].ravel())
         start = time.perf_counter()
         gradients.append(descend(seed))
@@ -271,7 +246,7 @@ def row_text(row: dict[str, Any]) -> str:
 def main() -> int:
     """Run every shortcut and print a table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("run", type=Path, help="folder of a run that ended in stage 2")
+    parser.add_argument("run", type=Path, help="folder of a run that ended with Monte Carlo")
     parser.add_argument("--views", type=int, default=4, help="training views (default: 4)")
     parser.add_argument("--seeds", type=int, default=12, help="evaluations of each (default: 12)")
     parser.add_argument("--output", type=Path, help="write all figures as JSON")
@@ -281,11 +256,11 @@ def main() -> int:
     enable_compilation_cache()
     retain_freed_memory()
     scene = load_scene(options.run, options.views)
-    reference = without_shortcuts(scene.model)
+    reference = without_shortcuts(scene.pipeline)
     exact = estimate(scene, reference, range(1000, 1000 + options.seeds))
     table: dict[str, dict[str, Any]] = {}
-    for name, model in shortcuts(scene.model).items():
-        table[name] = compare(estimate(scene, model, range(options.seeds)), exact)
+    for name, pipeline in shortcuts(scene.pipeline).items():
+        table[name] = compare(estimate(scene, pipeline, range(options.seeds)), exact)
         if len(table) == 1:
             print("| shortcut | " + " | ".join(table[name]) + " |")
             print("|---|" + "---|" * len(table[name]))

@@ -7,37 +7,49 @@ draws the figure from what the two left in ``--output``.
 import argparse
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import precision_plot as measures
 from precision_plot import GROUPS, Outcome, Stage, cast, errors, save
 
-from geosplat_jax import render as render_module
-from geosplat_jax.adapter import GAUSSIANS_PER_FACE, face_gaussians, shift_inwards
+from geosplat_jax.adapter import FaceSplats, face_splats, shift_inwards
 from geosplat_jax.core import capacity as capacity_module
-from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.capacity import Capacities, Usage
 from geosplat_jax.core.color import tone_map
+from geosplat_jax.core.mesh import vertex_normals
 from geosplat_jax.core.numerics import safe_normalize
-from geosplat_jax.core.types import Batch, Camera, EnvLight, Grid, Materials, Mesh
-from geosplat_jax.fit.config import Config, make_config
+from geosplat_jax.core.types import Batch, Camera, EnvLight, Materials, Mesh
+from geosplat_jax.fit.config import Config
+from geosplat_jax.fit.presets import SPLIT_SUM, make_config
 from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
-from geosplat_jax.fit.stages import initial_params, initial_sdf, make_batch, make_context
-from geosplat_jax.fit.step import make_optimizer
-from geosplat_jax.fit.train import load_run, plan_capacities
-from geosplat_jax.geometry import face_normals_and_areas, isosurface, sdf_entropy, vertex_normals
+from geosplat_jax.fit.stages import (
+    build_pipeline,
+    initial_params,
+    make_batch,
+    pipeline_at,
+    update_rule,
+)
+from geosplat_jax.fit.step import StepReport, initial_state, train_step
+from geosplat_jax.fit.train import plan_capacities
 from geosplat_jax.gradcheck.differences import double_precision
 from geosplat_jax.gradcheck.whole_stages import _from_groups, _groups
 from geosplat_jax.hashgrid import HashGridSpec, Layer, encode
-from geosplat_jax.io.dataset import load_dataset
+from geosplat_jax.io.dataset import Dataset, load_dataset
 from geosplat_jax.io.images import encode_srgb
-from geosplat_jax.io.views import Views
-from geosplat_jax.losses import light_term, loss, photometric_terms
+from geosplat_jax.losses import (
+    compare,
+    image_dissimilarity,
+    image_l1,
+    light_agreement,
+    mask_error,
+)
 from geosplat_jax.materials import (
     ROUGHNESS_MINIMUM,
     MaterialField,
@@ -45,13 +57,13 @@ from geosplat_jax.materials import (
     smoothness,
     to_unit_cube,
 )
-from geosplat_jax.model import Context, Params
-from geosplat_jax.render import grid_center_and_extent
-from geosplat_jax.splats.projection import project
+from geosplat_jax.pipeline import LossReport, Pipeline
+from geosplat_jax.render import Params
+from geosplat_jax.run import Run
 from geosplat_jax.splats.rasterize import TileLists, composite, gather_visible
-from geosplat_jax.surface.hull import fit_grid
+from geosplat_jax.surface.grids import sdf_entropy
 from geosplat_jax.transport.environment import prefilter
-from geosplat_jax.transport.split_sum import split_sum
+from geosplat_jax.transport.split_sum import SplitSum, split_sum
 
 STORED = (
     "hash tables",
@@ -70,9 +82,6 @@ def to_bfloat16(x: jax.Array) -> jax.Array:
     """Round values to bfloat16, keep the dtype, and let gradients pass as if nothing had been."""
     rounded = jax.lax.reduce_precision(x, exponent_bits=8, mantissa_bits=7)
     return x + jax.lax.stop_gradient(rounded - x)
-
-
-# --- whole training runs ------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -114,74 +123,69 @@ def rounded_where(params: Params, is_rounded: dict[str, jax.Array]) -> Params:
     return jax.tree_util.tree_map_with_path(leaf, params)
 
 
-@partial(jax.jit, static_argnames=("config", "capacities"))
-def training_step(params, optimizer, batch, context, weights, is_rounded, *, config, capacities):
-    """`step.train_step` with rounding in the forward pass; rounding is traced: one compilation."""
+class RoundedPipeline(Pipeline):
+    """A pipeline whose loss sees some groups of the parameters rounded to bfloat16.
 
-    def evaluate(params: Params) -> tuple[jax.Array, Any]:
-        return loss(
-            rounded_where(params, is_rounded),
-            batch,
-            context,
-            weights,
-            model=config.model,
-            objective=config.objective,
-            capacities=capacities,
-        )
+    Attributes
+    ----------
+    is_rounded : by group; traced, so that all variants share a program.
+    """
 
-    (total, report), gradient = jax.value_and_grad(evaluate, has_aux=True)(params)
-    updates, optimizer = make_optimizer(config.rates).update(gradient, optimizer, params)
-    moved = jax.tree.map(jnp.add, params, updates)
-    radiance = jnp.maximum(moved.light.radiance, config.run.smallest_light)
-    moved = replace(moved, light=replace(moved.light, radiance=radiance))
-    return moved, optimizer, total, report.usage
+    is_rounded: dict[str, jax.Array] = eqx.field(default_factory=dict)
+
+    def loss(self, params: Params, batch: Batch) -> tuple[jax.Array, LossReport]:
+        """Evaluate the loss at the rounded parameters."""
+        return super().loss(rounded_where(params, self.is_rounded), batch)
 
 
-def start(views: Views, bounds: Any, config: Config) -> tuple[Params, Context]:
-    """Build parameters and constants as `train.fit` does."""
-    sdf_key, field_key = jax.random.split(jax.random.key(config.run.seed))
-    grid = fit_grid(bounds, config.geometry.resolution)
-    sdf = initial_sdf(grid, views, config, sdf_key)
-    return initial_params(sdf, grid, config, field_key), make_context(grid, config.model)
-
-
-def run_variant(
-    variant: Variant,
-    views: Views,
-    bounds: Any,
-    config: Config,
-    capacities: Capacities,
-) -> tuple[list[float], dict[int, Params], float]:
-    """Train one variant; return losses, snapshots and the median seconds a step."""
-    config = replace(config, run=replace(config.run, seed=variant.seed))
-    params, context = start(views, bounds, config)
+def start(dataset: Dataset, config: Config, variant: Variant) -> tuple[Params, RoundedPipeline]:
+    """Build parameters and pipeline as `train.fit` does."""
+    shape_key, field_key = jax.random.split(jax.random.key(config.run.seed))
+    surface, shape = config.geometry.start(dataset, shape_key)
+    params = initial_params(shape, config, field_key)
     if variant.nudged:
         sdf = jnp.nextafter(params.geometry.sdf, jnp.inf)
         params = replace(params, geometry=replace(params.geometry, sdf=sdf))
-    is_rounded = flags_of(variant)
-    keep, losses, seconds = set(measures.snapshot_steps(config.run.steps)), [], []
+    plain = build_pipeline(config, config.stage(SPLIT_SUM), surface)
+    parts = {f.name: getattr(plain, f.name) for f in fields(plain)}
+    return params, RoundedPipeline(**parts, is_rounded=flags_of(variant))
+
+
+def run_variant(
+    variant: Variant, dataset: Dataset, config: Config, capacities: Capacities
+) -> tuple[list[float], dict[int, Params], float]:
+    """Train one variant; return losses, snapshots and the median seconds of a step."""
+    config = replace(config, run=replace(config.run, seed=variant.seed))
+    stage = config.stage(SPLIT_SUM)
+    params, pipeline = start(dataset, config, variant)
+    keep, losses, seconds = set(measures.snapshot_steps(stage.steps)), [], []
     snapshots = {0: jax.device_get(params)}
-    batches = (make_batch(views, step, config) for step in range(config.run.steps))
 
     def train() -> None:
-        state = cast(params, variant.dtype)
-        constants = cast(context, variant.dtype)
-        optimizer = make_optimizer(config.rates).init(state)
-        room = capacities
-        for step, batch in enumerate(batches):
+        state, room = initial_state(cast(params, variant.dtype)), capacities
+        for step in range(stage.steps):
+            batch = make_batch(dataset.train, step, stage, seed=config.run.seed)
             began = time.perf_counter()
-            weights = config.loss.at(step / config.run.steps)
-            inputs = (state, optimizer, cast(batch, variant.dtype), constants, weights, is_rounded)
-            while True:
-                *new, total, needed = training_step(*inputs, config=config, capacities=room)
-                if not capacity_module.overflowed(needed, room):
-                    break
-                room = capacity_module.grow(room, needed)
-            state, optimizer = new
-            losses.append(float(total))
+            inputs = (
+                batch,
+                pipeline_at(pipeline, config, stage, step),
+                update_rule(config, stage, params, step),
+            )
+            batch, current, rule = cast(inputs, variant.dtype)
+
+            def attempt(
+                room: Capacities, batch: Batch = batch, current: Any = current, rule: Any = rule
+            ) -> tuple[StepReport, Usage]:
+                nonlocal state
+                sized = replace(current, capacities=room)
+                state, report = train_step(state, batch, sized, rule)
+                return report, report.loss.usage
+
+            report, room = capacity_module.retry(attempt, room)
+            losses.append(float(report.total))
             seconds.append(time.perf_counter() - began)
             if step + 1 in keep:
-                snapshots[step + 1] = jax.device_get(state)
+                snapshots[step + 1] = jax.device_get(state.params)
 
     if variant.dtype == "float64":
         with double_precision():
@@ -193,25 +197,19 @@ def run_variant(
 
 def train_command(arguments: argparse.Namespace) -> None:
     """Train every variant; distances are from the float64 run of the same seed."""
-    overrides = (f"run.steps={arguments.steps}", *arguments.set)
+    overrides = (f"stages.{SPLIT_SUM}.steps={arguments.steps}", *arguments.set)
     config = make_config("default", arguments.quality, overrides=overrides)
     dataset = load_dataset(arguments.scene)
-    params, context = start(dataset.train, dataset.bounds, config)
-    room = plan_capacities(
-        params,
-        dataset.train.camera(),
-        context,
-        model=config.model,
-        sampling="face",
-        max_quads=config.geometry.max_quads,
-    )
-    room = Capacities(**{k: capacity_module.bucket(int(1.15 * v)) for k, v in vars(room).items()})
+    params, pipeline = start(dataset, config, Variant("float32"))
+    room = plan_capacities(pipeline, params, dataset.train.camera(), limits=config.geometry.limits)
+    room = Capacities(**{k: capacity_module.bucket(int(1.15 * v)) for k, v in room.items()})
+    pipeline = replace(pipeline, capacities=room)
     outcomes, records = {}, {}
     for variant in VARIANTS[: arguments.variants]:
-        trained = run_variant(variant, dataset.train, dataset.bounds, config, room)
+        trained = run_variant(variant, dataset, config, room)
         losses, snapshots, seconds = trained
         final = rounded_where(cast(snapshots[max(snapshots)], np.float32), flags_of(variant))
-        images, figures = measures.held_out(final, context, config, room, dataset.test)
+        images, figures = measures.held_out(final, pipeline, dataset.test)
         outcome = Outcome(losses, snapshots, images, figures, seconds)
         outcomes[variant.name] = outcome
         reference = next(iter(outcomes.values()))
@@ -230,8 +228,6 @@ def train_command(arguments: argparse.Namespace) -> None:
         save(arguments.output / "train.json", records)
 
 
-# --- the stages of a trained run ----------------------------------------------------------------
-
 Store = Callable[[str, jax.Array], jax.Array]
 
 
@@ -241,7 +237,7 @@ def exact(name: str, x: jax.Array) -> jax.Array:
 
 
 def heads(field: MaterialField, features: jax.Array, spec: MaterialSpec, store: Store):
-    """`materials.attributes_at` behind the encoding, with every activation stored."""
+    """Evaluate `materials.attributes_at` behind the encoding, with every activation stored."""
     field = jax.tree.map(lambda w: store("MLP weights", w), replace(field, albedo_table=None))
     active = []
 
@@ -265,97 +261,101 @@ def heads(field: MaterialField, features: jax.Array, spec: MaterialSpec, store: 
 def chain(
     params: Params,
     camera: Camera,
-    context: Context,
+    pipeline: Pipeline,
     *,
-    config: Config,
-    capacities: Capacities,
     lists: TileLists | None = None,
     store: Store = exact,
 ) -> dict[str, Any]:
-    """`render.render` of one view with every intermediate by name; `stages` checks that it is."""
-    model, grid, spec = config.model, context.grid, config.model.material
-    pose, intrinsics = camera.world_to_camera[0], camera.intrinsics[0]
-    frame = {"height": camera.height, "width": camera.width}
+    """Render one view, with every intermediate by name; `stages_command` compares with `render`."""
+    spec, box = pipeline.fields, pipeline.surface.box
+    assert isinstance(pipeline.transport, SplitSum)
+    assert isinstance(pipeline.splats, FaceSplats)
     geometry = replace(params.geometry, sdf=store("SDF", params.geometry.sdf))
-    surface = isosurface(geometry, grid, capacities=capacities, training=True)
+    surface = pipeline.surface.extract(geometry, capacities=pipeline.capacities)
     mesh, normals = surface.mesh, vertex_normals(surface.mesh)
-    center, half = grid_center_and_extent(grid)
-    gaussians = face_gaussians(mesh, normals, constants=model.adapter, unit=half)
-    unit = to_unit_cube(jax.lax.stop_gradient(gaussians.means), center, half)
+    splats = face_splats(mesh, normals, constants=pipeline.splats.constants, unit=box.half_extent)
+    unit = to_unit_cube(jax.lax.stop_gradient(splats.anchors), box)
     table = store("hash tables", params.material.albedo_table)
     encoded = store("MLP activations", encode(table, unit, spec=spec.grid))
     materials, shift, active = heads(params.material, encoded, spec, store)
-    face_normal, area = face_normals_and_areas(mesh)
-    moved = shift_inwards(gaussians, face_normal, area, shift)
+    moved = shift_inwards(splats, mesh, shift)
     if lists is None:
-        outward = jnp.repeat(face_normal, GAUSSIANS_PER_FACE, axis=0)
-        settings = {"model": model, "capacities": capacities}
-        lists = render_module._visible_in_view(
-            moved, outward, pose, intrinsics, grid, image_shape=tuple(frame.values()), **settings
-        )
+        lists = pipeline.visible(moved, camera)
     seen = partial(gather_visible, lists.index)
-    light = prefilter(EnvLight(store("light texels", params.light.radiance)), context.operators)
+    light = EnvLight(store("light texels", params.light.radiance))
+    light = prefilter(light, pipeline.transport.operators)
     light = replace(light, specular=store("prefiltered light", light.specular))
     means, lit = seen(moved.means), jax.tree.map(seen, materials)
-    view = safe_normalize(camera.centers[0][None, :] - means)
-    shaded = split_sum(lit, seen(moved.normals), view, light, context.fg_table)
+    view = safe_normalize(camera.centers - means)
+    shaded = split_sum(lit, seen(moved.normals), view, light, pipeline.transport.fg_table)
     splat_inputs = {"means": means, "quats": seen(moved.quats)}
     splat_inputs["scales"] = seen(moved.scales, padding=1.0)
-    near = model.near * half
-    cameras = {"world_to_camera": pose, "intrinsics": intrinsics, "near": near, **frame}
-    splats = project(**splat_inputs, **cameras)
-    splats = replace(
-        splats,
-        means2d=store("means2d", splats.means2d),
-        conics=store("conics", splats.conics),
+    footprints = pipeline.project(**splat_inputs, camera=camera)
+    footprints = replace(
+        footprints,
+        means2d=store("means2d", footprints.means2d),
+        conics=store("conics", footprints.conics),
     )
     colours = store("splat colours", shaded.rgb)
     opacities = seen(moved.opacities)
-    features = jnp.concatenate([colours, shaded.diffuse_light, shaded.specular_light], axis=1)
-    image, alpha = composite(splats, opacities, features, lists, tile_size=model.tile_size, **frame)
-    got = {"mesh": mesh, "vertex normals": normals, "gaussians": gaussians, "unit": unit}
+    features = jnp.concatenate([colours, shaded.diffuse_light, shaded.specular], axis=1)
+    image, alpha = composite(
+        footprints,
+        opacities,
+        features,
+        lists,
+        height=camera.height,
+        width=camera.width,
+        tile_size=pipeline.raster.tile_size,
+    )
+    got = {"mesh": mesh, "vertex normals": normals, "splats": splats, "unit": unit}
     got |= {"encoded": encoded, "active": active, "materials": materials, "shift": shift}
     got |= {"lists": lists, "light": light, "lit": lit, "seen normals": seen(moved.normals)}
-    got |= {"view": view, "colours": colours, "splat inputs": splat_inputs, "splats": splats}
-    got |= {"opacities": opacities, "image": image[..., :3], "lights": image[..., 3:]}
-    return got | {"alpha": alpha}
+    got |= {"view": view, "colours": colours, "splat inputs": splat_inputs}
+    got |= {"footprints": footprints, "opacities": opacities}
+    return got | {"image": image[..., :3], "lights": image[..., 3:], "alpha": alpha}
 
 
-def surface_stages(params: Params, grid: Grid, got: dict[str, Any], config: Config, room) -> list:
-    """Stages from the isosurface to the Gaussians."""
+def surface_stages(params: Params, pipeline: Pipeline, got: dict[str, Any]) -> list[Stage]:
+    """Stages from the isosurface to the splats."""
     geometry = {"geometry": params.geometry}
-    unit = grid_center_and_extent(grid)[1]
 
-    def surface(x: Any, grid: Grid) -> dict[str, Any]:
-        out = isosurface(x["geometry"], grid, capacities=room, training=True)
-        return {"vertices": out.mesh.vertices}
+    def extract(x: Any, pipeline: Pipeline) -> Any:
+        return pipeline.surface.extract(x["geometry"], capacities=pipeline.capacities)
 
-    def deviation(x: Any, grid: Grid) -> dict[str, Any]:
-        return {"L_dev": isosurface(x["geometry"], grid, capacities=room, training=True).deviation}
+    def surface(x: Any, pipeline: Pipeline) -> dict[str, Any]:
+        return {"vertices": extract(x, pipeline).mesh.vertices}
+
+    def deviation(x: Any, pipeline: Pipeline) -> dict[str, Any]:
+        return {"L_dev": extract(x, pipeline).deviation}
 
     def normals(x: Any, mesh: Mesh) -> dict[str, Any]:
         return {"normals": vertex_normals(replace(mesh, vertices=x["vertices"]))}
 
     def adapter(x: Any, constants: Any) -> dict[str, Any]:
-        mesh = replace(constants["mesh"], vertices=x["vertices"])
-        made = face_gaussians(
-            mesh, x["normals"], constants=config.model.adapter, unit=constants["unit"]
+        mesh, pipeline = constants
+        made = face_splats(
+            replace(mesh, vertices=x["vertices"]),
+            x["normals"],
+            constants=pipeline.splats.constants,
+            unit=pipeline.surface.box.half_extent,
         )
         return {name: getattr(made, name) for name in ("means", "quats", "scales", "normals")}
 
     mesh, vertices = got["mesh"], {"vertices": got["mesh"].vertices}
     both = {**vertices, "normals": got["vertex normals"]}
     return [
-        Stage("isosurface", surface, geometry, grid),
-        Stage("L_dev", deviation, geometry, grid),
+        Stage("isosurface", surface, geometry, pipeline),
+        Stage("L_dev", deviation, geometry, pipeline),
         Stage("vertex normals", normals, vertices, mesh),
-        Stage("adapter", adapter, both, {"mesh": mesh, "unit": unit}),
+        Stage("adapter", adapter, both, (mesh, pipeline)),
     ]
 
 
-def shading_stages(params: Params, context: Context, got: dict[str, Any], config: Config) -> list:
+def shading_stages(params: Params, pipeline: Pipeline, got: dict[str, Any]) -> list[Stage]:
     """Stages of materials and light."""
-    spec, field = config.model.material, params.material
+    spec, field = pipeline.fields, params.material
+    assert isinstance(pipeline.transport, SplitSum)
 
     def hash_grid(x: Any, unit: Any) -> dict[str, Any]:
         return {"features": encode(x["tables"], unit, spec=spec.grid)}
@@ -374,54 +374,63 @@ def shading_stages(params: Params, context: Context, got: dict[str, Any], config
 
     shade_inputs = {"materials": got["lit"], "normals": got["seen normals"], "view": got["view"]}
     shade_inputs["levels"] = got["light"].specular
+    rest = replace(field, albedo_table=None)
     return [
         Stage("hash grid", hash_grid, {"tables": field.albedo_table}, got["unit"]),
-        Stage(
-            "MLPs", mlps, {"heads": replace(field, albedo_table=None), "features": got["encoded"]}
-        ),
-        Stage("prefilter", light, {"light": params.light.radiance}, context.operators),
-        Stage("split sum", shade, shade_inputs, context.fg_table),
+        Stage("MLPs", mlps, {"heads": rest, "features": got["encoded"]}),
+        Stage("prefilter", light, {"light": params.light.radiance}, pipeline.transport.operators),
+        Stage("split sum", shade, shade_inputs, pipeline.transport.fg_table),
     ]
 
 
-def image_stages(camera: Camera, got: dict[str, Any], near: Any, config: Config) -> list:
-    """Stages of splats and images; the rasteriser uses the same lists in both precisions."""
-    frame = {"height": camera.height, "width": camera.width}
+def image_stages(camera: Camera, pipeline: Pipeline, got: dict[str, Any]) -> list[Stage]:
+    """Stages of footprints and images; the rasteriser uses the same lists in both precisions."""
     parts = ("means2d", "conics", "compensation", "depths")
+    tile_size = pipeline.raster.tile_size
 
     def projection(x: Any, constants: Any) -> dict[str, Any]:
-        camera, near = constants
-        splats = project(
-            **x,
-            world_to_camera=camera.world_to_camera[0],
-            intrinsics=camera.intrinsics[0],
-            near=near,
-            **frame,
-        )
-        return {name: getattr(splats, name) for name in parts}
+        camera, pipeline = constants
+        footprints = pipeline.project(**x, camera=camera)
+        return {name: getattr(footprints, name) for name in parts}
 
     def rasteriser(x: Any, constants: Any) -> dict[str, Any]:
-        splats, lists, kept = constants
-        splats = replace(splats, **{name: x[name] for name in parts[:3]})
+        footprints, lists, kept = constants
+        footprints = replace(footprints, **{name: x[name] for name in parts[:3]})
         image, alpha = composite(
-            splats, x["opacities"], x["colours"], lists, tile_size=config.model.tile_size, **frame
+            footprints,
+            x["opacities"],
+            x["colours"],
+            lists,
+            height=camera.height,
+            width=camera.width,
+            tile_size=tile_size,
         )
         return {"image": kept[..., None] * image, "alpha": kept * alpha}
 
-    inputs = {name: getattr(got["splats"], name) for name in parts[:3]}
+    inputs = {name: getattr(got["footprints"], name) for name in parts[:3]}
     inputs |= {"opacities": got["opacities"], "colours": got["colours"]}
     real = int(np.sum(np.asarray(got["lists"].index) < len(got["shift"])))
     splat_inputs = {name: x[:real] for name, x in got["splat inputs"].items()}
-    both = (got["splats"], got["lists"])
-    clear = np.float64(~measures.undecided(got, config.model.tile_size, camera))
+    both = (got["footprints"], got["lists"])
+    clear = np.float64(~measures.undecided(got, tile_size, camera))
     return [
-        Stage("projection", projection, splat_inputs, (camera, near)),
+        Stage("projection", projection, splat_inputs, (camera, pipeline)),
         Stage("rasteriser", rasteriser, inputs, (*both, np.ones_like(clear))),
         Stage("- undecided pixels", rasteriser, inputs, (*both, clear)),
     ]
 
 
-def loss_stages(params: Params, batch: Batch, context: Context, got, config: Config, room) -> list:
+PHOTOMETRIC = {"l1": image_l1, "ssim": image_dissimilarity, "mask": mask_error}
+"""The terms of Eq. 13."""
+
+
+def loss_stages(
+    params: Params,
+    batch: Batch,
+    pipeline: Pipeline,
+    got: dict[str, Any],
+    last_weights: dict[str, float],
+) -> list[Stage]:
     """Every term of the loss on its own inputs, and the whole loss from the parameters."""
     photo = {"rgb": got["image"][None], "alpha": got["alpha"][None]}
     photo["exposure"] = params.log_exposure
@@ -433,65 +442,77 @@ def loss_stages(params: Params, batch: Batch, context: Context, got, config: Con
         def function(x: Any, constants: Any) -> dict[str, Any]:
             image, behind, covered = constants
             rgb = covered[..., None] * tone_map(x["rgb"], x["exposure"])
-            terms, _ = photometric_terms(rgb, covered * x["alpha"], image, behind, srgb=False)
-            return {term: terms[term]}
+            images = compare(rgb, covered * x["alpha"], image, behind, None, srgb=False)
+            return {term: PHOTOMETRIC[term](images)}
 
         return Stage(f"loss: {term}", function, photo, (batch.image[:1], background, covered))
 
     def smooth(x: Any, constants: Any) -> dict[str, Any]:
-        points, mask, key, center, half = constants
-        spec = config.model.material
-        settings = {"spec": spec, "center": center, "half_extent": half}
-        return {"smoothness": smoothness(x["material"], points, mask, key, **settings)}
+        points, mask, key, pipeline = constants
+        changes = smoothness(
+            x["material"], points, mask, key, pipeline.surface.box, spec=pipeline.fields
+        )
+        return {"smoothness": changes.albedo + changes.roughness + changes.metallic}
 
     def light(x: Any, image: Any) -> dict[str, Any]:
-        return {"light": light_term(x["diffuse"], x["specular"], image)}
+        return {"light": light_agreement(x["diffuse"], x["specular"], x["exposure"], image)}
 
-    def entropy(x: Any, grid: Grid) -> dict[str, Any]:
-        return {"entropy": sdf_entropy(x["geometry"], grid)}
+    def entropy(x: Any, pipeline: Any) -> dict[str, Any]:
+        return {"entropy": sdf_entropy(x["geometry"], pipeline.surface.grid)}
 
     def whole(x: Any, constants: Any) -> dict[str, Any]:
-        settings = {"model": config.model, "objective": config.objective, "capacities": room}
-        total, report = loss(_from_groups(x), *constants, **settings)
+        batch, pipeline = constants
+        total, report = pipeline.loss(_from_groups(x), batch)
         # Terms that are only read have no cotangent.
         return {"total": total, **jax.lax.stop_gradient(report.terms)}
 
-    full = config.loss.at(1.0)
-    weights = {"whole loss": full, "- smoothness": replace(full, smoothness=0.0)}
-    weights["- smoothness, L1"] = replace(full, smoothness=0.0, l1=0.0)
-    count = config.objective.smoothness_samples
-    picked = np.linspace(0, int(got["gaussians"].count) - 1, count).astype(int)
-    points, mask = np.asarray(got["gaussians"].means)[picked], np.ones(count, bool)
-    where = grid_center_and_extent(context.grid)
+    left_out = {
+        "whole loss": (),
+        "- smoothness": ("smoothness",),
+        "- smoothness, L1": ("smoothness", "l1"),
+    }
+    losses = {
+        title: replace(
+            pipeline,
+            weights={
+                name: jnp.float32(weight)
+                for name, weight in last_weights.items()
+                if not name.startswith(without)
+            },
+        )
+        for title, without in left_out.items()
+    }
+    count = pipeline.objective.smoothness_samples
+    picked = np.linspace(0, int(got["splats"].count) - 1, count).astype(int)
+    points, mask = np.asarray(got["splats"].means)[picked], np.ones(count, bool)
     lights = {"diffuse": got["lights"][None, ..., :3], "specular": got["lights"][None, ..., 3:]}
+    lights["exposure"] = params.log_exposure
+    chosen = (points, mask, jax.random.key(1), pipeline)
     return [
-        *(photometric(term) for term in ("l1", "ssim", "mask")),
-        Stage(
-            "loss: smoothness",
-            smooth,
-            {"material": params.material},
-            (points, mask, jax.random.key(1), *where),
-        ),
+        *(photometric(term) for term in PHOTOMETRIC),
+        Stage("loss: smoothness", smooth, {"material": params.material}, chosen),
         Stage("loss: light", light, lights, batch.image[:1]),
-        Stage("loss: entropy", entropy, {"geometry": params.geometry}, context.grid),
-        *(Stage(name, whole, _groups(params), (batch, context, w)) for name, w in weights.items()),
+        Stage("loss: entropy", entropy, {"geometry": params.geometry}, pipeline),
+        *(Stage(name, whole, _groups(params), (batch, p)) for name, p in losses.items()),
     ]
 
 
-def half_rows(params: Params, batch: Batch, context: Context, config: Config, room) -> dict:
+def half_rows(params: Params, batch: Batch, pipeline: Pipeline) -> dict[str, Any]:
     """Effect on image and gradient of one view of rounding one kind of stored value at a time."""
 
-    def picture(params: Params, batch: Batch, context: Context, is_rounded: dict[str, Any]) -> Any:
+    def picture(
+        params: Params, batch: Batch, pipeline: Pipeline, is_rounded: dict[str, Any]
+    ) -> Any:
         def store(name: str, x: jax.Array) -> jax.Array:
             return jnp.where(is_rounded[name], to_bfloat16(x), x)
 
-        settings = {"config": config, "capacities": room, "store": store}
-        got = chain(params, batch.camera, context, **settings)
+        got = chain(params, batch.camera, pipeline, store=store)
         rgb = tone_map(got["image"], params.log_exposure)
         target = batch.image[:1]
         black = jnp.zeros_like(target[..., :3])
-        terms, _ = photometric_terms(rgb[None], got["alpha"][None], target, black, srgb=False)
-        total = 0.8 * terms["l1"] + 0.2 * terms["ssim"] + 5.0 * terms["mask"]
+        images = compare(rgb[None], got["alpha"][None], target, black, None, srgb=False)
+        weights = {"l1": 0.8, "ssim": 0.2, "mask": 5.0}
+        total = sum(weight * PHOTOMETRIC[name](images) for name, weight in weights.items())
         return total, rgb + (1.0 - got["alpha"])[..., None]
 
     run = jax.jit(jax.value_and_grad(picture, has_aux=True))
@@ -502,11 +523,11 @@ def half_rows(params: Params, batch: Batch, context: Context, config: Config, ro
         n: {name: np.array(name in chosen) for name in STORED} for n, chosen in choices.items()
     }
     with double_precision():
-        inputs = cast((params, batch, context), np.float64)
+        inputs = cast((params, batch, pipeline), np.float64)
         exact_result = jax.device_get(run(*inputs, flags["nothing (float32)"]))
     found = {}
     for name, chosen in flags.items():
-        (_, image), gradient = jax.device_get(run(params, batch, context, chosen))
+        (_, image), gradient = jax.device_get(run(params, batch, pipeline, chosen))
         (_, exact_image), exact_gradient = exact_result
         error = np.mean((encode_srgb(image.clip(0, 1)) - encode_srgb(exact_image.clip(0, 1))) ** 2)
         groups, exact_groups = _groups(gradient), _groups(exact_gradient)
@@ -520,47 +541,43 @@ def half_rows(params: Params, batch: Batch, context: Context, config: Config, ro
 
 def stages_command(arguments: argparse.Namespace) -> None:
     """Measure every stage on a trained run, the whole chain, and what bfloat16 would do."""
-    config, params, context, room, meta = load_run(arguments.run_folder)
-    if meta["stage"] != 1:
-        raise SystemExit(
-            f"{arguments.run_folder} ended in stage 2; train it with --set transport.steps=0"
-        )
-    dataset = load_dataset(arguments.scene)
-    batch = make_batch(dataset.train, meta["step"], config)
-    camera = jax.tree.map(lambda x: x[:1], batch.camera)
+    run = Run(arguments.run_folder, scene=arguments.scene)
+    config, params, pipeline, stage = run.config, run.params, run.pipeline, run.trained.stage
+    if not isinstance(pipeline.transport, SplitSum):
+        raise SystemExit(f"{run.folder} ended in {stage.name}; train it without that stage's steps")
+    batch = make_batch(run.dataset.train, run.trained.step, stage, seed=config.run.seed)
+    camera = batch.camera.view(0)
     first = replace(batch, camera=camera, image=batch.image[:1])
-    forward = jax.jit(partial(chain, config=config, capacities=room))
-    one = jax.device_get(forward(params, camera, context))
+    forward = jax.jit(chain)
+    one = jax.device_get(forward(params, camera, pipeline))
     with double_precision():
-        two = jax.device_get(forward(*cast((params, camera, context), np.float64)))
-    shared = jax.device_get(forward(params, camera, context, lists=two["lists"]))
-    output = jax.jit(partial(render_module.render, model=config.model, capacities=room))
-    expected = output(params, camera, context).rgb[0]
+        two = jax.device_get(forward(*cast((params, camera, pipeline), np.float64)))
+    shared = jax.device_get(forward(params, camera, pipeline, lists=two["lists"]))
+    expected = jax.jit(Pipeline.render)(pipeline, params, camera).rgb[0]
     assert errors(one["image"], expected)["l2"] < 1e-5, "the chain differs from render"
 
-    near = config.model.near * grid_center_and_extent(context.grid)[1]
     stages = [
-        *surface_stages(params, context.grid, two, config, room),
-        *shading_stages(params, context, two, config),
-        *image_stages(camera, two, near, config),
-        *loss_stages(params, batch, context, two, config, room),
+        *surface_stages(params, pipeline, two),
+        *shading_stages(params, pipeline, two),
+        *image_stages(camera, pipeline, two),
+        *loss_stages(params, batch, pipeline, two, stage.weights_at(stage.steps)),
     ]
     record: dict[str, Any] = {"stages": {}}
     print(f"{'stage':18s} | values: L2, worst, off | gradients: L2, worst, off, other sign")
-    for stage in stages:
-        found = record["stages"][stage.name] = measures.measure(stage)
+    for part in stages:
+        found = record["stages"][part.name] = measures.measure(part)
         v, g = found["values"]["all"], found["gradients"]["all"]
         print(
-            f"{stage.name:18s} | {v['l2']:.1e} {v['worst']:.1e} {v['off']:.1e} "
+            f"{part.name:18s} | {v['l2']:.1e} {v['worst']:.1e} {v['off']:.1e} "
             f"| {g['l2']:.1e} {g['worst']:.1e} {g['off']:.1e} {g['sign']:.1e}",
             flush=True,
         )
         save(arguments.output / "stages.json", record)
     record["decisions"] = measures.decisions(one, shared, two, config, camera)
     record["chain"] = measures.accumulated(one, shared, two)
-    record["bfloat16"] = half_rows(params, first, context, config, room)
-    points = two["unit"][: int(two["gaussians"].count)]
-    specs = {"draft": config.model.material.grid, "standard": HashGridSpec()}
+    record["bfloat16"] = half_rows(params, first, pipeline)
+    points = two["unit"][: int(two["splats"].count)]
+    specs = {"draft": config.material.grid, "standard": HashGridSpec()}
     record["times"] = {name: measures.half_times(points, spec) for name, spec in specs.items()}
     for part in ("decisions", "chain", "bfloat16", "times"):
         print(f"\n{part}")
@@ -577,12 +594,12 @@ def main() -> None:
     train.add_argument("scene", type=Path)
     train.add_argument("--quality", default="draft")
     train.add_argument("--steps", type=int, default=120)
-    train.add_argument("--set", nargs="*", default=[], help="overrides, e.g. loss.smoothness=0.0")
+    train.add_argument("--set", nargs="*", default=[], help="overrides of settings")
     train.add_argument("--variants", type=int, default=len(VARIANTS), help="only the first so many")
     train.set_defaults(run=train_command)
     stages = commands.add_parser("stages", help="every stage on a trained run")
     stages.add_argument("run_folder", metavar="RUN", type=Path)
-    stages.add_argument("--scene", type=Path, default=Path("examples/duck"))
+    stages.add_argument("--scene", type=Path, help="where the scene is now, if it has moved")
     stages.set_defaults(run=stages_command)
     plot = commands.add_parser("plot", help="the figure")
     plot.add_argument("--image", type=Path, default=Path("docs/images/precision.png"))

@@ -1,4 +1,4 @@
-"""Measures of experiments/precision.py, and its figure."""
+"""Measures of experiments/studies/precision.py, and its figure."""
 
 import json
 import time
@@ -13,16 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from geosplat_jax import hashgrid
-from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.core.types import Camera
 from geosplat_jax.fit.config import Config
 from geosplat_jax.gradcheck.differences import double_precision
 from geosplat_jax.hashgrid import HashGridSpec, encode
 from geosplat_jax.io.views import Views
-from geosplat_jax.model import Context, Params
+from geosplat_jax.pipeline import Pipeline
+from geosplat_jax.render import Params
 from geosplat_jax.report.metrics import normal_mae_deg, psnr
 from geosplat_jax.report.renderer import Renderer, photograph_on_white, render_on_white
-from geosplat_jax.splats.projection import Splats
+from geosplat_jax.splats.projection import Footprints
 from geosplat_jax.splats.rasterize import MAX_ALPHA, MIN_ALPHA, TileLists
 
 GROUPS = ("geometry", "tables", "heads", "light", "exposure")
@@ -120,7 +120,9 @@ def measure(stage: Stage) -> dict[str, Any]:
     }
 
 
-def raw_alphas(splats: Splats, opacities: Any, lists: TileLists, tile: int, width: int) -> Any:
+def raw_alphas(
+    footprints: Footprints, opacities: Any, lists: TileLists, tile: int, width: int
+) -> Any:
     """Compute alphas before cut and clamp in the pixels of each hit's tile, and those pixels."""
     real = lists.chunk_ranks < len(lists.index)
     ranks = np.where(real, lists.chunk_ranks, 0)
@@ -128,17 +130,19 @@ def raw_alphas(splats: Splats, opacities: Any, lists: TileLists, tile: int, widt
     corner = tile * np.stack([lists.chunk_tiles % columns, lists.chunk_tiles // columns], -1)
     inside = np.stack(np.meshgrid(np.arange(tile), np.arange(tile)), -1).reshape(-1, 2) + 0.5
     pixels = np.broadcast_to(corner[:, None] + inside, (*ranks.shape, tile * tile, 2))
-    offset = pixels - np.asarray(splats.means2d)[ranks][:, :, None]
+    offset = pixels - np.asarray(footprints.means2d)[ranks][:, :, None]
     dx, dy = offset[..., 0], offset[..., 1]
-    xx, xy, yy = np.moveaxis(np.asarray(splats.conics)[ranks][..., None], 2, 0)
+    xx, xy, yy = np.moveaxis(np.asarray(footprints.conics)[ranks][..., None], 2, 0)
     sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
-    alphas = (opacities * splats.compensation)[ranks][..., None] * np.exp(-sigma)
+    alphas = (opacities * footprints.compensation)[ranks][..., None] * np.exp(-sigma)
     return alphas[real], pixels[real]
 
 
 def undecided(got: dict, tile: int, camera: Camera) -> np.ndarray:
     """Mark the pixels of which some alpha lies at the cut, (H, W)."""
-    alphas, pixels = raw_alphas(got["splats"], got["opacities"], got["lists"], tile, camera.width)
+    alphas, pixels = raw_alphas(
+        got["footprints"], got["opacities"], got["lists"], tile, camera.width
+    )
     close = np.abs(alphas - MIN_ALPHA) < UNDECIDED * MIN_ALPHA
     mark = np.zeros((camera.height, camera.width), bool)
     x, y = pixels[close].astype(int).T
@@ -150,7 +154,7 @@ def undecided(got: dict, tile: int, camera: Camera) -> np.ndarray:
 def decisions(one: dict, shared: dict, two: dict, config: Config, camera: Camera) -> dict[str, Any]:
     """Count the discrete choices that differ between precisions, and how many there are."""
     first, second = one["lists"], two["lists"]
-    count = int(two["gaussians"].count)
+    count = int(two["splats"].count)
     rows = [lists.index[lists.index < count] for lists in (first, second)]
     rank = np.full(count, -1)
     rank[rows[0]] = np.arange(len(rows[0]))
@@ -160,17 +164,17 @@ def decisions(one: dict, shared: dict, two: dict, config: Config, camera: Camera
         real = lists.chunk_ranks < len(lists.index)
         owner = lists.index[np.where(real, lists.chunk_ranks, 0)].astype(np.int64)
         hits.append((lists.chunk_tiles[None, :] * (count + 1) + owner)[real])
-    tile = config.model.tile_size
+    tile = config.raster.tile_size
     a, b = (
-        raw_alphas(x["splats"], x["opacities"], second, tile, camera.width)[0]
+        raw_alphas(x["footprints"], x["opacities"], second, tile, camera.width)[0]
         for x in (shared, two)
     )
-    cells = np.array(config.model.material.grid.resolutions, np.float32)
+    cells = np.array(config.material.grid.resolutions, np.float32)
     corners = [np.floor(x["unit"][:count, None, :] * cells[None, :, None]) for x in (one, two)]
     active = [x["active"][:count] for x in (one, two)]
     return {
         "faces": (int(np.sum(one["mesh"].faces != two["mesh"].faces)), two["mesh"].faces.size),
-        "visible Gaussians": (len(np.setxor1d(*rows)), len(rows[1])),
+        "visible splats": (len(np.setxor1d(*rows)), len(rows[1])),
         "neighbours in depth": (int(np.sum(np.diff(order[order >= 0]) < 0)), len(rows[1])),
         "tile hits": (len(np.setxor1d(*hits)), len(hits[1])),
         "alpha cuts": (int(np.sum((a >= MIN_ALPHA) != (b >= MIN_ALPHA))), a.size),
@@ -186,15 +190,15 @@ def accumulated(one: dict, shared: dict, two: dict) -> dict[str, Any]:
     read = {
         "vertices": (one, lambda x: x["mesh"].vertices),
         "vertex normals": (one, lambda x: x["vertex normals"]),
-        "Gaussian means": (one, lambda x: x["gaussians"].means),
-        "Gaussian quats": (one, lambda x: x["gaussians"].quats),
-        "Gaussian scales": (one, lambda x: x["gaussians"].scales),
+        "splat means": (one, lambda x: x["splats"].means),
+        "splat quats": (one, lambda x: x["splats"].quats),
+        "splat scales": (one, lambda x: x["splats"].scales),
         "hash features": (one, lambda x: x["encoded"]),
         "materials": (one, lambda x: x["materials"]),
         "light levels": (one, lambda x: x["light"].specular),
         "splat colours": (shared, lambda x: x["colours"]),
-        "means2d": (shared, lambda x: x["splats"].means2d),
-        "conics": (shared, lambda x: x["splats"].conics[x["lists"].index < len(x["shift"])]),
+        "means2d": (shared, lambda x: x["footprints"].means2d),
+        "conics": (shared, lambda x: x["footprints"].conics[x["lists"].index < len(x["shift"])]),
         "image, same lists": (shared, lambda x: x["image"]),
         "image, own lists": (one, lambda x: x["image"]),
         "alpha, own lists": (one, lambda x: x["alpha"]),
@@ -247,10 +251,10 @@ def compare_runs(outcome: Outcome, reference: Outcome) -> dict[str, Any]:
 
 
 def held_out(
-    params: Params, context: Context, config: Config, room: Capacities, test: Views
+    params: Params, pipeline: Pipeline, test: Views
 ) -> tuple[np.ndarray, dict[str, float]]:
     """Render test views in float32 from the parameters as stored; PSNR and normal error."""
-    renderer = Renderer(config, params, context, room)
+    renderer = Renderer(pipeline, params)
     images, scores, angles = [], [], []
     for index in range(len(test)):
         view, image = renderer(test.camera(np.array([index]))), test.images[index]
@@ -307,7 +311,7 @@ def half_times(points: Any, spec: HashGridSpec, repeats: int = 21) -> dict[str, 
 
 
 def draw_errors(axis: Any, stages: dict[str, Any]) -> None:
-    """Bars of the relative L2 error of values and gradients, a pair a stage."""
+    """Bars of the relative L2 error of values and gradients, a pair per stage."""
     names = [name for name in stages if not name.startswith("-")]
     place = np.arange(len(names))
     for shift, part, colour in ((-0.2, "values", "#4c72b0"), (0.2, "gradients", "#dd8452")):

@@ -1,0 +1,157 @@
+"""Settings as frozen dataclasses that know the range and the meaning of every field.
+
+`settings` makes such a class: values are checked on construction, the string below a field says
+what it means, and instances are hashable where their fields are, so that they can be static fields
+of a jitted module. A `Variant` is a base class of settings of which a field may hold any subclass:
+a new way of doing something is a new class, in whatever file, and is written to JSON under its
+``kind``.
+"""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass
+from typing import Annotated, Any, ClassVar, TypeVar, dataclass_transform
+
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic import ConfigDict, Field, GetCoreSchemaHandler, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass as _checked_dataclass
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+
+_CONFIG = ConfigDict(extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)
+
+Count = Annotated[int, Field(ge=0)]
+"""0, 1, 2, ..."""
+PositiveCount = Annotated[int, Field(ge=1)]
+"""1, 2, 3, ..."""
+NonNegative = Annotated[float, Field(ge=0)]
+"""A finite number that is not negative."""
+Positive = Annotated[float, Field(gt=0)]
+"""A finite number above 0."""
+Share = Annotated[float, Field(ge=0, le=1)]
+"""A number from 0 to 1."""
+
+_NESTED = "nested_settings"
+"""Type of an error whose text begins with the rest of the path."""
+
+_Class = TypeVar("_Class")
+
+
+@dataclass_transform(frozen_default=True)
+def settings(kind: type[_Class]) -> type[_Class]:
+    """Make a class of frozen, checked settings; see the module."""
+    made: Any = _checked_dataclass(frozen=True, config=_CONFIG)(kind)
+    return made
+
+
+class Variant:
+    """Base of settings of several kinds; ``class Mine(Base, kind="mine")`` adds one."""
+
+    kinds: ClassVar[dict[str, type]]
+    kind: ClassVar[str]
+
+    def __init_subclass__(cls, kind: str | None = None, **others: Any) -> None:
+        """Register a kind with the nearest base that is no kind itself."""
+        super().__init_subclass__(**others)
+        if kind is None:
+            cls.kinds = {}
+        else:
+            cls.kind = kind
+            cls.kinds[kind] = cls
+
+
+class _AnyKind:
+    """Marks a field that holds any kind of its type: ``Annotated[Base, ANY_KIND]``."""
+
+    def __get_pydantic_core_schema__(self, base: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        def choose(value: Any, check: Callable[[Any], Any]) -> Any:
+            if isinstance(value, base) or not isinstance(value, dict):
+                return check(value)
+            rest = dict(value)
+            kind = rest.pop("kind", None)
+            if kind not in base.kinds:
+                raise ValueError(f"kind must be one of {sorted(base.kinds)}, got {kind!r}")
+            try:
+                return from_plain(base.kinds[kind], rest)
+            except ValueError as error:
+                raise PydanticCustomError(_NESTED, "{text}", {"text": str(error)}) from None
+
+        return core_schema.no_info_wrap_validator_function(choose, handler(base))
+
+
+ANY_KIND = _AnyKind()
+
+
+def to_plain(value: Any) -> Any:
+    """Turn settings into nested dictionaries, lists and numbers, ready for JSON."""
+    if is_dataclass(value) and not isinstance(value, type):
+        plain = {f.name: to_plain(getattr(value, f.name)) for f in fields(value)}
+        return {"kind": value.kind, **plain} if isinstance(value, Variant) else plain
+    if isinstance(value, dict):
+        return {name: to_plain(item) for name, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [to_plain(item) for item in value]
+    return value
+
+
+def from_plain(kind: type[_Class], values: Any, where: str = "") -> _Class:
+    """Build settings from what `to_plain` returned, possibly after a trip through JSON.
+
+    Raises
+    ------
+    ValueError
+        One line: the path of the first setting that is wrong, what is wrong, and its value.
+    """
+    try:
+        return TypeAdapter(kind).validate_json(json.dumps(values), strict=True)
+    except ValidationError as error:
+        raise ValueError(_first_problem(error, where)) from None
+
+
+def _first_problem(error: ValidationError, where: str) -> str:
+    """Describe the first thing that pydantic refused."""
+    first = error.errors()[0]
+    path = ".".join(filter(None, [where, *map(str, first["loc"])]))
+    if first["type"] == "unexpected_keyword_argument":
+        return f"unknown setting {path}"
+    if first["type"] == _NESTED:
+        unknown = "unknown setting "
+        text = first["msg"]
+        if text.startswith(unknown):
+            return f"{unknown}{path}.{text.removeprefix(unknown)}"
+        return f"{path}.{text}"
+    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "value_error":
+        return f"{path}: {message}" if path else message
+    message = message.removeprefix("Input should be ")
+    return f"{path} must be {message}, got {first.get('input')!r}"
+
+
+def listed(value: Any, where: str = "") -> Iterator[tuple[str, Any, str, str]]:
+    """Yield path, value, range and meaning of every single setting in ``value``."""
+    if isinstance(value, dict):
+        for name, item in value.items():
+            yield from listed(item, f"{where}{name}.")
+        return
+    for name, field in value.__pydantic_fields__.items():
+        item, path = getattr(value, name), f"{where}{name}"
+        if is_dataclass(item) or (isinstance(item, dict) and item):
+            yield from listed(item, f"{path}.")
+        elif isinstance(item, tuple) and item and is_dataclass(item[0]):
+            for part in item:
+                yield from listed(part, f"{path}.{getattr(part, 'name', '')}.")
+        else:
+            yield path, item, _range(field), " ".join((field.description or "").split())
+
+
+_LIMITS = ((">=", Ge, "ge"), (">", Gt, "gt"), ("<=", Le, "le"), ("<", Lt, "lt"))
+
+
+def _range(field: Any) -> str:
+    """Write the limits of a field."""
+    written = [
+        f"{sign} {getattr(limit, name)}"
+        for limit in field.metadata
+        for sign, kind, name in _LIMITS
+        if isinstance(limit, kind)
+    ]
+    return ", ".join(written)

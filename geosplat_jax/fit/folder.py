@@ -1,0 +1,280 @@
+"""The folder of a run: what lies where, who may write, what survives an interruption.
+
+::
+
+    run.json              scene, how it was read, settings, versions
+    metrics.jsonl         one line per step
+    checkpoints/          parameters, optimiser, step, capacities
+    stages/NAME/          the checkpoint that stage NAME ended with
+    previews/             truth, render and normals while training
+    training.json         how long the whole training took
+    metrics.json, *.png   what the last evaluation found
+"""
+
+import importlib.metadata
+import json
+import os
+import platform
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from geosplat_jax.fit.config import Config, config_from_dict
+from geosplat_jax.io.dataset import Dataset
+
+_PACKAGES = ("jax", "jaxlib", "numpy", "optax", "geosplat_jax")
+_OWN = (
+    *("metrics.json", "overview.png", "materials.png", "relight.png"),
+    *("checkpoints", "stages", "previews", "metrics.jsonl", "training.json", "run.json"),
+)
+"""What evaluation and training write; the record goes last: it says that the rest is a run."""
+
+
+_LOCK = ".lock"
+
+
+class RunError(RuntimeError):
+    """A run's folder cannot be used as it was asked for; the message says why, and the cure."""
+
+
+class RunFolder:
+    """Where a run lives; nothing is read or written until a method says so."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    @property
+    def metrics(self) -> Path:
+        """One line of JSON per step."""
+        return self.path / "metrics.jsonl"
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the checkpoints."""
+        return self.path / "checkpoints"
+
+    @property
+    def previews(self) -> Path:
+        """Folder of the previews."""
+        return self.path / "previews"
+
+    def end_of(self, stage: str) -> Path:
+        """Folder of the checkpoint that a stage ended with."""
+        return self.path / "stages" / stage
+
+    @property
+    def _record_path(self) -> Path:
+        return self.path / "run.json"
+
+    @property
+    def exists(self) -> bool:
+        """Whether there is a run."""
+        return self._record_path.exists()
+
+    def record(self) -> dict[str, Any]:
+        """Read what the run says about itself.
+
+        Raises
+        ------
+        RunError
+            If there is no run, or ``run.json`` is damaged.
+        """
+        if not self.exists:
+            raise RunError(f"{self.path} is not a run (it has no run.json)")
+        try:
+            record = json.loads(self._record_path.read_text(encoding="utf-8"))
+        except (json.JSONDecodeError, UnicodeDecodeError) as error:
+            raise RunError(f"{self._record_path} is damaged: {error}") from None
+        missing = {"scene", "dataset", "config"} - set(record if isinstance(record, dict) else ())
+        if missing:
+            raise RunError(f"{self._record_path} lacks {sorted(missing)}; it is no record of a run")
+        return record
+
+    def config(self) -> Config:
+        """Read the settings of the run.
+
+        Raises
+        ------
+        RunError
+            If there is no run, or its settings are not those of this version.
+        """
+        values = self.record()["config"]
+        try:
+            return config_from_dict(values)
+        except ValueError as error:
+            raise RunError(f"{self._record_path}: {error}") from None
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the folder; the lock ends with the process, however that ends.
+
+        Raises
+        ------
+        RunError
+            If another process holds it, or it is no run and holds other files.
+        """
+        self._require_own()
+        self.path.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(self.path / _LOCK)
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            raise RunError(
+                f"another process is writing to {self.path}; wait for it, or take another folder"
+            ) from None
+        try:
+            yield
+        finally:
+            lock.release()
+
+    def _require_own(self) -> None:
+        """Refuse a folder in which somebody else's files lie."""
+        if self.exists or not self.path.exists():
+            return
+        if not self.path.is_dir():
+            raise RunError(f"{self.path} exists already, and is no folder; choose another")
+        others = sorted(path.name for path in self.path.iterdir() if path.name != _LOCK)
+        if others:
+            raise RunError(
+                f"{self.path} exists already and holds other files, {others[0]} for one; choose "
+                "an empty folder"
+            )
+
+    def require_free(self, *, replace: bool) -> None:
+        """Refuse a folder that holds a run, unless that is to be replaced.
+
+        Raises
+        ------
+        RunError
+            If there is a run and ``replace`` is not set.
+        """
+        if self.exists and not replace:
+            raise RunError(
+                f"{self.path} holds a run; continue it with --resume, replace it with --force, or "
+                "choose another --output"
+            )
+
+    def begin(self, dataset: Dataset, config: Config, *, replace: bool) -> None:
+        """Write the record of a new run; call it with the lock held.
+
+        Raises
+        ------
+        RunError
+            See `require_free`.
+        """
+        self.require_free(replace=replace)
+        self.clear()
+        self._write_record(
+            {
+                **_scene_of(dataset),
+                "config": config.to_dict(),
+                "versions": {
+                    "python": platform.python_version(),
+                    **{name: importlib.metadata.version(name) for name in _PACKAGES},
+                },
+            }
+        )
+
+    def clear(self) -> None:
+        """Remove what training and evaluation wrote, and nothing else."""
+        for name in _OWN:
+            path = self.path / name
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+
+    def repoint(self, dataset: Dataset) -> None:
+        """Make a dataset the run's own, which was the same but elsewhere when it was trained.
+
+        Raises
+        ------
+        RunError
+            If its views are others, or were read in another way.
+        """
+        record, now = self.record(), _scene_of(dataset)
+        self.require_same_scene(dataset)
+        if record["scene"] != now["scene"]:
+            self._write_record({**record, **now})
+
+    def require_same_scene(self, dataset: Dataset) -> None:
+        """Refuse a dataset whose views are not those of the run.
+
+        Raises
+        ------
+        RunError
+            With the first difference.
+        """
+        record, now = self.record(), _scene_of(dataset)
+        for name in ("dataset", "views"):
+            if name in record and record[name] != now[name]:
+                raise RunError(
+                    f"{self._record_path} says that the run was trained on {record['scene']} with "
+                    f"{name} {record[name]}, not {now[name]}; take the same, or another folder"
+                )
+
+    def _write_record(self, record: dict[str, Any]) -> None:
+        """Replace ``run.json`` in one go."""
+        aside = self._record_path.with_suffix(".partial")
+        aside.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        os.replace(aside, self._record_path)
+
+    def metric_lines(self) -> list[dict[str, Any]]:
+        """Read ``metrics.jsonl``; a last line that an interruption tore is left out.
+
+        Raises
+        ------
+        RunError
+            If any other line is damaged.
+        """
+        if not self.metrics.exists():
+            return []
+        texts = self.metrics.read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = []
+        for number, text in enumerate(texts, 1):
+            try:
+                line = json.loads(text)
+                int(line["step"])
+            except (json.JSONDecodeError, KeyError, TypeError, ValueError):
+                if number == len(texts):
+                    break
+                raise RunError(f"line {number} of {self.metrics} is damaged") from None
+            lines.append(line)
+        return lines
+
+    def keep_lines_before(self, step: int) -> None:
+        """Drop the metrics of steps that a checkpoint does not contain."""
+        if self.metrics.exists():
+            lines = [line for line in self.metric_lines() if line["step"] < step]
+            aside = self.metrics.with_suffix(".partial")
+            aside.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+            os.replace(aside, self.metrics)
+
+    def write_training(self, summary: dict[str, Any]) -> None:
+        """Note how the training went as a whole."""
+        (self.path / "training.json").write_text(json.dumps(summary, indent=2) + "\n")
+
+    def training(self) -> dict[str, Any] | None:
+        """Read what `write_training` noted; None before the end."""
+        path = self.path / "training.json"
+        return json.loads(path.read_text()) if path.exists() else None
+
+
+def _scene_of(dataset: Dataset) -> dict[str, Any]:
+    """Return where a dataset is, how it was read, and what tells it from another."""
+    views = dataset.train
+    return {
+        "scene": str(dataset.root.resolve()),
+        "dataset": dict(dataset.options),
+        "views": f"{len(views)} of {views.width} x {views.height}, {views.fingerprint()}",
+    }

@@ -1,0 +1,331 @@
+"""Presets and quality levels by name.
+
+A preset says *which method* (``paper``: the appendix; ``code``: the authors' program; ``default``:
+what measures best here), a quality level *how much work* (``draft``, ``standard``, ``high``). A
+material prior says where roughness and metallic start. `make_config` combines them and applies
+overrides written as ``section.field=value``.
+"""
+
+from dataclasses import replace
+from typing import Any, Literal
+
+from geosplat_jax.adapter import AdapterConstants
+from geosplat_jax.fit.config import (
+    Config,
+    Rate,
+    RunSettings,
+    Stage,
+    config_from_dict,
+    merge,
+    parse_override,
+)
+from geosplat_jax.fit.entering import FreshAlbedo
+from geosplat_jax.fit.surfaces import FlexiCubesSettings
+from geosplat_jax.hashgrid import HashGridSpec
+from geosplat_jax.losses import Schedule
+from geosplat_jax.materials import MATERIAL_PRIORS, MaterialSpec
+from geosplat_jax.render import RasterSettings
+from geosplat_jax.transport.environment import LightSpec
+from geosplat_jax.transport.monte_carlo import MonteCarloSettings
+from geosplat_jax.transport.split_sum import SplitSumSettings
+
+PRESETS = ("default", "paper", "code")
+QUALITIES = ("draft", "standard", "high")
+SPLIT_SUM, MONTE_CARLO = "split_sum", "monte_carlo"
+"""Names of the stages of every preset."""
+
+_SURFACE = ("sdf", "deform", "weights")
+
+
+def _rates(surface: float, *, surface_warmup: int = 0, **others: float | Rate) -> dict[str, Rate]:
+    """Give the three groups of the isosurface one rate, and every other group its own."""
+    rates = dict.fromkeys(_SURFACE, Rate(surface, surface_warmup))
+    named = {n: r if isinstance(r, Rate) else Rate(r) for n, r in others.items()}
+    return rates | named
+
+
+def _weights(**weights: float | Schedule) -> dict[str, Schedule]:
+    """Make schedules of constant weights."""
+    return {n: w if isinstance(w, Schedule) else Schedule(w) for n, w in weights.items()}
+
+
+def _default() -> Config:
+    """Return what measures best at standard quality (docs/quality.md, docs/ablations.md)."""
+    photometric = {"l1": 0.8, "ssim": 0.2, "mask": 5.0}
+    surface = {"deviation": 0.5, "weights": 0.1}
+    smooth = {"smoothness_albedo": 0.03, "smoothness_roughness_metallic": 0.03}
+    split_sum = Stage(
+        name=SPLIT_SUM,
+        steps=500,
+        rates=_rates(
+            1e-2,
+            albedo=3e-3,
+            roughness_metallic=1.5e-3,
+            shift=3e-3,
+            light=1e-2,
+            exposure=5e-3,
+        ),
+        weights=_weights(**photometric, entropy=Schedule(0.2, 0.01, 0.5), **surface, **smooth),
+    )
+    # Materials learn faster than light, and what they have explained, shadows included, light has
+    # no reason to explain again; so they wait. Few samples make noisy gradients, so the surface is
+    # slower than the authors'.
+    monte_carlo = Stage(
+        name=MONTE_CARLO,
+        steps=300,
+        half_life=225.0,
+        transport=MonteCarloSettings(
+            light_count=2, diffuse_count=2, specular_count=2, residual_count=2, indirect="constant"
+        ),
+        enter=(FreshAlbedo("mean"),),
+        rates=_rates(
+            1e-3,
+            surface_warmup=50,
+            albedo=Rate(5e-3, 150),
+            roughness_metallic=Rate(4e-3, 150),
+            shift=3e-3,
+            indirect=1e-2,
+            light=1e-2,
+            exposure=5e-3,
+        ),
+        weights=_weights(**photometric, entropy=0.01, **surface, **smooth, indirect=0.001),
+    )
+    return Config(
+        preset="default", material=MaterialSpec(shared=True), stages=(split_sum, monte_carlo)
+    )
+
+
+def _original(
+    name: str, *, adapter: AdapterConstants, material: MaterialSpec, stages: tuple[Stage, ...]
+) -> Config:
+    """Return what the paper and the authors share.
+
+    96 cells along every side of a cube, noise as the first surface, grid vertices that move by a
+    quarter of a cell, splats that look away rendered too, two encodings that pull on the geometry.
+    """
+    return Config(
+        preset=name,
+        geometry=FlexiCubesSettings(
+            resolution=96, initial="random", cubic=True, reach=0.25, max_quads=1_200_000
+        ),
+        adapter=adapter,
+        material=replace(material, shared=False, position_gradient=True),
+        light=LightSpec(height=256, width=512),
+        raster=RasterSettings(cull_backfaces=False),
+        run=RunSettings(),
+        stages=stages,
+    )
+
+
+def _original_stages(
+    *,
+    split_sum_weights: dict[str, Schedule],
+    monte_carlo_weights: dict[str, Schedule],
+    baked_diffuse: bool,
+    indirect: Literal["constant", "harmonics"],
+) -> tuple[Stage, ...]:
+    """Return the stages that the paper and the authors share: 8 views, 128 rays per splat."""
+    surface = {"deviation": 0.5, "weights": 0.1}
+    split_sum = Stage(
+        name=SPLIT_SUM,
+        steps=500,
+        batch_views=8,
+        vertex_fraction=0.1,  # 5 % of the whole training
+        light_knee=0.0,
+        transport=SplitSumSettings(baked_diffuse=baked_diffuse),
+        rates=_rates(
+            1e-2,
+            albedo=3e-3,
+            roughness_metallic=1.5e-3,
+            shift=3e-3,
+            light=1e-2,
+            exposure=5e-3,
+        ),
+        weights={**split_sum_weights, **_weights(**surface)},
+    )
+    monte_carlo = Stage(
+        name=MONTE_CARLO,
+        steps=500,
+        batch_views=8,
+        light_knee=0.0,
+        transport=MonteCarloSettings(
+            light_count=64, diffuse_count=32, specular_count=32, indirect=indirect
+        ),
+        enter=(FreshAlbedo("grey" if baked_diffuse else "mean"),),
+        rates=_rates(
+            3e-3,
+            surface_warmup=50,
+            albedo=1e-2,
+            roughness_metallic=2e-3,
+            shift=3e-3,
+            indirect=1e-2,
+            light=1e-2,
+            exposure=5e-3,
+        ),
+        weights={**monte_carlo_weights, **_weights(**surface, indirect=0.001)},
+    )
+    return (split_sum, monte_carlo)
+
+
+def _paper() -> Config:
+    """Return the numbers of the appendix, the two stages taken from the authors' program."""
+    photometric = {"l1": 1.0, "ssim": 0.2, "mask": 5.0}
+    others = {
+        "smoothness_albedo": 0.03,
+        "smoothness_roughness_metallic": 0.03,
+        "light": 0.15,
+    }
+    # One ramp of the entropy's weight, which ends in the middle of the whole training.
+    stages = _original_stages(
+        split_sum_weights=_weights(**photometric, entropy=Schedule(0.2, 0.01), **others),
+        monte_carlo_weights=_weights(**photometric, entropy=0.01, **others),
+        baked_diffuse=False,
+        indirect="harmonics",
+    )
+    material = MaterialSpec(
+        grid=HashGridSpec(levels=16, features=2, log2_entries=19, coarsest=32, finest=4096),
+        has_shift=False,
+    )
+    adapter = AdapterConstants(opacity=1.0, shading_frame=True)
+    return _original("paper", adapter=adapter, material=material, stages=stages)
+
+
+def _code(material_prior: str) -> Config:
+    """Return the authors' numbers; smoothness there is a mean over channels, here a sum."""
+    photometric = {"l1": 0.8, "ssim": 0.2, "mask": 5.0}
+    is_specular = material_prior == "specular"
+    stages = _original_stages(
+        split_sum_weights=_weights(
+            **photometric,
+            entropy=Schedule(0.2, 0.12),
+            smoothness_albedo=Schedule(0.5 / 3 if is_specular else 0.0, 0.03 / 3),
+            smoothness_roughness_metallic=Schedule(0.1 / 2 if is_specular else 0.0, 0.001 / 2),
+            white_balance=0.002,
+        ),
+        monte_carlo_weights=_weights(
+            **photometric,
+            entropy=Schedule(0.2, 0.01),
+            smoothness_albedo=0.03 / 3,
+            smoothness_roughness_metallic=0.03 / 2,
+            normal_smoothness=0.03 if is_specular else 0.0,
+        ),
+        baked_diffuse=True,
+        indirect="constant",
+    )
+    split_sum, monte_carlo = stages
+    rates = dict(split_sum.rates)
+    if is_specular:
+        rates |= {name: Rate(5e-2) for name in _SURFACE}
+        monte_carlo = replace(monte_carlo, steps=1000)
+    if material_prior in ("specular", "glossy"):
+        rates |= {"light": Rate(3e-2), "exposure": Rate(1.5e-2)}
+    material = MaterialSpec(
+        grid=HashGridSpec(levels=16, features=2, log2_entries=18, coarsest=16, finest=4096)
+    )
+    return _original(
+        "code",
+        adapter=AdapterConstants(u=1 / 9 - 1 / 24, v=2 / 9),
+        material=material,
+        stages=(replace(split_sum, rates=rates), monte_carlo),
+    )
+
+
+# What each quality level spends.
+_QUALITY: dict[str, dict[str, Any]] = {
+    "draft": {
+        "geometry": {"resolution": 32},
+        "material": {"grid": {"levels": 6, "features": 4, "log2_entries": 14, "finest": 128}},
+        "stages": {
+            SPLIT_SUM: {"steps": 200, "batch_views": 2, "half_life": 100.0},
+            MONTE_CARLO: {
+                "steps": 150,
+                "batch_views": 2,
+                "half_life": 110.0,
+                "rates": {
+                    **dict.fromkeys(_SURFACE, {"warmup": 25}),
+                    "albedo": {"value": 1e-2, "warmup": 75},
+                    "roughness_metallic": {"value": 8e-3, "warmup": 75},
+                },
+            },
+        },
+    },
+    "standard": {},
+    "high": {
+        "geometry": {"resolution": 80},
+        "stages": {
+            SPLIT_SUM: {"steps": 1000, "batch_views": 6, "half_life": 400.0},
+            MONTE_CARLO: {
+                "steps": 500,
+                "batch_views": 6,
+                "half_life": 375.0,
+                "transport": {"light_count": 8, "diffuse_count": 8, "residual_count": 4},
+                "rates": {"albedo": {"warmup": 250}, "roughness_metallic": {"warmup": 250}},
+            },
+        },
+    },
+}
+
+# A draft of another's method: its numbers with less of everything.
+_ORIGINAL_DRAFT: dict[str, Any] = {
+    "geometry": {"resolution": 32},
+    "material": {"grid": {"levels": 8, "log2_entries": 15, "coarsest": 16, "finest": 256}},
+    "light": {"height": 64, "width": 128},
+    "stages": {
+        SPLIT_SUM: {"steps": 200, "batch_views": 2, "half_life": 320.0},
+        MONTE_CARLO: {
+            "steps": 150,
+            "batch_views": 2,
+            "half_life": 320.0,
+            "transport": {"light_count": 8, "diffuse_count": 4, "specular_count": 4},
+            "rates": dict.fromkeys(_SURFACE, {"warmup": 15}),
+        },
+    },
+}
+
+
+def make_config(
+    preset: str = "default",
+    quality: str = "standard",
+    *,
+    material_prior: str = "hybrid",
+    overrides: tuple[str, ...] = (),
+) -> Config:
+    """Combine a preset, a quality level and overrides into a validated `Config`.
+
+    Parameters
+    ----------
+    preset : one of `PRESETS`.
+    quality : one of `QUALITIES`. Of the presets ``paper`` and ``code``, ``draft`` is a smaller
+        version; ``standard`` and ``high`` are their own numbers.
+    material_prior : where roughness and metallic start, one of `materials.MATERIAL_PRIORS`.
+    overrides : ``section.field=value`` strings, applied last.
+
+    Raises
+    ------
+    ValueError
+        On an unknown name, a value of the wrong type or out of range.
+    """
+    if preset not in PRESETS:
+        raise ValueError(f"preset must be one of {PRESETS}, got {preset!r}")
+    if quality not in QUALITIES:
+        raise ValueError(f"quality must be one of {QUALITIES}, got {quality!r}")
+    if material_prior not in MATERIAL_PRIORS:
+        raise ValueError(
+            f"material_prior must be one of {sorted(MATERIAL_PRIORS)}, got {material_prior!r}"
+        )
+    if preset == "default":
+        config, changes = _default(), _QUALITY[quality]
+    else:
+        config = _paper() if preset == "paper" else _code(material_prior)
+        changes = _ORIGINAL_DRAFT if quality == "draft" else {}
+    roughness_logit, metallic_logit = MATERIAL_PRIORS[material_prior]
+    material = replace(
+        config.material,
+        initial_roughness_logit=float(roughness_logit),
+        initial_metallic_logit=float(metallic_logit),
+    )
+    config = replace(config, quality=quality, material_prior=material_prior, material=material)
+    values = merge(config.to_dict(), changes)
+    for override in overrides:
+        values = merge(values, parse_override(override))
+    return config_from_dict(values)

@@ -1,0 +1,138 @@
+"""Settings of the surfaces: what a run starts from, and how large it may become."""
+
+import abc
+from typing import Annotated, Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+from pydantic import Field
+
+from geosplat_jax.core.settings import PositiveCount, Variant, settings
+from geosplat_jax.core.types import Geometry, Grid
+from geosplat_jax.geometry import FlexiCubes, initial_geometry, random_sdf, sphere_sdf
+from geosplat_jax.io.dataset import Dataset
+from geosplat_jax.surface.base import SurfaceModel
+from geosplat_jax.surface.hull import fit_grid, hull_sdf
+
+_SDF_REACH = 2.0
+"""The first SDF is clipped to so many cells, so that the surface can be moved in few steps."""
+
+
+@settings
+class SurfaceSettings(Variant, abc.ABC):
+    """Settings of a surface; every kind of them is a subclass."""
+
+    @property
+    @abc.abstractmethod
+    def rate_groups(self) -> tuple[str, ...]:
+        """Names of the learning rates of its shape (see `core.types.learned`)."""
+
+    @property
+    @abc.abstractmethod
+    def penalty_names(self) -> tuple[str, ...]:
+        """Names of its terms in the loss."""
+
+    @property
+    def limits(self) -> dict[str, int]:
+        """Largest sensible need of a buffer, by name; beyond it the surface has exploded."""
+        return {}
+
+    @abc.abstractmethod
+    def start(self, dataset: Dataset, key: Key[Array, ""]) -> tuple[SurfaceModel, Any]:
+        """Make the surface and its first shape for a scene.
+
+        Raises
+        ------
+        ValueError
+            If there is nothing to start from; the message says what to change.
+        """
+
+    @abc.abstractmethod
+    def describe(self, model: SurfaceModel) -> dict[str, Any]:
+        """Return the sizes of a model that JSON can hold, for `template`."""
+
+    @abc.abstractmethod
+    def template(self, description: dict[str, Any]) -> tuple[SurfaceModel, Any]:
+        """Make a model and a shape of the described sizes, of any values."""
+
+
+@settings
+class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
+    """An isosurface on a grid of cubic cells."""
+
+    resolution: Annotated[int, Field(ge=4, le=512)] = 48
+    """Cells along the longest side of the box around the object."""
+    initial: Literal["hull", "sphere", "random"] = "hull"
+    """First surface: visual hull of the masks, a sphere, or noise (the paper)."""
+    cubic: bool = False
+    """As many cells along every side, as the authors; else only as many as the box needs."""
+    reach: Annotated[float, Field(ge=0, le=0.5)] = 0.5
+    """A grid vertex moves by at most this share of a cell (the authors: 1/4)."""
+    entropy_reduction: Literal["mean", "sum"] = "mean"
+    """Mean of Eq. 14 over sign-changing edges, or the sum, as printed, which soon outweighs the
+    picture and empties the surface."""
+    max_quads: PositiveCount = 400_000
+    """A surface with more quads than this is taken to have exploded (about 25 KB per quad)."""
+
+    @property
+    def rate_groups(self) -> tuple[str, ...]:
+        """Groups of `Geometry`."""
+        return ("sdf", "deform", "weights")
+
+    @property
+    def penalty_names(self) -> tuple[str, ...]:
+        """Terms of `FlexiCubes.penalties`."""
+        return ("entropy", "deviation", "weights")
+
+    @property
+    def limits(self) -> dict[str, int]:
+        """As many quads as ``max_quads``."""
+        return {"quads": self.max_quads}
+
+    def start(self, dataset: Dataset, key: Key[Array, ""]) -> tuple[FlexiCubes, Geometry]:
+        """Fit a grid to the object and fill it with a first surface."""
+        lo, hi = (np.asarray(corner) for corner in dataset.bounds)
+        if self.cubic:
+            middle, half = 0.5 * (lo + hi), 0.5 * np.max(hi - lo)
+            lo, hi = middle - half, middle + half
+        grid = fit_grid((lo, hi), self.resolution)
+        sdf = self._sdf(grid, dataset, key)
+        if not bool(jnp.any(sdf < 0)) or not bool(jnp.any(sdf >= 0)):
+            raise ValueError(
+                f"the first surface (geometry.initial = {self.initial}) is empty: the masks and "
+                "cameras agree on no point inside the bounds. Check poses and masks with "
+                "geosplat-jax info, give --bounds, or start from geometry.initial=sphere."
+            )
+        return self._model(grid), initial_geometry(grid, sdf)
+
+    def _sdf(self, grid: Grid, dataset: Dataset, key: Key[Array, ""]) -> Float[Array, " G"]:
+        """First signed values on the grid."""
+        if self.initial == "random":
+            return random_sdf(key, grid)
+        if self.initial == "sphere":
+            return sphere_sdf(grid, radius=0.35 * float(grid.cell_size) * max(grid.shape))
+        views = dataset.train
+        camera = views.camera()
+        sdf = hull_sdf(
+            np.asarray(camera.world_to_camera, np.float64),
+            np.asarray(camera.intrinsics, np.float64),
+            views.images[..., 3],
+            grid,
+        )
+        return jnp.clip(jnp.asarray(sdf), -_SDF_REACH, _SDF_REACH)
+
+    def _model(self, grid: Grid) -> FlexiCubes:
+        grid = Grid(grid.origin, grid.cell_size, grid.shape, self.reach)
+        return FlexiCubes(grid, self.entropy_reduction)
+
+    def describe(self, model: SurfaceModel) -> dict[str, Any]:
+        """Return the cells along each axis."""
+        assert isinstance(model, FlexiCubes)
+        return {"grid_shape": list(model.grid.shape)}
+
+    def template(self, description: dict[str, Any]) -> tuple[FlexiCubes, Geometry]:
+        """Make an empty grid."""
+        nx, ny, nz = description["grid_shape"]
+        grid = Grid(jnp.zeros(3), jnp.ones(()), (nx, ny, nz))
+        return self._model(grid), initial_geometry(grid, jnp.zeros(grid.vertex_count))

@@ -1,0 +1,63 @@
+"""What a transport asks of a surface: does a ray hit it, and where first."""
+
+import abc
+
+import equinox as eqx
+from jaxtyping import Array, Bool, Float, Int
+
+from geosplat_jax.core.capacity import Usage
+
+
+class RayIndex(eqx.Module):
+    """A surface, arranged so that rays find it fast. Exact, and without gradients.
+
+    Attributes
+    ----------
+    usage : true needs of its buffers. Where they exceed their capacities, answers are wrong and
+        must be discarded.
+    """
+
+    usage: eqx.AbstractVar[Usage]
+
+    @property
+    @abc.abstractmethod
+    def face_capacity(self) -> int:
+        """Rows of faces in the mesh, padding included."""
+
+    @abc.abstractmethod
+    def occluded(
+        self,
+        origins: Float[Array, "N 3"],
+        directions: Float[Array, "N 3"],
+        source: Int[Array, " N"],
+        mask: Bool[Array, " N"],
+        *,
+        two_sided: bool = False,
+    ) -> Bool[Array, " N"]:
+        """Tell which rays hit the surface anywhere.
+
+        Parameters
+        ----------
+        origins, directions : (N, 3) world; directions are unit.
+        source : (N,) face that a ray starts on and never hits; -1 for none.
+        mask : (N,) rays to trace; the others are not occluded, and cost little.
+        two_sided : static; whether back faces count.
+        """
+
+    @abc.abstractmethod
+    def nearest(
+        self,
+        origins: Float[Array, "N 3"],
+        directions: Float[Array, "N 3"],
+        source: Int[Array, " N"],
+        mask: Bool[Array, " N"],
+        *,
+        two_sided: bool = False,
+    ) -> tuple[Float[Array, " N"], Int[Array, " N"]]:
+        """Find the first hit of every ray; arguments as for `occluded`.
+
+        Returns
+        -------
+        distance : (N,) world units, infinite where nothing is hit.
+        face : (N,) face of the surface's mesh, -1 where nothing is hit.
+        """

@@ -1,0 +1,286 @@
+"""A run: what was trained from a scene, and everything that can be done with it.
+
+`train` makes a `Run`, `Run` opens one. The command ``geosplat-jax`` and Python make the same.
+"""
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geosplat_jax.core.types import Batch, EnvLight
+from geosplat_jax.fit.config import Config
+from geosplat_jax.fit.folder import RunError, RunFolder
+from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.stages import make_batch
+from geosplat_jax.fit.train import Progress, Trained, fit, load_trained
+from geosplat_jax.io.dataset import Dataset, load_recorded
+from geosplat_jax.io.images import write_png
+from geosplat_jax.io.views import Views
+from geosplat_jax.pipeline import Pipeline
+from geosplat_jax.render import Params
+from geosplat_jax.report.assets import export_assets
+from geosplat_jax.report.evaluate import evaluate_run, preview_image
+from geosplat_jax.report.pictures import normals_to_rgb
+from geosplat_jax.report.protocols import PROTOCOLS
+from geosplat_jax.report.relight import RelightOptions, load_light, relight_views
+from geosplat_jax.report.renderer import DEFAULT_SAMPLES, Renderer, straight_rgba
+
+
+class Run:
+    """A run's folder, opened.
+
+    Parameters
+    ----------
+    folder : of the run.
+    scene : where the scene is now, if it has moved; noted in the folder.
+
+    Raises
+    ------
+    RunError
+        If the folder holds no run, or the scene is another one.
+    """
+
+    def __init__(self, folder: str | Path, *, scene: str | Path | None = None) -> None:
+        self.folder = RunFolder(folder)
+        record = self.folder.record()
+        if scene is not None:
+            dataset = load_recorded(scene, record["dataset"])
+            with self.folder.locked():
+                self.folder.repoint(dataset)
+            self.dataset = dataset
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.folder)!r})"
+
+    @cached_property
+    def dataset(self) -> Dataset:
+        """The scene, as it was read for the training."""
+        record = self.folder.record()
+        if not record["scene"] or not Path(record["scene"]).is_dir():
+            raise RunError(
+                f"the scene of {self.folder} is not at {record['scene']} any more; say where it is "
+                "with --scene"
+            )
+        return load_recorded(record["scene"], record["dataset"])
+
+    @cached_property
+    def trained(self) -> Trained:
+        """The last good checkpoint."""
+        return load_trained(self.folder)
+
+    @property
+    def config(self) -> Config:
+        """Settings of the run."""
+        return self.folder.config()
+
+    @property
+    def params(self) -> Params:
+        """Learned parameters."""
+        return self.trained.params
+
+    @property
+    def pipeline(self) -> Pipeline:
+        """The method as the last stage trained it: ``pipeline.loss(params, batch)``."""
+        return self.trained.pipeline
+
+    def batch(self, step: int = 0) -> Batch:
+        """Return what a step of the training saw, or would see."""
+        stage = self.config.stage_at(step)
+        return make_batch(self.dataset.train, step, stage, seed=self.config.run.seed)
+
+    def renderer(self, *, samples: int = DEFAULT_SAMPLES) -> Renderer:
+        """Return a renderer of the learned parameters; ``samples`` : rays per splat."""
+        return Renderer.of(self.trained, samples=samples)
+
+    def steps(self) -> list[dict[str, Any]]:
+        """Read what was noted of every training step."""
+        return self.folder.metric_lines()
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """What the last evaluation found.
+
+        Raises
+        ------
+        RunError
+            If there was none.
+        """
+        path = self.folder.path / "metrics.json"
+        if not path.exists():
+            raise RunError(f"{self.folder} has not been evaluated; do so first")
+        return json.loads(path.read_text(encoding="utf-8"))
+
+    def _views(self, split: str) -> Views:
+        """Return a split that has views."""
+        views = self.dataset.test if split == "test" else self.dataset.train
+        if not views.names:
+            raise RunError(f"{self.dataset.root} has no {split} views")
+        return views
+
+    def _views_to_show(self) -> Views:
+        return self.dataset.test if self.dataset.test.names else self.dataset.train
+
+    def _output(self, folder: Path | None, name: str) -> Path:
+        chosen = folder or self.folder.path / name
+        chosen.mkdir(parents=True, exist_ok=True)
+        return chosen
+
+    def evaluate(
+        self,
+        *,
+        protocol: str = PROTOCOLS[0],
+        samples: int = DEFAULT_SAMPLES,
+        relight_indirect: str = "traced",
+    ) -> dict[str, Any]:
+        """Compare the test views with the truth; write ``metrics.json`` and sheets of pictures.
+
+        See `evaluate.evaluate_run` for the arguments.
+
+        Raises
+        ------
+        RunError
+            If the scene has no test views.
+        """
+        views = self._views("test")
+        record, dataset = self.folder.record(), self.dataset
+        lights = {name: load_light(path) for name, path in dataset.lights.items()}
+        peaks = [line["peak_memory_mb"] for line in self.steps()]
+        return evaluate_run(
+            self.trained,
+            views,
+            self.folder.path,
+            meta={
+                "scene": record["scene"],
+                "dataset": record["dataset"],
+                "step": self.trained.step,
+                "stage": self.trained.stage.name,
+                "training": self.folder.training(),
+                "training_peak_memory_mb": max(peaks, default=None),
+            },
+            protocol=protocol,
+            lights=lights,
+            train_light=lights.get(dataset.train_light or ""),
+            samples=samples,
+            relight_indirect=relight_indirect,
+        )
+
+    def render(self, split: str = "test", output: Path | None = None) -> list[Path]:
+        """Write every view of a split as ``NAME_rgba.png`` and ``NAME_normal.png``."""
+        views, written = self._views(split), []
+        folder, renderer = self._output(output, "renders"), self.renderer()
+        for index, name in enumerate(views.names):
+            view = renderer(views.camera(np.array([index])))
+            stem = name.replace("/", "_").strip("._")
+            written += [folder / f"{stem}_rgba.png", folder / f"{stem}_normal.png"]
+            write_png(written[-2], straight_rgba(view))
+            write_png(written[-1], normals_to_rgb(view.aovs["normal"], view.alpha))
+        return written
+
+    def relight(
+        self,
+        env: str | Path,
+        output: Path | None = None,
+        *,
+        options: RelightOptions | None = None,
+        intensity: float = 1.0,
+        albedo_scale: Sequence[float] = (1.0, 1.0, 1.0),
+        samples: int = DEFAULT_SAMPLES,
+        indirect: str = "traced",
+    ) -> list[Path]:
+        """Render the test views, and movies, under another light; return the files.
+
+        Parameters
+        ----------
+        env : lat-long environment map.
+        output : folder (default: ``relight_NAME`` in the run's).
+        options : which movies, and what is behind the object.
+        intensity : factor of the light. albedo_scale : (3,) factors of the albedo.
+        samples : rays per splat. indirect : see `Renderer.relit`.
+        """
+        options = options or RelightOptions()
+        options.check()
+        light = EnvLight(intensity * load_light(env).radiance)
+        relit = self.renderer(samples=samples).relit(
+            light, albedo_scale=albedo_scale, indirect=indirect
+        )
+        folder = self._output(output, f"relight_{Path(env).stem}")
+        return relight_views(relit, light, self._views_to_show(), folder, options)
+
+    def export(
+        self, output: Path | None = None, *, vertex_colors: bool = False, texture_size: int = 1024
+    ) -> dict[str, str]:
+        """Write ``mesh.glb``, ``gaussians.ply`` and ``light.exr``; return a line about each."""
+        return export_assets(
+            self.trained,
+            self._output(output, "export"),
+            vertex_colors=vertex_colors,
+            texture_size=texture_size,
+        )
+
+
+class _Previews:
+    """Write truth, render and normals of one view side by side while training."""
+
+    def __init__(self, dataset: Dataset, folder: RunFolder) -> None:
+        self._views = dataset.test if dataset.test.names else dataset.train
+        self._folder = folder.previews
+
+    def __call__(self, trained: Trained) -> None:
+        """Render and write one preview."""
+        self._folder.mkdir(exist_ok=True)
+        image = preview_image(trained, self._views)
+        write_png(self._folder / f"step_{trained.step:06d}.png", image)
+
+
+def train(
+    scene: str | Path | Dataset,
+    output: str | Path,
+    config: Config | None = None,
+    *,
+    quality: str = "standard",
+    resume: bool = False,
+    force: bool = False,
+    source: str | Path | None = None,
+    first_stage: str | None = None,
+    on_step: Callable[[Progress], None] | None = None,
+    **reading: Any,
+) -> Run:
+    """Train a scene into a run's folder.
+
+    Parameters
+    ----------
+    scene : folder, or a dataset from `load_dataset`.
+    output : folder of the run.
+    config : settings, see `make_config`; by default those of ``quality``.
+    resume, force, source, first_stage, on_step : see `fit.train.fit`; ``force`` replaces a run.
+    reading : how to read the scene: ``downscale``, ``light``, ``bounds`` (six numbers).
+
+    Raises
+    ------
+    SceneError, RunError, TrainingError, Interrupted
+        See `load_dataset` and `fit.train.fit`.
+    """
+    config = config or make_config(quality=quality)
+    dataset = scene if isinstance(scene, Dataset) else load_recorded(scene, reading)
+    folder = RunFolder(output)
+    began = time.perf_counter()
+    fit(
+        dataset,
+        config,
+        folder.path,
+        resume=resume,
+        replace_run=force,
+        source=source,
+        first_stage=first_stage,
+        on_step=on_step,
+        on_preview=_Previews(dataset, folder),
+    )
+    folder.write_training({"seconds_total": round(time.perf_counter() - began, 2)})
+    run = Run(folder.path)
+    run.dataset = dataset
+    return run

@@ -1,0 +1,62 @@
+"""What the method asks of a surface: a mesh, its penalties, and a way for rays to find it."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from geosplat_jax.core.capacity import Capacities, Usage
+from geosplat_jax.core.types import Box, Mesh
+from geosplat_jax.rays.base import RayIndex
+
+
+class Surface(eqx.Module):
+    """An extracted surface.
+
+    Attributes
+    ----------
+    mesh : triangles, outward; a face is known by its row.
+    usage : true needs of the buffers. Where they exceed their capacities the mesh is wrong and must
+        be discarded.
+    """
+
+    mesh: Mesh
+    usage: Usage
+
+
+class SurfaceModel(eqx.Module):
+    """A way to make a mesh of learned parameters, its *shape*: a pytree of whatever it needs."""
+
+    @property
+    @abc.abstractmethod
+    def box(self) -> Box:
+        """The cube around the surface that fields are defined on."""
+
+    @abc.abstractmethod
+    def extract(self, shape: Any, *, capacities: Capacities, final: bool = False) -> Surface:
+        """Build the mesh of a shape; differentiable in what moves its vertices.
+
+        Parameters
+        ----------
+        shape : learned parameters of the surface.
+        capacities : static sizes of buffers.
+        final : static; the mesh that leaves the program, where that differs from the one that is
+            trained.
+        """
+
+    @abc.abstractmethod
+    def penalties(self, shape: Any, surface: Any) -> dict[str, Float[Array, ""]]:
+        """Evaluate the surface's own terms of the loss, by name."""
+
+    @abc.abstractmethod
+    def ray_index(self, surface: Any, *, capacities: Capacities) -> RayIndex:
+        """Arrange a surface from `extract` for rays; no gradients."""
+
+    @abc.abstractmethod
+    def nearby_points(self, shape: Any) -> tuple[Float[Array, "N 3"], Float[Array, " N"]]:
+        """Return points beside the surface and their weights, which are zero where it is empty."""
+
+    @abc.abstractmethod
+    def first_capacities(self, shape: Any) -> Capacities:
+        """Guess the sizes of the surface's own buffers (host side)."""

@@ -1,0 +1,238 @@
+"""Directions in which a point looks for light: drawn by importance, and traced; no gradients.
+
+All samples are of low discrepancy. Memory is bounded by chunks of points (`in_chunks`).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from geosplat_jax.core.numerics import safe_divide
+from geosplat_jax.core.types import SurfacePoints
+from geosplat_jax.rays.base import RayIndex
+from geosplat_jax.transport import bsdf
+from geosplat_jax.transport.light_sampling import LightSampler, light_density, sample_light
+
+OPEN = -1
+"""A ray that reaches the environment."""
+
+BLOCKED = -2
+"""A ray that does not; by what is not known."""
+
+_RAYS_AT_ONCE = 4_194_304
+
+
+@dataclass(frozen=True)
+class SampleCounts:
+    """Static number of samples per point; hashable.
+
+    Attributes
+    ----------
+    light : samples of the environment, for both lobes.
+    diffuse : samples of the cosine, for the diffuse lobe.
+    specular : samples of the visible microfacet normals, for the specular lobe.
+    """
+
+    light: int = 4
+    diffuse: int = 4
+    specular: int = 4
+
+    def __post_init__(self) -> None:
+        """Refuse negative counts and a lobe without samples."""
+        if min(self.light, self.diffuse, self.specular) < 0:
+            raise ValueError(f"counts of samples must not be negative, got {self}")
+        if self.light + min(self.diffuse, self.specular) == 0:
+            raise ValueError(f"each lobe needs at least one sample, got {self}")
+
+    @property
+    def total(self) -> int:
+        """Rays per point."""
+        return self.light + self.diffuse + self.specular
+
+
+class Samples(eqx.Module):
+    """Directions that do not depend on a viewer, those of the light first; no gradients.
+
+    Attributes
+    ----------
+    directions : (N, S, 3) unit.
+    weights : (N, S) ``1 / (n_light p_light + n_cosine p_cosine)``; 0 where the mask is false.
+    hits : (N, S) int32 face that is hit, `OPEN` or `BLOCKED`.
+    light_density : (N, L) density of the light's samples, per steradian.
+    """
+
+    directions: Float[Array, "N S 3"]
+    weights: Float[Array, "N S"]
+    hits: Int[Array, "N S"]
+    light_density: Float[Array, "N L"]
+
+
+def low_discrepancy(
+    offsets: Float[Array, "N 2"], samples: int, dtype: jnp.dtype
+) -> Float[Array, "S N 2"]:
+    """Hammersley points, turned on the torus by one random offset per point: uniform, and even."""
+    index = np.arange(samples)
+    bits = (index[:, None] >> np.arange(31)[None, :]) & 1
+    radical = np.sum(bits * 0.5 ** np.arange(1, 32)[None, :], axis=1)
+    points = jnp.asarray(np.stack([index / max(samples, 1), radical], axis=1), jnp.float32)
+    turned = points[:, None, :] + offsets[None]
+    # Below one even where the sum rounds up.
+    return jnp.minimum(turned - jnp.floor(turned), 1 - 2.0**-24).astype(dtype)
+
+
+def _offsets(key: Key[Array, ""], count: int, numbers: int) -> Float[Array, "N k"]:
+    """Draw the points' random numbers, in float32 at any precision."""
+    return jax.random.uniform(key, (count, numbers), jnp.float32)
+
+
+def in_chunks(
+    function: Callable[[Any], Any], arguments: Any, mask: Bool[Array, " N"], samples: int
+) -> Any:
+    """Map a function of rows over chunks of them, to be computed again in the backward pass.
+
+    Chunks that the mask leaves nothing of give zeros, at no cost.
+    """
+    count = mask.shape[0]
+    chunk = min(max(256, _RAYS_AT_ONCE // max(samples, 1)), max(count, 1))
+    rows = -(-max(count, 1) // chunk)
+
+    def chunks(values: Array) -> Array:
+        widths = ((0, rows * chunk - count),) + ((0, 0),) * (values.ndim - 1)
+        return jnp.pad(values, widths).reshape(rows, chunk, *values.shape[1:])
+
+    def nothing(parts: Any) -> Any:
+        shapes = jax.eval_shape(function, parts)
+        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+    def one_chunk(parts: tuple[Array, Any]) -> Any:
+        is_used, arguments = parts
+        return jax.lax.cond(jnp.any(is_used), jax.checkpoint(function), nothing, arguments)
+
+    found = jax.lax.map(one_chunk, jax.tree.map(chunks, (mask, arguments)))
+    return jax.tree.map(lambda x: x.reshape(rows * chunk, *x.shape[2:])[:count], found)
+
+
+def cast(
+    points: SurfacePoints,
+    directions: Float[Array, "S N 3"],
+    index: RayIndex | None,
+    *,
+    finds_nearest: bool = False,
+) -> Int[Array, "S N"]:
+    """Tell where rays end: at a face, `OPEN`, or `BLOCKED` by something; no gradients.
+
+    Directions below a point's own face are blocked. Without an index nothing else is.
+
+    Parameters
+    ----------
+    finds_nearest : static; tell the face that is hit first, which takes longer.
+    """
+    points, directions = jax.lax.stop_gradient((points, directions))
+    is_below = jnp.sum(directions * points.outward[None], axis=-1) <= 0
+    if index is None:
+        return jnp.where(is_below, BLOCKED, OPEN).astype(jnp.int32)
+    samples, count, _ = directions.shape
+
+    def repeated(values: Array) -> Array:
+        return jnp.broadcast_to(values[None], (samples, *values.shape)).reshape(
+            -1, *values.shape[1:]
+        )
+
+    rays = (
+        repeated(points.positions),
+        directions.reshape(-1, 3),
+        repeated(points.faces),
+        (~is_below & points.mask[None]).reshape(-1),
+    )
+    if finds_nearest:
+        _, hits = index.nearest(*rays)
+    else:
+        hits = jnp.where(index.occluded(*rays), BLOCKED, OPEN).astype(jnp.int32)
+    return jnp.where(is_below, BLOCKED, hits.reshape(samples, count))
+
+
+def draw_samples(
+    key: Key[Array, ""],
+    points: SurfacePoints,
+    sampler: LightSampler,
+    index: RayIndex | None,
+    *,
+    counts: SampleCounts,
+    finds_nearest: bool = False,
+) -> Samples:
+    """Draw directions from the light and the cosine, and trace them; no gradients.
+
+    Parameters
+    ----------
+    key : of all random numbers.
+    points : where rays start.
+    sampler : tables of the light.
+    index : the surface that blocks rays; None for no occlusion.
+    counts, finds_nearest : static; see `SampleCounts` and `cast`.
+    """
+    points, sampler = jax.lax.stop_gradient((points, sampler))
+    count, dtype = points.normals.shape[0], points.normals.dtype
+
+    def one_chunk(parts: tuple[SurfacePoints, Array]) -> Samples:
+        points, offsets = parts
+        drawn = []
+        if counts.light:
+            uniforms = low_discrepancy(offsets[:, :2], counts.light, dtype)
+            found, _ = sample_light(sampler, uniforms.reshape(-1, 2))
+            drawn.append(found.reshape(counts.light, -1, 3))
+        if counts.diffuse:
+            uniforms = low_discrepancy(offsets[:, 2:], counts.diffuse, dtype)
+            normals = tuple(points.normals.T[:, None, :])
+            found = bsdf.cosine_directions(normals, uniforms[..., 0], uniforms[..., 1])
+            drawn.append(jnp.stack(found, axis=-1))
+        directions = jnp.concatenate(drawn)
+        flat = directions.reshape(-1, 3)
+        light = light_density(sampler, flat).reshape(directions.shape[:2])
+        cosine = jax.vmap(lambda wi: bsdf.cosine_pdf(points.normals, wi))(directions)
+        density = counts.light * light + counts.diffuse * cosine
+        weights = jnp.where(points.mask[None], safe_divide(jnp.ones_like(density), density), 0.0)
+        hits = cast(points, directions, index, finds_nearest=finds_nearest)
+        return Samples(jnp.moveaxis(directions, 0, 1), weights.T, hits.T, light[: counts.light].T)
+
+    samples = counts.light + counts.diffuse
+    return in_chunks(one_chunk, (points, _offsets(key, count, 4)), points.mask, samples)
+
+
+def draw_specular(
+    key: Key[Array, ""],
+    points: SurfacePoints,
+    roughness: Float[Array, " N"],
+    wo: Float[Array, "N 3"],
+    sampler: LightSampler,
+    index: RayIndex | None,
+    *,
+    counts: SampleCounts,
+    finds_nearest: bool,
+) -> tuple[Float[Array, "N S 3"], Int[Array, "N S"], Float[Array, "N S"]]:
+    """Draw the directions of the specular lobe from visible microfacet normals, and trace them.
+
+    Returns
+    -------
+    directions (N, S, 3), hits (N, S) and the density of the light's samples there (N, S).
+    """
+
+    def one_chunk(parts: tuple) -> tuple[Array, Array, Array]:
+        points, roughness, wo, offsets = parts
+        uniforms = low_discrepancy(offsets[:, :2], counts.specular, wo.dtype)
+        alpha = bsdf.ggx_alpha(roughness)[None, :]
+        normals, views = (tuple(x.T[:, None, :]) for x in (points.normals, wo))
+        found = bsdf.specular_directions(alpha, normals, views, uniforms[..., 0], uniforms[..., 1])
+        drawn = jnp.stack(found, axis=-1)
+        hits = cast(points, drawn, index, finds_nearest=finds_nearest)
+        density = light_density(sampler, drawn.reshape(-1, 3)).reshape(hits.shape)
+        return jnp.moveaxis(drawn, 0, 1), hits.T, density.T
+
+    count = wo.shape[0]
+    arguments = (points, roughness, wo, _offsets(key, count, 2))
+    return in_chunks(one_chunk, jax.lax.stop_gradient(arguments), points.mask, counts.specular)

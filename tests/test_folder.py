@@ -1,0 +1,140 @@
+"""A run's folder: one writer, one scene, and no accident that makes it useless."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import sphere_dataset, tiny_config
+
+from geosplat_jax.fit.folder import RunError, RunFolder
+
+
+@pytest.fixture
+def dataset():
+    return sphere_dataset(count=2, size=8)
+
+
+@pytest.fixture
+def run(dataset, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    with folder.locked():
+        folder.begin(dataset, tiny_config(), replace=False)
+    return folder
+
+
+def test_a_new_run_says_what_it_was_made_from(run, dataset):
+    record = run.record()
+    assert record["scene"] == str(Path().resolve())
+    assert record["versions"]["python"] == ".".join(map(str, sys.version_info[:3]))
+    assert run.config() == tiny_config()
+    run.require_same_scene(dataset)
+
+
+_HOLDER = """
+import sys
+from geosplat_jax.fit.folder import RunFolder
+with RunFolder(sys.argv[1]).locked():
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_second_process_is_refused_until_the_first_one_dies(run):
+    command = [sys.executable, "-c", _HOLDER, str(run)]
+    holder = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(RunError, match="another process is writing"), run.locked():
+            pass
+    finally:
+        holder.kill()
+        holder.communicate()
+    with run.locked():
+        pass
+
+
+def test_a_folder_with_a_run_is_replaced_only_when_asked(run, dataset):
+    run.metrics.write_text('{"step": 0}\n')
+    (run.path / "metrics.json").write_text("{}")
+    (run.path / "notes.txt").write_text("mine")
+    with pytest.raises(RunError, match=r"--resume, replace it with --force"), run.locked():
+        run.begin(dataset, tiny_config(), replace=False)
+    other = tiny_config("run.seed=5")
+    with run.locked():
+        run.begin(dataset, other, replace=True)
+    assert run.config() == other
+    assert not run.metrics.exists()
+    assert not (run.path / "metrics.json").exists()
+    assert (run.path / "notes.txt").read_text() == "mine"
+
+
+def test_a_folder_with_other_files_is_never_used(dataset, tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    folder = RunFolder(tmp_path)
+    for is_replaced in (False, True):
+        with pytest.raises(RunError, match=r"holds other files, thesis\.tex"), folder.locked():
+            folder.begin(dataset, tiny_config(), replace=is_replaced)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "is damaged"),
+        ("[]", "lacks"),
+        ("null", "lacks"),
+        ('{"scene": "x", "dataset": {}}', r"lacks \['config'\]"),
+        ('{"scene": "x", "dataset": {}, "config": {"run": {"seed": -4}}}', "run.seed must be"),
+        ('{"scene": "x", "dataset": {}, "config": {"rates": {"sdf": 1}}}', "earlier version"),
+    ],
+)
+def test_a_damaged_record_is_named_in_one_line(run, text, message):
+    (run.path / "run.json").write_text(text)
+    with pytest.raises(RunError, match=message) as caught:
+        run.config()
+    assert "run.json" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_no_run_says_so(tmp_path):
+    with pytest.raises(RunError, match="is not a run"):
+        RunFolder(tmp_path).record()
+
+
+def test_a_line_that_an_interruption_tore_is_left_out(run):
+    lines = [json.dumps({"step": step, "loss": 1.0}) for step in range(3)]
+    run.metrics.write_text("\n".join(lines) + "\n" + '{"step": 3, "lo')
+    assert [line["step"] for line in run.metric_lines()] == [0, 1, 2]
+    run.keep_lines_before(2)
+    assert run.metrics.read_text() == "\n".join(lines[:2]) + "\n"
+
+
+def test_a_damaged_line_in_the_middle_is_an_error(run):
+    run.metrics.write_text('{"step": 0}\n{"ste\n{"step": 2}\n')
+    with pytest.raises(RunError, match=r"line 2 of .*metrics\.jsonl is damaged"):
+        run.metric_lines()
+
+
+def test_a_scene_that_has_moved_is_recognised_by_its_views(run, dataset, tmp_path):
+    moved = replace(dataset, root=tmp_path)
+    run.repoint(moved)
+    assert run.record()["scene"] == str(tmp_path.resolve())
+    assert run.config() == tiny_config()
+
+
+@pytest.mark.parametrize("change", ["pose", "name", "options", "size"])
+def test_another_scene_is_refused(run, dataset, change):
+    views = dataset.train
+    if change == "pose":
+        views = replace(views, camera_to_world=views.camera_to_world + 1e-3 * np.eye(4))
+    elif change == "name":
+        views = replace(views, names=("a", "b"))
+    elif change == "size":
+        views = replace(views, images=views.images[:, :4])
+    other = replace(dataset, train=views, options={"downscale": 2} if change == "options" else {})
+    with pytest.raises(RunError, match="was trained on"):
+        run.repoint(other)

@@ -1,0 +1,359 @@
+"""``pipeline.loss`` and ``pipeline.render``: their laws, with either transport of light."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import MONTE_CARLO, ball, double_precision, sphere_views, tiny_config
+
+from geosplat_jax.core.capacity import Capacities, fits, grow, overflowed
+from geosplat_jax.core.types import Batch, EnvLight
+from geosplat_jax.fit.stages import update_rule
+from geosplat_jax.fit.step import initial_state, train_step
+from geosplat_jax.losses import light_agreement
+from geosplat_jax.pipeline import Pipeline
+
+SMALL = (
+    *MONTE_CARLO,
+    "geometry.resolution=8",
+    "material.shared=false",
+    "objective.smoothness_samples=16",
+    "stages.split_sum.weights.light=0.15",
+    "stages.split_sum.weights.indirect=0.001",
+    "stages.monte_carlo.weights.light=0.15",
+)
+TIGHT = Capacities(
+    surface_cubes=512,
+    dual_vertices=512,
+    quads=512,
+    visible=6144,
+    hits=8192,
+    chunks=2048,
+    cell_patches=4096,
+)
+evaluate = jax.jit(
+    lambda pipeline, params, batch: jax.value_and_grad(pipeline.loss, has_aux=True)(params, batch)
+)
+value_of = jax.jit(Pipeline.loss)
+AOVS = ("diffuse", "specular", "specular_radiance", "normal")
+draw = partial(jax.jit, static_argnames=("aov_names",))(Pipeline.render)
+
+
+def sky(seed=0):
+    """Return a map of random radiance with a few bright texels."""
+    texels = np.random.default_rng(seed).uniform(0, 1, (8, 16, 3))
+    return EnvLight(jnp.asarray(0.2 + 2 * texels**4, jnp.float32))
+
+
+def problem(*overrides, stage="monte_carlo"):
+    """Settings, pipeline, parameters away from any symmetry, and a batch."""
+    config = tiny_config(*SMALL, *overrides)
+    pipeline, params = ball(config, stage=stage)
+    rng = np.random.default_rng(0)
+    sdf = np.asarray(params.geometry.sdf)
+    sdf = sdf + rng.uniform(-0.15, 0.15, sdf.shape)
+    sdf = np.where(np.abs(sdf) < 0.03, np.copysign(0.03, sdf), sdf)
+
+    def varied(leaf):
+        return leaf + jnp.asarray(rng.uniform(-0.5, 0.5, leaf.shape), leaf.dtype)
+
+    params = replace(
+        params,
+        geometry=replace(params.geometry, sdf=jnp.asarray(sdf, jnp.float32)),
+        material=jax.tree.map(varied, params.material),
+        light=sky(2),
+        log_exposure=jnp.asarray(0.1),
+    )
+    views = sphere_views(2, size=14)
+    batch = Batch(views.camera([0]), jnp.asarray(views.images[:1]), jax.random.key(1))
+    return config, replace(pipeline, capacities=TIGHT), params, batch
+
+
+def groups_of(tree):
+    return {
+        "light": tree.light,
+        "albedo": tree.material.albedo_head,
+        "roughness_metallic": tree.material.surface_head,
+        "indirect": tree.material.indirect_head,
+        "tables": (tree.material.albedo_table, tree.material.surface_table),
+        "exposure": tree.log_exposure,
+        "sdf": tree.geometry.sdf,
+    }
+
+
+@pytest.fixture(scope="module", params=["split_sum", "monte_carlo"])
+def stage(request):
+    """Problem, value and gradient of either stage."""
+    config, pipeline, params, batch = problem(stage=request.param)
+    return config.stage(request.param), pipeline, params, batch, evaluate(pipeline, params, batch)
+
+
+@pytest.fixture(scope="module")
+def second():
+    return problem()
+
+
+def test_the_total_is_the_weighted_sum_of_every_term_that_has_a_weight(stage):
+    settings, pipeline, _, _, ((total, report), _) = stage
+    assert set(report.terms) == set(settings.weights_at(0))
+    expected = sum(float(w) * float(report.terms[name]) for name, w in pipeline.weights.items())
+    assert float(total) == pytest.approx(expected, rel=1e-5)
+    assert all(np.isfinite(float(term)) for term in report.terms.values())
+    assert bool(fits(report.usage, TIGHT))
+
+
+def test_the_loss_is_finite_and_pulls_on_everything(stage):
+    _, _, _, _, ((total, report), gradient) = stage
+    assert np.isfinite(float(total))
+    assert float(report.terms["light"]) > 0
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(gradient))
+    for name, group in groups_of(gradient).items():
+        for leaf in jax.tree.leaves(group):
+            assert float(jnp.max(jnp.abs(leaf))) > 1e-7, name
+
+
+def test_a_larger_weight_is_a_larger_share_and_compiles_nothing(stage):
+    _, pipeline, params, batch, ((total, report), _) = stage
+    before = evaluate._cache_size()
+    weights = {**pipeline.weights, "mask": pipeline.weights["mask"] + 1.0}
+    (other, _), _ = evaluate(replace(pipeline, weights=weights), params, batch)
+    assert float(other - total) == pytest.approx(float(report.terms["mask"]), rel=1e-3, abs=1e-6)
+    assert evaluate._cache_size() == before
+
+
+def test_the_key_decides_every_sample(stage):
+    settings, pipeline, params, batch, first = stage
+    again = evaluate(pipeline, params, batch)
+    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b)
+    (total, report), _ = evaluate(pipeline, params, replace(batch, key=jax.random.key(5)))
+    before = first[0][1].terms
+    assert float(total) != float(first[0][0])
+    # Background and smoothness are random; the surface is not, nor is light without samples.
+    assert float(report.terms["mask"]) == float(before["mask"])
+    assert float(report.terms["deviation"]) == float(before["deviation"])
+    is_sampled = settings.name == "monte_carlo"
+    assert (float(report.terms["light"]) != float(before["light"])) is is_sampled
+
+
+def test_an_unknown_term_is_refused_by_name(second):
+    _, pipeline, params, batch = second
+    wrong = replace(pipeline, weights={"colour": jnp.float32(1.0)})
+    with pytest.raises(ValueError, match="unknown term of the loss 'colour'; expected some of"):
+        jax.eval_shape(wrong.loss, params, batch)
+
+
+def test_unknown_aovs_are_refused_before_anything_is_built(second):
+    _, pipeline, params, batch = second
+    with pytest.raises(ValueError, match="unknown AOVs"):
+        pipeline.render(params, batch.camera, aov_names=("x",))
+
+
+def test_an_empty_surface_shows_the_background_and_has_zero_gradient():
+    _, pipeline, params, batch = problem(stage="split_sum")
+    gone = replace(params, geometry=replace(params.geometry, sdf=jnp.abs(params.geometry.sdf) + 1))
+    # The regularisers of the weights pull whether there is a surface or not.
+    weights = {**pipeline.weights, "weights": jnp.float32(0.0)}
+    (total, report), gradient = evaluate(replace(pipeline, weights=weights), gone, batch)
+    assert np.isfinite(total)
+    assert int(report.splat_count) == 0
+    assert float(report.terms["indirect"]) == 0.0
+    for leaf in jax.tree.leaves(gradient):
+        np.testing.assert_array_equal(np.asarray(leaf), 0.0)
+    output = draw(pipeline, gone, batch.camera, aov_names=AOVS)
+    np.testing.assert_array_equal(np.asarray(output.alpha), 0.0)
+    np.testing.assert_array_equal(np.asarray(output.rgb), 0.0)
+
+
+def test_eq_18_takes_what_the_specular_lobe_really_adds():
+    """Fresnel and tint included: of these materials a fraction of what a mirror would send."""
+    _, pipeline, params, batch = problem(stage="split_sum")
+    (_, report), _ = evaluate(pipeline, params, batch)
+    aovs = draw(pipeline, params, batch.camera, aov_names=AOVS).aovs
+    expected = light_agreement(
+        aovs["diffuse"], aovs["specular_radiance"], params.log_exposure, batch.image
+    )
+    assert float(report.terms["light"]) == pytest.approx(float(expected), rel=1e-5)
+    inside = np.asarray(batch.image[..., 3]) > 0.5
+    added, mirrored = (
+        np.asarray(aovs[n])[inside].mean() for n in ("specular_radiance", "specular")
+    )
+    assert 0 < added < 0.8 * mirrored
+
+
+def test_a_rendered_sphere_covers_its_disc_and_its_normals_face_the_camera():
+    config, pipeline, _, batch = problem(stage="split_sum")
+    _, params = ball(config)
+    output = draw(pipeline, params, batch.camera, aov_names=AOVS)
+    alpha = np.asarray(output.alpha[0])
+    assert alpha[6:8, 6:8].min() > 0.9
+    assert alpha[0, 0] == 0.0
+    # The four pixels around the middle: cells are as large as pixels here.
+    normal = np.asarray(output.aovs["normal"][0, 6:8, 6:8]).sum((0, 1)) / alpha[6:8, 6:8].sum()
+    towards = np.asarray(batch.camera.centers[0])
+    assert normal @ towards / np.linalg.norm(towards) > 0.9
+
+
+def with_settings(pipeline, **changes):
+    """Return the pipeline with other settings of its transport."""
+    settings = replace(pipeline.transport.settings, **changes)
+    return replace(pipeline, transport=replace(pipeline.transport, settings=settings))
+
+
+@pytest.mark.slow
+def test_a_residual_of_its_own_has_its_own_samples(second):
+    """The loss has the value of the second image; what has no samples keeps its gradient."""
+    _, pipeline, params, batch = second
+    (total, report), gradient = evaluate(pipeline, params, batch)
+    apart = with_settings(pipeline, residual_count=1)
+    (other_total, other), other_gradient = evaluate(apart, params, batch)
+    assert float(other.terms["l1"]) != float(report.terms["l1"])
+    assert float(other_total) != float(total)
+    # Eq. 18 and the mask are of the image that is differentiated.
+    for name in ("light", "mask"):
+        assert float(other.terms[name]) == pytest.approx(float(report.terms[name]), rel=1e-6)
+    for name, group in groups_of(other_gradient).items():
+        before = np.concatenate([np.ravel(x) for x in jax.tree.leaves(groups_of(gradient)[name])])
+        after = np.concatenate([np.ravel(x) for x in jax.tree.leaves(group)])
+        assert np.all(np.isfinite(after)), name
+        assert np.any(before != after), name
+
+
+@pytest.mark.slow
+def test_a_residual_of_its_own_takes_the_bias_from_the_gradient(second):
+    """Where the mean image is the photograph, nothing should pull on the brightness of the light.
+
+    Residuals from the samples of the derivative pull it down, since less light makes less noise.
+    """
+    _, pipeline, params, batch = second
+    params = replace(params, light=EnvLight(0.3 * params.light.radiance))
+    keys = jax.random.split(jax.random.key(9), 120)
+    exact = with_settings(pipeline, light_count=32, diffuse_count=32, specular_count=32)
+    images = [draw(exact, params, batch.camera, key=key) for key in keys[:24]]
+    alpha = images[0].alpha
+    mean = jnp.mean(jnp.stack([image.rgb for image in images]), axis=0)
+    mean = jnp.exp(params.log_exposure) * mean / jnp.maximum(alpha[..., None], 1e-6)
+    assert float(jnp.max(mean)) < 1.0  # nothing is clipped
+    photograph = jnp.concatenate([mean, alpha[..., None]], axis=-1)
+
+    def pulls(residual):
+        noisy = with_settings(pipeline, residual_count=residual)
+        noisy = replace(
+            noisy,
+            weights={"l1": jnp.float32(1.0)},
+            objective=replace(pipeline.objective, background="black"),
+        )
+        found = []
+        for key in keys:
+            _, gradient = evaluate(noisy, params, replace(batch, image=photograph, key=key))
+            found.append(float(jnp.sum(params.light.radiance * gradient.light.radiance)))
+        return np.array(found)
+
+    same, apart = pulls(0), pulls(1)
+    errors = [pull.std() / np.sqrt(len(keys)) for pull in (same, apart)]
+    assert same.mean() > 3 * errors[0]
+    assert abs(apart.mean()) < 2.5 * errors[1]
+    assert same.mean() - apart.mean() > 3 * np.hypot(*errors)
+
+
+DIFFERENCES = {
+    # No light samples: neither light nor metallic, albedo or exposure moves a sample.
+    "constant": ("light_count=0", "diffuse_count=2", "specular_count=2", "indirect=constant"),
+    "traced": ("light_count=0", "diffuse_count=2", "specular_count=2", "indirect=traced"),
+    # No samples of the lobe: roughness moves none.
+    "harmonics": ("light_count=2", "diffuse_count=2", "specular_count=0", "indirect=harmonics"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", DIFFERENCES)
+def test_the_gradient_of_the_whole_loss_agrees_with_differences(kind):
+    """In float64 and for fixed samples, in all parameters that do not move them."""
+    overrides = [f"stages.monte_carlo.transport.{text}" for text in DIFFERENCES[kind]]
+    single = problem(*overrides)[1:]
+    with double_precision():
+        pipeline, params, batch = _in_double(single)
+        rng = np.random.default_rng(1)
+        (_, report), gradient = evaluate(pipeline, params, batch)
+        assert bool(fits(report.usage, TIGHT))
+
+        def total(material, light, exposure):
+            moved = replace(params, material=material, light=light, log_exposure=exposure)
+            return value_of(pipeline, moved, batch)[0]
+
+        point = (params.material, params.light, params.log_exposure)
+        slopes = (gradient.material, gradient.light, gradient.log_exposure)
+        leaves, structure = jax.tree.flatten(point)
+        paths = [jax.tree_util.keystr(p) for p, _ in jax.tree_util.tree_flatten_with_path(point)[0]]
+        checked = 0
+        for index, (path, leaf, slope) in enumerate(
+            zip(paths, leaves, jax.tree.leaves(slopes), strict=True)
+        ):
+            direction = _free_direction(kind, path, rng.normal(size=leaf.shape))
+            if direction is None:
+                continue
+            step = 1e-6
+
+            def at(size, index=index, direction=direction):
+                moved = list(leaves)
+                moved[index] = moved[index] + size * direction
+                return float(total(*jax.tree.unflatten(structure, moved)))
+
+            found = (at(step) - at(-step)) / (2 * step)
+            expected = float(jnp.sum(slope * direction))
+            assert found == pytest.approx(expected, rel=1e-5, abs=2e-9), path
+            checked += abs(expected) > 1e-5
+        assert checked >= 5
+
+
+def _in_double(parts):
+    """Floats of pipeline, parameters and batch as float64."""
+
+    def convert(leaf):
+        return jnp.asarray(leaf, jnp.float64) if leaf.dtype == jnp.float32 else leaf
+
+    return jax.tree.map(convert, parts)
+
+
+def _free_direction(kind, path, direction):
+    """A direction of a leaf that moves no sample; None where there is none."""
+    if "shift" in path or "surface_table" in path:
+        return None  # moves the splats, or the roughness
+    if "surface_head" in path:
+        if kind != "harmonics":
+            # Only the last layer tells roughness (column 0) from metallic (column 1).
+            if direction.shape[-1] != 2:
+                return None
+            direction[..., 0] = 0.0
+        return jnp.asarray(direction)
+    if "radiance" in path and kind == "harmonics":
+        return None  # moves the samples of the light
+    return jnp.asarray(direction)
+
+
+@pytest.mark.slow
+def test_a_step_that_lacks_room_for_rays_changes_nothing_and_succeeds_with_it(second):
+    config, pipeline, params, batch = second
+    settings = config.stage("monte_carlo")
+
+    def step(capacities):
+        state = initial_state(jax.tree.map(jnp.copy, params))
+        rule = update_rule(config, settings, params, 0)
+        return train_step(state, batch, replace(pipeline, capacities=capacities), rule)
+
+    cramped = TIGHT.resized(cell_patches=64)
+    state, report = step(cramped)
+    assert not bool(report.fits)
+    assert int(state.step) == 0
+    for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(initial_state(params)), strict=True):
+        np.testing.assert_array_equal(a, b)
+    needed = report.loss.usage
+    assert overflowed(needed, cramped) == ["cell_patches"]
+    state, report = step(grow(cramped, needed))
+    assert bool(report.fits)
+    assert bool(report.finite)
+    assert int(state.step) == 1
+    assert np.any(state.params.log_exposure != params.log_exposure)

@@ -1,0 +1,131 @@
+"""A run, from Python and from the command: the same folder, the same numbers."""
+
+import json
+import shutil
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from support import TINY
+
+import geosplat_jax as gs
+from geosplat_jax import cli
+
+DUCK = Path(__file__).resolve().parents[1] / "examples" / "duck"
+SETTINGS = (*TINY, "stages.split_sum.steps=2", "run.preview_every=2")
+
+
+def command(*arguments):
+    """Run the command; return its exit status."""
+    return cli.main([*map(str, arguments)])
+
+
+def train_arguments(scene, output):
+    settings = [part for setting in SETTINGS for part in ("--set", setting)]
+    return ("train", scene, "--output", output, "--downscale", 8, *settings)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder whose name looks like markup, with the scene beside it."""
+    base = tmp_path_factory.mktemp("runs") / "a [bold]name[/]"
+    shutil.copytree(DUCK, base / "duck")
+    return base
+
+
+@pytest.fixture(scope="module")
+def run(folder):
+    """A run from Python."""
+    config = gs.make_config(overrides=SETTINGS)
+    return gs.train(folder / "duck", folder / "python", config, downscale=8)
+
+
+@pytest.fixture(scope="module")
+def commanded(run, folder):
+    """The same from the command."""
+    assert command(*train_arguments(folder / "duck", folder / "command")) == 0
+    return gs.Run(folder / "command")
+
+
+def test_python_and_the_command_make_the_same_run(run, commanded):
+    assert run.folder.record() == commanded.folder.record()
+    for a, b in zip(jax.tree.leaves(run.params), jax.tree.leaves(commanded.params), strict=True):
+        np.testing.assert_array_equal(a, b)
+    timing = {"seconds", "peak_memory_mb"}
+    first, second = (
+        [{k: v for k, v in line.items() if k not in timing} for line in r.steps()]
+        for r in (run, commanded)
+    )
+    assert first == second
+    assert len(first) == 2
+    assert run.folder.training()["seconds_total"] > 0
+
+
+def test_a_preview_is_written_while_training(run):
+    assert [path.name for path in run.folder.previews.iterdir()] == ["step_000002.png"]
+
+
+@pytest.mark.slow
+def test_the_pipeline_of_a_run_is_what_is_differentiated(run):
+    differentiate = jax.jit(lambda p, batch: jax.grad(run.pipeline.loss, has_aux=True)(p, batch))
+    gradient, report = differentiate(run.params, run.batch(2))
+    assert np.isfinite(float(report.psnr))
+    assert jax.tree.structure(gradient) == jax.tree.structure(run.params)
+    assert any(np.any(np.asarray(leaf)) for leaf in jax.tree.leaves(gradient))
+
+
+def test_a_view_is_rendered_as_the_readme_says(run):
+    view = run.renderer()(run.dataset.test.camera([0]))
+    assert view.rgb.shape == (16, 16, 3)
+    assert 0.5 < view.alpha.max() <= 1
+
+
+def test_metrics_are_there_after_an_evaluation_and_not_before(commanded, capsys):
+    with pytest.raises(gs.RunError, match="has not been evaluated"):
+        _ = commanded.metrics
+    assert command("evaluate", commanded.folder, "--samples", 4) == 0
+    assert "nvs.psnr" in capsys.readouterr().out
+    assert commanded.metrics["mean"]["nvs.psnr"] > 5
+    assert (commanded.metrics["step"], commanded.metrics["stage"]) == (2, "split_sum")
+
+
+def test_a_second_training_into_the_folder_is_refused_and_force_replaces_it(
+    run, commanded, folder, capsys
+):
+    before = commanded.folder.record()
+    arguments = train_arguments(folder / "duck", folder / "command")
+    assert command(*arguments) == 2
+    assert "--force" in " ".join(capsys.readouterr().err.split())
+    assert commanded.folder.record() == before
+    assert command(*arguments, "--force", "--seed", 7) == 0
+    assert commanded.folder.config().run.seed == 7
+
+
+def test_a_scene_that_has_moved_is_found_again_with_the_option(run, folder, capsys):
+    moved = folder / "moved"
+    shutil.copytree(folder / "duck", moved / "duck")
+    record = run.folder.record()
+    gone = {**record, "scene": str(folder / "nowhere")}
+    (run.folder.path / "run.json").write_text(json.dumps(gone))
+    assert command("render", run.folder, "--output", folder / "views") == 2
+    assert "--scene" in capsys.readouterr().err
+    again = gs.Run(run.folder.path, scene=moved / "duck")
+    assert again.folder.record()["scene"] == str((moved / "duck").resolve())
+    assert len(gs.Run(run.folder.path).dataset.train) == 40
+    (run.folder.path / "run.json").write_text(json.dumps(record))
+
+
+def test_every_setting_is_listed_with_its_default_range_and_meaning(capsys):
+    assert command("settings", "geometry.resolution", "--quality", "draft") == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "geometry.resolution 32 >= 4, <= 512" in shown
+    assert "longest side" in shown
+    assert command("settings", "nothing") == 2
+
+
+def test_an_option_that_is_no_setting_is_refused_by_its_name(folder, capsys):
+    arguments = train_arguments(folder / "duck", folder / "labelled")
+    assert command(*arguments, "--set", "quality=high") == 2
+    assert "--quality" in capsys.readouterr().err
+    assert not (folder / "labelled").exists()

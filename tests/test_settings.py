@@ -1,0 +1,91 @@
+"""Settings know their ranges, survive JSON, and take new kinds without a change elsewhere."""
+
+import json
+from typing import Annotated
+
+import pytest
+
+from geosplat_jax.core.settings import (
+    ANY_KIND,
+    Count,
+    NonNegative,
+    Variant,
+    from_plain,
+    listed,
+    settings,
+    to_plain,
+)
+
+
+@settings
+class Lamp(Variant):
+    """A base of settings."""
+
+
+@settings
+class Bulb(Lamp, kind="bulb"):
+    """One kind."""
+
+    watts: NonNegative = 40.0
+    """Power."""
+
+
+@settings
+class Strip(Lamp, kind="strip"):
+    """Another kind."""
+
+    lengths: tuple[NonNegative, ...] = (1.0, 2.0)
+    """Lengths in metres."""
+
+
+@settings
+class Room:
+    """What holds any kind of lamp."""
+
+    lamp: Annotated[Lamp, ANY_KIND] = Bulb()
+    """The lamp."""
+    doors: Count = 1
+    """Number of doors."""
+
+
+@pytest.mark.parametrize("room", [Room(), Room(Bulb(3.0), 0), Room(Strip((0.5,)), 2)])
+def test_settings_of_every_kind_survive_json(room):
+    assert from_plain(Room, json.loads(json.dumps(to_plain(room)))) == room
+    assert hash(room) == hash(from_plain(Room, to_plain(room)))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"doors": -1}, "doors must be greater than or equal to 0, got -1"),
+        ({"doors": 1.5}, "doors must be a valid integer, got 1.5"),
+        ({"doors": True}, "doors must be a valid integer, got True"),
+        ({"windows": 1}, "unknown setting windows"),
+        ({"lamp": {"kind": "fire"}}, "lamp: kind must be one of ['bulb', 'strip'], got 'fire'"),
+        ({"lamp": {"kind": "bulb", "watts": -2.0}}, "lamp.watts must be greater than or equal"),
+        ({"lamp": {"kind": "bulb", "volts": 3}}, "unknown setting lamp.volts"),
+        ({"lamp": {"kind": "bulb", "watts": float("nan")}}, "lamp.watts must be a finite number"),
+        ({"lamp": {"kind": "bulb", "watts": float("inf")}}, "lamp.watts must be a finite number"),
+        ({"lamp": {"kind": "strip", "lengths": [1, "a"]}}, "lamp.lengths.1 must be a valid number"),
+        ({"lamp": 3}, "lamp must be"),
+    ],
+)
+def test_the_first_mistake_is_named_by_its_path_in_one_line(values, message):
+    with pytest.raises(ValueError, match=".") as caught:
+        from_plain(Room, values)
+    assert str(caught.value).startswith(message)
+    assert "\n" not in str(caught.value)
+
+
+def test_values_are_checked_wherever_settings_are_made():
+    with pytest.raises(ValueError, match="watts"):
+        Bulb(watts=-1.0)
+    with pytest.raises(ValueError, match="doors"):
+        Room(doors=-1)
+
+
+def test_every_setting_is_listed_with_its_value_range_and_meaning():
+    assert list(listed(Room(Bulb(3.0)))) == [
+        ("lamp.watts", 3.0, ">= 0", "Power."),
+        ("doors", 1, ">= 0", "Number of doors."),
+    ]
