@@ -1,8 +1,8 @@
-"""The terms of the training objective (Eq. 13-19), as a table: name and function.
+"""The terms of the training objective (Eq. 13-19), as tables: name and function.
 
-`evaluate` computes what is asked for by name and nothing else. Each term is a function of
-`LossInputs`; a surface adds penalties of its own (`SurfaceModel.penalties`). Weights are not known
-here: `pipeline.Pipeline.loss` sums the terms (Eq. 19).
+A term is a function of one view (`ViewInputs`) or of none (`SharedInputs`), and is computed only
+where it is asked for by name; a surface adds penalties of its own (`SurfaceModel.penalties`).
+Weights are not known here: `pipeline.Pipeline.loss` sums the terms (Eq. 19).
 
 Differentiable in the parameters only. Not differentiable by contract: visibility and depth order,
 topology, the random background, the noise of the smoothness term, samples of light.
@@ -85,58 +85,74 @@ class Comparison(NamedTuple):
 
 
 @dataclass(frozen=True)
-class LossInputs:
-    """What the terms are made from.
+class ViewInputs:
+    """What the terms of a single view are made from.
 
     Attributes
     ----------
-    params, batch : as given to the loss.
-    asset, output : what was reconstructed and rendered.
-    rgb : (V, H, W, 3) premultiplied, exposed and tone mapped.
-    surface, fields, objective : as in the pipeline.
+    view : batch of one view.
+    output : its images.
+    rgb : (1, H, W, 3) premultiplied, exposed and tone mapped.
+    log_exposure : () of the render.
+    objective : as in the pipeline.
+    key : of the background.
     """
 
-    params: Params
-    batch: Batch
-    asset: Asset
+    view: Batch
     output: RenderOutput
-    rgb: Float[Array, "V H W 3"]
-    surface: SurfaceModel
-    fields: MaterialSpec
+    rgb: Float[Array, "1 H W 3"]
+    log_exposure: Float[Array, ""]
     objective: Objective
-
-    @cached_property
-    def keys(self) -> tuple[Key[Array, ""], ...]:
-        """Keys of the background, of the choice of splats and of their displacement."""
-        return tuple(jax.random.split(self.batch.key, 3))
+    key: Key[Array, ""]
 
     @cached_property
     def comparison(self) -> Comparison:
         """Both images over one background."""
         objective = self.objective
         background = random_background(
-            self.keys[0], self.rgb.shape, self.rgb.dtype, objective.background
+            self.key, self.rgb.shape, self.rgb.dtype, objective.background
         )
         return compare(
             self.rgb,
             self.output.alpha,
-            self.batch.image,
+            self.view.image,
             background,
-            self.batch.valid,
+            self.view.valid,
             srgb=objective.srgb,
         )
+
+
+@dataclass(frozen=True)
+class SharedInputs:
+    """What the terms that no view has a part in are made from.
+
+    Attributes
+    ----------
+    params : as given to the loss.
+    asset : what was reconstructed.
+    surface, fields, objective : as in the pipeline.
+    key : of what is drawn.
+    """
+
+    params: Params
+    asset: Asset
+    surface: SurfaceModel
+    fields: MaterialSpec
+    objective: Objective
+    key: Key[Array, ""]
 
     @cached_property
     def changes(self) -> Changes:
         """Eq. 15-17 on a random subset of the splats: unbiased, at a fraction of the cost."""
         splats, objective = self.asset.splats, self.objective
-        drawn = jax.random.uniform(self.keys[1], (objective.smoothness_samples,), jnp.float32)
+        choice_key, displacement_key = jax.random.split(self.key)
+        drawn = jax.random.uniform(choice_key, (objective.smoothness_samples,), jnp.float32)
         picked = jnp.floor(drawn * splats.count.astype(jnp.float32)).astype(jnp.int32)
         return smoothness(
             self.params.material,
             splats.anchors[picked],
             jnp.broadcast_to(splats.count > 0, picked.shape),
-            self.keys[2],
+            displacement_key,
             self.surface.box,
             spec=self.fields,
             std=objective.smoothness_radius,
@@ -267,49 +283,66 @@ def normal_smoothness(
     return terms[0] + terms[1]
 
 
-TERMS: dict[str, Callable[[LossInputs], Float[Array, ""]]] = {
+VIEW_TERMS: dict[str, Callable[[ViewInputs], Float[Array, ""]]] = {
     "l1": lambda x: image_l1(x.comparison),  # Eq. 13
     "ssim": lambda x: image_dissimilarity(x.comparison),
     "mask": lambda x: mask_error(x.comparison),
-    "smoothness_albedo": lambda x: x.changes.albedo,  # Eq. 15-17
-    "smoothness_roughness_metallic": lambda x: x.changes.roughness + x.changes.metallic,
     "light": lambda x: light_agreement(  # Eq. 18
         x.output.aovs["diffuse"],
         x.output.aovs["specular_radiance"],
-        x.params.log_exposure,
-        x.batch.image,
-        x.batch.valid,
+        x.log_exposure,
+        x.view.image,
+        x.view.valid,
     ),
-    "indirect": lambda x: indirect_magnitude(x.asset),
-    "white_balance": lambda x: white_balance(x.params.light.radiance),
     "normal_smoothness": lambda x: normal_smoothness(
-        x.output.aovs["normal"], x.batch.image, x.batch.valid
+        x.output.aovs["normal"], x.view.image, x.view.valid
     ),
 }
-"""Every term that is not a penalty of the surface, by the name of its weight."""
+"""Terms of a single view by the name of their weight; the loss takes their mean over the views."""
+
+SHARED_TERMS: dict[str, Callable[[SharedInputs], Float[Array, ""]]] = {
+    "smoothness_albedo": lambda x: x.changes.albedo,  # Eq. 15-17
+    "smoothness_roughness_metallic": lambda x: x.changes.roughness + x.changes.metallic,
+    "indirect": lambda x: indirect_magnitude(x.asset),
+    "white_balance": lambda x: white_balance(x.params.light.radiance),
+}
+"""Terms that no view has a part in. A surface adds penalties of its own."""
+
+TERMS = (*VIEW_TERMS, *SHARED_TERMS)
+"""Names of all terms that every surface has."""
 
 TERM_AOVS: dict[str, tuple[str, ...]] = {
     "light": ("diffuse", "specular_radiance"),
     "normal_smoothness": ("normal",),
 }
-"""Extra images that a term looks at."""
+"""Extra images that a term of a view looks at."""
 
 
-def evaluate(x: LossInputs, names: Iterable[str]) -> dict[str, Float[Array, ""]]:
-    """Compute terms by name, unweighted.
+def term_aovs(names: Iterable[str]) -> tuple[str, ...]:
+    """List the extra images that some terms look at."""
+    return tuple(dict.fromkeys(aov for name in names for aov in TERM_AOVS.get(name, ())))
+
+
+def view_terms(x: ViewInputs, names: Iterable[str]) -> dict[str, Float[Array, ""]]:
+    """Compute the terms of a view that are among ``names``, unweighted."""
+    return {name: VIEW_TERMS[name](x) for name in names if name in VIEW_TERMS}
+
+
+def shared_terms(x: SharedInputs, names: Iterable[str]) -> dict[str, Float[Array, ""]]:
+    """Compute the terms among ``names`` that belong to no view, unweighted.
 
     Raises
     ------
     ValueError
-        For a name that neither the table nor the surface knows.
+        For a name that neither a table nor the surface knows.
     """
     terms = {}
     for name in names:
-        if name in TERMS:
-            terms[name] = TERMS[name](x)
+        if name in SHARED_TERMS:
+            terms[name] = SHARED_TERMS[name](x)
         elif name in x.penalties:
             terms[name] = x.penalties[name]
-        else:
+        elif name not in VIEW_TERMS:
             known = sorted((*TERMS, *x.penalties))
             raise ValueError(f"unknown term of the loss {name!r}; expected some of {known}")
     return terms

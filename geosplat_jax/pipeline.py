@@ -4,6 +4,9 @@ A `Pipeline` is a pytree: its arrays are constants of training, its static field
 splats, transport and terms are meant. Nothing is threaded beside it::
 
     (total, report), gradient = jax.value_and_grad(pipeline.loss, has_aux=True)(params, batch)
+
+The loss is a mean over views of `Pipeline.view_loss`, plus `Pipeline.shared_loss`. Training makes
+the same gradient from these parts, see `fit.gradient`.
 """
 
 from dataclasses import replace
@@ -11,20 +14,54 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from geosplat_jax.core.capacity import Usage, combine
 from geosplat_jax.core.color import tone_map
 from geosplat_jax.core.numerics import safe_log
-from geosplat_jax.core.types import Batch
-from geosplat_jax.losses import TERM_AOVS, LossInputs, Objective, evaluate
+from geosplat_jax.core.types import Batch, EnvLight
+from geosplat_jax.losses import (
+    Objective,
+    SharedInputs,
+    ViewInputs,
+    shared_terms,
+    term_aovs,
+    view_terms,
+)
 from geosplat_jax.render import Asset, Params, RenderPipeline
-from geosplat_jax.transport.base import Transport
+from geosplat_jax.splats.tiles import TileLists
+from geosplat_jax.transport.base import Illumination
 
 _DECIBEL = 10.0 / 2.302585092994046
-_LIGHT_STREAM = 3
-_RESIDUAL_STREAM = 4
-"""Numbers of the random streams of the light's samples; 0 to 2 are those of the loss itself."""
+_SHARED_STREAM = 2**31
+_LIGHT_STREAM = 2**31 + 1
+_RESIDUAL_STREAM = 2**31 + 2
+"""Numbers of the random streams that no view has a part in; those of the views count from 0."""
+
+
+class ViewReport(eqx.Module):
+    """What one view, or the mean of several, says about itself.
+
+    Attributes
+    ----------
+    terms : unweighted, by name.
+    mse : () mean squared difference of the linear images.
+    usage : true needs of the view's buffers.
+    """
+
+    terms: dict[str, Float[Array, ""]]
+    mse: Float[Array, ""]
+    usage: Usage
+
+    def times(self, share: Float[Array, ""]) -> "ViewReport":
+        """Scale what is averaged."""
+        terms = {name: share * term for name, term in self.terms.items()}
+        return ViewReport(terms, share * self.mse, self.usage)
+
+    def plus(self, other: "ViewReport") -> "ViewReport":
+        """Add two reports that were scaled; of the needs, take the larger."""
+        terms = {name: term + other.terms[name] for name, term in self.terms.items()}
+        return ViewReport(terms, self.mse + other.mse, combine(self.usage, other.usage))
 
 
 class LossReport(eqx.Module):
@@ -64,7 +101,7 @@ class Pipeline(RenderPipeline):
         """Evaluate Eq. 19 on a batch of views; differentiate in ``params`` with ``has_aux=True``.
 
         With a transport that draws samples, these are constants, and the gradient is not that of
-        the returned, noisy value; see `_with_independent_residual`.
+        the returned, noisy value; see `residual_image`.
 
         Returns
         -------
@@ -72,44 +109,67 @@ class Pipeline(RenderPipeline):
         report : see `LossReport`.
         """
         asset = self.reconstruct(params)
-        output = self.render_views(
-            asset,
-            params.light,
-            batch.camera,
-            aov_names=tuple(
-                dict.fromkeys(aov for name in self.weights for aov in TERM_AOVS.get(name, ()))
-            ),
-            key=jax.random.fold_in(batch.key, _LIGHT_STREAM),
-            carry=batch.carry,
-        )
-        rgb = tone_map(output.rgb, params.log_exposure)
-        residual = self.transport.for_residual()
-        if residual is not None:
-            rgb = self._with_independent_residual(rgb, asset, params, batch, residual)
-        inputs = LossInputs(
-            params, batch, asset, output, rgb, self.surface, self.fields, self.objective
-        )
-        terms = evaluate(inputs, self.weights)
-        weighted = [self.weights[name] * terms[name] for name in self.weights]  # Eq. 19
-        report = LossReport(
-            terms=terms,
-            psnr=-_DECIBEL * safe_log(inputs.comparison.mse),
-            splat_count=asset.splats.count,
-            face_count=asset.mesh.face_count,
-            usage=combine(output.usage),
-            carry=output.carry,
-        )
-        return jnp.sum(jnp.stack(weighted)), report
+        views = [batch.view(number) for number in range(batch.camera.count)]
+        lists = [self.visible(asset.splats, view.camera) for view in views]
+        seen = self.points_seen(asset, lists)
+        lights, carry = self.lights(asset, params.light, seen, batch)
+        others = self.residual_lights(asset, params.light, seen, batch)
+        total, shared = self.shared_loss(params, asset, batch)
+        reports = []
+        for view, listed, share in zip(views, lists, batch.shares, strict=True):
+            residual = self.residual_image(params.log_exposure, asset, others, listed, view)
+            value, report = self.view_loss(
+                params.log_exposure, asset, lights, listed, view, residual
+            )
+            total = total + share * value
+            reports.append(report.times(share))
+        mean = reports[0]
+        for report in reports[1:]:
+            mean = mean.plus(report)
+        return total, self.report(asset, mean, shared, carry)
 
-    def _with_independent_residual(
+    def lights(
+        self, asset: Asset, light: EnvLight, seen: Bool[Array, " N"] | None, batch: Batch
+    ) -> tuple[Illumination, object]:
+        """Prepare the light of a step for all its views.
+
+        Parameters
+        ----------
+        asset, light : what is lit, and by what.
+        seen : (N,) splats that some view sees; None for all.
+        batch : whose key and carry are used.
+
+        Returns
+        -------
+        illumination : for `view_loss`.
+        carry : what the transport keeps for the next step.
+        """
+        key = jax.random.fold_in(batch.key, _LIGHT_STREAM)
+        return self.illuminate(asset, light, key=key, mask=seen, carry=batch.carry)
+
+    def residual_lights(
+        self, asset: Asset, light: EnvLight, seen: Bool[Array, " N"] | None, batch: Batch
+    ) -> Illumination | None:
+        """Prepare the light with other samples, as constants, for `residual_image`.
+
+        None where the residual comes from the image that is differentiated.
+        """
+        transport = self.transport.for_residual()
+        if transport is None:
+            return None
+        asset, light = jax.lax.stop_gradient((asset, light))
+        key = jax.random.fold_in(batch.key, _RESIDUAL_STREAM)
+        return replace(self, transport=transport).illuminate(asset, light, key=key, mask=seen)[0]
+
+    def residual_image(
         self,
-        rgb: Float[Array, "V H W 3"],
+        log_exposure: Float[Array, ""],
         asset: Asset,
-        params: Params,
-        batch: Batch,
-        transport: Transport,
-    ) -> Float[Array, "V H W 3"]:
-        """Return the values of an image drawn with other samples, with the derivative of ``rgb``.
+        lights: Illumination | None,
+        lists: TileLists,
+        view: Batch,
+    ) -> Float[Array, "1 H W 3"] | None:
+        """Render a view with samples of its own, as a constant from which Eq. 13 is evaluated.
 
         The gradient of a distance is residual times derivative. From the same samples the two
         depend on each other: the mean of the product is not the product of the means, and descent
@@ -117,11 +177,78 @@ class Pipeline(RenderPipeline):
         it is, which for a squared distance is the gradient at the mean image, and for L1 and SSIM
         comes close. Eq. 18 keeps the first image.
         """
-        output = replace(self, transport=transport).render_views(
-            jax.lax.stop_gradient(asset),
-            jax.lax.stop_gradient(params.light),
-            batch.camera,
-            key=jax.random.fold_in(batch.key, _RESIDUAL_STREAM),
+        transport = self.transport.for_residual()
+        if transport is None or lights is None:
+            return None
+        output = replace(self, transport=transport).render_view(
+            asset, lights, lists, view.camera, key=jax.random.fold_in(view.key, _RESIDUAL_STREAM)
         )
-        value = tone_map(output.rgb, params.log_exposure)
-        return rgb + jax.lax.stop_gradient(value - rgb)
+        return jax.lax.stop_gradient(tone_map(output.rgb, log_exposure))
+
+    def view_loss(
+        self,
+        log_exposure: Float[Array, ""],
+        asset: Asset,
+        lights: Illumination,
+        lists: TileLists,
+        view: Batch,
+        residual: Float[Array, "1 H W 3"] | None,
+    ) -> tuple[Float[Array, ""], ViewReport]:
+        """Evaluate the weighted terms of a single view.
+
+        Parameters
+        ----------
+        log_exposure : of the parameters.
+        asset, lights : see `reconstruct` and `lights`.
+        lists : what the view can see, see `visible`.
+        view : see `Batch.view`.
+        residual : image whose values are taken in place of the rendered ones, see
+            `residual_image`; None for those.
+        """
+        background_key, sample_key = jax.random.split(view.key)
+        output = self.render_view(
+            asset,
+            lights,
+            lists,
+            view.camera,
+            aov_names=term_aovs(self.weights),
+            key=sample_key,
+        )
+        rgb = tone_map(output.rgb, log_exposure)
+        if residual is not None:
+            rgb = rgb + jax.lax.stop_gradient(residual - rgb)
+        inputs = ViewInputs(view, output, rgb, log_exposure, self.objective, background_key)
+        terms = view_terms(inputs, self.weights)
+        return self._weighted(terms), ViewReport(terms, inputs.comparison.mse, lists.usage)
+
+    def shared_loss(
+        self, params: Params, asset: Asset, batch: Batch
+    ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+        """Evaluate the weighted terms that no view has a part in; also return them by name."""
+        key = jax.random.fold_in(batch.key, _SHARED_STREAM)
+        inputs = SharedInputs(params, asset, self.surface, self.fields, self.objective, key)
+        terms = shared_terms(inputs, self.weights)
+        return self._weighted(terms), terms
+
+    def report(
+        self,
+        asset: Asset,
+        views: ViewReport,
+        shared: dict[str, Float[Array, ""]],
+        carry: object,
+    ) -> LossReport:
+        """Say what a step was like, from the mean over its views and the terms of none."""
+        terms = {**views.terms, **shared}
+        return LossReport(
+            terms={name: terms[name] for name in self.weights},
+            psnr=-_DECIBEL * safe_log(views.mse),
+            splat_count=asset.splats.count,
+            face_count=asset.mesh.face_count,
+            usage=combine(asset.usage, views.usage),
+            carry=carry,
+        )
+
+    def _weighted(self, terms: dict[str, Float[Array, ""]]) -> Float[Array, ""]:
+        """Sum up terms with their weights (Eq. 19)."""
+        parts = [self.weights[name] * term for name, term in terms.items()]
+        return jnp.sum(jnp.stack(parts)) if parts else jnp.zeros(())

@@ -33,7 +33,7 @@ from geosplat_jax.splats.rasterize import (
     gather_visible,
 )
 from geosplat_jax.surface.base import Surface, SurfaceModel
-from geosplat_jax.transport.base import Illumination, Shaded, Transport
+from geosplat_jax.transport.base import Illumination, Transport
 
 AOV_CHANNELS = {
     "albedo": 3,
@@ -140,17 +140,17 @@ class ShadingDomain(Variant, abc.ABC):
         key: Key[Array, ""] | None,
         asset: Asset,
         illumination: Illumination,
-        lists: list[TileLists],
+        lists: TileLists,
         camera: Camera,
         names: tuple[str, ...],
-    ) -> list[tuple[dict[str, Float[Array, "H W c"]], Float[Array, "H W"]]]:
-        """Make ``rgb`` and the named images of every view, premultiplied, and its coverage.
+    ) -> tuple[dict[str, Float[Array, "H W c"]], Float[Array, "H W"]]:
+        """Make ``rgb`` and the named images of one view, premultiplied, and its coverage.
 
         Parameters
         ----------
         key : of the samples that depend on the viewer.
         asset, illumination : what is seen, and in which light.
-        lists, camera : what each view can see, and the views.
+        lists, camera : what the view can see, and its camera.
         names : of extra images, some of `AOV_CHANNELS`.
         """
 
@@ -165,85 +165,44 @@ class PerSplat(ShadingDomain, kind="per_splat"):
         key: Key[Array, ""] | None,
         asset: Asset,
         illumination: Illumination,
-        lists: list[TileLists],
-        camera: Camera,
-        names: tuple[str, ...],
-    ) -> list[tuple[dict[str, Float[Array, "H W c"]], Float[Array, "H W"]]]:
-        """Shade the visible splats of all views in one go, then composite view by view."""
-        shaded = self._shade(pipeline, key, asset, illumination, lists, camera)
-        return [
-            self._composite(pipeline, asset, shaded[view], lists[view], camera.view(view), names)
-            for view in range(len(lists))
-        ]
-
-    def _shade(
-        self,
-        pipeline: "RenderPipeline",
-        key: Key[Array, ""] | None,
-        asset: Asset,
-        illumination: Illumination,
-        lists: list[TileLists],
-        camera: Camera,
-    ) -> list[Shaded]:
-        """Shade the rows of every list, each towards its own camera."""
-        rows = jnp.concatenate([view.index for view in lists])
-        sizes = [view.index.shape[0] for view in lists]
-        centers = jnp.concatenate(
-            [
-                jnp.broadcast_to(center[None, :], (size, 3))
-                for center, size in zip(camera.centers, sizes, strict=True)
-            ]
-        )
-
-        def take(values: Array) -> Array:
-            return gather_visible(rows, values)
-
-        shaded = pipeline.transport.shade(
-            key,
-            jax.tree.map(take, asset.splats.points()),
-            jax.tree.map(take, asset.attributes),
-            safe_normalize(centers - take(asset.splats.means)),
-            illumination.take(rows),
-            asset.index,
-        )
-        starts = [sum(sizes[:view]) for view in range(len(sizes))]
-        return [
-            jax.tree.map(lambda x, a=start, n=size: x[a : a + n], shaded)
-            for start, size in zip(starts, sizes, strict=True)
-        ]
-
-    def _composite(
-        self,
-        pipeline: "RenderPipeline",
-        asset: Asset,
-        shaded: Shaded,
         lists: TileLists,
         camera: Camera,
         names: tuple[str, ...],
     ) -> tuple[dict[str, Float[Array, "H W c"]], Float[Array, "H W"]]:
-        """Blend the colours and attributes of one view's splats."""
+        """Shade the visible splats towards the camera, then blend colours and attributes."""
 
         def seen(values: Float[Array, "N ..."], padding: float = 0.0) -> Float[Array, "M ..."]:
             return gather_visible(lists.index, values, padding=padding)
 
-        splats, materials = asset.splats, asset.attributes.materials
+        splats = asset.splats
+        means, normals = seen(splats.means), seen(splats.normals)
+        attributes = jax.tree.map(seen, asset.attributes)
+        materials = attributes.materials
+        shaded = pipeline.transport.shade(
+            key,
+            jax.tree.map(lambda x: gather_visible(lists.index, x), splats.points()),
+            attributes,
+            safe_normalize(camera.centers - means),
+            illumination.take(lists.index),
+            asset.index,
+        )
         footprints = pipeline.project(
-            seen(splats.means), seen(splats.quats), seen(splats.scales, padding=1.0), camera
+            means, seen(splats.quats), seen(splats.scales, padding=1.0), camera
         )
         channels = {
-            "albedo": lambda: seen(materials.albedo),
-            "roughness": lambda: seen(materials.roughness)[:, None],
-            "metallic": lambda: seen(materials.metallic)[:, None],
-            "normal": lambda: seen(splats.normals),
-            "depth": lambda: footprints.depths[:, None],
-            "diffuse": lambda: shaded.diffuse_light,
-            "specular": lambda: shaded.specular_light,
-            "specular_radiance": lambda: shaded.specular,
+            "albedo": materials.albedo,
+            "roughness": materials.roughness[:, None],
+            "metallic": materials.metallic[:, None],
+            "normal": normals,
+            "depth": footprints.depths[:, None],
+            "diffuse": shaded.diffuse_light,
+            "specular": shaded.specular_light,
+            "specular_radiance": shaded.specular,
         }
         image, alpha = composite(
             footprints,
             seen(splats.opacities),
-            jnp.concatenate([shaded.rgb] + [channels[name]() for name in names], axis=-1),
+            jnp.concatenate([shaded.rgb] + [channels[name] for name in names], axis=-1),
             lists,
             height=camera.height,
             width=camera.width,
@@ -347,6 +306,25 @@ class RenderPipeline(eqx.Module):
         points = asset.splats.points(mask)
         return self.transport.prepare(key, points, asset.attributes, light, asset.index, carry)
 
+    def render_view(
+        self,
+        asset: Asset,
+        illumination: Illumination,
+        lists: TileLists,
+        camera: Camera,
+        *,
+        aov_names: tuple[str, ...] = (),
+        key: Key[Array, ""] | None = None,
+    ) -> RenderOutput:
+        """Render a prepared light from a single camera; see `visible` and `render_views`."""
+        _require_known(aov_names)
+        names = tuple(dict.fromkeys(aov_names + self.transport.filter_inputs))
+        images, alpha = self.domain.images(self, key, asset, illumination, lists, camera, names)
+        images = self.transport.filtered(images, alpha, camera.intrinsics[0, 0, 0])
+        usage = capacity_module.combine(asset.usage, lists.usage)
+        aovs = {name: images[name][None] for name in aov_names}
+        return RenderOutput(images["rgb"][None], alpha[None], aovs, usage)
+
     def render_lit(
         self,
         asset: Asset,
@@ -387,7 +365,7 @@ class RenderPipeline(eqx.Module):
         _require_known(aov_names)
         lists = self._lists(asset, camera)
         light_key, view_key = (None, None) if key is None else jax.random.split(key)
-        mask = None if self.transport.needs_every_point else _seen(lists, asset.splats)
+        mask = self.points_seen(asset, lists)
         illumination, carry = self.illuminate(asset, light, key=light_key, mask=mask, carry=carry)
         output = self._render_listed(view_key, asset, illumination, lists, camera, aov_names)
         return eqx.tree_at(lambda o: o.carry, output, carry, is_leaf=lambda x: x is None)
@@ -425,6 +403,15 @@ class RenderPipeline(eqx.Module):
             parts.append(self.surface.ray_index(surface, capacities=self.capacities).usage)
         return capacity_module.combine(*parts)
 
+    def points_seen(self, asset: Asset, lists: list[TileLists]) -> Bool[Array, " N"] | None:
+        """Tell which splats some view sees; None where the transport needs the others as well."""
+        if self.transport.needs_every_point:
+            return None
+        seen = jnp.zeros(asset.splats.opacities.shape, bool)
+        for listed in lists:
+            seen = seen.at[listed.index].set(True, mode="drop")
+        return seen
+
     def _lists(self, asset: Asset, camera: Camera) -> list[TileLists]:
         """List what every view can see."""
         # Unrolled: independent views let XLA run their single-threaded sorts side by side.
@@ -439,26 +426,22 @@ class RenderPipeline(eqx.Module):
         camera: Camera,
         aov_names: tuple[str, ...],
     ) -> RenderOutput:
-        """Make the images of what the lists hold, and filter them."""
-        names = tuple(dict.fromkeys(aov_names + self.transport.filter_inputs))
-        found = self.domain.images(self, key, asset, illumination, lists, camera, names)
-        views = []
-        for view, (images, alpha) in enumerate(found):
-            focal = camera.intrinsics[view, 0, 0]
-            images = self.transport.filtered(images, alpha, focal)
-            views.append({name: images[name] for name in ("rgb", *aov_names)})
-        stacked = jax.tree.map(lambda *parts: jnp.stack(parts), *views)
-        usage = capacity_module.combine(asset.usage, *(listed.usage for listed in lists))
-        alphas = jnp.stack([alpha for _, alpha in found])
-        return RenderOutput(stacked.pop("rgb"), alphas, stacked, usage)
-
-
-def _seen(lists: list[TileLists], splats: Splats) -> Bool[Array, " N"]:
-    """Tell which splats some view sees: the others need no light of their own."""
-    seen = jnp.zeros(splats.opacities.shape, bool)
-    for listed in lists:
-        seen = seen.at[listed.index].set(True, mode="drop")
-    return seen
+        """Render the views of some lists, each with samples of its own."""
+        views = [
+            self.render_view(
+                asset,
+                illumination,
+                listed,
+                camera.view(view),
+                aov_names=aov_names,
+                key=None if key is None else jax.random.fold_in(key, view),
+            )
+            for view, listed in enumerate(lists)
+        ]
+        usage = capacity_module.combine(*(view.usage for view in views))
+        images = [(view.rgb, view.alpha, view.aovs) for view in views]
+        rgb, alpha, aovs = jax.tree.map(lambda *parts: jnp.concatenate(parts), *images)
+        return RenderOutput(rgb, alpha, aovs, usage)
 
 
 def _require_known(aov_names: tuple[str, ...]) -> None:

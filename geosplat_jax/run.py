@@ -6,16 +6,21 @@
 import json
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from geosplat_jax.core.types import Batch, EnvLight
 from geosplat_jax.fit.config import Config
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.runtime import in_background
 from geosplat_jax.fit.stages import make_batch
 from geosplat_jax.fit.train import Progress, Trained, fit, load_trained
 from geosplat_jax.io.dataset import Dataset, load_recorded
@@ -224,14 +229,26 @@ class Run:
 
 
 class _Previews:
-    """Write truth, render and normals of one view side by side while training."""
+    """Write truth, render and normals of one view side by side, while the training goes on."""
 
     def __init__(self, dataset: Dataset, folder: RunFolder) -> None:
         self._views = dataset.test if dataset.test.names else dataset.train
         self._folder = folder.previews
+        self._running: Future[None] | None = None
 
     def __call__(self, trained: Trained) -> None:
-        """Render and write one preview."""
+        """Begin to render a preview; waits for the one before."""
+        self.finish()
+        # A copy, since the next step consumes the buffers of the parameters.
+        copied = replace(trained, params=jax.tree.map(jnp.array, trained.params))
+        self._running = in_background(lambda: self._write(copied))
+
+    def finish(self) -> None:
+        """Wait for the preview that is being rendered."""
+        if self._running is not None:
+            self._running.result()
+
+    def _write(self, trained: Trained) -> None:
         self._folder.mkdir(exist_ok=True)
         image = preview_image(trained, self._views)
         write_png(self._folder / f"step_{trained.step:06d}.png", image)
@@ -269,6 +286,7 @@ def train(
     dataset = scene if isinstance(scene, Dataset) else load_recorded(scene, reading)
     folder = RunFolder(output)
     began = time.perf_counter()
+    previews = _Previews(dataset, folder)
     fit(
         dataset,
         config,
@@ -278,8 +296,9 @@ def train(
         source=source,
         first_stage=first_stage,
         on_step=on_step,
-        on_preview=_Previews(dataset, folder),
+        on_preview=previews,
     )
+    previews.finish()
     folder.write_training({"seconds_total": round(time.perf_counter() - began, 2)})
     run = Run(folder.path)
     run.dataset = dataset

@@ -1,4 +1,15 @@
-"""Strictness for every test: dtypes, ranks, warnings and shapes at run time."""
+"""Strictness for every test, and a compiler in a hurry, since most of a test is compilation."""
+
+import os
+import sys
+from pathlib import Path
+
+# Before jax reads them. Laws are tested here, not speed: code that the compiler did not polish
+# keeps them as well, and is there in two thirds of the time.
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true",
+)
 
 import jax
 import pytest
@@ -6,8 +17,13 @@ from jaxtyping import install_import_hook
 
 install_import_hook("geosplat_jax", "beartype.beartype")
 
+from geosplat_jax.fit.runtime import enable_compilation_cache  # noqa: E402
+
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# In the environment's folder: files, workers and runs share what they compile.
+enable_compilation_cache(Path(sys.prefix) / "cache")
 
 
 @pytest.fixture(autouse=True, scope="module")

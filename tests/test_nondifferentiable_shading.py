@@ -21,8 +21,8 @@ from one_sided import (
 from support import double_precision
 
 from geosplat_jax.core.numerics import COSINE_EPSILON, safe_normalize
-from geosplat_jax.core.types import EnvLight
-from geosplat_jax.fit.step import UpdateRule, _moved, rate_groups
+from geosplat_jax.core.types import EnvLight, rate_groups
+from geosplat_jax.fit.step import UpdateRule, _moved
 from geosplat_jax.materials import MaterialSpec, init_materials
 from geosplat_jax.render import Params
 from geosplat_jax.transport import bsdf

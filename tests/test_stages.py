@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support import MONTE_CARLO, ball, sphere_dataset, tiny_config
 
-from geosplat_jax.fit import train as train_module
+from geosplat_jax.fit import loop as loop_module
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.stages import begin_stage
 from geosplat_jax.fit.train import Interrupted, TrainingError, fit, load_trained
@@ -180,7 +180,7 @@ def test_the_first_stage_of_another_run_can_be_taken_over_bit_for_bit(
     def stop(*arguments, **others):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(train_module, "train_step", stop)
+    monkeypatch.setattr(loop_module, "train_step", stop)
     with pytest.raises(Interrupted):
         fit(dataset, tiny_config(*RUN), early, source=folder, first_stage="monte_carlo")
     monkeypatch.undo()
@@ -262,7 +262,7 @@ def test_taking_over_everything_there_is_to_train_is_refused(dataset, whole, tmp
 def test_a_surface_that_vanishes_later_is_put_back_as_its_stage_began(
     dataset, whole, tmp_path, monkeypatch
 ):
-    advance, emptied = train_module._Loop.advance, []
+    advance, emptied = loop_module.Loop.advance, []
 
     def sabotage(self, step):
         if step == 3 and not emptied:
@@ -273,7 +273,7 @@ def test_a_surface_that_vanishes_later_is_put_back_as_its_stage_began(
             self.state = replace(self.state, params=replace(self.state.params, geometry=gone))
         return advance(self, step)
 
-    monkeypatch.setattr(train_module._Loop, "advance", sabotage)
+    monkeypatch.setattr(loop_module.Loop, "advance", sabotage)
     state = fit(
         dataset,
         tiny_config(*RUN),
@@ -283,7 +283,7 @@ def test_a_surface_that_vanishes_later_is_put_back_as_its_stage_began(
         stop_after=4,
     )
     assert_same(state.params.geometry, emptied[0])
-    resumed = train_module._continue(dataset, tiny_config(*RUN), RunFolder(tmp_path))
+    resumed = loop_module.resumed_loop(dataset, tiny_config(*RUN), RunFolder(tmp_path))
     assert_same(resumed.fallback, emptied[0])
 
 

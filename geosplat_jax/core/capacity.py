@@ -84,7 +84,7 @@ def combine(*usages: Usage) -> Usage:
     }
 
 
-def fits(needed: Usage, capacities: Capacities) -> Bool[Array, ""]:
+def fits(needed: Usage, capacities: Mapping[str, int | Int[Array, ""]]) -> Bool[Array, ""]:
     """Whether every true count lies within its capacity."""
     if not needed:
         return jnp.ones((), bool)

@@ -6,11 +6,16 @@ Rows past a count are padding: opacity 0, scale 1, unit quaternion, zero normal,
 so that every function is finite on them.
 """
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
+
+from geosplat_jax.core.numerics import safe_divide
 
 RATE_GROUP = "rate group"
 """Key of a field's metadata; see `learned`."""
@@ -22,6 +27,53 @@ def learned(group: str, **options: Any) -> Any:
     A field without a group of its own belongs to that of the nearest field around it.
     """
     return eqx.field(metadata={RATE_GROUP: group}, **options)
+
+
+def rate_groups(params: Any) -> list[str]:
+    """Name the learning rate of every leaf, in the order of `jax.tree.leaves`.
+
+    Raises
+    ------
+    ValueError
+        If a leaf lies below no field that declares one.
+    """
+    groups = []
+    for path, _ in jax.tree_util.tree_flatten_with_path(params)[0]:
+        node, group = params, None
+        for key in path:
+            if isinstance(key, jax.tree_util.GetAttrKey):
+                field = type(node).__dataclass_fields__[key.name]
+                group = field.metadata.get(RATE_GROUP, group)
+                node = getattr(node, key.name)
+            else:
+                node = node[getattr(key, "idx", getattr(key, "key", None))]
+        if group is None:
+            raise ValueError(
+                f"the parameter {jax.tree_util.keystr(path)} has no learning rate; declare its "
+                "group with core.types.learned"
+            )
+        groups.append(group)
+    return groups
+
+
+def without_gradient(params: Any, groups: tuple[str, ...]) -> Any:
+    """Take the parameters of some groups as constants."""
+    return _replaced(params, groups, jax.lax.stop_gradient)
+
+
+def zero_gradient(gradient: Any, groups: tuple[str, ...]) -> Any:
+    """Set the gradient of some groups to zero."""
+    return _replaced(gradient, groups, jnp.zeros_like)
+
+
+def _replaced(params: Any, groups: tuple[str, ...], change: Callable[[Array], Array]) -> Any:
+    """Change the leaves of some groups."""
+    leaves, structure = jax.tree.flatten(params)
+    changed = [
+        change(leaf) if name in groups else leaf
+        for leaf, name in zip(leaves, rate_groups(params), strict=True)
+    ]
+    return jax.tree.unflatten(structure, changed)
 
 
 class Camera(eqx.Module):
@@ -76,6 +128,34 @@ class Batch(eqx.Module):
     views: Int[Array, " V"] | None = None
     valid: Float[Array, "V H W"] | None = None
     carry: Any = None
+
+    @property
+    def shares(self) -> Float[Array, " V"]:
+        """Shares of the views in a mean over all pixels that count, (V,); they sum up to one."""
+        if self.valid is None:
+            count = self.image.shape[0]
+            return jnp.full((count,), 1.0 / count, self.image.dtype)
+        counted = jnp.sum(self.valid, axis=(1, 2))
+        return safe_divide(counted, jnp.sum(counted))
+
+    def view(self, number: Int[Array, ""] | int) -> "Batch":
+        """Return the batch of a single view, with randomness of its own and no carry."""
+
+        def one(values: Array) -> Array:
+            return jax.lax.dynamic_slice_in_dim(values, number, 1)
+
+        camera = replace(
+            self.camera,
+            world_to_camera=one(self.camera.world_to_camera),
+            intrinsics=one(self.camera.intrinsics),
+        )
+        return Batch(
+            camera=camera,
+            image=one(self.image),
+            key=jax.random.fold_in(self.key, number),
+            views=None if self.views is None else one(self.views),
+            valid=None if self.valid is None else one(self.valid),
+        )
 
 
 class Box(eqx.Module):

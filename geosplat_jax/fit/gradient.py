@@ -1,0 +1,231 @@
+"""The gradient of the loss from its parts: programs that do not grow with the number of views.
+
+The chain rule is written out here between compiled programs: the asset, what a view sees, the
+light, the loss of one view, and the way back. That of a view is called once for every view. So a
+step of eight views compiles as fast as one of a single view, a buffer that grows costs only the
+programs that it is in, and programs can be compiled side by side, or before they are needed.
+
+`value_and_gradient` equals ``jax.value_and_grad(pipeline.loss, has_aux=True)`` up to rounding.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.types import Batch, EnvLight, without_gradient, zero_gradient
+from geosplat_jax.pipeline import LossReport, Pipeline, ViewReport
+from geosplat_jax.render import Params
+from geosplat_jax.splats.tiles import LIST_BUFFERS, TileLists
+from geosplat_jax.transport.base import Illumination
+
+_Parts = tuple[Any, Any]
+"""A pytree cut in two: what has a derivative, and the rest."""
+
+
+def _cut(tree: Any) -> _Parts:
+    return eqx.partition(tree, eqx.is_inexact_array)
+
+
+@partial(jax.jit, static_argnames=("frozen",))
+def _asset(pipeline: Pipeline, params: Params, frozen: tuple[str, ...]) -> tuple[_Parts, Callable]:
+    """Reconstruct; also return the way back from what moves of the asset to the parameters."""
+    moving, pull, fixed = jax.vjp(
+        lambda params: _cut(pipeline.reconstruct(without_gradient(params, frozen))),
+        params,
+        has_aux=True,
+    )
+    return (moving, fixed), pull
+
+
+@jax.jit
+def _view(batch: Batch, number: Int[Array, ""]) -> tuple[Batch, Float[Array, ""]]:
+    """Take a view and its share in the mean."""
+    return batch.view(number), batch.shares[number]
+
+
+@jax.jit
+def _lists(pipeline: Pipeline, asset: _Parts, view: Batch) -> TileLists:
+    """List what a view can see."""
+    return pipeline.visible(eqx.combine(*asset).splats, view.camera)
+
+
+@jax.jit
+def _seen(pipeline: Pipeline, asset: _Parts, lists: list[TileLists]) -> Bool[Array, " N"] | None:
+    """Tell which splats are seen at all."""
+    return pipeline.points_seen(eqx.combine(*asset), lists)
+
+
+@jax.jit
+def _lights(
+    pipeline: Pipeline,
+    asset: _Parts,
+    light: EnvLight,
+    seen: Bool[Array, " N"] | None,
+    batch: Batch,
+) -> tuple[_Parts, Any, Callable]:
+    """Prepare the light; also return what the transport keeps, and the way back."""
+    moving, fixed = asset
+
+    def prepare(moving: Any, light: EnvLight) -> tuple[Any, Any]:
+        lights, carry = pipeline.lights(eqx.combine(moving, fixed), light, seen, batch)
+        changing, rest = _cut(lights)
+        return changing, (rest, carry)
+
+    changing, pull, (rest, carry) = jax.vjp(prepare, moving, light, has_aux=True)
+    return (changing, rest), carry, pull
+
+
+@jax.jit
+def _residual_lights(
+    pipeline: Pipeline,
+    asset: _Parts,
+    light: EnvLight,
+    seen: Bool[Array, " N"] | None,
+    batch: Batch,
+) -> Illumination | None:
+    """Prepare the light with other samples."""
+    return pipeline.residual_lights(eqx.combine(*asset), light, seen, batch)
+
+
+@jax.jit
+def _residual_image(
+    pipeline: Pipeline,
+    log_exposure: Float[Array, ""],
+    asset: _Parts,
+    lights: Illumination | None,
+    lists: TileLists,
+    view: tuple[Batch, Float[Array, ""]],
+) -> Float[Array, "1 H W 3"] | None:
+    """Render a view with other samples."""
+    return pipeline.residual_image(log_exposure, eqx.combine(*asset), lights, lists, view[0])
+
+
+@jax.jit
+def _view_gradient(
+    pipeline: Pipeline,
+    log_exposure: Float[Array, ""],
+    asset: _Parts,
+    lights: _Parts,
+    lists: TileLists,
+    view: tuple[Batch, Float[Array, ""]],
+    residual: Float[Array, "1 H W 3"] | None,
+) -> tuple[Any, ViewReport]:
+    """Differentiate the loss of a view, times its share, and return both with the report."""
+    batch, share = view
+
+    def loss(log_exposure: Array, moving: Any, changing: Any) -> tuple[Array, ViewReport]:
+        value, report = pipeline.view_loss(
+            log_exposure,
+            eqx.combine(moving, asset[1]),
+            eqx.combine(changing, lights[1]),
+            lists,
+            batch,
+            residual,
+        )
+        return share * value, report.times(share)
+
+    (value, report), gradient = jax.value_and_grad(loss, (0, 1, 2), has_aux=True)(
+        log_exposure, asset[0], lights[0]
+    )
+    return (value, gradient), report
+
+
+@partial(jax.jit, donate_argnums=(0,))
+def _plus(first: tuple[Any, ViewReport], second: tuple[Any, ViewReport]) -> tuple[Any, ViewReport]:
+    """Add what two views found."""
+    total = jax.tree.map(jnp.add, first[0], second[0])
+    return total, first[1].plus(second[1])
+
+
+@partial(jax.jit, static_argnames=("frozen",))
+def _back(
+    pipeline: Pipeline,
+    params: Params,
+    asset: _Parts,
+    pulls: tuple[Callable, Callable],
+    views: tuple[Any, ViewReport],
+    batch: Batch,
+    carry: Any,
+    frozen: tuple[str, ...],
+) -> tuple[tuple[Float[Array, ""], LossReport], Params]:
+    """Add the terms of no view, and go back to the parameters."""
+    moving, fixed = asset
+    (value, (by_exposure, by_asset, by_light)), report = views
+    from_light, light = pulls[1](by_light)
+
+    def shared_loss(params: Params, moving: Any) -> tuple[Array, dict[str, Array]]:
+        return pipeline.shared_loss(
+            without_gradient(params, frozen), eqx.combine(moving, fixed), batch
+        )
+
+    (shared, terms), (direct, from_shared) = jax.value_and_grad(shared_loss, (0, 1), has_aux=True)(
+        params, moving
+    )
+    (gradient,) = pulls[0](jax.tree.map(lambda *x: sum(x), by_asset, from_light, from_shared))
+    gradient = jax.tree.map(jnp.add, gradient, direct)
+    gradient = replace(
+        gradient,
+        light=jax.tree.map(jnp.add, gradient.light, light),
+        log_exposure=gradient.log_exposure + by_exposure,
+    )
+    whole = pipeline.report(eqx.combine(moving, fixed), report, terms, carry)
+    return (value + shared, whole), zero_gradient(gradient, frozen)
+
+
+def _divided(capacities: Capacities) -> tuple[dict[str, int], dict[str, int]]:
+    """Part the buffers of the lists of a view from all others."""
+    of_lists = {name: size for name, size in capacities.items() if name in LIST_BUFFERS}
+    return of_lists, {n: size for n, size in capacities.items() if n not in LIST_BUFFERS}
+
+
+def run_program(program: Any, *arguments: Any) -> Any:
+    """Call a program."""
+    return program(*arguments)
+
+
+def value_and_gradient(
+    pipeline: Pipeline,
+    params: Params,
+    batch: Batch,
+    *,
+    frozen: tuple[str, ...],
+    run: Callable[..., Any] = run_program,
+) -> tuple[tuple[Any, LossReport], Params]:
+    """Evaluate `Pipeline.loss` and its gradient, view by view (host side).
+
+    Parameters
+    ----------
+    pipeline, params, batch : see `Pipeline.loss`.
+    frozen : groups of parameters whose gradient is zero.
+    run : calls a program with arguments; for those who want shapes only.
+
+    Returns
+    -------
+    (total, report), gradient : as from ``jax.value_and_grad``.
+    """
+    # Lists of other sizes are another program to make them, and no other to make the asset.
+    listing, pipeline = (
+        replace(pipeline, capacities=Capacities(**sizes)) for sizes in _divided(pipeline.capacities)
+    )
+    asset, pull_asset = run(_asset, pipeline, params, frozen)
+    numbers = range(batch.camera.count)
+    views = [run(_view, batch, jnp.int32(number)) for number in numbers]
+    lists = [run(_lists, listing, asset, view) for view, _ in views]
+    seen = run(_seen, pipeline, asset, lists)
+    light, exposure = params.light, params.log_exposure
+    lights, carry, pull_lights = run(_lights, pipeline, asset, light, seen, batch)
+    others = run(_residual_lights, pipeline, asset, light, seen, batch)
+    total = None
+    for view, listed in zip(views, lists, strict=True):
+        residual = run(_residual_image, pipeline, exposure, asset, others, listed, view)
+        part = run(_view_gradient, pipeline, exposure, asset, lights, listed, view, residual)
+        total = part if total is None else run(_plus, total, part)
+    pulls = (pull_asset, pull_lights)
+    return run(_back, pipeline, params, asset, pulls, total, batch, carry, frozen)

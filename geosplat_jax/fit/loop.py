@@ -1,0 +1,391 @@
+"""The state of a training between two steps: where it starts, what a step does, what is kept."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from geosplat_jax.core import capacity as capacity_module
+from geosplat_jax.core.capacity import Capacities, Usage
+from geosplat_jax.fit.compilation import compile_step
+from geosplat_jax.fit.config import Config, Stage, config_from_dict, differences
+from geosplat_jax.fit.folder import RunFolder
+from geosplat_jax.fit.planning import TrainingError, check_limits, plan_capacities
+from geosplat_jax.fit.runtime import in_background, release_programs_when_crowded
+from geosplat_jax.fit.stages import (
+    begin_stage,
+    build_pipeline,
+    initial_params,
+    make_batch,
+    pipeline_at,
+    update_rule,
+)
+from geosplat_jax.fit.step import StepReport, TrainState, initial_state, train_step
+from geosplat_jax.fit.trained import read_checkpoint
+from geosplat_jax.io.checkpoints import latest_checkpoint, read_meta, save_checkpoint
+from geosplat_jax.io.dataset import Dataset
+from geosplat_jax.io.views import Views
+from geosplat_jax.pipeline import Pipeline
+from geosplat_jax.render import Params
+from geosplat_jax.surface.base import SurfaceModel
+
+_RECOVERIES_ALLOWED = 3
+_SHRINK_EVERY = 100
+_LOOK_AHEAD = 100
+"""Steps before the end of a stage, at most, at which the next one's programs are compiled."""
+
+
+@dataclass
+class Loop:
+    """Mutable bookkeeping of a run; everything but the clock goes into checkpoints.
+
+    ``fallback`` is the shape that the stage began with, on the host, since the step consumes its
+    buffers. ``upcoming`` is the next stage, once it is near; ``to_come`` is what a checkpoint said
+    of it. ``has_compiled`` is set by whatever compiles, and reset by whoever measures time.
+    """
+
+    config: Config
+    views: Views
+    folder: RunFolder
+    surface: SurfaceModel
+    stage: Stage
+    pipeline: Pipeline
+    state: TrainState
+    planned_for: str | None = None
+    peak: dict[str, int] | None = None
+    recoveries: int = 0
+    fallback: Any = None
+    last_checkpoint: Path | None = None
+    upcoming: "Upcoming | None" = None
+    has_compiled: bool = False
+    to_come: dict[str, Any] | None = None
+
+    @property
+    def step(self) -> int:
+        """Steps of the run that are done."""
+        return int(self.state.step)
+
+    def _since(self, step: int) -> int:
+        """Count the steps since the start of the stage."""
+        return step - self.config.first_step(self.stage.name)
+
+    def meta(self) -> dict[str, Any]:
+        """Everything of a checkpoint that is not an array."""
+        return {
+            "config": self.config.to_dict(),
+            "stage": self.stage.name,
+            "surface": self.config.geometry.describe(self.surface),
+            "capacities": dict(self.pipeline.capacities),
+            "planned_for": self.planned_for,
+            "peak": self.peak,
+            "recoveries": self.recoveries,
+            "to_come": None if self.upcoming is None else self.upcoming.meta(),
+        }
+
+    def tree(self) -> dict[str, Any]:
+        """All arrays of a checkpoint."""
+        return {"state": self.state, "surface": self.surface}
+
+    def save(self) -> Path:
+        """Write a checkpoint of the state as it is."""
+        self.last_checkpoint = save_checkpoint(
+            self.folder.checkpoints, self.step, tree=self.tree(), meta=self.meta()
+        )
+        return self.last_checkpoint
+
+    def save_end(self) -> Path:
+        """Keep the state as what the stage ended with."""
+        end = self.folder.end_of(self.stage.name)
+        return save_checkpoint(end, self.step, tree=self.tree(), meta=self.meta(), keep=1)
+
+    def prepare(self, step: int) -> None:
+        """Begin the next stage when it is time; set the weights, plan buffers, compile."""
+        stage = self.config.stage_at(step)
+        if stage != self.stage:
+            self._begin(stage)
+        self.pipeline = pipeline_at(self.pipeline, self.config, self.stage, self._since(step))
+        # Another kind of splats, another stage: other needs.
+        planned_for = f"{self.stage.name} {self.pipeline.splats}"
+        if planned_for != self.planned_for:
+            self.planned_for, self.peak = planned_for, None
+            self.pipeline = replace(self.pipeline, capacities=self._planned())
+            self._compile(step)
+        following = self._following(step)
+        if following is not None and self.upcoming is None:
+            self.upcoming = Upcoming(self, following, self.to_come)
+
+    def _planned(self) -> Capacities:
+        """Choose the buffers: as was planned ahead, or for what the surface needs now."""
+        upcoming = self.upcoming
+        if upcoming is not None and upcoming.stage == self.stage:
+            self.upcoming = None
+            upcoming.compiled.result()
+            return upcoming.capacities
+        if self.to_come is not None and self.to_come["stage"] == self.stage.name:
+            return Capacities(**self.to_come["capacities"])
+        return plan_capacities(
+            self.pipeline,
+            self.state.params,
+            self.views.camera(),
+            limits=self.config.geometry.limits,
+        )
+
+    def _following(self, step: int) -> Stage | None:
+        """Return the next stage, where its beginning is near."""
+        stages = self.config.active_stages
+        number = stages.index(self.stage) + 1
+        if number == len(stages):
+            return None
+        ahead = min(_LOOK_AHEAD, self.stage.steps // 2)
+        is_near = step >= self.config.first_step(stages[number].name) - ahead
+        return stages[number] if is_near else None
+
+    def _compile(self, step: int) -> None:
+        """Compile the programs of a step side by side; calls would do so one after the other."""
+        batch = make_batch(self.views, step, self.stage, seed=self.config.run.seed)
+        rule = update_rule(self.config, self.stage, self.state.params, self._since(step))
+        compile_step(self.state, batch, self.pipeline, rule)
+        self.has_compiled = True
+
+    def _begin(self, stage: Stage) -> None:
+        """Change settings, parameters and optimiser; keep what the stage before ended with."""
+        self.save_end()
+        params = begin_stage(self.state.params, self.pipeline, self.config, stage)
+        self.stage = stage
+        self.pipeline = build_pipeline(self.config, stage, self.surface)
+        self.start(params)
+
+    def start(self, params: Params) -> None:
+        """Begin the stage with these parameters."""
+        self.fallback = _on_host(params.geometry)
+        carry = self.pipeline.transport.first_carry()
+        self.state = initial_state(params, step=self.step, carry=carry)
+
+    def advance(self, step: int) -> StepReport:
+        """Make step ``step``, repeating the same batch with larger buffers as often as needed."""
+        batch = make_batch(self.views, step, self.stage, seed=self.config.run.seed)
+        rule = update_rule(self.config, self.stage, self.state.params, self._since(step))
+
+        def attempt(capacities: Capacities) -> tuple[StepReport, Usage]:
+            self._resize(capacities, step)
+            self.state, report = train_step(self.state, batch, self.pipeline, rule)
+            check_limits(report.loss.usage, self.config.geometry.limits)
+            return report, report.loss.usage
+
+        report, _ = capacity_module.retry(attempt, self.pipeline.capacities)
+        if not bool(report.finite):
+            raise TrainingError(self._not_finite(step, report))
+        needed = {name: int(count) for name, count in report.loss.usage.items()}
+        self.peak = {n: max(count, (self.peak or {}).get(n, 0)) for n, count in needed.items()}
+        if int(report.loss.face_count) == 0:
+            self._recover(step)
+        elif self.step % _SHRINK_EVERY == 0:
+            self._resize(capacity_module.shrink(self.pipeline.capacities, self.peak), step)
+            self.peak = None
+        return report
+
+    def _resize(self, capacities: Capacities, step: int) -> None:
+        """Change the buffers, which takes new programs; the old ones may be too many to keep."""
+        if capacities != self.pipeline.capacities:
+            self.pipeline = replace(self.pipeline, capacities=capacities)
+            release_programs_when_crowded()
+            self._compile(step)
+
+    def _not_finite(self, step: int, report: StepReport) -> str:
+        """Say which term broke, when, and where the last good state is."""
+        bad = [name for name, value in report.loss.terms.items() if not np.isfinite(value)]
+        what = f"the term {', '.join(bad)}" if bad else "a gradient (every term is finite)"
+        where = self.last_checkpoint or "none was written yet"
+        return (
+            f"step {step}: {what} is not finite. Parameters were left as before the step; the "
+            f"last good checkpoint: {where}. Start a new run with lower rates: {self._lower()}."
+        )
+
+    def _lower(self) -> str:
+        """Say how to start again with lower rates of the stage that runs."""
+        name = self.stage.name
+        again = f"--set stages.{name}.rates.GROUP=..."
+        is_first = self.stage == self.config.active_stages[0]
+        return again if is_first else f"--from {self.folder} --stage {name} {again}"
+
+    def _recover(self, step: int) -> None:
+        """Put the stage's first surface back after every face has vanished."""
+        if self.recoveries >= _RECOVERIES_ALLOWED or self.fallback is None:
+            raise TrainingError(
+                f"step {step}: the surface is empty (no face is left) for the "
+                f"{self.recoveries + 1}th time. Check that the masks are not inverted and that "
+                "the bounds hold the object (geosplat-jax info), or start a new run with lower "
+                f"rates: {self._lower()}."
+            )
+        self.recoveries += 1
+        shape = jax.tree.map(jnp.asarray, self.fallback)
+        self.state = initial_state(
+            replace(self.state.params, geometry=shape), step=self.step, carry=self.state.carry
+        )
+
+
+class Upcoming:
+    """The stage that comes next: its buffers and programs, made while the present one trains.
+
+    Parameters
+    ----------
+    loop : as it is now; what is planned depends on its surface alone.
+    stage : that comes next.
+    known : what `meta` returned in a run that is resumed.
+    """
+
+    def __init__(self, loop: Loop, stage: Stage, known: dict[str, Any] | None) -> None:
+        self.stage = stage
+        config, views, step = loop.config, loop.views, loop.config.first_step(stage.name)
+        before, surface = loop.pipeline, loop.surface
+        # A copy, since the steps to come consume the buffers of the state.
+        params = jax.tree.map(jnp.array, loop.state.params)
+
+        def first_pipeline(capacities: Capacities) -> Pipeline:
+            pipeline = pipeline_at(build_pipeline(config, stage, surface), config, stage, 0)
+            return replace(pipeline, capacities=capacities)
+
+        def plan() -> Capacities:
+            if known is not None and known["stage"] == stage.name:
+                return Capacities(**known["capacities"])
+            limits = config.geometry.limits
+            return plan_capacities(
+                first_pipeline(Capacities()), params, views.camera(), limits=limits
+            )
+
+        def compile_all() -> None:
+            pipeline = first_pipeline(self.capacities)
+            carry = pipeline.transport.first_carry()
+            state = jax.eval_shape(
+                lambda params: initial_state(
+                    begin_stage(params, before, config, stage), carry=carry
+                ),
+                params,
+            )
+            batch = make_batch(views, step, stage, seed=config.run.seed)
+            rule = update_rule(config, stage, state.params, 0)
+            compile_step(state, batch, pipeline, rule, threads=1)
+
+        self._planned = in_background(plan)
+        self.compiled = in_background(compile_all)
+
+    @property
+    def capacities(self) -> Capacities:
+        """Sizes of the buffers, once they are known."""
+        return self._planned.result()
+
+    def meta(self) -> dict[str, Any]:
+        """Return what a checkpoint keeps; waits until the buffers are planned."""
+        return {"stage": self.stage.name, "capacities": dict(self.capacities)}
+
+
+def _on_host(shape: Any) -> Any:
+    """Copy a shape out of buffers that the step will consume."""
+    return jax.tree.map(np.array, shape)
+
+
+def new_loop(dataset: Dataset, config: Config, folder: RunFolder) -> Loop:
+    """Build the loop of a new run."""
+    shape_key, field_key = jax.random.split(jax.random.key(config.run.seed))
+    if not config.active_stages:
+        raise TrainingError("nothing to train: no stage has steps")
+    try:
+        surface, shape = config.geometry.start(dataset, shape_key)
+    except ValueError as error:
+        raise TrainingError(str(error)) from error
+    stage = config.active_stages[0]
+    params = initial_params(shape, config, field_key)
+    pipeline = build_pipeline(config, stage, surface)
+    loop = Loop(
+        config=config,
+        views=dataset.train,
+        folder=folder,
+        surface=surface,
+        stage=stage,
+        pipeline=pipeline,
+        state=initial_state(params),
+    )
+    loop.start(params)
+    return loop
+
+
+def _put(loop: Loop, tree: dict[str, Any], meta: dict[str, Any]) -> None:
+    """Set a loop to a checkpoint."""
+    loop.surface = tree["surface"]
+    loop.stage = loop.config.stage(meta["stage"])
+    pipeline = build_pipeline(loop.config, loop.stage, loop.surface)
+    loop.pipeline = replace(pipeline, capacities=Capacities(**meta["capacities"]))
+    loop.state = tree["state"]
+    loop.planned_for, loop.peak = meta["planned_for"], meta["peak"]
+    loop.recoveries = meta["recoveries"]
+    loop.to_come = meta["to_come"]
+
+
+def resumed_loop(dataset: Dataset, config: Config, folder: RunFolder) -> Loop:
+    """Rebuild the loop of a run from its last good checkpoint, or from the start without one."""
+    changed = differences(folder.config(), config)
+    if changed:
+        raise TrainingError(
+            "cannot resume with another configuration; start a new run, or undo: "
+            + "; ".join(changed)
+        )
+    loop = new_loop(dataset, config, folder)
+    path = latest_checkpoint(folder.checkpoints)
+    before = [stage.name for stage in config.active_stages]
+    if path is None:
+        # A run that took its first stages over may have been stopped before its own checkpoint.
+        ended = [name for name in before if latest_checkpoint(folder.end_of(name))]
+        if ended:
+            end = latest_checkpoint(folder.end_of(ended[-1]))
+            _put(loop, *read_checkpoint(_require(end), config))
+        return loop
+    _put(loop, *read_checkpoint(path, config))
+    loop.last_checkpoint = path
+    number = before.index(loop.stage.name)
+    if number:
+        ended = latest_checkpoint(folder.end_of(before[number - 1]))
+        if ended is not None:
+            loop.fallback = _on_host(read_checkpoint(ended, config)[0]["state"].params.geometry)
+    return loop
+
+
+def _require(path: Path | None) -> Path:
+    assert path is not None
+    return path
+
+
+def adopted_loop(
+    dataset: Dataset, config: Config, folder: RunFolder, source: RunFolder, name: str
+) -> Loop:
+    """Build the loop of a run whose stages before ``name`` are those of another run."""
+    if not config.stage(name).steps:
+        raise TrainingError(f"nothing to train: stages.{name}.steps is 0")
+    number = [stage.name for stage in config.active_stages].index(name)
+    if number == 0:
+        raise TrainingError(f"{name} is the first stage; there is nothing to take over")
+    last = config.active_stages[number - 1]
+    path = latest_checkpoint(source.end_of(last.name)) or latest_checkpoint(source.checkpoints)
+    if path is None:
+        raise TrainingError(f"{source} holds no checkpoint to take the stage {last.name} from")
+    meta = read_meta(path)
+    theirs = config_from_dict(meta["config"])
+    kept = [stage.name for stage in config.active_stages[:number]]
+    changed = differences(theirs, config, stages=kept)
+    if changed:
+        raise TrainingError(
+            f"up to the stage {last.name}, {source} had other settings: {'; '.join(changed)}; "
+            "train it anew"
+        )
+    tree, meta = read_checkpoint(path, theirs)
+    done, end = int(tree["state"].step), config.first_step(name)
+    if meta["stage"] != last.name or done != end:
+        raise TrainingError(
+            f"{path} is at step {done}, in the stage {meta['stage']}, not at the end of "
+            f"{last.name} ({end} steps)"
+        )
+    loop = new_loop(dataset, config, folder)
+    _put(loop, tree, meta)
+    return loop

@@ -1,0 +1,73 @@
+"""The first sizes of a stage's buffers, and the sizes beyond which a training stops."""
+
+from dataclasses import replace
+
+import jax
+
+from geosplat_jax.core import capacity as capacity_module
+from geosplat_jax.core.capacity import Capacities, Usage
+from geosplat_jax.core.types import Camera
+from geosplat_jax.pipeline import Pipeline
+from geosplat_jax.render import Params
+
+_HEADROOM = 1.2
+_SPLATS_PER_QUAD = 24
+
+
+class TrainingError(RuntimeError):
+    """Training cannot go on; the message says why, where, and what to do."""
+
+
+_needs_of = jax.jit(Pipeline.needs)
+
+
+def plan_capacities(
+    pipeline: Pipeline, params: Params, camera: Camera, *, limits: dict[str, int]
+) -> Capacities:
+    """Choose capacities with some headroom for all the given views.
+
+    Parameters
+    ----------
+    pipeline, params : of the stage; the pipeline's own capacities do not matter.
+    camera : of all views.
+    limits : largest sensible needs, see `SurfaceSettings.limits`.
+
+    Raises
+    ------
+    TrainingError
+        If the surface needs more.
+    """
+    first = pipeline.surface.first_capacities(params.geometry)
+    splats = _SPLATS_PER_QUAD * first["quads"]
+    guess = first.resized(
+        visible=capacity_module.bucket(int(0.5 * splats)),
+        hits=capacity_module.bucket(int(1.7 * splats)),
+        chunks=capacity_module.bucket(int(0.33 * splats)),
+    )
+
+    def attempt(capacities: Capacities) -> tuple[Usage, Usage]:
+        needed = _needs_of(replace(pipeline, capacities=capacities), params, camera)
+        check_limits(needed, limits)
+        return needed, needed
+
+    needed, _ = capacity_module.retry(attempt, guess)
+    return Capacities(
+        **{name: capacity_module.bucket(int(_HEADROOM * int(n))) for name, n in needed.items()}
+    )
+
+
+def check_limits(needed: Usage, limits: dict[str, int]) -> None:
+    """Stop before an exploding surface exhausts the memory.
+
+    Raises
+    ------
+    TrainingError
+        If a buffer needs more than its limit.
+    """
+    for name, limit in limits.items():
+        if name in needed and int(needed[name]) > limit:
+            raise TrainingError(
+                f"the surface has {int(needed[name])} {name}, more than geometry.max_{name} = "
+                f"{limit}: it has exploded. Start from --set geometry.initial=hull, lower "
+                "geometry.resolution or the rates, or raise the limit if the memory allows."
+            )

@@ -1,0 +1,82 @@
+"""The gradient by parts is that of the whole loss."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import sphere_views
+from test_pipeline import TIGHT, evaluate, problem
+
+from geosplat_jax.core.types import rate_groups
+from geosplat_jax.fit import gradient
+from geosplat_jax.fit.gradient import value_and_gradient
+
+
+def two_views(pipeline, batch, *, valid=None):
+    """Return a batch of two views, on lists that hold them."""
+    views = sphere_views(2, size=14)
+    return replace(batch, camera=views.camera([0, 1]), image=jnp.asarray(views.images), valid=valid)
+
+
+def assert_close(found, expected):
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        scale = float(jnp.max(jnp.abs(b))) + 1e-12
+        np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-5 * scale)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        pytest.param((), id="one set of samples", marks=pytest.mark.slow),
+        pytest.param(
+            ("stages.monte_carlo.transport.residual_count=1",), id="a residual of its own"
+        ),
+    ],
+)
+def test_the_parts_give_the_gradient_of_the_whole_loss(overrides):
+    """Two views, of which one counts for less."""
+    _, pipeline, params, batch = problem(*overrides)
+    valid = jnp.ones((2, 14, 14)).at[1, :, :5].set(0.0)
+    batch = two_views(pipeline, batch, valid=valid)
+    (total, report), expected = evaluate(pipeline, params, batch)
+    (found_total, found_report), found = value_and_gradient(pipeline, params, batch, frozen=())
+    assert float(found_total) == pytest.approx(float(total), rel=1e-5)
+    assert_close(found_report, report)
+    assert_close(found, expected)
+
+
+def test_split_sum_by_parts_with_a_frozen_group():
+    """The surface gets no gradient, and the others the same as without that."""
+    _, pipeline, params, batch = problem(stage="split_sum")
+    batch = two_views(pipeline, batch)
+    (_, report), expected = evaluate(pipeline, params, batch)
+    frozen = ("sdf", "light")
+    (_, found_report), found = value_and_gradient(pipeline, params, batch, frozen=frozen)
+    assert_close(found_report, report)
+    for name, a, b in zip(
+        rate_groups(params), jax.tree.leaves(found), jax.tree.leaves(expected), strict=True
+    ):
+        if name in frozen:
+            np.testing.assert_array_equal(a, 0.0)
+        else:
+            assert_close(a, b)
+
+
+def test_more_views_are_no_new_program_and_larger_lists_only_two():
+    """Programs are counted: those of a view serve every view."""
+    _, pipeline, params, batch = problem(stage="split_sum")
+    value_and_gradient(pipeline, params, batch, frozen=())
+    before = {name: getattr(gradient, name)._cache_size() for name in PROGRAMS}
+    value_and_gradient(pipeline, params, two_views(pipeline, batch), frozen=())
+    assert all(getattr(gradient, name)._cache_size() == before[name] for name in PER_VIEW)
+    larger = replace(pipeline, capacities=TIGHT.resized(hits=2 * TIGHT["hits"], chunks=4096))
+    before = {name: getattr(gradient, name)._cache_size() for name in PROGRAMS}
+    value_and_gradient(larger, params, batch, frozen=())
+    grown = {n for n in PROGRAMS if getattr(gradient, n)._cache_size() > before[n]}
+    assert grown == {"_lists", "_seen", "_view_gradient"}
+
+
+PER_VIEW = ("_asset", "_lists", "_view_gradient")
+PROGRAMS = (*PER_VIEW, "_seen", "_lights", "_back")
