@@ -9,6 +9,8 @@ Visibility, depth order, topology and samples carry no gradient; everything else
 """
 
 import abc
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -24,6 +26,7 @@ from geosplat_jax.core.settings import Positive, PositiveCount, Variant, setting
 from geosplat_jax.core.types import Camera, EnvLight, Mesh, Splats, learned
 from geosplat_jax.materials import Attributes, MaterialField, MaterialSpec, attributes_at
 from geosplat_jax.rays.base import RayIndex
+from geosplat_jax.splats.composite import composite_tiles, composite_tiles_forward
 from geosplat_jax.splats.projection import Footprints, project
 from geosplat_jax.splats.rasterize import (
     DEFAULT_TILE_SIZE,
@@ -207,6 +210,7 @@ class PerSplat(ShadingDomain, kind="per_splat"):
             height=camera.height,
             width=camera.width,
             tile_size=pipeline.raster.tile_size,
+            compositor=pipeline.compositor,
         )
         images, start = {"rgb": image[..., :3]}, 3
         for name in names:
@@ -228,6 +232,8 @@ class RenderPipeline(eqx.Module):
     domain : static; where light transport is evaluated.
     raster : static settings of rasterisation.
     capacities : static sizes of every buffer.
+    compositor : static; how tiles are blended, and in which mode that is differentiated: see
+        `forward_mode`.
     """
 
     surface: SurfaceModel
@@ -237,6 +243,14 @@ class RenderPipeline(eqx.Module):
     domain: ShadingDomain = eqx.field(static=True, default=PerSplat())
     raster: RasterSettings = eqx.field(static=True, default=RasterSettings())
     capacities: Capacities = eqx.field(static=True, default=Capacities())
+    compositor: Callable[..., Array] = eqx.field(static=True, default=composite_tiles)
+
+    def forward_mode(self) -> "RenderPipeline":
+        """Return the pipeline whose images have derivatives in forward mode, and in no other.
+
+        For derivatives along few directions, such as those of a camera, of an asset that is there.
+        """
+        return replace(self, compositor=composite_tiles_forward)
 
     def reconstruct(self, params: Params) -> Asset:
         """Build surface, splats and attributes: all that depends on neither light nor view."""

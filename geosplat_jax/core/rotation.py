@@ -5,6 +5,9 @@ from jaxtyping import Array, Float
 
 from geosplat_jax.core.numerics import safe_norm, safe_normalize
 
+_SMALL_ANGLE = 1e-2
+"""Radians below which sines come from their series, exact to 1e-11 there."""
+
 
 def quaternion_to_matrix(quats: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
     """Rotation matrices of quaternions (w, x, y, z) of any length.
@@ -21,6 +24,25 @@ def quaternion_to_matrix(quats: Float[Array, "... 4"]) -> Float[Array, "... 3 3"
         jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1),
     ]
     return jnp.stack(rows, axis=-2)
+
+
+def rotation_vector_to_matrix(vector: Float[Array, " 3"]) -> Float[Array, "3 3"]:
+    """Rotation about the direction of ``vector`` by its length in radians (Rodrigues 1840).
+
+    The derivative is exact everywhere, at no rotation as well.
+    """
+    squared = jnp.sum(vector * vector)
+    is_small = squared < _SMALL_ANGLE**2
+    angle = jnp.sqrt(jnp.where(is_small, 1.0, squared))
+    # sin(a) / a and (1 - cos(a)) / a^2.
+    first = jnp.where(is_small, 1 - squared / 6 + squared**2 / 120, jnp.sin(angle) / angle)
+    half = jnp.sin(0.5 * angle) / angle
+    second = jnp.where(is_small, 0.5 - squared / 24 + squared**2 / 720, 2 * half * half)
+    x, y, z = vector
+    zero = jnp.zeros_like(x)
+    cross = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+    identity = jnp.eye(3, dtype=vector.dtype)
+    return identity + first * cross + second * jnp.matmul(cross, cross, precision="highest")
 
 
 def axes_to_quaternion(

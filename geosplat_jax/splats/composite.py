@@ -11,8 +11,6 @@ which neither divides by ``1 - alpha`` nor subtracts prefix sums, and keeps its 
 opaque surfaces in float32.
 """
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -175,8 +173,7 @@ def _composite_forward(tile_size, grid, table, chunk_ranks, chunk_tiles):
     return tiles, (table, chunk_ranks, chunk_tiles, before)
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def composite_tiles(
+def composite_tiles_forward(
     tile_size: int,
     grid: tuple[int, int],
     table: Float[Array, "M columns"],
@@ -185,6 +182,9 @@ def composite_tiles(
 ) -> Float[Array, "tiles channels P"]:
     """Composite every tile: features and, as the last channel, coverage.
 
+    As it stands it can be differentiated in forward mode only (`jax.jvp`, `jax.jacfwd`), since a
+    loop of unknown length has no reverse; `composite_tiles` equals it, in reverse mode only.
+
     Parameters
     ----------
     tile_size, grid : static; pixels of a tile side, rows and columns of tiles.
@@ -192,6 +192,10 @@ def composite_tiles(
     chunk_ranks, chunk_tiles : see `TileLists`; not differentiable.
     """
     return _composite_forward(tile_size, grid, table, chunk_ranks, chunk_tiles)[0]
+
+
+composite_tiles = jax.custom_vjp(composite_tiles_forward, nondiff_argnums=(0, 1))
+"""`composite_tiles_forward` with the reverse mode that is written below."""
 
 
 def _composite_backward(tile_size, grid, residuals, cotangent):

@@ -10,6 +10,9 @@ One view at a time; loop or scan over views. The pieces let a renderer shade onl
 so that the differentiable work grows with the visible Gaussians, not with all of them.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -55,6 +58,7 @@ def composite(
     height: int,
     width: int,
     tile_size: int = DEFAULT_TILE_SIZE,
+    compositor: Callable[..., Array] = composite_tiles,
 ) -> tuple[Float[Array, "H W C"], Float[Array, "H W"]]:
     """Composite visible Gaussians front to back.
 
@@ -72,6 +76,8 @@ def composite(
     features : (M, C) any number of channels, composited alike.
     lists : from `find_visible` with the same image and tile size.
     height, width, tile_size : static pixels.
+    compositor : static; `composite.composite_tiles`, or `composite.composite_tiles_forward` where
+        the image is differentiated in forward mode.
 
     Returns
     -------
@@ -82,7 +88,7 @@ def composite(
     table = jnp.concatenate(
         [splats.means2d, splats.conics, log_opacity[:, None], features], axis=-1
     )
-    tiles = composite_tiles(
+    tiles = compositor(
         tile_size,
         tile_grid(height, width, tile_size),
         table,
@@ -151,7 +157,7 @@ def rasterize(
     -------
     image : (H, W, C) premultiplied; alpha : (H, W); usage : true needs of the bounded buffers.
     """
-    frame = {"height": height, "width": width}
+    frame: dict[str, Any] = {"height": height, "width": width}
     all_splats = project(
         *jax.lax.stop_gradient((means, quats, scales)),
         world_to_camera=jax.lax.stop_gradient(world_to_camera),
