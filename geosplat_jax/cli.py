@@ -12,8 +12,10 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
+from geosplat_jax.fit.cameras import ViewProgress
 from geosplat_jax.fit.config import Config, all_settings, config_warnings
 from geosplat_jax.fit.folder import RunError
+from geosplat_jax.fit.gauge import change_lines
 from geosplat_jax.fit.presets import PRESETS, QUALITIES, make_config
 from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
 from geosplat_jax.fit.train import Interrupted, TrainingError
@@ -104,6 +106,11 @@ def _parser() -> argparse.ArgumentParser:
 
     _add_relight(_run_parser(commands, "relight", "show a run under another light"))
 
+    refine = _run_parser(
+        commands, "refine-cameras", "pose, focal length and exposure of every view of a run"
+    )
+    refine.add_argument("--output", type=Path, help="file (default: RUN/cameras.json)")
+
     export = _run_parser(commands, "export", "mesh.glb, gaussians.ply and light.exr of a run")
     export.add_argument("--output", type=Path, help="folder (default: RUN/export)")
     export.add_argument("--vertex-colors", action="store_true", help="instead of textures")
@@ -193,6 +200,9 @@ def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
         help="box around the object (default: from masks and cameras)",
     )
+    parser.add_argument(
+        "--cameras", type=Path, metavar="FILE", help="instead of the scene's: see refine-cameras"
+    )
 
 
 def _scene_options(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -201,6 +211,7 @@ def _scene_options(arguments: argparse.Namespace) -> dict[str, Any]:
         "downscale": arguments.downscale,
         "light": arguments.light,
         "bounds": arguments.bounds,
+        "cameras": arguments.cameras,
     }
 
 
@@ -374,6 +385,26 @@ def _render(arguments: argparse.Namespace) -> None:
     print(f"{len(written) // 2} views: {written[0].parent}")
 
 
+def _refine_cameras(arguments: argparse.Namespace) -> None:
+    """Refine the cameras of a run and print what changed."""
+    run = Run(arguments.run, scene=arguments.scene)
+
+    def tell(split: str, progress: ViewProgress) -> None:
+        camera = progress.camera
+        _say(
+            f"{split} {progress.done}/{progress.total} {progress.name}  residual "
+            f"{camera.residual_before:.4f} -> {camera.residual_after:.4f}  "
+            f"{camera.iterations} steps  {camera.note}"
+        )
+
+    refined = run.refine_cameras(arguments.output, on_view=tell)
+    for split, cameras in refined.items():
+        views = run.dataset.test if split == "test" else run.dataset.train
+        for line in change_lines(views, cameras, run.dataset.bounds):
+            print(f"{split}: {line}")
+    print(f"cameras: {arguments.output or run.folder.path / 'cameras.json'}")
+
+
 def _export(arguments: argparse.Namespace) -> None:
     """Export the reconstructed asset."""
     lines = Run(arguments.run, scene=arguments.scene).export(
@@ -412,6 +443,7 @@ _COMMANDS = {
     "settings": _settings,
     "evaluate": _evaluate,
     "render": _render,
+    "refine-cameras": _refine_cameras,
     "relight": _relight,
     "export": _export,
     "gradcheck": _gradcheck,

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from geosplat_jax.core.types import Batch, EnvLight
+from geosplat_jax.fit.cameras import CameraSettings, ViewProgress, refine_views
 from geosplat_jax.fit.config import Config
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.runtime import in_background
 from geosplat_jax.fit.stages import make_batch
 from geosplat_jax.fit.train import Progress, Trained, fit, load_trained
+from geosplat_jax.io.cameras import RefinedSplit, write_cameras
 from geosplat_jax.io.dataset import Dataset, load_recorded
 from geosplat_jax.io.images import write_png
 from geosplat_jax.io.views import Views
@@ -34,6 +36,9 @@ from geosplat_jax.report.pictures import normals_to_rgb
 from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.relight import RelightOptions, load_light, relight_views
 from geosplat_jax.report.renderer import DEFAULT_SAMPLES, Renderer, straight_rgba
+
+REFINEMENT_SAMPLES = 32
+"""Rays per splat when cameras are refined: noise averages out over the pixels of a view."""
 
 
 class Run:
@@ -216,6 +221,54 @@ class Run:
         folder = self._output(output, f"relight_{Path(env).stem}")
         return relight_views(relit, light, self._views_to_show(), folder, options)
 
+    def refine_cameras(
+        self,
+        output: Path | None = None,
+        *,
+        splits: Sequence[str] = ("train", "test"),
+        how: CameraSettings | None = None,
+        samples: int = REFINEMENT_SAMPLES,
+        on_view: Callable[[str, ViewProgress], None] | None = None,
+    ) -> dict[str, RefinedSplit]:
+        """Refine pose, focal length and exposure of every view; write them to a file.
+
+        The asset stays as it was trained. `load_dataset` and `train` take the file.
+
+        Parameters
+        ----------
+        output : file (default: ``cameras.json`` in the run's folder).
+        splits : some of ``train`` and ``test``; those without views are left out.
+        how : see `fit.cameras.CameraSettings`.
+        samples : rays per splat of the light that the asset is seen in.
+        on_view : called with the split after every view.
+
+        Returns
+        -------
+        refined : by split, as it was written.
+
+        Raises
+        ------
+        RunError
+            If no split has views, or the output is what the run itself was trained with.
+        """
+        path = output or self.folder.path / "cameras.json"
+        own = self.dataset.options.get("cameras")
+        if own is not None and Path(own) == path.resolve():
+            raise RunError(
+                f"{path} holds the cameras that {self.folder} was trained with; write to another "
+                "file with --output"
+            )
+        chosen = [name for name in splits if getattr(self.dataset, name).names]
+        if not chosen:
+            raise RunError(f"{self.dataset.root} has no {' and no '.join(splits)} views")
+        subject = self.renderer(samples=samples).subject()
+        refined = {}
+        for split in chosen:
+            tell = None if on_view is None else partial(on_view, split)
+            refined[split] = refine_views(subject, self._views(split), how, on_view=tell)
+        write_cameras(path, refined)
+        return refined
+
     def export(
         self, output: Path | None = None, *, vertex_colors: bool = False, texture_size: int = 1024
     ) -> dict[str, str]:
@@ -275,7 +328,8 @@ def train(
     output : folder of the run.
     config : settings, see `make_config`; by default those of ``quality``.
     resume, force, source, first_stage, on_step : see `fit.train.fit`; ``force`` replaces a run.
-    reading : how to read the scene: ``downscale``, ``light``, ``bounds`` (six numbers).
+    reading : how to read the scene: ``downscale``, ``light``, ``bounds`` (six numbers),
+        ``cameras`` (a file of `Run.refine_cameras`).
 
     Raises
     ------

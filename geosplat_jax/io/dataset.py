@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from geosplat_jax.io.cameras import cameras_digest, read_cameras, with_cameras
 from geosplat_jax.io.frames import Frame, Listing
 from geosplat_jax.io.images import MissingFileError, SceneError
 from geosplat_jax.io.layouts.nerf_synthetic import (
@@ -80,6 +81,7 @@ def load_dataset(
     bounds: Sequence[Sequence[float | int] | np.ndarray] | None = None,
     train_views: int | None = None,
     test_views: int | None = None,
+    cameras: str | Path | None = None,
 ) -> Dataset:
     """Load a scene folder.
 
@@ -91,6 +93,8 @@ def load_dataset(
     light : training light, where the layout has a choice.
     bounds : lo and hi of a box around the object; by default that of the visual hull.
     train_views, test_views : at most this many views, spread evenly over the list.
+    cameras : file of refined cameras, which take the place of the scene's in the splits that it
+        names; see `cameras.with_cameras` for what becomes of the photographs.
 
     Raises
     ------
@@ -105,6 +109,8 @@ def load_dataset(
         raise SceneError(f"layout must be one of {sorted(LAYOUTS)}, got {layout!r}")
     listing = LAYOUTS[layout].list_frames(root, light=light)
     warnings: list[str] = []
+    cameras = None if cameras is None else Path(cameras).expanduser()
+    refined = {} if cameras is None else read_cameras(cameras)
     splits = []
     for split, frames, limit in (
         ("train", listing.train, train_views),
@@ -118,6 +124,8 @@ def load_dataset(
         views, problems = load_views(chosen, factor=downscale, listing=listing)
         _check_masks(views, split, warnings)
         warnings += [f"{split}: {problem}" for problem in problems]
+        if split in refined:
+            views = with_cameras(views, refined[split], str(cameras))
         splits.append(views)
     train, test = splits
     box = object_bounds(train) if bounds is None else _checked_bounds(bounds)
@@ -137,22 +145,43 @@ def load_dataset(
             "downscale": downscale,
             "light": light,
             "bounds": None if bounds is None else np.ravel(bounds).tolist(),
+            **({} if cameras is None else _recorded(cameras)),
         },
     )
+
+
+def _recorded(cameras: Path) -> dict[str, str]:
+    """Return what a run notes of its refined cameras: where they are, and what they were."""
+    return {
+        "cameras": str(cameras.resolve()),
+        "cameras_digest": cameras_digest(cameras),
+    }
 
 
 def load_recorded(path: str | Path, options: Mapping[str, Any]) -> Dataset:
     """Load a scene folder as a run read it, by the options in its record.
 
-    ``options`` may have ``downscale``, ``light`` and ``bounds`` (six numbers, lo then hi); see
-    `load_dataset`.
+    ``options`` may have ``downscale``, ``light``, ``bounds`` (six numbers, lo then hi) and
+    ``cameras``; see `load_dataset`.
+
+    Raises
+    ------
+    SceneError
+        As `load_dataset`, and if the file of the cameras is not what it was when it was recorded.
     """
-    bounds = options.get("bounds")
+    bounds, cameras = options.get("bounds"), options.get("cameras")
+    digest = options.get("cameras_digest")
+    if cameras is not None and digest is not None and cameras_digest(cameras) != digest:
+        raise SceneError(
+            f"{cameras} has changed since the run read its cameras from it; train anew, or put "
+            "the file back"
+        )
     return load_dataset(
         path,
         downscale=options.get("downscale", 1),
         light=options.get("light"),
         bounds=None if bounds is None else (bounds[:3], bounds[3:]),
+        cameras=cameras,
     )
 
 

@@ -45,6 +45,7 @@ class Views:
         ``metallic``; zero on the background.
     relight : (V, H, W, 4) linear, by light; read anew each time, since they are large.
     valid : (V, H, W) float32 pixels that count, 0 or 1; None where all do.
+    exposure : (V,) factors that the photographs were divided by; None where they are as they were.
     """
 
     names: tuple[str, ...]
@@ -54,6 +55,7 @@ class Views:
     truth: Mapping[str, Any] = field(default_factory=dict)
     relight: Mapping[str, Any] = field(default_factory=dict)
     valid: Float[np.ndarray, "V H W"] | None = None
+    exposure: Float[np.ndarray, " V"] | None = None
 
     def __len__(self) -> int:
         """Count the views."""
@@ -96,6 +98,13 @@ class Views:
             height=self.height,
             width=self.width,
         )
+
+
+def camera_to_world_of(
+    world_to_camera: Float[np.ndarray, "V 4 4"],
+) -> Float[np.ndarray, "V 4 4"]:
+    """Invert `Views.world_to_camera`."""
+    return _rigid_inverse(world_to_camera) @ _BLENDER_TO_OPENCV
 
 
 def no_views(like: Views) -> Views:

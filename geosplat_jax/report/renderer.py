@@ -18,6 +18,7 @@ from geosplat_jax.core.capacity import Capacities, Usage
 from geosplat_jax.core.color import tone_map
 from geosplat_jax.core.mesh import vertex_normals
 from geosplat_jax.core.types import Camera, EnvLight, Mesh
+from geosplat_jax.fit.cameras import Subject
 from geosplat_jax.fit.train import Trained
 from geosplat_jax.io.images import encode_srgb
 from geosplat_jax.pipeline import Pipeline
@@ -202,6 +203,16 @@ class Renderer:
             materials = replace(materials, albedo=materials.albedo * self._albedo_scale[None, :])
             self._asset = replace(asset, attributes=replace(asset.attributes, materials=materials))
         return self._asset
+
+    def subject(self) -> Subject:
+        """Return what cameras are refined against: this asset under this light.
+
+        Diffuse light is the mean of all passes, the specular lobe that of the first.
+        """
+        illumination = self._illuminated()[0]
+        key = jax.random.fold_in(self._key, self._passes)
+        exposure = jnp.asarray(self._log_exposure)
+        return Subject(self._pipeline, self.asset(), illumination, exposure, key)
 
     def _illuminated(self) -> list[Illumination]:
         """Gather the light, once: the mean of all passes, with the light's samples of a few."""

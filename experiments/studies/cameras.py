@@ -1,0 +1,189 @@
+"""Measure what refining cameras wins back: poses, new views, materials.
+
+    python experiments/studies/cameras.py SCENE --output FOLDER [--rounds 2] [--downscale 2]
+
+Disturbs the training cameras of a scene, trains on them, refines the cameras against what was
+trained, trains anew, and so on; and trains with the true cameras. Runs that are there already are
+opened instead, so an interrupted study goes on where it stopped.
+
+Photographs say nothing about where the object is in the world. The test cameras, which are not
+disturbed, are therefore moved by the similarity that takes the true training cameras to those that
+were trained on (`fit.gauge.find_gauge`), before new views are compared.
+
+The table stands in docs/cameras.md.
+"""
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from geosplat_jax.fit.gauge import CameraErrors, Similarity, change_lines, compare_cameras
+from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.io.cameras import read_cameras, with_cameras
+from geosplat_jax.io.dataset import Dataset, load_dataset, object_bounds
+from geosplat_jax.io.views import Views
+from geosplat_jax.run import Run, train
+
+
+def disturbed(
+    views: Views,
+    target: np.ndarray,
+    *,
+    rotation_deg: float,
+    position: float,
+    focal: float,
+    exposure: float,
+    seed: int,
+) -> tuple[Views, np.ndarray]:
+    """Disturb every camera and the exposure of its photograph; return also the factors.
+
+    Parameters
+    ----------
+    views : the true ones.
+    target : (3,) what distances are measured to.
+    rotation_deg, position : angle about a random axis through the camera, and shift in a random
+        direction as a share of the distance; both of exactly this size.
+    focal, exposure : standard deviations of the logarithms of two factors.
+    seed : of all choices.
+    """
+    rng = np.random.default_rng(seed)
+    count = len(views)
+
+    def directions() -> np.ndarray:
+        drawn = rng.normal(size=(count, 3))
+        return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+
+    poses, lenses = views.camera_to_world.copy(), views.intrinsics.copy()
+    turns = Rotation.from_rotvec(np.radians(rotation_deg) * directions()).as_matrix()
+    distance = np.linalg.norm(poses[:, :3, 3] - target, axis=1, keepdims=True)
+    poses[:, :3, :3] = turns @ poses[:, :3, :3]
+    poses[:, :3, 3] += position * distance * directions()
+    lenses[:, [0, 1], [0, 1]] *= np.exp(focal * rng.normal(size=(count, 1)))
+    images = views.images.copy()
+    factors = np.exp(exposure * rng.normal(size=(count, 1, 1, 1)))
+    images[..., :3] *= factors
+    moved = replace(views, camera_to_world=poses, intrinsics=lenses, images=images)
+    return moved, factors.reshape(-1)
+
+
+def with_training_views(dataset: Dataset, views: Views) -> Dataset:
+    """Return a scene with other training views, and the box around the object as they see it."""
+    return replace(dataset, train=views, bounds=object_bounds(views))
+
+
+def train_or_open(dataset: Dataset, folder: Path, arguments: argparse.Namespace) -> Run:
+    """Train, or open the run that the folder holds."""
+    if (folder / "training.json").exists():
+        run = Run(folder)
+        run.dataset = dataset
+        return run
+    began = time.perf_counter()
+    config = make_config(quality=arguments.quality, overrides=("run.preview_every=0",))
+    run = train(dataset, folder, config, force=True)
+    print(f"{folder.name}: trained in {time.perf_counter() - began:.0f} s", flush=True)
+    return run
+
+
+MEASURES = {
+    "NVS PSNR": "nvs.psnr",
+    "relight PSNR": "relight.mean.psnr",
+    "albedo PSNR": "albedo.psnr",
+    "mask IoU": "mask.iou",
+}
+
+
+def evaluated(run: Run, test: Views, gauge: Similarity | None, samples: int) -> list[str]:
+    """Evaluate a run on test views in its gauge; return the cells of a row.
+
+    Metrics that are there already are taken.
+    """
+    path = run.folder.path / "metrics.json"
+    if not path.exists():
+        views = test if gauge is None else gauge.views(test)
+        run.dataset = replace(run.dataset, test=views)
+        run.evaluate(samples=samples)
+    mean = run.metrics["mean"]
+    return [f"{mean[key]:.3f}" if key in mean else "-" for key in MEASURES.values()]
+
+
+def error_cells(errors: CameraErrors) -> list[str]:
+    """Root mean square and largest error of every kind, as the cells of a row."""
+    columns = (
+        errors.rotation_deg,
+        errors.center_percent,
+        errors.focal_percent,
+        errors.exposure_percent,
+        errors.pixels,
+    )
+    return [f"{np.sqrt(np.mean(x**2)):.3f} ({np.max(x):.2f})" for x in columns]
+
+
+def main() -> None:
+    """Run the study and print its table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--downscale", type=int, default=2)
+    parser.add_argument("--quality", default="draft")
+    parser.add_argument("--rotation", type=float, default=0.5, help="degrees")
+    parser.add_argument("--position", type=float, default=0.01, help="share of the distance")
+    parser.add_argument("--focal", type=float, default=0.01, help="deviation of the logarithm")
+    parser.add_argument("--exposure", type=float, default=0.01, help="deviation of the logarithm")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--samples", type=int, default=32, help="rays per splat when evaluating")
+    parser.add_argument("--test-views", type=int, help="at most so many (default: all)")
+    arguments = parser.parse_args()
+    enable_compilation_cache()
+    retain_freed_memory()
+    base = load_dataset(
+        arguments.scene, downscale=arguments.downscale, test_views=arguments.test_views
+    )
+    views, factors = disturbed(
+        base.train,
+        np.mean(base.bounds, axis=0),
+        rotation_deg=arguments.rotation,
+        position=arguments.position,
+        focal=arguments.focal,
+        exposure=arguments.exposure,
+        seed=arguments.seed,
+    )
+    true_cameras = replace(base.train, exposure=factors)
+    current = with_training_views(base, views)
+    output, rows = arguments.output, []
+    for number in range(arguments.rounds + 1):
+        name = f"refined, round {number}" if number else "disturbed"
+        run = train_or_open(current, output / (f"round_{number}" if number else name), arguments)
+        errors, gauge = compare_cameras(current.train, true_cameras, base.bounds)
+        cells = error_cells(errors)
+        print(name, *cells, flush=True)
+        rows.append((run, gauge, [name, *cells]))
+        if number == arguments.rounds:
+            break
+        path = run.folder.path / "cameras.json"
+        if not path.exists():
+            began = time.perf_counter()
+            run.refine_cameras(splits=("train",))
+            print(f"{name}: refined in {time.perf_counter() - began:.0f} s", flush=True)
+        split = read_cameras(path)["train"]
+        for line in change_lines(current.train, split, base.bounds):
+            print(line, flush=True)
+        current = with_training_views(base, with_cameras(current.train, split, str(path)))
+    run = train_or_open(base, output / "true", arguments)
+    rows.append((run, None, ["true", *["0"] * len(cells)]))
+    kinds = ("rotation, deg", "position, %", "focal, %", "exposure, %", "object, pixels")
+    titles = ["cameras", *kinds, *MEASURES]
+    for cells in (titles, ["---"] * len(titles)):
+        print(f"| {' | '.join(cells)} |")
+    for run, gauge, cells in reversed(rows):
+        measured = evaluated(run, base.test, gauge, arguments.samples)
+        print(f"| {' | '.join([*cells, *measured])} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,416 @@
+"""Cameras refined against what was trained: pose, focal length and exposure of every view.
+
+The asset and its light stay as they are, so views are independent of each other: eight parameters
+each, found by Levenberg-Marquardt from the difference of render and photograph. Eight columns of a
+Jacobian are made in forward mode (`RenderPipeline.forward_mode`), whose cost does not depend on the
+number of pixels' residuals; visibility and depth order are found anew at every iterate and have no
+derivative.
+
+Splats are shaded towards the camera to begin with, and keep their colours while the solver runs:
+cameras move by less than highlights are wide, and noise of samples would be different at every
+iterate. Then all of it is done once more, from the camera that was found (`CameraSettings.rounds`).
+
+Parameters are dimensionless and of comparable effect on the image of the object: a rotation vector
+(radians) about the centre of its box, in camera axes; a shift of the object across the view in half
+extents of the box, and along it in shares of the distance; the logarithms of factors of both focal
+lengths and of the exposure. Rotation about the object, instead of the camera, keeps rotation and
+shift apart.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float, Int, Key
+
+from geosplat_jax.core import capacity as capacity_module
+from geosplat_jax.core.capacity import Capacities, Usage
+from geosplat_jax.core.color import tone_map
+from geosplat_jax.core.numerics import safe_normalize
+from geosplat_jax.core.rotation import rotation_vector_to_matrix
+from geosplat_jax.core.settings import NonNegative, Positive, PositiveCount, settings
+from geosplat_jax.core.types import Box, Camera, EnvLight, SurfacePoints
+from geosplat_jax.io.cameras import RefinedCamera, RefinedSplit
+from geosplat_jax.io.views import Views
+from geosplat_jax.materials import Attributes
+from geosplat_jax.rays.base import RayIndex
+from geosplat_jax.render import Asset, RenderPipeline
+from geosplat_jax.splats.rasterize import gather_visible
+from geosplat_jax.transport.base import Illumination, Shaded, Transport
+
+PARAMETER_COUNT = 8
+"""Rotation (3), shift (3), logarithm of the focal factor, logarithm of the exposure."""
+
+UNIT = 0.01
+"""What the solver takes as one: its damping begins at one of its units."""
+
+
+@settings
+class CameraSettings:
+    """How cameras are refined; static and hashable.
+
+    The sum of squares that is made small is that of a posterior: differences in units of
+    ``pixel_deviation``, and parameters in units of ``prior_deviation``.
+    """
+
+    pixel_deviation: Positive = 0.05
+    """Difference of a channel of a pixel that is nothing unusual, linear light."""
+    prior_deviation: Positive = 0.002
+    """Deviation of each of the eight parameters that weighs as much as one such pixel. Errors of
+    neighbouring pixels are alike, so it is smaller than what is to be corrected, and still hardly
+    holds back what the pixels show well. It decides what they leave open, a longer lens further
+    away above all. Large: no prior."""
+    coverage_weight: NonNegative = 1.0
+    """Weight of the squared difference of coverage and mask, beside one for each colour channel."""
+    robust_deviations: Positive = 3.0
+    """Pixels beyond so many deviations count by their difference instead of its square, so that
+    what the asset lacks does not pull at the camera."""
+    rounds: PositiveCount = 2
+    """How often the splats are shaded; the solver runs after each time."""
+    steps: PositiveCount = 20
+    """Steps of the solver in a round at most, rejected ones included."""
+    tolerance: Positive = 1e-2
+    """The solver stops when a step moves the parameters by less than this many hundredths, and the
+    pixels by less than this many deviations, root mean square."""
+
+
+class Baked(Illumination):
+    """Colours of N splats, shaded once."""
+
+    shaded: Shaded
+
+    def take(self, rows: Int[Array, " M"]) -> "Baked":
+        """See `Illumination.take`."""
+        return jax.tree.map(lambda values: gather_visible(rows, values), self)
+
+
+class BakedTransport(Transport):
+    """Light that is in the colours already."""
+
+    def prepare(
+        self,
+        key: Key[Array, ""] | None,
+        points: SurfacePoints,
+        attributes: Attributes,
+        light: EnvLight,
+        index: RayIndex | None,
+        carry: Any = None,
+    ) -> tuple[Baked, Any]:
+        """Refuse: `Subject.seen_from` prepares."""
+        raise NotImplementedError("colours are baked by Subject.seen_from")
+
+    def shade(
+        self,
+        key: Key[Array, ""] | None,
+        points: SurfacePoints,
+        attributes: Attributes,
+        wo: Float[Array, "M 3"],
+        illumination: Baked,
+        index: RayIndex | None,
+    ) -> Shaded:
+        """Return the colours."""
+        return illumination.shaded
+
+
+class Subject(eqx.Module):
+    """What the cameras look at: an asset under a prepared light.
+
+    Attributes
+    ----------
+    pipeline, asset, illumination : see `RenderPipeline.render_lit`.
+    log_exposure : () of all views. key : of samples that depend on the viewer.
+    """
+
+    pipeline: RenderPipeline
+    asset: Asset
+    illumination: Illumination
+    log_exposure: Float[Array, ""]
+    key: Key[Array, ""] | None
+
+    def seen_from(self, camera: Camera) -> "Subject":
+        """Return the same, with the colours that it has towards the camera of a single view."""
+        asset, transport = self.asset, self.pipeline.transport
+        towards = camera.centers - asset.splats.means
+        is_facing = jnp.sum(asset.splats.outward * towards, axis=-1) > 0
+        mask = is_facing if self.pipeline.raster.cull_backfaces else None
+        shaded = transport.shade(
+            self.key,
+            asset.splats.points(mask),
+            asset.attributes,
+            safe_normalize(towards),
+            self.illumination,
+            asset.index,
+        )
+        pipeline = replace(self.pipeline.forward_mode(), transport=BakedTransport())
+        return replace(
+            self, pipeline=pipeline, illumination=Baked(shaded), asset=replace(asset, index=None)
+        )
+
+
+class Photograph(eqx.Module):
+    """One view to compare with.
+
+    Attributes
+    ----------
+    camera : of the single view, to begin with.
+    image : (H, W, 4) linear colour, straight alpha.
+    valid : (H, W) pixels that count, 0 or 1.
+    """
+
+    camera: Camera
+    image: Float[Array, "H W 4"]
+    valid: Float[Array, "H W"]
+
+
+class Fit(eqx.Module):
+    """How well a camera fits its photograph.
+
+    Attributes
+    ----------
+    cost : () robust sum of squares of the pixels, without the prior.
+    rms : () root mean square of the differences of colour and coverage over all pixels that count.
+    rendered, covered : () pixels that count and are covered in the render, and in the mask.
+    usage : true needs of the buffers of this view.
+    """
+
+    cost: Float[Array, ""]
+    rms: Float[Array, ""]
+    rendered: Float[Array, ""]
+    covered: Float[Array, ""]
+    usage: Usage
+
+
+def moved_camera(
+    camera: Camera, parameters: Float[Array, " 8"], box: Box
+) -> tuple[Camera, Float[Array, ""]]:
+    """Move the camera of a single view; see the module for the meaning of the eight parameters.
+
+    Returns
+    -------
+    camera : moved; the one that was given, to rounding, where all parameters are zero.
+    log_exposure : () logarithm of the factor of the exposure.
+    """
+    rotation, translation = camera.world_to_camera[0, :3, :3], camera.world_to_camera[0, :3, 3]
+    center = rotation @ box.center + translation
+    lengths = jnp.stack([box.half_extent, box.half_extent, center[2]])
+    turn = rotation_vector_to_matrix(parameters[:3])
+    turned = turn @ rotation
+    moved = center + parameters[3:6] * lengths - turned @ box.center
+    pose = jnp.eye(4, dtype=rotation.dtype).at[:3, :3].set(turned).at[:3, 3].set(moved)
+    focal = jnp.exp(parameters[6])
+    factors = jnp.ones((3, 3), rotation.dtype).at[(0, 1), (0, 1)].set(focal)
+    lens = camera.intrinsics[0] * factors
+    return Camera(pose[None], lens[None], camera.height, camera.width), parameters[7]
+
+
+def view_residual(
+    parameters: Float[Array, " 8"], subject: Subject, photograph: Photograph, how: CameraSettings
+) -> tuple[Float[Array, " R"], Fit]:
+    """Evaluate the residual whose squares are summed, and how well the camera fits.
+
+    Differentiable in the parameters, in forward mode if the subject's pipeline is in that mode.
+
+    Where a buffer overflowed all residuals are zero. A solver takes such a step for a perfect one
+    and stays there, so that its result betrays it; see `refine_view`.
+
+    Parameters
+    ----------
+    parameters : in units of `UNIT`; zero is the camera of the photograph.
+    """
+    pipeline = subject.pipeline
+    camera, log_exposure = moved_camera(photograph.camera, UNIT * parameters, pipeline.surface.box)
+    output = pipeline.render_lit(subject.asset, subject.illumination, camera, key=subject.key)
+    rgb = tone_map(output.rgb[0], subject.log_exposure + log_exposure)
+    mask, valid = photograph.image[..., 3:], photograph.valid[..., None]
+    rgb_difference = valid * (rgb - photograph.image[..., :3] * mask)
+    coverage_difference = valid * (output.alpha[0][..., None] - mask)
+    weight = how.coverage_weight**0.5
+    deviations = jnp.concatenate([rgb_difference, weight * coverage_difference], axis=-1)
+    robust = _robust(deviations.reshape(-1) / how.pixel_deviation, how.robust_deviations)
+    prior = UNIT / how.prior_deviation * parameters
+    # The surface's needs are those of an asset that is whole.
+    usage = {n: count for n, count in output.usage.items() if n not in subject.asset.usage}
+    fits = capacity_module.fits(usage, pipeline.capacities)
+    residual = jnp.where(fits, jnp.concatenate([robust, prior]), 0.0)
+    squared = jnp.sum(rgb_difference**2) + jnp.sum(coverage_difference**2)
+    fit = Fit(
+        cost=jnp.sum(robust**2),
+        rms=jnp.sqrt(squared / jnp.maximum(4.0 * jnp.sum(valid), 1.0)),
+        rendered=jnp.sum(valid[..., 0] * output.alpha[0]),
+        covered=jnp.sum(valid * mask),
+        usage=usage,
+    )
+    return residual, jax.lax.stop_gradient(fit)
+
+
+def _robust(deviations: Float[Array, " R"], knee: float) -> Float[Array, " R"]:
+    """Shrink large deviations, so that their squares grow linearly (Charbonnier et al. 1994).
+
+    The square is ``2 knee^2 (sqrt(1 + (d / knee)^2) - 1)``, without cancellation.
+    """
+    return deviations * jnp.sqrt(2.0 / (1.0 + jnp.sqrt(1.0 + (deviations / knee) ** 2)))
+
+
+class Found(eqx.Module):
+    """What the solver found for one view.
+
+    Attributes
+    ----------
+    parameters : (8,) in units of `UNIT`, see `moved_camera`. camera : moved by them.
+    before, after : fits of the camera to begin with and of the one that was found.
+    iterations : () steps of the solver.
+    """
+
+    parameters: Float[Array, " 8"]
+    camera: Camera
+    before: Fit
+    after: Fit
+    iterations: Int[Array, ""]
+
+
+@partial(jax.jit, static_argnames=("how",))
+def _solve(
+    start: Float[Array, " 8"], subject: Subject, photograph: Photograph, *, how: CameraSettings
+) -> Found:
+    """Run Levenberg-Marquardt; valid only where both fits' usage is within the capacities."""
+    box = subject.pipeline.surface.box
+    subject = subject.seen_from(moved_camera(photograph.camera, UNIT * start, box)[0])
+
+    def residual(parameters: Float[Array, " 8"], args: None) -> tuple[Float[Array, " R"], Fit]:
+        del args
+        return view_residual(parameters, subject, photograph, how)
+
+    solver = optx.LevenbergMarquardt(rtol=how.tolerance, atol=how.tolerance, norm=optx.rms_norm)
+    solution = optx.least_squares(
+        residual, solver, start, has_aux=True, max_steps=how.steps, throw=False
+    )
+    ends = jnp.stack([start, solution.value])
+    before, after = _both(jax.lax.map(lambda y: residual(y, None)[1], ends))
+    camera, _ = moved_camera(photograph.camera, UNIT * solution.value, box)
+    return Found(solution.value, camera, before, after, solution.stats["num_steps"])
+
+
+def _both(fits: Fit) -> tuple[Fit, Fit]:
+    """Take two stacked fits apart."""
+    first, second = (jax.tree.map(lambda x, k=k: x[k], fits) for k in (0, 1))
+    return first, second
+
+
+def refine_view(
+    subject: Subject, photograph: Photograph, how: CameraSettings
+) -> tuple[Found, Capacities]:
+    """Refine the camera of one view, with buffers that grow until no iterate overflows (host side).
+
+    Returns
+    -------
+    found : whether or not it is better than the camera to begin with.
+    capacities : that it took.
+    """
+
+    def attempt(capacities: Capacities) -> tuple[Found, Usage]:
+        pipeline = replace(subject.pipeline, capacities=capacities)
+        sized = replace(subject, pipeline=pipeline)
+        start = jnp.zeros(PARAMETER_COUNT, photograph.image.dtype)
+        rounds = []
+        for _ in range(how.rounds):
+            rounds.append(_solve(start, sized, photograph, how=how))
+            start = rounds[-1].parameters
+        fits = [fit for found in rounds for fit in (found.before, found.after)]
+        steps = sum((found.iterations for found in rounds[1:]), rounds[0].iterations)
+        found = replace(rounds[-1], before=rounds[0].before, iterations=steps)
+        return found, capacity_module.combine(*(fit.usage for fit in fits))
+
+    return capacity_module.retry(attempt, subject.pipeline.capacities)
+
+
+class ViewProgress(NamedTuple):
+    """What a display needs to know after a view: how many are done, of how many, and the last."""
+
+    done: int
+    total: int
+    name: str
+    camera: RefinedCamera
+
+
+def refine_views(
+    subject: Subject,
+    views: Views,
+    how: CameraSettings | None = None,
+    *,
+    on_view: Callable[[ViewProgress], None] | None = None,
+) -> RefinedSplit:
+    """Refine the camera and the exposure of every view (host side).
+
+    A view of which nothing is visible, in the render or in the mask, and one whose error did not
+    fall, keep their camera and say so.
+
+    Parameters
+    ----------
+    subject : what was trained, see `Renderer.subject`.
+    views : with the cameras to begin with.
+    how : by default, see `CameraSettings`.
+    on_view : called after every view.
+    """
+    how, cameras = how or CameraSettings(), {}
+    for index, name in enumerate(views.names):
+        valid = np.ones((views.height, views.width), np.float32)
+        photograph = Photograph(
+            camera=views.camera([index]),
+            image=jnp.asarray(views.images[index]),
+            valid=jnp.asarray(valid if views.valid is None else views.valid[index]),
+        )
+        found, capacities = refine_view(subject, photograph, how)
+        subject = replace(subject, pipeline=replace(subject.pipeline, capacities=capacities))
+        cameras[name] = _refined(found, views, index)
+        if on_view is not None:
+            on_view(ViewProgress(index + 1, len(views), name, cameras[name]))
+    return RefinedSplit(views.width, views.height, cameras)
+
+
+def _refined(found: Found, views: Views, index: int) -> RefinedCamera:
+    """Take over what was found, if it is better."""
+    note = _refusal(found)
+    exposure = 1.0 if views.exposure is None else float(views.exposure[index])
+    before = float(found.before.rms)
+    kept = RefinedCamera(
+        world_to_camera=views.world_to_camera[index],
+        intrinsics=views.intrinsics[index],
+        exposure=exposure,
+        residual_before=before,
+        residual_after=before,
+        iterations=int(found.iterations),
+        accepted=False,
+        note=note,
+    )
+    if note:
+        return kept
+    pose = np.asarray(found.camera.world_to_camera[0], np.float64)
+    left, _, right = np.linalg.svd(pose[:3, :3])
+    pose[:3, :3] = left @ right  # rigid in double precision
+    lens = views.intrinsics[index].astype(np.float64)
+    lens[[0, 1], [0, 1]] *= np.exp(UNIT * float(found.parameters[6]))
+    return replace(
+        kept,
+        world_to_camera=pose,
+        intrinsics=lens,
+        exposure=exposure * float(np.exp(UNIT * float(found.parameters[7]))),
+        residual_after=float(found.after.rms),
+        accepted=True,
+    )
+
+
+def _refusal(found: Found) -> str:
+    """Say why a view keeps its camera; "" where it does not."""
+    if float(found.before.covered) == 0:
+        return "the mask is empty"
+    if float(found.before.rendered) == 0:
+        return "nothing of the object is visible"
+    if not float(found.after.cost) < float(found.before.cost):
+        return "the error did not fall"
+    return ""

@@ -1,0 +1,216 @@
+"""Two sets of cameras of the same views, compared: what differs, and what no photograph tells.
+
+Where the object is in the world, which way it is turned, and how large it is, photographs leave
+open: cameras that all move with it see the same. That freedom, the gauge, is taken away by the
+similarity under which both sets see points around the object at the same pixels, or nearly so.
+
+Everything here runs on the host in float64.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from geosplat_jax.io.cameras import RefinedSplit, with_cameras
+from geosplat_jax.io.views import Views, camera_to_world_of
+
+_RADIUS = 0.7
+"""Of the points that are looked at, in half extents of the box: about where a surface is."""
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """The map ``x -> scale rotation x + translation`` of the world.
+
+    Attributes
+    ----------
+    rotation : (3, 3). translation : (3,) world units. scale : positive.
+    """
+
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, " 3"]
+    scale: float = 1.0
+
+    def points(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+        """Move points of the world."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def views(self, views: Views) -> Views:
+        """Move cameras with the world: they see of moved points what they saw before."""
+        poses = views.world_to_camera
+        moved = poses.copy()
+        moved[:, :3, :3] = poses[:, :3, :3] @ self.rotation.T
+        moved[:, :3, 3] = self.scale * poses[:, :3, 3] - moved[:, :3, :3] @ self.translation
+        return replace(views, camera_to_world=camera_to_world_of(moved))
+
+
+@dataclass(frozen=True)
+class CameraErrors:
+    """How the cameras of V views differ.
+
+    Attributes
+    ----------
+    rotation_deg : (V,) angle between the orientations.
+    center_percent : (V,) distance of the positions, per distance to the object.
+    focal_percent : (V,) difference of the focal lengths.
+    exposure_percent : (V,) difference of the exposures.
+    pixels : (V,) root mean square distance at which points around the object appear.
+    """
+
+    rotation_deg: Float[np.ndarray, " V"]
+    center_percent: Float[np.ndarray, " V"]
+    focal_percent: Float[np.ndarray, " V"]
+    exposure_percent: Float[np.ndarray, " V"]
+    pixels: Float[np.ndarray, " V"]
+
+
+Bounds = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
+"""lo and hi of a box around the object, see `Dataset.bounds`."""
+
+
+def find_gauge(found: Views, true: Views, bounds: Bounds, *, scales: bool = True) -> Similarity:
+    """Find the similarity of the world that takes ``true`` cameras closest to ``found`` ones.
+
+    Closest in the image: points on a sphere around the object, moved by it, appear in the found
+    cameras as near as possible to where they appear, unmoved, in the true ones. Unlike an alignment
+    of the positions of cameras it does not take lenses that are all longer, further away, for a
+    larger world.
+
+    Parameters
+    ----------
+    found, true : cameras of the same views. bounds : of the object, as the true cameras see it.
+    scales : whether the size of the world is free; False for rigid motions.
+    """
+    points = _points_around(bounds)
+    center, half = points.mean(axis=0), 0.5 * float(np.max(bounds[1] - bounds[0]))
+    wanted = _pixels(true, points)
+    first = _aligned_poses(found, true, center, scales=scales)
+
+    def similarity(values: np.ndarray) -> Similarity:
+        scale = first.scale * float(np.exp(values[6])) if scales else first.scale
+        rotation = Rotation.from_rotvec(values[:3]).as_matrix() @ first.rotation
+        middle = first.points(center[None])[0] + half * values[3:6]
+        return Similarity(rotation, middle - scale * rotation @ center, scale)
+
+    def residual(values: np.ndarray) -> np.ndarray:
+        return np.ravel(_pixels(found, similarity(values).points(points)) - wanted)
+
+    tolerances = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
+    return similarity(least_squares(residual, np.zeros(7 if scales else 6), **tolerances).x)
+
+
+def camera_errors(found: Views, true: Views, bounds: Bounds) -> CameraErrors:
+    """Compare cameras of the same views as they are, without a change of the gauge.
+
+    Parameters
+    ----------
+    found, true : cameras of the same views. bounds : of the object, as the true cameras see it.
+    """
+    points = _points_around(bounds)
+    turns = found.camera_to_world[:, :3, :3] @ true.camera_to_world[:, :3, :3].transpose(0, 2, 1)
+    positions, wanted = found.camera_to_world[:, :3, 3], true.camera_to_world[:, :3, 3]
+    distance = np.linalg.norm(wanted - points.mean(axis=0), axis=-1)
+    apart = np.linalg.norm(_pixels(found, points) - _pixels(true, points), axis=-1)
+    ones = np.ones(len(true))
+    exposures = (ones if v.exposure is None else v.exposure for v in (found, true))
+    return CameraErrors(
+        rotation_deg=np.degrees(Rotation.from_matrix(turns).magnitude()),
+        center_percent=100 * np.linalg.norm(positions - wanted, axis=-1) / distance,
+        focal_percent=100 * np.abs(found.intrinsics[:, 0, 0] / true.intrinsics[:, 0, 0] - 1),
+        exposure_percent=100 * np.abs(np.divide(*exposures) - 1),
+        pixels=np.sqrt(np.mean(apart**2, axis=-1)),
+    )
+
+
+def compare_cameras(
+    found: Views, true: Views, bounds: Bounds, *, scales: bool = True
+) -> tuple[CameraErrors, Similarity]:
+    """Compare cameras after the true ones were moved into the gauge of the others.
+
+    Parameters
+    ----------
+    found, true : cameras of the same views. bounds : of the object, as the true cameras see it.
+    scales : see `find_gauge`.
+
+    Returns
+    -------
+    errors : of the found cameras; those of the exposures without a common factor, which is the
+        light's. gauge : by which the true cameras were moved.
+    """
+    gauge = find_gauge(found, true, bounds, scales=scales)
+    center, half = np.mean(bounds, axis=0), 0.5 * gauge.scale * (bounds[1] - bounds[0])
+    moved = gauge.points(center[None])[0]
+    ones = np.ones(len(true))
+    ratio = np.divide(*(ones if v.exposure is None else v.exposure for v in (found, true)))
+    brightness = float(np.exp(np.mean(np.log(ratio))))
+    there = gauge.views(true)
+    there = replace(there, exposure=brightness * (ones if true.exposure is None else true.exposure))
+    return camera_errors(found, there, (moved - half, moved + half)), gauge
+
+
+def change_lines(views: Views, split: RefinedSplit, bounds: Bounds) -> list[str]:
+    """Summarise in lines of text what a refinement changed.
+
+    Parameters
+    ----------
+    views : with the cameras to begin with. split : what became of them.
+    bounds : of the object.
+    """
+    cameras = [split.cameras[name] for name in views.names]
+    changes = camera_errors(with_cameras(views, split, "the refinement"), views, bounds)
+    kinds = {
+        "rotation": (changes.rotation_deg, "degrees"),
+        "position": (changes.center_percent, "% of the distance"),
+        "focal length": (changes.focal_percent, "%"),
+        "exposure": (changes.exposure_percent, "%"),
+        "object in the image": (changes.pixels, "pixels"),
+    }
+    lines = [
+        f"{kind} changed by {np.median(values):.3f} {unit} (median), {np.max(values):.3f} at most"
+        for kind, (values, unit) in kinds.items()
+    ]
+    before, after = (
+        float(np.sqrt(np.mean([getattr(c, f"residual_{when}") ** 2 for c in cameras])))
+        for when in ("before", "after")
+    )
+    lines.append(f"rms residual {before:.5f} before, {after:.5f} after")
+    notes = Counter(camera.note for camera in cameras if not camera.accepted)
+    why = "; ".join(f"{note}: {count}" for note, count in notes.items())
+    unchanged = f"{sum(notes.values())} of {len(cameras)} views keep their cameras"
+    return [*lines, f"{unchanged} ({why})" if why else unchanged]
+
+
+def _points_around(bounds: Bounds) -> Float[np.ndarray, "14 3"]:
+    """Points on a sphere around the object, towards the corners and faces of a cube."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    faces = np.concatenate([np.eye(3), -np.eye(3)])
+    around = np.concatenate([corners / np.sqrt(3.0), faces])
+    return np.mean(bounds, axis=0) + _RADIUS * 0.5 * np.max(bounds[1] - bounds[0]) * around
+
+
+def _pixels(views: Views, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "V N 2"]:
+    """Where points appear in every view."""
+    poses = views.world_to_camera
+    seen = np.einsum("vij,nj->vni", poses[:, :3, :3], points) + poses[:, None, :3, 3]
+    seen = np.einsum("vij,vnj->vni", views.intrinsics, seen)
+    return seen[..., :2] / seen[..., 2:]
+
+
+def _aligned_poses(found: Views, true: Views, center: np.ndarray, *, scales: bool) -> Similarity:
+    """Align cameras by their axes, then by their positions; good enough to begin with."""
+    axes = (views.camera_to_world[:, :3, :3] for views in (found, true))
+    left, _, right = np.linalg.svd(np.einsum("vij,vkj->ik", *axes))
+    left[:, -1] *= np.linalg.det(left @ right)
+    rotation = left @ right
+    positions, wanted = found.camera_to_world[:, :3, 3], true.camera_to_world[:, :3, 3]
+    spread, wanted_spread = (x - x.mean(axis=0) for x in (positions, wanted))
+    size, wanted_size = np.linalg.norm(spread), np.linalg.norm(wanted_spread)
+    is_known = scales and wanted_size > 1e-6 * np.linalg.norm(wanted - center)
+    scale = float(size / wanted_size) if is_known else 1.0
+    return Similarity(
+        rotation, positions.mean(axis=0) - scale * rotation @ wanted.mean(axis=0), scale
+    )

@@ -1,0 +1,213 @@
+"""Refined cameras as a file: written whole, checked on the way in, put in the place of a scene's.
+
+::
+
+    {"format": "geosplat_jax cameras", "version": 1,
+     "splits": {"train": {"width": 200, "height": 200, "views": {NAME: {
+         "world_to_camera": 4 x 4, OpenCV axes, "fx": .., "fy": .., "cx": .., "cy": .., pixels
+         "exposure": factor by which the photograph is brighter than the scene renders,
+         "residual_before": .., "residual_after": .., "iterations": .., "accepted": ..,
+         "note": why a camera was left as it was}}}}}
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from geosplat_jax.io.images import MissingFileError, SceneError
+from geosplat_jax.io.views import Views, camera_to_world_of
+
+_FORMAT, _VERSION = "geosplat_jax cameras", 1
+_RIGID_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class RefinedCamera:
+    """The camera of one view, and how it was found.
+
+    Attributes
+    ----------
+    world_to_camera : (4, 4) rigid, OpenCV axes. intrinsics : (3, 3) pixels.
+    exposure : the photograph, in linear light, is this times what the scene renders.
+    residual_before, residual_after : root of the mean squared difference to the photograph.
+    iterations : of the solver, trial steps included.
+    accepted : False where the camera is the one that the search began with.
+    note : why it is; "" where accepted.
+    """
+
+    world_to_camera: Float[np.ndarray, "4 4"]
+    intrinsics: Float[np.ndarray, "3 3"]
+    exposure: float
+    residual_before: float
+    residual_after: float
+    iterations: int
+    accepted: bool
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class RefinedSplit:
+    """Refined cameras of a split by the names of its views, for images of one size."""
+
+    width: int
+    height: int
+    cameras: Mapping[str, RefinedCamera]
+
+
+def write_cameras(path: Path, splits: Mapping[str, RefinedSplit]) -> None:
+    """Write refined cameras in one go; a file that is there is replaced."""
+    content = {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "splits": {
+            name: {
+                "width": split.width,
+                "height": split.height,
+                "views": {view: _to_plain(camera) for view, camera in split.cameras.items()},
+            }
+            for name, split in splits.items()
+        },
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(path.name + ".partial")
+    aside.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    os.replace(aside, path)
+
+
+def _to_plain(camera: RefinedCamera) -> dict[str, Any]:
+    lens = camera.intrinsics
+    return {
+        "world_to_camera": camera.world_to_camera.tolist(),
+        "fx": float(lens[0, 0]),
+        "fy": float(lens[1, 1]),
+        "cx": float(lens[0, 2]),
+        "cy": float(lens[1, 2]),
+        "exposure": camera.exposure,
+        "residual_before": camera.residual_before,
+        "residual_after": camera.residual_after,
+        "iterations": camera.iterations,
+        "accepted": camera.accepted,
+        "note": camera.note,
+    }
+
+
+def cameras_digest(path: str | Path) -> str:
+    """Return a short text that tells the content of a file from any other.
+
+    Raises
+    ------
+    MissingFileError
+        If it is not there.
+    """
+    try:
+        return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16]
+    except OSError as error:
+        raise MissingFileError(f"cannot read the cameras {path}: {error.strerror}") from None
+
+
+def read_cameras(path: str | Path) -> dict[str, RefinedSplit]:
+    """Read what `write_cameras` wrote.
+
+    Raises
+    ------
+    MissingFileError
+        If the file is not there.
+    SceneError
+        If it is damaged, or of another version.
+    """
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise MissingFileError(f"cannot read the cameras {path}: {error.strerror}") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path} is damaged: {error}; refine the cameras again") from None
+    if not isinstance(content, dict) or content.get("format") != _FORMAT:
+        raise SceneError(f"{path} holds no cameras; geosplat-jax refine-cameras writes such files")
+    if content.get("version") != _VERSION:
+        raise SceneError(
+            f"{path} has version {content.get('version')!r}, and this program reads version "
+            f"{_VERSION}; refine the cameras again"
+        )
+    try:
+        return {
+            name: RefinedSplit(
+                int(split["width"]),
+                int(split["height"]),
+                {view: _from_plain(values) for view, values in split["views"].items()},
+            )
+            for name, split in content["splits"].items()
+        }
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        what = f"no {error}" if isinstance(error, KeyError) else str(error)
+        raise SceneError(f"{path} is damaged: {what}; refine the cameras again") from None
+
+
+def _from_plain(values: Mapping[str, Any]) -> RefinedCamera:
+    pose = np.array(values["world_to_camera"], np.float64)
+    fx, fy, cx, cy = (float(values[name]) for name in ("fx", "fy", "cx", "cy"))
+    exposure = float(values["exposure"])
+    turn = pose[:3, :3] @ pose[:3, :3].T if pose.shape == (4, 4) else np.zeros((3, 3))
+    if not np.allclose(turn, np.eye(3), atol=_RIGID_TOLERANCE) or not np.isfinite(pose).all():
+        raise ValueError("a world_to_camera is not a rigid 4 x 4 matrix")
+    if not (min(fx, fy, exposure) > 0 and np.isfinite([fx, fy, cx, cy, exposure]).all()):
+        raise ValueError(f"fx {fx}, fy {fy} and exposure {exposure} must be finite and above 0")
+    return RefinedCamera(
+        world_to_camera=pose,
+        intrinsics=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
+        exposure=exposure,
+        residual_before=float(values["residual_before"]),
+        residual_after=float(values["residual_after"]),
+        iterations=int(values["iterations"]),
+        accepted=bool(values["accepted"]),
+        note=str(values.get("note", "")),
+    )
+
+
+def with_cameras(views: Views, split: RefinedSplit, where: str) -> Views:
+    """Return views with refined cameras, and photographs without their exposures.
+
+    Colours are divided by the refined factors in linear light; alpha is not. Pixels that the sensor
+    clipped are divided like all others, although they may have been brighter. A factor is that of
+    the photograph as it was read, whatever the views were divided by before.
+
+    Parameters
+    ----------
+    views : as they were read. split : of the same views. where : the file, for messages.
+
+    Raises
+    ------
+    SceneError
+        If a view has no camera, or the images have another size.
+    """
+    if not len(views):
+        return views
+    if (views.width, views.height) != (split.width, split.height):
+        raise SceneError(
+            f"{where} holds cameras of images of {split.width} x {split.height}, but these are "
+            f"{views.width} x {views.height}; read the scene with the same --downscale"
+        )
+    missing = [name for name in views.names if name not in split.cameras]
+    if missing:
+        raise SceneError(
+            f"{where} has no camera for {len(missing)} of {len(views)} views, {missing[0]!r} for "
+            "one; refine the cameras of this scene"
+        )
+    cameras = [split.cameras[name] for name in views.names]
+    exposure = np.array([camera.exposure for camera in cameras])
+    factors = exposure if views.exposure is None else exposure / views.exposure
+    images = views.images.copy()
+    images[..., :3] /= factors[:, None, None, None].astype(images.dtype)
+    return replace(
+        views,
+        camera_to_world=camera_to_world_of(np.stack([c.world_to_camera for c in cameras])),
+        intrinsics=np.stack([camera.intrinsics for camera in cameras]),
+        images=images,
+        exposure=exposure,
+    )

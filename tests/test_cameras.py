@@ -1,0 +1,544 @@
+"""Refined cameras: what is found, how it is differentiated, compared, written and read."""
+
+import json
+import shutil
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support import TINY, ball, double_precision, look_at_poses, tiny_config, views_from
+
+from geosplat_jax import cli
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.color import tone_map
+from geosplat_jax.core.rotation import rotation_vector_to_matrix
+from geosplat_jax.core.types import Box, EnvLight
+from geosplat_jax.fit import cameras as cameras_module
+from geosplat_jax.fit.cameras import (
+    CameraSettings,
+    Photograph,
+    Subject,
+    moved_camera,
+    refine_view,
+    refine_views,
+    view_residual,
+)
+from geosplat_jax.fit.gauge import (
+    Similarity,
+    camera_errors,
+    change_lines,
+    compare_cameras,
+    find_gauge,
+)
+from geosplat_jax.io.cameras import (
+    RefinedCamera,
+    RefinedSplit,
+    read_cameras,
+    with_cameras,
+    write_cameras,
+)
+from geosplat_jax.io.dataset import load_dataset, load_recorded
+from geosplat_jax.io.images import SceneError
+from geosplat_jax.report.renderer import Renderer
+from geosplat_jax.run import Run
+
+DUCK = Path(__file__).resolve().parents[1] / "examples" / "duck"
+CONFIG = tiny_config("geometry.resolution=8", "material.bias=true")
+STEPS = (*TINY, "stages.split_sum.steps=2")
+SIZE = 32
+BOUNDS = (np.full(3, -0.6), np.full(3, 0.6))
+AMPLE = Capacities(visible=2048, hits=8192, chunks=1024)
+SMALL = Capacities(visible=256, hits=512, chunks=1024)
+# Without a prior, until nothing moves any more: the minimum is the truth.
+EXACT = CameraSettings(prior_deviation=1e4, tolerance=1e-3, rounds=3)
+TRUTH = np.array([0.02, -0.015, 0.03, 0.02, -0.03, 0.02, 0.015, 0.05], np.float32)
+
+
+@pytest.fixture(scope="module")
+def subject():
+    """A ball with bumps and colours under a dim sky; it has no symmetry."""
+    pipeline, params = ball(CONFIG)
+    rng = np.random.default_rng(0)
+    sdf = np.asarray(params.geometry.sdf)
+    sdf = sdf + rng.uniform(-0.4, 0.4, sdf.shape)
+    sdf = np.where(np.abs(sdf) < 0.03, np.copysign(0.03, sdf), sdf)
+
+    def varied(leaf):
+        return leaf + jnp.asarray(rng.uniform(-0.6, 0.6, leaf.shape), leaf.dtype)
+
+    sky = 0.1 + 0.4 * rng.uniform(0, 1, (8, 16, 3)) ** 3
+    params = replace(
+        params,
+        geometry=replace(params.geometry, sdf=jnp.asarray(sdf, jnp.float32)),
+        material=jax.tree.map(varied, params.material),
+        light=EnvLight(jnp.asarray(sky, jnp.float32)),
+    )
+    found = Renderer(pipeline, params).subject()
+    return replace(found, pipeline=replace(found.pipeline, capacities=AMPLE))
+
+
+@pytest.fixture(scope="module")
+def views():
+    return views_from([[2.2, -1.8, 1.0]], size=SIZE)
+
+
+@jax.jit
+def draw(subject, camera):
+    return subject.pipeline.render_lit(subject.asset, subject.illumination, camera, key=subject.key)
+
+
+def photographed(subject, camera, log_exposure):
+    """Render what a camera sees, without noise, as (H, W, 4) with straight alpha."""
+    output = draw(subject, camera)
+    alpha = np.asarray(output.alpha[0])[..., None]
+    rgb = np.asarray(tone_map(output.rgb[0], subject.log_exposure + log_exposure))
+    straight = np.where(alpha > 0, rgb / np.where(alpha > 0, alpha, 1), 0)
+    return np.concatenate([straight, alpha], axis=-1).astype(np.float32)
+
+
+def box_of(subject):
+    return subject.pipeline.surface.box
+
+
+@pytest.fixture(scope="module")
+def photograph(subject, views):
+    """What a camera sees that `TRUTH` moves away from the one that is known."""
+    camera, log_exposure = moved_camera(views.camera([0]), jnp.asarray(TRUTH), box_of(subject))
+    image = jnp.asarray(photographed(subject, camera, log_exposure))
+    assert 0.1 < float(image[..., 3].mean()) < 0.9
+    return Photograph(views.camera([0]), image, jnp.ones((SIZE, SIZE)))
+
+
+@pytest.fixture(scope="module")
+def found(subject, photograph):
+    """What the solver finds, and the buffers that it took."""
+    return refine_view(subject, photograph, EXACT)
+
+
+def test_the_camera_and_the_exposure_of_a_render_are_found_again(found):
+    result, _ = found
+    # Only a longer lens further away is hard to tell; float32 leaves 1e-4 of it.
+    np.testing.assert_allclose(0.01 * np.asarray(result.parameters), TRUTH, atol=5e-4)
+    assert float(result.after.rms) < 2e-3 * float(result.before.rms) + 1e-4
+    assert float(result.before.rms) > 0.02
+
+
+def with_capacities(subject, capacities):
+    return replace(subject, pipeline=replace(subject.pipeline, capacities=capacities))
+
+
+baked = jax.jit(Subject.seen_from)
+evaluate = partial(jax.jit, static_argnames=("how",))(view_residual)
+
+
+def test_a_step_into_an_overflow_is_taken_for_a_perfect_one(subject, photograph):
+    seen = baked(subject, photograph.camera)
+    residual, fit = evaluate(jnp.zeros(8), with_capacities(seen, SMALL), photograph, how=EXACT)
+    assert not np.any(np.asarray(residual))
+    assert int(fit.usage["visible"]) > SMALL["visible"]
+    assert int(fit.usage["visible"]) <= AMPLE["visible"]
+
+
+def test_buffers_grow_until_every_iterate_fits(monkeypatch, subject, photograph, found):
+    seen, tried = [], []
+    needs = {"visible": jnp.int32(300), "hits": jnp.int32(400)}
+    later = {"visible": jnp.int32(300), "hits": jnp.int32(9000)}
+
+    def solve(start, subject, photograph, *, how):
+        tried.append(subject.pipeline.capacities)
+        seen.append(np.asarray(start))
+        before, after = (replace(found[0].before, usage=u) for u in (needs, later))
+        return replace(found[0], before=before, after=after, iterations=jnp.int32(4))
+
+    monkeypatch.setattr(cameras_module, "_solve", solve)
+    result, capacities = refine_view(with_capacities(subject, SMALL), photograph, EXACT)
+    # Two attempts of three rounds; what overflowed only at the end was noticed, too.
+    assert [c["hits"] >= 9000 for c in tried] == [False] * 3 + [True] * 3
+    assert capacities["visible"] >= 300
+    assert capacities["chunks"] == SMALL["chunks"]
+    assert int(result.iterations) == 12
+    # Every round goes on where the one before ended, and an attempt begins anew.
+    np.testing.assert_array_equal(seen[3], np.zeros(8))
+    np.testing.assert_array_equal(seen[4], found[0].parameters)
+
+
+@pytest.mark.slow
+def test_forward_reverse_and_differences_give_one_jacobian(subject, photograph):
+    # A low knee, so that the robust function is differentiated where it bends.
+    how = CameraSettings(robust_deviations=0.2)
+    ample = replace(subject.pipeline, capacities=AMPLE)
+    with double_precision():
+
+        def double(tree):
+            return jax.tree.map(
+                lambda x: x.astype(np.float64) if jnp.issubdtype(x.dtype, jnp.floating) else x,
+                tree,
+            )
+
+        seen = baked(replace(subject, pipeline=ample), photograph.camera)
+        seen, shot = double((seen, photograph))
+        at = jnp.asarray(np.linspace(-0.4, 0.6, 8))
+
+        def residual(y, pipeline):
+            return view_residual(y, replace(seen, pipeline=pipeline), shot, how)[0]
+
+        forward = np.asarray(jax.jit(jax.jacfwd(residual))(at, seen.pipeline))
+        reverse = replace(seen.pipeline, compositor=ample.compositor)
+        weights = np.random.default_rng(0).normal(size=forward.shape[0])
+        pulled = jax.jit(jax.grad(lambda y, p: residual(y, p) @ weights))(at, reverse)
+        value, step = jax.jit(residual), 1e-5
+        differences = np.stack(
+            [
+                (value(at.at[k].add(step), reverse) - value(at.at[k].add(-step), reverse))
+                / (2 * step)
+                for k in range(8)
+            ],
+            axis=-1,
+        )
+    assert forward.dtype == np.float64
+    np.testing.assert_allclose(weights @ forward, pulled, rtol=1e-9, atol=1e-9)
+    # A cut at alpha = 1/255 is a jump that no derivative sees; it moves single pixels.
+    apart = np.abs(differences - forward)
+    assert np.quantile(apart, 0.995) < 1e-6 * np.abs(forward).max()
+    assert all(np.abs(forward).max(axis=0) > 1e-3)
+
+
+def test_unseen_objects_and_empty_masks_keep_their_camera(subject, views, photograph):
+    away = views_from([[2.2, -1.8, 1.0]], size=SIZE).camera_to_world
+    away[:, :3, :3] = away[:, :3, :3] @ Rotation.from_rotvec([0.0, 2.0, 0.0]).as_matrix()
+    image = np.asarray(photograph.image)
+    cases = replace(
+        views,
+        names=("away", "empty", "fine"),
+        camera_to_world=np.concatenate([away, views.camera_to_world, views.camera_to_world]),
+        intrinsics=np.repeat(views.intrinsics, 3, axis=0),
+        images=np.stack([image, np.zeros_like(image), image]),
+        exposure=np.array([1.0, 1.0, 2.0]),
+    )
+    seen = []
+    split = refine_views(subject, cases, EXACT, on_view=seen.append)
+    assert [(p.done, p.total, p.name) for p in seen] == [
+        (1, 3, "away"),
+        (2, 3, "empty"),
+        (3, 3, "fine"),
+    ]
+    for index, (name, note) in enumerate([("away", "nothing of"), ("empty", "the mask is empty")]):
+        camera = split.cameras[name]
+        assert not camera.accepted
+        assert note in camera.note
+        np.testing.assert_array_equal(camera.world_to_camera, cases.world_to_camera[index])
+        np.testing.assert_array_equal(camera.intrinsics, cases.intrinsics[index])
+        assert camera.residual_after == camera.residual_before
+    fine = split.cameras["fine"]
+    assert fine.accepted
+    assert fine.residual_after < 0.02 * fine.residual_before
+    # What the photograph was divided by before belongs to the whole factor.
+    assert fine.exposure == pytest.approx(2 * np.exp(TRUTH[7]), rel=1e-3)
+    expected = moved_camera(views.camera(), jnp.asarray(TRUTH), box_of(subject))[0]
+    np.testing.assert_allclose(fine.world_to_camera, expected.world_to_camera[0], atol=2e-3)
+    np.testing.assert_allclose(np.linalg.det(fine.world_to_camera), 1.0, atol=1e-12)
+    lines = "\n".join(change_lines(cases, split, BOUNDS))
+    assert "2 of 3 views keep their cameras" in lines
+    assert "exposure changed by" in lines
+
+
+def test_pixels_that_do_not_count_say_nothing(subject, photograph):
+    rows = jnp.arange(SIZE) < SIZE // 2
+    valid = jnp.broadcast_to(rows[:, None], (SIZE, SIZE)).astype(jnp.float32)
+    image = photograph.image.at[SIZE // 2 :].set(0.7)
+    seen = baked(subject, photograph.camera)
+    parts = [
+        evaluate(jnp.zeros(8), seen, Photograph(photograph.camera, shown, valid), how=EXACT)
+        for shown in (photograph.image, image)
+    ]
+    np.testing.assert_array_equal(parts[0][0], parts[1][0])
+    assert float(parts[0][1].rms) == float(parts[1][1].rms) > 0
+
+
+def test_an_error_that_does_not_fall_leaves_the_camera(monkeypatch, subject, views, found):
+    result, capacities = found
+    worse = replace(result, after=replace(result.after, cost=result.before.cost))
+    monkeypatch.setattr(cameras_module, "refine_view", lambda *_: (worse, capacities))
+    camera = refine_views(subject, views, EXACT).cameras[views.names[0]]
+    assert camera.note == "the error did not fall"
+    np.testing.assert_array_equal(camera.world_to_camera, views.world_to_camera[0])
+
+
+def test_zero_parameters_are_the_camera_and_turns_are_about_the_box(views):
+    box = Box(jnp.asarray([0.1, -0.2, 0.05]), jnp.asarray(0.5))
+    same, log_exposure = moved_camera(views.camera(), jnp.zeros(8), box)
+    np.testing.assert_allclose(same.world_to_camera, views.camera().world_to_camera, atol=1e-6)
+    np.testing.assert_array_equal(same.intrinsics, views.camera().intrinsics)
+    assert float(log_exposure) == 0
+    turned, _ = moved_camera(views.camera(), jnp.zeros(8).at[1].set(0.3), box)
+
+    def place(camera):
+        pose = np.asarray(camera.world_to_camera[0])
+        return pose[:3, :3] @ np.asarray(box.center) + pose[:3, 3]
+
+    np.testing.assert_allclose(place(turned), place(same), atol=1e-6)
+    nearer, _ = moved_camera(views.camera(), jnp.zeros(8).at[5].set(-0.5), box)
+    np.testing.assert_allclose(place(nearer), place(same) * [1, 1, 0.5], atol=1e-6)
+
+
+@pytest.mark.parametrize("length", [0.0, 1e-3, 9.9e-3, 1.01e-2, 1.0, 3.0])
+def test_rotation_vectors_agree_with_scipy_and_have_a_derivative_at_zero(length):
+    axis = np.array([0.48, -0.6, 0.64])
+    with double_precision():
+        found = rotation_vector_to_matrix(jnp.asarray(length * axis))
+        slope = jax.jvp(
+            rotation_vector_to_matrix, (jnp.asarray(length * axis),), (jnp.asarray(axis),)
+        )[1]
+    expected = Rotation.from_rotvec(length * axis).as_matrix()
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    np.testing.assert_allclose(slope, cross @ expected, atol=1e-11)
+
+
+def many_views(count=6):
+    views = views_from([[3.0, 0, 0.1]], size=SIZE)
+    return replace(
+        views,
+        names=tuple(f"view_{k}" for k in range(count)),
+        camera_to_world=look_at_poses(count),
+        intrinsics=np.repeat(views.intrinsics, count, axis=0),
+        images=np.repeat(views.images, count, axis=0),
+    )
+
+
+@pytest.mark.parametrize("count", [2, 6])
+@pytest.mark.parametrize("scale", [1.0, 1.3])
+def test_a_common_motion_is_no_error(count, scale):
+    true = many_views(count)
+    motion = Similarity(
+        Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix(), np.array([3.0, -1.0, 0.5]), scale
+    )
+    moved = motion.views(true)
+    errors, gauge = compare_cameras(moved, true, BOUNDS, scales=scale != 1.0)
+    np.testing.assert_allclose(gauge.rotation, motion.rotation, atol=1e-8)
+    np.testing.assert_allclose(gauge.translation, motion.translation, atol=1e-7)
+    assert gauge.scale == pytest.approx(scale, rel=1e-8)
+    for values in vars(errors).values():
+        np.testing.assert_allclose(values, 0, atol=1e-5)
+    assert camera_errors(moved, true, BOUNDS).rotation_deg.min() > 10
+
+
+def test_an_error_of_one_camera_is_still_seen_without_the_gauge():
+    true = many_views(12)
+    wrong = true.camera_to_world.copy()
+    wrong[0, :3, :3] = Rotation.from_rotvec([0, 0, np.radians(1)]).as_matrix() @ wrong[0, :3, :3]
+    lenses = true.intrinsics.copy()
+    lenses[1, [0, 1], [0, 1]] *= 1.02
+    found = replace(true, camera_to_world=wrong, intrinsics=lenses)
+    errors, _ = compare_cameras(found, true, BOUNDS)
+    assert errors.rotation_deg[0] == pytest.approx(1.0, abs=0.2)
+    assert errors.rotation_deg[2:].max() < 0.2
+    assert errors.focal_percent[1] == pytest.approx(2.0)
+
+
+def test_longer_lenses_further_away_are_no_larger_world():
+    true = many_views()
+    poses, lenses = true.camera_to_world.copy(), true.intrinsics.copy()
+    poses[:, :3, 3] *= 1.05
+    lenses[:, [0, 1], [0, 1]] *= 1.05
+    gauge = find_gauge(replace(true, camera_to_world=poses, intrinsics=lenses), true, BOUNDS)
+    assert gauge.scale == pytest.approx(1.0, abs=0.005)
+
+
+def a_camera(views, index=0, **changes):
+    camera = RefinedCamera(
+        world_to_camera=views.world_to_camera[index],
+        intrinsics=views.intrinsics[index],
+        exposure=1.25,
+        residual_before=0.1,
+        residual_after=0.05,
+        iterations=7,
+        accepted=True,
+    )
+    return replace(camera, **changes)
+
+
+@pytest.fixture
+def file(tmp_path):
+    """Cameras of three views, on disk."""
+    views = many_views(3)
+    cameras = {name: a_camera(views, k) for k, name in enumerate(views.names)}
+    cameras["view_2"] = a_camera(views, 2, accepted=False, note="why", exposure=1.0)
+    path = tmp_path / "cameras.json"
+    write_cameras(path, {"train": RefinedSplit(SIZE, SIZE, cameras)})
+    return path, views, cameras
+
+
+def test_what_was_written_is_read(file):
+    path, _, cameras = file
+    split = read_cameras(path)["train"]
+    assert (split.width, split.height) == (SIZE, SIZE)
+    for name, camera in cameras.items():
+        for field, value in vars(camera).items():
+            np.testing.assert_array_equal(getattr(split.cameras[name], field), value)
+    assert [p.name for p in path.parent.iterdir()] == ["cameras.json"]
+
+
+def test_views_take_their_cameras_by_name_and_lose_their_exposure(file):
+    path, views, _ = file
+    views = replace(views, images=views.images + 0.5, names=("view_2", "view_0", "view_1"))
+    changed = with_cameras(views, read_cameras(path)["train"], str(path))
+    order = [2, 0, 1]
+    np.testing.assert_allclose(
+        changed.camera_to_world, many_views(3).camera_to_world[order], atol=1e-12
+    )
+    np.testing.assert_allclose(changed.images[:, 0, 0, 0], [0.5, 0.4, 0.4], rtol=1e-6)
+    np.testing.assert_array_equal(changed.images[..., 3], views.images[..., 3])
+    np.testing.assert_array_equal(changed.exposure, [1.0, 1.25, 1.25])
+    # The file holds whole factors: a second time changes nothing.
+    twice = with_cameras(changed, read_cameras(path)["train"], str(path))
+    np.testing.assert_array_equal(twice.images, changed.images)
+    np.testing.assert_array_equal(twice.exposure, changed.exposure)
+
+
+def damaged(content, kind):
+    first = content["splits"]["train"]["views"]["view_0"]
+    if kind == "version":
+        content["version"] = 2
+    elif kind == "format":
+        content.pop("format")
+    elif kind == "number":
+        first["fx"] = -1.0
+    elif kind == "pose":
+        first["world_to_camera"][0][0] = 7.0
+    elif kind == "key":
+        first.pop("exposure")
+    return json.dumps(content)
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("version", "version 2, and this program reads version 1"),
+        ("format", "holds no cameras"),
+        ("number", "must be finite and above 0"),
+        ("pose", "not a rigid 4 x 4 matrix"),
+        ("key", "no 'exposure'"),
+    ],
+)
+def test_a_broken_file_is_one_line(file, kind, message):
+    path, *_ = file
+    path.write_text(damaged(json.loads(path.read_text()), kind))
+    with pytest.raises(SceneError, match=message) as caught:
+        read_cameras(path)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_a_torn_and_a_missing_file_are_one_line(file, tmp_path):
+    path, *_ = file
+    path.write_text(path.read_text()[:100])
+    with pytest.raises(SceneError, match="is damaged"):
+        read_cameras(path)
+    with pytest.raises(SceneError, match="cannot read the cameras"):
+        read_cameras(tmp_path / "nothing.json")
+
+
+def test_missing_views_and_other_sizes_are_refused(file):
+    path, views, _ = file
+    split = read_cameras(path)["train"]
+    with pytest.raises(SceneError, match="no camera for 1 of 3 views, 'other' for one"):
+        with_cameras(replace(views, names=("view_0", "other", "view_2")), split, str(path))
+    with pytest.raises(SceneError, match=r"images of 32 x 32, but these are 16 x 16.*--downscale"):
+        with_cameras(replace(views, images=views.images[:, ::2, ::2]), split, str(path))
+
+
+def test_a_scene_is_read_with_the_cameras_of_a_file_and_remembers_it(tmp_path, capsys):
+    scene = load_dataset(DUCK, downscale=8)
+    factor = 1.01
+    cameras = {}
+    for index, name in enumerate(scene.train.names):
+        lens = scene.train.intrinsics[index].copy()
+        lens[[0, 1], [0, 1]] *= factor
+        cameras[name] = a_camera(scene.train, index, intrinsics=lens)
+    path = tmp_path / "cameras.json"
+    write_cameras(path, {"train": RefinedSplit(scene.train.width, scene.train.height, cameras)})
+    with_file = load_dataset(DUCK, downscale=8, cameras=path)
+    expected = scene.train.intrinsics[:, 0, 0] * factor
+    np.testing.assert_allclose(with_file.train.intrinsics[:, 0, 0], expected)
+    np.testing.assert_allclose(
+        with_file.train.images[..., :3], scene.train.images[..., :3] / 1.25, rtol=1e-6
+    )
+    assert with_file.train.fingerprint() != scene.train.fingerprint()
+    # A split that the file does not name stays as it is.
+    assert with_file.test.fingerprint() == scene.test.fingerprint()
+    assert set(scene.options) == {"downscale", "light", "bounds"}
+    options = json.loads(json.dumps(with_file.options))
+    again = load_recorded(DUCK, options)
+    assert again.train.fingerprint() == with_file.train.fingerprint()
+    assert again.options == with_file.options
+    arguments = ["info", str(DUCK), "--cameras", str(path)]
+    assert cli.main([*arguments, "--downscale", "4"]) == 2
+    assert "--downscale" in capsys.readouterr().err
+    path.write_text(path.read_text() + " ")
+    with pytest.raises(SceneError, match="has changed since the run read its cameras"):
+        load_recorded(DUCK, options)
+
+
+def test_refining_what_is_no_run_is_one_line(tmp_path, capsys):
+    assert cli.main(["refine-cameras", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert "is not a run" in said
+    assert said.count("\n") == 1
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of two steps on six views of the bundled scene."""
+    root = tmp_path_factory.mktemp("cameras")
+    names = [*(f"train_{k:03d}" for k in range(0, 40, 8)), "test_000"]
+    for name in names:
+        shutil.copytree(DUCK / name, root / "duck" / name)
+    shutil.copy(DUCK / "scene.json", root / "duck")
+    assert train(root, "run") == 0
+    return root
+
+
+def train(root, name, *arguments):
+    settings = [part for setting in STEPS for part in ("--set", setting)]
+    output = str(root / name)
+    scene = str(root / "duck")
+    return cli.main(["train", scene, "--output", output, "--downscale", "8", *arguments, *settings])
+
+
+@pytest.mark.slow
+def test_a_run_is_refined_and_trained_with_what_was_found(run, capsys):
+    assert cli.main(["refine-cameras", str(run / "run")]) == 0
+    said = capsys.readouterr().out
+    for words in ("train: rotation changed", "test: exposure changed", "rms residual", "5 views"):
+        assert words in said
+    path = run / "run" / "cameras.json"
+    refined = read_cameras(path)
+    assert (len(refined["train"].cameras), len(refined["test"].cameras)) == (5, 1)
+    assert any(camera.accepted for camera in refined["train"].cameras.values())
+    assert train(run, "again", "--cameras", str(path)) == 0
+    record = json.loads((run / "again" / "run.json").read_text())
+    assert record["dataset"]["cameras"] == str(path.resolve())
+    opened = Run(run / "again")
+    for name, pose in zip(
+        opened.dataset.train.names, opened.dataset.train.world_to_camera, strict=True
+    ):
+        np.testing.assert_allclose(pose, refined["train"].cameras[name].world_to_camera, atol=1e-12)
+    # Another loss from the first step on: these cameras and photographs were trained on.
+    assert opened.steps()[0]["loss"] != Run(run / "run").steps()[0]["loss"]
+    assert train(run, "again", "--cameras", str(path), "--resume") == 0
+    assert train(run, "again", "--resume") == 2
+    assert "take the same, or another folder" in capsys.readouterr().err
+    assert cli.main(["render", str(run / "again"), "--output", str(run / "pictures")]) == 0
+    # What it was trained with is never overwritten, and a change of it does not go unnoticed.
+    assert cli.main(["refine-cameras", str(run / "again"), "--output", str(path)]) == 2
+    assert "was trained with; write to another file" in capsys.readouterr().err
+    path.write_text(path.read_text() + " ")
+    assert cli.main(["render", str(run / "again"), "--output", str(run / "pictures")]) == 2
+    assert "has changed since the run" in capsys.readouterr().err
