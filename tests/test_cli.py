@@ -217,7 +217,7 @@ def test_factors_of_a_light_are_checked(tmp_path, capsys, name, value):
     assert f"{name} must be finite and not negative" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["evaluate", "export", "render"])
+@pytest.mark.parametrize("command", ["evaluate", "export", "render", "refine-cameras"])
 def test_commands_on_something_that_is_not_a_run_say_so(tmp_path, capsys, command):
     assert main([command, str(tmp_path)]) == 2
     assert "is not a run" in capsys.readouterr().err
