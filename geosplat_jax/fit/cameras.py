@@ -2,8 +2,8 @@
 
 The asset and its light stay as they are, so views are independent of each other: eight parameters
 each, found by Levenberg-Marquardt from the difference of render and photograph. Eight columns of a
-Jacobian are made in forward mode (`RenderPipeline.forward_mode`), which suits few
-parameters and many pixels; visibility and depth order are found anew at every iterate and have no
+Jacobian are made in forward mode (`RenderPipeline.forward_mode`), which suits few parameters and
+many pixels; visibility and depth order are found anew at every iterate and have no
 derivative.
 
 Splats are shaded towards the camera to begin with, and keep their colours while the solver runs:
