@@ -138,9 +138,13 @@ def _observe_view(asset: Asset, batch: Batch, view: int, pipeline: Pipeline) -> 
 
 def _residual(rgb: jax.Array, alpha: jax.Array, batch: Batch, pipeline: Pipeline) -> jax.Array:
     """Subtract the composited photographs from the composited images, as the loss does."""
-    # The first of the step's three keys, see `LossInputs.keys`.
-    key = jax.random.split(batch.key, 3)[0]
-    behind = random_background(key, rgb.shape, rgb.dtype, pipeline.objective.background)
+    kind, shape = pipeline.objective.background, (1, *rgb.shape[1:])
+    behind = []
+    for number in range(rgb.shape[0]):
+        # The first of the view's two keys, see `Pipeline.view_loss`.
+        key = jax.random.split(batch.view(number).key)[0]
+        behind.append(random_background(key, shape, rgb.dtype, kind))
+    behind = jnp.concatenate(behind)
     images = compare(rgb, alpha, batch.image, behind, batch.valid, srgb=False)
     return images.predicted - images.target
 

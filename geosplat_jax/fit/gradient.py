@@ -69,8 +69,8 @@ def _lights(
     light: EnvLight,
     seen: Bool[Array, " N"] | None,
     batch: Batch,
-) -> tuple[_Parts, Any, Callable]:
-    """Prepare the light; also return what the transport keeps, and the way back."""
+) -> tuple[_Parts, Illumination | None, Any, Callable]:
+    """Prepare the light, and that of residuals; also return the carry and the way back."""
     moving, fixed = asset
 
     def prepare(moving: Any, light: EnvLight) -> tuple[Any, Any]:
@@ -79,32 +79,8 @@ def _lights(
         return changing, (rest, carry)
 
     changing, pull, (rest, carry) = jax.vjp(prepare, moving, light, has_aux=True)
-    return (changing, rest), carry, pull
-
-
-@jax.jit
-def _residual_lights(
-    pipeline: Pipeline,
-    asset: _Parts,
-    light: EnvLight,
-    seen: Bool[Array, " N"] | None,
-    batch: Batch,
-) -> Illumination | None:
-    """Prepare the light with other samples."""
-    return pipeline.residual_lights(eqx.combine(*asset), light, seen, batch)
-
-
-@jax.jit
-def _residual_image(
-    pipeline: Pipeline,
-    log_exposure: Float[Array, ""],
-    asset: _Parts,
-    lights: Illumination | None,
-    lists: TileLists,
-    view: tuple[Batch, Float[Array, ""]],
-) -> Float[Array, "1 H W 3"] | None:
-    """Render a view with other samples."""
-    return pipeline.residual_image(log_exposure, eqx.combine(*asset), lights, lists, view[0])
+    others = pipeline.residual_lights(eqx.combine(moving, fixed), light, seen, batch)
+    return (changing, rest), others, carry, pull
 
 
 @jax.jit
@@ -113,12 +89,13 @@ def _view_gradient(
     log_exposure: Float[Array, ""],
     asset: _Parts,
     lights: _Parts,
+    others: Illumination | None,
     lists: TileLists,
     view: tuple[Batch, Float[Array, ""]],
-    residual: Float[Array, "1 H W 3"] | None,
 ) -> tuple[Any, ViewReport]:
     """Differentiate the loss of a view, times its share, and return both with the report."""
     batch, share = view
+    residual = pipeline.residual_image(log_exposure, eqx.combine(*asset), others, lists, batch)
 
     def loss(log_exposure: Array, moving: Any, changing: Any) -> tuple[Array, ViewReport]:
         value, report = pipeline.view_loss(
@@ -186,8 +163,8 @@ def _divided(capacities: Capacities) -> tuple[dict[str, int], dict[str, int]]:
 
 
 def run_program(program: Any, *arguments: Any) -> Any:
-    """Call a program."""
-    return program(*arguments)
+    """Call a program, and wait for it: on a CPU two side by side take longer (measured)."""
+    return jax.block_until_ready(program(*arguments))
 
 
 def value_and_gradient(
@@ -220,12 +197,10 @@ def value_and_gradient(
     lists = [run(_lists, listing, asset, view) for view, _ in views]
     seen = run(_seen, pipeline, asset, lists)
     light, exposure = params.light, params.log_exposure
-    lights, carry, pull_lights = run(_lights, pipeline, asset, light, seen, batch)
-    others = run(_residual_lights, pipeline, asset, light, seen, batch)
+    lights, others, carry, pull_lights = run(_lights, pipeline, asset, light, seen, batch)
     total = None
     for view, listed in zip(views, lists, strict=True):
-        residual = run(_residual_image, pipeline, exposure, asset, others, listed, view)
-        part = run(_view_gradient, pipeline, exposure, asset, lights, listed, view, residual)
+        part = run(_view_gradient, pipeline, exposure, asset, lights, others, listed, view)
         total = part if total is None else run(_plus, total, part)
     pulls = (pull_asset, pull_lights)
     return run(_back, pipeline, params, asset, pulls, total, batch, carry, frozen)

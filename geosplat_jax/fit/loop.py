@@ -34,7 +34,7 @@ from geosplat_jax.surface.base import SurfaceModel
 
 _RECOVERIES_ALLOWED = 3
 _SHRINK_EVERY = 100
-_LOOK_AHEAD = 100
+_LOOK_AHEAD = 200
 """Steps before the end of a stage, at most, at which the next one's programs are compiled."""
 
 

@@ -8,13 +8,14 @@ import json
 import platform
 import time
 from collections.abc import Mapping
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from geosplat_jax.core.types import EnvLight
-from geosplat_jax.fit.runtime import peak_memory_mb
+from geosplat_jax.fit.runtime import in_background, peak_memory_mb
 from geosplat_jax.fit.train import Trained
 from geosplat_jax.io.images import write_png
 from geosplat_jax.io.meshes import render_mesh_normals
@@ -124,8 +125,12 @@ def _relight_metrics(
     metrics: dict[str, float] = {}
     rows: list[dict[str, np.ndarray]] = [{} for _ in chosen]
     names = sorted(set(views.relight) & set(lights))
-    for name in names:
-        relit = renderer.relit(lights[name], albedo_scale=albedo_scale, indirect=indirect)
+    relit = renderer
+    for number, name in enumerate(names):
+        if number:
+            relit = relit.under(lights[name])
+        else:
+            relit = renderer.relit(lights[name], albedo_scale=albedo_scale, indirect=indirect)
         rgb, alpha = np.empty((*views.masks.shape, 3), np.float32), np.empty(views.masks.shape)
         for index in range(len(views)):
             view = relit(views.camera(np.array([index])))
@@ -141,6 +146,19 @@ def _relight_metrics(
             values = [metrics[f"relight.{name}.{key}"] for name in names]
             metrics[f"relight.mean.{key}"] = float(np.mean(values))
     return metrics, rows if names else []
+
+
+def _relight_programs(
+    renderer: Renderer, views: Views, lights: Mapping[str, EnvLight], indirect: str
+) -> Future[None]:
+    """Compile what relights while the views are rendered under the light that was trained."""
+    names = sorted(set(views.relight) & set(lights))
+
+    def render_once() -> None:
+        if names:
+            renderer.relit(lights[names[0]], indirect=indirect).hurried()(views.camera([0]))
+
+    return in_background(render_once)
 
 
 def evaluate_run(
@@ -179,12 +197,14 @@ def evaluate_run(
     began = time.perf_counter()
     chosen_protocol = protocols.protocol(protocol)
     renderer = Renderer.of(trained, samples=samples)
+    compiled = _relight_programs(renderer, views, lights or {}, relight_indirect)
     chosen = np.unique(np.linspace(0, len(views) - 1, sheet_views).round().astype(int))
     rendered = _render_all(renderer, views, chosen)
     lines = rendered.metrics
     names = dict.fromkeys(key for line in lines for key in line if key != "view")
     mean = {key: float(np.mean([line[key] for line in lines if key in line])) for key in names}
     materials, scale = _material_metrics(chosen_protocol, rendered, views)
+    compiled.result()
     relights, relit = _relight_metrics(
         chosen_protocol, renderer, views, lights or {}, scale, relight_indirect, chosen
     )

@@ -5,6 +5,7 @@ a size that fits memory, and serves every view.
 """
 
 import copy
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -36,7 +37,10 @@ _PASS_SAMPLES = 16
 """Samples of each kind in a pass, at most."""
 
 _SPECULAR_PASSES = 4
-"""Passes that specular light is averaged over; each keeps its samples of the light in memory."""
+"""Passes that specular light is averaged over at most; each keeps its samples of the light."""
+
+_SPECULAR_SAMPLES_PER_PIXEL = 128
+"""Samples of the specular lobe that are enough for a covered pixel, over its splats and passes."""
 
 RELIGHT_BOUNCES = 2
 """How often light goes from surface to surface under a new light."""
@@ -111,8 +115,8 @@ class Renderer:
     samples : rays per splat for the diffuse light, half of them towards the light and half after
         the cosine, where the transport traces any; rounded up to equal passes of at most 32, see
         `samples`. The noise falls as the square root. The specular lobe, which every view
-        integrates anew, has half as many of its own, from four passes at most, and the splats of
-        a pixel average it further.
+        integrates anew, has half as many of its own, from four passes at most, and from fewer where
+        the splats of a pixel average it anyway.
     seed : of the samples.
     """
 
@@ -191,6 +195,12 @@ class Renderer:
         other._illuminations = []
         return other
 
+    def hurried(self) -> "Renderer":
+        """Return a renderer of a single pass: noisier, and made of the same programs."""
+        other = copy.copy(self)
+        other._passes, other._illuminations = 1, []
+        return other
+
     def center(self) -> np.ndarray:
         """Centre of the box around the object in the world, (3,) float64."""
         return np.asarray(self._pipeline.surface.box.center, np.float64)
@@ -250,10 +260,11 @@ class Renderer:
 
     def __call__(self, camera: Camera) -> RenderedView:
         """Render the single view of ``camera``, with every AOV of the evaluation."""
-        outputs = [
-            self._render(camera, illumination, number)
-            for number, illumination in enumerate(self._illuminated())
-        ]
+        illuminations = self._illuminated()
+        outputs = [self._render(camera, illuminations[0], 0)]
+        passes = min(len(illuminations), self._passes_needed(outputs[0]))
+        for number in range(1, passes):
+            outputs.append(self._render(camera, illuminations[number], number))
         linear = jnp.mean(jnp.stack([output.rgb[0] for output in outputs]), axis=0)
         rgb = tone_map(linear, self._log_exposure)
         first = outputs[0]
@@ -262,6 +273,12 @@ class Renderer:
             np.asarray(first.alpha[0]),
             {name: np.asarray(image[0]) for name, image in first.aovs.items()},
         )
+
+    def _passes_needed(self, output: RenderOutput) -> int:
+        """Count the passes after which a covered pixel has its samples of the specular lobe."""
+        covered, drawn = float(jnp.sum(output.alpha)), int(output.usage["visible"])
+        wanted = _SPECULAR_SAMPLES_PER_PIXEL * covered
+        return math.ceil(wanted / max(drawn * self._pass_samples, 1))
 
     def mesh(self, *, training: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Extract the surface: vertices (n, 3), faces (m, 3) and vertex normals (n, 3).
