@@ -14,9 +14,10 @@ from geosplat_jax.fit import gradient
 from geosplat_jax.fit.gradient import value_and_gradient
 
 
-def two_views(pipeline, batch, *, valid=None):
-    """Return a batch of two views, on lists that hold them."""
+def two_views(pipeline, batch):
+    """Return a batch of two views, of which the second counts for less."""
     views = sphere_views(2, size=14)
+    valid = jnp.ones((2, 14, 14)).at[1, :, :5].set(0.0)
     return replace(batch, camera=views.camera([0, 1]), image=jnp.asarray(views.images), valid=valid)
 
 
@@ -26,20 +27,12 @@ def assert_close(found, expected):
         np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-5 * scale)
 
 
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        pytest.param((), id="one set of samples", marks=pytest.mark.slow),
-        pytest.param(
-            ("stages.monte_carlo.transport.residual_count=1",), id="a residual of its own"
-        ),
-    ],
-)
-def test_the_parts_give_the_gradient_of_the_whole_loss(overrides):
+@pytest.mark.slow
+@pytest.mark.parametrize("residual", [0, 1], ids=["same samples", "a residual of its own"])
+def test_the_parts_of_monte_carlo_give_the_gradient_of_the_whole_loss(residual):
     """Two views, of which one counts for less."""
-    _, pipeline, params, batch = problem(*overrides)
-    valid = jnp.ones((2, 14, 14)).at[1, :, :5].set(0.0)
-    batch = two_views(pipeline, batch, valid=valid)
+    _, pipeline, params, batch = problem(f"stages.monte_carlo.transport.residual_count={residual}")
+    batch = two_views(pipeline, batch)
     (total, report), expected = evaluate(pipeline, params, batch)
     (found_total, found_report), found = value_and_gradient(pipeline, params, batch, frozen=())
     assert float(found_total) == pytest.approx(float(total), rel=1e-5)
@@ -51,9 +44,10 @@ def test_split_sum_by_parts_with_a_frozen_group():
     """The surface gets no gradient, and the others the same as without that."""
     _, pipeline, params, batch = problem(stage="split_sum")
     batch = two_views(pipeline, batch)
-    (_, report), expected = evaluate(pipeline, params, batch)
+    (total, report), expected = evaluate(pipeline, params, batch)
     frozen = ("sdf", "light")
-    (_, found_report), found = value_and_gradient(pipeline, params, batch, frozen=frozen)
+    (found_total, found_report), found = value_and_gradient(pipeline, params, batch, frozen=frozen)
+    assert float(found_total) == pytest.approx(float(total), rel=1e-5)
     assert_close(found_report, report)
     for name, a, b in zip(
         rate_groups(params), jax.tree.leaves(found), jax.tree.leaves(expected), strict=True
@@ -67,6 +61,7 @@ def test_split_sum_by_parts_with_a_frozen_group():
 def test_more_views_are_no_new_program_and_larger_lists_only_two():
     """Programs are counted: those of a view serve every view."""
     _, pipeline, params, batch = problem(stage="split_sum")
+    batch = replace(batch, valid=jnp.ones((1, 14, 14)))
     value_and_gradient(pipeline, params, batch, frozen=())
     before = {name: getattr(gradient, name)._cache_size() for name in PROGRAMS}
     value_and_gradient(pipeline, params, two_views(pipeline, batch), frozen=())

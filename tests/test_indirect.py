@@ -164,7 +164,7 @@ def test_the_gradient_is_that_of_the_values_alone(model):
             return gradient, (at(moves) - at(-moves)) / (2 * step)
 
         (in_values, in_directions), expected = run(values, directions)
-        np.testing.assert_allclose(in_values.reshape(-1), expected, atol=1e-10, rtol=1e-8)
+        np.testing.assert_allclose(in_values.reshape(-1), expected, atol=1e-9, rtol=1e-8)
         np.testing.assert_array_equal(in_directions, 0.0)
 
 

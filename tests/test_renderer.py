@@ -157,8 +157,9 @@ def test_the_noise_falls_with_the_samples(direct, camera, material):
     _, params = ball_of_one_material(CONFIG, **material)
     params = replace(params, light=sky())
     few, many = (noise(direct, params, camera, samples) for samples in (32, 128))
-    # The inverse root of 4 would be .5.
-    assert 0 < many < 0.75 * few
+    # The inverse root of 4 would be .5. Highlights take no further passes once the many splats of a
+    # pixel leave so little noise.
+    assert 0 < many < max(0.75 * few, 0.002)
 
 
 def test_the_same_seed_gives_the_same_image_and_another_one_does_not(direct, matt, camera):
