@@ -1,0 +1,58 @@
+"""Programs that are compiled before they are needed."""
+
+import logging
+from dataclasses import replace
+
+import jax
+import pytest
+from test_pipeline import TIGHT, problem
+
+from geosplat_jax.fit import compilation
+from geosplat_jax.fit.compilation import compile_step
+from geosplat_jax.fit.runtime import in_background
+from geosplat_jax.fit.stages import update_rule
+from geosplat_jax.fit.step import initial_state, train_step
+
+LARGE = ("_asset", "_view_gradient", "_back", "_update")
+
+
+def compiled_programs(caplog):
+    """Names of the large programs that XLA was asked for."""
+    return {
+        name
+        for name in LARGE
+        for record in caplog.records
+        if f"XLA compilation of jit({name})" in record.getMessage()
+    }
+
+
+def test_a_step_finds_its_programs_compiled(caplog):
+    """From shapes alone, without a run of any program; the step then compiles none of them."""
+    config, pipeline, params, batch = problem(stage="split_sum")
+    pipeline = replace(pipeline, capacities=TIGHT.resized(visible=6272))
+    rule = update_rule(config, config.stage("split_sum"), params, 0)
+    shapes = jax.eval_shape(lambda: initial_state(params))
+    with jax.log_compiles(), caplog.at_level(logging.DEBUG, logger="jax"):
+        compile_step(shapes, batch, pipeline, rule)
+        assert compiled_programs(caplog) == set(LARGE)
+        caplog.clear()
+        train_step(initial_state(params), batch, pipeline, rule)
+        assert compiled_programs(caplog) == set()
+
+
+def test_a_compilation_that_fails_is_told(monkeypatch):
+    def fails(state, batch, pipeline, rule, *, run):
+        run(jax.jit(lambda x: x + "text"), 1.0)
+
+    monkeypatch.setattr(compilation, "train_step", fails)
+    with pytest.raises(TypeError):
+        compile_step(None, None, None, None)  # pyright: ignore[reportArgumentType]
+
+
+def test_an_error_in_the_background_reaches_who_asks():
+    def fails():
+        raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        in_background(fails).result()
+    assert in_background(lambda: 3).result() == 3
