@@ -21,7 +21,8 @@ test: $(INSTALLED)
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
 test-slow: $(INSTALLED)
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m slow
+	# Long tests compute more than they compile: with the optimisations that the others do without.
+	XLA_FLAGS= $(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m slow
 
 lint: $(INSTALLED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
