@@ -341,18 +341,20 @@ def train(
     folder = RunFolder(output)
     began = time.perf_counter()
     previews = _Previews(dataset, folder)
-    fit(
-        dataset,
-        config,
-        folder.path,
-        resume=resume,
-        replace_run=force,
-        source=source,
-        first_stage=first_stage,
-        on_step=on_step,
-        on_preview=previews,
-    )
-    previews.finish()
+    try:
+        fit(
+            dataset,
+            config,
+            folder.path,
+            resume=resume,
+            replace_run=force,
+            source=source,
+            first_stage=first_stage,
+            on_step=on_step,
+            on_preview=previews,
+        )
+    finally:
+        previews.finish()
     folder.write_training({"seconds_total": round(time.perf_counter() - began, 2)})
     run = Run(folder.path)
     run.dataset = dataset

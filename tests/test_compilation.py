@@ -1,17 +1,21 @@
 """Programs that are compiled before they are needed."""
 
 import logging
+import threading
+import time
 from dataclasses import replace
 
 import jax
 import pytest
+from support import MONTE_CARLO, sphere_dataset, tiny_config
 from test_pipeline import TIGHT, problem
 
-from geosplat_jax.fit import compilation
+from geosplat_jax.fit import compilation, loop
 from geosplat_jax.fit.compilation import compile_step
 from geosplat_jax.fit.runtime import in_background
 from geosplat_jax.fit.stages import update_rule
 from geosplat_jax.fit.step import initial_state, train_step
+from geosplat_jax.fit.train import fit
 
 LARGE = ("_asset", "_view_gradient", "_back", "_update")
 
@@ -38,6 +42,24 @@ def test_a_step_finds_its_programs_compiled(caplog):
         caplog.clear()
         train_step(initial_state(params), batch, pipeline, rule)
         assert compiled_programs(caplog) == set()
+
+
+def test_a_run_that_stops_early_leaves_no_thread_behind(tmp_path, monkeypatch):
+    """A process that ends while a thread of it compiles crashes, after Ctrl-C above all."""
+    begun = []
+
+    def slowly(*arguments, is_wanted=lambda: True, **others):
+        if others:  # the one in the background
+            begun.append(threading.current_thread())
+            until = time.monotonic() + 20
+            while is_wanted() and time.monotonic() < until:
+                time.sleep(0.01)
+
+    monkeypatch.setattr(loop, "compile_step", slowly)
+    fit(sphere_dataset(), tiny_config(*MONTE_CARLO), tmp_path, stop_after=3)
+    assert len(begun) == 1
+    begun[0].join(timeout=1)
+    assert not begun[0].is_alive()
 
 
 def test_a_compilation_that_fails_is_told(monkeypatch):

@@ -91,7 +91,14 @@ class Baked(Illumination):
 
 
 class BakedTransport(Transport):
-    """Light that is in the colours already."""
+    """Light that is in the colours already.
+
+    Attributes
+    ----------
+    shaded : of all N splats.
+    """
+
+    shaded: Shaded
 
     def prepare(
         self,
@@ -102,8 +109,8 @@ class BakedTransport(Transport):
         index: RayIndex | None,
         carry: Any = None,
     ) -> tuple[Baked, Any]:
-        """Refuse: `Subject.seen_from` prepares."""
-        raise NotImplementedError("colours are baked by Subject.seen_from")
+        """Return the colours."""
+        return Baked(self.shaded), carry
 
     def shade(
         self,
@@ -147,7 +154,7 @@ class Subject(eqx.Module):
             self.illumination,
             asset.index,
         )
-        pipeline = replace(self.pipeline.forward_mode(), transport=BakedTransport())
+        pipeline = replace(self.pipeline.forward_mode(), transport=BakedTransport(shaded))
         return replace(
             self, pipeline=pipeline, illumination=Baked(shaded), asset=replace(asset, index=None)
         )

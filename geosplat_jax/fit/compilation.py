@@ -5,6 +5,7 @@ time, and a thread that compiles the programs of the next stage does not hold up
 """
 
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -16,7 +17,13 @@ from geosplat_jax.pipeline import Pipeline
 
 
 def compile_step(
-    state: TrainState, batch: Batch, pipeline: Pipeline, rule: UpdateRule, *, threads: int = 2
+    state: TrainState,
+    batch: Batch,
+    pipeline: Pipeline,
+    rule: UpdateRule,
+    *,
+    threads: int = 2,
+    is_wanted: Callable[[], bool] = lambda: True,
 ) -> None:
     """Compile the programs of `step.train_step` for arguments of these shapes; run none of them.
 
@@ -26,6 +33,7 @@ def compile_step(
     ----------
     state, batch, pipeline, rule : arrays, or their shapes.
     threads : programs that are compiled at a time.
+    is_wanted : asked before each of them; the rest is left out once it says no.
     """
     free, compiling = threading.Semaphore(threads), []
 
@@ -34,7 +42,8 @@ def compile_step(
 
         def finish() -> None:
             with free:
-                traced.lower().compile()
+                if is_wanted():
+                    traced.lower().compile()
 
         compiling.append(in_background(finish))
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), traced.out_info)

@@ -1,5 +1,6 @@
 """The state of a training between two steps: where it starts, what a step does, what is kept."""
 
+from concurrent.futures import wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -116,6 +117,11 @@ class Loop:
         following = self._following(step)
         if following is not None and self.upcoming is None:
             self.upcoming = Upcoming(self, following, self.to_come)
+
+    def close(self) -> None:
+        """Leave nothing behind that still runs."""
+        if self.upcoming is not None:
+            self.upcoming.abandon()
 
     def _planned(self) -> Capacities:
         """Choose the buffers: as was planned ahead, or for what the surface needs now."""
@@ -239,6 +245,7 @@ class Upcoming:
 
     def __init__(self, loop: Loop, stage: Stage, known: dict[str, Any] | None) -> None:
         self.stage = stage
+        self._is_wanted = True
         config, views, step = loop.config, loop.views, loop.config.first_step(stage.name)
         before, surface = loop.pipeline, loop.surface
         # A copy, since the steps to come consume the buffers of the state.
@@ -267,7 +274,7 @@ class Upcoming:
             )
             batch = make_batch(views, step, stage, seed=config.run.seed)
             rule = update_rule(config, stage, state.params, 0)
-            compile_step(state, batch, pipeline, rule, threads=1)
+            compile_step(state, batch, pipeline, rule, threads=1, is_wanted=lambda: self._is_wanted)
 
         self._planned = in_background(plan)
         self.compiled = in_background(compile_all)
@@ -276,6 +283,12 @@ class Upcoming:
     def capacities(self) -> Capacities:
         """Sizes of the buffers, once they are known."""
         return self._planned.result()
+
+    def abandon(self) -> None:
+        """Compile no further programs, and wait for the one that is being compiled."""
+        self._is_wanted = False
+        wait([self._planned])
+        wait([self.compiled])
 
     def meta(self) -> dict[str, Any]:
         """Return what a checkpoint keeps; waits until the buffers are planned."""

@@ -59,7 +59,11 @@ def release_programs_when_crowded() -> bool:
 
 
 def in_background(function: Callable[[], _Result]) -> "Future[_Result]":
-    """Call a function in a thread that nobody waits for at the end of the process."""
+    """Call a function in a thread of its own.
+
+    The process ends after the thread: one that ends while XLA compiles crashes. So let nothing run
+    that nobody wants any more.
+    """
     future: Future[_Result] = Future()
 
     def work() -> None:
@@ -68,7 +72,7 @@ def in_background(function: Callable[[], _Result]) -> "Future[_Result]":
         except BaseException as error:  # whoever asks for the result gets it
             future.set_exception(error)
 
-    threading.Thread(target=work, daemon=True).start()
+    threading.Thread(target=work).start()
     return future
 
 

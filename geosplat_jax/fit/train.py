@@ -209,7 +209,10 @@ def fit(
                 run.repoint(dataset)
                 loop = resumed_loop(dataset, config, run)
             last = min(config.total_steps, stop_after or config.total_steps)
-            return _train(loop, last, stop_requested, on_step, on_preview)
+            try:
+                return _train(loop, last, stop_requested, on_step, on_preview)
+            finally:
+                loop.close()
         except KeyboardInterrupt:
             raise Interrupted(
                 f"stopped at once; continue with --resume from the last checkpoint in {run}"
