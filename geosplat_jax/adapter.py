@@ -5,6 +5,7 @@ one per vertex row); rows beyond the mesh's counts are inert padding.
 """
 
 import abc
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -235,6 +236,11 @@ class SplatModel(abc.ABC):
         box : of the scene; its half extent is the unit of length.
         """
 
+    def dress(self, attributes: Attributes, parameters: Any) -> Attributes:
+        """Put what the splats themselves have learned in the place of the fields' attributes."""
+        del parameters
+        return attributes
+
     def settle(self, splats: Splats, surface: Surface, attributes: Attributes) -> Splats:
         """Move the splats as their attributes say."""
         del surface, attributes
@@ -279,6 +285,32 @@ class SplatSettings(Variant, abc.ABC):
     def rate_groups(self) -> tuple[str, ...]:
         """Names of the learning rates of what the splats themselves learn."""
         return ()
+
+    @property
+    def needs_fixed_surface(self) -> bool:
+        """Whether what the splats have learned belongs to the faces of one surface."""
+        return False
+
+    def begin(self, previous: Callable[[], tuple[Splats, Attributes]], box: Box) -> Any:
+        """Return what the splats have learned at the start of a stage; None for nothing.
+
+        Parameters
+        ----------
+        previous : makes the splats that the stage before ended with, and their attributes.
+        box : of the scene.
+        """
+        del previous, box
+        return None
+
+    def describe(self, parameters: Any) -> Any:
+        """Return the sizes of learned parameters that JSON can hold, for `template`."""
+        del parameters
+        return None
+
+    def template(self, description: Any) -> Any:
+        """Make parameters of the described sizes, of any values; None where nothing is learned."""
+        del description
+        return None
 
     @abc.abstractmethod
     def build(self, constants: AdapterConstants) -> SplatModel:

@@ -265,12 +265,12 @@ def white_balance(radiance: Float[Array, "H W 3"]) -> Float[Array, ""]:
     return jnp.mean(absolute(radiance - jnp.mean(radiance, axis=-1, keepdims=True)))
 
 
-def normal_smoothness(
-    normals: Float[Array, "V H W 3"],
+def edge_aware_smoothness(
+    values: Float[Array, "V H W c"],
     image: Float[Array, "V H W 4"],
     valid: Float[Array, "V H W"] | None = None,
 ) -> Float[Array, ""]:
-    """Differences of neighbouring normals inside the mask, where the photograph has no edge."""
+    """Differences of neighbouring pixels inside the mask, where the photograph has no edge."""
     inside = image[..., 3] if valid is None else image[..., 3] * valid
     terms = []
     for axis in (1, 2):
@@ -278,7 +278,7 @@ def normal_smoothness(
         first, second = (*ends, slice(None, -1)), (*ends, slice(1, None))
         edge = jnp.mean(absolute(image[first] - image[second])[..., :3], axis=-1)
         weight = inside[first] * inside[second]
-        change = jnp.sum(absolute(normals[first] - normals[second]), axis=-1)
+        change = jnp.sum(absolute(values[first] - values[second]), axis=-1)
         terms.append(safe_divide(jnp.sum(weight * jnp.exp(-edge) * change), jnp.sum(weight)))
     return terms[0] + terms[1]
 
@@ -294,8 +294,11 @@ VIEW_TERMS: dict[str, Callable[[ViewInputs], Float[Array, ""]]] = {
         x.view.image,
         x.view.valid,
     ),
-    "normal_smoothness": lambda x: normal_smoothness(
+    "normal_smoothness": lambda x: edge_aware_smoothness(
         x.output.aovs["normal"], x.view.image, x.view.valid
+    ),
+    "albedo_smoothness": lambda x: edge_aware_smoothness(
+        x.output.aovs["albedo"], x.view.image, x.view.valid
     ),
 }
 """Terms of a single view by the name of their weight; the loss takes their mean over the views."""
@@ -314,6 +317,7 @@ TERMS = (*VIEW_TERMS, *SHARED_TERMS)
 TERM_AOVS: dict[str, tuple[str, ...]] = {
     "light": ("diffuse", "specular_radiance"),
     "normal_smoothness": ("normal",),
+    "albedo_smoothness": ("albedo",),
 }
 """Extra images that a term of a view looks at."""
 

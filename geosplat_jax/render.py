@@ -16,6 +16,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from geosplat_jax.adapter import FaceSplats, SplatModel
@@ -136,6 +137,20 @@ class RenderOutput(eqx.Module):
 class ShadingDomain(Variant, abc.ABC):
     """Where light transport is evaluated; static and hashable."""
 
+    @property
+    def uses_rays(self) -> bool:
+        """Whether it traces rays of its own against the surface."""
+        return False
+
+    @property
+    def shades_splats(self) -> bool:
+        """Whether its points are the splats, whose light serves every view."""
+        return True
+
+    def adapted(self, transport: Transport) -> Transport:
+        """Return the transport as this domain evaluates it."""
+        return transport
+
     @abc.abstractmethod
     def images(
         self,
@@ -193,6 +208,7 @@ class PerSplat(ShadingDomain, kind="per_splat"):
             means, seen(splats.quats), seen(splats.scales, padding=1.0), camera
         )
         channels = {
+            "rgb": shaded.rgb,
             "albedo": materials.albedo,
             "roughness": materials.roughness[:, None],
             "metallic": materials.metallic[:, None],
@@ -202,22 +218,8 @@ class PerSplat(ShadingDomain, kind="per_splat"):
             "specular": shaded.specular_light,
             "specular_radiance": shaded.specular,
         }
-        image, alpha = composite(
-            footprints,
-            seen(splats.opacities),
-            jnp.concatenate([shaded.rgb] + [channels[name] for name in names], axis=-1),
-            lists,
-            height=camera.height,
-            width=camera.width,
-            tile_size=pipeline.raster.tile_size,
-            compositor=pipeline.compositor,
-        )
-        images, start = {"rgb": image[..., :3]}, 3
-        for name in names:
-            stop = start + AOV_CHANNELS[name]
-            images[name] = image[..., start:stop]
-            start = stop
-        return images, alpha
+        channels = {name: channels[name] for name in ("rgb", *names)}
+        return pipeline.blend(footprints, seen(splats.opacities), channels, lists, camera)
 
 
 class RenderPipeline(eqx.Module):
@@ -252,6 +254,11 @@ class RenderPipeline(eqx.Module):
         """
         return replace(self, compositor=composite_tiles_forward)
 
+    @property
+    def uses_rays(self) -> bool:
+        """Whether rays are traced against the surface."""
+        return self.transport.uses_rays or self.domain.uses_rays
+
     def reconstruct(self, params: Params) -> Asset:
         """Build surface, splats and attributes: all that depends on neither light nor view."""
         surface = self.surface.extract(params.geometry, capacities=self.capacities)
@@ -261,9 +268,10 @@ class RenderPipeline(eqx.Module):
         attributes = attributes_at(
             params.material, splats.anchors, self.surface.box, spec=self.fields
         )
+        attributes = self.splats.dress(attributes, params.splats)
         splats = self.splats.settle(splats, surface, attributes)
         usage, index = surface.usage, None
-        if self.transport.uses_rays:
+        if self.uses_rays:
             index = self.surface.ray_index(surface, capacities=self.capacities)
             usage = capacity_module.combine(usage, index.usage)
         return Asset(surface, splats, attributes, index, usage)
@@ -286,6 +294,35 @@ class RenderPipeline(eqx.Module):
             width=camera.width,
             near=self.raster.near * self.surface.box.half_extent,
         )
+
+    def blend(
+        self,
+        footprints: Footprints,
+        opacities: Float[Array, " M"],
+        channels: dict[str, Float[Array, "M c"]],
+        lists: TileLists,
+        camera: Camera,
+    ) -> tuple[dict[str, Float[Array, "H W c"]], Float[Array, "H W"]]:
+        """Blend named values of the visible splats front to back, and return their coverage.
+
+        Parameters
+        ----------
+        footprints, opacities, channels : of the M rows of the lists.
+        lists, camera : what the view can see, and its camera.
+        """
+        image, alpha = composite(
+            footprints,
+            opacities,
+            jnp.concatenate(list(channels.values()), axis=-1),
+            lists,
+            height=camera.height,
+            width=camera.width,
+            tile_size=self.raster.tile_size,
+            compositor=self.compositor,
+        )
+        widths = [values.shape[-1] for values in channels.values()]
+        parts = jnp.split(image, np.cumsum(widths)[:-1], axis=-1)
+        return dict(zip(channels, parts, strict=True)), alpha
 
     def visible(self, splats: Splats, camera: Camera) -> TileLists:
         """List what a camera with a single view can see; no gradients."""
@@ -318,7 +355,8 @@ class RenderPipeline(eqx.Module):
         ``mask`` : (N,) splats that some view will see; all by default.
         """
         points = asset.splats.points(mask)
-        return self.transport.prepare(key, points, asset.attributes, light, asset.index, carry)
+        transport = self.domain.adapted(self.transport)
+        return transport.prepare(key, points, asset.attributes, light, asset.index, carry)
 
     def render_view(
         self,
@@ -413,7 +451,7 @@ class RenderPipeline(eqx.Module):
 
         views = jax.lax.map(one_view, (camera.world_to_camera, camera.intrinsics))
         parts = [surface.usage, jax.tree.map(jnp.max, views)]
-        if self.transport.uses_rays:
+        if self.uses_rays:
             parts.append(self.surface.ray_index(surface, capacities=self.capacities).usage)
         return capacity_module.combine(*parts)
 

@@ -110,6 +110,7 @@ TINY = (
     "stages.split_sum.steps=4",
     "stages.split_sum.batch_views=1",
     "stages.monte_carlo.steps=0",
+    "stages.refine.steps=0",
     "run.checkpoint_every=2",
     "run.preview_every=0",
     "material.grid.levels=2",

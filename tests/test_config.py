@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from geosplat_jax.deferred import PerPixel
 from geosplat_jax.fit.config import (
     Config,
     Rate,
@@ -65,7 +66,7 @@ def test_presets_carry_the_numbers_of_the_paper_and_of_the_authors_code():
 
 @pytest.mark.parametrize("preset", ["paper", "code"])
 def test_the_originals_have_the_schedule_of_the_authors_code(preset):
-    split_sum, monte_carlo = make_config(preset).stages
+    split_sum, monte_carlo, refine = make_config(preset).stages
     for stage in (split_sum, monte_carlo):
         assert (stage.steps, stage.batch_views, stage.half_life) == (500, 8, 800.0)
         assert stage.light_knee == 0
@@ -87,15 +88,30 @@ def test_the_originals_have_the_schedule_of_the_authors_code(preset):
     assert transport.light_count == 64
     assert transport.diffuse_count + transport.specular_count == 64
     assert transport.residual_count == 0
+    # The refinement: 512 rays per pixel, a mesh that does not move, and what decays.
+    assert (refine.steps, refine.transport.light_count) == (100, 256)
+    assert isinstance(refine.domain, PerPixel)
+    assert refine.domain.points == {"paper": "splats", "code": "mesh"}[preset]
+    assert {"sdf", "deform", "weights", "shift"} <= set(refine.frozen)
+    first, later = refine.rates_at(0), refine.rates_at(500)
+    expected = {
+        "splat_means": 1.6e-4, "splat_scales": 5e-3, "splat_quats": 1e-3, "splat_normals": 1e-3,
+        "splat_opacities": 5e-2, "splat_albedo": 5e-3, "splat_indirect": 2.5e-3,
+        "roughness_metallic": 5e-4, "light": 1e-3, "exposure": 5e-4,
+    }  # fmt: skip
+    assert {name: first[name] for name in expected} == pytest.approx(expected)
+    for name in expected:
+        decays = name in ("splat_means", "splat_normals", "light", "exposure")
+        assert later[name] == pytest.approx(first[name] * (0.5 if decays else 1.0), rel=1e-5)
 
 
 def test_the_weights_of_the_entropy_and_the_smoothness_follow_paper_and_code():
-    split_sum, monte_carlo = make_config("paper").stages
+    split_sum, monte_carlo, _ = make_config("paper").stages
     whole = [s.weights_at(n)["entropy"] for s in (split_sum, monte_carlo) for n in (0, 250, 500)]
     assert whole == pytest.approx([0.2, 0.105, 0.01, 0.01, 0.01, 0.01])
     assert split_sum.weights_at(0)["smoothness_albedo"] == 0.03
     assert split_sum.weights_at(0)["light"] == monte_carlo.weights_at(0)["light"] == 0.15
-    split_sum, monte_carlo = make_config("code").stages
+    split_sum, monte_carlo, refine = make_config("code").stages
     assert [split_sum.weights_at(n)["entropy"] for n in (0, 500)] == pytest.approx([0.2, 0.12])
     assert [monte_carlo.weights_at(n)["entropy"] for n in (0, 500)] == pytest.approx([0.2, 0.01])
     # Means over channels there, sums here.
@@ -104,6 +120,9 @@ def test_the_weights_of_the_entropy_and_the_smoothness_follow_paper_and_code():
     assert split_sum.weights_at(500)["smoothness_roughness_metallic"] == pytest.approx(0.001 / 2)
     assert split_sum.weights_at(0)["white_balance"] == 0.002
     assert "light" not in monte_carlo.weights_at(0)
+    assert refine.weights_at(0)["albedo_smoothness"] == pytest.approx(0.2 / 3)
+    assert refine.weights_at(0)["smoothness_roughness_metallic"] == pytest.approx(0.05 / 2)
+    assert "mask" not in refine.weights_at(0)
 
 
 def test_priors_of_shiny_materials_change_the_rates_of_the_authors_code():

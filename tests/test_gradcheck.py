@@ -17,6 +17,7 @@ SLOW_STAGES = {
     "adapter",
     "isosurface",
     "loss",
+    "refinement",
     "materials",
     "projection",
     "rasterizer",

@@ -10,11 +10,11 @@ from geosplat_jax.losses import (
     Comparison,
     Objective,
     compare,
+    edge_aware_smoothness,
     image_dissimilarity,
     image_l1,
     light_agreement,
     mask_error,
-    normal_smoothness,
     random_background,
     white_balance,
 )
@@ -152,12 +152,12 @@ def test_normals_may_change_where_the_photograph_does():
     flat = jnp.ones((1, 4, 4, 4)) * 0.5
     flat = flat.at[..., 3].set(1.0)
     edge = flat.at[:, :, 2:, :3].set(1.0)
-    smooth, sharp = (float(normal_smoothness(normals, image)) for image in (flat, edge))
+    smooth, sharp = (float(edge_aware_smoothness(normals, image)) for image in (flat, edge))
     # 4 of 12 pairs of columns differ by one.
     assert smooth == pytest.approx(1 / 3, rel=ROUNDING)
     assert sharp == pytest.approx(np.exp(-0.5) / 3, rel=ROUNDING)
     outside = flat.at[..., 3].set(0.0)
-    assert float(normal_smoothness(normals, outside)) == 0.0
+    assert float(edge_aware_smoothness(normals, outside)) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -157,7 +157,8 @@ class Config:
             raise ValueError(f"stages need names of their own, got {names}")
         terms = (*TERMS, *self.geometry.penalty_names)
         groups = self.rate_groups
-        for stage in self.stages:
+        for number, stage in enumerate(self.stages):
+            self._check_splats(stage, number)
             for what, given, known in (
                 ("weights", stage.weights, terms),
                 ("rates", stage.rates, groups),
@@ -168,6 +169,21 @@ class Config:
                         f"unknown setting stages.{stage.name}.{what}.{unknown[0]}; expected some "
                         f"of {sorted(known)}"
                     )
+
+    def _check_splats(self, stage: Stage, number: int) -> None:
+        """Refuse splats that belong to the faces of a surface which moves, or was not there."""
+        if not stage.splats.needs_fixed_surface or not stage.steps:
+            return
+        if number == 0:
+            raise ValueError(
+                f"stages.{stage.name}.splats: {stage.splats.kind} splats need a stage before"
+            )
+        moving = sorted(set(self.geometry.rate_groups) - set(stage.frozen))
+        if moving:
+            raise ValueError(
+                f"stages.{stage.name}.splats: {stage.splats.kind} splats need a frozen surface; "
+                f"set stages.{stage.name}.rates.{moving[0]} to 0"
+            )
 
     @property
     def rate_groups(self) -> tuple[str, ...]:

@@ -8,9 +8,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from geosplat_jax.adapter import SplatSettings
 from geosplat_jax.core.settings import Variant, settings
+from geosplat_jax.core.types import Splats
 from geosplat_jax.hashgrid import Layer
-from geosplat_jax.materials import init_indirect_head, init_materials, materials_at
+from geosplat_jax.materials import (
+    Attributes,
+    init_indirect_head,
+    init_materials,
+    materials_at,
+)
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
 
@@ -83,26 +90,38 @@ def enter_stage(
     params: Params,
     pipeline: Pipeline,
     entries: tuple[Entry, ...],
+    splats: SplatSettings,
     indirect_outputs: int,
     key: Key[Array, ""],
 ) -> Params:
     """Turn the parameters that a stage ends with into those that the next one starts with.
 
-    What the entries do not change stays. Indirect light gets a head where the stage learns it.
+    What the entries do not change stays. Indirect light gets a head where the stage learns it, and
+    splats parameters where they learn any.
 
     Parameters
     ----------
-    params, pipeline : of the stage before.
+    params, pipeline : of the stage before; where splats learn, its buffers hold the surface.
     entries : of the stage to come, in order.
+    splats : of the stage to come.
     indirect_outputs : numbers of indirect light that it learns per point.
     key : of what is drawn.
     """
     first, indirect_key = jax.random.split(key)
+    head = params.material.indirect_head
+    if head is None or head[-1].weights.shape[-1] != indirect_outputs:
+        head = init_indirect_head(indirect_key, pipeline.fields, indirect_outputs)
+    params = replace(params, material=replace(params.material, indirect_head=head))
     for number, entry in enumerate(entries):
         params = entry.apply(
             params, pipeline, jax.random.fold_in(first, number) if number else first
         )
-    head = params.material.indirect_head
-    if head is None or head[-1].weights.shape[-1] != indirect_outputs:
-        head = init_indirect_head(indirect_key, pipeline.fields, indirect_outputs)
-    return replace(params, material=replace(params.material, indirect_head=head))
+    learned = splats.begin(lambda: _placed(pipeline, params), pipeline.surface.box)
+    return replace(params, splats=learned)
+
+
+@jax.jit
+def _placed(pipeline: Pipeline, params: Params) -> tuple[Splats, Attributes]:
+    """Make splats and their attributes."""
+    asset = pipeline.reconstruct(params)
+    return asset.splats, asset.attributes

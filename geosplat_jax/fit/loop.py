@@ -14,7 +14,7 @@ from geosplat_jax.core.capacity import Capacities, Usage
 from geosplat_jax.fit.compilation import compile_step
 from geosplat_jax.fit.config import Config, Stage, config_from_dict, differences
 from geosplat_jax.fit.folder import RunFolder
-from geosplat_jax.fit.planning import TrainingError, check_limits, plan_capacities
+from geosplat_jax.fit.planning import TrainingError, check_limits, holding, plan_capacities
 from geosplat_jax.fit.runtime import in_background, release_programs_when_crowded
 from geosplat_jax.fit.stages import (
     begin_stage,
@@ -79,6 +79,7 @@ class Loop:
             "config": self.config.to_dict(),
             "stage": self.stage.name,
             "surface": self.config.geometry.describe(self.surface),
+            "splats": self.stage.splats.describe(self.state.params.splats),
             "capacities": dict(self.pipeline.capacities),
             "planned_for": self.planned_for,
             "peak": self.peak,
@@ -159,7 +160,11 @@ class Loop:
     def _begin(self, stage: Stage) -> None:
         """Change settings, parameters and optimiser; keep what the stage before ended with."""
         self.save_end()
-        params = begin_stage(self.state.params, self.pipeline, self.config, stage)
+        params, pipeline = self.state.params, self.pipeline
+        if stage.splats.needs_fixed_surface:
+            # The last update moved the surface once more.
+            pipeline = holding(pipeline, params)
+        params = begin_stage(params, pipeline, self.config, stage)
         self.stage = stage
         self.pipeline = build_pipeline(self.config, stage, self.surface)
         self.start(params)
@@ -258,9 +263,10 @@ class Upcoming:
         def plan() -> Capacities:
             if known is not None and known["stage"] == stage.name:
                 return Capacities(**known["capacities"])
+            first = begin_stage(params, before, config, stage)
             limits = config.geometry.limits
             return plan_capacities(
-                first_pipeline(Capacities()), params, views.camera(), limits=limits
+                first_pipeline(Capacities()), first, views.camera(), limits=limits
             )
 
         def compile_all() -> None:

@@ -56,6 +56,19 @@ def plan_capacities(
     )
 
 
+_needs_of_asset = jax.jit(lambda pipeline, params: pipeline.reconstruct(params).usage)
+
+
+def holding(pipeline: Pipeline, params: Params) -> Pipeline:
+    """Return the pipeline with buffers that hold the surface of these parameters."""
+
+    def attempt(capacities: Capacities) -> tuple[None, Usage]:
+        return None, _needs_of_asset(replace(pipeline, capacities=capacities), params)
+
+    _, capacities = capacity_module.retry(attempt, pipeline.capacities)
+    return replace(pipeline, capacities=capacities)
+
+
 def check_limits(needed: Usage, limits: dict[str, int]) -> None:
     """Stop before an exploding surface exhausts the memory.
 

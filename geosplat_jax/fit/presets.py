@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Any, Literal
 
 from geosplat_jax.adapter import AdapterConstants
+from geosplat_jax.deferred import PerPixel
 from geosplat_jax.fit.config import (
     Config,
     Rate,
@@ -24,6 +25,7 @@ from geosplat_jax.fit.surfaces import FlexiCubesSettings
 from geosplat_jax.hashgrid import HashGridSpec
 from geosplat_jax.losses import Schedule
 from geosplat_jax.materials import MATERIAL_PRIORS, MaterialSpec
+from geosplat_jax.refinement import FreeSplatSettings
 from geosplat_jax.render import RasterSettings
 from geosplat_jax.transport.environment import LightSpec
 from geosplat_jax.transport.monte_carlo import MonteCarloSettings
@@ -31,10 +33,12 @@ from geosplat_jax.transport.split_sum import SplitSumSettings
 
 PRESETS = ("default", "paper", "code")
 QUALITIES = ("draft", "standard", "high")
-SPLIT_SUM, MONTE_CARLO = "split_sum", "monte_carlo"
+SPLIT_SUM, MONTE_CARLO, REFINE = "split_sum", "monte_carlo", "refine"
 """Names of the stages of every preset."""
 
 _SURFACE = ("sdf", "deform", "weights")
+_NEVER = 1e9
+"""A half-life for rates that stay."""
 
 
 def _rates(surface: float, *, surface_warmup: int = 0, **others: float | Rate) -> dict[str, Rate]:
@@ -90,9 +94,41 @@ def _default() -> Config:
         ),
         weights=_weights(**photometric, entropy=0.01, **surface, **smooth, indirect=0.001),
     )
-    return Config(
-        preset="default", material=MaterialSpec(shared=True), stages=(split_sum, monte_carlo)
+    refine = Stage(
+        name=REFINE,
+        steps=100,
+        transport=monte_carlo.transport,
+        splats=FreeSplatSettings(),
+        rates=_refinement_rates(albedo=5e-4),
+        weights=_weights(**photometric, albedo_smoothness=0.02, **smooth, indirect=0.001),
     )
+    return Config(
+        preset="default",
+        material=MaterialSpec(shared=True),
+        stages=(split_sum, monte_carlo, refine),
+    )
+
+
+def _refinement_rates(*, albedo: float) -> dict[str, Rate]:
+    """Return the authors' rates of free splats; ``albedo`` is that of the table of the fields."""
+    decaying = {
+        "splat_means": 1.6e-4,
+        "splat_normals": 1e-3,
+        "light": 1e-3,
+        "exposure": 5e-4,
+    }
+    steady = {
+        "splat_scales": 5e-3,
+        "splat_quats": 1e-3,
+        "splat_opacities": 5e-2,
+        "splat_albedo": 5e-3,
+        "splat_indirect": 2.5e-3,
+        "roughness_metallic": 5e-4,
+        "albedo": albedo,
+    }
+    rates = _rates(0.0, shift=0.0, indirect=0.0)
+    rates |= {name: Rate(value, half_life=500.0) for name, value in decaying.items()}
+    return rates | {name: Rate(value, half_life=_NEVER) for name, value in steady.items()}
 
 
 def _original(
@@ -123,8 +159,13 @@ def _original_stages(
     monte_carlo_weights: dict[str, Schedule],
     baked_diffuse: bool,
     indirect: Literal["constant", "harmonics"],
+    points: Literal["splats", "mesh"],
 ) -> tuple[Stage, ...]:
-    """Return the stages that the paper and the authors share: 8 views, 128 rays per splat."""
+    """Return the stages that the paper and the authors share: 8 views, 128 rays per splat.
+
+    The refinement is that of the authors' program: 512 rays per pixel, no loss of the mask, and
+    smoothness as sums over channels where theirs are means.
+    """
     surface = {"deviation": 0.5, "weights": 0.1}
     split_sum = Stage(
         name=SPLIT_SUM,
@@ -164,7 +205,24 @@ def _original_stages(
         ),
         weights={**monte_carlo_weights, **_weights(**surface, indirect=0.001)},
     )
-    return (split_sum, monte_carlo)
+    photometric = {name: split_sum_weights[name] for name in ("l1", "ssim")}
+    refine = Stage(
+        name=REFINE,
+        steps=100,
+        batch_views=8,
+        light_knee=0.0,
+        transport=MonteCarloSettings(
+            light_count=256, diffuse_count=128, specular_count=128, indirect=indirect
+        ),
+        splats=FreeSplatSettings(),
+        domain=PerPixel(points=points),
+        rates=_refinement_rates(albedo=0.0),
+        weights={
+            **photometric,
+            **_weights(albedo_smoothness=0.2 / 3, smoothness_roughness_metallic=0.05 / 2),
+        },
+    )
+    return (split_sum, monte_carlo, refine)
 
 
 def _paper() -> Config:
@@ -181,6 +239,7 @@ def _paper() -> Config:
         monte_carlo_weights=_weights(**photometric, entropy=0.01, **others),
         baked_diffuse=False,
         indirect="harmonics",
+        points="splats",
     )
     material = MaterialSpec(
         grid=HashGridSpec(levels=16, features=2, log2_entries=19, coarsest=32, finest=4096),
@@ -211,8 +270,9 @@ def _code(material_prior: str) -> Config:
         ),
         baked_diffuse=True,
         indirect="constant",
+        points="mesh",
     )
-    split_sum, monte_carlo = stages
+    split_sum, monte_carlo, refine = stages
     rates = dict(split_sum.rates)
     if is_specular:
         rates |= {name: Rate(5e-2) for name in _SURFACE}
@@ -226,7 +286,7 @@ def _code(material_prior: str) -> Config:
         "code",
         adapter=AdapterConstants(u=1 / 9 - 1 / 24, v=2 / 9),
         material=material,
-        stages=(replace(split_sum, rates=rates), monte_carlo),
+        stages=(replace(split_sum, rates=rates), monte_carlo, refine),
     )
 
 
@@ -247,6 +307,7 @@ _QUALITY: dict[str, dict[str, Any]] = {
                     "roughness_metallic": {"value": 8e-3, "warmup": 75},
                 },
             },
+            REFINE: {"steps": 0, "batch_views": 2},
         },
     },
     "standard": {},
@@ -260,6 +321,10 @@ _QUALITY: dict[str, dict[str, Any]] = {
                 "half_life": 375.0,
                 "transport": {"light_count": 8, "diffuse_count": 8, "residual_count": 4},
                 "rates": {"albedo": {"warmup": 250}, "roughness_metallic": {"warmup": 250}},
+            },
+            REFINE: {
+                "batch_views": 6,
+                "transport": {"light_count": 8, "diffuse_count": 8, "residual_count": 4},
             },
         },
     },
@@ -278,6 +343,11 @@ _ORIGINAL_DRAFT: dict[str, Any] = {
             "half_life": 320.0,
             "transport": {"light_count": 8, "diffuse_count": 4, "specular_count": 4},
             "rates": dict.fromkeys(_SURFACE, {"warmup": 15}),
+        },
+        REFINE: {
+            "steps": 0,
+            "batch_views": 2,
+            "transport": {"light_count": 8, "diffuse_count": 4, "specular_count": 4},
         },
     },
 }

@@ -98,12 +98,13 @@ def begin_stage(params: Params, pipeline: Pipeline, config: Config, stage: Stage
 
     Parameters
     ----------
-    params, pipeline : of the stage before.
+    params, pipeline : of the stage before; see `entering.enter_stage`.
     config : settings of the run. stage : that begins.
     """
     number = config.active_stages.index(stage)
     key = jax.random.fold_in(jax.random.key(config.run.seed), _STAGE_STREAM - number)
-    return enter_stage(params, pipeline, stage.enter, stage.transport.indirect_outputs, key)
+    outputs = stage.transport.indirect_outputs
+    return enter_stage(params, pipeline, stage.enter, stage.splats, outputs, key)
 
 
 def template_params(config: Config, surface: SurfaceModel, shape: Any, stage: Stage) -> Params:

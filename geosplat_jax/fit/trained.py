@@ -17,12 +17,13 @@ from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
 
 
-def _template(config: Config, surface: dict[str, Any], stage: Stage) -> dict[str, Any]:
-    """Return a checkpoint's arrays as shapes only; ``surface`` is its description."""
+def _template(config: Config, stage: Stage, meta: dict[str, Any]) -> dict[str, Any]:
+    """Return a checkpoint's arrays as shapes only; ``meta`` describes their sizes."""
 
     def build() -> dict[str, Any]:
-        model, shape = config.geometry.template(surface)
+        model, shape = config.geometry.template(meta["surface"])
         params = template_params(config, model, shape, stage)
+        params = replace(params, splats=stage.splats.template(meta.get("splats")))
         carry = build_pipeline(config, stage, model).transport.first_carry()
         return {"state": initial_state(params, carry=carry), "surface": model}
 
@@ -32,7 +33,7 @@ def _template(config: Config, surface: dict[str, Any], stage: Stage) -> dict[str
 def read_checkpoint(path: Path, config: Config) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read a checkpoint's arrays and the rest; ``config`` is the one it was written with."""
     meta = read_meta(path)
-    like = _template(config, meta["surface"], config.stage(meta["stage"]))
+    like = _template(config, config.stage(meta["stage"]), meta)
     tree, _ = load_checkpoint(path, like=like)
     return tree, meta
 

@@ -11,11 +11,11 @@ from geosplat_jax.core.color import linear_to_srgb, tone_map
 from geosplat_jax.gradcheck.differences import Problem
 from geosplat_jax.losses import (
     compare,
+    edge_aware_smoothness,
     image_dissimilarity,
     image_l1,
     light_agreement,
     mask_error,
-    normal_smoothness,
     white_balance,
 )
 from geosplat_jax.splats.projection import project
@@ -140,7 +140,7 @@ def loss_term_problems(rng: np.random.Generator) -> list[Problem]:
     def others(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
         return {
             "white balance": white_balance(inputs["radiance"]),
-            "normal smoothness": normal_smoothness(inputs["normals"], constants["image"]),
+            "normal smoothness": edge_aware_smoothness(inputs["normals"], constants["image"]),
         }
 
     def curves(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:

@@ -21,7 +21,11 @@ from geosplat_jax.gradcheck.shading_stages import (
     split_sum_problems,
     transport_problems,
 )
-from geosplat_jax.gradcheck.whole_stages import loss_problems, smoothness_problems
+from geosplat_jax.gradcheck.whole_stages import (
+    loss_problems,
+    refinement_problems,
+    smoothness_problems,
+)
 
 TOLERANCE = 1e-6
 """Largest relative error in float64 that passes."""
@@ -43,6 +47,7 @@ STAGES: dict[str, Callable[[np.random.Generator], list[Problem]]] = {
     "rasterizer": rasteriser_problems,
     "terms": loss_term_problems,
     "loss": loss_problems,
+    "refinement": refinement_problems,
 }
 """What can be checked, from the surface to the whole loss."""
 

@@ -11,11 +11,12 @@ from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.core.types import Batch, Camera, EnvLight, Geometry, Grid
 from geosplat_jax.fit.config import Config
 from geosplat_jax.fit.presets import make_config
-from geosplat_jax.fit.stages import build_pipeline
+from geosplat_jax.fit.stages import begin_stage, build_pipeline
 from geosplat_jax.geometry import FlexiCubes, initial_geometry, sphere_sdf
 from geosplat_jax.gradcheck.differences import Problem, unit_box
 from geosplat_jax.materials import MaterialField, init_materials, smoothness
 from geosplat_jax.pipeline import Pipeline
+from geosplat_jax.refinement import FreeSplatParameters
 from geosplat_jax.render import Params
 from geosplat_jax.surface.hull import fit_grid
 
@@ -139,6 +140,63 @@ def loss_problems(rng: np.random.Generator) -> list[Problem]:
         replace(problem, skip=frozenset(detached)),
         _loss_problem("loss, all paths", opened, rng),
     ]
+
+
+def refinement_problems(rng: np.random.Generator) -> list[Problem]:
+    """Build the loss of free splats, shaded per pixel with the coverage differentiated.
+
+    As trained, the coverage that attributes are divided by is a constant. What the splats have of
+    a mesh that does not move, and all that the fields and the light learn, is checked besides.
+    """
+    config = make_config(
+        overrides=(
+            *_SETTINGS,
+            "material.position_gradient=true",
+            "material.has_shift=false",
+            "stages.monte_carlo.steps=0",
+            "stages.refine.steps=1",
+            'stages.refine.domain={kind="per_pixel", detach_coverage=false}',
+            'stages.refine.transport={kind="split_sum"}',
+            "stages.refine.weights.indirect=0",
+        )
+    )
+    corner = np.full(3, 0.6)
+    grid = fit_grid((-corner, corner), 6)
+    grid = Grid(jnp.asarray(grid.origin), jnp.asarray(grid.cell_size), grid.shape)
+    first, last = (
+        replace(build_pipeline(config, stage, FlexiCubes(grid)), capacities=_CAPACITIES)
+        for stage in config.active_stages
+    )
+    start = begin_stage(_params(rng, grid, config), first, config, config.stage("refine"))
+    splats = jax.tree.map(
+        lambda x: x + 0.03 * rng.uniform(-1, 1, x.shape) * (jnp.abs(x) + 0.1), start.splats
+    )
+    # Thicker than a trained splat, whose conic changes too fast for a step of differences.
+    splats = replace(splats, log_scales=jnp.maximum(splats.log_scales, np.log(0.02)))
+
+    names = ("means", "log_scales", "quats", "normals", "opacity_logits", "albedo")
+
+    def function(
+        inputs: dict[str, Any], constants: tuple[Batch, Pipeline, Params]
+    ) -> dict[str, Any]:
+        batch, pipeline, start = constants
+        material = replace(start.material, albedo_table=inputs["tables"])
+        params = replace(
+            start,
+            splats=FreeSplatParameters(**{n: inputs[n] for n in names}, indirect=None),
+            material=material,
+            light=EnvLight(inputs["light"]),
+        )
+        total, report = pipeline.loss(params, batch)
+        return {"total": total, **report.terms}
+
+    inputs = {
+        **{name: getattr(splats, name) for name in names},
+        "tables": start.material.albedo_table,
+        "light": start.light.radiance,
+    }
+    constants = (_batch(rng), last, start)
+    return [Problem("refinement", function, inputs, constants, full=100, vectorized=False)]
 
 
 def smoothness_problems(rng: np.random.Generator) -> list[Problem]:

@@ -42,6 +42,10 @@ _SPECULAR_PASSES = 4
 _SPECULAR_SAMPLES_PER_PIXEL = 128
 """Samples of the specular lobe that are enough for a covered pixel, over its splats and passes."""
 
+_PIXEL_PASSES = 2
+"""Passes of an image whose points are pixels, to one of an image of splats, of which a pixel
+averages several."""
+
 RELIGHT_BOUNCES = 2
 """How often light goes from surface to surface under a new light."""
 
@@ -262,9 +266,9 @@ class Renderer:
         """Render the single view of ``camera``, with every AOV of the evaluation."""
         illuminations = self._illuminated()
         outputs = [self._render(camera, illuminations[0], 0)]
-        passes = min(len(illuminations), self._passes_needed(outputs[0]))
-        for number in range(1, passes):
-            outputs.append(self._render(camera, illuminations[number], number))
+        for number in range(1, self._passes_needed(outputs[0])):
+            illumination = illuminations[number % len(illuminations)]
+            outputs.append(self._render(camera, illumination, number))
         linear = jnp.mean(jnp.stack([output.rgb[0] for output in outputs]), axis=0)
         rgb = tone_map(linear, self._log_exposure)
         first = outputs[0]
@@ -275,10 +279,16 @@ class Renderer:
         )
 
     def _passes_needed(self, output: RenderOutput) -> int:
-        """Count the passes after which a covered pixel has its samples of the specular lobe."""
+        """Count the passes after which a covered pixel has its samples of the specular lobe.
+
+        Pixels that are points themselves have samples of their own in every pass.
+        """
+        if not self._pipeline.domain.shades_splats:
+            return self._passes * _PIXEL_PASSES if self._pipeline.transport.needs_key else 1
         covered, drawn = float(jnp.sum(output.alpha)), int(output.usage["visible"])
         wanted = _SPECULAR_SAMPLES_PER_PIXEL * covered
-        return math.ceil(wanted / max(drawn * self._pass_samples, 1))
+        needed = math.ceil(wanted / max(drawn * self._pass_samples, 1))
+        return min(needed, len(self._illuminations))
 
     def mesh(self, *, training: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Extract the surface: vertices (n, 3), faces (m, 3) and vertex normals (n, 3).

@@ -147,6 +147,13 @@ class Transport(eqx.Module):
         """
         return None
 
+    def for_each_view(self) -> "Transport":
+        """Return the transport that prepares nothing for single points; `shade` draws its own.
+
+        For domains whose points are another set in every view.
+        """
+        return self
+
     def for_images(self, sample_count: int) -> "Transport":
         """Return the transport of one pass of an image to look at, without training's shortcuts.
 

@@ -502,6 +502,10 @@ class MonteCarlo(Transport):
         count = self.settings.residual_count
         return self._with_counts(count, residual_count=0) if count else None
 
+    def for_each_view(self) -> "MonteCarlo":
+        """Draw the samples of light and cosine in every view."""
+        return MonteCarlo(replace(self.settings, shares_views=False))
+
     def for_images(self, sample_count: int) -> "MonteCarlo":
         """Share the views' samples and leave the filter out."""
         return self._with_counts(sample_count, shares_views=True, denoise=DenoiseSpec(iterations=0))

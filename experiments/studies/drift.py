@@ -1,0 +1,75 @@
+"""How far splats move in the refinement, beside the paper's Table 7.
+
+Mean absolute change of every splat, between the end of the stage before and the end of `refine`:
+positions and scales in half sides of the box, unit quaternions and normals component by component,
+opacities between 0 and 1::
+
+    python experiments/studies/drift.py RUN [RUN ...]
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from geosplat_jax.core.types import Splats
+from geosplat_jax.fit.runtime import enable_compilation_cache
+from geosplat_jax.fit.trained import load_trained
+from geosplat_jax.report.renderer import build_asset
+
+COLUMNS = ("positions", "scales", "rotations", "opacities", "normals")
+PAPER = {
+    "paper, TensoIR": (0.0014, 0.0003, 0.0148, 0.0131, 0.0146),
+    "paper, Shiny": (0.0011, 0.0002, 0.0118, 0.0168, 0.0087),
+}
+
+
+def drift(before: Splats, after: Splats, half_extent: float) -> tuple[float, ...]:
+    """Mean absolute changes, in the order of `COLUMNS`.
+
+    A quaternion and its negative are one rotation; the nearer of the two counts.
+    """
+    count = int(before.count)
+    assert count == int(after.count), "the mesh is frozen, so both have the same splats"
+
+    def rows(splats: Splats, name: str) -> np.ndarray:
+        return np.asarray(getattr(splats, name), np.float64)[:count]
+
+    def change(name: str) -> float:
+        return float(np.mean(np.abs(rows(after, name) - rows(before, name))))
+
+    first, last = rows(before, "quats"), rows(after, "quats")
+    last = last * np.where(np.sum(first * last, axis=1, keepdims=True) < 0, -1.0, 1.0)
+    return (
+        change("means") / half_extent,
+        change("scales") / half_extent,
+        float(np.mean(np.abs(last - first))),
+        change("opacities"),
+        change("normals"),
+    )
+
+
+def of_run(folder: Path) -> tuple[float, ...]:
+    """Return the drift of a run whose last stage is a refinement."""
+    after = load_trained(folder)
+    names = [stage.name for stage in after.config.active_stages]
+    before = load_trained(folder, stage=names[names.index(after.stage.name) - 1])
+    splats = [build_asset(trained.pipeline, trained.params).splats for trained in (before, after)]
+    return drift(splats[0], splats[1], float(after.pipeline.surface.box.half_extent))
+
+
+def main() -> None:
+    """Print the table in Markdown."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("runs", type=Path, nargs="+")
+    arguments = parser.parse_args()
+    enable_compilation_cache()
+    print(f"| | {' | '.join(COLUMNS)} |")
+    print("|---" * (len(COLUMNS) + 1) + "|")
+    found = {folder.name: of_run(folder) for folder in arguments.runs}
+    for name, values in {**found, **PAPER}.items():
+        print(f"| {name} | {' | '.join(f'{value:.4f}' for value in values)} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,176 @@
+"""Deferred shading: what splats are made of is blended, and light is transported at every pixel.
+
+The attributes of the visible splats are rasterised and divided by their coverage (Eq. 21), and the
+rendering equation is evaluated once for every pixel with what remains (Eq. 22). Any
+`transport.base.Transport` serves: a pixel is a point like another.
+
+The samples of light, what they hit and the hits of the pixels' own rays carry no gradient.
+"""
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from geosplat_jax.core.numerics import safe_normalize
+from geosplat_jax.core.settings import NonNegative, settings
+from geosplat_jax.core.types import Camera, Materials, SurfacePoints
+from geosplat_jax.materials import Attributes
+from geosplat_jax.rays.base import RayIndex
+from geosplat_jax.render import AOV_CHANNELS, Asset, RenderPipeline, ShadingDomain
+from geosplat_jax.splats.rasterize import TileLists, gather_visible
+from geosplat_jax.transport.base import Illumination, Transport
+
+_THINNEST = 1e-6
+"""Coverage below this does not divide; a splat that is drawn at all covers 1/255."""
+
+_SHADED = ("rgb", "diffuse", "specular", "specular_radiance")
+"""Images that come from light; all others are blended from the splats."""
+
+
+@settings
+class PerPixel(ShadingDomain, kind="per_pixel"):
+    """Attributes are blended, and every pixel is shaded (Eq. 21-22)."""
+
+    points: Literal["splats", "mesh"] = "splats"
+    """Where rays start: at the blended positions of the splats (the paper), or where the mesh is
+    first hit (the authors' code). Pixels whose ray misses the mesh take the blended position."""
+    ray_offset: NonNegative = 1e-3
+    """How far above its point a ray starts, in half the longest side of the box; rays from the
+    mesh start on their face, which they never hit, and need none."""
+    detach_coverage: bool = True
+    """Attributes and colours take the coverage as a constant, as in the authors' code: opacities
+    and shapes then learn from what is blended and from the mask, not from the division."""
+
+    @property
+    def uses_rays(self) -> bool:
+        """Where points lie on the mesh."""
+        return self.points == "mesh"
+
+    @property
+    def shades_splats(self) -> bool:
+        """Every view has its own pixels."""
+        return False
+
+    def adapted(self, transport: Transport) -> Transport:
+        """Let every view draw its own samples: no two share a point."""
+        return transport.for_each_view()
+
+    def images(
+        self,
+        pipeline: RenderPipeline,
+        key: Key[Array, ""] | None,
+        asset: Asset,
+        illumination: Illumination,
+        lists: TileLists,
+        camera: Camera,
+        names: tuple[str, ...],
+    ) -> tuple[dict[str, Float[Array, "H W c"]], Float[Array, "H W"]]:
+        """Blend attributes, divide by coverage, shade every covered pixel."""
+        images, alpha = self._blended(pipeline, asset, lists, camera)
+        height, width = alpha.shape
+        coverage = jax.lax.stop_gradient(alpha) if self.detach_coverage else alpha
+        share = jnp.maximum(coverage, _THINNEST).reshape(-1, 1)
+        straight = {n: x.reshape(height * width, -1) / share for n, x in images.items()}
+        materials = Materials(
+            straight["albedo"], straight["roughness"][:, 0], straight["metallic"][:, 0]
+        )
+        points = self._points(pipeline, asset, straight, alpha.reshape(-1) > 0, camera)
+        shaded = self.adapted(pipeline.transport).shade(
+            key,
+            points,
+            Attributes(materials, None, straight.get("indirect")),
+            safe_normalize(camera.centers - straight["position"]),
+            illumination,
+            asset.index,
+        )
+        light = {
+            "rgb": shaded.rgb,
+            "diffuse": shaded.diffuse_light,
+            "specular": shaded.specular_light,
+            "specular_radiance": shaded.specular,
+        }
+        found = {}
+        for name in ("rgb", *names):
+            if name in _SHADED:
+                found[name] = light[name].reshape(height, width, -1) * coverage[..., None]
+            else:
+                found[name] = images[name]
+        return found, alpha
+
+    def _blended(
+        self, pipeline: RenderPipeline, asset: Asset, lists: TileLists, camera: Camera
+    ) -> tuple[dict[str, Float[Array, "H W c"]], Float[Array, "H W"]]:
+        """Rasterise the attributes, premultiplied (Eq. 21)."""
+
+        def seen(values: Float[Array, "N ..."], padding: float = 0.0) -> Float[Array, "M ..."]:
+            return gather_visible(lists.index, values, padding=padding)
+
+        splats = asset.splats
+        attributes = jax.tree.map(seen, asset.attributes)
+        materials = attributes.materials
+        footprints = pipeline.project(
+            seen(splats.means), seen(splats.quats), seen(splats.scales, padding=1.0), camera
+        )
+        channels = {
+            "normal": seen(splats.normals),
+            "albedo": materials.albedo,
+            "roughness": materials.roughness[:, None],
+            "metallic": materials.metallic[:, None],
+            "position": seen(splats.anchors),
+            "depth": footprints.depths[:, None],
+        }
+        if attributes.indirect is not None:
+            channels["indirect"] = attributes.indirect
+        assert {name for name in AOV_CHANNELS if name not in _SHADED} <= set(channels)
+        return pipeline.blend(footprints, seen(splats.opacities), channels, lists, camera)
+
+    def _points(
+        self,
+        pipeline: RenderPipeline,
+        asset: Asset,
+        straight: dict[str, Float[Array, "P c"]],
+        mask: Bool[Array, " P"],
+        camera: Camera,
+    ) -> SurfacePoints:
+        """Say where the pixels' rays start."""
+        normals, positions = safe_normalize(straight["normal"]), straight["position"]
+        offset = self.ray_offset * pipeline.surface.box.half_extent
+        starts, outward = positions + offset * normals, normals
+        faces = jnp.full(mask.shape, -1, jnp.int32)
+        if self.points == "mesh" and asset.index is not None:
+            hits, faces = _first_surface(asset.index, mask, camera)
+            is_hit = (faces >= 0)[:, None]
+            starts = jnp.where(is_hit, hits, starts)
+            outward = jnp.where(is_hit, _face_normals(asset, faces), outward)
+        return SurfacePoints(
+            *jax.lax.stop_gradient((starts,)), normals, jax.lax.stop_gradient(outward), faces, mask
+        )
+
+
+def _face_normals(asset: Asset, faces: Int[Array, " P"]) -> Float[Array, "P 3"]:
+    """Compute the unit normals of some faces of the mesh."""
+    mesh = asset.mesh
+    corners = mesh.vertices[mesh.faces.at[faces].get(mode="clip")]
+    across = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return safe_normalize(across)
+
+
+def _first_surface(
+    index: RayIndex, mask: Bool[Array, " P"], camera: Camera
+) -> tuple[Float[Array, "P 3"], Int[Array, " P"]]:
+    """Find where the rays through the pixel centres of a single view first meet the mesh."""
+    camera = jax.lax.stop_gradient(camera)
+    rotation, intrinsics = camera.world_to_camera[0, :3, :3], camera.intrinsics[0]
+    dtype = rotation.dtype
+    x, y = jnp.meshgrid(*(jnp.arange(n, dtype=dtype) + 0.5 for n in (camera.width, camera.height)))
+    across = (x - intrinsics[0, 2]) / intrinsics[0, 0]
+    down = (y - intrinsics[1, 2]) / intrinsics[1, 1]
+    local = jnp.stack([across, down, jnp.ones_like(across)], axis=-1).reshape(-1, 3)
+    directions = safe_normalize(jnp.einsum("pk,kc->pc", local, rotation))
+    origins = jnp.broadcast_to(camera.centers, directions.shape)
+    nowhere = jnp.full(mask.shape, -1, jnp.int32)
+    distance, faces = index.nearest(origins, directions, nowhere, mask)
+    reached = jnp.where(faces >= 0, distance, 0.0)
+    return origins + reached[:, None] * directions, faces

@@ -1,0 +1,191 @@
+"""Free splats (appendix E): the Gaussians of a trained mesh become parameters of their own.
+
+Position, shape, normal, opacity, albedo and indirect light are then learned for every splat, while
+roughness and metallic stay a field, at the splats' moving places. The mesh is frozen, and with it
+what blocks light; a splat keeps the face that it was sampled from.
+
+Differentiable in all parameters. The faces that splats belong to have no gradient.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from geosplat_jax.adapter import (
+    SPLATS_PER_FACE,
+    AdapterConstants,
+    SplatModel,
+    SplatSettings,
+)
+from geosplat_jax.core.mesh import face_normals_and_areas
+from geosplat_jax.core.numerics import safe_log, safe_normalize
+from geosplat_jax.core.settings import settings
+from geosplat_jax.core.types import Box, Splats, learned
+from geosplat_jax.materials import Attributes
+from geosplat_jax.surface.base import Surface
+
+_LEAST = 0.01
+"""Albedo is kept in [0.01, 0.99], as in the authors' code."""
+
+_FAINTEST = 1e-4
+"""First opacities are kept this far from 0 and 1, where the logit ends."""
+
+
+class FreeSplatParameters(eqx.Module):
+    """What N splats have learned; rows past those of the mesh's faces are padding.
+
+    Attributes
+    ----------
+    means : (N, 3) in half sides of the box, from its centre.
+    log_scales : (N, 3) natural logarithms, of the same unit.
+    quats : (N, 4) (w, x, y, z), of any length.
+    normals : (N, 3) shading normals, of any length.
+    opacity_logits : (N,).
+    albedo : (N, 3) linear; what lies outside [0.01, 0.99] is shown at the border.
+    indirect : (N, c) logits of indirect light (see `transport.indirect`); None where none is
+        learned.
+    """
+
+    means: Float[Array, "N 3"] = learned("splat_means")
+    log_scales: Float[Array, "N 3"] = learned("splat_scales")
+    quats: Float[Array, "N 4"] = learned("splat_quats")
+    normals: Float[Array, "N 3"] = learned("splat_normals")
+    opacity_logits: Float[Array, " N"] = learned("splat_opacities")
+    albedo: Float[Array, "N 3"] = learned("splat_albedo")
+    indirect: Float[Array, "N c"] | None = learned("splat_indirect")
+
+
+RATE_GROUPS = (
+    "splat_means",
+    "splat_scales",
+    "splat_quats",
+    "splat_normals",
+    "splat_opacities",
+    "splat_albedo",
+    "splat_indirect",
+)
+"""Learning rates of `FreeSplatParameters`, field by field."""
+
+
+def free(splats: Splats, attributes: Attributes, box: Box) -> FreeSplatParameters:
+    """Turn splats on a mesh into parameters that say the same.
+
+    Parameters
+    ----------
+    splats : six of every face, in the order of the faces (`adapter.face_splats`).
+    attributes : of the same rows.
+    box : of the scene.
+    """
+    opacities = jnp.clip(splats.opacities, _FAINTEST, 1.0 - _FAINTEST)
+    return FreeSplatParameters(
+        means=(splats.means - box.center[None, :]) / box.half_extent,
+        log_scales=safe_log(splats.scales / box.half_extent),
+        quats=splats.quats,
+        normals=splats.normals,
+        opacity_logits=safe_log(opacities) - jnp.log1p(-opacities),
+        albedo=attributes.materials.albedo,
+        indirect=attributes.indirect,
+    )
+
+
+def _kept_within(values: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Clip to where an albedo lies; the gradient is that of the identity, so values come back."""
+    return values + jax.lax.stop_gradient(jnp.clip(values, _LEAST, 1.0 - _LEAST) - values)
+
+
+@dataclass(frozen=True)
+class FreeSplats(SplatModel):
+    """Splats with parameters of their own, six for every face of a mesh that no longer moves."""
+
+    def place(self, surface: Surface, parameters: FreeSplatParameters, box: Box) -> Splats:
+        """Return the splats as they were learned.
+
+        Attributes are looked up, and rays start, at the projection of a splat's mean on the plane
+        of its face. A splat looks away where its face does.
+        """
+        mesh = surface.mesh
+        count = parameters.means.shape[0]
+        parents = jnp.arange(count, dtype=jnp.int32) // SPLATS_PER_FACE
+        normals, _ = face_normals_and_areas(mesh)
+        outward = normals.at[parents].get(mode="clip")
+        corner = mesh.vertices[mesh.faces.at[parents, 0].get(mode="clip")]
+        means = box.center[None, :] + box.half_extent * parameters.means
+        above = jnp.sum((means - corner) * outward, axis=-1, keepdims=True)
+        real = jnp.arange(count, dtype=jnp.int32) < mesh.face_count * SPLATS_PER_FACE
+        means = jnp.where(real[:, None], means, 0.0)
+        unit_quat = jnp.array([[1.0, 0.0, 0.0, 0.0]], means.dtype)
+        return Splats(
+            means=means,
+            quats=jnp.where(real[:, None], safe_normalize(parameters.quats), unit_quat),
+            scales=jnp.where(real[:, None], box.half_extent * jnp.exp(parameters.log_scales), 1.0),
+            opacities=jnp.where(real, jax.nn.sigmoid(parameters.opacity_logits), 0.0),
+            normals=jnp.where(real[:, None], safe_normalize(parameters.normals), 0.0),
+            outward=outward,
+            anchors=jnp.where(real[:, None], means - above * outward, 0.0),
+            parents=parents,
+            count=mesh.face_count * SPLATS_PER_FACE,
+        )
+
+    def dress(self, attributes: Attributes, parameters: FreeSplatParameters) -> Attributes:
+        """Give every splat its own albedo, and its indirect light where any is learned."""
+        materials = replace(attributes.materials, albedo=_kept_within(parameters.albedo))
+        indirect = attributes.indirect
+        if indirect is not None and parameters.indirect is not None:
+            indirect = parameters.indirect
+        return replace(attributes, materials=materials, indirect=indirect)
+
+
+@settings
+class FreeSplatSettings(SplatSettings, kind="free"):
+    """The splats of the stage before, with parameters of their own; the surface must be frozen."""
+
+    @property
+    def rate_groups(self) -> tuple[str, ...]:
+        """Groups of `FreeSplatParameters`."""
+        return RATE_GROUPS
+
+    @property
+    def needs_fixed_surface(self) -> bool:
+        """A splat belongs to a face by its row."""
+        return True
+
+    def begin(
+        self, previous: Callable[[], tuple[Splats, Attributes]], box: Box
+    ) -> FreeSplatParameters:
+        """Take the splats of the stage before as they are.
+
+        Raises
+        ------
+        ValueError
+            If they were not six for every face.
+        """
+        splats, attributes = previous()
+        if splats.means.shape[0] % SPLATS_PER_FACE:
+            raise ValueError("free splats start from the six splats of every face (splats: face)")
+        return free(splats, attributes, box)
+
+    def describe(self, parameters: FreeSplatParameters) -> dict[str, int]:
+        """Return the rows, and the numbers of indirect light per splat."""
+        indirect = parameters.indirect
+        outputs = 0 if indirect is None else int(indirect.shape[1])
+        return {"rows": int(parameters.means.shape[0]), "indirect": outputs}
+
+    def template(self, description: Any) -> FreeSplatParameters:
+        """Make parameters of zeros."""
+        rows, outputs = description["rows"], description["indirect"]
+        widths = {"means": 3, "log_scales": 3, "quats": 4, "normals": 3, "albedo": 3}
+        return FreeSplatParameters(
+            **{name: jnp.zeros((rows, width)) for name, width in widths.items()},
+            opacity_logits=jnp.zeros((rows,)),
+            indirect=jnp.zeros((rows, outputs)) if outputs else None,
+        )
+
+    def build(self, constants: AdapterConstants) -> FreeSplats:
+        """Make the model; constants of sampling do not matter any more."""
+        del constants
+        return FreeSplats()

@@ -1,0 +1,173 @@
+"""Free splats: they start as the mesh's, learn apart from it, and train, resume and render."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import MONTE_CARLO, ball, sphere_dataset, tiny_config
+
+from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.stages import begin_stage, build_pipeline
+from geosplat_jax.fit.train import fit, load_trained
+from geosplat_jax.refinement import FreeSplats, FreeSplatSettings, free
+from geosplat_jax.render import RenderPipeline
+from geosplat_jax.report.renderer import Renderer
+
+REFINE = (
+    *MONTE_CARLO,
+    "stages.split_sum.steps=2",
+    "stages.monte_carlo.steps=1",
+    "stages.refine.steps=3",
+    "stages.refine.batch_views=1",
+    "stages.refine.transport.light_count=1",
+    "stages.refine.transport.diffuse_count=1",
+    "stages.refine.transport.specular_count=1",
+    "stages.refine.transport.residual_count=0",
+    "run.checkpoint_every=1",
+)
+"""A run of three stages, small enough for a test."""
+
+build = jax.jit(RenderPipeline.reconstruct)
+
+
+@pytest.fixture(scope="module")
+def start():
+    """Pipelines before and in the refinement of a ball, and the first parameters of it."""
+    config = tiny_config("stages.refine.steps=3")
+    pipeline, params = ball(config)
+    before = build(pipeline, params)
+    stage = config.stage("refine")
+    refining = replace(
+        build_pipeline(config, stage, pipeline.surface), capacities=pipeline.capacities
+    )
+    return before, refining, begin_stage(params, pipeline, config, stage)
+
+
+def test_free_splats_begin_as_the_splats_of_the_mesh(start):
+    before, refining, params = start
+    after = build(refining, params)
+    real = np.asarray(before.splats.mask)
+    assert real.sum() > 500
+    for name in ("means", "scales", "opacities", "normals", "outward", "anchors", "parents"):
+        expected, found = (np.asarray(getattr(a.splats, name)) for a in (before, after))
+        np.testing.assert_allclose(found[real], expected[real], atol=2e-6, err_msg=name)
+    quats = [np.asarray(a.splats.quats)[real] for a in (before, after)]
+    np.testing.assert_allclose(np.abs(np.sum(quats[0] * quats[1], axis=1)), 1.0, atol=1e-6)
+    np.testing.assert_array_equal(after.splats.mask, real)
+    for a, b in zip(
+        jax.tree.leaves(after.attributes.materials),
+        jax.tree.leaves(before.attributes.materials),
+        strict=True,
+    ):
+        np.testing.assert_allclose(np.asarray(a)[real], np.asarray(b)[real], atol=1e-5)
+
+
+def test_a_splat_that_moves_along_its_face_takes_its_anchor_with_it(start):
+    """A move along the normal leaves the anchor on the plane of the face; one across follows."""
+    _, refining, params = start
+    asset = build(refining, params)
+    half = float(refining.surface.box.half_extent)
+    shift = 0.01 * np.asarray(asset.splats.outward)
+    moved = replace(params.splats, means=params.splats.means + jnp.asarray(shift) / half)
+    lifted = build(refining, replace(params, splats=moved))
+    real = np.asarray(asset.splats.mask)
+    np.testing.assert_allclose(lifted.splats.anchors, asset.splats.anchors, atol=1e-6)
+    change = np.asarray(lifted.splats.means - asset.splats.means)
+    np.testing.assert_allclose(change[real], shift[real], atol=1e-6)
+
+
+def test_padding_is_inert(start):
+    _, refining, params = start
+    wild = jax.tree.map(lambda x: jnp.full_like(x, 7.0), params.splats)
+    splats = build(refining, replace(params, splats=wild)).splats
+    padding = ~np.asarray(splats.mask)
+    assert padding.sum() > 10
+    np.testing.assert_array_equal(np.asarray(splats.opacities)[padding], 0.0)
+    np.testing.assert_array_equal(np.asarray(splats.scales)[padding], 1.0)
+    np.testing.assert_array_equal(np.asarray(splats.quats)[padding, 0], 1.0)
+
+
+def test_albedo_beyond_its_range_is_shown_at_the_border_and_finds_back(start):
+    _, refining, params = start
+    _, attributes = jax.jit(lambda p: (None, refining.reconstruct(p).attributes))(params)
+
+    def dressed(albedo):
+        splats = replace(params.splats, albedo=albedo)
+        return FreeSplats().dress(attributes, splats).materials.albedo
+
+    albedo = jnp.full_like(params.splats.albedo, 1.4)
+    np.testing.assert_allclose(dressed(albedo), 0.99)
+    np.testing.assert_allclose(jax.grad(lambda x: jnp.sum(dressed(x)))(albedo), 1.0)
+
+
+def test_opaque_splats_get_finite_logits(start):
+    before, refining, _ = start
+    opaque = replace(before.splats, opacities=jnp.ones_like(before.splats.opacities))
+    logits = free(opaque, before.attributes, refining.surface.box).opacity_logits
+    assert bool(jnp.all(jnp.isfinite(logits)))
+    np.testing.assert_allclose(jax.nn.sigmoid(logits), 1.0, atol=2e-4)
+
+
+def test_splats_of_vertices_cannot_be_freed(start):
+    before, refining, _ = start
+    odd = jax.tree.map(lambda x: x[:7] if x.ndim else x, before.splats)
+    with pytest.raises(ValueError, match="six splats of every face"):
+        FreeSplatSettings().begin(lambda: (odd, before.attributes), refining.surface.box)
+
+
+def test_a_surface_that_moves_is_refused():
+    with pytest.raises(ValueError, match=r"stages.refine.rates.deform to 0"):
+        make_config(overrides=("stages.refine.steps=1", "stages.refine.rates.deform=0.1"))
+    with pytest.raises(ValueError, match="need a stage before"):
+        make_config(overrides=("stages.split_sum.splats.kind=free",))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A whole run of three stages, and the same one stopped in the last."""
+    dataset, config = sphere_dataset(size=16), tiny_config(*REFINE)
+    whole, parted = (tmp_path_factory.mktemp(name) / "run" for name in ("whole", "parted"))
+    state = fit(dataset, config, whole)
+    fit(dataset, config, parted, stop_after=4)
+    resumed = fit(dataset, config, parted, resume=True)
+    return dataset, whole, state, resumed
+
+
+def test_the_stage_resumes_bit_for_bit(run):
+    _, _, state, resumed = run
+    for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(resumed), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_the_mesh_stays_and_the_splats_move(run):
+    _, folder, state, _ = run
+    trained, before = load_trained(folder), load_trained(folder, stage="monte_carlo")
+    assert trained.stage.name == "refine"
+    for a, b in zip(
+        jax.tree.leaves(trained.params.geometry), jax.tree.leaves(before.params.geometry),
+        strict=True,
+    ):  # fmt: skip
+        np.testing.assert_array_equal(a, b)
+    first = Renderer.of(before, samples=2).asset().splats
+    last = Renderer.of(trained, samples=2).asset().splats
+    count = int(first.count)
+    assert int(last.count) == count > 100
+    for name in ("means", "scales", "opacities", "normals"):
+        change = np.abs(
+            np.asarray(getattr(last, name))[:count] - np.asarray(getattr(first, name))[:count]
+        )
+        assert 0 < change.max() < 0.5, name
+    del state
+
+
+def test_refined_splats_are_rendered_and_relit(run):
+    dataset, folder, _, _ = run
+    renderer = Renderer.of(load_trained(folder), samples=8)
+    image = renderer(dataset.train.camera([0]))
+    assert image.alpha.max() > 0.9
+    assert np.all(np.isfinite(image.rgb))
+    relit = renderer.relit(load_trained(folder).params.light)(dataset.train.camera([0]))
+    assert np.all(np.isfinite(relit.rgb))
+    assert relit.rgb.max() > 0
