@@ -100,6 +100,10 @@ def _parser() -> argparse.ArgumentParser:
         help="light from blocked directions under new lights (default: %(default)s)",
     )
 
+    evaluate.add_argument(
+        "--stage", help="what this stage ended with, instead of the run as it is now"
+    )
+
     render = _run_parser(commands, "render", "render a run's test or training views")
     render.add_argument("--views", choices=("test", "train"), default="test")
     render.add_argument("--output", type=Path, help="folder (default: RUN/renders)")
@@ -341,6 +345,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         protocol=arguments.protocol,
         samples=arguments.samples,
         relight_indirect=arguments.relight_indirect,
+        stage=arguments.stage,
     )
     print(f"protocol: {arguments.protocol}")
     for name, value in metrics["mean"].items():
@@ -348,6 +353,8 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     for note in metrics["notes"]:
         print(f"note: {note}")
     folder = run.folder.path
+    if arguments.stage is not None:
+        folder = run.folder.end_of(arguments.stage)
     pictures = [name for name in _SHEETS if (folder / name).exists()]
     print(f"metrics: {folder / 'metrics.json'}\npictures: {', '.join(pictures)} in {folder}")
 

@@ -146,29 +146,38 @@ class Run:
         protocol: str = PROTOCOLS[0],
         samples: int = DEFAULT_SAMPLES,
         relight_indirect: str = "traced",
+        stage: str | None = None,
     ) -> dict[str, Any]:
         """Compare the test views with the truth; write ``metrics.json`` and sheets of pictures.
 
         See `evaluate.evaluate_run` for the arguments.
 
+        Parameters
+        ----------
+        stage : evaluate what this stage ended with, and write to the folder of its checkpoint;
+            the run as it is now by default.
+
         Raises
         ------
         RunError
             If the scene has no test views.
+        TrainingError
+            If that stage has not ended.
         """
         views = self._views("test")
         record, dataset = self.folder.record(), self.dataset
+        trained = self.trained if stage is None else load_trained(self.folder, stage=stage)
         lights = {name: load_light(path) for name, path in dataset.lights.items()}
         peaks = [line["peak_memory_mb"] for line in self.steps()]
         return evaluate_run(
-            self.trained,
+            trained,
             views,
-            self.folder.path,
+            self.folder.path if stage is None else self.folder.end_of(stage),
             meta={
                 "scene": record["scene"],
                 "dataset": record["dataset"],
-                "step": self.trained.step,
-                "stage": self.trained.stage.name,
+                "step": trained.step,
+                "stage": trained.stage.name,
                 "training": self.folder.training(),
                 "training_peak_memory_mb": max(peaks, default=None),
             },

@@ -90,6 +90,17 @@ def test_metrics_are_there_after_an_evaluation_and_not_before(commanded, capsys)
     assert (commanded.metrics["step"], commanded.metrics["stage"]) == (2, "split_sum")
 
 
+def test_what_a_stage_ended_with_is_evaluated_into_its_folder(commanded, capsys):
+    end = commanded.folder.end_of("split_sum")
+    assert command("evaluate", commanded.folder, "--stage", "split_sum") == 2
+    assert "no checkpoint" in " ".join(capsys.readouterr().err.split())
+    shutil.copytree(commanded.folder.checkpoints, end)
+    whole = (commanded.folder.path / "metrics.json").read_bytes()
+    assert command("evaluate", commanded.folder, "--stage", "split_sum", "--samples", 4) == 0
+    assert json.loads((end / "metrics.json").read_text())["mean"] == commanded.metrics["mean"]
+    assert (commanded.folder.path / "metrics.json").read_bytes() == whole
+
+
 def test_a_second_training_into_the_folder_is_refused_and_force_replaces_it(
     run, commanded, folder, capsys
 ):
