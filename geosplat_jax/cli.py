@@ -4,6 +4,7 @@ import argparse
 import importlib.metadata
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +104,10 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument(
         "--stage", help="what this stage ended with, instead of the run as it is now"
     )
+
+    consistency = _run_parser(commands, "consistency", "how well a run's splats stand for its mesh")
+    consistency.add_argument("--stage", help="as for evaluate")
+    consistency.add_argument("--json", type=Path, help="also write the figures to this file")
 
     render = _run_parser(commands, "render", "render a run's test or training views")
     render.add_argument("--views", choices=("test", "train"), default="test")
@@ -359,6 +364,17 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     print(f"metrics: {folder / 'metrics.json'}\npictures: {', '.join(pictures)} in {folder}")
 
 
+def _consistency(arguments: argparse.Namespace) -> None:
+    """Print the figures of Table 5 for a run."""
+    found = Run(arguments.run, scene=arguments.scene).consistency(stage=arguments.stage)
+    print(f"reflected direction, mesh against splats  {found.reflection_deg:9.3f} degrees")
+    print(f"distance along the ray, of the diagonal   {found.distance:9.5f}")
+    print(f"pixels compared                           {found.pixels:9d}")
+    print(f"pixels of the mesh without splats         {found.uncovered:9.2%}")
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(asdict(found), indent=2) + "\n", encoding="utf-8")
+
+
 def _relight(arguments: argparse.Namespace) -> None:
     """Run the relight command from its arguments."""
     factors = {"intensity": [arguments.intensity], "albedo-scale": arguments.albedo_scale}
@@ -449,6 +465,7 @@ _COMMANDS = {
     "train": _train,
     "settings": _settings,
     "evaluate": _evaluate,
+    "consistency": _consistency,
     "render": _render,
     "refine-cameras": _refine_cameras,
     "relight": _relight,

@@ -140,7 +140,7 @@ class PerPixel(ShadingDomain, kind="per_pixel"):
         starts, outward = positions + offset * normals, normals
         faces = jnp.full(mask.shape, -1, jnp.int32)
         if self.points == "mesh" and asset.index is not None:
-            hits, faces = _first_surface(asset.index, mask, camera)
+            hits, faces = first_surface(asset.index, mask, camera)
             is_hit = (faces >= 0)[:, None]
             starts = jnp.where(is_hit, hits, starts)
             outward = jnp.where(is_hit, _face_normals(asset, faces), outward)
@@ -157,10 +157,16 @@ def _face_normals(asset: Asset, faces: Int[Array, " P"]) -> Float[Array, "P 3"]:
     return safe_normalize(across)
 
 
-def _first_surface(
+def first_surface(
     index: RayIndex, mask: Bool[Array, " P"], camera: Camera
 ) -> tuple[Float[Array, "P 3"], Int[Array, " P"]]:
-    """Find where the rays through the pixel centres of a single view first meet the mesh."""
+    """Find where the rays through the pixel centres of a single view first meet the mesh.
+
+    Returns
+    -------
+    positions : (P, 3) world, row by row; the camera's centre where nothing is hit.
+    faces : (P,) face that is hit, -1 for none. No gradients.
+    """
     camera = jax.lax.stop_gradient(camera)
     rotation, intrinsics = camera.world_to_camera[0, :3, :3], camera.intrinsics[0]
     dtype = rotation.dtype

@@ -31,11 +31,12 @@ from geosplat_jax.io.views import Views
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
 from geosplat_jax.report.assets import export_assets
+from geosplat_jax.report.consistency import Consistency, measure, traceable
 from geosplat_jax.report.evaluate import evaluate_run, preview_image
 from geosplat_jax.report.pictures import normals_to_rgb
 from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.relight import RelightOptions, load_light, relight_views
-from geosplat_jax.report.renderer import DEFAULT_SAMPLES, Renderer, straight_rgba
+from geosplat_jax.report.renderer import DEFAULT_SAMPLES, Renderer, build_asset, straight_rgba
 
 REFINEMENT_SAMPLES = 32
 """Rays per splat when cameras are refined: noise averages out over the pixels of a view."""
@@ -187,6 +188,17 @@ class Run:
             samples=samples,
             relight_indirect=relight_indirect,
         )
+
+    def consistency(self, *, stage: str | None = None) -> Consistency:
+        """Measure how well the splats stand for the mesh, over the views to show.
+
+        See `report.consistency`. ``stage`` : as for `evaluate`.
+        """
+        trained = self.trained if stage is None else load_trained(self.folder, stage=stage)
+        pipeline = traceable(trained.pipeline)
+        views = self._views_to_show()
+        cameras = (views.camera([number]) for number in range(len(views)))
+        return measure(pipeline, build_asset(pipeline, trained.params), cameras)
 
     def render(self, split: str = "test", output: Path | None = None) -> list[Path]:
         """Write every view of a split as ``NAME_rgba.png`` and ``NAME_normal.png``."""

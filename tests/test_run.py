@@ -90,6 +90,15 @@ def test_metrics_are_there_after_an_evaluation_and_not_before(commanded, capsys)
     assert (commanded.metrics["step"], commanded.metrics["stage"]) == (2, "split_sum")
 
 
+def test_consistency_is_printed_and_written(commanded, capsys, tmp_path):
+    target = tmp_path / "consistency.json"
+    assert command("consistency", commanded.folder, "--json", target) == 0
+    found = json.loads(target.read_text())
+    assert f"{found['reflection_deg']:.3f} degrees" in capsys.readouterr().out
+    assert found["pixels"] > 100
+    assert 0 < found["reflection_deg"] < 60
+
+
 def test_what_a_stage_ended_with_is_evaluated_into_its_folder(commanded, capsys):
     end = commanded.folder.end_of("split_sum")
     assert command("evaluate", commanded.folder, "--stage", "split_sum") == 2

@@ -1,0 +1,55 @@
+"""Learn the light alone before Monte Carlo, to see whether that is worth while.
+
+The split sum leaves a light that was told apart from materials by an approximation. This study
+takes the split-sum stage of a run, learns nothing but light and exposure for some steps of Monte
+Carlo with the materials of the split sum, and then trains the stage `monte_carlo` as ever; compare
+with the run itself by ``geosplat-jax evaluate``::
+
+    python experiments/studies/light.py RUN --output OTHER [--steps 60] [--rate 0.02]
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from geosplat_jax.fit.config import Rate
+from geosplat_jax.fit.presets import MONTE_CARLO, SPLIT_SUM
+from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.train import fit
+from geosplat_jax.run import Run
+
+
+def main() -> None:
+    """Train with a stage between the two."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--steps", type=int, default=60)
+    parser.add_argument("--rate", type=float, default=0.02)
+    arguments = parser.parse_args()
+    enable_compilation_cache()
+    retain_freed_memory()
+    run = Run(arguments.run)
+    config = run.config
+    after = config.stage(MONTE_CARLO)
+    learned = {"light": Rate(arguments.rate), "exposure": Rate(0.5 * arguments.rate)}
+    light = replace(
+        after,
+        name="light",
+        steps=arguments.steps,
+        enter=(),
+        rates={name: learned.get(name, Rate(0.0)) for name in after.rates},
+    )
+    config = replace(config, stages=(config.stage(SPLIT_SUM), light, after))
+    fit(
+        run.dataset,
+        config,
+        arguments.output,
+        source=arguments.run,
+        first_stage="light",
+        on_step=lambda p: print(p.step, p.stage, f"{p.psnr:.2f} dB") if p.step % 50 == 0 else None,
+    )
+
+
+if __name__ == "__main__":
+    main()
