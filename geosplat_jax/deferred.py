@@ -144,9 +144,8 @@ class PerPixel(ShadingDomain, kind="per_pixel"):
             is_hit = (faces >= 0)[:, None]
             starts = jnp.where(is_hit, hits, starts)
             outward = jnp.where(is_hit, _face_normals(asset, faces), outward)
-        return SurfacePoints(
-            *jax.lax.stop_gradient((starts,)), normals, jax.lax.stop_gradient(outward), faces, mask
-        )
+        starts, outward = jax.lax.stop_gradient((starts, outward))
+        return SurfacePoints(starts, normals, outward, faces, mask)
 
 
 def _face_normals(asset: Asset, faces: Int[Array, " P"]) -> Float[Array, "P 3"]:

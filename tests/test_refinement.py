@@ -13,6 +13,7 @@ from geosplat_jax.fit.stages import begin_stage, build_pipeline
 from geosplat_jax.fit.train import fit, load_trained
 from geosplat_jax.refinement import FreeSplats, FreeSplatSettings, free
 from geosplat_jax.render import RenderPipeline
+from geosplat_jax.report.assets import MaterialSampler
 from geosplat_jax.report.renderer import Renderer
 
 REFINE = (
@@ -165,6 +166,18 @@ def test_refined_splats_are_rendered_and_relit(run):
     image = renderer(dataset.train.camera([0]))
     assert image.alpha.max() > 0.9
     assert np.all(np.isfinite(image.rgb))
+    # What is baked into textures is what the splats have learned.
+    asset = renderer.asset()
+    count = int(asset.splats.count)
+    anchors = np.asarray(asset.splats.anchors)[:count]
+    albedo, roughness, _ = MaterialSampler(trained, asset)(anchors)
+    materials = asset.attributes.materials
+    np.testing.assert_allclose(albedo, np.asarray(materials.albedo)[:count], atol=1e-3)
+    np.testing.assert_allclose(roughness, np.asarray(materials.roughness)[:count], atol=1e-4)
+    of_field = MaterialSampler(
+        replace(trained, params=replace(trained.params, splats=None)), asset
+    )(anchors)[0]
+    assert np.abs(albedo - of_field).max() > 1e-3
     relit = renderer.relit(trained.params.light)(dataset.train.camera([0]))
     assert np.all(np.isfinite(relit.rgb))
     assert relit.rgb.max() > 0

@@ -10,11 +10,13 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import cKDTree
 
 from geosplat_jax.fit.train import Trained
 from geosplat_jax.io.export import export_gaussians_ply, export_light_exr, export_mesh_glb
 from geosplat_jax.io.images import encode_srgb
 from geosplat_jax.materials import materials_at
+from geosplat_jax.render import Asset
 from geosplat_jax.report.renderer import Renderer, build_asset
 
 _MATERIAL_CHUNK = 65_536
@@ -22,16 +24,48 @@ _MATERIAL_CHUNK = 65_536
 _materials_at = partial(jax.jit, static_argnames=("spec",))(materials_at)
 
 
-class MaterialSampler:
-    """Evaluate the material fields at any number of points, in chunks of one compiled size."""
+_NEAREST = 4
+"""Splats that a point takes its refined albedo from."""
 
-    def __init__(self, trained: Trained) -> None:
+
+class MaterialSampler:
+    """Evaluate the materials of a surface at any number of points of it.
+
+    Fields are evaluated in chunks of one compiled size. What splats have learned of their own
+    (`refinement.FreeSplats`) is added: by how much the albedo of the four nearest differs from the
+    field, weighted by the inverse of the squared distance.
+
+    Parameters
+    ----------
+    trained : parameters of a run.
+    asset : of the same.
+    """
+
+    def __init__(self, trained: Trained, asset: Asset) -> None:
         self._spec = replace(trained.pipeline.fields, position_gradient=False)
         self._field = trained.params.material
         self._box = trained.pipeline.surface.box
+        self._nearest: cKDTree | None = None
+        if trained.params.splats is not None:
+            count = int(asset.splats.count)
+            anchors = np.asarray(asset.splats.anchors)[:count]
+            learned = np.asarray(asset.attributes.materials.albedo)[:count]
+            self._nearest = cKDTree(anchors)
+            self._own = learned - self._of_fields(anchors)[0]
 
     def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return albedo (n, 3) linear, roughness (n,) and metallic (n,) at world points (n, 3)."""
+        albedo, roughness, metallic = self._of_fields(points)
+        if self._nearest is not None and len(points):
+            distance, rows = self._nearest.query(points, k=_NEAREST)
+            weights = 1.0 / np.maximum(distance, 1e-6 * float(self._box.half_extent)) ** 2
+            weights /= weights.sum(axis=1, keepdims=True)
+            own = np.einsum("nk,nkc->nc", weights, self._own[rows])
+            albedo = np.clip(albedo + own, 0.0, 1.0).astype(np.float32)
+        return albedo, roughness, metallic
+
+    def _of_fields(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Evaluate the fields alone."""
         parts = []
         for start in range(0, max(len(points), 1), _MATERIAL_CHUNK):
             chunk = np.asarray(points[start : start + _MATERIAL_CHUNK], np.float32)
@@ -70,16 +104,16 @@ def export_assets(
         If the surface is empty.
     """
     vertices, faces, normals = Renderer.of(trained).mesh()
+    asset = build_asset(trained.pipeline, trained.params)
     mesh_info = export_mesh_glb(
         folder / "mesh.glb",
         vertices,
         faces,
         normals,
-        MaterialSampler(trained),
+        MaterialSampler(trained, asset),
         vertex_colors=vertex_colors,
         texture_size=texture_size,
     )
-    asset = build_asset(trained.pipeline, trained.params)
     count = int(asset.splats.count)
     rows = {
         name: np.asarray(getattr(asset.splats, name))[:count]
