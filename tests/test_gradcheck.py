@@ -27,7 +27,10 @@ SLOW_STAGES = {
 
 @pytest.mark.parametrize(
     "stage",
-    [pytest.param(s, marks=pytest.mark.slow) if s in SLOW_STAGES else s for s in STAGES],
+    [
+        pytest.param(s, marks=[pytest.mark.slow, pytest.mark.computes]) if s in SLOW_STAGES else s
+        for s in STAGES
+    ],
 )
 def test_every_gradient_agrees_with_differences(stage):
     rows = check_stage(stage)

@@ -142,6 +142,11 @@ def loss_problems(rng: np.random.Generator) -> list[Problem]:
     ]
 
 
+def _doubled(leaf: jax.Array) -> jax.Array:
+    """Turn floats into float64."""
+    return leaf.astype(jnp.float64) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+
+
 def refinement_problems(rng: np.random.Generator) -> list[Problem]:
     """Build the loss of free splats, shaded per pixel with the coverage differentiated.
 
@@ -167,7 +172,8 @@ def refinement_problems(rng: np.random.Generator) -> list[Problem]:
         replace(build_pipeline(config, stage, FlexiCubes(grid)), capacities=_CAPACITIES)
         for stage in config.active_stages
     )
-    start = begin_stage(_params(rng, grid, config), first, config, config.stage("refine"))
+    first, params = jax.tree.map(_doubled, (first, _params(rng, grid, config)))
+    start = begin_stage(params, first, config, config.stage("refine"))
     splats = jax.tree.map(
         lambda x: x + 0.03 * rng.uniform(-1, 1, x.shape) * (jnp.abs(x) + 0.1), start.splats
     )
