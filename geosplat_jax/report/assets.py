@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from geosplat_jax.fit.train import Trained
 from geosplat_jax.io.export import export_gaussians_ply, export_light_exr, export_mesh_glb
@@ -45,12 +45,12 @@ class MaterialSampler:
         self._spec = replace(trained.pipeline.fields, position_gradient=False)
         self._field = trained.params.material
         self._box = trained.pipeline.surface.box
-        self._nearest: cKDTree | None = None
+        self._nearest: KDTree | None = None
         if trained.params.splats is not None:
             count = int(asset.splats.count)
             anchors = np.asarray(asset.splats.anchors)[:count]
             learned = np.asarray(asset.attributes.materials.albedo)[:count]
-            self._nearest = cKDTree(anchors)
+            self._nearest = KDTree(anchors)
             self._own = learned - self._of_fields(anchors)[0]
 
     def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
