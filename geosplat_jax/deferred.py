@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from geosplat_jax.core.mesh import face_normals_and_areas
 from geosplat_jax.core.numerics import safe_normalize
 from geosplat_jax.core.settings import NonNegative, settings
 from geosplat_jax.core.types import Camera, Materials, SurfacePoints
@@ -143,17 +144,10 @@ class PerPixel(ShadingDomain, kind="per_pixel"):
             hits, faces = first_surface(asset.index, mask, camera)
             is_hit = (faces >= 0)[:, None]
             starts = jnp.where(is_hit, hits, starts)
-            outward = jnp.where(is_hit, _face_normals(asset, faces), outward)
+            normals_of_faces, _ = face_normals_and_areas(asset.mesh)
+            outward = jnp.where(is_hit, normals_of_faces.at[faces].get(mode="clip"), outward)
         starts, outward = jax.lax.stop_gradient((starts, outward))
         return SurfacePoints(starts, normals, outward, faces, mask)
-
-
-def _face_normals(asset: Asset, faces: Int[Array, " P"]) -> Float[Array, "P 3"]:
-    """Compute the unit normals of some faces of the mesh."""
-    mesh = asset.mesh
-    corners = mesh.vertices[mesh.faces.at[faces].get(mode="clip")]
-    across = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return safe_normalize(across)
 
 
 def first_surface(

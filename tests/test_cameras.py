@@ -18,6 +18,7 @@ from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.core.color import tone_map
 from geosplat_jax.core.rotation import rotation_vector_to_matrix
 from geosplat_jax.core.types import Box, EnvLight
+from geosplat_jax.deferred import PerPixel
 from geosplat_jax.fit import cameras as cameras_module
 from geosplat_jax.fit.cameras import (
     CameraSettings,
@@ -542,3 +543,12 @@ def test_a_run_is_refined_and_trained_with_what_was_found(run, capsys):
     path.write_text(path.read_text() + " ")
     assert cli.main(["render", str(run / "again"), "--output", str(run / "pictures")]) == 2
     assert "has changed since the run" in capsys.readouterr().err
+
+
+def test_colours_stay_those_of_the_splats_where_a_run_shades_per_pixel(subject, views):
+    """A run that shades pixels is refined against the same pictures as one that shades splats."""
+    camera = views.camera([0])
+    per_pixel = replace(subject, pipeline=replace(subject.pipeline, domain=PerPixel()))
+    expected, found = (draw(baked(one, camera), camera).rgb for one in (subject, per_pixel))
+    np.testing.assert_array_equal(found, expected)
+    assert float(jnp.max(expected)) > 0

@@ -16,12 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from geosplat_jax.adapter import (
+    SPLATS_PER_FACE,
     AdapterConstants,
     FaceSplats,
     VertexSplats,
     face_splats,
 )
-from geosplat_jax.core.mesh import vertex_normals
+from geosplat_jax.core.mesh import face_normals_and_areas, vertex_normals
+from geosplat_jax.core.numerics import safe_normalize
 from geosplat_jax.core.rotation import frame_from_normal, matrix_to_quaternion
 from geosplat_jax.core.types import Box, Camera, Splats
 from geosplat_jax.fit.runtime import enable_compilation_cache
@@ -67,13 +69,11 @@ class OneBall(FaceSplats):
             mesh, vertex_normals(mesh), constants=self.constants, unit=box.half_extent
         )
         middle = jnp.mean(mesh.vertices[mesh.faces], axis=1)
-        corners = mesh.vertices[mesh.faces]
-        across = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        _, area = face_normals_and_areas(mesh)
         # The standard deviation of a round disc of the face's area.
-        radius = 0.5 * jnp.sqrt(0.5 * jnp.linalg.norm(across, axis=1) / np.pi)
-        normals = jnp.mean(vertex_normals(mesh)[mesh.faces], axis=1)
-        normals = normals / jnp.maximum(jnp.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        first = jnp.arange(splats.means.shape[0]) % 6 == 0
+        radius = 0.5 * jnp.sqrt(area / np.pi)
+        normals = safe_normalize(jnp.mean(vertex_normals(mesh)[mesh.faces], axis=1))
+        first = jnp.arange(splats.means.shape[0]) % SPLATS_PER_FACE == 0
         chosen = splats.mask & first
         parents = splats.parents
         means = jnp.where(chosen[:, None], middle[parents], splats.means)

@@ -40,7 +40,7 @@ from geosplat_jax.io.cameras import RefinedCamera, RefinedSplit
 from geosplat_jax.io.views import Views
 from geosplat_jax.materials import Attributes
 from geosplat_jax.rays.base import RayIndex
-from geosplat_jax.render import Asset, RenderPipeline
+from geosplat_jax.render import Asset, PerSplat, RenderPipeline
 from geosplat_jax.splats.rasterize import gather_visible
 from geosplat_jax.transport.base import Illumination, Shaded, Transport
 
@@ -154,7 +154,10 @@ class Subject(eqx.Module):
             self.illumination,
             asset.index,
         )
-        pipeline = replace(self.pipeline.forward_mode(), transport=BakedTransport(shaded))
+        # The colours are those of the splats, wherever the run evaluates light.
+        pipeline = replace(
+            self.pipeline.forward_mode(), transport=BakedTransport(shaded), domain=PerSplat()
+        )
         return replace(
             self, pipeline=pipeline, illumination=Baked(shaded), asset=replace(asset, index=None)
         )
