@@ -277,6 +277,23 @@ class VertexSplats(SplatModel):
         return vertex_splats(surface.mesh, normals, constants=self.constants, unit=box.half_extent)
 
 
+@dataclass(frozen=True)
+class DiscSplats(FaceSplats):
+    """Six round discs per face: on its plane, of the ellipses' area, but blind to its shape.
+
+    For ablations: what remains where splats are aligned along the normal only.
+    """
+
+    def place(self, surface: Surface, parameters: Any, box: Box) -> Splats:
+        """Replace the ellipses of `face_splats` by discs."""
+        splats = super().place(surface, parameters, box)
+        radius = safe_sqrt(splats.scales[:, 0] * splats.scales[:, 1])
+        scales = jnp.stack([radius, radius, splats.scales[:, 2]], axis=-1)
+        tangent, bitangent = frame_from_normal(splats.outward)
+        quats = matrix_to_quaternion(jnp.stack([tangent, bitangent, splats.outward], axis=-1))
+        return _inert(replace(splats, scales=scales, quats=quats))
+
+
 @settings
 class SplatSettings(Variant, abc.ABC):
     """Settings of a splat model; every kind of them is a subclass."""
@@ -287,8 +304,8 @@ class SplatSettings(Variant, abc.ABC):
         return ()
 
     @property
-    def needs_fixed_surface(self) -> bool:
-        """Whether what the splats have learned belongs to the faces of one surface."""
+    def takes_over(self) -> bool:
+        """Whether a stage begins with the splats of the one before, whose surface is then fixed."""
         return False
 
     def begin(self, previous: Callable[[], tuple[Splats, Attributes]], box: Box) -> Any:
@@ -324,6 +341,15 @@ class FaceSplatSettings(SplatSettings, kind="face"):
     def build(self, constants: AdapterConstants) -> FaceSplats:
         """Make the model."""
         return FaceSplats(constants)
+
+
+@settings
+class DiscSplatSettings(SplatSettings, kind="disc"):
+    """Six round discs per face, which know its normal and area but not its shape."""
+
+    def build(self, constants: AdapterConstants) -> DiscSplats:
+        """Make the model."""
+        return DiscSplats(constants)
 
 
 @settings

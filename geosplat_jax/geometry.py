@@ -497,5 +497,8 @@ class FlexiCubes(SurfaceModel):
         quads = sum(int(np.sum(np.diff(inside, axis=axis))) for axis in range(3))
         vertices = bucket(int(1.3 * quads))
         return Capacities(
-            surface_cubes=vertices, dual_vertices=vertices, quads=bucket(int(1.2 * quads))
+            surface_cubes=vertices,
+            dual_vertices=vertices,
+            quads=bucket(int(1.2 * quads)),
+            cell_patches=bucket(6 * quads),
         )

@@ -150,7 +150,7 @@ class FreeSplatSettings(SplatSettings, kind="free"):
         return RATE_GROUPS
 
     @property
-    def needs_fixed_surface(self) -> bool:
+    def takes_over(self) -> bool:
         """A splat belongs to a face by its row."""
         return True
 

@@ -172,7 +172,7 @@ class Config:
 
     def _check_splats(self, stage: Stage, number: int) -> None:
         """Refuse splats that belong to the faces of a surface which moves, or was not there."""
-        if not stage.splats.needs_fixed_surface or not stage.steps:
+        if not stage.splats.takes_over or not stage.steps:
             return
         if number == 0:
             raise ValueError(

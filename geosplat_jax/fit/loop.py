@@ -14,7 +14,13 @@ from geosplat_jax.core.capacity import Capacities, Usage
 from geosplat_jax.fit.compilation import compile_step
 from geosplat_jax.fit.config import Config, Stage, config_from_dict, differences
 from geosplat_jax.fit.folder import RunFolder
-from geosplat_jax.fit.planning import TrainingError, check_limits, holding, plan_capacities
+from geosplat_jax.fit.planning import (
+    TrainingError,
+    add_rays,
+    check_limits,
+    holding,
+    plan_capacities,
+)
 from geosplat_jax.fit.runtime import in_background, release_programs_when_crowded
 from geosplat_jax.fit.stages import (
     begin_stage,
@@ -105,15 +111,15 @@ class Loop:
 
     def prepare(self, step: int) -> None:
         """Begin the next stage when it is time; set the weights, plan buffers, compile."""
-        stage = self.config.stage_at(step)
+        stage, known = self.config.stage_at(step), None
         if stage != self.stage:
-            self._begin(stage)
+            known = self._begin(stage)
         self.pipeline = pipeline_at(self.pipeline, self.config, self.stage, self._since(step))
         # Another kind of splats, another stage: other needs.
         planned_for = f"{self.stage.name} {self.pipeline.splats}"
         if planned_for != self.planned_for:
             self.planned_for, self.peak = planned_for, None
-            self.pipeline = replace(self.pipeline, capacities=self._planned())
+            self.pipeline = replace(self.pipeline, capacities=self._planned(known))
             self._compile(step)
         following = self._following(step)
         if following is not None and self.upcoming is None:
@@ -124,8 +130,11 @@ class Loop:
         if self.upcoming is not None:
             self.upcoming.abandon()
 
-    def _planned(self) -> Capacities:
-        """Choose the buffers: as was planned ahead, or for what the surface needs now."""
+    def _planned(self, known: Capacities | None) -> Capacities:
+        """Choose the buffers: as was planned ahead, or for what the surface needs now.
+
+        ``known`` : sizes that hold what the stage begins with; None where it begins anew.
+        """
         upcoming = self.upcoming
         if upcoming is not None and upcoming.stage == self.stage:
             self.upcoming = None
@@ -133,6 +142,8 @@ class Loop:
             return upcoming.capacities
         if self.to_come is not None and self.to_come["stage"] == self.stage.name:
             return Capacities(**self.to_come["capacities"])
+        if known is not None:
+            return add_rays(self.pipeline, self.state.params, known)
         return plan_capacities(
             self.pipeline,
             self.state.params,
@@ -157,17 +168,24 @@ class Loop:
         compile_step(self.state, batch, self.pipeline, rule)
         self.has_compiled = True
 
-    def _begin(self, stage: Stage) -> None:
-        """Change settings, parameters and optimiser; keep what the stage before ended with."""
+    def _begin(self, stage: Stage) -> Capacities | None:
+        """Change settings, parameters and optimiser; keep what the stage before ended with.
+
+        Returns
+        -------
+        Sizes of buffers that hold what the stage begins with; None where they are not known.
+        """
         self.save_end()
         params, pipeline = self.state.params, self.pipeline
-        if stage.splats.needs_fixed_surface:
+        if stage.splats.takes_over:
             # The last update moved the surface once more.
             pipeline = holding(pipeline, params)
         params = begin_stage(params, pipeline, self.config, stage)
         self.stage = stage
         self.pipeline = build_pipeline(self.config, stage, self.surface)
         self.start(params)
+        first = pipeline_at(self.pipeline, self.config, stage, 0)
+        return _continued(pipeline, first, stage)
 
     def start(self, params: Params) -> None:
         """Begin the stage with these parameters."""
@@ -263,11 +281,14 @@ class Upcoming:
         def plan() -> Capacities:
             if known is not None and known["stage"] == stage.name:
                 return Capacities(**known["capacities"])
-            first = begin_stage(params, before, config, stage)
-            limits = config.geometry.limits
-            return plan_capacities(
-                first_pipeline(Capacities()), first, views.camera(), limits=limits
+            first, pipeline = (
+                begin_stage(params, before, config, stage),
+                first_pipeline(Capacities()),
             )
+            carried = _continued(before, pipeline, stage)
+            if carried is not None:
+                return add_rays(pipeline, first, carried)
+            return plan_capacities(pipeline, first, views.camera(), limits=config.geometry.limits)
 
         def compile_all() -> None:
             pipeline = first_pipeline(self.capacities)
@@ -299,6 +320,12 @@ class Upcoming:
     def meta(self) -> dict[str, Any]:
         """Return what a checkpoint keeps; waits until the buffers are planned."""
         return {"stage": self.stage.name, "capacities": dict(self.capacities)}
+
+
+def _continued(before: Pipeline, first: Pipeline, stage: Stage) -> Capacities | None:
+    """Return the buffers of a pipeline whose splats those of a stage continue; None if not."""
+    is_continued = stage.splats.takes_over or first.splats == before.splats
+    return before.capacities if is_continued else None
 
 
 def _on_host(shape: Any) -> Any:

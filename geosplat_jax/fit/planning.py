@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import jax
+from jaxtyping import Array, Int
 
 from geosplat_jax.core import capacity as capacity_module
 from geosplat_jax.core.capacity import Capacities, Usage
@@ -51,9 +52,39 @@ def plan_capacities(
         return needed, needed
 
     needed, _ = capacity_module.retry(attempt, guess)
-    return Capacities(
-        **{name: capacity_module.bucket(int(_HEADROOM * int(n))) for name, n in needed.items()}
-    )
+    return Capacities(**{name: _with_headroom(count) for name, count in needed.items()})
+
+
+def _with_headroom(count: Int[Array, ""]) -> int:
+    return capacity_module.bucket(int(_HEADROOM * int(count)))
+
+
+@jax.jit
+def _needs_of_rays(pipeline: Pipeline, params: Params) -> Usage:
+    capacities = pipeline.capacities
+    surface = pipeline.surface.extract(params.geometry, capacities=capacities)
+    return pipeline.surface.ray_index(surface, capacities=capacities).usage
+
+
+def add_rays(pipeline: Pipeline, params: Params, known: Capacities) -> Capacities:
+    """Return capacities that hold the surface's index for rays too, where any are traced.
+
+    Parameters
+    ----------
+    pipeline, params : of the stage.
+    known : capacities that hold all else.
+    """
+    if not pipeline.uses_rays:
+        return known
+    guess = pipeline.surface.first_capacities(params.geometry)
+
+    def attempt(capacities: Capacities) -> tuple[Usage, Usage]:
+        needed = _needs_of_rays(replace(pipeline, capacities=capacities), params)
+        return needed, needed
+
+    needed, _ = capacity_module.retry(attempt, Capacities(**{**guess, **known}))
+    names = set(needed) - set(known)
+    return known.resized(**{name: _with_headroom(needed[name]) for name in names})
 
 
 _needs_of_asset = jax.jit(lambda pipeline, params: pipeline.reconstruct(params).usage)
