@@ -8,6 +8,7 @@ Differentiable in the parameters only. Not differentiable by contract: visibilit
 topology, the random background, the noise of the smoothness term, samples of light.
 """
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,17 +16,18 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float, Key
 from pydantic import Field
 
 from geosplat_jax.core.color import linear_to_srgb, tone_map
-from geosplat_jax.core.numerics import absolute, safe_divide
+from geosplat_jax.core.numerics import absolute, safe_divide, safe_log
 from geosplat_jax.core.settings import NonNegative, PositiveCount, settings
 from geosplat_jax.core.ssim import ssim
 from geosplat_jax.core.types import Batch
 from geosplat_jax.materials import SMOOTHNESS_STD, Changes, MaterialSpec, smoothness
 from geosplat_jax.render import Asset, Params, RenderOutput
 from geosplat_jax.surface.base import SurfaceModel
+from geosplat_jax.transport.environment import texel_solid_angles
 
 
 @settings
@@ -82,6 +84,11 @@ class Comparison(NamedTuple):
     mask: Float[Array, "V H W"]
     valid: Float[Array, "V H W"] | None
     mse: Float[Array, ""]
+
+    def encoded(self) -> "Comparison":
+        """Return the images as a screen shows them, in which shade weighs more."""
+        images = [linear_to_srgb(image) for image in (self.predicted, self.target)]
+        return self._replace(predicted=images[0], target=images[1])
 
 
 @dataclass(frozen=True)
@@ -190,9 +197,8 @@ def compare(
     predicted = rgb + (1.0 - alpha)[..., None] * background
     target = mask[..., None] * image[..., :3] + (1.0 - mask)[..., None] * background
     mse = _mean((predicted - target) ** 2, valid)
-    if srgb:
-        predicted, target = linear_to_srgb(predicted), linear_to_srgb(target)
-    return Comparison(predicted, target, alpha, mask, valid, mse)
+    images = Comparison(predicted, target, alpha, mask, valid, mse)
+    return images.encoded() if srgb else images
 
 
 def _mean(
@@ -260,9 +266,45 @@ def indirect_magnitude(asset: Asset) -> Float[Array, ""]:
     return safe_divide(total, jnp.sum(mask).astype(total.dtype) * values.shape[1])
 
 
+def mean_metallic(metallic: Float[Array, " N"], mask: Bool[Array, " N"]) -> Float[Array, ""]:
+    """Average over the splats: what the photographs leave open is taken for a dielectric."""
+    total = jnp.sum(jnp.where(mask, metallic, 0.0))
+    return safe_divide(total, jnp.sum(mask).astype(total.dtype))
+
+
 def white_balance(radiance: Float[Array, "H W 3"]) -> Float[Array, ""]:
     """Mean absolute distance of the light's texels from grey, as in the authors' code."""
     return jnp.mean(absolute(radiance - jnp.mean(radiance, axis=-1, keepdims=True)))
+
+
+def light_tint(radiance: Float[Array, "H W 3"]) -> Float[Array, ""]:
+    """Mean distance of the light's texels from grey, relative to the mean brightness.
+
+    Each texel counts by its solid angle; unlike `white_balance`, exposure does not matter.
+    """
+    weight = _solid_angle_shares(radiance)
+    grey = jnp.mean(radiance, axis=-1, keepdims=True)
+    distance = jnp.sum(weight * jnp.mean(absolute(radiance - grey), axis=-1))
+    return safe_divide(distance, jnp.sum(weight * grey[..., 0]))
+
+
+def light_smoothness(radiance: Float[Array, "H W 3"]) -> Float[Array, ""]:
+    """Mean absolute difference of the logarithms of neighbouring texels, around and upwards.
+
+    A sun costs the logarithm of its contrast along its rim, so that it may stay; noise costs
+    everywhere. Each texel counts by its solid angle.
+    """
+    values = safe_log(radiance)
+    weight = _solid_angle_shares(radiance)
+    around = jnp.mean(absolute(jnp.roll(values, 1, axis=1) - values), axis=-1)
+    upwards = jnp.mean(absolute(values[1:] - values[:-1]), axis=-1)
+    return jnp.sum(weight * around) + jnp.sum(0.5 * (weight[1:] + weight[:-1]) * upwards)
+
+
+def _solid_angle_shares(radiance: Float[Array, "H W 3"]) -> Float[Array, "H W"]:
+    """Parts of the sphere that texels cover."""
+    solid_angles = texel_solid_angles(*radiance.shape[:2])
+    return (solid_angles / (4 * math.pi)).astype(radiance.dtype)
 
 
 def edge_aware_smoothness(
@@ -287,6 +329,8 @@ VIEW_TERMS: dict[str, Callable[[ViewInputs], Float[Array, ""]]] = {
     "l1": lambda x: image_l1(x.comparison),  # Eq. 13
     "ssim": lambda x: image_dissimilarity(x.comparison),
     "mask": lambda x: mask_error(x.comparison),
+    "encoded_l1": lambda x: image_l1(x.comparison.encoded()),
+    "encoded_ssim": lambda x: image_dissimilarity(x.comparison.encoded()),
     "light": lambda x: light_agreement(  # Eq. 18
         x.output.aovs["diffuse"],
         x.output.aovs["specular_radiance"],
@@ -307,7 +351,10 @@ SHARED_TERMS: dict[str, Callable[[SharedInputs], Float[Array, ""]]] = {
     "smoothness_albedo": lambda x: x.changes.albedo,  # Eq. 15-17
     "smoothness_roughness_metallic": lambda x: x.changes.roughness + x.changes.metallic,
     "indirect": lambda x: indirect_magnitude(x.asset),
+    "metallic": lambda x: mean_metallic(x.asset.attributes.materials.metallic, x.asset.splats.mask),
     "white_balance": lambda x: white_balance(x.params.light.radiance),
+    "light_tint": lambda x: light_tint(x.params.light.radiance),
+    "light_smoothness": lambda x: light_smoothness(x.params.light.radiance),
 }
 """Terms that no view has a part in. A surface adds penalties of its own."""
 

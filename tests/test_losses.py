@@ -14,7 +14,10 @@ from geosplat_jax.losses import (
     image_dissimilarity,
     image_l1,
     light_agreement,
+    light_smoothness,
+    light_tint,
     mask_error,
+    mean_metallic,
     random_background,
     white_balance,
 )
@@ -145,6 +148,58 @@ def test_grey_light_is_balanced_and_coloured_light_is_not():
     assert float(white_balance(grey)) == pytest.approx(0.0, abs=1e-7)
     red = jnp.zeros((4, 8, 3)).at[..., 0].set(0.9)
     assert float(white_balance(red)) == pytest.approx((0.6 + 0.3 + 0.3) / 3, rel=ROUNDING)
+
+
+def test_a_tint_of_the_light_is_relative_and_counts_by_solid_angle():
+    grey = jnp.broadcast_to(uniform(0, 4, 8, 1, low=0.1), (4, 8, 3))
+    assert float(light_tint(grey)) == pytest.approx(0.0, abs=1e-6)
+    red = jnp.zeros((4, 8, 3)).at[..., 0].set(0.9)
+    assert float(light_tint(red)) == pytest.approx((0.6 + 0.3 + 0.3) / 0.9, rel=1e-5)
+    assert float(light_tint(7.0 * red)) == pytest.approx(float(light_tint(red)), rel=1e-5)
+    # A tinted row at the pole is less of the sphere than one at the equator.
+    pole, equator = (grey.at[row, :, 0].multiply(3.0) for row in (0, 1))
+    assert float(light_tint(pole)) < float(light_tint(equator))
+
+
+def test_noise_of_the_light_costs_more_than_a_sun():
+    """As much light in one bright patch, and in as many texels here and there."""
+    sky = jnp.full((8, 16, 3), 0.5)
+    assert float(light_smoothness(sky)) == pytest.approx(0.0, abs=1e-6)
+    sun = sky.at[3:5, 4:8].set(20.0)
+    noise = sky.at[2:6:2, ::4].set(20.0)
+    assert float(sun.sum()) == float(noise.sum())
+    assert float(light_smoothness(sun)) < 0.6 * float(light_smoothness(noise))
+    brighter = sky.at[3:5, 4:8].set(200.0)
+    # The logarithm of the contrast: 10 times the light costs 62 % more.
+    ratio = float(light_smoothness(brighter)) / float(light_smoothness(sun))
+    assert ratio == pytest.approx(np.log(400) / np.log(40), rel=1e-4)
+    # It goes around, and not over the poles.
+    seam = float(light_smoothness(jnp.roll(sun, 11, axis=1)))
+    assert seam == pytest.approx(float(light_smoothness(sun)), rel=1e-5)
+
+
+def test_padding_has_no_part_in_the_mean_metallic():
+    values, mask = jnp.array([0.2, 0.6, 1.0]), jnp.array([True, True, False])
+    assert float(mean_metallic(values, mask)) == pytest.approx(0.4)
+    assert float(mean_metallic(values, jnp.zeros(3, bool))) == 0.0
+    slope = jax.grad(mean_metallic)(values, mask)
+    np.testing.assert_allclose(slope, [0.5, 0.5, 0.0])
+
+
+def test_shade_weighs_more_in_encoded_colour():
+    dark, bright = (jnp.full((1, 4, 4, 3), value) for value in (0.02, 0.8))
+    image = jnp.ones((1, 4, 4, 4))
+    black = jnp.zeros((1, 4, 4, 3))
+
+    def errors(value):
+        images = compare(
+            value + 0.02, jnp.ones((1, 4, 4)), image.at[..., :3].set(value), black, None, srgb=False
+        )
+        return float(image_l1(images)), float(image_l1(images.encoded()))
+
+    (linear_dark, encoded_dark), (linear_bright, encoded_bright) = errors(dark), errors(bright)
+    assert linear_dark == pytest.approx(linear_bright, rel=1e-4)
+    assert encoded_dark > 5 * encoded_bright
 
 
 def test_normals_may_change_where_the_photograph_does():

@@ -15,6 +15,8 @@ from geosplat_jax.losses import (
     image_dissimilarity,
     image_l1,
     light_agreement,
+    light_smoothness,
+    light_tint,
     mask_error,
     white_balance,
 )
@@ -140,6 +142,8 @@ def loss_term_problems(rng: np.random.Generator) -> list[Problem]:
     def others(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
         return {
             "white balance": white_balance(inputs["radiance"]),
+            "tint of the light": light_tint(inputs["radiance"]),
+            "smoothness of the light": light_smoothness(inputs["radiance"]),
             "normal smoothness": edge_aware_smoothness(inputs["normals"], constants["image"]),
         }
 

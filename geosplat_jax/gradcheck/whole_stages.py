@@ -36,6 +36,11 @@ _SETTINGS = (
     "objective.background=black",
     "stages.split_sum.weights.light=0.15",
     "stages.split_sum.weights.white_balance=0.002",
+    "stages.split_sum.weights.light_tint=0.01",
+    "stages.split_sum.weights.light_smoothness=0.01",
+    "stages.split_sum.weights.metallic=0.01",
+    "stages.split_sum.weights.encoded_l1=0.3",
+    "stages.split_sum.weights.encoded_ssim=0.1",
     "stages.split_sum.weights.normal_smoothness=0.03",
 )
 _CAPACITIES = Capacities(
