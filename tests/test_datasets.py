@@ -10,7 +10,6 @@ import pytest
 from support import shared_path
 
 from geosplat_jax.io.dataset import describe, load_dataset, load_recorded
-from geosplat_jax.io.frames import AngleLens, PinholeLens
 from geosplat_jax.io.images import (
     ImageReadError,
     MissingFileError,
@@ -21,6 +20,7 @@ from geosplat_jax.io.images import (
     write_hdr,
     write_png,
 )
+from geosplat_jax.io.lenses import AngleLens, PinholeLens
 
 SIZE, ANGLE, RADIUS, DISTANCE = 24, 0.7, 0.8, 4.0
 ALBEDO, RADIANCE = np.array([0.8, 0.2, 0.05]), np.array([0.5, 0.25, 0.1])
