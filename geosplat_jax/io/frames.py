@@ -27,6 +27,7 @@ TEST_EVERY = 8
 """Where a capture names no test views, every eighth is one."""
 
 _OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_IMAGE_FOLDERS = ("images", "image", "blended_images")
 _MASK_FOLDERS = ("masks", "mask")
 _VALID_FOLDERS = ("valid",)
 
@@ -309,15 +310,19 @@ def find_lights(folders: list[Path], names: list[str]) -> dict[str, Path]:
     return found
 
 
+def _within_images(root: Path, image: Path) -> Path:
+    """Path of an image below the folder of all images."""
+    relative = image.relative_to(root)
+    return Path(*relative.parts[1:]) if relative.parts[0] in _IMAGE_FOLDERS else relative
+
+
 def beside_images(root: Path, image: Path, folders: tuple[str, ...]) -> Path | None:
     """Return the PNG that belongs to an image in one of the folders, None where there is none.
 
     It is named after the image, with or without the image's own ending (``IMG_1.png``,
-    ``IMG_1.jpg.png``), and lies in ``root/FOLDER`` under what leads from the folder of all images,
-    the first below ``root``, to this one.
+    ``IMG_1.jpg.png``), and lies in ``root/FOLDER`` as the image lies in ``root/images``.
     """
-    relative = image.relative_to(root)
-    inner = Path(*relative.parts[1:]) if len(relative.parts) > 1 else relative
+    inner = _within_images(root, image)
     names = (inner.with_suffix(".png"), inner.with_name(inner.name + ".png"))
     candidates = [root / folder / name for folder in folders for name in names]
     path = next((path for path in candidates if path.is_file()), None)
@@ -333,16 +338,30 @@ def captured_frame(
     ----------
     mask : the object's mask, where the files of the scene name one.
     """
-    relative = image.relative_to(root).with_suffix("")
-    inner = relative.parts[1:] if len(relative.parts) > 1 else relative.parts
     return Frame(
-        "_".join(inner),
+        "_".join(_within_images(root, image).with_suffix("").parts),
         pose,
         lens,
         image,
         mask=mask or beside_images(root, image, _MASK_FOLDERS),
         valid=beside_images(root, image, _VALID_FOLDERS),
     )
+
+
+def images_in(root: Path, folders: tuple[str, ...]) -> list[Path]:
+    """Return the images of the first of the folders that is there, by name.
+
+    Raises
+    ------
+    MissingFileError : none is there, or it has no image.
+    """
+    folder = next((root / name for name in folders if (root / name).is_dir()), None)
+    found = [] if folder is None else sorted(folder.iterdir())
+    images = [path for path in found if path.suffix.lower() in IMAGE_SUFFIXES]
+    if not images:
+        names = " or ".join(f"{name}/" for name in folders)
+        raise MissingFileError(f"{root} has no images in {names}; add them")
+    return [existing(root, [path], path.name) for path in images]
 
 
 def split_capture(frames: Sequence[Frame], *, notes: tuple[str, ...] = ()) -> Listing:
