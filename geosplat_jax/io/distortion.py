@@ -41,7 +41,7 @@ class Brown:
     tangential: tuple[float, float] = (0.0, 0.0)
     divisor: tuple[float, ...] = ()
 
-    def profile(self, radius: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    def profile(self, radius: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """Radius at which a radius is shown, without the tangential part."""
         squared = radius * radius
         return radius * _powers(squared, self.radial) / _nonzero(_powers(squared, self.divisor))
@@ -70,7 +70,7 @@ class Fisheye:
 
     radial: tuple[float, ...]
 
-    def profile(self, radius: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    def profile(self, radius: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """Radius at which a radius is shown."""
         angle = np.arctan(radius)
         return angle * _powers(angle * angle, self.radial)

@@ -8,6 +8,7 @@ scene folder.
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, NamedTuple
 
@@ -171,7 +172,8 @@ def checked_numbers(values: Any, shape: tuple[int, ...], what: str) -> Float[np.
         numbers = np.empty(0)
     if numbers.shape != shape or not np.isfinite(numbers).all():
         size = " x ".join(str(length) for length in shape)
-        raise SceneError(f"{what} must be {size} finite numbers, got {values!r}")
+        shown = values.tolist() if isinstance(values, np.ndarray) else values
+        raise SceneError(f"{what} must be {size} finite numbers, got {shown!r}")
     return numbers
 
 
@@ -368,8 +370,17 @@ def split_capture(frames: Sequence[Frame], *, notes: tuple[str, ...] = ()) -> Li
     """Choose test views where nobody did: by name, the first and every eighth after it.
 
     A single view is kept for training.
+
+    Raises
+    ------
+    SceneError : two views have one name.
     """
     ordered = sorted(frames, key=lambda frame: frame.name)
+    for one, other in pairwise(ordered):
+        if one.name == other.name:
+            raise SceneError(
+                f"{one.image} and {other.image} are both named {one.name!r}; rename one"
+            )
     test = ordered[::TEST_EVERY] if len(ordered) > 1 else []
     train = [ordered[i] for i in range(len(ordered)) if i % TEST_EVERY or not test]
     chosen = f"no split is given: {len(test)} test views of {len(ordered)}, every {TEST_EVERY}th"

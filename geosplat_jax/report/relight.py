@@ -63,7 +63,7 @@ def load_view_light(light: ViewLight, *, largest: int = LARGEST_LIGHT) -> EnvLig
     """
     axes = np.asarray(to_y_up_map(jnp.eye(3)), np.float64).T
     turn = light.camera_to_world[:3, :3] @ axes
-    return rotate_light(load_light(light.path, largest=largest), jnp.asarray(turn, jnp.float32))
+    return _rotate_light(load_light(light.path, largest=largest), jnp.asarray(turn, jnp.float32))
 
 
 def about_z(angle: float) -> np.ndarray:

@@ -70,7 +70,7 @@ def _camera_file(root: Path) -> Path | None:
 def _read_matrices(where: Path) -> dict[str, np.ndarray]:
     """Read the arrays; those that would run code are refused."""
     try:
-        with np.load(where, allow_pickle=False) as content:
+        with where.open("rb") as file, np.load(file, allow_pickle=False) as content:
             return {key: content[key] for key in content.files if not key.endswith("inv")}
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
         raise SceneError(f"{where} is damaged ({error}); write it again") from error

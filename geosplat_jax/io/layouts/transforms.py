@@ -56,10 +56,12 @@ def list_transforms_capture(root: Path, *, light: str | None = None) -> Listing:
     content = read_json(where)
     if "applied_transform" in content:
         checked_numbers(content["applied_transform"], (3, 4), f"'applied_transform' of {where}")
-    frames = {
-        _plain(listed.file_path): _frame(root, listed, where)
-        for listed in list_transforms(content, where)
-    }
+    frames: dict[str, Frame] = {}
+    for listed in list_transforms(content, where):
+        name = _plain(listed.file_path)
+        if name in frames:
+            raise SceneError(f"{where} names {name!r} for two frames; remove one")
+        frames[name] = _frame(root, listed, where)
     splits = {key: _names(content, key, where, frames) for key in _SPLITS if key in content}
     if not splits:
         return split_capture(list(frames.values()))
