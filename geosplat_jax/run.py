@@ -44,8 +44,9 @@ REFINEMENT_SAMPLES = 32
 
 def _true_light(dataset: Dataset, lights: Mapping[str, EnvLight]) -> EnvLight | None:
     """Return the light of the training images: by its name, or as the first test view saw it."""
-    if dataset.train_light in lights:
-        return lights[dataset.train_light]
+    named = lights.get(dataset.train_light or "")
+    if named is not None:
+        return named
     first = next(iter(dataset.test.lights.values()), None)
     return None if first is None else load_view_light(first)
 

@@ -267,11 +267,11 @@ def test_pixels_that_do_not_count_have_no_part_in_any_figure(run, views, perfect
         valid=valid,
     )
     mean = evaluate(run, cropped, tmp_path)["mean"]
-    assert set(mean) == set(perfect[1]["mean"])
+    of_light = {key for key in perfect[1]["mean"] if key.startswith("light.")}
+    assert set(mean) == set(perfect[1]["mean"]) - of_light
     for key in ("nvs.psnr", "albedo.psnr", "relight.mean.psnr"):
         assert mean[key] > 40, key
     assert mean["mask.iou"] > 0.99
-    # A third of the pixels are background, so the mean over those that count is another one.
     assert mean["normal.mae_masked_deg"] < 0.5
     assert mean["roughness.mse_full"] < 1e-6
 

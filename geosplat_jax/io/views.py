@@ -158,19 +158,24 @@ def load_views(
     canvas = np.max(sizes, axis=0)
     images = np.zeros((len(frames), *canvas, 4), np.float32)
     valid = np.zeros((len(frames), *canvas), bool)
-    has_mask = np.ones(len(frames), bool)
+    has_mask, leaves_file = np.ones(len(frames), bool), np.zeros(len(frames), bool)
 
     def fill(index: int) -> None:
         frame = frames[index]
         photograph = _read_photograph(frame)
         rows, columns = (slice(0, length) for length in sizes[index])
         images[index, rows, columns], valid[index, rows, columns] = photograph.reduced(factor)
-        has_mask[index] = photograph.has_mask
+        has_mask[index], leaves_file[index] = photograph.has_mask, photograph.leaves_file
         if not (photograph.has_mask or listing.is_capture):
             raise SceneError(_no_mask(frame))
 
     _in_parallel(fill, range(len(frames)))
     _require_masks_in_all_or_none(frames, has_mask)
+    if listing.is_capture and leaves_file.any():
+        problems.append(
+            f"{int(leaves_file.sum())} mask files are not read: their images have an alpha, "
+            f"{frames[int(np.argmax(leaves_file))].image.name} for one"
+        )
     lenses = [
         frame.lens.intrinsics(width, height)
         for frame, (height, width) in zip(frames, full, strict=True)
@@ -282,11 +287,13 @@ class _Photograph(NamedTuple):
     rgba : (H, W, 4) linear; zero where the colour does not count.
     valid : (H, W) pixels that count.
     has_mask : False where alpha is one because nothing is known of it.
+    leaves_file : True where the image's own alpha is taken and not the file of a mask.
     """
 
     rgba: Float[np.ndarray, "H W 4"]
     valid: Bool[np.ndarray, "H W"]
     has_mask: bool
+    leaves_file: bool
 
     def reduced(self, factor: int) -> tuple[np.ndarray, np.ndarray]:
         """Return colours and what counts of a smaller image: pixels of which all parts count."""
@@ -298,8 +305,9 @@ def _read_photograph(frame: Frame) -> _Photograph:
     """Read one view as linear RGBA without distortion."""
     pixels = _as_rgba_or_rgb(read_linear(frame.image))
     rgb, alpha = pixels[..., :3], pixels[..., 3:]
-    if frame.mask is not None and (alpha.size == 0 or alpha.min() == 1.0):
-        # An alpha of one everywhere says nothing, so a mask file takes its place.
+    # An alpha of one everywhere says nothing, so a mask file takes its place.
+    leaves_file = frame.mask is not None and alpha.size > 0 and alpha.min() < 1.0
+    if frame.mask is not None and not leaves_file:
         alpha = _read_mask(frame.mask, rgb)
     has_mask = alpha.size > 0
     if not has_mask:
@@ -314,7 +322,7 @@ def _read_photograph(frame: Frame) -> _Photograph:
     if frame.ignored is not None:
         valid &= _read_mask(frame.ignored, rgb)[..., 0] == 0.0
     rgba, seen = _undistorted(frame, rgba, valid)
-    return _Photograph(np.where(seen[..., None], rgba, 0.0), seen, has_mask)
+    return _Photograph(np.where(seen[..., None], rgba, 0.0), seen, has_mask, leaves_file)
 
 
 def _read_mask(path: Path, rgb: np.ndarray) -> np.ndarray:

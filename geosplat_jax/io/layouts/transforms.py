@@ -27,6 +27,7 @@ from geosplat_jax.io.frames import (
     image_stem,
     inside_scene,
     list_transforms,
+    optional_files,
     read_json,
     split_capture,
 )
@@ -87,8 +88,8 @@ def _frame(root: Path, listed: ListedFrame, where: Path) -> Frame:
         path = inside_scene(root, name, where)
         mask = existing(root, [path], f"the mask of {listed.file_path} of {where.name}")
     frame = captured_frame(root, image, listed.pose, listed.lens, mask=mask)
-    ignored = image.with_name(f"dynamic_mask_{image.stem}.png")
-    return replace(frame, ignored=ignored) if ignored.is_file() else frame
+    ignored = {"ignored": image.with_name(f"dynamic_mask_{image.stem}.png")}
+    return replace(frame, **optional_files(root, ignored))
 
 
 def _names(
