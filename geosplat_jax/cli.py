@@ -249,6 +249,8 @@ def _train(arguments: argparse.Namespace) -> None:
     config = _config_from(arguments)
     folder = arguments.output or Path("runs") / arguments.scene.resolve().name
     dataset = load_recorded(arguments.scene, _scene_options(arguments))
+    for note in dataset.notes:
+        _say(note)
     for warning in (*dataset.warnings, *config_warnings(config)):
         _say(warning, label="warning: ", style="yellow")
     _say(f"{dataset.name}: {len(dataset.train)} views, {dataset.layout}; compiling ...")

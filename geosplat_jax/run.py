@@ -5,7 +5,7 @@
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from functools import cached_property, partial
@@ -35,11 +35,20 @@ from geosplat_jax.report.consistency import Consistency, measure, traceable
 from geosplat_jax.report.evaluate import evaluate_run, preview_image
 from geosplat_jax.report.pictures import normals_to_rgb
 from geosplat_jax.report.protocols import PROTOCOLS
-from geosplat_jax.report.relight import RelightOptions, load_light, relight_views
+from geosplat_jax.report.relight import RelightOptions, load_light, load_view_light, relight_views
 from geosplat_jax.report.renderer import DEFAULT_SAMPLES, Renderer, build_asset, straight_rgba
 
 REFINEMENT_SAMPLES = 32
 """Rays per splat when cameras are refined: noise averages out over the pixels of a view."""
+
+
+def _true_light(dataset: Dataset, lights: Mapping[str, EnvLight]) -> EnvLight | None:
+    """Return the light of the training images: by its name, or as the first test view saw it."""
+    named = lights.get(dataset.train_light or "")
+    if named is not None:
+        return named
+    first = next(iter(dataset.test.lights.values()), None)
+    return None if first is None else load_view_light(first)
 
 
 class Run:
@@ -162,10 +171,13 @@ class Run:
         ------
         RunError
             If the scene has no test views.
+        SceneError
+            If they have no masks.
         TrainingError
             If that stage has not ended.
         """
         views = self._views("test")
+        self.dataset.require_masks("test")
         record, dataset = self.folder.record(), self.dataset
         trained = self.trained if stage is None else load_trained(self.folder, stage=stage)
         lights = {name: load_light(path) for name, path in dataset.lights.items()}
@@ -184,7 +196,7 @@ class Run:
             },
             protocol=protocol,
             lights=lights,
-            train_light=lights.get(dataset.train_light or ""),
+            train_light=_true_light(dataset, lights),
             samples=samples,
             relight_indirect=relight_indirect,
         )

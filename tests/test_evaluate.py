@@ -252,6 +252,30 @@ def test_a_view_without_an_object_has_no_part_in_masked_metrics(run, views, tmp_
         assert metrics["mean"][key] == with_object[key]
 
 
+def test_pixels_that_do_not_count_have_no_part_in_any_figure(run, views, perfect, tmp_path):
+    valid = np.ones(views.masks.shape, np.float32)
+    valid[:, :, :7] = 0.0
+
+    def counted(values):
+        return values * valid.reshape(valid.shape + (1,) * (values.ndim - 3))
+
+    cropped = replace(
+        views,
+        images=counted(views.images),
+        truth={name: counted(values) for name, values in views.truth.items()},
+        relight={name: counted(values) for name, values in views.relight.items()},
+        valid=valid,
+    )
+    mean = evaluate(run, cropped, tmp_path)["mean"]
+    of_light = {key for key in perfect[1]["mean"] if key.startswith("light.")}
+    assert set(mean) == set(perfect[1]["mean"]) - of_light
+    for key in ("nvs.psnr", "albedo.psnr", "relight.mean.psnr"):
+        assert mean[key] > 40, key
+    assert mean["mask.iou"] > 0.99
+    assert mean["normal.mae_masked_deg"] < 0.5
+    assert mean["roughness.mse_full"] < 1e-6
+
+
 def test_an_unknown_protocol_is_refused_before_any_work(run, views, tmp_path):
     with pytest.raises(ValueError, match="nobody"):
         evaluate(run, views, tmp_path, protocol="nobody")

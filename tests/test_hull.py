@@ -13,6 +13,7 @@ from geosplat_jax.surface.hull import (
     hull_bounds,
     hull_distance,
     hull_sdf,
+    sight_bounds,
     visual_hull,
 )
 
@@ -261,3 +262,61 @@ def test_hull_of_a_path_traced_scene_encloses_its_true_mesh(name):
         train.world_to_camera, train.intrinsics, train.images[..., 3], vertices
     )
     assert distance.max() < 0.01 * extent
+
+
+def test_pixels_that_do_not_count_carve_nothing(sphere):
+    poses, intrinsics, masks = sphere
+    # A bar hides a part of every ball, in the mask too, and the border of the image is unknown.
+    valid = np.ones(masks.shape, np.float32)
+    valid[:, :, 34:40] = 0.0
+    valid[:, :6] = 0.0
+    hidden = (masks * valid).astype(np.float32)
+    before = hidden.copy()
+    settings = {"tolerance": 0.0, "seen_fraction": 0.25}
+    inside = np.random.default_rng(0).normal(size=(400, 3))
+    inside *= 0.97 * RADIUS / np.linalg.norm(inside, axis=1, keepdims=True)
+    outside = inside * (1.2 / 0.97)
+    assert not visual_hull(poses, intrinsics, hidden, inside, **settings).all()
+    assert visual_hull(poses, intrinsics, hidden, inside, valid=valid, **settings).all()
+    assert visual_hull(poses, intrinsics, hidden, outside, valid=valid, **settings).mean() < 0.02
+    lo, hi = hull_bounds(poses, intrinsics, hidden, valid=valid)
+    exact = hull_bounds(poses, intrinsics, masks)
+    np.testing.assert_allclose((lo, hi), exact, atol=0.1)
+    grid = fit_grid(exact, 16)
+    sdf = hull_sdf(poses, intrinsics, hidden, grid, valid=valid)
+    np.testing.assert_allclose(sdf, hull_sdf(poses, intrinsics, masks, grid), atol=1.0)
+    # Nothing was written to what was given.
+    np.testing.assert_array_equal(hidden, before)
+
+
+def test_where_all_pixels_count_the_hull_is_the_same(sphere):
+    points = np.random.default_rng(3).uniform(-1.2, 1.2, (500, 3))
+    every = hull_distance(*sphere, points, valid=np.ones(sphere[2].shape, bool))
+    # Another program, so another rounding.
+    np.testing.assert_allclose(every, hull_distance(*sphere, points), atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_what_all_cameras_look_at_is_the_middle_of_the_bounds(scale):
+    center = scale * np.array([5.0, -3.0, 2.0])
+    poses, intrinsics = cameras_around(center, scale=scale)
+    lo, hi = sight_bounds(poses, intrinsics, height=SIZE, width=SIZE)
+    np.testing.assert_allclose((lo + hi) / 2, center, atol=1e-9 * scale)
+    # The corners of the cube are on the rim of what a camera shows.
+    corner = np.sqrt(3.0) * (hi - lo) / 2
+    np.testing.assert_allclose(corner, scale * DISTANCE * (SIZE / 2) / FOCAL, rtol=1e-9)
+    wide = intrinsics * np.array([[0.05], [0.05], [1.0]])
+    lo, hi = sight_bounds(poses, wide, height=SIZE, width=SIZE)
+    positions = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+    assert not ((positions > lo) & (positions < hi)).all(1).any()
+
+
+def test_cameras_that_look_nowhere_in_common_are_refused():
+    poses, intrinsics = cameras_around(np.zeros(3))
+    with pytest.raises(ValueError, match="parallel"):
+        sight_bounds(poses[[0, 0]], intrinsics[:2], height=SIZE, width=SIZE)
+    away = poses.copy()
+    turn = np.diag([1.0, -1.0, -1.0, 1.0])
+    away[:25] = turn @ poses[:25]
+    with pytest.raises(ValueError, match="25 of 40 cameras look away"):
+        sight_bounds(away, intrinsics, height=SIZE, width=SIZE)

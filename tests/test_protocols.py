@@ -411,3 +411,79 @@ def test_masked_ssim_is_what_the_protocols_print():
     measured = protocols.albedo_metrics(IRGS, albedo, alpha, truth, mask, np.ones(3))
     expected = ssim_masked(np.clip(albedo[0], 0, 1), truth[0], mask[0])
     assert measured["albedo.ssim_masked"] == pytest.approx(float(expected), abs=1e-5)
+
+
+def spoiled(views=2, size=26):
+    """A scene, half of whose pixels do not count and are zero; and one with a part cut away."""
+    albedo, alpha, truth, mask = scene(views, size)
+    # A border of unequal width for each view, so that pooling has to weigh.
+    valid = np.zeros(mask.shape, np.float32)
+    valid[0, :, : size // 2] = 1
+    valid[1:, 4:] = 1
+    colors = valid[..., None]
+    return valid, (albedo * colors, alpha * valid, truth * colors, mask * valid)
+
+
+def cut(maps, columns):
+    """Only the columns that count, of the first view."""
+    return [values[:1, :, :columns] for values in maps]
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_figures_are_those_of_the_pixels_that_count_alone(name):
+    row = protocol(name)
+    valid, maps = spoiled()
+    one = [values[:1] for values in maps]
+    small = cut(maps, 13)
+    found = protocols.albedo_metrics(row, *one, GAIN, valid[:1])
+    expected = protocols.albedo_metrics(row, *small, GAIN)
+    # Windows across the border see black in both, so only means over pixels are equal.
+    for key in ("albedo.psnr", "albedo.psnr_masked"):
+        assert found[key] == pytest.approx(expected[key], abs=DECIBELS)
+    assert 0 < found["albedo.ssim"] < 1
+    assert found["albedo.psnr"] < protocols.albedo_metrics(row, *one, GAIN)["albedo.psnr"] - 2
+
+    def rgba(maps):
+        _, _, truth, mask = maps
+        return np.concatenate([truth, mask[..., None]], -1)
+
+    lit = protocols.relight_metrics(row, one[0], one[1], rgba(one), valid[:1])
+    other = protocols.relight_metrics(row, small[0], small[1], rgba(small))
+    assert lit["psnr"] == pytest.approx(other["psnr"], abs=DECIBELS)
+    new = protocols.new_view_metrics(one[0][0], one[1][0], rgba(one)[0], valid[0])
+    other = protocols.new_view_metrics(small[0][0], small[1][0], rgba(small)[0])
+    assert new["nvs.psnr"] == pytest.approx(other["nvs.psnr"], abs=DECIBELS)
+
+
+def test_materials_and_pooled_errors_weigh_the_pixels_that_count():
+    valid, (albedo, alpha, truth, mask) = spoiled()
+    rough = {"roughness": albedo[..., 0]}
+    known = {"roughness": truth[..., 0]}
+    found = protocols.material_metrics(rough, alpha, known, mask, valid)
+    squared = (albedo[..., 0] - truth[..., 0]) ** 2
+    means = [squared[view][valid[view] == 1].mean() for view in range(2)]
+    assert found["roughness.mse_full"] == pytest.approx(np.mean(means), rel=1e-5)
+    # tensoir pools the squared error of all pixels on white, gamma 2.2.
+    found = protocols.albedo_metrics(TENSOIR, albedo, alpha, truth, mask, np.ones(3), valid)
+    inside = mask[..., None]
+    error = inside * (np.clip(albedo, 0, 1) ** (1 / 2.2) - truth ** (1 / 2.2)) ** 2
+    expected = decibels(error.sum() / (3 * valid.sum()))
+    assert found["albedo.psnr"] == pytest.approx(expected, abs=DECIBELS)
+
+
+def test_where_all_pixels_count_the_figures_are_the_same():
+    maps = scene(2, 16)
+    every = np.ones((2, 16, 16), np.float32)
+    found = protocols.albedo_metrics(GEOSPLATTING, *maps, GAIN, every)
+    same(found, protocols.albedo_metrics(GEOSPLATTING, *maps, GAIN), rel=1e-5)
+
+
+def test_coverage_where_pixels_do_not_count_is_refused():
+    valid, maps = spoiled()
+    _, whole_alpha, _, whole_mask = scene(2, 26)
+    albedo, alpha, truth, mask = maps
+    for wrong in ((albedo, whole_alpha, truth, mask), (albedo, alpha, truth, whole_mask)):
+        with pytest.raises(ValueError, match="must be zero on pixels that do not count"):
+            protocols.albedo_metrics(GEOSPLATTING, *wrong, GAIN, valid)
+    with pytest.raises(ValueError, match="valid must be"):
+        protocols.albedo_metrics(GEOSPLATTING, *maps, GAIN, valid[:, :5])

@@ -119,6 +119,7 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
             np.asarray(camera.intrinsics, np.float64),
             views.images[..., 3],
             grid,
+            valid=views.valid,
         )
         return jnp.clip(jnp.asarray(sdf), -_SDF_REACH, _SDF_REACH)
 

@@ -182,6 +182,8 @@ def fit(
     ------
     ValueError
         If ``resume`` and ``source`` are both given, or ``source`` without ``first_stage``.
+    SceneError
+        If the training views have no masks.
     RunError
         If the folder is another's, or in use.
     TrainingError
@@ -194,6 +196,7 @@ def fit(
         raise ValueError("a run that is resumed has its first stages already; leave source out")
     if (source is None) != (first_stage is None):
         raise ValueError("source and first_stage belong together")
+    dataset.require_masks("train")
     run = RunFolder(folder)
     with run.locked(), _stop_requests() as stop_requested:
         has_begun = False

@@ -11,16 +11,21 @@ from jaxtyping import Float
 from geosplat_jax.io.cameras import cameras_digest, read_cameras, with_cameras
 from geosplat_jax.io.frames import Frame, Listing
 from geosplat_jax.io.images import MissingFileError, SceneError
+from geosplat_jax.io.layouts.blended_mvs import is_blended_mvs, list_blended_mvs
+from geosplat_jax.io.layouts.colmap import is_colmap, list_colmap
+from geosplat_jax.io.layouts.idr import is_idr, list_idr
 from geosplat_jax.io.layouts.nerf_synthetic import (
     is_nerf_synthetic,
     is_shiny_blender,
     list_nerf_synthetic,
     list_shiny_blender,
 )
+from geosplat_jax.io.layouts.stanford_orb import is_stanford_orb, list_stanford_orb
 from geosplat_jax.io.layouts.synthetic4relight import is_synthetic4relight, list_synthetic4relight
 from geosplat_jax.io.layouts.tensoir import is_tensoir, list_tensoir
+from geosplat_jax.io.layouts.transforms import is_transforms, list_transforms_capture
 from geosplat_jax.io.views import COVERED, Views, load_views, no_views
-from geosplat_jax.surface.hull import hull_bounds
+from geosplat_jax.surface.hull import hull_bounds, sight_bounds
 
 
 class Layout(NamedTuple):
@@ -32,17 +37,22 @@ class Layout(NamedTuple):
 
 # The most specific first.
 LAYOUTS: dict[str, Layout] = {
+    "stanford_orb": Layout(is_stanford_orb, list_stanford_orb),
     "tensoir": Layout(is_tensoir, list_tensoir),
     "synthetic4relight": Layout(is_synthetic4relight, list_synthetic4relight),
     "shiny_blender": Layout(is_shiny_blender, list_shiny_blender),
     "nerf_synthetic": Layout(is_nerf_synthetic, list_nerf_synthetic),
+    "transforms": Layout(is_transforms, list_transforms_capture),
+    "colmap": Layout(is_colmap, list_colmap),
+    "idr": Layout(is_idr, list_idr),
+    "blended_mvs": Layout(is_blended_mvs, list_blended_mvs),
 }
 
-_UNSUPPORTED = {
-    "transforms.json": "an instant-ngp or nerfstudio capture",
-    "sparse/0": "a COLMAP reconstruction",
-    "train_mask": "a Stanford-ORB scene",
-}
+
+_NEEDS_MASKS = (
+    "training and evaluation need to know the object from the rest: write RGBA images, name a "
+    "mask_path for each frame, or add masks/NAME.png, white on the object (docs/captures.md)"
+)
 
 
 @dataclass(frozen=True)
@@ -57,6 +67,7 @@ class Dataset:
     train_light : light of the training images, where the layout names lights.
     bounds : lo (3,) and hi (3,), a world box around the object.
     warnings : what looks wrong but does not stop the work.
+    notes : what was chosen where the files leave it open.
     options : how it was read, for `load_recorded`.
     """
 
@@ -69,7 +80,14 @@ class Dataset:
     train_light: str | None
     bounds: tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
     warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
+
+    def require_masks(self, split: str) -> None:
+        """Refuse a split whose views have no masks; `SceneError`."""
+        views = self.train if split == "train" else self.test
+        if len(views) and not views.has_masks:
+            raise SceneError(f"the {split} views of {self.root} have no masks, but {_NEEDS_MASKS}")
 
 
 def load_dataset(
@@ -122,12 +140,18 @@ def load_dataset(
             splits.append(no_views(splits[0]))
             continue
         views, problems = load_views(chosen, factor=downscale, listing=listing)
+        _check_pixels(views, split)
         _check_masks(views, split, warnings)
         warnings += [f"{split}: {problem}" for problem in problems]
         if split in refined:
             views = with_cameras(views, refined[split], str(cameras))
         splits.append(views)
     train, test = splits
+    bare = [
+        name for name, views in zip(("train", "test"), splits, strict=True) if not views.has_masks
+    ]
+    if bare:
+        warnings.append(f"the {' and '.join(bare)} views have no masks; {_NEEDS_MASKS}")
     box = object_bounds(train) if bounds is None else _checked_bounds(bounds)
     for views in splits:
         _check_cameras_outside(views, box)
@@ -141,6 +165,7 @@ def load_dataset(
         train_light=listing.train_light,
         bounds=box,
         warnings=tuple(warnings),
+        notes=listing.notes,
         options={
             "downscale": downscale,
             "light": light,
@@ -195,27 +220,30 @@ def recognise_layout(root: Path) -> str:
     for name, layout in LAYOUTS.items():
         if layout.recognise(root):
             return name
-    kind = next((kind for mark, kind in _UNSUPPORTED.items() if (root / mark).exists()), None)
-    looks = f"looks like {kind}, which cannot be read" if kind else "has no known layout"
     raise SceneError(
-        f"{root} {looks}; expected transforms_train.json (NeRF-synthetic, Shiny Blender, "
-        "Synthetic4Relight) or folders train_000, test_000, ... (TensoIR)"
+        f"{root} has no known layout; expected transforms_train.json (NeRF-synthetic, Shiny "
+        "Blender, Synthetic4Relight, Stanford-ORB), folders train_000, test_000, ... (TensoIR), "
+        "transforms.json (nerfstudio, instant-ngp, nvdiffrec), sparse/0 (COLMAP), cameras*.npz "
+        "(IDR, NeuS) or cams/00000000_cam.txt (BlendedMVS)"
     )
 
 
 def object_bounds(
     views: Views, *, margin: float = 0.02
 ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-    """Box around the visual hull of the views; see `hull.hull_bounds`.
+    """Box around the visual hull of the views, or around what they look at without masks.
+
+    See `hull.hull_bounds` and `hull.sight_bounds`.
 
     Raises
     ------
     SceneError : the masks and cameras do not bound a volume.
     """
+    cameras = (views.world_to_camera, views.intrinsics)
     try:
-        return hull_bounds(
-            views.world_to_camera, views.intrinsics, views.images[..., 3], margin=margin
-        )
+        if not views.has_masks:
+            return sight_bounds(*cameras, height=views.height, width=views.width)
+        return hull_bounds(*cameras, views.images[..., 3], valid=views.valid, margin=margin)
     except ValueError as error:
         raise SceneError(f"cannot find the object: {error}") from error
 
@@ -227,11 +255,17 @@ def describe(dataset: Dataset) -> str:
         if not len(views):
             lines.append(f"  {split + ':':<12}none")
             continue
-        coverage = views.masks.mean((1, 2))
-        lines.append(
-            f"  {split + ':':<12}{len(views)} views of {views.width} x {views.height}, mask covers "
-            f"{coverage.mean():.1%} ({coverage.min():.1%} to {coverage.max():.1%})"
-        )
+        coverage, masks = views.coverage, "no masks"
+        if views.has_masks:
+            masks = (
+                f"mask covers {coverage.mean():.1%} ({coverage.min():.1%} to {coverage.max():.1%})"
+            )
+        size = f"{views.width} x {views.height}"
+        lines.append(f"  {split + ':':<12}{len(views)} views of {size}, {masks}")
+        if views.valid is not None:
+            lines.append(f"  {'':<12}pixels that count: {views.valid.mean():.1%}")
+        if views.lights:
+            lines.append(f"  {'':<12}environment maps of {len(views.lights)} views")
         if views.truth:
             lines.append(f"  {'':<12}ground truth: {', '.join(views.truth)}")
         if views.relight:
@@ -241,11 +275,26 @@ def describe(dataset: Dataset) -> str:
     lines.append(f"  {'maps:':<12}{maps or 'none found'}")
     lo, hi = dataset.bounds
     lines.append(f"  {'bounds:':<12}{_numbers(lo)} to {_numbers(hi)}, size {_numbers(hi - lo)}")
+    lines += [f"  note: {note}" for note in dataset.notes]
     lines += [f"  warning: {warning}" for warning in dataset.warnings]
     return "\n".join(lines)
 
 
+def _check_pixels(views: Views, split: str) -> None:
+    """Refuse a view of which no pixel counts."""
+    if views.valid is None:
+        return
+    counts = views.valid.any((1, 2))
+    if not counts.all():
+        name = views.names[int(np.argmin(counts))]
+        raise SceneError(
+            f"no pixel of the {split} view {name!r} counts; check its file in valid/, or its lens"
+        )
+
+
 def _check_masks(views: Views, split: str, warnings: list[str]) -> None:
+    if not views.has_masks:
+        return
     covered = views.masks.any((1, 2))
     if not covered.any():
         raise SceneError(
@@ -255,7 +304,7 @@ def _check_masks(views: Views, split: str, warnings: list[str]) -> None:
     if not covered.all():
         empty = [name for name, has in zip(views.names, covered, strict=True) if not has]
         warnings.append(f"{split}: the mask of {len(empty)} views is empty, {_some(empty)}")
-    if views.masks.all():
+    if (views.coverage == 1.0).all():
         warnings.append(f"{split}: every mask is full; the images may not be cut out at all")
 
 

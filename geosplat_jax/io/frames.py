@@ -6,75 +6,31 @@ scene folder.
 """
 
 import json
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from geosplat_jax.io.images import MissingFileError, SceneError
+from geosplat_jax.io.lenses import Lens, checked_lens
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff")
 MAP_SUFFIXES = (".hdr", ".exr")
 
 _RIGID_TOLERANCE = 1e-3
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-_LENS_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
-_FOCAL_TOLERANCE = 0.01
-"""Share by which a focal length may differ from the one that the camera's angle gives."""
-_LONGEST = 1e9
-"""Pixels; no lens is longer, and no image larger."""
+_QUATERNION_TOLERANCE = 1e-2
+TEST_EVERY = 8
+"""Where a capture names no test views, every eighth is one."""
 
-
-@dataclass(frozen=True)
-class AngleLens:
-    """A pinhole lens with square pixels and its axis in the middle of the image.
-
-    Attributes
-    ----------
-    angle_x : horizontal field of view in radians.
-    """
-
-    angle_x: float
-
-    def intrinsics(self, width: int, height: int) -> Float[np.ndarray, "3 3"]:
-        """Return the matrix of an image of this size, in its pixels."""
-        focal = 0.5 * width / np.tan(0.5 * self.angle_x)
-        return _matrix(focal, focal, 0.5 * width, 0.5 * height)
-
-
-@dataclass(frozen=True)
-class PinholeLens:
-    """A pinhole lens, given for images of one size.
-
-    Attributes
-    ----------
-    fx, fy : focal lengths in pixels.
-    cx, cy : principal point in pixels; pixel centres lie at integers + 0.5.
-    width, height : size of the image in pixels.
-    """
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    width: int
-    height: int
-
-    def intrinsics(self, width: int, height: int) -> Float[np.ndarray, "3 3"]:
-        """Return the matrix of the same view as an image of this size, in its pixels."""
-        x, y = width / self.width, height / self.height
-        return _matrix(self.fx * x, self.fy * y, self.cx * x, self.cy * y)
-
-
-Lens = AngleLens | PinholeLens
-
-
-def _matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+_OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_IMAGE_FOLDERS = ("images", "image", "blended_images")
+_MASK_FOLDERS = ("masks", "mask")
+_VALID_FOLDERS = ("valid",)
 
 
 @dataclass(frozen=True)
@@ -88,6 +44,9 @@ class Frame:
     lens : see `AngleLens` and `PinholeLens`.
     image : colour, with alpha unless there is a ``mask``.
     mask : coverage in channel 0, or None.
+    valid : file that is black where pixels do not count, or None; of the image's size.
+    ignored : likewise, black where they *do* count.
+    light : environment map of this view, lat-long in the frame of its camera; see `ViewLight`.
     truth : files of the ground truth, by ``albedo | normal | roughness | metallic``.
     relight : files of the same view under other lights, by light.
     """
@@ -97,6 +56,9 @@ class Frame:
     lens: Lens
     image: Path
     mask: Path | None = None
+    valid: Path | None = None
+    ignored: Path | None = None
+    light: Path | None = None
     truth: Mapping[str, Path] = field(default_factory=dict)
     relight: Mapping[str, Path] = field(default_factory=dict)
 
@@ -111,6 +73,8 @@ class Listing:
     lights : environment maps that were found, by light.
     train_light : the light of the training images, where the layout names lights.
     albedo_is_srgb : how the albedo files encode their values.
+    is_capture : photographs, whose sizes may differ and whose masks may be missing altogether.
+    notes : what was chosen that the files leave open, for the user to read.
     """
 
     train: tuple[Frame, ...]
@@ -118,6 +82,8 @@ class Listing:
     lights: Mapping[str, Path] = field(default_factory=dict)
     train_light: str | None = None
     albedo_is_srgb: bool = True
+    is_capture: bool = False
+    notes: tuple[str, ...] = ()
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -146,18 +112,39 @@ def require(content: Mapping[str, Any], key: str, where: Path | str) -> Any:
     return content[key]
 
 
+class ListedFrame(NamedTuple):
+    """A frame of a ``transforms*.json``: its path, camera, and keys with those of the file."""
+
+    file_path: str
+    pose: Float[np.ndarray, "4 4"]
+    lens: Lens
+    values: Mapping[str, Any]
+
+
 def read_transforms(path: Path) -> list[tuple[str, np.ndarray, Lens]]:
     """Read a ``transforms_*.json`` of Blender: file path, pose and lens of each frame.
 
+    See `list_transforms`.
+    """
+    return [frame[:3] for frame in list_transforms(read_json(path), path)]
+
+
+def list_transforms(content: Mapping[str, Any], path: Path) -> list[ListedFrame]:
+    """Check the frames of a ``transforms*.json``.
+
     Lenses are ``camera_angle_x``, or ``fl_x, fl_y, cx, cy`` in pixels of an image of ``w`` by
     ``h``, for all frames or for each. Without ``fl_y`` pixels are square, without ``cx`` or ``cy``
-    the axis is in the middle, and without ``fl_x`` the angle gives it.
+    the axis is in the middle, and without ``fl_x`` the angle gives it. ``camera_model``,
+    ``is_fisheye``, ``k1`` to ``k4``, ``p1, p2`` or ``distortion_params`` bend them.
+
+    Parameters
+    ----------
+    content : of the file. path : of it, for messages.
 
     Raises
     ------
-    MissingFileError, SceneError : not JSON, missing keys, no frames, an unusable pose or lens.
+    SceneError : missing keys, no frames, an unusable pose or lens.
     """
-    content = read_json(path)
     frames = require(content, "frames", path)
     if not isinstance(frames, list) or not frames:
         raise SceneError(f"{path} has no frames; 'frames' must be a list with at least one view")
@@ -173,68 +160,55 @@ def read_transforms(path: Path) -> list[tuple[str, np.ndarray, Lens]]:
         if "fl_x" not in both and "camera_angle_x" not in both:
             require(content, "camera_angle_x", path)
         pose = checked_pose(require(frame, "transform_matrix", where), where)
-        listed.append((file_path, pose, _checked_lens(both, where)))
+        listed.append(ListedFrame(file_path, pose, checked_lens(both, where), both))
     return listed
 
 
-def _checked_lens(values: Mapping[str, Any], where: str) -> Lens:
-    """Return the lens of a frame.
+def checked_numbers(values: Any, shape: tuple[int, ...], what: str) -> Float[np.ndarray, "..."]:
+    """Return finite numbers of a shape; `SceneError` otherwise."""
+    try:
+        numbers = np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    if numbers.shape != shape or not np.isfinite(numbers).all():
+        size = " x ".join(str(length) for length in shape)
+        shown = values.tolist() if isinstance(values, np.ndarray) else values
+        raise SceneError(f"{what} must be {size} finite numbers, got {shown!r}")
+    return numbers
+
+
+def opengl_pose(
+    rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, " 3"], where: str
+) -> Float[np.ndarray, "4 4"]:
+    """Return camera-to-world with OpenGL axes of ``x_camera = R x + t`` with OpenCV axes.
 
     Raises
     ------
-    SceneError : it is distorted, incomplete, contradicts itself, or a value is no lens's.
+    SceneError : see `checked_pose`.
     """
-    bent = [key for key in _DISTORTION if values.get(key, 0)]
-    if bent:
-        raise SceneError(f"{where} has lens distortion ({', '.join(bent)}); undistort the images")
-    given = {key: _checked_length(values[key], key, where) for key in _LENS_KEYS if key in values}
-    angle = None
-    if "camera_angle_x" in values:
-        angle = checked_angle(values["camera_angle_x"], where)
-    if angle is not None and not given.keys() - {"w", "h"}:
-        return AngleLens(angle)
-    missing = [key for key in ("w", "h") if key not in given]
-    if missing:
-        raise SceneError(
-            f"the lens of {where} has {', '.join(given)} but no {' and no '.join(missing)}; add "
-            "the size of the images that it is in pixels of"
-        )
-    width, height = given["w"], given["h"]
-    if angle is not None:
-        expected = 0.5 * width / math.tan(0.5 * angle)
-        focal = given.setdefault("fl_x", expected)
-        if abs(focal / expected - 1.0) > _FOCAL_TOLERANCE:
-            raise SceneError(
-                f"{where} contradicts itself: with w = {width:g}, fl_x is {focal:g}, but "
-                f"camera_angle_x = {angle:g} makes it {expected:g}; remove the wrong one"
-            )
-    return PinholeLens(
-        fx=given["fl_x"],
-        fy=given.get("fl_y", given["fl_x"]),
-        cx=given.get("cx", 0.5 * width),
-        cy=given.get("cy", 0.5 * height),
-        width=int(width),
-        height=int(height),
-    )
+    pose = np.eye(4)
+    # Inverted after the check, so that what is singular is named and not divided by.
+    pose[:3, :3], pose[:3, 3] = rotation, translation
+    rigid = checked_pose(pose, where)
+    turned = np.eye(4)
+    turned[:3, :3] = rigid[:3, :3].T
+    turned[:3, 3] = -rigid[:3, :3].T @ rigid[:3, 3]
+    return turned @ _OPENCV_TO_OPENGL
 
 
-def _checked_length(value: Any, key: str, where: str) -> float:
-    """Return a length of a lens in pixels: finite and positive, and whole if it is a size."""
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    is_size = key in ("w", "h")
-    # An integer of JSON may be too large for a float, so it is compared and not converted.
-    if not is_number or not 0 < value < _LONGEST or (is_size and value != int(value)):
-        kind = "a positive whole number" if is_size else "a positive number"
-        raise SceneError(f"{key!r} of {where} must be {kind} of pixels, got {value!r}")
-    return float(value)
+def quaternion_to_rotation(
+    quaternion: Float[np.ndarray, " 4"], where: str
+) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation of a unit quaternion (w, x, y, z), whose length may be off by 1 %.
 
-
-def checked_angle(angle: Any, where: str) -> float:
-    """Return a horizontal field of view in radians, between 0 and pi."""
-    is_number = isinstance(angle, int | float) and not isinstance(angle, bool)
-    if not is_number or not 0.0 < angle < math.pi:
-        raise SceneError(f"the camera angle of {where} must be in (0, pi) radians, got {angle!r}")
-    return float(angle)
+    Raises
+    ------
+    SceneError : it has another length, or is not finite.
+    """
+    length = float(np.sqrt(np.sum(np.square(quaternion))))
+    if not abs(length - 1.0) <= _QUATERNION_TOLERANCE:
+        raise SceneError(f"the quaternion of {where} must be of length 1, got {length:g}")
+    return Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
 
 
 def checked_pose(matrix: Any, where: str) -> Float[np.ndarray, "4 4"]:
@@ -336,3 +310,78 @@ def find_lights(folders: list[Path], names: list[str]) -> dict[str, Path]:
         if path is not None:
             found[name] = path
     return found
+
+
+def _within_images(root: Path, image: Path) -> Path:
+    """Path of an image below the folder of all images."""
+    relative = image.relative_to(root)
+    return Path(*relative.parts[1:]) if relative.parts[0] in _IMAGE_FOLDERS else relative
+
+
+def beside_images(root: Path, image: Path, folders: tuple[str, ...]) -> Path | None:
+    """Return the PNG that belongs to an image in one of the folders, None where there is none.
+
+    It is named after the image, with or without the image's own ending (``IMG_1.png``,
+    ``IMG_1.jpg.png``), and lies in ``root/FOLDER`` as the image lies in ``root/images``.
+    """
+    inner = _within_images(root, image)
+    names = (inner.with_suffix(".png"), inner.with_name(inner.name + ".png"))
+    candidates = [root / folder / name for folder in folders for name in names]
+    path = next((path for path in candidates if path.is_file()), None)
+    return None if path is None else inside_scene(root, str(path.relative_to(root)), image)
+
+
+def captured_frame(
+    root: Path, image: Path, pose: np.ndarray, lens: Lens, *, mask: Path | None = None
+) -> Frame:
+    """Return a frame of a capture, with the masks that lie in ``masks/`` and ``valid/``.
+
+    Parameters
+    ----------
+    mask : the object's mask, where the files of the scene name one.
+    """
+    return Frame(
+        "_".join(_within_images(root, image).with_suffix("").parts),
+        pose,
+        lens,
+        image,
+        mask=mask or beside_images(root, image, _MASK_FOLDERS),
+        valid=beside_images(root, image, _VALID_FOLDERS),
+    )
+
+
+def images_in(root: Path, folders: tuple[str, ...]) -> list[Path]:
+    """Return the images of the first of the folders that is there, by name.
+
+    Raises
+    ------
+    MissingFileError : none is there, or it has no image.
+    """
+    folder = next((root / name for name in folders if (root / name).is_dir()), None)
+    found = [] if folder is None else sorted(folder.iterdir())
+    images = [path for path in found if path.suffix.lower() in IMAGE_SUFFIXES]
+    if not images:
+        names = " or ".join(f"{name}/" for name in folders)
+        raise MissingFileError(f"{root} has no images in {names}; add them")
+    return [existing(root, [path], path.name) for path in images]
+
+
+def split_capture(frames: Sequence[Frame], *, notes: tuple[str, ...] = ()) -> Listing:
+    """Choose test views where nobody did: by name, the first and every eighth after it.
+
+    A single view is kept for training.
+
+    Raises
+    ------
+    SceneError : two views have one name.
+    """
+    ordered = sorted(frames, key=lambda frame: frame.name)
+    for one, other in pairwise(ordered):
+        if one.name == other.name:
+            raise SceneError(
+                f"{one.image} and {other.image} are both named {one.name!r}; rename one"
+            )
+    test = ordered[::TEST_EVERY] if len(ordered) > 1 else []
+    train = [ordered[i] for i in range(len(ordered)) if i % TEST_EVERY or not test]
+    chosen = f"no split is given: {len(test)} test views of {len(ordered)}, every {TEST_EVERY}th"
+    return Listing(tuple(train), tuple(test), is_capture=True, notes=(*notes, chosen))

@@ -56,6 +56,34 @@ def written_aside(path: str | Path) -> Iterator[Path]:
         aside.unlink(missing_ok=True)
 
 
+def _opened(path: Path) -> Any:
+    """Open an image; `MissingFileError` or `ImageReadError` where that cannot be done."""
+    if not path.is_file():
+        raise MissingFileError(f"image {path} does not exist; check the scene folder is complete")
+    # Without this hint the library multiplies colour by alpha on reading.
+    hint = oiio.ImageSpec()
+    hint.attribute("oiio:UnassociatedAlpha", 1)
+    source = oiio.ImageInput.open(str(path), hint)
+    if source is None:
+        raise ImageReadError(f"{path} is not a readable image ({_last_error()}); replace the file")
+    return source
+
+
+def image_size(path: str | Path) -> tuple[int, int]:
+    """Return height and width of an image in pixels; its pixels are not read.
+
+    Raises
+    ------
+    MissingFileError, ImageReadError
+    """
+    source = _opened(Path(path))
+    try:
+        spec = source.spec()
+        return spec.height, spec.width
+    finally:
+        source.close()
+
+
 def read_image(path: str | Path) -> Float[np.ndarray, "H W C"]:
     """Read an image as stored: no transfer curve, no premultiplication.
 
@@ -70,14 +98,7 @@ def read_image(path: str | Path) -> Float[np.ndarray, "H W C"]:
     MissingFileError, ImageReadError
     """
     path = Path(path)
-    if not path.is_file():
-        raise MissingFileError(f"image {path} does not exist; check the scene folder is complete")
-    # Without this hint the library multiplies colour by alpha on reading.
-    hint = oiio.ImageSpec()
-    hint.attribute("oiio:UnassociatedAlpha", 1)
-    source = oiio.ImageInput.open(str(path), hint)
-    if source is None:
-        raise ImageReadError(f"{path} is not a readable image ({_last_error()}); replace the file")
+    source = _opened(path)
     try:
         layout = _layout(source.spec())
         pixels = source.read_image(format=oiio.FLOAT)

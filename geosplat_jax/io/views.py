@@ -10,7 +10,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,8 +19,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from geosplat_jax.core.types import Camera
+from geosplat_jax.io.distortion import pinhole_lookup, resample, resample_valid
 from geosplat_jax.io.frames import Frame, Listing
-from geosplat_jax.io.images import SceneError, downscale, read_linear
+from geosplat_jax.io.images import SceneError, downscale, image_size, read_linear
 
 COVERED = 0.5
 """A pixel belongs to the object where its alpha exceeds this."""
@@ -31,9 +32,26 @@ _BLENDER_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _SHORTEST_NORMAL = 0.1  # below this a decoded normal is background, not rounding
 
 
+class ViewLight(NamedTuple):
+    """The environment of one view, as its camera saw it.
+
+    Attributes
+    ----------
+    path : lat-long map in the camera's OpenGL axes (x right, y up, z backwards), y up:
+        ``u = 0.5 + atan2(x, -z) / (2 pi)``, ``v = acos(y) / pi``.
+    camera_to_world : (4, 4) of the camera, which turns the map into the world.
+    """
+
+    path: Path
+    camera_to_world: Float[np.ndarray, "4 4"]
+
+
 @dataclass(frozen=True)
 class Views:
     """V views of one size; see the module for conventions.
+
+    Photographs of several sizes lie in the upper left corner of an image as large as the largest;
+    pixels beside them do not count.
 
     Attributes
     ----------
@@ -44,7 +62,10 @@ class Views:
     truth : (V, H, W, C) by ``albedo`` (linear), ``normal`` (unit, world), ``roughness``,
         ``metallic``; zero on the background.
     relight : (V, H, W, 4) linear, by light; read anew each time, since they are large.
-    valid : (V, H, W) float32 pixels that count, 0 or 1; None where all do.
+    valid : (V, H, W) float32 pixels that count, 0 or 1; None where all do. Others are zero in all
+        images.
+    has_masks : False where nothing tells the object from what is behind it; alpha is then one.
+    lights : environment maps of single views, by their names.
     exposure : (V,) factors that the photographs were divided by; None where they are as they were.
     """
 
@@ -56,6 +77,8 @@ class Views:
     relight: Mapping[str, Any] = field(default_factory=dict)
     valid: Float[np.ndarray, "V H W"] | None = None
     exposure: Float[np.ndarray, " V"] | None = None
+    has_masks: bool = True
+    lights: Mapping[str, ViewLight] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Count the views."""
@@ -75,6 +98,13 @@ class Views:
     def masks(self) -> Bool[np.ndarray, "V H W"]:
         """Pixels of the object."""
         return self.images[..., 3] > COVERED
+
+    @property
+    def coverage(self) -> Float[np.ndarray, " V"]:
+        """Share of each view's pixels that count which the object covers."""
+        if self.valid is None:
+            return self.masks.mean((1, 2))
+        return self.masks.sum((1, 2)) / np.maximum(self.valid.sum((1, 2)), 1.0)
 
     @property
     def world_to_camera(self) -> Float[np.ndarray, "V 4 4"]:
@@ -122,36 +152,98 @@ def load_views(
     MissingFileError, SceneError : see `load_dataset`.
     """
     _require_distinct([frame.name for frame in frames])
-    first = _read_frame(frames[0], factor)
-    images = np.empty((len(frames), *first.pixels.shape), np.float32)
-    problems = []
-    height, width = first.full_size
-    if height % factor or width % factor:
-        problems.append(
-            f"images of {width} x {height} are cut to a multiple of the downscale factor {factor}"
-        )
+    full = _in_parallel(lambda frame: image_size(frame.image), frames)
+    problems = _size_problems(frames, full, factor, listing)
+    sizes = [(height // factor, width // factor) for height, width in full]
+    canvas = np.max(sizes, axis=0)
+    images = np.zeros((len(frames), *canvas, 4), np.float32)
+    valid = np.zeros((len(frames), *canvas), bool)
+    has_mask, leaves_file = np.ones(len(frames), bool), np.zeros(len(frames), bool)
 
     def fill(index: int) -> None:
-        read = first if index == 0 else _read_frame(frames[index], factor)
-        if read.full_size != first.full_size:
-            raise SceneError(
-                f"{frames[index].image} is {read.full_size[1]} x {read.full_size[0]} pixels, but "
-                f"{frames[0].image} is {width} x {height}; all images of a split must agree"
-            )
-        images[index] = read.pixels
+        frame = frames[index]
+        photograph = _read_photograph(frame)
+        rows, columns = (slice(0, length) for length in sizes[index])
+        images[index, rows, columns], valid[index, rows, columns] = photograph.reduced(factor)
+        has_mask[index], leaves_file[index] = photograph.has_mask, photograph.leaves_file
+        if not (photograph.has_mask or listing.is_capture):
+            raise SceneError(_no_mask(frame))
 
     _in_parallel(fill, range(len(frames)))
-    intrinsics = np.stack([frame.lens.intrinsics(width, height) for frame in frames])
+    _require_masks_in_all_or_none(frames, has_mask)
+    if listing.is_capture and leaves_file.any():
+        problems.append(
+            f"{int(leaves_file.sum())} mask files are not read: their images have an alpha, "
+            f"{frames[int(np.argmax(leaves_file))].image.name} for one"
+        )
+    lenses = [
+        frame.lens.intrinsics(width, height)
+        for frame, (height, width) in zip(frames, full, strict=True)
+    ]
+    intrinsics = np.stack(lenses)
     intrinsics[:, :2] /= factor
+    reading = _Reading(frames, images, sizes, valid, factor)
     views = Views(
         names=tuple(frame.name for frame in frames),
         camera_to_world=np.stack([frame.camera_to_world for frame in frames]),
         intrinsics=intrinsics,
         images=images,
-        truth=_truth(frames, images, factor, listing.albedo_is_srgb, problems),
-        relight=_relight(frames, images, factor, problems),
+        truth=_truth(reading, listing.albedo_is_srgb, problems),
+        relight=_relight(reading, problems),
+        valid=None if valid.all() else valid.astype(np.float32),
+        has_masks=bool(has_mask.all()),
+        lights={
+            frame.name: ViewLight(frame.light, frame.camera_to_world)
+            for frame in frames
+            if frame.light is not None
+        },
     )
     return views, problems
+
+
+def _size_problems(
+    frames: Sequence[Frame], full: list[tuple[int, int]], factor: int, listing: Listing
+) -> list[str]:
+    """Say which sizes were met; refuse several of them outside captures."""
+    problems = []
+    for frame, (height, width) in zip(frames, full, strict=True):
+        if factor > min(height, width):
+            raise SceneError(
+                f"downscale factor must be between 1 and the image size, got {factor} for "
+                f"{frame.image}, which is {width} x {height}"
+            )
+        if (height, width) != full[0] and not listing.is_capture:
+            raise SceneError(
+                f"{frame.image} is {width} x {height} pixels, but {frames[0].image} is "
+                f"{full[0][1]} x {full[0][0]}; all images of a split must agree"
+            )
+    kinds = Counter(full)
+    if len(kinds) > 1:
+        height, width = np.max(full, axis=0)
+        problems.append(
+            f"images of {len(kinds)} sizes lie on a canvas of {width} x {height}; what is beside "
+            "them does not count"
+        )
+    cut = [(height, width) for height, width in kinds if height % factor or width % factor]
+    problems += [
+        f"images of {width} x {height} are cut to a multiple of the downscale factor {factor}"
+        for height, width in cut
+    ]
+    return problems
+
+
+def _no_mask(frame: Frame) -> str:
+    return (
+        f"{frame.image} has no alpha channel and there is no mask file beside it; the object "
+        "must be cut out: write RGBA images, or add masks as the layout names them (NAME_alpha"
+        ".png beside NAME.jpg for transforms of Blender, NAME_mask.png for Synthetic4Relight, "
+        "masks/NAME.png for captures)"
+    )
+
+
+def _require_masks_in_all_or_none(frames: Sequence[Frame], has_mask: np.ndarray) -> None:
+    if has_mask.any() and not has_mask.all():
+        raise SceneError(_no_mask(frames[int(np.argmin(has_mask))]))
 
 
 def _require_distinct(names: Sequence[str]) -> None:
@@ -187,39 +279,74 @@ class _OnDemand(Mapping[str, np.ndarray]):
         return len(self._makers)
 
 
-class _Read(NamedTuple):
-    pixels: np.ndarray
-    full_size: tuple[int, int]
+class _Photograph(NamedTuple):
+    """One view as large as it is, as a pinhole sees it.
+
+    Attributes
+    ----------
+    rgba : (H, W, 4) linear; zero where the colour does not count.
+    valid : (H, W) pixels that count.
+    has_mask : False where alpha is one because nothing is known of it.
+    leaves_file : True where the image's own alpha is taken and not the file of a mask.
+    """
+
+    rgba: Float[np.ndarray, "H W 4"]
+    valid: Bool[np.ndarray, "H W"]
+    has_mask: bool
+    leaves_file: bool
+
+    def reduced(self, factor: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return colours and what counts of a smaller image: pixels of which all parts count."""
+        valid = downscale(self.valid[..., None].astype(np.float32), factor)[..., 0] == 1.0
+        return np.where(valid[..., None], downscale(self.rgba, factor), 0.0), valid
 
 
-def _read_frame(frame: Frame, factor: int) -> _Read:
-    """Read one view as linear RGBA and reduce it."""
-    rgba = _read_rgba(frame)
-    return _Read(downscale(rgba, factor), rgba.shape[:2])
-
-
-def _read_rgba(frame: Frame) -> np.ndarray:
-    """Read one view as linear RGBA, as large as it is."""
+def _read_photograph(frame: Frame) -> _Photograph:
+    """Read one view as linear RGBA without distortion."""
     pixels = _as_rgba_or_rgb(read_linear(frame.image))
     rgb, alpha = pixels[..., :3], pixels[..., 3:]
-    if frame.mask is not None and (alpha.size == 0 or alpha.min() == 1.0):
-        # An alpha of one everywhere says nothing, so a mask file takes its place.
-        alpha = read_linear(frame.mask, is_srgb=False)[..., :1]
-        if alpha.shape[:2] != rgb.shape[:2]:
-            raise SceneError(
-                f"mask {frame.mask} is {alpha.shape[1]} x {alpha.shape[0]} pixels, but its image "
-                f"is {rgb.shape[1]} x {rgb.shape[0]}; they must agree"
-            )
-    if alpha.size == 0:
-        raise SceneError(
-            f"{frame.image} has no alpha channel and there is no mask file beside it; the object "
-            "must be cut out: write RGBA images, or add masks as the layout names them (NAME_alpha"
-            ".png beside NAME.jpg for transforms of Blender, NAME_mask.png for Synthetic4Relight)"
-        )
+    # An alpha of one everywhere says nothing, so a mask file takes its place.
+    leaves_file = frame.mask is not None and alpha.size > 0 and alpha.min() < 1.0
+    if frame.mask is not None and not leaves_file:
+        alpha = _read_mask(frame.mask, rgb)
+    has_mask = alpha.size > 0
+    if not has_mask:
+        alpha = np.ones_like(rgb[..., :1])
     if alpha.max() > 1.0 + 1e-3:
         raise SceneError(f"the alpha of {frame.image} must be in [0, 1], got {alpha.max()}")
-    rgba = np.concatenate([np.where(alpha > 0.0, rgb, 0.0), np.minimum(alpha, 1.0)], -1)
-    return rgba.astype(np.float32)
+    alpha = np.minimum(alpha, 1.0)
+    rgba = np.concatenate([np.where(alpha > 0.0, rgb, 0.0), alpha], -1).astype(np.float32)
+    valid = np.ones(rgba.shape[:2], bool)
+    if frame.valid is not None:
+        valid &= _read_mask(frame.valid, rgb)[..., 0] > COVERED
+    if frame.ignored is not None:
+        valid &= _read_mask(frame.ignored, rgb)[..., 0] == 0.0
+    rgba, seen = _undistorted(frame, rgba, valid)
+    return _Photograph(np.where(seen[..., None], rgba, 0.0), seen, has_mask, leaves_file)
+
+
+def _read_mask(path: Path, rgb: np.ndarray) -> np.ndarray:
+    """Channel 0 of a mask file of the image's size."""
+    mask = read_linear(path, is_srgb=False)[..., :1]
+    if mask.shape[:2] != rgb.shape[:2]:
+        raise SceneError(
+            f"mask {path} is {mask.shape[1]} x {mask.shape[0]} pixels, but its image is "
+            f"{rgb.shape[1]} x {rgb.shape[0]}; they must agree"
+        )
+    return mask
+
+
+def _undistorted(
+    frame: Frame, pixels: np.ndarray, valid: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return pixels as a pinhole sees them, and which of those are seen."""
+    height, width = pixels.shape[:2]
+    valid = np.ones((height, width), bool) if valid is None else valid
+    distortion = frame.lens.distortion
+    if distortion is None:
+        return pixels, valid
+    lookup = pinhole_lookup(distortion, frame.lens.intrinsics(width, height), width, height)
+    return resample(pixels, lookup), resample_valid(valid, lookup)
 
 
 def _as_rgba_or_rgb(pixels: np.ndarray) -> np.ndarray:
@@ -229,60 +356,71 @@ def _as_rgba_or_rgb(pixels: np.ndarray) -> np.ndarray:
     return np.concatenate([np.repeat(pixels[..., :1], 3, -1), pixels[..., 1:]], -1)
 
 
-def _truth(
-    frames: Sequence[Frame],
-    images: np.ndarray,
-    factor: int,
-    albedo_is_srgb: bool,
-    problems: list[str],
-) -> Mapping[str, Any]:
+class _Reading(NamedTuple):
+    """What the images of the truth must fit: frames, their images, sizes, and the reduction."""
+
+    frames: Sequence[Frame]
+    images: np.ndarray
+    sizes: Sequence[tuple[int, int]]
+    valid: np.ndarray
+    factor: int
+
+    def reduced(self, index: int, pixels: np.ndarray, path: Path) -> np.ndarray:
+        """Undistort and reduce pixels of a file, and lay them where the image of the view lies."""
+        pixels, _ = _undistorted(self.frames[index], pixels)
+        small = downscale(pixels, self.factor)
+        height, width = self.sizes[index]
+        _same_size(small, self.images[index][:height, :width], path)
+        placed = np.zeros((*self.images.shape[1:3], small.shape[-1]), np.float32)
+        placed[:height, :width] = small
+        return np.where(self.valid[index][..., None], placed, 0.0)
+
+
+def _truth(reading: _Reading, albedo_is_srgb: bool, problems: list[str]) -> Mapping[str, Any]:
     def maker(key: str) -> Callable[[], np.ndarray]:
         def read(index: int) -> np.ndarray:
-            is_srgb = albedo_is_srgb and key == "albedo"
-            return _read_truth(frames[index], key, images[index], factor, is_srgb)
+            return _read_truth(reading, index, key, albedo_is_srgb and key == "albedo")
 
-        return lambda: np.stack(_in_parallel(read, range(len(frames))))
+        return lambda: np.stack(_in_parallel(read, range(len(reading.frames))))
 
-    listed = [frame.truth for frame in frames]
+    listed = [frame.truth for frame in reading.frames]
     keys = _in_all(listed, "ground truth", problems)
     return _OnDemand({key: maker(key) for key in keys}, keeps=True)
 
 
-def _read_truth(
-    frame: Frame, key: str, image: np.ndarray, factor: int, is_srgb: bool
-) -> np.ndarray:
+def _read_truth(reading: _Reading, index: int, key: str, is_srgb: bool) -> np.ndarray:
+    frame = reading.frames[index]
     path = frame.truth[key]
     pixels = _as_rgba_or_rgb(read_linear(path, is_srgb=is_srgb))
-    if factor > 1 and pixels.shape[-1] == 3:
+    is_resampled = reading.factor > 1 or frame.lens.distortion is not None
+    if is_resampled and pixels.shape[-1] == 3:
         # Without an alpha of its own, the background would be averaged into the rim.
-        alpha = _same_size(_read_rgba(frame), pixels, frame.image)[..., 3:]
+        photograph = _read_photograph(replace(frame, lens=replace(frame.lens, distortion=None)))
+        alpha = _same_size(photograph.rgba, pixels, frame.image)[..., 3:]
         pixels = np.concatenate([pixels, alpha], -1)
     if key == "normal":
         pixels[..., :3] = 2.0 * pixels[..., :3] - 1.0
-    values = _same_size(downscale(pixels, factor), image, path)[..., : TRUTH_CHANNELS[key]]
+    values = reading.reduced(index, pixels, path)[..., : TRUTH_CHANNELS[key]]
     if key == "normal":
         length = np.sqrt((values**2).sum(-1, keepdims=True))
         is_normal = length > _SHORTEST_NORMAL
         values = np.where(is_normal, values / np.where(is_normal, length, 1.0), 0.0)
-    return np.where(image[..., 3:] > 0.0, values, 0.0).astype(np.float32)
+    return np.where(reading.images[index][..., 3:] > 0.0, values, 0.0).astype(np.float32)
 
 
-def _relight(
-    frames: Sequence[Frame], images: np.ndarray, factor: int, problems: list[str]
-) -> Mapping[str, Any]:
+def _relight(reading: _Reading, problems: list[str]) -> Mapping[str, Any]:
     def maker(light: str) -> Callable[[], np.ndarray]:
         def read(index: int) -> np.ndarray:
-            path = frames[index].relight[light]
-            relit = _as_rgba_or_rgb(read_linear(path))
-            relit = _same_size(downscale(relit, factor), images[index], path)
+            path = reading.frames[index].relight[light]
+            relit = reading.reduced(index, _as_rgba_or_rgb(read_linear(path)), path)
             # Without an alpha of its own it has that of the view: the object has not moved.
-            alpha = relit[..., 3:] if relit.shape[-1] == 4 else images[index][..., 3:]
+            alpha = relit[..., 3:] if relit.shape[-1] == 4 else reading.images[index][..., 3:]
             rgb = np.where(alpha > 0.0, relit[..., :3], 0.0)
             return np.concatenate([rgb, alpha], -1).astype(np.float32)
 
-        return lambda: np.stack(_in_parallel(read, range(len(frames))))
+        return lambda: np.stack(_in_parallel(read, range(len(reading.frames))))
 
-    listed = [frame.relight for frame in frames]
+    listed = [frame.relight for frame in reading.frames]
     keys = _in_all(listed, "light", problems)
     return _OnDemand({light: maker(light) for light in keys}, keeps=False)
 

@@ -9,6 +9,7 @@ import platform
 import time
 from collections.abc import Mapping
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,19 +39,46 @@ _PACKAGES = ("jax", "jaxlib", "numpy", "optax", "geosplat_jax")
 _MATERIALS = ("roughness", "metallic")
 
 
-def _view_metrics(view: RenderedView, image: np.ndarray, truth_normal: np.ndarray | None) -> dict:
+def _where_counted(view: RenderedView, valid: np.ndarray | None) -> RenderedView:
+    """Leave of a render what counts; ``valid`` is (H, W), or None for all of it."""
+    if valid is None:
+        return view
+    counted = valid[..., None]
+    return replace(
+        view,
+        rgb=view.rgb * counted,
+        alpha=view.alpha * valid,
+        aovs={name: values * counted for name, values in view.aovs.items()},
+    )
+
+
+def _valid(views: Views, index: int) -> np.ndarray | None:
+    return None if views.valid is None else views.valid[index]
+
+
+def _view_metrics(
+    view: RenderedView,
+    image: np.ndarray,
+    truth_normal: np.ndarray | None,
+    valid: np.ndarray | None,
+) -> dict:
     """Metrics of one view; ``image`` is (H, W, 4) linear with straight alpha.
 
     Metrics of the mask's pixels are left out where it has none.
     """
     mask = image[..., 3]
-    metrics = protocols.new_view_metrics(view.rgb, view.alpha, image)
+    metrics = protocols.new_view_metrics(view.rgb, view.alpha, image, valid)
     metrics["mask.iou"] = float(mask_iou(view.alpha, mask))
     if truth_normal is not None:
         for name in ("masked", "full") if np.any(mask > MASK_THRESHOLD) else ("full",):
             metrics[f"normal.mae_{name}_deg"] = float(
                 normal_mae_deg(
-                    view.aovs["normal"], truth_normal, mask, view.alpha, full=name == "full"
+                    view.aovs["normal"],
+                    truth_normal,
+                    mask,
+                    view.alpha,
+                    full=name == "full",
+                    valid=valid,
                 )
             )
     return metrics
@@ -78,9 +106,10 @@ def _render_all(renderer: Renderer, views: Views, chosen: np.ndarray) -> _Render
     metrics, shown, alpha = [], {}, []
     maps = {name: [] for name in ("albedo", *_MATERIALS) if name in views.truth}
     for index, name in enumerate(views.names):
-        view = renderer(views.camera(np.array([index])))
+        valid = _valid(views, index)
+        view = _where_counted(renderer(views.camera(np.array([index]))), valid)
         normal = views.truth["normal"][index] if "normal" in views.truth else None
-        metrics.append({"view": name, **_view_metrics(view, views.images[index], normal)})
+        metrics.append({"view": name, **_view_metrics(view, views.images[index], normal, valid)})
         alpha.append(view.alpha)
         for key, kept in maps.items():
             kept.append(view.aovs[key])
@@ -100,12 +129,14 @@ def _material_metrics(
     if "albedo" in maps:
         truth = views.truth["albedo"] * mask[..., None]
         scale = protocols.albedo_scale(protocol, maps["albedo"], alpha, truth, mask)
-        metrics |= protocols.albedo_metrics(protocol, maps["albedo"], alpha, truth, mask, scale)
+        metrics |= protocols.albedo_metrics(
+            protocol, maps["albedo"], alpha, truth, mask, scale, views.valid
+        )
         metrics |= {f"albedo.scale_{c}": float(x) for c, x in zip("rgb", scale, strict=True)}
     known = {name: views.truth[name][..., 0] * mask for name in _MATERIALS if name in maps}
     if known:
         found = {name: maps[name][..., 0] for name in known}
-        metrics |= protocols.material_metrics(found, alpha, known, mask)
+        metrics |= protocols.material_metrics(found, alpha, known, mask, views.valid)
     return metrics, scale
 
 
@@ -134,9 +165,10 @@ def _relight_metrics(
         rgb, alpha = np.empty((*views.masks.shape, 3), np.float32), np.empty(views.masks.shape)
         for index in range(len(views)):
             view = relit(views.camera(np.array([index])))
+            view = _where_counted(view, _valid(views, index))
             rgb[index], alpha[index] = view.rgb, view.alpha
         images = views.relight[name]
-        found = protocols.relight_metrics(protocol, rgb, alpha, images)
+        found = protocols.relight_metrics(protocol, rgb, alpha, images, views.valid)
         metrics |= {f"relight.{name}.{key}": value for key, value in found.items()}
         for row, index in zip(rows, chosen, strict=True):
             row[name] = render_on_white(rgb[index], alpha[index])
@@ -179,7 +211,8 @@ def evaluate_run(
     Writes ``metrics.json``, ``overview.png`` and, where the scene has the truth of them,
     ``materials.png`` and ``relight.png``. New views are always compared in sRGB on white, as the
     mean over the images of the measure of each; normals once over the mask's pixels and once over
-    all of them, with (0, 0, 1) behind the object. See `protocols` for the rest.
+    all of them, with (0, 0, 1) behind the object. Pixels that do not count have no part in any of
+    it, and are empty on the sheets. See `protocols` for the rest.
 
     Parameters
     ----------

@@ -118,6 +118,7 @@ def normal_mae_deg(
     predicted_mask: Shaped[ArrayLike, "H W"] | None = None,
     *,
     full: bool = False,
+    valid: Shaped[ArrayLike, "H W"] | None = None,
 ) -> Float[Array, ""]:
     """Mean angle in degrees between two normal maps of any vector lengths.
 
@@ -132,6 +133,7 @@ def normal_mae_deg(
     mask : (H, W) true mask.
     predicted_mask : (H, W) where the prediction is an object, used by ``full``; ``mask`` if None.
     full : average over all pixels.
+    valid : (H, W) pixels that count, the only ones that ``full`` averages over; None for all.
     """
     inside = _inside(mask)
     predicted, true = (safe_normalize(jnp.asarray(x)) for x in (normals, truth))
@@ -146,7 +148,9 @@ def normal_mae_deg(
         drawn = inside if predicted_mask is None else _inside(predicted_mask)
         predicted = jnp.where(drawn[..., None], predicted, background)
         true = jnp.where(inside[..., None], true, background)
-        mean = jnp.mean(angle_between(predicted, true))
+        angles = angle_between(predicted, true)
+        counted = jnp.ones_like(angles) if valid is None else _inside(valid).astype(angles.dtype)
+        mean = safe_divide(jnp.sum(counted * angles), jnp.sum(counted))
     return jnp.rad2deg(mean)
 
 

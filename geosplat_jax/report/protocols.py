@@ -10,6 +10,10 @@ their coverage (predicted ``alpha``, true ``mask``), hence zero on the backgroun
 straight colour is clipped to [0, 1], encoded, and then laid over the background: so do the public
 codes with the PNG files of the data sets, and so is truth and prediction treated here.
 
+Pixels that do not count (``valid``) have no part in any figure. Whoever calls has set them to zero
+in all maps, predicted and true; where ``valid`` is None, all count. SSIM is then the mean over the
+windows that touch a pixel that counts, the others being black in both images.
+
 Every ``*_masked`` figure compares the same pictures over the pixels of the true mask only; views
 without an object have no part in it. SSIM is always the mean over images.
 """
@@ -171,6 +175,16 @@ def _require(shape: tuple[int, ...], **maps: np.ndarray | tuple[np.ndarray, int]
             )
 
 
+def _require_black(valid: np.ndarray | None, **coverage: np.ndarray) -> None:
+    """Check that nothing is covered where pixels do not count."""
+    if valid is None:
+        return
+    for name, values in coverage.items():
+        _require(values.shape, valid=valid)
+        if np.any((values != 0) & ~(valid > MASK_THRESHOLD)):
+            raise ValueError(f"{name} must be zero on pixels that do not count; multiply by valid")
+
+
 def _require_object(inside: Bool[np.ndarray, "V H W"]) -> None:
     if not inside.any():
         raise ValueError(
@@ -268,13 +282,17 @@ def _compare(
     *,
     look: Look,
     is_pooled: bool,
+    valid: np.ndarray | None,
 ) -> dict[str, float]:
     """PSNR and SSIM, whole and masked, view by view, of linear images.
 
     Predictions are premultiplied by ``alpha``, truths straight.
     """
     errors, similarities, masked_errors, masked_similarities, counts = [], [], [], [], []
-    for prediction, drawn, truth, covered in zip(predictions, alpha, truths, mask, strict=True):
+    totals = []
+    known = [None] * len(mask) if valid is None else valid
+    views = zip(predictions, alpha, truths, mask, known, strict=True)
+    for prediction, drawn, truth, covered, counted in views:
         shown = {
             "alpha": np.clip(drawn, 0.0, 1.0),
             "solid": drawn > MASK_THRESHOLD,
@@ -282,19 +300,23 @@ def _compare(
         }
         predicted = _picture(_straight(prediction, drawn), shown[look.silhouette], look)
         true = _picture(truth, covered, look)
-        errors.append(float(_mse(predicted, true)))
-        similarities.append(float(_ssim(predicted, true)))
+        errors.append(float(_mse(predicted, true, counted)))
+        if counted is None:
+            similarities.append(float(_ssim(predicted, true)))
+        else:
+            similarities.append(float(_ssim_masked(predicted, true, counted)))
+        totals.append(covered.size if counted is None else int((counted > MASK_THRESHOLD).sum()))
         inside = covered > MASK_THRESHOLD
         if inside.any():
             masked_errors.append(float(_mse(predicted, true, inside)))
             masked_similarities.append(float(_ssim_masked(predicted, true, inside)))
             counts.append(int(inside.sum()))
 
-    def decibels(values: list[float], weights: list[int] | None) -> float:
+    def decibels(values: list[float], weights: list[int]) -> float:
         pooled = [float(np.average(values, weights=weights))] if is_pooled else values
         return float(np.mean([float(psnr_of_mse(value)) for value in pooled]))
 
-    metrics = {"psnr": decibels(errors, None), "ssim": float(np.mean(similarities))}
+    metrics = {"psnr": decibels(errors, totals), "ssim": float(np.mean(similarities))}
     if counts:
         metrics["psnr_masked"] = decibels(masked_errors, counts)
         metrics["ssim_masked"] = float(np.mean(masked_similarities))
@@ -302,17 +324,20 @@ def _compare(
 
 
 def _compare_images(
-    rgb: np.ndarray, alpha: np.ndarray, image: np.ndarray, look: Look
+    rgb: np.ndarray, alpha: np.ndarray, image: np.ndarray, look: Look, valid: np.ndarray | None
 ) -> dict[str, float]:
     """Compare premultiplied renders with straight RGBA images, (V, H, W, 3 and 4)."""
     _require(alpha.shape, alpha=alpha, rgb=(rgb, 3), image=(image, 4))
-    return _compare(rgb, alpha, image[..., :3], image[..., 3], look=look, is_pooled=False)
+    _require_black(valid, alpha=alpha, image=image[..., 3])
+    true, mask = image[..., :3], image[..., 3]
+    return _compare(rgb, alpha, true, mask, look=look, is_pooled=False, valid=valid)
 
 
 def new_view_metrics(
     rgb: Float[np.ndarray, "..."],
     alpha: Float[np.ndarray, "..."],
     image: Float[np.ndarray, "..."],
+    valid: Shaped[np.ndarray, "..."] | None = None,
 ) -> dict[str, float]:
     """Compare one view under the training light with its photograph, as `NEW_VIEWS` says.
 
@@ -321,6 +346,7 @@ def new_view_metrics(
     rgb : (H, W, 3) linear, exposed and tone mapped, premultiplied by ``alpha``; clipped here.
     alpha : (H, W) predicted coverage.
     image : (H, W, 4) photograph, linear, *straight* alpha, which is the mask.
+    valid : (H, W) pixels that count, or None.
 
     Returns
     -------
@@ -331,7 +357,8 @@ def new_view_metrics(
     ------
     ValueError : shapes that do not agree, values that are not finite.
     """
-    metrics = _compare_images(rgb[None], alpha[None], image[None], NEW_VIEWS)
+    counted = None if valid is None else valid[None]
+    metrics = _compare_images(rgb[None], alpha[None], image[None], NEW_VIEWS, counted)
     return {f"nvs.{name}": value for name, value in metrics.items()}
 
 
@@ -342,6 +369,7 @@ def albedo_metrics(
     truth: Float[np.ndarray, "..."],
     mask: Shaped[np.ndarray, "..."],
     scale: Float[np.ndarray, " 3"],
+    valid: Shaped[np.ndarray, "..."] | None = None,
 ) -> dict[str, float]:
     """Compare albedo in the protocol's encoding, silhouette and background.
 
@@ -349,6 +377,7 @@ def albedo_metrics(
     ----------
     protocol, albedo, alpha, truth, mask : see `albedo_scale`.
     scale : (3,) factor of the prediction, from `albedo_scale`.
+    valid : (V, H, W) pixels that count, or None.
 
     Returns
     -------
@@ -361,6 +390,7 @@ def albedo_metrics(
     ValueError : shapes that do not agree, values that are not finite, no object in the views.
     """
     _require(alpha.shape, alpha=alpha, mask=mask, albedo=(albedo, 3), truth=(truth, 3))
+    _require_black(valid, alpha=alpha, mask=mask)
     _require_object(mask > MASK_THRESHOLD)
     factor = np.asarray(scale, np.float32)
     metrics = _compare(
@@ -370,6 +400,7 @@ def albedo_metrics(
         mask,
         look=protocol.albedo,
         is_pooled=protocol.albedo_is_pooled,
+        valid=valid,
     )
     return {f"albedo.{name}": value for name, value in metrics.items()}
 
@@ -379,6 +410,7 @@ def material_metrics(
     alpha: Float[np.ndarray, "..."],
     truth: Mapping[str, Float[np.ndarray, "..."]],
     mask: Shaped[np.ndarray, "..."],
+    valid: Shaped[np.ndarray, "..."] | None = None,
 ) -> dict[str, float]:
     """Mean squared errors of roughness and metallic; the same in all protocols.
 
@@ -392,6 +424,7 @@ def material_metrics(
     truth : (V, H, W) by either name or both, premultiplied by ``mask``; what is missing here is
         left out of the metrics.
     mask : (V, H, W) true coverage, fraction or boolean.
+    valid : (V, H, W) pixels that count, or None.
 
     Returns
     -------
@@ -407,8 +440,10 @@ def material_metrics(
     """
     metrics = {}
     _require(alpha.shape, alpha=alpha, mask=mask)
+    _require_black(valid, alpha=alpha, mask=mask)
     inside = mask > MASK_THRESHOLD
     _require_object(inside)
+    counted = np.ones(mask.shape, bool) if valid is None else valid > MASK_THRESHOLD
     for name in (name for name in _MATERIALS if name in truth):
         if name not in materials:
             raise ValueError(f"there is a true {name} but no predicted one; render it too")
@@ -419,7 +454,8 @@ def material_metrics(
             np.mean(x[i], dtype=float) for x, i in zip(squared, inside, strict=True) if i.any()
         ]
         metrics[f"{name}.mse"] = float(np.mean(views))
-        metrics[f"{name}.mse_full"] = float(np.mean((predicted - true) ** 2, dtype=float))
+        whole = np.sum((predicted - true) ** 2, axis=(1, 2), dtype=float, where=counted)
+        metrics[f"{name}.mse_full"] = float(np.mean(whole / counted.sum(axis=(1, 2))))
     return metrics
 
 
@@ -428,6 +464,7 @@ def relight_metrics(
     rgb: Float[np.ndarray, "..."],
     alpha: Float[np.ndarray, "..."],
     image: Float[np.ndarray, "..."],
+    valid: Shaped[np.ndarray, "..."] | None = None,
 ) -> dict[str, float]:
     """Compare images under one new light, in the protocol's encoding, silhouette and background.
 
@@ -438,6 +475,7 @@ def relight_metrics(
         `albedo_scale`, at exposure 1; clipped here.
     alpha : (V, H, W) predicted coverage.
     image : (V, H, W, 4) true image, linear, *straight* alpha, which is the mask.
+    valid : (V, H, W) pixels that count, or None.
 
     Returns
     -------
@@ -448,6 +486,6 @@ def relight_metrics(
     ------
     ValueError : shapes that do not agree, values that are not finite, no object in the views.
     """
-    metrics = _compare_images(rgb, alpha, image, protocol.relight)
+    metrics = _compare_images(rgb, alpha, image, protocol.relight, valid)
     _require_object(image[..., 3] > MASK_THRESHOLD)
     return metrics

@@ -14,10 +14,10 @@ import numpy as np
 from geosplat_jax.core.types import Camera, EnvLight
 from geosplat_jax.io.images import SceneError, read_linear, write_png
 from geosplat_jax.io.movies import check_movie, has_encoder, write_movie
-from geosplat_jax.io.views import Views
+from geosplat_jax.io.views import ViewLight, Views
 from geosplat_jax.report.light_metrics import resize_light
 from geosplat_jax.report.renderer import RenderedView, Renderer, straight_rgba, to_picture
-from geosplat_jax.transport.environment import lookup, rotate_light
+from geosplat_jax.transport.environment import lookup, rotate_light, to_y_up_map
 
 LARGEST_LIGHT = 256
 """Rows of an environment map for lighting; finer detail is averaged, since it is only noise to a
@@ -51,6 +51,19 @@ def load_light(path: str | Path, *, largest: int = LARGEST_LIGHT) -> EnvLight:
     if radiance.shape[0] > largest:
         radiance = resize_light(radiance, largest, 2 * largest)
     return EnvLight(jnp.asarray(radiance, jnp.float32))
+
+
+def load_view_light(light: ViewLight, *, largest: int = LARGEST_LIGHT) -> EnvLight:
+    """Read the environment map of a single view and turn it into the world.
+
+    Raises
+    ------
+    SceneError
+        See `load_light`.
+    """
+    axes = np.asarray(to_y_up_map(jnp.eye(3)), np.float64).T
+    turn = light.camera_to_world[:3, :3] @ axes
+    return _rotate_light(load_light(light.path, largest=largest), jnp.asarray(turn, jnp.float32))
 
 
 def about_z(angle: float) -> np.ndarray:

@@ -42,6 +42,7 @@ def visual_hull(
     masks: Shaped[np.ndarray, "V H W"],
     points: Float[np.ndarray, "N 3"],
     *,
+    valid: Shaped[np.ndarray, "V H W"] | None = None,
     tolerance: float = TOLERANCE,
     seen_fraction: float = SEEN_FRACTION,
 ) -> Bool[np.ndarray, " N"]:
@@ -51,6 +52,7 @@ def visual_hull(
         intrinsics,
         masks,
         points,
+        valid=valid,
         tolerance=tolerance,
         seen_fraction=seen_fraction,
     )
@@ -63,6 +65,7 @@ def hull_distance(
     masks: Shaped[np.ndarray, "V H W"],
     points: Float[np.ndarray, "N 3"],
     *,
+    valid: Shaped[np.ndarray, "V H W"] | None = None,
     tolerance: float = TOLERANCE,
     seen_fraction: float = SEEN_FRACTION,
 ) -> Float[np.ndarray, " N"]:
@@ -73,6 +76,7 @@ def hull_distance(
     world_to_camera : (V, 4, 4); intrinsics : (V, 3, 3) pixels.
     masks : (V, H, W) bool, or coverage in [0, 1].
     points : (N, 3) world.
+    valid : (V, H, W) pixels that count, 0 or 1; a view does not see what lies on the others.
     tolerance : a point is inside when the masks of all but ``floor(tolerance * V)`` views agree.
     seen_fraction : points seen by a smaller fraction of the views are outside.
 
@@ -85,7 +89,7 @@ def hull_distance(
     ------
     ValueError : every mask is empty.
     """
-    view = _Silhouettes(world_to_camera, intrinsics, masks)
+    view = _Silhouettes(world_to_camera, intrinsics, masks, valid)
     return _evaluate(view, points, tolerance=tolerance, seen_fraction=seen_fraction)
 
 
@@ -94,6 +98,7 @@ def hull_bounds(
     intrinsics: Float[np.ndarray, "V 3 3"],
     masks: Shaped[np.ndarray, "V H W"],
     *,
+    valid: Shaped[np.ndarray, "V H W"] | None = None,
     margin: float = 0.02,
     tolerance: float = TOLERANCE,
     seen_fraction: float = SEEN_FRACTION,
@@ -105,6 +110,7 @@ def hull_bounds(
 
     Parameters
     ----------
+    valid : see `hull_distance`.
     margin : added on every side, as a fraction of the longest side; at least one pixel at the
         object's distance.
 
@@ -116,7 +122,7 @@ def hull_bounds(
     ------
     ValueError : the lines of sight do not meet, or no point lies on all masks.
     """
-    view = _Silhouettes(world_to_camera, intrinsics, masks)
+    view = _Silhouettes(world_to_camera, intrinsics, masks, valid)
     settings = {"tolerance": tolerance, "seen_fraction": seen_fraction}
     center, reach = _common_target(view, intrinsics, masks)
     lo, hi = center - reach, center + reach
@@ -144,12 +150,51 @@ def hull_bounds(
     return lo - pad, hi + pad
 
 
+def sight_bounds(
+    world_to_camera: Float[np.ndarray, "V 4 4"],
+    intrinsics: Float[np.ndarray, "V 3 3"],
+    *,
+    height: int,
+    width: int,
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    """Find a cube around what all cameras look at, where there are no masks.
+
+    Its centre is the point nearest to the cameras' axes. It is as large as half of the views, at
+    least, show whole at that distance, and holds no camera.
+
+    Returns
+    -------
+    lo, hi : (3,) float64 world corners.
+
+    Raises
+    ------
+    ValueError : the axes do not meet, or most of the cameras look away from where they meet.
+    """
+    poses = np.asarray(world_to_camera, np.float64)
+    centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+    center = _meeting_point(centers, poses[:, 2, :3])
+    depth = poses[:, 2, :3] @ center + poses[:, 2, 3]
+    ahead = depth > 0.0
+    if not ahead.mean() > SEEN_FRACTION:
+        raise ValueError(
+            f"{int((~ahead).sum())} of {len(depth)} cameras look away from the point that their "
+            "axes are nearest to: check that the poses are camera-to-world, or give the bounds"
+        )
+    lens = np.asarray(intrinsics, np.float64)[ahead]
+    shown = depth[ahead] * np.minimum(0.5 * width / lens[:, 0, 0], 0.5 * height / lens[:, 1, 1])
+    free = np.abs(centers - center).max(1).min()
+    # The cube's corners lie sqrt(3) as far from its centre as its faces.
+    half = min(float(np.median(shown)) / np.sqrt(3.0), 0.9 * free)
+    return center - half, center + half
+
+
 def hull_sdf(
     world_to_camera: Float[np.ndarray, "V 4 4"],
     intrinsics: Float[np.ndarray, "V 3 3"],
     masks: Shaped[np.ndarray, "V H W"],
     grid: Grid,
     *,
+    valid: Shaped[np.ndarray, "V H W"] | None = None,
     tolerance: float = TOLERANCE,
     seen_fraction: float = SEEN_FRACTION,
 ) -> Float[np.ndarray, " G"]:
@@ -167,7 +212,7 @@ def hull_sdf(
     """
     points = grid_points(grid)
     cell = float(grid.cell_size)
-    view = _Silhouettes(world_to_camera, intrinsics, masks)
+    view = _Silhouettes(world_to_camera, intrinsics, masks, valid)
     near = _evaluate(view, points, tolerance=tolerance, seen_fraction=seen_fraction) / cell
     lo = np.asarray(grid.origin, np.float64)
     hi = lo + cell * np.asarray(grid.shape)
@@ -230,13 +275,21 @@ def _box_points(lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 class _Silhouettes:
     """Views ready for lookup: distance images, and cameras recentred for float32."""
 
-    def __init__(self, world_to_camera, intrinsics, masks):
+    def __init__(self, world_to_camera, intrinsics, masks, valid=None):
         coverage = np.asarray(masks, np.float32)
         used = (coverage > _COVERED).any((1, 2))
+        counts = None if valid is None else np.asarray(valid) > _COVERED
         if not used.any():
             raise ValueError("every mask is empty; check the alpha channel or the mask files")
         factor = max(1, -(-max(coverage.shape[1:]) // _MASK_PIXELS))
-        coverage = np.stack([_reduced(image, factor) for image in coverage[used]])
+        coverage = coverage[used]
+        if counts is not None:
+            known = counts[used]
+            coverage = [_continued(*pair) for pair in zip(coverage, known, strict=True)]
+            counts = np.stack([_reduced(image, factor) for image in known.astype(np.float32)])
+            counts = counts > _FULL
+        coverage = np.stack([_reduced(image, factor) for image in coverage])
+        self.counts = counts
         poses = np.asarray(world_to_camera, np.float64)[used]
         centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
         self.used = used
@@ -251,6 +304,17 @@ class _Silhouettes:
         )
         self.pixel_angle = 1.0 / float(np.median(self.intrinsics[:, 0, 0]))
         self.distances = np.stack([_signed_pixels(image) for image in coverage])
+
+
+def _continued(coverage: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Give pixels that do not count the coverage of the nearest one that does.
+
+    A mask that is cut off there has no edge there.
+    """
+    if known.all() or not known.any():
+        return coverage
+    _, nearest = _nearest(known)
+    return coverage[nearest]
 
 
 def _reduced(coverage: np.ndarray, factor: int) -> np.ndarray:
@@ -300,13 +364,14 @@ def _evaluate(
     pinholes, intrinsics, distances = (
         jnp.asarray(x, jnp.float32) for x in (view.pinholes, view.intrinsics, view.distances)
     )
+    counts = None if view.counts is None else jnp.asarray(view.counts)
     results = []
     for start in range(0, points.shape[0], _POINTS_AT_ONCE):
         part = points[start : start + _POINTS_AT_ONCE] - view.origin
         padded = np.zeros((_POINTS_AT_ONCE, 3), np.float32)
         padded[: part.shape[0]] = part
         worst, seen = _worst_distance(
-            pinholes, intrinsics, distances, jnp.asarray(padded), tolerated=tolerated
+            pinholes, intrinsics, distances, counts, jnp.asarray(padded), tolerated=tolerated
         )
         kept = np.where(np.asarray(seen) >= least_seen, np.asarray(worst), np.inf)
         results.append(kept[: part.shape[0]].astype(np.float32))
@@ -318,6 +383,7 @@ def _worst_distance(
     pinholes: Float[Array, "V 3 4"],
     intrinsics: Float[Array, "V 3 3"],
     distances: Float[Array, "V H W"],
+    counts: Bool[Array, "V H W"] | None,
     points: Float[Array, "N 3"],
     *,
     tolerated: int,
@@ -329,8 +395,8 @@ def _worst_distance(
 
     def look(carry, view):
         largest, seen = carry
-        pinhole, matrix, distance = view
-        value, is_seen = _distance_in_view(pinhole, matrix, distance, points)
+        pinhole, matrix, distance, counted = view
+        value, is_seen = _distance_in_view(pinhole, matrix, distance, counted, points)
         kept = []
         for current in largest:
             kept.append(jnp.maximum(current, value))
@@ -339,11 +405,11 @@ def _worst_distance(
 
     nothing = jnp.full(points.shape[:1], -jnp.inf, points.dtype)
     start = ((nothing,) * (tolerated + 1), jnp.zeros(points.shape[:1], jnp.int32))
-    (largest, seen), _ = jax.lax.scan(look, start, (pinholes, intrinsics, distances))
+    (largest, seen), _ = jax.lax.scan(look, start, (pinholes, intrinsics, distances, counts))
     return largest[-1], seen
 
 
-def _distance_in_view(pinhole, intrinsics, distances, points):
+def _distance_in_view(pinhole, intrinsics, distances, counts, points):
     """World distance of points to one silhouette cone, negative inside; -inf where unseen."""
     height, width = distances.shape
     x, y, z = jnp.moveaxis(points @ pinhole[:, :3].T + pinhole[None, :, 3], -1, 0)
@@ -363,6 +429,11 @@ def _distance_in_view(pinhole, intrinsics, distances, points):
     # The clips above keep every index in bounds, so the gathers need not check.
     corner = top * width + left
     flat = distances.reshape(-1).at
+    if counts is not None:
+        own = jnp.minimum(v.astype(jnp.int32), height - 1) * width
+        own = own + jnp.minimum(u.astype(jnp.int32), width - 1)
+        own = jnp.where(seen, own, 0)
+        seen &= counts.reshape(-1).at[own].get(mode="promise_in_bounds")
     upper_left, upper_right, lower_left, lower_right = (
         flat[corner + step].get(mode="promise_in_bounds") for step in (0, right, down, right + down)
     )
@@ -371,6 +442,20 @@ def _distance_in_view(pinhole, intrinsics, distances, points):
     pixels = (1.0 - t) * upper + t * lower
     world = -pixels * depth * 2.0 / (fx + fy)
     return jnp.where(seen, world, -jnp.inf), seen
+
+
+def _meeting_point(centers: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Point nearest to lines through ``centers``; `ValueError` where they are parallel."""
+    sight = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    # Normal equations of min Σ |(I - d dᵀ)(x - c)|².
+    across = np.eye(3)[None] - sight[:, :, None] * sight[:, None, :]
+    matrix = across.sum(0)
+    if np.linalg.cond(matrix) > 1e6:
+        raise ValueError(
+            "the lines of sight are parallel or there is only one view, so the masks do not bound "
+            "a volume; give the bounds"
+        )
+    return np.linalg.solve(matrix, np.einsum("vij,vj->i", across, centers))
 
 
 def _common_target(view: _Silhouettes, intrinsics, masks) -> tuple[np.ndarray, float]:
@@ -391,16 +476,7 @@ def _common_target(view: _Silhouettes, intrinsics, masks) -> tuple[np.ndarray, f
         -1,
     )
     sight = np.einsum("vji,vj->vi", view.rotations, sight)
-    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-    # Normal equations of min Σ |(I - d dᵀ)(x - c)|².
-    across = np.eye(3)[None] - sight[:, :, None] * sight[:, None, :]
-    matrix = across.sum(0)
-    if np.linalg.cond(matrix) > 1e6:
-        raise ValueError(
-            "the lines of sight are parallel or there is only one view, so the masks do not bound "
-            "a volume; give the bounds"
-        )
-    center = np.linalg.solve(matrix, np.einsum("vij,vj->i", across, view.centers))
+    center = _meeting_point(view.centers, sight)
     return center, float(np.median(np.linalg.norm(view.centers - center[None], axis=1)))
 
 

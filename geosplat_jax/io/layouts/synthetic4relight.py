@@ -10,7 +10,6 @@ from pathlib import Path
 
 from geosplat_jax.io.frames import (
     Frame,
-    Lens,
     Listing,
     existing,
     find_lights,
@@ -19,6 +18,7 @@ from geosplat_jax.io.frames import (
     read_transforms,
 )
 from geosplat_jax.io.images import SceneError
+from geosplat_jax.io.lenses import Lens
 
 TRAIN_LIGHT = "envmap3"
 TEST_LIGHTS = ("envmap6", "envmap12")

@@ -13,11 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from geosplat_jax.io.frames import (
-    AngleLens,
     Frame,
-    Lens,
     Listing,
-    checked_angle,
     checked_pose,
     existing,
     find_lights,
@@ -28,6 +25,7 @@ from geosplat_jax.io.frames import (
     require,
 )
 from geosplat_jax.io.images import MissingFileError, SceneError
+from geosplat_jax.io.lenses import AngleLens, Lens, checked_angle
 
 USUAL_TRAIN_LIGHT = "sunset"
 

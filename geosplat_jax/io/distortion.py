@@ -1,0 +1,162 @@
+"""Bent lenses: a photograph, resampled to what a pinhole would have seen.
+
+Points are given on the plane z = 1 of the camera, OpenCV axes: x = X / Z, y = Y / Z. A model says
+where the lens shows such a point, which is all that undistorting an image takes. The polynomials of
+both models turn back far outside the photograph they were fitted to, where they would show a part
+of it a second time; the plane ends there.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import map_coordinates
+
+_SAMPLES = 4096  # of the radius, to see where a polynomial turns back
+_WHOLE = 1.0 - 1e-3  # a sample that counts takes all of its weight from pixels that count
+_SMALLEST_ALPHA = 1e-6
+
+
+def _powers(squared: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+    """``1 + c1 s + c2 s^2 + ...`` by Horner's rule."""
+    total = np.zeros_like(squared)
+    for coefficient in reversed(coefficients):
+        total = (total + coefficient) * squared
+    return 1.0 + total
+
+
+@dataclass(frozen=True)
+class Brown:
+    """Radial and tangential distortion (Brown and Conrady): OPENCV, RADIAL, SIMPLE_RADIAL.
+
+    Attributes
+    ----------
+    radial : k1, k2, ... of the even powers of the radius.
+    tangential : p1, p2.
+    divisor : k4, k5, k6 of OpenCV's rational model, which the radial factor is divided by.
+    """
+
+    radial: tuple[float, ...]
+    tangential: tuple[float, float] = (0.0, 0.0)
+    divisor: tuple[float, ...] = ()
+
+    def profile(self, radius: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Radius at which a radius is shown, without the tangential part."""
+        squared = radius * radius
+        return radius * _powers(squared, self.radial) / _nonzero(_powers(squared, self.divisor))
+
+    def distort(
+        self, x: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."]
+    ) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
+        """Return where the lens shows points of the plane z = 1, on the same plane."""
+        squared = x * x + y * y
+        factor = _powers(squared, self.radial) / _nonzero(_powers(squared, self.divisor))
+        p1, p2 = self.tangential
+        return (
+            x * factor + 2.0 * p1 * x * y + p2 * (squared + 2.0 * x * x),
+            y * factor + p1 * (squared + 2.0 * y * y) + 2.0 * p2 * x * y,
+        )
+
+
+@dataclass(frozen=True)
+class Fisheye:
+    """Equidistant projection with even powers of the angle (Kannala and Brandt): OPENCV_FISHEYE.
+
+    Attributes
+    ----------
+    radial : k1 to k4 of the angle to the axis.
+    """
+
+    radial: tuple[float, ...]
+
+    def profile(self, radius: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Radius at which a radius is shown."""
+        angle = np.arctan(radius)
+        return angle * _powers(angle * angle, self.radial)
+
+    def distort(
+        self, x: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."]
+    ) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
+        """Return where the lens shows points of the plane z = 1, on the same plane."""
+        radius = np.hypot(x, y)
+        is_off_axis = radius > 0.0
+        divisor = np.where(is_off_axis, radius, 1.0)
+        factor = np.where(is_off_axis, self.profile(radius) / divisor, 1.0)
+        return x * factor, y * factor
+
+
+Distortion = Brown | Fisheye
+
+
+def _nonzero(values: np.ndarray) -> np.ndarray:
+    return np.where(values == 0.0, 1e-12, values)
+
+
+def largest_radius(distortion: Distortion, reach: float) -> float:
+    """Radius on the plane z = 1, at most ``reach``, up to which what is shown moves outwards."""
+    radius = np.linspace(0.0, reach, _SAMPLES)
+    turns_back = np.diff(distortion.profile(radius)) <= 0.0
+    return float(radius[np.argmax(turns_back)]) if turns_back.any() else reach
+
+
+class Lookup(NamedTuple):
+    """Where the pixels of an undistorted image lie in the photograph of the same size.
+
+    Attributes
+    ----------
+    rows, columns : (H, W) pixel coordinates, centres at integers + 0.5.
+    inside : (H, W) those that the photograph shows.
+    """
+
+    rows: Float[np.ndarray, "H W"]
+    columns: Float[np.ndarray, "H W"]
+    inside: Bool[np.ndarray, "H W"]
+
+
+def pinhole_lookup(
+    distortion: Distortion, intrinsics: Float[np.ndarray, "3 3"], width: int, height: int
+) -> Lookup:
+    """Find the pixels of a pinhole with the same intrinsics and size in a photograph."""
+    fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
+    x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)
+    radius = np.hypot(x, y)
+    shown_x, shown_y = distortion.distort(x, y)
+    columns, rows = fx * shown_x + cx, fy * shown_y + cy
+    inside = (columns >= 0.0) & (columns <= width) & (rows >= 0.0) & (rows <= height)
+    inside &= radius <= largest_radius(distortion, float(radius.max()))
+    return Lookup(rows, columns, inside)
+
+
+def resample(pixels: Float[np.ndarray, "H W C"], lookup: Lookup) -> Float[np.ndarray, "H W C"]:
+    """Sample linear pixels bilinearly; zero where the photograph shows nothing.
+
+    Colour of four-channel images is weighted by alpha, the last channel, as `images.downscale`
+    does. Within half a pixel of the border, that of the last pixel is taken.
+    """
+    has_alpha = pixels.shape[-1] == 4
+    values = np.asarray(pixels, np.float32)
+    if has_alpha:
+        values = np.concatenate([values[..., :3] * values[..., 3:], values[..., 3:]], -1)
+    # Pixel centres lie at + 0.5, array entries at integers.
+    where = np.stack([lookup.rows - 0.5, lookup.columns - 0.5])
+    where = np.where(lookup.inside, where, 0.0)
+    sampled = np.stack(
+        [
+            map_coordinates(values[..., channel], where, order=1, mode="nearest")
+            for channel in range(values.shape[-1])
+        ],
+        -1,
+    )
+    if has_alpha:
+        alpha = sampled[..., 3:]
+        covered = alpha > _SMALLEST_ALPHA
+        color = np.where(covered, sampled[..., :3] / np.where(covered, alpha, 1.0), 0.0)
+        sampled = np.concatenate([color, alpha], -1)
+    return np.where(lookup.inside[..., None], sampled, 0.0).astype(np.float32)
+
+
+def resample_valid(valid: Bool[np.ndarray, "H W"], lookup: Lookup) -> Bool[np.ndarray, "H W"]:
+    """Tell which pixels are sampled from pixels that count only."""
+    weights = resample(valid[..., None].astype(np.float32), lookup)[..., 0]
+    return weights >= _WHOLE

@@ -1,0 +1,125 @@
+"""IDR, NeuS and their DTU: ``image/``, ``mask/`` and projections in ``cameras*.npz``.
+
+``world_mat_i @ scale_mat_i`` projects the unit sphere, which holds the object, to pixels of the
+i-th image by name. It is taken apart into a lens and a pose with OpenCV axes. Rays go through whole
+numbers there, so half a pixel is added to the principal point.
+"""
+
+import re
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from scipy.linalg import rq
+
+from geosplat_jax.io.frames import (
+    Frame,
+    Listing,
+    captured_frame,
+    checked_numbers,
+    images_in,
+    opengl_pose,
+    split_capture,
+)
+from geosplat_jax.io.images import SceneError, image_size
+from geosplat_jax.io.lenses import PinholeLens
+
+CAMERA_FILES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
+_IMAGE_FOLDERS = ("image", "images")
+_PIXEL_CENTER = 0.5
+_SKEW_TOLERANCE = 1e-3
+"""Share of the focal length by which the axes of the pixels may be off a right angle."""
+_SMALLEST_PIVOT = 1e-12
+
+
+def is_idr(root: Path) -> bool:
+    """Whether there are projections."""
+    return _camera_file(root) is not None
+
+
+def list_idr(root: Path, *, light: str | None = None) -> Listing:
+    """List the images with their projections.
+
+    Raises
+    ------
+    MissingFileError : there are no images.
+    SceneError : as many projections as images are not there, or one is none; a light is asked for.
+    """
+    if light is not None:
+        raise SceneError(f"this layout has one unnamed light, got light={light!r}; leave it out")
+    where = _camera_file(root)
+    if where is None:
+        raise SceneError(f"{root} has none of {', '.join(CAMERA_FILES)}; add one")
+    matrices = _read_matrices(where)
+    images = images_in(root, _IMAGE_FOLDERS)
+    count = sum(re.fullmatch(r"world_mat_\d+", key) is not None for key in matrices)
+    if count != len(images):
+        raise SceneError(
+            f"{where} has {count} cameras, but {images[0].parent} has {len(images)} images; they "
+            "belong together by number and name"
+        )
+    return split_capture(
+        [_frame(root, image, number, matrices, where) for number, image in enumerate(images)]
+    )
+
+
+def _camera_file(root: Path) -> Path | None:
+    return next((root / name for name in CAMERA_FILES if (root / name).is_file()), None)
+
+
+def _read_matrices(where: Path) -> dict[str, np.ndarray]:
+    """Read the arrays; those that would run code are refused."""
+    try:
+        with where.open("rb") as file, np.load(file, allow_pickle=False) as content:
+            return {key: content[key] for key in content.files if not key.endswith("inv")}
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        raise SceneError(f"{where} is damaged ({error}); write it again") from error
+
+
+def _frame(
+    root: Path, image: Path, number: int, matrices: dict[str, np.ndarray], where: Path
+) -> Frame:
+    both = []
+    for name in (f"world_mat_{number}", f"scale_mat_{number}"):
+        if name not in matrices:
+            raise SceneError(f"{where} has no {name}; cameras are numbered from 0 without gaps")
+        both.append(checked_numbers(matrices[name], (4, 4), f"{name} of {where}"))
+    world, scale = both
+    what = f"world_mat_{number} @ scale_mat_{number} of {where}"
+    lens, rotation, translation = _taken_apart((world @ scale)[:3], what)
+    height, width = image_size(image)
+    pinhole = PinholeLens(
+        fx=lens[0, 0],
+        fy=lens[1, 1],
+        cx=lens[0, 2] + _PIXEL_CENTER,
+        cy=lens[1, 2] + _PIXEL_CENTER,
+        width=width,
+        height=height,
+    )
+    return captured_frame(root, image, opengl_pose(rotation, translation, what), pinhole)
+
+
+def _taken_apart(projection: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return K, R and t of ``projection ~ K [R | t]``, K with a positive diagonal and K_33 = 1.
+
+    Raises
+    ------
+    SceneError : it is singular, or its pixels are no rectangles.
+    """
+    # A projection is the same times any number; this sign makes R a rotation.
+    if np.linalg.det(projection[:, :3]) < 0.0:
+        projection = -projection
+    lens, rotation = rq(projection[:, :3])
+    pivots = np.diag(lens)
+    if np.abs(pivots).min() <= _SMALLEST_PIVOT * np.abs(pivots).max():
+        raise SceneError(f"{what} is singular; it must be K [R | t]")
+    signs = np.diag(np.sign(pivots))
+    lens, rotation = lens @ signs, signs @ rotation
+    translation = np.linalg.solve(lens, projection[:, 3])
+    lens = lens / lens[2, 2]
+    if abs(lens[0, 1]) > _SKEW_TOLERANCE * lens[0, 0]:
+        raise SceneError(
+            f"{what} has a skew of {lens[0, 1]:g} pixels at a focal length of {lens[0, 0]:g}; "
+            "pixels must be rectangles"
+        )
+    return lens, rotation, translation

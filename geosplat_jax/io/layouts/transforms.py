@@ -1,0 +1,133 @@
+"""nerfstudio, instant-ngp and nvdiffrec: one ``transforms.json`` for all photographs.
+
+Poses are camera-to-world with OpenGL axes. The lens stands in the file or in each frame
+(`frames.list_transforms`). ``mask_path`` names the object's mask, white on the object; without it,
+``masks/`` is looked into (`frames.beside_images`). ``dynamic_mask_NAME.png`` beside an image, as
+instant-ngp has it, is not black where pixels do not count.
+
+``train_filenames``, ``val_filenames`` and ``test_filenames`` are the split of nerfstudio: views to
+test are those of the last, or else of ``val_filenames``. ``applied_transform`` says how nerfstudio
+turned the world before it wrote the poses, which are taken as they are. ``aabb_scale``, ``near``,
+``far`` and point clouds are not needed.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from geosplat_jax.io.frames import (
+    IMAGE_SUFFIXES,
+    Frame,
+    ListedFrame,
+    Listing,
+    captured_frame,
+    checked_numbers,
+    existing,
+    image_stem,
+    inside_scene,
+    list_transforms,
+    optional_files,
+    read_json,
+    split_capture,
+)
+from geosplat_jax.io.images import SceneError
+
+FILE = "transforms.json"
+
+_SPLITS = ("train_filenames", "val_filenames", "test_filenames")
+
+
+def is_transforms(root: Path) -> bool:
+    """Whether there is a single file of transforms."""
+    return (root / FILE).is_file()
+
+
+def list_transforms_capture(root: Path, *, light: str | None = None) -> Listing:
+    """List the frames of a ``transforms.json``.
+
+    Raises
+    ------
+    SceneError : see `frames.list_transforms`; a split names a file that no frame has, or shares
+        one; a light is asked for.
+    """
+    if light is not None:
+        raise SceneError(f"this layout has one unnamed light, got light={light!r}; leave it out")
+    where = root / FILE
+    content = read_json(where)
+    if "applied_transform" in content:
+        checked_numbers(content["applied_transform"], (3, 4), f"'applied_transform' of {where}")
+    frames: dict[str, Frame] = {}
+    for listed in list_transforms(content, where):
+        name = _plain(listed.file_path)
+        if name in frames:
+            raise SceneError(f"{where} names {name!r} for two frames; remove one")
+        frames[name] = _frame(root, listed, where)
+    splits = {key: _names(content, key, where, frames) for key in _SPLITS if key in content}
+    if not splits:
+        return split_capture(list(frames.values()))
+    return _given_split(frames, splits, where)
+
+
+def _plain(path: str) -> str:
+    """Write equal paths equally: ``./images/1.jpg`` as ``images/1.jpg``."""
+    return str(PurePosixPath(path.replace("\\", "/")))
+
+
+def _frame(root: Path, listed: ListedFrame, where: Path) -> Frame:
+    asked = inside_scene(root, listed.file_path, where)
+    stem = image_stem(root, listed.file_path, where)
+    candidates = [stem.with_name(stem.name + suffix) for suffix in IMAGE_SUFFIXES]
+    image = existing(
+        root, [asked] if asked != stem else candidates, f"{listed.file_path} of {where.name}"
+    )
+    mask, name = None, listed.values.get("mask_path")
+    if name is not None:
+        if not isinstance(name, str) or not name:
+            raise SceneError(f"'mask_path' of {listed.file_path} in {where} must be a name")
+        path = inside_scene(root, name, where)
+        mask = existing(root, [path], f"the mask of {listed.file_path} of {where.name}")
+    frame = captured_frame(root, image, listed.pose, listed.lens, mask=mask)
+    ignored = {"ignored": image.with_name(f"dynamic_mask_{image.stem}.png")}
+    return replace(frame, **optional_files(root, ignored))
+
+
+def _names(
+    content: Mapping[str, Any], key: str, where: Path, frames: Mapping[str, Frame]
+) -> list[str]:
+    """Return the frames that a split names."""
+    names = content[key]
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise SceneError(f"{key!r} of {where} must be a list of names, got {names!r}")
+    unknown = [name for name in names if _plain(name) not in frames]
+    if unknown:
+        raise SceneError(
+            f"{key!r} of {where} names {len(unknown)} files that no frame has, {unknown[0]!r} for "
+            "one; remove them"
+        )
+    return [_plain(name) for name in names]
+
+
+def _given_split(
+    frames: Mapping[str, Frame], splits: Mapping[str, Sequence[str]], where: Path
+) -> Listing:
+    train_key, validation_key, test_key = _SPLITS
+    test = splits.get(test_key) or splits.get(validation_key) or []
+    if train_key in splits:
+        train = splits[train_key]
+    else:
+        others = {name for names in splits.values() for name in names}
+        train = [name for name in frames if name not in others]
+    both = set(train) & set(test)
+    if both:
+        raise SceneError(f"{where} names {min(both)!r} to train on and to test; choose one")
+    if not train:
+        raise SceneError(f"the split of {where} leaves no view to train on")
+    left = len(frames) - len(set(train) | set(test))
+    notes = (f"{left} views that the split of {where.name} leaves out are not used",)
+    return Listing(
+        train=tuple(frames[name] for name in train),
+        test=tuple(frames[name] for name in test),
+        is_capture=True,
+        notes=notes if left else (),
+    )

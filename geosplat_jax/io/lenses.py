@@ -1,0 +1,175 @@
+"""Lenses as files describe them: checked numbers, and intrinsics for images of any size."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from geosplat_jax.io.distortion import Brown, Distortion, Fisheye
+from geosplat_jax.io.images import SceneError
+
+_LENS_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+_FOCAL_TOLERANCE = 0.01
+"""Share by which a focal length may differ from the one that the camera's angle gives."""
+_LONGEST = 1e9
+"""Pixels; no lens is longer, and no image larger."""
+
+_RADIAL, _TANGENTIAL = ("k1", "k2", "k3", "k4"), ("p1", "p2")
+_PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+_FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+_OTHER_PROJECTIONS = ("ftheta_p0", "is_latlong", "is_equirectangular", "is_orthographic")
+"""Keys of instant-ngp for cameras that are no lens with a focal length."""
+
+
+@dataclass(frozen=True)
+class AngleLens:
+    """A lens with square pixels and its axis in the middle of the image.
+
+    Attributes
+    ----------
+    angle_x : horizontal field of view in radians, as a pinhole sees it.
+    distortion : None for a pinhole.
+    """
+
+    angle_x: float
+    distortion: Distortion | None = None
+
+    def intrinsics(self, width: int, height: int) -> Float[np.ndarray, "3 3"]:
+        """Return the matrix of an image of this size, in its pixels."""
+        focal = 0.5 * width / np.tan(0.5 * self.angle_x)
+        return _matrix(focal, focal, 0.5 * width, 0.5 * height)
+
+
+@dataclass(frozen=True)
+class PinholeLens:
+    """A lens given for images of one size.
+
+    Attributes
+    ----------
+    fx, fy : focal lengths in pixels.
+    cx, cy : principal point in pixels; pixel centres lie at integers + 0.5.
+    width, height : size of the image in pixels.
+    distortion : None for a pinhole.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distortion: Distortion | None = None
+
+    def intrinsics(self, width: int, height: int) -> Float[np.ndarray, "3 3"]:
+        """Return the matrix of the same view as an image of this size, in its pixels."""
+        x, y = width / self.width, height / self.height
+        return _matrix(self.fx * x, self.fy * y, self.cx * x, self.cy * y)
+
+
+Lens = AngleLens | PinholeLens
+
+
+def _matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def checked_lens(values: Mapping[str, Any], where: str) -> Lens:
+    """Return the lens that the keys of a ``transforms.json`` describe.
+
+    Raises
+    ------
+    SceneError : it is incomplete, contradicts itself, is of another kind, or a value is no lens's.
+    """
+    distortion = _checked_distortion(values, where)
+    given = {key: checked_length(values[key], key, where) for key in _LENS_KEYS if key in values}
+    angle = None
+    if "camera_angle_x" in values:
+        angle = checked_angle(values["camera_angle_x"], where)
+    if angle is not None and not given.keys() - {"w", "h"}:
+        return AngleLens(angle, distortion)
+    missing = [key for key in ("w", "h") if key not in given]
+    if missing:
+        raise SceneError(
+            f"the lens of {where} has {', '.join(given)} but no {' and no '.join(missing)}; add "
+            "the size of the images that it is in pixels of"
+        )
+    width, height = given["w"], given["h"]
+    if angle is not None:
+        expected = 0.5 * width / math.tan(0.5 * angle)
+        focal = given.setdefault("fl_x", expected)
+        if abs(focal / expected - 1.0) > _FOCAL_TOLERANCE:
+            raise SceneError(
+                f"{where} contradicts itself: with w = {width:g}, fl_x is {focal:g}, but "
+                f"camera_angle_x = {angle:g} makes it {expected:g}; remove the wrong one"
+            )
+    return PinholeLens(
+        fx=given["fl_x"],
+        fy=given.get("fl_y", given["fl_x"]),
+        cx=given.get("cx", 0.5 * width),
+        cy=given.get("cy", 0.5 * height),
+        width=int(width),
+        height=int(height),
+        distortion=distortion,
+    )
+
+
+def _checked_distortion(values: Mapping[str, Any], where: str) -> Distortion | None:
+    """Return what bends a lens, None where nothing does."""
+    other = [key for key in _OTHER_PROJECTIONS if values.get(key)]
+    if other:
+        raise SceneError(f"{where} has {other[0]}, a camera that is no lens; render pinhole images")
+    model = values.get("camera_model")
+    if model is None:
+        model = "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV"
+    if model not in (*_PERSPECTIVE_MODELS, *_FISHEYE_MODELS):
+        known = ", ".join((*_PERSPECTIVE_MODELS, *_FISHEYE_MODELS))
+        raise SceneError(f"the camera_model of {where} must be one of {known}, got {model!r}")
+    names = (*_RADIAL, *_TANGENTIAL)
+    numbers = [values.get(name, 0.0) for name in names]
+    if "distortion_params" in values:
+        numbers = values["distortion_params"]
+        if not isinstance(numbers, list) or len(numbers) != len(names):
+            raise SceneError(
+                f"'distortion_params' of {where} must be the {len(names)} numbers "
+                f"{', '.join(names)}, got {numbers!r}"
+            )
+    k1, k2, k3, k4, p1, p2 = (
+        checked_coefficient(number, name, where)
+        for number, name in zip(numbers, names, strict=True)
+    )
+    if model in _FISHEYE_MODELS:
+        if p1 or p2:
+            raise SceneError(f"{where} has p1 or p2, which a fisheye lens has not; remove them")
+        return Fisheye((k1, k2, k3, k4))
+    return Brown((k1, k2, k3, k4), (p1, p2)) if any((k1, k2, k3, k4, p1, p2)) else None
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def checked_coefficient(value: Any, key: str, where: str) -> float:
+    """Return a number that bends a lens: finite, of either sign."""
+    if not _is_number(value) or not abs(value) < _LONGEST:
+        raise SceneError(f"{key!r} of {where} must be a finite number, got {value!r}")
+    return float(value)
+
+
+def checked_length(value: Any, key: str, where: str) -> float:
+    """Return a length of a lens in pixels: finite and positive, and whole if it is a size."""
+    is_size = key in ("w", "h")
+    # An integer of JSON may be too large for a float, so it is compared and not converted.
+    if not _is_number(value) or not 0 < value < _LONGEST or (is_size and value != int(value)):
+        kind = "a positive whole number" if is_size else "a positive number"
+        raise SceneError(f"{key!r} of {where} must be {kind} of pixels, got {value!r}")
+    return float(value)
+
+
+def checked_angle(angle: Any, where: str) -> float:
+    """Return a horizontal field of view in radians, between 0 and pi."""
+    if not _is_number(angle) or not 0.0 < angle < math.pi:
+        raise SceneError(f"the camera angle of {where} must be in (0, pi) radians, got {angle!r}")
+    return float(angle)

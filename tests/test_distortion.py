@@ -1,0 +1,176 @@
+"""Undistorted photographs show what a pinhole would have seen; formulas here are written anew."""
+
+import numpy as np
+import pytest
+
+from geosplat_jax.io.distortion import (
+    Brown,
+    Fisheye,
+    largest_radius,
+    pinhole_lookup,
+    resample,
+    resample_valid,
+)
+
+WIDTH, HEIGHT = 48, 40
+LENS = np.array([[46.0, 0.0, 22.5], [0.0, 50.0, 21.0], [0.0, 0.0, 1.0]])
+# Bilinear samples of a colour that turns by about a tenth of a radian a pixel.
+TOLERANCE = 3e-3
+
+MODELS = {
+    "SIMPLE_RADIAL": (Brown((-0.25,)), (-0.25,)),
+    "RADIAL": (Brown((0.15, -0.1)), (0.15, -0.1)),
+    "OPENCV": (Brown((-0.2, 0.05), (0.03, -0.02)), (-0.2, 0.05, 0.03, -0.02)),
+    "FULL_OPENCV": (
+        Brown((-0.2, 0.05, 0.02), (0.03, -0.02), (0.1, -0.05, 0.02)),
+        (-0.2, 0.05, 0.03, -0.02, 0.02, 0.1, -0.05, 0.02),
+    ),
+    "SIMPLE_RADIAL_FISHEYE": (Fisheye((0.1,)), (0.1,)),
+    "RADIAL_FISHEYE": (Fisheye((0.1, -0.05)), (0.1, -0.05)),
+    "OPENCV_FISHEYE": (Fisheye((0.1, -0.05, 0.02, -0.01)), (0.1, -0.05, 0.02, -0.01)),
+}
+"""Our model, and the numbers of the same in the order of OpenCV and COLMAP."""
+
+
+def shown(name, numbers, x, y):
+    """Where a lens shows (x, y, 1), as the manual of OpenCV writes it, one point at a time."""
+    if name.endswith("FISHEYE"):
+        k = [*numbers, 0.0, 0.0, 0.0, 0.0]
+        r = (x**2 + y**2) ** 0.5
+        t = np.arctan(r)
+        td = t * (1 + k[0] * t**2 + k[1] * t**4 + k[2] * t**6 + k[3] * t**8)
+        return (td / r * x, td / r * y) if r > 0 else (x, y)
+    if name.endswith("RADIAL"):
+        k1, k2 = (*numbers, 0.0)[:2]
+        p1 = p2 = k3 = k4 = k5 = k6 = 0.0
+    else:
+        k1, k2, p1, p2, k3, k4, k5, k6 = (*numbers, 0.0, 0.0, 0.0, 0.0)[:8]
+    r2 = x**2 + y**2
+    gain = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+    return (
+        x * gain + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
+        y * gain + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y,
+    )
+
+
+def unbent(name, numbers, u, v):
+    """Point of the plane that a lens shows at (u, v), by Newton's method."""
+    x, y = u, v
+    step = 1e-6
+    for _ in range(8):
+        at = np.array(shown(name, numbers, x, y))
+        along_x = (np.array(shown(name, numbers, x + step, y)) - at) / step
+        along_y = (np.array(shown(name, numbers, x, y + step)) - at) / step
+        change = np.linalg.solve(np.stack([along_x, along_y], -1), np.array([u, v]) - at)
+        x, y = x + change[0], y + change[1]
+    np.testing.assert_allclose(shown(name, numbers, x, y), (u, v), atol=1e-9)
+    return x, y
+
+
+def color(x, y):
+    """Smooth and different in every direction."""
+    z = np.sqrt(1 + x * x + y * y)
+    a, b = x / z, y / z
+    waves = [np.sin(4 * a + b), np.cos(3 * b - a), np.sin(2 * a - 4 * b + 1)]
+    return 0.5 + 0.4 * np.stack(waves, -1)
+
+
+def pixel_plane():
+    columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    return (columns - LENS[0, 2]) / LENS[0, 0], (rows - LENS[1, 2]) / LENS[1, 1]
+
+
+def photograph(name, numbers):
+    """What the lens takes of the colours at infinity, pixel by pixel."""
+    u, v = pixel_plane()
+    points = [unbent(name, numbers, *point) for point in zip(u.ravel(), v.ravel(), strict=True)]
+    x, y = np.array(points).T
+    return color(x, y).reshape(HEIGHT, WIDTH, 3).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", ["OPENCV", "RADIAL", "OPENCV_FISHEYE"])
+def test_an_undistorted_photograph_is_that_of_a_pinhole(name):
+    ours, numbers = MODELS[name]
+    lookup = pinhole_lookup(ours, LENS, WIDTH, HEIGHT)
+    found = resample(photograph(name, numbers), lookup)
+    expected = color(*pixel_plane())
+    assert 0.8 < lookup.inside.mean() <= 1.0
+    # Within half a pixel of the border the last pixel stands for what lies beyond its centre.
+    is_inner = (np.abs(lookup.rows - HEIGHT / 2) < HEIGHT / 2 - 0.5) & (
+        np.abs(lookup.columns - WIDTH / 2) < WIDTH / 2 - 0.5
+    )
+    assert np.abs(found - expected)[is_inner].max() < TOLERANCE
+    assert (found[~lookup.inside] == 0.0).all()
+
+
+@pytest.mark.parametrize("name", list(MODELS))
+def test_a_lens_shows_points_where_its_formula_says(name):
+    ours, numbers = MODELS[name]
+    points = np.random.default_rng(0).uniform(-0.7, 0.7, (50, 2))
+    points[0] = 0.0
+    found = np.stack(ours.distort(points[:, 0], points[:, 1]), -1)
+    expected = [shown(name, numbers, *point) for point in points]
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", list(MODELS))
+def test_a_lens_is_that_of_colmap(name):
+    pycolmap = pytest.importorskip("pycolmap")
+    ours, numbers = MODELS[name]
+    focal = [50.0] if "SIMPLE" in name or name.startswith("RADIAL") else [46.0, 50.0]
+    camera = pycolmap.Camera(
+        model=name, width=WIDTH, height=HEIGHT, params=[*focal, 22.5, 21.0, *numbers]
+    )
+    points = np.random.default_rng(1).uniform(-0.7, 0.7, (50, 2))
+    expected = camera.img_from_cam(np.concatenate([points, np.ones((50, 1))], -1))
+    found = np.stack(ours.distort(points[:, 0], points[:, 1]), -1)
+    found = found * [focal[0], focal[-1]] + [22.5, 21.0]
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_where_the_polynomial_turns_back_nothing_is_seen_twice():
+    bent = Brown((-0.6,))
+    limit = largest_radius(bent, 10.0)
+    assert limit == pytest.approx((1 / (3 * 0.6)) ** 0.5, rel=1e-2)  # where 1 - 1.8 r^2 is zero
+    assert largest_radius(Brown((0.1,)), 10.0) == 10.0
+    wide = np.array([[12.0, 0.0, 24.0], [0.0, 12.0, 20.0], [0.0, 0.0, 1.0]])
+    lookup = pinhole_lookup(bent, wide, WIDTH, HEIGHT)
+    x, y = np.meshgrid((np.arange(WIDTH) - 23.5) / 12, (np.arange(HEIGHT) - 19.5) / 12)
+    # The plane goes on beyond the limit, and the photograph has pixels there.
+    is_beyond = np.hypot(x, y) > limit
+    within = (lookup.rows > 0) & (lookup.rows < HEIGHT)
+    within &= (lookup.columns > 0) & (lookup.columns < WIDTH)
+    assert (is_beyond & within).sum() > 100
+    assert not lookup.inside[is_beyond].any()
+    assert lookup.inside[np.hypot(x, y) < 0.95 * limit].all()
+
+
+def test_no_distortion_changes_nothing():
+    pixels = np.random.default_rng(2).uniform(size=(HEIGHT, WIDTH, 3)).astype(np.float32)
+    lookup = pinhole_lookup(Brown((0.0,)), LENS, WIDTH, HEIGHT)
+    assert lookup.inside.all()
+    np.testing.assert_allclose(resample(pixels, lookup), pixels, atol=1e-6)
+
+
+def test_colour_behind_the_mask_does_not_bleed_in():
+    pixels = np.ones((HEIGHT, WIDTH, 4), np.float32)
+    pixels[:, : WIDTH // 2] = [5.0, 5.0, 5.0, 0.0]
+    pixels[:, WIDTH // 2 :, :3] = 0.25
+    lookup = pinhole_lookup(Brown((-0.2,)), LENS, WIDTH, HEIGHT)
+    found = resample(pixels, lookup)
+    has_color = found[..., 3] > 1e-3
+    assert ((found[..., 3] > 0.05) & (found[..., 3] < 0.95)).any()
+    np.testing.assert_allclose(found[has_color][:, :3], 0.25, atol=1e-4)
+
+
+def test_a_sample_next_to_a_pixel_that_does_not_count_does_not_count():
+    valid = np.ones((HEIGHT, WIDTH), bool)
+    valid[20, 30] = False
+    bent = Brown((-0.2,))
+    lookup = pinhole_lookup(bent, LENS, WIDTH, HEIGHT)
+    counts = resample_valid(valid, lookup)
+    near = (np.abs(lookup.rows - 20.5) < 0.9) & (np.abs(lookup.columns - 30.5) < 0.9)
+    assert near.any()
+    assert not counts[near].any()
+    far = (np.abs(lookup.rows - 20.5) > 1.01) | (np.abs(lookup.columns - 30.5) > 1.01)
+    np.testing.assert_array_equal(counts[far], lookup.inside[far])
