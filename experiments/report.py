@@ -265,6 +265,39 @@ def summary_table(sweep: dict[str, Any], entries: dict[str, dict[str, Entry]]) -
     return _table(rows)
 
 
+def seed_table(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Entry]]]) -> list[str]:
+    """Means over the scenes and over several seeds, and the spread over the seeds.
+
+    The reference's values, and how the other runs differ from them with the same seed. A seed
+    counts where every scene has the figure; the spread is the standard deviation of the sample.
+    """
+    reference = sweep["runs"][0]["name"]
+    rows = [["run", *(f"{name}{arrow(name)}" for name in sweep["figures"])]]
+    for run in sweep["runs"]:
+        name = run["name"]
+        row = [f"{name} (reference)" if name == reference else name]
+        for figure in sweep["figures"]:
+            values = []
+            for entries in repeated:
+                pairs, _ = _pairs(entries, name, reference, figure)
+                if len(pairs) == len(entries):
+                    other = 0.0 if name == reference else 1.0
+                    values.append(statistics.fmean(a - other * b for a, b in pairs))
+            row.append(_with_spread(figure, values, signed=name != reference))
+        rows.append(row)
+    return _table(rows)
+
+
+def _with_spread(figure: str, values: list[float], *, signed: bool) -> str:
+    """Write a mean and how far its values are apart; how many these are where it is one."""
+    if not values:
+        return _NONE
+    mean = digits(figure, statistics.fmean(values), signed=signed)
+    if len(values) == 1:
+        return f"{mean} (1 seed)"
+    return f"{mean} ± {digits(figure, statistics.stdev(values))}"
+
+
 def curves(
     sweep: dict[str, Any], entries: dict[str, dict[str, Entry]], group: str, figure: str
 ) -> dict[str, list[tuple[float, float, float | None]]]:
@@ -384,12 +417,14 @@ def compose(
     plots: list[str],
     notes: list[str],
     command: str,
+    others: list[dict[str, dict[str, Entry]]] | None = None,
 ) -> str:
     """Put the report together as markdown.
 
     Parameters
     ----------
     sweep, entries : from ``sweep.json`` and `read_entries`.
+    others : entries of the same sweep with other seeds.
     plots : links to the curves.
     notes : said beside missing and failed runs.
     command : the one that writes the report.
@@ -399,6 +434,15 @@ def compose(
     lines += ["## Summary", "", f"Means over {', '.join(sweep['scenes'])}: values of the first "]
     lines[-1] += "run, differences of the others from it, and ratios of seconds and memory."
     lines += ["", *summary_table(sweep, entries), ""]
+    if others:
+        lines += [
+            "## Seeds",
+            "",
+            f"Means over {len(others) + 1} seeds, and how far these are apart ",
+        ]
+        lines[-1] += "(standard deviation): as above, but for the costs."
+        lines.append("")
+        lines += [*seed_table(sweep, [entries, *others]), ""]
     for scene, runs in entries.items():
         lines += [f"## {scene}", "", *scene_table(sweep, runs), ""]
     lines += [
@@ -429,15 +473,52 @@ def _read_sweep(folder: Path) -> dict[str, Any]:
     return sweep
 
 
+def _read_repetitions(
+    sweep: dict[str, Any], folders: list[Path]
+) -> list[dict[str, dict[str, Entry]]]:
+    """Read the entries of sweeps that differ from this one in their seeds alone."""
+    found, seeds = [], {sweep["runs"][0]["config"]["run"]["seed"]}
+    for folder in folders:
+        other = _read_sweep(folder)
+        same = [
+            (one["name"], one["evaluate"]) == (two["name"], two["evaluate"])
+            and [line.split(":")[0] for line in _differences(one, two)] == ["run.seed"]
+            for one, two in zip(sweep["runs"], other["runs"], strict=False)
+        ]
+        alike = len(sweep["runs"]) == len(other["runs"]) and sweep["scenes"] == other["scenes"]
+        seed = other["runs"][0]["config"]["run"]["seed"]
+        if not (alike and all(same)) or seed in seeds:
+            raise ReportError(
+                f"{folder} does not repeat the sweep with another seed: runs, scenes and settings "
+                "must be the same but for run.seed"
+            )
+        seeds.add(seed)
+        found.append(read_entries(folder, other))
+    return found
+
+
+def _differences(one: dict[str, Any], two: dict[str, Any]) -> list[str]:
+    return differences(config_from_dict(one["config"]), config_from_dict(two["config"]))
+
+
 def main(argv: list[str] | None = None) -> int:
     """Write a report; 0, or 2 where there is no sweep."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("folder", type=Path, help="output of experiments/run.py")
     parser.add_argument("--output", type=Path, required=True, help="markdown file to write")
+    parser.add_argument(
+        "--seeds",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="FOLDER",
+        help="outputs of the same sweep with --set run.seed=..., for the spread",
+    )
     parser.add_argument("--plots", type=Path, help="folder for curves (default: none are drawn)")
     arguments = parser.parse_args(argv)
     try:
         sweep = _read_sweep(arguments.folder)
+        others = _read_repetitions(sweep, arguments.seeds)
     except ReportError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -453,10 +534,12 @@ def main(argv: list[str] | None = None) -> int:
         for path in write_plots(sweep, entries, arguments.plots, stem):
             links.append(Path(os.path.relpath(path, arguments.output.parent)).as_posix())
     places = [(arguments.folder, "RUNS"), "--output", (arguments.output, arguments.output.name)]
+    if arguments.seeds:
+        places += ["--seeds", *((folder, "OTHER_RUNS") for folder in arguments.seeds)]
     if arguments.plots is not None:
         places += ["--plots", (arguments.plots, "IMAGES")]
     command = command_line("experiments/report.py", *places)
-    text = compose(sweep, entries, plots=links, notes=notes, command=command)
+    text = compose(sweep, entries, plots=links, notes=notes, command=command, others=others)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     arguments.output.write_text(text, encoding="utf-8")
     for line in [*problems(sweep, entries), *(f"- {note}" for note in notes)]:

@@ -18,7 +18,7 @@ sys.path.insert(0, str(ROOT / "experiments"))
 import report  # noqa: E402
 import run as runner  # noqa: E402
 
-from geosplat_jax.fit.config import Config, Stage  # noqa: E402
+from geosplat_jax.fit.config import Config, Stage, differences  # noqa: E402
 from geosplat_jax.fit.presets import make_config  # noqa: E402
 from geosplat_jax.io.checkpoints import save_checkpoint  # noqa: E402
 
@@ -56,6 +56,8 @@ x = 16
 group = "light"
 """
 
+
+SEED = "run.seed=1"
 
 SHARED = "_full.split_sum"
 """Folder of the stage that all runs but one share."""
@@ -459,6 +461,26 @@ def test_the_bundled_sweeps_are_sound():
     assert stages["materials-at-once"].rates["albedo"].warmup == 0
     assert stages["albedo-kept"].enter == ()
     assert runner.read_sweep(SWEEPS / "smoke.toml").scenes == ("duck",)
+    assert len(runner.read_sweep(SWEEPS / "priors.toml").runs) == 9
+
+
+def test_the_ablation_of_the_paper_changes_what_its_rows_say():
+    sweep = runner.read_sweep(SWEEPS / "ablation.toml")
+    configs = {run.name: sweep.config(run) for run in sweep.runs}
+    stages = {name: [s.name for s in config.active_stages] for name, config in configs.items()}
+    assert stages["no-refinement"] == stages["full"][:-1]
+    changed = {name: differences(configs["full"], config) for name, config in configs.items()}
+    assert {line.split(":")[0] for line in changed["no-occlusion"]} == {
+        "stages.monte_carlo.transport.occlusion",
+        "stages.refine.transport.occlusion",
+    }
+    assert {line.split(":")[1].strip() for line in changed["no-indirect"]} == {
+        "'constant' -> 'none'"
+    }
+    assert {line.split(":")[0] for line in changed["no-alignment"]} == {
+        "stages.split_sum.splats.kind",
+        "stages.monte_carlo.splats.kind",
+    }
 
 
 def _hand_made(folder):
@@ -505,6 +527,35 @@ def test_the_report_has_the_figures_and_their_differences(tmp_path):
     assert "python experiments/run.py sweep.toml --scenes SCENES --output RUNS" in text
     assert "python experiments/report.py RUNS --output study.md" in text
     assert str(tmp_path) not in text
+
+
+def _other_seed(folder, name, psnr):
+    """Run the sweep with another seed, with one figure for the reference and one for the rest."""
+    arguments = [*_arguments(folder)[:3], "--output", str(folder / name), "--set", SEED]
+    assert runner.main(arguments, start=Fakes().start) == 0
+    for path in (folder / name).glob("*/*/metrics.json"):
+        figures = json.loads(path.read_text())
+        value = psnr[path.parent.name == "full"]
+        path.write_text(json.dumps(figures | {"mean": {"nvs.psnr": value}}))
+    return str(folder / name)
+
+
+def test_other_seeds_give_a_spread_of_paired_differences(tmp_path):
+    _hand_made(tmp_path)
+    other = _other_seed(tmp_path, "again", (30.5, 32.5))
+    text = _report(tmp_path, "--seeds", other)
+    seeds = _rows(text, "Seeds")
+    # The reference has 30.5 and 32.5, no-shadow differs by -1.5 and -2: means over both scenes.
+    assert seeds["full (reference)"] == ["31.50 ± 1.41", "0.0150 (1 seed)"]
+    assert seeds["no-shadow"] == ["−1.75 ± 0.35", "+0.0000 (1 seed)"]
+    assert "--seeds OTHER_RUNS" in text
+
+
+def test_seeds_of_another_sweep_are_refused(tmp_path, capsys):
+    _hand_made(tmp_path)
+    arguments = [str(tmp_path / "runs"), "--output", str(tmp_path / "x.md"), "--seeds"]
+    assert report.main([*arguments, str(tmp_path / "runs")]) == 2
+    assert "does not repeat the sweep with another seed" in capsys.readouterr().err
 
 
 def test_missing_failed_and_changed_runs_are_listed(tmp_path):
