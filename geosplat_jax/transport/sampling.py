@@ -92,11 +92,22 @@ def _offsets(key: Key[Array, ""], count: int, numbers: int) -> Float[Array, "N k
 
 
 def in_chunks(
-    function: Callable[[Any], Any], arguments: Any, mask: Bool[Array, " N"], samples: int
+    function: Callable[[Any], Any],
+    arguments: Any,
+    mask: Bool[Array, " N"],
+    samples: int,
+    *,
+    has_gradient: bool = True,
 ) -> Any:
     """Map a function of rows over chunks of them, to be computed again in the backward pass.
 
     Chunks that the mask leaves nothing of give zeros, at no cost.
+
+    Parameters
+    ----------
+    function : of a chunk of ``arguments``, pytrees with N rows.
+    mask : rows that matter. samples : per row, from which follows how many rows are a chunk.
+    has_gradient : static; False where nothing depends on what is differentiated.
     """
     count = mask.shape[0]
     chunk = min(max(256, _RAYS_AT_ONCE // max(samples, 1)), max(count, 1))
@@ -112,7 +123,8 @@ def in_chunks(
 
     def one_chunk(parts: tuple[Array, Any]) -> Any:
         is_used, arguments = parts
-        return jax.lax.cond(jnp.any(is_used), jax.checkpoint(function), nothing, arguments)
+        again = jax.checkpoint(function) if has_gradient else function
+        return jax.lax.cond(jnp.any(is_used), again, nothing, arguments)
 
     found = jax.lax.map(one_chunk, jax.tree.map(chunks, (mask, arguments)))
     return jax.tree.map(lambda x: x.reshape(rows * chunk, *x.shape[2:])[:count], found)
@@ -201,7 +213,8 @@ def draw_samples(
         return Samples(jnp.moveaxis(directions, 0, 1), weights.T, hits.T, light[: counts.light].T)
 
     samples = counts.light + counts.diffuse
-    return in_chunks(one_chunk, (points, _offsets(key, count, 4)), points.mask, samples)
+    arguments = (points, _offsets(key, count, 4))
+    return in_chunks(one_chunk, arguments, points.mask, samples, has_gradient=False)
 
 
 def draw_specular(
@@ -234,5 +247,5 @@ def draw_specular(
         return jnp.moveaxis(drawn, 0, 1), hits.T, density.T
 
     count = wo.shape[0]
-    arguments = (points, roughness, wo, _offsets(key, count, 2))
-    return in_chunks(one_chunk, jax.lax.stop_gradient(arguments), points.mask, counts.specular)
+    arguments = jax.lax.stop_gradient((points, roughness, wo, _offsets(key, count, 2)))
+    return in_chunks(one_chunk, arguments, points.mask, counts.specular, has_gradient=False)
