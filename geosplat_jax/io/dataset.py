@@ -71,6 +71,11 @@ class Dataset:
     warnings: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def views_to_show(self) -> Views:
+        """The test views; those of the training where there are none."""
+        return self.test if self.test.names else self.train
+
 
 def load_dataset(
     path: str | Path,
