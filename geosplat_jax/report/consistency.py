@@ -101,17 +101,24 @@ class PixelErrors:
 
     Attributes
     ----------
-    reflection_deg, distance : as in `Consistency`; of no meaning where coverage is zero.
+    reflection_deg : as in `Consistency`; of no meaning where coverage is zero.
+    ranges, shown : distances of the hit and of the splats, as shares of the box's diagonal.
     coverage : of the splats.
     facing : cosine between the way back to the camera and the mesh's interpolated normal.
     is_outside : whether the face that is met looks towards the camera.
     """
 
     reflection_deg: Float[np.ndarray, " P"]
-    distance: Float[np.ndarray, " P"]
+    ranges: Float[np.ndarray, " P"]
+    shown: Float[np.ndarray, " P"]
     coverage: Float[np.ndarray, " P"]
     facing: Float[np.ndarray, " P"]
     is_outside: Bool[np.ndarray, " P"]
+
+    @property
+    def distance(self) -> Float[np.ndarray, " P"]:
+        """Difference of the distances, as in `Consistency`."""
+        return np.abs(self.shown - self.ranges)
 
     @property
     def is_compared(self) -> Bool[np.ndarray, " P"]:
@@ -234,10 +241,10 @@ def _compare(body: Body, camera: Camera, capacities: Capacities) -> tuple[PixelE
     seen = see_mesh(body.vertices, body.faces, body.normals, camera)
     hit = seen.is_hit
     towards, normals = seen.towards[hit], seen.normals[hit]
-    angle = _angle(_reflect(towards, normals), _reflect(towards, _unit(shown[hit])))
     errors = PixelErrors(
-        np.rad2deg(angle),
-        np.abs(blended[hit] - seen.ranges[hit]) / body.diagonal,
+        reflection_angle_deg(towards, normals, _unit(shown[hit])),
+        seen.ranges[hit] / body.diagonal,
+        blended[hit] / body.diagonal,
         coverage[hit],
         -(towards * normals).sum(axis=-1),
         seen.is_outside[hit],
@@ -245,17 +252,20 @@ def _compare(body: Body, camera: Camera, capacities: Capacities) -> tuple[PixelE
     return errors, capacities
 
 
+def reflection_angle_deg(
+    directions: Float[np.ndarray, "P 3"],
+    normals: Float[np.ndarray, "P 3"],
+    others: Float[np.ndarray, "P 3"],
+) -> Float[np.ndarray, " P"]:
+    """Angle between unit directions reflected at two unit normals each; exact for small ones."""
+    first, second = _reflect(directions, normals), _reflect(directions, others)
+    return np.rad2deg(2.0 * np.arctan2(_length(first - second), _length(first + second)))
+
+
 def _reflect(
     directions: Float[np.ndarray, "P 3"], normals: Float[np.ndarray, "P 3"]
 ) -> Float[np.ndarray, "P 3"]:
     return directions - 2.0 * (directions * normals).sum(axis=-1, keepdims=True) * normals
-
-
-def _angle(
-    first: Float[np.ndarray, "P 3"], second: Float[np.ndarray, "P 3"]
-) -> Float[np.ndarray, " P"]:
-    """Angle between unit vectors, exact for small ones as well."""
-    return 2.0 * np.arctan2(_length(first - second), _length(first + second))
 
 
 def pixel_errors(
@@ -308,12 +318,12 @@ def body_of_run(trained: Trained) -> Body:
     )
 
 
-def body_of_mesh(mesh: Mesh, model: SplatModel | None = None) -> Body:
+def body_of_mesh(mesh: Mesh, model: SplatModel | None = None, box: Box | None = None) -> Body:
     """Return a mesh, and splats on it that follow it alone (default: those of `FaceSplats`).
 
-    What is a share of the box in a run is one of the mesh's own bounding box.
+    ``box`` : whose half is the unit of length (default: `box_of` the mesh).
     """
-    raster, box = RasterSettings(), box_of(mesh)
+    raster, box = RasterSettings(), box or box_of(mesh)
     place = jax.jit((model or FaceSplats()).place)
     splats = place(Surface(mesh, {}), None, box)
     vertices, faces, normals = trim_mesh(mesh)
@@ -350,12 +360,13 @@ def load_mesh(path: str | Path) -> Mesh:
     faces = faces[(corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2])]
     if not len(faces):
         raise ValueError(f"{path} has no triangle with three different corners")
-    return Mesh(
-        jnp.asarray(vertices),
-        jnp.asarray(faces),
-        jnp.asarray(len(vertices), jnp.int32),
-        jnp.asarray(len(faces), jnp.int32),
-    )
+    return whole_mesh(vertices, faces)
+
+
+def whole_mesh(vertices: Float[np.ndarray, "V 3"], faces: np.ndarray) -> Mesh:
+    """Return a mesh without padding."""
+    counts = (jnp.asarray(len(rows), jnp.int32) for rows in (vertices, faces))
+    return Mesh(jnp.asarray(vertices, jnp.float32), jnp.asarray(faces, jnp.int32), *counts)
 
 
 def cameras_around(
