@@ -1,7 +1,7 @@
 """Table 5: how well splats stand for their mesh, for several ways to put them there, and why.
 
     python experiments/studies/consistency.py RUN|MESH|ball [...] [--views 4] [--sizes 200 800]
-        [--cells 48 96] [--causes]
+        [--cells 48 96] [--only TEXT] [--causes]
 
 Every row places other splats on a mesh and compares both (`report.consistency`); nothing is
 trained. The mesh is that of a run, whose cameras are those of its scene, or that of a file: as it
@@ -157,7 +157,7 @@ class Subject(NamedTuple):
             "one isotropic splat per face": OneBall(constants),
             "vertices (Eq. 12)": VertexSplats(constants),
         }
-        sunk = {f"faces, shifted by {SHIFT:g}": lambda: self.body(Sunk(constants))}
+        sunk = {f"faces (Eq. 8-11), shifted by {SHIFT:g}": lambda: self.body(Sunk(constants))}
         if self.trained is not None:
             sunk = of_run(self.trained)
         return {**sunk, **{n: lambda model=m: self.body(model) for n, m in models.items()}}
@@ -170,7 +170,7 @@ def of_run(trained: Trained) -> dict[str, Callable[[], Body]]:
     bare = replace(trained, pipeline=pipeline, params=replace(trained.params, splats=None))
     found = {"as the run ended": lambda: body_of_run(trained)}
     if trained.params.material.shift_head is not None:
-        found = {"faces, shifted as learned": lambda: body_of_run(bare), **found}
+        found = {"faces (Eq. 8-11), shifted as learned": lambda: body_of_run(bare), **found}
     return found
 
 
@@ -194,12 +194,17 @@ def subjects(name: str, cells: list[int], views: int) -> Iterator[Subject]:
         yield Subject(title + made, mesh, box_of(mesh), AdapterConstants(), cameras, None)
 
 
-def print_table(subject: Subject, sizes: list[int]) -> None:
-    """Print a row for every way to place splats, and columns for every size of the images."""
+def print_table(subject: Subject, sizes: list[int], only: str) -> None:
+    """Print a row for every way to place splats, and columns for every size of the images.
+
+    ``only`` : part of the names of the rows that are wanted.
+    """
     print(f"\n{subject.name}: {int(subject.mesh.face_count)} faces, {len(subject.cameras)} views\n")
     print("| splats |" + "".join(f" {size} x {size} | not covered |" for size in sizes))
     print("|---|" + "---|---|" * len(sizes))
     for name, make in subject.ways().items():
+        if only not in name:
+            continue
         body, cells = make(), []
         for size in sizes:
             errors = pixel_errors(body, [resized(camera, size) for camera in subject.cameras])
@@ -296,6 +301,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--sizes", type=int, nargs="+", default=[200])
     parser.add_argument("--cells", type=int, nargs="+", default=[], help="of meshes of files")
+    parser.add_argument("--only", default="", metavar="TEXT", help="rows whose name has this in it")
     parser.add_argument("--causes", action="store_true", help="instead of ways to place splats")
     arguments = parser.parse_args()
     enable_compilation_cache()
@@ -305,7 +311,7 @@ def main() -> None:
                 for size in arguments.sizes:
                     print_causes(subject, size)
             else:
-                print_table(subject, arguments.sizes)
+                print_table(subject, arguments.sizes, arguments.only)
     for name, (degrees, distance) in PAPER.items():
         print(f"paper, {name}: {degrees:.2f}°, {distance:.3f}")
 
