@@ -50,7 +50,8 @@ MARGIN = 8
 """Pixels around a crop from which faces may still show in it."""
 SAMPLES = 4
 """Rays along each side of a pixel that say which share of it the mesh covers."""
-STEPS = 40
+STEPS, ROOM = 15, 1.5
+"""Of the solver at most; and how much longer and wider splats may get."""
 RASTER = RasterSettings()
 
 
@@ -423,11 +424,11 @@ def main() -> None:
 
 
 def room(constants: Constants, crops: list[Crop]) -> Capacities:
-    """Give buffers room for these constants, and for splats twice as long and wide."""
+    """Give buffers room for these constants, and for splats longer and wider by `ROOM`."""
     wide = eqx.tree_at(
         lambda c: (c.alpha, c.beta),
         constants,
-        (tuple(2.0 * x for x in constants.alpha), tuple(0.5 * x for x in constants.beta)),
+        (tuple(ROOM * x for x in constants.alpha), tuple(x / ROOM for x in constants.beta)),
     )
     sizes = Capacities(visible=2048, hits=8192, chunks=1024)
     for group in crops:
