@@ -404,7 +404,8 @@ def main() -> None:
     }
     capacities = room(ours, seen)
     for name, (start, names) in fits_to_make(ours).items():
-        rows[name], _ = fit(jax.tree.map(float, start), names, seen, capacities)
+        rows[name] = fit(start, names, seen, capacities)
+        print(f"  {described(rows[name])}", flush=True)
     print(
         "\n| constants | fitted meshes | coverage | held apart | coverage |\n|---|---|---|---|---|"
     )
