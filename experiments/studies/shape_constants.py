@@ -1,7 +1,7 @@
 """Fit the constants of the face sampling (Eq. 8-11) to how well splats stand for their mesh.
 
     python experiments/studies/shape_constants.py --fit ball MESH RUN ... --apart MESH RUN ...
-        [--cells 48] [--sizes 200 400] [--crops 2] [--crop 48] [--json FILE]
+        [--cells 48] [--sizes 200 400] [--views 2] [--crop 32] [--coverage .1 .03] [--json FILE]
 
 Constants are u, v, alpha and beta of both rings, thickness, and one inward shift and opacity for
 all splats. Levenberg-Marquardt makes small, over crops of several views of several meshes:
@@ -9,7 +9,7 @@ all splats. Levenberg-Marquardt makes small, over crops of several views of seve
 - the difference of the directions reflected at the mesh's normals and at the splats', in degrees;
 - the difference of the distances along the ray, in units of `DISTANCE_UNIT` of the box's diagonal;
 - the difference of the splats' coverage and the share of the pixel that the mesh covers, in units
-  of `COVERAGE_UNIT`,
+  of ``--coverage``: smaller ones ask for denser splats,
 
 all three beyond three units by their size instead of its square. Derivatives are of forward mode;
 visibility and order are found anew at every iterate and have none. Rows of the table are constants
@@ -19,6 +19,7 @@ set by hand and fitted, columns means over the meshes of the fit and over those 
 import argparse
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,7 @@ from geosplat_jax.splats.composite import composite_tiles_forward
 from geosplat_jax.splats.projection import project
 from geosplat_jax.splats.rasterize import composite, find_visible, gather_visible
 
-DISTANCE_UNIT, COVERAGE_UNIT, KNEE = 0.002, 0.1, 3.0
+DISTANCE_UNIT, KNEE = 0.002, 3.0
 MARGIN = 8
 """Pixels around a crop from which faces may still show in it."""
 SAMPLES = 4
@@ -247,10 +248,12 @@ def shrunk(deviations: Array, squared: Array) -> Array:
     return deviations * jnp.sqrt(2.0 / (1.0 + jnp.sqrt(1.0 + squared / KNEE**2)))
 
 
-def residual(constants: Constants, crop: Crop, capacities: Capacities) -> tuple[Array, Usage]:
+def residual(
+    constants: Constants, crop: Crop, coverage_unit: Float[Array, ""], capacities: Capacities
+) -> tuple[Array, Usage]:
     """Evaluate what is squared and summed, (P, P, 5), and needs of buffers."""
     turned, distance, coverage, usage = differences(constants, crop, capacities)
-    parts = (turned, (distance / DISTANCE_UNIT)[..., None], (coverage / COVERAGE_UNIT)[..., None])
+    parts = (turned, (distance / DISTANCE_UNIT)[..., None], (coverage / coverage_unit)[..., None])
     squares = (jnp.sum(part * part, axis=-1, keepdims=True) for part in parts)
     return jnp.concatenate([shrunk(p, s) for p, s in zip(parts, squares, strict=True)], -1), usage
 
@@ -259,6 +262,7 @@ def residual(constants: Constants, crop: Crop, capacities: Capacities) -> tuple[
 def solved(
     first: Float[Array, " 9"],
     is_free: Bool[Array, " 9"],
+    coverage_unit: Float[Array, ""],
     crops: list[Crop],
     capacities: Capacities,
 ) -> tuple[Float[Array, " 9"], Int[Array, ""], Usage]:
@@ -267,7 +271,7 @@ def solved(
     def everything(changes: Array, crops: list[Crop]) -> tuple[Array, Usage]:
         constants = bounded(first + jnp.where(is_free, changes, 0.0))
         parts = [
-            jax.lax.map(lambda crop: residual(constants, crop, capacities), group)
+            jax.lax.map(lambda crop: residual(constants, crop, coverage_unit, capacities), group)
             for group in crops
         ]
         usage = capacity_module.combine(*(jax.tree.map(jnp.max, usage) for _, usage in parts))
@@ -291,11 +295,17 @@ def solved(
 
 
 def fit(
-    start: Constants, names: tuple[str, ...], crops: list[Crop], capacities: Capacities
+    start: Constants,
+    names: tuple[str, ...],
+    coverage_unit: float,
+    crops: list[Crop],
+    capacities: Capacities,
 ) -> Constants:
     """Fit the named constants; the others stay."""
     is_free = jnp.asarray([name in names for name in NUMBERS])
-    value, steps, usage = solved(free(start), is_free, crops, capacities)
+    value, steps, usage = solved(
+        free(start), is_free, jnp.asarray(coverage_unit), crops, capacities
+    )
     needed = {name: int(count) for name, count in usage.items()}
     assert not capacity_module.overflowed(needed, capacities), "the solver ends where it has room"
     print(f"  {int(steps)} steps of the solver over {', '.join(names)}; needs {needed}", flush=True)
@@ -341,15 +351,18 @@ def score(constants: Constants, crops: list[Crop], capacities: Capacities) -> di
 RINGS = ("alpha", "beta", "u", "v")
 
 
-def fits_to_make(ours: Constants) -> dict[str, tuple[Constants, tuple[str, ...]]]:
-    """Name the fits: where they begin, and what they may change."""
+def fits_to_make(
+    ours: Constants, coverage_units: list[float]
+) -> Iterator[tuple[str, Constants, tuple[str, ...], float]]:
+    """Yield names of fits, where they begin, what they may change, and units of coverage."""
     sunk = eqx.tree_at(lambda c: c.shift, ours, 0.3)
-    return {
-        "fitted: shift": (sunk, ("shift",)),
-        "fitted: rings, no shift": (ours, (*RINGS, "thickness")),
-        "fitted: rings and shift": (sunk, (*RINGS, "thickness", "shift")),
-        "fitted: rings, shift and opacity": (sunk, (*RINGS, "thickness", "shift", "opacity")),
-    }
+    yield "fitted: shift", sunk, ("shift",), coverage_units[0]
+    for unit in coverage_units:
+        which = f", coverage {unit:g}"
+        yield f"fitted: rings, no shift{which}", ours, (*RINGS, "thickness"), unit
+        names = (*RINGS, "thickness", "shift")
+        yield f"fitted: rings and shift{which}", sunk, names, unit
+        yield f"fitted: rings, shift, opacity{which}", sunk, (*names, "opacity"), unit
 
 
 def described(constants: Constants) -> str:
@@ -385,8 +398,10 @@ def main() -> None:
     parser.add_argument("--apart", nargs="+", required=True, metavar="RUN|MESH|ball")
     parser.add_argument("--cells", type=int, default=48, help="of meshes of files")
     parser.add_argument("--sizes", type=int, nargs="+", default=[200, 400], help="of whole views")
-    parser.add_argument("--views", type=int, default=3, help="of every mesh, one crop each")
-    parser.add_argument("--crop", type=int, default=48, help="pixels along the side of a crop")
+    parser.add_argument("--views", type=int, default=2, help="of every mesh, one crop each")
+    parser.add_argument("--crop", type=int, default=32, help="pixels along the side of a crop")
+    parser.add_argument("--coverage", type=float, nargs="+", default=[0.1, 0.03], help="its units")
+    parser.add_argument("--only", default="", metavar="TEXT", help="fits whose name has this in it")
     parser.add_argument("--seed", type=int, default=0, help="of the crops")
     parser.add_argument("--json", type=Path, help="also write the constants to this file")
     arguments = parser.parse_args()
@@ -403,8 +418,10 @@ def main() -> None:
         "ours, shift .3": with_shift(AdapterConstants(), 0.3),
     }
     capacities = room(ours, seen)
-    for name, (start, names) in fits_to_make(ours).items():
-        rows[name] = fit(start, names, seen, capacities)
+    for name, start, names, unit in fits_to_make(ours, arguments.coverage):
+        if arguments.only not in name:
+            continue
+        rows[name] = fit(start, names, unit, seen, capacities)
         print(f"  {described(rows[name])}", flush=True)
     print(
         "\n| constants | fitted meshes | coverage | held apart | coverage |\n|---|---|---|---|---|"
