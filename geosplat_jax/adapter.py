@@ -17,7 +17,7 @@ from pydantic import Field
 from geosplat_jax.core.mesh import face_normals_and_areas, vertex_normals
 from geosplat_jax.core.numerics import safe_divide, safe_norm, safe_normalize, safe_sqrt
 from geosplat_jax.core.rotation import axes_to_quaternion, frame_from_normal, matrix_to_quaternion
-from geosplat_jax.core.settings import Positive, Variant, settings
+from geosplat_jax.core.settings import Positive, Share, Variant, settings
 from geosplat_jax.core.types import Box, Mesh, Splats
 from geosplat_jax.materials import Attributes
 from geosplat_jax.surface.base import Surface
@@ -45,6 +45,9 @@ class AdapterConstants:
     shading_frame: bool = False
     """Orient by the interpolated normal (the paper's text) instead of the face's (the authors'
     code)."""
+    shift: Share = 0.0
+    """Inward shift of the splats of a face in roots of its area, where none is learned
+    (``material.has_shift`` is off); see `shift_inwards`."""
     vertex_area_divisor: Positive = 2.5
     """The k in ``S = sqrt(area / k)`` of the vertex sampling."""
 
@@ -259,10 +262,13 @@ class FaceSplats(SplatModel):
         return face_splats(surface.mesh, normals, constants=self.constants, unit=box.half_extent)
 
     def settle(self, splats: Splats, surface: Surface, attributes: Attributes) -> Splats:
-        """Sink below the faces, where a shift is learned; see `shift_inwards`."""
-        if attributes.shift is None:
-            return splats
-        return shift_inwards(splats, surface.mesh, attributes.shift)
+        """Sink below the faces by the learned shift, or by that of the constants."""
+        fraction = attributes.shift
+        if fraction is None:
+            if self.constants.shift == 0:
+                return splats
+            fraction = jnp.full_like(splats.opacities, self.constants.shift)
+        return shift_inwards(splats, surface.mesh, fraction)
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,17 @@ from geosplat_jax.io.checkpoints import CheckpointError
 from geosplat_jax.io.dataset import describe, load_recorded
 from geosplat_jax.io.images import SceneError
 from geosplat_jax.materials import MATERIAL_PRIORS
+from geosplat_jax.report.consistency import (
+    DEFAULT_SIZE,
+    DEFAULT_VIEWS,
+    Consistency,
+    body_of_mesh,
+    box_of,
+    cameras_around,
+    load_mesh,
+    measure,
+    single_cameras,
+)
 from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.relight import BACKGROUNDS, RelightOptions
 from geosplat_jax.report.renderer import DEFAULT_SAMPLES, RELIGHT_KINDS
@@ -105,8 +116,22 @@ def _parser() -> argparse.ArgumentParser:
         "--stage", help="what this stage ended with, instead of the run as it is now"
     )
 
-    consistency = _run_parser(commands, "consistency", "how well a run's splats stand for its mesh")
-    consistency.add_argument("--stage", help="as for evaluate")
+    consistency = commands.add_parser(
+        "consistency", help="how well splats stand for the mesh of a run, or for any mesh"
+    )
+    consistency.add_argument(
+        "subject", type=Path, metavar="RUN|MESH", help="folder of a run, or file of a closed mesh"
+    )
+    consistency.add_argument(
+        "--scene",
+        type=Path,
+        help="where the run's scene is now; or the scene whose cameras see the mesh (default: "
+        f"{DEFAULT_VIEWS} cameras around it)",
+    )
+    consistency.add_argument("--stage", help="of a run, as for evaluate")
+    consistency.add_argument(
+        "--size", type=int, help="pixels along the longer side of the views (default: the scene's)"
+    )
     consistency.add_argument("--json", type=Path, help="also write the figures to this file")
 
     render = _run_parser(commands, "render", "render a run's test or training views")
@@ -367,14 +392,38 @@ def _evaluate(arguments: argparse.Namespace) -> None:
 
 
 def _consistency(arguments: argparse.Namespace) -> None:
-    """Print the figures of Table 5 for a run."""
-    found = Run(arguments.run, scene=arguments.scene).consistency(stage=arguments.stage)
+    """Print the figures of Table 5 for a run, or for splats that are put on a mesh."""
+    subject, size = arguments.subject, arguments.size
+    if size is not None and size < 1:
+        raise UsageError(f"--size must be at least 1 pixel, got {size}")
+    if subject.is_dir():
+        found = Run(subject, scene=arguments.scene).consistency(stage=arguments.stage, size=size)
+    else:
+        found = _consistency_of_mesh(arguments)
     print(f"reflected direction, mesh against splats  {found.reflection_deg:9.3f} degrees")
     print(f"distance along the ray, of the diagonal   {found.distance:9.5f}")
     print(f"pixels compared                           {found.pixels:9d}")
     print(f"pixels of the mesh without splats         {found.uncovered:9.2%}")
+    if found.behind:
+        print(f"pixels that see it from inside, left out  {found.behind:9.2%}")
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(asdict(found), indent=2) + "\n", encoding="utf-8")
+
+
+def _consistency_of_mesh(arguments: argparse.Namespace) -> Consistency:
+    """Put splats on the mesh of a file, and compare both."""
+    path = arguments.subject
+    if not path.exists():
+        raise UsageError(f"{path} is neither the folder of a run nor a mesh file")
+    if arguments.stage is not None:
+        raise UsageError(f"--stage is of runs, and {path} is a file")
+    mesh = load_mesh(path)
+    if arguments.scene is None:
+        cameras = cameras_around(box_of(mesh), size=arguments.size or DEFAULT_SIZE)
+    else:
+        views = load_recorded(arguments.scene, {}).views_to_show
+        cameras = single_cameras(views, arguments.size)
+    return measure(body_of_mesh(mesh), cameras)
 
 
 def _relight(arguments: argparse.Namespace) -> None:

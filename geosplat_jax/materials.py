@@ -69,6 +69,8 @@ class MaterialSpec:
     """Without it metallic is zero and has no parameters."""
     has_shift: bool = True
     """Whether there is a head for the inward shift of splats."""
+    initial_shift_logit: float = 0.0
+    """Added to the raw shift; the sigmoid of it is where the shift starts, near 1/2 at zero."""
     position_gradient: bool = False
     """Whether attributes pull on the geometry: the field is differentiated in the positions. Off,
     the field moves with the surface. On in the paper's and the authors' method."""
@@ -101,7 +103,8 @@ class Attributes(eqx.Module):
     materials : albedo in (0, 1), roughness in [0.1, 1] and metallic in (0, 1), or 0 for a field
         without metallic.
     shift : (N,) share in (0, 1) of ``sqrt(face area)`` by which a splat sinks below its face,
-        ``sigmoid(z(mu))``, starting near 1/2; None for a field without shift.
+        ``sigmoid(z(mu))``, starting near 1/2 (see `MaterialSpec.initial_shift_logit`); None for a
+        field without shift.
     indirect : (N, c) raw numbers of learned indirect light (see `transport.indirect`), or None. The
         points carry no gradient from here.
     """
@@ -200,7 +203,8 @@ def _detached_heads(
         if spec.position_gradient:
             table = field.albedo_table if field.surface_table is None else field.surface_table
             features = encode(table, jax.lax.stop_gradient(unit), spec=spec.grid)
-        shift = jax.nn.sigmoid(apply_mlp(field.shift_head, features)[:, 0])
+        raw = apply_mlp(field.shift_head, features)[:, 0]
+        shift = jax.nn.sigmoid(raw + spec.initial_shift_logit)
     if field.indirect_head is not None:
         features = encode(field.albedo_table, jax.lax.stop_gradient(unit), spec=spec.grid)
         indirect = apply_mlp(field.indirect_head, features)

@@ -88,6 +88,13 @@ class RasterSettings:
     near: Positive = 0.01
     """Near plane, in half the longest side of the box around the object."""
 
+    def eligible(self, splats: Splats, camera: Camera) -> Bool[Array, " N"]:
+        """Tell which splats a camera with a single view may show, wherever they are."""
+        if not self.cull_backfaces:
+            return splats.mask
+        towards_camera = camera.centers - splats.means
+        return splats.mask & (jnp.sum(splats.outward * towards_camera, axis=-1) > 0)
+
 
 class Asset(eqx.Module):
     """The half of a render that depends neither on light nor on view.
@@ -327,14 +334,10 @@ class RenderPipeline(eqx.Module):
     def visible(self, splats: Splats, camera: Camera) -> TileLists:
         """List what a camera with a single view can see; no gradients."""
         splats, camera = jax.lax.stop_gradient((splats, camera))
-        eligible = splats.mask
-        if self.raster.cull_backfaces:
-            towards_camera = camera.centers - splats.means
-            eligible = eligible & (jnp.sum(splats.outward * towards_camera, axis=-1) > 0)
         return find_visible(
             self.project(splats.means, splats.quats, splats.scales, camera),
             splats.opacities,
-            eligible,
+            self.raster.eligible(splats, camera),
             height=camera.height,
             width=camera.width,
             tile_size=self.raster.tile_size,

@@ -31,12 +31,12 @@ from geosplat_jax.io.views import Views
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
 from geosplat_jax.report.assets import export_assets
-from geosplat_jax.report.consistency import Consistency, measure, traceable
+from geosplat_jax.report.consistency import Consistency, body_of_run, measure, single_cameras
 from geosplat_jax.report.evaluate import evaluate_run, preview_image
 from geosplat_jax.report.pictures import normals_to_rgb
 from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.relight import RelightOptions, load_light, load_view_light, relight_views
-from geosplat_jax.report.renderer import DEFAULT_SAMPLES, Renderer, build_asset, straight_rgba
+from geosplat_jax.report.renderer import DEFAULT_SAMPLES, Renderer, straight_rgba
 
 REFINEMENT_SAMPLES = 32
 """Rays per splat when cameras are refined: noise averages out over the pixels of a view."""
@@ -142,9 +142,6 @@ class Run:
             raise RunError(f"{self.dataset.root} has no {split} views")
         return views
 
-    def _views_to_show(self) -> Views:
-        return self.dataset.test if self.dataset.test.names else self.dataset.train
-
     def _output(self, folder: Path | None, name: str) -> Path:
         chosen = folder or self.folder.path / name
         chosen.mkdir(parents=True, exist_ok=True)
@@ -201,16 +198,18 @@ class Run:
             relight_indirect=relight_indirect,
         )
 
-    def consistency(self, *, stage: str | None = None) -> Consistency:
+    def consistency(self, *, stage: str | None = None, size: int | None = None) -> Consistency:
         """Measure how well the splats stand for the mesh, over the views to show.
 
-        See `report.consistency`. ``stage`` : as for `evaluate`.
+        See `report.consistency`.
+
+        Parameters
+        ----------
+        stage : as for `evaluate`.
+        size : pixels along the longer side of the views (default: those of the photographs).
         """
         trained = self.trained if stage is None else load_trained(self.folder, stage=stage)
-        pipeline = traceable(trained.pipeline)
-        views = self._views_to_show()
-        cameras = (views.camera([number]) for number in range(len(views)))
-        return measure(pipeline, build_asset(pipeline, trained.params), cameras)
+        return measure(body_of_run(trained), single_cameras(self.dataset.views_to_show, size))
 
     def render(self, split: str = "test", output: Path | None = None) -> list[Path]:
         """Write every view of a split as ``NAME_rgba.png`` and ``NAME_normal.png``."""
@@ -252,7 +251,7 @@ class Run:
             light, albedo_scale=albedo_scale, indirect=indirect
         )
         folder = self._output(output, f"relight_{Path(env).stem}")
-        return relight_views(relit, light, self._views_to_show(), folder, options)
+        return relight_views(relit, light, self.dataset.views_to_show, folder, options)
 
     def refine_cameras(
         self,
@@ -318,7 +317,7 @@ class _Previews:
     """Write truth, render and normals of one view side by side, while the training goes on."""
 
     def __init__(self, dataset: Dataset, folder: RunFolder) -> None:
-        self._views = dataset.test if dataset.test.names else dataset.train
+        self._views = dataset.views_to_show
         self._folder = folder.previews
         self._running: Future[None] | None = None
 

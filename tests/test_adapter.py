@@ -245,6 +245,20 @@ def test_the_inward_shift_moves_the_means_and_leaves_the_anchors_on_the_face():
     np.testing.assert_array_equal(moved.means[count:], splats.means[count:])
 
 
+def test_the_constant_shift_is_used_where_none_is_learned():
+    mesh = _octahedron()
+    splats, surface = place_padded(mesh), Surface(mesh, {})
+    rows = splats.means.shape[0]
+    materials = Materials(jnp.zeros((rows, 3)), jnp.zeros(rows), jnp.zeros(rows))
+    settle = jax.jit(lambda model, shift: model.settle(splats, surface, shift), static_argnums=0)
+    model = FaceSplats(AdapterConstants(shift=0.3))
+    moved = settle(model, Attributes(materials, None, None))
+    np.testing.assert_array_equal(moved.means, sink(splats, mesh, jnp.full(rows, 0.3)).means)
+    learned = settle(model, Attributes(materials, jnp.full(rows, 0.5), None))
+    np.testing.assert_array_equal(learned.means, sink(splats, mesh, jnp.full(rows, 0.5)).means)
+    assert FaceSplats().settle(splats, surface, Attributes(materials, None, None)) is splats
+
+
 def test_the_inward_shift_leaves_splats_without_a_face_where_they_are():
     mesh = _octahedron()
     splats = place_padded(mesh, kind="vertex")

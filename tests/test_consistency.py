@@ -1,94 +1,226 @@
 """Consistency of mesh and splats: exact on a plane, and blind to nothing that it names."""
 
+import json
 from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import ball, tiny_config, views_from
+import trimesh
+from support import views_from
 
-from geosplat_jax.geometry import grid_vertices, initial_geometry
-from geosplat_jax.report.consistency import measure, traceable
-from geosplat_jax.report.renderer import build_asset
+from geosplat_jax.adapter import AdapterConstants, FaceSplats
+from geosplat_jax.cli import main
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.report.consistency import (
+    body_of_mesh,
+    box_of,
+    cameras_around,
+    load_mesh,
+    measure,
+    pixel_errors,
+    resized,
+    see_mesh,
+)
 
 EYE = [0.6, 0.3, 2.4]
 
 
+def plane(cells=16):
+    """Vertices and faces of a square from -1 to 1 at z = 0, seen from above."""
+    x, y = np.meshgrid(*[np.linspace(-1, 1, cells + 1)] * 2)
+    vertices = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
+    corner = np.arange(cells * (cells + 1)).reshape(cells, -1)[:, :-1].reshape(-1, 1)
+    up = cells + 1
+    faces = np.concatenate([corner + [0, 1, up + 1], corner + [0, up + 1, up]])
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def saved(mesh, folder, name="mesh.ply"):
+    mesh.export(folder / name)
+    return folder / name
+
+
 @pytest.fixture(scope="module")
-def scene():
-    """Pipeline and asset of a plane, whose splats lie on its faces, and a camera above it."""
-    pipeline, params = ball(tiny_config("geometry.resolution=14", "material.has_shift=false"))
-    grid = pipeline.surface.grid
-    height = np.asarray(grid_vertices(grid))[:, 2] - 0.01
-    shape = initial_geometry(grid, jnp.asarray(height / float(grid.cell_size), jnp.float32))
-    pipeline = replace(traceable(pipeline), capacities=pipeline.surface.first_capacities(shape))
-    room = pipeline.capacities.resized(visible=4096, hits=16384, chunks=8192, cell_patches=8192)
-    pipeline = replace(pipeline, capacities=room)
-    asset = build_asset(pipeline, replace(params, geometry=shape))
-    np.testing.assert_allclose(asset.splats.normals[:100], [[0, 0, 1.0]] * 100, atol=1e-4)
-    return pipeline, asset, [views_from([EYE], size=32, field_of_view=0.3).camera([0])]
+def body(tmp_path_factory):
+    """A plane with its splats."""
+    body = body_of_mesh(load_mesh(saved(plane(), tmp_path_factory.mktemp("plane"))))
+    np.testing.assert_allclose(body.splats.normals[:100], [[0, 0, 1.0]] * 100, atol=1e-5)
+    return body
 
 
-def with_splats(asset, **changes):
-    return replace(asset, splats=replace(asset.splats, **changes))
+@pytest.fixture(scope="module")
+def cameras():
+    """One camera above the plane that sees nothing beside it."""
+    return [views_from([EYE], size=32, field_of_view=0.3).camera([0])]
 
 
-def away_from(eye, asset):
+def with_splats(body, **changes):
+    return replace(body, splats=replace(body.splats, **changes))
+
+
+def away_from(eye, body):
     """Unit directions from the eye to the splats."""
-    away = asset.splats.means - jnp.asarray(eye)[None, :]
+    away = body.splats.means - jnp.asarray(eye)[None, :]
     return away / jnp.linalg.norm(away, axis=1, keepdims=True)
 
 
-def diagonal_of(asset):
-    mesh = np.asarray(asset.mesh.vertices)[np.asarray(asset.mesh.vertex_mask)]
-    return float(np.linalg.norm(mesh.max(axis=0) - mesh.min(axis=0)))
-
-
-def test_a_plane_is_what_its_splats_are(scene):
+def test_a_plane_is_what_its_splats_are(body, cameras):
     """But for the distance of a splat's mean, which is not that of the pixel's centre."""
-    pipeline, asset, cameras = scene
-    found = measure(pipeline, asset, cameras)
-    assert found.pixels > 32 * 32 - 40
+    found = measure(body, cameras)
+    assert found.pixels == 32 * 32
     assert found.reflection_deg < 0.01
-    assert found.distance < 0.02
-    assert found.uncovered < 0.04
+    assert found.distance < 0.01
+    assert (found.uncovered, found.behind) == (0, 0)
 
 
-def test_normals_that_are_turned_turn_the_reflection_by_twice_as_much(scene):
-    pipeline, asset, cameras = scene
-    eye = np.asarray(EYE) - np.asarray([0, 0, 0.01])
-    eye /= np.linalg.norm(eye)
+def test_normals_that_are_turned_turn_the_reflection_by_twice_as_much(body, cameras):
+    eye = np.asarray(EYE) / np.linalg.norm(EYE)
     # Within the plane of sight of the middle of the picture, where the angle doubles exactly.
     across = eye - eye[2] * np.array([0, 0, 1.0])
     across /= np.linalg.norm(across)
     angle = np.deg2rad(10.0)
     normal = np.cos(angle) * np.array([0, 0, 1.0]) + np.sin(angle) * across
-    normals = jnp.where(asset.splats.mask[:, None], jnp.asarray(normal, jnp.float32)[None], 0.0)
-    found = measure(pipeline, with_splats(asset, normals=normals), cameras)
+    normals = jnp.broadcast_to(jnp.asarray(normal, jnp.float32), body.splats.normals.shape)
+    found = measure(with_splats(body, normals=normals), cameras)
     assert found.reflection_deg == pytest.approx(20.0, abs=0.3)
 
 
-def test_splats_that_sink_change_the_distance_by_as_much(scene):
-    pipeline, asset, cameras = scene
-    sunk = with_splats(asset, means=asset.splats.means + 0.1 * away_from(EYE, asset))
-    raised = with_splats(asset, means=asset.splats.means - 0.1 * away_from(EYE, asset))
-    far, near = (measure(pipeline, a, cameras).distance for a in (sunk, raised))
+def test_splats_that_sink_change_the_distance_by_as_much(body, cameras):
+    sunk = with_splats(body, means=body.splats.means + 0.1 * away_from(EYE, body))
+    raised = with_splats(body, means=body.splats.means - 0.1 * away_from(EYE, body))
+    far, near = (measure(b, cameras).distance for b in (sunk, raised))
     # A slant shows the nearer of two splats, so both are a little closer than their means.
-    assert 0.5 * (far + near) == pytest.approx(0.1 / diagonal_of(asset), rel=0.05)
+    assert body.diagonal == pytest.approx(np.sqrt(8))
+    assert 0.5 * (far + near) == pytest.approx(0.1 / body.diagonal, rel=0.05)
 
 
-def test_pixels_without_splats_are_told_and_not_compared(scene):
-    pipeline, asset, cameras = scene
-    is_left = asset.splats.means[:, 0] > 0
-    opacities = jnp.where(is_left, asset.splats.opacities, 0.0)
-    found = measure(pipeline, with_splats(asset, opacities=opacities), cameras)
+def test_pixels_without_splats_are_told_and_not_compared(body, cameras):
+    is_left = body.splats.means[:, 0] > 0
+    opacities = jnp.where(is_left, body.splats.opacities, 0.0)
+    found = measure(with_splats(body, opacities=opacities), cameras)
     assert 0.3 < found.uncovered < 0.7
+    assert found.pixels == pytest.approx((1 - found.uncovered) * 32 * 32)
     with pytest.raises(ValueError, match="no view sees the mesh"):
-        measure(pipeline, with_splats(asset, opacities=0 * opacities), cameras)
+        measure(with_splats(body, opacities=0 * opacities), cameras)
 
 
-@pytest.mark.slow
-def test_buffers_grow(scene):
-    pipeline, asset, cameras = scene
-    small = replace(pipeline, capacities=pipeline.capacities.resized(hits=128, chunks=128))
-    assert measure(small, asset, cameras) == measure(pipeline, asset, cameras)
+def test_backs_of_faces_are_told_and_not_compared(body, cameras):
+    low, high = body.faces[: len(body.faces) // 2], body.faces[len(body.faces) // 2 :]
+    half = measure(replace(body, faces=np.concatenate([low[:, ::-1], high])), cameras)
+    assert half.behind == pytest.approx(0.5, abs=0.1)
+    assert half.pixels == pytest.approx((1 - half.behind) * 32 * 32)
+    with pytest.raises(ValueError, match="do its faces look inwards"):
+        measure(replace(body, faces=body.faces[:, ::-1]), cameras)
+
+
+def test_buffers_grow(body, cameras):
+    small = pixel_errors(body, cameras, Capacities(visible=4096, hits=128, chunks=4096))
+    np.testing.assert_array_equal(small.coverage, pixel_errors(body, cameras).coverage)
+
+
+def test_rays_meet_what_a_ray_tracer_says(tmp_path):
+    """Interpolated normals and distances of a bumpy ball, against embree."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    ball.vertices *= 1 + 0.2 * np.sin(5 * ball.vertices[:, :1]) * np.cos(4 * ball.vertices[:, 1:2])
+    body = body_of_mesh(load_mesh(saved(ball, tmp_path)))
+    camera = cameras_around(box_of(load_mesh(tmp_path / "mesh.ply")), views=3, size=40)[1]
+    seen = see_mesh(body.vertices, body.faces, body.normals, camera)
+    solid = trimesh.Trimesh(body.vertices, body.faces, process=False)
+    towards = seen.towards.reshape(-1, 3)
+    eye = np.asarray(camera.centers, np.float64)
+    places, rays, rows = solid.ray.intersects_location(
+        np.repeat(eye, len(towards), axis=0), towards, multiple_hits=False
+    )
+    differ = seen.is_hit.ravel() ^ np.isin(np.arange(len(towards)), rays)
+    assert differ.sum() <= 2  # a ray along an edge of the outline may go either way
+    rays, places, rows = (x[seen.is_hit.ravel()[rays]] for x in (rays, places, rows))
+    ranges = np.linalg.norm(places - eye, axis=1)
+    np.testing.assert_allclose(seen.ranges.ravel()[rays], ranges, atol=2e-5)
+    shares = trimesh.triangles.points_to_barycentric(solid.triangles[rows], places)
+    normals = np.einsum("nk,nkd->nd", shares, body.normals[body.faces[rows]])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    np.testing.assert_allclose(seen.normals.reshape(-1, 3)[rays], normals, atol=2e-4)
+    assert seen.is_outside[seen.is_hit].all()
+
+
+def test_seams_of_a_file_are_sewn(tmp_path):
+    """A file that repeats the corners of every face has the normals of the whole."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    torn = trimesh.Trimesh(
+        ball.vertices[ball.faces].reshape(-1, 3),
+        np.arange(3 * len(ball.faces)).reshape(-1, 3),
+        process=False,
+    )
+    mesh = load_mesh(saved(torn, tmp_path))
+    assert int(mesh.vertex_count) == len(ball.vertices)
+    whole = load_mesh(saved(ball, tmp_path, "whole.ply"))
+    normals = [body_of_mesh(m).normals for m in (mesh, whole)]
+    np.testing.assert_allclose(normals[0], normals[1], atol=1e-6)
+
+
+def test_what_is_a_share_of_the_box_follows_the_size_of_the_mesh(tmp_path):
+    small, large = (plane(4) for _ in range(2))
+    large.apply_scale(10.0)
+    bodies = [
+        body_of_mesh(load_mesh(saved(mesh, tmp_path, f"{k}.obj")))
+        for k, mesh in enumerate((small, large))
+    ]
+    np.testing.assert_allclose(bodies[1].splats.scales, 10 * bodies[0].splats.scales, rtol=1e-5)
+    assert bodies[1].near == pytest.approx(10 * bodies[0].near)
+
+
+def test_a_larger_image_has_the_same_field_of_view():
+    camera = views_from([EYE], size=20).camera([0])
+    large = resized(camera, 50)
+    assert (large.width, large.height) == (50, 50)
+    np.testing.assert_allclose(
+        large.intrinsics, np.asarray(camera.intrinsics) * [[[2.5], [2.5], [1.0]]]
+    )
+
+
+def test_constants_of_the_splats_change_what_is_found(tmp_path):
+    """Rotating nothing, only spreading the splats: the curved ball tells, by its angle."""
+    mesh = load_mesh(saved(trimesh.creation.icosphere(subdivisions=2), tmp_path))
+    cameras = cameras_around(box_of(mesh), views=1, size=32)
+    wide = FaceSplats(AdapterConstants(alpha=(2.0, 5.0)))
+    found = [measure(body_of_mesh(mesh, model), cameras) for model in (FaceSplats(), wide)]
+    assert found[1].reflection_deg > 1.2 * found[0].reflection_deg
+    assert found[0].reflection_deg > 3.0
+
+
+def said(capsys):
+    return " ".join(capsys.readouterr().err.split())
+
+
+def test_the_command_takes_any_closed_mesh(tmp_path, capsys):
+    path = saved(trimesh.creation.icosphere(subdivisions=2), tmp_path, "ball.stl")
+    target = tmp_path / "found.json"
+    assert main(["consistency", str(path), "--size", "32", "--json", str(target)]) == 0
+    found = json.loads(target.read_text())
+    assert f"{found['reflection_deg']:.3f} degrees" in capsys.readouterr().out
+    cameras = cameras_around(box_of(load_mesh(path)), size=32)
+    assert found["pixels"] == measure(body_of_mesh(load_mesh(path)), cameras).pixels
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "arguments", "message"),
+    [
+        ("absent.ply", None, (), "neither the folder of a run nor a mesh file"),
+        ("noise.ply", b"no mesh", (), "noise.ply cannot be read as a mesh"),
+        ("mesh.docx", b"no mesh", (), "mesh.docx cannot be read as a mesh"),
+        ("point.obj", b"v 0 0 0\n", (), "point.obj"),
+        ("flat.obj", b"v 0 0 0\nv 0 0 0\nv 1 0 0\nf 1 2 3\n", (), "three different corners"),
+        ("nan.obj", b"v 0 0 nan\nv 0 1 0\nv 1 0 0\nf 1 2 3\n", (), "not finite"),
+        ("a.ply", b"", ("--stage", "refine"), "--stage is of runs"),
+        ("a.ply", b"", ("--size", "0"), "--size must be at least 1"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused_in_one_line(
+    tmp_path, capsys, name, content, arguments, message
+):
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    assert main(["consistency", str(path), *arguments]) == 2
+    assert message in said(capsys)

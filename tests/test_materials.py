@@ -76,6 +76,8 @@ def test_a_new_field_starts_at_its_initial_guess():
         np.testing.assert_allclose(start.roughness, expected, atol=RAW_TABLES)
         np.testing.assert_allclose(start.metallic, 1 / (1 + np.exp(-metallic)), atol=RAW_TABLES)
         np.testing.assert_allclose(found.shift, 0.5, atol=RAW_TABLES)
+    shallow = attributes_at(field, points, BOX, spec=spec_of(initial_shift_logit=-1.1))
+    np.testing.assert_allclose(shallow.shift, 1 / (1 + np.exp(1.1)), atol=RAW_TABLES)
 
 
 def test_a_field_holds_only_what_the_model_uses():

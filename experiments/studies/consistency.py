@@ -1,19 +1,27 @@
-"""Table 5: how well splats stand for their mesh, for several ways to put them there.
+"""Table 5: how well splats stand for their mesh, for several ways to put them there, and why.
 
-    python experiments/studies/consistency.py RUN [RUN ...] [--views 12] [--enlarge 1]
+    python experiments/studies/consistency.py RUN|MESH|ball [...] [--views 4] [--sizes 200 800]
+        [--cells 48 96] [--only TEXT] [--causes]
 
-Every row places other splats on the mesh of a run and compares both (`report.consistency`); nothing
-is trained. The last rows are the splats that the run itself ended with, and the paper's.
+Every row places other splats on a mesh and compares both (`report.consistency`); nothing is
+trained. The mesh is that of a run, whose cameras are those of its scene, or that of a file: as it
+is, or for ``--cells`` the isosurface of its signed distance on so many cells (`shapes`), seen by
+cameras around it. ``ball`` is a sphere of radius one.
+
+``--causes`` asks instead what the angle and the distance consist of: one thing is changed a row.
 """
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import trimesh
+from scipy import ndimage
+from shapes import shape
 
 from geosplat_jax.adapter import (
     SPLATS_PER_FACE,
@@ -21,16 +29,33 @@ from geosplat_jax.adapter import (
     FaceSplats,
     VertexSplats,
     face_splats,
+    shift_inwards,
 )
 from geosplat_jax.core.mesh import face_normals_and_areas, vertex_normals
 from geosplat_jax.core.numerics import safe_normalize
 from geosplat_jax.core.rotation import frame_from_normal, matrix_to_quaternion
-from geosplat_jax.core.types import Box, Camera, Splats
+from geosplat_jax.core.types import Box, Camera, Mesh, Splats
 from geosplat_jax.fit.runtime import enable_compilation_cache
-from geosplat_jax.fit.trained import Trained, load_trained
-from geosplat_jax.report.consistency import Consistency, measure, traceable
+from geosplat_jax.fit.trained import Trained
+from geosplat_jax.io.meshes import unpadded
+from geosplat_jax.render import RasterSettings
+from geosplat_jax.report.consistency import (
+    Body,
+    PixelErrors,
+    body_of_mesh,
+    body_of_run,
+    box_of,
+    cameras_around,
+    pixel_errors,
+    reflection_angle_deg,
+    resized,
+    see_mesh,
+    single_cameras,
+    whole_mesh,
+)
 from geosplat_jax.report.renderer import build_asset
 from geosplat_jax.run import Run
+from geosplat_jax.splats.projection import LOW_PASS_VARIANCE
 from geosplat_jax.surface.base import Surface
 
 PAPER = {
@@ -40,6 +65,13 @@ PAPER = {
     "jugs": (0.89, 0.013),
 }
 """Degrees and shares of the bounding box, of the paper's Table 5."""
+
+SHIFT = 0.3
+"""Inward shift of splats on meshes of files, in roots of the face's area: the median that a run on
+``spot`` learned."""
+
+SAMPLES = 4
+"""Of the mesh's normals along each side of a pixel, where they are filtered."""
 
 
 @dataclass(frozen=True)
@@ -88,67 +120,200 @@ class OneBall(FaceSplats):
         )
 
 
-def rows(trained: Trained) -> dict[str, Callable[[], Trained]]:
-    """Name the ways to place splats, and make what is rendered with each."""
-    constants = trained.config.adapter
-    bare = replace(trained.params, splats=None)
-    unshifted = replace(bare, material=replace(bare.material, shift_head=None))
+@dataclass(frozen=True)
+class Sunk(FaceSplats):
+    """Six splats per face, all sunk by the same share of the root of its area."""
 
-    def with_splats(splats: Any, params: Any) -> Callable[[], Trained]:
-        pipeline = replace(trained.pipeline, splats=splats)
-        return lambda: replace(trained, pipeline=pipeline, params=params)
+    fraction: float = SHIFT
 
-    shading = replace(constants, shading_frame=True)
-    paper = AdapterConstants(opacity=1.0)
-    return {
-        "faces (Eq. 8-11), shifted inwards": with_splats(FaceSplats(constants), bare),
-        "faces, not shifted": with_splats(FaceSplats(constants), unshifted),
-        "faces, not shifted, R_z = n": with_splats(FaceSplats(shading), unshifted),
-        "faces, not shifted, opacity 1": with_splats(FaceSplats(paper), unshifted),
-        "aligned along the normal only": with_splats(AlignedAlongNormal(constants), unshifted),
-        "one isotropic splat per face": with_splats(OneBall(constants), unshifted),
-        "vertices (Eq. 12)": with_splats(VertexSplats(constants), unshifted),
-    }
+    def place(self, surface: Surface, parameters: Any, box: Box) -> Splats:
+        """Place them and sink them."""
+        splats = super().place(surface, parameters, box)
+        return shift_inwards(splats, surface.mesh, jnp.full_like(splats.opacities, self.fraction))
 
 
-def enlarged(camera: Camera, factor: int) -> Camera:
-    """Return a camera with the same field of view and so many times the pixels along each side."""
-    scale = jnp.asarray([[[factor], [factor], [1.0]]], camera.intrinsics.dtype)
-    height, width = factor * camera.height, factor * camera.width
-    return Camera(camera.world_to_camera, camera.intrinsics * scale, height, width)
+class Subject(NamedTuple):
+    """A mesh to put splats on, and who looks at it."""
+
+    name: str
+    mesh: Mesh
+    box: Box
+    constants: AdapterConstants
+    cameras: list[Camera]
+    trained: Trained | None
+
+    def body(self, model: FaceSplats | VertexSplats) -> Body:
+        """Put splats on it."""
+        return body_of_mesh(self.mesh, model, self.box)
+
+    def ways(self) -> dict[str, Callable[[], Body]]:
+        """Name the ways to place splats, and make what is rendered with each."""
+        constants = self.constants
+        models = {
+            "faces (Eq. 8-11)": FaceSplats(constants),
+            "faces, R_z = n": FaceSplats(replace(constants, shading_frame=True)),
+            "faces, opacity 1": FaceSplats(replace(constants, opacity=1.0)),
+            "aligned along the normal only": AlignedAlongNormal(constants),
+            "one isotropic splat per face": OneBall(constants),
+            "vertices (Eq. 12)": VertexSplats(constants),
+        }
+        sunk = {f"faces (Eq. 8-11), shifted by {SHIFT:g}": lambda: self.body(Sunk(constants))}
+        if self.trained is not None:
+            sunk = of_run(self.trained)
+        return {**sunk, **{n: lambda model=m: self.body(model) for n, m in models.items()}}
 
 
-def measured(trained: Trained, run: Run, views: int, factor: int) -> Consistency:
-    """Compare over some test views."""
-    pipeline = traceable(trained.pipeline)
-    test = run.dataset.test
-    chosen = np.unique(np.linspace(0, len(test) - 1, views).round().astype(int))
-    cameras = [enlarged(test.camera([number]), factor) for number in chosen]
-    return measure(pipeline, build_asset(pipeline, trained.params), cameras)
+def of_run(trained: Trained) -> dict[str, Callable[[], Body]]:
+    """Return the splats that a run has learned: with the learned shift, and as it ended."""
+    splats = FaceSplats(trained.config.adapter)
+    pipeline = replace(trained.pipeline, splats=splats)
+    bare = replace(trained, pipeline=pipeline, params=replace(trained.params, splats=None))
+    found = {"as the run ended": lambda: body_of_run(trained)}
+    if trained.params.material.shift_head is not None:
+        found = {"faces (Eq. 8-11), shifted as learned": lambda: body_of_run(bare), **found}
+    return found
+
+
+def subjects(name: str, cells: list[int], views: int) -> Iterator[Subject]:
+    """Open a run, or make the meshes of a file."""
+    if Path(name).is_dir():
+        run = Run(name)
+        trained, chosen = run.trained, run.dataset.views_to_show
+        mesh = build_asset(trained.pipeline, trained.params).mesh
+        rows = np.unique(np.linspace(0, len(chosen) - 1, views).round().astype(int))
+        cameras = [single_cameras(chosen)[row] for row in rows]
+        constants, box = trained.config.adapter, trained.pipeline.surface.box
+        yield Subject(f"run {run.folder.path.name}", mesh, box, constants, cameras, trained)
+        return
+    path = Path(name)
+    title = path.parent.name if path.stem.startswith("mesh") else path.stem
+    for count in cells or [None]:
+        mesh = shape(name, count)
+        made = f", {count} cells" if count else ", as it is"
+        cameras = cameras_around(box_of(mesh), views=views)
+        yield Subject(title + made, mesh, box_of(mesh), AdapterConstants(), cameras, None)
+
+
+def print_table(subject: Subject, sizes: list[int], only: str) -> None:
+    """Print a row for every way to place splats, and columns for every size of the images.
+
+    ``only`` : part of the names of the rows that are wanted.
+    """
+    print(f"\n{subject.name}: {int(subject.mesh.face_count)} faces, {len(subject.cameras)} views\n")
+    print("| splats |" + "".join(f" {size} x {size} | not covered |" for size in sizes))
+    print("|---|" + "---|---|" * len(sizes))
+    for name, make in subject.ways().items():
+        if only not in name:
+            continue
+        body, cells = make(), []
+        for size in sizes:
+            errors = pixel_errors(body, [resized(camera, size) for camera in subject.cameras])
+            counts = errors.is_compared
+            missing = 1.0 - counts.sum() / errors.is_outside.sum()
+            cells.append(f"{figures(errors, counts)} | {missing:.1%}")
+        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+
+
+def figures(errors: PixelErrors, counts: np.ndarray) -> str:
+    """Write angle and distance of some pixels."""
+    return f"{errors.reflection_deg[counts].mean():.2f}°, {errors.distance[counts].mean():.4f}"
+
+
+def print_causes(subject: Subject, size: int) -> None:
+    """Change one thing at a time, for splats on their faces and for those that are sunk."""
+    cameras = [resized(camera, size) for camera in subject.cameras]
+    constants = subject.constants
+    print(f"\n{subject.name}, {size} x {size}: angle and distance\n\n| | on faces | shifted |")
+    print("|---|---|---|")
+    bodies = [subject.body(model) for model in (FaceSplats(constants), Sunk(constants))]
+    fine = [divided(subject, share) for share in (0.0, SHIFT)]
+    found = [pixel_errors(body, cameras) for body in bodies]
+
+    def row(name: str, texts: list[str]) -> None:
+        print(f"| {name} | {' | '.join(texts)} |", flush=True)
+
+    row("all", [figures(e, e.is_compared) for e in found])
+    row("median", [median_figures(e) for e in found])
+    for least in (0.3, 0.6, 0.9):
+        name = f"pixels that face the camera by more than {least:g}"
+        row(name, [figures(e, e.is_compared & (e.facing > least)) for e in found])
+    row("pixels covered by more than .98", [figures(e, e.coverage > 0.98) for e in found])
+    both_sides = RasterSettings(cull_backfaces=False)
+    seen = [pixel_errors(replace(b, raster=both_sides), cameras) for b in bodies]
+    row("splats that look away as well", [figures(e, e.is_compared) for e in seen])
+    seen = [pixel_errors(body, cameras) for body in fine]
+    row("four faces in the place of each", [figures(e, e.is_compared) for e in seen])
+    whole = [np.abs(e.shown * e.coverage - e.ranges)[e.is_compared].mean() for e in found]
+    row("distance not divided by coverage", [f"{share:.4f}" for share in whole])
+    row("mean of 1 - coverage", [f"{1 - e.coverage[e.is_compared].mean():.4f}" for e in found])
+    alone = f"{filter_alone(bodies[0], cameras):.2f}°"
+    row("the mesh's own normals, filtered as a splat is", [alone, alone])
+
+
+def median_figures(errors: PixelErrors) -> str:
+    """Write the medians of angle and distance."""
+    counts = errors.is_compared
+    angle, distance = (np.median(x[counts]) for x in (errors.reflection_deg, errors.distance))
+    return f"{angle:.2f}°, {distance:.4f}"
+
+
+def divided(subject: Subject, shift: float) -> Body:
+    """Cut every face into four on its plane, with interpolated normals, and sink the splats."""
+    coarse = subject.body(FaceSplats(subject.constants))
+    vertices, faces, attributes = trimesh.remesh.subdivide(
+        coarse.vertices, coarse.faces, vertex_attributes={"normal": coarse.normals}
+    )
+    mesh = whole_mesh(vertices, faces)
+    normals = safe_normalize(jnp.asarray(attributes["normal"], jnp.float32))
+    unit = subject.box.half_extent
+    splats = face_splats(mesh, normals, constants=subject.constants, unit=unit)
+    splats = shift_inwards(splats, mesh, jnp.full_like(splats.opacities, shift))
+    vertices, faces = unpadded(mesh)
+    return replace(
+        coarse, vertices=vertices, faces=faces, normals=np.asarray(normals), splats=splats
+    )
+
+
+def filter_alone(body: Body, cameras: list[Camera]) -> float:
+    """Blur the mesh's normals by the low-pass filter of the splats; mean angle in degrees."""
+    found = []
+    for camera in cameras:
+        size = max(camera.height, camera.width)
+        fine = see_mesh(body.vertices, body.faces, body.normals, resized(camera, SAMPLES * size))
+        deviation = SAMPLES * LOW_PASS_VARIANCE**0.5
+        blurred = ndimage.gaussian_filter(fine.normals, deviation, axes=(0, 1))
+        blocks = blurred.reshape(camera.height, SAMPLES, camera.width, SAMPLES, 3)
+        middle = slice(SAMPLES // 2 - 1, SAMPLES // 2 + 1)
+        centers = blocks[:, middle, :, middle].mean(axis=(1, 3))
+        seen = see_mesh(body.vertices, body.faces, body.normals, camera)
+        hit = seen.is_outside
+        length = np.sqrt((centers[hit] ** 2).sum(axis=-1, keepdims=True))
+        found.append(
+            reflection_angle_deg(seen.towards[hit], seen.normals[hit], centers[hit] / length)
+        )
+    return float(np.concatenate(found).mean())
 
 
 def main() -> None:
     """Print the tables in Markdown."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("runs", type=Path, nargs="+")
-    parser.add_argument("--views", type=int, default=12)
-    parser.add_argument("--enlarge", type=int, default=1, help="times the size of the photographs")
+    parser.add_argument("subjects", nargs="+", metavar="RUN|MESH|ball")
+    parser.add_argument("--views", type=int, default=4)
+    parser.add_argument("--sizes", type=int, nargs="+", default=[200])
+    parser.add_argument("--cells", type=int, nargs="+", default=[], help="of meshes of files")
+    parser.add_argument("--only", default="", metavar="TEXT", help="rows whose name has this in it")
+    parser.add_argument("--causes", action="store_true", help="instead of ways to place splats")
     arguments = parser.parse_args()
     enable_compilation_cache()
-    for folder in arguments.runs:
-        run, trained = Run(folder), load_trained(folder)
-        ways = {**rows(trained), "as the run ended": lambda trained=trained: trained}
-        print(f"\n{folder.name}\n\n| splats | reflected direction | distance | not covered |")
-        print("|---|---|---|---|")
-        for name, make in ways.items():
-            row = measured(make(), run, arguments.views, arguments.enlarge)
-            print(
-                f"| {name} | {row.reflection_deg:.2f}° | {row.distance:.4f} "
-                f"| {row.uncovered:.2%} |",
-                flush=True,
-            )
+    for name in arguments.subjects:
+        for subject in subjects(name, arguments.cells, arguments.views):
+            if arguments.causes:
+                for size in arguments.sizes:
+                    print_causes(subject, size)
+            else:
+                print_table(subject, arguments.sizes, arguments.only)
     for name, (degrees, distance) in PAPER.items():
-        print(f"| paper, {name} | {degrees:.2f}° | {distance:.3f} | |")
+        print(f"paper, {name}: {degrees:.2f}°, {distance:.3f}")
 
 
 if __name__ == "__main__":

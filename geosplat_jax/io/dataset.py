@@ -89,6 +89,11 @@ class Dataset:
         if len(views) and not views.has_masks:
             raise SceneError(f"the {split} views of {self.root} have no masks, but {_NEEDS_MASKS}")
 
+    @property
+    def views_to_show(self) -> Views:
+        """The test views; those of the training where there are none."""
+        return self.test if self.test.names else self.train
+
 
 def load_dataset(
     path: str | Path,

@@ -63,9 +63,14 @@ def read_mesh(
     Raises
     ------
     ValueError
-        If the file holds no triangle.
+        If the file cannot be read, or holds no triangle.
     """
-    loaded = trimesh.load(path, process=False)
+    try:
+        loaded = trimesh.load(path, process=False)
+    except OSError:
+        raise
+    except Exception as problem:  # whatever the parser of a format raises
+        raise ValueError(f"{path} cannot be read as a mesh: {problem}") from problem
     mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise ValueError(f"{path} must hold a triangle mesh, found no triangle in it")
@@ -222,6 +227,57 @@ def rasterize_charts(
     return face_rows, barycentrics
 
 
+def first_hits(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    camera: Camera,
+    *,
+    supersampling: int = 1,
+) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]:
+    """Find where the rays through the pixel centres of one view first meet a mesh, on the host.
+
+    A depth buffer in float64. Faces that reach behind the camera are left out; both sides of a face
+    are met. An empty mesh is met nowhere.
+
+    Parameters
+    ----------
+    vertices : (V, 3) in the world; faces : (F, 3).
+    camera : one view (V = 1).
+    supersampling : samples a pixel along each axis; H and W are those of the samples.
+
+    Returns
+    -------
+    face_rows : (H, W) face that is met, -1 for none.
+    weights : (H, W, 3) barycentric coordinates of the hit in its face, over the depth of the hit
+        along the camera's axis: their sum is one over that depth. Zero where nothing is met.
+    """
+    height, width = camera.height * supersampling, camera.width * supersampling
+    world_to_camera = np.asarray(camera.world_to_camera[0], np.float64)
+    intrinsics = np.asarray(camera.intrinsics[0], np.float64)
+    points = np.asarray(vertices, np.float64) @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    extent = float(np.max(np.ptp(points, axis=0))) if len(points) else 0.0
+    near = max(_NEAR_SHARE * extent, np.finfo(np.float64).tiny)
+    in_front = np.flatnonzero(np.all(points[faces, 2] > near, axis=1))
+    faces = faces[in_front]
+    inverse_depth = 1.0 / np.maximum(points[:, 2], near)
+    pixels = (points @ intrinsics.T)[:, :2] * inverse_depth[:, None] * supersampling
+    nearest = np.zeros((height, width))
+    face_rows = np.full((height, width), -1, np.int32)
+    drawn = np.zeros((height, width, 3))
+    for row, column, face, weights in _covered_pixels(pixels[faces], height=height, width=width):
+        # 1/z is linear on the screen, and weights divided by z interpolate in perspective.
+        weights = weights * inverse_depth[faces[face]]
+        closeness = weights.sum(axis=-1)
+        order = np.argsort(closeness, kind="stable")
+        order = order[closeness[order] > nearest[row[order], column[order]]]
+        row, column = row[order], column[order]
+        # Of repeated pixels the last assignment, the nearest, stays.
+        nearest[row, column] = closeness[order]
+        face_rows[row, column] = in_front[face[order]]
+        drawn[row, column] = weights[order]
+    return face_rows, drawn
+
+
 def render_mesh_normals(
     vertices: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
@@ -232,8 +288,8 @@ def render_mesh_normals(
 ) -> tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W"]]:
     """Draw the interpolated vertex normals of a mesh with a depth buffer, on the host.
 
-    For previews and for the mesh's own normal error. Faces that reach behind the camera are left
-    out; both sides of a face are drawn. An empty mesh gives an empty picture.
+    For previews and for the mesh's own normal error; see `first_hits`. An empty mesh gives an empty
+    picture.
 
     Parameters
     ----------
@@ -246,35 +302,22 @@ def render_mesh_normals(
     normals : (H, W, 3) unit, in *OpenCV camera axes* (x right, y down, z forward); zero outside.
     alpha : (H, W) covered share of each pixel.
     """
-    height, width = camera.height * supersampling, camera.width * supersampling
-    world_to_camera = np.asarray(camera.world_to_camera[0], np.float64)
-    intrinsics = np.asarray(camera.intrinsics[0], np.float64)
-    points = np.asarray(vertices, np.float64) @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
-    extent = float(np.max(np.ptp(points, axis=0))) if len(points) else 0.0
-    near = max(_NEAR_SHARE * extent, np.finfo(np.float64).tiny)
-    faces = faces[np.all(points[faces, 2] > near, axis=1)]
-    inverse_depth = 1.0 / np.maximum(points[:, 2], near)
-    pixels = (points @ intrinsics.T)[:, :2] * inverse_depth[:, None] * supersampling
-    nearest = np.zeros((height, width))
-    drawn = np.zeros((height, width, 3))
-    turned = np.asarray(normals, np.float64) @ world_to_camera[:3, :3].T
-    for row, column, face, weights in _covered_pixels(pixels[faces], height=height, width=width):
-        # 1/z is linear on the screen, and weights divided by z interpolate in perspective.
-        weights = weights * inverse_depth[faces[face]]
-        closeness = weights.sum(axis=-1)
-        order = np.argsort(closeness, kind="stable")
-        order = order[closeness[order] > nearest[row[order], column[order]]]
-        row, column = row[order], column[order]
-        # Of repeated pixels the last assignment, the nearest, stays.
-        nearest[row, column] = closeness[order]
-        drawn[row, column] = np.einsum("nk,nkd->nd", weights[order], turned[faces[face[order]]])
+    face_rows, weights = first_hits(vertices, faces, camera, supersampling=supersampling)
+    is_hit = face_rows >= 0
+    turned = (
+        np.asarray(normals, np.float64)
+        @ np.asarray(camera.world_to_camera[0, :3, :3], np.float64).T
+    )
+    drawn = np.zeros(weights.shape)
+    corners = turned[faces[face_rows[is_hit]]]
+    drawn[is_hit] = np.einsum("nk,nkd->nd", weights[is_hit], corners)
     blocks = (camera.height, supersampling, camera.width, supersampling)
     lengths = np.sqrt((drawn**2).sum(-1, keepdims=True))
     unit = drawn / np.where(lengths > 0, lengths, 1.0)
     mean = unit.reshape(*blocks, 3).mean(axis=(1, 3))
     lengths = np.sqrt((mean**2).sum(-1, keepdims=True))
     mean = mean / np.where(lengths > 0, lengths, 1.0)
-    alpha = (nearest > 0).reshape(blocks).mean(axis=(1, 3))
+    alpha = is_hit.reshape(blocks).mean(axis=(1, 3))
     return mean.astype(np.float32), alpha.astype(np.float32)
 
 

@@ -1,6 +1,7 @@
 """How well splats stand for the mesh that they were sampled from (appendix B.3, Table 5).
 
-For every pixel whose ray meets the mesh, two things are compared with what the splats show there:
+For every pixel whose ray meets the mesh from outside, two things are compared with what the splats
+show there:
 
 - the direction in which the viewing ray is reflected, from the mesh's normal (vertex normals,
   interpolated at the hit) and from the normal of the splats (blended, of unit length): degrees;
@@ -8,30 +9,44 @@ For every pixel whose ray meets the mesh, two things are compared with what the 
   (blended, divided by coverage; along the ray, not along the axis): a share of the diagonal of the
   mesh's bounding box.
 
-Light that is reflected, and rays that start at what is seen, go as wrong as these two say.
+Light that is reflected, and rays that start at what is seen, go as wrong as these two say. Rays go
+through the pixel centres and are exact (float64, on the host).
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
+from pathlib import Path
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from geosplat_jax.adapter import FaceSplats, SplatModel
 from geosplat_jax.core import capacity as capacity_module
-from geosplat_jax.core.capacity import Capacities, Usage
-from geosplat_jax.core.mesh import vertex_normals
-from geosplat_jax.core.numerics import safe_divide, safe_norm, safe_normalize
-from geosplat_jax.core.types import Camera
-from geosplat_jax.deferred import PerPixel, first_surface
-from geosplat_jax.pipeline import Pipeline
-from geosplat_jax.render import Asset, RenderPipeline
-from geosplat_jax.splats.rasterize import gather_visible
+from geosplat_jax.core.capacity import Capacities, Usage, bucket
+from geosplat_jax.core.numerics import safe_divide, safe_norm
+from geosplat_jax.core.types import Box, Camera, Mesh, Splats
+from geosplat_jax.fit.trained import Trained
+from geosplat_jax.io.meshes import first_hits, read_mesh, unpadded
+from geosplat_jax.io.views import Views
+from geosplat_jax.render import RasterSettings
+from geosplat_jax.report.renderer import build_asset, trim_mesh
+from geosplat_jax.splats.rasterize import rasterize
+from geosplat_jax.surface.base import Surface
 
 _SEEN = 0.5
 """Coverage from which a pixel shows splats at all."""
+
+DEFAULT_VIEWS, DEFAULT_SIZE = 12, 400
+"""Views of a mesh without a scene, and pixels along their sides."""
+
+_FIELD_OF_VIEW = 0.69
+"""Of those views, radians."""
+
+_DISTANCE = 3.4
+"""Of those cameras from the middle, in half the longest side of the mesh's bounding box."""
 
 
 @dataclass(frozen=True)
@@ -44,133 +59,350 @@ class Consistency:
     distance : difference of the distances, as a share of the box's diagonal.
     pixels : that were compared.
     uncovered : share of the pixels on the mesh that the splats cover by less than a half.
+    behind : share of the pixels on the mesh that see the back of a face, and are not compared.
     """
 
     reflection_deg: float
     distance: float
     pixels: int
     uncovered: float
+    behind: float
 
 
-class _View(eqx.Module):
-    """Pixels of one view: their errors, and which of them count."""
+@dataclass(frozen=True)
+class Body:
+    """A mesh, and the splats that stand for it.
 
-    degrees: Float[Array, " P"]
-    distance: Float[Array, " P"]
-    is_hit: Bool[Array, " P"]
-    is_seen: Bool[Array, " P"]
-    usage: Usage
+    Attributes
+    ----------
+    vertices : (V, 3) world; faces : (F, 3); normals : (V, 3) unit normals of the vertices; host.
+    splats : to compare the mesh with.
+    raster : how they become pixels.
+    near : near plane, world units.
+    """
+
+    vertices: Float[np.ndarray, "V 3"]
+    faces: np.ndarray
+    normals: Float[np.ndarray, "V 3"]
+    splats: Splats
+    raster: RasterSettings = RasterSettings()
+    near: float = 0.0
+
+    @property
+    def diagonal(self) -> float:
+        """Diagonal of the mesh's bounding box."""
+        corners = self.vertices[self.faces].reshape(-1, 3)
+        return float(_length(np.ptp(corners.astype(np.float64), axis=0)[None])[0])
 
 
-@eqx.filter_jit
-def _compare(pipeline: RenderPipeline, asset: Asset, camera: Camera) -> _View:
-    """Compare mesh and splats in a single view."""
-    lists = pipeline.visible(asset.splats, camera)
+@dataclass(frozen=True)
+class PixelErrors:
+    """What is compared, for all P pixels whose ray meets the mesh.
 
-    def seen(values: Float[Array, "N ..."], padding: float = 0.0) -> Float[Array, "M ..."]:
-        return gather_visible(lists.index, values, padding=padding)
+    Attributes
+    ----------
+    reflection_deg : as in `Consistency`; of no meaning where coverage is zero.
+    ranges, shown : distances of the hit and of the splats, as shares of the box's diagonal.
+    coverage : of the splats.
+    facing : cosine between the way back to the camera and the mesh's interpolated normal.
+    is_outside : whether the face that is met looks towards the camera.
+    """
 
-    splats = asset.splats
-    means = seen(splats.means)
-    footprints = pipeline.project(means, seen(splats.quats), seen(splats.scales, 1.0), camera)
-    ranges = safe_norm(means - camera.centers, keepdims=True)
-    channels = {"normal": seen(splats.normals), "range": ranges}
-    images, alpha = pipeline.blend(footprints, seen(splats.opacities), channels, lists, camera)
-    coverage = alpha.reshape(-1)
-    shown = safe_normalize(images["normal"].reshape(-1, 3))
-    blended = safe_divide(images["range"].reshape(-1), coverage)
-    assert asset.index is not None
-    hits, faces = first_surface(asset.index, jnp.ones(coverage.shape, bool), camera)
-    true_range = safe_norm(hits - camera.centers)
-    towards = safe_normalize(hits - camera.centers)
-    angle = _angle(_reflect(towards, _mesh_normals(asset, hits, faces)), _reflect(towards, shown))
-    diagonal = _diagonal(asset)
-    usage = capacity_module.combine(asset.usage, lists.usage)
-    is_hit = faces >= 0
-    return _View(
-        jnp.rad2deg(angle),
-        jnp.abs(blended - true_range) / diagonal,
+    reflection_deg: Float[np.ndarray, " P"]
+    ranges: Float[np.ndarray, " P"]
+    shown: Float[np.ndarray, " P"]
+    coverage: Float[np.ndarray, " P"]
+    facing: Float[np.ndarray, " P"]
+    is_outside: Bool[np.ndarray, " P"]
+
+    @property
+    def distance(self) -> Float[np.ndarray, " P"]:
+        """Difference of the distances, as in `Consistency`."""
+        return np.abs(self.shown - self.ranges)
+
+    @property
+    def is_compared(self) -> Bool[np.ndarray, " P"]:
+        """Pixels that show splats where the mesh is met from outside."""
+        return self.is_outside & (self.coverage > _SEEN)
+
+
+@dataclass(frozen=True)
+class SeenMesh:
+    """What the rays through the pixel centres of one view meet; all (H, W, ...) or (H, W).
+
+    Attributes
+    ----------
+    is_hit : whether anything; what follows is zero where nothing is.
+    is_outside : whether the face looks towards the camera.
+    towards : unit directions of the rays, everywhere.
+    normals : unit, interpolated. ranges : distances from the camera.
+    """
+
+    is_hit: Bool[np.ndarray, "H W"]
+    is_outside: Bool[np.ndarray, "H W"]
+    towards: Float[np.ndarray, "H W 3"]
+    normals: Float[np.ndarray, "H W 3"]
+    ranges: Float[np.ndarray, "H W"]
+
+
+def _length(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+    return np.sqrt((vectors**2).sum(axis=-1))
+
+
+def _unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Give vectors unit length; zero where they have no direction."""
+    length = _length(vectors)[..., None]
+    return vectors / np.where(length > 0, length, 1.0)
+
+
+def see_mesh(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: np.ndarray,
+    normals: Float[np.ndarray, "V 3"],
+    camera: Camera,
+) -> SeenMesh:
+    """Meet a mesh with the rays of a single view; see `io.meshes.first_hits`."""
+    rows, weights = first_hits(vertices, faces, camera)
+    is_hit = rows >= 0
+    shares = weights[is_hit] / weights[is_hit].sum(axis=-1, keepdims=True)
+    corners = np.asarray(vertices, np.float64)[faces[rows[is_hit]]]
+    center = np.asarray(camera.centers[0], np.float64)
+    hits = np.einsum("nk,nkd->nd", shares, corners) - center
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+    def image(values: np.ndarray) -> np.ndarray:
+        filled = np.zeros((*rows.shape, *values.shape[1:]), values.dtype)
+        filled[is_hit] = values
+        return filled
+
+    return SeenMesh(
         is_hit,
-        coverage > _SEEN,
-        usage,
+        image((outward * hits).sum(axis=-1) < 0),
+        _ray_directions(camera),
+        image(_unit(np.einsum("nk,nkd->nd", shares, normals[faces[rows[is_hit]]]))),
+        image(_length(hits)),
     )
 
 
-def _reflect(directions: Float[Array, "P 3"], normals: Float[Array, "P 3"]) -> Float[Array, "P 3"]:
-    along = jnp.sum(directions * normals, axis=-1, keepdims=True)
-    return directions - 2.0 * along * normals
+def _ray_directions(camera: Camera) -> Float[np.ndarray, "H W 3"]:
+    """Aim the rays through the pixel centres of a single view; unit directions."""
+    lens, pose = (np.asarray(x[0], np.float64) for x in (camera.intrinsics, camera.world_to_camera))
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    local = np.stack([(x - lens[0, 2]) / lens[0, 0], (y - lens[1, 2]) / lens[1, 1], x * 0 + 1], -1)
+    return _unit(local @ pose[:3, :3])
 
 
-def _angle(first: Float[Array, "P 3"], second: Float[Array, "P 3"]) -> Float[Array, " P"]:
-    """Angle between unit vectors, exact for small ones as well."""
-    return 2.0 * jnp.arctan2(safe_norm(first - second), safe_norm(first + second))
+@partial(jax.jit, static_argnames=("raster", "capacities"))
+def _blended(
+    splats: Splats,
+    camera: Camera,
+    near: Float[Array, ""] | float,
+    *,
+    raster: RasterSettings,
+    capacities: Capacities,
+) -> tuple[Float[Array, "H W 3"], Float[Array, "H W"], Float[Array, "H W"], Usage]:
+    """Blend normals and distances of the splats in one view; also coverage and needs of buffers."""
+    ranges = safe_norm(splats.means - camera.centers, keepdims=True)
+    image, alpha, usage = rasterize(
+        splats.means,
+        splats.quats,
+        splats.scales,
+        splats.opacities,
+        jnp.concatenate([splats.normals, ranges], axis=-1),
+        raster.eligible(splats, camera),
+        world_to_camera=camera.world_to_camera[0],
+        intrinsics=camera.intrinsics[0],
+        height=camera.height,
+        width=camera.width,
+        capacities=capacities,
+        tile_size=raster.tile_size,
+        near=near,
+    )
+    return image[..., :3], safe_divide(image[..., 3], alpha), alpha, usage
 
 
-def _mesh_normals(asset: Asset, hits: Float[Array, "P 3"], faces: Array) -> Float[Array, "P 3"]:
-    """Interpolate the vertex normals at points of faces."""
-    mesh = asset.mesh
-    rows = mesh.faces.at[faces].get(mode="clip")
-    a, b, c = (mesh.vertices[rows[:, k]] for k in range(3))
-    across = jnp.cross(b - a, c - a)
-    size = jnp.sum(across * across, axis=-1)
-    wb = safe_divide(jnp.sum(jnp.cross(hits - a, c - a) * across, axis=-1), size)
-    wc = safe_divide(jnp.sum(jnp.cross(b - a, hits - a) * across, axis=-1), size)
-    shares = jnp.stack([1.0 - wb - wc, wb, wc], axis=-1)
-    return safe_normalize(jnp.sum(shares[..., None] * vertex_normals(mesh)[rows], axis=1))
+def _first_capacities(splats: Splats) -> Capacities:
+    """Guess what a view of all these splats needs."""
+    rows = splats.means.shape[0]
+    return Capacities(visible=bucket(rows // 2), hits=bucket(2 * rows), chunks=bucket(rows // 3))
 
 
-def _diagonal(asset: Asset) -> Float[Array, ""]:
-    """Diagonal of the mesh's bounding box."""
-    mesh = asset.mesh
-    real = mesh.vertex_mask[:, None]
-    low = jnp.min(jnp.where(real, mesh.vertices, jnp.inf), axis=0)
-    high = jnp.max(jnp.where(real, mesh.vertices, -jnp.inf), axis=0)
-    return safe_norm(high - low)
+def _compare(body: Body, camera: Camera, capacities: Capacities) -> tuple[PixelErrors, Capacities]:
+    """Compare in a single view, with buffers that grow."""
+
+    def attempt(sizes: Capacities) -> tuple[tuple[Array, Array, Array], Usage]:
+        *images, usage = _blended(
+            body.splats, camera, body.near, raster=body.raster, capacities=sizes
+        )
+        return (images[0], images[1], images[2]), usage
+
+    images, capacities = capacity_module.retry(attempt, capacities)
+    shown, blended, coverage = (np.asarray(image, np.float64) for image in images)
+    seen = see_mesh(body.vertices, body.faces, body.normals, camera)
+    hit = seen.is_hit
+    towards, normals = seen.towards[hit], seen.normals[hit]
+    errors = PixelErrors(
+        reflection_angle_deg(towards, normals, _unit(shown[hit])),
+        seen.ranges[hit] / body.diagonal,
+        blended[hit] / body.diagonal,
+        coverage[hit],
+        -(towards * normals).sum(axis=-1),
+        seen.is_outside[hit],
+    )
+    return errors, capacities
 
 
-def traceable(pipeline: Pipeline) -> Pipeline:
-    """Return the pipeline with an index for rays, whatever its transport needs."""
-    return replace(pipeline, domain=PerPixel(points="mesh"), weights={})
+def reflection_angle_deg(
+    directions: Float[np.ndarray, "P 3"],
+    normals: Float[np.ndarray, "P 3"],
+    others: Float[np.ndarray, "P 3"],
+) -> Float[np.ndarray, " P"]:
+    """Angle between unit directions reflected at two unit normals each; exact for small ones."""
+    first, second = _reflect(directions, normals), _reflect(directions, others)
+    return np.rad2deg(2.0 * np.arctan2(_length(first - second), _length(first + second)))
 
 
-def _attempt(
-    pipeline: Pipeline, asset: Asset, camera: Camera, capacities: Capacities
-) -> tuple[_View, Usage]:
-    """Compare with buffers of some sizes; also return the needs of those that a view fills."""
-    view = _compare(replace(pipeline, capacities=capacities), asset, camera)
-    names = set(view.usage) - set(asset.usage)
-    return view, {name: view.usage[name] for name in names}
+def _reflect(
+    directions: Float[np.ndarray, "P 3"], normals: Float[np.ndarray, "P 3"]
+) -> Float[np.ndarray, "P 3"]:
+    return directions - 2.0 * (directions * normals).sum(axis=-1, keepdims=True) * normals
 
 
-def measure(pipeline: Pipeline, asset: Asset, cameras: Iterable[Camera]) -> Consistency:
-    """Compare mesh and splats over some views (host side).
+def pixel_errors(
+    body: Body, cameras: Iterable[Camera], capacities: Capacities | None = None
+) -> PixelErrors:
+    """Compare mesh and splats in some single views, pixel by pixel (host side).
 
-    Parameters
-    ----------
-    pipeline : see `traceable`.
-    asset : from `renderer.build_asset` of that pipeline.
-    cameras : of single views.
+    ``capacities`` : sizes of the buffers to begin with (default: a guess); they grow.
+    """
+    capacities, views = capacities or _first_capacities(body.splats), []
+    for camera in cameras:
+        errors, capacities = _compare(body, camera, capacities)
+        views.append(errors)
+    names = [field.name for field in fields(PixelErrors)]
+    return PixelErrors(*(np.concatenate([getattr(view, name) for view in views]) for name in names))
+
+
+def measure(body: Body, cameras: Iterable[Camera]) -> Consistency:
+    """Compare mesh and splats over some single views (host side).
 
     Raises
     ------
     ValueError
-        If no view's rays meet the mesh where splats are seen.
+        If no view's rays meet the mesh from outside where splats are seen.
     """
-    degrees, distances, hit, compared = [], [], 0, 0
-    capacities = pipeline.capacities
-    for camera in cameras:
-        attempt = partial(_attempt, pipeline, asset, camera)
-        view, capacities = capacity_module.retry(attempt, capacities)
-        is_hit = np.asarray(view.is_hit)
-        counts = is_hit & np.asarray(view.is_seen)
-        hit, compared = hit + int(is_hit.sum()), compared + int(counts.sum())
-        degrees.append(np.asarray(view.degrees, np.float64)[counts])
-        distances.append(np.asarray(view.distance, np.float64)[counts])
+    errors = pixel_errors(body, cameras)
+    hit, outside = errors.is_outside.size, int(errors.is_outside.sum())
+    if hit and not outside:
+        raise ValueError("every view sees the mesh from inside; do its faces look inwards?")
+    counts = errors.is_compared
+    compared = int(counts.sum())
     if not compared:
         raise ValueError("no view sees the mesh where splats cover it; is the surface empty?")
     return Consistency(
-        float(np.concatenate(degrees).mean()),
-        float(np.concatenate(distances).mean()),
+        float(errors.reflection_deg[counts].mean()),
+        float(errors.distance[counts].mean()),
         compared,
-        1.0 - compared / hit,
+        1.0 - compared / outside,
+        1.0 - outside / hit,
     )
+
+
+def body_of_run(trained: Trained) -> Body:
+    """Return the mesh that a run's splats sit on, and the splats as it ended."""
+    asset = build_asset(trained.pipeline, trained.params)
+    raster, box = trained.pipeline.raster, trained.pipeline.surface.box
+    vertices, faces, normals = trim_mesh(asset.mesh)
+    return Body(
+        vertices, faces, normals, asset.splats, raster, raster.near * float(box.half_extent)
+    )
+
+
+def body_of_mesh(mesh: Mesh, model: SplatModel | None = None, box: Box | None = None) -> Body:
+    """Return a mesh, and splats on it that follow it alone (default: those of `FaceSplats`).
+
+    ``box`` : whose half is the unit of length (default: `box_of` the mesh).
+    """
+    raster, box = RasterSettings(), box or box_of(mesh)
+    place = jax.jit((model or FaceSplats()).place)
+    splats = place(Surface(mesh, {}), None, box)
+    vertices, faces, normals = trim_mesh(mesh)
+    return Body(vertices, faces, normals, splats, raster, raster.near * float(box.half_extent))
+
+
+def box_of(mesh: Mesh) -> Box:
+    """Return the smallest cube around a mesh, centred on its bounding box."""
+    vertices, faces = unpadded(mesh)
+    corners = vertices[faces].reshape(-1, 3)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    half = 0.5 * float((high - low).max())
+    return Box(jnp.asarray(0.5 * (low + high), jnp.float32), jnp.asarray(half, jnp.float32))
+
+
+def load_mesh(path: str | Path) -> Mesh:
+    """Read a mesh file to be compared with splats; corners at one position become one vertex.
+
+    Files repeat vertices along the seams of textures. Normals are then those of the whole surface.
+
+    Raises
+    ------
+    ValueError
+        If the file cannot be read as triangles, or holds positions that are not finite or all
+        alike.
+    """
+    vertices, faces = read_mesh(path)
+    vertices = vertices.astype(np.float32)
+    if not np.isfinite(vertices).all():
+        raise ValueError(f"{path} has vertices that are not finite numbers")
+    vertices, rows = np.unique(vertices, axis=0, return_inverse=True)
+    faces = rows.reshape(-1)[faces].astype(np.int32)
+    corners = np.sort(faces, axis=1)
+    faces = faces[(corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2])]
+    if not len(faces):
+        raise ValueError(f"{path} has no triangle with three different corners")
+    return whole_mesh(vertices, faces)
+
+
+def whole_mesh(vertices: Float[np.ndarray, "V 3"], faces: np.ndarray) -> Mesh:
+    """Return a mesh without padding."""
+    counts = (jnp.asarray(len(rows), jnp.int32) for rows in (vertices, faces))
+    return Mesh(jnp.asarray(vertices, jnp.float32), jnp.asarray(faces, jnp.int32), *counts)
+
+
+def cameras_around(
+    box: Box, *, views: int = DEFAULT_VIEWS, size: int = DEFAULT_SIZE
+) -> list[Camera]:
+    """Return single views of ``size`` x ``size`` pixels that look at a box, evenly from all sides.
+
+    Lens and distance are those of the usual synthetic scenes.
+    """
+    center = np.asarray(box.center, np.float64)
+    focal = 0.5 * size / np.tan(0.5 * _FIELD_OF_VIEW)
+    lens = jnp.asarray([[focal, 0, 0.5 * size], [0, focal, 0.5 * size], [0, 0, 1]], jnp.float32)
+    found = []
+    for number in range(views):
+        height = 1.0 - 2.0 * (number + 0.5) / views
+        turn = np.pi * (3.0 - np.sqrt(5.0)) * number
+        ring = np.sqrt(1.0 - height**2)
+        away = np.array([ring * np.cos(turn), ring * np.sin(turn), height])
+        right = np.array([-np.sin(turn), np.cos(turn), 0.0])
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(-away, right), -away])
+        pose[:3, 3] = -pose[:3, :3] @ (center + _DISTANCE * float(box.half_extent) * away)
+        found.append(Camera(jnp.asarray(pose[None], jnp.float32), lens[None], size, size))
+    return found
+
+
+def resized(camera: Camera, size: int) -> Camera:
+    """Return a camera of the same field of view whose longer side has ``size`` pixels."""
+    factor = size / max(camera.height, camera.width)
+    height, width = (max(1, round(side * factor)) for side in (camera.height, camera.width))
+    scale = np.array([width / camera.width, height / camera.height, 1.0])
+    intrinsics = camera.intrinsics * jnp.asarray(scale[None, :, None], jnp.float32)
+    return replace(camera, intrinsics=intrinsics, height=height, width=width)
+
+
+def single_cameras(views: Views, size: int | None = None) -> list[Camera]:
+    """Return the cameras of some views one by one; ``size`` : see `resized` (default: as is)."""
+    cameras = [views.camera([number]) for number in range(len(views))]
+    return cameras if size is None else [resized(camera, size) for camera in cameras]

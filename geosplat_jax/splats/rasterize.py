@@ -137,7 +137,7 @@ def rasterize(
     width: int,
     capacities: Capacities,
     tile_size: int = DEFAULT_TILE_SIZE,
-    near: float = 0.01,
+    near: Float[Array, ""] | float = 0.01,
 ) -> tuple[Float[Array, "H W C"], Float[Array, "H W"], Usage]:
     """Rasterise Gaussians with given features into one view.
 
