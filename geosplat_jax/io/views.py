@@ -20,10 +20,20 @@ from jaxtyping import Bool, Float
 
 from geosplat_jax.core.types import Camera
 from geosplat_jax.io.frames import Frame, Listing
-from geosplat_jax.io.images import SceneError, downscale, read_linear
+from geosplat_jax.io.images import (
+    SceneError,
+    downscale,
+    read_linear,
+    reading_bytes,
+    require_room,
+)
+from geosplat_jax.io.memory import Need
 
 COVERED = 0.5
 """A pixel belongs to the object where its alpha exceeds this."""
+
+_THREADS = min(8, os.cpu_count() or 1)
+"""Images that are read at the same time."""
 
 TRUTH_CHANNELS = {"albedo": 3, "normal": 3, "roughness": 1, "metallic": 1}
 
@@ -123,9 +133,17 @@ def load_views(
     """
     _require_distinct([frame.name for frame in frames])
     first = _read_frame(frames[0], factor)
+    height, width = first.full_size
+    at_once = min(_THREADS, len(frames)) * reading_bytes(width, height, 4)
+    require_room(
+        [
+            Need(f"{len(frames)} images like {frames[0].image}", len(frames) * first.pixels.nbytes),
+            Need(f"reading images of {width} x {height} pixels", at_once),
+        ],
+        "raise --downscale, or take fewer or smaller images",
+    )
     images = np.empty((len(frames), *first.pixels.shape), np.float32)
     problems = []
-    height, width = first.full_size
     if height % factor or width % factor:
         problems.append(
             f"images of {width} x {height} are cut to a multiple of the downscale factor {factor}"
@@ -311,7 +329,7 @@ def _same_size(pixels: np.ndarray, image: np.ndarray, path: Path) -> np.ndarray:
 
 def _in_parallel(function: Callable, items) -> list:
     """Map in threads; the first error, in the order of the items, is raised."""
-    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(max_workers=_THREADS) as pool:
         return list(pool.map(function, items))
 
 
