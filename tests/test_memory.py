@@ -131,8 +131,11 @@ def test_the_operators_of_the_light_are_counted_as_they_are_made():
 def test_a_checkpoint_of_large_settings_is_refused_by_its_file(machine):
     config = make_config(overrides=("light.width=8192", "light.height=4096"))
     with pytest.raises(TrainingError, match=r"^run/checkpoint\.npz: at least .*: light "):
-        require_rendering_memory(config, "run/checkpoint.npz")
-    require_rendering_memory(make_config("paper"), "run/checkpoint.npz")
+        require_rendering_memory(config, {}, "run/checkpoint.npz")
+    require_rendering_memory(make_config("paper"), {"hits": 10**6}, "run/checkpoint.npz")
+    machine(4)
+    with pytest.raises(TrainingError, match=r"^run/checkpoint\.npz: .* capacities\.hits 8\.0 GB"):
+        require_rendering_memory(make_config(), {"hits": 2 * GIGA}, "run/checkpoint.npz")
 
 
 def test_a_picture_larger_than_the_memory_is_refused_by_its_header(machine, tmp_path):

@@ -152,6 +152,11 @@ def from_plain(kind: type[_Class], values: Any, where: str = "") -> _Class:
         raise ValueError(_problems(error, where)) from None
 
 
+def first_line(error: Exception) -> str:
+    """Return the first line of an error, where one will do."""
+    return str(error).partition("\n")[0]
+
+
 def _problems(error: ValidationError, where: str, names: Sequence[str] = ()) -> str:
     """Describe everything that pydantic refused, one line each.
 

@@ -250,7 +250,7 @@ class Config:
         return plain
 
 
-def config_from_dict(values: dict[str, Any]) -> Config:
+def config_from_dict(values: Any) -> Config:
     """Rebuild a `Config` from `Config.to_dict` (after a trip through JSON).
 
     Raises
@@ -345,7 +345,7 @@ def moved_setting(path: str) -> str | None:
     return None
 
 
-def _require_current(values: dict[str, Any]) -> None:
+def _require_current(values: Any) -> None:
     """Refuse settings of an earlier version by their new names."""
     if not isinstance(values, dict):
         raise ValueError(f"settings must be an object with sections, got {values!r}")

@@ -7,6 +7,8 @@ limit of its own (`SurfaceSettings.limits`). The sum is therefore a lower bound:
 cannot work, and what is not refused may still need more.
 """
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -66,17 +68,26 @@ def require_training_memory(config: Config, dataset: Dataset) -> None:
         raise TrainingError(f"{refusal}; change the first of these")
 
 
-def require_rendering_memory(config: Config, where: Any) -> None:
+def require_rendering_memory(
+    config: Config, capacities: Mapping[str, int], where: str | Path
+) -> None:
     """Refuse to rebuild what a checkpoint describes where that cannot fit into the memory.
 
-    ``where`` : the file that the settings are from.
+    Parameters
+    ----------
+    config, capacities : of the checkpoint; a row of a buffer counts as one number.
+    where : the file that they are from.
 
     Raises
     ------
     TrainingError
         One line, with the file and the settings that take most.
     """
-    needs = [*_field_needs(config, config.active_stages), Need("light", _transport_bytes(config))]
+    needs = [
+        *_field_needs(config, config.active_stages),
+        Need("light", _transport_bytes(config)),
+        *(Need(f"capacities.{name}", _FLOAT_BYTES * n) for name, n in capacities.items()),
+    ]
     refusal = memory_refusal(needs)
     if refusal is not None:
         raise TrainingError(f"{where}: {refusal}")

@@ -156,5 +156,7 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
     def template(self, description: dict[str, Any]) -> tuple[FlexiCubes, Geometry]:
         """Make an empty grid."""
         nx, ny, nz = description["grid_shape"]
+        if not all(isinstance(n, int) and n > 0 for n in (nx, ny, nz)):
+            raise ValueError(f"grid_shape must be three numbers of cells, got {(nx, ny, nz)}")
         grid = Grid(jnp.zeros(3), jnp.ones(()), (nx, ny, nz))
         return self._model(grid), initial_geometry(grid, jnp.zeros(grid.vertex_count))

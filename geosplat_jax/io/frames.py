@@ -5,7 +5,6 @@ Here live the checks that all layouts share: JSON, keys, poses, and paths that m
 scene folder.
 """
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.images import MissingFileError, SceneError
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff")
@@ -131,8 +131,8 @@ def read_json(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise MissingFileError(f"{path} does not exist; check the scene folder is complete")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        content = parse_json(path.read_bytes())
+    except ValueError as error:
         raise SceneError(f"{path} is not JSON ({error}); write it again") from error
     if not isinstance(content, dict):
         raise SceneError(f"{path} must hold a JSON object, got {type(content).__name__}")
