@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from geosplat_jax.deferred import PerPixel
@@ -53,6 +54,10 @@ def test_presets_carry_the_numbers_of_the_paper_and_of_the_authors_code():
     assert not paper.stages[0].transport.baked_diffuse
     assert paper.stages[1].transport.indirect == "harmonics"
     assert code.stages[1].transport.indirect == "constant"
+    for config in (paper, code, make_config()):
+        # The authors' exp(-10), and linear images.
+        assert config.adapter.thickness == pytest.approx(np.exp(-10), rel=1e-3)
+        assert config.objective.srgb is False
     for config in (paper, code):
         assert config.geometry.resolution == 96
         assert config.geometry.cubic
