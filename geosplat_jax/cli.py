@@ -32,6 +32,7 @@ from geosplat_jax.gradcheck.report import (
     table,
     to_records,
 )
+from geosplat_jax.io.agreement import agreement_lines
 from geosplat_jax.io.checkpoints import CheckpointError
 from geosplat_jax.io.dataset import describe, load_recorded
 from geosplat_jax.io.export import LARGEST_TEXTURE
@@ -233,8 +234,11 @@ def _scene_options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _info(arguments: argparse.Namespace) -> None:
-    """Print what was recognised."""
-    print(describe(load_recorded(arguments.scene, _scene_options(arguments))))
+    """Print what was recognised, and whether masks and cameras agree."""
+    dataset = load_recorded(arguments.scene, _scene_options(arguments))
+    print(describe(dataset))
+    for line in agreement_lines(dataset.train, dataset.bounds):
+        print(f"  {line}")
 
 
 def _config_from(arguments: argparse.Namespace) -> Config:
