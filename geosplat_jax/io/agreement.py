@@ -47,7 +47,7 @@ def agreement(views: Views, bounds: Bounds) -> Float[np.ndarray, " V"]:
     shares = np.full(len(views), np.nan)
     for view in range(len(views)):
         # A voxel more on every side: rays pass between the middles of voxels.
-        hull = maximum_filter(total - left_out[view] <= allowed, size=3)
+        hull = np.asarray(maximum_filter(total - left_out[view] <= allowed, size=3), bool)
         points = _points_on_rays(views, view, lo, hi)
         if len(points):
             place = ((points - lo) / (hi - lo) * _VOXELS).astype(int)
