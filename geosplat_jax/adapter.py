@@ -17,7 +17,7 @@ from pydantic import Field
 from geosplat_jax.core.mesh import face_normals_and_areas, vertex_normals
 from geosplat_jax.core.numerics import safe_divide, safe_norm, safe_normalize, safe_sqrt
 from geosplat_jax.core.rotation import axes_to_quaternion, frame_from_normal, matrix_to_quaternion
-from geosplat_jax.core.settings import Positive, Share, Variant, settings
+from geosplat_jax.core.settings import Number, Positive, Share, Variant, settings
 from geosplat_jax.core.types import Box, Mesh, Splats
 from geosplat_jax.materials import Attributes
 from geosplat_jax.surface.base import Surface
@@ -29,9 +29,9 @@ SPLATS_PER_FACE = 6
 class AdapterConstants:
     """Constants of the sampling; static and hashable."""
 
-    u: float = 0.07
+    u: Number = 0.07
     """Barycentric coordinate of the outer triple of points, in [0, 1/3)."""
-    v: float = 0.22
+    v: Number = 0.22
     """Barycentric coordinate of the inner triple of points, in [0, 1/3)."""
     alpha: tuple[Positive, Positive] = (0.80, 2.08)
     """(outer, inner) ratio of S_x to half the length of the sampled segment."""

@@ -4,6 +4,7 @@ import argparse
 import importlib.metadata
 import json
 import sys
+import warnings
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -31,8 +32,10 @@ from geosplat_jax.gradcheck.report import (
     table,
     to_records,
 )
+from geosplat_jax.io.agreement import agreement_lines
 from geosplat_jax.io.checkpoints import CheckpointError
 from geosplat_jax.io.dataset import describe, load_recorded
+from geosplat_jax.io.export import LARGEST_TEXTURE
 from geosplat_jax.io.images import SceneError
 from geosplat_jax.materials import MATERIAL_PRIORS
 from geosplat_jax.report.consistency import (
@@ -48,7 +51,7 @@ from geosplat_jax.report.consistency import (
 )
 from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.relight import BACKGROUNDS, RelightOptions
-from geosplat_jax.report.renderer import DEFAULT_SAMPLES, RELIGHT_KINDS
+from geosplat_jax.report.renderer import DEFAULT_SAMPLES, LARGEST_SAMPLES, RELIGHT_KINDS
 from geosplat_jax.run import Run
 from geosplat_jax.run import train as train_run
 
@@ -68,6 +71,12 @@ class UsageError(ValueError):
 def _say(text: str, *, style: str = "", label: str = "") -> None:
     """Print a message as it is: what looks like markup may be a path."""
     _console.print(Text.assemble((label, style), text), soft_wrap=True)
+
+
+def _show_warning(message: Warning | str, *where: Any) -> None:
+    """Show a warning as one line, without the place in the program that it comes from."""
+    del where
+    _say(str(message), label="warning: ", style="yellow")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -250,8 +259,11 @@ def _scene_options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _info(arguments: argparse.Namespace) -> None:
-    """Print what was recognised."""
-    print(describe(load_recorded(arguments.scene, _scene_options(arguments))))
+    """Print what was recognised, and whether masks and cameras agree."""
+    dataset = load_recorded(arguments.scene, _scene_options(arguments))
+    print(describe(dataset))
+    for line in agreement_lines(dataset.train, dataset.bounds):
+        print(f"  {line}")
 
 
 def _config_from(arguments: argparse.Namespace) -> Config:
@@ -370,8 +382,15 @@ def _settings(arguments: argparse.Namespace) -> None:
     Console(highlight=False).print(table)
 
 
+def _check_samples(arguments: argparse.Namespace) -> None:
+    """Refuse numbers of samples that no image can be made with."""
+    if not 1 <= arguments.samples <= LARGEST_SAMPLES:
+        raise UsageError(f"--samples must be from 1 to {LARGEST_SAMPLES}, got {arguments.samples}")
+
+
 def _evaluate(arguments: argparse.Namespace) -> None:
     """Evaluate a run on its scene's test views and print the means."""
+    _check_samples(arguments)
     run = Run(arguments.run, scene=arguments.scene)
     metrics = run.evaluate(
         protocol=arguments.protocol,
@@ -435,6 +454,7 @@ def _relight(arguments: argparse.Namespace) -> None:
     for name in ("turntable", "rotate_env"):
         if getattr(arguments, name) < 0:
             raise UsageError(f"--{name.replace('_', '-')} must not be negative")
+    _check_samples(arguments)
     written = Run(arguments.run, scene=arguments.scene).relight(
         arguments.env,
         arguments.output,
@@ -481,6 +501,10 @@ def _refine_cameras(arguments: argparse.Namespace) -> None:
 
 def _export(arguments: argparse.Namespace) -> None:
     """Export the reconstructed asset."""
+    if not 1 <= arguments.texture_size <= LARGEST_TEXTURE:
+        raise UsageError(
+            f"--texture-size must be from 1 to {LARGEST_TEXTURE}, got {arguments.texture_size}"
+        )
     lines = Run(arguments.run, scene=arguments.scene).export(
         arguments.output,
         vertex_colors=arguments.vertex_colors,
@@ -541,7 +565,9 @@ def main(argv: list[str] | None = None) -> int:
     enable_compilation_cache()
     retain_freed_memory()
     try:
-        _COMMANDS[arguments.command](arguments)
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            _COMMANDS[arguments.command](arguments)
     except Interrupted as stop:
         _say(str(stop))
         return 130

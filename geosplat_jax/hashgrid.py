@@ -54,9 +54,9 @@ class HashGridSpec:
         more than half of the table.
     """
 
-    levels: PositiveCount = 8
+    levels: Annotated[int, Field(ge=1, le=64)] = 8
     """Number of grids."""
-    features: PositiveCount = 4
+    features: Annotated[int, Field(ge=1, le=64)] = 4
     """Numbers that a vertex holds in each of them."""
     log2_entries: Annotated[int, Field(ge=1, le=30)] = 15
     """Base-2 logarithm of the rows of the largest table."""

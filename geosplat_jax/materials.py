@@ -6,15 +6,16 @@ metallic and the inward shift; `MaterialSpec.shared` lets one encoding feed ever
 cost.
 """
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
+from pydantic import Field
 
 from geosplat_jax.core.numerics import absolute, safe_divide
-from geosplat_jax.core.settings import PositiveCount, settings
+from geosplat_jax.core.settings import Number, settings
 from geosplat_jax.core.types import Box, Materials, learned
 from geosplat_jax.hashgrid import (
     HashGridSpec,
@@ -45,25 +46,29 @@ A logit of 0 starts at roughness 0.55 or metallic 0.5; one of -3 at roughness 0.
 """
 
 
+Width = Annotated[int, Field(ge=1, le=1024)]
+"""Numbers between two layers of a head."""
+
+
 @settings
 class MaterialSpec:
     """Static shape of a material field; hashable."""
 
     grid: HashGridSpec = HashGridSpec()
     """Shape of the encodings."""
-    albedo_hidden: tuple[PositiveCount, ...] = (32, 32)
+    albedo_hidden: tuple[Width, ...] = (32, 32)
     """Hidden widths of the albedo head and of the indirect head."""
-    surface_hidden: tuple[PositiveCount, ...] = (32,)
+    surface_hidden: tuple[Width, ...] = (32,)
     """Hidden widths of the head of roughness and metallic and of the shift head."""
     shared: bool = False
     """One encoding for all heads instead of one for albedo and indirect light and one for
     roughness, metallic and shift."""
     bias: bool = False
     """Whether the heads' layers have biases."""
-    initial_roughness_logit: float = 0.0
+    initial_roughness_logit: Number = 0.0
     """Added to the raw roughness, so that training starts at a plausible material; see
     `MATERIAL_PRIORS`."""
-    initial_metallic_logit: float = 0.0
+    initial_metallic_logit: Number = 0.0
     """The same for metallic."""
     has_metallic: bool = True
     """Without it metallic is zero and has no parameters."""

@@ -11,19 +11,20 @@ Visibility, depth order, topology and samples carry no gradient; everything else
 import abc
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
+from pydantic import Field
 
 from geosplat_jax.adapter import FaceSplats, SplatModel
 from geosplat_jax.core import capacity as capacity_module
 from geosplat_jax.core.capacity import Capacities, Usage
 from geosplat_jax.core.numerics import safe_normalize
-from geosplat_jax.core.settings import Positive, PositiveCount, Variant, settings
+from geosplat_jax.core.settings import Positive, Variant, settings
 from geosplat_jax.core.types import Camera, EnvLight, Mesh, Splats, learned
 from geosplat_jax.materials import Attributes, MaterialField, MaterialSpec, attributes_at
 from geosplat_jax.rays.base import RayIndex
@@ -83,7 +84,7 @@ class RasterSettings:
     cull_backfaces: bool = True
     """Leave out splats whose face looks away from the camera. Half the work on a closed surface;
     the far side no longer shines through the gaps between splats."""
-    tile_size: PositiveCount = DEFAULT_TILE_SIZE
+    tile_size: Annotated[int, Field(ge=1, le=256)] = DEFAULT_TILE_SIZE
     """Edge of the square tiles in pixels."""
     near: Positive = 0.01
     """Near plane, in half the longest side of the box around the object."""

@@ -3,7 +3,6 @@
 `train` makes a `Run`, `Run` opens one. The command ``geosplat-jax`` and Python make the same.
 """
 
-import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
@@ -26,6 +25,7 @@ from geosplat_jax.fit.stages import make_batch
 from geosplat_jax.fit.train import Progress, Trained, fit, load_trained
 from geosplat_jax.io.cameras import RefinedSplit, write_cameras
 from geosplat_jax.io.dataset import Dataset, load_recorded
+from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.images import write_png
 from geosplat_jax.io.views import Views
 from geosplat_jax.pipeline import Pipeline
@@ -128,12 +128,15 @@ class Run:
         Raises
         ------
         RunError
-            If there was none.
+            If there was none, or its file is damaged.
         """
         path = self.folder.path / "metrics.json"
         if not path.exists():
             raise RunError(f"{self.folder} has not been evaluated; do so first")
-        return json.loads(path.read_text(encoding="utf-8"))
+        try:
+            return parse_json(path.read_bytes())
+        except ValueError as error:
+            raise RunError(f"{path} is damaged: {error}; evaluate the run again") from None
 
     def _views(self, split: str) -> Views:
         """Return a split that has views."""
@@ -178,7 +181,7 @@ class Run:
         record, dataset = self.folder.record(), self.dataset
         trained = self.trained if stage is None else load_trained(self.folder, stage=stage)
         lights = {name: load_light(path) for name, path in dataset.lights.items()}
-        peaks = [line["peak_memory_mb"] for line in self.steps()]
+        peaks = [line["peak_memory_mb"] for line in self.steps() if "peak_memory_mb" in line]
         return evaluate_run(
             trained,
             views,

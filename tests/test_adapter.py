@@ -117,6 +117,23 @@ def test_equations_8_to_11_by_hand():
 
 
 @pytest.mark.parametrize("constants", [PAPER, CODE], ids=["paper", "code"])
+def test_every_splat_has_the_normal_of_the_point_where_it_lies(constants):
+    """Normals that are linear over a face are told apart by place, in either ring."""
+    points = np.random.default_rng(1).normal(size=(3, 3))
+    mesh = _mesh(points, np.array([[0, 1, 2]]))
+    corner_normals = np.array([[1.0, 0.2, 0.1], [0.1, 1.0, -0.3], [-0.2, 0.3, 1.0]])
+    given = jnp.zeros_like(mesh.vertices).at[:3].set(jnp.asarray(corner_normals, jnp.float32))
+    splats = face_splats(mesh, given, constants=constants)
+    shares, _ = _shares_and_heights(splats.means[:6], mesh, np.zeros(6, int))
+    expected = shares @ corner_normals
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    # Means of two points of which each has a unit normal: equal but for their lengths.
+    np.testing.assert_allclose(splats.normals[:6], expected, atol=0.05)
+    apart = np.linalg.norm(expected[:, None] - expected[None], axis=-1) + np.eye(6)
+    assert apart.min() > 0.15
+
+
+@pytest.mark.parametrize("constants", [PAPER, CODE], ids=["paper", "code"])
 def test_frames_are_rotations_with_the_normal_as_z(constants):
     mesh = _octahedron()
     splats = place(mesh, constants=constants)

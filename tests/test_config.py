@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from geosplat_jax.deferred import PerPixel
@@ -53,6 +54,10 @@ def test_presets_carry_the_numbers_of_the_paper_and_of_the_authors_code():
     assert not paper.stages[0].transport.baked_diffuse
     assert paper.stages[1].transport.indirect == "harmonics"
     assert code.stages[1].transport.indirect == "constant"
+    for config in (paper, code, make_config()):
+        # The authors' exp(-10), and linear images.
+        assert config.adapter.thickness == pytest.approx(np.exp(-10), rel=1e-3)
+        assert config.objective.srgb is False
     for config in (paper, code):
         assert config.geometry.resolution == 96
         assert config.geometry.cubic
@@ -229,7 +234,22 @@ def test_another_kind_replaces_a_section():
         ("raster.near=nan", r"raster\.near must be a finite number"),
         ("raster.tile_size=0", r"raster\.tile_size must be greater"),
         ("run.seed=-1", r"run\.seed must be greater"),
+        ("run.seed=4294967296", r"run\.seed must be less than 4294967296"),
         ("run.initial_light=-1.0", r"run\.initial_light must be greater"),
+        ("run.initial_light=nan", r"run\.initial_light must be a finite number"),
+        ("run.initial_light=1e39", r"run\.initial_light must be .*single precision, got 1e\+39"),
+        ("stages.split_sum.rates.sdf=inf", r"rates\.sdf\.value must be a finite number"),
+        ("stages.split_sum.weights.l1=inf", r"weights\.l1\.value must be a finite number"),
+        ("stages.split_sum.steps=2147483648", r"split_sum\.steps must be less than 2\*\*31"),
+        ("stages.split_sum.steps=2147483647", r"all stages together must have less than 2\*\*31"),
+        ("stages=5", "^stages must be an object"),
+        ("stages.split_sum=5", r"^stages\.split_sum must be an object, got 5"),
+        ("objective.smoothness_radius=-1.0", r"objective\.smoothness_radius must be greater"),
+        ("raster.tile_size=257", r"raster\.tile_size must be less than or equal to 256"),
+        ("material.albedo_hidden=[-1]", r"material\.albedo_hidden\.0 must be greater"),
+        ("material.albedo_hidden=[1000000]", r"material\.albedo_hidden\.0 must be less"),
+        ("material.grid.levels=1000000000", r"material\.grid\.levels must be less than or equal"),
+        ("stages.monte_carlo.transport.light_count=5000", r"transport\.light_count must be less"),
         ("run.seed", "section.field=value"),
         ("quality=draft", "quality is chosen with --quality"),
         ("preset=paper", "preset is chosen with --preset"),
@@ -239,6 +259,18 @@ def test_another_kind_replaces_a_section():
 def test_bad_overrides_say_what_is_wrong(override, message):
     with pytest.raises(ValueError, match=message):
         make_config(overrides=(override,))
+
+
+def test_every_bad_override_has_a_line_of_its_own():
+    overrides = ("run.seed=-1", "stages.split_sum.steps=-1", "stages.monte_carlo.steps=-1")
+    with pytest.raises(ValueError, match=".") as caught:
+        make_config(overrides=overrides)
+    lines = str(caught.value).splitlines()
+    assert sorted(line.split(" must be ")[0] for line in lines) == [
+        "run.seed",
+        "stages.monte_carlo.steps",
+        "stages.split_sum.steps",
+    ]
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import pytest
 from support import shared_path
 
 from geosplat_jax.io.dataset import describe, load_dataset, load_recorded
+from geosplat_jax.io.frames import read_transforms
 from geosplat_jax.io.images import (
     ImageReadError,
     MissingFileError,
@@ -181,6 +182,17 @@ def tensoir(scenes, tmp_path):
 def load(root, **settings):
     """Load with given bounds, which the tests of bad input do not need found."""
     return load_dataset(root, **{"bounds": BOX, **settings})
+
+
+def test_every_frame_has_its_own_angle_where_it_says_so(tmp_path):
+    pose = np.eye(4).tolist()
+    frames = [
+        {"file_path": f"r_{k}", "transform_matrix": pose, **own}
+        for k, own in enumerate(({}, {"camera_angle_x": 0.5}, {"camera_angle_x": 0.7}))
+    ]
+    path = tmp_path / "transforms_train.json"
+    path.write_text(json.dumps({"camera_angle_x": 0.6, "frames": frames}))
+    assert [lens.angle_x for _, _, lens in read_transforms(path)] == [0.6, 0.5, 0.7]
 
 
 def edit(root, change, *, name="transforms_train.json"):

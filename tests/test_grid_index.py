@@ -181,6 +181,27 @@ def test_every_ray_equals_brute_force(scene, kind, two_sided):
     assert np.all(np.isinf(np.asarray(found)[np.asarray(hit) < 0]))
 
 
+def test_a_ray_meets_what_is_a_hundredth_of_a_cell_away_and_not_what_it_starts_on(torus):
+    """A thousandth of a cell is the border; it is written out here, so that it cannot drift."""
+    surface, index = torus
+    corners = triangles(surface)
+    cell = float(index.grid.cell_size)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    # Of large triangles only, whose middles rays meet whatever the rounding.
+    large = np.linalg.norm(normals, axis=1) > 0.2 * cell**2
+    chosen = np.flatnonzero(large)[np.arange(RAYS) % large.sum()]
+    normal, middle = unit(normals[chosen]), corners[chosen].mean(axis=1)
+    for cells, is_met in ((1e-2, True), (2e-3, True), (2e-4, False)):
+        distance, _ = index.nearest(
+            jnp.asarray(middle + cells * cell * normal, jnp.float32),
+            jnp.asarray(-normal, jnp.float32),
+            jnp.full((RAYS,), -1, jnp.int32),
+            jnp.ones((RAYS,), bool),
+        )
+        near = np.asarray(distance) < 0.1 * cell
+        assert near.mean() == (1.0 if is_met else 0.0)
+
+
 def _rays(count=RAYS, seed=2):
     rng = np.random.default_rng(seed)
     origins = jnp.asarray(rng.uniform(-1.5, 1.5, (count, 3)), jnp.float32)

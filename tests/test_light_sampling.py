@@ -46,6 +46,18 @@ def test_the_density_integrates_to_one(name):
     assert bool(jnp.all(jnp.diff(sampler.cumulative) >= 0))
 
 
+def test_the_seam_of_the_map_is_no_border():
+    """Turning a light by whole texels turns its density, and sets no more of it aside."""
+    light = EnvLight(jnp.zeros((6, 10, 3)).at[2, 0].set(5.0).at[4, 9].set(2.0))
+    density = np.asarray(light_sampler(light).density)
+    for columns in (1, 5):
+        turned = EnvLight(jnp.roll(light.radiance, columns, axis=1))
+        found = np.asarray(light_sampler(turned).density)
+        np.testing.assert_allclose(found, np.roll(density, columns, axis=1), rtol=1e-5)
+    # Next to a bright texel light is expected too, also across the seam.
+    np.testing.assert_allclose(density[2, 9], density[2, 1], rtol=1e-5)
+
+
 @pytest.mark.parametrize("name", LIGHTS)
 def test_samples_are_unit_and_report_the_density_of_their_direction(name):
     sampler = light_sampler(LIGHTS[name])

@@ -126,7 +126,7 @@ def test_too_small_buffers_grow_and_change_no_pixel(matt, camera):
 
 
 def test_no_samples_are_refused(matt):
-    with pytest.raises(ValueError, match="at least 1 sample per splat, got 0"):
+    with pytest.raises(ValueError, match="from 1 to 1000000 samples per splat, got 0"):
         Renderer(*matt, samples=0)
 
 

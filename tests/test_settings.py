@@ -77,11 +77,36 @@ def test_the_first_mistake_is_named_by_its_path_in_one_line(values, message):
     assert "\n" not in str(caught.value)
 
 
-def test_values_are_checked_wherever_settings_are_made():
-    with pytest.raises(ValueError, match="watts"):
-        Bulb(watts=-1.0)
-    with pytest.raises(ValueError, match="doors"):
-        Room(doors=-1)
+def test_every_mistake_has_a_line_of_its_own():
+    lamp = {"kind": "strip", "lengths": [1.0, -1.0, 1e31]}
+    with pytest.raises(ValueError, match=".") as caught:
+        from_plain(Room, {"doors": 2**31, "windows": 1, "lamp": lamp}, "house")
+    assert sorted(str(caught.value).splitlines()) == [
+        "house.doors must be less than 2**31, got 2147483648",
+        "house.lamp.lengths.1 must be greater than or equal to 0, got -1.0",
+        "house.lamp.lengths.2 must be 0, or between 1e-30 and 1e+30 in size, for single "
+        "precision, got 1e+31",
+        "unknown setting house.windows",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Bulb(watts=-1.0), "Bulb.watts must be greater than or equal to 0, got -1.0"),
+        (lambda: Bulb(-1.0), "Bulb.watts must be greater than or equal to 0, got -1.0"),
+        (lambda: Bulb(1e-40), "Bulb.watts must be 0, or between 1e-30 and 1e+30 in size, for "),
+        (lambda: Room(doors=-1), "Room.doors must be greater than or equal to 0, got -1"),
+        (lambda: Room(windows=1), "unknown setting Room.windows"),
+        (lambda: Room(doors="x" * 9999), "Room.doors must be a valid integer, unable to parse"),
+    ],
+)
+def test_values_are_checked_in_one_line_wherever_settings_are_made(make, message):
+    with pytest.raises(ValueError, match=".") as caught:
+        make()
+    assert str(caught.value).startswith(message)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
 
 
 def test_every_setting_is_listed_with_its_value_range_and_meaning():

@@ -8,24 +8,56 @@ a new way of doing something is a new class, in whatever file, and is written to
 """
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
+from functools import wraps
 from typing import Annotated, Any, ClassVar, TypeVar, dataclass_transform
 
 from annotated_types import Ge, Gt, Le, Lt
-from pydantic import ConfigDict, Field, GetCoreSchemaHandler, TypeAdapter, ValidationError
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    TypeAdapter,
+    ValidationError,
+)
 from pydantic.dataclasses import dataclass as _checked_dataclass
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 _CONFIG = ConfigDict(extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)
 
-Count = Annotated[int, Field(ge=0)]
+_SMALLEST, _LARGEST = 1e-30, 1e30
+"""Sizes of numbers other than 0, well within single precision, in which they are used."""
+
+
+def _of_single_precision(value: float) -> float:
+    """Refuse a number that single precision would round to 0 or to infinity."""
+    if value and not _SMALLEST <= abs(value) <= _LARGEST:
+        raise PydanticCustomError(
+            "single_precision",
+            "0, or between {smallest} and {largest} in size, for single precision",
+            {"smallest": f"{_SMALLEST:g}", "largest": f"{_LARGEST:g}"},
+        )
+    return value
+
+
+def _of_32_bits(value: int) -> int:
+    """Refuse a count that compiled programs cannot hold."""
+    if value >= 2**31:
+        raise PydanticCustomError("of_32_bits", "less than 2**31")
+    return value
+
+
+Count = Annotated[int, Field(ge=0), AfterValidator(_of_32_bits)]
 """0, 1, 2, ..."""
-PositiveCount = Annotated[int, Field(ge=1)]
+PositiveCount = Annotated[int, Field(ge=1), AfterValidator(_of_32_bits)]
 """1, 2, 3, ..."""
-NonNegative = Annotated[float, Field(ge=0)]
+Number = Annotated[float, AfterValidator(_of_single_precision)]
+"""A finite number."""
+NonNegative = Annotated[float, Field(ge=0), AfterValidator(_of_single_precision)]
 """A finite number that is not negative."""
-Positive = Annotated[float, Field(gt=0)]
+Positive = Annotated[float, Field(gt=0), AfterValidator(_of_single_precision)]
 """A finite number above 0."""
 Share = Annotated[float, Field(ge=0, le=1)]
 """A number from 0 to 1."""
@@ -38,8 +70,21 @@ _Class = TypeVar("_Class")
 
 @dataclass_transform(frozen_default=True)
 def settings(kind: type[_Class]) -> type[_Class]:
-    """Make a class of frozen, checked settings; see the module."""
+    """Make a class of frozen, checked settings; see the module.
+
+    Making an instance raises `ValueError` with one line for each value that is wrong.
+    """
     made: Any = _checked_dataclass(frozen=True, config=_CONFIG)(kind)
+    check, names = made.__init__, [field.name for field in fields(made)]
+
+    @wraps(check)
+    def checked(self: Any, *values: Any, **named: Any) -> None:
+        try:
+            check(self, *values, **named)
+        except ValidationError as error:
+            raise ValueError(_problems(error, kind.__name__, names)) from None
+
+    made.__init__ = checked
     return made
 
 
@@ -99,31 +144,61 @@ def from_plain(kind: type[_Class], values: Any, where: str = "") -> _Class:
     Raises
     ------
     ValueError
-        One line: the path of the first setting that is wrong, what is wrong, and its value.
+        One line for each setting that is wrong: its path, what is wrong, and its value.
     """
     try:
         return TypeAdapter(kind).validate_json(json.dumps(values), strict=True)
     except ValidationError as error:
-        raise ValueError(_first_problem(error, where)) from None
+        raise ValueError(_problems(error, where)) from None
 
 
-def _first_problem(error: ValidationError, where: str) -> str:
-    """Describe the first thing that pydantic refused."""
-    first = error.errors()[0]
-    path = ".".join(filter(None, [where, *map(str, first["loc"])]))
-    if first["type"] == "unexpected_keyword_argument":
-        return f"unknown setting {path}"
-    if first["type"] == _NESTED:
-        unknown = "unknown setting "
-        text = first["msg"]
-        if text.startswith(unknown):
-            return f"{unknown}{path}.{text.removeprefix(unknown)}"
-        return f"{path}.{text}"
-    message = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "value_error":
-        return f"{path}: {message}" if path else message
+def first_line(error: Exception) -> str:
+    """Return the first line of an error, where one will do."""
+    return str(error).partition("\n")[0]
+
+
+def _problems(error: ValidationError, where: str, names: Sequence[str] = ()) -> str:
+    """Describe everything that pydantic refused, one line each.
+
+    ``names`` : of the fields, where values may have been given by their place.
+    """
+    details = error.errors(include_url=False)
+    return "\n".join(line for detail in details for line in _lines(detail, where, names))
+
+
+def _lines(detail: Any, where: str, names: Sequence[str]) -> list[str]:
+    """Describe one thing that pydantic refused; settings of some kind may hold several."""
+    place = list(detail["loc"])
+    if place and isinstance(place[0], int) and place[0] < len(names):
+        place[0] = names[place[0]]
+    path = ".".join(filter(None, [where, *map(str, place)]))
+    if detail["type"] == "unexpected_keyword_argument":
+        return [f"unknown setting {path}"]
+    if detail["type"] == _NESTED:
+        return [_within(path, text) for text in detail["msg"].splitlines()]
+    message = detail["msg"].removeprefix("Value error, ")
+    if detail["type"] == "value_error":
+        return [f"{path}: {message}" if path else message]
     message = message.removeprefix("Input should be ")
-    return f"{path} must be {message}, got {first.get('input')!r}"
+    return [f"{path} must be {message}, got {_short(detail.get('input'))}"]
+
+
+def _within(path: str, text: str) -> str:
+    """Put a path before a line that begins with the rest of it."""
+    unknown = "unknown setting "
+    if text.startswith(unknown):
+        return f"{unknown}{path}.{text.removeprefix(unknown)}"
+    return f"{path}.{text}"
+
+
+_LONGEST_VALUE = 200
+"""Characters of a value that a message shows."""
+
+
+def _short(value: Any) -> str:
+    """Write a value, only its beginning where it is long."""
+    text = repr(value)
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]} ..."
 
 
 def listed(value: Any, where: str = "") -> Iterator[tuple[str, Any, str, str]]:

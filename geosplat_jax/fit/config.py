@@ -111,8 +111,8 @@ class Stage:
 class RunSettings:
     """What belongs to no part of the method."""
 
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Of every random choice."""
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    """Of every random choice; random streams tell no more seeds apart."""
     checkpoint_every: PositiveCount = 100
     """Steps between checkpoints."""
     preview_every: Count = 100
@@ -151,10 +151,14 @@ class Config:
     """What is trained, one after the other."""
 
     def __post_init__(self) -> None:
-        """Refuse stages of one name, and names that nothing answers to."""
+        """Refuse stages of one name, too many steps, and names that nothing answers to."""
         names = [stage.name for stage in self.stages]
         if len(set(names)) < len(names):
             raise ValueError(f"stages need names of their own, got {names}")
+        if self.total_steps >= 2**31:
+            raise ValueError(
+                f"all stages together must have less than 2**31 steps, got {self.total_steps}"
+            )
         terms = (*TERMS, *self.geometry.penalty_names)
         groups = self.rate_groups
         for number, stage in enumerate(self.stages):
@@ -246,21 +250,47 @@ class Config:
         return plain
 
 
-def config_from_dict(values: dict[str, Any]) -> Config:
+def config_from_dict(values: Any) -> Config:
     """Rebuild a `Config` from `Config.to_dict` (after a trip through JSON).
 
     Raises
     ------
     ValueError
-        For a setting that is unknown, has moved, or has a value that it cannot have; one line.
+        With one line for each setting that is unknown, has moved, or has a value that it cannot
+        have.
     """
     _require_current(values)
-    named = [{"name": name, **stage} for name, stage in values.get("stages", {}).items()]
-    stages = []
-    for stage in named:
-        where = f"stages.{stage['name']}"
-        stages.append(to_plain(from_plain(Stage, stage, where)))
-    return from_plain(Config, {**values, "stages": stages})
+    stages, problems = [], []
+    for name, stage in _stages_of(values).items():
+        try:
+            stages.append(to_plain(from_plain(Stage, {"name": name, **stage}, f"stages.{name}")))
+        except ValueError as error:
+            problems.append(str(error))
+    try:
+        config = from_plain(Config, {**values, "stages": stages})
+    except ValueError as error:
+        problems.append(str(error))
+    else:
+        if not problems:
+            return config
+    raise ValueError("\n".join(problems))
+
+
+def _stages_of(values: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the sections of the stages by name.
+
+    Raises
+    ------
+    ValueError
+        If they are no sections.
+    """
+    stages = values.get("stages", {})
+    if not isinstance(stages, dict):
+        raise ValueError(f"stages must be an object with one section per stage, got {stages!r}")
+    for name, stage in stages.items():
+        if not isinstance(stage, dict):
+            raise ValueError(f"stages.{name} must be an object, got {stage!r}")
+    return stages
 
 
 def all_settings(config: Config) -> list[tuple[str, Any, str, str]]:
@@ -315,7 +345,7 @@ def moved_setting(path: str) -> str | None:
     return None
 
 
-def _require_current(values: dict[str, Any]) -> None:
+def _require_current(values: Any) -> None:
     """Refuse settings of an earlier version by their new names."""
     if not isinstance(values, dict):
         raise ValueError(f"settings must be an object with sections, got {values!r}")

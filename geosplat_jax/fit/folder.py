@@ -18,13 +18,16 @@ import platform
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 
+from geosplat_jax.core.settings import PositiveCount, first_line, from_plain, settings
 from geosplat_jax.fit.config import Config, config_from_dict
 from geosplat_jax.io.dataset import Dataset
+from geosplat_jax.io.documents import parse_json
 
 _PACKAGES = ("jax", "jaxlib", "numpy", "optax", "geosplat_jax")
 _OWN = (
@@ -39,6 +42,51 @@ _LOCK = ".lock"
 
 class RunError(RuntimeError):
     """A run's folder cannot be used as it was asked for; the message says why, and the cure."""
+
+
+@settings
+class _Scene:
+    """Where the scene of a run is."""
+
+    scene: str
+    """Folder of the scene."""
+
+
+@settings
+class _Reading:
+    """Options of a scene's reading in a record that are checked; see `load_recorded`."""
+
+    downscale: PositiveCount = 1
+    """Factor that images are reduced by."""
+    light: str | None = None
+    """Training light."""
+    bounds: tuple[float, float, float, float, float, float] | None = None
+    """lo and hi of a box around the object."""
+    cameras: str | None = None
+    """File of refined cameras."""
+    cameras_digest: str | None = None
+    """What the file held."""
+
+
+def _known_of(options: Any) -> Any:
+    """Return those options that `_Reading` knows; anything but options as it is."""
+    if not isinstance(options, dict):
+        return options
+    return {f.name: options[f.name] for f in fields(_Reading) if f.name in options}
+
+
+def _parsed(path: Path) -> Any:
+    """Read a file of JSON.
+
+    Raises
+    ------
+    RunError
+        If it is damaged.
+    """
+    try:
+        return parse_json(path.read_bytes())
+    except ValueError as error:
+        raise RunError(f"{path} is damaged: {error}") from None
 
 
 class RunFolder:
@@ -91,13 +139,15 @@ class RunFolder:
         """
         if not self.exists:
             raise RunError(f"{self.path} is not a run (it has no run.json)")
-        try:
-            record = json.loads(self._record_path.read_text(encoding="utf-8"))
-        except (json.JSONDecodeError, UnicodeDecodeError) as error:
-            raise RunError(f"{self._record_path} is damaged: {error}") from None
+        record = _parsed(self._record_path)
         missing = {"scene", "dataset", "config"} - set(record if isinstance(record, dict) else ())
         if missing:
             raise RunError(f"{self._record_path} lacks {sorted(missing)}; it is no record of a run")
+        try:
+            from_plain(_Reading, _known_of(record["dataset"]), "dataset")
+            from_plain(_Scene, {"scene": record["scene"]})
+        except ValueError as error:
+            raise RunError(f"{self._record_path} is damaged: {first_line(error)}") from None
         return record
 
     def config(self) -> Config:
@@ -112,7 +162,7 @@ class RunFolder:
         try:
             return config_from_dict(values)
         except ValueError as error:
-            raise RunError(f"{self._record_path}: {error}") from None
+            raise RunError(f"{self._record_path}: {first_line(error)}") from None
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -243,9 +293,9 @@ class RunFolder:
         lines = []
         for number, text in enumerate(texts, 1):
             try:
-                line = json.loads(text)
+                line = parse_json(text)
                 int(line["step"])
-            except (json.JSONDecodeError, KeyError, TypeError, ValueError):
+            except (KeyError, TypeError, ValueError):
                 if number == len(texts):
                     break
                 raise RunError(f"line {number} of {self.metrics} is damaged") from None
@@ -265,9 +315,20 @@ class RunFolder:
         (self.path / "training.json").write_text(json.dumps(summary, indent=2) + "\n")
 
     def training(self) -> dict[str, Any] | None:
-        """Read what `write_training` noted; None before the end."""
+        """Read what `write_training` noted; None before the end.
+
+        Raises
+        ------
+        RunError
+            If the file is damaged.
+        """
         path = self.path / "training.json"
-        return json.loads(path.read_text()) if path.exists() else None
+        if not path.exists():
+            return None
+        summary = _parsed(path)
+        if not isinstance(summary, dict):
+            raise RunError(f"{path} is damaged: it holds no object; remove it")
+        return summary
 
 
 def _scene_of(dataset: Dataset) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from geosplat_jax.core import capacity as capacity_module
 from geosplat_jax.core.capacity import Capacities, Usage
+from geosplat_jax.core.settings import first_line
 from geosplat_jax.fit.compilation import compile_step
 from geosplat_jax.fit.config import Config, Stage, config_from_dict, differences
 from geosplat_jax.fit.folder import RunFolder
@@ -31,8 +32,13 @@ from geosplat_jax.fit.stages import (
     update_rule,
 )
 from geosplat_jax.fit.step import StepReport, TrainState, initial_state, train_step
-from geosplat_jax.fit.trained import read_checkpoint
-from geosplat_jax.io.checkpoints import latest_checkpoint, read_meta, save_checkpoint
+from geosplat_jax.fit.trained import (
+    Description,
+    NextStage,
+    read_checkpoint,
+    read_description,
+)
+from geosplat_jax.io.checkpoints import latest_checkpoint, save_checkpoint
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.views import Views
 from geosplat_jax.pipeline import Pipeline
@@ -68,7 +74,7 @@ class Loop:
     last_checkpoint: Path | None = None
     upcoming: "Upcoming | None" = None
     has_compiled: bool = False
-    to_come: dict[str, Any] | None = None
+    to_come: NextStage | None = None
 
     @property
     def step(self) -> int:
@@ -140,8 +146,8 @@ class Loop:
             self.upcoming = None
             upcoming.compiled.result()
             return upcoming.capacities
-        if self.to_come is not None and self.to_come["stage"] == self.stage.name:
-            return Capacities(**self.to_come["capacities"])
+        if self.to_come is not None and self.to_come.stage == self.stage.name:
+            return Capacities(**self.to_come.capacities)
         if known is not None:
             return add_rays(self.pipeline, self.state.params, known)
         return plan_capacities(
@@ -263,10 +269,10 @@ class Upcoming:
     ----------
     loop : as it is now; what is planned depends on its surface alone.
     stage : that comes next.
-    known : what `meta` returned in a run that is resumed.
+    known : what a checkpoint said of it, in a run that is resumed.
     """
 
-    def __init__(self, loop: Loop, stage: Stage, known: dict[str, Any] | None) -> None:
+    def __init__(self, loop: Loop, stage: Stage, known: NextStage | None) -> None:
         self.stage = stage
         self._is_wanted = True
         config, views, step = loop.config, loop.views, loop.config.first_step(stage.name)
@@ -279,8 +285,8 @@ class Upcoming:
             return replace(pipeline, capacities=capacities)
 
         def plan() -> Capacities:
-            if known is not None and known["stage"] == stage.name:
-                return Capacities(**known["capacities"])
+            if known is not None and known.stage == stage.name:
+                return Capacities(**known.capacities)
             first, pipeline = (
                 begin_stage(params, before, config, stage),
                 first_pipeline(Capacities()),
@@ -358,16 +364,16 @@ def new_loop(dataset: Dataset, config: Config, folder: RunFolder) -> Loop:
     return loop
 
 
-def _put(loop: Loop, tree: dict[str, Any], meta: dict[str, Any]) -> None:
+def _put(loop: Loop, tree: dict[str, Any], described: Description) -> None:
     """Set a loop to a checkpoint."""
     loop.surface = tree["surface"]
-    loop.stage = loop.config.stage(meta["stage"])
+    loop.stage = loop.config.stage(described.stage)
     pipeline = build_pipeline(loop.config, loop.stage, loop.surface)
-    loop.pipeline = replace(pipeline, capacities=Capacities(**meta["capacities"]))
+    loop.pipeline = replace(pipeline, capacities=Capacities(**described.capacities))
     loop.state = tree["state"]
-    loop.planned_for, loop.peak = meta["planned_for"], meta["peak"]
-    loop.recoveries = meta["recoveries"]
-    loop.to_come = meta["to_come"]
+    loop.planned_for, loop.peak = described.planned_for, described.peak
+    loop.recoveries = described.recoveries
+    loop.to_come = described.to_come
 
 
 def resumed_loop(dataset: Dataset, config: Config, folder: RunFolder) -> Loop:
@@ -416,8 +422,10 @@ def adopted_loop(
     path = latest_checkpoint(source.end_of(last.name)) or latest_checkpoint(source.checkpoints)
     if path is None:
         raise TrainingError(f"{source} holds no checkpoint to take the stage {last.name} from")
-    meta = read_meta(path)
-    theirs = config_from_dict(meta["config"])
+    try:
+        theirs = config_from_dict(read_description(path).config)
+    except ValueError as error:
+        raise TrainingError(f"{path}: {first_line(error)}") from None
     kept = [stage.name for stage in config.active_stages[:number]]
     changed = differences(theirs, config, stages=kept)
     if changed:
@@ -425,13 +433,13 @@ def adopted_loop(
             f"up to the stage {last.name}, {source} had other settings: {'; '.join(changed)}; "
             "train it anew"
         )
-    tree, meta = read_checkpoint(path, theirs)
+    tree, described = read_checkpoint(path, theirs)
     done, end = int(tree["state"].step), config.first_step(name)
-    if meta["stage"] != last.name or done != end:
+    if described.stage != last.name or done != end:
         raise TrainingError(
-            f"{path} is at step {done}, in the stage {meta['stage']}, not at the end of "
+            f"{path} is at step {done}, in the stage {described.stage}, not at the end of "
             f"{last.name} ({end} steps)"
         )
     loop = new_loop(dataset, config, folder)
-    _put(loop, tree, meta)
+    _put(loop, tree, described)
     return loop

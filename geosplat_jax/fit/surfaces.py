@@ -3,6 +3,7 @@
 import abc
 from typing import Annotated, Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
@@ -14,6 +15,9 @@ from geosplat_jax.geometry import FlexiCubes, initial_geometry, random_sdf, sphe
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.surface.base import SurfaceModel
 from geosplat_jax.surface.hull import fit_grid, hull_sdf
+
+Bounds = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
+"""lo and hi of a box in the world."""
 
 _SDF_REACH = 2.0
 """The first SDF is clipped to so many cells, so that the surface can be moved in few steps."""
@@ -37,6 +41,14 @@ class SurfaceSettings(Variant, abc.ABC):
     def limits(self) -> dict[str, int]:
         """Largest sensible need of a buffer, by name; beyond it the surface has exploded."""
         return {}
+
+    def parameter_bytes(self, bounds: Bounds) -> int:
+        """Count the memory that the shape takes which `start` makes; 0 where that is not known.
+
+        ``bounds`` : lo (3,) and hi (3,) of the box around the object.
+        """
+        del bounds
+        return 0
 
     @abc.abstractmethod
     def start(self, dataset: Dataset, key: Key[Array, ""]) -> tuple[SurfaceModel, Any]:
@@ -92,11 +104,7 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
 
     def start(self, dataset: Dataset, key: Key[Array, ""]) -> tuple[FlexiCubes, Geometry]:
         """Fit a grid to the object and fill it with a first surface."""
-        lo, hi = (np.asarray(corner) for corner in dataset.bounds)
-        if self.cubic:
-            middle, half = 0.5 * (lo + hi), 0.5 * np.max(hi - lo)
-            lo, hi = middle - half, middle + half
-        grid = fit_grid((lo, hi), self.resolution)
+        grid = self._grid(dataset.bounds)
         sdf = self._sdf(grid, dataset, key)
         if not bool(jnp.any(sdf < 0)) or not bool(jnp.any(sdf >= 0)):
             raise ValueError(
@@ -105,6 +113,20 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
                 "geosplat-jax info, give --bounds, or start from geometry.initial=sphere."
             )
         return self._model(grid), initial_geometry(grid, sdf)
+
+    def parameter_bytes(self, bounds: Bounds) -> int:
+        """Count the numbers of the vertices and cells of the grid."""
+        grid = self._grid(bounds)
+        shape = jax.eval_shape(lambda: initial_geometry(grid, jnp.zeros(grid.vertex_count)))
+        return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shape))
+
+    def _grid(self, bounds: Bounds) -> Grid:
+        """Lay the grid around the object."""
+        lo, hi = (np.asarray(corner) for corner in bounds)
+        if self.cubic:
+            middle, half = 0.5 * (lo + hi), 0.5 * np.max(hi - lo)
+            lo, hi = middle - half, middle + half
+        return fit_grid((lo, hi), self.resolution)
 
     def _sdf(self, grid: Grid, dataset: Dataset, key: Key[Array, ""]) -> Float[Array, " G"]:
         """First signed values on the grid."""
@@ -135,5 +157,7 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
     def template(self, description: dict[str, Any]) -> tuple[FlexiCubes, Geometry]:
         """Make an empty grid."""
         nx, ny, nz = description["grid_shape"]
+        if not all(isinstance(n, int) and n > 0 for n in (nx, ny, nz)):
+            raise ValueError(f"grid_shape must be three numbers of cells, got {(nx, ny, nz)}")
         grid = Grid(jnp.zeros(3), jnp.ones(()), (nx, ny, nz))
         return self._model(grid), initial_geometry(grid, jnp.zeros(grid.vertex_count))

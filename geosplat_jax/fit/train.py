@@ -18,6 +18,7 @@ import numpy as np
 from geosplat_jax.fit.config import Config
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.loop import Loop, adopted_loop, new_loop, resumed_loop
+from geosplat_jax.fit.memory import require_training_memory
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.runtime import peak_memory_mb
 from geosplat_jax.fit.step import StepReport, TrainState
@@ -187,8 +188,8 @@ def fit(
     RunError
         If the folder is another's, or in use.
     TrainingError
-        When a number is not finite, the surface vanishes or explodes for good, or the run to
-        resume or to take over does not fit.
+        When the settings ask for more memory than there is, a number is not finite, the surface
+        vanishes or explodes for good, or the run to resume or to take over does not fit.
     Interrupted
         After Ctrl-C or SIGTERM; the run can be resumed.
     """
@@ -197,6 +198,7 @@ def fit(
     if (source is None) != (first_stage is None):
         raise ValueError("source and first_stage belong together")
     dataset.require_masks("train")
+    require_training_memory(config, dataset)
     run = RunFolder(folder)
     with run.locked(), _stop_requests() as stop_requested:
         has_begun = False

@@ -7,35 +7,112 @@ from typing import Any
 import jax
 
 from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.settings import Count, PositiveCount, first_line, from_plain, settings
 from geosplat_jax.fit.config import Config, Stage, config_from_dict
 from geosplat_jax.fit.folder import RunError, RunFolder
+from geosplat_jax.fit.memory import require_rendering_memory
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.stages import build_pipeline, template_params
 from geosplat_jax.fit.step import initial_state
-from geosplat_jax.io.checkpoints import latest_checkpoint, load_checkpoint, read_meta
+from geosplat_jax.io.checkpoints import (
+    CheckpointError,
+    latest_checkpoint,
+    load_checkpoint,
+    read_meta,
+)
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
 
 
-def _template(config: Config, stage: Stage, meta: dict[str, Any]) -> dict[str, Any]:
-    """Return a checkpoint's arrays as shapes only; ``meta`` describes their sizes."""
+@settings
+class NextStage:
+    """What a checkpoint knows of the stage to come."""
+
+    stage: str
+    """Its name."""
+    capacities: dict[str, PositiveCount]
+    """Sizes of its buffers."""
+
+
+@settings
+class Description:
+    """Everything of a checkpoint that is not an array; `loop.Loop.meta` writes it."""
+
+    config: dict[str, Any]
+    """Settings of the run, see `Config.to_dict`."""
+    stage: str
+    """Name of the stage that it was written in."""
+    surface: dict[str, Any]
+    """Sizes of the surface, see `SurfaceSettings.describe`."""
+    capacities: dict[str, PositiveCount]
+    """Sizes of the buffers."""
+    splats: Any = None
+    """Sizes of what splats have learned, see `SplatSettings.describe`."""
+    planned_for: str | None = None
+    """What the buffers were planned for."""
+    peak: dict[str, Count] | None = None
+    """Largest needs of the buffers since they were last made smaller."""
+    recoveries: Count = 0
+    """How often the surface was put back."""
+    to_come: NextStage | None = None
+    """The stage to come, where it is near."""
+
+
+def read_description(path: Path) -> Description:
+    """Read what a checkpoint says beside its arrays.
+
+    Raises
+    ------
+    CheckpointError
+        If it is damaged.
+    """
+    try:
+        return from_plain(Description, read_meta(path))
+    except ValueError as error:
+        raise CheckpointError(f"checkpoint {path} is damaged: {first_line(error)}") from None
+
+
+def _template(config: Config, stage: Stage, described: Description) -> dict[str, Any]:
+    """Return a checkpoint's arrays as shapes only."""
 
     def build() -> dict[str, Any]:
-        model, shape = config.geometry.template(meta["surface"])
+        model, shape = config.geometry.template(described.surface)
         params = template_params(config, model, shape, stage)
-        params = replace(params, splats=stage.splats.template(meta.get("splats")))
+        params = replace(params, splats=stage.splats.template(described.splats))
         carry = build_pipeline(config, stage, model).transport.first_carry()
         return {"state": initial_state(params, carry=carry), "surface": model}
 
     return jax.eval_shape(build)
 
 
-def read_checkpoint(path: Path, config: Config) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read a checkpoint's arrays and the rest; ``config`` is the one it was written with."""
-    meta = read_meta(path)
-    like = _template(config, config.stage(meta["stage"]), meta)
+def read_checkpoint(path: Path, config: Config) -> tuple[dict[str, Any], Description]:
+    """Read a checkpoint's arrays and the rest; ``config`` is the one it was written with.
+
+    Raises
+    ------
+    CheckpointError
+        If it is damaged, or describes what cannot be.
+    TrainingError
+        If it describes what does not fit into the memory.
+    """
+    described = read_description(path)
+    stage = next((s for s in config.active_stages if s.name == described.stage), None)
+    if stage is None:
+        raise CheckpointError(
+            f"checkpoint {path} was written in the stage {described.stage!r}, which its settings "
+            "do not have, or not with any steps"
+        )
+    require_rendering_memory(config, described.capacities, path)
+    try:
+        like = _template(config, stage, described)
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        # Sizes belong to kinds of surfaces and splats, which read them each in its own way.
+        raise CheckpointError(
+            f"checkpoint {path} is damaged: surface {described.surface} and splats "
+            f"{described.splats} describe no arrays ({type(error).__name__}: {first_line(error)})"
+        ) from error
     tree, _ = load_checkpoint(path, like=like)
-    return tree, meta
+    return tree, described
 
 
 @dataclass(frozen=True)
@@ -62,21 +139,25 @@ def load_trained(folder: str | Path | RunFolder, *, stage: str | None = None) ->
     Raises
     ------
     TrainingError
-        If the folder holds no readable checkpoint.
+        If the folder holds no readable checkpoint, or one that does not fit into the memory.
+    CheckpointError
+        If the checkpoint is damaged.
     RunError
         If its settings are not those of this version.
     """
     run = folder if isinstance(folder, RunFolder) else RunFolder(folder)
     path = latest_checkpoint(run.checkpoints if stage is None else run.end_of(stage))
     if path is None:
-        raise TrainingError(f"{run} holds no checkpoint; is it the output of a training run?")
+        raise TrainingError(
+            f"{run} holds no checkpoint that can be read; is it the output of a training run?"
+        )
     try:
-        config = config_from_dict(read_meta(path)["config"])
+        config = config_from_dict(read_description(path).config)
     except ValueError as error:
-        raise RunError(f"{path}: {error}") from None
-    tree, meta = read_checkpoint(path, config)
-    current = config.stage(meta["stage"])
+        raise RunError(f"{path}: {first_line(error)}") from None
+    tree, described = read_checkpoint(path, config)
+    current = config.stage(described.stage)
     step = int(tree["state"].step)
     pipeline = build_pipeline(config, current, tree["surface"])
-    pipeline = replace(pipeline, capacities=Capacities(**meta["capacities"]))
+    pipeline = replace(pipeline, capacities=Capacities(**described.capacities))
     return Trained(config, current, tree["state"].params, pipeline, step)

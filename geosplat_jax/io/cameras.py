@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.images import MissingFileError, SceneError
 from geosplat_jax.io.views import Views, camera_to_world_of
 
@@ -123,10 +124,10 @@ def read_cameras(path: str | Path) -> dict[str, RefinedSplit]:
         If it is damaged, or of another version.
     """
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        content = parse_json(Path(path).read_bytes())
     except OSError as error:
         raise MissingFileError(f"cannot read the cameras {path}: {error.strerror}") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise SceneError(f"{path} is damaged: {error}; refine the cameras again") from None
     if not isinstance(content, dict) or content.get("format") != _FORMAT:
         raise SceneError(f"{path} holds no cameras; geosplat-jax refine-cameras writes such files")
@@ -144,7 +145,7 @@ def read_cameras(path: str | Path) -> dict[str, RefinedSplit]:
             )
             for name, split in content["splits"].items()
         }
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise SceneError(f"{path} is damaged: {what}; refine the cameras again") from None
 

@@ -8,29 +8,69 @@ renamed and its elders removed: at any moment the last good checkpoint is whole.
 """
 
 import json
+import math
 import os
 import re
 import warnings
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from pydantic import Field
+
+from geosplat_jax.core.settings import Count, first_line, from_plain, settings
+from geosplat_jax.io.documents import parse_json
 
 FORMAT = 1
 """Version of the file's own layout."""
 
 _META = "__meta__"
 _NAME = re.compile(r"checkpoint_(\d{8,})\.npz")
-_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError, OSError)
+_DAMAGE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    EOFError,
+    KeyError,
+    ValueError,
+    OSError,
+    NotImplementedError,
+)
+"""What a file raises that is not as it was written; a zip archive knows many ways."""
 _CARRIERS = {1: np.uint8, 2: np.uint16, 4: np.uint32, 8: np.uint64}
 
 
 class CheckpointError(RuntimeError):
     """A checkpoint cannot be written, read, or does not fit; the message says why."""
+
+
+@settings
+class _Leaf:
+    """A leaf of the tree as a checkpoint describes it."""
+
+    shape: tuple[Annotated[int, Field(ge=0)], ...]
+    """Of the array."""
+    dtype: str | None = None
+    """Of an array."""
+    key: str | None = None
+    """Generator of a typed PRNG key."""
+
+
+@settings
+class _Header:
+    """What a checkpoint says about itself."""
+
+    format: Literal[1]
+    """See `FORMAT`."""
+    step: Count
+    """That it was saved at."""
+    meta: dict[str, Any]
+    """Of the caller."""
+    leaves: dict[str, _Leaf]
+    """By their paths in the tree."""
 
 
 def save_checkpoint(folder: str | Path, step: int, *, tree: Any, meta: dict, keep: int = 2) -> Path:
@@ -110,16 +150,16 @@ def load_checkpoint(path: str | Path, *, like: Any) -> tuple[Any, dict]:
     header = _header(path)
     named, structure = jax.tree_util.tree_flatten_with_path(like)
     wanted = {_leaf_name(key_path): leaf for key_path, leaf in named}
-    _require_same_leaves(path, set(header["leaves"]), set(wanted))
+    _require_same_leaves(path, set(header.leaves), set(wanted))
     try:
         with zipfile.ZipFile(path) as archive:
             leaves = [
-                _unpack(path, name, header["leaves"][name], _read_member(archive, name), leaf)
+                _unpack(path, name, header.leaves[name], _read_member(archive, name), leaf)
                 for name, leaf in wanted.items()
             ]
     except _DAMAGE as error:
         raise CheckpointError(f"checkpoint {path} is damaged ({error}); use another") from error
-    return jax.tree_util.tree_unflatten(structure, leaves), header["meta"]
+    return jax.tree_util.tree_unflatten(structure, leaves), header.meta
 
 
 def latest_checkpoint(folder: str | Path) -> Path | None:
@@ -146,7 +186,7 @@ def read_meta(path: str | Path) -> dict:
     ------
     CheckpointError : missing or damaged file.
     """
-    return _header(Path(path))["meta"]
+    return _header(Path(path)).meta
 
 
 def read_step(path: str | Path) -> int:
@@ -156,7 +196,7 @@ def read_step(path: str | Path) -> int:
     ------
     CheckpointError : missing or damaged file.
     """
-    return _header(Path(path))["step"]
+    return _header(Path(path)).step
 
 
 def _leaf_name(key_path) -> str:
@@ -187,8 +227,9 @@ def _pack(tree: Any) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
     return members, described
 
 
-def _unpack(path: Path, name: str, described: dict, array: np.ndarray, like: Any) -> Any:
+def _unpack(path: Path, name: str, described: _Leaf, array: np.ndarray, like: Any) -> Any:
     """Turn a plain array back into a leaf, checking it against ``like``."""
+    stored = {"key": described.key, "dtype": described.dtype, "shape": list(described.shape)}
     wanted: dict[str, Any] = {"shape": list(np.shape(like))}
     if _is_key(like):
         wanted["key"] = str(jax.random.key_impl(like)) if isinstance(like, jax.Array) else None
@@ -196,14 +237,14 @@ def _unpack(path: Path, name: str, described: dict, array: np.ndarray, like: Any
         wanted["dtype"] = np.dtype(getattr(like, "dtype", np.asarray(like).dtype)).name
     for what in ("key", "dtype", "shape"):
         is_open = what == "key" and what in wanted and wanted[what] is None
-        if not is_open and wanted.get(what) != described.get(what):
+        if not is_open and wanted.get(what) != stored[what]:
             raise CheckpointError(
-                f"leaf {name} of {path} has {what} {described.get(what)}, but the run has "
+                f"leaf {name} of {path} has {what} {stored[what]}, but the run has "
                 f"{wanted.get(what)}; resume with the configuration the checkpoint was made with"
             )
-    if "key" in described:
-        return jax.random.wrap_key_data(jnp.asarray(array), impl=described["key"])
-    array = array.view(np.dtype(jnp.dtype(described["dtype"]))).reshape(described["shape"])
+    if described.key is not None:
+        return jax.random.wrap_key_data(jnp.asarray(array), impl=described.key)
+    array = array.view(np.dtype(jnp.dtype(described.dtype))).reshape(described.shape)
     if isinstance(like, bool | int | float | complex):
         return array.item()
     return array if isinstance(like, np.ndarray | np.generic) else jnp.asarray(array)
@@ -234,22 +275,57 @@ def _write_npz(path: Path, members: dict[str, np.ndarray]) -> None:
         os.fsync(file.fileno())
 
 
+_ENCRYPTED = 1
+"""Flag of a member."""
+
+
+def _require_plain(info: zipfile.ZipInfo) -> None:
+    """Refuse a member that may unfold to more than the file holds, or is not to be read."""
+    if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & _ENCRYPTED:
+        raise ValueError(f"{info.filename} is compressed or encrypted")
+
+
 def _read_member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    with archive.open(name + ".npy") as member:
-        return np.lib.format.read_array(member, allow_pickle=False)
+    """Read an array that is as large as it says; memory is spent only where the file has data.
+
+    Raises
+    ------
+    ValueError
+        If it is not as it was written.
+    """
+    info = archive.getinfo(name + ".npy")
+    _require_plain(info)
+    with archive.open(info) as member:
+        version = np.lib.format.read_magic(member)
+        read_header = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }.get(version)
+        if read_header is None:
+            raise ValueError(f"{info.filename} is of version {version}")
+        shape, is_fortran, dtype = read_header(member)
+        if dtype.hasobject or is_fortran:
+            raise ValueError(f"{info.filename} holds no plain numbers")
+        expected, content = math.prod(shape) * dtype.itemsize, member.read()
+        if expected != len(content):
+            raise ValueError(f"{info.filename} has {len(content)} bytes instead of {expected}")
+    return np.frombuffer(content, dtype).reshape(shape).copy()
 
 
-def _header(path: Path) -> dict:
+def _header(path: Path) -> _Header:
     if not path.is_file():
         raise CheckpointError(f"checkpoint {path} does not exist")
     try:
         with zipfile.ZipFile(path) as archive:
-            header = json.loads(_read_member(archive, _META).tobytes())
+            header = parse_json(_read_member(archive, _META).tobytes())
     except _DAMAGE as error:
         raise CheckpointError(f"checkpoint {path} is damaged ({error}); use another") from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise CheckpointError(f"{path} is no checkpoint of format {FORMAT}")
-    return header
+    try:
+        return from_plain(_Header, header)
+    except ValueError as error:
+        raise CheckpointError(f"checkpoint {path} is damaged: {first_line(error)}") from None
 
 
 def _damage(path: Path) -> str | None:
@@ -257,6 +333,8 @@ def _damage(path: Path) -> str | None:
     try:
         _header(path)
         with zipfile.ZipFile(path) as archive:
+            for info in archive.infolist():
+                _require_plain(info)
             bad = archive.testzip()
     except (CheckpointError, *_DAMAGE) as error:
         return str(error)

@@ -18,6 +18,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from geosplat_jax.io.images import encode_srgb, write_exr, written_aside
+from geosplat_jax.io.memory import Need, memory_refusal
 from geosplat_jax.io.meshes import (
     fill_gutters,
     is_closed,
@@ -30,6 +31,12 @@ from geosplat_jax.io.meshes import (
 
 SampleMaterials = Callable[[Float[np.ndarray, "N 3"]], tuple[Any, Any, Any]]
 """Positions (N, 3) in the world -> albedo (N, 3) linear, roughness (N,), metallic (N,)."""
+
+LARGEST_TEXTURE = 16_384
+"""Edge of the largest textures, texels; few programs open larger ones."""
+
+_TEXEL_BYTES = 4 * (1 + 3 + 5)
+"""Of a texel while a texture is baked: its face, barycentric coordinates and materials."""
 
 _SAMPLES_PER_CALL = 1 << 16
 _SH_DC = 0.28209479177387814
@@ -209,6 +216,15 @@ def _textured(
     }
 
 
+def _require_texture(size: int) -> None:
+    """Refuse textures of no size, or of one that cannot be made."""
+    if not 1 <= size <= LARGEST_TEXTURE:
+        raise ValueError(f"texture_size must be from 1 to {LARGEST_TEXTURE}, got {size}")
+    refusal = memory_refusal([Need(f"textures of {size} x {size}", _TEXEL_BYTES * size**2)])
+    if refusal is not None:
+        raise ValueError(f"{refusal}; lower texture_size")
+
+
 def export_mesh_glb(
     path: str | Path,
     vertices: Float[Array | np.ndarray, "V 3"],
@@ -247,9 +263,12 @@ def export_mesh_glb(
     Raises
     ------
     ValueError
-        If the mesh is empty or not finite, or ``sample_materials`` returns a wrong shape.
+        If the mesh is empty or not finite, ``sample_materials`` returns a wrong shape, or the
+        textures are of no size, of one above `LARGEST_TEXTURE`, or do not fit into the memory.
     """
     start = time.perf_counter()
+    if not vertex_colors:
+        _require_texture(texture_size)
     vertices, faces, normals, info = _checked_mesh(
         np.asarray(vertices, np.float32),
         np.asarray(faces, np.int32),

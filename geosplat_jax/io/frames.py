@@ -5,7 +5,6 @@ Here live the checks that all layouts share: JSON, keys, poses, and paths that m
 scene folder.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -16,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.images import MissingFileError, SceneError
 from geosplat_jax.io.lenses import Lens, checked_lens
 
@@ -97,8 +97,8 @@ def read_json(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise MissingFileError(f"{path} does not exist; check the scene folder is complete")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        content = parse_json(path.read_bytes())
+    except ValueError as error:
         raise SceneError(f"{path} is not JSON ({error}); write it again") from error
     if not isinstance(content, dict):
         raise SceneError(f"{path} must hold a JSON object, got {type(content).__name__}")

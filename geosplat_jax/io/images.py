@@ -7,7 +7,7 @@ reader never meets half a file and a full disk never destroys the previous one.
 """
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -20,6 +20,7 @@ import OpenImageIO as oiio
 from jaxtyping import Float
 
 from geosplat_jax.core.color import linear_to_srgb, srgb_to_linear
+from geosplat_jax.io.memory import Need, memory_refusal
 
 LINEAR_FORMATS = frozenset({".exr", ".hdr"})
 """Suffixes of the formats that hold linear light; every other one is taken as sRGB."""
@@ -101,6 +102,7 @@ def read_image(path: str | Path) -> Float[np.ndarray, "H W C"]:
     source = _opened(path)
     try:
         layout = _layout(source.spec())
+        _require_room_for(layout, path)
         pixels = source.read_image(format=oiio.FLOAT)
         problem = source.geterror()
     finally:
@@ -111,6 +113,34 @@ def read_image(path: str | Path) -> Float[np.ndarray, "H W C"]:
         )
     _require_plain(layout, path)
     return np.ascontiguousarray(pixels, np.float32)
+
+
+_COPIES_READING = 3
+"""Arrays of the size of the image that exist at once while it is read and decoded (measured)."""
+
+
+def reading_bytes(width: int, height: int, channels: int) -> int:
+    """Count the memory that it takes to read an image of this size."""
+    return _COPIES_READING * width * height * channels * np.dtype(np.float32).itemsize
+
+
+def require_room(needs: Sequence[Need], cure: str) -> None:
+    """Refuse images that do not fit into the memory, before it is spent.
+
+    Raises
+    ------
+    SceneError
+    """
+    refusal = memory_refusal(needs)
+    if refusal is not None:
+        raise SceneError(f"{refusal}; {cure}")
+
+
+def _require_room_for(layout: "_Layout", path: Path) -> None:
+    """Refuse an image that does not fit into the memory by what its header says."""
+    width, height = layout.shown[2:]
+    needed = reading_bytes(width, height, len(layout.channels))
+    require_room([Need(f"{path} of {width} x {height} pixels", needed)], "write a smaller image")
 
 
 class _Layout(NamedTuple):

@@ -21,10 +21,21 @@ from jaxtyping import Bool, Float
 from geosplat_jax.core.types import Camera
 from geosplat_jax.io.distortion import pinhole_lookup, resample, resample_valid
 from geosplat_jax.io.frames import Frame, Listing
-from geosplat_jax.io.images import SceneError, downscale, image_size, read_linear
+from geosplat_jax.io.images import (
+    SceneError,
+    downscale,
+    image_size,
+    read_linear,
+    reading_bytes,
+    require_room,
+)
+from geosplat_jax.io.memory import Need
 
 COVERED = 0.5
 """A pixel belongs to the object where its alpha exceeds this."""
+
+_THREADS = min(8, os.cpu_count() or 1)
+"""Images that are read at the same time."""
 
 TRUTH_CHANNELS = {"albedo": 3, "normal": 3, "roughness": 1, "metallic": 1}
 
@@ -156,6 +167,7 @@ def load_views(
     problems = _size_problems(frames, full, factor, listing)
     sizes = [(height // factor, width // factor) for height, width in full]
     canvas = np.max(sizes, axis=0)
+    _require_room_for_all(frames, full, canvas)
     images = np.zeros((len(frames), *canvas, 4), np.float32)
     valid = np.zeros((len(frames), *canvas), bool)
     has_mask, leaves_file = np.ones(len(frames), bool), np.zeros(len(frames), bool)
@@ -199,6 +211,23 @@ def load_views(
         },
     )
     return views, problems
+
+
+def _require_room_for_all(
+    frames: Sequence[Frame], full: list[tuple[int, int]], canvas: np.ndarray
+) -> None:
+    """Refuse views that do not fit into the memory, before it is spent."""
+    largest = max(full, key=lambda size: size[0] * size[1])
+    height, width = largest
+    at_once = min(_THREADS, len(frames)) * reading_bytes(width, height, 4)
+    pixels = len(frames) * int(np.prod(canvas)) * 4 * np.dtype(np.float32).itemsize
+    require_room(
+        [
+            Need(f"{len(frames)} images like {frames[full.index(largest)].image}", pixels),
+            Need(f"reading images of {width} x {height} pixels", at_once),
+        ],
+        "raise --downscale, or take fewer or smaller images",
+    )
 
 
 def _size_problems(
@@ -449,7 +478,7 @@ def _same_size(pixels: np.ndarray, image: np.ndarray, path: Path) -> np.ndarray:
 
 def _in_parallel(function: Callable, items) -> list:
     """Map in threads; the first error, in the order of the items, is raised."""
-    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(max_workers=_THREADS) as pool:
         return list(pool.map(function, items))
 
 

@@ -33,6 +33,9 @@ EVALUATION_AOVS = ("albedo", "roughness", "metallic", "normal")
 DEFAULT_SAMPLES = 128
 """Rays per splat, over all passes, in images that people look at and metrics are made from."""
 
+LARGEST_SAMPLES = 1_000_000
+"""Rays per splat at most, over all passes."""
+
 _PASS_SAMPLES = 16
 """Samples of each kind in a pass, at most."""
 
@@ -132,8 +135,10 @@ class Renderer:
         samples: int = DEFAULT_SAMPLES,
         seed: int = 0,
     ) -> None:
-        if samples < 1:
-            raise ValueError(f"an image needs at least 1 sample per splat, got {samples}")
+        if not 1 <= samples <= LARGEST_SAMPLES:
+            raise ValueError(
+                f"an image needs from 1 to {LARGEST_SAMPLES} samples per splat, got {samples}"
+            )
         self._trained = pipeline
         self._params = params
         self._key = jax.random.key(seed)

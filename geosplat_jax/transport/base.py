@@ -181,6 +181,14 @@ class TransportSettings(Variant, abc.ABC):
         """Say which settings have no effect together with the others."""
         return []
 
+    def constant_bytes(self, light: LightSpec) -> int:
+        """Count the memory that the constants take which `build` computes; 0 where there are none.
+
+        ``light`` : size of the lights.
+        """
+        del light
+        return 0
+
     @abc.abstractmethod
     def build(self, light: LightSpec) -> Transport:
         """Make the transport for lights of one size."""

@@ -14,15 +14,17 @@ milliseconds at 64 x 128 where the dense matrices would take gigabytes.
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from pydantic import Field
 
 from geosplat_jax.core.numerics import fast_arctan2, safe_sqrt
-from geosplat_jax.core.settings import PositiveCount, settings
+from geosplat_jax.core.settings import settings
 from geosplat_jax.core.types import EnvLight
 
 POLE_EPSILON = 1e-3
@@ -40,9 +42,9 @@ class LightSpec:
         1.
     """
 
-    height: PositiveCount = 64
+    height: Annotated[int, Field(ge=1, le=4096)] = 64
     """Rows of the environment map; one row is a light without elevation."""
-    width: PositiveCount = 128
+    width: Annotated[int, Field(ge=2, le=8192)] = 128
     """Columns of the environment map, an even number."""
     roughness: tuple[float, ...] = (0.0, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45, 0.6, 0.8, 1.0)
     """Increasing perceptual roughness of the levels (GGX alpha is its square). A first level 0 is
@@ -328,13 +330,19 @@ def _zonal_matrices(spec: LightSpec) -> np.ndarray:
     return np.ascontiguousarray(np.moveaxis(stacked, -1, 0))
 
 
+def operator_bytes(spec: LightSpec) -> int:
+    """Count the bytes of `prefilter_operators`: ``4 K H^2 (W/2+1)`` for K filtered levels."""
+    filtered = sum(roughness > 0 for roughness in spec.roughness)
+    return 4 * filtered * spec.height**2 * (spec.width // 2 + 1)
+
+
 def prefilter_operators(spec: LightSpec) -> PrefilterOperators:
     """Build, once a process and spec, the constant operators of `prefilter` on the host.
 
     Each output texel's lobe is cut into rings and spokes finer than the texels, and every piece
     deposits its exact mass on the four texels that the bilinear lookup would read. Rows therefore
-    sum to one: constant light is preserved. Memory is ``4 K H^2 (W/2+1)`` bytes for K filtered
-    levels: 10 MB at 64 x 128, 76 MB at 128 x 256 with the default levels.
+    sum to one: constant light is preserved. Memory (`operator_bytes`): 10 MB at 64 x 128, 76 MB at
+    128 x 256 with the default levels.
     """
     return PrefilterOperators(jnp.asarray(_zonal_matrices(spec)), spec)
 

@@ -19,16 +19,17 @@ Unbiased wherever the light is bounded. The backward pass computes chunks of poi
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
+from pydantic import Field
 
 from geosplat_jax.core.numerics import safe_divide
-from geosplat_jax.core.settings import Count, PositiveCount, settings
+from geosplat_jax.core.settings import settings
 from geosplat_jax.core.types import EnvLight, Materials, SurfacePoints
 from geosplat_jax.materials import Attributes
 from geosplat_jax.rays.base import RayIndex
@@ -318,17 +319,21 @@ class MonteCarloIllumination(Illumination):
         return replace(self, gathered=gathered, traced=traced)
 
 
+SampleCount = Annotated[int, Field(ge=0, le=4096)]
+"""Samples of one kind per point."""
+
+
 @settings
 class MonteCarloSettings(TransportSettings, kind="monte_carlo"):
     """Sampled light, with shadows traced against the surface."""
 
-    light_count: Count = 4
+    light_count: SampleCount = 4
     """Samples of the environment per point, for both lobes."""
-    diffuse_count: Count = 4
+    diffuse_count: SampleCount = 4
     """Samples of the cosine per point, for the diffuse lobe."""
-    specular_count: Count = 4
+    specular_count: SampleCount = 4
     """Samples of the visible microfacet normals per point, for the specular lobe."""
-    residual_count: Count = 0
+    residual_count: SampleCount = 0
     """Samples of each kind of a second image, from which Eq. 13 takes its residual; with 0 it takes
     that of the image that it differentiates, which biases the gradient."""
     occlusion: bool = True
@@ -336,7 +341,7 @@ class MonteCarloSettings(TransportSettings, kind="monte_carlo"):
     blocked."""
     indirect: Literal["none", "constant", "harmonics", "traced"] = "none"
     """Light from blocked directions, see `transport.indirect`."""
-    bounces: PositiveCount = 1
+    bounces: Annotated[int, Field(ge=1, le=16)] = 1
     """For traced indirect light, how often light goes from surface to surface."""
     shares_views: bool = True
     """All views of a batch use the same samples of light and cosine, which are then traced once.

@@ -26,6 +26,7 @@ from geosplat_jax.transport.environment import (
     LightSpec,
     PrefilteredLight,
     PrefilterOperators,
+    operator_bytes,
     prefilter,
     prefilter_operators,
     prefiltered_diffuse,
@@ -231,6 +232,10 @@ class SplitSumSettings(TransportSettings, kind="split_sum"):
     baked_diffuse: bool = False
     """The albedo field *is* the diffuse radiance and is not multiplied by irradiance, as in the
     authors' first stage."""
+
+    def constant_bytes(self, light: LightSpec) -> int:
+        """Count the operators of the prefilter twice: they are kept on the host, and copied."""
+        return 2 * operator_bytes(light)
 
     def build(self, light: LightSpec) -> SplitSum:
         """Compute the tables of the split sum."""

@@ -1,0 +1,129 @@
+"""The memory that a training is certain to take, known from its settings before anything is spent.
+
+What is counted has a known size: the photographs, the views of a step, the learned numbers with
+what Adam keeps of them, constants of the light transport, and the points of the smoothness terms.
+What depends on how many splats a surface has is not known beforehand and not counted; it has a
+limit of its own (`SurfaceSettings.limits`). The sum is therefore a lower bound: what is refused
+cannot work, and what is not refused may still need more.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from geosplat_jax.fit.config import Config, Stage
+from geosplat_jax.fit.planning import TrainingError
+from geosplat_jax.io.dataset import Dataset
+from geosplat_jax.io.memory import Need, memory_refusal
+from geosplat_jax.materials import init_materials
+
+_COPIES_LEARNED = 4
+"""A learned number, its gradient, and the two moments of Adam."""
+
+_FLOAT_BYTES = 4
+
+_SMOOTHNESS = {"smoothness_albedo", "smoothness_roughness_metallic"}
+"""Terms of the loss that are evaluated at points of their own."""
+
+_PIXEL_BYTES = 4 * _FLOAT_BYTES
+"""RGBA in single precision."""
+
+
+def training_needs(config: Config, dataset: Dataset) -> list[Need]:
+    """List what a training takes at least at one time, by the settings that decide it.
+
+    Stages follow one another, so of what they take apart the largest counts.
+    """
+    train, test = dataset.train, dataset.test
+    pixels = train.height * train.width
+    images = (len(train) * pixels + len(test) * test.height * test.width) * _PIXEL_BYTES
+    views = max((min(stage.batch_views, len(train)) for stage in config.active_stages), default=0)
+    light = config.light.height * config.light.width * 3 * _FLOAT_BYTES
+    return [
+        Need("the photographs (--downscale)", images),
+        Need("stages.*.batch_views", views * pixels * _PIXEL_BYTES),
+        Need("geometry", _COPIES_LEARNED * config.geometry.parameter_bytes(dataset.bounds)),
+        Need("light", _COPIES_LEARNED * light + _transport_bytes(config)),
+        *(
+            Need(need.what, _COPIES_LEARNED * need.byte_count)
+            for need in _field_needs(config, config.active_stages)
+        ),
+        Need("objective.smoothness_samples", _smoothness_bytes(config)),
+    ]
+
+
+def require_training_memory(config: Config, dataset: Dataset) -> None:
+    """Refuse a training that cannot fit into the memory.
+
+    Raises
+    ------
+    TrainingError
+        One line, with the settings that take most.
+    """
+    refusal = memory_refusal(training_needs(config, dataset))
+    if refusal is not None:
+        raise TrainingError(f"{refusal}; change the first of these")
+
+
+def require_rendering_memory(
+    config: Config, capacities: Mapping[str, int], where: str | Path
+) -> None:
+    """Refuse to rebuild what a checkpoint describes where that cannot fit into the memory.
+
+    Parameters
+    ----------
+    config, capacities : of the checkpoint; a row of a buffer counts as one number.
+    where : the file that they are from.
+
+    Raises
+    ------
+    TrainingError
+        One line, with the file and the settings that take most.
+    """
+    needs = [
+        *_field_needs(config, config.active_stages),
+        Need("light", _transport_bytes(config)),
+        *(Need(f"capacities.{name}", _FLOAT_BYTES * n) for name, n in capacities.items()),
+    ]
+    refusal = memory_refusal(needs)
+    if refusal is not None:
+        raise TrainingError(f"{where}: {refusal}")
+
+
+def _field_needs(config: Config, stages: tuple[Stage, ...]) -> list[Need]:
+    """Count the numbers of the material field once: its tables and its heads."""
+    outputs = max((stage.transport.indirect_outputs for stage in stages), default=0)
+    field = jax.eval_shape(
+        lambda key: init_materials(key, config.material, indirect_outputs=outputs),
+        jax.random.key(0),
+    )
+    tables = _byte_count((field.albedo_table, field.surface_table))
+    return [
+        Need("material.grid", tables),
+        Need("material.*_hidden", _byte_count(field) - tables),
+    ]
+
+
+def _transport_bytes(config: Config) -> int:
+    """Count the constants of the light transport, of the stage that has most."""
+    stages = config.active_stages
+    return max((stage.transport.constant_bytes(config.light) for stage in stages), default=0)
+
+
+def _smoothness_bytes(config: Config) -> int:
+    """Count the encoded points of the smoothness terms: each, and each displaced (Eq. 16)."""
+    if not any(_SMOOTHNESS & set(stage.weights_at(0)) for stage in config.active_stages):
+        return 0
+    width = config.material.grid.width * (1 if config.material.shared else 2)
+    return 2 * config.objective.smoothness_samples * width * _FLOAT_BYTES
+
+
+def _byte_count(tree: Any) -> int:
+    """Count the bytes of the arrays of a tree, or of their shapes."""
+    return sum(
+        int(np.prod(leaf.shape, dtype=object)) * leaf.dtype.itemsize
+        for leaf in jax.tree.leaves(tree)
+    )

@@ -1,0 +1,113 @@
+"""Whether silhouettes, poses and lenses of a scene agree with each other.
+
+Every ray through a pixel of a mask meets the object, and the object lies in the visual hull of all
+other views. So where rays of a view's mask miss the hull of the others, its mask, pose or lens is
+wrong, or those of the others are. What changes all views alike is not seen: a field of view that is
+wrong for every camera around a centred object only makes the object larger or smaller.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import maximum_filter
+
+from geosplat_jax.io.views import Views
+
+AGREES = 0.9
+"""Share of a mask's rays that meet the hull of the other views where everything is right; the rest
+is the thickness of a voxel, and thin parts."""
+
+_VOXELS = 40
+"""Along every side of the box."""
+_RAYS = 400
+"""Pixels of a mask that are tried."""
+_STEPS = 2 * _VOXELS
+"""Points of a ray within the box."""
+_DISSENT = 0.1
+"""Share of the other views that may leave a point out of their masks, so that a few wrong views do
+not carve the hull of all others away."""
+
+Bounds = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
+
+
+def agreement(views: Views, bounds: Bounds) -> Float[np.ndarray, " V"]:
+    """Find the share of every mask's pixels whose ray meets the visual hull of the other views.
+
+    Parameters
+    ----------
+    views : with masks. bounds : lo and hi of a box around the object.
+
+    Returns
+    -------
+    (V,) in [0, 1]; NaN for a view whose mask is empty.
+    """
+    lo, hi = (np.asarray(corner, np.float64) for corner in bounds)
+    left_out = np.stack([_left_out(views, view, lo, hi) for view in range(len(views))])
+    total = left_out.sum(0)
+    allowed = _DISSENT * (len(views) - 1)
+    shares = np.full(len(views), np.nan)
+    for view in range(len(views)):
+        # A voxel more on every side: rays pass between the middles of voxels.
+        hull = np.asarray(maximum_filter(total - left_out[view] <= allowed, size=3), bool)
+        points = _points_on_rays(views, view, lo, hi)
+        if len(points):
+            place = ((points - lo) / (hi - lo) * _VOXELS).astype(int)
+            is_inside = ((place >= 0) & (place < _VOXELS)).all(-1)
+            x, y, z = np.moveaxis(np.clip(place, 0, _VOXELS - 1), -1, 0)
+            shares[view] = (hull[x, y, z] & is_inside).any(1).mean()
+    return shares
+
+
+def agreement_lines(views: Views, bounds: Bounds) -> list[str]:
+    """Say whether the views agree, and which do not."""
+    if len(views) < 3:
+        return ["agreement:  not checked, it takes three views"]
+    shares = agreement(views, bounds)
+    known = shares[np.isfinite(shares)]
+    if not len(known):
+        return ["agreement:  not checked, every mask is empty"]
+    lines = [
+        f"agreement:  {known.mean():.1%} of the rays through masks meet the hull of the other "
+        f"views (worst view {known.min():.1%})"
+    ]
+    wrong = [k for k in np.argsort(shares) if shares[k] < AGREES]
+    if wrong:
+        shown = ", ".join(f"{views.names[k]} ({shares[k]:.0%})" for k in wrong[:5])
+        more = ", ..." if len(wrong) > 5 else ""
+        lines.append(
+            f"warning: silhouettes, poses and lenses of {len(wrong)} of {len(views)} views do not "
+            f"agree with the others: {shown}{more}; check their masks, their order and the axes "
+            "and field of view of the cameras"
+        )
+    return lines
+
+
+def _left_out(views: Views, view: int, lo: np.ndarray, hi: np.ndarray) -> Bool[np.ndarray, "N N N"]:
+    """Find the voxels that a view sees outside of its mask; one out of sight is not left out."""
+    axes = [a + (np.arange(_VOXELS) + 0.5) / _VOXELS * (b - a) for a, b in zip(lo, hi, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    pose = views.world_to_camera[view]
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    is_ahead = local[:, 2] > 0
+    depth = np.where(is_ahead, local[:, 2], 1.0)
+    pixel = (local @ views.intrinsics[view].T)[:, :2] / depth[:, None]
+    is_seen = is_ahead & (pixel >= 0).all(1) & (pixel < [views.width, views.height]).all(1)
+    column, row = np.where(is_seen[:, None], pixel, 0).astype(int).T
+    is_out = is_seen & ~views.masks[view][row, column]
+    return is_out.reshape(_VOXELS, _VOXELS, _VOXELS)
+
+
+def _points_on_rays(
+    views: Views, view: int, lo: np.ndarray, hi: np.ndarray
+) -> Float[np.ndarray, "R S 3"]:
+    """Spread points over the rays of some pixels of a mask, as far as the box reaches."""
+    rows, columns = np.nonzero(views.masks[view])
+    chosen = np.unique(np.linspace(0, len(rows) - 1, _RAYS).astype(int)) if len(rows) else []
+    pixels = np.stack([columns[chosen] + 0.5, rows[chosen] + 0.5, np.ones(len(chosen))], -1)
+    pose = views.world_to_camera[view]
+    rays = pixels @ np.linalg.inv(views.intrinsics[view]).T @ pose[:3, :3]
+    center = views.camera_to_world[view, :3, 3]
+    # Depths of the ball around the box, along the axis of the camera.
+    middle, radius = 0.5 * (lo + hi), 0.5 * float(np.linalg.norm(hi - lo))
+    depth = float(pose[2, :3] @ middle + pose[2, 3])
+    steps = np.linspace(max(depth - radius, 0.0), max(depth + radius, 0.0), _STEPS)
+    return center + steps[:, None] * rays[:, None, :]

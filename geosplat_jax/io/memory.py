@@ -1,0 +1,66 @@
+"""Memory of the machine, and refusals before it is spent."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+_CONTAINER_LIMITS = (
+    Path("/sys/fs/cgroup/memory.max"),
+    Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
+)
+"""Where Linux says how much memory a container may use, in either version of control groups."""
+
+
+@dataclass(frozen=True)
+class Need:
+    """Memory that something is certain to take.
+
+    Attributes
+    ----------
+    what : names the setting or the file that asks for it.
+    byte_count : of memory.
+    """
+
+    what: str
+    byte_count: int
+
+
+def memory_of_machine() -> int | None:
+    """Count the bytes of memory that this process may use at most.
+
+    That is the memory of the machine, or of the container that the process runs in; what other
+    processes hold of it at the moment does not matter. None where the system does not tell, as on
+    Windows.
+    """
+    try:
+        physical = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return None
+    return min([physical, *filter(None, map(_limit_in, _CONTAINER_LIMITS))])
+
+
+def _limit_in(path: Path) -> int | None:
+    """Read the limit of a container; None where there is none."""
+    try:
+        text = path.read_text().strip()
+    except OSError:
+        return None
+    return int(text) if text.isdigit() else None
+
+
+def memory_refusal(needs: Sequence[Need]) -> str | None:
+    """Say why needs cannot be met, the largest first; None where they fit, or nobody knows."""
+    available, total = memory_of_machine(), sum(need.byte_count for need in needs)
+    if available is None or total <= available:
+        return None
+    largest = sorted(needs, key=lambda need: need.byte_count, reverse=True)
+    parts = [f"{need.what} {_gigabytes(need.byte_count)}" for need in largest[:3]]
+    return (
+        f"at least {_gigabytes(total)} of memory would be needed, and there are "
+        f"{_gigabytes(available)}: {', '.join(parts)}"
+    )
+
+
+def _gigabytes(byte_count: int) -> str:
+    return f"{byte_count / 1e9:,.1f} GB"

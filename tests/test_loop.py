@@ -1,0 +1,142 @@
+"""What happens between two steps, with a step that is told what to answer: nothing is compiled."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import MONTE_CARLO, sphere_dataset, tiny_config
+
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.fit import loop as loop_module
+from geosplat_jax.fit.folder import RunFolder
+from geosplat_jax.fit.loop import new_loop, resumed_loop
+from geosplat_jax.fit.stages import build_pipeline, make_batch
+from geosplat_jax.fit.step import StepReport
+from geosplat_jax.pipeline import LossReport
+
+CONFIG = tiny_config(
+    *MONTE_CARLO,
+    "geometry.resolution=6",
+    "stages.split_sum.steps=6",
+    "stages.split_sum.weights.entropy={value=0.2, end=0.1, until=1.0}",
+    "stages.monte_carlo.steps=4",
+    "stages.monte_carlo.half_life=2.0",
+    "stages.monte_carlo.weights.entropy={value=0.4, end=0.0, until=1.0}",
+)
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return sphere_dataset(count=5, size=8)
+
+
+@pytest.fixture
+def folder(dataset, tmp_path):
+    run = RunFolder(tmp_path / "run")
+    with run.locked():
+        run.begin(dataset, CONFIG, replace=False)
+    return run
+
+
+class Steps:
+    """Stands for `train_step`: notes what it is given, and needs the hits it is told."""
+
+    def __init__(self, *needs):
+        self.needs = list(needs)
+        self.batches, self.rules, self.pipelines = [], [], []
+
+    def __call__(self, state, batch, pipeline, rule):
+        need = self.needs.pop(0) if self.needs else 1
+        self.batches.append(batch)
+        self.rules.append(rule)
+        self.pipelines.append(pipeline)
+        fits = need <= pipeline.capacities["hits"]
+        one = jnp.float32(1.0)
+        loss = LossReport({"l1": one}, one, jnp.int32(6), jnp.int32(1), {"hits": jnp.int32(need)})
+        if fits:
+            state = replace(state, step=state.step + 1)
+        return state, StepReport(one, loss, jnp.asarray(True), jnp.asarray(fits))
+
+
+@pytest.fixture
+def steps(monkeypatch):
+    """Put `Steps` in the place of the true step, and plan and compile nothing."""
+
+    def install(*needs):
+        told = Steps(*needs)
+        monkeypatch.setattr(loop_module, "train_step", told)
+        monkeypatch.setattr(loop_module, "compile_step", lambda *a, **k: None)
+        monkeypatch.setattr(loop_module, "plan_capacities", lambda *a, **k: Capacities(hits=128))
+        return told
+
+    return install
+
+
+def same(first, second):
+    a, b = (
+        jax.tree.leaves((first.image, first.views)),
+        jax.tree.leaves((second.image, second.views)),
+    )
+    key = np.array_equal(jax.random.key_data(first.key), jax.random.key_data(second.key))
+    return key and all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+def test_a_step_that_overflows_is_repeated_with_the_same_batch(dataset, folder, steps):
+    told = steps(1, 500, 500, 1)
+    loop = new_loop(dataset, CONFIG, folder)
+    for step in range(3):
+        loop.prepare(step)
+        loop.advance(step)
+    first, overflowed, repeated, last = told.batches
+    assert same(overflowed, repeated)
+    stage, seed = CONFIG.stages[0], CONFIG.run.seed
+    for batch, step in ((first, 0), (overflowed, 1), (last, 2)):
+        assert same(batch, make_batch(dataset.train, step, stage, seed=seed))
+    assert not same(first, repeated)
+    assert not same(repeated, last)
+    assert loop.step == 3
+    assert told.pipelines[1].capacities["hits"] == 128
+    assert told.pipelines[2].capacities["hits"] >= 500
+
+
+def test_weights_and_rates_count_from_the_start_of_their_stage(dataset, folder, steps):
+    told = steps()
+    loop = new_loop(dataset, CONFIG, folder)
+    for step in (0, 3):
+        loop.prepare(step)
+        loop.advance(step)
+    later = CONFIG.stage("monte_carlo")
+    loop.stage, loop.pipeline = later, build_pipeline(CONFIG, later, loop.surface)
+    for step in (6, 8):
+        loop.prepare(step)
+        loop.advance(step)
+    stages = [CONFIG.stages[0], CONFIG.stages[0], later, later]
+    for pipeline, rule, stage, since in zip(
+        told.pipelines, told.rules, stages, (0, 3, 0, 2), strict=True
+    ):
+        weights = {name: float(value) for name, value in pipeline.weights.items()}
+        assert weights == pytest.approx(stage.weights_at(since))
+        rates = {name: float(value) for name, value in rule.rates.items()}
+        assert rates == pytest.approx(stage.rates_at(since))
+    entropies = [float(pipeline.weights["entropy"]) for pipeline in told.pipelines]
+    assert entropies == pytest.approx([0.2, 0.15, 0.4, 0.2])
+
+
+def test_what_was_noted_between_steps_returns_when_a_run_is_resumed(dataset, folder, steps):
+    steps(40, 90, 20)
+    loop = new_loop(dataset, CONFIG, folder)
+    for step in range(3):
+        loop.prepare(step)
+        loop.advance(step)
+    loop.recoveries = 2
+    assert loop.peak == {"hits": 90}
+    path = loop.save()
+    resumed = resumed_loop(dataset, CONFIG, folder)
+    assert resumed.peak == {"hits": 90}
+    assert resumed.recoveries == 2
+    assert resumed.planned_for == loop.planned_for
+    assert resumed.pipeline.capacities == loop.pipeline.capacities
+    assert resumed.last_checkpoint == path
+    assert (resumed.step, resumed.stage) == (3, CONFIG.stages[0])

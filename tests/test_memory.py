@@ -1,0 +1,158 @@
+"""What cannot fit into the memory is refused before it is spent, with the setting that asks."""
+
+import jax
+import numpy as np
+import pytest
+from support import sphere_dataset, tiny_config
+
+from geosplat_jax.fit.memory import (
+    require_rendering_memory,
+    require_training_memory,
+    training_needs,
+)
+from geosplat_jax.fit.planning import TrainingError
+from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.stages import initial_params
+from geosplat_jax.fit.step import initial_state
+from geosplat_jax.fit.train import fit
+from geosplat_jax.io import memory
+from geosplat_jax.io.frames import AngleLens, Frame, Listing
+from geosplat_jax.io.images import SceneError, read_image, write_png
+from geosplat_jax.io.memory import Need, memory_of_machine, memory_refusal
+from geosplat_jax.io.views import load_views
+from geosplat_jax.surface.hull import fit_grid
+from geosplat_jax.transport.environment import LightSpec, operator_bytes, prefilter_operators
+
+GIGA = 10**9
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """Set the memory of the machine, GB."""
+
+    def set_to(gigabytes):
+        count = None if gigabytes is None else int(gigabytes * GIGA)
+        monkeypatch.setattr(memory, "memory_of_machine", lambda: count)
+
+    set_to(16)
+    return set_to
+
+
+def byte_count(tree):
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+
+
+def test_the_machine_has_memory():
+    known = memory_of_machine()
+    assert known is None or known > 10**8
+
+
+def test_the_limit_of_a_container_counts_where_it_is_the_smaller_one(tmp_path, monkeypatch):
+    limited, unlimited = tmp_path / "limited", tmp_path / "unlimited"
+    limited.write_text("1000000\n")
+    unlimited.write_text("max\n")
+    monkeypatch.setattr(memory, "_CONTAINER_LIMITS", (unlimited, tmp_path / "missing"))
+    whole = memory_of_machine()
+    if whole is None:
+        pytest.skip("this system does not tell how much memory it has")
+    assert whole > 10**8
+    monkeypatch.setattr(memory, "_CONTAINER_LIMITS", (unlimited, limited))
+    assert memory_of_machine() == 1_000_000
+
+
+def test_a_refusal_names_the_largest_needs_first(machine):
+    needs = [Need("small", GIGA), Need("large", 12 * GIGA), Need("middle", 4 * GIGA)]
+    assert memory_refusal(needs) == (
+        "at least 17.0 GB of memory would be needed, and there are 16.0 GB: large 12.0 GB, "
+        "middle 4.0 GB, small 1.0 GB"
+    )
+    assert memory_refusal(needs[1:]) is None
+    machine(None)
+    assert memory_refusal(needs) is None
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        (("material.grid.log2_entries=30", "material.grid.finest=4096"), "material.grid"),
+        (("geometry.resolution=512",), "geometry"),
+        (("geometry.resolution=400", "geometry.cubic=true"), "geometry"),
+        (("light.width=8192", "light.height=4096"), "light"),
+        (("objective.smoothness_samples=1000000000",), "objective.smoothness_samples"),
+    ],
+)
+def test_settings_that_cannot_fit_are_refused_by_their_names(machine, overrides, named):
+    config, dataset = make_config(overrides=overrides), sphere_dataset(size=4)
+    with pytest.raises(TrainingError, match=r"\d GB of memory would be needed, and") as caught:
+        require_training_memory(config, dataset)
+    assert f"there are 16.0 GB: {named} " in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_training_that_cannot_fit_makes_no_folder(machine, tmp_path):
+    machine(0.0001)
+    with pytest.raises(TrainingError, match="change the first of these"):
+        fit(sphere_dataset(size=4), tiny_config(), tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("preset", ["default", "paper", "code"])
+@pytest.mark.parametrize("quality", ["standard", "high"])
+def test_every_preset_fits_into_eight_gigabytes_as_far_as_is_known(machine, preset, quality):
+    machine(8)
+    require_training_memory(make_config(preset, quality), sphere_dataset(size=4))
+
+
+def test_what_is_counted_is_what_a_training_makes():
+    dataset = sphere_dataset(size=12)
+    config = tiny_config("stages.split_sum.batch_views=2", "geometry.resolution=9")
+    counted = {need.what: need.byte_count for need in training_needs(config, dataset)}
+    surface, shape = config.geometry.start(dataset, jax.random.key(0))
+    params = initial_params(shape, config, jax.random.key(0))
+    state = initial_state(params)
+    # Beside the parameters and both moments stands a gradient; exposure and counters are scalars.
+    learned = byte_count((state.params, state.optimizer)) + byte_count(params)
+    operators = 2 * operator_bytes(config.light)
+    parts = ("geometry", "light", "material.grid", "material.*_hidden")
+    assert sum(counted[part] for part in parts) - operators == pytest.approx(learned, abs=64)
+    assert counted["geometry"] == 4 * byte_count(params.geometry)
+    assert counted["material.grid"] >= 4 * byte_count(params.material.albedo_table)
+    assert counted["the photographs (--downscale)"] == 2 * dataset.train.images.nbytes
+    assert counted["stages.*.batch_views"] == 2 * 12 * 12 * 16
+    grid = fit_grid(dataset.bounds, 9)
+    assert surface.grid.shape == grid.shape
+
+
+def test_the_operators_of_the_light_are_counted_as_they_are_made():
+    spec = LightSpec(height=6, width=10, roughness=(0.0, 0.3, 1.0))
+    assert operator_bytes(spec) == np.asarray(prefilter_operators(spec).zonal).nbytes
+
+
+def test_a_checkpoint_of_large_settings_is_refused_by_its_file(machine):
+    config = make_config(overrides=("light.width=8192", "light.height=4096"))
+    with pytest.raises(TrainingError, match=r"^run/checkpoint\.npz: at least .*: light "):
+        require_rendering_memory(config, {}, "run/checkpoint.npz")
+    require_rendering_memory(make_config("paper"), {"hits": 10**6}, "run/checkpoint.npz")
+    machine(4)
+    with pytest.raises(TrainingError, match=r"^run/checkpoint\.npz: .* capacities\.hits 8\.0 GB"):
+        require_rendering_memory(make_config(), {"hits": 2 * GIGA}, "run/checkpoint.npz")
+
+
+def test_a_picture_larger_than_the_memory_is_refused_by_its_header(machine, tmp_path):
+    path = tmp_path / "bomb.png"
+    write_png(path, np.ones((400, 500, 4), np.float32))
+    machine(0.009)
+    with pytest.raises(SceneError, match=r"memory .*: .*bomb\.png of 500 x 400 pixels 0\.0 GB"):
+        read_image(path)
+    machine(0.010)
+    assert read_image(path).shape == (400, 500, 4)
+
+
+def test_many_pictures_are_refused_after_the_first(machine, tmp_path):
+    path = tmp_path / "one.png"
+    write_png(path, np.ones((40, 50, 4), np.float32))
+    frames = [Frame(f"view_{k}", np.eye(4), AngleLens(1.0), path) for k in range(200)]
+    machine(0.005)
+    with pytest.raises(SceneError, match=r"200 images like .*one\.png 0\.0 GB.*--downscale"):
+        load_views(frames, factor=1, listing=Listing(tuple(frames), ()))
+    load_views(frames, factor=2, listing=Listing(tuple(frames), ()))
