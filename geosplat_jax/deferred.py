@@ -20,7 +20,7 @@ from geosplat_jax.core.types import Camera, Materials, SurfacePoints
 from geosplat_jax.materials import Attributes
 from geosplat_jax.rays.base import RayIndex
 from geosplat_jax.render import AOV_CHANNELS, Asset, RenderPipeline, ShadingDomain
-from geosplat_jax.splats.rasterize import TileLists, gather_visible
+from geosplat_jax.splats.rasterize import TileLists
 from geosplat_jax.transport.base import Illumination, Transport
 
 _THINNEST = 1e-6
@@ -104,11 +104,7 @@ class PerPixel(ShadingDomain, kind="per_pixel"):
         self, pipeline: RenderPipeline, asset: Asset, lists: TileLists, camera: Camera
     ) -> tuple[dict[str, Float[Array, "H W c"]], Float[Array, "H W"]]:
         """Rasterise the attributes, premultiplied (Eq. 21)."""
-
-        def seen(values: Float[Array, "N ..."], padding: float = 0.0) -> Float[Array, "M ..."]:
-            return gather_visible(lists.index, values, padding=padding)
-
-        splats = asset.splats
+        splats, seen = asset.splats, lists.gather
         attributes = jax.tree.map(seen, asset.attributes)
         materials = attributes.materials
         footprints = pipeline.project(

@@ -35,7 +35,6 @@ from geosplat_jax.splats.rasterize import (
     TileLists,
     composite,
     find_visible,
-    gather_visible,
 )
 from geosplat_jax.surface.base import Surface, SurfaceModel
 from geosplat_jax.transport.base import Illumination, Transport
@@ -196,17 +195,13 @@ class PerSplat(ShadingDomain, kind="per_splat"):
         names: tuple[str, ...],
     ) -> tuple[dict[str, Float[Array, "H W c"]], Float[Array, "H W"]]:
         """Shade the visible splats towards the camera, then blend colours and attributes."""
-
-        def seen(values: Float[Array, "N ..."], padding: float = 0.0) -> Float[Array, "M ..."]:
-            return gather_visible(lists.index, values, padding=padding)
-
-        splats = asset.splats
+        splats, seen = asset.splats, lists.gather
         means, normals = seen(splats.means), seen(splats.normals)
         attributes = jax.tree.map(seen, asset.attributes)
         materials = attributes.materials
         shaded = pipeline.transport.shade(
             key,
-            jax.tree.map(lambda x: gather_visible(lists.index, x), splats.points()),
+            jax.tree.map(seen, splats.points()),
             attributes,
             safe_normalize(camera.centers - means),
             illumination.take(lists.index),

@@ -8,7 +8,6 @@ import argparse
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +59,7 @@ from geosplat_jax.materials import (
 from geosplat_jax.pipeline import LossReport, Pipeline
 from geosplat_jax.render import Params
 from geosplat_jax.run import Run
-from geosplat_jax.splats.rasterize import TileLists, composite, gather_visible
+from geosplat_jax.splats.rasterize import TileLists, composite
 from geosplat_jax.surface.grids import sdf_entropy
 from geosplat_jax.transport.environment import prefilter
 from geosplat_jax.transport.split_sum import SplitSum, split_sum
@@ -281,7 +280,7 @@ def chain(
     moved = shift_inwards(splats, mesh, shift)
     if lists is None:
         lists = pipeline.visible(moved, camera)
-    seen = partial(gather_visible, lists.index)
+    seen = lists.gather
     light = EnvLight(store("light texels", params.light.radiance))
     light = prefilter(light, pipeline.transport.operators)
     light = replace(light, specular=store("prefiltered light", light.specular))

@@ -44,7 +44,7 @@ from geosplat_jax.render import RasterSettings
 from geosplat_jax.report.consistency import resized, see_mesh
 from geosplat_jax.splats.composite import composite_tiles_forward
 from geosplat_jax.splats.projection import project
-from geosplat_jax.splats.rasterize import composite, find_visible, gather_visible
+from geosplat_jax.splats.rasterize import composite, find_visible
 
 DISTANCE_UNIT, KNEE = 0.002, 3.0
 MARGIN = 8
@@ -210,13 +210,11 @@ def rendered(
         **frame,
     )
 
-    def seen(values: Array, padding: float = 0.0) -> Array:
-        return gather_visible(lists.index, values, padding=padding)
-
+    seen = lists.gather
     means = seen(splats.means)
     ranges = safe_norm(means - camera.centers, keepdims=True)
     image, alpha = composite(
-        project(means, seen(splats.quats), seen(splats.scales, 1.0), **lens),
+        project(means, seen(splats.quats), seen(splats.scales, padding=1.0), **lens),
         seen(splats.opacities),
         jnp.concatenate([seen(splats.normals), ranges], axis=-1),
         lists,

@@ -3,7 +3,7 @@
 One view at a time; loop or scan over views. The pieces let a renderer shade only what a view sees::
 
     lists = find_visible(project(...), opacities, is_eligible, ...)   # no gradients
-    visible = gather_visible(lists.index, means, ...)                 # rows in depth order
+    visible = lists.gather(means), ...                                # rows in depth order
     splats = project(...)                                             # of the visible rows
     image, alpha = composite(splats, opacities, features, lists, ...)
 
@@ -169,9 +169,9 @@ def rasterize(
         all_splats, opacities, is_eligible, tile_size=tile_size, capacities=capacities, **frame
     )
     splats = project(
-        gather_visible(lists.index, means),
-        gather_visible(lists.index, quats),
-        gather_visible(lists.index, scales, padding=1.0),
+        lists.gather(means),
+        lists.gather(quats),
+        lists.gather(scales, padding=1.0),
         world_to_camera=world_to_camera,
         intrinsics=intrinsics,
         near=near,
@@ -179,8 +179,8 @@ def rasterize(
     )
     image, alpha = composite(
         splats,
-        gather_visible(lists.index, opacities),
-        gather_visible(lists.index, features),
+        lists.gather(opacities),
+        lists.gather(features),
         lists,
         tile_size=tile_size,
         **frame,
