@@ -16,8 +16,9 @@ from geosplat_jax.fit.stages import initial_params
 from geosplat_jax.fit.step import initial_state
 from geosplat_jax.fit.train import fit
 from geosplat_jax.io import memory
-from geosplat_jax.io.frames import AngleLens, Frame, Listing
+from geosplat_jax.io.frames import Frame, Listing
 from geosplat_jax.io.images import SceneError, read_image, write_png
+from geosplat_jax.io.lenses import AngleLens
 from geosplat_jax.io.memory import Need, memory_of_machine, memory_refusal
 from geosplat_jax.io.views import load_views
 from geosplat_jax.surface.hull import fit_grid
