@@ -26,6 +26,7 @@ from shapes import shape
 from geosplat_jax.adapter import (
     SPLATS_PER_FACE,
     AdapterConstants,
+    DiscSplats,
     FaceSplats,
     VertexSplats,
     face_splats,
@@ -33,7 +34,6 @@ from geosplat_jax.adapter import (
 )
 from geosplat_jax.core.mesh import face_normals_and_areas, vertex_normals
 from geosplat_jax.core.numerics import safe_normalize
-from geosplat_jax.core.rotation import frame_from_normal, matrix_to_quaternion
 from geosplat_jax.core.types import Box, Camera, Mesh, Splats
 from geosplat_jax.fit.runtime import enable_compilation_cache
 from geosplat_jax.fit.trained import Trained
@@ -72,22 +72,6 @@ SHIFT = 0.3
 
 SAMPLES = 4
 """Of the mesh's normals along each side of a pixel, where they are filtered."""
-
-
-@dataclass(frozen=True)
-class AlignedAlongNormal(FaceSplats):
-    """Flat discs on the faces' planes: aligned along the normal, the tangent plane left alone."""
-
-    def place(self, surface: Surface, parameters: Any, box: Box) -> Splats:
-        """Give the six splats of a face round footprints of the same area."""
-        splats = super().place(surface, parameters, box)
-        radius = jnp.sqrt(splats.scales[:, 0] * splats.scales[:, 1])
-        flat = jnp.stack([radius, radius, splats.scales[:, 2]], axis=-1)
-        tangent, bitangent = frame_from_normal(splats.outward)
-        frame = jnp.stack([tangent, bitangent, splats.outward], axis=-1)
-        real = splats.mask[:, None]
-        quats = jnp.where(real, matrix_to_quaternion(frame), splats.quats)
-        return replace(splats, scales=jnp.where(real, flat, splats.scales), quats=quats)
 
 
 @dataclass(frozen=True)
@@ -153,7 +137,7 @@ class Subject(NamedTuple):
             "faces (Eq. 8-11)": FaceSplats(constants),
             "faces, R_z = n": FaceSplats(replace(constants, shading_frame=True)),
             "faces, opacity 1": FaceSplats(replace(constants, opacity=1.0)),
-            "aligned along the normal only": AlignedAlongNormal(constants),
+            "aligned along the normal only": DiscSplats(constants),
             "one isotropic splat per face": OneBall(constants),
             "vertices (Eq. 12)": VertexSplats(constants),
         }
