@@ -6,7 +6,7 @@ import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
@@ -34,6 +34,7 @@ from geosplat_jax.gradcheck.report import (
 from geosplat_jax.io.checkpoints import CheckpointError
 from geosplat_jax.io.dataset import describe, load_recorded
 from geosplat_jax.io.images import SceneError
+from geosplat_jax.io.poses import PoseSettings, find_poses
 from geosplat_jax.materials import MATERIAL_PRIORS
 from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.relight import BACKGROUNDS, RelightOptions
@@ -72,6 +73,8 @@ def _parser() -> argparse.ArgumentParser:
 
     info = commands.add_parser("info", help="say what was recognised in a scene folder")
     _add_scene_arguments(info)
+
+    _add_poses(commands.add_parser("poses", help="find the cameras of a folder of photographs"))
 
     train = commands.add_parser("train", help="reconstruct a scene")
     _add_scene_arguments(train)
@@ -143,6 +146,32 @@ def _run_parser(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
     parser.add_argument("run", type=Path)
     parser.add_argument("--scene", type=Path, help="where the run's scene is now, if it has moved")
     return parser
+
+
+def _add_poses(poses: argparse.ArgumentParser) -> None:
+    """Describe the poses command."""
+    standard = PoseSettings()
+    poses.add_argument("folder", type=Path, help="photographs, in FOLDER/images or FOLDER")
+    poses.add_argument("--force", action="store_true", help="replace the cameras in FOLDER")
+    poses.add_argument(
+        "--size",
+        type=int,
+        default=standard.size,
+        help="pixels of the longer side that details are looked for in (default: %(default)s)",
+    )
+    poses.add_argument(
+        "--order",
+        choices=get_args(PoseSettings.__annotations__["order"]),
+        default=standard.order,
+        help="sequence: compare those that follow each other by name (default: every two)",
+    )
+    poses.add_argument(
+        "--lens",
+        choices=get_args(PoseSettings.__annotations__["lens"]),
+        default=standard.lens,
+        help="one for all photographs, or one for each (default: %(default)s)",
+    )
+    poses.add_argument("--seed", type=int, default=standard.seed, help="of random searches")
 
 
 def _add_samples(parser: argparse.ArgumentParser) -> None:
@@ -227,6 +256,43 @@ def _scene_options(arguments: argparse.Namespace) -> dict[str, Any]:
 def _info(arguments: argparse.Namespace) -> None:
     """Print what was recognised."""
     print(describe(load_recorded(arguments.scene, _scene_options(arguments))))
+
+
+def _poses(arguments: argparse.Namespace) -> None:
+    """Find the cameras of photographs, with progress on the terminal, and say how well they fit."""
+    if arguments.size < 1 or arguments.seed < 0:
+        raise UsageError("--size must be at least 1, and --seed must not be negative")
+    settings = PoseSettings(
+        size=arguments.size, order=arguments.order, lens=arguments.lens, seed=arguments.seed
+    )
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        console=_console,
+        disable=not _console.is_terminal,
+    )
+    tasks = {}
+
+    def show(part: str, done: int, total: int) -> None:
+        if part not in tasks:
+            tasks[part] = bar.add_task(part, total=total)
+            if bar.disable:
+                _say(f"{part} ...")
+        bar.update(tasks[part], completed=done)
+
+    with bar:
+        report = find_poses(arguments.folder, settings, force=arguments.force, on_progress=show)
+    total = report.registered + len(report.missing)
+    print(f"cameras: {report.registered} of {total} photographs ({report.registered / total:.0%})")
+    if report.missing:
+        print(f"without a camera, hence left out: {', '.join(report.missing)}")
+    print(f"reprojection error: {report.error:.2f} pixels, {report.points} points")
+    print("time: " + ", ".join(f"{part} {s:.0f} s" for part, s in report.seconds.items()))
+    print(f"model: {report.model}")
+    print(
+        f"next: masks of the object (docs/captures.md), then geosplat-jax train {arguments.folder}"
+    )
 
 
 def _config_from(arguments: argparse.Namespace) -> Config:
@@ -464,6 +530,7 @@ def _gradcheck(arguments: argparse.Namespace) -> None:
 
 _COMMANDS = {
     "info": _info,
+    "poses": _poses,
     "train": _train,
     "settings": _settings,
     "evaluate": _evaluate,

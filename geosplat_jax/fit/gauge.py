@@ -8,7 +8,7 @@ Everything here runs on the host in float64.
 """
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float

@@ -95,18 +95,18 @@ def up_direction(
     right, up : unit x and y axes of the cameras.
     """
     mean = up.mean(axis=0)
-    weights = np.ones(len(right))
-    for _ in range(_REWEIGHTINGS):
-        moments, directions = np.linalg.eigh((right * weights[:, None]).T @ right / weights.sum())
-        if moments[1] < _SMALLEST_TURN:
-            return _perpendicular(mean, directions[:, 2])
-        weights = 1.0 / np.maximum(np.abs(right @ directions[:, 0]), _SMALLEST_TILT)
+    moments, directions = np.linalg.eigh(right.T @ right / len(right))
+    if moments[1] < _SMALLEST_TURN:
+        return _perpendicular(mean, directions[:, 2])
     found = directions[:, 0]
+    for _ in range(_REWEIGHTINGS):
+        weights = 1.0 / np.maximum(np.abs(right @ found), _SMALLEST_TILT)
+        found = np.linalg.eigh((right * weights[:, None]).T @ right)[1][:, 0]
     return found if found @ mean >= 0.0 else -found
 
 
 def _perpendicular(vector: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Unit vector along what of ``vector`` is at right angles to ``normal``."""
+    """Return the part of ``vector`` at right angles to ``normal``, of length one."""
     across = vector - normal * (normal @ vector)
     length = np.linalg.norm(across)
     if length < 1e-6:

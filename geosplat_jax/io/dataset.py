@@ -224,7 +224,8 @@ def recognise_layout(root: Path) -> str:
         f"{root} has no known layout; expected transforms_train.json (NeRF-synthetic, Shiny "
         "Blender, Synthetic4Relight, Stanford-ORB), folders train_000, test_000, ... (TensoIR), "
         "transforms.json (nerfstudio, instant-ngp, nvdiffrec), sparse/0 (COLMAP), cameras*.npz "
-        "(IDR, NeuS) or cams/00000000_cam.txt (BlendedMVS)"
+        "(IDR, NeuS) or cams/00000000_cam.txt (BlendedMVS); geosplat-jax poses finds the cameras "
+        "of photographs"
     )
 
 
