@@ -3,23 +3,12 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support import level_poses
 
 from geosplat_jax.io.alignment import AlignmentError, Similarity, align_world, up_direction
 
 # Of float64 geometry, after some linear algebra.
 EXACT = 1e-9
-
-
-def looking_at(centers, target=(0.0, 0.0, 0.0)):
-    """Level cameras (V, 4, 4) with OpenGL axes, z up."""
-    poses = np.tile(np.eye(4), (len(centers), 1, 1))
-    for pose, center in zip(poses, centers, strict=True):
-        back = (center - np.asarray(target)) / np.linalg.norm(center - np.asarray(target))
-        right = np.cross([0.0, 0.0, 1.0], back)
-        right /= np.linalg.norm(right)
-        pose[:3, :3] = np.stack([right, np.cross(back, right), back], -1)
-        pose[:3, 3] = center
-    return poses
 
 
 def ring(count=12, *, heights=(0.3, 0.8), radius=1.0, turn=2 * np.pi):
@@ -44,7 +33,7 @@ POINTS = np.random.default_rng(0).normal(size=(200, 3)) * 0.1
 
 
 def test_the_world_is_found_again_from_any_other():
-    poses = looking_at(ring())
+    poses = level_poses(ring())
     found = align_world(moved(poses, ANYWHERE), ANYWHERE.points(POINTS))
     # The ring is at distance one around the origin, and its first camera looks towards y.
     np.testing.assert_allclose(found.points(ANYWHERE.points(POINTS)), POINTS, atol=EXACT)
@@ -55,13 +44,13 @@ def test_the_world_is_found_again_from_any_other():
 def test_one_is_the_median_distance_and_the_target_the_origin():
     centers = ring(radius=3.0) + [1.0, 2.0, 3.0]
     centers[0] = (centers[0] - [1, 2, 3]) * 20 + [1, 2, 3]
-    found = align_world(looking_at(centers, (1.0, 2.0, 3.0)), POINTS + [1.0, 2.0, 3.0])
+    found = align_world(level_poses(centers, (1.0, 2.0, 3.0)), POINTS + [1.0, 2.0, 3.0])
     assert np.median(np.linalg.norm(found.points(centers), axis=1)) == pytest.approx(1.0)
     np.testing.assert_allclose(found.points(np.array([[1.0, 2.0, 3.0]])), 0.0, atol=EXACT)
 
 
 def test_cameras_on_their_side_have_no_say():
-    poses = looking_at(ring(20))
+    poses = level_poses(ring(20))
     sideways = Rotation.from_euler("z", 90, degrees=True).as_matrix()
     poses[[3, 8, 13, 18], :3, :3] = poses[[3, 8, 13, 18], :3, :3] @ sideways
     up = up_direction(poses[:, :3, 0], poses[:, :3, 1])
@@ -70,7 +59,7 @@ def test_cameras_on_their_side_have_no_say():
 
 def test_shaken_hands_tilt_the_world_little():
     rng = np.random.default_rng(1)
-    poses = looking_at(ring(40, turn=np.pi))
+    poses = level_poses(ring(40, turn=np.pi))
     for pose in poses:
         roll = Rotation.from_euler("z", rng.normal(scale=4.0), degrees=True).as_matrix()
         pose[:3, :3] = pose[:3, :3] @ roll
@@ -82,13 +71,13 @@ def test_shaken_hands_tilt_the_world_little():
 
 
 def test_cameras_that_did_not_turn_say_what_is_up_by_their_y_axes():
-    poses = looking_at(np.array([[0, -1.0, 0.0], [0, -1.0, 0.2], [0.02, -1.0, 0.1]]))
+    poses = level_poses(np.array([[0, -1.0, 0.0], [0, -1.0, 0.2], [0.02, -1.0, 0.1]]))
     up = up_direction(poses[:, :3, 0], poses[:, :3, 1])
     assert np.degrees(np.arccos(up[2])) < 8.0
 
 
 def test_cameras_below_the_object_keep_up_above():
-    poses = looking_at(ring(heights=(-0.7, -0.4)))
+    poses = level_poses(ring(heights=(-0.7, -0.4)))
     found = align_world(poses, POINTS)
     np.testing.assert_allclose(found.rotation[2], [0, 0, 1], atol=EXACT)
 
@@ -102,15 +91,15 @@ def test_cameras_below_the_object_keep_up_above():
 )
 def test_cameras_that_say_too_little_are_refused(centers, message):
     with pytest.raises(AlignmentError, match=message):
-        align_world(looking_at(centers), POINTS)
+        align_world(level_poses(centers), POINTS)
 
 
 def test_cameras_that_look_elsewhere_are_refused():
-    poses = looking_at(ring())
+    poses = level_poses(ring())
     poses[:, :3, :3] = poses[0, :3, :3]
     with pytest.raises(AlignmentError, match="look the same way"):
         align_world(poses, POINTS)
-    outwards = looking_at(ring())
+    outwards = level_poses(ring())
     outwards[:, :3, [0, 2]] *= -1
     with pytest.raises(AlignmentError, match="12 of 12 photographs look away"):
         align_world(outwards, POINTS)

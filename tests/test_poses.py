@@ -5,13 +5,14 @@ import sys
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
+from support import level_poses
+from test_alignment import moved
 
 from geosplat_jax import cli
 from geosplat_jax.io.alignment import align_world
 from geosplat_jax.io.dataset import load_dataset
 from geosplat_jax.io.images import MissingFileError, SceneError, write_png
 from geosplat_jax.io.poses import PoseError, _Matches, _pairs, _upright, find_poses
-from test_alignment import looking_at, moved
 
 HEIGHT, WIDTH, FOCAL = 150, 200, 190.0
 # Cameras from some thousand details that are found to a third of a pixel.
@@ -29,7 +30,7 @@ def cameras():
     """Level cameras on a quarter of a ring, at two heights."""
     angle = np.linspace(-2.2, -0.9, COUNT)
     height = np.resize([0.9, 1.3], COUNT)
-    return looking_at(np.stack([2 * np.cos(angle), 2 * np.sin(angle), height], -1), (0, 0, 0.2))
+    return level_poses(np.stack([2 * np.cos(angle), 2 * np.sin(angle), height], -1), (0, 0, 0.2))
 
 
 def photograph(pose, texture):
@@ -131,7 +132,7 @@ def test_advice_names_the_cause(features, pairs, message):
 
 
 def test_photographs_stored_on_their_side_are_turned_up():
-    pose = looking_at(np.array([[0.0, -1.0, 0.0]]))[0]
+    pose = level_poses(np.array([[0.0, -1.0, 0.0]]))[0]
     # Orientation 6: the left column of the pixels is the top; 8: the right one is.
     for orientation, axis, sign in ((1, 1, 1), (3, 1, -1), (6, 0, -1), (8, 0, 1)):
         stored = _upright(pose, orientation)
