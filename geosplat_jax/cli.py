@@ -32,7 +32,7 @@ from geosplat_jax.gradcheck.report import (
     to_records,
 )
 from geosplat_jax.io.checkpoints import CheckpointError
-from geosplat_jax.io.dataset import describe, load_recorded
+from geosplat_jax.io.dataset import choose_downscale, describe, load_recorded
 from geosplat_jax.io.images import SceneError
 from geosplat_jax.io.poses import PoseSettings, find_poses
 from geosplat_jax.materials import MATERIAL_PRIORS
@@ -229,7 +229,13 @@ def _add_relight(relight: argparse.ArgumentParser) -> None:
 def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what tells how to read a scene."""
     parser.add_argument("scene", type=Path, help="scene folder")
-    parser.add_argument("--downscale", type=int, default=1, help="reduce the images by this factor")
+    parser.add_argument(
+        "--downscale",
+        type=_downscale,
+        default=1,
+        metavar="N",
+        help="reduce the images by this factor; auto: by what the grid's cells can resolve",
+    )
     parser.add_argument("--light", help="training light, where a scene has several")
     parser.add_argument(
         "--bounds",
@@ -243,19 +249,34 @@ def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _scene_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return what `load_dataset` needs, in a form that JSON keeps."""
-    return {
-        "downscale": arguments.downscale,
+def _downscale(text: str) -> int | str:
+    """Read a factor, or ``auto``."""
+    return text if text == "auto" else int(text)
+
+
+def _scene_options(arguments: argparse.Namespace, config: Config) -> dict[str, Any]:
+    """Return what `load_recorded` needs, in a form that JSON keeps; say what was chosen."""
+    options = {
         "light": arguments.light,
         "bounds": arguments.bounds,
         "cameras": arguments.cameras,
     }
+    if arguments.downscale != "auto":
+        return {**options, "downscale": arguments.downscale}
+    cells = getattr(config.geometry, "resolution", None)
+    if cells is None:
+        raise UsageError("--downscale auto needs a surface of cells; give a number")
+    corners = arguments.bounds
+    reading = {**options, "bounds": None if corners is None else (corners[:3], corners[3:])}
+    chosen = choose_downscale(arguments.scene, cells, **reading)
+    _say(chosen.reason)
+    return {**options, "downscale": chosen.factor}
 
 
 def _info(arguments: argparse.Namespace) -> None:
     """Print what was recognised."""
-    print(describe(load_recorded(arguments.scene, _scene_options(arguments))))
+    options = _scene_options(arguments, make_config())
+    print(describe(load_recorded(arguments.scene, options)))
 
 
 def _poses(arguments: argparse.Namespace) -> None:
@@ -314,7 +335,7 @@ def _train(arguments: argparse.Namespace) -> None:
         raise UsageError("--from RUN and --stage NAME belong together")
     config = _config_from(arguments)
     folder = arguments.output or Path("runs") / arguments.scene.resolve().name
-    dataset = load_recorded(arguments.scene, _scene_options(arguments))
+    dataset = load_recorded(arguments.scene, _scene_options(arguments, config))
     for note in dataset.notes:
         _say(note)
     for warning in (*dataset.warnings, *config_warnings(config)):
