@@ -7,7 +7,7 @@ import sys
 import warnings
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
@@ -34,9 +34,10 @@ from geosplat_jax.gradcheck.report import (
 )
 from geosplat_jax.io.agreement import agreement_lines
 from geosplat_jax.io.checkpoints import CheckpointError
-from geosplat_jax.io.dataset import describe, load_recorded
+from geosplat_jax.io.dataset import choose_downscale, describe, load_recorded
 from geosplat_jax.io.export import LARGEST_TEXTURE
 from geosplat_jax.io.images import SceneError
+from geosplat_jax.io.poses import PoseSettings, find_poses
 from geosplat_jax.materials import MATERIAL_PRIORS
 from geosplat_jax.report.consistency import (
     DEFAULT_SIZE,
@@ -92,6 +93,8 @@ def _parser() -> argparse.ArgumentParser:
 
     info = commands.add_parser("info", help="say what was recognised in a scene folder")
     _add_scene_arguments(info)
+
+    _add_poses(commands.add_parser("poses", help="find the cameras of a folder of photographs"))
 
     train = commands.add_parser("train", help="reconstruct a scene")
     _add_scene_arguments(train)
@@ -179,6 +182,32 @@ def _run_parser(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
     return parser
 
 
+def _add_poses(poses: argparse.ArgumentParser) -> None:
+    """Describe the poses command."""
+    standard = PoseSettings()
+    poses.add_argument("folder", type=Path, help="photographs, in FOLDER/images or FOLDER")
+    poses.add_argument("--force", action="store_true", help="replace the cameras in FOLDER")
+    poses.add_argument(
+        "--size",
+        type=int,
+        default=standard.size,
+        help="pixels of the longer side that details are looked for in (default: %(default)s)",
+    )
+    poses.add_argument(
+        "--order",
+        choices=get_args(PoseSettings.__annotations__["order"]),
+        default=standard.order,
+        help="sequence: compare those that follow each other by name (default: every two)",
+    )
+    poses.add_argument(
+        "--lens",
+        choices=get_args(PoseSettings.__annotations__["lens"]),
+        default=standard.lens,
+        help="one for all photographs, or one for each (default: %(default)s)",
+    )
+    poses.add_argument("--seed", type=int, default=standard.seed, help="of random searches")
+
+
 def _add_samples(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--samples", type=int, default=DEFAULT_SAMPLES, help="rays per splat (default: %(default)s)"
@@ -234,7 +263,13 @@ def _add_relight(relight: argparse.ArgumentParser) -> None:
 def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what tells how to read a scene."""
     parser.add_argument("scene", type=Path, help="scene folder")
-    parser.add_argument("--downscale", type=int, default=1, help="reduce the images by this factor")
+    parser.add_argument(
+        "--downscale",
+        type=_downscale,
+        default=1,
+        metavar="N",
+        help="reduce the images by this factor; auto: by what the grid's cells can resolve",
+    )
     parser.add_argument("--light", help="training light, where a scene has several")
     parser.add_argument(
         "--bounds",
@@ -248,22 +283,73 @@ def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _scene_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return what `load_dataset` needs, in a form that JSON keeps."""
-    return {
-        "downscale": arguments.downscale,
+def _downscale(text: str) -> int | str:
+    """Read a factor, or ``auto``."""
+    return text if text == "auto" else int(text)
+
+
+def _scene_options(arguments: argparse.Namespace, config: Config) -> dict[str, Any]:
+    """Return what `load_recorded` needs, in a form that JSON keeps; say what was chosen."""
+    options = {
         "light": arguments.light,
         "bounds": arguments.bounds,
         "cameras": arguments.cameras,
     }
+    if arguments.downscale != "auto":
+        return {**options, "downscale": arguments.downscale}
+    cells = getattr(config.geometry, "resolution", None)
+    if cells is None:
+        raise UsageError("--downscale auto needs a surface of cells; give a number")
+    corners = arguments.bounds
+    reading = {**options, "bounds": None if corners is None else (corners[:3], corners[3:])}
+    chosen = choose_downscale(arguments.scene, cells, **reading)
+    _say(chosen.reason)
+    return {**options, "downscale": chosen.factor}
 
 
 def _info(arguments: argparse.Namespace) -> None:
     """Print what was recognised, and whether masks and cameras agree."""
-    dataset = load_recorded(arguments.scene, _scene_options(arguments))
+    dataset = load_recorded(arguments.scene, _scene_options(arguments, make_config()))
     print(describe(dataset))
     for line in agreement_lines(dataset.train, dataset.bounds):
         print(f"  {line}")
+
+
+def _poses(arguments: argparse.Namespace) -> None:
+    """Find the cameras of photographs, with progress on the terminal, and say how well they fit."""
+    if arguments.size < 1 or arguments.seed < 0:
+        raise UsageError("--size must be at least 1, and --seed must not be negative")
+    settings = PoseSettings(
+        size=arguments.size, order=arguments.order, lens=arguments.lens, seed=arguments.seed
+    )
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        console=_console,
+        disable=not _console.is_terminal,
+    )
+    tasks = {}
+
+    def show(part: str, done: int, total: int) -> None:
+        if part not in tasks:
+            tasks[part] = bar.add_task(part, total=total)
+            if bar.disable:
+                _say(f"{part} ...")
+        bar.update(tasks[part], completed=done)
+
+    with bar:
+        report = find_poses(arguments.folder, settings, force=arguments.force, on_progress=show)
+    total = report.registered + len(report.missing)
+    print(f"cameras: {report.registered} of {total} photographs ({report.registered / total:.0%})")
+    if report.missing:
+        print(f"without a camera, hence left out: {', '.join(report.missing)}")
+    print(f"reprojection error: {report.error:.2f} pixels, {report.points} points")
+    print("time: " + ", ".join(f"{part} {s:.0f} s" for part, s in report.seconds.items()))
+    print(f"model: {report.model}")
+    print(
+        f"next: masks of the object (docs/captures.md), then geosplat-jax train {arguments.folder}"
+    )
 
 
 def _config_from(arguments: argparse.Namespace) -> Config:
@@ -285,7 +371,7 @@ def _train(arguments: argparse.Namespace) -> None:
         raise UsageError("--from RUN and --stage NAME belong together")
     config = _config_from(arguments)
     folder = arguments.output or Path("runs") / arguments.scene.resolve().name
-    dataset = load_recorded(arguments.scene, _scene_options(arguments))
+    dataset = load_recorded(arguments.scene, _scene_options(arguments, config))
     for note in dataset.notes:
         _say(note)
     for warning in (*dataset.warnings, *config_warnings(config)):
@@ -537,6 +623,7 @@ def _gradcheck(arguments: argparse.Namespace) -> None:
 
 _COMMANDS = {
     "info": _info,
+    "poses": _poses,
     "train": _train,
     "settings": _settings,
     "evaluate": _evaluate,

@@ -43,21 +43,25 @@ def shared_path(*parts):
     return path
 
 
-def look_at_poses(count, *, distance=3.0):
-    """Camera-to-world matrices (Blender axes) spread over a sphere, looking at the origin."""
-    poses = []
-    for k in range(count):
-        height = 1 - 2 * (k + 0.5) / count
-        angle = k * np.pi * (3 - 5**0.5)
-        ring = np.sqrt(1 - height**2)
-        back = np.array([ring * np.cos(angle), ring * np.sin(angle), height])
+def level_poses(centers, target=(0.0, 0.0, 0.0)):
+    """Camera-to-world matrices (Blender axes) at points, none above the target that they show."""
+    poses = np.tile(np.eye(4), (len(centers), 1, 1))
+    for pose, center in zip(poses, np.asarray(centers, float), strict=True):
+        back = center - np.asarray(target)
+        back /= np.linalg.norm(back)
         right = np.cross([0.0, 0.0, 1.0], back)
         right /= np.linalg.norm(right)
-        pose = np.eye(4)
         pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
-        pose[:3, 3] = distance * back
-        poses.append(pose)
-    return np.stack(poses)
+        pose[:3, 3] = center
+    return poses
+
+
+def look_at_poses(count, *, distance=3.0):
+    """Camera-to-world matrices (Blender axes) spread over a sphere, looking at the origin."""
+    height = 1 - 2 * (np.arange(count) + 0.5) / count
+    angle = np.arange(count) * np.pi * (3 - 5**0.5)
+    ring = np.sqrt(1 - height**2)
+    return level_poses(distance * np.stack([ring * np.cos(angle), ring * np.sin(angle), height], 1))
 
 
 def sphere_views(count=6, *, size=24, radius=0.5, field_of_view=0.6):
@@ -161,20 +165,12 @@ def ball(config, *, radius=0.4, stage=None):
 
 def views_from(eyes, *, size=16, field_of_view=0.5):
     """Black views from points of the world (none on the vertical axis) towards the origin."""
-    poses = []
-    for eye in np.asarray(eyes, float):
-        back = eye / np.linalg.norm(eye)
-        right = np.cross([0.0, 0.0, 1.0], back)
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
-        pose[:3, 3] = eye
-        poses.append(pose)
+    poses = level_poses(eyes)
     focal = 0.5 * size / np.tan(0.5 * field_of_view)
     intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
     return Views(
         names=tuple(f"view_{k}" for k in range(len(poses))),
-        camera_to_world=np.stack(poses),
+        camera_to_world=poses,
         intrinsics=np.repeat(intrinsics[None], len(poses), axis=0),
         images=np.zeros((len(poses), size, size, 4), np.float32),
     )

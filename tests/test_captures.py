@@ -11,8 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support import shared_path, tiny_config
 
+from geosplat_jax import cli
 from geosplat_jax.fit.train import fit
-from geosplat_jax.io.dataset import describe, load_dataset
+from geosplat_jax.io.dataset import choose_downscale, describe, load_dataset
 from geosplat_jax.io.images import MissingFileError, SceneError, write_exr, write_png
 from geosplat_jax.io.layouts.colmap import list_colmap
 from geosplat_jax.io.views import ViewLight
@@ -329,6 +330,34 @@ def test_half_the_size_is_the_same_capture(scenes):
     np.testing.assert_allclose(half.intrinsics * np.array([[2], [2], [1]]), full.intrinsics)
     assert half.images.shape == (8, 14, 12, 4)
     assert half.valid.sum() == full.valid.sum() / 4
+
+
+def test_images_are_reduced_to_half_a_cell(scenes):
+    root = scenes["idr"]
+    dataset = load_dataset(root)
+    lo, hi = dataset.bounds
+    middle = 0.5 * (lo + hi)
+    distance = np.linalg.norm(dataset.train.camera_to_world[:, :3, 3] - middle, axis=1)
+    pixel = np.median(distance / dataset.train.intrinsics[:, 0, 0])
+    longest = (hi - lo).max()
+    for cells in (1, 2, 3):
+        factor = choose_downscale(root, cells).factor
+        assert factor * pixel <= 0.5 * longest / cells < (factor + 1) * pixel
+        assert factor > 1
+    chosen = choose_downscale(root, 500)
+    assert chosen.factor == 1
+    assert "reduced by 1: a cell" in chosen.reason
+    # Half the box has half the cells for the same size.
+    half = (middle - 0.25 * (hi - lo), middle + 0.25 * (hi - lo))
+    assert choose_downscale(root, 1, bounds=half) == choose_downscale(root, 2)
+
+
+def test_the_size_that_was_chosen_is_said(scenes, capsys):
+    assert cli.main(["info", str(scenes["idr"]), "--downscale", "auto"]) == 0
+    said = capsys.readouterr()
+    assert "images are reduced by 1" in said.err
+    assert cli.main(["info", str(scenes["idr"]), "--downscale", "2"]) == 0
+    assert "reduced" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("masks", [None, "some"])

@@ -6,13 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.ndimage import minimum_filter
 
 from geosplat_jax.report import metrics, protocols
 from geosplat_jax.report.protocols import PROTOCOL, PROTOCOLS, protocol
 
 # Decibels of float32 images.
 DECIBELS = 2e-3
-GEOSPLATTING, TENSOIR, IRGS = (PROTOCOL[name] for name in PROTOCOLS)
+# Those that compare pictures; `orb` has its own figures.
+PICTURES = PROTOCOLS[:3]
+GEOSPLATTING, TENSOIR, IRGS = ROWS = tuple(PROTOCOL[name] for name in PICTURES)
+ORB = PROTOCOL["orb"]
 GAIN = np.array([0.5, 2.0, 1.25])
 # Compiled once a shape: eager, the many small operations take seconds.
 ssim, ssim_masked = jax.jit(metrics.ssim), jax.jit(metrics.ssim_masked)
@@ -56,9 +60,9 @@ def same(measured, others, **kwargs):
 
 
 def test_unknown_protocols_are_refused_by_name():
-    assert PROTOCOLS == ("geosplatting", "tensoir", "irgs")
+    assert PROTOCOLS == ("geosplatting", "tensoir", "irgs", "orb")
     assert [protocol(name).name for name in PROTOCOLS] == list(PROTOCOLS)
-    with pytest.raises(ValueError, match="'nerf'.*geosplatting, tensoir, irgs"):
+    with pytest.raises(ValueError, match="'nerf'.*geosplatting, tensoir, irgs, orb"):
         protocol("nerf")
     with pytest.raises(dataclasses.FrozenInstanceError):
         GEOSPLATTING.name = "other"
@@ -86,7 +90,7 @@ def test_tensoir_takes_the_scale_from_twenty_views():
     np.testing.assert_allclose(protocols.albedo_scale(IRGS, albedo, ones, truth, ones), 4.0)
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", PICTURES)
 def test_scale_recovers_a_gain_of_every_channel(name):
     _, alpha, truth, mask = scene()
     scale = protocols.albedo_scale(
@@ -177,9 +181,7 @@ def test_backgrounds_differ_where_coverage_is_partial():
     assert measured["albedo.psnr"] == pytest.approx(expected, abs=DECIBELS)
     image = np.concatenate([truth, mask[..., None]], -1)
     white = decibels((0.4 * (1 - srgb(0.5))) ** 2)
-    psnr = [
-        protocols.relight_metrics(row, albedo, alpha, image)["psnr"] for row in PROTOCOL.values()
-    ]
+    psnr = [protocols.relight_metrics(row, albedo, alpha, image)["psnr"] for row in ROWS]
     # `tensoir` shows it whole above one half, `irgs` cuts by the true mask.
     assert psnr == pytest.approx([white, 200.0, 200.0], abs=DECIBELS)
     alpha[:] = 0.4
@@ -227,7 +229,7 @@ def test_pooled_and_mean_of_images_differ():
     assert (TENSOIR.albedo_is_pooled, GEOSPLATTING.albedo_is_pooled) == (True, False)
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", PICTURES)
 def test_a_gain_of_the_prediction_changes_nothing_after_the_scale(name):
     albedo, alpha, truth, mask = scene()
     row = protocol(name)
@@ -241,7 +243,7 @@ def test_a_gain_of_the_prediction_changes_nothing_after_the_scale(name):
     assert measured[0]["albedo.psnr"] > measured[0]["albedo.psnr_masked"]
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", PICTURES)
 def test_masked_metrics_ignore_the_background(name):
     albedo, alpha, truth, mask = scene(views=1)
     outside = mask < 0.5
@@ -266,7 +268,7 @@ def test_masked_metrics_ignore_the_background(name):
         assert (dirty[whole] == pytest.approx(clean[whole], abs=1e-4)) == is_cut
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", PICTURES)
 def test_perfect_predictions_are_perfect(name):
     _, _, truth, mask = scene(views=2)
     mask[:, 7, :3], truth[:, 7, :3] = 0.3, 0.15  # partial coverage, too
@@ -290,7 +292,7 @@ def test_relit_values_are_clipped_before_encoding():
     mask = flat(1.0)
     image = flat([3.0, 1.0, 0.5, 1.0])
     rgb = flat([1.0, 7.0, 0.5])
-    for row in PROTOCOL.values():
+    for row in ROWS:
         assert protocols.relight_metrics(row, rgb, mask, image)["psnr"] > 150
     # In linear light the third channel alone errs.
     rgb[..., 2] = 0.25
@@ -334,7 +336,7 @@ def test_material_metrics_by_hand():
 def test_empty_views_are_left_out():
     albedo, alpha, truth, mask = scene(views=2)
     mask[1] = truth[1] = 0
-    for row in PROTOCOL.values():
+    for row in ROWS:
         one = protocols.albedo_metrics(row, albedo[:1], alpha[:1], truth[:1], mask[:1], GAIN)
         two = protocols.albedo_metrics(row, albedo, alpha, truth, mask, GAIN)
         for key in ("albedo.psnr_masked", "albedo.ssim_masked"):
@@ -362,7 +364,7 @@ def test_views_without_any_object_are_refused():
 
 def test_boolean_masks_equal_fractional_ones():
     albedo, alpha, truth, mask = scene(views=1)
-    for row in PROTOCOL.values():
+    for row in ROWS:
         args = albedo, alpha, truth
         np.testing.assert_array_equal(
             protocols.albedo_scale(row, *args, mask > 0.5), protocols.albedo_scale(row, *args, mask)
@@ -429,7 +431,7 @@ def cut(maps, columns):
     return [values[:1, :, :columns] for values in maps]
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", PICTURES)
 def test_figures_are_those_of_the_pixels_that_count_alone(name):
     row = protocol(name)
     valid, maps = spoiled()
@@ -487,3 +489,93 @@ def test_coverage_where_pixels_do_not_count_is_refused():
             protocols.albedo_metrics(GEOSPLATTING, *wrong, GAIN, valid)
     with pytest.raises(ValueError, match="valid must be"):
         protocols.albedo_metrics(GEOSPLATTING, *maps, GAIN, valid[:, :5])
+
+
+def orb_by_hand(rgb, image, *, largest, is_brightened, is_encoded):
+    """One figure of Stanford-ORB of one image, written down once more."""
+    inside = minimum_filter((image[..., 3] > 0.5).astype(int), 5, mode="nearest") == 1
+    found, true = (np.where(inside[..., None], x[..., :3], 0).astype(float) for x in (rgb, image))
+    if is_brightened:
+        gain = srgb(np.clip(true, 0, 1)).mean() / np.clip(true, 0, 1).mean()
+        found, true = gain * found, gain * true
+    for channel in range(3):
+        f, t = found[inside][:, channel], true[inside][:, channel]
+        found[..., channel] *= np.dot(f, t) / np.dot(f, f)
+    pair = [np.clip(x, 0, largest) for x in (found, true)]
+    if is_encoded:
+        pair = [srgb(x) for x in pair]
+    grey = 0.5 * inside[..., None]
+    return max(decibels(np.mean((x - pair[1]) ** 2)) for x in (pair[0], grey))
+
+
+def bright_scene(views=2, size=24):
+    rng = np.random.default_rng(3)
+    albedo, alpha, truth, mask = scene(views, size)
+    # Highlights above one and above four, so that both clips matter.
+    shine = np.where(rng.uniform(size=mask.shape) < 0.1, 12.0, 1.0).astype(np.float32)[..., None]
+    image = np.concatenate([truth * shine, mask[..., None]], -1)
+    return albedo * shine * np.float32(0.9), alpha, image
+
+
+def test_figures_of_stanford_orb_are_those_of_its_formula():
+    rgb, alpha, image = bright_scene()
+    measured = protocols.relight_metrics(ORB, rgb, alpha, image)
+    kinds = {
+        "psnr_h": {"largest": 4.0, "is_brightened": True, "is_encoded": False},
+        "psnr_l": {"largest": 1.0, "is_brightened": False, "is_encoded": True},
+    }
+    by_hand = {
+        name: [orb_by_hand(*pair, **kind) for pair in zip(rgb, image, strict=True)]
+        for name, kind in kinds.items()
+    }
+    same(measured, {name: np.mean(values) for name, values in by_hand.items()}, abs=DECIBELS)
+    new = protocols.new_view_metrics(rgb[0], alpha[0], image[0], look=ORB.new_views)
+    same(new, {f"nvs.{name}": values[0] for name, values in by_hand.items()}, abs=DECIBELS)
+    albedo, alpha, truth, mask = scene(1, 24)
+    measured = protocols.albedo_metrics(ORB, albedo, alpha, truth, mask, np.ones(3))
+    image = np.concatenate([truth, mask[..., None]], -1)
+    linear = {"largest": 1.0, "is_brightened": False, "is_encoded": False}
+    expected = orb_by_hand(albedo[0], image[0], **linear)
+    assert measured == {"albedo.psnr": pytest.approx(expected, abs=DECIBELS)}
+
+
+def test_stanford_orb_sees_neither_a_gain_nor_the_rim():
+    rgb, alpha, image = bright_scene()
+    before = protocols.relight_metrics(ORB, rgb, alpha, image)
+    gained = (rgb * np.array([0.2, 1.0, 3.0])).astype(np.float32)
+    inside = np.stack([protocols.eroded(view > 0.5) for view in image[..., 3]])
+    gained[~inside] = 5.0
+    same(protocols.relight_metrics(ORB, gained, alpha, image), before, abs=DECIBELS)
+    gained[inside] = 5.0
+    after = protocols.relight_metrics(ORB, gained, alpha, image)
+    assert all(after[name] < before[name] - 1 for name in before)
+
+
+def test_a_mask_is_eroded_by_two_pixels_but_not_from_the_border():
+    mask = np.zeros((12, 12), bool)
+    mask[:8, 3:] = True
+    expected = np.zeros_like(mask)
+    expected[:6, 5:] = True
+    np.testing.assert_array_equal(protocols.eroded(mask), expected)
+
+
+def test_stanford_orb_counts_no_image_below_grey():
+    rgb, alpha, image = bright_scene(1)
+    black = protocols.relight_metrics(ORB, np.zeros_like(rgb), alpha, image)
+    inside = protocols.eroded(image[0, ..., 3] > 0.5)[..., None]
+    true = srgb(np.clip(np.where(inside, image[0, ..., :3], 0), 0, 1))
+    assert black["psnr_l"] == pytest.approx(
+        decibels(np.mean((0.5 * inside - true) ** 2)), abs=DECIBELS
+    )
+
+
+def test_stanford_orb_means_over_the_pixels_that_count():
+    rgb, alpha, image = bright_scene(1, 24)
+    valid = np.ones(alpha.shape, np.float32)
+    valid[:, :3] = 0
+    kept = valid[..., None]
+    half = protocols.relight_metrics(ORB, rgb * kept, alpha * valid, image * kept, valid)
+    whole = protocols.relight_metrics(ORB, rgb * kept, alpha * valid, image * kept)
+    # The same error over fewer pixels.
+    for name in whole:
+        assert whole[name] - half[name] == pytest.approx(-decibels(24 / 21), abs=DECIBELS)

@@ -15,37 +15,12 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from geosplat_jax.io.alignment import Similarity
 from geosplat_jax.io.cameras import RefinedSplit, with_cameras
-from geosplat_jax.io.views import Views, camera_to_world_of
+from geosplat_jax.io.views import Views
 
 _RADIUS = 0.7
 """Of the points that are looked at, in half extents of the box: about where a surface is."""
-
-
-@dataclass(frozen=True)
-class Similarity:
-    """The map ``x -> scale rotation x + translation`` of the world.
-
-    Attributes
-    ----------
-    rotation : (3, 3). translation : (3,) world units. scale : positive.
-    """
-
-    rotation: Float[np.ndarray, "3 3"]
-    translation: Float[np.ndarray, " 3"]
-    scale: float = 1.0
-
-    def points(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-        """Move points of the world."""
-        return self.scale * points @ self.rotation.T + self.translation
-
-    def views(self, views: Views) -> Views:
-        """Move cameras with the world: they see of moved points what they saw before."""
-        poses = views.world_to_camera
-        moved = poses.copy()
-        moved[:, :3, :3] = poses[:, :3, :3] @ self.rotation.T
-        moved[:, :3, 3] = self.scale * poses[:, :3, 3] - moved[:, :3, :3] @ self.translation
-        return replace(views, camera_to_world=camera_to_world_of(moved))
 
 
 @dataclass(frozen=True)

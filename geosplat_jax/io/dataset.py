@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from geosplat_jax.io.cameras import cameras_digest, read_cameras, with_cameras
 from geosplat_jax.io.frames import Frame, Listing
-from geosplat_jax.io.images import MissingFileError, SceneError
+from geosplat_jax.io.images import MissingFileError, SceneError, image_size
 from geosplat_jax.io.layouts.blended_mvs import is_blended_mvs, list_blended_mvs
 from geosplat_jax.io.layouts.colmap import is_colmap, list_colmap
 from geosplat_jax.io.layouts.idr import is_idr, list_idr
@@ -49,6 +49,9 @@ LAYOUTS: dict[str, Layout] = {
 }
 
 
+_PIXELS_OF_A_CELL = 2.0
+_COARSE_PIXELS = 256
+_COARSE_VIEWS = 16
 _NEEDS_MASKS = (
     "training and evaluation need to know the object from the rest: write RGBA images, name a "
     "mask_path for each frame, or add masks/NAME.png, white on the object (docs/captures.md)"
@@ -215,6 +218,52 @@ def load_recorded(path: str | Path, options: Mapping[str, Any]) -> Dataset:
     )
 
 
+class Downscale(NamedTuple):
+    """A factor to read a scene with, and a sentence that says why."""
+
+    factor: int
+    reason: str
+
+
+def choose_downscale(path: str | Path, cells: int, **options: Any) -> Downscale:
+    """Choose how far photographs can be reduced before the grid's cells show more than they do.
+
+    It is the largest factor at which a pixel, at the distance of the object, is at most half as
+    wide as a cell; 1 where the photographs are coarser than that. Some of the views are read, as
+    small as they tell where the object is.
+
+    Parameters
+    ----------
+    path : the scene folder. cells : along the longest side of the object's box.
+    options : of `load_dataset`, without ``downscale``.
+
+    Raises
+    ------
+    SceneError : see `load_dataset`.
+    """
+    root = Path(path).expanduser()
+    if not root.is_dir():
+        raise MissingFileError(f"scene folder {root} does not exist")
+    layout = options.get("layout") or recognise_layout(root)
+    listing = LAYOUTS[layout].list_frames(root, light=options.get("light"))
+    shortest = min(min(image_size(frame.image)) for frame in (*listing.train, *listing.test))
+    coarse = max(1, shortest // _COARSE_PIXELS)
+    # Cameras that were refined belong to images of one size; here they would change little.
+    reading = {name: value for name, value in options.items() if name != "cameras"}
+    found = load_dataset(path, **reading, downscale=coarse, train_views=_COARSE_VIEWS, test_views=1)
+    lo, hi = found.bounds
+    views = found.train
+    distance = np.linalg.norm(views.camera_to_world[:, :3, 3] - 0.5 * (lo + hi), axis=1)
+    pixel = float(np.median(distance / (coarse * views.intrinsics[:, 0, 0])))
+    cell = float((hi - lo).max()) / cells
+    factor = int(np.clip(cell / (_PIXELS_OF_A_CELL * pixel), 1, shortest))
+    return Downscale(
+        factor,
+        f"images are reduced by {factor}: a cell of the grid then is {cell / (factor * pixel):.1f} "
+        "pixels wide",
+    )
+
+
 def recognise_layout(root: Path) -> str:
     """Tell the layout of a scene folder by the files that are there.
 
@@ -229,7 +278,8 @@ def recognise_layout(root: Path) -> str:
         f"{root} has no known layout; expected transforms_train.json (NeRF-synthetic, Shiny "
         "Blender, Synthetic4Relight, Stanford-ORB), folders train_000, test_000, ... (TensoIR), "
         "transforms.json (nerfstudio, instant-ngp, nvdiffrec), sparse/0 (COLMAP), cameras*.npz "
-        "(IDR, NeuS) or cams/00000000_cam.txt (BlendedMVS)"
+        "(IDR, NeuS) or cams/00000000_cam.txt (BlendedMVS); geosplat-jax poses finds the cameras "
+        "of photographs"
     )
 
 

@@ -85,6 +85,22 @@ def image_size(path: str | Path) -> tuple[int, int]:
         source.close()
 
 
+def image_orientation(path: str | Path) -> int:
+    """Return how a photograph is to be shown, as EXIF counts it: 1 as it is stored, to 8.
+
+    Pixels are read and compared as they are stored.
+
+    Raises
+    ------
+    MissingFileError, ImageReadError
+    """
+    source = _opened(Path(path))
+    try:
+        return source.spec().get_int_attribute("Orientation", 1)
+    finally:
+        source.close()
+
+
 def read_image(path: str | Path) -> Float[np.ndarray, "H W C"]:
     """Read an image as stored: no transfer curve, no premultiplication.
 

@@ -326,8 +326,11 @@ class _Photograph(NamedTuple):
 
     def reduced(self, factor: int) -> tuple[np.ndarray, np.ndarray]:
         """Return colours and what counts of a smaller image: pixels of which all parts count."""
+        small = downscale(self.rgba, factor)
+        if self.valid.all():
+            return small, np.ones(small.shape[:2], bool)
         valid = downscale(self.valid[..., None].astype(np.float32), factor)[..., 0] == 1.0
-        return np.where(valid[..., None], downscale(self.rgba, factor), 0.0), valid
+        return np.where(valid[..., None], small, 0.0), valid
 
 
 def _read_photograph(frame: Frame) -> _Photograph:
@@ -343,15 +346,18 @@ def _read_photograph(frame: Frame) -> _Photograph:
         alpha = np.ones_like(rgb[..., :1])
     if alpha.max() > 1.0 + 1e-3:
         raise SceneError(f"the alpha of {frame.image} must be in [0, 1], got {alpha.max()}")
-    alpha = np.minimum(alpha, 1.0)
-    rgba = np.concatenate([np.where(alpha > 0.0, rgb, 0.0), alpha], -1).astype(np.float32)
+    # In place, since copies of a large photograph take longer than to decode it.
+    rgba = np.empty((*rgb.shape[:2], 4), np.float32)
+    rgba[..., :3], rgba[..., 3:] = rgb, np.minimum(alpha, 1.0)
+    rgba[rgba[..., 3] <= 0.0] = 0.0
     valid = np.ones(rgba.shape[:2], bool)
     if frame.valid is not None:
         valid &= _read_mask(frame.valid, rgb)[..., 0] > COVERED
     if frame.ignored is not None:
         valid &= _read_mask(frame.ignored, rgb)[..., 0] == 0.0
     rgba, seen = _undistorted(frame, rgba, valid)
-    return _Photograph(np.where(seen[..., None], rgba, 0.0), seen, has_mask, leaves_file)
+    rgba[~seen] = 0.0
+    return _Photograph(rgba, seen, has_mask, leaves_file)
 
 
 def _read_mask(path: Path, rgb: np.ndarray) -> np.ndarray:

@@ -61,6 +61,7 @@ def _view_metrics(
     image: np.ndarray,
     truth_normal: np.ndarray | None,
     valid: np.ndarray | None,
+    protocol: Protocol,
 ) -> dict:
     """Metrics of one view; ``image`` is (H, W, 4) linear with straight alpha.
 
@@ -68,6 +69,10 @@ def _view_metrics(
     """
     mask = image[..., 3]
     metrics = protocols.new_view_metrics(view.rgb, view.alpha, image, valid)
+    if protocol.new_views is not None:
+        metrics |= protocols.new_view_metrics(
+            view.rgb, view.alpha, image, valid, protocol.new_views
+        )
     metrics["mask.iou"] = float(mask_iou(view.alpha, mask))
     if truth_normal is not None:
         for name in ("masked", "full") if np.any(mask > MASK_THRESHOLD) else ("full",):
@@ -101,7 +106,9 @@ class _Rendered(NamedTuple):
     shown: dict[int, RenderedView]
 
 
-def _render_all(renderer: Renderer, views: Views, chosen: np.ndarray) -> _Rendered:
+def _render_all(
+    renderer: Renderer, views: Views, chosen: np.ndarray, protocol: Protocol
+) -> _Rendered:
     """Render every view once, and keep of it no more than is needed: views may be many."""
     metrics, shown, alpha = [], {}, []
     maps = {name: [] for name in ("albedo", *_MATERIALS) if name in views.truth}
@@ -109,7 +116,8 @@ def _render_all(renderer: Renderer, views: Views, chosen: np.ndarray) -> _Render
         valid = _valid(views, index)
         view = _where_counted(renderer(views.camera(np.array([index]))), valid)
         normal = views.truth["normal"][index] if "normal" in views.truth else None
-        metrics.append({"view": name, **_view_metrics(view, views.images[index], normal, valid)})
+        found = _view_metrics(view, views.images[index], normal, valid, protocol)
+        metrics.append({"view": name, **found})
         alpha.append(view.alpha)
         for key, kept in maps.items():
             kept.append(view.aovs[key])
@@ -154,6 +162,7 @@ def _relight_metrics(
     One light is in memory at a time, and of its renders only what is compared.
     """
     metrics: dict[str, float] = {}
+    found: dict[str, float] = {}
     rows: list[dict[str, np.ndarray]] = [{} for _ in chosen]
     names = sorted(set(views.relight) & set(lights))
     relit = renderer
@@ -174,7 +183,7 @@ def _relight_metrics(
             row[name] = render_on_white(rgb[index], alpha[index])
             row[f"true {name}"] = photograph_on_white(images[index])
     if names:
-        for key in ("psnr", "ssim", "psnr_masked", "ssim_masked"):
+        for key in found:
             values = [metrics[f"relight.{name}.{key}"] for name in names]
             metrics[f"relight.mean.{key}"] = float(np.mean(values))
     return metrics, rows if names else []
@@ -232,7 +241,7 @@ def evaluate_run(
     renderer = Renderer.of(trained, samples=samples)
     compiled = _relight_programs(renderer, views, lights or {}, relight_indirect)
     chosen = np.unique(np.linspace(0, len(views) - 1, sheet_views).round().astype(int))
-    rendered = _render_all(renderer, views, chosen)
+    rendered = _render_all(renderer, views, chosen, chosen_protocol)
     lines = rendered.metrics
     names = dict.fromkeys(key for line in lines for key in line if key != "view")
     mean = {key: float(np.mean([line[key] for line in lines if key in line])) for key in names}

@@ -1,4 +1,4 @@
-"""Metrics of the three evaluation protocols of the field, as pure functions on the host.
+"""Metrics of the evaluation protocols of the field, as pure functions on the host.
 
 Numbers of papers with different protocols are not comparable, so a protocol is named and is data:
 one row of a table a name (`PROTOCOL`).
@@ -25,6 +25,7 @@ from typing import Literal
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
+from scipy.ndimage import binary_erosion
 
 from geosplat_jax.io.images import encode_srgb
 from geosplat_jax.report.metrics import (
@@ -62,6 +63,41 @@ class Look:
 
 
 @dataclass(frozen=True)
+class ScaledFigure:
+    """One figure of Stanford-ORB.
+
+    Attributes
+    ----------
+    name : of the figure.
+    largest : linear values are clipped to [0, largest]; the peak of the PSNR is always one.
+    is_brightened : both images are multiplied first by what the sRGB curve brightens the truth.
+    is_encoded : compared in sRGB, after clipping.
+    """
+
+    name: str
+    largest: float
+    is_brightened: bool
+    is_encoded: bool
+
+
+@dataclass(frozen=True)
+class ScaledLook:
+    """How Stanford-ORB compares images: on the object alone, after a scale for each image.
+
+    The true mask is eroded by 5 x 5 pixels, and what is outside is black in both images. Each
+    channel of each image is scaled by least squares over the pixels inside. Errors are means over
+    *all* pixels, so that they are smaller by the object's share; an image counts at least as much
+    as the grey 0.5 inside the mask would. The benchmark's images are 512 x 512.
+
+    Attributes
+    ----------
+    figures : what is measured.
+    """
+
+    figures: tuple[ScaledFigure, ...]
+
+
+@dataclass(frozen=True)
 class Protocol:
     """The choices that make the metrics of different papers incomparable.
 
@@ -75,15 +111,25 @@ class Protocol:
     albedo_is_pooled : one PSNR of the error over all images; otherwise, and for relit images
         always, the mean of the PSNR of every image.
     lpips_nets : networks of the perceptual distance; see `lpips_note`.
+    new_views : look of new views besides `NEW_VIEWS`, or None.
     """
 
     name: str
     albedo_scale: Literal["least_squares", "median"]
     scale_views: int | None
-    albedo: Look
+    albedo: Look | ScaledLook
     albedo_is_pooled: bool
-    relight: Look
+    relight: Look | ScaledLook
     lpips_nets: tuple[str, ...]
+    new_views: ScaledLook | None = None
+
+
+_ORB_IMAGES = ScaledLook(
+    (
+        ScaledFigure("psnr_h", 4.0, is_brightened=True, is_encoded=False),
+        ScaledFigure("psnr_l", 1.0, is_brightened=False, is_encoded=True),
+    )
+)
 
 
 PROTOCOL: Mapping[str, Protocol] = {
@@ -115,6 +161,16 @@ PROTOCOL: Mapping[str, Protocol] = {
             albedo_is_pooled=False,
             relight=Look("srgb", 0.0, "mask"),
             lpips_nets=("vgg",),
+        ),
+        Protocol(
+            name="orb",
+            albedo_scale="least_squares",
+            scale_views=None,
+            albedo=ScaledLook((ScaledFigure("psnr", 1.0, is_brightened=False, is_encoded=False),)),
+            albedo_is_pooled=False,
+            relight=_ORB_IMAGES,
+            lpips_nets=("vgg",),
+            new_views=_ORB_IMAGES,
         ),
     )
 }
@@ -274,20 +330,76 @@ def _picture(straight: np.ndarray, coverage: np.ndarray, look: Look) -> Float[np
 _mse, _ssim, _ssim_masked = jax.jit(mse), jax.jit(ssim), jax.jit(ssim_masked)
 
 
+def eroded(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Pixels of a mask whose 5 x 5 neighbours, as far as there are any, all belong to it."""
+    return binary_erosion(mask, np.ones((5, 5), bool), border_value=1)
+
+
+def scaled_psnr(
+    figure: ScaledFigure,
+    rgb: Float[np.ndarray, "H W 3"],
+    truth: Float[np.ndarray, "H W 3"],
+    inside: Bool[np.ndarray, "H W"],
+    counted: Bool[np.ndarray, "H W"],
+) -> float:
+    """Measure one figure of Stanford-ORB on one image, in dB; see `ScaledLook`.
+
+    Parameters
+    ----------
+    rgb, truth : linear. inside : eroded mask, not empty. counted : pixels that errors are means of.
+    """
+    predicted = np.where(inside[..., None], rgb, 0.0).astype(float)
+    true = np.maximum(np.where(inside[..., None], truth, 0.0).astype(float), 0.0)
+    if figure.is_brightened:
+        shown = np.clip(true, 0.0, 1.0)
+        total = shown.sum()
+        gain = encode_srgb(shown).sum() / total if total > 1e-8 * shown.size else 1.0
+        predicted, true = gain * predicted, gain * true
+    power = (predicted**2).sum(axis=(0, 1))
+    is_lit = power > 1e-6
+    scale = np.where(is_lit, (predicted * true).sum(axis=(0, 1)) / np.where(is_lit, power, 1), 1)
+    images = [np.clip(x, 0.0, figure.largest) for x in (scale * predicted, true)]
+    if figure.is_encoded:
+        images = [np.asarray(encode_srgb(x), float) for x in images]
+    grey = np.where(inside[..., None], 0.5, 0.0)
+    errors = [np.mean((x - images[1])[counted] ** 2) for x in (images[0], grey)]
+    return float(psnr_of_mse(min(errors)))
+
+
+def _compare_scaled(
+    predictions: Iterable[np.ndarray],
+    truths: Iterable[np.ndarray],
+    mask: np.ndarray,
+    look: ScaledLook,
+    valid: np.ndarray | None,
+) -> dict[str, float]:
+    """Means over the images that have an object after erosion; see `ScaledLook`."""
+    found: dict[str, list[float]] = {figure.name: [] for figure in look.figures}
+    known = np.ones(mask.shape, bool) if valid is None else valid > MASK_THRESHOLD
+    for prediction, truth, covered, counted in zip(predictions, truths, mask, known, strict=True):
+        inside = eroded(covered > MASK_THRESHOLD)
+        if inside.any():
+            for figure in look.figures:
+                found[figure.name].append(scaled_psnr(figure, prediction, truth, inside, counted))
+    return {name: float(np.mean(values)) for name, values in found.items() if values}
+
+
 def _compare(
     predictions: Iterable[np.ndarray],
     alpha: np.ndarray,
     truths: Iterable[np.ndarray],
     mask: np.ndarray,
     *,
-    look: Look,
+    look: Look | ScaledLook,
     is_pooled: bool,
     valid: np.ndarray | None,
 ) -> dict[str, float]:
-    """PSNR and SSIM, whole and masked, view by view, of linear images.
+    """PSNR and SSIM, whole and masked, view by view, of linear images; or what the look measures.
 
     Predictions are premultiplied by ``alpha``, truths straight.
     """
+    if isinstance(look, ScaledLook):
+        return _compare_scaled(predictions, truths, mask, look, valid)
     errors, similarities, masked_errors, masked_similarities, counts = [], [], [], [], []
     totals = []
     known = [None] * len(mask) if valid is None else valid
@@ -324,7 +436,11 @@ def _compare(
 
 
 def _compare_images(
-    rgb: np.ndarray, alpha: np.ndarray, image: np.ndarray, look: Look, valid: np.ndarray | None
+    rgb: np.ndarray,
+    alpha: np.ndarray,
+    image: np.ndarray,
+    look: Look | ScaledLook,
+    valid: np.ndarray | None,
 ) -> dict[str, float]:
     """Compare premultiplied renders with straight RGBA images, (V, H, W, 3 and 4)."""
     _require(alpha.shape, alpha=alpha, rgb=(rgb, 3), image=(image, 4))
@@ -338,6 +454,7 @@ def new_view_metrics(
     alpha: Float[np.ndarray, "..."],
     image: Float[np.ndarray, "..."],
     valid: Shaped[np.ndarray, "..."] | None = None,
+    look: Look | ScaledLook = NEW_VIEWS,
 ) -> dict[str, float]:
     """Compare one view under the training light with its photograph, as `NEW_VIEWS` says.
 
@@ -347,6 +464,7 @@ def new_view_metrics(
     alpha : (H, W) predicted coverage.
     image : (H, W, 4) photograph, linear, *straight* alpha, which is the mask.
     valid : (H, W) pixels that count, or None.
+    look : another one, whose figures are then returned.
 
     Returns
     -------
@@ -358,7 +476,7 @@ def new_view_metrics(
     ValueError : shapes that do not agree, values that are not finite.
     """
     counted = None if valid is None else valid[None]
-    metrics = _compare_images(rgb[None], alpha[None], image[None], NEW_VIEWS, counted)
+    metrics = _compare_images(rgb[None], alpha[None], image[None], look, counted)
     return {f"nvs.{name}": value for name, value in metrics.items()}
 
 
@@ -383,7 +501,8 @@ def albedo_metrics(
     -------
     ``albedo.psnr`` (dB) and ``albedo.ssim`` of whole images, ``albedo.psnr_masked`` and
     ``albedo.ssim_masked`` of the pixels of the mask. A pixel of the mask where nothing was drawn
-    shows the background, or black where the protocol cuts by the true mask.
+    shows the background, or black where the protocol cuts by the true mask. Of protocol ``orb``
+    only ``albedo.psnr``.
 
     Raises
     ------
@@ -480,7 +599,7 @@ def relight_metrics(
     Returns
     -------
     ``psnr`` (dB) and ``ssim`` of whole images, ``psnr_masked`` and ``ssim_masked`` of the pixels
-    of the mask, all means over the images.
+    of the mask, all means over the images. Of protocol ``orb`` ``psnr_h`` and ``psnr_l``.
 
     Raises
     ------

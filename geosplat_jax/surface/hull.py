@@ -172,7 +172,7 @@ def sight_bounds(
     """
     poses = np.asarray(world_to_camera, np.float64)
     centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
-    center = _meeting_point(centers, poses[:, 2, :3])
+    center = meeting_point(centers, poses[:, 2, :3])
     depth = poses[:, 2, :3] @ center + poses[:, 2, 3]
     ahead = depth > 0.0
     if not ahead.mean() > SEEN_FRACTION:
@@ -444,8 +444,10 @@ def _distance_in_view(pinhole, intrinsics, distances, counts, points):
     return jnp.where(seen, world, -jnp.inf), seen
 
 
-def _meeting_point(centers: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Point nearest to lines through ``centers``; `ValueError` where they are parallel."""
+def meeting_point(
+    centers: Float[np.ndarray, "V 3"], directions: Float[np.ndarray, "V 3"]
+) -> Float[np.ndarray, " 3"]:
+    """Find the point nearest to lines through ``centers``; `ValueError` where they are parallel."""
     sight = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     # Normal equations of min Σ |(I - d dᵀ)(x - c)|².
     across = np.eye(3)[None] - sight[:, :, None] * sight[:, None, :]
@@ -476,7 +478,7 @@ def _common_target(view: _Silhouettes, intrinsics, masks) -> tuple[np.ndarray, f
         -1,
     )
     sight = np.einsum("vji,vj->vi", view.rotations, sight)
-    center = _meeting_point(view.centers, sight)
+    center = meeting_point(view.centers, sight)
     return center, float(np.median(np.linalg.norm(view.centers - center[None], axis=1)))
 
 

@@ -1,8 +1,9 @@
-"""COLMAP: ``images/`` and a sparse model, ``cameras`` and ``images`` as ``.bin`` or ``.txt``.
+"""COLMAP: photographs and a sparse model, ``cameras`` and ``images`` as ``.bin`` or ``.txt``.
 
-The model lies in ``sparse/0``, ``sparse`` or ``colmap/sparse/0``; where both kinds are there, the
-binary one is read. Points are not needed. ``x_camera = R(q) x + t`` with OpenCV axes, quaternions
-(w, x, y, z), pixel centres at + 0.5, binary numbers in little-endian order.
+Photographs lie in ``images/``, or without it in the folder itself; the model in ``sparse/0``,
+``sparse`` or ``colmap/sparse/0``. Where both kinds of files are there, the binary one is read.
+Points are not needed. ``x_camera = R(q) x + t`` with OpenCV axes, quaternions (w, x, y, z), pixel
+centres at + 0.5, binary numbers in little-endian order.
 """
 
 import struct
@@ -73,6 +74,11 @@ def is_colmap(root: Path) -> bool:
     return _model_folder(root) is not None
 
 
+def image_folder(root: Path) -> Path:
+    """Return where photographs lie: in ``images/``, or without it in the folder itself."""
+    return root / IMAGE_FOLDER if (root / IMAGE_FOLDER).is_dir() else root
+
+
 def list_colmap(root: Path, *, light: str | None = None) -> Listing:
     """List the registered images of a reconstruction.
 
@@ -129,7 +135,8 @@ def _frame(root: Path, image: _Image, lenses: Mapping[int, PinholeLens], where: 
     translation = checked_numbers(image.translation, (3,), f"the translation of {what}")
     rotation = quaternion_to_rotation(np.array(image.quaternion), what)
     pose = opengl_pose(rotation, translation, what)
-    path = inside_scene(root, f"{IMAGE_FOLDER}/{image.name}", where)
+    folder = image_folder(root).relative_to(root)
+    path = inside_scene(root, f"{folder.as_posix()}/{image.name}", where)
     return captured_frame(root, existing(root, [path], what), pose, lenses[image.camera])
 
 

@@ -1,0 +1,398 @@
+"""Cameras of photographs by structure from motion, as a COLMAP model beside them.
+
+pycolmap does the work (extra ``capture``). The same photographs and settings give the same model,
+whatever the number of threads: photographs are numbered by name, every search has a seed, and what
+sums in the order of its threads has one. Nothing but ``sparse/0`` is written; photographs stay as
+they are, and are undistorted when the scene is read, together with masks that were drawn on them.
+"""
+
+import shutil
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import combinations, groupby
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from geosplat_jax.io.alignment import align_world
+from geosplat_jax.io.dataset import LAYOUTS
+from geosplat_jax.io.frames import IMAGE_SUFFIXES, inside_scene, opengl_pose
+from geosplat_jax.io.images import (
+    LINEAR_FORMATS,
+    MissingFileError,
+    SceneError,
+    image_orientation,
+    image_size,
+)
+from geosplat_jax.io.layouts.colmap import image_folder
+
+MODEL_FOLDER = "sparse/0"
+
+_FEWEST = 5
+_SMALLEST_SHARE = 0.5
+"""Of the photographs, that must fit together for a model to be written."""
+_GROUP = 8  # photographs whose features are found at a time, between two signs of life
+_BLOCK = 16  # photographs that are compared with as many others at a time
+_NEIGHBOURS = 10  # of a photograph in a sequence, in either direction
+_FEW_FEATURES = 300
+_FEW_PARTNERS = 4.0
+_UPRIGHT_DEGREES = {3: 180, 4: 180, 5: 90, 6: 90, 7: -90, 8: -90}
+"""Angle, by EXIF orientation, from the y axis of the pixels to what was up."""
+
+
+class PoseError(SceneError):
+    """The photographs give no cameras; the message says why and how to photograph instead."""
+
+
+@dataclass(frozen=True)
+class PoseSettings:
+    """How cameras are found.
+
+    Attributes
+    ----------
+    size : pixels of the longer side that photographs are reduced to for features.
+    order : ``any`` compares every two photographs; ``sequence`` those that are close by name, for
+        frames of a movie.
+    lens : ``one`` for all photographs, which then are of one size, or one for ``each``.
+    seed : of random searches.
+    """
+
+    size: int = 1600
+    order: Literal["any", "sequence"] = "any"
+    lens: Literal["one", "each"] = "one"
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class PoseReport:
+    """What was found.
+
+    Attributes
+    ----------
+    model : folder that it was written to.
+    registered : count of photographs with a camera. missing : names of the others.
+    error : mean distance in pixels between points and where the photographs show them.
+    points : count of points in space.
+    seconds : by ``features``, ``matching``, ``mapping``.
+    """
+
+    model: Path
+    registered: int
+    missing: tuple[str, ...]
+    error: float
+    points: int
+    seconds: dict[str, float]
+
+
+OnProgress = Callable[[str, int, int], None]
+"""Called with the part of the work, how much of it is done, and how much there is."""
+
+
+def find_poses(
+    root: str | Path,
+    settings: PoseSettings | None = None,
+    *,
+    force: bool = False,
+    on_progress: OnProgress | None = None,
+) -> PoseReport:
+    """Find the cameras of photographs and write them to ``sparse/0``.
+
+    The world has z up and the object at its origin; see `alignment.align_world`.
+
+    Parameters
+    ----------
+    root : folder with photographs, in ``images/`` or directly.
+    force : replace a model that is there.
+
+    Raises
+    ------
+    MissingFileError : the folder or the photographs are not there.
+    SceneError : pycolmap is missing, the folder has cameras already, or it has photographs that
+        cannot be used.
+    PoseError, AlignmentError : too few of them fit together, or all were taken from one place.
+    """
+    root, settings = Path(root).expanduser(), settings or PoseSettings()
+    names = _photographs(root)
+    _require_free(root, force)
+    _require_sizes(root, names, settings)
+    colmap = _import_pycolmap()
+    level = colmap.logging.minloglevel
+    colmap.logging.minloglevel = colmap.logging.FATAL.value  # what fails is said here
+    try:
+        with tempfile.TemporaryDirectory(prefix="geosplat_poses_") as work:
+            search = _Search(
+                colmap, image_folder(root), names, Path(work), settings, on_progress or _silent
+            )
+            best = search.run()
+            _align(colmap, best, image_folder(root))
+            _write(best, root / MODEL_FOLDER)
+    finally:
+        colmap.logging.minloglevel = level
+    found = {image.name for image in best.images.values() if image.has_pose}
+    return PoseReport(
+        model=root / MODEL_FOLDER,
+        registered=len(found),
+        missing=tuple(name for name in names if name not in found),
+        error=float(best.compute_mean_reprojection_error()),
+        points=int(best.num_points3D()),
+        seconds=search.seconds,
+    )
+
+
+def _silent(part: str, done: int, total: int) -> None:
+    """Say nothing."""
+
+
+def _import_pycolmap() -> ModuleType:
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise SceneError(
+            "finding cameras needs pycolmap, which is not installed; pip install "
+            "'geosplat_jax[capture]'"
+        ) from error
+    return pycolmap
+
+
+def _photographs(root: Path) -> list[str]:
+    """Names of the photographs, relative to their folder and sorted."""
+    if not root.is_dir():
+        raise MissingFileError(f"folder {root} does not exist")
+    folder = image_folder(root)
+    suffixes = set(IMAGE_SUFFIXES) - LINEAR_FORMATS
+    # Without images/, folders below may hold anything, masks for one.
+    listed = folder.iterdir() if folder == root else folder.rglob("*")
+    paths = [
+        path
+        for path in listed
+        if path.suffix.lower() in suffixes and path.is_file() and not path.name.startswith(".")
+    ]
+    names = sorted(path.relative_to(folder).as_posix() for path in paths)
+    for name in names:
+        inside_scene(root, (folder / name).relative_to(root).as_posix(), folder)
+    if len(names) < _FEWEST:
+        raise PoseError(
+            f"{folder} has {len(names)} photographs ({', '.join(sorted(suffixes))}); cameras take "
+            f"{_FEWEST} at least, and a good reconstruction some 50"
+        )
+    stems = Counter("_".join(Path(name).with_suffix("").parts) for name in names)
+    stem, count = stems.most_common(1)[0]
+    if count > 1:
+        raise SceneError(f"{count} photographs in {folder} are named {stem!r}; rename them")
+    return names
+
+
+def _require_free(root: Path, force: bool) -> None:
+    """Refuse a folder that has cameras, unless ours would replace them."""
+    found = next((name for name, layout in LAYOUTS.items() if layout.recognise(root)), None)
+    if found is None:
+        return
+    order = list(LAYOUTS)
+    if order.index(found) < order.index("colmap"):
+        raise SceneError(
+            f"{root} is a scene with cameras already, of layout {found}, which would be read "
+            "instead of those found here; move its file of cameras away"
+        )
+    if not force:
+        raise SceneError(f"{root} has cameras already, of layout {found}; --force replaces them")
+
+
+def _require_sizes(root: Path, names: list[str], settings: PoseSettings) -> None:
+    folder = image_folder(root)
+    sizes = {name: image_size(folder / name) for name in names}
+    first = sizes[names[0]]
+    other = next((name for name in names if sizes[name] != first), None)
+    if settings.lens == "one" and other is not None:
+        height, width = sizes[other]
+        raise SceneError(
+            f"{other} is {width} x {height} pixels, but {names[0]} is {first[1]} x {first[0]}: "
+            "they are not of one lens; pass --lens each, or leave some out"
+        )
+
+
+def _pairs(count: int, order: str) -> list[tuple[int, int]]:
+    """Photographs to compare, by number."""
+    pairs = list(combinations(range(count), 2))
+    if order == "any":
+        return pairs
+    # Powers of two close loops: a step back in a movie of one turn shows the same again.
+    return [(i, j) for i, j in pairs if j - i <= _NEIGHBOURS or not (j - i) & (j - i - 1)]
+
+
+def _in_blocks(pairs: list[tuple[int, int]]) -> Iterator[list[tuple[int, int]]]:
+    """Group pairs such that few photographs take part in a group."""
+
+    def block(pair: tuple[int, int]) -> tuple[int, int]:
+        return pair[0] // _BLOCK, pair[1] // _BLOCK
+
+    for _, group in groupby(sorted(pairs, key=lambda pair: (*block(pair), *pair)), key=block):
+        yield list(group)
+
+
+class _Matches(NamedTuple):
+    """What is known before photographs are put together.
+
+    Attributes
+    ----------
+    photographs : count. features : mean count on a photograph.
+    pairs : count of those that show something in common, of ``compared``.
+    """
+
+    photographs: int
+    features: float
+    pairs: int
+    compared: int
+
+    def advice(self, count: int) -> str:
+        """Say why no more than ``count`` photographs fit together, and how to take others."""
+        said = f"only {count} of {self.photographs} photographs fit together"
+        if self.features < _FEW_FEATURES:
+            return (
+                f"{said}: they show few details ({self.features:.0f} each); photograph sharply and "
+                "in good light, with a patterned ground, or look closer with a larger --size"
+            )
+        if 2 * self.pairs / self.photographs < _FEW_PARTNERS:
+            return (
+                f"{said}: they show little of the same ({self.pairs} of {self.compared} pairs "
+                "match); take more of them, with steps of about ten degrees around the object"
+            )
+        return (
+            f"{said}, though {self.pairs} of {self.compared} pairs match; walk around the object "
+            "instead of turning it or standing still, keep what is around it as it is, and pass "
+            "--lens each if you zoomed"
+        )
+
+
+@dataclass
+class _Search:
+    """One search for cameras, in a folder of its own."""
+
+    colmap: ModuleType
+    images: Path
+    names: list[str]
+    work: Path
+    settings: PoseSettings
+    tell: OnProgress
+
+    def run(self) -> Any:
+        """Return the largest model; `PoseError` where it is too small."""
+        self.database = self.work / "database.db"
+        self.colmap.Database.open(self.database).close()
+        self.seconds = {}
+        for part, search in (("features", self._features), ("matching", self._match)):
+            began = time.perf_counter()
+            search()
+            self.seconds[part] = time.perf_counter() - began
+        began = time.perf_counter()
+        models = self._map()
+        self.seconds["mapping"] = time.perf_counter() - began
+        best = max(models, key=lambda model: model.num_reg_images(), default=None)
+        count = 0 if best is None else best.num_reg_images()
+        if best is None or count < max(_FEWEST, _SMALLEST_SHARE * len(self.names)):
+            raise PoseError(self._matches().advice(count))
+        return best
+
+    def _features(self) -> None:
+        modes = self.colmap.CameraMode
+        is_one = self.settings.lens == "one"
+        mode = modes.SINGLE if is_one else modes.PER_IMAGE
+        reader = self.colmap.ImageReaderOptions()
+        # A lens of one photograph has few points to tell its numbers from.
+        reader.camera_model = "OPENCV" if is_one else "SIMPLE_RADIAL"
+        # Numbered here, since features come in the order of the threads.
+        self.colmap.import_images(self.database, self.images, mode, self.names, reader)
+        extraction = self.colmap.FeatureExtractionOptions()
+        extraction.max_image_size = self.settings.size
+        extraction.use_gpu = False
+        for first in range(0, len(self.names), _GROUP):
+            group = self.names[first : first + _GROUP]
+            self.colmap.extract_features(
+                self.database, self.images, group, mode, reader, extraction
+            )
+            self.tell("features", first + len(group), len(self.names))
+
+    def _match(self) -> None:
+        pairs = _pairs(len(self.names), self.settings.order)
+        matching = self.colmap.FeatureMatchingOptions()
+        matching.use_gpu = False
+        geometry = self.colmap.TwoViewGeometryOptions()
+        geometry.ransac.random_seed = self.settings.seed
+        pairing = self.colmap.ImportedPairingOptions()
+        pairing.match_list_path = self.work / "pairs.txt"
+        done = 0
+        for group in _in_blocks(pairs):
+            lines = [f"{self.names[i]} {self.names[j]}\n" for i, j in group]
+            (self.work / "pairs.txt").write_text("".join(lines), encoding="utf-8")
+            self.colmap.match_image_pairs(self.database, matching, pairing, geometry)
+            done += len(group)
+            self.tell("matching", done, len(pairs))
+
+    def _map(self) -> list[Any]:
+        options = self.colmap.IncrementalPipelineOptions()
+        options.num_threads = 1
+        options.min_model_size = _FEWEST
+        for part in (options, options.mapper, options.triangulation):
+            part.random_seed = self.settings.seed
+        # The first two photographs come as a pair, without a call.
+        registered = 2
+
+        def count() -> None:
+            nonlocal registered
+            registered = min(registered + 1, len(self.names))
+            self.tell("mapping", registered, len(self.names))
+
+        models = self.colmap.incremental_mapping(
+            self.database, self.images, self.work / "models", options, next_image_callback=count
+        )
+        return list(models.values())
+
+    def _matches(self) -> "_Matches":
+        with self.colmap.Database.open(self.database) as database:
+            return _Matches(
+                photographs=len(self.names),
+                features=database.num_keypoints() / len(self.names),
+                pairs=database.num_verified_image_pairs(),
+                compared=len(_pairs(len(self.names), self.settings.order)),
+            )
+
+
+def _upright(pose: Float[np.ndarray, "4 4"], orientation: int) -> Float[np.ndarray, "4 4"]:
+    """Turn a camera around its axis to how its photograph is shown, by EXIF orientation."""
+    turned = pose.copy()
+    angle = _UPRIGHT_DEGREES.get(orientation, 0)
+    turned[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", angle, degrees=True).as_matrix()
+    return turned
+
+
+def _align(colmap: ModuleType, model: Any, images: Path) -> None:
+    """Turn, move and scale a model to `align_world`."""
+    poses = []
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        if image.has_pose:
+            placed = image.cam_from_world()
+            pose = opengl_pose(placed.rotation.matrix(), placed.translation, image.name)
+            poses.append(_upright(pose, image_orientation(images / image.name)))
+    points = np.stack([point.xyz for point in model.points3D.values()])
+    world = align_world(np.stack(poses), points)
+    model.transform(colmap.Sim3d(world.scale, colmap.Rotation3d(world.rotation), world.translation))
+
+
+def _write(model: Any, folder: Path) -> None:
+    """Write a model aside, then in the place of the one before."""
+    aside = folder.with_name(f".{folder.name}.partial")
+    shutil.rmtree(aside, ignore_errors=True)
+    aside.mkdir(parents=True)
+    try:
+        model.write(aside)
+        if folder.exists():
+            shutil.rmtree(folder)
+        aside.rename(folder)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
