@@ -657,7 +657,7 @@ def test_first_capacities_hold_a_surface_of_any_roughness():
         needed = extract(geometry, grid, capacities=SMALL_ROOM, training=True).usage
         guess = FlexiCubes(grid).first_capacities(geometry)
         assert bool(fits(needed, guess))
-        assert set(guess) == {"surface_cubes", "dual_vertices", "quads"}
+        assert set(guess) == {"surface_cubes", "dual_vertices", "quads", "cell_patches"}
 
 
 # Change of grid
