@@ -46,7 +46,10 @@ def compile_step(
                     traced.lower().compile()
 
         compiling.append(in_background(finish))
-        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), traced.out_info)
+        # Weak types too: another type is another program.
+        return jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type), traced.out_info
+        )
 
     train_step(state, batch, pipeline, rule, run=compiled)
     for one in compiling:
