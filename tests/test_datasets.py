@@ -607,6 +607,9 @@ def test_images_that_were_not_cut_out_warn(blender):
     for i in range(COUNTS["train"]):
         write_png(blender / "train" / f"r_{i}.png", np.ones((SIZE, SIZE, 4), np.float32))
     assert any("every mask is full" in warning for warning in load(blender).warnings)
+    # Where their hull reaches the cameras, masks are to blame and not the poses.
+    with pytest.raises(SceneError, match=r"every mask is full.*cut out"):
+        load_dataset(blender, bounds=(np.full(3, -9.0), np.full(3, 9.0)))
 
 
 @pytest.mark.parametrize(("value", "message"), [(np.nan, "not finite"), (-1.0, "negative")])

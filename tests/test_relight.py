@@ -291,6 +291,12 @@ def test_radiance_that_is_not_radiance_is_refused(tmp_path, monkeypatch, value):
         load_light(path)
 
 
+def test_a_black_light_is_told(tmp_path):
+    write_hdr(tmp_path / "night.hdr", np.zeros((4, 8, 3), np.float32))
+    with pytest.warns(RuntimeWarning, match=r"night\.hdr is black all over"):
+        load_light(tmp_path / "night.hdr")
+
+
 def test_an_image_of_eight_bits_is_taken_as_srgb(tmp_path):
     write_png(tmp_path / "grey.png", np.full((4, 8, 3), 0.5, np.float32))
     found = load_light(tmp_path / "grey.png").radiance

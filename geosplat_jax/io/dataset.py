@@ -369,6 +369,11 @@ def _check_cameras_outside(views: Views, bounds: tuple[np.ndarray, np.ndarray]) 
     inside = ((centers > lo) & (centers < hi)).all(1)
     if inside.any():
         names = [name for name, is_in in zip(views.names, inside, strict=True) if is_in]
+        if views.has_masks and (views.coverage == 1.0).all():
+            raise SceneError(
+                "every mask is full, so that the object seems to reach the cameras; check that the "
+                "images are cut out: their alpha channel, or the mask files"
+            )
         raise SceneError(
             f"{len(names)} cameras are inside the object's bounds, {_some(names)} (the first at "
             f"{_numbers(centers[inside][0])}, bounds {_numbers(lo)} to {_numbers(hi)}); check the "

@@ -3,6 +3,7 @@
 Host side, around `renderer.Renderer`.
 """
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +34,7 @@ def load_light(path: str | Path, *, largest: int = LARGEST_LIGHT) -> EnvLight:
     """Read a lat-long environment map: linear radiance from HDR or EXR, sRGB from other images.
 
     The layout is that of `EnvLight`: z up, ``u = 0.5 - atan2(y, x) / (2 pi)``. Maps with more than
-    ``largest`` rows are reduced by averaging over solid angle.
+    ``largest`` rows are reduced by averaging over solid angle. A black one causes a warning.
 
     Raises
     ------
@@ -48,6 +49,10 @@ def load_light(path: str | Path, *, largest: int = LARGEST_LIGHT) -> EnvLight:
             "three channels (a lat-long map)"
         )
     radiance = pixels[..., :3]
+    if not radiance.any():
+        warnings.warn(
+            f"{path} is black all over: nothing will be lit", RuntimeWarning, stacklevel=2
+        )
     if radiance.shape[0] > largest:
         radiance = resize_light(radiance, largest, 2 * largest)
     return EnvLight(jnp.asarray(radiance, jnp.float32))
