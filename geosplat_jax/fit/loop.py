@@ -287,10 +287,8 @@ class Upcoming:
         def plan() -> Capacities:
             if known is not None and known.stage == stage.name:
                 return Capacities(**known.capacities)
-            first, pipeline = (
-                begin_stage(params, before, config, stage),
-                first_pipeline(Capacities()),
-            )
+            first = begin_stage(params, before, config, stage)
+            pipeline = first_pipeline(Capacities())
             carried = _continued(before, pipeline, stage)
             if carried is not None:
                 return add_rays(pipeline, first, carried)
