@@ -121,6 +121,17 @@ class ListedFrame(NamedTuple):
     values: Mapping[str, Any]
 
 
+def require_no_light(light: str | None) -> None:
+    """Refuse the name of a light, for layouts whose photographs have one without a name.
+
+    Raises
+    ------
+    SceneError
+    """
+    if light is not None:
+        raise SceneError(f"this layout has one unnamed light, got light={light!r}; leave it out")
+
+
 def read_transforms(path: Path) -> list[tuple[str, np.ndarray, Lens]]:
     """Read a ``transforms_*.json`` of Blender: file path, pose and lens of each frame.
 

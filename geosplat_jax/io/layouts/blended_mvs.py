@@ -26,6 +26,7 @@ from geosplat_jax.io.frames import (
     existing,
     images_in,
     opengl_pose,
+    require_no_light,
     split_capture,
 )
 from geosplat_jax.io.images import SceneError, image_size
@@ -49,8 +50,7 @@ def list_blended_mvs(root: Path, *, light: str | None = None) -> Listing:
     MissingFileError : there are no images, or one has no camera.
     SceneError : a camera's file is damaged; a light is asked for.
     """
-    if light is not None:
-        raise SceneError(f"this layout has one unnamed light, got light={light!r}; leave it out")
+    require_no_light(light)
     images = [path for path in images_in(root, _IMAGE_FOLDERS) if not path.stem.endswith(_MASKED)]
     if not images:
         raise SceneError(f"{root} has images that end in {_MASKED} only; add the others")

@@ -23,6 +23,7 @@ from geosplat_jax.io.frames import (
     inside_scene,
     opengl_pose,
     quaternion_to_rotation,
+    require_no_light,
     split_capture,
 )
 from geosplat_jax.io.images import MissingFileError, SceneError
@@ -87,8 +88,7 @@ def list_colmap(root: Path, *, light: str | None = None) -> Listing:
     MissingFileError : half of the model, or a registered image, is not there.
     SceneError : the model is damaged, or a camera of a kind that is not read; a light is asked for.
     """
-    if light is not None:
-        raise SceneError(f"this layout has one unnamed light, got light={light!r}; leave it out")
+    require_no_light(light)
     folder = _model_folder(root)
     if folder is None:
         raise MissingFileError(f"{root} has no model in {', '.join(MODEL_FOLDERS)}; add one")

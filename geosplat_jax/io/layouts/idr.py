@@ -19,6 +19,7 @@ from geosplat_jax.io.frames import (
     checked_numbers,
     images_in,
     opengl_pose,
+    require_no_light,
     split_capture,
 )
 from geosplat_jax.io.images import SceneError, image_size
@@ -45,8 +46,7 @@ def list_idr(root: Path, *, light: str | None = None) -> Listing:
     MissingFileError : there are no images.
     SceneError : as many projections as images are not there, or one is none; a light is asked for.
     """
-    if light is not None:
-        raise SceneError(f"this layout has one unnamed light, got light={light!r}; leave it out")
+    require_no_light(light)
     where = _camera_file(root)
     if where is None:
         raise SceneError(f"{root} has none of {', '.join(CAMERA_FILES)}; add one")

@@ -18,8 +18,8 @@ from geosplat_jax.io.frames import (
     inside_scene,
     optional_files,
     read_transforms,
+    require_no_light,
 )
-from geosplat_jax.io.images import SceneError
 
 
 def is_nerf_synthetic(root: Path) -> bool:
@@ -57,8 +57,7 @@ def list_shiny_blender(root: Path, *, light: str | None = None) -> Listing:
 
 
 def _list(root: Path, light: str | None, *, has_maps: bool) -> Listing:
-    if light is not None:
-        raise SceneError(f"this layout has one unnamed light, got light={light!r}; leave it out")
+    require_no_light(light)
     return Listing(
         train=_frames(root, "train", has_maps=has_maps),
         test=_frames(root, "test", has_maps=has_maps),

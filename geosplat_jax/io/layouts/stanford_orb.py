@@ -15,8 +15,8 @@ from geosplat_jax.io.frames import (
     existing,
     image_stem,
     read_transforms,
+    require_no_light,
 )
-from geosplat_jax.io.images import SceneError
 
 _SUFFIXES = (".png", ".exr")
 _LIGHTS = "env_map"
@@ -34,8 +34,7 @@ def list_stanford_orb(root: Path, *, light: str | None = None) -> Listing:
     ------
     SceneError : see `read_transforms`; a light is asked for.
     """
-    if light is not None:
-        raise SceneError(f"this layout has one unnamed light, got light={light!r}; leave it out")
+    require_no_light(light)
     train, test = (_frames(root, split) for split in ("train", "test"))
     lit = sum(frame.light is not None for frame in test)
     notes = ()

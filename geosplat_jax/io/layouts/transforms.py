@@ -29,6 +29,7 @@ from geosplat_jax.io.frames import (
     list_transforms,
     optional_files,
     read_json,
+    require_no_light,
     split_capture,
 )
 from geosplat_jax.io.images import SceneError
@@ -51,8 +52,7 @@ def list_transforms_capture(root: Path, *, light: str | None = None) -> Listing:
     SceneError : see `frames.list_transforms`; a split names a file that no frame has, or shares
         one; a light is asked for.
     """
-    if light is not None:
-        raise SceneError(f"this layout has one unnamed light, got light={light!r}; leave it out")
+    require_no_light(light)
     where = root / FILE
     content = read_json(where)
     if "applied_transform" in content:
