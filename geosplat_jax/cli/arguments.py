@@ -1,0 +1,223 @@
+"""What the commands take: one function for each group of options."""
+
+import argparse
+import importlib.metadata
+from pathlib import Path
+from typing import Any, get_args
+
+from geosplat_jax.fit.presets import PRESETS, QUALITIES
+from geosplat_jax.gradcheck.report import STAGES
+from geosplat_jax.io.poses import PoseSettings
+from geosplat_jax.materials import MATERIAL_PRIORS
+from geosplat_jax.report.consistency import DEFAULT_VIEWS
+from geosplat_jax.report.protocols import PROTOCOLS
+from geosplat_jax.report.relight import BACKGROUNDS
+from geosplat_jax.report.renderer import DEFAULT_SAMPLES, RELIGHT_KINDS
+
+
+def command_line() -> argparse.ArgumentParser:
+    """Describe the command line."""
+    parser = argparse.ArgumentParser(
+        prog="geosplat-jax",
+        description="Photographs in; mesh, PBR materials and light out.",
+    )
+    parser.add_argument(
+        "--version", action="version", version=importlib.metadata.version("geosplat_jax")
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+
+    info = commands.add_parser("info", help="say what was recognised in a scene folder")
+    _add_scene_arguments(info)
+
+    _add_poses(commands.add_parser("poses", help="find the cameras of a folder of photographs"))
+
+    train = commands.add_parser("train", help="reconstruct a scene")
+    _add_scene_arguments(train)
+    train.add_argument("--output", type=Path, help="run folder (default: runs/SCENE)")
+    _add_config_arguments(train)
+    start = train.add_mutually_exclusive_group()
+    start.add_argument(
+        "--resume", action="store_true", help="continue from the last checkpoint, or start again"
+    )
+    start.add_argument("--force", action="store_true", help="replace the run in the output folder")
+    start.add_argument(
+        "--from", dest="source", type=Path, metavar="RUN", help="take the first stages from a run"
+    )
+    train.add_argument("--stage", metavar="NAME", help="with --from: the stage to begin with")
+
+    settings = commands.add_parser("settings", help="list every setting: default, range, meaning")
+    settings.add_argument("prefix", nargs="?", default="", help="of the settings to list")
+    _add_config_arguments(settings)
+
+    evaluate = _run_parser(commands, "evaluate", "metrics and pictures of a run's test views")
+    evaluate.add_argument("--protocol", choices=PROTOCOLS, default=PROTOCOLS[0])
+    _add_samples(evaluate)
+    evaluate.add_argument(
+        "--relight-indirect",
+        choices=RELIGHT_KINDS,
+        default="traced",
+        help="light from blocked directions under new lights (default: %(default)s)",
+    )
+
+    evaluate.add_argument(
+        "--stage", help="what this stage ended with, instead of the run as it is now"
+    )
+
+    consistency = commands.add_parser(
+        "consistency", help="how well splats stand for the mesh of a run, or for any mesh"
+    )
+    consistency.add_argument(
+        "subject", type=Path, metavar="RUN|MESH", help="folder of a run, or file of a closed mesh"
+    )
+    consistency.add_argument(
+        "--scene",
+        type=Path,
+        help="where the run's scene is now; or the scene whose cameras see the mesh (default: "
+        f"{DEFAULT_VIEWS} cameras around it)",
+    )
+    consistency.add_argument("--stage", help="of a run, as for evaluate")
+    consistency.add_argument(
+        "--size", type=int, help="pixels along the longer side of the views (default: the scene's)"
+    )
+    consistency.add_argument("--json", type=Path, help="also write the figures to this file")
+
+    render = _run_parser(commands, "render", "render a run's test or training views")
+    render.add_argument("--views", choices=("test", "train"), default="test")
+    render.add_argument("--output", type=Path, help="folder (default: RUN/renders)")
+
+    _add_relight(_run_parser(commands, "relight", "show a run under another light"))
+
+    refine = _run_parser(
+        commands, "refine-cameras", "pose, focal length and exposure of every view of a run"
+    )
+    refine.add_argument("--output", type=Path, help="file (default: RUN/cameras.json)")
+
+    export = _run_parser(commands, "export", "mesh.glb, gaussians.ply and light.exr of a run")
+    export.add_argument("--output", type=Path, help="folder (default: RUN/export)")
+    export.add_argument("--vertex-colors", action="store_true", help="instead of textures")
+    export.add_argument("--texture-size", type=int, default=1024)
+
+    gradcheck = commands.add_parser(
+        "gradcheck", help="prove the gradients: float64 differences of every part"
+    )
+    gradcheck.add_argument(
+        "stages", nargs="*", metavar="PART", help=f"some of {', '.join(STAGES)} (default: all)"
+    )
+    gradcheck.add_argument("--sweep", action="store_true", help="show the error at every step size")
+    gradcheck.add_argument("--seed", type=int, default=0, help="of numbers, samples, directions")
+    gradcheck.add_argument("--json", type=Path, help="also write every comparison to this file")
+    return parser
+
+
+def _run_parser(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
+    """Add a command that works on a run."""
+    parser = commands.add_parser(name, help=text)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--scene", type=Path, help="where the run's scene is now, if it has moved")
+    return parser
+
+
+def _add_poses(poses: argparse.ArgumentParser) -> None:
+    """Describe the poses command."""
+    standard = PoseSettings()
+    poses.add_argument("folder", type=Path, help="photographs, in FOLDER/images or FOLDER")
+    poses.add_argument("--force", action="store_true", help="replace the cameras in FOLDER")
+    poses.add_argument(
+        "--size",
+        type=int,
+        default=standard.size,
+        help="pixels of the longer side that details are looked for in (default: %(default)s)",
+    )
+    poses.add_argument(
+        "--order",
+        choices=get_args(PoseSettings.__annotations__["order"]),
+        default=standard.order,
+        help="sequence: compare those that follow each other by name (default: every two)",
+    )
+    poses.add_argument(
+        "--lens",
+        choices=get_args(PoseSettings.__annotations__["lens"]),
+        default=standard.lens,
+        help="one for all photographs, or one for each (default: %(default)s)",
+    )
+    poses.add_argument("--seed", type=int, default=standard.seed, help="of random searches")
+
+
+def _add_samples(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--samples", type=int, default=DEFAULT_SAMPLES, help="rays per splat (default: %(default)s)"
+    )
+
+
+def _add_config_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what chooses the settings of a run."""
+    parser.add_argument("--preset", choices=PRESETS, default="default")
+    parser.add_argument("--quality", choices=QUALITIES, default="standard")
+    parser.add_argument(
+        "--material-prior",
+        choices=sorted(MATERIAL_PRIORS),
+        default="hybrid",
+        help="where roughness and metallic start (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--set",
+        dest="overrides",
+        action="append",
+        default=[],
+        metavar="SECTION.FIELD=VALUE",
+        help="change a setting; geosplat-jax settings lists them",
+    )
+    parser.add_argument("--seed", type=int, help="seed of every random choice")
+
+
+def _add_relight(relight: argparse.ArgumentParser) -> None:
+    """Describe the relight command."""
+    relight.add_argument(
+        "--env", type=Path, required=True, help="lat-long environment map: .hdr, .exr or an image"
+    )
+    relight.add_argument("--output", type=Path, help="folder (default: RUN/relight_NAME)")
+    relight.add_argument(
+        "--turntable", type=int, default=0, metavar="N", help="movie of N frames around the object"
+    )
+    relight.add_argument(
+        "--rotate-env", type=int, default=0, metavar="N", help="movie of N frames, the light turns"
+    )
+    relight.add_argument("--fps", type=float, default=24.0, help="frames a second of the movies")
+    relight.add_argument("--movie", choices=("gif", "mp4"), help="(default: mp4 if it can be made)")
+    relight.add_argument(
+        "--background", choices=BACKGROUNDS, default="light", help="(default: %(default)s)"
+    )
+    relight.add_argument("--intensity", type=float, default=1.0, help="factor of the light")
+    relight.add_argument(
+        "--albedo-scale", type=float, nargs=3, default=(1.0, 1.0, 1.0), metavar=("R", "G", "B")
+    )
+    _add_samples(relight)
+    relight.add_argument("--indirect", choices=RELIGHT_KINDS, default="traced")
+
+
+def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what tells how to read a scene."""
+    parser.add_argument("scene", type=Path, help="scene folder")
+    parser.add_argument(
+        "--downscale",
+        type=_downscale,
+        default=1,
+        metavar="N",
+        help="reduce the images by this factor; auto: by what the grid's cells can resolve",
+    )
+    parser.add_argument("--light", help="training light, where a scene has several")
+    parser.add_argument(
+        "--bounds",
+        type=float,
+        nargs=6,
+        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        help="box around the object (default: from masks and cameras)",
+    )
+    parser.add_argument(
+        "--cameras", type=Path, metavar="FILE", help="instead of the scene's: see refine-cameras"
+    )
+
+
+def _downscale(text: str) -> int | str:
+    """Read a factor, or ``auto``."""
+    return text if text == "auto" else int(text)
