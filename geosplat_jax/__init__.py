@@ -9,7 +9,7 @@
 """
 
 from geosplat_jax.core.types import Batch, Camera, EnvLight
-from geosplat_jax.fit.config import Config, Stage
+from geosplat_jax.fit.config import Budget, Config, Stage
 from geosplat_jax.fit.folder import RunError
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.train import Interrupted, Progress, TrainingError
@@ -23,6 +23,7 @@ from geosplat_jax.run import Run, train
 
 __all__ = [
     "Batch",
+    "Budget",
     "Camera",
     "Config",
     "Dataset",

@@ -16,15 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from geosplat_jax.core.types import Batch, EnvLight
+from geosplat_jax.fit.budget import Pacer, Plan, plan
 from geosplat_jax.fit.cameras import CameraSettings, ViewProgress, refine_views
-from geosplat_jax.fit.config import Config
+from geosplat_jax.fit.config import Budget, Config
+from geosplat_jax.fit.costs import expected_costs, slowness_of_machine
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.runtime import in_background
 from geosplat_jax.fit.stages import make_batch
 from geosplat_jax.fit.train import Progress, Trained, fit, load_trained
 from geosplat_jax.io.cameras import RefinedSplit, write_cameras
-from geosplat_jax.io.dataset import Dataset, load_recorded
+from geosplat_jax.io.dataset import Dataset, load_recorded, photograph_size
 from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.images import write_png
 from geosplat_jax.io.views import Views
@@ -342,6 +344,44 @@ class _Previews:
         write_png(self._folder / f"step_{trained.step:06d}.png", image)
 
 
+def plan_training(
+    scene: str | Path | Dataset,
+    budget: Budget,
+    *,
+    material_prior: str = "hybrid",
+    overrides: Sequence[str] = (),
+    downscale: int | None = None,
+    light: str | None = None,
+) -> Plan:
+    """Choose settings for a budget on this machine, whose speed is measured for a moment.
+
+    Parameters
+    ----------
+    scene : folder, or a dataset, whose photographs are then taken as they are.
+    budget, material_prior, overrides, downscale : see `budget.plan`.
+    light : that the photographs are to be read under.
+
+    Raises
+    ------
+    SceneError
+        See `load_dataset`.
+    TrainingError
+        See `budget.plan`.
+    """
+    if isinstance(scene, Dataset):
+        size, downscale = (scene.train.height, scene.train.width), 1
+    else:
+        size = photograph_size(scene, light=light)
+    return plan(
+        budget,
+        size,
+        slowness=slowness_of_machine(),
+        material_prior=material_prior,
+        overrides=overrides,
+        downscale=downscale,
+    )
+
+
 def train(
     scene: str | Path | Dataset,
     output: str | Path,
@@ -353,6 +393,7 @@ def train(
     source: str | Path | None = None,
     first_stage: str | None = None,
     on_step: Callable[[Progress], None] | None = None,
+    budget: Budget | None = None,
     **reading: Any,
 ) -> Run:
     """Train a scene into a run's folder.
@@ -363,6 +404,9 @@ def train(
     output : folder of the run.
     config : settings, see `make_config`; by default those of ``quality``.
     resume, force, source, first_stage, on_step : see `fit.train.fit`; ``force`` replaces a run.
+    budget : time and memory that the training may take. Without ``config``, settings are chosen for
+        it (`plan_training`); in any case steps are made fewer or more on the way, so that it ends
+        in time. A run that is resumed has what is left of it.
     reading : how to read the scene: ``downscale``, ``light``, ``bounds`` (six numbers),
         ``cameras`` (a file of `Run.refine_cameras`).
 
@@ -371,10 +415,18 @@ def train(
     SceneError, RunError, TrainingError, Interrupted
         See `load_dataset` and `fit.train.fit`.
     """
+    began, folder = time.perf_counter(), RunFolder(output)
+    if config is None and budget is not None:
+        chosen = plan_training(scene, budget, downscale=reading.get("downscale"))
+        config, reading = chosen.config, {**reading, "downscale": chosen.downscale}
     config = config or make_config(quality=quality)
     dataset = scene if isinstance(scene, Dataset) else load_recorded(scene, reading)
-    folder = RunFolder(output)
-    began = time.perf_counter()
+    pacer = None
+    if budget is not None:
+        pixels = float(dataset.train.height * dataset.train.width)
+        costs = expected_costs(config, pixels, slowness=slowness_of_machine())
+        used = folder.seconds_used() if resume else 0.0
+        pacer = Pacer(budget, config, costs, began=began - used)
     previews = _Previews(dataset, folder)
     try:
         fit(
@@ -387,6 +439,7 @@ def train(
             first_stage=first_stage,
             on_step=on_step,
             on_preview=previews,
+            pacer=pacer,
         )
     finally:
         previews.finish()

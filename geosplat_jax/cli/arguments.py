@@ -2,9 +2,11 @@
 
 import argparse
 import importlib.metadata
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, get_args
 
+from geosplat_jax.fit.budget import parse_duration, parse_memory
 from geosplat_jax.fit.presets import PRESETS, QUALITIES
 from geosplat_jax.gradcheck.report import STAGES
 from geosplat_jax.io.poses import PoseSettings
@@ -35,6 +37,19 @@ def command_line() -> argparse.ArgumentParser:
     _add_scene_arguments(train)
     train.add_argument("--output", type=Path, help="run folder (default: runs/SCENE)")
     _add_config_arguments(train)
+    train.add_argument(
+        "--budget",
+        type=_measured(parse_duration),
+        metavar="TIME",
+        help="90s, 5min, 2h: choose the settings that this machine has time for, and end in time "
+        "(instead of --quality and --preset)",
+    )
+    train.add_argument(
+        "--memory",
+        type=_measured(parse_memory),
+        metavar="SIZE",
+        help="with --budget: 4GB; as much as the machine has by default",
+    )
     start = train.add_mutually_exclusive_group()
     start.add_argument(
         "--resume", action="store_true", help="continue from the last checkpoint, or start again"
@@ -151,8 +166,8 @@ def _add_samples(parser: argparse.ArgumentParser) -> None:
 
 def _add_config_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what chooses the settings of a run."""
-    parser.add_argument("--preset", choices=PRESETS, default="default")
-    parser.add_argument("--quality", choices=QUALITIES, default="standard")
+    parser.add_argument("--preset", choices=PRESETS, help="method (default: default)")
+    parser.add_argument("--quality", choices=QUALITIES, help="work (default: standard)")
     parser.add_argument(
         "--material-prior",
         choices=sorted(MATERIAL_PRIORS),
@@ -216,6 +231,18 @@ def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cameras", type=Path, metavar="FILE", help="instead of the scene's: see refine-cameras"
     )
+
+
+def _measured(parse: Callable[[str], float]) -> Callable[[str], float]:
+    """Let argparse show what is wrong with a quantity."""
+
+    def read(text: str) -> float:
+        try:
+            return parse(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return read
 
 
 def _downscale(text: str) -> int | str:

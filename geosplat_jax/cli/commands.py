@@ -3,17 +3,16 @@
 import argparse
 import json
 from dataclasses import asdict
-from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from geosplat_jax.cli.display import ProgressDisplay, console, say
+from geosplat_jax.cli.display import console, say
+from geosplat_jax.cli.training import UsageError, config_from, scene_options, train
 from geosplat_jax.fit.cameras import ViewProgress
-from geosplat_jax.fit.config import Config, all_settings, config_warnings
+from geosplat_jax.fit.config import all_settings
 from geosplat_jax.fit.gauge import change_lines
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.gradcheck.report import (
@@ -27,7 +26,7 @@ from geosplat_jax.gradcheck.report import (
     to_records,
 )
 from geosplat_jax.io.agreement import agreement_lines
-from geosplat_jax.io.dataset import choose_downscale, describe, load_recorded
+from geosplat_jax.io.dataset import describe, load_recorded
 from geosplat_jax.io.export import LARGEST_TEXTURE
 from geosplat_jax.io.poses import PoseSettings, find_poses
 from geosplat_jax.report.consistency import (
@@ -43,7 +42,6 @@ from geosplat_jax.report.consistency import (
 from geosplat_jax.report.relight import RelightOptions
 from geosplat_jax.report.renderer import LARGEST_SAMPLES
 from geosplat_jax.run import Run
-from geosplat_jax.run import train as train_run
 
 _SHEETS = ("overview.png", "materials.png", "relight.png")
 
@@ -52,32 +50,9 @@ class GradientError(RuntimeError):
     """A gradient disagrees with differences; the message says where."""
 
 
-class UsageError(ValueError):
-    """A command cannot run as it was called; the message says what to change."""
-
-
-def _scene_options(arguments: argparse.Namespace, config: Config) -> dict[str, Any]:
-    """Return what `load_recorded` needs, in a form that JSON keeps; say what was chosen."""
-    options = {
-        "light": arguments.light,
-        "bounds": arguments.bounds,
-        "cameras": arguments.cameras,
-    }
-    if arguments.downscale != "auto":
-        return {**options, "downscale": arguments.downscale}
-    cells = getattr(config.geometry, "resolution", None)
-    if cells is None:
-        raise UsageError("--downscale auto needs a surface of cells; give a number")
-    corners = arguments.bounds
-    reading = {**options, "bounds": None if corners is None else (corners[:3], corners[3:])}
-    chosen = choose_downscale(arguments.scene, cells, **reading)
-    say(chosen.reason)
-    return {**options, "downscale": chosen.factor}
-
-
 def _info(arguments: argparse.Namespace) -> None:
     """Print what was recognised, and whether masks and cameras agree."""
-    dataset = load_recorded(arguments.scene, _scene_options(arguments, make_config()))
+    dataset = load_recorded(arguments.scene, scene_options(arguments, make_config()))
     print(describe(dataset))
     for line in agreement_lines(dataset.train, dataset.bounds):
         print(f"  {line}")
@@ -120,53 +95,13 @@ def _poses(arguments: argparse.Namespace) -> None:
     )
 
 
-def _config_from(arguments: argparse.Namespace) -> Config:
-    """Return the configuration that the arguments ask for."""
-    overrides = list(arguments.overrides)
-    if arguments.seed is not None:
-        overrides.append(f"run.seed={arguments.seed}")
-    return make_config(
-        arguments.preset,
-        arguments.quality,
-        material_prior=arguments.material_prior,
-        overrides=tuple(overrides),
-    )
-
-
-def _train(arguments: argparse.Namespace) -> None:
-    """Train a scene into a run's folder, with progress on the terminal."""
-    if (arguments.source is None) != (arguments.stage is None):
-        raise UsageError("--from RUN and --stage NAME belong together")
-    config = _config_from(arguments)
-    folder = arguments.output or Path("runs") / arguments.scene.resolve().name
-    dataset = load_recorded(arguments.scene, _scene_options(arguments, config))
-    for note in dataset.notes:
-        say(note)
-    for warning in (*dataset.warnings, *config_warnings(config)):
-        say(warning, label="warning: ", style="yellow")
-    say(f"{dataset.name}: {len(dataset.train)} views, {dataset.layout}; compiling ...")
-    with ProgressDisplay(config.total_steps) as display:
-        run = train_run(
-            dataset,
-            folder,
-            config,
-            resume=arguments.resume,
-            force=arguments.force,
-            source=arguments.source,
-            first_stage=arguments.stage,
-            on_step=display.show,
-        )
-    seconds = (run.folder.training() or {})["seconds_total"]
-    say(f"trained in {seconds:.0f} s; next: geosplat-jax evaluate {folder}")
-
-
 def _settings(arguments: argparse.Namespace) -> None:
     """List settings with their values under the chosen preset and quality."""
     table = Table(box=None, pad_edge=False)
     for title in ("setting", "value", "range", "meaning"):
         table.add_column(title, overflow="fold")
     rows = [
-        row for row in all_settings(_config_from(arguments)) if row[0].startswith(arguments.prefix)
+        row for row in all_settings(config_from(arguments)) if row[0].startswith(arguments.prefix)
     ]
     if not rows:
         raise UsageError(f"no setting begins with {arguments.prefix!r}")
@@ -331,7 +266,7 @@ def _gradcheck(arguments: argparse.Namespace) -> None:
 COMMANDS = {
     "info": _info,
     "poses": _poses,
-    "train": _train,
+    "train": train,
     "settings": _settings,
     "evaluate": _evaluate,
     "consistency": _consistency,

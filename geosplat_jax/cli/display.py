@@ -68,6 +68,7 @@ class ProgressDisplay:
             self._bar.update(
                 self._task,
                 completed=progress.step,
+                total=progress.steps,  # a budget changes it
                 stage=progress.stage,
                 loss=progress.total,
                 psnr=progress.psnr,

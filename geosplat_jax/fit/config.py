@@ -51,6 +51,16 @@ class Rate:
 
 
 @settings
+class Pace:
+    """A change of how fast a stage goes through its schedule."""
+
+    step: Count = 0
+    """Steps after the stage's start that were made before."""
+    speed: Positive = 1.0
+    """Steps of the schedule to one step from here on."""
+
+
+@settings
 class Stage:
     """A part of a run with settings of its own; Adam starts afresh, schedules count from its start.
 
@@ -82,10 +92,29 @@ class Stage:
     """Learning rates by group of parameters."""
     weights: dict[str, Schedule] = field(default_factory=dict)
     """Weights of the loss by term."""
+    pace: tuple[Pace, ...] = ()
+    """What a budget of time changed on the way (`budget.Pacer`), in order."""
+
+    def position(self, step: int) -> float:
+        """Tell how far the schedules are, ``step`` steps after the stage's start.
+
+        In steps of a stage that keeps its pace: all half-lives and warm-ups are counted in these.
+        """
+        begun, reached, speed = 0, 0.0, 1.0
+        for change in self.pace:
+            if step <= change.step:
+                break
+            reached += (change.step - begun) * speed
+            begun, speed = change.step, change.speed
+        return reached + (step - begun) * speed
+
+    def progress(self, step: int) -> float:
+        """Tell the share of the schedules that is behind, from 0 to 1."""
+        return self.position(step) / max(self.position(self.steps), 1.0)
 
     def weights_at(self, step: int) -> dict[str, float]:
         """Weights of all terms that ever count, ``step`` steps after the stage's start."""
-        progress = step / max(self.steps, 1)
+        progress = self.progress(step)
         return {
             name: schedule.at(progress)
             for name, schedule in self.weights.items()
@@ -94,10 +123,11 @@ class Stage:
 
     def rates_at(self, step: int) -> dict[str, float]:
         """Learning rates of all groups, ``step`` steps after the stage's start."""
+        position = self.position(step)
         return {
             name: rate.value
-            * 0.5 ** (step / (rate.half_life or self.half_life))
-            * (min((step + 1) / rate.warmup, 1.0) ** 2 if rate.warmup else 1.0)
+            * 0.5 ** (position / (rate.half_life or self.half_life))
+            * (min((position + 1) / rate.warmup, 1.0) ** 2 if rate.warmup else 1.0)
             for name, rate in self.rates.items()
         }
 
@@ -105,6 +135,16 @@ class Stage:
     def frozen(self) -> tuple[str, ...]:
         """Groups whose rate is zero."""
         return tuple(sorted(name for name, rate in self.rates.items() if rate.value == 0))
+
+
+@settings
+class Budget:
+    """What a training may take, see `budget.plan`."""
+
+    seconds: Positive
+    """From the start of the command to the last checkpoint, compilation included."""
+    memory: Positive | None = None
+    """Largest resident memory, bytes; none is as much as the machine has."""
 
 
 @settings
@@ -448,7 +488,7 @@ def config_warnings(config: Config) -> list[str]:
     warnings = []
     for stage in config.active_stages:
         for name, rate in stage.rates.items():
-            if rate.warmup > stage.steps:
+            if rate.warmup > stage.position(stage.steps):
                 warnings.append(
                     f"stages.{stage.name}.rates.{name}.warmup = {rate.warmup} is longer than the "
                     f"stage's {stage.steps} steps: the full rate will not be reached; half of the "

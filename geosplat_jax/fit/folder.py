@@ -18,14 +18,14 @@ import platform
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
 
 from geosplat_jax.core.settings import PositiveCount, first_line, from_plain, settings
-from geosplat_jax.fit.config import Config, config_from_dict
+from geosplat_jax.fit.config import Budget, Config, config_from_dict
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.documents import parse_json
 
@@ -214,7 +214,32 @@ class RunFolder:
                 "choose another --output"
             )
 
-    def begin(self, dataset: Dataset, config: Config, *, replace: bool) -> None:
+    def budget(self) -> Budget | None:
+        """Read what the run may take; None where nobody said.
+
+        Raises
+        ------
+        RunError
+            If the record is damaged.
+        """
+        values = self.record().get("budget")
+        try:
+            return None if values is None else from_plain(Budget, values, "budget")
+        except ValueError as error:
+            raise RunError(f"{self._record_path} is damaged: {first_line(error)}") from None
+
+    def seconds_used(self) -> float:
+        """Add up what the steps took that are in ``metrics.jsonl``."""
+        return sum(float(line.get("seconds", 0.0)) for line in self.metric_lines())
+
+    def begin(
+        self,
+        dataset: Dataset,
+        config: Config,
+        *,
+        replace: bool,
+        budget: Budget | None = None,
+    ) -> None:
         """Write the record of a new run; call it with the lock held.
 
         Raises
@@ -228,6 +253,7 @@ class RunFolder:
             {
                 **_scene_of(dataset),
                 "config": config.to_dict(),
+                **({} if budget is None else {"budget": asdict(budget)}),
                 "versions": {
                     "python": platform.python_version(),
                     **{name: importlib.metadata.version(name) for name in _PACKAGES},
@@ -272,6 +298,10 @@ class RunFolder:
                     f"{self._record_path} says that the run was trained on {record['scene']} with "
                     f"{name} {record[name]}, not {now[name]}; take the same, or another folder"
                 )
+
+    def amend(self, config: Config) -> None:
+        """Record other settings, which a training has come to on its way."""
+        self._write_record({**self.record(), "config": config.to_dict()})
 
     def _write_record(self, record: dict[str, Any]) -> None:
         """Replace ``run.json`` in one go."""

@@ -81,6 +81,11 @@ class Loop:
         """Steps of the run that are done."""
         return int(self.state.step)
 
+    @property
+    def steps_of_stage(self) -> int:
+        """Steps of the present stage that are done."""
+        return self._since(self.step)
+
     def _since(self, step: int) -> int:
         """Count the steps since the start of the stage."""
         return step - self.config.first_step(self.stage.name)
@@ -131,6 +136,11 @@ class Loop:
         if following is not None and self.upcoming is None:
             self.upcoming = Upcoming(self, following, self.to_come)
 
+    def retime(self, config: Config) -> None:
+        """Go on with stages of other lengths; what was done stays as it was."""
+        self.folder.amend(config)
+        self.config, self.stage = config, config.stage(self.stage.name)
+
     def close(self) -> None:
         """Leave nothing behind that still runs."""
         if self.upcoming is not None:
@@ -142,7 +152,7 @@ class Loop:
         ``known`` : sizes that hold what the stage begins with; None where it begins anew.
         """
         upcoming = self.upcoming
-        if upcoming is not None and upcoming.stage == self.stage:
+        if upcoming is not None and upcoming.stage.name == self.stage.name:
             self.upcoming = None
             upcoming.compiled.result()
             return upcoming.capacities

@@ -33,6 +33,8 @@ from geosplat_jax.transport.split_sum import SplitSumSettings
 
 PRESETS = ("default", "paper", "code")
 QUALITIES = ("draft", "standard", "high")
+BETWEEN = "between"
+"""The label of settings that lie between the quality levels."""
 SPLIT_SUM, MONTE_CARLO, REFINE = "split_sum", "monte_carlo", "refine"
 """Names of the stages of every preset."""
 
@@ -351,6 +353,47 @@ _ORIGINAL_DRAFT: dict[str, Any] = {
         },
     },
 }
+
+
+def between_qualities(
+    place: float, *, material_prior: str = "hybrid", overrides: tuple[str, ...] = ()
+) -> Config:
+    """Return settings of the preset ``default`` between its quality levels.
+
+    Numbers are interpolated in their logarithms; what is no number, and a stage that the lower
+    level leaves out, are the lower level's until the higher one is reached.
+
+    Parameters
+    ----------
+    place : from 0, `QUALITIES`' first, to its last, each one further.
+    material_prior, overrides : see `make_config`.
+    """
+    below = min(int(place), len(QUALITIES) - 2)
+    low, high = (
+        make_config("default", QUALITIES[number], material_prior=material_prior).to_dict()
+        for number in (below, below + 1)
+    )
+    values = {**_interpolated(low, high, place - below), "quality": BETWEEN}
+    for override in overrides:
+        values = merge(values, parse_override(override))
+    return config_from_dict(values)
+
+
+def _interpolated(low: Any, high: Any, share: float) -> Any:
+    """Interpolate what two nested dictionaries have as positive numbers."""
+    if isinstance(low, dict):
+        # A mapping of names, such as rates, may lack some on one side.
+        return {
+            name: _interpolated(value, high[name], share) if name in high else value
+            for name, value in low.items()
+        }
+    if share >= 1.0 or low == high:
+        return high if share >= 1.0 else low
+    is_number = all(isinstance(x, int | float) and not isinstance(x, bool) for x in (low, high))
+    if not is_number or min(low, high) <= 0:
+        return low
+    value = low * (high / low) ** share
+    return round(value) if isinstance(low, int) else value
 
 
 def make_config(

@@ -40,7 +40,7 @@ def build_pipeline(config: Config, stage: Stage, surface: SurfaceModel) -> Pipel
 
 def pipeline_at(pipeline: Pipeline, config: Config, stage: Stage, step: int) -> Pipeline:
     """Return a stage's pipeline as it is ``step`` steps after the stage's start."""
-    samples_vertices = step < stage.vertex_fraction * stage.steps
+    samples_vertices = stage.progress(step) < stage.vertex_fraction
     splats = VertexSplatSettings() if samples_vertices else stage.splats
     return replace(
         pipeline, splats=splats.build(config.adapter), weights=_arrays(stage.weights_at(step))

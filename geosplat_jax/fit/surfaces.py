@@ -42,6 +42,16 @@ class SurfaceSettings(Variant, abc.ABC):
         """Largest sensible need of a buffer, by name; beyond it the surface has exploded."""
         return {}
 
+    @property
+    def cells_along(self) -> int | None:
+        """Cells along the longest side of the box; None for a surface without a grid."""
+        return None
+
+    @property
+    def expected_splats(self) -> int:
+        """Guess how many splats there will be, before any surface is known."""
+        return 60_000
+
     def parameter_bytes(self, bounds: Bounds) -> int:
         """Count the memory that the shape takes which `start` makes; 0 where that is not known.
 
@@ -101,6 +111,16 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
     def limits(self) -> dict[str, int]:
         """As many quads as ``max_quads``."""
         return {"quads": self.max_quads}
+
+    @property
+    def cells_along(self) -> int:
+        """Cells along the longest side of the box."""
+        return self.resolution
+
+    @property
+    def expected_splats(self) -> int:
+        """Guess the splats: from 30 (a bottle) to 60 (a duck) times the square of the cells."""
+        return 50 * self.resolution**2
 
     def start(self, dataset: Dataset, key: Key[Array, ""]) -> tuple[FlexiCubes, Geometry]:
         """Fit a grid to the object and fill it with a first surface."""

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from geosplat_jax.fit.budget import Pacer
 from geosplat_jax.fit.config import Config
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.loop import Loop, adopted_loop, new_loop, resumed_loop
@@ -117,7 +118,7 @@ class _Clock:
     """Estimates the time left from the steps of each stage that compiled nothing."""
 
     def __init__(self, config: Config) -> None:
-        self._config = config
+        self.config = config
         self._began = time.perf_counter()
         self._seconds: dict[str, list[float]] = {}
 
@@ -137,7 +138,7 @@ class _Clock:
         transport costs more. Compilations to come are not foreseen.
         """
         total, end, known = 0.0, 0, None
-        for stage in self._config.active_stages:
+        for stage in self.config.active_stages:
             end += stage.steps
             steps = self._seconds.get(stage.name, [])
             cost = stage.transport.relative_cost
@@ -162,6 +163,7 @@ def fit(
     stop_after: int | None = None,
     on_step: Callable[[Progress], None] | None = None,
     on_preview: Callable[[Trained], None] | None = None,
+    pacer: Pacer | None = None,
 ) -> TrainState:
     """Train on a dataset and leave a run's folder; see `folder.RunFolder`.
 
@@ -178,6 +180,8 @@ def fit(
     stop_after : stop, with a checkpoint, once so many steps are done (for tests and schedulers).
     on_step : called after every step.
     on_preview : called every ``run.preview_every`` steps, and once early.
+    pacer : keeps the training to a budget of time by changing the steps to come; ``run.json`` says
+        how many there were in the end.
 
     Raises
     ------
@@ -206,16 +210,16 @@ def fit(
             if not (resume and run.exists):
                 run.require_free(replace=replace_run)
                 loop = _first_loop(dataset, config, run, source, first_stage)
-                run.begin(dataset, config, replace=replace_run)
+                budget = None if pacer is None else pacer.budget
+                run.begin(dataset, config, replace=replace_run, budget=budget)
                 has_begun = True
                 if source is not None:
                     loop.save_end()
             else:
                 run.repoint(dataset)
                 loop = resumed_loop(dataset, config, run)
-            last = min(config.total_steps, stop_after or config.total_steps)
             try:
-                return _train(loop, last, stop_requested, on_step, on_preview)
+                return _train(loop, stop_after, stop_requested, on_step, on_preview, pacer)
             finally:
                 loop.close()
         except KeyboardInterrupt:
@@ -243,18 +247,36 @@ def _first_loop(
     return adopted_loop(dataset, config, run, other, first_stage)
 
 
+def _keep_pace(loop: Loop, pacer: Pacer, seconds: float | None) -> None:
+    """Change the steps to come where the time that is left asks for it.
+
+    ``seconds`` : of the last step; None where it waited for a compiler.
+    """
+    stage = loop.stage
+    if seconds is not None:
+        pacer.note(stage.name, seconds)
+    adjusted = pacer.adjusted(loop.config, stage, loop.steps_of_stage)
+    if adjusted is not None:
+        loop.retime(adjusted)
+
+
 def _train(
     loop: Loop,
-    last: int,
+    stop_after: int | None,
     stop_requested: Callable[[], bool],
     on_step: Callable[[Progress], None] | None,
     on_preview: Callable[[Trained], None] | None,
+    pacer: Pacer | None,
 ) -> TrainState:
-    """Make steps until ``last`` are done."""
-    config, clock = loop.config, _Clock(loop.config)
+    """Make steps until all are done, or ``stop_after``."""
+    clock = _Clock(loop.config)
     loop.folder.keep_lines_before(loop.step)
+
+    def last_step() -> int:
+        return min(loop.config.total_steps, stop_after or loop.config.total_steps)
+
     with loop.folder.metrics.open("a", encoding="utf-8") as metrics:
-        for step in range(loop.step, last):
+        while (step := loop.step) < last_step():
             began, loop.has_compiled = time.perf_counter(), False
             loop.prepare(step)
             report = loop.advance(step)
@@ -265,6 +287,10 @@ def _train(
             done = step + 1
             if not loop.has_compiled:
                 clock.note(loop.stage.name, seconds)
+            if pacer is not None:
+                _keep_pace(loop, pacer, None if loop.has_compiled else seconds)
+                clock.config = loop.config
+            config, last = loop.config, last_step()
             if on_step is not None:
                 on_step(
                     Progress(
@@ -275,7 +301,7 @@ def _train(
                         psnr=line["psnr"],
                         splat_count=line["splats"],
                         seconds=clock.elapsed,
-                        seconds_left=clock.left(done),
+                        seconds_left=clock.left(done) if pacer is None else pacer.seconds_left,
                     )
                 )
             if done % config.run.checkpoint_every == 0 or done == last or stop_requested():

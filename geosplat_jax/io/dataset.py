@@ -218,6 +218,22 @@ def load_recorded(path: str | Path, options: Mapping[str, Any]) -> Dataset:
     )
 
 
+def photograph_size(
+    path: str | Path, *, layout: str | None = None, light: str | None = None
+) -> tuple[int, int]:
+    """Height and width of a scene's first training photograph, as it is on disk.
+
+    Raises
+    ------
+    SceneError : see `load_dataset`.
+    """
+    root = Path(path).expanduser()
+    if not root.is_dir():
+        raise MissingFileError(f"scene folder {root} does not exist")
+    listing = LAYOUTS[layout or recognise_layout(root)].list_frames(root, light=light)
+    return image_size(listing.train[0].image)
+
+
 class Downscale(NamedTuple):
     """A factor to read a scene with, and a sentence that says why."""
 

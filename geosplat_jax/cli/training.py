@@ -1,0 +1,130 @@
+"""The train command: what its options ask for, and the training with progress on the terminal."""
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from geosplat_jax.cli.display import ProgressDisplay, say
+from geosplat_jax.fit.config import Budget, Config, config_warnings
+from geosplat_jax.fit.folder import RunFolder
+from geosplat_jax.fit.presets import make_config
+from geosplat_jax.io.dataset import choose_downscale, load_recorded
+from geosplat_jax.run import plan_training
+from geosplat_jax.run import train as train_run
+
+
+class UsageError(ValueError):
+    """A command cannot run as it was called; the message says what to change."""
+
+
+def scene_options(arguments: argparse.Namespace, config: Config) -> dict[str, Any]:
+    """Return what `load_recorded` needs, in a form that JSON keeps; say what was chosen."""
+    options = {
+        "light": arguments.light,
+        "bounds": arguments.bounds,
+        "cameras": arguments.cameras,
+    }
+    if arguments.downscale != "auto":
+        return {**options, "downscale": arguments.downscale}
+    cells = config.geometry.cells_along
+    if cells is None:
+        raise UsageError("--downscale auto needs a surface of cells; give a number")
+    corners = arguments.bounds
+    reading = {**options, "bounds": None if corners is None else (corners[:3], corners[3:])}
+    chosen = choose_downscale(arguments.scene, cells, **reading)
+    say(chosen.reason)
+    return {**options, "downscale": chosen.factor}
+
+
+def config_from(arguments: argparse.Namespace) -> Config:
+    """Return the configuration that the arguments ask for."""
+    return make_config(
+        arguments.preset or "default",
+        arguments.quality or "standard",
+        material_prior=arguments.material_prior,
+        overrides=_overrides(arguments),
+    )
+
+
+def _overrides(arguments: argparse.Namespace) -> tuple[str, ...]:
+    """Return what ``--set`` and ``--seed`` change."""
+    seed = () if arguments.seed is None else (f"run.seed={arguments.seed}",)
+    return (*arguments.overrides, *seed)
+
+
+@dataclass(frozen=True)
+class _Order:
+    """What a training was asked for.
+
+    Attributes
+    ----------
+    config : settings.
+    reading : how to read the scene, see `load_recorded`.
+    budget : that it has to keep to; None for as long as it takes.
+    """
+
+    config: Config
+    reading: dict[str, Any]
+    budget: Budget | None = None
+
+
+def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
+    """Read from the options, or from the run that is resumed, what is to be done; say it."""
+    if arguments.resume and folder.exists and folder.budget() is not None:
+        if arguments.budget is not None or arguments.memory is not None:
+            raise UsageError(f"{folder} keeps its budget; leave --budget and --memory out")
+        # Its settings were chosen for the budget, and have changed since.
+        return _Order(folder.config(), folder.record()["dataset"], folder.budget())
+    if arguments.budget is None:
+        if arguments.memory is not None:
+            raise UsageError("--memory belongs to --budget")
+        config = config_from(arguments)
+        return _Order(config, scene_options(arguments, config))
+    if arguments.quality is not None or arguments.preset is not None:
+        raise UsageError("--budget chooses the settings; leave --quality and --preset out")
+    if arguments.source is not None:
+        raise UsageError("--budget plans a whole training; leave --from out")
+    budget = Budget(arguments.budget, arguments.memory)
+    is_chosen = arguments.downscale in ("auto", 1)
+    plan = plan_training(
+        arguments.scene,
+        budget,
+        material_prior=arguments.material_prior,
+        overrides=_overrides(arguments),
+        downscale=None if is_chosen else arguments.downscale,
+        light=arguments.light,
+    )
+    for line in plan.describe():
+        say(line)
+    arguments.downscale = plan.downscale
+    return _Order(plan.config, scene_options(arguments, plan.config), budget)
+
+
+def train(arguments: argparse.Namespace) -> None:
+    """Train a scene into a run's folder, with progress on the terminal."""
+    if (arguments.source is None) != (arguments.stage is None):
+        raise UsageError("--from RUN and --stage NAME belong together")
+    folder = arguments.output or Path("runs") / arguments.scene.resolve().name
+    order = _ordered(arguments, RunFolder(folder))
+    config = order.config
+    dataset = load_recorded(arguments.scene, order.reading)
+    for note in dataset.notes:
+        say(note)
+    for warning in (*dataset.warnings, *config_warnings(config)):
+        say(warning, label="warning: ", style="yellow")
+    say(f"{dataset.name}: {len(dataset.train)} views, {dataset.layout}; compiling ...")
+    with ProgressDisplay(config.total_steps) as display:
+        run = train_run(
+            dataset,
+            folder,
+            config,
+            resume=arguments.resume,
+            force=arguments.force,
+            source=arguments.source,
+            first_stage=arguments.stage,
+            on_step=display.show,
+            budget=order.budget,
+        )
+    seconds = (run.folder.training() or {})["seconds_total"]
+    say(f"trained in {seconds:.0f} s; next: geosplat-jax evaluate {folder}")

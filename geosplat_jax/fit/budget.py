@@ -1,0 +1,304 @@
+"""A training that ends when it should: settings chosen for a time, and a pace that keeps to it.
+
+`plan` picks settings between the quality levels by what they are expected to cost on this machine.
+`Pacer` measures the steps while they are made, and makes what is left of every stage shorter or
+longer; schedules are stretched with it, so that a training which is cut short has decayed to its
+end as well.
+"""
+
+import math
+import re
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from geosplat_jax.fit.config import Budget, Config, Pace, Stage
+from geosplat_jax.fit.costs import (
+    StageCost,
+    expected_costs,
+    expected_memory,
+    expected_seconds,
+)
+from geosplat_jax.fit.planning import TrainingError
+from geosplat_jax.fit.presets import QUALITIES, between_qualities
+
+_EFFORTS = tuple(0.25 * number for number in range(4 * (len(QUALITIES) - 1) + 1))
+"""Places between the quality levels that are tried, in order of cost."""
+
+_SHORTEST, _LONGEST = 0.4, 3.0
+"""How far the steps of a stage may be scaled for a plan, and made more of on the way."""
+
+_PIXELS_PER_CELL = 6.0
+"""Photographs are reduced until their longer side has at most so many pixels for each cell."""
+
+_TIMED = 5
+"""Steps that an estimate takes at least."""
+
+_RECENT = 20
+"""Steps that an estimate takes at most, the last ones."""
+
+_EVERY = 10
+"""Steps between two looks at the clock."""
+
+_TOLERANCE = 0.04
+"""A deviation from the time that is left without a change of pace."""
+
+_FEWEST = 0.1
+"""Share of a stage's planned steps that is made however late it is."""
+
+_UNITS = {"s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
+_BYTES = {"mb": 1e6, "mib": 2.0**20, "gb": 1e9, "gib": 2.0**30}
+
+
+def parse_duration(text: str) -> float:
+    """Turn ``90s``, ``5min`` or ``1.5h`` into seconds.
+
+    Raises
+    ------
+    ValueError
+        If it has another form.
+    """
+    return _quantity(text, _UNITS, "a time reads 90s, 5min or 1.5h")
+
+
+def parse_memory(text: str) -> float:
+    """Turn ``800MB`` or ``4GB`` into bytes; GiB and MiB are powers of two.
+
+    Raises
+    ------
+    ValueError
+        If it has another form.
+    """
+    return _quantity(text, _BYTES, "a memory size reads 800MB, 4GB or 4GiB")
+
+
+def _quantity(text: str, units: Mapping[str, float], form: str) -> float:
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([a-zA-Z]+)\s*", text)
+    if match is None or match[2].lower() not in units or float(match[1]) <= 0:
+        raise ValueError(f"{form}, got {text!r}")
+    return float(match[1]) * units[match[2].lower()]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Settings that were chosen for a budget, and what they are expected to take.
+
+    Attributes
+    ----------
+    config : the settings.
+    downscale : factor that the photographs are to be reduced by.
+    effort : where it lies between the quality levels, 0 to 2.
+    costs : of its stages, by name.
+    seconds, memory : expected; the training and its largest resident memory in bytes.
+    """
+
+    config: Config
+    downscale: int
+    effort: float
+    costs: Mapping[str, StageCost]
+    seconds: float
+    memory: float
+
+    def describe(self) -> list[str]:
+        """Say what was chosen, for people to read."""
+        stages = ", ".join(
+            f"{stage.name} {stage.steps} steps of {stage.batch_views} views "
+            f"({self.costs[stage.name].step:.2f} s each)"
+            for stage in self.config.active_stages
+        )
+        place = _place(self.effort)
+        return [
+            f"budget: {place}; {self.config.geometry.cells_along} cells, photographs reduced by "
+            f"{self.downscale}",
+            f"budget: {stages}",
+            f"budget: about {self.seconds:.0f} s and {self.memory / 1e9:.1f} GB are expected",
+        ]
+
+
+def _place(effort: float) -> str:
+    """Say where an effort lies."""
+    below = min(int(effort), len(QUALITIES) - 2)
+    share = effort - below
+    if share in (0.0, 1.0):
+        return f"as much as quality {QUALITIES[below + int(share)]}"
+    return f"{share:.0%} of the way from quality {QUALITIES[below]} to {QUALITIES[below + 1]}"
+
+
+def plan(
+    budget: Budget,
+    size: tuple[int, int],
+    *,
+    slowness: float,
+    material_prior: str = "hybrid",
+    overrides: Sequence[str] = (),
+    downscale: int | None = None,
+) -> Plan:
+    """Choose the settings that a budget pays for.
+
+    The most that fits with the steps of its own, these then scaled to fill the time.
+
+    Parameters
+    ----------
+    budget : time and memory.
+    size : height and width of the photographs as they are.
+    slowness : of this machine, see `costs.slowness_of_machine`.
+    material_prior, overrides : see `presets.make_config`.
+    downscale : of the photographs; chosen where it is not given.
+
+    Raises
+    ------
+    TrainingError
+        If the time or the memory is too small for anything.
+    """
+    candidates = [
+        _candidate(effort, size, slowness, material_prior, tuple(overrides), downscale)
+        for effort in _EFFORTS
+    ]
+    if budget.memory is not None:
+        fitting = [one for one in candidates if one.memory <= budget.memory]
+        if not fitting:
+            raise TrainingError(
+                f"about {candidates[0].memory / 1e9:.1f} GB are the least that a training takes, "
+                f"more than --memory allows ({budget.memory / 1e9:.1f} GB)"
+            )
+        candidates = fitting
+    affordable = [one for one in candidates if one.seconds <= budget.seconds]
+    chosen = affordable[-1] if affordable else candidates[0]
+    waits = sum(cost.startup for cost in chosen.costs.values())
+    share = (budget.seconds - waits) / (chosen.seconds - waits)
+    if share < _SHORTEST:
+        least = waits + _SHORTEST * (chosen.seconds - waits)
+        raise TrainingError(
+            f"a budget of {budget.seconds:.0f} s is too short: with programs that are compiled, "
+            f"the least is about {least:.0f} s on this machine"
+        )
+    config = with_steps(chosen.config, min(share, _LONGEST))
+    return replace(chosen, config=config, seconds=expected_seconds(config, chosen.costs))
+
+
+def _candidate(
+    effort: float,
+    size: tuple[int, int],
+    slowness: float,
+    material_prior: str,
+    overrides: tuple[str, ...],
+    downscale: int | None,
+) -> Plan:
+    """Return the settings of an effort with what they are expected to take."""
+    config = between_qualities(effort, material_prior=material_prior, overrides=overrides)
+    if downscale is None:
+        wanted = _PIXELS_PER_CELL * (config.geometry.cells_along or max(size))
+        downscale = max(1, math.floor(max(size) / wanted + 0.5))
+    pixels = float((size[0] // downscale) * (size[1] // downscale))
+    costs = expected_costs(config, pixels, slowness=slowness)
+    seconds = expected_seconds(config, costs)
+    return Plan(config, downscale, effort, costs, seconds, expected_memory(config))
+
+
+def with_steps(config: Config, share: float) -> Config:
+    """Scale the steps of all stages, and their schedules with them."""
+    return replace(config, stages=tuple(_scaled(stage, 0, share) for stage in config.stages))
+
+
+def _scaled(
+    stage: Stage, done: int, share: float, fewest: int = 1, most: int | None = None
+) -> Stage:
+    """Scale the steps that a stage has left after ``done`` ones; its schedules end as they would.
+
+    ``fewest`` : steps that are left at least. ``most`` : of the whole stage.
+    """
+    left = stage.steps - done
+    if left <= 0:
+        return stage
+    remaining = round(share * left)
+    if most is not None:
+        remaining = min(remaining, most - done)
+    remaining = max(remaining, min(fewest, left))
+    if remaining == left:
+        return stage
+    speed = (stage.position(stage.steps) - stage.position(done)) / remaining
+    pace = (*(change for change in stage.pace if change.step < done), Pace(done, speed))
+    return replace(stage, steps=done + remaining, pace=pace)
+
+
+class Pacer:
+    """Keeps a training to its time; everything that it knows of time comes from ``clock``.
+
+    Parameters
+    ----------
+    budget : what the training may take.
+    config : as it was planned. costs : of its stages, as they were expected.
+    clock : seconds, of any start. began : when the command began, by the clock.
+    """
+
+    def __init__(
+        self,
+        budget: Budget,
+        config: Config,
+        costs: Mapping[str, StageCost],
+        *,
+        clock: Callable[[], float] = time.perf_counter,
+        began: float | None = None,
+    ) -> None:
+        self.budget = budget
+        self._clock = clock
+        self._end = (clock() if began is None else began) + budget.seconds
+        self._costs = costs
+        self._planned = {stage.name: stage.steps for stage in config.active_stages}
+        self._measured: dict[str, list[float]] = {}
+
+    @property
+    def seconds_left(self) -> float:
+        """Seconds that the budget leaves."""
+        return self._end - self._clock()
+
+    def note(self, stage: str, seconds: float) -> None:
+        """Take the time of a step into account that waited for no compiler."""
+        self._measured.setdefault(stage, []).append(seconds)
+
+    def adjusted(self, config: Config, stage: Stage, done: int) -> Config | None:
+        """Return settings with other steps to come; None where those in use will do.
+
+        Parameters
+        ----------
+        config : in use. stage : that runs. done : its steps that were made.
+        """
+        if done % _EVERY or len(self._measured.get(stage.name, ())) < _TIMED:
+            return None
+        here = config.stage_names.index(stage.name)
+        later = [other for other in config.stages[here + 1 :] if other.steps]
+        left = stage.steps - done
+        work = left * self._step_seconds(stage.name)
+        work += sum(other.steps * self._step_seconds(other.name) for other in later)
+        if work <= 0.0 or left <= _EVERY:
+            return None
+        waits = sum(self._costs[other.name].startup for other in later)
+        share = max(self.seconds_left - waits, 0.0) / work
+        if abs(share - 1.0) <= _TOLERANCE:
+            return None
+        stages = [
+            *config.stages[:here],
+            self._scaled(stage, done, share),
+            *(self._scaled(other, 0, share) for other in config.stages[here + 1 :]),
+        ]
+        adjusted = replace(config, stages=tuple(stages))
+        return None if adjusted == config else adjusted
+
+    def _scaled(self, stage: Stage, done: int, share: float) -> Stage:
+        """Scale what a stage has left, within limits of what was planned."""
+        planned = self._planned.get(stage.name, 0)
+        fewest, most = math.ceil(_FEWEST * planned), math.ceil(_LONGEST * planned)
+        return _scaled(stage, done, share, max(fewest, 1), most)
+
+    def _step_seconds(self, name: str) -> float:
+        """Estimate a step: as measured, or as expected times what was wrong with the last one."""
+        measured = self._measured.get(name, [])
+        if len(measured) >= _TIMED:
+            return statistics.median(measured[-_RECENT:])
+        expected = self._costs[name].step
+        timed = [n for n, times in self._measured.items() if len(times) >= _TIMED]
+        if not timed:
+            return expected
+        last = timed[-1]
+        return expected * self._step_seconds(last) / self._costs[last].step

@@ -1,0 +1,130 @@
+"""What a training costs: seconds of a step and memory, from its settings, on this machine.
+
+The model is a sum of terms, each a count of work times a constant that runs were fitted to
+(`experiments/studies/costs.py`, by optimistix). How fast this machine is, a kernel tells whose time
+is known. A prediction is good to a third, since it does not know the object; `budget.Pacer`
+measures while the training runs, and corrects.
+"""
+
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from geosplat_jax.fit.config import Config, Stage
+
+_SPLATS_UNIT, _PIXELS_UNIT = 1e5, 1e5
+
+_REFERENCE_MS = 6.0
+"""The kernel's time on the machine that the constants are of, two idle cores with AVX-512."""
+
+_MEMORY_MB = (1800.0, 3700.0)
+"""Resident memory without splats, and for 100,000 of them, at most; in MB."""
+
+COST_NAMES = ("step", "splats", "rays", "views", "specular", "pixels")
+"""The terms of the seconds of a step, see `work_of`."""
+
+COST_SECONDS: Mapping[str, float] = {
+    "step": 0.017,
+    "splats": 0.051,
+    "rays": 0.043,
+    "views": 0.04,
+    "specular": 0.033,
+    "pixels": 0.013,
+}
+"""Seconds of each unit of `work_of` on the reference machine."""
+
+_STARTUP_SECONDS = {"first": 30.0, "next": 20.0}
+"""What stages wait for before their steps, programs being compiled: the first, and any other."""
+
+
+@dataclass(frozen=True)
+class StageCost:
+    """What a stage is expected to take.
+
+    Attributes
+    ----------
+    startup : seconds before its first step ends.
+    step : seconds of any other step.
+    """
+
+    startup: float
+    step: float
+
+
+def work_of(stage: Stage, splats: float, pixels: float) -> dict[str, float]:
+    """Count the work of a step by the names of `COST_NAMES`.
+
+    Parameters
+    ----------
+    splats : on the surface, whether seen or not. pixels : of a view.
+    """
+    transport, views, hundred_thousand = stage.transport, stage.batch_views, splats / _SPLATS_UNIT
+    shared = sum(
+        getattr(transport, name, 0) for name in ("light_count", "diffuse_count", "residual_count")
+    )
+    return {
+        "step": 1.0,
+        "splats": hundred_thousand,
+        "rays": hundred_thousand * shared,
+        "views": hundred_thousand * views,
+        "specular": hundred_thousand * views * getattr(transport, "specular_count", 0),
+        "pixels": views * pixels / _PIXELS_UNIT,
+    }
+
+
+def expected_costs(config: Config, pixels: float, *, slowness: float) -> dict[str, StageCost]:
+    """Predict every active stage, by name.
+
+    Parameters
+    ----------
+    pixels : of a view. slowness : of this machine, see `slowness_of_machine`.
+    """
+    costs = {}
+    for number, stage in enumerate(config.active_stages):
+        work = work_of(stage, float(config.geometry.expected_splats), pixels)
+        seconds = sum(COST_SECONDS[name] * amount for name, amount in work.items())
+        startup = _STARTUP_SECONDS["next" if number else "first"]
+        costs[stage.name] = StageCost(startup * slowness, seconds * slowness)
+    return costs
+
+
+def expected_seconds(config: Config, costs: Mapping[str, StageCost]) -> float:
+    """Add up what the active stages are expected to take."""
+    return sum(
+        costs[stage.name].startup + stage.steps * costs[stage.name].step
+        for stage in config.active_stages
+    )
+
+
+def expected_memory(config: Config) -> float:
+    """Predict the largest resident memory, bytes."""
+    base, by_splats = _MEMORY_MB
+    return 1e6 * (base + by_splats * config.geometry.expected_splats / _SPLATS_UNIT)
+
+
+def kernel_milliseconds(function: Callable[[Any], Any], argument: Any, repeats: int = 9) -> float:
+    """Median time of a compiled function."""
+    jax.block_until_ready(function(argument))
+    times = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        jax.block_until_ready(function(argument))
+        times.append(1e3 * (time.perf_counter() - began))
+    return statistics.median(times)
+
+
+def exponential_milliseconds() -> float:
+    """Time ``sum(exp(x))`` over 16M float32; about a tenth of a second in all."""
+    values = jnp.linspace(-1.0, 1.0, 1 << 24)
+    return kernel_milliseconds(jax.jit(lambda x: jnp.sum(jnp.exp(x))), values)
+
+
+def slowness_of_machine() -> float:
+    """Tell how many times slower than the reference this machine is at this moment."""
+    return float(np.clip(exponential_milliseconds() / _REFERENCE_MS, 0.2, 10.0))

@@ -1,0 +1,262 @@
+"""Budgets: what is chosen for a time, and a pace that keeps to it on any machine."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import jax
+import numpy as np
+import pytest
+from support import sphere_dataset, tiny_config
+
+from geosplat_jax import cli
+from geosplat_jax.fit.budget import (
+    Pacer,
+    parse_duration,
+    parse_memory,
+    plan,
+    with_steps,
+)
+from geosplat_jax.fit.config import Budget, Pace, Rate, Stage
+from geosplat_jax.fit.costs import StageCost, expected_costs, expected_seconds
+from geosplat_jax.fit.folder import RunFolder
+from geosplat_jax.fit.planning import TrainingError
+from geosplat_jax.fit.presets import QUALITIES, between_qualities, make_config
+from geosplat_jax.fit.train import fit
+
+SIZE = (200, 200)
+
+
+def _cells(config):
+    return config.geometry.cells_along or 0
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("90s", 90), ("5min", 300), ("1.5h", 5400), (" 2 MIN ", 120)]
+)
+def test_times_are_read(text, seconds):
+    assert parse_duration(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "5", "min", "-5min", "0s", "5 weeks", "nan s", "1e3s"])
+def test_what_is_no_time_is_refused(text):
+    with pytest.raises(ValueError, match="a time reads 90s, 5min"):
+        parse_duration(text)
+
+
+def test_memory_is_read():
+    assert parse_memory("4GB") == 4e9
+    assert parse_memory("512MiB") == 512 * 2**20
+    with pytest.raises(ValueError, match="a memory size reads"):
+        parse_memory("4 elephants")
+
+
+@pytest.mark.parametrize("place", range(len(QUALITIES)))
+def test_at_a_quality_level_the_settings_are_its_own(place):
+    expected = make_config("default", QUALITIES[place])
+    assert replace(between_qualities(float(place)), quality=QUALITIES[place]) == expected
+
+
+def test_between_two_levels_every_number_lies_between_theirs():
+    low, middle, high = (between_qualities(place) for place in (0.0, 0.5, 1.0))
+    assert [_cells(config) for config in (low, middle, high)] == [32, 39, 48]
+    for name in ("split_sum", "monte_carlo"):
+        below, here, above = (config.stage(name) for config in (low, middle, high))
+        assert below.steps < here.steps < above.steps
+        assert below.batch_views <= here.batch_views <= above.batch_views
+        assert below.half_life < here.half_life < above.half_life
+    assert middle.stage("refine").steps == 0
+
+
+def test_more_time_chooses_more_work():
+    plans = [plan(Budget(seconds), SIZE, slowness=1.0) for seconds in (90, 180, 600, 2400)]
+    assert all(a.effort < b.effort or a.seconds < b.seconds for a, b in pairwise(plans))
+    assert _cells(plans[0].config) < _cells(plans[-1].config)
+    for one, seconds in zip(plans, (90, 180, 600, 2400), strict=True):
+        # Steps are whole numbers.
+        assert one.seconds == pytest.approx(seconds, rel=0.01)
+
+
+def test_a_slow_machine_is_given_less_work():
+    fast, slow = (plan(Budget(600.0), SIZE, slowness=slowness) for slowness in (1.0, 3.0))
+    assert slow.effort < fast.effort
+    assert slow.seconds == pytest.approx(600, rel=0.01)
+
+
+def test_a_time_that_compilation_would_fill_is_refused():
+    with pytest.raises(TrainingError, match="a budget of 20 s is too short"):
+        plan(Budget(20.0), SIZE, slowness=1.0)
+
+
+def test_little_memory_chooses_fewer_cells_or_is_refused():
+    free = plan(Budget(1200.0), SIZE, slowness=1.0)
+    tight = plan(Budget(1200.0, memory=5e9), SIZE, slowness=1.0)
+    assert tight.memory <= 5e9 < free.memory
+    assert _cells(tight.config) < _cells(free.config)
+    with pytest.raises(TrainingError, match="more than --memory allows"):
+        plan(Budget(1200.0, memory=1e9), SIZE, slowness=1.0)
+
+
+def test_large_photographs_are_reduced_to_what_the_cells_show():
+    chosen = plan(Budget(120.0), (3000, 4000), slowness=1.0)
+    side = 4000 / chosen.downscale
+    assert 4 <= side / _cells(chosen.config) <= 8
+    assert plan(Budget(120.0), (3000, 4000), slowness=1.0, downscale=10).downscale == 10
+
+
+def test_a_shortened_stage_ends_its_schedules():
+    stage = make_config("default", "draft").stage("monte_carlo")
+    (short,) = with_steps(replace(make_config("default", "draft"), stages=(stage,)), 0.5).stages
+    assert short.steps == stage.steps // 2
+    assert short.rates_at(short.steps) == pytest.approx(stage.rates_at(stage.steps))
+    assert short.weights_at(short.steps) == pytest.approx(stage.weights_at(stage.steps))
+    assert short.rates_at(30) == pytest.approx(stage.rates_at(60))
+
+
+def test_a_stage_of_several_paces_is_continuous():
+    stage = Stage(name="s", steps=100, half_life=10.0, rates={"albedo": Rate(1.0)})
+    # 40 steps as they were, 20 of twice the speed, the other 20 in 40.
+    stage = replace(
+        stage,
+        steps=100,
+        pace=(Pace(40, 2.0), Pace(60, 0.5)),
+    )
+    positions = [stage.position(step) for step in (0, 40, 50, 60, 61, 100)]
+    assert positions == [0, 40, 60, 80, 80.5, 100]
+    assert stage.progress(60) == 0.8
+
+
+class _Machine:
+    """A clock, and a training that costs what a function of the time says."""
+
+    def __init__(self, config, costs, speed):
+        self.now, self.config, self.costs, self.speed = 1000.0, config, costs, speed
+
+    def __call__(self):
+        return self.now
+
+    def run(self, pacer):
+        """Make all steps as `fit.train` does; return the seconds and the settings at the end."""
+        began, config = self.now, self.config
+        for name in [stage.name for stage in config.active_stages]:
+            done = 0
+            while done < config.stage(name).steps:
+                seconds = self.costs[name].startup if done == 0 else self.costs[name].step
+                seconds *= self.speed(self.now - began)
+                self.now += seconds
+                if done:
+                    pacer.note(name, seconds)
+                done += 1
+                config = pacer.adjusted(config, config.stage(name), done) or config
+        return self.now - began, config
+
+
+@pytest.mark.parametrize(
+    ("speed", "tolerance"),
+    [
+        (lambda now: 1.0, 0.02),
+        (lambda now: 2.0, 0.05),
+        (lambda now: 0.5, 0.05),
+        (lambda now: 3.0 if now > 150 else 1.0, 0.05),
+        (lambda now: 1.0 if now > 150 else 3.0, 0.10),
+    ],
+    ids=["as expected", "half as fast", "twice as fast", "slows down", "recovers"],
+)
+def test_a_training_ends_in_time_on_a_machine_of_another_speed(speed, tolerance):
+    budget = Budget(300.0)
+    chosen = plan(budget, SIZE, slowness=1.0)
+    machine = _Machine(chosen.config, chosen.costs, speed)
+    seconds, config = machine.run(Pacer(budget, chosen.config, chosen.costs, clock=machine))
+    assert seconds == pytest.approx(300.0, rel=tolerance)
+    for before, after in zip(chosen.config.stages, config.stages, strict=True):
+        assert after.rates_at(after.steps) == pytest.approx(before.rates_at(before.steps))
+
+
+def test_a_very_fast_machine_makes_no_more_steps_than_are_worth_it():
+    budget = Budget(300.0)
+    chosen = plan(budget, SIZE, slowness=1.0)
+    machine = _Machine(chosen.config, chosen.costs, lambda now: 0.02)
+    _, config = machine.run(Pacer(budget, chosen.config, chosen.costs, clock=machine))
+    for before, after in zip(chosen.config.active_stages, config.active_stages, strict=True):
+        assert after.steps <= 3 * before.steps
+
+
+def test_a_training_that_is_hopelessly_late_still_makes_its_last_steps():
+    budget = Budget(300.0)
+    chosen = plan(budget, SIZE, slowness=1.0)
+    machine = _Machine(chosen.config, chosen.costs, lambda now: 20.0)
+    _, config = machine.run(Pacer(budget, chosen.config, chosen.costs, clock=machine))
+    for before, after in zip(chosen.config.active_stages, config.active_stages, strict=True):
+        assert 0.1 * before.steps <= after.steps < 0.3 * before.steps
+        assert after.rates_at(after.steps) == pytest.approx(before.rates_at(before.steps))
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return sphere_dataset()
+
+
+class _LateClock:
+    """An hour later at every look."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self):
+        self.now += 3600.0
+        return self.now
+
+
+def _paced_run(dataset, folder, config, **options):
+    costs = {stage.name: StageCost(0.0, 1e-3) for stage in config.active_stages}
+    pacer = Pacer(Budget(60.0), config, costs, clock=_LateClock())
+    return fit(dataset, config, folder, pacer=pacer, **options)
+
+
+def test_the_record_of_a_shortened_run_repeats_it_bit_for_bit(dataset, tmp_path):
+    config = tiny_config("stages.split_sum.steps=40", "stages.monte_carlo.steps=0")
+    state = _paced_run(dataset, tmp_path / "paced", config)
+    done = RunFolder(tmp_path / "paced").config()
+    assert int(state.step) == done.total_steps < 40
+    again = fit(dataset, done, tmp_path / "again")
+    for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+
+
+def test_a_shortened_run_that_was_stopped_goes_on_with_its_own_settings(dataset, tmp_path):
+    config = tiny_config("stages.split_sum.steps=40", "stages.monte_carlo.steps=0")
+    folder = tmp_path / "run"
+    _paced_run(dataset, folder, config, stop_after=12)
+    run = RunFolder(folder)
+    assert run.budget() == Budget(60.0)
+    assert run.config().total_steps < 40
+    state = fit(dataset, run.config(), folder, resume=True)
+    assert int(state.step) == run.config().total_steps
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--budget", "5min", "--quality", "draft"], "leave --quality and --preset out"),
+        (["--memory", "4GB"], "--memory belongs to --budget"),
+        (["--budget", "3s"], "too short"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(options, message, tmp_path, capsys):
+    scene = "examples/duck"
+    assert cli.main(["train", scene, "--output", str(tmp_path / "run"), *options]) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_budget_that_is_no_time_is_refused_by_the_command_line(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["train", "examples/duck", "--budget", "soon"])
+    assert "a time reads" in capsys.readouterr().err
+
+
+def test_expected_seconds_add_up():
+    config = make_config("default", "draft")
+    costs = expected_costs(config, 40_000.0, slowness=2.0)
+    single = expected_costs(config, 40_000.0, slowness=1.0)
+    assert costs["split_sum"].step == pytest.approx(2 * single["split_sum"].step)
+    by_hand = sum(costs[s.name].startup + s.steps * costs[s.name].step for s in config.stages[:2])
+    assert expected_seconds(config, costs) == pytest.approx(by_hand)
