@@ -1,21 +1,11 @@
 """Speed of the machine at this moment, from two kernels whose idle cost is known."""
 
 import json
-import statistics
-import time
 
 import jax
 import jax.numpy as jnp
 
-
-def _median_ms(function, argument, repeats: int = 9) -> float:
-    jax.block_until_ready(function(argument))
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(function(argument))
-        times.append(1e3 * (time.perf_counter() - start))
-    return round(statistics.median(times), 3)
+from geosplat_jax.fit.costs import kernel_milliseconds
 
 
 def calibrate() -> dict[str, float]:
@@ -26,8 +16,8 @@ def calibrate() -> dict[str, float]:
     values = jnp.linspace(-1.0, 1.0, 1 << 24)
     keys = jax.random.bits(jax.random.key(0), (1 << 20,), jnp.uint32)
     return {
-        "exp_ms": _median_ms(jax.jit(lambda x: jnp.sum(jnp.exp(x))), values),
-        "sort_ms": _median_ms(jax.jit(jnp.sort), keys),
+        "exp_ms": round(kernel_milliseconds(jax.jit(lambda x: jnp.sum(jnp.exp(x))), values), 3),
+        "sort_ms": round(kernel_milliseconds(jax.jit(jnp.sort), keys), 3),
     }
 
 

@@ -31,6 +31,7 @@ ORDER = [
     "fit",
     "report",
     "run",
+    "camera_rounds",
     "gradcheck",
     "cli",
 ]

@@ -50,6 +50,15 @@ def command_line() -> argparse.ArgumentParser:
         metavar="SIZE",
         help="with --budget: 4GB; as much as the machine has by default",
     )
+    train.add_argument(
+        "--refine-cameras",
+        type=int,
+        nargs="?",
+        const=1,
+        metavar="ROUNDS",
+        help="first train at quality draft and set the cameras right with what came out, so often "
+        "(once by default); docs/cameras.md",
+    )
     start = train.add_mutually_exclusive_group()
     start.add_argument(
         "--resume", action="store_true", help="continue from the last checkpoint, or start again"

@@ -9,9 +9,8 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from geosplat_jax.cli.display import console, say
+from geosplat_jax.cli.display import console, say, say_refined
 from geosplat_jax.cli.training import UsageError, config_from, scene_options, train
-from geosplat_jax.fit.cameras import ViewProgress
 from geosplat_jax.fit.config import all_settings
 from geosplat_jax.fit.gauge import change_lines
 from geosplat_jax.fit.presets import make_config
@@ -210,16 +209,7 @@ def _render(arguments: argparse.Namespace) -> None:
 def _refine_cameras(arguments: argparse.Namespace) -> None:
     """Refine the cameras of a run and print what changed."""
     run = Run(arguments.run, scene=arguments.scene)
-
-    def tell(split: str, progress: ViewProgress) -> None:
-        camera = progress.camera
-        say(
-            f"{split} {progress.done}/{progress.total} {progress.name}  residual "
-            f"{camera.residual_before:.4f} -> {camera.residual_after:.4f}  "
-            f"{camera.iterations} steps  {camera.note}"
-        )
-
-    refined = run.refine_cameras(arguments.output, on_view=tell)
+    refined = run.refine_cameras(arguments.output, on_view=say_refined)
     for split, cameras in refined.items():
         views = run.dataset.test if split == "test" else run.dataset.train
         for line in change_lines(views, cameras, run.dataset.bounds):

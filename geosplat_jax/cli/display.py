@@ -6,6 +6,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
+from geosplat_jax.fit.cameras import ViewProgress
 from geosplat_jax.fit.train import Progress as StepProgress
 
 console = Console(stderr=True, highlight=False)
@@ -20,6 +21,16 @@ def show_warning(message: Warning | str, *where: Any) -> None:
     """Show a warning as one line, without the place in the program that it comes from."""
     del where
     say(str(message), label="warning: ", style="yellow")
+
+
+def say_refined(split: str, progress: ViewProgress) -> None:
+    """Print what became of a camera that was refined."""
+    camera = progress.camera
+    say(
+        f"{split} {progress.done}/{progress.total} {progress.name}  residual "
+        f"{camera.residual_before:.4f} -> {camera.residual_after:.4f}  "
+        f"{camera.iterations} steps  {camera.note}"
+    )
 
 
 class ProgressDisplay:

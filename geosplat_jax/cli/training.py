@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from geosplat_jax.cli.display import ProgressDisplay, say
+from geosplat_jax.camera_rounds import refined_cameras
+from geosplat_jax.cli.display import ProgressDisplay, say, say_refined
 from geosplat_jax.fit.config import Budget, Config, config_warnings
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import make_config
@@ -101,14 +102,36 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
     return _Order(plan.config, scene_options(arguments, plan.config), budget)
 
 
+def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[str, Any]) -> Path:
+    """Set the cameras right before the training proper; say where they are."""
+    draft = make_config(quality="draft", material_prior=arguments.material_prior)
+    say("cameras first: training at quality draft")
+    with ProgressDisplay(draft.total_steps) as display:
+        cameras = refined_cameras(
+            arguments.scene,
+            folder,
+            rounds=arguments.refine_cameras,
+            config=draft,
+            reading=reading,
+            on_step=display.show,
+            on_view=say_refined,
+        )
+    say(f"cameras: {cameras}")
+    return cameras
+
+
 def train(arguments: argparse.Namespace) -> None:
     """Train a scene into a run's folder, with progress on the terminal."""
     if (arguments.source is None) != (arguments.stage is None):
         raise UsageError("--from RUN and --stage NAME belong together")
+    if arguments.refine_cameras is not None and (arguments.budget or arguments.source):
+        raise UsageError("--refine-cameras trains before; leave --budget and --from out")
     folder = arguments.output or Path("runs") / arguments.scene.resolve().name
     order = _ordered(arguments, RunFolder(folder))
-    config = order.config
-    dataset = load_recorded(arguments.scene, order.reading)
+    config, reading = order.config, dict(order.reading)
+    if arguments.refine_cameras is not None:
+        reading["cameras"] = _refined_cameras(arguments, folder, reading)
+    dataset = load_recorded(arguments.scene, reading)
     for note in dataset.notes:
         say(note)
     for warning in (*dataset.warnings, *config_warnings(config)):

@@ -1,0 +1,111 @@
+"""Fit what a step costs (`fit.costs`) to runs that were made on this machine.
+
+    python experiments/studies/costs.py RUN [RUN ...] [--slowness S] [--json FILE]
+
+Every stage of every run is a row: the work of a step, counted by its settings and its median number
+of splats, and the seconds that the fastest fifth of its steps stays below, since machines are
+shared. Constants are never negative; Levenberg-Marquardt makes the logarithms of predicted over
+measured seconds small. Prints the constants, divided by how slow the machine was (as it is at this
+moment, or ``--slowness``), and for every row what was measured and what they predict, before and
+after the fit.
+"""
+
+import argparse
+import json
+import re
+import statistics
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from geosplat_jax.fit.costs import COST_NAMES, COST_SECONDS, slowness_of_machine, work_of
+from geosplat_jax.fit.folder import RunFolder
+
+FASTEST = 0.2
+"""Share of the steps that took less than what is taken for the time of a step."""
+FIRST, FEWEST = 5, 30
+"""Steps of a stage that are left out, since they compile; and those that a row takes at least."""
+SMALLEST = 1e-5
+"""Seconds of a unit of work at least: a logarithm has to begin somewhere."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A stage of a run: where it is from, what a step had to do, and its seconds."""
+
+    run: str
+    stage: str
+    work: dict[str, float]
+    seconds: float
+
+
+def rows_of(path: Path) -> list[Row]:
+    """Read the stages of a run that have enough steps."""
+    folder = RunFolder(path)
+    size = re.search(r" of (\d+) x (\d+)", folder.record().get("views", ""))
+    if size is None:
+        raise ValueError(f"{folder} does not say how large its photographs are")
+    pixels, rows = float(int(size[1]) * int(size[2])), []
+    for stage in folder.config().active_stages:
+        lines = [line for line in folder.metric_lines() if line["stage"] == stage.name][FIRST:]
+        if len(lines) < FEWEST:
+            continue
+        splats = statistics.median(line["splats"] for line in lines)
+        seconds = float(np.quantile([line["seconds"] for line in lines], FASTEST))
+        rows.append(Row(path.name, stage.name, work_of(stage, float(splats), pixels), seconds))
+    return rows
+
+
+def fitted(rows: list[Row], start: Float[Array, " k"]) -> Float[np.ndarray, " k"]:
+    """Return the seconds of each unit of work that explain the rows best."""
+    work = jnp.asarray([[row.work[name] for name in COST_NAMES] for row in rows])
+    measured = jnp.log(jnp.asarray([row.seconds for row in rows]))
+
+    def residual(logs: Float[Array, " k"], unused: None) -> Float[Array, " n"]:
+        return jnp.log(work @ jnp.exp(logs)) - measured
+
+    solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
+    first = jnp.log(jnp.maximum(start, SMALLEST))
+    found = optx.least_squares(residual, solver, first, max_steps=500, throw=False)
+    return np.exp(np.asarray(found.value))
+
+
+def main() -> None:
+    """Read the runs, fit, print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    parser.add_argument("--slowness", type=float, help="of the machine when the runs were made")
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    rows = [row for path in arguments.runs for row in rows_of(path)]
+    if len(rows) < len(COST_NAMES):
+        raise SystemExit(f"{len(rows)} stages are too few to fit {len(COST_NAMES)} constants")
+    slowness = arguments.slowness or slowness_of_machine()
+    before = slowness * np.array([COST_SECONDS[name] for name in COST_NAMES])
+    after = fitted(rows, jnp.asarray(before))
+    print(f"the machine is {slowness:.2f} times as slow as the reference")
+    print(f"{'unit of work':12s} {'before':>10s} {'fitted':>10s}   seconds on the reference")
+    for name, old, new in zip(COST_NAMES, before, after, strict=True):
+        print(f"{name:12s} {old / slowness:10.5f} {new / slowness:10.5f}")
+    print(f"{'run':24s} {'stage':12s} {'seconds':>8s} {'before':>8s} {'fitted':>8s}")
+    deviations = []
+    for row in rows:
+        work = np.array([row.work[name] for name in COST_NAMES])
+        old, new = float(work @ before), float(work @ after)
+        deviations.append(np.log(new / row.seconds))
+        print(f"{row.run[:24]:24s} {row.stage:12s} {row.seconds:8.3f} {old:8.3f} {new:8.3f}")
+    print(
+        f"typical deviation after the fit: {np.expm1(np.sqrt(np.mean(np.square(deviations)))):.0%}"
+    )
+    if arguments.json is not None:
+        found = {name: float(x / slowness) for name, x in zip(COST_NAMES, after, strict=True)}
+        document = {"seconds": found, "slowness": slowness, "rows": [asdict(row) for row in rows]}
+        arguments.json.write_text(json.dumps(document, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

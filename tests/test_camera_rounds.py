@@ -1,0 +1,77 @@
+"""Rounds of training and refining: each reads the cameras of the one before, none is made twice."""
+
+import json
+
+import pytest
+
+from geosplat_jax import camera_rounds, cli
+from geosplat_jax.camera_rounds import refined_cameras, rounds_folder
+from geosplat_jax.io.dataset import Dataset
+from geosplat_jax.run import Run
+
+
+class _Scene(Dataset):
+    """What a scene would be read with."""
+
+    def __init__(self, options):
+        object.__setattr__(self, "options", dict(options))
+
+
+class _Round(Run):
+    """A run that is over, whose cameras come out as a number."""
+
+    def __init__(self, number):
+        self.number = number
+
+    def refine_cameras(self, output=None, **unused):
+        assert output is not None
+        output.write_text(json.dumps(self.number))
+        return {}
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Replace reading and training by a record of what they were called with."""
+    calls = []
+
+    def train(dataset, folder, config, *, resume, on_step):
+        folder.mkdir(parents=True)
+        calls.append((dataset.options, config.quality, resume))
+
+        return _Round(len(calls))
+
+    monkeypatch.setattr(camera_rounds, "train", train)
+    monkeypatch.setattr(camera_rounds, "load_recorded", lambda scene, options: _Scene(options))
+    return calls
+
+
+def test_a_round_reads_what_the_one_before_has_found(made, tmp_path):
+    output = tmp_path / "fox"
+    found = refined_cameras("scene", output, rounds=2, reading={"downscale": 2})
+    folder = rounds_folder(output)
+    assert found == folder / "round_2.json"
+    assert folder != output
+    assert made == [
+        ({"downscale": 2}, "draft", False),
+        ({"downscale": 2, "cameras": folder / "round_1.json"}, "draft", False),
+    ]
+
+
+def test_rounds_that_are_done_are_not_made_again(made, tmp_path):
+    refined_cameras("scene", tmp_path / "fox", rounds=1)
+    assert refined_cameras("scene", tmp_path / "fox", rounds=1).exists()
+    assert len(made) == 1
+
+
+def test_no_round_at_all_is_refused(made, tmp_path):
+    with pytest.raises(ValueError, match="takes one round at least, got 0"):
+        refined_cameras("scene", tmp_path / "fox", rounds=0)
+    assert not made
+
+
+@pytest.mark.parametrize("options", [["--budget", "5min"], ["--from", "run", "--stage", "refine"]])
+def test_the_command_refuses_what_does_not_go_together(options, tmp_path, capsys):
+    output = ["--output", str(tmp_path / "run")]
+    assert cli.main(["train", "examples/duck", *output, "--refine-cameras", *options]) == 2
+    assert "leave --budget and --from out" in capsys.readouterr().err
+    assert not rounds_folder(tmp_path / "run").exists()
