@@ -157,6 +157,9 @@ class RunSettings:
     """Steps between checkpoints."""
     preview_every: Count = 100
     """Steps between previews; 0 turns them off."""
+    window: Annotated[float, Field(ge=0, le=1)] = 0.4
+    """Where a window around the object has at most this share of the photographs' pixels, training
+    looks at nothing else; 0 is never."""
     initial_light: NonNegative = 0.5
     """Radiance of every texel at the start."""
     smallest_light: NonNegative = 0.01

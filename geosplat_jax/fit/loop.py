@@ -41,6 +41,7 @@ from geosplat_jax.fit.trained import (
 from geosplat_jax.io.checkpoints import latest_checkpoint, save_checkpoint
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.views import Views
+from geosplat_jax.io.windows import around_object
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
 from geosplat_jax.surface.base import SurfaceModel
@@ -56,8 +57,10 @@ class Loop:
     """Mutable bookkeeping of a run; everything but the clock goes into checkpoints.
 
     ``fallback`` is the shape that the stage began with, on the host, since the step consumes its
-    buffers. ``upcoming`` is the next stage, once it is near; ``to_come`` is what a checkpoint said
-    of it. ``has_compiled`` is set by whatever compiles, and reset by whoever measures time.
+    buffers. ``views`` are windows of the photographs that hold this ``share`` of their pixels, see
+    `windows.around_object`. ``upcoming`` is the next stage, once it is near; ``to_come`` is what a
+    checkpoint said of it. ``has_compiled`` is set by whatever compiles, and reset by whoever
+    measures time.
     """
 
     config: Config
@@ -67,6 +70,7 @@ class Loop:
     stage: Stage
     pipeline: Pipeline
     state: TrainState
+    share: float = 1.0
     planned_for: str | None = None
     peak: dict[str, int] | None = None
     recoveries: int = 0
@@ -125,7 +129,9 @@ class Loop:
         stage, known = self.config.stage_at(step), None
         if stage != self.stage:
             known = self._begin(stage)
-        self.pipeline = pipeline_at(self.pipeline, self.config, self.stage, self._since(step))
+        self.pipeline = pipeline_at(
+            self.pipeline, self.config, self.stage, self._since(step), share=self.share
+        )
         # Another kind of splats, another stage: other needs.
         planned_for = f"{self.stage.name} {self.pipeline.splats}"
         if planned_for != self.planned_for:
@@ -359,9 +365,11 @@ def new_loop(dataset: Dataset, config: Config, folder: RunFolder) -> Loop:
     stage = config.active_stages[0]
     params = initial_params(shape, config, field_key)
     pipeline = build_pipeline(config, stage, surface)
+    views, share = around_object(dataset.train, largest=config.run.window)
     loop = Loop(
         config=config,
-        views=dataset.train,
+        views=views,
+        share=share,
         folder=folder,
         surface=surface,
         stage=stage,

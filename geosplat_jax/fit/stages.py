@@ -14,6 +14,7 @@ from geosplat_jax.fit.config import Config, Stage
 from geosplat_jax.fit.entering import enter_stage
 from geosplat_jax.fit.step import UpdateRule
 from geosplat_jax.io.views import Views
+from geosplat_jax.losses import VIEW_TERMS
 from geosplat_jax.materials import init_materials
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
@@ -38,13 +39,21 @@ def build_pipeline(config: Config, stage: Stage, surface: SurfaceModel) -> Pipel
     )
 
 
-def pipeline_at(pipeline: Pipeline, config: Config, stage: Stage, step: int) -> Pipeline:
-    """Return a stage's pipeline as it is ``step`` steps after the stage's start."""
+def pipeline_at(
+    pipeline: Pipeline, config: Config, stage: Stage, step: int, *, share: float = 1.0
+) -> Pipeline:
+    """Return a stage's pipeline as it is ``step`` steps after the stage's start.
+
+    ``share`` : of the photographs that views show, see `windows.around_object`; what is a mean over
+    the pixels of a view counts so much less.
+    """
+    weights = {
+        name: weight * share if name in VIEW_TERMS else weight
+        for name, weight in stage.weights_at(step).items()
+    }
     samples_vertices = stage.progress(step) < stage.vertex_fraction
     splats = VertexSplatSettings() if samples_vertices else stage.splats
-    return replace(
-        pipeline, splats=splats.build(config.adapter), weights=_arrays(stage.weights_at(step))
-    )
+    return replace(pipeline, splats=splats.build(config.adapter), weights=_arrays(weights))
 
 
 def update_rule(config: Config, stage: Stage, params: Params, step: int) -> UpdateRule:

@@ -1,0 +1,106 @@
+"""Windows around the object: the same rays, the same loss, fewer pixels."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import ball, sphere_views, tiny_config
+
+from geosplat_jax.fit.stages import pipeline_at
+from geosplat_jax.io.windows import MARGIN, around_object
+from geosplat_jax.losses import Comparison, image_dissimilarity, image_l1, mask_error
+
+SIZE = 160
+
+
+@pytest.fixture(scope="module")
+def views():
+    """A small ball in large photographs, never in the middle."""
+    centred = sphere_views(4, size=SIZE, radius=0.15)
+    shifts = ((30, -20), (-25, 10), (0, 40), (-40, -40))
+    images, intrinsics = np.zeros_like(centred.images), centred.intrinsics.copy()
+    for index, (rows, columns) in enumerate(shifts):
+        images[index] = np.roll(centred.images[index], (rows, columns), axis=(0, 1))
+        intrinsics[index, :2, 2] += (columns, rows)
+    return replace(centred, images=images, intrinsics=intrinsics)
+
+
+def test_windows_hold_the_whole_object_and_a_margin(views):
+    windows, share = around_object(views, largest=0.5)
+    assert share == windows.height * windows.width / SIZE**2 < 0.4
+    covered = views.images[..., 3] > 0
+    inside = windows.images[..., 3] > 0
+    assert inside.sum() == covered.sum() > 0
+    rim = MARGIN
+    assert not inside[:, :rim].any()
+    assert not inside[:, -rim:].any()
+    assert not inside[:, :, :rim].any()
+    assert not inside[:, :, -rim:].any()
+
+
+def test_a_pixel_of_a_window_has_the_ray_that_it_had(views):
+    windows, _ = around_object(views, largest=0.5)
+    for index in range(len(views)):
+        # The first covered pixel, in both.
+        whole = np.argwhere(views.images[index, ..., 3] > 0)[0]
+        cut = np.argwhere(windows.images[index, ..., 3] > 0)[0]
+        rays = [
+            np.linalg.inv(k[index]) @ np.array([column + 0.5, row + 0.5, 1.0])
+            for k, (row, column) in ((views.intrinsics, whole), (windows.intrinsics, cut))
+        ]
+        np.testing.assert_allclose(rays[0], rays[1], rtol=1e-9, atol=1e-9)
+        np.testing.assert_array_equal(
+            views.images[index][tuple(whole)], windows.images[index][tuple(cut)]
+        )
+
+
+def test_large_objects_keep_their_photographs(views):
+    assert around_object(views, largest=0.0) == (views, 1.0)
+    assert around_object(views, largest=0.05) == (views, 1.0)
+    bare = replace(views, has_masks=False)
+    assert around_object(bare, largest=1.0) == (bare, 1.0)
+
+
+def test_pixels_that_do_not_count_stay_what_they_are(views):
+    valid = np.ones(views.images.shape[:3], np.float32)
+    valid[:, 70:90, :] = 0.0
+    windows, _ = around_object(replace(views, valid=valid), largest=0.5)
+    assert windows.valid is not None
+    assert windows.valid.shape == windows.images.shape[:3]
+    assert 0 < (windows.valid == 0).sum() < windows.valid.size
+
+
+def test_a_view_without_the_object_has_a_window_in_its_middle(views):
+    images = views.images.copy()
+    images[2] = 0.0
+    windows, share = around_object(replace(views, images=images), largest=0.5)
+    assert share < 0.4
+    assert not windows.images[2].any()
+
+
+def test_a_mean_over_a_window_is_that_over_the_photograph(views):
+    windows, share = around_object(views, largest=0.5)
+
+    def terms(shown):
+        image = jnp.asarray(shown.images)
+        mask, color = image[..., 3], image[..., :3] * image[..., 3:]
+        compared = Comparison(0.8 * color, color, 0.9 * mask, mask, None, jnp.zeros(()))
+        return np.array([image_l1(compared), mask_error(compared), image_dissimilarity(compared)])
+
+    # SSIM has a mean over the pixels around which its window of 11 pixels fits.
+    inner = (windows.height - 10) * (windows.width - 10) / (SIZE - 10) ** 2
+    whole = terms(views)
+    assert (whole > 0).all()
+    np.testing.assert_allclose(np.array([share, share, inner]) * terms(windows), whole, rtol=1e-5)
+
+
+def test_terms_of_pixels_count_by_their_share_of_the_photograph():
+    config = tiny_config()
+    pipeline, _ = ball(config)
+    whole, cut = (
+        pipeline_at(pipeline, config, config.stages[0], 0, share=share).weights
+        for share in (1.0, 0.25)
+    )
+    for name, weight in whole.items():
+        assert cut[name] == (0.25 if name in ("l1", "ssim", "mask") else 1.0) * weight
