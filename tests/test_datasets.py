@@ -1,6 +1,7 @@
 """Every layout loads as written, and every kind of bad input is named."""
 
 import json
+import os
 import shutil
 from dataclasses import replace
 
@@ -16,12 +17,14 @@ from geosplat_jax.io.images import (
     MissingFileError,
     SceneError,
     encode_srgb,
+    read_image,
     read_linear,
     write_exr,
     write_hdr,
     write_png,
 )
 from geosplat_jax.io.lenses import AngleLens, PinholeLens
+from geosplat_jax.io.quiet import without_decoder_lines
 
 SIZE, ANGLE, RADIUS, DISTANCE = 24, 0.7, 0.8, 4.0
 ALBEDO, RADIANCE = np.array([0.8, 0.2, 0.05]), np.array([0.5, 0.25, 0.1])
@@ -182,6 +185,50 @@ def tensoir(scenes, tmp_path):
 def load(root, **settings):
     """Load with given bounds, which the tests of bad input do not need found."""
     return load_dataset(root, **{"bounds": BOX, **settings})
+
+
+def paint(path, colors):
+    """Give the object of a picture other colours, (H, W, 3)."""
+    pixels = np.array(read_image(path))
+    pixels[..., :3] = colors
+    write_png(path, pixels)
+
+
+def test_a_photograph_of_one_colour_among_others_is_named(blender):
+    ramp = np.broadcast_to(np.linspace(0, 1, SIZE)[:, None, None], (SIZE, SIZE, 3))
+    for path in sorted((blender / "train").glob("r_*.png")):
+        paint(path, ramp)
+    assert not any("even colour" in warning for warning in load(blender).warnings)
+    paint(blender / "train" / "r_1.png", 0.5)
+    warnings = load(blender).warnings
+    assert any("one even colour in 1 views, r_1; such a" in warning for warning in warnings)
+
+
+def test_cameras_on_one_side_only_are_warned_of(blender):
+    path = blender / "transforms_train.json"
+    content = json.loads(path.read_text())
+    for frame in content["frames"]:
+        frame["transform_matrix"] = content["frames"][0]["transform_matrix"]
+    path.write_text(json.dumps(content))
+    assert any("from one side, within 0.0 degrees" in warning for warning in load(blender).warnings)
+
+
+@pytest.mark.parametrize("spoil", [lambda data: data[: len(data) // 2], lambda data: data[:40]])
+def test_a_damaged_picture_is_one_line_and_the_decoder_is_silent(blender, spoil, capfd):
+    path = blender / "train" / "r_1.png"
+    path.write_bytes(spoil(path.read_bytes()))
+    with pytest.raises(ImageReadError) as caught:
+        load(blender)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr().err == ""
+
+
+def test_only_the_lines_of_decoders_are_kept_away(capfd):
+    with without_decoder_lines(), without_decoder_lines():
+        os.write(2, b"libpng error: bad\nsomething else\n")
+    os.write(2, b"libpng afterwards\n")
+    assert capfd.readouterr().err == "something else\nlibpng afterwards\n"
 
 
 def test_every_frame_has_its_own_angle_where_it_says_so(tmp_path):

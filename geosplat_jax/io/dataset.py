@@ -50,6 +50,10 @@ LAYOUTS: dict[str, Layout] = {
 
 
 _PIXELS_OF_A_CELL = 2.0
+_EVEN = 0.02
+"""Linear colours of an object that differ by no more are one colour."""
+_NARROW_DEG = 20.0
+"""Cameras around the object within a smaller angle see one side of it."""
 _COARSE_PIXELS = 256
 _COARSE_VIEWS = 16
 _NEEDS_MASKS = (
@@ -150,6 +154,7 @@ def load_dataset(
         views, problems = load_views(chosen, factor=downscale, listing=listing)
         _check_pixels(views, split)
         _check_masks(views, split, warnings)
+        _check_colors(views, split, warnings)
         warnings += [f"{split}: {problem}" for problem in problems]
         if split in refined:
             views = with_cameras(views, refined[split], str(cameras))
@@ -163,6 +168,7 @@ def load_dataset(
     box = object_bounds(train) if bounds is None else _checked_bounds(bounds)
     for views in splits:
         _check_cameras_outside(views, box)
+    _check_sides(train, box, warnings)
     return Dataset(
         name=root.resolve().name,
         layout=layout,
@@ -377,6 +383,34 @@ def _check_masks(views: Views, split: str, warnings: list[str]) -> None:
         warnings.append(f"{split}: the mask of {len(empty)} views is empty, {_some(empty)}")
     if (views.coverage == 1.0).all():
         warnings.append(f"{split}: every mask is full; the images may not be cut out at all")
+
+
+def _check_colors(views: Views, split: str, warnings: list[str]) -> None:
+    """Warn of single photographs that show the object in one even colour."""
+    covered = views.masks if views.valid is None else views.masks & (views.valid > 0)
+    even = []
+    for name, image, inside in zip(views.names, views.images, covered, strict=True):
+        colors = image[inside][:, :3]
+        if len(colors) and np.ptp(colors, axis=0).max() <= _EVEN:
+            even.append(name)
+    if 0 < len(even) < 0.5 * len(views):
+        warnings.append(
+            f"{split}: the object has one even colour in {len(even)} views, {_some(even)}; such a "
+            "photograph is most likely empty or damaged"
+        )
+
+
+def _check_sides(views: Views, bounds: tuple[np.ndarray, np.ndarray], warnings: list[str]) -> None:
+    """Warn of cameras that see the object from one side only."""
+    away = views.camera_to_world[:, :3, 3] - 0.5 * (bounds[0] + bounds[1])
+    away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+    widest = np.degrees(np.arccos(np.clip((away @ away.T).min(), -1.0, 1.0)))
+    if len(views) > 1 and widest < _NARROW_DEG:
+        warnings.append(
+            f"train: all {len(views)} cameras see the object from one side, within {widest:.1f} "
+            "degrees; its shape away from them cannot be known. Check the poses, or photograph "
+            "all around the object"
+        )
 
 
 def _check_cameras_outside(views: Views, bounds: tuple[np.ndarray, np.ndarray]) -> None:

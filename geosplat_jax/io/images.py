@@ -125,7 +125,7 @@ def read_image(path: str | Path) -> Float[np.ndarray, "H W C"]:
         source.close()
     if pixels is None or problem:
         raise ImageReadError(
-            f"{path} is damaged or truncated ({problem.strip()}); replace the file"
+            f"{path} is damaged or truncated ({_one_line(problem)}); replace the file"
         )
     _require_plain(layout, path)
     return np.ascontiguousarray(pixels, np.float32)
@@ -389,8 +389,14 @@ def _write(path: str | Path, pixels: np.ndarray, pixel_format, *, suffix: str) -
         ok = sink.open(str(aside), spec) and sink.write_image(np.ascontiguousarray(pixels))
         ok = sink.close() and ok  # buffered data reaches the disk, or fails to, only here
         if not ok:
-            raise OSError(f"cannot write {path}: {sink.geterror().strip() or _last_error()}")
+            raise OSError(f"cannot write {path}: {_one_line(sink.geterror()) or _last_error()}")
+
+
+def _one_line(text: str) -> str:
+    """Join the lines of a library's message, without those that say the same again."""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return "; ".join(dict.fromkeys(lines))
 
 
 def _last_error() -> str:
-    return oiio.geterror().strip() or "unknown format"
+    return _one_line(oiio.geterror()) or "unknown format"

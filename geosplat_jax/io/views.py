@@ -30,6 +30,7 @@ from geosplat_jax.io.images import (
     require_room,
 )
 from geosplat_jax.io.memory import Need
+from geosplat_jax.io.quiet import without_decoder_lines
 
 COVERED = 0.5
 """A pixel belongs to the object where its alpha exceeds this."""
@@ -484,7 +485,7 @@ def _same_size(pixels: np.ndarray, image: np.ndarray, path: Path) -> np.ndarray:
 
 def _in_parallel(function: Callable, items) -> list:
     """Map in threads; the first error, in the order of the items, is raised."""
-    with ThreadPoolExecutor(max_workers=_THREADS) as pool:
+    with without_decoder_lines(), ThreadPoolExecutor(max_workers=_THREADS) as pool:
         return list(pool.map(function, items))
 
 
