@@ -233,6 +233,12 @@ def _add_config_arguments(parser: argparse.ArgumentParser) -> None:
         help="change a setting; geosplat-jax settings lists them",
     )
     parser.add_argument("--seed", type=int, help="seed of every random choice")
+    parser.add_argument(
+        "--mesh",
+        type=Path,
+        metavar="FILE",
+        help="start from this mesh: PLY, OBJ, GLB (docs/meshes.md)",
+    )
 
 
 def _add_relight(relight: argparse.ArgumentParser) -> None:
@@ -299,7 +305,7 @@ def _scene_options(arguments: argparse.Namespace, config: Config) -> dict[str, A
         return {**options, "downscale": arguments.downscale}
     cells = getattr(config.geometry, "resolution", None)
     if cells is None:
-        raise UsageError("--downscale auto needs a surface of cells; give a number")
+        raise UsageError("--downscale auto needs a surface of cells, not a mesh; give a number")
     corners = arguments.bounds
     reading = {**options, "bounds": None if corners is None else (corners[:3], corners[3:])}
     chosen = choose_downscale(arguments.scene, cells, **reading)
@@ -361,6 +367,7 @@ def _config_from(arguments: argparse.Namespace) -> Config:
         arguments.preset,
         arguments.quality,
         material_prior=arguments.material_prior,
+        mesh=arguments.mesh,
         overrides=tuple(overrides),
     )
 
@@ -372,7 +379,7 @@ def _train(arguments: argparse.Namespace) -> None:
     config = _config_from(arguments)
     folder = arguments.output or Path("runs") / arguments.scene.resolve().name
     dataset = load_recorded(arguments.scene, _scene_options(arguments, config))
-    for note in dataset.notes:
+    for note in (*dataset.notes, *config.geometry.notes(dataset)):
         _say(note)
     for warning in (*dataset.warnings, *config_warnings(config)):
         _say(warning, label="warning: ", style="yellow")

@@ -19,7 +19,7 @@ from geosplat_jax.core.types import Batch, EnvLight
 from geosplat_jax.fit.cameras import CameraSettings, ViewProgress, refine_views
 from geosplat_jax.fit.config import Config
 from geosplat_jax.fit.folder import RunError, RunFolder
-from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.presets import make_config, with_mesh
 from geosplat_jax.fit.runtime import in_background
 from geosplat_jax.fit.stages import make_batch
 from geosplat_jax.fit.train import Progress, Trained, fit, load_trained
@@ -348,6 +348,7 @@ def train(
     config: Config | None = None,
     *,
     quality: str = "standard",
+    mesh: str | Path | None = None,
     resume: bool = False,
     force: bool = False,
     source: str | Path | None = None,
@@ -362,6 +363,7 @@ def train(
     scene : folder, or a dataset from `load_dataset`.
     output : folder of the run.
     config : settings, see `make_config`; by default those of ``quality``.
+    mesh : file of a mesh to start from instead of a visual hull, see `fit.presets.with_mesh`.
     resume, force, source, first_stage, on_step : see `fit.train.fit`; ``force`` replaces a run.
     reading : how to read the scene: ``downscale``, ``light``, ``bounds`` (six numbers),
         ``cameras`` (a file of `Run.refine_cameras`).
@@ -370,8 +372,12 @@ def train(
     ------
     SceneError, RunError, TrainingError, Interrupted
         See `load_dataset` and `fit.train.fit`.
+    ValueError
+        If the mesh cannot be used; see `io.start_mesh`.
     """
     config = config or make_config(quality=quality)
+    if mesh is not None:
+        config = with_mesh(config, mesh)
     dataset = scene if isinstance(scene, Dataset) else load_recorded(scene, reading)
     folder = RunFolder(output)
     began = time.perf_counter()

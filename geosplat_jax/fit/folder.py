@@ -228,6 +228,7 @@ class RunFolder:
             {
                 **_scene_of(dataset),
                 "config": config.to_dict(),
+                "notes": [*dataset.notes, *config.geometry.notes(dataset)],
                 "versions": {
                     "python": platform.python_version(),
                     **{name: importlib.metadata.version(name) for name in _PACKAGES},
