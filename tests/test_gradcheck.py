@@ -14,6 +14,7 @@ from geosplat_jax.gradcheck.differences import STEPS, Problem, compare, double_p
 from geosplat_jax.gradcheck.report import STAGES, check_stage, passes, summary, table
 
 SLOW_STAGES = {
+    "mesh",
     "adapter",
     "isosurface",
     "loss",

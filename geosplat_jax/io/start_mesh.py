@@ -14,7 +14,6 @@ import trimesh
 from jaxtyping import Float, Int
 
 from geosplat_jax.io.meshes import (
-    is_closed,
     nondegenerate,
     read_mesh,
     signed_volume,
@@ -64,12 +63,25 @@ class StartMesh:
 
     @property
     def is_closed(self) -> bool:
-        """Whether every edge joins two faces that are wound alike."""
-        return is_closed(self.faces)
+        """Whether faces bound a volume: every edge is passed as often one way as the other.
+
+        Unlike for `meshes.is_closed`, four faces may meet at an edge.
+        """
+        return not _open_edges(self.faces).any()
 
     def noting(self, *notes: str, **changes: Any) -> "StartMesh":
         """Return the mesh with changes and what is to be said of them."""
         return replace(self, notes=(*self.notes, *notes), **changes)
+
+
+def _open_edges(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " E"]:
+    """Count how often every edge is passed one way, less how often the other."""
+    start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
+    stride = int(faces.max(initial=0)) + 1
+    edge = np.minimum(start, end) * stride + np.maximum(start, end)
+    _, number = np.unique(edge, return_inverse=True)
+    ways = np.where(start < end, 1.0, -1.0).ravel()
+    return np.rint(np.bincount(number.reshape(-1), ways)).astype(np.int64)
 
 
 def digest_of(path: str | Path) -> str:
@@ -134,22 +146,41 @@ def _cleaned(mesh: StartMesh, path: str) -> StartMesh:
     place = np.round(mesh.vertices / (_SAME_PLACE * size if size > 0 else 1.0))
     _, first, row = np.unique(place, axis=0, return_index=True, return_inverse=True)
     vertices, faces = mesh.vertices[first], row.reshape(-1)[mesh.faces].astype(np.int32)
-    has_area = nondegenerate(vertices, faces)
-    faces = faces[has_area]
-    _, only = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    faces = faces[np.sort(only)]
-    if not len(faces):
+    given = len(faces)
+    following = np.roll(faces, -1, axis=1)
+    faces = faces[(faces != following).all(axis=1)]
+    # Slivers close a surface as other faces do; of an open one they are no part.
+    if _open_edges(faces).any():
+        faces = faces[nondegenerate(vertices, faces)]
+    with_area = len(faces)
+    faces = _single(faces)
+    if not len(faces) or not nondegenerate(vertices, faces).any():
         raise ValueError(f"{path} must hold a triangle mesh, found no triangle with an area in it")
     used, rows = np.unique(faces, return_inverse=True)
     counts = {
         "corners at the place of others joined": len(mesh.vertices) - len(vertices),
-        "faces without area dropped": int((~has_area).sum()),
-        "faces that were there twice dropped": int(has_area.sum()) - len(only),
+        "faces without area dropped": given - with_area,
+        "faces that were there twice dropped": with_area - len(faces),
         "vertices without faces dropped": len(vertices) - len(used),
     }
     notes = [f"{count} {what}" for what, count in counts.items() if count]
     faces = rows.reshape(-1, 3).astype(np.int32)
     return mesh.noting(*notes, vertices=vertices[used], faces=faces)
+
+
+def _single(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "G 3"]:
+    """Keep one of the faces that share three corners; of a closed surface none of two that cancel.
+
+    Where every face stands twice, to be seen from both sides, nothing would be left: one stays.
+    """
+    _, only, number, count = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    kept = faces[np.sort(only)]
+    if (count == 1).all() or not _open_edges(kept).any():
+        return kept
+    alone = faces[count[number.reshape(-1)] == 1]
+    return kept if not len(alone) or _open_edges(alone).any() else alone
 
 
 def _outward(mesh: StartMesh) -> StartMesh:
@@ -166,7 +197,7 @@ def _outward(mesh: StartMesh) -> StartMesh:
         body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
         trimesh.repair.fix_winding(body)
         faces = np.asarray(body.faces, np.int32)
-        if not is_closed(faces):
+        if _open_edges(faces).any():
             return mesh
         mesh = mesh.noting("its faces were wound against each other; now alike", faces=faces)
     if signed_volume(mesh.vertices, mesh.faces) < 0:
@@ -183,7 +214,9 @@ def agreement_with_views(points: Float[np.ndarray, "P 3"], views: Views) -> floa
     """
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _VIEWS)).astype(int))
     masks = views.masks[chosen]
-    return float(np.mean([_fills(points, views, v, m) for v, m in zip(chosen, masks, strict=True)]))
+    return float(
+        np.mean([_fills(points, views, int(v), m) for v, m in zip(chosen, masks, strict=True)])
+    )
 
 
 def _fills(points: np.ndarray, views: Views, view: int, mask: np.ndarray) -> float:
