@@ -11,6 +11,7 @@ from references.rays import KINDS, brute_force, rays_of_kind, unit
 
 from geosplat_jax.core.capacity import Capacities, grow, overflowed
 from geosplat_jax.core.types import Mesh
+from geosplat_jax.rays import triangle_index
 from geosplat_jax.rays.triangle_index import build_triangle_index, cells_for
 from geosplat_jax.rays.walking import T_MIN
 from geosplat_jax.surface.base import Surface
@@ -152,6 +153,16 @@ def test_a_list_too_long_to_be_counted_is_refused(ball):
     capacities = AMPLE.resized(triangle_cells=2**20 + 1, cell_triangles=2047)
     with pytest.raises(ValueError, match="where a cell lists 2047 triangles, all cells list at"):
         index_of(*mesh, is_sheet=False, capacities=capacities)
+
+
+def test_more_cells_than_can_be_counted_are_refused_and_not_wrapped(ball):
+    whole = np.array([[0.0, 0, 0], [99, 0, 99], [0, 99, 99]])
+    corners = jnp.asarray(np.repeat(whole[:, :, None], 4400, axis=2), jnp.float32)
+    assert 4400 * 100**3 % 2**32 < 2**31  # it would look like a small positive number
+    assert int(triangle_index._boxed(corners, 8)[2]) == 2**31 - 1
+    mesh, _ = ball
+    with pytest.raises(ValueError, match="sizes of the mesh's faces differ too much"):
+        index_of(*mesh, is_sheet=False, capacities=AMPLE.resized(triangle_boxes=2**31))
 
 
 def test_the_grid_follows_the_vertices_wherever_they_go(ball):

@@ -29,7 +29,8 @@ class MeshSettings(SurfaceSettings, kind="mesh"):
     max_faces: Annotated[int, Field(ge=4, le=2_000_000)] = 150_000
     """Largest number of faces after that (about 6 KB per face)."""
     sides: Literal["auto", "one", "both"] = "auto"
-    """Sides that are surface; auto: one of a closed mesh, both of any other, at twice the cost."""
+    """Sides that are surface; auto: one of a closed mesh, both of any other, at twice the cost;
+    raster.cull_backfaces must then stay on."""
 
     @property
     def rate_groups(self) -> tuple[str, ...]:

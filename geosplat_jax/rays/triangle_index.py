@@ -40,6 +40,9 @@ _CELL_EDGES = 1.5
 _MOST_CELLS = 1 << 20
 """Cells of a grid, about; 4 MB for their words."""
 
+_MOST_BOXES = 1 << 25
+"""Pairs of a triangle and a cell that its bounding box meets, at most: some gigabytes."""
+
 _NUMBER = 9
 """Column of a row that holds the number of the triangle, exactly up to 2**24."""
 
@@ -202,7 +205,9 @@ def _boxed(
     size, first = size[:, triangle], first[:, triangle]
     z, rest = jnp.divmod(step, size[0] * size[1])
     y, x = jnp.divmod(rest, size[0])
-    return triangle, first + jnp.stack([x, y, z]), through[-1]
+    # Triangles as large as the grid may meet more cells together than 32 bits can count.
+    is_countable = jnp.sum(count.astype(corners.dtype)) < _MOST_BOXES
+    return triangle, first + jnp.stack([x, y, z]), jnp.where(is_countable, through[-1], 2**31 - 1)
 
 
 def _touches(corners: Float[Array, "3 3 P"], cell: Int[Array, "3 P"]) -> Bool[Array, " P"]:
@@ -252,6 +257,11 @@ def build_triangle_index(
         raise ValueError(
             f"where a cell lists {most} triangles, all cells list at most {largest}, not "
             f"{capacity}: the mesh has too many faces, or sizes that differ too much; decimate it"
+        )
+    if capacities["triangle_boxes"] > _MOST_BOXES:
+        raise ValueError(
+            "the sizes of the mesh's faces differ too much for rays: its large ones meet more than "
+            f"{_MOST_BOXES} cells of the size of the small ones; divide the large faces"
         )
     vertices = jax.lax.stop_gradient(vertices)
     grid = _grid_around(vertices, shape)
