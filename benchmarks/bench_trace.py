@@ -2,7 +2,8 @@
 
 Rays start on random triangles, sorted by triangle as splats are, and leave into the outer half
 space: what shading asks for. Embree runs its own occlusion query on one core (it has no other
-mode from Python); ours uses the cores that XLA gives it.
+mode from Python); ours uses the cores that XLA gives it. The same triangles are traced by both of
+our indices: that of the isosurface's own grid, and that of any triangles.
 """
 
 import importlib.util
@@ -20,6 +21,7 @@ from geosplat_jax.core.capacity import Capacities, combine, retry
 from geosplat_jax.core.types import Grid
 from geosplat_jax.geometry import grid_vertices, initial_geometry, isosurface
 from geosplat_jax.rays.grid_index import build_grid_index
+from geosplat_jax.rays.triangle_index import build_triangle_index, cells_for
 
 RESOLUTIONS = (48, 96)
 RAYS = 200_000
@@ -46,6 +48,21 @@ def _scene(resolution: int):
 
     (surface, index), capacities = retry(attempt, Capacities())
     return surface, index, grid, capacities
+
+
+def _mesh_index(surface) -> Callable[[], object]:
+    """Build the index of any triangles for the same mesh; return what builds it."""
+    vertices = surface.mesh.vertices[: int(surface.mesh.vertex_count)]
+    faces = surface.mesh.faces[: int(surface.mesh.face_count)]
+    build = jax.jit(build_triangle_index, static_argnames=("shape", "is_sheet", "capacities"))
+    shape = cells_for(np.asarray(vertices), np.asarray(faces))
+
+    def attempt(capacities: Capacities):
+        index = build(vertices, faces, shape=shape, is_sheet=False, capacities=capacities)
+        return index, index.usage
+
+    _, capacities = retry(attempt, Capacities(cell_triangles=128))
+    return lambda: attempt(capacities)[0]
 
 
 def _rays(surface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -97,6 +114,13 @@ def run() -> dict[str, float]:
             "occluded": lambda i=index, r=arguments: i.occluded(*r),
             "nearest": lambda i=index, r=arguments: i.nearest(*r),
         }
+        build = _mesh_index(surface)
+        mesh_index = build()
+        functions |= {
+            "mesh_build": build,
+            "mesh_occluded": lambda i=mesh_index, r=arguments: i.occluded(*r),
+            "mesh_nearest": lambda i=mesh_index, r=arguments: i.nearest(*r),
+        }
         embree = _embree(surface, origins + offset, directions)
         if embree is not None:
             functions["embree"] = embree
@@ -108,15 +132,15 @@ def run() -> dict[str, float]:
                 times[name].append(_seconds(function))
         median = {name: statistics.median(values) for name, values in times.items()}
         prefix = f"trace_{resolution}"
-        for name in ("build", "occluded", "nearest"):
+        for name in (name for name in functions if name != "embree"):
             results[f"{prefix}_{name}_ms"] = round(1e3 * median[name], 2)
         results[f"{prefix}_occluded_mrays"] = round(RAYS / median["occluded"] / 1e6, 2)
         if embree is not None:
             results[f"{prefix}_embree_yardstick_ms"] = round(1e3 * median["embree"], 2)
-            ratio = statistics.median(
-                a / b for a, b in zip(times["occluded"], times["embree"], strict=True)
-            )
-            results[f"{prefix}_slower_than_embree"] = round(ratio, 2)
+            for name, key in (("occluded", "slower"), ("mesh_occluded", "mesh_slower")):
+                pairs = zip(times[name], times["embree"], strict=True)
+                ratio = statistics.median(a / b for a, b in pairs)
+                results[f"{prefix}_{key}_than_embree"] = round(ratio, 2)
     return results
 
 

@@ -21,7 +21,7 @@ from geosplat_jax.fit.cameras import CameraSettings, ViewProgress, refine_views
 from geosplat_jax.fit.config import Budget, Config
 from geosplat_jax.fit.costs import expected_costs, slowness_of_machine
 from geosplat_jax.fit.folder import RunError, RunFolder
-from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.presets import make_config, with_mesh
 from geosplat_jax.fit.runtime import in_background
 from geosplat_jax.fit.stages import make_batch
 from geosplat_jax.fit.train import Progress, Trained, fit, load_trained
@@ -388,6 +388,7 @@ def train(
     config: Config | None = None,
     *,
     quality: str = "standard",
+    mesh: str | Path | None = None,
     resume: bool = False,
     force: bool = False,
     source: str | Path | None = None,
@@ -403,6 +404,7 @@ def train(
     scene : folder, or a dataset from `load_dataset`.
     output : folder of the run.
     config : settings, see `make_config`; by default those of ``quality``.
+    mesh : file of a mesh to start from instead of a visual hull, see `fit.presets.with_mesh`.
     resume, force, source, first_stage, on_step : see `fit.train.fit`; ``force`` replaces a run.
     budget : time and memory that the training may take. Without ``config``, settings are chosen for
         it (`plan_training`); in any case steps are made fewer or more on the way, so that it ends
@@ -414,12 +416,16 @@ def train(
     ------
     SceneError, RunError, TrainingError, Interrupted
         See `load_dataset` and `fit.train.fit`.
+    ValueError
+        If the mesh cannot be used; see `io.start_mesh`.
     """
     began, folder = time.perf_counter(), RunFolder(output)
     if config is None and budget is not None:
         chosen = plan_training(scene, budget, downscale=reading.get("downscale"))
         config, reading = chosen.config, {**reading, "downscale": chosen.downscale}
     config = config or make_config(quality=quality)
+    if mesh is not None:
+        config = with_mesh(config, mesh)
     dataset = scene if isinstance(scene, Dataset) else load_recorded(scene, reading)
     pacer = None
     if budget is not None:

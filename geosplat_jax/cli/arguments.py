@@ -192,6 +192,12 @@ def _add_config_arguments(parser: argparse.ArgumentParser) -> None:
         help="change a setting; geosplat-jax settings lists them",
     )
     parser.add_argument("--seed", type=int, help="seed of every random choice")
+    parser.add_argument(
+        "--mesh",
+        type=Path,
+        metavar="FILE",
+        help="start from this mesh: PLY, OBJ, GLB (docs/meshes.md)",
+    )
 
 
 def _add_relight(relight: argparse.ArgumentParser) -> None:

@@ -9,7 +9,7 @@ from geosplat_jax.camera_rounds import refined_cameras
 from geosplat_jax.cli.display import ProgressDisplay, say, say_refined
 from geosplat_jax.fit.config import Budget, Config, config_warnings
 from geosplat_jax.fit.folder import RunFolder
-from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.presets import make_config, with_mesh
 from geosplat_jax.io.dataset import choose_downscale, load_recorded
 from geosplat_jax.run import plan_training
 from geosplat_jax.run import train as train_run
@@ -30,7 +30,7 @@ def scene_options(arguments: argparse.Namespace, config: Config) -> dict[str, An
         return {**options, "downscale": arguments.downscale}
     cells = config.geometry.cells_along
     if cells is None:
-        raise UsageError("--downscale auto needs a surface of cells; give a number")
+        raise UsageError("--downscale auto needs a surface of cells, not a mesh; give a number")
     corners = arguments.bounds
     reading = {**options, "bounds": None if corners is None else (corners[:3], corners[3:])}
     chosen = choose_downscale(arguments.scene, cells, **reading)
@@ -44,6 +44,7 @@ def config_from(arguments: argparse.Namespace) -> Config:
         arguments.preset or "default",
         arguments.quality or "standard",
         material_prior=arguments.material_prior,
+        mesh=arguments.mesh,
         overrides=_overrides(arguments),
     )
 
@@ -99,7 +100,9 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
     for line in plan.describe():
         say(line)
     arguments.downscale = plan.downscale
-    return _Order(plan.config, scene_options(arguments, plan.config), budget)
+    reading = scene_options(arguments, plan.config)
+    mesh = arguments.mesh
+    return _Order(plan.config if mesh is None else with_mesh(plan.config, mesh), reading, budget)
 
 
 def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[str, Any]) -> Path:
@@ -132,7 +135,7 @@ def train(arguments: argparse.Namespace) -> None:
     if arguments.refine_cameras is not None:
         reading["cameras"] = _refined_cameras(arguments, folder, reading)
     dataset = load_recorded(arguments.scene, reading)
-    for note in dataset.notes:
+    for note in (*dataset.notes, *config.geometry.notes(dataset)):
         say(note)
     for warning in (*dataset.warnings, *config_warnings(config)):
         say(warning, label="warning: ", style="yellow")

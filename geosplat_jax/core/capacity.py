@@ -34,7 +34,10 @@ class Capacities(Mapping[str, int]):
     - ``visible`` : splats that one view can see;
     - ``hits`` : pairs of a visible splat and a tile it may touch, in one view;
     - ``chunks`` : groups of consecutive hits of one tile, in one view;
-    - ``cell_patches`` : pairs of a grid cell and a quad that may touch it, for tracing rays.
+    - ``cell_patches`` : pairs of a grid cell and a quad that may touch it, for tracing rays;
+    - ``triangle_boxes``, ``triangle_cells``, ``cell_triangles`` : the same for any triangles: pairs
+      of a triangle and a cell that its bounding box meets, those that may truly touch, and the
+      triangles of the fullest cell.
     """
 
     def __init__(self, **sizes: int) -> None:

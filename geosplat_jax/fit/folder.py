@@ -254,6 +254,7 @@ class RunFolder:
                 **_scene_of(dataset),
                 "config": config.to_dict(),
                 **({} if budget is None else {"budget": asdict(budget)}),
+                "notes": [*dataset.notes, *config.geometry.notes(dataset)],
                 "versions": {
                     "python": platform.python_version(),
                     **{name: importlib.metadata.version(name) for name in _PACKAGES},

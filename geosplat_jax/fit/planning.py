@@ -40,11 +40,11 @@ def plan_capacities(
     """
     first = pipeline.surface.first_capacities(params.geometry)
     splats = _SPLATS_PER_QUAD * first["quads"]
-    guess = first.resized(
+    guess = Capacities(
         visible=capacity_module.bucket(int(0.5 * splats)),
         hits=capacity_module.bucket(int(1.7 * splats)),
         chunks=capacity_module.bucket(int(0.33 * splats)),
-    )
+    ).resized(**first)
 
     def attempt(capacities: Capacities) -> tuple[Usage, Usage]:
         needed = _needs_of(replace(pipeline, capacities=capacities), params, camera)

@@ -7,6 +7,7 @@ overrides written as ``section.field=value``.
 """
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Literal
 
 from geosplat_jax.adapter import AdapterConstants
@@ -21,8 +22,10 @@ from geosplat_jax.fit.config import (
     parse_override,
 )
 from geosplat_jax.fit.entering import FreshAlbedo
+from geosplat_jax.fit.start_mesh import MeshSettings
 from geosplat_jax.fit.surfaces import FlexiCubesSettings
 from geosplat_jax.hashgrid import HashGridSpec
+from geosplat_jax.io.start_mesh import digest_of
 from geosplat_jax.losses import Schedule
 from geosplat_jax.materials import MATERIAL_PRIORS, MaterialSpec
 from geosplat_jax.refinement import FreeSplatSettings
@@ -292,6 +295,64 @@ def _code(material_prior: str) -> Config:
     )
 
 
+_MESH_RATES = {"default": 3e-4, "paper": 1e-4, "code": 1e-4}
+"""Rates of the vertices, in half the longest side of the box."""
+
+_MESH_WEIGHTS: dict[str, dict[str, float]] = {
+    "default": {"laplacian": 0.03, "normal_consistency": 0.01, "edge_length": 0.01, "offset": 0.0},
+    "paper": {"laplacian": 1e-3, "normal_consistency": 3e-4, "edge_length": 0.1, "offset": 0.1},
+}
+_MESH_WEIGHTS["code"] = _MESH_WEIGHTS["paper"]
+"""Weights of `surface.triangle_mesh`. Those of the paper are appendix H's, whose unit of length is
+not known."""
+
+_MESH_EDGES = {"draft": 3.0, BETWEEN: 2.0, "standard": 2.0, "high": 1.5}
+"""Mean edges of a mesh in pixels."""
+
+_MESH_VIEWS = 6
+"""Views per step in appendix H."""
+
+
+def with_mesh(config: Config, path: str | Path) -> Config:
+    """Return a configuration that starts from a mesh file instead of an isosurface (appendix H).
+
+    The surface's own rates and weights give way to those of a mesh; everything else stays, but for
+    what appendix H says of the methods of others: six views per step, smoother roughness and
+    metallic, and no vertex sampling. There splats that look away are left out, as those of an open
+    mesh must be.
+
+    Raises
+    ------
+    ValueError
+        If there is no such file.
+    """
+    path = Path(path)
+    geometry = MeshSettings(
+        path=str(path.resolve()),
+        digest=digest_of(path),
+        edge_pixels=_MESH_EDGES[config.quality],
+    )
+    old, is_original = config.geometry, config.preset != "default"
+    stages = []
+    for stage in config.stages:
+        rates = {n: r for n, r in stage.rates.items() if n not in old.rate_groups}
+        weights = {n: w for n, w in stage.weights.items() if n not in old.penalty_names}
+        before = [stage.rates[name] for name in old.rate_groups if name in stage.rates]
+        is_frozen = not before or all(rate.value == 0 for rate in before)
+        rate = Rate(0.0)
+        if not is_frozen:
+            rate = Rate(_MESH_RATES[config.preset], max(rate.warmup for rate in before))
+            weights |= _weights(**_MESH_WEIGHTS[config.preset])
+        if is_original and not is_frozen:
+            weights |= _weights(smoothness_roughness_metallic=0.01)
+        stage = replace(stage, rates={**rates, "vertices": rate}, weights=weights)
+        if is_original:
+            stage = replace(stage, vertex_fraction=0.0, batch_views=_MESH_VIEWS)
+        stages.append(stage)
+    raster = replace(config.raster, cull_backfaces=True)
+    return replace(config, geometry=geometry, raster=raster, stages=tuple(stages))
+
+
 # What each quality level spends.
 _QUALITY: dict[str, dict[str, Any]] = {
     "draft": {
@@ -401,6 +462,7 @@ def make_config(
     quality: str = "standard",
     *,
     material_prior: str = "hybrid",
+    mesh: str | Path | None = None,
     overrides: tuple[str, ...] = (),
 ) -> Config:
     """Combine a preset, a quality level and overrides into a validated `Config`.
@@ -411,12 +473,13 @@ def make_config(
     quality : one of `QUALITIES`. Of the presets ``paper`` and ``code``, ``draft`` is a smaller
         version; ``standard`` and ``high`` are their own numbers.
     material_prior : where roughness and metallic start, one of `materials.MATERIAL_PRIORS`.
+    mesh : file of a mesh to start from, see `with_mesh`.
     overrides : ``section.field=value`` strings, applied last.
 
     Raises
     ------
     ValueError
-        On an unknown name, a value of the wrong type or out of range.
+        On an unknown name, a value of the wrong type or out of range, or a mesh that is no file.
     """
     if preset not in PRESETS:
         raise ValueError(f"preset must be one of {PRESETS}, got {preset!r}")
@@ -439,6 +502,8 @@ def make_config(
     )
     config = replace(config, quality=quality, material_prior=material_prior, material=material)
     values = merge(config.to_dict(), changes)
+    if mesh is not None:
+        values = with_mesh(config_from_dict(values), mesh).to_dict()
     for override in overrides:
         values = merge(values, parse_override(override))
     return config_from_dict(values)

@@ -60,6 +60,17 @@ class SurfaceSettings(Variant, abc.ABC):
         del bounds
         return 0
 
+    def notes(self, dataset: Dataset) -> tuple[str, ...]:
+        """Say what `start` does for a scene that its user should know.
+
+        Raises
+        ------
+        ValueError
+            As `start`.
+        """
+        del dataset
+        return ()
+
     @abc.abstractmethod
     def start(self, dataset: Dataset, key: Key[Array, ""]) -> tuple[SurfaceModel, Any]:
         """Make the surface and its first shape for a scene.

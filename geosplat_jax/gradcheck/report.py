@@ -13,6 +13,7 @@ from geosplat_jax.gradcheck.image_stages import (
     projection_problems,
     rasteriser_problems,
 )
+from geosplat_jax.gradcheck.mesh_stages import mesh_problems
 from geosplat_jax.gradcheck.shading_stages import (
     bsdf_problems,
     hash_grid_problems,
@@ -35,6 +36,7 @@ SINGLE_TOLERANCE = 1e-3
 
 STAGES: dict[str, Callable[[np.random.Generator], list[Problem]]] = {
     "isosurface": isosurface_problems,
+    "mesh": mesh_problems,
     "adapter": adapter_problems,
     "hashgrid": hash_grid_problems,
     "materials": material_problems,

@@ -1,0 +1,154 @@
+"""Start from existing meshes (appendix H): what training makes of them, beside the joint method.
+
+    python experiments/studies/existing_mesh.py SCENE ... --output FOLDER [--downscale 2]
+        [--quality draft] [--noise 1] [--set SECTION.FIELD=VALUE] [--json FILE]
+
+Starts: ``noise``, the true mesh (``mesh_gt.ply`` of the scene) at the size of the pixels whose
+vertices were moved along their normals by so many pixels (standard deviation); and ``hull``,
+marching cubes of the visual hull, which stands for a mesh of another method. Each is trained twice:
+with its vertices frozen, which says what the start is worth, and with all rates. ``joint`` is
+trained from the masks alone, as ever.
+
+Columns: Chamfer distance (mean of both directions, in thousandths of the object's longest side),
+normal error of the test views, PSNR of new views, of relit ones and of albedo. Runs that are there
+already are opened instead.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+from skimage.measure import marching_cubes
+
+from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.io.dataset import Dataset, load_dataset
+from geosplat_jax.io.meshes import read_mesh
+from geosplat_jax.io.start_mesh import digest_of, fitted, pixel_length
+from geosplat_jax.run import Run, train
+from geosplat_jax.surface.hull import fit_grid, hull_sdf
+
+POINTS = 50_000
+"""Points of either surface that distances are measured at."""
+MOST_FACES = 200_000
+HULL_CELLS = 64
+FROZEN = tuple(f"stages.{name}.rates.vertices=0" for name in ("split_sum", "monte_carlo"))
+MEASURES = {
+    "normals, degrees": "normal.mae_masked_deg",
+    "NVS PSNR": "nvs.psnr",
+    "relight PSNR": "relight.mean.psnr",
+    "albedo PSNR": "albedo.psnr",
+}
+
+
+def noisy_truth(dataset: Dataset, pixels: float) -> trimesh.Trimesh:
+    """Move the vertices of the true mesh along their normals."""
+    path = str(dataset.root / "mesh_gt.ply")
+    views = dataset.train
+    mesh = fitted(path, digest_of(path), views, edge_pixels=2.0, most_faces=MOST_FACES)
+    body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    steps = np.random.default_rng(0).normal(size=(len(mesh.vertices), 1))
+    way = pixels * pixel_length(mesh, views) * steps * body.vertex_normals
+    return trimesh.Trimesh(mesh.vertices + way, mesh.faces, process=False)
+
+
+def hull_mesh(dataset: Dataset) -> trimesh.Trimesh:
+    """Extract the visual hull by marching cubes."""
+    grid = fit_grid(dataset.bounds, HULL_CELLS)
+    camera = dataset.train.camera()
+    matrices = (np.asarray(x, np.float64) for x in (camera.world_to_camera, camera.intrinsics))
+    masks = dataset.train.images[..., 3]
+    distance = hull_sdf(*matrices, masks, grid, valid=dataset.train.valid)
+    volume = distance.reshape(grid.vertex_shape[::-1]).transpose(2, 1, 0)
+    cell = float(grid.cell_size)
+    vertices, faces, _, _ = marching_cubes(volume, 0.0, spacing=(cell,) * 3)
+    return trimesh.Trimesh(vertices + np.asarray(grid.origin), faces, process=False)
+
+
+def chamfer(mesh: trimesh.Trimesh, truth: trimesh.Trimesh) -> float:
+    """Mean distance of points of either surface to the other, per mille of the truth's size."""
+    one, two = (
+        np.asarray(trimesh.sample.sample_surface(m, POINTS, seed=0)[0]) for m in (mesh, truth)
+    )
+    there, back = cKDTree(two).query(one)[0], cKDTree(one).query(two)[0]
+    return 1e3 * 0.5 * float(np.mean(there) + np.mean(back)) / float(np.max(truth.extents))
+
+
+def train_or_open(dataset: Dataset, folder: Path, overrides: list[str], quality: str, mesh) -> Run:
+    """Train, or open the run that the folder holds."""
+    if (folder / "training.json").exists():
+        run = Run(folder)
+        run.dataset = dataset
+        return run
+    config = make_config(quality=quality, mesh=mesh, overrides=("run.preview_every=0", *overrides))
+    return train(dataset, folder, config, force=True)
+
+
+def row(run: Run, truth: trimesh.Trimesh, samples: int) -> dict[str, float]:
+    """Evaluate a run, and measure its surface."""
+    if not (run.folder.path / "metrics.json").exists():
+        run.evaluate(samples=samples)
+    vertices, faces, _ = run.renderer().mesh()
+    mean = run.metrics["mean"]
+    return {
+        "Chamfer": chamfer(trimesh.Trimesh(vertices, faces, process=False), truth),
+        **{name: mean[key] for name, key in MEASURES.items() if key in mean},
+        "faces": len(faces),
+        "minutes": (run.folder.training() or {})["seconds_total"] / 60,
+    }
+
+
+def study(scene: Path, arguments: argparse.Namespace) -> dict[str, dict[str, float]]:
+    """Train every start of a scene; print and return its rows."""
+    dataset = load_dataset(scene, downscale=arguments.downscale, test_views=arguments.test_views)
+    truth = trimesh.Trimesh(*read_mesh(scene / "mesh_gt.ply"), process=False)
+    folder = arguments.output / scene.name
+    folder.mkdir(parents=True, exist_ok=True)
+    starts = {"noise": noisy_truth(dataset, arguments.noise), "hull": hull_mesh(dataset)}
+    rows = {}
+    for name in arguments.starts:
+        if name == "joint":
+            plans: list[tuple[str, Path | None, tuple[str, ...]]] = [("joint", None, ())]
+        else:
+            path = folder / f"{name}.ply"
+            starts[name].export(path)
+            plans = [(f"{name}, frozen", path, FROZEN), (f"{name}, trained", path, ())]
+        for title, mesh, changes in plans:
+            overrides = [*arguments.overrides, *changes]
+            place = folder / title.replace(", ", "_")
+            run = train_or_open(dataset, place, overrides, arguments.quality, mesh)
+            rows[title] = row(run, truth, arguments.samples)
+            cells = "  ".join(f"{key} {value:.2f}" for key, value in rows[title].items())
+            print(f"{scene.name:14s} {title:16s} {cells}", flush=True)
+    return rows
+
+
+def main() -> None:
+    """Run the study and print its rows."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenes", type=Path, nargs="+", metavar="SCENE")
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--downscale", type=int, default=2)
+    parser.add_argument("--quality", default="draft")
+    parser.add_argument("--noise", type=float, default=1.0, help="pixels (default: %(default)s)")
+    parser.add_argument("--samples", type=int, default=32, help="rays per splat when evaluating")
+    parser.add_argument("--test-views", type=int, help="at most so many (default: all)")
+    names = ("noise", "hull", "joint")
+    parser.add_argument("--starts", nargs="+", choices=names, default=names)
+    parser.add_argument("--set", dest="overrides", action="append", default=[])
+    parser.add_argument("--json", type=Path, help="also write the rows to this file")
+    arguments = parser.parse_args()
+    enable_compilation_cache()
+    retain_freed_memory()
+    found = {scene.name: study(scene, arguments) for scene in arguments.scenes}
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(found, indent=1), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,350 @@
+"""The mesh that a training starts from: read, cleaned, compared with the cameras, sized for them.
+
+Whatever is changed is said in a note; what cannot be right is refused with what to do about it.
+"""
+
+import hashlib
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+
+from geosplat_jax.io.meshes import (
+    nondegenerate,
+    read_mesh,
+    signed_volume,
+    surface_area,
+)
+from geosplat_jax.io.views import Views
+
+LARGEST = 5_000_000
+"""Faces of a mesh that is read at most; decimating more takes minutes and gigabytes."""
+
+_SAME_PLACE = 1e-7
+"""Corners nearer to each other than this share of the mesh's size are one vertex."""
+
+_Y_UP = {".glb", ".gltf"}
+"""Formats whose files say that y is up; the world of the cameras has z up."""
+
+_SAMPLES = 4000
+"""Points of the surface that are projected to compare it with the masks."""
+
+_VIEWS = 12
+"""Views that they are projected into, at most."""
+
+_AGREES = 0.3
+"""Least agreement with the views of a mesh that is where the object is. The object at half or twice
+its size has .25 or less, marching cubes of a visual hull nearly 1."""
+
+_FACTORS = (1e-3, 1e-2, 1e-1, 10.0, 1e2, 1e3)
+"""Changes of units that a message suggests where they would help."""
+
+_WORTHWHILE = 0.8
+"""A mesh is decimated where at most this share of its faces is to stay."""
+
+
+@dataclass(frozen=True)
+class StartMesh:
+    """A mesh to start from.
+
+    Attributes
+    ----------
+    vertices : (V, 3) float64 world; each belongs to a face. faces : (F, 3) int32.
+    notes : what was done to it, one sentence each.
+    """
+
+    vertices: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether faces bound a volume: every edge is passed as often one way as the other.
+
+        Unlike for `meshes.is_closed`, four faces may meet at an edge.
+        """
+        return not _open_edges(self.faces).any()
+
+    def noting(self, *notes: str, **changes: Any) -> "StartMesh":
+        """Return the mesh with changes and what is to be said of them."""
+        return replace(self, notes=(*self.notes, *notes), **changes)
+
+
+def _open_edges(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " E"]:
+    """Count how often every edge is passed one way, less how often the other."""
+    start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
+    stride = int(faces.max(initial=0)) + 1
+    edge = np.minimum(start, end) * stride + np.maximum(start, end)
+    _, number = np.unique(edge, return_inverse=True)
+    ways = np.where(start < end, 1.0, -1.0).ravel()
+    return np.rint(np.bincount(number.reshape(-1), ways)).astype(np.int64)
+
+
+def digest_of(path: str | Path) -> str:
+    """Return a short text that tells what a file holds from anything else.
+
+    Raises
+    ------
+    ValueError
+        If there is no such file.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"there is no mesh file {path}")
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+
+
+@lru_cache(maxsize=1)
+def read_start(path: str, digest: str) -> StartMesh:
+    """Read a mesh file and clean what it holds, in the axes of the world.
+
+    Corners at one place become one vertex; faces without area, faces that are there twice and
+    vertices without faces are dropped; faces of a closed mesh are turned outward.
+
+    Parameters
+    ----------
+    path : of the file. digest : see `digest_of`.
+
+    Raises
+    ------
+    ValueError
+        If the file is not what it was, holds no face that can be used, more than `LARGEST`, or
+        vertices that are not finite.
+    """
+    if digest_of(path) != digest:
+        raise ValueError(f"{path} is not the mesh that it was (its digest was {digest})")
+    vertices, faces = read_mesh(path)
+    if len(faces) > LARGEST:
+        raise ValueError(
+            f"{path} has {len(faces)} faces, more than {LARGEST}; decimate it first, to some "
+            "hundred thousand"
+        )
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError(f"{path} has faces of vertices that it does not have")
+    broken = ~np.isfinite(vertices).all(axis=1)
+    if broken.any():
+        raise ValueError(
+            f"{path}: {broken.sum()} of {len(vertices)} vertices are not finite numbers, the first "
+            f"is number {int(np.argmax(broken))}; repair the mesh"
+        )
+    mesh = StartMesh(vertices, faces, (f"mesh: {len(faces)} faces of {path}",))
+    if Path(path).suffix.lower() in _Y_UP:
+        # The inverse of `meshes.to_gltf_axes`.
+        turned = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], axis=-1)
+        mesh = mesh.noting("turned from glTF's y-up axes to z-up ones", vertices=turned)
+    return _outward(_cleaned(mesh, path))
+
+
+def _cleaned(mesh: StartMesh, path: str) -> StartMesh:
+    """Join corners at one place; drop faces that are none, and vertices without faces."""
+    size = float(np.max(np.ptp(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0)))
+    place = np.round(mesh.vertices / (_SAME_PLACE * size if size > 0 else 1.0))
+    _, first, row = np.unique(place, axis=0, return_index=True, return_inverse=True)
+    vertices, faces = mesh.vertices[first], row.reshape(-1)[mesh.faces].astype(np.int32)
+    given = len(faces)
+    following = np.roll(faces, -1, axis=1)
+    faces = faces[(faces != following).all(axis=1)]
+    # Slivers close a surface as other faces do; of an open one they are no part.
+    if _open_edges(faces).any():
+        faces = faces[nondegenerate(vertices, faces)]
+    with_area = len(faces)
+    faces = _single(faces)
+    if not len(faces) or not nondegenerate(vertices, faces).any():
+        raise ValueError(f"{path} must hold a triangle mesh, found no triangle with an area in it")
+    used, rows = np.unique(faces, return_inverse=True)
+    counts = {
+        "corners at the place of others joined": len(mesh.vertices) - len(vertices),
+        "faces without area dropped": given - with_area,
+        "faces that were there twice dropped": with_area - len(faces),
+        "vertices without faces dropped": len(vertices) - len(used),
+    }
+    notes = [f"{count} {what}" for what, count in counts.items() if count]
+    faces = rows.reshape(-1, 3).astype(np.int32)
+    return mesh.noting(*notes, vertices=vertices[used], faces=faces)
+
+
+def _single(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "G 3"]:
+    """Keep one of the faces that share three corners; of a closed surface none of two that cancel.
+
+    Where every face stands twice, to be seen from both sides, nothing would be left: one stays.
+    """
+    _, only, number, count = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    kept = faces[np.sort(only)]
+    if (count == 1).all() or not _open_edges(kept).any():
+        return kept
+    alone = faces[count[number.reshape(-1)] == 1]
+    return kept if not len(alone) or _open_edges(alone).any() else alone
+
+
+def _outward(mesh: StartMesh) -> StartMesh:
+    """Turn a closed mesh outward; wind alike the faces of one that is closed but for that.
+
+    Parts inside of others, and inverted parts beside right ones, stay as they are: the volume of
+    all decides.
+    """
+    if not mesh.is_closed:
+        edges = np.sort(np.stack([mesh.faces, np.roll(mesh.faces, -1, 1)], -1).reshape(-1, 2), 1)
+        _, counts = np.unique(edges, axis=0, return_counts=True)
+        if (counts != 2).any():
+            return mesh
+        body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        trimesh.repair.fix_winding(body)
+        faces = np.asarray(body.faces, np.int32)
+        if _open_edges(faces).any():
+            return mesh
+        mesh = mesh.noting("its faces were wound against each other; now alike", faces=faces)
+    if signed_volume(mesh.vertices, mesh.faces) < 0:
+        faces = np.ascontiguousarray(mesh.faces[:, ::-1])
+        mesh = mesh.noting("it was inside out; its faces were turned", faces=faces)
+    return mesh
+
+
+def agreement_with_views(points: Float[np.ndarray, "P 3"], views: Views) -> float:
+    """Tell how well points of a surface fill the masks, or the images where there are no masks.
+
+    Share of the points that some pixel of the mask sees, times the common share of the rectangles
+    around points and mask; the mean over some views. The second factor is left out without masks.
+    """
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _VIEWS)).astype(int))
+    masks = views.masks[chosen]
+    return float(
+        np.mean([_fills(points, views, int(v), m) for v, m in zip(chosen, masks, strict=True)])
+    )
+
+
+def _fills(points: np.ndarray, views: Views, view: int, mask: np.ndarray) -> float:
+    """See `agreement_with_views`; 0 for a view that sees no point, 1 for an empty mask."""
+    rows, columns = np.nonzero(mask)
+    if not len(rows):
+        return 1.0
+    pose = views.world_to_camera[view]
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    local = local[local[:, 2] > 0]
+    pixels = (local @ views.intrinsics[view].T)[:, :2] / local[:, 2:]
+    inside = (pixels >= 0).all(axis=1) & (pixels < mask.shape[::-1]).all(axis=1)
+    if not inside.any():
+        return 0.0
+    column, row = pixels[inside].astype(int).T
+    share = float(mask[row, column].sum() / len(points))
+    if not views.has_masks:
+        return share
+    low, high = np.percentile(pixels, (1, 99), axis=0)
+    first = np.array([columns.min(), rows.min()], float)
+    last = np.array([columns.max(), rows.max()], float) + 1
+    common = np.prod(np.maximum(np.minimum(high, last) - np.maximum(low, first), 0))
+    union = np.prod(high - low) + np.prod(last - first) - common
+    return share * float(common / union)
+
+
+def _points_on(mesh: StartMesh) -> Float[np.ndarray, "P 3"]:
+    """Spread points over the surface."""
+    corners = mesh.vertices[mesh.faces]
+    rng = np.random.default_rng(0)
+    edges = corners[:, 1:] - corners[:, :1]
+    area = np.sqrt(np.sum(np.cross(edges[:, 0], edges[:, 1]) ** 2, axis=-1))
+    face = rng.choice(len(corners), _SAMPLES, p=area / area.sum())
+    return np.einsum("pk,pkd->pd", rng.dirichlet([1, 1, 1], _SAMPLES), corners[face])
+
+
+def require_in_views(mesh: StartMesh, views: Views, path: str) -> None:
+    """Refuse a mesh that is not where the views see the object, or has other units.
+
+    Raises
+    ------
+    ValueError
+        With how much of it the views see, and the factor that would help, where one does.
+    """
+    points = _points_on(mesh)
+    found = agreement_with_views(points, views)
+    if found >= _AGREES:
+        return
+    scaled = {factor: agreement_with_views(factor * points, views) for factor in _FACTORS}
+    best = max(scaled, key=lambda factor: scaled[factor])
+    advice = "bring it into the axes, the place and the units of the cameras"
+    if scaled[best] >= max(_AGREES, 2 * found):
+        advice = f"{best:g} times as large it would (agreement {scaled[best]:.2f}): are its units "
+        advice += "others than the cameras'? Scale the file"
+    size = ", ".join(f"{extent:.3g}" for extent in np.ptp(mesh.vertices, axis=0))
+    middle = ", ".join(f"{x:.3g}" for x in 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0)))
+    raise ValueError(
+        f"{path} is not where the cameras see the object (agreement {found:.2f} of 1, at least "
+        f"{_AGREES}): it is {size} large, around ({middle}). {advice}"
+    )
+
+
+def pixel_length(mesh: StartMesh, views: Views) -> float:
+    """Return the width of a pixel at the middle of the mesh, in the world; the views' median."""
+    middle = 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
+    depth = views.world_to_camera[:, 2, :3] @ middle + views.world_to_camera[:, 2, 3]
+    return float(np.median(np.abs(depth) / views.intrinsics[:, 0, 0]))
+
+
+def sized(mesh: StartMesh, edge: float, *, most_faces: int, path: str) -> StartMesh:
+    """Decimate or divide a mesh to edges of a length, as far as a number of faces allows.
+
+    Raises
+    ------
+    ValueError
+        If it has too many faces and the package that decimates is missing.
+    """
+    area = surface_area(mesh.vertices, mesh.faces)
+    # As many equilateral triangles as cover the surface.
+    wanted = max(int(area / (0.25 * np.sqrt(3.0) * edge**2)), 4)
+    target = min(wanted, most_faces)
+    count = len(mesh.faces)
+    if target < _WORTHWHILE * count:
+        return _decimated(mesh, target, most_faces=most_faces, path=path)
+    vertices, faces = mesh.vertices, mesh.faces
+    while 4 * len(faces) <= target:
+        vertices, faces = trimesh.remesh.subdivide(vertices, faces)[:2]
+    if len(faces) == count:
+        return mesh
+    note = f"every face divided to {len(faces) // count}, {len(faces)} in all, to match the pixels"
+    return mesh.noting(note, vertices=np.asarray(vertices), faces=np.asarray(faces, np.int32))
+
+
+def _decimated(mesh: StartMesh, target: int, *, most_faces: int, path: str) -> StartMesh:
+    """Reduce a mesh to about so many faces by quadric errors."""
+    count = len(mesh.faces)
+    body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    try:
+        body = body.simplify_quadric_decimation(face_count=target)
+    except ImportError:
+        cure = "pip install 'geosplat_jax[mesh]'"
+        if count > most_faces:
+            raise ValueError(
+                f"{path} has {count} faces, more than geometry.max_faces = {most_faces}; to "
+                f"decimate it, {cure}"
+            ) from None
+        return mesh.noting(f"its faces are smaller than pixels need; to decimate it, {cure}")
+    was_closed = mesh.is_closed
+    reduced = StartMesh(np.asarray(body.vertices, np.float64), np.asarray(body.faces, np.int32))
+    reduced = _outward(_cleaned(reduced, path))
+    notes = [f"decimated to {len(reduced.faces)} faces, to match the pixels"]
+    if was_closed and not reduced.is_closed:
+        notes.append("decimation left it with open edges")
+    return replace(reduced, notes=(*mesh.notes, *notes))
+
+
+def fitted(
+    path: str, digest: str, views: Views, *, edge_pixels: float, most_faces: int
+) -> StartMesh:
+    """Read a mesh for the cameras of a scene: `read_start`, `require_in_views`, `sized`.
+
+    Parameters
+    ----------
+    path, digest : see `read_start`.
+    views : of the training.
+    edge_pixels : mean edge to aim at, in pixels. most_faces : of the result, at most.
+    """
+    mesh = read_start(path, digest)
+    require_in_views(mesh, views, path)
+    edge = edge_pixels * pixel_length(mesh, views)
+    return sized(mesh, edge, most_faces=most_faces, path=path)

@@ -1,0 +1,405 @@
+"""Rays that walk through a grid of cells, each of which lists what may be hit in it.
+
+What is listed, and how it is tested, belongs to the subclasses of `CellIndex`. Cells without a list
+know how many cells away the nearest one with some is, so that a ray crosses empty space in few
+steps. The method is exact: a ray tests everything that the cells which it passes list.
+
+Nothing here is differentiable: visibility has no gradient by contract.
+
+Sides. A closed surface has faces that point outwards, so that a ray from outside meets a front
+face first. With ``two_sided=False`` back faces are ignored, and cells whose normals all face away
+are passed without a test: the fast and usual choice for rays that leave the surface outwards. With
+``two_sided=True`` both sides count.
+
+Self-intersection. A ray never hits the face it is said to start from, nor anything nearer than
+`T_MIN` cells.
+
+On a CPU, XLA runs a loop over many rays in lockstep. Rays therefore travel in chunks; whenever half
+of a chunk has finished, the others move together and the loop goes on with half as many lanes.
+"""
+
+import abc
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, UInt
+
+from geosplat_jax.core.capacity import bit_set
+from geosplat_jax.core.numerics import safe_normalize
+from geosplat_jax.core.types import Grid
+from geosplat_jax.rays.base import RayIndex
+
+T_MIN = 1e-3
+"""Hits nearer to the start of a ray than this, in cells, are ignored."""
+
+SLACK = 1e-4
+"""Enlargement of what is listed in cells, so that rounding along a ray never passes it by."""
+
+WORD_BITS = 31
+"""Bits of a cell's word: how many entries it lists, and which is the first."""
+
+_CHUNK = 32_768
+_STAGES = 6
+_STRANDS = 2
+"""A loop runs on one core; so many of them are offered to the machine at once."""
+
+_LARGEST_SKIP = 15
+
+_CONE_MARGIN = 0.02
+"""Added to the sine of a cone for the rounding of its axis to 8 bits a component."""
+
+_PARALLEL = 1e-12
+"""Directions with a smaller component do not move along that axis."""
+
+
+class Lanes(NamedTuple):
+    """Rays on their way, one component an array; lengths in cells."""
+
+    origin: tuple[Float[Array, " n"], ...]
+    direction: tuple[Float[Array, " n"], ...]
+    inverse: tuple[Float[Array, " n"], ...]  # infinite along axes that a ray does not move on
+    cell: tuple[Int[Array, " n"], ...]
+    word: Int[Array, " n"]
+    tested: Int[Array, " n"]  # entries of the cell that have been tested
+    source: Int[Array, " n"]
+    ray: Int[Array, " n"]
+    is_travelling: Bool[Array, " n"]
+    distance: Float[Array, " n"]  # of the nearest hit so far
+    face: Int[Array, " n"]  # of that hit, or -1
+
+
+class CellIndex(RayIndex):
+    """A surface in the cells of a grid; all lengths in cells.
+
+    Attributes
+    ----------
+    grid : of the cells.
+    words : (cells,) number of entries of a cell (its low ``count_bits``) and the first of them, or,
+        for a cell without any, the distance in cells to the nearest one with some.
+    cones : (cells,) cone around the normals in a cell: three signed bytes of axis, one byte of
+        sine; see `cones`.
+    """
+
+    grid: Grid
+    words: Int[Array, " K"]
+    cones: UInt[Array, " K"]
+
+    @property
+    @abc.abstractmethod
+    def count_bits(self) -> int:
+        """Bits of a word that count entries."""
+
+    @abc.abstractmethod
+    def test(self, lanes: Lanes, *, two_sided: bool, any_hit: bool) -> Lanes:
+        """Test the rays against the next entries of their cells."""
+
+    def count(self, word: Int[Array, " n"]) -> Int[Array, " n"]:
+        """Read how many entries a cell lists."""
+        return word & ((1 << self.count_bits) - 1)
+
+    def first(self, word: Int[Array, " n"]) -> Int[Array, " n"]:
+        """Read the first entry of a cell, or how far an empty one is from those that list some."""
+        return word >> self.count_bits
+
+    def occluded(
+        self,
+        origins: Float[Array, "N 3"],
+        directions: Float[Array, "N 3"],
+        source: Int[Array, " N"],
+        mask: Bool[Array, " N"],
+        *,
+        two_sided: bool = False,
+    ) -> Bool[Array, " N"]:
+        """Tell which rays hit the surface anywhere; see `RayIndex.occluded`."""
+        return _occluded(self, origins, directions, source, mask, two_sided=two_sided)
+
+    def nearest(
+        self,
+        origins: Float[Array, "N 3"],
+        directions: Float[Array, "N 3"],
+        source: Int[Array, " N"],
+        mask: Bool[Array, " N"],
+        *,
+        two_sided: bool = False,
+    ) -> tuple[Float[Array, " N"], Int[Array, " N"]]:
+        """Find the first hit of every ray; see `RayIndex.nearest`."""
+        return _nearest(self, origins, directions, source, mask, two_sided=two_sided)
+
+
+# --- what cells know ----------------------------------------------------------------------------
+
+
+def words_of(cells: Int[Array, " E"], grid: Grid, *, count_bits: int) -> Int[Array, " K"]:
+    """Build the words of the cells of a grid.
+
+    ``cells`` : of every entry, sorted; the number of cells on padding.
+    """
+    cell_count = grid.cube_count
+    count = jnp.zeros((cell_count + 1,), jnp.int32).at[cells].add(1, indices_are_sorted=True)
+    first = (jnp.cumsum(count) - count)[:cell_count]
+    count = count[:cell_count]
+    distance = _distances(count > 0, grid)
+    return jnp.where(count > 0, first, distance) << count_bits | count
+
+
+def _distances(occupied: Bool[Array, " K"], grid: Grid) -> Int[Array, " K"]:
+    """Chessboard distance to the nearest occupied cell, at least 1 and at most a limit."""
+    nx, ny, nz = grid.shape
+    grown = occupied.reshape(nz, ny, nx).astype(jnp.uint8)
+    distance = jnp.ones(grown.shape, jnp.int32)
+    for _ in range(_LARGEST_SKIP - 1):
+        for axis in range(3):
+            pad = [(1, 1) if i == axis else (0, 0) for i in range(3)]
+            wide = jnp.pad(grown, pad)
+            size = grown.shape[axis]
+            parts = [jax.lax.slice_in_dim(wide, s, s + size, axis=axis) for s in range(3)]
+            grown = parts[0] | parts[1] | parts[2]
+        distance = distance + (grown == 0).astype(jnp.int32)
+    return distance.reshape(-1)
+
+
+def cones_of(
+    normals: Float[Array, "T Q 3"],
+    entries: Int[Array, " E"],
+    cells: Int[Array, " E"],
+    cell_count: int,
+) -> UInt[Array, " K"]:
+    """Cone that holds the normals of all triangles of a cell, packed; see `_faces_away`.
+
+    Parameters
+    ----------
+    normals : unit normals of the T triangles of each of the Q things that cells list; zero where a
+        triangle has none.
+    entries, cells : which of them every entry is, and the cell that lists it, sorted.
+    """
+    axis = jax.ops.segment_sum(
+        jnp.sum(normals, axis=0)[entries], cells, cell_count + 1, indices_are_sorted=True
+    )
+    axis = jnp.round(127 * safe_normalize(axis))
+    along = jnp.sum(normals[:, entries] * safe_normalize(axis)[cells][None], axis=-1)
+    # Triangles without a normal cannot be hit.
+    is_flat = jnp.all(normals[:, entries] == 0, axis=-1)
+    along = jnp.min(jnp.where(is_flat, 1.0, along), axis=0)
+    smallest = jax.ops.segment_min(along, cells, cell_count + 1, indices_are_sorted=True)
+    smallest = jnp.clip(smallest, -1.0, 1.0)
+    sine = jnp.where(smallest > 0, jnp.sqrt(1 - smallest**2) + _CONE_MARGIN, 1.0)
+    packed = jnp.ceil(255 * jnp.minimum(sine, 1.0)).astype(jnp.uint32)
+    for component in range(3):
+        packed = packed << 8 | (axis[:, component].astype(jnp.int32) + 128).astype(jnp.uint32)
+    return packed[:cell_count]
+
+
+# --- travelling ---------------------------------------------------------------------------------
+
+
+def cross(a: tuple[Array, ...], b: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Cross product of vectors whose components are arrays of their own."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def dot(a: tuple[Array, ...], b: tuple[Array, ...]) -> Array:
+    """Scalar product of vectors whose components are arrays of their own."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _faces_away(cone: UInt[Array, " n"], direction: tuple[Array, ...]) -> Bool[Array, " n"]:
+    """Whether every normal in the cone has a positive cosine with the direction.
+
+    With all normals within an angle a of the axis, that is so where the direction's cosine with
+    the axis exceeds sin(a).
+    """
+    shifts = (16, 8, 0)
+    axis = [((cone >> s) & 255).astype(jnp.int32) - 128 for s in shifts]
+    sine = (cone >> 24).astype(direction[0].dtype) * (127 / 255)
+    return sum(a.astype(d.dtype) * d for a, d in zip(axis, direction, strict=True)) > sine
+
+
+def _enter(
+    lanes: Lanes, cell: tuple[Array, ...], index: CellIndex, two_sided: bool
+) -> Int[Array, " n"]:
+    """Read the word of a cell; one whose patches all face away is as good as empty."""
+    nx, ny, _ = index.grid.shape
+    number = cell[0] + nx * (cell[1] + ny * cell[2])
+    word = index.words.at[number].get(mode="promise_in_bounds")
+    if two_sided:
+        return word
+    cone = index.cones.at[number].get(mode="promise_in_bounds")
+    is_idle = (index.count(word) > 0) & _faces_away(cone, lanes.direction)
+    return jnp.where(is_idle, 1 << index.count_bits, word)
+
+
+def _advance(lanes: Lanes, index: CellIndex, *, two_sided: bool) -> Lanes:
+    """Move the rays that are done with their cell to the next one, across empty ones at once."""
+    count = index.count(lanes.word)
+    is_moving = lanes.is_travelling & (lanes.tested >= count)
+    skip = jnp.where(count > 0, 1, index.first(lanes.word))
+    dtype = lanes.distance.dtype
+    leave = []
+    for o, d, inverse, c in zip(
+        lanes.origin, lanes.direction, lanes.inverse, lanes.cell, strict=True
+    ):
+        border = jnp.where(d > 0, c + skip, c - skip + 1).astype(dtype)
+        leave.append(jnp.where(jnp.isinf(inverse), jnp.inf, (border - o) * inverse))
+    exit_distance = jnp.minimum(jnp.minimum(leave[0], leave[1]), leave[2])
+    leave, exit_distance, skip = jax.lax.optimization_barrier((leave, exit_distance, skip))
+
+    # The axis of the exit is stepped exactly; the others follow from the position, in bounds.
+    is_open = jnp.ones_like(is_moving)
+    is_outside = ~jnp.isfinite(exit_distance)
+    cells = []
+    for axis, size in enumerate(index.grid.shape):
+        o, d, c = lanes.origin[axis], lanes.direction[axis], lanes.cell[axis]
+        at_exit = jnp.floor(o + jnp.where(is_outside, 0.0, exit_distance) * d).astype(jnp.int32)
+        at_exit = jnp.clip(at_exit, c - skip + 1, c + skip - 1)
+        is_exit = is_open & (leave[axis] <= exit_distance)
+        is_open = is_open & ~is_exit
+        following = jnp.where(is_exit, jnp.where(d > 0, c + skip, c - skip), at_exit)
+        is_outside = is_outside | (following < 0) | (following >= size)
+        cells.append(jnp.where(is_moving, jnp.clip(following, 0, size - 1), c))
+    # A hit is final once the ray has left the cells that lie before it.
+    is_over = is_moving & (is_outside | (lanes.distance <= exit_distance))
+    word = _enter(lanes, tuple(cells), index, two_sided)
+    return lanes._replace(
+        cell=tuple(cells),
+        word=jnp.where(is_moving, word, lanes.word),
+        tested=jnp.where(is_moving, 0, lanes.tested),
+        is_travelling=lanes.is_travelling & ~is_over,
+    )
+
+
+def _start(
+    origins: Float[Array, "n 3"],
+    directions: Float[Array, "n 3"],
+    source: Int[Array, " n"],
+    is_active: Bool[Array, " n"],
+    *,
+    index: CellIndex,
+    two_sided: bool,
+) -> Lanes:
+    """Put rays into their first cell; those that never meet the box are done at once."""
+    origin, direction = tuple(origins.T), tuple(directions.T)
+    inverse, near, far = [], jnp.zeros_like(origin[0]), jnp.full_like(origin[0], jnp.inf)
+    for o, d, size in zip(origin, direction, index.grid.shape, strict=True):
+        is_still = jnp.abs(d) < _PARALLEL
+        reciprocal = jnp.where(is_still, jnp.inf, 1.0 / jnp.where(is_still, 1.0, d))
+        inverse.append(reciprocal)
+        one, two = (0.0 - o) * reciprocal, (size - o) * reciprocal
+        is_between = (o >= 0) & (o <= size)
+        lowest = jnp.where(is_still, jnp.where(is_between, 0.0, jnp.inf), jnp.minimum(one, two))
+        highest = jnp.where(is_still, jnp.inf, jnp.maximum(one, two))
+        near, far = jnp.maximum(near, lowest), jnp.minimum(far, highest)
+    meets = is_active & (near <= far) & jnp.isfinite(near)
+    entry = jnp.where(meets, near, 0.0)
+    cell = tuple(
+        jnp.clip(jnp.floor(o + entry * d).astype(jnp.int32), 0, size - 1)
+        for o, d, size in zip(origin, direction, index.grid.shape, strict=True)
+    )
+    count = origins.shape[0]
+    lanes = Lanes(
+        origin=origin,
+        direction=direction,
+        inverse=tuple(inverse),
+        cell=cell,
+        word=jnp.zeros((count,), jnp.int32),
+        tested=jnp.zeros((count,), jnp.int32),
+        source=source,
+        ray=jnp.arange(count, dtype=jnp.int32),
+        is_travelling=meets,
+        distance=jnp.full((count,), jnp.inf, origins.dtype),
+        face=jnp.full((count,), -1, jnp.int32),
+    )
+    return lanes._replace(word=_enter(lanes, cell, index, two_sided))
+
+
+def _halve(lanes: Lanes, nobody: int) -> Lanes:
+    """Keep the lanes that still travel, in order; at most half of them may.
+
+    Lanes left over belong to the ray ``nobody``, whose result is dropped.
+    """
+    size = lanes.ray.shape[0]
+    travelling = bit_set(lanes.is_travelling)
+    index = travelling.first(capacity=size // 2)
+    is_real = jnp.arange(size // 2, dtype=jnp.int32) < travelling.count
+    kept = jax.tree.map(lambda x: x.at[index].get(mode="promise_in_bounds"), lanes)
+    return kept._replace(
+        is_travelling=kept.is_travelling & is_real, ray=jnp.where(is_real, kept.ray, nobody)
+    )
+
+
+def _trace_chunk(
+    index: CellIndex, lanes: Lanes, *, two_sided: bool, any_hit: bool
+) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
+    """Distance in cells and face of the hit of every lane."""
+    distance, face = lanes.distance, lanes.face
+
+    def step(lanes: Lanes) -> Lanes:
+        lanes = _advance(lanes, index, two_sided=two_sided)
+        return index.test(lanes, two_sided=two_sided, any_hit=any_hit)
+
+    for stage in range(_STAGES):
+        size = lanes.ray.shape[0]
+        limit = 0 if stage == _STAGES - 1 or size < 256 else size // 2
+
+        def goes_on(lanes: Lanes, limit: int = limit) -> Bool[Array, ""]:
+            return jnp.sum(lanes.is_travelling, dtype=jnp.int32) > limit
+
+        lanes = jax.lax.while_loop(goes_on, step, lanes)
+        distance = distance.at[lanes.ray].set(lanes.distance, mode="drop")
+        face = face.at[lanes.ray].set(lanes.face, mode="drop")
+        if limit == 0:
+            break
+        lanes = _halve(lanes, nobody=distance.shape[0])
+    return distance, face
+
+
+def trace(
+    index: CellIndex,
+    origins: Float[Array, "N 3"],
+    directions: Float[Array, "N 3"],
+    source: Int[Array, " N"],
+    mask: Bool[Array, " N"],
+    *,
+    two_sided: bool,
+    any_hit: bool,
+) -> tuple[Float[Array, " N"], Int[Array, " N"]]:
+    """Trace chunk after chunk, in strands that run side by side."""
+    count = origins.shape[0]
+    strands = _STRANDS if count >= _CHUNK else 1
+    chunk = min(_CHUNK, max(256, -(-count // (256 * strands)) * 256))
+    rows = -(-max(count, 1) // (chunk * strands)) * strands
+    grid = index.grid
+    local = (origins - grid.origin[None, :]) / grid.cell_size
+
+    def chunks(values: Array) -> Array:
+        widths = ((0, rows * chunk - count),) + ((0, 0),) * (values.ndim - 1)
+        return jnp.pad(values, widths).reshape(rows, chunk, *values.shape[1:])
+
+    def one(parts: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
+        lanes = _start(*parts, index=index, two_sided=two_sided)
+        return _trace_chunk(index, lanes, two_sided=two_sided, any_hit=any_hit)
+
+    parts = (chunks(local), chunks(directions), chunks(source), chunks(mask))
+    found = [
+        jax.lax.map(one, jax.tree.map(lambda x, k=strand: x[k::strands], parts))
+        for strand in range(strands)
+    ]
+    distance, face = (
+        jnp.stack(strand, axis=1).reshape(rows * chunk)[:count]
+        for strand in zip(*found, strict=True)
+    )
+    return distance * grid.cell_size, face
+
+
+@partial(jax.jit, static_argnames=("two_sided",))
+def _occluded(index, origins, directions, source, mask, *, two_sided):
+    arrays = jax.lax.stop_gradient((index, origins, directions))
+    _, face = trace(*arrays, source, mask, two_sided=two_sided, any_hit=True)
+    return face >= 0
+
+
+@partial(jax.jit, static_argnames=("two_sided",))
+def _nearest(index, origins, directions, source, mask, *, two_sided):
+    arrays = jax.lax.stop_gradient((index, origins, directions))
+    return trace(*arrays, source, mask, two_sided=two_sided, any_hit=False)

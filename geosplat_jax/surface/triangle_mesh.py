@@ -1,0 +1,257 @@
+"""A surface of given triangles: faces stay, and the vertices are the parameters (appendix H).
+
+A mesh that is not closed is a *sheet*: it is seen and lit from both sides. In training every
+triangle of it then stands twice in the mesh, as its front with vertices of its own and, in the
+other half of the rows, as its back; the sides share their parameters. What follows (splats that
+look away are left out, a splat is lit from where its face looks) holds for either side as for any
+closed surface. The mesh that leaves the program has every triangle once.
+
+Penalties. Lengths are in mean edges of the start, so that a weight means the same on a coarse mesh
+and on a fine one:
+
+- ``laplacian``: squared distance of a vertex from the mean of its neighbours (the umbrella, every
+  neighbour alike); at an open border only the neighbours along it count, so that holes stay;
+- ``normal_consistency``: one minus the cosine between the normals of faces that share an edge;
+- ``edge_length``: squared change of an edge's length since the start;
+- ``offset``: squared distance of a vertex from its start.
+
+Each is a mean over what it is summed over.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from geosplat_jax.core.capacity import Capacities, bucket
+from geosplat_jax.core.mesh import face_normals_and_areas
+from geosplat_jax.core.numerics import safe_norm
+from geosplat_jax.core.types import Box, Mesh, learned
+from geosplat_jax.rays.triangle_index import TriangleIndex, build_triangle_index, cells_for
+from geosplat_jax.surface.base import Surface, SurfaceModel
+
+PENALTIES = ("laplacian", "normal_consistency", "edge_length", "offset")
+"""Terms of `TriangleMesh.penalties`."""
+
+_BOX_MARGIN = 1.1
+"""Size of the box over that of the mesh: vertices move, and the fields end at its sides."""
+
+_SPLATS_PER_FACE = 6
+
+
+class VertexOffsets(eqx.Module):
+    """Shape of a `TriangleMesh`.
+
+    Attributes
+    ----------
+    offsets : (V, 3) way of every vertex from its start, in half the longest side of the box.
+    """
+
+    offsets: Float[Array, "V 3"] = learned("vertices")
+
+
+class Connectivity(NamedTuple):
+    """What is next to what in a mesh; rows of vertices or faces, host side.
+
+    Attributes
+    ----------
+    edges : (E, 2) vertices of every edge, once.
+    neighbours : (N, 2) pairs of a vertex and a neighbour that its umbrella takes, sorted.
+    wings : (P, 2) faces that share an edge which is theirs alone.
+    turned : (P,) whether the two are wound against each other.
+    """
+
+    edges: Int[np.ndarray, "E 2"]
+    neighbours: Int[np.ndarray, "N 2"]
+    wings: Int[np.ndarray, "P 2"]
+    turned: np.ndarray
+
+
+def connectivity(faces: Int[np.ndarray, "F 3"]) -> Connectivity:
+    """Find edges, neighbours and neighbouring faces; edges of three or more faces have no wings."""
+    directed = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+    rows = np.sort(directed, axis=1)
+    edges, edge_of, count = np.unique(rows, axis=0, return_inverse=True, return_counts=True)
+    edge_of = edge_of.reshape(-1)
+    border = edges[count == 1]
+    is_border = np.zeros(int(faces.max(initial=-1)) + 1, bool)
+    is_border[border] = True
+    both = np.concatenate([edges, edges[:, ::-1]])
+    along = np.tile(count == 1, 2)
+    neighbours = both[~is_border[both[:, 0]] | along]
+    neighbours = neighbours[np.lexsort((neighbours[:, 1], neighbours[:, 0]))]
+    order = np.argsort(edge_of, kind="stable")
+    pairs = order[np.isin(edge_of[order], np.flatnonzero(count == 2))].reshape(-1, 2)
+    forward = directed[pairs, 0] == rows[pairs, 0]
+    return Connectivity(
+        edges.astype(np.int32),
+        neighbours.astype(np.int32),
+        (pairs // 3).astype(np.int32),
+        forward[:, 0] == forward[:, 1],
+    )
+
+
+class TriangleMesh(SurfaceModel):
+    """Triangles whose vertices move.
+
+    Attributes
+    ----------
+    home : (V, 3) where the vertices start, world. faces : (F, 3) rows of them.
+    edges, neighbours, wings : see `Connectivity`.
+    wing_signs : (P,) -1 where faces are wound against each other, else 1.
+    edge_lengths : (E,) at the start. degrees : (V,) numbers of neighbours, at least 1.
+    unit : () mean length of an edge at the start.
+    bounds : the cube around the mesh.
+    cells : static numbers of cells for rays. is_sheet : static; both sides are surface.
+    """
+
+    home: Float[Array, "V 3"]
+    faces: Int[Array, "F 3"]
+    edges: Int[Array, "E 2"]
+    neighbours: Int[Array, "N 2"]
+    wings: Int[Array, "P 2"]
+    wing_signs: Float[Array, " P"]
+    edge_lengths: Float[Array, " E"]
+    degrees: Float[Array, " V"]
+    unit: Float[Array, ""]
+    bounds: Box
+    cells: tuple[int, int, int] = eqx.field(static=True)
+    is_sheet: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(
+        cls,
+        vertices: Float[np.ndarray, "V 3"],
+        faces: Int[np.ndarray, "F 3"],
+        *,
+        is_sheet: bool,
+        dtype: Any = np.float32,
+    ) -> "TriangleMesh":
+        """Make the surface of a mesh in which every vertex belongs to a face (host side)."""
+        near = connectivity(faces)
+        vertices = np.asarray(vertices, np.float64)
+        ends = vertices[near.edges]
+        lengths = np.sqrt(np.sum((ends[:, 1] - ends[:, 0]) ** 2, axis=-1))
+        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        half = 0.5 * _BOX_MARGIN * float(np.max(high - low))
+        degrees = np.bincount(near.neighbours[:, 0], minlength=len(vertices))
+        signs = np.where(near.turned, -1.0, 1.0)
+        indices = (faces.astype(np.int32), near.edges, near.neighbours, near.wings)
+        numbers = (signs, lengths, np.maximum(degrees, 1), lengths.mean())
+        return cls(
+            jnp.asarray(vertices, dtype),
+            *map(jnp.asarray, indices),
+            *(jnp.asarray(x, dtype) for x in numbers),
+            bounds=Box(jnp.asarray(0.5 * (low + high), dtype), jnp.asarray(half, dtype)),
+            cells=cells_for(vertices, faces),
+            is_sheet=is_sheet,
+        )
+
+    @classmethod
+    def blank(
+        cls,
+        vertices: int,
+        faces: int,
+        edges: int,
+        neighbours: int,
+        wings: int,
+        *,
+        cells: tuple[int, int, int],
+        is_sheet: bool,
+    ) -> "TriangleMesh":
+        """Make a surface of arrays of so many rows, all zero."""
+        pairs = (edges, neighbours, wings)
+        return cls(
+            jnp.zeros((vertices, 3)),
+            jnp.zeros((faces, 3), jnp.int32),
+            *(jnp.zeros((rows, 2), jnp.int32) for rows in pairs),
+            *(jnp.zeros(shape) for shape in ((wings,), (edges,), (vertices,), ())),
+            bounds=Box(jnp.zeros(3), jnp.zeros(())),
+            cells=cells,
+            is_sheet=is_sheet,
+        )
+
+    @property
+    def box(self) -> Box:
+        """The cube around the mesh as it started, with some room."""
+        return self.bounds
+
+    @property
+    def start(self) -> VertexOffsets:
+        """The shape that the mesh starts with."""
+        return VertexOffsets(jnp.zeros_like(self.home))
+
+    def positions(self, shape: VertexOffsets) -> Float[Array, "V 3"]:
+        """Place the vertices of a shape in the world."""
+        return self.home + self.bounds.half_extent * shape.offsets
+
+    def extract(
+        self, shape: VertexOffsets, *, capacities: Capacities, final: bool = False
+    ) -> Surface:
+        """Return the mesh; in training, of a sheet fronts and then backs."""
+        vertices, faces = self.positions(shape), self.faces
+        if self.is_sheet and not final:
+            backs = faces[:, ::-1] + vertices.shape[0]
+            vertices = jnp.concatenate([vertices, vertices])
+            faces = jnp.concatenate([faces, backs])
+        counts = (jnp.int32(vertices.shape[0]), jnp.int32(faces.shape[0]))
+        return Surface(Mesh(vertices, faces, *counts), {})
+
+    def penalties(self, shape: VertexOffsets, surface: Surface) -> dict[str, Float[Array, ""]]:
+        """Evaluate the terms that the module describes."""
+        vertices = self.positions(shape) / self.unit
+        return {
+            "laplacian": self._laplacian(vertices),
+            "normal_consistency": self._normal_consistency(surface.mesh),
+            "edge_length": self._edge_length(vertices),
+            "offset": jnp.mean(
+                jnp.sum((shape.offsets * (self.bounds.half_extent / self.unit)) ** 2, axis=-1)
+            ),
+        }
+
+    def _laplacian(self, vertices: Float[Array, "V 3"]) -> Float[Array, ""]:
+        vertex, neighbour = self.neighbours[:, 0], self.neighbours[:, 1]
+        ways = vertices[neighbour] - vertices.at[vertex].get(indices_are_sorted=True)
+        total = jnp.zeros_like(vertices).at[vertex].add(ways, indices_are_sorted=True)
+        return jnp.mean(jnp.sum((total / self.degrees[:, None]) ** 2, axis=-1))
+
+    def _normal_consistency(self, mesh: Mesh) -> Float[Array, ""]:
+        # The backs of a sheet say the same as its fronts, which come first.
+        normals, _ = face_normals_and_areas(mesh)
+        cosine = jnp.sum(normals[self.wings[:, 0]] * normals[self.wings[:, 1]], axis=-1)
+        return jnp.sum(1.0 - self.wing_signs * cosine) / max(self.wings.shape[0], 1)
+
+    def _edge_length(self, vertices: Float[Array, "V 3"]) -> Float[Array, ""]:
+        lengths = safe_norm(vertices[self.edges[:, 1]] - vertices[self.edges[:, 0]])
+        return jnp.mean((lengths - self.edge_lengths / self.unit) ** 2)
+
+    def ray_index(self, surface: Surface, *, capacities: Capacities) -> TriangleIndex:
+        """List the triangles of cells around the mesh; see `build_triangle_index`."""
+        return build_triangle_index(
+            surface.mesh.vertices[: self.home.shape[0]],
+            self.faces,
+            shape=self.cells,
+            is_sheet=self.is_sheet,
+            capacities=capacities,
+        )
+
+    def nearby_points(self, shape: VertexOffsets) -> tuple[Float[Array, "V 3"], Float[Array, " V"]]:
+        """Return the vertices."""
+        return self.positions(shape), jnp.ones_like(shape.offsets[:, 0])
+
+    def first_capacities(self, shape: VertexOffsets) -> Capacities:
+        """Guess sizes from the number of faces; a view sees half of them, of a sheet one side."""
+        face_count = self.faces.shape[0]
+        visible = _SPLATS_PER_FACE * face_count
+        if not self.is_sheet:
+            visible = int(0.55 * visible)
+        return Capacities(
+            triangle_boxes=bucket(4 * face_count),
+            triangle_cells=bucket(3 * face_count),
+            cell_triangles=bucket(1),
+            visible=bucket(visible),
+            hits=bucket(3 * visible),
+            chunks=bucket(int(0.6 * visible)),
+        )

@@ -1,0 +1,215 @@
+"""Meshes to start from: what is cleaned, what is refused, and that the cameras have a say."""
+
+import numpy as np
+import pytest
+import trimesh
+from support import sphere_views
+
+from geosplat_jax.io import start_mesh
+from geosplat_jax.io.meshes import signed_volume, to_gltf_axes
+from geosplat_jax.io.start_mesh import (
+    agreement_with_views,
+    digest_of,
+    fitted,
+    pixel_length,
+    read_start,
+    sized,
+)
+
+RADIUS = 0.5  # of the ball that the views show
+
+
+@pytest.fixture(scope="module")
+def views():
+    return sphere_views(count=4, size=32, radius=RADIUS)
+
+
+def ball(subdivisions=1, radius=RADIUS):
+    body = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    return np.array(body.vertices), np.array(body.faces)
+
+
+def written(folder, vertices, faces, name="mesh.ply"):
+    path = folder / name
+    trimesh.Trimesh(vertices, faces, process=False).export(path)
+    return str(path)
+
+
+def read(path):
+    return read_start(path, digest_of(path))
+
+
+def fit_to(path, views, *, edge_pixels=4.0, most_faces=10_000):
+    return fitted(path, digest_of(path), views, edge_pixels=edge_pixels, most_faces=most_faces)
+
+
+@pytest.mark.parametrize("name", ["mesh.ply", "mesh.obj", "mesh.glb", "mesh.stl"])
+def test_every_format_gives_the_same_closed_mesh(tmp_path, name):
+    vertices, faces = ball()
+    stored = to_gltf_axes(vertices) if name.endswith("glb") else vertices
+    mesh = read(written(tmp_path, stored, faces, name))
+    assert mesh.is_closed
+    assert len(mesh.faces) == 80
+    assert len(mesh.vertices) == 42
+    assert signed_volume(mesh.vertices, mesh.faces) > 0
+    order = np.lexsort(np.round(vertices, 5).T)
+    found = mesh.vertices[np.lexsort(np.round(mesh.vertices, 5).T)]
+    np.testing.assert_allclose(found, vertices[order], atol=2e-6)
+
+
+def test_what_is_no_surface_is_dropped_and_said(tmp_path):
+    vertices, faces = ball()
+    away = np.array([[9.0, 9, 9]])
+    doubled = np.concatenate([vertices, vertices[:1] + 1e-9, away])
+    split = np.where((faces == 0) & (np.arange(80) < 40)[:, None], len(vertices), faces)
+    middle = [[3, 3, 7], [0, 42, 5]]  # two corners at one place
+    again = [faces[7], faces[9][::-1]]
+    mesh = read(written(tmp_path, doubled, np.concatenate([split, middle, again])))
+    assert mesh.is_closed
+    assert len(mesh.faces) == 80
+    notes = " ".join(mesh.notes)
+    for said in (
+        "84 faces of",
+        "1 corners at the place of others joined",
+        "2 faces without area dropped",
+        "2 faces that were there twice dropped",
+        "1 vertices without faces dropped",
+    ):
+        assert said in notes
+
+
+def test_a_mesh_that_is_inside_out_is_turned(tmp_path):
+    vertices, faces = ball()
+    right = read(written(tmp_path, vertices, faces))
+    assert not any("turned" in note for note in right.notes)
+    mesh = read(written(tmp_path, vertices, faces[:, ::-1]))
+    assert signed_volume(mesh.vertices, mesh.faces) > 0
+    assert any("inside out" in note for note in mesh.notes)
+
+
+def test_faces_that_are_wound_against_each_other_are_wound_alike(tmp_path):
+    vertices, faces = ball()
+    faces[::3] = faces[::3, ::-1]
+    mesh = read(written(tmp_path, vertices, faces))
+    assert mesh.is_closed
+    assert signed_volume(mesh.vertices, mesh.faces) > 0
+    assert any("now alike" in note for note in mesh.notes)
+
+
+def test_an_open_mesh_stays_open(tmp_path):
+    vertices, faces = ball()
+    mesh = read(written(tmp_path, vertices, faces[:60]))
+    assert not mesh.is_closed
+    assert len(mesh.faces) == 60
+
+
+def test_meshes_that_cannot_be_used_are_refused(tmp_path, monkeypatch):
+    vertices, faces = ball()
+    with pytest.raises(ValueError, match="there is no mesh file"):
+        digest_of(tmp_path / "none.ply")
+    cloud = tmp_path / "cloud.ply"
+    trimesh.PointCloud(vertices).export(cloud)
+    with pytest.raises(ValueError, match="found no triangle"):
+        read(str(cloud))
+    with pytest.raises(ValueError, match="found no triangle with an area"):
+        read(written(tmp_path, np.ones((3, 3)), [[0, 1, 2]], "point.ply"))
+    broken = vertices.copy()
+    broken[5, 1] = np.nan
+    with pytest.raises(
+        ValueError, match="1 of 42 vertices are not finite numbers, the first is nu"
+    ):
+        read(written(tmp_path, broken, faces, "nan.ply"))
+    path = written(tmp_path, vertices, faces)
+    digest = digest_of(path)
+    written(tmp_path, 2 * vertices, faces)
+    with pytest.raises(ValueError, match="is not the mesh that it was"):
+        read_start(path, digest)
+    # Ten million faces, without their memory.
+    many = np.broadcast_to(np.array([[0, 1, 2]], np.int32), (10_000_000, 3))
+    monkeypatch.setattr(start_mesh, "read_mesh", lambda path: (vertices, many))
+    read_start.cache_clear()
+    with pytest.raises(ValueError, match="10000000 faces, more than 5000000; decimate it first"):
+        read(path)
+    faces[0, 0] = 99
+    monkeypatch.setattr(start_mesh, "read_mesh", lambda path: (vertices, faces))
+    with pytest.raises(ValueError, match="faces of vertices that it does not have"):
+        read(path)
+    read_start.cache_clear()
+
+
+@pytest.mark.parametrize(("factor", "advice"), [(1000, "0.001"), (0.01, "100"), (0.1, "10")])
+def test_other_units_than_the_cameras_are_refused_with_the_factor(tmp_path, views, factor, advice):
+    vertices, faces = ball(3)
+    path = written(tmp_path, factor * vertices, faces)
+    with pytest.raises(ValueError, match=f"{advice} times as large it would .* Scale the file"):
+        fit_to(path, views)
+
+
+@pytest.mark.parametrize("move", [(3.0, 0, 0), (0, 0, -40.0)])
+def test_a_mesh_beside_the_object_is_refused(tmp_path, views, move):
+    vertices, faces = ball(3)
+    path = written(tmp_path, vertices + np.array(move), faces)
+    with pytest.raises(ValueError, match="bring it into the axes, the place and the units"):
+        fit_to(path, views)
+
+
+def test_agreement_falls_with_the_size_to_either_side(views):
+    points = RADIUS * trimesh.creation.icosphere(subdivisions=4).vertices
+    right = agreement_with_views(points, views)
+    assert right > 0.8
+    for factor in (0.5, 2.0):
+        assert agreement_with_views(factor * points, views) < 0.3
+    # A start that is a tenth too thick is still one.
+    assert agreement_with_views(1.1 * points, views) > 0.5
+
+
+def test_a_pixel_is_as_wide_as_the_cameras_say(views):
+    # From a distance of 3: see `support.look_at_poses`.
+    mesh = start_mesh.StartMesh(*ball())
+    assert pixel_length(mesh, views) == pytest.approx(3 / views.intrinsics[0, 0, 0], rel=1e-6)
+
+
+def test_coarse_meshes_are_divided_and_fine_ones_decimated(monkeypatch):
+    mesh = start_mesh.StartMesh(*ball())
+    edge = float(
+        np.linalg.norm(
+            mesh.vertices[mesh.faces[:, 0]] - mesh.vertices[mesh.faces[:, 1]], axis=1
+        ).mean()
+    )
+    same = sized(mesh, edge, most_faces=1000, path="x")
+    assert same is mesh
+    finer = sized(mesh, edge / 4.5, most_faces=10_000, path="x")
+    assert len(finer.faces) == 16 * 80
+    assert finer.is_closed
+    assert any("divided to 16" in note for note in finer.notes)
+    # The limit holds for dividing too.
+    assert len(sized(mesh, edge / 4.5, most_faces=400, path="x").faces) == 320
+
+    def halved(self, face_count):
+        assert face_count < 0.8 * len(finer.faces)
+        return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+
+    monkeypatch.setattr(trimesh.Trimesh, "simplify_quadric_decimation", halved)
+    coarser = sized(finer, edge, most_faces=10_000, path="x")
+    assert len(coarser.faces) == 80
+    assert any("decimated to 80 faces" in note for note in coarser.notes)
+
+    def missing(self, face_count):
+        raise ImportError("fast_simplification")
+
+    monkeypatch.setattr(trimesh.Trimesh, "simplify_quadric_decimation", missing)
+    assert any(
+        "to decimate it, pip" in n for n in sized(finer, edge, most_faces=2000, path="x").notes
+    )
+    with pytest.raises(ValueError, match="1280 faces, more than geometry.max_faces = 1000"):
+        sized(finer, edge, most_faces=1000, path="x")
+
+
+def test_a_fine_mesh_is_truly_decimated():
+    pytest.importorskip("fast_simplification", reason="the extra mesh is not installed")
+    mesh = start_mesh.StartMesh(*ball(4))
+    coarser = sized(mesh, 0.1, most_faces=10_000, path="x")
+    assert 200 < len(coarser.faces) < 1000
+    assert coarser.is_closed
+    radii = np.linalg.norm(coarser.vertices, axis=1)
+    assert np.abs(radii - RADIUS).max() < 0.05 * RADIUS

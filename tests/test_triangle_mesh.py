@@ -1,0 +1,282 @@
+"""The surface of a given mesh: what it extracts and penalises, and that a run trains it."""
+
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from support import MONTE_CARLO, TINY, sphere_dataset
+
+from geosplat_jax import cli
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.fit.config import config_from_dict
+from geosplat_jax.fit.presets import make_config, with_mesh
+from geosplat_jax.fit.train import TrainingError, fit
+from geosplat_jax.io.meshes import read_mesh
+from geosplat_jax.io.start_mesh import read_start
+from geosplat_jax.run import Run, train
+from geosplat_jax.surface.triangle_mesh import TriangleMesh, VertexOffsets, connectivity
+
+SMALL = (
+    *(text for text in TINY if not text.startswith("geometry.")),
+    "geometry.edge_pixels=4",
+)
+
+
+def ball(subdivisions=1, radius=0.45):
+    body = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    return np.array(body.vertices), np.asarray(body.faces, np.int32)
+
+
+def bowl():
+    """The lower two thirds of a ball; the border is no plane curve."""
+    vertices, faces = ball()
+    faces = faces[vertices[faces][..., 2].mean(axis=1) < 0.15]
+    used, rows = np.unique(faces, return_inverse=True)
+    return vertices[used], rows.reshape(-1, 3).astype(np.int32)
+
+
+def moved(model, seed=0, size=0.1):
+    rng = np.random.default_rng(seed)
+    return VertexOffsets(jnp.asarray(rng.uniform(-size, size, model.home.shape), jnp.float32))
+
+
+@jax.jit
+def _penalties(model, shape):
+    return model.penalties(shape, model.extract(shape, capacities=Capacities()))
+
+
+def penalties_of(model, shape):
+    return {name: float(x) for name, x in _penalties(model, shape).items()}
+
+
+def slow_penalties(model, shape):
+    """The definitions, face by face and vertex by vertex, in float64."""
+    half, unit = float(model.box.half_extent), float(model.unit)
+    home = np.asarray(model.home, np.float64)
+    now = home + half * np.asarray(shape.offsets, np.float64)
+    edges, normals = {}, []
+    for number, (a, b, c) in enumerate(np.asarray(model.faces)):
+        normal = np.cross(now[b] - now[a], now[c] - now[a])
+        normals.append(normal / np.linalg.norm(normal))
+        for start, end in ((a, b), (b, c), (c, a)):
+            way = (min(start, end), max(start, end))
+            edges.setdefault(way, []).append((number, start < end))
+    around = {v: set() for v in range(len(now))}
+    border = {v for edge, sides in edges.items() if len(sides) == 1 for v in edge}
+    for edge, sides in edges.items():
+        for v, other in (edge, edge[::-1]):
+            if v not in border or len(sides) == 1:
+                around[v].add(other)
+    umbrella = [now[sorted(around[v])].mean(axis=0) - now[v] for v in around]
+    cosines = [
+        normals[s[0][0]] @ normals[s[1][0]] * (1 if s[0][1] != s[1][1] else -1)
+        for s in edges.values()
+        if len(s) == 2
+    ]
+    change = [np.linalg.norm(now[a] - now[b]) - np.linalg.norm(home[a] - home[b]) for a, b in edges]
+    lengths = [np.linalg.norm(home[a] - home[b]) for a, b in edges]
+    np.testing.assert_allclose(unit, np.mean(lengths), rtol=1e-5)
+    return {
+        "laplacian": np.mean(np.sum(np.square(umbrella), axis=1)) / unit**2,
+        "normal_consistency": np.mean(1 - np.array(cosines)),
+        "edge_length": np.mean(np.square(change)) / unit**2,
+        "offset": np.mean(np.sum((now - home) ** 2, axis=1)) / unit**2,
+    }
+
+
+def wound_badly(mesh):
+    vertices, faces = mesh
+    faces = faces.copy()
+    faces[3] = faces[3, ::-1]
+    return vertices, faces
+
+
+@pytest.mark.parametrize(
+    ("mesh", "is_sheet"),
+    [(ball(), False), (bowl(), True), (bowl(), False), (wound_badly(bowl()), True)],
+)
+def test_penalties_are_those_of_their_definitions(mesh, is_sheet):
+    model = TriangleMesh.of(*mesh, is_sheet=is_sheet)
+    shape = moved(model)
+    found, expected = penalties_of(model, shape), slow_penalties(model, shape)
+    assert set(found) == set(expected)
+    for name, value in expected.items():
+        assert value > 1e-3
+        assert found[name] == pytest.approx(value, rel=2e-4), name
+
+
+def test_penalties_know_neither_the_scale_nor_the_place_of_a_scene():
+    vertices, faces = bowl()
+    one = TriangleMesh.of(vertices, faces, is_sheet=True)
+    other = TriangleMesh.of(300 * vertices + 70, faces, is_sheet=True)
+    shape = moved(one)
+    for name, value in penalties_of(one, shape).items():
+        assert penalties_of(other, shape)[name] == pytest.approx(value, rel=1e-3)
+
+
+def test_nothing_changes_at_the_start_and_flat_surfaces_cost_nothing():
+    vertices, faces = ball()
+    model = TriangleMesh.of(vertices, faces, is_sheet=False)
+    start = penalties_of(model, model.start)
+    assert start["offset"] == 0
+    assert start["edge_length"] < 1e-10
+    grid = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0)), -1).reshape(-1, 2)
+    square = trimesh.Trimesh(np.c_[grid, 0 * grid[:, 0]], _grid_faces(5), process=False)
+    flat = TriangleMesh.of(np.array(square.vertices), np.array(square.faces), is_sheet=True)
+    found = penalties_of(flat, flat.start)
+    assert found["normal_consistency"] < 1e-6
+    # Every inner vertex, and every one along a side, is in the middle of its neighbours; the four
+    # corners are half a diagonal from theirs.
+    corner = 0.5 / float(flat.unit) ** 2
+    assert found["laplacian"] == pytest.approx(4 * corner / 25, rel=1e-4)
+
+
+def _grid_faces(n):
+    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    first = np.stack([corner, corner + 1, corner + n + 1], -1)
+    return np.concatenate([first, np.stack([corner, corner + n + 1, corner + n], -1)])
+
+
+def test_a_mesh_with_an_edge_of_three_faces_has_no_wings_there():
+    fan = np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]])
+    near = connectivity(fan)
+    assert len(near.edges) == 7
+    assert len(near.wings) == 0
+
+
+def test_a_sheet_has_two_sides_in_training_and_one_in_the_file():
+    model = TriangleMesh.of(*bowl(), is_sheet=True)
+    shape = moved(model)
+    count = len(model.faces)
+    mesh = model.extract(shape, capacities=Capacities()).mesh
+    assert int(mesh.face_count) == 2 * count
+    corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
+    np.testing.assert_array_equal(corners[:count], corners[count:, ::-1])
+    # No vertex serves both sides, so that their normals do not cancel.
+    assert not set(np.asarray(mesh.faces)[:count].ravel()) & set(
+        np.asarray(mesh.faces)[count:].ravel()
+    )
+    final = model.extract(shape, capacities=Capacities(), final=True).mesh
+    assert int(final.face_count) == count
+    np.testing.assert_array_equal(np.asarray(final.vertices), np.asarray(model.positions(shape)))
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return sphere_dataset(count=3, size=16)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("meshes")
+    paths = {}
+    for name, mesh in (("ball", ball()), ("bowl", bowl())):
+        paths[name] = folder / f"{name}.ply"
+        trimesh.Trimesh(*mesh, process=False).export(paths[name])
+    return paths
+
+
+def test_presets_give_the_rates_of_their_surface_to_the_vertices(files):
+    for preset in ("default", "paper", "code"):
+        plain, config = make_config(preset), make_config(preset, mesh=files["ball"])
+        assert config.geometry.kind == "mesh"
+        assert config.raster.cull_backfaces
+        for before, stage in zip(plain.stages, config.stages, strict=True):
+            moves = before.rates["sdf"].value > 0
+            assert (stage.rates["vertices"].value > 0) == moves
+            assert ("laplacian" in stage.weights) == moves
+            assert not {"sdf", "deform", "weights"} & set(stage.rates)
+            assert not {"entropy", "deviation", "weights"} & set(stage.weights)
+            assert stage.vertex_fraction == 0 or preset == "default"
+        assert config_from_dict(json.loads(json.dumps(config.to_dict()))) == config
+    given = make_config(mesh=files["ball"], overrides=("stages.split_sum.rates.vertices=0.5",))
+    assert given.stages[0].rates["vertices"].value == 0.5
+    with pytest.raises(ValueError, match="there is no mesh file"):
+        make_config(mesh="nowhere.ply")
+
+
+def leaves_equal(first, second):
+    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+
+
+def test_a_run_starts_from_the_file_says_so_and_resumes_bit_for_bit(dataset, files, tmp_path):
+    config = make_config(mesh=files["ball"], overrides=SMALL)
+    whole = fit(dataset, config, tmp_path / "whole")
+    lines = [json.loads(x) for x in (tmp_path / "whole/metrics.jsonl").read_text().splitlines()]
+    assert {line["faces"] for line in lines} == {80}
+    assert {"term.laplacian", "term.normal_consistency"} <= set(lines[0])
+    assert all(np.isfinite(line["loss"]) for line in lines)
+    assert 1e-4 < float(jnp.max(jnp.abs(whole.params.geometry.offsets))) < 5e-3
+    record = json.loads((tmp_path / "whole/run.json").read_text())
+    assert record["config"]["geometry"]["path"] == str(Path(files["ball"]).resolve())
+    assert len(record["config"]["geometry"]["digest"]) == 16
+    assert any("start: 42 vertices, 80 faces, one side" in note for note in record["notes"])
+    fit(dataset, config, tmp_path / "halves", stop_after=2)
+    leaves_equal(whole, fit(dataset, config, tmp_path / "halves", resume=True))
+    # What is written of a run no longer needs the file.
+    trained = Run(tmp_path / "whole").trained
+    leaves_equal(trained.params, whole.params)
+    vertices, faces, _ = Run(tmp_path / "whole").renderer().mesh()
+    assert (len(vertices), len(faces)) == (42, 80)
+
+
+def test_a_mesh_that_cannot_be_used_stops_before_anything_is_written(dataset, files, tmp_path):
+    large = tmp_path / "large.ply"
+    vertices, faces = read_mesh(files["ball"])
+    trimesh.Trimesh(100 * vertices, faces, process=False).export(large)
+    config = make_config(mesh=large, overrides=SMALL)
+    with pytest.raises(TrainingError, match=r"0\.01 times as large it would"):
+        fit(dataset, config, tmp_path / "run")
+    assert not (tmp_path / "run/run.json").exists()
+    changed = with_mesh(make_config(overrides=TINY), large)
+    large.write_bytes(Path(files["ball"]).read_bytes())
+    read_start.cache_clear()
+    with pytest.raises(TrainingError, match="is not the mesh that it was"):
+        fit(dataset, changed, tmp_path / "run")
+
+
+def test_the_command_refuses_a_mesh_that_is_no_file(tmp_path, capsys):
+    assert cli.main(["train", str(tmp_path), "--mesh", str(tmp_path / "none.ply")]) == 2
+    assert "there is no mesh file" in capsys.readouterr().err.replace("\n", " ")
+
+
+@pytest.mark.slow
+def test_an_open_mesh_goes_through_all_stages_and_is_seen_lit_and_exported(
+    dataset, files, tmp_path
+):
+    config = make_config(
+        mesh=files["bowl"],
+        overrides=(
+            *SMALL,
+            *MONTE_CARLO,
+            "stages.split_sum.steps=2",
+            "stages.monte_carlo.steps=2",
+            "stages.refine.steps=1",
+            "stages.refine.batch_views=1",
+        ),
+    )
+    run = train(dataset, tmp_path / "run", config)
+    assert [line["stage"] for line in run.steps()] == ["split_sum"] * 2 + ["monte_carlo"] * 2 + [
+        "refine"
+    ]
+    count = len(bowl()[1])
+    assert {line["faces"] for line in run.steps()} == {2 * count}
+    renderer = run.renderer(samples=2)
+    views = [renderer(dataset.test.camera([k])) for k in range(3)]
+    assert max(view.alpha.max() for view in views) > 0.9
+    relit = renderer.relit(run.params.light)(dataset.test.camera([0]))
+    assert np.isfinite(relit.rgb).all()
+    assert relit.rgb.max() > 0
+    run.export(tmp_path / "out", vertex_colors=True)
+    _, faces = read_mesh(tmp_path / "out/mesh.glb")
+    assert len(faces) == count
+    # The stages before the last can be taken over.
+    again = train(
+        dataset, tmp_path / "again", config, source=tmp_path / "run", first_stage="refine"
+    )
+    leaves_equal(again.params, run.params)
