@@ -9,11 +9,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
+from geosplat_jax.capture.masks import choose_factor, make_masks
+from geosplat_jax.capture.settings import RadianceSettings
 from geosplat_jax.fit.cameras import ViewProgress
 from geosplat_jax.fit.config import Config, all_settings, config_warnings
 from geosplat_jax.fit.folder import RunError
@@ -34,7 +37,7 @@ from geosplat_jax.gradcheck.report import (
 )
 from geosplat_jax.io.agreement import agreement_lines
 from geosplat_jax.io.checkpoints import CheckpointError
-from geosplat_jax.io.dataset import choose_downscale, describe, load_recorded
+from geosplat_jax.io.dataset import choose_downscale, describe, load_dataset, load_recorded
 from geosplat_jax.io.export import LARGEST_TEXTURE
 from geosplat_jax.io.images import SceneError
 from geosplat_jax.io.poses import PoseSettings, find_poses
@@ -95,6 +98,8 @@ def _parser() -> argparse.ArgumentParser:
     _add_scene_arguments(info)
 
     _add_poses(commands.add_parser("poses", help="find the cameras of a folder of photographs"))
+
+    _add_masks(commands.add_parser("masks", help="cut the object out of photographs with cameras"))
 
     train = commands.add_parser("train", help="reconstruct a scene")
     _add_scene_arguments(train)
@@ -206,6 +211,45 @@ def _add_poses(poses: argparse.ArgumentParser) -> None:
         help="one for all photographs, or one for each (default: %(default)s)",
     )
     poses.add_argument("--seed", type=int, default=standard.seed, help="of random searches")
+
+
+def _add_masks(masks: argparse.ArgumentParser) -> None:
+    """Describe the masks command."""
+    standard = RadianceSettings()
+    masks.add_argument("scene", type=Path, help="folder of a capture; SCENE/masks is written")
+    masks.add_argument(
+        "--box",
+        type=float,
+        nargs=6,
+        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        help="around the object (default: around what all cameras look at)",
+    )
+    masks.add_argument(
+        "--output", type=Path, help="folder of splats and sheet (default: runs/SCENE_masks)"
+    )
+    masks.add_argument("--steps", type=int, default=standard.steps, help="(default: %(default)s)")
+    masks.add_argument(
+        "--splats",
+        type=int,
+        default=standard.capacity,
+        metavar="N",
+        help="most that there may be (default: %(default)s)",
+    )
+    masks.add_argument(
+        "--downscale",
+        type=_downscale,
+        default="auto",
+        metavar="N",
+        help="reduce the images by this factor; auto: to at most as many pixels as 270 x 480",
+    )
+    masks.add_argument("--seed", type=int, default=standard.seed, help="of every random choice")
+    start = masks.add_mutually_exclusive_group()
+    start.add_argument(
+        "--resume",
+        action="store_true",
+        help="continue the training; where it is done, only make the masks again, in another --box",
+    )
+    start.add_argument("--force", action="store_true", help="replace splats and masks")
 
 
 def _add_samples(parser: argparse.ArgumentParser) -> None:
@@ -349,6 +393,42 @@ def _poses(arguments: argparse.Namespace) -> None:
     print(f"model: {report.model}")
     print(
         f"next: masks of the object (docs/captures.md), then geosplat-jax train {arguments.folder}"
+    )
+
+
+def _masks(arguments: argparse.Namespace) -> None:
+    """Make masks of a capture, with progress on the terminal, and say how sure they are."""
+    factor = arguments.downscale
+    if factor == "auto":
+        factor = choose_factor(arguments.scene)
+    settings = RadianceSettings(
+        steps=arguments.steps, capacity=arguments.splats, seed=arguments.seed
+    )
+    box = None
+    if arguments.box is not None:
+        box = (np.array(arguments.box[:3]), np.array(arguments.box[3:]))
+    dataset = load_dataset(arguments.scene, downscale=factor, bounds=box, mask_files=False)
+    for note in dataset.notes:
+        _say(note)
+    folder = arguments.output or Path("runs") / f"{arguments.scene.resolve().name}_masks"
+    views = dataset.train
+    _say(f"{dataset.name}: {len(views)} views of {views.width} x {views.height}; compiling ...")
+    with _ProgressDisplay(settings.steps) as display:
+        report = make_masks(
+            dataset,
+            settings,
+            folder,
+            box=box,
+            downscale=factor,
+            resume=arguments.resume,
+            force=arguments.force,
+            on_step=display.show,
+        )
+    print("\n".join(report.lines()))
+    print(f"sheet: {folder / 'masks.png'}; splats: {folder / 'splats.ply'}")
+    print(
+        "look at the sheet; if it is right, next: geosplat-jax train "
+        f"{arguments.scene}; if not: geosplat-jax masks {arguments.scene} --resume --box ..."
     )
 
 
@@ -624,6 +704,7 @@ def _gradcheck(arguments: argparse.Namespace) -> None:
 _COMMANDS = {
     "info": _info,
     "poses": _poses,
+    "masks": _masks,
     "train": _train,
     "settings": _settings,
     "evaluate": _evaluate,

@@ -12,6 +12,7 @@ nothing and is made again with larger ones (`core.capacity.retry`).
 
 import json
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -34,7 +35,7 @@ from geosplat_jax.core.types import Batch, Camera
 from geosplat_jax.fit.folder import RunError, locked_folder
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.step import ADAM, descended
-from geosplat_jax.fit.train import Interrupted, stop_requests
+from geosplat_jax.fit.train import Interrupted, Progress, stop_requests
 from geosplat_jax.io.checkpoints import (
     latest_checkpoint,
     load_checkpoint,
@@ -60,6 +61,8 @@ _MOST_HITS = 1 << 26
 
 _HEADROOM = 1.25
 """Of buffers that grow: the number of splats does, and every new size takes a compilation."""
+_STEPS_TIMED = 50
+"""Last steps that the estimate of the time left is made from."""
 _VIEWS_PLANNED = 8
 """Views whose needs the first sizes of the buffers are made for."""
 
@@ -114,18 +117,6 @@ class RadianceReport(eqx.Module):
     mse: Float[Array, ""]
     usage: Usage
     finite: Bool[Array, ""]
-
-
-@dataclass(frozen=True)
-class RadianceProgress:
-    """What a display needs to know after a step."""
-
-    step: int
-    steps: int
-    total: float
-    psnr: float
-    splat_count: int
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -287,6 +278,7 @@ class _Loop:
             step=jnp.int32(0),
         )
         self.capacities = _planned(self.state, self.views)
+        self.has_compiled = False
 
     def save(self) -> None:
         """Write a checkpoint."""
@@ -401,7 +393,7 @@ def train_radiance(
     resume: bool = False,
     replace_run: bool = False,
     stop_after: int | None = None,
-    on_step: Callable[[RadianceProgress], None] | None = None,
+    on_step: Callable[[Progress], None] | None = None,
 ) -> Radiance:
     """Train splats on photographs and leave checkpoints in a folder.
 
@@ -430,11 +422,17 @@ def train_radiance(
         if resume:
             loop.load()
         began, last = time.perf_counter(), min(settings.steps, stop_after or settings.steps)
+        took: deque[float] = deque(maxlen=_STEPS_TIMED)
         for step in range(int(loop.state.step), last):
+            before, sizes = time.perf_counter(), loop.capacities
             report = loop.advance(step)
-            done = step + 1
+            done, now = step + 1, time.perf_counter()
+            if loop.capacities == sizes and loop.has_compiled:
+                took.append(now - before)
+            loop.has_compiled = True
             if on_step is not None:
-                on_step(_progress(loop, report, time.perf_counter() - began))
+                left = float(np.median(took)) * (settings.steps - done) if took else None
+                on_step(_progress(loop, report, now - began, left))
             if done % settings.checkpoint_every == 0 or done == last or stop_requested():
                 loop.save()
             if stop_requested() and done < last:
@@ -442,14 +440,16 @@ def train_radiance(
         return loop.result()
 
 
-def _progress(loop: _Loop, report: RadianceReport, seconds: float) -> RadianceProgress:
-    return RadianceProgress(
+def _progress(loop: _Loop, report: RadianceReport, seconds: float, left: float | None) -> Progress:
+    return Progress(
         step=int(loop.state.step),
         steps=loop.settings.steps,
+        stage="splats",
         total=float(report.total),
         psnr=float(psnr_of_mse(report.mse)),
         splat_count=int(loop.state.count),
         seconds=seconds,
+        seconds_left=left,
     )
 
 

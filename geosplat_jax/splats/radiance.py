@@ -82,7 +82,7 @@ def render_radiance(
     *,
     degree: Int[Array, ""] | int = HIGHEST_DEGREE,
     capacities: Capacities,
-    near: float = 0.01,
+    near: Float[Array, ""] | float = 0.01,
     tile_size: int = DEFAULT_TILE_SIZE,
 ) -> tuple[Float[Array, "H W 3"], Float[Array, "H W"], Usage]:
     """Render one view, in exact order of the depths in the camera.
