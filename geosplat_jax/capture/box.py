@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import label
+from scipy.ndimage import label, maximum_filter
 
 from geosplat_jax.capture.start import CaptureError
 from geosplat_jax.io.views import Views
@@ -17,15 +17,17 @@ from geosplat_jax.surface.hull import sight_bounds
 
 _OPAQUE = 0.1
 """Splats that are less opaque say nothing about where things are."""
-_LARGEST_SCALE = 0.1  # of the sides of the search; larger splats are the background
+_LARGEST_SCALE = 0.06  # of the sides of the search; larger splats are the background
 _SEEN = 0.8
 """Share of the cameras that must have a place in sight for the object to be there."""
+_FREE = 0.9
+"""Of the way from the middle of the search to the nearest camera."""
 _CELLS = 40
 """Along every side of the search."""
-_REACH = 0.35
+_REACH = 0.2
 """Standard deviation, in sides of the search, of the weight of what is near its middle."""
 _TRIALS = 400
-_PLANE_THICKNESS = 0.012  # of the sides of the search, to either side
+_PLANE_THICKNESS = 0.007  # of the sides of the search, to either side
 _PLANE_SHARE = 0.15  # of the splats, that a plane must hold to be what the object stands on
 _ONE_SIDE = 0.9
 """Share of the other splats, and of the cameras, that lie above such a plane."""
@@ -74,9 +76,7 @@ def propose_box(cloud: Cloud, views: Views, *, seed: int = 0) -> Proposal:
     """
     cure = "give the box by --box X0 Y0 Z0 X1 Y1 Z1"
     try:
-        lo, hi = sight_bounds(
-            views.world_to_camera, views.intrinsics, height=views.height, width=views.width
-        )
+        lo, hi = _search(views)
     except ValueError as error:
         raise CaptureError(f"cannot tell what the cameras look at: {error}; {cure}") from error
     side = float((hi - lo).max())
@@ -129,6 +129,24 @@ def require_something_inside(
 
 def _corner(values: np.ndarray) -> str:
     return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
+
+
+def _search(views: Views) -> Corners:
+    """Find the cube around what half of the views show at the distance of what they look at.
+
+    It holds no camera. `hull.sight_bounds` has the cube within.
+
+    Raises
+    ------
+    ValueError : the cameras do not look at one place.
+    """
+    lo, hi = sight_bounds(
+        views.world_to_camera, views.intrinsics, height=views.height, width=views.width
+    )
+    middle = 0.5 * (lo + hi)
+    free = np.abs(views.camera_to_world[:, :3, 3] - middle).max(1).min()
+    half = min(np.sqrt(3.0) * 0.5 * float((hi - lo).max()), _FREE * float(free))
+    return middle - half, middle + half
 
 
 def _seen_share(positions: np.ndarray, views: Views) -> Float[np.ndarray, " N"]:
@@ -192,6 +210,8 @@ def _largest_cluster(
     cell = np.clip(((points - lo) / side * _CELLS).astype(int), 0, _CELLS - 1)
     is_taken = np.zeros((_CELLS,) * 3, bool)
     is_taken[tuple(cell.T)] = True
+    # Splats of plain surfaces lie apart: those with an empty cell between them are connected.
+    is_taken = maximum_filter(is_taken, size=3)
     found: Any = label(is_taken, structure=np.ones((3, 3, 3), int))
     numbers = found[0]
     cluster = numbers[tuple(cell.T)]

@@ -39,7 +39,7 @@ from geosplat_jax.io.export import export_gaussians_ply
 from geosplat_jax.io.frames import MASK_FOLDERS, Frame, beside_images, mask_file
 from geosplat_jax.io.images import MissingFileError, image_size, write_png
 from geosplat_jax.io.layouts.colmap import read_points
-from geosplat_jax.io.views import Views
+from geosplat_jax.io.views import COVERED, Views
 from geosplat_jax.report.pictures import overview_sheet
 from geosplat_jax.report.renderer import to_picture
 
@@ -361,7 +361,8 @@ def photograph_mask(
     )
     rows, columns = height // downscale, width // downscale
     reduced = Lookup(where.rows / downscale, where.columns / downscale, where.inside)
-    return resample(alpha[:rows, :columns, None], reduced)[..., 0] > OPAQUE
+    mask = (alpha[:rows, :columns, None] > OPAQUE).astype(np.float32)
+    return resample(mask, reduced)[..., 0] > COVERED
 
 
 def certainty(views: Views, alpha: Float[np.ndarray, "V H W"], box: Corners) -> Certainty:
@@ -370,9 +371,10 @@ def certainty(views: Views, alpha: Float[np.ndarray, "V H W"], box: Corners) -> 
     covered = int(masks.sum())
     rims = (masks[:, 0], masks[:, -1], masks[:, :, 0], masks[:, :, -1])
     on_border = sum(int(rim.sum()) for rim in rims)
-    inner = masks.copy()
+    around = np.pad(masks, ((0, 0), (1, 1), (1, 1)))
+    inner = around.copy()
     for axis, step in ((1, 1), (1, -1), (2, 1), (2, -1)):
-        inner &= np.roll(masks, step, axis)
+        inner &= np.roll(around, step, axis)
     rim = covered - int(inner.sum())
     cut_out = np.concatenate([views.images[..., :3], masks[..., None].astype(np.float32)], axis=-1)
     masked = replace(views, images=cut_out, has_masks=True)
@@ -394,7 +396,7 @@ def _numbers(corner: np.ndarray) -> tuple[float, float, float]:
 
 def mask_sheet(
     views: Views, alpha: Float[np.ndarray, "V H W"], notes: Sequence[str]
-) -> Float[np.ndarray, "H W 3"]:
+) -> Float[np.ndarray, "rows columns 3"]:
     """Show some views: the capture, its mask, and the capture with the mask on it.
 
     Half-opaque pixels are orange in the mask.

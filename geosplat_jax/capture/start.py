@@ -27,9 +27,9 @@ literature were found on."""
 _EXTENT_MARGIN = 1.1  # as in the code of Kerbl et al.
 _NEIGHBOURS = 3
 _SMALLEST_DISTANCE = 1e-4  # of neighbours, in quarters of the cameras' extent
-_START_SHARE = 0.25
+_START_SHARE = 0.5
 """Of the capacity that there are splats in the beginning."""
-_NEAREST, _BEYOND, _FARTHEST = 0.3, 2.0, 30.0
+_NEAREST, _BEYOND, _FARTHEST = 0.5, 1.5, 30.0
 """Depths of random points, in distances to what the cameras look at."""
 
 
@@ -77,8 +77,8 @@ def standard_world(views: Views) -> Similarity:
 def random_points(views: Views, count: int, rng: np.random.Generator) -> Points:
     """Draw points that the cameras see, with the colour that one of them sees there.
 
-    Half of them lie between 0.3 and 2 times the distance to what the cameras look at, evenly in
-    depth, the others between 2 and 30, evenly in the inverse of the depth.
+    Half of them lie between 0.5 and 1.5 times the distance to what the cameras look at, evenly in
+    depth, the others between 1.5 and 30, evenly in the inverse of the depth.
     """
     view = rng.integers(len(views), size=count)
     row, column = rng.integers(views.height, size=count), rng.integers(views.width, size=count)
@@ -107,7 +107,7 @@ def first_splats(
     """Place the first splats, in the world of the views; return them and how many there are.
 
     Points come first, all of them or a random choice; random points that the cameras see fill up to
-    a quarter of the capacity.
+    half of the capacity.
     """
     rng = np.random.default_rng(settings.seed)
     wanted = max(1, int(_START_SHARE * settings.capacity))

@@ -46,7 +46,7 @@ from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.layouts.colmap import Points
 from geosplat_jax.io.views import Views
 from geosplat_jax.losses import compare, image_dissimilarity, image_l1, random_background
-from geosplat_jax.report.metrics import psnr_of_mse
+from geosplat_jax.report.metrics import psnr, psnr_of_mse
 from geosplat_jax.splats.radiance import RadianceSplats, render_radiance
 from geosplat_jax.splats.relocation import DEAD_OPACITY, exploring_noise, relocate
 
@@ -277,7 +277,7 @@ class _Loop:
             count=jnp.int32(count),
             step=jnp.int32(0),
         )
-        self.capacities = _planned(self.state, self.views)
+        self.capacities = _planned(splats, count, self.views.camera(), NEAR)
         self.has_compiled = False
 
     def save(self) -> None:
@@ -353,23 +353,23 @@ class _Loop:
 
 
 @partial(jax.jit, static_argnames=("capacities",))
-def _needs(splats, count, camera, *, capacities):
+def _needs(splats, count, camera, near, *, capacities):
     """Count what one view needs; the image itself is not made."""
     return render_radiance(
-        splats, count, camera, capacities=capacities, near=NEAR, tile_size=TILE_SIZE
+        splats, count, camera, capacities=capacities, near=near, tile_size=TILE_SIZE
     )[2]
 
 
-def _planned(state: RadianceState, views: Views) -> Capacities:
-    """Choose buffers that hold some of the views, with headroom; no view sees more than all."""
-    capacities = Capacities(visible=bucket(state.splats.capacity))
-    some = np.unique(np.linspace(0, len(views) - 1, _VIEWS_PLANNED).astype(int))
-    camera = views.camera(some)
-    for number in range(camera.count):
-        one = camera.view(number)
+def _planned(
+    splats: RadianceSplats, count: Int[Array, ""] | int, camera: Camera, near: float
+) -> Capacities:
+    """Choose buffers that hold some views of splats; no view sees more than there are."""
+    capacities = Capacities(visible=bucket(splats.capacity))
+    for number in np.unique(np.linspace(0, camera.count - 1, _VIEWS_PLANNED).astype(int)):
+        one = camera.view(int(number))
 
         def attempt(sizes: Capacities, one: Camera = one) -> tuple[None, Usage]:
-            return None, _needs(state.splats, state.count, one, capacities=sizes)
+            return None, _needs(splats, count, one, jnp.float32(near), capacities=sizes)
 
         _, capacities = retry(attempt, capacities, headroom=_HEADROOM)
     return capacities
@@ -500,7 +500,7 @@ def render_views(
     radiance: Radiance, camera: Camera
 ) -> tuple[Float[np.ndarray, "V H W 3"], Float[np.ndarray, "V H W"]]:
     """Render views: (V, H, W, 3) premultiplied sRGB, and (V, H, W) alpha."""
-    capacities = Capacities(visible=bucket(radiance.splats.capacity))
+    capacities = _planned(radiance.splats, radiance.splats.capacity, camera, radiance.near)
     colors, alphas = [], []
     near = jnp.float32(radiance.near)
     for number in range(camera.count):
@@ -522,7 +522,6 @@ def quality(radiance: Radiance, views: Views) -> Float[np.ndarray, " V"]:
     """PSNR in decibels of new views against photographs, as a screen shows both, over black."""
     rgb, _ = render_views(radiance, views.camera())
     truth = np.asarray(linear_to_srgb(jnp.asarray(views.images[..., :3])))
-    squared = ((np.clip(rgb, 0.0, 1.0) - truth) ** 2).mean(-1)
-    valid = np.ones(squared.shape) if views.valid is None else views.valid
-    error = (squared * valid).sum((1, 2)) / np.maximum(valid.sum((1, 2)), 1.0)
-    return np.asarray(psnr_of_mse(jnp.asarray(error, jnp.float32)))
+    shown = np.clip(rgb, 0.0, 1.0)
+    valid = np.ones(shown.shape[:3], np.float32) if views.valid is None else views.valid
+    return np.array([float(psnr(*view)) for view in zip(shown, truth, valid, strict=True)])

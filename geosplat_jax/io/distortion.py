@@ -162,8 +162,10 @@ def photograph_lookup(
     return Lookup(rows, columns, inside & is_settled)
 
 
-def resample(pixels: Float[np.ndarray, "H W C"], lookup: Lookup) -> Float[np.ndarray, "H W C"]:
-    """Sample linear pixels bilinearly; zero where the photograph shows nothing.
+def resample(
+    pixels: Float[np.ndarray, "H W C"], lookup: Lookup
+) -> Float[np.ndarray, "rows columns C"]:
+    """Sample linear pixels bilinearly where a lookup says; zero where it is not inside.
 
     Colour of four-channel images is weighted by alpha, the last channel, as `images.downscale`
     does. Within half a pixel of the border, that of the last pixel is taken.
