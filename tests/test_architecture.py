@@ -30,6 +30,7 @@ ORDER = [
     "io",
     "fit",
     "report",
+    "capture",
     "run",
     "camera_rounds",
     "gradcheck",

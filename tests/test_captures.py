@@ -15,7 +15,7 @@ from geosplat_jax import cli
 from geosplat_jax.fit.train import fit
 from geosplat_jax.io.dataset import choose_downscale, describe, load_dataset
 from geosplat_jax.io.images import MissingFileError, SceneError, write_exr, write_png
-from geosplat_jax.io.layouts.colmap import list_colmap
+from geosplat_jax.io.layouts.colmap import list_colmap, read_points
 from geosplat_jax.io.views import ViewLight
 from geosplat_jax.report.relight import load_view_light
 
@@ -669,6 +669,8 @@ def test_colmap_itself_writes_what_is_read(copied):
         image.points2D = [pycolmap.Point2D(np.array([1.5, 2.5])) for _ in range(number % 3)]
         placed = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
         model.add_image_with_trivial_frame(image, placed)
+    for place, color in POINTS:
+        model.add_point3D(np.array(place), pycolmap.Track(), np.array(color, np.uint8))
     for kind, suffix in ((model.write_binary, "bin"), (model.write_text, "txt")):
         (root / "sparse" / "0").mkdir(parents=True)
         kind(str(root / "sparse" / "0"))
@@ -678,7 +680,58 @@ def test_colmap_itself_writes_what_is_read(copied):
         assert numbers == [1, 2, 3, 4, 5, 6, 7, 9]
         np.testing.assert_allclose(views.camera_to_world, opengl_poses()[numbers], atol=1e-9)
         np.testing.assert_allclose(views.intrinsics[:, 0, 2], LENS.cx)
+        points = read_points(root)
+        order = np.argsort(points.positions[:, 0])
+        np.testing.assert_allclose(points.positions[order], [place for place, _ in POINTS])
+        np.testing.assert_allclose(points.colors[order], np.array([c for _, c in POINTS]) / 255)
         shutil.rmtree(root / "sparse")
+
+
+POINTS = [((0.5, -1.0, 2.0), (255, 0, 51)), ((3.0, 4.0, -5.0), (0, 102, 255))]
+
+
+def point_bytes(points=POINTS, *, count=None):
+    parts = [struct.pack("<Q", len(points) if count is None else count)]
+    for number, (place, color) in enumerate(points):
+        parts.append(struct.pack("<Q3d3Bd", number, *place, *color, 0.7))
+        parts.append(struct.pack("<Q", number) + struct.pack("<ii", 1, 2) * number)
+    return b"".join(parts)
+
+
+def test_points_of_a_model_are_read_in_both_kinds_of_files(tmp_path):
+    folder = tmp_path / "sparse" / "0"
+    folder.mkdir(parents=True)
+    assert read_points(tmp_path) is None
+    (folder / "images.bin").write_bytes(image_bytes([]))
+    assert read_points(tmp_path) is None
+    for name, content in (
+        ("points3D.txt", b"# points\n7 0.5 -1 2 255 0 51 0.7\n9 3 4 -5 0 102 255 0.7 1 2 4 5\n"),
+        ("points3D.bin", point_bytes()),
+    ):
+        (folder / name).write_bytes(content)
+        points = read_points(tmp_path)
+        np.testing.assert_array_equal(points.positions, [place for place, _ in POINTS])
+        np.testing.assert_allclose(points.colors, np.array([c for _, c in POINTS]) / 255)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("bin", point_bytes()[:-3], "points3D.bin is truncated"),
+        ("bin", point_bytes(count=9), "points3D.bin is truncated"),
+        ("bin", point_bytes(count=1), "bytes more than its count says"),
+        ("bin", point_bytes([((0.0, np.nan, 1.0), (1, 2, 3))]), "points that are not finite"),
+        ("txt", b"7 0.5 -1 2 255 0\n", "line 1 of .*points3D.txt must be: number, position"),
+        ("txt", b"7 0.5 x 2 255 0 51 0.7\n", "line 1 of .*points3D.txt must have numbers"),
+    ],
+)
+def test_damaged_points_are_refused(tmp_path, name, content, message):
+    folder = tmp_path / "sparse"
+    folder.mkdir()
+    (folder / f"images.{name}").write_bytes(b"")
+    (folder / f"points3D.{name}").write_bytes(content)
+    with pytest.raises(SceneError, match=message):
+        read_points(tmp_path)
 
 
 def edit_matrices(root, change):

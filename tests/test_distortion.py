@@ -7,6 +7,7 @@ from geosplat_jax.io.distortion import (
     Brown,
     Fisheye,
     largest_radius,
+    photograph_lookup,
     pinhole_lookup,
     resample,
     resample_valid,
@@ -174,3 +175,24 @@ def test_a_sample_next_to_a_pixel_that_does_not_count_does_not_count():
     assert not counts[near].any()
     far = (np.abs(lookup.rows - 20.5) > 1.01) | (np.abs(lookup.columns - 30.5) > 1.01)
     np.testing.assert_array_equal(counts[far], lookup.inside[far])
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_pixels_of_a_photograph_are_found_in_the_pinhole_image(name):
+    model, _ = MODELS[name]
+    where = photograph_lookup(model, LENS, WIDTH, HEIGHT)
+    x, y = (where.columns - LENS[0, 2]) / LENS[0, 0], (where.rows - LENS[1, 2]) / LENS[1, 1]
+    u, v = model.distort(x, y)
+    columns, rows = LENS[0, 0] * u + LENS[0, 2], LENS[1, 1] * v + LENS[1, 2]
+    wanted = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    assert where.inside.mean() > 0.5
+    for found, expected in zip((columns, rows), wanted, strict=True):
+        np.testing.assert_allclose(found[where.inside], expected[where.inside], atol=0.02)
+
+
+def test_without_distortion_photograph_and_pinhole_image_are_one():
+    where = photograph_lookup(None, LENS, WIDTH, HEIGHT)
+    columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    np.testing.assert_allclose(where.columns, columns)
+    np.testing.assert_allclose(where.rows, rows)
+    assert where.inside.all()

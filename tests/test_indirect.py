@@ -1,11 +1,14 @@
 """Indirect light: the harmonics, the four models and their ranges, what faces send out."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import double_precision
 
+from geosplat_jax.core.harmonics import harmonics as harmonics_of_any_degree
 from geosplat_jax.core.types import Materials, SurfacePoints
 from geosplat_jax.transport.indirect import (
     INDIRECT_MODELS,
@@ -14,7 +17,6 @@ from geosplat_jax.transport.indirect import (
     HarmonicIndirect,
     NoIndirect,
     TracedIndirect,
-    harmonics,
 )
 from geosplat_jax.transport.indirect import outgoing as eager_outgoing
 from geosplat_jax.transport.sampling import BLOCKED, OPEN
@@ -23,6 +25,7 @@ ROUNDING = 1e-6  # float32, values of order one
 RAYS = 7
 HITS = jnp.asarray([0, 3, BLOCKED, 2, 2, OPEN, 1], jnp.int32)
 
+harmonics = partial(harmonics_of_any_degree, degree=2)
 # One compilation costs less than a handful of eager operations.
 outgoing = jax.jit(eager_outgoing, static_argnames="face_count")
 incoming = jax.jit(lambda model, directions, hits: model.incoming(directions, hits))

@@ -243,7 +243,7 @@ def test_stopping_writes_a_checkpoint(dataset, tmp_path, monkeypatch):
     def requests():
         yield lambda: next(asked)
 
-    monkeypatch.setattr(train_module, "_stop_requests", requests)
+    monkeypatch.setattr(train_module, "stop_requests", requests)
     with pytest.raises(Interrupted, match="--resume"):
         fit(dataset, tiny_config("run.checkpoint_every=100"), tmp_path)
     assert load_trained(tmp_path).step == 2

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, get_args
 
+from geosplat_jax.capture.settings import RadianceSettings
 from geosplat_jax.fit.budget import parse_duration, parse_memory
 from geosplat_jax.fit.presets import PRESETS, QUALITIES
 from geosplat_jax.gradcheck.report import STAGES
@@ -32,6 +33,8 @@ def command_line() -> argparse.ArgumentParser:
     _add_scene_arguments(info)
 
     _add_poses(commands.add_parser("poses", help="find the cameras of a folder of photographs"))
+
+    _add_masks(commands.add_parser("masks", help="cut the object out of photographs with cameras"))
 
     train = commands.add_parser("train", help="reconstruct a scene")
     _add_scene_arguments(train)
@@ -165,6 +168,45 @@ def _add_poses(poses: argparse.ArgumentParser) -> None:
         help="one for all photographs, or one for each (default: %(default)s)",
     )
     poses.add_argument("--seed", type=int, default=standard.seed, help="of random searches")
+
+
+def _add_masks(masks: argparse.ArgumentParser) -> None:
+    """Describe the masks command."""
+    standard = RadianceSettings()
+    masks.add_argument("scene", type=Path, help="folder of a capture; SCENE/masks is written")
+    masks.add_argument(
+        "--box",
+        type=float,
+        nargs=6,
+        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        help="around the object (default: around what all cameras look at)",
+    )
+    masks.add_argument(
+        "--output", type=Path, help="folder of splats and sheet (default: runs/SCENE_masks)"
+    )
+    masks.add_argument("--steps", type=int, default=standard.steps, help="(default: %(default)s)")
+    masks.add_argument(
+        "--splats",
+        type=int,
+        default=standard.capacity,
+        metavar="N",
+        help="most that there may be (default: %(default)s)",
+    )
+    masks.add_argument(
+        "--downscale",
+        type=_downscale,
+        default="auto",
+        metavar="N",
+        help="reduce the images by this factor; auto: to at most as many pixels as 270 x 480",
+    )
+    masks.add_argument("--seed", type=int, default=standard.seed, help="of every random choice")
+    start = masks.add_mutually_exclusive_group()
+    start.add_argument(
+        "--resume",
+        action="store_true",
+        help="continue the training; where it is done, only make the masks again, in another --box",
+    )
+    start.add_argument("--force", action="store_true", help="replace splats and masks")
 
 
 def _add_samples(parser: argparse.ArgumentParser) -> None:

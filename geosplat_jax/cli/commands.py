@@ -3,13 +3,17 @@
 import argparse
 import json
 from dataclasses import asdict
+from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from geosplat_jax.cli.display import console, say, say_refined
+from geosplat_jax.capture.masks import choose_factor, make_masks
+from geosplat_jax.capture.settings import RadianceSettings
+from geosplat_jax.cli.display import ProgressDisplay, console, say, say_refined
 from geosplat_jax.cli.training import UsageError, config_from, scene_options, train
 from geosplat_jax.fit.config import all_settings
 from geosplat_jax.fit.gauge import change_lines
@@ -25,7 +29,7 @@ from geosplat_jax.gradcheck.report import (
     to_records,
 )
 from geosplat_jax.io.agreement import agreement_lines
-from geosplat_jax.io.dataset import describe, load_recorded
+from geosplat_jax.io.dataset import describe, load_dataset, load_recorded
 from geosplat_jax.io.export import LARGEST_TEXTURE
 from geosplat_jax.io.poses import PoseSettings, find_poses
 from geosplat_jax.report.consistency import (
@@ -91,6 +95,42 @@ def _poses(arguments: argparse.Namespace) -> None:
     print(f"model: {report.model}")
     print(
         f"next: masks of the object (docs/captures.md), then geosplat-jax train {arguments.folder}"
+    )
+
+
+def _masks(arguments: argparse.Namespace) -> None:
+    """Make masks of a capture, with progress on the terminal, and say how sure they are."""
+    factor = arguments.downscale
+    if factor == "auto":
+        factor = choose_factor(arguments.scene)
+    settings = RadianceSettings(
+        steps=arguments.steps, capacity=arguments.splats, seed=arguments.seed
+    )
+    box = None
+    if arguments.box is not None:
+        box = (np.array(arguments.box[:3]), np.array(arguments.box[3:]))
+    dataset = load_dataset(arguments.scene, downscale=factor, bounds=box, mask_files=False)
+    for note in dataset.notes:
+        say(note)
+    folder = arguments.output or Path("runs") / f"{arguments.scene.resolve().name}_masks"
+    views = dataset.train
+    say(f"{dataset.name}: {len(views)} views of {views.width} x {views.height}; compiling ...")
+    with ProgressDisplay(settings.steps) as display:
+        report = make_masks(
+            dataset,
+            settings,
+            folder,
+            box=box,
+            downscale=factor,
+            resume=arguments.resume,
+            force=arguments.force,
+            on_step=display.show,
+        )
+    print("\n".join(report.lines()))
+    print(f"sheet: {folder / 'masks.png'}; splats: {folder / 'splats.ply'}")
+    print(
+        "look at the sheet; if it is right, next: geosplat-jax train "
+        f"{arguments.scene}; if not: geosplat-jax masks {arguments.scene} --resume --box ..."
     )
 
 
@@ -256,6 +296,7 @@ def _gradcheck(arguments: argparse.Namespace) -> None:
 COMMANDS = {
     "info": _info,
     "poses": _poses,
+    "masks": _masks,
     "train": train,
     "settings": _settings,
     "evaluate": _evaluate,

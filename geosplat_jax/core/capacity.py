@@ -132,7 +132,10 @@ _Result = TypeVar("_Result")
 
 
 def retry(
-    attempt: Callable[[Capacities], tuple[_Result, Usage]], capacities: Capacities
+    attempt: Callable[[Capacities], tuple[_Result, Usage]],
+    capacities: Capacities,
+    *,
+    headroom: float = 1.1,
 ) -> tuple[_Result, Capacities]:
     """Call ``attempt`` with growing capacities until everything it needed fitted (host side).
 
@@ -140,6 +143,7 @@ def retry(
     ----------
     attempt : takes capacities; returns a result, and what it truly needed.
     capacities : to begin with.
+    headroom : see `grow`.
 
     Returns
     -------
@@ -151,7 +155,7 @@ def retry(
         needed = jax.device_get(needed)
         if not overflowed(needed, capacities):
             return result, capacities
-        capacities = grow(capacities, needed)
+        capacities = grow(capacities, needed, headroom=headroom)
 
 
 def compact(

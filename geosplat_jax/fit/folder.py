@@ -89,6 +89,48 @@ def _parsed(path: Path) -> Any:
         raise RunError(f"{path} is damaged: {error}") from None
 
 
+@contextmanager
+def locked_folder(path: Path, *, own: Path) -> Iterator[None]:
+    """Hold a folder for one process, made where it is missing; the lock ends with the process.
+
+    Parameters
+    ----------
+    path : the folder. own : file of it that shows that its other files are the caller's.
+
+    Raises
+    ------
+    RunError
+        If another process holds it, or it lacks ``own`` and has other files.
+    """
+    _require_own(path, own)
+    path.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(path / _LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise RunError(
+            f"another process is writing to {path}; wait for it, or take another folder"
+        ) from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _require_own(path: Path, own: Path) -> None:
+    """Refuse a folder in which somebody else's files lie."""
+    if own.exists() or not path.exists():
+        return
+    if not path.is_dir():
+        raise RunError(f"{path} exists already, and is no folder; choose another")
+    others = sorted(file.name for file in path.iterdir() if file.name != _LOCK)
+    if others:
+        raise RunError(
+            f"{path} exists already and holds other files, {others[0]} for one; choose "
+            "an empty folder"
+        )
+
+
 class RunFolder:
     """Where a run lives; nothing is read or written until a method says so."""
 
@@ -173,32 +215,8 @@ class RunFolder:
         RunError
             If another process holds it, or it is no run and holds other files.
         """
-        self._require_own()
-        self.path.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(self.path / _LOCK)
-        try:
-            lock.acquire(timeout=0)
-        except Timeout:
-            raise RunError(
-                f"another process is writing to {self.path}; wait for it, or take another folder"
-            ) from None
-        try:
+        with locked_folder(self.path, own=self._record_path):
             yield
-        finally:
-            lock.release()
-
-    def _require_own(self) -> None:
-        """Refuse a folder in which somebody else's files lie."""
-        if self.exists or not self.path.exists():
-            return
-        if not self.path.is_dir():
-            raise RunError(f"{self.path} exists already, and is no folder; choose another")
-        others = sorted(path.name for path in self.path.iterdir() if path.name != _LOCK)
-        if others:
-            raise RunError(
-                f"{self.path} exists already and holds other files, {others[0]} for one; choose "
-                "an empty folder"
-            )
 
     def require_free(self, *, replace: bool) -> None:
         """Refuse a folder that holds a run, unless that is to be replaced.

@@ -17,7 +17,8 @@ from geosplat_jax.fit.gradient import run_program, value_and_gradient
 from geosplat_jax.pipeline import LossReport, Pipeline
 from geosplat_jax.render import Params
 
-_ADAM = optax.scale_by_adam(eps=1e-15)
+ADAM = optax.scale_by_adam(eps=1e-15)
+"""The optimiser of all trainings; rates of the groups come after it."""
 
 
 class TrainState(eqx.Module):
@@ -79,19 +80,24 @@ def initial_state(params: Params, *, step: int = 0, carry: Any = None) -> TrainS
     """
     params = jax.tree.map(jnp.array, params)
     tree: Any = params
-    return TrainState(params, _ADAM.init(tree), jnp.asarray(step, jnp.int32), carry)
+    return TrainState(params, ADAM.init(tree), jnp.asarray(step, jnp.int32), carry)
 
 
-def _moved(params: Params, directions: Params, rule: UpdateRule) -> Params:
-    """Step against the directions, and return to the feasible set."""
+def descended(params: Any, directions: Any, rates: dict[str, Float[Array, ""]]) -> Any:
+    """Step against the directions, every group of parameters with its own learning rate."""
     leaves, structure = jax.tree.flatten(params)
     moved = [
-        leaf - rule.rates[name].astype(leaf.dtype) * direction
+        leaf - rates[name].astype(leaf.dtype) * direction
         for leaf, direction, name in zip(
             leaves, jax.tree.leaves(directions), rate_groups(params), strict=True
         )
     ]
-    params_moved = jax.tree.unflatten(structure, moved)
+    return jax.tree.unflatten(structure, moved)
+
+
+def _moved(params: Params, directions: Params, rule: UpdateRule) -> Params:
+    """Step against the directions, and return to the feasible set."""
+    params_moved = descended(params, directions, rule.rates)
     # Absolute steps below the knee, relative ones above: a sun is thousands of times brighter than
     # its sky, and Adam's steps know nothing of that. No texel falls below its floor.
     old = params.light.radiance
@@ -114,7 +120,7 @@ def _update(
     total, report = found
     with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integer powers
         updates: Any = gradient
-        directions, optimizer = _ADAM.update(updates, state.optimizer)
+        directions, optimizer = ADAM.update(updates, state.optimizer)
     moved: Any = directions
     params = _moved(state.params, moved, rule)
     finite = jnp.isfinite(total) & jnp.all(

@@ -71,7 +71,7 @@ class Progress:
 
 
 @contextmanager
-def _stop_requests() -> Iterator[Callable[[], bool]]:
+def stop_requests() -> Iterator[Callable[[], bool]]:
     """Turn Ctrl-C and SIGTERM into a flag that the loop reads between two steps.
 
     A second signal does not wait: it raises KeyboardInterrupt wherever the program is.
@@ -204,7 +204,7 @@ def fit(
     dataset.require_masks("train")
     require_training_memory(config, dataset)
     run = RunFolder(folder)
-    with run.locked(), _stop_requests() as stop_requested:
+    with run.locked(), stop_requests() as stop_requested:
         has_begun = False
         try:
             if not (resume and run.exists):

@@ -73,9 +73,9 @@ def align_world(
     AlignmentError : the cameras stand at one point or on a line, or do not look at one place.
     """
     centers, axes = camera_to_world[:, :3, 3], camera_to_world[:, :3, :3]
-    _require_spread(centers, points)
+    require_spread(centers, points)
     up = up_direction(axes[:, :, 0], axes[:, :, 1])
-    target = _target(centers, -axes[:, :, 2])
+    target = common_target(centers, -axes[:, :, 2])
     distance = float(np.median(np.linalg.norm(centers - target, axis=1)))
     right = _perpendicular(axes[0, :, 0], up)
     rotation = np.stack([right, np.cross(up, right), up])
@@ -117,8 +117,13 @@ def _perpendicular(vector: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return across / length
 
 
-def _require_spread(centers: np.ndarray, points: np.ndarray) -> None:
-    """Refuse cameras that hardly moved, or along a line only."""
+def require_spread(centers: np.ndarray, points: np.ndarray) -> None:
+    """Refuse cameras that hardly moved, or along a line only; ``points`` tell what is far.
+
+    Raises
+    ------
+    AlignmentError
+    """
     middle = centers.mean(axis=0)
     spread = np.linalg.svd(centers - middle, compute_uv=False) / np.sqrt(len(centers))
     distance = float(np.median(np.linalg.norm(points - middle, axis=1)))
@@ -134,8 +139,13 @@ def _require_spread(centers: np.ndarray, points: np.ndarray) -> None:
         )
 
 
-def _target(centers: np.ndarray, sight: np.ndarray) -> np.ndarray:
-    """Point that the cameras look at."""
+def common_target(centers: np.ndarray, sight: np.ndarray) -> np.ndarray:
+    """Point that cameras look at whose axes point along ``sight``.
+
+    Raises
+    ------
+    AlignmentError : the axes are parallel, or most point away from where they come closest.
+    """
     cure = "keep the object in the middle of every photograph"
     try:
         target = meeting_point(centers, sight)

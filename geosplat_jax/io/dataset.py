@@ -1,7 +1,7 @@
 """Scenes in memory: one type for every layout, found out by itself and checked on the way in."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -112,6 +112,7 @@ def load_dataset(
     train_views: int | None = None,
     test_views: int | None = None,
     cameras: str | Path | None = None,
+    mask_files: bool = True,
 ) -> Dataset:
     """Load a scene folder.
 
@@ -125,6 +126,7 @@ def load_dataset(
     train_views, test_views : at most this many views, spread evenly over the list.
     cameras : file of refined cameras, which take the place of the scene's in the splits that it
         names; see `cameras.with_cameras` for what becomes of the photographs.
+    mask_files : False leaves files of masks unread; an image's own alpha stays.
 
     Raises
     ------
@@ -147,6 +149,8 @@ def load_dataset(
         ("test", listing.test, test_views),
     ):
         chosen = _spread(frames, limit, f"{split}_views")
+        if not mask_files:
+            chosen = [replace(frame, mask=None) for frame in chosen]
         if not chosen and split == "test":
             warnings.append("there are no test views; nothing can be evaluated")
             splits.append(no_views(splits[0]))

@@ -16,6 +16,9 @@ from scipy.ndimage import map_coordinates
 _SAMPLES = 4096  # of the radius, to see where a polynomial turns back
 _WHOLE = 1.0 - 1e-3  # a sample that counts takes all of its weight from pixels that count
 _SMALLEST_ALPHA = 1e-6
+_INVERSIONS = 60
+_INVERTED = 0.02  # pixels that an inverted lens may be off
+_WIDEST = 2.0  # radii of the photograph, beyond which no pixel of it is looked for
 
 
 def _powers(squared: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
@@ -128,8 +131,41 @@ def pinhole_lookup(
     return Lookup(rows, columns, inside)
 
 
-def resample(pixels: Float[np.ndarray, "H W C"], lookup: Lookup) -> Float[np.ndarray, "H W C"]:
-    """Sample linear pixels bilinearly; zero where the photograph shows nothing.
+def photograph_lookup(
+    distortion: Distortion | None, intrinsics: Float[np.ndarray, "3 3"], width: int, height: int
+) -> Lookup:
+    """Find the pixels of a photograph in the pinhole image of the same intrinsics and size.
+
+    The inverse of `pinhole_lookup`, by fixed-point iteration: ``x <- x + target - distort(x)``.
+    Pixels at which it does not settle, or that the pinhole does not show, are not inside.
+    """
+    fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
+    target_x, target_y = np.meshgrid(
+        (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy
+    )
+    x, y = target_x.copy(), target_y.copy()
+    is_settled = np.ones(x.shape, bool)
+    if distortion is not None:
+        # What a pinhole shows lies within its own border, so nothing leaves it on the way.
+        limit = largest_radius(distortion, _WIDEST * float(np.hypot(x, y).max()))
+        for _ in range(_INVERSIONS):
+            shown_x, shown_y = distortion.distort(x, y)
+            off_x, off_y = target_x - shown_x, target_y - shown_y
+            is_settled = np.hypot(fx * off_x, fy * off_y) < _INVERTED
+            if is_settled.all():
+                break
+            x, y = x + off_x, y + off_y
+            shrink = np.minimum(1.0, limit / np.maximum(np.hypot(x, y), limit))
+            x, y = x * shrink, y * shrink
+    columns, rows = fx * x + cx, fy * y + cy
+    inside = (columns >= 0.0) & (columns <= width) & (rows >= 0.0) & (rows <= height)
+    return Lookup(rows, columns, inside & is_settled)
+
+
+def resample(
+    pixels: Float[np.ndarray, "H W C"], lookup: Lookup
+) -> Float[np.ndarray, "rows columns C"]:
+    """Sample linear pixels bilinearly where a lookup says; zero where it is not inside.
 
     Colour of four-channel images is weighted by alpha, the last channel, as `images.downscale`
     does. Within half a pixel of the border, that of the last pixel is taken.

@@ -17,6 +17,7 @@ from trimesh.exchange.gltf import export_glb
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
+from geosplat_jax.core.harmonics import CONSTANT
 from geosplat_jax.io.images import encode_srgb, write_exr, written_aside
 from geosplat_jax.io.memory import Need, memory_refusal
 from geosplat_jax.io.meshes import (
@@ -39,7 +40,8 @@ _TEXEL_BYTES = 4 * (1 + 3 + 5)
 """Of a texel while a texture is baked: its face, barycentric coordinates and materials."""
 
 _SAMPLES_PER_CALL = 1 << 16
-_SH_DC = 0.28209479177387814
+_VIEWERS_SIGNS = np.array([(-1.0) ** m for degree in (1, 2, 3) for m in range(-degree, degree + 1)])
+"""Of the harmonics of degree 1 to 3: (-1)^m, the phase of Condon and Shortley."""
 # Keeps the logarithm of a flat Gaussian finite, whatever the size of the scene.
 _SMALLEST_SCALE = float(np.finfo(np.float32).tiny)
 _OPACITY_MARGIN = 1e-6
@@ -296,20 +298,24 @@ def export_gaussians_ply(
     opacities: Float[Array | np.ndarray, " N"],
     rgb: Float[Array | np.ndarray, "N 3"],
     normals: Float[Array | np.ndarray, "N 3"],
+    rest: Float[Array | np.ndarray, "N 15 3"] | None = None,
 ) -> None:
     """Write Gaussians in the binary PLY layout of 3D Gaussian Splatting, which viewers open.
 
     Scales are stored as logarithms, opacities as logits, the colour as the constant spherical
-    harmonic ``(rgb - 0.5) / 0.28209``, quaternions as (w, x, y, z) of unit length; there are no
-    higher harmonics. Pass real rows only, no padding.
+    harmonic ``(rgb - 0.5) / 0.28209``, quaternions as (w, x, y, z) of unit length. Pass real rows
+    only, no padding.
 
     Parameters
     ----------
     path : destination, ``*.ply``.
     means : (N, 3) world; quats : (N, 4) wxyz; scales : (N, 3) standard deviations;
         opacities : (N,) in [0, 1], kept 1e-6 away from both ends.
-    rgb : (N, 3) *display* colour in [0, 1], that is sRGB-encoded.
+    rgb : (N, 3) *display* colour, that is sRGB-encoded: of the constant harmonic alone.
     normals : (N, 3).
+    rest : (N, 15, 3) coefficients of the harmonics of degree 1 to 3 (`core.harmonics`), for splats
+        whose colour depends on the viewer. They are written as ``f_rest``, all of one channel
+        before those of the next, with the alternating sign that viewers expect.
 
     Raises
     ------
@@ -324,15 +330,20 @@ def export_gaussians_ply(
         raise ValueError("quats must not be zero; drop the padding rows first")
     opacities = np.clip(opacities, _OPACITY_MARGIN, 1.0 - _OPACITY_MARGIN)
     logits = np.log(opacities) - np.log1p(-opacities)
-    harmonics = (rgb - 0.5) / _SH_DC
+    harmonics = (rgb - 0.5) / CONSTANT
     log_scales = np.log(np.maximum(scales, _SMALLEST_SCALE))
+    higher = np.zeros((len(means), 0))
+    if rest is not None:
+        signed = np.asarray(rest, np.float64) * _VIEWERS_SIGNS[None, :, None]
+        higher = signed.transpose(0, 2, 1).reshape(len(means), -1)
     table = np.concatenate(
-        [means, normals, harmonics, logits[:, None], log_scales, quats / lengths], axis=-1
+        [means, normals, harmonics, higher, logits[:, None], log_scales, quats / lengths], axis=-1
     )
     if not np.all(np.isfinite(table)):
         raise ValueError("Gaussians must be finite, some values are not")
-    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
-    names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{number}" for number in range(higher.shape[1])]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
     header += [f"property float {name}" for name in names] + ["end_header\n"]
     with written_aside(path) as aside:

@@ -29,7 +29,7 @@ TEST_EVERY = 8
 
 _OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _IMAGE_FOLDERS = ("images", "image", "blended_images")
-_MASK_FOLDERS = ("masks", "mask")
+MASK_FOLDERS = ("masks", "mask")
 _VALID_FOLDERS = ("valid",)
 
 
@@ -329,6 +329,11 @@ def _within_images(root: Path, image: Path) -> Path:
     return Path(*relative.parts[1:]) if relative.parts[0] in _IMAGE_FOLDERS else relative
 
 
+def mask_file(root: Path, image: Path) -> Path:
+    """Where the mask of an image is looked for first, whether it is there or not."""
+    return root / MASK_FOLDERS[0] / _within_images(root, image).with_suffix(".png")
+
+
 def beside_images(root: Path, image: Path, folders: tuple[str, ...]) -> Path | None:
     """Return the PNG that belongs to an image in one of the folders, None where there is none.
 
@@ -356,7 +361,7 @@ def captured_frame(
         pose,
         lens,
         image,
-        mask=mask or beside_images(root, image, _MASK_FOLDERS),
+        mask=mask or beside_images(root, image, MASK_FOLDERS),
         valid=beside_images(root, image, _VALID_FOLDERS),
     )
 

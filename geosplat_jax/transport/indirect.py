@@ -20,31 +20,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from geosplat_jax.core.harmonics import harmonics
 from geosplat_jax.core.numerics import safe_divide
 from geosplat_jax.core.types import Materials, SurfacePoints
 from geosplat_jax.transport.bsdf import specular_f0
 
 _OFFSET = 3.0
+_DEGREE = 2  # of the harmonics
 
 Lobes = tuple[Float[Array, "N 3"], Float[Array, "N 3"]]
 """Radiance for the diffuse lobe and for the specular one."""
-
-
-def harmonics(directions: Float[Array, "N 3"]) -> Float[Array, "N 9"]:
-    """Real, orthonormal spherical harmonics of degree 0, 1 and 2 at unit directions."""
-    x, y, z = directions[:, 0], directions[:, 1], directions[:, 2]
-    values = [
-        jnp.full_like(x, 0.28209479177387814),
-        0.4886025119029199 * y,
-        0.4886025119029199 * z,
-        0.4886025119029199 * x,
-        1.0925484305920792 * x * y,
-        1.0925484305920792 * y * z,
-        0.31539156525252005 * (3 * z * z - 1),
-        1.0925484305920792 * x * z,
-        0.5462742152960396 * (x * x - y * y),
-    ]
-    return jnp.stack(values, axis=-1)
 
 
 class Indirect(eqx.Module):
@@ -109,7 +94,7 @@ class HarmonicIndirect(Indirect):
 
     def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
         """Evaluate the harmonics; both lobes see the same."""
-        basis = jax.lax.stop_gradient(harmonics(directions))
+        basis = jax.lax.stop_gradient(harmonics(directions, degree=_DEGREE))
         colors = [jnp.sum(self.values[:, 9 * c : 9 * c + 9] * basis, axis=-1) for c in range(3)]
         radiance = jax.nn.sigmoid(jnp.stack(colors, axis=-1) - _OFFSET)
         return radiance, radiance

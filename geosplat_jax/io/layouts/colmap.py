@@ -2,8 +2,8 @@
 
 Photographs lie in ``images/``, or without it in the folder itself; the model in ``sparse/0``,
 ``sparse`` or ``colmap/sparse/0``. Where both kinds of files are there, the binary one is read.
-Points are not needed. ``x_camera = R(q) x + t`` with OpenCV axes, quaternions (w, x, y, z), pixel
-centres at + 0.5, binary numbers in little-endian order.
+Points are read for splats of their own only (`read_points`). ``x_camera = R(q) x + t`` with OpenCV
+axes, quaternions (w, x, y, z), pixel centres at + 0.5, binary numbers in little-endian order.
 """
 
 import struct
@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from geosplat_jax.io.distortion import Brown, Distortion, Fisheye
 from geosplat_jax.io.frames import (
@@ -33,6 +34,7 @@ MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 IMAGE_FOLDER = "images"
 
 _POINT_BYTES = 24  # x, y and the number of the point of each feature
+_OBSERVATION_BYTES = 8  # the number of an image and of its feature
 
 
 class _Model(NamedTuple):
@@ -108,6 +110,33 @@ def list_colmap(root: Path, *, light: str | None = None) -> Listing:
     if folder.name.isdigit() and len(others) > 1:
         notes = (f"of {len(others)} models, sparse/{folder.name} is read",)
     return split_capture(frames, notes=notes)
+
+
+class Points(NamedTuple):
+    """Points of a sparse model: (N, 3) positions in the world, (N, 3) sRGB colours in [0, 1]."""
+
+    positions: Float[np.ndarray, "N 3"]
+    colors: Float[np.ndarray, "N 3"]
+
+
+def read_points(root: Path) -> Points | None:
+    """Read the points of a sparse model; None where there is no model, or none of its points.
+
+    Raises
+    ------
+    SceneError : the file is damaged, or a point is not finite.
+    """
+    folder = _model_folder(root)
+    if folder is None:
+        return None
+    for suffix, read in ((".bin", _binary_points), (".txt", _text_points)):
+        path = folder / f"points3D{suffix}"
+        if path.is_file():
+            rows = np.array(list(read(path)), np.float64).reshape(-1, 6)
+            if not np.isfinite(rows).all():
+                raise SceneError(f"{path} has points that are not finite; write the model again")
+            return Points(rows[:, :3], np.clip(rows[:, 3:] / 255.0, 0.0, 1.0))
+    return None
 
 
 def _model_folder(root: Path) -> Path | None:
@@ -248,6 +277,29 @@ def _binary_images(path: Path) -> Iterator[_Image]:
         content.skip(points * _POINT_BYTES)
         yield _Image(number, tuple(pose[:4]), tuple(pose[4:]), camera, name)
     content.end()
+
+
+def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
+    content = _Bytes(path)
+    (count,) = content.numbers("Q")
+    for _ in range(count):
+        _, *values, _, observations = content.numbers("Q3d3BdQ")
+        content.skip(observations * _OBSERVATION_BYTES)
+        yield tuple(values)
+    content.end()
+
+
+def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
+    for number, line in enumerate(_lines(path), start=1):
+        if not _is_entry(line):
+            continue
+        words = line.split(maxsplit=8)
+        if len(words) < 8:
+            raise SceneError(
+                f"line {number} of {path} must be: number, position, colour, error, ...; got "
+                f"{line[:60]!r}"
+            )
+        yield _floats(words[1:7], f"line {number} of {path}")
 
 
 def _lines(path: Path) -> list[str]:

@@ -1,0 +1,1 @@
+"""From photographs with cameras to masks: splats with colours of their own, and a box."""

@@ -1,0 +1,237 @@
+"""Where the object is: a box around the largest cluster of splats that all cameras look at.
+
+What it stands on is left out: the plane that holds many of the splats, with the rest of them and
+the cameras on one side. Everything here is NumPy in float64 and does not depend on the world's
+unit.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import label, maximum_filter
+
+from geosplat_jax.capture.start import CaptureError
+from geosplat_jax.io.views import Views
+from geosplat_jax.surface.hull import sight_bounds
+
+_OPAQUE = 0.1
+"""Splats that are less opaque say nothing about where things are."""
+_LARGEST_SCALE = 0.06  # of the sides of the search; larger splats are the background
+_SEEN = 0.8
+"""Share of the cameras that must have a place in sight for the object to be there."""
+_FREE = 0.9
+"""Of the way from the middle of the search to the nearest camera."""
+_CELLS = 40
+"""Along every side of the search."""
+_REACH = 0.2
+"""Standard deviation, in sides of the search, of the weight of what is near its middle."""
+_TRIALS = 400
+_PLANE_THICKNESS = 0.007  # of the sides of the search, to either side
+_PLANE_SHARE = 0.15  # of the splats, that a plane must hold to be what the object stands on
+_ONE_SIDE = 0.9
+"""Share of the other splats, and of the cameras, that lie above such a plane."""
+_TAIL = 0.005
+"""Share of the cluster that may lie outside of the box on each side."""
+_MARGIN = 0.05  # of the longest side, on every side
+
+Corners = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
+
+
+class Cloud(NamedTuple):
+    """Splats as points: (N, 3) positions, (N,) opacities, (N,) largest standard deviations."""
+
+    positions: Float[np.ndarray, "N 3"]
+    opacities: Float[np.ndarray, " N"]
+    sizes: Float[np.ndarray, " N"]
+
+
+class Proposal(NamedTuple):
+    """A box, and what it rests on.
+
+    Attributes
+    ----------
+    lo, hi : (3,) corners in the world.
+    share : of the weight of all splats in the search that the cluster holds.
+    has_plane : whether a plane was left out.
+    """
+
+    lo: Float[np.ndarray, " 3"]
+    hi: Float[np.ndarray, " 3"]
+    share: float
+    has_plane: bool
+
+
+def propose_box(cloud: Cloud, views: Views, *, seed: int = 0) -> Proposal:
+    """Find a box around the largest cluster that the cameras look at.
+
+    Parameters
+    ----------
+    cloud : of all splats. views : whose cameras tell where to search.
+    seed : of the search for a plane.
+
+    Raises
+    ------
+    CaptureError : the cameras do not look at one place, or nothing is there.
+    """
+    cure = "give the box by --box X0 Y0 Z0 X1 Y1 Z1"
+    try:
+        lo, hi = _search(views)
+    except ValueError as error:
+        raise CaptureError(f"cannot tell what the cameras look at: {error}; {cure}") from error
+    side = float((hi - lo).max())
+    positions = np.asarray(cloud.positions, np.float64)
+    is_solid = (cloud.opacities > _OPAQUE) & (cloud.sizes < _LARGEST_SCALE * side)
+    is_near = ((positions > lo) & (positions < hi)).all(1)
+    is_used = is_solid & is_near & (_seen_share(positions, views) >= _SEEN)
+    if not is_used.any():
+        raise CaptureError(
+            f"there is no opaque splat where the cameras look, between {_corner(lo)} and "
+            f"{_corner(hi)}; train longer, or {cure}"
+        )
+    points, weights = positions[is_used], np.asarray(cloud.opacities, np.float64)[is_used]
+    centers = views.camera_to_world[:, :3, 3]
+    on_plane = _ground(points, weights, centers, side, np.random.default_rng(seed))
+    rest, rest_weights = points[~on_plane], weights[~on_plane]
+    members = _largest_cluster(rest, rest_weights, lo, hi)
+    cluster = rest[members]
+    low, high = np.quantile(cluster, [_TAIL, 1.0 - _TAIL], axis=0)
+    pad = _MARGIN * float((high - low).max())
+    # A single splat has no extent; a cell of the search then is the smallest box.
+    pad = max(pad, 0.5 * side / _CELLS)
+    low, high = low - pad, high + pad
+    if on_plane.any():
+        low, high = _cut_at_plane(low, high, points[on_plane], cluster)
+    share = float(rest_weights[members].sum() / weights.sum())
+    return Proposal(low, high, share, bool(on_plane.any()))
+
+
+def inside_box(
+    positions: Float[np.ndarray, "N 3"], lo: Float[np.ndarray, " 3"], hi: Float[np.ndarray, " 3"]
+) -> Bool[np.ndarray, " N"]:
+    """Tell which points lie in a box."""
+    return ((positions >= lo) & (positions <= hi)).all(1)
+
+
+def require_something_inside(
+    inside: Bool[np.ndarray, " N"], cloud: Cloud, corners: Corners
+) -> None:
+    """Refuse a box without splats; `CaptureError` says where the splats are."""
+    if inside.any():
+        return
+    solid = cloud.positions[cloud.opacities > _OPAQUE]
+    low, high = np.quantile(solid if len(solid) else cloud.positions, [0.1, 0.9], axis=0)
+    raise CaptureError(
+        f"the box from {_corner(corners[0])} to {_corner(corners[1])} holds no splat; most of them "
+        f"lie between {_corner(low)} and {_corner(high)}, in the units of the cameras"
+    )
+
+
+def _corner(values: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
+
+
+def _search(views: Views) -> Corners:
+    """Find the cube around what half of the views show at the distance of what they look at.
+
+    It holds no camera. `hull.sight_bounds` has the cube within.
+
+    Raises
+    ------
+    ValueError : the cameras do not look at one place.
+    """
+    lo, hi = sight_bounds(
+        views.world_to_camera, views.intrinsics, height=views.height, width=views.width
+    )
+    middle = 0.5 * (lo + hi)
+    free = np.abs(views.camera_to_world[:, :3, 3] - middle).max(1).min()
+    half = min(np.sqrt(3.0) * 0.5 * float((hi - lo).max()), _FREE * float(free))
+    return middle - half, middle + half
+
+
+def _seen_share(positions: np.ndarray, views: Views) -> Float[np.ndarray, " N"]:
+    """Share of the cameras that have a point in their image."""
+    count = np.zeros(len(positions))
+    for pose, lens in zip(views.world_to_camera, views.intrinsics, strict=True):
+        local = positions @ pose[:3, :3].T + pose[:3, 3]
+        is_ahead = local[:, 2] > 0.0
+        depth = np.where(is_ahead, local[:, 2], 1.0)
+        pixel = (local @ lens.T)[:, :2] / depth[:, None]
+        count += is_ahead & (pixel >= 0).all(1) & (pixel < [views.width, views.height]).all(1)
+    return count / len(views)
+
+
+def _ground(
+    points: np.ndarray,
+    weights: np.ndarray,
+    centers: np.ndarray,
+    side: float,
+    rng: np.random.Generator,
+) -> Bool[np.ndarray, " N"]:
+    """Find the points of the plane that things stand on; none where there is no such plane.
+
+    Random planes through three points; the one with the most weight of those that have the cameras
+    and nearly all other points on one side (RANSAC, Fischler and Bolles 1981).
+    """
+    nothing = np.zeros(len(points), bool)
+    if len(points) < 3:
+        return nothing
+    thickness = _PLANE_THICKNESS * side
+    best, best_weight = nothing, _PLANE_SHARE * weights.sum()
+    for corners in rng.integers(len(points), size=(_TRIALS, 3)):
+        a, b, c = points[corners]
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length <= 1e-9 * side**2:
+            continue
+        normal = normal / length
+        if np.mean((centers - a) @ normal) < 0.0:
+            normal = -normal
+        height = (points - a) @ normal
+        on_plane = np.abs(height) < thickness
+        weight = weights[on_plane].sum()
+        if weight <= best_weight or ((centers - a) @ normal > 0.0).mean() < _ONE_SIDE:
+            continue
+        others = ~on_plane
+        above = weights[others & (height > 0.0)].sum()
+        if others.any() and above < _ONE_SIDE * weights[others].sum():
+            continue
+        # What is below belongs to the ground, too.
+        best, best_weight = height < thickness, weight
+    # A plane that leaves nothing is all that there is to see.
+    return nothing if best.all() else best
+
+
+def _largest_cluster(
+    points: np.ndarray, weights: np.ndarray, lo: np.ndarray, hi: np.ndarray
+) -> Bool[np.ndarray, " N"]:
+    """Find the points of the connected cells that weigh most, near the middle more than far off."""
+    side = float((hi - lo).max())
+    cell = np.clip(((points - lo) / side * _CELLS).astype(int), 0, _CELLS - 1)
+    is_taken = np.zeros((_CELLS,) * 3, bool)
+    is_taken[tuple(cell.T)] = True
+    # Splats of plain surfaces lie apart: those with an empty cell between them are connected.
+    is_taken = maximum_filter(is_taken, size=3)
+    found: Any = label(is_taken, structure=np.ones((3, 3, 3), int))
+    numbers = found[0]
+    cluster = numbers[tuple(cell.T)]
+    away = np.linalg.norm(points - 0.5 * (lo + hi), axis=1) / (_REACH * side)
+    totals = np.bincount(cluster, weights * np.exp(-0.5 * away**2))
+    return cluster == int(np.argmax(totals))
+
+
+def _cut_at_plane(
+    low: np.ndarray, high: np.ndarray, plane: np.ndarray, cluster: np.ndarray
+) -> Corners:
+    """Keep the box off the plane that was left out, where that is about level with an axis."""
+    middle = plane.mean(0)
+    normal = np.linalg.svd(plane - middle, full_matrices=False)[2][2]
+    axis = int(np.argmax(np.abs(normal)))
+    if abs(normal[axis]) < np.cos(np.radians(15.0)):
+        return low, high
+    low, high = low.copy(), high.copy()
+    if cluster[:, axis].mean() > middle[axis]:
+        low[axis] = max(low[axis], cluster[:, axis].min())
+    else:
+        high[axis] = min(high[axis], cluster[:, axis].max())
+    return low, high

@@ -1,0 +1,420 @@
+"""Masks of an object from photographs that show what is around it, too (appendix F).
+
+Splats are trained on the photographs as they are; those in a box are kept, and where they are
+opaque is the mask. Masks are files of the photographs' own size and lens, in ``SCENE/masks``, where
+the readers of captures look for them.
+"""
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from geosplat_jax.capture.box import (
+    Cloud,
+    Corners,
+    inside_box,
+    propose_box,
+    require_something_inside,
+)
+from geosplat_jax.capture.settings import RadianceSettings
+from geosplat_jax.capture.start import CaptureError, require_trainable
+from geosplat_jax.capture.training import (
+    Radiance,
+    quality,
+    render_views,
+    train_radiance,
+)
+from geosplat_jax.core.harmonics import CONSTANT
+from geosplat_jax.fit.train import Progress
+from geosplat_jax.io.agreement import agreement
+from geosplat_jax.io.dataset import LAYOUTS, Dataset, recognise_layout
+from geosplat_jax.io.distortion import Lookup, photograph_lookup, resample
+from geosplat_jax.io.export import export_gaussians_ply
+from geosplat_jax.io.frames import MASK_FOLDERS, Frame, beside_images, mask_file
+from geosplat_jax.io.images import MissingFileError, image_size, write_png
+from geosplat_jax.io.layouts.colmap import read_points
+from geosplat_jax.io.views import COVERED, Views
+from geosplat_jax.report.pictures import overview_sheet
+from geosplat_jax.report.renderer import to_picture
+
+OPAQUE = 0.8
+"""Alpha of the splats in the box above which a pixel is the object (appendix F)."""
+
+_UNSURE = (0.2, OPAQUE)
+"""Alpha between these belongs neither to the object nor to what is around it."""
+_MOST_UNSURE = 0.15
+_LEAST_AGREEMENT = 0.9
+_MOST_CUT = 0.05
+"""Figures beyond which a warning says what looks wrong."""
+_SHEET_VIEWS = 6
+_DIM = 0.12  # of what is outside of the mask, in the sheet
+_DISSENT = (0.9, 0.35, 0.1)  # colour that half-opaque pixels are marked with
+
+_PIXELS = 270 * 480
+"""Of an image at most, where nobody says otherwise: 5000 steps then take two cores a quarter of an
+hour."""
+
+REPORT = "masks.json"
+
+
+@dataclass(frozen=True)
+class Certainty:
+    """How sure masks are.
+
+    Attributes
+    ----------
+    coverage : mean share of an image that its mask covers.
+    unsure : pixels with alpha from 0.2 to 0.8 per pixel of the masks.
+    cut : share of the masks' rims that lies on the border of the image.
+    agreement : mean share of the rays through a mask that meet the visual hull of the others.
+    empty : names of views whose mask is empty.
+    """
+
+    coverage: float
+    unsure: float
+    cut: float
+    agreement: float
+    empty: tuple[str, ...]
+
+    def warnings(self) -> list[str]:
+        """Say what looks wrong, and what to do."""
+        found = []
+        if self.unsure > _MOST_UNSURE:
+            found.append("many pixels are half opaque; train longer, or give a tighter --box")
+        if self.agreement < _LEAST_AGREEMENT:
+            found.append("masks contradict each other; look at the sheet, and give a --box")
+        if self.cut > _MOST_CUT:
+            found.append(
+                f"{self.cut:.0%} of the masks' rims lie on the border of the image: the object, or "
+                "what the box holds besides, is cut off there"
+            )
+        if self.empty:
+            found.append(f"{len(self.empty)} masks are empty, {self.empty[0]} for one")
+        return found
+
+
+@dataclass(frozen=True)
+class MaskReport:
+    """What was written, and how sure it is.
+
+    Attributes
+    ----------
+    masks : count of files. folder : where they are.
+    lo, hi : corners of the box. proposed : whether it was found and not given.
+    plane : whether a plane that the object stands on was left out of the box.
+    splats : in the box. splats_total : of the scene.
+    psnr : mean decibels of the splats on views that they did not see; None without such views.
+    certainty : how sure the masks are.
+    """
+
+    masks: int
+    folder: str
+    lo: tuple[float, float, float]
+    hi: tuple[float, float, float]
+    proposed: bool
+    plane: bool
+    splats: int
+    splats_total: int
+    psnr: float | None
+    certainty: Certainty
+
+    def lines(self) -> list[str]:
+        """Describe the report for a reader."""
+        corners = " to ".join(
+            "(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in (self.lo, self.hi)
+        )
+        origin = "proposed" if self.proposed else "given"
+        plane = ", what it stands on left out" if self.plane else ""
+        held_back = "no views are held back"
+        if self.psnr is not None:
+            held_back = f"{self.psnr:.2f} dB on views that are held back"
+        sure = self.certainty
+        return [
+            f"splats:     {self.splats_total}, {held_back}",
+            f"box:        {corners} ({origin}{plane}), {self.splats} splats in it",
+            f"masks:      {self.masks} in {self.folder}, {sure.coverage:.1%} of an image each",
+            f"unsure:     half-opaque pixels are {sure.unsure:.1%} as many as those of the masks",
+            f"agreement:  {sure.agreement:.1%} of the rays through masks meet the others' hull",
+            *(f"warning: {warning}" for warning in sure.warnings()),
+        ]
+
+
+def make_masks(
+    dataset: Dataset,
+    settings: RadianceSettings,
+    folder: str | Path,
+    *,
+    box: Corners | None = None,
+    downscale: int = 1,
+    resume: bool = False,
+    force: bool = False,
+    on_step: Callable[[Progress], None] | None = None,
+) -> MaskReport:
+    """Train splats on a capture, keep those in a box, and write masks into the scene's folder.
+
+    Parameters
+    ----------
+    dataset : read with ``mask_files=False``.
+    settings : of the training.
+    folder : of splats, checkpoints, sheet and report.
+    box : lo and hi in the world; proposed where it is not given.
+    downscale : that the dataset was read with.
+    resume : continue a training, or take its splats where it is done.
+    force : replace splats in ``folder``, and masks that this command did not write.
+
+    Raises
+    ------
+    CaptureError : too few views, masks that are there already, a box that holds nothing, masks
+        that leave nothing.
+    SceneError, RunError, TrainingError, Interrupted : see `train_radiance`.
+    """
+    folder = Path(folder)
+    frames = _frames(dataset)
+    require_trainable(dataset.train)
+    files = [mask_file(dataset.root, frame.image) for frame in frames]
+    _require_free(frames, folder, resume=resume, force=force)
+    if box is not None and not (np.asarray(box[0]) < np.asarray(box[1])).all():
+        raise CaptureError(f"the box must be lo (x, y, z) below hi (x, y, z), got {box}")
+    radiance = train_radiance(
+        dataset.train,
+        settings,
+        folder,
+        points=read_points(dataset.root) if dataset.layout == "colmap" else None,
+        resume=resume,
+        replace_run=force,
+        on_step=on_step,
+    )
+    write_splats(radiance, folder / "splats.ply")
+    psnr = float(quality(radiance, dataset.test).mean()) if len(dataset.test) else None
+    views = _all_views(dataset)
+    clipped, lo, hi, has_plane = _clipped(radiance, dataset.train, box, settings.seed)
+    write_splats(clipped, folder / "object.ply")
+    _, alpha = render_views(clipped, views.camera())
+    if views.valid is not None:
+        alpha = alpha * views.valid
+    masks = alpha > OPAQUE
+    if not masks.any():
+        raise CaptureError(
+            f"the splats in the box from {_numbers(lo)} to {_numbers(hi)} cover no pixel by more "
+            f"than {OPAQUE:g}, so masks would leave nothing; give another --box, or train longer"
+        )
+    for frame, file, values in zip(frames, files, alpha, strict=True):
+        write_png(file, photograph_mask(values, frame, downscale)[..., None].astype(np.float32))
+    report = MaskReport(
+        masks=len(files),
+        folder=str(dataset.root / "masks"),
+        lo=_numbers(lo),
+        hi=_numbers(hi),
+        proposed=box is None,
+        plane=has_plane,
+        splats=clipped.splats.capacity,
+        splats_total=radiance.splats.capacity,
+        psnr=psnr,
+        certainty=certainty(views, alpha, (lo, hi)),
+    )
+    write_png(folder / "masks.png", mask_sheet(views, alpha, report.lines()))
+    text = json.dumps(asdict(report), indent=2)
+    (folder / REPORT).write_text(text + "\n", encoding="utf-8")
+    return report
+
+
+def choose_factor(path: str | Path) -> int:
+    """Return how far to reduce photographs so that one has no more pixels than 270 x 480.
+
+    Raises
+    ------
+    SceneError : see `io.dataset.load_dataset`.
+    """
+    root = Path(path).expanduser()
+    if not root.is_dir():
+        raise MissingFileError(f"scene folder {root} does not exist")
+    listing = LAYOUTS[recognise_layout(root)].list_frames(root, light=None)
+    sizes = [image_size(frame.image) for frame in (*listing.train, *listing.test)]
+    height, width = max(sizes, key=lambda size: size[0] * size[1])
+    factor = max(1, math.ceil(math.sqrt(height * width / _PIXELS)))
+    return min(factor, height, width)
+
+
+def _frames(dataset: Dataset) -> list[Frame]:
+    """Return the frames of all views, those of the training first.
+
+    Raises
+    ------
+    CaptureError : masks beside the images would not be read.
+    """
+    listing = LAYOUTS[dataset.layout].list_frames(dataset.root, light=None)
+    if not listing.is_capture:
+        raise CaptureError(
+            f"{dataset.root} is of the layout {dataset.layout}, whose images are cut out; masks "
+            "are made for captures (docs/captures.md)"
+        )
+    known = {frame.name: frame for frame in (*listing.train, *listing.test)}
+    frames = [known[name] for name in (*dataset.train.names, *dataset.test.names)]
+    for frame in frames:
+        beside = beside_images(dataset.root, frame.image, MASK_FOLDERS)
+        if frame.mask is not None and frame.mask != beside:
+            raise CaptureError(
+                f"the files of the scene name the mask {frame.mask} for {frame.image.name}, which "
+                "would be read instead of a new one; remove mask_path from transforms.json"
+            )
+    return frames
+
+
+def _require_free(frames: Sequence[Frame], folder: Path, *, resume: bool, force: bool) -> None:
+    """Refuse to replace masks of others, before hours of work."""
+    is_ours = resume and (folder / REPORT).exists()
+    there = [frame.mask for frame in frames if frame.mask is not None]
+    if there and not (is_ours or force):
+        raise CaptureError(
+            f"{len(there)} of {len(frames)} views have a mask already, {there[0]} for one; replace "
+            "them with --force, or move them away"
+        )
+
+
+def _all_views(dataset: Dataset) -> Views:
+    """Return the views of both splits as one, those of the training first."""
+    train, test = dataset.train, dataset.test
+    if not len(test):
+        return train
+    height, width = max(train.height, test.height), max(train.width, test.width)
+
+    def grown(values: np.ndarray, padding: float = 0.0) -> np.ndarray:
+        short = [(0, 0), (0, height - values.shape[1]), (0, width - values.shape[2])]
+        return np.pad(
+            values, [*short, *[(0, 0)] * (values.ndim - 3)], constant_values=np.float32(padding)
+        )
+
+    def valid_of(views: Views) -> np.ndarray:
+        known = views.valid
+        return grown(np.ones(views.images.shape[:3], np.float32) if known is None else known)
+
+    valid = np.concatenate([valid_of(train), valid_of(test)])
+    return Views(
+        names=train.names + test.names,
+        camera_to_world=np.concatenate([train.camera_to_world, test.camera_to_world]),
+        intrinsics=np.concatenate([train.intrinsics, test.intrinsics]),
+        images=np.concatenate([grown(train.images), grown(test.images)]),
+        valid=None if (valid == 1.0).all() else valid,
+        has_masks=False,
+    )
+
+
+def _clipped(
+    radiance: Radiance, views: Views, box: Corners | None, seed: int
+) -> tuple[Radiance, np.ndarray, np.ndarray, bool]:
+    """Keep the splats whose mean lies in the box; return them, the box, and whether it has a floor.
+
+    Raises
+    ------
+    CaptureError : there is no splat in the box.
+    """
+    splats = radiance.splats
+    cloud = Cloud(
+        np.asarray(splats.means, np.float64),
+        np.asarray(splats.opacities, np.float64),
+        np.asarray(splats.scales, np.float64).max(1),
+    )
+    has_plane = False
+    if box is None:
+        proposal = propose_box(cloud, views, seed=seed)
+        corners, has_plane = (proposal.lo, proposal.hi), proposal.has_plane
+    else:
+        corners = (np.asarray(box[0], np.float64), np.asarray(box[1], np.float64))
+    inside = inside_box(cloud.positions, *corners)
+    require_something_inside(inside, cloud, corners)
+    return radiance.of(inside), corners[0], corners[1], has_plane
+
+
+def write_splats(radiance: Radiance, path: Path) -> None:
+    """Write splats as the PLY of 3D Gaussian splatting, with all harmonics."""
+    splats = radiance.splats
+    export_gaussians_ply(
+        path,
+        splats.means,
+        splats.quats,
+        splats.scales,
+        splats.opacities,
+        0.5 + CONSTANT * np.asarray(splats.base),
+        np.zeros_like(splats.means),
+        rest=splats.rest,
+    )
+
+
+def photograph_mask(
+    alpha: Float[np.ndarray, "H W"], frame: Frame, downscale: int
+) -> Bool[np.ndarray, "h w"]:
+    """Return the mask of a photograph as large as it is, as its lens shows it.
+
+    Parameters
+    ----------
+    alpha : of the pinhole image that is smaller by ``downscale``; it may be padded at its end.
+    """
+    height, width = image_size(frame.image)
+    where = photograph_lookup(
+        frame.lens.distortion, frame.lens.intrinsics(width, height), width, height
+    )
+    rows, columns = height // downscale, width // downscale
+    reduced = Lookup(where.rows / downscale, where.columns / downscale, where.inside)
+    mask = (alpha[:rows, :columns, None] > OPAQUE).astype(np.float32)
+    return resample(mask, reduced)[..., 0] > COVERED
+
+
+def certainty(views: Views, alpha: Float[np.ndarray, "V H W"], box: Corners) -> Certainty:
+    """Measure how sure masks are; at least one must not be empty."""
+    masks = alpha > OPAQUE
+    covered = int(masks.sum())
+    rims = (masks[:, 0], masks[:, -1], masks[:, :, 0], masks[:, :, -1])
+    on_border = sum(int(rim.sum()) for rim in rims)
+    around = np.pad(masks, ((0, 0), (1, 1), (1, 1)))
+    inner = around.copy()
+    for axis, step in ((1, 1), (1, -1), (2, 1), (2, -1)):
+        inner &= np.roll(around, step, axis)
+    rim = covered - int(inner.sum())
+    cut_out = np.concatenate([views.images[..., :3], masks[..., None].astype(np.float32)], axis=-1)
+    masked = replace(views, images=cut_out, has_masks=True)
+    shares = agreement(masked, box)
+    is_empty = ~masks.any((1, 2))
+    return Certainty(
+        coverage=float(masked.coverage.mean()),
+        unsure=float(((alpha > _UNSURE[0]) & ~masks).sum() / covered),
+        cut=on_border / max(rim, on_border, 1),
+        agreement=float(shares[np.isfinite(shares)].mean()),
+        empty=tuple(name for name, no in zip(views.names, is_empty, strict=True) if no),
+    )
+
+
+def _numbers(corner: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = map(float, corner)
+    return x, y, z
+
+
+def mask_sheet(
+    views: Views, alpha: Float[np.ndarray, "V H W"], notes: Sequence[str]
+) -> Float[np.ndarray, "rows columns 3"]:
+    """Show some views: the capture, its mask, and the capture with the mask on it.
+
+    Half-opaque pixels are orange in the mask.
+    """
+    chosen = np.unique(np.linspace(0, len(views) - 1, _SHEET_VIEWS).astype(int))
+    rows: list[dict[str, Any]] = []
+    for view in chosen:
+        picture = to_picture(views.images[view, ..., :3])
+        mask = (alpha[view] > OPAQUE)[..., None]
+        is_unsure = (alpha[view] > _UNSURE[0])[..., None] & ~mask
+        shown = np.where(is_unsure, np.asarray(_DISSENT), mask.astype(np.float32))
+        rows.append(
+            {
+                "capture": picture,
+                "mask": shown.astype(np.float32),
+                "masked": np.where(mask, picture, _DIM * picture),
+            }
+        )
+    return overview_sheet(
+        rows, title="masks", row_labels=[views.names[view] for view in chosen], notes=notes
+    )

@@ -1,0 +1,155 @@
+"""Where splats start: points of structure from motion, or random points that the cameras see.
+
+The world is moved and scaled first, so that rates and penalties mean the same in every capture.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import KDTree
+
+from geosplat_jax.capture.settings import RadianceSettings
+from geosplat_jax.core.harmonics import CONSTANT, HIGHEST_DEGREE, harmonic_count
+from geosplat_jax.io.alignment import Similarity, common_target, require_spread
+from geosplat_jax.io.images import SceneError, encode_srgb
+from geosplat_jax.io.layouts.colmap import Points
+from geosplat_jax.io.views import Views
+from geosplat_jax.splats.radiance import RadianceSplats
+
+FEWEST_VIEWS = 5
+"""Views to train on."""
+
+_EXTENT = 4.0
+"""Of the cameras once the world is scaled: that of the Blender scenes which the numbers of the
+literature were found on."""
+_EXTENT_MARGIN = 1.1  # as in the code of Kerbl et al.
+_NEIGHBOURS = 3
+_SMALLEST_DISTANCE = 1e-4  # of neighbours, in quarters of the cameras' extent
+_START_SHARE = 0.5
+"""Of the capacity that there are splats in the beginning."""
+_NEAREST, _BEYOND, _FARTHEST = 0.5, 1.5, 30.0
+"""Depths of random points, in distances to what the cameras look at."""
+
+
+class CaptureError(SceneError):
+    """A capture does not do for splats or masks; the message says why and what to do."""
+
+
+def require_trainable(views: Views) -> None:
+    """Refuse views that no splats can be learned from.
+
+    Raises
+    ------
+    CaptureError : there are too few views, or they are cut out already.
+    AlignmentError : the cameras stand at one point or on a line.
+    """
+    if len(views) < FEWEST_VIEWS:
+        raise CaptureError(
+            f"there are {len(views)} views to train on, at least {FEWEST_VIEWS} are needed, and "
+            "50 are better; take more photographs all around the object"
+        )
+    if views.has_masks:
+        raise CaptureError(
+            "the images have an alpha channel: the object is cut out already, and splats of what "
+            "is around it cannot be learned"
+        )
+    centers = views.camera_to_world[:, :3, 3]
+    reach = np.linalg.norm(centers - centers.mean(0), axis=1).max()
+    try:
+        target = common_target(centers, -views.camera_to_world[:, :3, 2])
+    except SceneError:
+        # They may look anywhere, as long as they do not stand on a line.
+        target = centers.mean(0) + reach
+    require_spread(centers, target[None])
+
+
+def standard_world(views: Views) -> Similarity:
+    """Return the map to a world in which the cameras' extent is four and their mean the origin."""
+    centers = views.camera_to_world[:, :3, 3]
+    middle = centers.mean(0)
+    extent = _EXTENT_MARGIN * np.linalg.norm(centers - middle, axis=1).max()
+    scale = _EXTENT / extent
+    return Similarity(np.eye(3), -scale * middle, float(scale))
+
+
+def random_points(views: Views, count: int, rng: np.random.Generator) -> Points:
+    """Draw points that the cameras see, with the colour that one of them sees there.
+
+    Half of them lie between 0.5 and 1.5 times the distance to what the cameras look at, evenly in
+    depth, the others between 1.5 and 30, evenly in the inverse of the depth.
+    """
+    view = rng.integers(len(views), size=count)
+    row, column = rng.integers(views.height, size=count), rng.integers(views.width, size=count)
+    centers = views.camera_to_world[:, :3, 3]
+    sight = -views.camera_to_world[:, :3, 2]
+    try:
+        target = common_target(centers, sight)
+        distance = np.einsum("vi,vi->v", target - centers, sight)
+    except SceneError:
+        distance = np.full(len(views), np.linalg.norm(centers - centers.mean(0), axis=1).max())
+    distance = np.maximum(distance, np.median(distance) * _NEAREST)
+    near = rng.uniform(_NEAREST, _BEYOND, count)
+    far = 1.0 / rng.uniform(1.0 / _FARTHEST, 1.0 / _BEYOND, count)
+    depth = distance[view] * np.where(np.arange(count) % 2, near, far)
+    pixels = np.stack([column + 0.5, row + 0.5, np.ones(count)], -1)
+    local = np.einsum("nij,nj->ni", np.linalg.inv(views.intrinsics)[view], pixels) * depth[:, None]
+    local *= [1.0, -1.0, -1.0]
+    poses = views.camera_to_world[view]
+    positions = np.einsum("nij,nj->ni", poses[:, :3, :3], local) + poses[:, :3, 3]
+    return Points(positions, np.asarray(encode_srgb(views.images[view, row, column, :3])))
+
+
+def first_splats(
+    views: Views, points: Points | None, settings: RadianceSettings
+) -> tuple[RadianceSplats, int]:
+    """Place the first splats, in the world of the views; return them and how many there are.
+
+    Points come first, all of them or a random choice; random points that the cameras see fill up to
+    half of the capacity.
+    """
+    rng = np.random.default_rng(settings.seed)
+    wanted = max(1, int(_START_SHARE * settings.capacity))
+    given = Points(np.zeros((0, 3)), np.zeros((0, 3))) if points is None else points
+    if len(given.positions) > settings.capacity:
+        chosen = np.sort(rng.choice(len(given.positions), settings.capacity, replace=False))
+        given = Points(given.positions[chosen], given.colors[chosen])
+    drawn = random_points(views, max(0, wanted - len(given.positions)), rng)
+    positions = np.concatenate([given.positions, drawn.positions])
+    colors = np.concatenate([given.colors, drawn.colors])
+    scales = settings.first_scale * _neighbour_distance(positions)
+    return _padded(positions, colors, scales, settings), len(positions)
+
+
+def _neighbour_distance(positions: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
+    """Root of the mean squared distance to the three nearest neighbours."""
+    count = min(_NEIGHBOURS, len(positions) - 1)
+    if count < 1:
+        return np.ones(len(positions))
+    distances = np.asarray(KDTree(positions).query(positions, k=count + 1)[0])[:, 1:]
+    return np.maximum(np.sqrt((distances**2).mean(1)), _SMALLEST_DISTANCE)
+
+
+def _padded(
+    positions: np.ndarray, colors: np.ndarray, scales: np.ndarray, settings: RadianceSettings
+) -> RadianceSplats:
+    """Fill rows past the count with padding."""
+    capacity, count = settings.capacity, len(positions)
+
+    def filled(values: np.ndarray, padding: Any = 0.0) -> Any:
+        rows = np.full((capacity, *values.shape[1:]), padding, np.float32)
+        rows[:count] = values
+        return jnp.asarray(rows)
+
+    logit = np.log(settings.first_opacity) - np.log1p(-settings.first_opacity)
+    identity = np.array([1.0, 0.0, 0.0, 0.0])
+    columns = harmonic_count(HIGHEST_DEGREE) - 1
+    return RadianceSplats(
+        means=filled(positions),
+        log_scales=filled(np.repeat(np.log(scales)[:, None], 3, 1)),
+        quats=filled(np.repeat(identity[None], count, 0), identity),
+        opacity_logits=filled(np.full(count, logit)),
+        base=filled((colors - 0.5) / CONSTANT),
+        rest=jnp.zeros((capacity, columns, 3), jnp.float32),
+    )

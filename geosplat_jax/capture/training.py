@@ -1,0 +1,527 @@
+"""Training of splats that carry their own colour, one view a step, in a folder that can be resumed.
+
+::
+
+    splats.json           views, settings: what a resumed training must agree with
+    checkpoints/          splats, optimiser, step, capacities
+
+Views and random numbers of a step are functions of seed and step alone, so that a training that was
+resumed equals one that was not, bit by bit. A step that did not fit into its buffers changes
+nothing and is made again with larger ones (`core.capacity.retry`).
+"""
+
+import json
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from geosplat_jax.capture.settings import RadianceSettings
+from geosplat_jax.capture.start import first_splats, require_trainable, standard_world
+from geosplat_jax.core import capacity as capacity_module
+from geosplat_jax.core.capacity import Capacities, Usage, bucket, retry
+from geosplat_jax.core.color import linear_to_srgb
+from geosplat_jax.core.settings import to_plain
+from geosplat_jax.core.types import Batch, Camera
+from geosplat_jax.fit.folder import RunError, locked_folder
+from geosplat_jax.fit.planning import TrainingError
+from geosplat_jax.fit.step import ADAM, descended
+from geosplat_jax.fit.train import Interrupted, Progress, stop_requests
+from geosplat_jax.io.checkpoints import (
+    latest_checkpoint,
+    load_checkpoint,
+    read_meta,
+    save_checkpoint,
+)
+from geosplat_jax.io.documents import parse_json
+from geosplat_jax.io.layouts.colmap import Points
+from geosplat_jax.io.views import Views
+from geosplat_jax.losses import compare, image_dissimilarity, image_l1, random_background
+from geosplat_jax.report.metrics import psnr, psnr_of_mse
+from geosplat_jax.splats.radiance import RadianceSplats, render_radiance
+from geosplat_jax.splats.relocation import DEAD_OPACITY, exploring_noise, relocate
+
+TILE_SIZE = 8
+"""Side of a tile in pixels; splats of a capture are larger than those of a mesh."""
+
+NEAR = 0.2
+"""Splats closer to a camera are not drawn; the cameras' extent is four."""
+
+_MOST_HITS = 1 << 26
+"""Pairs of a splat and a tile of one view; more would take many GB."""
+
+_HEADROOM = 1.25
+"""Of buffers that grow: the number of splats does, and every new size takes a compilation."""
+_STEPS_TIMED = 50
+"""Last steps that the estimate of the time left is made from."""
+_VIEWS_PLANNED = 8
+"""Views whose needs the first sizes of the buffers are made for."""
+
+RECORD = "splats.json"
+
+
+class RadianceState(eqx.Module):
+    """What a step reads and writes.
+
+    Attributes
+    ----------
+    splats : of the standard world.
+    optimizer : state of Adam.
+    count : () splats in use.
+    step : () updates made.
+    """
+
+    splats: RadianceSplats
+    optimizer: Any
+    count: Int[Array, ""]
+    step: Int[Array, ""]
+
+
+class StepWeights(eqx.Module):
+    """Numbers of one step, all traced.
+
+    Attributes
+    ----------
+    rates : of the groups of `RadianceSplats`.
+    noise : rate of `exploring_noise`.
+    degree : of the harmonics.
+    structure, opacity, scale : weights of the loss.
+    """
+
+    rates: dict[str, Float[Array, ""]]
+    noise: Float[Array, ""]
+    degree: Int[Array, ""]
+    structure: Float[Array, ""]
+    opacity: Float[Array, ""]
+    scale: Float[Array, ""]
+
+
+class RadianceReport(eqx.Module):
+    """Outcome of a step; the state changed only where it is finite and fits.
+
+    Attributes
+    ----------
+    total : () loss; mse : () of the image; usage : needs of the buffers.
+    """
+
+    total: Float[Array, ""]
+    mse: Float[Array, ""]
+    usage: Usage
+    finite: Bool[Array, ""]
+
+
+@dataclass(frozen=True)
+class Radiance:
+    """Splats that were trained, in the world of the capture; no padding.
+
+    Attributes
+    ----------
+    splats : all rows are in use.
+    near : world units; closer to a camera nothing is drawn.
+    degree : of the harmonics.
+    """
+
+    splats: RadianceSplats
+    near: float
+    degree: int
+
+    def of(self, rows: Bool[np.ndarray, " N"]) -> "Radiance":
+        """Return some of the splats."""
+        chosen = np.flatnonzero(rows)
+        return replace(self, splats=jax.tree.map(lambda leaf: leaf[chosen], self.splats))
+
+
+def radiance_loss(
+    splats: RadianceSplats,
+    count: Int[Array, ""],
+    batch: Batch,
+    weights: StepWeights,
+    *,
+    capacities: Capacities,
+    background: str,
+) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Usage]]:
+    """Compare one view with its photograph, as a screen shows both; return loss, MSE and usage."""
+    rgb, alpha, usage = render_radiance(
+        splats,
+        count,
+        batch.camera,
+        degree=weights.degree,
+        capacities=capacities,
+        near=NEAR,
+        tile_size=TILE_SIZE,
+    )
+    photograph = jnp.concatenate(
+        [linear_to_srgb(batch.image[..., :3]), batch.image[..., 3:]], axis=-1
+    )
+    behind = random_background(batch.key, (1, *rgb.shape), rgb.dtype, background)
+    images = compare(rgb[None], alpha[None], photograph, behind, batch.valid, srgb=False)
+    in_use = (jnp.arange(splats.capacity, dtype=jnp.int32) < count).astype(rgb.dtype)
+    share = in_use / jnp.maximum(count, 1).astype(rgb.dtype)
+    total = (
+        (1.0 - weights.structure) * image_l1(images)
+        + weights.structure * image_dissimilarity(images)
+        + weights.opacity * jnp.sum(share * splats.opacities)
+        + weights.scale * jnp.sum(share[:, None] * splats.scales) / 3.0
+    )
+    return total, (images.mse, usage)
+
+
+@partial(jax.jit, static_argnames=("capacities", "background"), donate_argnames=("state",))
+def radiance_step(
+    state: RadianceState,
+    batch: Batch,
+    weights: StepWeights,
+    *,
+    capacities: Capacities,
+    background: str,
+) -> tuple[RadianceState, RadianceReport]:
+    """Make one update and add noise to the positions, or change nothing; see `RadianceReport`."""
+    batch_key, noise_key = jax.random.split(batch.key)
+    (total, (mse, usage)), gradient = jax.value_and_grad(radiance_loss, has_aux=True)(
+        state.splats,
+        state.count,
+        replace(batch, key=batch_key),
+        weights,
+        capacities=capacities,
+        background=background,
+    )
+    with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integer powers
+        directions, optimizer = ADAM.update(gradient, state.optimizer)
+    splats = descended(state.splats, directions, weights.rates)
+    noise = exploring_noise(splats, noise_key, rate=weights.noise)
+    splats = replace(splats, means=splats.means + noise)
+    finite = jnp.isfinite(total) & jnp.all(
+        jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(splats)])
+    )
+    sizes = {name: jnp.int32(capacities[name]) for name in usage}
+    is_sound = finite & capacity_module.fits(usage, sizes)
+    advanced = RadianceState(splats, optimizer, state.count, state.step + 1)
+    chosen = jax.tree.map(lambda new, old: jnp.where(is_sound, new, old), advanced, state)
+    return chosen, RadianceReport(total, mse, usage, finite)
+
+
+@partial(jax.jit, donate_argnames=("state",))
+def relocated(state: RadianceState, count: Int[Array, ""], key: Key[Array, ""]) -> RadianceState:
+    """Put dead splats onto live ones, then add some up to ``count``; see `relocation.relocate`."""
+    dead_key, birth_key = jax.random.split(key)
+    row = jnp.arange(state.splats.capacity, dtype=jnp.int32)
+    in_use = row < state.count
+    is_dead = in_use & (state.splats.opacities <= DEAD_OPACITY)
+    splats, first = relocate(state.splats, is_dead, in_use, dead_key)
+    is_born = (row >= state.count) & (row < count)
+    splats, second = relocate(splats, is_born, in_use, birth_key)
+    grown = jnp.where(jnp.any(second & is_born), jnp.maximum(count, state.count), state.count)
+    is_changed = first | second
+
+    def cleared(moments: Any) -> Any:
+        return jax.tree.map(
+            lambda m: jnp.where(is_changed.reshape(-1, *[1] * (m.ndim - 1)), 0.0, m), moments
+        )
+
+    optimizer = state.optimizer._replace(
+        mu=cleared(state.optimizer.mu), nu=cleared(state.optimizer.nu)
+    )
+    return RadianceState(splats, optimizer, grown, state.step)
+
+
+def weights_at(settings: RadianceSettings, step: int) -> StepWeights:
+    """Return the numbers of a step: the rate of positions decays, the degree rises."""
+    rates = settings.rates
+    through = step / max(settings.steps - 1, 1)
+    # Rates are in units of the extent, which is four in the standard world.
+    means = 4.0 * rates.means * (rates.means_last / rates.means) ** through
+    groups = {
+        name: getattr(rates, name) for name in ("scales", "quats", "opacities", "base", "rest")
+    }
+    number = partial(jnp.asarray, dtype=jnp.float32)
+    return StepWeights(
+        rates={name: number(rate) for name, rate in {**groups, "means": means}.items()},
+        noise=number(means * settings.relocation.noise),
+        degree=jnp.int32(min(settings.degree, step // settings.degree_every)),
+        structure=number(settings.structure),
+        opacity=number(settings.opacity_penalty),
+        scale=number(settings.scale_penalty),
+    )
+
+
+def relocates_after(settings: RadianceSettings, step: int) -> bool:
+    """Whether splats are relocated after ``step`` updates."""
+    when = settings.relocation
+    return step % when.every == 0 and when.first <= step <= when.until * settings.steps
+
+
+class _Loop:
+    """What is kept from step to step."""
+
+    def __init__(
+        self, views: Views, points: Points | None, settings: RadianceSettings, folder: Path
+    ) -> None:
+        self.settings, self.folder = settings, folder
+        self.world = standard_world(views)
+        self.views = self.world.views(views)
+        if points is not None:
+            points = points._replace(positions=self.world.points(points.positions))
+        splats, count = first_splats(self.views, points, settings)
+        self.state = RadianceState(
+            splats=splats,
+            optimizer=ADAM.init(splats),  # pyright: ignore[reportArgumentType]
+            count=jnp.int32(count),
+            step=jnp.int32(0),
+        )
+        self.capacities = _planned(splats, count, self.views.camera(), NEAR)
+        self.has_compiled = False
+
+    def save(self) -> None:
+        """Write a checkpoint."""
+        save_checkpoint(
+            self.folder / "checkpoints",
+            int(self.state.step),
+            tree=self.state,
+            meta={"capacities": dict(self.capacities)},
+        )
+
+    def load(self) -> None:
+        """Continue from the last checkpoint, if there is one."""
+        path = latest_checkpoint(self.folder / "checkpoints")
+        if path is not None:
+            self.state, _ = load_checkpoint(path, like=self.state)
+            self.capacities = Capacities(**read_meta(path)["capacities"])
+
+    def batch(self, step: int) -> Batch:
+        """Return the view of a step: every view once in a random order, then again."""
+        round_, place = divmod(step, len(self.views))
+        order = np.random.default_rng((self.settings.seed, round_)).permutation(len(self.views))
+        view = order[place : place + 1]
+        valid = self.views.valid
+        return Batch(
+            camera=self.views.camera(view),
+            image=jnp.asarray(self.views.images[view]),
+            key=jax.random.fold_in(jax.random.key(self.settings.seed), step),
+            valid=None if valid is None else jnp.asarray(valid[view]),
+        )
+
+    def advance(self, step: int) -> RadianceReport:
+        """Make one step, with larger buffers as often as needed."""
+        batch, weights = self.batch(step), weights_at(self.settings, step)
+
+        def attempt(capacities: Capacities) -> tuple[RadianceReport, Usage]:
+            self.state, report = radiance_step(
+                self.state,
+                batch,
+                weights,
+                capacities=capacities,
+                background=self.settings.background,
+            )
+            _require_few_hits(report.usage, step)
+            return report, report.usage
+
+        report, self.capacities = retry(attempt, self.capacities, headroom=_HEADROOM)
+        if not bool(report.finite):
+            raise TrainingError(
+                f"step {step}: a number is not finite; the last good checkpoint is kept in "
+                f"{self.folder / 'checkpoints'}"
+            )
+        if relocates_after(self.settings, step + 1):
+            grown = int(self.settings.relocation.growth * int(self.state.count))
+            key = jax.random.fold_in(jax.random.key(self.settings.seed + 1), step)
+            count = jnp.int32(min(self.settings.capacity, grown))
+            self.state = relocated(self.state, count, key)
+        return report
+
+    def result(self) -> Radiance:
+        """Return the splats in the world of the capture."""
+        count, scale = int(self.state.count), self.world.scale
+        splats = jax.tree.map(lambda leaf: leaf[:count], self.state.splats)
+        # Back in double precision, since the capture may lie far from its origin.
+        means = (np.asarray(splats.means, np.float64) - self.world.translation) / scale
+        splats = replace(
+            splats,
+            means=jnp.asarray(means, jnp.float32),
+            log_scales=splats.log_scales - jnp.float32(np.log(scale)),
+        )
+        done = min(self.settings.degree, (self.settings.steps - 1) // self.settings.degree_every)
+        return Radiance(splats, NEAR / scale, done)
+
+
+@partial(jax.jit, static_argnames=("capacities",))
+def _needs(splats, count, camera, near, *, capacities):
+    """Count what one view needs; the image itself is not made."""
+    return render_radiance(
+        splats, count, camera, capacities=capacities, near=near, tile_size=TILE_SIZE
+    )[2]
+
+
+def _planned(
+    splats: RadianceSplats, count: Int[Array, ""] | int, camera: Camera, near: float
+) -> Capacities:
+    """Choose buffers that hold some views of splats; no view sees more than there are."""
+    capacities = Capacities(visible=bucket(splats.capacity))
+    for number in np.unique(np.linspace(0, camera.count - 1, _VIEWS_PLANNED).astype(int)):
+        one = camera.view(int(number))
+
+        def attempt(sizes: Capacities, one: Camera = one) -> tuple[None, Usage]:
+            return None, _needs(splats, count, one, jnp.float32(near), capacities=sizes)
+
+        _, capacities = retry(attempt, capacities, headroom=_HEADROOM)
+    return capacities
+
+
+def _require_few_hits(usage: Usage, step: int) -> None:
+    """Stop before buffers exhaust the memory."""
+    if int(usage["hits"]) > _MOST_HITS:
+        raise TrainingError(
+            f"step {step}: {int(usage['hits'])} pairs of a splat and a tile in one view, more than "
+            f"{_MOST_HITS}; raise --downscale or lower --capacity"
+        )
+
+
+def train_radiance(
+    views: Views,
+    settings: RadianceSettings,
+    folder: str | Path,
+    *,
+    points: Points | None = None,
+    resume: bool = False,
+    replace_run: bool = False,
+    stop_after: int | None = None,
+    on_step: Callable[[Progress], None] | None = None,
+) -> Radiance:
+    """Train splats on photographs and leave checkpoints in a folder.
+
+    Parameters
+    ----------
+    views : without masks; see `start.require_trainable`.
+    points : of structure from motion, in the world of the views, where there are any.
+    folder : made where it is missing, and held while the training runs.
+    resume : continue from the last checkpoint; equals the uninterrupted training bit for bit.
+    replace_run : begin anew in a folder that has a training.
+    stop_after : stop, with a checkpoint, once so many steps are done.
+    on_step : called after every step.
+
+    Raises
+    ------
+    CaptureError, AlignmentError : see `start.require_trainable`.
+    RunError : the folder has another training or other files, or is in use.
+    TrainingError : a number is not finite, or the splats take too much memory.
+    Interrupted : after Ctrl-C or SIGTERM; the training can be resumed.
+    """
+    require_trainable(views)
+    folder = Path(folder)
+    with locked_folder(folder, own=folder / RECORD), stop_requests() as stop_requested:
+        _begin(folder, views, settings, resume=resume, replace_run=replace_run)
+        loop = _Loop(views, points, settings, folder)
+        if resume:
+            loop.load()
+        began, last = time.perf_counter(), min(settings.steps, stop_after or settings.steps)
+        took: deque[float] = deque(maxlen=_STEPS_TIMED)
+        for step in range(int(loop.state.step), last):
+            before, sizes = time.perf_counter(), loop.capacities
+            report = loop.advance(step)
+            done, now = step + 1, time.perf_counter()
+            if loop.capacities == sizes and loop.has_compiled:
+                took.append(now - before)
+            loop.has_compiled = True
+            if on_step is not None:
+                left = float(np.median(took)) * (settings.steps - done) if took else None
+                on_step(_progress(loop, report, now - began, left))
+            if done % settings.checkpoint_every == 0 or done == last or stop_requested():
+                loop.save()
+            if stop_requested() and done < last:
+                raise Interrupted(f"stopped at step {done}; continue with --resume")
+        return loop.result()
+
+
+def _progress(loop: _Loop, report: RadianceReport, seconds: float, left: float | None) -> Progress:
+    return Progress(
+        step=int(loop.state.step),
+        steps=loop.settings.steps,
+        stage="splats",
+        total=float(report.total),
+        psnr=float(psnr_of_mse(report.mse)),
+        splat_count=int(loop.state.count),
+        seconds=seconds,
+        seconds_left=left,
+    )
+
+
+def _begin(
+    folder: Path, views: Views, settings: RadianceSettings, *, resume: bool, replace_run: bool
+) -> None:
+    """Write what the training is of, or compare it with what is there."""
+    path = folder / RECORD
+    now = {
+        "views": f"{len(views)} of {views.width} x {views.height}, {views.fingerprint()}",
+        "settings": to_plain(settings),
+    }
+    if path.exists() and resume:
+        try:
+            record = parse_json(path.read_bytes())
+        except ValueError as error:
+            raise RunError(f"{path} is damaged: {error}; start again with --force") from None
+        if record != now:
+            raise RunError(
+                f"{path} is of other views or settings; give the same as then, or start again "
+                "with --force"
+            )
+        return
+    if path.exists() and not replace_run:
+        raise RunError(
+            f"{folder} has splats already; continue with --resume, replace them with --force, or "
+            "choose another --output"
+        )
+    for old in (folder / "checkpoints").glob("checkpoint_*.npz"):
+        old.unlink()
+    path.write_text(json.dumps(now, indent=2) + "\n", encoding="utf-8")
+
+
+@partial(jax.jit, static_argnames=("capacities", "degree"))
+def _rendered(splats, camera, near, *, capacities, degree):
+    return render_radiance(
+        splats,
+        splats.capacity,
+        camera,
+        degree=degree,
+        capacities=capacities,
+        near=near,
+        tile_size=TILE_SIZE,
+    )
+
+
+def render_views(
+    radiance: Radiance, camera: Camera
+) -> tuple[Float[np.ndarray, "V H W 3"], Float[np.ndarray, "V H W"]]:
+    """Render views: (V, H, W, 3) premultiplied sRGB, and (V, H, W) alpha."""
+    capacities = _planned(radiance.splats, radiance.splats.capacity, camera, radiance.near)
+    colors, alphas = [], []
+    near = jnp.float32(radiance.near)
+    for number in range(camera.count):
+        one = camera.view(number)
+
+        def attempt(sizes: Capacities, one: Camera = one) -> tuple[Any, Usage]:
+            rgb, alpha, usage = _rendered(
+                radiance.splats, one, near, capacities=sizes, degree=radiance.degree
+            )
+            return (rgb, alpha), usage
+
+        (rgb, alpha), capacities = retry(attempt, capacities)
+        colors.append(np.asarray(rgb))
+        alphas.append(np.asarray(alpha))
+    return np.stack(colors), np.stack(alphas)
+
+
+def quality(radiance: Radiance, views: Views) -> Float[np.ndarray, " V"]:
+    """PSNR in decibels of new views against photographs, as a screen shows both, over black."""
+    rgb, _ = render_views(radiance, views.camera())
+    truth = np.asarray(linear_to_srgb(jnp.asarray(views.images[..., :3])))
+    shown = np.clip(rgb, 0.0, 1.0)
+    valid = np.ones(shown.shape[:3], np.float32) if views.valid is None else views.valid
+    return np.array([float(psnr(*view)) for view in zip(shown, truth, valid, strict=True)])

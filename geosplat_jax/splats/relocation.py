@@ -1,0 +1,131 @@
+"""A fixed number of splats that go where they are needed (Kheradmand et al. 2024).
+
+Training is taken for sampling: positions receive noise, and splats that have become transparent are
+moved onto others, where several then stand for what was one. Their opacity and scale are chosen so
+that the image stays (Eq. 9 of the paper). Everything has static shapes.
+"""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from geosplat_jax.core.numerics import safe_log
+from geosplat_jax.core.rotation import quaternion_to_matrix
+from geosplat_jax.splats.radiance import RadianceSplats
+
+DEAD_OPACITY = 0.005
+"""A splat that is not more opaque is dead."""
+
+_HIGHEST_OPACITY = 1.0 - 1e-6
+"""Shared opacities are kept below it, where the logit ends."""
+_GATE_SHARPNESS = 100.0
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
+_FARTHEST = 4.5  # standard deviations times sqrt(2); the rest of the integral is below 1e-9
+
+
+def shared_opacity(
+    opacities: Float[Array, " N"], sharers: Float[Array, " N"]
+) -> Float[Array, " N"]:
+    """Opacity of each of several splats at one place that together are as opaque as one was.
+
+    ``1 - (1 - o)^(1 / n)``, in a form that keeps its digits for small opacities.
+    """
+    return -jnp.expm1(jnp.log1p(-opacities) / sharers)
+
+
+def shared_scale_factor(
+    opacities: Float[Array, " N"], shared: Float[Array, " N"], sharers: Float[Array, " N"]
+) -> Float[Array, " N"]:
+    """Factor of the scales of several splats at one place that stand for one.
+
+    The integral of alpha along any line through their centre is then what it was (Eq. 9):
+    ``o / D`` with ``D = 2 / sqrt(pi) times the integral of 1 - (1 - o' exp(-t^2))^n`` over t > 0,
+    by a Gauss-Legendre rule of 16 points, right to 1e-6 for every n.
+
+    Parameters
+    ----------
+    opacities : of the one splat, in (0, 1).
+    shared : of each of the several; see `shared_opacity`.
+    sharers : how many there are, at least 1.
+    """
+    place = jnp.asarray(0.5 * _FARTHEST * (_NODES + 1.0), opacities.dtype)
+    weights = jnp.asarray(0.5 * _FARTHEST * _WEIGHTS * 2.0 / np.sqrt(np.pi), opacities.dtype)
+    alpha = shared[:, None] * jnp.exp(-place * place)[None, :]
+    covered = -jnp.expm1(sharers[:, None] * jnp.log1p(-alpha))
+    return opacities / jnp.sum(covered * weights[None, :], axis=1)
+
+
+def _drawn_rows(
+    weights: Float[Array, " N"], key: Key[Array, ""], count: int
+) -> Int[Array, " count"]:
+    """Draw rows with a probability in proportion to their weights; never one without weight."""
+    through = jnp.cumsum(weights)
+    last = jnp.max(jnp.where(weights > 0.0, jnp.arange(weights.shape[0]), 0)).astype(jnp.int32)
+    place = jax.random.uniform(key, (count,), weights.dtype) * through[-1]
+    found = jnp.searchsorted(through, place, side="right").astype(jnp.int32)
+    return jnp.minimum(found, last)
+
+
+def relocate(
+    splats: RadianceSplats,
+    is_free: Bool[Array, " N"],
+    is_live: Bool[Array, " N"],
+    key: Key[Array, ""],
+) -> tuple[RadianceSplats, Bool[Array, " N"]]:
+    """Put splats onto others, which are drawn by their opacity, so that the image stays.
+
+    Parameters
+    ----------
+    splats : of any number.
+    is_free : rows to be put elsewhere; what they are is forgotten.
+    is_live : rows that may be drawn; those that are free, or dead, are not.
+
+    Returns
+    -------
+    splats : with the same rows.
+    is_changed : (N,) rows that were put elsewhere or drawn, whose moments are of no use any more.
+        Nothing changes where no row can be drawn.
+    """
+    opacities = splats.opacities
+    may_be_drawn = is_live & ~is_free & (opacities > DEAD_OPACITY)
+    weights = jnp.where(may_be_drawn, opacities, 0.0)
+    drawn = _drawn_rows(weights, key, splats.capacity)
+    is_free = is_free & jnp.any(may_be_drawn)
+    copies = jnp.zeros_like(opacities).at[drawn].add(is_free.astype(opacities.dtype))
+    sharers = 1.0 + copies
+    old = jnp.clip(opacities, DEAD_OPACITY, _HIGHEST_OPACITY)
+    shared = shared_opacity(old, sharers)
+    factor = shared_scale_factor(old, shared, sharers)
+    shared = jnp.clip(shared, DEAD_OPACITY, _HIGHEST_OPACITY)
+    is_drawn = copies > 0.0
+    logits = jnp.where(is_drawn, safe_log(shared) - jnp.log1p(-shared), splats.opacity_logits)
+    log_scales = jnp.where(
+        is_drawn[:, None], splats.log_scales + safe_log(factor)[:, None], splats.log_scales
+    )
+    thinned = replace(splats, opacity_logits=logits, log_scales=log_scales)
+    source = jnp.where(is_free, drawn, jnp.arange(splats.capacity, dtype=jnp.int32))
+    return jax.tree.map(lambda leaf: leaf[source], thinned), is_free | is_drawn
+
+
+def exploring_noise(
+    splats: RadianceSplats, key: Key[Array, ""], *, rate: Float[Array, ""] | float
+) -> Float[Array, "N 3"]:
+    """Noise of positions: as wide as the splat is, and none where it is opaque (Eq. 8).
+
+    ``rate Sigma xi sigmoid(-100 (o - 0.005))`` with normal xi.
+
+    Parameters
+    ----------
+    rate : learning rate of the positions times the strength of the noise.
+    """
+    normal = jax.random.normal(key, splats.means.shape, jnp.float32).astype(splats.means.dtype)
+    rotation = quaternion_to_matrix(splats.quats)
+    local = jnp.einsum("nji,nj->ni", rotation, normal, precision="highest")
+    spread = jnp.einsum(
+        "nij,nj->ni", rotation, jnp.exp(2.0 * splats.log_scales) * local, precision="highest"
+    )
+    gate = jax.nn.sigmoid(-_GATE_SHARPNESS * (splats.opacities - DEAD_OPACITY))
+    return rate * gate[:, None] * spread

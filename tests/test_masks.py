@@ -1,0 +1,301 @@
+"""Masks of captures: the box that is proposed, the files that are written, what is refused."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import views_from
+from test_captures import (
+    BOX,
+    CENTER,
+    COUNT,
+    RADIUS,
+    opengl_poses,
+    photograph,
+    size_of,
+    write_photographs,
+    write_transforms,
+)
+
+from geosplat_jax import cli
+from geosplat_jax.capture import masks as masks_module
+from geosplat_jax.capture.box import Cloud, inside_box, propose_box
+from geosplat_jax.capture.masks import OPAQUE, choose_factor, make_masks, photograph_mask
+from geosplat_jax.capture.settings import RadianceSettings
+from geosplat_jax.capture.start import CaptureError
+from geosplat_jax.capture.training import Radiance
+from geosplat_jax.fit.train import TrainingError
+from geosplat_jax.io.dataset import load_dataset
+from geosplat_jax.io.frames import Frame
+from geosplat_jax.io.images import SceneError, read_image, write_png
+from geosplat_jax.io.lenses import PinholeLens
+from geosplat_jax.splats.radiance import RadianceSplats
+
+SETTINGS = RadianceSettings(steps=1)
+
+
+def on_ball(count, center=(0.0, 0.0, 0.0), radius=1.0, seed=0):
+    directions = np.random.default_rng(seed).standard_normal((count, 3))
+    return center + radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def on_plane(count, height, reach=3.0, seed=1):
+    place = np.random.default_rng(seed).uniform(-reach, reach, (count, 3))
+    return place * [1.0, 1.0, 0.004] + [0.0, 0.0, height]
+
+
+def cloud_of(*parts, opacity=0.9, size=0.02):
+    positions = np.concatenate(parts)
+    return Cloud(positions, np.full(len(positions), opacity), np.full(len(positions), size))
+
+
+def ring(count=12, distance=5.0, scale=1.0):
+    angle = 2 * np.pi * np.arange(count) / count
+    eyes = np.stack([np.cos(angle), np.sin(angle), np.resize([0.4, 0.7], count)], -1)
+    return views_from(scale * distance * eyes, size=40, field_of_view=0.9)
+
+
+@pytest.mark.parametrize("scale", [1.0, 250.0])
+def test_the_box_is_that_of_the_object_without_what_it_stands_on(scale):
+    # The middle of the ball is off what the cameras look at.
+    middle = np.array([0.2, -0.15, 0.0])
+    cloud = cloud_of(
+        scale * on_ball(1500, middle, 0.6),
+        scale * on_plane(2500, -0.63),
+        scale * on_ball(3000, (0.0, 0.0, 0.0), 9.0),
+        size=0.02 * scale,
+    )
+    proposal = propose_box(cloud, ring(scale=scale))
+    assert proposal.has_plane
+    np.testing.assert_allclose(proposal.lo / scale, middle - 0.6, atol=0.12)
+    np.testing.assert_allclose(proposal.hi / scale, middle + 0.6, atol=0.12)
+    assert proposal.lo[2] / scale > -0.62
+    assert 0.2 < proposal.share < 0.8
+
+
+def test_a_larger_cluster_at_the_edge_is_not_the_object():
+    wall = on_plane(1600, 0.0, reach=0.9)[:, [2, 0, 1]] + [-1.45, 0.0, 0.0]
+    proposal = propose_box(cloud_of(on_ball(800, radius=0.4), wall), ring())
+    np.testing.assert_allclose(proposal.lo, -0.4, atol=0.1)
+    np.testing.assert_allclose(proposal.hi, 0.4, atol=0.1)
+
+
+def test_a_wall_through_the_object_is_no_ground():
+    # As many points on either side of the plane, so nothing stands on it.
+    board = on_plane(2000, 0.0, reach=0.7)[:, [2, 0, 1]]
+    cloud = cloud_of(on_ball(1500, radius=0.5), board)
+    assert not propose_box(cloud, ring()).has_plane
+
+
+def test_faint_and_large_splats_do_not_make_a_box():
+    ball = on_ball(500, radius=0.4)
+    fog = on_ball(4000, radius=1.2)
+    sizes = np.r_[np.full(500, 0.02), np.full(2000, 5.0), np.full(2000, 0.02)]
+    opacities = np.r_[np.full(2500, 0.9), np.full(2000, 0.05)]
+    proposal = propose_box(Cloud(np.concatenate([ball, fog]), opacities, sizes), ring())
+    assert np.abs([proposal.lo, proposal.hi]).max() < 0.6
+
+
+def test_where_nothing_is_in_sight_there_is_no_box():
+    alone = ring(1)
+    with pytest.raises(CaptureError, match="no opaque splat where the cameras look.*--box"):
+        propose_box(cloud_of(on_ball(100, radius=40.0)), ring())
+    with pytest.raises(CaptureError, match="what the cameras look at.*--box"):
+        propose_box(cloud_of(on_ball(100)), alone)
+
+
+def test_corners_of_a_box_belong_to_it():
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0], [1.0, 2.0, 3.01]])
+    assert inside_box(corners, corners[0], corners[1]).tolist() == [True, True, False]
+
+
+def a_ball_before_a_wall(opacity=0.999):
+    """Splats of the ball of `test_captures`, and of another, far larger one around everything."""
+    count, beyond = 1200, 600
+    positions = np.concatenate([on_ball(count, CENTER, RADIUS - 0.11), on_ball(beyond, CENTER, 9)])
+    sizes = np.repeat([0.05, 0.7], [count, beyond])[:, None] * np.ones(3)
+    logits = np.full(count + beyond, np.log(opacity / (1 - opacity)))
+    return Radiance(
+        RadianceSplats(
+            means=jnp.asarray(positions, jnp.float32),
+            log_scales=jnp.asarray(np.log(sizes), jnp.float32),
+            quats=jnp.ones((count + beyond, 4), jnp.float32),
+            opacity_logits=jnp.asarray(logits, jnp.float32),
+            base=jnp.zeros((count + beyond, 3), jnp.float32),
+            rest=jnp.zeros((count + beyond, 15, 3), jnp.float32),
+        ),
+        near=0.1,
+        degree=0,
+    )
+
+
+@pytest.fixture
+def capture(tmp_path, monkeypatch):
+    """A capture without masks, whose splats are known before they are trained."""
+    root = tmp_path / "scene"
+    write_transforms(root, masks=None)
+    monkeypatch.setattr(masks_module, "train_radiance", lambda *a, **b: a_ball_before_a_wall())
+    monkeypatch.setattr(masks_module, "quality", lambda *a: np.array([20.0, 22.0]))
+    (tmp_path / "run").mkdir()
+    return root, tmp_path / "run"
+
+
+def read(root, **options):
+    return load_dataset(root, mask_files=False, **options)
+
+
+def truths():
+    """True masks by the names of the views."""
+    return {
+        f"view_{k:02d}": photograph(pose, size_of(k))[1][..., 0] > 0.5
+        for k, pose in enumerate(opengl_poses())
+    }
+
+
+def test_masks_are_those_of_the_object_and_are_read_by_training(capture):
+    root, run = capture
+    report = make_masks(read(root), SETTINGS, run, box=BOX)
+    dataset = load_dataset(root)
+    found = {
+        name: mask
+        for views in (dataset.train, dataset.test)
+        for name, mask in zip(views.names, views.masks, strict=True)
+    }
+    assert dataset.train.has_masks
+    assert len(found) == COUNT == report.masks
+    overlaps = []
+    for name, truth in truths().items():
+        mask = found[name][: truth.shape[0], : truth.shape[1]]
+        overlaps.append((mask & truth).sum() / (mask | truth).sum())
+        assert read_image(root / "masks" / f"{name}.png").shape[:2] == truth.shape
+    # The ball is seventeen pixels wide: its rim is a fifth of it.
+    assert np.mean(overlaps) > 0.93
+    assert np.min(overlaps) > 0.88
+    assert report.splats == 1200
+    assert report.splats_total == 1800
+    assert not report.proposed
+    assert report.certainty.agreement > 0.95
+    assert 0.0 < report.certainty.unsure < 0.3
+    assert report.certainty.empty == ()
+    assert report.psnr == 21.0
+    assert (run / "masks.png").exists()
+    assert (run / "splats.ply").stat().st_size > (run / "object.ply").stat().st_size
+
+
+def test_without_a_box_the_object_is_found(capture):
+    root, run = capture
+    report = make_masks(read(root), SETTINGS, run)
+    assert report.proposed
+    np.testing.assert_allclose(report.lo, CENTER - RADIUS, atol=0.2)
+    np.testing.assert_allclose(report.hi, CENTER + RADIUS, atol=0.2)
+
+
+def test_masks_that_are_there_are_replaced_only_where_that_is_said(capture):
+    root, run = capture
+    write_photographs(root, "unused")
+    with pytest.raises(CaptureError, match=f"{COUNT} of {COUNT} views have a mask already"):
+        make_masks(read(root), SETTINGS, run, box=BOX)
+    make_masks(read(root), SETTINGS, run, box=BOX, force=True)
+    smaller = (CENTER - 1, CENTER + np.array([1.0, 1.0, 0.0]))
+    before = read_image(root / "masks" / "view_04.png").sum()
+    make_masks(read(root), SETTINGS, run, box=smaller, resume=True)
+    assert read_image(root / "masks" / "view_04.png").sum() < 0.8 * before
+
+
+def test_boxes_and_masks_that_leave_nothing_are_refused(capture, monkeypatch):
+    root, run = capture
+    with pytest.raises(CaptureError, match="holds no splat; most of them lie between"):
+        make_masks(read(root), SETTINGS, run, box=(CENTER + 2, CENTER + 3))
+    with pytest.raises(CaptureError, match="must be lo .* below hi"):
+        make_masks(read(root), SETTINGS, run, box=(CENTER, CENTER))
+    faint = (np.zeros((COUNT, 28, 24, 3), np.float32), np.full((COUNT, 28, 24), 0.7, np.float32))
+    monkeypatch.setattr(masks_module, "render_views", lambda *a: faint)
+    with pytest.raises(CaptureError, match="masks would leave nothing"):
+        make_masks(read(root), SETTINGS, run, box=BOX)
+    assert not (root / "masks").exists()
+
+
+def test_scenes_whose_masks_would_not_be_read_are_refused(tmp_path):
+    root = tmp_path / "named"
+    write_transforms(root)
+    with pytest.raises(CaptureError, match="remove mask_path from transforms.json"):
+        make_masks(read(root), SETTINGS, tmp_path / "run", force=True)
+    cut = tmp_path / "cut"
+    write_transforms(cut, masks=None, rgba=True)
+    with pytest.raises(CaptureError, match="cut out already"):
+        make_masks(read(cut), SETTINGS, tmp_path / "run")
+
+
+def test_too_few_photographs_are_refused(capture):
+    root, run = capture
+    with pytest.raises(CaptureError, match="there are 3 views to train on, at least 5"):
+        make_masks(read(root, train_views=3), SETTINGS, run)
+
+
+def test_a_mask_is_as_large_as_its_photograph(tmp_path):
+    write_png(tmp_path / "a.png", np.zeros((21, 31, 3), np.float32))
+    lens = PinholeLens(fx=30.0, fy=30.0, cx=15.5, cy=10.5, width=31, height=21)
+    frame = Frame("a", np.eye(4), lens, tmp_path / "a.png")
+    alpha = np.zeros((12, 16), np.float32)
+    alpha[2:6, 3:9] = 1.0
+    # The image was cut to 20 x 30 pixels, and lies on a larger canvas.
+    mask = photograph_mask(alpha, frame, 2)
+    rows, columns = np.nonzero(mask)
+    assert mask.shape == (21, 31)
+    assert (rows.min(), rows.max()) == (4, 11)
+    assert (columns.min(), columns.max()) == (6, 17)
+
+
+def test_large_photographs_are_reduced(tmp_path):
+    sizes = {"small": (20, 24), "large": (1000, 1100)}
+    for name, (height, width) in sizes.items():
+        root = tmp_path / name
+        write_transforms(root, masks=None, several=False)
+        for path in (root / "images").iterdir():
+            write_png(path, np.zeros((height, width, 3), np.float32))
+    assert choose_factor(tmp_path / "small") == 1
+    assert choose_factor(tmp_path / "large") == 3
+    with pytest.raises(SceneError, match="does not exist"):
+        choose_factor(tmp_path / "nowhere")
+
+
+def test_the_command_prints_how_sure_it_is(capture, capsys):
+    root, run = capture
+    box = [str(x) for x in np.concatenate(BOX)]
+    asked = ["masks", str(root), "--output", str(run), "--steps", "1"]
+    assert cli.main([*asked, "--box", *box]) == 0
+    printed = capsys.readouterr().out
+    for part in ("dB on views that are held back", "agreement:", "half-opaque", "masks.png"):
+        assert part in printed
+    assert cli.main(asked) == 2
+    assert "have a mask already" in capsys.readouterr().err
+
+
+def test_a_training_that_fails_says_so(capture, monkeypatch, capsys):
+    root, run = capture
+
+    def fail(*values, **named):
+        raise TrainingError("step 3: a number is not finite")
+
+    monkeypatch.setattr(masks_module, "train_radiance", fail)
+    assert cli.main(["masks", str(root), "--output", str(run)]) == 2
+    assert "not finite" in capsys.readouterr().err
+
+
+def test_half_opaque_pixels_and_cut_masks_raise_warnings():
+    views = replace(ring(6), has_masks=False)
+    alpha = np.zeros((6, 40, 40), np.float32)
+    alpha[:, :, 18:22] = 0.9
+    alpha[:, 5:35, 12:18] = 0.5
+    alpha[5] = 0.0
+    sure = masks_module.certainty(views, alpha, (np.full(3, -1.5), np.full(3, 1.5)))
+    assert sure.unsure == pytest.approx(30 * 6 / (40 * 4))
+    # Eight pixels of a rim of 2 x 40 and 2 x 2 lie on the border.
+    assert sure.cut == pytest.approx(8 / 84)
+    assert sure.empty == (views.names[5],)
+    assert sure.coverage == pytest.approx(5 / 6 * 0.1)
+    text = " ".join(sure.warnings())
+    for part in ("half opaque", "border of the image", "1 masks are empty"):
+        assert part in text
+    assert OPAQUE == 0.8

@@ -1,0 +1,472 @@
+"""Splats with colours of their own: harmonics, relocation, training, and the file viewers open."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from scipy.special import comb, sph_harm_y
+from support import double_precision, level_poses
+
+from geosplat_jax.capture.settings import RadianceRates, RadianceSettings, RelocationSettings
+from geosplat_jax.capture.start import CaptureError, first_splats, random_points, standard_world
+from geosplat_jax.capture.training import (
+    quality,
+    relocates_after,
+    train_radiance,
+    weights_at,
+)
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.harmonics import CONSTANT, harmonic_degrees, harmonics
+from geosplat_jax.core.types import Camera
+from geosplat_jax.fit.folder import RunError
+from geosplat_jax.io.alignment import AlignmentError
+from geosplat_jax.io.checkpoints import latest_checkpoint
+from geosplat_jax.io.export import export_gaussians_ply
+from geosplat_jax.io.images import encode_srgb
+from geosplat_jax.io.views import Views
+from geosplat_jax.splats.radiance import RadianceSplats, colors_seen_from, render_radiance
+from geosplat_jax.splats.relocation import (
+    exploring_noise,
+    relocate,
+    shared_opacity,
+    shared_scale_factor,
+)
+
+ROUNDING = 2e-6  # float32, values of order one
+QUADRATURE = 2e-6  # of the integral of Eq. 9, relative
+CAPACITIES = Capacities(visible=128, hits=4096, chunks=1024)
+ROWS = 49
+
+# One shape and one program for all images of this file.
+render = jax.jit(
+    lambda splats, count, camera: render_radiance(splats, count, camera, capacities=CAPACITIES)
+)
+seen_from = jax.jit(colors_seen_from)
+
+
+def unit(count, seed=0):
+    directions = np.random.default_rng(seed).standard_normal((count, 3))
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def some_splats(count=40, *, seed=0, dtype=jnp.float32):
+    """Splats about the origin."""
+    rng = np.random.default_rng(seed)
+
+    def normal(*shape, scale=1.0):
+        return jnp.asarray(scale * rng.standard_normal(shape), dtype)
+
+    return RadianceSplats(
+        means=normal(count, 3, scale=0.4),
+        log_scales=normal(count, 3, scale=0.3) - 2.0,
+        quats=normal(count, 4),
+        opacity_logits=normal(count),
+        base=normal(count, 3),
+        rest=normal(count, 15, 3, scale=0.3),
+    )
+
+
+def scipy_harmonics(directions):
+    """Real harmonics from scipy's complex ones."""
+    x, y, z = directions.T
+    polar, azimuth = np.arccos(z), np.arctan2(y, x)
+    columns = []
+    for degree in range(4):
+        for order in range(-degree, degree + 1):
+            value = sph_harm_y(degree, abs(order), polar, azimuth)
+            part = value.imag if order < 0 else value.real
+            sign = (-1.0) ** order  # without the phase of Condon and Shortley
+            columns.append(part * (1.0 if order == 0 else np.sqrt(2.0) * sign))
+    return np.stack(columns, -1)
+
+
+def test_harmonics_equal_those_of_scipy():
+    directions = unit(200)
+    found = harmonics(jnp.asarray(directions, jnp.float32), degree=3)
+    np.testing.assert_allclose(found, scipy_harmonics(directions), atol=2 * ROUNDING)
+    np.testing.assert_array_equal(harmonic_degrees(3), [0, 1, 1, 1, *[2] * 5, *[3] * 7])
+
+
+def test_harmonics_of_another_degree_are_refused():
+    with pytest.raises(ValueError, match="degree must be from 0 to 3, got 4"):
+        harmonics(jnp.zeros((1, 3)), degree=4)
+
+
+def test_gradient_of_the_colours_equals_differences():
+    with double_precision():
+        splats = some_splats(6, dtype=jnp.float64)
+        center = jnp.asarray([0.2, -2.5, 0.7])
+        weights = jnp.asarray(np.random.default_rng(1).standard_normal((6, 3)))
+
+        @jax.jit
+        def total(splats, center):
+            return jnp.sum(weights * colors_seen_from(splats, center, degree=3))
+
+        gradient = jax.grad(total, argnums=(0, 1))(splats, center)
+        rng = np.random.default_rng(2)
+        for _ in range(3):
+            step = jax.tree.map(lambda x: jnp.asarray(rng.standard_normal(x.shape)), gradient)
+            at = [
+                jax.tree.map(lambda x, d, h=h: x + h * d, (splats, center), step)
+                for h in (1e-6, -1e-6)
+            ]
+            difference = (total(*at[0]) - total(*at[1])) / 2e-6
+            along = sum(
+                jnp.vdot(g, d)
+                for g, d in zip(jax.tree.leaves(gradient), jax.tree.leaves(step), strict=True)
+            )
+            assert float(along) == pytest.approx(float(difference), rel=1e-6)
+
+
+def test_higher_harmonics_are_left_out_until_they_are_asked_for():
+    splats, center = some_splats(), jnp.asarray([0.0, -3.0, 0.0])
+    flat = replace(splats, rest=jnp.zeros_like(splats.rest))
+    np.testing.assert_allclose(
+        seen_from(splats, center, degree=0),
+        np.maximum(0.5 + CONSTANT * np.asarray(splats.base), 0.0),
+        atol=ROUNDING,
+    )
+    seen = [np.asarray(seen_from(splats, center, degree=d)) for d in (1, 2, 3)]
+    assert all(np.abs(a - b).max() > 0.05 for a, b in zip(seen, seen[1:], strict=False))
+    np.testing.assert_array_equal(
+        seen_from(flat, center, degree=3), seen_from(flat, center, degree=0)
+    )
+
+
+def test_padding_does_not_change_the_image():
+    splats = some_splats(ROWS)
+    other = jax.tree.map(lambda x: x.at[40:].set(x[: ROWS - 40]), splats)
+    camera = camera_at([0.0, -3.0, 0.4])
+    image = render(splats, 40, camera)[0]
+    assert float(image.max()) > 0.1
+    np.testing.assert_array_equal(render(other, 40, camera)[0], image)
+    assert np.abs(np.asarray(render(other, ROWS, camera)[0]) - image).max() > 0.01
+
+
+def camera_at(center, size=49, focal=30.0):
+    pose = level_poses([center])[0] @ np.diag([1.0, -1.0, -1.0, 1.0])
+    intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
+    return Camera(
+        jnp.asarray(np.linalg.inv(pose)[None], jnp.float32),
+        jnp.asarray(intrinsics[None], jnp.float32),
+        height=size,
+        width=size,
+    )
+
+
+@pytest.mark.parametrize("opacity", [0.006, 0.3, 0.999])
+def test_scales_of_several_splats_are_those_of_the_binomial_sum(opacity):
+    # The sum of Eq. 9 alternates, so its terms are added in double precision and up to 20 only.
+    for sharers in (1, 2, 5, 20):
+        shared = 1.0 - (1.0 - opacity) ** (1.0 / sharers)
+        total = sum(
+            comb(i - 1, k) * (-1.0) ** k * shared ** (k + 1) / np.sqrt(k + 1)
+            for i in range(1, sharers + 1)
+            for k in range(i)
+        )
+        with double_precision():
+            one, number = jnp.asarray([opacity]), jnp.asarray([float(sharers)])
+            found = shared_scale_factor(one, shared_opacity(one, number), number)
+        assert float(found[0]) == pytest.approx(opacity / total, rel=QUADRATURE)
+
+
+def one_splat():
+    """Rows of one splat of five pixels, so that the rasteriser's low-pass filter hardly matters."""
+    ones = jnp.ones((ROWS, 3), jnp.float32)
+    return RadianceSplats(
+        means=0.0 * ones,
+        log_scales=np.float32(np.log(0.5)) * ones,
+        quats=jnp.ones((ROWS, 4), jnp.float32),
+        opacity_logits=jnp.full((ROWS,), 1.1, jnp.float32),
+        base=0.3 * ones,
+        rest=jnp.zeros((ROWS, 15, 3), jnp.float32),
+    )
+
+
+@pytest.mark.parametrize("sharers", [2, 6])
+def test_relocation_keeps_the_image_of_the_splat_that_it_shares(sharers):
+    camera, before, row = camera_at([0.0, -3.0, 0.0]), one_splat(), jnp.arange(ROWS)
+    free = (row > 0) & (row < sharers)
+    after, is_changed = relocate(before, free, row == 0, jax.random.key(0))
+    assert int(is_changed.sum()) == sharers
+    unscaled = replace(after, log_scales=before.log_scales)
+    one = np.asarray(render(before, 1, camera)[1])
+    many, lazy = (np.asarray(render(x, sharers, camera)[1]) for x in (after, unscaled))
+    middle = 24
+    assert many[middle, middle] == pytest.approx(one[middle, middle], abs=0.01)
+    # Along a line through the middle the integral is kept, not every value.
+    assert many[middle].sum() == pytest.approx(one[middle].sum(), rel=0.01)
+    assert lazy[middle].sum() > 1.05 * one[middle].sum()
+    assert np.abs(many - one).mean() < 0.5 * np.abs(lazy - one).mean()
+
+
+def test_dead_splats_go_to_live_ones_in_proportion_to_their_opacity():
+    count = 4000
+    splats = some_splats(count)
+    row = np.arange(count)
+    opacity = np.where(row < 2, [0.6, 0.2][0], 0.001)
+    opacity[1] = 0.2
+    logits = jnp.asarray(np.log(opacity / (1 - opacity)), jnp.float32)
+    splats = replace(splats, opacity_logits=logits)
+    live = jnp.asarray(row < 3000)
+    moved, is_changed = relocate(
+        splats, jnp.asarray((row >= 2) & (row < 3000)), live, jax.random.key(1)
+    )
+    at = np.asarray(moved.means)
+    shares = [np.all(at[2:3000] == np.asarray(splats.means)[k], axis=1).mean() for k in (0, 1)]
+    assert sum(shares) == 1.0
+    assert shares[0] == pytest.approx(0.75, abs=0.04)
+    assert bool(is_changed[:3000].all())
+    assert not bool(is_changed[3000:].any())
+    np.testing.assert_array_equal(at[3000:], np.asarray(splats.means)[3000:])
+    # Copies are what their source has become.
+    first = int(np.argmax(np.all(at[2:] == at[0], axis=1))) + 2
+    assert float(moved.opacity_logits[first]) == float(moved.opacity_logits[0])
+
+
+def test_nothing_is_relocated_where_nothing_lives():
+    splats = replace(some_splats(), opacity_logits=jnp.full((40,), -9.0))
+    everywhere = jnp.ones((40,), bool)
+    moved, is_changed = relocate(splats, everywhere, everywhere, jax.random.key(0))
+    assert not bool(is_changed.any())
+    jax.tree.map(np.testing.assert_array_equal, moved, splats)
+
+
+def test_noise_is_shaped_like_the_splat_and_spares_opaque_ones():
+    count = 20_000
+    logits = jnp.where(jnp.arange(count) < count // 2, -9.0, 0.0).astype(jnp.float32)
+    splats = RadianceSplats(
+        means=jnp.zeros((count, 3)),
+        log_scales=jnp.log(jnp.broadcast_to(jnp.asarray([0.5, 0.2, 0.1]), (count, 3))),
+        quats=jnp.broadcast_to(jnp.asarray([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]), (count, 4)),
+        opacity_logits=logits,
+        base=jnp.zeros((count, 3)),
+        rest=jnp.zeros((count, 15, 3)),
+    )
+    noise = np.asarray(exploring_noise(splats, jax.random.key(0), rate=2.0))
+    gate = 1.0 / (1.0 + np.exp(100.0 * (1.0 / (1.0 + np.exp(9.0)) - 0.005)))
+    # A quarter turn about z: the long axis lies along y. Noise is Sigma xi, of deviation s^2.
+    spread = noise[: count // 2].std(0)
+    np.testing.assert_allclose(spread, 2.0 * gate * np.array([0.04, 0.25, 0.01]), rtol=0.03)
+    assert np.abs(noise[count // 2 :]).max() < 1e-12
+
+
+BALLS = (((0.0, 0.0, 0.0), (0.9, 0.5, 0.1)), ((0.6, 0.3, 0.2), (0.1, 0.3, 0.9)))
+
+
+def scene_views(count=9, size=32):
+    """Views, as a pinhole sees them, of two bright balls before a gradient that no ray leaves."""
+    heights = np.resize([0.4, 1.6], count)
+    angle = np.linspace(0.0, 4.5, count)
+    centers = np.stack([3 * np.cos(angle), 3 * np.sin(angle), heights], -1)
+    poses = level_poses(centers)
+    focal = 34.0
+    steps = (np.arange(size) + 0.5 - size / 2) / focal
+    x, y = np.meshgrid(steps, -steps)
+    images = []
+    for pose in poses:
+        rays = np.stack([x, y, -np.ones_like(x)], -1) @ pose[:3, :3].T
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        color = 0.3 + 0.2 * rays
+        for middle, paint in (
+            ((0.0, 0.0, 0.0), (0.9, 0.5, 0.1)),
+            ((0.6, 0.3, 0.2), (0.1, 0.3, 0.9)),
+        ):
+            away = pose[:3, 3] - np.asarray(middle)
+            along = rays @ away
+            hit = along**2 - away @ away + 0.45**2 > 0
+            color = np.where(hit[..., None], paint, color)
+        images.append(np.concatenate([color, np.ones((size, size, 1))], -1))
+    intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
+    return Views(
+        names=tuple(f"view_{k}" for k in range(count)),
+        camera_to_world=poses,
+        intrinsics=np.repeat(intrinsics[None], count, 0),
+        images=np.stack(images).astype(np.float32),
+        has_masks=False,
+    )
+
+
+TINY = RadianceSettings(
+    steps=60,
+    capacity=64,
+    degree_every=15,
+    checkpoint_every=8,
+    first_scale=0.4,
+    background="black",
+    rates=RadianceRates(base=0.02, scales=0.02),
+    relocation=RelocationSettings(every=5, first=5, growth=1.2),
+)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder, reports = tmp_path_factory.mktemp("splats") / "run", []
+    radiance = train_radiance(scene_views(), TINY, folder, on_step=reports.append)
+    return radiance, reports, folder
+
+
+def test_training_lowers_the_loss_and_fills_the_capacity(trained):
+    radiance, reports, _ = trained
+    totals = [report.total for report in reports]
+    # Of the nine views, each once.
+    assert np.mean(totals[-9:]) < 0.85 * np.mean(totals[:9])
+    assert [report.step for report in reports] == list(range(1, 61))
+    counts = [report.splat_count for report in reports]
+    assert counts[0] == 32
+    assert counts[-1] == radiance.splats.capacity > 40
+    assert quality(radiance, scene_views()).mean() > 14.0
+
+
+def test_resumed_training_equals_the_uninterrupted_one(trained, tmp_path):
+    _, _, whole = trained
+    for stop in (31, None):
+        train_radiance(scene_views(), TINY, tmp_path / "run", resume=True, stop_after=stop)
+    paths = [latest_checkpoint(folder / "checkpoints") for folder in (whole, tmp_path / "run")]
+    first, second = (np.load(path) for path in paths)
+    names = [name for name in first.files if name != "__meta__"]
+    assert any("rest" in name for name in names)
+    for name in names:
+        np.testing.assert_array_equal(first[name], second[name], err_msg=name)
+
+
+def test_a_folder_with_splats_is_neither_replaced_nor_continued_with_others(trained):
+    _, _, folder = trained
+    with pytest.raises(RunError, match="--resume"):
+        train_radiance(scene_views(), TINY, folder)
+    other = replace(TINY, capacity=80)
+    with pytest.raises(RunError, match="other views or settings"):
+        train_radiance(scene_views(), other, folder, resume=True)
+
+
+def test_rates_decay_and_degrees_rise_by_the_schedule():
+    settings = RadianceSettings(steps=2001)
+    rates = RadianceRates()
+    first, half, last = (weights_at(settings, step) for step in (0, 1000, 2000))
+    assert float(first.rates["means"]) == pytest.approx(4 * rates.means)
+    assert float(half.rates["means"]) == pytest.approx(4 * (rates.means * rates.means_last) ** 0.5)
+    assert float(last.rates["means"]) == pytest.approx(4 * rates.means_last)
+    assert float(half.noise) == pytest.approx(5e5 * float(half.rates["means"]))
+    assert [int(w.degree) for w in (first, half, last)] == [0, 1, 2]
+    assert float(last.rates["rest"]) == float(first.rates["rest"])
+    when = [step for step in range(2002) if relocates_after(settings, step)]
+    assert when == list(range(500, 1601, 100))
+
+
+def test_random_points_are_seen_with_their_colour():
+    views = scene_views()
+    points = random_points(views, 300, np.random.default_rng(0))
+    local = np.einsum("vij,nj->vni", views.world_to_camera[:, :3, :3], points.positions)
+    local = local + views.world_to_camera[:, None, :3, 3]
+    pixel = np.einsum("vij,vnj->vni", views.intrinsics, local)
+    pixel = pixel[..., :2] / pixel[..., 2:]
+    seen = (local[..., 2] > 0) & (pixel > 0).all(-1) & (pixel < views.width).all(-1)
+    assert seen.any(0).all()
+    assert np.where(seen, local[..., 2], 0.0).max() > 20
+    column, row = np.where(seen[..., None], pixel, 0).astype(int).transpose(2, 0, 1)
+    shown = encode_srgb(views.images[np.arange(len(views))[:, None], row, column, :3])
+    differs = np.abs(shown - points.colors).max(-1)
+    np.testing.assert_allclose(np.where(seen, differs, np.inf).min(0), 0.0, atol=ROUNDING)
+
+
+def test_points_come_first_and_are_as_large_as_their_neighbours_are_far():
+    views = standard_world(scene_views()).views(scene_views())
+    grid = np.stack(np.meshgrid(*[np.arange(3.0)] * 3), -1).reshape(-1, 3)
+    points = random_points(views, 27, np.random.default_rng(0))._replace(positions=grid)
+    splats, count = first_splats(views, points, RadianceSettings(capacity=54))
+    assert count == 27
+    np.testing.assert_allclose(splats.means[:27], grid)
+    np.testing.assert_allclose(np.exp(splats.log_scales[:27]), 0.1, rtol=1e-5)
+    np.testing.assert_allclose(splats.opacities[:27], 0.5)
+    np.testing.assert_allclose(
+        colors_seen_from(splats, jnp.zeros(3), degree=0)[:27], points.colors, atol=ROUNDING
+    )
+    few, total = first_splats(views, points, RadianceSettings(capacity=8))
+    assert (few.capacity, total) == (8, 8)
+
+
+def some_of(views, chosen):
+    return replace(
+        views,
+        names=tuple(np.asarray(views.names)[chosen]),
+        camera_to_world=views.camera_to_world[chosen],
+        intrinsics=views.intrinsics[chosen],
+        images=views.images[chosen],
+    )
+
+
+def test_captures_that_cannot_be_learned_are_refused(tmp_path):
+    views = scene_views()
+    with pytest.raises(CaptureError, match="there are 4 views"):
+        train_radiance(some_of(views, np.arange(4)), TINY, tmp_path / "few")
+    with pytest.raises(CaptureError, match="cut out already"):
+        train_radiance(replace(views, has_masks=True), TINY, tmp_path / "cut")
+    poses = level_poses(np.stack([np.linspace(-1, 1, 9), np.full(9, -3.0), np.full(9, 1.0)], -1))
+    with pytest.raises(AlignmentError, match="on one line"):
+        train_radiance(replace(views, camera_to_world=poses), TINY, tmp_path / "line")
+
+
+def test_ply_has_the_standard_layout(tmp_path):
+    splats = some_splats(7)
+    path = tmp_path / "splats.ply"
+    rgb = 0.5 + CONSTANT * np.asarray(splats.base)
+    export_gaussians_ply(
+        path,
+        splats.means,
+        splats.quats,
+        splats.scales,
+        splats.opacities,
+        rgb,
+        np.zeros((7, 3)),
+        rest=splats.rest,
+    )
+    header = path.read_bytes().split(b"end_header\n")[0].decode().splitlines()
+    names = [line.split()[-1] for line in header if line.startswith("property float")]
+    assert names == [
+        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+        *(f"f_rest_{k}" for k in range(45)),
+        *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    ]
+    rows = trimesh.load(path).metadata["_ply_raw"]["vertex"]["data"]
+    found = {name: np.asarray(rows[name], float).reshape(7) for name in names}
+    center = np.array([0.3, -4.0, 1.0])
+    seen = viewers_color(found, center)
+    expected = colors_seen_from(splats, jnp.asarray(center, jnp.float32), degree=3)
+    np.testing.assert_allclose(seen, expected, atol=1e-5)
+    np.testing.assert_allclose(found["opacity"], splats.opacity_logits, atol=1e-4)
+    np.testing.assert_allclose(found["scale_1"], splats.log_scales[:, 1], atol=1e-5)
+
+
+def viewers_color(found, center):
+    """Colour of the file's columns as the code of Kerbl et al. has it (utils/sh_utils.py)."""
+    mean = np.stack([found[axis] for axis in "xyz"], -1)
+    towards = mean - center
+    x, y, z = (towards / np.linalg.norm(towards, axis=-1, keepdims=True)).T
+    xx, yy, zz = x * x, y * y, z * z
+    basis = [
+        -0.4886025119029199 * y,
+        0.4886025119029199 * z,
+        -0.4886025119029199 * x,
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2.0 * zz - xx - yy),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (xx - yy),
+        -0.5900435899266435 * y * (3 * xx - yy),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * zz - xx - yy),
+        0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+        -0.4570457994644658 * x * (4 * zz - xx - yy),
+        1.445305721320277 * z * (xx - yy),
+        -0.5900435899266435 * x * (xx - 3 * yy),
+    ]
+    channels = []
+    for channel in range(3):
+        value = 0.5 + 0.28209479177387814 * found[f"f_dc_{channel}"]
+        for k in range(15):
+            value = value + basis[k] * found[f"f_rest_{15 * channel + k}"]
+        channels.append(np.maximum(value, 0.0))
+    return np.stack(channels, -1)
