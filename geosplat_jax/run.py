@@ -25,18 +25,19 @@ from geosplat_jax.fit.stages import make_batch
 from geosplat_jax.fit.train import Progress, Trained, fit, load_trained
 from geosplat_jax.io.cameras import RefinedSplit, write_cameras
 from geosplat_jax.io.dataset import Dataset, load_recorded
-from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.images import write_png
 from geosplat_jax.io.views import Views
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
 from geosplat_jax.report.assets import export_assets
 from geosplat_jax.report.consistency import Consistency, body_of_run, measure, single_cameras
-from geosplat_jax.report.evaluate import evaluate_run, preview_image
+from geosplat_jax.report.evaluate import evaluate_run
+from geosplat_jax.report.page import REPORT, Evaluated, write_report
 from geosplat_jax.report.pictures import normals_to_rgb
 from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.relight import RelightOptions, load_light, load_view_light, relight_views
 from geosplat_jax.report.renderer import DEFAULT_SAMPLES, Renderer, straight_rgba
+from geosplat_jax.report.sheets import preview_image
 
 REFINEMENT_SAMPLES = 32
 """Rays per splat when cameras are refined: noise averages out over the pixels of a view."""
@@ -130,13 +131,10 @@ class Run:
         RunError
             If there was none, or its file is damaged.
         """
-        path = self.folder.path / "metrics.json"
-        if not path.exists():
+        found = Evaluated.of(self.folder).metrics()
+        if not found:
             raise RunError(f"{self.folder} has not been evaluated; do so first")
-        try:
-            return parse_json(path.read_bytes())
-        except ValueError as error:
-            raise RunError(f"{path} is damaged: {error}; evaluate the run again") from None
+        return found
 
     def _views(self, split: str) -> Views:
         """Return a split that has views."""
@@ -158,7 +156,7 @@ class Run:
         relight_indirect: str = "traced",
         stage: str | None = None,
     ) -> dict[str, Any]:
-        """Compare the test views with the truth; write ``metrics.json`` and sheets of pictures.
+        """Compare the test views with the truth; write metrics, sheets of pictures and a report.
 
         See `evaluate.evaluate_run` for the arguments.
 
@@ -182,10 +180,11 @@ class Run:
         trained = self.trained if stage is None else load_trained(self.folder, stage=stage)
         lights = {name: load_light(path) for name, path in dataset.lights.items()}
         peaks = [line["peak_memory_mb"] for line in self.steps() if "peak_memory_mb" in line]
-        return evaluate_run(
+        evaluated = Evaluated.of(self.folder, stage=stage)
+        metrics = evaluate_run(
             trained,
             views,
-            self.folder.path if stage is None else self.folder.end_of(stage),
+            evaluated.results,
             meta={
                 "scene": record["scene"],
                 "dataset": record["dataset"],
@@ -199,7 +198,28 @@ class Run:
             train_light=_true_light(dataset, lights),
             samples=samples,
             relight_indirect=relight_indirect,
+            train_views=dataset.train,
         )
+        write_report(evaluated.results / REPORT, [evaluated])
+        return metrics
+
+    def report(self, output: Path | None = None, *, others: Sequence["Run"] = ()) -> Path:
+        """Write ``report.html``, one self-contained page; return its path.
+
+        Made of what training and the last evaluation left; see `report.page`.
+
+        Parameters
+        ----------
+        output : file (default: ``report.html`` in the run's folder).
+        others : runs to compare with, on the same page.
+
+        Raises
+        ------
+        RunError
+            If a file of a run is damaged.
+        """
+        runs = [Evaluated.of(run.folder) for run in (self, *others)]
+        return write_report(output or self.folder.path / REPORT, runs)
 
     def consistency(self, *, stage: str | None = None, size: int | None = None) -> Consistency:
         """Measure how well the splats stand for the mesh, over the views to show.

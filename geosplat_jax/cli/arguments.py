@@ -63,6 +63,12 @@ def command_line() -> argparse.ArgumentParser:
         "--stage", help="what this stage ended with, instead of the run as it is now"
     )
 
+    report = commands.add_parser("report", help="report.html of a run, or of several to compare")
+    report.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    report.add_argument(
+        "--output", type=Path, help="file (default: RUN/report.html; needed for several runs)"
+    )
+
     consistency = commands.add_parser(
         "consistency", help="how well splats stand for the mesh of a run, or for any mesh"
     )

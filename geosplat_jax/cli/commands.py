@@ -40,6 +40,7 @@ from geosplat_jax.report.consistency import (
     measure,
     single_cameras,
 )
+from geosplat_jax.report.page import REPORT
 from geosplat_jax.report.relight import RelightOptions
 from geosplat_jax.report.renderer import LARGEST_SAMPLES
 from geosplat_jax.run import Run
@@ -201,6 +202,15 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         folder = run.folder.end_of(arguments.stage)
     pictures = [name for name in _SHEETS if (folder / name).exists()]
     print(f"metrics: {folder / 'metrics.json'}\npictures: {', '.join(pictures)} in {folder}")
+    print(f"report: {folder / REPORT}")
+
+
+def _report(arguments: argparse.Namespace) -> None:
+    """Write the page of a run, or of several."""
+    first, *others = (Run(folder) for folder in arguments.runs)
+    if others and arguments.output is None:
+        raise UsageError("a report of several runs needs --output FILE")
+    print(f"report: {first.report(arguments.output, others=others)}")
 
 
 def _consistency(arguments: argparse.Namespace) -> None:
@@ -334,6 +344,7 @@ COMMANDS = {
     "train": _train,
     "settings": _settings,
     "evaluate": _evaluate,
+    "report": _report,
     "consistency": _consistency,
     "render": _render,
     "refine-cameras": _refine_cameras,

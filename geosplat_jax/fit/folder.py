@@ -9,6 +9,8 @@
     previews/             truth, render and normals while training
     training.json         how long the whole training took
     metrics.json, *.png   what the last evaluation found
+    evaluation/           its pictures one by one, the mesh and the lights of the report
+    report.html           all of it as one page
 """
 
 import importlib.metadata
@@ -31,7 +33,7 @@ from geosplat_jax.io.documents import parse_json
 
 _PACKAGES = ("jax", "jaxlib", "numpy", "optax", "geosplat_jax")
 _OWN = (
-    *("metrics.json", "overview.png", "materials.png", "relight.png"),
+    *("metrics.json", "overview.png", "materials.png", "relight.png", "evaluation", "report.html"),
     *("checkpoints", "stages", "previews", "metrics.jsonl", "training.json", "run.json"),
 )
 """What evaluation and training write; the record goes last: it says that the rest is a run."""
