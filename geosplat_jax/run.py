@@ -13,7 +13,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from geosplat_jax.core.types import Batch, EnvLight
 from geosplat_jax.fit.cameras import CameraSettings, ViewProgress, refine_views
@@ -32,12 +31,13 @@ from geosplat_jax.render import Params
 from geosplat_jax.report.assets import export_assets
 from geosplat_jax.report.consistency import Consistency, body_of_run, measure, single_cameras
 from geosplat_jax.report.evaluate import evaluate_run
+from geosplat_jax.report.pace import OnProgress, counted
 from geosplat_jax.report.page import REPORT, Evaluated, write_report
-from geosplat_jax.report.pictures import normals_to_rgb
 from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.relight import RelightOptions, load_light, load_view_light, relight_views
-from geosplat_jax.report.renderer import DEFAULT_SAMPLES, Renderer, straight_rgba
+from geosplat_jax.report.renderer import DEFAULT_SAMPLES, Renderer
 from geosplat_jax.report.sheets import preview_image
+from geosplat_jax.report.shots import Cameras, Images
 
 REFINEMENT_SAMPLES = 32
 """Rays per splat when cameras are refined: noise averages out over the pixels of a view."""
@@ -155,6 +155,7 @@ class Run:
         samples: int = DEFAULT_SAMPLES,
         relight_indirect: str = "traced",
         stage: str | None = None,
+        on_progress: OnProgress | None = None,
     ) -> dict[str, Any]:
         """Compare the test views with the truth; write metrics, sheets of pictures and a report.
 
@@ -164,6 +165,7 @@ class Run:
         ----------
         stage : evaluate what this stage ended with, and write to the folder of its checkpoint;
             the run as it is now by default.
+        on_progress : called with a part of the work, how much of it is done, and how much there is.
 
         Raises
         ------
@@ -199,6 +201,7 @@ class Run:
             samples=samples,
             relight_indirect=relight_indirect,
             train_views=dataset.train,
+            on_progress=on_progress,
         )
         write_report(evaluated.results / REPORT, [evaluated])
         return metrics
@@ -234,16 +237,40 @@ class Run:
         trained = self.trained if stage is None else load_trained(self.folder, stage=stage)
         return measure(body_of_run(trained), single_cameras(self.dataset.views_to_show, size))
 
-    def render(self, split: str = "test", output: Path | None = None) -> list[Path]:
-        """Write every view of a split as ``NAME_rgba.png`` and ``NAME_normal.png``."""
-        views, written = self._views(split), []
-        folder, renderer = self._output(output, "renders"), self.renderer()
-        for index, name in enumerate(views.names):
-            view = renderer(views.camera(np.array([index])))
-            stem = name.replace("/", "_").strip("._")
-            written += [folder / f"{stem}_rgba.png", folder / f"{stem}_normal.png"]
-            write_png(written[-2], straight_rgba(view))
-            write_png(written[-1], normals_to_rgb(view.aovs["normal"], view.alpha))
+    def render(
+        self,
+        split: str = "test",
+        output: Path | None = None,
+        *,
+        cameras: Cameras | None = None,
+        images: Images | None = None,
+        samples: int = DEFAULT_SAMPLES,
+        on_progress: OnProgress | None = None,
+    ) -> list[Path]:
+        """Render views, or from any cameras, under the light that was found; return the files.
+
+        Parameters
+        ----------
+        split : ``test`` or ``train``, where ``cameras`` are not given.
+        output : folder (default: ``renders`` in the run's).
+        cameras : see `shots.Cameras`. images : what to write, see `shots.Images`.
+        samples : rays per splat. on_progress : as for `evaluate`.
+
+        Raises
+        ------
+        RunError
+            If the scene has no such views.
+        ValueError
+            If a size, an angle or an image is unusable.
+        """
+        cameras, images = cameras or Cameras(split), images or Images()
+        cameras.check()
+        images.check()
+        renderer = self.renderer(samples=samples).with_aovs(*images.aovs)
+        shots, written = cameras.shots(self.dataset, renderer.center()), []
+        folder = self._output(output, "renders")
+        for name, camera in counted(shots, "views", on_progress):
+            written += images.write(folder, name, renderer(camera))
         return written
 
     def relight(
@@ -252,29 +279,38 @@ class Run:
         output: Path | None = None,
         *,
         options: RelightOptions | None = None,
+        cameras: Cameras | None = None,
+        images: Images | None = None,
         intensity: float = 1.0,
         albedo_scale: Sequence[float] = (1.0, 1.0, 1.0),
         samples: int = DEFAULT_SAMPLES,
         indirect: str = "traced",
+        on_progress: OnProgress | None = None,
     ) -> list[Path]:
-        """Render the test views, and movies, under another light; return the files.
+        """Render views, and movies, under another light; return the files.
 
         Parameters
         ----------
         env : lat-long environment map.
         output : folder (default: ``relight_NAME`` in the run's).
         options : which movies, and what is behind the object.
+        cameras : see `shots.Cameras` (default: the test views, or without any the training's).
+        images : what to write besides, see `shots.Images`.
         intensity : factor of the light. albedo_scale : (3,) factors of the albedo.
         samples : rays per splat. indirect : see `Renderer.relit`.
+        on_progress : as for `evaluate`.
         """
         options = options or RelightOptions()
         options.check()
+        cameras = cameras or Cameras(views=None)
+        cameras.check()
         light = EnvLight(intensity * load_light(env).radiance)
         relit = self.renderer(samples=samples).relit(
             light, albedo_scale=albedo_scale, indirect=indirect
         )
+        shots = cameras.shots(self.dataset, relit.center())
         folder = self._output(output, f"relight_{Path(env).stem}")
-        return relight_views(relit, light, self.dataset.views_to_show, folder, options)
+        return relight_views(relit, light, shots, folder, options, images, on_progress=on_progress)
 
     def refine_cameras(
         self,
@@ -325,14 +361,25 @@ class Run:
         return refined
 
     def export(
-        self, output: Path | None = None, *, vertex_colors: bool = False, texture_size: int = 1024
+        self,
+        output: Path | None = None,
+        *,
+        vertex_colors: bool = False,
+        texture_size: int = 1024,
+        obj: bool = False,
+        on_progress: OnProgress | None = None,
     ) -> dict[str, str]:
-        """Write ``mesh.glb``, ``gaussians.ply`` and ``light.exr``; return a line about each."""
+        """Write the mesh, Gaussians and light; return a line about each file.
+
+        See `assets.export_assets`; ``on_progress`` as for `evaluate`.
+        """
         return export_assets(
             self.trained,
             self._output(output, "export"),
             vertex_colors=vertex_colors,
             texture_size=texture_size,
+            obj=obj,
+            on_progress=on_progress,
         )
 
 
@@ -373,6 +420,7 @@ def train(
     source: str | Path | None = None,
     first_stage: str | None = None,
     on_step: Callable[[Progress], None] | None = None,
+    on_compile: Callable[[str], None] | None = None,
     **reading: Any,
 ) -> Run:
     """Train a scene into a run's folder.
@@ -382,7 +430,8 @@ def train(
     scene : folder, or a dataset from `load_dataset`.
     output : folder of the run.
     config : settings, see `make_config`; by default those of ``quality``.
-    resume, force, source, first_stage, on_step : see `fit.train.fit`; ``force`` replaces a run.
+    resume, force, source, first_stage, on_step, on_compile : see `fit.train.fit`; ``force``
+        replaces a run.
     reading : how to read the scene: ``downscale``, ``light``, ``bounds`` (six numbers),
         ``cameras`` (a file of `Run.refine_cameras`).
 
@@ -407,6 +456,7 @@ def train(
             first_stage=first_stage,
             on_step=on_step,
             on_preview=previews,
+            on_compile=on_compile,
         )
     finally:
         previews.finish()

@@ -1,12 +1,16 @@
 """Exported meshes, Gaussians and lights hold what was given; broken input leaves no file."""
 
 import json
+import os
+import shutil
 import struct
+import subprocess
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from scipy import ndimage
 
 from geosplat_jax.core.types import Camera, Mesh
@@ -197,6 +201,74 @@ def test_degenerate_faces_are_dropped_before_unwrapping(tmp_path):
     assert info["dropped_faces"] == 3
     assert info["faces"] == len(faces)
     assert info["closed"]
+
+
+def test_every_buffer_of_a_glb_says_what_it_holds(tmp_path):
+    for name, options in {"a": {"texture_size": 64}, "b": {"vertex_colors": True}}.items():
+        path = tmp_path / f"{name}.glb"
+        export.export_mesh_glb(path, *sphere(1), materials, **options)
+        tree = glb_tree(path)
+        (primitive,) = tree["meshes"][0]["primitives"]
+
+        def target(accessor, tree=tree):
+            return tree["bufferViews"][tree["accessors"][accessor]["bufferView"]]["target"]
+
+        assert {target(n) for n in primitive["attributes"].values()} == {34962}
+        assert target(primitive["indices"]) == 34963
+
+
+def test_an_obj_is_the_mesh_of_the_glb_with_the_same_textures(tmp_path):
+    path = tmp_path / "mesh.obj"
+    export.export_mesh_glb(
+        tmp_path / "mesh.glb", *sphere(), materials, texture_size=TEXTURE, obj_path=path
+    )
+    glb = only_mesh(tmp_path / "mesh.glb")
+    words = [line.split() for line in path.read_text().splitlines()]
+    columns = {
+        key: np.array([line[1:] for line in words if line[0] == key]) for key in ("v", "vt", "f")
+    }
+    np.testing.assert_allclose(columns["v"].astype(float), glb.vertices, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(columns["vt"].astype(float), glb.visual.uv, rtol=1e-5, atol=1e-6)
+    corners = [[int(n) for n in corner.split("/")] for corner in columns["f"].ravel()]
+    assert all(len(set(corner)) == 1 for corner in corners)
+    np.testing.assert_array_equal(np.array(corners)[:, 0].reshape(-1, 3) - 1, glb.faces)
+    maps = dict(line.split() for line in (tmp_path / "mesh.mtl").read_text().splitlines()[4:])
+    assert set(maps) == {"map_Kd", "map_Pr", "map_Pm"}
+    images = {key: np.asarray(Image.open(tmp_path / file)) for key, file in maps.items()}
+    np.testing.assert_array_equal(images["map_Kd"], glb.visual.material.baseColorTexture)
+    packed = np.asarray(glb.visual.material.metallicRoughnessTexture)
+    np.testing.assert_array_equal(images["map_Pr"], packed[..., 1])
+    np.testing.assert_array_equal(images["map_Pm"], packed[..., 2])
+    assert np.ptp(images["map_Pr"]) > 100
+    assert len(trimesh.load(path, process=False).faces) == len(glb.faces)
+    with pytest.raises(ValueError, match="an OBJ has textures"):
+        export.export_mesh_glb(path, *sphere(1), materials, vertex_colors=True, obj_path=path)
+
+
+VALIDATOR = """
+const validator = require(process.argv[2]);
+const bytes = new Uint8Array(require("fs").readFileSync(process.argv[3]));
+validator.validateBytes(bytes).then((report) => console.log(JSON.stringify(report.issues)));
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{"texture_size": 64}, {"vertex_colors": True}])
+def test_the_khronos_validator_has_nothing_to_say(tmp_path, options):
+    node, package = shutil.which("node"), os.environ.get("GLTF_VALIDATOR")
+    if node is None or package is None:
+        pytest.skip(
+            "no validator: install node and the npm package gltf-validator, and name its "
+            "folder in GLTF_VALIDATOR"
+        )
+    path = tmp_path / "mesh.glb"
+    export.export_mesh_glb(path, *sphere(2), materials, **options)
+    script = tmp_path / "validate.js"
+    script.write_text(VALIDATOR)
+    said = subprocess.run(
+        [node, script, package, path], capture_output=True, text=True, check=True, timeout=60
+    ).stdout
+    assert json.loads(said)["messages"] == []
 
 
 def test_unusable_meshes_are_refused_and_leave_no_file(tmp_path):

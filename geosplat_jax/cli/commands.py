@@ -2,18 +2,20 @@
 
 import argparse
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from geosplat_jax.cli.display import ProgressDisplay, console, say
+from geosplat_jax.cli.display import ProgressDisplay, WorkDisplay, say
 from geosplat_jax.fit.cameras import ViewProgress
 from geosplat_jax.fit.config import Config, all_settings, config_warnings
+from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.gauge import change_lines
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.gradcheck.report import (
@@ -43,6 +45,7 @@ from geosplat_jax.report.consistency import (
 from geosplat_jax.report.page import REPORT
 from geosplat_jax.report.relight import RelightOptions
 from geosplat_jax.report.renderer import LARGEST_SAMPLES
+from geosplat_jax.report.shots import Cameras, Images
 from geosplat_jax.run import Run
 from geosplat_jax.run import train as train_run
 
@@ -91,24 +94,8 @@ def _poses(arguments: argparse.Namespace) -> None:
     settings = PoseSettings(
         size=arguments.size, order=arguments.order, lens=arguments.lens, seed=arguments.seed
     )
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-        console=console,
-        disable=not console.is_terminal,
-    )
-    tasks = {}
-
-    def show(part: str, done: int, total: int) -> None:
-        if part not in tasks:
-            tasks[part] = bar.add_task(part, total=total)
-            if bar.disable:
-                say(f"{part} ...")
-        bar.update(tasks[part], completed=done)
-
-    with bar:
-        report = find_poses(arguments.folder, settings, force=arguments.force, on_progress=show)
+    with WorkDisplay() as display:
+        report = find_poses(arguments.folder, settings, force=arguments.force, on_progress=display)
     total = report.registered + len(report.missing)
     print(f"cameras: {report.registered} of {total} photographs ({report.registered / total:.0%})")
     if report.missing:
@@ -134,6 +121,17 @@ def _config_from(arguments: argparse.Namespace) -> Config:
     )
 
 
+@contextmanager
+def _table(path: Path | None, folder: Path) -> Iterator[None]:
+    """Write the steps of a run as a table when the training ends, however that is."""
+    try:
+        yield
+    finally:
+        steps = RunFolder(folder)
+        if path is not None and steps.exists:
+            steps.write_csv(path)
+
+
 def _train(arguments: argparse.Namespace) -> None:
     """Train a scene into a run's folder, with progress on the terminal."""
     if (arguments.source is None) != (arguments.stage is None):
@@ -145,8 +143,8 @@ def _train(arguments: argparse.Namespace) -> None:
         say(note)
     for warning in (*dataset.warnings, *config_warnings(config)):
         say(warning, label="warning: ", style="yellow")
-    say(f"{dataset.name}: {len(dataset.train)} views, {dataset.layout}; compiling ...")
-    with ProgressDisplay(config.total_steps) as display:
+    say(f"{dataset.name}: {len(dataset.train)} views, {dataset.layout} ...")
+    with ProgressDisplay(config.total_steps) as display, _table(arguments.csv, folder):
         run = train_run(
             dataset,
             folder,
@@ -156,6 +154,7 @@ def _train(arguments: argparse.Namespace) -> None:
             source=arguments.source,
             first_stage=arguments.stage,
             on_step=display.show,
+            on_compile=display.compiling,
         )
     seconds = (run.folder.training() or {})["seconds_total"]
     say(f"trained in {seconds:.0f} s; next: geosplat-jax evaluate {folder}")
@@ -186,12 +185,14 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     """Evaluate a run on its scene's test views and print the means."""
     _check_samples(arguments)
     run = Run(arguments.run, scene=arguments.scene)
-    metrics = run.evaluate(
-        protocol=arguments.protocol,
-        samples=arguments.samples,
-        relight_indirect=arguments.relight_indirect,
-        stage=arguments.stage,
-    )
+    with WorkDisplay() as display:
+        metrics = run.evaluate(
+            protocol=arguments.protocol,
+            samples=arguments.samples,
+            relight_indirect=arguments.relight_indirect,
+            stage=arguments.stage,
+            on_progress=display,
+        )
     print(f"protocol: {arguments.protocol}")
     for name, value in metrics["mean"].items():
         print(f"{name:36s} {value:9.4f}")
@@ -258,28 +259,60 @@ def _relight(arguments: argparse.Namespace) -> None:
         if getattr(arguments, name) < 0:
             raise UsageError(f"--{name.replace('_', '-')} must not be negative")
     _check_samples(arguments)
-    written = Run(arguments.run, scene=arguments.scene).relight(
-        arguments.env,
-        arguments.output,
-        options=RelightOptions(
-            turntable=arguments.turntable,
-            rotate_env=arguments.rotate_env,
-            background=arguments.background,
-            suffix=f".{arguments.movie}" if arguments.movie else None,
-            frames_per_second=arguments.fps,
-        ),
-        intensity=arguments.intensity,
-        albedo_scale=arguments.albedo_scale,
-        samples=arguments.samples,
-        indirect=arguments.indirect,
-    )
+    cameras = _cameras_from(arguments)
+    with WorkDisplay() as display:
+        written = Run(arguments.run, scene=arguments.scene).relight(
+            arguments.env,
+            arguments.output,
+            options=RelightOptions(
+                turntable=arguments.turntable,
+                rotate_env=arguments.rotate_env,
+                background=arguments.background,
+                suffix=f".{arguments.movie}" if arguments.movie else None,
+                frames_per_second=arguments.fps,
+            ),
+            cameras=cameras,
+            images=_images_from(arguments),
+            intensity=arguments.intensity,
+            albedo_scale=arguments.albedo_scale,
+            samples=arguments.samples,
+            indirect=arguments.indirect,
+            on_progress=display,
+        )
     print(f"{len(written)} files: {written[0].parent}")
 
 
+def _cameras_from(arguments: argparse.Namespace, turntable: int = 0) -> Cameras:
+    """Return the cameras that the arguments ask for."""
+    cameras = Cameras(
+        views=arguments.views,
+        file=arguments.cameras,
+        turntable=turntable,
+        size=arguments.size,
+        field_of_view=arguments.field_of_view,
+    )
+    cameras.check()
+    return cameras
+
+
+def _images_from(arguments: argparse.Namespace) -> Images:
+    return Images(aovs=tuple(dict.fromkeys(arguments.aovs)), exr=arguments.exr)
+
+
 def _render(arguments: argparse.Namespace) -> None:
-    """Render the views of a split."""
-    written = Run(arguments.run, scene=arguments.scene).render(arguments.views, arguments.output)
-    print(f"{len(written) // 2} views: {written[0].parent}")
+    """Render views of a split, or from other cameras."""
+    _check_samples(arguments)
+    cameras, images = _cameras_from(arguments, arguments.turntable), _images_from(arguments)
+    with WorkDisplay() as display:
+        written = Run(arguments.run, scene=arguments.scene).render(
+            output=arguments.output,
+            cameras=cameras,
+            images=images,
+            samples=arguments.samples,
+            on_progress=display,
+        )
+    count = sum(path.name.endswith("_rgba.png") for path in written)
+    print(f"{count} views, {len(written)} files: {written[0].parent}")
 
 
 def _refine_cameras(arguments: argparse.Namespace) -> None:
@@ -308,11 +341,16 @@ def _export(arguments: argparse.Namespace) -> None:
         raise UsageError(
             f"--texture-size must be from 1 to {LARGEST_TEXTURE}, got {arguments.texture_size}"
         )
-    lines = Run(arguments.run, scene=arguments.scene).export(
-        arguments.output,
-        vertex_colors=arguments.vertex_colors,
-        texture_size=arguments.texture_size,
-    )
+    if arguments.obj and arguments.vertex_colors:
+        raise UsageError("--obj needs textures; leave --vertex-colors out")
+    with WorkDisplay() as display:
+        lines = Run(arguments.run, scene=arguments.scene).export(
+            arguments.output,
+            vertex_colors=arguments.vertex_colors,
+            texture_size=arguments.texture_size,
+            obj=arguments.obj,
+            on_progress=display,
+        )
     for name, text in lines.items():
         print(f"{name}: {text}")
 

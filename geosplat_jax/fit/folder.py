@@ -13,6 +13,7 @@
     report.html           all of it as one page
 """
 
+import csv
 import importlib.metadata
 import json
 import os
@@ -303,6 +304,34 @@ class RunFolder:
                 raise RunError(f"line {number} of {self.metrics} is damaged") from None
             lines.append(line)
         return lines
+
+    def write_csv(self, path: str | Path) -> None:
+        """Write the metrics of all steps as a table: a row a step, a column a number.
+
+        What a step did not measure is left empty; ``usage`` and ``capacities`` of buffers are named
+        ``usage.NAME``.
+
+        Raises
+        ------
+        RunError
+            See `metric_lines`.
+        OSError
+            If the file cannot be written.
+        """
+        rows = []
+        for line in self.metric_lines():
+            flat = {}
+            for name, value in line.items():
+                parts = value if isinstance(value, dict) else {}
+                flat |= {f"{name}.{part}": number for part, number in parts.items()} or {
+                    name: value
+                }
+            rows.append(flat)
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        with Path(path).open("w", encoding="utf-8", newline="") as file:
+            table = csv.DictWriter(file, names)
+            table.writeheader()
+            table.writerows(rows)
 
     def keep_lines_before(self, step: int) -> None:
         """Drop the metrics of steps that a checkpoint does not contain."""

@@ -162,6 +162,7 @@ def fit(
     stop_after: int | None = None,
     on_step: Callable[[Progress], None] | None = None,
     on_preview: Callable[[Trained], None] | None = None,
+    on_compile: Callable[[str], None] | None = None,
 ) -> TrainState:
     """Train on a dataset and leave a run's folder; see `folder.RunFolder`.
 
@@ -178,6 +179,7 @@ def fit(
     stop_after : stop, with a checkpoint, once so many steps are done (for tests and schedulers).
     on_step : called after every step.
     on_preview : called every ``run.preview_every`` steps, and once early.
+    on_compile : called with the name of the stage before a step waits for a compilation.
 
     Raises
     ------
@@ -213,6 +215,7 @@ def fit(
             else:
                 run.repoint(dataset)
                 loop = resumed_loop(dataset, config, run)
+            loop.on_compile = on_compile
             last = min(config.total_steps, stop_after or config.total_steps)
             try:
                 return _train(loop, last, stop_requested, on_step, on_preview)

@@ -1,4 +1,4 @@
-"""Assets that other programs open: GLB meshes with PBR textures, Gaussian PLY, light EXR.
+"""Assets that other programs open: GLB and OBJ with PBR textures, Gaussian PLY, light EXR.
 
 Every file is written beside its destination and then renamed, so that an interrupted export leaves
 the previous file whole.
@@ -37,6 +37,9 @@ LARGEST_TEXTURE = 16_384
 
 _TEXEL_BYTES = 4 * (1 + 3 + 5)
 """Of a texel while a texture is baked: its face, barycentric coordinates and materials."""
+
+# glTF's targets of a buffer: vertex attributes and indices.
+_VERTEX_BUFFER, _INDEX_BUFFER = 34962, 34963
 
 _SAMPLES_PER_CALL = 1 << 16
 _SH_DC = 0.28209479177387814
@@ -126,12 +129,54 @@ def _write_glb(
     mesh: trimesh.Trimesh,
     tree_postprocessor: Callable[[dict], None] | None = None,
 ) -> None:
-    """Serialise one mesh with its normals."""
+    """Serialise one mesh with its normals, and say of each buffer what it holds."""
+
+    def complete(tree: dict) -> None:
+        if tree_postprocessor is not None:
+            tree_postprocessor(tree)
+        for primitive in (p for part in tree["meshes"] for p in part["primitives"]):
+            for accessor in primitive["attributes"].values():
+                view = tree["accessors"][accessor]["bufferView"]
+                tree["bufferViews"][view]["target"] = _VERTEX_BUFFER
+            indices = tree["accessors"][primitive["indices"]]["bufferView"]
+            tree["bufferViews"][indices]["target"] = _INDEX_BUFFER
+
     data = export_glb(
-        trimesh.Scene({"mesh": mesh}), include_normals=True, tree_postprocessor=tree_postprocessor
+        trimesh.Scene({"mesh": mesh}), include_normals=True, tree_postprocessor=complete
     )
     with written_aside(path) as aside:
         aside.write_bytes(data)
+
+
+def _write_obj(path: str | Path, mesh: trimesh.Trimesh) -> None:
+    """Write a textured mesh as OBJ, its material beside it as MTL, and its textures as PNG.
+
+    Roughness and metallic have no place in the format's first version; their maps, ``map_Pr`` and
+    ``map_Pm``, are those of its usual extension, and grey.
+    """
+    path = Path(path)
+    material = mesh.visual.material
+    packed = np.asarray(material.metallicRoughnessTexture)
+    maps = {
+        "map_Kd": ("base_color", material.baseColorTexture),
+        "map_Pr": ("roughness", Image.fromarray(packed[..., 1])),
+        "map_Pm": ("metallic", Image.fromarray(packed[..., 2])),
+    }
+    lines = ["newmtl material", "Kd 1 1 1", "Pr 1", "Pm 1"]
+    for key, (name, image) in maps.items():
+        file = path.with_name(f"{path.stem}_{name}.png")
+        with written_aside(file) as aside:
+            image.save(aside, format="PNG")
+        lines.append(f"{key} {file.name}")
+    with written_aside(path.with_suffix(".mtl")) as aside:
+        aside.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    uv, faces = np.asarray(mesh.visual.uv), np.asarray(mesh.faces) + 1
+    with written_aside(path) as aside, aside.open("w", encoding="utf-8") as file:
+        file.write(f"# y is up\nmtllib {path.with_suffix('.mtl').name}\nusemtl material\n")
+        np.savetxt(file, np.asarray(mesh.vertices), "v %.7g %.7g %.7g")
+        np.savetxt(file, uv, "vt %.7g %.7g")
+        np.savetxt(file, np.asarray(mesh.vertex_normals), "vn %.5g %.5g %.5g")
+        np.savetxt(file, np.repeat(faces, 3, axis=1), "f %d/%d/%d %d/%d/%d %d/%d/%d")
 
 
 def _standardize_vertex_color(tree: dict) -> None:
@@ -234,6 +279,7 @@ def export_mesh_glb(
     *,
     vertex_colors: bool = False,
     texture_size: int = 1024,
+    obj_path: str | Path | None = None,
 ) -> dict[str, Any]:
     """Write a mesh and its materials as a binary glTF 2.0 file.
 
@@ -253,6 +299,7 @@ def export_mesh_glb(
         metallic (N,); called with one N throughout.
     vertex_colors : colours on the vertices instead of textures.
     texture_size : width and height of the textures.
+    obj_path : also write the same mesh and textures there as OBJ, with MTL and PNG beside it.
 
     Returns
     -------
@@ -263,10 +310,13 @@ def export_mesh_glb(
     Raises
     ------
     ValueError
-        If the mesh is empty or not finite, ``sample_materials`` returns a wrong shape, or the
-        textures are of no size, of one above `LARGEST_TEXTURE`, or do not fit into the memory.
+        If an OBJ is asked for with colours on the vertices, the mesh is empty or not finite,
+        ``sample_materials`` returns a wrong shape, or the textures are of no size, of one above
+        `LARGEST_TEXTURE`, or do not fit into the memory.
     """
     start = time.perf_counter()
+    if vertex_colors and obj_path is not None:
+        raise ValueError("an OBJ has textures; leave out the colours on vertices")
     if not vertex_colors:
         _require_texture(texture_size)
     vertices, faces, normals, info = _checked_mesh(
@@ -283,6 +333,8 @@ def export_mesh_glb(
             vertices, faces, normals, sample_materials, double_sided, texture_size
         )
         _write_glb(path, mesh)
+        if obj_path is not None:
+            _write_obj(obj_path, mesh)
         info |= baking
     info |= {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
     return info | {"seconds": time.perf_counter() - start}

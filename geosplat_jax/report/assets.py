@@ -22,6 +22,7 @@ from geosplat_jax.materials import materials_at
 from geosplat_jax.render import Asset
 from geosplat_jax.report.gallery import FOLDER
 from geosplat_jax.report.light_metrics import resize_light
+from geosplat_jax.report.pace import OnProgress
 from geosplat_jax.report.renderer import Renderer, build_asset
 
 _MATERIAL_CHUNK = 65_536
@@ -90,6 +91,8 @@ def export_assets(
     *,
     vertex_colors: bool = False,
     texture_size: int = 1024,
+    obj: bool = False,
+    on_progress: OnProgress | None = None,
 ) -> dict[str, str]:
     """Write ``mesh.glb``, ``gaussians.ply`` and ``light.exr``; return a line about each.
 
@@ -102,14 +105,20 @@ def export_assets(
     trained : parameters of a run. folder : existing folder.
     vertex_colors : colours on vertices instead of an unwrapped texture.
     texture_size : edge of the square textures, texels.
+    obj : also write ``mesh.obj``, with ``mesh.mtl`` and textures as PNG.
+    on_progress : see `poses.OnProgress`.
 
     Raises
     ------
     ValueError
         If the surface is empty.
     """
+    tell = on_progress or (lambda part, done, total: None)
+    tell("surface and splats", 0, 1)
     vertices, faces, normals = Renderer.of(trained).mesh()
     asset = build_asset(trained.pipeline, trained.params)
+    tell("surface and splats", 1, 1)
+    tell("mesh and textures", 0, 1)
     mesh_info = export_mesh_glb(
         folder / "mesh.glb",
         vertices,
@@ -118,7 +127,9 @@ def export_assets(
         MaterialSampler(trained, asset),
         vertex_colors=vertex_colors,
         texture_size=texture_size,
+        obj_path=folder / "mesh.obj" if obj else None,
     )
+    tell("mesh and textures", 1, 1)
     count = int(asset.splats.count)
     rows = {
         name: np.asarray(getattr(asset.splats, name))[:count]
@@ -132,7 +143,8 @@ def export_assets(
     )
     export_light_exr(folder / "light.exr", radiance)
     height, width = trained.params.light.radiance.shape[:2]
-    return {
+    others = {str(folder / "mesh.obj"): "the same mesh, with mesh.mtl and PNG"} if obj else {}
+    return others | {
         str(folder / "mesh.glb"): ", ".join(f"{k} {v}" for k, v in mesh_info.items()),
         str(folder / "gaussians.ply"): f"{count} Gaussians",
         str(folder / "light.exr"): f"{width} x {height} lat-long, z-up, exposure included",

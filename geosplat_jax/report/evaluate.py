@@ -23,6 +23,7 @@ from geosplat_jax.report import protocols
 from geosplat_jax.report.assets import MODEL_TEXTURE, MaterialSampler, write_model
 from geosplat_jax.report.light_metrics import light_metrics
 from geosplat_jax.report.metrics import MASK_THRESHOLD, mask_iou, normal_mae_deg
+from geosplat_jax.report.pace import OnProgress, counted
 from geosplat_jax.report.protocols import Protocol
 from geosplat_jax.report.renderer import (
     DEFAULT_SAMPLES,
@@ -107,12 +108,16 @@ class _Rendered(NamedTuple):
 
 
 def _render_all(
-    renderer: Renderer, views: Views, chosen: np.ndarray, protocol: Protocol
+    renderer: Renderer,
+    views: Views,
+    chosen: np.ndarray,
+    protocol: Protocol,
+    on_progress: OnProgress | None,
 ) -> _Rendered:
     """Render every view once, and keep of it no more than is needed: views may be many."""
     metrics, shown, alpha = [], {}, []
     maps = {name: [] for name in ("albedo", *_MATERIALS) if name in views.truth}
-    for index, name in enumerate(views.names):
+    for index, name in counted([*enumerate(views.names)], "new views", on_progress):
         valid = _valid(views, index)
         view = _where_counted(renderer(views.camera(np.array([index]))), valid)
         normal = views.truth["normal"][index] if "normal" in views.truth else None
@@ -156,6 +161,7 @@ def _relight_metrics(
     albedo_scale: np.ndarray,
     indirect: str,
     chosen: np.ndarray,
+    on_progress: OnProgress | None,
 ) -> tuple[dict[str, float], list[dict[str, np.ndarray]]]:
     """Metrics of the views under every light that has true images and a map, and rows of a sheet.
 
@@ -172,7 +178,7 @@ def _relight_metrics(
         else:
             relit = renderer.relit(lights[name], albedo_scale=albedo_scale, indirect=indirect)
         rgb, alpha = np.empty((*views.masks.shape, 3), np.float32), np.empty(views.masks.shape)
-        for index in range(len(views)):
+        for index in counted(range(len(views)), f"under {name}", on_progress):
             view = relit(views.camera(np.array([index])))
             view = _where_counted(view, _valid(views, index))
             rgb[index], alpha[index] = view.rgb, view.alpha
@@ -217,6 +223,7 @@ def evaluate_run(
     sheet_views: int = 5,
     train_views: Views | None = None,
     model_texture: int | None = MODEL_TEXTURE,
+    on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
     """Render every test view, write metrics and sheets, return the metrics.
 
@@ -241,20 +248,28 @@ def evaluate_run(
     sheet_views : number of views on the sheets, spread evenly.
     train_views : those of the training, to count how many of them see each place.
     model_texture : texels along the edge of the model that the report shows; None for no model.
+    on_progress : see `poses.OnProgress`.
     """
     began = time.perf_counter()
     chosen_protocol = protocols.protocol(protocol)
     renderer = Renderer.of(trained, samples=samples)
     compiled = _relight_programs(renderer, views, lights or {}, relight_indirect)
     chosen = np.unique(np.linspace(0, len(views) - 1, sheet_views).round().astype(int))
-    rendered = _render_all(renderer, views, chosen, chosen_protocol)
+    rendered = _render_all(renderer, views, chosen, chosen_protocol, on_progress)
     lines = rendered.metrics
     names = dict.fromkeys(key for line in lines for key in line if key != "view")
     mean = {key: float(np.mean([line[key] for line in lines if key in line])) for key in names}
     materials, scale = _material_metrics(chosen_protocol, rendered, views)
     compiled.result()
     relights, relit = _relight_metrics(
-        chosen_protocol, renderer, views, lights or {}, scale, relight_indirect, chosen
+        chosen_protocol,
+        renderer,
+        views,
+        lights or {},
+        scale,
+        relight_indirect,
+        chosen,
+        on_progress,
     )
     no_map = sorted(set(views.relight) - set(lights or {}))
     notes = [protocols.lpips_note(chosen_protocol)]
@@ -264,6 +279,8 @@ def evaluate_run(
     if train_light is not None:
         found = light_metrics(radiance, np.asarray(train_light.radiance))
         mean |= {key: value for key, value in found.items() if isinstance(value, int | float)}
+    tell = on_progress or (lambda part, done, total: None)
+    tell("pictures and model", 0, 1)
     mesh = renderer.mesh()
     seen = None if train_views is None else sightings(*mesh, train_views)
     by_title = {"true light": None if train_light is None else np.asarray(train_light.radiance)}
@@ -299,6 +316,7 @@ def evaluate_run(
             eye=views.camera_to_world[0, :3, 3],
             texture_size=model_texture,
         )
+    tell("pictures and model", 1, 1)
     metrics = {
         "protocol": protocol,
         "notes": notes,
