@@ -12,6 +12,7 @@ from support import ball_of_one_material, tiny_config, views_from
 from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.core.types import EnvLight
 from geosplat_jax.io.images import SceneError, encode_srgb, write_hdr, write_png
+from geosplat_jax.report import relight
 from geosplat_jax.report.relight import (
     BACKGROUNDS,
     RelightOptions,
@@ -337,7 +338,15 @@ def test_the_orbit_of_camera_and_light_together_changes_no_background(light):
     np.testing.assert_allclose(second, first, atol=5e-3)
 
 
-def test_relighting_writes_stills_and_movies(light, matt, tmp_path):
+def test_movies_of_small_views_are_enlarged_and_those_of_large_ones_are_not():
+    small = relight._for_movies(camera_from([3.0, 0.0, 0.0]))
+    assert max(small.width, small.height) == 384
+    large = replace(camera_from([3.0, 0.0, 0.0]), width=500)
+    assert relight._for_movies(large) is large
+
+
+def test_relighting_writes_stills_and_movies(light, matt, tmp_path, monkeypatch):
+    monkeypatch.setattr(relight, "SMALLEST_MOVIE", SIZE)
     views = replace(
         views_from([[3.0, 0.0, 0.5], [0.0, 3.0, 0.5]], size=SIZE), names=("a/first", "second")
     )

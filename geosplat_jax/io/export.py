@@ -154,8 +154,10 @@ def _write_obj(path: str | Path, mesh: trimesh.Trimesh) -> None:
     Roughness and metallic have no place in the format's first version; their maps, ``map_Pr`` and
     ``map_Pm``, are those of its usual extension, and grey.
     """
-    path = Path(path)
-    material = mesh.visual.material
+    path, visual = Path(path), mesh.visual
+    assert isinstance(visual, TextureVisuals)
+    material = visual.material
+    assert isinstance(material, PBRMaterial)
     packed = np.asarray(material.metallicRoughnessTexture)
     maps = {
         "map_Kd": ("base_color", material.baseColorTexture),
@@ -164,13 +166,14 @@ def _write_obj(path: str | Path, mesh: trimesh.Trimesh) -> None:
     }
     lines = ["newmtl material", "Kd 1 1 1", "Pr 1", "Pm 1"]
     for key, (name, image) in maps.items():
+        assert image is not None
         file = path.with_name(f"{path.stem}_{name}.png")
         with written_aside(file) as aside:
             image.save(aside, format="PNG")
         lines.append(f"{key} {file.name}")
     with written_aside(path.with_suffix(".mtl")) as aside:
         aside.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    uv, faces = np.asarray(mesh.visual.uv), np.asarray(mesh.faces) + 1
+    uv, faces = np.asarray(visual.uv), np.asarray(mesh.faces) + 1
     with written_aside(path) as aside, aside.open("w", encoding="utf-8") as file:
         file.write(f"# y is up\nmtllib {path.with_suffix('.mtl').name}\nusemtl material\n")
         np.savetxt(file, np.asarray(mesh.vertices), "v %.7g %.7g %.7g")

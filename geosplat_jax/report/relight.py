@@ -16,6 +16,7 @@ from geosplat_jax.core.types import Camera, EnvLight
 from geosplat_jax.io.images import SceneError, read_linear, write_png
 from geosplat_jax.io.movies import check_movie, has_encoder, write_movie
 from geosplat_jax.io.views import ViewLight
+from geosplat_jax.report.consistency import resized
 from geosplat_jax.report.light_metrics import resize_light
 from geosplat_jax.report.pace import OnProgress, counted
 from geosplat_jax.report.renderer import RenderedView, Renderer, to_picture
@@ -25,6 +26,9 @@ from geosplat_jax.transport.environment import lookup, rotate_light, to_y_up_map
 LARGEST_LIGHT = 256
 """Rows of an environment map for lighting; finer detail is averaged, since it is only noise to a
 few hundred samples."""
+
+SMALLEST_MOVIE = 384
+"""Pixels along the longer side of movies, at least."""
 
 BACKGROUNDS = ("light", "white", "black")
 
@@ -138,6 +142,12 @@ class RelightOptions:
             check_movie(self.movie_suffix(), self.frames_per_second)
 
 
+def _for_movies(camera: Camera) -> Camera:
+    """Enlarge a small camera: dithering shows in small GIFs."""
+    is_small = max(camera.height, camera.width) < SMALLEST_MOVIE
+    return resized(camera, SMALLEST_MOVIE) if is_small else camera
+
+
 def relight_views(
     relit: Renderer,
     light: EnvLight,
@@ -153,7 +163,8 @@ def relight_views(
     Parameters
     ----------
     relit : from `Renderer.relit` with ``light``.
-    shots : cameras; the movies start from the first one.
+    shots : cameras; the movies start from the first one, and have at least
+        `SMALLEST_MOVIE` pixels along the longer side.
     folder : existing; receives ``NAME_rgba.png`` with straight alpha, ``NAME.png`` over the
         background, ``turntable`` and ``rotate_env``.
     images : what else to write (default: nothing).
@@ -173,7 +184,7 @@ def relight_views(
         written += images.write(folder, name, view)
         written.append(folder / f"{name}.png")
         write_png(written[-1], picture(view, camera, light, options.background))
-    first = shots[0].camera
+    first = _for_movies(shots[0].camera)
     center = relit.center()
 
     def on_turntable(angle: float) -> np.ndarray:
