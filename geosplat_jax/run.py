@@ -367,6 +367,7 @@ class Run:
         vertex_colors: bool = False,
         texture_size: int = 1024,
         obj: bool = False,
+        face_count: int | None = None,
         on_progress: OnProgress | None = None,
     ) -> dict[str, str]:
         """Write the mesh, Gaussians and light; return a line about each file.
@@ -379,6 +380,7 @@ class Run:
             vertex_colors=vertex_colors,
             texture_size=texture_size,
             obj=obj,
+            face_count=face_count,
             on_progress=on_progress,
         )
 

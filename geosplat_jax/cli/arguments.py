@@ -112,6 +112,9 @@ def command_line() -> argparse.ArgumentParser:
     export.add_argument("--vertex-colors", action="store_true", help="instead of textures")
     export.add_argument("--texture-size", type=int, default=1024)
     export.add_argument(
+        "--faces", type=int, metavar="N", help="reduce to about N faces, with a map of normals"
+    )
+    export.add_argument(
         "--obj", action="store_true", help="also mesh.obj, with mesh.mtl and textures as PNG"
     )
 

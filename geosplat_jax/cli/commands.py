@@ -341,14 +341,17 @@ def _export(arguments: argparse.Namespace) -> None:
         raise UsageError(
             f"--texture-size must be from 1 to {LARGEST_TEXTURE}, got {arguments.texture_size}"
         )
-    if arguments.obj and arguments.vertex_colors:
-        raise UsageError("--obj needs textures; leave --vertex-colors out")
+    if arguments.faces is not None and arguments.faces < 4:
+        raise UsageError(f"--faces must be at least 4, got {arguments.faces}")
+    if (arguments.obj or arguments.faces) and arguments.vertex_colors:
+        raise UsageError("--obj and --faces need textures; leave --vertex-colors out")
     with WorkDisplay() as display:
         lines = Run(arguments.run, scene=arguments.scene).export(
             arguments.output,
             vertex_colors=arguments.vertex_colors,
             texture_size=arguments.texture_size,
             obj=arguments.obj,
+            face_count=arguments.faces,
             on_progress=display,
         )
     for name, text in lines.items():

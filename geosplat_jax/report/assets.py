@@ -92,6 +92,7 @@ def export_assets(
     vertex_colors: bool = False,
     texture_size: int = 1024,
     obj: bool = False,
+    face_count: int | None = None,
     on_progress: OnProgress | None = None,
 ) -> dict[str, str]:
     """Write ``mesh.glb``, ``gaussians.ply`` and ``light.exr``; return a line about each.
@@ -106,6 +107,7 @@ def export_assets(
     vertex_colors : colours on vertices instead of an unwrapped texture.
     texture_size : edge of the square textures, texels.
     obj : also write ``mesh.obj``, with ``mesh.mtl`` and textures as PNG.
+    face_count : reduce the mesh to about so many faces, with a map of its normals.
     on_progress : see `poses.OnProgress`.
 
     Raises
@@ -128,6 +130,7 @@ def export_assets(
         vertex_colors=vertex_colors,
         texture_size=texture_size,
         obj_path=folder / "mesh.obj" if obj else None,
+        face_count=face_count,
     )
     tell("mesh and textures", 1, 1)
     count = int(asset.splats.count)
