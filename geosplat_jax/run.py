@@ -13,7 +13,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from geosplat_jax.core.types import Batch, EnvLight
 from geosplat_jax.fit.budget import Pacer, Plan, plan
@@ -27,18 +26,20 @@ from geosplat_jax.fit.stages import make_batch
 from geosplat_jax.fit.train import Progress, Trained, fit, load_trained
 from geosplat_jax.io.cameras import RefinedSplit, write_cameras
 from geosplat_jax.io.dataset import Dataset, load_recorded, photograph_size
-from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.images import write_png
 from geosplat_jax.io.views import Views
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
 from geosplat_jax.report.assets import export_assets
 from geosplat_jax.report.consistency import Consistency, body_of_run, measure, single_cameras
-from geosplat_jax.report.evaluate import evaluate_run, preview_image
-from geosplat_jax.report.pictures import normals_to_rgb
+from geosplat_jax.report.evaluate import evaluate_run
+from geosplat_jax.report.pace import OnProgress, counted
+from geosplat_jax.report.page import REPORT, Evaluated, write_report
 from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.relight import RelightOptions, load_light, load_view_light, relight_views
-from geosplat_jax.report.renderer import DEFAULT_SAMPLES, Renderer, straight_rgba
+from geosplat_jax.report.renderer import DEFAULT_SAMPLES, Renderer
+from geosplat_jax.report.sheets import preview_image
+from geosplat_jax.report.shots import Cameras, Images
 
 REFINEMENT_SAMPLES = 32
 """Rays per splat when cameras are refined: noise averages out over the pixels of a view."""
@@ -132,13 +133,10 @@ class Run:
         RunError
             If there was none, or its file is damaged.
         """
-        path = self.folder.path / "metrics.json"
-        if not path.exists():
+        found = Evaluated.of(self.folder).metrics()
+        if not found:
             raise RunError(f"{self.folder} has not been evaluated; do so first")
-        try:
-            return parse_json(path.read_bytes())
-        except ValueError as error:
-            raise RunError(f"{path} is damaged: {error}; evaluate the run again") from None
+        return found
 
     def _views(self, split: str) -> Views:
         """Return a split that has views."""
@@ -159,8 +157,9 @@ class Run:
         samples: int = DEFAULT_SAMPLES,
         relight_indirect: str = "traced",
         stage: str | None = None,
+        on_progress: OnProgress | None = None,
     ) -> dict[str, Any]:
-        """Compare the test views with the truth; write ``metrics.json`` and sheets of pictures.
+        """Compare the test views with the truth; write metrics, sheets of pictures and a report.
 
         See `evaluate.evaluate_run` for the arguments.
 
@@ -168,6 +167,7 @@ class Run:
         ----------
         stage : evaluate what this stage ended with, and write to the folder of its checkpoint;
             the run as it is now by default.
+        on_progress : called with a part of the work, how much of it is done, and how much there is.
 
         Raises
         ------
@@ -184,10 +184,11 @@ class Run:
         trained = self.trained if stage is None else load_trained(self.folder, stage=stage)
         lights = {name: load_light(path) for name, path in dataset.lights.items()}
         peaks = [line["peak_memory_mb"] for line in self.steps() if "peak_memory_mb" in line]
-        return evaluate_run(
+        evaluated = Evaluated.of(self.folder, stage=stage)
+        metrics = evaluate_run(
             trained,
             views,
-            self.folder.path if stage is None else self.folder.end_of(stage),
+            evaluated.results,
             meta={
                 "scene": record["scene"],
                 "dataset": record["dataset"],
@@ -201,7 +202,29 @@ class Run:
             train_light=_true_light(dataset, lights),
             samples=samples,
             relight_indirect=relight_indirect,
+            train_views=dataset.train,
+            on_progress=on_progress,
         )
+        write_report(evaluated.results / REPORT, [evaluated])
+        return metrics
+
+    def report(self, output: Path | None = None, *, others: Sequence["Run"] = ()) -> Path:
+        """Write ``report.html``, one self-contained page; return its path.
+
+        Made of what training and the last evaluation left; see `report.page`.
+
+        Parameters
+        ----------
+        output : file (default: ``report.html`` in the run's folder).
+        others : runs to compare with, on the same page.
+
+        Raises
+        ------
+        RunError
+            If a file of a run is damaged.
+        """
+        runs = [Evaluated.of(run.folder) for run in (self, *others)]
+        return write_report(output or self.folder.path / REPORT, runs)
 
     def consistency(self, *, stage: str | None = None, size: int | None = None) -> Consistency:
         """Measure how well the splats stand for the mesh, over the views to show.
@@ -216,16 +239,40 @@ class Run:
         trained = self.trained if stage is None else load_trained(self.folder, stage=stage)
         return measure(body_of_run(trained), single_cameras(self.dataset.views_to_show, size))
 
-    def render(self, split: str = "test", output: Path | None = None) -> list[Path]:
-        """Write every view of a split as ``NAME_rgba.png`` and ``NAME_normal.png``."""
-        views, written = self._views(split), []
-        folder, renderer = self._output(output, "renders"), self.renderer()
-        for index, name in enumerate(views.names):
-            view = renderer(views.camera(np.array([index])))
-            stem = name.replace("/", "_").strip("._")
-            written += [folder / f"{stem}_rgba.png", folder / f"{stem}_normal.png"]
-            write_png(written[-2], straight_rgba(view))
-            write_png(written[-1], normals_to_rgb(view.aovs["normal"], view.alpha))
+    def render(
+        self,
+        split: str = "test",
+        output: Path | None = None,
+        *,
+        cameras: Cameras | None = None,
+        images: Images | None = None,
+        samples: int = DEFAULT_SAMPLES,
+        on_progress: OnProgress | None = None,
+    ) -> list[Path]:
+        """Render views, or from any cameras, under the light that was found; return the files.
+
+        Parameters
+        ----------
+        split : ``test`` or ``train``, where ``cameras`` are not given.
+        output : folder (default: ``renders`` in the run's).
+        cameras : see `shots.Cameras`. images : what to write, see `shots.Images`.
+        samples : rays per splat. on_progress : as for `evaluate`.
+
+        Raises
+        ------
+        RunError
+            If the scene has no such views.
+        ValueError
+            If a size, an angle or an image is unusable.
+        """
+        cameras, images = cameras or Cameras(split), images or Images()
+        cameras.check()
+        images.check()
+        renderer = self.renderer(samples=samples).with_aovs(*images.aovs)
+        shots, written = cameras.shots(self.dataset, renderer.center()), []
+        folder = self._output(output, "renders")
+        for name, camera in counted(shots, "views", on_progress):
+            written += images.write(folder, name, renderer(camera))
         return written
 
     def relight(
@@ -234,29 +281,38 @@ class Run:
         output: Path | None = None,
         *,
         options: RelightOptions | None = None,
+        cameras: Cameras | None = None,
+        images: Images | None = None,
         intensity: float = 1.0,
         albedo_scale: Sequence[float] = (1.0, 1.0, 1.0),
         samples: int = DEFAULT_SAMPLES,
         indirect: str = "traced",
+        on_progress: OnProgress | None = None,
     ) -> list[Path]:
-        """Render the test views, and movies, under another light; return the files.
+        """Render views, and movies, under another light; return the files.
 
         Parameters
         ----------
         env : lat-long environment map.
         output : folder (default: ``relight_NAME`` in the run's).
         options : which movies, and what is behind the object.
+        cameras : see `shots.Cameras` (default: the test views, or without any the training's).
+        images : what to write besides, see `shots.Images`.
         intensity : factor of the light. albedo_scale : (3,) factors of the albedo.
         samples : rays per splat. indirect : see `Renderer.relit`.
+        on_progress : as for `evaluate`.
         """
         options = options or RelightOptions()
         options.check()
+        cameras = cameras or Cameras(views=None)
+        cameras.check()
         light = EnvLight(intensity * load_light(env).radiance)
         relit = self.renderer(samples=samples).relit(
             light, albedo_scale=albedo_scale, indirect=indirect
         )
+        shots = cameras.shots(self.dataset, relit.center())
         folder = self._output(output, f"relight_{Path(env).stem}")
-        return relight_views(relit, light, self.dataset.views_to_show, folder, options)
+        return relight_views(relit, light, shots, folder, options, images, on_progress=on_progress)
 
     def refine_cameras(
         self,
@@ -307,14 +363,27 @@ class Run:
         return refined
 
     def export(
-        self, output: Path | None = None, *, vertex_colors: bool = False, texture_size: int = 1024
+        self,
+        output: Path | None = None,
+        *,
+        vertex_colors: bool = False,
+        texture_size: int = 1024,
+        obj: bool = False,
+        face_count: int | None = None,
+        on_progress: OnProgress | None = None,
     ) -> dict[str, str]:
-        """Write ``mesh.glb``, ``gaussians.ply`` and ``light.exr``; return a line about each."""
+        """Write the mesh, Gaussians and light; return a line about each file.
+
+        See `assets.export_assets`; ``on_progress`` as for `evaluate`.
+        """
         return export_assets(
             self.trained,
             self._output(output, "export"),
             vertex_colors=vertex_colors,
             texture_size=texture_size,
+            obj=obj,
+            face_count=face_count,
+            on_progress=on_progress,
         )
 
 
@@ -395,6 +464,7 @@ def train(
     first_stage: str | None = None,
     on_step: Callable[[Progress], None] | None = None,
     budget: Budget | None = None,
+    on_compile: Callable[[str], None] | None = None,
     **reading: Any,
 ) -> Run:
     """Train a scene into a run's folder.
@@ -405,7 +475,8 @@ def train(
     output : folder of the run.
     config : settings, see `make_config`; by default those of ``quality``.
     mesh : file of a mesh to start from instead of a visual hull, see `fit.presets.with_mesh`.
-    resume, force, source, first_stage, on_step : see `fit.train.fit`; ``force`` replaces a run.
+    resume, force, source, first_stage, on_step, on_compile : see `fit.train.fit`; ``force``
+        replaces a run.
     budget : time and memory that the training may take. Without ``config``, settings are chosen for
         it (`plan_training`); in any case steps are made fewer or more on the way, so that it ends
         in time. A run that is resumed has what is left of it.
@@ -446,6 +517,7 @@ def train(
             on_step=on_step,
             on_preview=previews,
             pacer=pacer,
+            on_compile=on_compile,
         )
     finally:
         previews.finish()

@@ -12,9 +12,13 @@ from support import MONTE_CARLO, ball_of_one_material, tiny_config, views_from
 from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.core.types import EnvLight
 from geosplat_jax.fit.train import Trained
-from geosplat_jax.report.evaluate import evaluate_run, preview_image
+from geosplat_jax.io.images import read_image
+from geosplat_jax.report import sheets
+from geosplat_jax.report.evaluate import evaluate_run
+from geosplat_jax.report.gallery import comparisons
 from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.renderer import RELIGHT_BOUNCES, Renderer
+from geosplat_jax.report.sheets import preview_image
 
 AMPLE = Capacities(
     surface_cubes=256,
@@ -117,14 +121,22 @@ def views(run):
 
 
 def evaluate(run, views, folder, **kwargs):
-    options = {"lights": LIGHTS, "meta": {"step": 7}, "samples": SAMPLES, **kwargs}
+    options = {
+        "lights": LIGHTS,
+        "meta": {"step": 7},
+        "samples": SAMPLES,
+        "model_texture": None,
+        **kwargs,
+    }
     return evaluate_run(run, views, folder, **options)
 
 
 @pytest.fixture(scope="module")
 def perfect(run, views, tmp_path_factory):
     folder = tmp_path_factory.mktemp("perfect")
-    return folder, evaluate(run, views, folder, train_light=run.params.light)
+    return folder, evaluate(
+        run, views, folder, train_light=run.params.light, train_views=views, model_texture=32
+    )
 
 
 def test_truth_of_the_own_making_is_met(perfect):
@@ -174,6 +186,7 @@ def test_the_files_are_written(perfect):
         "overview.png",
         "materials.png",
         "relight.png",
+        "evaluation",
     }
     for path in folder.glob("*.png"):
         pixels = np.asarray(Image.open(path))
@@ -185,7 +198,39 @@ def test_without_truth_there_are_no_metrics_of_it(run, views, tmp_path):
     bare = replace(views, truth={}, relight={})
     metrics = evaluate(run, bare, tmp_path)
     assert set(metrics["mean"]) == NEW_VIEWS
-    assert {path.name for path in tmp_path.iterdir()} == {"metrics.json", "overview.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        *("metrics.json", "overview.png", "evaluation"),
+    }
+    titles = {name for view in metrics["gallery"]["views"] for name in view["pictures"]}
+    assert titles == {
+        *("truth", "render", "error", "normal", "albedo", "roughness", "metallic", "mesh"),
+    }
+    assert metrics["seen"] is None
+
+
+def test_every_picture_is_there_for_itself_truth_beside_it(perfect):
+    folder, metrics = perfect
+    gallery = metrics["gallery"]
+    assert [view["view"] for view in gallery["views"]] == ["view_0", "view_1"]
+    files = gallery["views"][0]["pictures"]
+    pairs = comparisons(list(files))
+    assert ("truth", "render") in pairs
+    assert ("true albedo", "albedo, aligned") in pairs
+    assert {"noon", "evening", "normal", "roughness", "metallic"} <= {name for _, name in pairs}
+    for true, found in pairs:
+        pixels = [np.asarray(Image.open(folder / files[name]), float) for name in (true, found)]
+        # The parameters made the truth, and 8 bits hold both.
+        assert np.abs(pixels[0] - pixels[1]).mean() < 2, found
+    assert list(gallery["lights"]) == ["true light", "light"]
+    assert all((folder / file).is_file() for file in gallery["lights"].values())
+    model = gallery["model"]
+    assert list(model["lights"]) == ["light as found", *LIGHT_NAMES]
+    assert (folder / model["mesh"]).read_bytes()[:4] == b"glTF"
+    for file in model["lights"].values():
+        assert read_image(folder / file).shape == (8, 16, 3)
+    seen = metrics["seen"]
+    assert (seen["asked"], seen["available"]) == (2, 2)
+    assert sum(part["share"] for part in seen["shares"]) == pytest.approx(1.0)
 
 
 def test_relit_truth_without_its_map_is_left_out(run, views, tmp_path):
@@ -282,8 +327,18 @@ def test_an_unknown_protocol_is_refused_before_any_work(run, views, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_preview_shows_truth_render_and_normals(run, views):
-    shown = preview_image(run, views)
-    assert shown.shape == (16, 48, 3)
-    np.testing.assert_allclose(shown[:, :16], shown[:, 16:32], atol=0.2)
-    assert np.ptp(shown[:, 32:]) > 0.3
+def test_the_preview_shows_truth_render_error_and_normals_and_says_when(run, views, monkeypatch):
+    told = {}
+
+    def sheet(rows, **words):
+        told.update(rows=rows, **words)
+        return np.zeros((1, 1, 3), np.float32)
+
+    monkeypatch.setattr(sheets, "overview_sheet", sheet)
+    preview_image(run, views)
+    (row,) = told["rows"]
+    assert list(row) == ["truth", "render", "error", "normal"]
+    np.testing.assert_allclose(row["truth"], row["render"], atol=0.2)
+    assert np.ptp(row["normal"]) > 0.3
+    assert told["title"] == "step 3, monte_carlo"
+    assert told["row_labels"] == ["view_0"]

@@ -1,17 +1,22 @@
 """Exported meshes, Gaussians and lights hold what was given; broken input leaves no file."""
 
 import json
+import os
+import shutil
 import struct
+import subprocess
+import sys
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from scipy import ndimage
 
 from geosplat_jax.core.types import Camera, Mesh
-from geosplat_jax.io import export, meshes
-from geosplat_jax.io.images import read_linear
+from geosplat_jax.io import baking, export, meshes
+from geosplat_jax.io.images import SceneError, read_linear
 
 # Half a texel across a chart's border, where a filled gutter is constant; 8 bits are far finer.
 COLOR_TOLERANCE = 0.03
@@ -197,6 +202,190 @@ def test_degenerate_faces_are_dropped_before_unwrapping(tmp_path):
     assert info["dropped_faces"] == 3
     assert info["faces"] == len(faces)
     assert info["closed"]
+
+
+def test_every_buffer_of_a_glb_says_what_it_holds(tmp_path):
+    for name, options in {"a": {"texture_size": 64}, "b": {"vertex_colors": True}}.items():
+        path = tmp_path / f"{name}.glb"
+        export.export_mesh_glb(path, *sphere(1), materials, **options)
+        tree = glb_tree(path)
+        (primitive,) = tree["meshes"][0]["primitives"]
+
+        def target(accessor, tree=tree):
+            return tree["bufferViews"][tree["accessors"][accessor]["bufferView"]]["target"]
+
+        assert {target(n) for n in primitive["attributes"].values()} == {34962}
+        assert target(primitive["indices"]) == 34963
+
+
+def test_an_obj_is_the_mesh_of_the_glb_with_the_same_textures(tmp_path):
+    path = tmp_path / "mesh.obj"
+    export.export_mesh_glb(
+        tmp_path / "mesh.glb", *sphere(), materials, texture_size=TEXTURE, obj_path=path
+    )
+    glb = only_mesh(tmp_path / "mesh.glb")
+    words = [line.split() for line in path.read_text().splitlines()]
+    columns = {
+        key: np.array([line[1:] for line in words if line[0] == key]) for key in ("v", "vt", "f")
+    }
+    np.testing.assert_allclose(columns["v"].astype(float), glb.vertices, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(columns["vt"].astype(float), glb.visual.uv, rtol=1e-5, atol=1e-6)
+    corners = [[int(n) for n in corner.split("/")] for corner in columns["f"].ravel()]
+    assert all(len(set(corner)) == 1 for corner in corners)
+    np.testing.assert_array_equal(np.array(corners)[:, 0].reshape(-1, 3) - 1, glb.faces)
+    maps = dict(line.split() for line in (tmp_path / "mesh.mtl").read_text().splitlines()[4:])
+    assert set(maps) == {"map_Kd", "map_Pr", "map_Pm"}
+    images = {key: np.asarray(Image.open(tmp_path / file)) for key, file in maps.items()}
+    np.testing.assert_array_equal(images["map_Kd"], glb.visual.material.baseColorTexture)
+    packed = np.asarray(glb.visual.material.metallicRoughnessTexture)
+    np.testing.assert_array_equal(images["map_Pr"], packed[..., 1])
+    np.testing.assert_array_equal(images["map_Pm"], packed[..., 2])
+    assert np.ptp(images["map_Pr"]) > 100
+    assert len(trimesh.load(path, process=False).faces) == len(glb.faces)
+    with pytest.raises(ValueError, match="an OBJ has textures"):
+        export.export_mesh_glb(path, *sphere(1), materials, vertex_colors=True, obj_path=path)
+
+
+def bumpy(directions):
+    """A ball with waves: points and unit normals of it in directions (N, 3)."""
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    frequency, height = 9.0, 0.02
+    radius = 1 + height * np.sin(frequency * unit).sum(1)
+    gradient = height * frequency * np.cos(frequency * unit)
+    across = gradient - (gradient * unit).sum(1, keepdims=True) * unit
+    normals = unit - across / radius[:, None]
+    return unit * radius[:, None], normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def accessor(path, tree, number):
+    """Read floats or indices of a GLB without a library."""
+    data = path.read_bytes()
+    start = 20 + struct.unpack("<I", data[12:16])[0] + 8
+    found = tree["accessors"][number]
+    view = tree["bufferViews"][found["bufferView"]]
+    kind = {5126: "<f4", 5125: "<u4", 5123: "<u2"}[found["componentType"]]
+    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[found["type"]]
+    at = start + view.get("byteOffset", 0) + found.get("byteOffset", 0)
+    return np.frombuffer(data, kind, found["count"] * width, at).reshape(-1, width)
+
+
+def decoded_normals(path, count=4000):
+    """Points, and normals as a renderer decodes them from map and tangents; and the mesh's own."""
+    tree = glb_tree(path)
+    (primitive,) = tree["meshes"][0]["primitives"]
+    names = ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_0")
+    columns = {n: accessor(path, tree, primitive["attributes"][n]) for n in names}
+    faces = accessor(path, tree, primitive["indices"]).reshape(-1, 3).astype(int)
+    rng = np.random.default_rng(0)
+    corners = faces[rng.integers(len(faces), size=count)]
+    weights = rng.dirichlet([2.0] * 3, count)
+    at = {n: np.einsum("nk,nkd->nd", weights, values[corners]) for n, values in columns.items()}
+    image = only_mesh(path).visual.material.normalTexture
+    texel = 2 * sample(image, at["TEXCOORD_0"] * [1, -1] + [0, 1]) - 1
+    normal = at["NORMAL"] / np.linalg.norm(at["NORMAL"], axis=1, keepdims=True)
+    tangent = at["TANGENT"][:, :3] / np.linalg.norm(at["TANGENT"][:, :3], axis=1, keepdims=True)
+    bitangent = np.cross(normal, tangent) * np.sign(at["TANGENT"][:, 3:])
+    shown = texel[:, :1] * tangent + texel[:, 1:2] * bitangent + texel[:, 2:] * normal
+    shown /= np.linalg.norm(shown, axis=1, keepdims=True)
+    return to_z_up(at["POSITION"]), to_z_up(shown), to_z_up(normal)
+
+
+def test_a_map_of_normals_gives_a_mesh_of_few_faces_the_look_of_the_fine_one(tmp_path):
+    pytest.importorskip("fast_simplification", reason="fewer faces need fast-simplification")
+    directions, faces, _ = sphere(5)
+    vertices, normals = bumpy(directions)
+    path = tmp_path / "mesh.glb"
+    info = export.export_mesh_glb(
+        *(path, vertices, faces, normals, materials),
+        texture_size=512,
+        face_count=2500,
+        obj_path=tmp_path / "mesh.obj",
+    )
+    assert info["faces"] == pytest.approx(2500, rel=0.02)
+    points, shown, plain = decoded_normals(path)
+    expected = bumpy(points)[1]
+
+    def error(found):
+        return np.degrees(np.arccos(np.clip((found * expected).sum(1), -1, 1)))
+
+    assert np.median(error(shown)) < 1.2
+    assert np.median(error(shown)) < 0.5 * np.median(error(plain))
+    maps = (tmp_path / "mesh.mtl").read_text()
+    assert "norm mesh_normal.png" in maps
+    tangents = accessor(
+        path, glb_tree(path), glb_tree(path)["meshes"][0]["primitives"][0]["attributes"]["TANGENT"]
+    )
+    np.testing.assert_allclose(np.linalg.norm(tangents[:, :3], axis=1), 1, atol=1e-5)
+    assert set(np.unique(tangents[:, 3])) <= {-1.0, 1.0}
+
+
+def test_tangents_follow_u_and_the_bitangent_points_to_the_top_of_the_texture():
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    normals = np.tile([0, 0, 1.0], (4, 1))
+    uv = np.array([[0, 1], [1, 1], [1, 0], [0, 0.0]])  # v runs down: y is up on the texture
+    found = baking.vertex_tangents(vertices, faces, normals, uv)
+    np.testing.assert_allclose(found, np.tile([1, 0, 0, 1.0], (4, 1)), atol=1e-6)
+    mirrored = baking.vertex_tangents(vertices, faces, normals, uv * [-1, 1] + [1, 0])
+    np.testing.assert_allclose(mirrored, np.tile([-1, 0, 0, -1.0], (4, 1)), atol=1e-6)
+    nothing = baking.vertex_tangents(vertices, faces, normals, np.zeros((4, 2)))
+    np.testing.assert_allclose(np.linalg.norm(nothing[:, :3], axis=1), 1)
+    np.testing.assert_allclose((nothing[:, :3] * normals).sum(1), 0, atol=1e-6)
+
+
+def test_the_nearest_point_of_a_surface_is_that_of_all_its_faces():
+    vertices, faces, normals = sphere(2)
+    points = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    surface = baking.FineSurface(vertices, normals, faces)
+    places, found = surface.nearest(points)
+    corners = vertices.astype(float)[faces]
+    for point, place in zip(points, places, strict=True):
+        close = trimesh.triangles.closest_point(
+            corners, np.tile(point.astype(float), (len(faces), 1))
+        )
+        best = np.linalg.norm(close - point, axis=1).min()
+        assert np.linalg.norm(place - point) == pytest.approx(best, rel=1e-4)
+    towards = places / np.linalg.norm(places, axis=1, keepdims=True)
+    assert np.all((towards * found).sum(1) > 0.995)
+
+
+def test_fewer_faces_without_the_package_say_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "fast_simplification", None)
+    with pytest.raises(SceneError, match=r"pip install 'geosplat_jax\[mesh\]'"):
+        baking.simplified(*sphere(1)[:2], 10)
+    with pytest.raises(ValueError, match="at least 4 faces, got 3"):
+        baking.simplified(*sphere(1)[:2], 3)
+
+
+VALIDATOR = """
+const validator = require(process.argv[2]);
+const bytes = new Uint8Array(require("fs").readFileSync(process.argv[3]));
+validator.validateBytes(bytes).then((report) => console.log(JSON.stringify(report.issues)));
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options",
+    [{"texture_size": 64}, {"vertex_colors": True}, {"texture_size": 64, "face_count": 100}],
+)
+def test_the_khronos_validator_has_nothing_to_say(tmp_path, options):
+    node, package = shutil.which("node"), os.environ.get("GLTF_VALIDATOR")
+    if node is None or package is None:
+        pytest.skip(
+            "no validator: install node and the npm package gltf-validator, and name its "
+            "folder in GLTF_VALIDATOR"
+        )
+    if "face_count" in options:
+        pytest.importorskip("fast_simplification", reason="fewer faces need fast-simplification")
+    path = tmp_path / "mesh.glb"
+    export.export_mesh_glb(path, *sphere(2), materials, **options)
+    script = tmp_path / "validate.js"
+    script.write_text(VALIDATOR)
+    said = subprocess.run(
+        [node, script, package, path], capture_output=True, text=True, check=True, timeout=60
+    ).stdout
+    assert json.loads(said)["messages"] == []
 
 
 def test_unusable_meshes_are_refused_and_leave_no_file(tmp_path):

@@ -6,6 +6,7 @@ import shutil
 import stat
 import subprocess
 import sys
+import types
 
 import jax.numpy as jnp
 import numpy as np
@@ -223,8 +224,19 @@ def test_encoder_that_writes_nothing_is_an_error(tmp_path, monkeypatch):
         write_movie(tmp_path / "film.mp4", ramp_frames(2), frames_per_second=24)
 
 
+def test_the_encoder_of_a_package_serves_where_none_is_on_the_path(tmp_path, monkeypatch):
+    install_fake(tmp_path / "bin", monkeypatch, RECORD)
+    package = types.SimpleNamespace(get_ffmpeg_exe=lambda: str(tmp_path / "bin" / "ffmpeg"))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", package)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert has_encoder(".mp4")
+    write_movie(tmp_path / "film.mp4", ramp_frames(2, 4, 4), frames_per_second=24)
+    assert (tmp_path / "film.mp4").stat().st_size == 2 * 4 * 4 * 3
+
+
 def test_missing_encoder_names_the_cure(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     assert not has_encoder(".mp4")
     assert has_encoder(".gif")
     assert has_encoder(".GIF")

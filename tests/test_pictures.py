@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from geosplat_jax.report import pictures
+from geosplat_jax.report.scales import ERROR
 
 SHEET = np.asarray(pictures._SHEET_COLOR, np.float32)
 CELL = np.asarray(pictures._CELL_COLOR, np.float32)
@@ -64,13 +65,36 @@ def test_titles_labels_notes_and_light_add_room_and_ink():
     plain = pictures.overview_sheet(rows)
     light = np.ones((16, 32, 3), np.float32)
     full = pictures.overview_sheet(
-        rows, light=light, title="Spot", row_labels=["0", "1", "2"], notes=["PSNR 30"]
+        rows, lights={"light": light}, title="Spot", row_labels=["0", "1", "2"], notes=["PSNR 30"]
     )
     assert full.shape[0] >= plain.shape[0] + 100
     assert full.shape[1] > plain.shape[1]
     title = full[: pictures._TITLE_HEIGHT, :80]
     assert np.any(title > 0.5)
     np.testing.assert_array_equal(find(full, [0.7] * 3)[1] - find(full, [0.7] * 3)[0], 308)
+
+
+def test_columns_are_as_wide_as_their_names():
+    rows = [{"roughness": flat(0.5, 8, 8), "true roughness": flat(0.7, 8, 8)}]
+    top, bottom, left, right = find(pictures.overview_sheet(rows), [0.7] * 3)
+    assert right - left >= pictures._text_width("true roughness")
+    # Pixels stay square and are repeated whole.
+    assert bottom - top == right - left
+    assert (right - left) % 8 == 0
+
+
+def test_scales_and_several_lights_stand_below_with_their_titles():
+    rows = [{name: flat(0.5, 64, 100) for name in "abcd"}]
+    lights = {"true light": flat(0.1, 8, 16), "light": flat(0.2, 8, 16)}
+    plain = pictures.overview_sheet(rows)
+    sheet = pictures.overview_sheet(rows, lights=lights, scales=[ERROR])
+    # Each is exposed for itself, so that both have one grey here.
+    strips = find(sheet, pictures.tone_map_light(lights["light"])[0, 0])
+    assert strips[3] - strips[2] > 2 * 200
+    bar = find(sheet, ERROR.colors[-1])
+    assert bar[0] > strips[1] > plain.shape[0] - 2 * pictures._MARGIN
+    ink = np.any(sheet[bar[0] : bar[1], bar[3] + 4 : bar[3] + 60] != SHEET, axis=-1)
+    assert ink.any()
 
 
 def test_unusable_input_is_named():

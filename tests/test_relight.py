@@ -12,16 +12,16 @@ from support import ball_of_one_material, tiny_config, views_from
 from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.core.types import EnvLight
 from geosplat_jax.io.images import SceneError, encode_srgb, write_hdr, write_png
+from geosplat_jax.report import relight
 from geosplat_jax.report.relight import (
     BACKGROUNDS,
     RelightOptions,
-    about_z,
     load_light,
-    orbit,
     picture,
     relight_views,
 )
 from geosplat_jax.report.renderer import RenderedView, Renderer
+from geosplat_jax.report.shots import about_z, orbit, shots_of
 from geosplat_jax.transport import environment
 
 AMPLE = Capacities(
@@ -338,12 +338,20 @@ def test_the_orbit_of_camera_and_light_together_changes_no_background(light):
     np.testing.assert_allclose(second, first, atol=5e-3)
 
 
-def test_relighting_writes_stills_and_movies(light, matt, tmp_path):
+def test_movies_of_small_views_are_enlarged_and_those_of_large_ones_are_not():
+    small = relight._for_movies(camera_from([3.0, 0.0, 0.0]))
+    assert max(small.width, small.height) == 384
+    large = replace(camera_from([3.0, 0.0, 0.0]), width=500)
+    assert relight._for_movies(large) is large
+
+
+def test_relighting_writes_stills_and_movies(light, matt, tmp_path, monkeypatch):
+    monkeypatch.setattr(relight, "SMALLEST_MOVIE", SIZE)
     views = replace(
         views_from([[3.0, 0.0, 0.5], [0.0, 3.0, 0.5]], size=SIZE), names=("a/first", "second")
     )
     options = RelightOptions(turntable=2, rotate_env=2, suffix=".gif", frames_per_second=10.0)
-    written = relight_views(matt, light, views, tmp_path, options)
+    written = relight_views(matt, light, shots_of(views), tmp_path, options)
     assert [path.name for path in written] == [
         "a_first_rgba.png",
         "a_first.png",
@@ -376,7 +384,9 @@ def test_relighting_writes_stills_and_movies(light, matt, tmp_path):
 
 def test_without_movies_only_stills_are_written(light, matt, tmp_path):
     views = views_from([[3.0, 0.0, 0.5]], size=SIZE)
-    written = relight_views(matt, light, views, tmp_path, RelightOptions(background="white"))
+    written = relight_views(
+        matt, light, shots_of(views), tmp_path, RelightOptions(background="white")
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(p.name for p in written)
     assert len(written) == 2
     assert np.all(np.asarray(Image.open(written[1]))[0, 0] == 255)

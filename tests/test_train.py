@@ -38,7 +38,15 @@ def dataset():
 def finished(dataset, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "run"
     seen = []
-    state = fit(dataset, tiny_config(), folder, on_step=seen.append)
+    compiled = []
+
+    def compiles(stage):
+        # What a step waits for is told before that step.
+        compiled.append((stage, len(seen)))
+
+    state = fit(dataset, tiny_config(), folder, on_step=seen.append, on_compile=compiles)
+    assert compiled[0] == ("split_sum", 0)
+    assert {stage for stage, _ in compiled} == {"split_sum"}
     return folder, state, seen
 
 

@@ -16,6 +16,7 @@ from geosplat_jax.report.consistency import DEFAULT_VIEWS
 from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.relight import BACKGROUNDS
 from geosplat_jax.report.renderer import DEFAULT_SAMPLES, RELIGHT_KINDS
+from geosplat_jax.report.shots import AOVS, SPLITS
 
 
 def command_line() -> argparse.ArgumentParser:
@@ -62,6 +63,9 @@ def command_line() -> argparse.ArgumentParser:
         help="first train at quality draft and set the cameras right with what came out, so often "
         "(once by default); docs/cameras.md",
     )
+    train.add_argument(
+        "--csv", type=Path, metavar="FILE", help="also write loss, terms and PSNR of every step"
+    )
     start = train.add_mutually_exclusive_group()
     start.add_argument(
         "--resume", action="store_true", help="continue from the last checkpoint, or start again"
@@ -90,6 +94,12 @@ def command_line() -> argparse.ArgumentParser:
         "--stage", help="what this stage ended with, instead of the run as it is now"
     )
 
+    report = commands.add_parser("report", help="report.html of a run, or of several to compare")
+    report.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    report.add_argument(
+        "--output", type=Path, help="file (default: RUN/report.html; needed for several runs)"
+    )
+
     consistency = commands.add_parser(
         "consistency", help="how well splats stand for the mesh of a run, or for any mesh"
     )
@@ -108,8 +118,13 @@ def command_line() -> argparse.ArgumentParser:
     )
     consistency.add_argument("--json", type=Path, help="also write the figures to this file")
 
-    render = _run_parser(commands, "render", "render a run's test or training views")
-    render.add_argument("--views", choices=("test", "train"), default="test")
+    render = _run_parser(commands, "render", "render a run from its views or any cameras")
+    _add_cameras(render, "test")
+    _add_images(render, ["normal"])
+    render.add_argument(
+        "--turntable", type=int, default=0, metavar="N", help="N cameras around the object"
+    )
+    _add_samples(render)
     render.add_argument("--output", type=Path, help="folder (default: RUN/renders)")
 
     _add_relight(_run_parser(commands, "relight", "show a run under another light"))
@@ -123,6 +138,12 @@ def command_line() -> argparse.ArgumentParser:
     export.add_argument("--output", type=Path, help="folder (default: RUN/export)")
     export.add_argument("--vertex-colors", action="store_true", help="instead of textures")
     export.add_argument("--texture-size", type=int, default=1024)
+    export.add_argument(
+        "--faces", type=int, metavar="N", help="reduce to about N faces, with a map of normals"
+    )
+    export.add_argument(
+        "--obj", action="store_true", help="also mesh.obj, with mesh.mtl and textures as PNG"
+    )
 
     gradcheck = commands.add_parser(
         "gradcheck", help="prove the gradients: float64 differences of every part"
@@ -215,6 +236,42 @@ def _add_samples(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_cameras(parser: argparse.ArgumentParser, views: str | None) -> None:
+    """Add what chooses the cameras to render from."""
+    default = "%(default)s" if views else "test, or train where the scene has no test views"
+    parser.add_argument(
+        "--views", choices=SPLITS, default=views, help=f"of the scene (default: {default})"
+    )
+    parser.add_argument(
+        "--cameras",
+        type=Path,
+        metavar="FILE",
+        help="instead of views: cameras in the form of a transforms.json, in the scene's world",
+    )
+    parser.add_argument(
+        "--size", type=int, metavar="N", help="pixels of the longer side (default: the scene's)"
+    )
+    parser.add_argument(
+        "--field-of-view",
+        type=float,
+        metavar="DEGREES",
+        help="horizontal, degrees (default: that of the cameras)",
+    )
+
+
+def _add_images(parser: argparse.ArgumentParser, aovs: list[str]) -> None:
+    """Add what chooses the images to write."""
+    shown = " ".join(aovs) or "none"
+    parser.add_argument(
+        "--aovs",
+        nargs="*",
+        choices=AOVS,
+        default=aovs,
+        help=f"images beside the colour; depth as EXR only (default: {shown})",
+    )
+    parser.add_argument("--exr", action="store_true", help="also as linear floats in EXR")
+
+
 def _add_config_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what chooses the settings of a run."""
     parser.add_argument("--preset", choices=PRESETS, help="method (default: default)")
@@ -248,6 +305,8 @@ def _add_relight(relight: argparse.ArgumentParser) -> None:
         "--env", type=Path, required=True, help="lat-long environment map: .hdr, .exr or an image"
     )
     relight.add_argument("--output", type=Path, help="folder (default: RUN/relight_NAME)")
+    _add_cameras(relight, None)
+    _add_images(relight, [])
     relight.add_argument(
         "--turntable", type=int, default=0, metavar="N", help="movie of N frames around the object"
     )

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
 from geosplat_jax.capture.masks import choose_factor, make_masks
 from geosplat_jax.capture.settings import RadianceSettings
-from geosplat_jax.cli.display import ProgressDisplay, console, say, say_refined
+from geosplat_jax.cli.display import ProgressDisplay, WorkDisplay, say, say_refined
 from geosplat_jax.cli.training import UsageError, config_from, scene_options, train
 from geosplat_jax.fit.config import all_settings
 from geosplat_jax.fit.gauge import change_lines
@@ -42,8 +41,10 @@ from geosplat_jax.report.consistency import (
     measure,
     single_cameras,
 )
+from geosplat_jax.report.page import REPORT
 from geosplat_jax.report.relight import RelightOptions
 from geosplat_jax.report.renderer import LARGEST_SAMPLES
+from geosplat_jax.report.shots import Cameras, Images
 from geosplat_jax.run import Run
 
 _SHEETS = ("overview.png", "materials.png", "relight.png")
@@ -68,24 +69,8 @@ def _poses(arguments: argparse.Namespace) -> None:
     settings = PoseSettings(
         size=arguments.size, order=arguments.order, lens=arguments.lens, seed=arguments.seed
     )
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-        console=console,
-        disable=not console.is_terminal,
-    )
-    tasks = {}
-
-    def show(part: str, done: int, total: int) -> None:
-        if part not in tasks:
-            tasks[part] = bar.add_task(part, total=total)
-            if bar.disable:
-                say(f"{part} ...")
-        bar.update(tasks[part], completed=done)
-
-    with bar:
-        report = find_poses(arguments.folder, settings, force=arguments.force, on_progress=show)
+    with WorkDisplay() as display:
+        report = find_poses(arguments.folder, settings, force=arguments.force, on_progress=display)
     total = report.registered + len(report.missing)
     print(f"cameras: {report.registered} of {total} photographs ({report.registered / total:.0%})")
     if report.missing:
@@ -159,12 +144,14 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     """Evaluate a run on its scene's test views and print the means."""
     _check_samples(arguments)
     run = Run(arguments.run, scene=arguments.scene)
-    metrics = run.evaluate(
-        protocol=arguments.protocol,
-        samples=arguments.samples,
-        relight_indirect=arguments.relight_indirect,
-        stage=arguments.stage,
-    )
+    with WorkDisplay() as display:
+        metrics = run.evaluate(
+            protocol=arguments.protocol,
+            samples=arguments.samples,
+            relight_indirect=arguments.relight_indirect,
+            stage=arguments.stage,
+            on_progress=display,
+        )
     print(f"protocol: {arguments.protocol}")
     for name, value in metrics["mean"].items():
         print(f"{name:36s} {value:9.4f}")
@@ -175,6 +162,15 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         folder = run.folder.end_of(arguments.stage)
     pictures = [name for name in _SHEETS if (folder / name).exists()]
     print(f"metrics: {folder / 'metrics.json'}\npictures: {', '.join(pictures)} in {folder}")
+    print(f"report: {folder / REPORT}")
+
+
+def _report(arguments: argparse.Namespace) -> None:
+    """Write the page of a run, or of several."""
+    first, *others = (Run(folder) for folder in arguments.runs)
+    if others and arguments.output is None:
+        raise UsageError("a report of several runs needs --output FILE")
+    print(f"report: {first.report(arguments.output, others=others)}")
 
 
 def _consistency(arguments: argparse.Namespace) -> None:
@@ -222,28 +218,60 @@ def _relight(arguments: argparse.Namespace) -> None:
         if getattr(arguments, name) < 0:
             raise UsageError(f"--{name.replace('_', '-')} must not be negative")
     _check_samples(arguments)
-    written = Run(arguments.run, scene=arguments.scene).relight(
-        arguments.env,
-        arguments.output,
-        options=RelightOptions(
-            turntable=arguments.turntable,
-            rotate_env=arguments.rotate_env,
-            background=arguments.background,
-            suffix=f".{arguments.movie}" if arguments.movie else None,
-            frames_per_second=arguments.fps,
-        ),
-        intensity=arguments.intensity,
-        albedo_scale=arguments.albedo_scale,
-        samples=arguments.samples,
-        indirect=arguments.indirect,
-    )
+    cameras = _cameras_from(arguments)
+    with WorkDisplay() as display:
+        written = Run(arguments.run, scene=arguments.scene).relight(
+            arguments.env,
+            arguments.output,
+            options=RelightOptions(
+                turntable=arguments.turntable,
+                rotate_env=arguments.rotate_env,
+                background=arguments.background,
+                suffix=f".{arguments.movie}" if arguments.movie else None,
+                frames_per_second=arguments.fps,
+            ),
+            cameras=cameras,
+            images=_images_from(arguments),
+            intensity=arguments.intensity,
+            albedo_scale=arguments.albedo_scale,
+            samples=arguments.samples,
+            indirect=arguments.indirect,
+            on_progress=display,
+        )
     print(f"{len(written)} files: {written[0].parent}")
 
 
+def _cameras_from(arguments: argparse.Namespace, turntable: int = 0) -> Cameras:
+    """Return the cameras that the arguments ask for."""
+    cameras = Cameras(
+        views=arguments.views,
+        file=arguments.cameras,
+        turntable=turntable,
+        size=arguments.size,
+        field_of_view=arguments.field_of_view,
+    )
+    cameras.check()
+    return cameras
+
+
+def _images_from(arguments: argparse.Namespace) -> Images:
+    return Images(aovs=tuple(dict.fromkeys(arguments.aovs)), exr=arguments.exr)
+
+
 def _render(arguments: argparse.Namespace) -> None:
-    """Render the views of a split."""
-    written = Run(arguments.run, scene=arguments.scene).render(arguments.views, arguments.output)
-    print(f"{len(written) // 2} views: {written[0].parent}")
+    """Render views of a split, or from other cameras."""
+    _check_samples(arguments)
+    cameras, images = _cameras_from(arguments, arguments.turntable), _images_from(arguments)
+    with WorkDisplay() as display:
+        written = Run(arguments.run, scene=arguments.scene).render(
+            output=arguments.output,
+            cameras=cameras,
+            images=images,
+            samples=arguments.samples,
+            on_progress=display,
+        )
+    count = sum(path.name.endswith("_rgba.png") for path in written)
+    print(f"{count} views, {len(written)} files: {written[0].parent}")
 
 
 def _refine_cameras(arguments: argparse.Namespace) -> None:
@@ -263,11 +291,19 @@ def _export(arguments: argparse.Namespace) -> None:
         raise UsageError(
             f"--texture-size must be from 1 to {LARGEST_TEXTURE}, got {arguments.texture_size}"
         )
-    lines = Run(arguments.run, scene=arguments.scene).export(
-        arguments.output,
-        vertex_colors=arguments.vertex_colors,
-        texture_size=arguments.texture_size,
-    )
+    if arguments.faces is not None and arguments.faces < 4:
+        raise UsageError(f"--faces must be at least 4, got {arguments.faces}")
+    if (arguments.obj or arguments.faces) and arguments.vertex_colors:
+        raise UsageError("--obj and --faces need textures; leave --vertex-colors out")
+    with WorkDisplay() as display:
+        lines = Run(arguments.run, scene=arguments.scene).export(
+            arguments.output,
+            vertex_colors=arguments.vertex_colors,
+            texture_size=arguments.texture_size,
+            obj=arguments.obj,
+            face_count=arguments.faces,
+            on_progress=display,
+        )
     for name, text in lines.items():
         print(f"{name}: {text}")
 
@@ -300,6 +336,7 @@ COMMANDS = {
     "train": train,
     "settings": _settings,
     "evaluate": _evaluate,
+    "report": _report,
     "consistency": _consistency,
     "render": _render,
     "refine-cameras": _refine_cameras,

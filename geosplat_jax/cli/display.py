@@ -1,5 +1,6 @@
 """What a terminal or a log file sees of a command that runs."""
 
+import time
 from typing import Any
 
 from rich.console import Console
@@ -8,6 +9,7 @@ from rich.text import Text
 
 from geosplat_jax.fit.cameras import ViewProgress
 from geosplat_jax.fit.train import Progress as StepProgress
+from geosplat_jax.report.pace import Pace, duration
 
 console = Console(stderr=True, highlight=False)
 
@@ -33,6 +35,66 @@ def say_refined(split: str, progress: ViewProgress) -> None:
     )
 
 
+_USUAL_COMPILATION = "usually 20 to 60 s"
+_LINE_EVERY = 10.0
+"""Seconds between two lines about a part of the work, where there is no terminal."""
+
+
+class WorkDisplay:
+    """Parts of a long work: a bar each on a terminal, a line now and then elsewhere.
+
+    Parameters
+    ----------
+    bars : whether the output is a terminal.
+    """
+
+    def __init__(self, *, bars: bool | None = None) -> None:
+        has_bars = console.is_terminal if bars is None else bars
+        self._paces: dict[str, Pace] = {}
+        self._tasks: dict[str, Any] = {}
+        self._said = time.perf_counter()
+        self._bar = None
+        if has_bars:
+            self._bar = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(),
+                TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+                TextColumn("{task.fields[left]}"),
+                console=console,
+            )
+
+    def __enter__(self) -> "WorkDisplay":
+        """Start the bars."""
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *unused: object) -> None:
+        """Stop the bars."""
+        if self._bar is not None:
+            self._bar.stop()
+
+    def __call__(self, part: str, done: int, total: int) -> None:
+        """Display how far a part is; see `poses.OnProgress`."""
+        is_new = part not in self._paces
+        left = self._paces.setdefault(part, Pace()).left(done, total)
+        if done >= total:
+            text = "done"
+        elif left is None:
+            text = "the first one compiles" if total > 1 else ""
+        else:
+            text = f"{duration(left)} left"
+        if self._bar is not None:
+            if is_new:
+                self._tasks[part] = self._bar.add_task(part, total=total, left=text)
+            self._bar.update(self._tasks[part], completed=done, left=text)
+            return
+        now = time.perf_counter()
+        if is_new or done >= total or now - self._said > _LINE_EVERY:
+            self._said = now
+            say(f"{part}: {done} of {total}" + (f", {text}" if text else ""))
+
+
 class ProgressDisplay:
     """A bar on a terminal, a line every fiftieth step elsewhere."""
 
@@ -53,6 +115,8 @@ class ProgressDisplay:
 
     def __enter__(self) -> "ProgressDisplay":
         """Start the bar."""
+        self._compiling: tuple[str, float] | None = None
+        self._compile_seconds: float | None = None
         if self._bar is not None:
             self._bar.start()
             self._task = self._bar.add_task(
@@ -71,10 +135,23 @@ class ProgressDisplay:
         if self._bar is not None:
             self._bar.stop()
 
+    def compiling(self, stage: str) -> None:
+        """Say that the next step waits for a compilation, and for how long."""
+        self._compiling = stage, time.perf_counter()
+        known = self._compile_seconds
+        usual = _USUAL_COMPILATION if known is None else f"the last took {duration(known)}"
+        if self._bar is not None:
+            self._bar.update(self._task, stage=stage, left=f"compiling, {usual}")
+        else:
+            say(f"compiling stage {stage}, {usual} ...")
+
     def show(self, progress: StepProgress) -> None:
         """Display one step."""
+        if self._compiling is not None:
+            self._compile_seconds = time.perf_counter() - self._compiling[1]
+            self._compiling = None
         left = progress.seconds_left
-        remaining = "compiling" if left is None else f"{left:.0f} s left"
+        remaining = "measuring the pace" if left is None else f"{duration(left)} left"
         if self._bar is not None:
             self._bar.update(
                 self._task,

@@ -1,6 +1,8 @@
 """The train command: what its options ask for, and the training with progress on the terminal."""
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -123,6 +125,17 @@ def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[
     return cameras
 
 
+@contextmanager
+def _table(path: Path | None, folder: Path) -> Iterator[None]:
+    """Write the steps of a run as a table when the training ends, however that is."""
+    try:
+        yield
+    finally:
+        steps = RunFolder(folder)
+        if path is not None and steps.exists:
+            steps.write_csv(path)
+
+
 def train(arguments: argparse.Namespace) -> None:
     """Train a scene into a run's folder, with progress on the terminal."""
     if (arguments.source is None) != (arguments.stage is None):
@@ -139,8 +152,8 @@ def train(arguments: argparse.Namespace) -> None:
         say(note)
     for warning in (*dataset.warnings, *config_warnings(config)):
         say(warning, label="warning: ", style="yellow")
-    say(f"{dataset.name}: {len(dataset.train)} views, {dataset.layout}; compiling ...")
-    with ProgressDisplay(config.total_steps) as display:
+    say(f"{dataset.name}: {len(dataset.train)} views, {dataset.layout} ...")
+    with ProgressDisplay(config.total_steps) as display, _table(arguments.csv, folder):
         run = train_run(
             dataset,
             folder,
@@ -150,6 +163,7 @@ def train(arguments: argparse.Namespace) -> None:
             source=arguments.source,
             first_stage=arguments.stage,
             on_step=display.show,
+            on_compile=display.compiling,
             budget=order.budget,
         )
     seconds = (run.folder.training() or {})["seconds_total"]

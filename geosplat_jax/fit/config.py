@@ -469,8 +469,10 @@ def _flat(values: Any, prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def differences(first: Config, second: Config, *, stages: list[str] | None = None) -> list[str]:
-    """Name every setting in which two configurations differ, with both values.
+def changed_settings(
+    first: Config, second: Config, *, stages: list[str] | None = None
+) -> dict[str, tuple[Any, Any]]:
+    """Map every setting in which two configurations differ to both values.
 
     ``stages`` : compare these stages only, beside what all stages share.
     """
@@ -483,7 +485,16 @@ def differences(first: Config, second: Config, *, stages: list[str] | None = Non
 
     one, two = flat(first), flat(second)
     names = sorted(set(one) | set(two))
-    return [f"{n}: {one.get(n)!r} -> {two.get(n)!r}" for n in names if one.get(n) != two.get(n)]
+    return {n: (one.get(n), two.get(n)) for n in names if one.get(n) != two.get(n)}
+
+
+def differences(first: Config, second: Config, *, stages: list[str] | None = None) -> list[str]:
+    """Name every setting in which two configurations differ, with both values.
+
+    ``stages`` : see `changed_settings`.
+    """
+    changed = changed_settings(first, second, stages=stages)
+    return [f"{name}: {old!r} -> {new!r}" for name, (old, new) in changed.items()]
 
 
 def config_warnings(config: Config) -> list[str]:

@@ -9,8 +9,11 @@
     previews/             truth, render and normals while training
     training.json         how long the whole training took
     metrics.json, *.png   what the last evaluation found
+    evaluation/           its pictures one by one, the mesh and the lights of the report
+    report.html           all of it as one page
 """
 
+import csv
 import importlib.metadata
 import json
 import os
@@ -31,7 +34,7 @@ from geosplat_jax.io.documents import parse_json
 
 _PACKAGES = ("jax", "jaxlib", "numpy", "optax", "geosplat_jax")
 _OWN = (
-    *("metrics.json", "overview.png", "materials.png", "relight.png"),
+    *("metrics.json", "overview.png", "materials.png", "relight.png", "evaluation", "report.html"),
     *("checkpoints", "stages", "previews", "metrics.jsonl", "training.json", "run.json"),
 )
 """What evaluation and training write; the record goes last: it says that the rest is a run."""
@@ -350,6 +353,34 @@ class RunFolder:
                 raise RunError(f"line {number} of {self.metrics} is damaged") from None
             lines.append(line)
         return lines
+
+    def write_csv(self, path: str | Path) -> None:
+        """Write the metrics of all steps as a table: a row a step, a column a number.
+
+        What a step did not measure is left empty; ``usage`` and ``capacities`` of buffers are named
+        ``usage.NAME``.
+
+        Raises
+        ------
+        RunError
+            See `metric_lines`.
+        OSError
+            If the file cannot be written.
+        """
+        rows = []
+        for line in self.metric_lines():
+            flat = {}
+            for name, value in line.items():
+                parts = value if isinstance(value, dict) else {}
+                flat |= {f"{name}.{part}": number for part, number in parts.items()} or {
+                    name: value
+                }
+            rows.append(flat)
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        with Path(path).open("w", encoding="utf-8", newline="") as file:
+            table = csv.DictWriter(file, names)
+            table.writeheader()
+            table.writerows(rows)
 
     def keep_lines_before(self, step: int) -> None:
         """Drop the metrics of steps that a checkpoint does not contain."""

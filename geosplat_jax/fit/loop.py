@@ -1,5 +1,6 @@
 """The state of a training between two steps: where it starts, what a step does, what is kept."""
 
+from collections.abc import Callable
 from concurrent.futures import wait
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -60,7 +61,8 @@ class Loop:
     buffers. ``views`` are windows of the photographs that hold this ``share`` of their pixels, see
     `windows.around_object`. ``upcoming`` is the next stage, once it is near; ``to_come`` is what a
     checkpoint said of it. ``has_compiled`` is set by whatever compiles, and reset by whoever
-    measures time.
+    measures time; ``on_compile`` is called with the stage's name before anything compiles that a
+    step waits for.
     """
 
     config: Config
@@ -79,6 +81,7 @@ class Loop:
     upcoming: "Upcoming | None" = None
     has_compiled: bool = False
     to_come: NextStage | None = None
+    on_compile: Callable[[str], None] | None = None
 
     @property
     def step(self) -> int:
@@ -136,6 +139,7 @@ class Loop:
         planned_for = f"{self.stage.name} {self.pipeline.splats}"
         if planned_for != self.planned_for:
             self.planned_for, self.peak = planned_for, None
+            self._announce()
             self.pipeline = replace(self.pipeline, capacities=self._planned(known))
             self._compile(step)
         following = self._following(step)
@@ -146,6 +150,15 @@ class Loop:
         """Go on with stages of other lengths; what was done stays as it was."""
         self.folder.amend(config)
         self.config, self.stage = config, config.stage(self.stage.name)
+
+    def _announce(self) -> None:
+        """Say that the next step waits for a compilation, unless it was made ahead."""
+        upcoming = self.upcoming
+        is_there = (
+            upcoming is not None and upcoming.stage.name == self.stage.name and upcoming.is_ready
+        )
+        if self.on_compile is not None and not is_there:
+            self.on_compile(self.stage.name)
 
     def close(self) -> None:
         """Leave nothing behind that still runs."""
@@ -243,6 +256,7 @@ class Loop:
         if capacities != self.pipeline.capacities:
             self.pipeline = replace(self.pipeline, capacities=capacities)
             release_programs_when_crowded()
+            self._announce()
             self._compile(step)
 
     def _not_finite(self, step: int, report: StepReport) -> str:
@@ -330,6 +344,11 @@ class Upcoming:
     def capacities(self) -> Capacities:
         """Sizes of the buffers, once they are known."""
         return self._planned.result()
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the programs are compiled."""
+        return self.compiled.done()
 
     def abandon(self) -> None:
         """Compile no further programs, and wait for the one that is being compiled."""

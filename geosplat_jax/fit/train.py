@@ -164,6 +164,7 @@ def fit(
     on_step: Callable[[Progress], None] | None = None,
     on_preview: Callable[[Trained], None] | None = None,
     pacer: Pacer | None = None,
+    on_compile: Callable[[str], None] | None = None,
 ) -> TrainState:
     """Train on a dataset and leave a run's folder; see `folder.RunFolder`.
 
@@ -182,6 +183,7 @@ def fit(
     on_preview : called every ``run.preview_every`` steps, and once early.
     pacer : keeps the training to a budget of time by changing the steps to come; ``run.json`` says
         how many there were in the end.
+    on_compile : called with the name of the stage before a step waits for a compilation.
 
     Raises
     ------
@@ -218,6 +220,7 @@ def fit(
             else:
                 run.repoint(dataset)
                 loop = resumed_loop(dataset, config, run)
+            loop.on_compile = on_compile
             try:
                 return _train(loop, stop_after, stop_requested, on_step, on_preview, pacer)
             finally:

@@ -1,4 +1,4 @@
-"""Assets that other programs open: GLB meshes with PBR textures, Gaussian PLY, light EXR.
+"""Assets that other programs open: GLB and OBJ with PBR textures, Gaussian PLY, light EXR.
 
 Every file is written beside its destination and then renamed, so that an interrupted export leaves
 the previous file whole.
@@ -18,6 +18,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from geosplat_jax.core.harmonics import CONSTANT
+from geosplat_jax.io.baking import FineSurface, in_tangent_space, simplified, vertex_tangents
 from geosplat_jax.io.images import encode_srgb, write_exr, written_aside
 from geosplat_jax.io.memory import Need, memory_refusal
 from geosplat_jax.io.meshes import (
@@ -38,6 +39,9 @@ LARGEST_TEXTURE = 16_384
 
 _TEXEL_BYTES = 4 * (1 + 3 + 5)
 """Of a texel while a texture is baked: its face, barycentric coordinates and materials."""
+
+# glTF's targets of a buffer: vertex attributes and indices.
+_VERTEX_BUFFER, _INDEX_BUFFER = 34962, 34963
 
 _SAMPLES_PER_CALL = 1 << 16
 _VIEWERS_SIGNS = np.array([(-1.0) ** m for degree in (1, 2, 3) for m in range(-degree, degree + 1)])
@@ -123,23 +127,67 @@ def _checked_mesh(
     return vertices[used], rows.reshape(-1, 3).astype(np.int32), normals[used], info
 
 
-def _write_glb(
-    path: str | Path,
-    mesh: trimesh.Trimesh,
-    tree_postprocessor: Callable[[dict], None] | None = None,
-) -> None:
-    """Serialise one mesh with its normals."""
+def _write_glb(path: str | Path, mesh: trimesh.Trimesh) -> None:
+    """Serialise one mesh with its normals, and say of each buffer what it holds."""
+
+    def complete(tree: dict) -> None:
+        _standardize(tree)
+        for primitive in (p for part in tree["meshes"] for p in part["primitives"]):
+            for accessor in primitive["attributes"].values():
+                view = tree["accessors"][accessor]["bufferView"]
+                tree["bufferViews"][view]["target"] = _VERTEX_BUFFER
+            indices = tree["accessors"][primitive["indices"]]["bufferView"]
+            tree["bufferViews"][indices]["target"] = _INDEX_BUFFER
+
     data = export_glb(
-        trimesh.Scene({"mesh": mesh}), include_normals=True, tree_postprocessor=tree_postprocessor
+        trimesh.Scene({"mesh": mesh}), include_normals=True, tree_postprocessor=complete
     )
     with written_aside(path) as aside:
         aside.write_bytes(data)
 
 
-def _standardize_vertex_color(tree: dict) -> None:
-    """Give the colour attribute its standard name; trimesh alone would round it to 8 bits."""
+def _write_obj(path: str | Path, mesh: trimesh.Trimesh) -> None:
+    """Write a textured mesh as OBJ, its material beside it as MTL, and its textures as PNG.
+
+    Roughness and metallic have no place in the format's first version; their maps, ``map_Pr`` and
+    ``map_Pm``, are those of its usual extension, and grey.
+    """
+    path, visual = Path(path), mesh.visual
+    assert isinstance(visual, TextureVisuals)
+    material = visual.material
+    assert isinstance(material, PBRMaterial)
+    packed = np.asarray(material.metallicRoughnessTexture)
+    maps = {
+        "map_Kd": ("base_color", material.baseColorTexture),
+        "map_Pr": ("roughness", Image.fromarray(packed[..., 1])),
+        "map_Pm": ("metallic", Image.fromarray(packed[..., 2])),
+    }
+    if material.normalTexture is not None:
+        maps["norm"] = ("normal", material.normalTexture)
+    lines = ["newmtl material", "Kd 1 1 1", "Pr 1", "Pm 1"]
+    for key, (name, image) in maps.items():
+        assert image is not None
+        file = path.with_name(f"{path.stem}_{name}.png")
+        with written_aside(file) as aside:
+            image.save(aside, format="PNG")
+        lines.append(f"{key} {file.name}")
+    with written_aside(path.with_suffix(".mtl")) as aside:
+        aside.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    uv, faces = np.asarray(visual.uv), np.asarray(mesh.faces) + 1
+    with written_aside(path) as aside, aside.open("w", encoding="utf-8") as file:
+        file.write(f"# y is up\nmtllib {path.with_suffix('.mtl').name}\nusemtl material\n")
+        np.savetxt(file, np.asarray(mesh.vertices), "v %.7g %.7g %.7g")
+        np.savetxt(file, uv, "vt %.7g %.7g")
+        np.savetxt(file, np.asarray(mesh.vertex_normals), "vn %.5g %.5g %.5g")
+        np.savetxt(file, np.repeat(faces, 3, axis=1), "f %d/%d/%d %d/%d/%d %d/%d/%d")
+
+
+def _standardize(tree: dict) -> None:
+    """Give attributes that trimesh does not know, or would round, their standard names."""
     for primitive in (p for mesh in tree["meshes"] for p in mesh["primitives"]):
-        primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_COLOR_0")
+        attributes = primitive["attributes"]
+        for name in {"_COLOR_0", "_TANGENT"} & set(attributes):
+            attributes[name.removeprefix("_")] = attributes.pop(name)
 
 
 def _vertex_colored(
@@ -180,14 +228,28 @@ def _textured(
     sample_materials: SampleMaterials,
     double_sided: bool,
     texture_size: int,
+    fine: FineSurface | None,
 ) -> tuple[trimesh.Trimesh, dict[str, Any]]:
-    """Mesh with baked textures, and what the baking took."""
+    """Mesh with baked textures, and what the baking took.
+
+    ``fine`` : surface that materials and a map of normals are taken from; None for the mesh itself,
+    whose normals need no map.
+    """
     charts = unwrap(vertices, faces, normals, texture_size=texture_size)
     start = time.perf_counter()
     face_rows, barycentrics = rasterize_charts(charts.uv, charts.faces, texture_size=texture_size)
     covered = face_rows >= 0
-    corners = vertices[charts.vertex_rows][charts.faces[face_rows[covered]]]
-    points = np.einsum("nk,nkd->nd", barycentrics[covered], corners).astype(np.float32)
+    rows, weights = charts.faces[face_rows[covered]], barycentrics[covered]
+    cut, cut_normals = vertices[charts.vertex_rows], normals[charts.vertex_rows]
+    points = np.einsum("nk,nkd->nd", weights, cut[rows]).astype(np.float32)
+    tangents, normal_map = None, None
+    if fine is not None:
+        points, wanted = fine.nearest(points)
+        tangents = vertex_tangents(cut, charts.faces, cut_normals, charts.uv)
+        interpolated = (np.einsum("nk,nkd->nd", weights, x[rows]) for x in (cut_normals, tangents))
+        shown = np.zeros((texture_size, texture_size, 3), np.float32)
+        shown[covered] = 0.5 + 0.5 * in_tangent_space(wanted, *interpolated)
+        normal_map = Image.fromarray(_to_bytes(fill_gutters(shown, covered)))
     baked = np.zeros((texture_size, texture_size, 5), np.float32)
     baked[covered] = _evaluate_materials(sample_materials, points)
     base_color, metallic_roughness = _textures(fill_gutters(baked, covered))
@@ -196,18 +258,24 @@ def _textured(
         baseColorFactor=[255, 255, 255, 255],
         baseColorTexture=base_color,
         metallicRoughnessTexture=metallic_roughness,
+        normalTexture=normal_map,
         roughnessFactor=1.0,
         metallicFactor=1.0,
         alphaMode="OPAQUE",
         doubleSided=double_sided,
     )
+    attributes = {}
+    if tangents is not None:
+        turned = to_gltf_axes(tangents[:, :3])
+        attributes["_TANGENT"] = np.concatenate([turned, tangents[:, 3:]], axis=-1)
     # trimesh keeps OpenGL's v upwards and flips it when it writes glTF, whose v runs down.
     uv = charts.uv * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)
     mesh = trimesh.Trimesh(
-        to_gltf_axes(vertices[charts.vertex_rows]),
+        to_gltf_axes(cut),
         charts.faces,
-        vertex_normals=to_gltf_axes(normals[charts.vertex_rows]),
+        vertex_normals=to_gltf_axes(cut_normals),
         visual=TextureVisuals(uv=uv, material=material),
+        vertex_attributes=attributes,
         process=False,
     )
     return mesh, {
@@ -236,6 +304,8 @@ def export_mesh_glb(
     *,
     vertex_colors: bool = False,
     texture_size: int = 1024,
+    obj_path: str | Path | None = None,
+    face_count: int | None = None,
 ) -> dict[str, Any]:
     """Write a mesh and its materials as a binary glTF 2.0 file.
 
@@ -255,6 +325,9 @@ def export_mesh_glb(
         metallic (N,); called with one N throughout.
     vertex_colors : colours on the vertices instead of textures.
     texture_size : width and height of the textures.
+    face_count : reduce the mesh to about so many faces first, and put its normals into a map, with
+        tangents; None for the mesh as it is.
+    obj_path : also write the same mesh and textures there as OBJ, with MTL and PNG beside it.
 
     Returns
     -------
@@ -264,11 +337,18 @@ def export_mesh_glb(
 
     Raises
     ------
+    SceneError
+        If fewer faces are asked for and fast-simplification is not installed.
     ValueError
-        If the mesh is empty or not finite, ``sample_materials`` returns a wrong shape, or the
-        textures are of no size, of one above `LARGEST_TEXTURE`, or do not fit into the memory.
+        If an OBJ or fewer faces are asked for with colours on the vertices, the mesh is empty or
+        not finite, ``sample_materials`` returns a wrong shape, or the textures are of no size, of
+        one above `LARGEST_TEXTURE`, or do not fit into the memory.
     """
     start = time.perf_counter()
+    if vertex_colors and obj_path is not None:
+        raise ValueError("an OBJ has textures; leave out the colours on vertices")
+    if vertex_colors and face_count is not None:
+        raise ValueError("a map of normals is a texture; leave out the colours on vertices")
     if not vertex_colors:
         _require_texture(texture_size)
     vertices, faces, normals, info = _checked_mesh(
@@ -276,15 +356,22 @@ def export_mesh_glb(
         np.asarray(faces, np.int32),
         np.asarray(normals, np.float32),
     )
-    double_sided = not info["closed"]
+    double_sided, fine = not info["closed"], None
+    if face_count is not None:
+        fine = FineSurface(vertices, normals, faces)
+        vertices, faces = simplified(vertices, faces, face_count)
+        faces = faces[nondegenerate(vertices, faces)]
+        normals = fine.nearest(vertices)[1]
     if vertex_colors:
         mesh = _vertex_colored(vertices, faces, normals, sample_materials, double_sided)
-        _write_glb(path, mesh, _standardize_vertex_color)
+        _write_glb(path, mesh)
     else:
         mesh, baking = _textured(
-            vertices, faces, normals, sample_materials, double_sided, texture_size
+            vertices, faces, normals, sample_materials, double_sided, texture_size, fine
         )
         _write_glb(path, mesh)
+        if obj_path is not None:
+            _write_obj(obj_path, mesh)
         info |= baking
     info |= {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
     return info | {"seconds": time.perf_counter() - start}

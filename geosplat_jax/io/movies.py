@@ -5,6 +5,7 @@ renamed, as images are.
 """
 
 import contextlib
+import importlib
 import math
 import shutil
 import subprocess
@@ -35,6 +36,21 @@ _PALETTE_PIXELS = 1_000_000
 _ERROR_LENGTH = 600
 
 
+def _encoder() -> str | None:
+    """Find ``ffmpeg``: on the PATH, or that of the package imageio-ffmpeg; None without either."""
+    on_path = shutil.which(_ENCODER)
+    if on_path is not None:
+        return on_path
+    try:
+        bundled = importlib.import_module("imageio_ffmpeg")
+    except ImportError:
+        return None
+    try:
+        return str(bundled.get_ffmpeg_exe())
+    except RuntimeError:  # it was installed without its program
+        return None
+
+
 class MissingEncoderError(SceneError):
     """The program that writes this format is not installed."""
 
@@ -42,7 +58,7 @@ class MissingEncoderError(SceneError):
 def has_encoder(suffix: str) -> bool:
     """Tell whether `write_movie` can write files with this suffix (``".gif"``) on this machine."""
     suffix = suffix.lower()
-    return suffix == ".gif" or (suffix == ".mp4" and shutil.which(_ENCODER) is not None)
+    return suffix == ".gif" or (suffix == ".mp4" and _encoder() is not None)
 
 
 def _checked(frames: Sequence[ArrayLike]) -> list[UInt8[np.ndarray, "H W 3"]]:
@@ -150,7 +166,7 @@ def _feed(process: subprocess.Popen[bytes], frames: list[UInt8[np.ndarray, "H W 
 
 
 def _write_mp4(path: Path, frames: list[UInt8[np.ndarray, "H W 3"]], rate: float) -> None:
-    encoder = shutil.which(_ENCODER) or _ENCODER
+    encoder = _encoder() or _ENCODER
     height, width, _ = _even(frames[0]).shape
     # Messages go to a file: a full pipe would stop the encoder while frames are being written.
     with written_aside(path) as aside, tempfile.TemporaryFile() as messages:
@@ -189,11 +205,11 @@ def check_movie(suffix: str, frames_per_second: float | int) -> None:
             f"{suffix} movies have {_MIN_RATE:g} to {fastest:g} frames per second, got "
             f"{frames_per_second}"
         )
-    if suffix == ".mp4" and shutil.which(_ENCODER) is None:
+    if suffix == ".mp4" and _encoder() is None:
         raise MissingEncoderError(
             f"writing .mp4 needs the program {_ENCODER}, which is not on the PATH; install it "
-            f"(for instance `apt install {_ENCODER}` or `brew install {_ENCODER}`), or write .gif "
-            "instead"
+            f"(`pip install 'geosplat_jax[movies]'`, `apt install {_ENCODER}` or `brew install "
+            f"{_ENCODER}`), or write .gif instead"
         )
 
 

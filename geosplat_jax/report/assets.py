@@ -3,9 +3,11 @@
 Host side, around the jitted stages; `io.export` and `io.meshes` know the file formats.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +16,13 @@ from scipy.spatial import KDTree
 
 from geosplat_jax.fit.train import Trained
 from geosplat_jax.io.export import export_gaussians_ply, export_light_exr, export_mesh_glb
-from geosplat_jax.io.images import encode_srgb
+from geosplat_jax.io.images import encode_srgb, write_hdr
+from geosplat_jax.io.meshes import nondegenerate, to_gltf_axes
 from geosplat_jax.materials import materials_at
 from geosplat_jax.render import Asset
+from geosplat_jax.report.gallery import FOLDER
+from geosplat_jax.report.light_metrics import resize_light
+from geosplat_jax.report.pace import OnProgress
 from geosplat_jax.report.renderer import Renderer, build_asset
 
 _MATERIAL_CHUNK = 65_536
@@ -85,6 +91,9 @@ def export_assets(
     *,
     vertex_colors: bool = False,
     texture_size: int = 1024,
+    obj: bool = False,
+    face_count: int | None = None,
+    on_progress: OnProgress | None = None,
 ) -> dict[str, str]:
     """Write ``mesh.glb``, ``gaussians.ply`` and ``light.exr``; return a line about each.
 
@@ -97,14 +106,21 @@ def export_assets(
     trained : parameters of a run. folder : existing folder.
     vertex_colors : colours on vertices instead of an unwrapped texture.
     texture_size : edge of the square textures, texels.
+    obj : also write ``mesh.obj``, with ``mesh.mtl`` and textures as PNG.
+    face_count : reduce the mesh to about so many faces, with a map of its normals.
+    on_progress : see `poses.OnProgress`.
 
     Raises
     ------
     ValueError
         If the surface is empty.
     """
+    tell = on_progress or (lambda part, done, total: None)
+    tell("surface and splats", 0, 1)
     vertices, faces, normals = Renderer.of(trained).mesh()
     asset = build_asset(trained.pipeline, trained.params)
+    tell("surface and splats", 1, 1)
+    tell("mesh and textures", 0, 1)
     mesh_info = export_mesh_glb(
         folder / "mesh.glb",
         vertices,
@@ -113,7 +129,10 @@ def export_assets(
         MaterialSampler(trained, asset),
         vertex_colors=vertex_colors,
         texture_size=texture_size,
+        obj_path=folder / "mesh.obj" if obj else None,
+        face_count=face_count,
     )
+    tell("mesh and textures", 1, 1)
     count = int(asset.splats.count)
     rows = {
         name: np.asarray(getattr(asset.splats, name))[:count]
@@ -127,8 +146,66 @@ def export_assets(
     )
     export_light_exr(folder / "light.exr", radiance)
     height, width = trained.params.light.radiance.shape[:2]
-    return {
+    others = {str(folder / "mesh.obj"): "the same mesh, with mesh.mtl and PNG"} if obj else {}
+    return others | {
         str(folder / "mesh.glb"): ", ".join(f"{k} {v}" for k, v in mesh_info.items()),
         str(folder / "gaussians.ply"): f"{count} Gaussians",
         str(folder / "light.exr"): f"{width} x {height} lat-long, z-up, exposure included",
+    }
+
+
+MODEL_TEXTURE = 1024
+"""Texels along the edge of the textures of the model in a report."""
+
+_MODEL_LIGHT_ROWS = 128
+
+
+def write_model(
+    folder: Path,
+    mesh: tuple[np.ndarray, np.ndarray, np.ndarray],
+    sampler: MaterialSampler,
+    *,
+    lights: Mapping[str, np.ndarray],
+    eye: np.ndarray,
+    texture_size: int = MODEL_TEXTURE,
+) -> dict[str, Any] | None:
+    """Write the mesh and the lights that a report shows it under.
+
+    Parameters
+    ----------
+    folder : of ``metrics.json``; the files go to its folder `gallery.FOLDER`.
+    mesh : vertices, faces and normals.
+    lights : lat-long maps of linear radiance by title; reduced to 128 rows.
+    eye : (3,) place in the world that it is seen from at first.
+
+    Returns
+    -------
+    dict of ``mesh``, ``faces``, ``lights`` by title, with paths below ``folder``, and ``orbit``,
+    the angles in degrees around glTF's vertical axis (from +z) and from it; None for an empty
+    surface.
+    """
+    own = folder / FOLDER
+    own.mkdir(exist_ok=True)
+    for old in own.glob("*.hdr"):
+        old.unlink()
+    vertices, faces, normals = mesh
+    if not nondegenerate(vertices, faces).any():
+        (own / "mesh.glb").unlink(missing_ok=True)
+        return None
+    info = export_mesh_glb(
+        own / "mesh.glb", vertices, faces, normals, sampler, texture_size=texture_size
+    )
+    files = {}
+    for number, (title, radiance) in enumerate(lights.items()):
+        files[title] = f"{FOLDER}/light_{number:02d}.hdr"
+        rows = min(_MODEL_LIGHT_ROWS, radiance.shape[0])
+        write_hdr(folder / files[title], resize_light(radiance, rows, 2 * rows))
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
+    x, y, z = to_gltf_axes(np.asarray(eye - middle, np.float64)[None])[0]
+    orbit = np.degrees([np.arctan2(x, z), np.arctan2(np.hypot(x, z), y)])
+    return {
+        "mesh": f"{FOLDER}/mesh.glb",
+        "faces": info["faces"],
+        "lights": files,
+        "orbit": orbit.round(1).tolist(),
     }

@@ -18,13 +18,12 @@ import numpy as np
 from geosplat_jax.core.types import EnvLight
 from geosplat_jax.fit.runtime import in_background, peak_memory_mb
 from geosplat_jax.fit.train import Trained
-from geosplat_jax.io.images import write_png
-from geosplat_jax.io.meshes import render_mesh_normals
 from geosplat_jax.io.views import Views
 from geosplat_jax.report import protocols
+from geosplat_jax.report.assets import MODEL_TEXTURE, MaterialSampler, write_model
 from geosplat_jax.report.light_metrics import light_metrics
 from geosplat_jax.report.metrics import MASK_THRESHOLD, mask_iou, normal_mae_deg
-from geosplat_jax.report.pictures import normals_to_rgb, overview_sheet, shade_mesh_preview
+from geosplat_jax.report.pace import OnProgress, counted
 from geosplat_jax.report.protocols import Protocol
 from geosplat_jax.report.renderer import (
     DEFAULT_SAMPLES,
@@ -32,8 +31,10 @@ from geosplat_jax.report.renderer import (
     Renderer,
     photograph_on_white,
     render_on_white,
-    to_picture,
 )
+from geosplat_jax.report.scales import error_map
+from geosplat_jax.report.sheets import Shown
+from geosplat_jax.report.trust import sightings
 
 _PACKAGES = ("jax", "jaxlib", "numpy", "optax", "geosplat_jax")
 _MATERIALS = ("roughness", "metallic")
@@ -107,12 +108,16 @@ class _Rendered(NamedTuple):
 
 
 def _render_all(
-    renderer: Renderer, views: Views, chosen: np.ndarray, protocol: Protocol
+    renderer: Renderer,
+    views: Views,
+    chosen: np.ndarray,
+    protocol: Protocol,
+    on_progress: OnProgress | None,
 ) -> _Rendered:
     """Render every view once, and keep of it no more than is needed: views may be many."""
     metrics, shown, alpha = [], {}, []
     maps = {name: [] for name in ("albedo", *_MATERIALS) if name in views.truth}
-    for index, name in enumerate(views.names):
+    for index, name in counted([*enumerate(views.names)], "new views", on_progress):
         valid = _valid(views, index)
         view = _where_counted(renderer(views.camera(np.array([index]))), valid)
         normal = views.truth["normal"][index] if "normal" in views.truth else None
@@ -156,6 +161,7 @@ def _relight_metrics(
     albedo_scale: np.ndarray,
     indirect: str,
     chosen: np.ndarray,
+    on_progress: OnProgress | None,
 ) -> tuple[dict[str, float], list[dict[str, np.ndarray]]]:
     """Metrics of the views under every light that has true images and a map, and rows of a sheet.
 
@@ -172,7 +178,7 @@ def _relight_metrics(
         else:
             relit = renderer.relit(lights[name], albedo_scale=albedo_scale, indirect=indirect)
         rgb, alpha = np.empty((*views.masks.shape, 3), np.float32), np.empty(views.masks.shape)
-        for index in range(len(views)):
+        for index in counted(range(len(views)), f"under {name}", on_progress):
             view = relit(views.camera(np.array([index])))
             view = _where_counted(view, _valid(views, index))
             rgb[index], alpha[index] = view.rgb, view.alpha
@@ -180,8 +186,9 @@ def _relight_metrics(
         found = protocols.relight_metrics(protocol, rgb, alpha, images, views.valid)
         metrics |= {f"relight.{name}.{key}": value for key, value in found.items()}
         for row, index in zip(rows, chosen, strict=True):
-            row[name] = render_on_white(rgb[index], alpha[index])
-            row[f"true {name}"] = photograph_on_white(images[index])
+            truth = photograph_on_white(images[index])
+            render = render_on_white(rgb[index], alpha[index])
+            row |= {f"true {name}": truth, name: render, f"error {name}": error_map(truth, render)}
     if names:
         for key in found:
             values = [metrics[f"relight.{name}.{key}"] for name in names]
@@ -214,14 +221,18 @@ def evaluate_run(
     samples: int = DEFAULT_SAMPLES,
     relight_indirect: str = "traced",
     sheet_views: int = 5,
+    train_views: Views | None = None,
+    model_texture: int | None = MODEL_TEXTURE,
+    on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
     """Render every test view, write metrics and sheets, return the metrics.
 
     Writes ``metrics.json``, ``overview.png`` and, where the scene has the truth of them,
-    ``materials.png`` and ``relight.png``. New views are always compared in sRGB on white, as the
-    mean over the images of the measure of each; normals once over the mask's pixels and once over
-    all of them, with (0, 0, 1) behind the object. Pixels that do not count have no part in any of
-    it, and are empty on the sheets. See `protocols` for the rest.
+    ``materials.png`` and ``relight.png``, and their pictures one by one (see `gallery`). New views
+    are always compared in sRGB on white, as the mean over the images of the measure of each;
+    normals once over the mask's pixels and once over all of them, with (0, 0, 1) behind the object.
+    Pixels that do not count have no part in any of it, and are empty on the sheets. See `protocols`
+    for the rest.
 
     Parameters
     ----------
@@ -235,20 +246,30 @@ def evaluate_run(
     samples : rays a splat of the images.
     relight_indirect : see `Renderer.relit`.
     sheet_views : number of views on the sheets, spread evenly.
+    train_views : those of the training, to count how many of them see each place.
+    model_texture : texels along the edge of the model that the report shows; None for no model.
+    on_progress : see `poses.OnProgress`.
     """
     began = time.perf_counter()
     chosen_protocol = protocols.protocol(protocol)
     renderer = Renderer.of(trained, samples=samples)
     compiled = _relight_programs(renderer, views, lights or {}, relight_indirect)
     chosen = np.unique(np.linspace(0, len(views) - 1, sheet_views).round().astype(int))
-    rendered = _render_all(renderer, views, chosen, chosen_protocol)
+    rendered = _render_all(renderer, views, chosen, chosen_protocol, on_progress)
     lines = rendered.metrics
     names = dict.fromkeys(key for line in lines for key in line if key != "view")
     mean = {key: float(np.mean([line[key] for line in lines if key in line])) for key in names}
     materials, scale = _material_metrics(chosen_protocol, rendered, views)
     compiled.result()
     relights, relit = _relight_metrics(
-        chosen_protocol, renderer, views, lights or {}, scale, relight_indirect, chosen
+        chosen_protocol,
+        renderer,
+        views,
+        lights or {},
+        scale,
+        relight_indirect,
+        chosen,
+        on_progress,
     )
     no_map = sorted(set(views.relight) - set(lights or {}))
     notes = [protocols.lpips_note(chosen_protocol)]
@@ -258,6 +279,44 @@ def evaluate_run(
     if train_light is not None:
         found = light_metrics(radiance, np.asarray(train_light.radiance))
         mean |= {key: value for key, value in found.items() if isinstance(value, int | float)}
+    tell = on_progress or (lambda part, done, total: None)
+    tell("pictures and model", 0, 1)
+    mesh = renderer.mesh()
+    seen = None if train_views is None else sightings(*mesh, train_views)
+    by_title = {"true light": None if train_light is None else np.asarray(train_light.radiance)}
+    by_title |= {"light": radiance}
+    figures = [
+        f"{key.removeprefix('relight.').removesuffix('.psnr')}: {value:.2f} dB, {protocol}"
+        for key, value in relights.items()
+        if key.endswith(".psnr")
+    ]
+    shown = Shown(
+        views=views,
+        psnr=[line["nvs.psnr"] for line in lines],
+        rendered=rendered.shown,
+        mesh=mesh,
+        seen=seen,
+        albedo_scale=scale,
+        relit=relit,
+        relit_figures=figures,
+        lights={title: light for title, light in by_title.items() if light is not None},
+    )
+    gallery = shown.write(folder)
+    if model_texture is not None:
+        exposed = radiance * np.exp(float(trained.params.log_exposure))
+        maps = {"light as found": exposed} | {
+            name: np.asarray(light.radiance) for name, light in (lights or {}).items()
+        }
+        sampler = MaterialSampler(trained, renderer.asset())
+        gallery["model"] = write_model(
+            folder,
+            mesh,
+            sampler,
+            lights=maps,
+            eye=views.camera_to_world[0, :3, 3],
+            texture_size=model_texture,
+        )
+    tell("pictures and model", 1, 1)
     metrics = {
         "protocol": protocol,
         "notes": notes,
@@ -274,70 +333,9 @@ def evaluate_run(
         },
         "seed": trained.config.run.seed,
         "config": trained.config.to_dict(),
+        "gallery": gallery,
+        "seen": None if seen is None else seen.described(),
         **meta,
     }
     (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
-    write_png(folder / "overview.png", _overview(renderer, radiance, views, rendered.shown))
-    if materials:
-        write_png(folder / "materials.png", _materials_sheet(views, rendered.shown, scale))
-    if relit:
-        write_png(folder / "relight.png", overview_sheet(relit))
     return metrics
-
-
-def _materials_sheet(
-    views: Views, shown: Mapping[int, RenderedView], scale: np.ndarray
-) -> np.ndarray:
-    """Compose a sheet of attributes beside the truth, the albedo in its scale."""
-    rows = []
-    for index, view in shown.items():
-        mask, row = views.images[index][..., 3:], {}
-        for name in ("albedo", "roughness", "metallic", "normal"):
-            if name not in views.truth:
-                continue
-            true, found = views.truth[name][index], view.aovs[name]
-            if name == "albedo":
-                pair = to_picture(found * scale), to_picture(true * mask)
-            elif name == "normal":
-                pair = normals_to_rgb(found, view.alpha), normals_to_rgb(true, mask[..., 0])
-            else:
-                pair = tuple(np.clip(np.repeat(x, 3, axis=-1), 0, 1) for x in (found, true * mask))
-            row[name], row[f"true {name}"] = pair
-        rows.append(row)
-    return overview_sheet(rows)
-
-
-def _overview(
-    renderer: Renderer,
-    radiance: np.ndarray,
-    views: Views,
-    shown: Mapping[int, RenderedView],
-) -> np.ndarray:
-    """Compose the sheet: a row a view, and the light."""
-    vertices, faces, normals = renderer.mesh()
-    rows = []
-    for index, view in shown.items():
-        row = {
-            "truth": photograph_on_white(views.images[index]),
-            "render": render_on_white(view.rgb, view.alpha),
-            "normal": normals_to_rgb(view.aovs["normal"], view.alpha),
-            "albedo": to_picture(view.aovs["albedo"]),
-            "roughness": np.repeat(view.aovs["roughness"], 3, axis=-1),
-            "metallic": np.repeat(view.aovs["metallic"], 3, axis=-1),
-        }
-        camera = views.camera(np.array([index]))
-        mesh_normals, mesh_alpha = render_mesh_normals(vertices, faces, normals, camera)
-        row["mesh"] = shade_mesh_preview(mesh_normals, mesh_alpha)
-        rows.append(row)
-    return overview_sheet(rows, light=radiance)
-
-
-def preview_image(trained: Trained, views: Views) -> np.ndarray:
-    """Put truth, render and normals of the first view side by side, (H, 3 W, 3) sRGB."""
-    view = Renderer.of(trained, samples=64)(views.camera(np.array([0])))
-    parts = [
-        photograph_on_white(views.images[0]),
-        render_on_white(view.rgb, view.alpha),
-        normals_to_rgb(view.aovs["normal"], view.alpha),
-    ]
-    return np.concatenate(parts, axis=1)

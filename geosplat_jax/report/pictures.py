@@ -6,12 +6,14 @@ Pictures are display-referred float32 in [0, 1], (H, W, 3), ready for `io.images
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 
 from geosplat_jax.io.images import encode_srgb
+from geosplat_jax.report.scales import Scale
 
 _SHEET_COLOR = (0.094, 0.098, 0.106)
 _CELL_COLOR = (0.149, 0.153, 0.161)
@@ -25,6 +27,7 @@ _LABEL_RISE = 8
 _LABEL_GAP = 10
 _TITLE_SIZE, _LABEL_SIZE = 17, 13
 _LINE_HEIGHT = 20
+_BAR_HEIGHT, _BAR_WIDTH = 14, 160
 # The light is at most this many rows tall, so that it does not dwarf the views.
 _LIGHT_ROWS = 2
 
@@ -211,6 +214,19 @@ def _light_strip(
     return _resized(tone_map_light(light), max(1, round(width * aspect)), width)
 
 
+def _enlarged(
+    rows: Sequence[Mapping[str, np.ndarray]], names: Sequence[str]
+) -> list[Mapping[str, np.ndarray]]:
+    """Repeat the pixels of small pictures until every name fits above its column."""
+    font = ImageFont.load_default(_LABEL_SIZE)
+    needed = max(font.getlength(name) for name in names)
+    width = next(iter(next(row for row in rows if row).values())).shape[1]
+    times = max(1, math.ceil(needed / width))
+    if times == 1:
+        return list(rows)
+    return [{n: im.repeat(times, 0).repeat(times, 1) for n, im in row.items()} for row in rows]
+
+
 def _captions(
     names: Sequence[str],
     labels: Sequence[str],
@@ -230,27 +246,79 @@ def _captions(
     return texts
 
 
+class _Footer(NamedTuple):
+    """What stands below the views: pictures at (y, x), the height of it all, and its texts."""
+
+    parts: list[tuple[int, int, np.ndarray]]
+    height: int
+    texts: list[_Text]
+
+
+def _footer(
+    lights: Sequence[tuple[str, np.ndarray]],
+    scales: Sequence[Scale],
+    notes: Sequence[str],
+    left: int,
+    top: int,
+) -> _Footer:
+    """Place lights side by side, notes to their right, and the scales of colours below.
+
+    ``lights`` : tone mapped, with their titles. ``left, top`` : of the footer, in pixels.
+    """
+    parts: list[tuple[int, int, np.ndarray]] = []
+    texts, x, y = [], left, top
+    if lights or notes:
+        y += _LABEL_HEIGHT
+    for name, strip in lights:
+        parts.append((y, x, strip))
+        texts.append(_Text(name, (x, y - _LABEL_RISE), "ls"))
+        x += strip.shape[1] + _MARGIN
+    for line, note in enumerate(notes):
+        place = (x, y + line * _LINE_HEIGHT)
+        texts.append(_Text(note, place, "lt", color=_FAINT_TEXT_COLOR))
+    y += max([len(notes) * _LINE_HEIGHT, *(strip.shape[0] for _, strip in lights)])
+    for scale in scales:
+        y += _LABEL_RISE
+        parts.append((y, left, scale.bar(_BAR_HEIGHT, _BAR_WIDTH)))
+        low, high = scale.ends
+        words = f"{low} to {high}   {scale.name}"
+        place = (left + _BAR_WIDTH + _LABEL_GAP, y + _BAR_HEIGHT // 2)
+        texts.append(_Text(words, place, "lm", color=_FAINT_TEXT_COLOR))
+        y += _BAR_HEIGHT
+    return _Footer(parts, y - top, texts)
+
+
+def _text_width(text: str, size: int = _LABEL_SIZE) -> int:
+    """Width of the widest line, pixels."""
+    font = ImageFont.load_default(size)
+    return math.ceil(max(font.getlength(line) for line in text.split("\n")))
+
+
 def overview_sheet(
     rows: Sequence[Mapping[str, np.ndarray]],
     *,
-    light: Float[np.ndarray, "h w 3"] | None = None,
+    lights: Mapping[str, Float[np.ndarray, "h w 3"]] | None = None,
+    scales: Sequence[Scale] = (),
     title: str | None = None,
     row_labels: Sequence[str] | None = None,
     notes: Sequence[str] = (),
 ) -> Float[np.ndarray, "H W 3"]:
-    """Compose labelled pictures into one sheet: a row a view, a column a name, the light below.
+    """Compose labelled pictures into one sheet: a row a view, a column a name, lights below.
 
     Columns are the names of all rows in order of first appearance; a picture that a row lacks
     leaves its cell empty. Cells have the size of the first picture; others are fitted into it.
+    Pixels of pictures that are narrower than the columns' names are repeated until those fit.
 
     Parameters
     ----------
     rows : one mapping a view, from the column's title to a picture: (H, W), (H, W, 1) or
         (H, W, 3); display-referred floats in [0, 1] or 8-bit.
-    light : lat-long map of *linear* radiance, tone mapped into a strip below the views.
+    lights : lat-long maps of *linear* radiance by title, each tone mapped for itself into a strip
+        below the views.
+    scales : of the colours in the pictures, drawn below.
     title : heading of the sheet.
-    row_labels : one text a row, to its left.
-    notes : lines of text beside the light, such as the figures of the run.
+    row_labels : one text a row, to its left; it may have several lines.
+    notes : lines of text beside the lights, such as the figures of the run.
 
     Returns
     -------
@@ -268,26 +336,30 @@ def overview_sheet(
         raise ValueError("the sheet needs at least one row with at least one picture, got none")
     if row_labels is not None and len(labels) != len(rows):
         raise ValueError(f"row_labels must be one a row, got {len(labels)} for {len(rows)} rows")
-    grid, cell_height, cell_width = _grid_of_cells(pictures, names)
-    label_widths = [ImageFont.load_default(_LABEL_SIZE).getlength(label) for label in labels]
-    left = _MARGIN + (math.ceil(max(label_widths)) + _LABEL_GAP if labels else 0)
+    grid, cell_height, cell_width = _grid_of_cells(_enlarged(pictures, names), names)
+    left = _MARGIN + (max(map(_text_width, labels)) + _LABEL_GAP if labels else 0)
     top = _MARGIN + (_TITLE_HEIGHT if title else 0) + _LABEL_HEIGHT
     texts = _captions(names, labels, left, top, cell_height, cell_width)
     if title:
         texts.append(_Text(title, (_MARGIN, _MARGIN), "lt", _TITLE_SIZE))
-    below = top + grid.shape[0] + _GUTTER + _LABEL_HEIGHT
-    strip, notes_left = np.zeros((0, 0, 3), np.float32), left
-    if light is not None:
-        strip = _light_strip(light, cell_height, cell_width, len(names))
-        texts.append(_Text("light", (left, below - _LABEL_RISE), "ls"))
-        notes_left = left + strip.shape[1] + _MARGIN
-    for line, note in enumerate(notes):
-        place = (notes_left, below + line * _LINE_HEIGHT)
-        texts.append(_Text(note, place, "lt", color=_FAINT_TEXT_COLOR))
-    footer = max(strip.shape[0], len(notes) * _LINE_HEIGHT)
-    bottom = below + footer if footer else top + grid.shape[0]
-    size = (bottom + _MARGIN, left + grid.shape[1] + _MARGIN, 3)
+    columns = max(1, len(names) // max(len(lights or {}), 1))
+    strips = [
+        (name, _light_strip(light, cell_height, cell_width, columns))
+        for name, light in (lights or {}).items()
+    ]
+    footer = _footer(strips, scales, notes, left, top + grid.shape[0] + _GUTTER)
+    texts += footer.texts
+    placed = [(top, left, grid), *footer.parts]
+    ends = [x + part.shape[1] for _, x, part in placed]
+    # Texts that stand at the left of their place may reach beyond the pictures.
+    ends += [
+        int(text.position[0]) + _text_width(text.words, text.size)
+        for text in texts
+        if text.anchor.startswith("l")
+    ]
+    height = top + grid.shape[0] + (_GUTTER + footer.height if footer.height else 0)
+    size = (height + _MARGIN, max(ends) + _MARGIN, 3)
     sheet = np.broadcast_to(np.asarray(_SHEET_COLOR, np.float32), size).copy()
-    sheet[top : top + grid.shape[0], left : left + grid.shape[1]] = grid
-    sheet[below : below + strip.shape[0], left : left + strip.shape[1]] = strip
+    for y, x, part in placed:
+        sheet[y : y + part.shape[0], x : x + part.shape[1]] = part
     return _write_texts(sheet, texts)

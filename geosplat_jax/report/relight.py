@@ -4,8 +4,8 @@ Host side, around `renderer.Renderer`.
 """
 
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import jax
@@ -15,14 +15,20 @@ import numpy as np
 from geosplat_jax.core.types import Camera, EnvLight
 from geosplat_jax.io.images import SceneError, read_linear, write_png
 from geosplat_jax.io.movies import check_movie, has_encoder, write_movie
-from geosplat_jax.io.views import ViewLight, Views
+from geosplat_jax.io.views import ViewLight
+from geosplat_jax.report.consistency import resized
 from geosplat_jax.report.light_metrics import resize_light
-from geosplat_jax.report.renderer import RenderedView, Renderer, straight_rgba, to_picture
+from geosplat_jax.report.pace import OnProgress, counted
+from geosplat_jax.report.renderer import RenderedView, Renderer, to_picture
+from geosplat_jax.report.shots import Images, Shot, about_z, orbit
 from geosplat_jax.transport.environment import lookup, rotate_light, to_y_up_map
 
 LARGEST_LIGHT = 256
 """Rows of an environment map for lighting; finer detail is averaged, since it is only noise to a
 few hundred samples."""
+
+SMALLEST_MOVIE = 384
+"""Pixels along the longer side of movies, at least."""
 
 BACKGROUNDS = ("light", "white", "black")
 
@@ -69,21 +75,6 @@ def load_view_light(light: ViewLight, *, largest: int = LARGEST_LIGHT) -> EnvLig
     axes = np.asarray(to_y_up_map(jnp.eye(3)), np.float64).T
     turn = light.camera_to_world[:3, :3] @ axes
     return _rotate_light(load_light(light.path, largest=largest), jnp.asarray(turn, jnp.float32))
-
-
-def about_z(angle: float) -> np.ndarray:
-    """Rotation by an angle in radians, counter-clockwise seen from above, (3, 3)."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def orbit(camera: Camera, center: np.ndarray, angle: float) -> Camera:
-    """Carry a single camera around the vertical axis through ``center`` (3,)."""
-    turned = np.eye(4)
-    turned[:3, :3] = about_z(angle)
-    turned[:3, 3] = center - turned[:3, :3] @ center
-    pose = np.asarray(camera.world_to_camera[0], np.float64) @ np.linalg.inv(turned)
-    return replace(camera, world_to_camera=jnp.asarray(pose[None], jnp.float32))
 
 
 def _behind(camera: Camera, light: EnvLight) -> np.ndarray:
@@ -151,33 +142,49 @@ class RelightOptions:
             check_movie(self.movie_suffix(), self.frames_per_second)
 
 
+def _for_movies(camera: Camera) -> Camera:
+    """Enlarge a small camera: dithering shows in small GIFs."""
+    is_small = max(camera.height, camera.width) < SMALLEST_MOVIE
+    return resized(camera, SMALLEST_MOVIE) if is_small else camera
+
+
 def relight_views(
-    relit: Renderer, light: EnvLight, views: Views, folder: Path, options: RelightOptions
+    relit: Renderer,
+    light: EnvLight,
+    shots: Sequence[Shot],
+    folder: Path,
+    options: RelightOptions,
+    images: Images | None = None,
+    *,
+    on_progress: OnProgress | None = None,
 ) -> list[Path]:
-    """Write stills of every view and the movies that were asked for; return the files.
+    """Write stills from every camera and the movies that were asked for; return the files.
 
     Parameters
     ----------
     relit : from `Renderer.relit` with ``light``.
-    views : their cameras; the movies start from the first one.
+    shots : cameras; the movies start from the first one, and have at least
+        `SMALLEST_MOVIE` pixels along the longer side.
     folder : existing; receives ``NAME_rgba.png`` with straight alpha, ``NAME.png`` over the
         background, ``turntable`` and ``rotate_env``.
+    images : what else to write (default: nothing).
+    on_progress : see `poses.OnProgress`.
 
     Raises
     ------
     SceneError, MissingEncoderError : see `RelightOptions.check`.
     """
     options.check()
+    images = images or Images(aovs=())
+    images.check()
+    relit = relit.with_aovs(*images.aovs)
     written = []
-    for index, name in enumerate(views.names):
-        camera = views.camera(np.array([index]))
+    for name, camera in counted(shots, "stills", on_progress):
         view = relit(camera)
-        stem = name.replace("/", "_").strip("._")
-        written.append(folder / f"{stem}_rgba.png")
-        write_png(written[-1], straight_rgba(view))
-        written.append(folder / f"{stem}.png")
+        written += images.write(folder, name, view)
+        written.append(folder / f"{name}.png")
         write_png(written[-1], picture(view, camera, light, options.background))
-    first = views.camera(np.array([0]))
+    first = _for_movies(shots[0].camera)
     center = relit.center()
 
     def on_turntable(angle: float) -> np.ndarray:
@@ -194,7 +201,8 @@ def relight_views(
     ]
     for name, count, frame in movies:
         if count:
-            frames = [frame(2 * np.pi * k / count) for k in range(count)]
+            angles = (2 * np.pi * np.arange(count) / count).tolist()
+            frames = [frame(angle) for angle in counted(angles, f"{name} frames", on_progress)]
             written.append((folder / name).with_suffix(options.movie_suffix()))
             write_movie(written[-1], frames, frames_per_second=options.frames_per_second)
     return written

@@ -74,7 +74,7 @@ class RenderedView:
     ----------
     rgb : (H, W, 3) linear, exposed and tone mapped.
     alpha : (H, W).
-    aovs : albedo, roughness, metallic, normal; (H, W, c) each.
+    aovs : albedo, roughness, metallic, normal, and those of `Renderer.with_aovs`; (H, W, c) each.
     """
 
     rgb: np.ndarray
@@ -150,6 +150,7 @@ class Renderer:
         self._pipeline = self._for_images(pipeline)
         self._asset: Asset | None = None
         self._illuminations: list[Illumination] = []
+        self._aov_names = EVALUATION_AOVS
 
     @classmethod
     def of(cls, trained: Trained, *, samples: int = DEFAULT_SAMPLES) -> "Renderer":
@@ -195,6 +196,7 @@ class Renderer:
         other._light = light
         other._log_exposure = jnp.zeros(())
         other._albedo_scale = np.asarray(albedo_scale, np.float32)
+        other._aov_names = self._aov_names
         return other
 
     def under(self, light: EnvLight) -> "Renderer":
@@ -202,6 +204,12 @@ class Renderer:
         other = copy.copy(self)
         other._light = light
         other._illuminations = []
+        return other
+
+    def with_aovs(self, *names: str) -> "Renderer":
+        """Return a renderer whose views have these AOVs too, some of `render.AOV_CHANNELS`."""
+        other = copy.copy(self)
+        other._aov_names = tuple(dict.fromkeys((*self._aov_names, *names)))
         return other
 
     def hurried(self) -> "Renderer":
@@ -257,7 +265,7 @@ class Renderer:
         def attempt(capacities: Capacities) -> tuple[RenderOutput, Usage]:
             pipeline = replace(self._pipeline, capacities=capacities)
             output = _render_lit(
-                pipeline, self.asset(), illumination, camera, aov_names=EVALUATION_AOVS, key=key
+                pipeline, self.asset(), illumination, camera, aov_names=self._aov_names, key=key
             )
             # The surface's needs are those of an asset that is whole.
             names = set(output.usage) - set(self.asset().usage)

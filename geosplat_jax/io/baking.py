@@ -1,0 +1,148 @@
+"""A simpler mesh that looks like a fine one: fewer faces, and a map of the normals they lost."""
+
+import importlib
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from geosplat_jax.io.images import SceneError
+
+# Faces of the fine mesh, by the distance of their centres, that a point may be nearest to.
+_CANDIDATES = 8
+# Points that are looked up at once: bounds memory at about 100 MB.
+_POINTS_PER_CALL = 1 << 16
+
+
+def simplified(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], count: int
+) -> tuple[Float[np.ndarray, "W 3"], Int[np.ndarray, "G 3"]]:
+    """Reduce a mesh to about ``count`` faces by collapsing edges (quadric error).
+
+    Raises
+    ------
+    SceneError
+        If the package that does it is not installed.
+    ValueError
+        If fewer than four faces are asked for.
+    """
+    if count < 4:
+        raise ValueError(f"a mesh has at least 4 faces, got {count}")
+    try:
+        library = importlib.import_module("fast_simplification")
+    except ImportError:
+        raise SceneError(
+            "fewer faces need the package fast-simplification; install it with "
+            "`pip install 'geosplat_jax[mesh]'`"
+        ) from None
+    if count >= len(faces):
+        return vertices, faces
+    points, triangles = library.simplify(
+        np.ascontiguousarray(vertices, np.float32),
+        np.ascontiguousarray(faces, np.int32),
+        target_count=count,
+    )
+    return np.asarray(points, np.float32), np.asarray(triangles, np.int32)
+
+
+@dataclass(frozen=True)
+class FineSurface:
+    """A mesh to look up the nearest point of.
+
+    Attributes
+    ----------
+    vertices, normals : (V, 3). faces : (F, 3).
+    """
+
+    vertices: Float[np.ndarray, "V 3"]
+    normals: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+
+    def nearest(
+        self, points: Float[np.ndarray, "N 3"]
+    ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
+        """Return the nearest points of the surface, and its unit normals there.
+
+        Of the eight faces whose centres are nearest.
+        """
+        corners = np.asarray(self.vertices, np.float64)[self.faces]
+        tree = KDTree(corners.mean(axis=1))
+        count = min(_CANDIDATES, len(self.faces))
+        places, normals = np.empty((2, len(points), 3), np.float32)
+        for first in range(0, len(points), _POINTS_PER_CALL):
+            chosen = slice(first, first + _POINTS_PER_CALL)
+            asked = np.asarray(points[chosen], np.float64)
+            rows = tree.query(asked, k=count)[1].reshape(len(asked), count)
+            repeated = np.repeat(asked, count, axis=0)
+            close = trimesh.triangles.closest_point(corners[rows.ravel()], repeated)
+            distance = ((close - repeated) ** 2).sum(-1).reshape(-1, count)
+            best = np.arange(len(asked)) * count + distance.argmin(axis=1)
+            face = rows.ravel()[best]
+            places[chosen] = close[best]
+            weights = trimesh.triangles.points_to_barycentric(corners[face], close[best])
+            blended = np.einsum("nk,nkd->nd", weights, self.normals[self.faces[face]])
+            normals[chosen] = unit(blended)
+        return places, normals
+
+
+def unit(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+    """Scale to unit length; vectors of no length stay."""
+    length = np.sqrt((np.asarray(vectors, np.float64) ** 2).sum(-1, keepdims=True))
+    return vectors / np.where(length > 0, length, 1.0)
+
+
+def vertex_tangents(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    normals: Float[np.ndarray, "V 3"],
+    uv: Float[np.ndarray, "V 2"],
+) -> Float[np.ndarray, "V 4"]:
+    """Return glTF's tangents: the direction of growing u, and the sign of the bitangent.
+
+    The mean over a vertex's faces, by area, made orthogonal to its normal. The bitangent, the sign
+    times normal x tangent, points to the top of the texture.
+
+    Parameters
+    ----------
+    uv : (V, 2), ``v`` downwards; vertices are cut where charts meet.
+    """
+    corners, places = np.asarray(vertices, np.float64)[faces], np.asarray(uv, np.float64)[faces]
+    edges, steps = corners[:, 1:] - corners[:, :1], places[:, 1:] - places[:, :1]
+    steps[..., 1] *= -1.0  # from downwards to upwards
+    area = steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 1, 0] * steps[:, 0, 1]
+    sign = np.sign(area)[:, None]
+    # Times the area on the texture, whose sign is all that matters of it.
+    towards_u = sign * (steps[:, 1, 1:] * edges[:, 0] - steps[:, 0, 1:] * edges[:, 1])
+    towards_v = sign * (steps[:, 0, :1] * edges[:, 1] - steps[:, 1, :1] * edges[:, 0])
+    tangents, bitangents = np.zeros((2, len(vertices), 3))
+    for corner in range(3):
+        np.add.at(tangents, faces[:, corner], towards_u)
+        np.add.at(bitangents, faces[:, corner], towards_v)
+    along = (tangents * normals).sum(-1, keepdims=True)
+    tangents = tangents - along * normals
+    # Where the texture says nothing, any direction across the normal will do.
+    axis = np.eye(3)[np.abs(normals).argmin(axis=1)]
+    lost = (tangents**2).sum(-1, keepdims=True) <= 0
+    tangents = unit(np.where(lost, np.cross(normals, axis), tangents))
+    side = (np.cross(normals, tangents) * bitangents).sum(-1, keepdims=True)
+    return np.concatenate([tangents, np.where(side < 0, -1.0, 1.0)], axis=-1).astype(np.float32)
+
+
+def in_tangent_space(
+    wanted: Float[np.ndarray, "N 3"],
+    normals: Float[np.ndarray, "N 3"],
+    tangents: Float[np.ndarray, "N 4"],
+) -> Float[np.ndarray, "N 3"]:
+    """Write normals as a map holds them: along tangent, bitangent and normal of the mesh, unit.
+
+    Parameters
+    ----------
+    wanted : (N, 3) normals to show.
+    normals, tangents : of the mesh, interpolated.
+    """
+    up, along = unit(normals), unit(tangents[:, :3])
+    across = np.sign(tangents[:, 3:]) * np.cross(up, along)
+    parts = [(wanted * axis).sum(-1) for axis in (along, across, up)]
+    return unit(np.stack(parts, axis=-1))

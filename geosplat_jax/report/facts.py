@@ -1,0 +1,206 @@
+"""What the report says of a run in words and numbers; knows the files of a run, and no JAX.
+
+Names and units of figures, times of the stages, settings that differ from the preset, and the
+command that repeats the training.
+"""
+
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from geosplat_jax.fit.config import Config, changed_settings
+from geosplat_jax.fit.presets import make_config
+from geosplat_jax.report.protocols import NEW_VIEWS, Look, Protocol, ScaledLook, protocol
+
+_MEASURES = {
+    "psnr": ("PSNR", "dB", "higher"),
+    "psnr_h": ("PSNR-H", "dB", "higher"),
+    "psnr_l": ("PSNR-L", "dB", "higher"),
+    "ssim": ("SSIM", "", "higher"),
+    "mse": ("mean squared error", "", "lower"),
+    "iou": ("intersection over union", "", "higher"),
+    "mae": ("mean angle", "degrees", "lower"),
+    "scale": ("factor to the truth", "", ""),
+    "correlation": ("correlation of log luminance", "", "higher"),
+    "direction_error": ("angle between mean directions", "degrees", "lower"),
+    "yaw_error": ("turn about the vertical axis", "degrees", ""),
+    "yaw_correlation": ("correlation after the best turn", "", "higher"),
+    "is_mirrored": ("the map is mirrored: 1 for yes", "", "lower"),
+    "mirrored_correlation": ("correlation of the mirrored map", "", ""),
+}
+"""Name, unit and which way is better, of what a figure's name ends with."""
+
+_REGIONS = {
+    "masked": "object's pixels",
+    "full": "all pixels",
+    "r": "red",
+    "g": "green",
+    "b": "blue",
+}
+
+_GROUPS = {
+    "nvs": "New views",
+    "mask": "Silhouettes",
+    "normal": "Normals",
+    "albedo": "Albedo",
+    "roughness": "Roughness",
+    "metallic": "Metallic",
+    "light": "Light",
+}
+
+_LONGEST_CURVE = 800
+"""Points of a curve at most; of longer ones every n-th step is shown, and the page says so."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One line of the table of figures.
+
+    Attributes
+    ----------
+    key : name in ``metrics.json``. group, label, unit : in words.
+    better : ``higher``, ``lower``, or empty where neither is.
+    """
+
+    key: str
+    group: str
+    label: str
+    unit: str
+    better: str
+
+
+def figure(key: str) -> Figure:
+    """Describe a figure of ``metrics.json`` by its name; what is not known keeps its name."""
+    group, _, rest = key.partition(".")
+    title = _GROUPS.get(group, group)
+    if group == "relight":
+        light, _, rest = rest.rpartition(".")
+        title = "New lights, mean" if light == "mean" else f"New light: {light}"
+    name, parts = rest.removesuffix("_deg"), []
+    while name not in _MEASURES and "_" in name:
+        name, _, region = name.rpartition("_")
+        parts.append(_REGIONS.get(region, region))
+    if name not in _MEASURES:
+        return Figure(key, title, rest, "", "")
+    label, unit, better = _MEASURES[name]
+    return Figure(key, title, ", ".join([label, *parts]), unit, better)
+
+
+def _look(look: Look | ScaledLook) -> str:
+    """Say how pictures are compared."""
+    if isinstance(look, ScaledLook):
+        return "on the object alone, each channel of each image scaled by least squares"
+    encodings = {"linear": "in linear light", "srgb": "in sRGB", "gamma22": "after gamma 2.2"}
+    grey = {0.0: "black", 1.0: "white"}.get(look.background, f"grey {look.background:g}")
+    return f"{encodings[look.encoding]} on {grey}"
+
+
+def protocol_text(name: str) -> str:
+    """Say in sentences what a protocol compares, and how."""
+    chosen: Protocol = protocol(name)
+    scale = {"least_squares": "least squares", "median": "the median of ratios"}
+    return (
+        f"Protocol {chosen.name}. New views are compared {_look(NEW_VIEWS)}, albedo "
+        f"{_look(chosen.albedo)} after one factor for each channel by "
+        f"{scale[chosen.albedo_scale]}, relit images {_look(chosen.relight)} with the albedo in "
+        "that scale. Figures of other protocols are not comparable."
+    )
+
+
+def curves(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Take the curves out of the lines of a training.
+
+    Returns
+    -------
+    ``step``, ``loss``, ``psnr``, ``splats``, ``memory`` (MB) of every ``every``-th step and the
+    last, and ``stages``: name and first step of each.
+    """
+    every = -(-len(lines) // _LONGEST_CURVE) if lines else 1
+    kept = [line for n, line in enumerate(lines) if n % every == 0 or n == len(lines) - 1]
+    stages, before = [], None
+    for line in lines:
+        if line["stage"] != before:
+            before = line["stage"]
+            stages.append({"name": before, "step": line["step"]})
+    columns = {"loss": "loss", "psnr": "psnr", "splats": "splats", "memory": "peak_memory_mb"}
+    values = {name: [_finite(line.get(key)) for line in kept] for name, key in columns.items()}
+    return {"step": [line["step"] for line in kept], **values, "stages": stages, "every": every}
+
+
+def _finite(value: Any) -> float | int | None:
+    """Return a number that JSON can hold, or None."""
+    return value if isinstance(value, int | float) and np.isfinite(value) else None
+
+
+def stage_times(lines: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Tell of each stage its steps, seconds, the median step and the longest, where it compiled."""
+    seconds: dict[str, list[float]] = {}
+    for line in lines:
+        seconds.setdefault(line["stage"], []).append(float(line["seconds"]))
+    return [
+        {
+            "stage": stage,
+            "steps": len(times),
+            "seconds": sum(times),
+            "median": float(np.median(times)),
+            "longest": max(times),
+        }
+        for stage, times in seconds.items()
+    ]
+
+
+def _preset_of(config: Config) -> Config:
+    return make_config(config.preset, config.quality, material_prior=config.material_prior)
+
+
+def changed_from_preset(config: Config) -> dict[str, tuple[Any, Any]]:
+    """Map each setting that differs from the preset's at its quality to both values."""
+    return changed_settings(_preset_of(config), config)
+
+
+def command(record: Mapping[str, Any], config: Config) -> tuple[str, bool]:
+    """Return the command that trains the run again, and whether its settings are all in it.
+
+    Parameters
+    ----------
+    record : ``run.json``. config : the settings in it.
+    """
+    words = ["geosplat-jax", "train", str(record["scene"]), "--output", "runs/again"]
+    words += ["--preset", config.preset, "--quality", config.quality]
+    words += ["--material-prior", config.material_prior]
+    reading = record["dataset"]
+    if reading.get("downscale", 1) != 1:
+        words += ["--downscale", str(reading["downscale"])]
+    for name in ("light", "cameras"):
+        if reading.get(name):
+            words += [f"--{name}", str(reading[name])]
+    if reading.get("bounds"):
+        words += ["--bounds", *(f"{x:.9g}" for x in reading["bounds"])]
+    overrides = [
+        f"{path}={json.dumps(new)}" for path, (_, new) in changed_from_preset(config).items()
+    ]
+    try:
+        again = make_config(
+            config.preset,
+            config.quality,
+            material_prior=config.material_prior,
+            overrides=tuple(overrides),
+        )
+        is_whole = not changed_settings(again, config)
+    except ValueError:
+        is_whole = False
+    if is_whole:
+        words += [word for override in overrides for word in ("--set", override)]
+    return _folded(words), is_whole
+
+
+def _folded(words: Sequence[str]) -> str:
+    """Quote for a shell, an option a line."""
+    starts = [0, *(n for n, word in enumerate(words) if word.startswith("--")), len(words)]
+    lines = [shlex.join(words[first:last]) for first, last in pairwise(starts)]
+    return " \\\n    ".join(lines)

@@ -1,0 +1,66 @@
+"""Progress of long work: who counts, who listens, and a time left that can be believed."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeVar
+
+import numpy as np
+
+from geosplat_jax.io.poses import OnProgress
+
+Item = TypeVar("Item")
+
+_RECENT = 20
+"""Items that the pace is taken from."""
+
+
+def counted(items: Sequence[Item], part: str, on_progress: OnProgress | None) -> Iterator[Item]:
+    """Go through items and tell after each, and before the first, how many are done."""
+    for done, item in enumerate(items):
+        if on_progress is not None:
+            on_progress(part, done, len(items))
+        yield item
+    if on_progress is not None:
+        on_progress(part, len(items), len(items))
+
+
+class Pace:
+    """Estimates the time left of one part of the work.
+
+    The first item waits for the compilation of all; it says nothing about the others, and there is
+    no estimate before the second is done.
+
+    Parameters
+    ----------
+    clock : seconds, monotonic (default: `time.perf_counter`).
+    """
+
+    def __init__(self, clock: Callable[[], float] | None = None) -> None:
+        self._clock = clock or time.perf_counter
+        self._before = self._clock()
+        self._done = 0
+        self._seconds: list[float] = []
+
+    def left(self, done: int, total: int) -> float | None:
+        """Note that ``done`` items are done; return the seconds left, None before it is known."""
+        now = self._clock()
+        fresh = done - self._done
+        if fresh > 0:
+            if self._done > 0:
+                self._seconds += [(now - self._before) / fresh] * fresh
+            self._before, self._done = now, done
+        if done >= total:
+            return 0.0
+        return (
+            None
+            if not self._seconds
+            else (total - done) * float(np.median(self._seconds[-_RECENT:]))
+        )
+
+
+def duration(seconds: float) -> str:
+    """Say a time as people do: ``40 s``, ``3 min``, ``1 h 20 min``."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"

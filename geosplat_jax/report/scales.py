@@ -1,0 +1,79 @@
+"""Numbers as colours: errors, roughness, counts of views, each with the scale that explains it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+_GREY = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+# Black through purple, red and orange to pale yellow; each is lighter than the one before.
+_HEAT = (
+    (0.00, 0.00, 0.02),
+    (0.23, 0.06, 0.44),
+    (0.55, 0.16, 0.50),
+    (0.87, 0.29, 0.41),
+    (0.99, 0.62, 0.43),
+    (0.99, 0.99, 0.75),
+)
+# Red for none through yellow to blue: what few views saw stands out.
+_TRUST = ((0.70, 0.09, 0.17), (0.96, 0.60, 0.35), (0.99, 0.95, 0.70), (0.45, 0.72, 0.78))
+_TRUST = (*_TRUST, (0.15, 0.36, 0.60))
+
+LARGEST_ERROR = 0.2
+"""Difference of sRGB values that the scale of errors ends at."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Which colour a number gets.
+
+    Attributes
+    ----------
+    name : what is shown. low, high : ends of the scale; numbers beyond have the colours of the
+        ends. colors : at equal distances from low to high, sRGB in [0, 1]. unit : of the numbers.
+    """
+
+    name: str
+    low: float
+    high: float
+    colors: tuple[tuple[float, float, float], ...]
+    unit: str = ""
+
+    def picture(self, values: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W 3"]:
+        """Return the colours of numbers, sRGB float32."""
+        share = np.clip((values - self.low) / (self.high - self.low), 0.0, 1.0)
+        places = np.linspace(0.0, 1.0, len(self.colors))
+        channels = [np.interp(share, places, channel) for channel in np.transpose(self.colors)]
+        return np.stack(channels, axis=-1).astype(np.float32)
+
+    def bar(self, height: int, width: int) -> Float[np.ndarray, "H W 3"]:
+        """Draw the scale from left to right."""
+        steps = np.linspace(self.low, self.high, width)
+        return self.picture(np.broadcast_to(steps, (height, width)))
+
+    @property
+    def ends(self) -> tuple[str, str]:
+        """Texts for both ends."""
+        unit = f" {self.unit}" if self.unit else ""
+        return f"{self.low:g}", f"{self.high:g}{unit}"
+
+    def described(self) -> dict[str, object]:
+        """Return what JSON and a style sheet need to draw the scale."""
+        hexes = ["#" + "".join(f"{round(255 * c):02x}" for c in color) for color in self.colors]
+        return {"name": self.name, "ends": self.ends, "colors": hexes}
+
+
+ERROR = Scale("error: mean difference of sRGB values", 0.0, LARGEST_ERROR, _HEAT)
+ROUGHNESS = Scale("roughness", 0.0, 1.0, _GREY)
+METALLIC = Scale("metallic", 0.0, 1.0, _GREY)
+SEEN = Scale("training views that see the place", 0.0, 16.0, _TRUST, "or more")
+
+
+def error_map(
+    first: Float[np.ndarray, "H W 3"], second: Float[np.ndarray, "H W 3"]
+) -> Float[np.ndarray, "H W 3"]:
+    """Show where two sRGB pictures differ: the mean over the channels of the absolute difference.
+
+    The scale is `ERROR`.
+    """
+    return ERROR.picture(np.abs(first - second).mean(axis=-1))

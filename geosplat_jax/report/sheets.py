@@ -1,0 +1,160 @@
+"""Sheets of an evaluation: truth first, what was found beside it, errors, lights and scales."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geosplat_jax.fit.train import Trained
+from geosplat_jax.io.images import write_png
+from geosplat_jax.io.meshes import render_mesh_normals
+from geosplat_jax.io.views import Views
+from geosplat_jax.report.gallery import write_gallery
+from geosplat_jax.report.pictures import normals_to_rgb, overview_sheet, shade_mesh_preview
+from geosplat_jax.report.renderer import (
+    RenderedView,
+    Renderer,
+    photograph_on_white,
+    render_on_white,
+    to_picture,
+)
+from geosplat_jax.report.scales import ERROR, METALLIC, ROUGHNESS, SEEN, error_map
+from geosplat_jax.report.trust import Sightings
+
+
+def _grey(values: np.ndarray) -> np.ndarray:
+    return ROUGHNESS.picture(values[..., 0])
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What is known of the views that are shown.
+
+    Attributes
+    ----------
+    views : all test views.
+    psnr : of every view, dB.
+    rendered : by index, those that are shown.
+    mesh : vertices, faces and normals.
+    seen : by how many training views; None where that was not counted.
+    albedo_scale : (3,) factors that the albedo is aligned to the truth with.
+    relit : pictures by title under each light, for every view that is shown; empty without lights.
+    relit_figures : lines about them.
+    lights : linear radiance by title, the true one first where it is known.
+    """
+
+    views: Views
+    psnr: Sequence[float]
+    rendered: Mapping[int, RenderedView]
+    mesh: tuple[np.ndarray, np.ndarray, np.ndarray]
+    seen: Sightings | None
+    albedo_scale: np.ndarray
+    relit: list[dict[str, np.ndarray]]
+    relit_figures: list[str]
+    lights: Mapping[str, np.ndarray]
+
+    def write(self, folder: Path) -> dict[str, Any]:
+        """Write the sheets, and every picture for itself; return what `write_gallery` does."""
+        overview, materials = self.overview_rows(), self.material_rows()
+        write_png(folder / "overview.png", self._overview_sheet(overview))
+        if materials[0]:
+            write_png(folder / "materials.png", self._material_sheet(materials))
+        if self.relit:
+            names = [self.views.names[index] for index in self.rendered]
+            sheet = overview_sheet(
+                self.relit, row_labels=names, scales=[ERROR], notes=self.relit_figures
+            )
+            write_png(folder / "relight.png", sheet)
+        relit = self.relit or [{}] * len(overview)
+        rows = {
+            self.views.names[index]: {**first, **second, **third}
+            for index, first, second, third in zip(
+                self.rendered, overview, materials, relit, strict=True
+            )
+        }
+        return write_gallery(folder, rows, lights=self.lights)
+
+    @property
+    def _labels(self) -> list[str]:
+        """Name every view that is shown, with how well it was met."""
+        names = self.views.names
+        return [f"{names[index]}\n{self.psnr[index]:.2f} dB" for index in self.rendered]
+
+    def overview_rows(self) -> list[dict[str, np.ndarray]]:
+        """Make the pictures that need no truth but the photograph."""
+        rows = []
+        for index, view in self.rendered.items():
+            truth = photograph_on_white(self.views.images[index])
+            render = render_on_white(view.rgb, view.alpha)
+            row = {
+                "truth": truth,
+                "render": render,
+                "error": error_map(truth, render),
+                "normal": normals_to_rgb(view.aovs["normal"], view.alpha),
+                "albedo": to_picture(view.aovs["albedo"]),
+                "roughness": _grey(view.aovs["roughness"]),
+                "metallic": _grey(view.aovs["metallic"]),
+            }
+            camera = self.views.camera(np.array([index]))
+            row["mesh"] = shade_mesh_preview(*render_mesh_normals(*self.mesh, camera))
+            if self.seen is not None:
+                row["seen by"] = self.seen.picture(camera)
+            rows.append(row)
+        return rows
+
+    def material_rows(self) -> list[dict[str, np.ndarray]]:
+        """Make pictures of attributes beside the truth, where there is some."""
+        rows = []
+        for index, view in self.rendered.items():
+            mask, row = self.views.images[index][..., 3:], {}
+            for name in ("albedo", "roughness", "metallic", "normal"):
+                if name not in self.views.truth:
+                    continue
+                true, found = self.views.truth[name][index], view.aovs[name]
+                if name == "albedo":
+                    row["true albedo"] = to_picture(true * mask)
+                    row["albedo, aligned"] = to_picture(found * self.albedo_scale)
+                    continue
+                if name == "normal":
+                    row["true normal"] = normals_to_rgb(true, mask[..., 0])
+                    row["normal"] = normals_to_rgb(found, view.alpha)
+                else:
+                    row[f"true {name}"], row[name] = _grey(true * mask), _grey(found)
+            rows.append(row)
+        return rows
+
+    def _overview_sheet(self, rows: list[dict[str, np.ndarray]]) -> np.ndarray:
+        """Compose the sheet: a row a view, and the lights below."""
+        scales = [ERROR, ROUGHNESS, METALLIC]
+        if self.seen is not None:
+            scales.append(SEEN)
+        notes = ["albedo: as it was found", "lights: each exposed for itself"]
+        return overview_sheet(
+            rows, row_labels=self._labels, lights=self.lights, scales=scales, notes=notes
+        )
+
+    def _material_sheet(self, rows: list[dict[str, np.ndarray]]) -> np.ndarray:
+        """Compose the sheet of attributes beside the truth."""
+        notes = []
+        if "albedo" in self.views.truth:
+            factors = zip("RGB", self.albedo_scale, strict=True)
+            text = ", ".join(f"{channel} x {factor:.3f}" for channel, factor in factors)
+            notes = [f"albedo, aligned: as it was found, times {text} (linear)"]
+        known = [scale for scale in (ROUGHNESS, METALLIC) if scale.name in rows[0]]
+        return overview_sheet(rows, row_labels=self._labels, scales=known, notes=notes)
+
+
+def preview_image(trained: Trained, views: Views) -> np.ndarray:
+    """Compose a labelled sheet of the first view: truth, render, error and normals, sRGB."""
+    view = Renderer.of(trained, samples=64)(views.camera(np.array([0])))
+    truth, render = photograph_on_white(views.images[0]), render_on_white(view.rgb, view.alpha)
+    row = {
+        "truth": truth,
+        "render": render,
+        "error": error_map(truth, render),
+        "normal": normals_to_rgb(view.aovs["normal"], view.alpha),
+    }
+    title = f"step {trained.step}, {trained.stage.name}"
+    return overview_sheet([row], title=title, row_labels=[views.names[0]], scales=[ERROR])

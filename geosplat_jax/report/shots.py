@@ -1,0 +1,251 @@
+"""Which cameras to render from, and what to write of each image."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from geosplat_jax.core.types import Camera
+from geosplat_jax.fit.folder import RunError
+from geosplat_jax.io.dataset import Dataset
+from geosplat_jax.io.frames import read_transforms
+from geosplat_jax.io.images import SceneError, write_exr, write_png
+from geosplat_jax.io.views import Views
+from geosplat_jax.report.consistency import resized
+from geosplat_jax.report.pictures import normals_to_rgb
+from geosplat_jax.report.renderer import RenderedView, straight_rgba, to_picture
+
+AOVS = ("albedo", "roughness", "metallic", "normal", "depth")
+"""Images beside the colour that can be written."""
+
+SPLITS = ("test", "train")
+
+LARGEST_SIZE = 8192
+"""Pixels along the longer side of an image, at most."""
+
+_SMALLEST_ALPHA = 1e-4
+
+
+class Shot(NamedTuple):
+    """A camera of one view, and the stem of the files that are written of it."""
+
+    name: str
+    camera: Camera
+
+
+def _stems(names: Sequence[str]) -> list[str]:
+    """Turn names of views into names of files, all different."""
+    stems: list[str] = []
+    for name in names:
+        stem = name.replace("/", "_").strip("._") or "view"
+        number, unique = 1, stem
+        while unique in stems:
+            number += 1
+            unique = f"{stem}_{number}"
+        stems.append(unique)
+    return stems
+
+
+def shots_of(views: Views) -> list[Shot]:
+    """Return the cameras of views."""
+    cameras = (views.camera(np.array([number])) for number in range(len(views)))
+    return [Shot(stem, camera) for stem, camera in zip(_stems(views.names), cameras, strict=True)]
+
+
+def read_shots(path: Path, like: Camera) -> list[Shot]:
+    """Read cameras from a file like ``transforms.json``.
+
+    Poses are camera-to-world with OpenGL axes, in the world of the scene. A lens that is given in
+    pixels says how large the image is; other images are as large as that of ``like``.
+
+    Raises
+    ------
+    SceneError
+        If the file cannot be read, a pose or lens is unusable, or a lens is bent.
+    """
+    listed = read_transforms(path)
+    shots = []
+    for (name, pose, lens), stem in zip(listed, _stems([n for n, *_ in listed]), strict=True):
+        if lens.distortion is not None:
+            raise SceneError(f"{path} bends the lens of {name}; images are made without distortion")
+        width = getattr(lens, "width", like.width)
+        height = getattr(lens, "height", like.height)
+        one = Views(
+            (name,),
+            np.asarray(pose, np.float64)[None],
+            lens.intrinsics(width, height)[None],
+            np.zeros((1, height, width, 4), np.float32),
+        )
+        shots.append(Shot(stem, one.camera()))
+    return shots
+
+
+def about_z(angle: float) -> np.ndarray:
+    """Rotation by an angle in radians, counter-clockwise seen from above, (3, 3)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def orbit(camera: Camera, center: np.ndarray, angle: float) -> Camera:
+    """Carry a single camera around the vertical axis through ``center`` (3,)."""
+    turned = np.eye(4)
+    turned[:3, :3] = about_z(angle)
+    turned[:3, 3] = center - turned[:3, :3] @ center
+    pose = np.asarray(camera.world_to_camera[0], np.float64) @ np.linalg.inv(turned)
+    return replace(camera, world_to_camera=jnp.asarray(pose[None], jnp.float32))
+
+
+def with_field_of_view(camera: Camera, degrees: float) -> Camera:
+    """Change the horizontal field of view; pixels keep their shape, the axis its place."""
+    wanted = 0.5 * camera.width / math.tan(0.5 * math.radians(degrees))
+    factor = wanted / float(camera.intrinsics[0, 0, 0])
+    scale = np.array([[factor, factor, 1.0], [factor, factor, 1.0], [1.0, 1.0, 1.0]])
+    scale[:2, 2] = 1.0
+    return replace(camera, intrinsics=camera.intrinsics * jnp.asarray(scale[None], jnp.float32))
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Which cameras to render from.
+
+    Attributes
+    ----------
+    views : ``test`` or ``train``; None for the test views, or those of the training without any.
+    file : cameras like those of a ``transforms.json``, instead of views.
+    turntable : so many cameras on a circle around the object, from the first of the others on;
+        0 for those themselves.
+    size : pixels along the longer side (default: those of the photographs).
+    field_of_view : horizontal, degrees (default: that of the photographs).
+    """
+
+    views: str | None = "test"
+    file: Path | None = None
+    turntable: int = 0
+    size: int | None = None
+    field_of_view: float | None = None
+
+    def check(self) -> None:
+        """Refuse what cannot be rendered.
+
+        Raises
+        ------
+        ValueError
+        """
+        if self.views is not None and self.views not in SPLITS:
+            raise ValueError(f"views must be one of {SPLITS}, got {self.views!r}")
+        if self.turntable < 0:
+            raise ValueError(f"a turntable has at least 0 cameras, got {self.turntable}")
+        if self.size is not None and not 1 <= self.size <= LARGEST_SIZE:
+            raise ValueError(f"the size must be from 1 to {LARGEST_SIZE} pixels, got {self.size}")
+        if self.field_of_view is not None and not 0.0 < self.field_of_view < 180.0:
+            raise ValueError(
+                "the field of view must be above 0 and below 180 degrees, got "
+                f"{self.field_of_view:g}"
+            )
+
+    def shots(self, dataset: Dataset, center: np.ndarray) -> list[Shot]:
+        """List the cameras; ``center`` : (3,) of the object.
+
+        Raises
+        ------
+        RunError
+            If the scene has no such views.
+        SceneError
+            See `read_shots`.
+        ValueError
+            See `check`.
+        """
+        self.check()
+        if self.file is not None:
+            shots = read_shots(self.file, dataset.train.camera(np.array([0])))
+        elif self.views is None:
+            shots = shots_of(dataset.views_to_show)
+        else:
+            views = getattr(dataset, self.views)
+            if not len(views):
+                other = " --views train for those of the training," if self.views == "test" else ""
+                raise RunError(
+                    f"{dataset.root} has no {self.views} views; take{other} --cameras FILE or, "
+                    "with either, --turntable N"
+                )
+            shots = shots_of(views)
+        if self.turntable:
+            angles = 2 * np.pi * np.arange(self.turntable) / self.turntable
+            first = shots[0].camera
+            shots = [
+                Shot(f"turntable_{number:04d}", orbit(first, center, float(angle)))
+                for number, angle in enumerate(angles)
+            ]
+        return [Shot(name, self._framed(camera)) for name, camera in shots]
+
+    def _framed(self, camera: Camera) -> Camera:
+        if self.field_of_view is not None:
+            camera = with_field_of_view(camera, self.field_of_view)
+        return camera if self.size is None else resized(camera, self.size)
+
+
+@dataclass(frozen=True)
+class Images:
+    """What to write of each render.
+
+    Attributes
+    ----------
+    aovs : some of `AOVS`.
+    exr : also write colour and AOVs as linear floats.
+    """
+
+    aovs: tuple[str, ...] = ("normal",)
+    exr: bool = False
+
+    def check(self) -> None:
+        """Refuse names of unknown images.
+
+        Raises
+        ------
+        ValueError
+        """
+        unknown = sorted(set(self.aovs) - set(AOVS))
+        if unknown:
+            raise ValueError(f"unknown images {unknown}; expected some of {list(AOVS)}")
+
+    def write(self, folder: Path, name: str, view: RenderedView) -> list[Path]:
+        """Write the images of a view; return the files.
+
+        ``NAME_rgba.png`` has straight alpha. PNG of AOVs: albedo in sRGB, roughness and metallic
+        as they are, normals as (n + 1) / 2. ``.exr`` are linear: colour with alpha as
+        ``NAME_rgba.exr``, AOVs as straight values, zero where nothing was hit. Normals are in world
+        axes; depth, along the camera's axis in the scene's unit, is written as EXR only.
+        """
+        written = [folder / f"{name}_rgba.png"]
+        write_png(written[0], straight_rgba(view))
+        if self.exr:
+            written.append(folder / f"{name}_rgba.exr")
+            colors = _straight(view.rgb, view.alpha)
+            write_exr(written[-1], np.concatenate([colors, view.alpha[..., None]], axis=-1))
+        for aov in self.aovs:
+            values = _straight(view.aovs[aov], view.alpha)
+            if aov != "depth":
+                written.append(folder / f"{name}_{aov}.png")
+                write_png(written[-1], _picture(aov, values, view))
+            if self.exr or aov == "depth":
+                written.append(folder / f"{name}_{aov}.exr")
+                write_exr(written[-1], values)
+        return written
+
+
+def _straight(values: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Divide blended values by their coverage; zero where nothing was hit."""
+    covered = (alpha > _SMALLEST_ALPHA)[..., None]
+    return np.where(covered, values / np.where(covered, alpha[..., None], 1.0), 0.0)
+
+
+def _picture(aov: str, values: np.ndarray, view: RenderedView) -> np.ndarray:
+    """Make a picture of an AOV."""
+    if aov == "normal":
+        return normals_to_rgb(view.aovs["normal"], view.alpha)
+    shown = to_picture(values) if aov == "albedo" else np.clip(values, 0.0, 1.0)
+    return np.concatenate([shown, np.clip(view.alpha, 0.0, 1.0)[..., None]], axis=-1)

@@ -1,0 +1,144 @@
+"""What of a surface can be trusted: how many training views see each place of it."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy import ndimage
+
+from geosplat_jax.core.types import Camera
+from geosplat_jax.io.meshes import first_hits
+from geosplat_jax.io.views import Views
+from geosplat_jax.report.consistency import resized
+from geosplat_jax.report.scales import SEEN
+
+LARGEST_COUNT = 64
+"""Views that are asked, at most; spread evenly over all."""
+
+_SIZE = 160
+"""Pixels along the longer side of the depth buffers."""
+
+_SLACK = 0.02
+"""Share of the surface's extent that a place may lie behind the depth that its pixel sees."""
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """How many training views see each vertex of a mesh.
+
+    Attributes
+    ----------
+    vertices : (V, 3) world. faces : (F, 3).
+    counts : (V,) views that see a vertex: it is in the picture, in front of every other surface,
+        its normal looks to the camera, and its pixel counts.
+    asked : views that were asked. available : views of the training.
+    """
+
+    vertices: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+    counts: Int[np.ndarray, " V"]
+    asked: int
+    available: int
+
+    @cached_property
+    def _areas(self) -> Float[np.ndarray, " V"]:
+        """Area that belongs to each vertex: a third of its faces."""
+        a, b, c = np.moveaxis(np.asarray(self.vertices, np.float64)[self.faces], 1, 0)
+        area = np.sqrt((np.cross(b - a, c - a) ** 2).sum(-1)) / 6.0
+        sums = np.bincount(self.faces.ravel(), np.repeat(area, 3), minlength=len(self.vertices))
+        return sums.astype(np.float64)
+
+    def shares(self) -> list[dict[str, float | str]]:
+        """Tell which share of the area how many views see: none, one or two, three to seven, more.
+
+        Of an empty surface there is nothing to tell.
+        """
+        total = self._areas.sum()
+        if total <= 0:
+            return []
+        limits = [("none", 0, 0), ("1 or 2", 1, 2), ("3 to 7", 3, 7), ("8 and more", 8, np.inf)]
+        return [
+            {
+                "views": text,
+                "share": float(
+                    self._areas[(self.counts >= low) & (self.counts <= high)].sum() / total
+                ),
+            }
+            for text, low, high in limits
+        ]
+
+    def described(self) -> dict[str, Any]:
+        """Return what ``metrics.json`` keeps."""
+        return {"asked": self.asked, "available": self.available, "shares": self.shares()}
+
+    def picture(self, camera: Camera) -> Float[np.ndarray, "H W 3"]:
+        """Show the counts as one view sees them, in the colours of `scales.SEEN`."""
+        face_rows, weights = first_hits(self.vertices, self.faces, camera)
+        is_hit = face_rows >= 0
+        image = np.zeros(face_rows.shape)
+        part = weights[is_hit] / weights[is_hit].sum(axis=-1, keepdims=True)
+        image[is_hit] = (part * self.counts[self.faces[face_rows[is_hit]]]).sum(axis=-1)
+        colors = SEEN.picture(image)
+        return np.where(is_hit[..., None], colors, np.float32(1.0))
+
+
+def _sees(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    normals: Float[np.ndarray, "V 3"],
+    camera: Camera,
+    valid: Float[np.ndarray, "h w"] | None,
+) -> np.ndarray:
+    """Which vertices a single view sees, (V,) bool."""
+    _, weights = first_hits(vertices, faces, camera)
+    inverse_depth = weights.sum(axis=-1)
+    hit = inverse_depth > 0
+    depth = np.where(hit, 1.0 / np.where(hit, inverse_depth, 1.0), np.inf)
+    # The farthest of the pixels around: where the surface is steep, depth changes within a pixel.
+    depth = ndimage.maximum_filter(depth, size=3)
+    pose = np.asarray(camera.world_to_camera[0], np.float64)
+    points = vertices @ pose[:3, :3].T + pose[:3, 3]
+    in_front = points[:, 2] > 0
+    z = np.where(in_front, points[:, 2], 1.0)
+    pixels = (points @ np.asarray(camera.intrinsics[0], np.float64).T)[:, :2] / z[:, None]
+    column, row = np.floor(pixels).astype(np.int64).T
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    column, row = np.where(inside, column, 0), np.where(inside, row, 0)
+    extent = float(np.max(np.ptp(vertices, axis=0)))
+    faces_camera = np.einsum("nd,nd->n", normals @ pose[:3, :3].T, points) < 0
+    is_nearest = z <= depth[row, column] + _SLACK * extent
+    seen = in_front & inside & faces_camera & is_nearest
+    if valid is not None:
+        rows = row * valid.shape[0] // camera.height
+        columns = column * valid.shape[1] // camera.width
+        seen &= valid[rows, columns] > 0
+    return seen
+
+
+def sightings(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    normals: Float[np.ndarray, "V 3"],
+    views: Views,
+) -> Sightings:
+    """Count the training views that see each vertex, on the host.
+
+    Parameters
+    ----------
+    vertices, normals : (V, 3) in the world; faces : (F, 3).
+    views : of the training; of more than `LARGEST_COUNT`, so many are asked, and `Sightings` says
+        so.
+    """
+    vertices, normals = np.asarray(vertices, np.float64), np.asarray(normals, np.float64)
+    count = min(len(views), LARGEST_COUNT)
+    chosen = np.unique(np.linspace(0, len(views) - 1, count).round().astype(int)) if count else []
+    counts = np.zeros(len(vertices), np.int64)
+    for number in chosen if len(faces) else ():
+        camera = views.camera(np.array([number]))
+        if max(camera.height, camera.width) > _SIZE:
+            camera = resized(camera, _SIZE)
+        valid = None if views.valid is None else views.valid[number]
+        counts += _sees(vertices, faces, normals, camera, valid)
+    return Sightings(vertices, faces, counts, len(chosen), len(views))
