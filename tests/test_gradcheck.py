@@ -19,6 +19,7 @@ SLOW_STAGES = {
     "loss",
     "refinement",
     "materials",
+    "paths",
     "projection",
     "rasterizer",
     "transport",

@@ -19,7 +19,7 @@ Unbiased wherever the light is bounded. The backward pass computes chunks of poi
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import equinox as eqx
 import jax
@@ -42,6 +42,7 @@ from geosplat_jax.transport.indirect import (
     INDIRECT_MODELS,
     NO_INDIRECT,
     Indirect,
+    IndirectSource,
     TracedIndirect,
     outgoing,
 )
@@ -79,16 +80,10 @@ def _arriving(
     hits: Int[Array, "S N"],
 ) -> tuple[Float[Array, "S N 3"], Float[Array, "S N 3"]]:
     """Radiance along rays for the diffuse lobe and for the specular one."""
-    samples = directions.shape[0]
-    flat, ends = directions.reshape(-1, 3), hits.reshape(-1)
-    direct = lookup(light.radiance, flat)
-    if indirect.belongs_to_points and indirect.values is not None:
-        values = jnp.broadcast_to(indirect.values[None], (samples, *indirect.values.shape))
-        indirect = replace(indirect, values=values.reshape(-1, values.shape[-1]))
-    lobes = indirect.incoming(flat, ends)
-    is_open = (ends == OPEN)[:, None]
+    direct = lookup(light.radiance, directions.reshape(-1, 3)).reshape(directions.shape)
+    is_open = (hits == OPEN)[..., None]
     diffuse, specular = (
-        jnp.where(is_open, direct, radiance).reshape(directions.shape) for radiance in lobes
+        jnp.where(is_open, direct, radiance) for radiance in indirect.along(directions, hits)
     )
     return diffuse, specular
 
@@ -104,7 +99,7 @@ def gather(
     points: SurfacePoints,
     samples: Samples,
     light: EnvLight,
-    indirect: Indirect = NO_INDIRECT,
+    indirect: IndirectSource = NO_INDIRECT,
 ) -> Gathered:
     """Sum up the diffuse light of N points, and keep what the light's samples bring.
 
@@ -112,7 +107,8 @@ def gather(
     """
     total = samples.weights.shape[1]
     shared = samples.light_density.shape[1]
-    rows, restore = _split(indirect)
+    followed = indirect.followed(points, samples.directions, samples.hits, samples.distances)
+    rows, restore = _split(followed)
 
     def one_chunk(parts: tuple) -> tuple[Array, Array]:
         normals, samples, rows = parts
@@ -166,7 +162,7 @@ def reflect(
     light: EnvLight,
     sampler: LightSampler,
     index: RayIndex | None,
-    indirect: Indirect = NO_INDIRECT,
+    indirect: IndirectSource = NO_INDIRECT,
     *,
     counts: SampleCounts,
     finds_nearest: bool = False,
@@ -201,15 +197,16 @@ def reflect(
         counts=counts,
         finds_nearest=finds_nearest,
     )
-    rows, restore = _split(indirect)
+    followed = indirect.followed(points, rays.directions, rays.hits, rays.distances)
+    rows, restore = _split(followed)
 
     def one_chunk(parts: tuple) -> tuple[Array, Array]:
         points, materials, wo, gathered, rays, rows = parts
-        drawn, hits, drawn_density = rays
-        _, brought = _arriving(light, restore(rows), jnp.moveaxis(drawn, 1, 0), hits.T)
+        drawn = rays.directions
+        _, brought = _arriving(light, restore(rows), jnp.moveaxis(drawn, 1, 0), rays.hits.T)
         wi = jnp.concatenate([gathered.directions.T, drawn.T], axis=1)
         radiance = [gathered.radiance.T, jnp.moveaxis(brought, -1, 0)]
-        light_part = jnp.concatenate([gathered.density.T, drawn_density.T])
+        light_part = jnp.concatenate([gathered.density.T, rays.light_density.T])
         found = (wi, jnp.concatenate(radiance, axis=1), light_part)
         return _specular_sums(materials, points.normals, wo, found, points.mask, counts)
 
@@ -324,8 +321,8 @@ SampleCount = Annotated[int, Field(ge=0, le=4096)]
 
 
 @settings
-class MonteCarloSettings(TransportSettings, kind="monte_carlo"):
-    """Sampled light, with shadows traced against the surface."""
+class SampledSettings:
+    """What every transport by samples of light and lobes has in common."""
 
     light_count: SampleCount = 4
     """Samples of the environment per point, for both lobes."""
@@ -336,13 +333,6 @@ class MonteCarloSettings(TransportSettings, kind="monte_carlo"):
     residual_count: SampleCount = 0
     """Samples of each kind of a second image, from which Eq. 13 takes its residual; with 0 it takes
     that of the image that it differentiates, which biases the gradient."""
-    occlusion: bool = True
-    """Trace rays against the surface; without it only directions below a point's own face are
-    blocked."""
-    indirect: Literal["none", "constant", "harmonics", "traced"] = "none"
-    """Light from blocked directions, see `transport.indirect`."""
-    bounces: Annotated[int, Field(ge=1, le=16)] = 1
-    """For traced indirect light, how often light goes from surface to surface."""
     shares_views: bool = True
     """All views of a batch use the same samples of light and cosine, which are then traced once.
     The noise of the images is then correlated between views; its mean is the same."""
@@ -356,6 +346,68 @@ class MonteCarloSettings(TransportSettings, kind="monte_carlo"):
                 "each lobe needs at least one sample: raise light_count, or both diffuse_count and "
                 "specular_count"
             )
+
+
+class SampledTransport(Transport):
+    """A transport by samples of light and lobes."""
+
+    settings: Any = eqx.field(static=True)
+
+    @property
+    def needs_key(self) -> bool:
+        """It draws samples."""
+        return True
+
+    @property
+    def filter_inputs(self) -> tuple[str, ...]:
+        """See `denoised`."""
+        return DENOISER_INPUTS if self.settings.denoise.iterations > 0 else ()
+
+    @property
+    def _counts(self) -> SampleCounts:
+        settings = self.settings
+        return SampleCounts(settings.light_count, settings.diffuse_count, settings.specular_count)
+
+    def filtered(
+        self,
+        images: dict[str, Float[Array, "H W c"]],
+        alpha: Float[Array, "H W"],
+        focal: Float[Array, ""],
+    ) -> dict[str, Float[Array, "H W c"]]:
+        """Filter the demodulated light; see `denoised`."""
+        if not self.filter_inputs:
+            return images
+        return denoised(images, alpha, spec=self.settings.denoise, focal=focal)
+
+    def for_residual(self) -> Self | None:
+        """Return a transport with ``residual_count`` samples of each kind."""
+        count = self.settings.residual_count
+        return self._with_counts(count, residual_count=0) if count else None
+
+    def for_each_view(self) -> Self:
+        """Draw the samples of light and cosine in every view."""
+        return replace(self, settings=replace(self.settings, shares_views=False))
+
+    def for_images(self, sample_count: int) -> Self:
+        """Share the views' samples and leave the filter out."""
+        return self._with_counts(sample_count, shares_views=True, denoise=DenoiseSpec(iterations=0))
+
+    def _with_counts(self, count: int, **others: Any) -> Self:
+        counts = dict.fromkeys(("light_count", "diffuse_count", "specular_count"), count)
+        return replace(self, settings=replace(self.settings, **counts, **others))
+
+
+@settings
+class MonteCarloSettings(SampledSettings, TransportSettings, kind="monte_carlo"):
+    """Sampled light, with shadows traced against the surface."""
+
+    occlusion: bool = True
+    """Trace rays against the surface; without it only directions below a point's own face are
+    blocked."""
+    indirect: Literal["none", "constant", "harmonics", "traced"] = "none"
+    """Light from blocked directions, see `transport.indirect`."""
+    bounces: Annotated[int, Field(ge=1, le=16)] = 1
+    """For traced indirect light, how often light goes from surface to surface."""
 
     @property
     def indirect_outputs(self) -> int:
@@ -382,15 +434,10 @@ class MonteCarloSettings(TransportSettings, kind="monte_carlo"):
         return MonteCarlo(self)
 
 
-class MonteCarlo(Transport):
+class MonteCarlo(SampledTransport):
     """One bounce by multiple importance sampling, with traced shadows."""
 
     settings: MonteCarloSettings = eqx.field(static=True)
-
-    @property
-    def needs_key(self) -> bool:
-        """It draws samples."""
-        return True
 
     @property
     def uses_rays(self) -> bool:
@@ -401,16 +448,6 @@ class MonteCarlo(Transport):
     def needs_every_point(self) -> bool:
         """Where indirect light is traced."""
         return self.settings.indirect == "traced" and self.settings.occlusion
-
-    @property
-    def filter_inputs(self) -> tuple[str, ...]:
-        """See `denoised`."""
-        return DENOISER_INPUTS if self.settings.denoise.iterations > 0 else ()
-
-    @property
-    def _counts(self) -> SampleCounts:
-        settings = self.settings
-        return SampleCounts(settings.light_count, settings.diffuse_count, settings.specular_count)
 
     def _finds_nearest(self, index: RayIndex | None) -> bool:
         return self.settings.indirect == "traced" and index is not None
@@ -490,31 +527,3 @@ class MonteCarlo(Transport):
             indirect,
             **how,
         )
-
-    def filtered(
-        self,
-        images: dict[str, Float[Array, "H W c"]],
-        alpha: Float[Array, "H W"],
-        focal: Float[Array, ""],
-    ) -> dict[str, Float[Array, "H W c"]]:
-        """Filter the demodulated light; see `denoised`."""
-        if not self.filter_inputs:
-            return images
-        return denoised(images, alpha, spec=self.settings.denoise, focal=focal)
-
-    def for_residual(self) -> "MonteCarlo | None":
-        """Return a transport with ``residual_count`` samples of each kind."""
-        count = self.settings.residual_count
-        return self._with_counts(count, residual_count=0) if count else None
-
-    def for_each_view(self) -> "MonteCarlo":
-        """Draw the samples of light and cosine in every view."""
-        return MonteCarlo(replace(self.settings, shares_views=False))
-
-    def for_images(self, sample_count: int) -> "MonteCarlo":
-        """Share the views' samples and leave the filter out."""
-        return self._with_counts(sample_count, shares_views=True, denoise=DenoiseSpec(iterations=0))
-
-    def _with_counts(self, count: int, **others: Any) -> "MonteCarlo":
-        counts = dict.fromkeys(("light_count", "diffuse_count", "specular_count"), count)
-        return MonteCarlo(replace(self.settings, **counts, **others))
