@@ -396,6 +396,12 @@ def make_config(
     )
     config = replace(config, quality=quality, material_prior=material_prior, material=material)
     values = merge(config.to_dict(), changes)
+    # Kinds come first, so that settings of theirs may follow one by one.
+    kinds = [text for text in overrides if text.partition("=")[0].strip().endswith(".kind")]
+    for override in kinds:
+        values = merge(values, parse_override(override))
+    if kinds:
+        values = config_from_dict(values).to_dict()
     for override in overrides:
         values = merge(values, parse_override(override))
     return config_from_dict(values)

@@ -19,7 +19,7 @@ Unbiased wherever the light is bounded. The backward pass computes chunks of poi
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import jax
@@ -379,20 +379,20 @@ class SampledTransport(Transport):
             return images
         return denoised(images, alpha, spec=self.settings.denoise, focal=focal)
 
-    def for_residual(self) -> Self | None:
+    def for_residual(self) -> "SampledTransport | None":
         """Return a transport with ``residual_count`` samples of each kind."""
         count = self.settings.residual_count
         return self._with_counts(count, residual_count=0) if count else None
 
-    def for_each_view(self) -> Self:
+    def for_each_view(self) -> "SampledTransport":
         """Draw the samples of light and cosine in every view."""
         return replace(self, settings=replace(self.settings, shares_views=False))
 
-    def for_images(self, sample_count: int) -> Self:
+    def for_images(self, sample_count: int) -> "SampledTransport":
         """Share the views' samples and leave the filter out."""
         return self._with_counts(sample_count, shares_views=True, denoise=DenoiseSpec(iterations=0))
 
-    def _with_counts(self, count: int, **others: Any) -> Self:
+    def _with_counts(self, count: int, **others: Any) -> "SampledTransport":
         counts = dict.fromkeys(("light_count", "diffuse_count", "specular_count"), count)
         return replace(self, settings=replace(self.settings, **counts, **others))
 

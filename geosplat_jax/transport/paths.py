@@ -280,14 +280,14 @@ class PathTracer(IndirectSource):
         wo, faces = -rows(wi), jnp.where(is_real, rows(hits), -1)
         reached = jnp.where(is_real, rows(distances.reshape(-1)), 0.0)
         origins = jax.lax.stop_gradient(rows(starts) - reached[:, None] * wo)
-        legs = self._draw(origins, faces, wo, is_real)
-        radiance = self._evaluate(legs, wo, is_real)
+        legs = self.draw(origins, faces, wo, is_real)
+        radiance = self.evaluate(legs, wo, is_real)
         target = jnp.where(is_real, ray, total)
         # Rays are numbered once each; only those that go on bring anything.
         brought = jnp.zeros_like(radiance).at[target].set(radiance, mode="drop")
         return KnownIndirect(brought.reshape(count, samples, 3))
 
-    def _draw(
+    def draw(
         self,
         origins: Float[Array, "n 3"],
         faces: Int[Array, " n"],
@@ -323,7 +323,7 @@ class PathTracer(IndirectSource):
             one_chunk, arguments, is_real, rows_at_once=_ROWS_AT_ONCE, has_gradient=False
         )
 
-    def _evaluate(
+    def evaluate(
         self, legs: tuple[Leg, ...], wo: Float[Array, "n 3"], is_real: Bool[Array, " n"]
     ) -> Float[Array, "n 3"]:
         """Add up what the paths bring."""
@@ -463,7 +463,7 @@ class Paths(SampledTransport):
         rest = (attributes.materials, wo, gathered, light, sampler, index)
         return reflect(keys[3], points, *rest, **source, **how)
 
-    def for_images(self, sample_count: int) -> "Paths":
+    def for_images(self, sample_count: int) -> "SampledTransport":
         """Share the views' samples and leave the filter out; nothing is differentiated."""
         shared = super().for_images(sample_count)
         return replace(shared, settings=replace(shared.settings, later_gradient="none"))
