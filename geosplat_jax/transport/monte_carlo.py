@@ -47,8 +47,16 @@ from geosplat_jax.transport.indirect import (
     outgoing,
 )
 from geosplat_jax.transport.light_sampling import LightSampler, light_sampler
+from geosplat_jax.transport.reservoirs import (
+    ReservoirSettings,
+    ReservoirStore,
+    empty_store,
+    kept,
+    resample,
+)
 from geosplat_jax.transport.sampling import (
     OPEN,
+    Chosen,
     SampleCounts,
     Samples,
     draw_samples,
@@ -118,7 +126,10 @@ def gather(
         share = samples.weights.T * cosine / np.pi
         diffuse_light = jnp.sum(diffuse * share[..., None], axis=0)
         is_used = samples.weights[:, :shared, None] > 0
-        return diffuse_light, jnp.where(is_used, jnp.moveaxis(specular[:shared], 0, 1), 0.0)
+        brought = jnp.moveaxis(specular[:shared], 0, 1)
+        if samples.light_factors is not None:
+            brought = brought * samples.light_factors[..., None]
+        return diffuse_light, jnp.where(is_used, brought, 0.0)
 
     arguments = (points.normals, samples, rows)
     diffuse_light, radiance = in_chunks(one_chunk, arguments, points.mask, total)
@@ -166,6 +177,7 @@ def reflect(
     *,
     counts: SampleCounts,
     finds_nearest: bool = False,
+    open_only: bool = False,
 ) -> Shaded:
     """Light that N points send to their viewers, one bounce after the environment.
 
@@ -178,6 +190,7 @@ def reflect(
     light, sampler : the environment and its tables.
     index, indirect : see `draw_samples` and `gather`.
     counts, finds_nearest : static, as for `draw_samples`.
+    open_only : static; whether the light's samples leave blocked directions to the lobe's.
 
     Returns
     -------
@@ -196,6 +209,7 @@ def reflect(
         index,
         counts=counts,
         finds_nearest=finds_nearest,
+        open_only=open_only,
     )
     followed = indirect.followed(points, rays.directions, rays.hits, rays.distances)
     rows, restore = _split(followed)
@@ -338,9 +352,17 @@ class SampledSettings:
     The noise of the images is then correlated between views; its mean is the same."""
     denoise: DenoiseSpec = DenoiseSpec(iterations=0)
     """Filter of the demodulated light in the image, off by default."""
+    reservoirs: ReservoirSettings = ReservoirSettings()
+    """Choice of the light's samples from many, and their use in later steps; where views share
+    them."""
 
     def __post_init__(self) -> None:
         """Refuse a lobe without samples."""
+        if self.reservoirs.drops_blocked and min(self.diffuse_count, self.specular_count) == 0:
+            raise ValueError(
+                "reservoirs.visibility leaves blocked directions to samples of cosine and "
+                "microfacets: raise diffuse_count and specular_count, or ignore visibility"
+            )
         if self.light_count + min(self.diffuse_count, self.specular_count) == 0:
             raise ValueError(
                 "each lobe needs at least one sample: raise light_count, or both diffuse_count and "
@@ -368,6 +390,44 @@ class SampledTransport(Transport):
         settings = self.settings
         return SampleCounts(settings.light_count, settings.diffuse_count, settings.specular_count)
 
+    def first_carry(self) -> ReservoirStore | None:
+        """Return an empty store, where samples are used again."""
+        spec, count = self.settings.reservoirs, self.settings.light_count
+        uses_store = spec.candidates > 0 and spec.reuse_steps and self.settings.shares_views
+        return empty_store(spec, count) if uses_store and count else None
+
+    def _draw_shared(
+        self,
+        key: Key[Array, ""],
+        points: SurfacePoints,
+        light: EnvLight,
+        sampler: LightSampler,
+        index: RayIndex | None,
+        carry: Any,
+        *,
+        finds_nearest: bool,
+    ) -> tuple[Samples, Any]:
+        """Draw and trace what views share; also return what the next step gets."""
+        spec, counts = self.settings.reservoirs, self._counts
+        how: dict[str, Any] = {"counts": counts, "finds_nearest": finds_nearest}
+        if not spec.candidates or not counts.light:
+            return draw_samples(key, points, sampler, index, **how), carry
+        own_key, key = jax.random.split(key)
+        found = resample(
+            own_key, points, light, sampler, index, carry, spec=spec, count=counts.light
+        )
+        chosen = Chosen(found.directions, found.weights, spec.drops_blocked)
+        samples = draw_samples(key, points, sampler, index, chosen=chosen, **how)
+        if carry is not None:
+            hits = samples.hits[:, : counts.light]
+            carry = kept(carry, points, found, hits, index, spec=spec)
+        return samples, carry
+
+    @property
+    def _open_only(self) -> bool:
+        """Whether the light's samples that views share leave blocked directions to others."""
+        return self.settings.reservoirs.drops_blocked and self.settings.light_count > 0
+
     def filtered(
         self,
         images: dict[str, Float[Array, "H W c"]],
@@ -385,12 +445,14 @@ class SampledTransport(Transport):
         return self._with_counts(count, residual_count=0) if count else None
 
     def for_each_view(self) -> "SampledTransport":
-        """Draw the samples of light and cosine in every view."""
-        return replace(self, settings=replace(self.settings, shares_views=False))
+        """Draw the samples of light and cosine in every view, and use none again."""
+        plain = replace(self.settings, shares_views=False, reservoirs=ReservoirSettings())
+        return replace(self, settings=plain)
 
     def for_images(self, sample_count: int) -> "SampledTransport":
-        """Share the views' samples and leave the filter out."""
-        return self._with_counts(sample_count, shares_views=True, denoise=DenoiseSpec(iterations=0))
+        """Share the views' samples, and leave out filter and reservoirs."""
+        plain = {"denoise": DenoiseSpec(iterations=0), "reservoirs": ReservoirSettings()}
+        return self._with_counts(sample_count, shares_views=True, **plain)
 
     def _with_counts(self, count: int, **others: Any) -> "SampledTransport":
         counts = dict.fromkeys(("light_count", "diffuse_count", "specular_count"), count)
@@ -479,8 +541,8 @@ class MonteCarlo(SampledTransport):
         finds_nearest = self._finds_nearest(index)
         gathered, traced = None, None
         if self.settings.shares_views or finds_nearest:
-            samples = draw_samples(
-                key, points, sampler, index, counts=self._counts, finds_nearest=finds_nearest
+            samples, carry = self._draw_shared(
+                key, points, light, sampler, index, carry, finds_nearest=finds_nearest
             )
             gathered = gather(points, samples, light, self._learned(attributes))
             # Traced indirect light is what it was, one bounce ago.
@@ -512,6 +574,7 @@ class MonteCarlo(SampledTransport):
             indirect = self._learned(attributes)
         how = {"counts": self._counts, "finds_nearest": self._finds_nearest(index)}
         own_key, shared_key = jax.random.split(key)
+        open_only = self._open_only and gathered is not None
         if gathered is None:
             samples = draw_samples(shared_key, points, sampler, index, **how)
             gathered = gather(points, samples, light, indirect)
@@ -525,5 +588,6 @@ class MonteCarlo(SampledTransport):
             sampler,
             index,
             indirect,
+            open_only=open_only,
             **how,
         )

@@ -434,8 +434,8 @@ class Paths(SampledTransport):
             table = face_table(points, attributes.materials, index.face_capacity)
         if self.settings.shares_views:
             first_key, later_key = jax.random.split(key)
-            samples = draw_samples(
-                first_key, points, sampler, index, counts=self._counts, finds_nearest=True
+            samples, carry = self._draw_shared(
+                first_key, points, light, sampler, index, carry, finds_nearest=True
             )
             source = self._tracer(later_key, light, sampler, table, index)
             gathered = gather(points, samples, light, **source)
@@ -455,13 +455,14 @@ class Paths(SampledTransport):
         light, sampler, gathered = illumination.light, illumination.sampler, illumination.gathered
         keys = jax.random.split(key, 4)
         how = {"counts": self._counts, "finds_nearest": True}
+        open_only = self._open_only and gathered is not None
         if gathered is None:
             samples = draw_samples(keys[0], points, sampler, index, **how)
             source = self._tracer(keys[1], light, sampler, illumination.table, index)
             gathered = gather(points, samples, light, **source)
         source = self._tracer(keys[2], light, sampler, illumination.table, index)
         rest = (attributes.materials, wo, gathered, light, sampler, index)
-        return reflect(keys[3], points, *rest, **source, **how)
+        return reflect(keys[3], points, *rest, **source, open_only=open_only, **how)
 
     def for_images(self, sample_count: int) -> "SampledTransport":
         """Share the views' samples and leave the filter out; nothing is differentiated."""

@@ -67,6 +67,8 @@ class Samples(eqx.Module):
     light_density : (N, L) density of the light's samples, per steradian.
     distances : (N, S) to the faces that are hit, world units, and infinite elsewhere; None where
         rays only tell whether they are blocked.
+    light_factors : (N, L) density of the light's samples times what stands for one over it, where
+        they were chosen from others; None for 1.
     """
 
     directions: Float[Array, "N S 3"]
@@ -74,6 +76,22 @@ class Samples(eqx.Module):
     hits: Int[Array, "N S"]
     light_density: Float[Array, "N L"]
     distances: Float[Array, "N S"] | None = None
+    light_factors: Float[Array, "N L"] | None = None
+
+
+class Chosen(eqx.Module):
+    """Samples of the light that were chosen from others.
+
+    Attributes
+    ----------
+    directions, weights : (N, L, 3) and (N, L), the weight being unbiased for one over the density.
+    is_open : static; whether blocked directions have no part in the choice, so that they are left
+        to the other techniques.
+    """
+
+    directions: Float[Array, "N L 3"]
+    weights: Float[Array, "N L"]
+    is_open: bool = eqx.field(static=True, default=False)
 
 
 def low_discrepancy(
@@ -218,6 +236,7 @@ def draw_samples(
     *,
     counts: SampleCounts,
     finds_nearest: bool = False,
+    chosen: Chosen | None = None,
 ) -> Samples:
     """Draw directions from the light and the cosine, and trace them; no gradients.
 
@@ -228,14 +247,17 @@ def draw_samples(
     sampler : tables of the light.
     index : the surface that blocks rays; None for no occlusion.
     counts, finds_nearest : static; see `SampleCounts` and `cast`.
+    chosen : what to take for the light's samples; drawn here by default.
     """
     points, sampler = jax.lax.stop_gradient((points, sampler))
     count, dtype = points.normals.shape[0], points.normals.dtype
 
-    def one_chunk(parts: tuple[SurfacePoints, Array]) -> Samples:
-        points, offsets = parts
+    def one_chunk(parts: tuple[SurfacePoints, Array, Chosen | None]) -> Samples:
+        points, offsets, chosen = parts
         drawn = []
-        if counts.light:
+        if chosen is not None:
+            drawn.append(jnp.moveaxis(chosen.directions, 1, 0))
+        elif counts.light:
             uniforms = low_discrepancy(offsets[:, :2], counts.light, dtype)
             found, _ = sample_light(sampler, uniforms.reshape(-1, 2))
             drawn.append(found.reshape(counts.light, -1, 3))
@@ -251,11 +273,23 @@ def draw_samples(
         density = counts.light * light + counts.diffuse * cosine
         weights = jnp.where(points.mask[None], safe_divide(jnp.ones_like(density), density), 0.0)
         hits, distances = _ends(points, directions, index, finds_nearest)
-        shared = light[: counts.light].T
-        return Samples(jnp.moveaxis(directions, 0, 1), weights.T, hits, shared, distances)
+        directions, weights, shared = jnp.moveaxis(directions, 0, 1), weights.T, light.T
+        if chosen is None:
+            return Samples(directions, weights, hits, shared[:, : counts.light], distances)
+        if chosen.is_open:
+            # Blocked directions are the cosine's alone.
+            is_open = hits == OPEN
+            alone = safe_divide(jnp.ones_like(cosine), counts.diffuse * cosine).T
+            alone = jnp.where(points.mask[:, None], alone, 0.0)
+            is_light = jnp.arange(weights.shape[1]) < counts.light
+            weights = jnp.where(is_open, weights, jnp.where(is_light[None], 0.0, alone))
+        shared = shared[:, : counts.light]
+        factors = shared * chosen.weights
+        weights = weights.at[:, : counts.light].multiply(factors)
+        return Samples(directions, weights, hits, shared, distances, factors)
 
     samples = counts.light + counts.diffuse
-    arguments = (points, _offsets(key, count, 4))
+    arguments = (points, _offsets(key, count, 4), chosen)
     return in_chunks(one_chunk, arguments, points.mask, samples, has_gradient=False)
 
 
@@ -269,11 +303,12 @@ def draw_specular(
     *,
     counts: SampleCounts,
     finds_nearest: bool,
+    open_only: bool = False,
 ) -> Samples:
     """Draw the directions of the specular lobe from visible microfacet normals, and trace them.
 
     The weights of the result are 1: they depend on the material. The density of the light's samples
-    stands beside every direction.
+    stands beside every direction; with ``open_only`` it is 0 where that is blocked.
     """
 
     def one_chunk(parts: tuple) -> Samples:
@@ -285,6 +320,8 @@ def draw_specular(
         drawn = jnp.stack(found, axis=-1)
         hits, distances = _ends(points, drawn, index, finds_nearest)
         density = light_density(sampler, drawn.reshape(-1, 3)).reshape(drawn.shape[:2]).T
+        if open_only:
+            density = jnp.where(hits == OPEN, density, 0.0)
         return Samples(jnp.moveaxis(drawn, 0, 1), jnp.ones_like(density), hits, density, distances)
 
     count = wo.shape[0]
