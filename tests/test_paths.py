@@ -254,11 +254,11 @@ def test_a_stage_chooses_paths_and_they_say_what_they_need():
     assert transport.needs_key
     assert transport.uses_rays
     assert transport.needs_every_point
-    assert transport.for_residual() is None
     images = transport.for_images(7).settings
     assert (images.light_count, images.bounce_count, images.later_gradient) == (7, 3, "none")
-    residual = replace(found, residual_count=2).build(LightSpec()).for_residual()
+    residual = transport.for_residual()
     assert (residual.settings.specular_count, residual.settings.bounce_count) == (2, 3)
+    assert replace(found, residual_count=0).build(LightSpec()).for_residual() is None
     attributes = Attributes(one_material(POINTS), None, None)
     with pytest.raises(ValueError, match="key"):
         transport.prepare(None, plate_points(), attributes, white_sky(), Plates())

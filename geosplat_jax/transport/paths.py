@@ -48,6 +48,7 @@ from geosplat_jax.transport.light_sampling import (
 )
 from geosplat_jax.transport.monte_carlo import (
     MonteCarloIllumination,
+    SampleCount,
     SampledSettings,
     SampledTransport,
     gather,
@@ -360,6 +361,9 @@ class PathIllumination(MonteCarloIllumination):
 class PathSettings(SampledSettings, TransportSettings, kind="paths"):
     """Paths over several surfaces: the light of other surfaces is traced, not learned."""
 
+    residual_count: SampleCount = 2
+    """Samples of each kind of a second image, from which Eq. 13 takes its residual; with 0 it takes
+    that of the image that it differentiates, which biases the gradient."""
     bounce_count: Annotated[int, Field(ge=2, le=64)] = 2
     """Surfaces on a path of light at most, the one that is seen included: with 2, light that came
     by way of one other surface. There is no Russian roulette."""
