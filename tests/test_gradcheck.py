@@ -20,6 +20,7 @@ SLOW_STAGES = {
     "loss",
     "refinement",
     "materials",
+    "paths",
     "projection",
     "rasterizer",
     "transport",

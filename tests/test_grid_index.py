@@ -265,3 +265,16 @@ def test_agrees_with_embree_on_a_hundred_thousand_rays():
     )
     assert 0.05 < expected.mean() < 0.5
     assert np.mean(np.asarray(found) == expected) > 0.9985
+
+
+def test_places_are_the_cells_that_points_lie_in():
+    grid = torus_grid()
+    _, index = traced(bumpy_torus(grid), grid)
+    rng = np.random.default_rng(8)
+    origin, cell = np.asarray(index.grid.origin), float(index.grid.cell_size)
+    cells = np.stack([rng.integers(0, size, 200) for size in index.grid.shape], axis=1)
+    points = origin + (cells + rng.uniform(0.01, 0.99, cells.shape)) * cell
+    found = index.places(jnp.asarray(points, jnp.float32), jnp.zeros(200, jnp.int32))
+    nx, ny, _ = index.grid.shape
+    np.testing.assert_array_equal(found, cells[:, 0] + nx * (cells[:, 1] + ny * cells[:, 2]))
+    assert float(index.place_size) == cell

@@ -25,6 +25,7 @@ from geosplat_jax.report.renderer import (
     straight_rgba,
     to_picture,
 )
+from geosplat_jax.transport.paths import PathSettings
 
 BUFFERS = ("surface_cubes", "dual_vertices", "quads", "visible", "hits", "chunks", "cell_patches")
 AMPLE = Capacities(**dict(zip(BUFFERS, (256, 256, 256, 4096, 8192, 2048, 4096), strict=True)))
@@ -236,6 +237,7 @@ def test_light_for_relighting_is_traced_and_learns_nothing():
     assert transport.indirect == "traced"
     assert transport.bounces == RELIGHT_BOUNCES
     assert relight_transport("none").indirect == "none"
+    assert relight_transport("paths") == PathSettings(bounce_count=RELIGHT_BOUNCES + 1)
     assert not relight_transport("unshadowed").occlusion
     with pytest.raises(ValueError, match="indirect must be one of .*, got 'constant'"):
         relight_transport("constant")

@@ -15,6 +15,7 @@ from geosplat_jax.core.types import EnvLight, Materials
 from geosplat_jax.geometry import grid_vertices, initial_geometry
 from geosplat_jax.materials import init_indirect_head
 from geosplat_jax.render import RenderPipeline
+from geosplat_jax.transport import bsdf
 from geosplat_jax.transport.base import TransportSettings
 from geosplat_jax.transport.denoise import DenoiseSpec
 from geosplat_jax.transport.environment import LightSpec
@@ -27,6 +28,7 @@ from geosplat_jax.transport.monte_carlo import (
     gather,
     reflect,
 )
+from geosplat_jax.transport.paths import PathSettings
 from geosplat_jax.transport.sampling import SampleCounts, draw_samples
 from geosplat_jax.transport.split_sum import SplitSumSettings
 
@@ -437,3 +439,30 @@ def test_the_filter_without_passes_is_the_identity_to_the_bit():
         assert np.any(other[name] != images[name])
     for name in ("albedo", "normal", "depth", "metallic", "specular_radiance"):
         np.testing.assert_array_equal(other[name], images[name])
+
+
+@pytest.mark.slow
+def test_paths_over_two_surfaces_bring_what_traced_light_brings(ball, bowl, monkeypatch):
+    """Where reflectance is the same in all directions, as traced light takes it to be."""
+
+    def matt(materials, normals, wi, wo):
+        sent = materials.albedo * (1 - materials.metallic)[:, None]
+        sent = sent + bsdf.specular_f0(materials.albedo, materials.metallic)
+        return sent / np.pi
+
+    monkeypatch.setattr(bsdf, "evaluate", matt)
+    asset, inside = bowl
+    counts = {"light_count": 5, "diffuse_count": 5, "specular_count": 1}
+    found = []
+    for transport in (
+        few(indirect="traced", **counts),
+        PathSettings(bounce_count=2, **counts).build(LIGHT),
+        few(**counts),
+    ):
+        points, attributes = asset.splats.points(), asset.attributes
+        prepared = prepare(transport, jax.random.key(2), points, attributes, sky(), asset.index)
+        found.append(np.asarray(prepared.gathered.diffuse_light)[inside])
+    traced, paths, direct = found
+    extra = np.mean(traced - direct)
+    assert extra > 0.05 * np.mean(direct)
+    assert np.mean(paths - direct) == pytest.approx(extra, rel=0.05)

@@ -215,7 +215,16 @@ def listed(value: Any, where: str = "") -> Iterator[tuple[str, Any, str, str]]:
             for part in item:
                 yield from listed(part, f"{path}.{getattr(part, 'name', '')}.")
         else:
-            yield path, item, _range(field), " ".join((field.description or "").split())
+            yield path, item, _range(field), _meaning(type(value), name)
+
+
+def _meaning(kind: type, name: str) -> str:
+    """Return what stands below a field, in the class itself or in the one that it comes from."""
+    for base in kind.__mro__:
+        field = getattr(base, "__pydantic_fields__", {}).get(name)
+        if field is not None and field.description:
+            return " ".join(field.description.split())
+    return ""
 
 
 _LIMITS = ((">=", Ge, "ge"), (">", Gt, "gt"), ("<=", Le, "le"), ("<", Lt, "lt"))

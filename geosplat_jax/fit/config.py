@@ -32,7 +32,12 @@ from geosplat_jax.materials import MaterialField, MaterialSpec
 from geosplat_jax.render import Params, PerSplat, RasterSettings, ShadingDomain
 from geosplat_jax.transport.base import TransportSettings
 from geosplat_jax.transport.environment import LightSpec
+from geosplat_jax.transport.monte_carlo import MonteCarloSettings
+from geosplat_jax.transport.paths import PathSettings
 from geosplat_jax.transport.split_sum import SplitSumSettings
+
+TRANSPORTS = (SplitSumSettings, MonteCarloSettings, PathSettings)
+"""Transports that a run may name: a kind is known once its class is imported."""
 
 LABELS = {"preset": "--preset", "quality": "--quality", "material_prior": "--material-prior"}
 """Fields of `Config` that only say what was asked for, and the options that ask."""

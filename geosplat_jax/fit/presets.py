@@ -504,6 +504,12 @@ def make_config(
     values = merge(config.to_dict(), changes)
     if mesh is not None:
         values = with_mesh(config_from_dict(values), mesh).to_dict()
+    # Kinds come first, so that settings of theirs may follow one by one.
+    kinds = [text for text in overrides if text.partition("=")[0].strip().endswith(".kind")]
+    for override in kinds:
+        values = merge(values, parse_override(override))
+    if kinds:
+        values = config_from_dict(values).to_dict()
     for override in overrides:
         values = merge(values, parse_override(override))
     return config_from_dict(values)

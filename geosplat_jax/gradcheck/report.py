@@ -19,6 +19,7 @@ from geosplat_jax.gradcheck.shading_stages import (
     hash_grid_problems,
     light_problems,
     material_problems,
+    path_problems,
     split_sum_problems,
     transport_problems,
 )
@@ -45,6 +46,7 @@ STAGES: dict[str, Callable[[np.random.Generator], list[Problem]]] = {
     "light": light_problems,
     "splitsum": split_sum_problems,
     "transport": transport_problems,
+    "paths": path_problems,
     "projection": projection_problems,
     "rasterizer": rasteriser_problems,
     "terms": loss_term_problems,

@@ -23,6 +23,7 @@ from geosplat_jax.transport.environment import (
 from geosplat_jax.transport.indirect import INDIRECT_MODELS
 from geosplat_jax.transport.light_sampling import light_sampler
 from geosplat_jax.transport.monte_carlo import gather, reflect
+from geosplat_jax.transport.paths import FaceTable, Leg, path_radiance
 from geosplat_jax.transport.sampling import BLOCKED, SampleCounts, draw_samples
 from geosplat_jax.transport.split_sum import fg_table, split_sum
 
@@ -224,3 +225,42 @@ def transport_problems(rng: np.random.Generator) -> list[Problem]:
         return Problem(f"transport, indirect {kind}", function, varied, (points, samples, sampler))
 
     return [problem(kind) for kind in ("constant", "harmonics", "traced")]
+
+
+def path_problems(rng: np.random.Generator) -> list[Problem]:
+    """Radiance of fixed paths of two vertices in the faces' materials and normals and the light.
+
+    Faces, directions and weights are random; a third of the paths end early.
+    """
+    count, faces, vertices = 6, 4, 2
+    dtype = jnp.zeros(0).dtype
+    inputs = _surface_points(rng, faces)
+    inputs["texels"] = rng.uniform(0.1, 2.0, (_LIGHT.height, _LIGHT.width, 3))
+    outward = inputs["normals"]
+    first = inputs.pop("wo")
+    hit = rng.integers(0, faces, (vertices, count))
+    hit[1:, ::3] = -1
+
+    def away(rows: np.ndarray) -> np.ndarray:
+        """Directions that leave the faces."""
+        drawn = unit_vectors(rng, count)
+        below = np.sum(drawn * outward[rows], axis=1, keepdims=True) < 0
+        return np.where(below, -drawn, drawn)
+
+    legs, wo = [], first[hit[0]]
+    for k in range(vertices):
+        # The next vertex must see this one: its face is turned towards where the path comes from.
+        onward = away(hit[k])
+        if k + 1 < vertices:
+            onward = -away(hit[k + 1])
+        weights = rng.uniform(0.5, 2.0, (3, count))
+        made = (away(hit[k]), weights[0], onward, weights[1], weights[2])
+        legs.append(Leg(jnp.asarray(hit[k], jnp.int32), *(jnp.asarray(x, dtype) for x in made)))
+
+    def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
+        legs, wo, outward = constants
+        table = FaceTable(_materials(inputs), inputs["normals"], outward)
+        return {"radiance": path_radiance(legs, wo, table, EnvLight(inputs["texels"]))}
+
+    constants = (tuple(legs), jnp.asarray(wo, dtype), jnp.asarray(outward, dtype))
+    return [Problem("paths", function, inputs, constants)]

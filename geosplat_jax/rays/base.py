@@ -3,6 +3,7 @@
 import abc
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from geosplat_jax.core.capacity import Usage
@@ -23,6 +24,26 @@ class RayIndex(eqx.Module):
     @abc.abstractmethod
     def face_capacity(self) -> int:
         """Rows of faces in the mesh, padding included."""
+
+    @property
+    def place_size(self) -> Float[Array, ""]:
+        """How far a point may move and still have its place, world units; see `places`."""
+        return jnp.asarray(jnp.inf)
+
+    def places(self, positions: Float[Array, "N 3"], faces: Int[Array, " N"]) -> Int[Array, " N"]:
+        """Name places on the surface that outlive a training step: here the rows of the faces.
+
+        Parameters
+        ----------
+        positions : (N, 3) world, on the surface.
+        faces : (N,) that they lie on; -1 for none, which has no place.
+
+        Returns
+        -------
+        (N,) at least 0, or -1 for none.
+        """
+        del positions
+        return faces
 
     @abc.abstractmethod
     def occluded(

@@ -82,6 +82,22 @@ class GridIndex(CellIndex):
         """Bits of a word that count patches."""
         return _COUNT_BITS
 
+    @property
+    def place_size(self) -> Float[Array, ""]:
+        """A cell."""
+        return self.grid.cell_size
+
+    def places(self, positions: Float[Array, "N 3"], faces: Int[Array, " N"]) -> Int[Array, " N"]:
+        """Name places by the cell that they lie in: rows of faces change with the topology."""
+        del faces
+        local = (positions - self.grid.origin[None, :]) / self.grid.cell_size
+        number = jnp.zeros(positions.shape[:1], jnp.int32)
+        for axis in (2, 1, 0):
+            size = self.grid.shape[axis]
+            cell = jnp.clip(jnp.floor(local[:, axis]).astype(jnp.int32), 0, size - 1)
+            number = number * size + cell
+        return jax.lax.stop_gradient(number)
+
     def test(self, lanes: Lanes, *, two_sided: bool, any_hit: bool) -> Lanes:
         """Test the next patch of the cell, four triangles at once, by signed volumes.
 

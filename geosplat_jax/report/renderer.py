@@ -28,6 +28,7 @@ from geosplat_jax.surface.base import Surface
 from geosplat_jax.transport.base import Illumination
 from geosplat_jax.transport.environment import LightSpec
 from geosplat_jax.transport.monte_carlo import MonteCarloSettings
+from geosplat_jax.transport.paths import PathSettings
 
 EVALUATION_AOVS = ("albedo", "roughness", "metallic", "normal")
 DEFAULT_SAMPLES = 128
@@ -52,7 +53,7 @@ averages several."""
 RELIGHT_BOUNCES = 2
 """How often light goes from surface to surface under a new light."""
 
-RELIGHT_KINDS = ("traced", "none", "unshadowed")
+RELIGHT_KINDS = ("traced", "paths", "none", "unshadowed")
 """How blocked directions look under a new light: see `relight_transport`."""
 
 _reconstruct = jax.jit(Pipeline.reconstruct)
@@ -92,11 +93,12 @@ def build_asset(pipeline: Pipeline, params: Params) -> Asset:
     return capacity_module.retry(attempt, pipeline.capacities)[0]
 
 
-def relight_transport(indirect: str = "traced") -> MonteCarloSettings:
+def relight_transport(indirect: str = "traced") -> MonteCarloSettings | PathSettings:
     """Return the light transport under a light that was never trained on.
 
-    What was learned of indirect light does not hold there: blocked directions bring traced light or
-    none. Unshadowed, only a splat's own face blocks, as for those who do not trace rays.
+    What was learned of indirect light does not hold there: blocked directions bring traced light,
+    light that paths bring by way of as many surfaces, or none. Unshadowed, only a splat's own face
+    blocks, as for those who do not trace rays.
 
     Raises
     ------
@@ -105,6 +107,8 @@ def relight_transport(indirect: str = "traced") -> MonteCarloSettings:
     """
     if indirect not in RELIGHT_KINDS:
         raise ValueError(f"indirect must be one of {RELIGHT_KINDS}, got {indirect!r}")
+    if indirect == "paths":
+        return PathSettings(bounce_count=RELIGHT_BOUNCES + 1)
     is_shadowed = indirect != "unshadowed"
     return MonteCarloSettings(
         occlusion=is_shadowed,

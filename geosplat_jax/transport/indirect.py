@@ -8,11 +8,15 @@ Each model is a class:
   degree 2 (the paper).
 - `TracedIndirect`: what the point that is hit sends out. It learns nothing and holds under any
   light.
+- `KnownIndirect`: a radiance for every single ray, from whoever followed it further.
+
+An `IndirectSource` becomes one of them once it is known where rays end.
 
 Learned values are logits; ``sigmoid(x - 3)`` gives them the range of a radiance that starts small.
 """
 
 import abc
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -31,8 +35,31 @@ _DEGREE = 2  # of the harmonics
 Lobes = tuple[Float[Array, "N 3"], Float[Array, "N 3"]]
 """Radiance for the diffuse lobe and for the specular one."""
 
+RayLobes = tuple[Float[Array, "S N 3"], Float[Array, "S N 3"]]
+"""The same for S rays of each of N points."""
 
-class Indirect(eqx.Module):
+
+class IndirectSource(eqx.Module):
+    """What can tell the light of blocked rays once they are traced."""
+
+    @abc.abstractmethod
+    def followed(
+        self,
+        points: SurfacePoints,
+        directions: Float[Array, "N S 3"],
+        hits: Int[Array, "N S"],
+        distances: Float[Array, "N S"] | None,
+    ) -> "Indirect":
+        """Return the model of these rays.
+
+        Parameters
+        ----------
+        points : where S rays start from each.
+        directions, hits, distances : see `sampling.Samples`.
+        """
+
+
+class Indirect(IndirectSource):
     """A model of indirect light.
 
     Attributes
@@ -48,6 +75,27 @@ class Indirect(eqx.Module):
     def belongs_to_points(self) -> bool:
         """Whether a row of the values is a point."""
         return self.outputs > 0
+
+    def followed(
+        self,
+        points: SurfacePoints,
+        directions: Float[Array, "N S 3"],
+        hits: Int[Array, "N S"],
+        distances: Float[Array, "N S"] | None,
+    ) -> "Indirect":
+        """Return itself: it knows any ray."""
+        del points, directions, hits, distances
+        return self
+
+    def along(self, directions: Float[Array, "S N 3"], hits: Int[Array, "S N"]) -> RayLobes:
+        """Radiance that S rays from each of N points bring; see `incoming`."""
+        samples, model = directions.shape[0], self
+        if self.belongs_to_points and self.values is not None:
+            values = jnp.broadcast_to(self.values[None], (samples, *self.values.shape))
+            model = replace(self, values=values.reshape(-1, values.shape[-1]))
+        lobes = model.incoming(directions.reshape(-1, 3), hits.reshape(-1))
+        diffuse, specular = (radiance.reshape(directions.shape) for radiance in lobes)
+        return diffuse, specular
 
     @abc.abstractmethod
     def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
@@ -109,6 +157,27 @@ class TracedIndirect(Indirect):
         """Look up the face that is hit."""
         sent = self.values.at[jnp.maximum(hits, 0)].get(mode="clip")
         radiance = jnp.where((hits >= 0)[:, None], sent, 0.0)
+        return radiance, radiance
+
+
+class KnownIndirect(Indirect):
+    """(N, S, 3) radiance of the rays themselves."""
+
+    values: Float[Array, "N S 3"]
+
+    @property
+    def belongs_to_points(self) -> bool:
+        """A row is a point, with all its rays."""
+        return True
+
+    def along(self, directions: Float[Array, "S N 3"], hits: Int[Array, "S N"]) -> RayLobes:
+        """Return what is known."""
+        radiance = jnp.moveaxis(self.values, 1, 0)
+        return radiance, radiance
+
+    def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
+        """Return what is known of all rays, in the order of the values."""
+        radiance = self.values.reshape(-1, 3)
         return radiance, radiance
 
 

@@ -42,12 +42,21 @@ from geosplat_jax.transport.indirect import (
     INDIRECT_MODELS,
     NO_INDIRECT,
     Indirect,
+    IndirectSource,
     TracedIndirect,
     outgoing,
 )
 from geosplat_jax.transport.light_sampling import LightSampler, light_sampler
+from geosplat_jax.transport.reservoirs import (
+    ReservoirSettings,
+    ReservoirStore,
+    empty_store,
+    kept,
+    resample,
+)
 from geosplat_jax.transport.sampling import (
     OPEN,
+    Chosen,
     SampleCounts,
     Samples,
     draw_samples,
@@ -79,16 +88,10 @@ def _arriving(
     hits: Int[Array, "S N"],
 ) -> tuple[Float[Array, "S N 3"], Float[Array, "S N 3"]]:
     """Radiance along rays for the diffuse lobe and for the specular one."""
-    samples = directions.shape[0]
-    flat, ends = directions.reshape(-1, 3), hits.reshape(-1)
-    direct = lookup(light.radiance, flat)
-    if indirect.belongs_to_points and indirect.values is not None:
-        values = jnp.broadcast_to(indirect.values[None], (samples, *indirect.values.shape))
-        indirect = replace(indirect, values=values.reshape(-1, values.shape[-1]))
-    lobes = indirect.incoming(flat, ends)
-    is_open = (ends == OPEN)[:, None]
+    direct = lookup(light.radiance, directions.reshape(-1, 3)).reshape(directions.shape)
+    is_open = (hits == OPEN)[..., None]
     diffuse, specular = (
-        jnp.where(is_open, direct, radiance).reshape(directions.shape) for radiance in lobes
+        jnp.where(is_open, direct, radiance) for radiance in indirect.along(directions, hits)
     )
     return diffuse, specular
 
@@ -104,7 +107,7 @@ def gather(
     points: SurfacePoints,
     samples: Samples,
     light: EnvLight,
-    indirect: Indirect = NO_INDIRECT,
+    indirect: IndirectSource = NO_INDIRECT,
 ) -> Gathered:
     """Sum up the diffuse light of N points, and keep what the light's samples bring.
 
@@ -112,7 +115,8 @@ def gather(
     """
     total = samples.weights.shape[1]
     shared = samples.light_density.shape[1]
-    rows, restore = _split(indirect)
+    followed = indirect.followed(points, samples.directions, samples.hits, samples.distances)
+    rows, restore = _split(followed)
 
     def one_chunk(parts: tuple) -> tuple[Array, Array]:
         normals, samples, rows = parts
@@ -122,7 +126,10 @@ def gather(
         share = samples.weights.T * cosine / np.pi
         diffuse_light = jnp.sum(diffuse * share[..., None], axis=0)
         is_used = samples.weights[:, :shared, None] > 0
-        return diffuse_light, jnp.where(is_used, jnp.moveaxis(specular[:shared], 0, 1), 0.0)
+        brought = jnp.moveaxis(specular[:shared], 0, 1)
+        if samples.light_factors is not None:
+            brought = brought * samples.light_factors[..., None]
+        return diffuse_light, jnp.where(is_used, brought, 0.0)
 
     arguments = (points.normals, samples, rows)
     diffuse_light, radiance = in_chunks(one_chunk, arguments, points.mask, total)
@@ -166,10 +173,11 @@ def reflect(
     light: EnvLight,
     sampler: LightSampler,
     index: RayIndex | None,
-    indirect: Indirect = NO_INDIRECT,
+    indirect: IndirectSource = NO_INDIRECT,
     *,
     counts: SampleCounts,
     finds_nearest: bool = False,
+    open_only: bool = False,
 ) -> Shaded:
     """Light that N points send to their viewers, one bounce after the environment.
 
@@ -182,6 +190,7 @@ def reflect(
     light, sampler : the environment and its tables.
     index, indirect : see `draw_samples` and `gather`.
     counts, finds_nearest : static, as for `draw_samples`.
+    open_only : static; whether the light's samples leave blocked directions to the lobe's.
 
     Returns
     -------
@@ -200,16 +209,18 @@ def reflect(
         index,
         counts=counts,
         finds_nearest=finds_nearest,
+        open_only=open_only,
     )
-    rows, restore = _split(indirect)
+    followed = indirect.followed(points, rays.directions, rays.hits, rays.distances)
+    rows, restore = _split(followed)
 
     def one_chunk(parts: tuple) -> tuple[Array, Array]:
         points, materials, wo, gathered, rays, rows = parts
-        drawn, hits, drawn_density = rays
-        _, brought = _arriving(light, restore(rows), jnp.moveaxis(drawn, 1, 0), hits.T)
+        drawn = rays.directions
+        _, brought = _arriving(light, restore(rows), jnp.moveaxis(drawn, 1, 0), rays.hits.T)
         wi = jnp.concatenate([gathered.directions.T, drawn.T], axis=1)
         radiance = [gathered.radiance.T, jnp.moveaxis(brought, -1, 0)]
-        light_part = jnp.concatenate([gathered.density.T, drawn_density.T])
+        light_part = jnp.concatenate([gathered.density.T, rays.light_density.T])
         found = (wi, jnp.concatenate(radiance, axis=1), light_part)
         return _specular_sums(materials, points.normals, wo, found, points.mask, counts)
 
@@ -324,8 +335,8 @@ SampleCount = Annotated[int, Field(ge=0, le=4096)]
 
 
 @settings
-class MonteCarloSettings(TransportSettings, kind="monte_carlo"):
-    """Sampled light, with shadows traced against the surface."""
+class SampledSettings:
+    """What every transport by samples of light and lobes has in common."""
 
     light_count: SampleCount = 4
     """Samples of the environment per point, for both lobes."""
@@ -336,6 +347,122 @@ class MonteCarloSettings(TransportSettings, kind="monte_carlo"):
     residual_count: SampleCount = 0
     """Samples of each kind of a second image, from which Eq. 13 takes its residual; with 0 it takes
     that of the image that it differentiates, which biases the gradient."""
+    shares_views: bool = True
+    """All views of a batch use the same samples of light and cosine, which are then traced once.
+    The noise of the images is then correlated between views; its mean is the same."""
+    denoise: DenoiseSpec = DenoiseSpec(iterations=0)
+    """Filter of the demodulated light in the image, off by default."""
+    reservoirs: ReservoirSettings = ReservoirSettings()
+    """Choice of the light's samples from many, and their use in later steps; where views share
+    them."""
+
+    def __post_init__(self) -> None:
+        """Refuse a lobe without samples."""
+        if self.reservoirs.drops_blocked and min(self.diffuse_count, self.specular_count) == 0:
+            raise ValueError(
+                "reservoirs.visibility leaves blocked directions to samples of cosine and "
+                "microfacets: raise diffuse_count and specular_count, or ignore visibility"
+            )
+        if self.light_count + min(self.diffuse_count, self.specular_count) == 0:
+            raise ValueError(
+                "each lobe needs at least one sample: raise light_count, or both diffuse_count and "
+                "specular_count"
+            )
+
+
+class SampledTransport(Transport):
+    """A transport by samples of light and lobes."""
+
+    settings: Any = eqx.field(static=True)
+
+    @property
+    def needs_key(self) -> bool:
+        """It draws samples."""
+        return True
+
+    @property
+    def filter_inputs(self) -> tuple[str, ...]:
+        """See `denoised`."""
+        return DENOISER_INPUTS if self.settings.denoise.iterations > 0 else ()
+
+    @property
+    def _counts(self) -> SampleCounts:
+        settings = self.settings
+        return SampleCounts(settings.light_count, settings.diffuse_count, settings.specular_count)
+
+    def first_carry(self) -> ReservoirStore | None:
+        """Return an empty store, where samples are used again."""
+        spec, count = self.settings.reservoirs, self.settings.light_count
+        uses_store = spec.candidates > 0 and spec.reuse_steps and self.settings.shares_views
+        return empty_store(spec, count) if uses_store and count else None
+
+    def _draw_shared(
+        self,
+        key: Key[Array, ""],
+        points: SurfacePoints,
+        light: EnvLight,
+        sampler: LightSampler,
+        index: RayIndex | None,
+        carry: Any,
+        *,
+        finds_nearest: bool,
+    ) -> tuple[Samples, Any]:
+        """Draw and trace what views share; also return what the next step gets."""
+        spec, counts = self.settings.reservoirs, self._counts
+        how: dict[str, Any] = {"counts": counts, "finds_nearest": finds_nearest}
+        if not spec.candidates or not counts.light:
+            return draw_samples(key, points, sampler, index, **how), carry
+        own_key, key = jax.random.split(key)
+        found = resample(
+            own_key, points, light, sampler, index, carry, spec=spec, count=counts.light
+        )
+        chosen = Chosen(found.directions, found.weights, spec.drops_blocked)
+        samples = draw_samples(key, points, sampler, index, chosen=chosen, **how)
+        if carry is not None:
+            hits = samples.hits[:, : counts.light]
+            carry = kept(carry, points, found, hits, index, spec=spec)
+        return samples, carry
+
+    @property
+    def _open_only(self) -> bool:
+        """Whether the light's samples that views share leave blocked directions to others."""
+        return self.settings.reservoirs.drops_blocked and self.settings.light_count > 0
+
+    def filtered(
+        self,
+        images: dict[str, Float[Array, "H W c"]],
+        alpha: Float[Array, "H W"],
+        focal: Float[Array, ""],
+    ) -> dict[str, Float[Array, "H W c"]]:
+        """Filter the demodulated light; see `denoised`."""
+        if not self.filter_inputs:
+            return images
+        return denoised(images, alpha, spec=self.settings.denoise, focal=focal)
+
+    def for_residual(self) -> "SampledTransport | None":
+        """Return a transport with ``residual_count`` samples of each kind."""
+        count = self.settings.residual_count
+        return self._with_counts(count, residual_count=0) if count else None
+
+    def for_each_view(self) -> "SampledTransport":
+        """Draw the samples of light and cosine in every view, and use none again."""
+        plain = replace(self.settings, shares_views=False, reservoirs=ReservoirSettings())
+        return replace(self, settings=plain)
+
+    def for_images(self, sample_count: int) -> "SampledTransport":
+        """Share the views' samples, and leave out filter and reservoirs."""
+        plain = {"denoise": DenoiseSpec(iterations=0), "reservoirs": ReservoirSettings()}
+        return self._with_counts(sample_count, shares_views=True, **plain)
+
+    def _with_counts(self, count: int, **others: Any) -> "SampledTransport":
+        counts = dict.fromkeys(("light_count", "diffuse_count", "specular_count"), count)
+        return replace(self, settings=replace(self.settings, **counts, **others))
+
+
+@settings
+class MonteCarloSettings(SampledSettings, TransportSettings, kind="monte_carlo"):
+    """Sampled light, with shadows traced against the surface."""
+
     occlusion: bool = True
     """Trace rays against the surface; without it only directions below a point's own face are
     blocked."""
@@ -343,19 +470,6 @@ class MonteCarloSettings(TransportSettings, kind="monte_carlo"):
     """Light from blocked directions, see `transport.indirect`."""
     bounces: Annotated[int, Field(ge=1, le=16)] = 1
     """For traced indirect light, how often light goes from surface to surface."""
-    shares_views: bool = True
-    """All views of a batch use the same samples of light and cosine, which are then traced once.
-    The noise of the images is then correlated between views; its mean is the same."""
-    denoise: DenoiseSpec = DenoiseSpec(iterations=0)
-    """Filter of the demodulated light in the image, off by default."""
-
-    def __post_init__(self) -> None:
-        """Refuse a lobe without samples."""
-        if self.light_count + min(self.diffuse_count, self.specular_count) == 0:
-            raise ValueError(
-                "each lobe needs at least one sample: raise light_count, or both diffuse_count and "
-                "specular_count"
-            )
 
     @property
     def indirect_outputs(self) -> int:
@@ -382,15 +496,10 @@ class MonteCarloSettings(TransportSettings, kind="monte_carlo"):
         return MonteCarlo(self)
 
 
-class MonteCarlo(Transport):
+class MonteCarlo(SampledTransport):
     """One bounce by multiple importance sampling, with traced shadows."""
 
     settings: MonteCarloSettings = eqx.field(static=True)
-
-    @property
-    def needs_key(self) -> bool:
-        """It draws samples."""
-        return True
 
     @property
     def uses_rays(self) -> bool:
@@ -401,16 +510,6 @@ class MonteCarlo(Transport):
     def needs_every_point(self) -> bool:
         """Where indirect light is traced."""
         return self.settings.indirect == "traced" and self.settings.occlusion
-
-    @property
-    def filter_inputs(self) -> tuple[str, ...]:
-        """See `denoised`."""
-        return DENOISER_INPUTS if self.settings.denoise.iterations > 0 else ()
-
-    @property
-    def _counts(self) -> SampleCounts:
-        settings = self.settings
-        return SampleCounts(settings.light_count, settings.diffuse_count, settings.specular_count)
 
     def _finds_nearest(self, index: RayIndex | None) -> bool:
         return self.settings.indirect == "traced" and index is not None
@@ -442,8 +541,8 @@ class MonteCarlo(Transport):
         finds_nearest = self._finds_nearest(index)
         gathered, traced = None, None
         if self.settings.shares_views or finds_nearest:
-            samples = draw_samples(
-                key, points, sampler, index, counts=self._counts, finds_nearest=finds_nearest
+            samples, carry = self._draw_shared(
+                key, points, light, sampler, index, carry, finds_nearest=finds_nearest
             )
             gathered = gather(points, samples, light, self._learned(attributes))
             # Traced indirect light is what it was, one bounce ago.
@@ -475,6 +574,7 @@ class MonteCarlo(Transport):
             indirect = self._learned(attributes)
         how = {"counts": self._counts, "finds_nearest": self._finds_nearest(index)}
         own_key, shared_key = jax.random.split(key)
+        open_only = self._open_only and gathered is not None
         if gathered is None:
             samples = draw_samples(shared_key, points, sampler, index, **how)
             gathered = gather(points, samples, light, indirect)
@@ -488,33 +588,6 @@ class MonteCarlo(Transport):
             sampler,
             index,
             indirect,
+            open_only=open_only,
             **how,
         )
-
-    def filtered(
-        self,
-        images: dict[str, Float[Array, "H W c"]],
-        alpha: Float[Array, "H W"],
-        focal: Float[Array, ""],
-    ) -> dict[str, Float[Array, "H W c"]]:
-        """Filter the demodulated light; see `denoised`."""
-        if not self.filter_inputs:
-            return images
-        return denoised(images, alpha, spec=self.settings.denoise, focal=focal)
-
-    def for_residual(self) -> "MonteCarlo | None":
-        """Return a transport with ``residual_count`` samples of each kind."""
-        count = self.settings.residual_count
-        return self._with_counts(count, residual_count=0) if count else None
-
-    def for_each_view(self) -> "MonteCarlo":
-        """Draw the samples of light and cosine in every view."""
-        return MonteCarlo(replace(self.settings, shares_views=False))
-
-    def for_images(self, sample_count: int) -> "MonteCarlo":
-        """Share the views' samples and leave the filter out."""
-        return self._with_counts(sample_count, shares_views=True, denoise=DenoiseSpec(iterations=0))
-
-    def _with_counts(self, count: int, **others: Any) -> "MonteCarlo":
-        counts = dict.fromkeys(("light_count", "diffuse_count", "specular_count"), count)
-        return MonteCarlo(replace(self.settings, **counts, **others))

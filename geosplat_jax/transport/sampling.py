@@ -65,12 +65,33 @@ class Samples(eqx.Module):
     weights : (N, S) ``1 / (n_light p_light + n_cosine p_cosine)``; 0 where the mask is false.
     hits : (N, S) int32 face that is hit, `OPEN` or `BLOCKED`.
     light_density : (N, L) density of the light's samples, per steradian.
+    distances : (N, S) to the faces that are hit, world units, and infinite elsewhere; None where
+        rays only tell whether they are blocked.
+    light_factors : (N, L) density of the light's samples times what stands for one over it, where
+        they were chosen from others; None for 1.
     """
 
     directions: Float[Array, "N S 3"]
     weights: Float[Array, "N S"]
     hits: Int[Array, "N S"]
     light_density: Float[Array, "N L"]
+    distances: Float[Array, "N S"] | None = None
+    light_factors: Float[Array, "N L"] | None = None
+
+
+class Chosen(eqx.Module):
+    """Samples of the light that were chosen from others.
+
+    Attributes
+    ----------
+    directions, weights : (N, L, 3) and (N, L), the weight being unbiased for one over the density.
+    is_open : static; whether blocked directions have no part in the choice, so that they are left
+        to the other techniques.
+    """
+
+    directions: Float[Array, "N L 3"]
+    weights: Float[Array, "N L"]
+    is_open: bool = eqx.field(static=True, default=False)
 
 
 def low_discrepancy(
@@ -95,8 +116,9 @@ def in_chunks(
     function: Callable[[Any], Any],
     arguments: Any,
     mask: Bool[Array, " N"],
-    samples: int,
+    samples: int = 1,
     *,
+    rows_at_once: int | None = None,
     has_gradient: bool = True,
 ) -> Any:
     """Map a function of rows over chunks of them, to be computed again in the backward pass.
@@ -107,10 +129,12 @@ def in_chunks(
     ----------
     function : of a chunk of ``arguments``, pytrees with N rows.
     mask : rows that matter. samples : per row, from which follows how many rows are a chunk.
+    rows_at_once : static; how many rows are a chunk whatever the samples.
     has_gradient : static; False where nothing depends on what is differentiated.
     """
     count = mask.shape[0]
-    chunk = min(max(256, _RAYS_AT_ONCE // max(samples, 1)), max(count, 1))
+    wanted = max(256, _RAYS_AT_ONCE // max(samples, 1)) if rows_at_once is None else rows_at_once
+    chunk = min(wanted, max(count, 1))
     rows = -(-max(count, 1) // chunk)
 
     def chunks(values: Array) -> Array:
@@ -145,28 +169,63 @@ def cast(
     ----------
     finds_nearest : static; tell the face that is hit first, which takes longer.
     """
+    if finds_nearest and index is not None:
+        return cast_to_faces(points, directions, index)[0]
     points, directions = jax.lax.stop_gradient((points, directions))
-    is_below = jnp.sum(directions * points.outward[None], axis=-1) <= 0
+    is_below = _below(points, directions)
     if index is None:
         return jnp.where(is_below, BLOCKED, OPEN).astype(jnp.int32)
-    samples, count, _ = directions.shape
+    is_blocked = index.occluded(*_rays(points, directions, is_below)).reshape(is_below.shape)
+    return jnp.where(is_below | is_blocked, BLOCKED, OPEN).astype(jnp.int32)
+
+
+def cast_to_faces(
+    points: SurfacePoints, directions: Float[Array, "S N 3"], index: RayIndex
+) -> tuple[Int[Array, "S N"], Float[Array, "S N"]]:
+    """Tell the face that rays hit first, as `cast` does, and how far away; no gradients."""
+    points, directions = jax.lax.stop_gradient((points, directions))
+    is_below = _below(points, directions)
+    distance, hits = index.nearest(*_rays(points, directions, is_below))
+    return jnp.where(is_below, BLOCKED, hits.reshape(is_below.shape)), distance.reshape(
+        is_below.shape
+    )
+
+
+def _below(points: SurfacePoints, directions: Float[Array, "S N 3"]) -> Bool[Array, "S N"]:
+    """Tell which directions start out below their point's face."""
+    return jnp.sum(directions * points.outward[None], axis=-1) <= 0
+
+
+def _rays(
+    points: SurfacePoints, directions: Float[Array, "S N 3"], is_below: Bool[Array, "S N"]
+) -> tuple[Array, Array, Array, Array]:
+    """Lay out what a `RayIndex` is asked: origins, directions, faces to start from, mask."""
+    samples = directions.shape[0]
 
     def repeated(values: Array) -> Array:
         return jnp.broadcast_to(values[None], (samples, *values.shape)).reshape(
             -1, *values.shape[1:]
         )
 
-    rays = (
+    return (
         repeated(points.positions),
         directions.reshape(-1, 3),
         repeated(points.faces),
         (~is_below & points.mask[None]).reshape(-1),
     )
-    if finds_nearest:
-        _, hits = index.nearest(*rays)
-    else:
-        hits = jnp.where(index.occluded(*rays), BLOCKED, OPEN).astype(jnp.int32)
-    return jnp.where(is_below, BLOCKED, hits.reshape(samples, count))
+
+
+def _ends(
+    points: SurfacePoints,
+    directions: Float[Array, "S N 3"],
+    index: RayIndex | None,
+    finds_nearest: bool,
+) -> tuple[Int[Array, "N S"], Float[Array, "N S"] | None]:
+    """Tell where rays end, and how far away the faces are where they are found; point by point."""
+    if finds_nearest and index is not None:
+        hits, distances = cast_to_faces(points, directions, index)
+        return hits.T, distances.T
+    return cast(points, directions, index).T, None
 
 
 def draw_samples(
@@ -177,6 +236,7 @@ def draw_samples(
     *,
     counts: SampleCounts,
     finds_nearest: bool = False,
+    chosen: Chosen | None = None,
 ) -> Samples:
     """Draw directions from the light and the cosine, and trace them; no gradients.
 
@@ -187,14 +247,17 @@ def draw_samples(
     sampler : tables of the light.
     index : the surface that blocks rays; None for no occlusion.
     counts, finds_nearest : static; see `SampleCounts` and `cast`.
+    chosen : what to take for the light's samples; drawn here by default.
     """
     points, sampler = jax.lax.stop_gradient((points, sampler))
     count, dtype = points.normals.shape[0], points.normals.dtype
 
-    def one_chunk(parts: tuple[SurfacePoints, Array]) -> Samples:
-        points, offsets = parts
+    def one_chunk(parts: tuple[SurfacePoints, Array, Chosen | None]) -> Samples:
+        points, offsets, chosen = parts
         drawn = []
-        if counts.light:
+        if chosen is not None:
+            drawn.append(jnp.moveaxis(chosen.directions, 1, 0))
+        elif counts.light:
             uniforms = low_discrepancy(offsets[:, :2], counts.light, dtype)
             found, _ = sample_light(sampler, uniforms.reshape(-1, 2))
             drawn.append(found.reshape(counts.light, -1, 3))
@@ -209,11 +272,24 @@ def draw_samples(
         cosine = jax.vmap(lambda wi: bsdf.cosine_pdf(points.normals, wi))(directions)
         density = counts.light * light + counts.diffuse * cosine
         weights = jnp.where(points.mask[None], safe_divide(jnp.ones_like(density), density), 0.0)
-        hits = cast(points, directions, index, finds_nearest=finds_nearest)
-        return Samples(jnp.moveaxis(directions, 0, 1), weights.T, hits.T, light[: counts.light].T)
+        hits, distances = _ends(points, directions, index, finds_nearest)
+        directions, weights, shared = jnp.moveaxis(directions, 0, 1), weights.T, light.T
+        if chosen is None:
+            return Samples(directions, weights, hits, shared[:, : counts.light], distances)
+        if chosen.is_open:
+            # Blocked directions are the cosine's alone.
+            is_open = hits == OPEN
+            alone = safe_divide(jnp.ones_like(cosine), counts.diffuse * cosine).T
+            alone = jnp.where(points.mask[:, None], alone, 0.0)
+            is_light = jnp.arange(weights.shape[1]) < counts.light
+            weights = jnp.where(is_open, weights, jnp.where(is_light[None], 0.0, alone))
+        shared = shared[:, : counts.light]
+        factors = shared * chosen.weights
+        weights = weights.at[:, : counts.light].multiply(factors)
+        return Samples(directions, weights, hits, shared, distances, factors)
 
     samples = counts.light + counts.diffuse
-    arguments = (points, _offsets(key, count, 4))
+    arguments = (points, _offsets(key, count, 4), chosen)
     return in_chunks(one_chunk, arguments, points.mask, samples, has_gradient=False)
 
 
@@ -227,24 +303,26 @@ def draw_specular(
     *,
     counts: SampleCounts,
     finds_nearest: bool,
-) -> tuple[Float[Array, "N S 3"], Int[Array, "N S"], Float[Array, "N S"]]:
+    open_only: bool = False,
+) -> Samples:
     """Draw the directions of the specular lobe from visible microfacet normals, and trace them.
 
-    Returns
-    -------
-    directions (N, S, 3), hits (N, S) and the density of the light's samples there (N, S).
+    The weights of the result are 1: they depend on the material. The density of the light's samples
+    stands beside every direction; with ``open_only`` it is 0 where that is blocked.
     """
 
-    def one_chunk(parts: tuple) -> tuple[Array, Array, Array]:
+    def one_chunk(parts: tuple) -> Samples:
         points, roughness, wo, offsets = parts
         uniforms = low_discrepancy(offsets[:, :2], counts.specular, wo.dtype)
         alpha = bsdf.ggx_alpha(roughness)[None, :]
         normals, views = (tuple(x.T[:, None, :]) for x in (points.normals, wo))
         found = bsdf.specular_directions(alpha, normals, views, uniforms[..., 0], uniforms[..., 1])
         drawn = jnp.stack(found, axis=-1)
-        hits = cast(points, drawn, index, finds_nearest=finds_nearest)
-        density = light_density(sampler, drawn.reshape(-1, 3)).reshape(hits.shape)
-        return jnp.moveaxis(drawn, 0, 1), hits.T, density.T
+        hits, distances = _ends(points, drawn, index, finds_nearest)
+        density = light_density(sampler, drawn.reshape(-1, 3)).reshape(drawn.shape[:2]).T
+        if open_only:
+            density = jnp.where(hits == OPEN, density, 0.0)
+        return Samples(jnp.moveaxis(drawn, 0, 1), jnp.ones_like(density), hits, density, distances)
 
     count = wo.shape[0]
     arguments = jax.lax.stop_gradient((points, roughness, wo, _offsets(key, count, 2)))

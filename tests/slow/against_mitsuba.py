@@ -23,7 +23,7 @@ import argparse
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -172,12 +172,19 @@ _extract = partial(jax.jit, static_argnames=("capacities",))(FlexiCubes.extract)
 _index = partial(jax.jit, static_argnames=("capacities",))(FlexiCubes.ray_index)
 
 
-def make_scene(resolution: int) -> Scene:
-    """Extract the mesh on a grid of so many cells along each axis, and arrange it for rays."""
+def make_scene(
+    resolution: int,
+    distances_at: Callable[[np.ndarray], np.ndarray] = _distances,
+    eye: tuple[float, float, float] = (1.6, -2.2, 1.5),
+) -> Scene:
+    """Extract the mesh on a grid of so many cells along each axis, and arrange it for rays.
+
+    ``distances_at`` : signed distances of points (N, 3). ``eye`` : where the camera stands.
+    """
     cell = 2.2 / resolution
     shape = (resolution, resolution, resolution)
     grid = Grid(jnp.full((3,), -1.1), jnp.asarray(cell, jnp.float32), shape)
-    distances = _distances(np.asarray(grid_vertices(grid)))
+    distances = distances_at(np.asarray(grid_vertices(grid)))
     geometry = initial_geometry(grid, jnp.asarray(distances / cell, jnp.float32))
     model = FlexiCubes(grid)
 
@@ -196,7 +203,7 @@ def make_scene(resolution: int) -> Scene:
         vertices=np.asarray(mesh.vertices)[:count],
         faces=np.asarray(mesh.faces)[: int(mesh.face_count)],
         normals=np.asarray(vertex_normals(mesh))[:count],
-        camera_to_world=look_at((1.6, -2.2, 1.5)),
+        camera_to_world=look_at(eye),
     )
 
 
@@ -332,6 +339,14 @@ def _shade_hits(
     return np.concatenate(found)[:count] if found else np.zeros((0, 3), np.float32)
 
 
+def binned(hits: Hits, radiance: np.ndarray, settings: Settings) -> np.ndarray:
+    """Average the radiance (M, 3) of hits over the rays of their pixels, (pixels, 3)."""
+    total = settings.size**2
+    channels = radiance.astype(np.float64).T
+    sums = [np.bincount(hits.pixels, channel, total) for channel in channels]
+    return np.stack(sums, axis=-1) / settings.strata**2
+
+
 def our_image(
     scene: Scene,
     passes: list[Hits],
@@ -348,14 +363,12 @@ def our_image(
     keys = jax.random.split(jax.random.key(settings.seed), len(passes))
     for key, hits in zip(keys, passes, strict=True):
         radiance = _shade_hits(hits, light, index, settings, key, material=material)
-        channels = radiance.astype(np.float64).T
-        sums = [np.bincount(hits.pixels, channel, total) for channel in channels]
-        images.append(np.stack(sums, axis=-1) / settings.strata**2)
+        images.append(binned(hits, radiance, settings))
         coverages.append(np.bincount(hits.pixels, minlength=total) / settings.strata**2)
-    return _combined(images, coverages, settings.size)
+    return combined(images, coverages, settings.size)
 
 
-def _combined(images: list[np.ndarray], coverages: list[np.ndarray], size: int) -> Image:
+def combined(images: list[np.ndarray], coverages: list[np.ndarray], size: int) -> Image:
     """Average passes; their noise is half the difference of those at even and odd places."""
     stack = np.stack(images).reshape(-1, size, size, 3)
     even = len(images) // 2 * 2  # of an odd number the last says nothing about noise
@@ -440,8 +453,17 @@ def mitsuba_light(light: EnvLight):
     return emitter
 
 
-def mitsuba_mesh(scene: Scene, settings: Settings, *, material: str):
+def mitsuba_mesh(
+    scene: Scene,
+    settings: Settings,
+    *,
+    material: str,
+    albedo: tuple[float, float, float] = ALBEDO,
+    chosen: np.ndarray | None = None,
+):
     """Hand the triangles and vertex normals to Mitsuba, with one of both materials.
+
+    ``chosen`` : (faces,) bool, which of them; all by default.
 
     Raises
     ------
@@ -450,19 +472,20 @@ def mitsuba_mesh(scene: Scene, settings: Settings, *, material: str):
     """
     import mitsuba as mi
 
-    color = {"type": "rgb", "value": list(ALBEDO)}
+    color = {"type": "rgb", "value": list(albedo)}
     bsdf = {"type": "diffuse", "reflectance": color}
     if material == "metal":
         metal = {"base_color": color, "roughness": settings.roughness, "metallic": 1.0}
         bsdf = {"type": "principled", **metal}
-    mesh = trimesh.Trimesh(scene.vertices, scene.faces, vertex_normals=scene.normals, process=False)
+    faces = scene.faces if chosen is None else scene.faces[chosen]
+    mesh = trimesh.Trimesh(scene.vertices, faces, vertex_normals=scene.normals, process=False)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "mesh.ply"
         path.write_bytes(export_ply(mesh, vertex_normal=True))
         shape = mi.load_dict({"type": "ply", "filename": str(path), "bsdf": bsdf})
     params = mi.traverse(shape)
     given = {"vertex_positions": scene.vertices, "vertex_normals": scene.normals}
-    for name, ours in {**given, "faces": scene.faces}.items():
+    for name, ours in {**given, "faces": faces}.items():
         theirs = np.array(params[name]).reshape(-1, 3)
         if theirs.shape != ours.shape or not np.allclose(theirs, ours, atol=1e-6):
             raise RuntimeError(f"Mitsuba's mesh has other {name} than ours")
@@ -471,6 +494,14 @@ def mitsuba_mesh(scene: Scene, settings: Settings, *, material: str):
 
 def mitsuba_image(scene: Scene, light: EnvLight, settings: Settings, *, material: str) -> Image:
     """Render the scene by Mitsuba: direct light only, black background, box filter."""
+    shapes = {"object": mitsuba_mesh(scene, settings, material=material)}
+    return render_by_mitsuba(scene, light, settings, {"type": "direct"}, shapes)
+
+
+def render_by_mitsuba(
+    scene: Scene, light: EnvLight, settings: Settings, integrator: dict, shapes: dict
+) -> Image:
+    """Render shapes under a light by one of Mitsuba's integrators: black background, box filter."""
     import mitsuba as mi
 
     to_world = scene.camera_to_world @ np.diag([-1.0, 1.0, -1.0, 1.0])
@@ -485,16 +516,16 @@ def mitsuba_image(scene: Scene, light: EnvLight, settings: Settings, *, material
         "sampler": {"type": "multijitter", "sample_count": samples},
     }
     parts = {
-        "integrator": {"type": "direct", "hide_emitters": True},
+        "integrator": {**integrator, "hide_emitters": True},
         "sensor": sensor,
         "light": mitsuba_light(light),
-        "object": mitsuba_mesh(scene, settings, material=material),
+        **shapes,
     }
     loaded = mi.load_dict({"type": "scene", **parts})
     seeds = range(settings.seed, settings.seed + settings.mitsuba_passes)
     passes = [np.array(mi.render(loaded, spp=samples, seed=k)) for k in seeds]
     images = [x[..., :3].astype(np.float64) for x in passes]
-    return _combined(images, [x[..., 3].astype(np.float64) for x in passes], size)
+    return combined(images, [x[..., 3].astype(np.float64) for x in passes], size)
 
 
 def _normalized(values: np.ndarray, white: float) -> np.ndarray:

@@ -1,0 +1,474 @@
+"""Light that reaches a point by way of other surfaces, by following paths of any length.
+
+`monte_carlo` samples the light that arrives at a point; where the surface is in the way, a ray goes
+on from there. At every later vertex of its path one direction is drawn towards the environment and
+one after the reflectance of the face that was hit, combined by the balance heuristic where they
+reach the environment; where the second one hits the surface the path goes on, up to
+`PathSettings.bounce_count` surfaces. Nothing else ends a path: no Russian roulette, so that the
+number of vertices is static. The first vertex is that of `monte_carlo`: points may be splats or
+pixels, and all views share what does not depend on the viewer.
+
+A later vertex sees the mean material and normal of the points that belong to its face
+(`FaceTable`), at the exact position of the hit. Faces without points are black; so is all
+interreflection between splats that belong to no face.
+
+Gradient semantics. Samples, densities, hits and visibility are constants of a step, as in
+`monte_carlo`. At the first vertex light, reflectance and normals are differentiated. What later
+vertices take part in depends on `PathSettings.later_gradient`: nothing, the light that they
+reflect, or that and their materials and normals as well.
+
+Unbiased for faces of one material, wherever the light is bounded. Rays that go on are brought
+together, so that those which leave cost nothing, and no list can be too short.
+"""
+
+from dataclasses import replace
+from typing import Annotated, Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+from pydantic import Field
+
+from geosplat_jax.core.capacity import bit_set
+from geosplat_jax.core.numerics import safe_divide, safe_normalize
+from geosplat_jax.core.settings import settings
+from geosplat_jax.core.types import EnvLight, Materials, SurfacePoints
+from geosplat_jax.materials import Attributes
+from geosplat_jax.rays.base import RayIndex
+from geosplat_jax.transport import bsdf
+from geosplat_jax.transport.base import Shaded, TransportSettings
+from geosplat_jax.transport.environment import LightSpec, lookup
+from geosplat_jax.transport.indirect import IndirectSource, KnownIndirect
+from geosplat_jax.transport.light_sampling import (
+    LightSampler,
+    light_density,
+    light_sampler,
+    sample_light,
+)
+from geosplat_jax.transport.monte_carlo import (
+    MonteCarloIllumination,
+    SampleCount,
+    SampledSettings,
+    SampledTransport,
+    gather,
+    reflect,
+)
+from geosplat_jax.transport.sampling import draw_samples, in_chunks
+
+LaterGradient = Literal["none", "light", "all"]
+
+_ROWS_AT_ONCE = 65_536
+"""Paths that are followed together; chunks beyond the last path cost nothing."""
+
+_NUMBERS = 5
+"""Random numbers of a vertex: two towards the light, three after the reflectance."""
+
+
+class FaceTable(eqx.Module):
+    """What a ray finds where it hits one of F faces.
+
+    Attributes
+    ----------
+    materials : mean of the points of each face.
+    normals, outward : (F, 3) unit, mean shading and geometric normals; zero without points.
+    """
+
+    materials: Materials
+    normals: Float[Array, "F 3"]
+    outward: Float[Array, "F 3"]
+
+
+def face_table(points: SurfacePoints, materials: Materials, face_count: int) -> FaceTable:
+    """Average points and their materials over the faces that they belong to.
+
+    Faces without points are black. Differentiable in materials and shading normals.
+
+    Parameters
+    ----------
+    points, materials : N rows; those that the mask leaves out do not count.
+    face_count : static; rows to return.
+    """
+    shine = jnp.stack([materials.roughness, materials.metallic], axis=1)
+    outward = jax.lax.stop_gradient(points.outward)
+    ones = jnp.ones_like(materials.roughness)[:, None]
+    values = jnp.concatenate([materials.albedo, shine, points.normals, outward, ones], axis=1)
+    values = jnp.where(points.mask[:, None], values, 0.0)
+    row = jnp.where(points.faces < 0, face_count, points.faces)
+    total = jnp.zeros((face_count, values.shape[1]), values.dtype).at[row].add(values, mode="drop")
+    mean = safe_divide(total, total[:, -1:])
+    return FaceTable(
+        Materials(mean[:, :3], mean[:, 3], mean[:, 4]),
+        safe_normalize(mean[:, 5:8]),
+        safe_normalize(mean[:, 8:11]),
+    )
+
+
+class _Vertex(eqx.Module):
+    """Where n paths are: their faces as seen from the vertex before, towards which ``wo`` points.
+
+    ``is_known`` : (n,) false where nothing is known of the face, which is black.
+    """
+
+    materials: Materials
+    normals: Float[Array, "n 3"]
+    outward: Float[Array, "n 3"]
+    wo: Float[Array, "n 3"]
+    is_known: Bool[Array, " n"]
+
+    def reflected(self, wi: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """Reflectance times the cosine."""
+        cosine = jnp.maximum(jnp.sum(self.normals * wi, axis=-1), 0.0)
+        value = bsdf.evaluate(self.materials, self.normals, wi, self.wo)
+        return jnp.where(self.is_known[:, None], value * cosine[:, None], 0.0)
+
+    def is_above(self, wi: Float[Array, "n 3"]) -> Bool[Array, " n"]:
+        """Tell which directions leave the face."""
+        return jnp.sum(self.outward * wi, axis=-1) > 0
+
+
+def _vertex(table: FaceTable, faces: Int[Array, " n"], wo: Float[Array, "n 3"]) -> _Vertex:
+    """Look up the faces that were hit; a shading normal that faces away gives way to the face's."""
+
+    def rows(values: Array) -> Array:
+        return values.at[jnp.maximum(faces, 0)].get(mode="clip")
+
+    outward, normals = rows(table.outward), rows(table.normals)
+    is_seen = jnp.sum(normals * wo, axis=-1, keepdims=True) > 0
+    return _Vertex(
+        materials=jax.tree.map(rows, table.materials),
+        normals=jnp.where(is_seen, normals, outward),
+        outward=outward,
+        wo=wo,
+        is_known=(faces >= 0) & (jnp.sum(outward * wo, axis=-1) > 0),
+    )
+
+
+class Leg(eqx.Module):
+    """What n paths did at one vertex; constants of a step.
+
+    Attributes
+    ----------
+    faces : (n,) where they are; -1 for a path that has ended.
+    to_light : (n, 3) direction drawn from the light; light_weight : (n,) one over the density of
+        both techniques, 0 where the surface is in the way.
+    onward : (n, 3) direction drawn after the reflectance; open_weight : (n,) the same weight where
+        it reaches the environment; onward_weight : (n,) one over its own density where it hits the
+        surface. One of the two is 0.
+    """
+
+    faces: Int[Array, " n"]
+    to_light: Float[Array, "n 3"]
+    light_weight: Float[Array, " n"]
+    onward: Float[Array, "n 3"]
+    open_weight: Float[Array, " n"]
+    onward_weight: Float[Array, " n"]
+
+
+def _step(
+    uniforms: Float[Array, "n k"],
+    origins: Float[Array, "n 3"],
+    faces: Int[Array, " n"],
+    wo: Float[Array, "n 3"],
+    table: FaceTable,
+    sampler: LightSampler,
+    index: RayIndex,
+    *,
+    is_last: bool,
+) -> tuple[Leg, Float[Array, "n 3"], Int[Array, " n"]]:
+    """Draw and trace both directions of one vertex; also return where the paths go on."""
+    at = _vertex(table, faces, wo)
+    to_light, _ = sample_light(sampler, uniforms[:, :2])
+    onward = bsdf.sample(at.materials, at.normals, wo, uniforms[:, 2:5])
+
+    def densities(wi: Float[Array, "n 3"]) -> tuple[Array, Array]:
+        return light_density(sampler, wi), bsdf.pdf(at.materials, at.normals, wi, wo)
+
+    light_part, reflected_part = densities(to_light)
+    weight = safe_divide(jnp.ones_like(light_part), light_part + reflected_part)
+    is_lit = at.is_known & at.is_above(to_light)
+    is_lit = is_lit & ~index.occluded(origins, to_light, faces, is_lit)
+    light_part, own = densities(onward)
+    both = safe_divide(jnp.ones_like(own), light_part + own)
+    is_going = at.is_known & at.is_above(onward) & (own > 0)
+    if is_last:
+        is_hit = index.occluded(origins, onward, faces, is_going)
+        distance, following = jnp.zeros_like(own), jnp.full_like(faces, -1)
+    else:
+        distance, following = index.nearest(origins, onward, faces, is_going)
+        is_hit = following >= 0
+    goes_on = is_going & is_hit
+    leg = Leg(
+        faces=jnp.where(at.is_known, faces, -1),
+        to_light=to_light,
+        light_weight=jnp.where(is_lit, weight, 0.0),
+        onward=onward,
+        open_weight=jnp.where(is_going & ~is_hit, both, 0.0),
+        onward_weight=jnp.where(goes_on, safe_divide(jnp.ones_like(own), own), 0.0),
+    )
+    reached = jnp.where(goes_on, distance, 0.0)
+    ends = origins + reached[:, None] * onward
+    return leg, ends, jnp.where(goes_on, following, -1)
+
+
+def path_radiance(
+    legs: tuple[Leg, ...], wo: Float[Array, "n 3"], table: FaceTable, light: EnvLight
+) -> Float[Array, "n 3"]:
+    """Add up what arrives at every vertex of n paths and leaves their first one along ``wo``.
+
+    Differentiable in table and light; the legs are constants.
+    """
+    total, throughput = jnp.zeros_like(wo), jnp.ones_like(wo)
+    for leg in legs:
+        at = _vertex(table, leg.faces, wo)
+        lit = at.reflected(leg.to_light) * leg.light_weight[:, None]
+        onward = at.reflected(leg.onward)
+        arriving = lit * lookup(light.radiance, leg.to_light)
+        arriving = arriving + onward * leg.open_weight[:, None] * lookup(light.radiance, leg.onward)
+        total = total + throughput * arriving
+        throughput = throughput * onward * leg.onward_weight[:, None]
+        wo = -leg.onward
+    return total
+
+
+class PathTracer(IndirectSource):
+    """Follows blocked rays further.
+
+    Attributes
+    ----------
+    key : of all samples.
+    table : what paths find on the surface.
+    light, sampler, index : the environment, its tables, and the surface.
+    vertex_count : static; later vertices of a path at most.
+    gradient : static; see the module.
+    """
+
+    key: Key[Array, ""]
+    table: FaceTable
+    light: EnvLight
+    sampler: LightSampler
+    index: RayIndex
+    vertex_count: int = eqx.field(static=True)
+    gradient: LaterGradient = eqx.field(static=True, default="light")
+
+    def followed(
+        self,
+        points: SurfacePoints,
+        directions: Float[Array, "N S 3"],
+        hits: Int[Array, "N S"],
+        distances: Float[Array, "N S"] | None,
+    ) -> KnownIndirect:
+        """Follow every ray that hit a face.
+
+        Raises
+        ------
+        ValueError
+            Without distances, that is if rays only tell whether they are blocked.
+        """
+        if distances is None:
+            raise ValueError("paths go on where rays end: trace the nearest hits")
+        count, samples = hits.shape
+        total = count * samples
+        hits, wi = hits.reshape(-1), directions.reshape(-1, 3)
+        starts = jnp.repeat(points.positions, samples, axis=0)
+        going = bit_set(hits >= 0)
+        ray = going.first(capacity=total)
+        is_real = jnp.arange(total, dtype=jnp.int32) < going.count
+
+        def rows(values: Array) -> Array:
+            return values.at[ray].get(mode="promise_in_bounds")
+
+        wo, faces = -rows(wi), jnp.where(is_real, rows(hits), -1)
+        reached = jnp.where(is_real, rows(distances.reshape(-1)), 0.0)
+        origins = jax.lax.stop_gradient(rows(starts) - reached[:, None] * wo)
+        legs = self.draw(origins, faces, wo, is_real)
+        radiance = self.evaluate(legs, wo, is_real)
+        target = jnp.where(is_real, ray, total)
+        # Rays are numbered once each; only those that go on bring anything.
+        brought = jnp.zeros_like(radiance).at[target].set(radiance, mode="drop")
+        return KnownIndirect(brought.reshape(count, samples, 3))
+
+    def draw(
+        self,
+        origins: Float[Array, "n 3"],
+        faces: Int[Array, " n"],
+        wo: Float[Array, "n 3"],
+        is_real: Bool[Array, " n"],
+    ) -> tuple[Leg, ...]:
+        """Draw and trace all later vertices; no gradients."""
+        table, sampler = jax.lax.stop_gradient((self.table, self.sampler))
+        width = self.vertex_count * _NUMBERS
+        # In float32 at any precision, so that a run in float64 sees the same numbers.
+        numbers = jax.random.uniform(self.key, (wo.shape[0], width), jnp.float32).astype(wo.dtype)
+
+        def one_chunk(parts: tuple[Array, Array, Array, Array]) -> tuple[Leg, ...]:
+            origins, faces, wo, numbers = parts
+            legs = []
+            for vertex in range(self.vertex_count):
+                leg, origins, faces = _step(
+                    numbers[:, vertex * _NUMBERS : (vertex + 1) * _NUMBERS],
+                    origins,
+                    faces,
+                    wo,
+                    table,
+                    sampler,
+                    self.index,
+                    is_last=vertex == self.vertex_count - 1,
+                )
+                legs.append(leg)
+                wo = -leg.onward
+            return tuple(legs)
+
+        arguments = jax.lax.stop_gradient((origins, faces, wo, numbers))
+        return in_chunks(
+            one_chunk, arguments, is_real, rows_at_once=_ROWS_AT_ONCE, has_gradient=False
+        )
+
+    def evaluate(
+        self, legs: tuple[Leg, ...], wo: Float[Array, "n 3"], is_real: Bool[Array, " n"]
+    ) -> Float[Array, "n 3"]:
+        """Add up what the paths bring."""
+        table, light = self.table, self.light
+        if self.gradient != "all":
+            table = jax.lax.stop_gradient(table)
+        if self.gradient == "none":
+            light = jax.lax.stop_gradient(light)
+
+        def one_chunk(parts: tuple[tuple[Leg, ...], Array]) -> Array:
+            return path_radiance(*parts, table, light)
+
+        return in_chunks(
+            one_chunk,
+            (legs, wo),
+            is_real,
+            rows_at_once=_ROWS_AT_ONCE,
+            has_gradient=self.gradient != "none",
+        )
+
+
+class PathIllumination(MonteCarloIllumination):
+    """Light of N points, and what paths find on the surface.
+
+    Attributes
+    ----------
+    table : of all faces; None where nothing blocks rays.
+    """
+
+    table: FaceTable | None = None
+
+
+@settings
+class PathSettings(SampledSettings, TransportSettings, kind="paths"):
+    """Paths over several surfaces: the light of other surfaces is traced, not learned."""
+
+    residual_count: SampleCount = 2
+    """Samples of each kind of a second image, from which Eq. 13 takes its residual; with 0 it takes
+    that of the image that it differentiates, which biases the gradient."""
+    bounce_count: Annotated[int, Field(ge=2, le=64)] = 2
+    """Surfaces on a path of light at most, the one that is seen included: with 2, light that came
+    by way of one other surface. There is no Russian roulette."""
+    later_gradient: LaterGradient = "light"
+    """What is differentiated at the vertices of a path after the first: nothing, the light that
+    they reflect, or that and their materials and normals."""
+
+    @property
+    def relative_cost(self) -> float:
+        """As for one bounce, and a ray in three goes on."""
+        drawn = self.light_count + self.diffuse_count + self.specular_count
+        onward = 1.0 + 0.5 * (self.bounce_count - 1)
+        return 1.0 + 0.2 * onward * (drawn + 3 * self.residual_count)
+
+    def build(self, light: LightSpec) -> "Paths":
+        """Make the transport; it has no constants."""
+        del light
+        return Paths(self)
+
+
+class Paths(SampledTransport):
+    """Many bounces by path tracing, the first as in `monte_carlo`."""
+
+    settings: PathSettings = eqx.field(static=True)
+
+    @property
+    def uses_rays(self) -> bool:
+        """Always."""
+        return True
+
+    @property
+    def needs_every_point(self) -> bool:
+        """Paths meet faces that no view sees."""
+        return True
+
+    def _tracer(
+        self,
+        key: Key[Array, ""],
+        light: EnvLight,
+        sampler: LightSampler,
+        table: FaceTable | None,
+        index: RayIndex | None,
+    ) -> dict[str, Any]:
+        """Return how `gather` and `reflect` learn of blocked directions; black without rays."""
+        if index is None or table is None:
+            return {}
+        count = self.settings.bounce_count - 1
+        gradient = self.settings.later_gradient
+        return {"indirect": PathTracer(key, table, light, sampler, index, count, gradient)}
+
+    def prepare(
+        self,
+        key: Key[Array, ""] | None,
+        points: SurfacePoints,
+        attributes: Attributes,
+        light: EnvLight,
+        index: RayIndex | None,
+        carry: Any = None,
+    ) -> tuple[PathIllumination, Any]:
+        """Average faces, follow what views share, and sum up the diffuse light.
+
+        Raises
+        ------
+        ValueError
+            Without a key.
+        """
+        if key is None:
+            raise ValueError("path tracing needs a key for its samples")
+        sampler = light_sampler(light)
+        table, gathered = None, None
+        if index is not None:
+            table = face_table(points, attributes.materials, index.face_capacity)
+        if self.settings.shares_views:
+            first_key, later_key = jax.random.split(key)
+            samples, carry = self._draw_shared(
+                first_key, points, light, sampler, index, carry, finds_nearest=True
+            )
+            source = self._tracer(later_key, light, sampler, table, index)
+            gathered = gather(points, samples, light, **source)
+        return PathIllumination(light, sampler, None, gathered, table), carry
+
+    def shade(
+        self,
+        key: Key[Array, ""] | None,
+        points: SurfacePoints,
+        attributes: Attributes,
+        wo: Float[Array, "M 3"],
+        illumination: PathIllumination,
+        index: RayIndex | None,
+    ) -> Shaded:
+        """Add what each viewer sees; see `monte_carlo.reflect`."""
+        assert key is not None
+        light, sampler, gathered = illumination.light, illumination.sampler, illumination.gathered
+        keys = jax.random.split(key, 4)
+        how = {"counts": self._counts, "finds_nearest": True}
+        open_only = self._open_only and gathered is not None
+        if gathered is None:
+            samples = draw_samples(keys[0], points, sampler, index, **how)
+            source = self._tracer(keys[1], light, sampler, illumination.table, index)
+            gathered = gather(points, samples, light, **source)
+        source = self._tracer(keys[2], light, sampler, illumination.table, index)
+        rest = (attributes.materials, wo, gathered, light, sampler, index)
+        return reflect(keys[3], points, *rest, **source, open_only=open_only, **how)
+
+    def for_images(self, sample_count: int) -> "SampledTransport":
+        """Share the views' samples and leave the filter out; nothing is differentiated."""
+        shared = super().for_images(sample_count)
+        return replace(shared, settings=replace(shared.settings, later_gradient="none"))

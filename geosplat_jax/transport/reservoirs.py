@@ -1,0 +1,399 @@
+"""Samples of the light that are chosen from many, and used again: weighted reservoir sampling.
+
+A point draws several directions towards the light and keeps one with a probability in proportion to
+its *target*, the brightness of the sky there times the cosine (resampled importance sampling,
+Talbot et al. 2005). What it kept may be offered again to the point in the next step, and to its
+neighbours on the surface (Bitterli et al. 2020). The environment is infinitely far away, so that a
+direction means the same to all of them.
+
+A reservoir is a direction, a weight whose mean is one over the density of that direction, and a
+confidence, the number of directions it was chosen from. Several reservoirs are joined by the
+balance heuristic over their confidences and targets (Lin et al. 2022)::
+
+    m_j(w) = c_j p_j(w) / sum_k c_k p_k(w),    weight_j = m_j(w_j) p(w_j) W_j
+
+with p_k the target of the point that reservoir k comes from. Sums of m_j are 1 wherever the target
+is positive, so that joined reservoirs are unbiased if the targets tell which directions their
+points can have kept. `ReservoirSettings.visibility` says whether these are the visible ones.
+
+A step's reservoirs are kept under the place of their points on the surface, `RayIndex.places`, in a
+table of fixed size. A point takes what lies under its own place if that comes from nearby and from
+a surface of about the same direction; else it begins anew. Where several places or points share a
+slot, the last row keeps it, whatever it holds, so that the choice favours no direction.
+
+Reservoirs, their weights and what they were chosen by carry no gradient.
+"""
+
+from typing import Annotated, Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+from pydantic import Field
+
+from geosplat_jax.core.color import luminance
+from geosplat_jax.core.numerics import safe_divide
+from geosplat_jax.core.settings import Positive, PositiveCount, Share, settings
+from geosplat_jax.core.types import EnvLight, SurfacePoints
+from geosplat_jax.rays.base import RayIndex
+from geosplat_jax.transport.environment import lookup
+from geosplat_jax.transport.light_sampling import LightSampler, sample_light
+from geosplat_jax.transport.sampling import OPEN, cast, in_chunks, low_discrepancy
+
+_DIMMEST = 1e-3
+"""Share of the mean brightness that every direction has in a target: where the sky is black,
+samples must still be possible, since other surfaces may shine there."""
+
+_LANES = 8
+"""Reservoirs kept for a place: its points take turns."""
+
+_NEIGHBORHOOD = 12
+"""Neighbours are at most so many rows away when points are in order of their places."""
+
+_SCATTER = np.int32(0x9E3779B1 - 2**32)
+"""An odd number that spreads keys over the slots."""
+
+
+@settings
+class ReservoirSettings:
+    """How the samples of the light are chosen; off by default."""
+
+    candidates: Annotated[int, Field(ge=0, le=1024)] = 0
+    """Directions drawn for every sample of the light, of which one is kept; with 0 samples are
+    plain, and nothing is used again."""
+    reuse_steps: bool = False
+    """Offer what a place kept in the step before."""
+    neighbors: Annotated[int, Field(ge=0, le=8)] = 0
+    """Points nearby whose samples of the same step are offered as well."""
+    visibility: Literal["ignored", "traced", "assumed"] = "ignored"
+    """What reused samples know of shadows. Ignored: nothing, which is unbiased and costs no rays.
+    Traced: blocked ones are dropped, and rays tell who could have kept them, which is unbiased
+    while the surface stands still. Assumed: blocked ones are dropped without asking, which makes
+    the edges of shadows darker."""
+    confidence: Positive = 20.0
+    """What was kept counts at most so many times as much as a step's own candidates."""
+    slots: PositiveCount = 65_536
+    """Size of the table from step to step."""
+    smallest_cosine: Share = 0.5
+    """Between the normals of points that use each other's samples."""
+
+    @property
+    def drops_blocked(self) -> bool:
+        """Whether blocked samples are left to other techniques."""
+        return self.candidates > 0 and self.visibility != "ignored"
+
+
+class Reservoirs(eqx.Module):
+    """R reservoirs of each of N points; no gradients.
+
+    Attributes
+    ----------
+    directions : (N, R, 3) unit. weights : (N, R) unbiased for one over the density; 0 for none.
+    confidences : (N,) candidates that they stand for.
+    """
+
+    directions: Float[Array, "N R 3"]
+    weights: Float[Array, "N R"]
+    confidences: Float[Array, " N"]
+
+
+class ReservoirStore(eqx.Module):
+    """What a step leaves to the next, slot by slot.
+
+    Attributes
+    ----------
+    keys : (T,) place and lane; -1 for an empty slot.
+    reservoirs : of the slots.
+    points : that they come from.
+    """
+
+    keys: Int[Array, " T"]
+    reservoirs: Reservoirs
+    points: SurfacePoints
+
+
+def empty_store(spec: ReservoirSettings, count: int) -> ReservoirStore:
+    """Return a store without content for ``count`` samples of the light per point."""
+    slots = spec.slots
+    vectors = [jnp.zeros((slots, 3)) for _ in range(3)]
+    nowhere = jnp.full((slots,), -1, jnp.int32)
+    nothing = Reservoirs(
+        jnp.zeros((slots, count, 3)), jnp.zeros((slots, count)), jnp.zeros((slots,))
+    )
+    points = SurfacePoints(*vectors, nowhere, jnp.zeros((slots,), bool))
+    # Arrays of their own: a step consumes the buffers of its state.
+    return jax.tree.map(jnp.array, ReservoirStore(nowhere, nothing, points))
+
+
+def _keys(points: SurfacePoints, index: RayIndex | None) -> Int[Array, " N"]:
+    """Name place and lane of every point; -1 where it has no place."""
+    places = points.faces if index is None else index.places(points.positions, points.faces)
+    lanes = jnp.arange(places.shape[0], dtype=jnp.int32) % _LANES
+    return jnp.where(places < 0, -1, places * _LANES + lanes)
+
+
+def _slots(keys: Int[Array, " N"], count: int) -> Int[Array, " N"]:
+    """Spread keys over the slots."""
+    mixed = keys * _SCATTER
+    return ((mixed ^ (mixed >> 15)) & 0x7FFFFFFF) % count
+
+
+def _brightness(light: EnvLight, directions: Float[Array, "... 3"]) -> Float[Array, "..."]:
+    """Brightness of the sky in directions, never 0 unless the whole sky is black."""
+    found = luminance(lookup(light.radiance, directions.reshape(-1, 3)))
+    floor = _DIMMEST * jnp.mean(luminance(light.radiance))
+    return jnp.maximum(found, floor).reshape(directions.shape[:-1])
+
+
+def _chosen(
+    uniforms: Float[Array, "R n"], weights: Float[Array, "K R n"]
+) -> tuple[Int[Array, "R n"], Float[Array, "R n"]]:
+    """Choose one of K in proportion to its weight; also return the sum of the weights."""
+    through = jnp.cumsum(weights, axis=0)
+    total = through[-1]
+    choice = jnp.sum((through <= (uniforms * total)[None]).astype(jnp.int32), axis=0)
+    return jnp.minimum(choice, weights.shape[0] - 1), total
+
+
+def _take(values: Array, choice: Int[Array, "R n"]) -> Array:
+    """Take the chosen one of K."""
+    choice = choice.reshape(1, *choice.shape, *[1] * (values.ndim - choice.ndim - 1))
+    return jnp.take_along_axis(values, choice, axis=0)[0]
+
+
+def _cosine(normals: Float[Array, "n 3"], directions: Float[Array, "R n 3"]) -> Array:
+    return jnp.maximum(jnp.sum(normals[None] * directions, axis=-1), 0.0)
+
+
+def _own(
+    points: SurfacePoints,
+    offsets: Float[Array, "n 2"],
+    uniforms: Float[Array, "n R"],
+    light: EnvLight,
+    sampler: LightSampler,
+    spec: ReservoirSettings,
+) -> tuple[Array, Array]:
+    """Choose from a step's own candidates: directions (R, n, 3) and weights (R, n)."""
+    count, dtype = uniforms.shape[1], points.normals.dtype
+    numbers = low_discrepancy(offsets, count * spec.candidates, dtype)
+    drawn, density = sample_light(sampler, numbers.reshape(-1, 2))
+    # Candidates of one reservoir lie as far apart as those of all.
+    shape = (spec.candidates, count, points.normals.shape[0])
+    drawn, density = drawn.reshape(*shape, 3), density.reshape(shape)
+    cosine = jnp.maximum(jnp.sum(points.normals[None, None] * drawn, axis=-1), 0.0)
+    target = _brightness(light, drawn) * cosine
+    choice, total = _chosen(uniforms.T, target / (spec.candidates * density))
+    weight = safe_divide(total, _take(target, choice))
+    return _take(drawn, choice), weight
+
+
+class _Source(eqx.Module):
+    """A reservoir that is offered to n points: (R, n, 3), (R, n), (n,) and where it comes from."""
+
+    directions: Float[Array, "R n 3"]
+    weights: Float[Array, "R n"]
+    confidences: Float[Array, " n"]
+    points: SurfacePoints
+
+
+def _is_open(
+    source: _Source, directions: Float[Array, "R n 3"], index: RayIndex | None
+) -> Bool[Array, "R n"]:
+    """Trace directions from where a source comes from."""
+    return cast(source.points, directions, index) == OPEN
+
+
+def _balance(parts: list[Array], j: int) -> Array:
+    """Share of source j by the balance heuristic."""
+    return safe_divide(parts[j], jnp.sum(jnp.stack(parts), axis=0))
+
+
+def _joined(
+    sources: list[_Source],
+    uniforms: Float[Array, "R n"],
+    light: EnvLight,
+    index: RayIndex | None,
+    *,
+    traces: bool,
+) -> _Source:
+    """Choose one of several reservoirs, of which the first is the points' own."""
+    brightness = [_brightness(light, source.directions) for source in sources]
+
+    def target(at: _Source, k: int, j: int) -> Array:
+        """Target at source k of the sample of source j."""
+        value = brightness[j] * _cosine(at.points.normals, sources[j].directions)
+        if traces and k != j:
+            value = jnp.where(_is_open(at, sources[j].directions, index), value, 0.0)
+        return value
+
+    own, weights = sources[0], []
+    for j, source in enumerate(sources):
+        values = [target(at, k, j) for k, at in enumerate(sources)]
+        parts = [at.confidences[None] * x for at, x in zip(sources, values, strict=True)]
+        weights.append(_balance(parts, j) * values[0] * source.weights)
+    choice, total = _chosen(uniforms, jnp.stack(weights))
+    directions = _take(jnp.stack([source.directions for source in sources]), choice)
+    chosen = _take(jnp.stack(brightness), choice) * _cosine(own.points.normals, directions)
+    confidences = jnp.sum(jnp.stack([source.confidences for source in sources]), axis=0)
+    return _Source(directions, safe_divide(total, chosen), confidences, own.points)
+
+
+def _offered(
+    taken: Reservoirs,
+    origin: SurfacePoints,
+    points: SurfacePoints,
+    is_there: Bool[Array, " N"],
+    reach: Float[Array, ""],
+    spec: ReservoirSettings,
+) -> tuple[Reservoirs, SurfacePoints]:
+    """Take what was kept elsewhere where that is near and alike; nothing elsewhere."""
+    offset = origin.positions - points.positions
+    is_near = jnp.sum(jnp.square(offset), axis=-1) <= jnp.square(reach)
+    alike = jnp.sum(origin.normals * points.normals, axis=-1) >= spec.smallest_cosine
+    is_good = is_there & is_near & alike & origin.mask & points.mask
+    confidences = jnp.where(is_good, taken.confidences, 0.0)
+    weights = jnp.where(is_good[:, None], taken.weights, 0.0)
+    return Reservoirs(taken.directions, weights, confidences), origin
+
+
+def _source(reservoirs: Reservoirs, points: SurfacePoints) -> _Source:
+    directions = jnp.moveaxis(reservoirs.directions, 1, 0)
+    return _Source(directions, reservoirs.weights.T, reservoirs.confidences, points)
+
+
+def _rows(values: Any, rows: Int[Array, " N"]) -> Any:
+    return jax.tree.map(lambda x: x.at[rows].get(mode="clip"), values)
+
+
+def _recalled(
+    store: ReservoirStore,
+    points: SurfacePoints,
+    index: RayIndex | None,
+    reach: Float[Array, ""],
+    spec: ReservoirSettings,
+) -> tuple[Reservoirs, SurfacePoints]:
+    """Look up what the points' places kept."""
+    keys = _keys(points, index)
+    slot = _slots(keys, spec.slots)
+    taken, origin = _rows((store.reservoirs, store.points), slot)
+    is_there = (keys >= 0) & (store.keys[slot] == keys)
+    most = spec.confidence * spec.candidates
+    taken = Reservoirs(taken.directions, taken.weights, jnp.minimum(taken.confidences, most))
+    return _offered(taken, origin, points, is_there, reach, spec)
+
+
+def _beside(
+    key: Key[Array, ""], points: SurfacePoints, index: RayIndex | None, count: int
+) -> list[Int[Array, " N"]]:
+    """Name other points of the same place or the next one, ``count`` for each; -1 for none."""
+    places = points.faces if index is None else index.places(points.positions, points.faces)
+    size = places.shape[0]
+    last = jnp.iinfo(jnp.int32).max
+    order = jnp.argsort(jnp.where(points.mask & (places >= 0), places, last)).astype(jnp.int32)
+    rank = jnp.zeros((size,), jnp.int32).at[order].set(jnp.arange(size, dtype=jnp.int32))
+    steps = jax.random.randint(key, (count, size), 1, _NEIGHBORHOOD + 1, jnp.int32)
+    signs = jax.random.bernoulli(jax.random.fold_in(key, 1), 0.5, (count, size))
+    place = rank[None] + jnp.where(signs, steps, -steps)
+    is_inside = (place >= 0) & (place < size)
+    rows = order.at[jnp.clip(place, 0, size - 1)].get(mode="promise_in_bounds")
+    return list(jnp.where(is_inside, rows, -1))
+
+
+def resample(
+    key: Key[Array, ""],
+    points: SurfacePoints,
+    light: EnvLight,
+    sampler: LightSampler,
+    index: RayIndex | None,
+    store: ReservoirStore | None,
+    *,
+    spec: ReservoirSettings,
+    count: int,
+) -> Reservoirs:
+    """Choose ``count`` directions towards the light for each of N points; no gradients.
+
+    Parameters
+    ----------
+    key : of all random numbers.
+    points, light, sampler, index : who looks for light, the environment, its tables, the surface.
+    store : what the step before left; None for nothing.
+    spec : static; with at least one candidate. count : static.
+    """
+    points, light, sampler = jax.lax.stop_gradient((points, light, sampler))
+    size, traces = points.normals.shape[0], spec.visibility == "traced"
+    keys = jax.random.split(key, 4)
+    offsets = jax.random.uniform(keys[0], (size, 2), jnp.float32)
+    dtype = points.normals.dtype
+    uniforms = [jax.random.uniform(k, (size, count), jnp.float32).astype(dtype) for k in keys[1:3]]
+    reach = jnp.asarray(jnp.inf, dtype) if index is None else index.place_size.astype(dtype)
+    recalled = None
+    if store is not None and spec.reuse_steps:
+        recalled = _recalled(jax.lax.stop_gradient(store), points, index, reach, spec)
+
+    def one_chunk(parts: tuple) -> Reservoirs:
+        points, offsets, uniforms, recalled = parts
+        directions, weights = _own(points, offsets, uniforms[0], light, sampler, spec)
+        confidences = jnp.full(points.faces.shape, float(spec.candidates), dtype)
+        found = _Source(directions, weights, confidences, points)
+        if traces:
+            is_open = _is_open(found, directions, index)
+            found = _Source(directions, jnp.where(is_open, weights, 0.0), confidences, points)
+        if recalled is not None:
+            sources = [found, _source(*recalled)]
+            found = _joined(sources, uniforms[1].T, light, index, traces=traces)
+        return Reservoirs(jnp.moveaxis(found.directions, 0, 1), found.weights.T, found.confidences)
+
+    def in_all(function: Any, arguments: Any, samples: int) -> Reservoirs:
+        return in_chunks(function, arguments, points.mask, samples, has_gradient=False)
+
+    found = in_all(one_chunk, (points, offsets, uniforms, recalled), count * spec.candidates)
+    if not spec.neighbors:
+        return found
+    numbers = jax.random.uniform(jax.random.fold_in(keys[3], 1), (size, count), jnp.float32)
+    others = [
+        _offered(*_rows((found, points), rows), points, rows >= 0, 2 * reach, spec)
+        for rows in _beside(keys[3], points, index, spec.neighbors)
+    ]
+
+    def with_neighbors(parts: tuple) -> Reservoirs:
+        points, found, others, numbers = parts
+        sources = [_source(found, points), *(_source(*other) for other in others)]
+        joined = _joined(sources, numbers.T, light, index, traces=traces)
+        directions = jnp.moveaxis(joined.directions, 0, 1)
+        return Reservoirs(directions, joined.weights.T, joined.confidences)
+
+    arguments = (points, found, others, numbers.astype(dtype))
+    return in_all(with_neighbors, arguments, count * (spec.neighbors + 1) ** 2)
+
+
+def kept(
+    store: ReservoirStore,
+    points: SurfacePoints,
+    reservoirs: Reservoirs,
+    hits: Int[Array, "N R"],
+    index: RayIndex | None,
+    *,
+    spec: ReservoirSettings,
+) -> ReservoirStore:
+    """Put a step's reservoirs into the store; slots that no point of the mask claims stay.
+
+    ``hits`` : of the reservoirs' directions, see `sampling.Samples`.
+    """
+    points, reservoirs = jax.lax.stop_gradient((points, reservoirs))
+    if spec.visibility != "ignored":
+        weights = jnp.where(hits == OPEN, reservoirs.weights, 0.0)
+        reservoirs = Reservoirs(reservoirs.directions, weights, reservoirs.confidences)
+    keys = _keys(points, index)
+    size = keys.shape[0]
+    slot = jnp.where((keys >= 0) & points.mask, _slots(keys, spec.slots), spec.slots)
+    row = jnp.full((spec.slots,), -1, jnp.int32)
+    row = row.at[slot].max(jnp.arange(size, dtype=jnp.int32), mode="drop")
+    fresh = _rows(ReservoirStore(keys, reservoirs, points), row)
+
+    def chosen(new: Array, old: Array) -> Array:
+        is_new = (row >= 0).reshape(-1, *[1] * (new.ndim - 1))
+        return jnp.where(is_new, new, old).astype(old.dtype)
+
+    return jax.tree.map(chosen, fresh, store)

@@ -1,0 +1,264 @@
+"""Paths over several surfaces: closed forms between two plates, and what is differentiated."""
+
+from dataclasses import replace
+from typing import Annotated
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import tiny_config
+
+from geosplat_jax.core.settings import ANY_KIND, from_plain, settings, to_plain
+from geosplat_jax.core.types import EnvLight, Materials, SurfacePoints
+from geosplat_jax.materials import Attributes
+from geosplat_jax.rays.base import RayIndex
+from geosplat_jax.transport import bsdf
+from geosplat_jax.transport.base import TransportSettings
+from geosplat_jax.transport.environment import LightSpec
+from geosplat_jax.transport.light_sampling import light_sampler
+from geosplat_jax.transport.paths import FaceTable, PathSettings, PathTracer, face_table
+from geosplat_jax.transport.sampling import OPEN
+
+COVER = 0.6  # share of the upper plate that is there
+ALBEDO = 0.7
+POINTS, RAYS = 64, 256
+STANDARD_ERRORS = 4.5  # chance: 7 in a million, a comparison
+
+
+class Plates(RayIndex):
+    """Two endless plates a unit apart, of which the upper one has small holes everywhere.
+
+    Face 0 is the floor, seen from above, face 1 the ceiling, seen from below.
+    """
+
+    usage: dict = eqx.field(default_factory=dict)
+
+    @property
+    def face_capacity(self):
+        return 2
+
+    def nearest(self, origins, directions, source, mask, *, two_sided=False):
+        height = directions[:, 2]
+        distance = 1.0 / jnp.maximum(jnp.abs(height), 1e-3)
+        place = origins[:, :2] + distance[:, None] * directions[:, :2]
+        noise = jnp.sin(place[:, 0] * 1271.3 + place[:, 1] * 3117.7) * 43758.5453
+        is_there = (noise - jnp.floor(noise) < COVER) | (height < 0)
+        face = jnp.where(height > 0, 1, 0).astype(jnp.int32)
+        is_hit = mask & is_there
+        return jnp.where(is_hit, distance, jnp.inf), jnp.where(is_hit, face, -1)
+
+    def occluded(self, origins, directions, source, mask, *, two_sided=False):
+        return self.nearest(origins, directions, source, mask)[1] >= 0
+
+
+def plate_points(count=POINTS, seed=0):
+    """Points of the floor, and a last one of the ceiling."""
+    places = np.random.default_rng(seed).uniform(-3, 3, (count, 3))
+    places[:, 2], places[-1, 2] = 0, 1
+    normals = np.tile([0.0, 0, 1], (count, 1))
+    normals[-1] *= -1
+    faces = np.zeros(count, np.int32)
+    faces[-1] = 1
+    vectors = (jnp.asarray(x, jnp.float32) for x in (places, normals, normals))
+    return SurfacePoints(*vectors, jnp.asarray(faces), jnp.ones(count, bool))
+
+
+def one_material(count, albedo=ALBEDO):
+    return Materials(jnp.full((count, 3), albedo), jnp.full(count, 0.5), jnp.zeros(count))
+
+
+def expected(vertices, albedo=ALBEDO):
+    """Radiance that leaves the ceiling and the floor after so many vertices, in a white sky."""
+    ceiling = floor = 0.0
+    for _ in range(vertices):
+        ceiling, floor = albedo * floor, albedo * (1 - COVER + COVER * ceiling)
+    return ceiling, floor
+
+
+def ceiling_hits(seed=1):
+    """Rays from the floor to the ceiling: directions, hits and distances."""
+    rng = np.random.default_rng(seed)
+    wi = rng.normal(size=(POINTS, RAYS, 3))
+    wi[..., 2] = np.abs(wi[..., 2]) + 0.2
+    wi /= np.linalg.norm(wi, axis=-1, keepdims=True)
+    hits = np.where(rng.uniform(size=wi.shape[:2]) < 0.8, 1, OPEN)
+    arrays = (wi, 1 / wi[..., 2])
+    wi, distances = (jnp.asarray(x, jnp.float32) for x in arrays)
+    return wi, jnp.asarray(hits, jnp.int32), distances
+
+
+def white_sky(height=4):
+    return EnvLight(jnp.ones((height, 2 * height, 3)))
+
+
+def tracer(vertices, light=None, gradient="light", albedo=ALBEDO):
+    light = white_sky() if light is None else light
+    points = plate_points()
+    table = face_table(points, one_material(POINTS, albedo), 2)
+    sampler = light_sampler(light)
+    return PathTracer(jax.random.key(3), table, light, sampler, Plates(), vertices, gradient)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def matt():
+    """Leave out the coat, which no closed form knows."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bsdf, "evaluate", lambda *args: bsdf.evaluate_lobes(*args)[0])
+        yield
+
+
+@pytest.fixture(scope="module")
+def paths():
+    """Legs of paths of three vertices that begin at the floor, and where they came from."""
+    wo, _, _ = (x.reshape(-1, *x.shape[2:]) for x in ceiling_hits())
+    starts = jnp.repeat(plate_points().positions, RAYS, axis=0)
+    faces, real = jnp.zeros(len(wo), jnp.int32), jnp.ones(len(wo), bool)
+    draw = jax.jit(lambda tracer: tracer.draw(starts, faces, wo, real))
+    return draw(tracer(3)), wo, real
+
+
+@pytest.fixture(scope="module")
+def radiance(paths):
+    """What paths bring by their number of vertices."""
+    legs, wo, real = paths
+    run = jax.jit(lambda tracer: [tracer.evaluate(legs[:k], wo, real) for k in (1, 3)])
+    return dict(zip((1, 3), map(np.asarray, run(tracer(3))), strict=True))
+
+
+@pytest.mark.parametrize("vertices", [1, 3])
+def test_light_between_plates_is_the_partial_sum_of_its_bounces(radiance, vertices):
+    values = radiance[vertices][:, 1]
+    error = values.std() / np.sqrt(len(values))
+    assert error < 0.005
+    assert abs(values.mean() - expected(vertices)[1]) <= STANDARD_ERRORS * error
+    if vertices == 3:
+        for wrong in (expected(1)[1], expected(5)[1], expected(3, 0.95 * ALBEDO)[1]):
+            assert abs(values.mean() - wrong) > STANDARD_ERRORS * error
+
+
+def test_the_error_falls_as_the_root_of_the_number_of_paths(radiance):
+    values = radiance[3][:, 1]
+
+    def spread(size):
+        groups = values[: len(values) // size * size].reshape(-1, size)
+        return np.sqrt(np.mean((groups.mean(axis=1) - values.mean()) ** 2))
+
+    assert spread(8) / spread(128) == pytest.approx(4.0, rel=0.2)
+
+
+def test_white_plates_send_out_no_more_than_they_receive(paths):
+    legs, wo, real = paths
+    found = jax.jit(lambda tracer: tracer.evaluate(legs, wo, real))(tracer(3, albedo=1.0))
+    assert 0.3 < float(jnp.mean(found)) < 1.0
+
+
+def test_only_rays_that_hit_go_on_and_each_gets_its_own_light():
+    """Every ray that hits the ceiling brings light, the others none; the floor is black."""
+    wi, hits, distances = ceiling_hits()
+    one = tracer(2)
+    brought = jax.jit(lambda tracer: tracer.followed(plate_points(), wi, hits, distances).values)
+    found = np.asarray(brought(one))
+    is_hit = np.asarray(hits) >= 0
+    np.testing.assert_array_equal(found[~is_hit], 0.0)
+    values = found[is_hit][:, 1]
+    error = values.std() / np.sqrt(len(values))
+    assert abs(values.mean() - expected(2)[0]) <= STANDARD_ERRORS * error
+    with pytest.raises(ValueError, match="nearest hits"):
+        one.followed(plate_points(), wi, hits, None)
+
+
+def test_what_is_differentiated_at_later_vertices_is_a_setting(paths):
+    legs, wo, real = paths
+    base = tracer(1)
+
+    def total(inputs, gradient):
+        table, light = inputs
+        one = replace(base, table=table, light=light, gradient=gradient)
+        return jnp.sum(one.evaluate(legs[:1], wo, real))
+
+    run = jax.jit(jax.value_and_grad(total), static_argnums=1)
+    inputs = (base.table, base.light)
+    for gradient, moves_light, moves_table in (
+        ("none", False, False),
+        ("light", True, False),
+        ("all", True, True),
+    ):
+        value, (by_table, by_light) = run(inputs, gradient)
+        assert float(value) != 0.0
+        # Linear in the light, and in the albedo of a single vertex.
+        parts = (
+            (by_light.radiance * base.light.radiance, moves_light),
+            (by_table.materials.albedo * base.table.materials.albedo, moves_table),
+        )
+        for part, moves in parts:
+            assert float(jnp.sum(part)) == pytest.approx(float(value) if moves else 0.0, rel=1e-4)
+        assert bool(jnp.any(by_table.normals != 0)) == moves_table
+
+
+def test_a_face_is_the_mean_of_its_points_and_black_without_any():
+    rng = np.random.default_rng(5)
+    count, faces = 20, np.array([0, 2, 2, 0, -1, 3] * 3 + [2, 0], np.int32)
+    albedo = rng.uniform(size=(count, 3)).astype(np.float32)
+    metallic = rng.uniform(size=count).astype(np.float32)
+    normals = rng.normal(size=(count, 3)) + [0, 0, 4]
+    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+    mask = rng.uniform(size=count) < 0.7
+    points = SurfacePoints(
+        jnp.zeros((count, 3)),
+        jnp.asarray(normals),
+        jnp.asarray(normals),
+        jnp.asarray(faces),
+        jnp.asarray(mask),
+    )
+    materials = Materials(jnp.asarray(albedo), jnp.full(count, 0.4), jnp.asarray(metallic))
+    table = jax.jit(face_table, static_argnums=2)(points, materials, 5)
+    assert isinstance(table, FaceTable)
+    for face in (0, 2, 3):
+        own = (faces == face) & mask
+        assert own.any()
+        np.testing.assert_allclose(table.materials.albedo[face], albedo[own].mean(0), rtol=1e-5)
+        np.testing.assert_allclose(table.materials.metallic[face], metallic[own].mean(), rtol=1e-5)
+        mean = normals[own].mean(0)
+        np.testing.assert_allclose(table.normals[face], mean / np.linalg.norm(mean), rtol=1e-5)
+    for face in (1, 4):
+        for values in jax.tree.leaves(table):
+            np.testing.assert_array_equal(values[face], 0.0)
+
+
+def test_settings_name_what_they_refuse_and_survive_json():
+    @settings
+    class Holder:
+        transport: Annotated[TransportSettings, ANY_KIND]
+
+    for values, message in [
+        ({"bounce_count": 1}, "bounce_count"),
+        ({"later_gradient": "some"}, "later_gradient"),
+        ({"light_count": 0, "diffuse_count": 0}, "at least one sample"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            PathSettings(**values)
+    chosen = PathSettings(bounce_count=5, later_gradient="all", light_count=3)
+    assert from_plain(Holder, to_plain(Holder(chosen))).transport == chosen
+
+
+def test_a_stage_chooses_paths_and_they_say_what_they_need():
+    config = tiny_config(
+        "stages.monte_carlo.transport.kind=paths",
+        "stages.monte_carlo.transport.bounce_count=3",
+    )
+    found = config.stage("monte_carlo").transport
+    assert found == PathSettings(bounce_count=3)
+    transport = found.build(LightSpec())
+    assert transport.needs_key
+    assert transport.uses_rays
+    assert transport.needs_every_point
+    images = transport.for_images(7).settings
+    assert (images.light_count, images.bounce_count, images.later_gradient) == (7, 3, "none")
+    residual = transport.for_residual()
+    assert (residual.settings.specular_count, residual.settings.bounce_count) == (2, 3)
+    assert replace(found, residual_count=0).build(LightSpec()).for_residual() is None
+    attributes = Attributes(one_material(POINTS), None, None)
+    with pytest.raises(ValueError, match="key"):
+        transport.prepare(None, plate_points(), attributes, white_sky(), Plates())

@@ -1,0 +1,271 @@
+"""Reservoirs: their mean equals brute force with every kind of reuse, and faults show."""
+
+from dataclasses import replace
+from functools import lru_cache, partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import MONTE_CARLO as TRAINED
+from support import sphere_dataset, tiny_config
+
+from geosplat_jax.core.types import EnvLight, Materials, SurfacePoints
+from geosplat_jax.fit.train import fit
+from geosplat_jax.materials import Attributes
+from geosplat_jax.rays.base import RayIndex
+from geosplat_jax.transport import reservoirs
+from geosplat_jax.transport.environment import LightSpec, light_directions, texel_solid_angles
+from geosplat_jax.transport.light_sampling import light_sampler
+from geosplat_jax.transport.monte_carlo import MonteCarloSettings
+from geosplat_jax.transport.reservoirs import ReservoirSettings, empty_store, kept, resample
+from geosplat_jax.transport.sampling import OPEN, cast
+
+KINDS, COPIES, COUNT = 4, 3000, 2
+POINTS = KINDS * COPIES
+STEPS, GROUPS = 4, 100  # copies of a group may share samples, groups hardly
+STANDARD_ERRORS = 5.0  # chance: 6 in ten million, a comparison
+ROWS = 4
+
+# Normals of four points that share a place, up to 80 degrees apart, and where they stand.
+NORMALS = np.array([[0, 0, 1], [0.64, 0, 0.77], [-0.64, 0, 0.77], [0, 0.5, 0.866]])
+PLACES = np.array([0.0, 0.35, -0.35, 0.1])
+
+
+class Wall(RayIndex):
+    """Directions whose x exceeds that of their start are blocked; places are chosen by hand."""
+
+    usage: dict = eqx.field(default_factory=dict)
+
+    @property
+    def face_capacity(self):
+        return POINTS
+
+    @property
+    def place_size(self):
+        return jnp.float32(2.0)
+
+    def places(self, positions, faces):
+        return faces // KINDS
+
+    def nearest(self, origins, directions, source, mask, *, two_sided=False):
+        is_hit = self.occluded(origins, directions, source, mask)
+        return jnp.where(is_hit, 1.0, jnp.inf), jnp.where(is_hit, 0, -1)
+
+    def occluded(self, origins, directions, source, mask, *, two_sided=False):
+        return mask & (directions[:, 0] > origins[:, 0])
+
+
+def scene():
+    """Copies of four points, side by side, whose faces never block."""
+    normals = NORMALS / np.linalg.norm(NORMALS, axis=1, keepdims=True)
+    positions = np.zeros((KINDS, 3))
+    positions[:, 0] = PLACES
+    tiled = [np.tile(x, (COPIES, 1)) for x in (positions, normals)]
+    positions, normals = (jnp.asarray(x, jnp.float32) for x in tiled)
+    faces = jnp.arange(POINTS, dtype=jnp.int32)
+    return SurfacePoints(positions, normals, normals, faces, jnp.ones(POINTS, bool))
+
+
+def sky():
+    """A dim map with some bright texels."""
+    texels = np.random.default_rng(3).uniform(0, 1, (ROWS, 2 * ROWS, 3))
+    return EnvLight(jnp.asarray(0.2 + 3 * texels**4, jnp.float32))
+
+
+@lru_cache
+def truth():
+    """Irradiance / pi in green by brute force: texels cut in 40 x 40, bilinear between centres."""
+    fine = 40 * ROWS
+    directions = np.asarray(light_directions(fine, 2 * fine), float).reshape(-1, 3)
+    share = np.asarray(texel_solid_angles(fine, 2 * fine), float)
+    share = np.broadcast_to(share, (fine, 2 * fine)).reshape(-1)
+    radiance = reservoirs.lookup(sky().radiance, jnp.asarray(directions, jnp.float32))
+    green = np.asarray(radiance, float)[:, 1]
+    points = scene()
+    found = []
+    for normal, position in zip(points.normals[:KINDS], points.positions[:KINDS], strict=True):
+        cosine = np.maximum(directions @ np.asarray(normal, float), 0)
+        is_open = directions[:, 0] <= float(position[0])
+        found.append(np.sum(green * cosine * is_open * share) / np.pi)
+    return np.array(found)
+
+
+@partial(jax.jit, static_argnames=("spec",))
+def one_step(key, store, spec):
+    """Estimates (points,) of one step, and what it leaves."""
+    points, light, index = scene(), sky(), Wall()
+    sampler = light_sampler(light)
+    found = resample(key, points, light, sampler, index, store, spec=spec, count=COUNT)
+    hits = cast(points, jnp.moveaxis(found.directions, 1, 0), index).T
+    if store is not None:
+        store = kept(store, points, found, hits, index, spec=spec)
+    radiance = reservoirs.lookup(light.radiance, found.directions.reshape(-1, 3))[:, 1]
+    cosine = jnp.sum(points.normals[:, None] * found.directions, axis=-1)
+    value = radiance.reshape(POINTS, COUNT) * jnp.maximum(cosine, 0.0) * found.weights
+    return jnp.mean(jnp.where(hits == OPEN, value, 0.0), axis=1) / jnp.pi, store
+
+
+def errors(spec, seed=0):
+    """Return bias of the kinds after some steps, and its standard error, relative to the truth."""
+    store = empty_store(spec, COUNT) if spec.reuse_steps else None
+    for step in range(STEPS):
+        key = jax.random.fold_in(jax.random.key(seed), step)
+        found, store = one_step(key, store, spec)
+    found = np.asarray(found, float).reshape(GROUPS, -1, KINDS).mean(axis=1)
+    expected = truth()
+    error = found.std(axis=0) / np.sqrt(GROUPS)
+    return (found.mean(axis=0) - expected) / expected, error / expected
+
+
+PLAIN = ReservoirSettings(candidates=4, slots=32_768)
+REUSE = {
+    "candidates alone": PLAIN,
+    "steps": replace(PLAIN, reuse_steps=True),
+    "steps and neighbours": replace(PLAIN, reuse_steps=True, neighbors=2),
+    "both, shadows traced": replace(PLAIN, reuse_steps=True, neighbors=1, visibility="traced"),
+}
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        pytest.param("candidates alone", marks=pytest.mark.slow),
+        pytest.param("steps", marks=pytest.mark.slow),
+        "steps and neighbours",
+        pytest.param("both, shadows traced", marks=pytest.mark.slow),
+    ],
+)
+def test_the_mean_over_seeds_is_brute_force(how):
+    bias, error = errors(REUSE[how])
+    assert np.all(error < 0.03)
+    assert np.all(np.abs(bias) <= STANDARD_ERRORS * error), (bias, error)
+
+
+@pytest.mark.slow
+def test_assumed_visibility_is_biased_as_it_says():
+    spec = replace(PLAIN, reuse_steps=True, neighbors=2, visibility="assumed")
+    bias, error = errors(spec)
+    assert np.min(bias / error) < -2 * STANDARD_ERRORS, (bias, error)
+
+
+@pytest.mark.parametrize("fault", ["shares by confidence alone", "wrong number of candidates"])
+def test_a_fault_shows(monkeypatch, fault):
+    jax.clear_caches()
+    if fault == "shares by confidence alone":
+        equal = lambda parts, j: jnp.full_like(parts[j], 1 / len(parts))  # noqa: E731
+        monkeypatch.setattr(reservoirs, "_balance", equal)
+        spec = REUSE["steps and neighbours"]
+    else:
+        own = reservoirs._own
+
+        def faulty(*args):
+            directions, weights = own(*args)
+            return directions, weights * (PLAIN.candidates / (PLAIN.candidates - 1))
+
+        monkeypatch.setattr(reservoirs, "_own", faulty)
+        spec = PLAIN
+    bias, error = errors(spec)
+    jax.clear_caches()
+    assert np.max(np.abs(bias) / error) > 2 * STANDARD_ERRORS, (bias, error)
+
+
+MONTE_CARLO = MonteCarloSettings(
+    light_count=2, diffuse_count=2, specular_count=2, indirect="constant"
+)
+
+
+@partial(jax.jit, static_argnames=("settings",))
+def shaded(key, carry, settings):
+    """Diffuse light, specular colour and carry of one step of a whole transport."""
+    points, transport = scene(), settings.build(LightSpec())
+    materials = Materials(jnp.full((POINTS, 3), 0.5), jnp.full(POINTS, 0.6), jnp.ones(POINTS))
+    # Blocked directions bring the logistic function of -1, of 0 less 3 by default.
+    attributes = Attributes(materials, None, jnp.full((POINTS, 6), 2.0))
+    first, second = jax.random.split(key)
+    prepared, carry = transport.prepare(first, points, attributes, sky(), Wall(), carry)
+    wo = points.normals
+    found = transport.shade(second, points, attributes, wo, prepared, Wall())
+    return found.diffuse_light, found.specular, carry
+
+
+@pytest.mark.slow
+def test_blocked_directions_are_counted_once_when_reservoirs_leave_them_out():
+    """Both lobes, with light from blocked directions, agree with plain samples on average."""
+    reuse = replace(REUSE["both, shadows traced"], neighbors=0)
+    reused = replace(MONTE_CARLO, reservoirs=reuse)
+    plain = shaded(jax.random.key(5), None, MONTE_CARLO)[:2]
+    carry = reused.build(LightSpec()).first_carry()
+    for step in range(3):
+        *found, carry = shaded(jax.random.key(step), carry, reused)
+    for one, other in zip(plain, found, strict=True):
+        one, other = (
+            np.asarray(x, float)[:, 1].reshape(GROUPS, -1, KINDS).mean(axis=1) for x in (one, other)
+        )
+        error = np.sqrt((one.var(axis=0) + other.var(axis=0)) / GROUPS)
+        assert np.all(error < 0.02 * one.mean(axis=0))
+        assert np.all(np.abs(one.mean(axis=0) - other.mean(axis=0)) < STANDARD_ERRORS * error)
+
+
+def test_what_a_place_kept_is_used_only_nearby_and_on_a_surface_of_that_direction():
+    """And counts at most half as much as the step's own four candidates, as the setting says."""
+    spec = replace(REUSE["steps"], candidates=4, confidence=0.5)
+    points, light, index = scene(), sky(), Wall()
+    store = empty_store(spec, COUNT)
+    how = {"spec": spec, "count": COUNT}
+    run = jax.jit(
+        lambda key, points, store: resample(
+            key, points, light, light_sampler(light), index, store, **how
+        )
+    )
+    first = run(jax.random.key(0), points, store)
+    np.testing.assert_array_equal(first.confidences, 4.0)
+    hits = jnp.full((POINTS, COUNT), OPEN, jnp.int32)
+    store = jax.jit(partial(kept, spec=spec))(store, points, first, hits, index)
+    moved = replace(points, positions=points.positions.at[:, 1].add(1.0))
+    far = replace(points, positions=points.positions.at[:, 1].add(5.0))
+    turned = replace(points, normals=-points.normals)
+    for now, is_used in ((points, True), (moved, True), (far, False), (turned, False)):
+        found = np.asarray(run(jax.random.key(1), now, store).confidences)
+        # Lanes and collisions: some places lie in slots that others took.
+        assert (np.mean(found == 6.0) > 0.5) == is_used
+        assert set(np.unique(found)) <= ({4.0, 6.0} if is_used else {4.0})
+    # A step that sees no point leaves the store as it is.
+    unseen = replace(points, mask=jnp.zeros(POINTS, bool))
+    same = jax.jit(partial(kept, spec=spec))(store, unseen, first, hits, index)
+    for one, other in zip(jax.tree.leaves(store), jax.tree.leaves(same), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_settings_refuse_what_would_lose_light():
+    kept_open = ReservoirSettings(candidates=2, visibility="traced")
+    with pytest.raises(ValueError, match="raise diffuse_count and specular_count"):
+        MonteCarloSettings(diffuse_count=0, specular_count=0, reservoirs=kept_open)
+    assert MonteCarloSettings(reservoirs=PLAIN).build(LightSpec()).first_carry() is None
+    reused = MonteCarloSettings(reservoirs=REUSE["steps"], light_count=3).build(LightSpec())
+    assert reused.first_carry().reservoirs.directions.shape == (32_768, 3, 3)
+    assert reused.for_each_view().first_carry() is None
+    assert reused.for_images(4).settings.reservoirs == ReservoirSettings()
+
+
+@pytest.mark.slow
+def test_a_run_with_paths_and_reservoirs_resumes_bit_for_bit(tmp_path):
+    config = tiny_config(
+        *TRAINED,
+        "stages.split_sum.steps=0",
+        "stages.monte_carlo.transport.kind=paths",
+        "stages.monte_carlo.transport.reservoirs.candidates=3",
+        "stages.monte_carlo.transport.reservoirs.reuse_steps=true",
+        "stages.monte_carlo.transport.reservoirs.neighbors=1",
+        "stages.monte_carlo.transport.reservoirs.slots=512",
+        "run.checkpoint_every=1",
+    )
+    dataset = sphere_dataset(count=3, size=12)
+    whole = fit(dataset, config, tmp_path / "whole")
+    fit(dataset, config, tmp_path / "parts", stop_after=2)
+    parts = fit(dataset, config, tmp_path / "parts", resume=True)
+    assert float(jnp.max(whole.carry.reservoirs.confidences)) > 3
+    assert jax.tree.structure(whole) == jax.tree.structure(parts)
+    for one, other in zip(jax.tree.leaves(whole), jax.tree.leaves(parts), strict=True):
+        np.testing.assert_array_equal(np.asarray(one), np.asarray(other))
