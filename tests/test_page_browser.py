@@ -111,7 +111,7 @@ def test_the_page_works_in_a_browser(tmp_path):
     asking = html.replace("<head>", f"<head>{LISTEN}", 1).replace("</body>", f"{ASK}</body>")
     page = tmp_path / "asking.html"
     page.write_text(asking)
-    # Virtual time does not wait for the software that draws: on a busy machine some tries are early.
+    # Virtual time does not wait for what draws: on a busy machine some tries are early.
     for number in range(5):
         answer = asked([command, *FLAGS, f"--user-data-dir={tmp_path / str(number)}"], page)
         if answer is not None and answer["colors"] > 50:
