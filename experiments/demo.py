@@ -44,6 +44,7 @@ def main() -> None:
     evaluated.result()
     print(
         f"\nDone in {time.perf_counter() - began:.0f} s. Look at:\n"
+        f"  {folder / 'report.html'}  all of it as one page\n"
         f"  {folder / 'overview.png'}  test views: truth, render, normals, materials, mesh, light\n"
         f"  {folder / 'relight.png'}  the duck under two lights that are new, beside the truth\n"
         f"  {folder / 'materials.png'}  albedo, roughness, metallic, normals, beside the truth\n"

@@ -292,23 +292,24 @@ def decoded_normals(path, count=4000):
 
 def test_a_map_of_normals_gives_a_mesh_of_few_faces_the_look_of_the_fine_one(tmp_path):
     pytest.importorskip("fast_simplification", reason="fewer faces need fast-simplification")
-    directions, faces, _ = sphere(5)
+    directions, faces, _ = sphere(4)
     vertices, normals = bumpy(directions)
     path = tmp_path / "mesh.glb"
     info = export.export_mesh_glb(
         *(path, vertices, faces, normals, materials),
-        texture_size=512,
-        face_count=2500,
+        texture_size=256,
+        face_count=1000,
         obj_path=tmp_path / "mesh.obj",
     )
-    assert info["faces"] == pytest.approx(2500, rel=0.02)
+    assert info["faces"] == pytest.approx(1000, rel=0.02)
     points, shown, plain = decoded_normals(path)
     expected = bumpy(points)[1]
 
     def error(found):
         return np.degrees(np.arccos(np.clip((found * expected).sum(1), -1, 1)))
 
-    assert np.median(error(shown)) < 1.2
+    # Measured: .27 degrees with the map, 1.56 without.
+    assert np.median(error(shown)) < 0.6
     assert np.median(error(shown)) < 0.5 * np.median(error(plain))
     maps = (tmp_path / "mesh.mtl").read_text()
     assert "norm mesh_normal.png" in maps

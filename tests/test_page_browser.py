@@ -31,8 +31,8 @@ ASK = """<script>
 (async () => {
   const viewer = document.querySelector("model-viewer");
   const wait = (ms) => new Promise((done) => setTimeout(done, ms));
-  for (let n = 0; n < 200 && !viewer.loaded; n++) await wait(50);
-  await wait(500);
+  for (let n = 0; n < 1000 && !viewer.loaded; n++) await wait(100);
+  await wait(2000);
   const colors = async () => {
     const image = new Image();
     image.src = URL.createObjectURL(await viewer.toBlob());
@@ -86,6 +86,19 @@ def ball(points):
     return albedo, np.full(len(points), 0.4, np.float32), np.zeros(len(points), np.float32)
 
 
+def asked(command, page):
+    """Return what the page says of itself; None where the browser closed it before."""
+    printed = subprocess.run(
+        [*command, "--virtual-time-budget=60000", "--dump-dom", page.as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    ).stdout
+    found = re.search(r'<pre id="answer">(.*?)</pre>', printed, re.DOTALL)
+    return json.loads(found[1]) if found else None
+
+
 @pytest.mark.slow
 def test_the_page_works_in_a_browser(tmp_path):
     command = browser()
@@ -98,17 +111,12 @@ def test_the_page_works_in_a_browser(tmp_path):
     asking = html.replace("<head>", f"<head>{LISTEN}", 1).replace("</body>", f"{ASK}</body>")
     page = tmp_path / "asking.html"
     page.write_text(asking)
-    printed = subprocess.run(
-        [command, *FLAGS, f"--user-data-dir={tmp_path / 'user'}", "--virtual-time-budget=20000"]
-        + ["--dump-dom", page.as_uri()],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    ).stdout
-    found = re.search(r'<pre id="answer">(.*?)</pre>', printed, re.DOTALL)
-    assert found, "the page did not answer"
-    answer = json.loads(found[1])
+    # Virtual time does not wait for what draws: on a busy machine some tries are early.
+    for number in range(5):
+        answer = asked([command, *FLAGS, f"--user-data-dir={tmp_path / str(number)}"], page)
+        if answer is not None and answer["colors"] > 50:
+            break
+    assert answer is not None, "the page did not answer"
     assert answer["problems"] == []
     assert answer["loaded"]
     assert answer["colors"] > 50
