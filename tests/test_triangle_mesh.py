@@ -22,7 +22,7 @@ from geosplat_jax.surface.triangle_mesh import TriangleMesh, VertexOffsets, conn
 
 SMALL = (
     *(text for text in TINY if not text.startswith("geometry.")),
-    "geometry.edge_pixels=4",
+    "geometry.edge_pixels=2",
 )
 
 
