@@ -231,6 +231,7 @@ def draw(rows: list[Row], path: Path) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import NullFormatter
 
     figure, axes = plt.subplots(3, 3, figsize=(12, 9), squeeze=False)
     kinds = (
@@ -246,6 +247,7 @@ def draw(rows: list[Row], path: Path) -> None:
                 x, y = ([getattr(row, name) for row in own] for name in (across, up))
                 axis.loglog(x, y, "o-" if way == "plain" else ".-", label=way)
             axis.set_title(f"{scene}: error of the {title}")
+            axis.xaxis.set_minor_formatter(NullFormatter())
             unit = "processor seconds" if across == "seconds" else "rays of a point"
             axis.set_xlabel(f"{unit} of a step")
     axes[0][0].legend(fontsize=7)
