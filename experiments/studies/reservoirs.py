@@ -108,7 +108,9 @@ def _make_scene(
     """Build a scene with a point on every face; also return the buffers that it needs at least."""
     distances, light = SCENES[name]
     cell = 2.2 / resolution
-    grid = Grid(jnp.full((3,), -1.1), jnp.asarray(cell, jnp.float32), (resolution,) * 3)
+    grid = Grid(
+        jnp.full((3,), -1.1), jnp.asarray(cell, jnp.float32), (resolution, resolution, resolution)
+    )
     values = distances(np.asarray(grid_vertices(grid), np.float64)) / cell
     shape, model = initial_geometry(grid, jnp.asarray(values, jnp.float32)), FlexiCubes(grid)
 
