@@ -108,7 +108,9 @@ def _make_scene(
     """Build a scene with a point on every face; also return the buffers that it needs at least."""
     distances, light = SCENES[name]
     cell = 2.2 / resolution
-    grid = Grid(jnp.full((3,), -1.1), jnp.asarray(cell, jnp.float32), (resolution,) * 3)
+    grid = Grid(
+        jnp.full((3,), -1.1), jnp.asarray(cell, jnp.float32), (resolution, resolution, resolution)
+    )
     values = distances(np.asarray(grid_vertices(grid), np.float64)) / cell
     shape, model = initial_geometry(grid, jnp.asarray(values, jnp.float32)), FlexiCubes(grid)
 
@@ -231,6 +233,7 @@ def draw(rows: list[Row], path: Path) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import NullFormatter
 
     figure, axes = plt.subplots(3, 3, figsize=(12, 9), squeeze=False)
     kinds = (
@@ -246,6 +249,7 @@ def draw(rows: list[Row], path: Path) -> None:
                 x, y = ([getattr(row, name) for row in own] for name in (across, up))
                 axis.loglog(x, y, "o-" if way == "plain" else ".-", label=way)
             axis.set_title(f"{scene}: error of the {title}")
+            axis.xaxis.set_minor_formatter(NullFormatter())
             unit = "processor seconds" if across == "seconds" else "rays of a point"
             axis.set_xlabel(f"{unit} of a step")
     axes[0][0].legend(fontsize=7)

@@ -117,12 +117,12 @@ class ReservoirStore(eqx.Module):
 def empty_store(spec: ReservoirSettings, count: int) -> ReservoirStore:
     """Return a store without content for ``count`` samples of the light per point."""
     slots = spec.slots
-    vectors = [jnp.zeros((slots, 3)) for _ in range(3)]
+    vector = jnp.zeros((slots, 3))
     nowhere = jnp.full((slots,), -1, jnp.int32)
     nothing = Reservoirs(
         jnp.zeros((slots, count, 3)), jnp.zeros((slots, count)), jnp.zeros((slots,))
     )
-    points = SurfacePoints(*vectors, nowhere, jnp.zeros((slots,), bool))
+    points = SurfacePoints(vector, vector, vector, nowhere, jnp.zeros((slots,), bool))
     # Arrays of their own: a step consumes the buffers of its state.
     return jax.tree.map(jnp.array, ReservoirStore(nowhere, nothing, points))
 
@@ -353,7 +353,7 @@ def resample(
         return found
     numbers = jax.random.uniform(jax.random.fold_in(keys[3], 1), (size, count), jnp.float32)
     others = [
-        _offered(*_rows((found, points), rows), points, rows >= 0, 2 * reach, spec)
+        _offered(_rows(found, rows), _rows(points, rows), points, rows >= 0, 2 * reach, spec)
         for rows in _beside(keys[3], points, index, spec.neighbors)
     ]
 
