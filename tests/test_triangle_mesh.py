@@ -211,7 +211,8 @@ def test_a_run_starts_from_the_file_says_so_and_resumes_bit_for_bit(dataset, fil
     assert {line["faces"] for line in lines} == {80}
     assert {"term.laplacian", "term.normal_consistency"} <= set(lines[0])
     assert all(np.isfinite(line["loss"]) for line in lines)
-    assert 1e-4 < float(jnp.max(jnp.abs(whole.params.geometry.offsets))) < 5e-3
+    # Four steps of about the rate, in half extents.
+    assert 3e-3 < float(jnp.max(jnp.abs(whole.params.geometry.offsets))) < 2e-2
     record = json.loads((tmp_path / "whole/run.json").read_text())
     assert record["config"]["geometry"]["path"] == str(Path(files["ball"]).resolve())
     assert len(record["config"]["geometry"]["digest"]) == 16
