@@ -31,8 +31,8 @@ from geosplat_jax.io.start_mesh import digest_of, fitted, pixel_length
 from geosplat_jax.run import Run, train
 from geosplat_jax.surface.hull import fit_grid, hull_sdf
 
-POINTS = 50_000
-"""Points of either surface that distances are measured at."""
+POINTS, NEIGHBOURS = 50_000, 1_000_000
+"""Points of either surface that distances are measured at, and to which of the other."""
 MOST_FACES = 200_000
 HULL_CELLS = 64
 FROZEN = tuple(f"stages.{name}.rates.vertices=0" for name in ("split_sum", "monte_carlo"))
@@ -70,11 +70,16 @@ def hull_mesh(dataset: Dataset) -> trimesh.Trimesh:
 
 def chamfer(mesh: trimesh.Trimesh, truth: trimesh.Trimesh) -> float:
     """Mean distance of points of either surface to the other, per mille of the truth's size."""
-    one, two = (
-        np.asarray(trimesh.sample.sample_surface(m, POINTS, seed=0)[0]) for m in (mesh, truth)
-    )
-    there, back = cKDTree(two).query(one)[0], cKDTree(one).query(two)[0]
-    return 1e3 * 0.5 * float(np.mean(there) + np.mean(back)) / float(np.max(truth.extents))
+
+    def mean_distance(start: trimesh.Trimesh, end: trimesh.Trimesh) -> float:
+        points, others = (
+            np.asarray(trimesh.sample.sample_surface(mesh, count, seed=0)[0])
+            for mesh, count in ((start, POINTS), (end, NEIGHBOURS))
+        )
+        return float(np.mean(cKDTree(others).query(points)[0]))
+
+    size = float(np.max(truth.extents))
+    return 1e3 * 0.5 * (mean_distance(mesh, truth) + mean_distance(truth, mesh)) / size
 
 
 def train_or_open(dataset: Dataset, folder: Path, overrides: list[str], quality: str, mesh) -> Run:

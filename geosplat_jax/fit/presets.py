@@ -295,11 +295,14 @@ def _code(material_prior: str) -> Config:
     )
 
 
-_MESH_RATES = {"default": 3e-4, "paper": 1e-4, "code": 1e-4}
-"""Rates of the vertices, in half the longest side of the box."""
+_MESH_RATE = 0.3
+"""Rate of the vertices of a mesh, to that of the values of an isosurface (docs/meshes.md)."""
+
+_MESH_RATE_ORIGINAL = 1e-4
+"""The same in appendix H, in half the longest side of the box."""
 
 _MESH_WEIGHTS: dict[str, dict[str, float]] = {
-    "default": {"laplacian": 0.03, "normal_consistency": 0.01, "edge_length": 0.01, "offset": 0.0},
+    "default": {"laplacian": 0.3, "normal_consistency": 0.1, "edge_length": 0.01, "offset": 0.0},
     "paper": {"laplacian": 1e-3, "normal_consistency": 3e-4, "edge_length": 0.1, "offset": 0.1},
 }
 _MESH_WEIGHTS["code"] = _MESH_WEIGHTS["paper"]
@@ -341,7 +344,9 @@ def with_mesh(config: Config, path: str | Path) -> Config:
         is_frozen = not before or all(rate.value == 0 for rate in before)
         rate = Rate(0.0)
         if not is_frozen:
-            rate = Rate(_MESH_RATES[config.preset], max(rate.warmup for rate in before))
+            value = _MESH_RATE * max(rate.value for rate in before)
+            warmup = max(rate.warmup for rate in before)
+            rate = Rate(_MESH_RATE_ORIGINAL if is_original else value, warmup)
             weights |= _weights(**_MESH_WEIGHTS[config.preset])
         if is_original and not is_frozen:
             weights |= _weights(smoothness_roughness_metallic=0.01)

@@ -248,8 +248,8 @@ class TriangleMesh(SurfaceModel):
         if not self.is_sheet:
             visible = int(0.55 * visible)
         return Capacities(
-            triangle_boxes=bucket(4 * face_count),
-            triangle_cells=bucket(3 * face_count),
+            triangle_boxes=bucket(6 * face_count),
+            triangle_cells=bucket(4 * face_count),
             cell_triangles=bucket(1),
             visible=bucket(visible),
             hits=bucket(3 * visible),
