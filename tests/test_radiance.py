@@ -323,8 +323,17 @@ def test_training_lowers_the_loss_and_fills_the_capacity(trained):
 
 def test_resumed_training_equals_the_uninterrupted_one(trained, tmp_path):
     _, _, whole = trained
+    steps = []
     for stop in (31, None):
-        train_radiance(scene_views(), TINY, tmp_path / "run", resume=True, stop_after=stop)
+        train_radiance(
+            scene_views(),
+            TINY,
+            tmp_path / "run",
+            resume=True,
+            stop_after=stop,
+            on_step=lambda progress: steps.append(progress.step),
+        )
+    assert steps == list(range(1, 61))
     paths = [latest_checkpoint(folder / "checkpoints") for folder in (whole, tmp_path / "run")]
     first, second = (np.load(path) for path in paths)
     names = [name for name in first.files if name != "__meta__"]

@@ -53,6 +53,7 @@ _LEAST_AGREEMENT = 0.9
 _MOST_CUT = 0.05
 """Figures beyond which a warning says what looks wrong."""
 _SHEET_VIEWS = 6
+_SHEET_WIDTH = 200  # pixels of a picture of the sheet, at least: the text below is as long as three
 _DIM = 0.12  # of what is outside of the mask, in the sheet
 _DISSENT = (0.9, 0.35, 0.1)  # colour that half-opaque pixels are marked with
 
@@ -402,6 +403,7 @@ def mask_sheet(
     Half-opaque pixels are orange in the mask.
     """
     chosen = np.unique(np.linspace(0, len(views) - 1, _SHEET_VIEWS).astype(int))
+    zoom = math.ceil(_SHEET_WIDTH / views.width)
     rows: list[dict[str, Any]] = []
     for view in chosen:
         picture = to_picture(views.images[view, ..., :3])
@@ -410,9 +412,12 @@ def mask_sheet(
         shown = np.where(is_unsure, np.asarray(_DISSENT), mask.astype(np.float32))
         rows.append(
             {
-                "capture": picture,
-                "mask": shown.astype(np.float32),
-                "masked": np.where(mask, picture, _DIM * picture),
+                name: np.repeat(np.repeat(image, zoom, 0), zoom, 1)
+                for name, image in (
+                    ("capture", picture),
+                    ("mask", shown.astype(np.float32)),
+                    ("masked", np.where(mask, picture, _DIM * picture)),
+                )
             }
         )
     return overview_sheet(
