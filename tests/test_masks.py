@@ -81,20 +81,23 @@ def test_a_larger_cluster_at_the_edge_is_not_the_object():
     np.testing.assert_allclose(proposal.hi, 0.4, atol=0.1)
 
 
-def test_a_wall_through_the_object_is_no_ground():
+@pytest.mark.parametrize("axes", [[2, 0, 1], [0, 1, 2]])
+def test_a_board_through_the_object_is_no_ground(axes):
     # As many points on either side of the plane, so nothing stands on it.
-    board = on_plane(2000, 0.0, reach=0.7)[:, [2, 0, 1]]
+    board = on_plane(2000, 0.0, reach=0.7)[:, axes]
     cloud = cloud_of(on_ball(1500, radius=0.5), board)
     assert not propose_box(cloud, ring()).has_plane
 
 
 def test_faint_and_large_splats_do_not_make_a_box():
     ball = on_ball(500, radius=0.4)
-    fog = on_ball(4000, radius=1.2)
+    fog = np.random.default_rng(3).uniform(-1.4, 1.4, (2000, 3))
     sizes = np.r_[np.full(500, 0.02), np.full(2000, 5.0), np.full(2000, 0.02)]
-    opacities = np.r_[np.full(2500, 0.9), np.full(2000, 0.05)]
-    proposal = propose_box(Cloud(np.concatenate([ball, fog]), opacities, sizes), ring())
-    assert np.abs([proposal.lo, proposal.hi]).max() < 0.6
+    positions = np.concatenate([ball, on_ball(2000, radius=1.2), fog])
+    for faint in (0.05, 0.12):
+        opacities = np.r_[np.full(2500, 0.9), np.full(2000, faint)]
+        proposal = propose_box(Cloud(positions, opacities, sizes), ring())
+        assert np.abs([proposal.lo, proposal.hi]).max() < 0.6
 
 
 def test_where_nothing_is_in_sight_there_is_no_box():
@@ -176,7 +179,7 @@ def test_masks_are_those_of_the_object_and_are_read_by_training(capture):
     assert report.splats_total == 1800
     assert not report.proposed
     assert report.certainty.agreement > 0.95
-    assert 0.0 < report.certainty.unsure < 0.3
+    assert report.certainty.unsure < 0.1
     assert report.certainty.empty == ()
     assert report.psnr == 21.0
     assert (run / "masks.png").exists()
@@ -191,16 +194,23 @@ def test_without_a_box_the_object_is_found(capture):
     np.testing.assert_allclose(report.hi, CENTER + RADIUS, atol=0.2)
 
 
-def test_masks_that_are_there_are_replaced_only_where_that_is_said(capture):
+def test_masks_that_are_there_are_replaced_only_where_that_is_said(capture, monkeypatch):
     root, run = capture
     write_photographs(root, "unused")
+
+    def as_wide_as_splats_are_many(radiance, camera):
+        alpha = np.zeros((COUNT, 28, 24), np.float32)
+        alpha[:, :, : 24 * radiance.splats.capacity // 1200] = 0.9
+        return np.zeros((COUNT, 28, 24, 3), np.float32), alpha
+
+    monkeypatch.setattr(masks_module, "render_views", as_wide_as_splats_are_many)
     with pytest.raises(CaptureError, match=f"{COUNT} of {COUNT} views have a mask already"):
         make_masks(read(root), SETTINGS, run, box=BOX)
     make_masks(read(root), SETTINGS, run, box=BOX, force=True)
+    assert read_image(root / "masks" / "view_04.png").mean() == 1.0
     smaller = (CENTER - 1, CENTER + np.array([1.0, 1.0, 0.0]))
-    before = read_image(root / "masks" / "view_04.png").sum()
     make_masks(read(root), SETTINGS, run, box=smaller, resume=True)
-    assert read_image(root / "masks" / "view_04.png").sum() < 0.8 * before
+    assert 0.2 < read_image(root / "masks" / "view_04.png").mean() < 0.8
 
 
 def test_boxes_and_masks_that_leave_nothing_are_refused(capture, monkeypatch):
@@ -290,7 +300,8 @@ def test_half_opaque_pixels_and_cut_masks_raise_warnings():
     alpha[:, 5:35, 12:18] = 0.5
     alpha[5] = 0.0
     sure = masks_module.certainty(views, alpha, (np.full(3, -1.5), np.full(3, 1.5)))
-    assert sure.unsure == pytest.approx(30 * 6 / (40 * 4))
+    # Six columns, of which one is next to the mask.
+    assert sure.unsure == pytest.approx(30 * 5 / (40 * 4))
     # Eight pixels of a rim of 2 x 40 and 2 x 2 lie on the border.
     assert sure.cut == pytest.approx(8 / 84)
     assert sure.empty == (views.names[5],)

@@ -30,10 +30,10 @@ from geosplat_jax.io.views import Views
 from geosplat_jax.splats.radiance import RadianceSplats, colors_seen_from, render_radiance
 from geosplat_jax.splats.relocation import (
     exploring_noise,
-    relocate,
     shared_opacity,
     shared_scale_factor,
 )
+from geosplat_jax.splats.relocation import relocate as eager_relocate
 
 ROUNDING = 2e-6  # float32, values of order one
 QUADRATURE = 2e-6  # of the integral of Eq. 9, relative
@@ -45,6 +45,7 @@ render = jax.jit(
     lambda splats, count, camera: render_radiance(splats, count, camera, capacities=CAPACITIES)
 )
 seen_from = jax.jit(colors_seen_from)
+relocate = jax.jit(eager_relocate)
 
 
 def unit(count, seed=0):
@@ -228,8 +229,8 @@ def test_dead_splats_go_to_live_ones_in_proportion_to_their_opacity():
 
 
 def test_nothing_is_relocated_where_nothing_lives():
-    splats = replace(some_splats(), opacity_logits=jnp.full((40,), -9.0))
-    everywhere = jnp.ones((40,), bool)
+    splats = replace(some_splats(ROWS), opacity_logits=jnp.full((ROWS,), -9.0))
+    everywhere = jnp.ones((ROWS,), bool)
     moved, is_changed = relocate(splats, everywhere, everywhere, jax.random.key(0))
     assert not bool(is_changed.any())
     jax.tree.map(np.testing.assert_array_equal, moved, splats)
@@ -309,6 +310,7 @@ def trained(tmp_path_factory):
     return radiance, reports, folder
 
 
+@pytest.mark.slow
 def test_training_lowers_the_loss_and_fills_the_capacity(trained):
     radiance, reports, _ = trained
     totals = [report.total for report in reports]
@@ -321,10 +323,20 @@ def test_training_lowers_the_loss_and_fills_the_capacity(trained):
     assert quality(radiance, scene_views()).mean() > 14.0
 
 
+@pytest.mark.slow
 def test_resumed_training_equals_the_uninterrupted_one(trained, tmp_path):
     _, _, whole = trained
+    steps = []
     for stop in (31, None):
-        train_radiance(scene_views(), TINY, tmp_path / "run", resume=True, stop_after=stop)
+        train_radiance(
+            scene_views(),
+            TINY,
+            tmp_path / "run",
+            resume=True,
+            stop_after=stop,
+            on_step=lambda progress: steps.append(progress.step),
+        )
+    assert steps == list(range(1, 61))
     paths = [latest_checkpoint(folder / "checkpoints") for folder in (whole, tmp_path / "run")]
     first, second = (np.load(path) for path in paths)
     names = [name for name in first.files if name != "__meta__"]
@@ -333,6 +345,7 @@ def test_resumed_training_equals_the_uninterrupted_one(trained, tmp_path):
         np.testing.assert_array_equal(first[name], second[name], err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_folder_with_splats_is_neither_replaced_nor_continued_with_others(trained):
     _, _, folder = trained
     with pytest.raises(RunError, match="--resume"):

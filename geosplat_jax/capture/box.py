@@ -17,6 +17,8 @@ from geosplat_jax.surface.hull import sight_bounds
 
 _OPAQUE = 0.1
 """Splats that are less opaque say nothing about where things are."""
+_LEAST_WEIGHT = 0.5
+"""Sum of the opacities in a cell, below which it holds fog and no thing."""
 _LARGEST_SCALE = 0.06  # of the sides of the search; larger splats are the background
 _SEEN = 0.8
 """Share of the cameras that must have a place in sight for the object to be there."""
@@ -94,6 +96,10 @@ def propose_box(cloud: Cloud, views: Views, *, seed: int = 0) -> Proposal:
     on_plane = _ground(points, weights, centers, side, np.random.default_rng(seed))
     rest, rest_weights = points[~on_plane], weights[~on_plane]
     members = _largest_cluster(rest, rest_weights, lo, hi)
+    if not members.any():
+        raise CaptureError(
+            f"where the cameras look there is nothing but fog; train longer, or {cure}"
+        )
     cluster = rest[members]
     low, high = np.quantile(cluster, [_TAIL, 1.0 - _TAIL], axis=0)
     pad = _MARGIN * float((high - low).max())
@@ -208,16 +214,17 @@ def _largest_cluster(
     """Find the points of the connected cells that weigh most, near the middle more than far off."""
     side = float((hi - lo).max())
     cell = np.clip(((points - lo) / side * _CELLS).astype(int), 0, _CELLS - 1)
-    is_taken = np.zeros((_CELLS,) * 3, bool)
-    is_taken[tuple(cell.T)] = True
+    density = np.zeros((_CELLS,) * 3)
+    np.add.at(density, tuple(cell.T), weights)
     # Splats of plain surfaces lie apart: those with an empty cell between them are connected.
-    is_taken = maximum_filter(is_taken, size=3)
+    is_taken = maximum_filter(density >= _LEAST_WEIGHT, size=3)
     found: Any = label(is_taken, structure=np.ones((3, 3, 3), int))
     numbers = found[0]
-    cluster = numbers[tuple(cell.T)]
+    cluster = np.where(density[tuple(cell.T)] >= _LEAST_WEIGHT, numbers[tuple(cell.T)], 0)
     away = np.linalg.norm(points - 0.5 * (lo + hi), axis=1) / (_REACH * side)
     totals = np.bincount(cluster, weights * np.exp(-0.5 * away**2))
-    return cluster == int(np.argmax(totals))
+    totals[0] = 0.0
+    return (cluster == int(np.argmax(totals))) & (cluster > 0)
 
 
 def _cut_at_plane(

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import maximum_filter
 
 from geosplat_jax.capture.box import (
     Cloud,
@@ -48,11 +49,12 @@ OPAQUE = 0.8
 
 _UNSURE = (0.2, OPAQUE)
 """Alpha between these belongs neither to the object nor to what is around it."""
-_MOST_UNSURE = 0.15
+_MOST_UNSURE = 0.1
 _LEAST_AGREEMENT = 0.9
 _MOST_CUT = 0.05
 """Figures beyond which a warning says what looks wrong."""
 _SHEET_VIEWS = 6
+_SHEET_WIDTH = 200  # pixels of a picture of the sheet, at least: the text below is as long as three
 _DIM = 0.12  # of what is outside of the mask, in the sheet
 _DISSENT = (0.9, 0.35, 0.1)  # colour that half-opaque pixels are marked with
 
@@ -70,7 +72,7 @@ class Certainty:
     Attributes
     ----------
     coverage : mean share of an image that its mask covers.
-    unsure : pixels with alpha from 0.2 to 0.8 per pixel of the masks.
+    unsure : pixels with alpha from 0.2 to 0.8, next to none of the masks', per pixel of the masks.
     cut : share of the masks' rims that lies on the border of the image.
     agreement : mean share of the rays through a mask that meet the visual hull of the others.
     empty : names of views whose mask is empty.
@@ -139,7 +141,7 @@ class MaskReport:
             f"splats:     {self.splats_total}, {held_back}",
             f"box:        {corners} ({origin}{plane}), {self.splats} splats in it",
             f"masks:      {self.masks} in {self.folder}, {sure.coverage:.1%} of an image each",
-            f"unsure:     half-opaque pixels are {sure.unsure:.1%} as many as those of the masks",
+            f"unsure:     half-opaque pixels off the rims are {sure.unsure:.1%} of the masks'",
             f"agreement:  {sure.agreement:.1%} of the rays through masks meet the others' hull",
             *(f"warning: {warning}" for warning in sure.warnings()),
         ]
@@ -380,9 +382,11 @@ def certainty(views: Views, alpha: Float[np.ndarray, "V H W"], box: Corners) -> 
     masked = replace(views, images=cut_out, has_masks=True)
     shares = agreement(masked, box)
     is_empty = ~masks.any((1, 2))
+    # A rim of a pixel is half opaque around any object.
+    near = np.asarray(maximum_filter(masks, (1, 3, 3)), bool)
     return Certainty(
         coverage=float(masked.coverage.mean()),
-        unsure=float(((alpha > _UNSURE[0]) & ~masks).sum() / covered),
+        unsure=float(((alpha > _UNSURE[0]) & ~near).sum() / covered),
         cut=on_border / max(rim, on_border, 1),
         agreement=float(shares[np.isfinite(shares)].mean()),
         empty=tuple(name for name, no in zip(views.names, is_empty, strict=True) if no),
@@ -402,6 +406,7 @@ def mask_sheet(
     Half-opaque pixels are orange in the mask.
     """
     chosen = np.unique(np.linspace(0, len(views) - 1, _SHEET_VIEWS).astype(int))
+    zoom = math.ceil(_SHEET_WIDTH / views.width)
     rows: list[dict[str, Any]] = []
     for view in chosen:
         picture = to_picture(views.images[view, ..., :3])
@@ -410,9 +415,12 @@ def mask_sheet(
         shown = np.where(is_unsure, np.asarray(_DISSENT), mask.astype(np.float32))
         rows.append(
             {
-                "capture": picture,
-                "mask": shown.astype(np.float32),
-                "masked": np.where(mask, picture, _DIM * picture),
+                name: np.repeat(np.repeat(image, zoom, 0), zoom, 1)
+                for name, image in (
+                    ("capture", picture),
+                    ("mask", shown.astype(np.float32)),
+                    ("masked", np.where(mask, picture, _DIM * picture)),
+                )
             }
         )
     return overview_sheet(
