@@ -192,7 +192,7 @@ class Loop:
         number = stages.index(self.stage) + 1
         if number == len(stages):
             return None
-        ahead = min(_LOOK_AHEAD, self.stage.steps // 2)
+        ahead = min(_LOOK_AHEAD, 3 * self.stage.steps // 4)
         is_near = step >= self.config.first_step(stages[number].name) - ahead
         return stages[number] if is_near else None
 
