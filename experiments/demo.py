@@ -37,9 +37,9 @@ def main() -> None:
     config = make_config("default", "draft", material_prior=MATERIAL_PRIOR, overrides=OVERRIDES)
     run = train(SCENE, folder, config, force=True)
     # Beside the movie: both wait for the compiler, which uses one core.
-    evaluated = in_background(lambda: run.evaluate(samples=128))
+    evaluated = in_background(lambda: run.evaluate(samples=64))
     movie = RelightOptions(turntable=FRAMES, suffix=".gif", frames_per_second=12.0)
-    run.relight(SCENE.parent / "sunset.hdr", options=movie, samples=64)
+    run.relight(SCENE.parent / "sunset.hdr", options=movie, samples=32)
     run.export()
     evaluated.result()
     print(

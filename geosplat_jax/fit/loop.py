@@ -49,6 +49,8 @@ from geosplat_jax.surface.base import SurfaceModel
 
 _RECOVERIES_ALLOWED = 3
 _SHRINK_EVERY = 100
+_WORTH = 100
+"""Steps to come in a stage for which smaller buffers are worth the compilation that they take."""
 _LOOK_AHEAD = 200
 """Steps before the end of a stage, at most, at which the next one's programs are compiled."""
 
@@ -246,7 +248,7 @@ class Loop:
         self.peak = {n: max(count, (self.peak or {}).get(n, 0)) for n, count in needed.items()}
         if int(report.loss.face_count) == 0:
             self._recover(step)
-        elif self.step % _SHRINK_EVERY == 0:
+        elif self.step % _SHRINK_EVERY == 0 and self.stage.steps - self.steps_of_stage >= _WORTH:
             self._resize(capacity_module.shrink(self.pipeline.capacities, self.peak), step)
             self.peak = None
         return report
