@@ -82,9 +82,16 @@ def test_a_slow_machine_is_given_less_work():
     assert slow.seconds == pytest.approx(600, rel=0.01)
 
 
-def test_a_time_that_compilation_would_fill_is_refused():
-    with pytest.raises(TrainingError, match="a budget of 20 s is too short"):
-        plan(Budget(20.0), SIZE, slowness=1.0)
+@pytest.mark.parametrize("slowness", [0.3, 1.0, 8.0])
+def test_a_time_that_compilation_would_fill_is_refused(slowness):
+    with pytest.raises(TrainingError, match="a budget of 15 s is too short"):
+        plan(Budget(15.0), SIZE, slowness=slowness)
+
+
+def test_a_fast_machine_and_a_busy_one_take_what_is_short_but_possible():
+    for slowness in (0.5, 1.0, 5.0):
+        chosen = plan(Budget(120.0), SIZE, slowness=slowness)
+        assert all(stage.steps >= 60 for stage in chosen.config.active_stages)
 
 
 def test_little_memory_chooses_fewer_cells_or_is_refused():

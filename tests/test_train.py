@@ -77,6 +77,22 @@ def test_the_same_seed_gives_the_same_parameters(dataset, finished, tmp_path):
     _assert_same(state, again)
 
 
+def test_buffers_are_made_smaller_only_where_steps_follow(dataset, tmp_path, monkeypatch):
+    asked = []
+
+    def shrink(capacities, peak):
+        asked.append(peak["visible"])
+        return capacities
+
+    monkeypatch.setattr(loop_module.capacity_module, "shrink", shrink)
+    monkeypatch.setattr(loop_module, "_SHRINK_EVERY", 2)
+    monkeypatch.setattr(loop_module, "_WORTH", 2)
+    fit(dataset, tiny_config(), tmp_path)
+    # After the second of four steps, and not after the last.
+    assert len(asked) == 1
+    assert asked[0] > 0
+
+
 def test_resuming_equals_the_uninterrupted_run_bit_for_bit(dataset, finished, tmp_path):
     _, state, _ = finished
     fit(dataset, tiny_config(), tmp_path, stop_after=2)

@@ -167,12 +167,12 @@ def plan(
     chosen = affordable[-1] if affordable else candidates[0]
     waits = sum(cost.startup for cost in chosen.costs.values())
     share = (budget.seconds - waits) / (chosen.seconds - waits)
-    least = (waits + _SHORTEST * (chosen.seconds - waits)) / slowness
+    # What keeps this machine busy now may end; what it cannot do when idle is hopeless.
+    least = (waits + _SHORTEST * (chosen.seconds - waits)) / max(slowness, 1.0)
     if budget.seconds < least:
-        # What keeps this machine busy now may end; what the reference cannot do is hopeless.
         raise TrainingError(
             f"a budget of {budget.seconds:.0f} s is too short: with programs that are compiled, "
-            f"the least is about {least:.0f} s on two idle cores"
+            f"the least is about {least:.0f} s on idle cores"
         )
     config = with_steps(chosen.config, min(max(share, _SHORTEST), _LONGEST))
     return replace(chosen, config=config, seconds=expected_seconds(config, chosen.costs))
