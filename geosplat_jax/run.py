@@ -479,7 +479,7 @@ def train(
         replaces a run.
     budget : time and memory that the training may take. Without ``config``, settings are chosen for
         it (`plan_training`); in any case steps are made fewer or more on the way, so that it ends
-        in time. A run that is resumed has what is left of it.
+        in time. A run that is resumed keeps its own, and has what is left of it.
     reading : how to read the scene: ``downscale``, ``light``, ``bounds`` (six numbers),
         ``cameras`` (a file of `Run.refine_cameras`).
 
@@ -491,6 +491,9 @@ def train(
         If the mesh cannot be used; see `io.start_mesh`.
     """
     began, folder = time.perf_counter(), RunFolder(output)
+    if resume and config is None and folder.exists and folder.budget() is not None:
+        # Its settings were chosen for the budget, and have changed since.
+        config, budget, reading = folder.config(), folder.budget(), folder.record()["dataset"]
     if config is None and budget is not None:
         chosen = plan_training(scene, budget, downscale=reading.get("downscale"))
         config, reading = chosen.config, {**reading, "downscale": chosen.downscale}

@@ -22,6 +22,7 @@ from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.presets import QUALITIES, between_qualities, make_config
 from geosplat_jax.fit.train import fit
+from geosplat_jax.run import train
 
 SIZE = (200, 200)
 
@@ -238,6 +239,14 @@ def test_a_shortened_run_that_was_stopped_goes_on_with_its_own_settings(dataset,
     assert run.config().total_steps < 40
     state = fit(dataset, run.config(), folder, resume=True)
     assert int(state.step) == run.config().total_steps
+
+
+def test_python_resumes_a_budget_without_naming_settings(dataset, tmp_path):
+    config = tiny_config("stages.split_sum.steps=40", "stages.monte_carlo.steps=0")
+    _paced_run(dataset, tmp_path / "run", config, stop_after=12)
+    run = train(dataset, tmp_path / "run", resume=True)
+    assert run.trained.step == run.config.total_steps
+    assert run.folder.budget() == Budget(60.0)
 
 
 @pytest.mark.parametrize(

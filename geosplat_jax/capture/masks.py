@@ -59,8 +59,7 @@ _DIM = 0.12  # of what is outside of the mask, in the sheet
 _DISSENT = (0.9, 0.35, 0.1)  # colour that half-opaque pixels are marked with
 
 _PIXELS = 270 * 480
-"""Of an image at most, where nobody says otherwise: 5000 steps then take two cores a quarter of an
-hour."""
+"""Of an image at most, where nobody says otherwise."""
 
 REPORT = "masks.json"
 

@@ -332,9 +332,9 @@ def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--downscale",
         type=_downscale,
-        default=1,
         metavar="N",
-        help="reduce the images by this factor; auto: by what the grid's cells can resolve",
+        help="reduce the images by this factor (default: 1, or what a budget asks for); auto: by "
+        "what the grid's cells can resolve",
     )
     parser.add_argument("--light", help="training light, where a scene has several")
     parser.add_argument(

@@ -29,7 +29,7 @@ def scene_options(arguments: argparse.Namespace, config: Config) -> dict[str, An
         "cameras": arguments.cameras,
     }
     if arguments.downscale != "auto":
-        return {**options, "downscale": arguments.downscale}
+        return {**options, "downscale": arguments.downscale or 1}
     cells = config.geometry.cells_along
     if cells is None:
         raise UsageError("--downscale auto needs a surface of cells, not a mesh; give a number")
@@ -90,13 +90,12 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
     if arguments.source is not None:
         raise UsageError("--budget plans a whole training; leave --from out")
     budget = Budget(arguments.budget, arguments.memory)
-    is_chosen = arguments.downscale in ("auto", 1)
     plan = plan_training(
         arguments.scene,
         budget,
         material_prior=arguments.material_prior,
         overrides=_overrides(arguments),
-        downscale=None if is_chosen else arguments.downscale,
+        downscale=None if arguments.downscale == "auto" else arguments.downscale,
         light=arguments.light,
     )
     for line in plan.describe():

@@ -120,10 +120,10 @@ def kernel_milliseconds(function: Callable[[Any], Any], argument: Any, repeats: 
     return statistics.median(times)
 
 
-def exponential_milliseconds() -> float:
-    """Time ``sum(exp(x))`` over 16M float32, for half a second: what else runs comes and goes."""
+def exponential_milliseconds(repeats: int = 71) -> float:
+    """Time ``sum(exp(x))`` over 16M float32; long enough that what else runs comes and goes."""
     values = jnp.linspace(-1.0, 1.0, 1 << 24)
-    return kernel_milliseconds(jax.jit(lambda x: jnp.sum(jnp.exp(x))), values, repeats=71)
+    return kernel_milliseconds(jax.jit(lambda x: jnp.sum(jnp.exp(x))), values, repeats)
 
 
 def slowness_of_machine() -> float:
