@@ -27,7 +27,10 @@ from geosplat_jax.core.types import Batch
 from geosplat_jax.materials import SMOOTHNESS_STD, Changes, MaterialSpec, smoothness
 from geosplat_jax.render import Asset, Params, RenderOutput
 from geosplat_jax.surface.base import SurfaceModel
+from geosplat_jax.transport.base import Illumination, Transport
 from geosplat_jax.transport.environment import texel_solid_angles
+
+_RADIOMETRIC_STREAM = 1
 
 
 @settings
@@ -61,6 +64,9 @@ class Objective:
     """Splats on which Eq. 15-17 are estimated in one step."""
     smoothness_radius: NonNegative = SMOOTHNESS_STD
     """Standard deviation of the displacement of Eq. 16, in half the side of the box."""
+    radiometric_samples: PositiveCount = 1024
+    """Splats, each with a direction, at which learned and sampled radiance are compared in one
+    step."""
     background: Literal["pixel", "view", "black"] = "pixel"
     """Behind both images: one random colour per pixel (as the authors), one per view, or black."""
     srgb: bool = False
@@ -139,6 +145,7 @@ class SharedInputs:
     asset : what was reconstructed.
     surface, fields, objective : as in the pipeline.
     key : of what is drawn.
+    transport, lights : how light arrives, and what it prepared for the step.
     """
 
     params: Params
@@ -147,6 +154,8 @@ class SharedInputs:
     fields: MaterialSpec
     objective: Objective
     key: Key[Array, ""]
+    transport: Transport
+    lights: Illumination
 
     @cached_property
     def changes(self) -> Changes:
@@ -266,6 +275,19 @@ def indirect_magnitude(asset: Asset) -> Float[Array, ""]:
     return safe_divide(total, jnp.sum(mask).astype(total.dtype) * values.shape[1])
 
 
+def radiometric_disagreement(x: SharedInputs) -> Float[Array, ""]:
+    """See `Transport.disagreement`; 0 where points learn nothing of what they send out."""
+    key = jax.random.fold_in(x.key, _RADIOMETRIC_STREAM)
+    return x.transport.disagreement(
+        key,
+        x.asset.splats.points(),
+        x.asset.attributes,
+        x.lights,
+        x.asset.index,
+        count=x.objective.radiometric_samples,
+    )
+
+
 def mean_metallic(metallic: Float[Array, " N"], mask: Bool[Array, " N"]) -> Float[Array, ""]:
     """Average over the splats: what the photographs leave open is taken for a dielectric."""
     total = jnp.sum(jnp.where(mask, metallic, 0.0))
@@ -352,6 +374,7 @@ SHARED_TERMS: dict[str, Callable[[SharedInputs], Float[Array, ""]]] = {
     "smoothness_roughness_metallic": lambda x: x.changes.roughness + x.changes.metallic,
     "indirect": lambda x: indirect_magnitude(x.asset),
     "metallic": lambda x: mean_metallic(x.asset.attributes.materials.metallic, x.asset.splats.mask),
+    "radiometric": lambda x: radiometric_disagreement(x),
     "white_balance": lambda x: white_balance(x.params.light.radiance),
     "light_tint": lambda x: light_tint(x.params.light.radiance),
     "light_smoothness": lambda x: light_smoothness(x.params.light.radiance),

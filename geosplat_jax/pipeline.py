@@ -114,7 +114,7 @@ class Pipeline(RenderPipeline):
         seen = self.points_seen(asset, lists)
         lights, carry = self.lights(asset, params.light, seen, batch)
         others = self.residual_lights(asset, params.light, seen, batch)
-        total, shared = self.shared_loss(params, asset, batch)
+        total, shared = self.shared_loss(params, asset, lights, batch)
         reports = []
         for view, listed, share in zip(views, lists, batch.shares, strict=True):
             residual = self.residual_image(params.log_exposure, asset, others, listed, view)
@@ -222,11 +222,13 @@ class Pipeline(RenderPipeline):
         return self._weighted(terms), ViewReport(terms, inputs.comparison.mse, lists.usage)
 
     def shared_loss(
-        self, params: Params, asset: Asset, batch: Batch
+        self, params: Params, asset: Asset, lights: Illumination, batch: Batch
     ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
         """Evaluate the weighted terms that no view has a part in; also return them by name."""
         key = jax.random.fold_in(batch.key, _SHARED_STREAM)
-        inputs = SharedInputs(params, asset, self.surface, self.fields, self.objective, key)
+        transport = self.domain.adapted(self.transport)
+        parts = (self.surface, self.fields, self.objective)
+        inputs = SharedInputs(params, asset, *parts, key, transport, lights)
         terms = shared_terms(inputs, self.weights)
         return self._weighted(terms), terms
 

@@ -37,7 +37,7 @@ from geosplat_jax.splats.rasterize import (
     find_visible,
 )
 from geosplat_jax.surface.base import Surface, SurfaceModel
-from geosplat_jax.transport.base import Illumination, Transport
+from geosplat_jax.transport.base import Illumination, Transport, Unlit
 
 AOV_CHANNELS = {
     "albedo": 3,
@@ -256,6 +256,10 @@ class RenderPipeline(eqx.Module):
         For derivatives along few directions, such as those of a camera, of an asset that is there.
         """
         return replace(self, compositor=composite_tiles_forward)
+
+    def unlit(self) -> "RenderPipeline":
+        """Return a pipeline that builds the same assets and lists, whatever the light transport."""
+        return replace(self, transport=Unlit(self.transport.uses_rays))
 
     @property
     def uses_rays(self) -> bool:

@@ -32,7 +32,7 @@ from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
 from geosplat_jax.report.assets import export_assets
 from geosplat_jax.report.consistency import Consistency, body_of_run, measure, single_cameras
-from geosplat_jax.report.evaluate import evaluate_run
+from geosplat_jax.report.evaluate import EvaluateOptions, Truth, evaluate_run
 from geosplat_jax.report.pace import OnProgress, counted
 from geosplat_jax.report.page import REPORT, Evaluated, write_report
 from geosplat_jax.report.protocols import PROTOCOLS
@@ -161,7 +161,7 @@ class Run:
     ) -> dict[str, Any]:
         """Compare the test views with the truth; write metrics, sheets of pictures and a report.
 
-        See `evaluate.evaluate_run` for the arguments.
+        See `evaluate.EvaluateOptions` for the arguments.
 
         Parameters
         ----------
@@ -187,8 +187,9 @@ class Run:
         evaluated = Evaluated.of(self.folder, stage=stage)
         metrics = evaluate_run(
             trained,
-            views,
+            Truth(views, lights, _true_light(dataset, lights), dataset.train),
             evaluated.results,
+            EvaluateOptions(protocol, samples, relight_indirect),
             meta={
                 "scene": record["scene"],
                 "dataset": record["dataset"],
@@ -197,12 +198,6 @@ class Run:
                 "training": self.folder.training(),
                 "training_peak_memory_mb": max(peaks, default=None),
             },
-            protocol=protocol,
-            lights=lights,
-            train_light=_true_light(dataset, lights),
-            samples=samples,
-            relight_indirect=relight_indirect,
-            train_views=dataset.train,
             on_progress=on_progress,
         )
         write_report(evaluated.results / REPORT, [evaluated])

@@ -14,7 +14,7 @@ from geosplat_jax.core.types import EnvLight
 from geosplat_jax.fit.train import Trained
 from geosplat_jax.io.images import read_image
 from geosplat_jax.report import sheets
-from geosplat_jax.report.evaluate import evaluate_run
+from geosplat_jax.report.evaluate import EvaluateOptions, Truth, evaluate_run
 from geosplat_jax.report.gallery import comparisons
 from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.renderer import RELIGHT_BOUNCES, Renderer
@@ -120,15 +120,14 @@ def views(run):
     return replace(cameras, images=images, truth=truth, relight=relight)
 
 
-def evaluate(run, views, folder, **kwargs):
-    options = {
-        "lights": LIGHTS,
-        "meta": {"step": 7},
-        "samples": SAMPLES,
-        "model_texture": None,
-        **kwargs,
-    }
-    return evaluate_run(run, views, folder, **options)
+def evaluate(run, views, folder, *, lights=LIGHTS, train_light=None, train_views=None, **options):
+    return evaluate_run(
+        run,
+        Truth(views, lights, train_light, train_views),
+        folder,
+        EvaluateOptions(**{"samples": SAMPLES, "model_texture": None, **options}),
+        meta={"step": 7},
+    )
 
 
 @pytest.fixture(scope="module")

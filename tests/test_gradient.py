@@ -29,8 +29,14 @@ def assert_close(found, expected):
 
 @pytest.mark.slow
 def test_the_parts_of_monte_carlo_give_the_gradient_of_the_whole_loss():
-    """Two views, of which one counts for less, and a residual with samples of its own."""
-    _, pipeline, params, batch = problem("stages.monte_carlo.transport.residual_count=1")
+    """Two views, of which one counts for less, a residual with samples of its own, and a term of
+    no view that looks at the light."""
+    _, pipeline, params, batch = problem(
+        "stages.monte_carlo.transport.residual_count=1",
+        "stages.monte_carlo.transport.indirect=radiometric",
+        "stages.monte_carlo.transport.radiometric_gradient=both",
+        "stages.monte_carlo.weights.radiometric=0.5",
+    )
     batch = two_views(pipeline, batch)
     (total, report), expected = evaluate(pipeline, params, batch)
     (found_total, found_report), found = value_and_gradient(pipeline, params, batch, frozen=())

@@ -16,7 +16,9 @@ from geosplat_jax.transport.indirect import (
     ConstantIndirect,
     HarmonicIndirect,
     NoIndirect,
+    RadiometricIndirect,
     TracedIndirect,
+    learned_radiance,
 )
 from geosplat_jax.transport.indirect import outgoing as eager_outgoing
 from geosplat_jax.transport.sampling import BLOCKED, OPEN
@@ -49,7 +51,7 @@ def sphere_rule(rows=12, columns=24):
 
 def values_of(model, seed=1):
     """Random values: a row for each ray, or for each of four faces."""
-    shape = (RAYS, model.outputs) if model.outputs else (4, 3)
+    shape = (4 if model.reads_faces else RAYS, model.outputs or 3)
     return np.random.default_rng(seed).uniform(-2, 2, shape)
 
 
@@ -88,10 +90,14 @@ def test_learned_numbers_are_those_that_a_model_reads():
         "constant": 2 * 3,
         "harmonics": 3 * harmonics(jnp.zeros((1, 3))).shape[1],
         "traced": 0,
+        "radiometric": 3 * harmonics(jnp.zeros((1, 3))).shape[1],
     }
     for model in (ConstantIndirect, HarmonicIndirect):
         assert model(jnp.zeros((2, model.outputs))).belongs_to_points
-    assert not TracedIndirect(jnp.zeros((2, 3))).belongs_to_points
+    for model, columns in ((TracedIndirect, 3), (RadiometricIndirect, 27)):
+        by_face = model(jnp.zeros((2, columns)))
+        assert by_face.reads_faces
+        assert not by_face.belongs_to_points
     assert not NO_INDIRECT.belongs_to_points
 
 
@@ -137,6 +143,20 @@ def test_traced_light_is_what_the_face_sends_and_black_where_none_is_known():
     np.testing.assert_array_equal(diffuse, specular)
 
 
+def test_faces_send_what_they_learned_towards_where_the_ray_comes_from():
+    """Along the ray backwards; black where the face is not known."""
+    values, hits, directions = values_of(RadiometricIndirect), np.asarray(HITS), unit(RAYS, 3)
+    diffuse, specular = arriving(RadiometricIndirect, values, directions, HITS)
+    own = values[np.maximum(hits, 0)].reshape(RAYS, 3, 9)
+    backwards = np.asarray(harmonics(jnp.asarray(-directions, jnp.float32)), float)
+    expected = np.log1p(np.exp(np.einsum("ncb,nb->nc", own, backwards) - 3))
+    expected = np.where((hits >= 0)[:, None], expected, 0.0)
+    np.testing.assert_allclose(diffuse, expected, atol=ROUNDING)
+    np.testing.assert_array_equal(diffuse, specular)
+    forwards = learned_radiance(jnp.asarray(own.reshape(RAYS, 27)), jnp.asarray(directions))
+    assert np.max(np.abs(np.asarray(forwards) - expected)[hits >= 0]) > 0.01
+
+
 @pytest.mark.parametrize("model", [ConstantIndirect, HarmonicIndirect])
 def test_learned_light_starts_small_and_stays_between_zero_and_one(model):
     for lobe in arriving(model, np.zeros((RAYS, model.outputs))):
@@ -146,7 +166,9 @@ def test_learned_light_starts_small_and_stays_between_zero_and_one(model):
             assert np.all((lobe >= 0) & (lobe <= 1))
 
 
-@pytest.mark.parametrize("model", [ConstantIndirect, HarmonicIndirect, TracedIndirect])
+@pytest.mark.parametrize(
+    "model", [ConstantIndirect, HarmonicIndirect, TracedIndirect, RadiometricIndirect]
+)
 def test_the_gradient_is_that_of_the_values_alone(model):
     """In the values it agrees with central differences of every entry; directions have none."""
     step = 1e-5

@@ -14,6 +14,7 @@ from geosplat_jax.core.types import EnvLight
 from geosplat_jax.fit.stages import begin_stage, build_pipeline
 from geosplat_jax.fit.train import Trained
 from geosplat_jax.pipeline import Pipeline
+from geosplat_jax.report import renderer as renderer_module
 from geosplat_jax.report.renderer import (
     EVALUATION_AOVS,
     RELIGHT_BOUNCES,
@@ -124,6 +125,37 @@ def test_too_small_buffers_grow_and_change_no_pixel(matt, camera):
     np.testing.assert_allclose(grown.alpha, ample.alpha, atol=1e-6)
     for name in EVALUATION_AOVS:
         np.testing.assert_allclose(grown.aovs[name], ample.aovs[name], atol=2e-6)
+
+
+def test_the_program_of_assets_serves_every_light(direct, matt):
+    """Whatever the transport, its samples, and the light."""
+    renderer = Renderer(direct, matt[1], samples=32)
+    renderer.asset()
+    before = renderer_module._reconstruct._cache_size()
+    renderer.relit(sky(seed=3), indirect="unshadowed").asset()
+    Renderer(direct, replace(matt[1], light=sky(2.0)), samples=64).asset()
+    Renderer(*matt).asset()
+    assert renderer_module._reconstruct._cache_size() == before
+
+
+def test_lists_have_grown_before_the_largest_program_is_compiled(matt, monkeypatch):
+    class Reached(Exception):
+        pass
+
+    def render_lit(pipeline, *arguments, **named):
+        raise Reached(pipeline.capacities)
+
+    monkeypatch.setattr(renderer_module, "_render_lit", render_lit)
+    pipeline, params = matt
+    tight = replace(pipeline, capacities=AMPLE.resized(hits=128))
+    renderer = Renderer(tight, params)
+    large = views_from([[2.2, -1.8, 1.0]], size=2 * SIZE).camera()
+    with pytest.raises(Reached) as reached:
+        renderer(large)
+    unlit = replace(tight.unlit(), capacities=AMPLE)
+    needed = int(renderer_module._needs(unlit, renderer.asset().splats, large)["hits"])
+    assert needed > 128
+    assert reached.value.args[0]["hits"] >= needed
 
 
 def test_no_samples_are_refused(matt):

@@ -1,11 +1,13 @@
 """The interface of both light transports, one bounce and many, and the denoiser in the pipeline."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from support import ball_of_one_material, tiny_config, views_from
 
@@ -16,6 +18,7 @@ from geosplat_jax.geometry import grid_vertices, initial_geometry
 from geosplat_jax.materials import init_indirect_head
 from geosplat_jax.render import RenderPipeline
 from geosplat_jax.transport import bsdf
+from geosplat_jax.transport import indirect as indirect_module
 from geosplat_jax.transport.base import TransportSettings
 from geosplat_jax.transport.denoise import DenoiseSpec
 from geosplat_jax.transport.environment import LightSpec
@@ -129,6 +132,7 @@ def test_what_a_transport_needs_follows_from_its_choices():
     assert not few(occlusion=False).uses_rays
     assert few(indirect="traced").needs_every_point
     assert not few(indirect="traced", occlusion=False).needs_every_point
+    assert few(indirect="radiometric").needs_every_point
     assert not few(indirect="constant").needs_every_point
     assert few(denoise=DenoiseSpec(iterations=0)).filter_inputs == ()
     assert few(denoise=DenoiseSpec(iterations=1)).filter_inputs == DENOISER_INPUTS
@@ -139,6 +143,7 @@ def test_what_a_transport_needs_follows_from_its_choices():
     assert MonteCarloSettings(indirect="constant").indirect_outputs == 6
     assert MonteCarloSettings(indirect="harmonics").indirect_outputs == 27
     assert MonteCarloSettings(indirect="traced").indirect_outputs == 0
+    assert MonteCarloSettings(indirect="radiometric").indirect_outputs == 27
     assert SplitSumSettings().indirect_outputs == 0
 
 
@@ -151,11 +156,12 @@ def test_images_to_look_at_are_made_without_the_shortcuts_of_training():
     assert plain.for_images(5) is plain
 
 
-def test_traced_light_without_rays_is_warned_about():
-    assert not MonteCarloSettings(indirect="traced").warnings()
+@pytest.mark.parametrize("kind", ["traced", "radiometric"])
+def test_light_of_faces_without_rays_is_warned_about(kind):
+    assert not MonteCarloSettings(indirect=kind).warnings()
     assert not SplitSumSettings().warnings()
-    (warning,) = MonteCarloSettings(indirect="traced", occlusion=False).warnings()
-    assert "no effect" in warning
+    (warning,) = MonteCarloSettings(indirect=kind, occlusion=False).warnings()
+    assert f"indirect = {kind} has no effect" in warning
 
 
 def arguments_of(asset):
@@ -365,6 +371,120 @@ def test_grey_surfaces_keep_what_they_absorb(bowl, bowl_light):
     assert dark < grey < white
     # One bounce is linear in what surfaces reflect.
     assert (grey - dark) / (white - dark) == pytest.approx(0.44, rel=1e-3)
+
+
+def learning(asset, values):
+    """Return attributes whose points have all learned the same coefficients."""
+    rows = asset.splats.opacities.shape[0]
+    learned = jnp.broadcast_to(jnp.asarray(values, jnp.float32), (rows, 27))
+    return replace(asset.attributes, indirect=learned)
+
+
+# The harmonic of degree 0 makes a radiance that is the same in all directions.
+EVEN = np.eye(9)[0] / 0.28209479177387814
+
+
+def even_radiance(level):
+    """Coefficients of a grey radiance."""
+    return np.tile((np.log(np.expm1(level)) + 3) * EVEN, 3)
+
+
+@pytest.mark.parametrize("moves", ["learned", "both"])
+def test_disagreement_is_the_squared_difference_and_moves_what_it_should(ball, moves):
+    """A ball blocks nothing of its own sky: matt, it sends albedo times the light, which is 1."""
+    _, _, asset = ball
+    transport = few(indirect="radiometric", radiometric_gradient=moves, diffuse_count=16)
+    light = EnvLight(jnp.ones((8, 16, 3)))
+    materials = replace(
+        asset.attributes.materials,
+        albedo=jnp.full_like(asset.attributes.materials.albedo, 0.5),
+        metallic=jnp.zeros_like(asset.attributes.materials.metallic),
+        roughness=jnp.ones_like(asset.attributes.materials.roughness),
+    )
+
+    @jax.jit
+    @partial(jax.value_and_grad, argnums=(0, 1))
+    def run(values, albedo, level):
+        attributes = replace(
+            learning(asset, jnp.zeros(27)),
+            materials=replace(materials, albedo=albedo),
+            indirect=values + jnp.asarray(level)[None, :],
+        )
+        points = asset.splats.points()
+        lit, _ = transport.prepare(jax.random.key(0), points, attributes, light, asset.index)
+        return transport.disagreement(
+            jax.random.key(1), points, attributes, lit, asset.index, count=256
+        )
+
+    zeros = jnp.zeros((asset.splats.opacities.shape[0], 27))
+    found = {}
+    for level in (0.3, 0.54, 0.9):
+        values = jnp.asarray(even_radiance(level), jnp.float32)
+        found[level], (in_values, in_albedo) = run(zeros, materials.albedo, values)
+        # It moves the mean towards what is sent, about .54 with the specular 4 %.
+        pull = float(jnp.sum(in_values @ jnp.asarray(np.tile(EVEN, 3), jnp.float32)))
+        assert level == 0.54 or np.sign(pull) == np.sign(level - 0.54)
+        assert bool(jnp.any(in_albedo != 0)) == (moves == "both")
+    assert found[0.3] == pytest.approx(0.24**2, rel=0.25)
+    assert found[0.9] == pytest.approx(0.36**2, rel=0.25)
+    assert found[0.54] < 0.01
+
+
+@pytest.mark.slow
+def test_faces_that_agree_with_themselves_send_the_light_of_many_bounces(bowl, monkeypatch):
+    """The fixed point of learned radiance in a white bowl, against eight traced bounces."""
+
+    def matt(normal, wi, wo, alpha):
+        lobe = specular_lobe(normal, wi, wo, alpha)
+        return replace(lobe, strength=jnp.zeros_like(lobe.strength))
+
+    specular_lobe = bsdf.specular_lobe
+    monkeypatch.setattr(bsdf, "specular_lobe", matt)
+    for module in (bsdf, indirect_module):
+        monkeypatch.setattr(module, "specular_f0", lambda albedo, metallic: jnp.zeros_like(albedo))
+    asset, inside = bowl
+    light, points = sky(), asset.splats.points()
+    attributes = replace(
+        asset.attributes,
+        materials=Materials(
+            jnp.full_like(asset.attributes.materials.albedo, 0.8),
+            jnp.ones_like(asset.attributes.materials.roughness),
+            jnp.zeros_like(asset.attributes.materials.metallic),
+        ),
+    )
+    counts = {"light_count": 8, "diffuse_count": 8, "specular_count": 1}
+    transport = few(indirect="radiometric", **counts)
+    rule = optax.adam(0.05)
+
+    @jax.jit
+    def step(values, state, key):
+        def disagreement(values):
+            first, second = jax.random.split(key)
+            told = replace(attributes, indirect=values)
+            lit, _ = transport.prepare(first, points, told, light, asset.index)
+            value = transport.disagreement(
+                second, points, told, lit, asset.index, count=values.shape[0]
+            )
+            return value * values.shape[0]
+
+        update, state = rule.update(jax.grad(disagreement)(values), state)
+        return optax.apply_updates(values, update), state
+
+    values = jnp.zeros((points.mask.shape[0], 27))
+    state = rule.init(values)
+    for number in range(300):
+        values, state = step(values, state, jax.random.key(number))
+    found = []
+    for chosen, told in (
+        (transport, replace(attributes, indirect=values)),
+        (few(indirect="traced", bounces=8, **counts), attributes),
+        (few(**counts), attributes),
+    ):
+        lit = prepare(chosen, jax.random.key(5), points, told, light, asset.index)
+        found.append(np.asarray(lit.gathered.diffuse_light)[inside].mean())
+    learned, traced, direct = found
+    assert traced - direct > 0.1 * direct
+    assert learned - direct == pytest.approx(traced - direct, rel=0.1)
 
 
 @pytest.fixture(scope="module")

@@ -519,5 +519,11 @@ def config_warnings(config: Config) -> list[str]:
                 f"stages.{stage.name}.weights.indirect has no effect: the stage learns no indirect "
                 "light"
             )
+        schedule = stage.weights.get("radiometric", Schedule())
+        if not schedule.is_zero and not stage.transport.is_radiometric:
+            warnings.append(
+                f"stages.{stage.name}.weights.radiometric has no effect: set "
+                f"stages.{stage.name}.transport.indirect=radiometric"
+            )
         warnings += [f"stages.{stage.name}.transport.{text}" for text in stage.transport.warnings()]
     return warnings

@@ -126,6 +126,7 @@ def _back(
     pipeline: Pipeline,
     params: Params,
     asset: _Parts,
+    lights: _Parts,
     pulls: tuple[Callable, Callable],
     views: tuple[Any, ViewReport],
     batch: Batch,
@@ -135,16 +136,19 @@ def _back(
     """Add the terms of no view, and go back to the parameters."""
     moving, fixed = asset
     (value, (by_exposure, by_asset, by_light)), report = views
-    from_light, light = pulls[1](by_light)
 
-    def shared_loss(params: Params, moving: Any) -> tuple[Array, dict[str, Array]]:
+    def shared_loss(params: Params, moving: Any, changing: Any) -> tuple[Array, dict[str, Array]]:
         return pipeline.shared_loss(
-            without_gradient(params, frozen), eqx.combine(moving, fixed), batch
+            without_gradient(params, frozen),
+            eqx.combine(moving, fixed),
+            eqx.combine(changing, lights[1]),
+            batch,
         )
 
-    (shared, terms), (direct, from_shared) = jax.value_and_grad(shared_loss, (0, 1), has_aux=True)(
-        params, moving
-    )
+    (shared, terms), (direct, from_shared, shared_by_light) = jax.value_and_grad(
+        shared_loss, (0, 1, 2), has_aux=True
+    )(params, moving, lights[0])
+    from_light, light = pulls[1](jax.tree.map(jnp.add, by_light, shared_by_light))
     (gradient,) = pulls[0](jax.tree.map(lambda *x: sum(x), by_asset, from_light, from_shared))
     gradient = jax.tree.map(jnp.add, gradient, direct)
     gradient = replace(
@@ -203,4 +207,4 @@ def value_and_gradient(
         part = run(_view_gradient, pipeline, exposure, asset, lights, others, listed, view)
         total = part if total is None else run(_plus, total, part)
     pulls = (pull_asset, pull_lights)
-    return run(_back, pipeline, params, asset, pulls, total, batch, carry, frozen)
+    return run(_back, pipeline, params, asset, lights, pulls, total, batch, carry, frozen)

@@ -220,11 +220,12 @@ def transport_problems(rng: np.random.Generator) -> list[Problem]:
                 "specular light": shaded.specular_light,
             }
 
-        shape = (faces, 3) if kind == "traced" else (count, INDIRECT_MODELS[kind].outputs)
+        model = INDIRECT_MODELS[kind]
+        shape = (faces if model.reads_faces else count, model.outputs or 3)
         varied = {**inputs, "indirect": rng.uniform(0.2, 1.0, shape)}
         return Problem(f"transport, indirect {kind}", function, varied, (points, samples, sampler))
 
-    return [problem(kind) for kind in ("constant", "harmonics", "traced")]
+    return [problem(kind) for kind in ("constant", "harmonics", "traced", "radiometric")]
 
 
 def path_problems(rng: np.random.Generator) -> list[Problem]:

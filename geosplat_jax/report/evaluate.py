@@ -9,7 +9,7 @@ import platform
 import time
 from collections.abc import Mapping
 from concurrent.futures import Future
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -209,20 +209,159 @@ def _relight_programs(
     return in_background(render_once)
 
 
+@dataclass(frozen=True)
+class Truth:
+    """What a run is compared with.
+
+    Attributes
+    ----------
+    views : test views; there are metrics of what their ``truth`` and ``relight`` hold.
+    lights : environment maps by the names of ``views.relight``.
+    train_light : true light of the training images, to compare the recovered one with.
+    train_views : those of the training, to count how many of them see each place.
+    """
+
+    views: Views
+    lights: Mapping[str, EnvLight] = field(default_factory=dict)
+    train_light: EnvLight | None = None
+    train_views: Views | None = None
+
+
+@dataclass(frozen=True)
+class EvaluateOptions:
+    """How to measure, and what to show.
+
+    Attributes
+    ----------
+    protocol : one of `protocols.PROTOCOLS`.
+    samples : rays a splat of the images.
+    relight_indirect : see `Renderer.relit`.
+    sheet_views : number of views on the sheets, spread evenly.
+    model_texture : texels along the edge of the model that the report shows; None for no model.
+    """
+
+    protocol: str = protocols.PROTOCOLS[0]
+    samples: int = DEFAULT_SAMPLES
+    relight_indirect: str = "traced"
+    sheet_views: int = 5
+    model_texture: int | None = MODEL_TEXTURE
+
+
+class _Measured(NamedTuple):
+    """Metrics of all views, and what the sheets need beside them.
+
+    Attributes
+    ----------
+    views : metrics of every view.
+    mean : of every metric, by name.
+    rendered : see `_Rendered`.
+    albedo_scale : (3,) factors that the albedo is aligned to the truth with.
+    relit : pictures by title under each light, for every view that is shown.
+    """
+
+    views: list[dict[str, Any]]
+    mean: dict[str, Any]
+    rendered: _Rendered
+    albedo_scale: np.ndarray
+    relit: list[dict[str, np.ndarray]]
+
+
+def _measure(
+    renderer: Renderer,
+    truth: Truth,
+    options: EvaluateOptions,
+    radiance: np.ndarray,
+    on_progress: OnProgress | None,
+) -> _Measured:
+    """Render every view, as trained and under every light, and compare.
+
+    ``radiance`` is the light that was found.
+    """
+    protocol, views = protocols.protocol(options.protocol), truth.views
+    compiled = _relight_programs(renderer, views, truth.lights, options.relight_indirect)
+    chosen = np.unique(np.linspace(0, len(views) - 1, options.sheet_views).round().astype(int))
+    rendered = _render_all(renderer, views, chosen, protocol, on_progress)
+    lines = rendered.metrics
+    names = dict.fromkeys(key for line in lines for key in line if key != "view")
+    mean = {key: float(np.mean([line[key] for line in lines if key in line])) for key in names}
+    materials, scale = _material_metrics(protocol, rendered, views)
+    compiled.result()
+    relights, relit = _relight_metrics(
+        protocol,
+        renderer,
+        views,
+        truth.lights,
+        scale,
+        options.relight_indirect,
+        chosen,
+        on_progress,
+    )
+    mean |= materials | relights
+    if truth.train_light is not None:
+        found = light_metrics(radiance, np.asarray(truth.train_light.radiance))
+        mean |= {key: value for key, value in found.items() if isinstance(value, int | float)}
+    return _Measured(lines, mean, rendered, scale, relit)
+
+
+def _show(
+    renderer: Renderer,
+    truth: Truth,
+    measured: _Measured,
+    folder: Path,
+    protocol: str,
+    radiance: np.ndarray,
+) -> tuple[Shown, dict[str, Any]]:
+    """Write the sheets and pictures; return what they show, and their paths for the metrics."""
+    mesh = renderer.mesh()
+    lights = {"light": radiance}
+    if truth.train_light is not None:
+        lights = {"true light": np.asarray(truth.train_light.radiance)} | lights
+    shown = Shown(
+        views=truth.views,
+        psnr=[line["nvs.psnr"] for line in measured.views],
+        rendered=measured.rendered.shown,
+        mesh=mesh,
+        seen=None if truth.train_views is None else sightings(*mesh, truth.train_views),
+        albedo_scale=measured.albedo_scale,
+        relit=measured.relit,
+        relit_figures=[
+            f"{key.removeprefix('relight.').removesuffix('.psnr')}: {value:.2f} dB, {protocol}"
+            for key, value in measured.mean.items()
+            if key.startswith("relight.") and key.endswith(".psnr")
+        ],
+        lights=lights,
+    )
+    return shown, shown.write(folder)
+
+
+def _write_model(
+    trained: Trained,
+    sampler: MaterialSampler,
+    shown: Shown,
+    lights: Mapping[str, EnvLight],
+    folder: Path,
+    texture_size: int,
+) -> dict[str, Any] | None:
+    """Write the mesh with its materials, and lights to see it under; see `assets.write_model`."""
+    exposed = np.asarray(trained.params.light.radiance) * np.exp(float(trained.params.log_exposure))
+    maps = {name: np.asarray(light.radiance) for name, light in lights.items()}
+    return write_model(
+        folder,
+        shown.mesh,
+        sampler,
+        lights={"light as found": exposed} | maps,
+        eye=shown.views.camera_to_world[0, :3, 3],
+        texture_size=texture_size,
+    )
+
+
 def evaluate_run(
     trained: Trained,
-    views: Views,
+    truth: Truth,
     folder: Path,
+    options: EvaluateOptions = EvaluateOptions(),
     *,
-    meta: dict[str, Any],
-    protocol: str = "geosplatting",
-    lights: Mapping[str, EnvLight] | None = None,
-    train_light: EnvLight | None = None,
-    samples: int = DEFAULT_SAMPLES,
-    relight_indirect: str = "traced",
-    sheet_views: int = 5,
-    train_views: Views | None = None,
-    model_texture: int | None = MODEL_TEXTURE,
+    meta: Mapping[str, Any],
     on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
     """Render every test view, write metrics and sheets, return the metrics.
@@ -237,94 +376,37 @@ def evaluate_run(
     Parameters
     ----------
     trained : see `train.load_trained`.
-    views : test views; metrics need ``truth`` and ``relight`` only where they exist.
+    truth : what to compare with.
     folder : receives the files.
+    options : see `EvaluateOptions`.
     meta : recorded with the metrics (step, scene, training seconds).
-    protocol : one of `protocols.PROTOCOLS`.
-    lights : environment maps by the names of ``views.relight``.
-    train_light : true light of the training images, to compare the recovered one with.
-    samples : rays a splat of the images.
-    relight_indirect : see `Renderer.relit`.
-    sheet_views : number of views on the sheets, spread evenly.
-    train_views : those of the training, to count how many of them see each place.
-    model_texture : texels along the edge of the model that the report shows; None for no model.
     on_progress : see `poses.OnProgress`.
     """
     began = time.perf_counter()
-    chosen_protocol = protocols.protocol(protocol)
-    renderer = Renderer.of(trained, samples=samples)
-    compiled = _relight_programs(renderer, views, lights or {}, relight_indirect)
-    chosen = np.unique(np.linspace(0, len(views) - 1, sheet_views).round().astype(int))
-    rendered = _render_all(renderer, views, chosen, chosen_protocol, on_progress)
-    lines = rendered.metrics
-    names = dict.fromkeys(key for line in lines for key in line if key != "view")
-    mean = {key: float(np.mean([line[key] for line in lines if key in line])) for key in names}
-    materials, scale = _material_metrics(chosen_protocol, rendered, views)
-    compiled.result()
-    relights, relit = _relight_metrics(
-        chosen_protocol,
-        renderer,
-        views,
-        lights or {},
-        scale,
-        relight_indirect,
-        chosen,
-        on_progress,
-    )
-    no_map = sorted(set(views.relight) - set(lights or {}))
-    notes = [protocols.lpips_note(chosen_protocol)]
-    notes += [f"{name}: images but no environment map, so no relit metrics" for name in no_map]
-    mean |= materials | relights
-    radiance = np.asarray(trained.params.light.radiance)
-    if train_light is not None:
-        found = light_metrics(radiance, np.asarray(train_light.radiance))
-        mean |= {key: value for key, value in found.items() if isinstance(value, int | float)}
     tell = on_progress or (lambda part, done, total: None)
+    protocol = protocols.protocol(options.protocol)
+    renderer = Renderer.of(trained, samples=options.samples)
+    radiance = np.asarray(trained.params.light.radiance)
+    measured = _measure(renderer, truth, options, radiance, on_progress)
     tell("pictures and model", 0, 1)
-    mesh = renderer.mesh()
-    seen = None if train_views is None else sightings(*mesh, train_views)
-    by_title = {"true light": None if train_light is None else np.asarray(train_light.radiance)}
-    by_title |= {"light": radiance}
-    figures = [
-        f"{key.removeprefix('relight.').removesuffix('.psnr')}: {value:.2f} dB, {protocol}"
-        for key, value in relights.items()
-        if key.endswith(".psnr")
-    ]
-    shown = Shown(
-        views=views,
-        psnr=[line["nvs.psnr"] for line in lines],
-        rendered=rendered.shown,
-        mesh=mesh,
-        seen=seen,
-        albedo_scale=scale,
-        relit=relit,
-        relit_figures=figures,
-        lights={title: light for title, light in by_title.items() if light is not None},
-    )
-    gallery = shown.write(folder)
-    if model_texture is not None:
-        exposed = radiance * np.exp(float(trained.params.log_exposure))
-        maps = {"light as found": exposed} | {
-            name: np.asarray(light.radiance) for name, light in (lights or {}).items()
-        }
+    shown, gallery = _show(renderer, truth, measured, folder, options.protocol, radiance)
+    if options.model_texture is not None:
         sampler = MaterialSampler(trained, renderer.asset())
-        gallery["model"] = write_model(
-            folder,
-            mesh,
-            sampler,
-            lights=maps,
-            eye=views.camera_to_world[0, :3, 3],
-            texture_size=model_texture,
-        )
+        size = options.model_texture
+        gallery["model"] = _write_model(trained, sampler, shown, truth.lights, folder, size)
     tell("pictures and model", 1, 1)
+    no_map = sorted(set(truth.views.relight) - set(truth.lights))
     metrics = {
-        "protocol": protocol,
-        "notes": notes,
-        "mean": mean,
-        "views": lines,
-        "samples": samples,
+        "protocol": options.protocol,
+        "notes": [
+            protocols.lpips_note(protocol),
+            *(f"{name}: images but no environment map, so no relit metrics" for name in no_map),
+        ],
+        "mean": measured.mean,
+        "views": measured.views,
+        "samples": options.samples,
         "samples_drawn": renderer.samples,
-        "relight_indirect": relight_indirect,
+        "relight_indirect": options.relight_indirect,
         "seconds": round(time.perf_counter() - began, 2),
         "peak_memory_mb": peak_memory_mb(),
         "versions": {
@@ -334,7 +416,7 @@ def evaluate_run(
         "seed": trained.config.run.seed,
         "config": trained.config.to_dict(),
         "gallery": gallery,
-        "seen": None if seen is None else seen.described(),
+        "seen": None if shown.seen is None else shown.seen.described(),
         **meta,
     }
     (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")

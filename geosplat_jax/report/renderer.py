@@ -18,12 +18,12 @@ from geosplat_jax.core import capacity as capacity_module
 from geosplat_jax.core.capacity import Capacities, Usage
 from geosplat_jax.core.color import tone_map
 from geosplat_jax.core.mesh import vertex_normals
-from geosplat_jax.core.types import Camera, EnvLight, Mesh
+from geosplat_jax.core.types import Camera, EnvLight, Mesh, Splats
 from geosplat_jax.fit.cameras import Subject
 from geosplat_jax.fit.train import Trained
 from geosplat_jax.io.images import encode_srgb
 from geosplat_jax.pipeline import Pipeline
-from geosplat_jax.render import Asset, Params, RenderOutput
+from geosplat_jax.render import Asset, Params, RenderOutput, RenderPipeline
 from geosplat_jax.surface.base import Surface
 from geosplat_jax.transport.base import Illumination
 from geosplat_jax.transport.environment import LightSpec
@@ -50,6 +50,9 @@ _PIXEL_PASSES = 2
 """Passes of an image whose points are pixels, to one of an image of splats, of which a pixel
 averages several."""
 
+_HEADROOM = 1.25
+"""Of the lists, over what the first view of a size needs, where they must grow."""
+
 RELIGHT_BOUNCES = 2
 """How often light goes from surface to surface under a new light."""
 
@@ -63,8 +66,14 @@ _vertex_normals = jax.jit(vertex_normals)
 
 
 @partial(jax.jit, static_argnames=("final",))
-def _extract(pipeline: Pipeline, params: Params, *, final: bool) -> Surface:
+def _extract(pipeline: RenderPipeline, params: Params, *, final: bool) -> Surface:
     return pipeline.surface.extract(params.geometry, capacities=pipeline.capacities, final=final)
+
+
+@jax.jit
+def _needs(pipeline: RenderPipeline, splats: Splats, camera: Camera) -> Usage:
+    """Count what the lists of a view need."""
+    return pipeline.visible(splats, camera).usage
 
 
 @dataclass(frozen=True)
@@ -85,9 +94,10 @@ class RenderedView:
 
 def build_asset(pipeline: Pipeline, params: Params) -> Asset:
     """Run what depends on neither light nor view, growing buffers as needed."""
+    unlit = pipeline.unlit()
 
     def attempt(capacities: Capacities) -> tuple[Asset, Usage]:
-        asset = _reconstruct(replace(pipeline, capacities=capacities), params)
+        asset = _reconstruct(replace(unlit, capacities=capacities), params)
         return asset, asset.usage
 
     return capacity_module.retry(attempt, pipeline.capacities)[0]
@@ -151,6 +161,8 @@ class Renderer:
         self._light = params.light
         self._log_exposure = params.log_exposure
         self._albedo_scale = np.ones(3, np.float32)
+        self._keeps_indirect = True
+        self._planned: set[tuple[int, int]] = set()
         self._pipeline = self._for_images(pipeline)
         self._asset: Asset | None = None
         self._illuminations: list[Illumination] = []
@@ -190,12 +202,10 @@ class Renderer:
         indirect : one of `RELIGHT_KINDS`.
         """
         transport = relight_transport(indirect).build(LightSpec())  # keeps no table of a light
-        material = replace(self._params.material, indirect_head=None)
         other = Renderer(
-            replace(self._trained, transport=transport),
-            replace(self._params, material=material),
-            samples=self.samples,
+            replace(self._trained, transport=transport), self._params, samples=self.samples
         )
+        other._keeps_indirect = False
         other._key = self._key
         other._light = light
         other._log_exposure = jnp.zeros(())
@@ -230,9 +240,13 @@ class Renderer:
         """Build surface and splats, once."""
         if self._asset is None:
             asset = build_asset(self._pipeline, self._params)
-            materials = asset.attributes.materials
+            attributes = asset.attributes
+            if not self._keeps_indirect:
+                attributes = replace(attributes, indirect=None)
+            materials = attributes.materials
             materials = replace(materials, albedo=materials.albedo * self._albedo_scale[None, :])
-            self._asset = replace(asset, attributes=replace(asset.attributes, materials=materials))
+            attributes = replace(attributes, materials=materials)
+            self._asset = replace(asset, attributes=attributes)
         return self._asset
 
     def subject(self) -> Subject:
@@ -262,8 +276,24 @@ class Renderer:
         self._illuminations = [prepared.with_parts(mean) for prepared in first]
         return self._illuminations
 
+    def _plan(self, camera: Camera) -> None:
+        """Grow the lists for the first view of a size, before a larger program is compiled."""
+        size, unlit = (camera.height, camera.width), self._pipeline.unlit()
+        if size in self._planned:
+            return
+
+        def attempt(capacities: Capacities) -> tuple[None, Usage]:
+            pipeline = replace(unlit, capacities=capacities)
+            return None, _needs(pipeline, self.asset().splats, camera)
+
+        # Other views of this size may need more than the first.
+        _, capacities = capacity_module.retry(attempt, unlit.capacities, headroom=_HEADROOM)
+        self._pipeline = replace(self._pipeline, capacities=capacities)
+        self._planned.add(size)
+
     def _render(self, camera: Camera, illumination: Illumination, number: int) -> RenderOutput:
         """Render one pass of a view, growing buffers as needed."""
+        self._plan(camera)
         key = jax.random.fold_in(self._key, self._passes + number)
 
         def attempt(capacities: Capacities) -> tuple[RenderOutput, Usage]:
@@ -312,9 +342,10 @@ class Renderer:
 
         ``training`` : the mesh that splats sit on, instead of the one that is exported.
         """
+        unlit = self._pipeline.unlit()
 
         def attempt(capacities: Capacities) -> tuple[Surface, Usage]:
-            pipeline = replace(self._pipeline, capacities=capacities)
+            pipeline = replace(unlit, capacities=capacities)
             surface = _extract(pipeline, self._params, final=not training)
             return surface, surface.usage
 

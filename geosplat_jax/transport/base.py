@@ -9,6 +9,7 @@ import abc
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from geosplat_jax.core.settings import Variant, settings
@@ -140,6 +141,30 @@ class Transport(eqx.Module):
         del alpha, focal
         return images
 
+    def disagreement(
+        self,
+        key: Key[Array, ""],
+        points: SurfacePoints,
+        attributes: Attributes,
+        illumination: Any,
+        index: RayIndex | None,
+        *,
+        count: int,
+    ) -> Float[Array, ""]:
+        """Compare what points have learned to send out with what they do, at random; () mean.
+
+        Zero for a transport that learns no such thing.
+
+        Parameters
+        ----------
+        key : of the points, the directions and their samples.
+        points, attributes, illumination : all N of the surface, as for `prepare`.
+        index : as for `prepare`.
+        count : static; points, each with a direction.
+        """
+        del key, points, attributes, illumination, index, count
+        return jnp.zeros(())
+
     def for_residual(self) -> "Transport | None":
         """Return the transport of an image with samples of its own, whose residual a loss takes.
 
@@ -163,6 +188,32 @@ class Transport(eqx.Module):
         return self
 
 
+class Unlit(Transport):
+    """No light at all, in the place of another transport where none is needed.
+
+    Programs that only differ in the light are then one program.
+
+    Attributes
+    ----------
+    traces : whether the other one traces rays.
+    """
+
+    traces: bool = eqx.field(static=True)
+
+    @property
+    def uses_rays(self) -> bool:
+        """As the other one."""
+        return self.traces
+
+    def prepare(self, *arguments: Any, **named: Any) -> tuple[Illumination, Any]:
+        """Refuse."""
+        raise TypeError("there is no light to prepare")
+
+    def shade(self, *arguments: Any, **named: Any) -> Shaded:
+        """Refuse."""
+        raise TypeError("there is no light to shade with")
+
+
 @settings
 class TransportSettings(Variant, abc.ABC):
     """Settings of a light transport; every kind of them is a subclass."""
@@ -171,6 +222,11 @@ class TransportSettings(Variant, abc.ABC):
     def indirect_outputs(self) -> int:
         """Learned numbers of indirect light per point."""
         return 0
+
+    @property
+    def is_radiometric(self) -> bool:
+        """Whether points learn what they send out, which `Transport.disagreement` checks."""
+        return False
 
     @property
     def relative_cost(self) -> float:

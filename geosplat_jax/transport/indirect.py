@@ -8,6 +8,8 @@ Each model is a class:
   degree 2 (the paper).
 - `TracedIndirect`: what the point that is hit sends out. It learns nothing and holds under any
   light.
+- `RadiometricIndirect`: what the point that is hit has learned to send out, which a term of the
+  loss compares with what it does send out (Radiometrically Consistent Gaussian Surfels, 2025).
 - `KnownIndirect`: a radiance for every single ray, from whoever followed it further.
 
 An `IndirectSource` becomes one of them once it is known where rays end.
@@ -65,16 +67,15 @@ class Indirect(IndirectSource):
     Attributes
     ----------
     outputs : learned numbers per point.
+    belongs_to_points : whether a row of the values is a point.
+    reads_faces : whether it is a face, the one that a ray hits.
     values : what it knows, or None.
     """
 
     outputs: ClassVar[int] = 0
+    belongs_to_points: ClassVar[bool] = False
+    reads_faces: ClassVar[bool] = False
     values: Any
-
-    @property
-    def belongs_to_points(self) -> bool:
-        """Whether a row of the values is a point."""
-        return self.outputs > 0
 
     def followed(
         self,
@@ -126,6 +127,7 @@ class ConstantIndirect(Indirect):
     """(N, 6) logits: the radiance of the diffuse lobe, then that of the specular lobe."""
 
     outputs: ClassVar[int] = 6
+    belongs_to_points: ClassVar[bool] = True
     values: Float[Array, "N 6"]
 
     def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
@@ -138,19 +140,19 @@ class HarmonicIndirect(Indirect):
     """(N, 27) coefficients of spherical harmonics, colour by colour."""
 
     outputs: ClassVar[int] = 27
+    belongs_to_points: ClassVar[bool] = True
     values: Float[Array, "N 27"]
 
     def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
         """Evaluate the harmonics; both lobes see the same."""
-        basis = jax.lax.stop_gradient(harmonics(directions, degree=_DEGREE))
-        colors = [jnp.sum(self.values[:, 9 * c : 9 * c + 9] * basis, axis=-1) for c in range(3)]
-        radiance = jax.nn.sigmoid(jnp.stack(colors, axis=-1) - _OFFSET)
+        radiance = jax.nn.sigmoid(_colors(self.values, directions) - _OFFSET)
         return radiance, radiance
 
 
 class TracedIndirect(Indirect):
     """(F, 3) radiance that each face sends out."""
 
+    reads_faces: ClassVar[bool] = True
     values: Float[Array, "F 3"]
 
     def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
@@ -160,15 +162,25 @@ class TracedIndirect(Indirect):
         return radiance, radiance
 
 
+class RadiometricIndirect(Indirect):
+    """(F, 27) coefficients of the radiance that each face sends out, colour by colour."""
+
+    outputs: ClassVar[int] = 27
+    reads_faces: ClassVar[bool] = True
+    values: Float[Array, "F 27"]
+
+    def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
+        """Evaluate the harmonics of the face that is hit, towards where the ray comes from."""
+        values = self.values.at[jnp.maximum(hits, 0)].get(mode="clip")
+        radiance = jnp.where((hits >= 0)[:, None], learned_radiance(values, -directions), 0.0)
+        return radiance, radiance
+
+
 class KnownIndirect(Indirect):
-    """(N, S, 3) radiance of the rays themselves."""
+    """(N, S, 3) radiance of the rays themselves; a row is a point, with all its rays."""
 
+    belongs_to_points: ClassVar[bool] = True
     values: Float[Array, "N S 3"]
-
-    @property
-    def belongs_to_points(self) -> bool:
-        """A row is a point, with all its rays."""
-        return True
 
     def along(self, directions: Float[Array, "S N 3"], hits: Int[Array, "S N"]) -> RayLobes:
         """Return what is known."""
@@ -186,10 +198,47 @@ INDIRECT_MODELS: dict[str, type[Indirect]] = {
     "constant": ConstantIndirect,
     "harmonics": HarmonicIndirect,
     "traced": TracedIndirect,
+    "radiometric": RadiometricIndirect,
 }
 """Models by the name that settings use."""
 
 NO_INDIRECT = NoIndirect()
+
+
+def _colors(values: Float[Array, "N 27"], directions: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
+    """Sum up harmonics, colour by colour; directions are constants."""
+    basis = jax.lax.stop_gradient(harmonics(directions, degree=_DEGREE))
+    colors = [jnp.sum(values[:, 9 * c : 9 * c + 9] * basis, axis=-1) for c in range(3)]
+    return jnp.stack(colors, axis=-1)
+
+
+def learned_radiance(
+    values: Float[Array, "N 27"], directions: Float[Array, "N 3"]
+) -> Float[Array, "N 3"]:
+    """Radiance that N points have learned to send along unit directions, without an upper bound.
+
+    ``softplus(x - 3)``; differentiable in the values only.
+    """
+    return jax.nn.softplus(_colors(values, directions) - _OFFSET)
+
+
+def mean_over_faces(
+    points: SurfacePoints, values: Float[Array, "N c"], face_count: int
+) -> Float[Array, "F c"]:
+    """Average values of points over the face that each belongs to; zero for faces without points.
+
+    Differentiable in the values.
+
+    Parameters
+    ----------
+    points, values : N rows; those that the mask leaves out do not count.
+    face_count : static; rows to return.
+    """
+    ones = jnp.ones((values.shape[0], 1), values.dtype)
+    rows = jnp.where(points.mask[:, None], jnp.concatenate([values, ones], axis=1), 0.0)
+    row = jnp.where(points.faces < 0, face_count, points.faces)
+    total = jnp.zeros((face_count, rows.shape[1]), rows.dtype).at[row].add(rows, mode="drop")
+    return safe_divide(total[:, :-1], total[:, -1:])
 
 
 def outgoing(
@@ -211,12 +260,4 @@ def outgoing(
     """
     matt = materials.albedo * (1 - materials.metallic)[:, None]
     glossy = specular_f0(materials.albedo, materials.metallic)
-    radiance = jnp.where(points.mask[:, None], (matt + glossy) * diffuse_light, 0.0)
-    row = jnp.where(points.faces < 0, face_count, points.faces)
-    total = jnp.zeros((face_count, 3), radiance.dtype).at[row].add(radiance, mode="drop")
-    count = (
-        jnp.zeros((face_count,), radiance.dtype)
-        .at[row]
-        .add(points.mask.astype(radiance.dtype), mode="drop")
-    )
-    return safe_divide(total, count[:, None])
+    return mean_over_faces(points, (matt + glossy) * diffuse_light, face_count)

@@ -43,7 +43,10 @@ from geosplat_jax.transport.indirect import (
     NO_INDIRECT,
     Indirect,
     IndirectSource,
+    RadiometricIndirect,
     TracedIndirect,
+    learned_radiance,
+    mean_over_faces,
     outgoing,
 )
 from geosplat_jax.transport.light_sampling import LightSampler, light_sampler
@@ -298,13 +301,13 @@ class MonteCarloIllumination(Illumination):
     Attributes
     ----------
     light, sampler : environment and its tables.
-    traced : indirect light by face, where it is traced.
+    traced : indirect light by face, where there is such a thing.
     gathered : what arrives at every point, where views share it.
     """
 
     light: EnvLight
     sampler: LightSampler
-    traced: TracedIndirect | None
+    traced: Indirect | None
     gathered: Gathered | None
 
     def take(self, rows: Int[Array, " M"]) -> "MonteCarloIllumination":
@@ -313,7 +316,7 @@ class MonteCarloIllumination(Illumination):
         return replace(self, gathered=gathered)
 
     def averaged_parts(self) -> Any:
-        """Return diffuse light, and traced indirect light."""
+        """Return diffuse light, and indirect light by face."""
         return (
             None if self.gathered is None else self.gathered.diffuse_light,
             None if self.traced is None else self.traced.values,
@@ -466,10 +469,18 @@ class MonteCarloSettings(SampledSettings, TransportSettings, kind="monte_carlo")
     occlusion: bool = True
     """Trace rays against the surface; without it only directions below a point's own face are
     blocked."""
-    indirect: Literal["none", "constant", "harmonics", "traced"] = "none"
+    indirect: Literal["none", "constant", "harmonics", "traced", "radiometric"] = "none"
     """Light from blocked directions, see `transport.indirect`."""
     bounces: Annotated[int, Field(ge=1, le=16)] = 1
     """For traced indirect light, how often light goes from surface to surface."""
+    radiometric_gradient: Literal["learned", "both"] = "learned"
+    """For radiometric indirect light, what the term of the loss moves: the radiance that was
+    learned, or what it is compared with as well."""
+
+    @property
+    def is_radiometric(self) -> bool:
+        """Where indirect light is."""
+        return self.indirect == "radiometric"
 
     @property
     def indirect_outputs(self) -> int:
@@ -484,9 +495,10 @@ class MonteCarloSettings(SampledSettings, TransportSettings, kind="monte_carlo")
 
     def warnings(self) -> list[str]:
         """Say that traced light needs rays."""
-        if self.indirect == "traced" and not self.occlusion:
+        if INDIRECT_MODELS[self.indirect].reads_faces and not self.occlusion:
             return [
-                "indirect = traced has no effect without occlusion: blocked directions are black"
+                f"indirect = {self.indirect} has no effect without occlusion: blocked directions "
+                "are black"
             ]
         return []
 
@@ -508,16 +520,28 @@ class MonteCarlo(SampledTransport):
 
     @property
     def needs_every_point(self) -> bool:
-        """Where indirect light is traced."""
-        return self.settings.indirect == "traced" and self.settings.occlusion
+        """Where the faces that are hit send indirect light."""
+        return self._model.reads_faces and self.settings.occlusion
+
+    @property
+    def _model(self) -> type[Indirect]:
+        return INDIRECT_MODELS[self.settings.indirect]
 
     def _finds_nearest(self, index: RayIndex | None) -> bool:
-        return self.settings.indirect == "traced" and index is not None
+        return self._model.reads_faces and index is not None
 
     def _learned(self, attributes: Attributes) -> Indirect:
         """Indirect light that belongs to points."""
-        model = INDIRECT_MODELS[self.settings.indirect]
-        return model(attributes.indirect) if model.outputs else NO_INDIRECT
+        return self._model(attributes.indirect) if self._model.belongs_to_points else NO_INDIRECT
+
+    def _by_face(
+        self, points: SurfacePoints, attributes: Attributes, face_count: int
+    ) -> RadiometricIndirect | None:
+        """Indirect light that faces have learned to send."""
+        if not self.settings.is_radiometric:
+            return None
+        assert attributes.indirect is not None
+        return RadiometricIndirect(mean_over_faces(points, attributes.indirect, face_count))
 
     def prepare(
         self,
@@ -540,13 +564,17 @@ class MonteCarlo(SampledTransport):
         sampler = light_sampler(light)
         finds_nearest = self._finds_nearest(index)
         gathered, traced = None, None
-        if self.settings.shares_views or finds_nearest:
+        if finds_nearest:
+            assert index is not None
+            traced = self._by_face(points, attributes, index.face_capacity)
+        is_traced = finds_nearest and traced is None
+        if self.settings.shares_views or is_traced:
             samples, carry = self._draw_shared(
                 key, points, light, sampler, index, carry, finds_nearest=finds_nearest
             )
-            gathered = gather(points, samples, light, self._learned(attributes))
+            gathered = gather(points, samples, light, traced or self._learned(attributes))
             # Traced indirect light is what it was, one bounce ago.
-            for _ in range(self.settings.bounces if finds_nearest else 0):
+            for _ in range(self.settings.bounces if is_traced else 0):
                 assert index is not None
                 sent = outgoing(
                     attributes.materials, gathered.diffuse_light, points, index.face_capacity
@@ -591,3 +619,36 @@ class MonteCarlo(SampledTransport):
             open_only=open_only,
             **how,
         )
+
+    def disagreement(
+        self,
+        key: Key[Array, ""],
+        points: SurfacePoints,
+        attributes: Attributes,
+        illumination: MonteCarloIllumination,
+        index: RayIndex | None,
+        *,
+        count: int,
+    ) -> Float[Array, ""]:
+        """Mean squared difference of learned and sampled radiance, where the first is learned.
+
+        Points are drawn evenly, directions by the cosine. Of squares, the noise of samples leaves
+        the gradient of what is learned unbiased; see ``radiometric_gradient``.
+        """
+        if not self.settings.is_radiometric:
+            return jnp.zeros(())
+        row_key, direction_key, sample_key = jax.random.split(key, 3)
+        # Real rows come first.
+        total = jnp.sum(points.mask).astype(jnp.float32)
+        drawn = jax.random.uniform(row_key, (count,), jnp.float32)
+        rows = jnp.floor(drawn * total).astype(jnp.int32)
+        points, attributes = jax.tree.map(lambda x: x[rows], (points, attributes))
+        numbers = jax.random.uniform(direction_key, (count, 2), jnp.float32)
+        wo = bsdf.sample_cosine(points.outward, numbers.astype(points.outward.dtype))
+        shaded = self.shade(sample_key, points, attributes, wo, illumination.take(rows), index).rgb
+        if self.settings.radiometric_gradient == "learned":
+            shaded = jax.lax.stop_gradient(shaded)
+        assert attributes.indirect is not None
+        squared = (learned_radiance(attributes.indirect, wo) - shaded) ** 2
+        seen = points.mask.astype(squared.dtype)
+        return safe_divide(jnp.sum(squared * seen[:, None]), 3.0 * jnp.sum(seen))

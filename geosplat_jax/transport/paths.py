@@ -39,7 +39,7 @@ from geosplat_jax.rays.base import RayIndex
 from geosplat_jax.transport import bsdf
 from geosplat_jax.transport.base import Shaded, TransportSettings
 from geosplat_jax.transport.environment import LightSpec, lookup
-from geosplat_jax.transport.indirect import IndirectSource, KnownIndirect
+from geosplat_jax.transport.indirect import IndirectSource, KnownIndirect, mean_over_faces
 from geosplat_jax.transport.light_sampling import (
     LightSampler,
     light_density,
@@ -91,12 +91,8 @@ def face_table(points: SurfacePoints, materials: Materials, face_count: int) -> 
     """
     shine = jnp.stack([materials.roughness, materials.metallic], axis=1)
     outward = jax.lax.stop_gradient(points.outward)
-    ones = jnp.ones_like(materials.roughness)[:, None]
-    values = jnp.concatenate([materials.albedo, shine, points.normals, outward, ones], axis=1)
-    values = jnp.where(points.mask[:, None], values, 0.0)
-    row = jnp.where(points.faces < 0, face_count, points.faces)
-    total = jnp.zeros((face_count, values.shape[1]), values.dtype).at[row].add(values, mode="drop")
-    mean = safe_divide(total, total[:, -1:])
+    values = jnp.concatenate([materials.albedo, shine, points.normals, outward], axis=1)
+    mean = mean_over_faces(points, values, face_count)
     return FaceTable(
         Materials(mean[:, :3], mean[:, 3], mean[:, 4]),
         safe_normalize(mean[:, 5:8]),
