@@ -11,6 +11,7 @@ from typing import Any
 from geosplat_jax.core.types import Batch
 from geosplat_jax.fit.devices import ONE_DEVICE, Devices
 from geosplat_jax.fit.gradient import SharedBatch
+from geosplat_jax.fit.memory import require_program_memory
 from geosplat_jax.fit.runtime import in_background
 from geosplat_jax.fit.step import TrainState, UpdateRule, train_step
 from geosplat_jax.pipeline import Pipeline
@@ -28,7 +29,8 @@ def compile_step(
 ) -> None:
     """Compile the programs of `step.train_step` for arguments of these shapes; run none of them.
 
-    A later call with such arguments finds them compiled.
+    A later call with such arguments finds them compiled. What does not fit into the memory is
+    refused, see `memory.require_program_memory`.
 
     Parameters
     ----------
@@ -45,7 +47,9 @@ def compile_step(
         def finish() -> None:
             with free:
                 if is_wanted():
-                    traced.lower().compile()
+                    require_program_memory(
+                        program.__name__, traced.lower().compile(), devices.count_here
+                    )
 
         compiling.append(in_background(finish))
         return devices.shapes(traced.out_info)

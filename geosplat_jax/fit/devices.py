@@ -43,6 +43,8 @@ class Devices:
 
     count = 1
     """Devices of all hosts."""
+    count_here = 1
+    """Those of this process."""
     is_first_host = True
     """Whether this process is the one that writes the run's folder."""
 
@@ -125,6 +127,7 @@ class ManyDevices(Devices):
     def __init__(self, devices: list[Any]) -> None:
         self.mesh = Mesh(np.array(devices), (_AXIS,), axis_types=(AxisType.Explicit,))
         self.count = len(devices)
+        self.count_here = len(self._mine)
         self.is_first_host = jax.process_index() == 0
         self._placed: dict[int, tuple[Any, Any]] = {}
 
