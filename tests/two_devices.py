@@ -111,7 +111,8 @@ def main():
         np.savez(folder / "gradient.npz", apart=found["apart"], **arrays)
         return
     port, host = rest
-    connect_hosts("2", host=int(host), coordinator=f"localhost:{port}")
+    # Machines of tests may stand still for minutes.
+    connect_hosts("2", host=int(host), coordinator=f"localhost:{port}", patience=3600)
     said, leaves = trained(folder / "run", int(host))
     (folder / f"host{host}.json").write_text(json.dumps(said))
     np.savez(folder / f"host{host}.npz", *leaves)

@@ -444,7 +444,9 @@ def choose_devices(count: int = 1) -> Devices:
     return ManyDevices([d for _, mine in sorted(by_process.items()) for d in mine[:count]])
 
 
-def connect_hosts(hosts: str, *, host: int | None = None, coordinator: str | None = None) -> None:
+def connect_hosts(
+    hosts: str, *, host: int | None = None, coordinator: str | None = None, patience: int = 100
+) -> None:
     """Make this process one of several; call it before jax computes anything.
 
     Parameters
@@ -452,6 +454,7 @@ def connect_hosts(hosts: str, *, host: int | None = None, coordinator: str | Non
     hosts : number of processes; ``auto`` for what Slurm, Open MPI, Kubernetes or a TPU pod say.
     host : number of this one, from 0.
     coordinator : ADDRESS:PORT of the process 0, which all others can reach.
+    patience : seconds without a sign of life after which a process is taken for dead.
 
     Raises
     ------
@@ -460,7 +463,9 @@ def connect_hosts(hosts: str, *, host: int | None = None, coordinator: str | Non
     """
     known = {} if hosts == "auto" else {"num_processes": int(hosts), "process_id": host}
     try:
-        jax.distributed.initialize(coordinator_address=coordinator, **known)
+        jax.distributed.initialize(
+            coordinator_address=coordinator, heartbeat_timeout_seconds=patience, **known
+        )
     except (ValueError, RuntimeError) as error:
         first = str(error).splitlines()[0]
         raise TrainingError(f"the hosts cannot be connected: {first}") from error
