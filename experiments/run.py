@@ -2,10 +2,13 @@
 
 ``python experiments/run.py SWEEP.toml --scenes ROOT --output DIR`` leaves a run folder
 ``DIR/SCENE/NAME`` for every run, and ``DIR/sweep.json`` for ``experiments/report.py``. The same
-command goes on where an earlier one stopped. `read_sweep` says what a sweep file may hold.
+command goes on where an earlier one stopped. With ``--cluster slurm`` or ``--cluster local`` it
+hands runs to `submitit` (the extra ``cluster``), up to ``--parallel`` at a time, and waits for
+them; see `cluster`. `read_sweep` says what a sweep file may hold.
 """
 
 import argparse
+import fnmatch
 import json
 import math
 import os
@@ -13,6 +16,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 import tomllib
 import traceback
 from collections import deque
@@ -21,16 +25,21 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cluster
 from report import command_line
 
-from geosplat_jax.fit.config import Config, config_from_dict, differences
-from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.config import Config, all_settings, config_from_dict, differences
+from geosplat_jax.fit.presets import QUALITIES, make_config
 from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
 from geosplat_jax.fit.train import Interrupted
 from geosplat_jax.io.checkpoints import latest_checkpoint
+from geosplat_jax.io.dataset import load_recorded
 from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.renderer import DEFAULT_SAMPLES, RELIGHT_KINDS
 from geosplat_jax.run import Run, train
+
+_POLL_SECONDS = 2.0
+"""Between two looks at what was submitted."""
 
 _FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _KINDS: dict[str, Callable[[Any], bool]] = {
@@ -50,7 +59,8 @@ _SWEEP_KEYS = {
 _RUN_KEYS = {
     **dict.fromkeys(("name", "title", "group"), "a text"),
     "set": "a list of texts",
-    "evaluate": "a table",
+    **dict.fromkeys(("evaluate", "scale"), "a table"),
+    "downscale": "a positive integer",
     "x": "a finite number",
 }
 _EVALUATE_KEYS = {"protocol": "a text", "relight_indirect": "a text"}
@@ -75,6 +85,7 @@ class SweepRun:
     evaluate: dict[str, Any]
     x: float | None
     group: str
+    downscale: int
 
 
 @dataclass(frozen=True)
@@ -121,6 +132,7 @@ class Job:
     source, first_stage : run folder whose stages to take over, and the first one to train; None
         to train all of them.
     evaluate : keyword arguments of `Run.evaluate`; None leaves evaluation out.
+    evaluate_options : how to read the scene for the evaluation; None as for the training.
     """
 
     label: str
@@ -131,6 +143,7 @@ class Job:
     source: str | None
     first_stage: str | None
     evaluate: dict[str, Any] | None
+    evaluate_options: dict[str, Any] | None = None
 
 
 def _check_keys(
@@ -161,7 +174,40 @@ def _check_names(names: Iterable[str], what: str, where: str) -> None:
         seen[name.lower()] = name
 
 
-def _read_run(values: dict[str, Any], where: str) -> SweepRun:
+def _numbers(config: Config) -> dict[str, float]:
+    """Return the settings that are numbers, by path."""
+    return {path: value for path, value, *_ in all_settings(config) if _is_number(value)}
+
+
+def has_numbers(config: Config, pattern: str) -> bool:
+    """Whether a number of the settings has such a path; ``*`` stands for anything."""
+    return any(fnmatch.fnmatchcase(path, pattern) for path in _numbers(config))
+
+
+def scaled(base: Config, factors: dict[str, Any], where: str) -> tuple[str, ...]:
+    """Write numbers of some settings as overrides, times factors; ``*`` stands for anything.
+
+    Counts are rounded; what is left out stays out, and what is there stays.
+    """
+    overrides, numbers = [], _numbers(base)
+    for pattern, factor in factors.items():
+        if not _is_number(factor) or factor <= 0:
+            raise SweepError(f"{where}, scale: {pattern} must be a factor above 0, got {factor!r}")
+        paths = [path for path in numbers if fnmatch.fnmatchcase(path, pattern)]
+        if not paths:
+            raise SweepError(f"{where}, scale: no number is called {pattern}")
+        for path in paths:
+            now, value = numbers[path], numbers[path] * factor
+            is_count = type(now) is int
+            overrides.append(f"{path}={max(round(value), min(now, 1)) if is_count else value}")
+    return tuple(overrides)
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float)
+
+
+def _read_run(values: dict[str, Any], where: str, base: Config, downscale: int) -> SweepRun:
     """Read one [[run]] table."""
     _check_keys(values, _RUN_KEYS, ("name",), where)
     where = f"{where} {values['name']!r}"
@@ -177,8 +223,9 @@ def _read_run(values: dict[str, Any], where: str) -> SweepRun:
     return SweepRun(
         name=values["name"],
         title=values.get("title", values["name"]),
-        overrides=tuple(values.get("set", ())),
+        overrides=(*scaled(base, values.get("scale", {}), where), *values.get("set", ())),
         evaluate=evaluate,
+        downscale=values.get("downscale", downscale),
         x=float(values["x"]) if "x" in values else None,
         group=values.get("group", "x"),
     )
@@ -213,7 +260,7 @@ def _check_settings(sweep: Sweep, where: str) -> None:
                 )
 
 
-def read_sweep(path: Path, *, overrides: Iterable[str] = ()) -> Sweep:
+def read_sweep(path: Path, *, overrides: Iterable[str] = (), quality: str | None = None) -> Sweep:
     """Read and validate a sweep file.
 
     Parameters
@@ -222,10 +269,13 @@ def read_sweep(path: Path, *, overrides: Iterable[str] = ()) -> Sweep:
         (see `presets.make_config`), ``scenes`` (folder names), ``set`` (overrides of every run),
         ``figures`` (names of ``metrics.json`` to tabulate), ``samples`` of the evaluation,
         ``downscale`` of the images, and tables ``[[run]]`` with ``name``, ``title``, ``set``,
+        ``scale`` (factors of settings by path, in which ``*`` stands for any stage),
+        ``downscale`` of the images that it is trained on (all are evaluated on the sweep's),
         ``evaluate`` (keyword arguments of `Run.evaluate`), ``x`` (the run is a point of a
         curve) and ``group`` (which curve). The first run is the reference. Required are ``title``,
         ``scenes``, ``figures``, one run, and each run's ``name``.
     overrides : applied to every run after ``set`` and before its own.
+    quality : instead of the file's.
 
     Raises
     ------
@@ -243,20 +293,30 @@ def read_sweep(path: Path, *, overrides: Iterable[str] = ()) -> Sweep:
             raise SweepError(f"{where}: {key} must not be empty")
     if len(set(values["figures"])) < len(values["figures"]):
         raise SweepError(f"{where}: figures must not name one twice, got {values['figures']}")
+    usual = {
+        "preset": values.get("preset", "default"),
+        "quality": quality or values.get("quality", "standard"),
+        "material_prior": values.get("material_prior", "hybrid"),
+        "overrides": (*values.get("set", ()), *overrides),
+    }
+    try:
+        base = make_config(**usual)
+    except ValueError as error:
+        raise SweepError(f"{where}: {error}") from error
+    downscale = values.get("downscale", 1)
     tables = enumerate(values["run"], 1)
     sweep = Sweep(
         file=path.name,
         title=values["title"],
         about=values.get("about", "").strip(),
-        preset=values.get("preset", "default"),
-        quality=values.get("quality", "standard"),
-        material_prior=values.get("material_prior", "hybrid"),
+        **usual,
         scenes=tuple(values["scenes"]),
-        overrides=(*values.get("set", ()), *overrides),
         figures=tuple(values["figures"]),
         samples=values.get("samples", DEFAULT_SAMPLES),
-        downscale=values.get("downscale", 1),
-        runs=tuple(_read_run(table, f"{where}, run {number}") for number, table in tables),
+        downscale=downscale,
+        runs=tuple(
+            _read_run(table, f"{where}, run {number}", base, downscale) for number, table in tables
+        ),
     )
     _check_names(sweep.scenes, "scene", where)
     _check_names((run.name for run in sweep.runs), "run", where)
@@ -266,7 +326,9 @@ def read_sweep(path: Path, *, overrides: Iterable[str] = ()) -> Sweep:
 
 def homes(sweep: Sweep) -> dict[str, str]:
     """Name for every run the first one with the same settings and evaluation: it is run once."""
-    settings = {run.name: (sweep.config(run), sweep.evaluation(run)) for run in sweep.runs}
+    settings = {
+        run.name: (sweep.config(run), sweep.evaluation(run), run.downscale) for run in sweep.runs
+    }
     names = list(settings)
     return {name: next(n for n in names if settings[n] == settings[name]) for name in names}
 
@@ -309,6 +371,7 @@ class Part:
     source : folder of the part whose stages it takes over; None for none.
     first_stage : name of the first stage that it trains itself; None with ``source``.
     run : None for stages that several runs share.
+    downscale : of the images that it is trained on.
     """
 
     folder: str
@@ -316,6 +379,7 @@ class Part:
     source: str | None
     first_stage: str | None
     run: SweepRun | None
+    downscale: int
 
 
 def parts_of(sweep: Sweep) -> dict[str, Part]:
@@ -323,9 +387,18 @@ def parts_of(sweep: Sweep) -> dict[str, Part]:
 
     Shared stages lie in ``_RUN.STAGE``: the first run that has them, and the last of them; names of
     runs start with a letter or a digit. A run that ends with the shared stages is a source itself.
+    Runs that are trained on images of other sizes share nothing.
     """
-    where = homes(sweep)
+    where, parts = homes(sweep), {}
     runs = [run for run in sweep.runs if where[run.name] == run.name]
+    for factor in dict.fromkeys(run.downscale for run in runs):
+        parts |= _parts_of(sweep, [run for run in runs if run.downscale == factor])
+    return parts
+
+
+def _parts_of(sweep: Sweep, runs: list[SweepRun]) -> dict[str, Part]:
+    """List the parts of runs that are trained on the same images."""
+    downscale = runs[0].downscale
     configs = {run.name: sweep.config(run) for run in runs}
     wanted: list[Config] = []
     for name, config in configs.items():
@@ -343,9 +416,9 @@ def parts_of(sweep: Sweep) -> dict[str, Part]:
             if len(first.stages) < count and _begins(first, config)
         ]
         if not before:
-            return Part(folder, config, None, None, run)
+            return Part(folder, config, None, None, run, downscale)
         length, source = max(before)
-        return Part(folder, config, source, config.active_stages[length].name, run)
+        return Part(folder, config, source, config.active_stages[length].name, run, downscale)
 
     shared = [
         part(folder, first, None)
@@ -384,7 +457,7 @@ def plan(
     """
     where, parts, jobs = homes(sweep), parts_of(sweep), []
     wanted = {where[name] for name in names}
-    options = {"downscale": sweep.downscale, "light": None, "bounds": None}
+    usual = {"downscale": sweep.downscale, "light": None, "bounds": None}
     for scene in scenes:
 
         def job(part: Part, scene: str = scene) -> Job:
@@ -394,10 +467,11 @@ def plan(
                 scene=str((root / scene).resolve()),
                 folder=str(output / scene / part.folder),
                 config=part.config.to_dict(),
-                options=options,
+                options=usual | {"downscale": part.downscale},
                 source=None if part.source is None else str(output / scene / part.source),
                 first_stage=part.first_stage,
                 evaluate=sweep.evaluation(part.run) if part.run and is_wanted else None,
+                evaluate_options=None if part.downscale == sweep.downscale else usual,
             )
 
         all_jobs = {name: job(part) for name, part in parts.items()}
@@ -469,9 +543,12 @@ def check_folders(jobs: Iterable[Job]) -> None:
         )
 
 
-def _evaluate(folder: Path, **arguments: Any) -> None:
-    """Evaluate the run in a folder."""
-    Run(folder).evaluate(**arguments)
+def _evaluate(folder: Path, reading: dict[str, Any] | None = None, **arguments: Any) -> None:
+    """Evaluate the run in a folder, on images as it was trained on or read in another way."""
+    run = Run(folder)
+    if reading is not None:
+        run.dataset = load_recorded(run.folder.record()["scene"], reading)
+    run.evaluate(**arguments)
 
 
 def execute(
@@ -503,7 +580,8 @@ def execute(
             **job.options,
         )
     if job.evaluate is not None:
-        evaluate(folder, **job.evaluate)
+        reading = {} if job.evaluate_options is None else {"reading": job.evaluate_options}
+        evaluate(folder, **job.evaluate, **reading)
         # Last, so that an evaluation without it was interrupted.
         (folder / "evaluation.json").write_text(json.dumps(job.evaluate, indent=2) + "\n")
 
@@ -598,6 +676,98 @@ def run_jobs(jobs: list[Job], *, start: Callable[[Job], None] = in_a_process) ->
     return failed
 
 
+def cluster_of(arguments: argparse.Namespace) -> Any:
+    """Return the executor that the options ask for; None to run here, one after the other.
+
+    Raises
+    ------
+    SweepError
+        If submitit is missing, or does not know what it is told.
+    """
+    if arguments.parallel < 1:
+        raise SweepError(f"--parallel must be at least 1, got {arguments.parallel}")
+    if arguments.cluster is None:
+        if arguments.cluster_set or arguments.parallel > 1:
+            raise SweepError("--cluster-set and --parallel belong to --cluster")
+        return None
+    parameters = {}
+    for text in arguments.cluster_set:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise SweepError(f"--cluster-set reads NAME=VALUE, got {text!r}")
+        try:
+            parameters[name] = tomllib.loads(f"value = {value}")["value"]
+        except tomllib.TOMLDecodeError:
+            parameters[name] = value
+    try:
+        return cluster.executor(arguments.output / "_cluster", arguments.cluster, parameters)
+    except (ImportError, ValueError, RuntimeError, TypeError, NameError) as error:
+        raise SweepError(f"--cluster {arguments.cluster}: {error}") from error
+
+
+def run_on_cluster(jobs: list[Job], executor: Any, *, parallel: int) -> list[Job]:
+    """Do the jobs side by side and return those that failed; sources before what needs them.
+
+    As `run_jobs`, but for the order. Ctrl-C cancels what was submitted; the same command goes on.
+    """
+    failed: list[Job] = []
+    left, running = list(jobs), {}
+    try:
+        while left or running:
+            for job in list(left):
+                if len(running) >= parallel:
+                    break
+                state = _state(job, left, running, failed)
+                if state == "waits":
+                    continue
+                left.remove(job)
+                head = f"[{len(jobs) - len(left)}/{len(jobs)}] {job.label}"
+                (Path(job.folder) / "error.txt").unlink(missing_ok=True)
+                if state == "finished":
+                    _say(f"{head}: finished already")
+                elif state == "lost":
+                    name = Path(job.source or "").name
+                    _note_failure(job, f"the stages to take over failed; see ../{name}/error.txt")
+                    failed.append(job)
+                else:
+                    command = [sys.executable, str(Path(__file__).resolve()), "--job"]
+                    submitted = cluster.submit(executor, [*command, json.dumps(asdict(job))])
+                    running[job.label] = (job, submitted)
+                    _say(f"{head}: submitted as {submitted.job_id}")
+            for label, (job, submitted) in list(running.items()):
+                if not submitted.done():
+                    continue
+                del running[label]
+                error = submitted.exception()
+                if error is None and is_finished(job):
+                    _say(f"{label}: done")
+                else:
+                    _note_failure(job, str(error or "it ended without its figures"))
+                    failed.append(job)
+            if running:
+                time.sleep(_POLL_SECONDS)
+    except KeyboardInterrupt:
+        for _, submitted in running.values():
+            submitted.cancel()
+        raise
+    return failed
+
+
+def _state(
+    job: Job, left: list[Job], running: dict[str, tuple[Job, Any]], failed: list[Job]
+) -> str:
+    """Tell whether a job is ``finished``, ``ready``, ``waits`` for its source, or ``lost`` it."""
+    if is_finished(job):
+        return "finished"
+    if job.source is None or is_trained(job):
+        return "ready"
+    going_on = [*left, *(one for one, _ in running.values())]
+    source = next((one for one in [*going_on, *failed] if one.folder == job.source), None)
+    if source is None or is_trained(source):
+        return "ready"
+    return "waits" if source in going_on else "lost"
+
+
 def _chosen(wanted: list[str], known: Iterable[str], option: str) -> list[str]:
     """Return what the options ask for, or everything; unknown names are errors."""
     known = list(known)
@@ -612,6 +782,8 @@ def _command_line(arguments: argparse.Namespace) -> str:
     places = {"--scenes": (arguments.scenes, "SCENES"), "--output": (arguments.output, "RUNS")}
     parts: list[str | tuple[Path, str]] = [(arguments.sweep, arguments.sweep.name)]
     parts += [part for place in places.items() for part in place]
+    if arguments.quality is not None:
+        parts += ["--quality", arguments.quality]
     for option in ("only", "scene"):
         if getattr(arguments, option):
             parts += [f"--{option}", *getattr(arguments, option)]
@@ -645,6 +817,20 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these runs")
     parser.add_argument("--scene", nargs="+", default=[], metavar="NAME", help="only these scenes")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="S.F=VALUE")
+    parser.add_argument("--quality", choices=QUALITIES, help="instead of the sweep's")
+    parser.add_argument(
+        "--cluster", choices=("slurm", "local"), help="hand the runs to submitit (extra `cluster`)"
+    )
+    parser.add_argument(
+        "--parallel", type=int, default=1, metavar="N", help="with --cluster: runs at a time"
+    )
+    parser.add_argument(
+        "--cluster-set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a parameter of submitit's executor: slurm_partition=cpu, timeout_min=600, mem_gb=16",
+    )
     return parser
 
 
@@ -667,7 +853,10 @@ def main(argv: list[str] | None = None, *, start: Callable[[Job], None] = in_a_p
         return _run_one(argv[1])
     arguments = _parser().parse_args(argv)
     try:
-        sweep = read_sweep(arguments.sweep, overrides=arguments.overrides)
+        sweep = read_sweep(
+            arguments.sweep, overrides=arguments.overrides, quality=arguments.quality
+        )
+        executor = cluster_of(arguments)
         scenes = _chosen(arguments.scene, sweep.scenes, "--scene")
         names = _chosen(arguments.only, (run.name for run in sweep.runs), "--only")
         for scene in scenes:
@@ -681,7 +870,10 @@ def main(argv: list[str] | None = None, *, start: Callable[[Job], None] = in_a_p
         return 2
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        failed = run_jobs(jobs, start=start)
+        if executor is None:
+            failed = run_jobs(jobs, start=start)
+        else:
+            failed = run_on_cluster(jobs, executor, parallel=arguments.parallel)
     except KeyboardInterrupt:
         _say("interrupted; the same command goes on from the last checkpoint")
         return 130

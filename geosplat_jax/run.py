@@ -19,6 +19,7 @@ from geosplat_jax.fit.budget import Pacer, Plan, plan
 from geosplat_jax.fit.cameras import CameraSettings, ViewProgress, refine_views
 from geosplat_jax.fit.config import Budget, Config
 from geosplat_jax.fit.costs import expected_costs, slowness_of_machine
+from geosplat_jax.fit.devices import Devices, choose_devices
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.presets import make_config, with_mesh
 from geosplat_jax.fit.runtime import in_background
@@ -460,6 +461,7 @@ def train(
     on_step: Callable[[Progress], None] | None = None,
     budget: Budget | None = None,
     on_compile: Callable[[str], None] | None = None,
+    devices: int | Devices = 1,
     **reading: Any,
 ) -> Run:
     """Train a scene into a run's folder.
@@ -475,6 +477,9 @@ def train(
     budget : time and memory that the training may take. Without ``config``, settings are chosen for
         it (`plan_training`); in any case steps are made fewer or more on the way, so that it ends
         in time. A run that is resumed keeps its own, and has what is left of it.
+    devices : number of those of this process that share the views of every step
+        (docs/devices.md); all processes that `jax.distributed.initialize` connected take part, with
+        so many each. Or what `fit.devices.choose_devices` made of it before.
     reading : how to read the scene: ``downscale``, ``light``, ``bounds`` (six numbers),
         ``cameras`` (a file of `Run.refine_cameras`).
 
@@ -486,6 +491,8 @@ def train(
         If the mesh cannot be used; see `io.start_mesh`.
     """
     began, folder = time.perf_counter(), RunFolder(output)
+    if isinstance(devices, int):
+        devices = choose_devices(devices)
     if resume and config is None and folder.exists and folder.budget() is not None:
         # Its settings were chosen for the budget, and have changed since.
         config, budget, reading = folder.config(), folder.budget(), folder.record()["dataset"]
@@ -516,10 +523,12 @@ def train(
             on_preview=previews,
             pacer=pacer,
             on_compile=on_compile,
+            devices=devices,
         )
     finally:
         previews.finish()
-    folder.write_training({"seconds_total": round(time.perf_counter() - began, 2)})
+    if devices.is_first_host:
+        folder.write_training({"seconds_total": round(time.perf_counter() - began, 2)})
     run = Run(folder.path)
     run.dataset = dataset
     return run

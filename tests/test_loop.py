@@ -47,7 +47,7 @@ class Steps:
         self.needs = list(needs)
         self.batches, self.rules, self.pipelines = [], [], []
 
-    def __call__(self, state, batch, pipeline, rule):
+    def __call__(self, state, batch, pipeline, rule, *, run):
         need = self.needs.pop(0) if self.needs else 1
         self.batches.append(batch)
         self.rules.append(rule)

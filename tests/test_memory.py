@@ -1,11 +1,13 @@
 """What cannot fit into the memory is refused before it is spent, with the setting that asks."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from support import sphere_dataset, tiny_config
 
 from geosplat_jax.fit.memory import (
+    require_program_memory,
     require_rendering_memory,
     require_training_memory,
     training_needs,
@@ -80,6 +82,10 @@ def test_a_refusal_names_the_largest_needs_first(machine):
         (("geometry.resolution=400", "geometry.cubic=true"), "geometry"),
         (("light.width=8192", "light.height=4096"), "light"),
         (("objective.smoothness_samples=1000000000",), "objective.smoothness_samples"),
+        (
+            ("geometry.resolution=128", "stages.monte_carlo.transport.light_count=4096"),
+            r"stages.*.transport.*_count",
+        ),
     ],
 )
 def test_settings_that_cannot_fit_are_refused_by_their_names(machine, overrides, named):
@@ -88,6 +94,37 @@ def test_settings_that_cannot_fit_are_refused_by_their_names(machine, overrides,
         require_training_memory(config, dataset)
     assert f"there are 16.0 GB: {named} " in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_program_that_does_not_fit_is_refused_once_it_is_compiled(machine):
+    """A table of all products of a thousand numbers: four megabytes between two small arrays."""
+
+    @jax.jit
+    def program(x):
+        return jnp.sum(jnp.sort(jnp.outer(x, x), axis=0))
+
+    compiled = program.trace(jax.ShapeDtypeStruct((1000,), jnp.float32)).lower().compile()
+    machine(0.0045)
+    require_program_memory("program", compiled)
+    for gigabytes, copies in ((0.0035, 1), (0.0045, 2)):
+        machine(gigabytes)
+        with pytest.raises(TrainingError, match="the program program 0.0 GB; lower geom") as caught:
+            require_program_memory("program", compiled, copies)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_limit_of_the_process_counts(monkeypatch):
+    import resource
+
+    machine_has = memory_of_machine()
+    if machine_has is None:
+        pytest.skip("this system does not tell how much memory it has")
+    monkeypatch.setattr(
+        resource,
+        "getrlimit",
+        lambda kind: (10**9 if kind == resource.RLIMIT_DATA else resource.RLIM_INFINITY, 0),
+    )
+    assert memory_of_machine() == 10**9
 
 
 def test_a_training_that_cannot_fit_makes_no_folder(machine, tmp_path):

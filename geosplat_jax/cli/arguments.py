@@ -75,6 +75,7 @@ def command_line() -> argparse.ArgumentParser:
         "--from", dest="source", type=Path, metavar="RUN", help="take the first stages from a run"
     )
     train.add_argument("--stage", metavar="NAME", help="with --from: the stage to begin with")
+    _add_devices(train)
 
     settings = commands.add_parser("settings", help="list every setting: default, range, meaning")
     settings.add_argument("prefix", nargs="?", default="", help="of the settings to list")
@@ -230,6 +231,31 @@ def _add_masks(masks: argparse.ArgumentParser) -> None:
     start.add_argument("--force", action="store_true", help="replace splats and masks")
 
 
+def _add_devices(train: argparse.ArgumentParser) -> None:
+    """Add what says where a training computes."""
+    train.add_argument(
+        "--devices",
+        type=_at_least_one,
+        default=1,
+        metavar="N",
+        help="share the views of a step between N devices of this process (docs/devices.md)",
+    )
+    train.add_argument(
+        "--hosts",
+        type=_hosts,
+        metavar="N",
+        help="this is one of N processes that train together; auto: as Slurm or Open MPI say",
+    )
+    train.add_argument(
+        "--host", type=int, metavar="K", help="with --hosts N: number of this process, from 0"
+    )
+    train.add_argument(
+        "--coordinator",
+        metavar="ADDRESS:PORT",
+        help="with --hosts N: of process 0, where all others find it",
+    )
+
+
 def _add_samples(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--samples", type=int, default=DEFAULT_SAMPLES, help="rays per splat (default: %(default)s)"
@@ -359,6 +385,19 @@ def _measured(parse: Callable[[str], float]) -> Callable[[str], float]:
             raise argparse.ArgumentTypeError(str(error)) from None
 
     return read
+
+
+def _at_least_one(text: str) -> int:
+    """Read a count."""
+    count = int(text)
+    if count < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, got {count}")
+    return count
+
+
+def _hosts(text: str) -> str:
+    """Read a number of processes, or ``auto``."""
+    return text if text == "auto" else str(_at_least_one(text))
 
 
 def _downscale(text: str) -> int | str:

@@ -10,6 +10,7 @@ from typing import Any
 from geosplat_jax.camera_rounds import refined_cameras
 from geosplat_jax.cli.display import ProgressDisplay, say, say_refined
 from geosplat_jax.fit.config import Budget, Config, config_warnings
+from geosplat_jax.fit.devices import Devices, choose_devices, connect_hosts
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import make_config, with_mesh
 from geosplat_jax.io.dataset import choose_downscale, load_recorded
@@ -135,12 +136,39 @@ def _table(path: Path | None, folder: Path) -> Iterator[None]:
             steps.write_csv(path)
 
 
+def _devices(arguments: argparse.Namespace) -> Devices:
+    """Return what the options ask to compute on; the first thing that a command does with jax."""
+    told = arguments.host is not None, arguments.coordinator is not None
+    if arguments.hosts is None and any(told):
+        raise UsageError("--host and --coordinator belong to --hosts")
+    if arguments.hosts is not None:
+        if arguments.hosts != "auto" and not all(told):
+            raise UsageError("--hosts N needs --host K and --coordinator ADDRESS:PORT")
+        if arguments.budget is not None or arguments.refine_cameras is not None:
+            raise UsageError(
+                "--hosts trains once, with given settings; leave --budget and --refine-cameras out"
+            )
+        connect_hosts(arguments.hosts, host=arguments.host, coordinator=arguments.coordinator)
+    return choose_devices(arguments.devices)
+
+
+def _idle(devices: Devices, config: Config) -> list[str]:
+    """Say which stages have fewer views in a step than there are devices."""
+    return [
+        f"stages.{stage.name}.batch_views = {stage.batch_views}: of {devices.count} devices, "
+        f"{devices.count - stage.batch_views} have nothing to do"
+        for stage in config.active_stages
+        if stage.batch_views < devices.count
+    ]
+
+
 def train(arguments: argparse.Namespace) -> None:
     """Train a scene into a run's folder, with progress on the terminal."""
     if (arguments.source is None) != (arguments.stage is None):
         raise UsageError("--from RUN and --stage NAME belong together")
     if arguments.refine_cameras is not None and (arguments.budget or arguments.source):
         raise UsageError("--refine-cameras trains before; leave --budget and --from out")
+    devices = _devices(arguments)
     folder = arguments.output or Path("runs") / arguments.scene.resolve().name
     order = _ordered(arguments, RunFolder(folder))
     config, reading = order.config, dict(order.reading)
@@ -149,7 +177,8 @@ def train(arguments: argparse.Namespace) -> None:
     dataset = load_recorded(arguments.scene, reading)
     for note in (*dataset.notes, *config.geometry.notes(dataset)):
         say(note)
-    for warning in (*dataset.warnings, *config_warnings(config)):
+    warnings = (*dataset.warnings, *config_warnings(config), *_idle(devices, config))
+    for warning in warnings:
         say(warning, label="warning: ", style="yellow")
     say(f"{dataset.name}: {len(dataset.train)} views, {dataset.layout} ...")
     with ProgressDisplay(config.total_steps) as display, _table(arguments.csv, folder):
@@ -164,6 +193,9 @@ def train(arguments: argparse.Namespace) -> None:
             on_step=display.show,
             on_compile=display.compiling,
             budget=order.budget,
+            devices=devices,
         )
+    if not devices.is_first_host:
+        return
     seconds = (run.folder.training() or {})["seconds_total"]
     say(f"trained in {seconds:.0f} s; next: geosplat-jax evaluate {folder}")

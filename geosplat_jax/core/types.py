@@ -138,6 +138,11 @@ class Batch(eqx.Module):
         counted = jnp.sum(self.valid, axis=(1, 2))
         return safe_divide(counted, jnp.sum(counted))
 
+    @property
+    def count(self) -> int:
+        """Number of views."""
+        return self.camera.count
+
     def view(self, number: Int[Array, ""] | int) -> "Batch":
         """Return the batch of a single view, with randomness of its own and no carry."""
 

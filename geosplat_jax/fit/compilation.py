@@ -8,9 +8,10 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-import jax
-
 from geosplat_jax.core.types import Batch
+from geosplat_jax.fit.devices import ONE_DEVICE, Devices
+from geosplat_jax.fit.gradient import SharedBatch
+from geosplat_jax.fit.memory import require_program_memory
 from geosplat_jax.fit.runtime import in_background
 from geosplat_jax.fit.step import TrainState, UpdateRule, train_step
 from geosplat_jax.pipeline import Pipeline
@@ -18,38 +19,40 @@ from geosplat_jax.pipeline import Pipeline
 
 def compile_step(
     state: TrainState,
-    batch: Batch,
+    batch: Batch | SharedBatch,
     pipeline: Pipeline,
     rule: UpdateRule,
     *,
+    devices: Devices = ONE_DEVICE,
     threads: int = 2,
     is_wanted: Callable[[], bool] = lambda: True,
 ) -> None:
     """Compile the programs of `step.train_step` for arguments of these shapes; run none of them.
 
-    A later call with such arguments finds them compiled.
+    A later call with such arguments finds them compiled. What does not fit into the memory is
+    refused, see `memory.require_program_memory`.
 
     Parameters
     ----------
     state, batch, pipeline, rule : arrays, or their shapes.
+    devices : that the programs are for.
     threads : programs that are compiled at a time.
     is_wanted : asked before each of them; the rest is left out once it says no.
     """
     free, compiling = threading.Semaphore(threads), []
 
     def compiled(program: Any, *arguments: Any) -> Any:
-        traced = program.trace(*arguments)
+        traced = devices.program(program).trace(*devices.shapes(arguments))
 
         def finish() -> None:
             with free:
                 if is_wanted():
-                    traced.lower().compile()
+                    require_program_memory(
+                        program.__name__, traced.lower().compile(), devices.count_here
+                    )
 
         compiling.append(in_background(finish))
-        # Weak types too: another type is another program.
-        return jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type), traced.out_info
-        )
+        return devices.shapes(traced.out_info)
 
     train_step(state, batch, pipeline, rule, run=compiled)
     for one in compiling:

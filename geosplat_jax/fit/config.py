@@ -8,7 +8,7 @@ import json
 import re
 import tomllib
 from dataclasses import field, fields
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -80,6 +80,8 @@ class Stage:
     """Full views per step."""
     half_life: Positive = 800.0
     """Steps after which rates have halved."""
+    decay: Literal["exponential", "linear"] = "exponential"
+    """How rates fall: by half-lives, or along a line that is zero at the stage's end."""
     vertex_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Share of the stage's steps that sample vertices instead of faces (Eq. 12). It spares memory
     while a random first surface is rough; a visual hull needs none of it."""
@@ -131,10 +133,16 @@ class Stage:
         position = self.position(step)
         return {
             name: rate.value
-            * 0.5 ** (position / (rate.half_life or self.half_life))
+            * self._decayed(step, rate)
             * (min((position + 1) / rate.warmup, 1.0) ** 2 if rate.warmup else 1.0)
             for name, rate in self.rates.items()
         }
+
+    def _decayed(self, step: int, rate: Rate) -> float:
+        """Tell the share of a rate that its decay leaves."""
+        if self.decay == "linear":
+            return max(1.0 - self.progress(step), 0.0)
+        return 0.5 ** (self.position(step) / (rate.half_life or self.half_life))
 
     @property
     def frozen(self) -> tuple[str, ...]:

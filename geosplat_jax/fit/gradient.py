@@ -29,6 +29,27 @@ _Parts = tuple[Any, Any]
 """A pytree cut in two: what has a derivative, and the rest."""
 
 
+class SharedBatch(eqx.Module):
+    """A batch whose views lie on several devices, see `devices.ManyDevices.share_out`.
+
+    Attributes
+    ----------
+    pictures : arrays by name, (devices, views of each, ...); ``keys`` and ``shares`` are those that
+        the views have in the whole batch. A share of 0 is a view that fills up the last round.
+    key : typed PRNG key of the step, the same on all devices.
+    carry : see `Batch`.
+    """
+
+    pictures: dict[str, Any]
+    key: Any
+    carry: Any = None
+
+    @property
+    def count(self) -> int:
+        """Number of views on each device."""
+        return self.pictures["shares"].shape[1]
+
+
 def _cut(tree: Any) -> _Parts:
     return eqx.partition(tree, eqx.is_inexact_array)
 
@@ -174,7 +195,7 @@ def run_program(program: Any, *arguments: Any) -> Any:
 def value_and_gradient(
     pipeline: Pipeline,
     params: Params,
-    batch: Batch,
+    batch: Batch | SharedBatch,
     *,
     frozen: tuple[str, ...],
     run: Callable[..., Any] = run_program,
@@ -183,9 +204,9 @@ def value_and_gradient(
 
     Parameters
     ----------
-    pipeline, params, batch : see `Pipeline.loss`.
+    pipeline, params, batch : see `Pipeline.loss`; a `SharedBatch` for several devices.
     frozen : groups of parameters whose gradient is zero.
-    run : calls a program with arguments; for those who want shapes only.
+    run : calls a program with arguments; for those who want shapes only, or several devices.
 
     Returns
     -------
@@ -196,7 +217,7 @@ def value_and_gradient(
         replace(pipeline, capacities=Capacities(**sizes)) for sizes in _divided(pipeline.capacities)
     )
     asset, pull_asset = run(_asset, pipeline, params, frozen)
-    numbers = range(batch.camera.count)
+    numbers = range(batch.count)
     views = [run(_view, batch, jnp.int32(number)) for number in numbers]
     lists = [run(_lists, listing, asset, view) for view, _ in views]
     seen = run(_seen, pipeline, asset, lists)

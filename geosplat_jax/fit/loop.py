@@ -13,9 +13,12 @@ import numpy as np
 from geosplat_jax.core import capacity as capacity_module
 from geosplat_jax.core.capacity import Capacities, Usage
 from geosplat_jax.core.settings import first_line
+from geosplat_jax.core.types import Batch
 from geosplat_jax.fit.compilation import compile_step
 from geosplat_jax.fit.config import Config, Stage, config_from_dict, differences
+from geosplat_jax.fit.devices import ONE_DEVICE, Devices
 from geosplat_jax.fit.folder import RunFolder
+from geosplat_jax.fit.gradient import SharedBatch
 from geosplat_jax.fit.planning import (
     TrainingError,
     add_rays,
@@ -32,7 +35,13 @@ from geosplat_jax.fit.stages import (
     pipeline_at,
     update_rule,
 )
-from geosplat_jax.fit.step import StepReport, TrainState, initial_state, train_step
+from geosplat_jax.fit.step import (
+    StepReport,
+    TrainState,
+    UpdateRule,
+    initial_state,
+    train_step,
+)
 from geosplat_jax.fit.trained import (
     Description,
     NextStage,
@@ -60,11 +69,12 @@ class Loop:
     """Mutable bookkeeping of a run; everything but the clock goes into checkpoints.
 
     ``fallback`` is the shape that the stage began with, on the host, since the step consumes its
-    buffers. ``views`` are windows of the photographs that hold this ``share`` of their pixels, see
-    `windows.around_object`. ``upcoming`` is the next stage, once it is near; ``to_come`` is what a
-    checkpoint said of it. ``has_compiled`` is set by whatever compiles, and reset by whoever
-    measures time; ``on_compile`` is called with the stage's name before anything compiles that a
-    step waits for.
+    buffers. The state lies on all ``devices``; ``surface`` and ``pipeline`` on one of this process,
+    where everything between two steps is computed. ``views`` are windows of the photographs that
+    hold this ``share`` of their pixels, see `windows.around_object`. ``upcoming`` is the next
+    stage, once it is near; ``to_come`` is what a checkpoint said of it. ``has_compiled`` is set by
+    whatever compiles, and reset by whoever measures time; ``on_compile`` is called with the stage's
+    name before anything compiles that a step waits for.
     """
 
     config: Config
@@ -74,6 +84,7 @@ class Loop:
     stage: Stage
     pipeline: Pipeline
     state: TrainState
+    devices: Devices = ONE_DEVICE
     share: float = 1.0
     planned_for: str | None = None
     peak: dict[str, int] | None = None
@@ -89,6 +100,11 @@ class Loop:
     def step(self) -> int:
         """Steps of the run that are done."""
         return int(self.state.step)
+
+    @property
+    def params(self) -> Params:
+        """Parameters as they are, on one device of this process."""
+        return self.devices.local(self.state.params)
 
     @property
     def steps_of_stage(self) -> int:
@@ -115,19 +131,26 @@ class Loop:
 
     def tree(self) -> dict[str, Any]:
         """All arrays of a checkpoint."""
-        return {"state": self.state, "surface": self.surface}
+        return {"state": self.devices.local(self.state), "surface": self.surface}
 
-    def save(self) -> Path:
-        """Write a checkpoint of the state as it is."""
-        self.last_checkpoint = save_checkpoint(
-            self.folder.checkpoints, self.step, tree=self.tree(), meta=self.meta()
-        )
+    def save(self) -> Path | None:
+        """Write a checkpoint of the state as it is, on the first host; return the last one."""
+        self.last_checkpoint = self._saved(self.folder.checkpoints) or self.last_checkpoint
         return self.last_checkpoint
 
-    def save_end(self) -> Path:
-        """Keep the state as what the stage ended with."""
-        end = self.folder.end_of(self.stage.name)
-        return save_checkpoint(end, self.step, tree=self.tree(), meta=self.meta(), keep=1)
+    def save_end(self) -> None:
+        """Keep the state as what the stage ended with, on the first host."""
+        self._saved(self.folder.end_of(self.stage.name), keep=1)
+
+    def _saved(self, folder: Path, **options: int) -> Path | None:
+        """Write a checkpoint into a folder; None on other hosts than the first."""
+
+        def written() -> Path | None:
+            if not self.devices.is_first_host:
+                return None
+            return save_checkpoint(folder, self.step, tree=self.tree(), meta=self.meta(), **options)
+
+        return self.devices.together(written)
 
     def prepare(self, step: int) -> None:
         """Begin the next stage when it is time; set the weights, plan buffers, compile."""
@@ -142,7 +165,9 @@ class Loop:
         if planned_for != self.planned_for:
             self.planned_for, self.peak = planned_for, None
             self._announce()
-            self.pipeline = replace(self.pipeline, capacities=self._planned(known))
+            planned = self.devices.together(lambda: self._planned(known))
+            sizes = self.devices.first_host(dict(planned))
+            self.pipeline = replace(self.pipeline, capacities=Capacities(**sizes))
             self._compile(step)
         following = self._following(step)
         if following is not None and self.upcoming is None:
@@ -150,7 +175,8 @@ class Loop:
 
     def retime(self, config: Config) -> None:
         """Go on with stages of other lengths; what was done stays as it was."""
-        self.folder.amend(config)
+        if self.devices.is_first_host:
+            self.folder.amend(config)
         self.config, self.stage = config, config.stage(self.stage.name)
 
     def _announce(self) -> None:
@@ -180,10 +206,10 @@ class Loop:
         if self.to_come is not None and self.to_come.stage == self.stage.name:
             return Capacities(**self.to_come.capacities)
         if known is not None:
-            return add_rays(self.pipeline, self.state.params, known)
+            return add_rays(self.pipeline, self.params, known)
         return plan_capacities(
             self.pipeline,
-            self.state.params,
+            self.params,
             self.views.camera(),
             limits=self.config.geometry.limits,
         )
@@ -200,10 +226,15 @@ class Loop:
 
     def _compile(self, step: int) -> None:
         """Compile the programs of a step side by side; calls would do so one after the other."""
+        batch, rule = self._inputs(step)
+        compile_step(self.state, batch, self.pipeline, rule, devices=self.devices)
+        self.has_compiled = True
+
+    def _inputs(self, step: int) -> tuple[Batch | SharedBatch, UpdateRule]:
+        """Return the views of a step, dealt out to the devices, and how far it goes."""
         batch = make_batch(self.views, step, self.stage, seed=self.config.run.seed)
         rule = update_rule(self.config, self.stage, self.state.params, self._since(step))
-        compile_step(self.state, batch, self.pipeline, rule)
-        self.has_compiled = True
+        return self.devices.share_out(batch), rule
 
     def _begin(self, stage: Stage) -> Capacities | None:
         """Change settings, parameters and optimiser; keep what the stage before ended with.
@@ -213,7 +244,7 @@ class Loop:
         Sizes of buffers that hold what the stage begins with; None where they are not known.
         """
         self.save_end()
-        params, pipeline = self.state.params, self.pipeline
+        params, pipeline = self.params, self.pipeline
         if stage.splats.takes_over:
             # The last update moved the surface once more.
             pipeline = holding(pipeline, params)
@@ -228,16 +259,16 @@ class Loop:
         """Begin the stage with these parameters."""
         self.fallback = _on_host(params.geometry)
         carry = self.pipeline.transport.first_carry()
-        self.state = initial_state(params, step=self.step, carry=carry)
+        self.state = self.devices.place(initial_state(params, step=self.step, carry=carry))
 
     def advance(self, step: int) -> StepReport:
         """Make step ``step``, repeating the same batch with larger buffers as often as needed."""
-        batch = make_batch(self.views, step, self.stage, seed=self.config.run.seed)
-        rule = update_rule(self.config, self.stage, self.state.params, self._since(step))
+        batch, rule = self._inputs(step)
 
         def attempt(capacities: Capacities) -> tuple[StepReport, Usage]:
             self._resize(capacities, step)
-            self.state, report = train_step(self.state, batch, self.pipeline, rule)
+            pipeline = self.devices.place_again(self.pipeline)
+            self.state, report = train_step(self.state, batch, pipeline, rule, run=self.devices.run)
             check_limits(report.loss.usage, self.config.geometry.limits)
             return report, report.loss.usage
 
@@ -289,9 +320,8 @@ class Loop:
             )
         self.recoveries += 1
         shape = jax.tree.map(jnp.asarray, self.fallback)
-        self.state = initial_state(
-            replace(self.state.params, geometry=shape), step=self.step, carry=self.state.carry
-        )
+        params, carry = replace(self.params, geometry=shape), self.devices.local(self.state.carry)
+        self.state = self.devices.place(initial_state(params, step=self.step, carry=carry))
 
 
 class Upcoming:
@@ -308,9 +338,9 @@ class Upcoming:
         self.stage = stage
         self._is_wanted = True
         config, views, step = loop.config, loop.views, loop.config.first_step(stage.name)
-        before, surface = loop.pipeline, loop.surface
+        before, surface, devices = loop.pipeline, loop.surface, loop.devices
         # A copy, since the steps to come consume the buffers of the state.
-        params = jax.tree.map(jnp.array, loop.state.params)
+        params = jax.tree.map(jnp.array, loop.params)
 
         def first_pipeline(capacities: Capacities) -> Pipeline:
             pipeline = pipeline_at(build_pipeline(config, stage, surface), config, stage, 0)
@@ -335,9 +365,17 @@ class Upcoming:
                 ),
                 params,
             )
-            batch = make_batch(views, step, stage, seed=config.run.seed)
+            batch = devices.share_out(make_batch(views, step, stage, seed=config.run.seed))
             rule = update_rule(config, stage, state.params, 0)
-            compile_step(state, batch, pipeline, rule, threads=1, is_wanted=lambda: self._is_wanted)
+            compile_step(
+                state,
+                batch,
+                pipeline,
+                rule,
+                devices=devices,
+                threads=1,
+                is_wanted=lambda: self._is_wanted,
+            )
 
         self._planned = in_background(plan)
         self.compiled = in_background(compile_all)
@@ -374,7 +412,9 @@ def _on_host(shape: Any) -> Any:
     return jax.tree.map(np.array, shape)
 
 
-def new_loop(dataset: Dataset, config: Config, folder: RunFolder) -> Loop:
+def new_loop(
+    dataset: Dataset, config: Config, folder: RunFolder, devices: Devices = ONE_DEVICE
+) -> Loop:
     """Build the loop of a new run."""
     shape_key, field_key = jax.random.split(jax.random.key(config.run.seed))
     if not config.active_stages:
@@ -396,6 +436,7 @@ def new_loop(dataset: Dataset, config: Config, folder: RunFolder) -> Loop:
         stage=stage,
         pipeline=pipeline,
         state=initial_state(params),
+        devices=devices,
     )
     loop.start(params)
     return loop
@@ -407,13 +448,15 @@ def _put(loop: Loop, tree: dict[str, Any], described: Description) -> None:
     loop.stage = loop.config.stage(described.stage)
     pipeline = build_pipeline(loop.config, loop.stage, loop.surface)
     loop.pipeline = replace(pipeline, capacities=Capacities(**described.capacities))
-    loop.state = tree["state"]
+    loop.state = loop.devices.place(tree["state"])
     loop.planned_for, loop.peak = described.planned_for, described.peak
     loop.recoveries = described.recoveries
     loop.to_come = described.to_come
 
 
-def resumed_loop(dataset: Dataset, config: Config, folder: RunFolder) -> Loop:
+def resumed_loop(
+    dataset: Dataset, config: Config, folder: RunFolder, devices: Devices = ONE_DEVICE
+) -> Loop:
     """Rebuild the loop of a run from its last good checkpoint, or from the start without one."""
     changed = differences(folder.config(), config)
     if changed:
@@ -421,7 +464,7 @@ def resumed_loop(dataset: Dataset, config: Config, folder: RunFolder) -> Loop:
             "cannot resume with another configuration; start a new run, or undo: "
             + "; ".join(changed)
         )
-    loop = new_loop(dataset, config, folder)
+    loop = new_loop(dataset, config, folder, devices)
     path = latest_checkpoint(folder.checkpoints)
     before = [stage.name for stage in config.active_stages]
     if path is None:
@@ -447,7 +490,12 @@ def _require(path: Path | None) -> Path:
 
 
 def adopted_loop(
-    dataset: Dataset, config: Config, folder: RunFolder, source: RunFolder, name: str
+    dataset: Dataset,
+    config: Config,
+    folder: RunFolder,
+    source: RunFolder,
+    name: str,
+    devices: Devices = ONE_DEVICE,
 ) -> Loop:
     """Build the loop of a run whose stages before ``name`` are those of another run."""
     if not config.stage(name).steps:
@@ -477,6 +525,6 @@ def adopted_loop(
             f"{path} is at step {done}, in the stage {described.stage}, not at the end of "
             f"{last.name} ({end} steps)"
         )
-    loop = new_loop(dataset, config, folder)
+    loop = new_loop(dataset, config, folder, devices)
     _put(loop, tree, described)
     return loop

@@ -1,10 +1,12 @@
 """The memory that a training is certain to take, known from its settings before anything is spent.
 
 What is counted has a known size: the photographs, the views of a step, the learned numbers with
-what Adam keeps of them, constants of the light transport, and the points of the smoothness terms.
-What depends on how many splats a surface has is not known beforehand and not counted; it has a
-limit of its own (`SurfaceSettings.limits`). The sum is therefore a lower bound: what is refused
-cannot work, and what is not refused may still need more.
+what Adam keeps of them, constants of the light transport, the points of the smoothness terms, and
+the samples of as many splats as there are at least. What else depends on how many splats a surface
+has is not known beforehand and not counted; it has a limit of its own (`SurfaceSettings.limits`).
+The sum is therefore a lower bound: what is refused cannot work, and what is not refused may still
+need more. That a program says itself, once it is compiled and before it runs
+(`require_program_memory`).
 """
 
 from collections.abc import Mapping
@@ -52,6 +54,7 @@ def training_needs(config: Config, dataset: Dataset) -> list[Need]:
             for need in _field_needs(config, config.active_stages)
         ),
         Need("objective.smoothness_samples", _smoothness_bytes(config)),
+        Need("stages.*.transport.*_count", _sample_bytes(config)),
     ]
 
 
@@ -66,6 +69,34 @@ def require_training_memory(config: Config, dataset: Dataset) -> None:
     refusal = memory_refusal(training_needs(config, dataset))
     if refusal is not None:
         raise TrainingError(f"{refusal}; change the first of these")
+
+
+def require_program_memory(name: str, compiled: jax.stages.Compiled, copies: int = 1) -> None:
+    """Refuse a compiled program whose arguments, results and temporaries do not fit.
+
+    Parameters
+    ----------
+    name : of the program. compiled : on a processor, or it is left alone: the memory of an
+        accelerator is its allocator's business.
+    copies : devices that share the memory of this machine.
+
+    Raises
+    ------
+    TrainingError
+        One line, with what makes it so large.
+    """
+    sizes = compiled.memory_analysis()
+    if sizes is None or jax.default_backend() != "cpu":
+        return
+    need = sizes.temp_size_in_bytes + sizes.argument_size_in_bytes + sizes.output_size_in_bytes
+    refusal = memory_refusal(
+        [Need(f"the program {name}", copies * (need - sizes.alias_size_in_bytes))]
+    )
+    if refusal is not None:
+        raise TrainingError(
+            f"{refusal}; lower geometry.resolution, stages.*.transport.*_count, the size of the "
+            "images (--downscale) or stages.*.batch_views"
+        )
 
 
 def require_rendering_memory(
@@ -111,6 +142,12 @@ def _transport_bytes(config: Config) -> int:
     """Count the constants of the light transport, of the stage that has most."""
     stages = config.active_stages
     return max((stage.transport.constant_bytes(config.light) for stage in stages), default=0)
+
+
+def _sample_bytes(config: Config) -> int:
+    """Count what the samples of as many splats take as there are at least."""
+    numbers = max((stage.transport.numbers_per_splat for stage in config.active_stages), default=0)
+    return _FLOAT_BYTES * config.geometry.fewest_splats * numbers
 
 
 def _smoothness_bytes(config: Config) -> int:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from geosplat_jax.core import capacity as capacity_module
 from geosplat_jax.core.types import Batch, rate_groups
-from geosplat_jax.fit.gradient import run_program, value_and_gradient
+from geosplat_jax.fit.gradient import SharedBatch, run_program, value_and_gradient
 from geosplat_jax.pipeline import LossReport, Pipeline
 from geosplat_jax.render import Params
 
@@ -134,7 +134,7 @@ def _update(
 
 def train_step(
     state: TrainState,
-    batch: Batch,
+    batch: Batch | SharedBatch,
     pipeline: Pipeline,
     rule: UpdateRule,
     *,

@@ -52,6 +52,11 @@ class SurfaceSettings(Variant, abc.ABC):
         """Guess how many splats there will be, before any surface is known."""
         return 60_000
 
+    @property
+    def fewest_splats(self) -> int:
+        """Splats that there are at least; 0 where that is not known."""
+        return 0
+
     def parameter_bytes(self, bounds: Bounds) -> int:
         """Count the memory that the shape takes which `start` makes; 0 where that is not known.
 
@@ -144,6 +149,11 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
                 "geosplat-jax info, give --bounds, or start from geometry.initial=sphere."
             )
         return self._model(grid), initial_geometry(grid, sdf)
+
+    @property
+    def fewest_splats(self) -> int:
+        """A third of what a bottle has: what any object has that is worth so many cells."""
+        return 10 * self.resolution**2
 
     def parameter_bytes(self, bounds: Bounds) -> int:
         """Count the numbers of the vertices and cells of the grid."""

@@ -5,18 +5,21 @@ Everything here runs on the host around `loop.Loop`, which knows stages only as 
 """
 
 import json
+import os
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from geosplat_jax.fit.budget import Pacer
 from geosplat_jax.fit.config import Config
+from geosplat_jax.fit.devices import ONE_DEVICE, Devices
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.loop import Loop, adopted_loop, new_loop, resumed_loop
 from geosplat_jax.fit.memory import require_training_memory
@@ -165,6 +168,7 @@ def fit(
     on_preview: Callable[[Trained], None] | None = None,
     pacer: Pacer | None = None,
     on_compile: Callable[[str], None] | None = None,
+    devices: Devices = ONE_DEVICE,
 ) -> TrainState:
     """Train on a dataset and leave a run's folder; see `folder.RunFolder`.
 
@@ -184,18 +188,23 @@ def fit(
     pacer : keeps the training to a budget of time by changing the steps to come; ``run.json`` says
         how many there were in the end.
     on_compile : called with the name of the stage before a step waits for a compilation.
+    devices : that the views of a step are shared by, see `devices.choose_devices`. Of several hosts
+        all call this with the same arguments; the first one alone writes the folder, from which all
+        read, and calls the functions above.
 
     Raises
     ------
     ValueError
-        If ``resume`` and ``source`` are both given, or ``source`` without ``first_stage``.
+        If ``resume`` and ``source`` are both given, ``source`` without ``first_stage``, or a pacer
+        on several hosts, whose clocks are not one.
     SceneError
         If the training views have no masks.
     RunError
         If the folder is another's, or in use.
     TrainingError
         When the settings ask for more memory than there is, a number is not finite, the surface
-        vanishes or explodes for good, or the run to resume or to take over does not fit.
+        vanishes or explodes for good, the run to resume or to take over does not fit, or hosts were
+        told different things.
     Interrupted
         After Ctrl-C or SIGTERM; the run can be resumed.
     """
@@ -203,23 +212,34 @@ def fit(
         raise ValueError("a run that is resumed has its first stages already; leave source out")
     if (source is None) != (first_stage is None):
         raise ValueError("source and first_stage belong together")
-    dataset.require_masks("train")
-    require_training_memory(config, dataset)
+    if pacer is not None and jax.process_count() > 1:
+        raise ValueError("a budget is kept by one clock; leave it out on several hosts")
     run = RunFolder(folder)
-    with run.locked(), stop_requests() as stop_requested:
+    writes = devices.is_first_host
+    if not writes:
+        on_step = on_preview = on_compile = None
+    with ExitStack() as held:
+        stop_requested = held.enter_context(stop_requests())
         has_begun = False
         try:
-            if not (resume and run.exists):
-                run.require_free(replace=replace_run)
-                loop = _first_loop(dataset, config, run, source, first_stage)
+            devices.together(lambda: _require_possible(dataset, config))
+            _require_agreement(devices, config, dataset, resume, replace_run, source, stop_after)
+            devices.together(lambda: held.enter_context(run.locked()) if writes else None)
+            if not devices.first_host(resume and run.exists):
+                devices.together(lambda: writes and run.require_free(replace=replace_run))
+                loop = devices.together(
+                    lambda: _first_loop(dataset, config, run, source, first_stage, devices)
+                )
                 budget = None if pacer is None else pacer.budget
-                run.begin(dataset, config, replace=replace_run, budget=budget)
-                has_begun = True
+                if writes:
+                    run.begin(dataset, config, replace=replace_run, budget=budget)
+                    has_begun = True
                 if source is not None:
                     loop.save_end()
             else:
-                run.repoint(dataset)
-                loop = resumed_loop(dataset, config, run)
+                devices.together(lambda: writes and run.repoint(dataset))
+                loop = devices.together(lambda: resumed_loop(dataset, config, run, devices))
+            _require_same_start(loop)
             loop.on_compile = on_compile
             try:
                 return _train(loop, stop_after, stop_requested, on_step, on_preview, pacer)
@@ -241,13 +261,58 @@ def _first_loop(
     run: RunFolder,
     source: str | Path | None,
     first_stage: str | None,
+    devices: Devices,
 ) -> Loop:
     """Build the loop of a new run, with its first stages from another one where asked."""
     if source is None or first_stage is None:
-        return new_loop(dataset, config, run)
+        return new_loop(dataset, config, run, devices)
     other = RunFolder(source)
     other.require_same_scene(dataset)
-    return adopted_loop(dataset, config, run, other, first_stage)
+    return adopted_loop(dataset, config, run, other, first_stage, devices)
+
+
+def _require_possible(dataset: Dataset, config: Config) -> None:
+    """Refuse what cannot be trained, before anything is spent."""
+    dataset.require_masks("train")
+    require_training_memory(config, dataset)
+
+
+def _require_agreement(
+    devices: Devices, config: Config, dataset: Dataset, *options: object
+) -> None:
+    """Refuse hosts that were told different things.
+
+    Raises
+    ------
+    TrainingError
+        On every host, with what is not the same.
+    """
+    views = dataset.train
+    mine = {
+        "settings": json.loads(json.dumps(config.to_dict())),
+        "views": f"{len(views)} of {views.width} x {views.height}",
+        "pixels": views.fingerprint() if devices.count > 1 else None,
+        "options": [str(option) for option in options],
+        "devices": devices.count,
+    }
+    theirs = devices.first_host(mine)
+    _require_same(devices, [name for name in mine if mine[name] != theirs[name]])
+
+
+def _require_same_start(loop: Loop) -> None:
+    """Refuse hosts that would begin from different states: what they read is not the same."""
+    mine = [loop.step, loop.stage.name, loop.config.total_steps]
+    theirs = loop.devices.first_host(mine)
+    _require_same(loop.devices, [] if mine == theirs else [f"checkpoint {mine}, not {theirs}"])
+
+
+def _require_same(devices: Devices, different: list[str]) -> None:
+    if devices.any_host(bool(different)):
+        what = ", ".join(different) or "see the other hosts"
+        raise TrainingError(
+            f"the hosts do not train the same ({what}); call all of them alike, on a file system "
+            "that they share"
+        )
 
 
 def _keep_pace(loop: Loop, pacer: Pacer, seconds: float | None) -> None:
@@ -272,13 +337,15 @@ def _train(
     pacer: Pacer | None,
 ) -> TrainState:
     """Make steps until all are done, or ``stop_after``."""
-    clock = _Clock(loop.config)
-    loop.folder.keep_lines_before(loop.step)
+    clock, writes = _Clock(loop.config), loop.devices.is_first_host
+    if writes:
+        loop.folder.keep_lines_before(loop.step)
 
     def last_step() -> int:
         return min(loop.config.total_steps, stop_after or loop.config.total_steps)
 
-    with loop.folder.metrics.open("a", encoding="utf-8") as metrics:
+    lines = loop.folder.metrics if writes else Path(os.devnull)
+    with lines.open("a", encoding="utf-8") as metrics:
         while (step := loop.step) < last_step():
             began, loop.has_compiled = time.perf_counter(), False
             loop.prepare(step)
@@ -307,12 +374,13 @@ def _train(
                         seconds_left=clock.left(done) if pacer is None else pacer.seconds_left,
                     )
                 )
-            if done % config.run.checkpoint_every == 0 or done == last or stop_requested():
+            is_stopped = loop.devices.any_host(stop_requested())
+            if done % config.run.checkpoint_every == 0 or done == last or is_stopped:
                 loop.save()
-            if stop_requested() and done < last:
+            if is_stopped and done < last:
                 raise Interrupted(f"stopped at step {done}; continue with --resume")
             every = config.run.preview_every
             is_early = done == every // _FIRST_PREVIEW
             if on_preview is not None and every and (is_early or done % every == 0):
-                on_preview(Trained(config, loop.stage, loop.state.params, loop.pipeline, done))
-    return loop.state
+                on_preview(Trained(config, loop.stage, loop.params, loop.pipeline, done))
+    return loop.devices.local(loop.state)

@@ -29,15 +29,26 @@ class Need:
 def memory_of_machine() -> int | None:
     """Count the bytes of memory that this process may use at most.
 
-    That is the memory of the machine, or of the container that the process runs in; what other
-    processes hold of it at the moment does not matter. None where the system does not tell, as on
-    Windows.
+    That is the memory of the machine, of the container that the process runs in, or what a limit
+    (``ulimit``) leaves the process; what others hold of it at the moment does not matter. None
+    where the system does not tell, as on Windows.
     """
     try:
         physical = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):
         return None
-    return min([physical, *filter(None, map(_limit_in, _CONTAINER_LIMITS))])
+    limits = [*filter(None, map(_limit_in, _CONTAINER_LIMITS)), *_limits_of_process()]
+    return min([physical, *limits])
+
+
+def _limits_of_process() -> list[int]:
+    """Return the limits of the data and of the addresses of this process, where it has some."""
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return []
+    soft = [resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_DATA, resource.RLIMIT_AS)]
+    return [limit for limit in soft if limit != resource.RLIM_INFINITY]
 
 
 def _limit_in(path: Path) -> int | None:

@@ -245,6 +245,11 @@ class TransportSettings(Variant, abc.ABC):
         del light
         return 0
 
+    @property
+    def numbers_per_splat(self) -> int:
+        """Numbers that a step holds at the same time for every splat at least, of its samples."""
+        return 0
+
     @abc.abstractmethod
     def build(self, light: LightSpec) -> Transport:
         """Make the transport for lights of one size."""

@@ -359,6 +359,11 @@ class SampledSettings:
     """Choice of the light's samples from many, and their use in later steps; where views share
     them."""
 
+    @property
+    def numbers_per_splat(self) -> int:
+        """Direction, weight and hit of every sample that views share; see `Samples`."""
+        return 5 * (self.light_count + self.diffuse_count) if self.shares_views else 0
+
     def __post_init__(self) -> None:
         """Refuse a lobe without samples."""
         if self.reservoirs.drops_blocked and min(self.diffuse_count, self.specular_count) == 0:

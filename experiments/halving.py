@@ -1,0 +1,198 @@
+"""Search the front of all knobs together by successive halving: many short runs, few long ones.
+
+``python experiments/halving.py SWEEP.toml --scenes ROOT --output DIR [--joint 24] [--rungs 3]``
+takes the runs of a sweep and combinations of them: of every group (a knob), the base or one value.
+In the first rung all are trained with a fraction of their steps, schedules shortened with them; the
+best third goes on with three times as many, and so on; the last rung trains in full. Candidates of
+a rung share the stages that they have in common. What is best is a matter of two figures, quality
+and seconds, so whole fronts go on, one after the other, until the places are taken. The same
+command goes on where it was stopped; ``DIR/rung_K`` are sweeps of their own, and ``DIR/front.md``
+is written at the end.
+"""
+
+import argparse
+import math
+import random
+import statistics
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import run as runner
+import trade
+from report import ReportError
+from run import Sweep, SweepError, SweepRun
+
+_LENGTHS = (
+    "stages.*.steps",
+    "stages.*.half_life",
+    "stages.*.rates.*.warmup",
+    "stages.*.rates.*.half_life",
+)
+"""Numbers of steps: a training of a fraction of them is the same one, in a hurry."""
+
+
+def joint_runs(sweep: Sweep, count: int, *, seed: int) -> list[SweepRun]:
+    """Combine the knobs of a sweep at random: of every group the base or one of its values.
+
+    Combinations whose settings are refused, or known already, are left out and drawn again.
+    """
+    groups: dict[str, list[SweepRun]] = {}
+    for one in sweep.runs:
+        if one.x is not None:
+            groups.setdefault(one.group, []).append(one)
+    base, draw = sweep.runs[0], random.Random(seed)
+    known = {tuple(run.overrides) + (run.downscale,) for run in sweep.runs}
+    found: list[SweepRun] = []
+    for _ in range(100 * count):
+        if len(found) == count:
+            break
+        chosen = [draw.choice(runs) for runs in groups.values() if draw.random() < 0.5]
+        overrides = tuple(dict.fromkeys(text for run in chosen for text in run.overrides))
+        factors = [run.downscale for run in chosen if run.downscale != sweep.downscale]
+        downscale = factors[0] if factors else sweep.downscale
+        if (*overrides, downscale) in known:
+            continue
+        known.add((*overrides, downscale))
+        candidate = replace(
+            base,
+            name=f"joint-{len(found):03d}",
+            title=", ".join(run.name for run in chosen),
+            overrides=overrides,
+            downscale=downscale,
+            x=None,
+        )
+        try:
+            has_steps = sweep.config(candidate).active_stages
+        except ValueError:
+            continue
+        if has_steps:
+            found.append(candidate)
+    return found
+
+
+def shortened(sweep: Sweep, run: SweepRun, factor: float) -> SweepRun:
+    """Return a run with a fraction of its steps, and schedules as much shorter."""
+    if factor == 1.0:
+        return run
+    config = sweep.config(run)
+    present = [p for p in _LENGTHS if runner.has_numbers(config, p)]
+    shorter = runner.scaled(config, dict.fromkeys(present, factor), run.name)
+    return replace(run, overrides=(*run.overrides, *shorter))
+
+
+def survivors(points: dict[str, tuple[float, float]], count: int) -> list[str]:
+    """Choose names by fronts: all of the first one, then of the next; of the last, spread evenly.
+
+    Parameters
+    ----------
+    points : cost and quality by name. count : that may go on.
+    """
+    chosen: list[str] = []
+    left = dict(points)
+    while left and len(chosen) < count:
+        front = trade.pareto(left)
+        free = count - len(chosen)
+        if len(front) > free:
+            # Both ends and places between.
+            places = {round(k * (len(front) - 1) / max(free - 1, 1)) for k in range(free)}
+            front = [front[k] for k in sorted(places)]
+            chosen += front
+            break
+        chosen += front
+        left = {name: value for name, value in left.items() if name not in front}
+    return chosen
+
+
+def full_costs(folder: Path, sweep: Sweep, factor: float) -> dict[str, tuple[float, float]]:
+    """Return seconds that the full trainings would take, and quality now, of what is on all scenes.
+
+    Seconds are those of median steps: compilation, which does not shrink, is not among them.
+    """
+    record = trade.report._read_sweep(folder)
+    figures = trade.quality_figures(record)
+    values = {}
+    for name, scenes in trade.read_points(folder, record).items():
+        if len(scenes) == len(sweep.scenes):
+            cost = statistics.fmean(point.steady for point in scenes.values()) / factor
+            good = statistics.fmean(trade.quality(point, figures) for point in scenes.values())
+            if math.isfinite(good):
+                values[name] = (cost, good)
+    return values
+
+
+def rung_factors(rungs: int, keep: float) -> list[float]:
+    """Return the share of the steps of every rung; the last one is 1."""
+    return [keep ** (rungs - 1 - rung) for rung in range(rungs)]
+
+
+def search(
+    sweep: Sweep, arguments: argparse.Namespace, run_jobs: Any = runner.run_jobs
+) -> tuple[Sweep, Path]:
+    """Train all rungs; return the sweep of the last one, and its folder.
+
+    Raises
+    ------
+    SweepError
+        If nothing of a rung came to figures.
+    """
+    candidates = [*sweep.runs, *joint_runs(sweep, arguments.joint, seed=arguments.seed)]
+    for rung, factor in enumerate(rung_factors(arguments.rungs, arguments.keep)):
+        runs = tuple(shortened(sweep, run, factor) for run in candidates)
+        here = replace(sweep, runs=runs, title=f"{sweep.title}, rung {rung}: ×{factor:.3g} steps")
+        folder = arguments.output / f"rung_{rung}"
+        names = [run.name for run in runs]
+        jobs = runner.plan(here, arguments.scenes, folder, scenes=here.scenes, names=names)
+        runner.check_folders(jobs)
+        command = f"python experiments/halving.py {arguments.sweep.name}"
+        runner.write_record(here, folder, command)
+        run_jobs(jobs)
+        if factor == 1.0:
+            return here, folder
+        values = full_costs(folder, here, factor)
+        if not values:
+            raise SweepError(f"rung {rung}: no run has figures on all scenes; see {folder}")
+        going_on = survivors(values, math.ceil(len(candidates) * arguments.keep))
+        # The base stays, since all is compared with it.
+        names = list(dict.fromkeys([candidates[0].name, *going_on]))
+        candidates = [run for run in candidates if run.name in names]
+        runner._say(f"rung {rung}: {len(candidates)} go on: {', '.join(names)}")
+    raise AssertionError("the last rung trains in full")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Search; 0, 2 on a wrong call, 130 if interrupted."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("sweep", type=Path, help="whose runs and groups are the candidates")
+    parser.add_argument("--scenes", type=Path, required=True, help="folder of the scene folders")
+    parser.add_argument("--output", type=Path, required=True, help="folder of all rungs")
+    parser.add_argument("--joint", type=int, default=24, metavar="N", help="combinations")
+    parser.add_argument("--rungs", type=int, default=3)
+    parser.add_argument("--keep", type=float, default=1 / 3, help="share that goes on")
+    parser.add_argument("--seed", type=int, default=0, help="of the combinations")
+    parser.add_argument("--quality", choices=runner.QUALITIES, help="instead of the sweep's")
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="S.F=VALUE")
+    arguments = parser.parse_args(argv)
+    try:
+        if arguments.rungs < 1 or not 0 < arguments.keep < 1 or arguments.joint < 0:
+            raise SweepError("--rungs must be at least 1, --keep between 0 and 1, --joint not < 0")
+        sweep = runner.read_sweep(
+            arguments.sweep, overrides=arguments.overrides, quality=arguments.quality
+        )
+        here, folder = search(sweep, arguments)
+        record = trade.report._read_sweep(folder)
+        text = trade.compose(record, [trade.read_points(folder, record)])
+    except (SweepError, ReportError, OSError) as error:
+        runner._say(f"error: {error}")
+        return 2
+    except KeyboardInterrupt:
+        runner._say("interrupted; the same command goes on from the last checkpoint")
+        return 130
+    (arguments.output / "front.md").write_text(text, encoding="utf-8")
+    runner._say(f"front of {len(here.runs)} runs: {arguments.output / 'front.md'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,471 @@
+"""The devices that a training computes on: one, or several that share the views of every step.
+
+With several, each device holds all parameters and makes the whole asset, since that costs no
+communication; the views of a batch are dealt out, and two sums go over the devices in a step: which
+splats are seen, and the gradient, in which the parameters get the same numbers everywhere. The
+programs are those of one device (`gradient`, `step`), each within a `jax.shard_map`; the mesh spans
+all processes that `jax.distributed` knows, and every process calls the same programs in the same
+order. So whatever decides between two steps has to be the same on all hosts: it comes out of the
+programs, or is asked for with `Devices.any_host` and `Devices.first_host`.
+"""
+
+import json
+import os
+from collections.abc import Callable, Iterable
+from functools import cache, partial
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Bool, Float, Int
+
+from geosplat_jax.core.types import Batch, Camera
+from geosplat_jax.fit import gradient, step
+from geosplat_jax.fit.gradient import SharedBatch, run_program
+from geosplat_jax.fit.planning import TrainingError
+from geosplat_jax.pipeline import ViewReport
+
+_AXIS = "views"
+_SAME, _OWN = PartitionSpec(), PartitionSpec(_AXIS)
+"""What all devices have alike, and what each has of its own: the first axis counts the devices."""
+
+_FORCED = "xla_force_host_platform_device_count"
+
+_Result = TypeVar("_Result")
+
+
+class Devices:
+    """One device: nothing is placed, and nobody has to be asked; `ManyDevices` for several."""
+
+    count = 1
+    """Devices of all hosts."""
+    count_here = 1
+    """Those of this process."""
+    is_first_host = True
+    """Whether this process is the one that writes the run's folder."""
+
+    def program(self, program: Any) -> Any:
+        """Return what stands for a program of `gradient` or `step` on these devices."""
+        return program
+
+    def run(self, program: Any, *arguments: Any) -> Any:
+        """Call a program, see `gradient.run_program`."""
+        return run_program(program, *arguments)
+
+    def shapes(self, tree: Any) -> Any:
+        """Return a tree with the shapes of its arrays, and where they lie, for compilation."""
+        # Weak types too: another type is another program.
+        return _mapped(
+            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=_is_weak(x)), tree
+        )
+
+    def place(self, tree: Any) -> Any:
+        """Put arrays on all devices."""
+        return tree
+
+    def place_again(self, tree: Any) -> Any:
+        """Put a tree on all devices, of which most arrays are those of the call before."""
+        return tree
+
+    def local(self, tree: Any) -> Any:
+        """Return arrays that all devices have alike as arrays of one device of this process."""
+        return tree
+
+    def share_out(self, batch: Batch) -> Batch | SharedBatch:
+        """Deal the views of a batch out."""
+        return batch
+
+    def any_host(self, flag: bool) -> bool:
+        """Tell whether a flag is set on any host."""
+        return flag
+
+    def first_host(self, value: Any) -> Any:
+        """Return the first host's value, which JSON can hold."""
+        return value
+
+    def together(self, action: Callable[[], _Result]) -> _Result:
+        """Do on every host what may fail on some; where it does, it fails on all.
+
+        Raises
+        ------
+        TrainingError
+            Where it went well here, and failed elsewhere.
+        """
+        return action()
+
+
+ONE_DEVICE = Devices()
+
+
+def _is_weak(x: Any) -> bool:
+    return getattr(x, "weak_type", False)
+
+
+def _is_placed(x: Any) -> bool:
+    """Whether an array, or its shape, says on which mesh it lies."""
+    sharding = getattr(x, "sharding", None)
+    return isinstance(sharding, NamedSharding) and sharding.mesh.axis_names == (_AXIS,)
+
+
+def _mapped(change: Callable[[Any], Any], tree: Any) -> Any:
+    """Change arrays and their shapes, and leave all else of a tree."""
+    return jax.tree.map(lambda x: change(x) if hasattr(x, "dtype") else x, tree)
+
+
+class ManyDevices(Devices):
+    """Several devices, of this process or of several.
+
+    Parameters
+    ----------
+    devices : one or more of every process, see `choose_devices`.
+    """
+
+    def __init__(self, devices: list[Any]) -> None:
+        self.mesh = Mesh(np.array(devices), (_AXIS,), axis_types=(AxisType.Explicit,))
+        self.count = len(devices)
+        self.count_here = len(self._mine)
+        self.is_first_host = jax.process_index() == 0
+        self._placed: dict[int, tuple[Any, Any]] = {}
+
+    def __repr__(self) -> str:
+        return f"ManyDevices({self.count})"
+
+    @property
+    def _mine(self) -> list[tuple[int, Any]]:
+        """Devices of this process, with their numbers among all."""
+        here = jax.process_index()
+        return [(n, d) for n, d in enumerate(self.mesh.devices.flat) if d.process_index == here]
+
+    def program(self, program: Any) -> Any:
+        """See `Devices.program`."""
+        return _programs(self.mesh)[program]
+
+    def run(self, program: Any, *arguments: Any) -> Any:
+        """See `Devices.run`; what lies nowhere in particular is put on all devices before."""
+        return run_program(self.program(program), *self.place(arguments))
+
+    def shapes(self, tree: Any) -> Any:
+        """See `Devices.shapes`."""
+
+        def shape(x: Any) -> jax.ShapeDtypeStruct:
+            spec = x.sharding.spec if _is_placed(x) else _SAME
+            sharding = NamedSharding(self.mesh, spec)
+            return jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding, weak_type=_is_weak(x))
+
+        return _mapped(shape, tree)
+
+    def place(self, tree: Any) -> Any:
+        """See `Devices.place`; arrays that are placed stay."""
+        return _mapped(self._copied, tree)
+
+    def place_again(self, tree: Any) -> Any:
+        """See `Devices.place_again`."""
+        before, self._placed = self._placed, {}
+
+        def placed(x: Any) -> Any:
+            known = before.get(id(x))
+            copy = known[1] if known is not None and known[0] is x else self._copied(x)
+            self._placed[id(x)] = (x, copy)
+            return copy
+
+        return _mapped(placed, tree)
+
+    def _copied(self, x: Any) -> Any:
+        if _is_placed(x):
+            return x
+        copies = [jax.device_put(x, device) for _, device in self._mine]
+        sharding = NamedSharding(self.mesh, _SAME)
+        return jax.make_array_from_single_device_arrays(copies[0].shape, sharding, copies)
+
+    def local(self, tree: Any) -> Any:
+        """See `Devices.local`."""
+        return _mapped(lambda x: x.addressable_data(0) if _is_placed(x) else x, tree)
+
+    def share_out(self, batch: Batch) -> SharedBatch:
+        """See `Devices.share_out`: view n lies on device n modulo their number.
+
+        Where the views do not divide evenly, the last one fills up the last round with a share of
+        0: it costs time that would be waited for anyhow, and adds nothing.
+        """
+        count, rounds = batch.count, -(-batch.count // self.count)
+        numbers = jnp.arange(count, dtype=jnp.int32)
+        pictures = {
+            "world_to_camera": batch.camera.world_to_camera,
+            "intrinsics": batch.camera.intrinsics,
+            "image": batch.image,
+            "views": batch.views,
+            "valid": batch.valid,
+            "keys": jax.vmap(lambda number: jax.random.fold_in(batch.key, number))(numbers),
+            "shares": batch.shares,
+        }
+
+        def dealt(name: str, values: Array) -> Array:
+            parts = []
+            for number, device in self._mine:
+                rows = number + self.count * np.arange(rounds)
+                part = values[np.minimum(rows, count - 1)]
+                if name == "shares":
+                    part = jnp.where(rows < count, part, 0.0)
+                parts.append(jax.device_put(part[None], device))
+            shape = (self.count, *parts[0].shape[1:])
+            sharding = NamedSharding(self.mesh, _OWN)
+            return jax.make_array_from_single_device_arrays(shape, sharding, parts)
+
+        return SharedBatch(
+            {name: dealt(name, x) for name, x in pictures.items() if x is not None},
+            self._copied(batch.key),
+        )
+
+    def any_host(self, flag: bool) -> bool:
+        """See `Devices.any_host`."""
+        if jax.process_count() == 1:
+            return flag
+        return bool(np.any(multihost_utils.process_allgather(np.array(flag))))
+
+    def first_host(self, value: Any) -> Any:
+        """See `Devices.first_host`."""
+        if jax.process_count() == 1:
+            return value
+        text = np.frombuffer(json.dumps(value).encode(), np.uint8)
+        length = int(multihost_utils.broadcast_one_to_all(np.int32(text.size)))
+        # Broadcast sizes must agree, whatever another host would have said.
+        mine = np.resize(text, length)
+        return json.loads(np.asarray(multihost_utils.broadcast_one_to_all(mine)).tobytes())
+
+    def together(self, action: Callable[[], _Result]) -> _Result:
+        """See `Devices.together`."""
+        try:
+            result = action()
+        except Exception:
+            self.any_host(True)
+            raise
+        if self.any_host(False):
+            raise TrainingError("stopped because another host did; its message says why")
+        return result
+
+
+def _local(tree: Any) -> Any:
+    """Take away the axis that counts the devices."""
+    return jax.tree.map(lambda x: x[0], tree)
+
+
+def _own(tree: Any) -> Any:
+    """Put the axis that counts the devices in front."""
+    return jax.tree.map(lambda x: x[None], tree)
+
+
+def _common(batch: SharedBatch) -> Batch:
+    """Return a batch with key and carry of a step, and a picture of one pixel that nobody reads."""
+    eye = jnp.zeros((1, 4, 4)), jnp.zeros((1, 3, 3))
+    return Batch(Camera(*eye, 1, 1), jnp.zeros((1, 1, 1, 4)), batch.key, carry=batch.carry)
+
+
+def _view(batch: SharedBatch, number: Int[Array, ""]) -> Any:
+    """See `gradient._view`; ``number`` counts the views of this device."""
+    pictures = _local(batch.pictures)
+    height, width = pictures["image"].shape[1:3]
+    camera = Camera(pictures["world_to_camera"], pictures["intrinsics"], height, width)
+    mine = Batch(
+        camera, pictures["image"], batch.key, pictures.get("views"), pictures.get("valid")
+    ).view(number)
+    mine = eqx.tree_at(lambda view: view.key, mine, pictures["keys"][number])
+    return _own((mine, pictures["shares"][number]))
+
+
+def _lists(pipeline: Any, asset: Any, view: Any) -> Any:
+    """See `gradient._lists`."""
+    return _own(gradient._lists(pipeline, asset, _local(view)))
+
+
+def _seen(pipeline: Any, asset: Any, lists: Any) -> Bool[Array, " N"] | None:
+    """See `gradient._seen`: by a view of any device."""
+    seen = gradient._seen(pipeline, asset, _local(lists))
+    return None if seen is None else jax.lax.pmax(seen.astype(jnp.int32), _AXIS) > 0
+
+
+def _lights(pipeline: Any, asset: Any, light: Any, seen: Any, batch: SharedBatch) -> Any:
+    """See `gradient._lights`."""
+    return gradient._lights(pipeline, asset, light, seen, _common(batch))
+
+
+def _view_gradient(
+    pipeline: Any,
+    log_exposure: Float[Array, ""],
+    asset: Any,
+    lights: Any,
+    others: Any,
+    lists: Any,
+    view: Any,
+) -> Any:
+    """See `gradient._view_gradient`."""
+    return _own(
+        gradient._view_gradient(
+            pipeline, log_exposure, asset, lights, others, _local(lists), _local(view)
+        )
+    )
+
+
+def _plus(first: Any, second: Any) -> Any:
+    """See `gradient._plus`."""
+    return _own(gradient._plus(_local(first), _local(second)))
+
+
+def _back(
+    pipeline: Any,
+    params: Any,
+    asset: Any,
+    pulls: Any,
+    views: Any,
+    batch: SharedBatch,
+    carry: Any,
+    frozen: tuple[str, ...],
+) -> Any:
+    """See `gradient._back`: every device goes back from its own views, then all are added up.
+
+    Terms that no view has a part in count on each device for its part of them. What is not added
+    up is taken from the first device, since the same numbers added in another order, as a GPU does
+    it, are other numbers, and parameters must not come apart.
+    """
+    found, report = _local(views)
+    part = 1.0 / jax.lax.axis_size(_AXIS)
+    weights = {name: part * weight for name, weight in pipeline.weights.items()}
+    pipeline = eqx.tree_at(lambda p: p.weights, pipeline, weights)
+    usage = jax.lax.pmax(report.usage, _AXIS)
+    terms, mse = jax.lax.psum((report.terms, report.mse), _AXIS)
+    (total, whole), gradient_here = gradient._back(
+        pipeline,
+        params,
+        asset,
+        pulls,
+        (found, ViewReport(terms, mse, usage)),
+        _common(batch),
+        carry,
+        frozen,
+    )
+    total, gradient_sum = jax.lax.psum((total, gradient_here), _AXIS)
+    usage, whole = jax.lax.pmax(whole.usage, _AXIS), _of_first_device(whole)
+    whole = eqx.tree_at(lambda report: report.usage, whole, usage)
+    return (total, whole), gradient_sum
+
+
+def _of_first_device(tree: Any) -> Any:
+    """Give every device what the first one has."""
+    is_first = jax.lax.axis_index(_AXIS) == 0
+
+    def sent(x: Array) -> Array:
+        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(sent(jax.random.key_data(x)))
+        if x.dtype == bool:
+            return sent(x.astype(jnp.int32)) > 0
+        return jax.lax.psum(jnp.where(is_first, x, jnp.zeros_like(x)), _AXIS)
+
+    return jax.tree.map(sent, tree)
+
+
+@cache
+def _programs(mesh: Mesh) -> dict[Any, Any]:
+    """Return what stands for each program of `gradient` and `step` on the devices of a mesh."""
+    specs_of_batch: Any = (_OWN, _SAME, _SAME)
+    batch = SharedBatch(*specs_of_batch)
+
+    def spread(
+        body: Callable[..., Any], arguments: Iterable[Any], result: Any, **options: Any
+    ) -> Any:
+        """Compile ``body`` for all devices; arguments and result lie as their specs say."""
+        specs = tuple(arguments)
+
+        @partial(jax.jit, **options)
+        def program(*values: Any) -> Any:
+            arrays, static = values[: len(specs)], values[len(specs) :]
+            shared = jax.shard_map(
+                lambda *blocks: body(*blocks, *static),
+                mesh=mesh,
+                in_specs=specs,
+                out_specs=result,
+                check_vma=False,
+            )
+            return shared(*arrays)
+
+        return program
+
+    s, o = _SAME, _OWN
+    return {
+        gradient._asset: spread(gradient._asset, (s, s), s, static_argnums=2),
+        gradient._view: spread(_view, (batch, s), o),
+        gradient._lists: spread(_lists, (s, s, o), o),
+        gradient._seen: spread(_seen, (s, s, o), s),
+        gradient._lights: spread(_lights, (s, s, s, s, batch), s),
+        gradient._view_gradient: spread(_view_gradient, (s, s, s, s, s, o, o), o),
+        gradient._plus: spread(_plus, (o, o), o, donate_argnums=0),
+        gradient._back: spread(_back, (s, s, s, s, o, batch, s), s, static_argnums=7),
+        step._update: spread(step._update, (s, s, s, s, s), s, donate_argnums=0),
+    }
+
+
+def choose_devices(count: int = 1) -> Devices:
+    """Return the devices of a training: so many of every process.
+
+    Where there is no accelerator, the processor is made into so many devices, which share its
+    cores: that is for trying things out. Several processes must be connected before, with
+    `jax.distributed.initialize`.
+
+    Parameters
+    ----------
+    count : of this process; every process must say the same.
+
+    Raises
+    ------
+    TrainingError
+        If there are fewer.
+    """
+    if count > 1 and _FORCED not in os.environ.get("XLA_FLAGS", ""):
+        try:
+            jax.config.update("jax_num_cpu_devices", count)
+        except RuntimeError:
+            pass  # jax runs already: what it has is counted below
+    there = jax.local_devices()
+    if len(there) < count:
+        raise TrainingError(
+            f"--devices {count}: this process has {len(there)} of kind {there[0].platform}; "
+            "ask for fewer (processors are divided only before jax computes anything)"
+        )
+    if count == 1 and jax.process_count() == 1:
+        return ONE_DEVICE
+    by_process: dict[int, list[Any]] = {}
+    for device in jax.devices():
+        by_process.setdefault(device.process_index, []).append(device)
+    fewest = min(map(len, by_process.values()))
+    if fewest < count:
+        raise TrainingError(f"--devices {count}: a host has {fewest} only; ask for fewer")
+    return ManyDevices([d for _, mine in sorted(by_process.items()) for d in mine[:count]])
+
+
+def connect_hosts(
+    hosts: str, *, host: int | None = None, coordinator: str | None = None, patience: int = 100
+) -> None:
+    """Make this process one of several; call it before jax computes anything.
+
+    Parameters
+    ----------
+    hosts : number of processes; ``auto`` for what Slurm, Open MPI, Kubernetes or a TPU pod say.
+    host : number of this one, from 0.
+    coordinator : ADDRESS:PORT of the process 0, which all others can reach.
+    patience : seconds without a sign of life after which a process is taken for dead.
+
+    Raises
+    ------
+    TrainingError
+        If they do not find each other, or it is not known how many there are.
+    """
+    known = {} if hosts == "auto" else {"num_processes": int(hosts), "process_id": host}
+    try:
+        jax.distributed.initialize(
+            coordinator_address=coordinator, heartbeat_timeout_seconds=patience, **known
+        )
+    except (ValueError, RuntimeError) as error:
+        first = str(error).splitlines()[0]
+        raise TrainingError(f"the hosts cannot be connected: {first}") from error

@@ -1,0 +1,134 @@
+"""Several devices give the loss and the gradient of one, and several hosts decide alike."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import sphere_dataset, tiny_config
+
+from geosplat_jax.cli.arguments import command_line
+from geosplat_jax.cli.training import UsageError, _devices, _idle
+from geosplat_jax.fit.devices import ONE_DEVICE, Devices, choose_devices
+from geosplat_jax.fit.planning import TrainingError
+from geosplat_jax.fit.train import fit
+
+HERE = Path(__file__).parent
+
+
+def started(*arguments):
+    """Start `two_devices.py` in a process of its own."""
+    environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    path = os.pathsep.join([str(HERE), str(HERE.parent), environment.get("PYTHONPATH", "")])
+    return subprocess.Popen(
+        [sys.executable, str(HERE / "two_devices.py"), *map(str, arguments)],
+        env={**environment, "PYTHONPATH": path},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def finished(*processes, seconds=540):
+    """Wait for processes, which must end well; none is left behind."""
+    try:
+        outputs = [process.communicate(timeout=seconds)[0] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    for process, output in zip(processes, outputs, strict=True):
+        assert process.returncode == 0, output[-3000:]
+
+
+@pytest.mark.slow
+def test_two_devices_give_the_loss_and_the_gradient_of_one(tmp_path):
+    """Three views on two devices, of which one counts for less; the light is frozen."""
+    finished(started("gradient", tmp_path))
+    found = np.load(tmp_path / "gradient.npz")
+    names = [name.removeprefix("one") for name in found if name.startswith("one")]
+    assert len(names) > 20
+    moving = 0
+    for name in names:
+        one, two = found[f"one{name}"], found[f"two{name}"]
+        scale = np.abs(one).max() + 1e-12
+        np.testing.assert_allclose(two, one, rtol=2e-4, atol=2e-5 * scale)
+        moving += bool(np.any(one))
+    assert moving > 15
+    # Parameters must not come apart: both devices hold the same bits.
+    assert not found["apart"].any()
+
+
+@pytest.mark.slow
+def test_two_hosts_grow_stop_resume_and_refuse_together(tmp_path):
+    """Two processes: a refusal, an overflow, a Ctrl-C at one of them, a checkpoint, the end."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    finished(*(started("train", tmp_path, port, host) for host in (0, 1)))
+    first, second = (json.loads((tmp_path / f"host{k}.json").read_text()) for k in (0, 1))
+    for host in (first, second):
+        assert "do not train the same" in host["said"]["other settings"]
+        assert host["said"]["stop"] == "Interrupted: stopped at step 2; continue with --resume"
+        assert set(host["said"]) == {"other settings", "stop"}
+        assert host["step"] == 4
+    # Both began with the first one's buffers and grew them to the same size, in the same step.
+    assert first["sizes"] == second["sizes"]
+    grown = [(step, new) for step, old, new in first["sizes"] if new > old]
+    assert len(grown) == 1
+    assert grown[0][0] == 0
+    a, b = (np.load(tmp_path / f"host{k}.npz") for k in (0, 1))
+    for name in a:
+        np.testing.assert_array_equal(a[name], b[name])
+    lines = [json.loads(x) for x in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [0, 1, 2, 3]
+    alone = tmp_path / "alone"
+    fit(sphere_dataset(), tiny_config("stages.split_sum.batch_views=2"), alone)
+    text = (alone / "metrics.jsonl").read_text().splitlines()
+    assert [line["loss"] for line in lines] == pytest.approx(
+        [json.loads(x)["loss"] for x in text], rel=1e-3
+    )
+
+
+def test_one_device_is_what_a_training_gets_that_asks_for_nothing():
+    assert choose_devices() is ONE_DEVICE
+
+
+def test_more_devices_than_there_are_is_refused_in_one_line():
+    import jax
+
+    there = len(jax.local_devices())
+    with pytest.raises(
+        TrainingError, match=f"--devices {there + 1}: this process has {there}"
+    ) as e:
+        choose_devices(there + 1)
+    assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--host", "0"], "belong to --hosts"),
+        (["--hosts", "2", "--host", "0"], "needs --host K and --coordinator"),
+        (["--hosts", "2", "--coordinator", "localhost:1"], "needs --host K and --coordinator"),
+        (["--hosts", "auto", "--budget", "5min"], "leave --budget"),
+    ],
+)
+def test_options_that_say_half_of_it_are_refused(options, message):
+    arguments = command_line().parse_args(["train", "scene", *options])
+    with pytest.raises(UsageError, match=message):
+        _devices(arguments)
+
+
+def test_devices_without_a_view_are_told_of():
+    devices = Devices()
+    devices.count = 3
+    config = tiny_config("stages.split_sum.batch_views=2")
+    assert _idle(devices, config) == [
+        "stages.split_sum.batch_views = 2: of 3 devices, 1 have nothing to do"
+    ]
+    devices.count = 2
+    assert _idle(devices, config) == []
