@@ -201,8 +201,8 @@ def outgoing(
     """Radiance that every face sends out, for `TracedIndirect`.
 
     The mean over a face's points of their irradiance / pi times what they reflect at normal
-    incidence, both lobes: seen by way of another surface, a glossy point passes for a matt one.
-    Faces without points are black. Differentiable in the first two arguments.
+    incidence, in all lobes that they have: seen by way of another surface, a glossy point passes
+    for a matt one. Faces without points are black. Differentiable in the first two arguments.
 
     Parameters
     ----------
@@ -210,8 +210,9 @@ def outgoing(
     face_count : static; rows to return.
     """
     matt = materials.albedo * (1 - materials.metallic)[:, None]
-    glossy = specular_f0(materials.albedo, materials.metallic)
-    radiance = jnp.where(points.mask[:, None], (matt + glossy) * diffuse_light, 0.0)
+    if materials.has_specular:
+        matt = matt + specular_f0(materials.albedo, materials.metallic)
+    radiance = jnp.where(points.mask[:, None], matt * diffuse_light, 0.0)
     row = jnp.where(points.faces < 0, face_count, points.faces)
     total = jnp.zeros((face_count, 3), radiance.dtype).at[row].add(radiance, mode="drop")
     count = (
