@@ -17,6 +17,7 @@ import numpy as np
 
 from geosplat_jax.fit.budget import Pacer
 from geosplat_jax.fit.config import Config
+from geosplat_jax.fit.entering import Start
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.loop import Loop, adopted_loop, new_loop, resumed_loop
 from geosplat_jax.fit.memory import require_training_memory
@@ -165,6 +166,8 @@ def fit(
     on_preview: Callable[[Trained], None] | None = None,
     pacer: Pacer | None = None,
     on_compile: Callable[[str], None] | None = None,
+    start: Start | None = None,
+    model: dict[str, Any] | None = None,
 ) -> TrainState:
     """Train on a dataset and leave a run's folder; see `folder.RunFolder`.
 
@@ -184,11 +187,14 @@ def fit(
     pacer : keeps the training to a budget of time by changing the steps to come; ``run.json`` says
         how many there were in the end.
     on_compile : called with the name of the stage before a step waits for a compilation.
+    start : shape, light and exposure of another training to begin with; without ``source``.
+    model : what ``run.json`` says of how the model was chosen.
 
     Raises
     ------
     ValueError
-        If ``resume`` and ``source`` are both given, or ``source`` without ``first_stage``.
+        If two of ``resume``, ``source`` and ``start`` do not go together, or ``source`` is given
+        without ``first_stage``.
     SceneError
         If the training views have no masks.
     RunError
@@ -203,6 +209,8 @@ def fit(
         raise ValueError("a run that is resumed has its first stages already; leave source out")
     if (source is None) != (first_stage is None):
         raise ValueError("source and first_stage belong together")
+    if source is not None and start is not None:
+        raise ValueError("a run that takes stages over has a start already; leave start out")
     dataset.require_masks("train")
     require_training_memory(config, dataset)
     run = RunFolder(folder)
@@ -211,15 +219,18 @@ def fit(
         try:
             if not (resume and run.exists):
                 run.require_free(replace=replace_run)
-                loop = _first_loop(dataset, config, run, source, first_stage)
+                if source is None or first_stage is None:
+                    loop = new_loop(dataset, config, run, start)
+                else:
+                    loop = _loop_from(dataset, config, run, source, first_stage)
                 budget = None if pacer is None else pacer.budget
-                run.begin(dataset, config, replace=replace_run, budget=budget)
+                run.begin(dataset, config, replace=replace_run, budget=budget, model=model)
                 has_begun = True
                 if source is not None:
                     loop.save_end()
             else:
                 run.repoint(dataset)
-                loop = resumed_loop(dataset, config, run)
+                loop = resumed_loop(dataset, config, run, start)
             loop.on_compile = on_compile
             try:
                 return _train(loop, stop_after, stop_requested, on_step, on_preview, pacer)
@@ -235,16 +246,10 @@ def fit(
             raise
 
 
-def _first_loop(
-    dataset: Dataset,
-    config: Config,
-    run: RunFolder,
-    source: str | Path | None,
-    first_stage: str | None,
+def _loop_from(
+    dataset: Dataset, config: Config, run: RunFolder, source: str | Path, first_stage: str
 ) -> Loop:
-    """Build the loop of a new run, with its first stages from another one where asked."""
-    if source is None or first_stage is None:
-        return new_loop(dataset, config, run)
+    """Build the loop of a new run with its first stages from another one."""
     other = RunFolder(source)
     other.require_same_scene(dataset)
     return adopted_loop(dataset, config, run, other, first_stage)
