@@ -15,6 +15,7 @@ from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.train import Interrupted, Progress, TrainingError
 from geosplat_jax.io.dataset import Dataset, load_dataset
 from geosplat_jax.io.images import SceneError
+from geosplat_jax.model_choice import ModelChoice
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
 from geosplat_jax.report.relight import load_light
@@ -29,6 +30,7 @@ __all__ = [
     "Dataset",
     "EnvLight",
     "Interrupted",
+    "ModelChoice",
     "Params",
     "Pipeline",
     "Progress",

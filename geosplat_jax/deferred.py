@@ -7,6 +7,7 @@ rendering equation is evaluated once for every pixel with what remains (Eq. 22).
 The samples of light, what they hit and the hits of the pixels' own rays carry no gradient.
 """
 
+from dataclasses import replace
 from typing import Literal
 
 import jax
@@ -16,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from geosplat_jax.core.mesh import face_normals_and_areas
 from geosplat_jax.core.numerics import safe_normalize
 from geosplat_jax.core.settings import NonNegative, settings
-from geosplat_jax.core.types import Camera, Materials, SurfacePoints
+from geosplat_jax.core.types import Camera, SurfacePoints
 from geosplat_jax.materials import Attributes
 from geosplat_jax.rays.base import RayIndex
 from geosplat_jax.render import AOV_CHANNELS, Asset, RenderPipeline, ShadingDomain
@@ -74,8 +75,11 @@ class PerPixel(ShadingDomain, kind="per_pixel"):
         coverage = jax.lax.stop_gradient(alpha) if self.detach_coverage else alpha
         share = jnp.maximum(coverage, _THINNEST).reshape(-1, 1)
         straight = {n: x.reshape(height * width, -1) / share for n, x in images.items()}
-        materials = Materials(
-            straight["albedo"], straight["roughness"][:, 0], straight["metallic"][:, 0]
+        materials = replace(
+            asset.attributes.materials,
+            albedo=straight["albedo"],
+            roughness=straight["roughness"][:, 0],
+            metallic=straight["metallic"][:, 0],
         )
         points = self._points(pipeline, asset, straight, alpha.reshape(-1) > 0, camera)
         shaded = self.adapted(pipeline.transport).shade(

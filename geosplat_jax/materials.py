@@ -6,7 +6,7 @@ metallic and the inward shift; `MaterialSpec.shared` lets one encoding feed ever
 cost.
 """
 
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -73,6 +73,9 @@ class MaterialSpec:
     `MATERIAL_PRIORS`."""
     initial_metallic_logit: Number = 0.0
     """The same for metallic."""
+    specular: Literal["none", "uniform", "field"] = "field"
+    """The specular lobe: of a roughness that varies over the surface, of a single one that is
+    learned, or none. Without one the surface is Lambertian, and has no metallic either."""
     has_metallic: bool = True
     """Without it metallic is zero and has no parameters."""
     has_shift: bool = True
@@ -83,6 +86,18 @@ class MaterialSpec:
     """Whether attributes pull on the geometry: the field is differentiated in the positions. Off,
     the field moves with the surface. On in the paper's and the authors' method."""
 
+    @property
+    def surface_outputs(self) -> int:
+        """Outputs of the head of roughness and metallic, in this order."""
+        if self.specular == "none":
+            return 0
+        return int(self.specular == "field") + int(self.has_metallic)
+
+    @property
+    def encodings(self) -> int:
+        """How many encodings there are: heads that a model lacks need none."""
+        return 1 + int(not self.shared and (self.surface_outputs > 0 or self.has_shift))
+
 
 class MaterialField(eqx.Module):
     """Parameters of a material field; a head that the method lacks is None and holds none.
@@ -90,17 +105,22 @@ class MaterialField(eqx.Module):
     Attributes
     ----------
     albedo_table : (E, F) encoding of albedo and indirect light, or of everything when shared.
-    surface_table : (E, F) encoding of roughness, metallic and shift; None when shared.
-    albedo_head : 3 outputs. surface_head : roughness and, with metallic, 2 outputs.
+    surface_table : (E, F) encoding of roughness, metallic and shift; None when shared, or where
+        there is none of these.
+    albedo_head : 3 outputs. surface_head : roughness and metallic, those of them that vary over the
+        surface, or None.
     shift_head : 1 output or None. indirect_head : learned indirect light, or None.
+    roughness_logit : () added to the initial logit of a roughness that is the same everywhere, or
+        None.
     """
 
     albedo_table: Float[Array, "E F"] = learned("albedo")
     surface_table: Float[Array, "E F"] | None = learned("roughness_metallic")
     albedo_head: tuple[Layer, ...] = learned("albedo")
-    surface_head: tuple[Layer, ...] = learned("roughness_metallic")
+    surface_head: tuple[Layer, ...] | None = learned("roughness_metallic")
     shift_head: tuple[Layer, ...] | None = learned("shift", default=None)
     indirect_head: tuple[Layer, ...] | None = learned("indirect", default=None)
+    roughness_logit: Float[Array, ""] | None = learned("roughness", default=None)
 
 
 class Attributes(eqx.Module):
@@ -109,7 +129,7 @@ class Attributes(eqx.Module):
     Attributes
     ----------
     materials : albedo in (0, 1), roughness in [0.1, 1] and metallic in (0, 1), or 0 for a field
-        without metallic.
+        without metallic; roughness 1 and metallic 0 for one without a specular lobe.
     shift : (N,) share in (0, 1) of ``sqrt(face area)`` by which a splat sinks below its face,
         ``sigmoid(z(mu))``, starting near 1/2 (see `MaterialSpec.initial_shift_logit`); None for a
         field without shift.
@@ -140,11 +160,16 @@ def init_materials(
 
     return MaterialField(
         albedo_table=init_tables(keys["albedo_table"], spec.grid),
-        surface_table=None if spec.shared else init_tables(keys["surface_table"], spec.grid),
+        surface_table=init_tables(keys["surface_table"], spec.grid) if spec.encodings > 1 else None,
         albedo_head=head("albedo", spec.albedo_hidden, 3),
-        surface_head=head("surface", spec.surface_hidden, 2 if spec.has_metallic else 1),
+        surface_head=(
+            head("surface", spec.surface_hidden, spec.surface_outputs)
+            if spec.surface_outputs
+            else None
+        ),
         shift_head=head("shift", spec.surface_hidden, 1) if spec.has_shift else None,
         indirect_head=init_indirect_head(keys["indirect"], spec, indirect_outputs),
+        roughness_logit=jnp.zeros((), jnp.float32) if spec.specular == "uniform" else None,
     )
 
 
@@ -187,15 +212,31 @@ def attributes_at(
     surface_features = albedo_features
     if field.surface_table is not None:
         surface_features = features(field.surface_table)
-    raw = apply_mlp(field.surface_head, surface_features)
-    roughness = jax.nn.sigmoid(raw[:, 0] + spec.initial_roughness_logit)
+    roughness, metallic = _surface_attributes(field, surface_features, spec)
+    materials = Materials(albedo, roughness, metallic, has_specular=spec.specular != "none")
+    return Attributes(materials, *_detached_heads(field, unit, surface_features, spec))
+
+
+def _surface_attributes(
+    field: MaterialField, features: Float[Array, "N W"], spec: MaterialSpec
+) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
+    """Evaluate roughness and metallic; what the model lacks is 1 and 0."""
+    one, zero = jnp.ones_like(features[:, 0]), jnp.zeros_like(features[:, 0])
+    if spec.specular == "none":
+        return one, zero
+    raw, metallic = jnp.zeros_like(features[:, :0]), zero
+    if field.surface_head is not None:
+        raw = apply_mlp(field.surface_head, features)
+    if spec.specular == "field":
+        logit = raw[:, 0]
+    else:
+        assert field.roughness_logit is not None
+        logit = field.roughness_logit * one
+    roughness = jax.nn.sigmoid(logit + spec.initial_roughness_logit)
     roughness = roughness * (1 - ROUGHNESS_MINIMUM) + ROUGHNESS_MINIMUM
     if spec.has_metallic:
-        metallic = jax.nn.sigmoid(raw[:, 1] + spec.initial_metallic_logit)
-    else:
-        metallic = jnp.zeros_like(roughness)
-    materials = Materials(albedo=albedo, roughness=roughness, metallic=metallic)
-    return Attributes(materials, *_detached_heads(field, unit, surface_features, spec))
+        metallic = jax.nn.sigmoid(raw[:, -1] + spec.initial_metallic_logit)
+    return roughness, metallic
 
 
 def _detached_heads(

@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -29,11 +29,13 @@ from geosplat_jax.io.cameras import RefinedSplit, write_cameras
 from geosplat_jax.io.dataset import Dataset, load_recorded, photograph_size
 from geosplat_jax.io.images import write_png
 from geosplat_jax.io.views import Views
+from geosplat_jax.model_choice import ModelChoice, Rung, choose_model
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
 from geosplat_jax.report.assets import export_assets
 from geosplat_jax.report.consistency import Consistency, body_of_run, measure, single_cameras
 from geosplat_jax.report.evaluate import EvaluateOptions, Truth, evaluate_run
+from geosplat_jax.report.facts import changed_from_preset
 from geosplat_jax.report.pace import OnProgress, counted
 from geosplat_jax.report.page import REPORT, Evaluated, write_report
 from geosplat_jax.report.protocols import PROTOCOLS
@@ -462,6 +464,8 @@ def train(
     budget: Budget | None = None,
     on_compile: Callable[[str], None] | None = None,
     devices: int | Devices = 1,
+    model: Literal["auto"] | ModelChoice | None = None,
+    on_rung: Callable[[Rung], None] | None = None,
     **reading: Any,
 ) -> Run:
     """Train a scene into a run's folder.
@@ -480,6 +484,11 @@ def train(
     devices : number of those of this process that share the views of every step
         (docs/devices.md); all processes that `jax.distributed.initialize` connected take part, with
         so many each. Or what `fit.devices.choose_devices` made of it before.
+    model : ``auto``, or how to choose: train the smallest model that explains the scene, see
+        `model_choice.choose_model`. Of the parts of ``config``, those stay as they are whose
+        settings differ from its preset, or are named in ``by_hand``. A run that is resumed keeps
+        its model.
+    on_rung : called after every part of a model that was tried.
     reading : how to read the scene: ``downscale``, ``light``, ``bounds`` (six numbers),
         ``cameras`` (a file of `Run.refine_cameras`).
 
@@ -488,14 +497,19 @@ def train(
     SceneError, RunError, TrainingError, Interrupted
         See `load_dataset` and `fit.train.fit`.
     ValueError
-        If the mesh cannot be used; see `io.start_mesh`.
+        If the mesh cannot be used, see `io.start_mesh`; if a model is to be chosen under a budget,
+        for stages of another run, or from too few views.
     """
+    if model is not None and (budget is not None or source is not None):
+        raise ValueError("a model is chosen for a whole training without a budget; leave model out")
     began, folder = time.perf_counter(), RunFolder(output)
     if isinstance(devices, int):
         devices = choose_devices(devices)
     if resume and config is None and folder.exists and folder.budget() is not None:
         # Its settings were chosen for the budget, and have changed since.
         config, budget, reading = folder.config(), folder.budget(), folder.record()["dataset"]
+    if resume and config is None and folder.has_chosen_model:
+        config, reading = folder.config(), folder.record()["dataset"]
     if config is None and budget is not None:
         chosen = plan_training(scene, budget, downscale=reading.get("downscale"))
         config, reading = chosen.config, {**reading, "downscale": chosen.downscale}
@@ -503,6 +517,24 @@ def train(
     if mesh is not None:
         config = with_mesh(config, mesh)
     dataset = scene if isinstance(scene, Dataset) else load_recorded(scene, reading)
+    evidence = None
+    if model is not None and not (resume and folder.exists):
+        folder.require_free(replace=force)
+        dataset.require_masks("train")
+        how = ModelChoice() if model == "auto" else model
+        by_hand = (*how.by_hand, *changed_from_preset(config))
+        chosen_model = choose_model(
+            dataset,
+            config,
+            folder.path,
+            replace(how, by_hand=tuple(dict.fromkeys(by_hand))),
+            resume=resume,
+            force=force,
+            on_step=on_step,
+            on_rung=on_rung,
+        )
+        config, evidence = chosen_model.config, chosen_model.record()
+        began = time.perf_counter()  # the cost of choosing is stated apart
     pacer = None
     if budget is not None:
         pixels = float(dataset.train.height * dataset.train.width)
@@ -524,6 +556,7 @@ def train(
             pacer=pacer,
             on_compile=on_compile,
             devices=devices,
+            model=evidence,
         )
     finally:
         previews.finish()

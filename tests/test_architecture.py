@@ -30,6 +30,7 @@ ORDER = [
     "io",
     "fit",
     "report",
+    "model_choice",
     "capture",
     "run",
     "camera_rounds",

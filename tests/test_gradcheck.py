@@ -20,6 +20,7 @@ SLOW_STAGES = {
     "loss",
     "refinement",
     "materials",
+    "models",
     "paths",
     "projection",
     "rasterizer",

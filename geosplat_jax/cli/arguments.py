@@ -55,6 +55,12 @@ def command_line() -> argparse.ArgumentParser:
         help="with --budget: 4GB; as much as the machine has by default",
     )
     train.add_argument(
+        "--model",
+        choices=("auto",),
+        help="auto: first find out in short trainings which parts of the model the scene needs, "
+        "and leave the others out; docs/models.md",
+    )
+    train.add_argument(
         "--refine-cameras",
         type=int,
         nargs="?",

@@ -1,19 +1,22 @@
 """The train command: what its options ask for, and the training with progress on the terminal."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from rich.table import Table
+
 from geosplat_jax.camera_rounds import refined_cameras
-from geosplat_jax.cli.display import ProgressDisplay, say, say_refined
+from geosplat_jax.cli.display import ProgressDisplay, console, say, say_refined
 from geosplat_jax.fit.config import Budget, Config, config_warnings
 from geosplat_jax.fit.devices import Devices, choose_devices, connect_hosts
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import make_config, with_mesh
 from geosplat_jax.io.dataset import choose_downscale, load_recorded
+from geosplat_jax.model_choice import ModelChoice, Rung, rung_row
 from geosplat_jax.run import plan_training
 from geosplat_jax.run import train as train_run
 
@@ -67,11 +70,13 @@ class _Order:
     config : settings.
     reading : how to read the scene, see `load_recorded`.
     budget : that it has to keep to; None for as long as it takes.
+    model : how to choose the parts of the model; None for those of the settings.
     """
 
     config: Config
     reading: dict[str, Any]
     budget: Budget | None = None
+    model: ModelChoice | None = None
 
 
 def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
@@ -81,11 +86,18 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
             raise UsageError(f"{folder} keeps its budget; leave --budget and --memory out")
         # Its settings were chosen for the budget, and have changed since.
         return _Order(folder.config(), folder.record()["dataset"], folder.budget())
+    if arguments.resume and folder.has_chosen_model:
+        return _Order(folder.config(), folder.record()["dataset"])
+    if arguments.model is not None and (arguments.budget or arguments.source):
+        raise UsageError("--model auto chooses for a whole training; leave --budget and --from out")
     if arguments.budget is None:
         if arguments.memory is not None:
             raise UsageError("--memory belongs to --budget")
-        config = config_from(arguments)
-        return _Order(config, scene_options(arguments, config))
+        config, model = config_from(arguments), None
+        if arguments.model is not None:
+            paths = (text.partition("=")[0].strip() for text in arguments.overrides)
+            model = ModelChoice(by_hand=tuple(dict.fromkeys(paths)))
+        return _Order(config, scene_options(arguments, config), model=model)
     if arguments.quality is not None or arguments.preset is not None:
         raise UsageError("--budget chooses the settings; leave --quality and --preset out")
     if arguments.source is not None:
@@ -123,6 +135,27 @@ def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[
         )
     say(f"cameras: {cameras}")
     return cameras
+
+
+def _say_rung(rung: Rung) -> None:
+    """Say what became of a part of the model, as soon as it is known."""
+    title, _, larger, gain, verdict = rung_row(asdict(rung))
+    say(f"model: {title}: {larger}, gain {gain}: {verdict}")
+
+
+def _say_model(record: Mapping[str, Any] | None) -> None:
+    """Show why the model is what it is."""
+    if record is None:
+        return
+    table = Table(title=f"model, by {len(record['held_back'])} views that were held back")
+    for column in ("part", "without", "with", "gain", ""):
+        table.add_column(column)
+    for rung in record["rungs"]:
+        table.add_row(*rung_row(rung))
+    for title in record["by_hand"]:
+        table.add_row(title, "", "", "", "set by hand")
+    console.print(table)
+    say(f"choosing took {record['seconds']:.0f} s, {record['trainings']} short trainings")
 
 
 @contextmanager
@@ -194,8 +227,12 @@ def train(arguments: argparse.Namespace) -> None:
             on_compile=display.compiling,
             budget=order.budget,
             devices=devices,
+            model=order.model,
+            on_rung=_say_rung,
         )
     if not devices.is_first_host:
         return
+    if order.model is not None:
+        _say_model(run.folder.record().get("model"))
     seconds = (run.folder.training() or {})["seconds_total"]
     say(f"trained in {seconds:.0f} s; next: geosplat-jax evaluate {folder}")

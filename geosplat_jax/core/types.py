@@ -320,11 +320,14 @@ class Materials(eqx.Module):
     ----------
     albedo : (N, 3) linear base colour in [0, 1]; roughness : (N,) perceptual, GGX alpha is its
         square; metallic : (N,) in [0, 1].
+    has_specular : static; whether there is a specular lobe. Without one, roughness is 1, metallic
+        is 0, and the light of the lobe is not computed.
     """
 
     albedo: Float[Array, "N 3"]
     roughness: Float[Array, " N"]
     metallic: Float[Array, " N"]
+    has_specular: bool = eqx.field(static=True, default=True)
 
 
 class EnvLight(eqx.Module):

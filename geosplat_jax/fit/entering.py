@@ -1,9 +1,10 @@
-"""What happens to the parameters when a stage begins."""
+"""Where parameters begin: a training that goes on from another one, and every stage."""
 
 import abc
 from dataclasses import replace
 from typing import Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
@@ -20,10 +21,35 @@ from geosplat_jax.materials import (
 )
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
+from geosplat_jax.surface.base import SurfaceModel
 
 _GREY = 0.5
 _DARKEST = 0.02
 """A first albedo lies between this and its complement, where the sigmoid still has a slope."""
+
+
+class Start(eqx.Module):
+    """Where a training begins that takes shape, light and exposure over from another one.
+
+    Attributes
+    ----------
+    surface : model of the surface. params : that the other training ended with.
+    """
+
+    surface: SurfaceModel
+    params: Params
+
+    def applied(self, params: Params) -> Params:
+        """Put what is taken over in the place of new parameters; the light takes their size."""
+        radiance = jax.image.resize(
+            self.params.light.radiance, params.light.radiance.shape, "linear", antialias=True
+        )
+        return replace(
+            params,
+            geometry=self.params.geometry,
+            light=replace(params.light, radiance=radiance),
+            log_exposure=self.params.log_exposure,
+        )
 
 
 @settings

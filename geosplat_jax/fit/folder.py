@@ -249,9 +249,14 @@ class RunFolder:
         except ValueError as error:
             raise RunError(f"{self._record_path} is damaged: {first_line(error)}") from None
 
+    @property
+    def has_chosen_model(self) -> bool:
+        """Whether there is a run whose model was chosen by what its scene needs."""
+        return self.exists and "model" in self.record()
+
     def seconds_used(self) -> float:
         """Add up what the steps took that are in ``metrics.jsonl``."""
-        return sum(float(line.get("seconds", 0.0)) for line in self.metric_lines())
+        return sum((float(line.get("seconds", 0.0)) for line in self.metric_lines()), 0.0)
 
     def begin(
         self,
@@ -260,8 +265,11 @@ class RunFolder:
         *,
         replace: bool,
         budget: Budget | None = None,
+        model: dict[str, Any] | None = None,
     ) -> None:
         """Write the record of a new run; call it with the lock held.
+
+        ``model`` : how its parts were chosen, see `model_choice.choose_model`.
 
         Raises
         ------
@@ -275,6 +283,7 @@ class RunFolder:
                 **_scene_of(dataset),
                 "config": config.to_dict(),
                 **({} if budget is None else {"budget": asdict(budget)}),
+                **({} if model is None else {"model": model}),
                 "notes": [*dataset.notes, *config.geometry.notes(dataset)],
                 "versions": {
                     "python": platform.python_version(),

@@ -17,6 +17,7 @@ from geosplat_jax.core.types import Batch
 from geosplat_jax.fit.compilation import compile_step
 from geosplat_jax.fit.config import Config, Stage, config_from_dict, differences
 from geosplat_jax.fit.devices import ONE_DEVICE, Devices
+from geosplat_jax.fit.entering import Start
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.gradient import SharedBatch
 from geosplat_jax.fit.planning import (
@@ -413,18 +414,26 @@ def _on_host(shape: Any) -> Any:
 
 
 def new_loop(
-    dataset: Dataset, config: Config, folder: RunFolder, devices: Devices = ONE_DEVICE
+    dataset: Dataset,
+    config: Config,
+    folder: RunFolder,
+    devices: Devices = ONE_DEVICE,
+    start: Start | None = None,
 ) -> Loop:
-    """Build the loop of a new run."""
+    """Build the loop of a new run; ``start`` : what it takes over, None where it begins anew."""
     shape_key, field_key = jax.random.split(jax.random.key(config.run.seed))
     if not config.active_stages:
         raise TrainingError("nothing to train: no stage has steps")
-    try:
-        surface, shape = config.geometry.start(dataset, shape_key)
-    except ValueError as error:
-        raise TrainingError(str(error)) from error
     stage = config.active_stages[0]
-    params = initial_params(shape, config, field_key)
+    if start is None:
+        try:
+            surface, shape = config.geometry.start(dataset, shape_key)
+        except ValueError as error:
+            raise TrainingError(str(error)) from error
+        params = initial_params(shape, config, field_key)
+    else:
+        surface = start.surface
+        params = start.applied(initial_params(start.params.geometry, config, field_key))
     pipeline = build_pipeline(config, stage, surface)
     views, share = around_object(dataset.train, largest=config.run.window)
     loop = Loop(
@@ -455,7 +464,11 @@ def _put(loop: Loop, tree: dict[str, Any], described: Description) -> None:
 
 
 def resumed_loop(
-    dataset: Dataset, config: Config, folder: RunFolder, devices: Devices = ONE_DEVICE
+    dataset: Dataset,
+    config: Config,
+    folder: RunFolder,
+    devices: Devices = ONE_DEVICE,
+    start: Start | None = None,
 ) -> Loop:
     """Rebuild the loop of a run from its last good checkpoint, or from the start without one."""
     changed = differences(folder.config(), config)
@@ -464,7 +477,7 @@ def resumed_loop(
             "cannot resume with another configuration; start a new run, or undo: "
             + "; ".join(changed)
         )
-    loop = new_loop(dataset, config, folder, devices)
+    loop = new_loop(dataset, config, folder, devices, start)
     path = latest_checkpoint(folder.checkpoints)
     before = [stage.name for stage in config.active_stages]
     if path is None:

@@ -154,7 +154,7 @@ def _smoothness_bytes(config: Config) -> int:
     """Count the encoded points of the smoothness terms: each, and each displaced (Eq. 16)."""
     if not any(_SMOOTHNESS & set(stage.weights_at(0)) for stage in config.active_stages):
         return 0
-    width = config.material.grid.width * (1 if config.material.shared else 2)
+    width = config.material.grid.width * config.material.encodings
     return 2 * config.objective.smoothness_samples * width * _FLOAT_BYTES
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from geosplat_jax.fit.budget import Pacer
 from geosplat_jax.fit.config import Config
 from geosplat_jax.fit.devices import ONE_DEVICE, Devices
+from geosplat_jax.fit.entering import Start
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.loop import Loop, adopted_loop, new_loop, resumed_loop
 from geosplat_jax.fit.memory import require_training_memory
@@ -169,6 +170,8 @@ def fit(
     pacer: Pacer | None = None,
     on_compile: Callable[[str], None] | None = None,
     devices: Devices = ONE_DEVICE,
+    start: Start | None = None,
+    model: dict[str, Any] | None = None,
 ) -> TrainState:
     """Train on a dataset and leave a run's folder; see `folder.RunFolder`.
 
@@ -191,12 +194,14 @@ def fit(
     devices : that the views of a step are shared by, see `devices.choose_devices`. Of several hosts
         all call this with the same arguments; the first one alone writes the folder, from which all
         read, and calls the functions above.
+    start : shape, light and exposure of another training to begin with; without ``source``.
+    model : what ``run.json`` says of how the model was chosen.
 
     Raises
     ------
     ValueError
-        If ``resume`` and ``source`` are both given, ``source`` without ``first_stage``, or a pacer
-        on several hosts, whose clocks are not one.
+        If two of ``resume``, ``source`` and ``start`` do not go together, ``source`` is given
+        without ``first_stage``, or a pacer on several hosts, whose clocks are not one.
     SceneError
         If the training views have no masks.
     RunError
@@ -214,6 +219,8 @@ def fit(
         raise ValueError("source and first_stage belong together")
     if pacer is not None and jax.process_count() > 1:
         raise ValueError("a budget is kept by one clock; leave it out on several hosts")
+    if source is not None and start is not None:
+        raise ValueError("a run that takes stages over has a start already; leave start out")
     run = RunFolder(folder)
     writes = devices.is_first_host
     if not writes:
@@ -228,17 +235,17 @@ def fit(
             if not devices.first_host(resume and run.exists):
                 devices.together(lambda: writes and run.require_free(replace=replace_run))
                 loop = devices.together(
-                    lambda: _first_loop(dataset, config, run, source, first_stage, devices)
+                    lambda: _first_loop(dataset, config, run, source, first_stage, devices, start)
                 )
                 budget = None if pacer is None else pacer.budget
                 if writes:
-                    run.begin(dataset, config, replace=replace_run, budget=budget)
+                    run.begin(dataset, config, replace=replace_run, budget=budget, model=model)
                     has_begun = True
                 if source is not None:
                     loop.save_end()
             else:
                 devices.together(lambda: writes and run.repoint(dataset))
-                loop = devices.together(lambda: resumed_loop(dataset, config, run, devices))
+                loop = devices.together(lambda: resumed_loop(dataset, config, run, devices, start))
             _require_same_start(loop)
             loop.on_compile = on_compile
             try:
@@ -262,10 +269,11 @@ def _first_loop(
     source: str | Path | None,
     first_stage: str | None,
     devices: Devices,
+    start: Start | None,
 ) -> Loop:
     """Build the loop of a new run, with its first stages from another one where asked."""
     if source is None or first_stage is None:
-        return new_loop(dataset, config, run, devices)
+        return new_loop(dataset, config, run, devices, start)
     other = RunFolder(source)
     other.require_same_scene(dataset)
     return adopted_loop(dataset, config, run, other, first_stage, devices)

@@ -108,6 +108,45 @@ def material_problems(rng: np.random.Generator) -> list[Problem]:
     return [field(True), field(False)]
 
 
+def model_problems(rng: np.random.Generator) -> list[Problem]:
+    """Shaded points of every model of the material: its parameters, normals, viewer and light."""
+    count, operators = 7, prefilter_operators(_LIGHT)
+    points, table = rng.uniform(-0.9, 0.9, (count, 3)), fg_table(cosines=9, roughnesses=7)
+    drawn = _surface_points(rng, count)
+    texels = rng.uniform(0.1, 2.0, (_LIGHT.height, _LIGHT.width, 3))
+
+    def model(name: str, **kind: Any) -> Problem:
+        spec = MaterialSpec(grid=_GRID, albedo_hidden=(5,), surface_hidden=(5,), bias=True, **kind)
+        leaves, structure = jax.tree.flatten(init_materials(jax.random.key(0), spec))
+        varied = [rng.uniform(-1, 1, leaf.shape) for leaf in leaves]
+
+        def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
+            operators, table, points = constants
+            field = inputs["parameters"]
+            box = unit_box(points.dtype)
+            materials = attributes_at(field, points, box, spec=spec).materials
+            light = prefilter(
+                EnvLight(inputs["texels"]), operators, diffuse_only=not materials.has_specular
+            )
+            shaded = split_sum(materials, inputs["normals"], inputs["wo"], light, table)
+            return {"rgb": shaded.rgb}
+
+        inputs = {
+            "parameters": jax.tree.unflatten(structure, varied),
+            "normals": drawn["normals"],
+            "wo": drawn["wo"],
+            "texels": texels,
+        }
+        return Problem(f"model, {name}", function, inputs, (operators, table, points))
+
+    return [
+        model("Lambertian", specular="none", has_shift=False),
+        model("one roughness", specular="uniform", has_metallic=False, has_shift=False),
+        model("one roughness and metallic", specular="uniform", has_shift=False),
+        model("roughness field", has_metallic=False, has_shift=False),
+    ]
+
+
 def _surface_points(rng: np.random.Generator, count: int) -> dict[str, Any]:
     """Materials, normals and a viewer in front of them."""
     normals, wo = unit_vectors(rng, count), unit_vectors(rng, count)

@@ -154,6 +154,36 @@ def no_views(like: Views) -> Views:
     return Views((), like.camera_to_world[:0], like.intrinsics[:0], like.images[:0])
 
 
+def some_views(views: Views, chosen: Sequence[int] | np.ndarray, *, factor: int = 1) -> Views:
+    """Return some of the views, reduced by an integer factor; truth and other lights stay behind.
+
+    Raises
+    ------
+    SceneError
+        See `images.downscale`.
+    """
+    chosen = np.asarray(chosen, int)
+    full = np.ones((views.height, views.width), bool)
+    pairs = [
+        _reduced(views.images[k], full if views.valid is None else views.valid[k] > 0, factor)
+        for k in chosen
+    ]
+    intrinsics = views.intrinsics[chosen].copy()
+    intrinsics[:, :2] /= factor
+    return replace(
+        views,
+        names=tuple(views.names[k] for k in chosen),
+        camera_to_world=views.camera_to_world[chosen],
+        intrinsics=intrinsics,
+        images=np.stack([rgba for rgba, _ in pairs]).astype(np.float32),
+        valid=None if views.valid is None else np.stack([v for _, v in pairs]).astype(np.float32),
+        exposure=None if views.exposure is None else views.exposure[chosen],
+        truth={},
+        relight={},
+        lights={},
+    )
+
+
 def load_views(
     frames: Sequence[Frame], *, factor: int, listing: Listing
 ) -> tuple[Views, list[str]]:
@@ -327,11 +357,18 @@ class _Photograph(NamedTuple):
 
     def reduced(self, factor: int) -> tuple[np.ndarray, np.ndarray]:
         """Return colours and what counts of a smaller image: pixels of which all parts count."""
-        small = downscale(self.rgba, factor)
-        if self.valid.all():
-            return small, np.ones(small.shape[:2], bool)
-        valid = downscale(self.valid[..., None].astype(np.float32), factor)[..., 0] == 1.0
-        return np.where(valid[..., None], small, 0.0), valid
+        return _reduced(self.rgba, self.valid, factor)
+
+
+def _reduced(
+    rgba: Float[np.ndarray, "H W 4"], valid: Bool[np.ndarray, "H W"], factor: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """See `_Photograph.reduced`."""
+    small = downscale(rgba, factor)
+    if valid.all():
+        return small, np.ones(small.shape[:2], bool)
+    is_whole = downscale(valid[..., None].astype(np.float32), factor)[..., 0] == 1.0
+    return np.where(is_whole[..., None], small, 0.0), is_whole
 
 
 def _read_photograph(frame: Frame) -> _Photograph:

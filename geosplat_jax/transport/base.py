@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from geosplat_jax.core.settings import Variant, settings
-from geosplat_jax.core.types import EnvLight, SurfacePoints
+from geosplat_jax.core.types import EnvLight, Materials, SurfacePoints
 from geosplat_jax.materials import Attributes
 from geosplat_jax.rays.base import RayIndex
 from geosplat_jax.transport.environment import LightSpec
@@ -36,6 +36,15 @@ class Shaded(eqx.Module):
     specular: Float[Array, "N 3"]
     diffuse_light: Float[Array, "N 3"]
     specular_light: Float[Array, "N 3"]
+
+
+def matt(materials: Materials, diffuse_light: Float[Array, "N 3"]) -> Shaded:
+    """Shade points without a specular lobe: the light of that lobe is zero.
+
+    ``diffuse_light`` : (N, 3) irradiance / pi.
+    """
+    diffuse, none = materials.albedo * diffuse_light, jnp.zeros_like(diffuse_light)
+    return Shaded(diffuse, diffuse, none, diffuse_light, none)
 
 
 class Illumination(eqx.Module):

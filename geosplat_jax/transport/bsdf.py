@@ -3,7 +3,8 @@
 ``f_r = a (1 - m) / pi + D G F / (4 (n.wi)(n.wo))`` with the GGX distribution at
 ``alpha = roughness**2``, height-correlated Smith masking and Schlick's Fresnel. Directions are
 unit, in the world, and point away from the surface: ``wi`` towards the light, ``wo`` towards the
-viewer. Pure functions on rows; a row is one surface point with one pair of directions.
+viewer. Pure functions on rows; a row is one surface point with one pair of directions. Materials
+without a specular lobe (`Materials.has_specular`) have the base alone.
 
 The base is not dimmed by what the coat reflects, as in the authors' code. A white dielectric
 therefore returns more light than it receives (up to 4% head-on, more at grazing angles); each lobe
@@ -191,6 +192,10 @@ def evaluate_lobes(
     wo: Float[Array, "N 3"],
 ) -> tuple[Float[Array, "N 3"], Float[Array, "N 3"]]:
     """Diffuse and specular reflectance per solid angle, without the cosine; see `evaluate`."""
+    if not materials.has_specular:
+        is_above = (_dot(normals, wi) > 0) & (_dot(normals, wo) > 0)
+        diffuse = jnp.where(is_above[:, None], materials.albedo * (1 / math.pi), 0.0)
+        return diffuse, jnp.zeros_like(diffuse)
     base, fresnel, strength = evaluate_factors(materials, normals, wi, wo)
     diffuse = materials.albedo * ((1 - materials.metallic) * base)[:, None]
     return diffuse, fresnel * strength[:, None]
@@ -256,7 +261,9 @@ def pdf(
     wi: Float[Array, "N 3"],
     wo: Float[Array, "N 3"],
 ) -> Float[Array, " N"]:
-    """Density per solid angle of `sample` at ``wi``: both lobes' by their shares."""
+    """Density per solid angle of `sample` at ``wi``: that of each lobe, times its share."""
+    if not materials.has_specular:
+        return cosine_pdf(normals, wi)
     share = specular_probability(materials, normals, wo)
     specular = specular_pdf(materials.roughness, normals, wi, wo)
     return share * specular + (1 - share) * cosine_pdf(normals, wi)
@@ -356,6 +363,8 @@ def sample(
     (N, 3) unit directions with density `pdf`; some may lie below the surface. Carries **no
     gradient**: estimators differentiate `evaluate` at fixed samples.
     """
+    if not materials.has_specular:
+        return sample_cosine(normals, uniforms[:, 1:])
     share = jax.lax.stop_gradient(specular_probability(materials, normals, wo))
     mirrored = sample_specular(materials.roughness, normals, wo, uniforms[:, 1:])
     scattered = sample_cosine(normals, uniforms[:, 1:])

@@ -347,13 +347,16 @@ def prefilter_operators(spec: LightSpec) -> PrefilterOperators:
     return PrefilterOperators(jnp.asarray(_zonal_matrices(spec)), spec)
 
 
-def prefilter(light: EnvLight, operators: PrefilterOperators) -> PrefilteredLight:
+def prefilter(
+    light: EnvLight, operators: PrefilterOperators, *, diffuse_only: bool = False
+) -> PrefilteredLight:
     """Convolve the light with the GGX lobe of every roughness level (split sum, first factor).
 
     Parameters
     ----------
     light : (H, W, 3) map of the size the operators were built for.
     operators : from `prefilter_operators`; not differentiated unless asked for.
+    diffuse_only : static; compute the last level alone, for surfaces without a specular lobe.
 
     Returns
     -------
@@ -376,10 +379,14 @@ def prefilter(light: EnvLight, operators: PrefilterOperators) -> PrefilteredLigh
     spectrum = jnp.fft.rfft(radiance, axis=1)  # (H, M, 3)
     parts = jnp.concatenate([spectrum.real, spectrum.imag], axis=-1)
     zonal = operators.zonal.astype(radiance.dtype)
+    if diffuse_only:
+        zonal = zonal[:, -height:]
     filtered = jnp.einsum("moi,imc->mco", zonal, parts)  # (M, 6, K*H)
     filtered = jax.lax.complex(filtered[:, :3], filtered[:, 3:])
     rows = jnp.fft.irfft(filtered, n=width, axis=0)  # (W, 3, K*H)
     levels = rows.reshape(width, 3, -1, height).transpose(2, 3, 0, 1)
+    if diffuse_only:
+        return PrefilteredLight(levels, spec.roughness[-1:])
     if spec.roughness[0] == 0.0:
         levels = jnp.concatenate([radiance[None], levels], axis=0)
     return PrefilteredLight(levels, spec.roughness)

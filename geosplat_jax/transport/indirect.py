@@ -250,8 +250,8 @@ def outgoing(
     """Radiance that every face sends out, for `TracedIndirect`.
 
     The mean over a face's points of their irradiance / pi times what they reflect at normal
-    incidence, both lobes: seen by way of another surface, a glossy point passes for a matt one.
-    Faces without points are black. Differentiable in the first two arguments.
+    incidence, in all lobes that they have: seen by way of another surface, a glossy point passes
+    for a matt one. Faces without points are black. Differentiable in the first two arguments.
 
     Parameters
     ----------
@@ -259,5 +259,6 @@ def outgoing(
     face_count : static; rows to return.
     """
     matt = materials.albedo * (1 - materials.metallic)[:, None]
-    glossy = specular_f0(materials.albedo, materials.metallic)
-    return mean_over_faces(points, (matt + glossy) * diffuse_light, face_count)
+    if materials.has_specular:
+        matt = matt + specular_f0(materials.albedo, materials.metallic)
+    return mean_over_faces(points, matt * diffuse_light, face_count)

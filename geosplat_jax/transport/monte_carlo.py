@@ -35,7 +35,13 @@ from geosplat_jax.materials import Attributes
 from geosplat_jax.rays.base import RayIndex
 from geosplat_jax.splats.tiles import gather_visible
 from geosplat_jax.transport import bsdf
-from geosplat_jax.transport.base import Illumination, Shaded, Transport, TransportSettings
+from geosplat_jax.transport.base import (
+    Illumination,
+    Shaded,
+    Transport,
+    TransportSettings,
+    matt,
+)
 from geosplat_jax.transport.denoise import DenoiseSpec, denoise
 from geosplat_jax.transport.environment import LightSpec, lookup
 from geosplat_jax.transport.indirect import (
@@ -111,13 +117,16 @@ def gather(
     samples: Samples,
     light: EnvLight,
     indirect: IndirectSource = NO_INDIRECT,
+    *,
+    has_specular: bool = True,
 ) -> Gathered:
     """Sum up the diffuse light of N points, and keep what the light's samples bring.
 
-    Differentiable in the points' normals, the light and the indirect light.
+    Differentiable in the points' normals, the light and the indirect light. ``has_specular`` :
+    static; false where no point has a specular lobe, for which nothing is then kept.
     """
     total = samples.weights.shape[1]
-    shared = samples.light_density.shape[1]
+    shared = samples.light_density.shape[1] if has_specular else 0
     followed = indirect.followed(points, samples.directions, samples.hits, samples.distances)
     rows, restore = _split(followed)
 
@@ -131,12 +140,13 @@ def gather(
         is_used = samples.weights[:, :shared, None] > 0
         brought = jnp.moveaxis(specular[:shared], 0, 1)
         if samples.light_factors is not None:
-            brought = brought * samples.light_factors[..., None]
+            brought = brought * samples.light_factors[:, :shared, None]
         return diffuse_light, jnp.where(is_used, brought, 0.0)
 
     arguments = (points.normals, samples, rows)
     diffuse_light, radiance = in_chunks(one_chunk, arguments, points.mask, total)
-    return Gathered(diffuse_light, samples.directions[:, :shared], radiance, samples.light_density)
+    density = samples.light_density[:, :shared]
+    return Gathered(diffuse_light, samples.directions[:, :shared], radiance, density)
 
 
 def _specular_sums(
@@ -199,8 +209,10 @@ def reflect(
     -------
     Shaded; ``diffuse_light`` is irradiance / pi, ``specular_light`` what a white lossless reflector
     of this roughness would send out. Zero where the mask is false. Differentiable in materials,
-    normals, views, light and indirect light.
+    normals, views, light and indirect light. Without a specular lobe no direction is drawn.
     """
+    if not materials.has_specular:
+        return matt(materials, gathered.diffuse_light)
     cosine = jnp.sum(points.normals * wo, axis=-1, keepdims=True)
     points = replace(points, normals=jnp.where(cosine < 0, -points.normals, points.normals))
     rays = draw_specular(
@@ -577,7 +589,10 @@ class MonteCarlo(SampledTransport):
             samples, carry = self._draw_shared(
                 key, points, light, sampler, index, carry, finds_nearest=finds_nearest
             )
-            gathered = gather(points, samples, light, traced or self._learned(attributes))
+            has_specular = attributes.materials.has_specular
+            how: dict[str, Any] = {"has_specular": has_specular}
+            arriving = traced or self._learned(attributes)
+            gathered = gather(points, samples, light, arriving, **how)
             # Traced indirect light is what it was, one bounce ago.
             for _ in range(self.settings.bounces if is_traced else 0):
                 assert index is not None
@@ -585,7 +600,7 @@ class MonteCarlo(SampledTransport):
                     attributes.materials, gathered.diffuse_light, points, index.face_capacity
                 )
                 traced = TracedIndirect(sent)
-                gathered = gather(points, samples, light, traced)
+                gathered = gather(points, samples, light, traced, **how)
         if not self.settings.shares_views:
             gathered = None
         return MonteCarloIllumination(light, sampler, traced, gathered), carry
@@ -610,7 +625,8 @@ class MonteCarlo(SampledTransport):
         open_only = self._open_only and gathered is not None
         if gathered is None:
             samples = draw_samples(shared_key, points, sampler, index, **how)
-            gathered = gather(points, samples, light, indirect)
+            has_specular = attributes.materials.has_specular
+            gathered = gather(points, samples, light, indirect, has_specular=has_specular)
         return reflect(
             own_key,
             points,

@@ -94,7 +94,7 @@ def face_table(points: SurfacePoints, materials: Materials, face_count: int) -> 
     values = jnp.concatenate([materials.albedo, shine, points.normals, outward], axis=1)
     mean = mean_over_faces(points, values, face_count)
     return FaceTable(
-        Materials(mean[:, :3], mean[:, 3], mean[:, 4]),
+        replace(materials, albedo=mean[:, :3], roughness=mean[:, 3], metallic=mean[:, 4]),
         safe_normalize(mean[:, 5:8]),
         safe_normalize(mean[:, 8:11]),
     )
@@ -438,7 +438,8 @@ class Paths(SampledTransport):
                 first_key, points, light, sampler, index, carry, finds_nearest=True
             )
             source = self._tracer(later_key, light, sampler, table, index)
-            gathered = gather(points, samples, light, **source)
+            has_specular = attributes.materials.has_specular
+            gathered = gather(points, samples, light, has_specular=has_specular, **source)
         return PathIllumination(light, sampler, None, gathered, table), carry
 
     def shade(
@@ -459,7 +460,8 @@ class Paths(SampledTransport):
         if gathered is None:
             samples = draw_samples(keys[0], points, sampler, index, **how)
             source = self._tracer(keys[1], light, sampler, illumination.table, index)
-            gathered = gather(points, samples, light, **source)
+            has_specular = attributes.materials.has_specular
+            gathered = gather(points, samples, light, has_specular=has_specular, **source)
         source = self._tracer(keys[2], light, sampler, illumination.table, index)
         rest = (attributes.materials, wo, gathered, light, sampler, index)
         return reflect(keys[3], points, *rest, **source, open_only=open_only, **how)

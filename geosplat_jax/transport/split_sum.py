@@ -8,6 +8,7 @@ the lobe (`environment.prefilter`) and the directional albedo ``F0 * scale + bia
 exact for constant light.
 """
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -20,7 +21,13 @@ from geosplat_jax.core.settings import settings
 from geosplat_jax.core.types import EnvLight, Materials, SurfacePoints
 from geosplat_jax.materials import Attributes
 from geosplat_jax.rays.base import RayIndex
-from geosplat_jax.transport.base import Illumination, Shaded, Transport, TransportSettings
+from geosplat_jax.transport.base import (
+    Illumination,
+    Shaded,
+    Transport,
+    TransportSettings,
+    matt,
+)
 from geosplat_jax.transport.bsdf import specular_f0
 from geosplat_jax.transport.environment import (
     LightSpec,
@@ -139,7 +146,8 @@ def split_sum(
     materials : `Materials` of the N points.
     normals : (N, 3) unit shading normals, world.
     view_directions : (N, 3) unit, from the point towards the viewer.
-    prefiltered : from `environment.prefilter`.
+    prefiltered : from `environment.prefilter`; for materials without a specular lobe, its diffuse
+        level is enough.
     table : from `fg_table`.
     two_sided : flip normals that face away from the viewer. Otherwise such points keep their
         normal and are shaded as at a grazing angle (n.v = 0).
@@ -155,11 +163,14 @@ def split_sum(
     if two_sided:
         facing = jnp.where(cosine < 0, -1.0, 1.0).astype(normals.dtype)
         normals, cosine = normals * facing[:, None], cosine * facing
+    diffuse_light = prefiltered_diffuse(prefiltered, normals)
+    if not materials.has_specular:
+        shaded, albedo = matt(materials, diffuse_light), materials.albedo
+        return replace(shaded, rgb=albedo, diffuse=albedo) if baked_diffuse else shaded
     reflected = 2 * cosine[:, None] * normals - view_directions
     dielectric = (1 - materials.metallic)[:, None]
     f0 = specular_f0(materials.albedo, materials.metallic)
 
-    diffuse_light = prefiltered_diffuse(prefiltered, normals)
     specular_light = prefiltered_specular(prefiltered, reflected, materials.roughness)
     scale, bias = fg_lookup(table, cosine, materials.roughness)
     base = materials.albedo * dielectric
@@ -202,8 +213,10 @@ class SplitSum(Transport):
         index: RayIndex | None,
         carry: Any = None,
     ) -> tuple[PrefilteredIllumination, Any]:
-        """Prefilter the light; nothing else matters."""
-        return PrefilteredIllumination(prefilter(light, self.operators)), carry
+        """Prefilter the light; of the rest, only the lobes that there are matter."""
+        is_matt = not attributes.materials.has_specular
+        filtered = prefilter(light, self.operators, diffuse_only=is_matt)
+        return PrefilteredIllumination(filtered), carry
 
     def shade(
         self,

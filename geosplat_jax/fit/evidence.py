@@ -1,0 +1,102 @@
+"""Whether a larger model explains held-back views better than a smaller one; plain NumPy.
+
+Both models are measured on the same views, in decibels. What makes one view harder than another is
+the same for both and cancels in the difference of each view, so gains are *paired*. Views beside
+each other see the same part of the object and err alike: they count as one block. And a training
+repeated with another seed ends elsewhere: a gain has to be larger than that.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A larger model against a smaller one.
+
+    Attributes
+    ----------
+    gain : mean over the views of the larger model's decibels minus the smaller one's.
+    standard_error : of the gain, over blocks of views; infinite for fewer than two blocks.
+    spread : standard deviation over seeds of the smaller model's mean; 0 for one seed.
+    """
+
+    gain: float
+    standard_error: float
+    spread: float = 0.0
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether the larger model is the better one beyond both errors."""
+        return self.gain > self.standard_error and self.gain > self.spread
+
+
+def every_nth(count: int, step: int) -> tuple[Int[np.ndarray, " T"], Int[np.ndarray, " H"]]:
+    """Split view numbers into those to train on and every ``step``-th one, which is held back.
+
+    The first that is held back is in the middle of the first ``step`` ones.
+    """
+    numbers = np.arange(count)
+    is_held = numbers % step == step // 2
+    return numbers[~is_held], numbers[is_held]
+
+
+def neighbouring_blocks(directions: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
+    """Group views into blocks of neighbours; return the block of each.
+
+    A walk from view to nearest view that has not been visited, cut into about ``sqrt(2 V)`` pieces
+    of equal length.
+
+    Parameters
+    ----------
+    directions : (V, 3) unit, from the object towards the cameras.
+    """
+    count = len(directions)
+    left = set(range(1, count))
+    order = [0] if count else []
+    while left:
+        here = directions[order[-1]]
+        order.append(min(left, key=lambda view: (-float(directions[view] @ here), view)))
+        left.remove(order[-1])
+    blocks = np.zeros(count, int)
+    pieces = min(count, max(round(math.sqrt(2 * count)), 1))
+    for block, views in enumerate(np.array_split(np.asarray(order, int), max(pieces, 1))):
+        blocks[views] = block
+    return blocks
+
+
+def clustered_error(values: Float[np.ndarray, " V"], blocks: Int[np.ndarray, " V"]) -> float:
+    """Return the standard error of the mean of values that are correlated within blocks.
+
+    ``SE^2 = B / (B - 1) sum_b (sum_{v in b} (x_v - mean))^2 / V^2`` over B blocks (Liang and Zeger
+    1986, for a mean). With blocks of one view it is the usual standard error.
+    """
+    _, member = np.unique(blocks, return_inverse=True)
+    count = int(member.max(initial=-1)) + 1
+    if count < 2:
+        return math.inf
+    sums = np.bincount(member, weights=values - values.mean())
+    return float(np.sqrt(count / (count - 1) * np.sum(sums**2)) / len(values))
+
+
+def compare(
+    larger: Float[np.ndarray, " V"],
+    smaller: Sequence[Float[np.ndarray, " V"]],
+    blocks: Int[np.ndarray, " V"],
+) -> Comparison:
+    """Compare two models on the same V views.
+
+    Parameters
+    ----------
+    larger : (V,) decibels of the larger model.
+    smaller : of each seed (V,) decibels of the smaller model, the first with the larger's seed.
+    blocks : (V,) block of each view.
+    """
+    gains = np.asarray(larger, float) - np.asarray(smaller[0], float)
+    means = [float(np.mean(one)) for one in smaller]
+    spread = float(np.std(means, ddof=1)) if len(means) > 1 else 0.0
+    return Comparison(float(gains.mean()), clustered_error(gains, blocks), spread)

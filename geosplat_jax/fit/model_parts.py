@@ -1,0 +1,235 @@
+"""The parts of a model that a scene may not need, and how each is left out of the settings.
+
+The settings of a run describe its largest model. Every `Part` knows how to take itself out, so
+that a smaller model is `without` some of them; what is left out has no parameters and is not
+computed. `LADDER` lists the parts from what explains most to what explains least.
+"""
+
+import abc
+from collections.abc import Collection, Iterable
+from dataclasses import replace
+from fnmatch import fnmatchcase
+from typing import ClassVar
+
+from geosplat_jax.fit.config import Config, Stage
+from geosplat_jax.fit.surfaces import FlexiCubesSettings
+from geosplat_jax.transport.monte_carlo import MonteCarloSettings
+from geosplat_jax.transport.split_sum import SplitSumSettings
+
+_FEWER_CELLS = 2.0 / 3.0
+"""Cells along the box without `FinerCells`, to those with it: 32 to 48."""
+
+_FEWEST_CELLS = 4
+_FEWEST_TEXELS = (4, 8)
+"""Rows and columns of the smallest light."""
+
+
+class Part(abc.ABC):
+    """What a model may have, or may do without.
+
+    Attributes
+    ----------
+    name : in files. title : for people.
+    settings : patterns of the paths of the settings that decide it; where one of them was set by
+        hand, the part stays as it is.
+    needs : parts that it cannot be without; they come with it.
+    follows : parts without which it is not tried at all.
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    settings: ClassVar[tuple[str, ...]]
+    needs: ClassVar[tuple[str, ...]] = ()
+    follows: ClassVar[tuple[str, ...]] = ()
+
+    @abc.abstractmethod
+    def removed(self, config: Config) -> Config:
+        """Return the settings without the part; the same where they have none of it."""
+
+    def is_in(self, config: Config) -> bool:
+        """Whether the settings have the part."""
+        return self.removed(config) != config
+
+    def is_set(self, paths: Iterable[str]) -> bool:
+        """Whether one of the settings at these paths decides the part."""
+        return any(fnmatchcase(path, pattern) for path in paths for pattern in self.settings)
+
+
+class Specular(Part):
+    """A specular lobe; without it the surface is Lambertian."""
+
+    name, title = "specular", "specular lobe, one roughness"
+    settings = ("material.specular",)
+
+    def removed(self, config: Config) -> Config:
+        """Leave the base."""
+        return replace(config, material=replace(config.material, specular="none"))
+
+
+class RoughnessField(Part):
+    """A roughness that varies over the surface."""
+
+    name, title = "roughness", "roughness field"
+    settings = ("material.specular",)
+    needs = ("specular",)
+
+    def removed(self, config: Config) -> Config:
+        """Leave a single roughness."""
+        if config.material.specular != "field":
+            return config
+        return replace(config, material=replace(config.material, specular="uniform"))
+
+
+class Metallic(Part):
+    """A metallic field."""
+
+    name, title = "metallic", "metallic"
+    settings = ("material.has_metallic",)
+    needs = ("specular",)
+
+    def removed(self, config: Config) -> Config:
+        """Leave a dielectric."""
+        if config.material.specular == "none":
+            return config
+        return replace(config, material=replace(config.material, has_metallic=False))
+
+
+def _with_stages(config: Config, stages: Iterable[Stage]) -> Config:
+    return replace(config, stages=tuple(stages))
+
+
+def _without_indirect_weight(stage: Stage) -> Stage:
+    return replace(stage, weights={n: w for n, w in stage.weights.items() if n != "indirect"})
+
+
+class Shadows(Part):
+    """Light that the surface blocks, by rays; without it stages use the split sum."""
+
+    name, title = "shadows", "traced shadows"
+    settings = ("stages.*.transport.kind", "stages.*.transport.occlusion")
+
+    def removed(self, config: Config) -> Config:
+        """Give every stage the split sum."""
+        return _with_stages(
+            config,
+            (
+                stage
+                if isinstance(stage.transport, SplitSumSettings) or not stage.steps
+                else _without_indirect_weight(replace(stage, transport=SplitSumSettings()))
+                for stage in config.stages
+            ),
+        )
+
+
+class IndirectLight(Part):
+    """Light from blocked directions."""
+
+    name, title = "indirect", "indirect light"
+    settings = ("stages.*.transport.indirect", "stages.*.weights.indirect*")
+    needs = follows = ("shadows",)
+
+    def removed(self, config: Config) -> Config:
+        """Make blocked directions black."""
+
+        def dark(stage: Stage) -> Stage:
+            transport = stage.transport
+            is_lit = isinstance(transport, MonteCarloSettings) and transport.indirect != "none"
+            if not (is_lit and stage.steps):
+                return stage
+            return _without_indirect_weight(
+                replace(stage, transport=replace(transport, indirect="none"))
+            )
+
+        return _with_stages(config, map(dark, config.stages))
+
+
+class Shift(Part):
+    """The learned inward shift of splats."""
+
+    name, title = "shift", "inward shift"
+    settings = ("material.has_shift",)
+
+    def removed(self, config: Config) -> Config:
+        """Leave splats on their faces, or where the adapter's constant puts them."""
+        return replace(config, material=replace(config.material, has_shift=False))
+
+
+class FinerHash(Part):
+    """Fine levels of the encodings of the attribute fields."""
+
+    name, title = "hash", "finer hash levels"
+    settings = ("material.grid.*",)
+
+    def removed(self, config: Config) -> Config:
+        """Leave three quarters of the levels, up to a quarter of the resolution, in half tables."""
+        grid = config.material.grid
+        finest = max(grid.coarsest, grid.finest // 4)
+        smaller = replace(
+            grid,
+            levels=max(1, round(0.75 * grid.levels)),
+            finest=finest,
+            log2_entries=max(grid.log2_entries - 1, (2 * finest).bit_length(), 1),
+        )
+        if smaller.total_entries >= grid.total_entries:
+            return config
+        return replace(config, material=replace(config.material, grid=smaller))
+
+
+class LargerLight(Part):
+    """An environment map of many texels."""
+
+    name, title = "light", "larger light"
+    settings = ("light.height", "light.width")
+
+    def removed(self, config: Config) -> Config:
+        """Leave a quarter of the rows and of the columns."""
+        light, (rows, columns) = config.light, _FEWEST_TEXELS
+        height, width = max(light.height // 4, rows), max(light.width // 8 * 2, columns)
+        smaller = replace(light, height=min(height, light.height), width=min(width, light.width))
+        return replace(config, light=smaller)
+
+
+class FinerCells(Part):
+    """More cells of the surface's grid."""
+
+    name, title = "cells", "finer cells"
+    settings = ("geometry.resolution",)
+
+    def removed(self, config: Config) -> Config:
+        """Leave two thirds of the cells along the box."""
+        geometry = config.geometry
+        if not isinstance(geometry, FlexiCubesSettings):
+            return config
+        fewer = max(_FEWEST_CELLS, round(_FEWER_CELLS * geometry.resolution))
+        return replace(config, geometry=replace(geometry, resolution=fewer))
+
+
+LADDER: tuple[Part, ...] = (
+    Specular(),
+    RoughnessField(),
+    Metallic(),
+    Shadows(),
+    IndirectLight(),
+    Shift(),
+    FinerHash(),
+    LargerLight(),
+    FinerCells(),
+)
+"""Parts in the order in which they are tried."""
+
+
+def offered_parts(config: Config, by_hand: Collection[str] = ()) -> tuple[Part, ...]:
+    """Return the parts that settings have and that nobody decided by hand, in order.
+
+    ``by_hand`` : paths of settings.
+    """
+    return tuple(part for part in LADDER if part.is_in(config) and not part.is_set(by_hand))
+
+
+def without(config: Config, parts: Iterable[Part]) -> Config:
+    """Return settings without some parts: what needs others is taken out before these."""
+    names = {part.name for part in parts}
+    for part in reversed(LADDER):
+        if part.name in names:
+            config = part.removed(config)
+    return config

@@ -1,0 +1,454 @@
+"""The smallest model that explains a scene: a ladder of parts, each kept where it has earned it.
+
+Beginning with the smallest model, one part after the other is added (`fit.model_parts.LADDER`), and
+the larger model is trained as long as the smaller one, from the same first stage, on the same
+views. Views that were held back tell whether it is better (`fit.evidence`). Trainings are short and
+of reduced photographs; what a training has measured is noted in a file, so that a choice that was
+interrupted goes on without repeating any.
+"""
+
+import hashlib
+import json
+import math
+import os
+import shutil
+import time
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geosplat_jax.core.settings import PositiveCount, settings
+from geosplat_jax.fit.budget import with_steps
+from geosplat_jax.fit.config import Config, Stage
+from geosplat_jax.fit.entering import Start
+from geosplat_jax.fit.evidence import Comparison, compare, every_nth, neighbouring_blocks
+from geosplat_jax.fit.folder import RunError, RunFolder
+from geosplat_jax.fit.model_parts import LADDER, Part, offered_parts, without
+from geosplat_jax.fit.train import Progress, TrainingError, fit, load_trained
+from geosplat_jax.io.dataset import Dataset
+from geosplat_jax.io.documents import parse_json
+from geosplat_jax.io.views import Views, some_views
+from geosplat_jax.report.renderer import Renderer, photograph_on_white, render_on_white
+
+_PIXELS_PER_CELL = 6.0
+"""Photographs are reduced until their longer side has at most so many pixels for each cell."""
+
+_USUAL_CELLS = 48
+"""Cells that this counts for a surface without any."""
+
+_SAMPLES = 64
+"""Rays per splat of the views that are compared."""
+
+_BATCH_VIEWS = 2
+"""Views per step of a trial at most."""
+
+_FEWEST_HELD = 3
+"""Held-back views that say anything."""
+
+_SIZES = ("shift", "hash", "light")
+"""Parts that the first stage, which all trials share, does without."""
+
+_STATE = "choice.json"
+
+
+@settings
+class ModelChoice:
+    """How a model is chosen."""
+
+    by_hand: tuple[str, ...] = ()
+    """Paths of settings that were set by hand; what they decide is not chosen."""
+    steps: PositiveCount = 150
+    """Steps of the first stage, and of every trial after it, at most."""
+    seeds: PositiveCount = 2
+    """Trainings of a model that a gain is measured against."""
+    hold_back: PositiveCount = 8
+    """Every so many-th training view is held back."""
+
+
+@dataclass(frozen=True)
+class Rung:
+    """What became of a part.
+
+    Attributes
+    ----------
+    part, title : its name, in files and for people.
+    smaller, larger : mean decibels of the held-back views without it and with it; None where its
+        training failed.
+    found : the gain and its errors; None likewise.
+    is_kept : whether the model has it.
+    note : why there is nothing to compare.
+    """
+
+    part: str
+    title: str
+    smaller: float
+    larger: float | None
+    found: Comparison | None
+    is_kept: bool
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class ChosenModel:
+    """A model, and why it is that one.
+
+    Attributes
+    ----------
+    config : settings of the training that is to follow, on all views.
+    rungs : of all parts that were tried, in order.
+    by_hand : titles of the parts that were set by hand.
+    held_back : names of the views.
+    trainings : how many there were. seconds : that they took, first stage included.
+    """
+
+    config: Config
+    rungs: tuple[Rung, ...]
+    by_hand: tuple[str, ...]
+    held_back: tuple[str, ...]
+    trainings: int
+    seconds: float
+
+    def record(self) -> dict[str, Any]:
+        """Return what ``run.json`` keeps."""
+        return {
+            "rungs": [asdict(rung) for rung in self.rungs],
+            "by_hand": list(self.by_hand),
+            "held_back": list(self.held_back),
+            "trainings": self.trainings,
+            "seconds": round(self.seconds, 1),
+        }
+
+
+def choice_folder(output: str | Path) -> Path:
+    """Return the folder beside a run's own that trials are made in."""
+    path = Path(output)
+    return path.with_name(f"{path.name}_model")
+
+
+def choose_model(
+    dataset: Dataset,
+    config: Config,
+    output: str | Path,
+    how: ModelChoice | None = None,
+    *,
+    resume: bool = False,
+    force: bool = False,
+    on_step: Callable[[Progress], None] | None = None,
+    on_rung: Callable[[Rung], None] | None = None,
+) -> ChosenModel:
+    """Find the smallest model that explains the training views of a scene.
+
+    Parameters
+    ----------
+    dataset : the scene.
+    config : the largest model, with what is to be spent on it in the end.
+    output : folder of the run to come; trials are made beside it, in ``OUTPUT_model``, of which
+        the file ``choice.json`` stays.
+    how : see `ModelChoice`.
+    resume : go on with a choice that was interrupted; trainings that are done are not made again.
+    force : begin anew where there was one.
+    on_step, on_rung : called after every step of a training, and after every part.
+
+    Raises
+    ------
+    ValueError
+        If there are too few views to hold any back, or nothing is trained.
+    RunError
+        If there is a choice already that is neither to be resumed nor replaced, or that was begun
+        with other settings.
+    TrainingError, Interrupted
+        See `fit.train.fit`; a part whose training fails is left out.
+    """
+    how = how or ModelChoice()
+    trials = _Trials(dataset, config, choice_folder(output), how, on_step)
+    trials.open(resume=resume, force=force)
+    offered = offered_parts(config, how.by_hand)
+    kept: frozenset[str] = frozenset()
+    rungs = []
+    for part in offered:
+        if not kept.issuperset(_among(part.follows, offered)):
+            continue
+        wanted = kept | {part.name} | _among(part.needs, offered)
+        rung = _tried(trials, part, kept, wanted)
+        kept = frozenset(wanted) if rung.is_kept else kept
+        rungs.append(rung)
+        if on_rung is not None:
+            on_rung(rung)
+    trials.close()
+    return ChosenModel(
+        config=trials.model(kept),
+        rungs=tuple(rungs),
+        by_hand=tuple(
+            part.title for part in LADDER if part.is_in(config) and part.is_set(how.by_hand)
+        ),
+        held_back=trials.held.names,
+        trainings=trials.count,
+        seconds=trials.seconds,
+    )
+
+
+def _among(names: Iterable[str], parts: Iterable[Part]) -> frozenset[str]:
+    """Return those names that are parts to choose."""
+    return frozenset(names) & {part.name for part in parts}
+
+
+def _tried(trials: "_Trials", part: Part, kept: Collection[str], wanted: Collection[str]) -> Rung:
+    """Compare the model with a part with the one without it.
+
+    Other seeds of the smaller model are trained only where the gain exceeds its standard error.
+    """
+    smaller = [trials.decibels(kept, 0)]
+    before = float(np.mean(smaller[0]))
+    try:
+        larger = trials.decibels(wanted, 0)
+    except TrainingError as error:
+        return Rung(part.name, part.title, before, None, None, False, str(error))
+    found = compare(larger, smaller, trials.blocks)
+    if found.is_kept:
+        smaller += [trials.decibels(kept, seed) for seed in range(1, trials.how.seeds)]
+        found = compare(larger, smaller, trials.blocks)
+    return Rung(part.name, part.title, before, float(np.mean(larger)), found, found.is_kept)
+
+
+class _Trials:
+    """Short trainings of models of one scene, each measured on the views that were held back.
+
+    Parameters
+    ----------
+    dataset, config, how : see `choose_model`.
+    folder : of the trainings and of what they have measured.
+    on_step : called after every step.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        config: Config,
+        folder: Path,
+        how: ModelChoice,
+        on_step: Callable[[Progress], None] | None,
+    ) -> None:
+        stages = [stage for stage in config.active_stages if not stage.splats.takes_over]
+        if not stages:
+            raise ValueError("there is no model to choose: no stage has steps")
+        used, held = every_nth(len(dataset.train), how.hold_back)
+        if len(held) < _FEWEST_HELD or not len(used):
+            raise ValueError(
+                f"choosing a model holds back every {how.hold_back}th of {len(dataset.train)} "
+                f"training views, which must be {_FEWEST_HELD} at least; take more photographs, or "
+                "train without --model auto"
+            )
+        self.how, self._config, self._folder, self._on_step = how, config, folder, on_step
+        self._first, self._last = stages[0], stages[-1]
+        self._offered = offered_parts(config, how.by_hand)
+        longest = max(dataset.train.height, dataset.train.width)
+        cells = config.geometry.cells_along or _USUAL_CELLS
+        factor = max(1, math.floor(longest / (_PIXELS_PER_CELL * cells) + 0.5))
+        self.held = some_views(dataset.train, held, factor=factor)
+        self._dataset = replace(
+            dataset,
+            train=some_views(dataset.train, used, factor=factor),
+            test=self.held,
+            options={**dataset.options, "reduced": factor, "held_back": how.hold_back},
+        )
+        center = 0.5 * (np.asarray(dataset.bounds[0]) + np.asarray(dataset.bounds[1]))
+        towards = self.held.camera_to_world[:, :3, 3] - center
+        lengths = np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+        self.blocks = neighbouring_blocks(towards / lengths)
+        self._measured: dict[str, dict[str, Any]] = {}
+        self._stage_1_seconds: dict[str, float] = {}
+
+    @property
+    def count(self) -> int:
+        """Trainings that were measured."""
+        return len(self._measured)
+
+    @property
+    def seconds(self) -> float:
+        """What all trainings took."""
+        trials = sum(float(found["seconds"]) for found in self._measured.values())
+        return trials + sum(self._stage_1_seconds.values())
+
+    def model(self, kept: Collection[str]) -> Config:
+        """Return the settings of a model: of the parts to choose, only those that are named."""
+        return without(self._config, [part for part in self._offered if part.name not in kept])
+
+    def open(self, *, resume: bool, force: bool) -> None:
+        """Begin, or read what is there already.
+
+        Raises
+        ------
+        RunError
+            See `choose_model`.
+        """
+        path, mark = self._folder / _STATE, self._mark()
+        if force and self._folder.exists():
+            _require_state(self._folder)
+            shutil.rmtree(self._folder)
+        if not path.exists():
+            if self._folder.exists():
+                _require_state(self._folder)
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._save(mark)
+            return
+        if not resume:
+            raise RunError(
+                f"{self._folder} holds a choice of a model; continue it with --resume, or replace "
+                "it with --force"
+            )
+        try:
+            state = parse_json(path.read_bytes())
+            measured, seconds = dict(state["trainings"]), dict(state["first_stages"])
+            was = state["mark"]
+        except (KeyError, TypeError, ValueError) as error:
+            raise RunError(f"{path} is damaged: {error}; begin anew with --force") from None
+        if was != mark:
+            raise RunError(
+                f"{path} was begun with other settings or other views; take the same, or begin "
+                "anew with --force"
+            )
+        self._measured, self._stage_1_seconds = measured, seconds
+
+    def close(self) -> None:
+        """Leave of the trainings what they have measured."""
+        for path in self._folder.iterdir():
+            if path.is_dir():
+                shutil.rmtree(path)
+
+    def _mark(self) -> str:
+        """Return a short text that tells this choice from others."""
+        what = (
+            self._config.to_dict(),
+            asdict(self.how),
+            self._dataset.train.fingerprint(),
+            self.held.fingerprint(),
+        )
+        return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:16]
+
+    def _save(self, mark: str) -> None:
+        """Write what was measured, in one go."""
+        path = self._folder / _STATE
+        aside = path.with_suffix(".partial")
+        state = {
+            "mark": mark,
+            "held_back": list(self.held.names),
+            "blocks": self.blocks.tolist(),
+            "first_stages": self._stage_1_seconds,
+            "trainings": self._measured,
+        }
+        aside.write_text(json.dumps(state, indent=2) + "\n", encoding="utf-8")
+        os.replace(aside, path)
+
+    def decibels(self, kept: Collection[str], seed: int) -> np.ndarray:
+        """Return how well a model explains every held-back view, trained once.
+
+        Parameters
+        ----------
+        kept : names of its parts. seed : added to that of the settings.
+        """
+        name = f"{_name_of(kept)}_seed_{seed}"
+        if name not in self._measured:
+            start = self._start("cells" in kept)
+            folder = self._folder / name
+            began = time.perf_counter() - _seconds_used(folder)
+            config = self._trial(self.model(kept), self._last, seed)
+            self._fit(config, folder, start)
+            found = self._measure(folder)
+            seconds = time.perf_counter() - began
+            self._measured[name] = {"psnr": found.tolist(), "seconds": round(seconds, 2)}
+            self._save(self._mark())
+            shutil.rmtree(folder)
+        return np.asarray(self._measured[name]["psnr"], float)
+
+    def _start(self, has_finer_cells: bool) -> Start:
+        """Train the first stage, once for each size of the cells, of all materials."""
+        left_out = (*_SIZES, *(() if has_finer_cells else ("cells",)))
+        name = "first_stage_cells" if has_finer_cells else "first_stage"
+        parts = [part for part in self._offered if part.name in left_out]
+        folder = self._folder / name
+        if name not in self._stage_1_seconds:
+            began = time.perf_counter() - _seconds_used(folder)
+            self._fit(self._trial(without(self._config, parts), self._first, 0), folder, None)
+            self._stage_1_seconds[name] = round(time.perf_counter() - began, 2)
+            self._save(self._mark())
+        return _start_of(folder)
+
+    def _trial(self, config: Config, stage: Stage, seed: int) -> Config:
+        """Return settings of a short training of one stage."""
+        chosen = config.stage(stage.name)
+        chosen = replace(chosen, batch_views=min(chosen.batch_views, _BATCH_VIEWS), enter=())
+        run = replace(
+            config.run,
+            seed=(config.run.seed + seed) % 2**32,
+            checkpoint_every=max(1, self.how.steps // 3),
+            preview_every=0,
+        )
+        single = replace(config, run=run, stages=(chosen,))
+        return with_steps(single, min(1.0, self.how.steps / chosen.steps))
+
+    def _fit(self, config: Config, folder: Path, start: Start | None) -> None:
+        fit(
+            self._dataset,
+            config,
+            folder,
+            resume=RunFolder(folder).exists,
+            start=start,
+            on_step=self._on_step,
+        )
+
+    def _measure(self, folder: Path) -> np.ndarray:
+        """Compare the held-back views with the photographs, in sRGB on white; decibels, (V,)."""
+        renderer = Renderer.of(load_trained(folder), samples=_SAMPLES)
+        return np.array([_decibels(renderer, self.held, view) for view in range(len(self.held))])
+
+
+def _decibels(renderer: Renderer, views: Views, view: int) -> float:
+    """Peak signal-to-noise ratio of one view over the pixels that count."""
+    found = renderer(views.camera([view]))
+    error = render_on_white(found.rgb, found.alpha) - photograph_on_white(views.images[view])
+    counted = np.ones(error.shape[:2]) if views.valid is None else views.valid[view]
+    mean = float(np.sum(counted[..., None] * error**2) / (3.0 * max(float(counted.sum()), 1.0)))
+    return -10.0 * math.log10(max(mean, 1e-20))
+
+
+def _start_of(folder: Path) -> Start:
+    """Return what a first stage has ended with."""
+    trained = load_trained(folder)
+    return Start(trained.pipeline.surface, trained.params)
+
+
+def _seconds_used(folder: Path) -> float:
+    """Return what a training has taken before it was interrupted."""
+    return RunFolder(folder).seconds_used()
+
+
+def _name_of(kept: Collection[str]) -> str:
+    """Return the name of a model's trainings."""
+    return "_".join(part.name for part in LADDER if part.name in kept) or "smallest"
+
+
+def _require_state(folder: Path) -> None:
+    """Refuse to work in, or to remove, a folder that is no choice's.
+
+    Raises
+    ------
+    RunError
+        If it holds files but no choice.
+    """
+    if not (folder / _STATE).exists() and any(folder.iterdir()):
+        raise RunError(f"{folder} holds other files; move them, or choose another --output")
+
+
+def rung_row(rung: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
+    """Lay out a rung of ``run.json``: part, decibels without and with it, gain, verdict."""
+    found, with_it, gain = rung["found"], "-", "-"
+    if found is not None:
+        with_it = f"{rung['larger']:.2f} dB"
+        gain = f"{found['gain']:+.2f} +- {found['standard_error']:.2f} dB"
+        if found["spread"]:
+            gain += f", seeds {found['spread']:.2f}"
+    verdict = "kept" if rung["is_kept"] else rung["note"] or "left out"
+    return rung["title"], f"{rung['smaller']:.2f} dB", with_it, gain, verdict

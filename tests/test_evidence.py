@@ -1,0 +1,121 @@
+"""Statistics of model choice: pairing, blocks of neighbours, seeds."""
+
+import math
+
+import numpy as np
+import pytest
+
+from geosplat_jax.fit.evidence import (
+    Comparison,
+    clustered_error,
+    compare,
+    every_nth,
+    neighbouring_blocks,
+)
+
+
+def ring(count, *, seed=None):
+    """Unit vectors around a circle, in order or shuffled."""
+    angle = 2 * np.pi * np.arange(count) / count
+    if seed is not None:
+        angle = np.random.default_rng(seed).permutation(angle)
+    return np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)
+
+
+def test_every_eighth_view_is_held_back_and_none_is_in_both():
+    used, held = every_nth(40, 8)
+    np.testing.assert_array_equal(held, [4, 12, 20, 28, 36])
+    np.testing.assert_array_equal(np.sort(np.concatenate([used, held])), np.arange(40))
+
+
+def test_with_blocks_of_one_view_the_error_is_the_usual_one():
+    values = np.random.default_rng(0).normal(size=9)
+    expected = values.std(ddof=1) / 3
+    assert clustered_error(values, np.arange(9)) == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_view_that_is_there_four_times_tells_no_more_than_once():
+    """The usual error would be half as large."""
+    values = np.random.default_rng(0).normal(size=6)
+    copies, blocks = np.repeat(values, 4), np.repeat(np.arange(6), 4)
+    once = clustered_error(values, np.arange(6))
+    assert clustered_error(copies, blocks) == pytest.approx(once, rel=1e-12)
+    assert clustered_error(copies, np.arange(24)) < 0.55 * once
+
+
+def test_the_error_covers_the_mean_as_often_as_it_says():
+    """Blocks of unequal sizes with a common error each: one standard error holds two of three."""
+    rng, sizes = np.random.default_rng(0), (1, 2, 3, 2, 4, 3, 2, 1, 3, 2)
+    blocks = np.repeat(np.arange(len(sizes)), sizes)
+    hits, alone = [], []
+    for _ in range(2000):
+        values = rng.normal(size=len(sizes))[blocks] + 0.2 * rng.normal(size=len(blocks))
+        hits.append(abs(values.mean()) < clustered_error(values, blocks))
+        alone.append(abs(values.mean()) < clustered_error(values, np.arange(len(blocks))))
+    assert 0.60 < np.mean(hits) < 0.70
+    assert np.mean(alone) < 0.55
+
+
+def test_one_block_says_nothing():
+    assert clustered_error(np.ones(5), np.zeros(5, int)) == math.inf
+    assert not compare(np.full(5, 9.0), [np.zeros(5)], np.zeros(5, int)).is_kept
+
+
+def test_gains_are_paired():
+    """Views differ by ten decibels, models by a twentieth: only pairs of views can tell."""
+    rng, blocks = np.random.default_rng(0), np.arange(12)
+    smaller = rng.uniform(20, 40, 12)
+    larger = smaller + 0.05 + 0.02 * rng.normal(size=12)
+    found = compare(larger, [smaller], blocks)
+    assert found.gain == pytest.approx(0.05, abs=0.02)
+    assert found.standard_error < 0.01
+    assert found.is_kept
+    unpaired = math.hypot(clustered_error(larger, blocks), clustered_error(smaller, blocks))
+    assert unpaired > 10 * found.gain
+    # The views must be the same ones, in the same order.
+    assert not compare(larger[::-1], [smaller], blocks).is_kept
+
+
+def test_a_gain_below_the_spread_over_seeds_is_not_kept():
+    views = np.linspace(20, 30, 8)
+    apart = [views, views + 0.6]
+    found = compare(views + 0.3, apart, np.arange(8))
+    assert found.standard_error < 1e-9
+    assert found.spread == pytest.approx(0.6 / math.sqrt(2))
+    assert not found.is_kept
+    assert compare(views + 0.5, apart, np.arange(8)).is_kept
+    # The first seed is the larger model's own, which the gain is measured against.
+    assert compare(views + 0.3, apart[::-1], np.arange(8)).gain == pytest.approx(-0.3)
+
+
+@pytest.mark.parametrize(
+    ("found", "is_kept"),
+    [
+        (Comparison(0.2, 0.1, 0.1), True),
+        (Comparison(0.2, 0.3, 0.1), False),
+        (Comparison(0.2, 0.1, 0.3), False),
+        (Comparison(-0.2, 0.1, 0.1), False),
+        (Comparison(0.0, 0.0, 0.0), False),
+        (Comparison(math.nan, 0.1, 0.1), False),
+    ],
+)
+def test_a_part_is_kept_for_a_gain_beyond_both_errors(found, is_kept):
+    assert found.is_kept == is_kept
+
+
+def test_blocks_are_neighbours_whatever_the_order_of_the_files():
+    directions = ring(24, seed=3)
+    blocks = neighbouring_blocks(directions)
+    assert len(np.unique(blocks)) == 7  # sqrt(48)
+    for block in np.unique(blocks):
+        members = directions[blocks == block]
+        assert 3 <= len(members) <= 4
+        # Four of 24 neighbours lie within 45 degrees.
+        assert (members @ members.T).min() > math.cos(math.radians(46))
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 5])
+def test_few_views_make_few_blocks(count):
+    blocks = neighbouring_blocks(ring(count)) if count else neighbouring_blocks(np.zeros((0, 3)))
+    assert len(blocks) == count
+    assert len(np.unique(blocks)) == min(count, round(math.sqrt(2 * count)))

@@ -1,0 +1,260 @@
+"""The choice of a model: what is kept, what is trained for it, and how it goes on after a stop."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import TINY, sphere_dataset, tiny_config
+
+import geosplat_jax as gs
+from geosplat_jax import cli, model_choice
+from geosplat_jax.fit.entering import Start
+from geosplat_jax.fit.folder import RunError
+from geosplat_jax.fit.model_parts import LADDER, without
+from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.train import Interrupted, TrainingError, load_trained
+from geosplat_jax.io.views import some_views
+from geosplat_jax.model_choice import ModelChoice, choice_folder, choose_model
+
+NAMES = [part.name for part in LADDER]
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return sphere_dataset(count=40, size=8)
+
+
+class _Trainings:
+    """Stands for training and rendering: views are as good as the parts of a model make them.
+
+    ``gains`` : decibels by part. ``made`` : names of the trainings, in order. ``fails`` : parts
+    whose trainings fail. ``stops_at`` : the training that is interrupted.
+    """
+
+    def __init__(self, monkeypatch, gains):
+        self.gains, self.made, self.configs, self.fails, self.stops_at = gains, [], {}, (), None
+        self.datasets = []
+        self.seed_noise = 0.0
+        monkeypatch.setattr(model_choice, "fit", self._fit)
+        monkeypatch.setattr(model_choice, "_start_of", lambda folder: object.__new__(Start))
+        monkeypatch.setattr(model_choice._Trials, "_measure", self._measure)
+
+    def _fit(self, dataset, config, folder, *, resume, start, on_step):
+        if len(self.made) == self.stops_at:
+            folder.mkdir(parents=True)
+            raise Interrupted("stopped")
+        self.made.append(folder.name)
+        self.configs[folder.name] = config
+        self.datasets.append(dataset)
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(part in folder.name for part in self.fails):
+            raise TrainingError("the surface has exploded")
+
+    def _measure(self, folder):
+        parts, seed = folder.name.split("_seed_")
+        total = sum(self.gains.get(part, 0.0) for part in parts.split("_"))
+        hardness = 25.0 + 5.0 * np.sin(np.arange(5))
+        return hardness + total + self.seed_noise * int(seed) + 1e-3 * np.arange(5) % 3e-3
+
+
+@pytest.fixture
+def trainings(monkeypatch):
+    return _Trainings(monkeypatch, {"specular": 2.0, "metallic": 0.5, "light": 0.2, "hash": -0.1})
+
+
+def names_of(chosen):
+    return [rung.part for rung in chosen.rungs if rung.is_kept]
+
+
+def test_parts_are_kept_for_what_they_gain(dataset, trainings, tmp_path):
+    config = make_config(quality="draft")
+    chosen = choose_model(dataset, config, tmp_path / "run")
+    assert names_of(chosen) == ["specular", "metallic", "light"]
+    left_out = [part for part in LADDER if part.name not in names_of(chosen)]
+    assert chosen.config == without(config, left_out)
+    gains = {rung.part: rung.found.gain for rung in chosen.rungs}
+    assert gains["metallic"] == pytest.approx(0.5)
+    assert gains["hash"] == pytest.approx(-0.1)
+    # Without shadows nothing is blocked: indirect light is not even tried.
+    assert [rung.part for rung in chosen.rungs] == [name for name in NAMES if name != "indirect"]
+    record = json.loads(json.dumps(chosen.record()))
+    assert record["trainings"] == sum("seed" in name for name in trainings.made)
+    assert record["held_back"] == [f"view_{k}" for k in (4, 12, 20, 28, 36)]
+    assert record["rungs"][0]["found"]["gain"] == pytest.approx(2.0)
+
+
+def test_a_part_brings_along_what_it_needs(dataset, trainings, tmp_path):
+    """One roughness explains nothing where metal is polished in places; the field does."""
+    trainings.gains = {"roughness": 1.0, "shadows": 0.4, "indirect": 0.3}
+    chosen = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
+    assert names_of(chosen) == ["roughness", "shadows", "indirect"]
+    assert chosen.config.material.specular == "field"
+    assert not chosen.config.material.has_metallic
+    assert chosen.config.stage("monte_carlo").transport.indirect == "constant"
+
+
+def test_other_seeds_are_trained_for_gains_alone(dataset, trainings, tmp_path):
+    choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
+    second = [name for name in trainings.made if name.endswith("seed_1")]
+    # The models that metallic, specular and light were better than.
+    assert second == ["smallest_seed_1", "specular_seed_1", "specular_metallic_seed_1"]
+    assert len(set(trainings.made)) == len(trainings.made)
+    assert trainings.configs["smallest_seed_1"].run.seed == 1
+
+
+def test_a_gain_that_another_seed_makes_too_is_no_gain(dataset, trainings, tmp_path):
+    trainings.seed_noise = 1.0
+    chosen = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
+    assert names_of(chosen) == ["specular"]
+    (metallic,) = (rung for rung in chosen.rungs if rung.part == "metallic")
+    assert metallic.found.spread == pytest.approx(1 / np.sqrt(2))
+
+
+def test_trials_are_short_and_see_no_view_that_is_held_back(dataset, trainings, tmp_path):
+    config = make_config()
+    choose_model(dataset, config, tmp_path / "run", ModelChoice(steps=60))
+    held = {f"view_{k}" for k in (4, 12, 20, 28, 36)}
+    for seen in trainings.datasets:
+        assert len(seen.train) == 35
+        assert not held & set(seen.train.names)
+    for name, trial in trainings.configs.items():
+        (stage,) = trial.active_stages
+        assert stage.steps == 60
+        assert stage.batch_views == 2
+        # Schedules end as they would have ended.
+        full = config.stage(stage.name)
+        assert stage.progress(60) == pytest.approx(1.0)
+        assert stage.rates_at(60)["light"] == pytest.approx(full.rates_at(full.steps)["light"])
+        is_first = name.startswith("first_stage")
+        assert stage.name == ("split_sum" if is_first else "monte_carlo")
+    # Shapes are of another size with finer cells, and need a first stage of their own.
+    first = [name for name in trainings.made if name.startswith("first_stage")]
+    assert first == ["first_stage", "first_stage_cells"]
+    assert trainings.configs["first_stage"].geometry.resolution == 32
+
+
+@pytest.mark.parametrize("stop", range(0, 12, 2))
+def test_a_choice_that_was_stopped_goes_on_and_ends_alike(dataset, trainings, tmp_path, stop):
+    config = make_config(quality="draft")
+    whole = choose_model(dataset, config, tmp_path / "whole")
+    expected, trainings.made = trainings.made, []
+    trainings.stops_at = stop
+    with pytest.raises(Interrupted):
+        choose_model(dataset, config, tmp_path / "run", resume=True)
+    trainings.stops_at = None
+    again = choose_model(dataset, config, tmp_path / "run", resume=True)
+    assert trainings.made == expected
+    assert again.config == whole.config
+    assert replace(again, seconds=0.0) == replace(whole, seconds=0.0)
+    # What remains are the figures, from which it can be repeated at no cost.
+    assert [path.name for path in choice_folder(tmp_path / "run").iterdir()] == ["choice.json"]
+    choose_model(dataset, config, tmp_path / "run", resume=True)
+    assert trainings.made == expected
+
+
+def test_a_choice_is_not_mixed_with_another(dataset, trainings, tmp_path):
+    config = make_config(quality="draft")
+    choose_model(dataset, config, tmp_path / "run")
+    with pytest.raises(RunError, match="continue it with --resume, or replace it with --force"):
+        choose_model(dataset, config, tmp_path / "run")
+    other = make_config(quality="draft", overrides=("run.seed=5",))
+    with pytest.raises(RunError, match="begun with other settings or other views"):
+        choose_model(dataset, other, tmp_path / "run", resume=True)
+    before = len(trainings.made)
+    choose_model(dataset, other, tmp_path / "run", force=True)
+    assert len(trainings.made) == 2 * before
+    (choice_folder(tmp_path / "run") / "choice.json").write_text("{")
+    with pytest.raises(RunError, match=r"choice\.json is damaged"):
+        choose_model(dataset, other, tmp_path / "run", resume=True)
+
+
+def test_a_folder_of_somebody_else_is_left_alone(dataset, trainings, tmp_path):
+    folder = choice_folder(tmp_path / "run")
+    folder.mkdir()
+    (folder / "letter.txt").write_text("dear")
+    for force in (False, True):
+        with pytest.raises(RunError, match="holds other files"):
+            choose_model(dataset, tiny_config(), tmp_path / "run", force=force)
+    assert (folder / "letter.txt").read_text() == "dear"
+    assert not trainings.made
+
+
+def test_a_part_whose_training_fails_is_left_out_and_says_so(dataset, trainings, tmp_path):
+    trainings.fails = ("metallic",)
+    chosen = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
+    assert names_of(chosen) == ["specular", "light"]
+    (rung,) = (rung for rung in chosen.record()["rungs"] if rung["part"] == "metallic")
+    assert rung["note"] == "the surface has exploded"
+    assert model_choice.rung_row(rung)[-1] == "the surface has exploded"
+
+
+def test_too_few_views_are_refused(trainings, tmp_path):
+    few = sphere_dataset(count=16, size=8)
+    with pytest.raises(ValueError, match="holds back every 8th of 16 training views"):
+        choose_model(few, tiny_config(), tmp_path / "run")
+    assert not trainings.made
+
+
+def test_some_views_are_those_views_reduced(dataset):
+    views = dataset.train
+    half = np.zeros((40, 8, 8), np.float32)
+    half[:, :, :5] = 1.0
+    counted = replace(views, valid=half, images=views.images * half[..., None])
+    found = some_views(counted, [3, 7], factor=2)
+    assert found.names == ("view_3", "view_7")
+    assert found.images.shape == (2, 4, 4, 4)
+    # A pixel counts where all of its parts do.
+    np.testing.assert_array_equal(found.valid[:, 0], [[1, 1, 0, 0]] * 2)
+    np.testing.assert_array_equal(found.images[:, :, 2:], 0.0)
+    np.testing.assert_allclose(found.intrinsics[:, :2], 0.5 * views.intrinsics[[3, 7], :2])
+    np.testing.assert_array_equal(found.camera_to_world, views.camera_to_world[[3, 7]])
+
+
+@pytest.mark.parametrize("options", [["--budget", "5min"], ["--from", "run", "--stage", "refine"]])
+def test_the_command_refuses_what_does_not_go_together(options, tmp_path, capsys):
+    output = ["--output", str(tmp_path / "run")]
+    assert cli.main(["train", "examples/duck", *output, "--model", "auto", *options]) == 2
+    assert "leave --budget and --from out" in capsys.readouterr().err
+    assert not choice_folder(tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.computes
+def test_a_model_is_chosen_recorded_and_trained_on_all_views(tmp_path, capsys):
+    """Only one part is left to choose; the run of few steps is stopped while it chooses."""
+    duck = Path(__file__).resolve().parents[1] / "examples" / "duck"
+    settings = (*TINY, "material.specular=uniform", "material.has_metallic=false")
+    flags = [word for override in settings for word in ("--set", override)]
+    output = tmp_path / "run"
+    command = ["train", str(duck), "--output", str(output), "--downscale", "8", *flags]
+    command += ["--model", "auto", "--resume"]
+    seen = []
+
+    def stop(progress):
+        seen.append(progress.step)
+        if len(seen) == 6:
+            raise KeyboardInterrupt
+
+    config = gs.make_config(overrides=settings)
+    with pytest.raises(Interrupted):
+        gs.train(duck, output, config, model="auto", on_step=stop, downscale=8)
+    assert not output.exists()
+    assert cli.main(command) == 0
+    said = capsys.readouterr().err
+    assert "inward shift" in said
+    assert "set by hand" in said
+    run = gs.Run(output)
+    record = run.folder.record()["model"]
+    assert [rung["part"] for rung in record["rungs"]] == ["shift"]
+    assert run.config.material.has_shift == record["rungs"][0]["is_kept"]
+    assert (run.params.material.shift_head is not None) == run.config.material.has_shift
+    assert len(run.dataset.train) == 40
+    assert load_trained(output).step == config.total_steps
+    # What is done is not done again; the model is the run's own.
+    measured = (choice_folder(output) / "choice.json").stat().st_mtime_ns
+    assert cli.main(command) == 0
+    assert (choice_folder(output) / "choice.json").stat().st_mtime_ns == measured
+    again = gs.train(duck, output, resume=True, model="auto", downscale=8)
+    assert again.config == run.config

@@ -1,0 +1,124 @@
+"""Parts of a model: each can be left out, alone and with others, and what is left is sound."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+from support import tiny_config
+
+from geosplat_jax.fit.config import config_from_dict, config_warnings, differences
+from geosplat_jax.fit.model_parts import LADDER, offered_parts, without
+from geosplat_jax.fit.presets import PRESETS, QUALITIES, make_config
+from geosplat_jax.fit.stages import initial_params, update_rule
+from geosplat_jax.materials import init_materials
+from geosplat_jax.render import Params
+from geosplat_jax.transport.environment import init_light
+from geosplat_jax.transport.monte_carlo import MonteCarloSettings
+from geosplat_jax.transport.split_sum import SplitSumSettings
+
+NAMES = [part.name for part in LADDER]
+
+
+def changed_by(name, config):
+    """Paths of the settings that the part's absence changes."""
+    part = LADDER[NAMES.index(name)]
+    return {line.partition(":")[0] for line in differences(config, part.removed(config))}
+
+
+@pytest.mark.parametrize("quality", QUALITIES)
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_smaller_model_has_settings_that_can_be_written_and_trained(preset, quality):
+    config = make_config(preset, quality)
+    offered = offered_parts(config)
+    for count in range(len(offered) + 1):
+        smaller = without(config, offered[count:])
+        assert config_from_dict(smaller.to_dict()) == smaller
+        found = {part.name for part in offered_parts(smaller)}
+        left = {part.name for part in offered[:count]}
+        # What is chosen by size can be reduced again.
+        assert left <= found <= left | {"hash", "light", "cells"}
+        assert config_warnings(smaller) == config_warnings(config)
+
+
+def test_the_default_model_has_all_parts_and_the_smallest_none():
+    config = make_config()
+    assert [part.name for part in offered_parts(config)] == NAMES
+    smallest = without(config, LADDER)
+    material = smallest.material
+    assert (material.specular, material.has_shift) == ("none", False)
+    assert (smallest.light.height, smallest.light.width) == (16, 32)
+    assert smallest.geometry.resolution == 32
+    assert material.grid == make_config(quality="draft").material.grid
+    assert {type(stage.transport) for stage in smallest.stages} == {SplitSumSettings}
+    # The parts that are chosen by size can be halved again; the others are out for good.
+    assert {part.name for part in offered_parts(smallest)} <= {"hash", "light", "cells"}
+
+
+def test_what_needs_another_part_is_taken_out_with_its_own_settings_only():
+    config = make_config()
+    assert changed_by("specular", config) == {"material.specular"}
+    assert changed_by("roughness", config) == {"material.specular"}
+    assert changed_by("metallic", config) == {"material.has_metallic"}
+    dark = LADDER[NAMES.index("indirect")].removed(config)
+    transport = dark.stage("monte_carlo").transport
+    assert isinstance(transport, MonteCarloSettings)
+    assert (transport.indirect, transport.occlusion) == ("none", True)
+    assert "indirect" not in dark.stage("monte_carlo").weights
+
+
+@pytest.mark.parametrize(
+    ("paths", "missing"),
+    [
+        (["material.specular"], {"specular", "roughness"}),
+        (["material.has_metallic"], {"metallic"}),
+        (["stages.monte_carlo.transport.occlusion"], {"shadows"}),
+        (["stages.monte_carlo.transport.indirect"], {"indirect"}),
+        (["material.grid.levels", "light.width"], {"hash", "light"}),
+        (["geometry.resolution", "material.has_shift"], {"cells", "shift"}),
+        (["run.seed", "stages.monte_carlo.steps"], set()),
+    ],
+)
+def test_what_was_set_by_hand_is_not_chosen(paths, missing):
+    offered = {part.name for part in offered_parts(make_config(), paths)}
+    assert offered == set(NAMES) - missing
+
+
+@pytest.mark.parametrize(
+    ("overrides", "missing"),
+    [
+        (("material.specular=none",), {"specular", "roughness", "metallic"}),
+        (("material.specular=uniform",), {"roughness"}),
+        (("stages.monte_carlo.steps=0", "stages.refine.steps=0"), {"shadows", "indirect"}),
+        (("geometry.resolution=4",), {"cells"}),
+    ],
+)
+def test_parts_that_settings_lack_or_never_use_are_not_offered(overrides, missing):
+    offered = {part.name for part in offered_parts(make_config(overrides=overrides))}
+    assert offered == set(NAMES) - missing
+
+
+def test_what_is_left_out_has_no_parameters():
+    """Every part adds some, but for shadows and indirect light, which are no parameters here."""
+    config = tiny_config("light.height=16", "light.width=32", "material.grid.finest=64")
+    shape = {"sdf": jax.numpy.zeros(3)}
+
+    def count(parts):
+        smaller = without(config, parts)
+        params = jax.eval_shape(lambda: initial_params(shape, smaller, jax.random.key(0)))
+        return sum(leaf.size for leaf in jax.tree.leaves(params))
+
+    sizes = [count(LADDER[n:]) for n in range(len(LADDER) + 1)]
+    grows = {name: b > a for name, a, b in zip(NAMES, sizes, sizes[1:], strict=False)}
+    assert grows == {
+        **dict.fromkeys(("specular", "roughness", "metallic", "shift", "hash", "light"), True),
+        **dict.fromkeys(("shadows", "indirect", "cells"), False),
+    }
+
+
+@pytest.mark.parametrize("specular", ["none", "uniform", "field"])
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_model_of_the_material_has_its_learning_rates(preset, specular):
+    config = make_config(preset, overrides=(f"material.specular={specular}",))
+    field = jax.eval_shape(lambda: init_materials(jax.random.key(0), config.material))
+    params = Params(geometry=(), material=field, light=init_light(2), log_exposure=jnp.zeros(()))
+    for stage in config.stages:
+        update_rule(config, stage, params, 0)  # raises where a group has none
