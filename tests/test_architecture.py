@@ -34,6 +34,7 @@ ORDER = [
     "run",
     "camera_rounds",
     "gradcheck",
+    "viewer",
     "cli",
 ]
 
