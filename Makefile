@@ -6,7 +6,7 @@ BIN = $(VENV)/bin
 INSTALLED = $(VENV)/.installed
 DEMO = demo
 
-.PHONY: demo test test-slow lint format bench clean
+.PHONY: demo test test-slow lint format bench docs clean
 
 $(INSTALLED): pyproject.toml
 	$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "geosplat_jax needs Python 3.11 or newer, got " + sys.version'
@@ -34,6 +34,11 @@ format:
 
 bench: $(INSTALLED)
 	$(BIN)/python -m benchmarks.suite
+
+# Writes build/docs/index.html, which opens from disk; links that lead nowhere are errors.
+docs: $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	$(BIN)/mkdocs build --strict
 
 clean:
 	rm -rf $(VENV) $(DEMO) build dist *.egg-info

@@ -381,15 +381,17 @@ SHARED_TERMS: dict[str, Callable[[SharedInputs], Float[Array, ""]]] = {
 }
 """Terms that no view has a part in. A surface adds penalties of its own."""
 
-TERMS = (*VIEW_TERMS, *SHARED_TERMS)
-"""Names of all terms that every surface has."""
-
 TERM_AOVS: dict[str, tuple[str, ...]] = {
     "light": ("diffuse", "specular_radiance"),
     "normal_smoothness": ("normal",),
     "albedo_smoothness": ("albedo",),
 }
 """Extra images that a term of a view looks at."""
+
+
+def term_names() -> tuple[str, ...]:
+    """Name all terms that every surface has; a term is known as soon as it is in a table."""
+    return (*VIEW_TERMS, *SHARED_TERMS)
 
 
 def term_aovs(names: Iterable[str]) -> tuple[str, ...]:
@@ -417,6 +419,6 @@ def shared_terms(x: SharedInputs, names: Iterable[str]) -> dict[str, Float[Array
         elif name in x.penalties:
             terms[name] = x.penalties[name]
         elif name not in VIEW_TERMS:
-            known = sorted((*TERMS, *x.penalties))
+            known = sorted((*term_names(), *x.penalties))
             raise ValueError(f"unknown term of the loss {name!r}; expected some of {known}")
     return terms

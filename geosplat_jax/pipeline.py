@@ -89,8 +89,8 @@ class Pipeline(RenderPipeline):
 
     Attributes
     ----------
-    weights : of the terms by name (see `losses.TERMS` and `SurfaceModel.penalties`); terms without
-        one are not computed. Arrays, so that schedules cost no compilation.
+    weights : of the terms by name (see `losses.term_names` and `SurfaceModel.penalties`); terms
+        without one are not computed. Arrays, so that schedules cost no compilation.
     objective : static choices.
     """
 

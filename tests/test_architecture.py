@@ -35,6 +35,7 @@ ORDER = [
     "run",
     "camera_rounds",
     "gradcheck",
+    "viewer",
     "cli",
 ]
 

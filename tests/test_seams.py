@@ -2,6 +2,7 @@
 
 Nothing in the package knows the classes of this file: a surface of plain triangles whose vertices
 are the parameters, with rays by brute force, and a third stage with a transport that keeps a carry.
+docs/extending.md shows what stands between the marks.
 """
 
 import json
@@ -66,6 +67,7 @@ class EveryTriangle(RayIndex):
         return self.nearest(origins, directions, source, mask, two_sided=two_sided)[1] >= 0
 
 
+# --8<-- [start:surface]
 class Corners(eqx.Module):
     """Positions of the vertices: the shape of `Triangles`."""
 
@@ -129,6 +131,9 @@ class TrianglesSettings(SurfaceSettings, kind="triangles"):
         return self._make()
 
 
+# --8<-- [end:surface]
+
+
 class LampLight(Illumination):
     """Nothing but a number."""
 
@@ -169,6 +174,7 @@ class LampSettings(TransportSettings, kind="lamp"):
         return Lamp(jnp.float32(self.growth))
 
 
+# --8<-- [start:entry]
 @settings
 class Darken(Entry, kind="darken"):
     """Multiply the light when the stage begins."""
@@ -180,6 +186,9 @@ class Darken(Entry, kind="darken"):
         return replace(
             params, light=replace(params.light, radiance=self.factor * params.light.radiance)
         )
+
+
+# --8<-- [end:entry]
 
 
 THIRD = Stage(

@@ -17,6 +17,7 @@ from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.relight import BACKGROUNDS
 from geosplat_jax.report.renderer import DEFAULT_SAMPLES, RELIGHT_KINDS
 from geosplat_jax.report.shots import AOVS, SPLITS
+from geosplat_jax.viewer.server import DEFAULT_PORT
 
 
 def command_line() -> argparse.ArgumentParser:
@@ -135,6 +136,19 @@ def command_line() -> argparse.ArgumentParser:
     render.add_argument("--output", type=Path, help="folder (default: RUN/renders)")
 
     _add_relight(_run_parser(commands, "relight", "show a run under another light"))
+
+    view = _run_parser(commands, "view", "look at a run in a browser, also while it trains")
+    view.add_argument(
+        "--env",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="FILE",
+        help="environment maps to choose from beside those of the scene; of a folder, all of them",
+    )
+    view.add_argument(
+        "--port", type=int, default=DEFAULT_PORT, help="of this machine (default: %(default)s)"
+    )
 
     refine = _run_parser(
         commands, "refine-cameras", "pose, focal length and exposure of every view of a run"

@@ -15,6 +15,7 @@ from geosplat_jax.capture.settings import RadianceSettings
 from geosplat_jax.cli.display import ProgressDisplay, WorkDisplay, say, say_refined
 from geosplat_jax.cli.training import UsageError, config_from, scene_options, train
 from geosplat_jax.fit.config import all_settings
+from geosplat_jax.fit.folder import RunError
 from geosplat_jax.fit.gauge import change_lines
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.gradcheck.report import (
@@ -46,6 +47,9 @@ from geosplat_jax.report.relight import RelightOptions
 from geosplat_jax.report.renderer import LARGEST_SAMPLES
 from geosplat_jax.report.shots import Cameras, Images
 from geosplat_jax.run import Run
+from geosplat_jax.viewer.painter import Viewer
+from geosplat_jax.viewer.server import ViewerServer, require_free_port, viser_library
+from geosplat_jax.viewer.source import CheckpointWatch, light_files, load_lights
 
 _SHEETS = ("overview.png", "materials.png", "relight.png")
 
@@ -274,6 +278,24 @@ def _render(arguments: argparse.Namespace) -> None:
     print(f"{count} views, {len(written)} files: {written[0].parent}")
 
 
+def _view(arguments: argparse.Namespace) -> None:
+    """Show a run in a browser until Ctrl-C."""
+    viser_library()
+    require_free_port(arguments.port)
+    run = Run(arguments.run, scene=arguments.scene)
+    known, views = {}, None
+    try:
+        known, views = run.dataset.lights, run.dataset.train
+    except RunError as error:
+        say(f"without photographs: {error}", label="warning: ", style="yellow")
+    lights = load_lights(light_files(arguments.env), known)
+    viewer = Viewer(CheckpointWatch(run.folder), lights)
+    server = ViewerServer(viewer, views, port=arguments.port)
+    print(f"open {server.url} in a browser; Ctrl-C ends", flush=True)
+    say("the first pictures of every size wait for a compilation, once on this machine")
+    server.serve()
+
+
 def _refine_cameras(arguments: argparse.Namespace) -> None:
     """Refine the cameras of a run and print what changed."""
     run = Run(arguments.run, scene=arguments.scene)
@@ -339,6 +361,7 @@ COMMANDS = {
     "report": _report,
     "consistency": _consistency,
     "render": _render,
+    "view": _view,
     "refine-cameras": _refine_cameras,
     "relight": _relight,
     "export": _export,

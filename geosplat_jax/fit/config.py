@@ -27,7 +27,7 @@ from geosplat_jax.core.settings import (
 from geosplat_jax.core.types import RATE_GROUP, EnvLight
 from geosplat_jax.fit.entering import Entry
 from geosplat_jax.fit.surfaces import FlexiCubesSettings, SurfaceSettings
-from geosplat_jax.losses import TERMS, Objective, Schedule
+from geosplat_jax.losses import Objective, Schedule, term_names
 from geosplat_jax.materials import MaterialField, MaterialSpec
 from geosplat_jax.render import Params, PerSplat, RasterSettings, ShadingDomain
 from geosplat_jax.transport.base import TransportSettings
@@ -215,7 +215,7 @@ class Config:
             raise ValueError(
                 f"all stages together must have less than 2**31 steps, got {self.total_steps}"
             )
-        terms = (*TERMS, *self.geometry.penalty_names)
+        terms = (*term_names(), *self.geometry.penalty_names)
         groups = self.rate_groups
         for number, stage in enumerate(self.stages):
             self._check_splats(stage, number)

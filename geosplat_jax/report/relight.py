@@ -77,6 +77,11 @@ def load_view_light(light: ViewLight, *, largest: int = LARGEST_LIGHT) -> EnvLig
     return _rotate_light(load_light(light.path, largest=largest), jnp.asarray(turn, jnp.float32))
 
 
+def turned(light: EnvLight, angle: float) -> EnvLight:
+    """Turn a light about the vertical axis by an angle in radians, see `shots.about_z`."""
+    return _rotate_light(light, jnp.asarray(about_z(angle), jnp.float32))
+
+
 def _behind(camera: Camera, light: EnvLight) -> np.ndarray:
     """Environment as a single camera sees it, (H, W, 3) linear."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
@@ -192,8 +197,8 @@ def relight_views(
         return picture(relit(camera), camera, light, options.background)
 
     def under_turning_light(angle: float) -> np.ndarray:
-        turned = _rotate_light(light, jnp.asarray(about_z(angle), jnp.float32))
-        return picture(relit.under(turned)(first), first, turned, options.background)
+        at_angle = turned(light, angle)
+        return picture(relit.under(at_angle)(first), first, at_angle, options.background)
 
     movies: list[tuple[str, int, Callable[[float], np.ndarray]]] = [
         ("turntable", options.turntable, on_turntable),

@@ -127,6 +127,22 @@ def relight_transport(indirect: str = "traced") -> MonteCarloSettings | PathSett
     )
 
 
+def _passes_of(samples: int) -> tuple[int, int]:
+    """Return the number of passes for so many rays per splat, and of samples of each kind in one.
+
+    Raises
+    ------
+    ValueError
+        If the number is not from 1 to `LARGEST_SAMPLES`.
+    """
+    if not 1 <= samples <= LARGEST_SAMPLES:
+        raise ValueError(
+            f"an image needs from 1 to {LARGEST_SAMPLES} samples per splat, got {samples}"
+        )
+    passes = -(-samples // (2 * _PASS_SAMPLES))
+    return passes, -(-samples // (2 * passes))
+
+
 class Renderer:
     """Render views of fixed parameters one at a time, growing buffers as needed.
 
@@ -149,15 +165,10 @@ class Renderer:
         samples: int = DEFAULT_SAMPLES,
         seed: int = 0,
     ) -> None:
-        if not 1 <= samples <= LARGEST_SAMPLES:
-            raise ValueError(
-                f"an image needs from 1 to {LARGEST_SAMPLES} samples per splat, got {samples}"
-            )
         self._trained = pipeline
         self._params = params
         self._key = jax.random.key(seed)
-        self._passes = -(-samples // (2 * _PASS_SAMPLES))
-        self._pass_samples = -(-samples // (2 * self._passes))
+        self._passes, self._pass_samples = _passes_of(samples)
         self._light = params.light
         self._log_exposure = params.log_exposure
         self._albedo_scale = np.ones(3, np.float32)
@@ -217,6 +228,15 @@ class Renderer:
         """Return a renderer that differs in the light alone; the surface is not built again."""
         other = copy.copy(self)
         other._light = light
+        other._illuminations = []
+        return other
+
+    def with_samples(self, samples: int) -> "Renderer":
+        """Return a renderer of the same surface with another number of rays per splat."""
+        self.asset()
+        other = copy.copy(self)
+        other._passes, other._pass_samples = _passes_of(samples)
+        other._pipeline = other._for_images(other._pipeline)
         other._illuminations = []
         return other
 

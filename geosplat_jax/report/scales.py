@@ -19,6 +19,9 @@ _HEAT = (
 _TRUST = ((0.70, 0.09, 0.17), (0.96, 0.60, 0.35), (0.99, 0.95, 0.70), (0.45, 0.72, 0.78))
 _TRUST = (*_TRUST, (0.15, 0.36, 0.60))
 
+DISTANCE_COLORS = _HEAT[::-1]
+"""Of depths: what is near is bright."""
+
 LARGEST_ERROR = 0.2
 """Difference of sRGB values that the scale of errors ends at."""
 

@@ -224,10 +224,10 @@ class Images:
         write_png(written[0], straight_rgba(view))
         if self.exr:
             written.append(folder / f"{name}_rgba.exr")
-            colors = _straight(view.rgb, view.alpha)
+            colors = straight(view.rgb, view.alpha)
             write_exr(written[-1], np.concatenate([colors, view.alpha[..., None]], axis=-1))
         for aov in self.aovs:
-            values = _straight(view.aovs[aov], view.alpha)
+            values = straight(view.aovs[aov], view.alpha)
             if aov != "depth":
                 written.append(folder / f"{name}_{aov}.png")
                 write_png(written[-1], _picture(aov, values, view))
@@ -237,7 +237,7 @@ class Images:
         return written
 
 
-def _straight(values: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+def straight(values: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """Divide blended values by their coverage; zero where nothing was hit."""
     covered = (alpha > _SMALLEST_ALPHA)[..., None]
     return np.where(covered, values / np.where(covered, alpha[..., None], 1.0), 0.0)

@@ -1,0 +1,236 @@
+"""Pictures of a run as somebody wants to see it, drawn by the program's own renderer."""
+
+import math
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from geosplat_jax.core.rotation import quaternion_to_matrix
+from geosplat_jax.core.types import EnvLight
+from geosplat_jax.fit.train import Trained
+from geosplat_jax.io.export import export_mesh_glb
+from geosplat_jax.io.images import encode_srgb
+from geosplat_jax.io.meshes import nondegenerate
+from geosplat_jax.report.assets import MaterialSampler
+from geosplat_jax.report.pictures import normals_to_rgb
+from geosplat_jax.report.relight import picture, turned
+from geosplat_jax.report.renderer import RenderedView, Renderer, to_picture
+from geosplat_jax.report.scales import DISTANCE_COLORS, Scale
+from geosplat_jax.report.shots import straight
+from geosplat_jax.viewer.looks import AS_TRAINED, LEVELS, Ladder, Level, Look
+from geosplat_jax.viewer.source import CheckpointWatch, same_size
+
+_GREY = 0.2
+"""What is behind pictures that do not show colour, sRGB."""
+
+_BEHIND_EVERYTHING = 150.0
+"""Depth where nothing is, below the largest that a browser is sent (167)."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What a browser shows.
+
+    Attributes
+    ----------
+    rgb : (H, W, 3) sRGB, bytes.
+    depth : (H, W) along the camera's axis, scene units; large where nothing is.
+    level : how good it is. step : of the training. seconds : that it took.
+    """
+
+    rgb: UInt8[np.ndarray, "H W 3"]
+    depth: Float[np.ndarray, "H W"]
+    level: Level
+    step: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """Splats as other viewers draw them.
+
+    Attributes
+    ----------
+    means : (N, 3). covariances : (N, 3, 3). colors : (N, 3) albedo in sRGB, [0, 1].
+    opacities : (N, 1).
+    """
+
+    means: Float[np.ndarray, "N 3"]
+    covariances: Float[np.ndarray, "N 3 3"]
+    colors: Float[np.ndarray, "N 3"]
+    opacities: Float[np.ndarray, "N 1"]
+
+
+class Painter:
+    """Draws looks at the parameters of one checkpoint.
+
+    The light that was found is shown as it was trained, with exposure and what was learned of
+    indirect light; turned, it is a new light like any other, and its blocked directions are traced.
+
+    Parameters
+    ----------
+    trained : parameters of a run.
+    lights : by name; all of one size, see `source.same_size`.
+    """
+
+    def __init__(self, trained: Trained, lights: Mapping[str, EnvLight]) -> None:
+        self.trained = trained
+        self._found = Renderer.of(trained).with_aovs("depth")
+        exposure = math.exp(float(trained.params.log_exposure))
+        own = EnvLight(trained.params.light.radiance * exposure)
+        self._lights = {AS_TRAINED: same_size(own), **lights}
+        self._relit: Renderer | None = None
+        self._prepared: dict[tuple[int, bool], tuple[tuple[str, float, float], Renderer]] = {}
+
+    def _light_of(self, look: Look) -> EnvLight:
+        light = turned(self._lights[look.light], math.radians(look.turn))
+        return EnvLight(light.radiance * look.intensity)
+
+    def _renderer(self, look: Look, samples: int) -> Renderer:
+        """Return a renderer with the light of a look; the last ones are kept."""
+        key = look.light, look.turn, look.intensity
+        is_found = key == (AS_TRAINED, 0.0, 1.0)
+        last = self._prepared.get((samples, is_found))
+        if last is not None and last[0] == key:
+            return last[1]
+        if is_found:
+            renderer = self._found.with_samples(samples)
+        elif last is not None:  # its buffers have grown to what this surface needs
+            renderer = last[1].under(self._light_of(look))
+        else:
+            light = self._light_of(look)
+            if self._relit is None:
+                self._relit = self._found.relit(light)
+            renderer = self._relit.with_samples(samples).under(light)
+        self._prepared[samples, is_found] = key, renderer
+        return renderer
+
+    def paint(self, look: Look, level: Level) -> Picture:
+        """Draw a look.
+
+        Raises
+        ------
+        KeyError
+            If there is no such light.
+        """
+        began = time.perf_counter()
+        camera = look.camera(level)
+        view = self._renderer(look, level.samples)(camera)
+        if look.mode == "render":
+            shown = picture(view, camera, self._light_of(look), look.background)
+        else:
+            shown = self._aov(look, view)
+        depth = straight(view.aovs["depth"], view.alpha)[..., 0]
+        return Picture(
+            np.round(255.0 * shown).astype(np.uint8),
+            np.where(view.alpha > 0.5, depth, _BEHIND_EVERYTHING).astype(np.float32),
+            level,
+            self.trained.step,
+            time.perf_counter() - began,
+        )
+
+    def _aov(self, look: Look, view: RenderedView) -> np.ndarray:
+        """Show what is not colour, over grey."""
+        if look.mode == "normal":
+            return normals_to_rgb(view.aovs["normal"], view.alpha)
+        alpha = np.clip(view.alpha, 0.0, 1.0)[..., None]
+        values = straight(view.aovs[look.mode], view.alpha)
+        if look.mode == "depth":
+            shown = self._depth_scale(look).picture(values[..., 0])
+        else:
+            shown = to_picture(values) if look.mode == "albedo" else np.clip(values, 0.0, 1.0)
+        over_grey = alpha * shown + (1.0 - alpha) * _GREY
+        return np.broadcast_to(over_grey, (*view.alpha.shape, 3))
+
+    def _depth_scale(self, look: Look) -> Scale:
+        """Return the scale of distances over the box around the object."""
+        box = self.trained.pipeline.surface.box
+        reach = math.sqrt(3.0) * float(box.half_extent)
+        far = float(np.linalg.norm(np.asarray(box.center) - np.asarray(look.position)))
+        return Scale("depth", max(far - reach, 0.0), far + reach, DISTANCE_COLORS)
+
+    def mesh_glb(self) -> bytes | None:
+        """Return the mesh with colours on its vertices as GLB, y up; None for an empty surface."""
+        vertices, faces, normals = self._found.mesh()
+        if not len(faces) or not nondegenerate(vertices, faces).any():
+            return None
+        sampler = MaterialSampler(self.trained, self._found.asset())
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "mesh.glb"
+            export_mesh_glb(path, vertices, faces, normals, sampler, vertex_colors=True)
+            return path.read_bytes()
+
+    def gaussians(self) -> Gaussians:
+        """Return the splats in the colour of their albedo."""
+        asset = self._found.asset()
+        count = int(asset.splats.count)
+        rotations = np.asarray(quaternion_to_matrix(jnp.asarray(asset.splats.quats[:count])))
+        axes = rotations * np.asarray(asset.splats.scales[:count])[:, None, :]
+        return Gaussians(
+            np.asarray(asset.splats.means[:count]),
+            axes @ axes.transpose(0, 2, 1),
+            np.clip(encode_srgb(np.asarray(asset.attributes.materials.albedo[:count])), 0.0, 1.0),
+            np.asarray(asset.splats.opacities[:count])[:, None],
+        )
+
+
+class Viewer:
+    """Pictures of a run for several people, and of a newer checkpoint when there is one.
+
+    Parameters
+    ----------
+    watch : reads the run. lights : by name; all of one size.
+    levels : from quick to good. clock : seconds, monotonic.
+    """
+
+    def __init__(
+        self,
+        watch: CheckpointWatch,
+        lights: Mapping[str, EnvLight],
+        *,
+        levels: Sequence[Level] = LEVELS,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self._watch, self._given = watch, dict(lights)
+        self._levels, self._clock = levels, clock
+        self._ladders: dict[int, Ladder] = {}
+        trained = watch.newer()
+        assert trained is not None, "the first look at a run reads it"
+        self.painter = Painter(trained, self._given)
+
+    @property
+    def lights(self) -> tuple[str, ...]:
+        """Names of the lights, that which was found first."""
+        return (AS_TRAINED, *self._given)
+
+    def refresh(self) -> bool:
+        """Take over a newer checkpoint; tell whether there was one."""
+        trained = self._watch.newer()
+        if trained is None:
+            return False
+        self.painter = Painter(trained, self._given)
+        for ladder in self._ladders.values():
+            ladder.forget()
+        return True
+
+    def draw(self, person: int, look: Look) -> Picture | None:
+        """Draw what is due for somebody; None where the last picture is as good as it gets."""
+        if person not in self._ladders:
+            self._ladders[person] = Ladder(self._levels, clock=self._clock)
+        ladder = self._ladders[person]
+        level = ladder.next(look)
+        if level is None:
+            return None
+        drawn = self.painter.paint(look, level)
+        ladder.note(level, drawn.seconds)
+        return drawn
+
+    def leave(self, person: int) -> None:
+        """Forget somebody."""
+        self._ladders.pop(person, None)

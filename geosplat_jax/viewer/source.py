@@ -1,0 +1,111 @@
+"""Where a viewer's run and lights come from: checkpoints, read again as they appear, and files."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from geosplat_jax.core.types import EnvLight
+from geosplat_jax.fit.folder import RunError, RunFolder
+from geosplat_jax.fit.train import Trained, TrainingError, load_trained
+from geosplat_jax.io.checkpoints import CheckpointError
+from geosplat_jax.io.images import SceneError
+from geosplat_jax.report.light_metrics import resize_light
+from geosplat_jax.report.relight import load_light
+
+LIGHT_ROWS = 128
+"""Rows of all lights in a viewer: programs depend on the size."""
+
+_LIGHT_SUFFIXES = (".hdr", ".exr")
+
+
+class CheckpointWatch:
+    """Reads the last checkpoint of a run whenever there is a newer one.
+
+    Parameters
+    ----------
+    folder : of the run.
+    """
+
+    def __init__(self, folder: RunFolder) -> None:
+        self._folder = folder
+        self._seen: tuple[tuple[str, int], ...] | None = None
+
+    def _listed(self) -> tuple[tuple[str, int], ...]:
+        """Name the checkpoints and when they were written."""
+        files = []
+        for path in sorted(self._folder.checkpoints.glob("*.npz")):
+            try:
+                files.append((path.name, path.stat().st_mtime_ns))
+            except FileNotFoundError:  # replaced by a newer one at this moment
+                continue
+        return tuple(files)
+
+    def newer(self) -> Trained | None:
+        """Return the last checkpoint if it was not returned before.
+
+        A folder that is being written, or replaced, is looked at again in the next call.
+
+        Raises
+        ------
+        TrainingError, RunError, CheckpointError
+            If there has been none yet, and none can be read.
+        """
+        listed = self._listed()
+        if listed == self._seen:
+            return None
+        try:
+            trained = load_trained(self._folder)
+        except (TrainingError, RunError, CheckpointError, OSError):
+            if self._seen is None:
+                raise
+            return None
+        self._seen = listed
+        return trained
+
+
+def same_size(light: EnvLight) -> EnvLight:
+    """Bring a light to the size of all lights in a viewer."""
+    pixels = resize_light(np.asarray(light.radiance), LIGHT_ROWS, 2 * LIGHT_ROWS)
+    return EnvLight(jnp.asarray(pixels, jnp.float32))
+
+
+def light_files(paths: Iterable[Path]) -> list[Path]:
+    """List environment maps: files as they are, and the HDR and EXR of folders.
+
+    Raises
+    ------
+    SceneError
+        If a folder has none.
+    """
+    files = []
+    for path in paths:
+        if not path.is_dir():
+            files.append(path)
+            continue
+        found = sorted(p for p in path.iterdir() if p.suffix.lower() in _LIGHT_SUFFIXES)
+        if not found:
+            raise SceneError(f"{path} holds no environment map (.hdr or .exr)")
+        files += found
+    return files
+
+
+def load_lights(files: Iterable[Path], known: Mapping[str, Path]) -> dict[str, EnvLight]:
+    """Read environment maps by name.
+
+    Parameters
+    ----------
+    files : maps, named after their files. known : others by name, such as those of a scene.
+
+    Raises
+    ------
+    SceneError
+        If two files have one name, or see `load_light`.
+    """
+    paths: dict[str, Path] = {}
+    for path in files:
+        if path.stem in paths and path.resolve() != paths[path.stem].resolve():
+            raise SceneError(f"{paths[path.stem]} and {path} have the same name; rename one")
+        paths[path.stem] = path
+    return {name: same_size(load_light(path)) for name, path in {**known, **paths}.items()}

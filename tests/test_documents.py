@@ -1,0 +1,118 @@
+"""The documents: links lead somewhere, every page is in the site, examples run."""
+
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+from geosplat_jax.fit.config import all_settings
+from geosplat_jax.fit.presets import make_config
+from geosplat_jax.io.dataset import LAYOUTS, load_dataset
+from geosplat_jax.losses import VIEW_TERMS
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.glob("*.md"))
+TEXTS = [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "examples" / "README.md"]
+
+CODE = re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+
+
+def headings(path):
+    """Anchors of a page, as GitHub and mkdocs make them."""
+    lines = re.findall(
+        r"^#+ (.+)$", re.sub(r"```.*?```", "", path.read_text(), flags=re.DOTALL), re.M
+    )
+    return {re.sub(r"[^\w\- ]", "", line.lower()).strip().replace(" ", "-") for line in lines}
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.name)
+def test_links_lead_to_files_and_headings(path):
+    for target in LINK.findall(CODE.sub("", path.read_text(encoding="utf-8"))):
+        if target.startswith(("https://", "http://")):
+            continue
+        name, _, anchor = target.partition("#")
+        found = (path.parent / name).resolve() if name else path
+        assert found.exists(), f"{path.name} links to {target}, which is not there"
+        if path.parent == DOCS:
+            assert DOCS in found.parents, f"{target} lies outside of the site"
+        if anchor:
+            assert anchor in headings(found), f"{path.name}: no heading for {target}"
+
+
+def test_every_page_is_in_the_site():
+    listed = set(re.findall(r": (\w+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M))
+    assert listed == {path.name for path in PAGES}
+
+
+def test_commands_in_the_tutorial_exist():
+    from geosplat_jax.cli.arguments import command_line
+
+    text = "".join((DOCS / name).read_text() for name in ("tutorial.md", "choosing.md", "index.md"))
+    lines = re.findall(r"^geosplat-jax (.+)$", text, re.M)
+    assert len(lines) > 8
+    for line in lines:
+        command_line().parse_args(line.replace("SCENE", "scene").split())
+
+
+def test_the_table_of_settings_has_them_all():
+    hooks = {}
+    exec((DOCS / "site_hooks.py").read_text(), hooks)
+    page = hooks["on_page_markdown"]((DOCS / "settings.md").read_text())
+    for path, *_ in all_settings(make_config()):
+        assert f"| `{path}` |" in page
+    cells = [line.count("|") for line in page.splitlines() if line.startswith("| `")]
+    assert set(cells) == {5}
+    assert hooks["on_page_markdown"]("another page") == "another page"
+
+
+@pytest.fixture
+def examples():
+    """What the Python blocks of the page define; what they registered is taken back."""
+    text = (DOCS / "extending.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert len(blocks) == 3
+    names = {}
+    exec("\n".join(blocks), names)
+    yield names
+    del VIEW_TERMS["haze"], LAYOUTS["plain"]
+
+
+def test_the_loss_of_the_page_counts_where_it_has_a_weight(examples):
+    assert examples["with_haze"].stage("split_sum").weights["haze"].value == 0.05
+    for coverage, expected in ((0.0, 0.0), (1.0, 0.0), (0.5, 1.0)):
+        images = SimpleNamespace(output=SimpleNamespace(alpha=jnp.full((1, 4, 4), coverage)))
+        assert float(VIEW_TERMS["haze"](images)) == pytest.approx(expected)
+
+
+def test_the_reader_of_the_page_is_recognised(examples, tmp_path):
+    (tmp_path / "images").mkdir()
+    poses = []
+    for number in range(3):
+        pixels = np.full((8, 12, 4), 200, np.uint8)
+        pixels[:2] = 0
+        Image.fromarray(pixels).save(tmp_path / "images" / f"{number}.png")
+        poses.append([1, 0, 0, number, 0, 1, 0, 0, 0, 0, 1, 5, 20])
+    np.savetxt(tmp_path / "poses.txt", poses)
+    bounds = ((-1.0,) * 3, (1.0,) * 3)
+    dataset = load_dataset(tmp_path, bounds=bounds)
+    assert dataset.layout == "plain"
+    assert (len(dataset.train), len(dataset.test)) == (2, 1)
+    np.testing.assert_allclose(dataset.train.camera_to_world[1, :3, 3], [2, 0, 5])
+    np.testing.assert_allclose(dataset.train.intrinsics[0], [[20, 0, 6], [0, 20, 4], [0, 0, 1]])
+    (tmp_path / "poses.txt").write_text("1 2 3\n")
+    with pytest.raises(ValueError, match="13 numbers for each of 3 images"):
+        load_dataset(tmp_path, bounds=bounds)
+
+
+def test_the_stage_of_the_page_trains_the_albedo_alone(examples):
+    stage = examples["polished"].active_stages[-1]
+    assert stage.name == "polish"
+    assert examples["polished"].rate_groups
+    assert "albedo" not in stage.frozen
+    assert {"sdf", "light", "roughness_metallic"} <= set(stage.frozen)
