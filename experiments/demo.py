@@ -23,6 +23,8 @@ OVERRIDES = (
     "stages.monte_carlo.steps=120",
 )
 FRAMES = 36
+# The same for metrics and movie, so that they share their programs.
+SAMPLES = 32
 SCENE = Path(__file__).resolve().parents[1] / "examples" / "duck"
 
 
@@ -37,9 +39,9 @@ def main() -> None:
     config = make_config("default", "draft", material_prior=MATERIAL_PRIOR, overrides=OVERRIDES)
     run = train(SCENE, folder, config, force=True)
     # Beside the movie: both wait for the compiler, which uses one core.
-    evaluated = in_background(lambda: run.evaluate(samples=64))
+    evaluated = in_background(lambda: run.evaluate(samples=SAMPLES))
     movie = RelightOptions(turntable=FRAMES, suffix=".gif", frames_per_second=12.0)
-    run.relight(SCENE.parent / "sunset.hdr", options=movie, samples=32)
+    run.relight(SCENE.parent / "sunset.hdr", options=movie, samples=SAMPLES)
     run.export()
     evaluated.result()
     print(
