@@ -524,7 +524,7 @@ def train(
         chosen_model = choose_model(
             dataset,
             config,
-            folder,
+            output,
             replace(how, by_hand=tuple(dict.fromkeys(by_hand))),
             resume=resume,
             force=force,
