@@ -34,8 +34,9 @@ from geosplat_jax.fit.stages import build_pipeline, initial_params
 from geosplat_jax.geometry import FlexiCubes, initial_geometry
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.views import Views
-from geosplat_jax.model_choice import ModelChoice, rung_row
+from geosplat_jax.model_choice import ModelChoice
 from geosplat_jax.render import Asset
+from geosplat_jax.report.facts import rung_row
 from geosplat_jax.report.metrics import psnr
 from geosplat_jax.report.relight import load_light
 from geosplat_jax.report.renderer import Renderer, photograph_on_white, render_on_white
