@@ -13,7 +13,7 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -322,7 +322,8 @@ class _Trials:
         """Return a short text that tells this choice from others."""
         what = (
             self._config.to_dict(),
-            asdict(self.how),
+            asdict(replace(self.how, by_hand=())),
+            [part.name for part in self._offered],
             self._dataset.train.fingerprint(),
             self.held.fingerprint(),
         )
@@ -440,15 +441,3 @@ def _require_state(folder: Path) -> None:
     """
     if not (folder / _STATE).exists() and any(folder.iterdir()):
         raise RunError(f"{folder} holds other files; move them, or choose another --output")
-
-
-def rung_row(rung: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
-    """Lay out a rung of ``run.json``: part, decibels without and with it, gain, verdict."""
-    found, with_it, gain = rung["found"], "-", "-"
-    if found is not None:
-        with_it = f"{rung['larger']:.2f} dB"
-        gain = f"{found['gain']:+.2f} +- {found['standard_error']:.2f} dB"
-        if found["spread"]:
-            gain += f", seeds {found['spread']:.2f}"
-    verdict = "kept" if rung["is_kept"] else rung["note"] or "left out"
-    return rung["title"], f"{rung['smaller']:.2f} dB", with_it, gain, verdict

@@ -526,7 +526,7 @@ def train(
         chosen_model = choose_model(
             dataset,
             config,
-            folder.path,
+            output,
             replace(how, by_hand=tuple(dict.fromkeys(by_hand))),
             resume=resume,
             force=force,

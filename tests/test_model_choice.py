@@ -17,6 +17,7 @@ from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.train import Interrupted, TrainingError, load_trained
 from geosplat_jax.io.views import some_views
 from geosplat_jax.model_choice import ModelChoice, choice_folder, choose_model
+from geosplat_jax.report.facts import rung_row
 
 NAMES = [part.name for part in LADDER]
 
@@ -187,7 +188,7 @@ def test_a_part_whose_training_fails_is_left_out_and_says_so(dataset, trainings,
     assert names_of(chosen) == ["specular", "light"]
     (rung,) = (rung for rung in chosen.record()["rungs"] if rung["part"] == "metallic")
     assert rung["note"] == "the surface has exploded"
-    assert model_choice.rung_row(rung)[-1] == "the surface has exploded"
+    assert rung_row(rung)[-1] == "the surface has exploded"
 
 
 def test_too_few_views_are_refused(trainings, tmp_path):

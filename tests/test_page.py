@@ -102,6 +102,32 @@ def small(monkeypatch):
     monkeypatch.setattr(page, "_web", lambda name: "" if name.endswith("min.js") else whole(name))
 
 
+def test_the_page_says_why_the_model_is_what_it_is(tmp_path, small):
+    evaluated = make_run(tmp_path / "duck")
+    assert "Model</h2>" not in report_html([evaluated])
+    path = tmp_path / "duck" / "run.json"
+    found = {"gain": 1.25, "standard_error": 0.5, "spread": 0.0}
+    rung = {"part": "metallic", "title": "metallic", "smaller": 30.0, "larger": 31.25}
+    rungs = [
+        {**rung, "found": found, "is_kept": True, "note": ""},
+        {
+            **rung,
+            "title": "shift",
+            "larger": None,
+            "found": None,
+            "is_kept": False,
+            "note": "<bad>",
+        },
+    ]
+    model = {"rungs": rungs, "by_hand": [], "held_back": ["a", "b"], "trainings": 7, "seconds": 9.0}
+    path.write_text(json.dumps({**json.loads(path.read_text()), "model": model}))
+    html = report_html([evaluated])
+    cells = ["metallic", "30.00 dB", "31.25 dB", "+1.25 +- 0.50 dB", "kept"]
+    assert "".join(f"<td>{cell}</td>" for cell in cells) in html
+    assert "<td>shift</td><td>30.00 dB</td><td>-</td><td>-</td><td>&lt;x&gt;</td>" in html
+    assert "Choosing took 9 s, 7 trainings" in texts_of(parsed(html))
+
+
 def parsed(text):
     """Parse as a browser does; anything that is not valid HTML raises."""
     parser = html5lib.HTMLParser(strict=True, namespaceHTMLElements=False)

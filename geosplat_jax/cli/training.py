@@ -16,7 +16,8 @@ from geosplat_jax.fit.devices import Devices, choose_devices, connect_hosts
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import make_config, with_mesh
 from geosplat_jax.io.dataset import choose_downscale, load_recorded
-from geosplat_jax.model_choice import ModelChoice, Rung, rung_row
+from geosplat_jax.model_choice import ModelChoice, Rung
+from geosplat_jax.report.facts import rung_row
 from geosplat_jax.run import plan_training
 from geosplat_jax.run import train as train_run
 

@@ -132,6 +132,18 @@ def curves(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {"step": [line["step"] for line in kept], **values, "stages": stages, "every": every}
 
 
+def rung_row(rung: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
+    """Lay out a rung of ``run.json``: part, decibels without and with it, gain, verdict."""
+    found, with_it, gain = rung["found"], "-", "-"
+    if found is not None:
+        with_it = f"{rung['larger']:.2f} dB"
+        gain = f"{found['gain']:+.2f} +- {found['standard_error']:.2f} dB"
+        if found["spread"]:
+            gain += f", seeds {found['spread']:.2f}"
+    verdict = "kept" if rung["is_kept"] else rung["note"] or "left out"
+    return rung["title"], f"{rung['smaller']:.2f} dB", with_it, gain, verdict
+
+
 def _finite(value: Any) -> float | int | None:
     """Return a number that JSON can hold, or None."""
     return value if isinstance(value, int | float) and np.isfinite(value) else None

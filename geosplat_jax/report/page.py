@@ -29,6 +29,7 @@ from geosplat_jax.report.facts import (
     curves,
     figure,
     protocol_text,
+    rung_row,
     stage_times,
 )
 from geosplat_jax.report.gallery import comparisons
@@ -214,6 +215,7 @@ def _described(run: Evaluated, name: str, room: int) -> dict[str, Any]:
         "seen_scale": SEEN.described() if seen else None,
         "times": stage_times(lines),
         "total_seconds": (run.folder.training() or {}).get("seconds_total"),
+        "rungs": [rung_row(rung) for rung in record.get("model", {}).get("rungs", [])],
         "changed": changed_from_preset(config),
         "command": again,
         "command_is_whole": is_whole,

@@ -1,0 +1,240 @@
+"""Does `--model auto` find the model that a scene was made with? Scenes of known models.
+
+    python experiments/studies/models.py --output FOLDER [--scenes matt,glossy] [--quality draft]
+        [--steps 100] [--size 96] [--views 48] [--full]
+
+Each scene is a shape with materials, rendered under ``examples/studio.hdr`` by this package's own
+Monte Carlo transport from splats on a finer grid than any training has; its models are therefore
+known exactly, and images have no error of a kind that no model could explain. Scenes:
+
+``matt``       a Lambertian ball with a pattern: no specular lobe, nothing blocks light
+``shadowed``   the same pattern on four balls that touch: light is blocked, and comes by others
+``glossy``     a dielectric ball of roughness .2
+``two_gloss``  a dielectric ball, polished below and rough above
+``metal``      a ball of gold and copper, of roughness .3
+
+Printed are what was kept with its gain, and the decibels of eight test views of the chosen model;
+with ``--full``, also of the whole model, and what both trainings took.
+"""
+
+import argparse
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from geosplat_jax.core.types import EnvLight, Materials
+from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.stages import build_pipeline, initial_params
+from geosplat_jax.geometry import FlexiCubes, initial_geometry
+from geosplat_jax.io.dataset import Dataset
+from geosplat_jax.io.views import Views
+from geosplat_jax.model_choice import ModelChoice
+from geosplat_jax.render import Asset
+from geosplat_jax.report.facts import rung_row
+from geosplat_jax.report.metrics import psnr
+from geosplat_jax.report.relight import load_light
+from geosplat_jax.report.renderer import Renderer, photograph_on_white, render_on_white
+from geosplat_jax.run import Run, train
+from geosplat_jax.surface.grids import grid_vertices
+from geosplat_jax.surface.hull import fit_grid
+
+LIGHT = Path(__file__).resolve().parents[2] / "examples" / "studio.hdr"
+CELLS, SAMPLES, TEST_VIEWS = 64, 256, 8
+ONE_BALL = ((0.0, 0.0, 0.0, 0.45),)
+FOUR_BALLS = (
+    (0.0, 0.0, -0.1, 0.32),
+    (0.36, 0.0, 0.14, 0.17),
+    (-0.2, 0.31, 0.14, 0.17),
+    (-0.2, -0.31, 0.14, 0.17),
+)
+BOX = (np.full(3, -0.62), np.full(3, 0.62))
+
+
+def pattern(points: jax.Array) -> jax.Array:
+    """Albedo that varies over the surface, (n, 3)."""
+    waves = jnp.sin(jnp.asarray([9.0, 7.0, 11.0])[None, :] * points + points[:, ::-1])
+    return 0.45 + 0.3 * waves
+
+
+def _constant(points: jax.Array, value: float) -> jax.Array:
+    return jnp.full(points.shape[:1], value)
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A scene of a known model.
+
+    Attributes
+    ----------
+    balls : centres and radii.
+    materials : of points (n, 3).
+    """
+
+    balls: tuple[tuple[float, float, float, float], ...]
+    materials: Callable[[jax.Array], Materials]
+
+    def sdf(self, points: np.ndarray) -> np.ndarray:
+        """Distance from the union of the balls."""
+        each = [np.linalg.norm(points - np.array(b[:3]), axis=1) - b[3] for b in self.balls]
+        return np.min(each, axis=0)
+
+
+def _matt(points: jax.Array) -> Materials:
+    one, zero = _constant(points, 1.0), _constant(points, 0.0)
+    return Materials(pattern(points), one, zero, has_specular=False)
+
+
+def _glossy(points: jax.Array) -> Materials:
+    return Materials(pattern(points), _constant(points, 0.2), _constant(points, 0.0))
+
+
+def _two_gloss(points: jax.Array) -> Materials:
+    roughness = jnp.where(points[:, 2] > 0, 0.7, 0.15)
+    return Materials(pattern(points), roughness, _constant(points, 0.0))
+
+
+def _metal(points: jax.Array) -> Materials:
+    gold, copper = jnp.asarray([1.0, 0.77, 0.34]), jnp.asarray([0.95, 0.64, 0.54])
+    share = (0.5 + 0.5 * jnp.sin(8.0 * points[:, 0]))[:, None]
+    albedo = share * gold[None, :] + (1 - share) * copper[None, :]
+    return Materials(albedo, _constant(points, 0.3), _constant(points, 1.0))
+
+
+RECIPES = {
+    "matt": Recipe(ONE_BALL, _matt),
+    "shadowed": Recipe(FOUR_BALLS, _matt),
+    "glossy": Recipe(ONE_BALL, _glossy),
+    "two_gloss": Recipe(ONE_BALL, _two_gloss),
+    "metal": Recipe(ONE_BALL, _metal),
+}
+
+
+class _Truth(Renderer):
+    """Renders the materials of a recipe in the place of a field's."""
+
+    recipe: Recipe
+
+    def asset(self) -> Asset:
+        """Build surface and splats, once."""
+        if self._asset is None:
+            asset = super().asset()
+            materials = self.recipe.materials(asset.splats.anchors)
+            self._asset = replace(asset, attributes=replace(asset.attributes, materials=materials))
+        return self._asset
+
+
+def _poses(count: int, *, turn: float) -> np.ndarray:
+    """Camera-to-world matrices (Blender axes) on a sphere, looking at its centre."""
+    height = 0.95 - 1.5 * (np.arange(count) + 0.5) / count
+    angle = turn + np.arange(count) * np.pi * (3 - 5**0.5)
+    ring = np.sqrt(1 - height**2)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    for pose, back in zip(
+        poses, np.stack([ring * np.cos(angle), ring * np.sin(angle), height], 1), strict=True
+    ):
+        right = np.cross([0.0, 0.0, 1.0], back)
+        right /= np.linalg.norm(right)
+        pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+        pose[:3, 3] = 3.0 * back
+    return poses
+
+
+def make_scene(name: str, *, size: int, count: int) -> Dataset:
+    """Render a recipe from ``count`` training cameras and a few others."""
+    recipe = RECIPES[name]
+    config = make_config(overrides=(f"geometry.resolution={CELLS}",))
+    grid = fit_grid(BOX, CELLS)
+    surface = FlexiCubes(grid)
+    distances = recipe.sdf(np.asarray(grid_vertices(grid), np.float64)) / float(grid.cell_size)
+    shape = initial_geometry(grid, jnp.asarray(distances, jnp.float32))
+    stage = replace(config.stage("monte_carlo"), enter=())
+    transport = replace(stage.transport, indirect="traced")  # pyright: ignore[reportCallIssue]
+    pipeline = build_pipeline(config, replace(stage, transport=transport), surface)
+    pipeline = replace(pipeline, capacities=surface.first_capacities(shape))
+    params = initial_params(shape, config, jax.random.key(0))
+    params = replace(params, light=EnvLight(load_light(LIGHT).radiance))
+    truth = _Truth(pipeline, params, samples=SAMPLES)
+    truth.recipe = recipe
+    focal = 0.5 * size / np.tan(0.25)
+    intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
+
+    def views(poses: np.ndarray, kind: str) -> Views:
+        black = Views(
+            names=tuple(f"{kind}_{k:03d}" for k in range(len(poses))),
+            camera_to_world=poses,
+            intrinsics=np.repeat(intrinsics[None], len(poses), axis=0),
+            images=np.zeros((len(poses), size, size, 4), np.float32),
+        )
+        images = []
+        for k in range(len(poses)):
+            found = truth(black.camera([k]))
+            alpha = found.alpha[..., None]
+            straight = np.where(alpha > 0, found.rgb / np.where(alpha > 0, alpha, 1.0), 0.0)
+            images.append(np.concatenate([straight, np.clip(alpha, 0.0, 1.0)], axis=-1))
+        return replace(black, images=np.stack(images).astype(np.float32))
+
+    train_views = views(_poses(count, turn=0.0), "train")
+    test_views = views(_poses(TEST_VIEWS, turn=1.0), "test")
+    return Dataset(name, "memory", Path(), train_views, test_views, {}, None, BOX)
+
+
+def decibels(run: Run, views: Views) -> float:
+    """Mean peak signal-to-noise ratio of views, in sRGB on white."""
+    renderer, found = run.renderer(samples=64), []
+    for k in range(len(views)):
+        view = renderer(views.camera([k]))
+        truth = photograph_on_white(views.images[k])
+        found.append(float(psnr(render_on_white(view.rgb, view.alpha), truth)))
+    return float(np.mean(found))
+
+
+def main() -> None:
+    """Choose, train and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--scenes", default=",".join(RECIPES))
+    parser.add_argument("--quality", default="draft")
+    parser.add_argument("--steps", type=int, default=100)
+    parser.add_argument("--size", type=int, default=96)
+    parser.add_argument("--views", type=int, default=48)
+    parser.add_argument("--full", action="store_true")
+    arguments = parser.parse_args()
+    enable_compilation_cache()
+    retain_freed_memory()
+    config = make_config(quality=arguments.quality)
+    for name in arguments.scenes.split(","):
+        dataset = make_scene(name, size=arguments.size, count=arguments.views)
+        model = ModelChoice(steps=arguments.steps)
+        output = arguments.output / name
+        run = train(
+            dataset,
+            output,
+            config,
+            model=model,
+            resume=True,
+            on_rung=lambda rung, name=name: print(name, rung, flush=True),
+        )
+        record = run.folder.record()["model"]
+        for rung in record["rungs"]:
+            print("|", " | ".join((name, *rung_row(rung))), "|")
+        result = {
+            "kept": [rung["part"] for rung in record["rungs"] if rung["is_kept"]],
+            "decibels": decibels(run, dataset.test),
+            "choosing": record["seconds"],
+            "training": (run.folder.training() or {})["seconds_total"],
+        }
+        if arguments.full:
+            whole = train(dataset, arguments.output / f"{name}_full", config, resume=True)
+            result["full decibels"] = decibels(whole, dataset.test)
+            result["full training"] = (whole.folder.training() or {})["seconds_total"]
+        print(name, json.dumps(result), flush=True)
+
+
+if __name__ == "__main__":
+    main()
