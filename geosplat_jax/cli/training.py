@@ -1,7 +1,7 @@
 """The train command: what its options ask for, and the training with progress on the terminal."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,9 @@ from geosplat_jax.cli.display import ProgressDisplay, say, say_refined
 from geosplat_jax.fit.config import Budget, Config, config_warnings
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import make_config, with_mesh
+from geosplat_jax.fit.train import Progress
 from geosplat_jax.io.dataset import choose_downscale, load_recorded
+from geosplat_jax.report.events import EventLog
 from geosplat_jax.run import plan_training
 from geosplat_jax.run import train as train_run
 
@@ -125,6 +127,19 @@ def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[
 
 
 @contextmanager
+def _events(wanted: bool, folder: Path) -> Iterator[Callable[[], None]]:
+    """Yield what to call after every step, so that event files are written where wanted."""
+    if not wanted:
+        yield lambda: None
+        return
+    log = EventLog(RunFolder(folder))
+    try:
+        yield log.note
+    finally:
+        log.close()
+
+
+@contextmanager
 def _table(path: Path | None, folder: Path) -> Iterator[None]:
     """Write the steps of a run as a table when the training ends, however that is."""
     try:
@@ -152,7 +167,16 @@ def train(arguments: argparse.Namespace) -> None:
     for warning in (*dataset.warnings, *config_warnings(config)):
         say(warning, label="warning: ", style="yellow")
     say(f"{dataset.name}: {len(dataset.train)} views, {dataset.layout} ...")
-    with ProgressDisplay(config.total_steps) as display, _table(arguments.csv, folder):
+    with (
+        ProgressDisplay(config.total_steps) as display,
+        _table(arguments.csv, folder),
+        _events(arguments.tensorboard, folder) as note_events,
+    ):
+
+        def on_step(progress: Progress) -> None:
+            display.show(progress)
+            note_events()
+
         run = train_run(
             dataset,
             folder,
@@ -161,7 +185,7 @@ def train(arguments: argparse.Namespace) -> None:
             force=arguments.force,
             source=arguments.source,
             first_stage=arguments.stage,
-            on_step=display.show,
+            on_step=on_step,
             on_compile=display.compiling,
             budget=order.budget,
         )
