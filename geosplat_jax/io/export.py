@@ -363,9 +363,9 @@ def export_mesh_glb(
     SceneError
         If fewer faces or a USD are asked for and the package for it is not installed.
     ValueError
-        If an OBJ, a USD or fewer faces are asked for with colours on the vertices, the mesh is empty or
-        not finite, ``sample_materials`` returns a wrong shape, or the textures are of no size, of
-        one above `LARGEST_TEXTURE`, or do not fit into the memory.
+        If an OBJ, a USD or fewer faces are asked for with colours on the vertices, the mesh is
+        empty or not finite, ``sample_materials`` returns a wrong shape, or the textures are of no
+        size, of one above `LARGEST_TEXTURE`, or do not fit into the memory.
     """
     start = time.perf_counter()
     for kind, other in (("an OBJ", obj_path), ("a USD", usd_path)):

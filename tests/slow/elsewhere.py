@@ -78,7 +78,7 @@ def _texture(pixels: np.ndarray, *, raw: bool):
     """Make a texture of bytes; ``raw`` ones are not decoded from sRGB."""
     import mitsuba as mi
 
-    bitmap = mi.Bitmap(np.ascontiguousarray(pixels))
+    bitmap = mi.Bitmap(np.array(pixels))  # a copy: no array that is read-only is taken
     bitmap.set_srgb_gamma(not raw)
     return {"type": "bitmap", "bitmap": bitmap, "raw": raw, "wrap_mode": "clamp"}
 
