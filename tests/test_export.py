@@ -17,6 +17,7 @@ from scipy import ndimage
 from geosplat_jax.core.types import Camera, Mesh
 from geosplat_jax.io import baking, export, meshes
 from geosplat_jax.io.images import SceneError, read_linear
+from geosplat_jax.io.usd import write_usd
 
 # Half a texel across a chart's border, where a filled gutter is constant; 8 bits are far finer.
 COLOR_TOLERANCE = 0.03
@@ -282,6 +283,21 @@ def test_a_usd_is_the_mesh_of_the_glb_and_its_material_reads_the_textures(tmp_pa
         np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / file)), pixels)
     with pytest.raises(ValueError, match="a USD has textures"):
         export.export_mesh_glb(path, *sphere(1), materials, vertex_colors=True, usd_path=path)
+
+
+def test_a_usd_decodes_its_map_of_normals(tmp_path):
+    pytest.importorskip("pxr", reason="USD needs usd-core")
+    from pxr import Usd, UsdShade
+
+    uv = np.zeros((len(sphere(0)[0]), 2))
+    ball = trimesh.Trimesh(*sphere(0)[:2], visual=trimesh.visual.TextureVisuals(uv=uv))
+    write_usd(tmp_path / "mesh.usdc", ball, {"normal": "bumps.png"})
+    stage = Usd.Stage.Open(str(tmp_path / "mesh.usdc"))
+    reader = UsdShade.Shader(stage.GetPrimAtPath("/Object/Material/normal"))
+    scale, bias = (np.array(reader.GetInput(name).Get())[:3] for name in ("scale", "bias"))
+    np.testing.assert_array_equal(scale * 0.5 + bias, 0.0)
+    np.testing.assert_array_equal(scale + bias, 1.0)
+    assert reader.GetInput("sourceColorSpace").Get() == "raw"
 
 
 def test_a_usd_without_its_package_is_refused_before_anything_is_written(tmp_path, monkeypatch):
