@@ -367,6 +367,7 @@ class Run:
         vertex_colors: bool = False,
         texture_size: int = 1024,
         obj: bool = False,
+        usd: bool = False,
         face_count: int | None = None,
         on_progress: OnProgress | None = None,
     ) -> dict[str, str]:
@@ -380,6 +381,7 @@ class Run:
             vertex_colors=vertex_colors,
             texture_size=texture_size,
             obj=obj,
+            usd=usd,
             face_count=face_count,
             on_progress=on_progress,
         )

@@ -1,6 +1,7 @@
 """The command line on the bundled scene: every command once, and errors that say what to do."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import trimesh
 from support import MONTE_CARLO, TINY
 
 from geosplat_jax.cli import main
+from geosplat_jax.cli.arguments import command_line
+from geosplat_jax.cli.commands import COMMANDS
 from geosplat_jax.fit.folder import RunError
 from geosplat_jax.fit.train import load_trained
 from geosplat_jax.io.images import read_image
@@ -51,6 +54,26 @@ def test_info_says_what_was_recognised(capsys):
     said = capsys.readouterr().out
     for word in ("tensoir", "40", "8", "128", "studio", "albedo"):
         assert word in said
+
+
+def test_the_help_is_short_and_names_every_command(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--help"])
+    said = capsys.readouterr().out
+    assert stop.value.code == 0
+    assert len(said.splitlines()) <= 30
+    for name in COMMANDS:
+        assert re.search(rf"^ +{name}\b", said, re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_help_of_a_command_ends_with_an_example_that_it_takes(name, capsys):
+    with pytest.raises(SystemExit):
+        main([name, "--help"])
+    *_, title, line = capsys.readouterr().out.rstrip().splitlines()
+    assert title == "example:"
+    assert line.startswith(f"  geosplat-jax {name} ")
+    assert command_line().parse_args(line.split()[1:]).command == name
 
 
 def test_settings_lists_values_under_the_choices(capsys):

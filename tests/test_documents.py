@@ -116,3 +116,25 @@ def test_the_stage_of_the_page_trains_the_albedo_alone(examples):
     assert examples["polished"].rate_groups
     assert "albedo" not in stage.frozen
     assert {"sdf", "light", "roughness_metallic"} <= set(stage.frozen)
+
+
+def test_docstrings_of_the_site_are_lists():
+    pytest.importorskip("griffe", reason="the site needs the extra `docs`")
+    names = {}
+    exec((DOCS / "site_docstrings.py").read_text(), names)
+    text = (
+        "Render.\n\nAs in::\n\n    code\n\nParameters\n----------\na, b : first\n    and more.\n"
+        "c : second\n\nRaises\n------\nValueError\n    If not."
+    )
+    assert names["as_markdown"](text).splitlines()[-9:] == [
+        "",
+        "**Parameters**",
+        "",
+        "- `a, b`: first and more.",
+        "- `c`: second",
+        "",
+        "**Raises**",
+        "",
+        "- `ValueError`: If not.",
+    ]
+    assert "As in:\n\n    code" in names["as_markdown"](text)

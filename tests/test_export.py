@@ -17,6 +17,7 @@ from scipy import ndimage
 from geosplat_jax.core.types import Camera, Mesh
 from geosplat_jax.io import baking, export, meshes
 from geosplat_jax.io.images import SceneError, read_linear
+from geosplat_jax.io.usd import write_usd
 
 # Half a texel across a chart's border, where a filled gutter is constant; 8 bits are far finer.
 COLOR_TOLERANCE = 0.03
@@ -244,6 +245,67 @@ def test_an_obj_is_the_mesh_of_the_glb_with_the_same_textures(tmp_path):
     assert len(trimesh.load(path, process=False).faces) == len(glb.faces)
     with pytest.raises(ValueError, match="an OBJ has textures"):
         export.export_mesh_glb(path, *sphere(1), materials, vertex_colors=True, obj_path=path)
+
+
+def test_a_usd_is_the_mesh_of_the_glb_and_its_material_reads_the_textures(tmp_path):
+    pytest.importorskip("pxr", reason="USD needs usd-core")
+    from pxr import Usd, UsdGeom, UsdShade
+
+    path = tmp_path / "mesh.usdc"
+    glb_path = tmp_path / "mesh.glb"
+    export.export_mesh_glb(glb_path, *sphere(), materials, texture_size=TEXTURE, usd_path=path)
+    glb, stage = only_mesh(glb_path), Usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    prim = stage.GetDefaultPrim().GetChild("Mesh")
+    mesh = UsdGeom.Mesh(prim)
+    assert mesh.GetSubdivisionSchemeAttr().Get() == "none"
+    np.testing.assert_allclose(mesh.GetPointsAttr().Get(), glb.vertices, atol=1e-6)
+    np.testing.assert_allclose(mesh.GetNormalsAttr().Get(), glb.vertex_normals, atol=1e-5)
+    corners = np.asarray(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    np.testing.assert_array_equal(corners, glb.faces)
+    uv = UsdGeom.PrimvarsAPI(prim).GetPrimvar("st").Get()
+    np.testing.assert_allclose(uv, glb.visual.uv, atol=1e-6)
+    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+    surface = material.ComputeSurfaceSource()[0]
+    packed = np.asarray(glb.visual.material.metallicRoughnessTexture)
+    expected = {
+        "diffuseColor": ("rgb", "sRGB", np.asarray(glb.visual.material.baseColorTexture)),
+        "roughness": ("r", "raw", packed[..., 1]),
+        "metallic": ("r", "raw", packed[..., 2]),
+    }
+    assert {port.GetBaseName() for port in surface.GetInputs()} == set(expected)
+    for name, (channel, space, pixels) in expected.items():
+        source, output, _ = surface.GetInput(name).GetConnectedSource()
+        reader = UsdShade.Shader(source.GetPrim())
+        assert (output, reader.GetInput("sourceColorSpace").Get()) == (channel, space)
+        file = reader.GetInput("file").Get().path
+        np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / file)), pixels)
+    with pytest.raises(ValueError, match="a USD has textures"):
+        export.export_mesh_glb(path, *sphere(1), materials, vertex_colors=True, usd_path=path)
+
+
+def test_a_usd_decodes_its_map_of_normals(tmp_path):
+    pytest.importorskip("pxr", reason="USD needs usd-core")
+    from pxr import Usd, UsdShade
+
+    uv = np.zeros((len(sphere(0)[0]), 2))
+    ball = trimesh.Trimesh(*sphere(0)[:2], visual=trimesh.visual.TextureVisuals(uv=uv))
+    write_usd(tmp_path / "mesh.usdc", ball, {"normal": "bumps.png"})
+    stage = Usd.Stage.Open(str(tmp_path / "mesh.usdc"))
+    reader = UsdShade.Shader(stage.GetPrimAtPath("/Object/Material/normal"))
+    scale, bias = (np.array(reader.GetInput(name).Get())[:3] for name in ("scale", "bias"))
+    np.testing.assert_array_equal(scale * 0.5 + bias, 0.0)
+    np.testing.assert_array_equal(scale + bias, 1.0)
+    assert reader.GetInput("sourceColorSpace").Get() == "raw"
+
+
+def test_a_usd_without_its_package_is_refused_before_anything_is_written(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    path = tmp_path / "mesh.glb"
+    with pytest.raises(SceneError, match=r"pip install 'geosplat_jax\[usd\]'"):
+        export.export_mesh_glb(path, *sphere(1), materials, usd_path=tmp_path / "mesh.usdc")
+    assert not list(tmp_path.iterdir())
 
 
 def bumpy(directions):

@@ -203,7 +203,7 @@ def test_lights_are_swapped_turned_and_scaled(recorded):
     looks = [
         LOOK,
         replace(LOOK, light="sky"),
-        replace(LOOK, light="sky", turn=180.0, intensity=2.0),
+        replace(LOOK, light="sky", turn=90.0, intensity=2.0),
         replace(LOOK, intensity=0.5),
     ]
     for look in looks:
@@ -214,7 +214,8 @@ def test_lights_are_swapped_turned_and_scaled(recorded):
     half = sky.shape[1] // 2
     assert sky[:, 4 : half - 4].min() > 0.99
     assert sky[:, half + 4 : -4].max() < 0.01
-    np.testing.assert_allclose(turned, 2.0 * np.roll(sky, half, axis=1), atol=1e-3)
+    # Counter-clockwise seen from above, against which columns run.
+    np.testing.assert_allclose(turned, 2.0 * np.roll(sky, -half // 2, axis=1), atol=1e-3)
     assert dimmed.mean() == pytest.approx(0.2, abs=0.01)  # half of what was found
     assert dimmed.shape == sky.shape
 

@@ -19,26 +19,45 @@ from geosplat_jax.report.renderer import DEFAULT_SAMPLES, RELIGHT_KINDS
 from geosplat_jax.report.shots import AOVS, SPLITS
 from geosplat_jax.viewer.server import DEFAULT_PORT
 
+EXAMPLES = {
+    "info": "info examples/duck",
+    "poses": "poses cup --size 1600",
+    "masks": "masks cup --resume --box -0.4 -0.4 -0.1 0.4 0.4 0.5",
+    "train": "train examples/duck --quality draft --output runs/duck",
+    "settings": "settings stages.monte_carlo --quality high",
+    "evaluate": "evaluate runs/duck --samples 64",
+    "report": "report runs/a runs/b --output both.html",
+    "consistency": "consistency runs/duck --size 400",
+    "render": "render runs/duck --turntable 60 --size 800 --aovs depth --exr",
+    "view": "view runs/duck --env examples",
+    "relight": "relight runs/duck --env examples/sunset.hdr --turntable 48",
+    "refine-cameras": "refine-cameras runs/duck --output cameras.json",
+    "export": "export runs/duck --faces 20000 --obj",
+    "gradcheck": "gradcheck bsdf --sweep",
+}
+"""One call of every command, which its help ends with."""
+
 
 def command_line() -> argparse.ArgumentParser:
     """Describe the command line."""
     parser = argparse.ArgumentParser(
         prog="geosplat-jax",
         description="Photographs in; mesh, PBR materials and light out.",
+        epilog="`geosplat-jax COMMAND --help` says what a command takes, and ends with an example.",
     )
     parser.add_argument(
         "--version", action="version", version=importlib.metadata.version("geosplat_jax")
     )
-    commands = parser.add_subparsers(dest="command", required=True)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    info = commands.add_parser("info", help="say what was recognised in a scene folder")
+    info = _command(commands, "info", "say what was recognised in a scene folder")
     _add_scene_arguments(info)
 
-    _add_poses(commands.add_parser("poses", help="find the cameras of a folder of photographs"))
+    _add_poses(_command(commands, "poses", "find the cameras of a folder of photographs"))
 
-    _add_masks(commands.add_parser("masks", help="cut the object out of photographs with cameras"))
+    _add_masks(_command(commands, "masks", "cut the object out of photographs with cameras"))
 
-    train = commands.add_parser("train", help="reconstruct a scene")
+    train = _command(commands, "train", "reconstruct a scene")
     _add_scene_arguments(train)
     train.add_argument("--output", type=Path, help="run folder (default: runs/SCENE)")
     _add_config_arguments(train)
@@ -73,6 +92,11 @@ def command_line() -> argparse.ArgumentParser:
     train.add_argument(
         "--csv", type=Path, metavar="FILE", help="also write loss, terms and PSNR of every step"
     )
+    train.add_argument(
+        "--tensorboard",
+        action="store_true",
+        help="also write steps and previews as event files, to the run's folder",
+    )
     start = train.add_mutually_exclusive_group()
     start.add_argument(
         "--resume", action="store_true", help="continue from the last checkpoint, or start again"
@@ -84,7 +108,7 @@ def command_line() -> argparse.ArgumentParser:
     train.add_argument("--stage", metavar="NAME", help="with --from: the stage to begin with")
     _add_devices(train)
 
-    settings = commands.add_parser("settings", help="list every setting: default, range, meaning")
+    settings = _command(commands, "settings", "list every setting: default, range, meaning")
     settings.add_argument("prefix", nargs="?", default="", help="of the settings to list")
     _add_config_arguments(settings)
 
@@ -102,14 +126,14 @@ def command_line() -> argparse.ArgumentParser:
         "--stage", help="what this stage ended with, instead of the run as it is now"
     )
 
-    report = commands.add_parser("report", help="report.html of a run, or of several to compare")
+    report = _command(commands, "report", "report.html of a run, or of several to compare")
     report.add_argument("runs", type=Path, nargs="+", metavar="RUN")
     report.add_argument(
         "--output", type=Path, help="file (default: RUN/report.html; needed for several runs)"
     )
 
-    consistency = commands.add_parser(
-        "consistency", help="how well splats stand for the mesh of a run, or for any mesh"
+    consistency = _command(
+        commands, "consistency", "how well splats stand for the mesh of a run, or for any mesh"
     )
     consistency.add_argument(
         "subject", type=Path, metavar="RUN|MESH", help="folder of a run, or file of a closed mesh"
@@ -165,9 +189,10 @@ def command_line() -> argparse.ArgumentParser:
     export.add_argument(
         "--obj", action="store_true", help="also mesh.obj, with mesh.mtl and textures as PNG"
     )
+    export.add_argument("--usd", action="store_true", help="also mesh.usdc, with textures as PNG")
 
-    gradcheck = commands.add_parser(
-        "gradcheck", help="prove the gradients: float64 differences of every part"
+    gradcheck = _command(
+        commands, "gradcheck", "prove the gradients: float64 differences of every part"
     )
     gradcheck.add_argument(
         "stages", nargs="*", metavar="PART", help=f"some of {', '.join(STAGES)} (default: all)"
@@ -178,9 +203,20 @@ def command_line() -> argparse.ArgumentParser:
     return parser
 
 
+def _command(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
+    """Add a command; its help ends with an example."""
+    return commands.add_parser(
+        name,
+        help=text,
+        description=f"{text[0].upper()}{text[1:]}.",
+        epilog=f"example:\n  geosplat-jax {EXAMPLES[name]}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
 def _run_parser(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
     """Add a command that works on a run."""
-    parser = commands.add_parser(name, help=text)
+    parser = _command(commands, name, text)
     parser.add_argument("run", type=Path)
     parser.add_argument("--scene", type=Path, help="where the run's scene is now, if it has moved")
     return parser

@@ -323,6 +323,7 @@ def _export(arguments: argparse.Namespace) -> None:
             vertex_colors=arguments.vertex_colors,
             texture_size=arguments.texture_size,
             obj=arguments.obj,
+            usd=arguments.usd,
             face_count=arguments.faces,
             on_progress=display,
         )

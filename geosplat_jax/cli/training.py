@@ -1,7 +1,7 @@
 """The train command: what its options ask for, and the training with progress on the terminal."""
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,9 +15,11 @@ from geosplat_jax.fit.config import Budget, Config, config_warnings
 from geosplat_jax.fit.devices import Devices, choose_devices, connect_hosts
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import make_config, with_mesh
+from geosplat_jax.fit.train import Progress
 from geosplat_jax.io.dataset import choose_downscale, load_recorded
 from geosplat_jax.model_choice import ModelChoice, Rung
 from geosplat_jax.report.facts import rung_row
+from geosplat_jax.report.events import EventLog
 from geosplat_jax.run import plan_training
 from geosplat_jax.run import train as train_run
 
@@ -160,6 +162,19 @@ def _say_model(record: Mapping[str, Any] | None) -> None:
 
 
 @contextmanager
+def _events(wanted: bool, folder: Path) -> Iterator[Callable[[], None]]:
+    """Yield what to call after every step, so that event files are written where wanted."""
+    if not wanted:
+        yield lambda: None
+        return
+    log = EventLog(RunFolder(folder))
+    try:
+        yield log.note
+    finally:
+        log.close()
+
+
+@contextmanager
 def _table(path: Path | None, folder: Path) -> Iterator[None]:
     """Write the steps of a run as a table when the training ends, however that is."""
     try:
@@ -215,7 +230,16 @@ def train(arguments: argparse.Namespace) -> None:
     for warning in warnings:
         say(warning, label="warning: ", style="yellow")
     say(f"{dataset.name}: {len(dataset.train)} views, {dataset.layout} ...")
-    with ProgressDisplay(config.total_steps) as display, _table(arguments.csv, folder):
+    with (
+        ProgressDisplay(config.total_steps) as display,
+        _table(arguments.csv, folder),
+        _events(arguments.tensorboard and devices.is_first_host, folder) as note_events,
+    ):
+
+        def on_step(progress: Progress) -> None:
+            display.show(progress)
+            note_events()
+
         run = train_run(
             dataset,
             folder,
@@ -224,7 +248,7 @@ def train(arguments: argparse.Namespace) -> None:
             force=arguments.force,
             source=arguments.source,
             first_stage=arguments.stage,
-            on_step=display.show,
+            on_step=on_step,
             on_compile=display.compiling,
             budget=order.budget,
             devices=devices,

@@ -8,6 +8,7 @@
     stages/NAME/          the checkpoint that stage NAME ended with
     previews/             truth, render and normals while training
     training.json         how long the whole training took
+    tensorboard/          the steps once more, as event files, where they were asked for
     metrics.json, *.png   what the last evaluation found
     evaluation/           its pictures one by one, the mesh and the lights of the report
     report.html           all of it as one page
@@ -33,9 +34,12 @@ from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.documents import parse_json
 
 _PACKAGES = ("jax", "jaxlib", "numpy", "optax", "geosplat_jax")
+EVENTS = "tensorboard"
+"""Name of the folder of event files."""
+
 _OWN = (
     *("metrics.json", "overview.png", "materials.png", "relight.png", "evaluation", "report.html"),
-    *("checkpoints", "stages", "previews", "metrics.jsonl", "training.json", "run.json"),
+    *(EVENTS, "checkpoints", "stages", "previews", "metrics.jsonl", "training.json", "run.json"),
 )
 """What evaluation and training write; the record goes last: it says that the rest is a run."""
 

@@ -1,4 +1,4 @@
-"""Assets that other programs open: GLB and OBJ with PBR textures, Gaussian PLY, light EXR.
+"""Assets that other programs open: GLB, OBJ and USD with PBR textures, Gaussian PLY, light EXR.
 
 Every file is written beside its destination and then renamed, so that an interrupted export leaves
 the previous file whole.
@@ -30,6 +30,7 @@ from geosplat_jax.io.meshes import (
     to_gltf_axes,
     unwrap,
 )
+from geosplat_jax.io.usd import usd_library, write_usd
 
 SampleMaterials = Callable[[Float[np.ndarray, "N 3"]], tuple[Any, Any, Any]]
 """Positions (N, 3) in the world -> albedo (N, 3) linear, roughness (N,), metallic (N,)."""
@@ -146,6 +147,41 @@ def _write_glb(path: str | Path, mesh: trimesh.Trimesh) -> None:
         aside.write_bytes(data)
 
 
+def _write_textures(path: Path, mesh: trimesh.Trimesh) -> dict[str, str]:
+    """Write the textures of a mesh as PNG beside ``path``; return the files' names.
+
+    Roughness and metallic are grey pictures of their own.
+    """
+    visual = mesh.visual
+    assert isinstance(visual, TextureVisuals)
+    material = visual.material
+    assert isinstance(material, PBRMaterial)
+    packed = np.asarray(material.metallicRoughnessTexture)
+    images = {
+        "base_color": material.baseColorTexture,
+        "roughness": Image.fromarray(packed[..., 1]),
+        "metallic": Image.fromarray(packed[..., 2]),
+        "normal": material.normalTexture,
+    }
+    written = {}
+    for name, image in images.items():
+        if image is not None:
+            file = path.with_name(f"{path.stem}_{name}.png")
+            with written_aside(file) as aside:
+                image.save(aside, format="PNG")
+            written[name] = file.name
+    return written
+
+
+_OBJ_MAPS = {
+    "base_color": "map_Kd",
+    "roughness": "map_Pr",
+    "metallic": "map_Pm",
+    "normal": "norm",
+}
+"""Lines of a material in MTL that name textures."""
+
+
 def _write_obj(path: str | Path, mesh: trimesh.Trimesh) -> None:
     """Write a textured mesh as OBJ, its material beside it as MTL, and its textures as PNG.
 
@@ -154,23 +190,8 @@ def _write_obj(path: str | Path, mesh: trimesh.Trimesh) -> None:
     """
     path, visual = Path(path), mesh.visual
     assert isinstance(visual, TextureVisuals)
-    material = visual.material
-    assert isinstance(material, PBRMaterial)
-    packed = np.asarray(material.metallicRoughnessTexture)
-    maps = {
-        "map_Kd": ("base_color", material.baseColorTexture),
-        "map_Pr": ("roughness", Image.fromarray(packed[..., 1])),
-        "map_Pm": ("metallic", Image.fromarray(packed[..., 2])),
-    }
-    if material.normalTexture is not None:
-        maps["norm"] = ("normal", material.normalTexture)
     lines = ["newmtl material", "Kd 1 1 1", "Pr 1", "Pm 1"]
-    for key, (name, image) in maps.items():
-        assert image is not None
-        file = path.with_name(f"{path.stem}_{name}.png")
-        with written_aside(file) as aside:
-            image.save(aside, format="PNG")
-        lines.append(f"{key} {file.name}")
+    lines += [f"{_OBJ_MAPS[name]} {file}" for name, file in _write_textures(path, mesh).items()]
     with written_aside(path.with_suffix(".mtl")) as aside:
         aside.write_text("\n".join(lines) + "\n", encoding="utf-8")
     uv, faces = np.asarray(visual.uv), np.asarray(mesh.faces) + 1
@@ -305,6 +326,7 @@ def export_mesh_glb(
     vertex_colors: bool = False,
     texture_size: int = 1024,
     obj_path: str | Path | None = None,
+    usd_path: str | Path | None = None,
     face_count: int | None = None,
 ) -> dict[str, Any]:
     """Write a mesh and its materials as a binary glTF 2.0 file.
@@ -328,6 +350,7 @@ def export_mesh_glb(
     face_count : reduce the mesh to about so many faces first, and put its normals into a map, with
         tangents; None for the mesh as it is.
     obj_path : also write the same mesh and textures there as OBJ, with MTL and PNG beside it.
+    usd_path : likewise as USD, ``*.usdc``.
 
     Returns
     -------
@@ -338,19 +361,22 @@ def export_mesh_glb(
     Raises
     ------
     SceneError
-        If fewer faces are asked for and fast-simplification is not installed.
+        If fewer faces or a USD are asked for and the package for it is not installed.
     ValueError
-        If an OBJ or fewer faces are asked for with colours on the vertices, the mesh is empty or
-        not finite, ``sample_materials`` returns a wrong shape, or the textures are of no size, of
-        one above `LARGEST_TEXTURE`, or do not fit into the memory.
+        If an OBJ, a USD or fewer faces are asked for with colours on the vertices, the mesh is
+        empty or not finite, ``sample_materials`` returns a wrong shape, or the textures are of no
+        size, of one above `LARGEST_TEXTURE`, or do not fit into the memory.
     """
     start = time.perf_counter()
-    if vertex_colors and obj_path is not None:
-        raise ValueError("an OBJ has textures; leave out the colours on vertices")
+    for kind, other in (("an OBJ", obj_path), ("a USD", usd_path)):
+        if vertex_colors and other is not None:
+            raise ValueError(f"{kind} has textures; leave out the colours on vertices")
     if vertex_colors and face_count is not None:
         raise ValueError("a map of normals is a texture; leave out the colours on vertices")
     if not vertex_colors:
         _require_texture(texture_size)
+    if usd_path is not None:
+        usd_library()
     vertices, faces, normals, info = _checked_mesh(
         np.asarray(vertices, np.float32),
         np.asarray(faces, np.int32),
@@ -372,6 +398,8 @@ def export_mesh_glb(
         _write_glb(path, mesh)
         if obj_path is not None:
             _write_obj(obj_path, mesh)
+        if usd_path is not None:
+            write_usd(usd_path, mesh, _write_textures(Path(usd_path), mesh))
         info |= baking
     info |= {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
     return info | {"seconds": time.perf_counter() - start}

@@ -92,6 +92,7 @@ def export_assets(
     vertex_colors: bool = False,
     texture_size: int = 1024,
     obj: bool = False,
+    usd: bool = False,
     face_count: int | None = None,
     on_progress: OnProgress | None = None,
 ) -> dict[str, str]:
@@ -107,6 +108,7 @@ def export_assets(
     vertex_colors : colours on vertices instead of an unwrapped texture.
     texture_size : edge of the square textures, texels.
     obj : also write ``mesh.obj``, with ``mesh.mtl`` and textures as PNG.
+    usd : also write ``mesh.usdc``, with the same textures.
     face_count : reduce the mesh to about so many faces, with a map of its normals.
     on_progress : see `poses.OnProgress`.
 
@@ -130,6 +132,7 @@ def export_assets(
         vertex_colors=vertex_colors,
         texture_size=texture_size,
         obj_path=folder / "mesh.obj" if obj else None,
+        usd_path=folder / "mesh.usdc" if usd else None,
         face_count=face_count,
     )
     tell("mesh and textures", 1, 1)
@@ -147,6 +150,8 @@ def export_assets(
     export_light_exr(folder / "light.exr", radiance)
     height, width = trained.params.light.radiance.shape[:2]
     others = {str(folder / "mesh.obj"): "the same mesh, with mesh.mtl and PNG"} if obj else {}
+    if usd:
+        others[str(folder / "mesh.usdc")] = "the same mesh, with PNG"
     return others | {
         str(folder / "mesh.glb"): ", ".join(f"{k} {v}" for k, v in mesh_info.items()),
         str(folder / "gaussians.ply"): f"{count} Gaussians",

@@ -82,15 +82,14 @@ class _Person:
         self._turn = gui.add_slider("light turned", 0, 360, 5, 0, hint="degrees, from above")
         self._intensity = gui.add_slider("intensity", 0.0, 4.0, 0.05, 1.0)
         self._background = gui.add_dropdown("background", BACKGROUNDS, initial_value="white")
-        self._status = gui.add_markdown("")
+        self._status = gui.add_markdown("the first pictures wait for a compilation")
 
     def look(self) -> Look | None:
         """Return what is to be seen; None before the window has a size."""
         camera = self._client.camera
         if not camera.image_height or not camera.image_width:
             return None
-        x, y, z = map(float, camera.position)
-        qw, qx, qy, qz = map(float, camera.wxyz)
+        (x, y, z), (qw, qx, qy, qz) = map(float, camera.position), map(float, camera.wxyz)
         return Look(
             position=(x, y, z),
             rotation=(qw, qx, qy, qz),

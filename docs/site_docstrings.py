@@ -1,0 +1,48 @@
+"""Shows docstrings as they are written: sections of numpydoc whose items read ``name : text``."""
+
+import re
+from typing import Any
+
+import griffe
+
+_RULE = re.compile(r"^-{3,}$")
+
+
+def _items(lines: list[str]) -> list[str]:
+    """Return the items of a section as a list of Markdown."""
+    items: list[list[str]] = []
+    for line in filter(str.strip, lines):
+        if line.startswith(" ") and items:
+            items[-1].append(line.strip())
+        else:
+            items.append([line.strip()])
+    listed = []
+    for first, *more in items:
+        name, colon, text = first.partition(" : ")
+        if colon:
+            listed.append(f"- `{name}`: {' '.join([text, *more])}")
+        elif more:
+            listed.append(f"- `{first}`: {' '.join(more)}")
+        else:
+            listed.append(f"- {first}")
+    return listed
+
+
+def as_markdown(text: str) -> str:
+    """Turn a docstring into Markdown; what is in no section stays."""
+    lines = text.splitlines()
+    starts = [number for number in range(len(lines) - 1) if _RULE.match(lines[number + 1])]
+    prose = lines[: starts[0]] if starts else lines
+    written = [re.sub(r"::$", ":", line) for line in prose]
+    for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
+        written += ["", f"**{lines[start]}**", "", *_items(lines[start + 2 : end])]
+    return "\n".join(written)
+
+
+class Docstrings(griffe.Extension):
+    """Rewrites every docstring that the site shows."""
+
+    def on_object(self, *, obj: griffe.Object, **unused: Any) -> None:
+        """Rewrite the docstring of one object; griffe calls this for each."""
+        if obj.docstring is not None:
+            obj.docstring.value = as_markdown(obj.docstring.value)

@@ -1,0 +1,88 @@
+"""A run as TensorBoard's event files: scalars of every step, and the previews, while it trains."""
+
+import importlib
+import json
+import shutil
+from typing import Any
+
+import numpy as np
+
+from geosplat_jax.fit.folder import EVENTS, RunFolder
+from geosplat_jax.io.images import SceneError, read_image
+
+_SHOWN = ("loss", "psnr", "splats", "faces", "seconds", "peak_memory_mb")
+_TERM = "term."
+
+
+def _writer_kind() -> Any:
+    """Return the class that writes event files.
+
+    Raises
+    ------
+    SceneError
+        If its package is not installed.
+    """
+    try:
+        return importlib.import_module("tensorboardX").SummaryWriter
+    except ImportError:
+        raise SceneError(
+            "--tensorboard needs the package tensorboardX; install it with "
+            "`pip install 'geosplat_jax[tensorboard]'`"
+        ) from None
+
+
+class EventLog:
+    """Follows ``metrics.jsonl`` and the previews of a run into ``tensorboard/`` in its folder.
+
+    Written anew from the first step on, so that a resumed run has no step twice.
+
+    Parameters
+    ----------
+    folder : of the run; need not exist yet.
+
+    Raises
+    ------
+    SceneError
+        If tensorboardX is not installed.
+    """
+
+    def __init__(self, folder: RunFolder) -> None:
+        self._kind, self._folder = _writer_kind(), folder
+        self._writer: Any = None
+        self._read = 0
+        self._shown: set[str] = set()
+
+    def note(self) -> None:
+        """Write what has been added since the last call."""
+        if self._writer is None:
+            if not self._folder.metrics.exists():
+                return
+            target = self._folder.path / EVENTS
+            shutil.rmtree(target, ignore_errors=True)
+            self._writer = self._kind(logdir=str(target))
+        with self._folder.metrics.open("rb") as file:
+            file.seek(self._read)
+            added = file.read()
+        whole = added[: added.rfind(b"\n") + 1]
+        self._read += len(whole)
+        for text in whole.splitlines():
+            self._write_step(json.loads(text))
+        for path in sorted(self._folder.previews.glob("step_*.png")):
+            if path.name not in self._shown:
+                self._shown.add(path.name)
+                picture = np.round(255.0 * read_image(path)[..., :3]).astype(np.uint8)
+                step = int(path.stem.removeprefix("step_"))
+                self._writer.add_image("preview", picture, step, dataformats="HWC")
+
+    def _write_step(self, line: dict[str, Any]) -> None:
+        for name, value in line.items():
+            if name in _SHOWN:
+                self._writer.add_scalar(name, value, line["step"])
+            elif name.startswith(_TERM):
+                self._writer.add_scalar(f"terms/{name.removeprefix(_TERM)}", value, line["step"])
+
+    def close(self) -> None:
+        """Write what is left and close the files; nothing where `note` has written nothing."""
+        if self._writer is not None:
+            self.note()
+            self._writer.close()

@@ -1,0 +1,77 @@
+"""Event files: every step once, terms and previews, also after a resume."""
+
+import json
+import struct
+import sys
+
+import numpy as np
+import pytest
+
+from geosplat_jax.fit.folder import RunFolder
+from geosplat_jax.io.images import SceneError, write_png
+from geosplat_jax.report.events import EventLog
+
+pytestmark = pytest.mark.filterwarnings("ignore")
+
+
+def add_steps(folder, *steps):
+    with folder.metrics.open("a") as file:
+        for step in steps:
+            line = {"step": step, "stage": "split_sum", "loss": 1.0 / (step + 1), "term.l1": 0.25}
+            file.write(json.dumps({**line, "usage": {"hits": 3}}) + "\n")
+
+
+def events(folder):
+    """Step and value by tag, as the files have them; pictures have a size instead of a value."""
+    kind = pytest.importorskip("tensorboardX.proto.event_pb2").Event
+    found = {}
+    (path,) = (folder.path / "tensorboard").glob("events.*")
+    data = path.read_bytes()
+    while data:
+        (length,) = struct.unpack("<Q", data[:8])
+        event = kind.FromString(data[12 : 12 + length])
+        data = data[16 + length :]
+        for value in event.summary.value:
+            shown = value.simple_value
+            if value.HasField("image"):
+                shown = (value.image.height, value.image.width)
+            found.setdefault(value.tag, []).append((event.step, shown))
+    return found
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return RunFolder(tmp_path)
+
+
+def test_steps_and_previews_are_written_once_and_anew_after_a_resume(folder):
+    pytest.importorskip("tensorboardX")
+    log = EventLog(folder)
+    log.note()
+    assert not (folder.path / "tensorboard").exists()
+    add_steps(folder, 0, 1)
+    log.note()
+    folder.previews.mkdir()
+    write_png(folder.previews / "step_000002.png", np.full((4, 6, 3), 0.5))
+    with folder.metrics.open("a") as file:
+        file.write('{"step": 2, "lo')  # a line that is being written
+    log.note()
+    log.note()
+    log.close()
+    found = events(folder)
+    assert found["loss"] == [(0, 1.0), (1, 0.5)]
+    assert found["terms/l1"] == [(0, 0.25), (1, 0.25)]
+    assert found["preview"] == [(2, (4, 6))]
+    assert set(found) == {"loss", "terms/l1", "preview"}
+    folder.metrics.unlink()
+    add_steps(folder, 0, 3)
+    resumed = EventLog(folder)
+    resumed.note()
+    resumed.close()
+    assert [step for step, _ in events(folder)["loss"]] == [0, 3]
+
+
+def test_a_missing_package_is_named(folder, monkeypatch):
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
+    with pytest.raises(SceneError, match=r"pip install 'geosplat_jax\[tensorboard\]'"):
+        EventLog(folder)
