@@ -18,8 +18,8 @@ from geosplat_jax.fit.presets import make_config, with_mesh
 from geosplat_jax.fit.train import Progress
 from geosplat_jax.io.dataset import choose_downscale, load_recorded
 from geosplat_jax.model_choice import ModelChoice, Rung
-from geosplat_jax.report.facts import rung_row
 from geosplat_jax.report.events import EventLog
+from geosplat_jax.report.facts import rung_row
 from geosplat_jax.run import plan_training
 from geosplat_jax.run import train as train_run
 
@@ -232,7 +232,7 @@ def train(arguments: argparse.Namespace) -> None:
     say(f"{dataset.name}: {len(dataset.train)} views, {dataset.layout} ...")
     with (
         ProgressDisplay(config.total_steps) as display,
-        _table(arguments.csv, folder),
+        _table(arguments.csv if devices.is_first_host else None, folder),
         _events(arguments.tensorboard and devices.is_first_host, folder) as note_events,
     ):
 
