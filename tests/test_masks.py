@@ -67,11 +67,34 @@ def test_the_box_is_that_of_the_object_without_what_it_stands_on(scale):
         size=0.02 * scale,
     )
     proposal = propose_box(cloud, ring(scale=scale))
-    assert proposal.has_plane
+    assert proposal.plane is not None
+    np.testing.assert_allclose(proposal.plane.normal, [0.0, 0.0, 1.0], atol=0.02)
     np.testing.assert_allclose(proposal.lo / scale, middle - 0.6, atol=0.12)
     np.testing.assert_allclose(proposal.hi / scale, middle + 0.6, atol=0.12)
     assert proposal.lo[2] / scale > -0.62
     assert 0.2 < proposal.share < 0.8
+
+
+def test_a_thick_wall_that_no_axis_follows_is_cut_off():
+    """As a trophy hangs at one: splats behind the wall, and the cameras on one side of it."""
+    turn = np.linalg.qr(np.array([[1.0, 0.6, 0.3], [-0.5, 1.0, 0.2], [0.1, -0.4, 1.0]]))[0]
+    turn = turn * np.sign(np.linalg.det(turn))
+    rng = np.random.default_rng(5)
+    wall = rng.uniform(-1.4, 1.4, (3000, 3)) * [1.0, 1.0, 0.02] - [0.0, 0.0, 0.45]
+    behind = rng.uniform(-1.4, 1.4, (300, 3)) * [1.0, 1.0, 0.1] - [0.0, 0.0, 0.8]
+    ball = on_ball(1500, radius=0.5)
+    cloud = cloud_of(*(part @ turn.T for part in (ball, wall, behind)))
+    across = np.stack(np.meshgrid(np.linspace(-1, 1, 4), np.linspace(-1, 1, 4)), -1).reshape(-1, 2)
+    eyes = 4.0 * np.c_[0.6 * across, np.ones(16)] @ turn.T
+    proposal = propose_box(cloud, views_from(eyes, size=40, field_of_view=0.7))
+    plane = proposal.plane
+    assert plane is not None
+    assert plane.normal @ turn[:, 2] > 0.999
+    above = plane.is_above(cloud.positions)
+    assert above[1500:].mean() < 0.02
+    assert above[:1500].mean() > 0.93
+    assert np.abs(proposal.lo).max() < 0.75
+    assert np.abs(proposal.hi).max() < 0.75
 
 
 def test_a_larger_cluster_at_the_edge_is_not_the_object():
@@ -86,7 +109,7 @@ def test_a_board_through_the_object_is_no_ground(axes):
     # As many points on either side of the plane, so nothing stands on it.
     board = on_plane(2000, 0.0, reach=0.7)[:, axes]
     cloud = cloud_of(on_ball(1500, radius=0.5), board)
-    assert not propose_box(cloud, ring()).has_plane
+    assert propose_box(cloud, ring()).plane is None
 
 
 def test_faint_and_large_splats_do_not_make_a_box():

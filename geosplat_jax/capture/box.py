@@ -29,10 +29,12 @@ _CELLS = 40
 _REACH = 0.2
 """Standard deviation, in sides of the search, of the weight of what is near its middle."""
 _TRIALS = 400
-_PLANE_THICKNESS = 0.007  # of the sides of the search, to either side
+_PLANE_THICKNESSES = (0.007, 0.014, 0.028)  # of the sides of the search, to either side
 _PLANE_SHARE = 0.15  # of the splats, that a plane must hold to be what the object stands on
-_ONE_SIDE = 0.9
-"""Share of the other splats, and of the cameras, that lie above such a plane."""
+_CAMERAS_ABOVE = 0.9
+"""Share of the cameras that lie above such a plane."""
+_SPLATS_ABOVE = 0.75
+"""Share of the other splats that do; what shines on a plane leaves some below."""
 _TAIL = 0.005
 """Share of the cluster that may lie outside of the box on each side."""
 _MARGIN = 0.05  # of the longest side, on every side
@@ -48,6 +50,20 @@ class Cloud(NamedTuple):
     sizes: Float[np.ndarray, " N"]
 
 
+class Plane(NamedTuple):
+    """What an object stands on or hangs at, however it lies: the points ``normal.x <= height``.
+
+    ``normal`` : (3,) unit, towards the object and the cameras.
+    """
+
+    normal: Float[np.ndarray, " 3"]
+    height: float
+
+    def is_above(self, positions: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
+        """Tell which points are no part of it."""
+        return positions @ self.normal > self.height
+
+
 class Proposal(NamedTuple):
     """A box, and what it rests on.
 
@@ -55,13 +71,13 @@ class Proposal(NamedTuple):
     ----------
     lo, hi : (3,) corners in the world.
     share : of the weight of all splats in the search that the cluster holds.
-    has_plane : whether a plane was left out.
+    plane : that was left out, which may cross the box; None for none.
     """
 
     lo: Float[np.ndarray, " 3"]
     hi: Float[np.ndarray, " 3"]
     share: float
-    has_plane: bool
+    plane: Plane | None
 
 
 def propose_box(cloud: Cloud, views: Views, *, seed: int = 0) -> Proposal:
@@ -93,7 +109,8 @@ def propose_box(cloud: Cloud, views: Views, *, seed: int = 0) -> Proposal:
         )
     points, weights = positions[is_used], np.asarray(cloud.opacities, np.float64)[is_used]
     centers = views.camera_to_world[:, :3, 3]
-    on_plane = _ground(points, weights, centers, side, np.random.default_rng(seed))
+    plane = _ground(points, weights, centers, side, np.random.default_rng(seed))
+    on_plane = np.zeros(len(points), bool) if plane is None else ~plane.is_above(points)
     rest, rest_weights = points[~on_plane], weights[~on_plane]
     members = _largest_cluster(rest, rest_weights, lo, hi)
     if not members.any():
@@ -109,7 +126,7 @@ def propose_box(cloud: Cloud, views: Views, *, seed: int = 0) -> Proposal:
     if on_plane.any():
         low, high = _cut_at_plane(low, high, points[on_plane], cluster)
     share = float(rest_weights[members].sum() / weights.sum())
-    return Proposal(low, high, share, bool(on_plane.any()))
+    return Proposal(low, high, share, plane)
 
 
 def inside_box(
@@ -173,39 +190,46 @@ def _ground(
     centers: np.ndarray,
     side: float,
     rng: np.random.Generator,
-) -> Bool[np.ndarray, " N"]:
-    """Find the points of the plane that things stand on; none where there is no such plane.
+) -> Plane | None:
+    """Find the plane that things stand on, or hang at; None where there is no such plane.
 
-    Random planes through three points; the one with the most weight of those that have the cameras
-    and nearly all other points on one side (RANSAC, Fischler and Bolles 1981).
+    The plane through three random points that holds the most weight (RANSAC, Fischler and Bolles
+    1981), if the cameras and most other points lie on one side of it. Where the thinnest such plane
+    does not, a thicker one may: a wall of splats is not flat.
     """
-    nothing = np.zeros(len(points), bool)
     if len(points) < 3:
-        return nothing
-    thickness = _PLANE_THICKNESS * side
-    best, best_weight = nothing, _PLANE_SHARE * weights.sum()
-    for corners in rng.integers(len(points), size=(_TRIALS, 3)):
-        a, b, c = points[corners]
-        normal = np.cross(b - a, c - a)
-        length = np.linalg.norm(normal)
-        if length <= 1e-9 * side**2:
+        return None
+    for thickness in side * np.array(_PLANE_THICKNESSES):
+        best, best_weight = None, _PLANE_SHARE * weights.sum()
+        for corners in rng.integers(len(points), size=(_TRIALS, 3)):
+            found = _plane_through(*points[corners], centers, side)
+            if found is None:
+                continue
+            weight = weights[np.abs(points @ found.normal - found.height) < thickness].sum()
+            if weight > best_weight:
+                best, best_weight = found, weight
+        if best is None or best.is_above(centers).mean() < _CAMERAS_ABOVE:
             continue
-        normal = normal / length
-        if np.mean((centers - a) @ normal) < 0.0:
-            normal = -normal
-        height = (points - a) @ normal
-        on_plane = np.abs(height) < thickness
-        weight = weights[on_plane].sum()
-        if weight <= best_weight or ((centers - a) @ normal > 0.0).mean() < _ONE_SIDE:
-            continue
-        others = ~on_plane
-        above = weights[others & (height > 0.0)].sum()
-        if others.any() and above < _ONE_SIDE * weights[others].sum():
-            continue
-        # What is below belongs to the ground, too.
-        best, best_weight = height < thickness, weight
-    # A plane that leaves nothing is all that there is to see.
-    return nothing if best.all() else best
+        # What is below belongs to the ground, too; a plane that leaves nothing is all there is.
+        ground = best._replace(height=float(best.height + thickness))
+        above = weights[ground.is_above(points)].sum()
+        if 0.0 < above >= _SPLATS_ABOVE * (weights.sum() - best_weight):
+            return ground
+    return None
+
+
+def _plane_through(
+    a: np.ndarray, b: np.ndarray, c: np.ndarray, centers: np.ndarray, side: float
+) -> Plane | None:
+    """Return the plane through three points, the cameras above; None where they lie on a line."""
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal)
+    if length <= 1e-9 * side**2:
+        return None
+    normal = normal / length
+    if np.mean((centers - a) @ normal) < 0.0:
+        normal = -normal
+    return Plane(normal, float(a @ normal))
 
 
 def _largest_cluster(

@@ -19,6 +19,7 @@ from scipy.ndimage import maximum_filter
 from geosplat_jax.capture.box import (
     Cloud,
     Corners,
+    Plane,
     inside_box,
     propose_box,
     require_something_inside,
@@ -108,7 +109,8 @@ class MaskReport:
     ----------
     masks : count of files. folder : where they are.
     lo, hi : corners of the box. proposed : whether it was found and not given.
-    plane : whether a plane that the object stands on was left out of the box.
+    plane : what the object stands on or hangs at and was left out: the points ``x`` with ``normal.x
+        <= height``, three numbers of the normal and the height; None for no such plane.
     splats : in the box. splats_total : of the scene.
     psnr : mean decibels of the splats on views that they did not see; None without such views.
     certainty : how sure the masks are.
@@ -119,7 +121,7 @@ class MaskReport:
     lo: tuple[float, float, float]
     hi: tuple[float, float, float]
     proposed: bool
-    plane: bool
+    plane: tuple[float, float, float, float] | None
     splats: int
     splats_total: int
     psnr: float | None
@@ -131,7 +133,7 @@ class MaskReport:
             "(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in (self.lo, self.hi)
         )
         origin = "proposed" if self.proposed else "given"
-        plane = ", what it stands on left out" if self.plane else ""
+        plane = ", what it stands on or hangs at left out" if self.plane else ""
         held_back = "no views are held back"
         if self.psnr is not None:
             held_back = f"{self.psnr:.2f} dB on views that are held back"
@@ -194,7 +196,7 @@ def make_masks(
     write_splats(radiance, folder / "splats.ply")
     psnr = float(quality(radiance, dataset.test).mean()) if len(dataset.test) else None
     views = _all_views(dataset)
-    clipped, lo, hi, has_plane = _clipped(radiance, dataset.train, box, settings.seed)
+    clipped, (lo, hi), plane = _clipped(radiance, dataset.train, box, settings.seed)
     write_splats(clipped, folder / "object.ply")
     _, alpha = render_views(clipped, views.camera())
     if views.valid is not None:
@@ -213,7 +215,7 @@ def make_masks(
         lo=_numbers(lo),
         hi=_numbers(hi),
         proposed=box is None,
-        plane=has_plane,
+        plane=None if plane is None else (*_numbers(plane.normal), plane.height),
         splats=clipped.splats.capacity,
         splats_total=radiance.splats.capacity,
         psnr=psnr,
@@ -308,8 +310,8 @@ def _all_views(dataset: Dataset) -> Views:
 
 def _clipped(
     radiance: Radiance, views: Views, box: Corners | None, seed: int
-) -> tuple[Radiance, np.ndarray, np.ndarray, bool]:
-    """Keep the splats whose mean lies in the box; return them, the box, and whether it has a floor.
+) -> tuple[Radiance, Corners, Plane | None]:
+    """Keep the splats whose mean lies in the box, and above the plane of a proposed one.
 
     Raises
     ------
@@ -321,15 +323,17 @@ def _clipped(
         np.asarray(splats.opacities, np.float64),
         np.asarray(splats.scales, np.float64).max(1),
     )
-    has_plane = False
+    plane = None
     if box is None:
         proposal = propose_box(cloud, views, seed=seed)
-        corners, has_plane = (proposal.lo, proposal.hi), proposal.has_plane
+        corners, plane = (proposal.lo, proposal.hi), proposal.plane
     else:
         corners = (np.asarray(box[0], np.float64), np.asarray(box[1], np.float64))
     inside = inside_box(cloud.positions, *corners)
+    if plane is not None:
+        inside &= plane.is_above(cloud.positions)
     require_something_inside(inside, cloud, corners)
-    return radiance.of(inside), corners[0], corners[1], has_plane
+    return radiance.of(inside), corners, plane
 
 
 def write_splats(radiance: Radiance, path: Path) -> None:
