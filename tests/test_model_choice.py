@@ -4,12 +4,14 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import TINY, sphere_dataset, tiny_config
+from support import TINY, ball, sphere_dataset, tiny_config
 
 import geosplat_jax as gs
 from geosplat_jax import cli, model_choice
+from geosplat_jax.core.types import EnvLight
 from geosplat_jax.fit.entering import Start
 from geosplat_jax.fit.folder import RunError
 from geosplat_jax.fit.model_parts import LADDER, without
@@ -196,6 +198,24 @@ def test_too_few_views_are_refused(trainings, tmp_path):
     with pytest.raises(ValueError, match="holds back every 8th of 16 training views"):
         choose_model(few, tiny_config(), tmp_path / "run")
     assert not trainings.made
+
+
+def test_a_trial_takes_shape_and_light_over_and_begins_with_a_new_material():
+    pipeline, params = ball(tiny_config())
+    _, fresh = ball(tiny_config("light.height=4", "light.width=8"), radius=0.3)
+    rows = jnp.linspace(0.0, 1.0, 8)[:, None, None]
+    trained = replace(
+        params,
+        light=EnvLight(jnp.broadcast_to(rows, (8, 16, 3))),
+        log_exposure=jnp.asarray(0.25),
+    )
+    begun = Start(pipeline.surface, trained).applied(fresh)
+    assert begun.geometry is trained.geometry
+    assert begun.material is fresh.material
+    assert float(begun.log_exposure) == 0.25
+    assert begun.light.radiance.shape == (4, 8, 3)
+    np.testing.assert_allclose(begun.light.radiance.mean(), 0.5, atol=1e-6)
+    assert np.all(np.diff(np.asarray(begun.light.radiance[:, 0, 0])) > 0.1)
 
 
 def test_some_views_are_those_views_reduced(dataset):
