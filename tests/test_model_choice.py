@@ -94,6 +94,8 @@ def test_a_part_brings_along_what_it_needs(dataset, trainings, tmp_path):
     chosen = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
     assert names_of(chosen) == ["roughness", "shadows", "indirect"]
     assert chosen.config.material.specular == "field"
+    (rung,) = (rung for rung in chosen.record()["rungs"] if rung["part"] == "roughness")
+    assert rung_row(rung)[-1] == "kept, with specular lobe, one roughness"
     assert not chosen.config.material.has_metallic
     assert chosen.config.stage("monte_carlo").transport.indirect == "constant"
 
@@ -168,9 +170,13 @@ def test_a_choice_is_not_mixed_with_another(dataset, trainings, tmp_path):
     before = len(trainings.made)
     choose_model(dataset, other, tmp_path / "run", force=True)
     assert len(trainings.made) == 2 * before
-    (choice_folder(tmp_path / "run") / "choice.json").write_text("{")
-    with pytest.raises(RunError, match=r"choice\.json is damaged"):
-        choose_model(dataset, other, tmp_path / "run", resume=True)
+    path = choice_folder(tmp_path / "run") / "choice.json"
+    state = json.loads(path.read_text())
+    state["trainings"]["smallest_seed_0"]["psnr"].pop()
+    for text in ("{", "[]", json.dumps({**state, "trainings": 5}), json.dumps(state)):
+        path.write_text(text)
+        with pytest.raises(RunError, match=r"choice\.json is damaged"):
+            choose_model(dataset, other, tmp_path / "run", resume=True)
 
 
 def test_a_folder_of_somebody_else_is_left_alone(dataset, trainings, tmp_path):
@@ -190,7 +196,12 @@ def test_a_part_whose_training_fails_is_left_out_and_says_so(dataset, trainings,
     assert names_of(chosen) == ["specular", "light"]
     (rung,) = (rung for rung in chosen.record()["rungs"] if rung["part"] == "metallic")
     assert rung["note"] == "the surface has exploded"
-    assert rung_row(rung)[-1] == "the surface has exploded"
+    assert rung_row(rung)[-1] == "left out: the surface has exploded"
+    # It is not tried again.
+    before = len(trainings.made)
+    again = choose_model(dataset, make_config(quality="draft"), tmp_path / "run", resume=True)
+    assert len(trainings.made) == before
+    assert again == chosen
 
 
 def test_too_few_views_are_refused(trainings, tmp_path):
