@@ -13,7 +13,7 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -79,7 +79,7 @@ class Rung:
         training failed.
     found : the gain and its errors; None likewise.
     is_kept : whether the model has it.
-    note : why there is nothing to compare.
+    note : why there is nothing to compare, or what came with it that had been left out before.
     """
 
     part: str
@@ -206,11 +206,14 @@ def _tried(trials: "_Trials", part: Part, kept: Collection[str], wanted: Collect
         larger = trials.decibels(wanted, 0)
     except TrainingError as error:
         return Rung(part.name, part.title, before, None, None, False, str(error))
+    brought = [other.title for other in LADDER if other.name in set(wanted) - {*kept, part.name}]
+    note = f"with {', '.join(brought)}" if brought else ""
     found = compare(larger, smaller, trials.blocks)
     if found.is_kept:
         smaller += [trials.decibels(kept, seed) for seed in range(1, trials.how.seeds)]
         found = compare(larger, smaller, trials.blocks)
-    return Rung(part.name, part.title, before, float(np.mean(larger)), found, found.is_kept)
+    after = float(np.mean(larger))
+    return Rung(part.name, part.title, before, after, found, found.is_kept, note)
 
 
 class _Trials:
@@ -301,9 +304,10 @@ class _Trials:
             )
         try:
             state = parse_json(path.read_bytes())
-            measured, seconds = dict(state["trainings"]), dict(state["first_stages"])
+            seconds = {name: float(taken) for name, taken in state["first_stages"].items()}
+            measured = {name: self._checked(found) for name, found in state["trainings"].items()}
             was = state["mark"]
-        except (KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise RunError(f"{path} is damaged: {error}; begin anew with --force") from None
         if was != mark:
             raise RunError(
@@ -311,6 +315,16 @@ class _Trials:
                 "anew with --force"
             )
         self._measured, self._stage_1_seconds = measured, seconds
+
+    def _checked(self, found: Mapping[str, Any]) -> dict[str, Any]:
+        """Read what a training has measured; of another form it raises."""
+        seconds = float(found["seconds"])
+        if "failure" in found:
+            return {"failure": str(found["failure"]), "seconds": seconds}
+        decibels = [float(value) for value in found["psnr"]]
+        if len(decibels) != len(self.held) or not np.isfinite(decibels).all():
+            raise ValueError(f"a number for each of {len(self.held)} views is expected")
+        return {"psnr": decibels, "seconds": seconds}
 
     def close(self) -> None:
         """Leave of the trainings what they have measured."""
@@ -349,6 +363,11 @@ class _Trials:
         Parameters
         ----------
         kept : names of its parts. seed : added to that of the settings.
+
+        Raises
+        ------
+        TrainingError
+            If its training fails, or has failed before.
         """
         name = f"{_name_of(kept)}_seed_{seed}"
         if name not in self._measured:
@@ -356,12 +375,18 @@ class _Trials:
             folder = self._folder / name
             began = time.perf_counter() - _seconds_used(folder)
             config = self._trial(self.model(kept), self._last, seed)
-            self._fit(config, folder, start)
-            found = self._measure(folder)
-            seconds = time.perf_counter() - began
-            self._measured[name] = {"psnr": found.tolist(), "seconds": round(seconds, 2)}
+            found: dict[str, Any] = {}
+            try:
+                self._fit(config, folder, start)
+                found["psnr"] = self._measure(folder).tolist()
+            except TrainingError as error:
+                found["failure"] = str(error)
+            found["seconds"] = round(time.perf_counter() - began, 2)
+            self._measured[name] = found
             self._save(self._mark())
-            shutil.rmtree(folder)
+            shutil.rmtree(folder, ignore_errors=True)  # it may hold nothing yet
+        if "failure" in self._measured[name]:
+            raise TrainingError(self._measured[name]["failure"])
         return np.asarray(self._measured[name]["psnr"], float)
 
     def _start(self, has_finer_cells: bool) -> Start:

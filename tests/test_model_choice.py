@@ -4,12 +4,14 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import TINY, sphere_dataset, tiny_config
+from support import TINY, ball, sphere_dataset, tiny_config
 
 import geosplat_jax as gs
 from geosplat_jax import cli, model_choice
+from geosplat_jax.core.types import EnvLight
 from geosplat_jax.fit.entering import Start
 from geosplat_jax.fit.folder import RunError
 from geosplat_jax.fit.model_parts import LADDER, without
@@ -92,6 +94,8 @@ def test_a_part_brings_along_what_it_needs(dataset, trainings, tmp_path):
     chosen = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
     assert names_of(chosen) == ["roughness", "shadows", "indirect"]
     assert chosen.config.material.specular == "field"
+    (rung,) = (rung for rung in chosen.record()["rungs"] if rung["part"] == "roughness")
+    assert rung_row(rung)[-1] == "kept, with specular lobe, one roughness"
     assert not chosen.config.material.has_metallic
     assert chosen.config.stage("monte_carlo").transport.indirect == "constant"
 
@@ -166,9 +170,13 @@ def test_a_choice_is_not_mixed_with_another(dataset, trainings, tmp_path):
     before = len(trainings.made)
     choose_model(dataset, other, tmp_path / "run", force=True)
     assert len(trainings.made) == 2 * before
-    (choice_folder(tmp_path / "run") / "choice.json").write_text("{")
-    with pytest.raises(RunError, match=r"choice\.json is damaged"):
-        choose_model(dataset, other, tmp_path / "run", resume=True)
+    path = choice_folder(tmp_path / "run") / "choice.json"
+    state = json.loads(path.read_text())
+    state["trainings"]["smallest_seed_0"]["psnr"].pop()
+    for text in ("{", "[]", json.dumps({**state, "trainings": 5}), json.dumps(state)):
+        path.write_text(text)
+        with pytest.raises(RunError, match=r"choice\.json is damaged"):
+            choose_model(dataset, other, tmp_path / "run", resume=True)
 
 
 def test_a_folder_of_somebody_else_is_left_alone(dataset, trainings, tmp_path):
@@ -188,7 +196,12 @@ def test_a_part_whose_training_fails_is_left_out_and_says_so(dataset, trainings,
     assert names_of(chosen) == ["specular", "light"]
     (rung,) = (rung for rung in chosen.record()["rungs"] if rung["part"] == "metallic")
     assert rung["note"] == "the surface has exploded"
-    assert rung_row(rung)[-1] == "the surface has exploded"
+    assert rung_row(rung)[-1] == "left out: the surface has exploded"
+    # It is not tried again.
+    before = len(trainings.made)
+    again = choose_model(dataset, make_config(quality="draft"), tmp_path / "run", resume=True)
+    assert len(trainings.made) == before
+    assert again == chosen
 
 
 def test_too_few_views_are_refused(trainings, tmp_path):
@@ -196,6 +209,24 @@ def test_too_few_views_are_refused(trainings, tmp_path):
     with pytest.raises(ValueError, match="holds back every 8th of 16 training views"):
         choose_model(few, tiny_config(), tmp_path / "run")
     assert not trainings.made
+
+
+def test_a_trial_takes_shape_and_light_over_and_begins_with_a_new_material():
+    pipeline, params = ball(tiny_config())
+    _, fresh = ball(tiny_config("light.height=4", "light.width=8"), radius=0.3)
+    rows = jnp.linspace(0.0, 1.0, 8)[:, None, None]
+    trained = replace(
+        params,
+        light=EnvLight(jnp.broadcast_to(rows, (8, 16, 3))),
+        log_exposure=jnp.asarray(0.25),
+    )
+    begun = Start(pipeline.surface, trained).applied(fresh)
+    assert begun.geometry is trained.geometry
+    assert begun.material is fresh.material
+    assert float(begun.log_exposure) == 0.25
+    assert begun.light.radiance.shape == (4, 8, 3)
+    np.testing.assert_allclose(begun.light.radiance.mean(), 0.5, atol=1e-6)
+    assert np.all(np.diff(np.asarray(begun.light.radiance[:, 0, 0])) > 0.1)
 
 
 def test_some_views_are_those_views_reduced(dataset):

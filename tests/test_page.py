@@ -110,21 +110,14 @@ def test_the_page_says_why_the_model_is_what_it_is(tmp_path, small):
     rung = {"part": "metallic", "title": "metallic", "smaller": 30.0, "larger": 31.25}
     rungs = [
         {**rung, "found": found, "is_kept": True, "note": ""},
-        {
-            **rung,
-            "title": "shift",
-            "larger": None,
-            "found": None,
-            "is_kept": False,
-            "note": "<bad>",
-        },
+        {**rung, "title": "shift", "found": None, "is_kept": False, "note": "<x>"},
     ]
     model = {"rungs": rungs, "by_hand": [], "held_back": ["a", "b"], "trainings": 7, "seconds": 9.0}
     path.write_text(json.dumps({**json.loads(path.read_text()), "model": model}))
     html = report_html([evaluated])
     cells = ["metallic", "30.00 dB", "31.25 dB", "+1.25 +- 0.50 dB", "kept"]
     assert "".join(f"<td>{cell}</td>" for cell in cells) in html
-    assert "<td>shift</td><td>30.00 dB</td><td>-</td><td>-</td><td>&lt;x&gt;</td>" in html
+    assert "<td>shift</td><td>30.00 dB</td><td>-</td><td>-</td><td>left out: &lt;x&gt;</td>" in html
     assert "Choosing took 9 s, 7 trainings" in texts_of(parsed(html))
 
 

@@ -140,7 +140,10 @@ def rung_row(rung: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
         gain = f"{found['gain']:+.2f} +- {found['standard_error']:.2f} dB"
         if found["spread"]:
             gain += f", seeds {found['spread']:.2f}"
-    verdict = "kept" if rung["is_kept"] else rung["note"] or "left out"
+    verdict = "kept" if rung["is_kept"] else "left out"
+    if rung["note"]:
+        joint = ": " if found is None else ", " if rung["is_kept"] else ", even "
+        verdict += joint + rung["note"]
     return rung["title"], f"{rung['smaller']:.2f} dB", with_it, gain, verdict
 
 
