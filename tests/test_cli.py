@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -236,6 +237,14 @@ def test_a_first_stage_that_does_not_fit_leaves_the_folder_free(scene, tmp_path,
     assert "not allowed with argument" in capsys.readouterr().err
     assert train(folder, *arguments[:-2], scene=scene) == 2
     assert "--from RUN and --stage NAME belong together" in capsys.readouterr().err
+
+
+def test_the_viewer_without_its_package_is_one_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["view", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert "pip install 'geosplat_jax[view]'" in said
+    assert said.count("\n") == 1
 
 
 @pytest.mark.parametrize(("name", "value"), [("--intensity", "nan"), ("--albedo-scale", "-1")])

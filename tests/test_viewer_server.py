@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 from support import sphere_views
 from test_viewer import LOOK, Recorder, Watch, make_trained
 
@@ -76,6 +77,8 @@ def server(watch, views, monkeypatch):
         np.zeros((2, 3)), np.stack([np.eye(3)] * 2), np.ones((2, 3)), np.ones((2, 1))
     )
     monkeypatch.setattr(painting.Painter, "gaussians", lambda self: splats)
+    glb = trimesh.creation.icosphere(1).export(file_type="glb")
+    monkeypatch.setattr(painting.Painter, "mesh_glb", lambda self: glb)
     monkeypatch.setattr(serving, "_REFRESH", 0.0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -102,9 +105,14 @@ def test_people_get_pictures_and_things_that_they_ask_for(server, watch, views):
     server._enter(browser)
     assert server.work()
     assert browser.pictures[0].shape == (128, 192, 3)
-    server._things._boxes["Gaussians"].value = True
+    for box in server._things._boxes.values():
+        box.value = True
+    server._things._cameras.value = True
+    server._things._show_photographs()
+    assert all(frustum.visible for frustum in server._things._photographs)
     server.work()
-    assert set(server._things._sent) == {"Gaussians"}
+    assert set(server._things._sent) == {"mesh", "Gaussians"}
+    server._things._boxes["mesh"].value = False
     watch.waiting.append(make_trained(9))
     server.work()
     assert server._people[3]._status.content.startswith("step 9, 192 x 128")
