@@ -31,6 +31,8 @@ _REACH = 0.2
 _TRIALS = 400
 _PLANE_THICKNESSES = (0.007, 0.014, 0.028)  # of the sides of the search, to either side
 _PLANE_SHARE = 0.15  # of the splats, that a plane must hold to be what the object stands on
+_MUCH_MORE = 1.15
+"""Of the weight of a thinner plane."""
 _CAMERAS_ABOVE = 0.9
 """Share of the cameras that lie above such a plane."""
 _SPLATS_ABOVE = 0.75
@@ -194,28 +196,41 @@ def _ground(
     """Find the plane that things stand on, or hang at; None where there is no such plane.
 
     The plane through three random points that holds the most weight (RANSAC, Fischler and Bolles
-    1981), if the cameras and most other points lie on one side of it. Where the thinnest such plane
-    does not, a thicker one may: a wall of splats is not flat.
+    1981), if the cameras and most other points lie on one side of it. A wall of splats is not flat:
+    a thicker plane is taken where it holds much more.
     """
     if len(points) < 3:
         return None
+    chosen, least = None, _PLANE_SHARE * weights.sum()
     for thickness in side * np.array(_PLANE_THICKNESSES):
-        best, best_weight = None, _PLANE_SHARE * weights.sum()
+        best, best_weight = None, least
         for corners in rng.integers(len(points), size=(_TRIALS, 3)):
-            found = _plane_through(*points[corners], centers, side)
+            a, b, c = points[corners]
+            found = _plane_through(a, b, c, centers, side)
             if found is None:
                 continue
             weight = weights[np.abs(points @ found.normal - found.height) < thickness].sum()
             if weight > best_weight:
                 best, best_weight = found, weight
-        if best is None or best.is_above(centers).mean() < _CAMERAS_ABOVE:
+        if best is None:
+            continue
+        best = _fitted(points[np.abs(points @ best.normal - best.height) < thickness], best)
+        if best.is_above(centers).mean() < _CAMERAS_ABOVE:
             continue
         # What is below belongs to the ground, too; a plane that leaves nothing is all there is.
         ground = best._replace(height=float(best.height + thickness))
         above = weights[ground.is_above(points)].sum()
         if 0.0 < above >= _SPLATS_ABOVE * (weights.sum() - best_weight):
-            return ground
-    return None
+            chosen, least = ground, _MUCH_MORE * best_weight
+    return chosen
+
+
+def _fitted(points: np.ndarray, plane: Plane) -> Plane:
+    """Fit a plane to its points by least squares; it keeps its side."""
+    middle = points.mean(0)
+    normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
+    normal = normal if normal @ plane.normal > 0.0 else -normal
+    return Plane(normal, float(middle @ normal))
 
 
 def _plane_through(

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import maximum_filter
+from scipy.ndimage import binary_fill_holes, label, maximum_filter
 
 from geosplat_jax.capture.box import (
     Cloud,
@@ -50,6 +50,8 @@ OPAQUE = 0.8
 
 _UNSURE = (0.2, OPAQUE)
 """Alpha between these belongs neither to the object nor to what is around it."""
+_SPECK = 0.02
+"""Share of the largest part of a mask, below which another part is a speck."""
 _MOST_UNSURE = 0.1
 _LEAST_AGREEMENT = 0.9
 _MOST_CUT = 0.05
@@ -201,6 +203,7 @@ def make_masks(
     _, alpha = render_views(clipped, views.camera())
     if views.valid is not None:
         alpha = alpha * views.valid
+    alpha = tidied(alpha)
     masks = alpha > OPAQUE
     if not masks.any():
         raise CaptureError(
@@ -349,6 +352,25 @@ def write_splats(radiance: Radiance, path: Path) -> None:
         np.zeros_like(splats.means),
         rest=splats.rest,
     )
+
+
+def tidied(alpha: Float[np.ndarray, "V H W"]) -> Float[np.ndarray, "V H W"]:
+    """Take specks off the masks, and fill holes in which the splats are half opaque.
+
+    A speck is smaller than a fiftieth of the largest part of the mask; its alpha becomes 0. A hole
+    that a mask encloses gets alpha 1 where alpha is above 0.2; what is clearer is a hole indeed.
+    """
+    found = np.array(alpha)
+    for values in found:
+        mask = values > OPAQUE
+        parts: Any = label(mask, structure=np.ones((3, 3), int))
+        sizes = np.bincount(parts[0].ravel())
+        sizes[0] = sizes[1:].max(initial=0)
+        is_speck = (sizes < _SPECK * sizes[0])[parts[0]]
+        values[is_speck] = 0.0
+        holes = binary_fill_holes(mask & ~is_speck) & ~mask
+        values[holes & (values > _UNSURE[0])] = 1.0
+    return found
 
 
 def photograph_mask(
