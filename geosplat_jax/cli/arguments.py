@@ -63,6 +63,7 @@ def command_line() -> argparse.ArgumentParser:
         help="first train at quality draft and set the cameras right with what came out, so often "
         "(once by default); docs/cameras.md",
     )
+    _add_white_balance(train)
     train.add_argument(
         "--csv", type=Path, metavar="FILE", help="also write loss, terms and PSNR of every step"
     )
@@ -130,9 +131,10 @@ def command_line() -> argparse.ArgumentParser:
     _add_relight(_run_parser(commands, "relight", "show a run under another light"))
 
     refine = _run_parser(
-        commands, "refine-cameras", "pose, focal length and exposure of every view of a run"
+        commands, "refine-cameras", "pose, focal length and colour of every view of a run"
     )
     refine.add_argument("--output", type=Path, help="file (default: RUN/cameras.json)")
+    _add_white_balance(refine)
 
     export = _run_parser(commands, "export", "mesh.glb, gaussians.ply and light.exr of a run")
     export.add_argument("--output", type=Path, help="folder (default: RUN/export)")
@@ -155,6 +157,14 @@ def command_line() -> argparse.ArgumentParser:
     gradcheck.add_argument("--seed", type=int, default=0, help="of numbers, samples, directions")
     gradcheck.add_argument("--json", type=Path, help="also write every comparison to this file")
     return parser
+
+
+def _add_white_balance(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--white-balance",
+        action="store_true",
+        help="refine factors of red, green and blue of every view with the cameras, too",
+    )
 
 
 def _run_parser(commands: Any, name: str, text: str) -> argparse.ArgumentParser:

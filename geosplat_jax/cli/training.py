@@ -9,11 +9,13 @@ from typing import Any
 
 from geosplat_jax.camera_rounds import refined_cameras
 from geosplat_jax.cli.display import ProgressDisplay, say, say_refined
+from geosplat_jax.fit.cameras import CameraSettings
 from geosplat_jax.fit.config import Budget, Config, config_warnings
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import make_config, with_mesh
+from geosplat_jax.fit.start_mesh import MeshSettings
 from geosplat_jax.io.dataset import choose_downscale, load_recorded
-from geosplat_jax.run import plan_training
+from geosplat_jax.run import mesh_of_run, plan_training
 from geosplat_jax.run import train as train_run
 
 
@@ -40,13 +42,16 @@ def scene_options(arguments: argparse.Namespace, config: Config) -> dict[str, An
     return {**options, "downscale": chosen.factor}
 
 
-def config_from(arguments: argparse.Namespace) -> Config:
-    """Return the configuration that the arguments ask for."""
+def config_from(arguments: argparse.Namespace, mesh: MeshSettings | None = None) -> Config:
+    """Return the configuration that the arguments ask for.
+
+    ``mesh`` : of the run that is resumed, where the arguments name none.
+    """
     return make_config(
         arguments.preset or "default",
         arguments.quality or "standard",
         material_prior=arguments.material_prior,
-        mesh=arguments.mesh,
+        mesh=arguments.mesh or mesh,
         overrides=_overrides(arguments),
     )
 
@@ -83,7 +88,7 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
     if arguments.budget is None:
         if arguments.memory is not None:
             raise UsageError("--memory belongs to --budget")
-        config = config_from(arguments)
+        config = config_from(arguments, mesh_of_run(folder) if arguments.resume else None)
         return _Order(config, scene_options(arguments, config))
     if arguments.quality is not None or arguments.preset is not None:
         raise UsageError("--budget chooses the settings; leave --quality and --preset out")
@@ -117,6 +122,7 @@ def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[
             rounds=arguments.refine_cameras,
             config=draft,
             reading=reading,
+            how=CameraSettings(white_balance=arguments.white_balance),
             on_step=display.show,
             on_view=say_refined,
         )
@@ -141,13 +147,20 @@ def train(arguments: argparse.Namespace) -> None:
         raise UsageError("--from RUN and --stage NAME belong together")
     if arguments.refine_cameras is not None and (arguments.budget or arguments.source):
         raise UsageError("--refine-cameras trains before; leave --budget and --from out")
+    if arguments.white_balance and arguments.refine_cameras is None:
+        raise UsageError("--white-balance belongs to --refine-cameras")
     folder = arguments.output or Path("runs") / arguments.scene.resolve().name
     order = _ordered(arguments, RunFolder(folder))
     config, reading = order.config, dict(order.reading)
     if arguments.refine_cameras is not None:
         reading["cameras"] = _refined_cameras(arguments, folder, reading)
     dataset = load_recorded(arguments.scene, reading)
-    for note in (*dataset.notes, *config.geometry.notes(dataset)):
+    begun = RunFolder(folder)
+    if arguments.resume and begun.exists:
+        notes = begun.record().get("notes", dataset.notes)
+    else:
+        notes = (*dataset.notes, *config.geometry.notes(dataset))
+    for note in notes:
         say(note)
     for warning in (*dataset.warnings, *config_warnings(config)):
         say(warning, label="warning: ", style="yellow")
