@@ -131,6 +131,7 @@ def test_the_camera_and_the_exposure_of_a_render_are_found_again(found):
     assert float(result.before.rms) > 0.02
 
 
+@pytest.mark.slow
 def test_the_white_balance_of_a_render_is_found_again(subject, views):
     camera, log_exposure = moved_camera(views.camera([0]), jnp.asarray(TRUTH), box_of(subject))
     wanted = np.array([0.12, -0.05, -0.07], np.float32)

@@ -314,7 +314,7 @@ def _solve(
     box = subject.pipeline.surface.box
     subject = subject.seen_from(moved_camera(photograph.camera, UNIT * start, box)[0])
 
-    def residual(parameters: Float[Array, " 8"], args: None) -> tuple[Float[Array, " R"], Fit]:
+    def residual(parameters: Float[Array, " P"], args: None) -> tuple[Float[Array, " R"], Fit]:
         del args
         return view_residual(parameters, subject, photograph, how)
 
