@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from geosplat_jax.fit.cameras import ViewProgress
+from geosplat_jax.fit.cameras import CameraSettings, ViewProgress
 from geosplat_jax.fit.config import Config
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import make_config
@@ -30,6 +30,7 @@ def refined_cameras(
     rounds: int = 1,
     config: Config | None = None,
     reading: Mapping[str, Any] | None = None,
+    how: CameraSettings | None = None,
     on_step: Callable[[Progress], None] | None = None,
     on_view: Callable[[str, ViewProgress], None] | None = None,
 ) -> Path:
@@ -44,6 +45,7 @@ def refined_cameras(
     rounds : of training and refining, at least one.
     config : of a round; quality ``draft`` by default.
     reading : how to read the scene, see `load_recorded`; ``cameras`` are those of the first round.
+    how : cameras are refined, see `CameraSettings`.
     on_step, on_view : called after every step, and after every refined view with its split.
 
     Raises
@@ -62,7 +64,7 @@ def refined_cameras(
         cameras = folder.with_suffix(".json")
         if not cameras.exists():
             run = _trained(scene, folder, config, options, on_step)
-            run.refine_cameras(cameras, on_view=on_view)
+            run.refine_cameras(cameras, how=how, on_view=on_view)
         options["cameras"] = cameras
     return cameras
 

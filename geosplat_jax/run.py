@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from geosplat_jax.core.types import Batch, EnvLight
 from geosplat_jax.fit.budget import Pacer, Plan, plan
-from geosplat_jax.fit.cameras import CameraSettings, ViewProgress, refine_views
+from geosplat_jax.fit.cameras import CameraSettings, ViewProgress, refine_views, with_mean_balance
 from geosplat_jax.fit.config import Budget, Config
 from geosplat_jax.fit.costs import expected_costs, slowness_of_machine
 from geosplat_jax.fit.devices import Devices, choose_devices
@@ -24,6 +24,7 @@ from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.presets import make_config, with_mesh
 from geosplat_jax.fit.runtime import in_background
 from geosplat_jax.fit.stages import make_batch
+from geosplat_jax.fit.start_mesh import MeshSettings
 from geosplat_jax.fit.train import Progress, Trained, fit, load_trained
 from geosplat_jax.io.cameras import RefinedSplit, write_cameras
 from geosplat_jax.io.dataset import Dataset, load_recorded, photograph_size
@@ -55,6 +56,12 @@ def _true_light(dataset: Dataset, lights: Mapping[str, EnvLight]) -> EnvLight | 
         return named
     first = next(iter(dataset.test.lights.values()), None)
     return None if first is None else load_view_light(first)
+
+
+def mesh_of_run(folder: RunFolder) -> MeshSettings | None:
+    """Return the settings of the mesh that a run started from; None without a run, or a mesh."""
+    geometry = folder.config().geometry if folder.exists else None
+    return geometry if isinstance(geometry, MeshSettings) else None
 
 
 class Run:
@@ -321,7 +328,7 @@ class Run:
         samples: int = REFINEMENT_SAMPLES,
         on_view: Callable[[str, ViewProgress], None] | None = None,
     ) -> dict[str, RefinedSplit]:
-        """Refine pose, focal length and exposure of every view; write them to a file.
+        """Refine pose, focal length and colour of every view; write them to a file.
 
         The asset stays as it was trained. `load_dataset` and `train` take the file.
 
@@ -353,10 +360,11 @@ class Run:
         if not chosen:
             raise RunError(f"{self.dataset.root} has no {' and no '.join(splits)} views")
         subject = self.renderer(samples=samples).subject()
-        refined = {}
+        refined: dict[str, RefinedSplit] = {}
         for split in chosen:
             tell = None if on_view is None else partial(on_view, split)
             refined[split] = refine_views(subject, self._views(split), how, on_view=tell)
+        refined = with_mean_balance(refined)
         write_cameras(path, refined)
         return refined
 
@@ -457,7 +465,7 @@ def train(
     config: Config | None = None,
     *,
     quality: str = "standard",
-    mesh: str | Path | None = None,
+    mesh: str | Path | MeshSettings | None = None,
     resume: bool = False,
     force: bool = False,
     source: str | Path | None = None,
@@ -477,7 +485,8 @@ def train(
     scene : folder, or a dataset from `load_dataset`.
     output : folder of the run.
     config : settings, see `make_config`; by default those of ``quality``.
-    mesh : file of a mesh to start from instead of a visual hull, see `fit.presets.with_mesh`.
+    mesh : file of a mesh to start from instead of a visual hull, see `fit.presets.with_mesh`. A run
+        that is resumed knows its own.
     resume, force, source, first_stage, on_step, on_compile : see `fit.train.fit`; ``force``
         replaces a run.
     budget : time and memory that the training may take. Without ``config``, settings are chosen for
@@ -516,6 +525,8 @@ def train(
         chosen = plan_training(scene, budget, downscale=reading.get("downscale"))
         config, reading = chosen.config, {**reading, "downscale": chosen.downscale}
     config = config or make_config(quality=quality)
+    if mesh is None and resume and not isinstance(config.geometry, MeshSettings):
+        mesh = mesh_of_run(folder)
     if mesh is not None:
         config = with_mesh(config, mesh)
     dataset = scene if isinstance(scene, Dataset) else load_recorded(scene, reading)

@@ -17,7 +17,7 @@ def views():
 
 
 def with_mask(views, number, mask):
-    images = views.images.copy()
+    images = np.array(views.images)
     images[number, ..., 3] = mask
     return replace(views, images=images)
 
@@ -66,7 +66,7 @@ def test_empty_masks_and_few_views_are_said(views):
     empty = with_mask(views, 0, 0.0)
     assert np.isnan(agreement(empty, BOX)[0])
     assert "12 views" not in agreement_lines(empty, BOX)[0]
-    none = replace(views, images=0 * views.images)
+    none = replace(views, images=0 * np.asarray(views.images))
     assert agreement_lines(none, BOX) == ["agreement:  not checked, every mask is empty"]
     few = sphere_views(2, size=8)
     assert agreement_lines(few, BOX) == ["agreement:  not checked, it takes three views"]

@@ -69,6 +69,12 @@ def test_no_round_at_all_is_refused(made, tmp_path):
     assert not made
 
 
+def test_white_balance_needs_cameras_to_refine(tmp_path, capsys):
+    output = ["--output", str(tmp_path / "run")]
+    assert cli.main(["train", "examples/duck", *output, "--white-balance"]) == 2
+    assert "--white-balance belongs to --refine-cameras" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("options", [["--budget", "5min"], ["--from", "run", "--stage", "refine"]])
 def test_the_command_refuses_what_does_not_go_together(options, tmp_path, capsys):
     output = ["--output", str(tmp_path / "run")]

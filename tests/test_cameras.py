@@ -24,10 +24,12 @@ from geosplat_jax.fit.cameras import (
     CameraSettings,
     Photograph,
     Subject,
+    log_balance,
     moved_camera,
     refine_view,
     refine_views,
     view_residual,
+    with_mean_balance,
 )
 from geosplat_jax.fit.gauge import (
     Similarity,
@@ -93,11 +95,11 @@ def draw(subject, camera):
     return subject.pipeline.render_lit(subject.asset, subject.illumination, camera, key=subject.key)
 
 
-def photographed(subject, camera, log_exposure):
+def photographed(subject, camera, log_exposure, gains=1.0):
     """Render what a camera sees, without noise, as (H, W, 4) with straight alpha."""
     output = draw(subject, camera)
     alpha = np.asarray(output.alpha[0])[..., None]
-    rgb = np.asarray(tone_map(output.rgb[0], subject.log_exposure + log_exposure))
+    rgb = np.asarray(tone_map(output.rgb[0] * gains, subject.log_exposure + log_exposure))
     straight = np.where(alpha > 0, rgb / np.where(alpha > 0, alpha, 1), 0)
     return np.concatenate([straight, alpha], axis=-1).astype(np.float32)
 
@@ -127,6 +129,20 @@ def test_the_camera_and_the_exposure_of_a_render_are_found_again(found):
     np.testing.assert_allclose(0.01 * np.asarray(result.parameters), TRUTH, atol=5e-4)
     assert float(result.after.rms) < 2e-3 * float(result.before.rms) + 1e-4
     assert float(result.before.rms) > 0.02
+
+
+@pytest.mark.slow
+def test_the_white_balance_of_a_render_is_found_again(subject, views):
+    camera, log_exposure = moved_camera(views.camera([0]), jnp.asarray(TRUTH), box_of(subject))
+    wanted = np.array([0.12, -0.05, -0.07], np.float32)
+    gains = jnp.exp(jnp.asarray(wanted))[None, None]
+    image = jnp.asarray(photographed(subject, camera, log_exposure, gains))
+    photograph = Photograph(views.camera([0]), image, jnp.ones((SIZE, SIZE)))
+    result, _ = refine_view(subject, photograph, replace(EXACT, white_balance=True, rounds=2))
+    found = 0.01 * np.asarray(result.parameters)
+    np.testing.assert_allclose(found[:8], TRUTH, atol=1e-3)
+    np.testing.assert_allclose(log_balance(jnp.asarray(found)), wanted, atol=1e-3)
+    np.testing.assert_array_equal(log_balance(jnp.asarray(TRUTH)), 0.0)
 
 
 def with_capacities(subject, capacities):
@@ -371,6 +387,7 @@ def file(tmp_path):
     views = many_views(3)
     cameras = {name: a_camera(views, k) for k, name in enumerate(views.names)}
     cameras["view_2"] = a_camera(views, 2, accepted=False, note="why", exposure=1.0)
+    cameras["view_0"] = replace(cameras["view_0"], white_balance=np.array([0.5, 1.0, 2.0]))
     path = tmp_path / "cameras.json"
     write_cameras(path, {"train": RefinedSplit(SIZE, SIZE, cameras)})
     return path, views, cameras
@@ -388,13 +405,16 @@ def test_what_was_written_is_read(file):
 
 def test_views_take_their_cameras_by_name_and_lose_their_exposure(file):
     path, views, _ = file
-    views = replace(views, images=views.images + 0.5, names=("view_2", "view_0", "view_1"))
+    images = np.asarray(views.images) + 0.5
+    views = replace(views, images=images, names=("view_2", "view_0", "view_1"))
     changed = with_cameras(views, read_cameras(path)["train"], str(path))
     order = [2, 0, 1]
     np.testing.assert_allclose(
         changed.camera_to_world, many_views(3).camera_to_world[order], atol=1e-12
     )
-    np.testing.assert_allclose(changed.images[:, 0, 0, 0], [0.5, 0.4, 0.4], rtol=1e-6)
+    np.testing.assert_allclose(changed.images[:, 0, 0, 0], [0.5, 0.8, 0.4], rtol=1e-6)
+    np.testing.assert_allclose(changed.images[1, 0, 0, :3], [0.8, 0.4, 0.2], rtol=1e-6)
+    np.testing.assert_array_equal(changed.white_balance[1], [0.5, 1.0, 2.0])
     np.testing.assert_array_equal(changed.images[..., 3], views.images[..., 3])
     np.testing.assert_array_equal(changed.exposure, [1.0, 1.25, 1.25])
     # The file holds whole factors: a second time changes nothing.
@@ -413,6 +433,8 @@ def damaged(content, kind):
         first["fx"] = -1.0
     elif kind == "pose":
         first["world_to_camera"][0][0] = 7.0
+    elif kind == "balance":
+        first["white_balance"] = [1.0, 0.0, 1.0]
     elif kind == "key":
         first.pop("exposure")
     return json.dumps(content)
@@ -425,6 +447,7 @@ def damaged(content, kind):
         ("format", "holds no cameras"),
         ("number", "must be finite and above 0"),
         ("pose", "not a rigid 4 x 4 matrix"),
+        ("balance", "a white_balance must be three factors above 0"),
         ("key", "no 'exposure'"),
     ],
 )
@@ -435,6 +458,32 @@ def test_a_broken_file_is_one_line(file, kind, message):
         read_cameras(path)
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
+
+
+def test_a_file_without_white_balance_is_read(file):
+    path, *_ = file
+    content = json.loads(path.read_text())
+    for camera in content["splits"]["train"]["views"].values():
+        camera.pop("white_balance")
+    path.write_text(json.dumps(content))
+    for camera in read_cameras(path)["train"].cameras.values():
+        np.testing.assert_array_equal(camera.white_balance, np.ones(3))
+
+
+def test_a_tint_of_all_training_views_is_the_lights():
+    views = many_views(3)
+    rng = np.random.default_rng(0)
+    gains = np.exp(rng.normal(0.2, 0.1, (4, 3)))
+    train, test = (
+        RefinedSplit(SIZE, SIZE, {str(k): a_camera(views, white_balance=gains[k]) for k in rows})
+        for rows in ((0, 1, 2), (3,))
+    )
+    split = with_mean_balance({"test": test, "train": train})
+    found = np.stack([camera.white_balance for camera in split["train"].cameras.values()])
+    np.testing.assert_allclose(found.mean(axis=0), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(found, gains[:3] / gains[:3].mean(axis=0), rtol=1e-12)
+    balance = split["test"].cameras["3"].white_balance
+    np.testing.assert_allclose(balance, gains[3] / gains[:3].mean(axis=0), rtol=1e-12)
 
 
 def test_a_torn_and_a_missing_file_are_one_line(file, tmp_path):

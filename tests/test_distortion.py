@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from geosplat_jax.io.distortion import (
     Brown,
     Fisheye,
+    Lookup,
     largest_radius,
     photograph_lookup,
     pinhole_lookup,
@@ -151,6 +153,18 @@ def test_no_distortion_changes_nothing():
     lookup = pinhole_lookup(Brown((0.0,)), LENS, WIDTH, HEIGHT)
     assert lookup.inside.all()
     np.testing.assert_allclose(resample(pixels, lookup), pixels, atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(23, 31), (1, 9), (40, 1)])
+def test_samples_are_those_of_scipy(shape):
+    rng = np.random.default_rng(4)
+    pixels = rng.random((*shape, 3), np.float32)
+    rows, columns = (rng.uniform(-1.0, n + 1.0, (37, 19)) for n in shape)
+    lookup = Lookup(rows, columns, rng.random(rows.shape) > 0.2)
+    where = np.stack([rows, columns]) - 0.5
+    expected = [map_coordinates(pixels[..., c], where, order=1, mode="nearest") for c in range(3)]
+    expected = np.where(lookup.inside[..., None], np.stack(expected, -1), 0.0)
+    np.testing.assert_allclose(resample(pixels, lookup), expected, atol=1e-6)
 
 
 def test_colour_behind_the_mask_does_not_bleed_in():

@@ -192,5 +192,5 @@ def test_many_pictures_are_refused_after_the_first(machine, tmp_path):
     frames = [Frame(f"view_{k}", np.eye(4), AngleLens(1.0), path) for k in range(200)]
     machine(0.005)
     with pytest.raises(SceneError, match=r"200 images like .*one\.png 0\.0 GB.*--downscale"):
-        load_views(frames, factor=1, listing=Listing(tuple(frames), ()))
-    load_views(frames, factor=2, listing=Listing(tuple(frames), ()))
+        load_views(frames, factor=1, listing=Listing(tuple(frames), ()), most_bytes=GIGA)
+    load_views(frames, factor=2, listing=Listing(tuple(frames), ()), most_bytes=GIGA)

@@ -286,7 +286,7 @@ def test_radiance_that_is_not_radiance_is_refused(tmp_path, monkeypatch, value):
     pixels = np.ones((4, 8, 3), np.float32)
     pixels[1, 2, 0] = value
     path = tmp_path / "any.exr"
-    monkeypatch.setattr("geosplat_jax.io.images.read_image", lambda path: pixels.copy())
+    monkeypatch.setattr("geosplat_jax.io.images.read_stored", lambda path: pixels.copy())
     with pytest.raises(SceneError, match=r"any\.exr has 1 .*values.* row 1, column 2, channel 0"):
         load_light(path)
 

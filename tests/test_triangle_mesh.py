@@ -13,11 +13,12 @@ from support import MONTE_CARLO, TINY, sphere_dataset
 from geosplat_jax import cli
 from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.fit.config import config_from_dict
+from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import make_config, with_mesh
 from geosplat_jax.fit.train import TrainingError, fit
 from geosplat_jax.io.meshes import read_mesh
 from geosplat_jax.io.start_mesh import read_start
-from geosplat_jax.run import Run, train
+from geosplat_jax.run import Run, mesh_of_run, train
 from geosplat_jax.surface.triangle_mesh import TriangleMesh, VertexOffsets, connectivity
 
 SMALL = (
@@ -217,8 +218,15 @@ def test_a_run_starts_from_the_file_says_so_and_resumes_bit_for_bit(dataset, fil
     assert record["config"]["geometry"]["path"] == str(Path(files["ball"]).resolve())
     assert len(record["config"]["geometry"]["digest"]) == 16
     assert any("start: 42 vertices, 80 faces, one side" in note for note in record["notes"])
-    fit(dataset, config, tmp_path / "halves", stop_after=2)
-    leaves_equal(whole, fit(dataset, config, tmp_path / "halves", resume=True))
+    copy = tmp_path / "copy.ply"
+    copy.write_bytes(Path(files["ball"]).read_bytes())
+    moved = make_config(mesh=copy, overrides=SMALL)
+    fit(dataset, moved, tmp_path / "halves", stop_after=2)
+    # Neither the file nor its name is asked for again.
+    copy.unlink()
+    read_start.cache_clear()
+    given = make_config(mesh=mesh_of_run(RunFolder(tmp_path / "halves")), overrides=SMALL)
+    leaves_equal(whole, fit(dataset, given, tmp_path / "halves", resume=True))
     # What is written of a run no longer needs the file.
     trained = Run(tmp_path / "whole").trained
     leaves_equal(trained.params, whole.params)
@@ -239,6 +247,13 @@ def test_a_mesh_that_cannot_be_used_stops_before_anything_is_written(dataset, fi
     read_start.cache_clear()
     with pytest.raises(TrainingError, match="is not the mesh that it was"):
         fit(dataset, changed, tmp_path / "run")
+
+
+def test_an_open_mesh_needs_culling(dataset, files, tmp_path):
+    config = make_config(mesh=files["bowl"], overrides=(*SMALL, "raster.cull_backfaces=false"))
+    with pytest.raises(TrainingError, match="fronts and the backs of an open mesh"):
+        fit(dataset, config, tmp_path / "run")
+    assert not (tmp_path / "run/run.json").exists()
 
 
 def test_the_command_refuses_a_mesh_that_is_no_file(tmp_path, capsys):

@@ -18,6 +18,7 @@ import json
 import os
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -79,7 +80,7 @@ def look_at_origin(position: NDArray[np.float64]) -> NDArray[np.float64]:
     return matrix
 
 
-def _position(azimuth: float, height: float) -> NDArray[np.float64]:
+def position(azimuth: float, height: float) -> NDArray[np.float64]:
     """Point on the camera sphere; `height` is the sine of the elevation."""
     radius = np.sqrt(1.0 - height**2)
     return CAMERA_DISTANCE * np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), height])
@@ -90,7 +91,7 @@ def train_views(count: int) -> list[View]:
     golden = np.pi * (3.0 - np.sqrt(5.0))
     heights = -0.80 + 1.77 * (np.arange(count) + 0.5) / count
     return [
-        View(f"train_{i:03d}", look_at_origin(_position(golden * i, h)), 1000 + i)
+        View(f"train_{i:03d}", look_at_origin(position(golden * i, h)), 1000 + i)
         for i, h in enumerate(heights)
     ]
 
@@ -101,7 +102,7 @@ def test_views(count: int) -> list[View]:
     azimuths = 0.62 + 2.0 * np.pi * turn
     heights = 0.26 + 0.42 * np.sin(4.0 * np.pi * turn)
     return [
-        View(f"test_{i:03d}", look_at_origin(_position(a, h)), 2000 + i)
+        View(f"test_{i:03d}", look_at_origin(position(a, h)), 2000 + i)
         for i, (a, h) in enumerate(zip(azimuths, heights, strict=True))
     ]
 
@@ -167,20 +168,31 @@ def sensor(view: View, size: int, sample_count: int) -> Any:
     )
 
 
-def write_render_mesh(path: Path) -> None:
-    """Write the finely sampled duck with its normals and per-vertex materials as PLY."""
-    vertices, faces = scene_duck.mesh(RENDER_RESOLUTION)
-    surface = scene_duck.materials(vertices)
-    mesh = mi.Mesh("duck", len(vertices), len(faces), has_vertex_normals=True)
+def write_mesh(
+    path: Path,
+    vertices: Array,
+    normals: Array,
+    faces: NDArray[np.int64],
+    surface: scene_duck.Materials,
+) -> None:
+    """Write a mesh with its normals and per-vertex materials as PLY."""
+    mesh = mi.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=True)
     mesh.add_attribute("vertex_albedo", 3, surface.albedo.ravel())
     mesh.add_attribute("vertex_roughness", 1, surface.roughness)
     mesh.add_attribute("vertex_metallic", 1, surface.metallic)
     params = mi.traverse(mesh)
     params["vertex_positions"] = vertices.ravel()
-    params["vertex_normals"] = scene_duck.normals(vertices).astype(np.float32).ravel()
+    params["vertex_normals"] = normals.astype(np.float32).ravel()
     params["faces"] = faces.astype(np.uint32).ravel()
     params.update()
     mesh.write_ply(str(path))
+
+
+def write_render_mesh(path: Path) -> None:
+    """Write the finely sampled duck."""
+    vertices, faces = scene_duck.mesh(RENDER_RESOLUTION)
+    normals = scene_duck.normals(vertices)
+    write_mesh(path, vertices, normals, faces, scene_duck.materials(vertices))
 
 
 def _attribute(name: str) -> dict[str, str]:
@@ -322,16 +334,32 @@ def contact_sheet(folder: Path, views: list[View], names: list[str], size: int) 
     return sheet.convert("RGB")
 
 
-def build(args: argparse.Namespace) -> Path:
-    """Render the whole scene and return its folder."""
-    folder = args.output / NAME
-    folder.mkdir(parents=True, exist_ok=True)
-    lights = write_lights(args.output)
+def render_all(
+    folder: Path,
+    train: list[View],
+    test: list[View],
+    lights: dict[str, Array],
+    args: argparse.Namespace,
+    write_render_mesh: Callable[[Path], None],
+) -> None:
+    """Write cameras, photographs of all views, and the truth and relit pictures of the test views.
+
+    Parameters
+    ----------
+    folder
+        Of the scene.
+    train, test
+        Views of either split.
+    lights
+        Maps by name; the first lights the training views.
+    args
+        See `parser`.
+    write_render_mesh
+        Writes the mesh with its materials as PLY.
+    """
     train_light, *_ = lights
-    train, test = train_views(args.views), test_views(args.test_views)
     write_cameras(folder, train, "train", args.size)
     write_cameras(folder, test, "test", args.size)
-    write_saved_mesh(folder / "mesh_gt.ply")
     description = {
         "train_light": train_light,
         "lights": list(lights),
@@ -343,7 +371,7 @@ def build(args: argparse.Namespace) -> Path:
 
     settings = {"size": args.size, "sample_count": args.spp}
     with tempfile.TemporaryDirectory() as scratch:
-        mesh_path = Path(scratch) / "duck.ply"
+        mesh_path = Path(scratch) / "mesh.ply"
         write_render_mesh(mesh_path)
         for name, light in lights.items():
             scene = shaded_scene(mesh_path, light)
@@ -366,27 +394,47 @@ def build(args: argparse.Namespace) -> Path:
     if args.contact_sheet:
         rows = [f"rgba_{name}" for name in lights] + ["albedo", "normal", "roughness", "metallic"]
         contact_sheet(folder, test, rows, args.size).save(args.contact_sheet)
+
+
+def build(args: argparse.Namespace) -> Path:
+    """Render the whole scene and return its folder."""
+    folder = args.output / NAME
+    folder.mkdir(parents=True, exist_ok=True)
+    lights = write_lights(args.output)
+    write_saved_mesh(folder / "mesh_gt.ply")
+    train, test = train_views(args.views), test_views(args.test_views)
+    render_all(folder, train, test, lights, args, write_render_mesh)
     return folder
+
+
+def _positive(text: str) -> int:
+    """Read a number of the command line that is at least one."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"must be a positive number, got {text!r}")
+    return int(text)
+
+
+def parser(documentation: str) -> argparse.ArgumentParser:
+    """Describe the command line of a scene; `documentation` begins with what it builds."""
+    made = argparse.ArgumentParser(
+        description=documentation.split("\n")[0],
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    made.add_argument("--output", type=Path, default=Path("examples"), help="parent folder")
+    made.add_argument("--views", type=_positive, default=40, help="number of training views")
+    made.add_argument("--test-views", type=_positive, default=8, help="number of test views")
+    made.add_argument("--size", type=_positive, default=128, help="width and height in pixels")
+    made.add_argument("--spp", type=_positive, default=484, help="paths a pixel, a square at best")
+    made.add_argument("--variant", default="auto", help="Mitsuba variant, or auto")
+    made.add_argument(
+        "--contact-sheet", type=Path, default=None, help="also lay out the test views in this PNG"
+    )
+    return made
 
 
 def main() -> None:
     """Parse the command line and build the scene."""
-    parser = argparse.ArgumentParser(
-        description=__doc__.split("\n")[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
-    )
-    parser.add_argument("--output", type=Path, default=Path("examples"), help="parent folder")
-    parser.add_argument("--views", type=int, default=40, help="number of training views")
-    parser.add_argument("--test-views", type=int, default=8, help="number of test views")
-    parser.add_argument("--size", type=int, default=128, help="width and height in pixels")
-    parser.add_argument("--spp", type=int, default=484, help="paths a pixel, a square at best")
-    parser.add_argument("--variant", default="auto", help="Mitsuba variant, or auto")
-    parser.add_argument(
-        "--contact-sheet", type=Path, default=None, help="also lay out the test views in this PNG"
-    )
-    args = parser.parse_args()
-    for name in ("views", "test_views", "size", "spp"):
-        if getattr(args, name) < 1:
-            parser.error(f"--{name.replace('_', '-')} must be positive, got {getattr(args, name)}")
+    args = parser(__doc__).parse_args()
     start = time.perf_counter()
     print(f"Mitsuba {mi.__version__}, {choose_variant(args.variant)}, {os.cpu_count()} cores")
     folder = build(args)

@@ -21,11 +21,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from geosplat_jax.fit.cameras import CameraSettings
 from geosplat_jax.fit.gauge import CameraErrors, Similarity, change_lines, compare_cameras
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
 from geosplat_jax.io.cameras import read_cameras, with_cameras
 from geosplat_jax.io.dataset import Dataset, load_dataset, object_bounds
+from geosplat_jax.io.photographs import Photographs
 from geosplat_jax.io.views import Views
 from geosplat_jax.run import Run, train
 
@@ -38,9 +40,13 @@ def disturbed(
     position: float,
     focal: float,
     exposure: float,
+    balance: float,
     seed: int,
-) -> tuple[Views, np.ndarray]:
-    """Disturb every camera and the exposure of its photograph; return also the factors.
+) -> tuple[Views, Views]:
+    """Disturb every camera and the colours of its photograph; return also the truth about them.
+
+    The truth is the views with their true cameras, with the factors of exposure and white balance
+    that the disturbed photographs have.
 
     Parameters
     ----------
@@ -48,7 +54,8 @@ def disturbed(
     target : (3,) what distances are measured to.
     rotation_deg, position : angle about a random axis through the camera, and shift in a random
         direction as a share of the distance; both of exactly this size.
-    focal, exposure : standard deviations of the logarithms of two factors.
+    focal, exposure, balance : standard deviations of the logarithms of the factors of focal lengths
+        and exposures, and of single channels.
     seed : of all choices.
     """
     rng = np.random.default_rng(seed)
@@ -64,11 +71,13 @@ def disturbed(
     poses[:, :3, :3] = turns @ poses[:, :3, :3]
     poses[:, :3, 3] += position * distance * directions()
     lenses[:, [0, 1], [0, 1]] *= np.exp(focal * rng.normal(size=(count, 1)))
-    images = views.images.copy()
-    factors = np.exp(exposure * rng.normal(size=(count, 1, 1, 1)))
-    images[..., :3] *= factors
+    factors = np.exp(exposure * rng.normal(size=count))
+    tints = balance * rng.normal(size=(count, 3))
+    tints = np.exp(tints - tints.mean(axis=1, keepdims=True))
+    tints /= tints.mean(axis=0)
+    images = Photographs.of(views.images).divided(1.0 / (factors[:, None] * tints))
     moved = replace(views, camera_to_world=poses, intrinsics=lenses, images=images)
-    return moved, factors.reshape(-1)
+    return moved, replace(views, exposure=factors, white_balance=tints)
 
 
 def with_training_views(dataset: Dataset, views: Views) -> Dataset:
@@ -118,6 +127,7 @@ def error_cells(errors: CameraErrors) -> list[str]:
         errors.center_percent,
         errors.focal_percent,
         errors.exposure_percent,
+        errors.balance_percent,
         errors.pixels,
     )
     return [f"{np.sqrt(np.mean(x**2)):.3f} ({np.max(x):.2f})" for x in columns]
@@ -134,6 +144,8 @@ def main() -> None:
     parser.add_argument("--position", type=float, default=0.01, help="share of the distance")
     parser.add_argument("--focal", type=float, default=0.01, help="deviation of the logarithm")
     parser.add_argument("--exposure", type=float, default=0.01, help="deviation of the logarithm")
+    parser.add_argument("--balance", type=float, default=0.0, help="likewise, of each channel")
+    parser.add_argument("--white-balance", action="store_true", help="refine it, too")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--samples", type=int, default=32, help="rays per splat when evaluating")
@@ -144,16 +156,16 @@ def main() -> None:
     base = load_dataset(
         arguments.scene, downscale=arguments.downscale, test_views=arguments.test_views
     )
-    views, factors = disturbed(
+    views, true_cameras = disturbed(
         base.train,
         np.mean(base.bounds, axis=0),
         rotation_deg=arguments.rotation,
         position=arguments.position,
         focal=arguments.focal,
         exposure=arguments.exposure,
+        balance=arguments.balance,
         seed=arguments.seed,
     )
-    true_cameras = replace(base.train, exposure=factors)
     current = with_training_views(base, views)
     output, rows = arguments.output, []
     for number in range(arguments.rounds + 1):
@@ -168,7 +180,9 @@ def main() -> None:
         path = run.folder.path / "cameras.json"
         if not path.exists():
             began = time.perf_counter()
-            run.refine_cameras(splits=("train",))
+            run.refine_cameras(
+                splits=("train",), how=CameraSettings(white_balance=arguments.white_balance)
+            )
             print(f"{name}: refined in {time.perf_counter() - began:.0f} s", flush=True)
         split = read_cameras(path)["train"]
         for line in change_lines(current.train, split, base.bounds):
@@ -176,7 +190,14 @@ def main() -> None:
         current = with_training_views(base, with_cameras(current.train, split, str(path)))
     run = train_or_open(base, output / "true", arguments)
     rows.append((run, None, ["true", *["0"] * len(cells)]))
-    kinds = ("rotation, deg", "position, %", "focal, %", "exposure, %", "object, pixels")
+    kinds = (
+        "rotation, deg",
+        "position, %",
+        "focal, %",
+        "exposure, %",
+        "balance, %",
+        "object, pixels",
+    )
     titles = ["cameras", *kinds, *MEASURES]
     for cells in (titles, ["---"] * len(titles)):
         print(f"| {' | '.join(cells)} |")

@@ -290,7 +290,8 @@ def _all_views(dataset: Dataset) -> Views:
         return train
     height, width = max(train.height, test.height), max(train.width, test.width)
 
-    def grown(values: np.ndarray, padding: float = 0.0) -> np.ndarray:
+    def grown(stored: Any, padding: float = 0.0) -> np.ndarray:
+        values = np.asarray(stored)
         short = [(0, 0), (0, height - values.shape[1]), (0, width - values.shape[2])]
         return np.pad(
             values, [*short, *[(0, 0)] * (values.ndim - 3)], constant_values=np.float32(padding)

@@ -89,6 +89,7 @@ def command_line() -> argparse.ArgumentParser:
         help="first train at quality draft and set the cameras right with what came out, so often "
         "(once by default); docs/cameras.md",
     )
+    _add_white_balance(train)
     train.add_argument(
         "--csv", type=Path, metavar="FILE", help="also write loss, terms and PSNR of every step"
     )
@@ -175,9 +176,10 @@ def command_line() -> argparse.ArgumentParser:
     )
 
     refine = _run_parser(
-        commands, "refine-cameras", "pose, focal length and exposure of every view of a run"
+        commands, "refine-cameras", "pose, focal length and colour of every view of a run"
     )
     refine.add_argument("--output", type=Path, help="file (default: RUN/cameras.json)")
+    _add_white_balance(refine)
 
     export = _run_parser(commands, "export", "mesh.glb, gaussians.ply and light.exr of a run")
     export.add_argument("--output", type=Path, help="folder (default: RUN/export)")
@@ -211,6 +213,14 @@ def _command(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
         description=f"{text[0].upper()}{text[1:]}.",
         epilog=f"example:\n  geosplat-jax {EXAMPLES[name]}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def _add_white_balance(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--white-balance",
+        action="store_true",
+        help="refine factors of red, green and blue of every view with the cameras, too",
     )
 
 

@@ -14,6 +14,7 @@ from geosplat_jax.capture.masks import choose_factor, make_masks
 from geosplat_jax.capture.settings import RadianceSettings
 from geosplat_jax.cli.display import ProgressDisplay, WorkDisplay, say, say_refined
 from geosplat_jax.cli.training import UsageError, config_from, scene_options, train
+from geosplat_jax.fit.cameras import CameraSettings
 from geosplat_jax.fit.config import all_settings
 from geosplat_jax.fit.folder import RunError
 from geosplat_jax.fit.gauge import change_lines
@@ -299,7 +300,8 @@ def _view(arguments: argparse.Namespace) -> None:
 def _refine_cameras(arguments: argparse.Namespace) -> None:
     """Refine the cameras of a run and print what changed."""
     run = Run(arguments.run, scene=arguments.scene)
-    refined = run.refine_cameras(arguments.output, on_view=say_refined)
+    how = CameraSettings(white_balance=arguments.white_balance)
+    refined = run.refine_cameras(arguments.output, how=how, on_view=say_refined)
     for split, cameras in refined.items():
         views = run.dataset.test if split == "test" else run.dataset.train
         for line in change_lines(views, cameras, run.dataset.bounds):

@@ -11,16 +11,18 @@ from rich.table import Table
 
 from geosplat_jax.camera_rounds import refined_cameras
 from geosplat_jax.cli.display import ProgressDisplay, console, say, say_refined
+from geosplat_jax.fit.cameras import CameraSettings
 from geosplat_jax.fit.config import Budget, Config, config_warnings
 from geosplat_jax.fit.devices import Devices, choose_devices, connect_hosts
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import make_config, with_mesh
+from geosplat_jax.fit.start_mesh import MeshSettings
 from geosplat_jax.fit.train import Progress
 from geosplat_jax.io.dataset import choose_downscale, load_recorded
 from geosplat_jax.model_choice import ModelChoice, Rung
 from geosplat_jax.report.events import EventLog
 from geosplat_jax.report.facts import rung_row
-from geosplat_jax.run import plan_training
+from geosplat_jax.run import mesh_of_run, plan_training
 from geosplat_jax.run import train as train_run
 
 
@@ -47,13 +49,16 @@ def scene_options(arguments: argparse.Namespace, config: Config) -> dict[str, An
     return {**options, "downscale": chosen.factor}
 
 
-def config_from(arguments: argparse.Namespace) -> Config:
-    """Return the configuration that the arguments ask for."""
+def config_from(arguments: argparse.Namespace, mesh: MeshSettings | None = None) -> Config:
+    """Return the configuration that the arguments ask for.
+
+    ``mesh`` : of the run that is resumed, where the arguments name none.
+    """
     return make_config(
         arguments.preset or "default",
         arguments.quality or "standard",
         material_prior=arguments.material_prior,
-        mesh=arguments.mesh,
+        mesh=arguments.mesh or mesh,
         overrides=_overrides(arguments),
     )
 
@@ -96,7 +101,8 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
     if arguments.budget is None:
         if arguments.memory is not None:
             raise UsageError("--memory belongs to --budget")
-        config, model = config_from(arguments), None
+        mesh = mesh_of_run(folder) if arguments.resume else None
+        config, model = config_from(arguments, mesh), None
         if arguments.model is not None:
             paths = (text.partition("=")[0].strip() for text in arguments.overrides)
             model = ModelChoice(by_hand=tuple(dict.fromkeys(paths)))
@@ -133,6 +139,7 @@ def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[
             rounds=arguments.refine_cameras,
             config=draft,
             reading=reading,
+            how=CameraSettings(white_balance=arguments.white_balance),
             on_step=display.show,
             on_view=say_refined,
         )
@@ -217,6 +224,8 @@ def train(arguments: argparse.Namespace) -> None:
         raise UsageError("--from RUN and --stage NAME belong together")
     if arguments.refine_cameras is not None and (arguments.budget or arguments.source):
         raise UsageError("--refine-cameras trains before; leave --budget and --from out")
+    if arguments.white_balance and arguments.refine_cameras is None:
+        raise UsageError("--white-balance belongs to --refine-cameras")
     devices = _devices(arguments)
     folder = arguments.output or Path("runs") / arguments.scene.resolve().name
     order = _ordered(arguments, RunFolder(folder))
@@ -224,7 +233,12 @@ def train(arguments: argparse.Namespace) -> None:
     if arguments.refine_cameras is not None:
         reading["cameras"] = _refined_cameras(arguments, folder, reading)
     dataset = load_recorded(arguments.scene, reading)
-    for note in (*dataset.notes, *config.geometry.notes(dataset)):
+    begun = RunFolder(folder)
+    if arguments.resume and begun.exists:
+        notes = begun.record().get("notes", dataset.notes)
+    else:
+        notes = (*dataset.notes, *config.geometry.notes(dataset))
+    for note in notes:
         say(note)
     warnings = (*dataset.warnings, *config_warnings(config), *_idle(devices, config))
     for warning in warnings:

@@ -1,10 +1,10 @@
-"""Cameras refined against what was trained: pose, focal length and exposure of every view.
+"""Cameras refined against what was trained: pose, focal length and colour of every view.
 
 The asset and its light stay as they are, so views are independent of each other: eight parameters
-each, found by Levenberg-Marquardt from the difference of render and photograph. Eight columns of a
-Jacobian are made in forward mode (`RenderPipeline.forward_mode`), which suits few parameters and
-many pixels; visibility and depth order are found anew at every iterate and have no
-derivative.
+each (ten with white balance), found by Levenberg-Marquardt from the difference of render and
+photograph. The columns of a Jacobian are made in forward mode (`RenderPipeline.forward_mode`),
+which suits few parameters and many pixels; visibility and depth order are found anew at every
+iterate and have no derivative.
 
 Splats are shaded towards the camera to begin with, and keep their colours while the solver runs:
 cameras move by less than highlights are wide, and noise of samples would be different at every
@@ -13,11 +13,13 @@ iterate. Then all of it is done once more, from the camera that was found (`Came
 Parameters are dimensionless and of comparable effect on the image of the object: a rotation vector
 (radians) about the centre of its box, in camera axes; a shift of the object across the view in half
 extents of the box, and along it in shares of the distance; the logarithms of factors of both focal
-lengths and of the exposure. Rotation about the object, instead of the camera, keeps rotation and
+lengths and of the exposure; where white balance is asked for, logarithms of factors of red and
+blue, and their negative sum of green. A tint of all views is the light's: `with_mean_balance` takes
+it from the views. Rotation about the object, instead of the camera, keeps rotation and
 shift apart.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -47,6 +49,9 @@ from geosplat_jax.transport.base import Illumination, Shaded, Transport
 PARAMETER_COUNT = 8
 """Rotation (3), shift (3), logarithm of the focal factor, logarithm of the exposure."""
 
+BALANCE_COUNT = 2
+"""Logarithms of the factors of red and blue."""
+
 UNIT = 0.01
 """What the solver takes as one: its damping begins at one of its units."""
 
@@ -62,7 +67,7 @@ class CameraSettings:
     pixel_deviation: Positive = 0.05
     """Difference of a channel of a pixel that is nothing unusual, linear light."""
     prior_deviation: Positive = 0.002
-    """Deviation of each of the eight parameters that weighs as much as one such pixel. Errors of
+    """Deviation of each of the parameters that weighs as much as one such pixel. Errors of
     neighbouring pixels are alike, so it is smaller than what is to be corrected, and still hardly
     holds back what the pixels show well. It decides what they leave open, a longer lens further
     away above all. Large: no prior."""
@@ -75,9 +80,16 @@ class CameraSettings:
     """How often the splats are shaded; the solver runs after each time."""
     steps: PositiveCount = 20
     """Steps of the solver in a round at most, rejected ones included."""
+    white_balance: bool = False
+    """Factors of red, green and blue for every view, beside that of the exposure."""
     tolerance: Positive = 1e-2
     """The solver stops when a step moves the parameters by less than this many hundredths, and the
     pixels by less than this many deviations, root mean square."""
+
+    @property
+    def parameter_count(self) -> int:
+        """Count the parameters of a view."""
+        return PARAMETER_COUNT + (BALANCE_COUNT if self.white_balance else 0)
 
 
 class Baked(Illumination):
@@ -197,9 +209,9 @@ class Fit(eqx.Module):
 
 
 def moved_camera(
-    camera: Camera, parameters: Float[Array, " 8"], box: Box
+    camera: Camera, parameters: Float[Array, " P"], box: Box
 ) -> tuple[Camera, Float[Array, ""]]:
-    """Move the camera of a single view; see the module for the meaning of the eight parameters.
+    """Move the camera of a single view; see the module for the meaning of its parameters.
 
     Returns
     -------
@@ -219,8 +231,16 @@ def moved_camera(
     return Camera(pose[None], lens[None], camera.height, camera.width), parameters[7]
 
 
+def log_balance(parameters: Float[Array, " P"]) -> Float[Array, " 3"]:
+    """Logarithms of the factors of red, green and blue, whose sum is zero; zeros without them."""
+    if parameters.shape[0] == PARAMETER_COUNT:
+        return jnp.zeros(3, parameters.dtype)
+    red, blue = parameters[PARAMETER_COUNT], parameters[PARAMETER_COUNT + 1]
+    return jnp.stack([red, -red - blue, blue])
+
+
 def view_residual(
-    parameters: Float[Array, " 8"], subject: Subject, photograph: Photograph, how: CameraSettings
+    parameters: Float[Array, " P"], subject: Subject, photograph: Photograph, how: CameraSettings
 ) -> tuple[Float[Array, " R"], Fit]:
     """Evaluate the residual whose squares are summed, and how well the camera fits.
 
@@ -236,7 +256,8 @@ def view_residual(
     pipeline = subject.pipeline
     camera, log_exposure = moved_camera(photograph.camera, UNIT * parameters, pipeline.surface.box)
     output = pipeline.render_lit(subject.asset, subject.illumination, camera, key=subject.key)
-    rgb = tone_map(output.rgb[0], subject.log_exposure + log_exposure)
+    balanced = output.rgb[0] * jnp.exp(log_balance(UNIT * parameters))[None, None]
+    rgb = tone_map(balanced, subject.log_exposure + log_exposure)
     mask, valid = photograph.image[..., 3:], photograph.valid[..., None]
     rgb_difference = valid * (rgb - photograph.image[..., :3] * mask)
     coverage_difference = valid * (output.alpha[0][..., None] - mask)
@@ -272,12 +293,13 @@ class Found(eqx.Module):
 
     Attributes
     ----------
-    parameters : (8,) in units of `UNIT`, see `moved_camera`. camera : moved by them.
+    parameters : (P,) in units of `UNIT`, see `moved_camera` and `log_balance`.
+    camera : moved by them.
     before, after : fits of the camera to begin with and of the one that was found.
     iterations : () steps of the solver.
     """
 
-    parameters: Float[Array, " 8"]
+    parameters: Float[Array, " P"]
     camera: Camera
     before: Fit
     after: Fit
@@ -286,13 +308,13 @@ class Found(eqx.Module):
 
 @partial(jax.jit, static_argnames=("how",))
 def _solve(
-    start: Float[Array, " 8"], subject: Subject, photograph: Photograph, *, how: CameraSettings
+    start: Float[Array, " P"], subject: Subject, photograph: Photograph, *, how: CameraSettings
 ) -> Found:
     """Run Levenberg-Marquardt; valid only where both fits' usage is within the capacities."""
     box = subject.pipeline.surface.box
     subject = subject.seen_from(moved_camera(photograph.camera, UNIT * start, box)[0])
 
-    def residual(parameters: Float[Array, " 8"], args: None) -> tuple[Float[Array, " R"], Fit]:
+    def residual(parameters: Float[Array, " P"], args: None) -> tuple[Float[Array, " R"], Fit]:
         del args
         return view_residual(parameters, subject, photograph, how)
 
@@ -326,7 +348,7 @@ def refine_view(
     def attempt(capacities: Capacities) -> tuple[Found, Usage]:
         pipeline = replace(subject.pipeline, capacities=capacities)
         sized = replace(subject, pipeline=pipeline)
-        start = jnp.zeros(PARAMETER_COUNT, photograph.image.dtype)
+        start = jnp.zeros(how.parameter_count, photograph.image.dtype)
         rounds = []
         for _ in range(how.rounds):
             rounds.append(_solve(start, sized, photograph, how=how))
@@ -387,6 +409,7 @@ def _refined(found: Found, views: Views, index: int) -> RefinedCamera:
     """Take over what was found, if it is better."""
     note = _refusal(found)
     exposure = 1.0 if views.exposure is None else float(views.exposure[index])
+    balance = np.ones(3) if views.white_balance is None else views.white_balance[index]
     before = float(found.before.rms)
     kept = RefinedCamera(
         world_to_camera=views.world_to_camera[index],
@@ -397,6 +420,7 @@ def _refined(found: Found, views: Views, index: int) -> RefinedCamera:
         iterations=int(found.iterations),
         accepted=False,
         note=note,
+        white_balance=balance,
     )
     if note:
         return kept
@@ -412,7 +436,32 @@ def _refined(found: Found, views: Views, index: int) -> RefinedCamera:
         exposure=exposure * float(np.exp(UNIT * float(found.parameters[7]))),
         residual_after=float(found.after.rms),
         accepted=True,
+        white_balance=balance * np.exp(np.asarray(log_balance(UNIT * found.parameters), float)),
     )
+
+
+def with_mean_balance(splits: Mapping[str, RefinedSplit]) -> dict[str, RefinedSplit]:
+    """Divide the factors of white balance, so that the mean over the training views is one.
+
+    Photographs that all have a tint look like those of a light that has it; only differences
+    between views are theirs.
+
+    Parameters
+    ----------
+    splits : all of them are divided by the same, the mean over the views of ``train``, or of the
+        first split without it.
+    """
+    taught = splits.get("train", next(iter(splits.values())))
+    mean = np.mean([camera.white_balance for camera in taught.cameras.values()], axis=0)
+
+    def divided(split: RefinedSplit) -> RefinedSplit:
+        cameras = {
+            name: replace(camera, white_balance=camera.white_balance / mean)
+            for name, camera in split.cameras.items()
+        }
+        return replace(split, cameras=cameras)
+
+    return {name: divided(split) for name, split in splits.items()}
 
 
 def _refusal(found: Found) -> str:

@@ -33,6 +33,7 @@ class CameraErrors:
     center_percent : (V,) distance of the positions, per distance to the object.
     focal_percent : (V,) difference of the focal lengths.
     exposure_percent : (V,) difference of the exposures.
+    balance_percent : (V,) largest difference of a factor of red, green or blue beside it.
     pixels : (V,) root mean square distance at which points around the object appear.
     """
 
@@ -40,6 +41,7 @@ class CameraErrors:
     center_percent: Float[np.ndarray, " V"]
     focal_percent: Float[np.ndarray, " V"]
     exposure_percent: Float[np.ndarray, " V"]
+    balance_percent: Float[np.ndarray, " V"]
     pixels: Float[np.ndarray, " V"]
 
 
@@ -97,6 +99,7 @@ def camera_errors(found: Views, true: Views, bounds: Bounds) -> CameraErrors:
         center_percent=100 * np.linalg.norm(positions - wanted, axis=-1) / distance,
         focal_percent=100 * np.abs(found.intrinsics[:, 0, 0] / true.intrinsics[:, 0, 0] - 1),
         exposure_percent=100 * np.abs(np.divide(*exposures) - 1),
+        balance_percent=100 * np.abs(_balance(found) / _balance(true) - 1).max(axis=1),
         pixels=np.sqrt(np.mean(apart**2, axis=-1)),
     )
 
@@ -142,6 +145,7 @@ def change_lines(views: Views, split: RefinedSplit, bounds: Bounds) -> list[str]
         "position": (changes.center_percent, "% of the distance"),
         "focal length": (changes.focal_percent, "%"),
         "exposure": (changes.exposure_percent, "%"),
+        "white balance": (changes.balance_percent, "%"),
         "object in the image": (changes.pixels, "pixels"),
     }
     lines = [
@@ -157,6 +161,10 @@ def change_lines(views: Views, split: RefinedSplit, bounds: Bounds) -> list[str]
     why = "; ".join(f"{note}: {count}" for note, count in notes.items())
     unchanged = f"{sum(notes.values())} of {len(cameras)} views keep their cameras"
     return [*lines, f"{unchanged} ({why})" if why else unchanged]
+
+
+def _balance(views: Views) -> Float[np.ndarray, "V 3"]:
+    return np.ones((len(views), 3)) if views.white_balance is None else views.white_balance
 
 
 def _points_around(bounds: Bounds) -> Float[np.ndarray, "14 3"]:

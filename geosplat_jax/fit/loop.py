@@ -419,21 +419,35 @@ def new_loop(
     folder: RunFolder,
     devices: Devices = ONE_DEVICE,
     start: Start | None = None,
+    *,
+    surface: SurfaceModel | None = None,
 ) -> Loop:
-    """Build the loop of a new run; ``start`` : what it takes over, None where it begins anew."""
+    """Build the loop of a new run.
+
+    ``start`` : what it takes over, None where it begins anew. ``surface`` : of a checkpoint, where
+    it is not made anew.
+    """
     shape_key, field_key = jax.random.split(jax.random.key(config.run.seed))
     if not config.active_stages:
         raise TrainingError("nothing to train: no stage has steps")
-    stage = config.active_stages[0]
-    if start is None:
-        try:
+    try:
+        if start is not None:
+            surface, shape = start.surface, start.params.geometry
+        elif surface is None:
             surface, shape = config.geometry.start(dataset, shape_key)
-        except ValueError as error:
-            raise TrainingError(str(error)) from error
-        params = initial_params(shape, config, field_key)
-    else:
-        surface = start.surface
-        params = start.applied(initial_params(start.params.geometry, config, field_key))
+        else:
+            shape = config.geometry.restart(surface, dataset, shape_key)
+    except ValueError as error:
+        raise TrainingError(str(error)) from error
+    if surface.is_two_sided and not config.raster.cull_backfaces:
+        raise TrainingError(
+            "raster.cull_backfaces=false shows the fronts and the backs of an open mesh at the "
+            "same place; leave it true, or set geometry.sides=one"
+        )
+    stage = config.active_stages[0]
+    params = initial_params(shape, config, field_key)
+    if start is not None:
+        params = start.applied(params)
     pipeline = build_pipeline(config, stage, surface)
     views, share = around_object(dataset.train, largest=config.run.window)
     loop = Loop(
@@ -477,17 +491,18 @@ def resumed_loop(
             "cannot resume with another configuration; start a new run, or undo: "
             + "; ".join(changed)
         )
-    loop = new_loop(dataset, config, folder, devices, start)
-    path = latest_checkpoint(folder.checkpoints)
+    own = latest_checkpoint(folder.checkpoints)
     before = [stage.name for stage in config.active_stages]
+    # A run that took its first stages over may have been stopped before its own checkpoint.
+    ends = [end for name in before if (end := latest_checkpoint(folder.end_of(name)))]
+    path = own or (ends[-1] if ends else None)
     if path is None:
-        # A run that took its first stages over may have been stopped before its own checkpoint.
-        ended = [name for name in before if latest_checkpoint(folder.end_of(name))]
-        if ended:
-            end = latest_checkpoint(folder.end_of(ended[-1]))
-            _put(loop, *read_checkpoint(_require(end), config))
+        return new_loop(dataset, config, folder, devices, start)
+    tree, described = read_checkpoint(path, config)
+    loop = new_loop(dataset, config, folder, devices, start, surface=tree["surface"])
+    _put(loop, tree, described)
+    if own is None:
         return loop
-    _put(loop, *read_checkpoint(path, config))
     loop.last_checkpoint = path
     number = before.index(loop.stage.name)
     if number:
@@ -495,11 +510,6 @@ def resumed_loop(
         if ended is not None:
             loop.fallback = _on_host(read_checkpoint(ended, config)[0]["state"].params.geometry)
     return loop
-
-
-def _require(path: Path | None) -> Path:
-    assert path is not None
-    return path
 
 
 def adopted_loop(

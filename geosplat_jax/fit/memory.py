@@ -41,7 +41,7 @@ def training_needs(config: Config, dataset: Dataset) -> list[Need]:
     """
     train, test = dataset.train, dataset.test
     pixels = train.height * train.width
-    images = (len(train) * pixels + len(test) * test.height * test.width) * _PIXEL_BYTES
+    images = train.images.nbytes + test.images.nbytes
     views = max((min(stage.batch_views, len(train)) for stage in config.active_stages), default=0)
     light = config.light.height * config.light.width * 3 * _FLOAT_BYTES
     return [

@@ -321,7 +321,7 @@ _MESH_VIEWS = 6
 """Views per step in appendix H."""
 
 
-def with_mesh(config: Config, path: str | Path) -> Config:
+def with_mesh(config: Config, mesh: str | Path | MeshSettings) -> Config:
     """Return a configuration that starts from a mesh file instead of an isosurface (appendix H).
 
     The surface's own rates and weights give way to those of a mesh; everything else stays, but for
@@ -329,17 +329,21 @@ def with_mesh(config: Config, path: str | Path) -> Config:
     metallic, and no vertex sampling. There splats that look away are left out, as those of an open
     mesh must be.
 
+    Parameters
+    ----------
+    config : of an isosurface.
+    mesh : file, or the settings of a run that started from one, whose file is not looked at.
+
     Raises
     ------
     ValueError
         If there is no such file.
     """
-    path = Path(path)
-    geometry = MeshSettings(
-        path=str(path.resolve()),
-        digest=digest_of(path),
-        edge_pixels=_MESH_EDGES[config.quality],
-    )
+    if isinstance(mesh, MeshSettings):
+        path, digest = mesh.path, mesh.digest
+    else:
+        path, digest = str(Path(mesh).resolve()), digest_of(mesh)
+    geometry = MeshSettings(path=path, digest=digest, edge_pixels=_MESH_EDGES[config.quality])
     old, is_original = config.geometry, config.preset != "default"
     stages = []
     for stage in config.stages:
@@ -472,7 +476,7 @@ def make_config(
     quality: str = "standard",
     *,
     material_prior: str = "hybrid",
-    mesh: str | Path | None = None,
+    mesh: str | Path | MeshSettings | None = None,
     overrides: tuple[str, ...] = (),
 ) -> Config:
     """Combine a preset, a quality level and overrides into a validated `Config`.

@@ -29,8 +29,8 @@ class MeshSettings(SurfaceSettings, kind="mesh"):
     max_faces: Annotated[int, Field(ge=4, le=2_000_000)] = 150_000
     """Largest number of faces after that (about 6 KB per face)."""
     sides: Literal["auto", "one", "both"] = "auto"
-    """Sides that are surface; auto: one of a closed mesh, both of any other, at twice the cost;
-    raster.cull_backfaces must then stay on."""
+    """Sides that are surface; auto: one of a closed mesh, both of any other, at twice the cost.
+    Both need raster.cull_backfaces."""
 
     @property
     def rate_groups(self) -> tuple[str, ...]:
@@ -78,6 +78,12 @@ class MeshSettings(SurfaceSettings, kind="mesh"):
         mesh = self.mesh(dataset)
         model = TriangleMesh.of(mesh.vertices, mesh.faces, is_sheet=self._is_sheet(mesh))
         return model, model.start
+
+    def restart(self, model: SurfaceModel, dataset: Dataset, key: Key[Array, ""]) -> VertexOffsets:
+        """Return no offsets; the file is not read again."""
+        del dataset, key
+        assert isinstance(model, TriangleMesh)
+        return model.start
 
     def describe(self, model: SurfaceModel) -> dict[str, Any]:
         """Return the rows of the arrays, the cells for rays, and whether both sides count."""

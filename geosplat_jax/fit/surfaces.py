@@ -86,6 +86,17 @@ class SurfaceSettings(Variant, abc.ABC):
             If there is nothing to start from; the message says what to change.
         """
 
+    def restart(self, model: SurfaceModel, dataset: Dataset, key: Key[Array, ""]) -> Any:
+        """Make the first shape once more, for a model that a checkpoint holds.
+
+        Raises
+        ------
+        ValueError
+            As `start`.
+        """
+        del model
+        return self.start(dataset, key)[1]
+
     @abc.abstractmethod
     def describe(self, model: SurfaceModel) -> dict[str, Any]:
         """Return the sizes of a model that JSON can hold, for `template`."""
@@ -180,7 +191,7 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
         sdf = hull_sdf(
             np.asarray(camera.world_to_camera, np.float64),
             np.asarray(camera.intrinsics, np.float64),
-            views.images[..., 3],
+            views.alphas,
             grid,
             valid=views.valid,
         )

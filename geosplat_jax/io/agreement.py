@@ -92,7 +92,7 @@ def _left_out(views: Views, view: int, lo: np.ndarray, hi: np.ndarray) -> Bool[n
     pixel = (local @ views.intrinsics[view].T)[:, :2] / depth[:, None]
     is_seen = is_ahead & (pixel >= 0).all(1) & (pixel < [views.width, views.height]).all(1)
     column, row = np.where(is_seen[:, None], pixel, 0).astype(int).T
-    is_out = is_seen & ~views.masks[view][row, column]
+    is_out = is_seen & ~views.mask(view)[row, column]
     return is_out.reshape(_VOXELS, _VOXELS, _VOXELS)
 
 
@@ -100,7 +100,7 @@ def _points_on_rays(
     views: Views, view: int, lo: np.ndarray, hi: np.ndarray
 ) -> Float[np.ndarray, "R S 3"]:
     """Spread points over the rays of some pixels of a mask, as far as the box reaches."""
-    rows, columns = np.nonzero(views.masks[view])
+    rows, columns = np.nonzero(views.mask(view))
     chosen = np.unique(np.linspace(0, len(rows) - 1, _RAYS).astype(int)) if len(rows) else []
     pixels = np.stack([columns[chosen] + 0.5, rows[chosen] + 0.5, np.ones(len(chosen))], -1)
     pose = views.world_to_camera[view]

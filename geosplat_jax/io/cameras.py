@@ -6,6 +6,7 @@
      "splits": {"train": {"width": 200, "height": 200, "views": {NAME: {
          "world_to_camera": 4 x 4, OpenCV axes, "fx": .., "fy": .., "cx": .., "cy": .., pixels
          "exposure": factor by which the photograph is brighter than the scene renders,
+         "white_balance": factors of red, green and blue beside it; ones where the key is missing,
          "residual_before": .., "residual_after": .., "iterations": .., "accepted": ..,
          "note": why a camera was left as it was}}}}}
 """
@@ -14,7 +15,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from jaxtyping import Float
 
 from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.images import MissingFileError, SceneError
+from geosplat_jax.io.photographs import Photographs
 from geosplat_jax.io.views import Views, camera_to_world_of
 
 _FORMAT, _VERSION = "geosplat_jax cameras", 1
@@ -41,6 +43,7 @@ class RefinedCamera:
     iterations : of the solver, trial steps included.
     accepted : False where the camera is the one that the search began with.
     note : why it is; "" where accepted.
+    white_balance : (3,) factors of red, green and blue, beside the exposure.
     """
 
     world_to_camera: Float[np.ndarray, "4 4"]
@@ -51,6 +54,7 @@ class RefinedCamera:
     iterations: int
     accepted: bool
     note: str = ""
+    white_balance: Float[np.ndarray, " 3"] = field(default_factory=lambda: np.ones(3))
 
 
 @dataclass(frozen=True)
@@ -91,6 +95,7 @@ def _to_plain(camera: RefinedCamera) -> dict[str, Any]:
         "cx": float(lens[0, 2]),
         "cy": float(lens[1, 2]),
         "exposure": camera.exposure,
+        "white_balance": camera.white_balance.tolist(),
         "residual_before": camera.residual_before,
         "residual_after": camera.residual_after,
         "iterations": camera.iterations,
@@ -154,11 +159,14 @@ def _from_plain(values: Mapping[str, Any]) -> RefinedCamera:
     pose = np.array(values["world_to_camera"], np.float64)
     fx, fy, cx, cy = (float(values[name]) for name in ("fx", "fy", "cx", "cy"))
     exposure = float(values["exposure"])
+    balance = np.array(values.get("white_balance", [1.0, 1.0, 1.0]), np.float64)
     turn = pose[:3, :3] @ pose[:3, :3].T if pose.shape == (4, 4) else np.zeros((3, 3))
     if not np.allclose(turn, np.eye(3), atol=_RIGID_TOLERANCE) or not np.isfinite(pose).all():
         raise ValueError("a world_to_camera is not a rigid 4 x 4 matrix")
     if not (min(fx, fy, exposure) > 0 and np.isfinite([fx, fy, cx, cy, exposure]).all()):
         raise ValueError(f"fx {fx}, fy {fy} and exposure {exposure} must be finite and above 0")
+    if balance.shape != (3,) or not (np.isfinite(balance) & (balance > 0)).all():
+        raise ValueError(f"a white_balance must be three factors above 0, got {balance.tolist()}")
     return RefinedCamera(
         world_to_camera=pose,
         intrinsics=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
@@ -168,11 +176,12 @@ def _from_plain(values: Mapping[str, Any]) -> RefinedCamera:
         iterations=int(values["iterations"]),
         accepted=bool(values["accepted"]),
         note=str(values.get("note", "")),
+        white_balance=balance,
     )
 
 
 def with_cameras(views: Views, split: RefinedSplit, where: str) -> Views:
-    """Return views with refined cameras, and photographs without their exposures.
+    """Return views with refined cameras, and photographs without exposures and white balance.
 
     Colours are divided by the refined factors in linear light; alpha is not. Pixels that the sensor
     clipped are divided like all others, although they may have been brighter. A factor is that of
@@ -202,13 +211,17 @@ def with_cameras(views: Views, split: RefinedSplit, where: str) -> Views:
         )
     cameras = [split.cameras[name] for name in views.names]
     exposure = np.array([camera.exposure for camera in cameras])
-    factors = exposure if views.exposure is None else exposure / views.exposure
-    images = views.images.copy()
-    images[..., :3] /= factors[:, None, None, None].astype(images.dtype)
+    balance = np.stack([camera.white_balance for camera in cameras])
+    factors = exposure[:, None] * balance
+    if views.exposure is not None:
+        factors = factors / views.exposure[:, None]
+    if views.white_balance is not None:
+        factors = factors / views.white_balance
     return replace(
         views,
         camera_to_world=camera_to_world_of(np.stack([c.world_to_camera for c in cameras])),
         intrinsics=np.stack([camera.intrinsics for camera in cameras]),
-        images=images,
+        images=Photographs.of(views.images).divided(factors),
         exposure=exposure,
+        white_balance=balance,
     )

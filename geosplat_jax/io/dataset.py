@@ -24,7 +24,7 @@ from geosplat_jax.io.layouts.stanford_orb import is_stanford_orb, list_stanford_
 from geosplat_jax.io.layouts.synthetic4relight import is_synthetic4relight, list_synthetic4relight
 from geosplat_jax.io.layouts.tensoir import is_tensoir, list_tensoir
 from geosplat_jax.io.layouts.transforms import is_transforms, list_transforms_capture
-from geosplat_jax.io.views import COVERED, Views, load_views, no_views
+from geosplat_jax.io.views import COVERED, KEPT_BYTES, Views, load_views, no_views, some_names
 from geosplat_jax.surface.hull import hull_bounds, sight_bounds
 
 
@@ -50,8 +50,6 @@ LAYOUTS: dict[str, Layout] = {
 
 
 _PIXELS_OF_A_CELL = 2.0
-_EVEN = 0.02
-"""Linear colours of an object that differ by no more are one colour."""
 _NARROW_DEG = 20.0
 """Cameras around the object within a smaller angle see one side of it."""
 _COARSE_PIXELS = 256
@@ -155,10 +153,11 @@ def load_dataset(
             warnings.append("there are no test views; nothing can be evaluated")
             splits.append(no_views(splits[0]))
             continue
-        views, problems = load_views(chosen, factor=downscale, listing=listing)
+        views, problems = load_views(
+            chosen, factor=downscale, listing=listing, most_bytes=KEPT_BYTES[split]
+        )
         _check_pixels(views, split)
         _check_masks(views, split, warnings)
-        _check_colors(views, split, warnings)
         warnings += [f"{split}: {problem}" for problem in problems]
         if split in refined:
             views = with_cameras(views, refined[split], str(cameras))
@@ -324,7 +323,7 @@ def object_bounds(
     try:
         if not views.has_masks:
             return sight_bounds(*cameras, height=views.height, width=views.width)
-        return hull_bounds(*cameras, views.images[..., 3], valid=views.valid, margin=margin)
+        return hull_bounds(*cameras, views.alphas, valid=views.valid, margin=margin)
     except ValueError as error:
         raise SceneError(f"cannot find the object: {error}") from error
 
@@ -344,7 +343,8 @@ def describe(dataset: Dataset) -> str:
         size = f"{views.width} x {views.height}"
         lines.append(f"  {split + ':':<12}{len(views)} views of {size}, {masks}")
         if views.valid is not None:
-            lines.append(f"  {'':<12}pixels that count: {views.valid.mean():.1%}")
+            share = views.valid_counts.mean() / (views.height * views.width)
+            lines.append(f"  {'':<12}pixels that count: {share:.1%}")
         if views.lights:
             lines.append(f"  {'':<12}environment maps of {len(views.lights)} views")
         if views.truth:
@@ -365,7 +365,7 @@ def _check_pixels(views: Views, split: str) -> None:
     """Refuse a view of which no pixel counts."""
     if views.valid is None:
         return
-    counts = views.valid.any((1, 2))
+    counts = views.valid_counts > 0.0
     if not counts.all():
         name = views.names[int(np.argmin(counts))]
         raise SceneError(
@@ -376,7 +376,7 @@ def _check_pixels(views: Views, split: str) -> None:
 def _check_masks(views: Views, split: str, warnings: list[str]) -> None:
     if not views.has_masks:
         return
-    covered = views.masks.any((1, 2))
+    covered = views.coverage > 0.0
     if not covered.any():
         raise SceneError(
             f"the mask of every {split} view is empty (no alpha above {COVERED}); check the alpha "
@@ -384,24 +384,9 @@ def _check_masks(views: Views, split: str, warnings: list[str]) -> None:
         )
     if not covered.all():
         empty = [name for name, has in zip(views.names, covered, strict=True) if not has]
-        warnings.append(f"{split}: the mask of {len(empty)} views is empty, {_some(empty)}")
+        warnings.append(f"{split}: the mask of {len(empty)} views is empty, {some_names(empty)}")
     if (views.coverage == 1.0).all():
         warnings.append(f"{split}: every mask is full; the images may not be cut out at all")
-
-
-def _check_colors(views: Views, split: str, warnings: list[str]) -> None:
-    """Warn of single photographs that show the object in one even colour."""
-    covered = views.masks if views.valid is None else views.masks & (views.valid > 0)
-    even = []
-    for name, image, inside in zip(views.names, views.images, covered, strict=True):
-        colors = image[inside][:, :3]
-        if len(colors) and np.ptp(colors, axis=0).max() <= _EVEN:
-            even.append(name)
-    if 0 < len(even) < 0.5 * len(views):
-        warnings.append(
-            f"{split}: the object has one even colour in {len(even)} views, {_some(even)}; such a "
-            "photograph is most likely empty or damaged"
-        )
 
 
 def _check_sides(views: Views, bounds: tuple[np.ndarray, np.ndarray], warnings: list[str]) -> None:
@@ -429,9 +414,9 @@ def _check_cameras_outside(views: Views, bounds: tuple[np.ndarray, np.ndarray]) 
                 "images are cut out: their alpha channel, or the mask files"
             )
         raise SceneError(
-            f"{len(names)} cameras are inside the object's bounds, {_some(names)} (the first at "
-            f"{_numbers(centers[inside][0])}, bounds {_numbers(lo)} to {_numbers(hi)}); check the "
-            "scale of the poses, or give tighter bounds"
+            f"{len(names)} cameras are inside the object's bounds, {some_names(names)} (the first "
+            f"at {_numbers(centers[inside][0])}, bounds {_numbers(lo)} to {_numbers(hi)}); check "
+            "the scale of the poses, or give tighter bounds"
         )
 
 
@@ -454,10 +439,6 @@ def _spread(frames: Sequence[Frame], limit: int | None, name: str) -> Sequence[F
         raise SceneError(f"{name} must be at least 1, got {limit}")
     chosen = np.round(np.linspace(0, len(frames) - 1, limit)).astype(int)
     return [frames[index] for index in chosen]
-
-
-def _some(names: Sequence[str], count: int = 3) -> str:
-    return ", ".join(names[:count]) + (", ..." if len(names) > count else "")
 
 
 def _numbers(values: np.ndarray) -> str:

@@ -6,16 +6,17 @@ both models turn back far outside the photograph they were fitted to, where they
 of it a second time; the plane ends there.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import map_coordinates
 
 _SAMPLES = 4096  # of the radius, to see where a polynomial turns back
 _WHOLE = 1.0 - 1e-3  # a sample that counts takes all of its weight from pixels that count
 _SMALLEST_ALPHA = 1e-6
+_ROWS_AT_ONCE = 16
 _INVERSIONS = 60
 _INVERTED = 0.02  # pixels that an inverted lens may be off
 _WIDEST = 2.0  # radii of the photograph, beyond which no pixel of it is looked for
@@ -116,19 +117,32 @@ class Lookup(NamedTuple):
     columns: Float[np.ndarray, "H W"]
     inside: Bool[np.ndarray, "H W"]
 
+    def part(self, rows: slice) -> "Lookup":
+        """Return some rows of it."""
+        return Lookup(self.rows[rows], self.columns[rows], self.inside[rows])
+
 
 def pinhole_lookup(
     distortion: Distortion, intrinsics: Float[np.ndarray, "3 3"], width: int, height: int
 ) -> Lookup:
     """Find the pixels of a pinhole with the same intrinsics and size in a photograph."""
     fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
-    x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)
-    radius = np.hypot(x, y)
-    shown_x, shown_y = distortion.distort(x, y)
-    columns, rows = fx * shown_x + cx, fy * shown_y + cy
-    inside = (columns >= 0.0) & (columns <= width) & (rows >= 0.0) & (rows <= height)
-    inside &= radius <= largest_radius(distortion, float(radius.max()))
-    return Lookup(rows, columns, inside)
+    across = (np.arange(width) + 0.5 - cx) / fx
+    along = (np.arange(height) + 0.5 - cy) / fy
+    reach = float(np.hypot(np.abs(across).max(), np.abs(along).max()))
+    limit = largest_radius(distortion, reach)
+    shape = (height, width)
+    found = Lookup(np.empty(shape), np.empty(shape), np.empty(shape, bool))
+    # A few rows at a time, as in `resample_at`.
+    for start in range(0, height, _ROWS_AT_ONCE):
+        part = found.part(slice(start, start + _ROWS_AT_ONCE))
+        x, y = np.meshgrid(across, along[start : start + _ROWS_AT_ONCE])
+        shown_x, shown_y = distortion.distort(x, y)
+        part.columns[:], part.rows[:] = fx * shown_x + cx, fy * shown_y + cy
+        inside = (part.columns >= 0.0) & (part.columns <= width)
+        inside &= (part.rows >= 0.0) & (part.rows <= height)
+        part.inside[:] = inside & (np.hypot(x, y) <= limit)
+    return found
 
 
 def photograph_lookup(
@@ -170,29 +184,65 @@ def resample(
     Colour of four-channel images is weighted by alpha, the last channel, as `images.downscale`
     does. Within half a pixel of the border, that of the last pixel is taken.
     """
-    has_alpha = pixels.shape[-1] == 4
     values = np.asarray(pixels, np.float32)
-    if has_alpha:
+    if values.shape[-1] == 4:
         values = np.concatenate([values[..., :3] * values[..., 3:], values[..., 3:]], -1)
-    # Pixel centres lie at + 0.5, array entries at integers.
-    where = np.stack([lookup.rows - 0.5, lookup.columns - 0.5])
-    where = np.where(lookup.inside, where, 0.0)
-    sampled = np.stack(
-        [
-            map_coordinates(values[..., channel], where, order=1, mode="nearest")
-            for channel in range(values.shape[-1])
-        ],
-        -1,
-    )
-    if has_alpha:
-        alpha = sampled[..., 3:]
-        covered = alpha > _SMALLEST_ALPHA
-        color = np.where(covered, sampled[..., :3] / np.where(covered, alpha, 1.0), 0.0)
-        sampled = np.concatenate([color, alpha], -1)
-    return np.where(lookup.inside[..., None], sampled, 0.0).astype(np.float32)
+    flat = values.reshape(-1, values.shape[-1])
+    return resample_at(lambda index: flat[index], values.shape, lookup)
 
 
-def resample_valid(valid: Bool[np.ndarray, "H W"], lookup: Lookup) -> Bool[np.ndarray, "H W"]:
+def resample_at(
+    pixels_at: Callable[[np.ndarray], np.ndarray], shape: tuple[int, ...], lookup: Lookup
+) -> Float[np.ndarray, "rows columns C"]:
+    """Sample as `resample` does what is not in memory as linear floats.
+
+    Parameters
+    ----------
+    pixels_at : makes the values (..., C) at indices of the flattened image; colour of four channels
+        is multiplied by alpha.
+    shape : of the image, (H, W, C).
+    lookup : where to sample.
+    """
+    sampled = np.zeros((*lookup.rows.shape, shape[-1]), np.float32)
+    # A few rows at a time: what a pass makes then stays in the cache.
+    for start in range(0, len(sampled), _ROWS_AT_ONCE):
+        rows = slice(start, start + _ROWS_AT_ONCE)
+        part = _bilinear(pixels_at, shape, lookup.rows[rows], lookup.columns[rows])
+        if shape[-1] == 4:
+            covered = part[..., 3:] > _SMALLEST_ALPHA
+            divisor = np.where(covered, part[..., 3:], 1.0)
+            part[..., :3] = np.where(covered, part[..., :3] / divisor, 0.0)
+        sampled[rows] = np.where(lookup.inside[rows, :, None], part, 0.0)
+    return sampled
+
+
+def _bilinear(
+    pixels_at: Callable[[np.ndarray], np.ndarray],
+    shape: tuple[int, ...],
+    rows: Float[np.ndarray, "h w"],
+    columns: Float[np.ndarray, "h w"],
+) -> Float[np.ndarray, "h w C"]:
+    """Sample at pixel coordinates, whose centres lie at + 0.5; beyond the border, its pixels."""
+    height, width = shape[:2]
+    row = np.clip(rows - 0.5, 0.0, height - 1.0)
+    column = np.clip(columns - 0.5, 0.0, width - 1.0)
+    top = np.minimum(row.astype(np.int64), max(height - 2, 0))
+    left = np.minimum(column.astype(np.int64), max(width - 2, 0))
+    down = (row - top).astype(np.float32)[..., None]
+    right = (column - left).astype(np.float32)[..., None]
+    corner = top * width + left
+    step, below = min(1, width - 1), width * min(1, height - 1)
+    upper = pixels_at(corner) * (1.0 - right) + pixels_at(corner + step) * right
+    corner += below
+    lower = pixels_at(corner) * (1.0 - right) + pixels_at(corner + step) * right
+    return upper * (1.0 - down) + lower * down
+
+
+def resample_valid(
+    valid: Bool[np.ndarray, "H W"], lookup: Lookup
+) -> Bool[np.ndarray, "rows columns"]:
     """Tell which pixels are sampled from pixels that count only."""
+    if valid.all():
+        return lookup.inside
     weights = resample(valid[..., None].astype(np.float32), lookup)[..., 0]
     return weights >= _WHOLE

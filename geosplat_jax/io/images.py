@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import OpenImageIO as oiio
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from geosplat_jax.core.color import linear_to_srgb, srgb_to_linear
 from geosplat_jax.io.memory import Need, memory_refusal
@@ -114,12 +114,31 @@ def read_image(path: str | Path) -> Float[np.ndarray, "H W C"]:
     ------
     MissingFileError, ImageReadError
     """
+    stored = read_stored(path)
+    if stored.dtype == np.float32:
+        return stored
+    return decoding_table(stored.dtype, is_srgb=False)[stored]
+
+
+def read_stored(path: str | Path) -> Shaped[np.ndarray, "H W C"]:
+    """Read an image in the numbers of its file, which `decoding_table` turns into values.
+
+    Returns
+    -------
+    (H, W, C) uint8 or uint16 where the file has such numbers; of any other file float32, as
+    `read_image` returns it.
+
+    Raises
+    ------
+    MissingFileError, ImageReadError
+    """
     path = Path(path)
     source = _opened(path)
     try:
-        layout = _layout(source.spec())
+        spec = source.spec()
+        layout = _layout(spec)
         _require_room_for(layout, path)
-        pixels = source.read_image(format=oiio.FLOAT)
+        pixels = source.read_image(format=_numbers_of(spec))
         problem = source.geterror()
     finally:
         source.close()
@@ -128,7 +147,27 @@ def read_image(path: str | Path) -> Float[np.ndarray, "H W C"]:
             f"{path} is damaged or truncated ({_one_line(problem)}); replace the file"
         )
     _require_plain(layout, path)
-    return np.ascontiguousarray(pixels, np.float32)
+    return np.ascontiguousarray(pixels)
+
+
+def _numbers_of(spec: Any) -> Any:
+    """Choose the numbers to read an image in: its own if they are 8 or 16 bits, else floats."""
+    own = spec.format.basetype
+    is_coded = own in (oiio.UINT8, oiio.UINT16) and not spec.channelformats
+    return own if is_coded else oiio.FLOAT
+
+
+@cache
+def decoding_table(numbers: np.dtype, *, is_srgb: bool) -> Float[np.ndarray, " N"]:
+    """Tabulate the value of every number of an integer image: linear light, or [0, 1] as it is.
+
+    ``numbers`` : uint8 or uint16.
+    """
+    largest = np.iinfo(numbers).max
+    values = np.arange(largest + 1, dtype=np.float32) * np.float32(1.0 / largest)
+    table = decode_srgb(values) if is_srgb else values
+    table.setflags(write=False)
+    return table
 
 
 _COPIES_READING = 3
@@ -213,16 +252,32 @@ def read_linear(path: str | Path, *, is_srgb: bool | None = None) -> Float[np.nd
     MissingFileError, ImageReadError
     SceneError : a pixel is negative, NaN or infinite.
     """
-    path = Path(path)
-    pixels = read_image(path)
-    _require_radiance(pixels, path)
-    colors = _color_channels(pixels)
-    if path.suffix.lower() == ".exr" and colors < pixels.shape[-1]:
-        pixels[..., :colors] = _unpremultiplied(pixels[..., :colors], pixels[..., colors:])
+    return linear_values(read_stored(path), Path(path), is_srgb=is_srgb)
+
+
+def linear_values(
+    stored: Shaped[np.ndarray, "H W C"], path: Path, *, is_srgb: bool | None = None
+) -> Float[np.ndarray, "H W C"]:
+    """Turn what `read_stored` read from ``path`` into linear values; see `read_linear`."""
     if is_srgb is None:
         is_srgb = path.suffix.lower() not in LINEAR_FORMATS
+    colors = _color_channels(stored)
+    if stored.dtype != np.float32:
+        return _decoded(stored, colors, is_srgb)
+    pixels = stored
+    _require_radiance(pixels, path)
+    if path.suffix.lower() == ".exr" and colors < pixels.shape[-1]:
+        pixels[..., :colors] = _unpremultiplied(pixels[..., :colors], pixels[..., colors:])
     if is_srgb:
         pixels[..., :colors] = decode_srgb(pixels[..., :colors])
+    return pixels
+
+
+def _decoded(stored: np.ndarray, colors: int, is_srgb: bool) -> Float[np.ndarray, "H W C"]:
+    """Look up the values of an integer image; alpha, after the colours, is stored as it is."""
+    pixels = np.empty(stored.shape, np.float32)
+    pixels[..., :colors] = decoding_table(stored.dtype, is_srgb=is_srgb)[stored[..., :colors]]
+    pixels[..., colors:] = decoding_table(stored.dtype, is_srgb=False)[stored[..., colors:]]
     return pixels
 
 

@@ -213,10 +213,7 @@ def agreement_with_views(points: Float[np.ndarray, "P 3"], views: Views) -> floa
     around points and mask; the mean over some views. The second factor is left out without masks.
     """
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _VIEWS)).astype(int))
-    masks = views.masks[chosen]
-    return float(
-        np.mean([_fills(points, views, int(v), m) for v, m in zip(chosen, masks, strict=True)])
-    )
+    return float(np.mean([_fills(points, views, v, views.mask(v)) for v in map(int, chosen)]))
 
 
 def _fills(points: np.ndarray, views: Views, view: int, mask: np.ndarray) -> float:

@@ -3,8 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 
+from geosplat_jax.io.photographs import Marks, Photographs
 from geosplat_jax.io.views import Views
 
 MARGIN = 16
@@ -34,41 +35,39 @@ def around_object(views: Views, *, largest: float) -> tuple[Views, float]:
     """
     if not views.has_masks or largest <= 0.0:
         return views, 1.0
-    corners, size = _windows(views.images[..., 3] > 0.0)
+    corners, size = _windows(views)
     share = float(np.prod(size)) / (views.height * views.width)
     if share > largest:
         return views, 1.0
     height, width = (int(length) for length in size)
-
-    def cut(images: np.ndarray) -> np.ndarray:
-        found = np.empty((len(views), height, width, *images.shape[3:]), images.dtype)
-        for index, (row, column) in enumerate(corners):
-            found[index] = images[index, row : row + height, column : column + width]
-        return found
 
     intrinsics = views.intrinsics.copy()
     intrinsics[:, 0, 2] -= corners[:, 1]
     intrinsics[:, 1, 2] -= corners[:, 0]
     windows = replace(
         views,
-        images=cut(views.images),
+        images=Photographs.of(views.images).windows(corners, height, width),
         intrinsics=intrinsics,
-        valid=None if views.valid is None else cut(views.valid),
+        valid=None
+        if views.valid is None
+        else Marks.of_array(views.valid).windows(corners, height, width),
         truth={},
         relight={},
     )
     return windows, share
 
 
-def _windows(
-    covered: Bool[np.ndarray, "V H W"],
-) -> tuple[Int[np.ndarray, "V 2"], Int[np.ndarray, " 2"]]:
+def _windows(views: Views) -> tuple[Int[np.ndarray, "V 2"], Int[np.ndarray, " 2"]]:
     """Return the upper left corner of every window, and the size of all: rows, columns."""
-    corners = np.zeros((len(covered), 2), int)
+    corners = np.zeros((len(views), 2), int)
     size = np.zeros(2, int)
-    for axis in (0, 1):
-        length = covered.shape[1 + axis]
-        used = covered.any(axis=2 - axis)
+    used_rows = np.zeros((len(views), views.height), bool)
+    used_columns = np.zeros((len(views), views.width), bool)
+    for index, alpha in enumerate(views.alphas):
+        covered = alpha > 0.0
+        used_rows[index], used_columns[index] = covered.any(axis=1), covered.any(axis=0)
+    for axis, used in enumerate((used_rows, used_columns)):
+        length = used.shape[1]
         low = np.where(used.any(1), used.argmax(1), length // 2)
         high = np.where(used.any(1), length - used[:, ::-1].argmax(1), length // 2)
         widest = int((high - low).max(initial=0))

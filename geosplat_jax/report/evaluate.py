@@ -57,6 +57,11 @@ def _valid(views: Views, index: int) -> np.ndarray | None:
     return None if views.valid is None else views.valid[index]
 
 
+def _all_valid(views: Views) -> np.ndarray | None:
+    """Pixels of all views that count; None where all do."""
+    return None if views.valid is None else np.asarray(views.valid)
+
+
 def _view_metrics(
     view: RenderedView,
     image: np.ndarray,
@@ -136,20 +141,20 @@ def _material_metrics(
     protocol: Protocol, rendered: _Rendered, views: Views
 ) -> tuple[dict[str, Any], np.ndarray]:
     """Metrics of albedo, roughness and metallic where there is truth, and the albedo's scale."""
-    alpha, maps, mask = rendered.alpha, rendered.maps, views.images[..., 3]
+    alpha, maps, mask = rendered.alpha, rendered.maps, np.asarray(views.alphas)
     metrics: dict[str, Any] = {}
     scale = np.ones(3)
     if "albedo" in maps:
         truth = views.truth["albedo"] * mask[..., None]
         scale = protocols.albedo_scale(protocol, maps["albedo"], alpha, truth, mask)
         metrics |= protocols.albedo_metrics(
-            protocol, maps["albedo"], alpha, truth, mask, scale, views.valid
+            protocol, maps["albedo"], alpha, truth, mask, scale, _all_valid(views)
         )
         metrics |= {f"albedo.scale_{c}": float(x) for c, x in zip("rgb", scale, strict=True)}
     known = {name: views.truth[name][..., 0] * mask for name in _MATERIALS if name in maps}
     if known:
         found = {name: maps[name][..., 0] for name in known}
-        metrics |= protocols.material_metrics(found, alpha, known, mask, views.valid)
+        metrics |= protocols.material_metrics(found, alpha, known, mask, _all_valid(views))
     return metrics, scale
 
 
@@ -177,13 +182,14 @@ def _relight_metrics(
             relit = relit.under(lights[name])
         else:
             relit = renderer.relit(lights[name], albedo_scale=albedo_scale, indirect=indirect)
-        rgb, alpha = np.empty((*views.masks.shape, 3), np.float32), np.empty(views.masks.shape)
+        rgb = np.empty((*views.images.shape[:3], 3), np.float32)
+        alpha = np.empty(views.images.shape[:3])
         for index in counted(range(len(views)), f"under {name}", on_progress):
             view = relit(views.camera(np.array([index])))
             view = _where_counted(view, _valid(views, index))
             rgb[index], alpha[index] = view.rgb, view.alpha
         images = views.relight[name]
-        found = protocols.relight_metrics(protocol, rgb, alpha, images, views.valid)
+        found = protocols.relight_metrics(protocol, rgb, alpha, images, _all_valid(views))
         metrics |= {f"relight.{name}.{key}": value for key, value in found.items()}
         for row, index in zip(rows, chosen, strict=True):
             truth = photograph_on_white(images[index])

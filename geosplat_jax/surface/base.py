@@ -33,6 +33,11 @@ class SurfaceModel(eqx.Module):
     def box(self) -> Box:
         """The cube around the surface that fields are defined on."""
 
+    @property
+    def is_two_sided(self) -> bool:
+        """Whether fronts and backs are two surfaces at the same place (static)."""
+        return False
+
     @abc.abstractmethod
     def extract(self, shape: Any, *, capacities: Capacities, final: bool = False) -> Surface:
         """Build the mesh of a shape; differentiable in what moves its vertices.

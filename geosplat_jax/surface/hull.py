@@ -12,11 +12,12 @@ A view whose mask is empty is taken as a failed mask and ignored.
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Shaped
+from jaxtyping import Array, Bool, Float
 from scipy.ndimage import distance_transform_edt
 
 from geosplat_jax.core.types import Grid
@@ -39,10 +40,10 @@ _SEARCH_STEPS = 8
 def visual_hull(
     world_to_camera: Float[np.ndarray, "V 4 4"],
     intrinsics: Float[np.ndarray, "V 3 3"],
-    masks: Shaped[np.ndarray, "V H W"],
+    masks: Any,
     points: Float[np.ndarray, "N 3"],
     *,
-    valid: Shaped[np.ndarray, "V H W"] | None = None,
+    valid: Any = None,
     tolerance: float = TOLERANCE,
     seen_fraction: float = SEEN_FRACTION,
 ) -> Bool[np.ndarray, " N"]:
@@ -62,10 +63,10 @@ def visual_hull(
 def hull_distance(
     world_to_camera: Float[np.ndarray, "V 4 4"],
     intrinsics: Float[np.ndarray, "V 3 3"],
-    masks: Shaped[np.ndarray, "V H W"],
+    masks: Any,
     points: Float[np.ndarray, "N 3"],
     *,
-    valid: Shaped[np.ndarray, "V H W"] | None = None,
+    valid: Any = None,
     tolerance: float = TOLERANCE,
     seen_fraction: float = SEEN_FRACTION,
 ) -> Float[np.ndarray, " N"]:
@@ -74,7 +75,7 @@ def hull_distance(
     Parameters
     ----------
     world_to_camera : (V, 4, 4); intrinsics : (V, 3, 3) pixels.
-    masks : (V, H, W) bool, or coverage in [0, 1].
+    masks : (V, H, W) bool, or coverage in [0, 1]; an array, or what makes one view when indexed.
     points : (N, 3) world.
     valid : (V, H, W) pixels that count, 0 or 1; a view does not see what lies on the others.
     tolerance : a point is inside when the masks of all but ``floor(tolerance * V)`` views agree.
@@ -96,9 +97,9 @@ def hull_distance(
 def hull_bounds(
     world_to_camera: Float[np.ndarray, "V 4 4"],
     intrinsics: Float[np.ndarray, "V 3 3"],
-    masks: Shaped[np.ndarray, "V H W"],
+    masks: Any,
     *,
-    valid: Shaped[np.ndarray, "V H W"] | None = None,
+    valid: Any = None,
     margin: float = 0.02,
     tolerance: float = TOLERANCE,
     seen_fraction: float = SEEN_FRACTION,
@@ -124,7 +125,7 @@ def hull_bounds(
     """
     view = _Silhouettes(world_to_camera, intrinsics, masks, valid)
     settings = {"tolerance": tolerance, "seen_fraction": seen_fraction}
-    center, reach = _common_target(view, intrinsics, masks)
+    center, reach = _common_target(view, intrinsics)
     lo, hi = center - reach, center + reach
     for _ in range(_SEARCH_STEPS):
         points, cell = _box_points(lo, hi)
@@ -191,10 +192,10 @@ def sight_bounds(
 def hull_sdf(
     world_to_camera: Float[np.ndarray, "V 4 4"],
     intrinsics: Float[np.ndarray, "V 3 3"],
-    masks: Shaped[np.ndarray, "V H W"],
+    masks: Any,
     grid: Grid,
     *,
-    valid: Shaped[np.ndarray, "V H W"] | None = None,
+    valid: Any = None,
     tolerance: float = TOLERANCE,
     seen_fraction: float = SEEN_FRACTION,
 ) -> Float[np.ndarray, " G"]:
@@ -276,20 +277,24 @@ class _Silhouettes:
     """Views ready for lookup: distance images, and cameras recentred for float32."""
 
     def __init__(self, world_to_camera, intrinsics, masks, valid=None):
-        coverage = np.asarray(masks, np.float32)
-        used = (coverage > _COVERED).any((1, 2))
-        counts = None if valid is None else np.asarray(valid) > _COVERED
+        # One view after the other: photographs may be many and large.
+        factor = max(1, -(-max(masks.shape[1:]) // _MASK_PIXELS))
+        used, coverage, counts, centroids = np.zeros(len(masks), bool), [], [], []
+        for view, mask in enumerate(masks):
+            image = np.asarray(mask, np.float32)
+            used[view] = (image > _COVERED).any()
+            if not used[view]:
+                continue
+            centroids.append(_centroid(image))
+            if valid is not None:
+                known = np.asarray(valid[view]) > _COVERED
+                image = _continued(image, known)
+                counts.append(_reduced(known.astype(np.float32), factor) > _FULL)
+            coverage.append(_reduced(image, factor))
         if not used.any():
             raise ValueError("every mask is empty; check the alpha channel or the mask files")
-        factor = max(1, -(-max(coverage.shape[1:]) // _MASK_PIXELS))
-        coverage = coverage[used]
-        if counts is not None:
-            known = counts[used]
-            coverage = [_continued(*pair) for pair in zip(coverage, known, strict=True)]
-            counts = np.stack([_reduced(image, factor) for image in known.astype(np.float32)])
-            counts = counts > _FULL
-        coverage = np.stack([_reduced(image, factor) for image in coverage])
-        self.counts = counts
+        self.counts = np.stack(counts) if counts else None
+        self.centroids = np.stack(centroids)
         poses = np.asarray(world_to_camera, np.float64)[used]
         centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
         self.used = used
@@ -460,15 +465,19 @@ def meeting_point(
     return np.linalg.solve(matrix, np.einsum("vij,vj->i", across, centers))
 
 
-def _common_target(view: _Silhouettes, intrinsics, masks) -> tuple[np.ndarray, float]:
+def _centroid(coverage: Float[np.ndarray, "H W"]) -> Float[np.ndarray, " 2"]:
+    """Column and row of the middle of what is covered, in pixels."""
+    height, width = coverage.shape
+    total = coverage.sum()
+    column = coverage.sum(0) @ (np.arange(width) + 0.5) / total
+    row = coverage.sum(1) @ (np.arange(height) + 0.5) / total
+    return np.array([column, row])
+
+
+def _common_target(view: _Silhouettes, intrinsics) -> tuple[np.ndarray, float]:
     """Point nearest to the lines of sight through the masks' centroids, and how far to search."""
-    coverage = np.asarray(masks, np.float32)[view.used]
     pinhole = np.asarray(intrinsics, np.float64)[view.used]
-    rows = np.arange(coverage.shape[1]) + 0.5
-    columns = np.arange(coverage.shape[2]) + 0.5
-    total = coverage.sum((1, 2))
-    u = coverage.sum(1) @ columns / total
-    v = coverage.sum(2) @ rows / total
+    u, v = view.centroids.T
     sight = np.stack(
         [
             (u - pinhole[:, 0, 2]) / pinhole[:, 0, 0],

@@ -120,6 +120,11 @@ class TriangleMesh(SurfaceModel):
     cells: tuple[int, int, int] = eqx.field(static=True)
     is_sheet: bool = eqx.field(static=True)
 
+    @property
+    def is_two_sided(self) -> bool:
+        """Whether it is a sheet."""
+        return self.is_sheet
+
     @classmethod
     def of(
         cls,

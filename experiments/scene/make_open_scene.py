@@ -1,0 +1,160 @@
+"""Build an open scene, three objects on a ground, rendered by Mitsuba 3 in the TensoIR layout.
+
+    pip install 'geosplat_jax[scene]'
+    python experiments/scene/make_open_scene.py --output FOLDER
+
+writes `<output>/table/` and the environment maps beside it, as `make_scene.py` does for the duck.
+The ground has no thickness and the cameras stay above it, so that its true mesh, `mesh_gt.ply`, is
+open: what `train --mesh` takes and an isosurface cannot be.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import make_scene
+import numpy as np
+import scene_duck
+import trimesh
+
+NAME = "table"
+GROUND_RADIUS = 1.25
+"""Of the round ground; its middle is the origin."""
+SAVED_EDGE = 0.06
+"""Longest edge of the mesh on disk."""
+LOWEST, HIGHEST = 0.25, 0.95
+"""Sines of the elevations of training cameras."""
+
+Array = make_scene.Array
+
+
+def _ground() -> trimesh.Trimesh:
+    """Make a disc of rings of triangles, upward."""
+    rings, sectors = 24, 96
+    angle = 2 * np.pi * np.arange(sectors) / sectors
+    around = np.stack([np.cos(angle), np.sin(angle), np.zeros(sectors)], -1)
+    radii = GROUND_RADIUS * np.arange(1, rings + 1) / rings
+    vertices = np.concatenate([np.zeros((1, 3)), *(radius * around for radius in radii)])
+    here = np.arange(sectors)
+    after = (here + 1) % sectors
+    faces = [np.stack([np.zeros(sectors, int), 1 + here, 1 + after], -1)]
+    for ring in range(rings - 1):
+        low, high = 1 + ring * sectors, 1 + (ring + 1) * sectors
+        faces.append(np.stack([low + here, high + here, high + after], -1))
+        faces.append(np.stack([low + here, high + after, low + after], -1))
+    return trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
+
+
+def _box() -> trimesh.Trimesh:
+    """Make a box that stands on the ground, with edges of its own for every face."""
+    body = trimesh.creation.box(extents=(0.5, 0.4, 0.7))
+    turn = trimesh.transformations.rotation_matrix(0.5, [0, 0, 1], point=[0, 0, 0])
+    body.apply_transform(turn)
+    body.apply_translation([0.45, 0.35, 0.33])
+    sides = [body.submesh([facet], append=True) for facet in body.facets]
+    return trimesh.util.concatenate([side.subdivide().subdivide().subdivide() for side in sides])
+
+
+def _ball() -> trimesh.Trimesh:
+    body = trimesh.creation.icosphere(subdivisions=4, radius=0.36)
+    body.apply_translation([-0.5, 0.2, 0.34])
+    return body
+
+
+def _ring() -> trimesh.Trimesh:
+    body = trimesh.creation.torus(0.3, 0.12, major_sections=72, minor_sections=36)
+    body.apply_translation([0.1, -0.55, 0.1])
+    return body
+
+
+def _paint(points: Array, albedo: Array, roughness: float, metallic: float):
+    count = len(points)
+    return scene_duck.Materials(
+        albedo=np.broadcast_to(np.asarray(albedo, np.float32), (count, 3)).copy(),
+        roughness=np.full(count, roughness, np.float32),
+        metallic=np.full(count, metallic, np.float32),
+    )
+
+
+def _ground_albedo(points: Array) -> Array:
+    """Soft stripes, as fine as the vertices can show."""
+    wave = 0.5 + 0.5 * np.sin(9.0 * points[:, :1]) * np.sin(9.0 * points[:, 1:2])
+    return (wave * [0.62, 0.56, 0.45] + (1 - wave) * [0.16, 0.25, 0.30]).astype(np.float32)
+
+
+def parts() -> list[tuple[trimesh.Trimesh, scene_duck.Materials]]:
+    """Return every part and its materials at the vertices."""
+    ground, box, ball, ring = _ground(), _box(), _ball(), _ring()
+    return [
+        (ground, _paint(ground.vertices, _ground_albedo(np.asarray(ground.vertices)), 0.6, 0.0)),
+        (box, _paint(box.vertices, [0.55, 0.10, 0.08], 0.5, 0.0)),
+        (ball, _paint(ball.vertices, [0.90, 0.72, 0.38], 0.25, 1.0)),
+        (ring, _paint(ring.vertices, [0.07, 0.22, 0.55], 0.35, 0.0)),
+    ]
+
+
+def write_scene_mesh(path: Path) -> None:
+    """Write all parts with normals and materials, for Mitsuba."""
+    bodies, surfaces = zip(*parts(), strict=True)
+    starts = np.cumsum([0, *(len(body.vertices) for body in bodies)])
+    make_scene.write_mesh(
+        path,
+        np.concatenate([body.vertices for body in bodies]).astype(np.float32),
+        np.concatenate([body.vertex_normals for body in bodies]).astype(np.float32),
+        np.concatenate([body.faces + start for body, start in zip(bodies, starts, strict=False)]),
+        scene_duck.Materials(
+            *(
+                np.concatenate([getattr(surface, name) for surface in surfaces])
+                for name in ("albedo", "roughness", "metallic")
+            )
+        ),
+    )
+
+
+def write_true_mesh(path: Path) -> None:
+    """Write the mesh to start from and to compare with: all parts, with short edges."""
+    whole = trimesh.util.concatenate([body for body, _ in parts()])
+    vertices, faces = trimesh.remesh.subdivide_to_size(whole.vertices, whole.faces, SAVED_EDGE)
+    trimesh.Trimesh(vertices, faces, process=False).export(path)
+
+
+def views_above(count: int, first_seed: int, name: str, turn: float) -> list[make_scene.View]:
+    """Spread cameras over the part of the sphere that is above the ground."""
+    golden = np.pi * (3.0 - np.sqrt(5.0))
+    heights = LOWEST + (HIGHEST - LOWEST) * (np.arange(count) + 0.5) / count
+    return [
+        make_scene.View(
+            f"{name}_{i:03d}",
+            make_scene.look_at_origin(make_scene.position(golden * i + turn, h)),
+            first_seed + i,
+        )
+        for i, h in enumerate(heights)
+    ]
+
+
+def build(args: argparse.Namespace) -> Path:
+    """Render the whole scene and return its folder."""
+    folder = args.output / NAME
+    folder.mkdir(parents=True, exist_ok=True)
+    lights = make_scene.write_lights(args.output)
+    train = views_above(args.views, 1000, "train", 0.0)
+    test = views_above(args.test_views, 2000, "test", 1.0)
+    write_true_mesh(folder / "mesh_gt.ply")
+    make_scene.render_all(folder, train, test, lights, args, write_scene_mesh)
+    return folder
+
+
+def main() -> None:
+    """Parse the command line and build the scene."""
+    parser = make_scene.parser(__doc__)
+    parser.set_defaults(views=32, test_views=6, spp=100, output=Path("scenes"))
+    args = parser.parse_args()
+    start = time.perf_counter()
+    print(make_scene.choose_variant(args.variant))
+    print(f"{build(args)}: {time.perf_counter() - start:.0f} s")
+
+
+if __name__ == "__main__":
+    main()

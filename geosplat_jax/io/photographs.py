@@ -1,0 +1,361 @@
+"""Many photographs in little memory: the numbers of their files, decoded view by view.
+
+Of every photograph the rectangle is kept that is not empty. A photograph of 8 or 16 bits that is
+neither reduced nor undistorted keeps the numbers of its file, any other one floats, so nothing is
+rounded. Where all of that is more than a given number of bytes, the colours of the views after
+it are read again from their files whenever they are asked for; what tells the object from the rest
+always stays.
+"""
+
+import threading
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+
+from geosplat_jax.io.images import decoding_table
+
+_FLOAT_BYTES = 4
+
+
+@dataclass(frozen=True)
+class Part:
+    """What is not empty of one photograph.
+
+    Attributes
+    ----------
+    top, left : of the rectangle in the photograph.
+    color : (h, w, 3) numbers of the file (sRGB), or linear float32; zero where alpha is.
+    alpha : (h, w) likewise; numbers of a file are linear.
+    """
+
+    top: int
+    left: int
+    color: Shaped[np.ndarray, "h w 3"]
+    alpha: Shaped[np.ndarray, "h w"]
+
+    @classmethod
+    def of(cls, color: Shaped[np.ndarray, "H W 3"], alpha: Shaped[np.ndarray, "H W"]) -> "Part":
+        """Cut out the rectangle around what is covered; copies, so that the rest can go."""
+        top, bottom = _reach((alpha > 0).any(axis=1))
+        left, right = _reach((alpha > 0).any(axis=0))
+        inside = slice(top, bottom), slice(left, right)
+        kept = alpha[inside]
+        if kept.size and kept.min() == kept.max():
+            kept = np.broadcast_to(kept.flat[0].copy(), kept.shape)  # takes no memory
+        else:
+            kept = kept.copy()
+        return cls(top, left, color[inside].copy(), kept)
+
+
+def _reach(used: Bool[np.ndarray, " N"]) -> tuple[int, int]:
+    """First used entry, and the one after the last; (0, 0) where none is."""
+    if not used.any():
+        return 0, 0
+    return int(used.argmax()), int(used.size - used[::-1].argmax())
+
+
+@dataclass(frozen=True)
+class _Packed:
+    """A part in memory; ``color`` is None where the file is read again, and alpha then is deflated.
+
+    ``numbers`` : kind of the numbers of alpha.
+    """
+
+    top: int
+    left: int
+    shape: tuple[int, int]
+    numbers: np.dtype
+    color: np.ndarray | None
+    alpha: np.ndarray | bytes
+
+    @classmethod
+    def of(cls, part: Part, *, keeps_color: bool) -> "_Packed":
+        alpha = part.alpha
+        common = (part.top, part.left, alpha.shape, alpha.dtype)
+        if keeps_color or not any(alpha.strides):
+            return cls(*common, part.color if keeps_color else None, alpha)
+        return cls(*common, None, zlib.compress(alpha.tobytes(), 1))
+
+    @property
+    def byte_count(self) -> int:
+        """Memory that is taken."""
+        color = 0 if self.color is None else self.color.nbytes
+        if isinstance(self.alpha, bytes):
+            return color + len(self.alpha)
+        return color + (self.alpha.nbytes if any(self.alpha.strides) else 0)
+
+    def unpacked_alpha(self) -> np.ndarray:
+        if not isinstance(self.alpha, bytes):
+            return self.alpha
+        return np.frombuffer(zlib.decompress(self.alpha), self.numbers).reshape(self.shape)
+
+
+class PartsInMemory:
+    """Gathers the parts of photographs, from any thread, until their colours take too much memory.
+
+    Attributes
+    ----------
+    most_bytes : that colours may take; of later photographs alpha alone is kept.
+    """
+
+    def __init__(self, count: int, most_bytes: int):
+        self.most_bytes = most_bytes
+        self._packed: list[_Packed | None] = [None] * count
+        self._lock, self._taken = threading.Lock(), 0
+
+    def add(self, index: int, part: Part) -> None:
+        """Take the part of a view."""
+        with self._lock:
+            fits = self._taken + part.color.nbytes <= self.most_bytes
+            self._taken += part.color.nbytes if fits else 0
+        self._packed[index] = _Packed.of(part, keeps_color=fits)
+
+    def photographs(
+        self, height: int, width: int, read: Callable[[int], Part], *, threads: int
+    ) -> "Photographs":
+        """Return the photographs, all of whose parts were added.
+
+        ``read`` : reads the part of a view again, by so many threads at most.
+        """
+        packed = [part for part in self._packed if part is not None]
+        count = len(self._packed)
+        assert len(packed) == count, "a view was not added"
+        corners = np.zeros((count, 2), int)
+        return Photographs((count, height, width, 4), None, packed, read, corners, threads)
+
+
+class _Stack:
+    """What behaves like an array of V things that are made when they are asked for."""
+
+    shape: tuple[int, ...]
+    dtype = np.dtype(np.float32)
+
+    def _make(self, index: int) -> np.ndarray:
+        """Make the thing of a view."""
+        raise NotImplementedError
+
+    def _make_all(self, indices: Sequence[int]) -> list[np.ndarray]:
+        return [self._make(index) for index in indices]
+
+    @property
+    def ndim(self) -> int:
+        """Number of axes."""
+        return len(self.shape)
+
+    def __len__(self) -> int:
+        """Count the views."""
+        return self.shape[0]
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        """Make one after the other."""
+        return (self._make(index) for index in range(len(self)))
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """Make all of them."""
+        if copy is False:
+            raise ValueError("the array is made anew, so it is always a copy")
+        made = self[:]
+        return made if dtype is None else made.astype(dtype)
+
+    def __getitem__(self, key: Any) -> np.ndarray:
+        """Make one view, or some, as an array does; further indices are applied to those."""
+        first, rest = (key[0], key[1:]) if isinstance(key, tuple) and key else (key, ())
+        if isinstance(first, int | np.integer):
+            index = range(len(self))[first]
+            return self._make(index)[rest] if rest else self._make(index)
+        is_list = not rest and first is not Ellipsis and np.ndim(first) == 1
+        if isinstance(first, slice) or is_list:
+            chosen = np.arange(len(self))[first]
+            made = self._make_all([int(index) for index in chosen])
+            views = np.stack(made) if made else np.empty((0, *self.shape[1:]), np.float32)
+            return views[(slice(None), *rest)] if rest else views
+        return self[:][key]
+
+
+@dataclass(frozen=True, eq=False)
+class Photographs(_Stack):
+    """V photographs of one size, (V, H, W, 4) float32 linear RGB with straight alpha when asked.
+
+    Indexing with a number, a list or a slice makes the arrays of those views; `numpy.asarray`
+    makes all of them.
+
+    Attributes
+    ----------
+    shape : (V, H, W, 4).
+    divisors : (V, 3) that colours are divided by; None for one.
+    """
+
+    shape: tuple[int, int, int, int]
+    divisors: Float[np.ndarray, "V 3"] | None
+    _packed: Sequence[_Packed]
+    _read: Callable[[int], Part] | None
+    _corners: Int[np.ndarray, "V 2"]
+    _threads: int = 1
+
+    @classmethod
+    def of(cls, images: "Images") -> "Photographs":
+        """Return images as photographs; an array is looked at and not copied."""
+        if isinstance(images, Photographs):
+            return images
+        packed = tuple(
+            _Packed(0, 0, image.shape[:2], image.dtype, image[..., :3], image[..., 3])
+            for image in images
+        )
+        shape: Any = images.shape
+        return cls(shape, None, packed, None, np.zeros((len(images), 2), int))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that is taken."""
+        return sum(part.byte_count for part in self._packed)
+
+    @property
+    def read_again_count(self) -> int:
+        """Count the views whose colours do not stay in memory."""
+        return sum(part.color is None for part in self._packed)
+
+    @property
+    def alphas(self) -> "Alphas":
+        """Alpha of the views, one by one."""
+        return Alphas(self)
+
+    def windows(self, corners: Int[np.ndarray, "V 2"], height: int, width: int) -> "Photographs":
+        """Look at a part of every photograph; nothing is copied.
+
+        Parameters
+        ----------
+        corners : (V, 2) row and column of the upper left pixels. height, width : of all parts.
+        """
+        shape = (len(self), height, width, 4)
+        return replace(self, shape=shape, _corners=self._corners + corners)
+
+    def divided(self, factors: Float[np.ndarray, "V 3"]) -> "Photographs":
+        """Divide colours by factors of every view and channel; alpha is not."""
+        before = 1.0 if self.divisors is None else self.divisors
+        return replace(self, divisors=before * factors)
+
+    def _placed(self, index: int, out: np.ndarray, values: np.ndarray) -> None:
+        """Lay values of the part of a view where they are in its window."""
+        packed, (row, column) = self._packed[index], self._corners[index]
+        top, left = packed.top - int(row), packed.left - int(column)
+        height, width = packed.shape
+        rows = slice(max(top, 0), max(min(top + height, self.shape[1]), 0))
+        columns = slice(max(left, 0), max(min(left + width, self.shape[2]), 0))
+        part = values[
+            max(rows.start - top, 0) : max(rows.stop - top, 0),
+            max(columns.start - left, 0) : max(columns.stop - left, 0),
+        ]
+        if part.size:
+            is_color = part.ndim == 3
+            out[rows, columns] = values_of(part, is_srgb=is_color)
+
+    def _make(self, index: int) -> Float[np.ndarray, "H W 4"]:
+        packed = self._packed[index]
+        image = np.zeros(self.shape[1:], np.float32)
+        color = packed.color
+        if color is None:
+            assert self._read is not None
+            color = self._read(index).color
+        self._placed(index, image[..., :3], color)
+        self._placed(index, image[..., 3], packed.unpacked_alpha())
+        if self.divisors is not None:
+            image[..., :3] /= self.divisors[index].astype(np.float32)
+        return image
+
+    def _make_all(self, indices: Sequence[int]) -> list[np.ndarray]:
+        from_files = sum(self._packed[index].color is None for index in indices)
+        if from_files < 2:
+            return super()._make_all(indices)
+        with ThreadPoolExecutor(max_workers=self._threads) as pool:
+            return list(pool.map(self._make, indices))
+
+    def alpha(self, index: int) -> Float[np.ndarray, "H W"]:
+        """Make the alpha of one view; its file is not read again."""
+        alpha = np.zeros(self.shape[1:3], np.float32)
+        self._placed(index, alpha, self._packed[index].unpacked_alpha())
+        return alpha
+
+
+def values_of(numbers: np.ndarray, *, is_srgb: bool) -> np.ndarray:
+    """Return the values that numbers of a file stand for; floats are values already.
+
+    ``is_srgb`` : whether they are colours, which files of integers encode.
+    """
+    if numbers.dtype.kind == "f":
+        return numbers
+    return np.take(decoding_table(numbers.dtype, is_srgb=is_srgb), numbers)
+
+
+@dataclass(frozen=True, eq=False)
+class Alphas(_Stack):
+    """Alpha of V photographs, (V, H, W) float32 when asked."""
+
+    photographs: Photographs
+    shape: tuple[int, int, int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Take the size over."""
+        object.__setattr__(self, "shape", self.photographs.shape[:3])
+
+    def _make(self, index: int) -> np.ndarray:
+        return self.photographs.alpha(index)
+
+
+def pack_marks(marks: Bool[np.ndarray, "H W"]) -> Shaped[np.ndarray, "H bytes"] | None:
+    """Pack an image of zeros and ones into bits; None where all are one."""
+    return None if marks.all() else np.packbits(marks, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Marks(_Stack):
+    """V images of zeros and ones, (V, H, W) float32 when asked; a bit each in memory."""
+
+    shape: tuple[int, int, int]
+    _bits: Sequence[np.ndarray]
+    _width: int
+    _corners: Int[np.ndarray, "V 2"]
+
+    @classmethod
+    def of(
+        cls, bits: Sequence[Shaped[np.ndarray, "H bytes"] | None], height: int, width: int
+    ) -> "Marks | None":
+        """Return images that `pack_marks` packed, None for all ones; None where all images are."""
+        if all(image is None for image in bits):
+            return None
+        ones = np.broadcast_to(np.uint8(255), (height, -(-width // 8)))
+        images = [ones if image is None else image for image in bits]
+        corners = np.zeros((len(bits), 2), int)
+        return cls((len(bits), height, width), images, width, corners)
+
+    @classmethod
+    def of_array(cls, marks: "np.ndarray | Marks") -> "Marks":
+        """Return images of zeros and ones, (V, H, W), packed."""
+        if isinstance(marks, Marks):
+            return marks
+        bits = [np.packbits(image > 0, axis=1) for image in marks]
+        return cls(marks.shape, bits, marks.shape[2], np.zeros((len(marks), 2), int))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that is taken."""
+        return sum(bits.nbytes for bits in self._bits if any(bits.strides))
+
+    def windows(self, corners: Int[np.ndarray, "V 2"], height: int, width: int) -> "Marks":
+        """Look at a part of every image, which holds it; see `Photographs.windows`."""
+        shape = (len(self), height, width)
+        return replace(self, shape=shape, _corners=self._corners + corners)
+
+    def _make(self, index: int) -> Float[np.ndarray, "H W"]:
+        (row, column), (height, width) = self._corners[index], self.shape[1:]
+        rows = self._bits[index][row : row + height]
+        whole = np.unpackbits(rows, axis=1, count=self._width)
+        return whole[:, column : column + width].astype(np.float32)
+
+
+Images = np.ndarray | Photographs
+"""(V, H, W, 4) linear RGB with straight alpha."""
