@@ -15,6 +15,12 @@ from test_sweeps import SWEEPS, Fakes, _arguments, _write  # noqa: E402
 
 from geosplat_jax.fit.config import Stage  # noqa: E402
 
+try:
+    # Here and not within a test: it takes the streams of its log when it is imported.
+    import submitit
+except ImportError:
+    submitit = None
+
 SWEEP = """
 title = "A trade"
 quality = "draft"
@@ -245,9 +251,9 @@ if job["evaluate"]:
 """
 
 
+@pytest.mark.skipif(submitit is None, reason="submitit is not installed")
 def test_runs_on_a_cluster_wait_for_their_sources_and_go_on(tmp_path, capsys, monkeypatch):
     """By submitit's local executor; what a job does is replaced by a script."""
-    pytest.importorskip("submitit")
     _write(tmp_path, SWEEP)
     script = tmp_path / "job.py"
     script.write_text(FAKE_JOB)
