@@ -591,6 +591,11 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
+def command_of(job: Job) -> list[str]:
+    """Return the command that executes a job."""
+    return [sys.executable, str(Path(__file__).resolve()), "--job", json.dumps(asdict(job))]
+
+
 def in_a_process(job: Job) -> None:
     """Execute a job in a process of its own, which gives all memory back.
 
@@ -601,7 +606,7 @@ def in_a_process(job: Job) -> None:
     KeyboardInterrupt
         After Ctrl-C, once the process has written its checkpoint; a second one ends it at once.
     """
-    command = [sys.executable, str(Path(__file__).resolve()), "--job", json.dumps(asdict(job))]
+    command = command_of(job)
     tail: deque[str] = deque(maxlen=60)
     # A session of its own: the terminal's Ctrl-C would otherwise reach it beside ours, and the
     # second request makes training stop without a checkpoint.
@@ -730,8 +735,7 @@ def run_on_cluster(jobs: list[Job], executor: Any, *, parallel: int) -> list[Job
                     _note_failure(job, f"the stages to take over failed; see ../{name}/error.txt")
                     failed.append(job)
                 else:
-                    command = [sys.executable, str(Path(__file__).resolve()), "--job"]
-                    submitted = cluster.submit(executor, [*command, json.dumps(asdict(job))])
+                    submitted = cluster.submit(executor, command_of(job))
                     running[job.label] = (job, submitted)
                     _say(f"{head}: submitted as {submitted.job_id}")
             for label, (job, submitted) in list(running.items()):

@@ -67,7 +67,7 @@ def stage_times(scene: Path) -> dict[str, tuple[float, float, float]]:
                 seconds = [line["seconds"] for line in own]
                 name = _identity(config, number, record["dataset"].get("downscale", 1))
                 steady = stage.steps * statistics.median(seconds)
-                memory = max(line["peak_memory_mb"] for line in own)
+                memory = max(line.get("peak_memory_mb", 0) for line in own)
                 found[name] = (sum(seconds), steady, memory)
     return found
 
@@ -157,7 +157,8 @@ def knob_tables(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]
                 continue
             more = [one.seconds / other.seconds for one, other in pairs]
             row.append(f"×{statistics.fmean(more):.2f}")
-            row.append(f"×{statistics.fmean(a.memory_mb / b.memory_mb for a, b in pairs):.2f}")
+            known = [a.memory_mb / b.memory_mb for a, b in pairs if b.memory_mb]
+            row.append(f"×{statistics.fmean(known):.2f}" if known else _NONE)
             for name in sweep["figures"]:
                 nan = math.nan
                 change = [a.figures.get(name, nan) - b.figures.get(name, nan) for a, b in pairs]

@@ -41,10 +41,12 @@ def test_a_corner_is_refused_before_anything_is_spent_where_it_has_to_be(corner,
     [
         pytest.param(
             (
-                "geometry.resolution=4",
+                "geometry.resolution=5",
                 "material.grid.levels=1",
                 "material.grid.features=1",
                 "material.grid.log2_entries=1",
+                "material.grid.coarsest=1",
+                "material.grid.finest=1",
                 "light.height=1",
                 "light.width=2",
                 "raster.tile_size=1",

@@ -83,7 +83,11 @@ def test_a_refusal_names_the_largest_needs_first(machine):
         (("light.width=8192", "light.height=4096"), "light"),
         (("objective.smoothness_samples=1000000000",), "objective.smoothness_samples"),
         (
-            ("geometry.resolution=128", "stages.monte_carlo.transport.light_count=4096"),
+            (
+                "geometry.resolution=128",
+                "stages.monte_carlo.transport.light_count=4096",
+                "stages.monte_carlo.transport.diffuse_count=4096",
+            ),
             r"stages.*.transport.*_count",
         ),
     ],

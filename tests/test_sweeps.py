@@ -144,7 +144,7 @@ def _run(folder, fakes, *more):
         ('name = "coarse"', 'name = ".."', "'..' is no folder name"),
         ('name = "coarse"', 'name = "coarse"\nsets = []', "unknown key 'sets'"),
         ("geometry.resolution=8", "geometry.resolutoin=8", "run 'coarse': unknown setting"),
-        ("geometry.resolution=8", "geometry.resolution=2", "greater than or equal to 4"),
+        ("geometry.resolution=8", "geometry.resolution=2", "greater than or equal to 5"),
         ("stages.monte_carlo.steps=3", "stages.monte_carlo.steps", "section.field=value"),
         ("stages.monte_carlo.steps=3", "transport.steps=3", "is now stages.monte_carlo.steps"),
         ("geometry.resolution=8", NO_STEPS, "run 'coarse': nothing to train"),

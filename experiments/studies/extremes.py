@@ -79,7 +79,7 @@ def _samples(count: int) -> tuple[str, ...]:
 
 CORNERS = (
     Corner("base"),
-    Corner("cells-4", ("geometry.resolution=4",)),
+    Corner("cells-5", ("geometry.resolution=5",)),
     Corner("cells-8", ("geometry.resolution=8",)),
     Corner("cells-128", ("geometry.resolution=128",)),
     Corner("cells-128-cubic", ("geometry.resolution=128", "geometry.cubic=true")),
@@ -92,7 +92,13 @@ CORNERS = (
     Corner("views-all", ("stages.*.batch_views=1000000",)),
     Corner(
         "table-2^1",
-        ("material.grid.log2_entries=1", "material.grid.levels=1", "material.grid.features=1"),
+        (
+            "material.grid.log2_entries=1",
+            "material.grid.levels=1",
+            "material.grid.features=1",
+            "material.grid.coarsest=1",
+            "material.grid.finest=1",
+        ),
     ),
     Corner("table-2^8", ("material.grid.log2_entries=8",)),
     Corner("table-2^20", ("material.grid.log2_entries=20", "material.grid.finest=2048")),
@@ -110,7 +116,7 @@ CORNERS = (
     Corner("images-800", size=800),
     Corner("images-800-all", ("stages.*.batch_views=1000000",), size=800),
     Corner("light-1x2", ("light.height=1", "light.width=2")),
-    Corner("light-512x1024", ("light.height=512", "light.width=1024")),
+    Corner("light-256x512", ("light.height=256", "light.width=512")),
     Corner("light-4096x8192", ("light.height=4096", "light.width=8192"), is_refused=True),
     Corner("tile-1", ("raster.tile_size=1",)),
     Corner("tile-256", ("raster.tile_size=256",)),

@@ -48,7 +48,7 @@ def compile_step(
             with free:
                 if is_wanted():
                     require_program_memory(
-                        program.__name__, traced.lower().compile(), devices.count_here
+                        program.__name__.strip("_"), traced.lower().compile(), devices.count_here
                     )
 
         compiling.append(in_background(finish))

@@ -12,7 +12,7 @@ programs, or is asked for with `Devices.any_host` and `Devices.first_host`.
 import json
 import os
 from collections.abc import Callable, Iterable
-from functools import cache, partial
+from functools import cache
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -378,7 +378,6 @@ def _programs(mesh: Mesh) -> dict[Any, Any]:
         """Compile ``body`` for all devices; arguments and result lie as their specs say."""
         specs = tuple(arguments)
 
-        @partial(jax.jit, **options)
         def program(*values: Any) -> Any:
             arrays, static = values[: len(specs)], values[len(specs) :]
             shared = jax.shard_map(
@@ -390,7 +389,8 @@ def _programs(mesh: Mesh) -> dict[Any, Any]:
             )
             return shared(*arrays)
 
-        return program
+        program.__name__ = body.__name__
+        return jax.jit(program, **options)
 
     s, o = _SAME, _OWN
     return {

@@ -110,7 +110,7 @@ class SurfaceSettings(Variant, abc.ABC):
 class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
     """An isosurface on a grid of cubic cells."""
 
-    resolution: Annotated[int, Field(ge=4, le=512)] = 48
+    resolution: Annotated[int, Field(ge=5, le=512)] = 48
     """Cells along the longest side of the box around the object."""
     initial: Literal["hull", "sphere", "random"] = "hull"
     """First surface: visual hull of the masks, a sphere, or noise (the paper)."""
