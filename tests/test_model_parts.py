@@ -88,7 +88,7 @@ def test_what_was_set_by_hand_is_not_chosen(paths, missing):
         (("material.specular=none",), {"specular", "roughness", "metallic"}),
         (("material.specular=uniform",), {"roughness"}),
         (("stages.monte_carlo.steps=0", "stages.refine.steps=0"), {"shadows", "indirect"}),
-        (("geometry.resolution=4",), {"cells"}),
+        (("geometry.resolution=5",), {"cells"}),
     ],
 )
 def test_parts_that_settings_lack_or_never_use_are_not_offered(overrides, missing):

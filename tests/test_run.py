@@ -139,7 +139,7 @@ def test_a_scene_that_has_moved_is_found_again_with_the_option(run, folder, caps
 def test_every_setting_is_listed_with_its_default_range_and_meaning(capsys):
     assert command("settings", "geometry.resolution", "--quality", "draft") == 0
     shown = " ".join(capsys.readouterr().out.split())
-    assert "geometry.resolution 32 >= 4, <= 512" in shown
+    assert "geometry.resolution 32 >= 5, <= 512" in shown
     assert "longest side" in shown
     assert command("settings", "nothing") == 2
 

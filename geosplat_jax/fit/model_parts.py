@@ -19,7 +19,7 @@ from geosplat_jax.transport.split_sum import SplitSumSettings
 _FEWER_CELLS = 2.0 / 3.0
 """Cells along the box without `FinerCells`, to those with it: 32 to 48."""
 
-_FEWEST_CELLS = 4
+_FEWEST_CELLS = 5
 _FEWEST_TEXELS = (4, 8)
 """Rows and columns of the smallest light."""
 
