@@ -56,8 +56,59 @@ def command_line() -> argparse.ArgumentParser:
     _add_poses(_command(commands, "poses", "find the cameras of a folder of photographs"))
 
     _add_masks(_command(commands, "masks", "cut the object out of photographs with cameras"))
+    _add_train(_command(commands, "train", "reconstruct a scene"))
+    _add_settings(_command(commands, "settings", "list every setting: default, range, meaning"))
+    _add_evaluate(_run_parser(commands, "evaluate", "metrics and pictures of a run's test views"))
+    _add_report(_command(commands, "report", "report.html of a run, or of several to compare"))
+    _add_consistency(
+        _command(
+            commands, "consistency", "how well splats stand for the mesh of a run, or for any mesh"
+        )
+    )
+    _add_render(_run_parser(commands, "render", "render a run from its views or any cameras"))
+    _add_relight(_run_parser(commands, "relight", "show a run under another light"))
+    _add_view(_run_parser(commands, "view", "look at a run in a browser, also while it trains"))
+    _add_refine_cameras(
+        _run_parser(
+            commands, "refine-cameras", "pose, focal length and colour of every view of a run"
+        )
+    )
+    _add_export(_run_parser(commands, "export", "mesh.glb, gaussians.ply and light.exr of a run"))
+    _add_gradcheck(
+        _command(commands, "gradcheck", "prove the gradients: float64 differences of every part")
+    )
+    return parser
 
-    train = _command(commands, "train", "reconstruct a scene")
+
+def _command(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
+    """Add a command; its help ends with an example."""
+    return commands.add_parser(
+        name,
+        help=text,
+        description=f"{text[0].upper()}{text[1:]}.",
+        epilog=f"example:\n  geosplat-jax {EXAMPLES[name]}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def _add_white_balance(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--white-balance",
+        action="store_true",
+        help="refine factors of red, green and blue of every view with the cameras, too",
+    )
+
+
+def _run_parser(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
+    """Add a command that works on a run."""
+    parser = _command(commands, name, text)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--scene", type=Path, help="where the run's scene is now, if it has moved")
+    return parser
+
+
+def _add_train(train: argparse.ArgumentParser) -> None:
+    """Describe the train command."""
     _add_scene_arguments(train)
     train.add_argument("--output", type=Path, help="run folder (default: runs/SCENE)")
     _add_config_arguments(train)
@@ -109,11 +160,15 @@ def command_line() -> argparse.ArgumentParser:
     train.add_argument("--stage", metavar="NAME", help="with --from: the stage to begin with")
     _add_devices(train)
 
-    settings = _command(commands, "settings", "list every setting: default, range, meaning")
+
+def _add_settings(settings: argparse.ArgumentParser) -> None:
+    """Describe the settings command."""
     settings.add_argument("prefix", nargs="?", default="", help="of the settings to list")
     _add_config_arguments(settings)
 
-    evaluate = _run_parser(commands, "evaluate", "metrics and pictures of a run's test views")
+
+def _add_evaluate(evaluate: argparse.ArgumentParser) -> None:
+    """Describe the evaluate command."""
     evaluate.add_argument("--protocol", choices=PROTOCOLS, default=PROTOCOLS[0])
     _add_samples(evaluate)
     evaluate.add_argument(
@@ -127,15 +182,17 @@ def command_line() -> argparse.ArgumentParser:
         "--stage", help="what this stage ended with, instead of the run as it is now"
     )
 
-    report = _command(commands, "report", "report.html of a run, or of several to compare")
+
+def _add_report(report: argparse.ArgumentParser) -> None:
+    """Describe the report command."""
     report.add_argument("runs", type=Path, nargs="+", metavar="RUN")
     report.add_argument(
         "--output", type=Path, help="file (default: RUN/report.html; needed for several runs)"
     )
 
-    consistency = _command(
-        commands, "consistency", "how well splats stand for the mesh of a run, or for any mesh"
-    )
+
+def _add_consistency(consistency: argparse.ArgumentParser) -> None:
+    """Describe the consistency command."""
     consistency.add_argument(
         "subject", type=Path, metavar="RUN|MESH", help="folder of a run, or file of a closed mesh"
     )
@@ -151,7 +208,9 @@ def command_line() -> argparse.ArgumentParser:
     )
     consistency.add_argument("--json", type=Path, help="also write the figures to this file")
 
-    render = _run_parser(commands, "render", "render a run from its views or any cameras")
+
+def _add_render(render: argparse.ArgumentParser) -> None:
+    """Describe the render command."""
     _add_cameras(render, "test")
     _add_images(render, ["normal"])
     render.add_argument(
@@ -160,9 +219,9 @@ def command_line() -> argparse.ArgumentParser:
     _add_samples(render)
     render.add_argument("--output", type=Path, help="folder (default: RUN/renders)")
 
-    _add_relight(_run_parser(commands, "relight", "show a run under another light"))
 
-    view = _run_parser(commands, "view", "look at a run in a browser, also while it trains")
+def _add_view(view: argparse.ArgumentParser) -> None:
+    """Describe the view command."""
     view.add_argument(
         "--env",
         type=Path,
@@ -175,13 +234,15 @@ def command_line() -> argparse.ArgumentParser:
         "--port", type=int, default=DEFAULT_PORT, help="of this machine (default: %(default)s)"
     )
 
-    refine = _run_parser(
-        commands, "refine-cameras", "pose, focal length and colour of every view of a run"
-    )
+
+def _add_refine_cameras(refine: argparse.ArgumentParser) -> None:
+    """Describe the refine-cameras command."""
     refine.add_argument("--output", type=Path, help="file (default: RUN/cameras.json)")
     _add_white_balance(refine)
 
-    export = _run_parser(commands, "export", "mesh.glb, gaussians.ply and light.exr of a run")
+
+def _add_export(export: argparse.ArgumentParser) -> None:
+    """Describe the export command."""
     export.add_argument("--output", type=Path, help="folder (default: RUN/export)")
     export.add_argument("--vertex-colors", action="store_true", help="instead of textures")
     export.add_argument("--texture-size", type=int, default=1024)
@@ -193,43 +254,15 @@ def command_line() -> argparse.ArgumentParser:
     )
     export.add_argument("--usd", action="store_true", help="also mesh.usdc, with textures as PNG")
 
-    gradcheck = _command(
-        commands, "gradcheck", "prove the gradients: float64 differences of every part"
-    )
+
+def _add_gradcheck(gradcheck: argparse.ArgumentParser) -> None:
+    """Describe the gradcheck command."""
     gradcheck.add_argument(
         "stages", nargs="*", metavar="PART", help=f"some of {', '.join(STAGES)} (default: all)"
     )
     gradcheck.add_argument("--sweep", action="store_true", help="show the error at every step size")
     gradcheck.add_argument("--seed", type=int, default=0, help="of numbers, samples, directions")
     gradcheck.add_argument("--json", type=Path, help="also write every comparison to this file")
-    return parser
-
-
-def _command(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
-    """Add a command; its help ends with an example."""
-    return commands.add_parser(
-        name,
-        help=text,
-        description=f"{text[0].upper()}{text[1:]}.",
-        epilog=f"example:\n  geosplat-jax {EXAMPLES[name]}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-
-
-def _add_white_balance(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--white-balance",
-        action="store_true",
-        help="refine factors of red, green and blue of every view with the cameras, too",
-    )
-
-
-def _run_parser(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
-    """Add a command that works on a run."""
-    parser = _command(commands, name, text)
-    parser.add_argument("run", type=Path)
-    parser.add_argument("--scene", type=Path, help="where the run's scene is now, if it has moved")
-    return parser
 
 
 def _add_poses(poses: argparse.ArgumentParser) -> None:
