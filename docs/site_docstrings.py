@@ -34,7 +34,7 @@ def as_markdown(text: str) -> str:
     starts = [number for number in range(len(lines) - 1) if _RULE.match(lines[number + 1])]
     prose = lines[: starts[0]] if starts else lines
     written = [re.sub(r"::$", ":", line) for line in prose]
-    for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
+    for start, end in zip(starts, [*starts, len(lines)][1:], strict=True):
         written += ["", f"**{lines[start]}**", "", *_items(lines[start + 2 : end])]
     return "\n".join(written)
 

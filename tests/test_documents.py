@@ -126,6 +126,7 @@ def test_docstrings_of_the_site_are_lists():
         "Render.\n\nAs in::\n\n    code\n\nParameters\n----------\na, b : first\n    and more.\n"
         "c : second\n\nRaises\n------\nValueError\n    If not."
     )
+    assert names["as_markdown"]("A plain one.") == "A plain one."
     assert names["as_markdown"](text).splitlines()[-9:] == [
         "",
         "**Parameters**",
