@@ -19,6 +19,8 @@ from geosplat_jax.viewer.painter import Viewer
 DEFAULT_PORT = 8080
 
 _LOCAL = "127.0.0.1"
+_RISE = 0.35
+"""Height of the first camera above the middle of the object, per distance from it."""
 _PHOTOGRAPH = 160
 """Pixels of the longer side of the photographs on frustums, about."""
 
@@ -245,15 +247,18 @@ class ViewerServer:
         self._refreshed = time.perf_counter()
 
     def _look_at_the_object(self, views: Views | None) -> None:
-        """Start where the first photograph was taken from, or beside the object."""
+        """Start at the photograph that looks down a little, or beside the object."""
         box = self._viewer.painter.trained.pipeline.surface.box
         center, start = np.asarray(box.center, np.float64), self._server.initial_camera
         if views is None:
             start.position = center + 3.0 * float(box.half_extent) * np.array([1.0, -1.0, 0.7])
         else:
-            pose = np.linalg.inv(np.asarray(views.world_to_camera[0], np.float64))
-            start.position = pose[:3, 3]
-            start.fov = float(2.0 * np.arctan(0.5 * views.height / views.intrinsics[0, 1, 1]))
+            positions = np.linalg.inv(np.asarray(views.world_to_camera, np.float64))[:, :3, 3]
+            away = positions - center
+            rise = away[:, 2] / np.maximum(np.linalg.norm(away, axis=1), 1e-12)
+            first = int(np.argmin(np.abs(rise - _RISE)))
+            start.position = positions[first]
+            start.fov = float(2.0 * np.arctan(0.5 * views.height / views.intrinsics[first, 1, 1]))
         start.look_at = center
 
     def _enter(self, client: Any) -> None:
