@@ -318,6 +318,7 @@ def _back(
     pipeline: Any,
     params: Any,
     asset: Any,
+    lights: Any,
     pulls: Any,
     views: Any,
     batch: SharedBatch,
@@ -340,6 +341,7 @@ def _back(
         pipeline,
         params,
         asset,
+        lights,
         pulls,
         (found, ViewReport(terms, mse, usage)),
         _common(batch),
@@ -401,7 +403,7 @@ def _programs(mesh: Mesh) -> dict[Any, Any]:
         gradient._lights: spread(_lights, (s, s, s, s, batch), s),
         gradient._view_gradient: spread(_view_gradient, (s, s, s, s, s, o, o), o),
         gradient._plus: spread(_plus, (o, o), o, donate_argnums=0),
-        gradient._back: spread(_back, (s, s, s, s, o, batch, s), s, static_argnums=7),
+        gradient._back: spread(_back, (s, s, s, s, s, o, batch, s), s, static_argnums=8),
         step._update: spread(step._update, (s, s, s, s, s), s, donate_argnums=0),
     }
 
