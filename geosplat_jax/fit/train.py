@@ -299,7 +299,7 @@ def _require_agreement(
     mine = {
         "settings": json.loads(json.dumps(config.to_dict())),
         "views": f"{len(views)} of {views.width} x {views.height}",
-        "pixels": views.fingerprint() if devices.count > 1 else None,
+        "cameras": views.fingerprint() if devices.count > 1 else None,
         "options": [str(option) for option in options],
         "devices": devices.count,
     }

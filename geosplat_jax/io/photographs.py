@@ -7,6 +7,7 @@ it are read again from their files whenever they are asked for; what tells the o
 always stays.
 """
 
+import abc
 import threading
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -129,15 +130,15 @@ class PartsInMemory:
         return Photographs((count, height, width, 4), None, packed, read, corners, threads)
 
 
-class _Stack:
+class _Stack(abc.ABC):
     """What behaves like an array of V things that are made when they are asked for."""
 
     shape: tuple[int, ...]
     dtype = np.dtype(np.float32)
 
+    @abc.abstractmethod
     def _make(self, index: int) -> np.ndarray:
         """Make the thing of a view."""
-        raise NotImplementedError
 
     def _make_all(self, indices: Sequence[int]) -> list[np.ndarray]:
         return [self._make(index) for index in indices]
