@@ -48,6 +48,9 @@ from geosplat_jax.report.shots import Cameras, Images
 REFINEMENT_SAMPLES = 32
 """Rays per splat when cameras are refined: noise averages out over the pixels of a view."""
 
+_PREVIEW_SECONDS = 60.0
+"""What a preview takes at most, usually: its program compiles beside the steps of a new stage."""
+
 
 def _true_light(dataset: Dataset, lights: Mapping[str, EnvLight]) -> EnvLight | None:
     """Return the light of the training images: by its name, or as the first test view saw it."""
@@ -396,15 +399,21 @@ class Run:
 
 
 class _Previews:
-    """Write truth, render and normals of one view side by side, while the training goes on."""
+    """Write truth, render and normals of one view side by side, while the training goes on.
 
-    def __init__(self, dataset: Dataset, folder: RunFolder) -> None:
+    A training with a budget begins none that it would have to wait for at its end.
+    """
+
+    def __init__(self, dataset: Dataset, folder: RunFolder, pacer: Pacer | None = None) -> None:
         self._views = dataset.views_to_show
         self._folder = folder.previews
+        self._pacer = pacer
         self._running: Future[None] | None = None
 
     def __call__(self, trained: Trained) -> None:
         """Begin to render a preview; waits for the one before."""
+        if self._pacer is not None and self._pacer.seconds_left < _PREVIEW_SECONDS:
+            return
         self.finish()
         # A copy, since the next step consumes the buffers of the parameters.
         copied = replace(trained, params=jax.tree.map(jnp.array, trained.params))
@@ -554,7 +563,7 @@ def train(
         costs = expected_costs(config, pixels, slowness=slowness_of_machine())
         used = folder.seconds_used() if resume else 0.0
         pacer = Pacer(budget, config, costs, began=began - used)
-    previews = _Previews(dataset, folder)
+    previews = _Previews(dataset, folder, pacer)
     try:
         fit(
             dataset,

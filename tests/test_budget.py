@@ -243,10 +243,13 @@ def test_a_shortened_run_that_was_stopped_goes_on_with_its_own_settings(dataset,
 
 def test_python_resumes_a_budget_without_naming_settings(dataset, tmp_path):
     config = tiny_config("stages.split_sum.steps=40", "stages.monte_carlo.steps=0")
+    config = replace(config, run=replace(config.run, preview_every=2))
     _paced_run(dataset, tmp_path / "run", config, stop_after=12)
     run = train(dataset, tmp_path / "run", resume=True)
     assert run.trained.step == run.config.total_steps
     assert run.folder.budget() == Budget(60.0)
+    # With less than a minute left no preview is begun, which the end would have to wait for.
+    assert not run.folder.previews.exists()
 
 
 @pytest.mark.parametrize(

@@ -69,15 +69,6 @@ def _ring() -> trimesh.Trimesh:
     return body
 
 
-def _paint(points: Array, albedo: Array, roughness: float, metallic: float):
-    count = len(points)
-    return scene_duck.Materials(
-        albedo=np.broadcast_to(np.asarray(albedo, np.float32), (count, 3)).copy(),
-        roughness=np.full(count, roughness, np.float32),
-        metallic=np.full(count, metallic, np.float32),
-    )
-
-
 def _ground_albedo(points: Array) -> Array:
     """Soft stripes, as fine as the vertices can show."""
     wave = 0.5 + 0.5 * np.sin(9.0 * points[:, :1]) * np.sin(9.0 * points[:, 1:2])
@@ -88,29 +79,16 @@ def parts() -> list[tuple[trimesh.Trimesh, scene_duck.Materials]]:
     """Return every part and its materials at the vertices."""
     ground, box, ball, ring = _ground(), _box(), _ball(), _ring()
     return [
-        (ground, _paint(ground.vertices, _ground_albedo(np.asarray(ground.vertices)), 0.6, 0.0)),
-        (box, _paint(box.vertices, [0.55, 0.10, 0.08], 0.5, 0.0)),
-        (ball, _paint(ball.vertices, [0.90, 0.72, 0.38], 0.25, 1.0)),
-        (ring, _paint(ring.vertices, [0.07, 0.22, 0.55], 0.35, 0.0)),
+        (ground, make_scene.painted(ground.vertices, _ground_albedo(np.asarray(ground.vertices)), 0.6, 0.0)),
+        (box, make_scene.painted(box.vertices, [0.55, 0.10, 0.08], 0.5, 0.0)),
+        (ball, make_scene.painted(ball.vertices, [0.90, 0.72, 0.38], 0.25, 1.0)),
+        (ring, make_scene.painted(ring.vertices, [0.07, 0.22, 0.55], 0.35, 0.0)),
     ]
 
 
 def write_scene_mesh(path: Path) -> None:
     """Write all parts with normals and materials, for Mitsuba."""
-    bodies, surfaces = zip(*parts(), strict=True)
-    starts = np.cumsum([0, *(len(body.vertices) for body in bodies)])
-    make_scene.write_mesh(
-        path,
-        np.concatenate([body.vertices for body in bodies]).astype(np.float32),
-        np.concatenate([body.vertex_normals for body in bodies]).astype(np.float32),
-        np.concatenate([body.faces + start for body, start in zip(bodies, starts, strict=False)]),
-        scene_duck.Materials(
-            *(
-                np.concatenate([getattr(surface, name) for surface in surfaces])
-                for name in ("albedo", "roughness", "metallic")
-            )
-        ),
-    )
+    make_scene.write_parts(path, parts())
 
 
 def write_true_mesh(path: Path) -> None:

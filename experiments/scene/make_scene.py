@@ -188,6 +188,34 @@ def write_mesh(
     mesh.write_ply(str(path))
 
 
+def write_parts(path: Path, parts: list[tuple[trimesh.Trimesh, scene_duck.Materials]]) -> None:
+    """Write several bodies, each with materials at its vertices, as one mesh in PLY."""
+    bodies, surfaces = zip(*parts, strict=True)
+    starts = np.cumsum([0, *(len(body.vertices) for body in bodies)])
+    write_mesh(
+        path,
+        np.concatenate([body.vertices for body in bodies]).astype(np.float32),
+        np.concatenate([body.vertex_normals for body in bodies]).astype(np.float32),
+        np.concatenate([body.faces + start for body, start in zip(bodies, starts, strict=False)]),
+        scene_duck.Materials(
+            *(
+                np.concatenate([getattr(surface, name) for surface in surfaces])
+                for name in ("albedo", "roughness", "metallic")
+            )
+        ),
+    )
+
+
+def painted(points: Array, albedo: Array, roughness: float, metallic: float = 0.0):
+    """Materials of points (n, 3) of one roughness and metallic; `albedo` is (3,) or (n, 3)."""
+    count = len(points)
+    return scene_duck.Materials(
+        albedo=np.broadcast_to(np.asarray(albedo, np.float32), (count, 3)).copy(),
+        roughness=np.full(count, roughness, np.float32),
+        metallic=np.full(count, metallic, np.float32),
+    )
+
+
 def write_render_mesh(path: Path) -> None:
     """Write the finely sampled duck."""
     vertices, faces = scene_duck.mesh(RENDER_RESOLUTION)

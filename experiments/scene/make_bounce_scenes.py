@@ -1,0 +1,129 @@
+"""Build two scenes in which much light comes by way of other surfaces, in the TensoIR layout.
+
+    pip install 'geosplat_jax[scene]'
+    python experiments/scene/make_bounce_scenes.py --output FOLDER [--only bowl]
+
+``bowl`` is white outside and coloured inside, so that its inner wall lights itself and takes on
+the colour of what is opposite; ``pair`` is a white ball beside a red and before a green slab, with
+gaps of a twentieth of its diameter. Both are matt enough for bounced light to be most of what differs
+between a renderer that knows it and one that does not. Rendered by Mitsuba 3 as `make_scene.py`
+renders the duck.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import make_scene
+import numpy as np
+import scene_duck
+import trimesh
+
+RADIUS, THICKNESS = 1.0, 0.12
+"""Of the bowl; world units."""
+OPENING = 0.15
+"""Height of the bowl's rim above its centre."""
+SECTIONS = 256
+SAVED_SECTIONS = 64
+"""Around the bowl, of the mesh that is rendered and of the one on disk."""
+
+Array = make_scene.Array
+Part = tuple[trimesh.Trimesh, scene_duck.Materials]
+
+
+def _bowl_body(sections: int) -> trimesh.Trimesh:
+    """Turn a round-lipped wall about the z axis; closed and outward."""
+    inner = RADIUS - THICKNESS
+    middle = 0.5 * (RADIUS + inner)
+    lip = np.arcsin(OPENING / middle)
+    steps = sections // 3
+    along = np.linspace(-np.pi / 2, lip, steps)
+    outside = RADIUS * np.stack([np.cos(along), np.sin(along)], -1)
+    inside = inner * np.stack([np.cos(along[::-1]), np.sin(along[::-1])], -1)
+    turn = lip + np.linspace(0, np.pi, max(steps // 8, 4))[1:-1]
+    top = middle * np.array([np.cos(lip), np.sin(lip)])
+    rim = top + 0.5 * THICKNESS * np.stack([np.cos(turn), np.sin(turn)], -1)
+    profile = np.concatenate([outside, rim, inside])
+    profile[[0, -1], 0] = 0.0  # exactly on the axis
+    body = trimesh.creation.revolve(profile, sections=sections)
+    body.apply_translation([0, 0, 0.5 * (RADIUS - OPENING)])
+    return body
+
+
+def _bowl_materials(body: trimesh.Trimesh) -> scene_duck.Materials:
+    """White outside; red, yellow, green and blue inside, one after the other around the axis."""
+    points = np.asarray(body.vertices) - [0, 0, 0.5 * (RADIUS - OPENING)]
+    turn = np.arctan2(points[:, 1], points[:, 0])
+    colours = np.array([[0.75, 0.08, 0.06], [0.75, 0.6, 0.08], [0.08, 0.5, 0.12], [0.08, 0.2, 0.7]])
+    centres = np.arange(4) * np.pi / 2
+    share = np.exp(4.0 * np.cos(turn[:, None] - centres))
+    inside = (share / share.sum(axis=1, keepdims=True)) @ colours
+    depth = RADIUS - 0.5 * THICKNESS - np.linalg.norm(points, axis=1)
+    blend = np.clip(0.5 + depth / (0.5 * THICKNESS), 0.0, 1.0)[:, None]
+    albedo = blend * inside + (1 - blend) * 0.8
+    return make_scene.painted(points, albedo, 0.6)
+
+
+def bowl(*, is_saved: bool = False) -> list[Part]:
+    """Return the bowl; `is_saved`: with the larger faces of the mesh on disk."""
+    body = _bowl_body(SAVED_SECTIONS if is_saved else SECTIONS)
+    return [(body, _bowl_materials(body))]
+
+
+def _slab(extents: tuple[float, float, float], centre: tuple[float, float, float]):
+    """Make a slab, with edges of its own for every side."""
+    body = trimesh.creation.box(extents=extents)
+    body.apply_translation(centre)
+    return [body.submesh([facet], append=True).subdivide().subdivide() for facet in body.facets]
+
+
+def pair(*, is_saved: bool = False) -> list[Part]:
+    """Return the ball and the slabs."""
+    ball = trimesh.creation.icosphere(subdivisions=4 if is_saved else 6, radius=0.5)
+    parts = [(ball, make_scene.painted(ball.vertices, [0.8, 0.8, 0.8], 0.5))]
+    slabs = (
+        ((0.14, 1.2, 1.2), (-0.62, 0.0, 0.0), [0.7, 0.06, 0.05]),
+        ((1.2, 0.14, 1.2), (0.1, 0.62, 0.0), [0.06, 0.5, 0.1]),
+    )
+    for extents, centre, albedo in slabs:
+        for side in _slab(extents, centre):
+            parts.append((side, make_scene.painted(side.vertices, albedo, 0.6)))
+    return parts
+
+
+SCENES = {"bowl": bowl, "pair": pair}
+
+
+def build(name: str, args: argparse.Namespace) -> Path:
+    """Render one of the scenes and return its folder."""
+    folder = args.output / name
+    folder.mkdir(parents=True, exist_ok=True)
+    lights = make_scene.write_lights(args.output)
+    saved = trimesh.util.concatenate([body for body, _ in SCENES[name](is_saved=True)])
+    saved.merge_vertices()
+    if not saved.is_volume:
+        raise RuntimeError(f"the mesh of {name} is not closed and outward")
+    saved.export(folder / "mesh_gt.ply")
+    train, test = make_scene.train_views(args.views), make_scene.test_views(args.test_views)
+    make_scene.render_all(
+        folder, train, test, lights, args, lambda path: make_scene.write_parts(path, SCENES[name]())
+    )
+    return folder
+
+
+def main() -> None:
+    """Parse the command line and build the scenes."""
+    parser = make_scene.parser(__doc__)
+    parser.add_argument("--only", choices=tuple(SCENES), help="one of the scenes")
+    parser.set_defaults(views=48, spp=256, output=Path("scenes"))
+    args = parser.parse_args()
+    print(make_scene.choose_variant(args.variant))
+    for name in SCENES if args.only is None else (args.only,):
+        start = time.perf_counter()
+        print(f"{build(name, args)}: {time.perf_counter() - start:.0f} s")
+
+
+if __name__ == "__main__":
+    main()
