@@ -5,9 +5,7 @@
 
 ``bowl`` is white outside and coloured inside, so that its inner wall lights itself and takes on
 the colour of what is opposite; ``pair`` is a white ball beside a red and before a green slab, with
-gaps of a twentieth of its diameter. Both are matt enough for bounced light to be most of what differs
-between a renderer that knows it and one that does not. Rendered by Mitsuba 3 as `make_scene.py`
-renders the duck.
+gaps of a twentieth of its diameter. Rendered by Mitsuba 3 as `make_scene.py` renders the duck.
 """
 
 from __future__ import annotations

@@ -79,7 +79,12 @@ def parts() -> list[tuple[trimesh.Trimesh, scene_duck.Materials]]:
     """Return every part and its materials at the vertices."""
     ground, box, ball, ring = _ground(), _box(), _ball(), _ring()
     return [
-        (ground, make_scene.painted(ground.vertices, _ground_albedo(np.asarray(ground.vertices)), 0.6, 0.0)),
+        (
+            ground,
+            make_scene.painted(
+                ground.vertices, _ground_albedo(np.asarray(ground.vertices)), 0.6, 0.0
+            ),
+        ),
         (box, make_scene.painted(box.vertices, [0.55, 0.10, 0.08], 0.5, 0.0)),
         (ball, make_scene.painted(ball.vertices, [0.90, 0.72, 0.38], 0.25, 1.0)),
         (ring, make_scene.painted(ring.vertices, [0.07, 0.22, 0.55], 0.35, 0.0)),

@@ -1,0 +1,180 @@
+"""How quality and cost grow with the cells of the grid (appendix G): the paper's cube and our box.
+
+    python experiments/studies/resolution.py SCENE ... --output FOLDER [--cells 32 48 64 96 128]
+        [--grids box cube] [--steps 200] [--proportional] [--quality draft] [--downscale 1]
+        [--set SECTION.FIELD=VALUE] [--json FILE] [--plot FILE]
+
+Trains the split sum stage alone, every run in a process of its own, so that its largest resident
+memory is its own. ``box`` has its cells along the longest side of the box around the object,
+``cube`` as many along every side (`geometry.cubic`). ``--proportional`` makes steps in proportion to
+the cells, ``--steps`` for the fewest: a finer surface has further to go, counted in cells.
+
+Columns: PSNR of new views; normal error; Chamfer distance as in `existing_mesh.py`, where the
+scene has a true mesh; recall of thin parts: of the pixels that an opening of the true mask by a
+disc of 3 pixels takes away, the share that the render covers by more than half; seconds of a step
+(median) and of the whole; largest memory. Below, the powers of the cells that Gaussians, seconds
+of a step and memory grow with, by least squares on logarithms.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from existing_mesh import chamfer
+from skimage.morphology import disk, opening
+
+from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.io.meshes import read_mesh
+from geosplat_jax.io.views import Views
+from geosplat_jax.run import Run
+
+GRIDS = {"box": "geometry.cubic=false", "cube": "geometry.cubic=true"}
+THIN_RADIUS = 3
+COMMAND = "import sys; from geosplat_jax.cli import main; sys.exit(main())"
+
+
+def train(scene: Path, folder: Path, grid: str, cells: int, arguments: argparse.Namespace) -> None:
+    """Train in a process of its own, where it has not been done."""
+    if (folder / "training.json").exists():
+        return
+    steps = arguments.steps
+    if arguments.proportional:
+        steps = round(steps * cells / min(arguments.cells))
+    settings = [
+        f"geometry.resolution={cells}",
+        GRIDS[grid],
+        f"stages.split_sum.steps={steps}",
+        "stages.monte_carlo.steps=0",
+        "stages.refine.steps=0",
+        "run.preview_every=0",
+        *arguments.overrides,
+    ]
+    command = [sys.executable, "-c", COMMAND, "train", str(scene), "--output", str(folder)]
+    command += ["--quality", arguments.quality, "--downscale", str(arguments.downscale), "--force"]
+    command += [part for setting in settings for part in ("--set", setting)]
+    subprocess.run(command, check=True)
+
+
+def thin_recall(run: Run, views: Views) -> float:
+    """Share of the thin parts' pixels that the render covers; NaN where the views show none."""
+    renderer, covered, count = run.renderer(samples=1), 0, 0
+    for k in range(len(views)):
+        mask = views.images[k][..., 3] > 0.5
+        thin = mask & ~opening(mask, disk(THIN_RADIUS))
+        alpha = np.asarray(renderer(views.camera([k])).alpha)
+        covered += int(np.sum(alpha[thin] > 0.5))
+        count += int(np.sum(thin))
+    return covered / count if count else float("nan")
+
+
+def row(run: Run, scene: Path, samples: int) -> dict[str, float]:
+    """Evaluate a run; measure its surface and what it took."""
+    if not (run.folder.path / "metrics.json").exists():
+        run.evaluate(samples=samples)
+    mean, steps = run.metrics["mean"], run.steps()
+    found = {"NVS PSNR": mean["nvs.psnr"]}
+    if "normal.mae_masked_deg" in mean:
+        found["normals, degrees"] = mean["normal.mae_masked_deg"]
+    if (scene / "mesh_gt.ply").exists():
+        truth = trimesh.Trimesh(*read_mesh(scene / "mesh_gt.ply"), process=False)
+        vertices, faces, _ = run.renderer().mesh()
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        found["Chamfer"] = chamfer(mesh, truth)
+    found["thin recall"] = thin_recall(run, run.dataset.test)
+    found["Gaussians"] = steps[-1]["splats"]
+    found["s a step"] = float(np.median([line["seconds"] for line in steps]))
+    found["minutes"] = (run.folder.training() or {})["seconds_total"] / 60
+    found["memory, GB"] = max(line["peak_memory_mb"] for line in steps) / 1000
+    return found
+
+
+def exponent(cells: list[int], values: list[float]) -> float:
+    """Power of the cells that values grow with."""
+    return float(np.polyfit(np.log(cells), np.log(values), 1)[0])
+
+
+def study(scene: Path, arguments: argparse.Namespace) -> dict[str, dict[int, dict[str, float]]]:
+    """Train and measure every grid of a scene; print its rows."""
+    rows: dict[str, dict[int, dict[str, float]]] = {}
+    for grid in arguments.grids:
+        rows[grid] = {}
+        for cells in arguments.cells:
+            folder = arguments.output / scene.name / f"{grid}_{cells}"
+            try:
+                train(scene, folder, grid, cells, arguments)
+            except subprocess.CalledProcessError as error:
+                print(
+                    f"| {scene.name} | {grid} | {cells} | refused or failed: {error.returncode} |"
+                )
+                continue
+            found = row(Run(folder), scene, arguments.samples)
+            if not rows[grid]:
+                print(f"| scene | grid | cells | {' | '.join(found)} |")
+            numbers = " | ".join(f"{value:.4g}" for value in found.values())
+            print(f"| {scene.name} | {grid} | {cells} | {numbers} |", flush=True)
+            rows[grid][cells] = found
+        if len(rows[grid]) > 1:
+            powers = {
+                name: exponent(list(rows[grid]), [one[name] for one in rows[grid].values()])
+                for name in ("Gaussians", "s a step", "memory, GB")
+            }
+            told = ", ".join(f"{name} {power:.2f}" for name, power in powers.items())
+            print(f"{scene.name}, {grid}: exponents of cells: {told}", flush=True)
+    return rows
+
+
+def plot(found: dict[str, dict[str, dict[int, dict[str, float]]]], path: Path) -> None:
+    """Draw every figure over the cells, a line for each scene and grid."""
+    import matplotlib.pyplot as plt
+
+    names = ["NVS PSNR", "normals, degrees", "Chamfer", "thin recall", "s a step", "memory, GB"]
+    figure, axes = plt.subplots(2, 3, figsize=(11, 6), constrained_layout=True)
+    for axis, name in zip(axes.flat, names, strict=True):
+        for scene, grids in found.items():
+            for grid, rows in grids.items():
+                known = {cells: one[name] for cells, one in rows.items() if name in one}
+                style = "o-" if grid == "box" else "s--"
+                axis.plot(list(known), list(known.values()), style, label=f"{scene}, {grid}")
+        axis.set(title=name, xlabel="cells", xscale="log")
+        axis.set_xticks(sorted({c for g in found.values() for rows in g.values() for c in rows}))
+        axis.get_xaxis().set_major_formatter("{x:.0f}")
+        axis.minorticks_off()
+        if name in ("s a step", "memory, GB"):
+            axis.set_yscale("log")
+    axes[0, 0].legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """Run the study."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenes", type=Path, nargs="+", metavar="SCENE")
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--cells", type=int, nargs="+", default=[32, 48, 64, 96, 128])
+    parser.add_argument("--grids", nargs="+", choices=tuple(GRIDS), default=tuple(GRIDS))
+    parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--proportional", action="store_true")
+    parser.add_argument("--quality", default="draft")
+    parser.add_argument("--downscale", type=int, default=1)
+    parser.add_argument("--samples", type=int, default=16, help="rays per splat when evaluating")
+    parser.add_argument("--set", dest="overrides", action="append", default=[])
+    parser.add_argument("--json", type=Path, help="also write the rows to this file")
+    parser.add_argument("--plot", type=Path, help="also draw the curves")
+    arguments = parser.parse_args()
+    enable_compilation_cache()
+    retain_freed_memory()
+    found = {scene.name: study(scene, arguments) for scene in arguments.scenes}
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(found, indent=1), encoding="utf-8")
+    if arguments.plot is not None:
+        plot(found, arguments.plot)
+
+
+if __name__ == "__main__":
+    main()
