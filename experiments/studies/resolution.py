@@ -6,8 +6,8 @@
 
 Trains the split sum stage alone, every run in a process of its own, so that its largest resident
 memory is its own. ``box`` has its cells along the longest side of the box around the object,
-``cube`` as many along every side (`geometry.cubic`). ``--proportional`` makes steps in proportion to
-the cells, ``--steps`` for the fewest: a finer surface has further to go, counted in cells.
+``cube`` as many along every side (`geometry.cubic`). ``--proportional`` makes steps in
+proportion to the cells, ``--steps`` for the fewest: a finer surface has further to go, in cells.
 
 Columns: PSNR of new views; normal error; Chamfer distance as in `existing_mesh.py`, where the
 scene has a true mesh; recall of thin parts: of the pixels that an opening of the true mask by a
