@@ -310,6 +310,17 @@ def light_tint(radiance: Float[Array, "H W 3"]) -> Float[Array, ""]:
     return safe_divide(distance, jnp.sum(weight * grey[..., 0]))
 
 
+def light_cast(radiance: Float[Array, "H W 3"]) -> Float[Array, ""]:
+    """Distance of the light's mean colour from grey, relative to its mean brightness.
+
+    A blue sky and a yellow sun may balance each other; what costs is a light that has taken the
+    colour of the object.
+    """
+    colour = jnp.sum(_solid_angle_shares(radiance)[..., None] * radiance, axis=(0, 1))
+    grey = jnp.mean(colour)
+    return safe_divide(jnp.mean(absolute(colour - grey)), grey)
+
+
 def light_smoothness(radiance: Float[Array, "H W 3"]) -> Float[Array, ""]:
     """Mean absolute difference of the logarithms of neighbouring texels, around and upwards.
 
@@ -377,6 +388,7 @@ SHARED_TERMS: dict[str, Callable[[SharedInputs], Float[Array, ""]]] = {
     "radiometric": lambda x: radiometric_disagreement(x),
     "white_balance": lambda x: white_balance(x.params.light.radiance),
     "light_tint": lambda x: light_tint(x.params.light.radiance),
+    "light_cast": lambda x: light_cast(x.params.light.radiance),
     "light_smoothness": lambda x: light_smoothness(x.params.light.radiance),
 }
 """Terms that no view has a part in. A surface adds penalties of its own."""

@@ -14,6 +14,7 @@ from geosplat_jax.losses import (
     image_dissimilarity,
     image_l1,
     light_agreement,
+    light_cast,
     light_smoothness,
     light_tint,
     mask_error,
@@ -159,6 +160,16 @@ def test_a_tint_of_the_light_is_relative_and_counts_by_solid_angle():
     # A tinted row at the pole is less of the sphere than one at the equator.
     pole, equator = (grey.at[row, :, 0].multiply(3.0) for row in (0, 1))
     assert float(light_tint(pole)) < float(light_tint(equator))
+
+
+def test_colours_of_the_light_that_balance_each_other_are_no_cast():
+    red, cyan = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 1.0])
+    balanced = jnp.zeros((4, 8, 3)).at[:, :4].set(red).at[:, 4:].set(cyan)
+    np.testing.assert_allclose(light_cast(balanced), 0.0, atol=ROUNDING)
+    assert light_tint(balanced) > 0.5
+    yellow = jnp.broadcast_to(jnp.array([2.0, 1.0, 0.0]), (4, 8, 3))
+    np.testing.assert_allclose(light_cast(yellow), 2 / 3, rtol=ROUNDING)
+    np.testing.assert_allclose(light_cast(9.0 * yellow), light_cast(yellow), rtol=ROUNDING)
 
 
 def test_noise_of_the_light_costs_more_than_a_sun():

@@ -15,6 +15,7 @@ from geosplat_jax.losses import (
     image_dissimilarity,
     image_l1,
     light_agreement,
+    light_cast,
     light_smoothness,
     light_tint,
     mask_error,
@@ -143,6 +144,7 @@ def loss_term_problems(rng: np.random.Generator) -> list[Problem]:
         return {
             "white balance": white_balance(inputs["radiance"]),
             "tint of the light": light_tint(inputs["radiance"]),
+            "cast of the light": light_cast(inputs["radiance"]),
             "smoothness of the light": light_smoothness(inputs["radiance"]),
             "normal smoothness": edge_aware_smoothness(inputs["normals"], constants["image"]),
         }

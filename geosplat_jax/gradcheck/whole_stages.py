@@ -37,6 +37,7 @@ _SETTINGS = (
     "stages.split_sum.weights.light=0.15",
     "stages.split_sum.weights.white_balance=0.002",
     "stages.split_sum.weights.light_tint=0.01",
+    "stages.split_sum.weights.light_cast=0.01",
     "stages.split_sum.weights.light_smoothness=0.01",
     "stages.split_sum.weights.metallic=0.01",
     "stages.split_sum.weights.encoded_l1=0.3",
