@@ -21,8 +21,11 @@ from typing import Any
 
 import run as runner
 import trade
+from jobs import plan
 from report import ReportError
-from run import Sweep, SweepError, SweepRun
+from sweep import Sweep, SweepError, SweepRun, has_numbers, read_sweep, scaled
+
+from geosplat_jax.fit.presets import QUALITIES
 
 _LENGTHS = (
     "stages.*.steps",
@@ -77,8 +80,8 @@ def shortened(sweep: Sweep, run: SweepRun, factor: float) -> SweepRun:
     if factor == 1.0:
         return run
     config = sweep.config(run)
-    present = [p for p in _LENGTHS if runner.has_numbers(config, p)]
-    shorter = runner.scaled(config, dict.fromkeys(present, factor), run.name)
+    present = [p for p in _LENGTHS if has_numbers(config, p)]
+    shorter = scaled(config, dict.fromkeys(present, factor), run.name)
     return replace(run, overrides=(*run.overrides, *shorter))
 
 
@@ -143,7 +146,7 @@ def search(
         here = replace(sweep, runs=runs, title=f"{sweep.title}, rung {rung}: ×{factor:.3g} steps")
         folder = arguments.output / f"rung_{rung}"
         names = [run.name for run in runs]
-        jobs = runner.plan(here, arguments.scenes, folder, scenes=here.scenes, names=names)
+        jobs = plan(here, arguments.scenes, folder, scenes=here.scenes, names=names)
         runner.check_folders(jobs)
         command = f"python experiments/halving.py {arguments.sweep.name}"
         runner.write_record(here, folder, command)
@@ -171,13 +174,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--rungs", type=int, default=3)
     parser.add_argument("--keep", type=float, default=1 / 3, help="share that goes on")
     parser.add_argument("--seed", type=int, default=0, help="of the combinations")
-    parser.add_argument("--quality", choices=runner.QUALITIES, help="instead of the sweep's")
+    parser.add_argument("--quality", choices=QUALITIES, help="instead of the sweep's")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="S.F=VALUE")
     arguments = parser.parse_args(argv)
     try:
         if arguments.rungs < 1 or not 0 < arguments.keep < 1 or arguments.joint < 0:
             raise SweepError("--rungs must be at least 1, --keep between 0 and 1, --joint not < 0")
-        sweep = runner.read_sweep(
+        sweep = read_sweep(
             arguments.sweep, overrides=arguments.overrides, quality=arguments.quality
         )
         here, folder = search(sweep, arguments)

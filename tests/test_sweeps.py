@@ -17,8 +17,10 @@ sys.path.insert(0, str(ROOT / "experiments"))
 
 import report  # noqa: E402
 import run as runner  # noqa: E402
+from jobs import Job, beginning, homes, parts_of, shared_stages  # noqa: E402
+from sweep import read_sweep  # noqa: E402
 
-from geosplat_jax.fit.config import Config, Stage, differences  # noqa: E402
+from geosplat_jax.fit.config import Config, Stage, config_from_dict, differences  # noqa: E402
 from geosplat_jax.fit.presets import make_config  # noqa: E402
 from geosplat_jax.io.checkpoints import save_checkpoint  # noqa: E402
 
@@ -108,7 +110,7 @@ class Fakes:
     def evaluate(self, folder, *, protocol, samples, relight_indirect):
         self.evaluated.append((f"{folder.parent.name}/{folder.name}", relight_indirect))
         record = json.loads((folder / "run.json").read_text())
-        config = runner.config_from_dict(record["config"])
+        config = config_from_dict(record["config"])
         figures = {
             "mean": {"nvs.psnr": 30.0, "roughness.mse": 0.01},
             "config": config.to_dict(),
@@ -205,8 +207,8 @@ def test_a_scene_that_is_not_there_is_named(tmp_path, capsys):
 def test_a_stage_is_shared_where_only_later_ones_differ(override, shares):
     base = make_config(quality="draft")
     config = make_config(quality="draft", overrides=(override,))
-    shared = runner.shared_stages(config, [base])
-    assert shared == (runner.beginning(base, 1) if shares else None)
+    shared = shared_stages(config, [base])
+    assert shared == (beginning(base, 1) if shares else None)
 
 
 def _several_stages(preset, quality, *, material_prior, overrides):
@@ -217,15 +219,15 @@ def _several_stages(preset, quality, *, material_prior, overrides):
 
 def _parts(tmp_path, monkeypatch, **runs):
     """Return the sources and first stages of a sweep of runs given as ``name="a=3 b=1"``."""
-    monkeypatch.setattr(runner, "make_config", _several_stages)
+    monkeypatch.setattr("sweep.make_config", _several_stages)
     tables = [
         f"[[run]]\nname = {name!r}\nset = {stages.split()}\n" for name, stages in runs.items()
     ]
     head = "title = 'x'\nscenes = ['one']\nfigures = ['f']\n"
-    sweep = runner.read_sweep(_write(tmp_path, head + "".join(tables)))
+    sweep = read_sweep(_write(tmp_path, head + "".join(tables)))
     return [
         (part.folder, part.source, part.first_stage, part.run is not None)
-        for part in runner.parts_of(sweep).values()
+        for part in parts_of(sweep).values()
     ]
 
 
@@ -316,8 +318,8 @@ def test_runs_with_the_same_settings_are_made_once(tmp_path):
     assert {r["name"]: r["same_as"] for r in record["runs"]}["again"] == "full"
     # Another evaluation makes it another run.
     other = again + 'evaluate = { relight_indirect = "none" }\n'
-    sweep = runner.read_sweep(_write(tmp_path, other))
-    assert runner.homes(sweep)["again"] == "again"
+    sweep = read_sweep(_write(tmp_path, other))
+    assert homes(sweep)["again"] == "again"
 
 
 def test_finished_runs_with_other_settings_stop_the_sweep_and_say_so(tmp_path, capsys):
@@ -434,7 +436,7 @@ def test_a_process_that_dies_is_a_failed_run(tmp_path, monkeypatch, code, said):
     script = tmp_path / "script.py"
     script.write_text(code)
     monkeypatch.setattr(runner, "__file__", str(script))
-    job = runner.Job("one/full", "scene", str(tmp_path / "full"), {}, {}, None, None, None)
+    job = Job("one/full", "scene", str(tmp_path / "full"), {}, {}, None, None, None)
     with pytest.raises(runner.RunFailed, match=said):
         runner.in_a_process(job)
     assert runner.run_jobs([job]) == [job]
@@ -442,10 +444,10 @@ def test_a_process_that_dies_is_a_failed_run(tmp_path, monkeypatch, code, said):
 
 
 def test_the_bundled_sweeps_are_sound():
-    sweep = runner.read_sweep(SWEEPS / "transport.toml")
+    sweep = read_sweep(SWEEPS / "transport.toml")
     configs = {run.name: sweep.config(run) for run in sweep.runs}
-    assert runner.homes(sweep)["indirect-constant"] == "full"
-    sources = {part.folder: part.source for part in runner.parts_of(sweep).values()}
+    assert homes(sweep)["indirect-constant"] == "full"
+    sources = {part.folder: part.source for part in parts_of(sweep).values()}
     alone = {SHARED, "no-culling"}
     assert {name for name, source in sources.items() if source is None} == alone
     assert {sources[name] for name in sources if name not in alone} == {SHARED}
@@ -460,12 +462,12 @@ def test_the_bundled_sweeps_are_sound():
     assert stages["denoiser"].transport.denoise.iterations == 2
     assert stages["materials-at-once"].rates["albedo"].warmup == 0
     assert stages["albedo-kept"].enter == ()
-    assert runner.read_sweep(SWEEPS / "smoke.toml").scenes == ("duck",)
-    assert len(runner.read_sweep(SWEEPS / "priors.toml").runs) == 13
+    assert read_sweep(SWEEPS / "smoke.toml").scenes == ("duck",)
+    assert len(read_sweep(SWEEPS / "priors.toml").runs) == 17
 
 
 def test_the_ablation_of_the_paper_changes_what_its_rows_say():
-    sweep = runner.read_sweep(SWEEPS / "ablation.toml")
+    sweep = read_sweep(SWEEPS / "ablation.toml")
     configs = {run.name: sweep.config(run) for run in sweep.runs}
     stages = {name: [s.name for s in config.active_stages] for name, config in configs.items()}
     assert stages["no-refinement"] == stages["full"][:-1]

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -11,9 +12,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "experiments"))
 import halving  # noqa: E402
 import run as runner  # noqa: E402
 import trade  # noqa: E402
+from jobs import homes, parts_of, plan  # noqa: E402
+from sweep import read_sweep  # noqa: E402
 from test_sweeps import SWEEPS, Fakes, _arguments, _write  # noqa: E402
 
-from geosplat_jax.fit.config import Stage  # noqa: E402
+from geosplat_jax.fit.config import Stage, config_from_dict  # noqa: E402
 
 try:
     # Here and not within a test: it takes the streams of its log when it is imported.
@@ -76,7 +79,7 @@ class Trained(Fakes):
         super().evaluate(folder, **arguments)
         self.evaluated[-1] = (*self.evaluated[-1], reading)
         figures = json.loads((folder / "metrics.json").read_text())
-        config = runner.config_from_dict(figures["config"])
+        config = config_from_dict(figures["config"])
         cells, samples = config.geometry.resolution, config.stages[1].transport.light_count
         psnr = 20 + cells / 8 + samples + config.total_steps / 60
         figures["mean"] = {"nvs.psnr": psnr, "normal.mae_masked_deg": 5.0}
@@ -95,16 +98,16 @@ def _rows(text, heading):
 
 
 def test_factors_are_of_the_quality_level_and_images_of_other_sizes_share_nothing(tmp_path):
-    sweep = runner.read_sweep(_write(tmp_path, SWEEP))
+    sweep = read_sweep(_write(tmp_path, SWEEP))
     configs = {run.name: sweep.config(run) for run in sweep.runs}
     base = configs["base"]
     cells = base.geometry.resolution
     assert configs["half"].geometry.resolution == round(cells / 2)
-    assert runner.read_sweep(_write(tmp_path, SWEEP), quality="standard").quality == "standard"
+    assert read_sweep(_write(tmp_path, SWEEP), quality="standard").quality == "standard"
     light = base.stage("monte_carlo").transport.light_count
     assert configs["many"].stage("monte_carlo").transport.light_count == 4 * light
     assert configs["few"].stage("monte_carlo").transport.light_count == max(1, light // 2)
-    sources = {part.folder: part.source for part in runner.parts_of(sweep).values()}
+    sources = {part.folder: part.source for part in parts_of(sweep).values()}
     shared = "_base.split_sum"
     assert sources == {
         shared: None,
@@ -114,9 +117,7 @@ def test_factors_are_of_the_quality_level_and_images_of_other_sizes_share_nothin
         "many": shared,
         "coarse": None,
     }
-    jobs = runner.plan(
-        sweep, tmp_path, tmp_path, scenes=["one"], names=[run.name for run in sweep.runs]
-    )
+    jobs = plan(sweep, tmp_path, tmp_path, scenes=["one"], names=[run.name for run in sweep.runs])
     by_name = {Path(job.folder).name: job for job in jobs}
     assert by_name["coarse"].options["downscale"] == 2
     assert by_name["coarse"].evaluate_options["downscale"] == 1
@@ -140,8 +141,8 @@ def test_a_bad_factor_is_one_error(tmp_path, capsys, old, new, said):
 
 def test_the_sweep_of_all_knobs_is_sound():
     for quality in ("draft", "standard"):
-        sweep = runner.read_sweep(SWEEPS / "trade.toml", quality=quality)
-        where = runner.homes(sweep)
+        sweep = read_sweep(SWEEPS / "trade.toml", quality=quality)
+        where = homes(sweep)
         configs = {run.name: sweep.config(run) for run in sweep.runs}
         assert len({run.group for run in sweep.runs if run.x is not None}) >= 14
         # Most differ from the base; what a level has already is trained once.
@@ -172,7 +173,7 @@ def test_the_tables_say_decibels_per_second_and_the_front(tmp_path, capsys):
     ]
     assert trade.main([str(tmp_path / "runs")]) == 0
     text = capsys.readouterr().out
-    sweep = runner.read_sweep(tmp_path / "sweep.toml")
+    sweep = read_sweep(tmp_path / "sweep.toml")
     base = sweep.config(sweep.runs[0])
     cells, light = base.geometry.resolution, base.stages[1].transport.light_count
     # 90 steps, which runs share that differ in samples only, and 30 of their own.
@@ -259,7 +260,7 @@ def test_runs_on_a_cluster_wait_for_their_sources_and_go_on(tmp_path, capsys, mo
     script.write_text(FAKE_JOB)
 
     def command_of(job):
-        return [sys.executable, str(script), json.dumps(runner.asdict(job))]
+        return [sys.executable, str(script), json.dumps(asdict(job))]
 
     monkeypatch.setattr(runner, "command_of", command_of)
     monkeypatch.setattr(runner, "_POLL_SECONDS", 0.05)

@@ -1,0 +1,207 @@
+"""What there is to do for a sweep: its runs, and the stages that several of them share, once."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from sweep import Sweep, SweepRun
+
+from geosplat_jax.fit.config import Config
+
+
+@dataclass(frozen=True)
+class Job:
+    """What one process does, in a form that JSON keeps.
+
+    Attributes
+    ----------
+    label : ``scene/name``, for messages.
+    scene, folder : where the scene lies, where the run goes.
+    config, options : see `geosplat_jax.run.train`, whose ``reading`` the options are.
+    source, first_stage : run folder whose stages to take over, and the first one to train; None
+        to train all of them.
+    evaluate : keyword arguments of `Run.evaluate`; None leaves evaluation out.
+    evaluate_options : how to read the scene for the evaluation; None as for the training.
+    """
+
+    label: str
+    scene: str
+    folder: str
+    config: dict[str, Any]
+    options: dict[str, Any]
+    source: str | None
+    first_stage: str | None
+    evaluate: dict[str, Any] | None
+    evaluate_options: dict[str, Any] | None = None
+
+
+def homes(sweep: Sweep) -> dict[str, str]:
+    """Name for every run the first one with the same settings and evaluation: it is run once."""
+    settings = {
+        run.name: (sweep.config(run), sweep.evaluation(run), run.downscale) for run in sweep.runs
+    }
+    names = list(settings)
+    return {name: next(n for n in names if settings[n] == settings[name]) for name in names}
+
+
+def beginning(config: Config, count: int) -> Config:
+    """Return the settings of a run's first stages; no setting of a later stage has a part in it."""
+    return replace(config, stages=config.active_stages[:count])
+
+
+def shared_stages(config: Config, others: Iterable[Config]) -> Config | None:
+    """Return the longest beginning that a run shares with another one and does not end with.
+
+    Stages are shared where they, all before them and whatever is common to all stages have equal
+    settings. The last stage of a run is always its own: nothing would be left to train. Those who
+    go on where this run ends do not count, since they take over from the run itself.
+    """
+    count = len(config.active_stages)
+    partners = [x for x in others if len(x.active_stages) <= count or not _begins(config, x)]
+    for length in range(count - 1, 0, -1):
+        first = beginning(config, length)
+        if any(_begins(first, other) for other in partners):
+            return first
+    return None
+
+
+def _begins(first: Config, config: Config) -> bool:
+    """Whether a run starts with all stages of another."""
+    count = len(first.active_stages)
+    return beginning(config, count) == beginning(first, count)
+
+
+@dataclass(frozen=True)
+class Part:
+    """What is trained of a sweep in every scene: a run, or stages that several runs share.
+
+    Attributes
+    ----------
+    folder : name of its folder in the scene's.
+    config : settings.
+    source : folder of the part whose stages it takes over; None for none.
+    first_stage : name of the first stage that it trains itself; None with ``source``.
+    run : None for stages that several runs share.
+    downscale : of the images that it is trained on.
+    """
+
+    folder: str
+    config: Config
+    source: str | None
+    first_stage: str | None
+    run: SweepRun | None
+    downscale: int
+
+
+def parts_of(sweep: Sweep) -> dict[str, Part]:
+    """List the parts of a sweep by folder, sources first.
+
+    Shared stages lie in ``_RUN.STAGE``: the first run that has them, and the last of them; names of
+    runs start with a letter or a digit. A run that ends with the shared stages is a source itself.
+    Runs that are trained on images of other sizes share nothing.
+    """
+    where, parts = homes(sweep), {}
+    runs = [run for run in sweep.runs if where[run.name] == run.name]
+    for factor in dict.fromkeys(run.downscale for run in runs):
+        parts |= _parts_of(sweep, [run for run in runs if run.downscale == factor])
+    return parts
+
+
+def _parts_of(sweep: Sweep, runs: list[SweepRun]) -> dict[str, Part]:
+    """List the parts of runs that are trained on the same images."""
+    downscale = runs[0].downscale
+    configs = {run.name: sweep.config(run) for run in runs}
+    wanted: list[Config] = []
+    for name, config in configs.items():
+        others = [other for key, other in configs.items() if key != name]
+        first = shared_stages(config, others)
+        if first is not None and first not in wanted:
+            wanted.append(first)
+    folders = [_folder_of(first, configs) for first in wanted]
+
+    def part(folder: str, config: Config, run: SweepRun | None) -> Part:
+        count = len(config.active_stages)
+        before = [
+            (len(first.stages), name)
+            for first, name in zip(wanted, folders, strict=True)
+            if len(first.stages) < count and _begins(first, config)
+        ]
+        if not before:
+            return Part(folder, config, None, None, run, downscale)
+        length, source = max(before)
+        return Part(folder, config, source, config.active_stages[length].name, run, downscale)
+
+    shared = [
+        part(folder, first, None)
+        for first, folder in zip(wanted, folders, strict=True)
+        if folder not in configs
+    ]
+    found = [*shared, *(part(run.name, configs[run.name], run) for run in runs)]
+    # A source has fewer stages than those who need it; otherwise the order is the sweep's.
+    parts: dict[str, Part] = {}
+
+    def add(one: Part) -> None:
+        if one.source is not None and one.source not in parts:
+            add(next(other for other in found if other.folder == one.source))
+        parts.setdefault(one.folder, one)
+
+    for one in found:
+        if one.run is not None:
+            add(one)
+    return parts
+
+
+def _folder_of(first: Config, configs: dict[str, Config]) -> str:
+    """Name the folder of shared stages: that of a run that ends with them, if there is one."""
+    having = [name for name, config in configs.items() if _begins(first, config)]
+    ending = [n for n in having if len(configs[n].active_stages) == len(first.stages)]
+    return ending[0] if ending else f"_{having[0]}.{first.stages[-1].name}"
+
+
+def plan(
+    sweep: Sweep, root: Path, output: Path, *, scenes: Iterable[str], names: Iterable[str]
+) -> list[Job]:
+    """List what there is to do for some scenes and runs, in the order to do it.
+
+    Stages that runs share come before the runs that take them over, and are left out where all of
+    these are trained already.
+    """
+    where, parts, jobs = homes(sweep), parts_of(sweep), []
+    wanted = {where[name] for name in names}
+    usual = {"downscale": sweep.downscale, "light": None, "bounds": None}
+    for scene in scenes:
+
+        def job(part: Part, scene: str = scene) -> Job:
+            is_wanted = part.folder in wanted
+            return Job(
+                label=f"{scene}/{part.folder}",
+                scene=str((root / scene).resolve()),
+                folder=str(output / scene / part.folder),
+                config=part.config.to_dict(),
+                options=usual | {"downscale": part.downscale},
+                source=None if part.source is None else str(output / scene / part.source),
+                first_stage=part.first_stage,
+                evaluate=sweep.evaluation(part.run) if part.run and is_wanted else None,
+                evaluate_options=None if part.downscale == sweep.downscale else usual,
+            )
+
+        all_jobs = {name: job(part) for name, part in parts.items()}
+        needed = set(wanted)
+        for name in reversed(parts):
+            source = parts[name].source
+            if source is not None and name in needed and not is_trained(all_jobs[name]):
+                needed.add(source)
+        jobs += [one for name, one in all_jobs.items() if name in needed]
+    return jobs
+
+
+def is_trained(job: Job) -> bool:
+    """Whether the training of a run came to its end."""
+    return (Path(job.folder) / "training.json").exists()
+
+
+def is_finished(job: Job) -> bool:
+    """Whether a run is trained and, where it is to be, evaluated."""
+    needed = ["training.json"] + ["metrics.json", "evaluation.json"] * (job.evaluate is not None)
+    return all((Path(job.folder) / name).exists() for name in needed)

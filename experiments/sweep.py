@@ -1,0 +1,267 @@
+"""Sweep files: many settings to train on many scenes, read and checked before any training."""
+
+import fnmatch
+import math
+import re
+import tomllib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from geosplat_jax.fit.config import Config, all_settings, differences
+from geosplat_jax.fit.presets import make_config
+from geosplat_jax.report.protocols import PROTOCOLS
+from geosplat_jax.report.renderer import DEFAULT_SAMPLES, RELIGHT_KINDS
+
+_FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_KINDS: dict[str, Callable[[Any], bool]] = {
+    "a text": lambda x: isinstance(x, str),
+    "a list of texts": lambda x: isinstance(x, list) and all(isinstance(y, str) for y in x),
+    "a list of tables": lambda x: isinstance(x, list) and all(isinstance(y, dict) for y in x),
+    "a table": lambda x: isinstance(x, dict),
+    "a positive integer": lambda x: type(x) is int and x > 0,
+    "a finite number": lambda x: type(x) in (int, float) and math.isfinite(x),
+}
+_SWEEP_KEYS = {
+    **dict.fromkeys(("title", "about", "preset", "quality", "material_prior"), "a text"),
+    **dict.fromkeys(("scenes", "set", "figures"), "a list of texts"),
+    **dict.fromkeys(("samples", "downscale"), "a positive integer"),
+    "run": "a list of tables",
+}
+_RUN_KEYS = {
+    **dict.fromkeys(("name", "title", "group"), "a text"),
+    "set": "a list of texts",
+    **dict.fromkeys(("evaluate", "scale"), "a table"),
+    "downscale": "a positive integer",
+    "x": "a finite number",
+}
+_EVALUATE_KEYS = {"protocol": "a text", "relight_indirect": "a text"}
+_EVALUATE_KEYS["samples"] = "a positive integer"
+
+
+class SweepError(ValueError):
+    """A sweep cannot be run as it was asked for; the message says what to change."""
+
+
+@dataclass(frozen=True)
+class SweepRun:
+    """One setting of a sweep; see `read_sweep`."""
+
+    name: str
+    title: str
+    overrides: tuple[str, ...]
+    evaluate: dict[str, Any]
+    x: float | None
+    group: str
+    downscale: int
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A parsed sweep file; see `read_sweep`."""
+
+    file: str
+    title: str
+    about: str
+    preset: str
+    quality: str
+    material_prior: str
+    scenes: tuple[str, ...]
+    overrides: tuple[str, ...]
+    figures: tuple[str, ...]
+    samples: int
+    downscale: int
+    runs: tuple[SweepRun, ...]
+
+    def config(self, run: SweepRun) -> Config:
+        """Return the settings of a run."""
+        return make_config(
+            self.preset,
+            self.quality,
+            material_prior=self.material_prior,
+            overrides=(*self.overrides, *run.overrides),
+        )
+
+    def evaluation(self, run: SweepRun) -> dict[str, Any]:
+        """Return all keyword arguments of a run's evaluation."""
+        usual = {"protocol": PROTOCOLS[0], "samples": self.samples, "relight_indirect": "traced"}
+        return usual | run.evaluate
+
+
+def _check_keys(
+    values: dict[str, Any], known: dict[str, str], required: Iterable[str], where: str
+) -> None:
+    """Refuse keys that nobody reads, values of the wrong kind, and missing keys."""
+    for key, value in values.items():
+        if key not in known:
+            raise SweepError(f"{where}: unknown key {key!r}; expected one of {sorted(known)}")
+        if not _KINDS[known[key]](value):
+            raise SweepError(f"{where}: {key} must be {known[key]}, got {value!r}")
+    for key in required:
+        if key not in values:
+            raise SweepError(f"{where}: {key!r} is missing")
+
+
+def _check_names(names: Iterable[str], what: str, where: str) -> None:
+    """Refuse names that are no folder names, and those that some file systems take for one."""
+    seen: dict[str, str] = {}
+    for name in names:
+        if not _FOLDER_NAME.fullmatch(name):
+            raise SweepError(
+                f"{where}: the {what} {name!r} is no folder name; take letters, digits, '.', '-' "
+                "and '_', a letter or digit first"
+            )
+        if name.lower() in seen:
+            raise SweepError(f"{where}: the {what} {name!r} appears twice")
+        seen[name.lower()] = name
+
+
+def _numbers(config: Config) -> dict[str, float]:
+    """Return the settings that are numbers, by path."""
+    return {path: value for path, value, *_ in all_settings(config) if _is_number(value)}
+
+
+def has_numbers(config: Config, pattern: str) -> bool:
+    """Whether a number of the settings has such a path; ``*`` stands for anything."""
+    return any(fnmatch.fnmatchcase(path, pattern) for path in _numbers(config))
+
+
+def scaled(base: Config, factors: dict[str, Any], where: str) -> tuple[str, ...]:
+    """Write numbers of some settings as overrides, times factors; ``*`` stands for anything.
+
+    Counts are rounded; what is left out stays out, and what is there stays.
+    """
+    overrides, numbers = [], _numbers(base)
+    for pattern, factor in factors.items():
+        if not _is_number(factor) or factor <= 0:
+            raise SweepError(f"{where}, scale: {pattern} must be a factor above 0, got {factor!r}")
+        paths = [path for path in numbers if fnmatch.fnmatchcase(path, pattern)]
+        if not paths:
+            raise SweepError(f"{where}, scale: no number is called {pattern}")
+        for path in paths:
+            now, value = numbers[path], numbers[path] * factor
+            is_count = type(now) is int
+            overrides.append(f"{path}={max(round(value), min(now, 1)) if is_count else value}")
+    return tuple(overrides)
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float)
+
+
+def _read_run(values: dict[str, Any], where: str, base: Config, downscale: int) -> SweepRun:
+    """Read one [[run]] table."""
+    _check_keys(values, _RUN_KEYS, ("name",), where)
+    where = f"{where} {values['name']!r}"
+    evaluate = values.get("evaluate", {})
+    _check_keys(evaluate, _EVALUATE_KEYS, (), f"{where}, evaluate")
+    for key, choices in (("protocol", PROTOCOLS), ("relight_indirect", RELIGHT_KINDS)):
+        if evaluate.get(key, choices[0]) not in choices:
+            raise SweepError(
+                f"{where}, evaluate: {key} must be one of {tuple(choices)}, got {evaluate[key]!r}"
+            )
+    if "group" in values and "x" not in values:
+        raise SweepError(f"{where}: group names the curve of a run with x, and there is no x")
+    return SweepRun(
+        name=values["name"],
+        title=values.get("title", values["name"]),
+        overrides=(*scaled(base, values.get("scale", {}), where), *values.get("set", ())),
+        evaluate=evaluate,
+        downscale=values.get("downscale", downscale),
+        x=float(values["x"]) if "x" in values else None,
+        group=values.get("group", "x"),
+    )
+
+
+def _check_settings(sweep: Sweep, where: str) -> None:
+    """Build all settings, so that a bad override is found before training.
+
+    Runs at the same place of a curve are repetitions, which may differ in their seeds alone.
+    """
+    for run in sweep.runs:
+        try:
+            config = sweep.config(run)
+        except ValueError as error:
+            raise SweepError(f"{where}, run {run.name!r}: {error}") from error
+        if not config.active_stages:
+            raise SweepError(f"{where}, run {run.name!r}: nothing to train: no stage has steps")
+    points: dict[tuple[str, float], list[SweepRun]] = {}
+    for run in sweep.runs:
+        if run.x is not None:
+            points.setdefault((run.group, run.x), []).append(run)
+    _check_names({run.group: None for run in sweep.runs if run.x is not None}, "group", where)
+    for (group, x), runs in points.items():
+        first, *others = runs
+        for other in others:
+            changed = differences(sweep.config(first), sweep.config(other))
+            if [line.split(":")[0] for line in changed] != ["run.seed"]:
+                raise SweepError(
+                    f"{where}: {first.name!r} and {other.name!r} are both at x = {x:g} of group "
+                    f"{group!r}; repetitions differ in run.seed alone, these differ in "
+                    f"{'; '.join(changed) or 'nothing'}"
+                )
+
+
+def read_sweep(path: Path, *, overrides: Iterable[str] = (), quality: str | None = None) -> Sweep:
+    """Read and validate a sweep file.
+
+    Parameters
+    ----------
+    path : TOML with ``title``, ``about``, ``preset``, ``quality``, ``material_prior``
+        (see `presets.make_config`), ``scenes`` (folder names), ``set`` (overrides of every run),
+        ``figures`` (names of ``metrics.json`` to tabulate), ``samples`` of the evaluation,
+        ``downscale`` of the images, and tables ``[[run]]`` with ``name``, ``title``, ``set``,
+        ``scale`` (factors of settings by path, in which ``*`` stands for any stage),
+        ``downscale`` of the images that it is trained on (all are evaluated on the sweep's),
+        ``evaluate`` (keyword arguments of `Run.evaluate`), ``x`` (the run is a point of a
+        curve) and ``group`` (which curve). The first run is the reference. Required are ``title``,
+        ``scenes``, ``figures``, one run, and each run's ``name``.
+    overrides : applied to every run after ``set`` and before its own.
+    quality : instead of the file's.
+
+    Raises
+    ------
+    SweepError
+        If the file cannot be read, or anything in it is unknown, of the wrong kind or not legal.
+    """
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise SweepError(f"cannot read the sweep {path}: {error}") from error
+    where = path.name
+    _check_keys(values, _SWEEP_KEYS, ("title", "scenes", "figures", "run"), where)
+    for key in ("scenes", "figures", "run"):
+        if not values[key]:
+            raise SweepError(f"{where}: {key} must not be empty")
+    if len(set(values["figures"])) < len(values["figures"]):
+        raise SweepError(f"{where}: figures must not name one twice, got {values['figures']}")
+    usual = {
+        "preset": values.get("preset", "default"),
+        "quality": quality or values.get("quality", "standard"),
+        "material_prior": values.get("material_prior", "hybrid"),
+        "overrides": (*values.get("set", ()), *overrides),
+    }
+    try:
+        base = make_config(**usual)
+    except ValueError as error:
+        raise SweepError(f"{where}: {error}") from error
+    downscale = values.get("downscale", 1)
+    tables = enumerate(values["run"], 1)
+    sweep = Sweep(
+        file=path.name,
+        title=values["title"],
+        about=values.get("about", "").strip(),
+        **usual,
+        scenes=tuple(values["scenes"]),
+        figures=tuple(values["figures"]),
+        samples=values.get("samples", DEFAULT_SAMPLES),
+        downscale=downscale,
+        runs=tuple(
+            _read_run(table, f"{where}, run {number}", base, downscale) for number, table in tables
+        ),
+    )
+    _check_names(sweep.scenes, "scene", where)
+    _check_names((run.name for run in sweep.runs), "run", where)
+    _check_settings(sweep, where)
+    return sweep
