@@ -294,6 +294,14 @@ def mean_metallic(metallic: Float[Array, " N"], mask: Bool[Array, " N"]) -> Floa
     return safe_divide(total, jnp.sum(mask).astype(total.dtype))
 
 
+def metallic_mixture(metallic: Float[Array, " N"], mask: Bool[Array, " N"]) -> Float[Array, ""]:
+    """Average m (1 - m) over the splats: surfaces are metals or dielectrics, seldom between.
+
+    What the photographs leave open goes to the nearer of both; a clear metal loses nothing.
+    """
+    return mean_metallic(metallic * (1.0 - metallic), mask)
+
+
 def white_balance(radiance: Float[Array, "H W 3"]) -> Float[Array, ""]:
     """Mean absolute distance of the light's texels from grey, as in the authors' code."""
     return jnp.mean(absolute(radiance - jnp.mean(radiance, axis=-1, keepdims=True)))
@@ -385,6 +393,9 @@ SHARED_TERMS: dict[str, Callable[[SharedInputs], Float[Array, ""]]] = {
     "smoothness_roughness_metallic": lambda x: x.changes.roughness + x.changes.metallic,
     "indirect": lambda x: indirect_magnitude(x.asset),
     "metallic": lambda x: mean_metallic(x.asset.attributes.materials.metallic, x.asset.splats.mask),
+    "metallic_mixture": lambda x: metallic_mixture(
+        x.asset.attributes.materials.metallic, x.asset.splats.mask
+    ),
     "radiometric": lambda x: radiometric_disagreement(x),
     "white_balance": lambda x: white_balance(x.params.light.radiance),
     "light_tint": lambda x: light_tint(x.params.light.radiance),

@@ -19,6 +19,7 @@ from geosplat_jax.losses import (
     light_tint,
     mask_error,
     mean_metallic,
+    metallic_mixture,
     random_background,
     white_balance,
 )
@@ -195,6 +196,13 @@ def test_padding_has_no_part_in_the_mean_metallic():
     assert float(mean_metallic(values, jnp.zeros(3, bool))) == 0.0
     slope = jax.grad(mean_metallic)(values, mask)
     np.testing.assert_allclose(slope, [0.5, 0.5, 0.0])
+
+
+def test_what_is_no_clear_metal_goes_to_the_nearer_of_both():
+    values, mask = jnp.array([0.0, 0.2, 0.8, 1.0, 0.5]), jnp.array([True] * 4 + [False])
+    assert float(metallic_mixture(values, mask)) == pytest.approx(0.08)
+    slope = jax.grad(metallic_mixture)(values, mask)
+    np.testing.assert_allclose(slope, [0.25, 0.15, -0.15, -0.25, 0.0], rtol=1e-6)
 
 
 def test_shade_weighs_more_in_encoded_colour():

@@ -463,7 +463,7 @@ def test_the_bundled_sweeps_are_sound():
     assert stages["materials-at-once"].rates["albedo"].warmup == 0
     assert stages["albedo-kept"].enter == ()
     assert read_sweep(SWEEPS / "smoke.toml").scenes == ("duck",)
-    assert len(read_sweep(SWEEPS / "priors.toml").runs) == 17
+    assert len(read_sweep(SWEEPS / "priors.toml").runs) == 18
 
 
 def test_the_ablation_of_the_paper_changes_what_its_rows_say():

@@ -40,6 +40,7 @@ _SETTINGS = (
     "stages.split_sum.weights.light_cast=0.01",
     "stages.split_sum.weights.light_smoothness=0.01",
     "stages.split_sum.weights.metallic=0.01",
+    "stages.split_sum.weights.metallic_mixture=0.01",
     "stages.split_sum.weights.encoded_l1=0.3",
     "stages.split_sum.weights.encoded_ssim=0.1",
     "stages.split_sum.weights.normal_smoothness=0.03",
