@@ -101,6 +101,20 @@ def test_a_step_that_overflows_is_repeated_with_the_same_batch(dataset, folder, 
     assert told.pipelines[2].capacities["hits"] >= 500
 
 
+def test_programs_of_trainings_before_are_forgotten_before_a_training_compiles(
+    dataset, folder, steps, monkeypatch
+):
+    """A process that trains again and again, to choose a model, would run out of memory maps."""
+    order = []
+    steps()
+    monkeypatch.setattr(
+        loop_module, "release_programs_when_crowded", lambda: order.append("release")
+    )
+    monkeypatch.setattr(loop_module, "compile_step", lambda *a, **k: order.append("compile"))
+    new_loop(dataset, CONFIG, folder).prepare(0)
+    assert order == ["release", "compile"]
+
+
 def test_weights_and_rates_count_from_the_start_of_their_stage(dataset, folder, steps):
     told = steps()
     loop = new_loop(dataset, CONFIG, folder)

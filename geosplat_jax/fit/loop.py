@@ -166,6 +166,8 @@ class Loop:
         if planned_for != self.planned_for:
             self.planned_for, self.peak = planned_for, None
             self._announce()
+            if self.upcoming is None:  # else its programs are there already
+                release_programs_when_crowded()
             planned = self.devices.together(lambda: self._planned(known))
             sizes = self.devices.first_host(dict(planned))
             self.pipeline = replace(self.pipeline, capacities=Capacities(**sizes))
