@@ -528,7 +528,7 @@ def train(
     if resume and config is None and folder.exists and folder.budget() is not None:
         # Its settings were chosen for the budget, and have changed since.
         config, budget, reading = folder.config(), folder.budget(), folder.record()["dataset"]
-    if resume and config is None and folder.has_chosen_model:
+    if resume and folder.has_chosen_model and (config is None or model is not None):
         config, reading = folder.config(), folder.record()["dataset"]
     if config is None and budget is not None:
         chosen = plan_training(scene, budget, downscale=reading.get("downscale"))

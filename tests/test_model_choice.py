@@ -288,5 +288,7 @@ def test_a_model_is_chosen_recorded_and_trained_on_all_views(tmp_path, capsys):
     measured = (choice_folder(output) / "choice.json").stat().st_mtime_ns
     assert cli.main(command) == 0
     assert (choice_folder(output) / "choice.json").stat().st_mtime_ns == measured
-    again = gs.train(duck, output, resume=True, model="auto", downscale=8)
-    assert again.config == run.config
+    # Its own, also where the settings are named that it was chosen from.
+    for named in (None, config):
+        again = gs.train(duck, output, named, resume=True, model="auto", downscale=8)
+        assert again.config == run.config
