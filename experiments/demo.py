@@ -4,6 +4,7 @@ import argparse
 import time
 from pathlib import Path
 
+from geosplat_jax.fit.begin import Anew
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.runtime import (
     enable_compilation_cache,
@@ -37,7 +38,7 @@ def main() -> None:
     retain_freed_memory()
     began = time.perf_counter()
     config = make_config("default", "draft", material_prior=MATERIAL_PRIOR, overrides=OVERRIDES)
-    run = train(SCENE, folder, config, force=True)
+    run = train(SCENE, folder, config, begin=Anew(replace=True))
     # Beside the movie: both wait for the compiler, which uses one core.
     evaluated = in_background(lambda: run.evaluate(samples=SAMPLES))
     movie = RelightOptions(turntable=FRAMES, suffix=".gif", frames_per_second=12.0)

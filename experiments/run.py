@@ -27,6 +27,7 @@ from jobs import Job, homes, is_finished, is_trained, plan
 from report import command_line
 from sweep import Sweep, SweepError, read_sweep
 
+from geosplat_jax.fit.begin import Anew, Begin, Resume, TakeOver
 from geosplat_jax.fit.config import config_from_dict, differences
 from geosplat_jax.fit.presets import QUALITIES
 from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
@@ -99,6 +100,17 @@ def _evaluate(folder: Path, reading: dict[str, Any] | None = None, **arguments: 
     run.evaluate(**arguments)
 
 
+def _begin(job: Job) -> Begin:
+    """Return how a run begins; a start that came to no whole checkpoint is replaced."""
+    folder = Path(job.folder)
+    if latest_checkpoint(folder / "checkpoints") is not None:
+        return Resume()
+    has_begun = (folder / "run.json").exists()
+    if job.source is None or job.first_stage is None:
+        return Anew(replace=has_begun)
+    return TakeOver(Path(job.source), job.first_stage, replace=has_begun)
+
+
 def execute(
     job: Job,
     *,
@@ -114,19 +126,8 @@ def execute(
     """
     folder = Path(job.folder)
     if not is_trained(job):
-        resume = latest_checkpoint(folder / "checkpoints") is not None
-        train(
-            Path(job.scene),
-            folder,
-            config_from_dict(job.config),
-            resume=resume,
-            # A start that came to no whole checkpoint is replaced.
-            force=not resume and (folder / "run.json").exists(),
-            # A resumed run has its first stages already.
-            source=None if resume or job.source is None else Path(job.source),
-            first_stage=None if resume else job.first_stage,
-            **job.options,
-        )
+        config = config_from_dict(job.config)
+        train(Path(job.scene), folder, config, begin=_begin(job), **job.options)
     if job.evaluate is not None:
         reading = {} if job.evaluate_options is None else {"reading": job.evaluate_options}
         evaluate(folder, **job.evaluate, **reading)

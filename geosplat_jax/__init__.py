@@ -9,10 +9,12 @@
 """
 
 from geosplat_jax.core.types import Batch, Camera, EnvLight
+from geosplat_jax.fit.begin import Anew, Resume, TakeOver
 from geosplat_jax.fit.config import Budget, Config, Stage
 from geosplat_jax.fit.folder import RunError
+from geosplat_jax.fit.listener import Listener, Progress
 from geosplat_jax.fit.presets import make_config
-from geosplat_jax.fit.train import Interrupted, Progress, TrainingError
+from geosplat_jax.fit.train import Interrupted, TrainingError
 from geosplat_jax.io.dataset import Dataset, load_dataset
 from geosplat_jax.io.images import SceneError
 from geosplat_jax.model_choice import ModelChoice
@@ -23,6 +25,7 @@ from geosplat_jax.report.renderer import Renderer
 from geosplat_jax.run import Run, train
 
 __all__ = [
+    "Anew",
     "Batch",
     "Budget",
     "Camera",
@@ -30,15 +33,18 @@ __all__ = [
     "Dataset",
     "EnvLight",
     "Interrupted",
+    "Listener",
     "ModelChoice",
     "Params",
     "Pipeline",
     "Progress",
     "Renderer",
+    "Resume",
     "Run",
     "RunError",
     "SceneError",
     "Stage",
+    "TakeOver",
     "TrainingError",
     "load_dataset",
     "load_light",

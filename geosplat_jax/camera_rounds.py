@@ -8,13 +8,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.cameras import CameraSettings, ViewProgress
 from geosplat_jax.fit.config import Config
-from geosplat_jax.fit.folder import RunFolder
+from geosplat_jax.fit.listener import NOBODY, Listener
 from geosplat_jax.fit.presets import make_config
-from geosplat_jax.fit.train import Progress
 from geosplat_jax.io.dataset import load_recorded
-from geosplat_jax.run import Run, train
+from geosplat_jax.run import train
 
 
 def rounds_folder(output: str | Path) -> Path:
@@ -31,7 +31,7 @@ def refined_cameras(
     config: Config | None = None,
     reading: Mapping[str, Any] | None = None,
     how: CameraSettings | None = None,
-    on_step: Callable[[Progress], None] | None = None,
+    listener: Listener = NOBODY,
     on_view: Callable[[str, ViewProgress], None] | None = None,
 ) -> Path:
     """Train and refine as often as asked; return the file of the last cameras.
@@ -46,7 +46,8 @@ def refined_cameras(
     config : of a round; quality ``draft`` by default.
     reading : how to read the scene, see `load_recorded`; ``cameras`` are those of the first round.
     how : cameras are refined, see `CameraSettings`.
-    on_step, on_view : called after every step, and after every refined view with its split.
+    listener : told of the trainings.
+    on_view : called after every refined view with its split.
 
     Raises
     ------
@@ -63,19 +64,8 @@ def refined_cameras(
         folder = rounds_folder(output) / f"round_{number}"
         cameras = folder.with_suffix(".json")
         if not cameras.exists():
-            run = _trained(scene, folder, config, options, on_step)
+            dataset = load_recorded(scene, options)
+            run = train(dataset, folder, config, begin=Resume(), listener=listener)
             run.refine_cameras(cameras, how=how, on_view=on_view)
         options["cameras"] = cameras
     return cameras
-
-
-def _trained(
-    scene: str | Path,
-    folder: Path,
-    config: Config,
-    options: Mapping[str, Any],
-    on_step: Callable[[Progress], None] | None,
-) -> Run:
-    """Train a round, or go on with it."""
-    dataset = load_recorded(scene, options)
-    return train(dataset, folder, config, resume=RunFolder(folder).exists, on_step=on_step)

@@ -13,7 +13,7 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,13 +21,15 @@ from typing import Any
 import numpy as np
 
 from geosplat_jax.core.settings import PositiveCount, settings
+from geosplat_jax.fit.begin import ANEW, Begin, Resume
 from geosplat_jax.fit.budget import with_steps
 from geosplat_jax.fit.config import Config, Stage
 from geosplat_jax.fit.entering import Start
-from geosplat_jax.fit.evidence import Comparison, compare, every_nth, neighbouring_blocks
+from geosplat_jax.fit.evidence import Rung, compare, every_nth, neighbouring_blocks
 from geosplat_jax.fit.folder import RunError, RunFolder
+from geosplat_jax.fit.listener import NOBODY, Listener
 from geosplat_jax.fit.model_parts import LADDER, Part, offered_parts, without
-from geosplat_jax.fit.train import Progress, TrainingError, fit, load_trained
+from geosplat_jax.fit.train import TrainingError, fit, load_trained
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.views import Views, some_views
@@ -66,29 +68,6 @@ class ModelChoice:
     """Trainings of a model that a gain is measured against."""
     hold_back: PositiveCount = 8
     """Every so many-th training view is held back."""
-
-
-@dataclass(frozen=True)
-class Rung:
-    """What became of a part.
-
-    Attributes
-    ----------
-    part, title : its name, in files and for people.
-    smaller, larger : mean decibels of the held-back views without it and with it; None where its
-        training failed.
-    found : the gain and its errors; None likewise.
-    is_kept : whether the model has it.
-    note : why there is nothing to compare, or what came with it that had been left out before.
-    """
-
-    part: str
-    title: str
-    smaller: float
-    larger: float | None
-    found: Comparison | None
-    is_kept: bool
-    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -134,10 +113,8 @@ def choose_model(
     output: str | Path,
     how: ModelChoice | None = None,
     *,
-    resume: bool = False,
-    force: bool = False,
-    on_step: Callable[[Progress], None] | None = None,
-    on_rung: Callable[[Rung], None] | None = None,
+    begin: Begin = ANEW,
+    listener: Listener = NOBODY,
 ) -> ChosenModel:
     """Find the smallest model that explains the training views of a scene.
 
@@ -148,9 +125,9 @@ def choose_model(
     output : folder of the run to come; trials are made beside it, in ``OUTPUT_model``, of which
         the file ``choice.json`` stays.
     how : see `ModelChoice`.
-    resume : go on with a choice that was interrupted; trainings that are done are not made again.
-    force : begin anew where there was one.
-    on_step, on_rung : called after every step of a training, and after every part.
+    begin : `Resume` goes on with a choice that was interrupted; trainings that are done are not
+        made again. `Anew` with ``replace`` begins anew where there was one.
+    listener : told of every training, and of every part that was tried.
 
     Raises
     ------
@@ -163,8 +140,8 @@ def choose_model(
         See `fit.train.fit`; a part whose training fails is left out.
     """
     how = how or ModelChoice()
-    trials = _Trials(dataset, config, choice_folder(output), how, on_step)
-    trials.open(resume=resume, force=force)
+    trials = _Trials(dataset, config, choice_folder(output), how, listener)
+    trials.open(begin)
     offered = offered_parts(config, how.by_hand)
     kept: frozenset[str] = frozenset()
     rungs = []
@@ -175,8 +152,7 @@ def choose_model(
         rung = _tried(trials, part, kept, wanted)
         kept = frozenset(wanted) if rung.is_kept else kept
         rungs.append(rung)
-        if on_rung is not None:
-            on_rung(rung)
+        listener.on_rung(rung)
     trials.close()
     return ChosenModel(
         config=trials.model(kept),
@@ -223,7 +199,7 @@ class _Trials:
     ----------
     dataset, config, how : see `choose_model`.
     folder : of the trainings and of what they have measured.
-    on_step : called after every step.
+    listener : told of every training.
     """
 
     def __init__(
@@ -232,7 +208,7 @@ class _Trials:
         config: Config,
         folder: Path,
         how: ModelChoice,
-        on_step: Callable[[Progress], None] | None,
+        listener: Listener,
     ) -> None:
         stages = [stage for stage in config.active_stages if not stage.splats.takes_over]
         if not stages:
@@ -244,7 +220,7 @@ class _Trials:
                 f"training views, which must be {_FEWEST_HELD} at least; take more photographs, or "
                 "train without --model auto"
             )
-        self.how, self._config, self._folder, self._on_step = how, config, folder, on_step
+        self.how, self._config, self._folder, self._listener = how, config, folder, listener
         self._first, self._last = stages[0], stages[-1]
         self._offered = offered_parts(config, how.by_hand)
         longest = max(dataset.train.height, dataset.train.width)
@@ -279,7 +255,7 @@ class _Trials:
         """Return the settings of a model: of the parts to choose, only those that are named."""
         return without(self._config, [part for part in self._offered if part.name not in kept])
 
-    def open(self, *, resume: bool, force: bool) -> None:
+    def open(self, begin: Begin) -> None:
         """Begin, or read what is there already.
 
         Raises
@@ -288,7 +264,7 @@ class _Trials:
             See `choose_model`.
         """
         path, mark = self._folder / _STATE, self._mark()
-        if force and self._folder.exists():
+        if begin.replace and self._folder.exists():
             _require_state(self._folder)
             shutil.rmtree(self._folder)
         if not path.exists():
@@ -297,7 +273,7 @@ class _Trials:
             self._folder.mkdir(parents=True, exist_ok=True)
             self._save(mark)
             return
-        if not resume:
+        if not begin.resumes:
             raise RunError(
                 f"{self._folder} holds a choice of a model; continue it with --resume, or replace "
                 "it with --force"
@@ -416,14 +392,8 @@ class _Trials:
         return with_steps(single, min(1.0, self.how.steps / chosen.steps))
 
     def _fit(self, config: Config, folder: Path, start: Start | None) -> None:
-        fit(
-            self._dataset,
-            config,
-            folder,
-            resume=RunFolder(folder).exists,
-            start=start,
-            on_step=self._on_step,
-        )
+        begin = Resume(start=start)
+        fit(self._dataset, config, folder, begin=begin, listener=self._listener)
 
     def _measure(self, folder: Path) -> np.ndarray:
         """Compare the held-back views with the photographs, in sRGB on white; decibels, (V,)."""

@@ -15,22 +15,24 @@ import jax
 import jax.numpy as jnp
 
 from geosplat_jax.core.types import Batch, EnvLight
+from geosplat_jax.fit.begin import ANEW, Begin
 from geosplat_jax.fit.budget import Pacer, Plan, plan
 from geosplat_jax.fit.cameras import CameraSettings, ViewProgress, refine_views, with_mean_balance
 from geosplat_jax.fit.config import Budget, Config
 from geosplat_jax.fit.costs import expected_costs, slowness_of_machine
 from geosplat_jax.fit.devices import Devices, choose_devices
 from geosplat_jax.fit.folder import RunError, RunFolder
+from geosplat_jax.fit.listener import NOBODY, Listener, Listeners
 from geosplat_jax.fit.presets import make_config, with_mesh
 from geosplat_jax.fit.runtime import in_background
 from geosplat_jax.fit.stages import make_batch
 from geosplat_jax.fit.start_mesh import MeshSettings
-from geosplat_jax.fit.train import Progress, Trained, fit, load_trained
+from geosplat_jax.fit.train import Trained, fit, load_trained
 from geosplat_jax.io.cameras import RefinedSplit, write_cameras
 from geosplat_jax.io.dataset import Dataset, load_recorded, photograph_size
 from geosplat_jax.io.images import write_png
 from geosplat_jax.io.views import Views
-from geosplat_jax.model_choice import ModelChoice, Rung, choose_model
+from geosplat_jax.model_choice import ChosenModel, ModelChoice, choose_model
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
 from geosplat_jax.report.assets import export_assets
@@ -398,7 +400,7 @@ class Run:
         )
 
 
-class _Previews:
+class _Previews(Listener):
     """Write truth, render and normals of one view side by side, while the training goes on.
 
     A training with a budget begins none that it would have to wait for at its end.
@@ -410,7 +412,7 @@ class _Previews:
         self._pacer = pacer
         self._running: Future[None] | None = None
 
-    def __call__(self, trained: Trained) -> None:
+    def on_preview(self, trained: Trained) -> None:
         """Begin to render a preview; waits for the one before."""
         if self._pacer is not None and self._pacer.seconds_left < _PREVIEW_SECONDS:
             return
@@ -475,16 +477,11 @@ def train(
     *,
     quality: str = "standard",
     mesh: str | Path | MeshSettings | None = None,
-    resume: bool = False,
-    force: bool = False,
-    source: str | Path | None = None,
-    first_stage: str | None = None,
-    on_step: Callable[[Progress], None] | None = None,
+    begin: Begin = ANEW,
     budget: Budget | None = None,
-    on_compile: Callable[[str], None] | None = None,
-    devices: int | Devices = 1,
     model: Literal["auto"] | ModelChoice | None = None,
-    on_rung: Callable[[Rung], None] | None = None,
+    devices: int | Devices = 1,
+    listener: Listener = NOBODY,
     **reading: Any,
 ) -> Run:
     """Train a scene into a run's folder.
@@ -496,19 +493,20 @@ def train(
     config : settings, see `make_config`; by default those of ``quality``.
     mesh : file of a mesh to start from instead of a visual hull, see `fit.presets.with_mesh`. A run
         that is resumed knows its own.
-    resume, force, source, first_stage, on_step, on_compile : see `fit.train.fit`; ``force``
-        replaces a run.
+    begin : ``Resume()`` goes on with the run that the folder holds, ``Anew(replace=True)`` replaces
+        it, ``TakeOver(run, stage)`` takes the stages before one from another run; by default the
+        folder must hold none.
     budget : time and memory that the training may take. Without ``config``, settings are chosen for
         it (`plan_training`); in any case steps are made fewer or more on the way, so that it ends
         in time. A run that is resumed keeps its own, and has what is left of it.
-    devices : number of those of this process that share the views of every step
-        (docs/devices.md); all processes that `jax.distributed.initialize` connected take part, with
-        so many each. Or what `fit.devices.choose_devices` made of it before.
     model : ``auto``, or how to choose: train the smallest model that explains the scene, see
         `model_choice.choose_model`. Of the parts of ``config``, those stay as they are whose
         settings differ from its preset, or are named in ``by_hand``. A run that is resumed keeps
         its model.
-    on_rung : called after every part of a model that was tried.
+    devices : number of those of this process that share the views of every step
+        (docs/devices.md); all processes that `jax.distributed.initialize` connected take part, with
+        so many each. Or what `fit.devices.choose_devices` made of it before.
+    listener : told of every step, compilation, preview, and part of a model that was tried.
     reading : how to read the scene: ``downscale``, ``light``, ``bounds`` (six numbers),
         ``cameras`` (a file of `Run.refine_cameras`).
 
@@ -520,70 +518,75 @@ def train(
         If the mesh cannot be used, see `io.start_mesh`; if a model is to be chosen under a budget,
         for stages of another run, or from too few views.
     """
-    if model is not None and (budget is not None or source is not None):
+    if model is not None and (budget is not None or begin.takes_over):
         raise ValueError("a model is chosen for a whole training without a budget; leave model out")
-    began, folder = time.perf_counter(), RunFolder(output)
+    started, folder = time.perf_counter(), RunFolder(output)
     if isinstance(devices, int):
         devices = choose_devices(devices)
-    if resume and config is None and folder.exists and folder.budget() is not None:
-        # Its settings were chosen for the budget, and have changed since.
-        config, budget, reading = folder.config(), folder.budget(), folder.record()["dataset"]
-    if resume and folder.has_chosen_model and (config is None or model is not None):
+    goes_on = begin.goes_on(folder)
+    keeps_model = goes_on and folder.has_chosen_model and (config is None or model is not None)
+    if keeps_model or (goes_on and config is None and folder.budget() is not None):
+        # Its settings were chosen, and those of a budget have changed since.
         config, reading = folder.config(), folder.record()["dataset"]
+        budget = folder.budget() or budget
     if config is None and budget is not None:
         chosen = plan_training(scene, budget, downscale=reading.get("downscale"))
         config, reading = chosen.config, {**reading, "downscale": chosen.downscale}
     config = config or make_config(quality=quality)
-    if mesh is None and resume and not isinstance(config.geometry, MeshSettings):
+    if mesh is None and goes_on and not isinstance(config.geometry, MeshSettings):
         mesh = mesh_of_run(folder)
     if mesh is not None:
         config = with_mesh(config, mesh)
     dataset = scene if isinstance(scene, Dataset) else load_recorded(scene, reading)
     evidence = None
-    if model is not None and not (resume and folder.exists):
-        folder.require_free(replace=force)
-        dataset.require_masks("train")
+    if model is not None and not goes_on:
         how = ModelChoice() if model == "auto" else model
-        by_hand = (*how.by_hand, *changed_from_preset(config))
-        chosen_model = choose_model(
-            dataset,
-            config,
-            output,
-            replace(how, by_hand=tuple(dict.fromkeys(by_hand))),
-            resume=resume,
-            force=force,
-            on_step=on_step,
-            on_rung=on_rung,
-        )
+        chosen_model = _chosen_model(dataset, config, folder, how, begin, listener)
         config, evidence = chosen_model.config, chosen_model.record()
-        began = time.perf_counter()  # the cost of choosing is stated apart
+        started = time.perf_counter()  # the cost of choosing is stated apart
     pacer = None
     if budget is not None:
-        pixels = float(dataset.train.height * dataset.train.width)
-        costs = expected_costs(config, pixels, slowness=slowness_of_machine())
-        used = folder.seconds_used() if resume else 0.0
-        pacer = Pacer(budget, config, costs, began=began - used)
+        used = folder.seconds_used() if goes_on else 0.0
+        pacer = _pacer(budget, dataset, config, began=started - used)
     previews = _Previews(dataset, folder, pacer)
     try:
         fit(
             dataset,
             config,
             folder.path,
-            resume=resume,
-            replace_run=force,
-            source=source,
-            first_stage=first_stage,
-            on_step=on_step,
-            on_preview=previews,
+            begin=begin,
+            listener=Listeners(listener, previews),
             pacer=pacer,
-            on_compile=on_compile,
             devices=devices,
             model=evidence,
         )
     finally:
         previews.finish()
     if devices.is_first_host:
-        folder.write_training({"seconds_total": round(time.perf_counter() - began, 2)})
+        folder.write_training({"seconds_total": round(time.perf_counter() - started, 2)})
     run = Run(folder.path)
     run.dataset = dataset
     return run
+
+
+def _chosen_model(
+    dataset: Dataset,
+    config: Config,
+    folder: RunFolder,
+    how: ModelChoice,
+    begin: Begin,
+    listener: Listener,
+) -> ChosenModel:
+    """Choose the model of a new run; what its settings change of their preset counts as by hand."""
+    folder.require_free(replace=begin.replace)
+    dataset.require_masks("train")
+    by_hand = tuple(dict.fromkeys((*how.by_hand, *changed_from_preset(config))))
+    how = replace(how, by_hand=by_hand)
+    return choose_model(dataset, config, folder.path, how, begin=begin, listener=listener)
+
+
+def _pacer(budget: Budget, dataset: Dataset, config: Config, *, began: float) -> Pacer:
+    """Return what keeps a training to its budget, on this machine."""
+    pixels = float(dataset.train.height * dataset.train.width)
+    costs = expected_costs(config, pixels, slowness=slowness_of_machine())
+    return Pacer(budget, config, costs, began=began)

@@ -37,6 +37,7 @@ ORDER = [
     "gradcheck",
     "viewer",
     "cli",
+    "__main__",
 ]
 
 # Everything below `io` may run inside jit, takes plain arguments and knows no settings of a run

@@ -9,6 +9,7 @@ import pytest
 from support import sphere_dataset, tiny_config
 
 from geosplat_jax import cli
+from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.budget import (
     Pacer,
     parse_duration,
@@ -237,7 +238,7 @@ def test_a_shortened_run_that_was_stopped_goes_on_with_its_own_settings(dataset,
     run = RunFolder(folder)
     assert run.budget() == Budget(60.0)
     assert run.config().total_steps < 40
-    state = fit(dataset, run.config(), folder, resume=True)
+    state = fit(dataset, run.config(), folder, begin=Resume())
     assert int(state.step) == run.config().total_steps
 
 
@@ -245,7 +246,7 @@ def test_python_resumes_a_budget_without_naming_settings(dataset, tmp_path):
     config = tiny_config("stages.split_sum.steps=40", "stages.monte_carlo.steps=0")
     config = replace(config, run=replace(config.run, preview_every=2))
     _paced_run(dataset, tmp_path / "run", config, stop_after=12)
-    run = train(dataset, tmp_path / "run", resume=True)
+    run = train(dataset, tmp_path / "run", begin=Resume())
     assert run.trained.step == run.config.total_steps
     assert run.folder.budget() == Budget(60.0)
     # With less than a minute left no preview is begun, which the end would have to wait for.

@@ -34,10 +34,9 @@ def made(monkeypatch):
     """Replace reading and training by a record of what they were called with."""
     calls = []
 
-    def train(dataset, folder, config, *, resume, on_step):
+    def train(dataset, folder, config, *, begin, listener):
         folder.mkdir(parents=True)
-        calls.append((dataset.options, config.quality, resume))
-
+        calls.append((dataset.options, config.quality, begin.resumes))
         return _Round(len(calls))
 
     monkeypatch.setattr(camera_rounds, "train", train)
@@ -52,8 +51,8 @@ def test_a_round_reads_what_the_one_before_has_found(made, tmp_path):
     assert found == folder / "round_2.json"
     assert folder != output
     assert made == [
-        ({"downscale": 2}, "draft", False),
-        ({"downscale": 2, "cameras": folder / "round_1.json"}, "draft", False),
+        ({"downscale": 2}, "draft", True),
+        ({"downscale": 2, "cameras": folder / "round_1.json"}, "draft", True),
     ]
 
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import runpy
 import shutil
 import sys
 from pathlib import Path
@@ -65,6 +66,14 @@ def test_the_help_is_short_and_names_every_command(capsys):
     assert len(said.splitlines()) <= 30
     for name in COMMANDS:
         assert re.search(rf"^ +{name}\b", said, re.MULTILINE)
+
+
+def test_the_package_run_as_a_module_is_the_command(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["geosplat_jax", "--help"])
+    with pytest.raises(SystemExit) as stop:
+        runpy.run_module("geosplat_jax", run_name="__main__")
+    assert stop.value.code == 0
+    assert "usage: geosplat-jax" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -12,8 +12,10 @@ from support import TINY, ball, sphere_dataset, tiny_config
 import geosplat_jax as gs
 from geosplat_jax import cli, model_choice
 from geosplat_jax.core.types import EnvLight
+from geosplat_jax.fit.begin import Anew, Resume
 from geosplat_jax.fit.entering import Start
 from geosplat_jax.fit.folder import RunError
+from geosplat_jax.fit.listener import Listener
 from geosplat_jax.fit.model_parts import LADDER, without
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.train import Interrupted, TrainingError, load_trained
@@ -44,7 +46,7 @@ class _Trainings:
         monkeypatch.setattr(model_choice, "_start_of", lambda folder: object.__new__(Start))
         monkeypatch.setattr(model_choice._Trials, "_measure", self._measure)
 
-    def _fit(self, dataset, config, folder, *, resume, start, on_step):
+    def _fit(self, dataset, config, folder, *, begin, listener):
         if len(self.made) == self.stops_at:
             folder.mkdir(parents=True)
             raise Interrupted("stopped")
@@ -147,15 +149,15 @@ def test_a_choice_that_was_stopped_goes_on_and_ends_alike(dataset, trainings, tm
     expected, trainings.made = trainings.made, []
     trainings.stops_at = stop
     with pytest.raises(Interrupted):
-        choose_model(dataset, config, tmp_path / "run", resume=True)
+        choose_model(dataset, config, tmp_path / "run", begin=Resume())
     trainings.stops_at = None
-    again = choose_model(dataset, config, tmp_path / "run", resume=True)
+    again = choose_model(dataset, config, tmp_path / "run", begin=Resume())
     assert trainings.made == expected
     assert again.config == whole.config
     assert replace(again, seconds=0.0) == replace(whole, seconds=0.0)
     # What remains are the figures, from which it can be repeated at no cost.
     assert [path.name for path in choice_folder(tmp_path / "run").iterdir()] == ["choice.json"]
-    choose_model(dataset, config, tmp_path / "run", resume=True)
+    choose_model(dataset, config, tmp_path / "run", begin=Resume())
     assert trainings.made == expected
 
 
@@ -166,9 +168,9 @@ def test_a_choice_is_not_mixed_with_another(dataset, trainings, tmp_path):
         choose_model(dataset, config, tmp_path / "run")
     other = make_config(quality="draft", overrides=("run.seed=5",))
     with pytest.raises(RunError, match="begun with other settings or other views"):
-        choose_model(dataset, other, tmp_path / "run", resume=True)
+        choose_model(dataset, other, tmp_path / "run", begin=Resume())
     before = len(trainings.made)
-    choose_model(dataset, other, tmp_path / "run", force=True)
+    choose_model(dataset, other, tmp_path / "run", begin=Anew(replace=True))
     assert len(trainings.made) == 2 * before
     path = choice_folder(tmp_path / "run") / "choice.json"
     state = json.loads(path.read_text())
@@ -176,16 +178,16 @@ def test_a_choice_is_not_mixed_with_another(dataset, trainings, tmp_path):
     for text in ("{", "[]", json.dumps({**state, "trainings": 5}), json.dumps(state)):
         path.write_text(text)
         with pytest.raises(RunError, match=r"choice\.json is damaged"):
-            choose_model(dataset, other, tmp_path / "run", resume=True)
+            choose_model(dataset, other, tmp_path / "run", begin=Resume())
 
 
 def test_a_folder_of_somebody_else_is_left_alone(dataset, trainings, tmp_path):
     folder = choice_folder(tmp_path / "run")
     folder.mkdir()
     (folder / "letter.txt").write_text("dear")
-    for force in (False, True):
+    for replaced in (False, True):
         with pytest.raises(RunError, match="holds other files"):
-            choose_model(dataset, tiny_config(), tmp_path / "run", force=force)
+            choose_model(dataset, tiny_config(), tmp_path / "run", begin=Anew(replace=replaced))
     assert (folder / "letter.txt").read_text() == "dear"
     assert not trainings.made
 
@@ -199,7 +201,7 @@ def test_a_part_whose_training_fails_is_left_out_and_says_so(dataset, trainings,
     assert rung_row(rung)[-1] == "left out: the surface has exploded"
     # It is not tried again.
     before = len(trainings.made)
-    again = choose_model(dataset, make_config(quality="draft"), tmp_path / "run", resume=True)
+    again = choose_model(dataset, make_config(quality="draft"), tmp_path / "run", begin=Resume())
     assert len(trainings.made) == before
     assert again == chosen
 
@@ -252,6 +254,18 @@ def test_the_command_refuses_what_does_not_go_together(options, tmp_path, capsys
     assert not choice_folder(tmp_path / "run").exists()
 
 
+class _StoppedAt(Listener):
+    """Interrupts after so many steps of any trainings."""
+
+    def __init__(self, steps):
+        self._left = steps
+
+    def on_step(self, progress):
+        self._left -= 1
+        if not self._left:
+            raise KeyboardInterrupt
+
+
 @pytest.mark.slow
 @pytest.mark.computes
 def test_a_model_is_chosen_recorded_and_trained_on_all_views(tmp_path, capsys):
@@ -262,16 +276,9 @@ def test_a_model_is_chosen_recorded_and_trained_on_all_views(tmp_path, capsys):
     output = tmp_path / "run"
     command = ["train", str(duck), "--output", str(output), "--downscale", "8", *flags]
     command += ["--model", "auto", "--resume"]
-    seen = []
-
-    def stop(progress):
-        seen.append(progress.step)
-        if len(seen) == 6:
-            raise KeyboardInterrupt
-
     config = gs.make_config(overrides=settings)
     with pytest.raises(Interrupted):
-        gs.train(duck, output, config, model="auto", on_step=stop, downscale=8)
+        gs.train(duck, output, config, model="auto", listener=_StoppedAt(6), downscale=8)
     assert not output.exists()
     assert cli.main(command) == 0
     said = capsys.readouterr().err
@@ -290,5 +297,5 @@ def test_a_model_is_chosen_recorded_and_trained_on_all_views(tmp_path, capsys):
     assert (choice_folder(output) / "choice.json").stat().st_mtime_ns == measured
     # Its own, also where the settings are named that it was chosen from.
     for named in (None, config):
-        again = gs.train(duck, output, named, resume=True, model="auto", downscale=8)
+        again = gs.train(duck, output, named, begin=gs.Resume(), model="auto", downscale=8)
         assert again.config == run.config

@@ -103,10 +103,10 @@ def test_a_compilation_is_announced_with_its_usual_time_and_then_with_the_last(c
         seconds_left=None,
     )
     with display.ProgressDisplay(9) as show:
-        show.compiling("split_sum")
+        show.on_compile("split_sum")
         clock.now += 33.0
-        show.show(progress)
-        show.compiling("monte_carlo")
+        show.on_step(progress)
+        show.on_compile("monte_carlo")
     said = capsys.readouterr().err
     assert "compiling stage split_sum, usually" in said
     assert "measuring the pace" in said

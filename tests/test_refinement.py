@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support import MONTE_CARLO, ball, sphere_dataset, tiny_config
 
+from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.stages import begin_stage, build_pipeline
 from geosplat_jax.fit.train import fit, load_trained
@@ -132,7 +133,7 @@ def run(tmp_path_factory):
     whole, parted = (tmp_path_factory.mktemp(name) / "run" for name in ("whole", "parted"))
     state = fit(dataset, config, whole)
     first = fit(dataset, config, parted, stop_after=4)
-    resumed = fit(dataset, config, parted, resume=True)
+    resumed = fit(dataset, config, parted, begin=Resume())
     return dataset, whole, (first, state, resumed)
 
 

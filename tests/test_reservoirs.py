@@ -12,6 +12,7 @@ from support import MONTE_CARLO as TRAINED
 from support import sphere_dataset, tiny_config
 
 from geosplat_jax.core.types import EnvLight, Materials, SurfacePoints
+from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.train import fit
 from geosplat_jax.materials import Attributes
 from geosplat_jax.rays.base import RayIndex
@@ -264,7 +265,7 @@ def test_a_run_with_paths_and_reservoirs_resumes_bit_for_bit(tmp_path):
     dataset = sphere_dataset(count=3, size=12)
     whole = fit(dataset, config, tmp_path / "whole")
     fit(dataset, config, tmp_path / "parts", stop_after=2)
-    parts = fit(dataset, config, tmp_path / "parts", resume=True)
+    parts = fit(dataset, config, tmp_path / "parts", begin=Resume())
     assert float(jnp.max(whole.carry.reservoirs.confidences)) > 3
     assert jax.tree.structure(whole) == jax.tree.structure(parts)
     for one, other in zip(jax.tree.leaves(whole), jax.tree.leaves(parts), strict=True):

@@ -21,6 +21,7 @@ from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.core.numerics import safe_normalize
 from geosplat_jax.core.settings import NonNegative, settings
 from geosplat_jax.core.types import Box, Mesh, learned
+from geosplat_jax.fit.begin import Resume, TakeOver
 from geosplat_jax.fit.config import Rate, Stage, config_from_dict
 from geosplat_jax.fit.entering import Entry
 from geosplat_jax.fit.surfaces import SurfaceSettings
@@ -282,18 +283,18 @@ def test_entering_and_freezing_do_what_the_stage_says(dataset, run):
 @pytest.mark.parametrize("stop", [pytest.param(4, marks=pytest.mark.slow), 7])
 def test_resuming_in_any_stage_equals_the_run_in_one_go(dataset, run, tmp_path, stop):
     fit(dataset, mesh_config(), tmp_path / "run", stop_after=stop)
-    assert_same(run[1], fit(dataset, mesh_config(), tmp_path / "run", resume=True))
+    assert_same(run[1], fit(dataset, mesh_config(), tmp_path / "run", begin=Resume()))
     assert [line["loss"] for line in lines_of(tmp_path / "run")] == [
         line["loss"] for line in lines_of(run[0])
     ]
 
 
 def test_the_stages_before_another_one_can_be_taken_from_a_run(dataset, run, tmp_path):
-    taken = fit(dataset, mesh_config(), tmp_path / "run", source=run[0], first_stage="lamp")
+    taken = fit(dataset, mesh_config(), tmp_path / "run", begin=TakeOver(run[0], "lamp"))
     assert_same(run[1], taken)
     assert [line["step"] for line in lines_of(tmp_path / "run")] == [6, 7, 8]
     with pytest.raises(TrainingError, match="is the first stage"):
-        fit(dataset, mesh_config(), tmp_path / "x", source=run[0], first_stage="split_sum")
+        fit(dataset, mesh_config(), tmp_path / "x", begin=TakeOver(run[0], "split_sum"))
 
 
 def test_a_strange_run_is_rendered_and_relit(dataset, run):

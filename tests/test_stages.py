@@ -11,6 +11,7 @@ import pytest
 from support import MONTE_CARLO, ball, sphere_dataset, tiny_config
 
 from geosplat_jax.fit import loop as loop_module
+from geosplat_jax.fit.begin import Resume, TakeOver
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.stages import begin_stage
 from geosplat_jax.fit.train import Interrupted, TrainingError, fit, load_trained
@@ -160,7 +161,7 @@ def test_resuming_in_either_stage_and_between_them_equals_the_run_in_one_go(
 ):
     fit(dataset, tiny_config(*RUN), tmp_path, stop_after=stop)
     assert load_trained(tmp_path).stage.name == ("split_sum" if stop <= 3 else "monte_carlo")
-    assert_same(whole[1], fit(dataset, tiny_config(*RUN), tmp_path, resume=True))
+    assert_same(whole[1], fit(dataset, tiny_config(*RUN), tmp_path, begin=Resume()))
     wanted, found = (
         [(line["step"], line["stage"], line["loss"]) for line in lines_of(folder)]
         for folder in (whole[0], tmp_path)
@@ -174,7 +175,7 @@ def test_the_first_stage_of_another_run_can_be_taken_over_bit_for_bit(
 ):
     folder, state = whole
     assert_same(
-        state, fit(dataset, tiny_config(*RUN), tmp_path, source=folder, first_stage="monte_carlo")
+        state, fit(dataset, tiny_config(*RUN), tmp_path, begin=TakeOver(folder, "monte_carlo"))
     )
     assert [line["step"] for line in lines_of(tmp_path)] == [3, 4, 5]
     # Also when it was stopped before its first step: what it took over is in its own folder.
@@ -185,9 +186,9 @@ def test_the_first_stage_of_another_run_can_be_taken_over_bit_for_bit(
 
     monkeypatch.setattr(loop_module, "train_step", stop)
     with pytest.raises(Interrupted):
-        fit(dataset, tiny_config(*RUN), early, source=folder, first_stage="monte_carlo")
+        fit(dataset, tiny_config(*RUN), early, begin=TakeOver(folder, "monte_carlo"))
     monkeypatch.undo()
-    assert_same(state, fit(dataset, tiny_config(*RUN), early, resume=True))
+    assert_same(state, fit(dataset, tiny_config(*RUN), early, begin=Resume()))
     assert [line["step"] for line in lines_of(early)] == [3, 4, 5]
     assert [line["loss"] for line in lines_of(tmp_path)] == [
         line["loss"] for line in lines_of(folder)[3:]
@@ -201,12 +202,12 @@ def test_a_run_that_ended_with_its_first_stage_can_be_taken_further(dataset, who
     fit(dataset, tiny_config(*RUN, "stages.monte_carlo.steps=0"), first)
     assert not (first / "stages").exists()
     assert_same(
-        whole[1], fit(dataset, tiny_config(*RUN), later, source=first, first_stage="monte_carlo")
+        whole[1], fit(dataset, tiny_config(*RUN), later, begin=TakeOver(first, "monte_carlo"))
     )
     # And a run that took a stage over can be resumed.
     third = tmp_path / "third"
-    fit(dataset, tiny_config(*RUN), third, source=first, first_stage="monte_carlo", stop_after=4)
-    assert_same(whole[1], fit(dataset, tiny_config(*RUN), third, resume=True))
+    fit(dataset, tiny_config(*RUN), third, begin=TakeOver(first, "monte_carlo"), stop_after=4)
+    assert_same(whole[1], fit(dataset, tiny_config(*RUN), third, begin=Resume()))
 
 
 @pytest.mark.slow
@@ -219,46 +220,34 @@ def test_another_first_stage_is_refused_by_name(dataset, whole, tmp_path):
             dataset,
             tiny_config(*RUN, "stages.split_sum.rates.sdf=0.5"),
             tmp_path / "a",
-            source=folder,
-            first_stage="monte_carlo",
+            begin=TakeOver(folder, "monte_carlo"),
         )
     with pytest.raises(TrainingError, match=r"other settings: .*split_sum\.steps: 3 -> 2"):
         fit(
             dataset,
             tiny_config(*RUN, "stages.split_sum.steps=2"),
             tmp_path / "b",
-            source=folder,
-            first_stage="monte_carlo",
+            begin=TakeOver(folder, "monte_carlo"),
         )
     with pytest.raises(RunError, match="is not a run"):
         fit(
             dataset,
             tiny_config(*RUN),
             tmp_path / "c",
-            source=tmp_path / "nowhere",
-            first_stage="monte_carlo",
+            begin=TakeOver(tmp_path / "nowhere", "monte_carlo"),
         )
     fit(dataset, tiny_config(*RUN), tmp_path / "d", stop_after=2)
     other = tmp_path / "other"
     with pytest.raises(
         TrainingError, match="at step 2, in the stage split_sum, not at the end of split_sum"
     ):
-        fit(dataset, tiny_config(*RUN), other, source=tmp_path / "d", first_stage="monte_carlo")
+        fit(dataset, tiny_config(*RUN), other, begin=TakeOver(tmp_path / "d", "monte_carlo"))
 
 
 @pytest.mark.slow
 def test_taking_over_everything_there_is_to_train_is_refused(dataset, whole, tmp_path):
     with pytest.raises(TrainingError, match=r"nothing to train: stages\.monte_carlo\.steps is 0"):
-        fit(dataset, tiny_config(), tmp_path / "e", source=whole[0], first_stage="monte_carlo")
-    with pytest.raises(ValueError, match="has its first stages already"):
-        fit(
-            dataset,
-            tiny_config(*RUN),
-            tmp_path,
-            source=tmp_path,
-            first_stage="monte_carlo",
-            resume=True,
-        )
+        fit(dataset, tiny_config(), tmp_path / "e", begin=TakeOver(whole[0], "monte_carlo"))
 
 
 @pytest.mark.slow
@@ -281,8 +270,7 @@ def test_a_surface_that_vanishes_later_is_put_back_as_its_stage_began(
         dataset,
         tiny_config(*RUN),
         tmp_path,
-        source=whole[0],
-        first_stage="monte_carlo",
+        begin=TakeOver(whole[0], "monte_carlo"),
         stop_after=4,
     )
     assert_same(state.params.geometry, emptied[0])
@@ -294,4 +282,4 @@ def test_a_surface_that_vanishes_later_is_put_back_as_its_stage_began(
 def test_resuming_a_later_stage_with_another_setting_of_it_is_refused(dataset, whole):
     changed = tiny_config(*RUN, OTHER)
     with pytest.raises(TrainingError, match=r"monte_carlo\.rates\.sdf\.value: .* -> 0\.5"):
-        fit(dataset, changed, whole[0], resume=True)
+        fit(dataset, changed, whole[0], begin=Resume())

@@ -87,14 +87,17 @@ class Fakes:
         self.trained, self.evaluated, self.broken = [], [], set(broken)
         self.first_stages = {}
 
-    def train(self, scene, folder, config, *, resume, force, source, first_stage, **options):
+    def train(self, scene, folder, config, *, begin, **options):
         label = f"{scene.name}/{folder.name}"
-        if not resume:
-            assert force or not folder.exists() or not any(folder.iterdir())
+        source, first_stage = (
+            (begin.source, begin.first_stage) if begin.takes_over else (None, None)
+        )
+        if not begin.resumes:
+            assert begin.replace or not folder.exists() or not any(folder.iterdir())
             folder.mkdir(parents=True, exist_ok=True)
             record = {"scene": str(scene), "dataset": options, "config": config.to_dict()}
             (folder / "run.json").write_text(json.dumps(record))
-        self.trained.append((label, resume, source and source.name))
+        self.trained.append((label, begin.resumes, source and source.name))
         self.first_stages[label] = first_stage
         if label in self.broken:
             raise RuntimeError(f"no luck with {label}")

@@ -15,8 +15,10 @@ from geosplat_jax.core.types import Geometry
 from geosplat_jax.fit import loop as loop_module
 from geosplat_jax.fit import runtime
 from geosplat_jax.fit import train as train_module
+from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.folder import RunError
 from geosplat_jax.fit.gradient import _asset, _back, _view_gradient
+from geosplat_jax.fit.listener import Listener
 from geosplat_jax.fit.stages import make_batch, pipeline_at, view_indices
 from geosplat_jax.fit.step import _update
 from geosplat_jax.fit.train import (
@@ -34,20 +36,35 @@ def dataset():
     return sphere_dataset()
 
 
+class _Notes(Listener):
+    """Notes the steps, and before which of them something compiled."""
+
+    def __init__(self):
+        self.steps, self.compiled = [], []
+
+    def on_step(self, progress):
+        self.steps.append(progress)
+
+    def on_compile(self, stage):
+        # What a step waits for is told before that step.
+        self.compiled.append((stage, len(self.steps)))
+
+
+class _Stopped(Listener):
+    """Interrupts after the first step."""
+
+    def on_step(self, progress):
+        raise KeyboardInterrupt
+
+
 @pytest.fixture(scope="module")
 def finished(dataset, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "run"
-    seen = []
-    compiled = []
-
-    def compiles(stage):
-        # What a step waits for is told before that step.
-        compiled.append((stage, len(seen)))
-
-    state = fit(dataset, tiny_config(), folder, on_step=seen.append, on_compile=compiles)
-    assert compiled[0] == ("split_sum", 0)
-    assert {stage for stage, _ in compiled} == {"split_sum"}
-    return folder, state, seen
+    told = _Notes()
+    state = fit(dataset, tiny_config(), folder, listener=told)
+    assert told.compiled[0] == ("split_sum", 0)
+    assert {stage for stage, _ in told.compiled} == {"split_sum"}
+    return folder, state, told.steps
 
 
 def _lines(folder):
@@ -97,7 +114,7 @@ def test_resuming_equals_the_uninterrupted_run_bit_for_bit(dataset, finished, tm
     _, state, _ = finished
     fit(dataset, tiny_config(), tmp_path, stop_after=2)
     assert load_trained(tmp_path).step == 2
-    resumed = fit(dataset, tiny_config(), tmp_path, resume=True)
+    resumed = fit(dataset, tiny_config(), tmp_path, begin=Resume())
     _assert_same(state, resumed)
     assert [line["step"] for line in _lines(tmp_path)] == [0, 1, 2, 3]
 
@@ -140,7 +157,7 @@ def test_resuming_with_another_configuration_names_the_difference(dataset, finis
     folder, _, _ = finished
     changed = tiny_config("stages.split_sum.rates.sdf=0.5")
     with pytest.raises(TrainingError, match=r"split_sum\.rates\.sdf\.value: .* -> 0\.5"):
-        fit(dataset, changed, folder, resume=True)
+        fit(dataset, changed, folder, begin=Resume())
 
 
 def test_a_second_training_into_a_folder_is_refused_and_harms_nothing(dataset, finished):
@@ -152,23 +169,19 @@ def test_a_second_training_into_a_folder_is_refused_and_harms_nothing(dataset, f
 
 def test_a_run_without_a_checkpoint_is_resumed_from_the_start(dataset, finished, tmp_path):
     """Also one that was interrupted while it compiled, or whose last line is torn."""
-
-    def stopped(progress):
-        raise KeyboardInterrupt
-
     folder = tmp_path / "run"
     with pytest.raises(Interrupted, match="--resume"):
-        fit(dataset, tiny_config("run.checkpoint_every=100"), folder, on_step=stopped)
+        fit(dataset, tiny_config("run.checkpoint_every=100"), folder, listener=_Stopped())
     assert not (folder / "checkpoints").exists()
     with (folder / "metrics.jsonl").open("a") as metrics:
         metrics.write('{"step": 1, "lo')
     config = tiny_config("run.checkpoint_every=100")
-    _assert_same(finished[1], fit(dataset, config, folder, resume=True))
+    _assert_same(finished[1], fit(dataset, config, folder, begin=Resume()))
     assert [line["step"] for line in _lines(folder)] == [0, 1, 2, 3]
 
 
 def test_resuming_where_there_is_no_run_begins_one(dataset, finished, tmp_path):
-    _assert_same(finished[1], fit(dataset, tiny_config(), tmp_path / "new", resume=True))
+    _assert_same(finished[1], fit(dataset, tiny_config(), tmp_path / "new", begin=Resume()))
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from support import MONTE_CARLO, TINY, sphere_dataset
 
 from geosplat_jax import cli
 from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.config import config_from_dict
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import make_config, with_mesh
@@ -226,7 +227,7 @@ def test_a_run_starts_from_the_file_says_so_and_resumes_bit_for_bit(dataset, fil
     copy.unlink()
     read_start.cache_clear()
     given = make_config(mesh=mesh_of_run(RunFolder(tmp_path / "halves")), overrides=SMALL)
-    leaves_equal(whole, fit(dataset, given, tmp_path / "halves", resume=True))
+    leaves_equal(whole, fit(dataset, given, tmp_path / "halves", begin=Resume()))
     # What is written of a run no longer needs the file.
     trained = Run(tmp_path / "whole").trained
     leaves_equal(trained.params, whole.params)

@@ -22,6 +22,7 @@ from support import sphere_dataset, sphere_views, tiny_config
 from test_pipeline import problem
 
 from geosplat_jax.fit import loop as loop_module
+from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.devices import choose_devices, connect_hosts
 from geosplat_jax.fit.gradient import value_and_gradient
 from geosplat_jax.fit.runtime import enable_compilation_cache
@@ -95,8 +96,8 @@ def trained(folder, host):
 
     loop_module.Loop._resize = noted
     attempt("stop", config)
-    attempt("resume", config, resume=True)
-    state = fit(dataset, config, folder, devices=devices, resume=True)
+    attempt("resume", config, begin=Resume())
+    state = fit(dataset, config, folder, devices=devices, begin=Resume())
     return {"said": said, "sizes": sizes, "step": int(state.step)}, jax.tree.leaves(state.params)
 
 

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from geosplat_jax.fit.begin import Anew
 from geosplat_jax.fit.cameras import CameraSettings
 from geosplat_jax.fit.gauge import CameraErrors, Similarity, change_lines, compare_cameras
 from geosplat_jax.fit.presets import make_config
@@ -93,7 +94,7 @@ def train_or_open(dataset: Dataset, folder: Path, arguments: argparse.Namespace)
         return run
     began = time.perf_counter()
     config = make_config(quality=arguments.quality, overrides=("run.preview_every=0",))
-    run = train(dataset, folder, config, force=True)
+    run = train(dataset, folder, config, begin=Anew(replace=True))
     print(f"{folder.name}: trained in {time.perf_counter() - began:.0f} s", flush=True)
     return run
 

@@ -28,6 +28,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
+from geosplat_jax.fit.begin import Anew
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
 from geosplat_jax.io.dataset import Dataset, load_dataset
@@ -94,7 +95,7 @@ def train_or_open(dataset: Dataset, folder: Path, overrides: list[str], quality:
         run.dataset = dataset
         return run
     config = make_config(quality=quality, mesh=mesh, overrides=("run.preview_every=0", *overrides))
-    return train(dataset, folder, config, force=True)
+    return train(dataset, folder, config, begin=Anew(replace=True))
 
 
 def row(run: Run, truth: trimesh.Trimesh, samples: int) -> dict[str, float]:

@@ -12,11 +12,22 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
+from geosplat_jax.fit.begin import TakeOver
 from geosplat_jax.fit.config import Rate
+from geosplat_jax.fit.listener import Listener, Progress
 from geosplat_jax.fit.presets import MONTE_CARLO, SPLIT_SUM
 from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
 from geosplat_jax.fit.train import fit
 from geosplat_jax.run import Run
+
+
+class _Printed(Listener):
+    """Prints every fiftieth step."""
+
+    def on_step(self, progress: Progress) -> None:
+        """Print where the training is."""
+        if progress.step % 50 == 0:
+            print(progress.step, progress.stage, f"{progress.psnr:.2f} dB")
 
 
 def main() -> None:
@@ -41,14 +52,8 @@ def main() -> None:
         rates={name: learned.get(name, Rate(0.0)) for name in after.rates},
     )
     config = replace(config, stages=(config.stage(SPLIT_SUM), light, after))
-    fit(
-        run.dataset,
-        config,
-        arguments.output,
-        source=arguments.run,
-        first_stage="light",
-        on_step=lambda p: print(p.step, p.stage, f"{p.psnr:.2f} dB") if p.step % 50 == 0 else None,
-    )
+    begin = TakeOver(arguments.run, "light")
+    fit(run.dataset, config, arguments.output, begin=begin, listener=_Printed())
 
 
 if __name__ == "__main__":

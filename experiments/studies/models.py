@@ -28,6 +28,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from geosplat_jax.core.types import EnvLight, Materials
+from geosplat_jax.fit.begin import Resume
+from geosplat_jax.fit.evidence import Rung
+from geosplat_jax.fit.listener import Listener
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
 from geosplat_jax.fit.stages import build_pipeline, initial_params
@@ -194,6 +197,17 @@ def decibels(run: Run, views: Views) -> float:
     return float(np.mean(found))
 
 
+class _Printed(Listener):
+    """Prints what becomes of every part of a scene's model."""
+
+    def __init__(self, scene: str) -> None:
+        self._scene = scene
+
+    def on_rung(self, rung: Rung) -> None:
+        """Print it."""
+        print(self._scene, rung, flush=True)
+
+
 def main() -> None:
     """Choose, train and print."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -217,8 +231,8 @@ def main() -> None:
             output,
             config,
             model=model,
-            resume=True,
-            on_rung=lambda rung, name=name: print(name, rung, flush=True),
+            begin=Resume(),
+            listener=_Printed(name),
         )
         record = run.folder.record()["model"]
         for rung in record["rungs"]:
@@ -230,7 +244,7 @@ def main() -> None:
             "training": (run.folder.training() or {})["seconds_total"],
         }
         if arguments.full:
-            whole = train(dataset, arguments.output / f"{name}_full", config, resume=True)
+            whole = train(dataset, arguments.output / f"{name}_full", config, begin=Resume())
             result["full decibels"] = decibels(whole, dataset.test)
             result["full training"] = (whole.folder.training() or {})["seconds_total"]
         print(name, json.dumps(result), flush=True)

@@ -33,7 +33,7 @@ from geosplat_jax.capture.training import (
     train_radiance,
 )
 from geosplat_jax.core.harmonics import CONSTANT
-from geosplat_jax.fit.train import Progress
+from geosplat_jax.fit.listener import Progress
 from geosplat_jax.io.agreement import agreement
 from geosplat_jax.io.dataset import LAYOUTS, Dataset, recognise_layout
 from geosplat_jax.io.distortion import Lookup, photograph_lookup, resample

@@ -33,9 +33,10 @@ from geosplat_jax.core.color import linear_to_srgb
 from geosplat_jax.core.settings import to_plain
 from geosplat_jax.core.types import Batch, Camera
 from geosplat_jax.fit.folder import RunError, locked_folder
+from geosplat_jax.fit.listener import Progress
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.step import ADAM, descended
-from geosplat_jax.fit.train import Interrupted, Progress, stop_requests
+from geosplat_jax.fit.train import Interrupted, stop_requests
 from geosplat_jax.io.checkpoints import (
     latest_checkpoint,
     load_checkpoint,

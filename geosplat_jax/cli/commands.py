@@ -114,7 +114,7 @@ def _masks(arguments: argparse.Namespace) -> None:
             downscale=factor,
             resume=arguments.resume,
             force=arguments.force,
-            on_step=display.show,
+            on_step=display.on_step,
         )
     print("\n".join(report.lines()))
     print(f"sheet: {folder / 'masks.png'}; splats: {folder / 'splats.ply'}")

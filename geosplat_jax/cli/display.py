@@ -1,6 +1,7 @@
 """What a terminal or a log file sees of a command that runs."""
 
 import time
+from dataclasses import asdict
 from typing import Any
 
 from rich.console import Console
@@ -8,7 +9,10 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
 from geosplat_jax.fit.cameras import ViewProgress
-from geosplat_jax.fit.train import Progress as StepProgress
+from geosplat_jax.fit.evidence import Rung
+from geosplat_jax.fit.listener import Listener
+from geosplat_jax.fit.listener import Progress as StepProgress
+from geosplat_jax.report.facts import rung_row
 from geosplat_jax.report.pace import Pace, duration
 
 console = Console(stderr=True, highlight=False)
@@ -95,8 +99,8 @@ class WorkDisplay:
             say(f"{part}: {done} of {total}" + (f", {text}" if text else ""))
 
 
-class ProgressDisplay:
-    """A bar on a terminal, a line every fiftieth step elsewhere."""
+class ProgressDisplay(Listener):
+    """A training: a bar on a terminal, a line every fiftieth step elsewhere."""
 
     def __init__(self, steps: int) -> None:
         self._steps = steps
@@ -135,7 +139,7 @@ class ProgressDisplay:
         if self._bar is not None:
             self._bar.stop()
 
-    def compiling(self, stage: str) -> None:
+    def on_compile(self, stage: str) -> None:
         """Say that the next step waits for a compilation, and for how long."""
         self._compiling = stage, time.perf_counter()
         known = self._compile_seconds
@@ -145,7 +149,7 @@ class ProgressDisplay:
         else:
             say(f"compiling stage {stage}, {usual} ...")
 
-    def show(self, progress: StepProgress) -> None:
+    def on_step(self, progress: StepProgress) -> None:
         """Display one step."""
         if self._compiling is not None:
             self._compile_seconds = time.perf_counter() - self._compiling[1]
@@ -170,3 +174,8 @@ class ProgressDisplay:
                 f"{progress.psnr:.2f} dB  {progress.splat_count:,} splats  "
                 f"{progress.seconds:.0f} s, {remaining}"
             )
+
+    def on_rung(self, rung: Rung) -> None:
+        """Say what became of a part of the model, as soon as it is known."""
+        title, _, larger, gain, verdict = rung_row(asdict(rung))
+        say(f"model: {title}: {larger}, gain {gain}: {verdict}")

@@ -1,9 +1,9 @@
 """The train command: what its options ask for, and the training with progress on the terminal."""
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +11,16 @@ from rich.table import Table
 
 from geosplat_jax.camera_rounds import refined_cameras
 from geosplat_jax.cli.display import ProgressDisplay, console, say, say_refined
+from geosplat_jax.fit.begin import Anew, Begin, Resume, TakeOver
 from geosplat_jax.fit.cameras import CameraSettings
 from geosplat_jax.fit.config import Budget, Config, config_warnings
 from geosplat_jax.fit.devices import Devices, choose_devices, connect_hosts
 from geosplat_jax.fit.folder import RunFolder
+from geosplat_jax.fit.listener import NOBODY, Listener, Listeners
 from geosplat_jax.fit.presets import make_config, with_mesh
 from geosplat_jax.fit.start_mesh import MeshSettings
-from geosplat_jax.fit.train import Progress
 from geosplat_jax.io.dataset import choose_downscale, load_recorded
-from geosplat_jax.model_choice import ModelChoice, Rung
+from geosplat_jax.model_choice import ModelChoice
 from geosplat_jax.report.events import EventLog
 from geosplat_jax.report.facts import rung_row
 from geosplat_jax.run import mesh_of_run, plan_training
@@ -140,17 +141,11 @@ def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[
             config=draft,
             reading=reading,
             how=CameraSettings(white_balance=arguments.white_balance),
-            on_step=display.show,
+            listener=display,
             on_view=say_refined,
         )
     say(f"cameras: {cameras}")
     return cameras
-
-
-def _say_rung(rung: Rung) -> None:
-    """Say what became of a part of the model, as soon as it is known."""
-    title, _, larger, gain, verdict = rung_row(asdict(rung))
-    say(f"model: {title}: {larger}, gain {gain}: {verdict}")
 
 
 def _say_model(record: Mapping[str, Any] | None) -> None:
@@ -169,14 +164,14 @@ def _say_model(record: Mapping[str, Any] | None) -> None:
 
 
 @contextmanager
-def _events(wanted: bool, folder: Path) -> Iterator[Callable[[], None]]:
-    """Yield what to call after every step, so that event files are written where wanted."""
+def _events(wanted: bool, folder: Path) -> Iterator[Listener]:
+    """Yield what writes event files while a training goes on, where they are wanted."""
     if not wanted:
-        yield lambda: None
+        yield NOBODY
         return
     log = EventLog(RunFolder(folder))
     try:
-        yield log.note
+        yield log
     finally:
         log.close()
 
@@ -190,6 +185,13 @@ def _table(path: Path | None, folder: Path) -> Iterator[None]:
         steps = RunFolder(folder)
         if path is not None and steps.exists:
             steps.write_csv(path)
+
+
+def begin_from(arguments: argparse.Namespace) -> Begin:
+    """Return how the arguments ask a run to begin."""
+    if arguments.source is not None:
+        return TakeOver(arguments.source, arguments.stage)
+    return Resume() if arguments.resume else Anew(replace=arguments.force)
 
 
 def _devices(arguments: argparse.Namespace) -> Devices:
@@ -247,27 +249,17 @@ def train(arguments: argparse.Namespace) -> None:
     with (
         ProgressDisplay(config.total_steps) as display,
         _table(arguments.csv if devices.is_first_host else None, folder),
-        _events(arguments.tensorboard and devices.is_first_host, folder) as note_events,
+        _events(arguments.tensorboard and devices.is_first_host, folder) as events,
     ):
-
-        def on_step(progress: Progress) -> None:
-            display.show(progress)
-            note_events()
-
         run = train_run(
             dataset,
             folder,
             config,
-            resume=arguments.resume,
-            force=arguments.force,
-            source=arguments.source,
-            first_stage=arguments.stage,
-            on_step=on_step,
-            on_compile=display.compiling,
+            begin=begin_from(arguments),
             budget=order.budget,
-            devices=devices,
             model=order.model,
-            on_rung=_say_rung,
+            devices=devices,
+            listener=Listeners(display, events),
         )
     if not devices.is_first_host:
         return

@@ -35,6 +35,29 @@ class Comparison:
         return self.gain > self.standard_error and self.gain > self.spread
 
 
+@dataclass(frozen=True)
+class Rung:
+    """What became of a part of a model that was tried.
+
+    Attributes
+    ----------
+    part, title : its name, in files and for people.
+    smaller, larger : mean decibels of the held-back views without it and with it; None where its
+        training failed.
+    found : the gain and its errors; None likewise.
+    is_kept : whether the model has it.
+    note : why there is nothing to compare, or what came with it that had been left out before.
+    """
+
+    part: str
+    title: str
+    smaller: float
+    larger: float | None
+    found: Comparison | None
+    is_kept: bool
+    note: str = ""
+
+
 def every_nth(count: int, step: int) -> tuple[Int[np.ndarray, " T"], Int[np.ndarray, " H"]]:
     """Split view numbers into those to train on and every ``step``-th one, which is held back.
 

@@ -8,21 +8,21 @@ import json
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from geosplat_jax.fit.begin import ANEW, Begin
 from geosplat_jax.fit.budget import Pacer
 from geosplat_jax.fit.config import Config
 from geosplat_jax.fit.devices import ONE_DEVICE, Devices
-from geosplat_jax.fit.entering import Start
 from geosplat_jax.fit.folder import RunError, RunFolder
-from geosplat_jax.fit.loop import Loop, adopted_loop, new_loop, resumed_loop
+from geosplat_jax.fit.listener import NOBODY, Listener, Progress
+from geosplat_jax.fit.loop import Loop, resumed_loop
 from geosplat_jax.fit.memory import require_training_memory
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.runtime import peak_memory_mb
@@ -38,7 +38,6 @@ _STEPS_TIMED = 5
 
 __all__ = [
     "Interrupted",
-    "Progress",
     "RunError",
     "Trained",
     "TrainingError",
@@ -49,29 +48,6 @@ __all__ = [
 
 class Interrupted(Exception):
     """The user stopped the run; it can be continued."""
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a display needs to know after a step.
-
-    Attributes
-    ----------
-    step, steps : done, and of all stages.
-    stage : name of the stage.
-    total, psnr, splat_count : of the step.
-    seconds : since the training began or was resumed.
-    seconds_left : estimated; None while a stage has just begun and compiles.
-    """
-
-    step: int
-    steps: int
-    stage: str
-    total: float
-    psnr: float
-    splat_count: int
-    seconds: float
-    seconds_left: float | None
 
 
 @contextmanager
@@ -118,6 +94,22 @@ def _record(report: StepReport, step: int, loop: Loop, seconds: float) -> dict[s
     }
 
 
+def _progress(
+    line: Mapping[str, Any], config: Config, seconds: float, left: float | None
+) -> Progress:
+    """Return what a listener hears of a step, from its line of metrics.jsonl."""
+    return Progress(
+        step=line["step"] + 1,
+        steps=config.total_steps,
+        stage=line["stage"],
+        total=line["loss"],
+        psnr=line["psnr"],
+        splat_count=line["splats"],
+        seconds=seconds,
+        seconds_left=left,
+    )
+
+
 class _Clock:
     """Estimates the time left from the steps of each stage that compiled nothing."""
 
@@ -160,17 +152,11 @@ def fit(
     config: Config,
     folder: str | Path,
     *,
-    resume: bool = False,
-    replace_run: bool = False,
-    source: str | Path | None = None,
-    first_stage: str | None = None,
-    stop_after: int | None = None,
-    on_step: Callable[[Progress], None] | None = None,
-    on_preview: Callable[[Trained], None] | None = None,
+    begin: Begin = ANEW,
+    listener: Listener = NOBODY,
     pacer: Pacer | None = None,
-    on_compile: Callable[[str], None] | None = None,
     devices: Devices = ONE_DEVICE,
-    start: Start | None = None,
+    stop_after: int | None = None,
     model: dict[str, Any] | None = None,
 ) -> TrainState:
     """Train on a dataset and leave a run's folder; see `folder.RunFolder`.
@@ -180,28 +166,20 @@ def fit(
     dataset : see `io.dataset.load_dataset`.
     config : see `presets.make_config`.
     folder : of the run; made where it is missing, and held while the training runs.
-    resume : continue from the last good checkpoint, or start again where there is none; equals the
-        uninterrupted run bit for bit.
-    replace_run : begin anew in a folder that holds a run.
-    source, first_stage : run whose stages before ``first_stage`` to take over, in a new run; its
-        scene and their settings must be the same.
-    stop_after : stop, with a checkpoint, once so many steps are done (for tests and schedulers).
-    on_step : called after every step.
-    on_preview : called every ``run.preview_every`` steps, and once early.
+    begin : `begin.Anew`, `begin.Resume` or `begin.TakeOver`.
+    listener : told how it goes.
     pacer : keeps the training to a budget of time by changing the steps to come; ``run.json`` says
         how many there were in the end.
-    on_compile : called with the name of the stage before a step waits for a compilation.
     devices : that the views of a step are shared by, see `devices.choose_devices`. Of several hosts
         all call this with the same arguments; the first one alone writes the folder, from which all
-        read, and calls the functions above.
-    start : shape, light and exposure of another training to begin with; without ``source``.
+        read, and tells its listener.
+    stop_after : stop, with a checkpoint, once so many steps are done (for tests and schedulers).
     model : what ``run.json`` says of how the model was chosen.
 
     Raises
     ------
     ValueError
-        If two of ``resume``, ``source`` and ``start`` do not go together, ``source`` is given
-        without ``first_stage``, or a pacer on several hosts, whose clocks are not one.
+        If there is a pacer on several hosts, whose clocks are not one.
     SceneError
         If the training views have no masks.
     RunError
@@ -213,43 +191,35 @@ def fit(
     Interrupted
         After Ctrl-C or SIGTERM; the run can be resumed.
     """
-    if resume and source is not None:
-        raise ValueError("a run that is resumed has its first stages already; leave source out")
-    if (source is None) != (first_stage is None):
-        raise ValueError("source and first_stage belong together")
     if pacer is not None and jax.process_count() > 1:
         raise ValueError("a budget is kept by one clock; leave it out on several hosts")
-    if source is not None and start is not None:
-        raise ValueError("a run that takes stages over has a start already; leave start out")
     run = RunFolder(folder)
     writes = devices.is_first_host
-    if not writes:
-        on_step = on_preview = on_compile = None
     with ExitStack() as held:
         stop_requested = held.enter_context(stop_requests())
         has_begun = False
         try:
             devices.together(lambda: _require_possible(dataset, config))
-            _require_agreement(devices, config, dataset, resume, replace_run, source, stop_after)
+            _require_agreement(devices, config, dataset, begin, stop_after)
             devices.together(lambda: held.enter_context(run.locked()) if writes else None)
-            if not devices.first_host(resume and run.exists):
-                devices.together(lambda: writes and run.require_free(replace=replace_run))
-                loop = devices.together(
-                    lambda: _first_loop(dataset, config, run, source, first_stage, devices, start)
-                )
+            if not devices.first_host(begin.goes_on(run)):
+                devices.together(lambda: writes and run.require_free(replace=begin.replace))
+                loop = devices.together(lambda: begin.first_loop(dataset, config, run, devices))
                 budget = None if pacer is None else pacer.budget
                 if writes:
-                    run.begin(dataset, config, replace=replace_run, budget=budget, model=model)
+                    run.begin(dataset, config, replace=begin.replace, budget=budget, model=model)
                     has_begun = True
-                if source is not None:
+                if begin.takes_over:
                     loop.save_end()
             else:
                 devices.together(lambda: writes and run.repoint(dataset))
-                loop = devices.together(lambda: resumed_loop(dataset, config, run, devices, start))
+                loop = devices.together(
+                    lambda: resumed_loop(dataset, config, run, devices, begin.start)
+                )
             _require_same_start(loop)
-            loop.on_compile = on_compile
             try:
-                return _train(loop, stop_after, stop_requested, on_step, on_preview, pacer)
+                told = listener if writes else NOBODY
+                return _train(loop, told, pacer, stop_after, stop_requested)
             finally:
                 loop.close()
         except KeyboardInterrupt:
@@ -260,23 +230,6 @@ def fit(
             if has_begun and not run.metric_lines():
                 run.clear()  # not one step was made: the folder is free again
             raise
-
-
-def _first_loop(
-    dataset: Dataset,
-    config: Config,
-    run: RunFolder,
-    source: str | Path | None,
-    first_stage: str | None,
-    devices: Devices,
-    start: Start | None,
-) -> Loop:
-    """Build the loop of a new run, with its first stages from another one where asked."""
-    if source is None or first_stage is None:
-        return new_loop(dataset, config, run, devices, start)
-    other = RunFolder(source)
-    other.require_same_scene(dataset)
-    return adopted_loop(dataset, config, run, other, first_stage, devices)
 
 
 def _require_possible(dataset: Dataset, config: Config) -> None:
@@ -338,14 +291,14 @@ def _keep_pace(loop: Loop, pacer: Pacer, seconds: float | None) -> None:
 
 def _train(
     loop: Loop,
+    listener: Listener,
+    pacer: Pacer | None,
     stop_after: int | None,
     stop_requested: Callable[[], bool],
-    on_step: Callable[[Progress], None] | None,
-    on_preview: Callable[[Trained], None] | None,
-    pacer: Pacer | None,
 ) -> TrainState:
     """Make steps until all are done, or ``stop_after``."""
     clock, writes = _Clock(loop.config), loop.devices.is_first_host
+    loop.on_compile = listener.on_compile
     if writes:
         loop.folder.keep_lines_before(loop.step)
 
@@ -369,19 +322,8 @@ def _train(
                 _keep_pace(loop, pacer, None if loop.has_compiled else seconds)
                 clock.config = loop.config
             config, last = loop.config, last_step()
-            if on_step is not None:
-                on_step(
-                    Progress(
-                        step=done,
-                        steps=config.total_steps,
-                        stage=loop.stage.name,
-                        total=line["loss"],
-                        psnr=line["psnr"],
-                        splat_count=line["splats"],
-                        seconds=clock.elapsed,
-                        seconds_left=clock.left(done) if pacer is None else pacer.seconds_left,
-                    )
-                )
+            left = clock.left(done) if pacer is None else pacer.seconds_left
+            listener.on_step(_progress(line, config, clock.elapsed, left))
             is_stopped = loop.devices.any_host(stop_requested())
             if done % config.run.checkpoint_every == 0 or done == last or is_stopped:
                 loop.save()
@@ -389,6 +331,6 @@ def _train(
                 raise Interrupted(f"stopped at step {done}; continue with --resume")
             every = config.run.preview_every
             is_early = done == every // _FIRST_PREVIEW
-            if on_preview is not None and every and (is_early or done % every == 0):
-                on_preview(Trained(config, loop.stage, loop.params, loop.pipeline, done))
+            if writes and every and (is_early or done % every == 0):
+                listener.on_preview(Trained(config, loop.stage, loop.params, loop.pipeline, done))
     return loop.devices.local(loop.state)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from geosplat_jax.fit.folder import EVENTS, RunFolder
+from geosplat_jax.fit.listener import Listener, Progress
 from geosplat_jax.io.images import SceneError, read_image
 
 _SHOWN = ("loss", "psnr", "splats", "faces", "seconds", "peak_memory_mb")
@@ -31,7 +32,7 @@ def _writer_kind() -> Any:
         ) from None
 
 
-class EventLog:
+class EventLog(Listener):
     """Follows ``metrics.jsonl`` and the previews of a run into ``tensorboard/`` in its folder.
 
     Written anew from the first step on, so that a resumed run has no step twice.
@@ -51,6 +52,11 @@ class EventLog:
         self._writer: Any = None
         self._read = 0
         self._shown: set[str] = set()
+
+    def on_step(self, progress: Progress) -> None:
+        """Write what has been added since the last step."""
+        del progress  # the files know more
+        self.note()
 
     def note(self) -> None:
         """Write what has been added since the last call."""

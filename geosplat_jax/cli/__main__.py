@@ -1,7 +1,0 @@
-"""``python -m geosplat_jax.cli``: the command without its installation."""
-
-import sys
-
-from geosplat_jax.cli import main
-
-sys.exit(main())

@@ -1,0 +1,60 @@
+"""How a run begins, and who is told of it; what is trained: test_train, test_stages, test_seams."""
+
+from pathlib import Path
+
+import pytest
+
+from geosplat_jax.cli.arguments import command_line
+from geosplat_jax.cli.training import begin_from
+from geosplat_jax.fit.begin import ANEW, Anew, Resume, TakeOver
+from geosplat_jax.fit.evidence import Rung
+from geosplat_jax.fit.folder import RunFolder
+from geosplat_jax.fit.listener import NOBODY, Listener, Listeners, Progress
+from geosplat_jax.fit.trained import Trained
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ([], Anew()),
+        (["--force"], Anew(replace=True)),
+        (["--resume"], Resume()),
+        (["--from", "runs/a", "--stage", "refine"], TakeOver(Path("runs/a"), "refine")),
+    ],
+)
+def test_options_say_how_a_run_begins(options, expected):
+    assert begin_from(command_line().parse_args(["train", "scene", *options])) == expected
+
+
+def test_only_resuming_goes_on_with_a_run_and_only_where_there_is_one(tmp_path):
+    run, ways = RunFolder(tmp_path), (ANEW, Anew(replace=True), TakeOver("a", "b"), Resume())
+    assert [way.goes_on(run) for way in ways] == [False] * 4
+    (tmp_path / "run.json").write_text("{}")
+    assert [way.goes_on(run) for way in ways] == [False, False, False, True]
+    assert [way.replace for way in ways] == [False, True, False, False]
+    assert [way.takes_over for way in ways] == [False, False, True, False]
+
+
+EVENTS = {
+    "on_step": Progress(1, 2, "split_sum", 0.5, 20.0, 6, 1.0, None),
+    "on_compile": "split_sum",
+    "on_preview": object.__new__(Trained),
+    "on_rung": Rung("light", "fine light", 20.0, None, None, is_kept=False),
+}
+
+
+class _Notes(Listener):
+    """Notes what it is told; knows every event by itself."""
+
+    def __init__(self, told, name):
+        for event in EVENTS:
+            setattr(self, event, lambda what, event=event: told.append((name, event, what)))
+
+
+def test_several_listeners_are_told_everything_in_turn():
+    told = []
+    several = Listeners(_Notes(told, "a"), NOBODY, _Notes(told, "b"))
+    assert {name for name in vars(Listener) if name.startswith("on_")} == set(EVENTS)
+    for event, what in EVENTS.items():
+        getattr(several, event)(what)
+    assert told == [(name, event, what) for event, what in EVENTS.items() for name in "ab"]
