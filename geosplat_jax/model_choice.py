@@ -22,6 +22,7 @@ import numpy as np
 
 from geosplat_jax.core.settings import PositiveCount, settings
 from geosplat_jax.fit.begin import ANEW, Begin, Resume
+from geosplat_jax.fit.blocked import blocked_share
 from geosplat_jax.fit.budget import with_steps
 from geosplat_jax.fit.config import Config, Stage
 from geosplat_jax.fit.entering import Start
@@ -49,6 +50,9 @@ _BATCH_VIEWS = 2
 
 _FEWEST_HELD = 3
 """Held-back views that say anything."""
+
+_BLOCKED = 0.02
+"""Share of an even sky's light that a surface blocks from itself, from which shadows matter."""
 
 _SIZES = ("shift", "hash", "light")
 """Parts that the first stage, which all trials share, does without."""
@@ -149,7 +153,8 @@ def choose_model(
         if not kept.issuperset(_among(part.follows, offered)):
             continue
         wanted = kept | {part.name} | _among(part.needs, offered)
-        rung = _tried(trials, part, kept, wanted)
+        judge = _tried if part.is_photographed else _seen_on_surface
+        rung = judge(trials, part, kept, wanted)
         kept = frozenset(wanted) if rung.is_kept else kept
         rungs.append(rung)
         listener.on_rung(rung)
@@ -190,6 +195,17 @@ def _tried(trials: "_Trials", part: Part, kept: Collection[str], wanted: Collect
         found = compare(larger, smaller, trials.blocks)
     after = float(np.mean(larger))
     return Rung(part.name, part.title, before, after, found, found.is_kept, note)
+
+
+def _seen_on_surface(
+    trials: "_Trials", part: Part, kept: Collection[str], wanted: Collection[str]
+) -> Rung:
+    """Judge a part that photographs cannot tell by what the surface blocks from itself."""
+    del wanted
+    before = float(np.mean(trials.decibels(kept, 0)))
+    share = trials.blocked_share()
+    note = f"the surface blocks {100 * share:.1f} % of an even sky"
+    return Rung(part.name, part.title, before, None, None, share > _BLOCKED, note)
 
 
 class _Trials:
@@ -365,10 +381,17 @@ class _Trials:
             raise TrainingError(self._measured[name]["failure"])
         return np.asarray(self._measured[name]["psnr"], float)
 
+    def blocked_share(self) -> float:
+        """Return what the surface of the first stage blocks, see `blocked.blocked_share`."""
+        self._start(False)
+        trained = load_trained(self._folder / _first_stage(False))
+        pipeline = trained.pipeline
+        return blocked_share(pipeline.surface, trained.params.geometry, pipeline.capacities)
+
     def _start(self, has_finer_cells: bool) -> Start:
         """Train the first stage, once for each size of the cells, of all materials."""
         left_out = (*_SIZES, *(() if has_finer_cells else ("cells",)))
-        name = "first_stage_cells" if has_finer_cells else "first_stage"
+        name = _first_stage(has_finer_cells)
         parts = [part for part in self._offered if part.name in left_out]
         folder = self._folder / name
         if name not in self._stage_1_seconds:
@@ -408,6 +431,11 @@ def _decibels(renderer: Renderer, views: Views, view: int) -> float:
     counted = np.ones(error.shape[:2]) if views.valid is None else views.valid[view]
     mean = float(np.sum(counted[..., None] * error**2) / (3.0 * max(float(counted.sum()), 1.0)))
     return -10.0 * math.log10(max(mean, 1e-20))
+
+
+def _first_stage(has_finer_cells: bool) -> str:
+    """Name the folder of a first stage."""
+    return "first_stage_cells" if has_finer_cells else "first_stage"
 
 
 def _start_of(folder: Path) -> Start:

@@ -41,10 +41,11 @@ class _Trainings:
     def __init__(self, monkeypatch, gains):
         self.gains, self.made, self.configs, self.fails, self.stops_at = gains, [], {}, (), None
         self.datasets = []
-        self.seed_noise = 0.0
+        self.seed_noise, self.blocked = 0.0, 0.0
         monkeypatch.setattr(model_choice, "fit", self._fit)
         monkeypatch.setattr(model_choice, "_start_of", lambda folder: object.__new__(Start))
         monkeypatch.setattr(model_choice._Trials, "_measure", self._measure)
+        monkeypatch.setattr(model_choice._Trials, "blocked_share", lambda trials: self.blocked)
 
     def _fit(self, dataset, config, folder, *, begin, listener):
         if len(self.made) == self.stops_at:
@@ -79,7 +80,7 @@ def test_parts_are_kept_for_what_they_gain(dataset, trainings, tmp_path):
     assert names_of(chosen) == ["specular", "metallic", "light"]
     left_out = [part for part in LADDER if part.name not in names_of(chosen)]
     assert chosen.config == without(config, left_out)
-    gains = {rung.part: rung.found.gain for rung in chosen.rungs}
+    gains = {rung.part: rung.found.gain for rung in chosen.rungs if rung.found is not None}
     assert gains["metallic"] == pytest.approx(0.5)
     assert gains["hash"] == pytest.approx(-0.1)
     # Without shadows nothing is blocked: indirect light is not even tried.
@@ -92,7 +93,7 @@ def test_parts_are_kept_for_what_they_gain(dataset, trainings, tmp_path):
 
 def test_a_part_brings_along_what_it_needs(dataset, trainings, tmp_path):
     """One roughness explains nothing where metal is polished in places; the field does."""
-    trainings.gains = {"roughness": 1.0, "shadows": 0.4, "indirect": 0.3}
+    trainings.gains, trainings.blocked = {"roughness": 1.0, "indirect": 0.3}, 0.1
     chosen = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
     assert names_of(chosen) == ["roughness", "shadows", "indirect"]
     assert chosen.config.material.specular == "field"
@@ -100,6 +101,20 @@ def test_a_part_brings_along_what_it_needs(dataset, trainings, tmp_path):
     assert rung_row(rung)[-1] == "kept, with specular lobe, one roughness"
     assert not chosen.config.material.has_metallic
     assert chosen.config.stage("monte_carlo").transport.indirect == "constant"
+
+
+@pytest.mark.parametrize(("share", "is_kept"), [(0.019, False), (0.021, True)])
+def test_the_surface_decides_whether_there_are_shadows(
+    share, is_kept, dataset, trainings, tmp_path
+):
+    """Photographs under one light cannot tell: here they would say the opposite."""
+    trainings.gains = {"specular": 2.0, "shadows": -5.0 if is_kept else 5.0}
+    trainings.blocked = share
+    chosen = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
+    assert names_of(chosen) == ["specular", *(["shadows"] if is_kept else [])]
+    (rung,) = (rung for rung in chosen.record()["rungs"] if rung["part"] == "shadows")
+    said = f"the surface blocks {100 * share:.1f} % of an even sky"
+    assert rung_row(rung)[2:] == ("-", "-", f"{'kept' if is_kept else 'left out'}: {said}")
 
 
 def test_other_seeds_are_trained_for_gains_alone(dataset, trainings, tmp_path):

@@ -34,6 +34,7 @@ class Part(abc.ABC):
         hand, the part stays as it is.
     needs : parts that it cannot be without; they come with it.
     follows : parts without which it is not tried at all.
+    is_photographed : whether photographs under one light can tell that it is missing.
     """
 
     name: ClassVar[str]
@@ -41,6 +42,7 @@ class Part(abc.ABC):
     settings: ClassVar[tuple[str, ...]]
     needs: ClassVar[tuple[str, ...]] = ()
     follows: ClassVar[tuple[str, ...]] = ()
+    is_photographed: ClassVar[bool] = True
 
     @abc.abstractmethod
     def removed(self, config: Config) -> Config:
@@ -103,10 +105,15 @@ def _without_indirect_weight(stage: Stage) -> Stage:
 
 
 class Shadows(Part):
-    """Light that the surface blocks, by rays; without it stages use the split sum."""
+    """Light that the surface blocks, by rays; without it stages use the split sum.
+
+    Under one light a darker albedo explains the same photographs, and is wrong under any other. So
+    the surface decides: whether it blocks enough of an even sky's light from itself.
+    """
 
     name, title = "shadows", "traced shadows"
     settings = ("stages.*.transport.kind", "stages.*.transport.occlusion")
+    is_photographed = False
 
     def removed(self, config: Config) -> Config:
         """Give every stage the split sum."""

@@ -1,0 +1,58 @@
+"""How much light an object keeps from itself: what photographs under one light cannot tell."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from geosplat_jax.core.capacity import Capacities, Usage, retry
+from geosplat_jax.core.mesh import face_normals_and_areas
+from geosplat_jax.core.numerics import safe_divide, safe_normalize
+from geosplat_jax.surface.base import SurfaceModel
+
+_RAYS = 4
+"""Of every face."""
+
+
+@partial(jax.jit, static_argnames="capacities")
+def _share(
+    model: SurfaceModel, shape: Any, key: Key[Array, ""], *, capacities: Capacities
+) -> tuple[Float[Array, ""], Usage]:
+    surface = model.extract(shape, capacities=capacities)
+    index = model.ray_index(surface, capacities=capacities)
+    mesh = surface.mesh
+    normals, areas = face_normals_and_areas(mesh)
+    middles = jnp.mean(mesh.vertices[mesh.faces], axis=1)
+    count = mesh.faces.shape[0]
+    # Points of the unit sphere around the tip of the normal lie in directions drawn by the cosine.
+    around = safe_normalize(jax.random.normal(key, (_RAYS, count, 3)))
+    directions = safe_normalize(normals[None] + around)
+    is_used = jnp.broadcast_to(mesh.face_mask & (areas > 0.0), (_RAYS, count))
+    is_used = is_used & (jnp.sum(directions * normals[None], axis=-1) > 0.0)
+    is_blocked = index.occluded(
+        jnp.broadcast_to(middles, directions.shape).reshape(-1, 3),
+        directions.reshape(-1, 3),
+        jnp.broadcast_to(jnp.arange(count, dtype=jnp.int32), is_used.shape).reshape(-1),
+        is_used.reshape(-1),
+    ).reshape(is_used.shape)
+    weights = jnp.where(is_used, areas[None, :], 0.0)
+    share = safe_divide(jnp.sum(jnp.where(is_blocked, weights, 0.0)), jnp.sum(weights))
+    return share, surface.usage | index.usage
+
+
+def blocked_share(model: SurfaceModel, shape: Any, capacities: Capacities) -> float:
+    """Return the share of an even sky's light that a surface keeps from itself, in [0, 1].
+
+    One minus the mean ambient occlusion factor, by area: 0 for whatever is convex. Rays start in
+    the middles of the faces, in directions drawn by the cosine; always the same ones. No gradients.
+
+    Parameters
+    ----------
+    model, shape : the surface.
+    capacities : to begin with; what they lack is guessed, and what is too small grows.
+    """
+    guess = Capacities(**{**model.first_capacities(shape), **capacities})
+    share, _ = retry(lambda sizes: _share(model, shape, jax.random.key(0), capacities=sizes), guess)
+    return float(share)

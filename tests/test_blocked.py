@@ -1,0 +1,45 @@
+"""The share of the light that a surface keeps from itself, against closed forms."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from geosplat_jax.fit.blocked import blocked_share
+from geosplat_jax.geometry import FlexiCubes, initial_geometry
+from geosplat_jax.surface.grids import grid_vertices
+from geosplat_jax.surface.hull import fit_grid
+
+MIDDLE, WALL = 0.4, 0.06
+"""Radius of the middle of a bowl's wall, and half its thickness."""
+
+
+def ball(x, y, z):
+    return np.sqrt(x**2 + y**2 + z**2) - MIDDLE
+
+
+def bowl(x, y, z):
+    """The lower half of a thick shell."""
+    return np.maximum(np.abs(ball(x, y, z)) - WALL, z)
+
+
+def bowl_share():
+    """Half of what leaves the inside of a hemisphere meets it again; no other part sees any."""
+    inner, outer = 2 * np.pi * (MIDDLE - WALL) ** 2, 2 * np.pi * (MIDDLE + WALL) ** 2
+    rim = 0.5 * (outer - inner)
+    return 0.5 * inner / (inner + outer + rim)
+
+
+def surface(distance):
+    grid = fit_grid((np.full(3, -0.52), np.full(3, 0.52)), 40)
+    values = distance(*np.asarray(grid_vertices(grid), np.float64).T) / float(grid.cell_size)
+    return FlexiCubes(grid), initial_geometry(grid, jnp.asarray(values, jnp.float32))
+
+
+@pytest.mark.parametrize(
+    ("distance", "share", "tolerance"), [(ball, 0.0, 0.002), (bowl, bowl_share(), 0.006)]
+)
+def test_a_surface_blocks_what_a_closed_form_says(distance, share, tolerance):
+    model, larger = surface(bowl)
+    # One program for both.
+    capacities = model.first_capacities(larger)
+    assert blocked_share(*surface(distance), capacities) == pytest.approx(share, abs=tolerance)
