@@ -20,17 +20,12 @@ from geosplat_jax.render import RenderPipeline
 from geosplat_jax.transport import bsdf
 from geosplat_jax.transport import indirect as indirect_module
 from geosplat_jax.transport.base import TransportSettings
-from geosplat_jax.transport.denoise import DenoiseSpec
+from geosplat_jax.transport.denoise import DENOISER_INPUTS, DenoiseSpec, denoised
 from geosplat_jax.transport.environment import LightSpec
+from geosplat_jax.transport.estimators import gather, reflect
 from geosplat_jax.transport.indirect import ConstantIndirect
 from geosplat_jax.transport.light_sampling import light_sampler
-from geosplat_jax.transport.monte_carlo import (
-    DENOISER_INPUTS,
-    MonteCarloSettings,
-    denoised,
-    gather,
-    reflect,
-)
+from geosplat_jax.transport.monte_carlo import MonteCarloSettings
 from geosplat_jax.transport.paths import PathSettings
 from geosplat_jax.transport.sampling import SampleCounts, draw_samples
 from geosplat_jax.transport.split_sum import SplitSumSettings
