@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import minimum_filter
 
-from geosplat_jax.report import metrics, protocols
+from geosplat_jax.report import metrics, protocol_metrics, protocols
 from geosplat_jax.report.protocols import PROTOCOL, PROTOCOLS, protocol
 
 # Decibels of float32 images.
