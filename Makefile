@@ -17,11 +17,14 @@ $(INSTALLED): pyproject.toml
 demo: $(INSTALLED)
 	$(BIN)/python experiments/demo.py --output $(DEMO)
 
+# Files in the order of tests/conftest.py; pytest would begin with those of most tests.
+IN_FILES = --numprocesses 2 --dist loadfile --no-loadscope-reorder
+
 test: $(INSTALLED)
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+	$(BIN)/python -m pytest $(IN_FILES)
 
 test-slow: $(INSTALLED)
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m 'slow and not computes'
+	$(BIN)/python -m pytest $(IN_FILES) -m 'slow and not computes'
 	# These compute more than they compile: with the optimisations that the others do without.
 	XLA_FLAGS= $(BIN)/python -m pytest --numprocesses 2 --dist load -m 'slow and computes'
 

@@ -26,6 +26,38 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 enable_compilation_cache(Path(sys.prefix) / "cache")
 
 
+LONGEST = (
+    "test_sweeps",
+    "test_transport",
+    "test_refinement",
+    "test_gradient",
+    "test_gradcheck",
+    "test_model_choice",
+    "test_seams",
+    "test_pipeline",
+    "test_determinism",
+    "test_deferred",
+    "test_devices",
+    "test_corners",
+    "test_reservoirs",
+    "test_evaluate",
+    "test_extremes_scene",
+    "test_cameras",
+    "test_stages",
+    "test_monte_carlo",
+    "test_cli",
+    "test_run",
+    "test_budget",
+)
+"""Files that take more than half a minute, with or without their slow tests."""
+
+
+def pytest_collection_modifyitems(items):
+    """Begin with the files that take longest: no process waits for another one at the end."""
+    order = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _release_compiled_programs():
     """Forget what a file compiled: every program holds memory maps, of which Linux grants 65,530.

@@ -20,6 +20,7 @@ from geosplat_jax.surface.hull import fit_grid
 __all__ = [
     "MONTE_CARLO",
     "TINY",
+    "TWO_STAGES",
     "ball",
     "ball_of_one_material",
     "double_precision",
@@ -138,6 +139,11 @@ MONTE_CARLO = (
     "stages.monte_carlo.transport.residual_count=0",
 )
 """Overrides that add a second stage to `TINY`, small enough for a test."""
+
+
+TWO_STAGES = (*MONTE_CARLO, "stages.split_sum.steps=3", "stages.monte_carlo.weights.light=0.15")
+"""Overrides of a run of both stages. Files that train on `sphere_dataset` with them find each
+other's programs in the cache, as do those with `TINY` alone."""
 
 
 def tiny_config(*overrides):

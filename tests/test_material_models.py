@@ -19,9 +19,9 @@ from geosplat_jax.materials import MaterialSpec, attributes_at, init_materials
 from geosplat_jax.report.assets import MaterialSampler
 from geosplat_jax.transport import bsdf
 from geosplat_jax.transport.environment import LightSpec, prefilter, prefilter_operators
+from geosplat_jax.transport.estimators import gather, reflect
 from geosplat_jax.transport.indirect import outgoing
 from geosplat_jax.transport.light_sampling import light_sampler
-from geosplat_jax.transport.monte_carlo import gather, reflect
 from geosplat_jax.transport.paths import face_table
 from geosplat_jax.transport.sampling import SampleCounts, draw_samples
 from geosplat_jax.transport.split_sum import fg_table, split_sum

@@ -21,8 +21,8 @@ from geosplat_jax.io import memory
 from geosplat_jax.io.frames import Frame, Listing
 from geosplat_jax.io.images import SceneError, read_image, write_png
 from geosplat_jax.io.lenses import AngleLens
+from geosplat_jax.io.loading import load_views
 from geosplat_jax.io.memory import Need, memory_of_machine, memory_refusal
-from geosplat_jax.io.views import load_views
 from geosplat_jax.surface.hull import fit_grid
 from geosplat_jax.transport.environment import LightSpec, operator_bytes, prefilter_operators
 

@@ -13,13 +13,13 @@ from geosplat_jax.core.types import EnvLight, Grid, Materials, SurfacePoints
 from geosplat_jax.geometry import FlexiCubes, initial_geometry, sphere_sdf
 from geosplat_jax.transport import bsdf, sampling
 from geosplat_jax.transport.environment import lookup
+from geosplat_jax.transport.estimators import gather, reflect
 from geosplat_jax.transport.indirect import (
     NO_INDIRECT,
     ConstantIndirect,
     TracedIndirect,
 )
 from geosplat_jax.transport.light_sampling import light_sampler
-from geosplat_jax.transport.monte_carlo import gather, reflect
 from geosplat_jax.transport.sampling import BLOCKED, OPEN, SampleCounts, cast, draw_samples
 
 POINTS = 12

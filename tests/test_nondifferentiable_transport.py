@@ -13,8 +13,8 @@ from one_sided import STEP, assert_kink, material
 from support import double_precision
 
 from geosplat_jax.core.types import EnvLight, SurfacePoints
+from geosplat_jax.transport.estimators import gather, reflect
 from geosplat_jax.transport.light_sampling import light_sampler
-from geosplat_jax.transport.monte_carlo import gather, reflect
 from geosplat_jax.transport.sampling import OPEN, SampleCounts, Samples, cast
 
 RADIANCE = 2.0

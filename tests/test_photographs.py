@@ -9,8 +9,8 @@ import pytest
 from geosplat_jax.io.cameras import RefinedCamera, RefinedSplit, with_cameras
 from geosplat_jax.io.dataset import load_dataset
 from geosplat_jax.io.images import SceneError, read_linear, write_exr, write_png
+from geosplat_jax.io.loading import KEPT_BYTES
 from geosplat_jax.io.photographs import Marks, Part, PartsInMemory, Photographs, pack_marks
-from geosplat_jax.io.views import KEPT_BYTES
 from geosplat_jax.io.windows import around_object
 
 HEIGHT, WIDTH, COUNT = 60, 80, 9

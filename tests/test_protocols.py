@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import minimum_filter
 
-from geosplat_jax.report import metrics, protocols
+from geosplat_jax.report import metrics, protocol_metrics, protocols
 from geosplat_jax.report.protocols import PROTOCOL, PROTOCOLS, protocol
 
 # Decibels of float32 images.
@@ -86,14 +86,16 @@ def test_tensoir_takes_the_scale_from_twenty_views():
     ones = np.ones((41, 1, 1), np.float32)
     albedo = flat([0.25, 0.25, 0.25], (41, 1, 1))
     truth[40] = 1.0
-    np.testing.assert_allclose(protocols.albedo_scale(TENSOIR, albedo, ones, truth, ones), 2.0)
-    np.testing.assert_allclose(protocols.albedo_scale(IRGS, albedo, ones, truth, ones), 4.0)
+    np.testing.assert_allclose(
+        protocol_metrics.albedo_scale(TENSOIR, albedo, ones, truth, ones), 2.0
+    )
+    np.testing.assert_allclose(protocol_metrics.albedo_scale(IRGS, albedo, ones, truth, ones), 4.0)
 
 
 @pytest.mark.parametrize("name", PICTURES)
 def test_scale_recovers_a_gain_of_every_channel(name):
     _, alpha, truth, mask = scene()
-    scale = protocols.albedo_scale(
+    scale = protocol_metrics.albedo_scale(
         protocol(name), (truth / GAIN).astype(np.float32), alpha, truth, mask
     )
     np.testing.assert_allclose(scale, GAIN, rtol=1e-5)
@@ -106,10 +108,10 @@ def test_least_squares_scale_is_the_mean_over_views_with_an_object():
     truth[0, 0], truth[0, 1] = 0.25, 0.5
     mask = np.ones((3, 2, 2), np.float32)
     mask[2], truth[2] = 0, 0
-    scale = protocols.albedo_scale(GEOSPLATTING, albedo, mask, truth, mask)
+    scale = protocol_metrics.albedo_scale(GEOSPLATTING, albedo, mask, truth, mask)
     np.testing.assert_allclose(scale, (0.4 + 1.0) / 2, rtol=1e-6)
     albedo[1, ..., 0] = 0  # one channel of one view is black: that view says nothing about it
-    scale = protocols.albedo_scale(GEOSPLATTING, albedo, mask, truth, mask)
+    scale = protocol_metrics.albedo_scale(GEOSPLATTING, albedo, mask, truth, mask)
     np.testing.assert_allclose(scale, [0.4, 0.7, 0.7], rtol=1e-6)
 
 
@@ -118,11 +120,11 @@ def test_least_squares_sees_spill_outside_the_mask_and_the_median_does_not():
     truth = flat([0.4, 0.4, 0.4]) * mask[..., None]
     albedo = flat([0.4, 0.4, 0.4])
     alpha = np.ones_like(mask)
-    least = protocols.albedo_scale(GEOSPLATTING, albedo, alpha, truth, mask)
+    least = protocol_metrics.albedo_scale(GEOSPLATTING, albedo, alpha, truth, mask)
     np.testing.assert_allclose(least, 0.5, rtol=1e-6)
     for row in (TENSOIR, IRGS):
         np.testing.assert_allclose(
-            protocols.albedo_scale(row, albedo, alpha, truth, mask), 1.0, rtol=1e-6
+            protocol_metrics.albedo_scale(row, albedo, alpha, truth, mask), 1.0, rtol=1e-6
         )
 
 
@@ -133,11 +135,11 @@ def test_median_scale_is_of_straight_values_and_robust():
     albedo = flat([0.2, 0.2, 0.2]) * alpha[..., None]
     albedo[0, 0] = 0.6  # four of sixteen pixels are outliers
     alpha[0, 1, :2] = albedo[0, 1, :2] = 0  # nothing was drawn in two others
-    scale = protocols.albedo_scale(IRGS, albedo, alpha, truth, mask)
+    scale = protocol_metrics.albedo_scale(IRGS, albedo, alpha, truth, mask)
     np.testing.assert_allclose(scale, 2.0, rtol=1e-5)
-    nothing = protocols.albedo_scale(IRGS, 0 * albedo, 0 * alpha, truth, mask)
+    nothing = protocol_metrics.albedo_scale(IRGS, 0 * albedo, 0 * alpha, truth, mask)
     np.testing.assert_array_equal(nothing, np.ones(3))
-    black = protocols.albedo_scale(GEOSPLATTING, 0 * albedo, 0 * alpha, truth, mask)
+    black = protocol_metrics.albedo_scale(GEOSPLATTING, 0 * albedo, 0 * alpha, truth, mask)
     np.testing.assert_array_equal(black, np.ones(3))
 
 
@@ -153,7 +155,7 @@ def test_albedo_metrics_by_hand():
         (IRGS, lambda v: v),
     ):
         error = (encode(0.2) - encode(0.5)) ** 2
-        measured = protocols.albedo_metrics(row, albedo, mask, truth, mask, scale)
+        measured = protocol_metrics.albedo_metrics(row, albedo, mask, truth, mask, scale)
         assert measured["albedo.psnr"] == pytest.approx(decibels(error / 2), abs=DECIBELS)
         assert measured["albedo.psnr_masked"] == pytest.approx(decibels(error), abs=DECIBELS)
 
@@ -164,7 +166,7 @@ def test_only_geosplatting_counts_albedo_beside_the_object():
     albedo = flat([0.5, 0.5, 0.5])
     alpha = np.ones_like(mask)
     measured = [
-        protocols.albedo_metrics(row, albedo, alpha, truth, mask, np.ones(3))["albedo.psnr"]
+        protocol_metrics.albedo_metrics(row, albedo, alpha, truth, mask, np.ones(3))["albedo.psnr"]
         for row in (GEOSPLATTING, TENSOIR, IRGS)
     ]
     assert measured[0] == pytest.approx(decibels(srgb(0.5) ** 2 / 2), abs=DECIBELS)
@@ -176,16 +178,16 @@ def test_backgrounds_differ_where_coverage_is_partial():
     mask, alpha = flat(1.0), flat(0.6)
     truth = flat([0.5, 0.5, 0.5])
     albedo = truth * alpha[..., None]
-    measured = protocols.albedo_metrics(GEOSPLATTING, albedo, alpha, truth, mask, np.ones(3))
+    measured = protocol_metrics.albedo_metrics(GEOSPLATTING, albedo, alpha, truth, mask, np.ones(3))
     expected = decibels((0.4 * srgb(0.5)) ** 2)
     assert measured["albedo.psnr"] == pytest.approx(expected, abs=DECIBELS)
     image = np.concatenate([truth, mask[..., None]], -1)
     white = decibels((0.4 * (1 - srgb(0.5))) ** 2)
-    psnr = [protocols.relight_metrics(row, albedo, alpha, image)["psnr"] for row in ROWS]
+    psnr = [protocol_metrics.relight_metrics(row, albedo, alpha, image)["psnr"] for row in ROWS]
     # `tensoir` shows it whole above one half, `irgs` cuts by the true mask.
     assert psnr == pytest.approx([white, 200.0, 200.0], abs=DECIBELS)
     alpha[:] = 0.4
-    thin = protocols.relight_metrics(TENSOIR, truth * 0.4, alpha, image)["psnr"]
+    thin = protocol_metrics.relight_metrics(TENSOIR, truth * 0.4, alpha, image)["psnr"]
     assert thin == pytest.approx(decibels((1 - srgb(0.5)) ** 2), abs=DECIBELS)
 
 
@@ -201,7 +203,7 @@ def test_albedo_similarity_sees_the_background():
             np.where(inside, encode(np.clip(x[0], 0, 1)), behind).astype(np.float32)
             for x in (albedo, truth)
         ]
-        measured = protocols.albedo_metrics(row, albedo, alpha, truth, mask, np.ones(3))
+        measured = protocol_metrics.albedo_metrics(row, albedo, alpha, truth, mask, np.ones(3))
         expected = float(ssim(*map(jnp.asarray, pictures)))
         assert measured["albedo.ssim"] == pytest.approx(expected, abs=1e-5)
 
@@ -215,7 +217,10 @@ def test_pooled_and_mean_of_images_differ():
     albedo[1] = 0.9 * mask[1][..., None]
     linear = dataclasses.replace(IRGS, albedo_is_pooled=True)
     args = (albedo, mask, truth, mask, np.ones(3))
-    mean, pooled = protocols.albedo_metrics(IRGS, *args), protocols.albedo_metrics(linear, *args)
+    mean, pooled = (
+        protocol_metrics.albedo_metrics(IRGS, *args),
+        protocol_metrics.albedo_metrics(linear, *args),
+    )
     assert mean["albedo.psnr"] == pytest.approx(
         (decibels(0.01) + decibels(0.16 / 2)) / 2, abs=DECIBELS
     )
@@ -236,8 +241,8 @@ def test_a_gain_of_the_prediction_changes_nothing_after_the_scale(name):
     measured = []
     for gain in (np.ones(3), np.array([0.3, 1.0, 4.0])):
         predicted = (albedo * gain).astype(np.float32)
-        scale = protocols.albedo_scale(row, predicted, alpha, truth, mask)
-        measured.append(protocols.albedo_metrics(row, predicted, alpha, truth, mask, scale))
+        scale = protocol_metrics.albedo_scale(row, predicted, alpha, truth, mask)
+        measured.append(protocol_metrics.albedo_metrics(row, predicted, alpha, truth, mask, scale))
     same(*measured, rel=1e-4)
     assert 15 < measured[0]["albedo.psnr_masked"] < 40
     assert measured[0]["albedo.psnr"] > measured[0]["albedo.psnr_masked"]
@@ -253,12 +258,12 @@ def test_masked_metrics_ignore_the_background(name):
     image = np.concatenate([truth, mask[..., None]], -1)
     for clean, dirty in (
         (
-            protocols.albedo_metrics(row, albedo, alpha, truth, mask, GAIN),
-            protocols.albedo_metrics(row, spoiled, spilled, truth, mask, GAIN),
+            protocol_metrics.albedo_metrics(row, albedo, alpha, truth, mask, GAIN),
+            protocol_metrics.albedo_metrics(row, spoiled, spilled, truth, mask, GAIN),
         ),
         (
-            protocols.relight_metrics(row, albedo, alpha, image),
-            protocols.relight_metrics(row, spoiled, spilled, image),
+            protocol_metrics.relight_metrics(row, albedo, alpha, image),
+            protocol_metrics.relight_metrics(row, spoiled, spilled, image),
         ),
     ):
         for key in (key for key in clean if key.endswith("_masked")):
@@ -275,8 +280,8 @@ def test_perfect_predictions_are_perfect(name):
     image = np.concatenate([np.where(mask[..., None] > 0, truth, 0), mask[..., None]], -1)
     image[:, 7, :3, :3] /= 0.3
     row = protocol(name)
-    albedo = protocols.albedo_metrics(row, truth, mask, truth, mask, np.ones(3))
-    relight = protocols.relight_metrics(row, truth, mask, image)
+    albedo = protocol_metrics.albedo_metrics(row, truth, mask, truth, mask, np.ones(3))
+    relight = protocol_metrics.relight_metrics(row, truth, mask, image)
     if name == "tensoir":
         # It cuts the prediction at one half, and blends the truth.
         assert relight.pop("psnr") < 60
@@ -293,11 +298,11 @@ def test_relit_values_are_clipped_before_encoding():
     image = flat([3.0, 1.0, 0.5, 1.0])
     rgb = flat([1.0, 7.0, 0.5])
     for row in ROWS:
-        assert protocols.relight_metrics(row, rgb, mask, image)["psnr"] > 150
+        assert protocol_metrics.relight_metrics(row, rgb, mask, image)["psnr"] > 150
     # In linear light the third channel alone errs.
     rgb[..., 2] = 0.25
     row = dataclasses.replace(IRGS, relight=protocols.Look("linear", 0.0, "mask"))
-    psnr = protocols.relight_metrics(row, rgb, mask, image)["psnr"]
+    psnr = protocol_metrics.relight_metrics(row, rgb, mask, image)["psnr"]
     assert psnr == pytest.approx(decibels(0.25**2 / 3), abs=DECIBELS)
 
 
@@ -307,7 +312,7 @@ def test_relight_encodings_by_hand():
     rgb = flat([0.2, 0.2, 0.2]) * mask[..., None]
     for row in (GEOSPLATTING, TENSOIR, IRGS):
         error = (srgb(0.2) - srgb(0.5)) ** 2
-        measured = protocols.relight_metrics(row, rgb, mask, image)
+        measured = protocol_metrics.relight_metrics(row, rgb, mask, image)
         assert measured["psnr"] == pytest.approx(decibels(error / 2), abs=DECIBELS)
         assert measured["psnr_masked"] == pytest.approx(decibels(error), abs=DECIBELS)
 
@@ -316,34 +321,34 @@ def test_material_metrics_by_hand():
     mask, alpha = left_half((2, 4, 4)), flat(0.5, (2, 4, 4))
     materials = {"roughness": flat(0.2, (2, 4, 4)), "metallic": flat(0.0, (2, 4, 4))}
     truth = {"roughness": 0.6 * mask}
-    measured = protocols.material_metrics(materials, alpha, truth, mask)
+    measured = protocol_metrics.material_metrics(materials, alpha, truth, mask)
     assert measured == {
         # Straight .4 against .6 inside; premultiplied .2 against .6 and, outside, 0.
         "roughness.mse": pytest.approx(0.04),
         "roughness.mse_full": pytest.approx((0.16 + 0.04) / 2),
     }
     mask[1] = truth["roughness"][1] = 0
-    measured = protocols.material_metrics(materials, alpha, truth, mask)
+    measured = protocol_metrics.material_metrics(materials, alpha, truth, mask)
     assert measured["roughness.mse"] == pytest.approx(0.04)
     truth["metallic"] = mask * 1.0
-    measured = protocols.material_metrics(materials, alpha, truth, mask)
+    measured = protocol_metrics.material_metrics(materials, alpha, truth, mask)
     assert measured["metallic.mse"] == pytest.approx(1.0)
     assert measured["metallic.mse_full"] == pytest.approx(0.25)
     with pytest.raises(ValueError, match="no predicted one"):
-        protocols.material_metrics({}, alpha, truth, mask)
+        protocol_metrics.material_metrics({}, alpha, truth, mask)
 
 
 def test_empty_views_are_left_out():
     albedo, alpha, truth, mask = scene(views=2)
     mask[1] = truth[1] = 0
     for row in ROWS:
-        one = protocols.albedo_metrics(row, albedo[:1], alpha[:1], truth[:1], mask[:1], GAIN)
-        two = protocols.albedo_metrics(row, albedo, alpha, truth, mask, GAIN)
+        one = protocol_metrics.albedo_metrics(row, albedo[:1], alpha[:1], truth[:1], mask[:1], GAIN)
+        two = protocol_metrics.albedo_metrics(row, albedo, alpha, truth, mask, GAIN)
         for key in ("albedo.psnr_masked", "albedo.ssim_masked"):
             assert two[key] == pytest.approx(one[key], abs=1e-4)
         np.testing.assert_allclose(
-            protocols.albedo_scale(row, albedo, alpha, truth, mask),
-            protocols.albedo_scale(row, albedo[:1], alpha[:1], truth[:1], mask[:1]),
+            protocol_metrics.albedo_scale(row, albedo, alpha, truth, mask),
+            protocol_metrics.albedo_scale(row, albedo[:1], alpha[:1], truth[:1], mask[:1]),
             rtol=1e-6,
         )
 
@@ -352,10 +357,10 @@ def test_views_without_any_object_are_refused():
     albedo, alpha, truth, mask = scene(views=2)
     nothing, image = 0 * mask, np.zeros((*mask.shape, 4), np.float32)
     calls = [
-        lambda: protocols.albedo_scale(TENSOIR, albedo, alpha, truth, nothing),
-        lambda: protocols.albedo_metrics(IRGS, albedo, alpha, truth, nothing, GAIN),
-        lambda: protocols.relight_metrics(GEOSPLATTING, albedo, alpha, image),
-        lambda: protocols.material_metrics({}, alpha, {}, nothing),
+        lambda: protocol_metrics.albedo_scale(TENSOIR, albedo, alpha, truth, nothing),
+        lambda: protocol_metrics.albedo_metrics(IRGS, albedo, alpha, truth, nothing, GAIN),
+        lambda: protocol_metrics.relight_metrics(GEOSPLATTING, albedo, alpha, image),
+        lambda: protocol_metrics.material_metrics({}, alpha, {}, nothing),
     ]
     for call in calls:
         with pytest.raises(ValueError, match="no pixel of the 2 views"):
@@ -367,33 +372,38 @@ def test_boolean_masks_equal_fractional_ones():
     for row in ROWS:
         args = albedo, alpha, truth
         np.testing.assert_array_equal(
-            protocols.albedo_scale(row, *args, mask > 0.5), protocols.albedo_scale(row, *args, mask)
+            protocol_metrics.albedo_scale(row, *args, mask > 0.5),
+            protocol_metrics.albedo_scale(row, *args, mask),
         )
         same(
-            protocols.albedo_metrics(row, *args, mask > 0.5, GAIN),
-            protocols.albedo_metrics(row, *args, mask, GAIN),
+            protocol_metrics.albedo_metrics(row, *args, mask > 0.5, GAIN),
+            protocol_metrics.albedo_metrics(row, *args, mask, GAIN),
         )
 
 
 def test_wrong_shapes_and_values_that_are_not_finite_are_refused():
     albedo, alpha, truth, mask = scene(views=2)
     with pytest.raises(ValueError, match=r"mask must be \(V, H, W\) = \(2, 14, 14\)"):
-        protocols.albedo_scale(IRGS, albedo, alpha, truth, mask[:1])
+        protocol_metrics.albedo_scale(IRGS, albedo, alpha, truth, mask[:1])
     with pytest.raises(ValueError, match=r"image must be \(V, H, W, C\).*got \(2, 14, 14, 3\)"):
-        protocols.relight_metrics(IRGS, albedo, alpha, truth)
+        protocol_metrics.relight_metrics(IRGS, albedo, alpha, truth)
     with pytest.raises(ValueError, match="at least one view"):
-        protocols.albedo_scale(IRGS, albedo[:0], alpha[:0], truth[:0], mask[:0])
+        protocol_metrics.albedo_scale(IRGS, albedo[:0], alpha[:0], truth[:0], mask[:0])
     with pytest.raises(ValueError, match="predicted roughness must be"):
-        protocols.material_metrics({"roughness": mask[..., None]}, alpha, {"roughness": mask}, mask)
+        protocol_metrics.material_metrics(
+            {"roughness": mask[..., None]}, alpha, {"roughness": mask}, mask
+        )
     albedo[0, 3, 3] = np.nan
     with pytest.raises(ValueError, match="albedo has 3 values that are not finite"):
-        protocols.albedo_metrics(IRGS, albedo, alpha, truth, mask, GAIN)
+        protocol_metrics.albedo_metrics(IRGS, albedo, alpha, truth, mask, GAIN)
 
 
 def test_new_views_are_encoded_before_they_are_laid_over_white():
     half, image = flat(0.5, (4, 4)), np.ones((4, 4, 4), np.float32)
     image[..., :3], image[..., 3] = 0.2, 0.8
-    measured = protocols.new_view_metrics(half[..., None] * flat([0.3] * 3, (4, 4)), half, image)
+    measured = protocol_metrics.new_view_metrics(
+        half[..., None] * flat([0.3] * 3, (4, 4)), half, image
+    )
     shown, true = 0.5 * srgb(0.3) + 0.5, 0.8 * srgb(0.2) + 0.2
     for name in ("nvs.psnr", "nvs.psnr_masked"):
         assert measured[name] == pytest.approx(decibels((shown - true) ** 2), abs=DECIBELS)
@@ -402,15 +412,15 @@ def test_new_views_are_encoded_before_they_are_laid_over_white():
 def test_new_views_without_an_object_have_no_masked_metrics():
     empty = np.zeros((12, 12), np.float32)
     image = np.zeros((12, 12, 4), np.float32)
-    measured = protocols.new_view_metrics(image[..., :3], empty, image)
+    measured = protocol_metrics.new_view_metrics(image[..., :3], empty, image)
     assert measured == {"nvs.psnr": pytest.approx(200.0), "nvs.ssim": pytest.approx(1.0)}
     with pytest.raises(ValueError, match="image must be"):
-        protocols.new_view_metrics(image[..., :3], empty, image[..., :3])
+        protocol_metrics.new_view_metrics(image[..., :3], empty, image[..., :3])
 
 
 def test_masked_ssim_is_what_the_protocols_print():
     albedo, alpha, truth, mask = scene(views=1)
-    measured = protocols.albedo_metrics(IRGS, albedo, alpha, truth, mask, np.ones(3))
+    measured = protocol_metrics.albedo_metrics(IRGS, albedo, alpha, truth, mask, np.ones(3))
     expected = ssim_masked(np.clip(albedo[0], 0, 1), truth[0], mask[0])
     assert measured["albedo.ssim_masked"] == pytest.approx(float(expected), abs=1e-5)
 
@@ -437,23 +447,25 @@ def test_figures_are_those_of_the_pixels_that_count_alone(name):
     valid, maps = spoiled()
     one = [values[:1] for values in maps]
     small = cut(maps, 13)
-    found = protocols.albedo_metrics(row, *one, GAIN, valid[:1])
-    expected = protocols.albedo_metrics(row, *small, GAIN)
+    found = protocol_metrics.albedo_metrics(row, *one, GAIN, valid[:1])
+    expected = protocol_metrics.albedo_metrics(row, *small, GAIN)
     # Windows across the border see black in both, so only means over pixels are equal.
     for key in ("albedo.psnr", "albedo.psnr_masked"):
         assert found[key] == pytest.approx(expected[key], abs=DECIBELS)
     assert 0 < found["albedo.ssim"] < 1
-    assert found["albedo.psnr"] < protocols.albedo_metrics(row, *one, GAIN)["albedo.psnr"] - 2
+    assert (
+        found["albedo.psnr"] < protocol_metrics.albedo_metrics(row, *one, GAIN)["albedo.psnr"] - 2
+    )
 
     def rgba(maps):
         _, _, truth, mask = maps
         return np.concatenate([truth, mask[..., None]], -1)
 
-    lit = protocols.relight_metrics(row, one[0], one[1], rgba(one), valid[:1])
-    other = protocols.relight_metrics(row, small[0], small[1], rgba(small))
+    lit = protocol_metrics.relight_metrics(row, one[0], one[1], rgba(one), valid[:1])
+    other = protocol_metrics.relight_metrics(row, small[0], small[1], rgba(small))
     assert lit["psnr"] == pytest.approx(other["psnr"], abs=DECIBELS)
-    new = protocols.new_view_metrics(one[0][0], one[1][0], rgba(one)[0], valid[0])
-    other = protocols.new_view_metrics(small[0][0], small[1][0], rgba(small)[0])
+    new = protocol_metrics.new_view_metrics(one[0][0], one[1][0], rgba(one)[0], valid[0])
+    other = protocol_metrics.new_view_metrics(small[0][0], small[1][0], rgba(small)[0])
     assert new["nvs.psnr"] == pytest.approx(other["nvs.psnr"], abs=DECIBELS)
 
 
@@ -461,12 +473,12 @@ def test_materials_and_pooled_errors_weigh_the_pixels_that_count():
     valid, (albedo, alpha, truth, mask) = spoiled()
     rough = {"roughness": albedo[..., 0]}
     known = {"roughness": truth[..., 0]}
-    found = protocols.material_metrics(rough, alpha, known, mask, valid)
+    found = protocol_metrics.material_metrics(rough, alpha, known, mask, valid)
     squared = (albedo[..., 0] - truth[..., 0]) ** 2
     means = [squared[view][valid[view] == 1].mean() for view in range(2)]
     assert found["roughness.mse_full"] == pytest.approx(np.mean(means), rel=1e-5)
     # tensoir pools the squared error of all pixels on white, gamma 2.2.
-    found = protocols.albedo_metrics(TENSOIR, albedo, alpha, truth, mask, np.ones(3), valid)
+    found = protocol_metrics.albedo_metrics(TENSOIR, albedo, alpha, truth, mask, np.ones(3), valid)
     inside = mask[..., None]
     error = inside * (np.clip(albedo, 0, 1) ** (1 / 2.2) - truth ** (1 / 2.2)) ** 2
     expected = decibels(error.sum() / (3 * valid.sum()))
@@ -476,8 +488,8 @@ def test_materials_and_pooled_errors_weigh_the_pixels_that_count():
 def test_where_all_pixels_count_the_figures_are_the_same():
     maps = scene(2, 16)
     every = np.ones((2, 16, 16), np.float32)
-    found = protocols.albedo_metrics(GEOSPLATTING, *maps, GAIN, every)
-    same(found, protocols.albedo_metrics(GEOSPLATTING, *maps, GAIN), rel=1e-5)
+    found = protocol_metrics.albedo_metrics(GEOSPLATTING, *maps, GAIN, every)
+    same(found, protocol_metrics.albedo_metrics(GEOSPLATTING, *maps, GAIN), rel=1e-5)
 
 
 def test_coverage_where_pixels_do_not_count_is_refused():
@@ -486,9 +498,9 @@ def test_coverage_where_pixels_do_not_count_is_refused():
     albedo, alpha, truth, mask = maps
     for wrong in ((albedo, whole_alpha, truth, mask), (albedo, alpha, truth, whole_mask)):
         with pytest.raises(ValueError, match="must be zero on pixels that do not count"):
-            protocols.albedo_metrics(GEOSPLATTING, *wrong, GAIN, valid)
+            protocol_metrics.albedo_metrics(GEOSPLATTING, *wrong, GAIN, valid)
     with pytest.raises(ValueError, match="valid must be"):
-        protocols.albedo_metrics(GEOSPLATTING, *maps, GAIN, valid[:, :5])
+        protocol_metrics.albedo_metrics(GEOSPLATTING, *maps, GAIN, valid[:, :5])
 
 
 def orb_by_hand(rgb, image, *, largest, is_brightened, is_encoded):
@@ -519,7 +531,7 @@ def bright_scene(views=2, size=24):
 
 def test_figures_of_stanford_orb_are_those_of_its_formula():
     rgb, alpha, image = bright_scene()
-    measured = protocols.relight_metrics(ORB, rgb, alpha, image)
+    measured = protocol_metrics.relight_metrics(ORB, rgb, alpha, image)
     kinds = {
         "psnr_h": {"largest": 4.0, "is_brightened": True, "is_encoded": False},
         "psnr_l": {"largest": 1.0, "is_brightened": False, "is_encoded": True},
@@ -529,10 +541,10 @@ def test_figures_of_stanford_orb_are_those_of_its_formula():
         for name, kind in kinds.items()
     }
     same(measured, {name: np.mean(values) for name, values in by_hand.items()}, abs=DECIBELS)
-    new = protocols.new_view_metrics(rgb[0], alpha[0], image[0], look=ORB.new_views)
+    new = protocol_metrics.new_view_metrics(rgb[0], alpha[0], image[0], look=ORB.new_views)
     same(new, {f"nvs.{name}": values[0] for name, values in by_hand.items()}, abs=DECIBELS)
     albedo, alpha, truth, mask = scene(1, 24)
-    measured = protocols.albedo_metrics(ORB, albedo, alpha, truth, mask, np.ones(3))
+    measured = protocol_metrics.albedo_metrics(ORB, albedo, alpha, truth, mask, np.ones(3))
     image = np.concatenate([truth, mask[..., None]], -1)
     linear = {"largest": 1.0, "is_brightened": False, "is_encoded": False}
     expected = orb_by_hand(albedo[0], image[0], **linear)
@@ -541,13 +553,13 @@ def test_figures_of_stanford_orb_are_those_of_its_formula():
 
 def test_stanford_orb_sees_neither_a_gain_nor_the_rim():
     rgb, alpha, image = bright_scene()
-    before = protocols.relight_metrics(ORB, rgb, alpha, image)
+    before = protocol_metrics.relight_metrics(ORB, rgb, alpha, image)
     gained = (rgb * np.array([0.2, 1.0, 3.0])).astype(np.float32)
-    inside = np.stack([protocols.eroded(view > 0.5) for view in image[..., 3]])
+    inside = np.stack([protocol_metrics.eroded(view > 0.5) for view in image[..., 3]])
     gained[~inside] = 5.0
-    same(protocols.relight_metrics(ORB, gained, alpha, image), before, abs=DECIBELS)
+    same(protocol_metrics.relight_metrics(ORB, gained, alpha, image), before, abs=DECIBELS)
     gained[inside] = 5.0
-    after = protocols.relight_metrics(ORB, gained, alpha, image)
+    after = protocol_metrics.relight_metrics(ORB, gained, alpha, image)
     assert all(after[name] < before[name] - 1 for name in before)
 
 
@@ -556,13 +568,13 @@ def test_a_mask_is_eroded_by_two_pixels_but_not_from_the_border():
     mask[:8, 3:] = True
     expected = np.zeros_like(mask)
     expected[:6, 5:] = True
-    np.testing.assert_array_equal(protocols.eroded(mask), expected)
+    np.testing.assert_array_equal(protocol_metrics.eroded(mask), expected)
 
 
 def test_stanford_orb_counts_no_image_below_grey():
     rgb, alpha, image = bright_scene(1)
-    black = protocols.relight_metrics(ORB, np.zeros_like(rgb), alpha, image)
-    inside = protocols.eroded(image[0, ..., 3] > 0.5)[..., None]
+    black = protocol_metrics.relight_metrics(ORB, np.zeros_like(rgb), alpha, image)
+    inside = protocol_metrics.eroded(image[0, ..., 3] > 0.5)[..., None]
     true = srgb(np.clip(np.where(inside, image[0, ..., :3], 0), 0, 1))
     assert black["psnr_l"] == pytest.approx(
         decibels(np.mean((0.5 * inside - true) ** 2)), abs=DECIBELS
@@ -574,8 +586,8 @@ def test_stanford_orb_means_over_the_pixels_that_count():
     valid = np.ones(alpha.shape, np.float32)
     valid[:, :3] = 0
     kept = valid[..., None]
-    half = protocols.relight_metrics(ORB, rgb * kept, alpha * valid, image * kept, valid)
-    whole = protocols.relight_metrics(ORB, rgb * kept, alpha * valid, image * kept)
+    half = protocol_metrics.relight_metrics(ORB, rgb * kept, alpha * valid, image * kept, valid)
+    whole = protocol_metrics.relight_metrics(ORB, rgb * kept, alpha * valid, image * kept)
     # The same error over fewer pixels.
     for name in whole:
         assert whole[name] - half[name] == pytest.approx(-decibels(24 / 21), abs=DECIBELS)

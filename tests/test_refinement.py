@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import MONTE_CARLO, ball, sphere_dataset, tiny_config
+from support import TWO_STAGES, ball, sphere_dataset, tiny_config
 
 from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.presets import make_config
@@ -18,8 +18,7 @@ from geosplat_jax.report.assets import MaterialSampler
 from geosplat_jax.report.renderer import Renderer
 
 REFINE = (
-    *MONTE_CARLO,
-    "stages.split_sum.steps=2",
+    *TWO_STAGES,
     "stages.monte_carlo.steps=1",
     "stages.refine.steps=3",
     "stages.refine.batch_views=1",
@@ -129,10 +128,10 @@ def test_a_surface_that_moves_is_refused():
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A whole run of three stages, and the same one stopped in the last."""
-    dataset, config = sphere_dataset(size=16), tiny_config(*REFINE)
+    dataset, config = sphere_dataset(), tiny_config(*REFINE)
     whole, parted = (tmp_path_factory.mktemp(name) / "run" for name in ("whole", "parted"))
     state = fit(dataset, config, whole)
-    first = fit(dataset, config, parted, stop_after=4)
+    first = fit(dataset, config, parted, stop_after=5)
     resumed = fit(dataset, config, parted, begin=Resume())
     return dataset, whole, (first, state, resumed)
 

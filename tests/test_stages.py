@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import MONTE_CARLO, ball, sphere_dataset, tiny_config
+from support import MONTE_CARLO, TWO_STAGES, ball, sphere_dataset, tiny_config
 
 from geosplat_jax.fit import loop as loop_module
 from geosplat_jax.fit.begin import Resume, TakeOver
@@ -108,7 +108,7 @@ def test_traced_indirect_light_learns_nothing():
     assert params.material.indirect_head is None
 
 
-RUN = (*MONTE_CARLO, "stages.split_sum.steps=3", "stages.monte_carlo.weights.light=0.15")
+RUN = TWO_STAGES
 OTHER = "stages.monte_carlo.rates.sdf=0.5"
 
 
@@ -124,7 +124,7 @@ def assert_same(first, second):
 
 @pytest.fixture(scope="module")
 def dataset():
-    return sphere_dataset(size=16)
+    return sphere_dataset()
 
 
 @pytest.fixture(scope="module")

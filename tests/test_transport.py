@@ -20,17 +20,12 @@ from geosplat_jax.render import RenderPipeline
 from geosplat_jax.transport import bsdf
 from geosplat_jax.transport import indirect as indirect_module
 from geosplat_jax.transport.base import TransportSettings
-from geosplat_jax.transport.denoise import DenoiseSpec
+from geosplat_jax.transport.denoise import DENOISER_INPUTS, DenoiseSpec, denoised
 from geosplat_jax.transport.environment import LightSpec
+from geosplat_jax.transport.estimators import gather, reflect
 from geosplat_jax.transport.indirect import ConstantIndirect
 from geosplat_jax.transport.light_sampling import light_sampler
-from geosplat_jax.transport.monte_carlo import (
-    DENOISER_INPUTS,
-    MonteCarloSettings,
-    denoised,
-    gather,
-    reflect,
-)
+from geosplat_jax.transport.monte_carlo import MonteCarloSettings
 from geosplat_jax.transport.paths import PathSettings
 from geosplat_jax.transport.sampling import SampleCounts, draw_samples
 from geosplat_jax.transport.split_sum import SplitSumSettings
@@ -431,6 +426,7 @@ def test_disagreement_is_the_squared_difference_and_moves_what_it_should(ball, m
 
 
 @pytest.mark.slow
+@pytest.mark.computes
 def test_faces_that_agree_with_themselves_send_the_light_of_many_bounces(bowl, monkeypatch):
     """The fixed point of learned radiance in a white bowl, against eight traced bounces."""
 

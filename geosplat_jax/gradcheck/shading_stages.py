@@ -20,9 +20,9 @@ from geosplat_jax.transport.environment import (
     prefiltered_diffuse,
     prefiltered_specular,
 )
+from geosplat_jax.transport.estimators import gather, reflect
 from geosplat_jax.transport.indirect import INDIRECT_MODELS
 from geosplat_jax.transport.light_sampling import light_sampler
-from geosplat_jax.transport.monte_carlo import gather, reflect
 from geosplat_jax.transport.paths import FaceTable, Leg, path_radiance
 from geosplat_jax.transport.sampling import BLOCKED, SampleCounts, draw_samples
 from geosplat_jax.transport.split_sum import fg_table, split_sum

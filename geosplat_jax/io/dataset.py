@@ -24,7 +24,8 @@ from geosplat_jax.io.layouts.stanford_orb import is_stanford_orb, list_stanford_
 from geosplat_jax.io.layouts.synthetic4relight import is_synthetic4relight, list_synthetic4relight
 from geosplat_jax.io.layouts.tensoir import is_tensoir, list_tensoir
 from geosplat_jax.io.layouts.transforms import is_transforms, list_transforms_capture
-from geosplat_jax.io.views import COVERED, KEPT_BYTES, Views, load_views, no_views, some_names
+from geosplat_jax.io.loading import KEPT_BYTES, load_views, some_names
+from geosplat_jax.io.views import COVERED, Views, no_views
 from geosplat_jax.surface.hull import hull_bounds, sight_bounds
 
 

@@ -19,7 +19,7 @@ from geosplat_jax.core.types import EnvLight
 from geosplat_jax.fit.runtime import in_background, peak_memory_mb
 from geosplat_jax.fit.train import Trained
 from geosplat_jax.io.views import Views
-from geosplat_jax.report import protocols
+from geosplat_jax.report import protocol_metrics, protocols
 from geosplat_jax.report.assets import MODEL_TEXTURE, MaterialSampler, write_model
 from geosplat_jax.report.light_metrics import light_metrics
 from geosplat_jax.report.metrics import MASK_THRESHOLD, mask_iou, normal_mae_deg
@@ -74,9 +74,9 @@ def _view_metrics(
     Metrics of the mask's pixels are left out where it has none.
     """
     mask = image[..., 3]
-    metrics = protocols.new_view_metrics(view.rgb, view.alpha, image, valid)
+    metrics = protocol_metrics.new_view_metrics(view.rgb, view.alpha, image, valid)
     if protocol.new_views is not None:
-        metrics |= protocols.new_view_metrics(
+        metrics |= protocol_metrics.new_view_metrics(
             view.rgb, view.alpha, image, valid, protocol.new_views
         )
     metrics["mask.iou"] = float(mask_iou(view.alpha, mask))
@@ -146,15 +146,15 @@ def _material_metrics(
     scale = np.ones(3)
     if "albedo" in maps:
         truth = views.truth["albedo"] * mask[..., None]
-        scale = protocols.albedo_scale(protocol, maps["albedo"], alpha, truth, mask)
-        metrics |= protocols.albedo_metrics(
+        scale = protocol_metrics.albedo_scale(protocol, maps["albedo"], alpha, truth, mask)
+        metrics |= protocol_metrics.albedo_metrics(
             protocol, maps["albedo"], alpha, truth, mask, scale, _all_valid(views)
         )
         metrics |= {f"albedo.scale_{c}": float(x) for c, x in zip("rgb", scale, strict=True)}
     known = {name: views.truth[name][..., 0] * mask for name in _MATERIALS if name in maps}
     if known:
         found = {name: maps[name][..., 0] for name in known}
-        metrics |= protocols.material_metrics(found, alpha, known, mask, _all_valid(views))
+        metrics |= protocol_metrics.material_metrics(found, alpha, known, mask, _all_valid(views))
     return metrics, scale
 
 
@@ -189,7 +189,7 @@ def _relight_metrics(
             view = _where_counted(view, _valid(views, index))
             rgb[index], alpha[index] = view.rgb, view.alpha
         images = views.relight[name]
-        found = protocols.relight_metrics(protocol, rgb, alpha, images, _all_valid(views))
+        found = protocol_metrics.relight_metrics(protocol, rgb, alpha, images, _all_valid(views))
         metrics |= {f"relight.{name}.{key}": value for key, value in found.items()}
         for row, index in zip(rows, chosen, strict=True):
             truth = photograph_on_white(images[index])

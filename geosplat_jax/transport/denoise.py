@@ -265,3 +265,63 @@ def denoise(
         sums = _gather(jnp.concatenate([values, alpha[None]]), weights, spread)
         values = alpha[None] * safe_divide(sums[:-1], sums[-1:])
     return jnp.moveaxis(values, 0, -1)
+
+
+DENOISER_INPUTS = (
+    "diffuse",
+    "specular",
+    "specular_radiance",
+    "albedo",
+    "metallic",
+    "normal",
+    "depth",
+)
+"""Images that `denoised` needs beside the colours."""
+
+_DARKEST = 1e-6
+"""Light below this has no tint."""
+
+
+def denoised(
+    images: dict[str, Float[Array, "H W c"]],
+    alpha: Float[Array, "H W"],
+    *,
+    spec: DenoiseSpec,
+    focal: Float[Array, ""],
+) -> dict[str, Float[Array, "H W c"]]:
+    """Filter the light of one view and correct its colours by what the filter changed.
+
+    ``rgb + base (F(L_d) - L_d) + tint (F(L_s) - L_s)``, with the filter F, the demodulated diffuse
+    and specular light L, the albedo of the diffuse lobe and the mean tint of the specular one. A
+    filter that changes nothing leaves the image as it was, to the bit.
+
+    Parameters
+    ----------
+    images : by name, premultiplied by ``alpha``: ``rgb``, ``diffuse`` and ``specular`` (light),
+        ``specular_radiance``, ``albedo``, ``metallic``, ``normal`` and ``depth``.
+    alpha : (H, W) coverage.
+    spec : static. focal : () focal length in pixels.
+
+    Returns
+    -------
+    ``images`` with new ``rgb``, ``diffuse`` and ``specular``. The gradient is that of a filter with
+    constant weights and of a constant tint.
+    """
+    light = jnp.concatenate([images["diffuse"], images["specular"]], axis=-1)
+    filtered = denoise(
+        light,
+        alpha,
+        images["normal"],
+        images["depth"][..., 0],
+        images["albedo"],
+        spec=spec,
+        focal=focal,
+    )
+    change = filtered - light
+    coverage = alpha[..., None]
+    base = safe_divide(images["albedo"], coverage)
+    base = base * (1 - safe_divide(images["metallic"], coverage))
+    tint = safe_divide(images["specular_radiance"], images["specular"], smallest=_DARKEST)
+    tint = jax.lax.stop_gradient(jnp.clip(tint, 0.0, 1.0))
+    rgb = images["rgb"] + base * change[..., :3] + tint * change[..., 3:]
+    return {**images, "rgb": rgb, "diffuse": filtered[..., :3], "specular": filtered[..., 3:]}

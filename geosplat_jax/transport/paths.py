@@ -39,6 +39,7 @@ from geosplat_jax.rays.base import RayIndex
 from geosplat_jax.transport import bsdf
 from geosplat_jax.transport.base import Shaded, TransportSettings
 from geosplat_jax.transport.environment import LightSpec, lookup
+from geosplat_jax.transport.estimators import gather, reflect
 from geosplat_jax.transport.indirect import IndirectSource, KnownIndirect, mean_over_faces
 from geosplat_jax.transport.light_sampling import (
     LightSampler,
@@ -46,13 +47,11 @@ from geosplat_jax.transport.light_sampling import (
     light_sampler,
     sample_light,
 )
-from geosplat_jax.transport.monte_carlo import (
-    MonteCarloIllumination,
+from geosplat_jax.transport.sampled import (
     SampleCount,
+    SampledIllumination,
     SampledSettings,
     SampledTransport,
-    gather,
-    reflect,
 )
 from geosplat_jax.transport.sampling import draw_samples, in_chunks
 
@@ -342,7 +341,7 @@ class PathTracer(IndirectSource):
         )
 
 
-class PathIllumination(MonteCarloIllumination):
+class PathIllumination(SampledIllumination):
     """Light of N points, and what paths find on the surface.
 
     Attributes
@@ -451,7 +450,7 @@ class Paths(SampledTransport):
         illumination: PathIllumination,
         index: RayIndex | None,
     ) -> Shaded:
-        """Add what each viewer sees; see `monte_carlo.reflect`."""
+        """Add what each viewer sees; see `estimators.reflect`."""
         assert key is not None
         light, sampler, gathered = illumination.light, illumination.sampler, illumination.gathered
         keys = jax.random.split(key, 4)

@@ -48,8 +48,8 @@ from geosplat_jax.io.images import write_png
 from geosplat_jax.rays.base import RayIndex
 from geosplat_jax.report.metrics import psnr, psnr_of_mse
 from geosplat_jax.transport.environment import light_directions, lookup
+from geosplat_jax.transport.estimators import gather, reflect
 from geosplat_jax.transport.light_sampling import light_sampler
-from geosplat_jax.transport.monte_carlo import gather, reflect
 from geosplat_jax.transport.sampling import SampleCounts, draw_samples
 
 FIELD_OF_VIEW = 0.62

@@ -26,9 +26,9 @@ import numpy as np
 from geosplat_jax.core.numerics import safe_normalize
 from geosplat_jax.core.types import EnvLight, Materials, SurfacePoints
 from geosplat_jax.transport import bsdf
+from geosplat_jax.transport.estimators import gather, reflect
 from geosplat_jax.transport.indirect import NO_INDIRECT
 from geosplat_jax.transport.light_sampling import light_sampler
-from geosplat_jax.transport.monte_carlo import gather, reflect
 from geosplat_jax.transport.paths import FaceTable, PathTracer
 from geosplat_jax.transport.sampling import SampleCounts, draw_samples
 

@@ -1,0 +1,241 @@
+"""Frames of a dataset become views: all images are read, reduced and checked against each other."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from geosplat_jax.io.frames import Frame, Listing
+from geosplat_jax.io.images import (
+    LINEAR_FORMATS,
+    SceneError,
+    image_size,
+    reading_bytes,
+    require_room,
+)
+from geosplat_jax.io.memory import Need
+from geosplat_jax.io.photographs import Marks, Part, PartsInMemory, pack_marks, values_of
+from geosplat_jax.io.reading import THREADS, forget_lenses, in_parallel, read_photograph
+from geosplat_jax.io.truth import Reading, relit_images, true_maps
+from geosplat_jax.io.views import COVERED, ViewLight, Views
+
+KEPT_BYTES = {"train": 3 << 29, "test": 1 << 28}
+"""Memory for the colours of a split, 1.5 GiB and a sixth of that; photographs beyond it are read
+again when they are needed."""
+
+_READING_BYTES = 5 << 28
+"""Memory that images may take which are read at the same time, but for the first."""
+
+_CODED_PIXEL_BYTES = 12
+"""Memory for a pixel while an image of integers is read whose floats are made in strips."""
+_EVEN = 0.02
+"""Linear colours of an object that differ by no more are one colour."""
+_EVEN_STRIDE = 8
+
+
+def load_views(
+    frames: Sequence[Frame], *, factor: int, listing: Listing, most_bytes: int
+) -> tuple[Views, list[str]]:
+    """Read the images of frames, several at a time; return the views and warnings.
+
+    ``most_bytes`` : that their colours may take in memory.
+
+    Raises
+    ------
+    MissingFileError, SceneError : see `load_dataset`.
+    """
+    _require_distinct([frame.name for frame in frames])
+    full = in_parallel(lambda frame: image_size(frame.image), frames)
+    problems = _size_problems(frames, full, factor, listing)
+    sizes = [(height // factor, width // factor) for height, width in full]
+    canvas = np.max(sizes, axis=0)
+    _require_room_for_all(frames, full, canvas, most_bytes)
+    height, width = (int(length) for length in canvas)
+    valid: list[Any] = [None] * len(frames)
+    has_mask, leaves_file = np.ones(len(frames), bool), np.zeros(len(frames), bool)
+    is_even = np.zeros(len(frames), bool)
+    kept, threads = PartsInMemory(len(frames), most_bytes), _threads_for(frames, full, factor)
+
+    def fill(index: int) -> None:
+        photograph = read_photograph(frames[index])
+        has_mask[index], leaves_file[index] = photograph.has_mask, photograph.leaves_file
+        if not (photograph.has_mask or listing.is_capture):
+            raise SceneError(_no_mask(frames[index]))
+        part, seen = photograph.part(frames[index], factor)
+        is_even[index] = _has_even_color(part)
+        valid[index] = pack_marks(_on_canvas(seen, height, width))
+        kept.add(index, part)
+
+    in_parallel(fill, range(len(frames)), threads=threads)
+    images = kept.photographs(
+        height,
+        width,
+        lambda index: read_photograph(frames[index]).part(frames[index], factor)[0],
+        threads=threads,
+    )
+    forget_lenses()
+    _require_masks_in_all_or_none(frames, has_mask)
+    if listing.is_capture and leaves_file.any():
+        problems.append(
+            f"{int(leaves_file.sum())} mask files are not read: their images have an alpha, "
+            f"{frames[int(np.argmax(leaves_file))].image.name} for one"
+        )
+    problems += _even_views(frames, is_even)
+    marks = Marks.of(valid, height, width)
+    reading = Reading(frames, images, sizes, marks, factor)
+    views = Views(
+        names=tuple(frame.name for frame in frames),
+        camera_to_world=np.stack([frame.camera_to_world for frame in frames]),
+        intrinsics=_intrinsics(frames, full, factor),
+        images=images,
+        truth=true_maps(reading, listing.albedo_is_srgb, problems),
+        relight=relit_images(reading, problems),
+        valid=marks,
+        has_masks=bool(has_mask.all()),
+        lights={
+            frame.name: ViewLight(frame.light, frame.camera_to_world)
+            for frame in frames
+            if frame.light is not None
+        },
+    )
+    return views, problems
+
+
+def _intrinsics(
+    frames: Sequence[Frame], full: Sequence[tuple[int, int]], factor: int
+) -> Float[np.ndarray, "V 3 3"]:
+    """Return the lenses of reduced images in pixels."""
+    lenses = [
+        frame.lens.intrinsics(width, height)
+        for frame, (height, width) in zip(frames, full, strict=True)
+    ]
+    intrinsics = np.stack(lenses)
+    intrinsics[:, :2] /= factor
+    return intrinsics
+
+
+def _require_room_for_all(
+    frames: Sequence[Frame], full: list[tuple[int, int]], canvas: np.ndarray, most_bytes: int
+) -> None:
+    """Refuse views that do not fit into the memory, before it is spent."""
+    largest = max(full, key=lambda size: size[0] * size[1])
+    height, width = largest
+    pixels = len(frames) * int(np.prod(canvas)) * 4 * np.dtype(np.float32).itemsize
+    require_room(
+        [
+            Need(
+                f"{len(frames)} images like {frames[full.index(largest)].image}",
+                min(pixels, most_bytes),
+            ),
+            Need(f"reading images of {width} x {height} pixels", reading_bytes(width, height, 4)),
+        ],
+        "raise --downscale, or take fewer or smaller images",
+    )
+
+
+def _threads_for(frames: Sequence[Frame], full: Sequence[tuple[int, int]], factor: int) -> int:
+    """Choose how many images are read at the same time."""
+
+    def bytes_of(frame: Frame, size: tuple[int, int]) -> int:
+        is_whole = factor == 1 and frame.lens.distortion is not None
+        if is_whole or frame.image.suffix.lower() in LINEAR_FORMATS:
+            return reading_bytes(size[1], size[0], 4)
+        return _CODED_PIXEL_BYTES * size[0] * size[1]
+
+    largest = max(map(bytes_of, frames, full))
+    return max(1, min(THREADS, len(full), _READING_BYTES // largest))
+
+
+def _on_canvas(seen: np.ndarray, height: int, width: int) -> Bool[np.ndarray, "H W"]:
+    """Lay what counts of a photograph into the upper left corner; nothing counts beside it."""
+    if seen.shape == (height, width):
+        return seen
+    placed = np.zeros((height, width), bool)
+    placed[: seen.shape[0], : seen.shape[1]] = seen
+    return placed
+
+
+def _has_even_color(part: Part) -> bool:
+    """Tell whether what is covered of a photograph has one even colour."""
+    # Few pixels tell most photographs; all are looked at where those are alike.
+    for stride in (_EVEN_STRIDE, 1):
+        color, alpha = part.color[::stride, ::stride], part.alpha[::stride, ::stride]
+        covered = color[values_of(alpha, is_srgb=False) > COVERED]
+        if len(covered):
+            ends = np.stack([covered.min(axis=0), covered.max(axis=0)])
+            if np.ptp(values_of(ends, is_srgb=True), axis=0).max() > _EVEN:
+                return False
+    return len(covered) > 0
+
+
+def _even_views(frames: Sequence[Frame], is_even: np.ndarray) -> list[str]:
+    """Warn of single photographs that show the object in one even colour."""
+    names = [frame.name for frame, even in zip(frames, is_even, strict=True) if even]
+    if not 0 < len(names) < 0.5 * len(frames):
+        return []
+    return [
+        f"the object has one even colour in {len(names)} views, {some_names(names)}; such a "
+        "photograph is most likely empty or damaged"
+    ]
+
+
+def _size_problems(
+    frames: Sequence[Frame], full: list[tuple[int, int]], factor: int, listing: Listing
+) -> list[str]:
+    """Say which sizes were met; refuse several of them outside captures."""
+    problems = []
+    for frame, (height, width) in zip(frames, full, strict=True):
+        if factor > min(height, width):
+            raise SceneError(
+                f"downscale factor must be between 1 and the image size, got {factor} for "
+                f"{frame.image}, which is {width} x {height}"
+            )
+        if (height, width) != full[0] and not listing.is_capture:
+            raise SceneError(
+                f"{frame.image} is {width} x {height} pixels, but {frames[0].image} is "
+                f"{full[0][1]} x {full[0][0]}; all images of a split must agree"
+            )
+    kinds = Counter(full)
+    if len(kinds) > 1:
+        height, width = np.max(full, axis=0)
+        problems.append(
+            f"images of {len(kinds)} sizes lie on a canvas of {width} x {height}; what is beside "
+            "them does not count"
+        )
+    cut = [(height, width) for height, width in kinds if height % factor or width % factor]
+    problems += [
+        f"images of {width} x {height} are cut to a multiple of the downscale factor {factor}"
+        for height, width in cut
+    ]
+    return problems
+
+
+def _no_mask(frame: Frame) -> str:
+    return (
+        f"{frame.image} has no alpha channel and there is no mask file beside it; the object "
+        "must be cut out: write RGBA images, or add masks as the layout names them (NAME_alpha"
+        ".png beside NAME.jpg for transforms of Blender, NAME_mask.png for Synthetic4Relight, "
+        "masks/NAME.png for captures)"
+    )
+
+
+def _require_masks_in_all_or_none(frames: Sequence[Frame], has_mask: np.ndarray) -> None:
+    if has_mask.any() and not has_mask.all():
+        raise SceneError(_no_mask(frames[int(np.argmin(has_mask))]))
+
+
+def _require_distinct(names: Sequence[str]) -> None:
+    """Refuse two views of one name: what is written of one would overwrite the other."""
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise SceneError(
+            f"{len(twice)} image names stand for several views of a split, the first "
+            f"{twice[0]!r}; rename the files, folders do not tell them apart"
+        )
+
+
+def some_names(names: Sequence[str], count: int = 3) -> str:
+    """Join the first names of a list."""
+    return ", ".join(names[:count]) + (", ..." if len(names) > count else "")

@@ -1,0 +1,144 @@
+"""True maps and relit images of views, read when they are first asked for."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from geosplat_jax.io.frames import Frame
+from geosplat_jax.io.images import SceneError, downscale, read_linear
+from geosplat_jax.io.photographs import Marks, Photographs, values_of
+from geosplat_jax.io.reading import as_rgba_or_rgb, in_parallel, read_photograph, undistorted
+
+TRUTH_CHANNELS = {"albedo": 3, "normal": 3, "roughness": 1, "metallic": 1}
+_SHORTEST_NORMAL = 0.1  # below this a decoded normal is background, not rounding
+
+
+class _OnDemand(Mapping[str, np.ndarray]):
+    """A mapping whose values are read when they are asked for, and kept only where that is said."""
+
+    def __init__(self, makers: dict[str, Callable[[], np.ndarray]], *, keeps: bool):
+        self._makers = makers
+        self._keeps = keeps
+        self._made: dict[str, np.ndarray] = {}
+
+    def __getitem__(self, key: str) -> np.ndarray:
+        if key in self._made:
+            return self._made[key]
+        made = self._makers[key]()
+        if self._keeps:
+            self._made[key] = made
+        return made
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._makers)
+
+    def __len__(self) -> int:
+        return len(self._makers)
+
+
+class Reading(NamedTuple):
+    """What the images of the truth must fit: frames, their images, sizes, and the reduction."""
+
+    frames: Sequence[Frame]
+    images: Photographs
+    sizes: Sequence[tuple[int, int]]
+    valid: Marks | None
+    factor: int
+
+    def reduced(self, index: int, pixels: np.ndarray, path: Path) -> np.ndarray:
+        """Undistort and reduce pixels of a file, and lay them where the image of the view lies."""
+        pixels = undistorted(self.frames[index], pixels)
+        small = downscale(pixels, self.factor)
+        height, width = self.sizes[index]
+        _require_size(small, self.sizes[index], path)
+        placed = np.zeros((*self.images.shape[1:3], small.shape[-1]), np.float32)
+        placed[:height, :width] = small
+        if self.valid is None:
+            return placed
+        return np.where(self.valid[index][..., None] > 0.0, placed, 0.0)
+
+
+def true_maps(reading: Reading, albedo_is_srgb: bool, problems: list[str]) -> Mapping[str, Any]:
+    """Return the true maps that all views have, by name; they are kept once they are read.
+
+    ``problems`` : gets a line about every map that only some views have.
+    """
+
+    def maker(key: str) -> Callable[[], np.ndarray]:
+        def read(index: int) -> np.ndarray:
+            return _read_truth(reading, index, key, albedo_is_srgb and key == "albedo")
+
+        return lambda: np.stack(in_parallel(read, range(len(reading.frames))))
+
+    listed = [frame.truth for frame in reading.frames]
+    keys = _in_all(listed, "ground truth", problems)
+    return _OnDemand({key: maker(key) for key in keys}, keeps=True)
+
+
+def _read_truth(reading: Reading, index: int, key: str, is_srgb: bool) -> np.ndarray:
+    frame = reading.frames[index]
+    path = frame.truth[key]
+    pixels = as_rgba_or_rgb(read_linear(path, is_srgb=is_srgb))
+    is_resampled = reading.factor > 1 or frame.lens.distortion is not None
+    if is_resampled and pixels.shape[-1] == 3:
+        # Without an alpha of its own, the background would be averaged into the rim.
+        photograph = read_photograph(frame)
+        _require_size(photograph.alpha, pixels.shape[:2], frame.image)
+        alpha = values_of(photograph.alpha, is_srgb=False)
+        pixels = np.concatenate([pixels, alpha[..., None]], -1)
+    if key == "normal":
+        pixels[..., :3] = 2.0 * pixels[..., :3] - 1.0
+    values = reading.reduced(index, pixels, path)[..., : TRUTH_CHANNELS[key]]
+    if key == "normal":
+        length = np.sqrt((values**2).sum(-1, keepdims=True))
+        is_normal = length > _SHORTEST_NORMAL
+        values = np.where(is_normal, values / np.where(is_normal, length, 1.0), 0.0)
+    covered = reading.images.alpha(index)[..., None] > 0.0
+    return np.where(covered, values, 0.0).astype(np.float32)
+
+
+def relit_images(reading: Reading, problems: list[str]) -> Mapping[str, Any]:
+    """Return the images of all views under other lights, by light; they are read anew each time.
+
+    ``problems`` : gets a line about every light that only some views have.
+    """
+
+    def maker(light: str) -> Callable[[], np.ndarray]:
+        def read(index: int) -> np.ndarray:
+            path = reading.frames[index].relight[light]
+            relit = reading.reduced(index, as_rgba_or_rgb(read_linear(path)), path)
+            # Without an alpha of its own it has that of the view: the object has not moved.
+            alpha = (
+                relit[..., 3:] if relit.shape[-1] == 4 else reading.images.alpha(index)[..., None]
+            )
+            rgb = np.where(alpha > 0.0, relit[..., :3], 0.0)
+            return np.concatenate([rgb, alpha], -1).astype(np.float32)
+
+        return lambda: np.stack(in_parallel(read, range(len(reading.frames))))
+
+    listed = [frame.relight for frame in reading.frames]
+    keys = _in_all(listed, "light", problems)
+    return _OnDemand({light: maker(light) for light in keys}, keeps=False)
+
+
+def _in_all(listed: list[Mapping[str, Path]], what: str, problems: list[str]) -> list[str]:
+    """Keys that every view has; those that only some have are reported."""
+    keys = list(dict.fromkeys(key for files in listed for key in files))
+    complete = []
+    for key in keys:
+        count = sum(key in files for files in listed)
+        if count == len(listed):
+            complete.append(key)
+        else:
+            problems.append(f"{what} {key!r} is left out: only {count} of {len(listed)} views")
+    return complete
+
+
+def _require_size(pixels: np.ndarray, size: Sequence[int], path: Path) -> None:
+    if pixels.shape[:2] != tuple(size):
+        raise SceneError(
+            f"{path} is {pixels.shape[1]} x {pixels.shape[0]} pixels (after reduction), but its "
+            f"view is {size[1]} x {size[0]}; they must agree"
+        )

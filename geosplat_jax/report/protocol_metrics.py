@@ -1,0 +1,443 @@
+"""Metrics of the evaluation protocols (`protocols`), as pure functions on the host.
+
+Conventions. Maps are NumPy, V views of one size. Predicted *and* true maps are premultiplied by
+their coverage (predicted ``alpha``, true ``mask``), hence zero on the background; the truth of
+`io.views.Views` is straight and is multiplied by the mask first. Only ``image`` of
+`relight_metrics` is straight RGBA, as `Views.relight` holds it. Where coverage is partial, the
+straight colour is clipped to [0, 1], encoded, and then laid over the background: so do the public
+codes with the PNG files of the data sets, and so is truth and prediction treated here.
+
+Pixels that do not count (``valid``) have no part in any figure. Whoever calls has set them to zero
+in all maps, predicted and true; where ``valid`` is None, all count. SSIM is then the mean over the
+windows that touch a pixel that counts, the others being black in both images.
+
+Every ``*_masked`` figure compares the same pictures over the pixels of the true mask only; views
+without an object have no part in it. SSIM is always the mean over images.
+"""
+
+from collections.abc import Iterable, Mapping
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Shaped
+from scipy.ndimage import binary_erosion
+
+from geosplat_jax.io.images import encode_srgb
+from geosplat_jax.report.metrics import (
+    MASK_THRESHOLD,
+    albedo_scale_least_squares,
+    albedo_scale_median,
+    composite,
+    mse,
+    psnr_of_mse,
+    ssim,
+    ssim_masked,
+)
+from geosplat_jax.report.protocols import (
+    NEW_VIEWS,
+    Look,
+    Protocol,
+    ScaledFigure,
+    ScaledLook,
+    scale_views,
+)
+
+_SMALLEST_ALPHA = 1e-6
+_MATERIALS = ("roughness", "metallic")
+
+
+def _require(shape: tuple[int, ...], **maps: np.ndarray | tuple[np.ndarray, int]) -> None:
+    """Check that maps have the (V, H, W) of alpha, then their channels, and finite values."""
+    for name, entry in maps.items():
+        values, *channels = entry if isinstance(entry, tuple) else (entry,)
+        wanted = (*shape, *channels)
+        if len(shape) != 3 or 0 in shape or values.shape != wanted:
+            raise ValueError(
+                f"{name} must be (V, H, W{', C' * len(channels)}) = {wanted}, at least one view of "
+                f"the size of alpha, got {values.shape}; render and load the same views"
+            )
+        bad = int(np.size(values) - np.count_nonzero(np.isfinite(values)))
+        if bad:
+            raise ValueError(
+                f"{name} has {bad} values that are not finite; metrics of it would mean nothing: "
+                "render again from a sound checkpoint"
+            )
+
+
+def _require_black(valid: np.ndarray | None, **coverage: np.ndarray) -> None:
+    """Check that nothing is covered where pixels do not count."""
+    if valid is None:
+        return
+    for name, values in coverage.items():
+        _require(values.shape, valid=valid)
+        if np.any((values != 0) & ~(valid > MASK_THRESHOLD)):
+            raise ValueError(f"{name} must be zero on pixels that do not count; multiply by valid")
+
+
+def _require_object(inside: Bool[np.ndarray, "V H W"]) -> None:
+    if not inside.any():
+        raise ValueError(
+            f"no pixel of the {inside.shape[0]} views lies inside the mask (coverage above "
+            f"{MASK_THRESHOLD}); check the alpha of the test images"
+        )
+
+
+def _straight(
+    premultiplied: Float[np.ndarray, "..."], coverage: Shaped[np.ndarray, "..."]
+) -> Float[np.ndarray, "..."]:
+    """Divide by coverage; zero where nothing is covered."""
+    coverage = coverage.reshape(coverage.shape + (1,) * (premultiplied.ndim - coverage.ndim))
+    covered = coverage > _SMALLEST_ALPHA
+    divisor = np.where(covered, coverage, 1).astype(premultiplied.dtype)
+    return np.where(covered, premultiplied / divisor, 0).astype(premultiplied.dtype)
+
+
+def albedo_scale(
+    protocol: Protocol,
+    albedo: Float[np.ndarray, "..."],
+    alpha: Float[np.ndarray, "..."],
+    truth: Float[np.ndarray, "..."],
+    mask: Shaped[np.ndarray, "..."],
+) -> Float[np.ndarray, " 3"]:
+    """Fit one factor a channel that takes the predicted albedo to the true one.
+
+    Albedo and light share a factor that no photograph can tell apart, so albedo is compared, and
+    relit, after this one is multiplied in.
+
+    Parameters
+    ----------
+    protocol : its ``albedo_scale`` and ``scale_views`` decide. ``least_squares`` fits the
+        premultiplied maps, which is on black; ``median`` takes the ratio of *straight* values over
+        the pixels of the mask where something was drawn.
+    albedo : (V, H, W, 3) linear, premultiplied by ``alpha``.
+    alpha : (V, H, W) predicted coverage.
+    truth : (V, H, W, 3) linear, premultiplied by ``mask``.
+    mask : (V, H, W) true coverage, fraction or boolean.
+
+    Returns
+    -------
+    (3,) float64. Views without an object have no part in it; nor, for least squares, has a channel
+    of a view that was predicted black. A channel without any evidence gets 1.
+
+    Raises
+    ------
+    ValueError : shapes that do not agree, values that are not finite, no object in the views.
+    """
+    _require(alpha.shape, alpha=alpha, mask=mask, albedo=(albedo, 3), truth=(truth, 3))
+    chosen = scale_views(protocol, len(alpha))
+    inside = mask[chosen] > MASK_THRESHOLD
+    _require_object(inside)
+    if protocol.albedo_scale == "least_squares":
+        return _mean_least_squares(albedo[chosen], truth[chosen], inside)
+    known = inside & (alpha[chosen] > _SMALLEST_ALPHA)
+    if not known.any():
+        return np.ones(3)
+    predicted = _straight(albedo[chosen][known], alpha[chosen][known])
+    true = _straight(truth[chosen][known], mask[chosen][known])
+    return np.asarray(albedo_scale_median(predicted, true, np.ones(len(true), bool)), float)
+
+
+def _mean_least_squares(
+    albedo: np.ndarray, truth: np.ndarray, inside: Bool[np.ndarray, "K H W"]
+) -> Float[np.ndarray, " 3"]:
+    """Average the scale of every view over the views that know it."""
+    scales = np.array(
+        [albedo_scale_least_squares(a, t) for a, t in zip(albedo, truth, strict=True)]
+    )
+    known = inside.any(axis=(1, 2))[:, None] & (albedo != 0).any(axis=(1, 2))
+    count = known.sum(axis=0)
+    total = np.where(known, scales, 0.0).sum(axis=0, dtype=float)
+    return np.where(count > 0, total / np.maximum(count, 1), 1.0)
+
+
+def _picture(straight: np.ndarray, coverage: np.ndarray, look: Look) -> Float[np.ndarray, "H W 3"]:
+    """Clip and encode straight linear colour, and lay it over the background."""
+    encoded = np.clip(straight, 0.0, 1.0).astype(np.float32)
+    if look.encoding == "srgb":
+        encoded = np.clip(encode_srgb(encoded), 0.0, 1.0)
+    elif look.encoding == "gamma22":
+        encoded = np.power(encoded, np.float32(1 / 2.2))
+    return np.asarray(composite(encoded, coverage.astype(np.float32), look.background))
+
+
+_mse, _ssim, _ssim_masked = jax.jit(mse), jax.jit(ssim), jax.jit(ssim_masked)
+
+
+def eroded(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Pixels of a mask whose 5 x 5 neighbours, as far as there are any, all belong to it."""
+    return binary_erosion(mask, np.ones((5, 5), bool), border_value=1)
+
+
+def scaled_psnr(
+    figure: ScaledFigure,
+    rgb: Float[np.ndarray, "H W 3"],
+    truth: Float[np.ndarray, "H W 3"],
+    inside: Bool[np.ndarray, "H W"],
+    counted: Bool[np.ndarray, "H W"],
+) -> float:
+    """Measure one figure of Stanford-ORB on one image, in dB; see `ScaledLook`.
+
+    Parameters
+    ----------
+    rgb, truth : linear. inside : eroded mask, not empty. counted : pixels that errors are means of.
+    """
+    predicted = np.where(inside[..., None], rgb, 0.0).astype(float)
+    true = np.maximum(np.where(inside[..., None], truth, 0.0).astype(float), 0.0)
+    if figure.is_brightened:
+        shown = np.clip(true, 0.0, 1.0)
+        total = shown.sum()
+        gain = encode_srgb(shown).sum() / total if total > 1e-8 * shown.size else 1.0
+        predicted, true = gain * predicted, gain * true
+    power = (predicted**2).sum(axis=(0, 1))
+    is_lit = power > 1e-6
+    scale = np.where(is_lit, (predicted * true).sum(axis=(0, 1)) / np.where(is_lit, power, 1), 1)
+    images = [np.clip(x, 0.0, figure.largest) for x in (scale * predicted, true)]
+    if figure.is_encoded:
+        images = [np.asarray(encode_srgb(x), float) for x in images]
+    grey = np.where(inside[..., None], 0.5, 0.0)
+    errors = [np.mean((x - images[1])[counted] ** 2) for x in (images[0], grey)]
+    return float(psnr_of_mse(min(errors)))
+
+
+def _compare_scaled(
+    predictions: Iterable[np.ndarray],
+    truths: Iterable[np.ndarray],
+    mask: np.ndarray,
+    look: ScaledLook,
+    valid: np.ndarray | None,
+) -> dict[str, float]:
+    """Means over the images that have an object after erosion; see `ScaledLook`."""
+    found: dict[str, list[float]] = {figure.name: [] for figure in look.figures}
+    known = np.ones(mask.shape, bool) if valid is None else valid > MASK_THRESHOLD
+    for prediction, truth, covered, counted in zip(predictions, truths, mask, known, strict=True):
+        inside = eroded(covered > MASK_THRESHOLD)
+        if inside.any():
+            for figure in look.figures:
+                found[figure.name].append(scaled_psnr(figure, prediction, truth, inside, counted))
+    return {name: float(np.mean(values)) for name, values in found.items() if values}
+
+
+def _compare(
+    predictions: Iterable[np.ndarray],
+    alpha: np.ndarray,
+    truths: Iterable[np.ndarray],
+    mask: np.ndarray,
+    *,
+    look: Look | ScaledLook,
+    is_pooled: bool,
+    valid: np.ndarray | None,
+) -> dict[str, float]:
+    """PSNR and SSIM, whole and masked, view by view, of linear images; or what the look measures.
+
+    Predictions are premultiplied by ``alpha``, truths straight.
+    """
+    if isinstance(look, ScaledLook):
+        return _compare_scaled(predictions, truths, mask, look, valid)
+    errors, similarities, masked_errors, masked_similarities, counts = [], [], [], [], []
+    totals = []
+    known = [None] * len(mask) if valid is None else valid
+    views = zip(predictions, alpha, truths, mask, known, strict=True)
+    for prediction, drawn, truth, covered, counted in views:
+        shown = {
+            "alpha": np.clip(drawn, 0.0, 1.0),
+            "solid": drawn > MASK_THRESHOLD,
+            "mask": covered,
+        }
+        predicted = _picture(_straight(prediction, drawn), shown[look.silhouette], look)
+        true = _picture(truth, covered, look)
+        errors.append(float(_mse(predicted, true, counted)))
+        if counted is None:
+            similarities.append(float(_ssim(predicted, true)))
+        else:
+            similarities.append(float(_ssim_masked(predicted, true, counted)))
+        totals.append(covered.size if counted is None else int((counted > MASK_THRESHOLD).sum()))
+        inside = covered > MASK_THRESHOLD
+        if inside.any():
+            masked_errors.append(float(_mse(predicted, true, inside)))
+            masked_similarities.append(float(_ssim_masked(predicted, true, inside)))
+            counts.append(int(inside.sum()))
+
+    def decibels(values: list[float], weights: list[int]) -> float:
+        pooled = [float(np.average(values, weights=weights))] if is_pooled else values
+        return float(np.mean([float(psnr_of_mse(value)) for value in pooled]))
+
+    metrics = {"psnr": decibels(errors, totals), "ssim": float(np.mean(similarities))}
+    if counts:
+        metrics["psnr_masked"] = decibels(masked_errors, counts)
+        metrics["ssim_masked"] = float(np.mean(masked_similarities))
+    return metrics
+
+
+def _compare_images(
+    rgb: np.ndarray,
+    alpha: np.ndarray,
+    image: np.ndarray,
+    look: Look | ScaledLook,
+    valid: np.ndarray | None,
+) -> dict[str, float]:
+    """Compare premultiplied renders with straight RGBA images, (V, H, W, 3 and 4)."""
+    _require(alpha.shape, alpha=alpha, rgb=(rgb, 3), image=(image, 4))
+    _require_black(valid, alpha=alpha, image=image[..., 3])
+    true, mask = image[..., :3], image[..., 3]
+    return _compare(rgb, alpha, true, mask, look=look, is_pooled=False, valid=valid)
+
+
+def new_view_metrics(
+    rgb: Float[np.ndarray, "..."],
+    alpha: Float[np.ndarray, "..."],
+    image: Float[np.ndarray, "..."],
+    valid: Shaped[np.ndarray, "..."] | None = None,
+    look: Look | ScaledLook = NEW_VIEWS,
+) -> dict[str, float]:
+    """Compare one view under the training light with its photograph, as `NEW_VIEWS` says.
+
+    Parameters
+    ----------
+    rgb : (H, W, 3) linear, exposed and tone mapped, premultiplied by ``alpha``; clipped here.
+    alpha : (H, W) predicted coverage.
+    image : (H, W, 4) photograph, linear, *straight* alpha, which is the mask.
+    valid : (H, W) pixels that count, or None.
+    look : another one, whose figures are then returned.
+
+    Returns
+    -------
+    ``nvs.psnr`` (dB) and ``nvs.ssim`` of the whole image; ``nvs.psnr_masked`` and
+    ``nvs.ssim_masked`` of the pixels of the mask, where it has any.
+
+    Raises
+    ------
+    ValueError : shapes that do not agree, values that are not finite.
+    """
+    counted = None if valid is None else valid[None]
+    metrics = _compare_images(rgb[None], alpha[None], image[None], look, counted)
+    return {f"nvs.{name}": value for name, value in metrics.items()}
+
+
+def albedo_metrics(
+    protocol: Protocol,
+    albedo: Float[np.ndarray, "..."],
+    alpha: Float[np.ndarray, "..."],
+    truth: Float[np.ndarray, "..."],
+    mask: Shaped[np.ndarray, "..."],
+    scale: Float[np.ndarray, " 3"],
+    valid: Shaped[np.ndarray, "..."] | None = None,
+) -> dict[str, float]:
+    """Compare albedo in the protocol's encoding, silhouette and background.
+
+    Parameters
+    ----------
+    protocol, albedo, alpha, truth, mask : see `albedo_scale`.
+    scale : (3,) factor of the prediction, from `albedo_scale`.
+    valid : (V, H, W) pixels that count, or None.
+
+    Returns
+    -------
+    ``albedo.psnr`` (dB) and ``albedo.ssim`` of whole images, ``albedo.psnr_masked`` and
+    ``albedo.ssim_masked`` of the pixels of the mask. A pixel of the mask where nothing was drawn
+    shows the background, or black where the protocol cuts by the true mask. Of protocol ``orb``
+    only ``albedo.psnr``.
+
+    Raises
+    ------
+    ValueError : shapes that do not agree, values that are not finite, no object in the views.
+    """
+    _require(alpha.shape, alpha=alpha, mask=mask, albedo=(albedo, 3), truth=(truth, 3))
+    _require_black(valid, alpha=alpha, mask=mask)
+    _require_object(mask > MASK_THRESHOLD)
+    factor = np.asarray(scale, np.float32)
+    metrics = _compare(
+        (view * factor for view in albedo),
+        alpha,
+        (_straight(t, covered) for t, covered in zip(truth, mask, strict=True)),
+        mask,
+        look=protocol.albedo,
+        is_pooled=protocol.albedo_is_pooled,
+        valid=valid,
+    )
+    return {f"albedo.{name}": value for name, value in metrics.items()}
+
+
+def material_metrics(
+    materials: Mapping[str, Float[np.ndarray, "..."]],
+    alpha: Float[np.ndarray, "..."],
+    truth: Mapping[str, Float[np.ndarray, "..."]],
+    mask: Shaped[np.ndarray, "..."],
+    valid: Shaped[np.ndarray, "..."] | None = None,
+) -> dict[str, float]:
+    """Mean squared errors of roughness and metallic; the same in all protocols.
+
+    Values are *mapped*: what the shading uses, roughness after its floor, and no raw output of a
+    network. No scale is fitted.
+
+    Parameters
+    ----------
+    materials : predicted (V, H, W) by ``roughness`` and ``metallic``, premultiplied by ``alpha``.
+    alpha : (V, H, W) predicted coverage.
+    truth : (V, H, W) by either name or both, premultiplied by ``mask``; what is missing here is
+        left out of the metrics.
+    mask : (V, H, W) true coverage, fraction or boolean.
+    valid : (V, H, W) pixels that count, or None.
+
+    Returns
+    -------
+    ``roughness.mse`` of straight values over the pixels of the mask, a pixel where nothing was
+    drawn counting as zero, and ``roughness.mse_full`` of premultiplied values over the whole
+    image, black behind both, which is smaller by about the object's share of it. Both are means
+    over the images, the first over those with an object. Likewise ``metallic``.
+
+    Raises
+    ------
+    ValueError : shapes that do not agree, values that are not finite, no object in the views, a
+        material with a truth but without a prediction.
+    """
+    metrics = {}
+    _require(alpha.shape, alpha=alpha, mask=mask)
+    _require_black(valid, alpha=alpha, mask=mask)
+    inside = mask > MASK_THRESHOLD
+    _require_object(inside)
+    counted = np.ones(mask.shape, bool) if valid is None else valid > MASK_THRESHOLD
+    for name in (name for name in _MATERIALS if name in truth):
+        if name not in materials:
+            raise ValueError(f"there is a true {name} but no predicted one; render it too")
+        predicted, true = materials[name], truth[name]
+        _require(alpha.shape, **{f"predicted {name}": predicted, f"true {name}": true})
+        squared = (_straight(predicted, alpha) - _straight(true, mask)) ** 2
+        views = [
+            np.mean(x[i], dtype=float) for x, i in zip(squared, inside, strict=True) if i.any()
+        ]
+        metrics[f"{name}.mse"] = float(np.mean(views))
+        whole = np.sum((predicted - true) ** 2, axis=(1, 2), dtype=float, where=counted)
+        metrics[f"{name}.mse_full"] = float(np.mean(whole / counted.sum(axis=(1, 2))))
+    return metrics
+
+
+def relight_metrics(
+    protocol: Protocol,
+    rgb: Float[np.ndarray, "..."],
+    alpha: Float[np.ndarray, "..."],
+    image: Float[np.ndarray, "..."],
+    valid: Shaped[np.ndarray, "..."] | None = None,
+) -> dict[str, float]:
+    """Compare images under one new light, in the protocol's encoding, silhouette and background.
+
+    Parameters
+    ----------
+    protocol : its ``relight`` decides.
+    rgb : (V, H, W, 3) linear, premultiplied by ``alpha``, lit with the albedo times its
+        `albedo_scale`, at exposure 1; clipped here.
+    alpha : (V, H, W) predicted coverage.
+    image : (V, H, W, 4) true image, linear, *straight* alpha, which is the mask.
+    valid : (V, H, W) pixels that count, or None.
+
+    Returns
+    -------
+    ``psnr`` (dB) and ``ssim`` of whole images, ``psnr_masked`` and ``ssim_masked`` of the pixels
+    of the mask, all means over the images. Of protocol ``orb`` ``psnr_h`` and ``psnr_l``.
+
+    Raises
+    ------
+    ValueError : shapes that do not agree, values that are not finite, no object in the views.
+    """
+    metrics = _compare_images(rgb, alpha, image, protocol.relight, valid)
+    _require_object(image[..., 3] > MASK_THRESHOLD)
+    return metrics

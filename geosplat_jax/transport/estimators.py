@@ -1,0 +1,210 @@
+"""The light that a point reflects, from samples: sums of Monte Carlo integration.
+
+``L_o = integral of f_r(wi, wo) L_i(wi) max(n.wi, 0) over wi`` with ``L_i`` the environment where
+nothing is in the way, and indirect light elsewhere (Eq. 20). The two lobes are integrated apart:
+the diffuse one from samples of the light and of the cosine, the specular one from the same samples
+of the light and from samples of the visible microfacet normals. Each pair is combined by the
+balance heuristic of Veach and Guibas (1995).
+
+What does not depend on the viewer is computed once for all views: `draw_samples` traces, `gather`
+sums up the diffuse light, and `reflect` adds what a viewer sees.
+
+Gradient semantics. The samples, their densities and what they hit are constants of a step: the
+backward pass evaluates the derivative of ``f_r L_i cos`` at the very samples of the forward pass.
+For fixed densities that is an unbiased estimate of the derivative of the integral, but for what
+moves a shadow's edge: visibility has no gradient.
+
+Unbiased wherever the light is bounded. The backward pass computes chunks of points again.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from geosplat_jax.core.numerics import safe_divide
+from geosplat_jax.core.types import EnvLight, Materials, SurfacePoints
+from geosplat_jax.rays.base import RayIndex
+from geosplat_jax.transport import bsdf
+from geosplat_jax.transport.base import Shaded, matt
+from geosplat_jax.transport.environment import lookup
+from geosplat_jax.transport.indirect import NO_INDIRECT, Indirect, IndirectSource
+from geosplat_jax.transport.light_sampling import LightSampler
+from geosplat_jax.transport.sampling import OPEN, SampleCounts, Samples, draw_specular, in_chunks
+
+
+class Gathered(eqx.Module):
+    """Light that arrives at N points, for any viewer.
+
+    Attributes
+    ----------
+    diffuse_light : (N, 3) irradiance / pi.
+    directions, radiance, density : (N, L, 3), (N, L, 3) and (N, L) the light's samples, what they
+        bring to the specular lobe, and their density; 0 where the mask is false.
+    """
+
+    diffuse_light: Float[Array, "N 3"]
+    directions: Float[Array, "N L 3"]
+    radiance: Float[Array, "N L 3"]
+    density: Float[Array, "N L"]
+
+
+def _arriving(
+    light: EnvLight,
+    indirect: Indirect,
+    directions: Float[Array, "S N 3"],
+    hits: Int[Array, "S N"],
+) -> tuple[Float[Array, "S N 3"], Float[Array, "S N 3"]]:
+    """Radiance along rays for the diffuse lobe and for the specular one."""
+    direct = lookup(light.radiance, directions.reshape(-1, 3)).reshape(directions.shape)
+    is_open = (hits == OPEN)[..., None]
+    diffuse, specular = (
+        jnp.where(is_open, direct, radiance) for radiance in indirect.along(directions, hits)
+    )
+    return diffuse, specular
+
+
+def _split(indirect: Indirect) -> tuple[Array | None, Callable[[Array | None], Indirect]]:
+    """Rows to cut into chunks with the points, and how to put them back."""
+    if indirect.belongs_to_points:
+        return indirect.values, lambda rows: replace(indirect, values=rows)
+    return None, lambda rows: indirect
+
+
+def gather(
+    points: SurfacePoints,
+    samples: Samples,
+    light: EnvLight,
+    indirect: IndirectSource = NO_INDIRECT,
+    *,
+    has_specular: bool = True,
+) -> Gathered:
+    """Sum up the diffuse light of N points, and keep what the light's samples bring.
+
+    Differentiable in the points' normals, the light and the indirect light. ``has_specular`` :
+    static; false where no point has a specular lobe, for which nothing is then kept.
+    """
+    total = samples.weights.shape[1]
+    shared = samples.light_density.shape[1] if has_specular else 0
+    followed = indirect.followed(points, samples.directions, samples.hits, samples.distances)
+    rows, restore = _split(followed)
+
+    def one_chunk(parts: tuple) -> tuple[Array, Array]:
+        normals, samples, rows = parts
+        directions = jnp.moveaxis(samples.directions, 1, 0)
+        diffuse, specular = _arriving(light, restore(rows), directions, samples.hits.T)
+        cosine = jnp.maximum(jnp.sum(normals[None] * directions, axis=-1), 0.0)
+        share = samples.weights.T * cosine / np.pi
+        diffuse_light = jnp.sum(diffuse * share[..., None], axis=0)
+        is_used = samples.weights[:, :shared, None] > 0
+        brought = jnp.moveaxis(specular[:shared], 0, 1)
+        if samples.light_factors is not None:
+            brought = brought * samples.light_factors[:, :shared, None]
+        return diffuse_light, jnp.where(is_used, brought, 0.0)
+
+    arguments = (points.normals, samples, rows)
+    diffuse_light, radiance = in_chunks(one_chunk, arguments, points.mask, total)
+    density = samples.light_density[:, :shared]
+    return Gathered(diffuse_light, samples.directions[:, :shared], radiance, density)
+
+
+def _specular_sums(
+    materials: Materials,
+    normals: Float[Array, "N 3"],
+    wo: Float[Array, "N 3"],
+    rays: tuple[Float[Array, "3 S N"], Float[Array, "3 S N"], Float[Array, "S N"]],
+    mask: Bool[Array, " N"],
+    counts: SampleCounts,
+) -> tuple[Float[Array, "N 3"], Float[Array, "N 3"]]:
+    """Weighted sums over rays of the specular lobe, with its Fresnel factor and without.
+
+    Rays are directions, what they bring, and the density of the light's samples there.
+    """
+    wi, radiance, light_density = rays
+    alpha = bsdf.ggx_alpha(materials.roughness)[None, :]
+    normal, view = (tuple(vectors.T[:, None, :]) for vectors in (normals, wo))
+    lobe = bsdf.specular_lobe(normal, tuple(wi), view, alpha)
+    density = counts.light * light_density
+    density = density + counts.specular * jax.lax.stop_gradient(lobe.density)
+    weight = jnp.where(mask[None, :], safe_divide(jnp.ones_like(density), density), 0.0)
+    share = weight * lobe.strength * lobe.cosine
+    # The Fresnel factor is f0 + (1 - f0) grazing, and f0 does not depend on the direction.
+    bare = jnp.stack([jnp.sum(share * channel, axis=0) for channel in radiance], axis=-1)
+    share = share * lobe.grazing
+    at_grazing = jnp.stack([jnp.sum(share * channel, axis=0) for channel in radiance], axis=-1)
+    f0 = bsdf.specular_f0(materials.albedo, materials.metallic)
+    return f0 * bare + (1 - f0) * at_grazing, bare
+
+
+def reflect(
+    key: Key[Array, ""],
+    points: SurfacePoints,
+    materials: Materials,
+    wo: Float[Array, "N 3"],
+    gathered: Gathered,
+    light: EnvLight,
+    sampler: LightSampler,
+    index: RayIndex | None,
+    indirect: IndirectSource = NO_INDIRECT,
+    *,
+    counts: SampleCounts,
+    finds_nearest: bool = False,
+    open_only: bool = False,
+) -> Shaded:
+    """Light that N points send to their viewers, one bounce after the environment.
+
+    Parameters
+    ----------
+    key : of the directions of the specular lobe.
+    points, materials, wo : the points, their materials and unit directions to the viewer. The
+        specular lobe flips shading normals that face away from the viewer.
+    gathered : of the same points, see `gather`.
+    light, sampler : the environment and its tables.
+    index, indirect : see `draw_samples` and `gather`.
+    counts, finds_nearest : static, as for `draw_samples`.
+    open_only : static; whether the light's samples leave blocked directions to the lobe's.
+
+    Returns
+    -------
+    Shaded; ``diffuse_light`` is irradiance / pi, ``specular_light`` what a white lossless reflector
+    of this roughness would send out. Zero where the mask is false. Differentiable in materials,
+    normals, views, light and indirect light. Without a specular lobe no direction is drawn.
+    """
+    if not materials.has_specular:
+        return matt(materials, gathered.diffuse_light)
+    cosine = jnp.sum(points.normals * wo, axis=-1, keepdims=True)
+    points = replace(points, normals=jnp.where(cosine < 0, -points.normals, points.normals))
+    rays = draw_specular(
+        key,
+        points,
+        materials.roughness,
+        wo,
+        sampler,
+        index,
+        counts=counts,
+        finds_nearest=finds_nearest,
+        open_only=open_only,
+    )
+    followed = indirect.followed(points, rays.directions, rays.hits, rays.distances)
+    rows, restore = _split(followed)
+
+    def one_chunk(parts: tuple) -> tuple[Array, Array]:
+        points, materials, wo, gathered, rays, rows = parts
+        drawn = rays.directions
+        _, brought = _arriving(light, restore(rows), jnp.moveaxis(drawn, 1, 0), rays.hits.T)
+        wi = jnp.concatenate([gathered.directions.T, drawn.T], axis=1)
+        radiance = [gathered.radiance.T, jnp.moveaxis(brought, -1, 0)]
+        light_part = jnp.concatenate([gathered.density.T, rays.light_density.T])
+        found = (wi, jnp.concatenate(radiance, axis=1), light_part)
+        return _specular_sums(materials, points.normals, wo, found, points.mask, counts)
+
+    samples = counts.light + counts.specular
+    arguments = (points, materials, wo, gathered, rays, rows)
+    specular, specular_light = in_chunks(one_chunk, arguments, points.mask, samples)
+    diffuse_light = gathered.diffuse_light
+    diffuse = materials.albedo * (1 - materials.metallic)[:, None] * diffuse_light
+    return Shaded(diffuse + specular, diffuse, specular, diffuse_light, specular_light)

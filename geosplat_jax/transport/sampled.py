@@ -1,0 +1,199 @@
+"""What transports by samples of light and lobes have in common; see `estimators`."""
+
+from dataclasses import replace
+from typing import Annotated, Any
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Float, Int, Key
+from pydantic import Field
+
+from geosplat_jax.core.settings import settings
+from geosplat_jax.core.types import EnvLight, SurfacePoints
+from geosplat_jax.rays.base import RayIndex
+from geosplat_jax.splats.tiles import gather_visible
+from geosplat_jax.transport.base import Illumination, Transport
+from geosplat_jax.transport.denoise import DENOISER_INPUTS, DenoiseSpec, denoised
+from geosplat_jax.transport.estimators import Gathered
+from geosplat_jax.transport.indirect import Indirect
+from geosplat_jax.transport.light_sampling import LightSampler
+from geosplat_jax.transport.reservoirs import (
+    ReservoirSettings,
+    ReservoirStore,
+    empty_store,
+    kept,
+    resample,
+)
+from geosplat_jax.transport.sampling import Chosen, SampleCounts, Samples, draw_samples
+
+
+class SampledIllumination(Illumination):
+    """Light of N points.
+
+    Attributes
+    ----------
+    light, sampler : environment and its tables.
+    traced : indirect light by face, where there is such a thing.
+    gathered : what arrives at every point, where views share it.
+    """
+
+    light: EnvLight
+    sampler: LightSampler
+    traced: Indirect | None
+    gathered: Gathered | None
+
+    def take(self, rows: Int[Array, " M"]) -> "SampledIllumination":
+        """Take rows of what was gathered."""
+        gathered = jax.tree.map(lambda x: gather_visible(rows, x), self.gathered)
+        return replace(self, gathered=gathered)
+
+    def averaged_parts(self) -> Any:
+        """Return diffuse light, and indirect light by face."""
+        return (
+            None if self.gathered is None else self.gathered.diffuse_light,
+            None if self.traced is None else self.traced.values,
+        )
+
+    def with_parts(self, parts: Any) -> "SampledIllumination":
+        """Put averaged parts back; the samples of the light stay."""
+        diffuse_light, values = parts
+        gathered, traced = self.gathered, self.traced
+        if gathered is not None:
+            gathered = replace(gathered, diffuse_light=diffuse_light)
+        if traced is not None:
+            traced = replace(traced, values=values)
+        return replace(self, gathered=gathered, traced=traced)
+
+
+SampleCount = Annotated[int, Field(ge=0, le=4096)]
+"""Samples of one kind per point."""
+
+
+@settings
+class SampledSettings:
+    """What every transport by samples of light and lobes has in common."""
+
+    light_count: SampleCount = 4
+    """Samples of the environment per point, for both lobes."""
+    diffuse_count: SampleCount = 4
+    """Samples of the cosine per point, for the diffuse lobe."""
+    specular_count: SampleCount = 4
+    """Samples of the visible microfacet normals per point, for the specular lobe."""
+    residual_count: SampleCount = 0
+    """Samples of each kind of a second image, from which Eq. 13 takes its residual; with 0 it takes
+    that of the image that it differentiates, which biases the gradient."""
+    shares_views: bool = True
+    """All views of a batch use the same samples of light and cosine, which are then traced once.
+    The noise of the images is then correlated between views; its mean is the same."""
+    denoise: DenoiseSpec = DenoiseSpec(iterations=0)
+    """Filter of the demodulated light in the image, off by default."""
+    reservoirs: ReservoirSettings = ReservoirSettings()
+    """Choice of the light's samples from many, and their use in later steps; where views share
+    them."""
+
+    @property
+    def numbers_per_splat(self) -> int:
+        """Direction, weight and hit of every sample that views share; see `Samples`."""
+        return 5 * (self.light_count + self.diffuse_count) if self.shares_views else 0
+
+    def __post_init__(self) -> None:
+        """Refuse a lobe without samples."""
+        if self.reservoirs.drops_blocked and min(self.diffuse_count, self.specular_count) == 0:
+            raise ValueError(
+                "reservoirs.visibility leaves blocked directions to samples of cosine and "
+                "microfacets: raise diffuse_count and specular_count, or ignore visibility"
+            )
+        if self.light_count + min(self.diffuse_count, self.specular_count) == 0:
+            raise ValueError(
+                "each lobe needs at least one sample: raise light_count, or both diffuse_count and "
+                "specular_count"
+            )
+
+
+class SampledTransport(Transport):
+    """A transport by samples of light and lobes."""
+
+    settings: Any = eqx.field(static=True)
+
+    @property
+    def needs_key(self) -> bool:
+        """It draws samples."""
+        return True
+
+    @property
+    def filter_inputs(self) -> tuple[str, ...]:
+        """See `denoised`."""
+        return DENOISER_INPUTS if self.settings.denoise.iterations > 0 else ()
+
+    @property
+    def _counts(self) -> SampleCounts:
+        settings = self.settings
+        return SampleCounts(settings.light_count, settings.diffuse_count, settings.specular_count)
+
+    def first_carry(self) -> ReservoirStore | None:
+        """Return an empty store, where samples are used again."""
+        spec, count = self.settings.reservoirs, self.settings.light_count
+        uses_store = spec.candidates > 0 and spec.reuse_steps and self.settings.shares_views
+        return empty_store(spec, count) if uses_store and count else None
+
+    def _draw_shared(
+        self,
+        key: Key[Array, ""],
+        points: SurfacePoints,
+        light: EnvLight,
+        sampler: LightSampler,
+        index: RayIndex | None,
+        carry: Any,
+        *,
+        finds_nearest: bool,
+    ) -> tuple[Samples, Any]:
+        """Draw and trace what views share; also return what the next step gets."""
+        spec, counts = self.settings.reservoirs, self._counts
+        how: dict[str, Any] = {"counts": counts, "finds_nearest": finds_nearest}
+        if not spec.candidates or not counts.light:
+            return draw_samples(key, points, sampler, index, **how), carry
+        own_key, key = jax.random.split(key)
+        found = resample(
+            own_key, points, light, sampler, index, carry, spec=spec, count=counts.light
+        )
+        chosen = Chosen(found.directions, found.weights, spec.drops_blocked)
+        samples = draw_samples(key, points, sampler, index, chosen=chosen, **how)
+        if carry is not None:
+            hits = samples.hits[:, : counts.light]
+            carry = kept(carry, points, found, hits, index, spec=spec)
+        return samples, carry
+
+    @property
+    def _open_only(self) -> bool:
+        """Whether the light's samples that views share leave blocked directions to others."""
+        return self.settings.reservoirs.drops_blocked and self.settings.light_count > 0
+
+    def filtered(
+        self,
+        images: dict[str, Float[Array, "H W c"]],
+        alpha: Float[Array, "H W"],
+        focal: Float[Array, ""],
+    ) -> dict[str, Float[Array, "H W c"]]:
+        """Filter the demodulated light; see `denoised`."""
+        if not self.filter_inputs:
+            return images
+        return denoised(images, alpha, spec=self.settings.denoise, focal=focal)
+
+    def for_residual(self) -> "SampledTransport | None":
+        """Return a transport with ``residual_count`` samples of each kind."""
+        count = self.settings.residual_count
+        return self._with_counts(count, residual_count=0) if count else None
+
+    def for_each_view(self) -> "SampledTransport":
+        """Draw the samples of light and cosine in every view, and use none again."""
+        plain = replace(self.settings, shares_views=False, reservoirs=ReservoirSettings())
+        return replace(self, settings=plain)
+
+    def for_images(self, sample_count: int) -> "SampledTransport":
+        """Share the views' samples, and leave out filter and reservoirs."""
+        plain = {"denoise": DenoiseSpec(iterations=0), "reservoirs": ReservoirSettings()}
+        return self._with_counts(sample_count, shares_views=True, **plain)
+
+    def _with_counts(self, count: int, **others: Any) -> "SampledTransport":
+        counts = dict.fromkeys(("light_count", "diffuse_count", "specular_count"), count)
+        return replace(self, settings=replace(self.settings, **counts, **others))
