@@ -8,19 +8,23 @@
     view = run.renderer()(run.dataset.test.camera([0]))
 """
 
-from geosplat_jax.core.types import Batch, Camera, EnvLight
-from geosplat_jax.fit.config import Budget, Config, Stage
-from geosplat_jax.fit.folder import RunError
-from geosplat_jax.fit.presets import make_config
-from geosplat_jax.fit.train import Interrupted, Progress, TrainingError
-from geosplat_jax.io.dataset import Dataset, load_dataset
-from geosplat_jax.io.images import SceneError
-from geosplat_jax.model_choice import ModelChoice
-from geosplat_jax.pipeline import Pipeline
-from geosplat_jax.render import Params
-from geosplat_jax.report.relight import load_light
-from geosplat_jax.report.renderer import Renderer
-from geosplat_jax.run import Run, train
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from geosplat_jax.core.types import Batch, Camera, EnvLight
+    from geosplat_jax.fit.config import Budget, Config, Stage
+    from geosplat_jax.fit.folder import RunError
+    from geosplat_jax.fit.presets import make_config
+    from geosplat_jax.fit.train import Interrupted, Progress, TrainingError
+    from geosplat_jax.io.dataset import Dataset, load_dataset
+    from geosplat_jax.io.images import SceneError
+    from geosplat_jax.model_choice import ModelChoice
+    from geosplat_jax.pipeline import Pipeline
+    from geosplat_jax.render import Params
+    from geosplat_jax.report.relight import load_light
+    from geosplat_jax.report.renderer import Renderer
+    from geosplat_jax.run import Run, train
 
 __all__ = [
     "Batch",
@@ -45,3 +49,39 @@ __all__ = [
     "make_config",
     "train",
 ]
+
+_WHERE = {
+    "Batch": "core.types",
+    "Camera": "core.types",
+    "EnvLight": "core.types",
+    "Budget": "fit.config",
+    "Config": "fit.config",
+    "Stage": "fit.config",
+    "RunError": "fit.folder",
+    "make_config": "fit.presets",
+    "Interrupted": "fit.train",
+    "Progress": "fit.train",
+    "TrainingError": "fit.train",
+    "Dataset": "io.dataset",
+    "load_dataset": "io.dataset",
+    "SceneError": "io.images",
+    "ModelChoice": "model_choice",
+    "Pipeline": "pipeline",
+    "Params": "render",
+    "load_light": "report.relight",
+    "Renderer": "report.renderer",
+    "Run": "run",
+    "train": "run",
+}
+"""Modules of the public names, which are imported when they are first asked for."""
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name: the command must not wait for all of them before it notices Ctrl-C."""
+    if name not in _WHERE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_WHERE[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
