@@ -15,7 +15,7 @@ import signal, sys, time
 from geosplat_jax.cli import stopping
 stopping._GRACE = 0.2
 {handler}
-with stopping.stops_soon():
+with stopping.stops_soon(with_process=True):
     print("ready", flush=True)
     end = time.monotonic() + 20
     while time.monotonic() < end:
@@ -48,6 +48,26 @@ def test_a_program_that_swallows_ctrl_c_ends_all_the_same():
     status, said, seconds = stopped()
     assert (status, said) == (130, "stopped\n")
     assert seconds < 15
+
+
+def test_threads_that_outlive_a_command_are_not_waited_for():
+    """They compile what nobody wants any more; `stopped` is said once all the same."""
+    program = """
+import signal, threading, time
+from geosplat_jax.cli import stopping
+stopping._GRACE = 0.2
+with stopping.stops_soon(with_process={alone}) as say_stopped:
+    try:
+        threading.Thread(target=time.sleep, args=(1.5,)).start()
+        signal.raise_signal(signal.SIGINT)
+        time.sleep(20)
+    except KeyboardInterrupt:
+        say_stopped()
+"""
+    for alone, status in ((True, 130), (False, 0)):
+        text = program.format(alone=alone)
+        done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (status, "stopped\n")
 
 
 def test_a_handler_of_its_own_is_left_alone():

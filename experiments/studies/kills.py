@@ -18,6 +18,7 @@ import argparse
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -33,6 +34,7 @@ from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.io.checkpoints import latest_checkpoint
 from geosplat_jax.io.images import read_image
 
+PACKAGE = "geosplat_jax"
 SCENE = Path(__file__).resolve().parents[2] / "examples" / "duck"
 SETTINGS = (
     "geometry.resolution=8",
@@ -67,6 +69,8 @@ PATIENCE = 900.0
 """Seconds after which a process that was sent a signal counts as one that swallowed it."""
 LEAD = 0.03
 """Seconds after a file was seen in which the signal is sent, at most."""
+PROGRESS = re.compile(r", step \d+/|: \d+ of \d+|^compiling|^warning|^\W*$|slow compile| views, ")
+"""Lines that say nothing of a signal."""
 UNMEASURED = ("seconds", "peak_memory_mb")
 """Numbers of a step that are never the same twice."""
 READERS = {
@@ -194,6 +198,8 @@ WATCHED = {
     "file": lambda path: True,
 }
 """Moments that a file tells of."""
+SEEN = {"checkpoint": 12, "end of stage": 2, "step": 12, "file": 6}
+"""How often, at least, files change that tell of them."""
 
 
 def killed(
@@ -213,7 +219,7 @@ def killed(
     elif moment == "compilation":
         if wait_for_words(process, "compiling stage"):
             time.sleep(draw.uniform(0.0, duration))
-    elif wait_for_file(process, folder, WATCHED[moment], draw.randrange(6)):
+    elif wait_for_file(process, folder, WATCHED[moment], draw.randrange(SEEN[moment])):
         time.sleep(draw.uniform(0.0, LEAD))
     if process.has_ended:
         return None
@@ -239,6 +245,11 @@ def judge(kill: Kill, process: Process) -> None:
     kill.outcome = {0: "had ended", 130: "stopped", -9: "died", -15: "died"}.get(
         kill.status, f"status {kill.status}"
     )
+    # Before the first line of the package nobody can listen.
+    has_begun = PACKAGE in text or bool(text.strip()) and "Traceback" not in text
+    if kill.number == signal.SIGINT and kill.status == -signal.SIGINT and not has_begun:
+        kill.outcome = "not begun"
+        return
     allowed = {
         signal.SIGINT: (0, 130),
         signal.SIGKILL: (0, -9),
@@ -249,7 +260,7 @@ def judge(kill: Kill, process: Process) -> None:
     if "Traceback" in text:
         kill.faults.append("a traceback")
     # Progress that was on its way is not meant; what is said of the signal is.
-    said = [line for line in kill.lines if "step " not in line and " of " not in line]
+    said = [line for line in kill.lines if not PROGRESS.search(line)]
     if kill.status == 130 and not 1 <= len(said) <= MOST_LINES:
         kill.faults.append(f"{len(said)} lines after Ctrl-C")
 

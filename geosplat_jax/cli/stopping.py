@@ -8,7 +8,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 STOPPED = 130
@@ -18,7 +18,19 @@ _GRACE = 3.0
 """Seconds in which a command can end in its own way."""
 
 
-def _watch(receiver: socket.socket) -> None:
+class _Notice:
+    """Says once that a command was stopped, whoever notices first."""
+
+    def __init__(self) -> None:
+        self._is_new = threading.Lock()
+
+    def __call__(self) -> None:
+        """Say it, unless that was done."""
+        if self._is_new.acquire(blocking=False):
+            print("stopped", file=sys.stderr, flush=True)
+
+
+def _watch(receiver: socket.socket, has_returned: threading.Event, notice: _Notice) -> None:
     """End the process some seconds after Ctrl-C, unless it ends before or has plans of its own.
 
     Python notices a signal between two of its own instructions, and raises KeyboardInterrupt there.
@@ -31,28 +43,43 @@ def _watch(receiver: socket.socket) -> None:
                 break
         else:
             return
-    threading.Event().wait(_GRACE)
-    print("stopped", file=sys.stderr, flush=True)
+        if has_returned.wait(_GRACE):
+            return
+    notice()
     os._exit(STOPPED)
 
 
 @contextmanager
-def stops_soon() -> Iterator[None]:
+def stops_soon(*, with_process: bool) -> Iterator[Callable[[], None]]:
     """End the process soon after Ctrl-C within the block, see `_watch`.
 
     A training has a handler of its own, which lets it write a checkpoint, and is left alone. So is
     whatever does not run in the main thread, to which signals do not come.
+
+    Parameters
+    ----------
+    with_process : whether the process has nothing else to do, so that threads which outlive the
+        block are not waited for either.
+
+    Yields
+    ------
+    What says that the command was stopped; once, however often it is called.
     """
+    notice = _Notice()
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield notice
         return
     receiver, sender = socket.socketpair()
     sender.setblocking(False)
     previous = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
-    threading.Thread(target=_watch, args=(receiver,), daemon=True).start()
+    has_returned = threading.Event()
+    watch = threading.Thread(target=_watch, args=(receiver, has_returned, notice), daemon=True)
+    watch.start()
     try:
-        yield
+        yield notice
     finally:
         signal.set_wakeup_fd(previous)
+        if not with_process:
+            has_returned.set()
         # Nothing more comes: a watch that was not called for ends.
         sender.close()
