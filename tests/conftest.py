@@ -13,11 +13,16 @@ os.environ.setdefault(
 
 import jax
 import pytest
+from hypothesis import settings
 from jaxtyping import install_import_hook
 
 install_import_hook("geosplat_jax", "beartype.beartype")
 
 from geosplat_jax.fit.runtime import enable_compilation_cache  # noqa: E402
+
+# The same examples in every run; `--hypothesis-profile=default` looks for others.
+settings.register_profile("same examples", derandomize=True)
+settings.load_profile("same examples")
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")

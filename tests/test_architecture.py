@@ -1,6 +1,8 @@
 """The order of the modules, the purity of the jitted ones, docstrings on all that is public."""
 
 import ast
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -151,3 +153,11 @@ def public_definitions(module):
 def test_public_functions_and_classes_have_docstrings(module):
     bare = [name for name, node in public_definitions(module) if not ast.get_docstring(node)]
     assert not bare, f"without a docstring: {bare}"
+
+
+def test_public_names_and_modules_are_there_when_they_are_asked_for():
+    code = (
+        "import sys, geosplat_jax as gs; assert 'jax' not in sys.modules; gs.geometry.isosurface; "
+        "assert all(hasattr(gs, name) for name in gs.__all__); assert not hasattr(gs, 'nothing')"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

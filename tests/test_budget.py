@@ -180,6 +180,23 @@ def test_a_training_ends_in_time_on_a_machine_of_another_speed(speed, tolerance)
         assert after.rates_at(after.steps) == pytest.approx(before.rates_at(before.steps))
 
 
+def test_what_later_stages_wait_for_is_set_aside():
+    """Of 290 s that are left, 190 steps of a second and a compilation of 100 s are just enough."""
+    stages = tuple(Stage(name=name, steps=100, rates={"albedo": Rate(1.0)}) for name in "ab")
+    config = replace(make_config("default", "draft"), stages=stages)
+    costs = {name: StageCost(startup=100.0, step=1.0) for name in "ab"}
+    now = [0.0]
+    pacer = Pacer(Budget(300.0), config, costs, clock=lambda: now[0])
+    for _ in range(10):
+        pacer.note("a", 1.0)
+    now[0] = 10.0
+    assert pacer.adjusted(config, config.stage("a"), 10) is None
+    now[0] = 60.0
+    slower = pacer.adjusted(config, config.stage("a"), 10)
+    assert slower is not None
+    assert slower.stage("a").steps == 10 + round(90 * 140 / 190)
+
+
 def test_a_very_fast_machine_makes_no_more_steps_than_are_worth_it():
     budget = Budget(300.0)
     chosen = plan(budget, SIZE, slowness=1.0)

@@ -346,6 +346,18 @@ def test_a_common_motion_is_no_error(count, scale):
     assert camera_errors(moved, true, BOUNDS).rotation_deg.min() > 10
 
 
+def test_a_common_brightness_is_no_error():
+    """It is the light's; what a single view has beside it is told."""
+    true = replace(many_views(6), exposure=np.array([1.0, 1.2, 0.9, 1.0, 1.1, 1.0]))
+    found = replace(true, exposure=1.5 * true.exposure)
+    errors, _ = compare_cameras(found, true, BOUNDS)
+    np.testing.assert_allclose(errors.exposure_percent, 0, atol=1e-9)
+    one = found.exposure * np.array([1.0, 1.0, 1.0, 1.1, 1.0, 1.0])
+    errors, _ = compare_cameras(replace(found, exposure=one), true, BOUNDS)
+    assert errors.exposure_percent.argmax() == 3
+    assert errors.exposure_percent[3] > 5
+
+
 def test_an_error_of_one_camera_is_still_seen_without_the_gauge():
     true = many_views(12)
     wrong = true.camera_to_world.copy()

@@ -7,13 +7,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import sphere_dataset, tiny_config
+from support import sphere_dataset, sphere_views, tiny_config
 
 from geosplat_jax.cli.arguments import command_line
 from geosplat_jax.cli.training import UsageError, _devices, _idle
-from geosplat_jax.fit.devices import ONE_DEVICE, Devices, choose_devices
+from geosplat_jax.core.types import Batch
+from geosplat_jax.fit import devices as devices_module
+from geosplat_jax.fit.devices import ONE_DEVICE, Devices, ManyDevices, choose_devices
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.train import fit
 
@@ -93,13 +97,43 @@ def test_two_hosts_grow_stop_resume_and_refuse_together(tmp_path):
     )
 
 
+def test_views_that_do_not_divide_are_filled_up_with_shares_of_nothing(monkeypatch):
+    """Three views on two devices, laid out without any: what each of them gets."""
+    here = jax.devices()[0]
+
+    class Two(ManyDevices):
+        def __init__(self):
+            self.mesh, self.count = None, 2
+
+        _mine = ((0, here), (1, here))
+
+        def _copied(self, x):
+            return x
+
+    monkeypatch.setattr(devices_module, "NamedSharding", lambda *where: None)
+    monkeypatch.setattr(
+        jax,
+        "make_array_from_single_device_arrays",
+        lambda shape, sharding, parts: jnp.concatenate(parts).reshape(shape),
+    )
+    views = sphere_views(3, size=4)
+    batch = Batch(
+        views.camera(range(3)),
+        jnp.asarray(views.images),
+        jax.random.key(0),
+        views=jnp.arange(3, dtype=jnp.int32),
+    )
+    dealt = Two().share_out(batch).pictures
+    np.testing.assert_array_equal(dealt["views"], [[0, 2], [1, 2]])
+    np.testing.assert_allclose(dealt["shares"], [[1 / 3, 1 / 3], [1 / 3, 0.0]])
+    np.testing.assert_array_equal(dealt["image"][1, 0], views.images[1])
+
+
 def test_one_device_is_what_a_training_gets_that_asks_for_nothing():
     assert choose_devices() is ONE_DEVICE
 
 
 def test_more_devices_than_there_are_is_refused_in_one_line():
-    import jax
-
     there = len(jax.local_devices())
     with pytest.raises(
         TrainingError, match=f"--devices {there + 1}: this process has {there}"

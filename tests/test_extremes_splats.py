@@ -234,6 +234,10 @@ def project_and_differentiate(inputs, **settings):
     return footprints, gradient
 
 
+def test_examples_are_the_same_in_every_run():
+    assert FEW.derandomize
+
+
 @FEW
 @example(field_of_view=1.0, exponents=(-8.0, 4.0), depth=0.0, seed=0)
 @example(field_of_view=150.0, exponents=(-8.0, 4.0), depth=0.0, seed=1)

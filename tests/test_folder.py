@@ -113,6 +113,19 @@ def test_a_line_that_an_interruption_tore_is_left_out(run):
     assert run.metrics.read_text() == "\n".join(lines[:2]) + "\n"
 
 
+def test_an_accident_leaves_what_was_noted_of_the_training(run, monkeypatch):
+    run.write_training({"seconds_total": 1.0})
+
+    def accident(old, new):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("geosplat_jax.io.images.os.replace", accident)
+    with pytest.raises(KeyboardInterrupt):
+        run.write_training({"seconds_total": 2.0})
+    assert run.training() == {"seconds_total": 1.0}
+    assert not list(run.path.glob(".training*"))
+
+
 def test_a_damaged_line_in_the_middle_is_an_error(run):
     run.metrics.write_text('{"step": 0}\n{"ste\n{"step": 2}\n')
     with pytest.raises(RunError, match=r"line 2 of .*metrics\.jsonl is damaged"):

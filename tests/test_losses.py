@@ -5,10 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from geosplat_jax.core.color import tone_map
+from geosplat_jax.core.color import linear_to_srgb, tone_map
+from geosplat_jax.core.types import Batch, Camera
 from geosplat_jax.losses import (
     Comparison,
     Objective,
+    ViewInputs,
     compare,
     edge_aware_smoothness,
     image_dissimilarity,
@@ -23,6 +25,7 @@ from geosplat_jax.losses import (
     random_background,
     white_balance,
 )
+from geosplat_jax.render import RenderOutput
 
 SHAPE = (2, 16, 16)
 # One float32 rounding of a mean over a few hundred numbers of order one.
@@ -91,6 +94,22 @@ def test_encoded_images_are_compared_as_they_are_seen():
     # Dark differences grow when they are encoded; the mean squared error stays linear.
     assert float(image_l1(encoded)) > 2 * float(image_l1(plain))
     assert float(encoded.mse) == float(plain.mse)
+
+
+def test_colours_are_compared_linear_unless_the_objective_says_so():
+    rgb, image = uniform(1, 1, 4, 4, 3), uniform(2, 1, 4, 4, 4).at[..., 3].set(1.0)
+    camera = Camera(jnp.eye(4)[None], jnp.eye(3)[None], 4, 4)
+    view, output = (
+        Batch(camera, image, jax.random.key(0)),
+        RenderOutput(rgb, jnp.ones((1, 4, 4)), {}, {}),
+    )
+    for objective, seen in (
+        (Objective(), lambda colours: colours),
+        (Objective(srgb=True), linear_to_srgb),
+    ):
+        found = ViewInputs(view, output, rgb, jnp.zeros(()), objective, view.key).comparison
+        np.testing.assert_allclose(found.predicted, seen(rgb), rtol=ROUNDING)
+        np.testing.assert_allclose(found.target, seen(image[..., :3]), rtol=ROUNDING)
 
 
 def test_pixels_that_do_not_count_change_no_term():

@@ -44,7 +44,7 @@ def test_the_default_model_has_all_parts_and_the_smallest_none():
     assert [part.name for part in offered_parts(config)] == NAMES
     smallest = without(config, LADDER)
     material = smallest.material
-    assert (material.specular, material.has_shift) == ("none", False)
+    assert (material.specular, material.has_metallic, material.has_shift) == ("none", False, False)
     assert (smallest.light.height, smallest.light.width) == (16, 32)
     assert smallest.geometry.resolution == 32
     assert material.grid == make_config(quality="draft").material.grid

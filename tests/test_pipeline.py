@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import MONTE_CARLO, ball, double_precision, sphere_views, tiny_config
+from support import MONTE_CARLO, ball, double_precision, sphere_views, tiny_config, views_from
 
 from geosplat_jax.core.capacity import Capacities, fits, grow, overflowed
 from geosplat_jax.core.types import Batch, EnvLight
 from geosplat_jax.fit.stages import update_rule
 from geosplat_jax.fit.step import initial_state, train_step
 from geosplat_jax.losses import light_agreement
-from geosplat_jax.pipeline import Pipeline
+from geosplat_jax.pipeline import Pipeline, ViewReport
 
 SMALL = (
     *MONTE_CARLO,
@@ -137,6 +137,32 @@ def test_the_key_decides_every_sample(stage):
     assert float(report.terms["deviation"]) == float(before["deviation"])
     is_sampled = settings.name == "monte_carlo"
     assert (float(report.terms["light"]) != float(before["light"])) is is_sampled
+
+
+def test_the_report_of_several_views_is_their_mean_with_the_larger_needs():
+    def report(value, hits, chunks):
+        needs = {"hits": jnp.int32(hits), "chunks": jnp.int32(chunks)}
+        return ViewReport({"l1": jnp.float32(value)}, jnp.float32(10 * value), needs)
+
+    share = jnp.float32(0.5)
+    mean = report(1.0, 7, 2).times(share).plus(report(3.0, 5, 9).times(share))
+    assert float(mean.terms["l1"]) == 2.0
+    assert float(mean.mse) == 20.0
+    assert {name: int(count) for name, count in mean.usage.items()} == {"hits": 7, "chunks": 9}
+
+
+def test_the_near_plane_is_measured_in_the_box():
+    """A scene is the same in any unit, also right before the camera."""
+    pipeline, _ = ball(tiny_config("geometry.resolution=6"))
+    camera = views_from([[2.0, 0.0, 0.0]]).camera([0])
+    near = pipeline.raster.near * float(pipeline.surface.box.half_extent)
+    assert abs(near / pipeline.raster.near - 1.0) > 0.2
+    depths = np.array([0.9, 1.1]) * near
+    means = jnp.asarray([[2.0 - depth, 0.0, 0.0] for depth in depths], jnp.float32)
+    ones = jnp.ones((2, 3), jnp.float32)
+    found = pipeline.project(means, jnp.ones((2, 4), jnp.float32), ones, camera)
+    np.testing.assert_allclose(found.depths, depths, rtol=1e-3)
+    np.testing.assert_array_equal(found.is_in_front, [False, True])
 
 
 def test_an_unknown_term_is_refused_by_name(second):

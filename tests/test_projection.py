@@ -90,6 +90,11 @@ def test_covariance_is_the_linearised_image_of_the_splat(x64):
     np.testing.assert_allclose(xy, expected[:, 0, 1], rtol=1e-9, atol=1e-10)
     np.testing.assert_allclose(yy, expected[:, 1, 1], rtol=1e-10)
     np.testing.assert_allclose(footprints.means2d, jax.vmap(pixel)(means), rtol=1e-12)
+    # What is spread over a larger area is fainter by the root of both areas' squares.
+    sharp = expected - LOW_PASS_VARIANCE * jnp.eye(2)[None]
+    shares = jnp.linalg.det(sharp) / jnp.linalg.det(expected)
+    np.testing.assert_allclose(footprints.compensation**2, shares, rtol=1e-6, atol=1e-12)
+    assert float(jnp.min(shares)) < 0.9
 
 
 def test_conic_inverts_the_covariance(x64):

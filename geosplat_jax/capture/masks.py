@@ -39,7 +39,7 @@ from geosplat_jax.io.dataset import LAYOUTS, Dataset, recognise_layout
 from geosplat_jax.io.distortion import Lookup, photograph_lookup, resample
 from geosplat_jax.io.export import export_gaussians_ply
 from geosplat_jax.io.frames import MASK_FOLDERS, Frame, beside_images, mask_file
-from geosplat_jax.io.images import MissingFileError, image_size, write_png
+from geosplat_jax.io.images import MissingFileError, image_size, write_png, written_aside
 from geosplat_jax.io.layouts.colmap import read_points
 from geosplat_jax.io.views import COVERED, Views
 from geosplat_jax.report.pictures import overview_sheet
@@ -226,7 +226,8 @@ def make_masks(
     )
     write_png(folder / "masks.png", mask_sheet(views, alpha, report.lines()))
     text = json.dumps(asdict(report), indent=2)
-    (folder / REPORT).write_text(text + "\n", encoding="utf-8")
+    with written_aside(folder / REPORT) as aside:
+        aside.write_text(text + "\n", encoding="utf-8")
     return report
 
 

@@ -44,6 +44,7 @@ from geosplat_jax.io.checkpoints import (
     save_checkpoint,
 )
 from geosplat_jax.io.documents import parse_json
+from geosplat_jax.io.images import written_aside
 from geosplat_jax.io.layouts.colmap import Points
 from geosplat_jax.io.views import Views
 from geosplat_jax.losses import compare, image_dissimilarity, image_l1, random_background
@@ -481,7 +482,8 @@ def _begin(
         )
     for old in (folder / "checkpoints").glob("checkpoint_*.npz"):
         old.unlink()
-    path.write_text(json.dumps(now, indent=2) + "\n", encoding="utf-8")
+    with written_aside(path) as aside:
+        aside.write_text(json.dumps(now, indent=2) + "\n", encoding="utf-8")
 
 
 @partial(jax.jit, static_argnames=("capacities", "degree"))

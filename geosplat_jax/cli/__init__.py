@@ -1,43 +1,19 @@
 """The ``geosplat-jax`` command."""
 
-import warnings
-
-from geosplat_jax.cli.arguments import command_line
-from geosplat_jax.cli.commands import COMMANDS, GradientError, UsageError
-from geosplat_jax.cli.display import say, show_warning
-from geosplat_jax.fit.folder import RunError
-from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
-from geosplat_jax.fit.train import Interrupted, TrainingError
-from geosplat_jax.io.checkpoints import CheckpointError
-from geosplat_jax.io.images import SceneError
-
-_CURABLE = (
-    SceneError,
-    UsageError,
-    RunError,
-    TrainingError,
-    CheckpointError,
-    OSError,
-    ValueError,
-)
+from geosplat_jax.cli.stopping import STOPPED, stops_soon
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command line; errors that a user can cure print one line and return 2."""
-    arguments = command_line().parse_args(argv)
-    enable_compilation_cache()
-    retain_freed_memory()
-    try:
-        with warnings.catch_warnings():
-            warnings.showwarning = show_warning
-            COMMANDS[arguments.command](arguments)
-    except Interrupted as stop:
-        say(str(stop))
-        return 130
-    except GradientError as error:
-        say(str(error))
-        return 1
-    except _CURABLE as error:
-        say(str(error), label="error: ", style="bold red")
-        return 2
-    return 0
+    """Run the command line, that of the process by default, and return its status.
+
+    Errors that a user can cure print one line and return 2, what somebody stopped 130.
+    """
+    with stops_soon(with_process=argv is None) as say_stopped:
+        try:
+            # Imports take seconds, in which somebody may have second thoughts.
+            from geosplat_jax.cli.calling import call
+
+            return call(argv)
+        except KeyboardInterrupt:
+            say_stopped()
+            return STOPPED

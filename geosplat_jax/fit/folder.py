@@ -32,6 +32,7 @@ from geosplat_jax.core.settings import PositiveCount, first_line, from_plain, se
 from geosplat_jax.fit.config import Budget, Config, config_from_dict
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.documents import parse_json
+from geosplat_jax.io.images import written_aside
 
 _PACKAGES = ("jax", "jaxlib", "numpy", "optax", "geosplat_jax")
 EVENTS = "tensorboard"
@@ -405,7 +406,8 @@ class RunFolder:
 
     def write_training(self, summary: dict[str, Any]) -> None:
         """Note how the training went as a whole."""
-        (self.path / "training.json").write_text(json.dumps(summary, indent=2) + "\n")
+        with written_aside(self.path / "training.json") as aside:
+            aside.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
     def training(self) -> dict[str, Any] | None:
         """Read what `write_training` noted; None before the end.

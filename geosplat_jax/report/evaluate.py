@@ -18,6 +18,7 @@ import numpy as np
 from geosplat_jax.core.types import EnvLight
 from geosplat_jax.fit.runtime import in_background, peak_memory_mb
 from geosplat_jax.fit.train import Trained
+from geosplat_jax.io.images import written_aside
 from geosplat_jax.io.views import Views
 from geosplat_jax.report import protocol_metrics, protocols
 from geosplat_jax.report.assets import MODEL_TEXTURE, MaterialSampler, write_model
@@ -425,5 +426,6 @@ def evaluate_run(
         "seen": None if shown.seen is None else shown.seen.described(),
         **meta,
     }
-    (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+    with written_aside(folder / "metrics.json") as aside:
+        aside.write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
     return metrics

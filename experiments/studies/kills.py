@@ -1,0 +1,491 @@
+"""Kill commands at random moments, and see what they leave and whether the next call goes on.
+
+    python experiments/studies/kills.py --output FOLDER [--kills 100] [--seed 0] [--json FILE]
+
+Trains a very small run of the bundled scene without a disturbance, and then again and again with
+signals 2 (Ctrl-C), 9 and 15: after a time that is uniform over a whole command, or as soon as a
+file is seen to appear in its folder (a checkpoint, the end of a stage, a line of
+``metrics.jsonl``), or while it compiles into an empty cache. A run is resumed, and often killed
+again, until it has ended; its arrays and its ``metrics.jsonl`` must then be those of the first one
+to the bit. ``evaluate``, ``export``, ``render`` and ``relight`` of the finished run are killed
+likewise: under no final name may lie half a file, and the command called again must succeed.
+
+A command that Ctrl-C reaches says so in at most three lines and ends with status 130. Prints what
+happened by kind of moment and signal, and every deviation; exit status 1 where there is one.
+"""
+
+import argparse
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from geosplat_jax.fit.folder import RunFolder
+from geosplat_jax.io.checkpoints import latest_checkpoint
+from geosplat_jax.io.images import read_image
+
+PACKAGE = "geosplat_jax"
+SCENE = Path(__file__).resolve().parents[2] / "examples" / "duck"
+SETTINGS = (
+    "geometry.resolution=8",
+    "stages.split_sum.steps=12",
+    "stages.split_sum.batch_views=1",
+    "stages.monte_carlo.steps=6",
+    "stages.monte_carlo.batch_views=1",
+    "stages.monte_carlo.transport.kind=split_sum",
+    "stages.refine.steps=0",
+    "run.checkpoint_every=2",
+    "run.preview_every=0",
+    "material.grid.levels=2",
+    "material.grid.log2_entries=10",
+    "material.grid.finest=24",
+    "material.albedo_hidden=[8, 8]",
+    "material.surface_hidden=[8]",
+    "light.height=8",
+    "light.width=16",
+    "objective.smoothness_samples=64",
+)
+"""Two stages of one kind of light, so that the second one needs few programs of its own."""
+
+FAST_COMPILER = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+"""As in the tests: most of the time of so small a run is compilation."""
+
+SIGNALS = (signal.SIGINT, signal.SIGKILL, signal.SIGTERM)
+MOST_KILLS = 4
+"""Of one training or one output, before it is left to end."""
+MOST_LINES = 3
+"""That a command prints after Ctrl-C."""
+PATIENCE = 900.0
+"""Seconds after which a process that was sent a signal counts as one that swallowed it."""
+LEAD = 0.03
+"""Seconds after a file was seen in which the signal is sent, at most."""
+PROGRESS = re.compile(r", step \d+/|: \d+ of \d+|^compiling|^warning|^\W*$|slow compile| views, ")
+"""Lines that say nothing of a signal."""
+UNMEASURED = ("seconds", "peak_memory_mb")
+"""Numbers of a step that are never the same twice."""
+READERS = {
+    "evaluate": ("--samples", "1"),
+    "export": ("--texture-size", "64"),
+    "render": ("--samples", "1"),
+    "relight": (str(SCENE.parent / "sunset.hdr"), "--samples", "1"),
+}
+"""Commands on a finished run, with their options."""
+
+
+@dataclass
+class Kill:
+    """A signal that was sent, and what became of it.
+
+    Attributes
+    ----------
+    command, moment, number : what was killed, when, with which signal.
+    outcome : in a word or two. seconds : from the signal to the end of the process.
+    status : of the process. lines : that it printed after the signal.
+    faults : what should not be.
+    """
+
+    command: str
+    moment: str
+    number: int
+    outcome: str = ""
+    seconds: float = 0.0
+    status: int | None = None
+    lines: list[str] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
+
+
+class Process:
+    """A command of geosplat-jax in a process of its own, whose words go to a file."""
+
+    def __init__(self, arguments: Sequence[str], log: Path, cache: Path) -> None:
+        self.log = log
+        environment = {
+            **os.environ,
+            "XDG_CACHE_HOME": str(cache),
+            "XLA_FLAGS": os.environ.get("XLA_FLAGS", FAST_COMPILER),
+        }
+        with log.open("wb") as words:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "geosplat_jax.cli", *arguments],
+                stdout=words,
+                stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL,
+                env=environment,
+                start_new_session=True,
+            )
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether there is nothing left to kill."""
+        return self._process.poll() is not None
+
+    def words(self) -> str:
+        """Return what was printed so far."""
+        return self.log.read_text(errors="replace")
+
+    def send(self, number: int) -> None:
+        """Send a signal."""
+        self._process.send_signal(number)
+
+    def wait(self, seconds: float | None = None) -> int | None:
+        """Wait for the end and return the status; None where it did not come in time."""
+        try:
+            return self._process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            return None
+
+
+def small_scene(folder: Path) -> Path:
+    """Copy a few views of the bundled scene."""
+    root = folder / "scene" / "duck"
+    if not root.exists():
+        for view in sorted(SCENE.glob("train_*"))[::4] + sorted(SCENE.glob("test_*"))[:2]:
+            shutil.copytree(view, root / view.name)
+        shutil.copy(SCENE / "scene.json", root)
+    return root
+
+
+def seen_files(folder: Path) -> Counter:
+    """Return names and sizes of the files below a folder, those that are being written as well."""
+    found = Counter()
+    for root, _, names in os.walk(folder):
+        for name in names:
+            path = os.path.join(root, name)
+            try:
+                found[path] = os.stat(path).st_size + 1
+            except OSError:  # renamed in between
+                continue
+    return found
+
+
+def wait_for_file(process: Process, folder: Path, wanted: Callable[[str], bool], skip: int) -> bool:
+    """Wait until a wanted file has appeared or grown ``skip`` times more; False at the end."""
+    before = seen_files(folder)
+    while not process.has_ended:
+        now = seen_files(folder)
+        if any(wanted(path) and now[path] != before[path] for path in now):
+            if not skip:
+                return True
+            skip -= 1
+        before = now
+        time.sleep(0.001)
+    return False
+
+
+def wait_for_words(process: Process, words: str) -> bool:
+    """Wait until words were printed; False at the end."""
+    while not process.has_ended:
+        if words in process.words():
+            return True
+        time.sleep(0.01)
+    return False
+
+
+WATCHED = {
+    "checkpoint": lambda path: "checkpoint_" in path and f"{os.sep}stages{os.sep}" not in path,
+    "end of stage": lambda path: f"{os.sep}stages{os.sep}" in path,
+    "step": lambda path: path.endswith("metrics.jsonl"),
+    "file": lambda path: True,
+}
+"""Moments that a file tells of."""
+SEEN = {"checkpoint": 12, "end of stage": 2, "step": 12, "file": 6}
+"""How often, at least, files change that tell of them."""
+
+
+def killed(
+    name: str,
+    process: Process,
+    folder: Path,
+    moment: str,
+    duration: float,
+    draw: random.Random,
+) -> Kill | None:
+    """Wait for a moment, send a signal, and wait for the end; None where the moment never came."""
+    number = draw.choice(SIGNALS)
+    if moment == "anywhere":
+        end = time.monotonic() + draw.uniform(0.0, duration)
+        while time.monotonic() < end and not process.has_ended:
+            time.sleep(0.005)
+    elif moment == "compilation":
+        if wait_for_words(process, "compiling stage"):
+            time.sleep(draw.uniform(0.0, duration))
+    elif wait_for_file(process, folder, WATCHED[moment], draw.randrange(SEEN[moment])):
+        time.sleep(draw.uniform(0.0, LEAD))
+    if process.has_ended:
+        return None
+    kill = Kill(name, moment, int(number))
+    printed, began = len(process.words()), time.monotonic()
+    process.send(number)
+    kill.status = process.wait(PATIENCE)
+    kill.seconds = time.monotonic() - began
+    kill.lines = [line for line in process.words()[printed:].splitlines() if line.strip()]
+    judge(kill, process)
+    return kill
+
+
+def judge(kill: Kill, process: Process) -> None:
+    """Say what became of a signal, and what should not be."""
+    text = process.words()
+    if kill.status is None:
+        kill.outcome = "swallowed"
+        kill.faults.append(f"still there {PATIENCE:.0f} s after signal {kill.number}")
+        process.send(signal.SIGKILL)
+        process.wait()
+        return
+    kill.outcome = {0: "had ended", 130: "stopped", -9: "died", -15: "died"}.get(
+        kill.status, f"status {kill.status}"
+    )
+    # Before the first line of the package nobody can listen.
+    has_begun = PACKAGE in text or bool(text.strip()) and "Traceback" not in text
+    if kill.number == signal.SIGINT and kill.status == -signal.SIGINT and not has_begun:
+        kill.outcome = "not begun"
+        return
+    allowed = {
+        signal.SIGINT: (0, 130),
+        signal.SIGKILL: (0, -9),
+        signal.SIGTERM: (0, 130, -15),
+    }[signal.Signals(kill.number)]
+    if kill.status not in allowed:
+        kill.faults.append(f"status {kill.status} after signal {kill.number}")
+    if "Traceback" in text:
+        kill.faults.append("a traceback")
+    # Progress that was on its way is not meant; what is said of the signal is.
+    said = [line for line in kill.lines if not PROGRESS.search(line)]
+    if kill.status == 130 and not 1 <= len(said) <= MOST_LINES:
+        kill.faults.append(f"{len(said)} lines after Ctrl-C")
+
+
+def differences(run: Path, reference: Path) -> list[str]:
+    """Compare two finished runs to the bit: arrays, what is beside them, and every step."""
+    found = []
+    for part in ("checkpoints", "stages/split_sum"):
+        mine, theirs = (latest_checkpoint(root / part) for root in (run, reference))
+        if mine is None or theirs is None or mine.name != theirs.name:
+            found.append(f"{part}: {mine}, not {theirs}")
+            continue
+        with zipfile.ZipFile(mine) as a, zipfile.ZipFile(theirs) as b:
+            if set(a.namelist()) != set(b.namelist()):
+                found.append(f"{part}: other arrays")
+                continue
+            found += [f"{part}: {n}" for n in a.namelist() if a.read(n) != b.read(n)]
+    steps = [
+        [{k: v for k, v in line.items() if k not in UNMEASURED} for line in lines]
+        for lines in (RunFolder(root).metric_lines() for root in (run, reference))
+    ]
+    if len(steps[0]) != len(steps[1]):
+        found.append(f"{len(steps[0])} steps are written down, not {len(steps[1])}")
+    changed = [a["step"] for a, b in zip(*steps, strict=False) if a != b]
+    return found + ([f"steps {changed}"] if changed else [])
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a file ends where it should."""
+    try:
+        if path.suffix == ".json":
+            json.loads(path.read_text())
+        elif path.suffix in (".png", ".exr", ".hdr"):
+            read_image(path)
+        elif path.suffix == ".glb":
+            data = path.read_bytes()
+            return int.from_bytes(data[8:12], "little") == len(data)
+        elif path.suffix == ".html":
+            return path.read_text().rstrip().endswith("</html>")
+        elif path.suffix == ".npz":
+            with zipfile.ZipFile(path) as archive:
+                return archive.testzip() is None
+    except (OSError, ValueError, zipfile.BadZipFile):
+        return False
+    return path.stat().st_size > 0
+
+
+def half_files(folder: Path) -> list[str]:
+    """Name the files below a folder that are not whole, those aside left out."""
+    paths = (path for path in folder.rglob("*") if path.is_file())
+    final = (p for p in paths if ".partial" not in p.name and p.name != ".lock")
+    # The last line of the steps may be torn: whoever reads them leaves it out.
+    return [str(p.relative_to(folder)) for p in final if p.suffix != ".jsonl" and not is_whole(p)]
+
+
+class Study:
+    """Trials of one output folder, and what they found."""
+
+    def __init__(self, folder: Path, seed: int) -> None:
+        self.folder, self.draw = folder, random.Random(seed)
+        folder.mkdir(parents=True, exist_ok=True)
+        self.scene, self.cache = small_scene(folder), folder / "cache"
+        self.reference = folder / "reference"
+        self.kills: list[Kill] = []
+        self.finished = 0
+        self.seconds: dict[str, float] = {}
+
+    def process(self, arguments: Sequence[str], *, cache: Path | None = None) -> Process:
+        """Start a command."""
+        return Process(arguments, self.folder / "log.txt", cache or self.cache)
+
+    def train_arguments(self, run: Path) -> list[str]:
+        """Return what trains a run, or resumes it."""
+        changed = [part for setting in SETTINGS for part in ("--set", setting)]
+        place = ["--output", str(run), "--downscale", "8"]
+        return ["train", str(self.scene), *place, "--resume", *changed]
+
+    def reader_arguments(self, name: str, run: Path) -> list[str]:
+        """Return what calls a command on a finished run."""
+        options = list(READERS[name])
+        return [name, str(run), *(["--env"] if name == "relight" else []), *options]
+
+    def whole(self, arguments: Sequence[str]) -> float:
+        """Let a command end; return its seconds.
+
+        Raises
+        ------
+        RuntimeError
+            If it fails.
+        """
+        began, process = time.monotonic(), self.process(arguments)
+        if process.wait() != 0:
+            raise RuntimeError(f"{' '.join(arguments[:2])}: {process.words()[-2000:]}")
+        return time.monotonic() - began
+
+    def prepare(self) -> None:
+        """Train the reference, and call every command once so that the cache holds its programs."""
+        if not (self.reference / "training.json").exists():
+            self.whole(self.train_arguments(self.reference))
+        again = self.folder / "again"
+        shutil.rmtree(again, ignore_errors=True)
+        self.seconds["train"] = self.whole(self.train_arguments(again))
+        found = differences(again, self.reference)
+        if found:
+            raise RuntimeError(f"two undisturbed runs differ: {found}")
+        for name in READERS:
+            self.whole(self.reader_arguments(name, again))
+            self.seconds[name] = self.whole(self.reader_arguments(name, again))
+        print(f"undisturbed: { ({k: round(v, 1) for k, v in self.seconds.items()}) }", flush=True)
+
+    def note(self, kill: Kill) -> None:
+        """Keep a kill, and say what was wrong with it."""
+        self.kills.append(kill)
+        print(
+            f"{len(self.kills):4d} {kill.command:9s} {kill.moment:12s} signal {kill.number:2d}  "
+            f"{kill.outcome:10s} after {kill.seconds:5.1f} s  {'; '.join(kill.faults)}",
+            flush=True,
+        )
+        if kill.faults:
+            print("     | " + "\n     | ".join(kill.lines[-12:]), flush=True)
+
+    def chain(self, name: str, run: Path, arguments: Sequence[str], moments: Sequence[str]) -> None:
+        """Kill a command some times, then let it end, and look at what there is."""
+        planned = self.draw.randint(1, MOST_KILLS)
+        last: Kill | None = None
+        for _ in range(planned):
+            moment = self.draw.choice(moments)
+            is_cold = moment == "compilation"
+            cold = self.folder / "cold"
+            shutil.rmtree(cold, ignore_errors=True)
+            process = self.process(arguments, cache=cold if is_cold else None)
+            kill = killed(name, process, run, moment, self.seconds[name], self.draw)
+            if kill is None:
+                self._require_success(name, process, last)
+                continue
+            last = kill
+            kill.faults += [f"half a file: {path}" for path in half_files(run)]
+            self.note(kill)
+        process = self.process(arguments)
+        process.wait()
+        self._require_success(name, process, last)
+        self.finished += 1
+
+    def _require_success(self, name: str, process: Process, last: Kill | None) -> None:
+        """Note against the last kill that a command which was left alone did not succeed."""
+        status, text = process.wait(), process.words()
+        fault = None
+        if status != 0:
+            fault = f"the next call of {name} ended with status {status}: {text[-500:]}"
+        elif "damaged" in text:
+            fault = f"the next call of {name} found damage: {text[-500:]}"
+        if fault is not None:
+            self._blame(last, fault)
+
+    def _blame(self, last: Kill | None, fault: str) -> None:
+        if last is not None:
+            last.faults.append(fault)
+        print(f"     ! {fault}", flush=True)
+
+    def train_trial(self) -> None:
+        """Kill a training until it has ended, and compare it with the reference."""
+        run = self.folder / "run"
+        shutil.rmtree(run, ignore_errors=True)
+        moments = ("anywhere", "anywhere", "checkpoint", "checkpoint", "step", "end of stage")
+        if self.draw.random() < 0.15:
+            moments = ("compilation", "anywhere")
+        before = len(self.kills)
+        self.chain("train", run, self.train_arguments(run), moments)
+        found = differences(run, self.reference)
+        if found:
+            last = self.kills[-1] if len(self.kills) > before else None
+            self._blame(last, f"the run is not that of the reference: {found}")
+
+    def reader_trial(self) -> None:
+        """Kill a command on a copy of the finished run."""
+        name, run = self.draw.choice(list(READERS)), self.folder / "run"
+        shutil.rmtree(run, ignore_errors=True)
+        shutil.copytree(self.reference, run)
+        self.chain(name, run, self.reader_arguments(name, run), ("anywhere", "anywhere", "file"))
+        halves = half_files(run)
+        if halves:
+            self._blame(self.kills[-1] if self.kills else None, f"half files in the end: {halves}")
+
+    def table(self) -> str:
+        """Count outcomes by command, moment and signal."""
+        rows = Counter((k.command, k.moment, k.number, k.outcome) for k in self.kills)
+        lines = [f"{'command':10s} {'moment':14s} {'signal':>6s}  {'outcome':12s} {'kills':>5s}"]
+        lines += [
+            f"{command:10s} {moment:14s} {number:6d}  {outcome:12s} {count:5d}"
+            for (command, moment, number, outcome), count in sorted(rows.items())
+        ]
+        waits = sorted(k.seconds for k in self.kills if k.number == signal.SIGINT)
+        if waits:
+            lines.append(
+                f"Ctrl-C took {waits[len(waits) // 2]:.1f} s (median), {waits[-1]:.1f} s at most"
+            )
+        bad = sum(bool(kill.faults) for kill in self.kills)
+        lines.append(
+            f"{len(self.kills)} kills, after which {self.finished} commands were left to end; "
+            f"{bad} kills with a fault"
+        )
+        return "\n".join(lines)
+
+
+def main() -> int:
+    """Run trials until there are enough kills, and print what they found."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--output", type=Path, required=True, help="working folder")
+    parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    study = Study(arguments.output, arguments.seed)
+    study.prepare()
+    while len(study.kills) < arguments.kills:
+        if study.draw.random() < 0.6:
+            study.train_trial()
+        else:
+            study.reader_trial()
+    print(study.table())
+    if arguments.json is not None:
+        records = [asdict(kill) for kill in study.kills]
+        arguments.json.write_text(json.dumps(records, indent=1) + "\n")
+    return int(any(kill.faults for kill in study.kills))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,43 @@
+"""A call of the command: which part of it runs, and what becomes of its errors."""
+
+import warnings
+
+from geosplat_jax.cli.arguments import command_line
+from geosplat_jax.cli.commands import COMMANDS, GradientError, UsageError
+from geosplat_jax.cli.display import say, show_warning
+from geosplat_jax.fit.folder import RunError
+from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.train import Interrupted, TrainingError
+from geosplat_jax.io.checkpoints import CheckpointError
+from geosplat_jax.io.images import SceneError
+
+_CURABLE = (
+    SceneError,
+    UsageError,
+    RunError,
+    TrainingError,
+    CheckpointError,
+    OSError,
+    ValueError,
+)
+
+
+def call(argv: list[str] | None) -> int:
+    """Run the command line and return its status; see `cli.main`."""
+    arguments = command_line().parse_args(argv)
+    enable_compilation_cache()
+    retain_freed_memory()
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = show_warning
+            COMMANDS[arguments.command](arguments)
+    except Interrupted as stop:
+        say(str(stop))
+        return 130
+    except GradientError as error:
+        say(str(error))
+        return 1
+    except _CURABLE as error:
+        say(str(error), label="error: ", style="bold red")
+        return 2
+    return 0

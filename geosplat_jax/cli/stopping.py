@@ -1,0 +1,85 @@
+"""Ctrl-C ends a command within seconds, also while Python waits for a compiler and cannot notice.
+
+Nothing of the package is imported here: this module has to be there before all others.
+"""
+
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+STOPPED = 130
+"""Status of a command that somebody stopped."""
+
+_GRACE = 3.0
+"""Seconds in which a command can end in its own way."""
+
+
+class _Notice:
+    """Says once that a command was stopped, whoever notices first."""
+
+    def __init__(self) -> None:
+        self._is_new = threading.Lock()
+
+    def __call__(self) -> None:
+        """Say it, unless that was done."""
+        if self._is_new.acquire(blocking=False):
+            print("stopped", file=sys.stderr, flush=True)
+
+
+def _watch(receiver: socket.socket, has_returned: threading.Event, notice: _Notice) -> None:
+    """End the process some seconds after Ctrl-C, unless it ends before or has plans of its own.
+
+    Python notices a signal between two of its own instructions, and raises KeyboardInterrupt there.
+    That may be a minute later, after a compilation, or within a function whose errors nobody gets.
+    """
+    with receiver:
+        while number := receiver.recv(1):
+            is_plain = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+            if number[0] == signal.SIGINT and is_plain:
+                break
+        else:
+            return
+        if has_returned.wait(_GRACE):
+            return
+    notice()
+    os._exit(STOPPED)
+
+
+@contextmanager
+def stops_soon(*, with_process: bool) -> Iterator[Callable[[], None]]:
+    """End the process soon after Ctrl-C within the block, see `_watch`.
+
+    A training has a handler of its own, which lets it write a checkpoint, and is left alone. So is
+    whatever does not run in the main thread, to which signals do not come.
+
+    Parameters
+    ----------
+    with_process : whether the process has nothing else to do, so that threads which outlive the
+        block are not waited for either.
+
+    Yields
+    ------
+    What says that the command was stopped; once, however often it is called.
+    """
+    notice = _Notice()
+    if threading.current_thread() is not threading.main_thread():
+        yield notice
+        return
+    receiver, sender = socket.socketpair()
+    sender.setblocking(False)
+    previous = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+    has_returned = threading.Event()
+    watch = threading.Thread(target=_watch, args=(receiver, has_returned, notice), daemon=True)
+    watch.start()
+    try:
+        yield notice
+    finally:
+        signal.set_wakeup_fd(previous)
+        if not with_process:
+            has_returned.set()
+        # Nothing more comes: a watch that was not called for ends.
+        sender.close()

@@ -1,0 +1,178 @@
+"""Plant the faults of ``faults.toml`` one after the other, and see which of them the tests notice.
+
+    python tests/faults/plant.py [--only NAME] [--jobs N] [--all-tests] [--sound]
+
+Every fault goes into a copy of the package in a temporary folder; the checkout stays as it is. The
+tests that are named beside the fault run against the copy. Prints for each whether it was noticed,
+and in how many seconds; exit status 1 where fewer than 90 % are.
+"""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = "geosplat_jax"
+LIST = Path(__file__).with_name("faults.toml")
+WANTED = 0.9
+"""Share of the faults that the default tests have to notice."""
+
+_BESIDE = ("benchmarks", "docs", "examples", "experiments", "pyproject.toml", "README.md")
+"""What tests look at, apart from the package and themselves."""
+
+_PASSED, _FAILED = 0, 1
+"""Statuses of pytest; any other one says that the tests did not run."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A line as it is and as it would be, see ``faults.toml``."""
+
+    name: str
+    file: str
+    old: str
+    new: str
+    harm: str
+    tests: tuple[str, ...]
+
+    @property
+    def source(self) -> Path:
+        """The file that it would be made in."""
+        return ROOT / PACKAGE / self.file
+
+    def planted(self) -> str:
+        """Return the text of the file with the fault.
+
+        Raises
+        ------
+        ValueError
+            If the line is not there exactly once: the list is older than the package.
+        """
+        text = self.source.read_text(encoding="utf-8")
+        count = text.count(self.old)
+        if count != 1:
+            raise ValueError(
+                f"fault {self.name!r}: its line is {count} times in {self.file}, not once; write "
+                f"it anew in {LIST.name}"
+            )
+        if self.new == self.old:
+            raise ValueError(f"fault {self.name!r} changes nothing")
+        return text.replace(self.old, self.new)
+
+
+def read_faults() -> list[Fault]:
+    """Read the list.
+
+    Raises
+    ------
+    ValueError
+        If two faults have one name.
+    """
+    rows = tomllib.loads(LIST.read_text(encoding="utf-8"))["fault"]
+    faults = [Fault(**{**row, "tests": tuple(row["tests"])}) for row in rows]
+    names = [fault.name for fault in faults]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"faults of one name: {', '.join(twice)}")
+    return faults
+
+
+def copied(folder: Path) -> Path:
+    """Copy the package and its tests into a folder; what stands beside them is linked."""
+    ignored = shutil.ignore_patterns("__pycache__")
+    for name in (PACKAGE, "tests"):
+        shutil.copytree(ROOT / name, folder / name, ignore=ignored)
+    for name in _BESIDE:
+        (folder / name).symlink_to(ROOT / name)
+    return folder
+
+
+def run_tests(folder: Path, tests: Sequence[str]) -> tuple[int, str]:
+    """Run tests of a copy; return the status of pytest and the end of what it said.
+
+    Without any given the whole default run.
+    """
+    paths = [str(folder / "tests" / test) for test in tests] or [str(folder / "tests")]
+    options = ["-x", "-q", "-n0", "-p", "no:cacheprovider", "--no-header"]
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", *options, "--rootdir", str(folder), *paths],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"},
+        capture_output=True,
+        text=True,
+    )
+    return done.returncode, (done.stdout + done.stderr)[-2000:]
+
+
+def verdict(fault: Fault, *, all_tests: bool) -> str:
+    """Plant a fault and say what the tests say: killed, survived, or why there is no telling."""
+    text = fault.planted()
+    with tempfile.TemporaryDirectory(prefix="fault_") as temporary:
+        folder = copied(Path(temporary))
+        (folder / PACKAGE / fault.file).write_text(text, encoding="utf-8")
+        status, said = run_tests(folder, fault.tests)
+        if status == _PASSED and all_tests:
+            status, said = run_tests(folder, ())
+    if status not in (_PASSED, _FAILED):
+        return f"unclear: pytest ended with status {status}\n{said}"
+    return "killed" if status == _FAILED else "survived"
+
+
+def timed(fault: Fault, *, all_tests: bool) -> str:
+    """Print the verdict of a fault beside its seconds, and return it."""
+    began = time.monotonic()
+    found = verdict(fault, all_tests=all_tests)
+    seconds = time.monotonic() - began
+    print(f"{found.splitlines()[0]:10s} {seconds:6.1f} s  {fault.file}: {fault.name}", flush=True)
+    if not found.startswith("killed"):
+        print(f"           {fault.harm}\n{found.partition(chr(10))[2]}", flush=True)
+    return found
+
+
+def main() -> int:
+    """Plant what was asked for, and sum up."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", metavar="NAME", action="append", help="some of the faults")
+    parser.add_argument("--jobs", type=int, default=1, help="faults at a time")
+    parser.add_argument(
+        "--all-tests", action="store_true", help="the whole default run for those that survive"
+    )
+    parser.add_argument(
+        "--sound", action="store_true", help="run the named tests without any fault: all pass"
+    )
+    arguments = parser.parse_args()
+    faults = read_faults()
+    for fault in faults:
+        fault.planted()
+    if arguments.only is not None:
+        unknown = sorted(set(arguments.only) - {fault.name for fault in faults})
+        if unknown:
+            parser.error(f"there is no fault {unknown[0]!r}")
+        faults = [fault for fault in faults if fault.name in arguments.only]
+    if arguments.sound:
+        tests = sorted({test for fault in faults for test in fault.tests})
+        with tempfile.TemporaryDirectory(prefix="fault_") as temporary:
+            status, said = run_tests(copied(Path(temporary)), tests)
+        print(said)
+        return status
+    with ThreadPoolExecutor(arguments.jobs) as pool:
+        found = list(pool.map(lambda one: timed(one, all_tests=arguments.all_tests), faults))
+    killed = found.count("killed")
+    print(f"{killed} of {len(found)} killed ({killed / len(found):.0%})")
+    survived = [fault.name for fault, one in zip(faults, found, strict=True) if one != "killed"]
+    if survived:
+        print("not noticed: " + "; ".join(survived))
+    return int(killed < WANTED * len(found))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,114 @@
+"""Ctrl-C ends a command soon, in a line, whatever it is doing, and with a status of its own."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from geosplat_jax import cli
+from geosplat_jax.cli import calling
+
+SWALLOWS = """
+import signal, sys, time
+from geosplat_jax.cli import stopping
+stopping._GRACE = 0.2
+{handler}
+with stopping.stops_soon(with_process=True):
+    print("ready", flush=True)
+    end = time.monotonic() + 20
+    while time.monotonic() < end:
+        try:
+            time.sleep(0.05)
+        except KeyboardInterrupt:
+            pass
+        if {ends}:
+            break
+"""
+
+
+def stopped(handler="", ends="False"):
+    """Start a program that has no ear for KeyboardInterrupt, and send Ctrl-C."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", SWALLOWS.format(handler=handler, ends=ends)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    process.send_signal(signal.SIGINT)
+    began = time.monotonic()
+    _, said = process.communicate(timeout=60)
+    return process.returncode, said, time.monotonic() - began
+
+
+def test_a_program_that_swallows_ctrl_c_ends_all_the_same():
+    status, said, seconds = stopped()
+    assert (status, said) == (130, "stopped\n")
+    assert seconds < 15
+
+
+def test_threads_that_outlive_a_command_are_not_waited_for():
+    """They compile what nobody wants any more; `stopped` is said once all the same."""
+    program = """
+import signal, threading, time
+from geosplat_jax.cli import stopping
+stopping._GRACE = 0.2
+with stopping.stops_soon(with_process={alone}) as say_stopped:
+    try:
+        threading.Thread(target=time.sleep, args=(1.5,)).start()
+        signal.raise_signal(signal.SIGINT)
+        time.sleep(20)
+    except KeyboardInterrupt:
+        say_stopped()
+"""
+    for alone, status in ((True, 130), (False, 0)):
+        text = program.format(alone=alone)
+        done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (status, "stopped\n")
+
+
+def test_a_handler_of_its_own_is_left_alone():
+    note = "asked = []; signal.signal(signal.SIGINT, lambda number, frame: asked.append(1))"
+    wait = "asked and (time.sleep(0.6) or True)"
+    assert stopped(note, wait)[:2] == (0, "")
+
+
+@pytest.mark.parametrize("command", ["info", "evaluate", "export"])
+def test_ctrl_c_is_one_line_and_a_status(command, tmp_path, monkeypatch, capsys):
+    def interrupted(arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(calling.COMMANDS, command, interrupted)
+    assert cli.main([command, str(tmp_path)]) == 130
+    assert capsys.readouterr().err == "stopped\n"
+
+
+def test_a_command_is_called_again_in_one_process_and_leaves_nothing(capsys):
+    before = signal.getsignal(signal.SIGINT)
+    for _ in range(2):
+        assert cli.main(["info", "nowhere"]) == 2
+    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.set_wakeup_fd(-1) == -1
+
+
+def test_the_command_listens_before_it_imports_what_takes_seconds():
+    program = (
+        "import sys, geosplat_jax.cli; print([n for n in ('jax', 'numpy') if n in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("[]\n", "")
+
+
+def test_public_names_are_those_of_their_modules():
+    import geosplat_jax
+
+    for name in geosplat_jax.__all__:
+        found = getattr(geosplat_jax, name)
+        assert found.__name__ == name
+        assert name in dir(geosplat_jax)
+    assert set(geosplat_jax._WHERE) == set(geosplat_jax.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = geosplat_jax.nothing
