@@ -211,9 +211,28 @@ def test_a_training_that_is_hopelessly_late_still_makes_its_last_steps():
     chosen = plan(budget, SIZE, slowness=1.0)
     machine = _Machine(chosen.config, chosen.costs, lambda now: 20.0)
     _, config = machine.run(Pacer(budget, chosen.config, chosen.costs, clock=machine))
-    for before, after in zip(chosen.config.active_stages, config.active_stages, strict=True):
-        assert 0.1 * before.steps <= after.steps < 0.3 * before.steps
-        assert after.rates_at(after.steps) == pytest.approx(before.rates_at(before.steps))
+    (after,), before = config.active_stages, chosen.config.active_stages[0]
+    assert 0.1 * before.steps <= after.steps < 0.3 * before.steps
+    assert after.rates_at(after.steps) == pytest.approx(before.rates_at(before.steps))
+
+
+def test_a_later_stage_that_would_come_too_short_is_left_out_and_its_time_used():
+    budget = Budget(300.0)
+    chosen = plan(budget, SIZE, slowness=1.0)
+    first, later = chosen.config.active_stages
+    machine = _Machine(chosen.config, chosen.costs, lambda now: 4.0)
+    seconds, config = machine.run(Pacer(budget, chosen.config, chosen.costs, clock=machine))
+    assert [stage.name for stage in config.active_stages] == [first.name]
+    assert config.stage(later.name).steps == 0
+    assert seconds == pytest.approx(300.0, rel=0.1)
+
+
+def test_what_is_too_short_for_all_stages_goes_to_the_first():
+    chosen = plan(Budget(110.0), SIZE, slowness=1.0)
+    assert [stage.name for stage in chosen.config.active_stages] == ["split_sum"]
+    assert chosen.seconds == pytest.approx(110.0, rel=0.05)
+    assert "without monte_carlo and refine" in chosen.describe()[0]
+    assert set(chosen.costs) == {"split_sum"}
 
 
 @pytest.fixture(scope="module")

@@ -47,6 +47,10 @@ _TOLERANCE = 0.04
 _FEWEST = 0.1
 """Share of a stage's planned steps that is made however late it is."""
 
+_WORTHWHILE = 75
+"""Steps, or half of those that were planned, below which a later stage is left out: a Monte Carlo
+stage begins with one albedo, and is worse than none before that is learned."""
+
 _UNITS = {"s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
 _BYTES = {"mb": 1e6, "mib": 2.0**20, "gb": 1e9, "gib": 2.0**30}
 
@@ -107,7 +111,8 @@ class Plan:
             f"({self.costs[stage.name].step:.2f} s each)"
             for stage in self.config.active_stages
         )
-        place = _place(self.effort)
+        left_out = [stage.name for stage in self.config.stages if not stage.steps]
+        place = _place(self.effort) + (f", without {' and '.join(left_out)}" if left_out else "")
         return [
             f"budget: {place}; {self.config.geometry.cells_along} cells, photographs reduced by "
             f"{self.downscale}",
@@ -136,7 +141,8 @@ def plan(
 ) -> Plan:
     """Choose the settings that a budget pays for.
 
-    The most that fits with the steps of its own, these then scaled to fill the time.
+    The most that fits with the steps of its own, these then scaled to fill the time. Where that is
+    nothing, the same of the first stage alone.
 
     Parameters
     ----------
@@ -164,6 +170,9 @@ def plan(
             )
         candidates = fitting
     affordable = [one for one in candidates if one.seconds <= budget.seconds]
+    if not affordable:
+        candidates = [_first_stage_alone(one) for one in candidates]
+        affordable = [one for one in candidates if one.seconds <= budget.seconds]
     chosen = affordable[-1] if affordable else candidates[0]
     waits = sum(cost.startup for cost in chosen.costs.values())
     share = (budget.seconds - waits) / (chosen.seconds - waits)
@@ -195,6 +204,21 @@ def _candidate(
     costs = expected_costs(config, pixels, slowness=slowness)
     seconds = expected_seconds(config, costs)
     return Plan(config, downscale, effort, costs, seconds, expected_memory(config))
+
+
+def _first_stage_alone(chosen: Plan) -> Plan:
+    """Leave all stages out but the first."""
+    first = chosen.config.active_stages[0]
+    config = _without(chosen.config, chosen.config.active_stages[1:])
+    costs = {first.name: chosen.costs[first.name]}
+    return replace(chosen, config=config, costs=costs, seconds=expected_seconds(config, costs))
+
+
+def _without(config: Config, left_out: Sequence[Stage]) -> Config:
+    """Take all steps from some stages."""
+    names = {stage.name for stage in left_out}
+    stages = (replace(s, steps=0, pace=()) if s.name in names else s for s in config.stages)
+    return replace(config, stages=tuple(stages))
 
 
 def with_steps(config: Config, share: float) -> Config:
@@ -267,24 +291,38 @@ class Pacer:
         """
         if done % _EVERY or len(self._measured.get(stage.name, ())) < _TIMED:
             return None
-        here = config.stage_names.index(stage.name)
-        later = [other for other in config.stages[here + 1 :] if other.steps]
-        left = stage.steps - done
-        work = left * self._step_seconds(stage.name)
-        work += sum(other.steps * self._step_seconds(other.name) for other in later)
-        if work <= 0.0 or left <= _EVERY:
+        if stage.steps - done <= _EVERY:
             return None
-        waits = sum(self._costs[other.name].startup for other in later)
-        share = max(self.seconds_left - waits, 0.0) / work
-        if abs(share - 1.0) <= _TOLERANCE:
+        here, wanted = config.stage_names.index(stage.name), config
+        share = self._share(wanted, stage, done)
+        while self._is_hurried(later := wanted.stages[here + 1 :], share):
+            wanted = _without(wanted, [other for other in later if other.steps][-1:])
+            share = self._share(wanted, stage, done)
+        if wanted == config and abs(share - 1.0) <= _TOLERANCE:
             return None
         stages = [
-            *config.stages[:here],
+            *wanted.stages[:here],
             self._scaled(stage, done, share),
-            *(self._scaled(other, 0, share) for other in config.stages[here + 1 :]),
+            *(self._scaled(other, 0, share) for other in wanted.stages[here + 1 :]),
         ]
-        adjusted = replace(config, stages=tuple(stages))
+        adjusted = replace(wanted, stages=tuple(stages))
         return None if adjusted == config else adjusted
+
+    def _share(self, config: Config, stage: Stage, done: int) -> float:
+        """Return the time that is left over what the steps to come are expected to take."""
+        here = config.stage_names.index(stage.name)
+        later = [other for other in config.stages[here + 1 :] if other.steps]
+        work = (stage.steps - done) * self._step_seconds(stage.name)
+        work += sum(other.steps * self._step_seconds(other.name) for other in later)
+        waits = sum(self._costs[other.name].startup for other in later)
+        return max(self.seconds_left - waits, 0.0) / max(work, 1e-9)
+
+    def _is_hurried(self, later: Sequence[Stage], share: float) -> bool:
+        """Whether a later stage would make too few of its steps to be worth them."""
+        return any(
+            other.steps and share * other.steps < min(_WORTHWHILE, 0.5 * self._planned[other.name])
+            for other in later
+        )
 
     def _scaled(self, stage: Stage, done: int, share: float) -> Stage:
         """Scale what a stage has left, within limits of what was planned."""

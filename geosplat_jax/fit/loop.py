@@ -181,6 +181,8 @@ class Loop:
         if self.devices.is_first_host:
             self.folder.amend(config)
         self.config, self.stage = config, config.stage(self.stage.name)
+        if self.upcoming is not None and not config.stage(self.upcoming.stage.name).steps:
+            self.upcoming.give_up()
 
     def _announce(self) -> None:
         """Say that the next step waits for a compilation, unless it was made ahead."""
@@ -393,9 +395,13 @@ class Upcoming:
         """Whether the programs are compiled."""
         return self.compiled.done()
 
+    def give_up(self) -> None:
+        """Compile no further programs."""
+        self._is_wanted = False
+
     def abandon(self) -> None:
         """Compile no further programs, and wait for the one that is being compiled."""
-        self._is_wanted = False
+        self.give_up()
         wait([self._planned])
         wait([self.compiled])
 
