@@ -86,8 +86,8 @@ def test_a_slow_machine_is_given_less_work():
 
 @pytest.mark.parametrize("slowness", [0.3, 1.0, 8.0])
 def test_a_time_that_compilation_would_fill_is_refused(slowness):
-    with pytest.raises(TrainingError, match="a budget of 15 s is too short"):
-        plan(Budget(15.0), SIZE, slowness=slowness)
+    with pytest.raises(TrainingError, match="a budget of 8 s is too short"):
+        plan(Budget(8.0), SIZE, slowness=slowness)
 
 
 def test_a_fast_machine_and_a_busy_one_take_what_is_short_but_possible():
@@ -176,7 +176,8 @@ def test_a_training_ends_in_time_on_a_machine_of_another_speed(speed, tolerance)
     machine = _Machine(chosen.config, chosen.costs, speed)
     seconds, config = machine.run(Pacer(budget, chosen.config, chosen.costs, clock=machine))
     assert seconds == pytest.approx(300.0, rel=tolerance)
-    for before, after in zip(chosen.config.stages, config.stages, strict=True):
+    for after in config.active_stages:
+        before = chosen.config.stage(after.name)
         assert after.rates_at(after.steps) == pytest.approx(before.rates_at(before.steps))
 
 
