@@ -14,6 +14,7 @@ SWALLOWS = """
 import signal, sys, time
 from geosplat_jax.cli import stopping
 stopping._GRACE = 0.2
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 {handler}
 with stopping.stops_soon(with_process=True):
     print("ready", flush=True)
@@ -56,9 +57,10 @@ def test_threads_that_outlive_a_command_are_not_waited_for():
 import signal, threading, time
 from geosplat_jax.cli import stopping
 stopping._GRACE = 0.2
+signal.signal(signal.SIGINT, signal.default_int_handler)
 with stopping.stops_soon(with_process={alone}) as say_stopped:
     try:
-        threading.Thread(target=time.sleep, args=(1.5,)).start()
+        threading.Thread(target=time.sleep, args=(0.8,)).start()
         signal.raise_signal(signal.SIGINT)
         time.sleep(20)
     except KeyboardInterrupt:

@@ -473,6 +473,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
+    # A shell lets jobs in the background ignore Ctrl-C, and all that they start.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     study = Study(arguments.output, arguments.seed)
     study.prepare()
     while len(study.kills) < arguments.kills:
