@@ -13,8 +13,10 @@ known exactly, and images have no error of a kind that no model could explain. S
 ``two_gloss``  a dielectric ball, polished below and rough above
 ``metal``      a ball of gold and copper, of roughness .3
 
-Printed are what was kept with its gain, and the decibels of eight test views of the chosen model;
-with ``--full``, also of the whole model, and what both trainings took.
+Printed are what was kept with its gain, and the decibels of eight test views of the chosen model,
+under the light of the training and under `examples/sunset.hdr` (colours aligned by one factor for
+each channel, since photographs leave it open); with ``--full``, also of the whole model, and what
+both trainings took.
 """
 
 import argparse
@@ -47,7 +49,8 @@ from geosplat_jax.run import Run, train
 from geosplat_jax.surface.grids import grid_vertices
 from geosplat_jax.surface.hull import fit_grid
 
-LIGHT = Path(__file__).resolve().parents[2] / "examples" / "studio.hdr"
+LIGHTS = Path(__file__).resolve().parents[2] / "examples"
+LIGHT, OTHER_LIGHT = LIGHTS / "studio.hdr", LIGHTS / "sunset.hdr"
 CELLS, SAMPLES, TEST_VIEWS = 64, 256, 8
 ONE_BALL = ((0.0, 0.0, 0.0, 0.45),)
 FOUR_BALLS = (
@@ -148,8 +151,8 @@ def _poses(count: int, *, turn: float) -> np.ndarray:
     return poses
 
 
-def make_scene(name: str, *, size: int, count: int) -> Dataset:
-    """Render a recipe from ``count`` training cameras and a few others."""
+def truth_of(name: str, light: Path) -> _Truth:
+    """Return a renderer of a recipe under a light."""
     recipe = RECIPES[name]
     config = make_config(overrides=(f"geometry.resolution={CELLS}",))
     grid = fit_grid(BOX, CELLS)
@@ -161,9 +164,15 @@ def make_scene(name: str, *, size: int, count: int) -> Dataset:
     pipeline = build_pipeline(config, replace(stage, transport=transport), surface)
     pipeline = replace(pipeline, capacities=surface.first_capacities(shape))
     params = initial_params(shape, config, jax.random.key(0))
-    params = replace(params, light=EnvLight(load_light(LIGHT).radiance))
+    params = replace(params, light=EnvLight(load_light(light).radiance))
     truth = _Truth(pipeline, params, samples=SAMPLES)
     truth.recipe = recipe
+    return truth
+
+
+def make_scene(name: str, *, size: int, count: int) -> Dataset:
+    """Render a recipe from ``count`` training cameras and a few others."""
+    truth = truth_of(name, LIGHT)
     focal = 0.5 * size / np.tan(0.25)
     intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
 
@@ -208,6 +217,19 @@ class _Printed(Listener):
         print(self._scene, rung, flush=True)
 
 
+def relit_decibels(run: Run, truth: Renderer, views: Views) -> float:
+    """Mean peak signal-to-noise ratio of views under another light, in sRGB on white."""
+    relit = run.renderer(samples=64).relit(load_light(OTHER_LIGHT))
+    pairs = [(relit(views.camera([k])), truth(views.camera([k]))) for k in range(len(views))]
+    ours, theirs = (np.stack([np.asarray(pair[n].rgb) for pair in pairs]) for n in (0, 1))
+    factor = np.sum(ours * theirs, axis=(0, 1, 2)) / np.sum(ours**2, axis=(0, 1, 2))
+    found = [
+        float(psnr(render_on_white(factor * a.rgb, a.alpha), render_on_white(b.rgb, b.alpha)))
+        for a, b in pairs
+    ]
+    return float(np.mean(found))
+
+
 def main() -> None:
     """Choose, train and print."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -224,6 +246,7 @@ def main() -> None:
     config = make_config(quality=arguments.quality)
     for name in arguments.scenes.split(","):
         dataset = make_scene(name, size=arguments.size, count=arguments.views)
+        other = truth_of(name, OTHER_LIGHT)
         model = ModelChoice(steps=arguments.steps)
         output = arguments.output / name
         run = train(
@@ -240,12 +263,14 @@ def main() -> None:
         result = {
             "kept": [rung["part"] for rung in record["rungs"] if rung["is_kept"]],
             "decibels": decibels(run, dataset.test),
+            "relit": relit_decibels(run, other, dataset.test),
             "choosing": record["seconds"],
             "training": (run.folder.training() or {})["seconds_total"],
         }
         if arguments.full:
             whole = train(dataset, arguments.output / f"{name}_full", config, begin=Resume())
             result["full decibels"] = decibels(whole, dataset.test)
+            result["full relit"] = relit_decibels(whole, other, dataset.test)
             result["full training"] = (whole.folder.training() or {})["seconds_total"]
         print(name, json.dumps(result), flush=True)
 
