@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support import TWO_STAGES, ball, sphere_dataset, tiny_config
 
+from geosplat_jax.core.types import Box
 from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.stages import begin_stage, build_pipeline
@@ -63,6 +64,17 @@ def test_free_splats_begin_as_the_splats_of_the_mesh(start):
         strict=True,
     ):
         np.testing.assert_allclose(np.asarray(a)[real], np.asarray(b)[real], atol=1e-5)
+
+
+def test_parameters_are_counted_in_half_sides_of_the_box(start):
+    """The box of the tests has a half side of about one, which would hide a unit."""
+    splats, half = start[0].splats, 2.5
+    center = np.array([1.0, 2.0, 3.0])
+    box = Box(jnp.asarray(center, jnp.float32), jnp.float32(half))
+    found, real = free(splats, start[0].attributes, box), np.asarray(splats.mask)
+    means, scales = (np.asarray(x)[real] for x in (splats.means, splats.scales))
+    np.testing.assert_allclose(found.means[real], (means - center) / half, atol=1e-6)
+    np.testing.assert_allclose(np.exp(found.log_scales)[real], scales / half, rtol=1e-4)
 
 
 def test_a_splat_that_moves_along_its_face_takes_its_anchor_with_it(start):
