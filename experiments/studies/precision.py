@@ -26,6 +26,7 @@ from geosplat_jax.core.mesh import vertex_normals
 from geosplat_jax.core.numerics import safe_normalize
 from geosplat_jax.core.types import Batch, Camera, EnvLight, Materials, Mesh
 from geosplat_jax.fit.config import Config
+from geosplat_jax.fit.planning import plan_capacities
 from geosplat_jax.fit.presets import SPLIT_SUM, make_config
 from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
 from geosplat_jax.fit.stages import (
@@ -36,7 +37,6 @@ from geosplat_jax.fit.stages import (
     update_rule,
 )
 from geosplat_jax.fit.step import StepReport, initial_state, train_step
-from geosplat_jax.fit.train import plan_capacities
 from geosplat_jax.gradcheck.differences import double_precision
 from geosplat_jax.gradcheck.whole_stages import _from_groups, _groups
 from geosplat_jax.hashgrid import HashGridSpec, Layer, encode

@@ -1,6 +1,5 @@
 """How a run begins in its folder: anew, where it was left, or with stages of another run."""
 
-import abc
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -13,7 +12,7 @@ from geosplat_jax.fit.loop import Loop, adopted_loop, new_loop
 from geosplat_jax.io.dataset import Dataset
 
 
-class Begin(abc.ABC):
+class Begin:
     """How a run begins; every way is a subclass.
 
     Attributes
@@ -33,17 +32,19 @@ class Begin(abc.ABC):
         """Whether this goes on with a run that the folder holds."""
         return self.resumes and run.exists
 
-    @abc.abstractmethod
     def first_loop(
         self, dataset: Dataset, config: Config, run: RunFolder, devices: Devices
     ) -> Loop:
         """Build the loop of a new run, before its folder says that there is one.
+
+        With new parameters, and the shape and light of ``start`` where there is one.
 
         Raises
         ------
         RunError, TrainingError
             If what it begins with does not fit.
         """
+        return new_loop(dataset, config, run, devices, self.start)
 
 
 @dataclass(frozen=True)
@@ -59,12 +60,6 @@ class Anew(Begin):
     replace: bool = False
     start: Start | None = field(default=None, repr=False)
 
-    def first_loop(
-        self, dataset: Dataset, config: Config, run: RunFolder, devices: Devices
-    ) -> Loop:
-        """Build the loop of a run with new parameters."""
-        return new_loop(dataset, config, run, devices, self.start)
-
 
 @dataclass(frozen=True)
 class Resume(Begin):
@@ -79,12 +74,6 @@ class Resume(Begin):
 
     start: Start | None = field(default=None, repr=False)
     resumes: ClassVar[bool] = True
-
-    def first_loop(
-        self, dataset: Dataset, config: Config, run: RunFolder, devices: Devices
-    ) -> Loop:
-        """Build the loop of a run where there is none to go on with."""
-        return new_loop(dataset, config, run, devices, self.start)
 
 
 @dataclass(frozen=True)
