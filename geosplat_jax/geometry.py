@@ -13,6 +13,7 @@ Where values are held, for all cells of the grid or for some, is a `Lattice`'s b
 Reference: Shen et al., "Flexible Isosurface Extraction for Gradient-Based Mesh Optimization", 2023.
 """
 
+import abc
 from dataclasses import replace
 from typing import Literal, NamedTuple
 
@@ -51,6 +52,7 @@ from geosplat_jax.surface.lattice import Lattice, WholeGrid, lattice_of
 
 __all__ = [
     "FlexiCubes",
+    "GridSurface",
     "IsoSurface",
     "deformed_vertices",
     "edge_deviations",
@@ -453,28 +455,26 @@ def edge_deviations(
     return duals.deviations, duals.crosses
 
 
-class FlexiCubes(SurfaceModel):
+class GridSurface(SurfaceModel):
     """Isosurface of values on a grid, with the regularisers of FlexiCubes and Eq. 14.
 
     Attributes
     ----------
-    grid : where the values live.
     entropy_reduction : static; ``"mean"`` over the edges of Eq. 14 or their ``"sum"``, as printed.
         The sum grows with the number of crossed edges and soon outweighs the picture.
     """
 
-    grid: Grid
-    entropy_reduction: Literal["mean", "sum"] = eqx.field(static=True, default="mean")
+    entropy_reduction: eqx.AbstractVar[Literal["mean", "sum"]]
+
+    @property
+    @abc.abstractmethod
+    def lattice(self) -> Lattice:
+        """Which cells and vertices of the grid hold values."""
 
     @property
     def box(self) -> Box:
         """The cube around the grid."""
-        return self.grid.box
-
-    @property
-    def lattice(self) -> Lattice:
-        """Which cells and vertices hold values: all."""
-        return WholeGrid(self.grid)
+        return self.lattice.grid.box
 
     def extract(
         self, shape: Geometry, *, capacities: Capacities, final: bool = False
@@ -484,20 +484,21 @@ class FlexiCubes(SurfaceModel):
 
     def penalties(self, shape: Geometry, surface: IsoSurface) -> dict[str, Float[Array, ""]]:
         """Evaluate ``entropy`` (Eq. 14), ``deviation`` (L_dev, in half boxes) and ``weights``."""
+        lattice = self.lattice
         return {
-            "entropy": sdf_entropy(shape, self.lattice, reduction=self.entropy_reduction),
+            "entropy": sdf_entropy(shape, lattice, reduction=self.entropy_reduction),
             "deviation": surface.deviation / self.box.half_extent,
-            "weights": weight_magnitude(shape, self.grid.cube_count),
+            "weights": weight_magnitude(shape, lattice.grid.cube_count),
         }
 
     def ray_index(self, surface: IsoSurface, *, capacities: Capacities) -> GridIndex:
         """List the patches of every cell; see `build_grid_index`."""
-        return build_grid_index(surface, self.grid, capacities=capacities)
+        return build_grid_index(surface, self.lattice.grid, capacities=capacities)
 
     def nearby_points(self, shape: Geometry) -> tuple[Float[Array, "G 3"], Float[Array, " G"]]:
         """Return the grid's vertices, those with an edge that the surface crosses weighing one."""
         lattice = self.lattice
-        points = lattice.vertices().astype(shape.sdf.dtype)
+        points = lattice.vertex_positions().astype(shape.sdf.dtype)
         crossings = lattice.crossed_edges(lattice.values(shape.sdf))
         return points, (crossings > 0).astype(points.dtype)
 
@@ -512,3 +513,21 @@ class FlexiCubes(SurfaceModel):
             quads=bucket(int(1.2 * quads)),
             cell_patches=bucket(6 * quads),
         )
+
+
+class FlexiCubes(GridSurface):
+    """Values everywhere on a grid.
+
+    Attributes
+    ----------
+    grid : where the values live.
+    entropy_reduction : see `GridSurface`.
+    """
+
+    grid: Grid
+    entropy_reduction: Literal["mean", "sum"] = eqx.field(static=True, default="mean")
+
+    @property
+    def lattice(self) -> Lattice:
+        """All cells and vertices."""
+        return WholeGrid(self.grid)

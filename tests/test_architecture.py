@@ -17,6 +17,7 @@ ORDER = [
     "rays",
     "surface",
     "geometry",
+    "banded",
     "hashgrid",
     "materials",
     "adapter",

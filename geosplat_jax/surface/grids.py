@@ -24,10 +24,15 @@ def initial_geometry(grid: Grid, sdf: Float[Array, " G"]) -> Geometry:
             f"sdf must have one value for each of the {grid.vertex_count} grid vertices, "
             f"got shape {sdf.shape}"
         )
-    cells, dtype = grid.cube_count, sdf.dtype
+    return neutral_geometry(sdf, grid.cube_count)
+
+
+def neutral_geometry(sdf: Float[Array, " G"], cells: int) -> Geometry:
+    """Geometry with this SDF, no deformation and neutral weights of so many cells."""
+    dtype = sdf.dtype
     return Geometry(
         sdf=sdf,
-        deform=jnp.zeros((grid.vertex_count, 3), dtype),
+        deform=jnp.zeros((*sdf.shape, 3), dtype),
         alpha=jnp.zeros((cells, 8), dtype),
         beta=jnp.zeros((cells, 12), dtype),
         gamma=jnp.zeros((cells,), dtype),

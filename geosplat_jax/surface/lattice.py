@@ -65,7 +65,7 @@ class Lattice(eqx.Module):
         """Count the grid edges at every vertex whose ends differ in sign; zero is outside."""
 
     @abc.abstractmethod
-    def vertices(self) -> Float[Array, "G 3"]:
+    def vertex_positions(self) -> Float[Array, "G 3"]:
         """Rest positions of the vertices, world."""
 
     @abc.abstractmethod
@@ -134,7 +134,7 @@ class WholeGrid(Lattice):
             crossings = crossings + jnp.pad(changes, before) + jnp.pad(changes, after)
         return crossings.reshape(-1)
 
-    def vertices(self) -> Float[Array, "G 3"]:
+    def vertex_positions(self) -> Float[Array, "G 3"]:
         """Rest positions of all vertices."""
         return grid_vertices(self.grid)
 
