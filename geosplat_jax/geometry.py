@@ -2,15 +2,19 @@
 
 Dual marching cubes: every patch that the surface cuts out of a cell gives a dual vertex, every
 interior grid edge it crosses gives a quad between the four cells around it. On a regular grid both
-follow from index arithmetic. Only tests of signs visit the whole volume; all else is done for
-the cells at the surface, so that the cost grows with its area.
+follow from index arithmetic. Only tests of signs visit all cells that hold values; all else is
+done for those at the surface, so that the cost grows with its area.
 
 Edges on the border of the grid have fewer than four cells and make no quad: a surface that runs
 into the border is open there. Keep the outermost vertices positive for a closed one.
 
+Where values are held, for all cells of the grid or for some, is a `Lattice`'s business.
+
 Reference: Shen et al., "Flexible Isosurface Extraction for Gradient-Based Mesh Optimization", 2023.
 """
 
+import abc
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -35,7 +39,6 @@ from geosplat_jax.surface.flexicubes_tables import (
     QUAD_EDGES,
 )
 from geosplat_jax.surface.grids import (
-    crossed_edges,
     deformed_vertices,
     grid_vertices,
     initial_geometry,
@@ -45,9 +48,11 @@ from geosplat_jax.surface.grids import (
     sphere_sdf,
     weight_magnitude,
 )
+from geosplat_jax.surface.lattice import Lattice, WholeGrid, lattice_of
 
 __all__ = [
     "FlexiCubes",
+    "GridSurface",
     "IsoSurface",
     "deformed_vertices",
     "edge_deviations",
@@ -107,44 +112,37 @@ def _cell_coordinates(index: Int[Array, " n"], grid: Grid) -> Int[Array, "3 n"]:
 class _Cells(NamedTuple):
     """The cells that the surface passes through, in the order of their number."""
 
+    row: Int[Array, " Ck"]  # of the lattice
     number: Int[Array, " Ck"]
     coordinates: Int[Array, "3 Ck"]
     signs: Int[Array, " Ck"]  # 8-bit set of inside corners; 0 on padding
     case: Int[Array, " Ck"]  # the case whose patches are used (see `_resolved_case`)
     first_vertex: Int[Array, " Ck"]
-    bits: BitSet
+    bits: BitSet  # of the lattice's rows
     vertex_count: Int[Array, ""]
     quad_count: Int[Array, ""]
-
-
-def _sign_grid(sdf: Float[Array, " G"], grid: Grid) -> UInt[Array, " K"]:
-    """8-bit set of the corners with negative SDF for every cell; zero counts as outside."""
-    nx, ny, nz = grid.shape
-    inside = (sdf < 0).reshape(nz + 1, ny + 1, nx + 1).astype(jnp.uint8)
-    signs = jnp.zeros((nz, ny, nx), jnp.uint8)
-    for corner, (x, y, z) in enumerate(CORNERS.tolist()):
-        signs = signs | inside[z : z + nz, y : y + ny, x : x + nx] << corner
-    return signs.reshape(-1)
 
 
 def _resolved_case(
     signs: Int[Array, " n"],
     coordinates: Int[Array, "3 n"],
-    sign_grid: UInt[Array, " K"],
-    grid: Grid,
+    sign_sets: UInt[Array, " K"],
+    lattice: Lattice,
 ) -> Int[Array, " n"]:
     """Case whose patches a cell uses: its complement where two C16 or C19 cells would clash.
 
     Depends on signs only and carries no gradient.
     """
-    nx, ny, nz = grid.shape
+    nx, ny, nz = lattice.grid.shape
     is_problem = jnp.asarray(np.any(PROBLEM_OFFSET != 0, axis=1))
     step = _rows(jnp.asarray(PROBLEM_OFFSET.astype(np.int32)), signs).T
     neighbour = coordinates + step
-    limit = jnp.asarray(grid.shape, jnp.int32)[:, None]
+    limit = jnp.asarray((nx, ny, nz), jnp.int32)[:, None]
     exists = jnp.all((neighbour >= 0) & (neighbour < limit), axis=0)
-    number = neighbour[0] + nx * (neighbour[1] + ny * neighbour[2])
-    clashes = exists & _rows(is_problem, _rows(sign_grid, number).astype(jnp.int32))
+    number = jnp.where(exists, neighbour[0] + nx * (neighbour[1] + ny * neighbour[2]), 0)
+    # The surface passes through both cells, so that the other one holds values too.
+    row = lattice.rows_of_cells(number)
+    clashes = exists & _rows(is_problem, _rows(sign_sets, row).astype(jnp.int32))
     return jnp.where(_rows(is_problem, signs) & clashes, 255 - signs, signs)
 
 
@@ -161,34 +159,35 @@ def _owned_crossings(signs: Int[Array, " n"], coordinates: Int[Array, "3 n"]) ->
     return jnp.stack(columns, axis=1)
 
 
-def _surface_cells(sdf: Float[Array, " G"], grid: Grid, *, capacity: int) -> _Cells:
+def _surface_cells(values: Float[Array, " G"], lattice: Lattice, *, capacity: int) -> _Cells:
     """Compact the cells whose corners differ in sign, and count what they will produce."""
-    sign_grid = _sign_grid(sdf, grid)
-    bits = bit_set((sign_grid != 0) & (sign_grid != 255))
+    sign_sets = lattice.sign_sets(values)
+    bits = bit_set((sign_sets != 0) & (sign_sets != 255))
     patch_count = jnp.asarray(PATCH_COUNT.astype(np.int32))
 
-    def describe(index: Int[Array, " n"]) -> tuple[Array, Array, Array]:
-        coordinates = _cell_coordinates(index, grid)
-        signs = _rows(sign_grid, index).astype(jnp.int32)
-        return coordinates, signs, _resolved_case(signs, coordinates, sign_grid, grid)
+    def describe(row: Int[Array, " n"]) -> tuple[Array, Array, Array]:
+        coordinates = _cell_coordinates(lattice.cell_numbers(row), lattice.grid)
+        signs = _rows(sign_sets, row).astype(jnp.int32)
+        return coordinates, signs, _resolved_case(signs, coordinates, sign_sets, lattice)
 
     def count(coordinates: Array, signs: Array, case: Array) -> tuple[Array, Array]:
         vertices = jnp.sum(_rows(patch_count, case), dtype=jnp.int32)
         return vertices, jnp.sum(_owned_crossings(signs, coordinates), dtype=jnp.int32)
 
-    index = bits.first(capacity=capacity)
+    row = bits.first(capacity=capacity)
     is_real = jnp.arange(capacity, dtype=jnp.int32) < bits.count
-    coordinates, signs, case = describe(index)
+    coordinates, signs, case = describe(row)
     signs, case = jnp.where(is_real, signs, 0), jnp.where(is_real, case, 0)
     through = jnp.cumsum(_rows(patch_count, case), dtype=jnp.int32)
-    # After an overflow the compacted cells do not tell the true needs, so the volume is asked.
+    # After an overflow the compacted cells do not tell the true needs, so all cells are asked.
     vertex_count, quad_count = jax.lax.cond(
         bits.count > capacity,
-        lambda: count(*describe(jnp.arange(grid.cube_count, dtype=jnp.int32))),
+        lambda: count(*describe(jnp.arange(lattice.cell_rows, dtype=jnp.int32))),
         lambda: count(coordinates, signs, case),
     )
     return _Cells(
-        number=index,
+        row=row,
+        number=lattice.cell_numbers(row),
         coordinates=coordinates,
         signs=signs,
         case=case,
@@ -238,14 +237,11 @@ def _crossing_fraction(
 
 
 def _corner_values(
-    geometry: Geometry, grid: Grid, coordinates: Int[Array, "3 n"]
+    geometry: Geometry, lattice: Lattice, rows: Int[Array, " n"], coordinates: Int[Array, "3 n"]
 ) -> tuple[Float[Array, "8 n"], Float[Array, "3 8 n"]]:
     """SDF and deformed positions, in cells from the centre of the grid, of the cells' corners."""
-    dtype = geometry.sdf.dtype
-    vx, vy, _ = grid.vertex_shape
-    steps = CORNERS @ np.array([1, vx, vx * vy], np.int32)
-    base = coordinates[0] + vx * (coordinates[1] + vy * coordinates[2])
-    vertex = base[None, :] + jnp.asarray(steps)[:, None]
+    dtype, grid = geometry.sdf.dtype, lattice.grid
+    vertex = lattice.corner_rows(rows, coordinates)
     moved = jnp.moveaxis(grid.reach * jnp.tanh(_rows(geometry.deform, vertex)), -1, 0)
     centre = jnp.asarray(np.array(grid.shape) / 2, dtype)
     corner = jnp.asarray(CORNERS.T, dtype)[:, :, None]
@@ -253,7 +249,7 @@ def _corner_values(
     return _rows(geometry.sdf, vertex), rest + moved
 
 
-def _dual_vertices(geometry: Geometry, grid: Grid, cells: _Cells, *, capacity: int) -> _Duals:
+def _dual_vertices(geometry: Geometry, lattice: Lattice, cells: _Cells, *, capacity: int) -> _Duals:
     """Place one vertex for every patch of the surface in a cell."""
     row_number = jnp.arange(capacity, dtype=jnp.int32)
     row = jnp.searchsorted(cells.first_vertex, row_number, side="right").astype(jnp.int32) - 1
@@ -262,9 +258,9 @@ def _dual_vertices(geometry: Geometry, grid: Grid, cells: _Cells, *, capacity: i
     patch = _rows(jnp.asarray(PATCH_EDGES.astype(np.int32).reshape(-1)), cells.case[row] * 4 + slot)
     crosses = (patch[None, :] >> jnp.arange(12, dtype=jnp.int32)[:, None]) & 1 == 1
     crosses = crosses & is_real[None, :]
-    index = cells.number[row]
+    index, cell_size = cells.row[row], lattice.grid.cell_size
 
-    sdf, corners = _corner_values(geometry, grid, cells.coordinates[:, row])
+    sdf, corners = _corner_values(geometry, lattice, index, cells.coordinates[:, row])
     alpha = jnp.tanh(_rows(geometry.alpha, index).T) * _WEIGHT_SCALE + 1.0
     beta = jnp.tanh(_rows(geometry.beta, index).T) * _WEIGHT_SCALE + 1.0
     gamma = jax.nn.sigmoid(_rows(geometry.gamma, index))
@@ -283,10 +279,10 @@ def _dual_vertices(geometry: Geometry, grid: Grid, cells: _Cells, *, capacity: i
     deviations = _deviations(plain - points[:, None, :], crosses)
     points = jnp.where(is_real[None, :], points, 0.0)
     return _Duals(
-        points=points * grid.cell_size,
+        points=points * cell_size,
         gamma=gamma,
-        cells=jnp.where(is_real, index, 0),
-        deviations=deviations * grid.cell_size,
+        cells=jnp.where(is_real, cells.number[row], 0),
+        deviations=deviations * cell_size,
         crosses=crosses,
     )
 
@@ -309,17 +305,17 @@ class _Quads(NamedTuple):
     mask: Bool[Array, " Cq"]
 
 
-def _quads(grid: Grid, cells: _Cells, *, capacity: int) -> _Quads:
+def _quads(lattice: Lattice, cells: _Cells, *, capacity: int) -> _Quads:
     """Join the dual vertices of the four cells around every crossed interior edge."""
     owned = _owned_crossings(cells.signs, cells.coordinates)
     owner = bit_set(owned.reshape(-1)).first(capacity=capacity)
     row, axis = owner // 3, owner % 3
     is_real = jnp.arange(capacity, dtype=jnp.int32) < cells.quad_count
 
-    nx, ny, _ = grid.shape
+    nx, ny, nz = lattice.grid.shape
     steps = QUAD_CELLS @ np.array([1, nx, nx * ny], np.int32)
     number = cells.number[row][None, :] + _rows(jnp.asarray(steps), axis).T
-    around = cells.bits.rank(jnp.clip(number, 0, grid.cube_count - 1))
+    around = cells.bits.rank(lattice.rows_of_cells(jnp.clip(number, 0, nx * ny * nz - 1)))
     edge = _rows(jnp.asarray(QUAD_EDGES), axis).T
     patch_of_edge = jnp.asarray(PATCH_OF_EDGE.astype(np.int32).reshape(-1))
     slot = _rows(patch_of_edge, _rows(cells.case, around) * 12 + edge)
@@ -373,8 +369,18 @@ def _split_faces(gamma: Float[Array, " Cd"], quads: _Quads) -> Int[Array, "F 3"]
     return jnp.where(takes_first[None, :], along_first, along_second).T.reshape(-1, 3)
 
 
+def _cells_and_duals(
+    geometry: Geometry, lattice: Lattice, capacities: Capacities
+) -> tuple[_Cells, _Duals]:
+    """Find the cells at the surface, and place its vertices in them."""
+    geometry = replace(geometry, sdf=lattice.values(geometry.sdf))
+    cells = _surface_cells(geometry.sdf, lattice, capacity=capacities["surface_cubes"])
+    duals = _dual_vertices(geometry, lattice, cells, capacity=capacities["dual_vertices"])
+    return cells, duals
+
+
 def isosurface(
-    geometry: Geometry, grid: Grid, *, capacities: Capacities, training: bool
+    geometry: Geometry, grid: Grid | Lattice, *, capacities: Capacities, training: bool
 ) -> IsoSurface:
     """Extract the surface where the SDF changes sign, as a watertight manifold mesh.
 
@@ -387,7 +393,7 @@ def isosurface(
     Parameters
     ----------
     geometry : raw SDF, deformations and weights (see `Geometry`).
-    grid : box of cells they live on.
+    grid : box of cells they live on, or what holds values of some of its cells.
     capacities : static sizes; ``surface_cubes``, ``dual_vertices`` and ``quads`` are used.
         If ``usage`` exceeds them the mesh is wrong and must be discarded (see `capacity`).
     training : static. True: four triangles a quad around a centre that blends both diagonals by
@@ -398,9 +404,9 @@ def isosurface(
     `IsoSurface`, whose mesh has ``dual_vertices`` (+ ``quads`` in training) vertex rows and
     ``2 (4) * quads`` face rows, padded with zeros. Faces are outward (towards positive SDF).
     """
-    cells = _surface_cells(geometry.sdf, grid, capacity=capacities["surface_cubes"])
-    duals = _dual_vertices(geometry, grid, cells, capacity=capacities["dual_vertices"])
-    quads = _quads(grid, cells, capacity=capacities["quads"])
+    lattice = lattice_of(grid)
+    cells, duals = _cells_and_duals(geometry, lattice, capacities)
+    quads = _quads(lattice, cells, capacity=capacities["quads"])
 
     vertices, vertex_count = duals.points.T, cells.vertex_count
     if training:
@@ -416,6 +422,7 @@ def isosurface(
         quad_centers = jnp.zeros(quads.mask.shape, jnp.int32)
     faces_each = 4 if training else 2
 
+    grid = lattice.grid
     centre = grid.origin + grid.cell_size * 0.5 * jnp.asarray(grid.shape, grid.origin.dtype)
     is_vertex = jnp.arange(vertices.shape[0], dtype=jnp.int32) < vertex_count
     mesh = Mesh(
@@ -441,60 +448,64 @@ def isosurface(
 
 
 def edge_deviations(
-    geometry: Geometry, grid: Grid, *, capacities: Capacities
+    geometry: Geometry, grid: Grid | Lattice, *, capacities: Capacities
 ) -> tuple[Float[Array, "12 Cd"], Bool[Array, "12 Cd"]]:
     """Return the terms whose mean is `IsoSurface.deviation`, and which of them are real."""
-    cells = _surface_cells(geometry.sdf, grid, capacity=capacities["surface_cubes"])
-    duals = _dual_vertices(geometry, grid, cells, capacity=capacities["dual_vertices"])
+    _, duals = _cells_and_duals(geometry, lattice_of(grid), capacities)
     return duals.deviations, duals.crosses
 
 
-class FlexiCubes(SurfaceModel):
+class GridSurface(SurfaceModel):
     """Isosurface of values on a grid, with the regularisers of FlexiCubes and Eq. 14.
 
     Attributes
     ----------
-    grid : where the values live.
     entropy_reduction : static; ``"mean"`` over the edges of Eq. 14 or their ``"sum"``, as printed.
         The sum grows with the number of crossed edges and soon outweighs the picture.
     """
 
-    grid: Grid
-    entropy_reduction: Literal["mean", "sum"] = eqx.field(static=True, default="mean")
+    entropy_reduction: eqx.AbstractVar[Literal["mean", "sum"]]
+
+    @property
+    @abc.abstractmethod
+    def lattice(self) -> Lattice:
+        """Which cells and vertices of the grid hold values."""
 
     @property
     def box(self) -> Box:
         """The cube around the grid."""
-        return self.grid.box
+        return self.lattice.grid.box
 
     def extract(
         self, shape: Geometry, *, capacities: Capacities, final: bool = False
     ) -> IsoSurface:
         """Extract the isosurface: four triangles a quad, two in the final mesh."""
-        return isosurface(shape, self.grid, capacities=capacities, training=not final)
+        return isosurface(shape, self.lattice, capacities=capacities, training=not final)
 
     def penalties(self, shape: Geometry, surface: IsoSurface) -> dict[str, Float[Array, ""]]:
         """Evaluate ``entropy`` (Eq. 14), ``deviation`` (L_dev, in half boxes) and ``weights``."""
+        lattice = self.lattice
         return {
-            "entropy": sdf_entropy(shape, self.grid, reduction=self.entropy_reduction),
+            "entropy": sdf_entropy(shape, lattice, reduction=self.entropy_reduction),
             "deviation": surface.deviation / self.box.half_extent,
-            "weights": weight_magnitude(shape),
+            "weights": weight_magnitude(shape, lattice.grid.cube_count),
         }
 
     def ray_index(self, surface: IsoSurface, *, capacities: Capacities) -> GridIndex:
         """List the patches of every cell; see `build_grid_index`."""
-        return build_grid_index(surface, self.grid, capacities=capacities)
+        return build_grid_index(surface, self.lattice.grid, capacities=capacities)
 
     def nearby_points(self, shape: Geometry) -> tuple[Float[Array, "G 3"], Float[Array, " G"]]:
         """Return the grid's vertices, those with an edge that the surface crosses weighing one."""
-        points = grid_vertices(self.grid).astype(shape.sdf.dtype)
-        return points, (crossed_edges(shape.sdf, self.grid) > 0).astype(points.dtype)
+        lattice = self.lattice
+        points = lattice.vertex_positions().astype(shape.sdf.dtype)
+        crossings = lattice.crossed_edges(lattice.values(shape.sdf))
+        return points, (crossings > 0).astype(points.dtype)
 
     def first_capacities(self, shape: Geometry) -> Capacities:
         """Guess sizes from the number of sign changes along grid edges."""
-        vx, vy, vz = self.grid.vertex_shape
-        inside = (np.asarray(shape.sdf) < 0).reshape(vz, vy, vx)
-        quads = sum(int(np.sum(np.diff(inside, axis=axis))) for axis in range(3))
+        lattice = self.lattice
+        quads = lattice.crossing_count(lattice.values(shape.sdf))
         vertices = bucket(int(1.3 * quads))
         return Capacities(
             surface_cubes=vertices,
@@ -502,3 +513,21 @@ class FlexiCubes(SurfaceModel):
             quads=bucket(int(1.2 * quads)),
             cell_patches=bucket(6 * quads),
         )
+
+
+class FlexiCubes(GridSurface):
+    """Values everywhere on a grid.
+
+    Attributes
+    ----------
+    grid : where the values live.
+    entropy_reduction : see `GridSurface`.
+    """
+
+    grid: Grid
+    entropy_reduction: Literal["mean", "sum"] = eqx.field(static=True, default="mean")
+
+    @property
+    def lattice(self) -> Lattice:
+        """All cells and vertices."""
+        return WholeGrid(self.grid)

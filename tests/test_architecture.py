@@ -19,6 +19,7 @@ ORDER = [
     "rays",
     "surface",
     "geometry",
+    "banded",
     "hashgrid",
     "materials",
     "adapter",

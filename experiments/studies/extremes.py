@@ -85,6 +85,8 @@ CORNERS = (
     Corner("cells-128-cubic", ("geometry.resolution=128", "geometry.cubic=true")),
     Corner("cells-512", ("geometry.resolution=512", "geometry.cubic=true"), is_refused=True),
     Corner("random-start", ("geometry.initial=random",)),
+    Corner("band-3", ("geometry.band=3",)),
+    Corner("band-7-random-start", ("geometry.band=7", "geometry.initial=random")),
     Corner("samples-1", _samples(1)),
     Corner("samples-256", _samples(256)),
     Corner("samples-4096", ("geometry.resolution=128", *_samples(4096)), is_refused=True),

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from concurrent.futures import wait
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -42,6 +42,7 @@ from geosplat_jax.fit.step import (
     UpdateRule,
     initial_state,
     train_step,
+    with_geometry,
 )
 from geosplat_jax.fit.trained import (
     Description,
@@ -61,21 +62,35 @@ _RECOVERIES_ALLOWED = 3
 _SHRINK_EVERY = 100
 _WORTH = 100
 """Steps to come in a stage for which smaller buffers are worth the compilation that they take."""
+_FOLLOW_EVERY = 10
+"""Steps between two looks at where the surface is; at usual rates it moves by less than a cell."""
 _LOOK_AHEAD = 200
 """Steps before the end of a stage, at most, at which the next one's programs are compiled."""
+
+
+class First(NamedTuple):
+    """What a stage began with: the surface, and its shape on the host, as steps consume theirs."""
+
+    surface: SurfaceModel
+    shape: Any
+
+    @classmethod
+    def of(cls, surface: SurfaceModel, shape: Any) -> "First":
+        """Copy a shape out of buffers that a step will consume."""
+        return cls(surface, jax.tree.map(np.array, shape))
 
 
 @dataclass
 class Loop:
     """Mutable bookkeeping of a run; everything but the clock goes into checkpoints.
 
-    ``fallback`` is the shape that the stage began with, on the host, since the step consumes its
-    buffers. The state lies on all ``devices``; ``surface`` and ``pipeline`` on one of this process,
-    where everything between two steps is computed. ``views`` are windows of the photographs that
-    hold this ``share`` of their pixels, see `windows.around_object`. ``upcoming`` is the next
-    stage, once it is near; ``to_come`` is what a checkpoint said of it. ``has_compiled`` is set by
-    whatever compiles, and reset by whoever measures time; ``on_compile`` is called with the stage's
-    name before anything compiles that a step waits for.
+    ``fallback`` is what the stage began with. The state lies on all ``devices``; ``surface`` and
+    ``pipeline`` on one of this process, where everything between two steps is computed. ``views``
+    are windows of the photographs that hold this ``share`` of their pixels, see
+    `windows.around_object`. ``upcoming`` is the next stage, once it is near; ``to_come`` is what a
+    checkpoint said of it. ``has_compiled`` is set by whatever compiles, and reset by whoever
+    measures time; ``on_compile`` is called with the stage's name before anything compiles that a
+    step waits for.
     """
 
     config: Config
@@ -90,7 +105,7 @@ class Loop:
     planned_for: str | None = None
     peak: dict[str, int] | None = None
     recoveries: int = 0
-    fallback: Any = None
+    fallback: "First | None" = None
     last_checkpoint: Path | None = None
     upcoming: "Upcoming | None" = None
     has_compiled: bool = False
@@ -262,7 +277,7 @@ class Loop:
 
     def start(self, params: Params) -> None:
         """Begin the stage with these parameters."""
-        self.fallback = _on_host(params.geometry)
+        self.fallback = First.of(self.surface, params.geometry)
         carry = self.pipeline.transport.first_carry()
         self.state = self.devices.place(initial_state(params, step=self.step, carry=carry))
 
@@ -287,15 +302,47 @@ class Loop:
         elif self.step % _SHRINK_EVERY == 0 and self.stage.steps - self.steps_of_stage >= _WORTH:
             self._resize(capacity_module.shrink(self.pipeline.capacities, self.peak), step)
             self.peak = None
+        if self.step % _FOLLOW_EVERY == 0:
+            self._follow(step)
         return report
+
+    def _follow(self, step: int) -> None:
+        """Let a surface that holds only what it needs follow its shape, with the optimiser."""
+        params = self.params
+        if set(self.config.geometry.rate_groups) <= set(self.stage.frozen):
+            return
+        following = self.surface.following(params.geometry)
+        if following is None:
+            return
+        state = self.devices.local(self.state)
+        optimizer = with_geometry(state.optimizer, following.carried)
+        sizes = _sizes(params.geometry)
+        params = replace(params, geometry=following.shape)
+        self.state = self.devices.place(replace(state, params=params, optimizer=optimizer))
+        self._put_surface(following.model)
+        if _sizes(params.geometry) != sizes:
+            if self.upcoming is not None:
+                self.upcoming.abandon()
+            # What was planned ahead is of other sizes.
+            self.upcoming = self.to_come = None
+            self._recompile(step)
+
+    def _put_surface(self, surface: SurfaceModel) -> None:
+        """Go on with another surface."""
+        self.surface = surface
+        self.pipeline = replace(self.pipeline, surface=surface)
 
     def _resize(self, capacities: Capacities, step: int) -> None:
         """Change the buffers, which takes new programs; the old ones may be too many to keep."""
         if capacities != self.pipeline.capacities:
             self.pipeline = replace(self.pipeline, capacities=capacities)
-            release_programs_when_crowded()
-            self._announce()
-            self._compile(step)
+            self._recompile(step)
+
+    def _recompile(self, step: int) -> None:
+        """Compile for other sizes."""
+        release_programs_when_crowded()
+        self._announce()
+        self._compile(step)
 
     def _not_finite(self, step: int, report: StepReport) -> str:
         """Say which term broke, when, and where the last good state is."""
@@ -324,8 +371,9 @@ class Loop:
                 f"rates: {self._lower()}."
             )
         self.recoveries += 1
-        shape = jax.tree.map(jnp.asarray, self.fallback)
+        shape = jax.tree.map(jnp.asarray, self.fallback.shape)
         params, carry = replace(self.params, geometry=shape), self.devices.local(self.state.carry)
+        self._put_surface(self.fallback.surface)
         self.state = self.devices.place(initial_state(params, step=self.step, carry=carry))
 
 
@@ -416,9 +464,9 @@ def _continued(before: Pipeline, first: Pipeline, stage: Stage) -> Capacities | 
     return before.capacities if is_continued else None
 
 
-def _on_host(shape: Any) -> Any:
-    """Copy a shape out of buffers that the step will consume."""
-    return jax.tree.map(np.array, shape)
+def _sizes(shape: Any) -> list[tuple[int, ...]]:
+    """Return the sizes of the arrays of a shape."""
+    return [leaf.shape for leaf in jax.tree.leaves(shape)]
 
 
 def new_loop(
@@ -444,7 +492,7 @@ def new_loop(
         elif surface is None:
             surface, shape = config.geometry.start(dataset, shape_key)
         else:
-            shape = config.geometry.restart(surface, dataset, shape_key)
+            surface, shape = config.geometry.restart(surface, dataset, shape_key)
     except ValueError as error:
         raise TrainingError(str(error)) from error
     if surface.is_two_sided and not config.raster.cull_backfaces:
@@ -516,7 +564,8 @@ def resumed_loop(
     if number:
         ended = latest_checkpoint(folder.end_of(before[number - 1]))
         if ended is not None:
-            loop.fallback = _on_host(read_checkpoint(ended, config)[0]["state"].params.geometry)
+            tree, _ = read_checkpoint(ended, config)
+            loop.fallback = First.of(tree["surface"], tree["state"].params.geometry)
     return loop
 
 

@@ -79,11 +79,13 @@ class MeshSettings(SurfaceSettings, kind="mesh"):
         model = TriangleMesh.of(mesh.vertices, mesh.faces, is_sheet=self._is_sheet(mesh))
         return model, model.start
 
-    def restart(self, model: SurfaceModel, dataset: Dataset, key: Key[Array, ""]) -> VertexOffsets:
+    def restart(
+        self, model: SurfaceModel, dataset: Dataset, key: Key[Array, ""]
+    ) -> tuple[TriangleMesh, VertexOffsets]:
         """Return no offsets; the file is not read again."""
         del dataset, key
         assert isinstance(model, TriangleMesh)
-        return model.start
+        return model, model.start
 
     def describe(self, model: SurfaceModel) -> dict[str, Any]:
         """Return the rows of the arrays, the cells for rays, and whether both sides count."""

@@ -83,6 +83,15 @@ def initial_state(params: Params, *, step: int = 0, carry: Any = None) -> TrainS
     return TrainState(params, ADAM.init(tree), jnp.asarray(step, jnp.int32), carry)
 
 
+def with_geometry(optimizer: Any, change: Callable[[Any], Any]) -> Any:
+    """Change what Adam keeps for the numbers of the surface's shape."""
+    moments = {
+        name: replace(moment, geometry=change(moment.geometry))
+        for name, moment in (("mu", optimizer.mu), ("nu", optimizer.nu))
+    }
+    return optimizer._replace(**moments)
+
+
 def descended(params: Any, directions: Any, rates: dict[str, Float[Array, ""]]) -> Any:
     """Step against the directions, every group of parameters with its own learning rate."""
     leaves, structure = jax.tree.flatten(params)

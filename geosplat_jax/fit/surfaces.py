@@ -1,6 +1,7 @@
 """Settings of the surfaces: what a run starts from, and how large it may become."""
 
 import abc
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import jax
@@ -9,18 +10,32 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 from pydantic import Field
 
+from geosplat_jax.banded import BandedFlexiCubes
 from geosplat_jax.core.settings import PositiveCount, Variant, settings
 from geosplat_jax.core.types import Geometry, Grid
-from geosplat_jax.geometry import FlexiCubes, initial_geometry, random_sdf, sphere_sdf
+from geosplat_jax.geometry import (
+    FlexiCubes,
+    GridSurface,
+    initial_geometry,
+    random_sdf,
+    sphere_sdf,
+)
 from geosplat_jax.io.dataset import Dataset
+from geosplat_jax.surface.band import REACH, Band
 from geosplat_jax.surface.base import SurfaceModel
+from geosplat_jax.surface.grids import neutral_geometry
 from geosplat_jax.surface.hull import fit_grid, hull_sdf
 
 Bounds = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
 """lo and hi of a box in the world."""
 
-_SDF_REACH = 2.0
-"""The first SDF is clipped to so many cells, so that the surface can be moved in few steps."""
+_SPLATS_PER_CELL = 24
+"""Splats of a cell that the surface passes through: of the one quad that it has in the mean."""
+
+_NUMBERS_PER_CELL = 25
+"""21 weights, and an SDF and a deformation for a vertex."""
+
+_FLOAT_BYTES = 4
 
 
 @settings
@@ -86,8 +101,10 @@ class SurfaceSettings(Variant, abc.ABC):
             If there is nothing to start from; the message says what to change.
         """
 
-    def restart(self, model: SurfaceModel, dataset: Dataset, key: Key[Array, ""]) -> Any:
-        """Make the first shape once more, for a model that a checkpoint holds.
+    def restart(
+        self, model: SurfaceModel, dataset: Dataset, key: Key[Array, ""]
+    ) -> tuple[SurfaceModel, Any]:
+        """Make the first surface and shape once more, for a model that a checkpoint holds.
 
         Raises
         ------
@@ -95,7 +112,7 @@ class SurfaceSettings(Variant, abc.ABC):
             As `start`.
         """
         del model
-        return self.start(dataset, key)[1]
+        return self.start(dataset, key)
 
     @abc.abstractmethod
     def describe(self, model: SurfaceModel) -> dict[str, Any]:
@@ -114,6 +131,9 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
     """Cells along the longest side of the box around the object."""
     initial: Literal["hull", "sphere", "random"] = "hull"
     """First surface: visual hull of the masks, a sphere, or noise (the paper)."""
+    band: Literal[0, 3, 5, 7] = 0
+    """Cells across in a band around the surface that hold values and follow it, so that memory and
+    time grow with its area; 0: all cells of the box."""
     cubic: bool = False
     """As many cells along every side, as the authors; else only as many as the box needs."""
     reach: Annotated[float, Field(ge=0, le=0.5)] = 0.5
@@ -131,7 +151,7 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
 
     @property
     def penalty_names(self) -> tuple[str, ...]:
-        """Terms of `FlexiCubes.penalties`."""
+        """Terms of `GridSurface.penalties`."""
         return ("entropy", "deviation", "weights")
 
     @property
@@ -149,7 +169,7 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
         """Guess the splats: from 30 (a bottle) to 60 (a duck) times the square of the cells."""
         return 50 * self.resolution**2
 
-    def start(self, dataset: Dataset, key: Key[Array, ""]) -> tuple[FlexiCubes, Geometry]:
+    def start(self, dataset: Dataset, key: Key[Array, ""]) -> tuple[GridSurface, Geometry]:
         """Fit a grid to the object and fill it with a first surface."""
         grid = self._grid(dataset.bounds)
         sdf = self._sdf(grid, dataset, key)
@@ -159,7 +179,17 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
                 "cameras agree on no point inside the bounds. Check poses and masks with "
                 "geosplat-jax info, give --bounds, or start from geometry.initial=sphere."
             )
-        return self._model(grid), initial_geometry(grid, sdf)
+        grid = self._reaching(grid)
+        if self.band:
+            return BandedFlexiCubes.around(
+                np.asarray(sdf), grid, self.layers, self.entropy_reduction
+            )
+        return FlexiCubes(grid, self.entropy_reduction), initial_geometry(grid, sdf)
+
+    @property
+    def layers(self) -> int:
+        """Layers of cells in the band on each side of those that the surface passes through."""
+        return self.band // 2
 
     @property
     def fewest_splats(self) -> int:
@@ -167,7 +197,11 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
         return 10 * self.resolution**2
 
     def parameter_bytes(self, bounds: Bounds) -> int:
-        """Count the numbers of the vertices and cells of the grid."""
+        """Count the numbers of the vertices and cells of the grid, or at least of a band."""
+        if self.band:
+            # One vertex a cell. Where the object is thin, only the outer layers are certain.
+            cells = (1 + self.layers) * self.fewest_splats // _SPLATS_PER_CELL
+            return cells * _NUMBERS_PER_CELL * _FLOAT_BYTES
         grid = self._grid(bounds)
         shape = jax.eval_shape(lambda: initial_geometry(grid, jnp.zeros(grid.vertex_count)))
         return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shape))
@@ -195,21 +229,34 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
             grid,
             valid=views.valid,
         )
-        return jnp.clip(jnp.asarray(sdf), -_SDF_REACH, _SDF_REACH)
+        return jnp.clip(jnp.asarray(sdf), -REACH, REACH)
 
-    def _model(self, grid: Grid) -> FlexiCubes:
-        grid = Grid(grid.origin, grid.cell_size, grid.shape, self.reach)
-        return FlexiCubes(grid, self.entropy_reduction)
+    def _reaching(self, grid: Grid) -> Grid:
+        """Set how far the vertices of a grid move."""
+        return replace(grid, reach=self.reach)
 
     def describe(self, model: SurfaceModel) -> dict[str, Any]:
-        """Return the cells along each axis."""
+        """Return the cells along each axis, and the rows of a band."""
+        if isinstance(model, BandedFlexiCubes):
+            band = model.band
+            rows = {"cell_rows": band.cell_rows, "vertex_rows": band.vertex_rows}
+            return {"grid_shape": list(band.grid.shape), **rows}
         assert isinstance(model, FlexiCubes)
         return {"grid_shape": list(model.grid.shape)}
 
-    def template(self, description: dict[str, Any]) -> tuple[FlexiCubes, Geometry]:
-        """Make an empty grid."""
+    def template(self, description: dict[str, Any]) -> tuple[GridSurface, Geometry]:
+        """Make an empty grid, or an empty band."""
         nx, ny, nz = description["grid_shape"]
         if not all(isinstance(n, int) and n > 0 for n in (nx, ny, nz)):
             raise ValueError(f"grid_shape must be three numbers of cells, got {(nx, ny, nz)}")
-        grid = Grid(jnp.zeros(3), jnp.ones(()), (nx, ny, nz))
-        return self._model(grid), initial_geometry(grid, jnp.zeros(grid.vertex_count))
+        grid = self._reaching(Grid(jnp.zeros(3), jnp.ones(()), (nx, ny, nz)))
+        if not self.band:
+            shape = initial_geometry(grid, jnp.zeros(grid.vertex_count))
+            return FlexiCubes(grid, self.entropy_reduction), shape
+        rows = description["cell_rows"], description["vertex_rows"]
+        if not all(isinstance(n, int) and n > 0 for n in rows):
+            raise ValueError(f"cell_rows and vertex_rows must be numbers of rows, got {rows}")
+        cell_rows, vertex_rows = rows
+        band = Band.blank(grid, cell_rows, vertex_rows)
+        shape = neutral_geometry(jnp.zeros(vertex_rows), cell_rows)
+        return BandedFlexiCubes(band, self.layers, self.entropy_reduction), shape

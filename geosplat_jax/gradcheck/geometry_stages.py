@@ -24,9 +24,11 @@ from geosplat_jax.geometry import (
     weight_magnitude,
 )
 from geosplat_jax.gradcheck.differences import Problem
+from geosplat_jax.surface.band import Band, band_from
 from geosplat_jax.surface.grids import grid_vertices
 
 _SHAPE = (3, 3, 4)
+_WEIGHTS = ("alpha", "beta", "gamma")
 
 
 def _grid(dtype: Any = jnp.float64) -> Grid:
@@ -57,8 +59,8 @@ def isosurface_problems(rng: np.random.Generator) -> list[Problem]:
     }
     capacities = Capacities(surface_cubes=64, dual_vertices=64, quads=64)
 
-    def surface(training: bool) -> Problem:
-        def function(inputs: dict[str, Any], constants: Grid) -> dict[str, Any]:
+    def surface(name: str, lattice: Any, inputs: dict[str, Any], *, training: bool) -> Problem:
+        def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
             geometry = Geometry(**inputs)
             found = isosurface(geometry, constants, capacities=capacities, training=training)
             return {
@@ -69,10 +71,33 @@ def isosurface_problems(rng: np.random.Generator) -> list[Problem]:
                 "weight magnitude": weight_magnitude(geometry),
             }
 
-        name = "isosurface, training" if training else "isosurface, evaluation"
-        return Problem(name, function, inputs, grid, full=500)
+        return Problem(f"isosurface, {name}", function, inputs, lattice, full=500)
 
-    return [surface(True), surface(False)]
+    banded = _in_band(inputs, _grid())
+    return [
+        surface("training", grid, inputs, training=True),
+        surface("evaluation", grid, inputs, training=False),
+        surface("band", *banded, training=True),
+    ]
+
+
+def _in_band(inputs: dict[str, Any], grid: Grid) -> tuple[Band, dict[str, Any]]:
+    """Return the cells that the surface passes through, and rows of their values and weights."""
+    band, sdf = band_from(grid, inputs["sdf"], 0)
+    # Padding is left out: it has no gradient, and would be most of what is compared.
+    cells = int(band.bits.count)
+    vertices = int(np.asarray(band.corners).max()) + 1
+    band = replace(
+        band,
+        cells=band.cells[:cells],
+        vertices=band.vertices[:vertices],
+        corners=band.corners[:, :cells],
+        neighbours=band.neighbours[:, :vertices],
+        fixed=band.fixed[:vertices],
+    )
+    rows = {name: np.asarray(inputs[name])[np.asarray(band.cells)] for name in _WEIGHTS}
+    deform = np.asarray(inputs["deform"])[np.asarray(band.vertices)]
+    return band, {"sdf": sdf[:vertices], "deform": deform, **rows}
 
 
 def _tetrahedron(rng: np.random.Generator) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """What the method asks of a surface: a mesh, its penalties, and a way for rays to find it."""
 
 import abc
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -23,6 +24,21 @@ class Surface(eqx.Module):
 
     mesh: Mesh
     usage: Usage
+
+
+class Following(NamedTuple):
+    """What takes the place of a surface model and its shape; see `SurfaceModel.following`.
+
+    Attributes
+    ----------
+    model, shape : the new ones.
+    carried : brings other numbers that belong to those of the shape, such as what an optimiser
+        keeps, to where they belong now; 0 for those that are new.
+    """
+
+    model: "SurfaceModel"
+    shape: Any
+    carried: Callable[[Any], Any]
 
 
 class SurfaceModel(eqx.Module):
@@ -65,3 +81,11 @@ class SurfaceModel(eqx.Module):
     @abc.abstractmethod
     def first_capacities(self, shape: Any) -> Capacities:
         """Guess the sizes of the surface's own buffers (host side)."""
+
+    def following(self, shape: Any) -> Following | None:
+        """Go on with a model that holds what the surface of a shape needs now (host side).
+
+        None where this model does, which most always do. A function of model and shape alone.
+        """
+        del shape
+        return None

@@ -4,20 +4,12 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Float, Key
 
 from geosplat_jax.core.numerics import absolute, safe_norm
 from geosplat_jax.core.types import Geometry, Grid
 from geosplat_jax.surface.flexicubes_tables import CORNERS
-
-
-def grid_vertices(grid: Grid) -> Float[Array, "G 3"]:
-    """Rest positions of the grid vertices, (vertices, 3) world, x fastest."""
-    vx, vy, vz = grid.vertex_shape
-    k, j, i = np.indices((vz, vy, vx), dtype=np.int32).reshape(3, -1)
-    steps = jnp.asarray(np.stack([i, j, k], axis=1), grid.origin.dtype)
-    return grid.origin[None, :] + grid.cell_size * steps
+from geosplat_jax.surface.lattice import Lattice, grid_vertices, lattice_of
 
 
 def deformed_vertices(geometry: Geometry, grid: Grid) -> Float[Array, "G 3"]:
@@ -32,10 +24,15 @@ def initial_geometry(grid: Grid, sdf: Float[Array, " G"]) -> Geometry:
             f"sdf must have one value for each of the {grid.vertex_count} grid vertices, "
             f"got shape {sdf.shape}"
         )
-    cells, dtype = grid.cube_count, sdf.dtype
+    return neutral_geometry(sdf, grid.cube_count)
+
+
+def neutral_geometry(sdf: Float[Array, " G"], cells: int) -> Geometry:
+    """Geometry with this SDF, no deformation and neutral weights of so many cells."""
+    dtype = sdf.dtype
     return Geometry(
         sdf=sdf,
-        deform=jnp.zeros((grid.vertex_count, 3), dtype),
+        deform=jnp.zeros((*sdf.shape, 3), dtype),
         alpha=jnp.zeros((cells, 8), dtype),
         beta=jnp.zeros((cells, 12), dtype),
         gamma=jnp.zeros((cells,), dtype),
@@ -89,42 +86,35 @@ def resample(geometry: Geometry, grid: Grid, new_grid: Grid) -> Geometry:
     return initial_geometry(new_grid, sdf * (grid.cell_size / new_grid.cell_size))
 
 
-def crossed_edges(sdf: Float[Array, " G"], grid: Grid) -> Int[Array, " G"]:
-    """Count the grid edges at every vertex whose ends differ in sign; zero counts as outside."""
-    nx, ny, nz = grid.shape
-    inside = sdf.reshape(nz + 1, ny + 1, nx + 1) < 0
-    crossings = jnp.zeros(inside.shape, jnp.int32)
-    for axis in range(3):
-        changes = jnp.diff(inside, axis=axis).astype(jnp.int32)
-        before = [(1, 0) if i == axis else (0, 0) for i in range(3)]
-        after = [(0, 1) if i == axis else (0, 0) for i in range(3)]
-        crossings = crossings + jnp.pad(changes, before) + jnp.pad(changes, after)
-    return crossings.reshape(-1)
-
-
 def sdf_entropy(
-    geometry: Geometry, grid: Grid, *, reduction: Literal["mean", "sum"] = "mean"
+    geometry: Geometry, grid: Grid | Lattice, *, reduction: Literal["mean", "sum"] = "mean"
 ) -> Float[Array, ""]:
     """Cross entropy of signs over the grid edges whose ends differ in sign (paper Eq. 14).
 
     ``BCE(sigmoid(a), sign(b)) + BCE(sigmoid(b), sign(a))`` summed, or averaged over those edges.
-    Zero counts as outside. An SDF of one sign gives 0 with zero gradient.
+    Zero counts as outside. An SDF of one sign gives 0 with zero gradient. ``grid`` : or what holds
+    values of some of its vertices.
     """
+    lattice = lattice_of(grid)
+    sdf = lattice.values(geometry.sdf)
     # Ends of opposite sign: BCE(sigmoid(a), sign(b)) = softplus(|a|), so that the sum over edges
     # is one over vertices, each weighted with the number of its crossed edges.
-    crossings = crossed_edges(geometry.sdf, grid)
-    size = jnp.where(geometry.sdf < 0, -geometry.sdf, geometry.sdf)
+    crossings = lattice.crossed_edges(sdf)
+    size = jnp.where(sdf < 0, -sdf, sdf)
     total = jnp.sum(crossings.astype(size.dtype) * jax.nn.softplus(size))
     if reduction == "sum":
         return total
     return total / jnp.maximum(jnp.sum(crossings, dtype=jnp.int32) // 2, 1).astype(size.dtype)
 
 
-def weight_magnitude(geometry: Geometry) -> Float[Array, ""]:
+def weight_magnitude(geometry: Geometry, cell_count: int | None = None) -> Float[Array, ""]:
     """Mean magnitude of all raw alpha and beta weights; gamma is free (FlexiCubes).
 
     Its minimum, where its gradient is zero, is plain dual cubes, from which training starts.
+    ``cell_count`` : cells of the whole grid, where the geometry holds weights of some of them and
+    those of the others are neutral.
     """
     weights = (geometry.alpha, geometry.beta)
     total = jnp.sum(jnp.stack([jnp.sum(absolute(weight)) for weight in weights]))
-    return total / sum(weight.size for weight in weights)
+    count = geometry.gamma.shape[0] if cell_count is None else cell_count
+    return total / float(count * sum(weight.shape[1] for weight in weights))

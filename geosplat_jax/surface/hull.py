@@ -29,6 +29,7 @@ SEEN_FRACTION = 0.5
 """A point that fewer of the views see is outside: few cones meet far away, where nobody looks."""
 
 _POINTS_AT_ONCE = 1 << 15  # what a pass holds then stays in the cache
+_POINTS_OF_A_SLAB = 1 << 20
 _MASK_PIXELS = 400  # larger masks are reduced first; the hull is never sampled that finely
 _COVERED = 0.5
 _FULL, _EMPTY = 1.0 - 1e-3, 1e-3  # coverage beyond these is a whole pixel
@@ -211,20 +212,25 @@ def hull_sdf(
     ------
     ValueError : no vertex, or every vertex, lies inside.
     """
-    points = grid_points(grid)
     cell = float(grid.cell_size)
     view = _Silhouettes(world_to_camera, intrinsics, masks, valid)
-    near = _evaluate(view, points, tolerance=tolerance, seen_fraction=seen_fraction) / cell
     lo = np.asarray(grid.origin, np.float64)
     hi = lo + cell * np.asarray(grid.shape)
-    outside_box = np.maximum(lo - points, points - hi).max(1) / cell + 1.0
-    near = np.maximum(near, outside_box).astype(np.float32)
+    vx, vy, vz = grid.vertex_shape
+    near = np.empty(grid.vertex_count, np.float32)
+    # A few layers at a time: the points of a fine grid take many times the memory of its values.
+    thickness = -(-_POINTS_OF_A_SLAB // (vx * vy))
+    for first in range(0, vz, thickness):
+        last = min(first + thickness, vz)
+        points = grid_points(grid, first, last)
+        distance = _evaluate(view, points, tolerance=tolerance, seen_fraction=seen_fraction)
+        outside_box = np.maximum(lo - points, points - hi).max(1) / cell + 1.0
+        near[first * vx * vy : last * vx * vy] = np.maximum(distance / cell, outside_box)
     if not (near < 0.0).any():
         raise ValueError(
             "the visual hull holds no vertex of the grid: the object is thinner than a cell, or "
             "the grid lies elsewhere; raise the resolution or use the bounds of the scene"
         )
-    vx, vy, vz = grid.vertex_shape
     return _extend(near.reshape(vz, vy, vx)).reshape(-1)
 
 
@@ -258,10 +264,14 @@ def fit_grid(
     return Grid(jnp.asarray(origin, jnp.float32), jnp.asarray(cell, jnp.float32), (nx, ny, nz))
 
 
-def grid_points(grid: Grid) -> Float[np.ndarray, "G 3"]:
-    """World positions of the grid's vertices, x fastest, float64 on the host."""
+def grid_points(grid: Grid, first: int = 0, last: int | None = None) -> Float[np.ndarray, "G 3"]:
+    """World positions of the grid's vertices, x fastest, float64 on the host.
+
+    ``first``, ``last`` : of the layers of vertices along z; None for all.
+    """
     origin, cell = np.asarray(grid.origin, np.float64), float(grid.cell_size)
     axes = [origin[i] + cell * np.arange(grid.vertex_shape[i]) for i in range(3)]
+    axes[2] = axes[2][first:last]
     z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
     return np.stack([x, y, z], -1).reshape(-1, 3)
 

@@ -1,0 +1,65 @@
+"""The isosurface of values in a band around it, so that cost and memory grow with its area.
+
+It is the isosurface of `geometry` in every respect: only where the values are held differs.
+"""
+
+from dataclasses import replace
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from geosplat_jax.core.types import Geometry, Grid
+from geosplat_jax.geometry import GridSurface
+from geosplat_jax.surface.band import Band, band_from
+from geosplat_jax.surface.base import Following
+from geosplat_jax.surface.grids import neutral_geometry
+from geosplat_jax.surface.lattice import Lattice
+
+
+class BandedFlexiCubes(GridSurface):
+    """Values in a band around the surface, which follows it; cost and memory grow with its area.
+
+    Attributes
+    ----------
+    band : cells and vertices that hold values; they are the rows of the shape.
+    layers : static; cells on each side of those that the surface passes through.
+    entropy_reduction : see `GridSurface`.
+    """
+
+    band: Band
+    layers: int = eqx.field(static=True, default=1)
+    entropy_reduction: Literal["mean", "sum"] = eqx.field(static=True, default="mean")
+
+    @property
+    def lattice(self) -> Lattice:
+        """Those of the band."""
+        return self.band
+
+    @classmethod
+    def around(
+        cls,
+        sdf: Float[np.ndarray, " V"],
+        grid: Grid,
+        layers: int,
+        entropy_reduction: Literal["mean", "sum"] = "mean",
+    ) -> "tuple[BandedFlexiCubes, Geometry]":
+        """Make the model and shape of a surface from values on all vertices of a grid (host side).
+
+        There is no deformation, and weights are neutral.
+        """
+        band, values = band_from(grid, sdf, layers)
+        return cls(band, layers, entropy_reduction), neutral_geometry(
+            jnp.asarray(values), band.cell_rows
+        )
+
+    def following(self, shape: Geometry) -> Following | None:
+        """Make the band around where the surface is now; see `Band.following`."""
+        found = self.band.following(shape.sdf, self.layers)
+        if found is None:
+            return None
+        band, move, sdf = found
+        moved = replace(move.carried(shape), sdf=jnp.array(sdf))
+        return Following(replace(self, band=band), moved, move.carried)

@@ -1,0 +1,362 @@
+"""A band of cells around a surface, outside of which a grid holds no values.
+
+The band consists of the cells that the surface passes through and some layers of cells around them.
+Beyond it every vertex keeps its side. So that nothing contradicts this, the vertices at the band's
+border (those with a cell around them that is not in the band) are read as lying on the side that
+they had when the band was made: the surface comes as near to them as it likes and never leaves.
+Where it has moved, `Band.following` makes the band around it anew.
+
+Only the band's cells and vertices have rows of values, so that a step costs as much as the surface
+is large. What remains of the volume is a bit per cell, to find its row. Making a band is host-side
+and not differentiable.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt
+
+from geosplat_jax.core.capacity import BitSet, bit_set, bucket
+from geosplat_jax.core.types import Geometry, Grid
+from geosplat_jax.surface.flexicubes_tables import CORNERS
+from geosplat_jax.surface.lattice import Lattice
+
+REACH = 2.0
+"""Cells. A vertex that enters the band lies at most so far from the surface, so that the surface
+can be moved in few steps."""
+
+_HELD = 1e-3
+"""Cells that a vertex at the border is read from the surface at least, on its side."""
+
+_HEADROOM = 1.2
+_MANY = 2
+"""Rows are kept where there are at most so many times as many as a new band would be given."""
+
+_CORNER_DISTANCE = np.sqrt(((CORNERS[:, None] - CORNERS[None]) ** 2).sum(-1))
+
+_bit_set = jax.jit(bit_set)
+
+
+class Band(Lattice):
+    """Cells near a surface and their vertices, in the order of their numbers, with padding.
+
+    Attributes
+    ----------
+    grid : that they are of.
+    cells : (K,) numbers; 0 on padding. vertices : (G,) likewise.
+    corners : (8, K) rows of the vertices at the corners of cells; on padding one vertex.
+    neighbours : (6, G) rows of the next vertices before and after along x, y and z; where there is
+        none in the band, the vertex itself.
+    fixed : (G,) the side of a vertex at the border, -1 or 1; 0 for all others.
+    bits : the cells of the grid that are in the band.
+    """
+
+    grid: Grid
+    cells: Int[Array, " K"]
+    vertices: Int[Array, " G"]
+    corners: Int[Array, "8 K"]
+    neighbours: Int[Array, "6 G"]
+    fixed: Int[Array, " G"]
+    bits: BitSet
+
+    @classmethod
+    def blank(cls, grid: Grid, cell_rows: int, vertex_rows: int) -> "Band":
+        """Make a band of no cell."""
+        words = -(-grid.cube_count // 32)
+        return cls(
+            grid,
+            jnp.zeros(cell_rows, jnp.int32),
+            jnp.zeros(vertex_rows, jnp.int32),
+            jnp.zeros((8, cell_rows), jnp.int32),
+            jnp.zeros((6, vertex_rows), jnp.int32),
+            jnp.zeros(vertex_rows, jnp.int8),
+            BitSet(jnp.zeros(words, jnp.uint32), jnp.zeros(words, jnp.int32), jnp.int32(0)),
+        )
+
+    @property
+    def cell_rows(self) -> int:
+        """Number of rows of cells, with padding."""
+        return self.cells.shape[0]
+
+    @property
+    def vertex_rows(self) -> int:
+        """Number of rows of vertices, with padding."""
+        return self.vertices.shape[0]
+
+    def values(self, sdf: Float[Array, " G"]) -> Float[Array, " G"]:
+        """Return signed values with every vertex at the border on its side."""
+        side = self.fixed.astype(sdf.dtype)
+        return jnp.where(side == 0, sdf, side * jnp.maximum(side * sdf, _HELD))
+
+    def cell_numbers(self, rows: Int[Array, "*n"]) -> Int[Array, "*n"]:
+        """Look the numbers up."""
+        return self.cells.at[rows].get(mode="clip")
+
+    def rows_of_cells(self, numbers: Int[Array, "*n"]) -> Int[Array, "*n"]:
+        """Count the cells of the band before each."""
+        return self.bits.rank(numbers)
+
+    def corner_rows(
+        self, rows: Int[Array, " n"], coordinates: Int[Array, "3 n"]
+    ) -> Int[Array, "8 n"]:
+        """Look the rows up."""
+        del coordinates
+        return self.corners.at[:, rows].get(mode="clip")
+
+    def sign_sets(self, values: Float[Array, " G"]) -> UInt[Array, " K"]:
+        """8-bit set of the corners with negative values for every cell of the band."""
+        inside = (values < 0).astype(jnp.uint8)
+        signs = jnp.zeros(self.cells.shape, jnp.uint8)
+        for corner in range(8):
+            signs = signs | inside[self.corners[corner]] << corner
+        return signs
+
+    def crossed_edges(self, values: Float[Array, " G"]) -> Int[Array, " G"]:
+        """Count the crossed edges at every vertex; none leaves the band."""
+        inside = values < 0
+        crossings = jnp.zeros(inside.shape, jnp.int32)
+        for neighbour in range(6):
+            changes = inside[self.neighbours[neighbour]] != inside
+            crossings = crossings + changes.astype(jnp.int32)
+        return crossings
+
+    def vertex_positions(self) -> Float[Array, "G 3"]:
+        """Rest positions of the band's vertices; any on padding."""
+        vx, vy, _ = self.grid.vertex_shape
+        number = self.vertices
+        steps = jnp.stack([number % vx, number // vx % vy, number // (vx * vy)], axis=1)
+        origin = self.grid.origin
+        return origin[None, :] + self.grid.cell_size * steps.astype(origin.dtype)
+
+    def crossing_count(self, values: Float[Array, " G"]) -> int:
+        """Count the crossed edges, each of which has two ends."""
+        return int(jnp.sum(self.crossed_edges(values), dtype=jnp.int32)) // 2
+
+    def surface_cells(self, values: Float[np.ndarray, " G"]) -> Int[np.ndarray, " n"]:
+        """Return the numbers of the cells that the surface passes through (host side)."""
+        inside = values < 0
+        corners = inside[np.asarray(self.corners)].sum(axis=0)
+        return np.asarray(self.cells)[(corners > 0) & (corners < 8)]
+
+    def following(
+        self, sdf: Float[Array, " G"], layers: int
+    ) -> "tuple[Band, Move, Float[np.ndarray, ' H']] | None":
+        """Make the band around where the surface is now (host side).
+
+        Parameters
+        ----------
+        sdf : signed values of this band. layers : of cells on each side of the surface.
+
+        Returns
+        -------
+        band, and where its rows come from, and the values of its vertices, among which those that
+        were not in this band are as far from the surface as those beside them and the way from
+        there, at most `REACH`. None where the band would stay as it is, and where there is no
+        surface to follow.
+        """
+        values = np.asarray(self.values(sdf))
+        at_surface = self.surface_cells(values)
+        if not at_surface.size:
+            return None
+        old_cells = np.asarray(self.cells)[: int(self.bits.count)]
+        cells = cells_around(at_surface, self.grid.shape, layers)
+        if np.array_equal(cells, old_cells):
+            return None
+        layout = _layout(self.grid, cells)
+        # Real vertices have a cell, and the last of them is the largest number.
+        old_vertices = np.asarray(self.vertices)[: int(np.asarray(self.corners).max()) + 1]
+        move = Move(
+            cells=_rows_before(old_cells, cells),
+            vertices=_rows_before(old_vertices, layout.vertices),
+        )
+        is_known = move.vertices >= 0
+        read = _extended(np.where(is_known, values[move.vertices], 0), is_known, layout.corners)
+        raw = np.where(is_known, np.asarray(sdf)[move.vertices], read)
+        band = _padded(self.grid, layout, read, self.cell_rows, self.vertex_rows)
+        return band, move.padded(band), _filled(raw, band.vertex_rows)
+
+
+class Move(NamedTuple):
+    """Rows of an earlier band that the rows of a band come from; -1 where from none.
+
+    Attributes
+    ----------
+    cells : (K,). vertices : (G,).
+    """
+
+    cells: Int[np.ndarray, " K"]
+    vertices: Int[np.ndarray, " G"]
+
+    def padded(self, band: Band) -> "Move":
+        """Add the rows of padding."""
+        return Move(
+            _filled(self.cells, band.cell_rows, -1), _filled(self.vertices, band.vertex_rows, -1)
+        )
+
+    def carried(self, geometry: Geometry) -> Geometry:
+        """Bring numbers of an earlier band into the rows of this one; 0 where there were none."""
+
+        def moved(array: Array, rows: np.ndarray) -> Array:
+            found = np.asarray(array)[rows]
+            found[rows < 0] = 0
+            return jnp.array(found)
+
+        return Geometry(
+            sdf=moved(geometry.sdf, self.vertices),
+            deform=moved(geometry.deform, self.vertices),
+            alpha=moved(geometry.alpha, self.cells),
+            beta=moved(geometry.beta, self.cells),
+            gamma=moved(geometry.gamma, self.cells),
+        )
+
+
+class _Layout(NamedTuple):
+    """Rows of a band without padding, see `Band`."""
+
+    cells: Int[np.ndarray, " K"]
+    vertices: Int[np.ndarray, " G"]
+    corners: Int[np.ndarray, "8 K"]
+    neighbours: Int[np.ndarray, "6 G"]
+    is_border: Bool[np.ndarray, " G"]
+
+
+def band_from(
+    grid: Grid, sdf: Float[np.ndarray, " V"], layers: int
+) -> tuple[Band, Float[np.ndarray, " G"]]:
+    """Make the band around a surface of values on all vertices of a grid (host side).
+
+    Returns
+    -------
+    band, and the values of its vertices.
+    """
+    nx, ny, nz = grid.shape
+    inside = (np.asarray(sdf) < 0).reshape(nz + 1, ny + 1, nx + 1)
+    is_any, is_all = np.zeros((nz, ny, nx), bool), np.ones((nz, ny, nx), bool)
+    for x, y, z in CORNERS.tolist():
+        corner = inside[z : z + nz, y : y + ny, x : x + nx]
+        is_any |= corner
+        is_all &= corner
+    at_surface = np.flatnonzero(is_any & ~is_all)
+    layout = _layout(grid, cells_around(at_surface, grid.shape, layers))
+    values = np.asarray(sdf)[layout.vertices]
+    band = _padded(grid, layout, values, 0, 0)
+    return band, _filled(values, band.vertex_rows)
+
+
+def cells_around(
+    cells: Int[np.ndarray, " n"], shape: tuple[int, int, int], layers: int
+) -> Int[np.ndarray, " K"]:
+    """Return the numbers of cells and of all within so many layers of them, ascending."""
+    nx, ny, nz = shape
+    x, y, z = cells % nx, cells // nx % ny, cells // (nx * ny)
+    mask = np.zeros(nx * ny * nz, bool)
+    steps = range(-layers, layers + 1)
+    for k in (np.clip(z + step, 0, nz - 1) for step in steps):
+        for j in (np.clip(y + step, 0, ny - 1) for step in steps):
+            row = nx * (j + ny * k)
+            for step in steps:
+                mask[row + np.clip(x + step, 0, nx - 1)] = True
+    return np.flatnonzero(mask).astype(np.int32)
+
+
+def _layout(grid: Grid, cells: Int[np.ndarray, " K"]) -> _Layout:
+    """Find the vertices of cells, and what lies beside what."""
+    nx, ny, _ = grid.shape
+    sizes = grid.vertex_shape
+    strides = (1, sizes[0], sizes[0] * sizes[1])
+    base = cells % nx + strides[1] * (cells // nx % ny) + strides[2] * (cells // (nx * ny))
+    numbers = base[None, :] + (CORNERS @ np.array(strides, np.int32))[:, None]
+    is_held = np.zeros(grid.vertex_count, bool)
+    is_held[numbers] = True
+    vertices = np.flatnonzero(is_held).astype(np.int32)
+    # Only rows of vertices that are held are written, or read.
+    row_of = np.empty(grid.vertex_count, np.int32)
+    own = row_of[vertices] = np.arange(vertices.size, dtype=np.int32)
+    corners = row_of[numbers]
+    neighbours = []
+    cells_beside = np.ones(vertices.shape, np.int32)
+    for size, stride in zip(sizes, strides, strict=True):
+        place = vertices // stride % size
+        cells_beside *= np.where((place > 0) & (place < size - 1), 2, 1)
+        for step in (-1, 1):
+            exists = (place + step >= 0) & (place + step < size)
+            beside = np.where(exists, vertices + step * stride, vertices)
+            beside = np.where(is_held[beside], beside, vertices)
+            neighbours.append(row_of[beside])
+    is_border = np.bincount(corners.reshape(-1), minlength=own.size) < cells_beside
+    return _Layout(cells, vertices, corners, np.stack(neighbours), is_border)
+
+
+def _padded(
+    grid: Grid, layout: _Layout, values: np.ndarray, cell_rows: int, vertex_rows: int
+) -> Band:
+    """Make the band of a layout, in as many rows as an earlier one where they fit."""
+    cell_rows = _row_count(layout.cells.size, cell_rows)
+    vertex_rows = _row_count(layout.vertices.size, vertex_rows)
+    side = np.where(values < 0, -1, 1).astype(np.int8)
+    own = np.arange(vertex_rows, dtype=np.int32)
+    neighbours = np.tile(own, (6, 1))
+    neighbours[:, : layout.vertices.size] = layout.neighbours
+    corners = np.zeros((8, cell_rows), np.int32)
+    corners[:, : layout.cells.size] = layout.corners
+    is_in_band = np.zeros(grid.cube_count, bool)
+    is_in_band[layout.cells] = True
+    return Band(
+        grid=grid,
+        cells=jnp.asarray(_filled(layout.cells, cell_rows)),
+        vertices=jnp.asarray(_filled(layout.vertices, vertex_rows)),
+        corners=jnp.asarray(corners),
+        neighbours=jnp.asarray(neighbours),
+        fixed=jnp.asarray(
+            _filled(np.where(layout.is_border, side, 0).astype(np.int8), vertex_rows)
+        ),
+        bits=_bit_set(jnp.asarray(is_in_band)),
+    )
+
+
+def _row_count(count: int, have: int) -> int:
+    """Choose a number of rows: as before where that is enough and not far too much."""
+    wanted = bucket(int(_HEADROOM * count))
+    return have if count <= have <= _MANY * wanted else wanted
+
+
+def _filled(values: np.ndarray, rows: int, padding: int = 0) -> np.ndarray:
+    """Add rows of padding."""
+    full = np.full(rows, padding, values.dtype)
+    full[: values.size] = values
+    return full
+
+
+def _rows_before(old: np.ndarray, new: np.ndarray) -> Int[np.ndarray, " n"]:
+    """Find ascending numbers among those before; -1 for one that was not there."""
+    place = np.minimum(np.searchsorted(old, new), old.size - 1)
+    return np.where(old[place] == new, place, -1).astype(np.int32)
+
+
+def _extended(
+    values: np.ndarray, is_known: Bool[np.ndarray, " G"], corners: Int[np.ndarray, "8 K"]
+) -> np.ndarray:
+    """Give values to vertices that have none, from those at the corners of the same cells.
+
+    No surface passes through a cell with such a vertex, so that all of its corners lie on one side.
+    """
+    values, is_known = values.copy(), is_known.copy()
+    while not is_known.all():
+        known = is_known[corners]
+        cells = corners[:, known.any(axis=0) & ~known.all(axis=0)]
+        size = np.full(values.shape, np.inf, values.dtype)
+        side = np.zeros(values.shape, values.dtype)
+        for source, target in np.ndindex(8, 8):
+            taken = is_known[cells[source]] & ~is_known[cells[target]]
+            start, end = cells[source][taken], cells[target][taken]
+            way = values.dtype.type(_CORNER_DISTANCE[source, target])
+            np.minimum.at(size, end, np.abs(values[start]) + way)
+            side[end] = np.where(values[start] < 0, -1, 1)
+        reached = np.isfinite(size)
+        # Every layer of cells around the surface touches the one before.
+        assert reached.any(), "a band of cells that do not touch"
+        values[reached] = side[reached] * np.minimum(size[reached], REACH)
+        is_known |= reached
+    return values
