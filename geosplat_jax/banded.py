@@ -26,12 +26,17 @@ class BandedFlexiCubes(GridSurface):
     ----------
     band : cells and vertices that hold values; they are the rows of the shape.
     layers : static; cells on each side of those that the surface passes through.
-    entropy_reduction : see `GridSurface`.
+    entropy_reduction : see `GridSurface.reduction`.
     """
 
     band: Band
     layers: int = eqx.field(static=True, default=1)
     entropy_reduction: Literal["mean", "sum"] = eqx.field(static=True, default="mean")
+
+    @property
+    def reduction(self) -> Literal["mean", "sum"]:
+        """As it was given."""
+        return self.entropy_reduction
 
     @property
     def lattice(self) -> Lattice:

@@ -456,20 +456,20 @@ def edge_deviations(
 
 
 class GridSurface(SurfaceModel):
-    """Isosurface of values on a grid, with the regularisers of FlexiCubes and Eq. 14.
-
-    Attributes
-    ----------
-    entropy_reduction : static; ``"mean"`` over the edges of Eq. 14 or their ``"sum"``, as printed.
-        The sum grows with the number of crossed edges and soon outweighs the picture.
-    """
-
-    entropy_reduction: eqx.AbstractVar[Literal["mean", "sum"]]
+    """Isosurface of values on a grid, with the regularisers of FlexiCubes and Eq. 14."""
 
     @property
     @abc.abstractmethod
     def lattice(self) -> Lattice:
         """Which cells and vertices of the grid hold values."""
+
+    @property
+    @abc.abstractmethod
+    def reduction(self) -> Literal["mean", "sum"]:
+        """Mean over the edges of Eq. 14, or their sum, as printed (static).
+
+        The sum grows with the number of crossed edges and soon outweighs the picture.
+        """
 
     @property
     def box(self) -> Box:
@@ -486,7 +486,7 @@ class GridSurface(SurfaceModel):
         """Evaluate ``entropy`` (Eq. 14), ``deviation`` (L_dev, in half boxes) and ``weights``."""
         lattice = self.lattice
         return {
-            "entropy": sdf_entropy(shape, lattice, reduction=self.entropy_reduction),
+            "entropy": sdf_entropy(shape, lattice, reduction=self.reduction),
             "deviation": surface.deviation / self.box.half_extent,
             "weights": weight_magnitude(shape, lattice.grid.cube_count),
         }
@@ -521,11 +521,16 @@ class FlexiCubes(GridSurface):
     Attributes
     ----------
     grid : where the values live.
-    entropy_reduction : see `GridSurface`.
+    entropy_reduction : see `GridSurface.reduction`.
     """
 
     grid: Grid
     entropy_reduction: Literal["mean", "sum"] = eqx.field(static=True, default="mean")
+
+    @property
+    def reduction(self) -> Literal["mean", "sum"]:
+        """As it was given."""
+        return self.entropy_reduction
 
     @property
     def lattice(self) -> Lattice:
