@@ -12,6 +12,7 @@ from geosplat_jax.banded import BandedFlexiCubes
 from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.core.types import Geometry, Grid
 from geosplat_jax.fit import loop as loop_module
+from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.config import Rate
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.loop import new_loop, resumed_loop
@@ -453,4 +454,4 @@ def test_training_in_a_band_is_training_on_the_whole_grid(dataset, tmp_path, mon
         assert two["loss"] == pytest.approx(one["loss"], rel=1e-4)
     stopped = tmp_path / "stopped"
     fit(dataset, banded, stopped, stop_after=3)
-    assert_same(fit(dataset, banded, stopped, resume=True), states[1])
+    assert_same(fit(dataset, banded, stopped, begin=Resume()), states[1])
