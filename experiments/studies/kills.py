@@ -116,7 +116,7 @@ class Process:
         }
         with log.open("wb") as words:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "geosplat_jax.cli", *arguments],
+                [sys.executable, "-m", "geosplat_jax", *arguments],
                 stdout=words,
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,
