@@ -14,6 +14,7 @@ from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.loop import new_loop, resumed_loop
 from geosplat_jax.fit.stages import build_pipeline, make_batch
 from geosplat_jax.fit.step import StepReport
+from geosplat_jax.fit.trained import NextStage
 from geosplat_jax.pipeline import LossReport
 
 CONFIG = tiny_config(
@@ -154,3 +155,16 @@ def test_what_was_noted_between_steps_returns_when_a_run_is_resumed(dataset, fol
     assert resumed.pipeline.capacities == loop.pipeline.capacities
     assert resumed.last_checkpoint == path
     assert (resumed.step, resumed.stage) == (3, CONFIG.stages[0])
+
+
+def test_what_is_known_of_the_next_stage_is_kept_until_it_begins(dataset, folder, steps):
+    """A run that is resumed where a stage has just ended writes what the other one wrote."""
+    steps()
+    loop = new_loop(dataset, CONFIG, folder)
+    noted = {"stage": "monte_carlo", "capacities": {"hits": 256}}
+    loop.to_come = NextStage(**noted)
+    assert loop.meta()["to_come"] == noted
+    loop.stage = CONFIG.stage("monte_carlo")
+    assert loop.meta()["to_come"] is None
+    assert loop._planned(None) == Capacities(hits=256)
+    assert loop.to_come is None

@@ -72,6 +72,20 @@ with stopping.stops_soon(with_process={alone}) as say_stopped:
         assert (done.returncode, done.stderr) == (status, "stopped\n")
 
 
+def test_ctrl_c_after_the_end_of_a_command_is_silent():
+    """Libraries clean up for some tenths of a second, and would show where they were."""
+    program = """
+import atexit, signal
+from geosplat_jax.cli import stopping
+signal.signal(signal.SIGINT, signal.default_int_handler)
+atexit.register(signal.raise_signal, signal.SIGINT)
+with stopping.stops_soon(with_process=True):
+    pass
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
+
+
 def test_a_handler_of_its_own_is_left_alone():
     note = "asked = []; signal.signal(signal.SIGINT, lambda number, frame: asked.append(1))"
     wait = "asked and (time.sleep(0.6) or True)"

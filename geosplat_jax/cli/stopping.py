@@ -79,7 +79,10 @@ def stops_soon(*, with_process: bool) -> Iterator[Callable[[], None]]:
         yield notice
     finally:
         signal.set_wakeup_fd(previous)
-        if not with_process:
+        if with_process:
+            # While the process cleans up there is nobody to catch a KeyboardInterrupt.
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+        else:
             has_returned.set()
         # Nothing more comes: a watch that was not called for ends.
         sender.close()

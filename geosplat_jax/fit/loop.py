@@ -142,8 +142,17 @@ class Loop:
             "planned_for": self.planned_for,
             "peak": self.peak,
             "recoveries": self.recoveries,
-            "to_come": None if self.upcoming is None else self.upcoming.meta(),
+            "to_come": self._known_to_come(),
         }
+
+    def _known_to_come(self) -> dict[str, Any] | None:
+        """Return what a checkpoint keeps of the next stage; after a resume, what one has kept."""
+        if self.upcoming is not None:
+            return self.upcoming.meta()
+        known = self.to_come
+        if known is None or known.stage == self.stage.name:
+            return None
+        return {"stage": known.stage, "capacities": dict(known.capacities)}
 
     def tree(self) -> dict[str, Any]:
         """All arrays of a checkpoint."""
@@ -218,13 +227,15 @@ class Loop:
 
         ``known`` : sizes that hold what the stage begins with; None where it begins anew.
         """
-        upcoming = self.upcoming
+        upcoming, noted = self.upcoming, None
+        if self.to_come is not None and self.to_come.stage == self.stage.name:
+            noted, self.to_come = self.to_come, None
         if upcoming is not None and upcoming.stage.name == self.stage.name:
             self.upcoming = None
             upcoming.compiled.result()
             return upcoming.capacities
-        if self.to_come is not None and self.to_come.stage == self.stage.name:
-            return Capacities(**self.to_come.capacities)
+        if noted is not None:
+            return Capacities(**noted.capacities)
         if known is not None:
             return add_rays(self.pipeline, self.params, known)
         return plan_capacities(
