@@ -24,6 +24,11 @@ class _Notice:
     def __init__(self) -> None:
         self._is_new = threading.Lock()
 
+    @property
+    def was_given(self) -> bool:
+        """Whether it was said."""
+        return self._is_new.locked()
+
     def __call__(self) -> None:
         """Say it, unless that was done."""
         if self._is_new.acquire(blocking=False):
@@ -79,10 +84,10 @@ def stops_soon(*, with_process: bool) -> Iterator[Callable[[], None]]:
         yield notice
     finally:
         signal.set_wakeup_fd(previous)
-        if with_process:
+        if not with_process:
+            has_returned.set()
+        elif not notice.was_given:
             # While the process cleans up there is nobody to catch a KeyboardInterrupt.
             signal.signal(signal.SIGINT, signal.SIG_DFL)
-        else:
-            has_returned.set()
         # Nothing more comes: a watch that was not called for ends.
         sender.close()
