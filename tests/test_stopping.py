@@ -72,6 +72,28 @@ with stopping.stops_soon(with_process={alone}) as say_stopped:
         assert (done.returncode, done.stderr) == (status, "stopped\n")
 
 
+def test_ctrl_c_that_a_callback_swallows_is_raised_again():
+    """Python only reports what is raised where nobody can catch it, and goes on."""
+    program = """
+import signal, time
+from geosplat_jax.cli import stopping
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+class Callback:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+with stopping.stops_soon(with_process=False):
+    try:
+        Callback()
+        time.sleep(20)
+    except KeyboardInterrupt:
+        print("heard")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "heard\n", "")
+
+
 def test_ctrl_c_after_the_end_of_a_command_is_silent():
     """Libraries clean up for some tenths of a second, and would show where they were."""
     program = """

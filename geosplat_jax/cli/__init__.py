@@ -8,12 +8,15 @@ def main(argv: list[str] | None = None) -> int:
 
     Errors that a user can cure print one line and return 2, what somebody stopped 130.
     """
-    with stops_soon(with_process=argv is None) as say_stopped:
-        try:
-            # Imports take seconds, in which somebody may have second thoughts.
-            from geosplat_jax.cli.calling import call
+    try:
+        with stops_soon(with_process=argv is None) as say_stopped:
+            try:
+                # Imports take seconds, in which somebody may have second thoughts.
+                from geosplat_jax.cli.calling import call
 
-            return call(argv)
-        except KeyboardInterrupt:
-            say_stopped()
-            return STOPPED
+                return call(argv)
+            except KeyboardInterrupt:
+                say_stopped()
+                return STOPPED
+    except KeyboardInterrupt:  # between the last line of a command and the end of the block
+        return STOPPED

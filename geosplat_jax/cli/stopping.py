@@ -10,12 +10,17 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 STOPPED = 130
 """Status of a command that somebody stopped."""
 
 _GRACE = 3.0
 """Seconds in which a command can end in its own way."""
+
+
+_AGAIN = 0.05
+"""Seconds after which Ctrl-C that was swallowed is raised again: the callback is over by then."""
 
 
 class _Notice:
@@ -55,6 +60,24 @@ def _watch(receiver: socket.socket, has_returned: threading.Event, notice: _Noti
 
 
 @contextmanager
+def _heard_in_callbacks() -> Iterator[None]:
+    """Raise Ctrl-C again where a callback of a library has swallowed it, and say nothing."""
+    previous = sys.unraisablehook
+
+    def hook(unraisable: Any) -> None:
+        if issubclass(unraisable.exc_type, KeyboardInterrupt):
+            threading.Timer(_AGAIN, os.kill, (os.getpid(), signal.SIGINT)).start()
+        else:
+            previous(unraisable)
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = previous
+
+
+@contextmanager
 def stops_soon(*, with_process: bool) -> Iterator[Callable[[], None]]:
     """End the process soon after Ctrl-C within the block, see `_watch`.
 
@@ -81,7 +104,8 @@ def stops_soon(*, with_process: bool) -> Iterator[Callable[[], None]]:
     watch = threading.Thread(target=_watch, args=(receiver, has_returned, notice), daemon=True)
     watch.start()
     try:
-        yield notice
+        with _heard_in_callbacks():
+            yield notice
     finally:
         signal.set_wakeup_fd(previous)
         if not with_process:
