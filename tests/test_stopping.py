@@ -16,16 +16,18 @@ from geosplat_jax.cli import stopping
 stopping._GRACE = 0.2
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 {handler}
+end = time.monotonic() + 20
+
+def wait():
+    while time.monotonic() < end and not ({ends}):
+        time.sleep(0.05)
+
 with stopping.stops_soon(with_process=True):
-    print("ready", flush=True)
-    end = time.monotonic() + 20
-    while time.monotonic() < end:
-        try:
-            time.sleep(0.05)
-        except KeyboardInterrupt:
-            pass
-        if {ends}:
-            break
+    try:  # the signal may come as soon as this is read
+        print("ready", flush=True)
+        wait()
+    except KeyboardInterrupt:
+        wait()
 """
 
 
