@@ -153,8 +153,10 @@ def choose_model(
         if not kept.issuperset(_among(part.follows, offered)):
             continue
         wanted = kept | {part.name} | _among(part.needs, offered)
-        judge = _tried if part.is_photographed else _seen_on_surface
-        rung = judge(trials, part, kept, wanted)
+        if part.is_photographed:
+            rung = _tried(trials, part, kept, wanted)
+        else:
+            rung = _seen_on_surface(trials, part, kept)
         kept = frozenset(wanted) if rung.is_kept else kept
         rungs.append(rung)
         listener.on_rung(rung)
@@ -197,11 +199,8 @@ def _tried(trials: "_Trials", part: Part, kept: Collection[str], wanted: Collect
     return Rung(part.name, part.title, before, after, found, found.is_kept, note)
 
 
-def _seen_on_surface(
-    trials: "_Trials", part: Part, kept: Collection[str], wanted: Collection[str]
-) -> Rung:
+def _seen_on_surface(trials: "_Trials", part: Part, kept: Collection[str]) -> Rung:
     """Judge a part that photographs cannot tell by what the surface blocks from itself."""
-    del wanted
     before = float(np.mean(trials.decibels(kept, 0)))
     share = trials.blocked_share()
     note = f"the surface blocks {100 * share:.1f} % of an even sky"

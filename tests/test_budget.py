@@ -229,6 +229,11 @@ def test_a_later_stage_that_would_come_too_short_is_left_out_and_its_time_used()
     assert seconds == pytest.approx(480.0, rel=0.1)
 
 
+def test_a_later_stage_of_which_something_was_set_is_not_left_out():
+    chosen = plan(Budget(150.0), SIZE, slowness=1.0, overrides=["stages.monte_carlo.batch_views=2"])
+    assert [stage.name for stage in chosen.config.active_stages] == ["split_sum", "monte_carlo"]
+
+
 def test_what_is_too_short_for_all_stages_goes_to_the_first():
     chosen = plan(Budget(110.0), SIZE, slowness=1.0)
     assert [stage.name for stage in chosen.config.active_stages] == ["split_sum"]

@@ -178,4 +178,5 @@ class ProgressDisplay(Listener):
     def on_rung(self, rung: Rung) -> None:
         """Say what became of a part of the model, as soon as it is known."""
         title, _, larger, gain, verdict = rung_row(asdict(rung))
-        say(f"model: {title}: {larger}, gain {gain}: {verdict}")
+        measured = f"{larger}, gain {gain}: " if rung.found is not None else ""
+        say(f"model: {title}: {measured}{verdict}")

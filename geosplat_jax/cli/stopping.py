@@ -18,7 +18,6 @@ STOPPED = 130
 _GRACE = 3.0
 """Seconds in which a command can end in its own way."""
 
-
 _AGAIN = 0.05
 """Seconds after which Ctrl-C that was swallowed is raised again: the callback is over by then."""
 

@@ -146,7 +146,8 @@ def plan(
     """Choose the settings that a budget pays for.
 
     The most that fits with the steps of its own, these then scaled to fill the time. Where that is
-    less than later stages are worth, the same of the first stage alone.
+    less than later stages are worth, the same of the first stage alone, unless ``overrides`` set
+    something of a later one.
 
     Parameters
     ----------
@@ -174,7 +175,9 @@ def plan(
             )
         candidates = fitting
     affordable = [one for one in candidates if one.seconds <= budget.seconds]
-    if not affordable or affordable[-1].effort < _ALL_STAGES:
+    if not _asks_for_more(overrides, candidates[0].config) and (
+        not affordable or affordable[-1].effort < _ALL_STAGES
+    ):
         candidates = [_first_stage_alone(one) for one in candidates]
         affordable = [one for one in candidates if one.seconds <= budget.seconds]
     chosen = affordable[-1] if affordable else candidates[0]
@@ -208,6 +211,12 @@ def _candidate(
     costs = expected_costs(config, pixels, slowness=slowness)
     seconds = expected_seconds(config, costs)
     return Plan(config, downscale, effort, costs, seconds, expected_memory(config))
+
+
+def _asks_for_more(overrides: Sequence[str], config: Config) -> bool:
+    """Whether somebody has set something of a stage after the first."""
+    later = tuple(f"stages.{stage.name}." for stage in config.active_stages[1:])
+    return any(text.startswith(later) for text in overrides)
 
 
 def _first_stage_alone(chosen: Plan) -> Plan:
