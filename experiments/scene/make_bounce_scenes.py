@@ -11,7 +11,7 @@ gaps of a twentieth of its diameter. Rendered by Mitsuba 3 as `make_scene.py` re
 from __future__ import annotations
 
 import argparse
-import time
+from functools import partial
 from pathlib import Path
 
 import make_scene
@@ -117,10 +117,8 @@ def main() -> None:
     parser.add_argument("--only", choices=tuple(SCENES), help="one of the scenes")
     parser.set_defaults(views=48, spp=256, output=Path("scenes"))
     args = parser.parse_args()
-    print(make_scene.choose_variant(args.variant))
     for name in SCENES if args.only is None else (args.only,):
-        start = time.perf_counter()
-        print(f"{build(name, args)}: {time.perf_counter() - start:.0f} s")
+        make_scene.timed_build(args, partial(build, name))
 
 
 if __name__ == "__main__":

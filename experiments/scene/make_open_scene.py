@@ -11,7 +11,6 @@ open: what `train --mesh` takes and an isosurface cannot be.
 from __future__ import annotations
 
 import argparse
-import time
 from pathlib import Path
 
 import make_scene
@@ -133,10 +132,7 @@ def main() -> None:
     """Parse the command line and build the scene."""
     parser = make_scene.parser(__doc__)
     parser.set_defaults(views=32, test_views=6, spp=100, output=Path("scenes"))
-    args = parser.parse_args()
-    start = time.perf_counter()
-    print(make_scene.choose_variant(args.variant))
-    print(f"{build(args)}: {time.perf_counter() - start:.0f} s")
+    make_scene.timed_build(parser.parse_args(), build)
 
 
 if __name__ == "__main__":

@@ -460,6 +460,13 @@ def parser(documentation: str) -> argparse.ArgumentParser:
     return made
 
 
+def timed_build(args: argparse.Namespace, build: Callable[[argparse.Namespace], Path]) -> None:
+    """Activate a Mitsuba variant, build a scene, and say where it is and what it took."""
+    start = time.perf_counter()
+    print(choose_variant(args.variant))
+    print(f"{build(args)}: {time.perf_counter() - start:.0f} s")
+
+
 def main() -> None:
     """Parse the command line and build the scene."""
     args = parser(__doc__).parse_args()

@@ -10,7 +10,6 @@ twenty-fifth of the basket's width thick: as wide as two cells where 48 lie alon
 from __future__ import annotations
 
 import argparse
-import time
 from pathlib import Path
 
 import make_scene
@@ -115,10 +114,7 @@ def main() -> None:
     """Parse the command line and build the scene."""
     parser = make_scene.parser(__doc__)
     parser.set_defaults(views=48, size=200, spp=144, output=Path("scenes"))
-    args = parser.parse_args()
-    start = time.perf_counter()
-    print(make_scene.choose_variant(args.variant))
-    print(f"{build(args)}: {time.perf_counter() - start:.0f} s")
+    make_scene.timed_build(parser.parse_args(), build)
 
 
 if __name__ == "__main__":
