@@ -6,6 +6,7 @@ import shutil
 import struct
 import subprocess
 import sys
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +19,8 @@ from geosplat_jax.core.types import Camera, Mesh
 from geosplat_jax.io import baking, export, meshes
 from geosplat_jax.io.images import SceneError, read_linear
 from geosplat_jax.io.usd import write_usd
+
+DATA = Path(__file__).parent / "data"
 
 # Half a texel across a chart's border, where a filled gutter is constant; 8 bits are far finer.
 COLOR_TOLERANCE = 0.03
@@ -394,6 +397,16 @@ def test_tangents_follow_u_and_the_bitangent_points_to_the_top_of_the_texture():
     nothing = baking.vertex_tangents(vertices, faces, normals, np.zeros((4, 2)))
     np.testing.assert_allclose(np.linalg.norm(nothing[:, :3], axis=1), 1)
     np.testing.assert_allclose((nothing[:, :3] * normals).sum(1), 0, atol=1e-6)
+
+
+def test_tangents_are_those_of_mikktspace():
+    # Two bent sheets, one with a mirrored texture, and what Mikkelsen's own program makes of them
+    # (`mikktspace` 1.1.1 of npm, in WebAssembly; v runs upwards there, and downwards here).
+    with np.load(DATA / "mikktspace.npz") as known:
+        names = ("vertices", "faces", "normals", "uv")
+        found = baking.vertex_tangents(*(known[name] for name in names))
+        np.testing.assert_allclose(found, known["tangents"], atol=1e-6)
+    assert set(found[:, 3]) == {-1.0, 1.0}
 
 
 def test_the_nearest_point_of_a_surface_is_that_of_all_its_faces():

@@ -116,6 +116,39 @@ def test_a_handler_of_its_own_is_left_alone():
     assert stopped(note, wait)[:2] == (0, "")
 
 
+REQUEST = """
+from geosplat_jax.fit.train import stop_requests
+requests = stop_requests()
+is_asked = requests.__enter__()
+"""
+"""What a training does; here it is in the middle of something that takes long."""
+
+
+def test_a_training_says_at_once_that_it_will_stop():
+    """Whoever hears nothing for the rest of a compilation presses Ctrl-C again, and loses steps."""
+    status, said, _ = stopped(REQUEST, "is_asked() and (time.sleep(0.6) or True)")
+    assert (status, said) == (0, "stopping after this step; Ctrl-C once more stops at once\n")
+
+
+def test_the_second_ctrl_c_ends_a_training_that_cannot_hear():
+    """Python calls handlers between its own instructions, of which a compilation has none."""
+    program = """
+import hashlib, os, signal, threading
+from geosplat_jax.cli import stopping
+from geosplat_jax.fit.train import stop_requests
+stopping._GRACE = 0.2
+with stopping.stops_soon(with_process=True), stop_requests():
+    for delay in (0.1, 0.5):
+        threading.Timer(delay, os.kill, (os.getpid(), signal.SIGINT)).start()
+    while True:
+        hashlib.pbkdf2_hmac("sha256", b"", b"", 100_000_000)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60
+    )
+    assert (done.returncode, done.stderr.splitlines()[1:]) == (130, ["stopped"])
+
+
 @pytest.mark.parametrize("command", ["info", "evaluate", "export"])
 def test_ctrl_c_is_one_line_and_a_status(command, tmp_path, monkeypatch, capsys):
     def interrupted(arguments):

@@ -44,12 +44,18 @@ def _watch(receiver: socket.socket, has_returned: threading.Event, notice: _Noti
 
     Python notices a signal between two of its own instructions, and raises KeyboardInterrupt there.
     That may be a minute later, after a compilation, or within a function whose errors nobody gets.
+    A handler with a ``notice`` wants to go on for a while: its words are said at once, and only the
+    second signal ends the process. Any other handler is left alone.
     """
     with receiver:
+        was_told = False
         while number := receiver.recv(1):
-            is_plain = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-            if number[0] == signal.SIGINT and is_plain:
+            handler = signal.getsignal(number[0])
+            if handler is signal.default_int_handler or was_told:
                 break
+            if words := getattr(handler, "notice", None):
+                print(words, file=sys.stderr, flush=True)
+                was_told = True
         else:
             return
         if has_returned.wait(_GRACE):
@@ -80,8 +86,9 @@ def _heard_in_callbacks() -> Iterator[None]:
 def stops_soon(*, with_process: bool) -> Iterator[Callable[[], None]]:
     """End the process soon after Ctrl-C within the block, see `_watch`.
 
-    A training has a handler of its own, which lets it write a checkpoint, and is left alone. So is
-    whatever does not run in the main thread, to which signals do not come.
+    A training has a handler of its own, which lets it end its step and write a checkpoint; the second
+    Ctrl-C does not wait for that. What does not run in the main thread is left alone: signals do not
+    come to it.
 
     Parameters
     ----------

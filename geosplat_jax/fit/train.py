@@ -50,28 +50,42 @@ class Interrupted(Exception):
     """The user stopped the run; it can be continued."""
 
 
+class _StopRequest:
+    """A signal's handler that notes the first one; the second raises KeyboardInterrupt.
+
+    Attributes
+    ----------
+    notice : what whoever hears of the signal at once may tell the user: Python calls the handler
+        only when a compilation or a step is over.
+    """
+
+    notice = "stopping after this step; Ctrl-C once more stops at once"
+
+    def __init__(self) -> None:
+        self.was_made = False
+
+    def __call__(self, number: int, frame: Any) -> None:
+        """Handle a signal."""
+        if self.was_made:
+            raise KeyboardInterrupt
+        self.was_made = True
+
+
 @contextmanager
 def stop_requests() -> Iterator[Callable[[], bool]]:
     """Turn Ctrl-C and SIGTERM into a flag that the loop reads between two steps.
 
     A second signal does not wait: it raises KeyboardInterrupt wherever the program is.
     """
-    asked = []
-
-    def note(number: int, frame: Any) -> None:
-        if asked:
-            raise KeyboardInterrupt
-        asked.append(number)
-
-    previous = {}
+    request, previous = _StopRequest(), {}
     for number in (signal.SIGINT, signal.SIGTERM):
         try:
-            previous[number] = signal.signal(number, note)
+            previous[number] = signal.signal(number, request)
         except ValueError:
             # Not in the main thread: signals are somebody else's business.
             break
     try:
-        yield lambda: bool(asked)
+        yield lambda: request.was_made
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

@@ -99,35 +99,51 @@ def vertex_tangents(
     normals: Float[np.ndarray, "V 3"],
     uv: Float[np.ndarray, "V 2"],
 ) -> Float[np.ndarray, "V 4"]:
-    """Return glTF's tangents: the direction of growing u, and the sign of the bitangent.
+    """Return glTF's tangents by MikkTSpace: the direction of growing u, and the bitangent's sign.
 
-    The mean over a vertex's faces, by area, made orthogonal to its normal. The bitangent, the sign
-    times normal x tangent, points to the top of the texture.
+    The convention of Blender, Substance and most engines (Mikkelsen 2008, "Simulation of Wrinkled
+    Surfaces Revisited"), so that a program that makes tangents of its own reads the map alike. The
+    directions of a vertex's faces, each of unit length across the normal, count by the angle of
+    their corner there, as seen along the normal. The bitangent, the sign times normal x tangent,
+    points to the top of the texture.
 
     Parameters
     ----------
-    uv : (V, 2), ``v`` downwards; vertices are cut where charts meet.
+    normals : (V, 3), of unit length.
+    uv : (V, 2), ``v`` downwards; vertices are cut where charts meet, and no chart is mirrored in
+        part, so that all faces of a vertex have one sign.
     """
     corners, places = np.asarray(vertices, np.float64)[faces], np.asarray(uv, np.float64)[faces]
     edges, steps = corners[:, 1:] - corners[:, :1], places[:, 1:] - places[:, :1]
     steps[..., 1] *= -1.0  # from downwards to upwards
     area = steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 1, 0] * steps[:, 0, 1]
-    sign = np.sign(area)[:, None]
+    sign = np.sign(area)
     # Times the area on the texture, whose sign is all that matters of it.
-    towards_u = sign * (steps[:, 1, 1:] * edges[:, 0] - steps[:, 0, 1:] * edges[:, 1])
-    towards_v = sign * (steps[:, 0, :1] * edges[:, 1] - steps[:, 1, :1] * edges[:, 0])
-    tangents, bitangents = np.zeros((2, len(vertices), 3))
+    towards_u = sign[:, None] * (steps[:, 1, 1:] * edges[:, 0] - steps[:, 0, 1:] * edges[:, 1])
+    tangents, side = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
     for corner in range(3):
-        np.add.at(tangents, faces[:, corner], towards_u)
-        np.add.at(bitangents, faces[:, corner], towards_v)
-    along = (tangents * normals).sum(-1, keepdims=True)
-    tangents = tangents - along * normals
+        rows = faces[:, corner]
+        normal = normals[rows]
+        before, after = (
+            unit(_across(corners[:, (corner + step) % 3] - corners[:, corner], normal))
+            for step in (2, 1)
+        )
+        angle = np.arccos(np.clip((before * after).sum(-1), -1.0, 1.0))
+        np.add.at(tangents, rows, angle[:, None] * unit(_across(towards_u, normal)))
+        np.add.at(side, rows, angle * sign)
     # Where the texture says nothing, any direction across the normal will do.
     axis = np.eye(3)[np.abs(normals).argmin(axis=1)]
     lost = (tangents**2).sum(-1, keepdims=True) <= 0
     tangents = unit(np.where(lost, np.cross(normals, axis), tangents))
-    side = (np.cross(normals, tangents) * bitangents).sum(-1, keepdims=True)
-    return np.concatenate([tangents, np.where(side < 0, -1.0, 1.0)], axis=-1).astype(np.float32)
+    signs = np.where(side < 0, -1.0, 1.0)[:, None]
+    return np.concatenate([tangents, signs], axis=-1).astype(np.float32)
+
+
+def _across(
+    vectors: Float[np.ndarray, "N 3"], normals: Float[np.ndarray, "N 3"]
+) -> Float[np.ndarray, "N 3"]:
+    """Return the part of vectors that is orthogonal to unit normals."""
+    return vectors - (vectors * normals).sum(-1, keepdims=True) * normals
 
 
 def in_tangent_space(
