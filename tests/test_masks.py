@@ -104,6 +104,29 @@ def test_a_larger_cluster_at_the_edge_is_not_the_object():
     np.testing.assert_allclose(proposal.hi, 0.4, atol=0.1)
 
 
+def test_what_some_photographs_cut_off_belongs_to_the_object_where_it_is_connected():
+    """As a muzzle that sticks out towards the camera of close photographs."""
+    rod = (
+        on_ball(900, radius=0.12) * [1.0, 1.0, 0.0]
+        + [0.0, 0.0, 1.0] * np.linspace(0.3, 1.25, 900)[:, None]
+    )
+    apart = on_ball(900, (0.0, 1.1, 1.0), radius=0.15)
+    cloud = cloud_of(on_ball(1500, radius=0.5), rod, apart)
+    eyes = [[np.cos(a) * d, np.sin(a) * d, 0.2] for a in np.arange(0, 6, 0.5) for d in (2.2, 4.5)]
+    views = views_from(np.array(eyes), size=40, field_of_view=0.8)
+    share = np.mean([_tip_is_seen(views, index, [0.0, 0.0, 1.25]) for index in range(len(views))])
+    assert 0.4 < share < 0.8
+    proposal = propose_box(cloud, views)
+    assert proposal.hi[2] == pytest.approx(1.25, abs=0.12)
+    assert proposal.hi[1] < 0.7
+
+
+def _tip_is_seen(views, index, point):
+    local = views.world_to_camera[index] @ [*point, 1.0]
+    pixel = (views.intrinsics[index] @ local[:3])[:2] / local[2]
+    return (pixel >= 0).all() and (pixel < 40).all()
+
+
 @pytest.mark.parametrize("axes", [[2, 0, 1], [0, 1, 2]])
 def test_a_board_through_the_object_is_no_ground(axes):
     # As many points on either side of the plane, so nothing stands on it.

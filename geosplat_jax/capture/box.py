@@ -22,6 +22,8 @@ _LEAST_WEIGHT = 0.5
 _LARGEST_SCALE = 0.06  # of the sides of the search; larger splats are the background
 _SEEN = 0.8
 """Share of the cameras that must have a place in sight for the object to be there."""
+_SEEN_IN_PART = 0.4
+"""The same of what is connected with such a place: photographs may cut off a part of the object."""
 _FREE = 0.9
 """Of the way from the middle of the search to the nearest camera."""
 _CELLS = 40
@@ -103,18 +105,21 @@ def propose_box(cloud: Cloud, views: Views, *, seed: int = 0) -> Proposal:
     positions = np.asarray(cloud.positions, np.float64)
     is_solid = (cloud.opacities > _OPAQUE) & (cloud.sizes < _LARGEST_SCALE * side)
     is_near = ((positions > lo) & (positions < hi)).all(1)
-    is_used = is_solid & is_near & (_seen_share(positions, views) >= _SEEN)
-    if not is_used.any():
+    seen = _seen_share(positions, views)
+    is_used = is_solid & is_near & (seen >= _SEEN_IN_PART)
+    points, weights = positions[is_used], np.asarray(cloud.opacities, np.float64)[is_used]
+    is_sure = seen[is_used] >= _SEEN
+    if not is_sure.any():
         raise CaptureError(
             f"there is no opaque splat where the cameras look, between {_corner(lo)} and "
             f"{_corner(hi)}; train longer, or {cure}"
         )
-    points, weights = positions[is_used], np.asarray(cloud.opacities, np.float64)[is_used]
     centers = views.camera_to_world[:, :3, 3]
-    plane = _ground(points, weights, centers, side, np.random.default_rng(seed))
-    on_plane = np.zeros(len(points), bool) if plane is None else ~plane.is_above(points)
-    rest, rest_weights = points[~on_plane], weights[~on_plane]
-    members = _largest_cluster(rest, rest_weights, lo, hi)
+    rng = np.random.default_rng(seed)
+    plane = _ground(points[is_sure], weights[is_sure], centers, side, rng)
+    is_above = np.ones(len(points), bool) if plane is None else plane.is_above(points)
+    rest, rest_weights = points[is_above], weights[is_above]
+    members = _largest_cluster(rest, rest_weights, is_sure[is_above], lo, hi)
     if not members.any():
         raise CaptureError(
             f"where the cameras look there is nothing but fog; train longer, or {cure}"
@@ -125,8 +130,8 @@ def propose_box(cloud: Cloud, views: Views, *, seed: int = 0) -> Proposal:
     # A single splat has no extent; a cell of the search then is the smallest box.
     pad = max(pad, 0.5 * side / _CELLS)
     low, high = low - pad, high + pad
-    if on_plane.any():
-        low, high = _cut_at_plane(low, high, points[on_plane], cluster)
+    if not is_above.all():
+        low, high = _cut_at_plane(low, high, points[~is_above & is_sure], cluster)
     share = float(rest_weights[members].sum() / weights.sum())
     return Proposal(low, high, share, plane)
 
@@ -248,9 +253,9 @@ def _plane_through(
 
 
 def _largest_cluster(
-    points: np.ndarray, weights: np.ndarray, lo: np.ndarray, hi: np.ndarray
+    points: np.ndarray, weights: np.ndarray, is_sure: np.ndarray, lo: np.ndarray, hi: np.ndarray
 ) -> Bool[np.ndarray, " N"]:
-    """Find the points of the connected cells that weigh most, near the middle more than far off."""
+    """Find the connected cells whose sure points weigh most, near the middle more than far off."""
     side = float((hi - lo).max())
     cell = np.clip(((points - lo) / side * _CELLS).astype(int), 0, _CELLS - 1)
     density = np.zeros((_CELLS,) * 3)
@@ -261,9 +266,9 @@ def _largest_cluster(
     numbers = found[0]
     cluster = np.where(density[tuple(cell.T)] >= _LEAST_WEIGHT, numbers[tuple(cell.T)], 0)
     away = np.linalg.norm(points - 0.5 * (lo + hi), axis=1) / (_REACH * side)
-    totals = np.bincount(cluster, weights * np.exp(-0.5 * away**2))
+    totals = np.bincount(cluster, is_sure * weights * np.exp(-0.5 * away**2))
     totals[0] = 0.0
-    return (cluster == int(np.argmax(totals))) & (cluster > 0)
+    return (cluster == int(np.argmax(totals))) & (totals.max() > 0.0)
 
 
 def _cut_at_plane(
