@@ -168,8 +168,16 @@ class _Machine:
         (lambda now: 0.5, 0.05),
         (lambda now: 3.0 if now > 150 else 1.0, 0.05),
         (lambda now: 1.0 if now > 150 else 3.0, 0.10),
+        (lambda now: 4.0 if now > 420 else 1.0, 0.10),
     ],
-    ids=["as expected", "half as fast", "twice as fast", "slows down", "recovers"],
+    ids=[
+        "as expected",
+        "half as fast",
+        "twice as fast",
+        "slows down",
+        "recovers",
+        "slows down late",
+    ],
 )
 def test_a_training_ends_in_time_on_a_machine_of_another_speed(speed, tolerance):
     budget = Budget(480.0)

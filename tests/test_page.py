@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 
 import html5lib
 import numpy as np
@@ -12,7 +13,7 @@ from support import tiny_config
 
 from geosplat_jax.cli import main
 from geosplat_jax.fit.folder import RunError, RunFolder
-from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.presets import between_qualities, make_config
 from geosplat_jax.io.images import write_hdr
 from geosplat_jax.report import page
 from geosplat_jax.report.facts import changed_from_preset, command, curves, figure, stage_times
@@ -304,6 +305,20 @@ def test_the_command_of_the_report_makes_the_same_settings():
     assert "'/a b'" in text
     assert "--light 'x y'" in text
     assert "--bounds" not in text
+
+
+def test_settings_between_two_levels_are_said_beside_the_standard_ones():
+    """Those of a budget, which no quality level names."""
+    config = between_qualities(0.6)
+    changed = changed_from_preset(config)
+    assert changed["geometry.resolution"] == (48, config.geometry.resolution)
+    assert "quality" not in changed
+    text, is_whole = command({"scene": "s", "dataset": {}}, config)
+    assert is_whole
+    assert "--quality standard" in text
+    words = re.findall(r"--set '?([^ ']+)", text)
+    again = make_config("default", "standard", overrides=tuple(words))
+    assert replace(again, quality=config.quality) == config
 
 
 def test_settings_that_options_cannot_say_are_not_pretended():

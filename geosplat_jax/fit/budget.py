@@ -244,7 +244,7 @@ def _scaled(
 ) -> Stage:
     """Scale the steps that a stage has left after ``done`` ones; its schedules end as they would.
 
-    ``fewest`` : steps that are left at least. ``most`` : of the whole stage.
+    ``fewest``, ``most`` : steps of the whole stage.
     """
     left = stage.steps - done
     if left <= 0:
@@ -252,7 +252,7 @@ def _scaled(
     remaining = round(share * left)
     if most is not None:
         remaining = min(remaining, most - done)
-    remaining = max(remaining, min(fewest, left))
+    remaining = max(remaining, min(fewest - done, left), 1)
     if remaining == left:
         return stage
     speed = (stage.position(stage.steps) - stage.position(done)) / remaining
@@ -341,7 +341,7 @@ class Pacer:
         """Scale what a stage has left, within limits of what was planned."""
         planned = self._planned.get(stage.name, 0)
         fewest, most = math.ceil(_FEWEST * planned), math.ceil(_LONGEST * planned)
-        return _scaled(stage, done, share, max(fewest, 1), most)
+        return _scaled(stage, done, share, fewest, most)
 
     def _step_seconds(self, name: str) -> float:
         """Estimate a step: as measured, or as expected times what was wrong with the last one."""

@@ -7,14 +7,14 @@ command that repeats the training.
 import json
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from geosplat_jax.fit.config import Config, changed_settings
-from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.presets import BETWEEN, make_config
 from geosplat_jax.report.protocols import NEW_VIEWS, Look, Protocol, ScaledLook, protocol
 
 _MEASURES = {
@@ -169,8 +169,20 @@ def stage_times(lines: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def _preset_of(config: Config) -> Config:
-    return make_config(config.preset, config.quality, material_prior=config.material_prior)
+def _level_of(config: Config) -> str:
+    """Return the quality level that settings are compared with: their own, if they have one."""
+    return "standard" if config.quality == BETWEEN else config.quality
+
+
+def _preset_of(config: Config, overrides: Sequence[str] = ()) -> Config:
+    """Return the preset at that level, under the label of ``config``."""
+    found = make_config(
+        config.preset,
+        _level_of(config),
+        material_prior=config.material_prior,
+        overrides=tuple(overrides),
+    )
+    return replace(found, quality=config.quality)
 
 
 def changed_from_preset(config: Config) -> dict[str, tuple[Any, Any]]:
@@ -186,7 +198,7 @@ def command(record: Mapping[str, Any], config: Config) -> tuple[str, bool]:
     record : ``run.json``. config : the settings in it.
     """
     words = ["geosplat-jax", "train", str(record["scene"]), "--output", "runs/again"]
-    words += ["--preset", config.preset, "--quality", config.quality]
+    words += ["--preset", config.preset, "--quality", _level_of(config)]
     words += ["--material-prior", config.material_prior]
     reading = record["dataset"]
     if reading.get("downscale", 1) != 1:
@@ -200,13 +212,7 @@ def command(record: Mapping[str, Any], config: Config) -> tuple[str, bool]:
         f"{path}={json.dumps(new)}" for path, (_, new) in changed_from_preset(config).items()
     ]
     try:
-        again = make_config(
-            config.preset,
-            config.quality,
-            material_prior=config.material_prior,
-            overrides=tuple(overrides),
-        )
-        is_whole = not changed_settings(again, config)
+        is_whole = not changed_settings(_preset_of(config, overrides), config)
     except ValueError:
         is_whole = False
     if is_whole:
