@@ -86,9 +86,9 @@ def _heard_in_callbacks() -> Iterator[None]:
 def stops_soon(*, with_process: bool) -> Iterator[Callable[[], None]]:
     """End the process soon after Ctrl-C within the block, see `_watch`.
 
-    A training has a handler of its own, which lets it end its step and write a checkpoint; the second
-    Ctrl-C does not wait for that. What does not run in the main thread is left alone: signals do not
-    come to it.
+    A training has a handler of its own, which lets it end its step and write a checkpoint; the
+    second Ctrl-C does not wait for that. What does not run in the main thread is left alone:
+    signals do not come to it.
 
     Parameters
     ----------
