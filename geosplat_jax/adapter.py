@@ -7,17 +7,16 @@ one per vertex row); rows beyond the mesh's counts are inert padding.
 import abc
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from pydantic import Field
 
 from geosplat_jax.core.mesh import face_normals_and_areas, vertex_normals
 from geosplat_jax.core.numerics import safe_divide, safe_norm, safe_normalize, safe_sqrt
 from geosplat_jax.core.rotation import axes_to_quaternion, frame_from_normal, matrix_to_quaternion
-from geosplat_jax.core.settings import Number, Positive, Share, Variant, settings
+from geosplat_jax.core.settings import Number, Positive, PositiveShare, Share, Variant, settings
 from geosplat_jax.core.types import Box, Mesh, Splats
 from geosplat_jax.materials import Attributes
 from geosplat_jax.surface.base import Surface
@@ -40,7 +39,7 @@ class AdapterConstants:
     thickness: Positive = 4.54e-5
     """S_z in half the longest side of the scene's box (the paper's box is [-1, 1]^3). The paper
     prints 4.5e-7; the authors' code has exp(-10), which is this."""
-    opacity: Annotated[float, Field(gt=0, le=1)] = 0.99
+    opacity: PositiveShare = 0.99
     """Opacity of every splat."""
     shading_frame: bool = False
     """Orient by the interpolated normal (the paper's text) instead of the face's (the authors'

@@ -12,16 +12,15 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
-from pydantic import Field
 
 from geosplat_jax.core.color import linear_to_srgb, tone_map
 from geosplat_jax.core.numerics import absolute, safe_divide, safe_log
-from geosplat_jax.core.settings import NonNegative, PositiveCount, settings
+from geosplat_jax.core.settings import NonNegative, PositiveCount, PositiveShare, settings
 from geosplat_jax.core.ssim import ssim
 from geosplat_jax.core.types import Batch
 from geosplat_jax.materials import SMOOTHNESS_STD, Changes, MaterialSpec, smoothness
@@ -41,7 +40,7 @@ class Schedule:
     """Weight at the start of the stage."""
     end: NonNegative | None = None
     """Weight at ``until`` and after it; none for a constant."""
-    until: Annotated[float, Field(gt=0, le=1)] = 1.0
+    until: PositiveShare = 1.0
     """Share of the stage in which the weight moves to ``end``."""
 
     def at(self, progress: float) -> float:

@@ -80,7 +80,7 @@ class MaterialSpec:
     """Without it metallic is zero and has no parameters."""
     has_shift: bool = True
     """Whether there is a head for the inward shift of splats."""
-    initial_shift_logit: float = 0.0
+    initial_shift_logit: Number = 0.0
     """Added to the raw shift; the sigmoid of it is where the shift starts, near 1/2 at zero."""
     position_gradient: bool = False
     """Whether attributes pull on the geometry: the field is differentiated in the positions. Off,

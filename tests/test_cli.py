@@ -256,11 +256,49 @@ def test_the_viewer_without_its_package_is_one_line(tmp_path, capsys, monkeypatc
     assert said.count("\n") == 1
 
 
-@pytest.mark.parametrize(("name", "value"), [("--intensity", "nan"), ("--albedo-scale", "-1")])
+@pytest.mark.parametrize(
+    ("name", "value"), [("--intensity", "nan"), ("--albedo-scale", "-1"), ("--intensity", "1e38")]
+)
 def test_factors_of_a_light_are_checked(tmp_path, capsys, name, value):
     values = [value] * (3 if name == "--albedo-scale" else 1)
     assert main(["relight", str(tmp_path), "--env", "x.hdr", name, *values]) == 2
-    assert f"{name} must be finite and not negative" in capsys.readouterr().err
+    assert f"{name} must be from 0 to 1e+06" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["train", str(DUCK), "--csv"],
+        ["gradcheck", "bsdf", "--json"],
+        ["consistency", "mesh.ply", "--json"],
+        ["report", "run", "--output"],
+        ["refine-cameras", "run", "--output"],
+    ],
+)
+def test_a_file_that_could_not_be_written_is_refused_at_once(tmp_path, capsys, arguments):
+    (tmp_path / "file").write_text("")
+    for place, message in ((tmp_path, "is a folder"), (tmp_path / "file" / "x", "nothing can be")):
+        assert main([*arguments, str(place)]) == 2
+        said = capsys.readouterr().err
+        assert f"{arguments[-1]} " in said
+        assert message in said
+        assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["info", str(DUCK), "--downscale", "0"],
+        ["masks", str(DUCK), "--downscale", "-1"],
+        ["train", str(DUCK), "--downscale", "0"],
+        ["gradcheck", "bsdf", "--seed", "-1"],
+        ["poses", str(DUCK), "--seed", "99999999999"],
+    ],
+)
+def test_factors_and_seeds_that_cannot_be_are_refused_by_their_option(capsys, arguments):
+    with pytest.raises(SystemExit):
+        main(arguments)
+    assert f"argument {arguments[-2]}: must be " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["evaluate", "export", "render", "refine-cameras"])

@@ -359,6 +359,12 @@ def test_reduced_views_are_the_same_cameras(scenes):
     np.testing.assert_allclose(length[half.test.masks], 1.0, atol=1e-5)
 
 
+@pytest.mark.parametrize("factor", [-1, 0, 10**6])
+def test_factors_that_no_image_can_be_reduced_by_are_refused(blender, factor):
+    with pytest.raises(SceneError, match=f"between 1 and the image size, got {factor} for"):
+        load_dataset(blender, downscale=factor)
+
+
 def test_a_size_that_does_not_divide_is_cut_and_said(scenes):
     dataset = load(scenes["nerf_synthetic"], downscale=5)
     assert dataset.train.images.shape[1:3] == (4, 4)
@@ -775,6 +781,15 @@ def test_paths_that_climb_out_of_the_scene_are_refused(blender, path):
     write_png(blender.parent / "outside.png", np.ones((SIZE, SIZE, 4), np.float32))
     edit(blender, lambda content: content["frames"][0].update(file_path=path))
     with pytest.raises(SceneError, match="leaves the scene folder"):
+        load(blender)
+
+
+def test_names_that_no_file_can_have_are_refused(blender):
+    def change(content):
+        content["frames"][0]["file_path"] = "train/\0r_0"
+
+    edit(blender, change)
+    with pytest.raises(SceneError, match=r"transforms_train\.json, is no name of a file"):
         load(blender)
 
 

@@ -477,6 +477,8 @@ def test_unusable_meshes_are_refused_and_leave_no_file(tmp_path):
         export.export_mesh_glb(
             path, vertices, faces, normals, lambda p: (p, p, p), vertex_colors=True
         )
+    with pytest.raises(ValueError, match="1 x 1 show nothing of the mesh; raise the size"):
+        export.export_mesh_glb(path, vertices, faces, normals, materials, texture_size=1)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -147,6 +147,11 @@ def test_a_missing_image_is_named(tmp_path):
     assert isinstance(caught.value, FileNotFoundError)
 
 
+def test_a_folder_is_no_image(tmp_path):
+    with pytest.raises(SceneError, match="is a folder; an image is expected"):
+        read_image(tmp_path)
+
+
 def test_text_is_no_image(tmp_path):
     (tmp_path / "a.png").write_text("hello")
     with pytest.raises(ImageReadError, match="not a readable image"):

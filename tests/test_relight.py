@@ -308,6 +308,8 @@ def test_movies_that_cannot_be_written_are_refused_before_anything_is_rendered(t
     with pytest.raises(SceneError, match="50 frames per second, got 60"):
         options.check()
     replace(options, turntable=0).check()
+    with pytest.raises(ValueError, match="a turn of the light has from 0 to 10000 pictures"):
+        RelightOptions(rotate_env=10**9).check()
 
 
 def test_the_orbit_goes_counter_clockwise_and_keeps_distance_and_view():

@@ -29,6 +29,11 @@ class Bulb(Lamp, kind="bulb"):
     watts: NonNegative = 40.0
     """Power."""
 
+    def __post_init__(self) -> None:
+        """Refuse a bulb that no socket takes."""
+        if self.watts == 13.0:
+            raise ValueError("no socket takes 13 watts")
+
 
 @settings
 class Strip(Lamp, kind="strip"):
@@ -62,6 +67,8 @@ def test_settings_of_every_kind_survive_json(room):
         ({"doors": True}, "doors must be a valid integer, got True"),
         ({"windows": 1}, "unknown setting windows"),
         ({"lamp": {"kind": "fire"}}, "lamp: kind must be one of ['bulb', 'strip'], got 'fire'"),
+        ({"lamp": {"kind": ["bulb"]}}, "lamp: kind must be one of ['bulb', 'strip'], got ['bulb']"),
+        ({"lamp": {"kind": "bulb", "watts": 13.0}}, "lamp: no socket takes 13 watts"),
         ({"lamp": {"kind": "bulb", "watts": -2.0}}, "lamp.watts must be greater than or equal"),
         ({"lamp": {"kind": "bulb", "volts": 3}}, "unknown setting lamp.volts"),
         ({"lamp": {"kind": "bulb", "watts": float("nan")}}, "lamp.watts must be a finite number"),
@@ -107,6 +114,19 @@ def test_values_are_checked_in_one_line_wherever_settings_are_made(make, message
     assert str(caught.value).startswith(message)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 400
+
+
+@settings
+class Street:
+    """What holds several lamps, which have no names."""
+
+    lamps: tuple[Annotated[Lamp, ANY_KIND], ...] = (Bulb(3.0), Strip((0.5,)))
+    """From one end to the other."""
+
+
+def test_settings_without_names_are_listed_as_one_value():
+    lamps = [{"kind": "bulb", "watts": 3.0}, {"kind": "strip", "lengths": [0.5]}]
+    assert list(listed(Street())) == [("lamps", lamps, "", "From one end to the other.")]
 
 
 def test_every_setting_is_listed_with_its_value_range_and_meaning():

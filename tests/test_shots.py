@@ -95,6 +95,11 @@ def test_cameras_of_a_file_have_its_poses_and_its_lens(tmp_path):
     assert float(shot.camera.intrinsics[0, 0, 0]) == pytest.approx(30.0)
 
 
+def test_a_folder_of_cameras_is_refused(tmp_path):
+    with pytest.raises(SceneError, match="is a folder; a file of JSON is expected"):
+        Cameras(file=tmp_path).shots(DATASET, CENTER)
+
+
 def test_a_bent_lens_is_refused(tmp_path):
     path = write_cameras(tmp_path, fl_x=30.0, w=50, h=20, k1=0.1)
     with pytest.raises(SceneError, match="without distortion"):
@@ -115,7 +120,8 @@ def test_a_scene_without_test_views_says_what_to_do():
         (["--size", "100000"], "from 1 to 8192"),
         (["--field-of-view", "180"], "below 180 degrees, got 180"),
         (["--field-of-view", "nan"], "below 180 degrees, got nan"),
-        (["--turntable", "-3"], "at least 0 cameras"),
+        (["--turntable", "-3"], "a turntable has from 0 to 10000 pictures, got -3"),
+        (["--turntable", "1000000000"], "a turntable has from 0 to 10000 pictures"),
         (["--samples", "0"], "--samples must be"),
     ],
 )

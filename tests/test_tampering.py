@@ -207,7 +207,7 @@ def test_settings_of_a_record_that_cannot_be_are_refused_by_the_file(run, value)
 
 
 def test_what_a_training_noted_is_refused_where_it_is_damaged(run):
-    for text in ("{", "[]"):
+    for text in ("{", "[]", "{}", '{"seconds_total": "long"}', '{"seconds_total": NaN}'):
         (run.path / "training.json").write_text(text)
         with pytest.raises(RunError, match=r"training\.json is damaged"):
             run.training()
@@ -231,6 +231,14 @@ def test_a_run_that_is_damaged_is_one_line_on_the_command_line(run, capsys):
 def test_textures_of_impossible_sizes_are_refused(run, capsys, size):
     assert main(["export", str(run.path), "--texture-size", str(size)]) == 2
     assert f"--texture-size must be from 1 to 16384, got {size}" in capsys.readouterr().err
+
+
+def test_whole_numbers_beyond_floating_point_are_one_line():
+    assert parse_json(f"[{10**200}]") == [10**200]
+    with pytest.raises(ValueError, match=r"a whole number has 401 digits, 1000") as caught:
+        parse_json(f'{{"x": {10**400}}}')
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 100
 
 
 def test_documents_that_are_nested_too_deeply_are_one_line():

@@ -261,7 +261,7 @@ def _add_gradcheck(gradcheck: argparse.ArgumentParser) -> None:
         "stages", nargs="*", metavar="PART", help=f"some of {', '.join(STAGES)} (default: all)"
     )
     gradcheck.add_argument("--sweep", action="store_true", help="show the error at every step size")
-    gradcheck.add_argument("--seed", type=int, default=0, help="of numbers, samples, directions")
+    gradcheck.add_argument("--seed", type=_seed, default=0, help="of numbers, samples, directions")
     gradcheck.add_argument("--json", type=Path, help="also write every comparison to this file")
 
 
@@ -288,7 +288,7 @@ def _add_poses(poses: argparse.ArgumentParser) -> None:
         default=standard.lens,
         help="one for all photographs, or one for each (default: %(default)s)",
     )
-    poses.add_argument("--seed", type=int, default=standard.seed, help="of random searches")
+    poses.add_argument("--seed", type=_seed, default=standard.seed, help="of random searches")
 
 
 def _add_masks(masks: argparse.ArgumentParser) -> None:
@@ -501,4 +501,12 @@ def _hosts(text: str) -> str:
 
 def _downscale(text: str) -> int | str:
     """Read a factor, or ``auto``."""
-    return text if text == "auto" else int(text)
+    return text if text == "auto" else _at_least_one(text)
+
+
+def _seed(text: str) -> int:
+    """Read a seed."""
+    seed = int(text)
+    if not 0 <= seed < 2**31:
+        raise argparse.ArgumentTypeError(f"must be from 0 to 2**31 - 1, got {seed}")
+    return seed

@@ -4,6 +4,7 @@ import argparse
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -13,7 +14,7 @@ from rich.text import Text
 from geosplat_jax.capture.masks import choose_factor, make_masks
 from geosplat_jax.capture.settings import RadianceSettings
 from geosplat_jax.cli.display import ProgressDisplay, WorkDisplay, say, say_refined
-from geosplat_jax.cli.training import UsageError, config_from, scene_options, train
+from geosplat_jax.cli.training import UsageError, config_from, require_place, scene_options, train
 from geosplat_jax.fit.cameras import CameraSettings
 from geosplat_jax.fit.config import all_settings
 from geosplat_jax.fit.folder import RunError
@@ -32,6 +33,7 @@ from geosplat_jax.gradcheck.report import (
 from geosplat_jax.io.agreement import agreement_lines
 from geosplat_jax.io.dataset import describe, load_dataset, load_recorded
 from geosplat_jax.io.export import LARGEST_TEXTURE
+from geosplat_jax.io.images import written_aside
 from geosplat_jax.io.poses import PoseSettings, find_poses
 from geosplat_jax.report.consistency import (
     DEFAULT_SIZE,
@@ -46,11 +48,14 @@ from geosplat_jax.report.consistency import (
 from geosplat_jax.report.page import REPORT
 from geosplat_jax.report.relight import RelightOptions
 from geosplat_jax.report.renderer import LARGEST_SAMPLES
-from geosplat_jax.report.shots import Cameras, Images
+from geosplat_jax.report.shots import LARGEST_SIZE, Cameras, Images
 from geosplat_jax.run import Run
 from geosplat_jax.viewer.painter import Viewer
 from geosplat_jax.viewer.server import ViewerServer, require_free_port, viser_library
 from geosplat_jax.viewer.source import CheckpointWatch, light_files, load_lights
+
+_LARGEST_FACTOR = 1e6
+"""Of a light or an albedo; far beyond any that is of use, and single precision holds the result."""
 
 _SHEETS = ("overview.png", "materials.png", "relight.png")
 
@@ -69,8 +74,8 @@ def _info(arguments: argparse.Namespace) -> None:
 
 def _poses(arguments: argparse.Namespace) -> None:
     """Find the cameras of photographs, with progress on the terminal, and say how well they fit."""
-    if arguments.size < 1 or arguments.seed < 0:
-        raise UsageError("--size must be at least 1, and --seed must not be negative")
+    if arguments.size < 1:
+        raise UsageError(f"--size must be at least 1, got {arguments.size}")
     settings = PoseSettings(
         size=arguments.size, order=arguments.order, lens=arguments.lens, seed=arguments.seed
     )
@@ -172,17 +177,25 @@ def _evaluate(arguments: argparse.Namespace) -> None:
 
 def _report(arguments: argparse.Namespace) -> None:
     """Write the page of a run, or of several."""
+    require_place(arguments.output, "--output")
     first, *others = (Run(folder) for folder in arguments.runs)
     if others and arguments.output is None:
         raise UsageError("a report of several runs needs --output FILE")
     print(f"report: {first.report(arguments.output, others=others)}")
 
 
+def _write_json(path: Path, content: Any) -> None:
+    """Write a file of figures; it appears whole or not at all."""
+    with written_aside(path) as aside:
+        aside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
 def _consistency(arguments: argparse.Namespace) -> None:
     """Print the figures of Table 5 for a run, or for splats that are put on a mesh."""
     subject, size = arguments.subject, arguments.size
-    if size is not None and size < 1:
-        raise UsageError(f"--size must be at least 1 pixel, got {size}")
+    if size is not None and not 1 <= size <= LARGEST_SIZE:
+        raise UsageError(f"--size must be from 1 to {LARGEST_SIZE} pixels, got {size}")
+    require_place(arguments.json, "--json")
     if subject.is_dir():
         found = Run(subject, scene=arguments.scene).consistency(stage=arguments.stage, size=size)
     else:
@@ -194,7 +207,7 @@ def _consistency(arguments: argparse.Namespace) -> None:
     if found.behind:
         print(f"pixels that see it from inside, left out  {found.behind:9.2%}")
     if arguments.json is not None:
-        arguments.json.write_text(json.dumps(asdict(found), indent=2) + "\n", encoding="utf-8")
+        _write_json(arguments.json, asdict(found))
 
 
 def _consistency_of_mesh(arguments: argparse.Namespace) -> Consistency:
@@ -217,11 +230,8 @@ def _relight(arguments: argparse.Namespace) -> None:
     """Run the relight command from its arguments."""
     factors = {"intensity": [arguments.intensity], "albedo-scale": arguments.albedo_scale}
     for name, values in factors.items():
-        if not all(0 <= value < float("inf") for value in values):
-            raise UsageError(f"--{name} must be finite and not negative, got {values}")
-    for name in ("turntable", "rotate_env"):
-        if getattr(arguments, name) < 0:
-            raise UsageError(f"--{name.replace('_', '-')} must not be negative")
+        if not all(0 <= value <= _LARGEST_FACTOR for value in values):
+            raise UsageError(f"--{name} must be from 0 to {_LARGEST_FACTOR:g}, got {values}")
     _check_samples(arguments)
     cameras = _cameras_from(arguments)
     with WorkDisplay() as display:
@@ -299,6 +309,7 @@ def _view(arguments: argparse.Namespace) -> None:
 
 def _refine_cameras(arguments: argparse.Namespace) -> None:
     """Refine the cameras of a run and print what changed."""
+    require_place(arguments.output, "--output")
     run = Run(arguments.run, scene=arguments.scene)
     how = CameraSettings(white_balance=arguments.white_balance)
     refined = run.refine_cameras(arguments.output, how=how, on_view=say_refined)
@@ -317,8 +328,8 @@ def _export(arguments: argparse.Namespace) -> None:
         )
     if arguments.faces is not None and arguments.faces < 4:
         raise UsageError(f"--faces must be at least 4, got {arguments.faces}")
-    if (arguments.obj or arguments.faces) and arguments.vertex_colors:
-        raise UsageError("--obj and --faces need textures; leave --vertex-colors out")
+    if (arguments.obj or arguments.usd or arguments.faces) and arguments.vertex_colors:
+        raise UsageError("--obj, --usd and --faces need textures; leave --vertex-colors out")
     with WorkDisplay() as display:
         lines = Run(arguments.run, scene=arguments.scene).export(
             arguments.output,
@@ -339,13 +350,14 @@ def _gradcheck(arguments: argparse.Namespace) -> None:
     unknown = [name for name in names if name not in STAGES]
     if unknown:
         raise UsageError(f"unknown part {unknown[0]!r}; expected some of {', '.join(STAGES)}")
+    require_place(arguments.json, "--json")
     checked = {}
     for name in names:
         checked[name] = check_stage(name, seed=arguments.seed)
         print(f"{table(checked[name], sweep=arguments.sweep)}\n", flush=True)
     print(summary(checked))
     if arguments.json is not None:
-        arguments.json.write_text(json.dumps(to_records(checked), indent=1), encoding="utf-8")
+        _write_json(arguments.json, to_records(checked))
     failed = [row for rows in checked.values() for row in rows if not passes(row)]
     if failed:
         raise GradientError(

@@ -1,6 +1,7 @@
 """The train command: what its options ask for, and the training with progress on the terminal."""
 
 import argparse
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,6 +30,27 @@ from geosplat_jax.run import train as train_run
 
 class UsageError(ValueError):
     """A command cannot run as it was called; the message says what to change."""
+
+
+def require_place(file: Path | None, option: str) -> None:
+    """Refuse a file that could not be written in the end, before anything is spent.
+
+    Parameters
+    ----------
+    file : that will be written; None for none. Its folder need not exist yet.
+    option : that names it.
+
+    Raises
+    ------
+    UsageError
+    """
+    if file is None:
+        return
+    if file.is_dir():
+        raise UsageError(f"{option} needs a file, and {file} is a folder")
+    above = next(folder for folder in file.absolute().parents if folder.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK):
+        raise UsageError(f"{option} {file}: nothing can be written in {above}")
 
 
 def scene_options(arguments: argparse.Namespace, config: Config) -> dict[str, Any]:
@@ -228,6 +250,7 @@ def train(arguments: argparse.Namespace) -> None:
         raise UsageError("--refine-cameras trains before; leave --budget and --from out")
     if arguments.white_balance and arguments.refine_cameras is None:
         raise UsageError("--white-balance belongs to --refine-cameras")
+    require_place(arguments.csv, "--csv")
     devices = _devices(arguments)
     folder = arguments.output or Path("runs") / arguments.scene.resolve().name
     order = _ordered(arguments, RunFolder(folder))

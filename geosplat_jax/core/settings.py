@@ -8,6 +8,7 @@ a new way of doing something is a new class, in whatever file, and is written to
 """
 
 import json
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from functools import wraps
@@ -42,6 +43,11 @@ def _of_single_precision(value: float) -> float:
     return value
 
 
+def _infinite_or_of_single_precision(value: float) -> float:
+    """Refuse what `_of_single_precision` does, but for infinity."""
+    return value if math.isinf(value) else _of_single_precision(value)
+
+
 def _of_32_bits(value: int) -> int:
     """Refuse a count that compiled programs cannot hold."""
     if value >= 2**31:
@@ -59,11 +65,20 @@ NonNegative = Annotated[float, Field(ge=0), AfterValidator(_of_single_precision)
 """A finite number that is not negative."""
 Positive = Annotated[float, Field(gt=0), AfterValidator(_of_single_precision)]
 """A finite number above 0."""
+PositiveOrInfinite = Annotated[
+    float, Field(gt=0, allow_inf_nan=True), AfterValidator(_infinite_or_of_single_precision)
+]
+"""A number above 0, or infinity."""
 Share = Annotated[float, Field(ge=0, le=1)]
 """A number from 0 to 1."""
+PositiveShare = Annotated[float, Field(gt=0, le=1), AfterValidator(_of_single_precision)]
+"""A number above 0, up to 1."""
 
 _NESTED = "nested_settings"
-"""Type of an error whose text begins with the rest of the path."""
+"""Type of an error whose text names its place with `_HERE`."""
+
+_HERE = "\0"
+"""Stands for the path of nested settings where only what lies within them is known."""
 
 _Class = TypeVar("_Class")
 
@@ -113,10 +128,10 @@ class _AnyKind:
                 return check(value)
             rest = dict(value)
             kind = rest.pop("kind", None)
-            if kind not in base.kinds:
+            if not isinstance(kind, str) or kind not in base.kinds:
                 raise ValueError(f"kind must be one of {sorted(base.kinds)}, got {kind!r}")
             try:
-                return from_plain(base.kinds[kind], rest)
+                return from_plain(base.kinds[kind], rest, _HERE)
             except ValueError as error:
                 raise PydanticCustomError(_NESTED, "{text}", {"text": str(error)}) from None
 
@@ -175,20 +190,12 @@ def _lines(detail: Any, where: str, names: Sequence[str]) -> list[str]:
     if detail["type"] == "unexpected_keyword_argument":
         return [f"unknown setting {path}"]
     if detail["type"] == _NESTED:
-        return [_within(path, text) for text in detail["msg"].splitlines()]
+        return detail["msg"].replace(_HERE, path).splitlines()
     message = detail["msg"].removeprefix("Value error, ")
     if detail["type"] == "value_error":
         return [f"{path}: {message}" if path else message]
     message = message.removeprefix("Input should be ")
     return [f"{path} must be {message}, got {_short(detail.get('input'))}"]
-
-
-def _within(path: str, text: str) -> str:
-    """Put a path before a line that begins with the rest of it."""
-    unknown = "unknown setting "
-    if text.startswith(unknown):
-        return f"{unknown}{path}.{text.removeprefix(unknown)}"
-    return f"{path}.{text}"
 
 
 _LONGEST_VALUE = 200
@@ -211,11 +218,11 @@ def listed(value: Any, where: str = "") -> Iterator[tuple[str, Any, str, str]]:
         item, path = getattr(value, name), f"{where}{name}"
         if is_dataclass(item) or (isinstance(item, dict) and item):
             yield from listed(item, f"{path}.")
-        elif isinstance(item, tuple) and item and is_dataclass(item[0]):
+        elif isinstance(item, tuple) and item and hasattr(item[0], "name"):
             for part in item:
-                yield from listed(part, f"{path}.{getattr(part, 'name', '')}.")
+                yield from listed(part, f"{path}.{part.name}.")
         else:
-            yield path, item, _range(field), _meaning(type(value), name)
+            yield path, to_plain(item), _range(field), _meaning(type(value), name)
 
 
 def _meaning(kind: type, name: str) -> str:

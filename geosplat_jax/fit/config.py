@@ -425,7 +425,7 @@ def parse_override(text: str) -> dict[str, Any]:
     """
     name, equals, value = text.partition("=")
     name = name.strip()
-    if not equals or not name:
+    if not equals or not all(name.split(".")):
         raise ValueError(f"an override reads section.field=value, got {text!r}")
     if name in LABELS:
         raise ValueError(f"{name} is chosen with {LABELS[name]}, not with --set")
@@ -434,6 +434,8 @@ def parse_override(text: str) -> dict[str, Any]:
         raise ValueError(f"the setting {name} is now {now}")
     try:
         parsed = tomllib.loads(f"value = {value}")["value"]
+        # What JSON lacks, which is dates and times, is text.
+        parsed = json.loads(json.dumps(parsed, default=str))
     except tomllib.TOMLDecodeError:
         parsed = value.strip()
     nested: Any = parsed
@@ -455,11 +457,10 @@ def merge(base: dict[str, Any], changes: dict[str, Any], where: str = "") -> dic
     merged = dict(base)
     for name, value in changes.items():
         now = base.get(name)
+        kind = now.get("kind") if isinstance(now, dict) else None
         if name not in base and not _OPEN.fullmatch(where):
             raise ValueError(f"unknown setting {where}{name}; expected one of {sorted(base)}")
-        if isinstance(value, dict) and value.get("kind", now and now.get("kind")) != (
-            now or {}
-        ).get("kind"):
+        if isinstance(value, dict) and value.get("kind", kind) != kind:
             merged[name] = value
         elif isinstance(value, dict) and isinstance(now, dict):
             merged[name] = merge(now, value, f"{where}{name}.")

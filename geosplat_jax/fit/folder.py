@@ -391,7 +391,7 @@ class RunFolder:
                 }
             rows.append(flat)
         names = list(dict.fromkeys(name for row in rows for name in row))
-        with Path(path).open("w", encoding="utf-8", newline="") as file:
+        with written_aside(path) as aside, aside.open("w", encoding="utf-8", newline="") as file:
             table = csv.DictWriter(file, names)
             table.writeheader()
             table.writerows(rows)
@@ -421,8 +421,9 @@ class RunFolder:
         if not path.exists():
             return None
         summary = _parsed(path)
-        if not isinstance(summary, dict):
-            raise RunError(f"{path} is damaged: it holds no object; remove it")
+        seconds = summary.get("seconds_total") if isinstance(summary, dict) else None
+        if not isinstance(seconds, int | float) or not 0 <= seconds < float("inf"):
+            raise RunError(f"{path} is damaged: it does not say how long it took; remove it")
         return summary
 
 

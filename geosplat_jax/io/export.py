@@ -260,6 +260,10 @@ def _textured(
     start = time.perf_counter()
     face_rows, barycentrics = rasterize_charts(charts.uv, charts.faces, texture_size=texture_size)
     covered = face_rows >= 0
+    if not covered.any():
+        raise ValueError(
+            f"textures of {texture_size} x {texture_size} show nothing of the mesh; raise the size"
+        )
     rows, weights = charts.faces[face_rows[covered]], barycentrics[covered]
     cut, cut_normals = vertices[charts.vertex_rows], normals[charts.vertex_rows]
     points = np.einsum("nk,nkd->nd", weights, cut[rows]).astype(np.float32)

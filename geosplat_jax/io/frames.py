@@ -94,6 +94,8 @@ def read_json(path: Path) -> dict[str, Any]:
     MissingFileError : no such file.
     SceneError : not JSON, or not an object.
     """
+    if path.is_dir():
+        raise SceneError(f"{path} is a folder; a file of JSON is expected in its place")
     if not path.is_file():
         raise MissingFileError(f"{path} does not exist; check the scene folder is complete")
     try:
@@ -266,8 +268,11 @@ def inside_scene(root: Path, relative: str, where: Path | str) -> Path:
 
     Raises
     ------
-    SceneError : the path is absolute, climbs with ``..``, or follows a link out of the folder.
+    SceneError : the path is absolute, climbs with ``..``, or follows a link out of the folder; no
+        file can have such a name.
     """
+    if "\0" in relative:
+        raise SceneError(f"{relative!r}, named in {where}, is no name of a file")
     # Both notations, since scenes travel between systems.
     parts = PurePosixPath(relative).parts + PureWindowsPath(relative).parts
     is_rooted = PurePosixPath(relative).is_absolute() or PureWindowsPath(relative).anchor

@@ -59,6 +59,8 @@ def written_aside(path: str | Path) -> Iterator[Path]:
 
 def _opened(path: Path) -> Any:
     """Open an image; `MissingFileError` or `ImageReadError` where that cannot be done."""
+    if path.is_dir():
+        raise SceneError(f"{path} is a folder; an image is expected in its place")
     if not path.is_file():
         raise MissingFileError(f"image {path} does not exist; check the scene folder is complete")
     # Without this hint the library multiplies colour by alpha on reading.

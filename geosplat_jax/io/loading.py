@@ -187,7 +187,7 @@ def _size_problems(
     """Say which sizes were met; refuse several of them outside captures."""
     problems = []
     for frame, (height, width) in zip(frames, full, strict=True):
-        if factor > min(height, width):
+        if not 1 <= factor <= min(height, width):
             raise SceneError(
                 f"downscale factor must be between 1 and the image size, got {factor} for "
                 f"{frame.image}, which is {width} x {height}"

@@ -20,7 +20,7 @@ from geosplat_jax.report.consistency import resized
 from geosplat_jax.report.light_metrics import resize_light
 from geosplat_jax.report.pace import OnProgress, counted
 from geosplat_jax.report.renderer import RenderedView, Renderer, to_picture
-from geosplat_jax.report.shots import Images, Shot, about_z, orbit
+from geosplat_jax.report.shots import Images, Shot, about_z, orbit, require_frames
 from geosplat_jax.transport.environment import lookup, rotate_light, to_y_up_map
 
 LARGEST_LIGHT = 256
@@ -142,7 +142,10 @@ class RelightOptions:
         Raises
         ------
         SceneError, MissingEncoderError : see `io.movies.check_movie`.
+        ValueError : for more frames than can be looked at.
         """
+        require_frames("a turntable", self.turntable)
+        require_frames("a turn of the light", self.rotate_env)
         if self.turntable or self.rotate_env:
             check_movie(self.movie_suffix(), self.frames_per_second)
 

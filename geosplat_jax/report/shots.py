@@ -27,6 +27,9 @@ SPLITS = ("test", "train")
 LARGEST_SIZE = 8192
 """Pixels along the longer side of an image, at most."""
 
+MOST_FRAMES = 10_000
+"""Pictures on a way around the object, at most."""
+
 _SMALLEST_ALPHA = 1e-4
 
 
@@ -99,6 +102,17 @@ def orbit(camera: Camera, center: np.ndarray, angle: float) -> Camera:
     return replace(camera, world_to_camera=jnp.asarray(pose[None], jnp.float32))
 
 
+def require_frames(what: str, count: int) -> None:
+    """Refuse a number of pictures that nobody can look at; ``what`` : that has them.
+
+    Raises
+    ------
+    ValueError
+    """
+    if not 0 <= count <= MOST_FRAMES:
+        raise ValueError(f"{what} has from 0 to {MOST_FRAMES} pictures, got {count}")
+
+
 def with_field_of_view(camera: Camera, degrees: float) -> Camera:
     """Change the horizontal field of view; pixels keep their shape, the axis its place."""
     wanted = 0.5 * camera.width / math.tan(0.5 * math.radians(degrees))
@@ -137,8 +151,7 @@ class Cameras:
         """
         if self.views is not None and self.views not in SPLITS:
             raise ValueError(f"views must be one of {SPLITS}, got {self.views!r}")
-        if self.turntable < 0:
-            raise ValueError(f"a turntable has at least 0 cameras, got {self.turntable}")
+        require_frames("a turntable", self.turntable)
         if self.size is not None and not 1 <= self.size <= LARGEST_SIZE:
             raise ValueError(f"the size must be from 1 to {LARGEST_SIZE} pixels, got {self.size}")
         if self.field_of_view is not None and not 0.0 < self.field_of_view < 180.0:

@@ -21,7 +21,7 @@ from jaxtyping import Array, ArrayLike, Float
 from pydantic import Field
 
 from geosplat_jax.core.numerics import safe_divide, safe_log, safe_normalize
-from geosplat_jax.core.settings import settings
+from geosplat_jax.core.settings import PositiveOrInfinite, settings
 
 _B3 = (3 / 8, 1 / 4, 1 / 16)
 """The B3 spline at distances 0, 1 and 2 (Dammertz et al. 2010, section 2)."""
@@ -35,7 +35,7 @@ _SMALLEST_SIGMA, _LARGEST_SHARPNESS = 1e-4, 1e6
 _HALF_OF_TAPS = tuple((dy, dx) for dy in range(3) for dx in range(-2, 3) if dy > 0 or dx > 0)
 
 
-_Sigma = Annotated[float, Field(ge=_SMALLEST_SIGMA, allow_inf_nan=True)]
+_Sigma = Annotated[PositiveOrInfinite, Field(ge=_SMALLEST_SIGMA)]
 
 
 @settings
