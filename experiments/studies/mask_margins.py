@@ -7,8 +7,8 @@ Training views of a scene with true masks are laid over the environment that lig
 mask that is too large shows what is behind the object, and one that is too small cuts it off. The
 first surface, the bounds and the loss see those masks; test views keep the true ones.
 
-Columns: PSNR of new views, error of normals where the true mask is, IoU of the masks of new views,
-and that of the masks that were trained on. Runs that are there already are opened instead.
+Columns: PSNR of new views, everywhere and where the true mask is, error of normals there, PSNR of
+albedo, IoU of the masks of new views, and that of the masks that were trained on. Runs that are there already are opened instead.
 """
 
 import argparse
@@ -28,7 +28,9 @@ from geosplat_jax.io.images import read_linear
 MARGINS = (-8, -4, -2, -1, 0, 1, 2, 4, 8)
 MEASURES = {
     "NVS PSNR": "nvs.psnr",
+    "of the object's pixels": "nvs.psnr_masked",
     "normals, degrees": "normal.mae_masked_deg",
+    "albedo PSNR": "albedo.psnr",
     "IoU": "mask.iou",
 }
 
