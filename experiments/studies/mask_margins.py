@@ -8,7 +8,8 @@ mask that is too large shows what is behind the object, and one that is too smal
 first surface, the bounds and the loss see those masks; test views keep the true ones.
 
 Columns: PSNR of new views, everywhere and where the true mask is, error of normals there, PSNR of
-albedo, IoU of the masks of new views, and that of the masks that were trained on. Runs that are there already are opened instead.
+albedo, IoU of the masks of new views, and that of the masks that were trained on. Runs that are
+there already are opened instead.
 """
 
 import argparse

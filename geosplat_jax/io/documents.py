@@ -1,26 +1,27 @@
 """JSON that others wrote: whatever it holds, reading it fails with one line."""
 
 import json
+import math
 from typing import Any
 
 _MOST_DIGITS = 300
 """Of a whole number; a longer one has no floating-point number near it."""
 
 
-def _whole_number(text: str) -> int:
-    if len(text) > _MOST_DIGITS:
-        raise ValueError(f"a whole number has {len(text)} digits, {text[:20]}...")
-    return int(text)
+def _whole_number(text: str) -> int | float:
+    """Read a whole number; one beyond all floating-point numbers is infinite."""
+    if len(text) <= _MOST_DIGITS:
+        return int(text)
+    return -math.inf if text.startswith("-") else math.inf
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse a JSON document.
+    """Parse a JSON document; whole numbers beyond all floating-point numbers are infinite.
 
     Raises
     ------
     ValueError
-        If it is no JSON, not UTF-8, or nested more deeply than Python follows; if it holds a
-        whole number that is larger than any floating-point number.
+        If it is no JSON, not UTF-8, or nested more deeply than Python follows.
     """
     try:
         decoded = text.decode("utf-8") if isinstance(text, bytes) else text
