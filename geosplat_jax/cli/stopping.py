@@ -51,9 +51,10 @@ def _watch(receiver: socket.socket, has_returned: threading.Event, notice: _Noti
         was_told = False
         while number := receiver.recv(1):
             handler = signal.getsignal(number[0])
-            if handler is signal.default_int_handler or was_told:
+            words = getattr(handler, "notice", None)
+            if handler is signal.default_int_handler or (words and was_told):
                 break
-            if words := getattr(handler, "notice", None):
+            if words:
                 print(words, file=sys.stderr, flush=True)
                 was_told = True
         else:
