@@ -4,23 +4,58 @@ A round trains at quality ``draft``, refines the cameras of every view against w
 (`Run.refine_cameras`), and hands them to the next. What a round recovers: docs/cameras.md.
 """
 
+import json
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.cameras import CameraSettings, ViewProgress
 from geosplat_jax.fit.config import Config
+from geosplat_jax.fit.folder import RunError
 from geosplat_jax.fit.listener import NOBODY, Listener
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.io.dataset import load_recorded
+from geosplat_jax.io.documents import parse_json
+from geosplat_jax.io.images import written_aside
 from geosplat_jax.run import train
+
+_RECORD = "rounds.json"
+"""What the rounds of a folder are made with."""
 
 
 def rounds_folder(output: str | Path) -> Path:
     """Return the folder beside a run's own that the rounds are kept in."""
     path = Path(output)
     return path.with_name(f"{path.name}_cameras")
+
+
+def _require_same(folder: Path, made_with: Mapping[str, Any]) -> None:
+    """Note what the rounds in a folder are made with; refuse those made with something else.
+
+    Raises
+    ------
+    RunError
+    """
+    path, text = folder / _RECORD, json.dumps(made_with, indent=1, default=str) + "\n"
+    try:
+        before = parse_json(path.read_bytes())
+    except FileNotFoundError:
+        with written_aside(path) as aside:
+            aside.write_text(text, encoding="utf-8")
+        return
+    except ValueError as error:
+        raise RunError(f"{path} is damaged: {error}; delete {folder} to begin again") from None
+    now = parse_json(text)
+    changed = sorted(
+        name for name in now if not isinstance(before, dict) or now[name] != before.get(name)
+    )
+    if changed:
+        raise RunError(
+            f"the cameras in {folder} were refined with another {' and '.join(changed)}; delete "
+            "that folder to refine them again, or take another output"
+        )
 
 
 def refined_cameras(
@@ -37,7 +72,7 @@ def refined_cameras(
     """Train and refine as often as asked; return the file of the last cameras.
 
     Rounds that are there already, from a command that was interrupted, are not made again, and one
-    that was begun goes on.
+    that was begun goes on. All of a folder are made alike.
 
     Parameters
     ----------
@@ -53,13 +88,19 @@ def refined_cameras(
     ------
     ValueError
         If there is no round.
-    SceneError, RunError, TrainingError, Interrupted
+    RunError
+        If rounds are there that were made with other settings; and see `train`.
+    SceneError, TrainingError, Interrupted
         See `train`.
     """
     if rounds < 1:
         raise ValueError(f"refining cameras takes one round at least, got {rounds}")
     config = config or make_config(quality="draft")
-    options, cameras = dict(reading or {}), Path()
+    options, cameras, how = dict(reading or {}), Path(), how or CameraSettings()
+    made_with = {"scene": str(Path(scene).resolve()), "reading": options}
+    _require_same(
+        rounds_folder(output), {**made_with, "config": config.to_dict(), "refinement": asdict(how)}
+    )
     for number in range(1, rounds + 1):
         folder = rounds_folder(output) / f"round_{number}"
         cameras = folder.with_suffix(".json")

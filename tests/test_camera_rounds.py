@@ -6,6 +6,9 @@ import pytest
 
 from geosplat_jax import camera_rounds, cli
 from geosplat_jax.camera_rounds import refined_cameras, rounds_folder
+from geosplat_jax.fit.cameras import CameraSettings
+from geosplat_jax.fit.folder import RunError
+from geosplat_jax.fit.presets import make_config
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.run import Run
 
@@ -60,6 +63,30 @@ def test_rounds_that_are_done_are_not_made_again(made, tmp_path):
     refined_cameras("scene", tmp_path / "fox", rounds=1)
     assert refined_cameras("scene", tmp_path / "fox", rounds=1).exists()
     assert len(made) == 1
+
+
+@pytest.mark.parametrize(
+    ("changed", "what"),
+    [
+        ({"how": CameraSettings(white_balance=True)}, "refinement"),
+        ({"reading": {"downscale": 4}}, "reading"),
+        ({"config": make_config(quality="standard")}, "config"),
+    ],
+)
+def test_rounds_of_other_settings_are_not_taken_for_these(made, tmp_path, changed, what):
+    usual = {"rounds": 1, "reading": {"downscale": 2}}
+    refined_cameras("scene", tmp_path / "fox", **usual)
+    with pytest.raises(RunError, match=f"refined with another {what}; delete"):
+        refined_cameras("scene", tmp_path / "fox", **{**usual, **changed})
+    refined_cameras("scene", tmp_path / "fox", **{**usual, "rounds": 2})
+    assert len(made) == 2
+
+
+def test_a_damaged_record_of_rounds_is_named(made, tmp_path):
+    refined_cameras("scene", tmp_path / "fox")
+    (rounds_folder(tmp_path / "fox") / "rounds.json").write_text("{")
+    with pytest.raises(RunError, match=r"rounds\.json is damaged: it is not JSON"):
+        refined_cameras("scene", tmp_path / "fox")
 
 
 def test_no_round_at_all_is_refused(made, tmp_path):

@@ -10,7 +10,7 @@ import pytest
 from support import MONTE_CARLO, sphere_dataset, tiny_config
 from test_pipeline import TIGHT, problem
 
-from geosplat_jax.fit import compilation, loop
+from geosplat_jax.fit import compilation, upcoming
 from geosplat_jax.fit.compilation import compile_step
 from geosplat_jax.fit.runtime import in_background
 from geosplat_jax.fit.stages import update_rule
@@ -55,7 +55,7 @@ def test_a_run_that_stops_early_leaves_no_thread_behind(tmp_path, monkeypatch):
             while is_wanted() and time.monotonic() < until:
                 time.sleep(0.01)
 
-    monkeypatch.setattr(loop, "compile_step", slowly)
+    monkeypatch.setattr(upcoming, "compile_step", slowly)
     fit(sphere_dataset(), tiny_config(*MONTE_CARLO), tmp_path, stop_after=3)
     assert len(begun) == 1
     begun[0].join(timeout=1)

@@ -321,6 +321,18 @@ def test_settings_between_two_levels_are_said_beside_the_standard_ones():
     assert replace(again, quality=config.quality) == config
 
 
+def test_the_command_of_a_run_from_a_mesh_names_the_file(tmp_path):
+    path = tmp_path / "a mesh.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    config = make_config("paper", "draft", mesh=path, overrides=("geometry.max_faces=99",))
+    assert set(changed_from_preset(config)) == {"geometry.max_faces"}
+    text, is_whole = command({"scene": "s", "dataset": {}}, config)
+    assert is_whole
+    assert f"--mesh '{path}'" in text
+    assert "geometry.max_faces=99" in text
+    assert "geometry.path" not in text
+
+
 def test_settings_that_options_cannot_say_are_not_pretended():
     text, is_whole = command({"scene": "s", "dataset": {}}, tiny_config())
     if not is_whole:

@@ -1,7 +1,6 @@
 """The state of a training between two steps: where it starts, what a step does, what is kept."""
 
 from collections.abc import Callable
-from concurrent.futures import wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,7 +26,7 @@ from geosplat_jax.fit.planning import (
     holding,
     plan_capacities,
 )
-from geosplat_jax.fit.runtime import in_background, release_programs_when_crowded
+from geosplat_jax.fit.runtime import release_programs_when_crowded
 from geosplat_jax.fit.stages import (
     begin_stage,
     build_pipeline,
@@ -50,6 +49,7 @@ from geosplat_jax.fit.trained import (
     read_checkpoint,
     read_description,
 )
+from geosplat_jax.fit.upcoming import Ends, Upcoming, continued
 from geosplat_jax.io.checkpoints import latest_checkpoint, save_checkpoint
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.views import Views
@@ -107,7 +107,7 @@ class Loop:
     recoveries: int = 0
     fallback: "First | None" = None
     last_checkpoint: Path | None = None
-    upcoming: "Upcoming | None" = None
+    upcoming: Upcoming | None = None
     has_compiled: bool = False
     to_come: NextStage | None = None
     on_compile: Callable[[str], None] | None = None
@@ -198,7 +198,10 @@ class Loop:
             self._compile(step)
         following = self._following(step)
         if following is not None and self.upcoming is None:
-            self.upcoming = Upcoming(self, following, self.to_come)
+            # A copy, since the steps to come consume the buffers of the state.
+            params = jax.tree.map(jnp.array, self.params)
+            ends = Ends(self.config, self.views, self.pipeline, params, self.devices)
+            self.upcoming = Upcoming(following, ends, self.to_come)
 
     def retime(self, config: Config) -> None:
         """Go on with stages of other lengths; what was done stays as it was."""
@@ -284,7 +287,7 @@ class Loop:
         self.pipeline = build_pipeline(self.config, stage, self.surface)
         self.start(params)
         first = pipeline_at(self.pipeline, self.config, stage, 0)
-        return _continued(pipeline, first, stage)
+        return continued(pipeline, first, stage)
 
     def start(self, params: Params) -> None:
         """Begin the stage with these parameters."""
@@ -386,93 +389,6 @@ class Loop:
         params, carry = replace(self.params, geometry=shape), self.devices.local(self.state.carry)
         self._put_surface(self.fallback.surface)
         self.state = self.devices.place(initial_state(params, step=self.step, carry=carry))
-
-
-class Upcoming:
-    """The stage that comes next: its buffers and programs, made while the present one trains.
-
-    Parameters
-    ----------
-    loop : as it is now; what is planned depends on its surface alone.
-    stage : that comes next.
-    known : what a checkpoint said of it, in a run that is resumed.
-    """
-
-    def __init__(self, loop: Loop, stage: Stage, known: NextStage | None) -> None:
-        self.stage = stage
-        self._is_wanted = True
-        config, views, step = loop.config, loop.views, loop.config.first_step(stage.name)
-        before, surface, devices = loop.pipeline, loop.surface, loop.devices
-        # A copy, since the steps to come consume the buffers of the state.
-        params = jax.tree.map(jnp.array, loop.params)
-
-        def first_pipeline(capacities: Capacities) -> Pipeline:
-            pipeline = pipeline_at(build_pipeline(config, stage, surface), config, stage, 0)
-            return replace(pipeline, capacities=capacities)
-
-        def plan() -> Capacities:
-            if known is not None and known.stage == stage.name:
-                return Capacities(**known.capacities)
-            first = begin_stage(params, before, config, stage)
-            pipeline = first_pipeline(Capacities())
-            carried = _continued(before, pipeline, stage)
-            if carried is not None:
-                return add_rays(pipeline, first, carried)
-            return plan_capacities(pipeline, first, views.camera(), limits=config.geometry.limits)
-
-        def compile_all() -> None:
-            pipeline = first_pipeline(self.capacities)
-            carry = pipeline.transport.first_carry()
-            state = jax.eval_shape(
-                lambda params: initial_state(
-                    begin_stage(params, before, config, stage), carry=carry
-                ),
-                params,
-            )
-            batch = devices.share_out(make_batch(views, step, stage, seed=config.run.seed))
-            rule = update_rule(config, stage, state.params, 0)
-            compile_step(
-                state,
-                batch,
-                pipeline,
-                rule,
-                devices=devices,
-                threads=1,
-                is_wanted=lambda: self._is_wanted,
-            )
-
-        self._planned = in_background(plan)
-        self.compiled = in_background(compile_all)
-
-    @property
-    def capacities(self) -> Capacities:
-        """Sizes of the buffers, once they are known."""
-        return self._planned.result()
-
-    @property
-    def is_ready(self) -> bool:
-        """Whether the programs are compiled."""
-        return self.compiled.done()
-
-    def give_up(self) -> None:
-        """Compile no further programs."""
-        self._is_wanted = False
-
-    def abandon(self) -> None:
-        """Compile no further programs, and wait for the one that is being compiled."""
-        self.give_up()
-        wait([self._planned])
-        wait([self.compiled])
-
-    def meta(self) -> dict[str, Any]:
-        """Return what a checkpoint keeps; waits until the buffers are planned."""
-        return {"stage": self.stage.name, "capacities": dict(self.capacities)}
-
-
-def _continued(before: Pipeline, first: Pipeline, stage: Stage) -> Capacities | None:
-    """Return the buffers of a pipeline whose splats those of a stage continue; None if not."""
-    is_continued = stage.splats.takes_over or first.splats == before.splats
-    return before.capacities if is_continued else None
 
 
 def _sizes(shape: Any) -> list[tuple[int, ...]]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from geosplat_jax.fit.config import Config, changed_settings
 from geosplat_jax.fit.presets import BETWEEN, make_config
+from geosplat_jax.fit.start_mesh import MeshSettings
 from geosplat_jax.report.protocols import NEW_VIEWS, Look, Protocol, ScaledLook, protocol
 
 _MEASURES = {
@@ -176,10 +177,12 @@ def _level_of(config: Config) -> str:
 
 def _preset_of(config: Config, overrides: Sequence[str] = ()) -> Config:
     """Return the preset at that level, under the label of ``config``."""
+    geometry = config.geometry
     found = make_config(
         config.preset,
         _level_of(config),
         material_prior=config.material_prior,
+        mesh=geometry if isinstance(geometry, MeshSettings) else None,
         overrides=tuple(overrides),
     )
     return replace(found, quality=config.quality)
@@ -200,6 +203,8 @@ def command(record: Mapping[str, Any], config: Config) -> tuple[str, bool]:
     words = ["geosplat-jax", "train", str(record["scene"]), "--output", "runs/again"]
     words += ["--preset", config.preset, "--quality", _level_of(config)]
     words += ["--material-prior", config.material_prior]
+    if isinstance(config.geometry, MeshSettings):
+        words += ["--mesh", config.geometry.path]
     reading = record["dataset"]
     if reading.get("downscale", 1) != 1:
         words += ["--downscale", str(reading["downscale"])]

@@ -64,6 +64,7 @@ PERCENTILE = 99.0
 DIFFERENCE_GAIN = 8.0
 
 _POINTS_AT_ONCE = 65_536
+"""At most, so that what a block takes fits into memory."""
 
 # A z-up world in Mitsuba's y-up envmap: local = (y, z, x).
 _ENVMAP_TO_WORLD = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
@@ -304,6 +305,12 @@ def shaded_lobes(key, points, materials, wo, light, index, *, counts):
     return shaded.diffuse, shaded.specular
 
 
+def block_of(passes: list[Hits], *, most: int = _POINTS_AT_ONCE) -> int:
+    """Return how many hits are shaded at once: one size for all passes, which compiles once."""
+    largest = max(len(hits.pixels) for hits in passes)
+    return min(most, 1 << largest.bit_length())
+
+
 def _shade_hits(
     hits: Hits,
     light: EnvLight,
@@ -312,9 +319,10 @@ def _shade_hits(
     key: jax.Array,
     *,
     material: str,
+    block: int,
 ) -> np.ndarray:
-    """Radiance (M, 3) of the hits, in blocks of one size that compile once."""
-    count, block = len(hits.pixels), _POINTS_AT_ONCE
+    """Radiance (M, 3) of the hits, in blocks of a size."""
+    count = len(hits.pixels)
     metallic = {"diffuse": 0.0, "metal": 1.0}[material]
     materials = Materials(
         albedo=jnp.broadcast_to(jnp.asarray(ALBEDO, jnp.float32), (block, 3)),
@@ -361,8 +369,9 @@ def our_image(
     total = settings.size**2
     images, coverages = [], []
     keys = jax.random.split(jax.random.key(settings.seed), len(passes))
+    how = {"material": material, "block": block_of(passes)}
     for key, hits in zip(keys, passes, strict=True):
-        radiance = _shade_hits(hits, light, index, settings, key, material=material)
+        radiance = _shade_hits(hits, light, index, settings, key, **how)
         images.append(binned(hits, radiance, settings))
         coverages.append(np.bincount(hits.pixels, minlength=total) / settings.strata**2)
     return combined(images, coverages, settings.size)

@@ -116,7 +116,8 @@ def our_image(
 ) -> against.Image:
     """Render by our estimators from passes of primary hits."""
     table = table_of(scene, face_materials(scene, settings.roughness, material))
-    key, block, images, coverages = jax.random.key(settings.seed), _POINTS_AT_ONCE, [], []
+    key, images, coverages = jax.random.key(settings.seed), [], []
+    block = against.block_of(passes, most=_POINTS_AT_ONCE)
     how = {"counts": settings.counts, "segments": segments, "material": material}
     for hits in passes:
         count, found = len(hits.pixels), []

@@ -13,7 +13,7 @@ from geosplat_jax.core.types import EnvLight  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
-SETTINGS = against.Settings(size=64, resolution=24)
+SETTINGS = against.Settings(size=32, resolution=24)
 COARSE = replace(SETTINGS, strata=4, mitsuba_passes=2)
 
 # Decibels over the object's pixels, which is stricter than over the whole image.

@@ -1,0 +1,131 @@
+"""The stage that comes next is planned and compiled while the present one trains."""
+
+from concurrent.futures import wait
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+
+from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.fit.compilation import compile_step
+from geosplat_jax.fit.config import Config, Stage
+from geosplat_jax.fit.devices import Devices
+from geosplat_jax.fit.planning import add_rays, plan_capacities
+from geosplat_jax.fit.runtime import in_background
+from geosplat_jax.fit.stages import (
+    begin_stage,
+    build_pipeline,
+    make_batch,
+    pipeline_at,
+    update_rule,
+)
+from geosplat_jax.fit.step import initial_state
+from geosplat_jax.fit.trained import NextStage
+from geosplat_jax.io.views import Views
+from geosplat_jax.pipeline import Pipeline
+from geosplat_jax.render import Params
+
+
+@dataclass(frozen=True)
+class Ends:
+    """A stage that comes to its end.
+
+    Attributes
+    ----------
+    config, views : of the run.
+    pipeline : of the stage; what is planned depends on its surface alone.
+    params : as they are now, in buffers that no step consumes.
+    devices : that the run trains on.
+    """
+
+    config: Config
+    views: Views
+    pipeline: Pipeline
+    params: Params
+    devices: Devices
+
+
+def continued(before: Pipeline, first: Pipeline, stage: Stage) -> Capacities | None:
+    """Return the buffers of a pipeline whose splats those of a stage continue; None if not."""
+    is_continued = stage.splats.takes_over or first.splats == before.splats
+    return before.capacities if is_continued else None
+
+
+class Upcoming:
+    """The stage that comes next: its buffers and programs, made while the present one trains.
+
+    Parameters
+    ----------
+    stage : that comes next. ends : the present one.
+    known : what a checkpoint said of it, in a run that is resumed.
+    """
+
+    def __init__(self, stage: Stage, ends: Ends, known: NextStage | None) -> None:
+        self.stage = stage
+        self._is_wanted = True
+        config, views, before = ends.config, ends.views, ends.pipeline
+        params, devices = ends.params, ends.devices
+
+        def first_pipeline(capacities: Capacities) -> Pipeline:
+            pipeline = pipeline_at(build_pipeline(config, stage, before.surface), config, stage, 0)
+            return replace(pipeline, capacities=capacities)
+
+        def plan() -> Capacities:
+            if known is not None and known.stage == stage.name:
+                return Capacities(**known.capacities)
+            first = begin_stage(params, before, config, stage)
+            pipeline = first_pipeline(Capacities())
+            carried = continued(before, pipeline, stage)
+            if carried is not None:
+                return add_rays(pipeline, first, carried)
+            return plan_capacities(pipeline, first, views.camera(), limits=config.geometry.limits)
+
+        def compile_all() -> None:
+            pipeline = first_pipeline(self.capacities)
+            carry = pipeline.transport.first_carry()
+            state = jax.eval_shape(
+                lambda params: initial_state(
+                    begin_stage(params, before, config, stage), carry=carry
+                ),
+                params,
+            )
+            batch = devices.share_out(
+                make_batch(views, config.first_step(stage.name), stage, seed=config.run.seed)
+            )
+            rule = update_rule(config, stage, state.params, 0)
+            compile_step(
+                state,
+                batch,
+                pipeline,
+                rule,
+                devices=devices,
+                threads=1,
+                is_wanted=lambda: self._is_wanted,
+            )
+
+        self._planned = in_background(plan)
+        self.compiled = in_background(compile_all)
+
+    @property
+    def capacities(self) -> Capacities:
+        """Sizes of the buffers, once they are known."""
+        return self._planned.result()
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the programs are compiled."""
+        return self.compiled.done()
+
+    def give_up(self) -> None:
+        """Compile no further programs."""
+        self._is_wanted = False
+
+    def abandon(self) -> None:
+        """Compile no further programs, and wait for the one that is being compiled."""
+        self.give_up()
+        wait([self._planned])
+        wait([self.compiled])
+
+    def meta(self) -> dict[str, Any]:
+        """Return what a checkpoint keeps; waits until the buffers are planned."""
+        return {"stage": self.stage.name, "capacities": dict(self.capacities)}
