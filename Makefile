@@ -1,12 +1,13 @@
 # Two commands: `make demo` and `make test`. Both make their own environment in .venv.
-# `make test-slow` adds the long tests: whole runs, compiled against eager, the whole loss.
+# `make test-slow` adds slow tests: whole runs, compiled against eager, images beside Mitsuba's;
+# `make test-long` those of minutes, by hand: the whole loss against differences, a whole sweep.
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 INSTALLED = $(VENV)/.installed
 DEMO = demo
 
-.PHONY: demo test test-slow lint format bench docs clean
+.PHONY: demo test test-slow test-long lint format bench docs clean
 
 $(INSTALLED): pyproject.toml
 	$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "geosplat_jax needs Python 3.11 or newer, got " + sys.version'
@@ -24,9 +25,13 @@ test: $(INSTALLED)
 	$(BIN)/python -m pytest $(IN_FILES)
 
 test-slow: $(INSTALLED)
-	$(BIN)/python -m pytest $(IN_FILES) -m 'slow and not computes'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test,scene]'
+	$(BIN)/python -m pytest $(IN_FILES) -m 'slow and not computes and not long'
 	# These compute more than they compile: with the optimisations that the others do without.
-	XLA_FLAGS= $(BIN)/python -m pytest --numprocesses 2 --dist load -m 'slow and computes'
+	XLA_FLAGS= $(BIN)/python -m pytest --numprocesses 2 --dist loadgroup -m 'slow and computes and not long'
+
+test-long: $(INSTALLED)
+	XLA_FLAGS= $(BIN)/python -m pytest --numprocesses 2 --dist load -m long
 
 lint: $(INSTALLED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'

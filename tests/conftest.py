@@ -32,6 +32,7 @@ enable_compilation_cache(Path(sys.prefix) / "cache")
 
 
 LONGEST = (
+    "test_against_mitsuba",
     "test_sweeps",
     "test_transport",
     "test_refinement",

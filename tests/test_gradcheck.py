@@ -28,12 +28,19 @@ SLOW_STAGES = {
 }
 
 
+LONG_STAGES = {"loss", "refinement"}
+"""Minutes each; `make test-long`."""
+
+
+def marks(stage):
+    """Return the marks of a stage: how long its check takes."""
+    slow = [pytest.mark.slow, pytest.mark.computes] if stage in SLOW_STAGES else []
+    return [*slow, pytest.mark.long] if stage in LONG_STAGES else slow
+
+
 @pytest.mark.parametrize(
     "stage",
-    [
-        pytest.param(s, marks=[pytest.mark.slow, pytest.mark.computes]) if s in SLOW_STAGES else s
-        for s in STAGES
-    ],
+    [pytest.param(s, marks=marks(s)) for s in STAGES],
 )
 def test_every_gradient_agrees_with_differences(stage):
     rows = check_stage(stage)

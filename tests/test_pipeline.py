@@ -250,6 +250,7 @@ def test_a_residual_of_its_own_has_its_own_samples(second):
 
 @pytest.mark.slow
 @pytest.mark.computes
+@pytest.mark.long
 def test_a_residual_of_its_own_takes_the_bias_from_the_gradient(second):
     """Where the mean image is the photograph, nothing should pull on the brightness of the light.
 
@@ -302,7 +303,7 @@ DIFFERENCES = {
 
 @pytest.mark.slow
 @pytest.mark.computes
-@pytest.mark.parametrize("kind", DIFFERENCES)
+@pytest.mark.parametrize("kind", [pytest.param("constant", marks=pytest.mark.long), "harmonics"])
 def test_the_gradient_of_the_whole_loss_agrees_with_differences(kind):
     """In float64 and for fixed samples, in all parameters that do not move them."""
     overrides = [f"stages.monte_carlo.transport.{text}" for text in DIFFERENCES[kind]]

@@ -649,6 +649,7 @@ def test_curves_are_drawn_and_linked(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_smoke_sweep_runs_for_real(tmp_path):
     runs, output = tmp_path / "runs", tmp_path / "smoke.md"
     command = [sys.executable, str(ROOT / "experiments" / "run.py"), str(SWEEPS / "smoke.toml")]

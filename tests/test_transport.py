@@ -427,6 +427,7 @@ def test_disagreement_is_the_squared_difference_and_moves_what_it_should(ball, m
 
 @pytest.mark.slow
 @pytest.mark.computes
+@pytest.mark.long
 def test_faces_that_agree_with_themselves_send_the_light_of_many_bounces(bowl, monkeypatch):
     """The fixed point of learned radiance in a white bowl, against eight traced bounces."""
 

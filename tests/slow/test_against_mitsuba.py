@@ -11,18 +11,20 @@ import against_mitsuba as against  # noqa: E402
 
 from geosplat_jax.core.types import EnvLight  # noqa: E402
 
-pytestmark = pytest.mark.slow
+# One group: its tests share images, which one process then renders once.
+pytestmark = [pytest.mark.slow, pytest.mark.computes, pytest.mark.xdist_group("mitsuba")]
 
-SETTINGS = against.Settings(size=32, resolution=24)
+SETTINGS = against.Settings(size=48, resolution=24)
 COARSE = replace(SETTINGS, strata=4, mitsuba_passes=2)
 
 # Decibels over the object's pixels, which is stricter than over the whole image.
 MARKS = {"diffuse": 42.0, "metal": 30.0}
 
-# Noise explains the difference to within this: systematic errors are below two thirds of the noise
-# (10^(1.5 / 10) = 1.41), whatever the marks. Separable masking in Mitsuba costs less at this
-# roughness.
-NOISE_MARGIN = 1.5
+# Noise explains the difference to within this: under the sky systematic errors are below two thirds
+# of the noise (10^(1.5 / 10) = 1.41), whatever the marks. Separable masking in Mitsuba costs less
+# at this roughness. The small sun is seen in few pixels, and the noise itself is known to some two
+# decibels only: three seeds gave -1.9, +1.2 and -0.3.
+NOISE_MARGIN = {"sky": 1.5, "sun": 3.0}
 
 # A wrong light, visibility or material is worse than noise by at least so much.
 ERROR_MARGIN = 4.0
@@ -46,7 +48,7 @@ def test_our_image_equals_that_of_mitsuba(comparisons, light, material):
     found = comparisons[f"{light}_{material}"]
     agreement = found.agreement
     assert agreement.object_psnr >= MARKS[material], found
-    assert agreement.object_psnr >= agreement.noise_psnr - NOISE_MARGIN, found
+    assert agreement.object_psnr >= agreement.noise_psnr - NOISE_MARGIN[light], found
     # Separable masking leaves Mitsuba's metal a tenth of a percent darker.
     assert abs(agreement.bias) <= 4 * agreement.bias_error + 0.002, found
     assert abs(found.ours.coverage - found.reference.coverage).mean() < 2e-3

@@ -14,7 +14,7 @@ from test_export import materials, sphere  # noqa: E402
 from geosplat_jax.io.export import export_mesh_glb  # noqa: E402
 from geosplat_jax.io.images import decode_srgb  # noqa: E402
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.computes]
 
 # Eight bits of sRGB, and a texel of 256 across the ball.
 TOLERANCE = 0.02

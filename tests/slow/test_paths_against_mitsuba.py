@@ -9,7 +9,7 @@ import paths_against_mitsuba as paths  # noqa: E402
 
 from geosplat_jax.transport.sampling import SampleCounts  # noqa: E402
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.computes]
 
 SETTINGS = against.Settings(
     size=32,
