@@ -67,6 +67,8 @@ MOST_LINES = 3
 """That a command prints after Ctrl-C."""
 PATIENCE = 900.0
 """Seconds after which a process that was sent a signal counts as one that swallowed it."""
+LAST_WORDS = "trained in"
+"""What a training prints when all its files are written."""
 LEAD = 0.03
 """Seconds after a file was seen in which the signal is sent, at most."""
 PROGRESS = re.compile(r", step \d+/|: \d+ of \d+|^compiling|^warning|^\W*$|slow compile| views, ")
@@ -249,6 +251,10 @@ def judge(kill: Kill, process: Process) -> None:
     has_begun = PACKAGE in text or bool(text.strip()) and "Traceback" not in text
     if kill.number == signal.SIGINT and kill.status == -signal.SIGINT and not has_begun:
         kill.outcome = "not begun"
+        return
+    # A command that is over leaves Ctrl-C to the system while Python cleans up; shells show 130.
+    if kill.status == -signal.SIGINT and LAST_WORDS in text and "Traceback" not in text:
+        kill.outcome = "had ended"
         return
     allowed = {
         signal.SIGINT: (0, 130),
