@@ -28,6 +28,7 @@ def assert_close(found, expected):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_parts_of_monte_carlo_give_the_gradient_of_the_whole_loss():
     """Two views, of which one counts for less, a residual with samples of its own, and a term of
     no view that looks at the light."""

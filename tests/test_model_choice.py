@@ -282,6 +282,7 @@ class _StoppedAt(Listener):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.computes
 def test_a_model_is_chosen_recorded_and_trained_on_all_views(tmp_path, capsys):
     """Only one part is left to choose; the run of few steps is stopped while it chooses."""

@@ -369,6 +369,7 @@ def _free_direction(kind, path, direction):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_step_that_lacks_room_for_rays_changes_nothing_and_succeeds_with_it(second):
     config, pipeline, params, batch = second
     settings = config.stage("monte_carlo")

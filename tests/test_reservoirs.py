@@ -251,6 +251,7 @@ def test_settings_refuse_what_would_lose_light():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_run_with_paths_and_reservoirs_resumes_bit_for_bit(tmp_path):
     config = tiny_config(
         *TRAINED,
