@@ -31,7 +31,8 @@ test-slow: $(INSTALLED)
 	XLA_FLAGS= $(BIN)/python -m pytest --numprocesses 2 --dist loadgroup -m 'slow and computes and not long'
 
 test-long: $(INSTALLED)
-	XLA_FLAGS= $(BIN)/python -m pytest --numprocesses 2 --dist load -m long
+	$(BIN)/python -m pytest $(IN_FILES) -m 'long and not computes'
+	XLA_FLAGS= $(BIN)/python -m pytest --numprocesses 2 --dist load -m 'long and computes'
 
 lint: $(INSTALLED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'

@@ -39,12 +39,13 @@ def _require_same(folder: Path, made_with: Mapping[str, Any]) -> None:
     RunError
     """
     path, text = folder / _RECORD, json.dumps(made_with, indent=1, default=str) + "\n"
-    try:
-        before = parse_json(path.read_bytes())
-    except FileNotFoundError:
+    # A command that failed before its first round, for a wrong scene say, binds nobody.
+    if not path.exists() or not any(folder.glob("round_*")):
         with written_aside(path) as aside:
             aside.write_text(text, encoding="utf-8")
         return
+    try:
+        before = parse_json(path.read_bytes())
     except ValueError as error:
         raise RunError(f"{path} is damaged: {error}; delete {folder} to begin again") from None
     now = parse_json(text)

@@ -10,6 +10,7 @@ from geosplat_jax.fit.cameras import CameraSettings
 from geosplat_jax.fit.folder import RunError
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.io.dataset import Dataset
+from geosplat_jax.io.images import SceneError
 from geosplat_jax.run import Run
 
 
@@ -80,6 +81,18 @@ def test_rounds_of_other_settings_are_not_taken_for_these(made, tmp_path, change
         refined_cameras("scene", tmp_path / "fox", **{**usual, **changed})
     refined_cameras("scene", tmp_path / "fox", **{**usual, "rounds": 2})
     assert len(made) == 2
+
+
+def test_a_command_that_failed_before_its_first_round_can_be_corrected(made, tmp_path, monkeypatch):
+    def is_not_there(scene, options):
+        raise SceneError(f"{scene} does not exist")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(camera_rounds, "load_recorded", is_not_there)
+        with pytest.raises(SceneError):
+            refined_cameras("seen", tmp_path / "fox")
+    assert refined_cameras("scene", tmp_path / "fox").exists()
+    assert len(made) == 1
 
 
 def test_a_damaged_record_of_rounds_is_named(made, tmp_path):
