@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from sweep import Sweep, SweepRun
+from sweep import Sweep, SweepRun, in_scene
 
 from geosplat_jax.fit.config import Config
 
@@ -178,7 +178,7 @@ def plan(
                 label=f"{scene}/{part.folder}",
                 scene=str((root / scene).resolve()),
                 folder=str(output / scene / part.folder),
-                config=part.config.to_dict(),
+                config=in_scene(part.config, root / scene).to_dict(),
                 options=usual | {"downscale": part.downscale},
                 source=None if part.source is None else str(output / scene / part.source),
                 first_stage=part.first_stage,

@@ -14,11 +14,12 @@ import re
 import shlex
 import statistics
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from geosplat_jax.fit.config import Config, config_from_dict, differences
+from geosplat_jax.fit.start_mesh import MeshSettings
 
 _UP = ("psnr", "ssim", "iou", "correlation")
 _DOWN = ("mse", "mae", "direction_error")
@@ -146,6 +147,16 @@ def _costs(
     return costs, notes
 
 
+def _with_file_of(recorded: Config, wanted: Config) -> Config:
+    """Return a sweep's settings with a run's mesh: the file of that name in the run's scene."""
+    run, sweep = recorded.geometry, wanted.geometry
+    if not (isinstance(run, MeshSettings) and isinstance(sweep, MeshSettings)):
+        return wanted
+    if not Path(run.path).as_posix().endswith(f"/{sweep.path}"):
+        return wanted
+    return replace(wanted, geometry=replace(sweep, path=run.path, digest=run.digest))
+
+
 def read_entry(folder: Path, run: dict[str, Any]) -> Entry:
     """Read what one run left, and check that it is the run that the sweep wants.
 
@@ -161,8 +172,8 @@ def read_entry(folder: Path, run: dict[str, Any]) -> Entry:
         return Entry({}, {}, state)
     try:
         record = json.loads((folder / "metrics.json").read_text())
-        config = config_from_dict(run["config"])
         recorded = config_from_dict(record["config"])
+        config = _with_file_of(recorded, config_from_dict(run["config"]))
         changed = differences(recorded, config)
         if changed:
             problem = f"other settings than the sweep (recorded -> wanted): {'; '.join(changed)}"

@@ -335,8 +335,9 @@ def _command_line(arguments: argparse.Namespace) -> str:
     places = {"--scenes": (arguments.scenes, "SCENES"), "--output": (arguments.output, "RUNS")}
     parts: list[str | tuple[Path, str]] = [(arguments.sweep, arguments.sweep.name)]
     parts += [part for place in places.items() for part in place]
-    if arguments.quality is not None:
-        parts += ["--quality", arguments.quality]
+    for option in ("quality", "mesh", "downscale"):
+        if getattr(arguments, option) is not None:
+            parts += [f"--{option}", str(getattr(arguments, option))]
     for option in ("only", "scene"):
         if getattr(arguments, option):
             parts += [f"--{option}", *getattr(arguments, option)]
@@ -371,6 +372,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--scene", nargs="+", default=[], metavar="NAME", help="only these scenes")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="S.F=VALUE")
     parser.add_argument("--quality", choices=QUALITIES, help="instead of the sweep's")
+    parser.add_argument("--mesh", metavar="NAME", help="file in each scene to start from, as above")
+    parser.add_argument("--downscale", type=int, metavar="N", help="of the images, as above")
     parser.add_argument(
         "--cluster", choices=("slurm", "local"), help="hand the runs to submitit (extra `cluster`)"
     )
@@ -407,7 +410,11 @@ def main(argv: list[str] | None = None, *, start: Callable[[Job], None] = in_a_p
     arguments = _parser().parse_args(argv)
     try:
         sweep = read_sweep(
-            arguments.sweep, overrides=arguments.overrides, quality=arguments.quality
+            arguments.sweep,
+            overrides=arguments.overrides,
+            quality=arguments.quality,
+            mesh=arguments.mesh,
+            downscale=arguments.downscale,
         )
         executor = cluster_of(arguments)
         scenes = _chosen(arguments.scene, sweep.scenes, "--scene")

@@ -5,12 +5,14 @@ import math
 import re
 import tomllib
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from geosplat_jax.fit.config import Config, all_settings, differences
 from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.start_mesh import MeshSettings
+from geosplat_jax.io.start_mesh import digest_of
 from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.renderer import DEFAULT_SAMPLES, RELIGHT_KINDS
 
@@ -24,7 +26,7 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
     "a finite number": lambda x: type(x) in (int, float) and math.isfinite(x),
 }
 _SWEEP_KEYS = {
-    **dict.fromkeys(("title", "about", "preset", "quality", "material_prior"), "a text"),
+    **dict.fromkeys(("title", "about", "preset", "quality", "material_prior", "mesh"), "a text"),
     **dict.fromkeys(("scenes", "set", "figures"), "a list of texts"),
     **dict.fromkeys(("samples", "downscale"), "a positive integer"),
     "run": "a list of tables",
@@ -73,13 +75,15 @@ class Sweep:
     samples: int
     downscale: int
     runs: tuple[SweepRun, ...]
+    mesh: str = ""
 
     def config(self, run: SweepRun) -> Config:
-        """Return the settings of a run."""
+        """Return the settings of a run; those of a mesh name its file within any scene's folder."""
         return make_config(
             self.preset,
             self.quality,
             material_prior=self.material_prior,
+            mesh=_anywhere(self.mesh),
             overrides=(*self.overrides, *run.overrides),
         )
 
@@ -87,6 +91,30 @@ class Sweep:
         """Return all keyword arguments of a run's evaluation."""
         usual = {"protocol": PROTOCOLS[0], "samples": self.samples, "relight_indirect": "traced"}
         return usual | run.evaluate
+
+
+def _anywhere(mesh: str) -> MeshSettings | None:
+    """Name the mesh that a sweep starts from, in whatever scene; None if it starts from none."""
+    return MeshSettings(path=mesh) if mesh else None
+
+
+def in_scene(config: Config, scene: Path) -> Config:
+    """Return settings of a sweep with the mesh that a scene's folder holds, if they have one.
+
+    Raises
+    ------
+    SweepError
+        If there is no such file.
+    """
+    if not isinstance(config.geometry, MeshSettings):
+        return config
+    path = (scene / config.geometry.path).resolve()
+    try:
+        return replace(
+            config, geometry=replace(config.geometry, path=str(path), digest=digest_of(path))
+        )
+    except ValueError as error:
+        raise SweepError(str(error)) from error
 
 
 def _check_keys(
@@ -203,7 +231,14 @@ def _check_settings(sweep: Sweep, where: str) -> None:
                 )
 
 
-def read_sweep(path: Path, *, overrides: Iterable[str] = (), quality: str | None = None) -> Sweep:
+def read_sweep(
+    path: Path,
+    *,
+    overrides: Iterable[str] = (),
+    quality: str | None = None,
+    mesh: str | None = None,
+    downscale: int | None = None,
+) -> Sweep:
     """Read and validate a sweep file.
 
     Parameters
@@ -211,14 +246,15 @@ def read_sweep(path: Path, *, overrides: Iterable[str] = (), quality: str | None
     path : TOML with ``title``, ``about``, ``preset``, ``quality``, ``material_prior``
         (see `presets.make_config`), ``scenes`` (folder names), ``set`` (overrides of every run),
         ``figures`` (names of ``metrics.json`` to tabulate), ``samples`` of the evaluation,
-        ``downscale`` of the images, and tables ``[[run]]`` with ``name``, ``title``, ``set``,
+        ``downscale`` of the images, ``mesh`` (a file in every scene's folder to start from
+        instead of the visual hull), and tables ``[[run]]`` with ``name``, ``title``, ``set``,
         ``scale`` (factors of settings by path, in which ``*`` stands for any stage),
         ``downscale`` of the images that it is trained on (all are evaluated on the sweep's),
         ``evaluate`` (keyword arguments of `Run.evaluate`), ``x`` (the run is a point of a
         curve) and ``group`` (which curve). The first run is the reference. Required are ``title``,
         ``scenes``, ``figures``, one run, and each run's ``name``.
     overrides : applied to every run after ``set`` and before its own.
-    quality : instead of the file's.
+    quality, mesh, downscale : instead of the file's.
 
     Raises
     ------
@@ -242,11 +278,14 @@ def read_sweep(path: Path, *, overrides: Iterable[str] = (), quality: str | None
         "material_prior": values.get("material_prior", "hybrid"),
         "overrides": (*values.get("set", ()), *overrides),
     }
+    mesh = values.get("mesh", "") if mesh is None else mesh
     try:
-        base = make_config(**usual)
+        base = make_config(**usual, mesh=_anywhere(mesh))
     except ValueError as error:
         raise SweepError(f"{where}: {error}") from error
-    downscale = values.get("downscale", 1)
+    downscale = values.get("downscale", 1) if downscale is None else downscale
+    if downscale < 1:
+        raise SweepError(f"{where}: downscale must be a positive integer, got {downscale}")
     tables = enumerate(values["run"], 1)
     sweep = Sweep(
         file=path.name,
@@ -257,6 +296,7 @@ def read_sweep(path: Path, *, overrides: Iterable[str] = (), quality: str | None
         figures=tuple(values["figures"]),
         samples=values.get("samples", DEFAULT_SAMPLES),
         downscale=downscale,
+        mesh=mesh,
         runs=tuple(
             _read_run(table, f"{where}, run {number}", base, downscale) for number, table in tables
         ),

@@ -59,6 +59,8 @@ group = "light"
 """
 
 
+FROM_MESH = SWEEP.replace("geometry.resolution", "geometry.edge_pixels")
+
 SEED = "run.seed=1"
 
 SHARED = "_full.split_sum"
@@ -160,6 +162,8 @@ def _run(folder, fakes, *more):
         ("x = 16", "", "group names the curve"),
         ("x = 16", "x = 1", "both at x = 1"),
         ('group = "light"', 'group = "a/b"', "the group 'a/b' is no folder name"),
+        ('quality = "draft"', "mesh = 3", "mesh must be a text"),
+        ('quality = "draft"', "downscale = 0", "downscale must be a positive integer"),
         ('"roughness.mse"', '"nvs.psnr"', "must not name one twice"),
         ("[[run]]", "[[run", "cannot read the sweep"),
     ],
@@ -214,7 +218,7 @@ def test_a_stage_is_shared_where_only_later_ones_differ(override, shares):
     assert shared == (beginning(base, 1) if shares else None)
 
 
-def _several_stages(preset, quality, *, material_prior, overrides):
+def _several_stages(preset, quality, *, material_prior, mesh, overrides):
     """Stand in for `make_config`: overrides are stages, such as ``a=3`` for three steps of a."""
     named = [text.split("=") for text in overrides]
     return Config(stages=tuple(Stage(name=name, steps=int(steps)) for name, steps in named))
@@ -339,6 +343,41 @@ def test_finished_runs_with_other_settings_stop_the_sweep_and_say_so(tmp_path, c
     path.write_text(json.dumps(figures | {"samples": 3}))
     assert _run(tmp_path, fakes) == 2
     assert "evaluate.samples: 3 -> " in capsys.readouterr().err
+
+
+def test_runs_start_from_the_mesh_in_their_scenes_folder(tmp_path, capsys):
+    _write(tmp_path, FROM_MESH)
+    for scene, text in (("one", "a mesh"), ("two", "another mesh")):
+        (tmp_path / "scenes" / scene / "mesh.ply").write_text(text)
+    fakes = Fakes()
+    some = ["--only", "full", "few", "--mesh", "mesh.ply"]
+    assert _run(tmp_path, fakes, *some) == 0
+    starts = {}
+    for scene in ("one", "two"):
+        record = json.loads((tmp_path / "runs" / scene / "few" / "run.json").read_text())
+        starts[scene] = record["config"]["geometry"]
+        assert starts[scene]["path"] == str(tmp_path / "scenes" / scene / "mesh.ply")
+    assert starts["one"]["digest"] != starts["two"]["digest"]
+    text = _report(tmp_path)
+    assert "--mesh mesh.ply" in text
+    assert "other settings" not in text
+    (tmp_path / "scenes" / "one" / "mesh.ply").write_text("a third mesh")
+    assert _run(tmp_path, Fakes(), *some) == 2
+    assert "geometry.digest" in capsys.readouterr().err
+    (tmp_path / "scenes" / "one" / "mesh.ply").unlink()
+    assert _run(tmp_path, Fakes(), *some) == 2
+    assert "there is no mesh file" in capsys.readouterr().err
+
+
+def test_the_report_notices_a_start_from_another_mesh(tmp_path):
+    _write(tmp_path, FROM_MESH)
+    for scene in ("one", "two"):
+        for name in ("mesh.ply", "other.ply"):
+            (tmp_path / "scenes" / scene / name).write_text(name)
+    assert _run(tmp_path, Fakes(), "--mesh", "other.ply") == 0
+    record = tmp_path / "runs" / "sweep.json"
+    record.write_text(record.read_text().replace("other.ply", "mesh.ply"))
+    assert "geometry.path" in _report(tmp_path)
 
 
 def test_settings_of_later_stages_leave_the_shared_ones_as_they_are(tmp_path, capsys):
