@@ -1,0 +1,187 @@
+"""How right the light is that comes by way of other surfaces, pixel by pixel against Mitsuba.
+
+    pip install 'geosplat_jax[scene]'
+    python experiments/studies/indirect.py SCENE RUN ... [--samples 256] [--spp 1024] [--views 4]
+        [--picture FILE] [--json FILE]
+
+SCENE is one of `experiments/scene/make_bounce_scenes.py`, the runs were trained on it. Mitsuba
+renders the true scene under the light of the photographs twice, with eight segments to a path and
+with one bounce; a run renders its own surface, materials and light with the indirect light that it
+was trained with, and without any. The differences of either pair are the indirect light, in units
+of the photographs, so that an albedo that is too dark under a light that is too bright counts as
+right.
+
+Columns: PSNR of the indirect light, and of direct and indirect together, on pixels of the object
+that no photograph clips, with the 99th percentile of the true image as the peak; and the mean of
+the indirect light over the true one's. With black instead of any indirect light, the first says
+how much there is to find. ``--picture`` writes the indirect light of one view, Mitsuba's first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scene"))
+
+import make_bounce_scenes  # noqa: E402
+import make_scene  # noqa: E402
+import mitsuba as mi  # noqa: E402
+import scene_lights  # noqa: E402
+
+from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory  # noqa: E402
+from geosplat_jax.fit.trained import load_trained  # noqa: E402
+from geosplat_jax.report.renderer import RenderedView, Renderer  # noqa: E402
+from geosplat_jax.run import Run  # noqa: E402
+from geosplat_jax.transport.environment import LightSpec  # noqa: E402
+from geosplat_jax.transport.monte_carlo import MonteCarloSettings  # noqa: E402
+
+UNCLIPPED = 0.95
+"""Largest channel of a pixel that counts: photographs hold nothing above 1."""
+
+OPAQUE = 0.99
+"""Smallest coverage of a pixel that counts."""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """One view: (H, W, 3) linear, all light and that of the first bounce; (H, W) coverage."""
+
+    whole: np.ndarray
+    direct: np.ndarray
+    alpha: np.ndarray
+
+    @property
+    def indirect(self) -> np.ndarray:
+        """What came by way of other surfaces."""
+        return self.whole - self.direct
+
+
+def rendered_by_mitsuba(scene: Path, count: int, spp: int) -> list[Parts]:
+    """Render the first test views of a scene by path tracing, with and without later bounces."""
+    description = json.loads((scene / "scene.json").read_text())
+    light = scene_lights.read_hdr(scene.parent / f"{description['train_light']}.hdr")
+    size = json.loads((scene / "test_000" / "metadata.json").read_text())["imw"]
+    cameras = json.loads((scene / "transforms_test.json").read_text())["frames"][:count]
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "mesh.ply"
+        make_scene.write_parts(path, make_bounce_scenes.SCENES[scene.name]())
+        world = make_scene.shaded_scene(path, light)
+        integrators = [
+            mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
+            for depth in (make_scene.MAX_DEPTH, 2)
+        ]
+        found = []
+        for number, camera in enumerate(cameras):
+            view = make_scene.View("", np.asarray(camera["transform_matrix"]), 7000 + number)
+            whole, direct = (
+                np.array(
+                    mi.render(
+                        world,
+                        sensor=make_scene.sensor(view, size, spp),
+                        integrator=integrator,
+                        seed=view.seed,
+                    ),
+                    np.float32,
+                )
+                for integrator in integrators
+            )
+            found.append(Parts(whole[..., :3], direct[..., :3], whole[..., 3]))
+    return found
+
+
+def rendered_by_run(folder: Path, count: int, samples: int) -> list[Parts]:
+    """Render the same views of a run's own scene, with its indirect light and without any."""
+    trained = load_trained(folder)
+    without = MonteCarloSettings(indirect="none").build(LightSpec())
+    pipelines = (trained.pipeline, replace(trained.pipeline, transport=without))
+    renderers = [Renderer(one, trained.params, samples=samples) for one in pipelines]
+    views = Run(folder).dataset.test
+
+    def view_of(renderer: Renderer, number: int) -> RenderedView:
+        return renderer(views.camera(np.array([number])))
+
+    found = []
+    for number in range(count):
+        whole, direct = (view_of(renderer, number) for renderer in renderers)
+        found.append(Parts(whole.rgb, direct.rgb, whole.alpha))
+    return found
+
+
+def _counted(truth: Parts) -> np.ndarray:
+    """Tell the pixels of the object that photographs say anything about: (H, W) bool."""
+    return (truth.alpha > OPAQUE) & (truth.whole.max(-1) < UNCLIPPED)
+
+
+def compared(found: list[Parts], truth: list[Parts]) -> dict[str, float]:
+    """Compare the views of a run with the true ones."""
+    counted = [_counted(view) for view in truth]
+
+    def pixels(views: list[Parts], part: str) -> np.ndarray:
+        return np.concatenate(
+            [getattr(view, part)[where] for view, where in zip(views, counted, strict=True)]
+        )
+
+    peak = float(np.percentile(pixels(truth, "whole"), 99))
+
+    def psnr(part: str) -> float:
+        error = pixels(found, part) - pixels(truth, part)
+        return float(-10.0 * np.log10(np.mean(error**2) / peak**2))
+
+    share = float(pixels(found, "indirect").mean() / pixels(truth, "indirect").mean())
+    return {"indirect PSNR": psnr("indirect"), "all PSNR": psnr("whole"), "share found": share}
+
+
+def write_picture(path: Path, columns: list[Parts]) -> None:
+    """Write the indirect light of one view side by side, four times as bright as it is."""
+    images = [make_scene.linear_to_srgb(4.0 * np.clip(view.indirect, 0, None)) for view in columns]
+    picture = np.round(255.0 * np.concatenate(images, axis=1)).astype(np.uint8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(picture).save(path)
+
+
+def main() -> None:
+    """Compare the runs of the command line with Mitsuba and print a table of Markdown."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("runs", type=Path, nargs="+")
+    parser.add_argument("--samples", type=int, default=256, help="rays per splat")
+    parser.add_argument("--spp", type=int, default=1024, help="paths a pixel of Mitsuba's")
+    parser.add_argument("--views", type=int, default=4, help="of the test views")
+    parser.add_argument("--variant", default="auto", help="Mitsuba variant, or auto")
+    parser.add_argument("--picture", type=Path)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    if arguments.scene.resolve().name not in make_bounce_scenes.SCENES:
+        parser.error(f"SCENE must be one of {', '.join(make_bounce_scenes.SCENES)}")
+    make_scene.choose_variant(arguments.variant)
+    enable_compilation_cache()
+    retain_freed_memory()
+    truth = rendered_by_mitsuba(arguments.scene.resolve(), arguments.views, arguments.spp)
+    black = [Parts(view.direct, view.direct, view.alpha) for view in truth]
+    rows, columns = {"black": compared(black, truth)}, [truth[0]]
+    for folder in arguments.runs:
+        views = rendered_by_run(folder, arguments.views, arguments.samples)
+        rows[folder.name] = compared(views, truth)
+        columns.append(views[0])
+        print(folder.name, rows[folder.name], file=sys.stderr, flush=True)
+    names = list(rows["black"])
+    for cells in (["run", *names], ["---"] * (1 + len(names))):
+        print(f"| {' | '.join(cells)} |")
+    for name, row in rows.items():
+        print(f"| {name} | {' | '.join(f'{value:.2f}' for value in row.values())} |")
+    if arguments.picture is not None:
+        write_picture(arguments.picture, columns)
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(rows, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
