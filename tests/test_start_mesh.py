@@ -6,7 +6,14 @@ import trimesh
 from support import sphere_views
 
 from geosplat_jax.io import start_mesh
-from geosplat_jax.io.meshes import signed_volume, to_gltf_axes
+from geosplat_jax.io.meshes import (
+    longest_edge,
+    nondegenerate,
+    signed_volume,
+    split_long_edges,
+    surface_area,
+    to_gltf_axes,
+)
 from geosplat_jax.io.start_mesh import (
     agreement_with_views,
     digest_of,
@@ -203,6 +210,53 @@ def test_coarse_meshes_are_divided_and_fine_ones_decimated(monkeypatch):
     )
     with pytest.raises(ValueError, match="1280 faces, more than geometry.max_faces = 1000"):
         sized(finer, edge, most_faces=1000, path="x")
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        trimesh.creation.cylinder(radius=0.1, height=2.0, sections=24),
+        trimesh.creation.box(extents=(1.0, 0.3, 0.07)),
+        trimesh.creation.icosphere(subdivisions=1),
+    ],
+    ids=["slivers", "box", "ball"],
+)
+def test_long_edges_are_split_and_the_surface_stays(body):
+    vertices, faces = np.array(body.vertices), np.array(body.faces)
+    found = split_long_edges(vertices, faces, longest=0.11, most_faces=10**6)
+    assert longest_edge(*found) <= 0.11
+    assert start_mesh.StartMesh(*found).is_closed
+    assert nondegenerate(*found).all()
+    assert surface_area(*found) == pytest.approx(surface_area(vertices, faces), rel=1e-9)
+    assert signed_volume(*found) == pytest.approx(signed_volume(vertices, faces), rel=1e-9)
+    # The corners that were there keep their rows.
+    assert np.array_equal(found[0][: len(vertices)], vertices)
+
+
+def test_of_an_open_mesh_the_border_is_split_too():
+    vertices = np.array([[0.0, 0, 0], [3.0, 0, 0], [0, 1.0, 0]])
+    found = split_long_edges(vertices, np.array([[0, 1, 2]]), longest=0.5, most_faces=1000)
+    assert longest_edge(*found) <= 0.5
+    assert surface_area(*found) == pytest.approx(1.5)
+
+
+def test_splitting_ends_before_there_are_too_many_faces():
+    body = trimesh.creation.cylinder(radius=0.1, height=2.0, sections=24)
+    vertices, faces = np.array(body.vertices), np.array(body.faces)
+    some = split_long_edges(vertices, faces, longest=0.01, most_faces=500)
+    assert len(faces) < len(some[1]) <= 500
+    assert start_mesh.StartMesh(*some).is_closed
+
+
+def test_long_faces_of_a_mesh_with_enough_of_them_are_split():
+    body = trimesh.creation.cylinder(radius=0.2, height=2.0, sections=200)
+    mesh = start_mesh.StartMesh(np.array(body.vertices), np.array(body.faces))
+    even = sized(mesh, 0.07, most_faces=100_000, path="x")
+    assert longest_edge(even.vertices, even.faces) <= 2 * 0.07
+    assert [note for note in even.notes if "long faces split" in note] == list(even.notes)
+    some = sized(mesh, 0.07, most_faces=2000, path="x")
+    assert len(some.faces) <= 2000
+    assert any("stay longer than pixels need" in note for note in some.notes)
 
 
 def test_a_fine_mesh_is_truly_decimated():

@@ -115,6 +115,12 @@ def surface_area(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3
     return float(0.5 * np.sqrt((np.cross(b - a, c - a) ** 2).sum(-1)).sum())
 
 
+def longest_edge(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> float:
+    """Return the length of the longest edge of a face."""
+    edges = vertices[faces] - vertices[np.roll(faces, -1, axis=1)]
+    return float(np.sqrt(np.max(np.sum(edges**2, axis=-1))))
+
+
 def to_gltf_axes(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
     """Turn positions or normals of the z-up world into glTF's y-up axes: (x, z, -y)."""
     return np.stack([vectors[:, 0], vectors[:, 2], -vectors[:, 1]], axis=-1)
@@ -335,3 +341,64 @@ def fill_gutters(
         ndimage.distance_transform_edt(~covered, return_distances=False, return_indices=True)
     )
     return texture[rows, columns]
+
+
+def split_long_edges(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    *,
+    longest: float,
+    most_faces: int,
+) -> tuple[Float[np.ndarray, "W 3"], Int[np.ndarray, "G 3"]]:
+    """Split edges at their middles until none is longer than a length; the longest ones first.
+
+    All faces at an edge are split with it, so that a closed mesh stays closed; the surface does not
+    change. It ends early rather than make more than ``most_faces``.
+    """
+    while True:
+        ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1)  # (F, edge, 2)
+        edges, number = np.unique(np.sort(ends.reshape(-1, 2), axis=1), axis=0, return_inverse=True)
+        lengths = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=-1)
+        is_long = lengths > max(longest, 0.7 * float(lengths.max(initial=0.0)))
+        is_split = is_long[number.reshape(-1)].reshape(-1, 3)
+        if not is_long.any() or len(faces) + is_split.sum() > most_faces:
+            return vertices, faces
+        row = np.full(len(edges), -1)
+        row[is_long] = len(vertices) + np.arange(is_long.sum())
+        middle = row[number.reshape(-1)].reshape(-1, 3)
+        vertices = np.concatenate([vertices, vertices[edges[is_long]].mean(axis=1)])
+        faces = _split_faces(vertices, faces, middle).astype(np.int32)
+
+
+def _split_faces(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    middle: Int[np.ndarray, "F 3"],
+) -> Int[np.ndarray, "G 3"]:
+    """Make the faces of triangles whose edges have vertices in their middles, or -1 for none.
+
+    Edge k of a face goes from its corner k to the next one.
+    """
+    count = (middle >= 0).sum(axis=1)
+    # Turned so that a single split edge is the first one, and a single whole edge the last one.
+    odd = np.where(count == 1, np.argmax(middle >= 0, axis=1), (np.argmin(middle, axis=1) + 1) % 3)
+    turn = (odd[:, None] + np.arange(3)) % 3
+    corners, middles = (np.take_along_axis(x, turn, axis=1) for x in (faces, middle))
+    found = [faces[count == 0]]
+
+    def add(where: np.ndarray, *triangles: tuple[int, int, int]) -> None:
+        """Add triangles of corners, 0 to 2, and of the middles of their edges, 3 to 5."""
+        both = np.concatenate([corners, middles], axis=1)[where]
+        found.extend(both[:, list(triangle)] for triangle in triangles)
+
+    add(count == 1, (0, 3, 2), (3, 1, 2))
+    add(count == 3, (0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))
+    # What two splits leave has four corners, and is cut along its shorter diagonal.
+    two = count == 2
+    ends = np.where(two[:, None], middles, 0)
+    first = np.linalg.norm(vertices[corners[:, 0]] - vertices[ends[:, 1]], axis=-1)
+    second = np.linalg.norm(vertices[ends[:, 0]] - vertices[corners[:, 2]], axis=-1)
+    add(two, (3, 1, 4))
+    add(two & (first <= second), (0, 3, 4), (0, 4, 2))
+    add(two & (first > second), (0, 3, 2), (3, 4, 2))
+    return np.concatenate(found)

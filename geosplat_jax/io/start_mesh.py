@@ -14,9 +14,11 @@ import trimesh
 from jaxtyping import Float, Int
 
 from geosplat_jax.io.meshes import (
+    longest_edge,
     nondegenerate,
     read_mesh,
     signed_volume,
+    split_long_edges,
     surface_area,
 )
 from geosplat_jax.io.views import Views
@@ -45,6 +47,10 @@ _FACTORS = (1e-3, 1e-2, 1e-1, 10.0, 1e2, 1e3)
 
 _WORTHWHILE = 0.8
 """A mesh is decimated where at most this share of its faces is to stay."""
+
+_LONG = 2.0
+"""Edges longer than the wanted one by this factor are split: Gaussians are as long as their faces,
+and a material cannot change along one."""
 
 
 @dataclass(frozen=True)
@@ -286,6 +292,9 @@ def pixel_length(mesh: StartMesh, views: Views) -> float:
 def sized(mesh: StartMesh, edge: float, *, most_faces: int, path: str) -> StartMesh:
     """Decimate or divide a mesh to edges of a length, as far as a number of faces allows.
 
+    The number of faces is what their area asks for; faces that are still too long, as those of flat
+    parts are in meshes made by hand or decimated, are then split.
+
     Raises
     ------
     ValueError
@@ -295,10 +304,27 @@ def sized(mesh: StartMesh, edge: float, *, most_faces: int, path: str) -> StartM
     # As many equilateral triangles as cover the surface.
     wanted = max(int(area / (0.25 * np.sqrt(3.0) * edge**2)), 4)
     target = min(wanted, most_faces)
-    count = len(mesh.faces)
-    if target < _WORTHWHILE * count:
-        return _decimated(mesh, target, most_faces=most_faces, path=path)
-    vertices, faces = mesh.vertices, mesh.faces
+    if target < _WORTHWHILE * len(mesh.faces):
+        mesh = _decimated(mesh, target, most_faces=most_faces, path=path)
+    else:
+        mesh = _divided(mesh, target)
+    vertices, faces = split_long_edges(
+        mesh.vertices, mesh.faces, longest=_LONG * edge, most_faces=most_faces
+    )
+    notes = []
+    if len(faces) > len(mesh.faces):
+        notes.append(f"long faces split, {len(faces)} in all, to match the pixels")
+    if longest_edge(vertices, faces) > _LONG * edge:
+        notes.append(
+            f"some faces stay longer than pixels need: more than geometry.max_faces = {most_faces} "
+            "would be necessary"
+        )
+    return mesh.noting(*notes, vertices=vertices, faces=faces) if notes else mesh
+
+
+def _divided(mesh: StartMesh, target: int) -> StartMesh:
+    """Divide every face in four, as often as a number of faces allows."""
+    count, vertices, faces = len(mesh.faces), mesh.vertices, mesh.faces
     while 4 * len(faces) <= target:
         vertices, faces = trimesh.remesh.subdivide(vertices, faces)[:2]
     if len(faces) == count:
