@@ -1,8 +1,8 @@
 """How right the light is that comes by way of other surfaces, pixel by pixel against Mitsuba.
 
     pip install 'geosplat_jax[scene]'
-    python experiments/studies/indirect.py SCENE RUN ... [--samples 256] [--spp 1024] [--views 4]
-        [--picture FILE] [--json FILE]
+    python experiments/studies/indirect.py SCENE RUN ... [--samples 256] [--spp 1024]
+        [--views 0 2 5 6] [--picture FILE] [--json FILE]
 
 SCENE is one of `experiments/scene/make_bounce_scenes.py`, the runs were trained on it. Mitsuba
 renders the true scene under the light of the photographs twice, with eight segments to a path and
@@ -14,7 +14,8 @@ right.
 Columns: PSNR of the indirect light, and of direct and indirect together, on pixels of the object
 that no photograph clips, with the 99th percentile of the true image as the peak; and the mean of
 the indirect light over the true one's. With black instead of any indirect light, the first says
-how much there is to find. ``--picture`` writes the indirect light of one view, Mitsuba's first.
+how much there is to find. ``--picture`` writes a sheet of one view, the truth first: indirect
+light, four times as bright as it is, albedo, each channel aligned to the truth, and normals.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ import scene_lights  # noqa: E402
 
 from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory  # noqa: E402
 from geosplat_jax.fit.trained import load_trained  # noqa: E402
+from geosplat_jax.io.dataset import load_dataset  # noqa: E402
 from geosplat_jax.report.renderer import RenderedView, Renderer  # noqa: E402
 from geosplat_jax.run import Run  # noqa: E402
 from geosplat_jax.transport.environment import LightSpec  # noqa: E402
@@ -52,11 +54,16 @@ OPAQUE = 0.99
 
 @dataclass(frozen=True)
 class Parts:
-    """One view: (H, W, 3) linear, all light and that of the first bounce; (H, W) coverage."""
+    """One view: (H, W, 3) linear, all light and that of the first bounce; (H, W) coverage.
+
+    Albedo, premultiplied by coverage, and normals are (H, W, 3) too.
+    """
 
     whole: np.ndarray
     direct: np.ndarray
     alpha: np.ndarray
+    albedo: np.ndarray
+    normal: np.ndarray
 
     @property
     def indirect(self) -> np.ndarray:
@@ -64,12 +71,13 @@ class Parts:
         return self.whole - self.direct
 
 
-def rendered_by_mitsuba(scene: Path, count: int, spp: int) -> list[Parts]:
-    """Render the first test views of a scene by path tracing, with and without later bounces."""
+def rendered_by_mitsuba(scene: Path, chosen: list[int], spp: int) -> list[Parts]:
+    """Render test views of a scene by path tracing, with and without later bounces."""
     description = json.loads((scene / "scene.json").read_text())
     light = scene_lights.read_hdr(scene.parent / f"{description['train_light']}.hdr")
     size = json.loads((scene / "test_000" / "metadata.json").read_text())["imw"]
-    cameras = json.loads((scene / "transforms_test.json").read_text())["frames"][:count]
+    cameras = json.loads((scene / "transforms_test.json").read_text())["frames"]
+    known = load_dataset(scene).test.truth
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "mesh.ply"
         make_scene.write_parts(path, make_bounce_scenes.SCENES[scene.name]())
@@ -79,8 +87,9 @@ def rendered_by_mitsuba(scene: Path, count: int, spp: int) -> list[Parts]:
             for depth in (make_scene.MAX_DEPTH, 2)
         ]
         found = []
-        for number, camera in enumerate(cameras):
-            view = make_scene.View("", np.asarray(camera["transform_matrix"]), 7000 + number)
+        for number in chosen:
+            pose = np.asarray(cameras[number]["transform_matrix"])
+            view = make_scene.View("", pose, 7000 + number)
             whole, direct = (
                 np.array(
                     mi.render(
@@ -93,11 +102,15 @@ def rendered_by_mitsuba(scene: Path, count: int, spp: int) -> list[Parts]:
                 )
                 for integrator in integrators
             )
-            found.append(Parts(whole[..., :3], direct[..., :3], whole[..., 3]))
+            alpha = np.clip(whole[..., 3:], 0.0, 1.0)
+            albedo, normal = (np.asarray(known[name][number]) for name in ("albedo", "normal"))
+            found.append(
+                Parts(whole[..., :3], direct[..., :3], alpha[..., 0], albedo * alpha, normal)
+            )
     return found
 
 
-def rendered_by_run(folder: Path, count: int, samples: int) -> list[Parts]:
+def rendered_by_run(folder: Path, chosen: list[int], samples: int) -> list[Parts]:
     """Render the same views of a run's own scene, with its indirect light and without any."""
     trained = load_trained(folder)
     without = MonteCarloSettings(indirect="none").build(LightSpec())
@@ -109,9 +122,10 @@ def rendered_by_run(folder: Path, count: int, samples: int) -> list[Parts]:
         return renderer(views.camera(np.array([number])))
 
     found = []
-    for number in range(count):
+    for number in chosen:
         whole, direct = (view_of(renderer, number) for renderer in renderers)
-        found.append(Parts(whole.rgb, direct.rgb, whole.alpha))
+        maps = (whole.aovs["albedo"], whole.aovs["normal"])
+        found.append(Parts(whole.rgb, direct.rgb, whole.alpha, *maps))
     return found
 
 
@@ -139,12 +153,23 @@ def compared(found: list[Parts], truth: list[Parts]) -> dict[str, float]:
     return {"indirect PSNR": psnr("indirect"), "all PSNR": psnr("whole"), "share found": share}
 
 
-def write_picture(path: Path, columns: list[Parts]) -> None:
-    """Write the indirect light of one view side by side, four times as bright as it is."""
-    images = [make_scene.linear_to_srgb(4.0 * np.clip(view.indirect, 0, None)) for view in columns]
-    picture = np.round(255.0 * np.concatenate(images, axis=1)).astype(np.uint8)
+def write_picture(path: Path, truth: Parts, others: list[Parts]) -> None:
+    """Write the sheet of one view: a row for each map, a column for the truth and each run."""
+    rows = [
+        [4.0 * np.clip(view.indirect, 0, None) for view in (truth, *others)],
+        [truth.albedo, *(_aligned(view.albedo, truth.albedo) for view in others)],
+    ]
+    cells = [np.concatenate([make_scene.linear_to_srgb(x) for x in row], axis=1) for row in rows]
+    cells.append(np.concatenate([0.5 + 0.5 * v.normal for v in (truth, *others)], axis=1))
+    picture = np.round(255.0 * np.clip(np.concatenate(cells), 0.0, 1.0)).astype(np.uint8)
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(picture).save(path)
+
+
+def _aligned(albedo: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Scale each channel by least squares."""
+    both, own = (np.sum(x * albedo, axis=(0, 1)) for x in (truth, albedo))
+    return albedo * (both / np.maximum(own, 1e-12))
 
 
 def main() -> None:
@@ -154,7 +179,9 @@ def main() -> None:
     parser.add_argument("runs", type=Path, nargs="+")
     parser.add_argument("--samples", type=int, default=256, help="rays per splat")
     parser.add_argument("--spp", type=int, default=1024, help="paths a pixel of Mitsuba's")
-    parser.add_argument("--views", type=int, default=4, help="of the test views")
+    parser.add_argument(
+        "--views", type=int, nargs="+", default=[0, 2, 5, 6], help="of the test views; first shown"
+    )
     parser.add_argument("--variant", default="auto", help="Mitsuba variant, or auto")
     parser.add_argument("--picture", type=Path)
     parser.add_argument("--json", type=Path)
@@ -165,8 +192,8 @@ def main() -> None:
     enable_compilation_cache()
     retain_freed_memory()
     truth = rendered_by_mitsuba(arguments.scene.resolve(), arguments.views, arguments.spp)
-    black = [Parts(view.direct, view.direct, view.alpha) for view in truth]
-    rows, columns = {"black": compared(black, truth)}, [truth[0]]
+    black = [replace(view, whole=view.direct) for view in truth]
+    rows, columns = {"black": compared(black, truth)}, []
     for folder in arguments.runs:
         views = rendered_by_run(folder, arguments.views, arguments.samples)
         rows[folder.name] = compared(views, truth)
@@ -178,7 +205,7 @@ def main() -> None:
     for name, row in rows.items():
         print(f"| {name} | {' | '.join(f'{value:.2f}' for value in row.values())} |")
     if arguments.picture is not None:
-        write_picture(arguments.picture, columns)
+        write_picture(arguments.picture, truth[0], columns)
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(rows, indent=2) + "\n")
 
