@@ -247,9 +247,10 @@ def test_a_stage_chooses_paths_and_they_say_what_they_need():
     config = tiny_config(
         "stages.monte_carlo.transport.kind=paths",
         "stages.monte_carlo.transport.bounce_count=3",
+        "stages.monte_carlo.transport.later_gradient=light",
     )
     found = config.stage("monte_carlo").transport
-    assert found == PathSettings(bounce_count=3)
+    assert found == PathSettings(bounce_count=3, later_gradient="light")
     transport = found.build(LightSpec())
     assert transport.needs_key
     assert transport.uses_rays
