@@ -356,8 +356,10 @@ def split_long_edges(
     change. It ends early rather than make more than ``most_faces``.
     """
     while True:
-        ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1)  # (F, edge, 2)
-        edges, number = np.unique(np.sort(ends.reshape(-1, 2), axis=1), axis=0, return_inverse=True)
+        start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
+        keys = np.minimum(start, end) * len(vertices) + np.maximum(start, end)  # one an edge
+        keys, number = np.unique(keys, return_inverse=True)
+        edges = np.stack(np.divmod(keys, len(vertices)), axis=-1)
         lengths = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=-1)
         is_long = lengths > max(longest, 0.7 * float(lengths.max(initial=0.0)))
         is_split = is_long[number.reshape(-1)].reshape(-1, 3)
