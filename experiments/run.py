@@ -372,8 +372,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--scene", nargs="+", default=[], metavar="NAME", help="only these scenes")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="S.F=VALUE")
     parser.add_argument("--quality", choices=QUALITIES, help="instead of the sweep's")
-    parser.add_argument("--mesh", metavar="NAME", help="file in each scene to start from, as above")
-    parser.add_argument("--downscale", type=int, metavar="N", help="of the images, as above")
+    parser.add_argument(
+        "--mesh", metavar="NAME", help="start from this file of every scene; instead of the sweep's"
+    )
+    parser.add_argument(
+        "--downscale", type=int, metavar="N", help="reduce the images; instead of the sweep's"
+    )
     parser.add_argument(
         "--cluster", choices=("slurm", "local"), help="hand the runs to submitit (extra `cluster`)"
     )

@@ -364,7 +364,7 @@ class PathSettings(SampledSettings, TransportSettings, kind="paths"):
     by way of one other surface. There is no Russian roulette."""
     later_gradient: LaterGradient = "none"
     """What is differentiated at the vertices of a path after the first: nothing, the light that
-    they reflect, or that and their materials and normals. Nothing is fastest, and no worse."""
+    they reflect, or that and their materials and normals."""
 
     @property
     def relative_cost(self) -> float:
