@@ -24,6 +24,7 @@ from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.surface.band import REACH, Band
 from geosplat_jax.surface.base import SurfaceModel
 from geosplat_jax.surface.grids import neutral_geometry
+from geosplat_jax.surface.hollows import carve_hollows
 from geosplat_jax.surface.hull import fit_grid, hull_sdf
 
 Bounds = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
@@ -131,6 +132,9 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
     """Cells along the longest side of the box around the object."""
     initial: Literal["hull", "sphere", "random"] = "hull"
     """First surface: visual hull of the masks, a sphere, or noise (the paper)."""
+    hollows: bool = True
+    """Carve what no mask shows, the inside of a bowl, from the visual hull, where the photographs
+    agree much better on the colours behind its surface."""
     band: Literal[0, 3, 5, 7] = 0
     """Cells across in a band around the surface that hold values and follow it, so that memory and
     time grow with its area; 0: all cells of the box."""
@@ -221,14 +225,10 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
         if self.initial == "sphere":
             return sphere_sdf(grid, radius=0.35 * float(grid.cell_size) * max(grid.shape))
         views = dataset.train
-        camera = views.camera()
-        sdf = hull_sdf(
-            np.asarray(camera.world_to_camera, np.float64),
-            np.asarray(camera.intrinsics, np.float64),
-            views.alphas,
-            grid,
-            valid=views.valid,
-        )
+        cameras = views.world_to_camera, np.asarray(views.intrinsics, np.float64)
+        sdf = hull_sdf(*cameras, views.alphas, grid, valid=views.valid)
+        if self.hollows:
+            sdf = carve_hollows(*cameras, views.images, sdf, grid, valid=views.valid)
         return jnp.clip(jnp.asarray(sdf), -REACH, REACH)
 
     def _reaching(self, grid: Grid) -> Grid:

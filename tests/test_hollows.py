@@ -1,0 +1,178 @@
+"""Hollows: half a hollow ball, whose inside no silhouette shows, and bodies that have none."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from support import look_at_poses
+
+from geosplat_jax.fit.surfaces import FlexiCubesSettings
+from geosplat_jax.io.dataset import Dataset
+from geosplat_jax.io.views import Views
+from geosplat_jax.surface.hollows import carve_hollows
+from geosplat_jax.surface.hull import fit_grid, grid_points, hull_sdf
+
+OUTER, INNER = 1.0, 0.8
+BOUNDS = (np.full(3, -1.05), np.array([1.05, 1.05, 0.1]))
+COUNT, SIZE, DISTANCE = 24, 64, 4.0
+FOCAL = 0.45 * SIZE * DISTANCE
+
+
+def bowl(points):
+    """Signed distance bound of half a ball, hollowed out from above."""
+    away = np.linalg.norm(points, axis=-1)
+    return np.maximum(np.maximum(away - OUTER, INNER - away), points[..., 2])
+
+
+def half_ball(points):
+    """Signed distance bound of the same with a flat lid."""
+    return np.maximum(np.linalg.norm(points, axis=-1) - OUTER, points[..., 2])
+
+
+def painted(points, rays):
+    """Four colours around the axis, of a surface that looks alike from everywhere."""
+    del rays
+    angle = np.arctan2(points[..., 1], points[..., 0])
+    waves = [np.cos(2 * angle), np.sin(2 * angle), np.cos(angle)]
+    return 0.3 + 0.25 * np.stack(waves, axis=-1)
+
+
+def mirrored(points, rays):
+    """What the polished lid and the polished ball show of a colourful world."""
+    ball = points / np.linalg.norm(points, axis=-1, keepdims=True)
+    normal = np.where(points[..., 2:] > -0.02, [0.0, 0.0, 1.0], ball)
+    x, y, z = np.moveaxis(rays - 2 * (rays * normal).sum(-1, keepdims=True) * normal, -1, 0)
+    waves = [np.sin(5 * x + 3 * y), np.sin(4 * z - 3 * x), np.cos(6 * y + 2 * z)]
+    return 0.4 + 0.3 * np.stack(waves, axis=-1)
+
+
+def reflecting_softly(points, rays):
+    """The same under a light that is nearly even."""
+    ball = points / np.linalg.norm(points, axis=-1, keepdims=True)
+    normal = np.where(points[..., 2:] > -0.02, [0.0, 0.0, 1.0], ball)
+    return 0.5 + 0.3 * (rays - 2 * (rays * normal).sum(-1, keepdims=True) * normal)
+
+
+def photographed(distance, color, *, count=COUNT):
+    """Views of a body, by sphere tracing."""
+    poses = look_at_poses(count, distance=DISTANCE)
+    steps = (np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL
+    x, y = np.meshgrid(steps, -steps)
+    rays = np.stack([x, y, -np.ones_like(x)], axis=-1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    images = []
+    for pose in poses:
+        towards = rays @ pose[:3, :3].T
+        travelled = np.full((SIZE, SIZE, 1), DISTANCE - 1.5)
+        for _ in range(60):
+            points = pose[:3, 3] + travelled * towards
+            travelled = travelled + distance(points)[..., None]
+        hit = distance(points)[..., None] < 0.01
+        images.append(np.concatenate([np.where(hit, color(points, towards), 0.0), hit], -1))
+    lens = np.array([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1.0]])
+    return Views(
+        names=tuple(f"view_{k}" for k in range(count)),
+        camera_to_world=poses,
+        intrinsics=np.repeat(lens[None], count, axis=0),
+        images=np.stack(images).astype(np.float32),
+    )
+
+
+def carved(views, *, resolution=24):
+    """Return the grid's points, the hull and what is carved from it."""
+    grid = fit_grid(BOUNDS, resolution)
+    cameras = views.world_to_camera, views.intrinsics
+    hull = hull_sdf(*cameras, views.alphas, grid, valid=views.valid)
+    return grid, hull, carve_hollows(*cameras, views.images, hull, grid, valid=views.valid)
+
+
+def found(grid, hull, sdf):
+    """Share of the hollow that was found, and the deepest that the wall was cut into, in cells."""
+    cell = float(grid.cell_size)
+    distance = bowl(grid_points(grid)) / cell
+    hollow = (hull < 0) & (distance > 1.0)
+    cut = (hull < 0) & (sdf >= 0) & (distance < 0)
+    return (sdf[hollow] >= 0).mean(), -distance[cut].min(initial=0.0)
+
+
+@pytest.fixture(scope="module")
+def open_bowl():
+    return photographed(bowl, painted)
+
+
+def test_the_inside_of_a_bowl_is_found_and_its_wall_left(open_bowl):
+    grid, hull, sdf = carved(open_bowl)
+    assert ((hull < 0) & (bowl(grid_points(grid)) > 0)).sum() > 500
+    share, cut = found(grid, hull, sdf)
+    assert share > 0.8
+    assert cut < 1.0
+    # The outside of the wall is as it was; nothing is added.
+    beside = np.abs(hull) < 0.5
+    beside &= grid_points(grid)[:, 2] < -0.2
+    np.testing.assert_array_equal(sdf[beside], hull[beside])
+    assert (sdf >= hull).all()
+
+
+def test_finer_grids_are_carved_by_what_a_coarse_one_shows(open_bowl):
+    grid, hull, sdf = carved(open_bowl, resolution=60)
+    share, cut = found(grid, hull, sdf)
+    assert share > 0.8
+    assert cut < 2.0
+    assert (sdf >= hull).all()
+
+
+def test_values_near_the_new_surface_are_distances_in_cells(open_bowl):
+    grid, hull, sdf = carved(open_bowl)
+    distance = bowl(grid_points(grid)) / float(grid.cell_size)
+    axis = np.linalg.norm(grid_points(grid)[:, :2], axis=1) < 0.3
+    opened = axis & (hull < -2.0) & (np.abs(distance) < 2.0)
+    assert opened.sum() > 10
+    assert np.abs(sdf - distance)[opened].mean() < 1.0
+
+
+@pytest.mark.parametrize("color", [painted, mirrored, reflecting_softly])
+def test_a_body_without_a_hollow_stays_bit_for_bit(color):
+    _, hull, sdf = carved(photographed(half_ball, color))
+    np.testing.assert_array_equal(sdf, hull)
+
+
+def test_a_bowl_brighter_than_white_is_carved_alike(open_bowl):
+    images = open_bowl.images * np.array([16.0, 16.0, 16.0, 1.0], np.float32)
+    share, cut = found(*carved(replace(open_bowl, images=images)))
+    assert share > 0.8
+    assert cut < 1.0
+
+
+def test_pixels_that_do_not_count_say_nothing(open_bowl):
+    images, valid = open_bowl.images.copy(), np.ones(open_bowl.images.shape[:3], np.float32)
+    valid[:, : SIZE // 2, : SIZE // 2] = 0.0
+    images[:, : SIZE // 2, : SIZE // 2, :3] = np.random.default_rng(0).random(3)
+    share, cut = found(*carved(replace(open_bowl, images=images, valid=valid)))
+    assert share > 0.6
+    assert cut < 1.0
+
+
+def test_few_views_say_too_little(open_bowl):
+    few = photographed(bowl, painted, count=7)
+    _, hull, sdf = carved(few)
+    assert sdf is hull
+
+
+def test_a_run_begins_with_the_hollow_unless_it_is_told_not_to(open_bowl):
+    dataset = Dataset(
+        name="bowl",
+        layout="memory",
+        root=Path(),
+        train=open_bowl,
+        test=open_bowl,
+        lights={},
+        train_light=None,
+        bounds=BOUNDS,
+    )
+    opened, closed = (
+        FlexiCubesSettings(resolution=20, hollows=hollows).start(dataset, jax.random.key(0))[1].sdf
+        for hollows in (True, False)
+    )
+    assert ((opened >= 0) & (closed < 0)).sum() > 200
