@@ -65,6 +65,32 @@ _Field = Float[np.ndarray, "Z Y X"]
 _Where = Bool[np.ndarray, "Z Y X"]
 
 
+class Candidate(NamedTuple):
+    """A part of the hull on whose surface views disagree, and how well what is behind explains it.
+
+    Differences are means in sRGB, of one half of the views from what the other half shows.
+
+    Attributes
+    ----------
+    region : vertices of the grid that is carved, as z, y and x.
+    lid : difference on the surface of the hull.
+    behind : difference on the surface behind the region.
+    mirror : difference from what a mirror would show in place of the hull's surface; inf where the
+        halves have hardly any direction of reflection in common.
+    """
+
+    region: _Where
+    lid: float
+    behind: float
+    mirror: float
+
+    @property
+    def is_hollow(self) -> bool:
+        """Whether what is behind explains the views far better than the lid and than a mirror."""
+        explains = self.lid > _CONFLICT and self.behind < _EXPLAINED * self.lid
+        return explains and self.behind < _PLAINER * self.mirror
+
+
 def carve_hollows(
     world_to_camera: Float[np.ndarray, "V 4 4"],
     intrinsics: Float[np.ndarray, "V 3 3"],
@@ -91,61 +117,65 @@ def carve_hollows(
     """
     if len(images) < _FEWEST_VIEWS:
         return sdf
-    fine = np.asarray(sdf, np.float32).reshape(grid.vertex_shape[::-1])
-    factor = -(-max(grid.shape) // _LONGEST)
+    fine, factor = _laid_out(sdf, grid)
     hull = _coarser(fine, factor)
-    views = _Views.of(
-        world_to_camera,
-        intrinsics,
-        images,
-        valid,
-        origin=np.asarray(grid.origin, np.float64),
-        cell=factor * float(grid.cell_size),
-        shape=hull.shape,
-    )
-    hollows = _hollows(hull, views)
-    if not hollows.any():
+    views = _Views.of(world_to_camera, intrinsics, images, valid, grid, factor)
+    kept = [candidate.region for candidate in _candidates(hull, views) if candidate.is_hollow]
+    if not kept:
         return sdf
-    return _opened(fine, hull, hollows, factor).reshape(-1)
-
-
-def _hollows(hull: _Field, views: "_Views") -> _Where:
-    """Find the vertices inside the hull that lie in a hollow."""
-    fit, judge = views.every_second(0), views.every_second(1)
-    everywhere = np.ones(hull.shape, bool)
-    field, _ = _carved(hull, fit, everywhere, *_FIRST_PASS)
-    candidates, count = ndimage.label((hull < 0.0) & (field >= 0.0), np.ones((3, 3, 3)))
-    kept = np.zeros(hull.shape, bool)
-    if count:
-        before, after = _judged(hull, fit, judge), _judged(field, fit, judge)
-        for number in range(1, count + 1):
-            region = candidates == number
-            lid, behind = before.of(before.inside, region), after.of(after.outside, region)
-            if _explains(lid, behind) and not _mirrors(hull, region, fit, judge, behind.mean()):
-                kept |= region
-    if not kept.any():
-        return kept
-    field, region = hull, kept
+    field, region = hull, np.any(kept, axis=0)
     for tolerance, share in _LATER_PASSES:
         field, region = _carved(field, views, region, tolerance, share)
     field = _advanced(field, views, region)
-    return (hull < 0.0) & (field >= 0.0)
+    return _opened(fine, hull, (hull < 0.0) & (field >= 0.0), factor).reshape(-1)
 
 
-def _explains(lid: Float[np.ndarray, " N"], behind: Float[np.ndarray, " M"]) -> bool:
-    """Whether views that were not asked disagree on a lid, and much less on what is behind it."""
-    if min(len(lid), len(behind)) < _FEWEST_POINTS:
-        return False
-    conflict = float(lid.mean())
-    return conflict > _CONFLICT and float(behind.mean()) < _EXPLAINED * conflict
+def hollow_candidates(
+    world_to_camera: Float[np.ndarray, "V 4 4"],
+    intrinsics: Float[np.ndarray, "V 3 3"],
+    images: Any,
+    sdf: Float[np.ndarray, " G"],
+    grid: Grid,
+    *,
+    valid: Any = None,
+) -> list[Candidate]:
+    """Return what `carve_hollows` chooses from, for the same arguments; none for few views."""
+    if len(images) < _FEWEST_VIEWS:
+        return []
+    fine, factor = _laid_out(sdf, grid)
+    views = _Views.of(world_to_camera, intrinsics, images, valid, grid, factor)
+    return _candidates(_coarser(fine, factor), views)
 
 
-def _mirrors(hull: _Field, region: _Where, fit: "_Views", judge: "_Views", behind: float) -> bool:
-    """Whether a lid that mirrors its surroundings explains it about as well as what is behind it.
+def _laid_out(sdf: Float[np.ndarray, " G"], grid: Grid) -> tuple[_Field, int]:
+    """Lay values out as z, y and x, and say how many cells are taken as one."""
+    fine = np.asarray(sdf, np.float32).reshape(grid.vertex_shape[::-1])
+    return fine, -(-max(grid.shape) // _LONGEST)
+
+
+def _candidates(hull: _Field, views: "_Views") -> list[Candidate]:
+    """Carve with one half of the views, and let the other half judge every connected part."""
+    fit, judge = views.every_second(0), views.every_second(1)
+    field, _ = _carved(hull, fit, np.ones(hull.shape, bool), *_FIRST_PASS)
+    parts, count = ndimage.label((hull < 0.0) & (field >= 0.0), np.ones((3, 3, 3)))
+    if not count:
+        return []
+    before, after = _judged(hull, fit, judge), _judged(field, fit, judge)
+    candidates = []
+    for number in range(1, count + 1):
+        region = parts == number
+        lid, behind = before.of(before.inside, region), after.of(after.outside, region)
+        if min(len(lid), len(behind)) >= _FEWEST_POINTS:
+            mirror = _mirrored(hull, region, fit, judge)
+            candidates.append(Candidate(region, float(lid.mean()), float(behind.mean()), mirror))
+    return candidates
+
+
+def _mirrored(hull: _Field, region: _Where, fit: "_Views", judge: "_Views") -> float:
+    """Difference from a hull that mirrors its surroundings.
 
     The colour of a mirror depends on the direction of reflection alone: the mean over what one
-    half of the views shows in a direction is compared with what the other half shows in it. Where
-    they have hardly any direction in common, nothing speaks for a mirror.
+    half of the views shows in a direction is compared with what the other half shows in it.
     """
     surface = _surface(hull)
     surface = surface.of(region[tuple(surface.inside.T)])
@@ -161,10 +191,10 @@ def _mirrors(hull: _Field, region: _Where, fit: "_Views", judge: "_Views", behin
     ]
     mean = np.stack(total, axis=-1) / np.maximum(seen, 1.0)[:, None]
     compared = judging.seen & (seen[judging_bin] >= _FEWEST_JUDGING)
-    if compared.sum() < _COMPARED * judging.seen.sum():
-        return False
+    if compared.sum() < _COMPARED * judging.seen.sum() or not compared.any():
+        return np.inf
     difference = judge.difference(mean[judging_bin], judging)
-    return bool(np.minimum(difference, _WORST)[compared].mean() < behind / _PLAINER)
+    return float(np.minimum(difference, _WORST)[compared].mean())
 
 
 class _Surface(NamedTuple):
@@ -378,22 +408,21 @@ class _Views:
         intrinsics: Float[np.ndarray, "V 3 3"],
         images: Any,
         valid: Any,
-        *,
-        origin: Float[np.ndarray, " 3"],
-        cell: float,
-        shape: tuple[int, ...],
+        grid: Grid,
+        factor: int,
     ) -> "_Views":
-        """Choose views, reduce them and put their cameras into the grid."""
+        """Choose views, reduce them and put their cameras into a grid of larger cells."""
+        origin, cell = np.asarray(grid.origin, np.float64), factor * float(grid.cell_size)
         number = min(len(images), _MOST_VIEWS)
         chosen = np.unique(np.linspace(0, len(images) - 1, number).round().astype(int))
         poses = np.asarray(world_to_camera, np.float64)[chosen]
         rotation, shift = poses[:, :3, :3], poses[:, :3, 3] + poses[:, :3, :3] @ origin
         centers = -np.einsum("vji,vj->vi", rotation, shift) / cell
         lens = np.asarray(intrinsics, np.float64)[chosen]
-        middle = 0.5 * (np.asarray(shape[::-1]) - 1.0)
+        middle = 0.5 * np.asarray(grid.shape) / factor
         away = np.median(np.linalg.norm(centers - middle, axis=1))
-        factor = max(1, round(float(np.median(lens[:, 0, 0]) / away)))
-        pictures = [_small(images[k], None if valid is None else valid[k], factor) for k in chosen]
+        pixels = max(1, round(float(np.median(lens[:, 0, 0]) / away)))
+        pictures = [_small(images[k], None if valid is None else valid[k], pixels) for k in chosen]
         color, shows = (np.stack(part) for part in zip(*pictures, strict=True))
         color = _encoded(color, shows)
         hidden = ~shows[..., None]
@@ -401,7 +430,7 @@ class _Views:
         return cls(
             np.concatenate([rotation, shift[..., None] / cell], -1).astype(np.float32),
             centers.astype(np.float32),
-            (lens / np.array([[factor], [factor], [1.0]])).astype(np.float32),
+            (lens / np.array([[pixels], [pixels], [1.0]])).astype(np.float32),
             np.stack([_filled(c, s) for c, s in zip(color, shows, strict=True)]),
             ndimage.minimum_filter(np.where(hidden, np.float32(np.inf), color), window),
             ndimage.maximum_filter(np.where(hidden, np.float32(-np.inf), color), window),

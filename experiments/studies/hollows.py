@@ -1,0 +1,115 @@
+"""What is carved from the visual hull, against the true surface: `surface.hollows`.
+
+    python experiments/studies/hollows.py SCENE ... [--resolution 32 48] [--candidates]
+
+Every SCENE has a ``mesh_gt.ply`` (without one, only what is carved is counted). Vertices of the
+grid are counted. Columns: those in the hull; those of them outside the true surface before carving
+and after it; those carved that are inside the true surface, and more than 1.5 cells inside; the
+seconds that carving took, compilation included. Inside is what two of three rays leave an odd
+number of times.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from scipy.ndimage import distance_transform_edt
+
+from geosplat_jax.core.types import Grid
+from geosplat_jax.io.dataset import load_dataset
+from geosplat_jax.surface.hollows import carve_hollows, hollow_candidates
+from geosplat_jax.surface.hull import fit_grid, grid_points, hull_sdf
+
+_DIRECTIONS = ((0.01, 0.02, 1.0), (1.0, 0.013, 0.017), (0.011, 1.0, 0.019))
+"""Nearly along the axes, so that no ray lies in a face of a box."""
+
+
+def is_inside(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+    """Tell which points (N, 3) a mesh encloses."""
+    odd = np.zeros(len(points), int)
+    for direction in _DIRECTIONS:
+        rays = np.tile(direction, (len(points), 1))
+        _, row, _ = mesh.ray.intersects_location(points, rays, multiple_hits=True)
+        odd += np.bincount(row, minlength=len(points)) % 2
+    return odd >= 2
+
+
+def rows(scene: Path, resolution: int) -> list[list[str]]:
+    """Carve the hull of a scene and count; one row."""
+    grid, hull, photographs = _hull(scene, resolution)
+    began = time.perf_counter()
+    opened = carve_hollows(*photographs[:3], hull, grid, valid=photographs[3])
+    seconds = time.perf_counter() - began
+    carved = (hull < 0.0) & (opened >= 0.0)
+    truth = scene / "mesh_gt.ply"
+    counts = _against(truth, grid, hull, opened, carved) if truth.is_file() else ["", "", "", ""]
+    excess, left, wrong, deep = counts
+    inside, taken = int((hull < 0).sum()), int(carved.sum())
+    return [[str(inside), excess, str(taken), left, wrong, deep, f"{seconds:.1f}"]]
+
+
+def candidates(scene: Path, resolution: int) -> list[list[str]]:
+    """Return a row for every part of the hull that was judged, the largest first."""
+    grid, hull, photographs = _hull(scene, resolution)
+    judged = hollow_candidates(*photographs[:3], hull, grid, valid=photographs[3])
+    return [
+        [
+            str(int(part.region.sum())),
+            *(f"{value:.4f}" for value in (part.lid, part.behind, part.mirror)),
+            "yes" if part.is_hollow else "no",
+        ]
+        for part in sorted(judged, key=lambda part: -int(part.region.sum()))
+    ]
+
+
+def _hull(scene: Path, resolution: int) -> tuple[Grid, np.ndarray, tuple[Any, ...]]:
+    """Return grid, hull, and what `carve_hollows` is told of the photographs."""
+    dataset = load_dataset(scene)
+    views, grid = dataset.train, fit_grid(dataset.bounds, resolution)
+    cameras = views.world_to_camera, np.asarray(views.intrinsics, np.float64)
+    hull = hull_sdf(*cameras, views.alphas, grid, valid=views.valid)
+    return grid, hull, (*cameras, views.images, views.valid)
+
+
+def _against(
+    truth: Path, grid: Grid, hull: np.ndarray, opened: np.ndarray, carved: np.ndarray
+) -> list[str]:
+    """Count vertices outside the true surface before and after, and carved ones inside it."""
+    mesh = trimesh.load(truth, force="mesh")
+    assert isinstance(mesh, trimesh.Trimesh)
+    inside = is_inside(mesh, grid_points(grid))
+    depth = distance_transform_edt(inside.reshape(grid.vertex_shape[::-1]))
+    deep = np.asarray(depth).reshape(-1) > 1.5
+    parts = (hull < 0) & ~inside, (opened < 0) & ~inside, carved & inside, carved & deep
+    return [str(int(part.sum())) for part in parts]
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description="Hollows carved from visual hulls.")
+    parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE", help="scene folder")
+    parser.add_argument(
+        "--resolution", nargs="+", type=int, default=[32, 48], metavar="N", help="cells"
+    )
+    parser.add_argument("--candidates", action="store_true", help="what was judged")
+    arguments = parser.parse_args()
+    if arguments.candidates:
+        names, table = ("vertices", "lid", "behind", "mirror", "hollow"), candidates
+    else:
+        names = ("in the hull", "in excess", "carved", "excess left", "wrong", "deep", "s")
+        table = rows
+    print("| " + " | ".join(("scene", "cells", *names)) + " |")
+    print("|---" * (2 + len(names)) + "|")
+    for scene in arguments.scenes:
+        for resolution in arguments.resolution:
+            for row in table(scene, resolution):
+                print("| " + " | ".join((scene.name, str(resolution), *row)) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
