@@ -1,0 +1,339 @@
+"""What photographs show at points of a solid on a grid: who sees a point, and in which colours.
+
+Lengths are cells of the grid, from its origin. All of it is host-side preparation and not
+differentiable.
+"""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from scipy import ndimage
+
+from geosplat_jax.core.color import linear_to_srgb
+from geosplat_jax.core.types import Grid
+
+Field = Float[np.ndarray, "Z Y X"]
+"""Signed distances of the vertices of a grid, negative inside."""
+
+Where = Bool[np.ndarray, "Z Y X"]
+"""Some of the vertices of a grid."""
+
+FEWEST_SEEN = 4
+"""Views that must see a point to say anything about it."""
+
+_MOST_VIEWS = 64  # evenly chosen; time grows with them
+_FACING = 0.25  # least cosine between a point's normal and the direction to a view
+_CLEAR = 2.0  # cells above a point at which its line of sight begins
+_STRIDE = 0.7  # cells between looks along a line of sight
+_WHOLE = 0.99  # coverage of a pixel that shows nothing but the object
+_DIRECTIONS = 6  # bins of a reflected direction for each unit of x, y and z: about ten degrees
+_POINTS_AT_ONCE = 2048
+
+
+class Crossings(NamedTuple):
+    """Where the edges of the grid leave the solid.
+
+    Attributes
+    ----------
+    inside : (N, 3) the edge's vertex in the solid, as z, y and x.
+    outside : (N, 3) its other one.
+    position : (N, 3) where it leaves, x, y and z in cells.
+    normal : (N, 3) outward.
+    """
+
+    inside: Int[np.ndarray, "N 3"]
+    outside: Int[np.ndarray, "N 3"]
+    position: Float[np.ndarray, "N 3"]
+    normal: Float[np.ndarray, "N 3"]
+
+    def of(self, chosen: Bool[np.ndarray, " N"]) -> "Crossings":
+        """Return some of the points."""
+        return Crossings(*(rows[chosen] for rows in self))
+
+
+def crossings(field: Field) -> Crossings:
+    """Find the points at which the edges of the grid cross the surface."""
+    solid = field < 0.0
+    inside, outside = [], []
+    for axis in range(3):
+        lower = [slice(None)] * 3
+        upper = [slice(None)] * 3
+        lower[axis], upper[axis] = slice(0, -1), slice(1, None)
+        below, above = solid[tuple(lower)], solid[tuple(upper)]
+        step = np.eye(3, dtype=int)[axis]
+        for leaves, first, second in ((below & ~above, 0, 1), (above & ~below, 1, 0)):
+            corner = np.argwhere(leaves)
+            inside.append(corner + first * step)
+            outside.append(corner + second * step)
+    start, end = np.concatenate(inside), np.concatenate(outside)
+    low, high = field[tuple(start.T)], field[tuple(end.T)]
+    share = np.clip(low / (low - high), 0.02, 0.98)
+    smooth = np.asarray(ndimage.gaussian_filter(np.clip(field, -1.5, 1.5), 1.0))
+    slope = np.stack([np.gradient(smooth, axis=axis) for axis in range(3)], axis=-1)
+    normal = slope[tuple(start.T)] + slope[tuple(end.T)]
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    return Crossings(
+        start,
+        end,
+        (start + (end - start) * share[:, None])[:, ::-1].astype(np.float32),
+        (normal / np.maximum(length, 1e-9))[:, ::-1].astype(np.float32),
+    )
+
+
+class Sight(NamedTuple):
+    """What V views show at N points, in sRGB.
+
+    Attributes
+    ----------
+    color : (V, N, 3).
+    low, high : (V, N, 3) least and largest in the window around it.
+    seen : (V, N) whether the view shows the point.
+    """
+
+    color: Float[np.ndarray, "V N 3"]
+    low: Float[np.ndarray, "V N 3"]
+    high: Float[np.ndarray, "V N 3"]
+    seen: Bool[np.ndarray, "V N"]
+
+    @property
+    def counts(self) -> Bool[np.ndarray, " N"]:
+        """Whether enough views see a point."""
+        return self.seen.sum(0) >= FEWEST_SEEN
+
+    def median(self) -> Float[np.ndarray, "N 3"]:
+        """Median colour over the views that see a point, the lower one of two; else 0."""
+        ordered = np.sort(np.where(self.seen[..., None], self.color, np.inf), axis=0)
+        count = self.seen.sum(0)
+        middle = np.maximum(count - 1, 0) // 2
+        chosen = np.take_along_axis(ordered, middle[None, :, None], 0)[0]
+        return np.where(count[:, None] > 0, chosen, 0.0)
+
+    def difference(self, color: Float[np.ndarray, "... N 3"]) -> Float[np.ndarray, "V N"]:
+        """How far a colour lies from all in the window, largest over the channels; else 0.
+
+        ``color`` : (N, 3) for all views, or (V, N, 3).
+        """
+        beyond = np.maximum(self.low - color, color - self.high)
+        return np.where(self.seen, np.maximum(beyond, 0.0).max(-1), 0.0)
+
+    def mean(self, values: Float[np.ndarray, "V N"]) -> Float[np.ndarray, " N"]:
+        """Mean over the views that see a point, 0 where none does."""
+        return (values * self.seen).sum(0) / np.maximum(self.seen.sum(0), 1)
+
+
+@dataclass(frozen=True)
+class Photographed:
+    """Photographs of about a pixel a cell, with cameras in units of cells from the grid's origin.
+
+    Attributes
+    ----------
+    pinholes : (V, 3, 4) from cells to the camera's axes.
+    centers : (V, 3) of the cameras, cells.
+    intrinsics : (V, 3, 3) pixels.
+    color, low, high : (V, H, W, 3) sRGB; the latter two over windows of 3 x 3 pixels.
+    shows : (V, H, W) pixels that show the object alone, and count.
+    """
+
+    pinholes: Float[np.ndarray, "V 3 4"]
+    centers: Float[np.ndarray, "V 3"]
+    intrinsics: Float[np.ndarray, "V 3 3"]
+    color: Float[np.ndarray, "V H W 3"]
+    low: Float[np.ndarray, "V H W 3"]
+    high: Float[np.ndarray, "V H W 3"]
+    shows: Bool[np.ndarray, "V H W"]
+
+    @classmethod
+    def of(
+        cls,
+        world_to_camera: Float[np.ndarray, "V 4 4"],
+        intrinsics: Float[np.ndarray, "V 3 3"],
+        images: Any,
+        valid: Any,
+        grid: Grid,
+        factor: int,
+    ) -> "Photographed":
+        """Choose views, reduce them and put their cameras into a grid of larger cells."""
+        origin, cell = np.asarray(grid.origin, np.float64), factor * float(grid.cell_size)
+        number = min(len(images), _MOST_VIEWS)
+        chosen = np.unique(np.linspace(0, len(images) - 1, number).round().astype(int))
+        poses = np.asarray(world_to_camera, np.float64)[chosen]
+        rotation, shift = poses[:, :3, :3], poses[:, :3, 3] + poses[:, :3, :3] @ origin
+        centers = -np.einsum("vji,vj->vi", rotation, shift) / cell
+        lens = np.asarray(intrinsics, np.float64)[chosen]
+        middle = 0.5 * np.asarray(grid.shape) / factor
+        away = np.median(np.linalg.norm(centers - middle, axis=1))
+        pixels = max(1, round(float(np.median(lens[:, 0, 0]) / away)))
+        pictures = [_small(images[k], None if valid is None else valid[k], pixels) for k in chosen]
+        color, shows = (np.stack(part) for part in zip(*pictures, strict=True))
+        color = _encoded(color, shows)
+        hidden = ~shows[..., None]
+        window = (1, 3, 3, 1)
+        return cls(
+            np.concatenate([rotation, shift[..., None] / cell], -1).astype(np.float32),
+            centers.astype(np.float32),
+            (lens / np.array([[pixels], [pixels], [1.0]])).astype(np.float32),
+            np.stack([_filled(c, s) for c, s in zip(color, shows, strict=True)]),
+            ndimage.minimum_filter(np.where(hidden, np.float32(np.inf), color), window),
+            ndimage.maximum_filter(np.where(hidden, np.float32(-np.inf), color), window),
+            shows,
+        )
+
+    def every_second(self, first: int) -> "Photographed":
+        """Return one half of the views."""
+        arrays = {name: getattr(self, name)[first::2] for name in self.__dataclass_fields__}
+        return replace(self, **arrays)
+
+    def look(self, surface: Crossings, solid: Where) -> Sight:
+        """Return what the views that see the points of a surface show there."""
+        return self.sample(surface.position, self.visible(surface, solid))
+
+    def visible(self, surface: Crossings, solid: Where) -> Bool[np.ndarray, "V N"]:
+        """Tell which views see the points of a surface past the solid, a cell of doubt around it.
+
+        They must look at its front, and at where it may begin to be clear of its own doubt.
+        """
+        steps = int(np.ceil(np.linalg.norm(solid.shape) / _STRIDE))
+        doubtful = jnp.asarray(ndimage.binary_dilation(solid))
+        return _in_parts(
+            lambda *points: _visible(doubtful, self.centers, *points, steps=steps),
+            surface.position,
+            surface.normal,
+        )[0]
+
+    def sample(self, points: Float[np.ndarray, "N 3"], visible: Bool[np.ndarray, "V N"]) -> Sight:
+        """Look points up in the images of all views, of which some see them."""
+        arrays = (self.pinholes, self.intrinsics, self.color, self.low, self.high, self.shows)
+        color, low, high, shown = _in_parts(lambda part: _sample(*arrays, part), points)
+        return Sight(color, low, high, shown & visible)
+
+    def reflected(self, surface: Crossings) -> Int[np.ndarray, "V N"]:
+        """Return a number for the direction from which a mirror would show something to a view."""
+        towards = self.centers[:, None] - surface.position[None]
+        towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+        normal = surface.normal[None]
+        mirrored = 2.0 * (towards * normal).sum(-1, keepdims=True) * normal - towards
+        place = np.floor(mirrored * _DIRECTIONS + 0.5).astype(int) + _DIRECTIONS + 1
+        return (place * (2 * _DIRECTIONS + 3) ** np.arange(3)).sum(-1)
+
+
+def _in_parts(function: Any, *points: Float[np.ndarray, "N 3"]) -> tuple[np.ndarray, ...]:
+    """Apply a function of (N, 3) arrays a fixed number at a time (one compilation)."""
+    count = len(points[0])
+    parts = []
+    for start in range(0, max(count, 1), _POINTS_AT_ONCE):
+        rows = [array[start : start + _POINTS_AT_ONCE] for array in points]
+        room = ((0, _POINTS_AT_ONCE - len(rows[0])), (0, 0))
+        results = function(*(jnp.asarray(np.pad(array, room)) for array in rows))
+        parts.append([np.asarray(array)[:, : len(rows[0])] for array in results])
+    return tuple(np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
+
+
+@partial(jax.jit, static_argnames="steps")
+def _visible(
+    solid: Bool[Array, "Z Y X"],
+    centers: Float[Array, "V 3"],
+    points: Float[Array, "N 3"],
+    normals: Float[Array, "N 3"],
+    *,
+    steps: int,
+) -> tuple[Bool[Array, "V N"]]:
+    """March from points to cameras, to where the grid ends."""
+    last = jnp.asarray(solid.shape[::-1]) - 1
+    flat = solid.reshape(-1)
+    strides = jnp.asarray([1, solid.shape[2], solid.shape[1] * solid.shape[2]])
+    start = points + _CLEAR * normals
+
+    def seen_by(center):
+        direction = center[None] - points
+        direction /= jnp.linalg.norm(direction, axis=-1, keepdims=True)
+
+        def look(step, blocked):
+            place = jnp.round(start + direction * (step.astype(start.dtype) * _STRIDE)).astype(
+                jnp.int32
+            )
+            is_inside = jnp.all((place >= 0) & (place <= last[None]), axis=-1)
+            row = jnp.where(is_inside, (place * strides[None]).sum(-1), 0)
+            return blocked | (is_inside & flat.at[row].get(mode="promise_in_bounds"))
+
+        blocked = jax.lax.fori_loop(0, steps, look, jnp.zeros(points.shape[:1], bool))
+        return ((direction * normals).sum(-1) > _FACING) & ~blocked
+
+    return (jax.lax.map(seen_by, centers),)
+
+
+@jax.jit
+def _sample(
+    pinholes: Float[Array, "V 3 4"],
+    intrinsics: Float[Array, "V 3 3"],
+    color: Float[Array, "V H W 3"],
+    low: Float[Array, "V H W 3"],
+    high: Float[Array, "V H W 3"],
+    shows: Bool[Array, "V H W"],
+    points: Float[Array, "N 3"],
+) -> tuple[Array, ...]:
+    """Look up colours between pixels, the window around the own one, and whether it shows them."""
+    height, width = shows.shape[1:]
+
+    def one(view):
+        pinhole, lens, image, least, largest, counted = view
+        x, y, z = jnp.moveaxis(points @ pinhole[:, :3].T + pinhole[None, :, 3], -1, 0)
+        depth = jnp.maximum(z, 1e-6)
+        u, v = lens[0, 0] * x / depth + lens[0, 2], lens[1, 1] * y / depth + lens[1, 2]
+        is_inside = (z > 0.0) & (u >= 0.0) & (u < width) & (v >= 0.0) & (v < height)
+        own_column = jnp.clip(u.astype(jnp.int32), 0, width - 1)
+        own_row = jnp.clip(v.astype(jnp.int32), 0, height - 1)
+        column, row = jnp.clip(u - 0.5, 0.0, width - 1.0), jnp.clip(v - 0.5, 0.0, height - 1.0)
+        left, top = column.astype(jnp.int32), row.astype(jnp.int32)
+        right, bottom = jnp.minimum(left + 1, width - 1), jnp.minimum(top + 1, height - 1)
+        s = (column - left.astype(column.dtype))[:, None]
+        t = (row - top.astype(row.dtype))[:, None]
+        upper = (1.0 - s) * image[top, left] + s * image[top, right]
+        lower = (1.0 - s) * image[bottom, left] + s * image[bottom, right]
+        own = own_row, own_column
+        return (
+            (1.0 - t) * upper + t * lower,
+            least[own],
+            largest[own],
+            is_inside & counted[own],
+        )
+
+    return jax.lax.map(one, (pinholes, intrinsics, color, low, high, shows))
+
+
+def _small(
+    rgba: Float[np.ndarray, "H W 4"], valid: Float[np.ndarray, "H W"] | None, factor: int
+) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+    """Mean colour of the object in blocks of pixels, and which blocks show nothing else."""
+    rgba = np.asarray(rgba, np.float32)
+    coverage = rgba[..., 3] if valid is None else rgba[..., 3] * (np.asarray(valid) > 0.5)
+    weighted = np.concatenate([rgba[..., :3] * coverage[..., None], coverage[..., None]], -1)
+    height, width = (-(-size // factor) for size in rgba.shape[:2])
+    room = ((0, height * factor - rgba.shape[0]), (0, width * factor - rgba.shape[1]), (0, 0))
+    blocks = np.pad(weighted, room).reshape(height, factor, width, factor, 4).mean((1, 3))
+    covered = blocks[..., 3]
+    return blocks[..., :3] / np.maximum(covered, 1e-6)[..., None], covered >= _WHOLE
+
+
+def _encoded(
+    linear: Float[np.ndarray, "V H W 3"], shows: Bool[np.ndarray, "V H W"]
+) -> Float[np.ndarray, "V H W 3"]:
+    """Encode in sRGB, where equal steps look alike; radiance above white is exposed down first."""
+    brightest = np.quantile(linear[shows], 0.99) if shows.any() else 1.0
+    exposed = np.clip(linear / max(1.0, float(brightest)), 0.0, 1.0)
+    return np.asarray(linear_to_srgb(jnp.asarray(exposed, jnp.float32)))
+
+
+def _filled(
+    color: Float[np.ndarray, "H W 3"], shows: Bool[np.ndarray, "H W"]
+) -> Float[np.ndarray, "H W 3"]:
+    """Give pixels that do not show the object the colour of the nearest one that does."""
+    if not shows.any():
+        return color
+    nearest = ndimage.distance_transform_edt(~shows, return_distances=False, return_indices=True)
+    assert isinstance(nearest, np.ndarray)
+    return color[tuple(nearest)]
