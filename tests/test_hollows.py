@@ -6,6 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from scipy.ndimage import binary_dilation
 from support import look_at_poses
 
 from geosplat_jax.fit.surfaces import FlexiCubesSettings
@@ -132,10 +133,55 @@ def test_values_near_the_new_surface_are_distances_in_cells(open_bowl):
     assert np.abs(sdf - distance)[opened].mean() < 1.0
 
 
-@pytest.mark.parametrize("color", [painted, mirrored, reflecting_softly])
-def test_a_body_without_a_hollow_stays_bit_for_bit(color):
+@pytest.fixture(scope="module")
+def closed_body():
+    return photographed(half_ball, painted)
+
+
+@pytest.mark.parametrize("color", [mirrored, reflecting_softly])
+def test_a_body_that_mirrors_stays_bit_for_bit(color):
     _, hull, sdf = carved(photographed(half_ball, color))
     np.testing.assert_array_equal(sdf, hull)
+
+
+def exposed_at_random(views, spread):
+    factors = np.random.default_rng(0).uniform(1 - spread, 1 + spread, (COUNT, 1, 1, 1))
+    color = views.images[..., :3] * factors
+    return replace(
+        views, images=np.concatenate([color, views.images[..., 3:]], -1).astype(np.float32)
+    )
+
+
+def displaced(views, distance):
+    poses = views.camera_to_world.copy()
+    poses[:, :3, 3] += np.random.default_rng(0).normal(0.0, distance, (COUNT, 3))
+    return replace(views, camera_to_world=poses)
+
+
+def with_wide_masks(views, pixels):
+    images = views.images.copy()
+    for image, color in zip(images, np.random.default_rng(0).random((COUNT, 3)), strict=True):
+        wide = binary_dilation(image[..., 3] > 0.5, iterations=pixels)
+        image[wide & (image[..., 3] < 0.5)] = [*color, 1.0]
+    return replace(views, images=images)
+
+
+@pytest.mark.parametrize(
+    ("disturb", "amount"),
+    [(exposed_at_random, 0.0), (exposed_at_random, 0.3), (displaced, 0.15), (with_wide_masks, 3)],
+)
+def test_a_body_without_a_hollow_stays_bit_for_bit(closed_body, disturb, amount):
+    _, hull, sdf = carved(disturb(closed_body, amount))
+    np.testing.assert_array_equal(sdf, hull)
+
+
+def test_noise_and_small_differences_of_exposure_hide_no_hollow(open_bowl):
+    noise = np.random.default_rng(1).normal(0.0, 0.03, open_bowl.images.shape)
+    noisy = open_bowl.images + np.where(open_bowl.images[..., 3:] > 0, noise, 0.0) * [1, 1, 1, 0]
+    views = replace(open_bowl, images=np.maximum(noisy, 0.0).astype(np.float32))
+    share, cut = found(*carved(exposed_at_random(views, 0.1)))
+    assert share > 0.8
+    assert cut < 1.0
 
 
 def test_a_bowl_brighter_than_white_is_carved_alike(open_bowl):
