@@ -52,6 +52,7 @@ LONGEST = (
     "test_stages",
     "test_monte_carlo",
     "test_cli",
+    "test_hollows",
     "test_run",
     "test_budget",
 )

@@ -1,5 +1,6 @@
 """Hollows: half a hollow ball, whose inside no silhouette shows, and bodies that have none."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from scipy.ndimage import binary_dilation
 from support import look_at_poses
 
 from geosplat_jax.fit.surfaces import FlexiCubesSettings
+from geosplat_jax.io.agreement import hollow_line
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.views import Views
 from geosplat_jax.surface.hollows import carve_hollows
@@ -222,3 +224,12 @@ def test_a_run_begins_with_the_hollow_unless_it_is_told_not_to(open_bowl):
         for hollows in (True, False)
     )
     assert ((opened >= 0) & (closed < 0)).sum() > 200
+
+
+def test_the_command_info_says_whether_there_is_a_hollow(open_bowl, closed_body):
+    line = hollow_line(open_bowl, BOUNDS)
+    share = int(re.fullmatch(r"hollows: +1, at least (\d+)% of the visual hull: .*", line)[1])
+    assert 5 < share < 60
+    assert hollow_line(closed_body, BOUNDS).startswith("hollows:    none")
+    masked = replace(closed_body, images=0 * closed_body.images)
+    assert hollow_line(masked, BOUNDS).startswith("hollows:    not looked for: every mask is empty")

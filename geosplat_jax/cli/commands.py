@@ -30,7 +30,7 @@ from geosplat_jax.gradcheck.report import (
     table,
     to_records,
 )
-from geosplat_jax.io.agreement import agreement_lines
+from geosplat_jax.io.agreement import agreement_lines, hollow_line
 from geosplat_jax.io.dataset import describe, load_dataset, load_recorded
 from geosplat_jax.io.export import LARGEST_TEXTURE
 from geosplat_jax.io.images import written_aside
@@ -70,6 +70,8 @@ def _info(arguments: argparse.Namespace) -> None:
     print(describe(dataset))
     for line in agreement_lines(dataset.train, dataset.bounds):
         print(f"  {line}")
+    if dataset.train.has_masks:
+        print(f"  {hollow_line(dataset.train, dataset.bounds)}")
 
 
 def _poses(arguments: argparse.Namespace) -> None:

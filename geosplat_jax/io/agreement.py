@@ -4,6 +4,8 @@ Every ray through a pixel of a mask meets the object, and the object lies in the
 other views. So where rays of a view's mask miss the hull of the others, its mask, pose or lens is
 wrong, or those of the others are. What changes all views alike is not seen: a field of view that is
 wrong for every camera around a centred object only makes the object larger or smaller.
+
+Colours say more than silhouettes: whether the hull closes hollows, which a training begins with.
 """
 
 import numpy as np
@@ -11,6 +13,8 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import maximum_filter
 
 from geosplat_jax.io.views import Views
+from geosplat_jax.surface.hollows import hollow_candidates
+from geosplat_jax.surface.hull import fit_grid, hull_sdf
 
 AGREES = 0.9
 """Share of a mask's rays that meet the hull of the other views where everything is right; the rest
@@ -25,6 +29,9 @@ _STEPS = 2 * _VOXELS
 _DISSENT = 0.1
 """Share of the other views that may leave a point out of their masks, so that a few wrong views do
 not carve the hull of all others away."""
+
+_CELLS = 32
+"""Along the longest side of the grid in which hollows are looked for."""
 
 Bounds = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
 
@@ -79,6 +86,25 @@ def agreement_lines(views: Views, bounds: Bounds) -> list[str]:
             "and field of view of the cameras"
         )
     return lines
+
+
+def hollow_line(views: Views, bounds: Bounds) -> str:
+    """Say which part of the visual hull is a hollow, by the colours of the photographs."""
+    cameras = views.world_to_camera, np.asarray(views.intrinsics, np.float64)
+    try:
+        grid = fit_grid(bounds, _CELLS)
+        hull = hull_sdf(*cameras, views.alphas, grid, valid=views.valid)
+    except ValueError as error:
+        return f"hollows:    not looked for: {error}"
+    judged = hollow_candidates(*cameras, views.images, hull, grid, valid=views.valid)
+    sizes = [int(part.region.sum()) for part in judged if part.is_hollow]
+    if not sizes:
+        return "hollows:    none that the colours of the photographs show"
+    share = sum(sizes) / max(int((hull < 0.0).sum()), 1)
+    return (
+        f"hollows:    {len(sizes)}, at least {share:.0%} of the visual hull: no mask shows them, "
+        "the colours of the photographs do"
+    )
 
 
 def _left_out(views: Views, view: int, lo: np.ndarray, hi: np.ndarray) -> Bool[np.ndarray, "N N N"]:
