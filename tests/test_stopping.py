@@ -6,6 +6,7 @@ import sys
 import time
 
 import pytest
+from jax.errors import JaxRuntimeError
 
 from geosplat_jax import cli
 from geosplat_jax.cli import calling
@@ -157,6 +158,19 @@ def test_ctrl_c_is_one_line_and_a_status(command, tmp_path, monkeypatch, capsys)
     monkeypatch.setitem(calling.COMMANDS, command, interrupted)
     assert cli.main([command, str(tmp_path)]) == 130
     assert capsys.readouterr().err == "stopped\n"
+
+
+@pytest.mark.parametrize(
+    "error",
+    [MemoryError("Unable to allocate 9 GiB"), JaxRuntimeError("RESOURCE_EXHAUSTED: 9 bytes")],
+)
+def test_memory_that_runs_out_is_one_line_and_a_status(error, tmp_path, monkeypatch, capsys):
+    def exhausted(arguments):
+        raise error
+
+    monkeypatch.setitem(calling.COMMANDS, "evaluate", exhausted)
+    assert cli.main(["evaluate", str(tmp_path)]) == 2
+    assert capsys.readouterr().err == f"error: memory ran out: {error}\n"
 
 
 def test_a_command_is_called_again_in_one_process_and_leaves_nothing(capsys):

@@ -15,7 +15,7 @@ from geosplat_jax.core.types import Geometry
 from geosplat_jax.fit import loop as loop_module
 from geosplat_jax.fit import runtime
 from geosplat_jax.fit import train as train_module
-from geosplat_jax.fit.begin import Resume
+from geosplat_jax.fit.begin import Anew, Resume
 from geosplat_jax.fit.folder import RunError
 from geosplat_jax.fit.gradient import _asset, _back, _view_gradient
 from geosplat_jax.fit.listener import Listener
@@ -271,6 +271,40 @@ def test_a_number_that_is_not_finite_stops_and_names_step_term_and_checkpoint(
     trained = load_trained(tmp_path)
     assert trained.step == 2
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(trained.params))
+
+
+XLA_OUT_OF_MEMORY = "RESOURCE_EXHAUSTED: Out of memory allocating 843605184 bytes."
+
+
+@pytest.mark.parametrize("error", [MemoryError(), jax.errors.JaxRuntimeError(XLA_OUT_OF_MEMORY)])
+@pytest.mark.parametrize("step", [0, 3])
+def test_memory_that_runs_out_is_one_line_and_loses_nothing(
+    dataset, tmp_path, monkeypatch, error, step
+):
+    advance = loop_module.Loop.advance
+
+    def exhausted(self, at):
+        if at == step:
+            raise error
+        return advance(self, at)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(loop_module.Loop, "advance", exhausted)
+        with pytest.raises(TrainingError, match="^memory ran out .*--downscale") as caught:
+            fit(dataset, tiny_config(), tmp_path)
+    assert "\n" not in str(caught.value)
+    assert ("--resume" in str(caught.value)) == (step > 0)
+    begin = Resume() if step else Anew()
+    assert int(fit(dataset, tiny_config(), tmp_path, begin=begin).step) == 4
+
+
+def test_other_errors_of_the_runtime_are_not_taken_for_memory(dataset, tmp_path, monkeypatch):
+    def broken(self, at):
+        raise jax.errors.JaxRuntimeError("INTERNAL: something else")
+
+    monkeypatch.setattr(loop_module.Loop, "advance", broken)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="INTERNAL"):
+        fit(dataset, tiny_config(), tmp_path)
 
 
 def test_stopping_writes_a_checkpoint(dataset, tmp_path, monkeypatch):

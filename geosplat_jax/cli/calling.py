@@ -2,6 +2,8 @@
 
 import warnings
 
+from jax.errors import JaxRuntimeError
+
 from geosplat_jax.cli.arguments import command_line
 from geosplat_jax.cli.commands import COMMANDS, GradientError, UsageError
 from geosplat_jax.cli.display import say, show_warning
@@ -10,6 +12,7 @@ from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memo
 from geosplat_jax.fit.train import Interrupted, TrainingError
 from geosplat_jax.io.checkpoints import CheckpointError
 from geosplat_jax.io.images import SceneError
+from geosplat_jax.io.memory import is_out_of_memory
 
 _CURABLE = (
     SceneError,
@@ -39,5 +42,11 @@ def call(argv: list[str] | None) -> int:
         return 1
     except _CURABLE as error:
         say(str(error), label="error: ", style="bold red")
+        return 2
+    except (MemoryError, JaxRuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        detail = str(error).partition("\n")[0] or "MemoryError"
+        say(f"memory ran out: {detail}", label="error: ", style="bold red")
         return 2
     return 0

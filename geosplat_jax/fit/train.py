@@ -29,6 +29,7 @@ from geosplat_jax.fit.runtime import peak_memory_mb
 from geosplat_jax.fit.step import StepReport, TrainState
 from geosplat_jax.fit.trained import Trained, load_trained
 from geosplat_jax.io.dataset import Dataset
+from geosplat_jax.io.memory import is_out_of_memory
 
 _FIRST_PREVIEW = 4
 """The first preview comes after this part of the steps between two of them."""
@@ -199,9 +200,9 @@ def fit(
     RunError
         If the folder is another's, or in use.
     TrainingError
-        When the settings ask for more memory than there is, a number is not finite, the surface
-        vanishes or explodes for good, the run to resume or to take over does not fit, or hosts were
-        told different things.
+        When the settings ask for more memory than there is, or it runs out, a number is not finite,
+        the surface vanishes or explodes for good, the run to resume or to take over does not fit,
+        or hosts were told different things.
     Interrupted
         After Ctrl-C or SIGTERM; the run can be resumed.
     """
@@ -240,10 +241,23 @@ def fit(
             raise Interrupted(
                 f"stopped at once; continue with --resume from the last checkpoint in {run}"
             ) from None
-        except TrainingError:
-            if has_begun and not run.metric_lines():
+        except (TrainingError, MemoryError, jax.errors.JaxRuntimeError) as error:
+            steps = len(run.metric_lines()) if has_begun else None
+            if steps == 0:
                 run.clear()  # not one step was made: the folder is free again
-            raise
+            if not is_out_of_memory(error):
+                raise
+            raise TrainingError(_out_of_memory(run, error, saves=steps != 0)) from error
+
+
+def _out_of_memory(run: RunFolder, error: BaseException, *, saves: bool) -> str:
+    """Say in one line that memory ran out, and what to do."""
+    detail = str(error).partition("\n")[0] or type(error).__name__
+    again = f"; {run} keeps its last checkpoint, for --resume where more is free" if saves else ""
+    return (
+        f"memory ran out ({detail}): lower geometry.resolution, stages.*.transport.*_count, "
+        f"stages.*.batch_views or the size of the images (--downscale){again}"
+    )
 
 
 def _require_possible(dataset: Dataset, config: Config) -> None:

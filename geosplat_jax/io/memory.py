@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import jax
+
 _CONTAINER_LIMITS = (
     Path("/sys/fs/cgroup/memory.max"),
     Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
@@ -71,6 +73,13 @@ def memory_refusal(needs: Sequence[Need]) -> str | None:
         f"at least {_gigabytes(total)} of memory would be needed, and there are "
         f"{_gigabytes(available)}: {', '.join(parts)}"
     )
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an error says that memory could not be had, of Python or of XLA."""
+    if isinstance(error, MemoryError):
+        return True
+    return isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" in str(error)
 
 
 def _gigabytes(byte_count: int) -> str:
