@@ -1,6 +1,6 @@
 # Two commands: `make demo` and `make test`. Both make their own environment in .venv.
 # `make test-slow` adds slow tests: whole runs, compiled against eager, images beside Mitsuba's;
-# `make test-long` those of a minute or more, by hand: the whole loss against differences, a whole sweep.
+# `make test-long` those of half a minute or more, by hand: the whole loss against differences, a whole sweep.
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin

@@ -185,6 +185,7 @@ def test_buffers_grow_until_every_iterate_fits(monkeypatch, subject, photograph,
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_forward_reverse_and_differences_give_one_jacobian(subject, photograph):
     # A low knee, so that the robust function is differentiated where it bends.
     how = CameraSettings(robust_deviations=0.2)

@@ -68,6 +68,7 @@ def test_capacities_change_a_pixel_by_a_rounding_at_most(setting):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_capacities_change_neither_loss_nor_gradients(setting):
     pipeline, params, batch = setting
     (first, first_gradient), (second, second_gradient) = (

@@ -230,6 +230,7 @@ def with_settings(pipeline, **changes):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_residual_of_its_own_has_its_own_samples(second):
     """The loss has the value of the second image; what has no samples keeps its gradient."""
     _, pipeline, params, batch = second

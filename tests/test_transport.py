@@ -503,6 +503,7 @@ def pictures(ball):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_splats_that_no_view_sees_need_no_light_of_their_own(pictures):
     """Rendering leaves them out; lighting every splat gives the same image."""
     found, params, camera, pipeline = pictures
@@ -519,6 +520,7 @@ def test_splats_that_no_view_sees_need_no_light_of_their_own(pictures):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_denoiser_brings_the_image_closer_and_leaves_its_outline(pictures):
     """Against the mean over many keys, on the pixels of the object."""
     found = pictures[0]
@@ -560,6 +562,7 @@ def test_the_filter_without_passes_is_the_identity_to_the_bit():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_paths_over_two_surfaces_bring_what_traced_light_brings(ball, bowl, monkeypatch):
     """Where reflectance is the same in all directions, as traced light takes it to be."""
 
