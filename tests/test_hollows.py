@@ -35,27 +35,30 @@ def half_ball(points):
 
 
 def painted(points, rays):
-    """Four colours around the axis, of a surface that looks alike from everywhere."""
+    """Colours that change around the axis, of a surface that looks alike from everywhere."""
     del rays
     angle = np.arctan2(points[..., 1], points[..., 0])
     waves = [np.cos(2 * angle), np.sin(2 * angle), np.cos(angle)]
     return 0.3 + 0.25 * np.stack(waves, axis=-1)
 
 
-def mirrored(points, rays):
-    """What the polished lid and the polished ball show of a colourful world."""
+def reflected(points, rays):
+    """Directions from which the lid and the ball, both polished, reflect what rays see."""
     ball = points / np.linalg.norm(points, axis=-1, keepdims=True)
     normal = np.where(points[..., 2:] > -0.02, [0.0, 0.0, 1.0], ball)
-    x, y, z = np.moveaxis(rays - 2 * (rays * normal).sum(-1, keepdims=True) * normal, -1, 0)
+    return rays - 2 * (rays * normal).sum(-1, keepdims=True) * normal
+
+
+def mirrored(points, rays):
+    """What they show of a colourful world."""
+    x, y, z = np.moveaxis(reflected(points, rays), -1, 0)
     waves = [np.sin(5 * x + 3 * y), np.sin(4 * z - 3 * x), np.cos(6 * y + 2 * z)]
     return 0.4 + 0.3 * np.stack(waves, axis=-1)
 
 
 def reflecting_softly(points, rays):
-    """The same under a light that is nearly even."""
-    ball = points / np.linalg.norm(points, axis=-1, keepdims=True)
-    normal = np.where(points[..., 2:] > -0.02, [0.0, 0.0, 1.0], ball)
-    return 0.5 + 0.3 * (rays - 2 * (rays * normal).sum(-1, keepdims=True) * normal)
+    """What they show of a light that changes slowly."""
+    return 0.5 + 0.3 * reflected(points, rays)
 
 
 def photographed(distance, color, *, count=COUNT):

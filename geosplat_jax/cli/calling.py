@@ -7,6 +7,7 @@ from jax.errors import JaxRuntimeError
 from geosplat_jax.cli.arguments import command_line
 from geosplat_jax.cli.commands import COMMANDS, GradientError, UsageError
 from geosplat_jax.cli.display import say, show_warning
+from geosplat_jax.core.settings import first_line
 from geosplat_jax.fit.folder import RunError
 from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
 from geosplat_jax.fit.train import Interrupted, TrainingError
@@ -46,7 +47,7 @@ def call(argv: list[str] | None) -> int:
     except (MemoryError, JaxRuntimeError) as error:
         if not is_out_of_memory(error):
             raise
-        detail = str(error).partition("\n")[0] or "MemoryError"
+        detail = first_line(error) or type(error).__name__
         say(f"memory ran out: {detail}", label="error: ", style="bold red")
         return 2
     return 0

@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from geosplat_jax.core.settings import first_line
 from geosplat_jax.fit.begin import ANEW, Begin
 from geosplat_jax.fit.budget import Pacer
 from geosplat_jax.fit.config import Config
@@ -242,18 +243,19 @@ def fit(
                 f"stopped at once; continue with --resume from the last checkpoint in {run}"
             ) from None
         except (TrainingError, MemoryError, jax.errors.JaxRuntimeError) as error:
-            steps = len(run.metric_lines()) if has_begun else None
-            if steps == 0:
+            if has_begun and not run.metric_lines():
                 run.clear()  # not one step was made: the folder is free again
             if not is_out_of_memory(error):
                 raise
-            raise TrainingError(_out_of_memory(run, error, saves=steps != 0)) from error
+            raise TrainingError(_out_of_memory(run, error)) from error
 
 
-def _out_of_memory(run: RunFolder, error: BaseException, *, saves: bool) -> str:
+def _out_of_memory(run: RunFolder, error: BaseException) -> str:
     """Say in one line that memory ran out, and what to do."""
-    detail = str(error).partition("\n")[0] or type(error).__name__
-    again = f"; {run} keeps its last checkpoint, for --resume where more is free" if saves else ""
+    detail = first_line(error) or type(error).__name__
+    again = ""
+    if run.metric_lines():
+        again = f"; {run} keeps its last checkpoint, for --resume where more is free"
     return (
         f"memory ran out ({detail}): lower geometry.resolution, stages.*.transport.*_count, "
         f"stages.*.batch_views or the size of the images (--downscale){again}"

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy import ndimage
 
 from geosplat_jax.core.color import linear_to_srgb
+from geosplat_jax.core.numerics import safe_normalize
 from geosplat_jax.core.types import Grid
 
 Field = Float[np.ndarray, "Z Y X"]
@@ -249,8 +250,7 @@ def _visible(
     start = points + _CLEAR * normals
 
     def seen_by(center):
-        direction = center[None] - points
-        direction /= jnp.linalg.norm(direction, axis=-1, keepdims=True)
+        direction = safe_normalize(center[None] - points)
 
         def look(step, blocked):
             place = jnp.round(start + direction * (step.astype(start.dtype) * _STRIDE)).astype(
