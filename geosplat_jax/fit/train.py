@@ -250,7 +250,7 @@ def fit(
             raise TrainingError(_out_of_memory(run, error)) from error
 
 
-def _out_of_memory(run: RunFolder, error: BaseException) -> str:
+def _out_of_memory(run: RunFolder, error: Exception) -> str:
     """Say in one line that memory ran out, and what to do."""
     detail = first_line(error) or type(error).__name__
     again = ""
