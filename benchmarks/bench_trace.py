@@ -1,17 +1,22 @@
-"""Time occlusion rays against a bumpy torus, and Embree on the same rays where it is installed.
+"""Time rays against a bumpy torus, and Embree on the same rays where it is installed.
 
 Rays start on random triangles, sorted by triangle as splats are, and leave into the outer half
-space: what shading asks for. Embree runs its own occlusion query on one core (it has no other
-mode from Python); ours uses the cores that XLA gives it. The same triangles are traced by both of
-our indices: that of the isosurface's own grid, and that of any triangles.
+space: what shading asks for. Embree answers the same two questions, whether anything is hit and
+what is hit first, on one core (it has no other mode from Python); ours runs on one, too, since XLA
+does not share a loop between the cores of a CPU. The same triangles are traced by both of our
+indices: that of the isosurface's own grid, and that of any triangles.
+
+    python -m benchmarks.bench_trace [--mesh FILE ...]
 """
 
+import argparse
 import importlib.util
 import json
 import statistics
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +25,7 @@ import numpy as np
 from geosplat_jax.core.capacity import Capacities, combine, retry
 from geosplat_jax.core.types import Grid
 from geosplat_jax.geometry import grid_vertices, initial_geometry, isosurface
+from geosplat_jax.io.meshes import read_mesh
 from geosplat_jax.rays.grid_index import build_grid_index
 from geosplat_jax.rays.triangle_index import build_triangle_index, cells_for
 
@@ -50,48 +56,58 @@ def _scene(resolution: int):
     return surface, index, grid, capacities
 
 
-def _mesh_index(surface) -> Callable[[], object]:
-    """Build the index of any triangles for the same mesh; return what builds it."""
-    vertices = surface.mesh.vertices[: int(surface.mesh.vertex_count)]
-    faces = surface.mesh.faces[: int(surface.mesh.face_count)]
+def _triangles(surface) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of the mesh, without padding."""
+    mesh = surface.mesh
+    vertices = np.asarray(mesh.vertices)[: int(mesh.vertex_count)]
+    return vertices, np.asarray(mesh.faces)[: int(mesh.face_count)]
+
+
+def _mesh_index(vertices: np.ndarray, faces: np.ndarray) -> Callable[[], object]:
+    """Build the index of any triangles; return what builds it again."""
     build = jax.jit(build_triangle_index, static_argnames=("shape", "is_sheet", "capacities"))
-    shape = cells_for(np.asarray(vertices), np.asarray(faces))
+    shape = cells_for(vertices, faces)
+    arrays = jnp.asarray(vertices), jnp.asarray(faces)
 
     def attempt(capacities: Capacities):
-        index = build(vertices, faces, shape=shape, is_sheet=False, capacities=capacities)
+        index = build(*arrays, shape=shape, is_sheet=False, capacities=capacities)
         return index, index.usage
 
     _, capacities = retry(attempt, Capacities(cell_triangles=128))
     return lambda: attempt(capacities)[0]
 
 
-def _rays(surface) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _rays(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, ...]:
     """Draw starts on the surface, outward directions, faces, and the faces' normals."""
     rng = np.random.default_rng(1)
-    faces = np.asarray(surface.mesh.faces)[: int(surface.mesh.face_count)]
     source = np.sort(rng.integers(0, len(faces), RAYS)).astype(np.int32)
-    corners = np.asarray(surface.mesh.vertices)[faces[source]]
+    corners = vertices[faces[source]]
     origins = np.einsum("nk,nkd->nd", rng.dirichlet([1, 1, 1], RAYS), corners)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     directions = rng.normal(size=(RAYS, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     directions *= np.where(np.sum(directions * normals, axis=1) < 0, -1, 1)[:, None]
     return origins.astype(np.float32), directions.astype(np.float32), source, normals
 
 
-def _embree(surface, origins: np.ndarray, directions: np.ndarray) -> Callable[[], object] | None:
-    """Embree's occlusion query on the same rays, or None."""
+def _embree(
+    vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray
+) -> dict[str, Callable[[], object]]:
+    """Embree's occlusion and nearest hits of the same rays; nothing where it is not installed."""
     if importlib.util.find_spec("embreex") is None:
-        return None
+        return {}
     import trimesh
     from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-    faces = np.asarray(surface.mesh.faces)[: int(surface.mesh.face_count)]
-    mesh = trimesh.Trimesh(np.asarray(surface.mesh.vertices), faces, process=False)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
     tracer = RayMeshIntersector(mesh, scale_to_box=False)
     tracer.intersects_any(origins[:1], directions[:1])
-    return lambda: tracer._scene.run(origins, directions, query="OCCLUDED")
+    queries = {"occluded": "OCCLUDED", "nearest": "INTERSECT"}
+    return {
+        f"embree_{name}": lambda q=query: tracer._scene.run(origins, directions, query=q)
+        for name, query in queries.items()
+    }
 
 
 def _seconds(function: Callable[[], object]) -> float:
@@ -100,49 +116,77 @@ def _seconds(function: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
+def _times(functions: dict[str, Callable[[], object]], prefix: str) -> dict[str, float]:
+    """Median milliseconds, interleaved, and medians of the ratios to Embree's."""
+    for function in functions.values():
+        _seconds(function)
+    times: dict[str, list[float]] = {name: [] for name in functions}
+    for _ in range(9):
+        for name, function in functions.items():
+            times[name].append(_seconds(function))
+    results = {}
+    for name, seconds in times.items():
+        suffix = "_yardstick" if name.startswith("embree") else ""
+        results[f"{prefix}_{name}{suffix}_ms"] = round(1e3 * statistics.median(seconds), 2)
+    for name in times:
+        yardstick = f"embree_{name.removeprefix('mesh_')}"
+        if yardstick in times and name != yardstick:
+            pairs = zip(times[name], times[yardstick], strict=True)
+            ratio = statistics.median(a / b for a, b in pairs)
+            results[f"{prefix}_{name}_over_embree"] = round(ratio, 2)
+    return results
+
+
+def _mesh_queries(vertices: np.ndarray, faces: np.ndarray) -> dict[str, Callable[[], object]]:
+    """Ask our index of any triangles, and Embree."""
+    origins, directions, source, normals = _rays(vertices, faces)
+    arguments = (*map(jnp.asarray, (origins, directions, source)), jnp.ones((RAYS,), bool))
+    build = _mesh_index(vertices, faces)
+    index = build()
+    offset = 1e-3 * float(index.grid.cell_size) * normals.astype(np.float32)
+    return {
+        "mesh_build": build,
+        "mesh_occluded": lambda: index.occluded(*arguments),
+        "mesh_nearest": lambda: index.nearest(*arguments),
+        **_embree(vertices, faces, origins + offset, directions),
+    }
+
+
 def run() -> dict[str, float]:
-    """Medians, interleaved: milliseconds for all rays, millions of rays a second, and the ratio."""
+    """Medians, interleaved: milliseconds for all rays, millions of rays a second, and ratios."""
     results: dict[str, float] = {}
     for resolution in RESOLUTIONS:
         surface, index, grid, capacities = _scene(resolution)
-        origins, directions, source, normals = _rays(surface)
-        everything = jnp.ones((RAYS,), bool)
-        arguments = (*map(jnp.asarray, (origins, directions, source)), everything)
-        offset = 1e-3 * float(grid.cell_size) * normals.astype(np.float32)
+        vertices, faces = _triangles(surface)
+        origins, directions, source, _ = _rays(vertices, faces)
+        arguments = (*map(jnp.asarray, (origins, directions, source)), jnp.ones((RAYS,), bool))
         functions: dict[str, Callable[[], object]] = {
             "build": lambda s=surface, g=grid, c=capacities: _build(s, g, capacities=c),
             "occluded": lambda i=index, r=arguments: i.occluded(*r),
             "nearest": lambda i=index, r=arguments: i.nearest(*r),
+            **_mesh_queries(vertices, faces),
         }
-        build = _mesh_index(surface)
-        mesh_index = build()
-        functions |= {
-            "mesh_build": build,
-            "mesh_occluded": lambda i=mesh_index, r=arguments: i.occluded(*r),
-            "mesh_nearest": lambda i=mesh_index, r=arguments: i.nearest(*r),
-        }
-        embree = _embree(surface, origins + offset, directions)
-        if embree is not None:
-            functions["embree"] = embree
-        for function in functions.values():
-            _seconds(function)
-        times: dict[str, list[float]] = {name: [] for name in functions}
-        for _ in range(9):
-            for name, function in functions.items():
-                times[name].append(_seconds(function))
-        median = {name: statistics.median(values) for name, values in times.items()}
         prefix = f"trace_{resolution}"
-        for name in (name for name in functions if name != "embree"):
-            results[f"{prefix}_{name}_ms"] = round(1e3 * median[name], 2)
-        results[f"{prefix}_occluded_mrays"] = round(RAYS / median["occluded"] / 1e6, 2)
-        if embree is not None:
-            results[f"{prefix}_embree_yardstick_ms"] = round(1e3 * median["embree"], 2)
-            for name, key in (("occluded", "slower"), ("mesh_occluded", "mesh_slower")):
-                pairs = zip(times[name], times["embree"], strict=True)
-                ratio = statistics.median(a / b for a, b in pairs)
-                results[f"{prefix}_{key}_than_embree"] = round(ratio, 2)
+        results |= _times(functions, prefix)
+        seconds = 1e-3 * results[f"{prefix}_occluded_ms"]
+        results[f"{prefix}_occluded_mrays"] = round(RAYS / seconds / 1e6, 2)
     return results
 
 
+def main() -> None:
+    """Time the torus, or the meshes that are named."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("--mesh", type=Path, nargs="+", metavar="FILE", help="instead of the torus")
+    arguments = parser.parse_args()
+    if arguments.mesh is None:
+        print(json.dumps(run(), indent=2))
+        return
+    for path in arguments.mesh:
+        vertices, faces = read_mesh(path)
+        vertices, faces = np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
+        times = _times(_mesh_queries(vertices, faces), "trace")
+        print(path, len(faces), "faces", json.dumps(times, indent=2))
+
+
 if __name__ == "__main__":
-    print(json.dumps(run(), indent=2))
+    main()

@@ -4,15 +4,16 @@
         [--quality draft] [--noise 1] [--mesh FILE] [--set SECTION.FIELD=VALUE] [--json FILE]
 
 Starts: ``noise``, the true mesh (``mesh_gt.ply`` of the scene) at the size of the pixels whose
-vertices were moved along their normals by so many pixels (standard deviation); and ``hull``,
-marching cubes of the visual hull, which stands for a mesh of another method. Each is trained twice:
-with its vertices frozen, which says what the start is worth, and with all rates. ``joint`` is
-trained from the masks alone, as ever.
+vertices were moved along their normals by so many pixels (standard deviation); ``hull``, marching
+cubes of the visual hull; and ``matt``, the surface of a training without a specular lobe, in the
+folder ``matt_start``. Each is trained twice: with its vertices frozen, which says what the start is
+worth, and with all rates. ``joint`` is trained from the masks alone, as ever.
 
 The paper says that on a specular object such a start loses to the joint method, since the other
-method took reflections for shape. A hull has no such error, and noise is not one: ``--mesh FILE``
-adds the mesh of another method (of the first scene). Compare rows of ``knight`` (diffuse) with
-those of ``waterbottle`` (metal and glass).
+method took reflections for shape. A hull has no such error, and noise is not one; ``matt`` has, as
+every method that looks for points of the same colour in all views. ``--mesh FILE`` adds a mesh of
+any other method (of the first scene). Compare rows of ``knight`` (diffuse) with those of
+``waterbottle`` (metal and glass).
 
 Columns: Chamfer distance (mean of both directions, in thousandths of the object's longest side),
 normal error of the test views, PSNR of new views, of relit ones and of albedo. Runs that are there
@@ -41,6 +42,8 @@ POINTS, NEIGHBOURS = 50_000, 1_000_000
 """Points of either surface that distances are measured at, and to which of the other."""
 MOST_FACES = 200_000
 HULL_CELLS = 64
+STARTS = ("noise", "hull", "matt", "joint")
+MATT = ("material.specular=none", "stages.monte_carlo.steps=0", "stages.refine.steps=0")
 FROZEN = tuple(f"stages.{name}.rates.vertices=0" for name in ("split_sum", "monte_carlo"))
 MEASURES = {
     "normals, degrees": "normal.mae_masked_deg",
@@ -72,6 +75,14 @@ def hull_mesh(dataset: Dataset) -> trimesh.Trimesh:
     cell = float(grid.cell_size)
     vertices, faces, _, _ = marching_cubes(volume, 0.0, spacing=(cell,) * 3)
     return trimesh.Trimesh(vertices + np.asarray(grid.origin), faces, process=False)
+
+
+def matt_mesh(dataset: Dataset, folder: Path, arguments: argparse.Namespace) -> trimesh.Trimesh:
+    """Train without a specular lobe, so that what is a reflection has to be shape or colour."""
+    overrides = [*arguments.overrides, *MATT]
+    run = train_or_open(dataset, folder / "matt_start", overrides, arguments.quality, None)
+    vertices, faces, _ = run.renderer().mesh()
+    return trimesh.Trimesh(vertices, faces, process=False)
 
 
 def chamfer(mesh: trimesh.Trimesh, truth: trimesh.Trimesh) -> float:
@@ -118,10 +129,14 @@ def study(scene: Path, arguments: argparse.Namespace) -> dict[str, dict[str, flo
     truth = trimesh.Trimesh(*read_mesh(scene / "mesh_gt.ply"), process=False)
     folder = arguments.output / scene.name
     folder.mkdir(parents=True, exist_ok=True)
-    starts = {"noise": noisy_truth(dataset, arguments.noise), "hull": hull_mesh(dataset)}
+    makers = {
+        "noise": lambda: noisy_truth(dataset, arguments.noise),
+        "hull": lambda: hull_mesh(dataset),
+        "matt": lambda: matt_mesh(dataset, folder, arguments),
+        "given": lambda: trimesh.Trimesh(*read_mesh(arguments.mesh), process=False),
+    }
     names = list(arguments.starts)
     if arguments.mesh is not None and scene == arguments.scenes[0]:
-        starts["given"] = trimesh.Trimesh(*read_mesh(arguments.mesh), process=False)
         names.append("given")
     rows = {}
     for name in names:
@@ -129,7 +144,7 @@ def study(scene: Path, arguments: argparse.Namespace) -> dict[str, dict[str, flo
             plans: list[tuple[str, Path | None, tuple[str, ...]]] = [("joint", None, ())]
         else:
             path = folder / f"{name}.ply"
-            starts[name].export(path)
+            makers[name]().export(path)
             plans = [(f"{name}, frozen", path, FROZEN), (f"{name}, trained", path, ())]
             plans = plans[1:] if arguments.skip_frozen else plans
         for title, mesh, changes in plans:
@@ -167,8 +182,7 @@ def main() -> None:
     parser.add_argument("--mesh", type=Path, help="another start, of the first scene")
     parser.add_argument("--samples", type=int, default=32, help="rays per splat when evaluating")
     parser.add_argument("--test-views", type=int, help="at most so many (default: all)")
-    names = ("noise", "hull", "joint")
-    parser.add_argument("--starts", nargs="+", choices=names, default=names)
+    parser.add_argument("--starts", nargs="+", choices=STARTS, default=STARTS)
     parser.add_argument("--skip-frozen", action="store_true", help="without frozen vertices")
     parser.add_argument("--set", dest="overrides", action="append", default=[])
     parser.add_argument("--json", type=Path, help="also write the rows to this file")

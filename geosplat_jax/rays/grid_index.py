@@ -112,6 +112,9 @@ class GridIndex(CellIndex):
         points = [
             tuple(rows[:, 3 * i + axis] - lanes.origin[axis] for axis in range(3)) for i in range(5)
         ]
+        if not any_hit:
+            # Distance and face both leave, and each would gather the corners for itself.
+            points = jax.lax.optimization_barrier(points)
         moment = cross(lanes.direction, points[4])
         spokes = [dot(points[i], moment) for i in range(4)]  # d.(c x a)
         distance, face = lanes.distance, lanes.face
@@ -136,7 +139,7 @@ class GridIndex(CellIndex):
         lanes = lanes._replace(tested=lanes.tested + is_testing.astype(jnp.int32))
         if not any_hit:
             return lanes._replace(distance=distance, face=face)
-        # Every array that leaves here costs the whole computation once more, so only one does.
+        # Both arrays that change would repeat the whole computation.
         is_blocked = jax.lax.optimization_barrier(is_blocked)
         return lanes._replace(
             face=jnp.where(is_blocked, 0, lanes.face),

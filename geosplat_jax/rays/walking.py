@@ -1,8 +1,10 @@
 """Rays that walk through a grid of cells, each of which lists what may be hit in it.
 
-What is listed, and how it is tested, belongs to the subclasses of `CellIndex`. Cells without a list
-know how many cells away the nearest one with some is, so that a ray crosses empty space in few
-steps. The method is exact: a ray tests everything that the cells which it passes list.
+What is listed, and how it is tested, belongs to the subclasses of `CellIndex`. A cell without a
+list knows, for each of the eight octants of directions, how large a cube of such cells begins with
+it, so that a ray crosses empty space in few steps; one that leaves a convex part of the surface is
+out of the grid after one or two. The method is exact: a ray tests everything that the cells which
+it passes list.
 
 Nothing here is differentiable: visibility has no gradient by contract.
 
@@ -40,12 +42,16 @@ SLACK = 1e-4
 WORD_BITS = 31
 """Bits of a cell's word: how many entries it lists, and which is the first."""
 
-_CHUNK = 32_768
-_STAGES = 6
-_STRANDS = 2
-"""A loop runs on one core; so many of them are offered to the machine at once."""
+_CHUNK = 8192
+"""Rays that travel together: few enough to stay in the cache of a core."""
 
-_LARGEST_SKIP = 15
+_STAGES = 6
+
+_CUBES = 7
+"""Doublings of an empty cube, so that three bits hold how often it was doubled: up to 128 cells."""
+
+_EMPTY = -(1 << WORD_BITS)
+"""Sign of the word of a cell without a list."""
 
 _CONE_MARGIN = 0.02
 """Added to the sine of a cone for the rounding of its axis to 8 bits a component."""
@@ -76,8 +82,8 @@ class CellIndex(RayIndex):
     Attributes
     ----------
     grid : of the cells.
-    words : (cells,) number of entries of a cell (its low ``count_bits``) and the first of them, or,
-        for a cell without any, the distance in cells to the nearest one with some.
+    words : (cells,) number of entries of a cell (its low ``count_bits``) and the first of them;
+        negative of a cell without any, with the sizes of its `_empty_cubes`.
     cones : (cells,) cone around the normals in a cell: three signed bytes of axis, one byte of
         sine; see `cones`.
     """
@@ -100,7 +106,7 @@ class CellIndex(RayIndex):
         return word & ((1 << self.count_bits) - 1)
 
     def first(self, word: Int[Array, " n"]) -> Int[Array, " n"]:
-        """Read the first entry of a cell, or how far an empty one is from those that list some."""
+        """Read the first entry of a cell; of an empty one, the side of the cube that is crossed."""
         return word >> self.count_bits
 
     def occluded(
@@ -140,24 +146,37 @@ def words_of(cells: Int[Array, " E"], grid: Grid, *, count_bits: int) -> Int[Arr
     count = jnp.zeros((cell_count + 1,), jnp.int32).at[cells].add(1, indices_are_sorted=True)
     first = (jnp.cumsum(count) - count)[:cell_count]
     count = count[:cell_count]
-    distance = _distances(count > 0, grid)
-    return jnp.where(count > 0, first, distance) << count_bits | count
+    cubes = _empty_cubes(count > 0, grid) | _EMPTY
+    return jnp.where(count > 0, first << count_bits | count, cubes)
 
 
-def _distances(occupied: Bool[Array, " K"], grid: Grid) -> Int[Array, " K"]:
-    """Chessboard distance to the nearest occupied cell, at least 1 and at most a limit."""
+def _empty_cubes(occupied: Bool[Array, " K"], grid: Grid) -> Int[Array, " K"]:
+    """Find how large an empty cube begins with a cell, towards each octant of directions.
+
+    Returns the binary logarithm of its side in cells, three bits an octant; bit i of an octant's
+    number is set where directions are negative along axis i. What lies outside of the grid is
+    empty.
+    """
     nx, ny, nz = grid.shape
-    grown = occupied.reshape(nz, ny, nx).astype(jnp.uint8)
-    distance = jnp.ones(grown.shape, jnp.int32)
-    for _ in range(_LARGEST_SKIP - 1):
+    meets = jnp.where(occupied.reshape(nz, ny, nx), jnp.uint8(255), jnp.uint8(0))
+    levels = jnp.zeros(meets.shape, jnp.int32)
+    for doubling in range(_CUBES):
+        # Bit o of `meets`: the cube of this side towards octant o holds an occupied cell.
+        side = 1 << doubling
         for axis in range(3):
-            pad = [(1, 1) if i == axis else (0, 0) for i in range(3)]
-            wide = jnp.pad(grown, pad)
-            size = grown.shape[axis]
-            parts = [jax.lax.slice_in_dim(wide, s, s + size, axis=axis) for s in range(3)]
-            grown = parts[0] | parts[1] | parts[2]
-        distance = distance + (grown == 0).astype(jnp.int32)
-    return distance.reshape(-1)
+            size = meets.shape[2 - axis]
+            forward = sum(1 << octant for octant in range(8) if not octant >> axis & 1)
+            pad = [(side, side) if i == 2 - axis else (0, 0) for i in range(3)]
+            wide = jnp.pad(meets, pad)
+            after = jax.lax.slice_in_dim(wide, 2 * side, 2 * side + size, axis=2 - axis)
+            before = jax.lax.slice_in_dim(wide, 0, size, axis=2 - axis)
+            meets = meets | (after & forward) | (before & (255 - forward))
+        # Spread the eight bits, so that there is one in every three.
+        empty = (~meets).astype(jnp.int32)
+        empty = (empty | empty << 8) & 0xF00F
+        empty = (empty | empty << 4) & 0xC30C3
+        levels = levels + ((empty | empty << 2) & 0x249249)
+    return levels.reshape(-1)
 
 
 def cones_of(
@@ -219,10 +238,16 @@ def _faces_away(cone: UInt[Array, " n"], direction: tuple[Array, ...]) -> Bool[A
 def _enter(
     lanes: Lanes, cell: tuple[Array, ...], index: CellIndex, two_sided: bool
 ) -> Int[Array, " n"]:
-    """Read the word of a cell; one whose patches all face away is as good as empty."""
+    """Read the word of a cell for a ray: how far to go on, if it lists nothing that can be hit.
+
+    A cell whose patches all face away is as good as empty.
+    """
     nx, ny, _ = index.grid.shape
     number = cell[0] + nx * (cell[1] + ny * cell[2])
     word = index.words.at[number].get(mode="promise_in_bounds")
+    x, y, z = (jnp.where(d < 0, 3 << axis, 0) for axis, d in enumerate(lanes.direction))
+    side = 1 << (word >> (x + y + z) & 7)
+    word = jnp.where(word < 0, side << index.count_bits, word)
     if two_sided:
         return word
     cone = index.cones.at[number].get(mode="promise_in_bounds")
@@ -252,7 +277,8 @@ def _advance(lanes: Lanes, index: CellIndex, *, two_sided: bool) -> Lanes:
     for axis, size in enumerate(index.grid.shape):
         o, d, c = lanes.origin[axis], lanes.direction[axis], lanes.cell[axis]
         at_exit = jnp.floor(o + jnp.where(is_outside, 0.0, exit_distance) * d).astype(jnp.int32)
-        at_exit = jnp.clip(at_exit, c - skip + 1, c + skip - 1)
+        ahead, behind = jnp.where(d < 0, 0, skip - 1), jnp.where(d < 0, skip - 1, 0)
+        at_exit = jnp.clip(at_exit, c - behind, c + ahead)
         is_exit = is_open & (leave[axis] <= exit_distance)
         is_open = is_open & ~is_exit
         following = jnp.where(is_exit, jnp.where(d > 0, c + skip, c - skip), at_exit)
@@ -364,11 +390,10 @@ def trace(
     two_sided: bool,
     any_hit: bool,
 ) -> tuple[Float[Array, " N"], Int[Array, " N"]]:
-    """Trace chunk after chunk, in strands that run side by side."""
+    """Trace chunk after chunk."""
     count = origins.shape[0]
-    strands = _STRANDS if count >= _CHUNK else 1
-    chunk = min(_CHUNK, max(256, -(-count // (256 * strands)) * 256))
-    rows = -(-max(count, 1) // (chunk * strands)) * strands
+    chunk = min(_CHUNK, max(256, -(-count // 256) * 256))
+    rows = -(-max(count, 1) // chunk)
     grid = index.grid
     local = (origins - grid.origin[None, :]) / grid.cell_size
 
@@ -381,14 +406,7 @@ def trace(
         return _trace_chunk(index, lanes, two_sided=two_sided, any_hit=any_hit)
 
     parts = (chunks(local), chunks(directions), chunks(source), chunks(mask))
-    found = [
-        jax.lax.map(one, jax.tree.map(lambda x, k=strand: x[k::strands], parts))
-        for strand in range(strands)
-    ]
-    distance, face = (
-        jnp.stack(strand, axis=1).reshape(rows * chunk)[:count]
-        for strand in zip(*found, strict=True)
-    )
+    distance, face = (found.reshape(-1)[:count] for found in jax.lax.map(one, parts))
     return distance * grid.cell_size, face
 
 

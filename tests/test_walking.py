@@ -1,0 +1,62 @@
+"""What the cells of a grid know: their lists, and how far a ray may go where there are none."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from geosplat_jax.core.types import Grid
+from geosplat_jax.rays.walking import words_of
+
+COUNT_BITS = 5
+SHAPE = (20, 9, 37)
+
+
+def words(cells):
+    grid = Grid(jnp.zeros(3), jnp.asarray(1.0), SHAPE)
+    return np.asarray(words_of(jnp.asarray(cells, jnp.int32), grid, count_bits=COUNT_BITS))
+
+
+def largest_empty_cube(occupied, x, y, z, octant):
+    """Side of the largest cube, a power of two, that begins with a cell and lists nothing."""
+    side = 1
+    while side < 128:
+        spans = []
+        for axis, cell in enumerate((x, y, z)):
+            is_negative = octant >> axis & 1
+            low = cell - 2 * side + 1 if is_negative else cell
+            spans.append(slice(max(low, 0), low + 2 * side))
+        if occupied[spans[2], spans[1], spans[0]].any():
+            break
+        side *= 2
+    return side
+
+
+def test_a_cell_without_a_list_knows_the_empty_cube_towards_every_octant():
+    rng = np.random.default_rng(3)
+    cells = np.sort(rng.integers(0, np.prod(SHAPE), 6))
+    found = words(cells)
+    occupied = np.zeros(np.prod(SHAPE), bool)
+    occupied[cells] = True
+    volume = occupied.reshape(SHAPE[::-1])
+    sides = set()
+    for number in rng.choice(np.flatnonzero(~occupied), 300, replace=False):
+        z, y, x = np.unravel_index(number, volume.shape)
+        assert found[number] < 0
+        for octant in range(8):
+            side = 1 << (int(found[number]) >> 3 * octant & 7)
+            assert side == largest_empty_cube(volume, x, y, z, octant), (x, y, z, octant)
+            sides.add(side)
+    assert {1, 2, 4, 8, 16, 128} <= sides
+
+
+def test_a_grid_that_lists_nothing_is_crossed_at_once():
+    levels = words(np.full(4, np.prod(SHAPE)))[:, None] >> 3 * np.arange(8) & 7
+    assert np.all(levels == 7)
+
+
+def test_a_cell_with_a_list_says_where_it_begins_and_how_long_it_is():
+    cells = np.array([0, 0, 0, 7, 50, 50, 6659])
+    found = words(np.append(cells, np.prod(SHAPE)))
+    for cell in np.unique(cells):
+        assert found[cell] & (1 << COUNT_BITS) - 1 == np.sum(cells == cell)
+        assert found[cell] >> COUNT_BITS == np.flatnonzero(cells == cell)[0]
+    assert np.sum(found >= 0) == 4
