@@ -139,7 +139,7 @@ class GridIndex(CellIndex):
         lanes = lanes._replace(tested=lanes.tested + is_testing.astype(jnp.int32))
         if not any_hit:
             return lanes._replace(distance=distance, face=face)
-        # Both arrays that change would repeat the whole computation.
+        # The two arrays that change would each repeat the whole computation.
         is_blocked = jax.lax.optimization_barrier(is_blocked)
         return lanes._replace(
             face=jnp.where(is_blocked, 0, lanes.face),

@@ -47,7 +47,7 @@ _CHUNK = 8192
 
 _STAGES = 6
 
-_CUBES = 7
+_DOUBLINGS = 7
 """Doublings of an empty cube, so that three bits hold how often it was doubled: up to 128 cells."""
 
 _EMPTY = -(1 << WORD_BITS)
@@ -160,7 +160,7 @@ def _empty_cubes(occupied: Bool[Array, " K"], grid: Grid) -> Int[Array, " K"]:
     nx, ny, nz = grid.shape
     meets = jnp.where(occupied.reshape(nz, ny, nx), jnp.uint8(255), jnp.uint8(0))
     levels = jnp.zeros(meets.shape, jnp.int32)
-    for doubling in range(_CUBES):
+    for doubling in range(_DOUBLINGS):
         # Bit o of `meets`: the cube of this side towards octant o holds an occupied cell.
         side = 1 << doubling
         for axis in range(3):
