@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from geosplat_jax.core.types import Grid
-from geosplat_jax.rays.walking import words_of
+from geosplat_jax.rays.walking import cell_lists, words_of
 
 COUNT_BITS = 5
 SHAPE = (20, 9, 37)
@@ -12,7 +12,8 @@ SHAPE = (20, 9, 37)
 
 def words(cells):
     grid = Grid(jnp.zeros(3), jnp.asarray(1.0), SHAPE)
-    return np.asarray(words_of(jnp.asarray(cells, jnp.int32), grid, count_bits=COUNT_BITS))
+    lists = cell_lists(jnp.asarray(cells, jnp.int32), grid.cube_count)
+    return np.asarray(words_of(lists, grid, count_bits=COUNT_BITS))
 
 
 def largest_empty_cube(occupied, x, y, z, octant):

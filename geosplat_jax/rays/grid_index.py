@@ -9,7 +9,6 @@ from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from geosplat_jax.core.capacity import Capacities, Usage, bit_set, usage
@@ -21,6 +20,7 @@ from geosplat_jax.rays.walking import (
     WORD_BITS,
     CellIndex,
     Lanes,
+    cell_lists,
     cones_of,
     cross,
     dot,
@@ -163,33 +163,35 @@ def _fan(patches: Float[Array, "Q 16"]) -> list[tuple[Array, Array, Array]]:
 
 def _touched_cells(
     patches: Float[Array, "Q 16"], is_real: Bool[Array, " Q"], grid: Grid
-) -> tuple[Bool[Array, "64 Q"], Int[Array, "64 Q"]]:
-    """Which of the cells from a patch's lowest corner on it may touch, and their numbers.
+) -> tuple[Bool[Array, "64 Q"], Int[Array, "3 Q"]]:
+    """Which of the cells from a patch's lowest corner on it may touch, z fastest, and the lowest.
 
     A triangle touches a cell only if their bounding boxes meet and its plane passes the cell.
     """
-    fan = _fan(patches)
-    low = jnp.min(jnp.stack([jnp.minimum(jnp.minimum(a, b), c) for a, b, c in fan]), axis=0)
-    first = jnp.floor(low - SLACK).astype(jnp.int32)
-    steps = np.stack(np.meshgrid(*[np.arange(_REACH)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    touches, numbers = [], []
-    nx, ny, nz = grid.shape
-    limit = jnp.array([[nx], [ny], [nz]], jnp.int32)
-    for step in steps.astype(np.int32):
-        cell = first + jnp.asarray(step)[:, None]
-        corner = cell.astype(patches.dtype)
-        touch = jnp.zeros(is_real.shape, bool)
-        for a, b, c in fan:
-            above = jnp.maximum(jnp.maximum(a, b), c) >= corner - SLACK
-            below = jnp.minimum(jnp.minimum(a, b), c) <= corner + (1 + SLACK)
-            normal = jnp.cross(b - a, c - a, axis=0)
-            reach = (0.5 + SLACK) * jnp.sum(jnp.abs(normal), axis=0)
-            passes = jnp.abs(jnp.sum(normal * (corner + 0.5 - a), axis=0)) <= reach
-            touch = touch | (jnp.all(above & below, axis=0) & passes)
-        inside = jnp.all((cell >= 0) & (cell < limit), axis=0)
-        touches.append(touch & inside & is_real)
-        numbers.append(cell[0] + nx * (cell[1] + ny * cell[2]))
-    return jnp.stack(touches), jnp.stack(numbers)
+    lowest = jnp.min(patches[:, :15].reshape(-1, 5, 3), axis=1).T
+    first = jnp.floor(lowest - SLACK).astype(jnp.int32)
+    cell = first[None] + jnp.arange(_REACH, dtype=jnp.int32)[:, None, None]
+    limit = jnp.array(grid.shape, jnp.int32)[None, :, None]
+    inside = (cell >= 0) & (cell < limit) & is_real[None, None]
+    corner = cell.astype(patches.dtype)
+    half = 0.5 + SLACK
+    triangles = []
+    for a, b, c in _fan(patches):
+        above = jnp.maximum(jnp.maximum(a, b), c)[None] >= corner - SLACK
+        below = jnp.minimum(jnp.minimum(a, b), c)[None] <= corner + (1 + SLACK)
+        normal = jnp.cross(b - a, c - a, axis=0)
+        # How far the plane is from the middle of a cell: a term for each of its coordinates.
+        terms = normal[None] * (corner + 0.5 - a[None])
+        reach = half * jnp.sum(jnp.abs(normal), axis=0)
+        triangles.append((above & below & inside, terms, reach[None, None, None]))
+    # Fused with what follows, these would be computed again for each of the 64 cells.
+    triangles = jax.lax.optimization_barrier(triangles)
+    touches = jnp.zeros((_REACH, _REACH, _REACH, is_real.shape[0]), bool)
+    for meets, terms, reach in triangles:
+        x, y, z = terms[:, None, None, 0], terms[None, :, None, 1], terms[None, None, :, 2]
+        near = meets[:, None, None, 0] & meets[None, :, None, 1] & meets[None, None, :, 2]
+        touches = touches | (near & (jnp.abs(x + y + z) <= reach))
+    return touches.reshape(_REACH**3, -1), first
 
 
 def build_grid_index(surface: PatchMesh, grid: Grid, *, capacities: Capacities) -> GridIndex:
@@ -220,24 +222,29 @@ def build_grid_index(surface: PatchMesh, grid: Grid, *, capacities: Capacities) 
     patches = _patches(surface, padded)
     quads, cell_count = patches.shape[0], padded.cube_count
     is_real = 4 * jnp.arange(quads, dtype=jnp.int32) < surface.mesh.face_count
-    touches, numbers = _touched_cells(patches, is_real, padded)
+    touches, lowest = _touched_cells(patches, is_real, padded)
 
     found = bit_set(touches.reshape(-1))
     capacity = capacities["cell_patches"]
     pair = found.first(capacity=capacity)
     is_entry = jnp.arange(capacity, dtype=jnp.int32) < found.count
-    cells = jnp.where(is_entry, numbers.reshape(-1)[pair], cell_count)
+    step, patch = jnp.divmod(pair, quads)
+    steps = jnp.stack([step // _REACH**axis % _REACH for axis in (2, 1, 0)])
+    x, y, z = lowest[:, patch] + steps
+    nx, ny, _ = padded.shape
+    cells = jnp.where(is_entry, x + nx * (y + ny * z), cell_count)
     # One stable sort: pairs of a cell keep the order of their candidates, hence are reproducible.
-    cells, pair = jax.lax.sort((cells, pair), num_keys=1, is_stable=True)
-    entries = jnp.where(cells < cell_count, pair % quads, 0)
+    cells, patch = jax.lax.sort((cells, patch), num_keys=1, is_stable=True)
+    entries = jnp.where(cells < cell_count, patch, 0)
+    lists = cell_lists(cells, cell_count)
 
     normals = jnp.stack(
         [safe_normalize(jnp.cross(b - a, c - a, axis=0), axis=0).T for a, b, c in _fan(patches)]
     )
     return GridIndex(
         grid=padded,
-        words=words_of(cells, padded, count_bits=_COUNT_BITS),
-        cones=cones_of(normals, entries, cells, cell_count),
+        words=words_of(lists, padded, count_bits=_COUNT_BITS),
+        cones=cones_of(normals, entries, lists, cell_count),
         entries=entries,
         patches=patches,
         usage=usage(cell_patches=found.count),

@@ -25,6 +25,7 @@ from geosplat_jax.rays.walking import (
     WORD_BITS,
     CellIndex,
     Lanes,
+    cell_lists,
     cones_of,
     cross,
     dot,
@@ -283,20 +284,20 @@ def build_triangle_index(
         (cells, jnp.where(is_entry, triangle[pair], 0)), num_keys=1, is_stable=True
     )
     cells = jnp.clip(cells, 0, grid.cube_count)
-    counts = jnp.zeros((grid.cube_count + 1,), jnp.int32).at[cells].add(1, indices_are_sorted=True)
+    lists = cell_lists(cells, grid.cube_count)
     a, b, c = corners
     normals = safe_normalize(jnp.cross(b - a, c - a, axis=0), axis=0).T
     return TriangleIndex(
         grid=grid,
-        words=words_of(cells, grid, count_bits=most.bit_length()),
-        cones=cones_of(normals[None], entries, cells, grid.cube_count),
+        words=words_of(lists, grid, count_bits=most.bit_length()),
+        cones=cones_of(normals[None], entries, lists, grid.cube_count),
         rows=jnp.concatenate(
             [local[faces].reshape(-1, 9)[entries], entries.astype(local.dtype)[:, None]], axis=1
         ),
         usage=usage(
             triangle_boxes=box_count,
             triangle_cells=touch.count,
-            cell_triangles=jnp.max(counts[:-1]),
+            cell_triangles=jnp.max(jnp.where(lists.cell < grid.cube_count, lists.count, 0)),
         ),
         triangle_count=faces.shape[0],
         is_sheet=is_sheet,

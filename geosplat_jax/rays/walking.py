@@ -137,17 +137,48 @@ class CellIndex(RayIndex):
 # --- what cells know ----------------------------------------------------------------------------
 
 
-def words_of(cells: Int[Array, " E"], grid: Grid, *, count_bits: int) -> Int[Array, " K"]:
-    """Build the words of the cells of a grid.
+class CellLists(NamedTuple):
+    """The cells that list something, in order, in as many rows as there are entries.
 
-    ``cells`` : of every entry, sorted; the number of cells on padding.
+    Attributes
+    ----------
+    cell : number of the cell; the number of all cells on padding.
+    first, count : where its list begins, and how much it lists.
+    row : of every entry, the row here of the cell that lists it.
     """
-    cell_count = grid.cube_count
-    count = jnp.zeros((cell_count + 1,), jnp.int32).at[cells].add(1, indices_are_sorted=True)
-    first = (jnp.cumsum(count) - count)[:cell_count]
-    count = count[:cell_count]
-    cubes = _empty_cubes(count > 0, grid) | _EMPTY
-    return jnp.where(count > 0, first << count_bits | count, cubes)
+
+    cell: Int[Array, " E"]
+    first: Int[Array, " E"]
+    count: Int[Array, " E"]
+    row: Int[Array, " E"]
+
+
+def cell_lists(cells: Int[Array, " E"], cell_count: int) -> CellLists:
+    """Find the list of every cell; ``cells`` of every entry, sorted, ``cell_count`` on padding."""
+    size = cells.shape[0]
+    numbers = jnp.arange(size, dtype=jnp.int32)
+    begins = jnp.concatenate([jnp.ones((1,), bool), cells[1:] != cells[:-1]])
+    row = jnp.cumsum(begins.astype(jnp.int32)) - 1
+    first = jnp.full((size + 1,), size, jnp.int32)
+    first = first.at[jnp.where(begins, row, size + 1)].set(numbers, mode="drop")
+    cell = jnp.full((size,), cell_count, jnp.int32).at[row].set(cells, indices_are_sorted=True)
+    return CellLists(cell, first[:-1], first[1:] - first[:-1], row)
+
+
+def words_of(lists: CellLists, grid: Grid, *, count_bits: int) -> Int[Array, " K"]:
+    """Build the words of the cells of a grid."""
+    occupied = jnp.zeros((grid.cube_count,), bool).at[lists.cell].set(True, mode="drop")
+    words = _empty_cubes(occupied, grid) | _EMPTY
+    return words.at[lists.cell].set(lists.first << count_bits | lists.count, mode="drop")
+
+
+def _moved(values: UInt[Array, "z y x"], by: int, axis: int) -> UInt[Array, "z y x"]:
+    """Move values along an axis by so many cells; what comes in from outside is zero."""
+    size = values.shape[axis]
+    by = max(-size, min(by, size))
+    kept = jax.lax.slice_in_dim(values, max(-by, 0), size - max(by, 0), axis=axis)
+    beyond = jnp.zeros_like(jax.lax.slice_in_dim(values, 0, abs(by), axis=axis))
+    return jnp.concatenate([beyond, kept] if by > 0 else [kept, beyond], axis=axis)
 
 
 def _empty_cubes(occupied: Bool[Array, " K"], grid: Grid) -> Int[Array, " K"]:
@@ -164,13 +195,11 @@ def _empty_cubes(occupied: Bool[Array, " K"], grid: Grid) -> Int[Array, " K"]:
         # Bit o of `meets`: the cube of this side towards octant o holds an occupied cell.
         side = 1 << doubling
         for axis in range(3):
-            size = meets.shape[2 - axis]
             forward = sum(1 << octant for octant in range(8) if not octant >> axis & 1)
-            pad = [(side, side) if i == 2 - axis else (0, 0) for i in range(3)]
-            wide = jnp.pad(meets, pad)
-            after = jax.lax.slice_in_dim(wide, 2 * side, 2 * side + size, axis=2 - axis)
-            before = jax.lax.slice_in_dim(wide, 0, size, axis=2 - axis)
+            after, before = (_moved(meets, by, 2 - axis) for by in (-side, side))
             meets = meets | (after & forward) | (before & (255 - forward))
+            # Fused with what follows, every cell would be computed many times over.
+            meets = jax.lax.optimization_barrier(meets)
         # Spread the eight bits, so that there is one in every three.
         empty = (~meets).astype(jnp.int32)
         empty = (empty | empty << 8) & 0xF00F
@@ -180,10 +209,7 @@ def _empty_cubes(occupied: Bool[Array, " K"], grid: Grid) -> Int[Array, " K"]:
 
 
 def cones_of(
-    normals: Float[Array, "T Q 3"],
-    entries: Int[Array, " E"],
-    cells: Int[Array, " E"],
-    cell_count: int,
+    normals: Float[Array, "T Q 3"], entries: Int[Array, " E"], lists: CellLists, cell_count: int
 ) -> UInt[Array, " K"]:
     """Cone that holds the normals of all triangles of a cell, packed; see `_faces_away`.
 
@@ -191,23 +217,24 @@ def cones_of(
     ----------
     normals : unit normals of the T triangles of each of the Q things that cells list; zero where a
         triangle has none.
-    entries, cells : which of them every entry is, and the cell that lists it, sorted.
+    entries : which of them every entry is.
     """
+    size = entries.shape[0]
     axis = jax.ops.segment_sum(
-        jnp.sum(normals, axis=0)[entries], cells, cell_count + 1, indices_are_sorted=True
+        jnp.sum(normals, axis=0)[entries], lists.row, size, indices_are_sorted=True
     )
     axis = jnp.round(127 * safe_normalize(axis))
-    along = jnp.sum(normals[:, entries] * safe_normalize(axis)[cells][None], axis=-1)
+    along = jnp.sum(normals[:, entries] * safe_normalize(axis)[lists.row][None], axis=-1)
     # Triangles without a normal cannot be hit.
     is_flat = jnp.all(normals[:, entries] == 0, axis=-1)
     along = jnp.min(jnp.where(is_flat, 1.0, along), axis=0)
-    smallest = jax.ops.segment_min(along, cells, cell_count + 1, indices_are_sorted=True)
+    smallest = jax.ops.segment_min(along, lists.row, size, indices_are_sorted=True)
     smallest = jnp.clip(smallest, -1.0, 1.0)
     sine = jnp.where(smallest > 0, jnp.sqrt(1 - smallest**2) + _CONE_MARGIN, 1.0)
     packed = jnp.ceil(255 * jnp.minimum(sine, 1.0)).astype(jnp.uint32)
     for component in range(3):
         packed = packed << 8 | (axis[:, component].astype(jnp.int32) + 128).astype(jnp.uint32)
-    return packed[:cell_count]
+    return jnp.zeros((cell_count,), jnp.uint32).at[lists.cell].set(packed, mode="drop")
 
 
 # --- travelling ---------------------------------------------------------------------------------
