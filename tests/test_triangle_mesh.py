@@ -250,6 +250,17 @@ def test_a_mesh_that_cannot_be_used_stops_before_anything_is_written(dataset, fi
         fit(dataset, changed, tmp_path / "run")
 
 
+def test_the_inward_shift_of_a_mesh_starts_smaller_unless_it_was_set(files):
+    def start(preset="default", *overrides):
+        return make_config(preset, mesh=files["ball"], overrides=overrides).material
+
+    assert start().initial_shift_logit == -1
+    assert start("paper").initial_shift_logit == 0
+    assert start("default", "material.initial_shift_logit=0").initial_shift_logit == 0
+    by_hand = make_config(overrides=("material.initial_shift_logit=-0.5",))
+    assert with_mesh(by_hand, files["ball"]).material.initial_shift_logit == -0.5
+
+
 def test_an_open_mesh_needs_culling(dataset, files, tmp_path):
     config = make_config(mesh=files["bowl"], overrides=(*SMALL, "raster.cull_backfaces=false"))
     with pytest.raises(TrainingError, match="fronts and the backs of an open mesh"):

@@ -317,6 +317,10 @@ not known."""
 _MESH_EDGES = {"draft": 3.0, BETWEEN: 2.0, "standard": 2.0, "high": 1.5}
 """Mean edges of a mesh in pixels."""
 
+_MESH_SHIFT_LOGIT = -1.0
+"""Where the inward shift of splats starts on a mesh: near a quarter of the root of a face's area
+(docs/meshes.md)."""
+
 _MESH_VIEWS = 6
 """Views per step in appendix H."""
 
@@ -324,10 +328,10 @@ _MESH_VIEWS = 6
 def with_mesh(config: Config, mesh: str | Path | MeshSettings) -> Config:
     """Return a configuration that starts from a mesh file instead of an isosurface (appendix H).
 
-    The surface's own rates and weights give way to those of a mesh; everything else stays, but for
-    what appendix H says of the methods of others: six views per step, smoother roughness and
-    metallic, and no vertex sampling. There splats that look away are left out, as those of an open
-    mesh must be.
+    The surface's own rates and weights give way to those of a mesh, and the inward shift of splats
+    starts smaller, unless its start was set. Splats that look away are left out, as those of an
+    open mesh must be. The presets of the methods of others take from appendix H: six views per
+    step, smoother roughness and metallic, and no vertex sampling; their shift starts as ever.
 
     Parameters
     ----------
@@ -363,8 +367,12 @@ def with_mesh(config: Config, mesh: str | Path | MeshSettings) -> Config:
         if is_original:
             stage = replace(stage, vertex_fraction=0.0, batch_views=_MESH_VIEWS)
         stages.append(stage)
-    raster = replace(config.raster, cull_backfaces=True)
-    return replace(config, geometry=geometry, raster=raster, stages=tuple(stages))
+    raster, material = replace(config.raster, cull_backfaces=True), config.material
+    if not is_original and material.initial_shift_logit == MaterialSpec().initial_shift_logit:
+        material = replace(material, initial_shift_logit=_MESH_SHIFT_LOGIT)
+    return replace(
+        config, geometry=geometry, raster=raster, material=material, stages=tuple(stages)
+    )
 
 
 # What each quality level spends.
