@@ -1,9 +1,12 @@
 """Configurations: presets, overrides, validation, serialisation."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
+import trimesh
 
 from geosplat_jax.deferred import PerPixel
 from geosplat_jax.fit.config import (
@@ -402,3 +405,15 @@ def test_settings_without_effect_are_told(overrides, told):
     found = config_warnings(make_config(overrides=overrides))
     assert len(found) == len(told)
     assert all(words in text for words, text in zip(told, found, strict=True))
+
+
+def test_whoever_reads_a_configuration_needs_no_other_module(tmp_path):
+    ball, written = tmp_path / "ball.ply", tmp_path / "config.json"
+    trimesh.creation.icosphere(1).export(ball)
+    written.write_text(json.dumps(make_config("default", "standard", mesh=ball).to_dict()))
+    script = (
+        "import json, sys; from geosplat_jax.fit.config import config_from_dict; "
+        "config_from_dict(json.load(open(sys.argv[1])))"
+    )
+    done = subprocess.run([sys.executable, "-c", script, str(written)], capture_output=True)
+    assert done.returncode == 0, done.stderr.decode()[-500:]

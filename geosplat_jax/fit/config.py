@@ -25,10 +25,13 @@ from geosplat_jax.core.settings import (
     to_plain,
 )
 from geosplat_jax.core.types import RATE_GROUP, EnvLight
+from geosplat_jax.deferred import PerPixel
 from geosplat_jax.fit.entering import Entry
+from geosplat_jax.fit.start_mesh import MeshSettings
 from geosplat_jax.fit.surfaces import FlexiCubesSettings, SurfaceSettings
 from geosplat_jax.losses import Objective, Schedule, term_names
 from geosplat_jax.materials import MaterialField, MaterialSpec
+from geosplat_jax.refinement import FreeSplatSettings
 from geosplat_jax.render import Params, PerSplat, RasterSettings, ShadingDomain
 from geosplat_jax.transport.base import TransportSettings
 from geosplat_jax.transport.environment import LightSpec
@@ -304,6 +307,10 @@ class Config:
         plain = to_plain(self)
         plain["stages"] = {stage.pop("name"): stage for stage in plain["stages"]}
         return plain
+
+
+KNOWN_KINDS = (FreeSplatSettings, MeshSettings, PerPixel)
+"""Kinds of settings that nothing else here imports: one that is not imported cannot be read."""
 
 
 def config_from_dict(values: Any) -> Config:
