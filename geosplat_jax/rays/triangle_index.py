@@ -297,7 +297,7 @@ def build_triangle_index(
         usage=usage(
             triangle_boxes=box_count,
             triangle_cells=touch.count,
-            cell_triangles=jnp.max(jnp.where(lists.cell < grid.cube_count, lists.count, 0)),
+            cell_triangles=jnp.max(jnp.where(lists.cell < grid.cube_count, lists.length, 0)),
         ),
         triangle_count=faces.shape[0],
         is_sheet=is_sheet,

@@ -143,13 +143,13 @@ class CellLists(NamedTuple):
     Attributes
     ----------
     cell : number of the cell; the number of all cells on padding.
-    first, count : where its list begins, and how much it lists.
+    first, length : where its list begins, and how much it lists.
     row : of every entry, the row here of the cell that lists it.
     """
 
     cell: Int[Array, " E"]
     first: Int[Array, " E"]
-    count: Int[Array, " E"]
+    length: Int[Array, " E"]
     row: Int[Array, " E"]
 
 
@@ -169,7 +169,7 @@ def words_of(lists: CellLists, grid: Grid, *, count_bits: int) -> Int[Array, " K
     """Build the words of the cells of a grid."""
     occupied = jnp.zeros((grid.cube_count,), bool).at[lists.cell].set(True, mode="drop")
     words = _empty_cubes(occupied, grid) | _EMPTY
-    return words.at[lists.cell].set(lists.first << count_bits | lists.count, mode="drop")
+    return words.at[lists.cell].set(lists.first << count_bits | lists.length, mode="drop")
 
 
 def _moved(values: UInt[Array, "z y x"], by: int, axis: int) -> UInt[Array, "z y x"]:
