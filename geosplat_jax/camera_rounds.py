@@ -1,7 +1,8 @@
 """Trainings whose cameras are a little wrong: short ones first, that set the cameras right.
 
-A round trains at quality ``draft``, refines the cameras of every view against what came out
-(`Run.refine_cameras`), and hands them to the next. What a round recovers: docs/cameras.md.
+A round trains at quality ``draft`` without free splats, refines the cameras of every view against
+what came out (`Run.refine_cameras`), and hands them to the next. What a round recovers:
+docs/cameras.md.
 """
 
 import json
@@ -15,7 +16,7 @@ from geosplat_jax.fit.cameras import CameraSettings, ViewProgress
 from geosplat_jax.fit.config import Config
 from geosplat_jax.fit.folder import RunError
 from geosplat_jax.fit.listener import NOBODY, Listener
-from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.presets import REFINE, make_config
 from geosplat_jax.io.dataset import load_recorded
 from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.images import written_aside
@@ -29,6 +30,20 @@ def rounds_folder(output: str | Path) -> Path:
     """Return the folder beside a run's own that the rounds are kept in."""
     path = Path(output)
     return path.with_name(f"{path.name}_cameras")
+
+
+def round_config(material_prior: str = "hybrid") -> Config:
+    """Return the settings of a round: a draft whose splats stay on the surface.
+
+    What rounds recover was measured so; cameras are refined by the shape and its texture, which
+    free splats hardly change.
+
+    Parameters
+    ----------
+    material_prior : see `make_config`.
+    """
+    overrides = (f"stages.{REFINE}.steps=0",)
+    return make_config(quality="draft", material_prior=material_prior, overrides=overrides)
 
 
 def _require_same(folder: Path, made_with: Mapping[str, Any]) -> None:
@@ -79,7 +94,7 @@ def refined_cameras(
     ----------
     scene : folder. output : of the run to come; rounds are kept beside it, in ``OUTPUT_cameras``.
     rounds : of training and refining, at least one.
-    config : of a round; quality ``draft`` by default.
+    config : of a round; `round_config` by default.
     reading : how to read the scene, see `load_recorded`; ``cameras`` are those of the first round.
     how : cameras are refined, see `CameraSettings`.
     listener : told of the trainings.
@@ -96,7 +111,7 @@ def refined_cameras(
     """
     if rounds < 1:
         raise ValueError(f"refining cameras takes one round at least, got {rounds}")
-    config = config or make_config(quality="draft")
+    config = config or round_config()
     options, cameras, how = dict(reading or {}), Path(), how or CameraSettings()
     made_with = {"scene": str(Path(scene).resolve()), "reading": options}
     _require_same(

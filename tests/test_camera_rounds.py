@@ -5,7 +5,7 @@ import json
 import pytest
 
 from geosplat_jax import camera_rounds, cli
-from geosplat_jax.camera_rounds import refined_cameras, rounds_folder
+from geosplat_jax.camera_rounds import refined_cameras, round_config, rounds_folder
 from geosplat_jax.fit.cameras import CameraSettings
 from geosplat_jax.fit.folder import RunError
 from geosplat_jax.fit.presets import make_config
@@ -40,7 +40,7 @@ def made(monkeypatch):
 
     def train(dataset, folder, config, *, begin, listener):
         folder.mkdir(parents=True)
-        calls.append((dataset.options, config.quality, begin.resumes))
+        calls.append((dataset.options, config, begin.resumes))
         return _Round(len(calls))
 
     monkeypatch.setattr(camera_rounds, "train", train)
@@ -55,9 +55,11 @@ def test_a_round_reads_what_the_one_before_has_found(made, tmp_path):
     assert found == folder / "round_2.json"
     assert folder != output
     assert made == [
-        ({"downscale": 2}, "draft", True),
-        ({"downscale": 2, "cameras": folder / "round_1.json"}, "draft", True),
+        ({"downscale": 2}, round_config(), True),
+        ({"downscale": 2, "cameras": folder / "round_1.json"}, round_config(), True),
     ]
+    assert round_config().quality == "draft"
+    assert [stage.name for stage in round_config().active_stages] == ["split_sum", "monte_carlo"]
 
 
 def test_rounds_that_are_done_are_not_made_again(made, tmp_path):

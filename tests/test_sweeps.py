@@ -30,7 +30,7 @@ title = "A sweep"
 about = "What it is about."
 quality = "draft"
 scenes = ["one", "two"]
-set = ["stages.monte_carlo.steps=3", "stages.monte_carlo.batch_views=2"]
+set = ["stages.monte_carlo.steps=3", "stages.monte_carlo.batch_views=2", "stages.refine.steps=0"]
 figures = ["nvs.psnr", "roughness.mse"]
 
 [[run]]
@@ -212,8 +212,9 @@ def test_a_scene_that_is_not_there_is_named(tmp_path, capsys):
     ],
 )
 def test_a_stage_is_shared_where_only_later_ones_differ(override, shares):
-    base = make_config(quality="draft")
-    config = make_config(quality="draft", overrides=(override,))
+    two_stages = ("stages.refine.steps=0",)
+    base = make_config(quality="draft", overrides=two_stages)
+    config = make_config(quality="draft", overrides=(*two_stages, override))
     shared = shared_stages(config, [base])
     assert shared == (beginning(base, 1) if shares else None)
 

@@ -28,7 +28,7 @@ SWEEP = """
 title = "A trade"
 quality = "draft"
 scenes = ["one", "two"]
-set = ["stages.monte_carlo.steps=30", "stages.split_sum.steps=90"]
+set = ["stages.monte_carlo.steps=30", "stages.split_sum.steps=90", "stages.refine.steps=0"]
 figures = ["nvs.psnr", "normal.mae_masked_deg"]
 
 [[run]]

@@ -10,7 +10,7 @@ Photographs say nothing about where the object is in the world. The test cameras
 disturbed, are therefore moved by the similarity that takes the true training cameras to those that
 were trained on (`fit.gauge.find_gauge`), before new views are compared.
 
-The table stands in docs/cameras.md.
+Splats stay on the surface in all trainings. The table stands in docs/cameras.md.
 """
 
 import argparse
@@ -31,6 +31,8 @@ from geosplat_jax.io.dataset import Dataset, load_dataset, object_bounds
 from geosplat_jax.io.photographs import Photographs
 from geosplat_jax.io.views import Views
 from geosplat_jax.run import Run, train
+
+USUAL = ("run.preview_every=0", "stages.refine.steps=0")
 
 
 def disturbed(
@@ -93,7 +95,7 @@ def train_or_open(dataset: Dataset, folder: Path, arguments: argparse.Namespace)
         run.dataset = dataset
         return run
     began = time.perf_counter()
-    config = make_config(quality=arguments.quality, overrides=("run.preview_every=0",))
+    config = make_config(quality=arguments.quality, overrides=USUAL)
     run = train(dataset, folder, config, begin=Anew(replace=True))
     print(f"{folder.name}: trained in {time.perf_counter() - began:.0f} s", flush=True)
     return run

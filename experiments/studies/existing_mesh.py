@@ -15,6 +15,8 @@ every method that looks for points of the same colour in all views. ``--mesh FIL
 any other method (of the first scene). Compare rows of ``knight`` (diffuse) with those of
 ``waterbottle`` (metal and glass).
 
+Splats do not become free (`stages.refine.steps=0`): that leaves the surface where it is.
+
 Columns: Chamfer distance (mean of both directions, in thousandths of the object's longest side),
 normal error of the test views, PSNR of new views, of relit ones and of albedo. Runs that are there
 already are opened instead.
@@ -43,7 +45,8 @@ POINTS, NEIGHBOURS = 50_000, 1_000_000
 MOST_FACES = 200_000
 HULL_CELLS = 64
 STARTS = ("noise", "hull", "matt", "joint")
-MATT = ("material.specular=none", "stages.monte_carlo.steps=0", "stages.refine.steps=0")
+USUAL = ("run.preview_every=0", "stages.refine.steps=0")
+MATT = ("material.specular=none", "stages.monte_carlo.steps=0")
 FROZEN = tuple(f"stages.{name}.rates.vertices=0" for name in ("split_sum", "monte_carlo"))
 MEASURES = {
     "normals, degrees": "normal.mae_masked_deg",
@@ -105,7 +108,7 @@ def train_or_open(dataset: Dataset, folder: Path, overrides: list[str], quality:
         run = Run(folder)
         run.dataset = dataset
         return run
-    config = make_config(quality=quality, mesh=mesh, overrides=("run.preview_every=0", *overrides))
+    config = make_config(quality=quality, mesh=mesh, overrides=(*USUAL, *overrides))
     return train(dataset, folder, config, begin=Anew(replace=True))
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from rich.table import Table
 
-from geosplat_jax.camera_rounds import refined_cameras
+from geosplat_jax.camera_rounds import refined_cameras, round_config
 from geosplat_jax.cli.display import ProgressDisplay, console, say, say_refined
 from geosplat_jax.fit.begin import Anew, Begin, Resume, TakeOver
 from geosplat_jax.fit.cameras import CameraSettings
@@ -153,7 +153,7 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
 
 def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[str, Any]) -> Path:
     """Set the cameras right before the training proper; say where they are."""
-    draft = make_config(quality="draft", material_prior=arguments.material_prior)
+    draft = round_config(arguments.material_prior)
     say("cameras first: training at quality draft")
     with ProgressDisplay(draft.total_steps) as display:
         cameras = refined_cameras(

@@ -392,7 +392,7 @@ _QUALITY: dict[str, dict[str, Any]] = {
                     "roughness_metallic": {"value": 8e-3, "warmup": 75},
                 },
             },
-            REFINE: {"steps": 0, "batch_views": 2},
+            REFINE: {"batch_views": 2},
         },
     },
     "standard": {},
