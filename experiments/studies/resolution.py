@@ -2,7 +2,7 @@
 
     python experiments/studies/resolution.py SCENE ... --output FOLDER [--cells 32 48 64 96 128]
         [--grids box cube] [--steps 200] [--proportional] [--quality draft] [--downscale 1]
-        [--set SECTION.FIELD=VALUE] [--json FILE] [--plot FILE]
+        [--set SECTION.FIELD=VALUE] [--json FILE] [--plot FILE] [--picture FILE]
 
 Trains the split sum stage alone, every run in a process of its own, so that its largest resident
 memory is its own. ``box`` has its cells along the longest side of the box around the object,
@@ -13,7 +13,8 @@ Columns: PSNR of new views; normal error; Chamfer distance as in `existing_mesh.
 scene has a true mesh; recall of thin parts: of the pixels that an opening of the true mask by a
 disc of 3 pixels takes away, the share that the render covers by more than half; seconds of a step
 (median) and of the whole; largest memory. Below, the powers of the cells that Gaussians, seconds
-of a step and memory grow with, by least squares on logarithms.
+of a step and memory grow with, by least squares on logarithms. ``--picture`` shows the object of the
+first scene in its first test view: render, normals and mesh, the truth first.
 """
 
 import argparse
@@ -25,6 +26,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from existing_mesh import chamfer
+from PIL import Image
 from skimage.morphology import disk, opening
 
 from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
@@ -149,6 +151,26 @@ def plot(found: dict[str, dict[str, dict[int, dict[str, float]]]], path: Path) -
     figure.savefig(path, dpi=110)
 
 
+def write_picture(runs: list[Path], path: Path) -> None:
+    """Write a sheet of one view with a column for each run, cut to the object."""
+    views = [json.loads((run / "metrics.json").read_text())["gallery"]["views"][0] for run in runs]
+    folders = [runs[0], *runs]
+    names = [views[0]["pictures"], *(view["pictures"] for view in views)]
+    rows = []
+    for true, found in (("truth", "render"), ("true normal", "normal"), (None, "mesh")):
+        keys = [true, *(found for _ in runs)]
+        row = [
+            np.asarray(Image.open(folder / names[k][key]).convert("RGB")) if key else None
+            for k, (folder, key) in enumerate(zip(folders, keys, strict=True))
+        ]
+        blank = np.zeros_like(row[-1])
+        rows.append([blank if picture is None else picture for picture in row])
+    covered = np.argwhere(np.any(rows[0][0] < 255, axis=-1))
+    (top, left), (bottom, right) = covered.min(axis=0), covered.max(axis=0) + 1
+    sheet = [np.concatenate([p[top:bottom, left:right] for p in row], axis=1) for row in rows]
+    Image.fromarray(np.concatenate(sheet)).save(path)
+
+
 def main() -> None:
     """Run the study."""
     parser = argparse.ArgumentParser(
@@ -166,6 +188,7 @@ def main() -> None:
     parser.add_argument("--set", dest="overrides", action="append", default=[])
     parser.add_argument("--json", type=Path, help="also write the rows to this file")
     parser.add_argument("--plot", type=Path, help="also draw the curves")
+    parser.add_argument("--picture", type=Path, help="also show one view of every run")
     arguments = parser.parse_args()
     enable_compilation_cache()
     retain_freed_memory()
@@ -174,6 +197,10 @@ def main() -> None:
         arguments.json.write_text(json.dumps(found, indent=1), encoding="utf-8")
     if arguments.plot is not None:
         plot(found, arguments.plot)
+    if arguments.picture is not None:
+        scene, grids = next(iter(found.items()))
+        runs = [f"{grid}_{cells}" for grid, rows in grids.items() for cells in rows]
+        write_picture([arguments.output / scene / run for run in runs], arguments.picture)
 
 
 if __name__ == "__main__":
