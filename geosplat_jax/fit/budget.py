@@ -26,9 +26,10 @@ from geosplat_jax.fit.presets import QUALITIES, between_qualities
 _EFFORTS = tuple(0.25 * number for number in range(4 * (len(QUALITIES) - 1) + 1))
 """Places between the quality levels that are tried, in order of cost."""
 
-_ALL_STAGES = 0.75
+_ALL_STAGES = 0.25
 """Place between the quality levels from which later stages are worth their time: below it, the
-first stage alone gives better images, shapes and, but for hard shadows, better relighting."""
+first stage alone gives better images, shapes and, but for hard shadows, better relighting
+(docs/trade.md)."""
 
 _SHORTEST, _LONGEST = 0.4, 3.0
 """How far the steps of a stage may be scaled for a plan, and made more of on the way."""
