@@ -13,8 +13,8 @@ Columns: PSNR of new views; normal error; Chamfer distance as in `existing_mesh.
 scene has a true mesh; recall of thin parts: of the pixels that an opening of the true mask by a
 disc of 3 pixels takes away, the share that the render covers by more than half; seconds of a step
 (median) and of the whole; largest memory. Below, the powers of the cells that Gaussians, seconds
-of a step and memory grow with, by least squares on logarithms. ``--picture`` shows the object of the
-first scene in its first test view: render, normals and mesh, the truth first.
+of a step and memory grow with, by least squares on logarithms. ``--picture`` shows the object of
+the first scene in its first test view: render, normals and mesh, the truth first.
 """
 
 import argparse
