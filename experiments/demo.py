@@ -30,7 +30,7 @@ SCENE = Path(__file__).resolve().parents[1] / "examples" / "duck"
 
 
 def main() -> None:
-    """Run the demo; about six minutes on two cores."""
+    """Run the demo; about eight minutes on two cores."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=Path("demo"))
     folder = parser.parse_args().output
