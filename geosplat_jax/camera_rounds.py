@@ -35,8 +35,7 @@ def rounds_folder(output: str | Path) -> Path:
 def round_config(material_prior: str = "hybrid") -> Config:
     """Return the settings of a round: a draft whose splats stay on the surface.
 
-    What rounds recover was measured so; cameras are refined by the shape and its texture, which
-    free splats hardly change.
+    What rounds recover was measured so (docs/cameras.md); rounds with free splats were not tried.
 
     Parameters
     ----------
