@@ -19,6 +19,7 @@ from geosplat_jax.fit.budget import (
 )
 from geosplat_jax.fit.config import Budget, Pace, Rate, Stage
 from geosplat_jax.fit.costs import StageCost, expected_costs, expected_seconds
+from geosplat_jax.fit.entering import FreshAlbedo
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.presets import QUALITIES, between_qualities, make_config
@@ -238,6 +239,28 @@ def test_a_later_stage_that_would_come_too_short_is_left_out_and_its_time_used()
     assert [stage.name for stage in config.active_stages] == [first.name]
     assert all(config.stage(stage.name).steps == 0 for stage in later)
     assert seconds == pytest.approx(480.0, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("seconds_left", "monte_carlo", "refine"),
+    [(360, 200, 60), (198, 110, 33), (144, 96, 0), (78, 0, 0)],
+    ids=["in time", "a short refinement stays", "a shorter one goes", "Monte Carlo takes it along"],
+)
+def test_what_is_too_short_to_be_worth_it_goes_with_all_after_it(seconds_left, monte_carlo, refine):
+    """A refinement is worth 30 steps, Monte Carlo 75; 100 steps of the first stage are to come."""
+    stages = (
+        Stage(name="split_sum", steps=110),
+        Stage(name="monte_carlo", steps=200, enter=(FreshAlbedo("mean"),)),
+        Stage(name="refine", steps=60),
+    )
+    config = replace(make_config("default", "draft"), stages=stages)
+    costs = {stage.name: StageCost(startup=0.0, step=1.0) for stage in stages}
+    pacer = Pacer(Budget(seconds_left), config, costs, clock=lambda: 0.0)
+    for _ in range(10):
+        pacer.note("split_sum", 1.0)
+    adjusted = pacer.adjusted(config, config.stage("split_sum"), 10) or config
+    assert adjusted.stage("monte_carlo").steps == monte_carlo
+    assert adjusted.stage("refine").steps == refine
 
 
 def test_a_later_stage_of_which_something_was_set_is_not_left_out():

@@ -20,6 +20,7 @@ from geosplat_jax.fit.costs import (
     expected_memory,
     expected_seconds,
 )
+from geosplat_jax.fit.entering import FreshAlbedo
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.presets import QUALITIES, between_qualities
 
@@ -52,9 +53,10 @@ _TOLERANCE = 0.04
 _FEWEST = 0.1
 """Share of a stage's planned steps that is made however late it is."""
 
-_WORTHWHILE = 75
-"""Steps, or half of those that were planned, below which a later stage is left out: a Monte Carlo
-stage begins with one albedo, and is worse than none before that is learned."""
+_WORTHWHILE, _WORTHWHILE_ANEW = 30.0, 75.0
+"""Steps, or half of those that were planned, below which a later stage is left out: one that goes
+on from what the stage before it has found, as a refinement does, and one that begins with one
+albedo, as Monte Carlo does, and is worse than none before that is learned."""
 
 _UNITS = {"s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
 _BYTES = {"mb": 1e6, "mib": 2.0**20, "gb": 1e9, "gib": 2.0**30}
@@ -309,8 +311,8 @@ class Pacer:
             return None
         here, wanted = config.stage_names.index(stage.name), config
         share = self._share(wanted, stage, done)
-        while self._is_hurried(later := wanted.stages[here + 1 :], share):
-            wanted = _without(wanted, [other for other in later if other.steps][-1:])
+        while left_out := self._too_short(wanted.stages[here + 1 :], share):
+            wanted = _without(wanted, left_out)
             share = self._share(wanted, stage, done)
         if wanted == config and abs(share - 1.0) <= _TOLERANCE:
             return None
@@ -331,12 +333,18 @@ class Pacer:
         waits = sum(self._costs[other.name].startup for other in later)
         return max(self.seconds_left - waits, 0.0) / max(work, 1e-9)
 
-    def _is_hurried(self, later: Sequence[Stage], share: float) -> bool:
-        """Whether a later stage would make too few of its steps to be worth them."""
-        return any(
-            other.steps and share * other.steps < min(_WORTHWHILE, 0.5 * self._planned[other.name])
-            for other in later
-        )
+    def _too_short(self, later: Sequence[Stage], share: float) -> Sequence[Stage]:
+        """Return the first stage that is not worth the steps it would make, and all after it."""
+        for number, stage in enumerate(later):
+            if stage.steps and share * stage.steps < self._least_worthwhile(stage):
+                return later[number:]
+        return ()
+
+    def _least_worthwhile(self, stage: Stage) -> float:
+        """Return the steps that a later stage has to make."""
+        anew = any(isinstance(entry, FreshAlbedo) for entry in stage.enter)
+        least = _WORTHWHILE_ANEW if anew else _WORTHWHILE
+        return min(least, 0.5 * self._planned[stage.name])
 
     def _scaled(self, stage: Stage, done: int, share: float) -> Stage:
         """Scale what a stage has left, within limits of what was planned."""
