@@ -341,7 +341,7 @@ class Pacer:
         return ()
 
     def _least_worthwhile(self, stage: Stage) -> float:
-        """Return the steps that a later stage has to make."""
+        """Return the steps from which on a later stage is worth its time."""
         anew = any(isinstance(entry, FreshAlbedo) for entry in stage.enter)
         least = _WORTHWHILE_ANEW if anew else _WORTHWHILE
         return min(least, 0.5 * self._planned[stage.name])
