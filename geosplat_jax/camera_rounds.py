@@ -16,7 +16,7 @@ from geosplat_jax.fit.cameras import CameraSettings, ViewProgress
 from geosplat_jax.fit.config import Config
 from geosplat_jax.fit.folder import RunError
 from geosplat_jax.fit.listener import NOBODY, Listener
-from geosplat_jax.fit.presets import REFINE, make_config
+from geosplat_jax.fit.presets import REFINE, SPLIT_SUM, make_config
 from geosplat_jax.io.dataset import load_recorded
 from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.images import written_aside
@@ -33,15 +33,19 @@ def rounds_folder(output: str | Path) -> Path:
 
 
 def round_config(material_prior: str = "hybrid") -> Config:
-    """Return the settings of a round: a draft whose splats stay on the surface.
+    """Return the settings of a round: half the split sum of a draft, and splats on the surface.
 
-    What rounds recover was measured so (docs/cameras.md); rounds with free splats were not tried.
+    What rounds recover was measured so (docs/cameras.md); longer rounds and free splats were not tried.
 
     Parameters
     ----------
     material_prior : see `make_config`.
     """
-    overrides = (f"stages.{REFINE}.steps=0",)
+    overrides = (
+        f"stages.{SPLIT_SUM}.steps=200",
+        f"stages.{SPLIT_SUM}.half_life=100",
+        f"stages.{REFINE}.steps=0",
+    )
     return make_config(quality="draft", material_prior=material_prior, overrides=overrides)
 
 

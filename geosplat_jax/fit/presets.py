@@ -381,7 +381,7 @@ _QUALITY: dict[str, dict[str, Any]] = {
         "geometry": {"resolution": 32},
         "material": {"grid": {"levels": 6, "features": 4, "log2_entries": 14, "finest": 128}},
         "stages": {
-            SPLIT_SUM: {"steps": 200, "batch_views": 2, "half_life": 100.0},
+            SPLIT_SUM: {"steps": 400, "batch_views": 2, "half_life": 200.0},
             MONTE_CARLO: {
                 "steps": 150,
                 "batch_views": 2,
