@@ -35,7 +35,8 @@ def rounds_folder(output: str | Path) -> Path:
 def round_config(material_prior: str = "hybrid") -> Config:
     """Return the settings of a round: half the split sum of a draft, and splats on the surface.
 
-    What rounds recover was measured so (docs/cameras.md); longer rounds and free splats were not tried.
+    What rounds recover was measured so (docs/cameras.md); longer rounds and free splats were not
+    tried.
 
     Parameters
     ----------
