@@ -241,6 +241,46 @@ def test_a_later_stage_that_would_come_too_short_is_left_out_and_its_time_used()
     assert seconds == pytest.approx(480.0, rel=0.1)
 
 
+@pytest.mark.parametrize("slow_steps", [15, 60], ids=["at the start", "for a third of the stage"])
+def test_a_stage_left_out_comes_back_once_the_machine_is_fast_again(slow_steps):
+    """What a training makes that was slow for some steps is what it would have planned for them."""
+    stages = (
+        Stage(name="split_sum", steps=200, rates={"albedo": Rate(1.0)}),
+        Stage(name="monte_carlo", steps=100, rates={"albedo": Rate(1.0)}),
+        Stage(name="refine", steps=100, rates={"albedo": Rate(1.0)}),
+    )
+    config = replace(make_config("default", "draft"), stages=stages)
+    costs = {stage.name: StageCost(startup=20.0, step=1.0) for stage in stages}
+    made = [0]
+
+    def speed(now):
+        made[0] += 1
+        return 6.0 if 1 < made[0] <= slow_steps else 1.0
+
+    machine = _Machine(config, costs, speed)
+    left_out = []
+    pacer = Pacer(Budget(640.0), config, costs, clock=machine)
+    pacer_adjusted = pacer.adjusted
+
+    def noted(before, stage, done):
+        after = pacer_adjusted(before, stage, done)
+        left_out.append(any(not s.steps for s in (after or before).stages))
+        return after
+
+    pacer.adjusted = noted
+    seconds, after = machine.run(pacer)
+    assert any(left_out)
+    assert seconds == pytest.approx(640.0, rel=0.03)
+    # All schedules have the same length as they were planned, and later stages share one pace.
+    assert [stage.name for stage in after.active_stages] == [s.name for s in stages]
+    for stage in after.stages:
+        assert stage.rates_at(stage.steps) == pytest.approx(
+            config.stage(stage.name).rates_at(config.stage(stage.name).steps)
+        )
+    monte_carlo, refine = (after.stage(name).steps for name in ("monte_carlo", "refine"))
+    assert monte_carlo == pytest.approx(refine, rel=0.1)
+
+
 @pytest.mark.parametrize(
     ("seconds_left", "monte_carlo", "refine"),
     [(360, 200, 60), (198, 110, 33), (144, 96, 0), (78, 0, 0)],

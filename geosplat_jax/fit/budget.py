@@ -10,7 +10,7 @@ import math
 import re
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from geosplat_jax.fit.config import Budget, Config, Pace, Stage
@@ -57,6 +57,10 @@ _WORTHWHILE, _WORTHWHILE_ANEW = 30.0, 75.0
 """Steps, or half of those that were planned, below which a later stage is left out: one that goes
 on from what the stage before it has found, as a refinement does, and one that begins with one
 albedo, as Monte Carlo does, and is worse than none before that is learned."""
+
+_TO_COME_BACK = 1.2
+"""Times these steps, for which a stage that was left out is taken back: a stage that is on the edge
+does not come and go with every look."""
 
 _UNITS = {"s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
 _BYTES = {"mb": 1e6, "mib": 2.0**20, "gb": 1e9, "gib": 2.0**30}
@@ -263,8 +267,16 @@ def _scaled(
     return replace(stage, steps=done + remaining, pace=pace)
 
 
+def _length(stage: Stage) -> float:
+    """Return how long a stage's schedules are, in steps of their own; no pace changes that."""
+    return stage.position(stage.steps)
+
+
 class Pacer:
     """Keeps a training to its time; everything that it knows of time comes from ``clock``.
+
+    Every look begins from the schedules as they were planned, whatever the looks before it have
+    made of the stages: what was left out comes back once there is time for it again.
 
     Parameters
     ----------
@@ -286,7 +298,7 @@ class Pacer:
         self._clock = clock
         self._end = (clock() if began is None else began) + budget.seconds
         self._costs = costs
-        self._planned = {stage.name: stage.steps for stage in config.active_stages}
+        self._planned = config
         self._measured: dict[str, list[float]] = {}
 
     @property
@@ -307,36 +319,44 @@ class Pacer:
         """
         if done % _EVERY or len(self._measured.get(stage.name, ())) < _TIMED:
             return None
-        if stage.steps - done <= _EVERY:
+        left = stage.steps - done
+        if left <= _EVERY:
             return None
-        here, wanted = config.stage_names.index(stage.name), config
-        share = self._share(wanted, stage, done)
-        while left_out := self._too_short(wanted.stages[here + 1 :], share):
-            wanted = _without(wanted, left_out)
-            share = self._share(wanted, stage, done)
-        if wanted == config and abs(share - 1.0) <= _TOLERANCE:
+        here = config.stage_names.index(stage.name)
+        later = [other for other in self._planned.stages[here + 1 :] if other.steps]
+        ahead = _length(stage) - stage.position(done)
+        in_use = {other.name for other in config.active_stages[here + 1 :]}
+        share = self._share(stage, ahead, later)
+        while left_out := self._too_short(later, share, in_use):
+            later = [other for other in later if other not in left_out]
+            share = self._share(stage, ahead, later)
+        is_same = in_use == {other.name for other in later}
+        if is_same and abs(share * ahead / left - 1.0) <= _TOLERANCE:
             return None
-        stages = [
-            *wanted.stages[:here],
-            self._scaled(stage, done, share),
-            *(self._scaled(other, 0, share) for other in wanted.stages[here + 1 :]),
-        ]
-        adjusted = replace(wanted, stages=tuple(stages))
+        changed = {stage.name: self._scaled(stage, done, share * ahead)}
+        changed |= {other.name: self._scaled(other, 0, share * _length(other)) for other in later}
+        behind = _without(config, config.stages[here + 1 :])
+        stages = tuple(changed.get(other.name, other) for other in behind.stages)
+        adjusted = replace(config, stages=stages)
         return None if adjusted == config else adjusted
 
-    def _share(self, config: Config, stage: Stage, done: int) -> float:
-        """Return the time that is left over what the steps to come are expected to take."""
-        here = config.stage_names.index(stage.name)
-        later = [other for other in config.stages[here + 1 :] if other.steps]
-        work = (stage.steps - done) * self._step_seconds(stage.name)
-        work += sum(other.steps * self._step_seconds(other.name) for other in later)
+    def _share(self, stage: Stage, ahead: float, later: Sequence[Stage]) -> float:
+        """Return the time that is left over what all schedules to come would take at their own pace.
+
+        ``ahead`` : of the schedule of ``stage``. ``later`` : stages, as planned.
+        """
+        work = ahead * self._step_seconds(stage.name)
+        work += sum(_length(other) * self._step_seconds(other.name) for other in later)
         waits = sum(self._costs[other.name].startup for other in later)
         return max(self.seconds_left - waits, 0.0) / max(work, 1e-9)
 
-    def _too_short(self, later: Sequence[Stage], share: float) -> Sequence[Stage]:
+    def _too_short(
+        self, later: Sequence[Stage], share: float, in_use: Collection[str]
+    ) -> Sequence[Stage]:
         """Return the first stage that is not worth the steps it would make, and all after it."""
         for number, stage in enumerate(later):
-            if stage.steps and share * stage.steps < self._least_worthwhile(stage):
+            least = self._least_worthwhile(stage)
+            if share * _length(stage) < (least if stage.name in in_use else _TO_COME_BACK * least):
                 return later[number:]
         return ()
 
@@ -344,13 +364,13 @@ class Pacer:
         """Return the steps from which on a later stage is worth its time."""
         anew = any(isinstance(entry, FreshAlbedo) for entry in stage.enter)
         least = _WORTHWHILE_ANEW if anew else _WORTHWHILE
-        return min(least, 0.5 * self._planned[stage.name])
+        return min(least, 0.5 * stage.steps)
 
-    def _scaled(self, stage: Stage, done: int, share: float) -> Stage:
-        """Scale what a stage has left, within limits of what was planned."""
-        planned = self._planned.get(stage.name, 0)
+    def _scaled(self, stage: Stage, done: int, remaining: float) -> Stage:
+        """Give a stage so many steps after ``done`` ones, within limits of what was planned."""
+        planned = self._planned.stage(stage.name).steps
         fewest, most = math.ceil(_FEWEST * planned), math.ceil(_LONGEST * planned)
-        return _scaled(stage, done, share, fewest, most)
+        return _scaled(stage, done, remaining / (stage.steps - done), fewest, most)
 
     def _step_seconds(self, name: str) -> float:
         """Estimate a step: as measured, or as expected times what was wrong with the last one."""
