@@ -334,7 +334,7 @@ def steps_that_grow(monkeypatch):
         return grown(state), report
 
     monkeypatch.setattr(loop_module, "train_step", step)
-    monkeypatch.setattr(loop_module, "compile_step", lambda *a, **k: compiled.append(a))
+    monkeypatch.setattr(loop_module, "compile_step", lambda *a, **k: compiled.append(a) is None)
     monkeypatch.setattr(loop_module, "plan_capacities", lambda *a, **k: Capacities(hits=128))
     monkeypatch.setattr(loop_module, "_FOLLOW_EVERY", 2)
     return compiled

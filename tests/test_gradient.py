@@ -1,5 +1,7 @@
 """The gradient by parts is that of the whole loss."""
 
+import threading
+import time
 from dataclasses import replace
 
 import jax
@@ -11,7 +13,7 @@ from test_pipeline import TIGHT, evaluate, problem
 
 from geosplat_jax.core.types import rate_groups
 from geosplat_jax.fit import gradient
-from geosplat_jax.fit.gradient import value_and_gradient
+from geosplat_jax.fit.gradient import Runner, SideBySide, value_and_gradient
 
 
 def two_views(pipeline, batch):
@@ -44,6 +46,56 @@ def test_the_parts_of_monte_carlo_give_the_gradient_of_the_whole_loss():
     assert float(found_total) == pytest.approx(float(total), rel=1e-5)
     assert_close(found_report, report)
     assert_close(found, expected)
+    again = value_and_gradient(pipeline, params, batch, frozen=(), run=SideBySide())
+    for a, b in zip(jax.tree.leaves(again[1]), jax.tree.leaves(found), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_two_programs_run_at_a_time_and_their_results_stay_in_order():
+    """Each of two waits for the other; one after the other they would never end."""
+    both = threading.Barrier(2, timeout=20)
+
+    def program(number):
+        both.wait()
+        return number
+
+    assert SideBySide().all(*((program, number) for number in range(4))) == [0, 1, 2, 3]
+    assert SideBySide().all((lambda x: x, 5)) == Runner().all((lambda x: x, 5)) == [5]
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_program_that_fails_beside_another_is_told_when_both_have_ended(number):
+    ended = []
+
+    def program(mine):
+        if mine == number:
+            raise ValueError("no")
+        time.sleep(0.05)
+        ended.append(mine)
+
+    with pytest.raises(ValueError, match="no"):
+        SideBySide().all((program, 0), (program, 1))
+    assert ended == [1 - number]
+
+
+@pytest.mark.parametrize("stage", ["split_sum", "monte_carlo"])
+def test_only_programs_that_trace_rays_are_called_side_by_side(stage):
+    _, pipeline, params, batch = problem(stage=stage)
+    together = []
+
+    class Noting(Runner):
+        """Evaluates shapes only, and notes what could run side by side."""
+
+        def __call__(self, program, *arguments):
+            return program.trace(*arguments).out_info
+
+        def all(self, *calls):
+            together.extend(program.__name__ for program, *_ in calls)
+            return super().all(*calls)
+
+    value_and_gradient(pipeline, params, two_views(pipeline, batch), frozen=(), run=Noting())
+    views = ["_lists", "_lists", "_lights", "_residual_lights", "_view_gradient", "_view_gradient"]
+    assert together == (views if stage == "monte_carlo" else [])
 
 
 def test_split_sum_by_parts_with_a_frozen_group():

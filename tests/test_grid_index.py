@@ -140,11 +140,12 @@ def test_masked_rays_hit_nothing_and_leave_the_others(torus):
 
 
 @pytest.mark.slow
-def test_rays_in_many_chunks_equal_rays_in_one(torus, monkeypatch):
+def test_rays_that_wait_for_others_hit_what_they_would_at_once(torus, monkeypatch):
     _, index = torus
-    rays = _rays(1500)
+    *rays, _ = _rays(1500)
+    rays.append(jnp.asarray(np.random.default_rng(0).random(1500) < 0.8))
     whole = index.nearest(*rays)
-    monkeypatch.setattr(walking, "_CHUNK", 512)
+    monkeypatch.setattr(walking, "_LANES", 512)
     again = jax.jit(walking.trace, static_argnames=("two_sided", "any_hit"))
     parts = again(index, *rays, two_sided=False, any_hit=False)
     np.testing.assert_array_equal(whole[1], parts[1])

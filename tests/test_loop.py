@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 from support import MONTE_CARLO, sphere_dataset, tiny_config
 
+from geosplat_jax.adapter import VertexSplats
 from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.fit import loop as loop_module
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.loop import new_loop, resumed_loop
+from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.stages import build_pipeline, make_batch
 from geosplat_jax.fit.step import StepReport
 from geosplat_jax.fit.trained import NextStage
+from geosplat_jax.fit.upcoming import continued
 from geosplat_jax.pipeline import LossReport
 
 CONFIG = tiny_config(
@@ -68,7 +71,7 @@ def steps(monkeypatch):
     def install(*needs):
         told = Steps(*needs)
         monkeypatch.setattr(loop_module, "train_step", told)
-        monkeypatch.setattr(loop_module, "compile_step", lambda *a, **k: None)
+        monkeypatch.setattr(loop_module, "compile_step", lambda *a, **k: True)
         monkeypatch.setattr(loop_module, "plan_capacities", lambda *a, **k: Capacities(hits=128))
         return told
 
@@ -111,7 +114,9 @@ def test_programs_of_trainings_before_are_forgotten_before_a_training_compiles(
     monkeypatch.setattr(
         loop_module, "release_programs_when_crowded", lambda: order.append("release")
     )
-    monkeypatch.setattr(loop_module, "compile_step", lambda *a, **k: order.append("compile"))
+    monkeypatch.setattr(
+        loop_module, "compile_step", lambda *a, **k: order.append("compile") is None
+    )
     new_loop(dataset, CONFIG, folder).prepare(0)
     assert order == ["release", "compile"]
 
@@ -168,3 +173,37 @@ def test_what_is_known_of_the_next_stage_is_kept_until_it_begins(dataset, folder
     assert loop.meta()["to_come"] is None
     assert loop._planned(None) == Capacities(hits=256)
     assert loop.to_come is None
+
+
+def test_what_a_stage_continues_gets_buffers_for_what_was_needed_of_late(dataset, folder, steps):
+    """Where splats become parameters their rows follow from the surface's buffers, which stay."""
+    steps(100)
+    loop = new_loop(dataset, CONFIG, folder)
+    sizes = {"hits": 4096, "quads": 4096, "visible": 128}
+    pipeline = replace(loop.pipeline, capacities=Capacities(**sizes))
+    needed = {"hits": 1000, "quads": 1000, "visible": 127}
+    stage, refine = CONFIG.stage("monte_carlo"), make_config("default", "draft").stage("refine")
+    found = continued(pipeline, needed, pipeline, stage)
+    assert 1100 <= found["hits"] == found["quads"] <= 1280
+    assert found["visible"] == 128
+    found = continued(pipeline, needed, pipeline, refine)
+    assert found["hits"] <= 1280
+    assert found["quads"] == 4096
+    others = replace(pipeline, splats=VertexSplats())
+    assert continued(pipeline, needed, others, stage) is None
+
+
+def test_what_was_needed_before_buffers_are_looked_at_is_not_forgotten(
+    dataset, folder, steps, monkeypatch
+):
+    monkeypatch.setattr(loop_module, "_SHRINK_EVERY", 2)
+    monkeypatch.setattr(loop_module, "_WORTH", 0)
+    steps(40, 120, 30)
+    loop = new_loop(dataset, CONFIG, folder)
+    for step in range(3):
+        loop.prepare(step)
+        loop.advance(step)
+    assert (loop.peak, loop.peak_before) == ({"hits": 30}, {"hits": 120})
+    assert loop._needed() == {"hits": 120}
+    loop.save()
+    assert resumed_loop(dataset, CONFIG, folder)._needed() == {"hits": 120}

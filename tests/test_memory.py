@@ -7,6 +7,7 @@ import pytest
 from support import sphere_dataset, tiny_config
 
 from geosplat_jax.fit.memory import (
+    fits_twice,
     require_program_memory,
     require_rendering_memory,
     require_training_memory,
@@ -110,6 +111,9 @@ def test_a_program_that_does_not_fit_is_refused_once_it_is_compiled(machine):
     compiled = program.trace(jax.ShapeDtypeStruct((1000,), jnp.float32)).lower().compile()
     machine(0.0045)
     require_program_memory("program", compiled)
+    assert not fits_twice(compiled)
+    machine(0.016)
+    assert fits_twice(compiled)
     for gigabytes, copies in ((0.0035, 1), (0.0045, 2)):
         machine(gigabytes)
         with pytest.raises(TrainingError, match="the program program 0.0 GB; lower geom") as caught:

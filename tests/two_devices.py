@@ -48,7 +48,7 @@ def gradients():
         devices.place(params),
         devices.share_out(batch),
         frozen=("light",),
-        run=devices.run,
+        run=devices.runner(),
     )
     copies = [[part.data for part in leaf.addressable_shards] for leaf in jax.tree.leaves(two)]
     assert all(len(parts) == 2 for parts in copies)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, UInt
 
-_LADDER_RATIO = 1.25
+_LADDER_RATIO = 1.1
 _LADDER_STEP = 128
 _SHRINK_BELOW = 0.5
 UNSIZED = 1024
@@ -95,7 +95,7 @@ def fits(needed: Usage, capacities: Mapping[str, int | Int[Array, ""]]) -> Bool[
 
 
 def bucket(count: int) -> int:
-    """Smallest rung of the ladder that holds ``count``: at most 25 % above it, multiples of 128."""
+    """Smallest rung of the ladder that holds ``count``: some tenth above it, a multiple of 128."""
     size = _LADDER_STEP
     while size < count:
         steps = -(-int(size * _LADDER_RATIO) // _LADDER_STEP)
@@ -108,7 +108,7 @@ def overflowed(needed: Counts, capacities: Capacities) -> list[str]:
     return [name for name, count in needed.items() if int(count) > capacities[name]]
 
 
-def grow(capacities: Capacities, needed: Counts, *, headroom: float = 1.1) -> Capacities:
+def grow(capacities: Capacities, needed: Counts, *, headroom: float = 1.2) -> Capacities:
     """Capacities that hold ``needed`` with some headroom; buffers that fit keep their size."""
     names = overflowed(needed, capacities)
     return capacities.resized(**{name: bucket(int(int(needed[name]) * headroom)) for name in names})
@@ -128,6 +128,23 @@ def shrink(capacities: Capacities, needed: Counts, *, headroom: float = 1.25) ->
     return capacities.resized(**smaller)
 
 
+def tightened(capacities: Capacities, needed: Counts, *, headroom: float = 1.1) -> Capacities:
+    """Capacities that hold ``needed`` with some headroom, none larger than before.
+
+    For programs that have to be compiled anyhow; see `shrink` for others.
+    """
+    sizes = {name: bucket(int(int(count) * headroom)) for name, count in needed.items()}
+    smaller = {name: size for name, size in sizes.items() if size < capacities[name]}
+    return capacities.resized(**smaller)
+
+
+def largest(first: Counts | None, second: Counts | None) -> dict[str, int]:
+    """Larger of two counts of every buffer (host side); None counts nothing."""
+    first, second = first or {}, second or {}
+    names = sorted({*first, *second})
+    return {name: max(int(first.get(name, 0)), int(second.get(name, 0))) for name in names}
+
+
 _Result = TypeVar("_Result")
 
 
@@ -135,7 +152,7 @@ def retry(
     attempt: Callable[[Capacities], tuple[_Result, Usage]],
     capacities: Capacities,
     *,
-    headroom: float = 1.1,
+    headroom: float = 1.2,
 ) -> tuple[_Result, Capacities]:
     """Call ``attempt`` with growing capacities until everything it needed fitted (host side).
 

@@ -341,7 +341,7 @@ class Pacer:
         return None if adjusted == config else adjusted
 
     def _share(self, stage: Stage, ahead: float, later: Sequence[Stage]) -> float:
-        """Return the time that is left over what all schedules to come would take at their own pace.
+        """Return the time that is left over what all schedules to come would take as planned.
 
         ``ahead`` : of the schedule of ``stage``. ``later`` : stages, as planned.
         """

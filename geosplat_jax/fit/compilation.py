@@ -6,15 +6,48 @@ time, and a thread that compiles the programs of the next stage does not hold up
 
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Any
 
 from geosplat_jax.core.types import Batch
 from geosplat_jax.fit.devices import ONE_DEVICE, Devices
-from geosplat_jax.fit.gradient import SharedBatch
-from geosplat_jax.fit.memory import require_program_memory
+from geosplat_jax.fit.gradient import Runner, SharedBatch
+from geosplat_jax.fit.memory import fits_twice, require_program_memory
 from geosplat_jax.fit.runtime import in_background
 from geosplat_jax.fit.step import TrainState, UpdateRule, train_step
 from geosplat_jax.pipeline import Pipeline
+
+
+class _Compiling(Runner):
+    """Compiles programs instead of calling them, and returns the shapes of their results."""
+
+    def __init__(self, devices: Devices, threads: int, is_wanted: Callable[[], bool]) -> None:
+        self.devices, self.is_wanted = devices, is_wanted
+        self.free, self.compiling = threading.Semaphore(threads), list[Future[None]]()
+        self.fits_twice = True
+
+    def __call__(self, program: Any, *arguments: Any) -> Any:
+        """Compile a program that runs alone."""
+        return self._compile(program, arguments, is_alone=True)
+
+    def all(self, *calls: tuple[Any, ...]) -> list[Any]:
+        """Compile programs that may run side by side."""
+        return [self._compile(program, rest, is_alone=False) for program, *rest in calls]
+
+    def _compile(self, program: Any, arguments: Any, *, is_alone: bool) -> Any:
+        devices = self.devices
+        traced = devices.program(program).trace(*devices.shapes(tuple(arguments)))
+
+        def finish() -> None:
+            with self.free:
+                if not self.is_wanted():
+                    return
+                compiled = traced.lower().compile()
+            require_program_memory(program.__name__.strip("_"), compiled, devices.count_here)
+            self.fits_twice &= is_alone or fits_twice(compiled)
+
+        self.compiling.append(in_background(finish))
+        return devices.shapes(traced.out_info)
 
 
 def compile_step(
@@ -26,7 +59,7 @@ def compile_step(
     devices: Devices = ONE_DEVICE,
     threads: int = 2,
     is_wanted: Callable[[], bool] = lambda: True,
-) -> None:
+) -> bool:
     """Compile the programs of `step.train_step` for arguments of these shapes; run none of them.
 
     A later call with such arguments finds them compiled. What does not fit into the memory is
@@ -38,22 +71,13 @@ def compile_step(
     devices : that the programs are for.
     threads : programs that are compiled at a time.
     is_wanted : asked before each of them; the rest is left out once it says no.
+
+    Returns
+    -------
+    Whether the memory holds two at a time of those that do not wait for each other.
     """
-    free, compiling = threading.Semaphore(threads), []
-
-    def compiled(program: Any, *arguments: Any) -> Any:
-        traced = devices.program(program).trace(*devices.shapes(arguments))
-
-        def finish() -> None:
-            with free:
-                if is_wanted():
-                    require_program_memory(
-                        program.__name__.strip("_"), traced.lower().compile(), devices.count_here
-                    )
-
-        compiling.append(in_background(finish))
-        return devices.shapes(traced.out_info)
-
-    train_step(state, batch, pipeline, rule, run=compiled)
-    for one in compiling:
+    compiling = _Compiling(devices, threads, is_wanted)
+    train_step(state, batch, pipeline, rule, run=compiling)
+    for one in compiling.compiling:
         one.result()
+    return compiling.fits_twice

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from geosplat_jax.core.types import Batch, Camera
 from geosplat_jax.fit import gradient, step
-from geosplat_jax.fit.gradient import SharedBatch, run_program
+from geosplat_jax.fit.gradient import IN_TURN, Runner, SharedBatch, SideBySide
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.pipeline import ViewReport
 
@@ -52,9 +52,12 @@ class Devices:
         """Return what stands for a program of `gradient` or `step` on these devices."""
         return program
 
-    def run(self, program: Any, *arguments: Any) -> Any:
-        """Call a program, see `gradient.run_program`."""
-        return run_program(program, *arguments)
+    def runner(self, *, fits_twice: bool = False) -> Runner:
+        """Return what calls programs on these devices.
+
+        ``fits_twice`` : whether the memory holds two of them at a time.
+        """
+        return SideBySide() if fits_twice else IN_TURN
 
     def shapes(self, tree: Any) -> Any:
         """Return a tree with the shapes of its arrays, and where they lie, for compilation."""
@@ -144,9 +147,9 @@ class ManyDevices(Devices):
         """See `Devices.program`."""
         return _programs(self.mesh)[program]
 
-    def run(self, program: Any, *arguments: Any) -> Any:
-        """See `Devices.run`; what lies nowhere in particular is put on all devices before."""
-        return run_program(self.program(program), *self.place(arguments))
+    def runner(self, *, fits_twice: bool = False) -> Runner:
+        """See `Devices.runner`; never two at a time, since all hosts need the same order."""
+        return _OnAll(self)
 
     def shapes(self, tree: Any) -> Any:
         """See `Devices.shapes`."""
@@ -248,6 +251,17 @@ class ManyDevices(Devices):
         return result
 
 
+class _OnAll(Runner):
+    """Calls programs on many devices; what lies nowhere in particular is put on all before."""
+
+    def __init__(self, devices: ManyDevices) -> None:
+        self.devices = devices
+
+    def __call__(self, program: Any, *arguments: Any) -> Any:
+        """See `Runner`."""
+        return super().__call__(self.devices.program(program), *self.devices.place(arguments))
+
+
 def _local(tree: Any) -> Any:
     """Take away the axis that counts the devices."""
     return jax.tree.map(lambda x: x[0], tree)
@@ -290,6 +304,11 @@ def _seen(pipeline: Any, asset: Any, lists: Any) -> Bool[Array, " N"] | None:
 def _lights(pipeline: Any, asset: Any, light: Any, seen: Any, batch: SharedBatch) -> Any:
     """See `gradient._lights`."""
     return gradient._lights(pipeline, asset, light, seen, _common(batch))
+
+
+def _residual_lights(pipeline: Any, asset: Any, light: Any, seen: Any, batch: SharedBatch) -> Any:
+    """See `gradient._residual_lights`."""
+    return gradient._residual_lights(pipeline, asset, light, seen, _common(batch))
 
 
 def _view_gradient(
@@ -401,6 +420,7 @@ def _programs(mesh: Mesh) -> dict[Any, Any]:
         gradient._lists: spread(_lists, (s, s, o), o),
         gradient._seen: spread(_seen, (s, s, o), s),
         gradient._lights: spread(_lights, (s, s, s, s, batch), s),
+        gradient._residual_lights: spread(_residual_lights, (s, s, s, s, batch), s),
         gradient._view_gradient: spread(_view_gradient, (s, s, s, s, s, o, o), o),
         gradient._plus: spread(_plus, (o, o), o, donate_argnums=0),
         gradient._back: spread(_back, (s, s, s, s, s, o, batch, s), s, static_argnums=8),

@@ -9,6 +9,7 @@ programs that it is in, and programs can be compiled side by side, or before the
 """
 
 from collections.abc import Callable
+from concurrent.futures import wait
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -20,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.core.types import Batch, EnvLight, without_gradient, zero_gradient
+from geosplat_jax.fit.runtime import in_background
 from geosplat_jax.pipeline import LossReport, Pipeline, ViewReport
 from geosplat_jax.render import Params
 from geosplat_jax.splats.tiles import LIST_BUFFERS, TileLists
@@ -27,6 +29,42 @@ from geosplat_jax.transport.base import Illumination
 
 _Parts = tuple[Any, Any]
 """A pytree cut in two: what has a derivative, and the rest."""
+
+
+class Runner:
+    """Calls programs one after the other, and waits for each."""
+
+    def __call__(self, program: Any, *arguments: Any) -> Any:
+        """Call a program and wait for its results."""
+        return jax.block_until_ready(program(*arguments))
+
+    def all(self, *calls: tuple[Any, ...]) -> list[Any]:
+        """Call programs that do not wait for each other, each given with its arguments."""
+        return [self(*call) for call in calls]
+
+
+IN_TURN = Runner()
+"""The usual one."""
+
+
+class SideBySide(Runner):
+    """Calls two programs at a time where they do not wait for each other.
+
+    XLA divides the operations of a program among the cores of a CPU, but neither sorts nor loops,
+    and rays travel in loops. So two programs that trace take less time side by side; two of others
+    take more (measured, docs/transport.md), and twice the memory.
+    """
+
+    def all(self, *calls: tuple[Any, ...]) -> list[Any]:
+        """See `Runner.all`; every second call is made by another thread."""
+        others = in_background(lambda: super(SideBySide, self).all(*calls[1::2]))
+        try:
+            mine = super().all(*calls[::2])
+        finally:
+            wait([others])
+        found = [None] * len(calls)
+        found[::2], found[1::2] = mine, others.result()
+        return found
 
 
 class SharedBatch(eqx.Module):
@@ -90,8 +128,8 @@ def _lights(
     light: EnvLight,
     seen: Bool[Array, " N"] | None,
     batch: Batch,
-) -> tuple[_Parts, Illumination | None, Any, Callable]:
-    """Prepare the light, and that of residuals; also return the carry and the way back."""
+) -> tuple[_Parts, Any, Callable]:
+    """Prepare the light; also return the carry and the way back."""
     moving, fixed = asset
 
     def prepare(moving: Any, light: EnvLight) -> tuple[Any, Any]:
@@ -100,8 +138,19 @@ def _lights(
         return changing, (rest, carry)
 
     changing, pull, (rest, carry) = jax.vjp(prepare, moving, light, has_aux=True)
-    others = pipeline.residual_lights(eqx.combine(moving, fixed), light, seen, batch)
-    return (changing, rest), others, carry, pull
+    return (changing, rest), carry, pull
+
+
+@jax.jit
+def _residual_lights(
+    pipeline: Pipeline,
+    asset: _Parts,
+    light: EnvLight,
+    seen: Bool[Array, " N"] | None,
+    batch: Batch,
+) -> Illumination | None:
+    """Prepare the light of residuals."""
+    return pipeline.residual_lights(eqx.combine(*asset), light, seen, batch)
 
 
 @jax.jit
@@ -187,18 +236,13 @@ def _divided(capacities: Capacities) -> tuple[dict[str, int], dict[str, int]]:
     return of_lists, {n: size for n, size in capacities.items() if n not in LIST_BUFFERS}
 
 
-def run_program(program: Any, *arguments: Any) -> Any:
-    """Call a program, and wait for it: on a CPU two side by side take longer (measured)."""
-    return jax.block_until_ready(program(*arguments))
-
-
 def value_and_gradient(
     pipeline: Pipeline,
     params: Params,
     batch: Batch | SharedBatch,
     *,
     frozen: tuple[str, ...],
-    run: Callable[..., Any] = run_program,
+    run: Runner = IN_TURN,
 ) -> tuple[tuple[Any, LossReport], Params]:
     """Evaluate `Pipeline.loss` and its gradient, view by view (host side).
 
@@ -206,7 +250,7 @@ def value_and_gradient(
     ----------
     pipeline, params, batch : see `Pipeline.loss`; a `SharedBatch` for several devices.
     frozen : groups of parameters whose gradient is zero.
-    run : calls a program with arguments; for those who want shapes only, or several devices.
+    run : calls the programs.
 
     Returns
     -------
@@ -216,16 +260,18 @@ def value_and_gradient(
     listing, pipeline = (
         replace(pipeline, capacities=Capacities(**sizes)) for sizes in _divided(pipeline.capacities)
     )
+    together = run.all if pipeline.uses_rays else partial(Runner.all, run)
     asset, pull_asset = run(_asset, pipeline, params, frozen)
-    numbers = range(batch.count)
-    views = [run(_view, batch, jnp.int32(number)) for number in numbers]
-    lists = [run(_lists, listing, asset, view) for view, _ in views]
+    views = [run(_view, batch, jnp.int32(number)) for number in range(batch.count)]
+    lists = together(*((_lists, listing, asset, view) for view, _ in views))
     seen = run(_seen, pipeline, asset, lists)
-    light, exposure = params.light, params.log_exposure
-    lights, others, carry, pull_lights = run(_lights, pipeline, asset, light, seen, batch)
-    total = None
-    for view, listed in zip(views, lists, strict=True):
-        part = run(_view_gradient, pipeline, exposure, asset, lights, others, listed, view)
-        total = part if total is None else run(_plus, total, part)
+    lit = (pipeline, asset, params.light, seen, batch)
+    (lights, carry, pull_lights), others = together((_lights, *lit), (_residual_lights, *lit))
+    of_all = (pipeline, params.log_exposure, asset, lights, others)
+    total, *parts = together(
+        *((_view_gradient, *of_all, *one) for one in zip(lists, views, strict=True))
+    )
+    for part in parts:
+        total = run(_plus, total, part)
     pulls = (pull_asset, pull_lights)
     return run(_back, pipeline, params, asset, lights, pulls, total, batch, carry, frozen)

@@ -88,9 +88,10 @@ class Loop:
     ``pipeline`` on one of this process, where everything between two steps is computed. ``views``
     are windows of the photographs that hold this ``share`` of their pixels, see
     `windows.around_object`. ``upcoming`` is the next stage, once it is near; ``to_come`` is what a
-    checkpoint said of it. ``has_compiled`` is set by whatever compiles, and reset by whoever
-    measures time; ``on_compile`` is called with the stage's name before anything compiles that a
-    step waits for.
+    checkpoint said of it. ``peak`` is the largest need of every buffer since these were last looked
+    at, ``peak_before`` that of the time before. ``has_compiled`` is set by whatever compiles, and
+    reset by whoever measures time; ``fits_twice`` is what `compile_step` says; ``on_compile`` is
+    called with the stage's name before anything compiles that a step waits for.
     """
 
     config: Config
@@ -104,11 +105,13 @@ class Loop:
     share: float = 1.0
     planned_for: str | None = None
     peak: dict[str, int] | None = None
+    peak_before: dict[str, int] | None = None
     recoveries: int = 0
     fallback: "First | None" = None
     last_checkpoint: Path | None = None
     upcoming: Upcoming | None = None
     has_compiled: bool = False
+    fits_twice: bool = False
     to_come: NextStage | None = None
     on_compile: Callable[[str], None] | None = None
 
@@ -141,6 +144,7 @@ class Loop:
             "capacities": dict(self.pipeline.capacities),
             "planned_for": self.planned_for,
             "peak": self.peak,
+            "peak_before": self.peak_before,
             "recoveries": self.recoveries,
             "to_come": self._known_to_come(),
         }
@@ -188,7 +192,7 @@ class Loop:
         # Another kind of splats, another stage: other needs.
         planned_for = f"{self.stage.name} {self.pipeline.splats}"
         if planned_for != self.planned_for:
-            self.planned_for, self.peak = planned_for, None
+            self.planned_for, self.peak, self.peak_before = planned_for, None, None
             self._announce()
             if self.upcoming is None:  # else its programs are there already
                 release_programs_when_crowded()
@@ -200,7 +204,9 @@ class Loop:
         if following is not None and self.upcoming is None:
             # A copy, since the steps to come consume the buffers of the state.
             params = jax.tree.map(jnp.array, self.params)
-            ends = Ends(self.config, self.views, self.pipeline, params, self.devices)
+            ends = Ends(
+                self.config, self.views, self.pipeline, params, self.devices, self._needed()
+            )
             self.upcoming = Upcoming(following, ends, self.to_come)
 
     def retime(self, config: Config) -> None:
@@ -261,7 +267,8 @@ class Loop:
     def _compile(self, step: int) -> None:
         """Compile the programs of a step side by side; calls would do so one after the other."""
         batch, rule = self._inputs(step)
-        compile_step(self.state, batch, self.pipeline, rule, devices=self.devices)
+        devices = self.devices
+        self.fits_twice = compile_step(self.state, batch, self.pipeline, rule, devices=devices)
         self.has_compiled = True
 
     def _inputs(self, step: int) -> tuple[Batch | SharedBatch, UpdateRule]:
@@ -287,7 +294,11 @@ class Loop:
         self.pipeline = build_pipeline(self.config, stage, self.surface)
         self.start(params)
         first = pipeline_at(self.pipeline, self.config, stage, 0)
-        return continued(pipeline, first, stage)
+        return continued(pipeline, self._needed(), first, stage)
+
+    def _needed(self) -> dict[str, int]:
+        """Return the largest need of every buffer in the last hundred steps at least."""
+        return capacity_module.largest(self.peak, self.peak_before)
 
     def start(self, params: Params) -> None:
         """Begin the stage with these parameters."""
@@ -302,7 +313,8 @@ class Loop:
         def attempt(capacities: Capacities) -> tuple[StepReport, Usage]:
             self._resize(capacities, step)
             pipeline = self.devices.place_again(self.pipeline)
-            self.state, report = train_step(self.state, batch, pipeline, rule, run=self.devices.run)
+            run = self.devices.runner(fits_twice=self.fits_twice)
+            self.state, report = train_step(self.state, batch, pipeline, rule, run=run)
             check_limits(report.loss.usage, self.config.geometry.limits)
             return report, report.loss.usage
 
@@ -310,12 +322,12 @@ class Loop:
         if not bool(report.finite):
             raise TrainingError(self._not_finite(step, report))
         needed = {name: int(count) for name, count in report.loss.usage.items()}
-        self.peak = {n: max(count, (self.peak or {}).get(n, 0)) for n, count in needed.items()}
+        self.peak = capacity_module.largest(self.peak, needed)
         if int(report.loss.face_count) == 0:
             self._recover(step)
         elif self.step % _SHRINK_EVERY == 0 and self.stage.steps - self.steps_of_stage >= _WORTH:
             self._resize(capacity_module.shrink(self.pipeline.capacities, self.peak), step)
-            self.peak = None
+            self.peak, self.peak_before = None, self.peak
         if self.step % _FOLLOW_EVERY == 0:
             self._follow(step)
         return report
@@ -456,6 +468,7 @@ def _put(loop: Loop, tree: dict[str, Any], described: Description) -> None:
     loop.pipeline = replace(pipeline, capacities=Capacities(**described.capacities))
     loop.state = loop.devices.place(tree["state"])
     loop.planned_for, loop.peak = described.planned_for, described.peak
+    loop.peak_before = described.peak_before
     loop.recoveries = described.recoveries
     loop.to_come = described.to_come
 

@@ -85,18 +85,27 @@ def require_program_memory(name: str, compiled: jax.stages.Compiled, copies: int
     TrainingError
         One line, with what makes it so large.
     """
-    sizes = compiled.memory_analysis()
-    if sizes is None or jax.default_backend() != "cpu":
-        return
-    need = sizes.temp_size_in_bytes + sizes.argument_size_in_bytes + sizes.output_size_in_bytes
-    refusal = memory_refusal(
-        [Need(f"the program {name}", copies * (need - sizes.alias_size_in_bytes))]
-    )
+    refusal = _program_refusal(name, compiled, copies)
     if refusal is not None:
         raise TrainingError(
             f"{refusal}; lower geometry.resolution, stages.*.transport.*_count, the size of the "
             "images (--downscale) or stages.*.batch_views"
         )
+
+
+def fits_twice(compiled: jax.stages.Compiled) -> bool:
+    """Tell whether the memory holds a program of a processor two times at once."""
+    return jax.default_backend() == "cpu" and _program_refusal("", compiled, 2) is None
+
+
+def _program_refusal(name: str, compiled: jax.stages.Compiled, copies: int) -> str | None:
+    """Say why so many copies of a program do not fit, if so; see `require_program_memory`."""
+    sizes = compiled.memory_analysis()
+    if sizes is None or jax.default_backend() != "cpu":
+        return None
+    need = sizes.temp_size_in_bytes + sizes.argument_size_in_bytes + sizes.output_size_in_bytes
+    need = copies * (need - sizes.alias_size_in_bytes)
+    return memory_refusal([Need(f"the program {name}", need)])
 
 
 def require_rendering_memory(

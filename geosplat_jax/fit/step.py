@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from geosplat_jax.core import capacity as capacity_module
 from geosplat_jax.core.types import Batch, rate_groups
-from geosplat_jax.fit.gradient import SharedBatch, run_program, value_and_gradient
+from geosplat_jax.fit.gradient import IN_TURN, Runner, SharedBatch, value_and_gradient
 from geosplat_jax.pipeline import LossReport, Pipeline
 from geosplat_jax.render import Params
 
@@ -147,7 +147,7 @@ def train_step(
     pipeline: Pipeline,
     rule: UpdateRule,
     *,
-    run: Callable[..., Any] = run_program,
+    run: Runner = IN_TURN,
 ) -> tuple[TrainState, StepReport]:
     """Make one update, or none at all.
 

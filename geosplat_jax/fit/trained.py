@@ -51,6 +51,7 @@ class Description:
     planned_for: str | None = None
     """What the buffers were planned for."""
     peak: dict[str, Count] | None = None
+    peak_before: dict[str, Count] | None = None
     """Largest needs of the buffers since they were last made smaller."""
     recoveries: Count = 0
     """How often the surface was put back."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 
-from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.core.capacity import Capacities, Counts, tightened
 from geosplat_jax.fit.compilation import compile_step
 from geosplat_jax.fit.config import Config, Stage
 from geosplat_jax.fit.devices import Devices
@@ -24,6 +24,7 @@ from geosplat_jax.fit.trained import NextStage
 from geosplat_jax.io.views import Views
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
+from geosplat_jax.splats.tiles import LIST_BUFFERS
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class Ends:
     pipeline : of the stage; what is planned depends on its surface alone.
     params : as they are now, in buffers that no step consumes.
     devices : that the run trains on.
+    needed : largest needs of the buffers of late.
     """
 
     config: Config
@@ -43,12 +45,20 @@ class Ends:
     pipeline: Pipeline
     params: Params
     devices: Devices
+    needed: dict[str, int]
 
 
-def continued(before: Pipeline, first: Pipeline, stage: Stage) -> Capacities | None:
-    """Return the buffers of a pipeline whose splats those of a stage continue; None if not."""
-    is_continued = stage.splats.takes_over or first.splats == before.splats
-    return before.capacities if is_continued else None
+def continued(before: Pipeline, needed: Counts, first: Pipeline, stage: Stage) -> Capacities | None:
+    """Return buffers for the splats of a pipeline, if those of a stage continue them, or None.
+
+    They are no larger than was ``needed`` of late, since the stage has programs of its own. Where
+    splats become parameters, the buffers of the surface stay: rows of splats follow from them.
+    """
+    if stage.splats.takes_over:
+        needed = {name: needed[name] for name in LIST_BUFFERS if name in needed}
+    elif first.splats != before.splats:
+        return None
+    return tightened(before.capacities, needed)
 
 
 class Upcoming:
@@ -75,7 +85,7 @@ class Upcoming:
                 return Capacities(**known.capacities)
             first = begin_stage(params, before, config, stage)
             pipeline = first_pipeline(Capacities())
-            carried = continued(before, pipeline, stage)
+            carried = continued(before, ends.needed, pipeline, stage)
             if carried is not None:
                 return add_rays(pipeline, first, carried)
             return plan_capacities(pipeline, first, views.camera(), limits=config.geometry.limits)

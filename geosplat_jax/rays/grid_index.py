@@ -113,12 +113,11 @@ class GridIndex(CellIndex):
             tuple(rows[:, 3 * i + axis] - lanes.origin[axis] for axis in range(3)) for i in range(5)
         ]
         if not any_hit:
-            # Distance and face both leave, and each would gather the corners for itself.
+            # Each triangle would gather the corners for itself.
             points = jax.lax.optimization_barrier(points)
         moment = cross(lanes.direction, points[4])
         spokes = [dot(points[i], moment) for i in range(4)]  # d.(c x a)
-        distance, face = lanes.distance, lanes.face
-        is_blocked = jnp.zeros_like(is_testing)
+        is_blocked, hits = jnp.zeros_like(is_testing), []
         for i in range(4):
             j = (i + 1) % 4
             normal = cross(points[i], points[j])
@@ -133,18 +132,21 @@ class GridIndex(CellIndex):
             at = volume / jnp.where(total == 0, 1.0, total)
             is_hit = is_hit & (at > T_MIN)
             is_blocked = is_blocked | is_hit
-            is_nearer = is_hit & (at < distance)
-            distance = jnp.where(is_nearer, at, distance)
-            face = jnp.where(is_nearer, 4 * patch + i, face)
+            hits.append(jnp.where(is_hit, at, jnp.inf))
         lanes = lanes._replace(tested=lanes.tested + is_testing.astype(jnp.int32))
-        if not any_hit:
-            return lanes._replace(distance=distance, face=face)
-        # The two arrays that change would each repeat the whole computation.
-        is_blocked = jax.lax.optimization_barrier(is_blocked)
-        return lanes._replace(
-            face=jnp.where(is_blocked, 0, lanes.face),
-            is_travelling=lanes.is_travelling & ~is_blocked,
-        )
+        # Each of the two arrays that change would repeat the whole computation.
+        if any_hit:
+            is_blocked = jax.lax.optimization_barrier(is_blocked)
+            return lanes._replace(
+                face=jnp.where(is_blocked, 0, lanes.face),
+                is_travelling=lanes.is_travelling & ~is_blocked,
+            )
+        hits = jax.lax.optimization_barrier(hits)
+        distance, face = lanes.distance, lanes.face
+        for i, at in enumerate(hits):
+            face = jnp.where(at < distance, 4 * patch + i, face)
+            distance = jnp.minimum(distance, at)
+        return lanes._replace(distance=distance, face=face)
 
 
 def _patches(surface: PatchMesh, grid: Grid) -> Float[Array, "Q 16"]:

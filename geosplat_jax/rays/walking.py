@@ -16,8 +16,9 @@ are passed without a test: the fast and usual choice for rays that leave the sur
 Self-intersection. A ray never hits the face it is said to start from, nor anything nearer than
 `T_MIN` cells.
 
-On a CPU, XLA runs a loop over many rays in lockstep. Rays therefore travel in chunks; whenever half
-of a chunk has finished, the others move together and the loop goes on with half as many lanes.
+On a CPU, XLA runs a loop over many rays in lockstep. Rays therefore wait in a queue, of which only
+as many travel as stay in the cache of a core; whenever half of these have finished, the others move
+together and the next of the queue take their places. Rays that the mask leaves out never travel.
 """
 
 import abc
@@ -42,10 +43,11 @@ SLACK = 1e-4
 WORD_BITS = 31
 """Bits of a cell's word: how many entries it lists, and which is the first."""
 
-_CHUNK = 8192
+_LANES = 8192
 """Rays that travel together: few enough to stay in the cache of a core."""
 
-_STAGES = 6
+_FEWEST_LANES = 256
+"""Fewer rays than this are not worth moving together."""
 
 _DOUBLINGS = 7
 """Doublings of an empty cube, so that three bits hold how often it was doubled: up to 128 cells."""
@@ -70,10 +72,14 @@ class Lanes(NamedTuple):
     word: Int[Array, " n"]
     tested: Int[Array, " n"]  # entries of the cell that have been tested
     source: Int[Array, " n"]
-    ray: Int[Array, " n"]
+    ray: Int[Array, " n"]  # its row in the results; one past the last for nobody
     is_travelling: Bool[Array, " n"]
     distance: Float[Array, " n"]  # of the nearest hit so far
     face: Int[Array, " n"]  # of that hit, or -1
+
+
+_Hits = tuple[Float[Array, " N"], Int[Array, " N"]]
+"""Distance in cells and face of what every ray hits first, of those that have finished."""
 
 
 class CellIndex(RayIndex):
@@ -381,32 +387,6 @@ def _halve(lanes: Lanes, nobody: int) -> Lanes:
     )
 
 
-def _trace_chunk(
-    index: CellIndex, lanes: Lanes, *, two_sided: bool, any_hit: bool
-) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
-    """Distance in cells and face of the hit of every lane."""
-    distance, face = lanes.distance, lanes.face
-
-    def step(lanes: Lanes) -> Lanes:
-        lanes = _advance(lanes, index, two_sided=two_sided)
-        return index.test(lanes, two_sided=two_sided, any_hit=any_hit)
-
-    for stage in range(_STAGES):
-        size = lanes.ray.shape[0]
-        limit = 0 if stage == _STAGES - 1 or size < 256 else size // 2
-
-        def goes_on(lanes: Lanes, limit: int = limit) -> Bool[Array, ""]:
-            return jnp.sum(lanes.is_travelling, dtype=jnp.int32) > limit
-
-        lanes = jax.lax.while_loop(goes_on, step, lanes)
-        distance = distance.at[lanes.ray].set(lanes.distance, mode="drop")
-        face = face.at[lanes.ray].set(lanes.face, mode="drop")
-        if limit == 0:
-            break
-        lanes = _halve(lanes, nobody=distance.shape[0])
-    return distance, face
-
-
 def trace(
     index: CellIndex,
     origins: Float[Array, "N 3"],
@@ -417,23 +397,51 @@ def trace(
     two_sided: bool,
     any_hit: bool,
 ) -> tuple[Float[Array, " N"], Int[Array, " N"]]:
-    """Trace chunk after chunk."""
-    count = origins.shape[0]
-    chunk = min(_CHUNK, max(256, -(-count // 256) * 256))
-    rows = -(-max(count, 1) // chunk)
-    grid = index.grid
-    local = (origins - grid.origin[None, :]) / grid.cell_size
+    """Trace the rays of the mask; return the distance and the face of the hit of every ray."""
+    nobody, grid = origins.shape[0], index.grid
+    if nobody == 0:
+        return jnp.zeros((0,), origins.dtype), jnp.zeros((0,), jnp.int32)
+    half = min(_LANES, max(_FEWEST_LANES, -(-nobody // _FEWEST_LANES) * _FEWEST_LANES)) // 2
+    rays = ((origins - grid.origin[None, :]) / grid.cell_size, directions, source)
+    is_waiting = bit_set(mask)
+    queue, total = jnp.pad(is_waiting.first(capacity=nobody), (0, half)), is_waiting.count
 
-    def chunks(values: Array) -> Array:
-        widths = ((0, rows * chunk - count),) + ((0, 0),) * (values.ndim - 1)
-        return jnp.pad(values, widths).reshape(rows, chunk, *values.shape[1:])
+    def next_ones(begin: Int[Array, ""]) -> Lanes:
+        rows = jax.lax.dynamic_slice(queue, (begin,), (half,))
+        is_real = begin + jnp.arange(half, dtype=jnp.int32) < total
+        parts = (values.at[rows].get(mode="promise_in_bounds") for values in rays)
+        lanes = _start(*parts, is_real, index=index, two_sided=two_sided)
+        return lanes._replace(ray=jnp.where(is_real, rows, nobody))
 
-    def one(parts: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
-        lanes = _start(*parts, index=index, two_sided=two_sided)
-        return _trace_chunk(index, lanes, two_sided=two_sided, any_hit=any_hit)
+    def step(lanes: Lanes) -> Lanes:
+        lanes = _advance(lanes, index, two_sided=two_sided)
+        return index.test(lanes, two_sided=two_sided, any_hit=any_hit)
 
-    parts = (chunks(local), chunks(directions), chunks(source), chunks(mask))
-    distance, face = (found.reshape(-1)[:count] for found in jax.lax.map(one, parts))
+    def travel(lanes: Lanes, found: _Hits, limit: int) -> tuple[Lanes, _Hits]:
+        """Go on while more than so many travel, and note what was hit."""
+
+        def goes_on(lanes: Lanes) -> Bool[Array, ""]:
+            return jnp.sum(lanes.is_travelling, dtype=jnp.int32) > limit
+
+        lanes = jax.lax.while_loop(goes_on, step, lanes)
+        distance, face = found
+        distance = distance.at[lanes.ray].set(lanes.distance, mode="drop")
+        return lanes, (distance, face.at[lanes.ray].set(lanes.face, mode="drop"))
+
+    def refill(state: tuple[Array, Lanes, _Hits]) -> tuple[Array, Lanes, _Hits]:
+        begin, lanes, found = state
+        lanes = jax.tree.map(lambda *x: jnp.concatenate(x), lanes, next_ones(begin))
+        lanes, found = travel(lanes, found, half)
+        return begin + half, _halve(lanes, nobody), found
+
+    found = (jnp.full((nobody,), jnp.inf, origins.dtype), jnp.full((nobody,), -1, jnp.int32))
+    state = (jnp.zeros((), jnp.int32), next_ones(total), found)
+    _, lanes, found = jax.lax.while_loop(lambda state: state[0] < total, refill, state)
+    while half > _FEWEST_LANES:
+        half //= 2
+        lanes, found = travel(lanes, found, half)
+        lanes = _halve(lanes, nobody)
+    distance, face = travel(lanes, found, 0)[1]
     return distance * grid.cell_size, face
 
 
