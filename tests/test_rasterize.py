@@ -17,7 +17,7 @@ from geosplat_jax.splats.rasterize import (
     gather_visible,
     rasterize,
 )
-from geosplat_jax.splats.tiles import _sort_hits, _stable_argsort
+from geosplat_jax.splats.tiles import MIN_ALPHA, _sort_hits, _stable_argsort
 
 ORACLES = Path(__file__).parents[2] / "shared" / "oracles"
 # float64; a few hundred products deep, the oracle's own rounding included.
@@ -476,3 +476,55 @@ def test_vmap_and_scan_over_views_equal_the_loop():
     expected = jnp.stack([one(view) for view in views])
     np.testing.assert_allclose(jax.lax.map(one, views), expected, atol=1e-5)
     np.testing.assert_allclose(jax.vmap(one)(views), expected, atol=1e-5)
+
+
+def test_tiles_list_the_splats_that_their_pixels_may_see_and_hardly_any_other():
+    """Thin ellipses above all: a box around one that runs across the image meets every tile."""
+    count, size, tile = 300, 96, 8
+    rng = np.random.default_rng(5)
+    long, thin = rng.uniform(2.0, 25.0, count), rng.uniform(0.3, 2.0, count)
+    angle = rng.uniform(0, np.pi, count)
+    axis = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    across = np.stack([-axis[:, 1], axis[:, 0]], axis=-1)
+    squares = long[:, None, None] ** 2 * axis[:, :, None] * axis[:, None, :]
+    covariance = squares + thin[:, None, None] ** 2 * across[:, :, None] * across[:, None, :]
+    conic = np.linalg.inv(covariance)
+    upper = (slice(None), [0, 0, 1], [0, 1, 1])
+    means = rng.uniform(-10, size + 10, (count, 2))
+    opacities = rng.uniform(0.01, 1.0, count)
+    splats = Footprints(
+        means2d=jnp.asarray(means, jnp.float32),
+        covariances2d=jnp.asarray(covariance[upper], jnp.float32),
+        conics=jnp.asarray(conic[upper], jnp.float32),
+        depths=jnp.asarray(rng.uniform(1, 2, count), jnp.float32),
+        compensation=jnp.ones(count),
+        is_in_front=jnp.ones(count, bool),
+    )
+    capacities = Capacities(visible=512, hits=16384, chunks=4096)
+    lists = find_visible(
+        splats,
+        jnp.asarray(opacities, jnp.float32),
+        jnp.ones(count, bool),
+        height=size,
+        width=size,
+        tile_size=tile,
+        capacities=capacities,
+    )
+    assert not overflowed(lists.usage, capacities)
+    index, ranks, tiles = (
+        np.asarray(x) for x in (lists.index, lists.chunk_ranks, lists.chunk_tiles)
+    )
+    slot, chunk = np.nonzero(ranks < capacities["visible"])
+    listed = np.zeros((count, (size // tile) ** 2), bool)
+    listed[index[ranks[slot, chunk]], tiles[chunk]] = True
+
+    x, y = np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5)
+    offset = np.stack([x, y], axis=-1)[None] - means[:, None, None]
+    sigma = 0.5 * np.einsum("nhwi,nij,nhwj->nhw", offset, conic, offset)
+    is_seen = opacities[:, None, None] * np.exp(-sigma) >= MIN_ALPHA
+    blocks = is_seen.reshape(count, size // tile, tile, size // tile, tile)
+    needed = blocks.any(axis=(2, 4)).reshape(count, -1)
+    assert not np.any(needed & ~listed)
+    # An ellipse may pass between the centres of pixels.
+    assert listed.sum() < 1.1 * needed.sum()
+    assert int(lists.usage["hits"]) > 1.3 * listed.sum()

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped, UInt
 
 from geosplat_jax.core.capacity import Capacities, Usage, compact, usage
-from geosplat_jax.core.numerics import safe_log, safe_sqrt
+from geosplat_jax.core.numerics import safe_divide, safe_log, safe_sqrt
 from geosplat_jax.splats.projection import Footprints
 
 MIN_ALPHA = 1.0 / 255.0
@@ -28,6 +28,9 @@ At most 12: the compositor relies on ``(1 - 0.999)**CHUNK_SIZE`` being a normal 
 
 _EXTENT_SLACK = 1e-4
 """Relative and absolute (pixels) enlargement of extents, so that rounding never loses a pixel."""
+
+_CANCELLATION = 2e-6
+"""Rounding of an exponent in float32, as a share of the terms that it is the sum of; generous."""
 
 _LARGEST_COUNT = 2**31 - 1
 
@@ -127,6 +130,39 @@ def _pixel_bounds(
     return first, jnp.clip(last, -1.0, sizes - 1.0).astype(jnp.int32)
 
 
+def _ellipses(splats: Footprints, opacities: Float[Array, " N"]) -> Float[Array, "N 6"]:
+    """Where alpha is at least 1/255: centre, conic, and the largest exponent, a little enlarged."""
+    reach = safe_log(opacities * splats.compensation / MIN_ALPHA)
+    reach = reach * (1.0 + _EXTENT_SLACK) + _EXTENT_SLACK
+    return jnp.concatenate([splats.means2d, splats.conics, reach[:, None]], axis=-1)
+
+
+def _meets_tile(
+    ellipses: Float[Array, "h 6"], tile_x: Int[Array, " h"], tile_y: Int[Array, " h"], size: int
+) -> Bool[Array, " h"]:
+    """Whether an ellipse meets the pixel centres' rectangle of a tile.
+
+    The exponent is least where the centre is, or on an edge of the rectangle that faces it.
+    """
+    x, y, xx, xy, yy, reach = ellipses.T
+
+    def span(middle: Float[Array, " h"], tile: Int[Array, " h"]) -> tuple[Array, Array, Array]:
+        low = (tile * size).astype(middle.dtype) + 0.5 - middle
+        high = low + (size - 1)
+        return low, high, jnp.clip(0.0, low, high)
+
+    (low_x, high_x, near_x), (low_y, high_y, near_y) = span(x, tile_x), span(y, tile_y)
+
+    def least(a: Array, b: Array) -> Array:
+        squares, product = 0.5 * (xx * a * a + yy * b * b), xy * a * b
+        # Of thin ellipses the two nearly cancel.
+        return squares + product - _CANCELLATION * (squares + jnp.abs(product))
+
+    along_y = jnp.clip(-xy * near_x * safe_divide(jnp.ones_like(yy), yy), low_y, high_y)
+    along_x = jnp.clip(-xy * near_y * safe_divide(jnp.ones_like(xx), xx), low_x, high_x)
+    return jnp.minimum(least(near_x, along_y), least(along_x, near_y)) <= reach
+
+
 def _runs(
     starts: Int[Array, " n"], counts: Int[Array, " n"], capacity: int
 ) -> Int[Array, " capacity"]:
@@ -196,7 +232,8 @@ def find_visible(
 
     Not differentiable: gradients of all inputs are stopped. A Gaussian is visible when it is
     eligible, in front of the near plane, and some pixel centre of the image lies in the bounding
-    box of the ellipse where its alpha is at least 1/255.
+    box of the ellipse where its alpha is at least 1/255. Tiles that meet the box and not the
+    ellipse count as ``hits``, and are in no chunk.
 
     Parameters
     ----------
@@ -230,7 +267,9 @@ def find_visible(
     within, hit_columns = hit - rows_of_hits[:, 0], jnp.maximum(rows_of_hits[:, 3], 1)
     tile_y = rows_of_hits[:, 2] + within // hit_columns
     tile_x = rows_of_hits[:, 1] + within % hit_columns
-    tiles = jnp.where(hit < hit_count, tile_y * columns + tile_x, rows * columns)
+    ellipses = gather_visible(index, _ellipses(splats, opacities))[ranks]
+    is_hit = (hit < hit_count) & _meets_tile(ellipses, tile_x, tile_y, tile_size)
+    tiles = jnp.where(is_hit, tile_y * columns + tile_x, rows * columns)
     tiles, ranks = _sort_hits(tiles, ranks, rows * columns, capacities["visible"])
     chunk_ranks, chunk_tiles, chunk_count = _chunk_lists(
         tiles, ranks, rows * columns, capacities["visible"], capacities["chunks"]
