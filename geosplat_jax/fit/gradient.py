@@ -52,7 +52,7 @@ class SideBySide(Runner):
 
     XLA divides the operations of a program among the cores of a CPU, but neither sorts nor loops,
     and rays travel in loops. So two programs that trace take less time side by side; two of others
-    take more (measured, docs/transport.md), and twice the memory.
+    take more (docs/transport.md). The temporaries of both are in memory at once.
     """
 
     def all(self, *calls: tuple[Any, ...]) -> list[Any]:
