@@ -263,7 +263,8 @@ def value_and_gradient(
     together = run.all if pipeline.uses_rays else partial(Runner.all, run)
     asset, pull_asset = run(_asset, pipeline, params, frozen)
     views = [run(_view, batch, jnp.int32(number)) for number in range(batch.count)]
-    lists = together(*((_lists, listing, asset, view) for view, _ in views))
+    # These sort, in every stage.
+    lists = run.all(*((_lists, listing, asset, view) for view, _ in views))
     seen = run(_seen, pipeline, asset, lists)
     lit = (pipeline, asset, params.light, seen, batch)
     (lights, carry, pull_lights), others = together((_lights, *lit), (_residual_lights, *lit))

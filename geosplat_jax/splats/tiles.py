@@ -29,6 +29,10 @@ At most 12: the compositor relies on ``(1 - 0.999)**CHUNK_SIZE`` being a normal 
 _EXTENT_SLACK = 1e-4
 """Relative and absolute (pixels) enlargement of extents, so that rounding never loses a pixel."""
 
+_DEPTH_BITS = 30
+_INFINITY = 0x7F800000
+"""Bit pattern of an infinite float32."""
+
 _CANCELLATION = 2e-6
 """Rounding of an exponent in float32, as a share of the terms that it is the sum of; generous."""
 
@@ -106,8 +110,11 @@ def _stable_argsort(keys: UInt[Array, " n"], key_bits: int) -> Int[Array, " n"]:
 def _depth_order(depths: Float[Array, " n"]) -> Int[Array, " n"]:
     """Stable order of positive depths (infinity on padding), nearest first."""
     if depths.dtype == jnp.float32:
-        # Positive IEEE floats order as their bit patterns do; the sign bit is zero.
-        return _stable_argsort(jax.lax.bitcast_convert_type(depths, jnp.uint32), 31)
+        # Positive IEEE floats order as their bit patterns do. Beginning with the nearest one, 30
+        # bits hold them up to a ratio of 2^128, and take one pass less than 31 of most views.
+        bits = jax.lax.bitcast_convert_type(depths, jnp.uint32)
+        keys = jnp.minimum(bits - jnp.min(bits, initial=_INFINITY), (1 << _DEPTH_BITS) - 1)
+        return _stable_argsort(keys.astype(jnp.uint32), _DEPTH_BITS)
     return jnp.argsort(depths, stable=True).astype(jnp.int32)
 
 
