@@ -256,6 +256,6 @@ def test_the_floor_of_the_light_is_a_projection_after_the_step_and_no_kink():
     )
     still = jax.tree.map(jnp.zeros_like, params)
     rates = dict.fromkeys(rate_groups(params), jnp.asarray(1.0))
-    rule = UpdateRule(rates, light_knee=jnp.asarray(0.0), smallest_light=jnp.asarray(0.01))
+    rule = UpdateRule(rates, jnp.asarray(0.0), jnp.asarray(0.0), jnp.asarray(0.01))
     moved = _moved(params, still, rule).light.radiance
     np.testing.assert_array_equal(moved, np.maximum(radiance - 0.5, 0.01))

@@ -26,8 +26,8 @@ def params():
 
 def rule(**changes):
     rates = {name: jnp.float32(0.01) for name in CONFIG.rate_groups}
-    knee, smallest = jnp.float32(0.0), jnp.float32(0.0)
-    return replace(UpdateRule(rates, knee, smallest), **changes)
+    knee, pyramid, smallest = jnp.float32(0.0), jnp.float32(0.0), jnp.float32(0.0)
+    return replace(UpdateRule(rates, knee, pyramid, smallest), **changes)
 
 
 def test_every_parameter_has_a_declared_rate(params):

@@ -90,6 +90,9 @@ class Stage:
     while a random first surface is rough; a visual hull needs none of it."""
     light_knee: NonNegative = 0.5
     """Radiance above which the light's steps grow with its brightness; 0 is never."""
+    light_pyramid: Annotated[float, Field(ge=0, le=1)] = 0.4
+    """Share of a step of the light that each level of its pyramid makes: regions then learn as one,
+    and single texels hold less noise. With 0 texels alone make steps."""
     transport: Annotated[TransportSettings, ANY_KIND] = SplitSumSettings()
     """How light arrives."""
     splats: Annotated[SplatSettings, ANY_KIND] = FaceSplatSettings()

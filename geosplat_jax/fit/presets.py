@@ -181,6 +181,7 @@ def _original_stages(
         batch_views=8,
         vertex_fraction=0.1,  # 5 % of the whole training
         light_knee=0.0,
+        light_pyramid=0.0,
         transport=SplitSumSettings(baked_diffuse=baked_diffuse),
         rates=_rates(
             1e-2,
@@ -198,6 +199,7 @@ def _original_stages(
         steps=500,
         batch_views=8,
         light_knee=0.0,
+        light_pyramid=0.0,
         transport=MonteCarloSettings(
             light_count=64, diffuse_count=32, specular_count=32, indirect=indirect
         ),
@@ -221,6 +223,7 @@ def _original_stages(
         steps=100,
         batch_views=8,
         light_knee=0.0,
+        light_pyramid=0.0,
         transport=MonteCarloSettings(
             light_count=256, diffuse_count=128, specular_count=128, indirect=indirect
         ),

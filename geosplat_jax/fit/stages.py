@@ -73,6 +73,7 @@ def update_rule(config: Config, stage: Stage, params: Params, step: int) -> Upda
     return UpdateRule(
         rates=_arrays(stage.rates_at(step)),
         light_knee=jnp.float32(stage.light_knee),
+        light_pyramid=jnp.float32(stage.light_pyramid),
         smallest_light=jnp.float32(config.run.smallest_light),
         frozen=stage.frozen,
     )

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from geosplat_jax.core import capacity as capacity_module
 from geosplat_jax.core.types import Batch, rate_groups
+from geosplat_jax.fit import pyramid
 from geosplat_jax.fit.gradient import IN_TURN, Runner, SharedBatch, value_and_gradient
 from geosplat_jax.pipeline import LossReport, Pipeline
 from geosplat_jax.render import Params
@@ -45,12 +46,15 @@ class UpdateRule(eqx.Module):
     ----------
     rates : learning rate of every group (see `core.types.learned`).
     light_knee : () radiance above which the light's steps grow with its brightness; 0 is never.
+    light_pyramid : () share of its step that every level of the light's pyramid makes, see
+        `pyramid.from_levels`.
     smallest_light : () texels are kept at or above this.
     frozen : static; groups that are not differentiated.
     """
 
     rates: dict[str, Float[Array, ""]]
     light_knee: Float[Array, ""]
+    light_pyramid: Float[Array, ""]
     smallest_light: Float[Array, ""]
     frozen: tuple[str, ...] = eqx.field(static=True, default=())
 
@@ -79,8 +83,9 @@ def initial_state(params: Params, *, step: int = 0, carry: Any = None) -> TrainS
     caller may hold the same arrays.
     """
     params = jax.tree.map(jnp.array, params)
-    tree: Any = params
-    return TrainState(params, ADAM.init(tree), jnp.asarray(step, jnp.int32), carry)
+    return TrainState(
+        params, ADAM.init(pyramid.to_levels(params)), jnp.asarray(step, jnp.int32), carry
+    )
 
 
 def with_geometry(optimizer: Any, change: Callable[[Any], Any]) -> Any:
@@ -128,9 +133,9 @@ def _update(
     """Move the parameters where everything fitted and is finite."""
     total, report = found
     with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integer powers
-        updates: Any = gradient
+        updates = pyramid.to_levels(gradient)
         directions, optimizer = ADAM.update(updates, state.optimizer)
-    moved: Any = directions
+    moved = pyramid.from_levels(directions, rule.light_pyramid)
     params = _moved(state.params, moved, rule)
     finite = jnp.isfinite(total) & jnp.all(
         jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient)])

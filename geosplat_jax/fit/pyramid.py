@@ -1,0 +1,82 @@
+"""The light learns in a pyramid: steps of whole regions beside those of single texels.
+
+Adam moves every texel of a light by its rate at most, whatever the gradient is. What all texels of
+a sky agree on is then learned no faster than the noise of a single one, and noise is all that
+texels have which no highlight looks at. With the light as a sum of levels of half the size each,
+and Adam on the numbers of every level, a region moves as one where its texels agree, and a texel
+alone by a part of the rate only.
+
+The sum is taken of the steps, so that parameters, checkpoints and exports hold texels as ever:
+`to_levels` turns the gradient in the texels into that in the levels, which is what the optimiser
+sees, and `from_levels` adds up its steps.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+_SMALLEST = 4
+"""Rows and columns of the coarsest level, at least."""
+
+_NEAR, _FAR = 0.75, 0.25
+"""Weights of linear interpolation at a quarter of the way between two texels."""
+
+
+def _doubled(values: Float[Array, "H W 3"]) -> Float[Array, "2*H 2*W 3"]:
+    """Interpolate linearly to twice the rows and columns; columns go around."""
+
+    def along(values: Array, before: Array, after: Array, axis: int) -> Array:
+        parts = (_NEAR * values + _FAR * before, _NEAR * values + _FAR * after)
+        shape = tuple(2 * n if k == axis else n for k, n in enumerate(values.shape))
+        return jnp.stack(parts, axis=axis + 1).reshape(shape)
+
+    above = jnp.concatenate([values[:1], values[:-1]])
+    below = jnp.concatenate([values[1:], values[-1:]])
+    values = along(values, above, below, 0)
+    return along(values, jnp.roll(values, 1, axis=1), jnp.roll(values, -1, axis=1), 1)
+
+
+def _levels(gradient: Float[Array, "H W 3"]) -> tuple[Float[Array, "h w 3"], ...]:
+    """Return the gradient in the numbers of every level, the texels first."""
+    levels = [gradient]
+    while min(shape := levels[-1].shape[:2]) >= 2 * _SMALLEST and not any(n % 2 for n in shape):
+        half = jnp.zeros((shape[0] // 2, shape[1] // 2, 3), gradient.dtype)
+        levels.append(jax.linear_transpose(_doubled, half)(levels[-1])[0])
+    return tuple(levels)
+
+
+def to_levels(gradient: Any) -> Any:
+    """Replace the gradient in the light's texels by that in all levels of its pyramid.
+
+    Parameters
+    ----------
+    gradient : of the parameters, or these themselves where only shapes matter.
+
+    Returns
+    -------
+    The same with ``light.radiance`` a tuple: (H, W, 3), (H / 2, W / 2, 3) and so on, while both
+    sizes are even and the smaller one is at least 4. A light of odd sizes has texels alone.
+    """
+    return eqx.tree_at(lambda tree: tree.light.radiance, gradient, _levels(gradient.light.radiance))
+
+
+def from_levels(steps: Any, share: Float[Array, ""]) -> Any:
+    """Add up the steps of the levels to one of the texels.
+
+    Parameters
+    ----------
+    steps : as `to_levels` returns them.
+    share : of its step that every level makes; 0 for the texels alone, with the whole of it.
+    """
+    texels, *coarser = steps.light.radiance
+    if coarser:
+        *between, total = coarser
+        for level in reversed(between):
+            total = _doubled(total) + level
+        texels = jnp.where(share > 0, share * (texels + _doubled(total)), texels)
+    return eqx.tree_at(
+        lambda tree: tree.light.radiance, steps, texels, is_leaf=lambda x: isinstance(x, tuple)
+    )
