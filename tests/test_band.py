@@ -16,6 +16,7 @@ from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.config import Rate
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.loop import new_loop, resumed_loop
+from geosplat_jax.fit.pyramid import to_levels
 from geosplat_jax.fit.step import StepReport
 from geosplat_jax.fit.train import fit
 from geosplat_jax.geometry import FlexiCubes, initial_geometry
@@ -313,7 +314,7 @@ def dataset():
 def grown(state):
     """Move the surface of a state outwards by a third of a cell, and fill what Adam keeps."""
     geometry = replace(state.params.geometry, sdf=state.params.geometry.sdf - 0.3)
-    moments = replace(state.params, geometry=numbered(geometry))
+    moments = to_levels(replace(state.params, geometry=numbered(geometry)))
     optimizer = state.optimizer._replace(mu=moments, nu=jax.tree.map(jnp.square, moments))
     return replace(
         state,

@@ -158,5 +158,6 @@ def test_a_step_that_overflows_or_is_not_finite_changes_nothing(params, broken):
 def test_a_frozen_group_gets_no_gradient_and_stays(params):
     state, _ = run_step(params, frozen=("light",))
     np.testing.assert_array_equal(state.params.light.radiance, params.light.radiance)
-    np.testing.assert_array_equal(state.optimizer.mu.light.radiance, 0.0)
+    for level in state.optimizer.mu.light.radiance:
+        np.testing.assert_array_equal(level, 0.0)
     assert float(state.params.log_exposure) > 0
