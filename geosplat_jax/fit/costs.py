@@ -3,7 +3,7 @@
 The model is a sum of terms, each a count of work times a constant that runs were fitted to
 (`experiments/studies/costs.py`, by optimistix). How fast this machine is, a kernel tells whose time
 is known. The constants explain idle runs of three objects to 8 % where the number of splats is
-known. Before a run it is not, and a prediction is good to a third; `budget.Pacer` measures
+known, 12 % since steps that trace rays became faster. Before a run it is not, and a prediction is good to a third; `budget.Pacer` measures
 while the training runs, and corrects.
 """
 
@@ -33,9 +33,9 @@ COST_NAMES = ("step", "splats", "rays", "views", "specular", "pixels")
 COST_SECONDS: Mapping[str, float] = {
     "step": 0.002,
     "splats": 0.114,
-    "rays": 0.04,
+    "rays": 0.024,
     "views": 0.043,
-    "specular": 0.054,
+    "specular": 0.032,
     "pixels": 0.035,
 }
 """Seconds of each unit of `work_of` on the reference machine."""
