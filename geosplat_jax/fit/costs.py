@@ -3,8 +3,8 @@
 The model is a sum of terms, each a count of work times a constant that runs were fitted to
 (`experiments/studies/costs.py`, by optimistix). How fast this machine is, a kernel tells whose time
 is known. The constants explain idle runs of three objects to 8 % where the number of splats is
-known, 12 % since steps that trace rays became faster. Before a run it is not, and a prediction is good to a third; `budget.Pacer` measures
-while the training runs, and corrects.
+known, 12 % since steps that trace rays became faster. Before a run it is not, and a prediction is
+good to a third; `budget.Pacer` measures while the training runs, and corrects.
 """
 
 import statistics
