@@ -18,6 +18,7 @@ import numpy as np
 
 from geosplat_jax.fit.config import Config, Stage
 from geosplat_jax.fit.planning import TrainingError
+from geosplat_jax.fit.pyramid import level_sizes
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.memory import Need, memory_refusal
 from geosplat_jax.materials import init_materials
@@ -43,12 +44,12 @@ def training_needs(config: Config, dataset: Dataset) -> list[Need]:
     pixels = train.height * train.width
     images = train.images.nbytes + test.images.nbytes
     views = max((min(stage.batch_views, len(train)) for stage in config.active_stages), default=0)
-    light = config.light.height * config.light.width * 3 * _FLOAT_BYTES
+    light = _light_numbers(config) * _FLOAT_BYTES
     return [
         Need("the photographs (--downscale)", images),
         Need("stages.*.batch_views", views * pixels * _PIXEL_BYTES),
         Need("geometry", _COPIES_LEARNED * config.geometry.parameter_bytes(dataset.bounds)),
-        Need("light", _COPIES_LEARNED * light + _transport_bytes(config)),
+        Need("light", light + _transport_bytes(config)),
         *(
             Need(need.what, _COPIES_LEARNED * need.byte_count)
             for need in _field_needs(config, config.active_stages)
@@ -145,6 +146,13 @@ def _field_needs(config: Config, stages: tuple[Stage, ...]) -> list[Need]:
         Need("material.grid", tables),
         Need("material.*_hidden", _byte_count(field) - tables),
     ]
+
+
+def _light_numbers(config: Config) -> int:
+    """Count a light's texels and their gradient, and the moments of the levels of its pyramid."""
+    height, width = config.light.height, config.light.width
+    levels = sum(rows * columns for rows, columns in level_sizes(height, width))
+    return 3 * (2 * height * width + 2 * levels)
 
 
 def _transport_bytes(config: Config) -> int:

@@ -39,11 +39,20 @@ def _doubled(values: Float[Array, "H W 3"]) -> Float[Array, "2*H 2*W 3"]:
     return along(values, jnp.roll(values, 1, axis=1), jnp.roll(values, -1, axis=1), 1)
 
 
+def level_sizes(height: int, width: int) -> list[tuple[int, int]]:
+    """Return rows and columns of the levels of a light, the texels first."""
+    sizes = [(height, width)]
+    while min(sizes[-1]) >= 2 * _SMALLEST and not any(n % 2 for n in sizes[-1]):
+        rows, columns = sizes[-1]
+        sizes.append((rows // 2, columns // 2))
+    return sizes
+
+
 def _levels(gradient: Float[Array, "H W 3"]) -> tuple[Float[Array, "h w 3"], ...]:
     """Return the gradient in the numbers of every level, the texels first."""
     levels = [gradient]
-    while min(shape := levels[-1].shape[:2]) >= 2 * _SMALLEST and not any(n % 2 for n in shape):
-        half = jnp.zeros((shape[0] // 2, shape[1] // 2, 3), gradient.dtype)
+    for rows, columns in level_sizes(*gradient.shape[:2])[1:]:
+        half = jnp.zeros((rows, columns, 3), gradient.dtype)
         levels.append(jax.linear_transpose(_doubled, half)(levels[-1])[0])
     return tuple(levels)
 
