@@ -402,15 +402,17 @@ def trace(
     if nobody == 0:
         return jnp.zeros((0,), origins.dtype), jnp.zeros((0,), jnp.int32)
     half = min(_LANES, max(_FEWEST_LANES, -(-nobody // _FEWEST_LANES) * _FEWEST_LANES)) // 2
-    rays = ((origins - grid.origin[None, :]) / grid.cell_size, directions, source)
+    local = (origins - grid.origin[None, :]) / grid.cell_size
     is_waiting = bit_set(mask)
     queue, total = jnp.pad(is_waiting.first(capacity=nobody), (0, half)), is_waiting.count
 
     def next_ones(begin: Int[Array, ""]) -> Lanes:
         rows = jax.lax.dynamic_slice(queue, (begin,), (half,))
         is_real = begin + jnp.arange(half, dtype=jnp.int32) < total
-        parts = (values.at[rows].get(mode="promise_in_bounds") for values in rays)
-        lanes = _start(*parts, is_real, index=index, two_sided=two_sided)
+        starts, ways, own = (
+            values.at[rows].get(mode="promise_in_bounds") for values in (local, directions, source)
+        )
+        lanes = _start(starts, ways, own, is_real, index=index, two_sided=two_sided)
         return lanes._replace(ray=jnp.where(is_real, rows, nobody))
 
     def step(lanes: Lanes) -> Lanes:
