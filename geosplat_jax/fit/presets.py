@@ -111,7 +111,7 @@ def _default() -> Config:
     )
     return Config(
         preset="default",
-        material=MaterialSpec(shared=True),
+        material=MaterialSpec(shared=True, bias=True),
         stages=(split_sum, monte_carlo, refine),
     )
 
