@@ -70,6 +70,8 @@ def test_presets_carry_the_numbers_of_the_paper_and_of_the_authors_code():
         assert not config.raster.cull_backfaces
         assert config.material.position_gradient
         assert not config.material.shared
+        assert not config.material.bias
+    assert all(make_config("default", quality).material.bias for quality in QUALITIES)
 
 
 @pytest.mark.parametrize("preset", ["paper", "code"])
