@@ -506,7 +506,10 @@ def test_the_bundled_sweeps_are_sound():
     assert stages["materials-at-once"].rates["albedo"].warmup == 0
     assert stages["albedo-kept"].enter == ()
     assert read_sweep(SWEEPS / "smoke.toml").scenes == ("duck",)
-    assert len(read_sweep(SWEEPS / "priors.toml").runs) == 18
+    priors = read_sweep(SWEEPS / "priors.toml")
+    assert len(priors.runs) == 19
+    biases = {run.name: priors.config(run).material.bias for run in priors.runs}
+    assert {name for name, bias in biases.items() if not bias} == {"no-biases"}
 
 
 def test_the_ablation_of_the_paper_changes_what_its_rows_say():
