@@ -70,6 +70,10 @@ class Objective:
     """Behind both images: one random colour per pixel (as the authors), one per view, or black."""
     srgb: bool = False
     """Compare encoded instead of linear colours."""
+    relative_albedo: bool = False
+    """Measure changes of the albedo against twice its mean (Eq. 15-17, and in the image). Absolute
+    changes are smaller on a dark surface in bright light than on a bright one in dim light, which
+    photographs hardly tell apart, and so draw the albedo into the dark (docs/quality.md)."""
 
 
 class Comparison(NamedTuple):
@@ -171,6 +175,7 @@ class SharedInputs:
             self.surface.box,
             spec=self.fields,
             std=objective.smoothness_radius,
+            relative=objective.relative_albedo,
         )
 
     @cached_property
@@ -351,9 +356,18 @@ def edge_aware_smoothness(
     values: Float[Array, "V H W c"],
     image: Float[Array, "V H W 4"],
     valid: Float[Array, "V H W"] | None = None,
+    *,
+    relative: bool = False,
 ) -> Float[Array, ""]:
-    """Differences of neighbouring pixels inside the mask, where the photograph has no edge."""
+    """Differences of neighbouring pixels inside the mask, where the photograph has no edge.
+
+    ``relative`` : whether differences are divided by twice the mean inside the mask.
+    """
     inside = image[..., 3] if valid is None else image[..., 3] * valid
+    if relative:
+        total = jnp.sum(inside[..., None] * values, axis=(0, 1, 2))
+        twice = 2.0 * safe_divide(total, jnp.sum(inside))
+        values = safe_divide(values, twice[None, None, None])
     terms = []
     for axis in (1, 2):
         ends = (slice(None),) * axis
@@ -382,7 +396,10 @@ VIEW_TERMS: dict[str, Callable[[ViewInputs], Float[Array, ""]]] = {
         x.output.aovs["normal"], x.view.image, x.view.valid
     ),
     "albedo_smoothness": lambda x: edge_aware_smoothness(
-        x.output.aovs["albedo"], x.view.image, x.view.valid
+        x.output.aovs["albedo"],
+        x.view.image,
+        x.view.valid,
+        relative=x.objective.relative_albedo,
     ),
 }
 """Terms of a single view by the name of their weight; the loss takes their mean over the views."""

@@ -284,6 +284,7 @@ def smoothness(
     *,
     spec: MaterialSpec,
     std: float | Float[Array, ""] = SMOOTHNESS_STD,
+    relative: bool = False,
 ) -> Changes:
     """Mean change of the attributes under a small random displacement (Eq. 15-17).
 
@@ -297,6 +298,8 @@ def smoothness(
     key : for the displacements.
     box, spec : see `attributes_at`.
     std : in units of half the box.
+    relative : whether the albedo's changes are divided by twice its mean over both sets of points,
+        channel by channel, so that a darker albedo under a brighter light is no smoother.
     """
     # Drawn in float32 at any precision, so that a run in float64 sees the same numbers.
     noise = jax.random.normal(key, points.shape, jnp.float32).astype(points.dtype)
@@ -308,8 +311,15 @@ def smoothness(
     def mean(change: Float[Array, " M"]) -> Float[Array, ""]:
         return safe_divide(jnp.sum(jnp.where(mask, change, 0.0)), total)
 
+    def albedo_change() -> Float[Array, ""]:
+        first, second = both.albedo[:half], both.albedo[half:]
+        change = jax.vmap(mean, in_axes=1)(absolute(first - second))
+        if relative:
+            change = safe_divide(change, jax.vmap(mean, in_axes=1)(first + second))
+        return jnp.sum(change)
+
     return Changes(  # Eq. 17
-        mean(jnp.sum(absolute(both.albedo[:half] - both.albedo[half:]), axis=-1)),
+        albedo_change(),
         mean(absolute(both.roughness[:half] - both.roughness[half:])),
         mean(absolute(both.metallic[:half] - both.metallic[half:])),
     )

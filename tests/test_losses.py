@@ -253,6 +253,25 @@ def test_normals_may_change_where_the_photograph_does():
     assert float(edge_aware_smoothness(normals, outside)) == 0.0
 
 
+def test_relative_smoothness_in_the_image_does_not_reward_darkness():
+    rng = np.random.default_rng(4)
+    albedo = jnp.asarray(rng.uniform(0.1, 0.9, (1, 5, 6, 3)), jnp.float32)
+    image = jnp.asarray(rng.uniform(0.0, 1.0, (1, 5, 6, 4)), jnp.float32)
+    mean = jnp.sum(albedo * image[..., 3:], axis=(0, 1, 2)) / jnp.sum(image[..., 3])
+    dark = albedo * jnp.array([0.5, 0.1, 0.8])[None, None, None]
+    bright, dimmed = (
+        float(edge_aware_smoothness(values, image, relative=True)) for values in (albedo, dark)
+    )
+    assert dimmed == pytest.approx(bright, rel=1e-5)
+    pull = jax.grad(lambda k: edge_aware_smoothness(k * albedo, image, relative=True))(1.0)
+    assert abs(float(pull)) < 1e-5 * bright
+    # With a mean of one half both forms agree.
+    half = albedo * (0.5 / mean)[None, None, None]
+    assert float(edge_aware_smoothness(half, image)) == pytest.approx(bright, rel=1e-5)
+    black = jnp.zeros_like(albedo)
+    assert float(edge_aware_smoothness(black, image, relative=True)) == 0.0
+
+
 @pytest.mark.parametrize(
     "wrong", [{"background": "blue"}, {"smoothness_samples": 0}, {"smoothness_radius": -1.0}]
 )

@@ -221,15 +221,57 @@ def test_smoothness_is_the_mean_of_the_absolute_changes_of_each_attribute():
         np.testing.assert_allclose(getattr(found, name), expected, rtol=ROUNDING)
 
 
-def test_smoothness_without_points_is_zero_with_zero_gradient():
+def test_relative_smoothness_does_not_reward_a_darker_albedo(monkeypatch):
+    """The absolute change halves with the albedo; the relative one stays, channel by channel."""
+    spec = spec_of()
+    field, points, key = lively(spec), points_in_the_box(), jax.random.key(2)
+    mask = jnp.arange(60) < 40
+    tint = jnp.ones(3)
+
+    def changes(relative):
+        return materials.smoothness(
+            field, points, mask, key, BOX, spec=spec, std=0.05, relative=relative
+        )
+
+    bright, relative = changes(False), changes(True)
+    whole = materials.materials_at
+
+    def tinted(*args, **settings):
+        found = whole(*args, **settings)
+        return replace(found, albedo=found.albedo * jnp.broadcast_to(tint, found.albedo.shape))
+
+    monkeypatch.setattr(materials, "materials_at", tinted)
+    tint = jnp.array([0.5, 0.25, 1.0])
+    assert float(changes(False).albedo) < 0.75 * float(bright.albedo)
+    np.testing.assert_allclose(changes(True).albedo, relative.albedo, rtol=ROUNDING)
+    np.testing.assert_allclose(changes(True).roughness, bright.roughness, rtol=ROUNDING)
+
+    def darkened(k):
+        nonlocal tint
+        tint = k * jnp.ones(3)
+        return changes(True).albedo
+
+    assert abs(float(jax.grad(darkened)(0.5))) < 1e-5 * float(relative.albedo)
+    here, there = (
+        np.asarray(whole(field, x, BOX, spec=spec).albedo)[:40]
+        for x in (points, points + 0.05 * BOX.half_extent * jax.random.normal(key, points.shape))
+    )
+    expected = np.abs(here - there).mean(axis=0) / (here + there).mean(axis=0)
+    np.testing.assert_allclose(relative.albedo, expected.sum(), rtol=ROUNDING)
+
+
+@pytest.mark.parametrize("relative", [False, True])
+def test_smoothness_without_points_is_zero_with_zero_gradient(relative):
     spec = spec_of(has_metallic=False)
     field, points = lively(spec), points_in_the_box()
 
     @jax.jit
     @jax.value_and_grad
     def total(field):
-        nothing = jnp.zeros(60, bool)
-        return sum(materials.smoothness(field, points, nothing, jax.random.key(0), BOX, spec=spec))
+        nothing, key = jnp.zeros(60, bool), jax.random.key(0)
+        return sum(
+            materials.smoothness(field, points, nothing, key, BOX, spec=spec, relative=relative)
+        )
 
     value, gradient = total(field)
     assert float(value) == 0.0

@@ -26,7 +26,7 @@ from geosplat_jax.fit.start_mesh import MeshSettings
 from geosplat_jax.fit.surfaces import FlexiCubesSettings
 from geosplat_jax.hashgrid import HashGridSpec
 from geosplat_jax.io.start_mesh import digest_of
-from geosplat_jax.losses import Schedule
+from geosplat_jax.losses import Objective, Schedule
 from geosplat_jax.materials import MATERIAL_PRIORS, MaterialSpec
 from geosplat_jax.refinement import FreeSplatSettings
 from geosplat_jax.render import RasterSettings
@@ -112,6 +112,7 @@ def _default() -> Config:
     return Config(
         preset="default",
         material=MaterialSpec(shared=True, bias=True),
+        objective=Objective(relative_albedo=True),
         stages=(split_sum, monte_carlo, refine),
     )
 

@@ -147,6 +147,9 @@ def loss_term_problems(rng: np.random.Generator) -> list[Problem]:
             "cast of the light": light_cast(inputs["radiance"]),
             "smoothness of the light": light_smoothness(inputs["radiance"]),
             "normal smoothness": edge_aware_smoothness(inputs["normals"], constants["image"]),
+            "relative smoothness": edge_aware_smoothness(
+                inputs["albedo"], constants["image"], relative=True
+            ),
         }
 
     def curves(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
@@ -170,11 +173,12 @@ def loss_term_problems(rng: np.random.Generator) -> list[Problem]:
             {"image": image},
         ),
         Problem(
-            "priors on light and normals",
+            "priors on light, normals and albedo",
             others,
             {
                 "radiance": rng.uniform(0, 1, (4, 8, 3)),
                 "normals": rng.uniform(-1, 1, (*shape, 3)),
+                "albedo": rng.uniform(0.1, 0.9, (*shape, 3)),
             },
             {"image": image},
         ),

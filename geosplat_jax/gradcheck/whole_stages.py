@@ -223,15 +223,23 @@ def smoothness_problems(rng: np.random.Generator) -> list[Problem]:
     def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
         dtype = inputs["points"].dtype
         albedo, surface = inputs["MLPs"]
-        changes = smoothness(
-            MaterialField(inputs["tables"], None, albedo, surface),
-            inputs["points"],
-            jnp.ones(inputs["points"].shape[:1], bool),
-            jax.random.key(1),
-            unit_box(dtype),
-            spec=spec,
-        )
-        return changes._asdict()
+        mask = jnp.ones(inputs["points"].shape[:1], bool)
+        found = {}
+        for relative in (False, True):
+            changes = smoothness(
+                MaterialField(inputs["tables"], None, albedo, surface),
+                inputs["points"],
+                mask,
+                jax.random.key(1),
+                unit_box(dtype),
+                spec=spec,
+                relative=relative,
+            )
+            found |= {
+                f"{name}, relative" if relative else name: change
+                for name, change in changes._asdict().items()
+            }
+        return found
 
     inputs = {
         "tables": params.albedo_table,
