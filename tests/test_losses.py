@@ -258,18 +258,24 @@ def test_relative_smoothness_in_the_image_does_not_reward_darkness():
     albedo = jnp.asarray(rng.uniform(0.1, 0.9, (1, 5, 6, 3)), jnp.float32)
     image = jnp.asarray(rng.uniform(0.0, 1.0, (1, 5, 6, 4)), jnp.float32)
     mean = jnp.sum(albedo * image[..., 3:], axis=(0, 1, 2)) / jnp.sum(image[..., 3])
-    dark = albedo * jnp.array([0.5, 0.1, 0.8])[None, None, None]
-    bright, dimmed = (
-        float(edge_aware_smoothness(values, image, relative=True)) for values in (albedo, dark)
-    )
-    assert dimmed == pytest.approx(bright, rel=1e-5)
-    pull = jax.grad(lambda k: edge_aware_smoothness(k * albedo, image, relative=True))(1.0)
-    assert abs(float(pull)) < 1e-5 * bright
-    # With a mean of one half both forms agree.
-    half = albedo * (0.5 / mean)[None, None, None]
-    assert float(edge_aware_smoothness(half, image)) == pytest.approx(bright, rel=1e-5)
-    black = jnp.zeros_like(albedo)
-    assert float(edge_aware_smoothness(black, image, relative=True)) == 0.0
+
+    def smoothness(factors, relative):
+        values = albedo * factors[None, None, None]
+        return edge_aware_smoothness(values, image, relative=relative)
+
+    for factors in (jnp.ones(3), jnp.array([0.5, 0.1, 0.8])):
+        against = 4 * factors * mean * (1 - factors * mean)
+        expected = float(smoothness(factors / against, False))
+        assert float(smoothness(factors, True)) == pytest.approx(expected, rel=1e-5)
+
+    def pull(relative):
+        dark = 0.05 * jnp.ones(3)
+        value, slope = jax.value_and_grad(smoothness)(dark, relative)
+        return float(jnp.sum(dark * slope) / value)
+
+    assert pull(False) == pytest.approx(1.0, rel=1e-4)
+    assert 0.0 < pull(True) < 0.05
+    assert float(smoothness(jnp.zeros(3), True)) == 0.0
 
 
 @pytest.mark.parametrize(

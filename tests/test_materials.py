@@ -222,42 +222,44 @@ def test_smoothness_is_the_mean_of_the_absolute_changes_of_each_attribute():
 
 
 def test_relative_smoothness_does_not_reward_a_darker_albedo(monkeypatch):
-    """The absolute change halves with the albedo; the relative one stays, channel by channel."""
+    """Half the albedo changes half as much, which is nearly as much against its contrast."""
     spec = spec_of()
     field, points, key = lively(spec), points_in_the_box(), jax.random.key(2)
     mask = jnp.arange(60) < 40
-    tint = jnp.ones(3)
+    brightness = 1.0
 
-    def changes(relative):
+    def changes(relative, factor):
+        nonlocal brightness
+        brightness = factor
         return materials.smoothness(
             field, points, mask, key, BOX, spec=spec, std=0.05, relative=relative
         )
 
-    bright, relative = changes(False), changes(True)
     whole = materials.materials_at
 
-    def tinted(*args, **settings):
+    def scaled(*args, **settings):
         found = whole(*args, **settings)
-        return replace(found, albedo=found.albedo * jnp.broadcast_to(tint, found.albedo.shape))
+        return replace(found, albedo=brightness * found.albedo)
 
-    monkeypatch.setattr(materials, "materials_at", tinted)
-    tint = jnp.array([0.5, 0.25, 1.0])
-    assert float(changes(False).albedo) < 0.75 * float(bright.albedo)
-    np.testing.assert_allclose(changes(True).albedo, relative.albedo, rtol=ROUNDING)
-    np.testing.assert_allclose(changes(True).roughness, bright.roughness, rtol=ROUNDING)
+    monkeypatch.setattr(materials, "materials_at", scaled)
+    moved = points + 0.05 * BOX.half_extent * jax.random.normal(key, points.shape)
+    here, there = (np.asarray(whole(field, x, BOX, spec=spec).albedo)[:40] for x in (points, moved))
+    for factor in (1.0, 0.5, 0.02):
+        change = factor * np.abs(here - there).mean(axis=0)
+        mean = 0.5 * factor * (here + there).mean(axis=0)
+        found = changes(True, factor)
+        expected = np.sum(change / (4 * mean * (1 - mean)))
+        np.testing.assert_allclose(found.albedo, expected, rtol=1e-5)
+        np.testing.assert_allclose(found.roughness, changes(False, 1.0).roughness, rtol=ROUNDING)
 
-    def darkened(k):
-        nonlocal tint
-        tint = k * jnp.ones(3)
-        return changes(True).albedo
+    def pull(relative, factor):
+        value, slope = jax.value_and_grad(lambda k: changes(relative, k).albedo)(factor)
+        return float(factor * slope / value)  # by how many per cent it grows, for one of brightness
 
-    assert abs(float(jax.grad(darkened)(0.5))) < 1e-5 * float(relative.albedo)
-    here, there = (
-        np.asarray(whole(field, x, BOX, spec=spec).albedo)[:40]
-        for x in (points, points + 0.05 * BOX.half_extent * jax.random.normal(key, points.shape))
-    )
-    expected = np.abs(here - there).mean(axis=0) / (here + there).mean(axis=0)
-    np.testing.assert_allclose(relative.albedo, expected.sum(), rtol=ROUNDING)
+    assert pull(False, 0.1) == pytest.approx(1.0, rel=1e-4)
+    assert 0.0 < pull(True, 0.1) < 0.1
+    # Nor is there a reward for an albedo near one, where the field is flat.
+    assert pull(True, 1.5) > 1.0
 
 
 @pytest.mark.parametrize("relative", [False, True])
