@@ -224,10 +224,10 @@ def smoothness_problems(rng: np.random.Generator) -> list[Problem]:
         dtype = inputs["points"].dtype
         albedo, surface = inputs["MLPs"]
         mask = jnp.ones(inputs["points"].shape[:1], bool)
-        found = {}
-        for relative in (False, True):
-            changes = smoothness(
-                MaterialField(inputs["tables"], None, albedo, surface),
+        field = MaterialField(inputs["tables"], None, albedo, surface)
+        absolute, relative = (
+            smoothness(
+                field,
                 inputs["points"],
                 mask,
                 jax.random.key(1),
@@ -235,11 +235,9 @@ def smoothness_problems(rng: np.random.Generator) -> list[Problem]:
                 spec=spec,
                 relative=relative,
             )
-            found |= {
-                f"{name}, relative" if relative else name: change
-                for name, change in changes._asdict().items()
-            }
-        return found
+            for relative in (False, True)
+        )
+        return {**absolute._asdict(), "relative albedo": relative.albedo}
 
     inputs = {
         "tables": params.albedo_table,
