@@ -23,7 +23,7 @@ from geosplat_jax.core.numerics import absolute, safe_divide, safe_log
 from geosplat_jax.core.settings import NonNegative, PositiveCount, PositiveShare, settings
 from geosplat_jax.core.ssim import ssim
 from geosplat_jax.core.types import Batch
-from geosplat_jax.materials import SMOOTHNESS_STD, Changes, MaterialSpec, contrast, smoothness
+from geosplat_jax.materials import SMOOTHNESS_STD, Changes, MaterialSpec, smoothness
 from geosplat_jax.render import Asset, Params, RenderOutput
 from geosplat_jax.surface.base import SurfaceModel
 from geosplat_jax.transport.base import Illumination, Transport
@@ -71,9 +71,9 @@ class Objective:
     srgb: bool = False
     """Compare encoded instead of linear colours."""
     relative_albedo: bool = False
-    """Measure changes of the albedo against ``4 m (1 - m)`` of its mean m (Eq. 15-17, and in the
-    image). Absolute changes are smaller on a dark surface in bright light than on a bright one in
-    dim light, which photographs hardly tell apart, and so draw the albedo into the dark."""
+    """Measure changes of the albedo against twice its mean (Eq. 15-17, and in the image). Absolute
+    changes are smaller on a dark surface in bright light than on a bright one in dim light, which
+    photographs hardly tell apart, and so draw the albedo into the dark."""
 
 
 class Comparison(NamedTuple):
@@ -361,14 +361,14 @@ def edge_aware_smoothness(
 ) -> Float[Array, ""]:
     """Differences of neighbouring pixels inside the mask, where the photograph has no edge.
 
-    ``relative`` : whether differences are divided by the `materials.contrast` of the mean inside
-    the mask, channel by channel.
+    ``relative`` : whether differences are divided by twice the mean inside the mask, channel by
+    channel.
     """
     inside = image[..., 3] if valid is None else image[..., 3] * valid
     if relative:
         total = jnp.sum(inside[..., None] * values, axis=(0, 1, 2))
-        against = contrast(safe_divide(total, jnp.sum(inside)))
-        values = safe_divide(values, against[None, None, None])
+        twice = 2.0 * safe_divide(total, jnp.sum(inside))
+        values = safe_divide(values, twice[None, None, None])
     terms = []
     for axis in (1, 2):
         ends = (slice(None),) * axis

@@ -267,16 +267,6 @@ def materials_at(
     return attributes_at(field, points, box, spec=spec).materials
 
 
-def contrast(mean: Float[Array, "*c"]) -> Float[Array, "*c"]:
-    """Return what changes of an albedo are measured against, ``4 m (1 - m)`` of its mean m.
-
-    It is 1 for a mean of one half. For a dark albedo it is proportional to the mean, so that one
-    and the same picture of a darker surface in a brighter light is not smoother; towards 1, where
-    the sigmoid of the field flattens changes, it falls again.
-    """
-    return 4.0 * mean * (1.0 - mean)
-
-
 class Changes(NamedTuple):
     """Mean absolute change of each attribute under a displacement, summed over its channels."""
 
@@ -308,8 +298,8 @@ def smoothness(
     key : for the displacements.
     box, spec : see `attributes_at`.
     std : in units of half the box.
-    relative : whether the albedo's changes are divided by the `contrast` of its mean over both sets
-        of points, channel by channel, so that an albedo is no smoother for being dark or bright.
+    relative : whether the albedo's changes are divided by twice its mean over both sets of points,
+        channel by channel, so that a darker albedo in a brighter light is no smoother.
     """
     # Drawn in float32 at any precision, so that a run in float64 sees the same numbers.
     noise = jax.random.normal(key, points.shape, jnp.float32).astype(points.dtype)
@@ -325,7 +315,7 @@ def smoothness(
         first, second = both.albedo[:half], both.albedo[half:]
         change = jax.vmap(mean, in_axes=1)(absolute(first - second))
         if relative:
-            change = safe_divide(change, contrast(0.5 * jax.vmap(mean, in_axes=1)(first + second)))
+            change = safe_divide(change, jax.vmap(mean, in_axes=1)(first + second))
         return jnp.sum(change)
 
     return Changes(  # Eq. 17

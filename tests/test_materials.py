@@ -222,7 +222,7 @@ def test_smoothness_is_the_mean_of_the_absolute_changes_of_each_attribute():
 
 
 def test_relative_smoothness_does_not_reward_a_darker_albedo(monkeypatch):
-    """Half the albedo changes half as much, which is nearly as much against its contrast."""
+    """Half the albedo changes half as much, which against its mean is as much."""
     spec = spec_of()
     field, points, key = lively(spec), points_in_the_box(), jax.random.key(2)
     mask = jnp.arange(60) < 40
@@ -248,18 +248,15 @@ def test_relative_smoothness_does_not_reward_a_darker_albedo(monkeypatch):
         change = factor * np.abs(here - there).mean(axis=0)
         mean = 0.5 * factor * (here + there).mean(axis=0)
         found = changes(True, factor)
-        expected = np.sum(change / (4 * mean * (1 - mean)))
-        np.testing.assert_allclose(found.albedo, expected, rtol=1e-5)
+        np.testing.assert_allclose(found.albedo, np.sum(change / (2 * mean)), rtol=1e-5)
         np.testing.assert_allclose(found.roughness, changes(False, 1.0).roughness, rtol=ROUNDING)
 
     def pull(relative, factor):
         value, slope = jax.value_and_grad(lambda k: changes(relative, k).albedo)(factor)
         return float(factor * slope / value)  # by how many per cent it grows, for one of brightness
 
-    assert pull(False, 0.1) == pytest.approx(1.0, rel=1e-4)
-    assert 0.0 < pull(True, 0.1) < 0.1
-    # Nor is there a reward for an albedo near one, where the field is flat.
-    assert pull(True, 1.5) > 1.0
+    assert pull(False, 0.5) == pytest.approx(1.0, rel=1e-4)
+    assert abs(pull(True, 0.5)) < 1e-4
 
 
 @pytest.mark.parametrize("relative", [False, True])
