@@ -507,9 +507,11 @@ def test_the_bundled_sweeps_are_sound():
     assert stages["albedo-kept"].enter == ()
     assert read_sweep(SWEEPS / "smoke.toml").scenes == ("duck",)
     priors = read_sweep(SWEEPS / "priors.toml")
-    assert len(priors.runs) == 19
-    biases = {run.name: priors.config(run).material.bias for run in priors.runs}
-    assert {name for name, bias in biases.items() if not bias} == {"no-biases"}
+    assert len(priors.runs) == 20
+    configs = {run.name: priors.config(run) for run in priors.runs}
+    assert [name for name, config in configs.items() if not config.material.bias] == ["no-biases"]
+    absolute = [n for n, config in configs.items() if not config.objective.relative_albedo]
+    assert absolute == ["absolute-albedo"]
 
 
 def test_the_ablation_of_the_paper_changes_what_its_rows_say():
