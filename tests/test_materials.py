@@ -253,7 +253,7 @@ def test_relative_smoothness_does_not_reward_a_darker_albedo(monkeypatch):
 
     def pull(relative, factor):
         value, slope = jax.value_and_grad(lambda k: changes(relative, k).albedo)(factor)
-        return float(factor * slope / value)  # by how many per cent it grows, for one of brightness
+        return float(factor * slope / value)  # d log(change) / d log(brightness)
 
     assert pull(False, 0.5) == pytest.approx(1.0, rel=1e-4)
     assert abs(pull(True, 0.5)) < 1e-4
