@@ -19,8 +19,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from geosplat_jax.core.color import linear_to_srgb, tone_map
-from geosplat_jax.core.numerics import absolute, safe_divide, safe_log
-from geosplat_jax.core.settings import NonNegative, PositiveCount, PositiveShare, settings
+from geosplat_jax.core.numerics import absolute, safe_divide, safe_log, safe_power
+from geosplat_jax.core.settings import (
+    NonNegative,
+    PositiveCount,
+    PositiveShare,
+    Share,
+    settings,
+)
 from geosplat_jax.core.ssim import ssim
 from geosplat_jax.core.types import Batch
 from geosplat_jax.materials import SMOOTHNESS_STD, Changes, MaterialSpec, smoothness
@@ -70,10 +76,11 @@ class Objective:
     """Behind both images: one random colour per pixel (as the authors), one per view, or black."""
     srgb: bool = False
     """Compare encoded instead of linear colours."""
-    relative_albedo: bool = False
-    """Measure changes of the albedo against twice its mean (Eq. 15-17, and in the image). Absolute
-    changes are smaller on a dark surface in bright light than on a bright one in dim light, which
-    photographs hardly tell apart, and so draw the albedo into the dark."""
+    relative_albedo: Share = 0.0
+    """Power of twice the albedo's mean by which its changes are divided (Eq. 15-17, and in the
+    image): 0 leaves them absolute, 1 makes them relative. Absolute changes are smaller on a dark
+    surface in bright light than on a bright one in dim light, which photographs hardly tell apart,
+    and so draw the albedo into the dark; relative ones leave it to drift to either side."""
 
 
 class Comparison(NamedTuple):
@@ -357,18 +364,17 @@ def edge_aware_smoothness(
     image: Float[Array, "V H W 4"],
     valid: Float[Array, "V H W"] | None = None,
     *,
-    relative: bool = False,
+    relative: float = 0.0,
 ) -> Float[Array, ""]:
     """Differences of neighbouring pixels inside the mask, where the photograph has no edge.
 
-    ``relative`` : whether differences are divided by twice the mean inside the mask, channel by
-    channel.
+    ``relative`` : power of twice the mean inside the mask by which differences are divided, channel
+    by channel: 0 leaves them absolute, 1 makes them independent of brightness.
     """
     inside = image[..., 3] if valid is None else image[..., 3] * valid
-    if relative:
-        total = jnp.sum(inside[..., None] * values, axis=(0, 1, 2))
-        twice = 2.0 * safe_divide(total, jnp.sum(inside))
-        values = safe_divide(values, twice[None, None, None])
+    total = jnp.sum(inside[..., None] * values, axis=(0, 1, 2))
+    twice = 2.0 * safe_divide(total, jnp.sum(inside))
+    values = safe_divide(values, safe_power(twice, relative)[None, None, None])
     terms = []
     for axis in (1, 2):
         ends = (slice(None),) * axis

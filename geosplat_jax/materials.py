@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 from pydantic import Field
 
-from geosplat_jax.core.numerics import absolute, safe_divide
+from geosplat_jax.core.numerics import absolute, safe_divide, safe_power
 from geosplat_jax.core.settings import Number, settings
 from geosplat_jax.core.types import Box, Materials, learned
 from geosplat_jax.hashgrid import (
@@ -284,7 +284,7 @@ def smoothness(
     *,
     spec: MaterialSpec,
     std: float | Float[Array, ""] = SMOOTHNESS_STD,
-    relative: bool = False,
+    relative: float = 0.0,
 ) -> Changes:
     """Mean change of the attributes under a small random displacement (Eq. 15-17).
 
@@ -298,8 +298,9 @@ def smoothness(
     key : for the displacements.
     box, spec : see `attributes_at`.
     std : in units of half the box.
-    relative : whether the albedo's changes are divided by twice its mean over both sets of points,
-        channel by channel, so that a darker albedo in a brighter light is no smoother.
+    relative : power of twice the albedo's mean over both sets of points by which its changes are
+        divided, channel by channel: with 0 they are those of Eq. 17, with 1 a darker albedo in a
+        brighter light is no smoother.
     """
     # Drawn in float32 at any precision, so that a run in float64 sees the same numbers.
     noise = jax.random.normal(key, points.shape, jnp.float32).astype(points.dtype)
@@ -314,9 +315,8 @@ def smoothness(
     def albedo_change() -> Float[Array, ""]:
         first, second = both.albedo[:half], both.albedo[half:]
         change = jax.vmap(mean, in_axes=1)(absolute(first - second))
-        if relative:
-            change = safe_divide(change, jax.vmap(mean, in_axes=1)(first + second))
-        return jnp.sum(change)
+        twice = jax.vmap(mean, in_axes=1)(first + second)
+        return jnp.sum(safe_divide(change, safe_power(twice, relative)))
 
     return Changes(  # Eq. 17
         albedo_change(),

@@ -71,11 +71,11 @@ def test_presets_carry_the_numbers_of_the_paper_and_of_the_authors_code():
         assert config.material.position_gradient
         assert not config.material.shared
         assert not config.material.bias
-        assert not config.objective.relative_albedo
+        assert config.objective.relative_albedo == 0
     for quality in QUALITIES:
         config = make_config("default", quality)
         assert config.material.bias
-        assert config.objective.relative_albedo
+        assert config.objective.relative_albedo == 0.5
 
 
 @pytest.mark.parametrize("preset", ["paper", "code"])

@@ -253,7 +253,8 @@ def test_normals_may_change_where_the_photograph_does():
     assert float(edge_aware_smoothness(normals, outside)) == 0.0
 
 
-def test_relative_smoothness_in_the_image_does_not_reward_darkness():
+@pytest.mark.parametrize("power", [0.5, 1.0])
+def test_relative_smoothness_in_the_image_does_not_reward_darkness(power):
     rng = np.random.default_rng(4)
     albedo = jnp.asarray(rng.uniform(0.1, 0.9, (1, 5, 6, 3)), jnp.float32)
     image = jnp.asarray(rng.uniform(0.0, 1.0, (1, 5, 6, 4)), jnp.float32)
@@ -264,17 +265,17 @@ def test_relative_smoothness_in_the_image_does_not_reward_darkness():
         return edge_aware_smoothness(values, image, relative=relative)
 
     for factors in (jnp.ones(3), jnp.array([0.5, 0.1, 0.8])):
-        expected = float(smoothness(0.5 / mean, False))
-        assert float(smoothness(factors, True)) == pytest.approx(expected, rel=1e-5)
+        expected = float(smoothness(factors * (2 * factors * mean) ** -power, 0.0))
+        assert float(smoothness(factors, power)) == pytest.approx(expected, rel=1e-5)
 
     def pull(relative):
         dark = 0.5 * jnp.ones(3)
         value, slope = jax.value_and_grad(smoothness)(dark, relative)
         return float(jnp.sum(dark * slope) / value)
 
-    assert pull(False) == pytest.approx(1.0, rel=1e-4)
-    assert abs(pull(True)) < 1e-4
-    assert float(smoothness(jnp.zeros(3), True)) == 0.0
+    assert pull(0.0) == pytest.approx(1.0, rel=1e-4)
+    assert pull(power) == pytest.approx(1.0 - power, abs=1e-4)
+    assert float(smoothness(jnp.zeros(3), power)) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -221,7 +221,8 @@ def test_smoothness_is_the_mean_of_the_absolute_changes_of_each_attribute():
         np.testing.assert_allclose(getattr(found, name), expected, rtol=ROUNDING)
 
 
-def test_relative_smoothness_does_not_reward_a_darker_albedo(monkeypatch):
+@pytest.mark.parametrize("power", [0.5, 1.0])
+def test_relative_smoothness_does_not_reward_a_darker_albedo(monkeypatch, power):
     """Half the albedo changes half as much, which against its mean is as much."""
     spec = spec_of()
     field, points, key = lively(spec), points_in_the_box(), jax.random.key(2)
@@ -247,19 +248,19 @@ def test_relative_smoothness_does_not_reward_a_darker_albedo(monkeypatch):
     for factor in (1.0, 0.5, 0.02):
         change = factor * np.abs(here - there).mean(axis=0)
         mean = 0.5 * factor * (here + there).mean(axis=0)
-        found = changes(True, factor)
-        np.testing.assert_allclose(found.albedo, np.sum(change / (2 * mean)), rtol=1e-5)
-        np.testing.assert_allclose(found.roughness, changes(False, 1.0).roughness, rtol=ROUNDING)
+        found = changes(power, factor)
+        np.testing.assert_allclose(found.albedo, np.sum(change / (2 * mean) ** power), rtol=1e-5)
+        np.testing.assert_allclose(found.roughness, changes(0.0, 1.0).roughness, rtol=ROUNDING)
 
     def pull(relative, factor):
         value, slope = jax.value_and_grad(lambda k: changes(relative, k).albedo)(factor)
         return float(factor * slope / value)  # d log(change) / d log(brightness)
 
-    assert pull(False, 0.5) == pytest.approx(1.0, rel=1e-4)
-    assert abs(pull(True, 0.5)) < 1e-4
+    assert pull(0.0, 0.5) == pytest.approx(1.0, rel=1e-4)
+    assert pull(power, 0.5) == pytest.approx(1.0 - power, abs=1e-4)
 
 
-@pytest.mark.parametrize("relative", [False, True])
+@pytest.mark.parametrize("relative", [0.0, 0.5, 1.0])
 def test_smoothness_without_points_is_zero_with_zero_gradient(relative):
     spec = spec_of(has_metallic=False)
     field, points = lively(spec), points_in_the_box()

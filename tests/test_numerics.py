@@ -1,5 +1,7 @@
 """Safe functions: right over 40 decades, finite at the edges, rows independent of one another."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +17,7 @@ from geosplat_jax.core.numerics import (
     safe_log,
     safe_norm,
     safe_normalize,
+    safe_power,
     safe_sqrt,
 )
 
@@ -111,6 +114,17 @@ def test_square_root_is_exact_and_flat_below_zero():
     np.testing.assert_allclose(gradient, [0, 0, 5e17, 0.25, 5e-19], rtol=RELATIVE)
 
 
+@pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0])
+def test_power_is_exact_and_flat_below_zero(exponent):
+    x = jnp.asarray([-1.0, 0.0, 1e-30, 4.0, 1e30], jnp.float32)
+    positive, counts = np.maximum(np.asarray(x, np.float64), 0.0), np.asarray(x) > 0
+    expected = np.ones(5) if exponent == 0 else positive**exponent
+    np.testing.assert_allclose(safe_power(x, exponent), expected, rtol=RELATIVE)
+    slopes = np.where(counts, exponent * np.where(counts, positive, 1.0) ** (exponent - 1), 0.0)
+    gradient = jax.grad(lambda v: jnp.sum(safe_power(v, exponent)))(x)
+    np.testing.assert_allclose(gradient, slopes, rtol=RELATIVE)
+
+
 def test_logarithm_is_exact_above_its_floor_and_flat_below():
     x = jnp.asarray([-1.0, 0.0, 1e-10, 1.0, 1e30], jnp.float32)
     floor = np.log(LENGTH_EPSILON)
@@ -128,7 +142,7 @@ def test_clamp_away_from_zero_keeps_the_sign_and_large_values():
     np.testing.assert_array_equal(gradient, [1, 0, 0, 0, 1])
 
 
-@pytest.mark.parametrize("function", [safe_sqrt, safe_log])
+@pytest.mark.parametrize("function", [safe_sqrt, safe_log, partial(safe_power, exponent=0.5)])
 def test_scalar_functions_are_finite_on_every_magnitude(function):
     x = jnp.asarray(EXTREMES, jnp.float32)
     assert np.all(np.isfinite(function(x)))
@@ -140,7 +154,7 @@ def test_precision_in_is_precision_out():
         for dtype in (jnp.float32, jnp.float64):
             x = jnp.ones((2, 3), dtype)
             results = [safe_norm(x), safe_normalize(x), safe_sqrt(x), safe_log(x)]
-            results += [safe_divide(x, x), clamp_away_from_zero(x, 0.1)]
+            results += [safe_power(x, 0.5), safe_divide(x, x), clamp_away_from_zero(x, 0.1)]
             assert all(result.dtype == dtype for result in results)
             assert jax.grad(lambda v: jnp.sum(safe_normalize(v)))(x).dtype == dtype
 

@@ -507,11 +507,12 @@ def test_the_bundled_sweeps_are_sound():
     assert stages["albedo-kept"].enter == ()
     assert read_sweep(SWEEPS / "smoke.toml").scenes == ("duck",)
     priors = read_sweep(SWEEPS / "priors.toml")
-    assert len(priors.runs) == 20
+    assert len(priors.runs) == 21
     configs = {run.name: priors.config(run) for run in priors.runs}
     assert [name for name, config in configs.items() if not config.material.bias] == ["no-biases"]
-    absolute = [n for n, config in configs.items() if not config.objective.relative_albedo]
-    assert absolute == ["absolute-albedo"]
+    powers = {n: config.objective.relative_albedo for n, config in configs.items()}
+    others = {name: power for name, power in powers.items() if power != 0.5}
+    assert others == {"absolute-albedo": 0, "relative-albedo": 1}
 
 
 def test_the_ablation_of_the_paper_changes_what_its_rows_say():

@@ -70,6 +70,17 @@ def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
+def safe_power(x: Float[Array, "..."], exponent: float) -> Float[Array, "..."]:
+    """Power of the positive part; where ``x <= 0`` its gradient is zero, and it is zero.
+
+    With an exponent of 0 it is one everywhere, with one of 1 the positive part, both exactly.
+    """
+    if exponent == 0.0:
+        return jnp.ones_like(x)
+    positive = x > 0
+    return jnp.where(positive, jnp.where(positive, x, 1.0) ** exponent, 0.0)
+
+
 def safe_log(x: Float[Array, "..."], *, smallest: float = LENGTH_EPSILON) -> Float[Array, "..."]:
     """Logarithm of ``max(x, smallest)``; the gradient is zero where the floor is active."""
     above = x > smallest

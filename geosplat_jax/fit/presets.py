@@ -112,7 +112,7 @@ def _default() -> Config:
     return Config(
         preset="default",
         material=MaterialSpec(shared=True, bias=True),
-        objective=Objective(relative_albedo=True),
+        objective=Objective(relative_albedo=0.5),
         stages=(split_sum, monte_carlo, refine),
     )
 

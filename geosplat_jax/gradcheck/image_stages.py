@@ -148,7 +148,7 @@ def loss_term_problems(rng: np.random.Generator) -> list[Problem]:
             "smoothness of the light": light_smoothness(inputs["radiance"]),
             "normal smoothness": edge_aware_smoothness(inputs["normals"], constants["image"]),
             "relative smoothness": edge_aware_smoothness(
-                inputs["albedo"], constants["image"], relative=True
+                inputs["albedo"], constants["image"], relative=0.5
             ),
         }
 

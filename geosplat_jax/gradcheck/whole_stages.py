@@ -235,7 +235,7 @@ def smoothness_problems(rng: np.random.Generator) -> list[Problem]:
                 spec=spec,
                 relative=relative,
             )
-            for relative in (False, True)
+            for relative in (0.0, 0.5)
         )
         return {**absolute._asdict(), "relative albedo": relative.albedo}
 
