@@ -82,7 +82,7 @@ def test_more_time_chooses_more_work():
 
 
 def test_a_slow_machine_is_given_less_work():
-    fast, slow = (plan(Budget(600.0), SIZE, slowness=slowness) for slowness in (1.0, 3.0))
+    fast, slow = (plan(Budget(600.0), SIZE, slowness=slowness) for slowness in (1.0, 5.0))
     assert slow.config.total_steps < fast.config.total_steps
     assert len(slow.config.active_stages) < len(fast.config.active_stages)
     assert slow.seconds == pytest.approx(600, rel=0.01)
@@ -307,6 +307,17 @@ def test_a_later_stage_of_which_something_was_set_is_not_left_out():
     overrides = ["stages.monte_carlo.batch_views=2", "stages.refine.steps=0"]
     chosen = plan(Budget(150.0), SIZE, slowness=1.0, overrides=overrides)
     assert [stage.name for stage in chosen.config.active_stages] == ["split_sum", "monte_carlo"]
+
+
+def test_all_stages_share_a_budget_that_pays_for_a_draft():
+    draft = make_config("default", "draft")
+    costs = expected_costs(draft, float(SIZE[0] * SIZE[1]), slowness=1.0)
+    seconds = expected_seconds(draft, costs)
+    stages = [
+        [stage.name for stage in plan(Budget(budget), SIZE, slowness=1.0).config.active_stages]
+        for budget in (0.98 * seconds, 1.02 * seconds)
+    ]
+    assert stages == [["split_sum"], ["split_sum", "monte_carlo", "refine"]]
 
 
 def test_what_is_too_short_for_all_stages_goes_to_the_first():

@@ -27,11 +27,6 @@ from geosplat_jax.fit.presets import QUALITIES, between_qualities
 _EFFORTS = tuple(0.25 * number for number in range(4 * (len(QUALITIES) - 1) + 1))
 """Places between the quality levels that are tried, in order of cost."""
 
-_ALL_STAGES = 0.25
-"""Place between the quality levels from which later stages are worth their time: below it, the
-first stage alone gives better images, shapes and, but for hard shadows, better relighting
-(docs/trade.md)."""
-
 _SHORTEST, _LONGEST = 0.4, 3.0
 """How far the steps of a stage may be scaled for a plan, and made more of on the way."""
 
@@ -152,9 +147,10 @@ def plan(
 ) -> Plan:
     """Choose the settings that a budget pays for.
 
-    The most that fits with the steps of its own, these then scaled to fill the time. Where that is
-    less than later stages are worth, the same of the first stage alone, unless ``overrides`` set
-    something of a later one.
+    The most that fits with the steps of its own, these then scaled to fill the time. Where not even
+    the lowest quality fits, the same of the first stage alone, unless ``overrides`` set something
+    of a later one: in so little time the first stage alone gives better images, shapes and, but for
+    hard shadows, better relighting (docs/trade.md).
 
     Parameters
     ----------
@@ -182,9 +178,7 @@ def plan(
             )
         candidates = fitting
     affordable = [one for one in candidates if one.seconds <= budget.seconds]
-    if not _asks_for_more(overrides, candidates[0].config) and (
-        not affordable or affordable[-1].effort < _ALL_STAGES
-    ):
+    if not affordable and not _asks_for_more(overrides, candidates[0].config):
         candidates = [_first_stage_alone(one) for one in candidates]
         affordable = [one for one in candidates if one.seconds <= budget.seconds]
     chosen = affordable[-1] if affordable else candidates[0]
