@@ -80,7 +80,7 @@ class Objective:
     """Power of twice the albedo's mean by which its changes are divided (Eq. 15-17, and in the
     image): 0 leaves them absolute, 1 makes them relative. Absolute changes are smaller on a dark
     surface in bright light than on a bright one in dim light, which photographs hardly tell apart,
-    and so draw the albedo into the dark; relative ones leave it to drift to either side."""
+    and so draw the albedo into the dark; relative ones have let it rise too far."""
 
 
 class Comparison(NamedTuple):

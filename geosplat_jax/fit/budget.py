@@ -149,7 +149,7 @@ def plan(
 
     The most that fits with the steps of its own, these then scaled to fill the time. Where not even
     the lowest quality fits, the same of the first stage alone, unless ``overrides`` set something
-    of a later one: in so little time the first stage alone gives better images, shapes and, but for
+    of a later one: in two minutes the first stage alone gave better images, shapes and, but for
     hard shadows, better relighting (docs/trade.md).
 
     Parameters
