@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from geosplat_jax.core.capacity import Capacities, retry
+from geosplat_jax.core.capacity import Capacities, retry, tightened
 from geosplat_jax.core.rotation import matrix_to_quaternion
 from geosplat_jax.fit.runtime import retain_freed_memory
 from geosplat_jax.splats.projection import project
@@ -155,7 +155,7 @@ def forward_backward(inputs, eligible, camera, *, size, capacities, tile_size):
 
 
 def fitted_capacities(inputs, eligible, camera, *, size, tile_size) -> Capacities:
-    """Grow from small capacities until every buffer fits."""
+    """Buffers with the headroom that training gives them once it knows what a view needs."""
 
     def attempt(capacities: Capacities):
         lists = lists_only(
@@ -163,7 +163,8 @@ def fitted_capacities(inputs, eligible, camera, *, size, tile_size) -> Capacitie
         )
         return lists, lists.usage
 
-    return retry(attempt, Capacities())[1]
+    lists, capacities = retry(attempt, Capacities())
+    return tightened(capacities, lists.usage)
 
 
 def milliseconds(function, *args, repeats: int, **settings) -> tuple[list[float], list[float]]:

@@ -371,7 +371,9 @@ def test_depth_order_is_exact_and_ties_keep_row_order(dtype, x64):
     assert bool(jnp.all(lists.index[count:] == count))
 
 
-@pytest.mark.parametrize(("bits", "count"), [(1, 1), (9, 7), (16, 70_000), (32, 70_000)])
+@pytest.mark.parametrize(
+    ("bits", "count"), [(1, 1), (1, 0), (9, 7), (16, 200_001), (17, 70_000), (32, 140_000)]
+)
 def test_packed_argsort_is_stable(bits, count):
     rng = np.random.default_rng(11)
     keys = rng.integers(0, 2**bits, count, dtype=np.uint64).astype(np.uint32)

@@ -37,7 +37,9 @@ def _slot_rows(
     table: Float[Array, "M columns"], ranks: Int[Array, " K"], centers: Float[Array, "K 2"]
 ) -> Float[Array, "K columns"]:
     """Gather one row a chunk, with the mean relative to the centre of the chunk's tile."""
-    return table[ranks].at[:, :2].add(-centers)
+    rows = table[ranks]
+    # Not by `.at[:, :2].add`, for which XLA copies the rows.
+    return jnp.concatenate([rows[:, :2] - centers, rows[:, 2:]], axis=-1)
 
 
 def _alpha(rows: Float[Array, "K columns"], tile_size: int) -> Float[Array, "K P"]:
