@@ -325,6 +325,9 @@ def test_what_is_too_short_for_all_stages_goes_to_the_first():
     assert [stage.name for stage in chosen.config.active_stages] == ["split_sum"]
     assert chosen.seconds == pytest.approx(110.0, rel=0.05)
     assert "without monte_carlo and refine" in chosen.describe()[0]
+    assert "in full size" in chosen.describe()[0]
+    smaller = plan(Budget(110.0), SIZE, slowness=1.0, downscale=2)
+    assert "reduced by 2" in smaller.describe()[0]
     assert set(chosen.costs) == {"split_sum"}
 
 

@@ -344,9 +344,10 @@ def test_images_are_reduced_to_half_a_cell(scenes):
         factor = choose_downscale(root, cells).factor
         assert factor * pixel <= 0.5 * longest / cells < (factor + 1) * pixel
         assert factor > 1
+        assert f"images are reduced by {factor}: a cell" in choose_downscale(root, cells).reason
     chosen = choose_downscale(root, 500)
     assert chosen.factor == 1
-    assert "reduced by 1: a cell" in chosen.reason
+    assert "images stay in full size: a cell" in chosen.reason
     # Half the box has half the cells for the same size.
     half = (middle - 0.25 * (hi - lo), middle + 0.25 * (hi - lo))
     assert choose_downscale(root, 1, bounds=half) == choose_downscale(root, 2)
@@ -355,7 +356,7 @@ def test_images_are_reduced_to_half_a_cell(scenes):
 def test_the_size_that_was_chosen_is_said(scenes, capsys):
     assert cli.main(["info", str(scenes["idr"]), "--downscale", "auto"]) == 0
     said = capsys.readouterr()
-    assert "images are reduced by 1" in said.err
+    assert "images stay in full size" in said.err
     assert cli.main(["info", str(scenes["idr"]), "--downscale", "2"]) == 0
     assert "reduced" not in capsys.readouterr().err
 

@@ -119,9 +119,9 @@ class Plan:
         )
         left_out = [stage.name for stage in self.config.stages if not stage.steps]
         place = _place(self.effort) + (f", without {' and '.join(left_out)}" if left_out else "")
+        size = "in full size" if self.downscale == 1 else f"reduced by {self.downscale}"
         return [
-            f"budget: {place}; {self.config.geometry.cells_along} cells, photographs reduced by "
-            f"{self.downscale}",
+            f"budget: {place}; {self.config.geometry.cells_along} cells, photographs {size}",
             f"budget: {stages}",
             f"budget: about {self.seconds:.0f} s and {self.memory / 1e9:.1f} GB are expected",
         ]

@@ -283,10 +283,10 @@ def choose_downscale(path: str | Path, cells: int, **options: Any) -> Downscale:
     pixel = float(np.median(distance / (coarse * views.intrinsics[:, 0, 0])))
     cell = float((hi - lo).max()) / cells
     factor = int(np.clip(cell / (_PIXELS_OF_A_CELL * pixel), 1, shortest))
+    size = "stay in full size" if factor == 1 else f"are reduced by {factor}"
     return Downscale(
         factor,
-        f"images are reduced by {factor}: a cell of the grid then is {cell / (factor * pixel):.1f} "
-        "pixels wide",
+        f"images {size}: a cell of the grid then is {cell / (factor * pixel):.1f} pixels wide",
     )
 
 
