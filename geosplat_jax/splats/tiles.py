@@ -39,7 +39,7 @@ _CANCELLATION = 2e-6
 _LARGEST_COUNT = 2**31 - 1
 
 _MOST_DIGIT_BITS = 16
-"""Of a digit by which a list is sorted; the table of its counts is no larger than the list."""
+"""Of a digit by which a list is sorted; with more, the table of its counts outgrows the list."""
 
 
 class TileLists(eqx.Module):
