@@ -121,6 +121,22 @@ def test_a_ray_meets_what_is_a_hundredth_of_a_cell_away_and_not_what_it_starts_o
         assert near.mean() == (1.0 if is_met else 0.0)
 
 
+@pytest.mark.parametrize("far", [30.0, 1000.0])
+def test_a_ray_from_far_away_meets_what_one_from_nearby_does(torus, far):
+    _, index = torus
+    origins, directions, source, mask = _rays()
+    start = origins - 3.0 * directions
+    distance, face = index.nearest(start, directions, source, mask)
+    away, same = index.nearest(start - far * directions, directions, source, mask)
+    # What rounding moves over an edge of a face may meet another.
+    is_same = np.asarray(same) == np.asarray(face)
+    assert is_same.mean() > 0.97
+    is_hit = is_same & (np.asarray(face) >= 0)
+    assert 0.1 < is_hit.mean() < 1.0
+    difference = np.asarray(away - distance)[is_hit] - far
+    assert np.abs(difference).max() < 1e-2 * float(index.grid.cell_size) + 4e-7 * far
+
+
 def _rays(count=RAYS, seed=2):
     rng = np.random.default_rng(seed)
     origins = jnp.asarray(rng.uniform(-1.5, 1.5, (count, 3)), jnp.float32)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from geosplat_jax.core.types import Grid
-from geosplat_jax.rays.walking import cell_lists, words_of
+from geosplat_jax.rays.walking import _faces_away, cell_lists, cones_of, words_of
 
 COUNT_BITS = 5
 SHAPE = (20, 9, 37)
@@ -61,3 +61,31 @@ def test_a_cell_with_a_list_says_where_it_begins_and_how_long_it_is():
         assert found[cell] & (1 << COUNT_BITS) - 1 == np.sum(cells == cell)
         assert found[cell] >> COUNT_BITS == np.flatnonzero(cells == cell)[0]
     assert np.sum(found >= 0) == 4
+
+
+def test_a_cone_passes_no_cell_whose_faces_a_ray_may_meet():
+    """Of normals that spread narrowly, widely, or over more than half a sphere."""
+    rng = np.random.default_rng(0)
+    cells, each, rays = 400, 4, 200
+    axes = rng.standard_normal((cells, 1, 3))
+    axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
+    spread = np.repeat([0.05, 0.5, 2.0, 20.0], cells // 4)[:, None, None]
+    normals = axes + spread * rng.standard_normal((cells, each, 3))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    entries = np.arange(cells * each)
+    lists = cell_lists(jnp.asarray(entries // each, jnp.int32), cells)
+    flat = jnp.asarray(normals.reshape(1, -1, 3), jnp.float32)
+    cones = np.asarray(cones_of(flat, jnp.asarray(entries, jnp.int32), lists, cells))
+
+    # Directions around the axis, where a cone passes the most, and anywhere.
+    middle = normals.sum(axis=1, keepdims=True)
+    middle /= np.linalg.norm(middle, axis=-1, keepdims=True)
+    width = rng.choice([0.03, 0.3, 30.0], (cells, rays, 1))
+    directions = middle + width * rng.standard_normal((cells, rays, 3))
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    cone = jnp.asarray(np.repeat(cones, rays))
+    ways = tuple(jnp.asarray(directions.reshape(-1, 3).T, jnp.float32))
+    passes = np.asarray(_faces_away(cone, ways)).reshape(cells, rays)
+    meets = np.any(np.einsum("cnk,crk->crn", normals, directions) < 0, axis=-1)
+    assert not np.any(passes & meets)
+    assert passes[: cells // 4].mean() > 0.2

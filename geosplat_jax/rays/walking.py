@@ -56,7 +56,8 @@ _EMPTY = -(1 << WORD_BITS)
 """Sign of the word of a cell without a list."""
 
 _CONE_MARGIN = 0.02
-"""Added to the sine of a cone for the rounding of its axis to 8 bits a component."""
+"""Added to the sine of a cone for the rounding of its axis to 8 bits a component, by which the axis
+may also become a little longer than 127. Cones that this makes a half space pass for none."""
 
 _PARALLEL = 1e-12
 """Directions with a smaller component do not move along that axis."""
@@ -236,7 +237,10 @@ def cones_of(
     along = jnp.min(jnp.where(is_flat, 1.0, along), axis=0)
     smallest = jax.ops.segment_min(along, lists.row, size, indices_are_sorted=True)
     smallest = jnp.clip(smallest, -1.0, 1.0)
-    sine = jnp.where(smallest > 0, jnp.sqrt(1 - smallest**2) + _CONE_MARGIN, 1.0)
+    sine = jnp.sqrt(1 - smallest**2) + _CONE_MARGIN
+    is_cone = (smallest > 0) & (sine < 1)
+    # Where no cone holds the normals, an axis of zero faces no direction.
+    axis = jnp.where(is_cone[:, None], axis, 0.0)
     packed = jnp.ceil(255 * jnp.minimum(sine, 1.0)).astype(jnp.uint32)
     for component in range(3):
         packed = packed << 8 | (axis[:, component].astype(jnp.int32) + 128).astype(jnp.uint32)
@@ -328,6 +332,27 @@ def _advance(lanes: Lanes, index: CellIndex, *, two_sided: bool) -> Lanes:
     )
 
 
+def _entered(
+    origins: Float[Array, "n 3"], directions: Float[Array, "n 3"], shape: tuple[int, int, int]
+) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
+    """Tell where rays enter the box of the cells, 0 where they start in it, and which of them do.
+
+    The distance is 0 for those that never do.
+    """
+    near = jnp.zeros_like(origins[:, 0])
+    far = jnp.full_like(near, jnp.inf)
+    for o, d, size in zip(origins.T, directions.T, shape, strict=True):
+        is_still = jnp.abs(d) < _PARALLEL
+        reciprocal = jnp.where(is_still, jnp.inf, 1.0 / jnp.where(is_still, 1.0, d))
+        one, two = (0.0 - o) * reciprocal, (size - o) * reciprocal
+        is_between = (o >= 0) & (o <= size)
+        lowest = jnp.where(is_still, jnp.where(is_between, 0.0, jnp.inf), jnp.minimum(one, two))
+        highest = jnp.where(is_still, jnp.inf, jnp.maximum(one, two))
+        near, far = jnp.maximum(near, lowest), jnp.minimum(far, highest)
+    meets = (near <= far) & jnp.isfinite(near)
+    return jnp.where(meets, near, 0.0), meets
+
+
 def _start(
     origins: Float[Array, "n 3"],
     directions: Float[Array, "n 3"],
@@ -337,23 +362,21 @@ def _start(
     index: CellIndex,
     two_sided: bool,
 ) -> Lanes:
-    """Put rays into their first cell; those that never meet the box are done at once."""
-    origin, direction = tuple(origins.T), tuple(directions.T)
-    inverse, near, far = [], jnp.zeros_like(origin[0]), jnp.full_like(origin[0], jnp.inf)
-    for o, d, size in zip(origin, direction, index.grid.shape, strict=True):
-        is_still = jnp.abs(d) < _PARALLEL
-        reciprocal = jnp.where(is_still, jnp.inf, 1.0 / jnp.where(is_still, 1.0, d))
-        inverse.append(reciprocal)
-        one, two = (0.0 - o) * reciprocal, (size - o) * reciprocal
-        is_between = (o >= 0) & (o <= size)
-        lowest = jnp.where(is_still, jnp.where(is_between, 0.0, jnp.inf), jnp.minimum(one, two))
-        highest = jnp.where(is_still, jnp.inf, jnp.maximum(one, two))
-        near, far = jnp.maximum(near, lowest), jnp.minimum(far, highest)
-    meets = is_active & (near <= far) & jnp.isfinite(near)
-    entry = jnp.where(meets, near, 0.0)
+    """Put rays into their first cell; those that never meet the box are done at once.
+
+    Rays from outside start anew where they enter: tests against what is far away lose digits by the
+    square of the distance.
+    """
+    entry, meets = _entered(origins, directions, index.grid.shape)
+    direction = tuple(directions.T)
+    origin = tuple(o + entry * d for o, d in zip(origins.T, direction, strict=True))
+    inverse = [
+        jnp.where(jnp.abs(d) < _PARALLEL, jnp.inf, 1.0 / jnp.where(jnp.abs(d) < _PARALLEL, 1.0, d))
+        for d in direction
+    ]
     cell = tuple(
-        jnp.clip(jnp.floor(o + entry * d).astype(jnp.int32), 0, size - 1)
-        for o, d, size in zip(origin, direction, index.grid.shape, strict=True)
+        jnp.clip(jnp.floor(o).astype(jnp.int32), 0, size - 1)
+        for o, size in zip(origin, index.grid.shape, strict=True)
     )
     count = origins.shape[0]
     lanes = Lanes(
@@ -365,7 +388,7 @@ def _start(
         tested=jnp.zeros((count,), jnp.int32),
         source=source,
         ray=jnp.arange(count, dtype=jnp.int32),
-        is_travelling=meets,
+        is_travelling=meets & is_active,
         distance=jnp.full((count,), jnp.inf, origins.dtype),
         face=jnp.full((count,), -1, jnp.int32),
     )
@@ -444,7 +467,8 @@ def trace(
         lanes, found = travel(lanes, found, half)
         lanes = _halve(lanes, nobody)
     distance, face = travel(lanes, found, 0)[1]
-    return distance * grid.cell_size, face
+    entry, _ = _entered(local, directions, grid.shape)
+    return (entry + distance) * grid.cell_size, face
 
 
 @partial(jax.jit, static_argnames=("two_sided",))
