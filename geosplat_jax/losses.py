@@ -35,7 +35,8 @@ from geosplat_jax.surface.base import SurfaceModel
 from geosplat_jax.transport.base import Illumination, Transport
 from geosplat_jax.transport.environment import texel_solid_angles
 
-_RADIOMETRIC_STREAM = 1
+_RADIOMETRIC_STREAM = 2**31
+"""Of random directions; `SharedInputs.changes` splits the same key, which counts from 0."""
 
 
 @settings
@@ -92,6 +93,7 @@ class Comparison(NamedTuple):
     alpha, mask : (V, H, W) coverage, and what it should be.
     valid : (V, H, W) pixels that count, or None.
     mse : () mean squared difference of the linear images.
+    is_encoded : whether the images are as a screen shows them.
     """
 
     predicted: Float[Array, "V H W 3"]
@@ -100,11 +102,14 @@ class Comparison(NamedTuple):
     mask: Float[Array, "V H W"]
     valid: Float[Array, "V H W"] | None
     mse: Float[Array, ""]
+    is_encoded: bool = False
 
     def encoded(self) -> "Comparison":
         """Return the images as a screen shows them, in which shade weighs more."""
+        if self.is_encoded:
+            return self
         images = [linear_to_srgb(image) for image in (self.predicted, self.target)]
-        return self._replace(predicted=images[0], target=images[1])
+        return self._replace(predicted=images[0], target=images[1], is_encoded=True)
 
 
 @dataclass(frozen=True)
@@ -410,6 +415,10 @@ VIEW_TERMS: dict[str, Callable[[ViewInputs], Float[Array, ""]]] = {
     ),
 }
 """Terms of a single view by the name of their weight; the loss takes their mean over the views."""
+
+PIXEL_MEANS = frozenset({"l1", "ssim", "mask", "encoded_l1", "encoded_ssim", "light"})
+"""Those that are means over all pixels that count, so that empty borders make them smaller. The
+others are means inside the mask."""
 
 SHARED_TERMS: dict[str, Callable[[SharedInputs], Float[Array, ""]]] = {
     "smoothness_albedo": lambda x: x.changes.albedo,  # Eq. 15-17

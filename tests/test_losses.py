@@ -94,6 +94,9 @@ def test_encoded_images_are_compared_as_they_are_seen():
     # Dark differences grow when they are encoded; the mean squared error stays linear.
     assert float(image_l1(encoded)) > 2 * float(image_l1(plain))
     assert float(encoded.mse) == float(plain.mse)
+    # The terms that ask for encoded images find them encoded once, whichever they get.
+    assert float(image_l1(encoded.encoded())) == float(image_l1(encoded))
+    assert float(image_l1(plain.encoded())) == float(image_l1(encoded))
 
 
 def test_colours_are_compared_linear_unless_the_objective_says_so():

@@ -9,7 +9,13 @@ from support import ball, sphere_views, tiny_config
 
 from geosplat_jax.fit.stages import pipeline_at
 from geosplat_jax.io.windows import MARGIN, around_object
-from geosplat_jax.losses import Comparison, image_dissimilarity, image_l1, mask_error
+from geosplat_jax.losses import (
+    Comparison,
+    edge_aware_smoothness,
+    image_dissimilarity,
+    image_l1,
+    mask_error,
+)
 
 SIZE = 160
 
@@ -96,11 +102,49 @@ def test_a_mean_over_a_window_is_that_over_the_photograph(views):
 
 
 def test_terms_of_pixels_count_by_their_share_of_the_photograph():
-    config = tiny_config()
+    config = tiny_config(
+        "stages.split_sum.weights.albedo_smoothness=0.3",
+        "stages.split_sum.weights.encoded_l1=0.4",
+    )
     pipeline, _ = ball(config)
     whole, cut = (
         pipeline_at(pipeline, config, config.stages[0], 0, share=share).weights
         for share in (1.0, 0.25)
     )
+    assert {"encoded_l1", "albedo_smoothness"} <= whole.keys()
     for name, weight in whole.items():
-        assert cut[name] == (0.25 if name in ("l1", "ssim", "mask") else 1.0) * weight
+        expected = 0.25 if name in ("l1", "ssim", "mask", "encoded_l1") else 1.0
+        assert float(cut[name]) == pytest.approx(expected * float(weight))
+
+
+def test_differences_inside_the_mask_are_those_of_the_photograph(views):
+    windows, share = around_object(views, largest=0.5)
+    assert share < 0.4
+
+    def smoothness(shown):
+        images = jnp.asarray(np.array(shown.images))
+        return float(edge_aware_smoothness(images[..., :3] ** 2, images, relative=0.5))
+
+    assert smoothness(windows) == pytest.approx(smoothness(views), rel=1e-5)
+
+
+def test_a_share_counts_the_pixels_that_count(views):
+    valid = np.ones(views.images.shape[:3], np.float32)
+    border = SIZE // 10
+    for edge in (
+        np.s_[:, :border],
+        np.s_[:, -border:],
+        np.s_[:, :, :border],
+        np.s_[:, :, -border:],
+    ):
+        valid[edge] = 0.0
+    views = replace(views, valid=valid)
+    windows, share = around_object(views, largest=0.5)
+
+    def error(shown):
+        images, counts = jnp.asarray(np.array(shown.images)), jnp.asarray(np.array(shown.valid))
+        mask, color = images[..., 3], images[..., :3] * images[..., 3:]
+        compared = Comparison(0.8 * color, color, mask, mask, counts, jnp.zeros(()))
+        return float(image_l1(compared))
+
+    assert share * error(windows) == pytest.approx(error(views), rel=0.02)

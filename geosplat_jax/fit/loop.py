@@ -28,6 +28,7 @@ from geosplat_jax.fit.planning import (
 )
 from geosplat_jax.fit.runtime import release_programs_when_crowded
 from geosplat_jax.fit.stages import (
+    START_STREAM,
     begin_stage,
     build_pipeline,
     initial_params,
@@ -422,7 +423,8 @@ def new_loop(
     ``start`` : what it takes over, None where it begins anew. ``surface`` : of a checkpoint, where
     it is not made anew.
     """
-    shape_key, field_key = jax.random.split(jax.random.key(config.run.seed))
+    start_key = jax.random.fold_in(jax.random.key(config.run.seed), START_STREAM)
+    shape_key, field_key = jax.random.split(start_key)
     if not config.active_stages:
         raise TrainingError("nothing to train: no stage has steps")
     try:

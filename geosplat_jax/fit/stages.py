@@ -14,15 +14,18 @@ from geosplat_jax.fit.config import Config, Stage
 from geosplat_jax.fit.entering import enter_stage
 from geosplat_jax.fit.step import UpdateRule
 from geosplat_jax.io.views import Views
-from geosplat_jax.losses import VIEW_TERMS
+from geosplat_jax.losses import PIXEL_MEANS
 from geosplat_jax.materials import init_materials
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
 from geosplat_jax.surface.base import SurfaceModel
 from geosplat_jax.transport.environment import init_light
 
+START_STREAM = 2**31 + 1
+"""Random stream of the first parameters; steps take theirs from 0 on, as keys that are split do."""
+
 _STAGE_STREAM = 2**31
-"""Random streams of the starts of stages count down from here; steps take theirs from 0 on."""
+"""Random streams of the starts of stages count down from here."""
 
 
 def build_pipeline(config: Config, stage: Stage, surface: SurfaceModel) -> Pipeline:
@@ -45,10 +48,10 @@ def pipeline_at(
     """Return a stage's pipeline as it is ``step`` steps after the stage's start.
 
     ``share`` : of the photographs that views show, see `windows.around_object`; what is a mean over
-    the pixels of a view counts so much less.
+    all pixels of a view counts so much less.
     """
     weights = {
-        name: weight * share if name in VIEW_TERMS else weight
+        name: weight * share if name in PIXEL_MEANS else weight
         for name, weight in stage.weights_at(step).items()
     }
     samples_vertices = stage.progress(step) < stage.vertex_fraction

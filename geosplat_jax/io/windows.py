@@ -29,9 +29,10 @@ def around_object(views: Views, *, largest: float) -> tuple[Views, float]:
     Returns
     -------
     views : cut, or whole.
-    share : of the photographs' pixels that are left, in (0, 1]. A mean over a window is that over
-        the photograph divided by this, where render and photograph are both empty outside. (SSIM
-        leaves out a border of five pixels of either, so its mean falls a little more.)
+    share : of the photographs' pixels that are left, of those that count, in (0, 1]. A mean over a
+        window is that over the photograph divided by this, where render and photograph are both
+        empty outside. (SSIM leaves out a border of five pixels of either, so its mean falls a
+        little more.)
     """
     if not views.has_masks or largest <= 0.0:
         return views, 1.0
@@ -54,6 +55,10 @@ def around_object(views: Views, *, largest: float) -> tuple[Views, float]:
         truth={},
         relight={},
     )
+    if views.valid is not None:
+        whole = views.valid_counts
+        some = whole > 0
+        share = float(np.mean(windows.valid_counts[some] / whole[some])) if some.any() else 1.0
     return windows, share
 
 
