@@ -77,6 +77,12 @@ def sky():
 
 @lru_cache
 def truth():
+    """Irradiance / pi in green of the kinds of points, behind the wall."""
+    points = scene()
+    return irradiance(np.asarray(points.normals[:KINDS], float), PLACES)
+
+
+def irradiance(normals, largest_x):
     """Irradiance / pi in green by brute force: texels cut in 40 x 40, bilinear between centres."""
     fine = 40 * ROWS
     directions = np.asarray(light_directions(fine, 2 * fine), float).reshape(-1, 3)
@@ -84,11 +90,10 @@ def truth():
     share = np.broadcast_to(share, (fine, 2 * fine)).reshape(-1)
     radiance = reservoirs.lookup(sky().radiance, jnp.asarray(directions, jnp.float32))
     green = np.asarray(radiance, float)[:, 1]
-    points = scene()
     found = []
-    for normal, position in zip(points.normals[:KINDS], points.positions[:KINDS], strict=True):
-        cosine = np.maximum(directions @ np.asarray(normal, float), 0)
-        is_open = directions[:, 0] <= float(position[0])
+    for normal, largest in zip(normals, largest_x, strict=True):
+        cosine = np.maximum(directions @ normal, 0)
+        is_open = directions[:, 0] <= largest
         found.append(np.sum(green * cosine * is_open * share) / np.pi)
     return np.array(found)
 
@@ -142,6 +147,34 @@ def test_the_mean_over_seeds_is_brute_force(how):
     bias, error = errors(REUSE[how])
     assert np.all(error < 0.03)
     assert np.all(np.abs(bias) <= STANDARD_ERRORS * error), (bias, error)
+
+
+def test_which_neighbour_is_asked_does_not_decide_what_is_chosen():
+    # Two groups of points in a row: the side of a neighbour says which group it is from. With one
+    # sample of one neighbour, both choices take as many random bits.
+    each, keys = 12, 20_000
+    normals = np.repeat([[0, 0, 1], [0.77, 0, 0.64]], each, axis=0)
+    normals = jnp.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True), jnp.float32)
+    count, light, wall = 2 * each, sky(), 0.3  # what no target knows
+    faces = jnp.arange(count, dtype=jnp.int32)
+    points = SurfacePoints(jnp.zeros_like(normals), normals, normals, faces, faces >= 0)
+    sampler, spec = light_sampler(light), replace(PLAIN, candidates=2, neighbors=1)
+
+    def estimate(key):
+        found = resample(key, points, light, sampler, None, None, spec=spec, count=1)
+        radiance = reservoirs.lookup(light.radiance, found.directions[:, 0])[:, 1]
+        cosine = jnp.maximum(jnp.sum(normals * found.directions[:, 0], axis=-1), 0.0)
+        is_open = found.directions[:, 0, 0] <= wall
+        return jnp.where(is_open, radiance * cosine * found.weights[:, 0] / jnp.pi, 0.0)
+
+    drawn = jax.random.split(jax.random.key(0), keys)
+    found = jax.jit(lambda keys: jax.lax.map(estimate, keys, batch_size=500))(drawn)
+    found = np.asarray(found, float)
+    expected = irradiance(np.asarray(normals, float), np.full(count, wall))
+    error = found.std(axis=0) / np.sqrt(keys) / expected
+    bias = found.mean(axis=0) / expected - 1
+    assert np.all(error < 0.03)
+    assert np.all(np.abs(bias) <= STANDARD_ERRORS * error), bias / error
 
 
 @pytest.mark.slow

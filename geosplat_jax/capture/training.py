@@ -52,6 +52,9 @@ from geosplat_jax.report.metrics import psnr, psnr_of_mse
 from geosplat_jax.splats.radiance import RadianceSplats, render_radiance
 from geosplat_jax.splats.relocation import DEAD_OPACITY, exploring_noise, relocate
 
+_RELOCATION_STREAM = 2**31
+"""Random streams of relocations count from here by the step; steps take theirs from 0 on."""
+
 TILE_SIZE = 8
 """Side of a tile in pixels; splats of a capture are larger than those of a mesh."""
 
@@ -334,7 +337,7 @@ class _Loop:
             )
         if relocates_after(self.settings, step + 1):
             grown = int(self.settings.relocation.growth * int(self.state.count))
-            key = jax.random.fold_in(jax.random.key(self.settings.seed + 1), step)
+            key = jax.random.fold_in(jax.random.key(self.settings.seed), _RELOCATION_STREAM + step)
             count = jnp.int32(min(self.settings.capacity, grown))
             self.state = relocated(self.state, count, key)
         return report

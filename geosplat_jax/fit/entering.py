@@ -139,9 +139,7 @@ def enter_stage(
         head = init_indirect_head(indirect_key, pipeline.fields, indirect_outputs)
     params = replace(params, material=replace(params.material, indirect_head=head))
     for number, entry in enumerate(entries):
-        params = entry.apply(
-            params, pipeline, jax.random.fold_in(first, number) if number else first
-        )
+        params = entry.apply(params, pipeline, jax.random.fold_in(first, number))
     learned = splats.begin(lambda: _placed(pipeline, params), pipeline.surface.box)
     return replace(params, splats=learned)
 

@@ -293,8 +293,9 @@ def _beside(
     last = jnp.iinfo(jnp.int32).max
     order = jnp.argsort(jnp.where(points.mask & (places >= 0), places, last)).astype(jnp.int32)
     rank = jnp.zeros((size,), jnp.int32).at[order].set(jnp.arange(size, dtype=jnp.int32))
-    steps = jax.random.randint(key, (count, size), 1, _NEIGHBORHOOD + 1, jnp.int32)
-    signs = jax.random.bernoulli(jax.random.fold_in(key, 1), 0.5, (count, size))
+    step_key, sign_key = jax.random.split(key)
+    steps = jax.random.randint(step_key, (count, size), 1, _NEIGHBORHOOD + 1, jnp.int32)
+    signs = jax.random.bernoulli(sign_key, 0.5, (count, size))
     place = rank[None] + jnp.where(signs, steps, -steps)
     is_inside = (place >= 0) & (place < size)
     rows = order.at[jnp.clip(place, 0, size - 1)].get(mode="promise_in_bounds")
@@ -323,7 +324,7 @@ def resample(
     """
     points, light, sampler = jax.lax.stop_gradient((points, light, sampler))
     size, traces = points.normals.shape[0], spec.visibility == "traced"
-    keys = jax.random.split(key, 4)
+    keys = jax.random.split(key, 5)
     offsets = jax.random.uniform(keys[0], (size, 2), jnp.float32)
     dtype = points.normals.dtype
     uniforms = [jax.random.uniform(k, (size, count), jnp.float32).astype(dtype) for k in keys[1:3]]
@@ -351,7 +352,7 @@ def resample(
     found = in_all(one_chunk, (points, offsets, uniforms, recalled), count * spec.candidates)
     if not spec.neighbors:
         return found
-    numbers = jax.random.uniform(jax.random.fold_in(keys[3], 1), (size, count), jnp.float32)
+    numbers = jax.random.uniform(keys[4], (size, count), jnp.float32)
     others = [
         _offered(_rows(found, rows), _rows(points, rows), points, rows >= 0, 2 * reach, spec)
         for rows in _beside(keys[3], points, index, spec.neighbors)
