@@ -437,6 +437,7 @@ def plan_training(
     budget: Budget,
     *,
     material_prior: str = "hybrid",
+    mesh: str | Path | MeshSettings | None = None,
     overrides: Sequence[str] = (),
     downscale: int | None = None,
     light: str | None = None,
@@ -446,7 +447,7 @@ def plan_training(
     Parameters
     ----------
     scene : folder, or a dataset, whose photographs are then taken as they are.
-    budget, material_prior, overrides, downscale : see `budget.plan`.
+    budget, material_prior, mesh, overrides, downscale : see `budget.plan`.
     light : that the photographs are to be read under.
 
     Raises
@@ -465,6 +466,7 @@ def plan_training(
         size,
         slowness=slowness_of_machine(),
         material_prior=material_prior,
+        mesh=mesh,
         overrides=overrides,
         downscale=downscale,
     )
@@ -530,8 +532,8 @@ def train(
         config, reading = folder.config(), folder.record()["dataset"]
         budget = folder.budget() or budget
     if config is None and budget is not None:
-        chosen = plan_training(scene, budget, downscale=reading.get("downscale"))
-        config, reading = chosen.config, {**reading, "downscale": chosen.downscale}
+        chosen = plan_training(scene, budget, mesh=mesh, downscale=reading.get("downscale"))
+        config, reading, mesh = chosen.config, {**reading, "downscale": chosen.downscale}, None
     config = config or make_config(quality=quality)
     if mesh is None and goes_on and not isinstance(config.geometry, MeshSettings):
         mesh = mesh_of_run(folder)

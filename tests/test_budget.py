@@ -6,6 +6,7 @@ from itertools import pairwise
 import jax
 import numpy as np
 import pytest
+import trimesh
 from support import sphere_dataset, tiny_config
 
 from geosplat_jax import cli
@@ -18,7 +19,13 @@ from geosplat_jax.fit.budget import (
     with_steps,
 )
 from geosplat_jax.fit.config import Budget, Pace, Rate, Stage
-from geosplat_jax.fit.costs import StageCost, expected_costs, expected_seconds
+from geosplat_jax.fit.costs import (
+    COST_SECONDS,
+    StageCost,
+    expected_costs,
+    expected_seconds,
+    work_of,
+)
 from geosplat_jax.fit.entering import FreshAlbedo
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.planning import TrainingError
@@ -320,6 +327,28 @@ def test_all_stages_share_a_budget_that_pays_for_a_draft():
     assert stages == [["split_sum"], ["split_sum", "monte_carlo", "refine"]]
 
 
+def test_a_mesh_keeps_what_is_set_of_it(tmp_path):
+    file = tmp_path / "ball.ply"
+    trimesh.creation.icosphere().export(file)
+    changes = ["geometry.edge_pixels=4", "stages.split_sum.rates.vertices=0"]
+    chosen = plan(Budget(600.0), SIZE, slowness=1.0, mesh=file, overrides=changes)
+    geometry, split_sum = chosen.config.geometry, chosen.config.stage("split_sum")
+    assert (geometry.path, geometry.edge_pixels) == (str(file), 4.0)
+    assert split_sum.rates["vertices"].value == 0
+    assert "cells" not in chosen.describe()[0]
+    # Four times as many faces are as many splats.
+    finer = plan(Budget(600.0), SIZE, slowness=1.0, mesh=file, overrides=["geometry.edge_pixels=2"])
+    pixels = float(SIZE[0] * SIZE[1])
+    ratio = finer.config.geometry.expected_splats(pixels) / geometry.expected_splats(pixels)
+    assert ratio == pytest.approx(4.0, rel=0.01)
+
+
+def test_kinds_may_be_set_together_with_what_they_have():
+    changes = ("stages.refine.domain.points=mesh", "stages.refine.domain.kind=per_pixel")
+    config = between_qualities(0.6, overrides=changes)
+    assert config.stage("refine").domain.points == "mesh"
+
+
 def test_what_is_too_short_for_all_stages_goes_to_the_first():
     chosen = plan(Budget(110.0), SIZE, slowness=1.0)
     assert [stage.name for stage in chosen.config.active_stages] == ["split_sum"]
@@ -403,6 +432,15 @@ def test_a_budget_that_is_no_time_is_refused_by_the_command_line(capsys):
     with pytest.raises(SystemExit):
         cli.main(["train", "examples/duck", "--budget", "soon"])
     assert "a time reads" in capsys.readouterr().err
+
+
+def test_the_work_of_a_step_that_shows_nothing_is_its_constant():
+    stage = make_config("default", "draft").stage("split_sum")
+    work = work_of(stage, 0.0, 0.0)
+    assert work.keys() == COST_SECONDS.keys()
+    assert sum(COST_SECONDS[name] * amount for name, amount in work.items()) == pytest.approx(
+        COST_SECONDS["step"]
+    )
 
 
 def test_expected_seconds_add_up():

@@ -85,6 +85,9 @@ def test_light_steps_grow_with_its_brightness_and_stop_at_its_floor(params):
     np.testing.assert_allclose(moved.light.radiance, expected, atol=1e-5)
     floored = _moved(params, directions, rule(smallest_light=jnp.float32(0.3)))
     assert float(jnp.min(floored.light.radiance)) == pytest.approx(0.3)
+    still = jax.tree.map(jnp.zeros_like, params)
+    frozen = _moved(params, still, rule(smallest_light=jnp.float32(0.3), frozen=("light",)))
+    np.testing.assert_array_equal(frozen.light.radiance, radiance)
 
 
 class Bowl(Pipeline):

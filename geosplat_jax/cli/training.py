@@ -18,7 +18,7 @@ from geosplat_jax.fit.config import Budget, Config, config_warnings
 from geosplat_jax.fit.devices import Devices, choose_devices, connect_hosts
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.listener import NOBODY, Listener, Listeners
-from geosplat_jax.fit.presets import make_config, with_mesh
+from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.start_mesh import MeshSettings
 from geosplat_jax.io.dataset import choose_downscale, load_recorded
 from geosplat_jax.model_choice import ModelChoice
@@ -139,6 +139,7 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
         arguments.scene,
         budget,
         material_prior=arguments.material_prior,
+        mesh=arguments.mesh,
         overrides=_overrides(arguments),
         downscale=None if arguments.downscale == "auto" else arguments.downscale,
         light=arguments.light,
@@ -146,9 +147,7 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
     for line in plan.describe():
         say(line)
     arguments.downscale = plan.downscale
-    reading = scene_options(arguments, plan.config)
-    mesh = arguments.mesh
-    return _Order(plan.config if mesh is None else with_mesh(plan.config, mesh), reading, budget)
+    return _Order(plan.config, scene_options(arguments, plan.config), budget)
 
 
 def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[str, Any]) -> Path:

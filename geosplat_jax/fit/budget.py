@@ -12,6 +12,8 @@ import statistics
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 from geosplat_jax.fit.config import Budget, Config, Pace, Stage
 from geosplat_jax.fit.costs import (
@@ -23,6 +25,7 @@ from geosplat_jax.fit.costs import (
 from geosplat_jax.fit.entering import FreshAlbedo
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.presets import QUALITIES, between_qualities
+from geosplat_jax.fit.start_mesh import MeshSettings
 
 _EFFORTS = tuple(0.25 * number for number in range(4 * (len(QUALITIES) - 1) + 1))
 """Places between the quality levels that are tried, in order of cost."""
@@ -119,9 +122,11 @@ class Plan:
         )
         left_out = [stage.name for stage in self.config.stages if not stage.steps]
         place = _place(self.effort) + (f", without {' and '.join(left_out)}" if left_out else "")
+        cells = self.config.geometry.cells_along
+        cells = "" if cells is None else f"{cells} cells, "
         size = "in full size" if self.downscale == 1 else f"reduced by {self.downscale}"
         return [
-            f"budget: {place}; {self.config.geometry.cells_along} cells, photographs {size}",
+            f"budget: {place}; {cells}photographs {size}",
             f"budget: {stages}",
             f"budget: about {self.seconds:.0f} s and {self.memory / 1e9:.1f} GB are expected",
         ]
@@ -142,6 +147,7 @@ def plan(
     *,
     slowness: float,
     material_prior: str = "hybrid",
+    mesh: str | Path | MeshSettings | None = None,
     overrides: Sequence[str] = (),
     downscale: int | None = None,
 ) -> Plan:
@@ -157,18 +163,21 @@ def plan(
     budget : time and memory.
     size : height and width of the photographs as they are.
     slowness : of this machine, see `costs.slowness_of_machine`.
-    material_prior, overrides : see `presets.make_config`.
-    downscale : of the photographs; chosen where it is not given.
+    material_prior, mesh, overrides : see `presets.make_config`.
+    downscale : of the photographs; chosen where it is not given, for a mesh by the cells that an
+        isosurface would have.
 
     Raises
     ------
     TrainingError
         If the time or the memory is too small for anything.
     """
-    candidates = [
-        _candidate(effort, size, slowness, material_prior, tuple(overrides), downscale)
-        for effort in _EFFORTS
-    ]
+    changes: dict[str, Any] = {
+        "material_prior": material_prior,
+        "mesh": mesh,
+        "overrides": tuple(overrides),
+    }
+    candidates = [_candidate(effort, size, slowness, downscale, changes) for effort in _EFFORTS]
     if budget.memory is not None:
         fitting = [one for one in candidates if one.memory <= budget.memory]
         if not fitting:
@@ -199,19 +208,19 @@ def _candidate(
     effort: float,
     size: tuple[int, int],
     slowness: float,
-    material_prior: str,
-    overrides: tuple[str, ...],
     downscale: int | None,
+    changes: Mapping[str, Any],
 ) -> Plan:
-    """Return the settings of an effort with what they are expected to take."""
-    config = between_qualities(effort, material_prior=material_prior, overrides=overrides)
+    """Return the settings of an effort, with these changes, and what they are expected to take."""
+    config = between_qualities(effort, **changes)
     if downscale is None:
-        wanted = _PIXELS_PER_CELL * (config.geometry.cells_along or max(size))
+        cells = config.geometry.cells_along or between_qualities(effort).geometry.cells_along
+        wanted = _PIXELS_PER_CELL * (cells or max(size))
         downscale = max(1, math.floor(max(size) / wanted + 0.5))
     pixels = float((size[0] // downscale) * (size[1] // downscale))
     costs = expected_costs(config, pixels, slowness=slowness)
     seconds = expected_seconds(config, costs)
-    return Plan(config, downscale, effort, costs, seconds, expected_memory(config))
+    return Plan(config, downscale, effort, costs, seconds, expected_memory(config, pixels))
 
 
 def _asks_for_more(overrides: Sequence[str], config: Config) -> bool:

@@ -70,7 +70,7 @@ def work_of(stage: Stage, splats: float, pixels: float) -> dict[str, float]:
         getattr(transport, name, 0) for name in ("light_count", "diffuse_count", "residual_count")
     )
     return {
-        "step": 0.002,
+        "step": 1.0,
         "splats": hundred_thousand,
         "rays": hundred_thousand * shared,
         "views": hundred_thousand * views,
@@ -88,7 +88,7 @@ def expected_costs(config: Config, pixels: float, *, slowness: float) -> dict[st
     """
     costs = {}
     for number, stage in enumerate(config.active_stages):
-        work = work_of(stage, float(config.geometry.expected_splats), pixels)
+        work = work_of(stage, float(config.geometry.expected_splats(pixels)), pixels)
         seconds = sum(COST_SECONDS[name] * amount for name, amount in work.items())
         startup = _STARTUP_SECONDS["next" if number else "first"]
         costs[stage.name] = StageCost(startup * slowness, seconds * slowness)
@@ -103,10 +103,10 @@ def expected_seconds(config: Config, costs: Mapping[str, StageCost]) -> float:
     )
 
 
-def expected_memory(config: Config) -> float:
-    """Predict the largest resident memory, bytes."""
+def expected_memory(config: Config, pixels: float) -> float:
+    """Predict the largest resident memory, bytes; ``pixels`` of a view."""
     base, by_splats = _MEMORY_MB
-    return 1e6 * (base + by_splats * config.geometry.expected_splats / _SPLATS_UNIT)
+    return 1e6 * (base + by_splats * config.geometry.expected_splats(pixels) / _SPLATS_UNIT)
 
 
 def kernel_milliseconds(function: Callable[[Any], Any], argument: Any, repeats: int = 9) -> float:

@@ -443,7 +443,11 @@ _ORIGINAL_DRAFT: dict[str, Any] = {
 
 
 def between_qualities(
-    place: float, *, material_prior: str = "hybrid", overrides: tuple[str, ...] = ()
+    place: float,
+    *,
+    material_prior: str = "hybrid",
+    mesh: str | Path | MeshSettings | None = None,
+    overrides: tuple[str, ...] = (),
 ) -> Config:
     """Return settings of the preset ``default`` between its quality levels.
 
@@ -453,7 +457,7 @@ def between_qualities(
     Parameters
     ----------
     place : from 0, `QUALITIES`' first, to its last, each one further.
-    material_prior, overrides : see `make_config`.
+    material_prior, mesh, overrides : see `make_config`.
     """
     below = min(int(place), len(QUALITIES) - 2)
     low, high = (
@@ -461,9 +465,7 @@ def between_qualities(
         for number in (below, below + 1)
     )
     values = {**_interpolated(low, high, place - below), "quality": BETWEEN}
-    for override in overrides:
-        values = merge(values, parse_override(override))
-    return config_from_dict(values)
+    return _finished(values, mesh, overrides)
 
 
 def _interpolated(low: Any, high: Any, share: float) -> Any:
@@ -527,7 +529,15 @@ def make_config(
         initial_metallic_logit=float(metallic_logit),
     )
     config = replace(config, quality=quality, material_prior=material_prior, material=material)
-    values = merge(config.to_dict(), changes)
+    return _finished(merge(config.to_dict(), changes), mesh, overrides)
+
+
+def _finished(
+    values: dict[str, Any],
+    mesh: str | Path | MeshSettings | None,
+    overrides: tuple[str, ...],
+) -> Config:
+    """Put a mesh and overrides, in this order, over the values of a preset."""
     if mesh is not None:
         values = with_mesh(config_from_dict(values), mesh).to_dict()
     # Kinds come first, so that settings of theirs may follow one by one.

@@ -5,12 +5,17 @@ from typing import Annotated, Any, Literal
 from jaxtyping import Array, Key
 from pydantic import Field
 
+from geosplat_jax.adapter import SPLATS_PER_FACE
 from geosplat_jax.core.settings import Positive, settings
 from geosplat_jax.fit.surfaces import SurfaceSettings
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.start_mesh import StartMesh, fitted
 from geosplat_jax.surface.base import SurfaceModel
 from geosplat_jax.surface.triangle_mesh import PENALTIES, TriangleMesh, VertexOffsets
+
+_FACES_PER_PIXEL = 2.5
+"""Faces for each square of an edge that a view has room for: the object fills a third of it, and
+has about three times as much surface as outline."""
 
 _SIZES = ("home", "faces", "edges", "neighbours", "wings")
 """Arrays of a `TriangleMesh` whose rows say how large all of it is."""
@@ -41,6 +46,11 @@ class MeshSettings(SurfaceSettings, kind="mesh"):
     def penalty_names(self) -> tuple[str, ...]:
         """Terms of `TriangleMesh.penalties`."""
         return PENALTIES
+
+    def expected_splats(self, pixels: float) -> int:
+        """Guess the splats from the pixels of a view: faces have edges of a length in pixels."""
+        faces = min(_FACES_PER_PIXEL * pixels / self.edge_pixels**2, float(self.max_faces))
+        return SPLATS_PER_FACE * round(faces)
 
     def mesh(self, dataset: Dataset) -> StartMesh:
         """Read the file and fit it to the cameras.

@@ -118,7 +118,9 @@ def _moved(params: Params, directions: Params, rule: UpdateRule) -> Params:
     knee = rule.light_knee
     growth = jnp.where(knee > 0, 1.0 + old / jnp.where(knee > 0, knee, 1.0), 1.0)
     radiance = old + growth * (params_moved.light.radiance - old)
-    light = replace(params.light, radiance=jnp.maximum(radiance, rule.smallest_light))
+    is_learned = "light" not in rule.frozen
+    floor = rule.smallest_light if is_learned else -jnp.inf
+    light = replace(params.light, radiance=jnp.maximum(radiance, floor))
     return replace(params_moved, light=light)
 
 

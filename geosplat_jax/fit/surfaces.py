@@ -63,9 +63,12 @@ class SurfaceSettings(Variant, abc.ABC):
         """Cells along the longest side of the box; None for a surface without a grid."""
         return None
 
-    @property
-    def expected_splats(self) -> int:
-        """Guess how many splats there will be, before any surface is known."""
+    def expected_splats(self, pixels: float) -> int:
+        """Guess how many splats there will be, before any surface is known.
+
+        ``pixels`` : of a view.
+        """
+        del pixels
         return 60_000
 
     @property
@@ -168,9 +171,9 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
         """Cells along the longest side of the box."""
         return self.resolution
 
-    @property
-    def expected_splats(self) -> int:
+    def expected_splats(self, pixels: float) -> int:
         """Guess the splats: from 30 (a bottle) to 60 (a duck) times the square of the cells."""
+        del pixels
         return 50 * self.resolution**2
 
     def start(self, dataset: Dataset, key: Key[Array, ""]) -> tuple[GridSurface, Geometry]:
