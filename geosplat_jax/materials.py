@@ -132,9 +132,8 @@ class Attributes(eqx.Module):
         without metallic; roughness 1 and metallic 0 for one without a specular lobe.
     shift : (N,) share in (0, 1) of ``sqrt(face area)`` by which a splat sinks below its face,
         ``sigmoid(z(mu))``, starting near 1/2 (see `MaterialSpec.initial_shift_logit`); None for a
-        field without shift.
-    indirect : (N, c) raw numbers of learned indirect light (see `transport.indirect`), or None. The
-        points carry no gradient from here.
+        field without shift. The points carry no gradient from here.
+    indirect : (N, c) raw numbers of learned indirect light (see `transport.indirect`), or None.
     """
 
     materials: Materials
@@ -198,7 +197,7 @@ def attributes_at(
     field : parameters.
     points : (N, 3) world; points outside the box take the value at its border. They receive a
         gradient where ``spec.position_gradient`` says so (see `hashgrid.encode`), but none from
-        shift and indirect light.
+        the shift.
     box : the cube that the encodings cover.
     spec : static shape of the field.
     """
@@ -214,7 +213,10 @@ def attributes_at(
         surface_features = features(field.surface_table)
     roughness, metallic = _surface_attributes(field, surface_features, spec)
     materials = Materials(albedo, roughness, metallic, has_specular=spec.specular != "none")
-    return Attributes(materials, *_detached_heads(field, unit, surface_features, spec))
+    indirect = None
+    if field.indirect_head is not None:
+        indirect = apply_mlp(field.indirect_head, albedo_features)
+    return Attributes(materials, _shift(field, unit, surface_features, spec), indirect)
 
 
 def _surface_attributes(
@@ -239,25 +241,21 @@ def _surface_attributes(
     return roughness, metallic
 
 
-def _detached_heads(
+def _shift(
     field: MaterialField,
     unit: Float[Array, "N 3"],
     surface_features: Float[Array, "N W"],
     spec: MaterialSpec,
-) -> tuple[Float[Array, " N"] | None, Float[Array, "N c"] | None]:
-    """Evaluate shift and indirect light, from which points receive no gradient."""
-    shift, indirect = None, None
-    if field.shift_head is not None:
-        features = surface_features
-        if spec.position_gradient:
-            table = field.albedo_table if field.surface_table is None else field.surface_table
-            features = encode(table, jax.lax.stop_gradient(unit), spec=spec.grid)
-        raw = apply_mlp(field.shift_head, features)[:, 0]
-        shift = jax.nn.sigmoid(raw + spec.initial_shift_logit)
-    if field.indirect_head is not None:
-        features = encode(field.albedo_table, jax.lax.stop_gradient(unit), spec=spec.grid)
-        indirect = apply_mlp(field.indirect_head, features)
-    return shift, indirect
+) -> Float[Array, " N"] | None:
+    """Evaluate the inward shift, from which points receive no gradient."""
+    if field.shift_head is None:
+        return None
+    features = surface_features
+    if spec.position_gradient:
+        table = field.albedo_table if field.surface_table is None else field.surface_table
+        features = encode(table, jax.lax.stop_gradient(unit), spec=spec.grid)
+    raw = apply_mlp(field.shift_head, features)[:, 0]
+    return jax.nn.sigmoid(raw + spec.initial_shift_logit)
 
 
 def materials_at(

@@ -402,7 +402,26 @@ def test_differences_name_the_setting_and_both_values():
                 "stages.monte_carlo.transport.indirect=traced",
                 "stages.monte_carlo.transport.occlusion=false",
             ),
-            ["stages.monte_carlo.weights.indirect has no effect", "blocked directions are black"],
+            [
+                "stages.monte_carlo.weights.indirect has no effect",
+                "blocked directions are black",
+                "stages.refine.transport.indirect=constant takes the place of",
+            ],
+        ),
+        (
+            (
+                "stages.monte_carlo.transport.indirect=radiometric",
+                "stages.refine.transport.indirect=radiometric",
+            ),
+            [],
+        ),
+        (
+            ("stages.refine.transport.kind=paths", "stages.refine.weights.indirect=0"),
+            ["refine.transport.kind=paths takes the place of stages.monte_carlo"],
+        ),
+        (
+            ("stages.monte_carlo.transport.indirect=harmonics", "stages.refine.steps=0"),
+            [],
         ),
         (("stages.monte_carlo.steps=0",), []),
     ],

@@ -346,14 +346,15 @@ def test_the_floor_of_variances_is_no_kink_of_the_similarity():
 def _varied_field():
     """A field of attributes that changes from place to place, in float64."""
     spec = MaterialSpec(grid=GRID, albedo_hidden=(4,), surface_hidden=(4,), shared=True)
-    field = jax.jit(partial(init_materials, spec=spec))(jax.random.key(0))
-    field = jax.tree.map(lambda x: x.astype(jnp.float64), field)
+    start = partial(init_materials, spec=spec, indirect_outputs=6)
+    field = jax.tree.map(lambda x: x.astype(jnp.float64), jax.jit(start)(jax.random.key(0)))
     table = jax.random.normal(jax.random.key(1), field.albedo_table.shape, jnp.float64)
     return spec, replace(field, albedo_table=table)
 
 
+@pytest.mark.parametrize("which", ["materials", "indirect"])
 @pytest.mark.parametrize("position_gradient", [False, True])
-def test_attributes_pull_on_the_geometry_only_when_asked(position_gradient):
+def test_attributes_pull_on_the_geometry_only_when_asked(position_gradient, which):
     spec, field = _varied_field()
     spec = replace(spec, position_gradient=position_gradient)
     grid, geometry = make_ball()
@@ -364,7 +365,8 @@ def test_attributes_pull_on_the_geometry_only_when_asked(position_gradient):
     @jax.grad
     def pull(geometry):
         params = Params(geometry, field, light, jnp.asarray(0.0))
-        return sum(map(jnp.sum, jax.tree.leaves(pipeline.reconstruct(params).attributes.materials)))
+        attributes = pipeline.reconstruct(params).attributes
+        return sum(map(jnp.sum, jax.tree.leaves(getattr(attributes, which))))
 
     gradient = pull(geometry)
     is_pulled = [bool(np.any(np.asarray(leaf))) for leaf in (gradient.sdf, gradient.deform)]

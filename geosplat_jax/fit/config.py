@@ -8,6 +8,7 @@ import json
 import re
 import tomllib
 from dataclasses import field, fields
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
@@ -545,4 +546,16 @@ def config_warnings(config: Config) -> list[str]:
                 f"stages.{stage.name}.transport.indirect=radiometric"
             )
         warnings += [f"stages.{stage.name}.transport.{text}" for text in stage.transport.warnings()]
-    return warnings
+    return warnings + _changes_of_blocked_light(config)
+
+
+def _changes_of_blocked_light(config: Config) -> list[str]:
+    """Say where a stage drops what the one before it has found out about blocked directions."""
+    traced = [stage for stage in config.active_stages if stage.transport.blocked_light]
+    return [
+        f"stages.{after.name}.transport.{after.transport.blocked_light} takes the place of "
+        f"stages.{before.name}.transport.{before.transport.blocked_light}: what that found of "
+        "light from blocked directions is dropped; set both alike"
+        for before, after in pairwise(traced)
+        if before.transport.blocked_light != after.transport.blocked_light
+    ]

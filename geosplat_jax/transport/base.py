@@ -238,6 +238,11 @@ class TransportSettings(Variant, abc.ABC):
         return False
 
     @property
+    def blocked_light(self) -> str | None:
+        """Setting that says what blocked directions bring; None where nothing is ever blocked."""
+        return None
+
+    @property
     def relative_cost(self) -> float:
         """About how much longer a training step takes than with the split sum."""
         return 1.0

@@ -62,6 +62,11 @@ class MonteCarloSettings(SampledSettings, TransportSettings, kind="monte_carlo")
         return INDIRECT_MODELS[self.indirect].outputs
 
     @property
+    def blocked_light(self) -> str:
+        """The model of indirect light."""
+        return f"indirect={self.indirect}"
+
+    @property
     def relative_cost(self) -> float:
         """Measured: each ray per splat adds a fifth."""
         drawn = self.light_count + self.diffuse_count + self.specular_count

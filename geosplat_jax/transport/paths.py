@@ -367,6 +367,11 @@ class PathSettings(SampledSettings, TransportSettings, kind="paths"):
     they reflect, or that and their materials and normals."""
 
     @property
+    def blocked_light(self) -> str:
+        """All that paths find."""
+        return "kind=paths"
+
+    @property
     def relative_cost(self) -> float:
         """As for one bounce, and a ray in three goes on."""
         drawn = self.light_count + self.diffuse_count + self.specular_count
