@@ -204,6 +204,19 @@ def test_a_photograph_of_one_colour_among_others_is_named(blender):
     assert any("one even colour in 1 views, r_1; such a" in warning for warning in warnings)
 
 
+def test_an_object_far_from_the_origin_is_warned_of(blender):
+    def moved(content, by):
+        for frame in content["frames"]:
+            frame["transform_matrix"][0][3] += by
+
+    told = "times its size away from the origin"
+    assert not any(told in text for text in load(blender).warnings)
+    for name in ("transforms_train.json", "transforms_test.json"):
+        edit(blender, lambda content: moved(content, 5e4), name=name)
+    bounds = list(np.array(BOX) + [5e4, 0.0, 0.0])
+    assert any(told in text for text in load(blender, bounds=bounds).warnings)
+
+
 def test_cameras_on_one_side_only_are_warned_of(blender):
     path = blender / "transforms_train.json"
     content = json.loads(path.read_text())

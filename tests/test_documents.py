@@ -45,6 +45,26 @@ def test_links_lead_to_files_and_headings(path):
             assert anchor in headings(found), f"{path.name}: no heading for {target}"
 
 
+@pytest.mark.parametrize("name", ["gradients.md", "numerics.md"])
+def test_tables_name_what_the_code_and_its_tests_have(name):
+    """Of rows about a point or a guard, the function or constant, and the tests."""
+    files = sorted((ROOT / "geosplat_jax").rglob("*.py"))
+    tests = "".join(path.read_text() for path in sorted((ROOT / "tests").glob("test_*.py")))
+    text = (DOCS / name).read_text()
+    rows = "\n".join(line for line in text.splitlines() if line.startswith("|"))
+    named = set(re.findall(r"`([a-z_]+)\.([A-Za-z_]+)`", rows))
+    assert len(named) > 5
+    for module, member in named - {("numerics", "py"), ("material", "position_gradient")}:
+        sources = [path.read_text() for path in files if path.stem == module]
+        assert sources, f"{name} names {module}.{member}, and there is no such module"
+        is_there = any(re.search(rf"^ *(def |class )?{member}\b", text, re.M) for text in sources)
+        assert is_there, f"{name} names {module}.{member}, which is not there"
+    for path in re.findall(r"`((?:tests|experiments|benchmarks)/[\w/]+\.py)`", text):
+        assert (ROOT / path).exists(), f"{name} names {path}, which is not there"
+    for test in re.findall(r"`([a-z_0-9]{30,})`", rows):
+        assert f"def test_{test}(" in tests, f"{name} names test_{test}, which is not there"
+
+
 def test_every_page_is_in_the_site():
     listed = set(re.findall(r": (\w+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M))
     assert listed == {path.name for path in PAGES}

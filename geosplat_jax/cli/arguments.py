@@ -137,7 +137,7 @@ def _add_train(train: argparse.ArgumentParser) -> None:
         nargs="?",
         const=1,
         metavar="ROUNDS",
-        help="first train at quality draft and set the cameras right with what came out, so often "
+        help="first train for a short while and set the cameras right with what came out, so often "
         "(once by default); docs/cameras.md",
     )
     _add_white_balance(train)

@@ -153,7 +153,7 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
 def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[str, Any]) -> Path:
     """Set the cameras right before the training proper; say where they are."""
     draft = round_config(arguments.material_prior)
-    say("cameras first: training at quality draft")
+    say("cameras first: a short training, half the split sum of a draft")
     with ProgressDisplay(draft.total_steps) as display:
         cameras = refined_cameras(
             arguments.scene,

@@ -51,6 +51,10 @@ LAYOUTS: dict[str, Layout] = {
 
 
 _PIXELS_OF_A_CELL = 2.0
+_FAR_SIZES = 1000.0
+"""Objects farther from the origin than so many times their size are warned of: by then a point of
+them may lie .04 pixels beside where it is drawn, for a focal length of 800 pixels."""
+
 _NARROW_DEG = 20.0
 """Cameras around the object within a smaller angle see one side of it."""
 _COARSE_PIXELS = 256
@@ -173,6 +177,7 @@ def load_dataset(
     for views in splits:
         _check_cameras_outside(views, box)
     _check_sides(train, box, warnings)
+    _check_origin(box, warnings)
     return Dataset(
         name=root.resolve().name,
         layout=layout,
@@ -400,6 +405,16 @@ def _check_sides(views: Views, bounds: tuple[np.ndarray, np.ndarray], warnings: 
             f"train: all {len(views)} cameras see the object from one side, within {widest:.1f} "
             "degrees; its shape away from them cannot be known. Check the poses, or photograph "
             "all around the object"
+        )
+
+
+def _check_origin(bounds: tuple[np.ndarray, np.ndarray], warnings: list[str]) -> None:
+    """Warn of an object so far from the origin that float32 does not know where its parts are."""
+    sizes = np.linalg.norm(0.5 * (bounds[0] + bounds[1])) / np.max(bounds[1] - bounds[0])
+    if sizes > _FAR_SIZES:
+        warnings.append(
+            f"the object lies {sizes:,.0f} times its size away from the origin, where single "
+            "precision blurs its shape; move the origin of the poses to the object"
         )
 
 
