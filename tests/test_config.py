@@ -152,7 +152,7 @@ def test_priors_of_shiny_materials_change_the_rates_of_the_authors_code():
         [0.01, 0.03, 0.03]
     )
     assert specular.stages[0].weights_at(0)["smoothness_albedo"] == pytest.approx(0.5 / 3)
-    assert specular.stages[1].weights_at(0)["normal_smoothness"] == 0.03
+    assert specular.stages[1].weights_at(0)["normal_smoothness"] == pytest.approx(0.005)
     assert "normal_smoothness" not in hybrid.stages[1].weights_at(0)
     assert specular.stages[1].steps == 1000
 

@@ -280,7 +280,8 @@ def _code(material_prior: str) -> Config:
             entropy=Schedule(0.2, 0.01),
             smoothness_albedo=0.03 / 3,
             smoothness_roughness_metallic=0.03 / 2,
-            normal_smoothness=0.03 if is_specular else 0.0,
+            # Of normals as colours, n / 2 + 1 / 2.
+            normal_smoothness=0.03 / 3 / 2 if is_specular else 0.0,
         ),
         baked_diffuse=True,
         indirect="constant",
