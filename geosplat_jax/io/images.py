@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import OpenImageIO as oiio
 from jaxtyping import Float, Shaped
+from skimage.measure import block_reduce
 
 from geosplat_jax.core.color import linear_to_srgb, srgb_to_linear
 from geosplat_jax.io.memory import Need, memory_refusal
@@ -269,7 +270,7 @@ def linear_values(
     pixels = stored
     _require_radiance(pixels, path)
     if path.suffix.lower() == ".exr" and colors < pixels.shape[-1]:
-        pixels[..., :colors] = _unpremultiplied(pixels[..., :colors], pixels[..., colors:])
+        pixels[..., :colors] = straight(pixels[..., :colors], pixels[..., colors])
     if is_srgb:
         pixels[..., :colors] = decode_srgb(pixels[..., :colors])
     return pixels
@@ -368,14 +369,14 @@ def downscale(pixels: Float[np.ndarray, "H W C"], factor: int) -> Float[np.ndarr
         )
     if factor == 1:
         return pixels
-    h, w = height // factor, width // factor
-    blocks = pixels[: h * factor, : w * factor].reshape(h, factor, w, factor, channels)
+    block = (factor, factor, 1)
+    pixels = pixels[: height // factor * factor, : width // factor * factor]
     colors = _color_channels(pixels)
     if colors == channels:
-        return blocks.mean((1, 3))
-    alpha = blocks[..., colors:].mean((1, 3))
-    premultiplied = (blocks[..., :colors] * blocks[..., colors:]).mean((1, 3))
-    return np.concatenate([_unpremultiplied(premultiplied, alpha), alpha], -1)
+        return block_reduce(pixels, block, np.mean)
+    alpha = block_reduce(pixels[..., colors:], block, np.mean)
+    premultiplied = block_reduce(pixels[..., :colors] * pixels[..., colors:], block, np.mean)
+    return np.concatenate([straight(premultiplied, alpha[..., 0]), alpha], -1)
 
 
 def decode_srgb(encoded: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
@@ -400,9 +401,17 @@ def _color_channels(pixels: np.ndarray) -> int:
     return {1: 1, 2: 1, 3: 3, 4: 3}[pixels.shape[-1]]
 
 
-def _unpremultiplied(premultiplied: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    visible = alpha > _SMALLEST_ALPHA
-    return np.where(visible, premultiplied / np.where(visible, alpha, 1.0), 0.0)
+def straight(
+    premultiplied: Float[np.ndarray, "..."], alpha: Shaped[np.ndarray, "..."]
+) -> Float[np.ndarray, "..."]:
+    """Divide blended values by their coverage; zero where (almost) nothing is covered.
+
+    ``alpha`` : of the leading axes of the values.
+    """
+    alpha = alpha.reshape(alpha.shape + (1,) * (premultiplied.ndim - alpha.ndim))
+    covered = alpha > _SMALLEST_ALPHA
+    divisor = np.where(covered, alpha, 1).astype(premultiplied.dtype)
+    return np.where(covered, premultiplied / divisor, 0).astype(premultiplied.dtype)
 
 
 def _require_finite(pixels: np.ndarray, path: Path) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 from scipy.ndimage import binary_erosion
 
-from geosplat_jax.io.images import encode_srgb
+from geosplat_jax.io.images import encode_srgb, straight
 from geosplat_jax.report.metrics import (
     MASK_THRESHOLD,
     albedo_scale_least_squares,
@@ -82,16 +82,6 @@ def _require_object(inside: Bool[np.ndarray, "V H W"]) -> None:
         )
 
 
-def _straight(
-    premultiplied: Float[np.ndarray, "..."], coverage: Shaped[np.ndarray, "..."]
-) -> Float[np.ndarray, "..."]:
-    """Divide by coverage; zero where nothing is covered."""
-    coverage = coverage.reshape(coverage.shape + (1,) * (premultiplied.ndim - coverage.ndim))
-    covered = coverage > _SMALLEST_ALPHA
-    divisor = np.where(covered, coverage, 1).astype(premultiplied.dtype)
-    return np.where(covered, premultiplied / divisor, 0).astype(premultiplied.dtype)
-
-
 def albedo_scale(
     protocol: Protocol,
     albedo: Float[np.ndarray, "..."],
@@ -132,8 +122,8 @@ def albedo_scale(
     known = inside & (alpha[chosen] > _SMALLEST_ALPHA)
     if not known.any():
         return np.ones(3)
-    predicted = _straight(albedo[chosen][known], alpha[chosen][known])
-    true = _straight(truth[chosen][known], mask[chosen][known])
+    predicted = straight(albedo[chosen][known], alpha[chosen][known])
+    true = straight(truth[chosen][known], mask[chosen][known])
     return np.asarray(albedo_scale_median(predicted, true, np.ones(len(true), bool)), float)
 
 
@@ -150,9 +140,9 @@ def _mean_least_squares(
     return np.where(count > 0, total / np.maximum(count, 1), 1.0)
 
 
-def _picture(straight: np.ndarray, coverage: np.ndarray, look: Look) -> Float[np.ndarray, "H W 3"]:
+def _picture(colors: np.ndarray, coverage: np.ndarray, look: Look) -> Float[np.ndarray, "H W 3"]:
     """Clip and encode straight linear colour, and lay it over the background."""
-    encoded = np.clip(straight, 0.0, 1.0).astype(np.float32)
+    encoded = np.clip(colors, 0.0, 1.0).astype(np.float32)
     if look.encoding == "srgb":
         encoded = np.clip(encode_srgb(encoded), 0.0, 1.0)
     elif look.encoding == "gamma22":
@@ -243,7 +233,7 @@ def _compare(
             "solid": drawn > MASK_THRESHOLD,
             "mask": covered,
         }
-        predicted = _picture(_straight(prediction, drawn), shown[look.silhouette], look)
+        predicted = _picture(straight(prediction, drawn), shown[look.silhouette], look)
         true = _picture(truth, covered, look)
         errors.append(float(_mse(predicted, true, counted)))
         if counted is None:
@@ -348,7 +338,7 @@ def albedo_metrics(
     metrics = _compare(
         (view * factor for view in albedo),
         alpha,
-        (_straight(t, covered) for t, covered in zip(truth, mask, strict=True)),
+        (straight(t, covered) for t, covered in zip(truth, mask, strict=True)),
         mask,
         look=protocol.albedo,
         is_pooled=protocol.albedo_is_pooled,
@@ -401,7 +391,7 @@ def material_metrics(
             raise ValueError(f"there is a true {name} but no predicted one; render it too")
         predicted, true = materials[name], truth[name]
         _require(alpha.shape, **{f"predicted {name}": predicted, f"true {name}": true})
-        squared = (_straight(predicted, alpha) - _straight(true, mask)) ** 2
+        squared = (straight(predicted, alpha) - straight(true, mask)) ** 2
         views = [
             np.mean(x[i], dtype=float) for x, i in zip(squared, inside, strict=True) if i.any()
         ]

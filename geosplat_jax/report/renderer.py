@@ -21,7 +21,7 @@ from geosplat_jax.core.mesh import vertex_normals
 from geosplat_jax.core.types import Camera, EnvLight, Mesh, Splats
 from geosplat_jax.fit.cameras import Subject
 from geosplat_jax.fit.train import Trained
-from geosplat_jax.io.images import encode_srgb
+from geosplat_jax.io.images import encode_srgb, straight
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Asset, Params, RenderOutput, RenderPipeline
 from geosplat_jax.surface.base import Surface
@@ -400,6 +400,5 @@ def photograph_on_white(image: np.ndarray) -> np.ndarray:
 
 def straight_rgba(view: RenderedView) -> np.ndarray:
     """Return sRGB with straight alpha, (H, W, 4); colour is zero where nothing was hit."""
-    alpha = view.alpha[..., None]
-    straight = np.where(alpha > 0, view.rgb / np.where(alpha > 0, alpha, 1.0), 0.0)
-    return np.concatenate([to_picture(straight), np.clip(alpha, 0.0, 1.0)], axis=-1)
+    colors = to_picture(straight(view.rgb, view.alpha))
+    return np.concatenate([colors, np.clip(view.alpha, 0.0, 1.0)[..., None]], axis=-1)

@@ -13,7 +13,7 @@ from geosplat_jax.core.types import Camera
 from geosplat_jax.fit.folder import RunError
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.frames import read_transforms
-from geosplat_jax.io.images import SceneError, write_exr, write_png
+from geosplat_jax.io.images import SceneError, straight, write_exr, write_png
 from geosplat_jax.io.views import Views
 from geosplat_jax.report.consistency import resized
 from geosplat_jax.report.pictures import normals_to_rgb
@@ -29,8 +29,6 @@ LARGEST_SIZE = 8192
 
 MOST_FRAMES = 10_000
 """Pictures on a way around the object, at most."""
-
-_SMALLEST_ALPHA = 1e-4
 
 
 class Shot(NamedTuple):
@@ -248,12 +246,6 @@ class Images:
                 written.append(folder / f"{name}_{aov}.exr")
                 write_exr(written[-1], values)
         return written
-
-
-def straight(values: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Divide blended values by their coverage; zero where nothing was hit."""
-    covered = (alpha > _SMALLEST_ALPHA)[..., None]
-    return np.where(covered, values / np.where(covered, alpha[..., None], 1.0), 0.0)
 
 
 def _picture(aov: str, values: np.ndarray, view: RenderedView) -> np.ndarray:

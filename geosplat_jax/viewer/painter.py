@@ -15,14 +15,13 @@ from geosplat_jax.core.rotation import quaternion_to_matrix
 from geosplat_jax.core.types import EnvLight
 from geosplat_jax.fit.train import Trained
 from geosplat_jax.io.export import export_mesh_glb
-from geosplat_jax.io.images import encode_srgb
+from geosplat_jax.io.images import encode_srgb, straight
 from geosplat_jax.io.meshes import nondegenerate
 from geosplat_jax.report.assets import MaterialSampler
 from geosplat_jax.report.pictures import normals_to_rgb
 from geosplat_jax.report.relight import picture, turned
 from geosplat_jax.report.renderer import RenderedView, Renderer, to_picture
 from geosplat_jax.report.scales import DISTANCE_COLORS, Scale
-from geosplat_jax.report.shots import straight
 from geosplat_jax.viewer.looks import AS_TRAINED, LEVELS, Ladder, Level, Look
 from geosplat_jax.viewer.source import CheckpointWatch, same_size
 
