@@ -33,6 +33,8 @@ STEPS = tuple(2.0**-9 * 4.0**-k for k in range(8))
 
 _SAMPLED_ENTRIES = 48
 _RANDOM_DIRECTIONS = 3
+_LARGEST_ENTRY = 3.0
+"""Of a direction along a gradient: about that of a random one."""
 _CHUNK = 64
 """Points that one call of a compiled function evaluates; the last call is padded."""
 
@@ -289,18 +291,20 @@ def _directional_errors(
     """Errors (R, 2) of R combinations: along their gradient, and the worst of random directions."""
     count = span.stop - span.start
     norms = np.sqrt(np.sum(np.square(gradients), axis=1))
-    # All directions have the length of a random one, whose typical derivative is the norm.
+    # As long as a random one, whose typical derivative is the norm; shorter where few entries have
+    # all of the gradient, which would else move by hundreds of steps and past the kinks around.
     unit = gradients / np.where(norms > 0, norms, 1.0)[:, None]
-    along = np.where(norms[:, None] > 0, np.sqrt(count) * unit, 1.0)
+    largest = np.max(np.abs(unit), axis=1)
+    lengths = np.minimum(np.sqrt(count), _LARGEST_ENTRY / np.where(norms > 0, largest, 1.0))
+    lengths = np.where(norms > 0, lengths, np.sqrt(count))
+    along = np.where(norms[:, None] > 0, lengths[:, None] * unit, 1.0)
     inside = np.concatenate([along, rng.standard_normal((_RANDOM_DIRECTIONS, count))])
     directions = np.zeros((len(inside), len(flat.point)))
     directions[:, span] = scale * inside
     found = _settled(*_differences(flat, directions, combinations))[0] / scale
     error = np.abs(found - inside @ gradients.T) / np.where(norms > 0, norms, 1.0)[None, :]
     rows = np.arange(len(gradients))
-    return np.stack(
-        [error[rows, rows] / np.sqrt(count), np.max(error[len(rows) :], axis=0)], axis=1
-    )
+    return np.stack([error[rows, rows] / lengths, np.max(error[len(rows) :], axis=0)], axis=1)
 
 
 def compare(problem: Problem, *, single: bool = True, seed: int = 0) -> list[Comparison]:
