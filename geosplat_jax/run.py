@@ -29,7 +29,7 @@ from geosplat_jax.fit.stages import make_batch
 from geosplat_jax.fit.start_mesh import MeshSettings
 from geosplat_jax.fit.train import Trained, fit, load_trained
 from geosplat_jax.io.cameras import RefinedSplit, write_cameras
-from geosplat_jax.io.dataset import Dataset, load_recorded, photograph_size
+from geosplat_jax.io.dataset import READING_OPTIONS, Dataset, load_recorded, photograph_size
 from geosplat_jax.io.images import write_png
 from geosplat_jax.io.views import Views
 from geosplat_jax.model_choice import ChosenModel, ModelChoice, choose_model
@@ -160,8 +160,8 @@ class Run:
             raise RunError(f"{self.dataset.root} has no {split} views")
         return views
 
-    def _output(self, folder: Path | None, name: str) -> Path:
-        chosen = folder or self.folder.path / name
+    def _output(self, folder: str | Path | None, name: str) -> Path:
+        chosen = self.folder.path / name if folder is None else Path(folder)
         chosen.mkdir(parents=True, exist_ok=True)
         return chosen
 
@@ -218,7 +218,7 @@ class Run:
         write_report(evaluated.results / REPORT, [evaluated])
         return metrics
 
-    def report(self, output: Path | None = None, *, others: Sequence["Run"] = ()) -> Path:
+    def report(self, output: str | Path | None = None, *, others: Sequence["Run"] = ()) -> Path:
         """Write ``report.html``, one self-contained page; return its path.
 
         Made of what training and the last evaluation left; see `report.page`.
@@ -234,7 +234,7 @@ class Run:
             If a file of a run is damaged.
         """
         runs = [Evaluated.of(run.folder) for run in (self, *others)]
-        return write_report(output or self.folder.path / REPORT, runs)
+        return write_report(Path(output or self.folder.path / REPORT), runs)
 
     def consistency(self, *, stage: str | None = None, size: int | None = None) -> Consistency:
         """Measure how well the splats stand for the mesh, over the views to show.
@@ -252,7 +252,7 @@ class Run:
     def render(
         self,
         split: str = "test",
-        output: Path | None = None,
+        output: str | Path | None = None,
         *,
         cameras: Cameras | None = None,
         images: Images | None = None,
@@ -288,7 +288,7 @@ class Run:
     def relight(
         self,
         env: str | Path,
-        output: Path | None = None,
+        output: str | Path | None = None,
         *,
         options: RelightOptions | None = None,
         cameras: Cameras | None = None,
@@ -326,7 +326,7 @@ class Run:
 
     def refine_cameras(
         self,
-        output: Path | None = None,
+        output: str | Path | None = None,
         *,
         splits: Sequence[str] = ("train", "test"),
         how: CameraSettings | None = None,
@@ -354,7 +354,7 @@ class Run:
         RunError
             If no split has views, or the output is what the run itself was trained with.
         """
-        path = output or self.folder.path / "cameras.json"
+        path = Path(output or self.folder.path / "cameras.json")
         own = self.dataset.options.get("cameras")
         if own is not None and Path(own) == path.resolve():
             raise RunError(
@@ -375,7 +375,7 @@ class Run:
 
     def export(
         self,
-        output: Path | None = None,
+        output: str | Path | None = None,
         *,
         vertex_colors: bool = False,
         texture_size: int = 1024,
@@ -510,16 +510,23 @@ def train(
         so many each. Or what `fit.devices.choose_devices` made of it before.
     listener : told of every step, compilation, preview, and part of a model that was tried.
     reading : how to read the scene: ``downscale``, ``light``, ``bounds`` (six numbers),
-        ``cameras`` (a file of `Run.refine_cameras`).
+        ``cameras`` (a file of `Run.refine_cameras`), and what else `load_dataset` takes.
 
     Raises
     ------
+    TypeError
+        On any other keyword.
     SceneError, RunError, TrainingError, Interrupted
         See `load_dataset` and `fit.train.fit`.
     ValueError
         If the mesh cannot be used, see `io.start_mesh`; if a model is to be chosen under a budget,
         for stages of another run, or from too few views.
     """
+    if unknown := sorted(set(reading) - set(READING_OPTIONS)):
+        raise TypeError(
+            f"train takes no {', '.join(unknown)}; a scene is read by "
+            f"{', '.join(sorted(READING_OPTIONS))}, and settings belong into the config"
+        )
     if model is not None and (budget is not None or begin.takes_over):
         raise ValueError("a model is chosen for a whole training without a budget; leave model out")
     started, folder = time.perf_counter(), RunFolder(output)
@@ -532,7 +539,13 @@ def train(
         config, reading = folder.config(), folder.record()["dataset"]
         budget = folder.budget() or budget
     if config is None and budget is not None:
-        chosen = plan_training(scene, budget, mesh=mesh, downscale=reading.get("downscale"))
+        chosen = plan_training(
+            scene,
+            budget,
+            mesh=mesh,
+            downscale=reading.get("downscale"),
+            light=reading.get("light"),
+        )
         config, reading, mesh = chosen.config, {**reading, "downscale": chosen.downscale}, None
     config = config or make_config(quality=quality)
     if mesh is None and goes_on and not isinstance(config.geometry, MeshSettings):

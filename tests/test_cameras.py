@@ -446,6 +446,10 @@ def damaged(content, kind):
         first["fx"] = -1.0
     elif kind == "pose":
         first["world_to_camera"][0][0] = 7.0
+    elif kind == "mirror":
+        first["world_to_camera"][0] = [-x for x in first["world_to_camera"][0]]
+    elif kind == "row":
+        first["world_to_camera"][3] = [5.0, 0.0, 0.0, 1.0]
     elif kind == "balance":
         first["white_balance"] = [1.0, 0.0, 1.0]
     elif kind == "key":
@@ -460,6 +464,8 @@ def damaged(content, kind):
         ("format", "holds no cameras"),
         ("number", "must be finite and above 0"),
         ("pose", "not a rigid 4 x 4 matrix"),
+        ("mirror", "not a rigid 4 x 4 matrix"),
+        ("row", "not a rigid 4 x 4 matrix"),
         ("balance", "a white_balance must be three factors above 0"),
         ("key", "no 'exposure'"),
     ],

@@ -192,6 +192,17 @@ def test_inside_out_meshes_are_turned_and_open_ones_are_double_sided(tmp_path):
     assert glb_tree(tmp_path / "open.glb")["materials"][0]["doubleSided"]
 
 
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
+def test_a_texture_does_not_depend_on_the_unit_of_the_scene(scale):
+    vertices, faces, normals = sphere(2)
+    there = np.float32([3.0, -1.0, 2.0])
+    cut = meshes.unwrap(scale * (vertices + there), faces, normals, texture_size=64)
+    corners = cut.uv[cut.faces]
+    (ax, ay), (bx, by) = (np.moveaxis(corners[:, k] - corners[:, 0], 1, 0) for k in (1, 2))
+    area = 0.5 * np.abs(ax * by - ay * bx)
+    assert area.sum() > 0.3
+
+
 def test_degenerate_faces_are_dropped_before_unwrapping(tmp_path):
     vertices, faces, normals = sphere(1)
     bad = np.array([[0, 0, 1], [2, 3, 2], [5, 5, 5]], np.int32)

@@ -62,6 +62,25 @@ def test_python_and_the_command_make_the_same_run(run, commanded):
     assert run.folder.training()["seconds_total"] > 0
 
 
+def test_what_no_scene_is_read_with_is_refused(folder):
+    with pytest.raises(TypeError, match="takes no downscal, seed"):
+        gs.train(folder / "duck", folder / "refused", downscal=8, seed=7)
+    assert not (folder / "refused").exists()
+
+
+def test_a_run_reads_the_views_that_it_was_trained_with(folder):
+    dataset = gs.load_dataset(folder / "duck", downscale=8, train_views=5, test_views=2)
+    run = gs.train(dataset, folder / "few", gs.make_config(overrides=SETTINGS))
+    again = gs.Run(folder / "few").dataset
+    assert again.train.names == run.dataset.train.names
+    assert (len(again.train), len(again.test)) == (5, 2)
+
+
+def test_folders_may_be_texts(run, tmp_path):
+    assert run.export(str(tmp_path / "out"), texture_size=64)
+    assert (tmp_path / "out" / "mesh.glb").exists()
+
+
 def test_a_preview_is_written_while_training(run):
     assert [path.name for path in run.folder.previews.iterdir()] == ["step_000002.png"]
 
@@ -102,7 +121,9 @@ def test_consistency_is_printed_and_written(commanded, capsys, tmp_path):
 def test_what_a_stage_ended_with_is_evaluated_into_its_folder(commanded, capsys):
     end = commanded.folder.end_of("split_sum")
     assert command("evaluate", commanded.folder, "--stage", "split_sum") == 2
-    assert "no checkpoint" in " ".join(capsys.readouterr().err.split())
+    assert "is the last stage of" in " ".join(capsys.readouterr().err.split())
+    assert command("evaluate", commanded.folder, "--stage", "split") == 2
+    assert "has the stages split_sum" in " ".join(capsys.readouterr().err.split())
     shutil.copytree(commanded.folder.checkpoints, end)
     whole = (commanded.folder.path / "metrics.json").read_bytes()
     assert command("evaluate", commanded.folder, "--stage", "split_sum", "--samples", 4) == 0

@@ -68,9 +68,9 @@ def _info(arguments: argparse.Namespace) -> None:
     """Print what was recognised, and whether masks and cameras agree."""
     dataset = load_recorded(arguments.scene, scene_options(arguments, make_config()))
     print(describe(dataset))
-    for line in agreement_lines(dataset.train, dataset.bounds):
-        print(f"  {line}")
     if dataset.train.has_masks:
+        for line in agreement_lines(dataset.train, dataset.bounds):
+            print(f"  {line}")
         print(f"  {hollow_line(dataset.train, dataset.bounds)}")
 
 

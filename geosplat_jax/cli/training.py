@@ -110,14 +110,33 @@ class _Order:
     model: ModelChoice | None = None
 
 
+def _require_no_settings(arguments: argparse.Namespace, folder: RunFolder) -> None:
+    """Refuse settings for a run that goes on with those that were chosen for it."""
+    given = {
+        "--set": arguments.overrides,
+        "--seed": arguments.seed,
+        "--quality": arguments.quality,
+        "--preset": arguments.preset,
+        "--mesh": arguments.mesh,
+    }
+    told = [name for name, value in given.items() if value not in (None, (), [])]
+    if told:
+        raise UsageError(
+            f"{folder} goes on with the settings that were chosen for it; leave {', '.join(told)} "
+            "out, or train anew into another --output"
+        )
+
+
 def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
     """Read from the options, or from the run that is resumed, what is to be done; say it."""
     if arguments.resume and folder.exists and folder.budget() is not None:
         if arguments.budget is not None or arguments.memory is not None:
             raise UsageError(f"{folder} keeps its budget; leave --budget and --memory out")
+        _require_no_settings(arguments, folder)
         # Its settings were chosen for the budget, and have changed since.
         return _Order(folder.config(), folder.record()["dataset"], folder.budget())
     if arguments.resume and folder.has_chosen_model:
+        _require_no_settings(arguments, folder)
         return _Order(folder.config(), folder.record()["dataset"])
     if arguments.model is not None and (arguments.budget or arguments.source):
         raise UsageError("--model auto chooses for a whole training; leave --budget and --from out")
@@ -255,6 +274,8 @@ def train(arguments: argparse.Namespace) -> None:
     order = _ordered(arguments, RunFolder(folder))
     config, reading = order.config, dict(order.reading)
     if arguments.refine_cameras is not None:
+        if not arguments.resume:
+            RunFolder(folder).require_free(replace=arguments.force)
         reading["cameras"] = _refined_cameras(arguments, folder, reading)
     dataset = load_recorded(arguments.scene, reading)
     begun = RunFolder(folder)

@@ -442,8 +442,10 @@ def choose_devices(count: int = 1) -> Devices:
     Raises
     ------
     TrainingError
-        If there are fewer.
+        If there are fewer, or none are asked for.
     """
+    if count < 1:
+        raise TrainingError(f"a training needs at least one device, got {count}")
     if count > 1 and _FORCED not in os.environ.get("XLA_FLAGS", ""):
         try:
             jax.config.update("jax_num_cpu_devices", count)

@@ -134,6 +134,18 @@ class Trained:
     step: int
 
 
+def _checkpoints(run: RunFolder, stage: str | None) -> Path:
+    """Return the folder of the checkpoint that a stage ended with, or of the run's own."""
+    if stage is None or not run.exists:
+        return run.checkpoints
+    names = [active.name for active in run.config().active_stages]
+    if stage not in names:
+        raise TrainingError(f"{run} has the stages {', '.join(names)}, and no {stage!r}")
+    if stage == names[-1] and latest_checkpoint(run.end_of(stage)) is None:
+        raise TrainingError(f"{stage} is the last stage of {run}; leave the stage out")
+    return run.end_of(stage)
+
+
 def load_trained(folder: str | Path | RunFolder, *, stage: str | None = None) -> Trained:
     """Read the last good checkpoint of a run, or the one that a stage ended with.
 
@@ -147,7 +159,7 @@ def load_trained(folder: str | Path | RunFolder, *, stage: str | None = None) ->
         If its settings are not those of this version.
     """
     run = folder if isinstance(folder, RunFolder) else RunFolder(folder)
-    path = latest_checkpoint(run.checkpoints if stage is None else run.end_of(stage))
+    path = latest_checkpoint(_checkpoints(run, stage))
     if path is None:
         raise TrainingError(
             f"{run} holds no checkpoint that can be read; is it the output of a training run?"

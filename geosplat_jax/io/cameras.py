@@ -161,7 +161,8 @@ def _from_plain(values: Mapping[str, Any]) -> RefinedCamera:
     exposure = float(values["exposure"])
     balance = np.array(values.get("white_balance", [1.0, 1.0, 1.0]), np.float64)
     turn = pose[:3, :3] @ pose[:3, :3].T if pose.shape == (4, 4) else np.zeros((3, 3))
-    if not np.allclose(turn, np.eye(3), atol=_RIGID_TOLERANCE) or not np.isfinite(pose).all():
+    is_rigid = np.allclose(turn, np.eye(3), atol=_RIGID_TOLERANCE) and np.isfinite(pose).all()
+    if not is_rigid or np.linalg.det(pose[:3, :3]) < 0 or pose[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
         raise ValueError("a world_to_camera is not a rigid 4 x 4 matrix")
     if not (min(fx, fy, exposure) > 0 and np.isfinite([fx, fy, cx, cy, exposure]).all()):
         raise ValueError(f"fx {fx}, fy {fy} and exposure {exposure} must be finite and above 0")

@@ -51,6 +51,19 @@ LAYOUTS: dict[str, Layout] = {
 
 
 _PIXELS_OF_A_CELL = 2.0
+_READING: tuple[tuple[str, Any], ...] = (
+    ("downscale", 1),
+    ("light", None),
+    ("layout", None),
+    ("train_views", None),
+    ("test_views", None),
+    ("mask_files", True),
+)
+"""Options of `load_dataset` that a record keeps as they are, and their defaults."""
+
+READING_OPTIONS = (*(name for name, _ in _READING), "bounds", "cameras")
+"""All by which a scene may be read, see `load_recorded`."""
+
 _FAR_SIZES = 1000.0
 """Objects farther from the origin than so many times their size are warned of: by then a point of
 them may lie .04 pixels beside where it is drawn, for a focal length of 800 pixels."""
@@ -139,6 +152,12 @@ def load_dataset(
     root = Path(path).expanduser()
     if not root.is_dir():
         raise MissingFileError(f"scene folder {root} does not exist")
+    asked = {
+        "layout": layout,
+        "train_views": train_views,
+        "test_views": test_views,
+        "mask_files": mask_files,
+    }
     layout = recognise_layout(root) if layout is None else layout
     if layout not in LAYOUTS:
         raise SceneError(f"layout must be one of {sorted(LAYOUTS)}, got {layout!r}")
@@ -194,6 +213,7 @@ def load_dataset(
             "light": light,
             "bounds": None if bounds is None else np.ravel(bounds).tolist(),
             **({} if cameras is None else _recorded(cameras)),
+            **{name: asked[name] for name, usual in _READING if asked.get(name, usual) != usual},
         },
     )
 
@@ -209,8 +229,8 @@ def _recorded(cameras: Path) -> dict[str, str]:
 def load_recorded(path: str | Path, options: Mapping[str, Any]) -> Dataset:
     """Load a scene folder as a run read it, by the options in its record.
 
-    ``options`` may have ``downscale``, ``light``, ``bounds`` (six numbers, lo then hi) and
-    ``cameras``; see `load_dataset`.
+    ``options`` may have ``bounds`` (six numbers, lo then hi) and all else that `load_dataset` takes
+    by name; anything else in it is left alone.
 
     Raises
     ------
@@ -226,10 +246,9 @@ def load_recorded(path: str | Path, options: Mapping[str, Any]) -> Dataset:
         )
     return load_dataset(
         path,
-        downscale=options.get("downscale", 1),
-        light=options.get("light"),
         bounds=None if bounds is None else (bounds[:3], bounds[3:]),
         cameras=cameras,
+        **{name: options.get(name, usual) for name, usual in _READING},
     )
 
 

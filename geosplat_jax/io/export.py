@@ -38,8 +38,9 @@ SampleMaterials = Callable[[Float[np.ndarray, "N 3"]], tuple[Any, Any, Any]]
 LARGEST_TEXTURE = 16_384
 """Edge of the largest textures, texels; few programs open larger ones."""
 
-_TEXEL_BYTES = 4 * (1 + 3 + 5)
-"""Of a texel while a texture is baked: its face, barycentric coordinates and materials."""
+_TEXEL_BYTES = 130
+"""Of a texel while a texture is baked, measured: its face, barycentric coordinates and materials,
+and copies of these."""
 
 # glTF's targets of a buffer: vertex attributes and indices.
 _VERTEX_BUFFER, _INDEX_BUFFER = 34962, 34963

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import OpenImageIO as oiio
 from jaxtyping import Float, Shaped
-from skimage.measure import block_reduce
+from skimage.transform import downscale_local_mean
 
 from geosplat_jax.core.color import linear_to_srgb, srgb_to_linear
 from geosplat_jax.io.memory import Need, memory_refusal
@@ -373,9 +373,9 @@ def downscale(pixels: Float[np.ndarray, "H W C"], factor: int) -> Float[np.ndarr
     pixels = pixels[: height // factor * factor, : width // factor * factor]
     colors = _color_channels(pixels)
     if colors == channels:
-        return block_reduce(pixels, block, np.mean)
-    alpha = block_reduce(pixels[..., colors:], block, np.mean)
-    premultiplied = block_reduce(pixels[..., :colors] * pixels[..., colors:], block, np.mean)
+        return downscale_local_mean(pixels, block)
+    alpha = downscale_local_mean(pixels[..., colors:], block)
+    premultiplied = downscale_local_mean(pixels[..., :colors] * pixels[..., colors:], block)
     return np.concatenate([straight(premultiplied, alpha[..., 0]), alpha], -1)
 
 
