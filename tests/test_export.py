@@ -200,7 +200,7 @@ def test_a_texture_does_not_depend_on_the_unit_of_the_scene(scale):
     corners = cut.uv[cut.faces]
     (ax, ay), (bx, by) = (np.moveaxis(corners[:, k] - corners[:, 0], 1, 0) for k in (1, 2))
     area = 0.5 * np.abs(ax * by - ay * bx)
-    assert area.sum() > 0.3
+    assert area.sum() > 0.1
 
 
 def test_degenerate_faces_are_dropped_before_unwrapping(tmp_path):
