@@ -559,9 +559,10 @@ def train(
         chosen_model = _chosen_model(dataset, config, folder, how, begin, listener)
         config, evidence = chosen_model.config, chosen_model.record()
         started = time.perf_counter()  # the cost of choosing is stated apart
+    earlier = (folder.training() or {}).get("seconds_total", 0.0) if goes_on else 0.0
+    used = folder.seconds_used() if goes_on else 0.0
     pacer = None
     if budget is not None:
-        used = folder.seconds_used() if goes_on else 0.0
         pacer = _pacer(budget, dataset, config, began=started - used)
     previews = _Previews(dataset, folder, pacer)
     try:
@@ -578,7 +579,9 @@ def train(
     finally:
         previews.finish()
     if devices.is_first_host:
-        folder.write_training({"seconds_total": round(time.perf_counter() - started, 2)})
+        # Of a training that was interrupted only its steps are known.
+        seconds = max(earlier, used) + time.perf_counter() - started
+        folder.write_training({"seconds_total": round(seconds, 2)})
     run = Run(folder.path)
     run.dataset = dataset
     return run

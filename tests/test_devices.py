@@ -17,7 +17,7 @@ from geosplat_jax.cli.arguments import command_line
 from geosplat_jax.cli.training import UsageError, _devices, _idle
 from geosplat_jax.core.types import Batch
 from geosplat_jax.fit import devices as devices_module
-from geosplat_jax.fit.devices import ONE_DEVICE, Devices, ManyDevices, choose_devices
+from geosplat_jax.fit.devices import ONE_DEVICE, Devices, ManyDevices, choose_devices, connect_hosts
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.train import fit
 
@@ -140,6 +140,13 @@ def test_more_devices_than_there_are_is_refused_in_one_line():
     ) as e:
         choose_devices(there + 1)
     assert "\n" not in str(e.value)
+
+
+def test_no_device_and_a_coordinator_without_a_port_are_refused():
+    with pytest.raises(TrainingError, match="at least one device, got 0"):
+        choose_devices(0)
+    with pytest.raises(TrainingError, match="reads ADDRESS:PORT, got 'first'"):
+        connect_hosts("1", host=0, coordinator="first")
 
 
 @pytest.mark.parametrize(

@@ -80,6 +80,14 @@ def test_commands_in_the_tutorial_exist():
         command_line().parse_args(line.replace("SCENE", "scene").split())
 
 
+def test_bounds_are_read_as_they_are_printed():
+    from geosplat_jax.cli.arguments import command_line
+
+    corners = ["-1.2e-05", "-1", "-.5", "1e-05", "1.5E+06", "2."]
+    arguments = command_line().parse_args(["info", "scene", "--bounds", *corners])
+    assert arguments.bounds == [float(text) for text in corners]
+
+
 def test_the_table_of_settings_has_them_all():
     hooks = {}
     exec((DOCS / "site_hooks.py").read_text(), hooks)

@@ -81,6 +81,12 @@ def test_folders_may_be_texts(run, tmp_path):
     assert (tmp_path / "out" / "mesh.glb").exists()
 
 
+def test_the_time_of_a_training_is_that_of_all_its_sessions(run):
+    before = run.folder.training()["seconds_total"]
+    gs.train(run.dataset, run.folder.path, run.folder.config(), begin=gs.Resume())
+    assert run.folder.training()["seconds_total"] > before
+
+
 def test_a_preview_is_written_while_training(run):
     assert [path.name for path in run.folder.previews.iterdir()] == ["step_000002.png"]
 

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib.metadata
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, get_args
@@ -36,6 +37,9 @@ EXAMPLES = {
     "gradcheck": "gradcheck bsdf --sweep",
 }
 """One call of every command, which its help ends with."""
+
+
+_NEGATIVE_NUMBER = re.compile(r"-(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$", re.IGNORECASE)
 
 
 def command_line() -> argparse.ArgumentParser:
@@ -462,6 +466,8 @@ def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
         "what the grid's cells can resolve",
     )
     parser.add_argument("--light", help="training light, where a scene has several")
+    # By itself argparse takes -1e-5 for an option; `info` and reports print such numbers.
+    parser._negative_number_matcher = _NEGATIVE_NUMBER
     parser.add_argument(
         "--bounds",
         type=float,

@@ -11,6 +11,7 @@ programs, or is asked for with `Devices.any_host` and `Devices.first_host`.
 
 import json
 import os
+import re
 from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Any, TypeVar
@@ -483,8 +484,11 @@ def connect_hosts(
     Raises
     ------
     TrainingError
-        If they do not find each other, or it is not known how many there are.
+        If they do not find each other, it is not known how many there are, or the coordinator has
+        no port.
     """
+    if coordinator is not None and not re.fullmatch(r".+:\d+", coordinator):
+        raise TrainingError(f"--coordinator reads ADDRESS:PORT, got {coordinator!r}")
     known = {} if hosts == "auto" else {"num_processes": int(hosts), "process_id": host}
     try:
         jax.distributed.initialize(
