@@ -111,6 +111,18 @@ def test_the_density_is_positive_wherever_light_arrives():
     assert weight.max() < 4.5 * mean
 
 
+def test_every_texel_of_a_large_map_can_be_drawn():
+    radiance = np.random.default_rng(0).uniform(0.5, 1.0, (256, 512, 3)).astype(np.float32)
+    radiance[40, 100] = 3e4
+    sampler = jax.jit(light_sampler)(EnvLight(jnp.asarray(radiance)))
+    steps = np.diff(np.asarray(sampler.cumulative, float), prepend=0.0)
+    assert np.all(steps >= 0)
+    assert np.mean(steps == 0) < 2e-3
+    share = np.asarray(sampler.density) * np.asarray(texel_solid_angles(256, 512))
+    rows = steps.reshape(256, 512).sum(axis=1)
+    np.testing.assert_allclose(rows, share.sum(axis=1), rtol=1e-3, atol=2e-7)
+
+
 @pytest.mark.parametrize("name", ["random", "sun", "flat"])
 def test_a_sampled_flux_is_that_of_quadrature(name):
     light = LIGHTS[name]

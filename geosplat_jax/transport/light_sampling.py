@@ -57,7 +57,10 @@ def light_sampler(light: EnvLight) -> LightSampler:
     share = jnp.where(total > 0, power / jnp.where(total > 0, total, 1.0), 0.0)
     uniform = solid_angle / (4 * math.pi)
     share = jnp.where(total > 0, (1 - _UNIFORM_SHARE) * share + _UNIFORM_SHARE * uniform, uniform)
-    cumulative = jnp.cumsum(share.reshape(-1))
+    # Row by row, since a sum over a whole map has errors larger than the share of a texel.
+    within = jnp.cumsum(share, axis=1)
+    before = jnp.cumsum(within[:, -1]) - within[:, -1]
+    cumulative = jax.lax.cummax((before[:, None] + within).reshape(-1))
     return LightSampler(cumulative / cumulative[-1], share / solid_angle)
 
 
