@@ -414,6 +414,16 @@ def test_python_resumes_a_budget_without_naming_settings(dataset, tmp_path):
     assert not run.folder.previews.exists()
 
 
+def test_a_budget_that_is_resumed_takes_no_other_settings(dataset, tmp_path, capsys):
+    config = tiny_config("stages.split_sum.steps=40", "stages.monte_carlo.steps=0")
+    _paced_run(dataset, tmp_path / "run", config, stop_after=12)
+    options = ["--set", "foo.bar=1", "--seed", "5", "--downscale", "4", "--mesh", "nope.ply"]
+    command = ["train", "examples/duck", "--output", str(tmp_path / "run"), "--resume", *options]
+    assert cli.main(command) == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert "leave --set, --seed, --mesh, --downscale out" in told
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

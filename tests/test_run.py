@@ -87,6 +87,13 @@ def test_the_time_of_a_training_is_that_of_all_its_sessions(run):
     assert run.folder.training()["seconds_total"] > before
 
 
+def test_a_folder_that_is_taken_is_told_of_before_cameras_are_refined(run, folder, capsys):
+    arguments = train_arguments(folder / "duck", run.folder.path)
+    assert command(*arguments, "--refine-cameras") == 2
+    assert "holds a run" in " ".join(capsys.readouterr().err.split())
+    assert not run.folder.path.with_name("python_cameras").exists()
+
+
 def test_a_preview_is_written_while_training(run):
     assert [path.name for path in run.folder.previews.iterdir()] == ["step_000002.png"]
 

@@ -11,6 +11,7 @@ from typing import Any
 from rich.table import Table
 
 from geosplat_jax.camera_rounds import refined_cameras, round_config
+from geosplat_jax.cli.arguments import command_line
 from geosplat_jax.cli.display import ProgressDisplay, console, say, say_refined
 from geosplat_jax.fit.begin import Anew, Begin, Resume, TakeOver
 from geosplat_jax.fit.cameras import CameraSettings
@@ -110,20 +111,33 @@ class _Order:
     model: ModelChoice | None = None
 
 
+_SETTING_OPTIONS = {
+    "--set": "overrides",
+    "--seed": "seed",
+    "--quality": "quality",
+    "--preset": "preset",
+    "--material-prior": "material_prior",
+    "--mesh": "mesh",
+    "--downscale": "downscale",
+    "--light": "light",
+    "--bounds": "bounds",
+    "--cameras": "cameras",
+}
+"""Options that a record answers, by the names of their values."""
+
+
 def _require_no_settings(arguments: argparse.Namespace, folder: RunFolder) -> None:
-    """Refuse settings for a run that goes on with those that were chosen for it."""
-    given = {
-        "--set": arguments.overrides,
-        "--seed": arguments.seed,
-        "--quality": arguments.quality,
-        "--preset": arguments.preset,
-        "--mesh": arguments.mesh,
-    }
-    told = [name for name, value in given.items() if value not in (None, (), [])]
+    """Refuse settings and ways of reading for a run that goes on with those in its record."""
+    usual = command_line().parse_args(["train", str(arguments.scene)])
+    told = [
+        option
+        for option, name in _SETTING_OPTIONS.items()
+        if getattr(arguments, name) != getattr(usual, name)
+    ]
     if told:
         raise UsageError(
-            f"{folder} goes on with the settings that were chosen for it; leave {', '.join(told)} "
-            "out, or train anew into another --output"
+            f"{folder} goes on as it was begun; leave {', '.join(told)} out, or train anew into "
+            "another --output"
         )
 
 

@@ -12,8 +12,8 @@ import statistics
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from geosplat_jax.fit.config import Budget, Config, Pace, Stage
 from geosplat_jax.fit.costs import (
@@ -24,7 +24,7 @@ from geosplat_jax.fit.costs import (
 )
 from geosplat_jax.fit.entering import FreshAlbedo
 from geosplat_jax.fit.planning import TrainingError
-from geosplat_jax.fit.presets import QUALITIES, between_qualities
+from geosplat_jax.fit.presets import QUALITIES, between_qualities, mesh_settings
 from geosplat_jax.fit.start_mesh import MeshSettings
 
 _EFFORTS = tuple(0.25 * number for number in range(4 * (len(QUALITIES) - 1) + 1))
@@ -122,8 +122,8 @@ class Plan:
         )
         left_out = [stage.name for stage in self.config.stages if not stage.steps]
         place = _place(self.effort) + (f", without {' and '.join(left_out)}" if left_out else "")
-        cells = self.config.geometry.cells_along
-        cells = "" if cells is None else f"{cells} cells, "
+        along = self.config.geometry.cells_along
+        cells = "" if along is None else f"{along} cells, "
         size = "in full size" if self.downscale == 1 else f"reduced by {self.downscale}"
         return [
             f"budget: {place}; {cells}photographs {size}",
@@ -172,12 +172,15 @@ def plan(
     TrainingError
         If the time or the memory is too small for anything.
     """
-    changes: dict[str, Any] = {
-        "material_prior": material_prior,
-        "mesh": mesh,
-        "overrides": tuple(overrides),
-    }
-    candidates = [_candidate(effort, size, slowness, downscale, changes) for effort in _EFFORTS]
+    settings_at = partial(
+        between_qualities,
+        material_prior=material_prior,
+        mesh=None if mesh is None else mesh_settings(mesh),
+        overrides=tuple(overrides),
+    )
+    candidates = [
+        _candidate(effort, settings_at(effort), size, slowness, downscale) for effort in _EFFORTS
+    ]
     if budget.memory is not None:
         fitting = [one for one in candidates if one.memory <= budget.memory]
         if not fitting:
@@ -206,13 +209,12 @@ def plan(
 
 def _candidate(
     effort: float,
+    config: Config,
     size: tuple[int, int],
     slowness: float,
     downscale: int | None,
-    changes: Mapping[str, Any],
 ) -> Plan:
-    """Return the settings of an effort, with these changes, and what they are expected to take."""
-    config = between_qualities(effort, **changes)
+    """Return the settings of an effort with what they are expected to take."""
     if downscale is None:
         cells = config.geometry.cells_along or between_qualities(effort).geometry.cells_along
         wanted = _PIXELS_PER_CELL * (cells or max(size))

@@ -330,6 +330,19 @@ _MESH_VIEWS = 6
 """Views per step in appendix H."""
 
 
+def mesh_settings(mesh: str | Path | MeshSettings) -> MeshSettings:
+    """Name a file by its place and what it holds; settings that name one already are returned.
+
+    Raises
+    ------
+    ValueError
+        If there is no such file.
+    """
+    if isinstance(mesh, MeshSettings):
+        return mesh
+    return MeshSettings(path=str(Path(mesh).resolve()), digest=digest_of(mesh))
+
+
 def with_mesh(config: Config, mesh: str | Path | MeshSettings) -> Config:
     """Return a configuration that starts from a mesh file instead of an isosurface (appendix H).
 
@@ -348,11 +361,9 @@ def with_mesh(config: Config, mesh: str | Path | MeshSettings) -> Config:
     ValueError
         If there is no such file.
     """
-    if isinstance(mesh, MeshSettings):
-        path, digest = mesh.path, mesh.digest
-    else:
-        path, digest = str(Path(mesh).resolve()), digest_of(mesh)
-    geometry = MeshSettings(path=path, digest=digest, edge_pixels=_MESH_EDGES[config.quality])
+    named = mesh_settings(mesh)
+    edge_pixels = _MESH_EDGES[config.quality]
+    geometry = MeshSettings(path=named.path, digest=named.digest, edge_pixels=edge_pixels)
     old, is_original = config.geometry, config.preset != "default"
     stages = []
     for stage in config.stages:

@@ -332,6 +332,12 @@ def _advance(lanes: Lanes, index: CellIndex, *, two_sided: bool) -> Lanes:
     )
 
 
+def _inverse(direction: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Return one over a component, infinite where a ray does not move along its axis."""
+    is_still = jnp.abs(direction) < _PARALLEL
+    return jnp.where(is_still, jnp.inf, 1.0 / jnp.where(is_still, 1.0, direction))
+
+
 def _entered(
     origins: Float[Array, "n 3"], directions: Float[Array, "n 3"], shape: tuple[int, int, int]
 ) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
@@ -342,8 +348,8 @@ def _entered(
     near = jnp.zeros_like(origins[:, 0])
     far = jnp.full_like(near, jnp.inf)
     for o, d, size in zip(origins.T, directions.T, shape, strict=True):
-        is_still = jnp.abs(d) < _PARALLEL
-        reciprocal = jnp.where(is_still, jnp.inf, 1.0 / jnp.where(is_still, 1.0, d))
+        reciprocal = _inverse(d)
+        is_still = jnp.isinf(reciprocal)
         one, two = (0.0 - o) * reciprocal, (size - o) * reciprocal
         is_between = (o >= 0) & (o <= size)
         lowest = jnp.where(is_still, jnp.where(is_between, 0.0, jnp.inf), jnp.minimum(one, two))
@@ -370,10 +376,6 @@ def _start(
     entry, meets = _entered(origins, directions, index.grid.shape)
     direction = tuple(directions.T)
     origin = tuple(o + entry * d for o, d in zip(origins.T, direction, strict=True))
-    inverse = [
-        jnp.where(jnp.abs(d) < _PARALLEL, jnp.inf, 1.0 / jnp.where(jnp.abs(d) < _PARALLEL, 1.0, d))
-        for d in direction
-    ]
     cell = tuple(
         jnp.clip(jnp.floor(o).astype(jnp.int32), 0, size - 1)
         for o, size in zip(origin, index.grid.shape, strict=True)
@@ -382,7 +384,7 @@ def _start(
     lanes = Lanes(
         origin=origin,
         direction=direction,
-        inverse=tuple(inverse),
+        inverse=tuple(_inverse(d) for d in direction),
         cell=cell,
         word=jnp.zeros((count,), jnp.int32),
         tested=jnp.zeros((count,), jnp.int32),
