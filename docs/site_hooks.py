@@ -1,8 +1,8 @@
 """Fills the page of settings from the table that `geosplat-jax settings` prints."""
 
 import html
-import json
 
+from geosplat_jax.core.settings import as_written
 from geosplat_jax.fit.config import all_settings
 from geosplat_jax.fit.presets import make_config
 
@@ -18,7 +18,7 @@ def settings_table() -> str:
             section = first
             lines += ["", f"## {section}", "", "| setting | value | range | meaning |"]
             lines.append("|---|---|---|---|")
-        cells = (f"`{path}`", f"`{json.dumps(value)}`", html.escape(limits), html.escape(meaning))
+        cells = (f"`{path}`", f"`{as_written(value)}`", html.escape(limits), html.escape(meaning))
         lines.append(f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |")
     return "\n".join(lines)
 

@@ -22,6 +22,7 @@ from geosplat_jax.core.color import linear_to_srgb, tone_map
 from geosplat_jax.core.numerics import absolute, safe_divide, safe_log, safe_power
 from geosplat_jax.core.settings import (
     NonNegative,
+    NonNegativeOrNone,
     PositiveCount,
     PositiveShare,
     Share,
@@ -45,7 +46,7 @@ class Schedule:
 
     value: NonNegative = 0.0
     """Weight at the start of the stage."""
-    end: NonNegative | None = None
+    end: NonNegativeOrNone = None
     """Weight at ``until`` and after it; none for a constant."""
     until: PositiveShare = 1.0
     """Share of the stage in which the weight moves to ``end``."""

@@ -200,6 +200,22 @@ def test_a_number_sets_the_value_of_a_rate_or_a_weight_and_leaves_the_rest():
     assert after.stages[0].weights["indirect"] == Schedule(0.0, 0.25)
 
 
+def test_the_word_none_takes_a_value_away():
+    config = make_config(
+        overrides=(
+            "stages.split_sum.weights.entropy.end=none",
+            "stages.refine.rates.splat_means.half_life=none",
+        )
+    )
+    assert config.stages[0].weights["entropy"].end is None
+    assert config.stages[2].rates["splat_means"].half_life is None
+    assert config_from_dict(json.loads(json.dumps(config.to_dict()))) == config
+    ranges = {path: limits for path, _, limits, _ in all_settings(config)}
+    assert ranges["stages.split_sum.weights.entropy.end"] == ">= 0 or none"
+    with pytest.raises(ValueError, match=r"entropy\.end must be .*equal to 0, got -1"):
+        make_config(overrides=("stages.split_sum.weights.entropy.end=-1.0",))
+
+
 def test_another_kind_replaces_a_section():
     config = make_config(overrides=('stages.monte_carlo.transport={kind="split_sum"}',))
     assert config.stages[1].transport.kind == "split_sum"

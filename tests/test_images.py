@@ -169,7 +169,13 @@ def test_half_a_file_is_an_error(tmp_path, suffix):
 
 
 @pytest.mark.parametrize(
-    ("value", "message"), [(np.nan, "not finite"), (np.inf, "not finite"), (-0.25, "negative")]
+    ("value", "message"),
+    [
+        (np.nan, "not finite"),
+        (np.inf, "not finite"),
+        (-0.25, "negative"),
+        (1e30, r"above 1e\+12"),
+    ],
 )
 def test_light_that_is_no_light_is_located(tmp_path, value, message):
     pixels = random_pixels(4, 5, 3)

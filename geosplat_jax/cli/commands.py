@@ -15,6 +15,7 @@ from geosplat_jax.capture.masks import choose_factor, make_masks
 from geosplat_jax.capture.settings import RadianceSettings
 from geosplat_jax.cli.display import ProgressDisplay, WorkDisplay, say, say_refined
 from geosplat_jax.cli.training import UsageError, config_from, require_place, scene_options, train
+from geosplat_jax.core.settings import as_written
 from geosplat_jax.fit.cameras import CameraSettings
 from geosplat_jax.fit.config import all_settings
 from geosplat_jax.fit.folder import RunError
@@ -142,7 +143,7 @@ def _settings(arguments: argparse.Namespace) -> None:
     if not rows:
         raise UsageError(f"no setting begins with {arguments.prefix!r}")
     for path, value, limits, meaning in rows:
-        table.add_row(*map(Text, (path, json.dumps(value), limits, meaning)))
+        table.add_row(*map(Text, (path, as_written(value), limits, meaning)))
     Console(highlight=False).print(table)
 
 

@@ -12,11 +12,12 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from functools import wraps
-from typing import Annotated, Any, ClassVar, TypeVar, dataclass_transform
+from typing import Annotated, Any, ClassVar, TypeVar, dataclass_transform, get_args
 
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import (
     AfterValidator,
+    BeforeValidator,
     ConfigDict,
     Field,
     GetCoreSchemaHandler,
@@ -27,6 +28,9 @@ from pydantic.dataclasses import dataclass as _checked_dataclass
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 _CONFIG = ConfigDict(extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)
+
+NONE = "none"
+"""How people write that a setting has no value; JSON has null for it."""
 
 _SMALLEST, _LARGEST = 1e-30, 1e30
 """Sizes of numbers other than 0, well within single precision, in which they are used."""
@@ -48,6 +52,11 @@ def _infinite_or_of_single_precision(value: float) -> float:
     return value if math.isinf(value) else _of_single_precision(value)
 
 
+def _none_by_its_word(value: Any) -> Any:
+    """Let ``none`` be written where TOML and ``--set`` have no other word for it."""
+    return None if value == NONE else value
+
+
 def _of_32_bits(value: int) -> int:
     """Refuse a count that compiled programs cannot hold."""
     if value >= 2**31:
@@ -65,6 +74,10 @@ NonNegative = Annotated[float, Field(ge=0), AfterValidator(_of_single_precision)
 """A finite number that is not negative."""
 Positive = Annotated[float, Field(gt=0), AfterValidator(_of_single_precision)]
 """A finite number above 0."""
+NonNegativeOrNone = Annotated[NonNegative | None, BeforeValidator(_none_by_its_word)]
+"""A finite number that is not negative, or none."""
+PositiveOrNone = Annotated[Positive | None, BeforeValidator(_none_by_its_word)]
+"""A finite number above 0, or none."""
 PositiveOrInfinite = Annotated[
     float, Field(gt=0, allow_inf_nan=True), AfterValidator(_infinite_or_of_single_precision)
 ]
@@ -167,6 +180,11 @@ def from_plain(kind: type[_Class], values: Any, where: str = "") -> _Class:
         raise ValueError(_problems(error, where)) from None
 
 
+def as_written(value: Any) -> str:
+    """Write the plain value of a setting as ``--set`` takes it."""
+    return NONE if value is None else json.dumps(value)
+
+
 def first_line(error: Exception) -> str:
     """Return the first line of an error, where one will do."""
     return str(error).partition("\n")[0]
@@ -238,11 +256,15 @@ _LIMITS = ((">=", Ge, "ge"), (">", Gt, "gt"), ("<=", Le, "le"), ("<", Lt, "lt"))
 
 
 def _range(field: Any) -> str:
-    """Write the limits of a field."""
+    """Write the limits of a field, and whether it may have no value."""
+    parts = get_args(field.annotation)
+    marks = [mark for part in parts for mark in getattr(part, "__metadata__", ())]
+    inner = [limit for mark in marks for limit in getattr(mark, "metadata", ())]
     written = [
         f"{sign} {getattr(limit, name)}"
-        for limit in field.metadata
+        for limit in (*field.metadata, *inner)
         for sign, kind, name in _LIMITS
         if isinstance(limit, kind)
     ]
-    return ", ".join(written)
+    alternatives = [", ".join(written)] + [NONE] * (type(None) in parts)
+    return " or ".join(filter(None, alternatives))

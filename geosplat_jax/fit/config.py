@@ -20,6 +20,7 @@ from geosplat_jax.core.settings import (
     NonNegative,
     Positive,
     PositiveCount,
+    PositiveOrNone,
     from_plain,
     listed,
     settings,
@@ -55,7 +56,7 @@ class Rate:
     """Adam's rate before any decay; 0 freezes the group."""
     warmup: Count = 0
     """Steps over which the rate rises from zero, quadratically."""
-    half_life: Positive | None = None
+    half_life: PositiveOrNone = None
     """Steps after which the rate has halved; none takes the stage's."""
 
 
@@ -163,7 +164,7 @@ class Budget:
 
     seconds: Positive
     """From the start of the command to the last checkpoint, compilation included."""
-    memory: Positive | None = None
+    memory: PositiveOrNone = None
     """Largest resident memory, bytes; none is as much as the machine has."""
 
 

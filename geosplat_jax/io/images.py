@@ -253,7 +253,7 @@ def read_linear(path: str | Path, *, is_srgb: bool | None = None) -> Float[np.nd
     Raises
     ------
     MissingFileError, ImageReadError
-    SceneError : a pixel is negative, NaN or infinite.
+    SceneError : a pixel is negative, above 1e12, NaN or infinite.
     """
     return linear_values(read_stored(path), Path(path), is_srgb=is_srgb)
 
@@ -340,7 +340,7 @@ def write_hdr(path: str | Path, pixels: Float[np.ndarray, "H W 3"]) -> None:
 
     Raises
     ------
-    SceneError : NaN, infinite or negative values, which the format cannot hold.
+    SceneError : values that are NaN, infinite, negative or above 1e12.
     OSError : the file cannot be written.
     """
     values = np.asarray(pixels, np.float32)
@@ -415,25 +415,33 @@ def straight(
 
 
 def _require_finite(pixels: np.ndarray, path: Path) -> None:
-    is_bad = ~np.isfinite(pixels)
-    if is_bad.any():
-        row, column, channel = (int(i) for i in np.argwhere(is_bad)[0])
-        raise SceneError(
-            f"{path} has {int(is_bad.sum())} values that are not finite, the first "
-            f"{pixels[row, column, channel]} at row {row}, column {column}, channel {channel}; "
-            "render or convert it again"
-        )
+    _require_none(
+        ~np.isfinite(pixels), pixels, path, "that are not finite", "render or convert it again"
+    )
+
+
+_BRIGHTEST = 1e12
+"""Radiance above which an image is taken for damaged; squares of gradients would overflow."""
 
 
 def _require_radiance(pixels: np.ndarray, path: Path) -> None:
     _require_finite(pixels, path)
-    is_bad = pixels < 0.0
+    negative = "light never is: clip it, or check the filter that made it"
+    _require_none(pixels < 0.0, pixels, path, "that are negative", negative)
+    bright = "no light is so bright: render or convert it again"
+    _require_none(pixels > _BRIGHTEST, pixels, path, f"above {_BRIGHTEST:g}", bright)
+
+
+def _require_none(
+    is_bad: np.ndarray, pixels: np.ndarray, path: Path, what: str, advice: str
+) -> None:
+    """Refuse an image of which a pixel is bad, with its place."""
     if is_bad.any():
         row, column, channel = (int(i) for i in np.argwhere(is_bad)[0])
         raise SceneError(
-            f"{path} has {int(is_bad.sum())} negative values, the first "
+            f"{path} has {int(is_bad.sum())} values {what}, the first "
             f"{pixels[row, column, channel]} at row {row}, column {column}, channel {channel}; "
-            "light is not negative: clip it, or check the filter that made it"
+            f"{advice}"
         )
 
 
