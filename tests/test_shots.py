@@ -132,6 +132,13 @@ def test_unusable_options_are_refused_before_the_run_is_opened(tmp_path, capsys,
 
 def test_names_of_files_are_all_different():
     assert _stems(["a/b", "a_b", "a_b_2", "..", "/x/"]) == ["a_b", "a_b_2", "a_b_2_2", "view", "x"]
+    assert _stems(["a", "a_rgba", "A", "b_normal", "b"]) == [
+        "a",
+        "a_rgba_2",
+        "A_2",
+        "b_normal",
+        "b_2",
+    ]
 
 
 def rendered():

@@ -39,16 +39,27 @@ class Shot(NamedTuple):
 
 
 def _stems(names: Sequence[str]) -> list[str]:
-    """Turn names of views into names of files, all different."""
+    """Turn names of views into names of files, no two of which share a file.
+
+    Some file systems take small and capital letters for the same, and a view ``a`` has a file
+    ``a_normal.png``, which would be the picture of a view ``a_normal``.
+    """
     stems: list[str] = []
+    taken: set[str] = set()
     for name in names:
         stem = name.replace("/", "_").strip("._") or "view"
         number, unique = 1, stem
-        while unique in stems:
+        while _files(unique) & taken:
             number += 1
             unique = f"{stem}_{number}"
         stems.append(unique)
+        taken |= _files(unique)
     return stems
+
+
+def _files(stem: str) -> set[str]:
+    """Return the stems of all files of a view, in small letters."""
+    return {f"{stem}{ending}".casefold() for ending in ("", "_rgba", *(f"_{a}" for a in AOVS))}
 
 
 def shots_of(views: Views) -> list[Shot]:
