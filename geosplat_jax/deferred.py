@@ -167,7 +167,7 @@ def first_surface(
     across = (x - intrinsics[0, 2]) / intrinsics[0, 0]
     down = (y - intrinsics[1, 2]) / intrinsics[1, 1]
     local = jnp.stack([across, down, jnp.ones_like(across)], axis=-1).reshape(-1, 3)
-    directions = safe_normalize(jnp.einsum("pk,kc->pc", local, rotation))
+    directions = safe_normalize(jnp.einsum("pk,kc->pc", local, rotation, precision="highest"))
     origins = jnp.broadcast_to(camera.centers, directions.shape)
     nowhere = jnp.full(mask.shape, -1, jnp.int32)
     distance, faces = index.nearest(origins, directions, nowhere, mask)

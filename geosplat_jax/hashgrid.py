@@ -375,7 +375,7 @@ def init_mlp(key: Key[Array, ""], widths: tuple[int, ...], *, bias: bool) -> tup
 def apply_mlp(layers: tuple[Layer, ...], x: Float[Array, "N I"]) -> Float[Array, "N O"]:
     """Evaluate an MLP with rectified hidden layers and a linear output."""
     for index, layer in enumerate(layers):
-        x = x @ layer.weights
+        x = jnp.matmul(x, layer.weights, precision="highest")
         if layer.bias is not None:
             x = x + layer.bias[None, :]
         if index + 1 < len(layers):

@@ -25,6 +25,7 @@ __all__ = [
     "ball_of_one_material",
     "double_precision",
     "look_at_poses",
+    "operations",
     "shared_path",
     "sphere_dataset",
     "sphere_views",
@@ -214,3 +215,20 @@ def ball_of_one_material(config, *, albedo, roughness, metallic, radius=0.4, sta
         params, config.material, albedo=albedo, roughness=roughness, metallic=metallic
     )
     return pipeline, params
+
+
+def operations(name, function, *arguments):
+    """Operations of a name in a program, those of its inner programs included."""
+    found = []
+
+    def walk(jaxpr):
+        for equation in jaxpr.eqns:
+            if equation.primitive.name == name:
+                found.append(equation)
+            for value in jax.tree.leaves(list(equation.params.values())):
+                inner = getattr(value, "jaxpr", value)
+                if hasattr(inner, "eqns"):
+                    walk(inner)
+
+    walk(jax.make_jaxpr(function)(*arguments).jaxpr)
+    return found

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from support import ball, tiny_config
+from support import ball, operations, tiny_config
 
 from geosplat_jax.core.types import Box, EnvLight, Materials, SurfacePoints
 from geosplat_jax.fit.train import Trained
@@ -154,23 +154,6 @@ def test_the_split_sum_of_a_lambertian_is_its_diffuse_part(scene):
     np.testing.assert_array_equal(baked.rgb, materials.albedo)
 
 
-def keys_used(function):
-    """Operations of a program, inner ones included, that draw random bits."""
-    found = []
-
-    def walk(jaxpr):
-        for equation in jaxpr.eqns:
-            if equation.primitive.name == "random_bits":
-                found.append(equation)
-            for value in jax.tree.leaves(list(equation.params.values())):
-                inner = getattr(value, "jaxpr", value)
-                if hasattr(inner, "eqns"):
-                    walk(inner)
-
-    walk(jax.make_jaxpr(function)().jaxpr)
-    return found
-
-
 def test_monte_carlo_draws_nothing_for_a_lobe_that_is_not_there(scene):
     points, materials, light = scene
     counts, sampler = SampleCounts(light=3, diffuse=2, specular=4), light_sampler(light)
@@ -190,7 +173,7 @@ def test_monte_carlo_draws_nothing_for_a_lobe_that_is_not_there(scene):
     np.testing.assert_array_equal(found.specular_light, 0.0)
     assert float(jnp.min(expected.specular)) > 0
     # Two keys make numbers: of the light and the cosine, and of the lobe.
-    counted = [len(keys_used(lambda m=m: shade(m))) for m in (both, materials)]
+    counted = [len(operations("random_bits", lambda m=m: shade(m))) for m in (both, materials)]
     assert counted == [2, 1]
 
 

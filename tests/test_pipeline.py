@@ -7,7 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import MONTE_CARLO, ball, double_precision, sphere_views, tiny_config, views_from
+from support import (
+    MONTE_CARLO,
+    ball,
+    double_precision,
+    operations,
+    sphere_views,
+    tiny_config,
+    views_from,
+)
 
 from geosplat_jax.core.capacity import Capacities, fits, grow, overflowed
 from geosplat_jax.core.types import Batch, EnvLight
@@ -94,6 +102,20 @@ def stage(request):
 @pytest.fixture(scope="module")
 def second():
     return problem()
+
+
+@pytest.mark.parametrize(
+    ("stage", "domain"), [("split_sum", "per_pixel"), ("monte_carlo", "per_splat")]
+)
+def test_every_matrix_product_of_a_step_is_of_full_precision(stage, domain):
+    """GPUs multiply with 10 bits unless told otherwise, and positions would be a pixel off."""
+    _, pipeline, params, batch = problem(f"stages.{stage}.domain.kind={domain}", stage=stage)
+    step = jax.value_and_grad(pipeline.loss, has_aux=True)
+    products = operations("dot_general", step, params, batch)
+    assert products
+    assert {product.params["precision"] for product in products} == {
+        (jax.lax.Precision.HIGHEST, jax.lax.Precision.HIGHEST)
+    }
 
 
 def test_the_total_is_the_weighted_sum_of_every_term_that_has_a_weight(stage):

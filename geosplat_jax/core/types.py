@@ -95,7 +95,7 @@ class Camera(eqx.Module):
     def centers(self) -> Float[Array, "V 3"]:
         """Camera positions in the world, (V, 3)."""
         rotation, translation = self.world_to_camera[:, :3, :3], self.world_to_camera[:, :3, 3]
-        return -jnp.einsum("vji,vj->vi", rotation, translation)
+        return -jnp.einsum("vji,vj->vi", rotation, translation, precision="highest")
 
     @property
     def count(self) -> int:

@@ -108,7 +108,9 @@ def project(
     """
     fx, fy, cx, cy = (intrinsics[i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     rotation = world_to_camera[:3, :3]
-    camera_means = means @ rotation.T + world_to_camera[None, :3, 3]
+    # GPUs multiply matrices with 10 bits unless told otherwise, which would be a pixel.
+    turned = jnp.matmul(means, rotation.T, precision="highest")
+    camera_means = turned + world_to_camera[None, :3, 3]
     depths = camera_means[:, 2]
     is_in_front = depths > near
     inverse_depth = 1.0 / jnp.where(is_in_front, depths, 1.0)

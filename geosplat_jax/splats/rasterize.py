@@ -118,7 +118,7 @@ def _reference_composite(
     alpha = jnp.where(raw >= MIN_ALPHA, jnp.minimum(raw, MAX_ALPHA), 0.0)
     after = jnp.cumprod(1.0 - alpha, axis=0)
     before = jnp.concatenate([jnp.ones_like(after[:1]), after[:-1]])
-    image = jnp.einsum("mp,mc->pc", alpha * before, features)
+    image = jnp.einsum("mp,mc->pc", alpha * before, features, precision="highest")
     coverage = 1.0 - jnp.prod(1.0 - alpha, axis=0)
     return image.reshape(height, width, -1), coverage.reshape(height, width)
 

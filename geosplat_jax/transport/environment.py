@@ -255,7 +255,7 @@ def downsample_light(light: EnvLight, *, factor: int) -> EnvLight:
     weights = texel_solid_angles(height, width)[:, 0].astype(light.radiance.dtype)
     weights = weights.reshape(height // factor, factor)
     weights = weights / (jnp.sum(weights, axis=1, keepdims=True) * factor)
-    return EnvLight(jnp.einsum("iajbc,ia->ijc", blocks, weights))
+    return EnvLight(jnp.einsum("iajbc,ia->ijc", blocks, weights, precision="highest"))
 
 
 def ggx_lobe(cosine: np.ndarray, roughness: float) -> np.ndarray:
@@ -381,7 +381,7 @@ def prefilter(
     zonal = operators.zonal.astype(radiance.dtype)
     if diffuse_only:
         zonal = zonal[:, -height:]
-    filtered = jnp.einsum("moi,imc->mco", zonal, parts)  # (M, 6, K*H)
+    filtered = jnp.einsum("moi,imc->mco", zonal, parts, precision="highest")  # (M, 6, K*H)
     filtered = jax.lax.complex(filtered[:, :3], filtered[:, 3:])
     rows = jnp.fft.irfft(filtered, n=width, axis=0)  # (W, 3, K*H)
     levels = rows.reshape(width, 3, -1, height).transpose(2, 3, 0, 1)
