@@ -14,6 +14,7 @@ import os
 import shutil
 import time
 from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -193,7 +194,10 @@ def _tried(trials: "_Trials", part: Part, kept: Collection[str], wanted: Collect
     note = f"with {', '.join(brought)}" if brought else ""
     found = compare(larger, smaller, trials.blocks)
     if found.is_kept:
-        smaller += [trials.decibels(kept, seed) for seed in range(1, trials.how.seeds)]
+        for seed in range(1, trials.how.seeds):
+            # A seed whose training fails says nothing of the others.
+            with suppress(TrainingError):
+                smaller.append(trials.decibels(kept, seed))
         found = compare(larger, smaller, trials.blocks)
     after = float(np.mean(larger))
     return Rung(part.name, part.title, before, after, found, found.is_kept, note)

@@ -563,7 +563,8 @@ def train(
     used = folder.seconds_used() if goes_on else 0.0
     pacer = None
     if budget is not None:
-        pacer = _pacer(budget, dataset, config, began=started - used)
+        planned = folder.planned() if goes_on else config
+        pacer = _pacer(budget, dataset, planned, began=started - used)
     previews = _Previews(dataset, folder, pacer)
     try:
         fit(

@@ -354,6 +354,10 @@ def assert_same(first, second):
     jax.tree.map(np.testing.assert_array_equal, first, second)
 
 
+def rows_of(model):
+    return model.band.cell_rows, model.band.vertex_rows
+
+
 def advanced(loop, steps):
     for _ in range(steps):
         loop.prepare(loop.step)
@@ -379,18 +383,22 @@ def test_between_two_steps_the_band_follows_with_all_that_adam_keeps(dataset, fo
     assert_same(loop.state.optimizer.nu.geometry, following.carried(before.optimizer.nu.geometry))
     # What is no part of the shape stays as it is.
     assert_same(loop.state.optimizer.mu.light, before.optimizer.mu.light)
-    rows = [(model.band.cell_rows, model.band.vertex_rows) for model in (first, loop.surface)]
-    has_grown = rows[0] != rows[1]
+    has_grown = rows_of(first) != rows_of(loop.surface)
     assert len(compiled) == count + has_grown
 
 
 def test_a_run_that_goes_on_from_a_checkpoint_has_the_band_that_it_had(
     dataset, folder, monkeypatch
 ):
-    steps_that_grow(monkeypatch)
+    compiled = steps_that_grow(monkeypatch)
     loop = advanced(new_loop(dataset, CONFIG, folder), 3)
     assert loop.save() is not None
     resumed = resumed_loop(dataset, CONFIG, folder)
+    count = len(compiled)
+    resumed.prepare(resumed.step)
+    # Side by side, and before a step waits for it.
+    assert len(compiled) == count + 1
+    assert resumed.has_compiled
     assert_same(resumed.surface, loop.surface)
     assert_same(resumed.state, loop.state)
     assert_same(resumed.fallback, loop.fallback)
@@ -399,6 +407,19 @@ def test_a_run_that_goes_on_from_a_checkpoint_has_the_band_that_it_had(
         advanced(one, 3)
     assert_same(resumed.surface, loop.surface)
     assert_same(resumed.state, loop.state)
+
+
+def test_a_stage_that_ends_earlier_than_before_an_interruption_leaves_one_end(
+    dataset, folder, monkeypatch
+):
+    """A budget may shorten a stage that had ended already when its process was killed."""
+    steps_that_grow(monkeypatch)
+    loop = new_loop(dataset, CONFIG, folder)
+    for steps in (8, 5):
+        loop.state = replace(loop.state, step=jnp.int32(steps))
+        loop.save_end()
+    ends = list(folder.end_of("split_sum").iterdir())
+    assert [path.name for path in ends] == ["checkpoint_00000005.npz"]
 
 
 def test_the_memory_that_a_band_is_certain_to_take_is_less_than_it_takes(dataset):
@@ -429,12 +450,14 @@ def test_a_stage_that_leaves_the_surface_alone_leaves_the_band_alone(dataset, fo
 
 
 def test_a_surface_that_vanishes_is_put_back_with_its_band(dataset, folder, monkeypatch):
-    steps_that_grow(monkeypatch)
+    compiled = steps_that_grow(monkeypatch)
     loop = new_loop(dataset, CONFIG, folder)
     first = loop.surface
-    advanced(loop, 2)
-    assert loop.surface is not first
-    loop._recover(2)
+    while rows_of(loop.surface) == rows_of(first):
+        advanced(loop, 2)
+    count = len(compiled)
+    loop._recover(loop.step)
+    assert len(compiled) == count + 1
     assert loop.surface is loop.pipeline.surface is first
     assert_same(loop.params.geometry, jax.tree.map(jnp.asarray, loop.fallback.shape))
 

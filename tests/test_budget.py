@@ -10,6 +10,7 @@ import trimesh
 from support import sphere_dataset, tiny_config
 
 from geosplat_jax import cli
+from geosplat_jax import run as run_module
 from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.budget import (
     Pacer,
@@ -401,6 +402,19 @@ def test_a_shortened_run_that_was_stopped_goes_on_with_its_own_settings(dataset,
     assert run.config().total_steps < 40
     state = fit(dataset, run.config(), folder, begin=Resume())
     assert int(state.step) == run.config().total_steps
+
+
+def test_a_resumed_budget_measures_itself_against_what_was_planned(dataset, tmp_path, monkeypatch):
+    config = tiny_config("stages.split_sum.steps=40", "stages.monte_carlo.steps=0")
+    _paced_run(dataset, tmp_path / "run", config, stop_after=12)
+    planned = []
+    true_pacer = run_module.Pacer
+    monkeypatch.setattr(
+        run_module, "Pacer", lambda *a, **k: planned.append(a[1]) or true_pacer(*a, **k)
+    )
+    run = train(dataset, tmp_path / "run", begin=Resume())
+    assert planned == [config]
+    assert run.config.total_steps < 40
 
 
 def test_python_resumes_a_budget_without_naming_settings(dataset, tmp_path):

@@ -4,18 +4,21 @@ import logging
 import threading
 import time
 from dataclasses import replace
+from typing import Any
 
 import jax
 import pytest
 from support import MONTE_CARLO, sphere_dataset, tiny_config
 from test_pipeline import TIGHT, problem
 
+from geosplat_jax.core.types import Batch
 from geosplat_jax.fit import compilation, upcoming
 from geosplat_jax.fit.compilation import compile_step
 from geosplat_jax.fit.runtime import in_background
 from geosplat_jax.fit.stages import update_rule
-from geosplat_jax.fit.step import initial_state, train_step
+from geosplat_jax.fit.step import TrainState, UpdateRule, initial_state, train_step
 from geosplat_jax.fit.train import fit
+from geosplat_jax.pipeline import Pipeline
 
 LARGE = ("_asset", "_view_gradient", "_back", "_update")
 
@@ -62,13 +65,46 @@ def test_a_run_that_stops_early_leaves_no_thread_behind(tmp_path, monkeypatch):
     assert not begun[0].is_alive()
 
 
+NOTHING: Any = [object.__new__(kind) for kind in (TrainState, Batch, Pipeline, UpdateRule)]
+"""Arguments of `compile_step` where nothing looks at them."""
+
+
+class _Program:
+    """Stands for a program of a step; ``seconds`` : that looking at its memory takes."""
+
+    __name__ = "program"
+    out_info = None
+
+    def __init__(self, *, fits, seconds):
+        self.fits, self.seconds = fits, seconds
+
+    def trace(self):
+        return self
+
+    lower = compile = trace
+
+
+def test_one_program_that_does_not_fit_twice_decides_for_all(monkeypatch):
+    """Also where one that fits is looked at for longer, by another thread."""
+
+    def fits_twice(program):
+        time.sleep(program.seconds)
+        return program.fits
+
+    monkeypatch.setattr(compilation, "fits_twice", fits_twice)
+    monkeypatch.setattr(compilation, "require_program_memory", lambda *a: None)
+    programs = [(_Program(fits=True, seconds=0.3),), (_Program(fits=False, seconds=0.01),)]
+    monkeypatch.setattr(compilation, "train_step", lambda *a, run: run.all(*programs))
+    assert not compile_step(*NOTHING)
+
+
 def test_a_compilation_that_fails_is_told(monkeypatch):
     def fails(state, batch, pipeline, rule, *, run):
-        run(jax.jit(lambda x: x + "text"), 1.0)
+        run(jax.jit(lambda x: x + object()), 1.0)
 
     monkeypatch.setattr(compilation, "train_step", fails)
-    with pytest.raises(TypeError):
-        compile_step(None, None, None, None)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match="unsupported operand"):
+        compile_step(*NOTHING)
 
 
 def test_an_error_in_the_background_reaches_who_asks():

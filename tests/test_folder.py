@@ -113,6 +113,25 @@ def test_a_line_that_an_interruption_tore_is_left_out(run):
     assert run.metrics.read_text() == "\n".join(lines[:2]) + "\n"
 
 
+def test_the_time_of_steps_that_are_made_again_stays_known(run):
+    for begun in range(3):  # each time killed before the checkpoint after step 5
+        with run.metrics.open("a") as file:
+            file.writelines(json.dumps({"step": s, "seconds": 2.0}) + "\n" for s in range(1, 5))
+        assert run.seconds_used() == 8.0 * (begun + 1)
+        run.keep_lines_before(1)
+        assert run.seconds_used() == 8.0 * (begun + 1)
+    assert run.metric_lines() == []
+
+
+def test_what_was_planned_stays_known_when_settings_are_amended(run):
+    planned = run.config()
+    assert run.planned() == planned
+    for steps in (7, 5):
+        run.amend(tiny_config(f"stages.split_sum.steps={steps}"))
+        assert run.config().stages[0].steps == steps
+        assert run.planned() == planned
+
+
 def test_an_accident_leaves_what_was_noted_of_the_training(run, monkeypatch):
     run.write_training({"seconds_total": 1.0})
 

@@ -221,6 +221,13 @@ def test_a_part_whose_training_fails_is_left_out_and_says_so(dataset, trainings,
     assert again == chosen
 
 
+def test_a_seed_whose_training_fails_says_nothing(dataset, trainings, tmp_path):
+    trainings.fails = ("specular_metallic_seed_1",)
+    chosen = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
+    assert "specular_metallic_seed_1" in trainings.made
+    assert names_of(chosen) == ["specular", "metallic", "light"]
+
+
 def test_too_few_views_are_refused(trainings, tmp_path):
     few = sphere_dataset(count=16, size=8)
     with pytest.raises(ValueError, match="holds back every 8th of 16 training views"):

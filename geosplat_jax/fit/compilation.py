@@ -44,7 +44,8 @@ class _Compiling(Runner):
                     return
                 compiled = traced.lower().compile()
             require_program_memory(program.__name__.strip("_"), compiled, devices.count_here)
-            self.fits_twice &= is_alone or fits_twice(compiled)
+            if not (is_alone or fits_twice(compiled)):
+                self.fits_twice = False  # nobody sets it again, so threads cannot undo each other
 
         self.compiling.append(in_background(finish))
         return devices.shapes(traced.out_info)

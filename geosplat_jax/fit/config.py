@@ -246,6 +246,11 @@ class Config:
             raise ValueError(
                 f"stages.{stage.name}.splats: {stage.splats.kind} splats need a stage before"
             )
+        if stage.vertex_fraction:
+            raise ValueError(
+                f"stages.{stage.name}.vertex_fraction: {stage.splats.kind} splats are no samples "
+                "of vertices or faces; set it to 0"
+            )
         moving = sorted(set(self.geometry.rate_groups) - set(stage.frozen))
         if moving:
             raise ValueError(

@@ -20,7 +20,7 @@ import json
 import os
 import platform
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -74,6 +74,11 @@ class _Reading:
     """File of refined cameras."""
     cameras_digest: str | None = None
     """What the file held."""
+
+
+def _seconds(lines: Iterable[dict[str, Any]]) -> float:
+    """Add up what steps took."""
+    return sum((float(line.get("seconds", 0.0)) for line in lines), 0.0)
 
 
 def _known_of(options: Any) -> Any:
@@ -208,7 +213,15 @@ class RunFolder:
         RunError
             If there is no run, or its settings are not those of this version.
         """
-        values = self.record()["config"]
+        return self._settings(self.record()["config"])
+
+    def planned(self) -> Config:
+        """Read the settings that the run began with, before `amend`; see `config`."""
+        record = self.record()
+        return self._settings(record.get("planned", record["config"]))
+
+    def _settings(self, values: Any) -> Config:
+        """Read settings of the record."""
         try:
             return config_from_dict(values)
         except ValueError as error:
@@ -260,8 +273,18 @@ class RunFolder:
         return self.exists and "model" in self.record()
 
     def seconds_used(self) -> float:
-        """Add up what the steps took that are in ``metrics.jsonl``."""
-        return sum((float(line.get("seconds", 0.0)) for line in self.metric_lines()), 0.0)
+        """Add up what all steps took, those too that were made in vain, see `keep_lines_before`.
+
+        Raises
+        ------
+        RunError
+            If the record or the metrics are damaged.
+        """
+        try:
+            lost = float(self.record().get("seconds_lost", 0.0)) if self.exists else 0.0
+        except (TypeError, ValueError):
+            raise RunError(f"{self._record_path} is damaged: seconds_lost") from None
+        return lost + _seconds(self.metric_lines())
 
     def begin(
         self,
@@ -336,8 +359,10 @@ class RunFolder:
                 )
 
     def amend(self, config: Config) -> None:
-        """Record other settings, which a training has come to on its way."""
-        self._write_record({**self.record(), "config": config.to_dict()})
+        """Record other settings, which a training has come to on its way; see `planned`."""
+        record = self.record()
+        planned = record.get("planned", record["config"])
+        self._write_record({**record, "planned": planned, "config": config.to_dict()})
 
     def _write_record(self, record: dict[str, Any]) -> None:
         """Replace ``run.json`` in one go."""
@@ -397,9 +422,12 @@ class RunFolder:
             table.writerows(rows)
 
     def keep_lines_before(self, step: int) -> None:
-        """Drop the metrics of steps that a checkpoint does not contain."""
+        """Drop the metrics of steps that a checkpoint does not contain; their time stays known."""
         if self.metrics.exists():
-            lines = [line for line in self.metric_lines() if line["step"] < step]
+            used, everything = self.seconds_used(), self.metric_lines()
+            lines = [line for line in everything if line["step"] < step]
+            if len(lines) < len(everything) and self.exists:
+                self._write_record({**self.record(), "seconds_lost": used - _seconds(lines)})
             aside = self.metrics.with_suffix(".partial")
             aside.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
             os.replace(aside, self.metrics)

@@ -91,8 +91,9 @@ class Loop:
     `windows.around_object`. ``upcoming`` is the next stage, once it is near; ``to_come`` is what a
     checkpoint said of it. ``peak`` is the largest need of every buffer since these were last looked
     at, ``peak_before`` that of the time before. ``has_compiled`` is set by whatever compiles, and
-    reset by whoever measures time; ``fits_twice`` is what `compile_step` says; ``on_compile`` is
-    called with the stage's name before anything compiles that a step waits for.
+    reset by whoever measures time; ``is_compiled`` is not reset. ``fits_twice`` is what
+    `compile_step` says; ``on_compile`` is called with the stage's name before anything compiles
+    that a step waits for.
     """
 
     config: Config
@@ -112,6 +113,7 @@ class Loop:
     last_checkpoint: Path | None = None
     upcoming: Upcoming | None = None
     has_compiled: bool = False
+    is_compiled: bool = False
     fits_twice: bool = False
     to_come: NextStage | None = None
     on_compile: Callable[[str], None] | None = None
@@ -170,7 +172,12 @@ class Loop:
 
     def save_end(self) -> None:
         """Keep the state as what the stage ended with, on the first host."""
-        self._saved(self.folder.end_of(self.stage.name), keep=1)
+        folder = self.folder.end_of(self.stage.name)
+        path = self._saved(folder, keep=1)
+        # A stage that was longer before its training was interrupted has ended once already.
+        for other in folder.glob("checkpoint_*") if path is not None else ():
+            if other != path:
+                other.unlink()
 
     def _saved(self, folder: Path, **options: int) -> Path | None:
         """Write a checkpoint into a folder; None on other hosts than the first."""
@@ -200,6 +207,9 @@ class Loop:
             planned = self.devices.together(lambda: self._planned(known))
             sizes = self.devices.first_host(dict(planned))
             self.pipeline = replace(self.pipeline, capacities=Capacities(**sizes))
+            self._compile(step)
+        elif not self.is_compiled:  # resumed: all is planned, but nothing is compiled
+            self._announce()
             self._compile(step)
         following = self._following(step)
         if following is not None and self.upcoming is None:
@@ -270,7 +280,7 @@ class Loop:
         batch, rule = self._inputs(step)
         devices = self.devices
         self.fits_twice = compile_step(self.state, batch, self.pipeline, rule, devices=devices)
-        self.has_compiled = True
+        self.has_compiled = self.is_compiled = True
 
     def _inputs(self, step: int) -> tuple[Batch | SharedBatch, UpdateRule]:
         """Return the views of a step, dealt out to the devices, and how far it goes."""
@@ -347,12 +357,17 @@ class Loop:
         params = replace(params, geometry=following.shape)
         self.state = self.devices.place(replace(state, params=params, optimizer=optimizer))
         self._put_surface(following.model)
-        if _sizes(params.geometry) != sizes:
-            if self.upcoming is not None:
-                self.upcoming.abandon()
-            # What was planned ahead is of other sizes.
-            self.upcoming = self.to_come = None
-            self._recompile(step)
+        self._recompile_for_shape(sizes, step)
+
+    def _recompile_for_shape(self, sizes: list[tuple[int, ...]], step: int) -> None:
+        """Compile where the shape's arrays had other ``sizes`` before."""
+        if _sizes(self.params.geometry) == sizes:
+            return
+        if self.upcoming is not None:
+            self.upcoming.abandon()
+        # What was planned ahead is of other sizes.
+        self.upcoming = self.to_come = None
+        self._recompile(step)
 
     def _put_surface(self, surface: SurfaceModel) -> None:
         """Go on with another surface."""
@@ -398,10 +413,12 @@ class Loop:
                 f"rates: {self._lower()}."
             )
         self.recoveries += 1
+        sizes = _sizes(self.params.geometry)
         shape = jax.tree.map(jnp.asarray, self.fallback.shape)
         params, carry = replace(self.params, geometry=shape), self.devices.local(self.state.carry)
         self._put_surface(self.fallback.surface)
         self.state = self.devices.place(initial_state(params, step=self.step, carry=carry))
+        self._recompile_for_shape(sizes, step)
 
 
 def _sizes(shape: Any) -> list[tuple[int, ...]]:
