@@ -3,7 +3,8 @@
 Both models are measured on the same views, in decibels. What makes one view harder than another is
 the same for both and cancels in the difference of each view, so gains are *paired*. Views beside
 each other see the same part of the object and err alike: they count as one block. And a training
-repeated with another seed ends elsewhere: a gain has to be larger than that.
+repeated with another seed ends elsewhere: a gain has to be larger than what two seeds differ by in
+their standard deviation, which is a low hurdle (docs/models.md).
 """
 
 import math
