@@ -246,14 +246,15 @@ def image_l1(images: Comparison) -> Float[Array, ""]:
 def image_dissimilarity(images: Comparison) -> Float[Array, ""]:
     """One minus the structural similarity of the images (Eq. 13).
 
-    Pixels that do not count are black in both images, hence equal; the mean is over the others.
+    The mean is over the windows all of whose pixels count, as for an image that ends there.
     """
     predicted, target, valid = images.predicted, images.target, images.valid
     if valid is None:
         return 1.0 - jnp.mean(jax.vmap(ssim)(predicted, target))
-    weights = valid[..., None]
-    unlike = 1.0 - jnp.mean(jax.vmap(ssim)(predicted * weights, target * weights))
-    return safe_divide(unlike, jnp.mean(valid))
+    # Whatever the others hold, it must not reach the sums, not even as a NaN.
+    predicted, target = (jnp.where(valid[..., None] > 0, x, 0.0) for x in (predicted, target))
+    each = jax.vmap(lambda a, b, counts: ssim(a, b, valid=counts))(predicted, target, valid)
+    return 1.0 - jnp.mean(each)
 
 
 def mask_error(images: Comparison) -> Float[Array, ""]:

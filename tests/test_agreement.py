@@ -39,6 +39,16 @@ def test_one_wrong_mask_is_named_and_no_other(views, kind):
     assert "view_5 (" in line
 
 
+def test_pixels_that_do_not_count_contradict_nobody(views):
+    """Nothing counts in the lower part of every second view; the mask there is empty."""
+    valid = np.ones(views.images.shape[:3], np.float32)
+    valid[::2, 20:] = 0.0
+    images = np.array(views.images)
+    images[valid == 0] = 0.0
+    shares = agreement(replace(views, images=images, valid=valid), BOX)
+    assert shares.min() > 0.97
+
+
 def test_one_wrong_pose_is_named(views):
     poses = views.camera_to_world.copy()
     poses[3, :3, 3] += 0.5 * poses[3, :3, 0]

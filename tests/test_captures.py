@@ -13,8 +13,8 @@ from support import shared_path, tiny_config
 
 from geosplat_jax import cli
 from geosplat_jax.fit.train import fit
-from geosplat_jax.io.dataset import choose_downscale, describe, load_dataset
-from geosplat_jax.io.images import MissingFileError, SceneError, write_exr, write_png
+from geosplat_jax.io.dataset import choose_downscale, describe, load_dataset, photograph_size
+from geosplat_jax.io.images import MissingFileError, SceneError, read_image, write_exr, write_png
 from geosplat_jax.io.layouts.colmap import list_colmap, read_points
 from geosplat_jax.io.views import ViewLight
 from geosplat_jax.report.relight import load_view_light
@@ -351,6 +351,11 @@ def test_images_are_reduced_to_half_a_cell(scenes):
     # Half the box has half the cells for the same size.
     half = (middle - 0.25 * (hi - lo), middle + 0.25 * (hi - lo))
     assert choose_downscale(root, 1, bounds=half) == choose_downscale(root, 2)
+    # Of other options it takes those that tell how to read the scene.
+    assert choose_downscale(root, 2, train_views=4, test_views=1) == choose_downscale(root, 2)
+    for chosen in (choose_downscale, photograph_size):
+        with pytest.raises(SceneError, match="layout must be one of"):
+            chosen(root, *([2] if chosen is choose_downscale else []), layout="nope")
 
 
 def test_the_size_that_was_chosen_is_said(scenes, capsys):
@@ -403,6 +408,42 @@ def test_images_with_alpha_need_no_masks_and_leave_those_that_are_there(tmp_path
     np.testing.assert_array_equal(again.train.images, dataset.train.images)
     said = "train: 1 mask files are not read: their images have an alpha, view_04.png for one"
     assert said in again.warnings
+
+
+def test_an_alpha_that_is_one_in_all_photographs_cuts_nothing_out(tmp_path):
+    """Screenshots and converters write one; a single photograph may be filled by the object."""
+    write_transforms(tmp_path, masks=None)
+    for path in (tmp_path / "images").iterdir():
+        write_png(path, np.concatenate([read_image(path), np.ones((*size(path), 1))], -1))
+    dataset = load(tmp_path)
+    assert not dataset.train.has_masks
+    assert any("no masks" in warning for warning in dataset.warnings)
+    write_transforms(tmp_path, masks=None, rgba=True)
+    path = tmp_path / "images" / "view_04.png"
+    write_png(path, np.concatenate([read_image(path)[..., :3], np.ones((*size(path), 1))], -1))
+    assert load(tmp_path).train.has_masks
+
+
+def size(path):
+    return read_image(path).shape[:2]
+
+
+def test_masks_of_dtu_belong_to_the_images_by_number(copied):
+    root = copied("idr")
+    expected = load(root).train
+    for number, path in enumerate(sorted((root / "mask").iterdir())):
+        path.rename(path.with_name(f"m{number:03d}.png"))
+    found = load(root).train
+    assert found.has_masks
+    np.testing.assert_array_equal(found.images, expected.images)
+    (root / "mask" / "m003.png").unlink()
+    refuses(root, "has 9 masks for 10 images")
+
+
+def test_hidden_files_are_no_images(copied):
+    root = copied("idr")
+    (root / "image" / "._00.png").write_bytes(b"of a system that keeps its notes so")
+    assert len(load(root).train) + len(load(root).test) == COUNT
 
 
 def test_pixels_that_do_not_count_are_apart_from_the_mask(copied):

@@ -327,6 +327,23 @@ def test_relit_views_have_colour_and_alpha(scenes, layout, gains):
         np.testing.assert_allclose(found, gain * RADIANCE, atol=2 * STEP)
 
 
+@pytest.mark.parametrize("factor", [2, 4])
+def test_relit_views_without_alpha_are_reduced_as_those_with_it(scenes, tmp_path, factor):
+    """Their background, here white, must not be averaged into the rim."""
+    root = shutil.copytree(scenes["synthetic4relight"], tmp_path / "ball")
+    alphas = [read_image(path)[..., 3:] for path in sorted((root / "test").glob("*_rgba.png"))]
+    relit = []
+    for with_alpha in (True, False):
+        for number, alpha in enumerate(alphas):
+            path = root / "test_rli" / f"envmap6_{number:03d}.png"
+            color = np.where(alpha > 0, read_image(path)[..., :3], 1.0)
+            write_png(path, np.concatenate([color, alpha], -1) if with_alpha else color)
+        relit.append(load(root, downscale=factor).test.relight["envmap6"])
+    np.testing.assert_allclose(relit[1], relit[0], atol=1e-5)
+    rim = (relit[0][..., 3] > 0) & (relit[0][..., 3] < 1)
+    assert rim.any()
+
+
 def test_environment_maps_and_lights_are_found(scenes):
     tensoir = load(scenes["tensoir"])
     assert tensoir.train_light == "noon"

@@ -274,6 +274,7 @@ def test_a_usd_is_the_mesh_of_the_glb_and_its_material_reads_the_textures(tmp_pa
     prim = stage.GetDefaultPrim().GetChild("Mesh")
     mesh = UsdGeom.Mesh(prim)
     assert mesh.GetSubdivisionSchemeAttr().Get() == "none"
+    assert mesh.GetDoubleSidedAttr().Get() is False
     np.testing.assert_allclose(mesh.GetPointsAttr().Get(), glb.vertices, atol=1e-6)
     np.testing.assert_allclose(mesh.GetNormalsAttr().Get(), glb.vertex_normals, atol=1e-5)
     corners = np.asarray(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)

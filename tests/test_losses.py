@@ -138,6 +138,18 @@ def test_where_all_pixels_count_a_mask_of_them_changes_nothing():
     np.testing.assert_allclose(every, none, rtol=ROUNDING)
 
 
+def test_similarity_of_a_part_is_that_of_an_image_which_ends_there():
+    a, b = (uniform(seed, 1, 40, 30, 3) for seed in (1, 2))
+    valid = jnp.zeros((1, 40, 30)).at[:, 3:27, 5:28].set(1.0)
+    zeros = jnp.zeros((1, 40, 30))
+    found, cropped = (
+        image_dissimilarity(Comparison(x, y, zeros, zeros, v, jnp.zeros(())))
+        for x, y, v in ((a, b, valid), (a[:, 3:27, 5:28], b[:, 3:27, 5:28], None))
+    )
+    assert float(found) == pytest.approx(float(cropped), rel=1e-4)
+    assert float(found) > 0.5
+
+
 def test_the_mean_is_over_the_pixels_that_count():
     valid = jnp.zeros(SHAPE).at[0, 3, 4].set(1.0)
     images = comparison(valid)

@@ -294,7 +294,8 @@ def test_figures_have_names_and_units(key, group, label, unit, better):
 
 
 def test_the_command_of_the_report_makes_the_same_settings():
-    overrides = ("stages.split_sum.steps=5", "run.seed=3", "adapter.thickness=1e-5")
+    overrides = ("stages.split_sum.steps=5", "run.seed=3", "adapter.thickness=1e-5",
+                 "stages.split_sum.weights.entropy.end=none")  # fmt: skip
     config = make_config("default", "draft", overrides=overrides)
     assert set(changed_from_preset(config)) == {text.split("=")[0] for text in overrides}
     record = {"scene": "/a b", "dataset": {"downscale": 2, "light": "x y", "bounds": None}}
@@ -305,6 +306,10 @@ def test_the_command_of_the_report_makes_the_same_settings():
     assert "'/a b'" in text
     assert "--light 'x y'" in text
     assert "--bounds" not in text
+    # What no option of the command says is not left out without a word.
+    for more in ({"train_views": 4}, {"layout": "colmap"}, {"mask_files": False}):
+        reading = {**record["dataset"], **more}
+        assert not command({**record, "dataset": reading}, config)[1]
 
 
 def test_settings_between_two_levels_are_said_beside_the_standard_ones():

@@ -172,6 +172,17 @@ def test_only_rays_that_hit_go_on_and_each_gets_its_own_light():
         one.followed(plate_points(), wi, hits, None)
 
 
+def test_without_rays_nothing_is_followed_and_rows_that_are_no_points_are_not():
+    wi, hits, distances = ceiling_hits()
+    none = tracer(2).followed(plate_points(), wi[:, :0], hits[:, :0], distances[:, :0])
+    assert none.values.shape == (POINTS, 0, 3)
+    half = jnp.arange(POINTS) < POINTS // 2
+    points = eqx.tree_at(lambda p: p.mask, plate_points(), half)
+    found = tracer(2).followed(points, wi, hits, distances).values
+    np.testing.assert_array_equal(found[POINTS // 2 :], 0.0)
+    assert float(jnp.max(found[: POINTS // 2])) > 0
+
+
 def test_what_is_differentiated_at_later_vertices_is_a_setting(paths):
     legs, wo, real = paths
     base = tracer(1)

@@ -94,6 +94,12 @@ def test_photographs_of_one_name_are_refused(tmp_path):
     refuses(tmp_path, "2 photographs in .* are named '03'")
 
 
+def test_names_that_colmap_cannot_match_are_refused(tmp_path):
+    photographs(tmp_path, 6)
+    (tmp_path / "images" / "03.png").rename(tmp_path / "images" / "03 2.png")
+    refuses(tmp_path, "1 photographs in .* '03 2.png' for one.*rename them")
+
+
 def test_cameras_that_are_there_are_not_replaced(tmp_path):
     photographs(tmp_path, 6)
     model = tmp_path / "sparse" / "0" / "images.bin"

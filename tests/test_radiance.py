@@ -29,6 +29,7 @@ from geosplat_jax.io.images import encode_srgb
 from geosplat_jax.io.views import Views
 from geosplat_jax.splats.radiance import RadianceSplats, colors_seen_from, render_radiance
 from geosplat_jax.splats.relocation import (
+    _drawn_rows,
     exploring_noise,
     shared_opacity,
     shared_scale_factor,
@@ -228,6 +229,14 @@ def test_dead_splats_go_to_live_ones_in_proportion_to_their_opacity():
     assert float(moved.opacity_logits[first]) == float(moved.opacity_logits[0])
 
 
+def test_rows_without_weight_are_never_drawn():
+    """A hundred thousand of them: sums in float32 grow there, and fall elsewhere."""
+    rng = np.random.default_rng(0)
+    weights = jnp.asarray(rng.uniform(size=300_000) * (rng.uniform(size=300_000) > 0.3), "f4")
+    drawn = jax.jit(_drawn_rows, static_argnums=2)(weights, jax.random.key(0), 300_000)
+    assert float(jnp.min(weights[drawn])) > 0
+
+
 def test_nothing_is_relocated_where_nothing_lives():
     splats = replace(some_splats(ROWS), opacity_logits=jnp.full((ROWS,), -9.0))
     everywhere = jnp.ones((ROWS,), bool)
@@ -383,6 +392,20 @@ def test_random_points_are_seen_with_their_colour():
     shown = encode_srgb(views.images[np.arange(len(views))[:, None], row, column, :3])
     differs = np.abs(shown - points.colors).max(-1)
     np.testing.assert_allclose(np.where(seen, differs, np.inf).min(0), 0.0, atol=ROUNDING)
+
+
+def test_random_points_come_from_pixels_that_count():
+    views = scene_views()
+    images = np.array(views.images)
+    images[..., :3] = 1.0
+    valid = np.ones(images.shape[:3], np.float32)
+    valid[:, :, views.width // 2 :] = 0.0
+    valid[0] = 0.0
+    images[valid == 0] = 0.0
+    points = random_points(
+        replace(views, images=images, valid=valid), 300, np.random.default_rng(0)
+    )
+    np.testing.assert_allclose(points.colors, 1.0, atol=ROUNDING)
 
 
 def test_points_come_first_and_are_as_large_as_their_neighbours_are_far():

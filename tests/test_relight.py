@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 from PIL import Image
 from support import ball_of_one_material, tiny_config, views_from
@@ -286,9 +287,20 @@ def test_radiance_that_is_not_radiance_is_refused(tmp_path, monkeypatch, value):
     pixels = np.ones((4, 8, 3), np.float32)
     pixels[1, 2, 0] = value
     path = tmp_path / "any.exr"
-    monkeypatch.setattr("geosplat_jax.io.images.read_stored", lambda path: pixels.copy())
+    monkeypatch.setattr("geosplat_jax.report.relight.read_stored", lambda path: pixels.copy())
     with pytest.raises(SceneError, match=r"any\.exr has 1 .*values.* row 1, column 2, channel 0"):
         load_light(path)
+
+
+def test_alpha_of_a_map_means_nothing(tmp_path):
+    pixels = np.full((4, 8, 4), 2.0, np.float32)
+    pixels[..., 3] = 0.0
+    path = str(tmp_path / "map.exr")
+    sink = oiio.ImageOutput.create(path)
+    assert sink.open(path, oiio.ImageSpec(8, 4, 4, oiio.FLOAT))
+    assert sink.write_image(pixels)
+    assert sink.close()
+    np.testing.assert_array_equal(load_light(tmp_path / "map.exr").radiance, 2.0)
 
 
 def test_a_black_light_is_told(tmp_path):

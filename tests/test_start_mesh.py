@@ -1,11 +1,13 @@
 """Meshes to start from: what is cleaned, what is refused, and that the cameras have a say."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
-from support import sphere_views
+from support import look_at_poses, sphere_views
 
-from geosplat_jax.io import start_mesh
+from geosplat_jax.io import export, start_mesh
 from geosplat_jax.io.meshes import (
     longest_edge,
     nondegenerate,
@@ -22,6 +24,7 @@ from geosplat_jax.io.start_mesh import (
     read_start,
     sized,
 )
+from geosplat_jax.io.views import Views
 
 RADIUS = 0.5  # of the ball that the views show
 
@@ -158,6 +161,53 @@ def test_a_mesh_beside_the_object_is_refused(tmp_path, views, move):
     path = written(tmp_path, vertices + np.array(move), faces)
     with pytest.raises(ValueError, match="bring it into the axes, the place and the units"):
         fit_to(path, views)
+
+
+def test_pixels_that_do_not_count_say_nothing_against_a_mesh(views):
+    points = RADIUS * trimesh.creation.icosphere(subdivisions=4).vertices
+    valid = np.ones(views.images.shape[:3], np.float32)
+    valid[:, :16] = 0.0
+    images = np.array(views.images)
+    images[valid == 0] = 0.0
+    found = agreement_with_views(points, replace(views, images=images, valid=valid))
+    assert found > 0.8 * agreement_with_views(points, views)
+
+
+def test_our_own_obj_and_what_else_says_so_is_turned_from_y_up(tmp_path):
+    vertices, faces = ball()
+    vertices = vertices * [1.0, 2.0, 3.0]
+    path = tmp_path / "mesh.obj"
+    export.export_mesh_glb(
+        tmp_path / "mesh.glb", vertices, faces.astype(np.int32), np.ones_like(vertices),
+        lambda p: (np.full((len(p), 3), 0.5), np.full(len(p), 0.5), np.zeros(len(p))),
+        texture_size=64, obj_path=path,
+    )  # fmt: skip
+    assert "turned from y-up axes to z-up ones" in read(str(path)).notes
+    np.testing.assert_allclose(np.ptp(read(str(path)).vertices, axis=0), np.ptp(vertices, axis=0))
+
+
+def test_a_mesh_with_y_up_that_does_not_say_so_is_refused_with_the_cure(tmp_path):
+    vertices, faces = ball(3, radius=0.2)
+    tall = vertices * [1.0, 1.0, 8.0]
+    points = look_at_poses(6)
+    rows = np.arange(64) + 0.5
+    images = np.zeros((6, 64, 64, 4), np.float32)
+    lens = np.array([[60.0, 0, 32], [0, 60, 32], [0, 0, 1]])
+    views = Views(
+        names=tuple(map(str, range(6))), camera_to_world=points,
+        intrinsics=np.repeat(lens[None], 6, 0), images=images,
+    )  # fmt: skip
+    for number in range(6):
+        pose = views.world_to_camera[number]
+        dense = 0.2 * trimesh.creation.icosphere(subdivisions=5).vertices * [1.0, 1.0, 8.0]
+        local = dense @ pose[:3, :3].T + pose[:3, 3]
+        pixel = (local @ lens.T)[:, :2] / local[:, 2:]
+        column, row = np.clip(pixel.astype(int), 0, len(rows) - 1).T
+        images[number, row, column] = 1.0
+    assert fit_to(written(tmp_path, tall, faces), views).is_closed
+    lying = written(tmp_path, to_gltf_axes(tall), faces, "lying.ply")
+    with pytest.raises(ValueError, match="turned from y-up axes to z-up ones it would"):
+        fit_to(lying, views)
 
 
 def test_agreement_falls_with_the_size_to_either_side(views):

@@ -86,13 +86,16 @@ def command_line() -> argparse.ArgumentParser:
 
 def _command(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
     """Add a command; its help ends with an example."""
-    return commands.add_parser(
+    parser = commands.add_parser(
         name,
         help=text,
         description=f"{text[0].upper()}{text[1:]}.",
         epilog=f"example:\n  geosplat-jax {EXAMPLES[name]}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    # By itself argparse takes -1e-5 for an option; commands and reports print such numbers.
+    parser._negative_number_matcher = _NEGATIVE_NUMBER
+    return parser
 
 
 def _add_white_balance(parser: argparse.ArgumentParser) -> None:
@@ -466,8 +469,6 @@ def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
         "what the grid's cells can resolve",
     )
     parser.add_argument("--light", help="training light, where a scene has several")
-    # By itself argparse takes -1e-5 for an option; `info` and reports print such numbers.
-    parser._negative_number_matcher = _NEGATIVE_NUMBER
     parser.add_argument(
         "--bounds",
         type=float,

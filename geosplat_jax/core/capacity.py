@@ -240,4 +240,5 @@ def bit_set(mask: Bool[Array, " n"]) -> BitSet:
     bits = jnp.pad(mask, (0, -mask.shape[0] % 32)).reshape(-1, 32).astype(jnp.uint32)
     words = jnp.sum(bits << jnp.arange(32, dtype=jnp.uint32)[None, :], axis=1, dtype=jnp.uint32)
     through = jnp.cumsum(_popcount(words), dtype=jnp.int32)
-    return BitSet(words=words, before=through - _popcount(words), count=through[-1])
+    count = through[-1] if through.size else jnp.zeros((), through.dtype)
+    return BitSet(words=words, before=through - _popcount(words), count=count)

@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from geosplat_jax.core.numerics import safe_divide
+
 WINDOW_SIZE = 11
 """Width of the Gaussian window, pixels (Wang et al. 2004)."""
 
@@ -80,6 +82,7 @@ def ssim(
     image_b: Float[ArrayLike, "H W C"],
     *,
     data_range: float = 1.0,
+    valid: Float[ArrayLike, "H W"] | None = None,
 ) -> Float[Array, ""]:
     """Return the mean structural similarity of two images; 1 where they are equal.
 
@@ -95,6 +98,8 @@ def ssim(
     ----------
     image_a, image_b : (H, W, C) in the same encoding.
     data_range : largest minus smallest value an image may take.
+    valid : pixels that count, 1 or 0; the mean is over the windows all of whose pixels count, and 1
+        where there is none.
 
     Returns
     -------
@@ -117,4 +122,13 @@ def ssim(
     covariance = jnp.clip(mean_product - product, -0.5 * variances, 0.5 * variances)
     similarity = (2 * product + luminance_floor) * (2 * covariance + contrast_floor)
     divisor = (squares + luminance_floor) * (variances + contrast_floor)
-    return jnp.mean(similarity / divisor)
+    if valid is None:
+        return jnp.mean(similarity / divisor)
+    counts = _pad_to_window(jnp.asarray(valid)[..., None])[..., 0]
+    window = (WINDOW_SIZE, WINDOW_SIZE)
+    counts = jax.lax.reduce_window(
+        jax.lax.stop_gradient(counts), 1.0, jax.lax.min, window, (1, 1), "valid"
+    )
+    unlike = (1.0 - similarity / divisor).reshape(*counts.shape, channels)
+    total = jnp.sum(unlike * counts[..., None])
+    return 1.0 - safe_divide(total, channels * jnp.sum(counts))

@@ -108,7 +108,7 @@ def hollow_line(views: Views, bounds: Bounds) -> str:
 
 
 def _left_out(views: Views, view: int, lo: np.ndarray, hi: np.ndarray) -> Bool[np.ndarray, "N N N"]:
-    """Find the voxels that a view sees outside of its mask; one out of sight is not left out."""
+    """Find the voxels that a view sees outside of its mask, in a pixel that counts."""
     axes = [a + (np.arange(_VOXELS) + 0.5) / _VOXELS * (b - a) for a, b in zip(lo, hi, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     pose = views.world_to_camera[view]
@@ -118,6 +118,8 @@ def _left_out(views: Views, view: int, lo: np.ndarray, hi: np.ndarray) -> Bool[n
     pixel = (local @ views.intrinsics[view].T)[:, :2] / depth[:, None]
     is_seen = is_ahead & (pixel >= 0).all(1) & (pixel < [views.width, views.height]).all(1)
     column, row = np.where(is_seen[:, None], pixel, 0).astype(int).T
+    if views.valid is not None:
+        is_seen &= np.asarray(views.valid[view])[row, column] > 0
     is_out = is_seen & ~views.mask(view)[row, column]
     return is_out.reshape(_VOXELS, _VOXELS, _VOXELS)
 

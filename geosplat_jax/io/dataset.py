@@ -158,9 +158,7 @@ def load_dataset(
         "test_views": test_views,
         "mask_files": mask_files,
     }
-    layout = recognise_layout(root) if layout is None else layout
-    if layout not in LAYOUTS:
-        raise SceneError(f"layout must be one of {sorted(LAYOUTS)}, got {layout!r}")
+    layout = _layout_of(root, layout)
     listing = LAYOUTS[layout].list_frames(root, light=light)
     warnings: list[str] = []
     cameras = None if cameras is None else Path(cameras).expanduser()
@@ -264,7 +262,7 @@ def photograph_size(
     root = Path(path).expanduser()
     if not root.is_dir():
         raise MissingFileError(f"scene folder {root} does not exist")
-    listing = LAYOUTS[layout or recognise_layout(root)].list_frames(root, light=light)
+    listing = LAYOUTS[_layout_of(root, layout)].list_frames(root, light=light)
     return image_size(listing.train[0].image)
 
 
@@ -294,12 +292,13 @@ def choose_downscale(path: str | Path, cells: int, **options: Any) -> Downscale:
     root = Path(path).expanduser()
     if not root.is_dir():
         raise MissingFileError(f"scene folder {root} does not exist")
-    layout = options.get("layout") or recognise_layout(root)
+    layout = _layout_of(root, options.get("layout"))
     listing = LAYOUTS[layout].list_frames(root, light=options.get("light"))
     shortest = min(min(image_size(frame.image)) for frame in (*listing.train, *listing.test))
     coarse = max(1, shortest // _COARSE_PIXELS)
     # Cameras that were refined belong to images of one size; here they would change little.
-    reading = {name: value for name, value in options.items() if name != "cameras"}
+    own = ("cameras", "train_views", "test_views")
+    reading = {name: value for name, value in options.items() if name not in own}
     found = load_dataset(path, **reading, downscale=coarse, train_views=_COARSE_VIEWS, test_views=1)
     lo, hi = found.bounds
     views = found.train
@@ -312,6 +311,15 @@ def choose_downscale(path: str | Path, cells: int, **options: Any) -> Downscale:
         factor,
         f"images {size}: a cell of the grid then is {cell / (factor * pixel):.1f} pixels wide",
     )
+
+
+def _layout_of(root: Path, layout: str | None) -> str:
+    """Return the layout that was named, or else the one that is recognised."""
+    if layout is None:
+        return recognise_layout(root)
+    if layout not in LAYOUTS:
+        raise SceneError(f"layout must be one of {sorted(LAYOUTS)}, got {layout!r}")
+    return layout
 
 
 def recognise_layout(root: Path) -> str:

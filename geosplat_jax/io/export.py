@@ -30,6 +30,7 @@ from geosplat_jax.io.meshes import (
     to_gltf_axes,
     unwrap,
 )
+from geosplat_jax.io.start_mesh import Y_UP_LINE
 from geosplat_jax.io.usd import usd_library, write_usd
 
 SampleMaterials = Callable[[Float[np.ndarray, "N 3"]], tuple[Any, Any, Any]]
@@ -197,7 +198,7 @@ def _write_obj(path: str | Path, mesh: trimesh.Trimesh) -> None:
         aside.write_text("\n".join(lines) + "\n", encoding="utf-8")
     uv, faces = np.asarray(visual.uv), np.asarray(mesh.faces) + 1
     with written_aside(path) as aside, aside.open("w", encoding="utf-8") as file:
-        file.write(f"# y is up\nmtllib {path.with_suffix('.mtl').name}\nusemtl material\n")
+        file.write(f"{Y_UP_LINE}\nmtllib {path.with_suffix('.mtl').name}\nusemtl material\n")
         np.savetxt(file, np.asarray(mesh.vertices), "v %.7g %.7g %.7g")
         np.savetxt(file, uv, "vt %.7g %.7g")
         np.savetxt(file, np.asarray(mesh.vertex_normals), "vn %.5g %.5g %.5g")

@@ -380,7 +380,11 @@ def images_in(root: Path, folders: tuple[str, ...]) -> list[Path]:
     """
     folder = next((root / name for name in folders if (root / name).is_dir()), None)
     found = [] if folder is None else sorted(folder.iterdir())
-    images = [path for path in found if path.suffix.lower() in IMAGE_SUFFIXES]
+    images = [
+        path
+        for path in found
+        if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+    ]
     if not images:
         names = " or ".join(f"{name}/" for name in folders)
         raise MissingFileError(f"{root} has no images in {names}; add them")

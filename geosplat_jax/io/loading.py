@@ -54,13 +54,14 @@ def load_views(
     _require_room_for_all(frames, full, canvas, most_bytes)
     height, width = (int(length) for length in canvas)
     valid: list[Any] = [None] * len(frames)
-    has_mask, leaves_file = np.ones(len(frames), bool), np.zeros(len(frames), bool)
-    is_even = np.zeros(len(frames), bool)
+    has_mask = np.ones(len(frames), bool)
+    leaves_file, is_even, is_opaque = np.zeros((3, len(frames)), bool)
     kept, threads = PartsInMemory(len(frames), most_bytes), _threads_for(frames, full, factor)
 
     def fill(index: int) -> None:
         photograph = read_photograph(frames[index])
         has_mask[index], leaves_file[index] = photograph.has_mask, photograph.leaves_file
+        is_opaque[index] = photograph.is_opaque
         if not (photograph.has_mask or listing.is_capture):
             raise SceneError(_no_mask(frames[index]))
         part, seen = photograph.part(frames[index], factor)
@@ -76,6 +77,9 @@ def load_views(
         threads=threads,
     )
     forget_lenses()
+    if listing.is_capture and not (has_mask & ~is_opaque).any():
+        # An object may fill one photograph, but where it fills all of them nobody cut it out.
+        has_mask[:] = False
     _require_masks_in_all_or_none(frames, has_mask)
     if listing.is_capture and leaves_file.any():
         problems.append(

@@ -182,6 +182,13 @@ def _photographs(root: Path) -> list[str]:
             f"{folder} has {len(names)} photographs ({', '.join(sorted(suffixes))}); cameras take "
             f"{_FEWEST} at least, and a good reconstruction some 50"
         )
+    unlisted = [name for name in names if name.startswith("#") or len(name.split()) != 1]
+    if unlisted:
+        # COLMAP reads pairs of names from lines, and leaves out what it does not find.
+        raise SceneError(
+            f"{len(unlisted)} photographs in {folder} have a space in their name or begin with #, "
+            f"{unlisted[0]!r} for one, which COLMAP cannot match; rename them"
+        )
     stems = Counter("_".join(Path(name).with_suffix("").parts) for name in names)
     stem, count = stems.most_common(1)[0]
     if count > 1:

@@ -41,6 +41,7 @@ class Photograph(NamedTuple):
     valid : (H, W) pixels that count.
     has_mask : False where alpha is one because nothing is known of it.
     leaves_file : True where the image's own alpha is taken and not the file of a mask.
+    is_opaque : True where the image's own alpha is one everywhere and there is no file of a mask.
     """
 
     color: Shaped[np.ndarray, "H W 3"]
@@ -48,6 +49,7 @@ class Photograph(NamedTuple):
     valid: Bool[np.ndarray, "H W"]
     has_mask: bool
     leaves_file: bool
+    is_opaque: bool
 
     def part(self, frame: Frame, factor: int) -> tuple[Part, Bool[np.ndarray, "h w"]]:
         """Return what is not empty, as a pinhole sees it and reduced, and the pixels that count.
@@ -100,7 +102,9 @@ def read_photograph(frame: Frame) -> Photograph:
     color = np.ascontiguousarray(pixels[..., :3])
     alpha = np.ascontiguousarray(pixels[..., 3]) if pixels.shape[-1] == 4 else None
     # An alpha of one everywhere says nothing, so a mask file takes its place.
-    leaves_file = frame.mask is not None and alpha is not None and _value(alpha.min()) < 1.0
+    is_whole = alpha is not None and _value(alpha.min()) >= 1.0
+    is_opaque = is_whole and frame.mask is None
+    leaves_file = frame.mask is not None and alpha is not None and not is_whole
     if frame.mask is not None and not leaves_file:
         alpha = _read_mask(frame.mask, pixels)
     has_mask = alpha is not None
@@ -119,7 +123,7 @@ def read_photograph(frame: Frame) -> Photograph:
         alpha = np.where(valid, alpha, np.zeros((), alpha.dtype))
     # In place, since copies of a large photograph take longer than to decode it.
     color[alpha <= 0] = 0
-    return Photograph(color, alpha, valid, has_mask, leaves_file)
+    return Photograph(color, alpha, valid, has_mask, leaves_file, is_opaque)
 
 
 def _value(number: Any) -> float:

@@ -32,6 +32,9 @@ _SAME_PLACE = 1e-7
 _Y_UP = {".glb", ".gltf"}
 """Formats whose files say that y is up; the world of the cameras has z up."""
 
+Y_UP_LINE = "# y is up"
+"""First line of an OBJ file that says so, as ours do; the format itself knows no axes."""
+
 _SAMPLES = 4000
 """Points of the surface that are projected to compare it with the masks."""
 
@@ -105,6 +108,19 @@ def digest_of(path: str | Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 
 
+def _is_y_up(path: Path) -> bool:
+    """Tell whether a file says that y is up."""
+    if path.suffix.lower() != ".obj":
+        return path.suffix.lower() in _Y_UP
+    with path.open("rb") as file:
+        return file.readline().strip() == Y_UP_LINE.encode()
+
+
+def _from_y_up(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+    """Turn points from y-up axes, the inverse of `meshes.to_gltf_axes`."""
+    return np.stack([points[:, 0], -points[:, 2], points[:, 1]], axis=-1)
+
+
 @lru_cache(maxsize=1)
 def read_start(path: str, digest: str) -> StartMesh:
     """Read a mesh file and clean what it holds, in the axes of the world.
@@ -139,10 +155,8 @@ def read_start(path: str, digest: str) -> StartMesh:
             f"is number {int(np.argmax(broken))}; repair the mesh"
         )
     mesh = StartMesh(vertices, faces, (f"mesh: {len(faces)} faces of {path}",))
-    if Path(path).suffix.lower() in _Y_UP:
-        # The inverse of `meshes.to_gltf_axes`.
-        turned = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], axis=-1)
-        mesh = mesh.noting("turned from glTF's y-up axes to z-up ones", vertices=turned)
+    if _is_y_up(Path(path)):
+        mesh = mesh.noting("turned from y-up axes to z-up ones", vertices=_from_y_up(vertices))
     return _outward(_cleaned(mesh, path))
 
 
@@ -235,7 +249,17 @@ def _fills(points: np.ndarray, views: Views, view: int, mask: np.ndarray) -> flo
     if not inside.any():
         return 0.0
     column, row = pixels[inside].astype(int).T
-    share = float(mask[row, column].sum() / len(points))
+    if views.valid is not None:
+        # Nobody knows what pixels show that do not count.
+        counts = np.ones(len(pixels), bool)
+        counts[inside] = np.asarray(views.valid[view])[row, column] > 0
+        column, row = column[counts[inside]], row[counts[inside]]
+        unknown, pixels = len(pixels) - int(counts.sum()), pixels[counts]
+        if not len(column):
+            return 1.0
+    else:
+        unknown = 0
+    share = float(mask[row, column].sum() / (len(points) - unknown))
     if not views.has_masks:
         return share
     low, high = np.percentile(pixels, (1, 99), axis=0)
@@ -274,6 +298,10 @@ def require_in_views(mesh: StartMesh, views: Views, path: str) -> None:
     if scaled[best] >= max(_AGREES, 2 * found):
         advice = f"{best:g} times as large it would (agreement {scaled[best]:.2f}): are its units "
         advice += "others than the cameras'? Scale the file"
+    turned = agreement_with_views(_from_y_up(points), views)
+    if turned >= max(_AGREES, 2 * found):
+        advice = f"turned from y-up axes to z-up ones it would (agreement {turned:.2f}): write "
+        advice += "it with z up, or as glTF, whose axes are known"
     size = ", ".join(f"{extent:.3g}" for extent in np.ptp(mesh.vertices, axis=0))
     middle = ", ".join(f"{x:.3g}" for x in 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0)))
     raise ValueError(

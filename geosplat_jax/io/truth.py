@@ -77,17 +77,25 @@ def true_maps(reading: Reading, albedo_is_srgb: bool, problems: list[str]) -> Ma
     return _OnDemand({key: maker(key) for key in keys}, keeps=True)
 
 
+def _for_reduction(reading: Reading, frame: Frame, pixels: np.ndarray) -> np.ndarray:
+    """Give an image that will be resampled the alpha of its view, where it has none of its own.
+
+    Otherwise the background would be averaged into the rim.
+    """
+    pixels = as_rgba_or_rgb(pixels)
+    is_resampled = reading.factor > 1 or frame.lens.distortion is not None
+    if not is_resampled or pixels.shape[-1] == 4:
+        return pixels
+    photograph = read_photograph(frame)
+    _require_size(photograph.alpha, pixels.shape[:2], frame.image)
+    alpha = values_of(photograph.alpha, is_srgb=False)
+    return np.concatenate([pixels, alpha[..., None]], -1)
+
+
 def _read_truth(reading: Reading, index: int, key: str, is_srgb: bool) -> np.ndarray:
     frame = reading.frames[index]
     path = frame.truth[key]
-    pixels = as_rgba_or_rgb(read_linear(path, is_srgb=is_srgb))
-    is_resampled = reading.factor > 1 or frame.lens.distortion is not None
-    if is_resampled and pixels.shape[-1] == 3:
-        # Without an alpha of its own, the background would be averaged into the rim.
-        photograph = read_photograph(frame)
-        _require_size(photograph.alpha, pixels.shape[:2], frame.image)
-        alpha = values_of(photograph.alpha, is_srgb=False)
-        pixels = np.concatenate([pixels, alpha[..., None]], -1)
+    pixels = _for_reduction(reading, frame, read_linear(path, is_srgb=is_srgb))
     if key == "normal":
         pixels[..., :3] = 2.0 * pixels[..., :3] - 1.0
     values = reading.reduced(index, pixels, path)[..., : TRUTH_CHANNELS[key]]
@@ -107,8 +115,10 @@ def relit_images(reading: Reading, problems: list[str]) -> Mapping[str, Any]:
 
     def maker(light: str) -> Callable[[], np.ndarray]:
         def read(index: int) -> np.ndarray:
-            path = reading.frames[index].relight[light]
-            relit = reading.reduced(index, as_rgba_or_rgb(read_linear(path)), path)
+            frame = reading.frames[index]
+            path = frame.relight[light]
+            pixels = _for_reduction(reading, frame, read_linear(path))
+            relit = reading.reduced(index, pixels, path)
             # Without an alpha of its own it has that of the view: the object has not moved.
             alpha = (
                 relit[..., 3:] if relit.shape[-1] == 4 else reading.images.alpha(index)[..., None]

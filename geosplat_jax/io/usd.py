@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import trimesh
 from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 from geosplat_jax.io.images import SceneError, written_aside
 
@@ -41,6 +42,7 @@ def _add_mesh(stage: Any, mesh: trimesh.Trimesh) -> Any:
     gf, sdf, usd_geom, vt = _modules("Gf", "Sdf", "UsdGeom", "Vt")
     visual = mesh.visual
     assert isinstance(visual, TextureVisuals)
+    assert isinstance(visual.material, PBRMaterial)
     faces = np.asarray(mesh.faces, np.int32)
     points, normals, uv = (
         np.ascontiguousarray(values, np.float32)
@@ -53,6 +55,7 @@ def _add_mesh(stage: Any, mesh: trimesh.Trimesh) -> Any:
     shape.CreateNormalsAttr(vt.Vec3fArray.FromNumpy(normals))
     shape.SetNormalsInterpolation(usd_geom.Tokens.vertex)
     shape.CreateSubdivisionSchemeAttr(usd_geom.Tokens.none)
+    shape.CreateDoubleSidedAttr(bool(visual.material.doubleSided))
     corners = [gf.Vec3f(*map(float, corner)) for corner in (points.min(0), points.max(0))]
     shape.CreateExtentAttr(vt.Vec3fArray(corners))
     kind = sdf.ValueTypeNames.TexCoord2fArray

@@ -4,7 +4,6 @@ Names and units of figures, times of the stages, settings that differ from the p
 command that repeats the training.
 """
 
-import json
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from geosplat_jax.core.settings import as_written
 from geosplat_jax.fit.config import Config, changed_settings
 from geosplat_jax.fit.presets import BETWEEN, make_config
 from geosplat_jax.fit.start_mesh import MeshSettings
@@ -193,6 +193,10 @@ def changed_from_preset(config: Config) -> dict[str, tuple[Any, Any]]:
     return changed_settings(_preset_of(config), config)
 
 
+_UNNAMED = {"layout": None, "train_views": None, "test_views": None, "mask_files": True}
+"""Ways of reading a scene that Python has, and no option of the command."""
+
+
 def command(record: Mapping[str, Any], config: Config) -> tuple[str, bool]:
     """Return the command that trains the run again, and whether its settings are all in it.
 
@@ -214,12 +218,13 @@ def command(record: Mapping[str, Any], config: Config) -> tuple[str, bool]:
     if reading.get("bounds"):
         words += ["--bounds", *(f"{x:.9g}" for x in reading["bounds"])]
     overrides = [
-        f"{path}={json.dumps(new)}" for path, (_, new) in changed_from_preset(config).items()
+        f"{path}={as_written(new)}" for path, (_, new) in changed_from_preset(config).items()
     ]
     try:
         is_whole = not changed_settings(_preset_of(config, overrides), config)
     except ValueError:
         is_whole = False
+    is_whole &= all(reading.get(name, usual) == usual for name, usual in _UNNAMED.items())
     if is_whole:
         words += [word for override in overrides for word in ("--set", override)]
     return _folded(words), is_whole

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from geosplat_jax.core.types import Camera, EnvLight
-from geosplat_jax.io.images import SceneError, read_linear, write_png
+from geosplat_jax.io.images import SceneError, linear_values, read_stored, write_png
 from geosplat_jax.io.movies import check_movie, has_encoder, write_movie
 from geosplat_jax.io.views import ViewLight
 from geosplat_jax.report.consistency import resized
@@ -48,7 +48,9 @@ def load_light(path: str | Path, *, largest: int = LARGEST_LIGHT) -> EnvLight:
         If the file cannot be read, is not twice as wide as high, or holds negative or infinite
         radiance.
     """
-    pixels = read_linear(path)
+    stored = read_stored(path)
+    # A light is everywhere, whatever a fourth channel says.
+    pixels = linear_values(np.ascontiguousarray(stored[..., :3]), Path(path))
     if pixels.ndim != 3 or pixels.shape[-1] < 3 or pixels.shape[1] != 2 * pixels.shape[0]:
         raise SceneError(
             f"{path} has shape {pixels.shape}; an environment map is twice as wide as high and has "

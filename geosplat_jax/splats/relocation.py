@@ -63,7 +63,8 @@ def _drawn_rows(
     weights: Float[Array, " N"], key: Key[Array, ""], count: int
 ) -> Int[Array, " count"]:
     """Draw rows with a probability in proportion to their weights; never one without weight."""
-    through = jnp.cumsum(weights)
+    # In float32 the sums of a parallel scan may fall, and grow where there is no weight.
+    through = jax.lax.cummax(jnp.where(weights > 0.0, jnp.cumsum(weights), 0.0))
     last = jnp.max(jnp.where(weights > 0.0, jnp.arange(weights.shape[0]), 0)).astype(jnp.int32)
     place = jax.random.uniform(key, (count,), weights.dtype) * through[-1]
     found = jnp.searchsorted(through, place, side="right").astype(jnp.int32)

@@ -27,8 +27,9 @@ class Shaded(eqx.Module):
     rgb : (N, 3) ``diffuse + specular``, linear.
     diffuse, specular : (N, 3) the two parts, materials included.
     diffuse_light : (N, 3) irradiance / pi: what a white Lambertian point would send out.
-    specular_light : (N, 3) radiance filtered by the lobe, before the BRDF's directional albedo:
-        what a lossless white reflector of this roughness would send out.
+    specular_light : (N, 3) radiance filtered by the lobe. Of the split sum it is what a lossless
+        white reflector of this roughness would send out; sampled transports keep what
+        microfacets hide from each other, with a Fresnel factor of one (.31 of it at roughness 1).
     """
 
     rgb: Float[Array, "N 3"]

@@ -45,12 +45,14 @@ class Gathered(eqx.Module):
     diffuse_light : (N, 3) irradiance / pi.
     directions, radiance, density : (N, L, 3), (N, L, 3) and (N, L) the light's samples, what they
         bring to the specular lobe, and their density; 0 where the mask is false.
+    is_chosen : static; whether the light's samples were chosen by what the unflipped normals see.
     """
 
     diffuse_light: Float[Array, "N 3"]
     directions: Float[Array, "N L 3"]
     radiance: Float[Array, "N L 3"]
     density: Float[Array, "N L"]
+    is_chosen: bool = eqx.field(static=True, default=False)
 
 
 def _arriving(
@@ -109,7 +111,8 @@ def gather(
     arguments = (points.normals, samples, rows)
     diffuse_light, radiance = in_chunks(one_chunk, arguments, points.mask, total)
     density = samples.light_density[:, :shared]
-    return Gathered(diffuse_light, samples.directions[:, :shared], radiance, density)
+    is_chosen = samples.light_factors is not None
+    return Gathered(diffuse_light, samples.directions[:, :shared], radiance, density, is_chosen)
 
 
 def _specular_sums(
@@ -170,8 +173,8 @@ def reflect(
 
     Returns
     -------
-    Shaded; ``diffuse_light`` is irradiance / pi, ``specular_light`` what a white lossless reflector
-    of this roughness would send out. Zero where the mask is false. Differentiable in materials,
+    Shaded; ``diffuse_light`` is irradiance / pi, ``specular_light`` what the lobe would send out
+    with a Fresnel factor of one. Zero where the mask is false. Differentiable in materials,
     normals, views, light and indirect light. Without a specular lobe no direction is drawn.
     """
     if not materials.has_specular:
@@ -189,6 +192,15 @@ def reflect(
         finds_nearest=finds_nearest,
         open_only=open_only,
     )
+    if gathered.is_chosen:
+        # Samples chosen above the unflipped normal have never looked above the flipped one.
+        faces_viewer = cosine >= 0
+        gathered = replace(
+            gathered,
+            radiance=jnp.where(faces_viewer[..., None], gathered.radiance, 0.0),
+            density=jnp.where(faces_viewer, gathered.density, 0.0),
+        )
+        rays = replace(rays, light_density=jnp.where(faces_viewer, rays.light_density, 0.0))
     followed = indirect.followed(points, rays.directions, rays.hits, rays.distances)
     rows, restore = _split(followed)
 

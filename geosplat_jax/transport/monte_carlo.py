@@ -106,6 +106,10 @@ class MonteCarlo(SampledTransport):
     def _model(self) -> type[Indirect]:
         return INDIRECT_MODELS[self.settings.indirect]
 
+    def _own_rays(self, index: RayIndex | None) -> RayIndex | None:
+        """Leave rays out that only the shading domain has asked for."""
+        return index if self.settings.occlusion else None
+
     def _finds_nearest(self, index: RayIndex | None) -> bool:
         return self._model.reads_faces and index is not None
 
@@ -140,6 +144,7 @@ class MonteCarlo(SampledTransport):
         """
         if key is None:
             raise ValueError("Monte Carlo shading needs a key for its samples")
+        index = self._own_rays(index)
         sampler = light_sampler(light)
         finds_nearest = self._finds_nearest(index)
         gathered, traced = None, None
@@ -178,6 +183,7 @@ class MonteCarlo(SampledTransport):
     ) -> Shaded:
         """Add what each viewer sees; see `reflect`."""
         assert key is not None
+        index = self._own_rays(index)
         light, sampler, gathered = illumination.light, illumination.sampler, illumination.gathered
         indirect = illumination.traced
         if indirect is None:

@@ -264,9 +264,12 @@ class PathTracer(IndirectSource):
             raise ValueError("paths go on where rays end: trace the nearest hits")
         count, samples = hits.shape
         total = count * samples
+        if total == 0:
+            return KnownIndirect(jnp.zeros_like(directions))
         hits, wi = hits.reshape(-1), directions.reshape(-1, 3)
         starts = jnp.repeat(points.positions, samples, axis=0)
-        going = bit_set(hits >= 0)
+        # Rows that no chunk has traced are no points, and say that they hit face 0.
+        going = bit_set((hits >= 0) & jnp.repeat(points.mask, samples))
         ray = going.first(capacity=total)
         is_real = jnp.arange(total, dtype=jnp.int32) < going.count
 

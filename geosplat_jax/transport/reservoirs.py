@@ -294,8 +294,9 @@ def _beside(
     order = jnp.argsort(jnp.where(points.mask & (places >= 0), places, last)).astype(jnp.int32)
     rank = jnp.zeros((size,), jnp.int32).at[order].set(jnp.arange(size, dtype=jnp.int32))
     step_key, sign_key = jax.random.split(key)
-    steps = jax.random.randint(step_key, (count, size), 1, _NEIGHBORHOOD + 1, jnp.int32)
-    signs = jax.random.bernoulli(sign_key, 0.5, (count, size))
+    # Row by row, so that a point draws the same numbers whatever the buffer's size.
+    steps = jax.random.randint(step_key, (size, count), 1, _NEIGHBORHOOD + 1, jnp.int32).T
+    signs = jax.random.bernoulli(sign_key, 0.5, (size, count)).T
     place = rank[None] + jnp.where(signs, steps, -steps)
     is_inside = (place >= 0) & (place < size)
     rows = order.at[jnp.clip(place, 0, size - 1)].get(mode="promise_in_bounds")

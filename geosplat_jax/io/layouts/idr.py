@@ -13,8 +13,10 @@ import numpy as np
 from scipy.linalg import rq
 
 from geosplat_jax.io.frames import (
+    MASK_FOLDERS,
     Frame,
     Listing,
+    beside_images,
     captured_frame,
     checked_numbers,
     images_in,
@@ -58,9 +60,34 @@ def list_idr(root: Path, *, light: str | None = None) -> Listing:
             f"{where} has {count} cameras, but {images[0].parent} has {len(images)} images; they "
             "belong together by number and name"
         )
+    masks = _masks(root, images)
     return split_capture(
-        [_frame(root, image, number, matrices, where) for number, image in enumerate(images)]
+        [
+            _frame(root, image, number, matrices, where, mask)
+            for number, (image, mask) in enumerate(zip(images, masks, strict=True))
+        ]
     )
+
+
+def _masks(root: Path, images: list[Path]) -> list[Path | None]:
+    """Return the masks in ``mask/`` by number, where none is named after its image.
+
+    Scenes of DTU have ``image/000000.png`` beside ``mask/000.png``.
+
+    Raises
+    ------
+    SceneError : there are not as many masks as images.
+    """
+    folder = next((root / name for name in MASK_FOLDERS if (root / name).is_dir()), None)
+    if folder is None or any(beside_images(root, image, MASK_FOLDERS) for image in images):
+        return [None] * len(images)
+    files = images_in(root, (folder.name,))
+    if len(files) != len(images):
+        raise SceneError(
+            f"{folder} has {len(files)} masks for {len(images)} images, and none is named after "
+            "its image; they belong together by number"
+        )
+    return [*files]
 
 
 def _camera_file(root: Path) -> Path | None:
@@ -77,7 +104,12 @@ def _read_matrices(where: Path) -> dict[str, np.ndarray]:
 
 
 def _frame(
-    root: Path, image: Path, number: int, matrices: dict[str, np.ndarray], where: Path
+    root: Path,
+    image: Path,
+    number: int,
+    matrices: dict[str, np.ndarray],
+    where: Path,
+    mask: Path | None,
 ) -> Frame:
     both = []
     for name in (f"world_mat_{number}", f"scale_mat_{number}"):
@@ -96,7 +128,8 @@ def _frame(
         width=width,
         height=height,
     )
-    return captured_frame(root, image, opengl_pose(rotation, translation, what), pinhole)
+    pose = opengl_pose(rotation, translation, what)
+    return captured_frame(root, image, pose, pinhole, mask=mask)
 
 
 def _taken_apart(projection: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
