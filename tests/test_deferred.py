@@ -148,23 +148,6 @@ def test_a_convex_body_does_not_shadow_itself(traced, points):
     assert np.percentile(light, 5) > 0.8
 
 
-def test_rays_of_the_domain_are_not_the_transports(traced):
-    """Without occlusion nothing is shadowed, though pixels find the mesh by rays."""
-    pipeline, asset, camera = traced
-    normals = -asset.splats.normals  # everything that shines on them is behind the ball
-    inside = replace(asset, splats=replace(asset.splats, normals=normals))
-    white = EnvLight(jnp.ones((8, 16, 3)))
-
-    def light(occlusion):
-        transport = few(light_count=8, diffuse_count=8, occlusion=occlusion)
-        one = replace(pipeline, domain=PerPixel(points="mesh"), transport=transport)
-        output = draw(one, inside, white, camera, aov_names=("diffuse",), key=jax.random.key(1))
-        return float(jnp.mean(output.aovs["diffuse"][0][output.alpha[0] > 0.95]))
-
-    assert light(True) < 0.05
-    assert light(False) == pytest.approx(1.0, abs=0.06)
-
-
 def test_points_of_the_mesh_lie_on_it(traced):
     """The start of a pixel's ray is where the ray through its centre meets the ball."""
     pipeline, asset, camera = traced

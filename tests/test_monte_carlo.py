@@ -11,8 +11,9 @@ import pytest
 from geosplat_jax.core.capacity import fits
 from geosplat_jax.core.types import EnvLight, Grid, Materials, SurfacePoints
 from geosplat_jax.geometry import FlexiCubes, initial_geometry, sphere_sdf
+from geosplat_jax.materials import Attributes
 from geosplat_jax.transport import bsdf, sampling
-from geosplat_jax.transport.environment import lookup
+from geosplat_jax.transport.environment import LightSpec, lookup
 from geosplat_jax.transport.estimators import gather, reflect
 from geosplat_jax.transport.indirect import (
     NO_INDIRECT,
@@ -20,6 +21,7 @@ from geosplat_jax.transport.indirect import (
     TracedIndirect,
 )
 from geosplat_jax.transport.light_sampling import light_sampler
+from geosplat_jax.transport.monte_carlo import MonteCarloSettings
 from geosplat_jax.transport.sampling import BLOCKED, OPEN, SampleCounts, cast, draw_samples
 
 POINTS = 12
@@ -258,6 +260,29 @@ def test_a_ball_overhead_takes_its_solid_angle_of_the_light(ball_index):
 
 def repeated(tree, times):
     return jax.tree.map(lambda x: jnp.concatenate([x] * times), tree)
+
+
+def test_without_occlusion_rays_that_are_there_for_others_block_nothing(ball_index):
+    """A shading domain may have asked for them, to find the mesh."""
+    count = 50
+    up = jnp.tile(jnp.asarray([[0.0, 0, 1]]), (count, 1))
+    nowhere = jnp.full((count,), -1, jnp.int32)
+    points = SurfacePoints(-0.9 * up, up, up, nowhere, jnp.ones(count, bool))
+    materials = Materials(jnp.full((count, 3), 0.5), jnp.full(count, 0.5), jnp.zeros(count))
+    attributes = Attributes(materials, None, None)
+    light = EnvLight(jnp.ones((8, 16, 3)))
+
+    def shaded(index, occlusion):
+        settings = MonteCarloSettings(
+            light_count=4, diffuse_count=4, specular_count=4, occlusion=occlusion
+        )
+        transport = settings.build(LightSpec(8, 16))
+        key = jax.random.key(0)
+        lights, _ = transport.prepare(key, points, attributes, light, index)
+        return transport.shade(key, points, attributes, up, lights, index).rgb
+
+    np.testing.assert_array_equal(shaded(ball_index, False), shaded(None, False))
+    assert float(jnp.mean(shaded(ball_index, True))) < 0.8 * float(jnp.mean(shaded(None, False)))
 
 
 def test_chunks_and_masks_change_nothing_for_the_others(ball_index, monkeypatch):

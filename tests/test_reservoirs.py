@@ -242,6 +242,37 @@ def test_blocked_directions_are_counted_once_when_reservoirs_leave_them_out():
         assert np.all(np.abs(one.mean(axis=0) - other.mean(axis=0)) < STANDARD_ERRORS * error)
 
 
+def test_normals_that_face_away_lose_no_highlight_to_reservoirs():
+    """Samples were chosen above the normal; the specular lobe looks above the flipped one."""
+    count = 4000
+
+    def rows(angle):
+        vector = [np.sin(np.radians(angle)), 0.0, np.cos(np.radians(angle))]
+        return jnp.tile(jnp.asarray([vector], jnp.float32), (count, 1))
+
+    nowhere = jnp.full((count,), -1, jnp.int32)
+    points = SurfacePoints(0 * rows(0), rows(0), rows(10), nowhere, jnp.ones(count, bool))
+    metal = Materials(jnp.full((count, 3), 0.8), jnp.full(count, 0.6), jnp.ones(count))
+    attributes, light = Attributes(metal, None, None), EnvLight(jnp.ones((8, 16, 3)))
+
+    def specular(candidates):
+        spec = ReservoirSettings(candidates=candidates)
+        counts = {"light_count": 4, "diffuse_count": 4, "specular_count": 4}
+        transport = MonteCarloSettings(**counts, reservoirs=spec).build(LightSpec(8, 16))
+
+        @jax.jit
+        def shade(key):
+            lights, _ = transport.prepare(key, points, attributes, light, None)
+            return transport.shade(key, points, attributes, rows(93), lights, None).specular
+
+        found = np.asarray(shade(jax.random.key(1)), float)[:, 0]
+        return found.mean(), found.std() / np.sqrt(count)
+
+    (plain, first), (chosen, second) = specular(0), specular(8)
+    assert abs(plain - chosen) < STANDARD_ERRORS * np.hypot(first, second)
+    assert plain > 10 * np.hypot(first, second)
+
+
 def test_what_a_place_kept_is_used_only_nearby_and_on_a_surface_of_that_direction():
     """And counts at most half as much as the step's own four candidates, as the setting says."""
     spec = replace(REUSE["steps"], candidates=4, confidence=0.5)
