@@ -51,9 +51,9 @@ AOV_CHANNELS = {
 }
 """Extra images that can be asked for, and their channels.
 
-``diffuse`` and ``specular`` are the light of either lobe without material, ``specular_radiance`` is
-what the specular lobe adds to the colour, ``normal`` is in world axes, ``depth`` along the camera's
-axis.
+``diffuse`` and ``specular`` are the light of either lobe without its colours (see `Shaded`),
+``specular_radiance`` is what the specular lobe adds to the colour, ``normal`` is in world axes,
+``depth`` along the camera's axis.
 """
 
 

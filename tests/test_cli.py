@@ -58,6 +58,13 @@ def test_info_says_what_was_recognised(capsys):
         assert word in said
 
 
+@pytest.mark.parametrize("words", [["info", "s", "--bounds"], ["masks", "s", "--box"]])
+def test_small_negative_numbers_are_no_options(words):
+    box = ["-1e-05", "-0.4", "-.1", "4e-1", "0.4", "0.5"]
+    found = vars(command_line().parse_args([*words, *box]))[words[-1].removeprefix("--")]
+    assert np.ravel(found).tolist() == [float(x) for x in box]
+
+
 def test_the_help_is_short_and_names_every_command(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["--help"])
