@@ -300,6 +300,21 @@ def test_a_usd_is_the_mesh_of_the_glb_and_its_material_reads_the_textures(tmp_pa
         export.export_mesh_glb(path, *sphere(1), materials, vertex_colors=True, usd_path=path)
 
 
+def test_an_open_mesh_is_seen_from_both_sides_in_usd_as_in_gltf(tmp_path):
+    pytest.importorskip("pxr", reason="USD needs usd-core")
+    from pxr import Usd, UsdGeom
+
+    vertices, faces, normals = sphere()
+    glb, usd = tmp_path / "mesh.glb", tmp_path / "mesh.usdc"
+    export.export_mesh_glb(
+        glb, vertices, faces[1:], normals, materials, texture_size=TEXTURE, usd_path=usd
+    )
+    assert only_mesh(glb).visual.material.doubleSided
+    stage = Usd.Stage.Open(str(usd))
+    mesh = UsdGeom.Mesh(stage.GetDefaultPrim().GetChild("Mesh"))
+    assert mesh.GetDoubleSidedAttr().Get() is True
+
+
 def test_a_usd_decodes_its_map_of_normals(tmp_path):
     pytest.importorskip("pxr", reason="USD needs usd-core")
     from pxr import Usd, UsdShade

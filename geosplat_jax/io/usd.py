@@ -42,7 +42,6 @@ def _add_mesh(stage: Any, mesh: trimesh.Trimesh) -> Any:
     gf, sdf, usd_geom, vt = _modules("Gf", "Sdf", "UsdGeom", "Vt")
     visual = mesh.visual
     assert isinstance(visual, TextureVisuals)
-    assert isinstance(visual.material, PBRMaterial)
     faces = np.asarray(mesh.faces, np.int32)
     points, normals, uv = (
         np.ascontiguousarray(values, np.float32)
@@ -55,7 +54,8 @@ def _add_mesh(stage: Any, mesh: trimesh.Trimesh) -> Any:
     shape.CreateNormalsAttr(vt.Vec3fArray.FromNumpy(normals))
     shape.SetNormalsInterpolation(usd_geom.Tokens.vertex)
     shape.CreateSubdivisionSchemeAttr(usd_geom.Tokens.none)
-    shape.CreateDoubleSidedAttr(bool(visual.material.doubleSided))
+    material = visual.material
+    shape.CreateDoubleSidedAttr(isinstance(material, PBRMaterial) and bool(material.doubleSided))
     corners = [gf.Vec3f(*map(float, corner)) for corner in (points.min(0), points.max(0))]
     shape.CreateExtentAttr(vt.Vec3fArray(corners))
     kind = sdf.ValueTypeNames.TexCoord2fArray
