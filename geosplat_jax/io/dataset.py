@@ -51,7 +51,7 @@ LAYOUTS: dict[str, Layout] = {
 
 
 _PIXELS_OF_A_CELL = 2.0
-_READING: tuple[tuple[str, Any], ...] = (
+READING: tuple[tuple[str, Any], ...] = (
     ("downscale", 1),
     ("light", None),
     ("layout", None),
@@ -61,7 +61,7 @@ _READING: tuple[tuple[str, Any], ...] = (
 )
 """Options of `load_dataset` that a record keeps as they are, and their defaults."""
 
-READING_OPTIONS = (*(name for name, _ in _READING), "bounds", "cameras")
+READING_OPTIONS = (*(name for name, _ in READING), "bounds", "cameras")
 """All by which a scene may be read, see `load_recorded`."""
 
 _FAR_SIZES = 1000.0
@@ -211,7 +211,7 @@ def load_dataset(
             "light": light,
             "bounds": None if bounds is None else np.ravel(bounds).tolist(),
             **({} if cameras is None else _recorded(cameras)),
-            **{name: asked[name] for name, usual in _READING if asked.get(name, usual) != usual},
+            **{name: asked[name] for name, usual in READING if asked.get(name, usual) != usual},
         },
     )
 
@@ -246,7 +246,7 @@ def load_recorded(path: str | Path, options: Mapping[str, Any]) -> Dataset:
         path,
         bounds=None if bounds is None else (bounds[:3], bounds[3:]),
         cameras=cameras,
-        **{name: options.get(name, usual) for name, usual in _READING},
+        **{name: options.get(name, usual) for name, usual in READING},
     )
 
 

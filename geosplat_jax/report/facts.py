@@ -16,6 +16,7 @@ from geosplat_jax.core.settings import as_written
 from geosplat_jax.fit.config import Config, changed_settings
 from geosplat_jax.fit.presets import BETWEEN, make_config
 from geosplat_jax.fit.start_mesh import MeshSettings
+from geosplat_jax.io.dataset import READING
 from geosplat_jax.report.protocols import NEW_VIEWS, Look, Protocol, ScaledLook, protocol
 
 _MEASURES = {
@@ -193,8 +194,8 @@ def changed_from_preset(config: Config) -> dict[str, tuple[Any, Any]]:
     return changed_settings(_preset_of(config), config)
 
 
-_UNNAMED = {"layout": None, "train_views": None, "test_views": None, "mask_files": True}
-"""Ways of reading a scene that Python has, and no option of the command."""
+_NAMED = ("downscale", "light")
+"""Ways of reading a scene that the command has an option for; Python has more."""
 
 
 def command(record: Mapping[str, Any], config: Config) -> tuple[str, bool]:
@@ -224,7 +225,7 @@ def command(record: Mapping[str, Any], config: Config) -> tuple[str, bool]:
         is_whole = not changed_settings(_preset_of(config, overrides), config)
     except ValueError:
         is_whole = False
-    is_whole &= all(reading.get(name, usual) == usual for name, usual in _UNNAMED.items())
+    is_whole &= all(reading.get(n, usual) == usual for n, usual in READING if n not in _NAMED)
     if is_whole:
         words += [word for override in overrides for word in ("--set", override)]
     return _folded(words), is_whole
