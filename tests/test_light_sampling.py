@@ -9,7 +9,13 @@ from support import double_precision
 
 from geosplat_jax.core.types import EnvLight
 from geosplat_jax.transport.environment import lookup, texel_solid_angles
-from geosplat_jax.transport.light_sampling import light_density, light_sampler, sample_light
+from geosplat_jax.transport.light_sampling import (
+    _drawn,
+    light_density,
+    light_sampler,
+    sample_light,
+)
+from geosplat_jax.transport.sampling import low_discrepancy
 
 
 def random_light(height=6, width=10, seed=0):
@@ -42,8 +48,9 @@ def test_the_density_integrates_to_one(name):
     sampler = light_sampler(LIGHTS[name])
     total = jnp.sum(sampler.density * texel_solid_angles(*sampler.density.shape))
     assert float(total) == pytest.approx(1.0, abs=1e-5)
-    assert float(sampler.cumulative[-1]) == 1.0
-    assert bool(jnp.all(jnp.diff(sampler.cumulative) >= 0))
+    for table in (sampler.rows, sampler.columns):
+        np.testing.assert_allclose(table[:, -1], 1.0, rtol=1e-6)
+        assert bool(jnp.all(jnp.diff(table, axis=1) >= 0))
 
 
 def test_the_seam_of_the_map_is_no_border():
@@ -112,22 +119,43 @@ def test_the_density_is_positive_wherever_light_arrives():
 
 
 def test_every_texel_of_a_large_map_can_be_drawn():
-    radiance = np.random.default_rng(0).uniform(0.5, 1.0, (256, 512, 3)).astype(np.float32)
-    radiance[40, 100] = 3e4
+    """One table of two million texels would have 2^24 places, and leave out a fifth of them."""
+    radiance = np.random.default_rng(0).uniform(0.5, 1.0, (1024, 2048, 3)).astype(np.float32)
+    radiance[160, 400] = 3e4
     sampler = jax.jit(light_sampler)(EnvLight(jnp.asarray(radiance)))
-    steps = np.diff(np.asarray(sampler.cumulative, float), prepend=0.0)
-    assert np.all(steps >= 0)
-    assert np.mean(steps == 0) < 2e-3
-    share = np.asarray(sampler.density) * np.asarray(texel_solid_angles(256, 512))
-    rows = steps.reshape(256, 512).sum(axis=1)
-    np.testing.assert_allclose(rows, share.sum(axis=1), rtol=1e-3, atol=2e-7)
+    rows, columns = (
+        np.diff(np.asarray(t, float), prepend=0.0) for t in (sampler.rows, sampler.columns)
+    )
+    assert np.all(columns > 0)
+    share = np.asarray(sampler.density) * np.asarray(texel_solid_angles(1024, 2048))
+    np.testing.assert_allclose(rows[0], share.sum(axis=1), rtol=1e-3, atol=1e-7)
+    # Rows next to the poles are a few millionths of all, in steps of 2^-24.
+    np.testing.assert_allclose(rows.T * columns, share, rtol=0.04)
+
+
+@pytest.mark.parametrize("width", [2, 3, 8, 10])
+def test_the_search_finds_the_entry_of_every_number(width):
+    rng = np.random.default_rng(width)
+    shares = rng.uniform(0, 1, (3, width)) * (rng.uniform(0, 1, (3, width)) < 0.7)
+    shares[:, -1] = 0.1
+    tables = np.cumsum(shares / shares.sum(axis=1, keepdims=True), axis=1).astype(np.float32)
+    tables[:, -1] = 1.0
+    numbers = np.concatenate([rng.uniform(0, 1, 50), tables[0, :-1], [0.0]]).astype(np.float32)
+    for row in range(3):
+        found, rest = _drawn(
+            jnp.asarray(tables), jnp.full(len(numbers), row, jnp.int32), jnp.asarray(numbers)
+        )
+        np.testing.assert_array_equal(found, np.searchsorted(tables[row], numbers, side="right"))
+        lower = np.concatenate([[0.0], tables[row]])[np.asarray(found)]
+        share = tables[row][np.asarray(found)] - lower
+        np.testing.assert_allclose(lower + rest * share, numbers, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["random", "sun", "flat"])
 def test_a_sampled_flux_is_that_of_quadrature(name):
     light = LIGHTS[name]
     sampler = light_sampler(light)
-    directions, density = sample_light(sampler, grid_uniforms(20_000, 40))
+    directions, density = sample_light(sampler, grid_uniforms(900))
     found = jnp.mean(lookup(light.radiance, directions) / density[:, None], axis=0)
     # Midpoints, far finer than the texels, of the bilinear map.
     rows, columns = 600, 1200
@@ -176,3 +204,20 @@ def test_precision_in_is_precision_out_and_jit_equals_eager():
             light_sampler(light), jnp.asarray(np.asarray(uniforms), jnp.float64)
         )
         assert directions.dtype == density.dtype == jnp.float64
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+def test_points_that_are_spread_evenly_take_noise_away_in_both_directions(axis):
+    """Of sixteen samples of a flat sky, evenly over the unit square and at random."""
+    light = EnvLight(jnp.ones((16, 32, 3)))
+
+    def variance(uniforms):
+        directions, density = sample_light(light_sampler(light), uniforms.reshape(-1, 2))
+        seen = jnp.maximum(directions[:, axis], 0.0) / density
+        return float(jnp.var(jnp.mean(seen.reshape(uniforms.shape[:2]), axis=0)))
+
+    keys = jax.random.split(jax.random.key(0))
+    offsets = jax.random.uniform(keys[0], (4000, 2))
+    even = low_discrepancy(offsets, 16, offsets.dtype)
+    independent = jax.random.uniform(keys[1], (16, 4000, 2))
+    assert variance(even) < 0.15 * variance(independent)

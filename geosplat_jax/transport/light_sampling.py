@@ -1,9 +1,11 @@
 """Importance sampling of an environment map.
 
-A texel is drawn with a probability proportional to its brightness and solid angle, then a direction
-uniformly within the texel, so that the density is constant there. The brightness of a texel is the
-largest channel, blurred over its neighbours: the map is bilinear between texels, so that light
-reaches into the texels around it, and the density is positive wherever the map is.
+A texel is drawn with a probability proportional to its brightness and solid angle, its row first
+and then its column, and a direction uniformly within the texel, so that the density is constant
+there. Each of the two steps has a number of its own, so that points spread evenly over the unit
+square are spread evenly over rows and columns, too. The brightness of a texel is the largest
+channel, blurred over its neighbours: the map is bilinear between texels, so that light reaches into
+the texels around it, and the density is positive wherever the map is.
 
 No gradients: estimators differentiate what they evaluate at fixed samples.
 """
@@ -28,11 +30,14 @@ class LightSampler(eqx.Module):
 
     Attributes
     ----------
-    cumulative : (H W,) increasing to 1, row by row; entry i is the probability of texels 0 to i.
+    rows : (1, H) increasing to 1; entry i is the probability of rows 0 to i.
+    columns : (H, W) increasing to 1 along every row; entry j is the probability of columns 0 to j
+        in that row. One table of all texels would run out of float32's digits on large maps.
     density : (H, W) per steradian.
     """
 
-    cumulative: Float[Array, " T"]
+    rows: Float[Array, "1 H"]
+    columns: Float[Array, "H W"]
     density: Float[Array, "H W"]
 
 
@@ -57,24 +62,38 @@ def light_sampler(light: EnvLight) -> LightSampler:
     share = jnp.where(total > 0, power / jnp.where(total > 0, total, 1.0), 0.0)
     uniform = solid_angle / (4 * math.pi)
     share = jnp.where(total > 0, (1 - _UNIFORM_SHARE) * share + _UNIFORM_SHARE * uniform, uniform)
-    # Row by row, since a sum over a whole map has errors larger than the share of a texel.
-    within = jnp.cumsum(share, axis=1)
-    before = jnp.cumsum(within[:, -1]) - within[:, -1]
-    cumulative = jax.lax.cummax((before[:, None] + within).reshape(-1))
-    return LightSampler(cumulative / cumulative[-1], share / solid_angle)
+    in_row = jnp.sum(share, axis=1)
+    return LightSampler(_cumulative(in_row[None]), _cumulative(share), share / solid_angle)
 
 
-def _texel_of(sampler: LightSampler, uniforms: Float[Array, " N"]) -> tuple[Array, Array]:
-    """Texel that a number in [0, 1) falls into, and where in [0, 1) of its share."""
-    count = sampler.cumulative.shape[0]
-    texel = jnp.searchsorted(sampler.cumulative, uniforms, side="right")
-    # Without the barrier XLA searches once for each use of the texel.
-    texel = jax.lax.optimization_barrier(jnp.minimum(texel.astype(jnp.int32), count - 1))
-    upper = sampler.cumulative[texel]
-    lower = jnp.where(texel > 0, sampler.cumulative[jnp.maximum(texel - 1, 0)], 0.0)
-    width = upper - lower
+def _cumulative(share: Float[Array, "R n"]) -> Float[Array, "R n"]:
+    """Sum up to each entry of a row, over the sum of all."""
+    sums = jax.lax.cummax(jnp.cumsum(share, axis=1), axis=1)
+    return sums / sums[:, -1:]
+
+
+def _drawn(
+    tables: Float[Array, "R n"], row: Int[Array, " N"], uniforms: Float[Array, " N"]
+) -> tuple[Int[Array, " N"], Float[Array, " N"]]:
+    """Entry of a row of a table that a number in [0, 1) falls into, and where in its share."""
+    length = tables.shape[1]
+    flat, first = tables.reshape(-1), row * length
+
+    def at(entry):
+        return flat.at[first + entry].get(mode="promise_in_bounds")
+
+    # Binary search for how many entries are at most the number, from the highest bit down.
+    entry = jnp.zeros_like(row)
+    for bit in reversed(range((length - 1).bit_length())):
+        probe = entry + (1 << bit)
+        is_passed = at(jnp.minimum(probe, length) - 1) <= uniforms
+        entry = jnp.where((probe < length) & is_passed, probe, entry)
+    # Without the barrier XLA searches once for each use of the entry.
+    entry = jax.lax.optimization_barrier(entry)
+    lower = jnp.where(entry > 0, at(jnp.maximum(entry - 1, 0)), 0.0)
+    width = at(entry) - lower
     rest = (uniforms - lower) / jnp.where(width > 0, width, 1.0)
-    return texel, jnp.clip(rest, 0.0, 1.0)
+    return entry, jnp.clip(rest, 0.0, 1.0)
 
 
 def sample_light(
@@ -84,8 +103,8 @@ def sample_light(
 
     Parameters
     ----------
-    uniforms : (N, 2) in [0, 1); stratify them. The first chooses the texel, and what is left of it
-        the azimuth within; the second the elevation.
+    uniforms : (N, 2) in [0, 1); stratify them. The first chooses the row, and what is left of it
+        the elevation within; the second the column and the azimuth.
 
     Returns
     -------
@@ -93,16 +112,16 @@ def sample_light(
     density : (N,) per steradian, positive.
     """
     height, width = sampler.density.shape
-    texel, across = _texel_of(sampler, uniforms[:, 0])
-    row, column = texel // width, texel % width
+    row, down = _drawn(sampler.rows, jnp.zeros(uniforms.shape[:1], jnp.int32), uniforms[:, 0])
+    column, across = _drawn(sampler.columns, row, uniforms[:, 1])
     azimuth = (0.5 - (column.astype(across.dtype) + across) / width) * (2 * math.pi)
     # Uniform in the cosine between the edges of the row. Written with half angles, because
     # 1 - cos loses all digits next to a pole.
     top, bottom = (jnp.sin(0.5 * math.pi * (row + k).astype(across.dtype) / height) for k in (0, 1))
-    half = jnp.square(top) + uniforms[:, 1] * (jnp.square(bottom) - jnp.square(top))  # sin^2(v/2)
+    half = jnp.square(top) + down * (jnp.square(bottom) - jnp.square(top))  # sin^2(v/2)
     cosine, sine = 1 - 2 * half, 2 * safe_sqrt(half * (1 - half))
     directions = jnp.stack([sine * jnp.cos(azimuth), sine * jnp.sin(azimuth), cosine], axis=-1)
-    return directions, sampler.density.reshape(-1)[texel]
+    return directions, sampler.density.reshape(-1)[row * width + column]
 
 
 def _texel_at(directions: Float[Array, "N 3"], height: int, width: int) -> Int[Array, " N"]:
