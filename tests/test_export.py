@@ -412,6 +412,20 @@ def test_a_map_of_normals_gives_a_mesh_of_few_faces_the_look_of_the_fine_one(tmp
     assert set(np.unique(tangents[:, 3])) <= {-1.0, 1.0}
 
 
+def test_a_hole_that_fewer_faces_tear_is_said_and_gives_the_mesh_two_sides(tmp_path, monkeypatch):
+    def torn(vertices, faces, count):
+        return vertices, faces[:count]
+
+    monkeypatch.setattr(export, "simplified", torn)
+    for count, closed in ((320, True), (319, False)):
+        path = tmp_path / f"{count}.glb"
+        info = export.export_mesh_glb(
+            *(path, *sphere(2), materials), texture_size=64, face_count=count
+        )
+        assert info["closed"] is closed
+        assert glb_tree(path)["materials"][0].get("doubleSided", False) is not closed
+
+
 def test_tangents_follow_u_and_the_bitangent_points_to_the_top_of_the_texture():
     vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])

@@ -9,7 +9,7 @@ import pytest
 from support import TWO_STAGES, ball, sphere_dataset, tiny_config
 
 from geosplat_jax.core.types import Box
-from geosplat_jax.fit.begin import Resume
+from geosplat_jax.fit.begin import Resume, TakeOver
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.stages import begin_stage, build_pipeline
 from geosplat_jax.fit.train import fit, load_trained
@@ -139,11 +139,11 @@ def test_a_surface_that_moves_is_refused():
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A whole run of three stages, and the same one stopped in the last."""
+    """A whole run of three stages, and one of the same start that was stopped in the last."""
     dataset, config = sphere_dataset(), tiny_config(*REFINE)
     whole, parted = (tmp_path_factory.mktemp(name) / "run" for name in ("whole", "parted"))
     state = fit(dataset, config, whole)
-    first = fit(dataset, config, parted, stop_after=5)
+    first = fit(dataset, config, parted, begin=TakeOver(whole, "refine"), stop_after=5)
     resumed = fit(dataset, config, parted, begin=Resume())
     return dataset, whole, (first, state, resumed)
 

@@ -388,12 +388,14 @@ def export_mesh_glb(
         np.asarray(faces, np.int32),
         np.asarray(normals, np.float32),
     )
-    double_sided, fine = not info["closed"], None
+    fine = None
     if face_count is not None:
         fine = FineSurface(vertices, normals, faces)
         vertices, faces = simplified(vertices, faces, face_count)
         faces = faces[nondegenerate(vertices, faces)]
         normals = fine.nearest(vertices)[1]
+        info["closed"] = is_closed(faces)
+    double_sided = not info["closed"]
     if vertex_colors:
         mesh = _vertex_colored(vertices, faces, normals, sample_materials, double_sided)
         _write_glb(path, mesh)
