@@ -1,13 +1,14 @@
 # Two commands: `make demo` and `make test`. Both make their own environment in .venv.
 # `make test-slow` adds slow tests: whole runs, compiled against eager, images beside Mitsuba's;
 # `make test-long` those of half a minute or more, by hand: the whole loss against differences, a whole sweep.
+# `.ci/run` is the first two in two runs of pytest, so that what tests share is made once.
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 INSTALLED = $(VENV)/.installed
 DEMO = demo
 
-.PHONY: demo test test-slow test-long lint format bench docs clean
+.PHONY: demo test test-slow test-computing test-long lint format bench docs clean
 
 $(INSTALLED): pyproject.toml
 	$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "geosplat_jax needs Python 3.11 or newer, got " + sys.version'
@@ -21,13 +22,19 @@ demo: $(INSTALLED)
 # Files in the order of tests/conftest.py; pytest would begin with those of most tests.
 IN_FILES = --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
+# `make test SELECTED='not computes and not long'` runs all but the longest.
+SELECTED ?= not slow
+
 test: $(INSTALLED)
-	$(BIN)/python -m pytest $(IN_FILES)
+	$(BIN)/python -m pytest $(IN_FILES) -m '$(SELECTED)'
 
 test-slow: $(INSTALLED)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test,scene]'
 	$(BIN)/python -m pytest $(IN_FILES) -m 'slow and not computes and not long'
-	# These compute more than they compile: with the optimisations that the others do without.
+	$(MAKE) test-computing
+
+# These compute more than they compile: with the optimisations that the others do without.
+test-computing: $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test,scene]'
 	XLA_FLAGS= $(BIN)/python -m pytest --numprocesses 2 --dist loadgroup -m 'slow and computes and not long'
 
 test-long: $(INSTALLED)

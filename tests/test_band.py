@@ -463,6 +463,7 @@ def test_a_surface_that_vanishes_is_put_back_with_its_band(dataset, folder, monk
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_training_in_a_band_is_training_on_the_whole_grid(dataset, tmp_path, monkeypatch):
     """Until a cell leaves the band and comes back, and up to the order of sums."""
     monkeypatch.setattr(loop_module, "_FOLLOW_EVERY", 2)

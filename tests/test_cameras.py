@@ -132,6 +132,7 @@ def test_the_camera_and_the_exposure_of_a_render_are_found_again(found):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_white_balance_of_a_render_is_found_again(subject, views):
     camera, log_exposure = moved_camera(views.camera([0]), jnp.asarray(TRUTH), box_of(subject))
     wanted = np.array([0.12, -0.05, -0.07], np.float32)
@@ -582,6 +583,7 @@ def train(root, name, *arguments):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_run_is_refined_and_trained_with_what_was_found(run, capsys):
     assert cli.main(["refine-cameras", str(run / "run")]) == 0
     said = capsys.readouterr().out

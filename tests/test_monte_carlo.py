@@ -158,6 +158,7 @@ def test_the_error_falls_with_the_samples(integral, single_samples):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_combining_is_never_much_worse_than_the_better_technique():
     """A glossy metal under a broad light, and a diffuse point under a sun."""
     points, materials, wo, light = scene()

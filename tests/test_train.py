@@ -348,6 +348,7 @@ def test_vertices_are_sampled_first_and_faces_later(finished):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_random_start_samples_vertices_and_then_faces(dataset, tmp_path):
     config = tiny_config("geometry.initial=random", "stages.split_sum.vertex_fraction=0.5")
     fit(dataset, config, tmp_path)

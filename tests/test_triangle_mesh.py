@@ -274,6 +274,7 @@ def test_the_command_refuses_a_mesh_that_is_no_file(tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_an_open_mesh_is_traced_and_exported(dataset, files, tmp_path):
     config = make_config(
         mesh=files["bowl"],
