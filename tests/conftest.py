@@ -26,6 +26,9 @@ settings.load_profile("same examples")
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+# GPUs round the factors of a product to 10 bits where it does not ask for more. A processor has no
+# such product, so that one which does not ask is an error here.
+jax.config.update("jax_default_matmul_precision", "TF32_TF32_F32")
 
 # In the environment's folder: files, workers and runs share what they compile.
 enable_compilation_cache(Path(sys.prefix) / "cache")

@@ -13,6 +13,7 @@ from test_pipeline import TIGHT, evaluate, problem
 
 from geosplat_jax.core.types import rate_groups
 from geosplat_jax.fit import gradient
+from geosplat_jax.fit.devices import ONE_DEVICE
 from geosplat_jax.fit.gradient import Runner, SideBySide, value_and_gradient
 
 
@@ -61,6 +62,22 @@ def test_two_programs_run_at_a_time_and_their_results_stay_in_order():
 
     assert SideBySide().all(*((program, number) for number in range(4))) == [0, 1, 2, 3]
     assert SideBySide().all((lambda x: x, 5)) == Runner().all((lambda x: x, 5)) == [5]
+
+
+def test_accelerators_are_given_programs_without_waiting(monkeypatch):
+    """What a program returns may still be in the making: nobody asks whether it is ready."""
+
+    class Unfinished:
+        def block_until_ready(self):
+            raise AssertionError("waited")
+
+    run = ONE_DEVICE.runner()
+    with pytest.raises(AssertionError, match="waited"):
+        run(Unfinished)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    run = ONE_DEVICE.runner(fits_twice=True)
+    assert isinstance(run(Unfinished), Unfinished)
+    assert [type(one) for one in run.all((Unfinished,), (Unfinished,))] == [Unfinished] * 2
 
 
 @pytest.mark.parametrize("number", [0, 1])

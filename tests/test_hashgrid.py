@@ -253,7 +253,8 @@ def test_rows_with_zero_cotangent_leave_no_trace():
         )(table)
 
     padded = jnp.concatenate([points, jnp.full((13, 3), 0.123)])
-    np.testing.assert_array_equal(gradient(points), gradient(padded))
+    # Equal bits on a processor; accelerators add up what meets in an entry in any order.
+    np.testing.assert_allclose(gradient(points), gradient(padded), rtol=1e-6, atol=1e-6)
 
 
 def test_no_points_give_no_rows_and_zero_gradients():

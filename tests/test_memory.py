@@ -15,6 +15,7 @@ from geosplat_jax.fit.memory import (
 )
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.runtime import peak_memory_mb
 from geosplat_jax.fit.stages import initial_params
 from geosplat_jax.fit.step import initial_state
 from geosplat_jax.fit.train import fit
@@ -119,6 +120,36 @@ def test_a_program_that_does_not_fit_is_refused_once_it_is_compiled(machine):
         with pytest.raises(TrainingError, match="the program program 0.0 GB; lower geom") as caught:
             require_program_memory("program", compiled, copies)
         assert "\n" not in str(caught.value)
+
+
+class Accelerator:
+    """Tells of its memory as JAX's devices do."""
+
+    def __init__(self, limit, peak):
+        self.stats = {"bytes_limit": limit, "peak_bytes_in_use": peak}
+
+    def memory_stats(self):
+        return self.stats
+
+
+def test_an_accelerator_has_memory_of_its_own(machine, monkeypatch):
+    """Programs have to fit into that, each into one of several; the machine's says nothing."""
+    program = jax.jit(lambda x: jnp.sum(jnp.sort(jnp.outer(x, x), axis=0)))
+    compiled = program.trace(jax.ShapeDtypeStruct((1000,), jnp.float32)).lower().compile()
+    there = [Accelerator(8 * GIGA, 3 * GIGA), Accelerator(4_500_000, 2**20)]
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax, "local_devices", lambda: there)
+    machine(0.001)
+    require_program_memory("program", compiled, 2)
+    assert not fits_twice(compiled)
+    assert peak_memory_mb() == 3 * GIGA // 2**20
+    there[1].stats["bytes_limit"] = 3_500_000
+    with pytest.raises(TrainingError, match="there are 0.0 GB: the program program 0.0 GB"):
+        require_program_memory("program", compiled)
+    there[:] = [there[1]]
+    there[0].stats = None  # as of devices that do not tell
+    require_program_memory("program", compiled)
+    assert peak_memory_mb() == 0
 
 
 def test_a_limit_of_the_process_counts(monkeypatch):

@@ -219,11 +219,12 @@ def moved_camera(
     log_exposure : () logarithm of the factor of the exposure.
     """
     rotation, translation = camera.world_to_camera[0, :3, :3], camera.world_to_camera[0, :3, 3]
-    center = rotation @ box.center + translation
+    product = partial(jnp.matmul, precision="highest")
+    center = product(rotation, box.center) + translation
     lengths = jnp.stack([box.half_extent, box.half_extent, center[2]])
     turn = rotation_vector_to_matrix(parameters[:3])
-    turned = turn @ rotation
-    moved = center + parameters[3:6] * lengths - turned @ box.center
+    turned = product(turn, rotation)
+    moved = center + parameters[3:6] * lengths - product(turned, box.center)
     pose = jnp.eye(4, dtype=rotation.dtype).at[:3, :3].set(turned).at[:3, 3].set(moved)
     focal = jnp.exp(parameters[6])
     factors = jnp.ones((3, 3), rotation.dtype).at[(0, 1), (0, 1)].set(focal)

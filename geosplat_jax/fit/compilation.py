@@ -4,6 +4,7 @@ XLA compiles a program on one core and without the interpreter's lock: two threa
 time, and a thread that compiles the programs of the next stage does not hold up the present one.
 """
 
+import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -16,6 +17,9 @@ from geosplat_jax.fit.memory import fits_twice, require_program_memory
 from geosplat_jax.fit.runtime import in_background
 from geosplat_jax.fit.step import TrainState, UpdateRule, train_step
 from geosplat_jax.pipeline import Pipeline
+
+THREADS = max(2, os.cpu_count() or 2)
+"""Programs that are compiled at a time where nothing else runs."""
 
 
 class _Compiling(Runner):
@@ -58,7 +62,7 @@ def compile_step(
     rule: UpdateRule,
     *,
     devices: Devices = ONE_DEVICE,
-    threads: int = 2,
+    threads: int = THREADS,
     is_wanted: Callable[[], bool] = lambda: True,
 ) -> bool:
     """Compile the programs of `step.train_step` for arguments of these shapes; run none of them.

@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from geosplat_jax.core.types import Batch, Camera
 from geosplat_jax.fit import gradient, step
-from geosplat_jax.fit.gradient import IN_TURN, Runner, SharedBatch, SideBySide
+from geosplat_jax.fit.gradient import IN_TURN, QUEUED, Runner, SharedBatch, SideBySide
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.pipeline import ViewReport
 
@@ -58,6 +58,8 @@ class Devices:
 
         ``fits_twice`` : whether the memory holds two of them at a time.
         """
+        if jax.default_backend() != "cpu":
+            return QUEUED
         return SideBySide() if fits_twice else IN_TURN
 
     def shapes(self, tree: Any) -> Any:

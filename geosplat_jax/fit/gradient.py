@@ -44,7 +44,19 @@ class Runner:
 
 
 IN_TURN = Runner()
-"""The usual one."""
+"""The usual one of processors."""
+
+
+class Queued(Runner):
+    """Calls programs without waiting: an accelerator works them off while the next are prepared."""
+
+    def __call__(self, program: Any, *arguments: Any) -> Any:
+        """Put a program into the queue and return what its results will be."""
+        return program(*arguments)
+
+
+QUEUED = Queued()
+"""The usual one of accelerators."""
 
 
 class SideBySide(Runner):

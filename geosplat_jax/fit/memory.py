@@ -20,7 +20,7 @@ from geosplat_jax.fit.config import Config, Stage
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.pyramid import level_sizes
 from geosplat_jax.io.dataset import Dataset
-from geosplat_jax.io.memory import Need, memory_refusal
+from geosplat_jax.io.memory import Need, accelerator_refusal, memory_refusal
 from geosplat_jax.materials import init_materials
 
 _COPIES_LEARNED = 4
@@ -77,9 +77,9 @@ def require_program_memory(name: str, compiled: jax.stages.Compiled, copies: int
 
     Parameters
     ----------
-    name : of the program. compiled : on a processor, or it is left alone: the memory of an
-        accelerator is its allocator's business.
-    copies : devices that share the memory of this machine.
+    name : of the program. compiled : for a processor or an accelerator.
+    copies : devices of this process; processors share the memory of the machine, and every
+        accelerator has its own.
 
     Raises
     ------
@@ -102,11 +102,13 @@ def fits_twice(compiled: jax.stages.Compiled) -> bool:
 def _program_refusal(name: str, compiled: jax.stages.Compiled, copies: int) -> str | None:
     """Say why so many copies of a program do not fit, if so; see `require_program_memory`."""
     sizes = compiled.memory_analysis()
-    if sizes is None or jax.default_backend() != "cpu":
+    if sizes is None:
         return None
     need = sizes.temp_size_in_bytes + sizes.argument_size_in_bytes + sizes.output_size_in_bytes
-    need = copies * (need - sizes.alias_size_in_bytes)
-    return memory_refusal([Need(f"the program {name}", need)])
+    need -= sizes.alias_size_in_bytes
+    if jax.default_backend() != "cpu":
+        return accelerator_refusal([Need(f"the program {name}", need)])
+    return memory_refusal([Need(f"the program {name}", copies * need)])
 
 
 def require_rendering_memory(

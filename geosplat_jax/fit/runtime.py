@@ -77,7 +77,14 @@ def in_background(function: Callable[[], _Result]) -> "Future[_Result]":
 
 
 def peak_memory_mb() -> int:
-    """Largest resident memory of this process so far, MB; 0 where the system does not tell."""
+    """Largest memory of this process so far, MB; 0 where the system does not tell.
+
+    That is what its allocator gave out of one accelerator where JAX computes on some, and what
+    was resident on a processor.
+    """
+    if jax.default_backend() != "cpu":
+        stats = [device.memory_stats() or {} for device in jax.local_devices()]
+        return max(one.get("peak_bytes_in_use", 0) for one in stats) // (1024 * 1024)
     try:
         import resource
     except ImportError:  # not on Windows

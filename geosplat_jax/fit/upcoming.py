@@ -7,7 +7,7 @@ from typing import Any
 import jax
 
 from geosplat_jax.core.capacity import Capacities, Counts, tightened
-from geosplat_jax.fit.compilation import compile_step
+from geosplat_jax.fit.compilation import THREADS, compile_step
 from geosplat_jax.fit.config import Config, Stage
 from geosplat_jax.fit.devices import Devices
 from geosplat_jax.fit.planning import add_rays, plan_capacities
@@ -109,7 +109,7 @@ class Upcoming:
                 pipeline,
                 rule,
                 devices=devices,
-                threads=1,
+                threads=THREADS // 2,  # the steps before need the other half
                 is_wanted=lambda: self._is_wanted,
             )
 

@@ -62,9 +62,26 @@ def _limit_in(path: Path) -> int | None:
     return int(text) if text.isdigit() else None
 
 
+def memory_of_accelerator() -> int | None:
+    """Count the bytes that JAX may use of each accelerator; None where it computes on none."""
+    if jax.default_backend() == "cpu":
+        return None
+    limits = [(device.memory_stats() or {}).get("bytes_limit") for device in jax.local_devices()]
+    return min(filter(None, limits), default=None)
+
+
 def memory_refusal(needs: Sequence[Need]) -> str | None:
     """Say why needs cannot be met, the largest first; None where they fit, or nobody knows."""
-    available, total = memory_of_machine(), sum(need.byte_count for need in needs)
+    return _refusal(needs, memory_of_machine())
+
+
+def accelerator_refusal(needs: Sequence[Need]) -> str | None:
+    """Say what `memory_refusal` says, of needs that the memory of an accelerator has to meet."""
+    return _refusal(needs, memory_of_accelerator())
+
+
+def _refusal(needs: Sequence[Need], available: int | None) -> str | None:
+    total = sum(need.byte_count for need in needs)
     if available is None or total <= available:
         return None
     largest = sorted(needs, key=lambda need: need.byte_count, reverse=True)

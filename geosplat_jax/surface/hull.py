@@ -427,7 +427,8 @@ def _worst_distance(
 def _distance_in_view(pinhole, intrinsics, distances, counts, points):
     """World distance of points to one silhouette cone, negative inside; -inf where unseen."""
     height, width = distances.shape
-    x, y, z = jnp.moveaxis(points @ pinhole[:, :3].T + pinhole[None, :, 3], -1, 0)
+    local = jnp.matmul(points, pinhole[:, :3].T, precision="highest") + pinhole[None, :, 3]
+    x, y, z = jnp.moveaxis(local, -1, 0)
     ahead = z > 0.0
     depth = jnp.where(ahead, z, 1.0)
     fx, fy = intrinsics[0, 0], intrinsics[1, 1]

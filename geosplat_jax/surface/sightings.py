@@ -281,7 +281,8 @@ def _sample(
 
     def one(view):
         pinhole, lens, image, least, largest, counted = view
-        x, y, z = jnp.moveaxis(points @ pinhole[:, :3].T + pinhole[None, :, 3], -1, 0)
+        local = jnp.matmul(points, pinhole[:, :3].T, precision="highest") + pinhole[None, :, 3]
+        x, y, z = jnp.moveaxis(local, -1, 0)
         depth = jnp.maximum(z, 1e-6)
         u, v = lens[0, 0] * x / depth + lens[0, 2], lens[1, 1] * y / depth + lens[1, 2]
         is_inside = (z > 0.0) & (u >= 0.0) & (u < width) & (v >= 0.0) & (v < height)

@@ -237,7 +237,9 @@ def rotate_light(light: EnvLight, rotation: Float[Array, "3 3"]) -> EnvLight:
     """
     height, width, _ = light.radiance.shape
     directions = jnp.asarray(_texel_directions(height, width).reshape(-1, 3), rotation.dtype)
-    radiance = lookup(light.radiance, directions @ rotation)  # rows of d^T R are R^T d
+    # Rows of d^T R are R^T d.
+    turned = jnp.matmul(directions, rotation, precision="highest")
+    radiance = lookup(light.radiance, turned)
     return EnvLight(radiance.reshape(light.radiance.shape))
 
 
