@@ -8,7 +8,8 @@ come from an independent path tracer (8 bounces, Disney principled BSDF), so tha
 on them is not judged by their own renderer.
 
 The `llvm_ad_rgb` variant of Mitsuba is many times faster than `scalar_rgb`, but needs an LLVM
-library of version 16 or newer, found through the environment variable `DRJIT_LIBLLVM_PATH`.
+library of version 16 or newer, found through the environment variable `DRJIT_LIBLLVM_PATH`; the
+latter is taken where the former does not render.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ import scene_lights
 import trimesh
 from numpy.typing import NDArray
 from PIL import Image
+from variants import choose_variant
 
 Array = NDArray[np.float32]
 
@@ -105,29 +107,6 @@ def test_views(count: int) -> list[View]:
         View(f"test_{i:03d}", look_at_origin(position(a, h)), 2000 + i)
         for i, (a, h) in enumerate(zip(azimuths, heights, strict=True))
     ]
-
-
-def choose_variant(requested: str) -> str:
-    """Activate a Mitsuba variant and return its name.
-
-    Parameters
-    ----------
-    requested
-        A variant name, or `auto`: `llvm_ad_rgb` if its library loads, else `scalar_rgb`.
-    """
-    if requested != "auto":
-        mi.set_variant(requested)
-        return requested
-    if "llvm_ad_rgb" in mi.variants():
-        try:
-            mi.set_variant("llvm_ad_rgb")
-            mi.Float([1.0, 2.0])  # the library is opened on first use
-        except (ImportError, RuntimeError) as error:
-            print(f"llvm_ad_rgb is unavailable, using the slower scalar_rgb: {error}")
-        else:
-            return "llvm_ad_rgb"
-    mi.set_variant("scalar_rgb")
-    return "scalar_rgb"
 
 
 def _transform(matrix: NDArray[np.float64]) -> Any:

@@ -21,6 +21,7 @@ import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
+from variants import choose_variant
 
 Array = NDArray[np.float64]
 
@@ -159,7 +160,7 @@ def main() -> None:
     parser.add_argument("--scene", type=Path, default=Path("examples") / make_scene.NAME)
     parser.add_argument("--variant", default="auto", help="Mitsuba variant, or auto")
     args = parser.parse_args()
-    make_scene.choose_variant(args.variant)
+    choose_variant(args.variant)
     results: list[tuple[str, float, float]] = []
     # Four sides, top and bottom of different colours, varying smoothly: any flip or turn shows.
     directions = scene_lights.pixel_directions(64)

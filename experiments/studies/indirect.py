@@ -36,6 +36,7 @@ import make_bounce_scenes  # noqa: E402
 import make_scene  # noqa: E402
 import mitsuba as mi  # noqa: E402
 import scene_lights  # noqa: E402
+from variants import choose_variant  # noqa: E402
 
 from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory  # noqa: E402
 from geosplat_jax.fit.trained import load_trained  # noqa: E402
@@ -188,7 +189,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.scene.resolve().name not in make_bounce_scenes.SCENES:
         parser.error(f"SCENE must be one of {', '.join(make_bounce_scenes.SCENES)}")
-    make_scene.choose_variant(arguments.variant)
+    choose_variant(arguments.variant)
     enable_compilation_cache()
     retain_freed_memory()
     truth = rendered_by_mitsuba(arguments.scene.resolve(), arguments.views, arguments.spp)

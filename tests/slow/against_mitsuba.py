@@ -20,7 +20,6 @@ test, in Mitsuba because the shadow ray then starts inside a closed mesh.
 """
 
 import argparse
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -33,6 +32,10 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 from trimesh.exchange.ply import export_ply
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "experiments" / "scene"))
+
+from variants import choose_variant
 
 from geosplat_jax.core.capacity import combine, retry
 from geosplat_jax.core.types import EnvLight, Grid, Materials, SurfacePoints
@@ -68,20 +71,6 @@ _POINTS_AT_ONCE = 65_536
 
 # A z-up world in Mitsuba's y-up envmap: local = (y, z, x).
 _ENVMAP_TO_WORLD = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
-
-_VARIANTS = ("llvm_ad_rgb", "scalar_rgb")
-"""Fastest first."""
-
-# Run in a process of its own: an LLVM that lacks an instruction aborts instead of raising.
-_PROBE = """
-import sys, mitsuba as mi, numpy as np
-mi.set_variant(sys.argv[1])
-light = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32))}
-ball = {"type": "sphere", "center": [0, 0, 5], "bsdf": {"type": "principled", "metallic": 1.0}}
-sensor = {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}}
-parts = {"integrator": {"type": "direct"}, "sensor": sensor, "light": light, "ball": ball}
-assert np.isfinite(np.array(mi.render(mi.load_dict({"type": "scene", **parts}), spp=4))).all()
-"""
 
 
 @dataclass(frozen=True)
@@ -384,29 +373,6 @@ def combined(images: list[np.ndarray], coverages: list[np.ndarray], size: int) -
     halves = np.mean(stack[:even:2], axis=0) - np.mean(stack[1:even:2], axis=0)
     coverage = np.mean(np.stack(coverages).reshape(-1, size, size), axis=0)
     return Image(np.mean(stack, axis=0), coverage, 0.5 * halves)
-
-
-def choose_variant() -> str:
-    """Set the fastest variant of Mitsuba that renders on this machine, and name it.
-
-    Raises
-    ------
-    RuntimeError
-        If none does; the message holds what the last one printed.
-    """
-    import mitsuba
-
-    last = ""
-    for variant in _VARIANTS:
-        if variant not in mitsuba.variants():
-            continue
-        command = [sys.executable, "-c", _PROBE, variant]
-        found = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-        if found.returncode == 0:
-            mitsuba.set_variant(variant)
-            return variant
-        last = found.stderr[-2000:]
-    raise RuntimeError(f"no variant of {_VARIANTS} renders here; the last one said: {last}")
 
 
 def _envmap_texels(light: EnvLight) -> np.ndarray:
