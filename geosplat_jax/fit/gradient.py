@@ -17,6 +17,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from geosplat_jax.core.capacity import Capacities
@@ -274,7 +275,8 @@ def value_and_gradient(
     )
     together = run.all if pipeline.uses_rays else partial(Runner.all, run)
     asset, pull_asset = run(_asset, pipeline, params, frozen)
-    views = [run(_view, batch, jnp.int32(number)) for number in range(batch.count)]
+    numbers = jax.device_put([np.int32(number) for number in range(batch.count)])
+    views = [run(_view, batch, number) for number in numbers]
     # These sort, in every stage.
     lists = run.all(*((_lists, listing, asset, view) for view, _ in views))
     seen = run(_seen, pipeline, asset, lists)

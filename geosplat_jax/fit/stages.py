@@ -73,18 +73,17 @@ def update_rule(config: Config, stage: Stage, params: Params, step: int) -> Upda
             f"stages.{stage.name}.rates lacks {missing[0]}, the learning rate of some parameters; "
             "add it (0 freezes them)"
         )
-    return UpdateRule(
-        rates=_arrays(stage.rates_at(step)),
-        light_knee=jnp.float32(stage.light_knee),
-        light_pyramid=jnp.float32(stage.light_pyramid),
-        smallest_light=jnp.float32(config.run.smallest_light),
-        frozen=stage.frozen,
-    )
+    light = {
+        "light_knee": stage.light_knee,
+        "light_pyramid": stage.light_pyramid,
+        "smallest_light": config.run.smallest_light,
+    }
+    return UpdateRule(rates=_arrays(stage.rates_at(step)), frozen=stage.frozen, **_arrays(light))
 
 
 def _arrays(values: dict[str, float]) -> dict[str, Array]:
     """Make scalars of numbers, so that a change of value costs no compilation."""
-    return {name: jnp.float32(value) for name, value in values.items()}
+    return jax.device_put({name: np.float32(value) for name, value in values.items()})
 
 
 def initial_params(shape: Any, config: Config, key: Key[Array, ""]) -> Params:

@@ -8,6 +8,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -164,5 +165,5 @@ def train_step(
     """
     batch = replace(batch, carry=state.carry)
     found, gradient = value_and_gradient(pipeline, state.params, batch, frozen=rule.frozen, run=run)
-    sizes = {name: jnp.int32(pipeline.capacities[name]) for name in found[1].usage}
+    sizes = jax.device_put({n: np.int32(pipeline.capacities[n]) for n in found[1].usage})
     return run(_update, state, gradient, found, sizes, rule)

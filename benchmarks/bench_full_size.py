@@ -1,0 +1,73 @@
+"""Time the steps of every stage on a scene of any size, on whatever JAX computes on.
+
+    python -m benchmarks.bench_full_size SCENE --quality high --set geometry.resolution=96
+
+Every stage makes a few steps, each from where the one before ended, so that a run takes minutes.
+The surface is then still close to the visual hull and has about as many faces as a trained one.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import tempfile
+from pathlib import Path
+
+import jax
+
+from geosplat_jax.fit.folder import RunFolder
+from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.runtime import enable_compilation_cache, peak_memory_mb, retain_freed_memory
+from geosplat_jax.fit.train import fit
+from geosplat_jax.io.dataset import load_dataset
+
+_WARM_UP = 3
+
+
+def run(
+    scene: Path, *, quality: str, overrides: tuple[str, ...] = (), steps: int = 20
+) -> dict[str, float | int | str]:
+    """Return median seconds of a step of every stage, first ones apart, and the peak memory."""
+    names = make_config("default", quality, overrides=overrides).stage_names
+    lengths = [f"stages.{name}.steps={steps + _WARM_UP}" for name in names]
+    config = make_config(
+        "default", quality, overrides=(*overrides, *lengths, "run.preview_every=0")
+    )
+    dataset = load_dataset(scene)
+    with tempfile.TemporaryDirectory() as folder:
+        fit(dataset, config, folder)
+        lines = RunFolder(folder).metric_lines()
+    results: dict[str, float | int | str] = {
+        "device": jax.devices()[0].device_kind,
+        "cores": os.cpu_count() or 0,
+        "jax": jax.__version__,
+        "views": len(dataset.train),
+        "pixels": f"{dataset.train.width} x {dataset.train.height}",
+        "quality": " ".join((quality, *overrides)),
+        "splats": lines[-1]["splats"],
+        "peak_memory_mb": peak_memory_mb(),
+    }
+    for name in names:
+        timed = [line["seconds"] for line in lines if line["stage"] == name][_WARM_UP:]
+        results[f"step_{name}_s"] = round(statistics.median(timed), 4)
+    return results
+
+
+def main() -> None:
+    """Run the benchmark and print it."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--quality", default="high")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.FIELD=VALUE")
+    parser.add_argument("--steps", type=int, default=20, help="timed steps of every stage")
+    options = parser.parse_args()
+    enable_compilation_cache()
+    retain_freed_memory()
+    measured = run(
+        options.scene, quality=options.quality, overrides=tuple(options.set), steps=options.steps
+    )
+    print(json.dumps(measured, indent=1))
+
+
+if __name__ == "__main__":
+    main()
