@@ -26,9 +26,6 @@ settings.load_profile("same examples")
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-# GPUs round the factors of a product to 10 bits where it does not ask for more. A processor has no
-# such product, so that one which does not ask is an error here.
-jax.config.update("jax_default_matmul_precision", "TF32_TF32_F32")
 
 # In the environment's folder: files, workers and runs share what they compile.
 enable_compilation_cache(Path(sys.prefix) / "cache")
@@ -76,3 +73,15 @@ def _release_compiled_programs():
     """
     yield
     jax.clear_caches()
+
+
+@pytest.fixture(scope="module")
+def products_must_ask():
+    """Refuse products of matrices that do not ask for the precision of their factors.
+
+    GPUs round the factors of such products to 10 bits. A processor cannot, and where that is the
+    default, a product that leaves it at the default is an error.
+    """
+    jax.config.update("jax_default_matmul_precision", "TF32_TF32_F32")
+    yield
+    jax.config.update("jax_default_matmul_precision", None)

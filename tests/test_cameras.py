@@ -50,6 +50,8 @@ from geosplat_jax.io.images import SceneError
 from geosplat_jax.report.renderer import Renderer
 from geosplat_jax.run import Run
 
+pytestmark = pytest.mark.usefixtures("products_must_ask")
+
 DUCK = Path(__file__).resolve().parents[1] / "examples" / "duck"
 CONFIG = tiny_config("geometry.resolution=8", "material.bias=true")
 STEPS = (*TINY, "stages.split_sum.steps=2")

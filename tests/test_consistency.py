@@ -23,6 +23,8 @@ from geosplat_jax.report.consistency import (
     see_mesh,
 )
 
+pytestmark = pytest.mark.usefixtures("products_must_ask")
+
 EYE = [0.6, 0.3, 2.4]
 
 

@@ -23,6 +23,8 @@ from geosplat_jax.transport.environment import (
     to_y_up_map,
 )
 
+pytestmark = pytest.mark.usefixtures("products_must_ask")
+
 # One compilation costs less than a dozen eager operations.
 lookup, rotate_light = jax.jit(environment.lookup), jax.jit(environment.rotate_light)
 prefiltered_specular = jax.jit(environment.prefiltered_specular)

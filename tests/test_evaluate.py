@@ -20,6 +20,8 @@ from geosplat_jax.report.protocols import PROTOCOLS
 from geosplat_jax.report.renderer import RELIGHT_BOUNCES, Renderer
 from geosplat_jax.report.sheets import preview_image
 
+pytestmark = pytest.mark.usefixtures("products_must_ask")
+
 AMPLE = Capacities(
     surface_cubes=256,
     dual_vertices=256,

@@ -20,6 +20,8 @@ from geosplat_jax.io import baking, export, meshes
 from geosplat_jax.io.images import SceneError, read_linear
 from geosplat_jax.io.usd import write_usd
 
+pytestmark = pytest.mark.usefixtures("products_must_ask")
+
 DATA = Path(__file__).parent / "data"
 
 # Half a texel across a chart's border, where a filled gutter is constant; 8 bits are far finer.

@@ -156,12 +156,16 @@ def test_masked_rays_hit_nothing_and_leave_the_others(torus):
 
 
 @pytest.mark.slow
-def test_rays_that_wait_for_others_hit_what_they_would_at_once(torus, monkeypatch):
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+def test_rays_that_wait_for_others_hit_what_they_would_at_once(torus, monkeypatch, backend):
     _, index = torus
     *rays, _ = _rays(1500)
     rays.append(jnp.asarray(np.random.default_rng(0).random(1500) < 0.8))
     whole = index.nearest(*rays)
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
     monkeypatch.setattr(walking, "_LANES", 512)
+    monkeypatch.setattr(walking, "_ACCELERATOR_LANES", 1024)
+    monkeypatch.setattr(walking, "_ACCELERATOR_FEWEST_LANES", 128)
     again = jax.jit(walking.trace, static_argnames=("two_sided", "any_hit"))
     parts = again(index, *rays, two_sided=False, any_hit=False)
     np.testing.assert_array_equal(whole[1], parts[1])

@@ -17,6 +17,8 @@ from geosplat_jax.io.views import Views
 from geosplat_jax.surface.hollows import carve_hollows
 from geosplat_jax.surface.hull import fit_grid, grid_points, hull_sdf
 
+pytestmark = pytest.mark.usefixtures("products_must_ask")
+
 OUTER, INNER = 1.0, 0.8
 BOUNDS = (np.full(3, -1.05), np.array([1.05, 1.05, 0.1]))
 COUNT, SIZE, DISTANCE = 24, 64, 4.0

@@ -17,6 +17,8 @@ from geosplat_jax.surface.hull import (
     visual_hull,
 )
 
+pytestmark = pytest.mark.usefixtures("products_must_ask")
+
 SHARED = Path(__file__).parents[2] / "shared"
 VIEW_COUNT, SIZE, FOCAL, DISTANCE, RADIUS = 40, 64, 90.0, 4.0, 0.9
 BACKGROUND = (0.5, 0.5, 0.5)

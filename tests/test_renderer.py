@@ -28,6 +28,8 @@ from geosplat_jax.report.renderer import (
 )
 from geosplat_jax.transport.paths import PathSettings
 
+pytestmark = pytest.mark.usefixtures("products_must_ask")
+
 BUFFERS = ("surface_cubes", "dual_vertices", "quads", "visible", "hits", "chunks", "cell_patches")
 AMPLE = Capacities(**dict(zip(BUFFERS, (256, 256, 256, 4096, 8192, 2048, 4096), strict=True)))
 COMMON = ("material.bias=true", "stages.monte_carlo.enter=[]", *MONTE_CARLO)

@@ -16,9 +16,10 @@ are passed without a test: the fast and usual choice for rays that leave the sur
 Self-intersection. A ray never hits the face it is said to start from, nor anything nearer than
 `T_MIN` cells.
 
-On a CPU, XLA runs a loop over many rays in lockstep. Rays therefore wait in a queue, of which only
-as many travel as stay in the cache of a core; whenever half of these have finished, the others move
-together and the next of the queue take their places. Rays that the mask leaves out never travel.
+XLA runs a loop over many rays in lockstep. Rays therefore wait in a queue, of which only as many
+travel as stay in the cache of a core, or as fill an accelerator; whenever half of these have
+finished, the others move together and the next of the queue take their places. Rays that the mask
+leaves out never travel.
 """
 
 import abc
@@ -48,6 +49,12 @@ _LANES = 8192
 
 _FEWEST_LANES = 256
 """Fewer rays than this are not worth moving together."""
+
+_ACCELERATOR_LANES = 1 << 19
+"""Rays that travel together on an accelerator, which a few thousand would leave idle."""
+
+_ACCELERATOR_FEWEST_LANES = 1 << 14
+"""Fewer rays than this take an accelerator as long to move on as to move together."""
 
 _DOUBLINGS = 7
 """Doublings of an empty cube, so that three bits hold how often it was doubled: up to 128 cells."""
@@ -412,6 +419,13 @@ def _halve(lanes: Lanes, nobody: int) -> Lanes:
     )
 
 
+def _lane_counts() -> tuple[int, int]:
+    """Return how many rays travel together at most, and how few are not moved together."""
+    if jax.default_backend() == "cpu":
+        return _LANES, _FEWEST_LANES
+    return _ACCELERATOR_LANES, _ACCELERATOR_FEWEST_LANES
+
+
 def trace(
     index: CellIndex,
     origins: Float[Array, "N 3"],
@@ -426,7 +440,8 @@ def trace(
     nobody, grid = origins.shape[0], index.grid
     if nobody == 0:
         return jnp.zeros((0,), origins.dtype), jnp.zeros((0,), jnp.int32)
-    half = min(_LANES, max(_FEWEST_LANES, -(-nobody // _FEWEST_LANES) * _FEWEST_LANES)) // 2
+    most, fewest = _lane_counts()
+    half = min(most, max(fewest, -(-nobody // fewest) * fewest)) // 2
     local = (origins - grid.origin[None, :]) / grid.cell_size
     is_waiting = bit_set(mask)
     queue, total = jnp.pad(is_waiting.first(capacity=nobody), (0, half)), is_waiting.count
@@ -464,7 +479,7 @@ def trace(
     found = (jnp.full((nobody,), jnp.inf, origins.dtype), jnp.full((nobody,), -1, jnp.int32))
     state = (jnp.zeros((), jnp.int32), next_ones(total), found)
     _, lanes, found = jax.lax.while_loop(lambda state: state[0] < total, refill, state)
-    while half > _FEWEST_LANES:
+    while half > fewest:
         half //= 2
         lanes, found = travel(lanes, found, half)
         lanes = _halve(lanes, nobody)
