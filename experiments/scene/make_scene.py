@@ -41,6 +41,9 @@ CAMERA_ANGLE_X = 0.68
 MAX_DEPTH = 8
 # The true pictures have no light transport, so only their edges need samples.
 TRUTH_SAMPLE_COUNT = 256
+# Seeds of the views are below it.
+OTHER_SEED = 1_000_000
+TRIES = 3
 # The picture is made from a mesh whose edges are shorter than a pixel; the one on disk is coarser.
 RENDER_RESOLUTION = 200
 SAVED_RESOLUTION = 80
@@ -243,15 +246,29 @@ def truth_scene(mesh_path: Path, attribute: str) -> Any:
 
 
 def render(scene: Any, view: View, *, size: int, sample_count: int) -> Array:
-    """Render one view.
+    """Render one view; a pixel that one path made not a number gets other paths.
 
     Returns
     -------
     Array
         (size, size, C) linear, premultiplied by coverage; channel 3 is coverage.
+
+    Raises
+    ------
+    RuntimeError
+        If pixels stay without a number.
     """
-    image = mi.render(scene, sensor=sensor(view, size, sample_count), seed=view.seed)
-    return np.array(image, np.float32)
+    from_where = sensor(view, size, sample_count)
+    image = np.array(mi.render(scene, sensor=from_where, seed=view.seed), np.float32)
+    for seed in range(view.seed + OTHER_SEED, view.seed + OTHER_SEED + TRIES):
+        is_bad = ~np.isfinite(image).all(-1)
+        if not is_bad.any():
+            return image
+        again = np.array(mi.render(scene, sensor=from_where, seed=seed), np.float32)
+        image[is_bad] = again[is_bad]
+    if not np.isfinite(image).all():
+        raise RuntimeError(f"{view.name}: {TRIES} more renderings left pixels without a number")
+    return image
 
 
 def straight(premultiplied: Array, alpha: Array) -> Array:
