@@ -1,8 +1,7 @@
 """Compiling the programs of a step side by side, and before the first step needs them.
 
-XLA compiles a program on one core and without the interpreter's lock: as many threads as cores take
-the least time, and a thread that compiles the programs of the next stage does not hold up the
-present one.
+XLA compiles a program on one core and without the interpreter's lock: so there are as many threads
+as cores, and one that compiles the programs of the next stage does not hold up the present one.
 """
 
 import os

@@ -79,8 +79,8 @@ def in_background(function: Callable[[], _Result]) -> "Future[_Result]":
 def peak_memory_mb() -> int:
     """Largest memory of this process so far, MB; 0 where the system does not tell.
 
-    That is what its allocator gave out of one accelerator where JAX computes on some, and what
-    was resident on a processor.
+    Where JAX computes on accelerators, that is what its allocator gave out of the fullest of them;
+    on a processor, what was resident.
     """
     if jax.default_backend() != "cpu":
         stats = [device.memory_stats() or {} for device in jax.local_devices()]
