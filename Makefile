@@ -1,7 +1,7 @@
 # Two commands: `make demo` and `make test`. Both make their own environment in .venv.
 # `make test-slow` adds slow tests: whole runs, compiled against eager, images beside Mitsuba's;
-# `make test-long` those of half a minute or more, by hand: the whole loss against differences, a whole sweep.
-# `.ci/run` runs what `make test` and `make test-slow` run, but trains only once what their tests share.
+# `make test-long` those of half a minute or more, by hand: the whole loss against differences, a whole
+# sweep, two hosts, another process. `.ci/run` runs the first two, the slow ones where a machine is fast enough.
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
@@ -22,11 +22,8 @@ demo: $(INSTALLED)
 # Files in the order of tests/conftest.py; pytest would begin with those of most tests.
 IN_FILES = --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
-# Marks of the tests to run; `not computes and not long` adds slow tests to the default ones.
-SELECTED ?= not slow
-
 test: $(INSTALLED)
-	$(BIN)/python -m pytest $(IN_FILES) -m '$(SELECTED)'
+	$(BIN)/python -m pytest $(IN_FILES) -m 'not slow'
 
 test-slow: $(INSTALLED)
 	$(BIN)/python -m pytest $(IN_FILES) -m 'slow and not computes and not long'

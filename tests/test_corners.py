@@ -36,6 +36,7 @@ def test_a_corner_is_refused_before_anything_is_spent_where_it_has_to_be(corner,
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "overrides",
     [

@@ -132,7 +132,7 @@ def traced(scene):
     return pipeline, build(pipeline, params), camera
 
 
-@pytest.mark.parametrize("points", ["splats", "mesh"])
+@pytest.mark.parametrize("points", ["splats", pytest.param("mesh", marks=pytest.mark.slow)])
 def test_a_convex_body_does_not_shadow_itself(traced, points):
     """Under a constant sky the diffuse light of every covered pixel is that sky."""
     pipeline, asset, camera = traced

@@ -105,6 +105,7 @@ fit(sphere_dataset(), tiny_config(), Path(sys.argv[2]))
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_another_process_trains_the_same_bits(tmp_path):
     """Compiled anew, with other addresses and another hash seed."""
     here, there = tmp_path / "here", tmp_path / "there"

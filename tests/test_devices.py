@@ -67,6 +67,7 @@ def test_two_devices_give_the_loss_and_the_gradient_of_one(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_two_hosts_grow_stop_resume_and_refuse_together(tmp_path):
     """Two processes: a refusal, an overflow, a Ctrl-C at one of them, a checkpoint, the end."""
     with socket.socket() as free:

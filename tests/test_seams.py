@@ -297,6 +297,7 @@ def test_the_stages_before_another_one_can_be_taken_from_a_run(dataset, run, tmp
         fit(dataset, mesh_config(), tmp_path / "x", begin=TakeOver(run[0], "split_sum"))
 
 
+@pytest.mark.slow
 def test_a_strange_run_is_rendered_and_relit(dataset, run):
     trained = load_trained(run[0])
     renderer = Renderer.of(trained, samples=4)

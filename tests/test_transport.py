@@ -384,7 +384,7 @@ def even_radiance(level):
     return np.tile((np.log(np.expm1(level)) + 3) * EVEN, 3)
 
 
-@pytest.mark.parametrize("moves", ["learned", "both"])
+@pytest.mark.parametrize("moves", ["learned", pytest.param("both", marks=pytest.mark.slow)])
 def test_disagreement_is_the_squared_difference_and_moves_what_it_should(ball, moves):
     """A ball blocks nothing of its own sky: matt, it sends albedo times the light, which is 1."""
     _, _, asset = ball
