@@ -196,6 +196,8 @@ def test_the_files_are_written(perfect):
 
 
 def test_without_truth_there_are_no_metrics_of_it(run, views, tmp_path):
+    """Nor sheets, of which an earlier evaluation had left one."""
+    (tmp_path / "relight.png").write_bytes(b"of an earlier evaluation")
     bare = replace(views, truth={}, relight={})
     metrics = evaluate(run, bare, tmp_path)
     assert set(metrics["mean"]) == NEW_VIEWS

@@ -49,6 +49,7 @@ from geosplat_jax.report.consistency import (
 from geosplat_jax.report.page import REPORT
 from geosplat_jax.report.relight import RelightOptions
 from geosplat_jax.report.renderer import LARGEST_SAMPLES
+from geosplat_jax.report.sheets import SHEETS
 from geosplat_jax.report.shots import LARGEST_SIZE, Cameras, Images
 from geosplat_jax.run import Run
 from geosplat_jax.viewer.painter import Viewer
@@ -57,8 +58,6 @@ from geosplat_jax.viewer.source import CheckpointWatch, light_files, load_lights
 
 _LARGEST_FACTOR = 1e6
 """Of a light or an albedo; far beyond any that is of use, and single precision holds the result."""
-
-_SHEETS = ("overview.png", "materials.png", "relight.png")
 
 
 class GradientError(RuntimeError):
@@ -173,7 +172,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     folder = run.folder.path
     if arguments.stage is not None:
         folder = run.folder.end_of(arguments.stage)
-    pictures = [name for name in _SHEETS if (folder / name).exists()]
+    pictures = [name for name in SHEETS if (folder / name).exists()]
     print(f"metrics: {folder / 'metrics.json'}\npictures: {', '.join(pictures)} in {folder}")
     print(f"report: {folder / REPORT}")
 

@@ -23,6 +23,9 @@ from geosplat_jax.report.renderer import (
 from geosplat_jax.report.scales import ERROR, METALLIC, ROUGHNESS, SEEN, error_map
 from geosplat_jax.report.trust import Sightings
 
+SHEETS = ("overview.png", "materials.png", "relight.png")
+"""What an evaluation may write; the latter two where the scene has the truth of them."""
+
 
 def _grey(values: np.ndarray) -> np.ndarray:
     return ROUGHNESS.picture(values[..., 0])
@@ -56,8 +59,13 @@ class Shown:
     lights: Mapping[str, np.ndarray]
 
     def write(self, folder: Path) -> dict[str, Any]:
-        """Write the sheets, and every picture for itself; return what `write_gallery` does."""
+        """Write the sheets, and every picture for itself; return what `write_gallery` does.
+
+        Sheets of an earlier evaluation are removed, also those that are not made anew.
+        """
         overview, materials = self.overview_rows(), self.material_rows()
+        for name in SHEETS:
+            (folder / name).unlink(missing_ok=True)
         write_png(folder / "overview.png", self._overview_sheet(overview))
         if materials[0]:
             write_png(folder / "materials.png", self._material_sheet(materials))
