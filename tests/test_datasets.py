@@ -669,6 +669,27 @@ def test_truth_of_another_size_is_named(tensoir):
         truth["albedo"]
 
 
+@pytest.mark.parametrize("channels", [2, 4])
+def test_a_mask_may_be_the_alpha_of_a_cut_out(scenes, tmp_path, channels):
+    """Its colours, which say nothing of the object's outline, are not looked at."""
+    root = shutil.copytree(scenes["synthetic4relight"], tmp_path / "scene")
+    for path in (root / "train").glob("*_mask.png"):
+        mask = read_image(path)
+        colors = np.full((*mask.shape[:2], channels - 1), 0.2, np.float32)
+        write_png(path, np.concatenate([colors, mask[..., :1]], -1))
+    expected = load(scenes["synthetic4relight"]).train
+    np.testing.assert_array_equal(np.asarray(load(root).train.alphas), np.asarray(expected.alphas))
+
+
+@pytest.mark.parametrize("value", [1 / 255, 128 / 255])
+def test_masks_that_are_numbers_or_colours_of_labels_are_refused(scenes, tmp_path, value):
+    root = shutil.copytree(scenes["synthetic4relight"], tmp_path / "scene")
+    for path in (root / "train").glob("*_mask.png"):
+        write_png(path, value * (read_image(path) > 0.5))
+    with pytest.raises(SceneError, match="must be 255 on the object"):
+        load(root)
+
+
 def test_images_without_alpha_and_mask_are_refused(blender):
     write_png(blender / "train" / "r_3.png", np.ones((SIZE, SIZE, 3), np.float32))
     with pytest.raises(SceneError, match=r"r_3\.png has no alpha channel and there is no mask"):

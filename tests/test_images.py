@@ -249,3 +249,39 @@ def test_a_part_of_a_frame_is_refused(tmp_path):
     _write_exr(tmp_path / "part.exr", pixels, ("R", "G", "B"), frame=(12, 8))
     with pytest.raises(ImageReadError, match=r"the part \(0, 0, 6, 4\) .* frame \(0, 0, 12, 8\)"):
         read_linear(tmp_path / "part.exr")
+
+
+def write_tiff(path, pixels, numbers, *, associated=False):
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], numbers)
+    if not associated:
+        spec.attribute("oiio:UnassociatedAlpha", 1)
+    out = oiio.ImageOutput.create(str(path))
+    assert out.open(str(path), spec)
+    assert out.write_image(pixels)
+    out.close()
+
+
+@pytest.mark.parametrize("numbers", [oiio.HALF, oiio.FLOAT, oiio.DOUBLE])
+def test_floats_of_any_format_are_linear_light(tmp_path, numbers):
+    pixels = random_pixels(4, 5, 3)
+    write_tiff(tmp_path / "a.tif", pixels, numbers)
+    np.testing.assert_allclose(read_linear(tmp_path / "a.tif"), pixels, atol=1e-3)
+
+
+@pytest.mark.parametrize("numbers", ["uint8", "uint16", "uint32"])
+def test_integers_of_tiff_are_srgb_of_any_depth(tmp_path, numbers):
+    pixels = random_pixels(4, 5, 3)
+    write_tiff(tmp_path / "a.tif", pixels, numbers)
+    np.testing.assert_allclose(read_linear(tmp_path / "a.tif"), decode_srgb(pixels), atol=5e-3)
+
+
+@pytest.mark.parametrize("numbers", ["uint8", "uint16", "float"])
+def test_colour_that_a_tiff_stores_multiplied_by_alpha_comes_back_straight(tmp_path, numbers):
+    rgba = 0.2 + 0.8 * random_pixels(6, 5, 4)
+    rgba[0, 0] = 0.0
+    stored = np.concatenate([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1)
+    write_tiff(tmp_path / "a.tif", stored, numbers, associated=True)
+    read = read_image(tmp_path / "a.tif")
+    np.testing.assert_allclose(read, rgba, atol=2e-2 if numbers == "uint8" else 1e-4)
+    write_tiff(tmp_path / "b.tif", rgba, numbers)
+    np.testing.assert_allclose(read_image(tmp_path / "b.tif"), rgba, atol=2e-3)

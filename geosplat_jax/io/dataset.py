@@ -25,7 +25,7 @@ from geosplat_jax.io.layouts.synthetic4relight import is_synthetic4relight, list
 from geosplat_jax.io.layouts.tensoir import is_tensoir, list_tensoir
 from geosplat_jax.io.layouts.transforms import is_transforms, list_transforms_capture
 from geosplat_jax.io.loading import KEPT_BYTES, load_views, some_names
-from geosplat_jax.io.views import COVERED, Views, no_views
+from geosplat_jax.io.views import COVERED, OPAQUE, Views, no_views
 from geosplat_jax.surface.hull import hull_bounds, sight_bounds
 
 
@@ -413,7 +413,12 @@ def _check_masks(views: Views, split: str, warnings: list[str]) -> None:
     if not covered.any():
         raise SceneError(
             f"the mask of every {split} view is empty (no alpha above {COVERED}); check the alpha "
-            "channel of the images, or the mask files"
+            "channel of the images, or the mask files, which must be 255 on the object"
+        )
+    if not views.has_opaque_pixel:
+        raise SceneError(
+            f"no pixel of any {split} view is opaque (alpha of {OPAQUE} or more); masks must be "
+            "255 on the object, and not the number or the colour of a label"
         )
     if not covered.all():
         empty = [name for name, has in zip(views.names, covered, strict=True) if not has]

@@ -1,9 +1,10 @@
 """Images on disk: reading, writing and reducing, with alpha and transfer curve accounted for.
 
 Conventions. Arrays are float32, (H, W, C), row 0 at the top. Alpha is *straight* (colour is not
-multiplied by it), as PNG stores it; OpenEXR stores premultiplied colour, which `read_linear`
-divides out and `write_exr` multiplies in. Every file is written aside and then renamed, so that a
-reader never meets half a file and a full disk never destroys the previous one.
+multiplied by it), as PNG stores it; OpenEXR, and TIFF with associated alpha, store premultiplied
+colour, which reading divides out; `write_exr` multiplies it in. Every file is written aside and
+then renamed, so that a reader never meets half a file and a full disk never destroys the previous
+one.
 """
 
 import os
@@ -24,7 +25,7 @@ from geosplat_jax.core.color import linear_to_srgb, srgb_to_linear
 from geosplat_jax.io.memory import Need, memory_refusal
 
 LINEAR_FORMATS = frozenset({".exr", ".hdr"})
-"""Suffixes of the formats that hold linear light; every other one is taken as sRGB."""
+"""Suffixes of the formats that hold linear light, as all files of floats do; others are sRGB."""
 
 _SMALLEST_ALPHA = 1e-6
 
@@ -128,8 +129,8 @@ def read_stored(path: str | Path) -> Shaped[np.ndarray, "H W C"]:
 
     Returns
     -------
-    (H, W, C) uint8 or uint16 where the file has such numbers; of any other file float32, as
-    `read_image` returns it.
+    (H, W, C) uint8 or uint16 where the file has integers (of 32 bits the upper 16), and float32
+    where it has floats, as `read_image` returns it. Alpha is straight, but in OpenEXR.
 
     Raises
     ------
@@ -150,14 +151,28 @@ def read_stored(path: str | Path) -> Shaped[np.ndarray, "H W C"]:
             f"{path} is damaged or truncated ({_one_line(problem)}); replace the file"
         )
     _require_plain(layout, path)
-    return np.ascontiguousarray(pixels)
+    pixels = np.ascontiguousarray(pixels)
+    if layout.is_associated and path.suffix.lower() in (".tif", ".tiff"):
+        pixels[..., :-1] = _divided_by_alpha(pixels)
+    return pixels
+
+
+def _divided_by_alpha(pixels: Shaped[np.ndarray, "H W C"]) -> Shaped[np.ndarray, "H W c"]:
+    """Return the colours of a file that stores them multiplied by alpha, in the same numbers."""
+    if pixels.dtype == np.float32:
+        return straight(pixels[..., :-1], pixels[..., -1])
+    largest = np.iinfo(pixels.dtype).max
+    alpha = pixels[..., -1].astype(np.float32) / largest
+    colors = straight(pixels[..., :-1].astype(np.float32), alpha)
+    return np.minimum(np.rint(colors), largest).astype(pixels.dtype)
 
 
 def _numbers_of(spec: Any) -> Any:
-    """Choose the numbers to read an image in: its own if they are 8 or 16 bits, else floats."""
+    """Choose the numbers to read an image in: 8 or 16 bits for integers, else floats."""
     own = spec.format.basetype
-    is_coded = own in (oiio.UINT8, oiio.UINT16) and not spec.channelformats
-    return own if is_coded else oiio.FLOAT
+    if own in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE) or spec.channelformats:
+        return oiio.FLOAT
+    return own if own == oiio.UINT8 else oiio.UINT16
 
 
 @cache
@@ -202,10 +217,18 @@ def _require_room_for(layout: "_Layout", path: Path) -> None:
 
 
 class _Layout(NamedTuple):
-    """Names of the channels, which of them is alpha, and windows as (x, y, width, height)."""
+    """What is needed of the header of an image.
+
+    Attributes
+    ----------
+    channels : names. alpha : which of them is alpha, -1 if none.
+    is_associated : whether colours are stored multiplied by alpha.
+    shown, whole : windows as (x, y, width, height).
+    """
 
     channels: tuple[str, ...]
     alpha: int
+    is_associated: bool
     shown: tuple[int, int, int, int]
     whole: tuple[int, int, int, int]
 
@@ -215,6 +238,7 @@ def _layout(spec: Any) -> _Layout:
     return _Layout(
         tuple(spec.channelnames),
         spec.alpha_channel,
+        spec.alpha_channel >= 0 and spec.get_int_attribute("oiio:UnassociatedAlpha", 0) == 0,
         (spec.x, spec.y, spec.width, spec.height),
         (spec.full_x, spec.full_y, spec.full_width, spec.full_height),
     )
@@ -241,9 +265,10 @@ def read_linear(path: str | Path, *, is_srgb: bool | None = None) -> Float[np.nd
     Parameters
     ----------
     path : the file.
-    is_srgb : whether to decode the sRGB curve. By default EXR and HDR are taken as linear and every
-        other format (PNG, JPEG) is decoded. Pass False for data in PNG: normals, roughness,
-        linear albedo. Alpha (channel 2 of 2, or 4 of 4) is never decoded.
+    is_srgb : whether to decode the sRGB curve. By default EXR, HDR and files of floats (TIFF) are
+        taken as linear, and integers of every other format (PNG, JPEG, TIFF) are decoded. Pass
+        False for data in PNG: normals, roughness, linear albedo. Alpha (channel 2 of 2, or 4 of 4)
+        is never decoded.
 
     Returns
     -------
@@ -263,7 +288,8 @@ def linear_values(
 ) -> Float[np.ndarray, "H W C"]:
     """Turn what `read_stored` read from ``path`` into linear values; see `read_linear`."""
     if is_srgb is None:
-        is_srgb = path.suffix.lower() not in LINEAR_FORMATS
+        is_float = stored.dtype == np.float32
+        is_srgb = not is_float and path.suffix.lower() not in LINEAR_FORMATS
     colors = _color_channels(stored)
     if stored.dtype != np.float32:
         return _decoded(stored, colors, is_srgb)

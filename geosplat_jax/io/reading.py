@@ -132,11 +132,16 @@ def _value(number: Any) -> float:
 
 
 def _read_mask(path: Path, rgb: np.ndarray) -> Shaped[np.ndarray, "H W"]:
-    """Channel 0 of a mask file of the image's size, in the numbers of the file."""
+    """Read a mask file of the image's size, in the numbers of the file.
+
+    The mask is the alpha channel, as in cut-outs, or channel 0 where there is none or where it is
+    one everywhere.
+    """
     mask = read_stored(path)
     if mask.dtype == np.float32:
         mask = linear_values(mask, path, is_srgb=False)
-    mask = np.ascontiguousarray(mask[..., 0])
+    has_alpha = mask.shape[-1] in (2, 4) and _value(mask[..., -1].min()) < 1.0
+    mask = np.ascontiguousarray(mask[..., -1 if has_alpha else 0])
     if mask.shape[:2] != rgb.shape[:2]:
         raise SceneError(
             f"mask {path} is {mask.shape[1]} x {mask.shape[0]} pixels, but its image is "

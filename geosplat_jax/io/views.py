@@ -23,6 +23,9 @@ from geosplat_jax.io.photographs import Images, Marks, Photographs
 COVERED = 0.5
 """A pixel belongs to the object where its alpha exceeds this."""
 
+OPAQUE = 0.95
+"""Some pixel of a split has to have this alpha: masks by which nothing is solid are a mistake."""
+
 _BLENDER_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -110,6 +113,11 @@ class Views:
         """Share of each view's pixels that count which the object covers."""
         covered = [np.count_nonzero(self.mask(index)) for index in range(len(self))]
         return np.array(covered) / np.maximum(self.valid_counts, 1.0)
+
+    @property
+    def has_opaque_pixel(self) -> bool:
+        """Whether alpha reaches one, or nearly, in any view."""
+        return any(np.max(alpha, initial=0.0) >= OPAQUE for alpha in self.alphas)
 
     @cached_property
     def valid_counts(self) -> Float[np.ndarray, " V"]:
