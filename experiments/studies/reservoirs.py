@@ -11,6 +11,7 @@ both together. It writes a table and, with matplotlib, curves::
 """
 
 import argparse
+import importlib.util
 import json
 import time
 from collections.abc import Iterator
@@ -276,6 +277,9 @@ def main() -> None:
         json.dumps([vars(row) for row in rows], indent=1) + "\n"
     )
     (arguments.output / "reservoirs.md").write_text(table(rows) + "\n")
+    if importlib.util.find_spec("matplotlib") is None:
+        print("no curves are drawn: install matplotlib")
+        return
     draw(rows, arguments.output / "reservoirs.png")
 
 
