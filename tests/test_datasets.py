@@ -681,13 +681,18 @@ def test_a_mask_may_be_the_alpha_of_a_cut_out(scenes, tmp_path, channels):
     np.testing.assert_array_equal(np.asarray(load(root).train.alphas), np.asarray(expected.alphas))
 
 
-@pytest.mark.parametrize("value", [1 / 255, 128 / 255])
-def test_masks_that_are_numbers_or_colours_of_labels_are_refused(scenes, tmp_path, value):
+def test_masks_that_are_numbers_or_colours_of_labels_are_noticed(scenes, tmp_path):
+    """Read as numbers of 1 they are empty, and as a colour of 128 half transparent."""
     root = shutil.copytree(scenes["synthetic4relight"], tmp_path / "scene")
-    for path in (root / "train").glob("*_mask.png"):
-        write_png(path, value * (read_image(path) > 0.5))
+    masks = {path: read_image(path) > 0.5 for path in (root / "train").glob("*_mask.png")}
+    for path, mask in masks.items():
+        write_png(path, mask * (128 / 255))
+    assert any("255 on the object" in warning for warning in load(root).warnings)
+    for path, mask in masks.items():
+        write_png(path, mask * (1 / 255))
     with pytest.raises(SceneError, match="must be 255 on the object"):
         load(root)
+    assert not any("opaque" in warning for warning in load(scenes["synthetic4relight"]).warnings)
 
 
 def test_images_without_alpha_and_mask_are_refused(blender):

@@ -416,9 +416,9 @@ def _check_masks(views: Views, split: str, warnings: list[str]) -> None:
             "channel of the images, or the mask files, which must be 255 on the object"
         )
     if not views.has_opaque_pixel:
-        raise SceneError(
-            f"no pixel of any {split} view is opaque (alpha of {OPAQUE} or more); masks must be "
-            "255 on the object, and not the number or the colour of a label"
+        warnings.append(
+            f"{split}: no pixel of any view is opaque (alpha of {OPAQUE} or more); masks must be "
+            "255 on the object, and not the colour of a label"
         )
     if not covered.all():
         empty = [name for name, has in zip(views.names, covered, strict=True) if not has]

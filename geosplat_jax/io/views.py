@@ -24,7 +24,7 @@ COVERED = 0.5
 """A pixel belongs to the object where its alpha exceeds this."""
 
 OPAQUE = 0.95
-"""Some pixel of a split has to have this alpha: masks by which nothing is solid are a mistake."""
+"""Masks of which no pixel reaches this alpha are taken for a mistake."""
 
 _BLENDER_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
