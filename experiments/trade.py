@@ -11,7 +11,7 @@ import math
 import statistics
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ import report
 from report import ReportError, arrow, digits
 
 from geosplat_jax.fit.config import Config, config_from_dict
+from geosplat_jax.fit.start_mesh import MeshSettings
 
 _NONE = "–"
 
@@ -41,7 +42,13 @@ class Point:
 
 
 def _identity(config: Config, count: int, downscale: int) -> str:
-    """Name the first stages of a run: equal for runs that share them."""
+    """Name the first stages of a run: equal for runs that share them.
+
+    A run notes where its mesh is and what was in it, a sweep the name of the file.
+    """
+    if isinstance(config.geometry, MeshSettings):
+        name = Path(config.geometry.path).name
+        config = replace(config, geometry=replace(config.geometry, path=name, digest=""))
     plain = config.to_dict()
     kept = {stage.name for stage in config.active_stages[:count]}
     plain["stages"] = {name: stage for name, stage in plain["stages"].items() if name in kept}

@@ -161,7 +161,7 @@ class Run:
         return views
 
     def _output(self, folder: str | Path | None, name: str) -> Path:
-        chosen = self.folder.path / name if folder is None else Path(folder)
+        chosen = self.folder.path / name if folder is None else Path(folder).expanduser()
         chosen.mkdir(parents=True, exist_ok=True)
         return chosen
 
@@ -515,7 +515,7 @@ def train(
     Raises
     ------
     TypeError
-        On any other keyword.
+        On any other keyword, and on options of reading for a dataset that has been read.
     SceneError, RunError, TrainingError, Interrupted
         See `load_dataset` and `fit.train.fit`.
     ValueError
@@ -526,6 +526,11 @@ def train(
         raise TypeError(
             f"train takes no {', '.join(unknown)}; a scene is read by "
             f"{', '.join(sorted(READING_OPTIONS))}, and settings belong into the config"
+        )
+    if isinstance(scene, Dataset) and reading:
+        raise TypeError(
+            f"a dataset has been read already; give {', '.join(sorted(reading))} to load_dataset, "
+            "or the scene's folder to train"
         )
     if model is not None and (budget is not None or begin.takes_over):
         raise ValueError("a model is chosen for a whole training without a budget; leave model out")

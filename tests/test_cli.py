@@ -12,10 +12,10 @@ import pytest
 import trimesh
 from support import MONTE_CARLO, TINY
 
-from geosplat_jax.cli import main
+from geosplat_jax.cli import main, training
 from geosplat_jax.cli.arguments import command_line
 from geosplat_jax.cli.commands import COMMANDS
-from geosplat_jax.fit.folder import RunError
+from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.train import load_trained
 from geosplat_jax.io.images import read_image
 from geosplat_jax.run import Run
@@ -227,6 +227,27 @@ def test_an_existing_output_folder_is_not_touched(tmp_path, capsys):
     assert train(tmp_path, "--downscale", "4") == 2
     assert "holds other files, precious.txt for one" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["precious.txt"]
+
+
+def test_a_table_of_steps_is_written_only_by_a_command_that_made_some(tmp_path):
+    """Not by one that is refused because the folder holds another run."""
+    run, table = RunFolder(tmp_path / "run"), tmp_path / "steps.csv"
+    run.path.mkdir()
+    (run.path / "run.json").write_text("{}")
+    run.metrics.write_text(json.dumps({"step": 0, "stage": "a", "seconds": 1.0}) + "\n")
+    table.write_text("of another run")
+    with pytest.raises(RunError), training._table(table, run.path):
+        raise RunError("holds a run")
+    assert table.read_text() == "of another run"
+
+    def stopped():
+        with run.metrics.open("a") as file:
+            file.write(json.dumps({"step": 1, "stage": "a", "seconds": 1.0}) + "\n")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), training._table(table, run.path):
+        stopped()
+    assert len(table.read_text().splitlines()) == 3
 
 
 def test_a_failed_start_leaves_no_folder_behind(tmp_path, capsys):

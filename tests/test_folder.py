@@ -34,6 +34,11 @@ def test_a_new_run_says_what_it_was_made_from(run, dataset):
     run.require_same_scene(dataset)
 
 
+def test_the_home_folder_may_be_written_as_a_tilde(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert RunFolder("~/runs/a").path == tmp_path / "runs" / "a"
+
+
 _HOLDER = """
 import sys
 from geosplat_jax.fit.folder import RunFolder

@@ -7,6 +7,7 @@ import stat
 import subprocess
 import sys
 import types
+import weakref
 
 import jax.numpy as jnp
 import numpy as np
@@ -81,6 +82,22 @@ def test_gif_colours_that_fit_a_palette_are_exact_and_still_in_all_frames(tmp_pa
     write_movie(tmp_path / "film.gif", frames, frames_per_second=10)
     found, _, _ = read_gif(tmp_path / "film.gif")
     np.testing.assert_allclose(found, np.stack(frames), atol=1e-6)
+
+
+def test_frames_may_be_made_when_they_are_asked_for(tmp_path):
+    """Floats of one frame exist at a time, however long the film is."""
+    frames, alive = ramp_frames(5), []
+
+    def made():
+        for frame in frames:
+            alive.append(weakref.ref(one := frame.copy()))
+            yield one
+            del one
+            assert sum(ref() is not None for ref in alive) <= 1
+
+    write_movie(tmp_path / "lazy.gif", made(), frames_per_second=10)
+    write_movie(tmp_path / "film.gif", frames, frames_per_second=10)
+    assert (tmp_path / "lazy.gif").read_bytes() == (tmp_path / "film.gif").read_bytes()
 
 
 def test_palette_of_a_long_film_is_made_from_all_columns(tmp_path, monkeypatch):

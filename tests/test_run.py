@@ -68,6 +68,13 @@ def test_what_no_scene_is_read_with_is_refused(folder):
     assert not (folder / "refused").exists()
 
 
+def test_a_dataset_is_not_read_again(folder):
+    dataset = gs.load_dataset(folder / "duck")
+    with pytest.raises(TypeError, match="read already; give downscale to load_dataset"):
+        gs.train(dataset, folder / "refused", downscale=8)
+    assert not (folder / "refused").exists()
+
+
 def test_a_run_reads_the_views_that_it_was_trained_with(folder):
     dataset = gs.load_dataset(folder / "duck", downscale=8, train_views=5, test_views=2)
     run = gs.train(dataset, folder / "few", gs.make_config(overrides=SETTINGS))

@@ -89,6 +89,10 @@ def test_cameras_of_a_file_have_its_poses_and_its_lens(tmp_path):
     )
     assert angle_of(shots[0].camera) == pytest.approx(np.degrees(0.8), abs=1e-3)
     assert shots[0].camera.width == DATASET.train.width
+    path = write_cameras(tmp_path, camera_angle_x=0.8, w=50, h=20)
+    (shot, _) = Cameras(file=path).shots(DATASET, CENTER)
+    assert (shot.camera.width, shot.camera.height) == (50, 20)
+    assert angle_of(shot.camera) == pytest.approx(np.degrees(0.8), abs=1e-3)
     path = write_cameras(tmp_path, fl_x=30.0, w=50, h=20)
     (shot, _) = Cameras(file=path).shots(DATASET, CENTER)
     assert (shot.camera.width, shot.camera.height) == (50, 20)
@@ -173,9 +177,9 @@ def test_floats_are_straight_linear_values_and_zero_beside_the_object(tmp_path):
 
 def test_pictures_are_what_viewers_expect_and_depth_is_never_rounded(tmp_path):
     view, _, straight = rendered()
-    Images(("albedo", "roughness", "depth")).write(tmp_path, "v", view)
+    Images(("albedo", "roughness", "normal", "depth")).write(tmp_path, "v", view)
     assert {path.name for path in tmp_path.iterdir()} == {
-        *("v_rgba.png", "v_albedo.png", "v_roughness.png", "v_depth.exr"),
+        *("v_rgba.png", "v_albedo.png", "v_roughness.png", "v_normal.png", "v_depth.exr"),
     }
     covered = view.alpha > 0
     albedo = read_image(tmp_path / "v_albedo.png")
@@ -186,6 +190,10 @@ def test_pictures_are_what_viewers_expect_and_depth_is_never_rounded(tmp_path):
         roughness[covered][:, 0], straight["roughness"][covered][:, 0], atol=1 / 255
     )
     np.testing.assert_allclose(roughness[..., -1], view.alpha, atol=1 / 255)
+    normal = read_image(tmp_path / "v_normal.png")
+    unit = 2 * normal[covered][:, :3] - 1
+    np.testing.assert_allclose(unit, straight["normal"][covered], atol=1.01 / 255)
+    np.testing.assert_allclose(normal[..., 3], view.alpha, atol=1 / 255)
 
 
 def test_unknown_images_are_named():

@@ -17,6 +17,8 @@ from sweep import read_sweep  # noqa: E402
 from test_sweeps import SWEEPS, Fakes, _arguments, _write  # noqa: E402
 
 from geosplat_jax.fit.config import Stage, config_from_dict  # noqa: E402
+from geosplat_jax.fit.presets import make_config  # noqa: E402
+from geosplat_jax.fit.start_mesh import MeshSettings  # noqa: E402
 
 try:
     # Here and not within a test: it takes the streams of its log when it is imported.
@@ -188,6 +190,17 @@ def test_the_tables_say_decibels_per_second_and_the_front(tmp_path, capsys):
     assert half[-1] == f"{lost / (seconds * (1 - round(cells / 2) / cells)):+.4f}"
     front = _rows(text, "The front")
     assert [name for name in front if name not in ("run", "---")] == ["half", "few", "base", "many"]
+
+
+def test_a_run_from_a_mesh_is_that_of_the_sweep_which_names_its_file():
+    """Where the file is and what was in it is noted by the run alone."""
+
+    def of(path, digest=""):
+        config = make_config(quality="draft", mesh=MeshSettings(path, digest))
+        return trade._identity(config, 2, 1)
+
+    assert of("/scenes/one/mesh.ply", "abc") == of("mesh.ply")
+    assert of("/scenes/one/other.ply", "abc") != of("mesh.ply")
 
 
 def test_a_front_holds_what_nothing_beats():

@@ -232,13 +232,28 @@ def _events(wanted: bool, folder: Path) -> Iterator[Listener]:
 
 @contextmanager
 def _table(path: Path | None, folder: Path) -> Iterator[None]:
-    """Write the steps of a run as a table when the training ends, however that is."""
+    """Write the steps of a run as a table when the training ends, however that is.
+
+    A command that is refused made no step and leaves the file as it was.
+    """
+    steps = RunFolder(folder)
+    before = _state_of(steps.metrics)
+    ended = False
     try:
         yield
+        ended = True
     finally:
-        steps = RunFolder(folder)
-        if path is not None and steps.exists:
+        has_steps = ended or _state_of(steps.metrics) != before
+        if path is not None and has_steps and steps.exists:
             steps.write_csv(path)
+
+
+def _state_of(path: Path) -> tuple[int, int] | None:
+    """Size and time of the last change of a file; None where there is none."""
+    if not path.exists():
+        return None
+    state = path.stat()
+    return state.st_size, state.st_mtime_ns
 
 
 def begin_from(arguments: argparse.Namespace) -> Begin:

@@ -148,7 +148,7 @@ class RunFolder:
     """Where a run lives; nothing is read or written until a method says so."""
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
+        self.path = Path(path).expanduser()
 
     def __fspath__(self) -> str:
         return str(self.path)

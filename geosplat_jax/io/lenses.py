@@ -32,10 +32,13 @@ class AngleLens:
     ----------
     angle_x : horizontal field of view in radians, as a pinhole sees it.
     distortion : None for a pinhole.
+    size : width and height of images that are to be made, where they are given; those that exist
+        have their own.
     """
 
     angle_x: float
     distortion: Distortion | None = None
+    size: tuple[int, int] | None = None
 
     def intrinsics(self, width: int, height: int) -> Float[np.ndarray, "3 3"]:
         """Return the matrix of an image of this size, in its pixels."""
@@ -63,6 +66,11 @@ class PinholeLens:
     height: int
     distortion: Distortion | None = None
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image in pixels."""
+        return self.width, self.height
+
     def intrinsics(self, width: int, height: int) -> Float[np.ndarray, "3 3"]:
         """Return the matrix of the same view as an image of this size, in its pixels."""
         x, y = width / self.width, height / self.height
@@ -89,7 +97,8 @@ def checked_lens(values: Mapping[str, Any], where: str) -> Lens:
     if "camera_angle_x" in values:
         angle = checked_angle(values["camera_angle_x"], where)
     if angle is not None and not given.keys() - {"w", "h"}:
-        return AngleLens(angle, distortion)
+        size = (int(given["w"]), int(given["h"])) if {"w", "h"} <= given.keys() else None
+        return AngleLens(angle, distortion, size)
     missing = [key for key in ("w", "h") if key not in given]
     if missing:
         raise SceneError(

@@ -10,7 +10,7 @@ import math
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +61,7 @@ def has_encoder(suffix: str) -> bool:
     return suffix == ".gif" or (suffix == ".mp4" and _encoder() is not None)
 
 
-def _checked(frames: Sequence[ArrayLike]) -> list[UInt8[np.ndarray, "H W 3"]]:
+def _checked(frames: Iterable[ArrayLike]) -> list[UInt8[np.ndarray, "H W 3"]]:
     """Check all frames and reduce them to eight bits."""
     reduced = []
     for index, frame in enumerate(frames):
@@ -215,7 +215,7 @@ def check_movie(suffix: str, frames_per_second: float | int) -> None:
 
 def write_movie(
     path: str | Path,
-    frames: Sequence[ArrayLike],
+    frames: Iterable[ArrayLike],
     *,
     frames_per_second: float | int,
 ) -> None:
@@ -229,7 +229,8 @@ def write_movie(
     Parameters
     ----------
     path : file ending in ``.gif`` or ``.mp4``; its folder is made when missing.
-    frames : one or more (H, W, 3) of one size, sRGB; values outside [0, 1] are clipped.
+    frames : one or more (H, W, 3) of one size, sRGB; values outside [0, 1] are clipped. Of those
+        that are made when they are asked for, bytes stay in memory and not floats.
     frames_per_second : 0.1 to 50 for GIF, to 1000 for MP4.
 
     Raises

@@ -212,7 +212,7 @@ def relight_views(
     for name, count, frame in movies:
         if count:
             angles = (2 * np.pi * np.arange(count) / count).tolist()
-            frames = [frame(angle) for angle in counted(angles, f"{name} frames", on_progress)]
+            frames = (frame(angle) for angle in counted(angles, f"{name} frames", on_progress))
             written.append((folder / name).with_suffix(options.movie_suffix()))
             write_movie(written[-1], frames, frames_per_second=options.frames_per_second)
     return written

@@ -16,7 +16,6 @@ from geosplat_jax.io.frames import read_transforms
 from geosplat_jax.io.images import SceneError, straight, write_exr, write_png
 from geosplat_jax.io.views import Views
 from geosplat_jax.report.consistency import resized
-from geosplat_jax.report.pictures import normals_to_rgb
 from geosplat_jax.report.renderer import RenderedView, straight_rgba, to_picture
 
 AOVS = ("albedo", "roughness", "metallic", "normal", "depth")
@@ -71,8 +70,8 @@ def shots_of(views: Views) -> list[Shot]:
 def read_shots(path: Path, like: Camera) -> list[Shot]:
     """Read cameras from a file like ``transforms.json``.
 
-    Poses are camera-to-world with OpenGL axes, in the world of the scene. A lens that is given in
-    pixels says how large the image is; other images are as large as that of ``like``.
+    Poses are camera-to-world with OpenGL axes, in the world of the scene. Images are as large as
+    the file says (``w`` and ``h``), or as that of ``like`` where it does not.
 
     Raises
     ------
@@ -84,8 +83,7 @@ def read_shots(path: Path, like: Camera) -> list[Shot]:
     for (name, pose, lens), stem in zip(listed, _stems([n for n, *_ in listed]), strict=True):
         if lens.distortion is not None:
             raise SceneError(f"{path} bends the lens of {name}; images are made without distortion")
-        width = getattr(lens, "width", like.width)
-        height = getattr(lens, "height", like.height)
+        width, height = lens.size or (like.width, like.height)
         one = Views(
             (name,),
             np.asarray(pose, np.float64)[None],
@@ -238,9 +236,10 @@ class Images:
         """Write the images of a view; return the files.
 
         ``NAME_rgba.png`` has straight alpha. PNG of AOVs: albedo in sRGB, roughness and metallic
-        as they are, normals as (n + 1) / 2. ``.exr`` are linear: colour with alpha as
-        ``NAME_rgba.exr``, AOVs as straight values, zero where nothing was hit. Normals are in world
-        axes; depth, along the camera's axis in the scene's unit, is written as EXR only.
+        as they are, unit normals as (n + 1) / 2, all with straight alpha. ``.exr`` are linear:
+        colour with alpha as ``NAME_rgba.exr``, AOVs as straight values, zero where nothing was
+        hit. Normals are in world axes; depth, along the camera's axis in the scene's unit, is
+        written as EXR only.
         """
         written = [folder / f"{name}_rgba.png"]
         write_png(written[0], straight_rgba(view))
@@ -260,8 +259,10 @@ class Images:
 
 
 def _picture(aov: str, values: np.ndarray, view: RenderedView) -> np.ndarray:
-    """Make a picture of an AOV."""
+    """Make a picture of an AOV, with straight alpha."""
     if aov == "normal":
-        return normals_to_rgb(view.aovs["normal"], view.alpha)
-    shown = to_picture(values) if aov == "albedo" else np.clip(values, 0.0, 1.0)
+        length = np.linalg.norm(values, axis=-1, keepdims=True)
+        shown = 0.5 + 0.5 * values / np.maximum(length, 1e-6)
+    else:
+        shown = to_picture(values) if aov == "albedo" else np.clip(values, 0.0, 1.0)
     return np.concatenate([shown, np.clip(view.alpha, 0.0, 1.0)[..., None]], axis=-1)
