@@ -17,7 +17,7 @@ from geosplat_jax.fit.config import Config
 from geosplat_jax.fit.folder import RunError
 from geosplat_jax.fit.listener import NOBODY, Listener
 from geosplat_jax.fit.presets import REFINE, SPLIT_SUM, make_config
-from geosplat_jax.io.dataset import load_recorded
+from geosplat_jax.io.dataset import Dataset, load_recorded
 from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.images import written_aside
 from geosplat_jax.run import train
@@ -73,7 +73,7 @@ def _require_same(folder: Path, made_with: Mapping[str, Any]) -> None:
     )
     if changed:
         raise RunError(
-            f"the cameras in {folder} were refined with another {' and '.join(changed)}; delete "
+            f"the cameras in {folder} were refined with other {' and '.join(changed)}; delete "
             "that folder to refine them again, or take another output"
         )
 
@@ -117,16 +117,23 @@ def refined_cameras(
         raise ValueError(f"refining cameras takes one round at least, got {rounds}")
     config = config or round_config()
     options, cameras, how = dict(reading or {}), Path(), how or CameraSettings()
-    made_with = {"scene": str(Path(scene).resolve()), "reading": options}
-    _require_same(
-        rounds_folder(output), {**made_with, "config": config.to_dict(), "refinement": asdict(how)}
-    )
+    dataset: Dataset | None = load_recorded(scene, options)
+    assert dataset is not None
+    made_with = {
+        "scene": str(Path(scene).resolve()),
+        "reading": options,
+        "views": [dataset.train.fingerprint(), dataset.test.fingerprint()],
+        "config": config.to_dict(),
+        "refinement": asdict(how),
+    }
+    _require_same(rounds_folder(output), made_with)
     for number in range(1, rounds + 1):
         folder = rounds_folder(output) / f"round_{number}"
         cameras = folder.with_suffix(".json")
         if not cameras.exists():
-            dataset = load_recorded(scene, options)
+            if dataset is None:
+                dataset = load_recorded(scene, options)
             run = train(dataset, folder, config, begin=Resume(), listener=listener)
             run.refine_cameras(cameras, how=how, on_view=on_view)
-        options["cameras"] = cameras
+        options["cameras"], dataset = cameras, None
     return cameras

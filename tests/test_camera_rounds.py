@@ -14,11 +14,23 @@ from geosplat_jax.io.images import SceneError
 from geosplat_jax.run import Run
 
 
-class _Scene(Dataset):
-    """What a scene would be read with."""
+class _Views:
+    """Views that are told from others by a number."""
 
-    def __init__(self, options):
+    def __init__(self, number):
+        self.number = number
+
+    def fingerprint(self):
+        return f"views {self.number}"
+
+
+class _Scene(Dataset):
+    """What a scene would be read with, and its views."""
+
+    def __init__(self, options, poses=0):
         object.__setattr__(self, "options", dict(options))
+        for split in ("train", "test"):
+            object.__setattr__(self, split, _Views(poses))
 
 
 class _Round(Run):
@@ -79,10 +91,21 @@ def test_rounds_that_are_done_are_not_made_again(made, tmp_path):
 def test_rounds_of_other_settings_are_not_taken_for_these(made, tmp_path, changed, what):
     usual = {"rounds": 1, "reading": {"downscale": 2}}
     refined_cameras("scene", tmp_path / "fox", **usual)
-    with pytest.raises(RunError, match=f"refined with another {what}; delete"):
+    with pytest.raises(RunError, match=f"refined with other {what}; delete"):
         refined_cameras("scene", tmp_path / "fox", **{**usual, **changed})
     refined_cameras("scene", tmp_path / "fox", **{**usual, "rounds": 2})
     assert len(made) == 2
+
+
+def test_rounds_of_other_poses_are_not_taken_for_these(made, tmp_path, monkeypatch):
+    """The scene's own poses were found anew since."""
+    refined_cameras("scene", tmp_path / "fox")
+    monkeypatch.setattr(
+        camera_rounds, "load_recorded", lambda scene, options: _Scene(options, poses=1)
+    )
+    with pytest.raises(RunError, match="refined with other views; delete"):
+        refined_cameras("scene", tmp_path / "fox")
+    assert len(made) == 1
 
 
 def test_a_command_that_failed_before_its_first_round_can_be_corrected(made, tmp_path, monkeypatch):

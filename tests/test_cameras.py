@@ -31,6 +31,7 @@ from geosplat_jax.fit.cameras import (
     view_residual,
     with_mean_balance,
 )
+from geosplat_jax.fit.folder import CAMERAS
 from geosplat_jax.fit.gauge import (
     Similarity,
     camera_errors,
@@ -609,11 +610,15 @@ def test_a_run_is_refined_and_trained_with_what_was_found(run, capsys):
     assert train(run, "again", "--resume") == 2
     assert "take the same, or another folder" in capsys.readouterr().err
     assert cli.main(["render", str(run / "again"), "--output", str(run / "pictures")]) == 0
-    # What it was trained with is never overwritten, and a change of it does not go unnoticed.
-    assert cli.main(["refine-cameras", str(run / "again"), "--output", str(path)]) == 2
+    # The run keeps what it was trained with, wherever it is moved; a change is noticed.
+    path.unlink()
+    moved = (run / "again").rename(run / "moved")
+    assert cli.main(["render", str(moved), "--output", str(run / "pictures")]) == 0
+    own = moved / CAMERAS
+    assert cli.main(["refine-cameras", str(moved), "--output", str(own)]) == 2
     assert "was trained with; write to another file" in capsys.readouterr().err
-    path.write_text(path.read_text() + " ")
-    assert cli.main(["render", str(run / "again"), "--output", str(run / "pictures")]) == 2
+    own.write_text(own.read_text() + " ")
+    assert cli.main(["render", str(moved), "--output", str(run / "pictures")]) == 2
     assert "has changed since the run" in capsys.readouterr().err
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from PIL import Image, ImageCms
 from support import shared_path
 
 from geosplat_jax.io.dataset import describe, load_dataset, load_recorded
@@ -693,6 +694,20 @@ def test_masks_that_are_numbers_or_colours_of_labels_are_noticed(scenes, tmp_pat
     with pytest.raises(SceneError, match="must be 255 on the object"):
         load(root)
     assert not any("opaque" in warning for warning in load(scenes["synthetic4relight"]).warnings)
+
+
+@pytest.mark.parametrize(("name", "warns"), [("Display P3", True), ("sRGB IEC61966-2.1", False)])
+def test_photographs_of_a_wide_colour_space_are_warned_of(blender, name, warns):
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    built_in = "sRGB built-in".encode("utf-16-be")
+    assert built_in in profile
+    path = blender / "train" / "r_0.png"
+    with Image.open(path) as image:
+        renamed = profile.replace(built_in, name[:13].ljust(13).encode("utf-16-be"))
+        image.save(path, icc_profile=renamed)
+    said = [warning for warning in load(blender).warnings if "read as sRGB" in warning]
+    assert (len(said) == 1) == warns
+    assert all("Display P3" in warning for warning in said)
 
 
 def test_images_without_alpha_and_mask_are_refused(blender):

@@ -34,6 +34,31 @@ def test_a_new_run_says_what_it_was_made_from(run, dataset):
     run.require_same_scene(dataset)
 
 
+def test_a_run_keeps_the_cameras_that_it_was_trained_with(dataset, tmp_path):
+    """The file that they were read from may go, and the run may be moved."""
+    file = tmp_path / "refined.json"
+    file.write_text("cameras")
+    options = {**dataset.options, "cameras": str(file), "cameras_digest": "abc"}
+    read = replace(dataset, options=options)
+    folder = RunFolder(tmp_path / "run")
+    with folder.locked():
+        folder.begin(read, tiny_config(), replace=False)
+    file.unlink()
+    moved = RunFolder(folder.path.rename(tmp_path / "moved"))
+    cameras = Path(moved.record()["dataset"]["cameras"])
+    assert cameras.parent == moved.path
+    assert cameras.read_text() == "cameras"
+    moved.require_same_scene(read)
+    with pytest.raises(RunError, match="with dataset"):
+        moved.require_same_scene(replace(read, options={**options, "cameras_digest": "other"}))
+    with pytest.raises(RunError, match="with dataset"):
+        moved.require_same_scene(dataset)
+    # A new run in its place, without such cameras, keeps none.
+    with moved.locked():
+        moved.begin(dataset, tiny_config(), replace=True)
+    assert not cameras.exists()
+
+
 def test_the_home_folder_may_be_written_as_a_tilde(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     assert RunFolder("~/runs/a").path == tmp_path / "runs" / "a"

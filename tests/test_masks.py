@@ -259,6 +259,28 @@ def test_masks_that_are_there_are_replaced_only_where_that_is_said(capture, monk
     assert 0.2 < read_image(root / "masks" / "view_04.png").mean() < 0.8
 
 
+def test_a_command_that_was_stopped_while_it_wrote_masks_goes_on(capture, monkeypatch):
+    root, run = capture
+    write, written = masks_module.write_png, []
+
+    def stopped(path, pixels):
+        if len(written) == 2:
+            raise KeyboardInterrupt
+        written.append(path)
+        write(path, pixels)
+
+    with monkeypatch.context() as interrupted:
+        interrupted.setattr(masks_module, "write_png", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            make_masks(read(root), SETTINGS, run, box=BOX)
+    assert len(list((root / "masks").iterdir())) == 2
+    with pytest.raises(CaptureError, match=f"2 of {COUNT} views have a mask already"):
+        make_masks(read(root), SETTINGS, run, box=BOX)
+    assert make_masks(read(root), SETTINGS, run, box=BOX, resume=True).masks == COUNT
+    assert len(list((root / "masks").iterdir())) == COUNT
+    assert not list(run.glob("*begun*"))
+
+
 def test_boxes_and_masks_that_leave_nothing_are_refused(capture, monkeypatch):
     root, run = capture
     with pytest.raises(CaptureError, match="holds no splat; most of them lie between"):

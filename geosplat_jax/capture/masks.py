@@ -37,6 +37,7 @@ from geosplat_jax.fit.listener import Progress
 from geosplat_jax.io.agreement import agreement
 from geosplat_jax.io.dataset import LAYOUTS, Dataset, recognise_layout
 from geosplat_jax.io.distortion import Lookup, photograph_lookup, resample
+from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.export import export_gaussians_ply
 from geosplat_jax.io.frames import MASK_FOLDERS, Frame, beside_images, mask_file
 from geosplat_jax.io.images import MissingFileError, image_size, write_png, written_aside
@@ -65,6 +66,8 @@ _PIXELS = 270 * 480
 """Of an image at most, where nobody says otherwise."""
 
 REPORT = "masks.json"
+_BEGUN = "masks_begun.json"
+"""Which files a command is about to write; it is gone once they are all there."""
 
 
 @dataclass(frozen=True)
@@ -210,6 +213,12 @@ def make_masks(
             f"the splats in the box from {_numbers(lo)} to {_numbers(hi)} cover no pixel by more "
             f"than {OPAQUE:g}, so masks would leave nothing; give another --box, or train longer"
         )
+    # Whoever is stopped between the first mask and the report can go on.
+    begun = folder / _BEGUN
+    with written_aside(begun) as aside:
+        aside.write_text(
+            json.dumps([str(file.resolve()) for file in files]) + "\n", encoding="utf-8"
+        )
     for frame, file, values in zip(frames, files, alpha, strict=True):
         write_png(file, photograph_mask(values, frame, downscale)[..., None].astype(np.float32))
     report = MaskReport(
@@ -228,6 +237,7 @@ def make_masks(
     text = json.dumps(asdict(report), indent=2)
     with written_aside(folder / REPORT) as aside:
         aside.write_text(text + "\n", encoding="utf-8")
+    begun.unlink()
     return report
 
 
@@ -275,8 +285,11 @@ def _frames(dataset: Dataset) -> list[Frame]:
 
 def _require_free(frames: Sequence[Frame], folder: Path, *, resume: bool, force: bool) -> None:
     """Refuse to replace masks of others, before hours of work."""
-    is_ours = resume and (folder / REPORT).exists()
     there = [frame.mask for frame in frames if frame.mask is not None]
+    begun = folder / _BEGUN
+    written = set(parse_json(begun.read_bytes())) if begun.exists() else set()
+    of_a_stopped_one = bool(written) and {str(mask.resolve()) for mask in there} <= written
+    is_ours = resume and ((folder / REPORT).exists() or of_a_stopped_one)
     if there and not (is_ours or force):
         raise CaptureError(
             f"{len(there)} of {len(frames)} views have a mask already, {there[0]} for one; replace "

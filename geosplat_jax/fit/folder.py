@@ -37,10 +37,13 @@ from geosplat_jax.io.images import written_aside
 _PACKAGES = ("jax", "jaxlib", "numpy", "optax", "geosplat_jax")
 EVENTS = "tensorboard"
 """Name of the folder of event files."""
+CAMERAS = "given_cameras.json"
+"""Copy of the refined cameras that a run was trained with; the run can be moved with it."""
 
 _OWN = (
     *("metrics.json", "overview.png", "materials.png", "relight.png", "evaluation", "report.html"),
-    *(EVENTS, "checkpoints", "stages", "previews", "metrics.jsonl", "training.json", "run.json"),
+    *(EVENTS, CAMERAS, "checkpoints", "stages", "previews", "metrics.jsonl", "training.json"),
+    "run.json",
 )
 """What evaluation and training write; the record goes last: it says that the rest is a run."""
 
@@ -187,6 +190,8 @@ class RunFolder:
     def record(self) -> dict[str, Any]:
         """Read what the run says about itself.
 
+        Refined cameras are those of its own copy, where it has one.
+
         Raises
         ------
         RunError
@@ -203,6 +208,9 @@ class RunFolder:
             from_plain(_Scene, {"scene": record["scene"]})
         except ValueError as error:
             raise RunError(f"{self._record_path} is damaged: {first_line(error)}") from None
+        cameras = self.path / CAMERAS
+        if record["dataset"].get("cameras") is not None and cameras.exists():
+            record["dataset"]["cameras"] = str(cameras)
         return record
 
     def config(self) -> Config:
@@ -305,7 +313,11 @@ class RunFolder:
             See `require_free`.
         """
         self.require_free(replace=replace)
+        cameras = dataset.options.get("cameras")
+        given = None if cameras is None else Path(cameras).read_bytes()
         self.clear()
+        if given is not None:
+            (self.path / CAMERAS).write_bytes(given)
         self._write_record(
             {
                 **_scene_of(dataset),
@@ -345,12 +357,16 @@ class RunFolder:
     def require_same_scene(self, dataset: Dataset) -> None:
         """Refuse a dataset whose views are not those of the run.
 
+        Where a file of cameras lies does not matter, only what it holds.
+
         Raises
         ------
         RunError
             With the first difference.
         """
         record, now = self.record(), _scene_of(dataset)
+        for one in (record, now):
+            one["dataset"].pop("cameras", None)
         for name in ("dataset", "views"):
             if name in record and record[name] != now[name]:
                 raise RunError(

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from geosplat_jax.io.cameras import cameras_digest, read_cameras, with_cameras
 from geosplat_jax.io.frames import Frame, Listing
-from geosplat_jax.io.images import MissingFileError, SceneError, image_size
+from geosplat_jax.io.images import MissingFileError, SceneError, image_size, wide_color_profile
 from geosplat_jax.io.layouts.blended_mvs import is_blended_mvs, list_blended_mvs
 from geosplat_jax.io.layouts.colmap import is_colmap, list_colmap
 from geosplat_jax.io.layouts.idr import is_idr, list_idr
@@ -181,6 +181,11 @@ def load_dataset(
         _check_pixels(views, split)
         _check_masks(views, split, warnings)
         warnings += [f"{split}: {problem}" for problem in problems]
+        if (profile := wide_color_profile(chosen[0].image)) is not None:
+            warnings.append(
+                f"{split}: {chosen[0].image.name} has colours of the profile {profile!r}, which "
+                "are read as sRGB and come out too dull; convert the photographs to sRGB"
+            )
         if split in refined:
             views = with_cameras(views, refined[split], str(cameras))
         splits.append(views)

@@ -8,6 +8,7 @@ one.
 """
 
 import os
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
@@ -28,6 +29,8 @@ LINEAR_FORMATS = frozenset({".exr", ".hdr"})
 """Suffixes of the formats that hold linear light, as all files of floats do; others are sRGB."""
 
 _SMALLEST_ALPHA = 1e-6
+_WIDE = re.compile(r"\bP3\b|Adobe RGB|ProPhoto|2020|Wide Gamut", re.IGNORECASE)
+"""Names of colour spaces that are wider than sRGB, as profiles have them."""
 
 
 class SceneError(ValueError):
@@ -103,6 +106,23 @@ def image_orientation(path: str | Path) -> int:
         return source.spec().get_int_attribute("Orientation", 1)
     finally:
         source.close()
+
+
+def wide_color_profile(path: str | Path) -> str | None:
+    """Return the name of an embedded profile whose colours reach beyond sRGB; None without one.
+
+    Reading does not convert colours: they are taken for sRGB.
+
+    Raises
+    ------
+    MissingFileError, ImageReadError
+    """
+    source = _opened(Path(path))
+    try:
+        name = source.spec().get_string_attribute("ICCProfile:profile_description")
+    finally:
+        source.close()
+    return name if _WIDE.search(name) else None
 
 
 def read_image(path: str | Path) -> Float[np.ndarray, "H W C"]:
