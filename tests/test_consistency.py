@@ -12,6 +12,7 @@ from support import views_from
 from geosplat_jax.adapter import AdapterConstants, FaceSplats
 from geosplat_jax.cli import main
 from geosplat_jax.core.capacity import Capacities
+from geosplat_jax.io.meshes import to_gltf_axes
 from geosplat_jax.report.consistency import (
     body_of_mesh,
     box_of,
@@ -227,3 +228,14 @@ def test_what_cannot_be_compared_is_refused_in_one_line(
         path.write_bytes(content)
     assert main(["consistency", str(path), *arguments]) == 2
     assert message in said(capsys)
+
+
+def test_a_file_with_y_up_is_compared_in_the_axes_of_the_world(tmp_path):
+    box = trimesh.creation.box((1.0, 2.0, 3.0))
+    box.export(tmp_path / "box.ply")
+    trimesh.Trimesh(to_gltf_axes(box.vertices), box.faces, process=False).export(
+        tmp_path / "box.glb"
+    )
+    for name in ("box.ply", "box.glb"):
+        extent = np.ptp(np.asarray(load_mesh(tmp_path / name).vertices), axis=0)
+        np.testing.assert_allclose(extent, [1.0, 2.0, 3.0], rtol=1e-6)

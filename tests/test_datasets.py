@@ -520,11 +520,39 @@ def test_a_lens_of_larger_images_is_scaled_to_those_on_disk(blender):
     np.testing.assert_array_equal(found, INTRINSICS)
 
 
+@pytest.mark.parametrize(
+    ("width", "height", "said"),
+    [(24, 12, None), (12, 24, "lie on their side"), (24, 24, "were cropped")],
+)
+def test_images_of_another_shape_than_their_lens_are_noticed(tmp_path, width, height, said):
+    """A lens of 48 x 24 pixels, of images of half the size, turned, or cut."""
+    lens = {"fl_x": 60.0, "w": 48, "h": 24}
+    (tmp_path / "images").mkdir()
+    frames = []
+    for number, pose in enumerate(poses(4)):
+        pixels = np.zeros((height, width, 4), np.float32)
+        pixels[3:-3, 3:-3] = 1.0
+        write_png(tmp_path / "images" / f"{number}.png", pixels)
+        frames.append({"file_path": f"images/{number}.png", "transform_matrix": pose.tolist()})
+    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    warnings = load_dataset(tmp_path, bounds=((-0.5,) * 3, (0.5,) * 3)).warnings
+    found = [warning for warning in warnings if "another shape" in warning]
+    assert len(found) == 2 * (said is not None)
+    assert all(said in warning for warning in found)
+
+
 def test_what_a_lens_leaves_out_is_square_and_centred(blender):
     lens = {"fl_x": 40.0, "w": SIZE, "h": SIZE, "k1": 0.0, "p2": 0}
     found = load(with_lens(blender, lens)).train.intrinsics[0]
     middle = SIZE / 2
     np.testing.assert_array_equal(found, [[40.0, 0, middle], [0, 40.0, middle], [0, 0, 1.0]])
+
+
+def test_a_vertical_angle_gives_the_vertical_focal_length(blender):
+    with_lens(blender, {"camera_angle_x": 0.8, "camera_angle_y": 0.4, "w": SIZE, "h": SIZE})
+    found = load(blender).train.intrinsics[0]
+    assert found[0, 0] == pytest.approx(0.5 * SIZE / np.tan(0.4))
+    assert found[1, 1] == pytest.approx(0.5 * SIZE / np.tan(0.2))
 
 
 def test_an_angle_gives_the_focal_length_that_a_lens_lacks(blender):

@@ -263,6 +263,27 @@ def test_an_obj_is_the_mesh_of_the_glb_with_the_same_textures(tmp_path):
         export.export_mesh_glb(path, *sphere(1), materials, vertex_colors=True, obj_path=path)
 
 
+def test_textures_of_another_format_leave_those_of_an_obj_alone(tmp_path):
+    """A later export, of a mesh that was reduced, say, has charts of its own."""
+    export.export_mesh_glb(
+        tmp_path / "mesh.glb",
+        *sphere(),
+        materials,
+        texture_size=TEXTURE,
+        obj_path=tmp_path / "mesh.obj",
+    )
+    before = {path: path.read_bytes() for path in tmp_path.glob("mesh_*.png")}
+    assert len(before) == 3
+    other = only_mesh(tmp_path / "mesh.glb")
+    other.visual.material.baseColorTexture = Image.new("RGB", (4, 4), (255, 0, 0))
+    stale = tmp_path / "mesh_usd_normal.png"
+    stale.write_bytes(b"of an earlier export")
+    written = export._write_textures(tmp_path / "mesh.usdc", other, mark="_usd")
+    assert {path: path.read_bytes() for path in before} == before
+    assert {path.name for path in tmp_path.glob("mesh_usd_*.png")} == set(written.values())
+    assert not stale.exists()
+
+
 def test_a_usd_is_the_mesh_of_the_glb_and_its_material_reads_the_textures(tmp_path):
     pytest.importorskip("pxr", reason="USD needs usd-core")
     from pxr import Usd, UsdGeom, UsdShade

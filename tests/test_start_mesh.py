@@ -317,3 +317,27 @@ def test_a_fine_mesh_is_truly_decimated():
     assert coarser.is_closed
     radii = np.linalg.norm(coarser.vertices, axis=1)
     assert np.abs(radii - RADIUS).max() < 0.05 * RADIUS
+
+
+def test_a_vertex_of_no_face_may_lie_anywhere(tmp_path):
+    """It says nothing of the size of the mesh, nor need it be a number."""
+    ball = trimesh.creation.icosphere(2, 1.0)
+    faces = ball.faces[: len(ball.faces) // 2]
+    for place in ([0.0, 0.0, 0.0], [np.nan] * 3):
+        vertices = np.concatenate([ball.vertices + [5e5, 4e6, 0.0], [place]])
+        path = tmp_path / "ball.ply"
+        trimesh.Trimesh(vertices, faces, process=False).export(path)
+        assert len(read_start(str(path), digest_of(path)).faces) == len(faces)
+
+
+@pytest.mark.parametrize("name", ["KHR_draco_mesh_compression", "KHR_mesh_quantization"])
+def test_a_compressed_file_is_refused_by_name(tmp_path, name):
+    path = tmp_path / "ball.glb"
+
+    def packed(tree):
+        tree["extensionsRequired"] = [name]
+
+    scene = trimesh.Scene(trimesh.creation.icosphere(1))
+    path.write_bytes(trimesh.exchange.gltf.export_glb(scene, tree_postprocessor=packed))
+    with pytest.raises(ValueError, match=f"is compressed .{name}.*without compression"):
+        read_start(str(path), digest_of(path))

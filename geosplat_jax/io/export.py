@@ -22,6 +22,7 @@ from geosplat_jax.io.baking import FineSurface, in_tangent_space, simplified, ve
 from geosplat_jax.io.images import encode_srgb, write_exr, written_aside
 from geosplat_jax.io.memory import Need, memory_refusal
 from geosplat_jax.io.meshes import (
+    Y_UP_LINE,
     fill_gutters,
     is_closed,
     nondegenerate,
@@ -30,7 +31,6 @@ from geosplat_jax.io.meshes import (
     to_gltf_axes,
     unwrap,
 )
-from geosplat_jax.io.start_mesh import Y_UP_LINE
 from geosplat_jax.io.usd import usd_library, write_usd
 
 SampleMaterials = Callable[[Float[np.ndarray, "N 3"]], tuple[Any, Any, Any]]
@@ -149,10 +149,11 @@ def _write_glb(path: str | Path, mesh: trimesh.Trimesh) -> None:
         aside.write_bytes(data)
 
 
-def _write_textures(path: Path, mesh: trimesh.Trimesh) -> dict[str, str]:
+def _write_textures(path: Path, mesh: trimesh.Trimesh, *, mark: str = "") -> dict[str, str]:
     """Write the textures of a mesh as PNG beside ``path``; return the files' names.
 
-    Roughness and metallic are grey pictures of their own.
+    Roughness and metallic are grey pictures of their own. ``mark`` keeps the files of a format
+    apart from those of another, which may be of another mesh.
     """
     visual = mesh.visual
     assert isinstance(visual, TextureVisuals)
@@ -167,8 +168,10 @@ def _write_textures(path: Path, mesh: trimesh.Trimesh) -> dict[str, str]:
     }
     written = {}
     for name, image in images.items():
-        if image is not None:
-            file = path.with_name(f"{path.stem}_{name}.png")
+        file = path.with_name(f"{path.stem}{mark}_{name}.png")
+        if image is None:
+            file.unlink(missing_ok=True)  # of an earlier export
+        else:
             with written_aside(file) as aside:
                 image.save(aside, format="PNG")
             written[name] = file.name
@@ -407,7 +410,7 @@ def export_mesh_glb(
         if obj_path is not None:
             _write_obj(obj_path, mesh)
         if usd_path is not None:
-            write_usd(usd_path, mesh, _write_textures(Path(usd_path), mesh))
+            write_usd(usd_path, mesh, _write_textures(Path(usd_path), mesh, mark="_usd"))
         info |= baking
     info |= {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
     return info | {"seconds": time.perf_counter() - start}

@@ -96,6 +96,9 @@ def checked_lens(values: Mapping[str, Any], where: str) -> Lens:
     angle = None
     if "camera_angle_x" in values:
         angle = checked_angle(values["camera_angle_x"], where)
+    if "camera_angle_y" in values and "fl_y" not in given and {"w", "h"} <= given.keys():
+        half = 0.5 * checked_angle(values["camera_angle_y"], where)
+        given["fl_y"] = 0.5 * given["h"] / math.tan(half)
     if angle is not None and not given.keys() - {"w", "h"}:
         size = (int(given["w"]), int(given["h"])) if {"w", "h"} <= given.keys() else None
         return AngleLens(angle, distortion, size)
@@ -178,7 +181,7 @@ def checked_length(value: Any, key: str, where: str) -> float:
 
 
 def checked_angle(angle: Any, where: str) -> float:
-    """Return a horizontal field of view in radians, between 0 and pi."""
+    """Return a field of view in radians, between 0 and pi."""
     if not _is_number(angle) or not 0.0 < angle < math.pi:
         raise SceneError(f"the camera angle of {where} must be in (0, pi) radians, got {angle!r}")
     return float(angle)

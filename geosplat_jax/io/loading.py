@@ -15,6 +15,7 @@ from geosplat_jax.io.images import (
     reading_bytes,
     require_room,
 )
+from geosplat_jax.io.lenses import PinholeLens
 from geosplat_jax.io.memory import Need
 from geosplat_jax.io.photographs import Marks, Part, PartsInMemory, pack_marks, values_of
 from geosplat_jax.io.reading import THREADS, forget_lenses, in_parallel, read_photograph
@@ -30,6 +31,8 @@ _READING_BYTES = 5 << 28
 
 _CODED_PIXEL_BYTES = 12
 """Memory for a pixel while an image of integers is read whose floats are made in strips."""
+_SHAPE_PIXELS, _SHAPE_TOLERANCE = 1.5, 0.02
+"""How far the width of an image may be from that of the shape of its lens, pixels or a share."""
 _EVEN = 0.02
 """Linear colours of an object that differ by no more are one colour."""
 _EVEN_STRIDE = 8
@@ -48,7 +51,7 @@ def load_views(
     """
     _require_distinct([frame.name for frame in frames])
     full = in_parallel(lambda frame: image_size(frame.image), frames)
-    problems = _size_problems(frames, full, factor, listing)
+    problems = _size_problems(frames, full, factor, listing) + _other_shapes(frames, full)
     sizes = [(height // factor, width // factor) for height, width in full]
     canvas = np.max(sizes, axis=0)
     _require_room_for_all(frames, full, canvas, most_bytes)
@@ -105,6 +108,35 @@ def load_views(
         },
     )
     return views, problems
+
+
+def _other_shapes(frames: Sequence[Frame], full: Sequence[tuple[int, int]]) -> list[str]:
+    """Say which images are of another shape than their lens; reduced ones are rounded."""
+
+    def fits(width: int, height: int, across: int, along: int) -> bool:
+        allowed = max(_SHAPE_PIXELS, _SHAPE_TOLERANCE * width)
+        return abs(width - across * height / along) <= allowed
+
+    other, turned = [], 0
+    for frame, (height, width) in zip(frames, full, strict=True):
+        lens = frame.lens
+        if isinstance(lens, PinholeLens) and not fits(width, height, lens.width, lens.height):
+            other.append(
+                f"{frame.image.name} ({width} x {height}, its lens {lens.width} x {lens.height})"
+            )
+            turned += fits(width, height, lens.height, lens.width)
+    if not other:
+        return []
+    cure = "where images were cropped, give the lens that they have now"
+    if turned == len(other):
+        cure = (
+            "they lie on their side, as EXIF may say of them: store them turned, or find the "
+            "cameras of the images as they are stored"
+        )
+    return [
+        f"{len(other)} images are of another shape than their lens, which is squeezed to fit, "
+        f"{other[0]} for one; {cure}"
+    ]
 
 
 def _intrinsics(

@@ -5,6 +5,7 @@ counter-clockwise. Texture coordinates are those of an image with row 0 at the t
 right, ``v`` runs *down*, a texel's centre lies at ``(column + 0.5) / size``.
 """
 
+import json
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,6 +19,15 @@ from scipy import ndimage
 
 from geosplat_jax.core.types import Camera, Mesh
 
+Y_UP_FORMATS = frozenset({".glb", ".gltf"})
+"""Formats whose files say that y is up."""
+
+Y_UP_LINE = "# y is up"
+"""First line of an OBJ file that says so, as ours do; the format itself knows no axes."""
+
+_PACKED = frozenset(
+    {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_mesh_quantization"}
+)
 # A face thinner than this share of the bounding box's diagonal has no usable normal or chart.
 _DEGENERATE_HEIGHT = 1e-7
 # Texels between charts: room for bilinear taps and for two mipmap levels.
@@ -65,16 +75,62 @@ def read_mesh(
     ValueError
         If the file cannot be read, or holds no triangle.
     """
+    _require_plain(Path(path))
     try:
         loaded = trimesh.load(path, process=False)
     except OSError:
         raise
     except Exception as problem:  # whatever the parser of a format raises
-        raise ValueError(f"{path} cannot be read as a mesh: {problem}") from problem
+        said = f"{path} cannot be read as a mesh: {problem}"
+        if Path(path).suffix.lower() == ".ply":
+            said += (
+                "; of binary PLY only faces of one number of corners are read: export triangles, "
+                "or OBJ"
+            )
+        raise ValueError(said) from problem
     mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise ValueError(f"{path} must hold a triangle mesh, found no triangle in it")
     return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
+
+
+def _require_plain(path: Path) -> None:
+    """Refuse glTF whose numbers are packed in a way that is not read, or is read wrongly."""
+    suffix = path.suffix.lower()
+    if suffix not in Y_UP_FORMATS or not path.is_file():
+        return
+    with path.open("rb") as file:
+        # A GLB begins with 12 bytes, the length of its JSON, and four letters.
+        if suffix == ".glb":
+            start = file.read(20)
+            text = file.read(int.from_bytes(start[12:16], "little")) if len(start) == 20 else b""
+        else:
+            text = file.read()
+    try:
+        tree = json.loads(text)
+    except ValueError:
+        return  # The reader of the format says what is wrong.
+    required = tree.get("extensionsRequired", []) if isinstance(tree, dict) else []
+    packed = sorted(_PACKED & set(required))
+    if packed:
+        raise ValueError(
+            f"{path} is compressed ({', '.join(packed)}), which is not read; export it without "
+            "compression"
+        )
+
+
+def is_y_up(path: str | Path) -> bool:
+    """Tell whether a mesh file says that y is up; the world of the cameras has z up."""
+    path = Path(path)
+    if path.suffix.lower() != ".obj":
+        return path.suffix.lower() in Y_UP_FORMATS
+    with path.open("rb") as file:
+        return file.readline().strip() == Y_UP_LINE.encode()
+
+
+def from_y_up(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+    """Turn points from y-up axes, the inverse of `to_gltf_axes`."""
+    return np.stack([points[:, 0], -points[:, 2], points[:, 1]], axis=-1)
 
 
 def unpadded(mesh: Mesh) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
@@ -86,12 +142,14 @@ def unpadded(mesh: Mesh) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3
 def nondegenerate(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Bool[np.ndarray, " F"]:
-    """Tell which faces have three distinct corners and a height above 1e-7 of the mesh's size."""
+    """Tell which faces have three distinct corners and a height above 1e-7 of the size of all."""
     corners = np.asarray(vertices, np.float64)[faces]
     edges = corners[:, [1, 2, 0]] - corners
     longest = np.sqrt((edges**2).sum(-1).max(-1))
     double_area = np.sqrt((np.cross(edges[:, 0], edges[:, 1]) ** 2).sum(-1))
-    size = np.sqrt((np.ptp(vertices, axis=0).astype(np.float64) ** 2).sum())
+    # Of what faces have corners at; vertices that none has may lie anywhere.
+    extent = np.ptp(corners.reshape(-1, 3), axis=0) if len(faces) else np.zeros(3)
+    size = np.sqrt((extent**2).sum())
     return double_area > _DEGENERATE_HEIGHT * size * longest
 
 

@@ -14,6 +14,8 @@ import trimesh
 from jaxtyping import Float, Int
 
 from geosplat_jax.io.meshes import (
+    from_y_up,
+    is_y_up,
     longest_edge,
     nondegenerate,
     read_mesh,
@@ -28,12 +30,6 @@ LARGEST = 5_000_000
 
 _SAME_PLACE = 1e-7
 """Corners nearer to each other than this share of the mesh's size are one vertex."""
-
-_Y_UP = {".glb", ".gltf"}
-"""Formats whose files say that y is up; the world of the cameras has z up."""
-
-Y_UP_LINE = "# y is up"
-"""First line of an OBJ file that says so, as ours do; the format itself knows no axes."""
 
 _SAMPLES = 4000
 """Points of the surface that are projected to compare it with the masks."""
@@ -108,19 +104,6 @@ def digest_of(path: str | Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 
 
-def _is_y_up(path: Path) -> bool:
-    """Tell whether a file says that y is up."""
-    if path.suffix.lower() != ".obj":
-        return path.suffix.lower() in _Y_UP
-    with path.open("rb") as file:
-        return file.readline().strip() == Y_UP_LINE.encode()
-
-
-def _from_y_up(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-    """Turn points from y-up axes, the inverse of `meshes.to_gltf_axes`."""
-    return np.stack([points[:, 0], -points[:, 2], points[:, 1]], axis=-1)
-
-
 @lru_cache(maxsize=1)
 def read_start(path: str, digest: str) -> StartMesh:
     """Read a mesh file and clean what it holds, in the axes of the world.
@@ -148,15 +131,17 @@ def read_start(path: str, digest: str) -> StartMesh:
         )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError(f"{path} has faces of vertices that it does not have")
-    broken = ~np.isfinite(vertices).all(axis=1)
+    used = np.zeros(len(vertices), bool)
+    used[faces.reshape(-1)] = True
+    broken = used & ~np.isfinite(vertices).all(axis=1)
     if broken.any():
         raise ValueError(
             f"{path}: {broken.sum()} of {len(vertices)} vertices are not finite numbers, the first "
             f"is number {int(np.argmax(broken))}; repair the mesh"
         )
     mesh = StartMesh(vertices, faces, (f"mesh: {len(faces)} faces of {path}",))
-    if _is_y_up(Path(path)):
-        mesh = mesh.noting("turned from y-up axes to z-up ones", vertices=_from_y_up(vertices))
+    if is_y_up(path):
+        mesh = mesh.noting("turned from y-up axes to z-up ones", vertices=from_y_up(vertices))
     return _outward(_cleaned(mesh, path))
 
 
@@ -298,7 +283,7 @@ def require_in_views(mesh: StartMesh, views: Views, path: str) -> None:
     if scaled[best] >= max(_AGREES, 2 * found):
         advice = f"{best:g} times as large it would (agreement {scaled[best]:.2f}): are its units "
         advice += "others than the cameras'? Scale the file"
-    turned = agreement_with_views(_from_y_up(points), views)
+    turned = agreement_with_views(from_y_up(points), views)
     if turned >= max(_AGREES, 2 * found):
         advice = f"turned from y-up axes to z-up ones it would (agreement {turned:.2f}): write "
         advice += "it with z up, or as glTF, whose axes are known"

@@ -29,7 +29,7 @@ from geosplat_jax.core.capacity import Capacities, Usage, bucket
 from geosplat_jax.core.numerics import safe_divide, safe_norm
 from geosplat_jax.core.types import Box, Camera, Mesh, Splats
 from geosplat_jax.fit.trained import Trained
-from geosplat_jax.io.meshes import first_hits, read_mesh, unpadded
+from geosplat_jax.io.meshes import first_hits, from_y_up, is_y_up, read_mesh, unpadded
 from geosplat_jax.io.views import Views
 from geosplat_jax.render import RasterSettings
 from geosplat_jax.report.renderer import build_asset, trim_mesh
@@ -343,6 +343,7 @@ def load_mesh(path: str | Path) -> Mesh:
     """Read a mesh file to be compared with splats; corners at one position become one vertex.
 
     Files repeat vertices along the seams of textures. Normals are then those of the whole surface.
+    A file that says that y is up is turned into the axes of the world, whose z is up.
 
     Raises
     ------
@@ -351,7 +352,7 @@ def load_mesh(path: str | Path) -> Mesh:
         alike.
     """
     vertices, faces = read_mesh(path)
-    vertices = vertices.astype(np.float32)
+    vertices = (from_y_up(vertices) if is_y_up(path) else vertices).astype(np.float32)
     if not np.isfinite(vertices).all():
         raise ValueError(f"{path} has vertices that are not finite numbers")
     vertices, rows = np.unique(vertices, axis=0, return_inverse=True)

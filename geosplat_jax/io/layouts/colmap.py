@@ -59,6 +59,7 @@ _MODELS = {
     10: _Model("THIN_PRISM_FISHEYE", 12),
 }
 _UNREAD = ("FOV", "THIN_PRISM_FISHEYE")
+_UNDISTORT = "undistort the images with colmap image_undistorter"
 _BY_NAME = {model.name: model for model in _MODELS.values()}
 
 
@@ -172,10 +173,7 @@ def _frame(root: Path, image: _Image, lenses: Mapping[int, PinholeLens], where: 
 def _lens(model: _Model, width: int, height: int, numbers: tuple[float, ...], what: str):
     """Return the lens of a camera, its numbers checked."""
     if model.name in _UNREAD:
-        raise SceneError(
-            f"{what} has the model {model.name}, which is not read; undistort the images with "
-            "colmap image_undistorter"
-        )
+        raise SceneError(f"{what} has the model {model.name}, which is not read; {_UNDISTORT}")
     checked_numbers(numbers, (model.numbers,), f"the numbers of {what} ({model.name})")
     has_two = model.name in ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV")
     fx, fy = numbers[0], numbers[1] if has_two else numbers[0]
@@ -261,7 +259,7 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, PinholeLens]]:
         number, kind, width, height = content.numbers("IiQQ")
         what = f"camera {number} of {path}"
         if kind not in _MODELS:
-            raise SceneError(f"{what} has the unknown model {kind}; write the model again")
+            raise SceneError(f"{what} has the unknown model {kind}; {_UNDISTORT}")
         model = _MODELS[kind]
         yield number, _lens(model, width, height, content.numbers(f"{model.numbers}d"), what)
     content.end()
@@ -322,7 +320,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, PinholeLens]]:
         if len(words) < 4:
             raise SceneError(f"{where} must be: number, model, width, height, ...; got {line!r}")
         if words[1] not in _BY_NAME:
-            raise SceneError(f"{where} has the unknown model {words[1]!r}; write the model again")
+            raise SceneError(f"{where} has the unknown model {words[1]!r}; {_UNDISTORT}")
         model = _BY_NAME[words[1]]
         camera, width, height = _integers([words[0], *words[2:4]], where)
         numbers = _floats(words[4:], where)

@@ -56,7 +56,9 @@ def list_transforms_capture(root: Path, *, light: str | None = None) -> Listing:
     where = root / FILE
     content = read_json(where)
     if "applied_transform" in content:
-        checked_numbers(content["applied_transform"], (3, 4), f"'applied_transform' of {where}")
+        rows = content["applied_transform"]
+        shape = (4, 4) if isinstance(rows, list) and len(rows) == 4 else (3, 4)
+        checked_numbers(rows, shape, f"'applied_transform' of {where}")
     frames: dict[str, Frame] = {}
     for listed in list_transforms(content, where):
         name = _plain(listed.file_path)
