@@ -11,8 +11,10 @@ is written at the end.
 """
 
 import argparse
+import json
 import math
 import random
+import signal
 import statistics
 import sys
 from dataclasses import replace
@@ -39,40 +41,43 @@ _LENGTHS = (
 def joint_runs(sweep: Sweep, count: int, *, seed: int) -> list[SweepRun]:
     """Combine the knobs of a sweep at random: of every group the base or one of its values.
 
-    Combinations whose settings are refused, or known already, are left out and drawn again.
+    Combinations whose settings are refused, or known already, are left out and drawn again; a sweep
+    of few values may have fewer than ``count``.
     """
     groups: dict[str, list[SweepRun]] = {}
     for one in sweep.runs:
         if one.x is not None:
             groups.setdefault(one.group, []).append(one)
     base, draw = sweep.runs[0], random.Random(seed)
-    known = {tuple(run.overrides) + (run.downscale,) for run in sweep.runs}
+    known = {_settings_of(sweep, run) for run in sweep.runs}
     found: list[SweepRun] = []
     for _ in range(100 * count):
         if len(found) == count:
             break
         chosen = [draw.choice(runs) for runs in groups.values() if draw.random() < 0.5]
-        overrides = tuple(dict.fromkeys(text for run in chosen for text in run.overrides))
-        factors = [run.downscale for run in chosen if run.downscale != sweep.downscale]
-        downscale = factors[0] if factors else sweep.downscale
-        if (*overrides, downscale) in known:
-            continue
-        known.add((*overrides, downscale))
+        texts = (*base.overrides, *(text for run in chosen for text in run.overrides))
+        factors = [run.downscale for run in chosen if run.downscale != base.downscale]
         candidate = replace(
             base,
             name=f"joint-{len(found):03d}",
             title=", ".join(run.name for run in chosen),
-            overrides=overrides,
-            downscale=downscale,
+            overrides=tuple(dict.fromkeys(texts)),
+            downscale=factors[0] if factors else base.downscale,
             x=None,
         )
         try:
-            has_steps = sweep.config(candidate).active_stages
+            settings = _settings_of(sweep, candidate)
         except ValueError:
             continue
-        if has_steps:
+        if settings not in known and sweep.config(candidate).active_stages:
+            known.add(settings)
             found.append(candidate)
     return found
+
+
+def _settings_of(sweep: Sweep, run: SweepRun) -> str:
+    """Return a text that is the same for runs with the same settings."""
+    return json.dumps([sweep.config(run).to_dict(), run.downscale], sort_keys=True)
 
 
 def shortened(sweep: Sweep, run: SweepRun, factor: float) -> SweepRun:
@@ -98,8 +103,9 @@ def survivors(points: dict[str, tuple[float, float]], count: int) -> list[str]:
         front = trade.pareto(left)
         free = count - len(chosen)
         if len(front) > free:
-            # Both ends and places between.
-            places = {round(k * (len(front) - 1) / max(free - 1, 1)) for k in range(free)}
+            # Both ends and places between; the best alone where there is one place.
+            last = len(front) - 1
+            places = {last} if free == 1 else {round(k * last / (free - 1)) for k in range(free)}
             front = [front[k] for k in sorted(places)]
             chosen += front
             break
@@ -177,6 +183,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--quality", choices=QUALITIES, help="instead of the sweep's")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="S.F=VALUE")
     arguments = parser.parse_args(argv)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         if arguments.rungs < 1 or not 0 < arguments.keep < 1 or arguments.joint < 0:
             raise SweepError("--rungs must be at least 1, --keep between 0 and 1, --joint not < 0")
@@ -192,6 +199,8 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         runner._say("interrupted; the same command goes on from the last checkpoint")
         return 130
+    finally:
+        signal.signal(signal.SIGTERM, before)
     (arguments.output / "front.md").write_text(text, encoding="utf-8")
     runner._say(f"front of {len(here.runs)} runs: {arguments.output / 'front.md'}")
     return 0

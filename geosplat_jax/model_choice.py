@@ -157,7 +157,7 @@ def choose_model(
         if part.is_photographed:
             rung = _tried(trials, part, kept, wanted)
         else:
-            rung = _seen_on_surface(trials, part, kept)
+            rung = _seen_on_surface(trials, part, kept, wanted)
         kept = frozenset(wanted) if rung.is_kept else kept
         rungs.append(rung)
         listener.on_rung(rung)
@@ -203,11 +203,21 @@ def _tried(trials: "_Trials", part: Part, kept: Collection[str], wanted: Collect
     return Rung(part.name, part.title, before, after, found, found.is_kept, note)
 
 
-def _seen_on_surface(trials: "_Trials", part: Part, kept: Collection[str]) -> Rung:
-    """Judge a part that photographs cannot tell by what the surface blocks from itself."""
+def _seen_on_surface(
+    trials: "_Trials", part: Part, kept: Collection[str], wanted: Collection[str]
+) -> Rung:
+    """Judge a part that photographs cannot tell by what the surface blocks from itself.
+
+    Where it is to be kept it is trained, so that one whose training fails is left out.
+    """
     before = float(np.mean(trials.decibels(kept, 0)))
     share = trials.blocked_share()
     note = f"the surface blocks {100 * share:.1f} % of an even sky"
+    if share > _BLOCKED:
+        try:
+            trials.decibels(wanted, 0)
+        except TrainingError as error:
+            return Rung(part.name, part.title, before, None, None, False, str(error))
     return Rung(part.name, part.title, before, None, None, share > _BLOCKED, note)
 
 
@@ -258,6 +268,7 @@ class _Trials:
         self.blocks = neighbouring_blocks(towards / lengths)
         self._measured: dict[str, dict[str, Any]] = {}
         self._stage_1_seconds: dict[str, float] = {}
+        self._blocked: float | None = None
 
     @property
     def count(self) -> int:
@@ -301,6 +312,8 @@ class _Trials:
             state = parse_json(path.read_bytes())
             seconds = {name: float(taken) for name, taken in state["first_stages"].items()}
             measured = {name: self._checked(found) for name, found in state["trainings"].items()}
+            blocked = state.get("blocked")
+            self._blocked = None if blocked is None else float(blocked)
             was = state["mark"]
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise RunError(f"{path} is damaged: {error}; begin anew with --force") from None
@@ -348,6 +361,7 @@ class _Trials:
             "blocks": self.blocks.tolist(),
             "first_stages": self._stage_1_seconds,
             "trainings": self._measured,
+            "blocked": self._blocked,
         }
         aside.write_text(json.dumps(state, indent=2) + "\n", encoding="utf-8")
         os.replace(aside, path)
@@ -385,11 +399,19 @@ class _Trials:
         return np.asarray(self._measured[name]["psnr"], float)
 
     def blocked_share(self) -> float:
-        """Return what the surface of the first stage blocks, see `blocked.blocked_share`."""
-        self._start(False)
-        trained = load_trained(self._folder / _first_stage(False))
-        pipeline = trained.pipeline
-        return blocked_share(pipeline.surface, trained.params.geometry, pipeline.capacities)
+        """Return what the surface of the first stage blocks, see `blocked.blocked_share`.
+
+        It is noted, since the first stage is removed once the model is chosen.
+        """
+        if self._blocked is None:
+            self._start(False)
+            trained = load_trained(self._folder / _first_stage(False))
+            pipeline = trained.pipeline
+            self._blocked = float(
+                blocked_share(pipeline.surface, trained.params.geometry, pipeline.capacities)
+            )
+            self._save(self._mark())
+        return self._blocked
 
     def _start(self, has_finer_cells: bool) -> Start:
         """Train the first stage, once for each size of the cells, of all materials."""

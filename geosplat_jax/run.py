@@ -4,6 +4,7 @@
 """
 
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
@@ -422,9 +423,15 @@ class _Previews(Listener):
         self._running = in_background(lambda: self._write(copied))
 
     def finish(self) -> None:
-        """Wait for the preview that is being rendered."""
-        if self._running is not None:
-            self._running.result()
+        """Wait for the preview that is being rendered; one that failed is told of once."""
+        running, self._running = self._running, None
+        if running is None:
+            return
+        error = running.exception()
+        if isinstance(error, Exception):
+            warnings.warn(f"a preview could not be made: {error}", stacklevel=2)
+        elif error is not None:
+            raise error
 
     def _write(self, trained: Trained) -> None:
         self._folder.mkdir(exist_ok=True)
@@ -539,6 +546,14 @@ def train(
         devices = choose_devices(devices)
     goes_on = begin.goes_on(folder)
     keeps_model = goes_on and folder.has_chosen_model and (config is None or model is not None)
+    if goes_on and model is not None and not folder.has_chosen_model:
+        raise RunError(
+            f"the run in {folder} has begun without choosing a model; leave that out, or begin "
+            "anew with --force"
+        )
+    if goes_on and folder.budget() is not None and config == folder.planned():
+        # The same call again; the settings have changed with the pace since.
+        config, budget = folder.config(), folder.budget()
     if keeps_model or (goes_on and config is None and folder.budget() is not None):
         # Its settings were chosen, and those of a budget have changed since.
         config, reading = folder.config(), folder.record()["dataset"]

@@ -28,7 +28,7 @@ from geosplat_jax.fit.costs import (
     work_of,
 )
 from geosplat_jax.fit.entering import FreshAlbedo
-from geosplat_jax.fit.folder import RunFolder
+from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.presets import QUALITIES, between_qualities, make_config
 from geosplat_jax.fit.train import fit
@@ -417,11 +417,18 @@ def test_a_resumed_budget_measures_itself_against_what_was_planned(dataset, tmp_
     assert run.config.total_steps < 40
 
 
-def test_python_resumes_a_budget_without_naming_settings(dataset, tmp_path):
+@pytest.mark.parametrize("names_settings", [False, True])
+def test_python_resumes_a_budget_with_the_same_call_or_a_shorter_one(
+    dataset, tmp_path, names_settings
+):
     config = tiny_config("stages.split_sum.steps=40", "stages.monte_carlo.steps=0")
     config = replace(config, run=replace(config.run, preview_every=2))
     _paced_run(dataset, tmp_path / "run", config, stop_after=12)
-    run = train(dataset, tmp_path / "run", begin=Resume())
+    same = {"config": config, "budget": Budget(60.0)} if names_settings else {}
+    with pytest.raises(RunError, match="without choosing a model"):
+        train(dataset, tmp_path / "run", begin=Resume(), model="auto")
+    run = train(dataset, tmp_path / "run", begin=Resume(), **same)
+    assert run.config != config
     assert run.trained.step == run.config.total_steps
     assert run.folder.budget() == Budget(60.0)
     # With less than a minute left no preview is begun, which the end would have to wait for.

@@ -441,6 +441,30 @@ def test_differences_name_the_setting_and_both_values():
             [],
         ),
         (("stages.monte_carlo.steps=0",), []),
+        (
+            (
+                "stages.monte_carlo.transport.reservoirs.candidates=8",
+                "stages.monte_carlo.transport.shares_views=false",
+                "stages.monte_carlo.transport.bounces=2",
+            ),
+            ["with shares_views = false", "bounces = 2 has no effect"],
+        ),
+        (
+            (
+                "stages.monte_carlo.transport.reservoirs.candidates=8",
+                "stages.monte_carlo.domain.kind=per_pixel",
+                "stages.monte_carlo.transport.radiometric_gradient=both",
+            ),
+            ["where pixels are shaded", "radiometric_gradient has no effect"],
+        ),
+        (("stages.monte_carlo.transport.reservoirs.neighbors=2",), ["without candidates"]),
+        (
+            (
+                "stages.monte_carlo.transport.reservoirs.candidates=8",
+                "stages.monte_carlo.transport.light_count=0",
+            ),
+            ["without samples of the light"],
+        ),
     ],
 )
 def test_settings_without_effect_are_told(overrides, told):

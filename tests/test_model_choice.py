@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,6 +30,9 @@ NAMES = [part.name for part in LADDER]
 @pytest.fixture(scope="module")
 def dataset():
     return sphere_dataset(count=40, size=8)
+
+
+_BLOCKED_SHARE = model_choice._Trials.blocked_share
 
 
 class _Trainings:
@@ -115,6 +119,36 @@ def test_the_surface_decides_whether_there_are_shadows(
     (rung,) = (rung for rung in chosen.record()["rungs"] if rung["part"] == "shadows")
     said = f"the surface blocks {100 * share:.1f} % of an even sky"
     assert rung_row(rung)[2:] == ("-", "-", f"{'kept' if is_kept else 'left out'}: {said}")
+
+
+def test_what_the_surface_blocks_is_noted_with_the_other_figures(
+    dataset, trainings, tmp_path, monkeypatch
+):
+    """The first stage is gone when the choice is repeated."""
+    looked = []
+
+    def surface_of(folder):
+        assert folder.is_dir()
+        looked.append(folder)
+        whole = SimpleNamespace(surface=None, capacities=None)
+        return SimpleNamespace(pipeline=whole, params=SimpleNamespace(geometry=None))
+
+    monkeypatch.setattr(model_choice._Trials, "blocked_share", _BLOCKED_SHARE)
+    monkeypatch.setattr(model_choice, "load_trained", surface_of)
+    monkeypatch.setattr(model_choice, "blocked_share", lambda *unused: 0.3)
+    config = make_config(quality="draft")
+    chosen = choose_model(dataset, config, tmp_path / "run")
+    assert "shadows" in names_of(chosen)
+    assert choose_model(dataset, config, tmp_path / "run", begin=Resume()) == chosen
+    assert len(looked) == 1
+
+
+def test_shadows_whose_training_fails_are_left_out(dataset, trainings, tmp_path):
+    trainings.blocked, trainings.fails = 0.5, ("shadows",)
+    chosen = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
+    assert names_of(chosen) == ["specular", "metallic", "light"]
+    (rung,) = (rung for rung in chosen.record()["rungs"] if rung["part"] == "shadows")
+    assert rung_row(rung)[-1] == "left out: the surface has exploded"
 
 
 def test_other_seeds_are_trained_for_gains_alone(dataset, trainings, tmp_path):

@@ -7,10 +7,12 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from support import TINY
+from support import TINY, sphere_dataset
 
 import geosplat_jax as gs
 from geosplat_jax import cli
+from geosplat_jax import run as run_module
+from geosplat_jax.fit.folder import RunFolder
 
 DUCK = Path(__file__).resolve().parents[1] / "examples" / "duck"
 SETTINGS = (*TINY, "stages.split_sum.steps=2", "run.preview_every=2")
@@ -66,6 +68,18 @@ def test_what_no_scene_is_read_with_is_refused(folder):
     with pytest.raises(TypeError, match="takes no downscal, seed"):
         gs.train(folder / "duck", folder / "refused", downscal=8, seed=7)
     assert not (folder / "refused").exists()
+
+
+def test_a_preview_that_fails_is_told_of_and_ends_nothing(tmp_path, monkeypatch):
+    previews = run_module._Previews(sphere_dataset(count=2, size=8), RunFolder(tmp_path))
+
+    def failing():
+        raise MemoryError("no memory is left")
+
+    previews._running = run_module.in_background(failing)
+    with pytest.warns(UserWarning, match="could not be made: no memory is left"):
+        previews.finish()
+    previews.finish()
 
 
 def test_a_dataset_is_not_read_again(folder):

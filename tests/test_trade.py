@@ -207,8 +207,21 @@ def test_a_front_holds_what_nothing_beats():
     points = {"a": (1.0, 1.0), "b": (2.0, 3.0), "c": (2.0, 2.0), "d": (3.0, 2.5), "e": (4.0, 3.5)}
     assert trade.pareto(points) == ["a", "b", "e"]
     assert halving.survivors(points, 3) == ["a", "b", "e"]
-    assert halving.survivors(points, 4) == ["a", "b", "e", "c"]
+    assert halving.survivors(points, 4) == ["a", "b", "e", "d"]
     assert halving.survivors(points, 2) == ["a", "e"]
+    # Where there is one place the best goes on, not the cheapest.
+    assert halving.survivors(points, 1) == ["e"]
+
+
+def test_combinations_keep_what_the_base_sets(tmp_path):
+    text = SWEEP.replace('name = "base"\n', 'name = "base"\nset = ["run.preview_every=7"]\n')
+    sweep = read_sweep(_write(tmp_path, text))
+    joint = halving.joint_runs(sweep, 6, seed=0)
+    assert joint
+    assert all("run.preview_every=7" in run.overrides for run in joint)
+    assert all(run.title for run in joint)
+    settings = [halving._settings_of(sweep, run) for run in (*joint, *sweep.runs)]
+    assert len(set(settings)) == len(settings)
 
 
 def test_halving_trains_many_a_little_and_few_in_full(tmp_path, monkeypatch):

@@ -551,6 +551,11 @@ def config_warnings(config: Config) -> list[str]:
                 f"stages.{stage.name}.weights.radiometric has no effect: set "
                 f"stages.{stage.name}.transport.indirect=radiometric"
             )
+        if stage.transport.chooses_samples and not stage.domain.shades_splats:
+            warnings.append(
+                f"stages.{stage.name}.transport.reservoirs have no effect where pixels are shaded: "
+                "no two views share a point"
+            )
         warnings += [f"stages.{stage.name}.transport.{text}" for text in stage.transport.warnings()]
     return warnings + _changes_of_blocked_light(config)
 

@@ -248,6 +248,11 @@ class TransportSettings(Variant, abc.ABC):
         """About how much longer a training step takes than with the split sum."""
         return 1.0
 
+    @property
+    def chooses_samples(self) -> bool:
+        """Whether samples that views share are chosen from reservoirs."""
+        return False
+
     def warnings(self) -> list[str]:
         """Say which settings have no effect together with the others."""
         return []

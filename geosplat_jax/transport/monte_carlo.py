@@ -73,13 +73,18 @@ class MonteCarloSettings(SampledSettings, TransportSettings, kind="monte_carlo")
         return 1.0 + 0.2 * (drawn + 3 * self.residual_count)
 
     def warnings(self) -> list[str]:
-        """Say that traced light needs rays."""
+        """Say that traced light needs rays, and what belongs to another kind of indirect light."""
+        texts = SampledSettings.warnings(self)
         if INDIRECT_MODELS[self.indirect].reads_faces and not self.occlusion:
-            return [
+            texts.append(
                 f"indirect = {self.indirect} has no effect without occlusion: blocked directions "
                 "are black"
-            ]
-        return []
+            )
+        if self.bounces > 1 and self.indirect != "traced":
+            texts.append(f"bounces = {self.bounces} has no effect without indirect = traced")
+        if self.radiometric_gradient == "both" and not self.is_radiometric:
+            texts.append("radiometric_gradient has no effect without indirect = radiometric")
+        return texts
 
     def build(self, light: LightSpec) -> "MonteCarlo":
         """Make the transport; it has no constants."""

@@ -96,6 +96,24 @@ class SampledSettings:
         """Direction, weight and hit of every sample that views share; see `Samples`."""
         return 5 * (self.light_count + self.diffuse_count) if self.shares_views else 0
 
+    @property
+    def chooses_samples(self) -> bool:
+        """Whether there are candidates for the samples of the light."""
+        return self.reservoirs.candidates > 0 and self.light_count > 0 and self.shares_views
+
+    def warnings(self) -> list[str]:
+        """Say where nothing is chosen from reservoirs, though it was asked for."""
+        chosen = self.reservoirs
+        if chosen.candidates == 0:
+            if chosen.reuse_steps or chosen.neighbors > 0:
+                return ["reservoirs have no effect without candidates: samples are plain"]
+            return []
+        if self.light_count == 0:
+            return ["reservoirs have no effect without samples of the light (light_count = 0)"]
+        if not self.shares_views:
+            return ["reservoirs have no effect with shares_views = false: samples are plain"]
+        return []
+
     def __post_init__(self) -> None:
         """Refuse a lobe without samples."""
         if self.reservoirs.drops_blocked and min(self.diffuse_count, self.specular_count) == 0:
