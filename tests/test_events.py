@@ -1,6 +1,7 @@
 """Event files: every step once, terms and previews, also after a resume."""
 
 import json
+import shutil
 import struct
 import sys
 
@@ -69,6 +70,21 @@ def test_steps_and_previews_are_written_once_and_anew_after_a_resume(folder):
     resumed.note()
     resumed.close()
     assert [step for step, _ in events(folder)["loss"]] == [0, 3]
+
+
+def test_a_run_that_takes_the_place_of_another_is_written_whole(folder):
+    """While a model is chosen, the run that will be replaced is still there."""
+    pytest.importorskip("tensorboardX")
+    add_steps(folder, 0, 1, 2)
+    log = EventLog(folder)
+    log.note()
+    shutil.rmtree(folder.path / "tensorboard")
+    folder.metrics.rename(folder.path / "old")
+    log.note()
+    add_steps(folder, 0, 1)
+    log.note()
+    log.close()
+    assert [step for step, _ in events(folder)["loss"]] == [0, 1]
 
 
 def test_a_missing_package_is_named(folder, monkeypatch):

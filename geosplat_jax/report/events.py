@@ -50,6 +50,14 @@ class EventLog(Listener):
     def __init__(self, folder: RunFolder) -> None:
         self._kind, self._folder = _writer_kind(), folder
         self._writer: Any = None
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """Forget what has been written, and of which file."""
+        if self._writer is not None:
+            self._writer.close()
+        self._writer = None
+        self._file: int | None = None
         self._read = 0
         self._shown: set[str] = set()
 
@@ -59,10 +67,14 @@ class EventLog(Listener):
         self.note()
 
     def note(self) -> None:
-        """Write what has been added since the last call."""
+        """Write what has been added since the last call; all of it where the run is another one."""
+        if not self._folder.metrics.exists():
+            return
+        file = self._folder.metrics.stat().st_ino
+        if self._file not in (None, file):
+            self._begin_anew()
+        self._file = file
         if self._writer is None:
-            if not self._folder.metrics.exists():
-                return
             target = self._folder.path / EVENTS
             shutil.rmtree(target, ignore_errors=True)
             self._writer = self._kind(logdir=str(target))
