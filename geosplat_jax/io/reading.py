@@ -106,7 +106,7 @@ def read_photograph(frame: Frame) -> Photograph:
     is_opaque = is_whole and frame.mask is None
     leaves_file = frame.mask is not None and alpha is not None and not is_whole
     if frame.mask is not None and not leaves_file:
-        alpha = _read_mask(frame.mask, pixels)
+        alpha = _read_mask(frame.mask, pixels, may_be_alpha=True)
     has_mask = alpha is not None
     if alpha is None:
         alpha = np.full(pixels.shape[:2], 255, np.uint8)
@@ -131,17 +131,18 @@ def _value(number: Any) -> float:
     return float(values_of(np.array([number]), is_srgb=False)[0])
 
 
-def _read_mask(path: Path, rgb: np.ndarray) -> Shaped[np.ndarray, "H W"]:
-    """Read a mask file of the image's size, in the numbers of the file.
+def _read_mask(
+    path: Path, rgb: np.ndarray, *, may_be_alpha: bool = False
+) -> Shaped[np.ndarray, "H W"]:
+    """Read channel 0 of a mask file of the image's size, in the numbers of the file.
 
-    The mask is the alpha channel, as in cut-outs, or channel 0 where there is none or where it is
-    one everywhere.
+    ``may_be_alpha`` : take the alpha channel of a cut-out, whose alpha is not one everywhere.
     """
     mask = read_stored(path)
     if mask.dtype == np.float32:
         mask = linear_values(mask, path, is_srgb=False)
     has_alpha = mask.shape[-1] in (2, 4) and _value(mask[..., -1].min()) < 1.0
-    mask = np.ascontiguousarray(mask[..., -1 if has_alpha else 0])
+    mask = np.ascontiguousarray(mask[..., -1 if may_be_alpha and has_alpha else 0])
     if mask.shape[:2] != rgb.shape[:2]:
         raise SceneError(
             f"mask {path} is {mask.shape[1]} x {mask.shape[0]} pixels, but its image is "
