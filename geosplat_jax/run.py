@@ -551,11 +551,9 @@ def train(
             f"the run in {folder} has begun without choosing a model; leave that out, or begin "
             "anew with --force"
         )
-    if goes_on and folder.budget() is not None and config == folder.planned():
-        # The same call again; the settings have changed with the pace since.
-        config, budget = folder.config(), folder.budget()
-    if keeps_model or (goes_on and config is None and folder.budget() is not None):
-        # Its settings were chosen, and those of a budget have changed since.
+    keeps_budget = goes_on and folder.budget() is not None
+    if keeps_model or (keeps_budget and config in (None, folder.planned())):
+        # Its settings were chosen, and those of a budget have changed with the pace since.
         config, reading = folder.config(), folder.record()["dataset"]
         budget = folder.budget() or budget
     if config is None and budget is not None:
