@@ -17,10 +17,11 @@ import tempfile
 import jax
 
 from benchmarks.bench_step import SCENE
+from geosplat_jax.core.allocator import retain_freed_memory
 from geosplat_jax.fit.devices import choose_devices
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import make_config
-from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.runtime import enable_compilation_cache
 from geosplat_jax.fit.train import fit
 from geosplat_jax.io.dataset import load_dataset
 

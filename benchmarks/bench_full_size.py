@@ -16,9 +16,10 @@ from pathlib import Path
 
 import jax
 
+from geosplat_jax.core.allocator import retain_freed_memory
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import make_config
-from geosplat_jax.fit.runtime import enable_compilation_cache, peak_memory_mb, retain_freed_memory
+from geosplat_jax.fit.runtime import enable_compilation_cache, peak_memory_mb
 from geosplat_jax.fit.train import fit
 from geosplat_jax.io.dataset import load_dataset
 

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from geosplat_jax.core.allocator import retain_freed_memory
 from geosplat_jax.core.capacity import Capacities, retry, tightened
 from geosplat_jax.core.rotation import matrix_to_quaternion
-from geosplat_jax.fit.runtime import retain_freed_memory
 from geosplat_jax.splats.projection import project
 from geosplat_jax.splats.rasterize import DEFAULT_TILE_SIZE, find_visible, rasterize
 

@@ -19,9 +19,10 @@ import tempfile
 import tomllib
 from pathlib import Path
 
+from geosplat_jax.core.allocator import retain_freed_memory
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import MONTE_CARLO, QUALITIES, make_config
-from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.runtime import enable_compilation_cache
 from geosplat_jax.fit.train import fit
 from geosplat_jax.io.dataset import load_dataset
 

@@ -19,7 +19,8 @@ import jax
 
 from benchmarks import bench_geometry, bench_hashgrid, bench_rasterize, bench_step, bench_trace
 from benchmarks.calibration import calibrate
-from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.core.allocator import retain_freed_memory
+from geosplat_jax.fit.runtime import enable_compilation_cache
 
 BASELINE = Path(__file__).with_name("baseline.json")
 

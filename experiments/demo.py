@@ -4,13 +4,10 @@ import argparse
 import time
 from pathlib import Path
 
+from geosplat_jax.core.allocator import retain_freed_memory
 from geosplat_jax.fit.begin import Anew
 from geosplat_jax.fit.presets import make_config
-from geosplat_jax.fit.runtime import (
-    enable_compilation_cache,
-    in_background,
-    retain_freed_memory,
-)
+from geosplat_jax.fit.runtime import enable_compilation_cache, in_background
 from geosplat_jax.report.relight import RelightOptions
 from geosplat_jax.run import train
 

@@ -27,10 +27,11 @@ from jobs import Job, homes, is_finished, is_trained, plan
 from report import command_line
 from sweep import Sweep, SweepError, read_sweep
 
+from geosplat_jax.core.allocator import retain_freed_memory
 from geosplat_jax.fit.begin import Anew, Begin, Resume, TakeOver
 from geosplat_jax.fit.config import config_from_dict, differences
 from geosplat_jax.fit.presets import QUALITIES
-from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.runtime import enable_compilation_cache
 from geosplat_jax.fit.train import Interrupted
 from geosplat_jax.io.checkpoints import latest_checkpoint
 from geosplat_jax.io.dataset import load_recorded

@@ -34,11 +34,6 @@ def test_a_cache_chosen_by_the_user_is_respected(monkeypatch, cache_setting):
     assert jax.config.jax_compilation_cache_dir == before
 
 
-def test_retaining_memory_is_for_linux_only(monkeypatch):
-    monkeypatch.setattr(sys, "platform", "darwin")
-    assert runtime.retain_freed_memory() is False
-
-
 def test_programs_are_forgotten_when_they_hold_too_many_maps(monkeypatch):
     double = jax.jit(lambda x: 2 * x)
     double(jax.numpy.ones(3))

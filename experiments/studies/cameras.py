@@ -21,11 +21,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from geosplat_jax.core.allocator import retain_freed_memory
 from geosplat_jax.fit.begin import Anew
 from geosplat_jax.fit.cameras import CameraSettings
 from geosplat_jax.fit.gauge import CameraErrors, Similarity, change_lines, compare_cameras
 from geosplat_jax.fit.presets import make_config
-from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.runtime import enable_compilation_cache
 from geosplat_jax.io.cameras import read_cameras, with_cameras
 from geosplat_jax.io.dataset import Dataset, load_dataset, object_bounds
 from geosplat_jax.io.photographs import Photographs

@@ -31,9 +31,10 @@ import trimesh
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
+from geosplat_jax.core.allocator import retain_freed_memory
 from geosplat_jax.fit.begin import Anew
 from geosplat_jax.fit.presets import make_config
-from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.runtime import enable_compilation_cache
 from geosplat_jax.io.dataset import Dataset, load_dataset
 from geosplat_jax.io.meshes import read_mesh
 from geosplat_jax.io.start_mesh import digest_of, fitted, pixel_length

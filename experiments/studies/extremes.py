@@ -20,13 +20,10 @@ from typing import Any
 import numpy as np
 from skimage.transform import resize
 
+from geosplat_jax.core.allocator import retain_freed_memory
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import make_config
-from geosplat_jax.fit.runtime import (
-    enable_compilation_cache,
-    peak_memory_mb,
-    retain_freed_memory,
-)
+from geosplat_jax.fit.runtime import enable_compilation_cache, peak_memory_mb
 from geosplat_jax.fit.train import TrainingError, fit
 from geosplat_jax.io.dataset import Dataset, load_dataset
 from geosplat_jax.io.views import Views

@@ -38,7 +38,8 @@ import mitsuba as mi  # noqa: E402
 import scene_lights  # noqa: E402
 from variants import choose_variant  # noqa: E402
 
-from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory  # noqa: E402
+from geosplat_jax.core.allocator import retain_freed_memory  # noqa: E402
+from geosplat_jax.fit.runtime import enable_compilation_cache  # noqa: E402
 from geosplat_jax.fit.trained import load_trained  # noqa: E402
 from geosplat_jax.io.dataset import load_dataset  # noqa: E402
 from geosplat_jax.report.renderer import RenderedView, Renderer  # noqa: E402

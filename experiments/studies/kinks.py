@@ -28,12 +28,13 @@ import numpy as np
 
 from geosplat_jax.adapter import SPLATS_PER_FACE, FaceSplats
 from geosplat_jax.core import capacity
+from geosplat_jax.core.allocator import retain_freed_memory
 from geosplat_jax.core.capacity import Capacities, Usage
 from geosplat_jax.core.color import tone_map
 from geosplat_jax.core.numerics import safe_normalize
 from geosplat_jax.core.types import Batch, Grid
 from geosplat_jax.fit.config import Config, Stage
-from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.runtime import enable_compilation_cache
 from geosplat_jax.fit.stages import (
     build_pipeline,
     initial_params,

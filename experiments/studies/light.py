@@ -12,11 +12,12 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
+from geosplat_jax.core.allocator import retain_freed_memory
 from geosplat_jax.fit.begin import TakeOver
 from geosplat_jax.fit.config import Rate
 from geosplat_jax.fit.listener import Listener, Progress
 from geosplat_jax.fit.presets import MONTE_CARLO, SPLIT_SUM
-from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.runtime import enable_compilation_cache
 from geosplat_jax.fit.train import fit
 from geosplat_jax.run import Run
 

@@ -22,7 +22,8 @@ from existing_mesh import train_or_open
 from masks import background
 from scipy.ndimage import distance_transform_edt
 
-from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.core.allocator import retain_freed_memory
+from geosplat_jax.fit.runtime import enable_compilation_cache
 from geosplat_jax.io.dataset import Dataset, load_dataset, object_bounds
 from geosplat_jax.io.images import read_linear
 

@@ -29,12 +29,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from geosplat_jax.core.allocator import retain_freed_memory
 from geosplat_jax.core.types import EnvLight, Materials
 from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.evidence import Rung
 from geosplat_jax.fit.listener import Listener
 from geosplat_jax.fit.presets import make_config
-from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.runtime import enable_compilation_cache
 from geosplat_jax.fit.stages import build_pipeline, initial_params
 from geosplat_jax.geometry import FlexiCubes, initial_geometry
 from geosplat_jax.io.dataset import Dataset

@@ -20,6 +20,7 @@ from precision_plot import GROUPS, Outcome, Stage, cast, errors, save
 
 from geosplat_jax.adapter import FaceSplats, face_splats, shift_inwards
 from geosplat_jax.core import capacity as capacity_module
+from geosplat_jax.core.allocator import retain_freed_memory
 from geosplat_jax.core.capacity import Capacities, Usage
 from geosplat_jax.core.color import tone_map
 from geosplat_jax.core.mesh import vertex_normals
@@ -28,7 +29,7 @@ from geosplat_jax.core.types import Batch, Camera, EnvLight, Materials, Mesh
 from geosplat_jax.fit.config import Config
 from geosplat_jax.fit.planning import plan_capacities
 from geosplat_jax.fit.presets import SPLIT_SUM, make_config
-from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.runtime import enable_compilation_cache
 from geosplat_jax.fit.stages import (
     build_pipeline,
     initial_params,

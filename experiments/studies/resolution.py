@@ -29,7 +29,8 @@ from existing_mesh import chamfer
 from PIL import Image
 from skimage.morphology import disk, opening
 
-from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.core.allocator import retain_freed_memory
+from geosplat_jax.fit.runtime import enable_compilation_cache
 from geosplat_jax.io.meshes import read_mesh
 from geosplat_jax.io.views import Views
 from geosplat_jax.run import Run

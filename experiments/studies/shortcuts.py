@@ -27,13 +27,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from geosplat_jax.core import capacity
+from geosplat_jax.core.allocator import retain_freed_memory
 from geosplat_jax.core.capacity import Capacities, Usage
 from geosplat_jax.core.types import Batch
-from geosplat_jax.fit.runtime import (
-    enable_compilation_cache,
-    release_programs_when_crowded,
-    retain_freed_memory,
-)
+from geosplat_jax.fit.runtime import enable_compilation_cache, release_programs_when_crowded
 from geosplat_jax.fit.stages import make_batch
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params, RenderOutput

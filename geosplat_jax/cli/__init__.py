@@ -1,6 +1,7 @@
 """The ``geosplat-jax`` command."""
 
 from geosplat_jax.cli.stopping import STOPPED, stops_soon
+from geosplat_jax.core.allocator import retain_freed_memory
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -8,6 +9,7 @@ def main(argv: list[str] | None = None) -> int:
 
     Errors that a user can cure print one line and return 2, what somebody stopped 130.
     """
+    retain_freed_memory()
     try:
         with stops_soon(with_process=argv is None) as say_stopped:
             try:

@@ -9,7 +9,7 @@ from geosplat_jax.cli.commands import COMMANDS, GradientError, UsageError
 from geosplat_jax.cli.display import say, show_warning
 from geosplat_jax.core.settings import first_line
 from geosplat_jax.fit.folder import RunError
-from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.runtime import enable_compilation_cache
 from geosplat_jax.fit.train import Interrupted, TrainingError
 from geosplat_jax.io.checkpoints import CheckpointError
 from geosplat_jax.io.images import SceneError
@@ -30,7 +30,6 @@ def call(argv: list[str] | None) -> int:
     """Run the command line and return its status; see `cli.main`."""
     arguments = command_line().parse_args(argv)
     enable_compilation_cache()
-    retain_freed_memory()
     try:
         with warnings.catch_warnings():
             warnings.showwarning = show_warning

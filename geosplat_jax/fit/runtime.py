@@ -1,9 +1,8 @@
-"""How this process uses the machine: the compilation cache and the memory allocator.
+"""How this process uses the machine: compiled programs, threads and memory.
 
 Called by commands and benchmarks, never on import: a library must not change its host process.
 """
 
-import ctypes
 import hashlib
 import importlib.metadata
 import os
@@ -19,26 +18,8 @@ import jax
 
 _Result = TypeVar("_Result")
 
-# Parameters of glibc's mallopt: one arena, never mmap, never give memory back, grow in large steps.
-_RETAINING = {-8: 1, -4: 0, -1: 2**31 - 1, -2: 1 << 28}
 _CROWDED = 0.5
 """Share of the memory maps from which programs are forgotten."""
-
-
-def retain_freed_memory() -> bool:
-    """Make glibc reuse freed memory instead of returning it; False where that is impossible.
-
-    XLA allocates the temporaries of a program anew for every call. glibc maps and unmaps large
-    ones each time, and the page faults cost a fifth of a training step. Call it before the first
-    computation: threads that have an arena of their own by then keep it.
-    """
-    if not sys.platform.startswith("linux"):
-        return False
-    try:
-        libc = ctypes.CDLL("libc.so.6")
-    except OSError:
-        return False
-    return all(libc.mallopt(name, value) for name, value in _RETAINING.items())
 
 
 def release_programs_when_crowded() -> bool:

@@ -26,9 +26,10 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 
+from geosplat_jax.core.allocator import retain_freed_memory
 from geosplat_jax.core.color import tone_map
 from geosplat_jax.core.types import Camera, EnvLight
-from geosplat_jax.fit.runtime import enable_compilation_cache, retain_freed_memory
+from geosplat_jax.fit.runtime import enable_compilation_cache
 from geosplat_jax.io.images import write_png
 from geosplat_jax.report.metrics import psnr
 from geosplat_jax.report.relight import load_light
