@@ -313,6 +313,11 @@ class SplatSettings(Variant, abc.ABC):
         """Whether a stage begins with the splats of the one before, whose surface is then fixed."""
         return False
 
+    @property
+    def is_six_per_face(self) -> bool:
+        """Whether splats come in the order of the faces, `SPLATS_PER_FACE` of each."""
+        return False
+
     def begin(self, previous: Callable[[], tuple[Splats, Attributes]], box: Box) -> Any:
         """Return what the splats have learned at the start of a stage; None for nothing.
 
@@ -343,6 +348,11 @@ class SplatSettings(Variant, abc.ABC):
 class FaceSplatSettings(SplatSettings, kind="face"):
     """Six splats per face."""
 
+    @property
+    def is_six_per_face(self) -> bool:
+        """True."""
+        return True
+
     def build(self, constants: AdapterConstants) -> FaceSplats:
         """Make the model."""
         return FaceSplats(constants)
@@ -351,6 +361,11 @@ class FaceSplatSettings(SplatSettings, kind="face"):
 @settings
 class DiscSplatSettings(SplatSettings, kind="disc"):
     """Six round discs per face, which know its normal and area but not its shape."""
+
+    @property
+    def is_six_per_face(self) -> bool:
+        """True."""
+        return True
 
     def build(self, constants: AdapterConstants) -> DiscSplats:
         """Make the model."""

@@ -63,15 +63,15 @@ class HashGridSpec:
     coarsest: PositiveCount = 16
     """Cells along an axis of the first level."""
     finest: PositiveCount = 512
-    """Cells along an axis of the last level."""
+    """Cells along an axis of the last level; without effect where there is but one."""
 
     def __post_init__(self) -> None:
         """Check the sizes."""
         if self.finest < self.coarsest:
             raise ValueError(f"finest must be at least coarsest: {self}")
-        if not all(self.is_dense) and 2 * self.finest > 2**self.log2_entries:
+        if not self.is_dense[-1] and 2 * self.resolutions[-1] > 2**self.log2_entries:
             raise ValueError(
-                f"a grid line of {self.finest} cells takes more than half of "
+                f"a grid line of {self.resolutions[-1]} cells takes more than half of "
                 f"2**{self.log2_entries} rows; raise log2_entries or lower finest"
             )
 

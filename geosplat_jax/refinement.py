@@ -22,7 +22,7 @@ from geosplat_jax.adapter import (
     SplatModel,
     SplatSettings,
 )
-from geosplat_jax.core.mesh import face_normals_and_areas
+from geosplat_jax.core.mesh import closest_on_faces, face_normals_and_areas
 from geosplat_jax.core.numerics import safe_log, safe_normalize
 from geosplat_jax.core.settings import settings
 from geosplat_jax.core.types import Box, Splats, learned
@@ -34,6 +34,9 @@ _LEAST = 0.01
 
 _FAINTEST = 1e-4
 """First opacities are kept this far from 0 and 1, where the logit ends."""
+
+_OFF_THE_EDGE = 0.01
+"""Rays start so far within the edges of a face, as a share of its size."""
 
 
 class FreeSplatParameters(eqx.Module):
@@ -105,17 +108,17 @@ class FreeSplats(SplatModel):
     def place(self, surface: Surface, parameters: FreeSplatParameters, box: Box) -> Splats:
         """Return the splats as they were learned.
 
-        Attributes are looked up, and rays start, at the projection of a splat's mean on the plane
-        of its face. A splat looks away where its face does.
+        Attributes are looked up, and rays start, at the point of a splat's face that is closest to
+        its mean: beyond an edge of the face they could start behind another one. A splat looks
+        away where its face does.
         """
         mesh = surface.mesh
         count = parameters.means.shape[0]
         parents = jnp.arange(count, dtype=jnp.int32) // SPLATS_PER_FACE
         normals, _ = face_normals_and_areas(mesh)
         outward = normals.at[parents].get(mode="clip")
-        corner = mesh.vertices[mesh.faces.at[parents, 0].get(mode="clip")]
         means = box.center[None, :] + box.half_extent * parameters.means
-        above = jnp.sum((means - corner) * outward, axis=-1, keepdims=True)
+        anchors = closest_on_faces(mesh, parents, means, margin=_OFF_THE_EDGE)
         real = jnp.arange(count, dtype=jnp.int32) < mesh.face_count * SPLATS_PER_FACE
         means = jnp.where(real[:, None], means, 0.0)
         unit_quat = jnp.array([[1.0, 0.0, 0.0, 0.0]], means.dtype)
@@ -126,7 +129,7 @@ class FreeSplats(SplatModel):
             opacities=jnp.where(real, jax.nn.sigmoid(parameters.opacity_logits), 0.0),
             normals=jnp.where(real[:, None], safe_normalize(parameters.normals), 0.0),
             outward=outward,
-            anchors=jnp.where(real[:, None], means - above * outward, 0.0),
+            anchors=jnp.where(real[:, None], anchors, 0.0),
             parents=parents,
             count=mesh.face_count * SPLATS_PER_FACE,
         )
@@ -152,6 +155,11 @@ class FreeSplatSettings(SplatSettings, kind="free"):
     @property
     def takes_over(self) -> bool:
         """A splat belongs to a face by its row."""
+        return True
+
+    @property
+    def is_six_per_face(self) -> bool:
+        """A splat keeps the row that it began in."""
         return True
 
     def begin(

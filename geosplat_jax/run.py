@@ -10,7 +10,7 @@ from concurrent.futures import Future
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -529,53 +529,21 @@ def train(
         If the mesh cannot be used, see `io.start_mesh`; if a model is to be chosen under a budget,
         for stages of another run, or from too few views.
     """
-    if unknown := sorted(set(reading) - set(READING_OPTIONS)):
-        raise TypeError(
-            f"train takes no {', '.join(unknown)}; a scene is read by "
-            f"{', '.join(sorted(READING_OPTIONS))}, and settings belong into the config"
-        )
-    if isinstance(scene, Dataset) and reading:
-        raise TypeError(
-            f"a dataset has been read already; give {', '.join(sorted(reading))} to load_dataset, "
-            "or the scene's folder to train"
-        )
-    if model is not None and (budget is not None or begin.takes_over):
-        raise ValueError("a model is chosen for a whole training without a budget; leave model out")
+    _require_consistent(scene, reading, chooses=model is not None, budget=budget, begin=begin)
     started, folder = time.perf_counter(), RunFolder(output)
     if isinstance(devices, int):
         devices = choose_devices(devices)
     goes_on = begin.goes_on(folder)
-    keeps_model = goes_on and folder.has_chosen_model and (config is None or model is not None)
-    if goes_on and model is not None and not folder.has_chosen_model:
-        raise RunError(
-            f"the run in {folder} has begun without choosing a model; leave that out, or begin "
-            "anew with --force"
-        )
-    keeps_budget = goes_on and folder.budget() is not None
-    if keeps_model or (keeps_budget and config in (None, folder.planned())):
-        # Its settings were chosen, and those of a budget have changed with the pace since.
-        config, reading = folder.config(), folder.record()["dataset"]
-        budget = folder.budget() or budget
-    if config is None and budget is not None:
-        chosen = plan_training(
-            scene,
-            budget,
-            mesh=mesh,
-            downscale=reading.get("downscale"),
-            light=reading.get("light"),
-        )
-        config, reading, mesh = chosen.config, {**reading, "downscale": chosen.downscale}, None
-    config = config or make_config(quality=quality)
-    if mesh is None and goes_on and not isinstance(config.geometry, MeshSettings):
-        mesh = mesh_of_run(folder)
-    if mesh is not None:
-        config = with_mesh(config, mesh)
+    order = _Order(config, mesh, budget, reading)
+    if goes_on:
+        order = _as_it_began(order, folder, chooses=model is not None)
+    config, budget, reading = _settled(order, scene, quality=quality)
     dataset = scene if isinstance(scene, Dataset) else load_recorded(scene, reading)
     evidence = None
     if model is not None and not goes_on:
         how = ModelChoice() if model == "auto" else model
-        chosen_model = _chosen_model(dataset, config, folder, how, begin, listener)
-        config, evidence = chosen_model.config, chosen_model.record()
+        chosen = _chosen_model(dataset, config, folder, how, begin, listener)
+        config, evidence = chosen.config, chosen.record()
         started = time.perf_counter()  # the cost of choosing is stated apart
     earlier = (folder.training() or {}).get("seconds_total", 0.0) if goes_on else 0.0
     used = folder.seconds_used() if goes_on else 0.0
@@ -604,6 +572,79 @@ def train(
     run = Run(folder.path)
     run.dataset = dataset
     return run
+
+
+class _Order(NamedTuple):
+    """What a caller of `train` wants, as far as it was said."""
+
+    config: Config | None
+    mesh: str | Path | MeshSettings | None
+    budget: Budget | None
+    reading: dict[str, Any]
+
+
+def _require_consistent(
+    scene: str | Path | Dataset,
+    reading: dict[str, Any],
+    *,
+    chooses: bool,
+    budget: Budget | None,
+    begin: Begin,
+) -> None:
+    """Raise TypeError or ValueError, see `train`, if its arguments do not go together."""
+    if unknown := sorted(set(reading) - set(READING_OPTIONS)):
+        raise TypeError(
+            f"train takes no {', '.join(unknown)}; a scene is read by "
+            f"{', '.join(sorted(READING_OPTIONS))}, and settings belong into the config"
+        )
+    if isinstance(scene, Dataset) and reading:
+        raise TypeError(
+            f"a dataset has been read already; give {', '.join(sorted(reading))} to load_dataset, "
+            "or the scene's folder to train"
+        )
+    if chooses and (budget is not None or begin.takes_over):
+        raise ValueError("a model is chosen for a whole training without a budget; leave model out")
+
+
+def _as_it_began(order: _Order, folder: RunFolder, *, chooses: bool) -> _Order:
+    """Complete an order to go on with a run by what that run knows itself.
+
+    A run whose settings were chosen, for its model or for a budget, keeps them, unless the order
+    has others. Those of a budget have changed with the pace since.
+    """
+    if chooses and not folder.has_chosen_model:
+        raise RunError(
+            f"the run in {folder} has begun without choosing a model; leave that out, or begin "
+            "anew with --force"
+        )
+    config, mesh, budget, reading = order
+    keeps_model = folder.has_chosen_model and (config is None or chooses)
+    has_budget = folder.budget() is not None
+    if keeps_model or (has_budget and config in (None, folder.planned())):
+        config, reading = folder.config(), folder.record()["dataset"]
+        budget = folder.budget() or budget
+    has_own_mesh = config is not None and isinstance(config.geometry, MeshSettings)
+    if mesh is None and not has_own_mesh:
+        mesh = mesh_of_run(folder)
+    return _Order(config, mesh, budget, reading)
+
+
+def _settled(
+    order: _Order, scene: str | Path | Dataset, *, quality: str
+) -> tuple[Config, Budget | None, dict[str, Any]]:
+    """Return settings, budget and how to read the scene: as ordered, chosen, or by default."""
+    config, mesh, budget, reading = order
+    if config is None and budget is not None:
+        chosen = plan_training(
+            scene,
+            budget,
+            mesh=mesh,
+            downscale=reading.get("downscale"),
+            light=reading.get("light"),
+        )
+        return chosen.config, budget, {**reading, "downscale": chosen.downscale}
+    config = config or make_config(quality=quality)
+    return (config if mesh is None else with_mesh(config, mesh)), budget, reading
 
 
 def _chosen_model(

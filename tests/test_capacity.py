@@ -154,6 +154,13 @@ def test_a_buffer_that_nobody_sized_has_a_common_size_and_grows_from_it():
     assert grown["quads"] == 7
 
 
+def test_only_sized_buffers_are_contained():
+    sizes = Capacities(quads=7)
+    assert "quads" in sizes
+    assert "hits" not in sizes
+    assert sizes["hits"] == UNSIZED
+
+
 def test_capacities_are_values_whatever_the_order_of_their_names():
     one, two = Capacities(hits=1, quads=2), Capacities(quads=2, hits=1)
     assert one == two

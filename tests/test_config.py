@@ -429,9 +429,33 @@ def test_differences_name_the_setting_and_both_values():
             (
                 "stages.monte_carlo.transport.indirect=radiometric",
                 "stages.refine.transport.indirect=radiometric",
+                "stages.monte_carlo.weights.radiometric=1",
             ),
-            [],
+            ["stages.refine.transport.indirect=radiometric is never compared"],
         ),
+        (
+            (
+                "stages.monte_carlo.transport.indirect=traced",
+                "stages.monte_carlo.weights.indirect=0",
+                "stages.monte_carlo.vertex_fraction=0.5",
+                "stages.refine.steps=0",
+            ),
+            ["surfaces which indirect=traced finds are black"],
+        ),
+        (
+            (
+                "stages.monte_carlo.transport.kind=paths",
+                "stages.monte_carlo.weights.indirect=0",
+                "stages.monte_carlo.splats.kind=vertex",
+                "stages.refine.steps=0",
+            ),
+            ["surfaces which kind=paths finds are black"],
+        ),
+        (
+            ('stages.split_sum.domain={kind="per_pixel",points="mesh"}',),
+            ["stages.split_sum.domain.points has no effect"],
+        ),
+        (("stages.monte_carlo.transport.reservoirs.visibility=traced",), ["without candidates"]),
         (
             ("stages.refine.transport.kind=paths", "stages.refine.weights.indirect=0"),
             ["refine.transport.kind=paths takes the place of stages.monte_carlo"],

@@ -197,6 +197,28 @@ def test_a_rotated_light_shines_from_the_rotated_direction():
     np.testing.assert_allclose(after, before, atol=0.02)  # constant caps of half a texel
 
 
+def test_a_sun_keeps_its_flux_whatever_the_light_is_turned_by():
+    """Texels are narrow beside the poles, and single directions would meet a sun by chance."""
+    height, width = 64, 128
+    solid_angles = np.asarray(environment.texel_solid_angles(height, width))
+    rng, changes = np.random.default_rng(9), {1: [], 4: []}
+    for _ in range(6):
+        sun = np.zeros((height, width, 3), np.float32)
+        sun[6, rng.integers(width)] = 100.0  # 72 degrees high
+        rotation = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        rotation *= np.sign(np.linalg.det(rotation))
+        for subsamples, found in changes.items():
+            turned = environment.rotate_light(
+                EnvLight(jnp.asarray(sun)),
+                jnp.asarray(rotation, jnp.float32),
+                subsamples=subsamples,
+            )
+            flux = np.sum(np.asarray(turned.radiance) * solid_angles[..., None])
+            found.append(abs(flux / np.sum(sun * solid_angles[..., None]) - 1))
+    assert max(changes[4]) < 0.03
+    assert max(changes[1]) > 0.1
+
+
 def test_downsampling_preserves_flux():
     light = EnvLight(jnp.asarray(_texels(16, 32), jnp.float32))
     coarse = downsample_light(light, factor=4)

@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from support import double_precision, shared_path
+from support import double_precision, shared_path, sphere_dataset
 
 from geosplat_jax.core.capacity import Capacities, fits, grow
 from geosplat_jax.core.numerics import safe_norm
 from geosplat_jax.core.types import Geometry, Grid, Mesh
+from geosplat_jax.fit.surfaces import FlexiCubesSettings
 from geosplat_jax.geometry import (
     FlexiCubes,
     deformed_vertices,
@@ -295,6 +296,23 @@ def test_surface_is_open_at_the_border_of_the_grid():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("initial", ["sphere", "random"])
+def test_a_first_surface_is_closed_in_any_box(initial):
+    dataset = replace(
+        sphere_dataset(count=1, size=8), bounds=(np.full(3, -1.0), np.array([1.0, -0.4, -0.3]))
+    )
+    settings = FlexiCubesSettings(resolution=14, initial=initial)
+    surface, shape = settings.start(dataset, jax.random.key(0))
+    assert max(surface.grid.shape) > 1.5 * min(surface.grid.shape)
+    mesh = extract_by_model(
+        surface, shape, capacities=surface.first_capacities(shape), final=True
+    ).mesh
+    faces = np.asarray(mesh.faces)[: int(mesh.face_count)]
+    assert len(faces) > 100
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    assert np.all(np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0)
+
+
 def test_area_and_volume_of_a_sphere_converge_at_second_order():
     radius, errors = 0.6, []
     for resolution in (8, 16, 32):

@@ -215,6 +215,16 @@ def test_the_table_shows_failures_worst_entries_and_zeros():
     assert "FAILS" in summary({"shown": rows})
 
 
+def test_the_summary_hides_no_number_that_is_none():
+    def function(inputs, constants):
+        return {"y": inputs["x"] ** 2, "z": inputs["x"] ** 3}
+
+    with double_precision():
+        good, bad = compare(Problem("shown", function, {"x": np.array([1.0, 2.0])}))
+    bad = replace(bad, relative=np.nan, one_minus_cosine=np.nan, random_direction=np.nan)
+    assert summary({"shown": [good, bad]}).splitlines()[1].count("nan") == 3
+
+
 def test_an_unknown_stage_is_refused():
     with pytest.raises(ValueError, match="unknown stage 'teapot'; expected some of isosurface"):
         check_stage("teapot")

@@ -102,6 +102,12 @@ def test_impossible_sizes_are_refused(sizes):
         HashGridSpec(**sizes)
 
 
+def test_a_single_level_is_checked_by_its_own_cells():
+    assert HashGridSpec(levels=1, log2_entries=12, coarsest=16, finest=4096).resolutions == (16,)
+    with pytest.raises(ValueError, match="a grid line of 4096 cells"):
+        HashGridSpec(levels=2, log2_entries=12, coarsest=16, finest=4096)
+
+
 def test_a_constant_table_gives_a_constant_output():
     table = jnp.full((SMALL.total_entries, 2), 0.7)
     points = jnp.concatenate([_points(), _points(seed=2) * 4 - 2])

@@ -157,6 +157,17 @@ def test_faces_send_what_they_learned_towards_where_the_ray_comes_from():
     assert np.max(np.abs(np.asarray(forwards) - expected)[hits >= 0]) > 0.01
 
 
+def test_faces_without_points_have_learned_nothing_and_are_black():
+    faces = np.array([0, 0, 2, 2, 2, 2])
+    values = jnp.asarray(np.random.default_rng(8).normal(size=(6, 27)), jnp.float32)
+    model = RadiometricIndirect.of(points_on(faces), values, 3)
+    np.testing.assert_allclose(model.values[2], values[2:].mean(axis=0), atol=ROUNDING)
+    directions = jnp.asarray(unit(4, 3), jnp.float32)
+    radiance, _ = model.incoming(directions, jnp.asarray([0, 1, 2, -1]))
+    assert np.all(np.asarray(radiance)[[0, 2]] > 0)
+    np.testing.assert_array_equal(np.asarray(radiance)[[1, 3]], 0.0)
+
+
 @pytest.mark.parametrize("model", [ConstantIndirect, HarmonicIndirect])
 def test_learned_light_starts_small_and_stays_between_zero_and_one(model):
     for lobe in arriving(model, np.zeros((RAYS, model.outputs))):

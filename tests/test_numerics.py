@@ -41,6 +41,15 @@ def test_norm_and_its_gradient_are_exact_over_40_decades():
     np.testing.assert_allclose(gradient, unit, atol=RELATIVE)
 
 
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_norm_holds_to_the_largest_numbers(dtype):
+    with double_precision():
+        largest = float(jnp.finfo(dtype).max)
+        x = jnp.asarray([[0.9, 0.1, 0.0], [0.3, 0.0, 0.0], [0.26, 0.2, 0.1]], dtype) * largest
+        expected = np.linalg.norm(np.asarray(x, np.longdouble), axis=1)
+        np.testing.assert_allclose(jax.jit(safe_norm)(x), expected, rtol=RELATIVE)
+
+
 def test_normalize_and_its_gradient_are_exact_over_40_decades():
     unit, x = _vectors_over_decades(1)
     x32, cotangent = jnp.asarray(x, jnp.float32), np.array([0.3, -1.0, 0.7])
@@ -132,6 +141,7 @@ def test_logarithm_is_exact_above_its_floor_and_flat_below():
     np.testing.assert_allclose(safe_log(x), expected, rtol=RELATIVE)
     gradient = jax.grad(lambda v: jnp.sum(safe_log(v)))(x)
     np.testing.assert_allclose(gradient, [0, 0, 1e10, 1.0, 1e-30], rtol=RELATIVE)
+    assert np.isnan(safe_log(jnp.asarray(jnp.nan)))
 
 
 def test_clamp_away_from_zero_keeps_the_sign_and_large_values():

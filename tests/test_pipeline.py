@@ -173,6 +173,21 @@ def test_the_report_of_several_views_is_their_mean_with_the_larger_needs():
     assert {name: int(count) for name, count in mean.usage.items()} == {"hits": 7, "chunks": 9}
 
 
+def test_what_is_in_pixels_that_do_not_count_does_not_matter(second):
+    _, pipeline, params, batch = second
+    valid = jnp.ones(batch.image.shape[:3]).at[:, :5].set(0.0)
+    found = []
+    for spoilt in (0.0, jnp.nan, jnp.inf):
+        image = jnp.where(valid[..., None] > 0, batch.image, spoilt)
+        changed = replace(batch, image=image, valid=valid)
+        (total, report), gradient = evaluate(pipeline, params, changed)
+        found.append(jax.tree.leaves((total, report.psnr, gradient)))
+    for leaves in zip(*found, strict=True):
+        assert np.all(np.isfinite(leaves[0]))
+        np.testing.assert_array_equal(leaves[0], leaves[1])
+        np.testing.assert_array_equal(leaves[0], leaves[2])
+
+
 def test_the_near_plane_is_measured_in_the_box():
     """A scene is the same in any unit, also right before the camera."""
     pipeline, _ = ball(tiny_config("geometry.resolution=6"))

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from support import TWO_STAGES, ball, sphere_dataset, tiny_config
 
 from geosplat_jax.core.types import Box
@@ -91,6 +92,28 @@ def test_a_splat_that_moves_along_its_face_takes_its_anchor_with_it(start):
     np.testing.assert_allclose(change[real], shift[real], atol=1e-6)
 
 
+def test_a_splat_that_leaves_its_face_is_shaded_on_it(start):
+    """Beyond an edge the plane of a face may lie behind another face."""
+    _, refining, params = start
+    rng = np.random.default_rng(3)
+    moves = jnp.asarray(rng.normal(scale=0.05, size=params.splats.means.shape), jnp.float32)
+    moved = replace(params.splats, means=params.splats.means + moves)
+    asset = build(refining, replace(params, splats=moved))
+    real = np.asarray(asset.splats.mask)
+    faces = np.asarray(asset.mesh.faces)[np.asarray(asset.splats.parents)[real]]
+    corners = np.asarray(asset.mesh.vertices, float)[faces]
+    means, anchors = (
+        np.asarray(x, float)[real] for x in (asset.splats.means, asset.splats.anchors)
+    )
+    closest = trimesh.triangles.closest_point(corners, means)
+    size = np.max(np.linalg.norm(corners - corners.mean(axis=1, keepdims=True), axis=2), axis=1)
+    assert np.all(np.linalg.norm(anchors - closest, axis=1) < 0.03 * size + 1e-6)
+    has_area = size > 1e-3
+    shares = trimesh.triangles.points_to_barycentric(corners[has_area], anchors[has_area])
+    assert np.min(shares) > 1e-3
+    assert np.mean(np.min(shares, axis=1) < 0.01) > 0.3  # many had left their face
+
+
 def test_padding_is_inert(start):
     _, refining, params = start
     wild = jax.tree.map(lambda x: jnp.full_like(x, 7.0), params.splats)
@@ -128,6 +151,13 @@ def test_splats_of_vertices_cannot_be_freed(start):
     odd = jax.tree.map(lambda x: x[:7] if x.ndim else x, before.splats)
     with pytest.raises(ValueError, match="six splats of every face"):
         FreeSplatSettings().begin(lambda: (odd, before.attributes), refining.surface.box)
+
+
+def test_splats_of_vertices_in_the_stage_before_are_refused_at_once():
+    with pytest.raises(ValueError, match=r"stages\.monte_carlo\.splats: free splats"):
+        make_config(overrides=('stages.monte_carlo.splats={kind="vertex"}',))
+    make_config(overrides=('stages.split_sum.splats={kind="vertex"}',))
+    make_config(overrides=('stages.monte_carlo.splats={kind="disc"}',))
 
 
 def test_a_surface_that_moves_is_refused():

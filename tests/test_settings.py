@@ -1,9 +1,11 @@
 """Settings know their ranges, survive JSON, and take new kinds without a change elsewhere."""
 
 import json
+import re
 from typing import Annotated
 
 import pytest
+from pydantic import Field
 
 from geosplat_jax.core.settings import (
     ANY_KIND,
@@ -51,6 +53,29 @@ class Room:
     """The lamp."""
     doors: Count = 1
     """Number of doors."""
+
+
+@settings
+class Shelf:
+    """What holds a number of things."""
+
+    size: tuple[NonNegative, NonNegative] = (3.0, 4.0)
+    """Sides in metres."""
+    tags: Annotated[tuple[str, ...], Field(min_length=1)] = ("plain",)
+    """What it is called."""
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"size": [1.0]}, "size.1 is missing"),
+        ({"size": [1.0, 2.0, 3.0]}, "size must have at most 2 items"),
+        ({"tags": []}, "tags must have at least 1 items"),
+    ],
+)
+def test_lists_of_the_wrong_length_are_refused(values, message):
+    with pytest.raises(ValueError, match=rf"^{re.escape(message)}$"):
+        from_plain(Shelf, values)
 
 
 @pytest.mark.parametrize("room", [Room(), Room(Bulb(3.0), 0), Room(Strip((0.5,)), 2)])

@@ -100,6 +100,25 @@ def test_a_fresh_albedo_is_grey_where_asked_and_where_there_is_no_surface(overri
     np.testing.assert_allclose(_albedo(begun, np.zeros((4, 3)), pipeline), 0.5, rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("after", "is_kept"), [("harmonics", True), ("radiometric", False), ("constant", False)]
+)
+def test_a_head_of_indirect_light_is_kept_where_it_means_the_same(after, is_kept):
+    """Harmonics and radiometric light have equally many numbers, of what arrives and is sent."""
+    config = tiny_config(
+        "geometry.resolution=6",
+        "stages.monte_carlo.steps=1",
+        "stages.monte_carlo.transport.indirect=harmonics",
+        "stages.refine.steps=1",
+        f"stages.refine.transport.indirect={after}",
+    )
+    pipeline, params = ball(config, stage="monte_carlo")
+    begun = begin_stage(params, pipeline, config, config.stage("refine"))
+    before, found = (x.material.indirect_head[-1].weights for x in (params, begun))
+    assert found.shape[1] == (6 if after == "constant" else 27)
+    assert np.array_equal(before, found) is is_kept
+
+
 def test_traced_indirect_light_learns_nothing():
     traced = "stages.monte_carlo.transport.indirect=traced"
     _, params = ball(

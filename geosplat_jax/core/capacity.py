@@ -47,6 +47,9 @@ class Capacities(Mapping[str, int]):
         """Size of a buffer; `UNSIZED` where nobody has sized it."""
         return dict(self._sizes).get(name, UNSIZED)
 
+    def __contains__(self, name: object) -> bool:
+        return any(name == sized for sized, _ in self._sizes)
+
     def __iter__(self) -> Iterator[str]:
         return (name for name, _ in self._sizes)
 

@@ -1,9 +1,9 @@
-"""Normals and areas of padded triangle meshes."""
+"""Normals, areas and closest points of padded triangle meshes."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from geosplat_jax.core.numerics import safe_norm, safe_normalize
+from geosplat_jax.core.numerics import safe_divide, safe_norm, safe_normalize
 from geosplat_jax.core.types import Mesh
 
 
@@ -31,6 +31,34 @@ def face_normals_and_areas(
     """
     vectors = _doubled_area_vectors(mesh)
     return safe_normalize(vectors, axis=0).T, 0.5 * safe_norm(vectors, axis=0)
+
+
+def closest_on_faces(
+    mesh: Mesh, faces: Int[Array, " N"], points: Float[Array, "N 3"], *, margin: float
+) -> Float[Array, "N 3"]:
+    """Find the point of a face that is closest to each of N points.
+
+    Differentiable in the points and in the mesh; the choice of an edge is a constant.
+
+    Parameters
+    ----------
+    mesh, faces, points : row by row; faces beyond the last are the last one.
+    margin : the face is taken to be smaller by this share, about its centre, so that what is found
+        lies off its edges.
+    """
+    corners = mesh.vertices.at[mesh.faces.at[faces].get(mode="clip")].get(mode="clip")
+    corners = corners - margin * (corners - jnp.mean(corners, axis=1, keepdims=True))
+    edges = jnp.roll(corners, -1, axis=1) - corners
+    normals = safe_normalize(jnp.cross(edges[:, 0], edges[:, 1]))
+    away = points[:, None, :] - corners
+    above = jnp.sum(away[:, 0] * normals, axis=-1, keepdims=True)
+    projected = points - above * normals
+    is_within = jnp.sum(jnp.cross(edges, away) * normals[:, None, :], axis=-1) >= 0.0
+    part = safe_divide(jnp.sum(away * edges, axis=-1), jnp.sum(edges * edges, axis=-1))
+    on_edges = corners + jnp.clip(part, 0.0, 1.0)[..., None] * edges
+    distance = jnp.sum((points[:, None, :] - on_edges) ** 2, axis=-1)
+    nearest = jnp.take_along_axis(on_edges, jnp.argmin(distance, axis=1)[:, None, None], axis=1)
+    return jnp.where(jnp.all(is_within, axis=1)[:, None], projected, nearest[:, 0])
 
 
 def vertex_normals(mesh: Mesh) -> Float[Array, "Cv 3"]:

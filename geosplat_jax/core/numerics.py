@@ -12,6 +12,9 @@ from jaxtyping import Array, Float
 LENGTH_EPSILON = 1e-20
 """Vectors shorter than this have no direction; also the smallest divisor of `safe_divide`."""
 
+_LARGEST_SCALE = 0.75
+"""Lengths are computed relative to at most this power of the largest number of the dtype."""
+
 COSINE_EPSILON = 1e-4
 """Smallest cosine used as a divisor in shading."""
 
@@ -82,9 +85,11 @@ def safe_power(x: Float[Array, "..."], exponent: float) -> Float[Array, "..."]:
 
 
 def safe_log(x: Float[Array, "..."], *, smallest: float = LENGTH_EPSILON) -> Float[Array, "..."]:
-    """Logarithm of ``max(x, smallest)``; the gradient is zero where the floor is active."""
-    above = x > smallest
-    return jnp.log(jnp.where(above, x, smallest))
+    """Logarithm of ``max(x, smallest)``; the gradient is zero where the floor is active.
+
+    What is not a number stays so.
+    """
+    return jnp.log(jnp.where(x <= smallest, smallest, x))
 
 
 def safe_norm(
@@ -97,6 +102,8 @@ def safe_norm(
     """
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True))
     has_length = largest > 0
+    # XLA may multiply by the inverse, which is zero for the largest numbers.
+    largest = jnp.minimum(largest, float(jnp.finfo(x.dtype).max) ** _LARGEST_SCALE)
     scale = jnp.where(has_length, largest, 1.0)
     squared = jnp.sum((x / scale) ** 2, axis=axis, keepdims=True)
     length = scale * safe_sqrt(squared)
@@ -106,7 +113,10 @@ def safe_norm(
 def safe_normalize(
     x: Float[Array, "..."], *, axis: int = -1, smallest: float = LENGTH_EPSILON
 ) -> Float[Array, "..."]:
-    """Scale to unit length along ``axis``; zero with zero gradient below length ``smallest``."""
+    """Scale to unit length along ``axis``; zero with zero gradient below length ``smallest``.
+
+    Zero also above a quarter of the largest number of the dtype, whose inverse is none.
+    """
     length = safe_norm(x, axis=axis, keepdims=True)
     return safe_divide(x, length, smallest=smallest)
 

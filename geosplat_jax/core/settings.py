@@ -212,9 +212,16 @@ def _lines(detail: Any, where: str, names: Sequence[str]) -> list[str]:
     message = detail["msg"].removeprefix("Value error, ")
     if detail["type"] == "value_error":
         return [f"{path}: {message}" if path else message]
+    if detail["type"] == "missing":
+        return [f"{path} is missing"]
+    if detail["type"] in ("too_long", "too_short"):
+        bound, length = _BOUNDS_OF_LENGTH[detail["type"]]
+        return [f"{path} must have {bound} {detail['ctx'][length]} items"]
     message = message.removeprefix("Input should be ")
     return [f"{path} must be {message}, got {_short(detail.get('input'))}"]
 
+
+_BOUNDS_OF_LENGTH = {"too_long": ("at most", "max_length"), "too_short": ("at least", "min_length")}
 
 _LONGEST_VALUE = 200
 """Characters of a value that a message shows."""

@@ -144,7 +144,10 @@ class Batch(eqx.Module):
         return self.camera.count
 
     def view(self, number: Int[Array, ""] | int) -> "Batch":
-        """Return the batch of a single view, with randomness of its own and no carry."""
+        """Return the batch of a single view, with randomness of its own and no carry.
+
+        Pixels that do not count are black and empty there, whatever they were.
+        """
 
         def one(values: Array) -> Array:
             return jax.lax.dynamic_slice_in_dim(values, number, 1)
@@ -154,12 +157,17 @@ class Batch(eqx.Module):
             world_to_camera=one(self.camera.world_to_camera),
             intrinsics=one(self.camera.intrinsics),
         )
+        image = one(self.image)
+        valid = None if self.valid is None else one(self.valid)
+        if valid is not None:
+            # Weights of zero would keep what is not finite.
+            image = jnp.where(valid[..., None] > 0, image, 0.0)
         return Batch(
             camera=camera,
-            image=one(self.image),
+            image=image,
             key=jax.random.fold_in(self.key, number),
             views=None if self.views is None else one(self.views),
-            valid=None if self.valid is None else one(self.valid),
+            valid=valid,
         )
 
 

@@ -57,7 +57,8 @@ class Rate:
     warmup: Count = 0
     """Steps over which the rate rises from zero, quadratically."""
     half_life: PositiveOrNone = None
-    """Steps after which the rate has halved; none takes the stage's."""
+    """Steps after which the rate has halved; none takes the stage's. Without effect where the stage
+    decays linearly."""
 
 
 @settings
@@ -86,7 +87,7 @@ class Stage:
     half_life: Positive = 800.0
     """Steps after which rates have halved."""
     decay: Literal["exponential", "linear"] = "exponential"
-    """How rates fall: by half-lives, or along a line that is zero at the stage's end."""
+    """How rates fall: by half-lives, or all along a line that is zero at the stage's end."""
     vertex_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Share of the stage's steps that sample vertices instead of faces (Eq. 12). It spares memory
     while a random first surface is rough; a visual hull needs none of it."""
@@ -242,9 +243,15 @@ class Config:
         """Refuse splats that belong to the faces of a surface which moves, or was not there."""
         if not stage.splats.takes_over or not stage.steps:
             return
-        if number == 0:
+        before = [earlier for earlier in self.stages[:number] if earlier.steps]
+        if not before:
             raise ValueError(
                 f"stages.{stage.name}.splats: {stage.splats.kind} splats need a stage before"
+            )
+        if not before[-1].splats.is_six_per_face:
+            raise ValueError(
+                f"stages.{before[-1].name}.splats: {stage.splats.kind} splats, which "
+                f"stages.{stage.name} has, start from the six splats of every face; set it to face"
             )
         if stage.vertex_fraction:
             raise ValueError(
@@ -550,6 +557,23 @@ def config_warnings(config: Config) -> list[str]:
             warnings.append(
                 f"stages.{stage.name}.weights.radiometric has no effect: set "
                 f"stages.{stage.name}.transport.indirect=radiometric"
+            )
+        if schedule.is_zero and stage.transport.is_radiometric:
+            warnings.append(
+                f"stages.{stage.name}.transport.indirect=radiometric is never compared with what "
+                "is sent out, and surfaces may glow; set "
+                f"stages.{stage.name}.weights.radiometric=1"
+            )
+        has_other_points = not stage.splats.is_six_per_face or stage.vertex_fraction > 0
+        if stage.transport.reads_faces and has_other_points:
+            warnings.append(
+                f"stages.{stage.name}: splats of vertices belong to no face, so that surfaces "
+                f"which {stage.transport.blocked_light} finds are black; use splats of faces"
+            )
+        if stage.domain.uses_rays and stage.transport.blocked_light is None:
+            warnings.append(
+                f"stages.{stage.name}.domain.points has no effect: the stage traces no rays from "
+                "points"
             )
         if stage.transport.chooses_samples and not stage.domain.shades_splats:
             warnings.append(

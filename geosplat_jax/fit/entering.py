@@ -2,7 +2,7 @@
 
 import abc
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -50,6 +50,18 @@ class Start(eqx.Module):
             light=replace(params.light, radiance=radiance),
             log_exposure=self.params.log_exposure,
         )
+
+
+class IndirectHead(NamedTuple):
+    """What a stage learns of indirect light.
+
+    Attributes
+    ----------
+    outputs : numbers per point. goes_on : whether they mean what they meant in the stage before.
+    """
+
+    outputs: int
+    goes_on: bool
 
 
 @settings
@@ -117,7 +129,7 @@ def enter_stage(
     pipeline: Pipeline,
     entries: tuple[Entry, ...],
     splats: SplatSettings,
-    indirect_outputs: int,
+    indirect: IndirectHead,
     key: Key[Array, ""],
 ) -> Params:
     """Turn the parameters that a stage ends with into those that the next one starts with.
@@ -130,13 +142,13 @@ def enter_stage(
     params, pipeline : of the stage before; where splats learn, its buffers hold the surface.
     entries : of the stage to come, in order.
     splats : of the stage to come.
-    indirect_outputs : numbers of indirect light that it learns per point.
+    indirect : what the stage to come learns of indirect light.
     key : of what is drawn.
     """
     first, indirect_key = jax.random.split(key)
     head = params.material.indirect_head
-    if head is None or head[-1].weights.shape[-1] != indirect_outputs:
-        head = init_indirect_head(indirect_key, pipeline.fields, indirect_outputs)
+    if head is None or not indirect.goes_on:
+        head = init_indirect_head(indirect_key, pipeline.fields, indirect.outputs)
     params = replace(params, material=replace(params.material, indirect_head=head))
     for number, entry in enumerate(entries):
         params = entry.apply(params, pipeline, jax.random.fold_in(first, number))

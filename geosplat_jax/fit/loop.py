@@ -1,5 +1,6 @@
 """The state of a training between two steps: where it starts, what a step does, what is kept."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -426,6 +427,18 @@ def _sizes(shape: Any) -> list[tuple[int, ...]]:
     return [leaf.shape for leaf in jax.tree.leaves(shape)]
 
 
+def _warn_of_blended_points(config: Config) -> None:
+    """Warn where rays start between splats, which on an open mesh may be behind a face."""
+    for stage in config.active_stages:
+        if not stage.domain.shades_splats and not stage.domain.uses_rays:
+            warnings.warn(
+                f"stages.{stage.name}.domain: rays start at blended positions of splats, which "
+                "beside an edge of an open mesh may lie behind a face and then see nothing; set "
+                f"stages.{stage.name}.domain.points=mesh",
+                stacklevel=3,
+            )
+
+
 def new_loop(
     dataset: Dataset,
     config: Config,
@@ -458,6 +471,8 @@ def new_loop(
             "raster.cull_backfaces=false shows the fronts and the backs of an open mesh at the "
             "same place; leave it true, or set geometry.sides=one"
         )
+    if surface.is_two_sided:
+        _warn_of_blended_points(config)
     stage = config.active_stages[0]
     params = initial_params(shape, config, field_key)
     if start is not None:

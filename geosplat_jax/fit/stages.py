@@ -11,7 +11,7 @@ from jaxtyping import Array, Key
 from geosplat_jax.adapter import VertexSplatSettings
 from geosplat_jax.core.types import Batch, rate_groups
 from geosplat_jax.fit.config import Config, Stage
-from geosplat_jax.fit.entering import enter_stage
+from geosplat_jax.fit.entering import IndirectHead, enter_stage
 from geosplat_jax.fit.step import UpdateRule
 from geosplat_jax.io.views import Views
 from geosplat_jax.losses import PIXEL_MEANS
@@ -115,8 +115,10 @@ def begin_stage(params: Params, pipeline: Pipeline, config: Config, stage: Stage
     """
     number = config.active_stages.index(stage)
     key = jax.random.fold_in(jax.random.key(config.run.seed), _STAGE_STREAM - number)
-    outputs = stage.transport.indirect_outputs
-    return enter_stage(params, pipeline, stage.enter, stage.splats, outputs, key)
+    before, after = config.active_stages[number - 1].transport, stage.transport
+    goes_on = before.blocked_light == after.blocked_light
+    indirect = IndirectHead(after.indirect_outputs, goes_on)
+    return enter_stage(params, pipeline, stage.enter, stage.splats, indirect, key)
 
 
 def template_params(config: Config, surface: SurfaceModel, shape: Any, stage: Stage) -> Params:

@@ -23,7 +23,7 @@ from geosplat_jax.geometry import (
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.surface.band import REACH, Band
 from geosplat_jax.surface.base import SurfaceModel
-from geosplat_jax.surface.grids import neutral_geometry
+from geosplat_jax.surface.grids import closed_at_border, neutral_geometry
 from geosplat_jax.surface.hollows import carve_hollows
 from geosplat_jax.surface.hull import fit_grid, hull_sdf
 
@@ -224,9 +224,10 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
     def _sdf(self, grid: Grid, dataset: Dataset, key: Key[Array, ""]) -> Float[Array, " G"]:
         """First signed values on the grid."""
         if self.initial == "random":
-            return random_sdf(key, grid)
+            return closed_at_border(random_sdf(key, grid), grid)
         if self.initial == "sphere":
-            return sphere_sdf(grid, radius=0.35 * float(grid.cell_size) * max(grid.shape))
+            radius = 0.35 * float(grid.cell_size) * max(grid.shape)
+            return closed_at_border(sphere_sdf(grid, radius=radius), grid)
         views = dataset.train
         cameras = views.world_to_camera, np.asarray(views.intrinsics, np.float64)
         sdf = hull_sdf(*cameras, views.alphas, grid, valid=views.valid)

@@ -148,12 +148,13 @@ def summary(checked: dict[str, list[Comparison]]) -> str:
     """One line a stage: the worst of everything."""
     lines = [f"{'stage':<12} {'pairs':>6} {'rel. L2':>8} {'1 - cos':>8} {'directions':>10} float32"]
     for stage, rows in checked.items():
-        directions = max(max(row.along_gradient, row.random_direction) for row in rows)
+        # NumPy's maximum of what holds a NaN is NaN, Python's need not be.
+        directions = np.max([(row.along_gradient, row.random_direction) for row in rows])
         verdict = "" if all(map(passes, rows)) else "  FAILS"
         lines.append(
-            f"{stage:<12} {len(rows):>6} {max(r.relative for r in rows):8.1e} "
-            f"{max(r.one_minus_cosine for r in rows):8.1e} {directions:10.1e} "
-            f"{max(r.single or 0.0 for r in rows):7.1e}{verdict}"
+            f"{stage:<12} {len(rows):>6} {np.max([r.relative for r in rows]):8.1e} "
+            f"{np.max([r.one_minus_cosine for r in rows]):8.1e} {directions:10.1e} "
+            f"{np.max([r.single or 0.0 for r in rows]):7.1e}{verdict}"
         )
     return "\n".join(lines)
 

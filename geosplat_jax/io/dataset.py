@@ -175,25 +175,12 @@ def load_dataset(
             warnings.append("there are no test views; nothing can be evaluated")
             splits.append(no_views(splits[0]))
             continue
-        views, problems = load_views(
-            chosen, factor=downscale, listing=listing, most_bytes=KEPT_BYTES[split]
-        )
-        _check_pixels(views, split)
-        _check_masks(views, split, warnings)
-        warnings += [f"{split}: {problem}" for problem in problems]
-        if (profile := wide_color_profile(chosen[0].image)) is not None:
-            warnings.append(
-                f"{split}: {chosen[0].image.name} has colours of the profile {profile!r}, which "
-                "are read as sRGB and come out too dull; convert the photographs to sRGB"
-            )
+        views = _load_split(split, chosen, listing, downscale, warnings)
         if split in refined:
             views = with_cameras(views, refined[split], str(cameras))
         splits.append(views)
     train, test = splits
-    bare = [
-        name for name, views in zip(("train", "test"), splits, strict=True) if not views.has_masks
-    ]
-    if bare:
+    if bare := [name for name, views in (("train", train), ("test", test)) if not views.has_masks]:
         warnings.append(f"the {' and '.join(bare)} views have no masks; {_NEEDS_MASKS}")
     box = object_bounds(train) if bounds is None else _checked_bounds(bounds)
     for views in splits:
@@ -219,6 +206,24 @@ def load_dataset(
             **{name: asked[name] for name, usual in READING if asked.get(name, usual) != usual},
         },
     )
+
+
+def _load_split(
+    split: str, frames: Sequence[Frame], listing: Listing, downscale: int, warnings: list[str]
+) -> Views:
+    """Load the views of a split, and append what is wrong with them to the warnings."""
+    views, problems = load_views(
+        frames, factor=downscale, listing=listing, most_bytes=KEPT_BYTES[split]
+    )
+    _check_pixels(views, split)
+    _check_masks(views, split, warnings)
+    warnings += [f"{split}: {problem}" for problem in problems]
+    if (profile := wide_color_profile(frames[0].image)) is not None:
+        warnings.append(
+            f"{split}: {frames[0].image.name} has colours of the profile {profile!r}, which "
+            "are read as sRGB and come out too dull; convert the photographs to sRGB"
+        )
+    return views
 
 
 def _recorded(cameras: Path) -> dict[str, str]:

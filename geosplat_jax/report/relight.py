@@ -34,6 +34,8 @@ BACKGROUNDS = ("light", "white", "black")
 
 _lookup = jax.jit(lookup)
 _rotate_light = jax.jit(rotate_light)
+_SUBSAMPLES = 4
+"""Directions along each side of a texel of a light that is turned about any axis."""
 
 
 def load_light(path: str | Path, *, largest: int = LARGEST_LIGHT) -> EnvLight:
@@ -76,7 +78,8 @@ def load_view_light(light: ViewLight, *, largest: int = LARGEST_LIGHT) -> EnvLig
     """
     axes = np.asarray(to_y_up_map(jnp.eye(3)), np.float64).T
     turn = light.camera_to_world[:3, :3] @ axes
-    return _rotate_light(load_light(light.path, largest=largest), jnp.asarray(turn, jnp.float32))
+    read = load_light(light.path, largest=largest)
+    return rotate_light(read, jnp.asarray(turn, jnp.float32), subsamples=_SUBSAMPLES)
 
 
 def turned(light: EnvLight, angle: float) -> EnvLight:

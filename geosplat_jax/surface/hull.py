@@ -210,7 +210,7 @@ def hull_sdf(
 
     Raises
     ------
-    ValueError : no vertex, or every vertex, lies inside.
+    ValueError : no vertex lies inside.
     """
     cell = float(grid.cell_size)
     view = _Silhouettes(world_to_camera, intrinsics, masks, valid)

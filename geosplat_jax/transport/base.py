@@ -239,6 +239,11 @@ class TransportSettings(Variant, abc.ABC):
         return False
 
     @property
+    def reads_faces(self) -> bool:
+        """Whether blocked directions bring what the points of the face send that is hit."""
+        return False
+
+    @property
     def blocked_light(self) -> str | None:
         """Setting that says what blocked directions bring; None where nothing is ever blocked."""
         return None

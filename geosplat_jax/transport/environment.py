@@ -230,17 +230,28 @@ def lookup(texels: Float[Array, "H W C"], directions: Float[Array, "N 3"]) -> Fl
     return _gather(texels.reshape(-1, channels), _footprint(directions, height, width))
 
 
-def rotate_light(light: EnvLight, rotation: Float[Array, "3 3"]) -> EnvLight:
+def rotate_light(
+    light: EnvLight, rotation: Float[Array, "3 3"], *, subsamples: int = 1
+) -> EnvLight:
     """Rotate a light: what shone from direction d then shines from ``rotation @ d``.
 
     The map is resampled bilinearly, which blurs by up to a texel; it is differentiable in both.
+
+    Parameters
+    ----------
+    light, rotation : what is rotated, and how; proper.
+    subsamples : directions along each side of a texel whose mean it becomes. One is enough for
+        turns about the vertical axis. Elsewhere a sun of half a degree keeps its flux within 5 %
+        with one, 30 degrees above the horizon, and within .1 % with four; with one it may be lost
+        beside the poles, where texels are narrow.
     """
-    height, width, _ = light.radiance.shape
-    directions = jnp.asarray(_texel_directions(height, width).reshape(-1, 3), rotation.dtype)
+    height, width, channels = light.radiance.shape
+    rows, columns = height * subsamples, width * subsamples
+    directions = jnp.asarray(_texel_directions(rows, columns).reshape(-1, 3), rotation.dtype)
     # Rows of d^T R are R^T d.
     turned = jnp.matmul(directions, rotation, precision="highest")
-    radiance = lookup(light.radiance, turned)
-    return EnvLight(radiance.reshape(light.radiance.shape))
+    radiance = lookup(light.radiance, turned).reshape(rows, columns, channels)
+    return downsample_light(EnvLight(radiance), factor=subsamples)
 
 
 def downsample_light(light: EnvLight, *, factor: int) -> EnvLight:
@@ -249,6 +260,8 @@ def downsample_light(light: EnvLight, *, factor: int) -> EnvLight:
     Preserves the total flux. Raises `ValueError` if a size is not a multiple of the factor.
     """
     height, width, _ = light.radiance.shape
+    if factor == 1:
+        return light
     if height % factor or width % factor:
         raise ValueError(
             f"cannot downsample {height} x {width} texels by {factor}; both must be multiples"

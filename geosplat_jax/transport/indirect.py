@@ -24,7 +24,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from geosplat_jax.core.harmonics import harmonics
 from geosplat_jax.core.numerics import safe_divide
@@ -163,16 +163,32 @@ class TracedIndirect(Indirect):
 
 
 class RadiometricIndirect(Indirect):
-    """(F, 27) coefficients of the radiance that each face sends out, colour by colour."""
+    """(F, 27) coefficients of the radiance that each face sends out, colour by colour.
+
+    ``is_known`` : (F,) false for faces without points, which are black; None where all have some.
+    """
 
     outputs: ClassVar[int] = 27
     reads_faces: ClassVar[bool] = True
     values: Float[Array, "F 27"]
+    is_known: Bool[Array, " F"] | None = None
+
+    @classmethod
+    def of(
+        cls, points: SurfacePoints, values: Float[Array, "N 27"], face_count: int
+    ) -> "RadiometricIndirect":
+        """Average what points have learned over the faces that they belong to."""
+        ones = jnp.ones((values.shape[0], 1), values.dtype)
+        mean = mean_over_faces(points, jnp.concatenate([values, ones], axis=1), face_count)
+        return cls(mean[:, :-1], mean[:, -1] > 0)
 
     def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
         """Evaluate the harmonics of the face that is hit, towards where the ray comes from."""
         values = self.values.at[jnp.maximum(hits, 0)].get(mode="clip")
-        radiance = jnp.where((hits >= 0)[:, None], learned_radiance(values, -directions), 0.0)
+        is_lit = hits >= 0
+        if self.is_known is not None:
+            is_lit &= self.is_known.at[jnp.maximum(hits, 0)].get(mode="clip")
+        radiance = jnp.where(is_lit[:, None], learned_radiance(values, -directions), 0.0)
         return radiance, radiance
 
 

@@ -28,7 +28,6 @@ from geosplat_jax.transport.indirect import (
     RadiometricIndirect,
     TracedIndirect,
     learned_radiance,
-    mean_over_faces,
     outgoing,
 )
 from geosplat_jax.transport.light_sampling import light_sampler
@@ -62,6 +61,11 @@ class MonteCarloSettings(SampledSettings, TransportSettings, kind="monte_carlo")
         return INDIRECT_MODELS[self.indirect].outputs
 
     @property
+    def reads_faces(self) -> bool:
+        """Where it is traced, or learned by what it comes from."""
+        return INDIRECT_MODELS[self.indirect].reads_faces
+
+    @property
     def blocked_light(self) -> str:
         """The model of indirect light."""
         return f"indirect={self.indirect}"
@@ -75,7 +79,7 @@ class MonteCarloSettings(SampledSettings, TransportSettings, kind="monte_carlo")
     def warnings(self) -> list[str]:
         """Say that traced light needs rays, and what belongs to another kind of indirect light."""
         texts = SampledSettings.warnings(self)
-        if INDIRECT_MODELS[self.indirect].reads_faces and not self.occlusion:
+        if self.reads_faces and not self.occlusion:
             texts.append(
                 f"indirect = {self.indirect} has no effect without occlusion: blocked directions "
                 "are black"
@@ -129,7 +133,7 @@ class MonteCarlo(SampledTransport):
         if not self.settings.is_radiometric:
             return None
         assert attributes.indirect is not None
-        return RadiometricIndirect(mean_over_faces(points, attributes.indirect, face_count))
+        return RadiometricIndirect.of(points, attributes.indirect, face_count)
 
     def prepare(
         self,

@@ -370,6 +370,11 @@ class PathSettings(SampledSettings, TransportSettings, kind="paths"):
     they reflect, or that and their materials and normals."""
 
     @property
+    def reads_faces(self) -> bool:
+        """Paths go on from the face that they hit."""
+        return True
+
+    @property
     def blocked_light(self) -> str:
         """All that paths find."""
         return "kind=paths"

@@ -105,7 +105,7 @@ class SampledSettings:
         """Say where nothing is chosen from reservoirs, though it was asked for."""
         chosen = self.reservoirs
         if chosen.candidates == 0:
-            if chosen.reuse_steps or chosen.neighbors > 0:
+            if chosen.reuse_steps or chosen.neighbors > 0 or chosen.visibility != "ignored":
                 return ["reservoirs have no effect without candidates: samples are plain"]
             return []
         if self.light_count == 0:
