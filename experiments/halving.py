@@ -23,7 +23,7 @@ from typing import Any
 
 import run as runner
 import trade
-from jobs import plan
+from jobs import Job, plan
 from report import ReportError
 from sweep import Sweep, SweepError, SweepRun, has_numbers, read_sweep, scaled
 
@@ -138,8 +138,8 @@ def rung_factors(rungs: int, keep: float) -> list[float]:
 
 def search(
     sweep: Sweep, arguments: argparse.Namespace, run_jobs: Any = runner.run_jobs
-) -> tuple[Sweep, Path]:
-    """Train all rungs; return the sweep of the last one, and its folder.
+) -> tuple[Sweep, Path, list[Job]]:
+    """Train all rungs; return the sweep of the last one, its folder, and what failed there.
 
     Raises
     ------
@@ -155,10 +155,10 @@ def search(
         jobs = plan(here, arguments.scenes, folder, scenes=here.scenes, names=names)
         runner.check_folders(jobs)
         command = f"python experiments/halving.py {arguments.sweep.name}"
-        runner.write_record(here, folder, command)
-        run_jobs(jobs)
+        runner.write_record(here, arguments.scenes, folder, command)
+        failed = run_jobs(jobs)
         if factor == 1.0:
-            return here, folder
+            return here, folder, failed
         values = full_costs(folder, here, factor)
         if not values:
             raise SweepError(f"rung {rung}: no run has figures on all scenes; see {folder}")
@@ -171,7 +171,7 @@ def search(
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Search; 0, 2 on a wrong call, 130 if interrupted."""
+    """Search; 0, 1 if runs of the last rung failed, 2 on a wrong call, 130 if interrupted."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("sweep", type=Path, help="whose runs and groups are the candidates")
     parser.add_argument("--scenes", type=Path, required=True, help="folder of the scene folders")
@@ -190,7 +190,7 @@ def main(argv: list[str] | None = None) -> int:
         sweep = read_sweep(
             arguments.sweep, overrides=arguments.overrides, quality=arguments.quality
         )
-        here, folder = search(sweep, arguments)
+        here, folder, failed = search(sweep, arguments)
         record = trade.report._read_sweep(folder)
         text = trade.compose(record, [trade.read_points(folder, record)])
     except (SweepError, ReportError, OSError) as error:
@@ -203,6 +203,10 @@ def main(argv: list[str] | None = None) -> int:
         signal.signal(signal.SIGTERM, before)
     (arguments.output / "front.md").write_text(text, encoding="utf-8")
     runner._say(f"front of {len(here.runs)} runs: {arguments.output / 'front.md'}")
+    if failed:
+        labels = ", ".join(job.label for job in failed)
+        runner._say(f"{len(failed)} of the last rung failed, and are not compared: {labels}")
+        return 1
     return 0
 
 

@@ -157,13 +157,35 @@ def _with_file_of(recorded: Config, wanted: Config) -> Config:
     return replace(wanted, geometry=replace(sweep, path=run.path, digest=run.digest))
 
 
-def read_entry(folder: Path, run: dict[str, Any]) -> Entry:
+def _other_images(folder: Path, run: dict[str, Any], sweep: dict[str, Any], scene: str) -> str:
+    """Say where a run saw other images than the sweep wants, or an empty text.
+
+    Records of earlier versions do not say where the scenes were, nor what size of images a run was
+    evaluated on; they are believed.
+    """
+    record = json.loads((folder / "run.json").read_text())
+    factor = record["dataset"].get("downscale", 1)
+    if factor != run["downscale"]:
+        return f"trained on images reduced by {factor} instead of {run['downscale']}"
+    if record["scene"] != sweep.get("scene_folders", {}).get(scene, record["scene"]):
+        return "trained on a scene in another folder than that of the last --scenes"
+    path = folder / "evaluation.json"
+    evaluated = json.loads(path.read_text()) if path.exists() else {}
+    factor = evaluated.get("downscale", sweep["downscale"])
+    if factor != sweep["downscale"]:
+        return f"evaluated on images reduced by {factor} instead of {sweep['downscale']}"
+    return ""
+
+
+def read_entry(folder: Path, run: dict[str, Any], sweep: dict[str, Any], scene: str) -> Entry:
     """Read what one run left, and check that it is the run that the sweep wants.
 
     Parameters
     ----------
     folder : run folder.
     run : the run in ``sweep.json``.
+    sweep : all of ``sweep.json``.
+    scene : name of the scene.
     """
     if (folder / "error.txt").exists():
         return Entry({}, {}, f"failed: {_last_line(folder / 'error.txt')}")
@@ -178,6 +200,9 @@ def read_entry(folder: Path, run: dict[str, Any]) -> Entry:
         if changed:
             problem = f"other settings than the sweep (recorded -> wanted): {'; '.join(changed)}"
             return Entry({}, {}, problem)
+        other = _other_images(folder, run, sweep, scene)
+        if other:
+            return Entry({}, {}, other)
         if record["step"] != config.total_steps:
             return Entry({}, {}, f"evaluated at step {record['step']} of {config.total_steps}")
         costs, notes = _costs(folder, record, config)
@@ -194,7 +219,9 @@ def read_entries(folder: Path, sweep: dict[str, Any]) -> dict[str, dict[str, Ent
     """Read all runs, by scene and name; a run that equals another one has the other's figures."""
     return {
         scene: {
-            run["name"]: read_entry(folder / scene / (run["same_as"] or run["name"]), run)
+            run["name"]: read_entry(
+                folder / scene / (run["same_as"] or run["name"]), run, sweep, scene
+            )
             for run in sweep["runs"]
         }
         for scene in sweep["scenes"]
@@ -421,6 +448,18 @@ def problems(sweep: dict[str, Any], entries: dict[str, dict[str, Entry]]) -> lis
     return lines
 
 
+def all_problems(
+    sweep: dict[str, Any],
+    entries: dict[str, dict[str, Entry]],
+    others: list[dict[str, dict[str, Entry]]] | None,
+) -> list[str]:
+    """List the problems of a sweep and of its repetitions with other seeds; see `problems`."""
+    lines = problems(sweep, entries)
+    for number, repeated in enumerate(others or (), 2):
+        lines += [f"- seed {number}: {line[2:]}" for line in problems(sweep, repeated)]
+    return lines
+
+
 def compose(
     sweep: dict[str, Any],
     entries: dict[str, dict[str, Entry]],
@@ -464,7 +503,7 @@ def compose(
     lines.append("")
     if plots:
         lines += ["## Curves", "", *(f"![{Path(link).stem}]({link})" for link in plots), ""]
-    missing = [*problems(sweep, entries), *(f"- {note}" for note in notes)]
+    missing = [*all_problems(sweep, entries, others), *(f"- {note}" for note in notes)]
     if missing:
         lines += ["## Missing and failed", "", *missing, ""]
     lines += ["## How this was made", "", "```", *sweep["commands"], command, "```", ""]
@@ -492,16 +531,18 @@ def _read_repetitions(
     for folder in folders:
         other = _read_sweep(folder)
         same = [
-            (one["name"], one["evaluate"]) == (two["name"], two["evaluate"])
+            all(one.get(key) == two.get(key) for key in ("name", "evaluate", "downscale"))
             and [line.split(":")[0] for line in _differences(one, two)] == ["run.seed"]
             for one, two in zip(sweep["runs"], other["runs"], strict=False)
         ]
-        alike = len(sweep["runs"]) == len(other["runs"]) and sweep["scenes"] == other["scenes"]
+        alike = len(sweep["runs"]) == len(other["runs"]) and all(
+            sweep.get(key) == other.get(key) for key in ("scenes", "downscale")
+        )
         seed = other["runs"][0]["config"]["run"]["seed"]
         if not (alike and all(same)) or seed in seeds:
             raise ReportError(
-                f"{folder} does not repeat the sweep with another seed: runs, scenes and settings "
-                "must be the same but for run.seed"
+                f"{folder} does not repeat the sweep with another seed: runs, scenes, sizes of "
+                "images and settings must be the same but for run.seed"
             )
         seeds.add(seed)
         found.append(read_entries(folder, other))
@@ -553,7 +594,7 @@ def main(argv: list[str] | None = None) -> int:
     text = compose(sweep, entries, plots=links, notes=notes, command=command, others=others)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     arguments.output.write_text(text, encoding="utf-8")
-    for line in [*problems(sweep, entries), *(f"- {note}" for note in notes)]:
+    for line in [*all_problems(sweep, entries, others), *(f"- {note}" for note in notes)]:
         print(line, file=sys.stderr)
     return 0
 

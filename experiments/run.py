@@ -45,6 +45,12 @@ class RunFailed(RuntimeError):
     """The process of a run ended badly; the message ends with what it last said."""
 
 
+def _evaluation_of(job: Job) -> dict[str, Any]:
+    """Return what is noted of an evaluation: its arguments, and the factor of its images."""
+    reading = job.options if job.evaluate_options is None else job.evaluate_options
+    return {**(job.evaluate or {}), "downscale": reading.get("downscale", 1)}
+
+
 def _changes(job: Job) -> list[str]:
     """Say how what lies in a run's folder differs from what is wanted; nothing where it agrees."""
     folder, wanted = Path(job.folder), config_from_dict(job.config)
@@ -61,9 +67,12 @@ def _changes(job: Job) -> list[str]:
     found += differences(config_from_dict(figures["config"]), wanted)
     evaluated = json.loads((folder / "evaluation.json").read_text())
     evaluated |= {name: figures[name] for name in job.evaluate}
+    wanted_evaluation = _evaluation_of(job)
+    # Earlier versions did not note the size of the images.
+    evaluated.setdefault("downscale", wanted_evaluation["downscale"])
     return found + [
         f"evaluate.{name}: {evaluated.get(name)!r} -> {now!r}"
-        for name, now in job.evaluate.items()
+        for name, now in wanted_evaluation.items()
         if evaluated.get(name) != now
     ]
 
@@ -126,6 +135,8 @@ def execute(
     train, evaluate : `geosplat_jax.run.train`; and `Run.evaluate` of the run in a folder.
     """
     folder = Path(job.folder)
+    # It would vouch for the figures of an evaluation that dies before its end.
+    (folder / "evaluation.json").unlink(missing_ok=True)
     if not is_trained(job):
         config = config_from_dict(job.config)
         train(Path(job.scene), folder, config, begin=_begin(job), **job.options)
@@ -133,7 +144,8 @@ def execute(
         reading = {} if job.evaluate_options is None else {"reading": job.evaluate_options}
         evaluate(folder, **job.evaluate, **reading)
         # Last, so that an evaluation without it was interrupted.
-        (folder / "evaluation.json").write_text(json.dumps(job.evaluate, indent=2) + "\n")
+        text = json.dumps(_evaluation_of(job), indent=2) + "\n"
+        (folder / "evaluation.json").write_text(text)
 
 
 def _say(text: str) -> None:
@@ -347,8 +359,13 @@ def _command_line(arguments: argparse.Namespace) -> str:
     return command_line("experiments/run.py", *parts)
 
 
-def write_record(sweep: Sweep, output: Path, command: str) -> None:
-    """Write ``sweep.json``: the parsed sweep, every run's settings, and all commands so far."""
+def write_record(sweep: Sweep, scenes: Path, output: Path, command: str) -> None:
+    """Write ``sweep.json``: the parsed sweep, every run's settings, and all commands so far.
+
+    Parameters
+    ----------
+    scenes, output : folders of the scenes and of all runs. command : the one that was called.
+    """
     path, where = output / "sweep.json", homes(sweep)
     commands = json.loads(path.read_text())["commands"] if path.exists() else []
     record = asdict(sweep)
@@ -356,6 +373,7 @@ def write_record(sweep: Sweep, output: Path, command: str) -> None:
         values["same_as"] = None if where[run.name] == run.name else where[run.name]
         values["evaluate"] = sweep.evaluation(run)
         values["config"] = sweep.config(run).to_dict()
+    record["scene_folders"] = {name: str((scenes / name).resolve()) for name in sweep.scenes}
     record["commands"] = list(dict.fromkeys([*commands, command]))
     output.mkdir(parents=True, exist_ok=True)
     aside = output / ".sweep.json.partial"
@@ -429,7 +447,7 @@ def main(argv: list[str] | None = None, *, start: Callable[[Job], None] = in_a_p
                 raise SweepError(f"--scenes {arguments.scenes} has no folder {scene!r}")
         jobs = plan(sweep, arguments.scenes, arguments.output, scenes=scenes, names=names)
         check_folders(jobs)
-        write_record(sweep, arguments.output, _command_line(arguments))
+        write_record(sweep, arguments.scenes, arguments.output, _command_line(arguments))
     except (SweepError, OSError) as error:
         _say(f"error: {error}")
         return 2

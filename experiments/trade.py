@@ -2,7 +2,9 @@
 
 ``python experiments/trade.py DIR [--seeds DIR ...] --output FILE.md``, where ``experiments/run.py``
 wrote ``DIR``. Seconds are those of all stages, also of those that a run took over from another one:
-what it would have taken alone. Error bars are standard errors over scenes and seeds.
+what it would have taken alone, were nothing compiled. All runs share one cache of programs, so that
+the first one compiles for the others; whole seconds, as measured, stand in a column of their own.
+Error bars are standard errors over the scenes, of means over the seeds.
 """
 
 import argparse
@@ -30,7 +32,8 @@ class Point:
 
     Attributes
     ----------
-    seconds : of the whole training. steady : of its steps, were nothing compiled.
+    seconds : of the whole training, with what it compiled. steady : of its steps, were nothing
+        compiled: their number times the median, for every stage.
     memory_mb : largest of the training's processes.
     figures : of the evaluation.
     """
@@ -123,86 +126,169 @@ def pareto(points: dict[str, tuple[float, float]]) -> list[str]:
 
 def _pairs(
     repeated: list[dict[str, dict[str, Point]]], name: str, base: str
-) -> list[tuple[Point, Point]]:
-    """Return a run and the base where both are known, on every scene and with every seed."""
+) -> list[list[tuple[Point, Point]]]:
+    """Return a run and the base with the same seed, where both are known, for every scene."""
+    scenes = dict.fromkeys(scene for points in repeated for scene in points[base])
     return [
-        (points[name][scene], points[base][scene])
-        for points in repeated
-        for scene in points[name]
-        if scene in points[base]
+        [
+            (points[name][scene], points[base][scene])
+            for points in repeated
+            if scene in points[name] and scene in points[base]
+        ]
+        for scene in scenes
     ]
 
 
-def _spread(values: list[float], figure: str, *, signed: bool) -> str:
-    """Write a mean with its standard error."""
-    known = [value for value in values if math.isfinite(value)]
+def _finite(groups: Iterable[Iterable[float]]) -> list[list[float]]:
+    """Leave out what is not finite, and scenes of which nothing is left."""
+    kept = ([value for value in values if math.isfinite(value)] for values in groups)
+    return [values for values in kept if values]
+
+
+def _mean(groups: list[list[float]]) -> float:
+    """Mean over the scenes of the means over the seeds."""
+    return statistics.fmean(statistics.fmean(values) for values in groups)
+
+
+def _standard_error(groups: list[list[float]]) -> float | None:
+    """Return the standard error over scenes, of means over seeds: those of a scene are not apart.
+
+    Over the seeds where there is one scene; None for a single value.
+    """
+    values = groups[0] if len(groups) == 1 else [statistics.fmean(group) for group in groups]
+    return statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else None
+
+
+def _spread(groups: list[list[float]], figure: str, count: int) -> str:
+    """Write the mean of a difference with its standard error.
+
+    Parameters
+    ----------
+    groups : values of the seeds, for every scene; those that are not finite are left out.
+    count : of the values that there should be; said where some are missing.
+    """
+    known = _finite(groups)
     if not known:
         return _NONE
-    text = digits(figure, statistics.fmean(known), signed=signed)
-    if len(known) > 1:
-        text += f" ± {digits(figure, statistics.stdev(known) / math.sqrt(len(known)))}"
-    return text
+    text, error = digits(figure, _mean(known), signed=True), _standard_error(known)
+    if error is not None:
+        text += f" ± {digits(figure, error)}"
+    return text + _of(sum(len(values) for values in known), count)
+
+
+def _of(found: int, count: int) -> str:
+    """Say how many of the values are there, where some are missing."""
+    return f" ({found} of {count})" if found < count else ""
+
+
+def _exchange(gain: float, extra: float) -> str:
+    """Write the decibels per second, where one is paid with the other; in words where it is not.
+
+    Parameters
+    ----------
+    gain, extra : change of the quality and of the seconds.
+    """
+    if gain == extra == 0.0:
+        return _NONE
+    if gain * extra > 0.0:
+        return f"{gain / extra:+.4f}"
+    good = "as good" if gain == 0.0 else "better" if gain > 0.0 else "worse"
+    cost = "as dear" if extra == 0.0 else "cheaper" if extra < 0.0 else "dearer"
+    return f"{good}, {cost}"
+
+
+_COSTS = {
+    "seconds, ratio": lambda point: point.steady,
+    "whole seconds, ratio": lambda point: point.seconds,
+    "memory, ratio": lambda point: point.memory_mb,
+}
+"""Columns of what a run costs, in parts of what the base does."""
+
+
+def _knob_row(
+    pairs: list[list[tuple[Point, Point]]], names: list[str], figures: list[str], count: int
+) -> list[str]:
+    """Write what a run costs and brings against the base.
+
+    Parameters
+    ----------
+    pairs : see `_pairs`. names : of all figures. figures : of the quality.
+    count : of the pairs that there should be.
+    """
+    row = []
+    for cost in _COSTS.values():
+        known = _finite([cost(a) / cost(b) for a, b in group if cost(b)] for group in pairs)
+        row.append(f"×{_mean(known):.2f}" if known else _NONE)
+    for name in names:
+        change = [
+            [a.figures.get(name, math.nan) - b.figures.get(name, math.nan) for a, b in group]
+            for group in pairs
+        ]
+        row.append(_spread(change, name, count))
+    gains = [[quality(a, figures) - quality(b, figures) for a, b in group] for group in pairs]
+    row.append(_spread(gains, "psnr", count))
+    # Of the same pairs: seconds without a quality say nothing.
+    extra = _finite(
+        [
+            a.steady - b.steady if math.isfinite(gain) else math.nan
+            for (a, b), gain in zip(group, values, strict=True)
+        ]
+        for group, values in zip(pairs, gains, strict=True)
+    )
+    row.append(_exchange(_mean(_finite(gains)), _mean(extra)) if extra else _NONE)
+    return row
 
 
 def knob_tables(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]]]) -> list[str]:
     """Tabulate every knob: its values, what they cost and what they bring against the base.
 
     Decibels per second are the change of the quality over the change of the seconds: what a second
-    more buys where both are positive, and what one less costs where both are negative.
+    more buys where both are positive, and what one less costs where both are negative. Where their
+    signs differ there is nothing to weigh, and words say so.
     """
     base, figures = sweep["runs"][0]["name"], quality_figures(sweep)
-    lines = []
+    names, lines = sweep["figures"], []
+    count = sum(len(points[base]) for points in repeated)
     for group in dict.fromkeys(run["group"] for run in sweep["runs"] if run["x"] is not None):
-        head = ["value", "seconds", "memory, MB", *(f"{n}{arrow(n)}" for n in sweep["figures"])]
+        head = ["value", *_COSTS, *(f"{name}{arrow(name)}" for name in names)]
         rows = [[*head, "quality, dB", "dB per second"]]
         members = [r for r in sweep["runs"] if r["x"] is not None and r["group"] == group]
         for run in sorted(members, key=lambda run: run["x"]):
             pairs = _pairs(repeated, run["name"], base)
-            row = [f"{run['x']:g} ({run['name']})"]
-            if not pairs:
-                rows.append([*row, *[_NONE] * (len(rows[0]) - 1)])
-                continue
-            more = [one.seconds / other.seconds for one, other in pairs]
-            row.append(f"×{statistics.fmean(more):.2f}")
-            known = [a.memory_mb / b.memory_mb for a, b in pairs if b.memory_mb]
-            row.append(f"×{statistics.fmean(known):.2f}" if known else _NONE)
-            for name in sweep["figures"]:
-                nan = math.nan
-                change = [a.figures.get(name, nan) - b.figures.get(name, nan) for a, b in pairs]
-                row.append(_spread(change, name, signed=True))
-            gains = [quality(a, figures) - quality(b, figures) for a, b in pairs]
-            row.append(_spread(gains, "psnr", signed=True))
-            extra = statistics.fmean(a.seconds - b.seconds for a, b in pairs)
-            gain = statistics.fmean(gains)
-            row.append(f"{gain / extra:+.4f}".replace("-", "−") if extra else _NONE)
-            rows.append(row)
+            row = _knob_row(pairs, names, figures, count)
+            rows.append([f"{run['x']:g} ({run['name']})", *row])
         lines += [f"### {group}", "", *report._table(rows), ""]
     return lines
 
 
 def front_table(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]]]) -> list[str]:
     """Tabulate the runs than which none is as good in less time, over what all have."""
-    figures = quality_figures(sweep)
-    values = {}
+    figures, count = quality_figures(sweep), len(repeated) * len(sweep["scenes"])
+    values, whole, left_out = {}, {}, []
     for run in sweep["runs"]:
-        found = [p for points in repeated for p in points[run["name"]].values()]
-        if len(found) == len(repeated) * len(sweep["scenes"]):
-            means = [statistics.fmean(p.seconds for p in found)]
-            values[run["name"]] = (means[0], statistics.fmean(quality(p, figures) for p in found))
+        name = run["name"]
+        points = [p for points in repeated for p in points[name].values()]
+        found = [p for p in points if math.isfinite(quality(p, figures))]
+        if len(found) < count:
+            left_out.append(f"{name} ({len(found)} of {count})")
+            continue
+        good = statistics.fmean(quality(p, figures) for p in found)
+        values[name] = (statistics.fmean(p.steady for p in found), good)
+        whole[name] = statistics.fmean(p.seconds for p in found)
     titles = {run["name"]: run["title"] for run in sweep["runs"]}
-    rows = [["run", "seconds", "quality, dB", "dB per second more", "what it is"]]
-    before = None
+    head = ["run", "seconds", "whole seconds", "quality, dB", "dB per second more", "what it is"]
+    rows, before = [head], None
     for name in pareto(values):
         seconds, good = values[name]
         slope = _NONE
         if before is not None:
             slope = f"{(good - before[1]) / (seconds - before[0]):.4f}"
-        rows.append([name, f"{seconds:.0f}", f"{good:.2f}", slope, titles[name]])
+        costs = [f"{seconds:.0f}", f"{whole[name]:.0f}"]
+        rows.append([name, *costs, f"{good:.2f}", slope, titles[name]])
         before = (seconds, good)
-    left_out = [run["name"] for run in sweep["runs"] if run["name"] not in values]
     lines = [*report._table(rows), ""]
     if left_out:
-        lines += [f"Not on all scenes, hence not compared: {', '.join(left_out)}.", ""]
+        lines += [f"Without figures of all scenes, hence not compared: {', '.join(left_out)}.", ""]
     return lines
 
 
@@ -210,10 +296,15 @@ def compose(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]]]) 
     """Put the tables together as markdown."""
     base, figures = sweep["runs"][0]["name"], quality_figures(sweep)
     count = len(repeated)
+    over = "the scenes, of means over the seeds"
+    if len(sweep["scenes"]) == 1:
+        over = "the seeds, since there is one scene"
     about = (
         f"Against `{base}` at quality {sweep['quality']}, on {', '.join(sweep['scenes'])}, "
-        f"{count} seed{'s' if count > 1 else ''}. Quality is the mean of {', '.join(figures)}; "
-        "± is the standard error over scenes and seeds."
+        f"{count} seed{'s' if count > 1 else ''}. Quality is the mean of {', '.join(figures)}. "
+        f"± is the standard error over {over}. Seconds are those of median steps, were nothing "
+        "compiled; whole seconds are with what a run happened to compile. Where figures are "
+        "missing, (1 of 2) says how many trainings have them."
     )
     return "\n".join(
         [

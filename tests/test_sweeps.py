@@ -5,9 +5,11 @@ slow test runs a sweep for real.
 """
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -422,6 +424,44 @@ def test_an_interrupted_evaluation_is_repeated_without_training(tmp_path):
     assert fakes.evaluated == [("one/full", "traced")]
 
 
+def test_an_evaluation_of_what_was_replaced_vouches_for_no_other(tmp_path):
+    """An evaluation that dies after its figures is not finished, whatever lay there before."""
+    _write(tmp_path)
+    some = ["--only", "full", "--scene", "one"]
+    assert _run(tmp_path, Fakes(), *some) == 0
+    (tmp_path / "runs" / "one" / "full" / "training.json").unlink()
+
+    class Dying(Fakes):
+        def evaluate(self, folder, **arguments):
+            super().evaluate(folder, **arguments)
+            raise RuntimeError("no room for pictures")
+
+    assert _run(tmp_path, Dying(), *some) == 1
+    fakes = Fakes()
+    assert _run(tmp_path, fakes, *some) == 0
+    assert (fakes.trained, fakes.evaluated) == ([], [("one/full", "traced")])
+
+
+def test_an_evaluation_reads_the_images_that_it_is_told_to(tmp_path, monkeypatch):
+    seen = []
+
+    class Opened:
+        dataset = "as trained on"
+
+        def __init__(self, folder):
+            self.folder = SimpleNamespace(record=lambda: {"scene": "a scene"})
+
+        def evaluate(self, **arguments):
+            seen.append((self.dataset, arguments))
+
+    monkeypatch.setattr(runner, "Run", Opened)
+    monkeypatch.setattr(runner, "load_recorded", lambda scene, reading: (scene, reading))
+    runner._evaluate(tmp_path, {"downscale": 3}, samples=2)
+    runner._evaluate(tmp_path, samples=4)
+    other = ("a scene", {"downscale": 3})
+    assert seen == [(other, {"samples": 2}), ("as trained on", {"samples": 4})]
+
+
 def test_files_that_no_run_wrote_are_left_alone(tmp_path):
     _write(tmp_path)
     precious = tmp_path / "runs" / "one" / "full" / "previews" / "precious.png"
@@ -466,6 +506,67 @@ def test_ctrl_c_ends_the_sweep_with_its_own_status(tmp_path, capsys):
     assert runner.main(_arguments(tmp_path), start=stop) == 130
     assert "goes on from the last checkpoint" in capsys.readouterr().err
     assert not list((tmp_path / "runs").rglob("error.txt"))
+
+
+def test_being_ended_is_as_ctrl_c_while_runs_go_on(tmp_path):
+    """Schedulers end a job by SIGTERM."""
+    _write(tmp_path)
+    before, handlers = signal.getsignal(signal.SIGTERM), []
+
+    def stop(job):
+        handlers.append(signal.getsignal(signal.SIGTERM))
+        raise KeyboardInterrupt
+
+    assert runner.main(_arguments(tmp_path), start=stop) == 130
+    assert handlers == [signal.default_int_handler]
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+@pytest.mark.parametrize(
+    ("interruptions", "calls"),
+    [(1, ["SIGINT", "wait"]), (2, ["SIGINT", "kill"])],
+)
+def test_ctrl_c_asks_for_a_checkpoint_and_a_second_one_ends_the_process(
+    tmp_path, monkeypatch, interruptions, calls
+):
+    made = []
+
+    class Child:
+        returncode = 130
+
+        def __init__(self, command, **options):
+            self.calls, self.left, self.options = [], interruptions, options
+            made.append(self)
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            pass
+
+        @property
+        def stdout(self):
+            if self.left:
+                self.left -= 1
+                raise KeyboardInterrupt
+            return ["written\n"]
+
+        def wait(self):
+            self.calls.append("wait")
+
+        def kill(self):
+            self.calls.append("kill")
+
+        def send_signal(self, number):
+            self.calls.append(signal.Signals(number).name)
+
+    monkeypatch.setattr(runner.subprocess, "Popen", Child)
+    job = Job("one/full", "scene", str(tmp_path / "full"), {}, {}, None, None, None)
+    with pytest.raises(KeyboardInterrupt):
+        runner.in_a_process(job)
+    assert made[0].calls == calls
+    # The terminal's own Ctrl-C would be a second one.
+    assert made[0].options["start_new_session"]
 
 
 @pytest.mark.parametrize(
@@ -599,6 +700,7 @@ def test_other_seeds_give_a_spread_of_paired_differences(tmp_path):
     # The reference has 30.5 and 32.5, no-shadow differs by -1.5 and -2: means over both scenes.
     assert seeds["full (reference)"] == ["31.50 ± 1.41", "0.0150 (1 seed)"]
     assert seeds["no-shadow"] == ["−1.75 ± 0.35", "+0.0000 (1 seed)"]
+    assert "- seed 2: one/full: has no roughness.mse" in text
     assert "--seeds OTHER_RUNS" in text
 
 
@@ -607,6 +709,46 @@ def test_seeds_of_another_sweep_are_refused(tmp_path, capsys):
     arguments = [str(tmp_path / "runs"), "--output", str(tmp_path / "x.md"), "--seeds"]
     assert report.main([*arguments, str(tmp_path / "runs")]) == 2
     assert "does not repeat the sweep with another seed" in capsys.readouterr().err
+
+
+def test_seeds_on_images_of_another_size_are_refused(tmp_path, capsys):
+    _write(tmp_path)
+    some = ["--only", "full", "--scene", "one"]
+    assert _run(tmp_path, Fakes(), *some) == 0
+    again = ["--output", str(tmp_path / "again"), "--set", SEED, "--downscale", "2"]
+    assert _run(tmp_path, Fakes(), *some, *again) == 0
+    command = [str(tmp_path / "runs"), "--output", str(tmp_path / "x.md")]
+    assert report.main([*command, "--seeds", str(tmp_path / "again")]) == 2
+    assert "sizes of images" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("first", "others", "said"),
+    [
+        (
+            "coarse",
+            ["--only", "full", "no-shadow", "few", "many", "--downscale", "4"],
+            "- one/coarse: trained on images reduced by 1 instead of 4",
+        ),
+        (
+            "full",
+            ["--only", "coarse", "--scenes", "OTHER"],
+            "- one/full: trained on a scene in another folder",
+        ),
+    ],
+)
+def test_runs_on_other_images_than_the_last_are_listed(tmp_path, first, others, said):
+    _write(tmp_path)
+    other = tmp_path / "other" / "scenes"
+    (other / "one").mkdir(parents=True)
+    others = [str(other) if part == "OTHER" else part for part in others]
+    assert _run(tmp_path, Fakes(), "--scene", "one", "--only", first) == 0
+    assert "instead of" not in _report(tmp_path)
+    assert _run(tmp_path, Fakes(), "--scene", "one", *others) == 0
+    text = _report(tmp_path)
+    assert said in text
+    assert str(tmp_path) not in text
+    assert _rows(text, "one")[first] == ["–"] * 5
 
 
 def test_missing_failed_and_changed_runs_are_listed(tmp_path):

@@ -26,6 +26,8 @@ try:
 except ImportError:
     submitit = None
 
+STAGES = ("split_sum", "monte_carlo", "refine")
+
 SWEEP = """
 title = "A trade"
 quality = "draft"
@@ -63,17 +65,24 @@ group = "samples"
 """
 
 
+SAMPLE_GAIN = {"one": 1.0, "two": 2.0}
+"""Decibels of a sample, by scene."""
+
+
 class Trained(Fakes):
-    """Runs whose seconds and quality are functions of their settings."""
+    """Runs whose seconds and quality are functions of their settings, and of their scene."""
 
     def train(self, scene, folder, config, **options):
         super().train(scene, folder, config, **options)
         path = folder / "metrics.jsonl"
         lines = [json.loads(x) for x in path.read_text().splitlines()]
-        for line in lines:
+        for k, line in enumerate(lines):
             samples = getattr(config.stage(line["stage"]).transport, "light_count", 1)
             seconds = 0.01 * config.geometry.resolution * samples
-            line |= {"seconds": seconds, "peak_memory_mb": 1000}
+            line |= {"seconds": seconds, "peak_memory_mb": 1000 * samples if k % 2 else 700}
+        if len(self.trained) == 1:
+            # All runs share a cache of programs: the first one compiles for the others.
+            lines[0]["seconds"] += 1000.0
         path.write_text("".join(json.dumps(line) + "\n" for line in lines))
 
     def evaluate(self, folder, *, protocol, samples, relight_indirect, reading=None):
@@ -83,12 +92,15 @@ class Trained(Fakes):
         figures = json.loads((folder / "metrics.json").read_text())
         config = config_from_dict(figures["config"])
         cells, samples = config.geometry.resolution, config.stages[1].transport.light_count
-        psnr = 20 + cells / 8 + samples + config.total_steps / 60
+        weight = SAMPLE_GAIN[folder.parent.name]
+        psnr = 20 + cells / 8 + weight * samples + config.total_steps / 60
         figures["mean"] = {"nvs.psnr": psnr, "normal.mae_masked_deg": 5.0}
         (folder / "metrics.json").write_text(json.dumps(figures))
 
     def run_jobs(self, jobs):
-        assert runner.run_jobs(jobs, start=self.start) == []
+        failed = runner.run_jobs(jobs, start=self.start)
+        assert failed == []
+        return failed
 
 
 def _rows(text, heading):
@@ -183,13 +195,159 @@ def test_the_tables_say_decibels_per_second_and_the_front(tmp_path, capsys):
     many = _rows(text, "samples")["4 (many)"]
     more = 0.01 * cells * 30 * 3 * light
     assert many[0] == f"×{(seconds + more) / seconds:.2f}"
-    assert many[2] == f"+{3 * light:.2f} ± 0.00"
-    assert many[-1] == f"{3 * light / more:+.4f}"
+    assert many[1] != many[0]
+    assert many[2] == "×4.00"
+    # One and two decibels for each sample, in the two scenes.
+    assert many[3] == f"+{4.5 * light:.2f} ± {1.5 * light:.2f}"
+    assert many[-1] == f"{4.5 * light / more:+.4f}"
     half = _rows(text, "cells")["0.5 (half)"]
     lost = (cells - round(cells / 2)) / 8
     assert half[-1] == f"{lost / (seconds * (1 - round(cells / 2) / cells)):+.4f}"
     front = _rows(text, "The front")
     assert [name for name in front if name not in ("run", "---")] == ["half", "few", "base", "many"]
+    assert front["base"][0] == f"{seconds:.0f}"
+    assert front["base"][1] == f"{seconds + 500:.0f}"
+    # The sweep itself is no repetition with another seed.
+    assert trade.main([str(tmp_path / "runs"), "--seeds", str(tmp_path / "runs")]) == 2
+    assert "does not repeat the sweep" in capsys.readouterr().err
+
+
+def _point(psnr, *, seconds=10.0, whole=None, memory=1000.0):
+    """Return a training's point; None for a figure that it lacks."""
+    figures = {} if psnr is None else {"nvs.psnr": psnr}
+    return trade.Point(seconds if whole is None else whole, seconds, memory, figures)
+
+
+def _record(scenes):
+    """Return as much of a sweep's record as the tables read: a base, and one value of a knob."""
+    runs = [
+        {"name": "base", "title": "as ever", "x": None, "group": "x"},
+        {"name": "more", "title": "more of it", "x": 2.0, "group": "knob"},
+    ]
+    about = {"title": "A trade", "quality": "draft", "figures": ["nvs.psnr"]}
+    return {**about, "runs": runs, "scenes": scenes}
+
+
+def _more(scenes, *seeds):
+    """Return the row of the knob's value; seeds hold, by scene, the base's point and the value's.
+
+    A point may be missing.
+    """
+    repeated = [
+        {
+            name: {scene: both[k] for scene, both in points.items() if both[k] is not None}
+            for k, name in enumerate(("base", "more"))
+        }
+        for points in seeds
+    ]
+    text = trade.compose(_record(list(scenes)), repeated)
+    return _rows(text, "knob")["2 (more)"], text
+
+
+def test_an_error_is_that_over_scenes_of_means_over_seeds():
+    """Two seeds of a scene share what is particular to it: they are not two scenes."""
+    # Scenes differ by far more than the change; what it brings differs by 1 between them.
+    levels = {"a": (20.0, 20.0), "b": (30.0, 31.0), "c": (40.0, 42.0)}
+    seed = {scene: tuple(_point(psnr) for psnr in both) for scene, both in levels.items()}
+    row, text = _more("abc", seed, seed)
+    assert row[3] == f"+1.00 ± {1 / 3**0.5:.2f}"
+    assert row[4] == row[3]
+    assert "over the scenes, of means over the seeds" in text
+    # One seed less of a scene changes how sure its mean is, not how much the scene counts.
+    without_last = {**seed, "c": (seed["c"][0], None)}
+    row, _ = _more("abc", seed, without_last)
+    assert row[3] == f"+1.00 ± {1 / 3**0.5:.2f} (5 of 6)"
+
+
+def test_a_run_is_compared_with_the_base_of_its_own_seed_and_one_scene_has_seeds():
+    first = {"a": (_point(20.0), _point(21.0))}
+    second = {"a": (_point(30.0), _point(33.0))}
+    row, text = _more("a", first, second)
+    # Differences of 1 and 3, whose standard deviation is the root of 2.
+    assert row[3] == "+2.00 ± 1.00"
+    assert "over the seeds, since there is one scene" in text
+    row, _ = _more("a", first)
+    assert row[3] == "+1.00"
+
+
+def test_costs_are_ratios_of_a_run_to_the_base():
+    base, more = _point(20.0, whole=100.0), _point(21.0, seconds=20.0, whole=50.0, memory=1500.0)
+    row, text = _more("a", {"a": (base, more)})
+    assert row[:3] == ["×2.00", "×0.50", "×1.50"]
+    assert row[-1] == "+0.1000"
+    head = _rows(text, "knob")["value"]
+    assert head[:3] == ["seconds, ratio", "whole seconds, ratio", "memory, ratio"]
+
+
+@pytest.mark.parametrize(
+    ("psnr", "seconds", "said"),
+    [
+        (21.0, 20.0, "+0.1000"),
+        (19.0, 8.0, "+0.5000"),
+        (21.0, 8.0, "better, cheaper"),
+        (19.0, 20.0, "worse, dearer"),
+        (21.0, 10.0, "better, as dear"),
+        (20.0, 8.0, "as good, cheaper"),
+        (20.0, 10.0, "–"),
+    ],
+)
+def test_decibels_per_second_stand_where_one_is_paid_with_the_other(psnr, seconds, said):
+    row, _ = _more("a", {"a": (_point(20.0), _point(psnr, seconds=seconds))})
+    assert row[-1] == said
+
+
+def test_a_missing_figure_leaves_a_scene_out_and_is_said():
+    whole = (_point(20.0), _point(22.0, seconds=20.0))
+    row, text = _more("ab", {"a": whole, "b": (_point(20.0), _point(None, seconds=400.0))})
+    assert row[3:5] == ["+2.00 (1 of 2)"] * 2
+    # The seconds of the scene without the figure have no part in it.
+    assert row[-1] == "+0.2000"
+    assert "hence not compared: more (1 of 2)" in text
+    assert "nan" not in text
+
+
+def _left(scene, name, config, lines):
+    """Leave what the tables read of a training."""
+    folder = scene / name
+    folder.mkdir(parents=True)
+    (folder / "run.json").write_text(
+        json.dumps({"scene": "s", "dataset": {"downscale": 1}, "config": config.to_dict()})
+    )
+    texts = [
+        json.dumps({"stage": "split_sum", "seconds": seconds, "peak_memory_mb": memory})
+        for seconds, memory in lines
+    ]
+    (folder / "metrics.jsonl").write_text("".join(f"{text}\n" for text in texts))
+
+
+def test_what_a_run_compiles_is_no_part_of_its_cost(tmp_path):
+    """All runs share a cache of programs, so the first one compiles for the others."""
+    steps = [f"stages.{s}.steps={n}" for s, n in zip(STAGES, (3, 0, 0), strict=True)]
+    points = {}
+    for name, every, first in (("base", 1, 91.0), ("more", 2, 1.0)):
+        config = make_config(quality="draft", overrides=(*steps, f"run.preview_every={every}"))
+        _left(tmp_path / "one", name, config, [(first, 500), (1.0, 2000), (1.0, 800)])
+        times = trade.stage_times(tmp_path / "one")
+        seconds, steady, memory = times[trade._identity(config, 1, 1)]
+        assert (seconds, steady, memory) == (first + 2.0, 3.0, 2000)
+        points[name] = trade.Point(seconds, steady, memory, {"nvs.psnr": 20.0})
+    row, _ = _more("a", {"a": (points["base"], points["more"])})
+    assert row[0] == "×1.00"
+    assert row[1] == f"×{3 / 93:.2f}"
+
+
+def test_figures_on_images_of_another_size_are_another_evaluation(tmp_path, capsys):
+    """A run that is trained on reduced images is evaluated on those of the sweep."""
+    _write(tmp_path, SWEEP)
+    some = _arguments(tmp_path, "--scene", "one", "--only")
+    assert runner.main([*some, "coarse"], start=Trained().start) == 0
+    assert runner.main([*some, "half", "--downscale", "4"], start=Trained().start) == 0
+    sweep = trade.report._read_sweep(tmp_path / "runs")
+    entry = trade.report.read_entries(tmp_path / "runs", sweep)["one"]["coarse"]
+    assert entry.problem == "evaluated on images reduced by 1 instead of 4"
+    capsys.readouterr()
+    assert runner.main([*some, "coarse", "--downscale", "4"], start=Trained().start) == 2
+    assert "one/coarse: evaluate.downscale: 1 -> 4" in capsys.readouterr().err
 
 
 def test_a_run_from_a_mesh_is_that_of_the_sweep_which_names_its_file():
@@ -254,6 +412,23 @@ def test_halving_trains_many_a_little_and_few_in_full(tmp_path, monkeypatch):
     trained = len(fakes.trained)
     assert halving.main(command) == 0
     assert len(fakes.trained) == trained
+
+
+def test_what_fails_in_the_last_rung_is_in_the_status(tmp_path, monkeypatch, capsys):
+    path, fakes = _write(tmp_path, SWEEP), Trained()
+    fakes.broken = {"one/half"}
+
+    def run_jobs(jobs):
+        return runner.run_jobs(jobs, start=fakes.start)
+
+    monkeypatch.setattr(halving.search, "__defaults__", (run_jobs,))
+    command = [str(path), "--scenes", str(tmp_path / "scenes"), "--output", str(tmp_path / "out")]
+    command += ["--joint", "0", "--rungs", "1"]
+    assert halving.main(command) == 1
+    assert "1 of the last rung failed, and are not compared: one/half" in capsys.readouterr().err
+    assert "half (1 of 2)" in (tmp_path / "out" / "front.md").read_text()
+    fakes.broken = set()
+    assert halving.main(command) == 0
 
 
 FAKE_JOB = """

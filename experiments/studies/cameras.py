@@ -4,7 +4,8 @@
 
 Disturbs the training cameras of a scene, trains on them, refines the cameras against what was
 trained, trains anew, and so on; and trains with the true cameras. Runs that are there already are
-opened instead, so an interrupted study goes on where it stopped.
+opened instead, so an interrupted study goes on where it stopped; those with other settings or
+cameras are refused. Disturbed colours are in no record: take another folder for these.
 
 Photographs say nothing about where the object is in the world. The test cameras, which are not
 disturbed, are therefore moved by the similarity that takes the true training cameras to those that
@@ -19,6 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from earlier_runs import evaluated_mean, is_trained, open_run
 from scipy.spatial.transform import Rotation
 
 from geosplat_jax.core.allocator import retain_freed_memory
@@ -91,12 +93,10 @@ def with_training_views(dataset: Dataset, views: Views) -> Dataset:
 
 def train_or_open(dataset: Dataset, folder: Path, arguments: argparse.Namespace) -> Run:
     """Train, or open the run that the folder holds."""
-    if (folder / "training.json").exists():
-        run = Run(folder)
-        run.dataset = dataset
-        return run
-    began = time.perf_counter()
     config = make_config(quality=arguments.quality, overrides=USUAL)
+    if is_trained(folder):
+        return open_run(folder, config, dataset)
+    began = time.perf_counter()
     run = train(dataset, folder, config, begin=Anew(replace=True))
     print(f"{folder.name}: trained in {time.perf_counter() - began:.0f} s", flush=True)
     return run
@@ -115,12 +115,9 @@ def evaluated(run: Run, test: Views, gauge: Similarity | None, samples: int) -> 
 
     Metrics that are there already are taken.
     """
-    path = run.folder.path / "metrics.json"
-    if not path.exists():
-        views = test if gauge is None else gauge.views(test)
-        run.dataset = replace(run.dataset, test=views)
-        run.evaluate(samples=samples)
-    mean = run.metrics["mean"]
+    views = test if gauge is None else gauge.views(test)
+    run.dataset = replace(run.dataset, test=views)
+    mean = evaluated_mean(run, samples)
     return [f"{mean[key]:.3f}" if key in mean else "-" for key in MEASURES.values()]
 
 

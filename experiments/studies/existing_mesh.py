@@ -19,7 +19,7 @@ Splats do not become free (`stages.refine.steps=0`): that leaves the surface whe
 
 Columns: Chamfer distance (mean of both directions, in thousandths of the object's longest side),
 normal error of the test views, PSNR of new views, of relit ones and of albedo. Runs that are there
-already are opened instead.
+already are opened instead, and refused where they have other settings.
 """
 
 import argparse
@@ -28,6 +28,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from earlier_runs import evaluated_mean, is_trained, open_run
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
@@ -105,20 +106,16 @@ def chamfer(mesh: trimesh.Trimesh, truth: trimesh.Trimesh) -> float:
 
 def train_or_open(dataset: Dataset, folder: Path, overrides: list[str], quality: str, mesh) -> Run:
     """Train, or open the run that the folder holds."""
-    if (folder / "training.json").exists():
-        run = Run(folder)
-        run.dataset = dataset
-        return run
     config = make_config(quality=quality, mesh=mesh, overrides=(*USUAL, *overrides))
+    if is_trained(folder):
+        return open_run(folder, config, dataset)
     return train(dataset, folder, config, begin=Anew(replace=True))
 
 
 def row(run: Run, truth: trimesh.Trimesh, samples: int) -> dict[str, float]:
     """Evaluate a run, and measure its surface."""
-    if not (run.folder.path / "metrics.json").exists():
-        run.evaluate(samples=samples)
+    mean = evaluated_mean(run, samples)
     vertices, faces, _ = run.renderer().mesh()
-    mean = run.metrics["mean"]
     return {
         "Chamfer": chamfer(trimesh.Trimesh(vertices, faces, process=False), truth),
         **{name: mean[key] for name, key in MEASURES.items() if key in mean},

@@ -2,8 +2,8 @@
 
 The split sum leaves a light that was told apart from materials by an approximation. This study
 takes the split-sum stage of a run, learns nothing but light and exposure for some steps of Monte
-Carlo with the materials of the split sum, and then trains the stage `monte_carlo` as ever; compare
-with the run itself by ``geosplat-jax evaluate``::
+Carlo with the materials of the split sum, and then trains `monte_carlo` and the stages after it as
+ever; compare with the run itself by ``geosplat-jax evaluate``::
 
     python experiments/studies/light.py RUN --output OTHER [--steps 60] [--rate 0.02]
 """
@@ -14,9 +14,9 @@ from pathlib import Path
 
 from geosplat_jax.core.allocator import retain_freed_memory
 from geosplat_jax.fit.begin import TakeOver
-from geosplat_jax.fit.config import Rate
+from geosplat_jax.fit.config import Config, Rate
 from geosplat_jax.fit.listener import Listener, Progress
-from geosplat_jax.fit.presets import MONTE_CARLO, SPLIT_SUM
+from geosplat_jax.fit.presets import MONTE_CARLO
 from geosplat_jax.fit.runtime import enable_compilation_cache
 from geosplat_jax.fit.train import fit
 from geosplat_jax.run import Run
@@ -31,6 +31,28 @@ class _Printed(Listener):
             print(progress.step, progress.stage, f"{progress.psnr:.2f} dB")
 
 
+def with_light_stage(config: Config, *, steps: int, rate: float) -> Config:
+    """Return the settings of a run with a stage that learns the light alone before Monte Carlo.
+
+    Parameters
+    ----------
+    config : of the run; its other stages stay as they are.
+    steps : of the new stage.
+    rate : of the light; exposure learns at half of it.
+    """
+    after = config.stage(MONTE_CARLO)
+    place = config.stages.index(after)
+    learned = {"light": Rate(rate), "exposure": Rate(0.5 * rate)}
+    light = replace(
+        after,
+        name="light",
+        steps=steps,
+        enter=(),
+        rates={name: learned.get(name, Rate(0.0)) for name in after.rates},
+    )
+    return replace(config, stages=(*config.stages[:place], light, *config.stages[place:]))
+
+
 def main() -> None:
     """Train with a stage between the two."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -42,17 +64,7 @@ def main() -> None:
     enable_compilation_cache()
     retain_freed_memory()
     run = Run(arguments.run)
-    config = run.config
-    after = config.stage(MONTE_CARLO)
-    learned = {"light": Rate(arguments.rate), "exposure": Rate(0.5 * arguments.rate)}
-    light = replace(
-        after,
-        name="light",
-        steps=arguments.steps,
-        enter=(),
-        rates={name: learned.get(name, Rate(0.0)) for name in after.rates},
-    )
-    config = replace(config, stages=(config.stage(SPLIT_SUM), light, after))
+    config = with_light_stage(run.config, steps=arguments.steps, rate=arguments.rate)
     begin = TakeOver(arguments.run, "light")
     fit(run.dataset, config, arguments.output, begin=begin, listener=_Printed())
 

@@ -9,7 +9,8 @@ first surface, the bounds and the loss see those masks; test views keep the true
 
 Columns: PSNR of new views, everywhere and where the true mask is, error of normals there, PSNR of
 albedo, IoU of the masks of new views, and that of the masks that were trained on. Runs that are
-there already are opened instead.
+there already are opened instead, and refused where they have other settings; the light is not among
+these.
 """
 
 import argparse
@@ -18,6 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from earlier_runs import evaluated_mean
 from existing_mesh import train_or_open
 from masks import background
 from scipy.ndimage import distance_transform_edt
@@ -95,9 +97,8 @@ def main() -> None:
         dataset, overlap = with_margin(base, light, margin)
         folder = arguments.output / f"margin_{margin:+d}"
         run = train_or_open(dataset, folder, arguments.overrides, arguments.quality, None)
-        if not (run.folder.path / "metrics.json").exists():
-            run.evaluate(samples=arguments.samples)
-        mean, seconds = run.metrics["mean"], (run.folder.training() or {})["seconds_total"]
+        mean = evaluated_mean(run, arguments.samples)
+        seconds = (run.folder.training() or {})["seconds_total"]
         row = {name: mean[key] for name, key in MEASURES.items()}
         rows[margin] = {**row, "IoU of the masks": overlap, "minutes": seconds / 60}
         numbers = [f"{value:.3f}" for value in rows[margin].values()]

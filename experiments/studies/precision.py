@@ -238,14 +238,18 @@ def exact(name: str, x: jax.Array) -> jax.Array:
 
 def heads(field: MaterialField, features: jax.Array, spec: MaterialSpec, store: Store):
     """Evaluate `materials.attributes_at` behind the encoding, with every activation stored."""
-    field = jax.tree.map(lambda w: store("MLP weights", w), replace(field, albedo_table=None))
     active = []
 
+    def affine(layer: Layer, x: jax.Array) -> jax.Array:
+        x = x @ layer.weights
+        return x if layer.bias is None else x + layer.bias[None, :]
+
     def apply(layers: tuple[Layer, ...], x: jax.Array) -> jax.Array:
+        layers = jax.tree.map(lambda w: store("MLP weights", w), layers)
         for layer in layers[:-1]:
-            x = store("MLP activations", jax.nn.relu(x @ layer.weights))
+            x = store("MLP activations", jax.nn.relu(affine(layer, x)))
             active.append(x > 0)
-        return x @ layers[-1].weights
+        return affine(layers[-1], x)
 
     surface = apply(field.surface_head, features)
     logits = jnp.stack(

@@ -14,7 +14,8 @@ scene has a true mesh; recall of thin parts: of the pixels that an opening of th
 disc of 3 pixels takes away, the share that the render covers by more than half; seconds of a step
 (median) and of the whole; largest memory. Below, the powers of the cells that Gaussians, seconds
 of a step and memory grow with, by least squares on logarithms. ``--picture`` shows the object of
-the first scene in its first test view: render, normals and mesh, the truth first.
+the first scene in its first test view: render, normals and mesh, the truth first. Runs that are
+there already are opened instead, and refused where they have other settings.
 """
 
 import argparse
@@ -25,12 +26,15 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from earlier_runs import evaluated_mean, is_trained, open_run
 from existing_mesh import chamfer
 from PIL import Image
 from skimage.morphology import disk, opening
 
 from geosplat_jax.core.allocator import retain_freed_memory
+from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.runtime import enable_compilation_cache
+from geosplat_jax.io.dataset import Dataset, load_dataset
 from geosplat_jax.io.meshes import read_mesh
 from geosplat_jax.io.views import Views
 from geosplat_jax.run import Run
@@ -40,10 +44,10 @@ THIN_RADIUS = 3
 COMMAND = "import sys; from geosplat_jax.cli import main; sys.exit(main())"
 
 
-def train(scene: Path, folder: Path, grid: str, cells: int, arguments: argparse.Namespace) -> None:
-    """Train in a process of its own, where it has not been done."""
-    if (folder / "training.json").exists():
-        return
+def train(
+    dataset: Dataset, folder: Path, grid: str, cells: int, arguments: argparse.Namespace
+) -> Run:
+    """Train in a process of its own, or open the run that the folder holds."""
     steps = arguments.steps
     if arguments.proportional:
         steps = round(steps * cells / min(arguments.cells))
@@ -56,10 +60,15 @@ def train(scene: Path, folder: Path, grid: str, cells: int, arguments: argparse.
         "run.preview_every=0",
         *arguments.overrides,
     ]
-    command = [sys.executable, "-c", COMMAND, "train", str(scene), "--output", str(folder)]
+    if is_trained(folder):
+        config = make_config(quality=arguments.quality, overrides=tuple(settings))
+        return open_run(folder, config, dataset)
+    scene = str(dataset.root)
+    command = [sys.executable, "-c", COMMAND, "train", scene, "--output", str(folder)]
     command += ["--quality", arguments.quality, "--downscale", str(arguments.downscale), "--force"]
     command += [part for setting in settings for part in ("--set", setting)]
     subprocess.run(command, check=True)
+    return Run(folder)
 
 
 def thin_recall(run: Run, views: Views) -> float:
@@ -76,9 +85,7 @@ def thin_recall(run: Run, views: Views) -> float:
 
 def row(run: Run, scene: Path, samples: int) -> dict[str, float]:
     """Evaluate a run; measure its surface and what it took."""
-    if not (run.folder.path / "metrics.json").exists():
-        run.evaluate(samples=samples)
-    mean, steps = run.metrics["mean"], run.steps()
+    mean, steps = evaluated_mean(run, samples), run.steps()
     found = {"NVS PSNR": mean["nvs.psnr"]}
     if "normal.mae_masked_deg" in mean:
         found["normals, degrees"] = mean["normal.mae_masked_deg"]
@@ -103,18 +110,19 @@ def exponent(cells: list[int], values: list[float]) -> float:
 def study(scene: Path, arguments: argparse.Namespace) -> dict[str, dict[int, dict[str, float]]]:
     """Train and measure every grid of a scene; print its rows."""
     rows: dict[str, dict[int, dict[str, float]]] = {}
+    dataset = load_dataset(scene, downscale=arguments.downscale)
     for grid in arguments.grids:
         rows[grid] = {}
         for cells in arguments.cells:
             folder = arguments.output / scene.name / f"{grid}_{cells}"
             try:
-                train(scene, folder, grid, cells, arguments)
+                run = train(dataset, folder, grid, cells, arguments)
             except subprocess.CalledProcessError as error:
                 print(
                     f"| {scene.name} | {grid} | {cells} | refused or failed: {error.returncode} |"
                 )
                 continue
-            found = row(Run(folder), scene, arguments.samples)
+            found = row(run, scene, arguments.samples)
             if not rows[grid]:
                 print(f"| scene | grid | cells | {' | '.join(found)} |")
             numbers = " | ".join(f"{value:.4g}" for value in found.values())

@@ -1,0 +1,159 @@
+"""The studies: each can be called, and what they compute beside the package agrees with it."""
+
+import importlib
+import json
+import sys
+from argparse import Namespace
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from support import ball, sphere_dataset, tiny_config, views_from
+
+STUDIES = Path(__file__).resolve().parents[1] / "experiments" / "studies"
+sys.path.insert(0, str(STUDIES))
+
+import cameras  # noqa: E402
+import earlier_runs  # noqa: E402
+import existing_mesh  # noqa: E402
+import light  # noqa: E402
+import precision  # noqa: E402
+import resolution  # noqa: E402
+
+from geosplat_jax.fit.folder import RunFolder  # noqa: E402
+from geosplat_jax.fit.presets import make_config  # noqa: E402
+
+IMAGE = 1e-5
+"""Relative L2 between the same sums in another order, float32; what the study itself asks for."""
+
+OPTIONAL = ("drjit", "matplotlib", "mitsuba")
+"""Modules that not every installation has."""
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in STUDIES.glob("*.py")))
+def test_every_study_says_how_it_is_called(name, monkeypatch, capsys):
+    try:
+        module = importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in OPTIONAL:
+            raise
+        pytest.skip(str(error))
+    if not hasattr(module, "main"):
+        return
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", "--help"])
+    with pytest.raises(SystemExit) as ended:
+        module.main()
+    assert ended.value.code == 0
+    assert f"usage: {name}.py" in capsys.readouterr().out
+
+
+def _with_random_biases(params):
+    """Return parameters whose heads have other biases than the zeros that they start with."""
+    rng = np.random.default_rng(0)
+
+    def shaken(path, x):
+        is_bias = getattr(path[-1], "name", "") == "bias"
+        return x + rng.normal(size=x.shape).astype(np.float32) if is_bias else x
+
+    return jax.tree_util.tree_map_with_path(shaken, params)
+
+
+def test_the_chain_of_the_study_of_precision_is_the_render():
+    pipeline, params = ball(tiny_config("material.bias=true"))
+    params = _with_random_biases(params)
+    camera = views_from([[2.0, 1.0, 0.5]]).camera()
+
+    @jax.jit
+    def both(pipeline, params, camera):
+        expected = pipeline.render(params, camera).rgb[0]
+        return expected, precision.chain(params, camera, pipeline)["image"]
+
+    expected, found = both(pipeline, params, camera)
+    assert float(np.max(expected)) > 0.1
+    assert precision.errors(found, expected)["l2"] < IMAGE
+
+
+def test_a_stage_for_the_light_leaves_all_other_stages_as_they_are():
+    config = make_config(quality="draft")
+    found = light.with_light_stage(config, steps=60, rate=0.02)
+    assert [s.name for s in found.stages] == ["split_sum", "light", "monte_carlo", "refine"]
+    assert [s for s in found.stages if s.name != "light"] == list(config.stages)
+    stage = found.stage("light")
+    rates = {name: rate.value for name, rate in stage.rates.items() if rate.value}
+    assert (stage.steps, rates) == (60, {"light": 0.02, "exposure": 0.01})
+
+
+def _trained(folder, dataset, config):
+    """Leave the records of a run that was trained, and evaluated with 16 samples."""
+    folder.mkdir()
+    RunFolder(folder).begin(dataset, config, replace=False)
+    (folder / "training.json").write_text("{}")
+    figures = {"mean": {"nvs.psnr": 30.0}, "samples": 16, "config": config.to_dict()}
+    (folder / "metrics.json").write_text(json.dumps(figures))
+
+
+def test_earlier_runs_are_opened_where_they_are_those_that_are_wanted(tmp_path):
+    folder, config = tmp_path / "run", tiny_config()
+    dataset = replace(sphere_dataset(size=8), root=tmp_path, options={"downscale": 2})
+    assert not earlier_runs.is_trained(folder)
+    _trained(folder, dataset, config)
+    assert earlier_runs.is_trained(folder)
+    run = earlier_runs.open_run(folder, config, dataset)
+    assert run.dataset is dataset
+    assert earlier_runs.evaluated_mean(run, 16) == {"nvs.psnr": 30.0}
+    with pytest.raises(SystemExit, match="of 16 samples, not 32"):
+        earlier_runs.evaluated_mean(run, 32)
+    steps = tiny_config("stages.split_sum.steps=5")
+    with pytest.raises(SystemExit, match=r"stages\.split_sum\.steps: 4 -> 5"):
+        earlier_runs.open_run(folder, steps, dataset)
+    turned = replace(
+        dataset.train, camera_to_world=np.flip(dataset.train.camera_to_world, axis=0).copy()
+    )
+    others = {
+        "dataset {'downscale': 2}": replace(dataset, options={"downscale": 1}),
+        "scene: ": replace(dataset, root=tmp_path / "other"),
+        "with views ": replace(dataset, train=turned),
+    }
+    for said, other in others.items():
+        with pytest.raises(SystemExit, match=said):
+            earlier_runs.open_run(folder, config, other)
+
+
+def _cameras(dataset, folder, quality):
+    return cameras.train_or_open(dataset, folder, Namespace(quality=quality))
+
+
+def _existing_mesh(dataset, folder, quality):
+    return existing_mesh.train_or_open(dataset, folder, [], quality, None)
+
+
+def _resolution(dataset, folder, quality):
+    settings = {"steps": 200, "proportional": False, "quality": quality, "overrides": []}
+    return resolution.train(dataset, folder, "box", 32, Namespace(**settings))
+
+
+@pytest.mark.parametrize(
+    ("open_with", "overrides"),
+    [
+        (_cameras, cameras.USUAL),
+        (_existing_mesh, existing_mesh.USUAL),
+        (
+            _resolution,
+            (
+                "geometry.resolution=32",
+                "stages.split_sum.steps=200",
+                "stages.monte_carlo.steps=0",
+                "stages.refine.steps=0",
+                "run.preview_every=0",
+            ),
+        ),
+    ],
+)
+def test_studies_open_runs_with_their_settings_and_no_others(tmp_path, open_with, overrides):
+    dataset = replace(sphere_dataset(size=8), root=tmp_path)
+    _trained(tmp_path / "run", dataset, make_config(quality="draft", overrides=overrides))
+    assert open_with(dataset, tmp_path / "run", "draft").dataset is dataset
+    with pytest.raises(SystemExit, match="holds a run with other settings"):
+        open_with(dataset, tmp_path / "run", "standard")
