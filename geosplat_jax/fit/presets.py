@@ -552,8 +552,8 @@ def _finished(
     """Put a mesh and overrides, in this order, over the values of a preset."""
     if mesh is not None:
         values = with_mesh(config_from_dict(values), mesh).to_dict()
-    # Kinds come first, so that settings of theirs may follow one by one; with them numbers of steps,
-    # since of a stage without any nothing is asked.
+    # Kinds come first, so that settings of theirs may follow one by one; and with them numbers of
+    # steps, since of a stage without any nothing is asked.
     names = [text.partition("=")[0].strip() for text in overrides]
     if any(name.endswith(".kind") for name in names):
         for name, override in zip(names, overrides, strict=True):
