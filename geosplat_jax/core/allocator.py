@@ -11,6 +11,16 @@ import sys
 _RETAINING = {-8: 1, -4: 0, -1: -1, -2: 1 << 28}
 
 
+def _glibc() -> ctypes.CDLL | None:
+    """Return the C library of this process if it is glibc."""
+    if not sys.platform.startswith("linux"):
+        return None
+    try:
+        return ctypes.CDLL("libc.so.6")
+    except OSError:
+        return None
+
+
 def retain_freed_memory() -> bool:
     """Make glibc reuse freed memory instead of returning it; False where that is impossible.
 
@@ -19,10 +29,15 @@ def retain_freed_memory() -> bool:
     the first thread is started: glibc gives a thread an arena of its own until it is told not to,
     and puts later threads into that one, too; but only the first arena holds large blocks.
     """
-    if not sys.platform.startswith("linux"):
-        return False
-    try:
-        libc = ctypes.CDLL("libc.so.6")
-    except OSError:
-        return False
-    return all(libc.mallopt(name, value) for name, value in _RETAINING.items())
+    libc = _glibc()
+    return libc is not None and all(libc.mallopt(*option) for option in _RETAINING.items())
+
+
+def release_freed_memory() -> None:
+    """Give back, once, what is free now: what a compiler took beside a training, say.
+
+    Its small pieces lie in between, so that large blocks do not fit there again.
+    """
+    libc = _glibc()
+    if libc is not None:
+        libc.malloc_trim(0)

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 
+from geosplat_jax.core.allocator import release_freed_memory
 from geosplat_jax.core.capacity import Capacities, Counts, tightened
 from geosplat_jax.fit.compilation import THREADS, compile_step
 from geosplat_jax.fit.config import Config, Stage
@@ -112,6 +113,7 @@ class Upcoming:
                 threads=THREADS // 2,  # the steps before need the other half
                 is_wanted=lambda: self._is_wanted,
             )
+            release_freed_memory()
 
         self._planned = in_background(plan)
         self.compiled = in_background(compile_all)
