@@ -50,6 +50,10 @@ class PerPixel(ShadingDomain, kind="per_pixel"):
         """Where points lie on the mesh."""
         return self.points == "mesh"
 
+    def without_rays(self) -> "PerPixel":
+        """Blend positions, too."""
+        return replace(self, points="splats")
+
     @property
     def shades_splats(self) -> bool:
         """Every view has its own pixels."""

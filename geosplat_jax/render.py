@@ -149,6 +149,10 @@ class ShadingDomain(Variant, abc.ABC):
         """Whether it traces rays of its own against the surface."""
         return False
 
+    def without_rays(self) -> "ShadingDomain":
+        """Return the same domain with points that need no rays."""
+        return self
+
     @property
     def shades_splats(self) -> bool:
         """Whether its points are the splats, whose light serves every view."""

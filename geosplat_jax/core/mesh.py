@@ -46,19 +46,23 @@ def closest_on_faces(
     margin : the face is taken to be smaller by this share, about its centre, so that what is found
         lies off its edges.
     """
-    corners = mesh.vertices.at[mesh.faces.at[faces].get(mode="clip")].get(mode="clip")
+    # (3, 3, N): components, corners, rows; the arithmetic runs along contiguous rows.
+    corners = mesh.vertices.at[mesh.faces.at[faces].get(mode="clip").T].get(mode="clip")
+    corners = jnp.moveaxis(corners, -1, 0)
     corners = corners - margin * (corners - jnp.mean(corners, axis=1, keepdims=True))
     edges = jnp.roll(corners, -1, axis=1) - corners
-    normals = safe_normalize(jnp.cross(edges[:, 0], edges[:, 1]))
-    away = points[:, None, :] - corners
-    above = jnp.sum(away[:, 0] * normals, axis=-1, keepdims=True)
-    projected = points - above * normals
-    is_within = jnp.sum(jnp.cross(edges, away) * normals[:, None, :], axis=-1) >= 0.0
-    part = safe_divide(jnp.sum(away * edges, axis=-1), jnp.sum(edges * edges, axis=-1))
-    on_edges = corners + jnp.clip(part, 0.0, 1.0)[..., None] * edges
-    distance = jnp.sum((points[:, None, :] - on_edges) ** 2, axis=-1)
-    nearest = jnp.take_along_axis(on_edges, jnp.argmin(distance, axis=1)[:, None, None], axis=1)
-    return jnp.where(jnp.all(is_within, axis=1)[:, None], projected, nearest[:, 0])
+    normals = safe_normalize(jnp.cross(edges[:, 0], edges[:, 1], axis=0), axis=0)
+    away = points.T[:, None, :] - corners
+    projected = points.T - jnp.sum(away[:, 0] * normals, axis=0, keepdims=True) * normals
+    inwards = jnp.cross(normals[:, None, :], edges, axis=0)
+    is_within = jnp.all(jnp.sum(inwards * away, axis=0) >= 0.0, axis=0)
+    part = safe_divide(jnp.sum(away * edges, axis=0), jnp.sum(edges * edges, axis=0))
+    on_edges = corners + jnp.clip(part, 0.0, 1.0)[None] * edges
+    first, second, third = jnp.sum((points.T[:, None, :] - on_edges) ** 2, axis=0)
+    nearest = jnp.where((second < first)[None], on_edges[:, 1], on_edges[:, 0])
+    is_third = third < jnp.minimum(first, second)
+    nearest = jnp.where(is_third[None], on_edges[:, 2], nearest)
+    return jnp.where(is_within[None], projected, nearest).T
 
 
 def vertex_normals(mesh: Mesh) -> Float[Array, "Cv 3"]:

@@ -100,6 +100,10 @@ def _with_stages(config: Config, stages: Iterable[Stage]) -> Config:
     return replace(config, stages=tuple(stages))
 
 
+def _without_rays(stage: Stage) -> Stage:
+    return replace(stage, transport=SplitSumSettings(), domain=stage.domain.without_rays())
+
+
 def _without_indirect_weight(stage: Stage) -> Stage:
     return replace(stage, weights={n: w for n, w in stage.weights.items() if n != "indirect"})
 
@@ -112,7 +116,11 @@ class Shadows(Part):
     """
 
     name, title = "shadows", "traced shadows"
-    settings = ("stages.*.transport.kind", "stages.*.transport.occlusion")
+    settings = (
+        "stages.*.transport.kind",
+        "stages.*.transport.occlusion",
+        "stages.*.domain.points",
+    )
     is_photographed = False
 
     def removed(self, config: Config) -> Config:
@@ -122,7 +130,7 @@ class Shadows(Part):
             (
                 stage
                 if isinstance(stage.transport, SplitSumSettings) or not stage.steps
-                else _without_indirect_weight(replace(stage, transport=SplitSumSettings()))
+                else _without_indirect_weight(_without_rays(stage))
                 for stage in config.stages
             ),
         )
