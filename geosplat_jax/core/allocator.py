@@ -1,7 +1,7 @@
 """What the memory allocator of this process does with freed memory.
 
-Light, so that a command can set it before it imports or starts anything. Called by commands and
-benchmarks, never on import: a library must not change its host process.
+Light, so that a command can set it before it imports or starts anything. Only commands and
+benchmarks call `retain_freed_memory`: a library must not change its host process.
 """
 
 import ctypes

@@ -56,6 +56,7 @@ def closest_on_faces(
     projected = points.T - jnp.sum(away[:, 0] * normals, axis=0, keepdims=True) * normals
     inwards = jnp.cross(normals[:, None, :], edges, axis=0)
     is_within = jnp.all(jnp.sum(inwards * away, axis=0) >= 0.0, axis=0)
+    is_within &= jnp.any(normals != 0.0, axis=0)  # without area it has edges only
     part = safe_divide(jnp.sum(away * edges, axis=0), jnp.sum(edges * edges, axis=0))
     on_edges = corners + jnp.clip(part, 0.0, 1.0)[None] * edges
     first, second, third = jnp.sum((points.T[:, None, :] - on_edges) ** 2, axis=0)
