@@ -1,14 +1,14 @@
 # Two commands: `make demo` and `make test`. Both make their own environment in .venv.
 # `make test-slow` adds slow tests: whole runs, compiled against eager, images beside Mitsuba's;
 # `make test-long` those of half a minute or more, by hand: the whole loss against differences, a whole
-# sweep, two hosts, another process. `.ci/run` runs the first two, the slow ones where a machine is fast enough.
+# sweep, two hosts, another process. `.ci/run` runs the first, and of the second what fits into half an hour.
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 INSTALLED = $(VENV)/.installed
 DEMO = demo
 
-.PHONY: demo test test-slow test-computing test-long lint format bench docs clean
+.PHONY: demo test test-slow test-compiling test-computing test-long lint format bench docs clean
 
 $(INSTALLED): pyproject.toml
 	$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "geosplat_jax needs Python 3.11 or newer, got " + sys.version'
@@ -25,9 +25,10 @@ IN_FILES = --numprocesses 2 --dist loadfile --no-loadscope-reorder
 test: $(INSTALLED)
 	$(BIN)/python -m pytest $(IN_FILES) -m 'not slow'
 
-test-slow: $(INSTALLED)
+test-slow: test-compiling test-computing
+
+test-compiling: $(INSTALLED)
 	$(BIN)/python -m pytest $(IN_FILES) -m 'slow and not computes and not long'
-	$(MAKE) test-computing
 
 # These compute more than they compile: with the optimisations that the others do without.
 test-computing: $(INSTALLED)

@@ -18,7 +18,10 @@ from jaxtyping import install_import_hook
 
 install_import_hook("geosplat_jax", "beartype.beartype")
 
-from geosplat_jax.fit.runtime import enable_compilation_cache  # noqa: E402
+from geosplat_jax.fit.runtime import (  # noqa: E402
+    enable_compilation_cache,
+    release_programs_when_crowded,
+)
 
 # The same examples in every run; `--hypothesis-profile=default` looks for others.
 settings.register_profile("same examples", derandomize=True)
@@ -67,12 +70,12 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(autouse=True, scope="module")
 def _release_compiled_programs():
-    """Forget what a file compiled: every program holds memory maps, of which Linux grants 65,530.
+    """Forget what was compiled once that is too much for one process.
 
-    Thousands of programs in one process end in a crash of the compiler.
+    Until then, files find each other's programs without tracing them again.
     """
     yield
-    jax.clear_caches()
+    release_programs_when_crowded()
 
 
 @pytest.fixture(scope="module")

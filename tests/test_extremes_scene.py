@@ -319,9 +319,8 @@ def test_coverage_is_the_disc_of_the_sphere_through_any_lens(degrees, distance):
     assert norm(result[2].geometry.sdf) > 0.0
 
 
-@pytest.mark.parametrize(
-    "size", [(1, 1), pytest.param((1, 20), marks=[pytest.mark.slow, pytest.mark.long])]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(1, 1), pytest.param((1, 20), marks=pytest.mark.long)])
 def test_one_small_view_has_a_finite_loss_and_gradient(size):
     lens = {"field_of_view": 2 * np.arctan(0.5 * min(size) / 30.0)}  # a focal length of 30 pixels
     total, report, gradient = evaluate(

@@ -73,6 +73,8 @@ def steps(monkeypatch):
         monkeypatch.setattr(loop_module, "train_step", told)
         monkeypatch.setattr(loop_module, "compile_step", lambda *a, **k: True)
         monkeypatch.setattr(loop_module, "plan_capacities", lambda *a, **k: Capacities(hits=128))
+        # Else the next stage would be planned and compiled beside these steps.
+        monkeypatch.setattr(loop_module.Loop, "_following", lambda *a: None)
         return told
 
     return install

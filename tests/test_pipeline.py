@@ -57,7 +57,11 @@ def sky(seed=0):
 
 
 def problem(*overrides, stage="monte_carlo"):
-    """Settings, pipeline, parameters away from any symmetry, and a batch."""
+    """Settings, pipeline, parameters away from any symmetry, and a batch of two views.
+
+    Its shapes are those of every test that differentiates the whole loss, which compiles for half a
+    minute.
+    """
     config = tiny_config(*SMALL, *overrides)
     pipeline, params = ball(config, stage=stage)
     rng = np.random.default_rng(0)
@@ -76,7 +80,10 @@ def problem(*overrides, stage="monte_carlo"):
         log_exposure=jnp.asarray(0.1),
     )
     views = sphere_views(2, size=14)
-    batch = Batch(views.camera([0]), jnp.asarray(views.images[:1]), jax.random.key(1))
+    everywhere = jnp.ones(views.images.shape[:3])
+    batch = Batch(
+        views.camera([0, 1]), jnp.asarray(views.images), jax.random.key(1), valid=everywhere
+    )
     return config, replace(pipeline, capacities=TIGHT), params, batch
 
 
@@ -175,7 +182,7 @@ def test_the_report_of_several_views_is_their_mean_with_the_larger_needs():
 
 def test_what_is_in_pixels_that_do_not_count_does_not_matter(second):
     _, pipeline, params, batch = second
-    valid = jnp.ones(batch.image.shape[:3]).at[:, :5].set(0.0)
+    valid = batch.valid.at[:, :5].set(0.0)
     found = []
     for spoilt in (0.0, jnp.nan, jnp.inf):
         image = jnp.where(valid[..., None] > 0, batch.image, spoilt)

@@ -91,9 +91,11 @@ def test_a_dataset_is_not_read_again(folder):
 
 def test_a_run_reads_the_views_that_it_was_trained_with(folder):
     dataset = gs.load_dataset(folder / "duck", downscale=8, train_views=5, test_views=2)
-    run = gs.train(dataset, folder / "few", gs.make_config(overrides=SETTINGS))
+    begun = RunFolder(folder / "few")
+    with begun.locked():
+        begun.begin(dataset, gs.make_config(overrides=SETTINGS), replace=False)
     again = gs.Run(folder / "few").dataset
-    assert again.train.names == run.dataset.train.names
+    assert again.train.names == dataset.train.names
     assert (len(again.train), len(again.test)) == (5, 2)
 
 

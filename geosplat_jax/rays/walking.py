@@ -3,8 +3,9 @@
 What is listed, and how it is tested, belongs to the subclasses of `CellIndex`. A cell without a
 list knows, for each of the eight octants of directions, how large a cube of such cells begins with
 it, so that a ray crosses empty space in few steps; one that leaves a convex part of the surface is
-out of the grid after one or two. The method is exact: a ray tests everything that the cells which
-it passes list.
+out of the grid after one or two. The method leaves nothing out: a ray tests everything that the
+cells which it passes list. A ray aimed at an edge to within rounding may pass between the two
+triangles that share it, since each of them decides for itself on which side the ray passes.
 
 Nothing here is differentiable: visibility has no gradient by contract.
 
