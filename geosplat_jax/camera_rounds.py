@@ -6,10 +6,13 @@ docs/cameras.md.
 """
 
 import json
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.cameras import CameraSettings, ViewProgress
@@ -28,12 +31,12 @@ _RECORD = "rounds.json"
 
 def rounds_folder(output: str | Path) -> Path:
     """Return the folder beside a run's own that the rounds are kept in."""
-    path = Path(output)
+    path = Path(os.path.abspath(Path(output).expanduser()))
     return path.with_name(f"{path.name}_cameras")
 
 
 def round_config(material_prior: str = "hybrid") -> Config:
-    """Return the settings of a round: half the split sum of a draft, and splats on the surface.
+    """Return the settings of a round: a draft with half its split sum that is not refined.
 
     What rounds recover was measured so (docs/cameras.md); longer rounds and free splats were not
     tried.
@@ -116,19 +119,21 @@ def refined_cameras(
     if rounds < 1:
         raise ValueError(f"refining cameras takes one round at least, got {rounds}")
     config = config or round_config()
-    options, cameras, how = dict(reading or {}), Path(), how or CameraSettings()
+    beside, options = rounds_folder(output), dict(reading or {})
+    cameras, how = Path(), how or CameraSettings()
     dataset: Dataset | None = load_recorded(scene, options)
     assert dataset is not None
     made_with = {
         "scene": str(Path(scene).resolve()),
         "reading": options,
         "views": [dataset.train.fingerprint(), dataset.test.fingerprint()],
+        "masks": [np.round(views.coverage, 6).tolist() for views in (dataset.train, dataset.test)],
         "config": config.to_dict(),
         "refinement": asdict(how),
     }
-    _require_same(rounds_folder(output), made_with)
+    _require_same(beside, made_with)
     for number in range(1, rounds + 1):
-        folder = rounds_folder(output) / f"round_{number}"
+        folder = beside / f"round_{number}"
         cameras = folder.with_suffix(".json")
         if not cameras.exists():
             if dataset is None:
@@ -136,4 +141,5 @@ def refined_cameras(
             run = train(dataset, folder, config, begin=Resume(), listener=listener)
             run.refine_cameras(cameras, how=how, on_view=on_view)
         options["cameras"], dataset = cameras, None
+        options.pop("cameras_digest", None)  # of the cameras before
     return cameras

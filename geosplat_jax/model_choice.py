@@ -108,7 +108,7 @@ class ChosenModel:
 
 def choice_folder(output: str | Path) -> Path:
     """Return the folder beside a run's own that trials are made in."""
-    path = Path(output)
+    path = Path(os.path.abspath(Path(output).expanduser()))
     return path.with_name(f"{path.name}_model")
 
 
@@ -165,9 +165,7 @@ def choose_model(
     return ChosenModel(
         config=trials.model(kept),
         rungs=tuple(rungs),
-        by_hand=tuple(
-            part.title for part in LADDER if part.is_in(config) and part.is_set(how.by_hand)
-        ),
+        by_hand=tuple(part.title for part in LADDER if part.is_in(config) and part not in offered),
         held_back=trials.held.names,
         trainings=trials.count,
         seconds=trials.seconds,

@@ -63,6 +63,9 @@ class FreeSplatParameters(eqx.Module):
     indirect: Float[Array, "N c"] | None = learned("splat_indirect")
 
 
+INDIRECT_GROUP = "splat_indirect"
+"""Learning rate of what only splats have whose light transport learns indirect light."""
+
 RATE_GROUPS = (
     "splat_means",
     "splat_scales",
@@ -70,7 +73,7 @@ RATE_GROUPS = (
     "splat_normals",
     "splat_opacities",
     "splat_albedo",
-    "splat_indirect",
+    INDIRECT_GROUP,
 )
 """Learning rates of `FreeSplatParameters`, field by field."""
 

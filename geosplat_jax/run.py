@@ -491,6 +491,7 @@ def train(
     model: Literal["auto"] | ModelChoice | None = None,
     devices: int | Devices = 1,
     listener: Listener = NOBODY,
+    began: float | None = None,
     **reading: Any,
 ) -> Run:
     """Train a scene into a run's folder.
@@ -506,8 +507,9 @@ def train(
         it, ``TakeOver(run, stage)`` takes the stages before one from another run; by default the
         folder must hold none.
     budget : time and memory that the training may take. Without ``config``, settings are chosen for
-        it (`plan_training`); in any case steps are made fewer or more on the way, so that it ends
-        in time. A run that is resumed keeps its own, and has what is left of it.
+        it (`plan_training`), as its memory asks for; in any case steps are made fewer or more on
+        the way, so that it ends in time. A run that is resumed keeps its own, and has what is left
+        of it; one that began without has none.
     model : ``auto``, or how to choose: train the smallest model that explains the scene, see
         `model_choice.choose_model`. Of the parts of ``config``, those stay as they are whose
         settings differ from its preset, or are named in ``by_hand``. A run that is resumed keeps
@@ -516,6 +518,7 @@ def train(
         (docs/devices.md); all processes that `jax.distributed.initialize` connected take part, with
         so many each. Or what `fit.devices.choose_devices` made of it before.
     listener : told of every step, compilation, preview, and part of a model that was tried.
+    began : `time.perf_counter` when the time of the training began to count; by default now.
     reading : how to read the scene: ``downscale``, ``light``, ``bounds`` (six numbers),
         ``cameras`` (a file of `Run.refine_cameras`), and what else `load_dataset` takes.
 
@@ -526,11 +529,12 @@ def train(
     SceneError, RunError, TrainingError, Interrupted
         See `load_dataset` and `fit.train.fit`.
     ValueError
-        If the mesh cannot be used, see `io.start_mesh`; if a model is to be chosen under a budget,
-        for stages of another run, or from too few views.
+        If the mesh cannot be used, see `io.start_mesh`, or is another than that of the settings; if
+        a model is to be chosen under a budget, for stages of another run, by several hosts, or from
+        too few views.
     """
     _require_consistent(scene, reading, chooses=model is not None, budget=budget, begin=begin)
-    started, folder = time.perf_counter(), RunFolder(output)
+    started, folder = time.perf_counter() if began is None else began, RunFolder(output)
     if isinstance(devices, int):
         devices = choose_devices(devices)
     goes_on = begin.goes_on(folder)
@@ -604,6 +608,8 @@ def _require_consistent(
         )
     if chooses and (budget is not None or begin.takes_over):
         raise ValueError("a model is chosen for a whole training without a budget; leave model out")
+    if chooses and jax.process_count() > 1:
+        raise ValueError("a model is chosen by one host; leave model out")
 
 
 def _as_it_began(order: _Order, folder: RunFolder, *, chooses: bool) -> _Order:
@@ -618,6 +624,8 @@ def _as_it_began(order: _Order, folder: RunFolder, *, chooses: bool) -> _Order:
             "anew with --force"
         )
     config, mesh, budget, reading = order
+    if budget is not None and folder.budget() is None:
+        raise RunError(f"the run in {folder} was begun without a budget; leave that out")
     keeps_model = folder.has_chosen_model and (config is None or chooses)
     has_budget = folder.budget() is not None
     if keeps_model or (has_budget and config in (None, folder.planned())):

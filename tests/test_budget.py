@@ -11,6 +11,7 @@ from support import sphere_dataset, tiny_config
 
 from geosplat_jax import cli
 from geosplat_jax import run as run_module
+from geosplat_jax.fit import budget as budget_module
 from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.budget import (
     Pacer,
@@ -35,6 +36,12 @@ from geosplat_jax.fit.train import fit
 from geosplat_jax.run import train
 
 SIZE = (200, 200)
+
+
+@pytest.fixture(autouse=True)
+def _large_machine(monkeypatch):
+    """Choices are those of a machine with memory for any of them."""
+    monkeypatch.setattr(budget_module, "memory_of_machine", lambda: 10**12)
 
 
 def _cells(config):
@@ -115,6 +122,37 @@ def test_little_memory_chooses_fewer_cells_or_is_refused():
     assert _cells(tight.config) < _cells(free.config)
     with pytest.raises(TrainingError, match="more than --memory allows"):
         plan(Budget(1200.0, memory=1e9), SIZE, slowness=1.0)
+
+
+def test_no_more_memory_is_asked_for_than_the_machine_has(monkeypatch):
+    free = plan(Budget(1200.0), SIZE, slowness=1.0)
+    monkeypatch.setattr(budget_module, "memory_of_machine", lambda: int(5e9))
+    tight = plan(Budget(1200.0), SIZE, slowness=1.0)
+    assert tight.memory <= 5e9 < free.memory
+    assert plan(Budget(1200.0, memory=20e9), SIZE, slowness=1.0).memory == tight.memory
+    # What a training takes is only expected: the least is tried, and refused once it is known.
+    monkeypatch.setattr(budget_module, "memory_of_machine", lambda: int(1e9))
+    assert plan(Budget(1200.0), SIZE, slowness=1.0).memory < tight.memory
+    monkeypatch.setattr(budget_module, "memory_of_machine", lambda: None)
+    assert plan(Budget(1200.0), SIZE, slowness=1.0).memory == free.memory
+
+
+def test_a_training_without_steps_is_refused():
+    overrides = [f"stages.{name}.steps=0" for name in make_config().stage_names]
+    with pytest.raises(TrainingError, match="nothing to train"):
+        plan(Budget(600.0), SIZE, slowness=1.0, overrides=overrides)
+
+
+def test_a_run_on_its_pace_is_left_alone_whichever_stage_it_begins_with():
+    config = make_config("default", "draft", overrides=("stages.split_sum.steps=0",))
+    costs = {stage.name: StageCost(0.0, 0.1) for stage in config.stages}
+    now = [0.0]
+    budget = Budget(0.1 * config.total_steps)
+    pacer, stage = Pacer(budget, config, costs, clock=lambda: now[0]), config.stage("monte_carlo")
+    for done in range(1, 41):
+        now[0] += 0.1
+        pacer.note(stage.name, 0.1)
+        assert pacer.adjusted(config, stage, done) is None
 
 
 def test_large_photographs_are_reduced_to_what_the_cells_show():
@@ -433,6 +471,33 @@ def test_python_resumes_a_budget_with_the_same_call_or_a_shorter_one(
     assert run.folder.budget() == Budget(60.0)
     # With less than a minute left no preview is begun, which the end would have to wait for.
     assert not run.folder.previews.exists()
+
+
+def test_a_run_that_was_begun_without_a_budget_takes_none_later(dataset, tmp_path, capsys):
+    run = RunFolder(tmp_path / "run")
+    with run.locked():
+        run.begin(dataset, tiny_config(), replace=False)
+    with pytest.raises(RunError, match="begun without a budget"):
+        train(dataset, run.path, tiny_config(), begin=Resume(), budget=Budget(600.0))
+    command = ["train", "examples/duck", "--output", str(run.path), "--resume"]
+    assert cli.main([*command, "--budget", "5min"]) == 2
+    assert "was begun without a budget; leave --budget out" in " ".join(
+        capsys.readouterr().err.split()
+    )
+
+
+def test_the_time_of_a_budget_counts_from_when_it_is_said_to(dataset, tmp_path, monkeypatch):
+    """Commands have read the scene before."""
+    seen = []
+    monkeypatch.setattr(run_module, "_pacer", lambda *a, began: seen.append(began))
+
+    def nothing(*arguments, **others):
+        raise RunError("told enough")
+
+    monkeypatch.setattr(run_module, "fit", nothing)
+    with pytest.raises(RunError, match="told enough"):
+        train(dataset, tmp_path / "run", tiny_config(), budget=Budget(600.0), began=123.0)
+    assert seen == [123.0]
 
 
 def test_a_budget_that_is_resumed_takes_no_other_settings(dataset, tmp_path, capsys):

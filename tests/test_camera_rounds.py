@@ -6,19 +6,20 @@ import pytest
 
 from geosplat_jax import camera_rounds, cli
 from geosplat_jax.camera_rounds import refined_cameras, round_config, rounds_folder
+from geosplat_jax.cli import training
 from geosplat_jax.fit.cameras import CameraSettings
-from geosplat_jax.fit.folder import RunError
+from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.presets import make_config
-from geosplat_jax.io.dataset import Dataset
+from geosplat_jax.io.dataset import Dataset, load_dataset
 from geosplat_jax.io.images import SceneError
 from geosplat_jax.run import Run
 
 
 class _Views:
-    """Views that are told from others by a number."""
+    """Views that are told from others by a number, and by their masks."""
 
-    def __init__(self, number):
-        self.number = number
+    def __init__(self, number, coverage):
+        self.number, self.coverage = number, [coverage]
 
     def fingerprint(self):
         return f"views {self.number}"
@@ -27,10 +28,10 @@ class _Views:
 class _Scene(Dataset):
     """What a scene would be read with, and its views."""
 
-    def __init__(self, options, poses=0):
+    def __init__(self, options, poses=0, coverage=0.5):
         object.__setattr__(self, "options", dict(options))
         for split in ("train", "test"):
-            object.__setattr__(self, split, _Views(poses))
+            object.__setattr__(self, split, _Views(poses, coverage))
 
 
 class _Round(Run):
@@ -74,6 +75,20 @@ def test_a_round_reads_what_the_one_before_has_found(made, tmp_path):
     assert [stage.name for stage in round_config().active_stages] == ["split_sum", "monte_carlo"]
 
 
+def test_the_digest_of_given_cameras_is_not_that_of_the_next(made, tmp_path):
+    given = {"cameras": tmp_path / "given.json", "cameras_digest": "abc"}
+    refined_cameras("scene", tmp_path / "fox", rounds=2, reading=given)
+    assert made[0][0] == given
+    assert made[1][0] == {"cameras": rounds_folder(tmp_path / "fox") / "round_1.json"}
+
+
+def test_rounds_are_beside_the_run_wherever_that_is(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert rounds_folder(".") == tmp_path.with_name(f"{tmp_path.name}_cameras")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    assert rounds_folder("~/fox") == tmp_path / "home" / "fox_cameras"
+
+
 def test_rounds_that_are_done_are_not_made_again(made, tmp_path):
     refined_cameras("scene", tmp_path / "fox", rounds=1)
     assert refined_cameras("scene", tmp_path / "fox", rounds=1).exists()
@@ -97,13 +112,16 @@ def test_rounds_of_other_settings_are_not_taken_for_these(made, tmp_path, change
     assert len(made) == 2
 
 
-def test_rounds_of_other_poses_are_not_taken_for_these(made, tmp_path, monkeypatch):
-    """The scene's own poses were found anew since."""
+@pytest.mark.parametrize(("new", "what"), [({"poses": 1}, "views"), ({"coverage": 0.4}, "masks")])
+def test_rounds_of_other_poses_or_masks_are_not_taken_for_these(
+    made, tmp_path, monkeypatch, new, what
+):
+    """The scene's own were found anew since."""
     refined_cameras("scene", tmp_path / "fox")
     monkeypatch.setattr(
-        camera_rounds, "load_recorded", lambda scene, options: _Scene(options, poses=1)
+        camera_rounds, "load_recorded", lambda scene, options: _Scene(options, **new)
     )
-    with pytest.raises(RunError, match="refined with other views; delete"):
+    with pytest.raises(RunError, match=f"refined with other {what}; delete"):
         refined_cameras("scene", tmp_path / "fox")
     assert len(made) == 1
 
@@ -131,6 +149,41 @@ def test_no_round_at_all_is_refused(made, tmp_path):
     with pytest.raises(ValueError, match="takes one round at least, got 0"):
         refined_cameras("scene", tmp_path / "fox", rounds=0)
     assert not made
+
+
+def _resumed(monkeypatch, folder, *, reading, chosen):
+    """Resume a run whose record says so; return what its training was asked for."""
+    config, asked = make_config(quality="draft"), []
+    scene = load_dataset("examples/duck", downscale=8)
+    run = RunFolder(folder)
+    model = {"held_back": [], "rungs": [], "by_hand": [], "seconds": 0, "trainings": 0}
+    with run.locked():
+        run.begin(scene, config, replace=False, model=model if chosen else None)
+    record = run.record()
+    record["dataset"] |= reading
+    (folder / "run.json").write_text(json.dumps(record))
+
+    def train(dataset, output, config, **options):
+        asked.append(dataset)
+        raise RunError("told enough")
+
+    monkeypatch.setattr(training, "train_run", train)
+    monkeypatch.setattr(training, "load_recorded", lambda path, options: scene)
+    monkeypatch.setattr(training, "refined_cameras", lambda *a, **k: pytest.fail("refined"))
+    command = ["train", "examples/duck", "--output", str(folder), "--resume", "--refine-cameras"]
+    options = ["--model", "auto"] if chosen else ["--quality", "draft", "--downscale", "8"]
+    assert cli.main([*command, *options]) == 2
+    return asked
+
+
+def test_a_resumed_run_with_a_chosen_model_keeps_its_refined_cameras(monkeypatch, tmp_path):
+    reading = {"cameras": "given_cameras.json"}
+    assert _resumed(monkeypatch, tmp_path / "run", reading=reading, chosen=True)
+
+
+def test_a_run_that_began_without_refined_cameras_is_refused_at_once(monkeypatch, tmp_path, capsys):
+    assert not _resumed(monkeypatch, tmp_path / "run", reading={}, chosen=False)
+    assert "was begun without --refine-cameras" in " ".join(capsys.readouterr().err.split())
 
 
 def test_white_balance_needs_cameras_to_refine(tmp_path, capsys):

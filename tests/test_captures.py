@@ -16,6 +16,7 @@ from geosplat_jax.fit.train import fit
 from geosplat_jax.io.dataset import choose_downscale, describe, load_dataset, photograph_size
 from geosplat_jax.io.images import MissingFileError, SceneError, read_image, write_exr, write_png
 from geosplat_jax.io.layouts.colmap import list_colmap, read_points
+from geosplat_jax.io.layouts.idr import _read_matrices
 from geosplat_jax.io.views import ViewLight
 from geosplat_jax.report.relight import load_view_light
 
@@ -642,7 +643,6 @@ def test_half_a_model_and_an_empty_one_are_refused(copied):
     refuses(root, "has no registered image")
     (root / "sparse" / "0" / "cameras.bin").unlink()
     refuses(root, r"the COLMAP model has no file cameras\.bin", MissingFileError)
-    (root / "sparse" / "0" / "images.bin").write_bytes(b"\0" * 8)
 
 
 @pytest.mark.parametrize(
@@ -664,6 +664,17 @@ def test_a_spoiled_text_model_is_named(copied, name, old, new, message):
     assert old in content
     path.write_text(content.replace(old, new, 1))
     refuses(root, message)
+
+
+@pytest.mark.parametrize("name", ["{}", "my {}", "my cat {}"])
+def test_a_text_model_without_lines_of_points_is_refused(copied, name):
+    """Every second image would be taken for points, of which a line may have any number."""
+    root = copied("colmap_text")
+    path = root / "sparse" / "images.txt"
+    head, *lines = path.read_text().splitlines()
+    images = [line.rsplit(" ", 1) for line in lines[::2]]
+    path.write_text("\n".join([head, *(f"{a} {name.format(b)}" for a, b in images)]) + "\n")
+    refuses(root, r"line 3 of .*images\.txt")
 
 
 def test_a_text_model_that_is_no_text_is_named(copied):
@@ -815,6 +826,24 @@ def test_a_damaged_or_dangerous_archive_is_refused(copied):
     refuses(root, r"cameras_sphere\.npz is damaged")
     path.write_bytes(pickle.dumps({"world_mat_0": 1}))
     refuses(root, r"cameras_sphere\.npz is damaged")
+    with path.open("wb") as file:
+        np.save(file, np.eye(4))
+    refuses(root, r"cameras_sphere\.npz is damaged")
+
+
+def test_no_flipped_byte_of_a_compressed_archive_is_a_traceback(copied):
+    root = copied("idr")
+    path = root / "cameras_sphere.npz"
+    with np.load(path) as arrays:
+        np.savez_compressed(path, **{name: arrays[name] for name in arrays.files[:2]})
+    whole, refused = path.read_bytes(), 0
+    for place in range(0, len(whole), 3):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0x55]) + whole[place + 1 :])
+        try:
+            _read_matrices(path)
+        except SceneError:
+            refused += 1
+    assert refused > 10
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,34 @@ def test_a_compilation_that_fails_is_told(monkeypatch):
         compile_step(*NOTHING)
 
 
+def test_no_thread_compiles_on_for_a_step_that_failed(monkeypatch):
+    """The next training would wait for it, and so would the end of the process."""
+    ended = []
+
+    class Slow(_Program):
+        def compile(self):
+            time.sleep(self.seconds)
+            ended.append(self.seconds)
+            return self
+
+    class Wrong(_Program):
+        def lower(self):
+            raise ValueError("no")
+
+    monkeypatch.setattr(compilation, "require_program_memory", lambda *a: None)
+    monkeypatch.setattr(compilation, "fits_twice", lambda program: True)
+    monkeypatch.setattr(compilation, "THREADS", 2)
+    slow = [(Slow(fits=True, seconds=0.3 + 0.001 * number),) for number in range(8)]
+    programs = [(Wrong(fits=True, seconds=0.0),), *slow]
+    monkeypatch.setattr(compilation, "train_step", lambda *a, run: run.all(*programs))
+    with pytest.raises(ValueError, match="no"):
+        compile_step(*NOTHING, threads=2)
+    count = len(ended)
+    assert count <= 4  # those that had begun
+    time.sleep(0.7)
+    assert len(ended) == count
+
+
 def test_an_error_in_the_background_reaches_who_asks():
     def fails():
         raise ValueError("no")

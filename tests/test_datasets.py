@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -238,6 +239,12 @@ def test_a_damaged_picture_is_one_line_and_the_decoder_is_silent(blender, spoil,
     assert capfd.readouterr().err == ""
 
 
+def test_a_process_without_a_stream_of_errors_reads_scenes(scenes, monkeypatch):
+    """As services and ``pythonw`` are."""
+    monkeypatch.setattr(sys, "stderr", None)
+    assert len(load(scenes["nerf_synthetic"]).train)
+
+
 def test_only_the_lines_of_decoders_are_kept_away(capfd):
     with without_decoder_lines(), without_decoder_lines():
         os.write(2, b"libpng error: bad\nsomething else\n")
@@ -345,13 +352,15 @@ def test_relit_views_without_alpha_are_reduced_as_those_with_it(scenes, tmp_path
     assert rim.any()
 
 
-def test_environment_maps_and_lights_are_found(scenes):
+def test_environment_maps_and_lights_are_found(scenes, monkeypatch):
     tensoir = load(scenes["tensoir"])
     assert tensoir.train_light == "noon"
     assert {name: path.name for name, path in tensoir.lights.items()} == {
         "noon": "noon.hdr",
         "night": "night.hdr",
     }
+    monkeypatch.chdir(scenes["tensoir"])
+    assert list(load(".").lights) == ["noon", "night"]
     relight = load(scenes["synthetic4relight"])
     assert relight.train_light == "envmap3"
     assert list(relight.lights) == ["envmap3", "envmap6", "envmap12"]
@@ -592,6 +601,29 @@ def test_a_distorted_lens_bends_truth_and_images_alike(scenes, tmp_path):
     towards = bent.camera_to_world[:, :3, 2]
     facing = np.einsum("vhwc,vc->vhw", normal, towards)
     assert (facing[inside] > 0).all()
+
+
+def test_truth_of_another_size_is_named_and_not_its_image(scenes, tmp_path):
+    root = shutil.copytree(scenes["shiny_blender"], tmp_path / "ball")
+    path = root / "test" / "r_0_normal.png"
+    write_png(path, read_image(path)[::2, ::2, :3])
+    with pytest.raises(SceneError, match=r"r_0_normal\.png is \d+ x \d+ pixels, but its view is"):
+        _ = load(root, downscale=2).test.truth["normal"]
+
+
+def test_an_image_of_any_format_may_be_named_with_its_ending(blender):
+    """Endings are left out in this layout, of which only the usual ones are tried."""
+    for path in sorted((blender / "train").glob("r_?.png")):
+        write_png(path.with_suffix(".tga.png"), read_image(path))
+        path.with_suffix(".tga.png").rename(path.with_suffix(".tga"))
+        path.unlink()
+
+    def name_them(content):
+        for frame in content["frames"]:
+            frame["file_path"] += ".tga"
+
+    edit(blender, name_them)
+    assert len(load(blender).train)
 
 
 @pytest.mark.parametrize("key", list(LENS))

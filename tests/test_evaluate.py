@@ -13,11 +13,12 @@ from geosplat_jax.core.capacity import Capacities
 from geosplat_jax.core.types import EnvLight
 from geosplat_jax.fit.train import Trained
 from geosplat_jax.io.images import read_image
+from geosplat_jax.report import evaluate as evaluate_module
 from geosplat_jax.report import sheets
 from geosplat_jax.report.evaluate import EvaluateOptions, Truth, evaluate_run
 from geosplat_jax.report.gallery import comparisons
-from geosplat_jax.report.protocols import PROTOCOLS
-from geosplat_jax.report.renderer import RELIGHT_BOUNCES, Renderer
+from geosplat_jax.report.protocols import PROTOCOLS, protocol
+from geosplat_jax.report.renderer import RELIGHT_BOUNCES, RenderedView, Renderer
 from geosplat_jax.report.sheets import preview_image
 
 pytestmark = pytest.mark.usefixtures("products_must_ask")
@@ -82,6 +83,21 @@ def run():
         pipeline=replace(pipeline, capacities=AMPLE),
         step=3,
     )
+
+
+def test_highlights_brighter_than_white_are_compared_where_a_protocol_has_them():
+    """Stanford-ORB does; the sRGB pictures of all protocols end at white."""
+    linear = np.full((24, 24, 3), 0.3, np.float32)
+    linear[8:14, 8:14] = 3.0
+    alpha = np.ones((24, 24), np.float32)
+    view = RenderedView(np.minimum(linear, 1.0), alpha, linear, {})
+    image = np.concatenate([linear, alpha[..., None]], axis=-1)
+    found = evaluate_module._view_metrics(view, image, None, None, protocol("orb"))
+    assert min(found[name] for name in ("nvs.psnr", "nvs.psnr_h", "nvs.psnr_l")) > 60
+    dim = replace(view, linear=np.minimum(linear, 1.0))
+    found = evaluate_module._view_metrics(dim, image, None, None, protocol("orb"))
+    assert found["nvs.psnr"] > 60
+    assert max(found["nvs.psnr_h"], found["nvs.psnr_l"]) < 40
 
 
 def straight(values, alpha):

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import sphere_views
 from test_pipeline import TIGHT, evaluate, problem
 
 from geosplat_jax.core.types import rate_groups

@@ -14,6 +14,7 @@ from geosplat_jax.io.images import (
     encode_srgb,
     read_image,
     read_linear,
+    read_stored,
     write_exr,
     write_hdr,
     write_png,
@@ -238,10 +239,25 @@ def _write_exr(path, pixels, names, *, frame=None):
 def test_a_fourth_channel_that_is_no_alpha_is_refused(tmp_path):
     pixels = np.full((4, 6, 4), 0.5, np.float32)
     _write_exr(tmp_path / "depth.exr", pixels, ("R", "G", "B", "Z"))
-    with pytest.raises(ImageReadError, match="channels R, G, B, Z, of which the last is no alpha"):
+    with pytest.raises(ImageReadError, match="channels R, G, B, Z, which are not grey or RGB"):
         read_linear(tmp_path / "depth.exr")
     _write_exr(tmp_path / "alpha.exr", pixels, ("R", "G", "B", "A"))
     np.testing.assert_allclose(read_linear(tmp_path / "alpha.exr")[..., :3], 1.0)
+
+
+@pytest.mark.parametrize("ending", ["exr", "tif"])
+def test_channels_beside_colour_and_alpha_are_refused(tmp_path, ending):
+    """Of floats, and of whole numbers, which would become grey."""
+    path, kind = tmp_path / f"five.{ending}", oiio.FLOAT if ending == "exr" else oiio.UINT8
+    spec = oiio.ImageSpec(6, 4, 5, kind)
+    spec.channelnames = ("R", "G", "B", "A", "selection")
+    sink = oiio.ImageOutput.create(str(path))
+    assert sink.open(str(path), spec)
+    assert sink.write_image(np.full((4, 6, 5), 0.5, np.float32))
+    assert sink.close()
+    for read in (read_linear, read_stored):
+        with pytest.raises(ImageReadError, match=rf"five\.{ending} has the channels R, G, B, A, "):
+            read(path)
 
 
 def test_a_part_of_a_frame_is_refused(tmp_path):

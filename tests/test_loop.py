@@ -14,10 +14,11 @@ from geosplat_jax.fit import loop as loop_module
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.loop import new_loop, resumed_loop
 from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.runtime import in_background
 from geosplat_jax.fit.stages import build_pipeline, make_batch
 from geosplat_jax.fit.step import StepReport
 from geosplat_jax.fit.trained import NextStage
-from geosplat_jax.fit.upcoming import continued
+from geosplat_jax.fit.upcoming import Upcoming, continued
 from geosplat_jax.pipeline import LossReport
 
 CONFIG = tiny_config(
@@ -175,6 +176,40 @@ def test_what_is_known_of_the_next_stage_is_kept_until_it_begins(dataset, folder
     assert loop.meta()["to_come"] is None
     assert loop._planned(None) == Capacities(hits=256)
     assert loop.to_come is None
+
+
+def test_what_fails_for_the_next_stage_spares_the_checkpoints_of_this_one(dataset, folder, steps):
+    steps()
+    loop = new_loop(dataset, CONFIG, folder)
+    later = CONFIG.stage("monte_carlo")
+
+    def out_of_memory():
+        raise MemoryError("no room")
+
+    upcoming = object.__new__(Upcoming)
+    upcoming.stage, upcoming._planned = later, in_background(out_of_memory)
+    loop.upcoming = upcoming
+    assert loop.save().exists()
+    upcoming._planned = in_background(lambda: Capacities(hits=256))
+    assert loop.meta()["to_come"] == {"stage": "monte_carlo", "capacities": {"hits": 256}}
+
+
+def test_a_run_goes_on_from_the_end_of_a_stage_where_that_is_newer(dataset, folder, steps):
+    """It may have been killed while the programs of the next one compiled."""
+    steps()
+    loop = new_loop(dataset, CONFIG, folder)
+    for step in range(6):
+        loop.prepare(step)
+        loop.advance(step)
+        if step == 2:
+            saved = loop.save()
+    loop.save_end()
+    resumed = resumed_loop(dataset, CONFIG, folder)
+    assert (resumed.step, resumed.stage, resumed.last_checkpoint) == (6, CONFIG.stages[0], saved)
+    # Not from where a stage of another length ended.
+    longer = replace(CONFIG, stages=(replace(CONFIG.stages[0], steps=9), *CONFIG.stages[1:]))
+    folder.amend(longer)
+    assert resumed_loop(dataset, longer, folder).step == 3
 
 
 def test_what_a_stage_continues_gets_buffers_for_what_was_needed_of_late(dataset, folder, steps):

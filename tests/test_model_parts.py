@@ -69,9 +69,9 @@ def test_what_needs_another_part_is_taken_out_with_its_own_settings_only():
     ("paths", "missing"),
     [
         (["material.specular"], {"specular", "roughness"}),
-        (["material.has_metallic"], {"metallic"}),
+        (["material.has_metallic"], {"metallic", "specular"}),  # with what it needs
         (["stages.monte_carlo.transport.occlusion"], {"shadows"}),
-        (["stages.monte_carlo.transport.indirect"], {"indirect"}),
+        (["stages.monte_carlo.transport.indirect"], {"indirect", "shadows"}),
         (["material.grid.levels", "light.width"], {"hash", "light"}),
         (["geometry.resolution", "material.has_shift"], {"cells", "shift"}),
         (["run.seed", "stages.monte_carlo.steps"], set()),

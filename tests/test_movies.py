@@ -171,11 +171,16 @@ def test_unusable_rates_are_refused(tmp_path, name, rate):
         write_movie(tmp_path / name, ramp_frames(1), frames_per_second=rate)
 
 
-def install_fake(folder, monkeypatch, body):
-    """Put a program named ffmpeg on the PATH, alone; ``body`` sees arguments and input."""
+def install_fake(folder, monkeypatch, body, *, encoder="libx264"):
+    """Put a program named ffmpeg on the PATH, alone; ``body`` sees arguments and input.
+
+    ``encoder`` : that it says it has.
+    """
     folder.mkdir()
     program = folder / "ffmpeg"
-    program.write_text(f"#!{sys.executable}\nimport json, sys\nfrom pathlib import Path\n{body}\n")
+    listed = f"if '-encoders' in sys.argv:\n    sys.exit(print(' V....D {encoder} H.264'))\n"
+    begin = f"#!{sys.executable}\nimport json, sys\nfrom pathlib import Path\n"
+    program.write_text(f"{begin}{listed}{body}\n")
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setenv("PATH", str(folder))
 
@@ -249,6 +254,22 @@ def test_the_encoder_of_a_package_serves_where_none_is_on_the_path(tmp_path, mon
     assert has_encoder(".mp4")
     write_movie(tmp_path / "film.mp4", ramp_frames(2, 4, 4), frames_per_second=24)
     assert (tmp_path / "film.mp4").stat().st_size == 2 * 4 * 4 * 3
+
+
+@on_posix
+def test_a_program_without_h264_is_none_and_hides_none(tmp_path, monkeypatch):
+    install_fake(tmp_path / "bundled", monkeypatch, RECORD)
+    install_fake(tmp_path / "bin", monkeypatch, RECORD, encoder="libopenh264")
+    package = types.SimpleNamespace(get_ffmpeg_exe=lambda: str(tmp_path / "bundled" / "ffmpeg"))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    assert not has_encoder(".mp4")
+    with pytest.raises(MissingEncoderError, match="with libx264"):
+        write_movie(tmp_path / "film.mp4", ramp_frames(1), frames_per_second=24)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", package)
+    assert has_encoder(".mp4")
+    write_movie(tmp_path / "film.mp4", ramp_frames(2, 4, 4), frames_per_second=24)
+    assert (tmp_path / "bundled" / "arguments.json").exists()
+    assert not (tmp_path / "bin" / "arguments.json").exists()
 
 
 def test_missing_encoder_names_the_cure(tmp_path, monkeypatch):

@@ -9,13 +9,12 @@ import html5lib
 import numpy as np
 import pytest
 from PIL import Image
-from support import tiny_config
 
 from geosplat_jax.cli import main
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.presets import between_qualities, make_config
 from geosplat_jax.io.images import write_hdr
-from geosplat_jax.report import page
+from geosplat_jax.report import facts, page
 from geosplat_jax.report.facts import changed_from_preset, command, curves, figure, stage_times
 from geosplat_jax.report.gallery import comparisons, write_gallery
 from geosplat_jax.report.page import LARGEST_PAGE, Evaluated, report_html
@@ -338,13 +337,24 @@ def test_the_command_of_a_run_from_a_mesh_names_the_file(tmp_path):
     assert "geometry.path" not in text
 
 
-def test_settings_that_options_cannot_say_are_not_pretended():
-    text, is_whole = command({"scene": "s", "dataset": {}}, tiny_config())
-    if not is_whole:
+def test_settings_that_options_cannot_say_are_not_pretended(monkeypatch):
+    config = make_config("default", "draft", overrides=("run.seed=3",))
+    assert command({"scene": "s", "dataset": {}}, config)[1]
+    for unsayable in ("nothing", "7"):  # refused; and taken for something else
+        monkeypatch.setattr(facts, "as_written", lambda value, text=unsayable: text)
+        text, is_whole = command({"scene": "s", "dataset": {}}, config)
+        assert not is_whole
         assert "--set" not in text
-    changed = tiny_config("stages.monte_carlo.transport.kind=split_sum")
-    text, is_whole = command({"scene": "s", "dataset": {}}, changed)
-    assert is_whole == ("--set" in text)
+
+
+def test_a_run_that_was_trained_further_since_its_evaluation_says_so(tmp_path):
+    folder = tmp_path / "run"
+    make_run(folder)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    for step, is_older in ((STEPS, False), (900, True)):
+        (folder / "metrics.json").write_text(json.dumps({**metrics, "step": step}))
+        html = report_html([Evaluated.of(RunFolder(folder))])
+        assert (f"was evaluated after {step} steps" in html) is is_older
 
 
 def test_long_curves_are_thinned_and_keep_their_ends():

@@ -192,7 +192,8 @@ def test_turning_the_light_by_a_quarter_moves_red_from_x_to_y(light, matt):
 
 def nothing(size=SIZE):
     """A view without any object."""
-    return RenderedView(np.zeros((size, size, 3), np.float32), np.zeros((size, size)), {})
+    black = np.zeros((size, size, 3), np.float32)
+    return RenderedView(black, np.zeros((size, size)), black, {})
 
 
 @pytest.mark.parametrize("side", AXES)
@@ -231,7 +232,8 @@ def test_the_background_is_the_environment_in_the_direction_of_every_pixel(light
 
 def test_pictures_lie_over_white_and_black_and_refuse_other_names(light):
     camera = camera_from([3.0, 0.0, 0.0])
-    view = RenderedView(np.full((SIZE, SIZE, 3), 0.1, np.float32), np.full((SIZE, SIZE), 0.5), {})
+    grey = np.full((SIZE, SIZE, 3), 0.1, np.float32)
+    view = RenderedView(grey, np.full((SIZE, SIZE), 0.5), grey, {})
     for name, value in (("white", 0.6), ("black", 0.1)):
         expected = encode_srgb(np.full((SIZE, SIZE, 3), value))
         np.testing.assert_allclose(picture(view, camera, light, name), expected, atol=1e-6)

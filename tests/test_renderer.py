@@ -293,7 +293,7 @@ def test_the_mesh_is_trimmed_and_lies_on_the_ball(relit):
 def test_pictures_have_straight_alpha_and_no_colour_behind_nothing():
     alpha = np.array([[0.0, 0.5, 1.0]], np.float32)
     rgb = np.array([[[0.0] * 3, [0.25] * 3, [0.5] * 3]], np.float32)
-    found = straight_rgba(RenderedView(rgb, alpha, {}))
+    found = straight_rgba(RenderedView(rgb, alpha, rgb, {}))
     np.testing.assert_array_equal(found[0, :, 3], alpha[0])
     np.testing.assert_array_equal(found[0, 0, :3], 0.0)
     np.testing.assert_allclose(found[0, 1, :3], found[0, 2, :3], rtol=1e-6)

@@ -155,14 +155,17 @@ def rendered():
         "normal": np.full((2, 2, 3), 3**-0.5),
         "depth": rng.uniform(2, 5, (2, 2, 1)),
     }
-    rgb = rng.uniform(0.1, 0.9, (2, 2, 3))
+    rgb = rng.uniform(0.1, 4.0, (2, 2, 3))
+    linear = (rgb * alpha[..., None]).astype(np.float32)
     blended = {name: (v * alpha[..., None]).astype(np.float32) for name, v in straight.items()}
-    view = RenderedView((rgb * alpha[..., None]).astype(np.float32), alpha, blended)
+    view = RenderedView(np.minimum(linear, 1.0), alpha, linear, blended)
     return view, rgb, straight
 
 
 def test_floats_are_straight_linear_values_and_zero_beside_the_object(tmp_path):
+    """Of colours brighter than white, too."""
     view, rgb, straight = rendered()
+    assert np.max(rgb[view.alpha > 0]) > 2.0
     names = ("albedo", "roughness", "metallic", "normal", "depth")
     written = Images(names, exr=True).write(tmp_path, "v", view)
     assert {path.name for path in written} == {path.name for path in tmp_path.iterdir()}

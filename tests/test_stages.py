@@ -12,8 +12,10 @@ from support import MONTE_CARLO, TWO_STAGES, ball, sphere_dataset, tiny_config
 
 from geosplat_jax.fit import loop as loop_module
 from geosplat_jax.fit.begin import Resume, TakeOver
+from geosplat_jax.fit.config import Rate, Stage
 from geosplat_jax.fit.folder import RunError, RunFolder
-from geosplat_jax.fit.stages import begin_stage
+from geosplat_jax.fit.presets import PRESETS, QUALITIES, make_config
+from geosplat_jax.fit.stages import begin_stage, require_rates
 from geosplat_jax.fit.train import Interrupted, TrainingError, fit, load_trained
 from geosplat_jax.materials import materials_at
 from geosplat_jax.surface.grids import grid_vertices
@@ -117,6 +119,31 @@ def test_a_head_of_indirect_light_is_kept_where_it_means_the_same(after, is_kept
     before, found = (x.material.indirect_head[-1].weights for x in (params, begun))
     assert found.shape[1] == (6 if after == "constant" else 27)
     assert np.array_equal(before, found) is is_kept
+
+
+@pytest.mark.parametrize("quality", QUALITIES)
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_have_a_rate_for_everything_that_their_stages_learn(preset, quality):
+    require_rates(make_config(preset, quality))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ((), r"stages\.polish\.rates lacks "),
+        (("stages.split_sum.transport.kind=monte_carlo",), r"split_sum\.rates lacks indirect"),
+    ],
+)
+def test_a_stage_that_lacks_a_rate_is_refused_before_any_is_trained(tmp_path, overrides, message):
+    config = make_config("default", "draft", overrides=overrides)
+    rates = {"albedo": Rate(1e-3)}
+    polish = Stage(
+        name="polish", steps=5, batch_views=1, rates=rates, weights=config.stages[0].weights
+    )
+    config = replace(config, stages=(*config.stages, polish))
+    with pytest.raises(TrainingError, match=message):
+        fit(sphere_dataset(count=3, size=8), config, tmp_path / "run")
+    assert not (tmp_path / "run" / "run.json").exists()
 
 
 def test_traced_indirect_light_learns_nothing():

@@ -260,6 +260,9 @@ def test_coarse_meshes_are_divided_and_fine_ones_decimated(monkeypatch):
     )
     with pytest.raises(ValueError, match="1280 faces, more than geometry.max_faces = 1000"):
         sized(finer, edge, most_faces=1000, path="x")
+    # Also where it has hardly more, and faces of the size that is wanted.
+    with pytest.raises(ValueError, match="1280 faces, more than geometry.max_faces = 1200"):
+        sized(finer, edge / 4.5, most_faces=1200, path="x")
 
 
 @pytest.mark.parametrize(

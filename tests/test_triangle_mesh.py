@@ -261,6 +261,13 @@ def test_the_inward_shift_of_a_mesh_starts_smaller_unless_it_was_set(files):
     assert with_mesh(by_hand, files["ball"]).material.initial_shift_logit == -0.5
 
 
+def test_a_mesh_that_is_given_twice_counts_once_and_two_are_refused(files):
+    config = make_config(mesh=files["ball"], overrides=("geometry.max_faces=5000",))
+    assert with_mesh(config, files["ball"]) == config
+    with pytest.raises(ValueError, match=r"start from .*, and .* is given beside them"):
+        with_mesh(config, files["bowl"])
+
+
 def test_an_open_mesh_needs_culling(dataset, files, tmp_path):
     config = make_config(mesh=files["bowl"], overrides=(*SMALL, "raster.cull_backfaces=false"))
     with pytest.raises(TrainingError, match="fronts and the backs of an open mesh"):

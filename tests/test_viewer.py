@@ -159,7 +159,8 @@ class Recorder(Renderer):
         shown = {"albedo": [0.6] * 3, "roughness": [0.8], "metallic": [0.25]}
         shown |= {"normal": [0.0, -1.0, 0.0], "depth": [2.6]}
         aovs = {name: alpha[..., None] * np.float32(value) for name, value in shown.items()}
-        return RenderedView(0.5 * np.stack([alpha] * 3, -1), alpha, aovs)
+        grey = 0.5 * np.stack([alpha] * 3, -1)
+        return RenderedView(grey, alpha, grey, aovs)
 
 
 @pytest.fixture

@@ -385,7 +385,7 @@ def _require_few_hits(usage: Usage, step: int) -> None:
     if int(usage["hits"]) > _MOST_HITS:
         raise TrainingError(
             f"step {step}: {int(usage['hits'])} pairs of a splat and a tile in one view, more than "
-            f"{_MOST_HITS}; raise --downscale or lower --capacity"
+            f"{_MOST_HITS}; raise --downscale or lower --splats"
         )
 
 

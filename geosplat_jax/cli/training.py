@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -103,12 +104,14 @@ class _Order:
     reading : how to read the scene, see `load_recorded`.
     budget : that it has to keep to; None for as long as it takes.
     model : how to choose the parts of the model; None for those of the settings.
+    goes_on : whether all of it is from the record of a run that is resumed.
     """
 
     config: Config
     reading: dict[str, Any]
     budget: Budget | None = None
     model: ModelChoice | None = None
+    goes_on: bool = False
 
 
 _SETTING_OPTIONS = {
@@ -132,7 +135,7 @@ def _require_no_settings(arguments: argparse.Namespace, folder: RunFolder) -> No
     told = [
         option
         for option, name in _SETTING_OPTIONS.items()
-        if getattr(arguments, name) != getattr(usual, name)
+        if getattr(arguments, name) not in (getattr(usual, name), "auto")
     ]
     if told:
         raise UsageError(
@@ -143,15 +146,20 @@ def _require_no_settings(arguments: argparse.Namespace, folder: RunFolder) -> No
 
 def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
     """Read from the options, or from the run that is resumed, what is to be done; say it."""
-    if arguments.resume and folder.exists and folder.budget() is not None:
-        if arguments.budget is not None or arguments.memory is not None:
+    known = folder.budget() if arguments.resume and folder.exists else None
+    if known is not None:
+        asked = arguments.budget, arguments.memory
+        if asked not in ((None, None), (known.seconds, known.memory)):
             raise UsageError(f"{folder} keeps its budget; leave --budget and --memory out")
         _require_no_settings(arguments, folder)
         # Its settings were chosen for the budget, and have changed since.
-        return _Order(folder.config(), folder.record()["dataset"], folder.budget())
+        reading = folder.record()["dataset"]
+        return _Order(folder.config(), reading, known, goes_on=True)
+    if arguments.resume and folder.exists and arguments.budget is not None:
+        raise UsageError(f"{folder} was begun without a budget; leave --budget out")
     if arguments.resume and folder.has_chosen_model:
         _require_no_settings(arguments, folder)
-        return _Order(folder.config(), folder.record()["dataset"])
+        return _Order(folder.config(), folder.record()["dataset"], goes_on=True)
     if arguments.model is not None and (arguments.budget or arguments.source):
         raise UsageError("--model auto chooses for a whole training; leave --budget and --from out")
     if arguments.budget is None:
@@ -186,7 +194,7 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
 def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[str, Any]) -> Path:
     """Set the cameras right before the training proper; say where they are."""
     draft = round_config(arguments.material_prior)
-    say("cameras first: a short training, half the split sum of a draft")
+    say("cameras first: a short training, a draft with half its split sum that is not refined")
     with ProgressDisplay(draft.total_steps) as display:
         cameras = refined_cameras(
             arguments.scene,
@@ -271,9 +279,10 @@ def _devices(arguments: argparse.Namespace) -> Devices:
     if arguments.hosts is not None:
         if arguments.hosts != "auto" and not all(told):
             raise UsageError("--hosts N needs --host K and --coordinator ADDRESS:PORT")
-        if arguments.budget is not None or arguments.refine_cameras is not None:
+        alone = ("--budget", "--refine-cameras", "--model")
+        if any(getattr(arguments, name[2:].replace("-", "_")) is not None for name in alone):
             raise UsageError(
-                "--hosts trains once, with given settings; leave --budget and --refine-cameras out"
+                f"--hosts trains once, with given settings; leave {', '.join(alone)} out"
             )
         connect_hosts(arguments.hosts, host=arguments.host, coordinator=arguments.coordinator)
     return choose_devices(arguments.devices)
@@ -291,6 +300,7 @@ def _idle(devices: Devices, config: Config) -> list[str]:
 
 def train(arguments: argparse.Namespace) -> None:
     """Train a scene into a run's folder, with progress on the terminal."""
+    began = time.perf_counter()
     if (arguments.source is None) != (arguments.stage is None):
         raise UsageError("--from RUN and --stage NAME belong together")
     if arguments.refine_cameras is not None and (arguments.budget or arguments.source):
@@ -302,12 +312,15 @@ def train(arguments: argparse.Namespace) -> None:
     folder = arguments.output or Path("runs") / arguments.scene.resolve().name
     order = _ordered(arguments, RunFolder(folder))
     config, reading = order.config, dict(order.reading)
-    if arguments.refine_cameras is not None:
+    begun = RunFolder(folder)
+    # A run that knows how it reads its scene knows its refined cameras.
+    if arguments.refine_cameras is not None and not order.goes_on:
         if not arguments.resume:
-            RunFolder(folder).require_free(replace=arguments.force)
+            begun.require_free(replace=arguments.force)
+        elif begun.exists and not begun.record()["dataset"].get("cameras"):
+            raise UsageError(f"{folder} was begun without --refine-cameras; leave it out")
         reading["cameras"] = _refined_cameras(arguments, folder, reading)
     dataset = load_recorded(arguments.scene, reading)
-    begun = RunFolder(folder)
     if arguments.resume and begun.exists:
         notes = begun.record().get("notes", dataset.notes)
     else:
@@ -329,6 +342,7 @@ def train(arguments: argparse.Namespace) -> None:
             config,
             begin=begin_from(arguments),
             budget=order.budget,
+            began=began if order.budget is not None else None,
             model=order.model,
             devices=devices,
             listener=Listeners(display, events),

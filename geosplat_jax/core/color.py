@@ -32,6 +32,17 @@ def luminance(rgb: Float[Array, "... 3"]) -> Float[Array, "..."]:
     return 0.2126 * rgb[..., 0] + 0.7152 * rgb[..., 1] + 0.0722 * rgb[..., 2]
 
 
+def expose(rgb: Float[Array, "... 3"], log_exposure: Float[Array, ""]) -> Float[Array, "... 3"]:
+    """Multiply linear radiance by the exposure.
+
+    Parameters
+    ----------
+    rgb : (..., 3) linear radiance.
+    log_exposure : () natural logarithm of the exposure; held, with zero gradient, above 60.
+    """
+    return jnp.exp(jnp.minimum(log_exposure, _LARGEST_LOG_EXPOSURE)) * rgb
+
+
 def tone_map(
     rgb: Float[Array, "... 3"], log_exposure: Float[Array, ""], *, sharpness: float = 100.0
 ) -> Float[Array, "... 3"]:
@@ -47,5 +58,5 @@ def tone_map(
     log_exposure : () natural logarithm of the exposure; held, with zero gradient, above 60.
     sharpness : the beta of the softplus.
     """
-    headroom = 1.0 - jnp.exp(jnp.minimum(log_exposure, _LARGEST_LOG_EXPOSURE)) * rgb
+    headroom = 1.0 - expose(rgb, log_exposure)
     return 1.0 - jax.nn.softplus(sharpness * headroom) / sharpness

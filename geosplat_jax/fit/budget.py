@@ -26,6 +26,7 @@ from geosplat_jax.fit.entering import FreshAlbedo
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.presets import QUALITIES, between_qualities, mesh_settings
 from geosplat_jax.fit.start_mesh import MeshSettings
+from geosplat_jax.io.memory import memory_of_machine
 
 _EFFORTS = tuple(0.25 * number for number in range(4 * (len(QUALITIES) - 1) + 1))
 """Places between the quality levels that are tried, in order of cost."""
@@ -181,14 +182,17 @@ def plan(
     candidates = [
         _candidate(effort, settings_at(effort), size, slowness, downscale) for effort in _EFFORTS
     ]
-    if budget.memory is not None:
-        fitting = [one for one in candidates if one.memory <= budget.memory]
-        if not fitting:
-            raise TrainingError(
-                f"about {candidates[0].memory / 1e9:.1f} GB are the least that a training takes, "
-                f"more than --memory allows ({budget.memory / 1e9:.1f} GB)"
-            )
-        candidates = fitting
+    if not candidates[0].config.active_stages:
+        raise TrainingError("nothing to train: no stage has steps")
+    if budget.memory is not None and candidates[0].memory > budget.memory:
+        raise TrainingError(
+            f"about {candidates[0].memory / 1e9:.1f} GB are the least that a training takes, "
+            f"more than --memory allows ({budget.memory / 1e9:.1f} GB)"
+        )
+    limits = [most for most in (budget.memory, memory_of_machine()) if most is not None]
+    # Expectations err: the least may train where it is expected not to.
+    fitting = [one for one in candidates if one.memory <= min(limits, default=math.inf)]
+    candidates = fitting or candidates[:1]
     affordable = [one for one in candidates if one.seconds <= budget.seconds]
     if not affordable and not _asks_for_more(overrides, candidates[0].config):
         candidates = [_first_stage_alone(one) for one in candidates]
@@ -330,7 +334,7 @@ class Pacer:
         here = config.stage_names.index(stage.name)
         later = [other for other in self._planned.stages[here + 1 :] if other.steps]
         ahead = _length(stage) - stage.position(done)
-        in_use = {other.name for other in config.active_stages[here + 1 :]}
+        in_use = {other.name for other in config.stages[here + 1 :] if other.steps}
         share = self._share(stage, ahead, later)
         while left_out := self._too_short(later, share, in_use):
             later = [other for other in later if other not in left_out]

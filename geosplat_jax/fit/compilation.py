@@ -7,7 +7,7 @@ as cores, and one that compiles the programs of the next stage does not hold up 
 import os
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from typing import Any
 
 from geosplat_jax.core.types import Batch
@@ -82,7 +82,13 @@ def compile_step(
     Whether the memory holds two at a time of those that do not wait for each other.
     """
     compiling = _Compiling(devices, threads, is_wanted)
-    train_step(state, batch, pipeline, rule, run=compiling)
-    for one in compiling.compiling:
-        one.result()
+    try:
+        train_step(state, batch, pipeline, rule, run=compiling)
+        for one in compiling.compiling:
+            one.result()
+    except BaseException:
+        # No thread goes on for a step that will not be made.
+        compiling.is_wanted = lambda: False
+        wait(compiling.compiling)
+        raise
     return compiling.fits_twice

@@ -52,7 +52,7 @@ from geosplat_jax.fit.trained import (
     read_description,
 )
 from geosplat_jax.fit.upcoming import Ends, Upcoming, continued
-from geosplat_jax.io.checkpoints import latest_checkpoint, save_checkpoint
+from geosplat_jax.io.checkpoints import latest_checkpoint, read_step, save_checkpoint
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.views import Views
 from geosplat_jax.io.windows import around_object
@@ -156,7 +156,8 @@ class Loop:
     def _known_to_come(self) -> dict[str, Any] | None:
         """Return what a checkpoint keeps of the next stage; after a resume, what one has kept."""
         if self.upcoming is not None:
-            return self.upcoming.meta()
+            # What fails there is told when that stage begins, and spares this one's checkpoints.
+            return self.upcoming.meta() if self.upcoming.is_planned else None
         known = self.to_come
         if known is None or known.stage == self.stage.name:
             return None
@@ -523,17 +524,19 @@ def resumed_loop(
         )
     own = latest_checkpoint(folder.checkpoints)
     before = [stage.name for stage in config.active_stages]
-    # A run that took its first stages over may have been stopped before its own checkpoint.
-    ends = [end for name in before if (end := latest_checkpoint(folder.end_of(name)))]
-    path = own or (ends[-1] if ends else None)
+    ends = _ends(config, folder)
+    path = own
+    # Where a stage has ended since, or was taken over from another run.
+    if ends and (own is None or read_step(own) < read_step(ends[-1])):
+        path = ends[-1]
     if path is None:
         return new_loop(dataset, config, folder, devices, start)
     tree, described = read_checkpoint(path, config)
     loop = new_loop(dataset, config, folder, devices, start, surface=tree["surface"])
     _put(loop, tree, described)
-    if own is None:
+    loop.last_checkpoint = own
+    if path != own:
         return loop
-    loop.last_checkpoint = path
     number = before.index(loop.stage.name)
     if number:
         ended = latest_checkpoint(folder.end_of(before[number - 1]))
@@ -541,6 +544,17 @@ def resumed_loop(
             tree, _ = read_checkpoint(ended, config)
             loop.fallback = First.of(tree["surface"], tree["state"].params.geometry)
     return loop
+
+
+def _ends(config: Config, folder: RunFolder) -> list[Path]:
+    """Find what the stages ended with, in order, as long as these are now."""
+    found = []
+    for stage in config.active_stages:
+        path = latest_checkpoint(folder.end_of(stage.name))
+        end = config.first_step(stage.name) + stage.steps
+        if path is not None and read_step(path) == end:
+            found.append(path)
+    return found
 
 
 def adopted_loop(

@@ -236,9 +236,16 @@ LADDER: tuple[Part, ...] = (
 def offered_parts(config: Config, by_hand: Collection[str] = ()) -> tuple[Part, ...]:
     """Return the parts that settings have and that nobody decided by hand, in order.
 
+    What a part that was decided by hand needs is decided with it.
+
     ``by_hand`` : paths of settings.
     """
-    return tuple(part for part in LADDER if part.is_in(config) and not part.is_set(by_hand))
+    present = [part for part in LADDER if part.is_in(config)]
+    decided = {part.name for part in present if part.is_set(by_hand)}
+    for part in reversed(present):  # what is needed stands before what needs it
+        if part.name in decided:
+            decided.update(part.needs)
+    return tuple(part for part in present if part.name not in decided)
 
 
 def without(config: Config, parts: Iterable[Part]) -> Config:

@@ -353,15 +353,22 @@ def with_mesh(config: Config, mesh: str | Path | MeshSettings) -> Config:
 
     Parameters
     ----------
-    config : of an isosurface.
+    config : of an isosurface. One that starts from this mesh already stays as it is.
     mesh : file, or the settings of a run that started from one, whose file is not looked at.
 
     Raises
     ------
     ValueError
-        If there is no such file.
+        If there is no such file, or the configuration starts from another mesh.
     """
     named = mesh_settings(mesh)
+    if isinstance(config.geometry, MeshSettings):
+        if config.geometry.digest != named.digest:
+            raise ValueError(
+                f"the settings start from {config.geometry.path}, and {named.path} is given beside "
+                "them; leave one of the two out"
+            )
+        return config
     edge_pixels = _MESH_EDGES[config.quality]
     geometry = MeshSettings(path=named.path, digest=named.digest, edge_pixels=edge_pixels)
     old, is_original = config.geometry, config.preset != "default"

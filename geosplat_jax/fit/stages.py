@@ -1,6 +1,8 @@
 """What a stage trains: its pipeline, its parameters, the views of its steps."""
 
+from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -17,6 +19,7 @@ from geosplat_jax.io.views import Views
 from geosplat_jax.losses import PIXEL_MEANS
 from geosplat_jax.materials import init_materials
 from geosplat_jax.pipeline import Pipeline
+from geosplat_jax.refinement import INDIRECT_GROUP
 from geosplat_jax.render import Params
 from geosplat_jax.surface.base import SurfaceModel
 from geosplat_jax.transport.environment import init_light
@@ -59,6 +62,33 @@ def pipeline_at(
     return replace(pipeline, splats=splats.build(config.adapter), weights=_arrays(weights))
 
 
+def require_rates(config: Config) -> None:
+    """Refuse settings of which a stage lacks the learning rate of some of its parameters.
+
+    Raises
+    ------
+    ValueError
+        With the stage and the group.
+    """
+    for stage in config.active_stages:
+        params = jax.eval_shape(
+            partial(_first_params, (), config=config, stage=stage), jax.random.key(0)
+        )
+        groups = {*rate_groups(params), *config.geometry.rate_groups, *stage.splats.rate_groups}
+        if not stage.transport.indirect_outputs:
+            groups -= {INDIRECT_GROUP}
+        _require_rates(groups, stage)
+
+
+def _require_rates(groups: Iterable[str], stage: Stage) -> None:
+    missing = sorted(set(groups) - set(stage.rates))
+    if missing:
+        raise ValueError(
+            f"stages.{stage.name}.rates lacks {missing[0]}, the learning rate of some parameters; "
+            "add it (0 freezes them)"
+        )
+
+
 def update_rule(config: Config, stage: Stage, params: Params, step: int) -> UpdateRule:
     """Return the learning rates ``step`` steps after a stage's start.
 
@@ -67,12 +97,7 @@ def update_rule(config: Config, stage: Stage, params: Params, step: int) -> Upda
     ValueError
         If a group of parameters has no rate.
     """
-    missing = sorted(set(rate_groups(params)) - set(stage.rates))
-    if missing:
-        raise ValueError(
-            f"stages.{stage.name}.rates lacks {missing[0]}, the learning rate of some parameters; "
-            "add it (0 freezes them)"
-        )
+    _require_rates(rate_groups(params), stage)
     light = {
         "light_knee": stage.light_knee,
         "light_pyramid": stage.light_pyramid,
@@ -94,7 +119,14 @@ def initial_params(shape: Any, config: Config, key: Key[Array, ""]) -> Params:
     shape : of the surface, see `SurfaceSettings.start`.
     config : settings of the run. key : of the material field.
     """
-    outputs = config.active_stages[0].transport.indirect_outputs if config.active_stages else 0
+    return _first_params(shape, key, config=config, stage=next(iter(config.active_stages), None))
+
+
+def _first_params(
+    shape: Any, key: Key[Array, ""], *, config: Config, stage: Stage | None
+) -> Params:
+    """Build parameters with what a stage learns of indirect light."""
+    outputs = 0 if stage is None else stage.transport.indirect_outputs
     return Params(
         geometry=shape,
         material=init_materials(key, config.material, indirect_outputs=outputs),

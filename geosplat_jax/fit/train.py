@@ -28,6 +28,7 @@ from geosplat_jax.fit.loop import Loop, resumed_loop
 from geosplat_jax.fit.memory import require_training_memory
 from geosplat_jax.fit.planning import TrainingError
 from geosplat_jax.fit.runtime import peak_memory_mb
+from geosplat_jax.fit.stages import require_rates
 from geosplat_jax.fit.step import StepReport, TrainState
 from geosplat_jax.fit.trained import Trained, load_trained
 from geosplat_jax.io.dataset import Dataset
@@ -246,7 +247,7 @@ def fit(
             raise Interrupted(
                 f"stopped at once; continue with --resume from the last checkpoint in {run}"
             ) from None
-        except (TrainingError, MemoryError, jax.errors.JaxRuntimeError) as error:
+        except (ValueError, TrainingError, MemoryError, jax.errors.JaxRuntimeError) as error:
             if has_begun and not run.metric_lines():
                 run.clear()  # not one step was made: the folder is free again
             if not is_out_of_memory(error):
@@ -269,6 +270,10 @@ def _out_of_memory(run: RunFolder, error: Exception) -> str:
 def _require_possible(dataset: Dataset, config: Config) -> None:
     """Refuse what cannot be trained, before anything is spent."""
     dataset.require_masks("train")
+    try:
+        require_rates(config)
+    except ValueError as error:
+        raise TrainingError(first_line(error)) from None
     require_training_memory(config, dataset)
 
 

@@ -124,6 +124,11 @@ class Upcoming:
         return self._planned.result()
 
     @property
+    def is_planned(self) -> bool:
+        """Whether the buffers could be planned; waits until that is known."""
+        return self._planned.exception() is None
+
+    @property
     def is_ready(self) -> bool:
         """Whether the programs are compiled."""
         return self.compiled.done()

@@ -5,6 +5,7 @@ Here live the checks that all layouts share: JSON, keys, poses, and paths that m
 scene folder.
 """
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -317,8 +318,9 @@ def optional_files(root: Path, candidates: Mapping[str, Path]) -> dict[str, Path
     }
 
 
-def find_lights(folders: list[Path], names: list[str]) -> dict[str, Path]:
-    """Find environment maps by name in the first folder that has them."""
+def find_lights(root: Path, names: list[str]) -> dict[str, Path]:
+    """Find environment maps by name in the folder of a scene, or else in the one above it."""
+    folders = [root, Path(os.path.abspath(root)).parent]  # of the path ".", too
     found = {}
     for name in names:
         candidates = [folder / f"{name}{suffix}" for folder in folders for suffix in MAP_SUFFIXES]

@@ -265,12 +265,12 @@ def _layout(spec: Any) -> _Layout:
 
 
 def _require_plain(layout: _Layout, path: Path) -> None:
-    """Refuse a last channel that is no alpha, and an image that shows a part of its frame only."""
+    """Refuse channels beside colour and alpha, and an image that shows a part of its frame only."""
     count = len(layout.channels)
-    if count in (2, 4) and layout.alpha != count - 1:
+    if count > 4 or (count in (2, 4) and layout.alpha != count - 1):
         raise ImageReadError(
-            f"{path} has the channels {', '.join(layout.channels)}, of which the last is no "
-            "alpha; write grey, RGB, or either with alpha"
+            f"{path} has the channels {', '.join(layout.channels)}, which are not grey or RGB with "
+            "or without an alpha at the end; write one of these"
         )
     if layout.shown != layout.whole:
         raise ImageReadError(

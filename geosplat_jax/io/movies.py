@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from geosplat_jax.io.images import SceneError, written_aside
 FORMATS = (".gif", ".mp4")
 """Suffixes that `write_movie` knows."""
 
-_ENCODER = "ffmpeg"
+_ENCODER, _H264 = "ffmpeg", "libx264"
 
 # Viewers slow down GIF frames that last less than two hundredths of a second.
 _MAX_GIF_RATE, _MAX_MP4_RATE = 50.0, 1000.0
@@ -37,10 +38,15 @@ _ERROR_LENGTH = 600
 
 
 def _encoder() -> str | None:
-    """Find ``ffmpeg``: on the PATH, or that of the package imageio-ffmpeg; None without either."""
-    on_path = shutil.which(_ENCODER)
-    if on_path is not None:
-        return on_path
+    """Find an ``ffmpeg`` that writes H.264: on the PATH, or that of the package imageio-ffmpeg.
+
+    None without either.
+    """
+    candidates = (shutil.which(_ENCODER), _bundled_encoder())
+    return next((one for one in candidates if one is not None and _writes_h264(one)), None)
+
+
+def _bundled_encoder() -> str | None:
     try:
         bundled = importlib.import_module("imageio_ffmpeg")
     except ImportError:
@@ -51,8 +57,19 @@ def _encoder() -> str | None:
         return None
 
 
+@cache
+def _writes_h264(program: str) -> bool:
+    """Ask a program for its encoders; some systems leave those of H.264 out."""
+    asked = [program, "-hide_banner", "-encoders"]
+    try:
+        told = subprocess.run(asked, capture_output=True, text=True, timeout=60, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return _H264 in told.stdout.split()
+
+
 class MissingEncoderError(SceneError):
-    """The program that writes this format is not installed."""
+    """The program that writes this format is not installed, or cannot do it."""
 
 
 def has_encoder(suffix: str) -> bool:
@@ -149,7 +166,7 @@ def _encoder_command(encoder: str, path: Path, width: int, height: int, rate: fl
         *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"),
         *("-framerate", f"{rate:.10g}", "-i", "pipe:0"),
         *("-vf", convert),
-        *("-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p"),
+        *("-c:v", _H264, "-crf", "18", "-pix_fmt", "yuv420p"),
         *("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "iec61966-2-1"),
         *("-color_range", "tv", "-movflags", "+faststart", "-f", "mp4"),
         f"file:{path}",
@@ -185,7 +202,7 @@ def _write_mp4(path: Path, frames: list[UInt8[np.ndarray, "H W 3"]], rate: float
             said = messages.read().decode(errors="replace").strip()[-_ERROR_LENGTH:]
             raise OSError(
                 f"cannot write {path}: {_ENCODER} ended with status {process.returncode} "
-                f"({said or 'no message'}); check that it has libx264, or write a .gif instead"
+                f"({said or 'no message'}); write a .gif instead"
             )
 
 
@@ -207,7 +224,7 @@ def check_movie(suffix: str, frames_per_second: float | int) -> None:
         )
     if suffix == ".mp4" and _encoder() is None:
         raise MissingEncoderError(
-            f"writing .mp4 needs the program {_ENCODER}, which is not on the PATH; install it "
+            f"writing .mp4 needs the program {_ENCODER} with {_H264} on the PATH; install it "
             f"(`pip install 'geosplat_jax[movies]'`, `apt install {_ENCODER}` or `brew install "
             f"{_ENCODER}`), or write .gif instead"
         )

@@ -32,18 +32,29 @@ def without_decoder_lines() -> Iterator[None]:
 
 
 def _begin() -> None:
-    global _users, _saved, _aside
+    global _users
     with _lock:
+        if not _users:
+            _put_aside()
         _users += 1
-        if _users > 1:
-            return
-        sys.stderr.flush()
-        try:
-            _saved = os.dup(2)
-        except OSError:
-            return  # a process without the stream has nothing to keep clean
-        _aside = tempfile.TemporaryFile()
-        os.dup2(_aside.fileno(), 2)
+
+
+def _put_aside() -> None:
+    global _saved, _aside
+    if sys.stderr is None:
+        return  # a process without the stream has nothing to keep clean
+    sys.stderr.flush()
+    try:
+        saved = os.dup(2)
+    except OSError:
+        return
+    try:
+        aside = tempfile.TemporaryFile()
+    except OSError:
+        os.close(saved)
+        raise
+    os.dup2(aside.fileno(), 2)
+    _saved, _aside = saved, aside
 
 
 def _end() -> None:
@@ -52,7 +63,8 @@ def _end() -> None:
         _users -= 1
         if _users or _aside is None:
             return
-        sys.stderr.flush()
+        if sys.stderr is not None:
+            sys.stderr.flush()
         os.dup2(_saved, 2)
         os.close(_saved)
         _aside.seek(0)

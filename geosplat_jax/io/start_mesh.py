@@ -317,7 +317,7 @@ def sized(mesh: StartMesh, edge: float, *, most_faces: int, path: str) -> StartM
     # As many equilateral triangles as cover the surface.
     wanted = max(int(area / (0.25 * np.sqrt(3.0) * edge**2)), 4)
     target = min(wanted, most_faces)
-    if target < _WORTHWHILE * len(mesh.faces):
+    if len(mesh.faces) > most_faces or target < _WORTHWHILE * len(mesh.faces):
         mesh = _decimated(mesh, target, most_faces=most_faces, path=path)
     else:
         mesh = _divided(mesh, target)

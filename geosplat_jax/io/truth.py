@@ -52,7 +52,7 @@ class Reading(NamedTuple):
         pixels = undistorted(self.frames[index], pixels)
         small = downscale(pixels, self.factor)
         height, width = self.sizes[index]
-        _require_size(small, self.sizes[index], path)
+        _require_size(small, self.sizes[index], path, " after reduction")
         placed = np.zeros((*self.images.shape[1:3], small.shape[-1]), np.float32)
         placed[:height, :width] = small
         if self.valid is None:
@@ -77,7 +77,7 @@ def true_maps(reading: Reading, albedo_is_srgb: bool, problems: list[str]) -> Ma
     return _OnDemand({key: maker(key) for key in keys}, keeps=True)
 
 
-def _for_reduction(reading: Reading, frame: Frame, pixels: np.ndarray) -> np.ndarray:
+def _for_reduction(reading: Reading, frame: Frame, pixels: np.ndarray, path: Path) -> np.ndarray:
     """Give an image that will be resampled the alpha of its view, where it has none of its own.
 
     Otherwise the background would be averaged into the rim.
@@ -87,7 +87,7 @@ def _for_reduction(reading: Reading, frame: Frame, pixels: np.ndarray) -> np.nda
     if not is_resampled or pixels.shape[-1] == 4:
         return pixels
     photograph = read_photograph(frame)
-    _require_size(photograph.alpha, pixels.shape[:2], frame.image)
+    _require_size(pixels, photograph.alpha.shape, path)
     alpha = values_of(photograph.alpha, is_srgb=False)
     return np.concatenate([pixels, alpha[..., None]], -1)
 
@@ -95,7 +95,7 @@ def _for_reduction(reading: Reading, frame: Frame, pixels: np.ndarray) -> np.nda
 def _read_truth(reading: Reading, index: int, key: str, is_srgb: bool) -> np.ndarray:
     frame = reading.frames[index]
     path = frame.truth[key]
-    pixels = _for_reduction(reading, frame, read_linear(path, is_srgb=is_srgb))
+    pixels = _for_reduction(reading, frame, read_linear(path, is_srgb=is_srgb), path)
     if key == "normal":
         pixels[..., :3] = 2.0 * pixels[..., :3] - 1.0
     values = reading.reduced(index, pixels, path)[..., : TRUTH_CHANNELS[key]]
@@ -117,7 +117,7 @@ def relit_images(reading: Reading, problems: list[str]) -> Mapping[str, Any]:
         def read(index: int) -> np.ndarray:
             frame = reading.frames[index]
             path = frame.relight[light]
-            pixels = _for_reduction(reading, frame, read_linear(path))
+            pixels = _for_reduction(reading, frame, read_linear(path), path)
             relit = reading.reduced(index, pixels, path)
             # Without an alpha of its own it has that of the view: the object has not moved.
             alpha = (
@@ -146,9 +146,9 @@ def _in_all(listed: list[Mapping[str, Path]], what: str, problems: list[str]) ->
     return complete
 
 
-def _require_size(pixels: np.ndarray, size: Sequence[int], path: Path) -> None:
+def _require_size(pixels: np.ndarray, size: Sequence[int], path: Path, when: str = "") -> None:
     if pixels.shape[:2] != tuple(size):
         raise SceneError(
-            f"{path} is {pixels.shape[1]} x {pixels.shape[0]} pixels (after reduction), but its "
+            f"{path} is {pixels.shape[1]} x {pixels.shape[0]} pixels{when}, but its "
             f"view is {size[1]} x {size[0]}; they must agree"
         )

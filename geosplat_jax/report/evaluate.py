@@ -25,7 +25,7 @@ from geosplat_jax.report.assets import MODEL_TEXTURE, MaterialSampler, write_mod
 from geosplat_jax.report.light_metrics import light_metrics
 from geosplat_jax.report.metrics import MASK_THRESHOLD, mask_iou, normal_mae_deg
 from geosplat_jax.report.pace import OnProgress, counted
-from geosplat_jax.report.protocols import Protocol
+from geosplat_jax.report.protocols import Look, Protocol, ScaledLook
 from geosplat_jax.report.renderer import (
     DEFAULT_SAMPLES,
     RenderedView,
@@ -49,9 +49,15 @@ def _where_counted(view: RenderedView, valid: np.ndarray | None) -> RenderedView
     return replace(
         view,
         rgb=view.rgb * counted,
+        linear=view.linear * counted,
         alpha=view.alpha * valid,
         aovs={name: values * counted for name, values in view.aovs.items()},
     )
+
+
+def _compared(view: RenderedView, look: Look | ScaledLook) -> np.ndarray:
+    """Return the colours that a look compares: those brighter than white only where it has them."""
+    return view.linear if isinstance(look, ScaledLook) else view.rgb
 
 
 def _valid(views: Views, index: int) -> np.ndarray | None:
@@ -77,8 +83,9 @@ def _view_metrics(
     mask = image[..., 3]
     metrics = protocol_metrics.new_view_metrics(view.rgb, view.alpha, image, valid)
     if protocol.new_views is not None:
+        look = protocol.new_views
         metrics |= protocol_metrics.new_view_metrics(
-            view.rgb, view.alpha, image, valid, protocol.new_views
+            _compared(view, look), view.alpha, image, valid, look
         )
     metrics["mask.iou"] = float(mask_iou(view.alpha, mask))
     if truth_normal is not None:
@@ -188,14 +195,18 @@ def _relight_metrics(
         for index in counted(range(len(views)), f"under {name}", on_progress):
             view = relit(views.camera(np.array([index])))
             view = _where_counted(view, _valid(views, index))
-            rgb[index], alpha[index] = view.rgb, view.alpha
+            rgb[index], alpha[index] = _compared(view, protocol.relight), view.alpha
+            if index in chosen:
+                truth = photograph_on_white(views.relight[name][index])
+                render = render_on_white(view.rgb, view.alpha)
+                rows[int(np.searchsorted(chosen, index))] |= {
+                    f"true {name}": truth,
+                    name: render,
+                    f"error {name}": error_map(truth, render),
+                }
         images = views.relight[name]
         found = protocol_metrics.relight_metrics(protocol, rgb, alpha, images, _all_valid(views))
         metrics |= {f"relight.{name}.{key}": value for key, value in found.items()}
-        for row, index in zip(rows, chosen, strict=True):
-            truth = photograph_on_white(images[index])
-            render = render_on_white(rgb[index], alpha[index])
-            row |= {f"true {name}": truth, name: render, f"error {name}": error_map(truth, render)}
     if names:
         for key in found:
             values = [metrics[f"relight.{name}.{key}"] for name in names]
@@ -395,13 +406,6 @@ def evaluate_run(
     renderer = Renderer.of(trained, samples=options.samples)
     radiance = np.asarray(trained.params.light.radiance)
     measured = _measure(renderer, truth, options, radiance, on_progress)
-    tell("pictures and model", 0, 1)
-    shown, gallery = _show(renderer, truth, measured, folder, options.protocol, radiance)
-    if options.model_texture is not None:
-        sampler = MaterialSampler(trained, renderer.asset())
-        size = options.model_texture
-        gallery["model"] = _write_model(trained, sampler, shown, truth.lights, folder, size)
-    tell("pictures and model", 1, 1)
     no_map = sorted(set(truth.views.relight) - set(truth.lights))
     metrics = {
         "protocol": options.protocol,
@@ -414,18 +418,32 @@ def evaluate_run(
         "samples": options.samples,
         "samples_drawn": renderer.samples,
         "relight_indirect": options.relight_indirect,
-        "seconds": round(time.perf_counter() - began, 2),
-        "peak_memory_mb": peak_memory_mb(),
         "versions": {
             "python": platform.python_version(),
             **{package: importlib.metadata.version(package) for package in _PACKAGES},
         },
         "seed": trained.config.run.seed,
         "config": trained.config.to_dict(),
-        "gallery": gallery,
-        "seen": None if shown.seen is None else shown.seen.described(),
         **meta,
     }
-    with written_aside(folder / "metrics.json") as aside:
-        aside.write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
-    return metrics
+
+    def written(**found: Any) -> dict[str, Any]:
+        """Write the metrics, with what else was found and what it took."""
+        effort = {
+            "seconds": round(time.perf_counter() - began, 2),
+            "peak_memory_mb": peak_memory_mb(),
+        }
+        with written_aside(folder / "metrics.json") as aside:
+            text = json.dumps(metrics | effort | found, indent=2)
+            aside.write_text(text + "\n", encoding="utf-8")
+        return metrics | effort | found
+
+    written(gallery={}, seen=None)  # pictures may fail, for want of memory say
+    tell("pictures and model", 0, 1)
+    shown, gallery = _show(renderer, truth, measured, folder, options.protocol, radiance)
+    if options.model_texture is not None:
+        sampler = MaterialSampler(trained, renderer.asset())
+        size = options.model_texture
+        gallery["model"] = _write_model(trained, sampler, shown, truth.lights, folder, size)
+    tell("pictures and model", 1, 1)
+    return written(gallery=gallery, seen=None if shown.seen is None else shown.seen.described())

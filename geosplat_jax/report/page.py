@@ -195,12 +195,14 @@ def _described(run: Evaluated, name: str, room: int) -> dict[str, Any]:
     psnr = {line["view"]: line["nvs.psnr"] for line in metrics.get("views", [])}
     again, is_whole = command(record, config)
     seen = metrics.get("seen")
+    last = lines[-1]["step"] + 1 if lines and run.results == run.folder.path else None
     return {
         "name": name,
         "folder": str(run.results),
         "record": record,
         "config": config,
         "metrics": metrics,
+        "older": metrics.get("step") if last and metrics.get("step") not in (None, last) else None,
         "figures": [(figure(key), value) for key, value in mean.items()],
         "headlines": [
             (figure(key), metrics["mean"][key])

@@ -19,6 +19,10 @@ _SHEET_COLOR = (0.094, 0.098, 0.106)
 _CELL_COLOR = (0.149, 0.153, 0.161)
 _TEXT_COLOR = (208, 210, 214)
 _FAINT_TEXT_COLOR = (134, 138, 146)
+_LARGEST_CELL = 800
+"""Pixels of a picture's longer side on a sheet, at most: sheets of photographs would be larger than
+programs open, and take gigabytes to make."""
+
 _GUTTER = 4
 _MARGIN = 16
 _TITLE_HEIGHT = 34
@@ -172,6 +176,15 @@ def _write_texts(
     return np.where(is_written, written.astype(np.float32) / 255.0, sheet)
 
 
+def _reduced(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "h w 3"]:
+    """Reduce a picture to the largest that a sheet shows."""
+    size = picture.shape[:2]
+    factor = _LARGEST_CELL / max(size)
+    if factor >= 1.0:
+        return picture
+    return _resized(picture, *(max(1, round(factor * extent)) for extent in size))
+
+
 def _place(cell: Float[np.ndarray, "h w 3"], picture: Float[np.ndarray, "H W 3"]) -> None:
     """Fit a picture into a view of the sheet, centred, keeping its proportions."""
     height, width = cell.shape[:2]
@@ -307,6 +320,7 @@ def overview_sheet(
 
     Columns are the names of all rows in order of first appearance; a picture that a row lacks
     leaves its cell empty. Cells have the size of the first picture; others are fitted into it.
+    Pictures of more than `_LARGEST_CELL` pixels are reduced.
     Pixels of pictures that are narrower than the columns' names are repeated until those fit.
 
     Parameters
@@ -329,7 +343,7 @@ def overview_sheet(
     ValueError
         If there is no picture, or an image or the labels have the wrong shape or number.
     """
-    pictures = [{name: _as_picture(im, name) for name, im in row.items()} for row in rows]
+    pictures = [{name: _reduced(_as_picture(im, name)) for name, im in row.items()} for row in rows]
     names = list(dict.fromkeys(name for row in pictures for name in row))
     labels = list(row_labels or ())
     if not names:

@@ -283,7 +283,8 @@ def new_view_metrics(
 
     Parameters
     ----------
-    rgb : (H, W, 3) linear, exposed and tone mapped, premultiplied by ``alpha``; clipped here.
+    rgb : (H, W, 3) linear, exposed and tone mapped, premultiplied by ``alpha``; clipped here. For a
+        `ScaledLook` not tone mapped: it measures what is brighter than white, too.
     alpha : (H, W) predicted coverage.
     image : (H, W, 4) photograph, linear, *straight* alpha, which is the mask.
     valid : (H, W) pixels that count, or None.
@@ -414,7 +415,7 @@ def relight_metrics(
     ----------
     protocol : its ``relight`` decides.
     rgb : (V, H, W, 3) linear, premultiplied by ``alpha``, lit with the albedo times its
-        `albedo_scale`, at exposure 1; clipped here.
+        `albedo_scale`, at exposure 1; clipped here. For a `ScaledLook` not tone mapped.
     alpha : (V, H, W) predicted coverage.
     image : (V, H, W, 4) true image, linear, *straight* alpha, which is the mask.
     valid : (V, H, W) pixels that count, or None.

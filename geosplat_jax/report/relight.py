@@ -199,6 +199,8 @@ def relight_views(
         write_png(written[-1], picture(view, camera, light, options.background))
     first = _for_movies(shots[0].camera)
     center = relit.center()
+    if options.rotate_env:
+        relit.plan(first)  # once for the renderers of all frames
 
     def on_turntable(angle: float) -> np.ndarray:
         camera = orbit(first, center, angle)

@@ -16,7 +16,7 @@ import numpy as np
 
 from geosplat_jax.core import capacity as capacity_module
 from geosplat_jax.core.capacity import Capacities, Usage
-from geosplat_jax.core.color import tone_map
+from geosplat_jax.core.color import expose, tone_map
 from geosplat_jax.core.mesh import vertex_normals
 from geosplat_jax.core.types import Camera, EnvLight, Mesh, Splats
 from geosplat_jax.fit.cameras import Subject
@@ -84,11 +84,13 @@ class RenderedView:
     ----------
     rgb : (H, W, 3) linear, exposed and tone mapped.
     alpha : (H, W).
+    linear : (H, W, 3) exposed radiance, of any size: what is tone mapped.
     aovs : albedo, roughness, metallic, normal, and those of `Renderer.with_aovs`; (H, W, c) each.
     """
 
     rgb: np.ndarray
     alpha: np.ndarray
+    linear: np.ndarray
     aovs: dict[str, np.ndarray]
 
 
@@ -226,7 +228,7 @@ class Renderer:
 
     def under(self, light: EnvLight) -> "Renderer":
         """Return a renderer that differs in the light alone; the surface is not built again."""
-        other = copy.copy(self)
+        other = self._copy()
         other._light = light
         other._illuminations = []
         return other
@@ -234,7 +236,7 @@ class Renderer:
     def with_samples(self, samples: int) -> "Renderer":
         """Return a renderer of the same surface with another number of rays per splat."""
         self.asset()
-        other = copy.copy(self)
+        other = self._copy()
         other._passes, other._pass_samples = _passes_of(samples)
         other._pipeline = other._for_images(other._pipeline)
         other._illuminations = []
@@ -242,14 +244,20 @@ class Renderer:
 
     def with_aovs(self, *names: str) -> "Renderer":
         """Return a renderer whose views have these AOVs too, some of `render.AOV_CHANNELS`."""
-        other = copy.copy(self)
+        other = self._copy()
         other._aov_names = tuple(dict.fromkeys((*self._aov_names, *names)))
         return other
 
     def hurried(self) -> "Renderer":
         """Return a renderer of a single pass: noisier, and made of the same programs."""
-        other = copy.copy(self)
+        other = self._copy()
         other._passes, other._illuminations = 1, []
+        return other
+
+    def _copy(self) -> "Renderer":
+        """Return a renderer like this one, which remembers apart for what it has planned."""
+        other = copy.copy(self)
+        other._planned = set(self._planned)
         return other
 
     def center(self) -> np.ndarray:
@@ -296,8 +304,11 @@ class Renderer:
         self._illuminations = [prepared.with_parts(mean) for prepared in first]
         return self._illuminations
 
-    def _plan(self, camera: Camera) -> None:
-        """Grow the lists for the first view of a size, before a larger program is compiled."""
+    def plan(self, camera: Camera) -> None:
+        """Grow the lists for the first view of a size, before a larger program is compiled.
+
+        Rendering does so by itself; renderers made `under` other lights afterwards need not.
+        """
         size, unlit = (camera.height, camera.width), self._pipeline.unlit()
         if size in self._planned:
             return
@@ -313,7 +324,7 @@ class Renderer:
 
     def _render(self, camera: Camera, illumination: Illumination, number: int) -> RenderOutput:
         """Render one pass of a view, growing buffers as needed."""
-        self._plan(camera)
+        self.plan(camera)
         key = jax.random.fold_in(self._key, self._passes + number)
 
         def attempt(capacities: Capacities) -> tuple[RenderOutput, Usage]:
@@ -337,11 +348,11 @@ class Renderer:
             illumination = illuminations[number % len(illuminations)]
             outputs.append(self._render(camera, illumination, number))
         linear = jnp.mean(jnp.stack([output.rgb[0] for output in outputs]), axis=0)
-        rgb = tone_map(linear, self._log_exposure)
         first = outputs[0]
         return RenderedView(
-            np.asarray(rgb),
+            np.asarray(tone_map(linear, self._log_exposure)),
             np.asarray(first.alpha[0]),
+            np.asarray(expose(linear, self._log_exposure)),
             {name: np.asarray(image[0]) for name, image in first.aovs.items()},
         )
 

@@ -237,15 +237,15 @@ class Images:
 
         ``NAME_rgba.png`` has straight alpha. PNG of AOVs: albedo in sRGB, roughness and metallic
         as they are, unit normals as (n + 1) / 2, all with straight alpha. ``.exr`` are linear:
-        colour with alpha as ``NAME_rgba.exr``, AOVs as straight values, zero where nothing was
-        hit. Normals are in world axes; depth, along the camera's axis in the scene's unit, is
-        written as EXR only.
+        exposed radiance of any size, with alpha, as ``NAME_rgba.exr``, AOVs as straight values,
+        zero where nothing was hit. Normals are in world axes; depth, along the camera's axis in the
+        scene's unit, is written as EXR only.
         """
         written = [folder / f"{name}_rgba.png"]
         write_png(written[0], straight_rgba(view))
         if self.exr:
             written.append(folder / f"{name}_rgba.exr")
-            colors = straight(view.rgb, view.alpha)
+            colors = straight(view.linear, view.alpha)
             write_exr(written[-1], np.concatenate([colors, view.alpha[..., None]], axis=-1))
         for aov in self.aovs:
             values = straight(view.aovs[aov], view.alpha)

@@ -341,12 +341,14 @@ def _text_images(path: Path) -> Iterator[_Image]:
         image, camera = _integers([words[0], words[8]], where)
         pose = _floats(words[1:8], where)
         # Every image has a second line of points, which may be empty.
-        points = len(next(lines, (0, ""))[1].split())
-        if points % 3:
+        points = next(lines, (0, ""))[1].split()
+        if len(points) % 3:
             raise SceneError(
-                f"line {number + 1} of {path} must hold points of three numbers each, got {points} "
-                "numbers; write the model again"
+                f"line {number + 1} of {path} must hold points of three numbers each, got "
+                f"{len(points)} numbers; write the model again"
             )
+        # Names are words: a model without these lines would lose every second image.
+        _floats(points[-3:], f"line {number + 1} of {path}, which holds points,")
         yield _Image(image, pose[:4], pose[4:], camera, words[9].strip())
 
 

@@ -7,6 +7,7 @@ numbers there, so half a pixel is added to the principal point.
 
 import re
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -90,6 +91,10 @@ def _masks(root: Path, images: list[Path]) -> list[Path | None]:
     return [*files]
 
 
+_DAMAGES = (OSError, ValueError, EOFError, KeyError, TypeError, RuntimeError)
+"""Errors of `numpy.load` where a file is no archive of arrays, or not a whole one."""
+
+
 def _camera_file(root: Path) -> Path | None:
     return next((root / name for name in CAMERA_FILES if (root / name).is_file()), None)
 
@@ -99,7 +104,7 @@ def _read_matrices(where: Path) -> dict[str, np.ndarray]:
     try:
         with where.open("rb") as file, np.load(file, allow_pickle=False) as content:
             return {key: content[key] for key in content.files if not key.endswith("inv")}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+    except (*_DAMAGES, zipfile.BadZipFile, zlib.error) as error:
         raise SceneError(f"{where} is damaged ({error}); write it again") from error
 
 

@@ -74,7 +74,7 @@ def _frames(root: Path, split: str, *, has_maps: bool) -> tuple[Frame, ...]:
         candidates = [stem.with_name(stem.name + suffix) for suffix in IMAGE_SUFFIXES]
         asked = inside_scene(root, file_path, where)
         image = existing(
-            root, [asked] if asked != stem else candidates, f"{file_path} of {where.name}"
+            root, [asked] if asked != stem else [*candidates, asked], f"{file_path} of {where.name}"
         )
         maps = {}
         if has_maps:

@@ -44,7 +44,7 @@ def list_synthetic4relight(root: Path, *, light: str | None = None) -> Listing:
     return Listing(
         train=tuple(_train_frame(root, *listed) for listed in _listed(root, "train")),
         test=tuple(_test_frame(root, *listed) for listed in _listed(root, "test")),
-        lights=find_lights([root, root.parent], [TRAIN_LIGHT, *TEST_LIGHTS]),
+        lights=find_lights(root, [TRAIN_LIGHT, *TEST_LIGHTS]),
         train_light=TRAIN_LIGHT,
     )
 

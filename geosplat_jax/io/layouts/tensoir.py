@@ -61,7 +61,7 @@ def list_tensoir(root: Path, *, light: str | None = None) -> Listing:
     return Listing(
         train=splits["train"],
         test=splits["test"],
-        lights=find_lights([root, root.parent], list(lights)),
+        lights=find_lights(root, list(lights)),
         train_light=train_light,
         albedo_is_srgb=False,
     )

@@ -79,10 +79,10 @@ def _plain(path: str) -> str:
 def _frame(root: Path, listed: ListedFrame, where: Path) -> Frame:
     asked = inside_scene(root, listed.file_path, where)
     stem = image_stem(root, listed.file_path, where)
-    candidates = [stem.with_name(stem.name + suffix) for suffix in IMAGE_SUFFIXES]
-    image = existing(
-        root, [asked] if asked != stem else candidates, f"{listed.file_path} of {where.name}"
-    )
+    candidates = [asked]
+    if asked == stem:  # no ending, or one that is not known
+        candidates = [*(stem.with_name(stem.name + suffix) for suffix in IMAGE_SUFFIXES), asked]
+    image = existing(root, candidates, f"{listed.file_path} of {where.name}")
     mask, name = None, listed.values.get("mask_path")
     if name is not None:
         if not isinstance(name, str) or not name:
