@@ -131,7 +131,13 @@ def test_presets_have_a_rate_for_everything_that_their_stages_learn(preset, qual
     ("overrides", "message"),
     [
         ((), r"stages\.polish\.rates lacks "),
-        (("stages.split_sum.transport.kind=monte_carlo",), r"split_sum\.rates lacks indirect"),
+        (
+            (
+                "stages.split_sum.transport.kind=monte_carlo",
+                "stages.split_sum.transport.indirect=constant",
+            ),
+            r"split_sum\.rates lacks indirect",
+        ),
     ],
 )
 def test_a_stage_that_lacks_a_rate_is_refused_before_any_is_trained(tmp_path, overrides, message):

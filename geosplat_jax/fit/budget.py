@@ -179,11 +179,11 @@ def plan(
         mesh=None if mesh is None else mesh_settings(mesh),
         overrides=tuple(overrides),
     )
+    if not settings_at(_EFFORTS[0]).active_stages:
+        raise TrainingError("nothing to train: no stage has steps")
     candidates = [
         _candidate(effort, settings_at(effort), size, slowness, downscale) for effort in _EFFORTS
     ]
-    if not candidates[0].config.active_stages:
-        raise TrainingError("nothing to train: no stage has steps")
     if budget.memory is not None and candidates[0].memory > budget.memory:
         raise TrainingError(
             f"about {candidates[0].memory / 1e9:.1f} GB are the least that a training takes, "
