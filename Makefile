@@ -25,7 +25,9 @@ IN_FILES = --numprocesses 2 --dist loadfile --no-loadscope-reorder
 test: $(INSTALLED)
 	$(BIN)/python -m pytest $(IN_FILES) -m 'not slow'
 
-test-slow: test-compiling test-computing
+test-slow:
+	$(MAKE) test-compiling
+	$(MAKE) test-computing
 
 test-compiling: $(INSTALLED)
 	$(BIN)/python -m pytest $(IN_FILES) -m 'slow and not computes and not long'

@@ -36,7 +36,7 @@ def rounds_folder(output: str | Path) -> Path:
 
 
 def round_config(material_prior: str = "hybrid") -> Config:
-    """Return the settings of a round: a draft with half its split sum that is not refined.
+    """Return the settings of a round: a draft with half its split sum and no refinement.
 
     What rounds recover was measured so (docs/cameras.md); longer rounds and free splats were not
     tried.
@@ -71,8 +71,11 @@ def _require_same(folder: Path, made_with: Mapping[str, Any]) -> None:
     except ValueError as error:
         raise RunError(f"{path} is damaged: {error}; delete {folder} to begin again") from None
     now = parse_json(text)
+    # Of what an earlier version did not note nothing is known.
     changed = sorted(
-        name for name in now if not isinstance(before, dict) or now[name] != before.get(name)
+        name
+        for name in now
+        if not isinstance(before, dict) or now[name] != before.get(name, now[name])
     )
     if changed:
         raise RunError(

@@ -83,7 +83,7 @@ class ChosenModel:
     ----------
     config : settings of the training that is to follow, on all views.
     rungs : of all parts that were tried, in order.
-    by_hand : titles of the parts that were set by hand.
+    by_hand : titles of the parts that were set by hand, and of those that these need.
     held_back : names of the views.
     trainings : how many there were. seconds : that they took, first stage included.
     """

@@ -537,6 +537,8 @@ def train(
     started, folder = time.perf_counter() if began is None else began, RunFolder(output)
     if isinstance(devices, int):
         devices = choose_devices(devices)
+    if model is not None and jax.process_count() > 1:  # asked after the devices were made
+        raise ValueError("a model is chosen by one host; leave model out")
     goes_on = begin.goes_on(folder)
     order = _Order(config, mesh, budget, reading)
     if goes_on:
@@ -608,8 +610,6 @@ def _require_consistent(
         )
     if chooses and (budget is not None or begin.takes_over):
         raise ValueError("a model is chosen for a whole training without a budget; leave model out")
-    if chooses and jax.process_count() > 1:
-        raise ValueError("a model is chosen by one host; leave model out")
 
 
 def _as_it_began(order: _Order, folder: RunFolder, *, chooses: bool) -> _Order:

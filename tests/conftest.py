@@ -70,12 +70,16 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(autouse=True, scope="module")
 def _release_compiled_programs():
-    """Forget what was compiled once that is too much for one process.
+    """Forget what was compiled once that is too much for one process, where that can be told.
 
-    Until then, files find each other's programs without tracing them again.
+    Every program holds memory maps, without which the compiler crashes. Until then, files find each
+    other's programs without tracing them again.
     """
     yield
-    release_programs_when_crowded()
+    if sys.platform.startswith("linux"):
+        release_programs_when_crowded()
+    else:
+        jax.clear_caches()
 
 
 @pytest.fixture(scope="module")

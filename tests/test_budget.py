@@ -1,5 +1,6 @@
 """Budgets: what is chosen for a time, and a pace that keeps to it on any machine."""
 
+import time
 from dataclasses import replace
 from itertools import pairwise
 
@@ -11,6 +12,7 @@ from support import sphere_dataset, tiny_config
 
 from geosplat_jax import cli
 from geosplat_jax import run as run_module
+from geosplat_jax.cli import training
 from geosplat_jax.fit import budget as budget_module
 from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.budget import (
@@ -508,6 +510,28 @@ def test_a_budget_that_is_resumed_takes_no_other_settings(dataset, tmp_path, cap
     assert cli.main(command) == 2
     told = " ".join(capsys.readouterr().err.split())
     assert "leave --set, --seed, --mesh, --downscale out" in told
+    begun = ["train", "examples/duck", "--output", str(tmp_path / "run"), "--resume"]
+    assert cli.main([*begun, "--budget", "2min"]) == 2
+    assert "keeps its budget; leave --budget" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_command_of_a_budget_goes_on_with_resume_alone(dataset, tmp_path, monkeypatch):
+    """The scene is read as it was, the budget is its own, and reading counts."""
+    config = tiny_config("stages.split_sum.steps=40", "stages.monte_carlo.steps=0")
+    _paced_run(dataset, tmp_path / "run", config, stop_after=12)
+    asked = {}
+
+    def noted(scene, output, config, **options):
+        asked.update(options)
+        raise RunError("told enough")
+
+    monkeypatch.setattr(training, "train_run", noted)
+    monkeypatch.setattr(training, "load_recorded", lambda scene, options: dataset)
+    command = ["train", "examples/duck", "--output", str(tmp_path / "run"), "--resume"]
+    before = time.perf_counter()
+    assert cli.main([*command, "--budget", "60s", "--downscale", "auto"]) == 2
+    assert asked["budget"] == Budget(60.0)
+    assert before <= asked["began"] <= time.perf_counter()
 
 
 @pytest.mark.parametrize(

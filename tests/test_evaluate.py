@@ -156,6 +156,18 @@ def perfect(run, views, tmp_path_factory):
     )
 
 
+def test_figures_are_there_when_pictures_fail(run, views, tmp_path, monkeypatch):
+    def fails(*arguments):
+        raise MemoryError("no room for pictures")
+
+    monkeypatch.setattr(evaluate_module, "_show", fails)
+    with pytest.raises(MemoryError, match="no room"):
+        evaluate(run, views, tmp_path)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["mean"]["nvs.psnr"] > 60
+    assert (metrics["gallery"], metrics["seen"], metrics["step"]) == ({}, None, 7)
+
+
 def test_truth_of_the_own_making_is_met(perfect):
     _, metrics = perfect
     mean = metrics["mean"]

@@ -350,7 +350,7 @@ def test_a_model_is_chosen_recorded_and_trained_on_all_views(tmp_path, capsys):
     assert load_trained(output).step == config.total_steps
     # What is done is not done again; the model is the run's own.
     measured = (choice_folder(output) / "choice.json").stat().st_mtime_ns
-    assert cli.main(command) == 0
+    assert cli.main(["train", str(duck), "--output", str(output), "--resume"]) == 0
     assert (choice_folder(output) / "choice.json").stat().st_mtime_ns == measured
     # Its own, also where the settings are named that it was chosen from.
     for named in (None, config):

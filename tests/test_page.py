@@ -13,6 +13,7 @@ from PIL import Image
 from geosplat_jax.cli import main
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.presets import between_qualities, make_config
+from geosplat_jax.io.checkpoints import save_checkpoint
 from geosplat_jax.io.images import write_hdr
 from geosplat_jax.report import facts, page
 from geosplat_jax.report.facts import changed_from_preset, command, curves, figure, stage_times
@@ -351,10 +352,25 @@ def test_a_run_that_was_trained_further_since_its_evaluation_says_so(tmp_path):
     folder = tmp_path / "run"
     make_run(folder)
     metrics = json.loads((folder / "metrics.json").read_text())
-    for step, is_older in ((STEPS, False), (900, True)):
+    save_checkpoint(RunFolder(folder).checkpoints, 1600, tree={"x": np.zeros(2)}, meta={})
+    # A killed run has made steps since its last checkpoint, which no evaluation can see.
+    for step, is_older in ((1600, False), (900, True)):
         (folder / "metrics.json").write_text(json.dumps({**metrics, "step": step}))
         html = report_html([Evaluated.of(RunFolder(folder))])
         assert (f"was evaluated after {step} steps" in html) is is_older
+
+
+def test_different_indirect_light_under_new_lights_is_said(tmp_path):
+    runs = []
+    for name, indirect in (("a", "traced"), ("b", "traced"), ("c", "none")):
+        make_run(tmp_path / name)
+        metrics = json.loads((tmp_path / name / "metrics.json").read_text())
+        metrics["relight_indirect"] = indirect
+        (tmp_path / name / "metrics.json").write_text(json.dumps(metrics))
+        runs.append(Evaluated.of(RunFolder(tmp_path / name)))
+    told = "relit with different indirect light"
+    assert told not in report_html(runs[:2])
+    assert told in report_html(runs)
 
 
 def test_long_curves_are_thinned_and_keep_their_ends():

@@ -60,6 +60,15 @@ def test_pictures_of_another_size_are_fitted_into_the_cell():
     assert (b[1] - b[0], b[3] - b[2]) == (20, 60)
 
 
+def test_large_pictures_are_reduced_in_proportion(monkeypatch):
+    monkeypatch.setattr(pictures, "_LARGEST_CELL", 300)
+    sheet = pictures.overview_sheet([{"a": flat(0.5, 400, 600), "b": flat(0.9, 800, 900)}])
+    a, b = find(sheet, [0.5] * 3), find(sheet, [0.9] * 3)
+    assert (a[1] - a[0], a[3] - a[2]) == (200, 300)
+    # The second is fitted into a cell of the size of the first.
+    assert (b[1] - b[0], b[3] - b[2]) == (200, 225)
+
+
 def test_titles_labels_notes_and_light_add_room_and_ink():
     rows = [{"truth": flat(0.5, 100, 100), "render": flat(0.7, 100, 100)}] * 3
     plain = pictures.overview_sheet(rows)

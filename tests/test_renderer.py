@@ -233,6 +233,15 @@ def test_another_light_is_the_same_as_relighting_with_it(matt, relit, camera):
     assert_same_view(relit.under(sky(seed=5))(camera), directly(camera))
 
 
+def test_what_a_renderer_has_planned_binds_no_other(relit):
+    """Frames under a light that turns would each grow their buffers, or render once in vain."""
+    other = relit.under(sky(seed=6))
+    other.plan(views_from([[2.2, -1.8, 1.0]], size=200).camera())
+    assert other._pipeline.capacities != relit._pipeline.capacities
+    assert relit.under(sky(seed=6))._planned == relit._planned != other._planned
+    assert other.under(sky(seed=7))._pipeline.capacities == other._pipeline.capacities
+
+
 def test_light_enters_linearly_at_exposure_one(relit, camera):
     """Twice the light is twice the radiance: the same samples, and no exposure."""
     single, double = relit(camera), relit.under(sky(2.0, seed=3))(camera)

@@ -152,6 +152,16 @@ def test_a_stage_that_lacks_a_rate_is_refused_before_any_is_trained(tmp_path, ov
     assert not (tmp_path / "run" / "run.json").exists()
 
 
+def test_a_training_that_is_refused_when_it_begins_leaves_its_folder_free(tmp_path, monkeypatch):
+    def fails(*arguments):
+        raise ValueError("no such thing")
+
+    monkeypatch.setattr(loop_module.Loop, "prepare", fails)
+    with pytest.raises(ValueError, match="no such thing"):
+        fit(sphere_dataset(count=3, size=8), tiny_config(), tmp_path / "run")
+    assert not (tmp_path / "run" / "run.json").exists()
+
+
 def test_traced_indirect_light_learns_nothing():
     traced = "stages.monte_carlo.transport.indirect=traced"
     _, params = ball(

@@ -129,13 +129,18 @@ _SETTING_OPTIONS = {
 """Options that a record answers, by the names of their values."""
 
 
-def _require_no_settings(arguments: argparse.Namespace, folder: RunFolder) -> None:
-    """Refuse settings and ways of reading for a run that goes on with those in its record."""
+def _require_no_settings(
+    arguments: argparse.Namespace, folder: RunFolder, *, but: str | None = None
+) -> None:
+    """Refuse settings and ways of reading for a run that goes on with those in its record.
+
+    ``but`` : an option that says what the record says.
+    """
     usual = command_line().parse_args(["train", str(arguments.scene)])
     told = [
         option
         for option, name in _SETTING_OPTIONS.items()
-        if getattr(arguments, name) not in (getattr(usual, name), "auto")
+        if option != but and getattr(arguments, name) != getattr(usual, name)
     ]
     if told:
         raise UsageError(
@@ -148,10 +153,10 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
     """Read from the options, or from the run that is resumed, what is to be done; say it."""
     known = folder.budget() if arguments.resume and folder.exists else None
     if known is not None:
-        asked = arguments.budget, arguments.memory
+        asked, chooses_size = (arguments.budget, arguments.memory), arguments.downscale == "auto"
         if asked not in ((None, None), (known.seconds, known.memory)):
             raise UsageError(f"{folder} keeps its budget; leave --budget and --memory out")
-        _require_no_settings(arguments, folder)
+        _require_no_settings(arguments, folder, but="--downscale" if chooses_size else None)
         # Its settings were chosen for the budget, and have changed since.
         reading = folder.record()["dataset"]
         return _Order(folder.config(), reading, known, goes_on=True)
@@ -194,7 +199,7 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
 def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[str, Any]) -> Path:
     """Set the cameras right before the training proper; say where they are."""
     draft = round_config(arguments.material_prior)
-    say("cameras first: a short training, a draft with half its split sum that is not refined")
+    say("cameras first: a short training, a draft with half its split sum and no refinement")
     with ProgressDisplay(draft.total_steps) as display:
         cameras = refined_cameras(
             arguments.scene,
@@ -313,12 +318,13 @@ def train(arguments: argparse.Namespace) -> None:
     order = _ordered(arguments, RunFolder(folder))
     config, reading = order.config, dict(order.reading)
     begun = RunFolder(folder)
+    if arguments.refine_cameras is not None and arguments.resume and begun.exists:
+        if not begun.record()["dataset"].get("cameras"):
+            raise UsageError(f"{folder} was begun without --refine-cameras; leave it out")
     # A run that knows how it reads its scene knows its refined cameras.
     if arguments.refine_cameras is not None and not order.goes_on:
         if not arguments.resume:
             begun.require_free(replace=arguments.force)
-        elif begun.exists and not begun.record()["dataset"].get("cameras"):
-            raise UsageError(f"{folder} was begun without --refine-cameras; leave it out")
         reading["cameras"] = _refined_cameras(arguments, folder, reading)
     dataset = load_recorded(arguments.scene, reading)
     if arguments.resume and begun.exists:

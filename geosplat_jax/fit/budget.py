@@ -15,6 +15,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import jax
+
 from geosplat_jax.fit.config import Budget, Config, Pace, Stage
 from geosplat_jax.fit.costs import (
     StageCost,
@@ -189,7 +191,7 @@ def plan(
             f"about {candidates[0].memory / 1e9:.1f} GB are the least that a training takes, "
             f"more than --memory allows ({budget.memory / 1e9:.1f} GB)"
         )
-    limits = [most for most in (budget.memory, memory_of_machine()) if most is not None]
+    limits = [most for most in (budget.memory, _memory_here()) if most is not None]
     # Expectations err: the least may train where it is expected not to.
     fitting = [one for one in candidates if one.memory <= min(limits, default=math.inf)]
     candidates = fitting or candidates[:1]
@@ -209,6 +211,11 @@ def plan(
         )
     config = with_steps(chosen.config, min(max(share, _SHORTEST), _LONGEST))
     return replace(chosen, config=config, seconds=expected_seconds(config, chosen.costs))
+
+
+def _memory_here() -> float | None:
+    """Return the memory of the machine where it computes itself: that is what is expected."""
+    return memory_of_machine() if jax.default_backend() == "cpu" else None
 
 
 def _candidate(

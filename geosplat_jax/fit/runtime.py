@@ -21,6 +21,9 @@ _Result = TypeVar("_Result")
 _CROWDED = 0.5
 """Share of the memory maps from which programs are forgotten."""
 
+_MOST_MAPS = 65_530
+"""Memory maps that count, also where a system grants more: programs take memory, too."""
+
 
 def release_programs_when_crowded() -> bool:
     """Forget compiled programs if they hold half of the memory maps of this process; tell if so.
@@ -29,7 +32,7 @@ def release_programs_when_crowded() -> bool:
     process 65,530 maps; beyond them the compiler crashes. What is needed again is compiled again.
     """
     try:
-        granted = int(Path("/proc/sys/vm/max_map_count").read_text())
+        granted = min(int(Path("/proc/sys/vm/max_map_count").read_text()), _MOST_MAPS)
         held = Path("/proc/self/maps").read_bytes().count(b"\n")
     except OSError:  # not on Linux
         return False

@@ -1,4 +1,4 @@
-"""Films of rendered frames: animated GIF, and H.264 in MP4 where ``ffmpeg`` is installed.
+"""Films of rendered frames: animated GIF, and H.264 in MP4 where an ``ffmpeg`` with libx264 is installed.
 
 Frames are display-referred sRGB in [0, 1], row 0 at the top. Files are written aside and then
 renamed, as images are.
@@ -42,8 +42,11 @@ def _encoder() -> str | None:
 
     None without either.
     """
-    candidates = (shutil.which(_ENCODER), _bundled_encoder())
-    return next((one for one in candidates if one is not None and _writes_h264(one)), None)
+    for find in (lambda: shutil.which(_ENCODER), _bundled_encoder):
+        program = find()
+        if program is not None and _writes_h264(program):
+            return program
+    return None
 
 
 def _bundled_encoder() -> str | None:
@@ -212,7 +215,7 @@ def check_movie(suffix: str, frames_per_second: float | int) -> None:
     Raises
     ------
     SceneError : an unknown suffix, an unusable rate.
-    MissingEncoderError : MP4 without ``ffmpeg``.
+    MissingEncoderError : MP4 without an ``ffmpeg`` that has libx264.
     """
     if suffix not in FORMATS:
         raise SceneError(f"a movie must end in {' or '.join(FORMATS)}, got {suffix!r}")
@@ -224,7 +227,7 @@ def check_movie(suffix: str, frames_per_second: float | int) -> None:
         )
     if suffix == ".mp4" and _encoder() is None:
         raise MissingEncoderError(
-            f"writing .mp4 needs the program {_ENCODER} with {_H264} on the PATH; install it "
+            f"writing .mp4 needs the program {_ENCODER} with {_H264}, and none is found; install it "
             f"(`pip install 'geosplat_jax[movies]'`, `apt install {_ENCODER}` or `brew install "
             f"{_ENCODER}`), or write .gif instead"
         )
@@ -254,7 +257,7 @@ def write_movie(
     ------
     SceneError : an unknown suffix, an unusable rate, no frames, or a frame of a wrong shape or
         type, of another size, or with values that are not finite.
-    MissingEncoderError : MP4 without ``ffmpeg``.
+    MissingEncoderError : MP4 without an ``ffmpeg`` that has libx264.
     OSError : the file cannot be written.
     """
     path = Path(path)

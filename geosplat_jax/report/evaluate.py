@@ -192,21 +192,19 @@ def _relight_metrics(
             relit = renderer.relit(lights[name], albedo_scale=albedo_scale, indirect=indirect)
         rgb = np.empty((*views.images.shape[:3], 3), np.float32)
         alpha = np.empty(views.images.shape[:3])
+        shown: dict[int, np.ndarray] = {}
         for index in counted(range(len(views)), f"under {name}", on_progress):
             view = relit(views.camera(np.array([index])))
             view = _where_counted(view, _valid(views, index))
             rgb[index], alpha[index] = _compared(view, protocol.relight), view.alpha
             if index in chosen:
-                truth = photograph_on_white(views.relight[name][index])
-                render = render_on_white(view.rgb, view.alpha)
-                rows[int(np.searchsorted(chosen, index))] |= {
-                    f"true {name}": truth,
-                    name: render,
-                    f"error {name}": error_map(truth, render),
-                }
-        images = views.relight[name]
+                shown[index] = render_on_white(view.rgb, view.alpha)
+        images = views.relight[name]  # read once, since every look reads all of them
         found = protocol_metrics.relight_metrics(protocol, rgb, alpha, images, _all_valid(views))
         metrics |= {f"relight.{name}.{key}": value for key, value in found.items()}
+        for row, index in zip(rows, chosen, strict=True):
+            truth, render = photograph_on_white(images[index]), shown[index]
+            row |= {f"true {name}": truth, name: render, f"error {name}": error_map(truth, render)}
     if names:
         for key in found:
             values = [metrics[f"relight.{name}.{key}"] for name in names]

@@ -20,6 +20,7 @@ from PIL import Image
 
 from geosplat_jax.core.settings import first_line
 from geosplat_jax.fit.folder import RunError, RunFolder
+from geosplat_jax.io.checkpoints import latest_checkpoint, read_step
 from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.images import written_aside
 from geosplat_jax.report.facts import (
@@ -105,6 +106,13 @@ class Evaluated:
     def of(cls, folder: RunFolder, *, stage: str | None = None) -> "Evaluated":
         """Return the run as it is now, or as a stage ended."""
         return cls(folder, folder.path if stage is None else folder.end_of(stage))
+
+    def trained_steps(self) -> int:
+        """Count the steps of the last checkpoint; 0 of what a stage ended with, which stays."""
+        if self.results != self.folder.path:
+            return 0
+        path = latest_checkpoint(self.folder.checkpoints)
+        return 0 if path is None else read_step(path)
 
     def metrics(self) -> dict[str, Any]:
         """Read what the evaluation found; empty where there was none.
@@ -195,14 +203,14 @@ def _described(run: Evaluated, name: str, room: int) -> dict[str, Any]:
     psnr = {line["view"]: line["nvs.psnr"] for line in metrics.get("views", [])}
     again, is_whole = command(record, config)
     seen = metrics.get("seen")
-    last = lines[-1]["step"] + 1 if lines and run.results == run.folder.path else None
+    evaluated, trained = metrics.get("step"), run.trained_steps()
     return {
         "name": name,
         "folder": str(run.results),
         "record": record,
         "config": config,
         "metrics": metrics,
-        "older": metrics.get("step") if last and metrics.get("step") not in (None, last) else None,
+        "older": evaluated if evaluated is not None and evaluated < trained else None,
         "figures": [(figure(key), value) for key, value in mean.items()],
         "headlines": [
             (figure(key), metrics["mean"][key])

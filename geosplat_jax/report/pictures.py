@@ -320,7 +320,7 @@ def overview_sheet(
 
     Columns are the names of all rows in order of first appearance; a picture that a row lacks
     leaves its cell empty. Cells have the size of the first picture; others are fitted into it.
-    Pictures of more than `_LARGEST_CELL` pixels are reduced.
+    Pictures whose longer side has more than `_LARGEST_CELL` pixels are reduced.
     Pixels of pictures that are narrower than the columns' names are repeated until those fit.
 
     Parameters
