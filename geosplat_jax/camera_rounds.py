@@ -71,11 +71,10 @@ def _require_same(folder: Path, made_with: Mapping[str, Any]) -> None:
     except ValueError as error:
         raise RunError(f"{path} is damaged: {error}; delete {folder} to begin again") from None
     now = parse_json(text)
+    known = before if isinstance(before, dict) else {}
     # Of what an earlier version did not note nothing is known.
     changed = sorted(
-        name
-        for name in now
-        if not isinstance(before, dict) or now[name] != before.get(name, now[name])
+        name for name in now if now[name] != known.get(name, now[name] if known else None)
     )
     if changed:
         raise RunError(

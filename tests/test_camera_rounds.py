@@ -138,6 +138,19 @@ def test_a_command_that_failed_before_its_first_round_can_be_corrected(made, tmp
     assert len(made) == 1
 
 
+def test_a_record_of_an_earlier_version_is_taken_as_far_as_it_goes(made, tmp_path):
+    refined_cameras("scene", tmp_path / "fox")
+    path = rounds_folder(tmp_path / "fox") / "rounds.json"
+    record = json.loads(path.read_text())
+    del record["masks"]
+    path.write_text(json.dumps(record))
+    refined_cameras("scene", tmp_path / "fox")
+    assert len(made) == 1
+    path.write_text("[]")
+    with pytest.raises(RunError, match="refined with other"):
+        refined_cameras("scene", tmp_path / "fox")
+
+
 def test_a_damaged_record_of_rounds_is_named(made, tmp_path):
     refined_cameras("scene", tmp_path / "fox")
     (rounds_folder(tmp_path / "fox") / "rounds.json").write_text("{")

@@ -1,4 +1,4 @@
-"""Films of rendered frames: animated GIF, and H.264 in MP4 where an ``ffmpeg`` with libx264 is installed.
+"""Films of rendered frames: animated GIF, and MP4 where an ``ffmpeg`` with libx264 is installed.
 
 Frames are display-referred sRGB in [0, 1], row 0 at the top. Files are written aside and then
 renamed, as images are.
@@ -227,8 +227,8 @@ def check_movie(suffix: str, frames_per_second: float | int) -> None:
         )
     if suffix == ".mp4" and _encoder() is None:
         raise MissingEncoderError(
-            f"writing .mp4 needs the program {_ENCODER} with {_H264}, and none is found; install it "
-            f"(`pip install 'geosplat_jax[movies]'`, `apt install {_ENCODER}` or `brew install "
+            f"writing .mp4 needs the program {_ENCODER} with {_H264}, and none is found; install "
+            f"one (`pip install 'geosplat_jax[movies]'`, `apt install {_ENCODER}` or `brew install "
             f"{_ENCODER}`), or write .gif instead"
         )
 
