@@ -213,7 +213,7 @@ def plan(
     return replace(chosen, config=config, seconds=expected_seconds(config, chosen.costs))
 
 
-def _memory_here() -> float | None:
+def _memory_here() -> int | None:
     """Return the memory of the machine where it computes itself: that is what is expected."""
     return memory_of_machine() if jax.default_backend() == "cpu" else None
 
