@@ -70,12 +70,11 @@ def _require_same(folder: Path, made_with: Mapping[str, Any]) -> None:
         before = parse_json(path.read_bytes())
     except ValueError as error:
         raise RunError(f"{path} is damaged: {error}; delete {folder} to begin again") from None
+    if not isinstance(before, dict):
+        raise RunError(f"{path} is damaged: it is no record; delete {folder} to begin again")
     now = parse_json(text)
-    known = before if isinstance(before, dict) else {}
     # Of what an earlier version did not note nothing is known.
-    changed = sorted(
-        name for name in now if now[name] != known.get(name, now[name] if known else None)
-    )
+    changed = sorted(name for name in now if name in before and now[name] != before[name])
     if changed:
         raise RunError(
             f"the cameras in {folder} were refined with other {' and '.join(changed)}; delete "

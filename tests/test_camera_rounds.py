@@ -147,7 +147,7 @@ def test_a_record_of_an_earlier_version_is_taken_as_far_as_it_goes(made, tmp_pat
     refined_cameras("scene", tmp_path / "fox")
     assert len(made) == 1
     path.write_text("[]")
-    with pytest.raises(RunError, match="refined with other"):
+    with pytest.raises(RunError, match="is damaged: it is no record"):
         refined_cameras("scene", tmp_path / "fox")
 
 

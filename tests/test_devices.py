@@ -157,7 +157,7 @@ def test_no_device_and_a_coordinator_without_a_port_are_refused():
         (["--hosts", "2", "--host", "0"], "needs --host K and --coordinator"),
         (["--hosts", "2", "--coordinator", "localhost:1"], "needs --host K and --coordinator"),
         (["--hosts", "auto", "--budget", "5min"], "leave --budget"),
-        (["--hosts", "auto", "--model", "auto"], "--refine-cameras, --model out"),
+        (["--hosts", "auto", "--model", "auto"], "--refine-cameras and --model out"),
     ],
 )
 def test_options_that_say_half_of_it_are_refused(options, message):

@@ -284,10 +284,11 @@ def _devices(arguments: argparse.Namespace) -> Devices:
     if arguments.hosts is not None:
         if arguments.hosts != "auto" and not all(told):
             raise UsageError("--hosts N needs --host K and --coordinator ADDRESS:PORT")
-        alone = ("--budget", "--refine-cameras", "--model")
-        if any(getattr(arguments, name[2:].replace("-", "_")) is not None for name in alone):
+        of_one_host = (arguments.budget, arguments.refine_cameras, arguments.model)
+        if any(value is not None for value in of_one_host):
             raise UsageError(
-                f"--hosts trains once, with given settings; leave {', '.join(alone)} out"
+                "--hosts trains once, with given settings; leave --budget, --refine-cameras and "
+                "--model out"
             )
         connect_hosts(arguments.hosts, host=arguments.host, coordinator=arguments.coordinator)
     return choose_devices(arguments.devices)
