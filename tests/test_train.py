@@ -328,6 +328,19 @@ def test_views_come_in_shuffled_epochs_that_depend_on_seed_and_step_alone():
     assert view_indices(0, view_count=2, batch_views=8, seed=0).shape == (2,)
 
 
+def test_photographs_end_at_white_as_renders_do(dataset):
+    stage = tiny_config().stages[0]
+    images = np.array(dataset.train.images)
+    images[:, 3, 4, :3] = 1.0
+    brighter = images.copy()
+    brighter[:, 3, 4, :3] = 7.0
+    white, beyond = (
+        make_batch(replace(dataset.train, images=x), 0, stage, seed=0) for x in (images, brighter)
+    )
+    np.testing.assert_array_equal(white.image, images[np.asarray(white.views)])
+    np.testing.assert_array_equal(beyond.image, white.image)
+
+
 def test_a_batch_knows_its_views_and_the_pixels_that_count(dataset):
     stage = tiny_config("stages.split_sum.batch_views=3").stages[0]
     valid = np.zeros((len(dataset.train), 24, 24), np.float32)

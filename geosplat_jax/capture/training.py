@@ -309,7 +309,7 @@ class _Loop:
         valid = self.views.valid
         return Batch(
             camera=self.views.camera(view),
-            image=jnp.asarray(self.views.images[view]),
+            image=jnp.asarray(self.views.clipped(view)),
             key=jax.random.fold_in(jax.random.key(self.settings.seed), step),
             valid=None if valid is None else jnp.asarray(valid[view]),
         )

@@ -115,7 +115,8 @@ class Batch(eqx.Module):
     Attributes
     ----------
     camera : `Camera` of V views.
-    image : (V, H, W, 4) linear RGB with straight alpha; alpha is the mask of the object.
+    image : (V, H, W, 4) linear RGB with straight alpha; alpha is the mask of the object. Colours
+        end at one, as those of a render do.
     key : typed PRNG key.
     views : (V,) int32 numbers of the views within their split; None where they have none.
     valid : (V, H, W) pixels that count, 0 or 1; None where all do.

@@ -395,7 +395,7 @@ def refine_views(
         valid = np.ones((views.height, views.width), np.float32)
         photograph = Photograph(
             camera=views.camera([index]),
-            image=jnp.asarray(views.images[index]),
+            image=jnp.asarray(views.clipped([index])[0]),
             valid=jnp.asarray(valid if views.valid is None else views.valid[index]),
         )
         found, capacities = refine_view(subject, photograph, how)

@@ -186,7 +186,7 @@ def make_batch(views: Views, step: int, stage: Stage, *, seed: int) -> Batch:
     )
     return Batch(
         camera=views.camera(index),
-        image=jnp.asarray(views.images[index]),
+        image=jnp.asarray(views.clipped(index)),
         key=jax.random.fold_in(jax.random.key(seed), step),
         views=jnp.asarray(index, jnp.int32),
         valid=None if views.valid is None else jnp.asarray(views.valid[index]),

@@ -99,6 +99,13 @@ class Views:
         """Alpha of the views, (V, H, W) like ``images``; no file is read again for it."""
         return self.images.alphas if isinstance(self.images, Photographs) else self.images[..., 3]
 
+    def clipped(self, indices: Sequence[int] | np.ndarray) -> Float[np.ndarray, "K H W 4"]:
+        """Photographs of some views, with colours that end at white as those of a render do.
+
+        Those of float images, and those that were divided by an exposure, may go beyond it.
+        """
+        return np.minimum(self.images[np.asarray(indices, int)], np.float32(1.0))
+
     def mask(self, index: int) -> Bool[np.ndarray, "H W"]:
         """Pixels of the object in one view."""
         return self.alphas[index] > COVERED
