@@ -1,10 +1,12 @@
 """Free splats (appendix E): the Gaussians of a trained mesh become parameters of their own.
 
 Position, shape, normal, opacity, albedo and indirect light are then learned for every splat, while
-roughness and metallic stay a field, at the splats' moving places. The mesh is frozen, and with it
-what blocks light; a splat keeps the face that it was sampled from.
+roughness and metallic stay a field, at the splats' moving places; what is too dark for a metal is
+none. The mesh is frozen, and with it what blocks light; a splat keeps the face that it was sampled
+from.
 
-Differentiable in all parameters. The faces that splats belong to have no gradient.
+Differentiable in all parameters. The faces that splats belong to have no gradient, and whether an
+albedo is too dark for a metal gives it none.
 """
 
 from collections.abc import Callable
@@ -24,7 +26,7 @@ from geosplat_jax.adapter import (
 )
 from geosplat_jax.core.mesh import closest_on_faces, face_normals_and_areas
 from geosplat_jax.core.numerics import safe_log, safe_normalize
-from geosplat_jax.core.settings import settings
+from geosplat_jax.core.settings import Share, settings
 from geosplat_jax.core.types import Box, Splats, learned
 from geosplat_jax.materials import Attributes
 from geosplat_jax.surface.base import Surface
@@ -104,9 +106,25 @@ def _kept_within(values: Float[Array, "..."]) -> Float[Array, "..."]:
     return values + jax.lax.stop_gradient(jnp.clip(values, _LEAST, 1.0 - _LEAST) - values)
 
 
+def possible_metal(albedo: Float[Array, "N 3"], darkest: float) -> Float[Array, " N"]:
+    """Return the share of its metallic that a surface of an albedo may have, (N,) in [0, 1].
+
+    It rises smoothly from 0 to 1 while the strongest channel of the albedo rises from half of
+    ``darkest`` to ``darkest``; with 0 it is 1. Not differentiable: brightening what is no metal
+    must not make it one.
+    """
+    if darkest == 0:
+        return jnp.ones_like(albedo[:, 0])
+    brightest = jnp.max(jax.lax.stop_gradient(albedo), axis=1)
+    along = jnp.clip(2.0 * brightest / darkest - 1.0, 0.0, 1.0)
+    return along**2 * (3.0 - 2.0 * along)
+
+
 @dataclass(frozen=True)
 class FreeSplats(SplatModel):
     """Splats with parameters of their own, six for every face of a mesh that no longer moves."""
+
+    darkest_metal: float = 0.0
 
     def place(self, surface: Surface, parameters: FreeSplatParameters, box: Box) -> Splats:
         """Return the splats as they were learned.
@@ -138,8 +156,14 @@ class FreeSplats(SplatModel):
         )
 
     def dress(self, attributes: Attributes, parameters: FreeSplatParameters) -> Attributes:
-        """Give every splat its own albedo, and its indirect light where any is learned."""
-        materials = replace(attributes.materials, albedo=_kept_within(parameters.albedo))
+        """Give every splat its own albedo, and its indirect light where any is learned.
+
+        A splat that is too dark for a metal has no metallic, see `possible_metal`.
+        """
+        albedo = _kept_within(parameters.albedo)
+        share = possible_metal(albedo, self.darkest_metal)
+        metallic = share * attributes.materials.metallic
+        materials = replace(attributes.materials, albedo=albedo, metallic=metallic)
         indirect = attributes.indirect
         if indirect is not None and parameters.indirect is not None:
             indirect = parameters.indirect
@@ -149,6 +173,12 @@ class FreeSplats(SplatModel):
 @settings
 class FreeSplatSettings(SplatSettings, kind="free"):
     """The splats of the stage before, with parameters of their own; the surface must be frozen."""
+
+    darkest_metal: Share = 0.0
+    """Albedo, in its strongest channel, from which on a splat may be a metal. Metallic is what the
+    field says there, zero below half of it, and smooth between; 0 leaves it to the field. Pure
+    metals reflect .4 and more of what falls on them, diamond .17, and photographs hardly tell a
+    darker metal from a dielectric."""
 
     @property
     def rate_groups(self) -> tuple[str, ...]:
@@ -199,4 +229,4 @@ class FreeSplatSettings(SplatSettings, kind="free"):
     def build(self, constants: AdapterConstants) -> FreeSplats:
         """Make the model; constants of sampling do not matter any more."""
         del constants
-        return FreeSplats()
+        return FreeSplats(self.darkest_metal)

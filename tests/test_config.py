@@ -72,10 +72,12 @@ def test_presets_carry_the_numbers_of_the_paper_and_of_the_authors_code():
         assert not config.material.shared
         assert not config.material.bias
         assert config.objective.relative_albedo == 0
+        assert config.stage("refine").splats.darkest_metal == 0
     for quality in QUALITIES:
         config = make_config("default", quality)
         assert config.material.bias
         assert config.objective.relative_albedo == 0.5
+        assert config.stage("refine").splats.darkest_metal == 0.2
 
 
 @pytest.mark.parametrize("preset", ["paper", "code"])

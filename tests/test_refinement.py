@@ -14,7 +14,7 @@ from geosplat_jax.fit.begin import Resume, TakeOver
 from geosplat_jax.fit.presets import make_config
 from geosplat_jax.fit.stages import begin_stage, build_pipeline
 from geosplat_jax.fit.train import fit, load_trained
-from geosplat_jax.refinement import FreeSplats, FreeSplatSettings, free
+from geosplat_jax.refinement import FreeSplats, FreeSplatSettings, free, possible_metal
 from geosplat_jax.render import RenderPipeline
 from geosplat_jax.report.assets import MaterialSampler
 from geosplat_jax.report.renderer import Renderer
@@ -138,6 +138,28 @@ def test_albedo_beyond_its_range_is_shown_at_the_border_and_finds_back(start):
     np.testing.assert_allclose(jax.grad(lambda x: jnp.sum(dressed(x)))(albedo), 1.0)
 
 
+def test_what_is_darker_than_metals_are_is_none():
+    grey = np.array([0.0, 0.05, 0.1, 0.125, 0.15, 0.2, 0.7])[:, None] * [0.5, 1.0, 0.2]
+    albedo = jnp.asarray(grey, jnp.float32)
+    np.testing.assert_allclose(possible_metal(albedo, 0.2), [0, 0, 0, 5 / 32, 0.5, 1, 1], atol=1e-6)
+    np.testing.assert_array_equal(possible_metal(albedo, 0.0), 1.0)
+    np.testing.assert_array_equal(jax.grad(lambda x: possible_metal(x, 0.2).sum())(albedo), 0.0)
+
+
+def test_a_dark_splat_is_no_metal_whatever_the_field_says(start):
+    _, refining, params = start
+    assert refining.splats == FreeSplats(0.2)
+    dark = jnp.arange(params.splats.albedo.shape[0]) % 2 == 0
+    albedo = jnp.where(dark[:, None], 0.05, params.splats.albedo)
+    params = replace(params, splats=replace(params.splats, albedo=albedo))
+    free_of_it = replace(refining, splats=FreeSplats())
+    held, left = (build(p, params).attributes.materials for p in (refining, free_of_it))
+    np.testing.assert_array_equal(held.metallic, jnp.where(dark, 0.0, left.metallic))
+    assert float(jnp.min(left.metallic)) > 0
+    np.testing.assert_array_equal(held.albedo, left.albedo)
+    np.testing.assert_array_equal(held.roughness, left.roughness)
+
+
 def test_opaque_splats_get_finite_logits(start):
     before, refining, _ = start
     opaque = replace(before.splats, opacities=jnp.ones_like(before.splats.opacities))
@@ -212,10 +234,11 @@ def test_refined_splats_are_rendered_and_relit(run):
     asset = renderer.asset()
     count = int(asset.splats.count)
     anchors = np.asarray(asset.splats.anchors)[:count]
-    albedo, roughness, _ = MaterialSampler(trained, asset)(anchors)
+    albedo, roughness, metallic = MaterialSampler(trained, asset)(anchors)
     materials = asset.attributes.materials
     np.testing.assert_allclose(albedo, np.asarray(materials.albedo)[:count], atol=1e-3)
     np.testing.assert_allclose(roughness, np.asarray(materials.roughness)[:count], atol=1e-4)
+    np.testing.assert_allclose(metallic, np.asarray(materials.metallic)[:count], atol=1e-3)
     of_field = MaterialSampler(
         replace(trained, params=replace(trained.params, splats=None)), asset
     )(anchors)[0]

@@ -105,7 +105,7 @@ def _default() -> Config:
         name=REFINE,
         steps=100,
         transport=monte_carlo.transport,
-        splats=FreeSplatSettings(),
+        splats=FreeSplatSettings(darkest_metal=0.2),
         rates=_refinement_rates(albedo=5e-4),
         weights=_weights(**photometric, albedo_smoothness=0.02, **smooth, indirect=0.001),
     )

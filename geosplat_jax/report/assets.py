@@ -38,8 +38,8 @@ class MaterialSampler:
     """Evaluate the materials of a surface at any number of points of it.
 
     Fields are evaluated in chunks of one compiled size. What splats have learned of their own
-    (`refinement.FreeSplats`) is added: by how much the albedo of the four nearest differs from the
-    field, weighted by the inverse of the squared distance.
+    (`refinement.FreeSplats`) is added: by how much albedo and metallic of the four nearest differ
+    from the field, weighted by the inverse of the squared distance.
 
     Parameters
     ----------
@@ -55,9 +55,15 @@ class MaterialSampler:
         if trained.params.splats is not None:
             count = int(asset.splats.count)
             anchors = np.asarray(asset.splats.anchors)[:count]
-            learned = np.asarray(asset.attributes.materials.albedo)[:count]
+            learned = asset.attributes.materials
+            albedo, _, metallic = self._of_fields(anchors)
             self._nearest = KDTree(anchors)
-            self._own = learned - self._of_fields(anchors)[0]
+            self._own = np.column_stack(
+                [
+                    np.asarray(learned.albedo)[:count] - albedo,
+                    np.asarray(learned.metallic)[:count] - metallic,
+                ]
+            )
 
     def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return albedo (n, 3) linear, roughness (n,) and metallic (n,) at world points (n, 3)."""
@@ -67,7 +73,8 @@ class MaterialSampler:
             weights = 1.0 / np.maximum(distance, 1e-6 * float(self._box.half_extent)) ** 2
             weights /= weights.sum(axis=1, keepdims=True)
             own = np.einsum("nk,nkc->nc", weights, self._own[rows])
-            albedo = np.clip(albedo + own, 0.0, 1.0).astype(np.float32)
+            albedo = np.clip(albedo + own[:, :3], 0.0, 1.0).astype(np.float32)
+            metallic = np.clip(metallic + own[:, 3], 0.0, 1.0).astype(np.float32)
         return albedo, roughness, metallic
 
     def _of_fields(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
