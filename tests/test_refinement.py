@@ -226,6 +226,11 @@ def test_refined_splats_are_rendered_and_relit(run):
     dataset, folder, _ = run
     trained = load_trained(folder)
     assert trained.stage.name == "refine"
+    # A place that is too dark for a metal, among others.
+    dark = trained.params.splats.means[:, :1] > 0
+    splats = trained.params.splats
+    splats = replace(splats, albedo=jnp.where(dark, 0.05, splats.albedo))
+    trained = replace(trained, params=replace(trained.params, splats=splats))
     renderer = Renderer.of(trained, samples=8)
     image = renderer(dataset.train.camera([0]))
     assert image.alpha.max() > 0.9
@@ -239,6 +244,7 @@ def test_refined_splats_are_rendered_and_relit(run):
     np.testing.assert_allclose(albedo, np.asarray(materials.albedo)[:count], atol=1e-3)
     np.testing.assert_allclose(roughness, np.asarray(materials.roughness)[:count], atol=1e-4)
     np.testing.assert_allclose(metallic, np.asarray(materials.metallic)[:count], atol=1e-3)
+    assert 0.1 < np.mean(metallic < 1e-3) < 0.9
     of_field = MaterialSampler(
         replace(trained, params=replace(trained.params, splats=None)), asset
     )(anchors)[0]
