@@ -122,7 +122,12 @@ def possible_metal(albedo: Float[Array, "N 3"], darkest: float) -> Float[Array, 
 
 @dataclass(frozen=True)
 class FreeSplats(SplatModel):
-    """Splats with parameters of their own, six for every face of a mesh that no longer moves."""
+    """Splats with parameters of their own, six for every face of a mesh that no longer moves.
+
+    Attributes
+    ----------
+    darkest_metal : see `FreeSplatSettings`.
+    """
 
     darkest_metal: float = 0.0
 
