@@ -147,6 +147,27 @@ def test_rays_meet_what_a_ray_tracer_says(tmp_path):
     assert seen.is_outside[seen.is_hit].all()
 
 
+def test_of_a_sheet_both_sides_are_outside_with_a_normal_of_their_own(tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    ball.update_faces(ball.triangles_center[:, 2] < 0.3)
+    mesh = load_mesh(saved(ball, tmp_path))
+    body, cameras = body_of_mesh(mesh), cameras_around(box_of(mesh), views=4, size=32)
+    one, both = (
+        [replace(body, is_two_sided=both).seen(camera) for camera in cameras]
+        for both in (False, True)
+    )
+    backs = 0
+    for single, double in zip(one, both, strict=True):
+        hit = single.is_hit
+        np.testing.assert_array_equal(double.is_outside, hit)
+        sign = np.where(single.is_outside, 1.0, -1.0)[..., None]
+        np.testing.assert_array_equal(double.normals, single.normals * sign)
+        towards = (double.normals * double.towards).sum(-1)[hit]
+        assert np.mean(towards < 0) > 0.98
+        backs += np.sum(hit & ~single.is_outside)
+    assert backs > 100
+
+
 def test_seams_of_a_file_are_sewn(tmp_path):
     """A file that repeats the corners of every face has the normals of the whole."""
     ball = trimesh.creation.icosphere(subdivisions=2)

@@ -477,7 +477,7 @@ def test_the_nearest_point_of_a_surface_is_that_of_all_its_faces():
     vertices, faces, normals = sphere(2)
     points = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
     surface = baking.FineSurface(vertices, normals, faces)
-    places, found = surface.nearest(points)
+    places, found = surface.nearest(points, points)
     corners = vertices.astype(float)[faces]
     for point, place in zip(points, places, strict=True):
         close = trimesh.triangles.closest_point(
@@ -487,6 +487,48 @@ def test_the_nearest_point_of_a_surface_is_that_of_all_its_faces():
         assert np.linalg.norm(place - point) == pytest.approx(best, rel=1e-4)
     towards = places / np.linalg.norm(places, axis=1, keepdims=True)
     assert np.all((towards * found).sum(1) > 0.995)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e3])
+def test_points_of_tiny_meshes_are_as_near_as_those_of_large_ones(scale):
+    """The library that finds them takes edges below 5e-4 for points."""
+    vertices, faces, normals = sphere(4)
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    points *= (1.01 / np.linalg.norm(points, axis=1))[:, None]
+    expected, shown = baking.FineSurface(vertices, normals, faces).nearest(points, points)
+    surface = baking.FineSurface(scale * vertices, normals, faces)
+    places, found = surface.nearest(scale * points, points)
+    np.testing.assert_allclose(places, scale * expected, atol=1e-6 * scale)
+    np.testing.assert_allclose(found, shown, atol=1e-5)
+
+
+def test_the_side_of_a_thin_wall_is_that_which_looks_the_same_way():
+    vertices, faces, normals = sphere(3)
+    inside = (0.99 * vertices, -normals, faces[:, ::-1])
+    wall = baking.FineSurface(
+        np.concatenate([vertices, inside[0]]),
+        np.concatenate([normals, inside[1]]),
+        np.concatenate([faces, inside[2] + len(vertices)]),
+    )
+    asked = 0.98 * vertices  # nearer to the inner side
+    for towards in (normals, -normals):
+        found = wall.nearest(asked, towards)[1]
+        assert np.all((found * towards).sum(1) > 0.99)
+
+
+@pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
+def test_fewer_faces_are_as_good_in_any_unit(scale):
+    """The library that simplifies has thresholds in units of length."""
+    pytest.importorskip("fast_simplification")
+    vertices, faces, _ = sphere(4)
+    far = np.array([3.0, -2.0, 1.0])
+    relief = vertices * (1.0 + 0.03 * np.sin(9.0 * vertices[:, :1]))
+    places, rows = baking.simplified(scale * (relief + far), faces, 1000)
+    assert len(rows) <= 1010
+    simple = baking.FineSurface(places / scale - far, places, rows)
+    error = np.linalg.norm(simple.nearest(relief, relief)[0] - relief, axis=1)
+    # Measured: .0016 in all of them; in the units of the file .0023, .0018 and .0016.
+    assert np.mean(error) < 1.7e-3
 
 
 def test_fewer_faces_without_the_package_say_what_to_install(monkeypatch):
@@ -603,6 +645,11 @@ def test_rendered_normals_of_a_sphere_are_exact():
     vertices, faces, normals = sphere(4)
     camera = camera_at_distance_three()
     drawn, alpha = meshes.render_mesh_normals(vertices, faces, normals, camera)
+    turned = (vertices, faces[:, ::-1], -normals)
+    np.testing.assert_allclose(
+        meshes.render_mesh_normals(*turned, camera, is_two_sided=True)[0], drawn, atol=1e-6
+    )
+    np.testing.assert_allclose(meshes.render_mesh_normals(*turned, camera)[0], -drawn, atol=1e-6)
     grid = (np.stack(np.meshgrid(np.arange(64), np.arange(64)), -1) + 0.5 - 32) / (1.2 * 64)
     rays = np.concatenate([grid, np.ones((64, 64, 1))], -1)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)

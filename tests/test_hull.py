@@ -191,6 +191,22 @@ def test_bool_masks_and_full_masks_are_masks_too(sphere):
     assert visual_hull(poses, intrinsics, np.ones_like(masks), np.zeros((1, 3))).all()
 
 
+def test_a_haze_of_compression_is_neither_object_nor_background(sphere):
+    poses, pinholes, masks = sphere
+    haze = np.random.default_rng(0).integers(0, 4, masks.shape) / 255.0
+    points = grid_points(fit_grid((np.full(3, -1.2), np.full(3, 1.2)), 24))
+    clean = hull_distance(poses, pinholes, masks, points)
+    assert clean.min() < -0.6
+    for hazy in (np.maximum(masks, haze), np.minimum(masks, 1.0 - haze), 0.985 * masks):
+        found = hull_distance(poses, pinholes, hazy, points)
+        # A pixel is .044 wide there.
+        np.testing.assert_allclose(found, clean, atol=0.02)
+        for corner, expected in zip(
+            hull_bounds(poses, pinholes, hazy), hull_bounds(poses, pinholes, masks), strict=True
+        ):
+            np.testing.assert_allclose(corner, expected, atol=0.02)
+
+
 def test_large_masks_are_reduced_without_moving_the_edge():
     poses, intrinsics = cameras_around(np.zeros(3), count=8)
     masks = sphere_coverage(poses, intrinsics, np.zeros(3), RADIUS)

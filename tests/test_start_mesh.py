@@ -1,5 +1,6 @@
 """Meshes to start from: what is cleaned, what is refused, and that the cameras have a say."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -104,6 +105,97 @@ def test_faces_that_are_wound_against_each_other_are_wound_alike(tmp_path):
     assert mesh.is_closed
     assert signed_volume(mesh.vertices, mesh.faces) > 0
     assert any("now alike" in note for note in mesh.notes)
+
+
+def test_an_open_mesh_is_wound_alike_where_that_is_possible(tmp_path):
+    body = trimesh.creation.icosphere(subdivisions=2, radius=RADIUS)
+    faces = np.array(body.faces[body.triangles_center[:, 2] > 0.1])
+    mixed = np.where((np.arange(len(faces)) % 3 == 0)[:, None], faces[:, ::-1], faces)
+    mesh = read(written(tmp_path, body.vertices, mixed))
+    assert not mesh.is_closed
+    outward = np.einsum("fd,fd->f", normals_of(mesh), mesh.vertices[mesh.faces].mean(axis=1))
+    assert (outward > 0).all()  # as most were
+    assert any("now alike" in note for note in mesh.notes)
+    # A band with a half turn.
+    around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    across = np.array([-0.2, 0.2])[:, None]
+    radius = 1 + across * np.cos(0.5 * around)
+    band = np.stack(
+        [radius * np.cos(around), radius * np.sin(around), across * np.sin(0.5 * around)], axis=-1
+    ).reshape(-1, 3)
+    first, last = np.arange(24), np.roll(np.arange(24), -1)
+    upper, end = first + 24, last + 24
+    last[-1], end[-1] = 24, 0
+    quads = np.stack([first, last, end, upper], axis=1)
+    strip = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    mesh = read(written(tmp_path, band, strip, "band.ply"))
+    assert any("48 faces are of bands that have one side only" in note for note in mesh.notes)
+    assert len(mesh.faces) == 48
+
+
+@pytest.mark.parametrize("jitter", [1e-10, 1e-8, 2e-7])
+def test_corners_that_rounding_has_moved_are_one(tmp_path, jitter):
+    vertices, faces = ball(3)
+    soup = vertices[faces].reshape(-1, 3)
+    soup = soup + np.random.default_rng(0).uniform(-jitter, jitter, soup.shape)
+    np.testing.assert_array_equal(np.arange(len(soup)).reshape(-1, 3)[:2], [[0, 1, 2], [3, 4, 5]])
+    mesh = start_mesh.StartMesh(soup, np.arange(len(soup)).reshape(-1, 3))
+    found = start_mesh._cleaned(mesh, "x")
+    assert found.is_closed
+    assert len(found.vertices) == len(vertices)
+
+
+def test_a_flag_with_a_front_and_a_back_stays_and_a_wall_between_rooms_goes(tmp_path):
+    vertices, faces = ball(2)
+    flag = np.array([[0.5, 0, 0], [1.2, 0, 0], [1.2, 0, 0.4], [0.5, 0, 0.4]])
+    sides = np.array([[0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0]]) + len(vertices)
+    both = np.concatenate([vertices, flag]), np.concatenate([faces, sides])
+    mesh = read(written(tmp_path, *both, "flag.ply"))
+    assert len(mesh.faces) == len(faces) + 2
+    assert mesh.vertices[:, 0].max() == pytest.approx(1.2)
+    assert not mesh.is_closed
+    rooms = [trimesh.creation.box(bounds=[[x, 0, 0], [x + 1, 1, 1]]) for x in (0, 1)]
+    mesh = read(written(tmp_path, rooms[0].vertices, rooms[0].faces, "room.ply"))
+    assert len(mesh.faces) == 12
+    two = trimesh.util.concatenate(rooms)
+    faces, wall = np.array(two.faces), np.isclose(two.triangles_center[:, 0], 1.0)
+    # One diagonal for both sides of the wall.
+    corners = {tuple(p): n for n, p in enumerate(np.round(two.vertices, 6).tolist())}
+    a, b, c, d = (corners[1.0, y, z] for y, z in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    panels = np.array([[a, b, c], [a, c, d], [c, b, a], [d, c, a]])
+    mesh = read(
+        written(tmp_path, two.vertices, np.concatenate([faces[~wall], panels]), "rooms.ply")
+    )
+    assert mesh.is_closed
+    assert len(mesh.faces) == 20
+
+
+def normals_of(mesh):
+    corners = mesh.vertices[mesh.faces]
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def test_what_cannot_be_decimated_far_enough_is_refused():
+    pytest.importorskip("fast_simplification")
+    body = trimesh.creation.cylinder(radius=0.2, height=2.0, sections=3000)
+    mesh = start_mesh.StartMesh(np.array(body.vertices), np.array(body.faces))
+    with pytest.raises(ValueError, match=r"has 12000 faces, .*max_faces is 300.*Remesh"):
+        sized(mesh, 0.07, most_faces=300, path="x")
+
+
+def test_faces_of_many_corners_are_read_if_they_are_convex(tmp_path):
+    path = tmp_path / "plate.obj"
+    u_shape = [(0, 0), (3, 0), (3, 3), (2, 3), (2, 1), (1, 1), (1, 3), (0, 3)]
+    hexagon = [(np.cos(a), np.sin(a)) for a in np.arange(6) * np.pi / 3]
+    for outline, rows in ((u_shape, "1 2 3 4 5 6 7 8"), (hexagon, "-6/1 -5/1 -4/1 -3/1 -2/1 -1/1")):
+        path.write_text("".join(f"v {x} {y} 0\n" for x, y in outline) + f"f {rows}\n")
+        if outline is u_shape:
+            with pytest.raises(ValueError, match="1 faces that are not convex; export it as tri"):
+                read(str(path))
+        else:
+            mesh = read(str(path))
+            assert len(mesh.faces) == 4
+            assert surface_area(mesh.vertices, mesh.faces) == pytest.approx(1.5 * np.sqrt(3))
 
 
 def test_an_open_mesh_stays_open(tmp_path):
@@ -242,19 +334,17 @@ def test_coarse_meshes_are_divided_and_fine_ones_decimated(monkeypatch):
     # The limit holds for dividing too.
     assert len(sized(mesh, edge / 4.5, most_faces=400, path="x").faces) == 320
 
-    def halved(self, face_count):
+    def halved(vertices, faces, face_count):
         assert face_count < 0.8 * len(finer.faces)
-        return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        return mesh.vertices, mesh.faces
 
-    monkeypatch.setattr(trimesh.Trimesh, "simplify_quadric_decimation", halved)
+    monkeypatch.setattr(start_mesh, "simplified", halved)
     coarser = sized(finer, edge, most_faces=10_000, path="x")
     assert len(coarser.faces) == 80
     assert any("decimated to 80 faces" in note for note in coarser.notes)
 
-    def missing(self, face_count):
-        raise ImportError("fast_simplification")
-
-    monkeypatch.setattr(trimesh.Trimesh, "simplify_quadric_decimation", missing)
+    monkeypatch.undo()
+    monkeypatch.setitem(sys.modules, "fast_simplification", None)
     assert any(
         "to decimate it, pip" in n for n in sized(finer, edge, most_faces=2000, path="x").notes
     )

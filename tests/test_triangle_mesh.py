@@ -150,6 +150,31 @@ def test_a_mesh_with_an_edge_of_three_faces_has_no_wings_there():
     assert len(near.wings) == 0
 
 
+def test_faces_without_height_do_not_pull_on_their_neighbours():
+    """As T-junctions that were closed, and boolean operations, leave them."""
+    vertices, faces = ball(2)
+    split = np.arange(0, len(faces), 40)
+    middles = vertices[faces[split]][:, :2].mean(axis=1)
+    added = len(vertices) + np.arange(len(split))
+    first, second, third = faces[split].T
+    halves = np.concatenate([np.stack([first, added, third], 1), np.stack([added, second, third], 1)])
+    slivers = np.stack([first, second, added], axis=1)
+    whole = np.delete(faces, split, axis=0)
+    places = np.concatenate([vertices, middles])
+    model = TriangleMesh.of(places, np.concatenate([whole, halves, slivers]), is_sheet=False)
+
+    @jax.jit
+    @jax.grad
+    def gradient(shape):
+        surface = model.extract(shape, capacities=Capacities())
+        return model.penalties(shape, surface)["normal_consistency"]
+
+    found = np.linalg.norm(np.asarray(gradient(moved(model, size=1e-4)).offsets), axis=1)
+    others = np.delete(np.arange(len(vertices)), np.unique(faces[split]))
+    assert found.max() < 20 * np.median(found[others])
+    assert len(model.wings) == 3 * len(model.faces) // 2 - 3 * len(split)
+
+
 def test_a_sheet_has_two_sides_in_training_and_one_in_the_file():
     model = TriangleMesh.of(*bowl(), is_sheet=True)
     shape = moved(model)

@@ -64,6 +64,15 @@ def test_of_many_views_some_are_asked_and_that_is_said():
     assert (found.asked, found.available) == (LARGEST_COUNT, count)
 
 
+def test_of_a_sheet_either_side_is_seen():
+    bowl = FACES[VERTICES[FACES][..., 0].mean(axis=1) < 0]  # open towards the camera
+    view = views_from([[3.0, 0, 0]], size=64)
+    one = sightings(VERTICES, bowl, NORMALS, view).counts[np.unique(bowl)]
+    both = sightings(VERTICES, bowl, NORMALS, view, is_two_sided=True).counts[np.unique(bowl)]
+    assert one.mean() < 0.1
+    assert both.mean() > 0.9
+
+
 def test_an_empty_surface_is_no_error():
     found = seen_by([[3.0, 0, 0]], np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3)))
     assert found.shares() == []

@@ -49,7 +49,6 @@ from geosplat_jax.report.consistency import (
     pixel_errors,
     reflection_angle_deg,
     resized,
-    see_mesh,
     single_cameras,
     whole_mesh,
 )
@@ -263,13 +262,13 @@ def filter_alone(body: Body, cameras: list[Camera]) -> float:
     found = []
     for camera in cameras:
         size = max(camera.height, camera.width)
-        fine = see_mesh(body.vertices, body.faces, body.normals, resized(camera, SAMPLES * size))
+        fine = body.seen(resized(camera, SAMPLES * size))
         deviation = SAMPLES * LOW_PASS_VARIANCE**0.5
         blurred = ndimage.gaussian_filter(fine.normals, deviation, axes=(0, 1))
         blocks = blurred.reshape(camera.height, SAMPLES, camera.width, SAMPLES, 3)
         middle = slice(SAMPLES // 2 - 1, SAMPLES // 2 + 1)
         centers = blocks[:, middle, :, middle].mean(axis=(1, 3))
-        seen = see_mesh(body.vertices, body.faces, body.normals, camera)
+        seen = body.seen(camera)
         hit = seen.is_outside
         length = np.sqrt((centers[hit] ** 2).sum(axis=-1, keepdims=True))
         found.append(

@@ -14,12 +14,25 @@ from geosplat_jax.io.images import SceneError
 _CANDIDATES = 8
 # Points that are looked up at once: bounds memory at about 100 MB.
 _POINTS_PER_CALL = 1 << 16
+_SIZE = 100.0
+"""Longest side of what libraries are given, whose thresholds are lengths: neither of the two below
+knows how long an edge is."""
+
+
+def _middle_and_scale(vertices: Float[np.ndarray, "V 3"]) -> tuple[np.ndarray, float]:
+    """Return where a mesh lies and the factor that makes it `_SIZE` long, for ``(x - m) * f``."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    size = float(np.max(high - low))
+    return 0.5 * (low + high), _SIZE / size if size > 0 else 1.0
 
 
 def simplified(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], count: int
 ) -> tuple[Float[np.ndarray, "W 3"], Int[np.ndarray, "G 3"]]:
     """Reduce a mesh to about ``count`` faces by collapsing edges (quadric error).
+
+    Where it lies and how large it is does not matter. More faces stay where it has many without
+    area, whose edges are not collapsed.
 
     Raises
     ------
@@ -39,12 +52,14 @@ def simplified(
         ) from None
     if count >= len(faces):
         return vertices, faces
+    middle, scale = _middle_and_scale(np.asarray(vertices, np.float64))
     points, triangles = library.simplify(
-        np.ascontiguousarray(vertices, np.float32),
+        np.ascontiguousarray((vertices - middle) * scale, np.float32),
         np.ascontiguousarray(faces, np.int32),
         target_count=count,
     )
-    return np.asarray(points, np.float32), np.asarray(triangles, np.int32)
+    points = np.asarray(points, np.float64) / scale + middle
+    return points.astype(vertices.dtype), np.asarray(triangles, np.int32)
 
 
 @dataclass(frozen=True)
@@ -61,30 +76,44 @@ class FineSurface:
     faces: Int[np.ndarray, "F 3"]
 
     def nearest(
-        self, points: Float[np.ndarray, "N 3"]
+        self, points: Float[np.ndarray, "N 3"], towards: Float[np.ndarray, "N 3"]
     ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
         """Return the nearest points of the surface, and its unit normals there.
 
-        Of the eight faces whose centres are nearest.
+        Of the eight faces whose centres are nearest, and of those that look the wanted way where
+        any does: of a thin wall the other side may be nearer.
+
+        Parameters
+        ----------
+        towards : direction, of any length, that the surface is to look to at each point.
         """
-        corners = np.asarray(self.vertices, np.float64)[self.faces]
+        middle, scale = _middle_and_scale(np.asarray(self.vertices, np.float64))
+        corners = ((self.vertices - middle) * scale)[self.faces]
+        outward = facing(corners)
         tree = KDTree(corners.mean(axis=1))
         count = min(_CANDIDATES, len(self.faces))
         places, normals = np.empty((2, len(points), 3), np.float32)
         for first in range(0, len(points), _POINTS_PER_CALL):
             chosen = slice(first, first + _POINTS_PER_CALL)
-            asked = np.asarray(points[chosen], np.float64)
+            asked = (points[chosen] - middle) * scale
             rows = tree.query(asked, k=count)[1].reshape(len(asked), count)
             repeated = np.repeat(asked, count, axis=0)
             close = trimesh.triangles.closest_point(corners[rows.ravel()], repeated)
             distance = ((close - repeated) ** 2).sum(-1).reshape(-1, count)
+            looks_away = np.einsum("nkd,nd->nk", outward[rows], towards[chosen]) <= 0
+            distance[looks_away & ~looks_away.all(axis=1, keepdims=True)] = np.inf
             best = np.arange(len(asked)) * count + distance.argmin(axis=1)
             face = rows.ravel()[best]
-            places[chosen] = close[best]
+            places[chosen] = close[best] / scale + middle
             weights = trimesh.triangles.points_to_barycentric(corners[face], close[best])
             blended = np.einsum("nk,nkd->nd", weights, self.normals[self.faces[face]])
             normals[chosen] = unit(blended)
         return places, normals
+
+
+def facing(corners: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 3"]:
+    """Return where triangles look to, of twice their area's length."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def unit(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:

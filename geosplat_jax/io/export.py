@@ -18,7 +18,13 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from geosplat_jax.core.harmonics import CONSTANT
-from geosplat_jax.io.baking import FineSurface, in_tangent_space, simplified, vertex_tangents
+from geosplat_jax.io.baking import (
+    FineSurface,
+    facing,
+    in_tangent_space,
+    simplified,
+    vertex_tangents,
+)
 from geosplat_jax.io.images import encode_srgb, write_exr, written_aside
 from geosplat_jax.io.memory import Need, memory_refusal
 from geosplat_jax.io.meshes import (
@@ -274,7 +280,7 @@ def _textured(
     points = np.einsum("nk,nkd->nd", weights, cut[rows]).astype(np.float32)
     tangents, normal_map = None, None
     if fine is not None:
-        points, wanted = fine.nearest(points)
+        points, wanted = fine.nearest(points, facing(cut[rows]))
         tangents = vertex_tangents(cut, charts.faces, cut_normals, charts.uv)
         interpolated = (np.einsum("nk,nkd->nd", weights, x[rows]) for x in (cut_normals, tangents))
         shown = np.zeros((texture_size, texture_size, 3), np.float32)
@@ -396,7 +402,9 @@ def export_mesh_glb(
         fine = FineSurface(vertices, normals, faces)
         vertices, faces = simplified(vertices, faces, face_count)
         faces = faces[nondegenerate(vertices, faces)]
-        normals = fine.nearest(vertices)[1]
+        summed = np.zeros(vertices.shape)
+        np.add.at(summed, faces, facing(vertices[faces])[:, None])
+        normals = fine.nearest(vertices, summed)[1]
         info["closed"] = is_closed(faces)
     double_sided = not info["closed"]
     if vertex_colors:

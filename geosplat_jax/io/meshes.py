@@ -73,9 +73,11 @@ def read_mesh(
     Raises
     ------
     ValueError
-        If the file cannot be read, or holds no triangle.
+        If the file cannot be read, holds no triangle, or is an OBJ with faces that are not convex,
+        which would be cut into triangles that overlap.
     """
     _require_plain(Path(path))
+    _require_convex(Path(path))
     try:
         loaded = trimesh.load(path, process=False)
     except OSError:
@@ -116,6 +118,34 @@ def _require_plain(path: Path) -> None:
         raise ValueError(
             f"{path} is compressed ({', '.join(packed)}), which is not read; export it without "
             "compression"
+        )
+
+
+def _require_convex(path: Path) -> None:
+    """Refuse an OBJ with faces of four and more corners that fans of triangles do not cover."""
+    if path.suffix.lower() != ".obj" or not path.is_file():
+        return
+    points: list[bytes] = []
+    polygons: list[list[int]] = []
+    with path.open("rb") as file:
+        for line in file:
+            if line.startswith(b"v "):
+                points.append(line)
+            elif line.startswith(b"f ") and len(corners := line.split()[1:]) > 3:
+                rows = [int(corner.partition(b"/")[0]) for corner in corners]
+                # Counted from one, or backwards from the last.
+                polygons.append([row - 1 if row > 0 else len(points) + row for row in rows])
+    concave = 0
+    for rows in polygons:
+        if max(rows) >= len(points) or min(rows) < 0:
+            continue  # The reader of the format says what is wrong.
+        corners = np.array([points[row].split()[1:4] for row in rows], np.float64)
+        spokes = corners[1:] - corners[0]
+        fan = np.cross(spokes[:-1], spokes[1:])
+        concave += bool((fan @ fan.sum(axis=0) < 0).any())
+    if concave:
+        raise ValueError(
+            f"{path} has {concave} faces that are not convex; export it as triangles"
         )
 
 
@@ -346,6 +376,16 @@ def first_hits(
     return face_rows, drawn
 
 
+def sides(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "N 3"], camera: Camera
+) -> Float[np.ndarray, " N"]:
+    """Tell which side of faces one view (V = 1) sees: 1 the front, -1 the back or the edge."""
+    corners = np.asarray(vertices, np.float64)[faces]
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    from_camera = corners[:, 0] - np.asarray(camera.centers[0], np.float64)
+    return np.where((outward * from_camera).sum(axis=-1) < 0, 1.0, -1.0)
+
+
 def render_mesh_normals(
     vertices: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
@@ -353,6 +393,7 @@ def render_mesh_normals(
     camera: Camera,
     *,
     supersampling: int = 2,
+    is_two_sided: bool = False,
 ) -> tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W"]]:
     """Draw the interpolated vertex normals of a mesh with a depth buffer, on the host.
 
@@ -364,6 +405,7 @@ def render_mesh_normals(
     vertices, normals : (V, 3) in the world; faces : (F, 3).
     camera : one view (V = 1).
     supersampling : samples a pixel along each axis.
+    is_two_sided : the back of a face has a normal too, which looks the other way.
 
     Returns
     -------
@@ -379,6 +421,8 @@ def render_mesh_normals(
     drawn = np.zeros(weights.shape)
     corners = turned[faces[face_rows[is_hit]]]
     drawn[is_hit] = np.einsum("nk,nkd->nd", weights[is_hit], corners)
+    if is_two_sided:
+        drawn[is_hit] *= sides(vertices, faces[face_rows[is_hit]], camera)[:, None]
     blocks = (camera.height, supersampling, camera.width, supersampling)
     lengths = np.sqrt((drawn**2).sum(-1, keepdims=True))
     unit = drawn / np.where(lengths > 0, lengths, 1.0)

@@ -12,7 +12,11 @@ from typing import Any
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
+from geosplat_jax.io.baking import simplified
+from geosplat_jax.io.images import SceneError
 from geosplat_jax.io.meshes import (
     from_y_up,
     is_y_up,
@@ -24,12 +28,14 @@ from geosplat_jax.io.meshes import (
     surface_area,
 )
 from geosplat_jax.io.views import Views
+from geosplat_jax.surface.triangle_mesh import connectivity
 
 LARGEST = 5_000_000
 """Faces of a mesh that is read at most; decimating more takes minutes and gigabytes."""
 
-_SAME_PLACE = 1e-7
-"""Corners nearer to each other than this share of the mesh's size are one vertex."""
+_SAME_PLACE = 1e-6
+"""Corners nearer to each other than this share of the mesh's size are one vertex: parts that were
+moved in single precision meet to within some 1e-7."""
 
 _SAMPLES = 4000
 """Points of the surface that are projected to compare it with the masks."""
@@ -147,11 +153,11 @@ def read_start(path: str, digest: str) -> StartMesh:
 
 def _cleaned(mesh: StartMesh, path: str) -> StartMesh:
     """Join corners at one place; drop faces that are none, and vertices without faces."""
-    size = float(np.max(np.ptp(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0)))
-    place = np.round(mesh.vertices / (_SAME_PLACE * size if size > 0 else 1.0))
-    _, first, row = np.unique(place, axis=0, return_index=True, return_inverse=True)
-    vertices, faces = mesh.vertices[first], row.reshape(-1)[mesh.faces].astype(np.int32)
-    given = len(faces)
+    used, rows = np.unique(mesh.faces, return_inverse=True)
+    unused = len(mesh.vertices) - len(used)
+    vertices, place = _joined(mesh.vertices[used])
+    faces = place[rows.reshape(-1, 3)].astype(np.int32)
+    given, joined = len(faces), len(used) - len(vertices)
     following = np.roll(faces, -1, axis=1)
     faces = faces[(faces != following).all(axis=1)]
     # Slivers close a surface as other faces do; of an open one they are no part.
@@ -163,52 +169,121 @@ def _cleaned(mesh: StartMesh, path: str) -> StartMesh:
         raise ValueError(f"{path} must hold a triangle mesh, found no triangle with an area in it")
     used, rows = np.unique(faces, return_inverse=True)
     counts = {
-        "corners at the place of others joined": len(mesh.vertices) - len(vertices),
+        "corners at the place of others joined": joined,
         "faces without area dropped": given - with_area,
         "faces that were there twice dropped": with_area - len(faces),
-        "vertices without faces dropped": len(vertices) - len(used),
+        "vertices without faces dropped": unused + len(vertices) - len(used),
     }
     notes = [f"{count} {what}" for what, count in counts.items() if count]
     faces = rows.reshape(-1, 3).astype(np.int32)
     return mesh.noting(*notes, vertices=vertices[used], faces=faces)
 
 
-def _single(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "G 3"]:
-    """Keep one of the faces that share three corners; of a closed surface none of two that cancel.
+def _joined(points: Float[np.ndarray, "V 3"]) -> tuple[np.ndarray, Int[np.ndarray, " V"]]:
+    """Make one of points at one place; with the row of each in the result.
 
-    Where every face stands twice, to be seen from both sides, nothing would be left: one stays.
+    Those nearer to each other than `_SAME_PLACE`, and some up to 3.5 times as far. They share a
+    cube of twice that in one at least of eight grids, each shifted by half a cube along some axes.
+    """
+    low = points.min(axis=0)
+    size = float(np.max(points.max(axis=0) - low))
+    count = len(points)
+    within = (points - low) / (2.0 * _SAME_PLACE * size if size > 0 else 1.0)
+    ends = []
+    for shift in np.ndindex(2, 2, 2):
+        cube = np.floor(within + 0.5 * np.array(shift)).astype(np.int64)
+        _, first, row = np.unique(
+            cube @ np.array([1 << 42, 1 << 21, 1]), return_index=True, return_inverse=True
+        )
+        ends.append(first[row.reshape(-1)])
+    links = (np.ones(8 * count, bool), (np.concatenate(ends), np.tile(np.arange(count), 8)))
+    group = connected_components(coo_matrix(links, shape=(count, count)), directed=False)[1]
+    _, first = np.unique(group, return_index=True)
+    return points[first], group
+
+
+def _single(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "G 3"]:
+    """Keep one of the faces that share three corners; of two that cancel in a closed surface none.
+
+    Two cancel as the wall between two rooms does, where they end at faces that stay. Others, such
+    as a flag that has a front and a back, are a part of what is to be seen, and one of two stays.
     """
     _, only, number, count = np.unique(
         np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
     )
-    kept = faces[np.sort(only)]
-    if (count == 1).all() or not _open_edges(kept).any():
+    kept, is_alone = faces[np.sort(only)], count[number.reshape(-1)] == 1
+    alone = faces[is_alone]
+    if not _open_edges(kept).any() or not len(alone) or _open_edges(alone).any():
         return kept
-    alone = faces[count[number.reshape(-1)] == 1]
-    return kept if not len(alone) or _open_edges(alone).any() else alone
+    doubled = faces[np.sort(only[count > 1])]
+    return np.concatenate([alone, doubled[~_within(doubled, alone)]])
+
+
+def _within(walls: Int[np.ndarray, "F 3"], faces: Int[np.ndarray, "G 3"]) -> np.ndarray:
+    """Tell of each face of some sheets whether all of its sheet's border lies on other faces."""
+
+    def edges(rows: np.ndarray) -> np.ndarray:
+        ends = np.sort(np.stack([rows, np.roll(rows, -1, axis=1)], axis=-1), axis=-1)
+        return ends.reshape(-1, 2).astype(np.int64) @ np.array([stride, 1])
+
+    stride = int(max(walls.max(initial=0), faces.max(initial=0))) + 1
+    of_walls = edges(walls)
+    _, number, count = np.unique(of_walls, return_inverse=True, return_counts=True)
+    number = number.reshape(-1)
+    face = np.arange(len(of_walls)) // 3
+    links = coo_matrix((np.ones(len(face), bool), (face, len(walls) + number)))
+    links.resize((len(walls) + len(count),) * 2)
+    sheet = connected_components(links, directed=False)[1][: len(walls)]
+    is_free = (count[number] == 1) & ~np.isin(of_walls, edges(faces))
+    ends_freely = np.bincount(sheet[face], is_free) > 0
+    has_border = np.bincount(sheet[face], count[number] == 1) > 0
+    return (has_border & ~ends_freely)[sheet]
 
 
 def _outward(mesh: StartMesh) -> StartMesh:
-    """Turn a closed mesh outward; wind alike the faces of one that is closed but for that.
+    """Wind faces alike that meet at an edge of two, and turn a closed mesh outward.
 
     Parts inside of others, and inverted parts beside right ones, stay as they are: the volume of
-    all decides.
+    all decides. Where more than two faces meet at an edge, nobody knows which belong together, and
+    one-sided bands cannot be wound alike.
     """
     if not mesh.is_closed:
-        edges = np.sort(np.stack([mesh.faces, np.roll(mesh.faces, -1, 1)], -1).reshape(-1, 2), 1)
-        _, counts = np.unique(edges, axis=0, return_counts=True)
-        if (counts != 2).any():
+        faces, left = _wound_alike(mesh.faces)
+        if not np.array_equal(faces, mesh.faces):
+            mesh = mesh.noting("its faces were wound against each other; now alike", faces=faces)
+        if left:
+            mesh = mesh.noting(f"{left} faces are of bands that have one side only")
+        if not mesh.is_closed:
             return mesh
-        body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-        trimesh.repair.fix_winding(body)
-        faces = np.asarray(body.faces, np.int32)
-        if _open_edges(faces).any():
-            return mesh
-        mesh = mesh.noting("its faces were wound against each other; now alike", faces=faces)
     if signed_volume(mesh.vertices, mesh.faces) < 0:
         faces = np.ascontiguousarray(mesh.faces[:, ::-1])
         mesh = mesh.noting("it was inside out; its faces were turned", faces=faces)
     return mesh
+
+
+def _wound_alike(faces: Int[np.ndarray, "F 3"]) -> tuple[Int[np.ndarray, "F 3"], int]:
+    """Wind faces that meet at an edge of two alike, turning the fewest of each part.
+
+    Also returns the number of faces that cannot be, which stay as they are. Every face is a node
+    as it is, and one turned; edges tie what goes together, which makes two parts of each.
+    """
+    count, near = len(faces), connectivity(faces)
+    first, second = near.wings[:, 0], near.wings[:, 1]
+    other = second + count * near.turned
+    start = np.concatenate([first, first + count])
+    links = coo_matrix(
+        (np.ones(len(start), bool), (start, np.concatenate([other, (other + count) % (2 * count)]))),
+        shape=(2 * count, 2 * count),
+    )
+    part = connected_components(links, directed=False)[1]
+    kept, turned = part[:count], part[count:]
+    is_one_sided = kept == turned
+    size = np.bincount(kept, minlength=int(part.max(initial=-1)) + 1)
+    # Of two parts that are each other's other side the one that turns fewer; then either.
+    is_turned = ~is_one_sided & (
+        (size[kept] < size[turned]) | ((size[kept] == size[turned]) & (kept > turned))
+    )
+    return np.where(is_turned[:, None], faces[:, ::-1], faces), int(is_one_sided.sum())
 
 
 def agreement_with_views(points: Float[np.ndarray, "P 3"], views: Views) -> float:
@@ -311,7 +386,7 @@ def sized(mesh: StartMesh, edge: float, *, most_faces: int, path: str) -> StartM
     Raises
     ------
     ValueError
-        If it has too many faces and the package that decimates is missing.
+        If it has too many faces, and the package that decimates is missing, or leaves too many.
     """
     area = surface_area(mesh.vertices, mesh.faces)
     # As many equilateral triangles as cover the surface.
@@ -349,10 +424,9 @@ def _divided(mesh: StartMesh, target: int) -> StartMesh:
 def _decimated(mesh: StartMesh, target: int, *, most_faces: int, path: str) -> StartMesh:
     """Reduce a mesh to about so many faces by quadric errors."""
     count = len(mesh.faces)
-    body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     try:
-        body = body.simplify_quadric_decimation(face_count=target)
-    except ImportError:
+        vertices, faces = simplified(mesh.vertices, mesh.faces, target)
+    except SceneError:
         cure = "pip install 'geosplat_jax[mesh]'"
         if count > most_faces:
             raise ValueError(
@@ -361,8 +435,13 @@ def _decimated(mesh: StartMesh, target: int, *, most_faces: int, path: str) -> S
             ) from None
         return mesh.noting(f"its faces are smaller than pixels need; to decimate it, {cure}")
     was_closed = mesh.is_closed
-    reduced = StartMesh(np.asarray(body.vertices, np.float64), np.asarray(body.faces, np.int32))
-    reduced = _outward(_cleaned(reduced, path))
+    reduced = _outward(_cleaned(StartMesh(vertices, faces), path))
+    if len(reduced.faces) > most_faces:
+        raise ValueError(
+            f"{path} has {count} faces, which could be decimated to {len(reduced.faces)} only, and "
+            f"geometry.max_faces is {most_faces}: faces without height stand in the way. Remesh it, "
+            "or allow more faces"
+        )
     notes = [f"decimated to {len(reduced.faces)} faces, to match the pixels"]
     if was_closed and not reduced.is_closed:
         notes.append("decimation left it with open edges")

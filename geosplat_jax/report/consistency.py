@@ -29,7 +29,7 @@ from geosplat_jax.core.capacity import Capacities, Usage, bucket
 from geosplat_jax.core.numerics import safe_divide, safe_norm
 from geosplat_jax.core.types import Box, Camera, Mesh, Splats
 from geosplat_jax.fit.trained import Trained
-from geosplat_jax.io.meshes import first_hits, from_y_up, is_y_up, read_mesh, unpadded
+from geosplat_jax.io.meshes import first_hits, from_y_up, is_y_up, read_mesh, sides, unpadded
 from geosplat_jax.io.views import Views
 from geosplat_jax.render import RasterSettings
 from geosplat_jax.report.renderer import build_asset, trim_mesh
@@ -79,6 +79,7 @@ class Body:
     splats : to compare the mesh with.
     raster : how they become pixels.
     near : near plane, world units.
+    is_two_sided : whether both sides of a face are surface.
     """
 
     vertices: Float[np.ndarray, "V 3"]
@@ -87,12 +88,19 @@ class Body:
     splats: Splats
     raster: RasterSettings = RasterSettings()
     near: float = 0.0
+    is_two_sided: bool = False
 
     @property
     def diagonal(self) -> float:
         """Diagonal of the mesh's bounding box."""
         corners = self.vertices[self.faces].reshape(-1, 3)
         return float(_length(np.ptp(corners.astype(np.float64), axis=0)[None])[0])
+
+    def seen(self, camera: Camera) -> "SeenMesh":
+        """Meet the mesh with the rays of a single view."""
+        return see_mesh(
+            self.vertices, self.faces, self.normals, camera, is_two_sided=self.is_two_sided
+        )
 
 
 @dataclass(frozen=True)
@@ -160,15 +168,23 @@ def see_mesh(
     faces: np.ndarray,
     normals: Float[np.ndarray, "V 3"],
     camera: Camera,
+    *,
+    is_two_sided: bool = False,
 ) -> SeenMesh:
-    """Meet a mesh with the rays of a single view; see `io.meshes.first_hits`."""
+    """Meet a mesh with the rays of a single view; see `io.meshes.first_hits`.
+
+    ``is_two_sided`` : the back of a face is met from outside, too, with the other normal.
+    """
     rows, weights = first_hits(vertices, faces, camera)
     is_hit = rows >= 0
     shares = weights[is_hit] / weights[is_hit].sum(axis=-1, keepdims=True)
     corners = np.asarray(vertices, np.float64)[faces[rows[is_hit]]]
     center = np.asarray(camera.centers[0], np.float64)
     hits = np.einsum("nk,nkd->nd", shares, corners) - center
-    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    side = sides(vertices, faces[rows[is_hit]], camera)
+    found = np.einsum("nk,nkd->nd", shares, normals[faces[rows[is_hit]]])
+    if is_two_sided:
+        found, side = side[:, None] * found, np.ones_like(side)
 
     def image(values: np.ndarray) -> np.ndarray:
         filled = np.zeros((*rows.shape, *values.shape[1:]), values.dtype)
@@ -177,9 +193,9 @@ def see_mesh(
 
     return SeenMesh(
         is_hit,
-        image((outward * hits).sum(axis=-1) < 0),
+        image(side > 0),
         _ray_directions(camera),
-        image(_unit(np.einsum("nk,nkd->nd", shares, normals[faces[rows[is_hit]]]))),
+        image(_unit(found)),
         image(_length(hits)),
     )
 
@@ -238,7 +254,7 @@ def _compare(body: Body, camera: Camera, capacities: Capacities) -> tuple[PixelE
 
     images, capacities = capacity_module.retry(attempt, capacities)
     shown, blended, coverage = (np.asarray(image, np.float64) for image in images)
-    seen = see_mesh(body.vertices, body.faces, body.normals, camera)
+    seen = body.seen(camera)
     hit = seen.is_hit
     towards, normals = seen.towards[hit], seen.normals[hit]
     errors = PixelErrors(
@@ -311,10 +327,18 @@ def measure(body: Body, cameras: Iterable[Camera]) -> Consistency:
 def body_of_run(trained: Trained) -> Body:
     """Return the mesh that a run's splats sit on, and the splats as it ended."""
     asset = build_asset(trained.pipeline, trained.params)
-    raster, box = trained.pipeline.raster, trained.pipeline.surface.box
+    raster, surface = trained.pipeline.raster, trained.pipeline.surface
     vertices, faces, normals = trim_mesh(asset.mesh)
+    if surface.is_two_sided:
+        faces = faces[: len(faces) // 2]  # Of two faces at one place, nobody knows which is met.
     return Body(
-        vertices, faces, normals, asset.splats, raster, raster.near * float(box.half_extent)
+        vertices,
+        faces,
+        normals,
+        asset.splats,
+        raster,
+        raster.near * float(surface.box.half_extent),
+        surface.is_two_sided,
     )
 
 

@@ -328,7 +328,9 @@ def _show(
     radiance: np.ndarray,
 ) -> tuple[Shown, dict[str, Any]]:
     """Write the sheets and pictures; return what they show, and their paths for the metrics."""
-    mesh = renderer.mesh()
+    mesh, is_two_sided, seen = renderer.mesh(), renderer.is_two_sided, None
+    if truth.train_views is not None:
+        seen = sightings(*mesh, truth.train_views, is_two_sided=is_two_sided)
     lights = {"light": radiance}
     if truth.train_light is not None:
         lights = {"true light": np.asarray(truth.train_light.radiance)} | lights
@@ -337,7 +339,8 @@ def _show(
         psnr=[line["nvs.psnr"] for line in measured.views],
         rendered=measured.rendered.shown,
         mesh=mesh,
-        seen=None if truth.train_views is None else sightings(*mesh, truth.train_views),
+        is_two_sided=is_two_sided,
+        seen=seen,
         albedo_scale=measured.albedo_scale,
         relit=measured.relit,
         relit_figures=[

@@ -368,6 +368,11 @@ class Renderer:
         needed = math.ceil(wanted / max(drawn * self._pass_samples, 1))
         return min(needed, len(self._illuminations))
 
+    @property
+    def is_two_sided(self) -> bool:
+        """Whether both sides of the mesh are surface."""
+        return self._pipeline.surface.is_two_sided
+
     def mesh(self, *, training: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Extract the surface: vertices (n, 3), faces (m, 3) and vertex normals (n, 3).
 

@@ -40,7 +40,7 @@ class Shown:
     views : all test views.
     psnr : of every view, dB.
     rendered : by index, those that are shown.
-    mesh : vertices, faces and normals.
+    mesh : vertices, faces and normals. is_two_sided : whether both sides of it are surface.
     seen : by how many training views; None where that was not counted.
     albedo_scale : (3,) factors that the albedo is aligned to the truth with.
     relit : pictures by title under each light, for every view that is shown; empty without lights.
@@ -52,6 +52,7 @@ class Shown:
     psnr: Sequence[float]
     rendered: Mapping[int, RenderedView]
     mesh: tuple[np.ndarray, np.ndarray, np.ndarray]
+    is_two_sided: bool
     seen: Sightings | None
     albedo_scale: np.ndarray
     relit: list[dict[str, np.ndarray]]
@@ -106,7 +107,8 @@ class Shown:
                 "metallic": _grey(view.aovs["metallic"]),
             }
             camera = self.views.camera(np.array([index]))
-            row["mesh"] = shade_mesh_preview(*render_mesh_normals(*self.mesh, camera))
+            drawn = render_mesh_normals(*self.mesh, camera, is_two_sided=self.is_two_sided)
+            row["mesh"] = shade_mesh_preview(*drawn)
             if self.seen is not None:
                 row["seen by"] = self.seen.picture(camera)
             rows.append(row)

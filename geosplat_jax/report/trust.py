@@ -32,7 +32,7 @@ class Sightings:
     ----------
     vertices : (V, 3) world. faces : (F, 3).
     counts : (V,) views that see a vertex: it is in the picture, in front of every other surface,
-        its normal looks to the camera, and its pixel counts.
+        its normal looks to the camera unless both sides are surface, and its pixel counts.
     asked : views that were asked. available : views of the training.
     """
 
@@ -90,6 +90,7 @@ def _sees(
     normals: Float[np.ndarray, "V 3"],
     camera: Camera,
     valid: Float[np.ndarray, "h w"] | None,
+    is_two_sided: bool,
 ) -> np.ndarray:
     """Which vertices a single view sees, (V,) bool."""
     _, weights = first_hits(vertices, faces, camera)
@@ -107,7 +108,7 @@ def _sees(
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     column, row = np.where(inside, column, 0), np.where(inside, row, 0)
     extent = float(np.max(np.ptp(vertices, axis=0)))
-    faces_camera = np.einsum("nd,nd->n", normals @ pose[:3, :3].T, points) < 0
+    faces_camera = is_two_sided | (np.einsum("nd,nd->n", normals @ pose[:3, :3].T, points) < 0)
     is_nearest = z <= depth[row, column] + _SLACK * extent
     seen = in_front & inside & faces_camera & is_nearest
     if valid is not None:
@@ -122,6 +123,8 @@ def sightings(
     faces: Int[np.ndarray, "F 3"],
     normals: Float[np.ndarray, "V 3"],
     views: Views,
+    *,
+    is_two_sided: bool = False,
 ) -> Sightings:
     """Count the training views that see each vertex, on the host.
 
@@ -130,6 +133,7 @@ def sightings(
     vertices, normals : (V, 3) in the world; faces : (F, 3).
     views : of the training; of more than `LARGEST_COUNT`, so many are asked, and `Sightings` says
         so.
+    is_two_sided : both sides of a face are surface, and either may be seen.
     """
     vertices, normals = np.asarray(vertices, np.float64), np.asarray(normals, np.float64)
     count = min(len(views), LARGEST_COUNT)
@@ -140,5 +144,5 @@ def sightings(
         if max(camera.height, camera.width) > _SIZE:
             camera = resized(camera, _SIZE)
         valid = None if views.valid is None else views.valid[number]
-        counts += _sees(vertices, faces, normals, camera, valid)
+        counts += _sees(vertices, faces, normals, camera, valid, is_two_sided)
     return Sightings(vertices, faces, counts, len(chosen), len(views))

@@ -33,6 +33,7 @@ _POINTS_OF_A_SLAB = 1 << 20
 _MASK_PIXELS = 400  # larger masks are reduced first; the hull is never sampled that finely
 _COVERED = 0.5
 _FULL, _EMPTY = 1.0 - 1e-3, 1e-3  # coverage beyond these is a whole pixel
+_HAZE = 0.02  # five steps of 8 bits: what compression and mattes leave where nothing or all is covered
 _BAND_CELLS = 1.5  # the looked-up distance is trusted this far from the surface
 _SEARCH_POINTS = 48  # along each side, while the bounds close in on the hull
 _SEARCH_STEPS = 8
@@ -291,7 +292,7 @@ class _Silhouettes:
         factor = max(1, -(-max(masks.shape[1:]) // _MASK_PIXELS))
         used, coverage, counts, centroids = np.zeros(len(masks), bool), [], [], []
         for view, mask in enumerate(masks):
-            image = np.asarray(mask, np.float32)
+            image = without_haze(np.asarray(mask, np.float32))
             used[view] = (image > _COVERED).any()
             if not used[view]:
                 continue
@@ -319,6 +320,28 @@ class _Silhouettes:
         )
         self.pixel_angle = 1.0 / float(np.median(self.intrinsics[:, 0, 0]))
         self.distances = np.stack([_signed_pixels(image) for image in coverage])
+
+
+def without_haze(coverage: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    """Take pixels that are hardly covered, or nearly wholly, for what they are meant to be.
+
+    In clean masks such pixels lie at outlines and tell where these are. So nothing is changed unless
+    one in a hundred of those that lie among their like is neither 0 nor 1.
+    """
+    found = coverage
+    for whole in (0.0, 1.0):
+        is_near = np.abs(coverage - whole) <= _HAZE
+        is_among = is_near & ~_grown(~is_near)
+        if (is_among & (coverage != whole)).sum() > 0.01 * is_among.sum():
+            found = np.where(is_near, np.float32(whole), found)
+    return found
+
+
+def _grown(where: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Add the eight pixels around each."""
+    padded = np.pad(where, 1)
+    rows = padded[:-2] | padded[1:-1] | padded[2:]
+    return rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
 
 
 def _continued(coverage: np.ndarray, known: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from scipy import ndimage
 from geosplat_jax.core.color import linear_to_srgb
 from geosplat_jax.core.numerics import safe_normalize
 from geosplat_jax.core.types import Grid
+from geosplat_jax.surface.hull import without_haze
 
 Field = Float[np.ndarray, "Z Y X"]
 """Signed distances of the vertices of a grid, negative inside."""
@@ -311,7 +312,9 @@ def _small(
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """Mean colour of the object in blocks of pixels, and which blocks show nothing else."""
     rgba = np.asarray(rgba, np.float32)
-    coverage = rgba[..., 3] if valid is None else rgba[..., 3] * (np.asarray(valid) > 0.5)
+    coverage = without_haze(rgba[..., 3])
+    if valid is not None:
+        coverage = coverage * (np.asarray(valid) > 0.5)
     weighted = np.concatenate([rgba[..., :3] * coverage[..., None], coverage[..., None]], -1)
     height, width = (-(-size // factor) for size in rgba.shape[:2])
     room = ((0, height * factor - rgba.shape[0]), (0, width * factor - rgba.shape[1]), (0, 0))

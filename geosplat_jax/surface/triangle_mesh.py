@@ -11,7 +11,8 @@ and on a fine one:
 
 - ``laplacian``: squared distance of a vertex from the mean of its neighbours (the umbrella, every
   neighbour alike); at an open border only the neighbours along it count, so that holes stay;
-- ``normal_consistency``: one minus the cosine between the normals of faces that share an edge;
+- ``normal_consistency``: one minus the cosine between the normals of faces that share an edge, but
+  for faces that start with hardly any height;
 - ``edge_length``: squared change of an edge's length since the start;
 - ``offset``: squared distance of a vertex from its start.
 
@@ -39,6 +40,9 @@ _BOX_MARGIN = 1.1
 """Size of the box over that of the mesh: vertices move, and the fields end at its sides."""
 
 _SPLATS_PER_FACE = 6
+
+_LEAST_HEIGHT = 1e-3
+"""Height over its longest edge, in mean edges of the mesh, from which a face says where it looks."""
 
 
 class VertexOffsets(eqx.Module):
@@ -93,13 +97,29 @@ def connectivity(faces: Int[np.ndarray, "F 3"]) -> Connectivity:
     )
 
 
+def _without_slivers(
+    near: Connectivity, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Connectivity:
+    """Leave out the wings of faces that start with hardly any height.
+
+    Rounding decides where such faces look, and the gradient of that grows with one over the height:
+    a first step of it stays in Adam's second moment for the rest of a stage.
+    """
+    sides = vertices[np.roll(faces, -1, axis=1)] - vertices[faces]
+    lengths = np.linalg.norm(sides, axis=-1)
+    doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1)
+    is_sliver = doubled <= _LEAST_HEIGHT * lengths.mean() * lengths.max(axis=1)
+    kept = ~is_sliver[near.wings].any(axis=1)
+    return near._replace(wings=near.wings[kept], turned=near.turned[kept])
+
+
 class TriangleMesh(SurfaceModel):
     """Triangles whose vertices move.
 
     Attributes
     ----------
     home : (V, 3) where the vertices start, world. faces : (F, 3) rows of them.
-    edges, neighbours, wings : see `Connectivity`.
+    edges, neighbours, wings : see `Connectivity`; wings are those of faces that have a height.
     wing_signs : (P,) -1 where faces are wound against each other, else 1.
     edge_lengths : (E,) at the start. degrees : (V,) numbers of neighbours, at least 1.
     unit : () mean length of an edge at the start.
@@ -135,8 +155,8 @@ class TriangleMesh(SurfaceModel):
         dtype: Any = np.float32,
     ) -> "TriangleMesh":
         """Make the surface of a mesh in which every vertex belongs to a face (host side)."""
-        near = connectivity(faces)
         vertices = np.asarray(vertices, np.float64)
+        near = _without_slivers(connectivity(faces), vertices, faces)
         ends = vertices[near.edges]
         lengths = np.sqrt(np.sum((ends[:, 1] - ends[:, 0]) ** 2, axis=-1))
         low, high = vertices.min(axis=0), vertices.max(axis=0)
