@@ -4,6 +4,7 @@ The extra ``cluster``. A job calls a command and ends with it. Where the cluster
 time, it is put into the queue again and goes on from its last checkpoint.
 """
 
+import signal
 import subprocess
 import sys
 from collections import deque
@@ -12,6 +13,9 @@ from typing import Any
 
 _TIMEOUT_MIN = 24 * 60
 """Minutes that a job may take, where nobody says otherwise."""
+
+_PATIENCE = 60.0
+"""Seconds that a command has to end in once its job is cancelled."""
 
 
 class Command:
@@ -32,9 +36,18 @@ class Command:
         with subprocess.Popen(
             self.command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         ) as child:
-            for line in child.stdout or ():
-                tail.append(line)
-                print(line, end="", flush=True)
+            try:
+                for line in child.stdout or ():
+                    tail.append(line)
+                    print(line, end="", flush=True)
+            except BaseException:
+                # A job that is cancelled takes its command along, which writes a checkpoint.
+                child.send_signal(signal.SIGINT)
+                try:
+                    child.wait(_PATIENCE)
+                except subprocess.TimeoutExpired:
+                    child.kill()
+                raise
         if child.returncode:
             raise RuntimeError(f"the process ended with status {child.returncode}\n{''.join(tail)}")
 

@@ -21,6 +21,7 @@ import report
 from report import ReportError, arrow, digits
 
 from geosplat_jax.fit.config import Config, config_from_dict
+from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.start_mesh import MeshSettings
 
 _NONE = "–"
@@ -65,17 +66,18 @@ def stage_times(scene: Path) -> dict[str, tuple[float, float, float]]:
     """
     found = {}
     for path in sorted(scene.glob("*/run.json")):
-        record = json.loads(path.read_text())
-        config = config_from_dict(record["config"])
-        metrics = path.with_name("metrics.jsonl")
-        lines = (
-            [json.loads(x) for x in metrics.read_text().splitlines()] if metrics.exists() else []
-        )
+        run = RunFolder(path.parent)
+        try:
+            config, lines = run.config(), run.metric_lines()
+            downscale = run.record()["dataset"].get("downscale", 1)
+        except RunError as error:
+            print(f"left out: {error}", file=sys.stderr)
+            continue
         for number, stage in enumerate(config.active_stages, 1):
             own = [line for line in lines if line["stage"] == stage.name]
             if len(own) == stage.steps:
                 seconds = [line["seconds"] for line in own]
-                name = _identity(config, number, record["dataset"].get("downscale", 1))
+                name = _identity(config, number, downscale)
                 steady = stage.steps * statistics.median(seconds)
                 memory = max(line.get("peak_memory_mb", 0) for line in own)
                 found[name] = (sum(seconds), steady, memory)

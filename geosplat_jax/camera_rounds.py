@@ -17,7 +17,7 @@ import numpy as np
 from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.cameras import CameraSettings, ViewProgress
 from geosplat_jax.fit.config import Config
-from geosplat_jax.fit.folder import RunError
+from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.listener import NOBODY, Listener
 from geosplat_jax.fit.presets import REFINE, SPLIT_SUM, make_config
 from geosplat_jax.io.dataset import Dataset, load_recorded
@@ -35,7 +35,7 @@ def rounds_folder(output: str | Path) -> Path:
     return path.with_name(f"{path.name}_cameras")
 
 
-def round_config(material_prior: str = "hybrid") -> Config:
+def round_config(material_prior: str = "hybrid", *, seed: int | None = None) -> Config:
     """Return the settings of a round: a draft with half its split sum and no refinement.
 
     What rounds recover was measured so (docs/cameras.md); longer rounds and free splats were not
@@ -43,9 +43,10 @@ def round_config(material_prior: str = "hybrid") -> Config:
 
     Parameters
     ----------
-    material_prior : see `make_config`.
+    material_prior : see `make_config`. seed : of every random choice, by default the usual one.
     """
     overrides = (
+        *(() if seed is None else (f"run.seed={seed}",)),
         f"stages.{SPLIT_SUM}.steps=200",
         f"stages.{SPLIT_SUM}.half_life=100",
         f"stages.{REFINE}.steps=0",
@@ -90,6 +91,7 @@ def refined_cameras(
     config: Config | None = None,
     reading: Mapping[str, Any] | None = None,
     how: CameraSettings | None = None,
+    replace: bool = False,
     listener: Listener = NOBODY,
     on_view: Callable[[str, ViewProgress], None] | None = None,
 ) -> Path:
@@ -105,6 +107,7 @@ def refined_cameras(
     config : of a round; `round_config` by default.
     reading : how to read the scene, see `load_recorded`; ``cameras`` are those of the first round.
     how : cameras are refined, see `CameraSettings`.
+    replace : remove a run that ``output`` holds before the first round.
     listener : told of the trainings.
     on_view : called after every refined view with its split.
 
@@ -129,10 +132,13 @@ def refined_cameras(
         "reading": options,
         "views": [dataset.train.fingerprint(), dataset.test.fingerprint()],
         "masks": [np.round(views.coverage, 6).tolist() for views in (dataset.train, dataset.test)],
+        "colours": [views.mean_colors.tolist() for views in (dataset.train, dataset.test)],
         "config": config.to_dict(),
         "refinement": asdict(how),
     }
     _require_same(beside, made_with)
+    if replace:
+        RunFolder(output).make_room(replace=True)
     for number in range(1, rounds + 1):
         folder = beside / f"round_{number}"
         cameras = folder.with_suffix(".json")

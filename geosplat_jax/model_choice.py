@@ -16,6 +16,7 @@ import time
 from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from geosplat_jax.fit.budget import with_steps
 from geosplat_jax.fit.config import Config, Stage
 from geosplat_jax.fit.entering import Start
 from geosplat_jax.fit.evidence import Rung, compare, every_nth, neighbouring_blocks
-from geosplat_jax.fit.folder import RunError, RunFolder
+from geosplat_jax.fit.folder import RunError, RunFolder, locked_folder
 from geosplat_jax.fit.listener import NOBODY, Listener
 from geosplat_jax.fit.model_parts import LADDER, Part, offered_parts, without
 from geosplat_jax.fit.train import TrainingError, fit, load_trained
@@ -38,7 +39,8 @@ from geosplat_jax.io.views import Views, some_views
 from geosplat_jax.report.renderer import Renderer, photograph_on_white, render_on_white
 
 _PIXELS_PER_CELL = 6.0
-"""Photographs are reduced until their longer side has at most so many pixels for each cell."""
+"""Photographs are reduced until their longer side has about so many pixels for each cell; by a
+whole number, so that one and a half times as many may stay."""
 
 _USUAL_CELLS = 48
 """Cells that this counts for a surface without any."""
@@ -139,29 +141,30 @@ def choose_model(
     ValueError
         If there are too few views to hold any back, or nothing is trained.
     RunError
-        If there is a choice already that is neither to be resumed nor replaced, or that was begun
-        with other settings.
+        If there is a choice already that is neither to be resumed nor replaced, that was begun with
+        other settings or of other photographs, or that another process is making.
     TrainingError, Interrupted
         See `fit.train.fit`; a part whose training fails is left out.
     """
     how = how or ModelChoice()
     trials = _Trials(dataset, config, choice_folder(output), how, listener)
-    trials.open(begin)
     offered = offered_parts(config, how.by_hand)
     kept: frozenset[str] = frozenset()
     rungs = []
-    for part in offered:
-        if not kept.issuperset(_among(part.follows, offered)):
-            continue
-        wanted = kept | {part.name} | _among(part.needs, offered)
-        if part.is_photographed:
-            rung = _tried(trials, part, kept, wanted)
-        else:
-            rung = _seen_on_surface(trials, part, kept, wanted)
-        kept = frozenset(wanted) if rung.is_kept else kept
-        rungs.append(rung)
-        listener.on_rung(rung)
-    trials.close()
+    with locked_folder(trials.state_path.parent, own=trials.state_path):
+        trials.open(begin)
+        for part in offered:
+            if not kept.issuperset(_among(part.follows, offered)):
+                continue
+            wanted = kept | {part.name} | _among(part.needs, offered)
+            if part.is_photographed:
+                rung = _tried(trials, part, kept, wanted)
+            else:
+                rung = _seen_on_surface(trials, part, kept, wanted)
+            kept = frozenset(wanted) if rung.is_kept else kept
+            rungs.append(rung)
+            listener.on_rung(rung)
+        trials.close()
     return ChosenModel(
         config=trials.model(kept),
         rungs=tuple(rungs),
@@ -279,6 +282,11 @@ class _Trials:
         trials = sum(float(found["seconds"]) for found in self._measured.values())
         return trials + sum(self._stage_1_seconds.values())
 
+    @property
+    def state_path(self) -> Path:
+        """File of what was measured."""
+        return self._folder / _STATE
+
     def model(self, kept: Collection[str]) -> Config:
         """Return the settings of a model: of the parts to choose, only those that are named."""
         return without(self._config, [part for part in self._offered if part.name not in kept])
@@ -291,14 +299,11 @@ class _Trials:
         RunError
             See `choose_model`.
         """
-        path, mark = self._folder / _STATE, self._mark()
-        if begin.replace and self._folder.exists():
-            _require_state(self._folder)
-            shutil.rmtree(self._folder)
+        path, mark = self.state_path, self._mark
+        if begin.replace and path.exists():
+            self.close()
+            path.unlink()
         if not path.exists():
-            if self._folder.exists():
-                _require_state(self._folder)
-            self._folder.mkdir(parents=True, exist_ok=True)
             self._save(mark)
             return
         if not begin.resumes:
@@ -317,8 +322,8 @@ class _Trials:
             raise RunError(f"{path} is damaged: {error}; begin anew with --force") from None
         if was != mark:
             raise RunError(
-                f"{path} was begun with other settings or other views; take the same, or begin "
-                "anew with --force"
+                f"{path} was begun with other settings or other views, or these were read "
+                "otherwise; take the same, or begin anew with --force"
             )
         self._measured, self._stage_1_seconds = measured, seconds
 
@@ -338,20 +343,22 @@ class _Trials:
             if path.is_dir():
                 shutil.rmtree(path)
 
+    @cached_property
     def _mark(self) -> str:
         """Return a short text that tells this choice from others."""
         what = (
             self._config.to_dict(),
             asdict(replace(self.how, by_hand=())),
             [part.name for part in self._offered],
-            self._dataset.train.fingerprint(),
-            self.held.fingerprint(),
+            {name: text for name, text in self._dataset.options.items() if name != "cameras"},
+            [[x.fingerprint(), x.mean_colors.tolist()] for x in (self._dataset.train, self.held)],
         )
-        return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:16]
+        text = json.dumps(what, sort_keys=True, default=str)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def _save(self, mark: str) -> None:
         """Write what was measured, in one go."""
-        path = self._folder / _STATE
+        path = self.state_path
         aside = path.with_suffix(".partial")
         state = {
             "mark": mark,
@@ -390,7 +397,7 @@ class _Trials:
                 found["failure"] = str(error)
             found["seconds"] = round(time.perf_counter() - began, 2)
             self._measured[name] = found
-            self._save(self._mark())
+            self._save(self._mark)
             shutil.rmtree(folder, ignore_errors=True)  # it may hold nothing yet
         if "failure" in self._measured[name]:
             raise TrainingError(self._measured[name]["failure"])
@@ -408,7 +415,7 @@ class _Trials:
             self._blocked = float(
                 blocked_share(pipeline.surface, trained.params.geometry, pipeline.capacities)
             )
-            self._save(self._mark())
+            self._save(self._mark)
         return self._blocked
 
     def _start(self, has_finer_cells: bool) -> Start:
@@ -421,7 +428,7 @@ class _Trials:
             began = time.perf_counter() - _seconds_used(folder)
             self._fit(self._trial(without(self._config, parts), self._first, 0), folder, None)
             self._stage_1_seconds[name] = round(time.perf_counter() - began, 2)
-            self._save(self._mark())
+            self._save(self._mark)
         return _start_of(folder)
 
     def _trial(self, config: Config, stage: Stage, seed: int) -> Config:
@@ -475,15 +482,3 @@ def _seconds_used(folder: Path) -> float:
 def _name_of(kept: Collection[str]) -> str:
     """Return the name of a model's trainings."""
     return "_".join(part.name for part in LADDER if part.name in kept) or "smallest"
-
-
-def _require_state(folder: Path) -> None:
-    """Refuse to work in, or to remove, a folder that is no choice's.
-
-    Raises
-    ------
-    RunError
-        If it holds files but no choice.
-    """
-    if not (folder / _STATE).exists() and any(folder.iterdir()):
-        raise RunError(f"{folder} holds other files; move them, or choose another --output")

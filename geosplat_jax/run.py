@@ -33,6 +33,7 @@ from geosplat_jax.io.cameras import RefinedSplit, write_cameras
 from geosplat_jax.io.dataset import READING_OPTIONS, Dataset, load_recorded, photograph_size
 from geosplat_jax.io.images import write_png
 from geosplat_jax.io.views import Views
+from geosplat_jax.io.windows import around_object
 from geosplat_jax.model_choice import ChosenModel, ModelChoice, choose_model
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
@@ -128,9 +129,14 @@ class Run:
         return self.trained.pipeline
 
     def batch(self, step: int = 0) -> Batch:
-        """Return what a step of the training saw, or would see."""
-        stage = self.config.stage_at(step)
-        return make_batch(self.dataset.train, step, stage, seed=self.config.run.seed)
+        """Return what a step of the training saw, or would see.
+
+        Where photographs are cut to windows around the object (``run.window``), training counts
+        terms that are means over pixels by the share of the windows; `pipeline` does not.
+        """
+        config = self.config
+        views, _ = around_object(self.dataset.train, largest=config.run.window)
+        return make_batch(views, step, config.stage_at(step), seed=config.run.seed)
 
     def renderer(self, *, samples: int = DEFAULT_SAMPLES) -> Renderer:
         """Return a renderer of the learned parameters; ``samples`` : rays per splat."""
@@ -484,7 +490,7 @@ def train(
     output: str | Path,
     config: Config | None = None,
     *,
-    quality: str = "standard",
+    quality: str | None = None,
     mesh: str | Path | MeshSettings | None = None,
     begin: Begin = ANEW,
     budget: Budget | None = None,
@@ -501,6 +507,7 @@ def train(
     scene : folder, or a dataset from `load_dataset`.
     output : folder of the run.
     config : settings, see `make_config`; by default those of ``quality``.
+    quality : one of `QUALITIES`, by default ``standard``; neither beside a config nor a budget.
     mesh : file of a mesh to start from instead of a visual hull, see `fit.presets.with_mesh`. A run
         that is resumed knows its own.
     begin : ``Resume()`` goes on with the run that the folder holds, ``Anew(replace=True)`` replaces
@@ -525,7 +532,8 @@ def train(
     Raises
     ------
     TypeError
-        On any other keyword, and on options of reading for a dataset that has been read.
+        On any other keyword, on options of reading for a dataset that has been read, and on a
+        quality beside what makes it meaningless.
     SceneError, RunError, TrainingError, Interrupted
         See `load_dataset` and `fit.train.fit`.
     ValueError
@@ -534,6 +542,8 @@ def train(
         too few views.
     """
     _require_consistent(scene, reading, chooses=model is not None, budget=budget, begin=begin)
+    if quality is not None and not (config is None and budget is None):
+        raise TypeError("a config and a budget say what is spent; leave quality out")
     started, folder = time.perf_counter() if began is None else began, RunFolder(output)
     if isinstance(devices, int):
         devices = choose_devices(devices)
@@ -543,7 +553,7 @@ def train(
     order = _Order(config, mesh, budget, reading)
     if goes_on:
         order = _as_it_began(order, folder, chooses=model is not None)
-    config, budget, reading = _settled(order, scene, quality=quality)
+    config, budget, reading = _settled(order, scene, quality=quality or "standard")
     dataset = scene if isinstance(scene, Dataset) else load_recorded(scene, reading)
     evidence = None
     if model is not None and not goes_on:
@@ -664,8 +674,8 @@ def _chosen_model(
     listener: Listener,
 ) -> ChosenModel:
     """Choose the model of a new run; what its settings change of their preset counts as by hand."""
-    folder.require_free(replace=begin.replace)
     dataset.require_masks("train")
+    folder.make_room(replace=begin.replace)
     by_hand = tuple(dict.fromkeys((*how.by_hand, *changed_from_preset(config))))
     how = replace(how, by_hand=by_hand)
     return choose_model(dataset, config, folder.path, how, begin=begin, listener=listener)

@@ -2,7 +2,9 @@
 
 import json
 
+import numpy as np
 import pytest
+from support import sphere_dataset, tiny_config
 
 from geosplat_jax import camera_rounds, cli
 from geosplat_jax.camera_rounds import refined_cameras, round_config, rounds_folder
@@ -16,10 +18,11 @@ from geosplat_jax.run import Run
 
 
 class _Views:
-    """Views that are told from others by a number, and by their masks."""
+    """Views that are told from others by a number, their masks and their colours."""
 
-    def __init__(self, number, coverage):
+    def __init__(self, number, coverage, brightness):
         self.number, self.coverage = number, [coverage]
+        self.mean_colors = np.full((1, 3), brightness)
 
     def fingerprint(self):
         return f"views {self.number}"
@@ -28,10 +31,10 @@ class _Views:
 class _Scene(Dataset):
     """What a scene would be read with, and its views."""
 
-    def __init__(self, options, poses=0, coverage=0.5):
+    def __init__(self, options, poses=0, coverage=0.5, brightness=0.3):
         object.__setattr__(self, "options", dict(options))
         for split in ("train", "test"):
-            object.__setattr__(self, split, _Views(poses, coverage))
+            object.__setattr__(self, split, _Views(poses, coverage, brightness))
 
 
 class _Round(Run):
@@ -112,8 +115,11 @@ def test_rounds_of_other_settings_are_not_taken_for_these(made, tmp_path, change
     assert len(made) == 2
 
 
-@pytest.mark.parametrize(("new", "what"), [({"poses": 1}, "views"), ({"coverage": 0.4}, "masks")])
-def test_rounds_of_other_poses_or_masks_are_not_taken_for_these(
+@pytest.mark.parametrize(
+    ("new", "what"),
+    [({"poses": 1}, "views"), ({"coverage": 0.4}, "masks"), ({"brightness": 0.1}, "colours")],
+)
+def test_rounds_of_other_poses_or_photographs_are_not_taken_for_these(
     made, tmp_path, monkeypatch, new, what
 ):
     """The scene's own were found anew since."""
@@ -124,6 +130,24 @@ def test_rounds_of_other_poses_or_masks_are_not_taken_for_these(
     with pytest.raises(RunError, match=f"refined with other {what}; delete"):
         refined_cameras("scene", tmp_path / "fox")
     assert len(made) == 1
+
+
+def test_a_run_that_is_to_be_replaced_is_gone_before_the_first_round(made, tmp_path):
+    """Whoever is interrupted in a round goes on with it, not with that run."""
+    old = RunFolder(tmp_path / "fox")
+    with old.locked():
+        old.begin(sphere_dataset(), tiny_config(), replace=False)
+    (old.path / "notes.txt").write_text("mine")
+    refined_cameras("scene", old.path)
+    assert old.exists
+    refined_cameras("scene", old.path, replace=True)
+    assert not old.exists
+    assert (old.path / "notes.txt").exists()
+
+
+def test_the_seed_of_a_training_is_that_of_its_rounds():
+    assert round_config(seed=5).run.seed == 5
+    assert round_config() == round_config(seed=round_config().run.seed)
 
 
 def test_a_command_that_failed_before_its_first_round_can_be_corrected(made, tmp_path, monkeypatch):

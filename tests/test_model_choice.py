@@ -15,7 +15,7 @@ from geosplat_jax import cli, model_choice
 from geosplat_jax.core.types import EnvLight
 from geosplat_jax.fit.begin import Anew, Resume
 from geosplat_jax.fit.entering import Start
-from geosplat_jax.fit.folder import RunError
+from geosplat_jax.fit.folder import RunError, locked_folder
 from geosplat_jax.fit.listener import Listener
 from geosplat_jax.fit.model_parts import LADDER, without
 from geosplat_jax.fit.presets import make_config
@@ -205,7 +205,8 @@ def test_a_choice_that_was_stopped_goes_on_and_ends_alike(dataset, trainings, tm
     assert again.config == whole.config
     assert replace(again, seconds=0.0) == replace(whole, seconds=0.0)
     # What remains are the figures, from which it can be repeated at no cost.
-    assert [path.name for path in choice_folder(tmp_path / "run").iterdir()] == ["choice.json"]
+    left = {path.name for path in choice_folder(tmp_path / "run").iterdir()}
+    assert left == {".lock", "choice.json"}
     choose_model(dataset, config, tmp_path / "run", begin=Resume())
     assert trainings.made == expected
 
@@ -228,6 +229,18 @@ def test_a_choice_is_not_mixed_with_another(dataset, trainings, tmp_path):
         path.write_text(text)
         with pytest.raises(RunError, match=r"choice\.json is damaged"):
             choose_model(dataset, other, tmp_path / "run", begin=Resume())
+
+
+def test_a_choice_of_other_photographs_is_not_gone_on_with(dataset, trainings, tmp_path):
+    config = make_config(quality="draft")
+    choose_model(dataset, config, tmp_path / "run")
+    darker = replace(dataset, train=replace(dataset.train, images=0.2 * dataset.train.images))
+    for other in (darker, replace(dataset, options={"downscale": 2})):
+        with pytest.raises(RunError, match="other settings or other views, or these were read"):
+            choose_model(other, config, tmp_path / "run", begin=Resume())
+    with locked_folder(choice_folder(tmp_path / "run"), own=choice_folder(tmp_path / "run")):
+        with pytest.raises(RunError, match="another process is writing"):
+            choose_model(dataset, config, tmp_path / "run", begin=Anew(replace=True))
 
 
 def test_a_folder_of_somebody_else_is_left_alone(dataset, trainings, tmp_path):

@@ -13,6 +13,7 @@ import geosplat_jax as gs
 from geosplat_jax import cli
 from geosplat_jax import run as run_module
 from geosplat_jax.fit.folder import RunFolder
+from geosplat_jax.fit.presets import make_config
 
 DUCK = Path(__file__).resolve().parents[1] / "examples" / "duck"
 SETTINGS = (*TINY, "stages.split_sum.steps=2", "run.preview_every=2")
@@ -80,6 +81,12 @@ def test_a_preview_that_fails_is_told_of_and_ends_nothing(tmp_path, monkeypatch)
     with pytest.warns(UserWarning, match="could not be made: no memory is left"):
         previews.finish()
     previews.finish()
+
+
+def test_a_quality_beside_settings_or_a_budget_is_refused(folder):
+    for others in ({"config": make_config()}, {"budget": gs.Budget(600.0)}):
+        with pytest.raises(TypeError, match="leave quality out"):
+            gs.train(folder / "duck", folder / "none", quality="high", **others)
 
 
 def test_a_dataset_is_not_read_again(folder):
@@ -199,6 +206,13 @@ def test_every_setting_is_listed_with_its_default_range_and_meaning(capsys):
     assert "geometry.resolution 32 >= 5, <= 512" in shown
     assert "longest side" in shown
     assert command("settings", "nothing") == 2
+    # Where nobody looks on, a line is a line: paths are found by grep.
+    assert command("settings", "stages.monte_carlo") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert any(
+        line.startswith("stages.monte_carlo.transport.reservoirs.candidates ") for line in lines
+    )
+    assert all(line.startswith(("setting ", "stages.monte_carlo.")) for line in lines)
 
 
 def test_an_option_that_is_no_setting_is_refused_by_its_name(folder, capsys):

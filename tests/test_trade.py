@@ -1,6 +1,8 @@
 """What a sweep says of time against quality, the search of the front, and runs on a cluster."""
 
 import json
+import signal
+import subprocess
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -9,6 +11,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "experiments"))
 
+import cluster  # noqa: E402
 import halving  # noqa: E402
 import run as runner  # noqa: E402
 import trade  # noqa: E402
@@ -314,8 +317,10 @@ def _left(scene, name, config, lines):
         json.dumps({"scene": "s", "dataset": {"downscale": 1}, "config": config.to_dict()})
     )
     texts = [
-        json.dumps({"stage": "split_sum", "seconds": seconds, "peak_memory_mb": memory})
-        for seconds, memory in lines
+        json.dumps(
+            {"step": step, "stage": "split_sum", "seconds": seconds, "peak_memory_mb": memory}
+        )
+        for step, (seconds, memory) in enumerate(lines)
     ]
     (folder / "metrics.jsonl").write_text("".join(f"{text}\n" for text in texts))
 
@@ -334,6 +339,40 @@ def test_what_a_run_compiles_is_no_part_of_its_cost(tmp_path):
     row, _ = _more("a", {"a": (points["base"], points["more"])})
     assert row[0] == "×1.00"
     assert row[1] == f"×{3 / 93:.2f}"
+
+
+def test_a_run_that_is_being_written_is_read_and_a_damaged_one_left_out(tmp_path, capsys):
+    steps = [f"stages.{s}.steps={n}" for s, n in zip(STAGES, (3, 0, 0), strict=True)]
+    config = make_config(quality="draft", overrides=tuple(steps))
+    for name in ("whole", "torn"):
+        _left(tmp_path / "one", name, config, [(1.0, 500), (1.0, 2000), (1.0, 800)])
+    expected = trade.stage_times(tmp_path / "one")
+    with (tmp_path / "one/torn/metrics.jsonl").open("a") as file:
+        file.write('{"step": 3, "st')
+    assert trade.stage_times(tmp_path / "one") == expected
+    (tmp_path / "one/torn/run.json").write_text("{")
+    assert trade.stage_times(tmp_path / "one") == expected
+    assert "left out: " in capsys.readouterr().err
+
+
+def test_a_command_on_a_cluster_ends_with_its_job(monkeypatch):
+    """Its child is told to end, and is gone when the job is."""
+    started = []
+
+    class Child(subprocess.Popen):
+        def __init__(self, *arguments, **options):
+            super().__init__(*arguments, **options)
+            started.append(self)
+
+    def interrupted(*words, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cluster.subprocess, "Popen", Child)
+    monkeypatch.setattr(cluster, "print", interrupted, raising=False)
+    program = "import time; print('here', flush=True); time.sleep(600)"
+    with pytest.raises(KeyboardInterrupt):
+        cluster.Command([sys.executable, "-c", program])()
+    assert started[0].returncode == -signal.SIGINT
 
 
 def test_figures_on_images_of_another_size_are_another_evaluation(tmp_path, capsys):

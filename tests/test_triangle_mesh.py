@@ -157,11 +157,14 @@ def test_faces_without_height_do_not_pull_on_their_neighbours():
     middles = vertices[faces[split]][:, :2].mean(axis=1)
     added = len(vertices) + np.arange(len(split))
     first, second, third = faces[split].T
-    halves = np.concatenate([np.stack([first, added, third], 1), np.stack([added, second, third], 1)])
-    slivers = np.stack([first, second, added], axis=1)
-    whole = np.delete(faces, split, axis=0)
+    rows = [
+        np.delete(faces, split, axis=0),
+        np.stack([first, added, third], axis=1),
+        np.stack([added, second, third], axis=1),
+        np.stack([first, second, added], axis=1),
+    ]
     places = np.concatenate([vertices, middles])
-    model = TriangleMesh.of(places, np.concatenate([whole, halves, slivers]), is_sheet=False)
+    model = TriangleMesh.of(places, np.concatenate(rows), is_sheet=False)
 
     @jax.jit
     @jax.grad

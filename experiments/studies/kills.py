@@ -331,6 +331,7 @@ class Study:
         self.scene, self.cache = small_scene(folder), folder / "cache"
         self.reference = folder / "reference"
         self.kills: list[Kill] = []
+        self.other_faults = 0
         self.finished = 0
         self.seconds: dict[str, float] = {}
 
@@ -424,6 +425,7 @@ class Study:
     def _blame(self, last: Kill | None, fault: str) -> None:
         if last is not None:
             last.faults.append(fault)
+        self.other_faults += last is None
         print(f"     ! {fault}", flush=True)
 
     def train_trial(self) -> None:
@@ -466,7 +468,7 @@ class Study:
         bad = sum(bool(kill.faults) for kill in self.kills)
         lines.append(
             f"{len(self.kills)} kills, after which {self.finished} commands were left to end; "
-            f"{bad} kills with a fault"
+            f"{bad} kills with a fault, {self.other_faults} faults after none"
         )
         return "\n".join(lines)
 
@@ -492,7 +494,7 @@ def main() -> int:
     if arguments.json is not None:
         records = [asdict(kill) for kill in study.kills]
         arguments.json.write_text(json.dumps(records, indent=1) + "\n")
-    return int(any(kill.faults for kill in study.kills))
+    return int(study.other_faults > 0 or any(kill.faults for kill in study.kills))
 
 
 if __name__ == "__main__":

@@ -34,6 +34,7 @@ from geosplat_jax.core.color import tone_map
 from geosplat_jax.core.numerics import safe_normalize
 from geosplat_jax.core.types import Batch, Grid
 from geosplat_jax.fit.config import Config, Stage
+from geosplat_jax.fit.loop import start_keys
 from geosplat_jax.fit.runtime import enable_compilation_cache
 from geosplat_jax.fit.stages import (
     build_pipeline,
@@ -415,7 +416,7 @@ def follow(
 
 def _first_state(dataset: Dataset, config: Config) -> tuple[FlexiCubes, TrainState]:
     """Build the surface and the state before the first step, as training does."""
-    shape_key, field_key = jax.random.split(jax.random.key(config.run.seed))
+    shape_key, field_key = start_keys(config)
     surface, shape = config.geometry.start(dataset, shape_key)
     assert isinstance(surface, FlexiCubes)
     return surface, initial_state(initial_params(shape, config, field_key))

@@ -27,6 +27,7 @@ from geosplat_jax.core.mesh import vertex_normals
 from geosplat_jax.core.numerics import safe_normalize
 from geosplat_jax.core.types import Batch, Camera, EnvLight, Materials, Mesh
 from geosplat_jax.fit.config import Config
+from geosplat_jax.fit.loop import start_keys
 from geosplat_jax.fit.planning import plan_capacities
 from geosplat_jax.fit.presets import SPLIT_SUM, make_config
 from geosplat_jax.fit.runtime import enable_compilation_cache
@@ -140,7 +141,7 @@ class RoundedPipeline(Pipeline):
 
 def start(dataset: Dataset, config: Config, variant: Variant) -> tuple[Params, RoundedPipeline]:
     """Build parameters and pipeline as `train.fit` does."""
-    shape_key, field_key = jax.random.split(jax.random.key(config.run.seed))
+    shape_key, field_key = start_keys(config)
     surface, shape = config.geometry.start(dataset, shape_key)
     params = initial_params(shape, config, field_key)
     if variant.nudged:

@@ -112,7 +112,7 @@ def propose_box(cloud: Cloud, views: Views, *, seed: int = 0) -> Proposal:
     if not is_sure.any():
         raise CaptureError(
             f"there is no opaque splat where the cameras look, between {_corner(lo)} and "
-            f"{_corner(hi)}; train longer, or {cure}"
+            f"{_corner(hi)}; train longer (--force --steps), or {cure}"
         )
     centers = views.camera_to_world[:, :3, 3]
     rng = np.random.default_rng(seed)
@@ -122,7 +122,8 @@ def propose_box(cloud: Cloud, views: Views, *, seed: int = 0) -> Proposal:
     members = _largest_cluster(rest, rest_weights, is_sure[is_above], lo, hi)
     if not members.any():
         raise CaptureError(
-            f"where the cameras look there is nothing but fog; train longer, or {cure}"
+            "where the cameras look there is nothing but fog; train longer (--force --steps), or "
+            f"{cure}"
         )
     cluster = rest[members]
     low, high = np.quantile(cluster, [_TAIL, 1.0 - _TAIL], axis=0)

@@ -93,7 +93,10 @@ class Certainty:
         """Say what looks wrong, and what to do."""
         found = []
         if self.unsure > _MOST_UNSURE:
-            found.append("many pixels are half opaque; train longer, or give a tighter --box")
+            found.append(
+                "many pixels are half opaque; train longer (--force --steps), or give a tighter "
+                "--box"
+            )
         if self.agreement < _LEAST_AGREEMENT:
             found.append("masks contradict each other; look at the sheet, and give a --box")
         if self.cut > _MOST_CUT:
@@ -211,7 +214,8 @@ def make_masks(
     if not masks.any():
         raise CaptureError(
             f"the splats in the box from {_numbers(lo)} to {_numbers(hi)} cover no pixel by more "
-            f"than {OPAQUE:g}, so masks would leave nothing; give another --box, or train longer"
+            f"than {OPAQUE:g}, so masks would leave nothing; give another --box, or train longer "
+            "(--force --steps)"
         )
     # Whoever is stopped between the first mask and the report can go on.
     begun = folder / _BEGUN

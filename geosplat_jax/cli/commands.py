@@ -34,7 +34,7 @@ from geosplat_jax.gradcheck.report import (
 from geosplat_jax.io.agreement import agreement_lines, hollow_line
 from geosplat_jax.io.dataset import describe, load_dataset, load_recorded
 from geosplat_jax.io.export import LARGEST_TEXTURE
-from geosplat_jax.io.images import written_aside
+from geosplat_jax.io.images import SceneError, written_aside
 from geosplat_jax.io.poses import PoseSettings, find_poses
 from geosplat_jax.report.consistency import (
     DEFAULT_SIZE,
@@ -55,6 +55,9 @@ from geosplat_jax.run import Run
 from geosplat_jax.viewer.painter import Viewer
 from geosplat_jax.viewer.server import ViewerServer, require_free_port, viser_library
 from geosplat_jax.viewer.source import CheckpointWatch, light_files, load_lights
+
+_ONE_LINE = 1000
+"""Columns of a table that no terminal shows."""
 
 _LARGEST_FACTOR = 1e6
 """Of a light or an albedo; far beyond any that is of use, and single precision holds the result."""
@@ -133,9 +136,10 @@ def _masks(arguments: argparse.Namespace) -> None:
 
 def _settings(arguments: argparse.Namespace) -> None:
     """List settings with their values under the chosen preset and quality."""
+    # Paths stay whole, for --set and grep; where nobody looks on, so does every line.
     table = Table(box=None, pad_edge=False)
     for title in ("setting", "value", "range", "meaning"):
-        table.add_column(title, overflow="fold")
+        table.add_column(title, overflow="fold", no_wrap=title == "setting")
     rows = [
         row for row in all_settings(config_from(arguments)) if row[0].startswith(arguments.prefix)
     ]
@@ -143,7 +147,10 @@ def _settings(arguments: argparse.Namespace) -> None:
         raise UsageError(f"no setting begins with {arguments.prefix!r}")
     for path, value, limits, meaning in rows:
         table.add_row(*map(Text, (path, as_written(value), limits, meaning)))
-    Console(highlight=False).print(table)
+    screen = Console(highlight=False)
+    if not screen.is_terminal:
+        screen.width = _ONE_LINE
+    screen.print(table)
 
 
 def _check_samples(arguments: argparse.Namespace) -> None:
@@ -299,7 +306,7 @@ def _view(arguments: argparse.Namespace) -> None:
     known, views = {}, None
     try:
         known, views = run.dataset.lights, run.dataset.train
-    except RunError as error:
+    except (RunError, SceneError) as error:
         say(f"without photographs: {error}", label="warning: ", style="yellow")
     lights = load_lights(light_files(arguments.env), known)
     viewer = Viewer(CheckpointWatch(run.folder), lights)

@@ -198,7 +198,7 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
 
 def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[str, Any]) -> Path:
     """Set the cameras right before the training proper; say where they are."""
-    draft = round_config(arguments.material_prior)
+    draft = round_config(arguments.material_prior, seed=arguments.seed)
     say("cameras first: a short training, a draft with half its split sum and no refinement")
     with ProgressDisplay(draft.total_steps) as display:
         cameras = refined_cameras(
@@ -208,6 +208,7 @@ def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[
             config=draft,
             reading=reading,
             how=CameraSettings(white_balance=arguments.white_balance),
+            replace=arguments.force,
             listener=display,
             on_view=say_refined,
         )

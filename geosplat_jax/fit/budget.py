@@ -37,7 +37,8 @@ _SHORTEST, _LONGEST = 0.4, 3.0
 """How far the steps of a stage may be scaled for a plan, and made more of on the way."""
 
 _PIXELS_PER_CELL = 6.0
-"""Photographs are reduced until their longer side has at most so many pixels for each cell."""
+"""Photographs are reduced until their longer side has about so many pixels for each cell; by a
+whole number, so that one and a half times as many may stay."""
 
 _TIMED = 5
 """Steps that an estimate takes at least."""

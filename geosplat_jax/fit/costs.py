@@ -40,6 +40,10 @@ COST_SECONDS: Mapping[str, float] = {
 }
 """Seconds of each unit of `work_of` on the reference machine."""
 
+_FASTEST_CPU, _FASTEST_GPU = 0.2, 0.05
+"""Least slowness that is believed. Steps of the full size took an H200 a quarter of what .2 makes of
+them (docs/devices.md)."""
+
 _STARTUP_SECONDS = {"first": 30.0, "next": 20.0}
 """What stages wait for before their steps, programs being compiled: the first, and any other."""
 
@@ -84,14 +88,15 @@ def expected_costs(config: Config, pixels: float, *, slowness: float) -> dict[st
 
     Parameters
     ----------
-    pixels : of a view. slowness : of this machine, see `slowness_of_machine`.
+    pixels : of a view. slowness : of this machine, see `slowness_of_machine`. However fast an
+        accelerator is, programs for it are compiled by a processor.
     """
-    costs = {}
+    costs, compiling = {}, slowness if jax.default_backend() == "cpu" else max(slowness, 1.0)
     for number, stage in enumerate(config.active_stages):
         work = work_of(stage, float(config.geometry.expected_splats(pixels)), pixels)
         seconds = sum(COST_SECONDS[name] * amount for name, amount in work.items())
         startup = _STARTUP_SECONDS["next" if number else "first"]
-        costs[stage.name] = StageCost(startup * slowness, seconds * slowness)
+        costs[stage.name] = StageCost(startup * compiling, seconds * slowness)
     return costs
 
 
@@ -127,5 +132,9 @@ def exponential_milliseconds(repeats: int = 71) -> float:
 
 
 def slowness_of_machine() -> float:
-    """Tell how many times slower than the reference this machine is at this moment."""
-    return float(np.clip(exponential_milliseconds() / _REFERENCE_MS, 0.2, 10.0))
+    """Tell how many times slower than the reference this machine is at this moment.
+
+    An accelerator is not as much faster in the steps of a training as in exponentials.
+    """
+    fastest = _FASTEST_CPU if jax.default_backend() == "cpu" else _FASTEST_GPU
+    return float(np.clip(exponential_milliseconds() / _REFERENCE_MS, fastest, 10.0))

@@ -261,6 +261,21 @@ class RunFolder:
                 "choose another --output"
             )
 
+    def make_room(self, *, replace: bool) -> None:
+        """Remove a run that is to be replaced, before the work that comes before the new one.
+
+        Whoever goes on with that work then finds no other run in its place.
+
+        Raises
+        ------
+        RunError
+            If there is a run and ``replace`` is not set, or another process holds it.
+        """
+        self.require_free(replace=replace)
+        if self.exists:
+            with self.locked():
+                self.clear()
+
     def budget(self) -> Budget | None:
         """Read what the run may take; None where nobody said.
 

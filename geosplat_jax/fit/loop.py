@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Key
 
 from geosplat_jax.core import capacity as capacity_module
 from geosplat_jax.core.capacity import Capacities, Usage
@@ -440,6 +441,13 @@ def _warn_of_blended_points(config: Config) -> None:
             )
 
 
+def start_keys(config: Config) -> tuple[Key[Array, ""], Key[Array, ""]]:
+    """Return the keys of the first surface and of the first fields."""
+    start_key = jax.random.fold_in(jax.random.key(config.run.seed), START_STREAM)
+    shape_key, field_key = jax.random.split(start_key)
+    return shape_key, field_key
+
+
 def new_loop(
     dataset: Dataset,
     config: Config,
@@ -454,8 +462,7 @@ def new_loop(
     ``start`` : what it takes over, None where it begins anew. ``surface`` : of a checkpoint, where
     it is not made anew.
     """
-    start_key = jax.random.fold_in(jax.random.key(config.run.seed), START_STREAM)
-    shape_key, field_key = jax.random.split(start_key)
+    shape_key, field_key = start_keys(config)
     if not config.active_stages:
         raise TrainingError("nothing to train: no stage has steps")
     try:

@@ -319,7 +319,7 @@ _MESH_WEIGHTS["code"] = _MESH_WEIGHTS["paper"]
 """Weights of `surface.triangle_mesh`. Those of the paper are appendix H's, whose unit of length is
 not known."""
 
-_MESH_EDGES = {"draft": 3.0, BETWEEN: 2.0, "standard": 2.0, "high": 1.5}
+_MESH_EDGES = {"draft": 3.0, "standard": 2.0, "high": 1.5}
 """Mean edges of a mesh in pixels."""
 
 _MESH_SHIFT_LOGIT = -1.0
@@ -480,8 +480,8 @@ def between_qualities(
     """
     below = min(int(place), len(QUALITIES) - 2)
     low, high = (
-        make_config("default", QUALITIES[number], material_prior=material_prior).to_dict()
-        for number in (below, below + 1)
+        make_config("default", quality, material_prior=material_prior, mesh=mesh).to_dict()
+        for quality in QUALITIES[below : below + 2]
     )
     values = {**_interpolated(low, high, place - below), "quality": BETWEEN}
     return _finished(values, mesh, overrides)

@@ -144,9 +144,7 @@ def _require_convex(path: Path) -> None:
         fan = np.cross(spokes[:-1], spokes[1:])
         concave += bool((fan @ fan.sum(axis=0) < 0).any())
     if concave:
-        raise ValueError(
-            f"{path} has {concave} faces that are not convex; export it as triangles"
-        )
+        raise ValueError(f"{path} has {concave} faces that are not convex; export it as triangles")
 
 
 def is_y_up(path: str | Path) -> bool:

@@ -270,11 +270,11 @@ def _wound_alike(faces: Int[np.ndarray, "F 3"]) -> tuple[Int[np.ndarray, "F 3"],
     count, near = len(faces), connectivity(faces)
     first, second = near.wings[:, 0], near.wings[:, 1]
     other = second + count * near.turned
-    start = np.concatenate([first, first + count])
-    links = coo_matrix(
-        (np.ones(len(start), bool), (start, np.concatenate([other, (other + count) % (2 * count)]))),
-        shape=(2 * count, 2 * count),
+    ends = (
+        np.concatenate([first, first + count]),
+        np.concatenate([other, (other + count) % (2 * count)]),
     )
+    links = coo_matrix((np.ones(len(ends[0]), bool), ends), shape=(2 * count, 2 * count))
     part = connected_components(links, directed=False)[1]
     kept, turned = part[:count], part[count:]
     is_one_sided = kept == turned
@@ -439,8 +439,8 @@ def _decimated(mesh: StartMesh, target: int, *, most_faces: int, path: str) -> S
     if len(reduced.faces) > most_faces:
         raise ValueError(
             f"{path} has {count} faces, which could be decimated to {len(reduced.faces)} only, and "
-            f"geometry.max_faces is {most_faces}: faces without height stand in the way. Remesh it, "
-            "or allow more faces"
+            f"geometry.max_faces is {most_faces}: faces without height stand in the way. Remesh "
+            "it, or allow more faces"
         )
     notes = [f"decimated to {len(reduced.faces)} faces, to match the pixels"]
     if was_closed and not reduced.is_closed:

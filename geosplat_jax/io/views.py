@@ -121,6 +121,12 @@ class Views:
         covered = [np.count_nonzero(self.mask(index)) for index in range(len(self))]
         return np.array(covered) / np.maximum(self.valid_counts, 1.0)
 
+    @cached_property
+    def mean_colors(self) -> Float[np.ndarray, "V 3"]:
+        """Mean of each view, linear; tells photographs from others of their name."""
+        means = [np.asarray(self.images[v])[..., :3].mean((0, 1)) for v in range(len(self))]
+        return np.round(np.reshape(np.array(means, np.float64), (-1, 3)), 6)
+
     @property
     def has_opaque_pixel(self) -> bool:
         """Whether alpha reaches one, or nearly, in any view."""

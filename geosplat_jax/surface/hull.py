@@ -33,7 +33,9 @@ _POINTS_OF_A_SLAB = 1 << 20
 _MASK_PIXELS = 400  # larger masks are reduced first; the hull is never sampled that finely
 _COVERED = 0.5
 _FULL, _EMPTY = 1.0 - 1e-3, 1e-3  # coverage beyond these is a whole pixel
-_HAZE = 0.02  # five steps of 8 bits: what compression and mattes leave where nothing or all is covered
+_HAZE = (
+    0.02  # five steps of 8 bits: what compression and mattes leave where nothing or all is covered
+)
 _BAND_CELLS = 1.5  # the looked-up distance is trusted this far from the surface
 _SEARCH_POINTS = 48  # along each side, while the bounds close in on the hull
 _SEARCH_STEPS = 8
@@ -325,8 +327,8 @@ class _Silhouettes:
 def without_haze(coverage: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
     """Take pixels that are hardly covered, or nearly wholly, for what they are meant to be.
 
-    In clean masks such pixels lie at outlines and tell where these are. So nothing is changed unless
-    one in a hundred of those that lie among their like is neither 0 nor 1.
+    In clean masks such pixels lie at outlines and tell where these are. So nothing is changed
+    unless one in a hundred of those that lie among their like is neither 0 nor 1.
     """
     found = coverage
     for whole in (0.0, 1.0):

@@ -42,7 +42,7 @@ _BOX_MARGIN = 1.1
 _SPLATS_PER_FACE = 6
 
 _LEAST_HEIGHT = 1e-3
-"""Height over its longest edge, in mean edges of the mesh, from which a face says where it looks."""
+"""Height over its longest edge, in mean edges of the mesh, from which a face has a direction."""
 
 
 class VertexOffsets(eqx.Module):

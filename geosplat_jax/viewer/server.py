@@ -219,7 +219,7 @@ def _to_camera(pose: np.ndarray, field_of_view: float, name: str) -> Callable[[A
 
 
 class ViewerServer:
-    """A viewer that browsers on this machine can open.
+    """A viewer that browsers on this machine can open, whatever page they show.
 
     Parameters
     ----------
