@@ -32,7 +32,8 @@ from geosplat_jax.materials import Attributes
 from geosplat_jax.surface.base import Surface
 
 _LEAST = 0.01
-"""Albedo is kept in [0.01, 0.99], as in the authors' code."""
+"""Albedo is shown within [0.01, 0.99]. The authors' code keeps the parameter there; here it may
+leave, and comes back by its gradient."""
 
 _FAINTEST = 1e-4
 """First opacities are kept this far from 0 and 1, where the logit ends."""

@@ -377,7 +377,9 @@ def test_a_mesh_keeps_what_is_set_of_it(tmp_path):
     assert (geometry.path, geometry.edge_pixels) == (str(file), 4.0)
     assert split_sum.rates["vertices"].value == 0
     assert "cells" not in chosen.describe()[0]
-    edges = [between_qualities(place, mesh=file).geometry.edge_pixels for place in (0.0, 0.5, 1.0, 2.0)]
+    edges = [
+        between_qualities(place, mesh=file).geometry.edge_pixels for place in (0.0, 0.5, 1.0, 2.0)
+    ]
     assert edges == pytest.approx([3.0, 6.0**0.5, 2.0, 1.5])
     # Four times as many faces are as many splats.
     finer = plan(Budget(600.0), SIZE, slowness=1.0, mesh=file, overrides=["geometry.edge_pixels=2"])

@@ -90,6 +90,18 @@ def test_a_splat_that_moves_along_its_face_takes_its_anchor_with_it(start):
     np.testing.assert_allclose(lifted.splats.anchors, asset.splats.anchors, atol=1e-6)
     change = np.asarray(lifted.splats.means - asset.splats.means)
     np.testing.assert_allclose(change[real], shift[real], atol=1e-6)
+    # A tenth of the way to the middle of its face a splat is still on it.
+    faces = np.asarray(asset.mesh.faces)[np.asarray(asset.splats.parents)]
+    middles = np.asarray(asset.mesh.vertices, float)[faces].mean(axis=1)
+    anchors = np.asarray(asset.splats.anchors, float)
+    along = 0.1 * (middles - anchors)
+    moved = replace(
+        params.splats, means=params.splats.means + jnp.asarray(along / half, jnp.float32)
+    )
+    followed = build(refining, replace(params, splats=moved))
+    change = np.asarray(followed.splats.anchors) - anchors
+    assert np.median(np.linalg.norm(along[real], axis=1)) > 1e-4
+    np.testing.assert_allclose(change[real], along[real], atol=2e-6)
 
 
 def test_a_splat_that_leaves_its_face_is_shaded_on_it(start):

@@ -303,6 +303,22 @@ def test_an_open_mesh_needs_culling(dataset, files, tmp_path):
     assert not (tmp_path / "run/run.json").exists()
 
 
+def test_an_open_mesh_is_not_shaded_behind_its_faces(dataset, files, tmp_path):
+    """What little shows through of the far wall draws blended positions into the body."""
+    changes = ("stages.refine.steps=1", "stages.refine.domain.kind=per_pixel")
+    config = make_config(mesh=files["bowl"], overrides=(*SMALL, *changes))
+    with pytest.raises(TrainingError, match=r"behind its faces; set stages.refine.domain.points"):
+        fit(dataset, config, tmp_path / "run")
+    # The preset `paper` does that, and is sent back before anything is written.
+    with pytest.raises(TrainingError, match="geometry.sides=one"):
+        fit(
+            dataset,
+            make_config("paper", "draft", mesh=files["bowl"], overrides=("stages.refine.steps=1",)),
+            tmp_path / "run",
+        )
+    assert not (tmp_path / "run/run.json").exists()
+
+
 def test_the_command_refuses_a_mesh_that_is_no_file(tmp_path, capsys):
     assert cli.main(["train", str(tmp_path), "--mesh", str(tmp_path / "none.ply")]) == 2
     assert "there is no mesh file" in capsys.readouterr().err.replace("\n", " ")

@@ -41,8 +41,8 @@ COST_SECONDS: Mapping[str, float] = {
 """Seconds of each unit of `work_of` on the reference machine."""
 
 _FASTEST_CPU, _FASTEST_GPU = 0.2, 0.05
-"""Least slowness that is believed. Steps of the full size took an H200 a quarter of what .2 makes of
-them (docs/devices.md)."""
+"""Least slowness that is believed. Steps of the full size took an H200 a quarter of what .2 makes
+of them (docs/devices.md)."""
 
 _STARTUP_SECONDS = {"first": 30.0, "next": 20.0}
 """What stages wait for before their steps, programs being compiled: the first, and any other."""

@@ -1,6 +1,5 @@
 """The state of a training between two steps: where it starts, what a step does, what is kept."""
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -429,15 +428,18 @@ def _sizes(shape: Any) -> list[tuple[int, ...]]:
     return [leaf.shape for leaf in jax.tree.leaves(shape)]
 
 
-def _warn_of_blended_points(config: Config) -> None:
-    """Warn where rays start between splats, which on an open mesh may be behind a face."""
+def _refuse_blended_points(config: Config) -> None:
+    """Refuse rays that start between splats, where both sides of a mesh are surface.
+
+    What little shows through of the wall behind draws a position behind the face, on the whole of
+    which it then lies in its own shadow.
+    """
     for stage in config.active_stages:
         if not stage.domain.shades_splats and not stage.domain.uses_rays:
-            warnings.warn(
-                f"stages.{stage.name}.domain: rays start at blended positions of splats, which "
-                "beside an edge of an open mesh may lie behind a face and then see nothing; set "
-                f"stages.{stage.name}.domain.points=mesh",
-                stacklevel=3,
+            raise TrainingError(
+                f"stages.{stage.name}.domain: rays start at blended positions of splats, which of "
+                f"an open mesh lie behind its faces; set stages.{stage.name}.domain.points=mesh, "
+                "or geometry.sides=one"
             )
 
 
@@ -480,7 +482,7 @@ def new_loop(
             "same place; leave it true, or set geometry.sides=one"
         )
     if surface.is_two_sided:
-        _warn_of_blended_points(config)
+        _refuse_blended_points(config)
     stage = config.active_stages[0]
     params = initial_params(shape, config, field_key)
     if start is not None:

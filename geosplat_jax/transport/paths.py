@@ -293,7 +293,10 @@ class PathTracer(IndirectSource):
         wo: Float[Array, "n 3"],
         is_real: Bool[Array, " n"],
     ) -> tuple[Leg, ...]:
-        """Draw and trace all later vertices; no gradients."""
+        """Draw and trace all later vertices; no gradients.
+
+        Random numbers and legs are of all rays at once: their memory grows with rays and vertices.
+        """
         table, sampler = jax.lax.stop_gradient((self.table, self.sampler))
         width = self.vertex_count * _NUMBERS
         # In float32 at any precision, so that a run in float64 sees the same numbers.

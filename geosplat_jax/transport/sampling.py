@@ -1,6 +1,7 @@
 """Directions in which a point looks for light: drawn by importance, and traced; no gradients.
 
-All samples are of low discrepancy. Memory is bounded by chunks of points (`in_chunks`).
+All samples are of low discrepancy. Memory is bounded by chunks of points (`in_chunks`),
+but for paths (`paths`), whose later vertices are kept for all rays of a call.
 """
 
 from collections.abc import Callable
