@@ -195,8 +195,9 @@ def _joined(points: Float[np.ndarray, "V 3"]) -> tuple[np.ndarray, Int[np.ndarra
         _, first, row = np.unique(
             cube @ np.array([1 << 42, 1 << 21, 1]), return_index=True, return_inverse=True
         )
-        ends.append(first[row.reshape(-1)])
-    links = (np.ones(8 * count, bool), (np.concatenate(ends), np.tile(np.arange(count), 8)))
+        ends.append(first[row.reshape(-1)].astype(np.int32))
+    starts = np.tile(np.arange(count, dtype=np.int32), len(ends))
+    links = (np.ones(len(starts), bool), (np.concatenate(ends), starts))
     group = connected_components(coo_matrix(links, shape=(count, count)), directed=False)[1]
     _, first = np.unique(group, return_index=True)
     return points[first], group
