@@ -106,7 +106,7 @@ def _default() -> Config:
         steps=100,
         transport=monte_carlo.transport,
         splats=FreeSplatSettings(darkest_metal=0.2),
-        rates=_refinement_rates(albedo=5e-4),
+        rates=_refinement_rates(albedo=5e-4, roughness_metallic=2e-3),
         weights=_weights(**photometric, albedo_smoothness=0.02, **smooth, indirect=0.001),
     )
     return Config(
@@ -117,8 +117,8 @@ def _default() -> Config:
     )
 
 
-def _refinement_rates(*, albedo: float) -> dict[str, Rate]:
-    """Return the authors' rates of free splats; ``albedo`` is that of the table of the fields."""
+def _refinement_rates(*, albedo: float, roughness_metallic: float) -> dict[str, Rate]:
+    """Return the authors' rates of free splats, with those of the fields as given."""
     decaying = {
         "splat_means": 1.6e-4,
         "splat_normals": 1e-3,
@@ -131,7 +131,7 @@ def _refinement_rates(*, albedo: float) -> dict[str, Rate]:
         "splat_opacities": 5e-2,
         "splat_albedo": 5e-3,
         "splat_indirect": 2.5e-3,
-        "roughness_metallic": 5e-4,
+        "roughness_metallic": roughness_metallic,
         "roughness": 5e-3,
         "albedo": albedo,
     }
@@ -230,7 +230,7 @@ def _original_stages(
         ),
         splats=FreeSplatSettings(),
         domain=PerPixel(points=points),
-        rates=_refinement_rates(albedo=0.0),
+        rates=_refinement_rates(albedo=0.0, roughness_metallic=5e-4),
         weights={
             **photometric,
             **_weights(albedo_smoothness=0.2 / 3, smoothness_roughness_metallic=0.05 / 2),
