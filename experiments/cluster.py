@@ -4,7 +4,6 @@ The extra ``cluster``. A job calls a command and ends with it. Where the cluster
 time, it is put into the queue again and goes on from its last checkpoint.
 """
 
-import signal
 import subprocess
 import sys
 from collections import deque
@@ -42,9 +41,9 @@ class Command:
                     print(line, end="", flush=True)
             except BaseException:
                 # A job that is cancelled takes its command along, which writes a checkpoint.
-                child.send_signal(signal.SIGINT)
+                child.terminate()
                 try:
-                    child.wait(_PATIENCE)
+                    child.communicate(timeout=_PATIENCE)
                 except subprocess.TimeoutExpired:
                     child.kill()
                 raise

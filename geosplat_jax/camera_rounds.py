@@ -138,6 +138,7 @@ def refined_cameras(
     }
     _require_same(beside, made_with)
     if replace:
+        dataset.require_masks("train")
         RunFolder(output).make_room(replace=True)
     for number in range(1, rounds + 1):
         folder = beside / f"round_{number}"

@@ -130,10 +130,11 @@ def choose_model(
     dataset : the scene.
     config : the largest model, with what is to be spent on it in the end.
     output : folder of the run to come; trials are made beside it, in ``OUTPUT_model``, of which
-        the file ``choice.json`` stays.
+        the file ``choice.json`` stays, and a lock.
     how : see `ModelChoice`.
     begin : `Resume` goes on with a choice that was interrupted; trainings that are done are not
-        made again. `Anew` with ``replace`` begins anew where there was one.
+        made again. `Anew` with ``replace`` begins anew where there was one, and removes a run that
+        ``output`` holds.
     listener : told of every training, and of every part that was tried.
 
     Raises
@@ -153,6 +154,8 @@ def choose_model(
     rungs = []
     with locked_folder(trials.state_path.parent, own=trials.state_path):
         trials.open(begin)
+        if begin.replace:
+            RunFolder(output).make_room(replace=True)
         for part in offered:
             if not kept.issuperset(_among(part.follows, offered)):
                 continue
@@ -323,7 +326,7 @@ class _Trials:
         if was != mark:
             raise RunError(
                 f"{path} was begun with other settings or other views, or these were read "
-                "otherwise; take the same, or begin anew with --force"
+                "otherwise, or by another version; take the same, or begin anew with --force"
             )
         self._measured, self._stage_1_seconds = measured, seconds
 

@@ -674,8 +674,8 @@ def _chosen_model(
     listener: Listener,
 ) -> ChosenModel:
     """Choose the model of a new run; what its settings change of their preset counts as by hand."""
+    folder.require_free(replace=begin.replace)
     dataset.require_masks("train")
-    folder.make_room(replace=begin.replace)
     by_hand = tuple(dict.fromkeys((*how.by_hand, *changed_from_preset(config))))
     how = replace(how, by_hand=by_hand)
     return choose_model(dataset, config, folder.path, how, begin=begin, listener=listener)

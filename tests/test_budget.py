@@ -33,7 +33,7 @@ from geosplat_jax.fit.costs import (
 from geosplat_jax.fit.entering import FreshAlbedo
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.planning import TrainingError
-from geosplat_jax.fit.presets import QUALITIES, between_qualities, make_config
+from geosplat_jax.fit.presets import QUALITIES, between_qualities, make_config, with_mesh
 from geosplat_jax.fit.train import fit
 from geosplat_jax.run import train
 
@@ -381,6 +381,7 @@ def test_a_mesh_keeps_what_is_set_of_it(tmp_path):
         between_qualities(place, mesh=file).geometry.edge_pixels for place in (0.0, 0.5, 1.0, 2.0)
     ]
     assert edges == pytest.approx([3.0, 6.0**0.5, 2.0, 1.5])
+    assert with_mesh(between_qualities(0.5), file).geometry.edge_pixels == 2.0
     # Four times as many faces are as many splats.
     finer = plan(Budget(600.0), SIZE, slowness=1.0, mesh=file, overrides=["geometry.edge_pixels=2"])
     pixels = float(SIZE[0] * SIZE[1])

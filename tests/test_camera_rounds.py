@@ -23,6 +23,10 @@ class _Views:
     def __init__(self, number, coverage, brightness):
         self.number, self.coverage = number, [coverage]
         self.mean_colors = np.full((1, 3), brightness)
+        self.has_masks = True
+
+    def __len__(self):
+        return 1
 
     def fingerprint(self):
         return f"views {self.number}"

@@ -1,10 +1,12 @@
 """The visual hull of a sphere is known: its distance, its box, and what masks may do to it."""
 
+import io
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from geosplat_jax.io.dataset import load_dataset
 from geosplat_jax.surface.hull import (
@@ -191,13 +193,21 @@ def test_bool_masks_and_full_masks_are_masks_too(sphere):
     assert visual_hull(poses, intrinsics, np.ones_like(masks), np.zeros((1, 3))).all()
 
 
+def through_jpeg(mask, *, quality):
+    buffer = io.BytesIO()
+    Image.fromarray(np.rint(255 * mask).astype(np.uint8)).save(buffer, "JPEG", quality=quality)
+    return np.asarray(Image.open(buffer)) / 255.0
+
+
 def test_a_haze_of_compression_is_neither_object_nor_background(sphere):
     poses, pinholes, masks = sphere
     haze = np.random.default_rng(0).integers(0, 4, masks.shape) / 255.0
     points = grid_points(fit_grid((np.full(3, -1.2), np.full(3, 1.2)), 24))
     clean = hull_distance(poses, pinholes, masks, points)
     assert clean.min() < -0.6
-    for hazy in (np.maximum(masks, haze), np.minimum(masks, 1.0 - haze), 0.985 * masks):
+    hazes = [np.maximum(masks, haze), np.minimum(masks, 1.0 - haze), 0.985 * masks]
+    hazes.append(np.stack([through_jpeg(mask, quality=95) for mask in masks]))
+    for hazy in hazes:
         found = hull_distance(poses, pinholes, hazy, points)
         # A pixel is .044 wide there.
         np.testing.assert_allclose(found, clean, atol=0.02)

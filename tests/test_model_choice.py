@@ -15,7 +15,7 @@ from geosplat_jax import cli, model_choice
 from geosplat_jax.core.types import EnvLight
 from geosplat_jax.fit.begin import Anew, Resume
 from geosplat_jax.fit.entering import Start
-from geosplat_jax.fit.folder import RunError, locked_folder
+from geosplat_jax.fit.folder import RunError, RunFolder, locked_folder
 from geosplat_jax.fit.listener import Listener
 from geosplat_jax.fit.model_parts import LADDER, without
 from geosplat_jax.fit.presets import make_config
@@ -241,6 +241,25 @@ def test_a_choice_of_other_photographs_is_not_gone_on_with(dataset, trainings, t
     with locked_folder(choice_folder(tmp_path / "run"), own=choice_folder(tmp_path / "run")):
         with pytest.raises(RunError, match="another process is writing"):
             choose_model(dataset, config, tmp_path / "run", begin=Anew(replace=True))
+
+
+def test_a_run_is_replaced_only_once_the_choice_is_possible(dataset, trainings, tmp_path):
+    old = RunFolder(tmp_path / "run")
+    with old.locked():
+        old.begin(dataset, tiny_config(), replace=False)
+    few = sphere_dataset(count=6, size=8)
+    letter = choice_folder(old.path) / "letter.txt"
+    letter.parent.mkdir()
+    letter.write_text("dear")
+    for scene, error in ((few, ValueError), (dataset, RunError)):
+        with pytest.raises(error):
+            choose_model(scene, make_config(quality="draft"), old.path, begin=Anew(replace=True))
+        assert old.exists
+    letter.unlink()
+    trainings.stops_at = 0
+    with pytest.raises(Interrupted):
+        choose_model(dataset, make_config(quality="draft"), old.path, begin=Anew(replace=True))
+    assert not old.exists
 
 
 def test_a_folder_of_somebody_else_is_left_alone(dataset, trainings, tmp_path):

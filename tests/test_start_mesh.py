@@ -10,6 +10,7 @@ from support import look_at_poses, sphere_views
 
 from geosplat_jax.io import export, start_mesh
 from geosplat_jax.io.meshes import (
+    _require_convex,
     longest_edge,
     nondegenerate,
     signed_volume,
@@ -196,6 +197,20 @@ def test_faces_of_many_corners_are_read_if_they_are_convex(tmp_path):
             mesh = read(str(path))
             assert len(mesh.faces) == 4
             assert surface_area(mesh.vertices, mesh.faces) == pytest.approx(1.5 * np.sqrt(3))
+
+
+def test_corners_on_a_straight_side_and_lines_that_go_on_are_no_faults(tmp_path):
+    """As CAD programs write them, with six decimals."""
+    outline = np.array([[0, 0, 0], [2, 0, 0], [4, 0, 0], [4, 3, 0], [0, 3, 0]], float)
+    path = tmp_path / "plate.obj"
+    for seed in range(40):
+        turn = trimesh.transformations.random_rotation_matrix(np.random.default_rng(seed).random(3))
+        places = outline @ turn[:3, :3].T
+        lines = [f"v {x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in places]
+        path.write_text("".join(lines) + "f 1/1 2/2 3/3 \\\n4/4 5/5\n")
+        _require_convex(path)
+    path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3 # a b\nf 1 2 3 x\n")
+    _require_convex(path)
 
 
 def test_an_open_mesh_stays_open(tmp_path):

@@ -372,7 +372,7 @@ def test_a_command_on_a_cluster_ends_with_its_job(monkeypatch):
     program = "import time; print('here', flush=True); time.sleep(600)"
     with pytest.raises(KeyboardInterrupt):
         cluster.Command([sys.executable, "-c", program])()
-    assert started[0].returncode == -signal.SIGINT
+    assert started[0].returncode == -signal.SIGTERM
 
 
 def test_figures_on_images_of_another_size_are_another_evaluation(tmp_path, capsys):

@@ -465,6 +465,7 @@ def new_loop(
     it is not made anew.
     """
     shape_key, field_key = start_keys(config)
+    is_new = surface is None
     if not config.active_stages:
         raise TrainingError("nothing to train: no stage has steps")
     try:
@@ -481,7 +482,7 @@ def new_loop(
             "raster.cull_backfaces=false shows the fronts and the backs of an open mesh at the "
             "same place; leave it true, or set geometry.sides=one"
         )
-    if surface.is_two_sided:
+    if surface.is_two_sided and is_new:
         _refuse_blended_points(config)
     stage = config.active_stages[0]
     params = initial_params(shape, config, field_key)

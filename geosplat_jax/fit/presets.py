@@ -320,7 +320,7 @@ _MESH_WEIGHTS["code"] = _MESH_WEIGHTS["paper"]
 not known."""
 
 _MESH_EDGES = {"draft": 3.0, "standard": 2.0, "high": 1.5}
-"""Mean edges of a mesh in pixels."""
+"""Mean edges of a mesh in pixels; between two levels, those of `standard`."""
 
 _MESH_SHIFT_LOGIT = -1.0
 """Where the inward shift of splats starts on a mesh: near a quarter of the root of a face's area
@@ -369,7 +369,7 @@ def with_mesh(config: Config, mesh: str | Path | MeshSettings) -> Config:
                 "them; leave one of the two out"
             )
         return config
-    edge_pixels = _MESH_EDGES[config.quality]
+    edge_pixels = _MESH_EDGES.get(config.quality, _MESH_EDGES["standard"])
     geometry = MeshSettings(path=named.path, digest=named.digest, edge_pixels=edge_pixels)
     old, is_original = config.geometry, config.preset != "default"
     stages = []

@@ -40,6 +40,9 @@ _FACES_PER_CHART = 512
 _PAIRS_PER_CHUNK = 1 << 20
 # Faces that come nearer to the camera than this share of the mesh's extent are not drawn.
 _NEAR_SHARE = 1e-3
+_ROUNDING = 1e-3
+"""Share of a polygon's area by which a triangle of it may look away."""
+
 # Pixel centres this far outside a face (in barycentric units) still count as covered.
 _COVERAGE_SLACK = 1e-4
 
@@ -122,29 +125,44 @@ def _require_plain(path: Path) -> None:
 
 
 def _require_convex(path: Path) -> None:
-    """Refuse an OBJ with faces of four and more corners that fans of triangles do not cover."""
+    """Refuse an OBJ with faces of four and more corners that fans of triangles do not cover.
+
+    Of what it cannot read, the reader of the format says what is wrong.
+    """
     if path.suffix.lower() != ".obj" or not path.is_file():
         return
     points: list[bytes] = []
-    polygons: list[list[int]] = []
-    with path.open("rb") as file:
-        for line in file:
-            if line.startswith(b"v "):
-                points.append(line)
-            elif line.startswith(b"f ") and len(corners := line.split()[1:]) > 3:
+    polygons: dict[int, list[list[int]]] = {}
+    for line in path.read_bytes().replace(b"\\\n", b" ").splitlines():
+        if line.startswith(b"v "):
+            points.append(line)
+        elif line.startswith(b"f ") and len(corners := line.partition(b"#")[0].split()[1:]) > 3:
+            try:
                 rows = [int(corner.partition(b"/")[0]) for corner in corners]
-                # Counted from one, or backwards from the last.
-                polygons.append([row - 1 if row > 0 else len(points) + row for row in rows])
-    concave = 0
-    for rows in polygons:
-        if max(rows) >= len(points) or min(rows) < 0:
-            continue  # The reader of the format says what is wrong.
-        corners = np.array([points[row].split()[1:4] for row in rows], np.float64)
-        spokes = corners[1:] - corners[0]
-        fan = np.cross(spokes[:-1], spokes[1:])
-        concave += bool((fan @ fan.sum(axis=0) < 0).any())
+            except ValueError:
+                return
+            # Counted from one, or backwards from the last.
+            rows = [row - 1 if row > 0 else len(points) + row for row in rows]
+            polygons.setdefault(len(rows), []).append(rows)
+    if not polygons:
+        return
+    try:
+        places = np.array([line.split()[1:4] for line in points], np.float64)
+        concave = sum(_count_folded(places[np.array(rows)]) for rows in polygons.values())
+    except (ValueError, IndexError):
+        return
     if concave:
         raise ValueError(f"{path} has {concave} faces that are not convex; export it as triangles")
+
+
+def _count_folded(polygons: Float[np.ndarray, "N C 3"]) -> int:
+    """Count polygons whose triangles around their first corner do not all look alike."""
+    spokes = polygons[:, 1:] - polygons[:, :1]
+    fan = np.cross(spokes[:, :-1], spokes[:, 1:])
+    whole = fan.sum(axis=1, keepdims=True)
+    # Corners on a straight side make triangles of hardly any area, which may look anywhere.
+    turned = (fan * whole).sum(axis=-1) < -_ROUNDING * (whole**2).sum(axis=-1)
+    return int(turned.any(axis=1).sum())
 
 
 def is_y_up(path: str | Path) -> bool:

@@ -182,8 +182,9 @@ def _cleaned(mesh: StartMesh, path: str) -> StartMesh:
 def _joined(points: Float[np.ndarray, "V 3"]) -> tuple[np.ndarray, Int[np.ndarray, " V"]]:
     """Make one of points at one place; with the row of each in the result.
 
-    Those nearer to each other than `_SAME_PLACE`, and some up to 3.5 times as far. They share a
-    cube of twice that in one at least of eight grids, each shifted by half a cube along some axes.
+    Those nearer to each other than `_SAME_PLACE`, some up to 3.5 times as far, and chains of such.
+    They share a cube of twice that in one at least of eight grids, each shifted by half a cube
+    along some axes.
     """
     low = points.min(axis=0)
     size = float(np.max(points.max(axis=0) - low))
@@ -438,10 +439,12 @@ def _decimated(mesh: StartMesh, target: int, *, most_faces: int, path: str) -> S
     was_closed = mesh.is_closed
     reduced = _outward(_cleaned(StartMesh(vertices, faces), path))
     if len(reduced.faces) > most_faces:
+        cause = "its shape does not allow fewer"
+        if not nondegenerate(reduced.vertices, reduced.faces).all():
+            cause = "faces without height stand in the way"
         raise ValueError(
             f"{path} has {count} faces, which could be decimated to {len(reduced.faces)} only, and "
-            f"geometry.max_faces is {most_faces}: faces without height stand in the way. Remesh "
-            "it, or allow more faces"
+            f"geometry.max_faces is {most_faces}: {cause}. Remesh it, or allow more faces"
         )
     notes = [f"decimated to {len(reduced.faces)} faces, to match the pixels"]
     if was_closed and not reduced.is_closed:

@@ -123,9 +123,13 @@ class Views:
 
     @cached_property
     def mean_colors(self) -> Float[np.ndarray, "V 3"]:
-        """Mean of each view, linear; tells photographs from others of their name."""
-        means = [np.asarray(self.images[v])[..., :3].mean((0, 1)) for v in range(len(self))]
-        return np.round(np.reshape(np.array(means, np.float64), (-1, 3)), 6)
+        """Mean of pixels of each view, linear; tells photographs from others of their name."""
+        step, found = max(1, max(self.height, self.width) // 512), np.zeros((len(self), 3))
+        for first in range(0, len(self), 4):
+            rows = np.arange(first, min(first + 4, len(self)))
+            pixels = np.asarray(self.images[rows])[:, ::step, ::step, :3]
+            found[rows] = pixels.mean((1, 2), dtype=np.float64)
+        return np.round(found, 4)
 
     @property
     def has_opaque_pixel(self) -> bool:
