@@ -89,6 +89,16 @@ def test_a_quality_beside_settings_or_a_budget_is_refused(folder):
             gs.train(folder / "duck", folder / "none", quality="high", **others)
 
 
+def test_a_refused_choice_leaves_the_run_that_it_was_to_replace(tmp_path):
+    few = sphere_dataset(count=6, size=8)
+    old = RunFolder(tmp_path / "run")
+    with old.locked():
+        old.begin(few, make_config(overrides=TINY), replace=False)
+    with pytest.raises(ValueError, match="holds back every 8th of 6"):
+        gs.train(few, old.path, model="auto", begin=gs.Anew(replace=True))
+    assert old.exists
+
+
 def test_a_dataset_is_not_read_again(folder):
     dataset = gs.load_dataset(folder / "duck")
     with pytest.raises(TypeError, match="read already; give downscale to load_dataset"):
