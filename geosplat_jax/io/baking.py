@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from geosplat_jax.io.images import SceneError
+from geosplat_jax.io.meshes import facing
 
 # Faces of the fine mesh, by the distance of their centres, that a point may be nearest to.
 _CANDIDATES = 8
@@ -109,11 +110,6 @@ class FineSurface:
             blended = np.einsum("nk,nkd->nd", weights, self.normals[self.faces[face]])
             normals[chosen] = unit(blended)
         return places, normals
-
-
-def facing(corners: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 3"]:
-    """Return where triangles look to, of twice their area's length."""
-    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def unit(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:

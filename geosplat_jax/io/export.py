@@ -20,7 +20,6 @@ from trimesh.visual.material import PBRMaterial
 from geosplat_jax.core.harmonics import CONSTANT
 from geosplat_jax.io.baking import (
     FineSurface,
-    facing,
     in_tangent_space,
     simplified,
     vertex_tangents,
@@ -29,6 +28,7 @@ from geosplat_jax.io.images import encode_srgb, write_exr, written_aside
 from geosplat_jax.io.memory import Need, memory_refusal
 from geosplat_jax.io.meshes import (
     Y_UP_LINE,
+    facing,
     fill_gutters,
     is_closed,
     nondegenerate,

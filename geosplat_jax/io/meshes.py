@@ -392,14 +392,18 @@ def first_hits(
     return face_rows, drawn
 
 
+def facing(corners: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 3"]:
+    """Return the direction that triangles look in, of twice their area's length."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
 def sides(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "N 3"], camera: Camera
 ) -> Float[np.ndarray, " N"]:
     """Tell which side of faces one view (V = 1) sees: 1 the front, -1 the back or the edge."""
     corners = np.asarray(vertices, np.float64)[faces]
-    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     from_camera = corners[:, 0] - np.asarray(camera.centers[0], np.float64)
-    return np.where((outward * from_camera).sum(axis=-1) < 0, 1.0, -1.0)
+    return np.where((facing(corners) * from_camera).sum(axis=-1) < 0, 1.0, -1.0)
 
 
 def render_mesh_normals(
