@@ -209,12 +209,13 @@ def shift_inwards(splats: Splats, mesh: Mesh, fraction: Float[Array, " N"]) -> S
 
     Splats are wider than the triangles they stand for, so the silhouette swells by part of a
     pixel; a learned fraction in (0, 1) takes that back. Face normal and area carry *no* gradient.
-    The anchors stay on the face, and splats without a face where they are.
+    Anchors stay on their faces. Splats without a face do not move.
 
     Parameters
     ----------
-    splats : N rows. mesh : that their parents are faces of.
-    fraction : (N,) how far, in units of the root of the face's area.
+    splats : N splats.
+    mesh : whose faces ``splats.parents`` number.
+    fraction : (N,) distance in units of the square root of the face's area.
     """
     normal, area = face_normals_and_areas(mesh)
     step = jax.lax.stop_gradient(normal * safe_sqrt(area)[:, None])
@@ -239,7 +240,7 @@ class SplatModel(abc.ABC):
         """
 
     def dress(self, attributes: Attributes, parameters: Any) -> Attributes:
-        """Put what the splats themselves have learned in the place of the fields' attributes."""
+        """Replace attributes of the field by those that the splats have learned themselves."""
         del parameters
         return attributes
 
@@ -284,9 +285,9 @@ class VertexSplats(SplatModel):
 
 @dataclass(frozen=True)
 class DiscSplats(FaceSplats):
-    """Six round discs per face: on its plane, of the ellipses' area, but blind to its shape.
+    """Six round discs per face, in its plane, with the areas of the ellipses of `FaceSplats`.
 
-    For ablations: what remains where splats are aligned along the normal only.
+    For ablations: discs follow the normal of the face but not its shape.
     """
 
     def place(self, surface: Surface, parameters: Any, box: Box) -> Splats:

@@ -35,12 +35,12 @@ class BandedFlexiCubes(GridSurface):
 
     @property
     def reduction(self) -> Literal["mean", "sum"]:
-        """As it was given."""
+        """Reduction of Eq. 14, see `GridSurface.reduction`."""
         return self.entropy_reduction
 
     @property
     def lattice(self) -> Lattice:
-        """Those of the band."""
+        """The band: only its cells and vertices hold values."""
         return self.band
 
     @classmethod

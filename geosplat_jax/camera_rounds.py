@@ -1,8 +1,8 @@
-"""Trainings whose cameras are a little wrong: short ones first, that set the cameras right.
+"""Rounds of camera refinement before a training, for cameras that are slightly wrong.
 
-A round trains at quality ``draft`` without free splats, refines the cameras of every view against
-what came out (`Run.refine_cameras`), and hands them to the next. What a round recovers:
-docs/cameras.md.
+A round trains briefly at quality ``draft`` without free splats, refines the cameras of all views
+against the result (`Run.refine_cameras`), and passes them on to the next round. How much a round
+recovers: docs/cameras.md.
 """
 
 import json
@@ -62,7 +62,7 @@ def _require_same(folder: Path, made_with: Mapping[str, Any]) -> None:
     RunError
     """
     path, text = folder / _RECORD, json.dumps(made_with, indent=1, default=str) + "\n"
-    # A command that failed before its first round, for a wrong scene say, binds nobody.
+    # What a command has recorded that failed before its first round may be overwritten.
     if not path.exists() or not any(folder.glob("round_*")):
         with written_aside(path) as aside:
             aside.write_text(text, encoding="utf-8")
@@ -74,7 +74,7 @@ def _require_same(folder: Path, made_with: Mapping[str, Any]) -> None:
     if not isinstance(before, dict):
         raise RunError(f"{path} is damaged: it is no record; delete {folder} to begin again")
     now = parse_json(text)
-    # Of what an earlier version did not note nothing is known.
+    # An earlier version may have recorded less: only what it recorded is compared.
     changed = sorted(name for name in now if name in before and now[name] != before[name])
     if changed:
         raise RunError(
@@ -97,8 +97,8 @@ def refined_cameras(
 ) -> Path:
     """Train and refine as often as asked; return the file of the last cameras.
 
-    Rounds that are there already, from a command that was interrupted, are not made again, and one
-    that was begun goes on. All of a folder are made alike.
+    After an interruption, finished rounds are reused, and an unfinished one is resumed. All rounds
+    of a folder must have the same settings.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Deferred shading: what splats are made of is blended, and light is transported at every pixel.
+"""Deferred shading: attributes of splats are blended first, then every covered pixel is shaded.
 
 The attributes of the visible splats are rasterised and divided by their coverage (Eq. 21), and the
 rendering equation is evaluated once for every pixel with what remains (Eq. 22). Any

@@ -529,10 +529,10 @@ class FlexiCubes(GridSurface):
 
     @property
     def reduction(self) -> Literal["mean", "sum"]:
-        """As it was given."""
+        """Reduction of Eq. 14, see `GridSurface.reduction`."""
         return self.entropy_reduction
 
     @property
     def lattice(self) -> Lattice:
-        """All cells and vertices."""
+        """The whole grid: all cells and vertices hold values."""
         return WholeGrid(self.grid)

@@ -79,10 +79,10 @@ class Objective:
     srgb: bool = False
     """Compare encoded instead of linear colours."""
     relative_albedo: Share = 0.0
-    """Power of twice the albedo's mean by which its changes are divided (Eq. 15-17, and in the
-    image): 0 leaves them absolute, 1 makes them relative. Absolute changes are smaller on a dark
-    surface in bright light than on a bright one in dim light, which photographs hardly tell apart,
-    and so draw the albedo into the dark; relative ones have let it rise too far."""
+    """Changes of the albedo (Eq. 15-17, and in the image) are divided by twice its mean, raised to
+    this power: 0 leaves them absolute, 1 makes them relative. Photographs hardly tell a dark
+    surface in bright light from a bright one in dim light. Absolute changes are smaller on the dark
+    one, and so make the albedo too dark; relative changes made it too bright in our trials."""
 
 
 class Comparison(NamedTuple):
@@ -106,7 +106,7 @@ class Comparison(NamedTuple):
     is_encoded: bool = False
 
     def encoded(self) -> "Comparison":
-        """Return the images as a screen shows them, in which shade weighs more."""
+        """Return the comparison in sRGB, where differences in dark regions weigh more."""
         if self.is_encoded:
             return self
         images = [linear_to_srgb(image) for image in (self.predicted, self.target)]
@@ -153,15 +153,15 @@ class ViewInputs:
 
 @dataclass(frozen=True)
 class SharedInputs:
-    """What the terms that no view has a part in are made from.
+    """Inputs of the loss terms that do not depend on a view.
 
     Attributes
     ----------
     params : as given to the loss.
-    asset : what was reconstructed.
+    asset : surface, splats and attributes of the step.
     surface, fields, objective : as in the pipeline.
-    key : of what is drawn.
-    transport, lights : how light arrives, and what it prepared for the step.
+    key : random key of all samples of these terms.
+    transport, lights : the light transport, and what it prepared for the step.
     """
 
     params: Params
@@ -307,7 +307,10 @@ def radiometric_disagreement(x: SharedInputs) -> Float[Array, ""]:
 
 
 def mean_metallic(metallic: Float[Array, " N"], mask: Bool[Array, " N"]) -> Float[Array, ""]:
-    """Average over the splats: what the photographs leave open is taken for a dielectric."""
+    """Mean metallic of the splats, () in [0, 1]; 0 without splats.
+
+    As a penalty it makes dielectrics of the splats whose metallic the photographs leave open.
+    """
     total = jnp.sum(jnp.where(mask, metallic, 0.0))
     return safe_divide(total, jnp.sum(mask).astype(total.dtype))
 
@@ -339,8 +342,8 @@ def light_tint(radiance: Float[Array, "H W 3"]) -> Float[Array, ""]:
 def light_cast(radiance: Float[Array, "H W 3"]) -> Float[Array, ""]:
     """Distance of the light's mean colour from grey, relative to its mean brightness.
 
-    A blue sky and a yellow sun may balance each other; what costs is a light that has taken the
-    colour of the object.
+    Penalises a light that has taken on the colour of the object. Parts of the light may be coloured
+    where they balance each other, such as a blue sky and a yellow sun.
     """
     colour = jnp.sum(_solid_angle_shares(radiance)[..., None] * radiance, axis=(0, 1))
     grey = jnp.mean(colour)
@@ -436,7 +439,7 @@ SHARED_TERMS: dict[str, Callable[[SharedInputs], Float[Array, ""]]] = {
     "light_cast": lambda x: light_cast(x.params.light.radiance),
     "light_smoothness": lambda x: light_smoothness(x.params.light.radiance),
 }
-"""Terms that no view has a part in. A surface adds penalties of its own."""
+"""Terms that do not depend on a view, by the name of their weight. A surface adds its penalties."""
 
 TERM_AOVS: dict[str, tuple[str, ...]] = {
     "light": ("diffuse", "specular_radiance"),

@@ -84,7 +84,8 @@ class MaterialSpec:
     """Added to the raw shift; the sigmoid of it is where the shift starts, near 1/2 at zero."""
     position_gradient: bool = False
     """Whether attributes pull on the geometry: the field is differentiated in the positions. Off,
-    the field moves with the surface. On in the paper's and the authors' method."""
+    the gradient takes attributes as fixed to the moving surface. On in the paper's and the authors'
+    method."""
 
     @property
     def surface_outputs(self) -> int:
@@ -132,7 +133,7 @@ class Attributes(eqx.Module):
         without metallic; roughness 1 and metallic 0 for one without a specular lobe.
     shift : (N,) share in (0, 1) of ``sqrt(face area)`` by which a splat sinks below its face,
         ``sigmoid(z(mu))``, starting near 1/2 (see `MaterialSpec.initial_shift_logit`); None for a
-        field without shift. The points carry no gradient from here.
+        field without shift. Not differentiable in the points.
     indirect : (N, c) raw numbers of learned indirect light (see `transport.indirect`), or None.
     """
 

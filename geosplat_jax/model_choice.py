@@ -210,9 +210,10 @@ def _tried(trials: "_Trials", part: Part, kept: Collection[str], wanted: Collect
 def _seen_on_surface(
     trials: "_Trials", part: Part, kept: Collection[str], wanted: Collection[str]
 ) -> Rung:
-    """Judge a part that photographs cannot tell by what the surface blocks from itself.
+    """Keep a part, such as shadows, if the surface blocks enough light from itself.
 
-    Where it is to be kept it is trained, so that one whose training fails is left out.
+    For parts that photographs under one light cannot judge (`Part.is_photographed`). A part that
+    would be kept is trained once, and left out if that training fails.
     """
     before = float(np.mean(trials.decibels(kept, 0)))
     share = trials.blocked_share()
@@ -325,8 +326,9 @@ class _Trials:
             raise RunError(f"{path} is damaged: {error}; begin anew with --force") from None
         if was != mark:
             raise RunError(
-                f"{path} was begun with other settings or other views, or these were read "
-                "otherwise, or by another version; take the same, or begin anew with --force"
+                f"{path} was begun with other settings or other views, or these were read with "
+                "other options, or by another version; use the same again, or begin anew with "
+                "--force"
             )
         self._measured, self._stage_1_seconds = measured, seconds
 
@@ -341,7 +343,7 @@ class _Trials:
         return {"psnr": decibels, "seconds": seconds}
 
     def close(self) -> None:
-        """Leave of the trainings what they have measured."""
+        """Delete the folders of the trainings; what they measured stays in the state file."""
         for path in self._folder.iterdir():
             if path.is_dir():
                 shutil.rmtree(path)

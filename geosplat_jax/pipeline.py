@@ -36,7 +36,7 @@ _DECIBEL = 10.0 / 2.302585092994046
 _SHARED_STREAM = 2**31
 _LIGHT_STREAM = 2**31 + 1
 _RESIDUAL_STREAM = 2**31 + 2
-"""Numbers of the random streams that no view has a part in; those of the views count from 0."""
+"""Numbers that are folded into a key for streams of their own; those of the views count from 0."""
 
 
 class ViewReport(eqx.Module):
@@ -171,11 +171,17 @@ class Pipeline(RenderPipeline):
     ) -> Float[Array, "1 H W 3"] | None:
         """Render a view with samples of its own, as a constant from which Eq. 13 is evaluated.
 
-        The gradient of a distance is residual times derivative. From the same samples the two
-        depend on each other: the mean of the product is not the product of the means, and descent
-        lowers whatever makes noise, the sun above all (docs/transport.md). From different samples
-        it is, which for a squared distance is the gradient at the mean image, and for L1 and SSIM
-        comes close. Eq. 18 keeps the first image.
+        The gradient of a distance is the residual times the derivative of the image. Computed from
+        the same samples, these two factors are correlated: the mean of their product is not the
+        product of their means, and descent lowers whatever makes noise, bright suns above all
+        (docs/transport.md). With independent samples the mean of the product is the product of the
+        means. For a squared distance that is the gradient at the mean image; for L1 and SSIM it is
+        close to it. Eq. 18 is evaluated on the first image.
+
+        Returns
+        -------
+        (1, H, W, 3) tone-mapped colours, premultiplied, without gradient; None where the transport
+        draws no second set of samples.
         """
         transport = self.transport.for_residual()
         if transport is None or lights is None:
@@ -224,7 +230,13 @@ class Pipeline(RenderPipeline):
     def shared_loss(
         self, params: Params, asset: Asset, lights: Illumination, batch: Batch
     ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-        """Evaluate the weighted terms that no view has a part in; also return them by name."""
+        """Sum the weighted terms that do not depend on a view; also return them by name.
+
+        Returns
+        -------
+        total : () weighted sum.
+        terms : by name, unweighted.
+        """
         key = jax.random.fold_in(batch.key, _SHARED_STREAM)
         transport = self.domain.adapted(self.transport)
         parts = (self.surface, self.fields, self.objective)
@@ -239,7 +251,7 @@ class Pipeline(RenderPipeline):
         shared: dict[str, Float[Array, ""]],
         carry: object,
     ) -> LossReport:
-        """Say what a step was like, from the mean over its views and the terms of none."""
+        """Assemble the report of a step from the mean over its views and the shared terms."""
         terms = {**views.terms, **shared}
         return LossReport(
             terms={name: terms[name] for name in self.weights},

@@ -1,12 +1,12 @@
 """Free splats (appendix E): the Gaussians of a trained mesh become parameters of their own.
 
-Position, shape, normal, opacity, albedo and indirect light are then learned for every splat, while
-roughness and metallic stay a field, at the splats' moving places; what is too dark for a metal is
-none. The mesh is frozen, and with it what blocks light; a splat keeps the face that it was sampled
-from.
+Position, shape, normal, opacity, albedo and indirect light are then learned for every splat.
+Roughness and metallic are still read from the field, at the point of its face that is closest to
+the splat; a splat whose albedo is too dark for a metal gets no metallic. The mesh is frozen, and
+with it what blocks light. A splat stays with the face that it was sampled from.
 
-Differentiable in all parameters. The faces that splats belong to have no gradient, and whether an
-albedo is too dark for a metal gives it none.
+Differentiable in all parameters, except that the test of whether an albedo is too dark for a metal
+gives the albedo no gradient. The face that a splat belongs to is a constant.
 """
 
 from collections.abc import Callable
@@ -67,7 +67,7 @@ class FreeSplatParameters(eqx.Module):
 
 
 INDIRECT_GROUP = "splat_indirect"
-"""Learning rate of what only splats have whose light transport learns indirect light."""
+"""Learning rate of indirect light, which splats hold only where their transport learns it."""
 
 RATE_GROUPS = (
     "splat_means",
@@ -108,11 +108,20 @@ def _kept_within(values: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def possible_metal(albedo: Float[Array, "N 3"], darkest: float) -> Float[Array, " N"]:
-    """Return the share of its metallic that a surface of an albedo may have, (N,) in [0, 1].
+    """Return the factor on metallic by albedo: 0 where the albedo is too dark for a metal.
 
     It rises smoothly from 0 to 1 while the strongest channel of the albedo rises from half of
-    ``darkest`` to ``darkest``; with 0 it is 1. Not differentiable: brightening what is no metal
-    must not make it one.
+    ``darkest`` to ``darkest``; for ``darkest = 0`` it is 1 everywhere. Not differentiable, so that
+    the optimiser does not brighten a dielectric in order to make it a metal.
+
+    Parameters
+    ----------
+    albedo : (N, 3) linear.
+    darkest : albedo from which on a surface may be wholly metallic, see `FreeSplatSettings`.
+
+    Returns
+    -------
+    (N,) in [0, 1].
     """
     if darkest == 0:
         return jnp.ones_like(albedo[:, 0])
@@ -136,8 +145,8 @@ class FreeSplats(SplatModel):
         """Return the splats as they were learned.
 
         Attributes are looked up, and rays start, at the point of a splat's face that is closest to
-        its mean: beyond an edge of the face they could start behind another one. A splat looks
-        away where its face does.
+        its mean, since a point beyond an edge of the face could lie behind another face. Back-face
+        culling uses the normal of the face, not that of the splat.
         """
         mesh = surface.mesh
         count = parameters.means.shape[0]
@@ -209,7 +218,7 @@ class FreeSplatSettings(SplatSettings, kind="free"):
         Raises
         ------
         ValueError
-            If they were not six for every face.
+            If the number of splats is not a multiple of six.
         """
         splats, attributes = previous()
         if splats.means.shape[0] % SPLATS_PER_FACE:

@@ -5,7 +5,9 @@ light and the domain in which it is evaluated. `RenderPipeline.reconstruct` runs
 neither light nor view, `illuminate` what does not depend on the view, `render_lit` the rest;
 `render` is all three.
 
-Visibility, depth order, topology and samples carry no gradient; everything else does.
+Visibility, depth order, topology and light samples carry no gradient. By default attributes do not
+pull on positions either (`MaterialSpec.position_gradient`), and the inward shift takes the normals
+and areas of faces as constants; docs/gradients.md lists all such paths.
 """
 
 import abc
@@ -89,7 +91,10 @@ class RasterSettings:
     """Near plane, in half the longest side of the box around the object."""
 
     def eligible(self, splats: Splats, camera: Camera) -> Bool[Array, " N"]:
-        """Tell which splats a camera with a single view may show, wherever they are."""
+        """Tell which splats are real and, with ``cull_backfaces``, face a single-view camera, (N,).
+
+        The image borders and the near plane are not considered.
+        """
         if not self.cull_backfaces:
             return splats.mask
         towards_camera = camera.centers - splats.means
@@ -255,9 +260,10 @@ class RenderPipeline(eqx.Module):
     compositor: Callable[..., Array] = eqx.field(static=True, default=composite_tiles)
 
     def forward_mode(self) -> "RenderPipeline":
-        """Return the pipeline whose images have derivatives in forward mode, and in no other.
+        """Return the pipeline whose images can be differentiated in forward mode only.
 
-        For derivatives along few directions, such as those of a camera, of an asset that is there.
+        For derivatives in few numbers, such as the pose of a camera, with the asset held fixed:
+        `reconstruct` has no forward mode (see `hashgrid.encode`).
         """
         return replace(self, compositor=composite_tiles_forward)
 

@@ -507,7 +507,7 @@ def train(
     scene : folder, or a dataset from `load_dataset`.
     output : folder of the run.
     config : settings, see `make_config`; by default those of ``quality``.
-    quality : one of `QUALITIES`, by default ``standard``; neither beside a config nor a budget.
+    quality : one of `QUALITIES`, by default ``standard``; not together with a config or a budget.
     mesh : file of a mesh to start from instead of a visual hull, see `fit.presets.with_mesh`. A run
         that is resumed knows its own.
     begin : ``Resume()`` goes on with the run that the folder holds, ``Anew(replace=True)`` replaces
@@ -517,10 +517,9 @@ def train(
         it (`plan_training`), as its memory asks for; in any case steps are made fewer or more on
         the way, so that it ends in time. A run that is resumed keeps its own, and has what is left
         of it; one that began without has none.
-    model : ``auto``, or how to choose: train the smallest model that explains the scene, see
-        `model_choice.choose_model`. Of the parts of ``config``, those stay as they are whose
-        settings differ from its preset, or are named in ``by_hand``. A run that is resumed keeps
-        its model.
+    model : ``auto``, or a `ModelChoice`: train the smallest model that explains the scene, see
+        `model_choice.choose_model`. Parts of ``config`` whose settings differ from its preset, or
+        that `ModelChoice.by_hand` names, stay as they are. A run that is resumed keeps its model.
     devices : number of those of this process that share the views of every step
         (docs/devices.md); all processes that `jax.distributed.initialize` connected take part, with
         so many each. Or what `fit.devices.choose_devices` made of it before.
@@ -532,8 +531,8 @@ def train(
     Raises
     ------
     TypeError
-        On any other keyword, on options of reading for a dataset that has been read, and on a
-        quality beside what makes it meaningless.
+        On any other keyword, on options of reading together with a dataset, which has been read
+        already, and on a quality together with a config or a budget.
     SceneError, RunError, TrainingError, Interrupted
         See `load_dataset` and `fit.train.fit`.
     ValueError
@@ -543,7 +542,10 @@ def train(
     """
     _require_consistent(scene, reading, chooses=model is not None, budget=budget, begin=begin)
     if quality is not None and not (config is None and budget is None):
-        raise TypeError("a config and a budget say what is spent; leave quality out")
+        raise TypeError(
+            "quality cannot be given with a config or a budget, which decide how much is spent; "
+            "leave quality out"
+        )
     started, folder = time.perf_counter() if began is None else began, RunFolder(output)
     if isinstance(devices, int):
         devices = choose_devices(devices)

@@ -34,9 +34,10 @@ def retain_freed_memory() -> bool:
 
 
 def release_freed_memory() -> None:
-    """Give back, once, what is free now: what a compiler took beside a training, say.
+    """Return memory that is free now to the operating system, once; nothing without glibc.
 
-    Its small pieces lie in between, so that large blocks do not fit there again.
+    Useful after a program was compiled beside a training: the compiler's small allocations divide
+    the freed memory into holes that are too small for the large blocks of a training.
     """
     libc = _glibc()
     if libc is not None:

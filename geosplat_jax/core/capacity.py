@@ -98,7 +98,10 @@ def fits(needed: Usage, capacities: Mapping[str, int | Int[Array, ""]]) -> Bool[
 
 
 def bucket(count: int) -> int:
-    """Smallest rung of the ladder that holds ``count``: some tenth above it, a multiple of 128."""
+    """Smallest size of the ladder that holds ``count``.
+
+    Sizes begin at 128; each is a tenth above the one before, rounded up to a multiple of 128.
+    """
     size = _LADDER_STEP
     while size < count:
         steps = -(-int(size * _LADDER_RATIO) // _LADDER_STEP)

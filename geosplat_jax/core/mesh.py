@@ -16,8 +16,9 @@ def _doubled_area_vectors(mesh: Mesh) -> Float[Array, "3 Cf"]:
     a, b, c = jnp.moveaxis(corners, -1, 1)
     (ux, uy, uz), (vx, vy, vz) = b - a, c - a
     cross = jnp.stack([uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx])
-    # Where b = c the compiler's fused multiply-add leaves the rounding of one product, and with it
-    # a random normal; where another two coincide an edge is zero, and so is every product.
+    # Where b = c both edges are equal and their cross product should vanish, but XLA's fused
+    # multiply-add leaves the rounding error of one product, which would become a random normal.
+    # Where a equals b or c, one edge is zero, and the cross product is exactly zero.
     is_real = mesh.face_mask & jnp.any(b != c, axis=0)
     return jnp.where(is_real[None, :], cross, 0.0)
 
@@ -36,15 +37,22 @@ def face_normals_and_areas(
 def closest_on_faces(
     mesh: Mesh, faces: Int[Array, " N"], points: Float[Array, "N 3"], *, margin: float
 ) -> Float[Array, "N 3"]:
-    """Find the point of a face that is closest to each of N points.
+    """Find, for each of N points, the closest point of its face.
 
-    Differentiable in the points and in the mesh; the choice of an edge is a constant.
+    Differentiable in the points and in the mesh's vertices. Whether the interior or an edge of the
+    face is closest is piecewise constant and carries no gradient.
 
     Parameters
     ----------
-    mesh, faces, points : row by row; faces beyond the last are the last one.
-    margin : the face is taken to be smaller by this share, about its centre, so that what is found
-        lies off its edges.
+    mesh : whose faces are meant.
+    faces : (N,) face of each point; a number past the last face means the last one.
+    points : (N, 3) world.
+    margin : share by which the faces are first shrunk about their centres, so that the results lie
+        off their edges.
+
+    Returns
+    -------
+    (N, 3) world.
     """
     # (3, 3, N): components, corners, rows; the arithmetic runs along contiguous rows.
     corners = mesh.vertices.at[mesh.faces.at[faces].get(mode="clip").T].get(mode="clip")

@@ -13,7 +13,8 @@ LENGTH_EPSILON = 1e-20
 """Vectors shorter than this have no direction; also the smallest divisor of `safe_divide`."""
 
 _LARGEST_SCALE = 0.75
-"""Lengths are computed relative to at most this power of the largest number of the dtype."""
+"""Exponent of the dtype's largest number that bounds the scale of `safe_norm`: XLA may multiply by
+the reciprocal of the scale, which is zero for the largest numbers."""
 
 COSINE_EPSILON = 1e-4
 """Smallest cosine used as a divisor in shading."""
@@ -74,9 +75,10 @@ def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def safe_power(x: Float[Array, "..."], exponent: float) -> Float[Array, "..."]:
-    """Power of the positive part; where ``x <= 0`` its gradient is zero, and it is zero.
+    """Power of the positive part of ``x``; zero, with zero gradient, where ``x <= 0``.
 
-    With an exponent of 0 it is one everywhere, with one of 1 the positive part, both exactly.
+    Exact for two exponents: 0 gives one everywhere, also where ``x <= 0``, and 1 gives the positive
+    part itself.
     """
     if exponent == 0.0:
         return jnp.ones_like(x)
@@ -115,7 +117,8 @@ def safe_normalize(
 ) -> Float[Array, "..."]:
     """Scale to unit length along ``axis``; zero with zero gradient below length ``smallest``.
 
-    Zero also above a quarter of the largest number of the dtype, whose inverse is none.
+    Also zero for lengths above a quarter of the dtype's largest number: their reciprocal is below
+    the smallest normal number, and XLA takes it for zero.
     """
     length = safe_norm(x, axis=axis, keepdims=True)
     return safe_divide(x, length, smallest=smallest)

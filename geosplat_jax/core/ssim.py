@@ -86,29 +86,32 @@ def ssim(
 ) -> Float[Array, ""]:
     """Return the mean structural similarity of two images; 1 where they are equal.
 
-    Gaussian window of 11 pixels and sigma 1.5, population statistics, mean over channels and over
-    the windows that lie *wholly inside* the image. The last equals
+    Wang et al. 2004, Eq. 13: Gaussian window of 11 pixels and sigma 1.5, population statistics,
+    mean over channels and over the windows that lie *wholly inside* the image. Equal to
     ``skimage.metrics.structural_similarity(gaussian_weights=True, sigma=1.5,
-    use_sample_covariance=False)``, which crops the border it has reflected; code that pads with
-    zeros instead differs by the border's share. Images smaller than the window are continued by
-    their last row and column. Symmetric, and differentiable in both images by reverse mode only;
-    use `jax.vmap` for several views.
+    use_sample_covariance=False)``, which averages over the same windows. Code that pads with zeros
+    and averages over all pixels differs along the border. An image smaller than the window is
+    extended by repeating its last row and column.
+
+    Symmetric in the images, and differentiable in both by reverse mode only; ``valid`` has no
+    gradient. Use `jax.vmap` for several views.
 
     Parameters
     ----------
     image_a, image_b : (H, W, C) in the same encoding.
     data_range : largest minus smallest value an image may take.
-    valid : pixels that count, 1 or 0; the mean is over the windows all of whose pixels count, and 1
-        where there is none.
+    valid : (H, W) 1 for pixels that count, 0 for others. Only windows all of whose pixels count
+        enter the mean, which is 1 where there is no such window.
 
     Returns
     -------
-    () in [-1, 1]. In float32, flat parts with values above some tens of ``data_range`` compare
-    rounding errors; values up to 1e9 are finite.
+    () in [-1, 1]. Finite for values up to 1e9. In float32, a flat region brighter than some tens of
+    ``data_range`` has no signal left but rounding errors.
     """
     a, b = (_pad_to_window(jnp.asarray(image)) for image in (image_a, image_b))
     height, width, channels = a.shape
-    # (H, W C): neighbours along a row lie C apart, and no channel axis of 3 starves the vectors.
+    # (H, W * C): neighbouring pixels lie C entries apart. A last axis of length 3 would not fill
+    # SIMD vectors.
     a, b = a.reshape(height, width * channels), b.reshape(height, width * channels)
     maps = jnp.stack([a, b, a * a + b * b, a * b])
     mean_a, mean_b, mean_squares, mean_product = _blur(maps, channels)

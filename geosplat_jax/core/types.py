@@ -2,8 +2,8 @@
 
 Conventions. World axes are those of the capture (Blender scenes are z-up). Cameras use OpenCV
 axes: x right, y down, z forward; pixel centres lie at integers + 0.5. Colours are linear.
-Rows past a count are padding: opacity 0, scale 1, unit quaternion, zero normal, faces on row 0,
-so that every function is finite on them.
+Rows past a count are padding: opacity 0, scale 1, identity quaternion, zero normal, faces whose
+corners are all vertex 0. Every function is finite on them.
 """
 
 from collections.abc import Callable
@@ -22,9 +22,14 @@ RATE_GROUP = "rate group"
 
 
 def learned(group: str, **options: Any) -> Any:
-    """Declare a field of parameters, and which learning rate moves what is below it.
+    """Declare a field of learned parameters, and the learning rate of all leaves below it.
 
-    A field without a group of its own belongs to that of the nearest field around it.
+    A nested field without a group of its own takes the group of the nearest enclosing field.
+
+    Parameters
+    ----------
+    group : name of the learning rate.
+    options : passed on to `equinox.field`.
     """
     return eqx.field(metadata={RATE_GROUP: group}, **options)
 
@@ -116,7 +121,7 @@ class Batch(eqx.Module):
     ----------
     camera : `Camera` of V views.
     image : (V, H, W, 4) linear RGB with straight alpha; alpha is the mask of the object. Colours
-        end at one, as those of a render do.
+        are clipped at one, as tone-mapped renders are.
     key : typed PRNG key.
     views : (V,) int32 numbers of the views within their split; None where they have none.
     valid : (V, H, W) pixels that count, 0 or 1; None where all do.
@@ -193,7 +198,7 @@ class Grid(eqx.Module):
     origin : (3,) world position of the lowest corner.
     cell_size : () edge length of a cell, world units.
     shape : static (nx, ny, nz), the number of *cells* along each axis.
-    reach : static; a vertex moves by at most this share of a cell along every axis, at most 1/2.
+    reach : static, at most 1/2; largest move of a vertex along each axis, in cells.
     """
 
     origin: Float[Array, " 3"]
@@ -294,9 +299,8 @@ class Splats(eqx.Module):
     ----------
     means : (N, 3) world; quats : (N, 4) unit (w, x, y, z); scales : (N, 3) standard deviations,
         world units; opacities : (N,) in [0, 1]; normals : (N, 3) unit shading normals.
-    outward : (N, 3) unit geometric normals, which say what looks away from a camera.
-    anchors : (N, 3) where the splats' attributes are looked up and their rays start, on the
-        surface.
+    outward : (N, 3) unit geometric normals, by which back-facing splats are culled.
+    anchors : (N, 3) points on the surface, world, where attributes are looked up and rays start.
     parents : (N,) int32 face that each splat belongs to; -1 for none.
     count : () int32.
     """

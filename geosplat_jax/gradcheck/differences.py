@@ -34,7 +34,7 @@ STEPS = tuple(2.0**-9 * 4.0**-k for k in range(8))
 _SAMPLED_ENTRIES = 48
 _RANDOM_DIRECTIONS = 3
 _LARGEST_ENTRY = 3.0
-"""Of a direction along a gradient: about that of a random one."""
+"""Largest entry of a direction along a gradient, about that of a random direction."""
 _CHUNK = 64
 """Points that one call of a compiled function evaluates; the last call is padded."""
 
@@ -291,8 +291,9 @@ def _directional_errors(
     """Errors (R, 2) of R combinations: along their gradient, and the worst of random directions."""
     count = span.stop - span.start
     norms = np.sqrt(np.sum(np.square(gradients), axis=1))
-    # As long as a random one, whose typical derivative is the norm; shorter where few entries have
-    # all of the gradient, which would else move by hundreds of steps and past the kinks around.
+    # Directions along a gradient are as long as random ones, so that a typical derivative is the
+    # norm. Where a few entries hold all of the gradient they are shorter: those entries would
+    # otherwise move by hundreds of steps, past kinks of the function.
     unit = gradients / np.where(norms > 0, norms, 1.0)[:, None]
     largest = np.max(np.abs(unit), axis=1)
     lengths = np.minimum(np.sqrt(count), _LARGEST_ENTRY / np.where(norms > 0, largest, 1.0))

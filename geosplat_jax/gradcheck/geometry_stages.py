@@ -47,7 +47,7 @@ def _blob(rng: np.random.Generator, grid: Grid) -> np.ndarray:
 
 
 def isosurface_problems(rng: np.random.Generator) -> list[Problem]:
-    """Positions, normals and regularisers in all that shapes the surface."""
+    """Differentiate vertices, normals and regularisers in SDF, deformations and weights."""
     grid = _grid()
     cells, vertices = grid.cube_count, grid.vertex_count
     inputs = {

@@ -55,7 +55,7 @@ def _splats(rng: np.random.Generator, count: int) -> dict[str, Any]:
 
 
 def projection_problems(rng: np.random.Generator) -> list[Problem]:
-    """Footprints in Gaussians and camera; also far outside the image, where slopes are clamped."""
+    """Differentiate footprints in Gaussians and camera, inside and far outside the image."""
 
     def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
         splats = project(

@@ -40,7 +40,7 @@ def unit_vectors(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def hash_grid_problems(rng: np.random.Generator) -> list[Problem]:
-    """Features in the tables and in the points."""
+    """Differentiate encoded features in the tables and in the points."""
 
     def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
         features = encode(inputs["table"], inputs["points"], spec=_GRID, position_gradient=True)

@@ -127,11 +127,13 @@ def _loss_problem(name: str, config: Config, rng: np.random.Generator) -> Proble
 
 
 def loss_problems(rng: np.random.Generator) -> list[Problem]:
-    """Build the loss as trained, in all but the geometry, and with every detached path open.
+    """Build two problems: the loss as trained, and the loss with every detached path open.
 
-    As trained, attributes do not pull on positions and the inward shift takes normal and area as
-    given, so that the gradient in the geometry, and that of the smoothness term in the shift, is
-    by design not the whole derivative. With ``material.position_gradient`` and no shift it is.
+    As trained, attributes do not pull on positions, and the inward shift takes the normals and
+    areas of faces as constants: by design the gradient in the geometry is not the whole derivative.
+    That problem leaves out the geometry and the smoothness terms. With
+    ``material.position_gradient`` and without the shift the gradient is the whole derivative, and
+    all of it is compared.
     """
     off = tuple(
         f"stages.split_sum.weights.smoothness_{name}=0" for name in ("albedo", "roughness_metallic")
@@ -213,7 +215,7 @@ def refinement_problems(rng: np.random.Generator) -> list[Problem]:
 
 
 def smoothness_problems(rng: np.random.Generator) -> list[Problem]:
-    """Eq. 15-17 in tables, MLPs and points."""
+    """Differentiate the smoothness term (Eq. 15-17) in tables, MLPs and points."""
     config = make_config(overrides=_SETTINGS)
     spec = replace(config.material, position_gradient=True)
     params = jax.tree.map(

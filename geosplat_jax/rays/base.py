@@ -27,7 +27,7 @@ class RayIndex(eqx.Module):
 
     @property
     def place_size(self) -> Float[Array, ""]:
-        """How far a point may move and still have its place, world units; see `places`."""
+        """Size of a place in world units; infinite where places are faces. See `places`."""
         return jnp.asarray(jnp.inf)
 
     def places(self, positions: Float[Array, "N 3"], faces: Int[Array, " N"]) -> Int[Array, " N"]:

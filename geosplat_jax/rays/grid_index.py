@@ -34,7 +34,8 @@ _LARGEST_LIST = 1 << (WORD_BITS - _COUNT_BITS)
 """The other bits of a word say where a cell's list begins."""
 
 _REACH = 4
-"""A patch touches at most so many cells along an axis: corners stray by half a cell from theirs."""
+"""Most cells that a patch touches along an axis: its corners belong to two neighbouring cells, and
+may lie up to half a cell outside of them."""
 
 
 @runtime_checkable
@@ -113,7 +114,7 @@ class GridIndex(CellIndex):
             tuple(rows[:, 3 * i + axis] - lanes.origin[axis] for axis in range(3)) for i in range(5)
         ]
         if not any_hit:
-            # Each triangle would gather the corners for itself.
+            # Without the barrier XLA gathers the corners again for each of the four triangles.
             points = jax.lax.optimization_barrier(points)
         moment = cross(lanes.direction, points[4])
         spokes = [dot(points[i], moment) for i in range(4)]  # d.(c x a)
@@ -166,9 +167,14 @@ def _fan(patches: Float[Array, "Q 16"]) -> list[tuple[Array, Array, Array]]:
 def _touched_cells(
     patches: Float[Array, "Q 16"], is_real: Bool[Array, " Q"], grid: Grid
 ) -> tuple[Bool[Array, "64 Q"], Int[Array, "3 Q"]]:
-    """Which of the cells from a patch's lowest corner on it may touch, z fastest, and the lowest.
+    """Find which of 4 x 4 x 4 cells every patch may touch.
 
     A triangle touches a cell only if their bounding boxes meet and its plane passes the cell.
+
+    Returns
+    -------
+    touches : (64, Q) for the cells from the lowest one on, z fastest; False on padding.
+    lowest : (3, Q) the cell that holds the lowest corner of a patch's bounding box.
     """
     lowest = jnp.min(patches[:, :15].reshape(-1, 5, 3), axis=1).T
     first = jnp.floor(lowest - SLACK).astype(jnp.int32)

@@ -64,8 +64,8 @@ _EMPTY = -(1 << WORD_BITS)
 """Sign of the word of a cell without a list."""
 
 _CONE_MARGIN = 0.02
-"""Added to the sine of a cone for the rounding of its axis to 8 bits a component, by which the axis
-may also become a little longer than 127. Cones that this makes a half space pass for none."""
+"""Added to the sine of a cone, because its axis is rounded to 8 bits per component and may thereby
+become a little longer than 127. Where the sum reaches 1 the cell is stored without a cone."""
 
 _PARALLEL = 1e-12
 """Directions with a smaller component do not move along that axis."""
@@ -97,10 +97,11 @@ class CellIndex(RayIndex):
     Attributes
     ----------
     grid : of the cells.
-    words : (cells,) number of entries of a cell (its low ``count_bits``) and the first of them;
-        negative of a cell without any, with the sizes of its `_empty_cubes`.
-    cones : (cells,) cone around the normals in a cell: three signed bytes of axis, one byte of
-        sine; see `cones`.
+    words : (cells,) the low ``count_bits`` hold the number of entries of a cell, the other bits the
+        row of its first entry. The word of a cell without entries is negative, and holds the sizes
+        of its `_empty_cubes`.
+    cones : (cells,) cone around the normals in a cell: in the highest byte its sine, in the others
+        the x, y and z of its axis, offset by 128; see `cones_of`.
     """
 
     grid: Grid
@@ -283,9 +284,11 @@ def _faces_away(cone: UInt[Array, " n"], direction: tuple[Array, ...]) -> Bool[A
 def _enter(
     lanes: Lanes, cell: tuple[Array, ...], index: CellIndex, two_sided: bool
 ) -> Int[Array, " n"]:
-    """Read the word of a cell for a ray: how far to go on, if it lists nothing that can be hit.
+    """Read the word of the cell that each ray enters.
 
-    A cell whose patches all face away is as good as empty.
+    Where the cell lists nothing that the ray can hit, the count in the word is zero, and in place
+    of the first entry stands the side of the cube of cells that the ray may skip. To a one-sided
+    ray a cell whose normals all face away counts as empty, with a side of one.
     """
     nx, ny, _ = index.grid.shape
     number = cell[0] + nx * (cell[1] + ny * cell[2])
@@ -349,9 +352,12 @@ def _inverse(direction: Float[Array, " n"]) -> Float[Array, " n"]:
 def _entered(
     origins: Float[Array, "n 3"], directions: Float[Array, "n 3"], shape: tuple[int, int, int]
 ) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """Tell where rays enter the box of the cells, 0 where they start in it, and which of them do.
+    """Intersect rays with the box of the cells.
 
-    The distance is 0 for those that never do.
+    Returns
+    -------
+    distance : (n,) cells to where a ray enters the box; 0 where it starts inside, or misses it.
+    meets : (n,) whether a ray meets the box.
     """
     near = jnp.zeros_like(origins[:, 0])
     far = jnp.full_like(near, jnp.inf)
@@ -437,7 +443,22 @@ def trace(
     two_sided: bool,
     any_hit: bool,
 ) -> tuple[Float[Array, " N"], Int[Array, " N"]]:
-    """Trace the rays of the mask; return the distance and the face of the hit of every ray."""
+    """Trace rays through the cells; not differentiable.
+
+    Parameters
+    ----------
+    index : the surface.
+    origins, directions : (N, 3) world; directions are unit.
+    source : (N,) face that a ray starts on and never hits; -1 for none.
+    mask : (N,) rays to trace; the others hit nothing.
+    two_sided : static; whether back faces count.
+    any_hit : static; stop at any hit instead of finding the nearest.
+
+    Returns
+    -------
+    distance : (N,) world units; infinite where nothing is hit, and everywhere with ``any_hit``.
+    face : (N,) of the hit, as `CellIndex.test` numbers it (0 with ``any_hit``); -1 for none.
+    """
     nobody, grid = origins.shape[0], index.grid
     if nobody == 0:
         return jnp.zeros((0,), origins.dtype), jnp.zeros((0,), jnp.int32)

@@ -63,9 +63,9 @@ def _moments(d_log_alpha: Float[Array, "K P"], tile_size: int) -> Float[Array, "
 def _geometry_vjp(
     rows: Float[Array, "K columns"], moments: Float[Array, "K 6"]
 ) -> list[Float[Array, " K"]]:
-    """Cotangents of the geometry columns from the moments of that of log alpha.
+    """Cotangents of the geometry columns, from the moments of the cotangent of log alpha.
 
-    The moments are about the centre of the tile; here they move to the mean of the Gaussian.
+    `_moments` are taken about the centre of the tile; here they are shifted to the Gaussian's mean.
     """
     m, mu, mv, muu, muv, mvv = (moments[:, i] for i in range(6))
     x, y, xx, xy, yy = (rows[:, i] for i in range(5))
@@ -184,14 +184,19 @@ def composite_tiles_forward(
 ) -> Float[Array, "tiles channels P"]:
     """Composite every tile: features and, as the last channel, coverage.
 
-    As it stands it can be differentiated in forward mode only (`jax.jvp`, `jax.jacfwd`), since a
-    loop of unknown length has no reverse; `composite_tiles` equals it, in reverse mode only.
+    Differentiable in ``table``, in forward mode only (`jax.jvp`, `jax.jacfwd`): JAX cannot reverse
+    its loop of unknown length. `composite_tiles` has the same values, and reverse mode only.
 
     Parameters
     ----------
-    tile_size, grid : static; pixels of a tile side, rows and columns of tiles.
+    tile_size : static; side of a tile in pixels.
+    grid : static; rows and columns of tiles.
     table : (M, 6 + C) mean x, y; conic xx, xy, yy; log opacity; C features.
     chunk_ranks, chunk_tiles : see `TileLists`; not differentiable.
+
+    Returns
+    -------
+    (rows * columns, C + 1, tile_size**2) premultiplied features, then coverage in [0, 1].
     """
     return _composite_forward(tile_size, grid, table, chunk_ranks, chunk_tiles)[0]
 

@@ -31,7 +31,8 @@ class Footprints(eqx.Module):
     covariances2d : (N, 3) ``[xx, xy, yy]`` after the low-pass filter, square pixels.
     conics : (N, 3) ``[xx, xy, yy]`` of the inverse of ``covariances2d``.
     depths : (N,) camera z of the mean, world units.
-    compensation : (N,) factor in [0, 1] on the opacity for what the low-pass filter spreads.
+    compensation : (N,) factor in [0, 1] on the opacity: the low-pass filter widens a footprint, and
+        the factor keeps its integral.
     is_in_front : (N,) whether ``depths > near``; the other rows are finite but meaningless.
     """
 
@@ -108,7 +109,7 @@ def project(
     """
     fx, fy, cx, cy = (intrinsics[i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     rotation = world_to_camera[:3, :3]
-    # GPUs multiply matrices with 10 bits unless told otherwise, which would be a pixel.
+    # By default GPUs multiply matrices with a mantissa of 10 bits (TF32): an error of a pixel.
     turned = jnp.matmul(means, rotation.T, precision="highest")
     camera_means = turned + world_to_camera[None, :3, 3]
     depths = camera_means[:, 2]

@@ -61,10 +61,16 @@ class RadianceSplats(eqx.Module):
 def colors_seen_from(
     splats: RadianceSplats, center: Float[Array, " 3"], *, degree: Int[Array, ""] | int
 ) -> Float[Array, "N 3"]:
-    """Colours in sRGB of splats that are seen from a point, not below zero.
+    """Colours, (N, 3) sRGB, of splats that are seen from a point; clipped below at zero.
 
-    Harmonics of a higher degree than ``degree``, which may be traced, are left out. A splat at the
-    point itself has the colour of its constant harmonic and those that do not vanish at zero.
+    Differentiable in the splats and the point. A splat at the point itself has no direction; its
+    harmonics, which are polynomials of the direction, are evaluated at zero.
+
+    Parameters
+    ----------
+    splats : N splats.
+    center : (3,) the point, world.
+    degree : highest degree of the harmonics that are used; may be traced.
     """
     towards = safe_normalize(splats.means - center[None, :])
     basis = harmonics(towards, degree=HIGHEST_DEGREE)

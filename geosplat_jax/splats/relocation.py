@@ -1,8 +1,8 @@
-"""A fixed number of splats that go where they are needed (Kheradmand et al. 2024).
+"""Relocation of a fixed number of splats by Markov chain Monte Carlo (Kheradmand et al. 2024).
 
-Training is taken for sampling: positions receive noise, and splats that have become transparent are
-moved onto others, where several then stand for what was one. Their opacity and scale are chosen so
-that the image stays (Eq. 9 of the paper). Everything has static shapes.
+Training is treated as sampling: positions receive noise, and splats that have become transparent
+are moved onto opaque ones, so that several splats represent what one did before. Their opacities
+and scales are chosen so that the image stays the same (Eq. 9 of that paper). All shapes are static.
 """
 
 from dataclasses import replace
@@ -17,10 +17,10 @@ from geosplat_jax.core.rotation import quaternion_to_matrix
 from geosplat_jax.splats.radiance import RadianceSplats
 
 DEAD_OPACITY = 0.005
-"""A splat that is not more opaque is dead."""
+"""A splat of at most this opacity is dead: it is never a target of a move."""
 
 _HIGHEST_OPACITY = 1.0 - 1e-6
-"""Shared opacities are kept below it, where the logit ends."""
+"""Largest shared opacity; at 1 the logit would be infinite."""
 _GATE_SHARPNESS = 100.0
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _FARTHEST = 4.5  # standard deviations times sqrt(2); the rest of the integral is below 1e-9
@@ -77,19 +77,25 @@ def relocate(
     is_live: Bool[Array, " N"],
     key: Key[Array, ""],
 ) -> tuple[RadianceSplats, Bool[Array, " N"]]:
-    """Put splats onto others, which are drawn by their opacity, so that the image stays.
+    """Move free splats onto others without changing the image (Eq. 9).
+
+    Every free splat becomes a copy of a target, which is drawn with a probability proportional to
+    its opacity; a target and its copies then share its opacity and extent. Nothing changes where no
+    splat can be a target.
 
     Parameters
     ----------
-    splats : of any number.
-    is_free : rows to be put elsewhere; what they are is forgotten.
-    is_live : rows that may be drawn; those that are free, or dead, are not.
+    splats : N splats.
+    is_free : (N,) rows to move; their parameters are discarded.
+    is_live : (N,) rows that may be targets; free ones, and those of at most `DEAD_OPACITY`, never
+        are.
+    key : random key of the draws.
 
     Returns
     -------
-    splats : with the same rows.
-    is_changed : (N,) rows that were put elsewhere or drawn, whose moments are of no use any more.
-        Nothing changes where no row can be drawn.
+    splats : N splats, in the same rows.
+    is_changed : (N,) rows that were moved or were targets; an optimiser's moments of these rows are
+        no longer valid.
     """
     opacities = splats.opacities
     may_be_drawn = is_live & ~is_free & (opacities > DEAD_OPACITY)

@@ -39,7 +39,7 @@ _CANCELLATION = 2e-6
 _LARGEST_COUNT = 2**31 - 1
 
 _MOST_DIGIT_BITS = 16
-"""Of a digit by which a list is sorted; with more, the table of its counts outgrows the list."""
+"""Largest width of a radix-sort digit; with more bits, its table of counts outgrows the list."""
 
 
 class TileLists(eqx.Module):
@@ -94,10 +94,11 @@ def _bit_count(size: int) -> int:
 def _digit_order(digits: UInt[Array, " n"], digit_bits: int) -> Int[Array, " n"]:
     """Stable order of unsigned digits of at most 16 bits.
 
-    XLA on CPU sorts one uint32 operand three to six times faster than a key and a payload, and
-    several rows on several cores. So blocks of entries are sorted as packed integers, the digit
-    above the place in the block. Where there is more than one block, every entry then moves behind
-    the smaller digits of all blocks and behind its own digit of earlier blocks.
+    One pass of a radix sort. XLA on CPU sorts one uint32 operand three to six times faster than a
+    key with a payload, and several rows on several cores. So the list is cut into blocks, and each
+    entry is packed into one integer, the digit in the high bits and the place in the block in the
+    low bits. Sorted blocks are merged by counting: an entry comes behind all entries with a smaller
+    digit, and behind those of its own digit in earlier blocks.
     """
     n, place_bits = digits.shape[0], 32 - digit_bits
     blocks = max(-(-n >> place_bits), 1)

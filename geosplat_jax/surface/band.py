@@ -24,15 +24,15 @@ from geosplat_jax.surface.flexicubes_tables import CORNERS
 from geosplat_jax.surface.lattice import Lattice
 
 REACH = 2.0
-"""Cells. A vertex that enters the band lies at most so far from the surface, so that the surface
-can be moved in few steps."""
+"""Largest magnitude, in cells, of the value of a vertex that enters the band: the surface can then
+reach the vertex in few steps."""
 
 _HELD = 1e-3
-"""Cells that a vertex at the border is read from the surface at least, on its side."""
+"""Least magnitude, in cells, that the value of a border vertex is read with, on its fixed side."""
 
 _HEADROOM = 1.2
 _MANY = 2
-"""Rows are kept where there are at most so many times as many as a new band would be given."""
+"""The number of rows is kept up to this many times what a new band would be given."""
 
 _CORNER_DISTANCE = np.sqrt(((CORNERS[:, None] - CORNERS[None]) ** 2).sum(-1))
 
@@ -145,16 +145,20 @@ class Band(Lattice):
     ) -> "tuple[Band, Move, Float[np.ndarray, ' H']] | None":
         """Make the band around where the surface is now (host side).
 
+        Returns None where the band would stay as it is, or where the surface has vanished.
+
         Parameters
         ----------
-        sdf : signed values of this band. layers : of cells on each side of the surface.
+        sdf : (G,) signed values of this band, cells.
+        layers : layers of cells on each side of the surface.
 
         Returns
         -------
-        band, and where its rows come from, and the values of its vertices, among which those that
-        were not in this band are as far from the surface as those beside them and the way from
-        there, at most `REACH`. None where the band would stay as it is, and where there is no
-        surface to follow.
+        band : the new band, in as many rows as this one where that suits.
+        move : the rows of this band that the new rows come from.
+        values : (H,) float signed values of the new band's vertices, cells. Vertices of this band
+            keep theirs. A new vertex takes the sign of its neighbours, and as magnitude the
+            smallest sum of a neighbour's magnitude and the distance to it, at most `REACH`.
         """
         values = np.asarray(self.values(sdf))
         at_surface = self.surface_cells(values)

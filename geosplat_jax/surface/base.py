@@ -27,13 +27,13 @@ class Surface(eqx.Module):
 
 
 class Following(NamedTuple):
-    """What takes the place of a surface model and its shape; see `SurfaceModel.following`.
+    """The successor of a surface model and of its shape; see `SurfaceModel.following`.
 
     Attributes
     ----------
-    model, shape : the new ones.
-    carried : brings other numbers that belong to those of the shape, such as what an optimiser
-        keeps, to where they belong now; 0 for those that are new.
+    model, shape : the model that replaces the old one, and its parameters.
+    carried : function that brings a pytree laid out like the old shape, such as an optimiser's
+        moments, into the layout of the new shape; rows that are new become 0.
     """
 
     model: "SurfaceModel"
@@ -76,16 +76,17 @@ class SurfaceModel(eqx.Module):
 
     @abc.abstractmethod
     def nearby_points(self, shape: Any) -> tuple[Float[Array, "N 3"], Float[Array, " N"]]:
-        """Return points beside the surface and their weights, which are zero where it is empty."""
+        """Return points (N, 3), world, and weights (N,): zero for points not near the surface."""
 
     @abc.abstractmethod
     def first_capacities(self, shape: Any) -> Capacities:
         """Guess the sizes of the surface's own buffers (host side)."""
 
     def following(self, shape: Any) -> Following | None:
-        """Go on with a model that holds what the surface of a shape needs now (host side).
+        """Return the model that must replace this one now that the surface has moved (host side).
 
-        None where this model does, which most always do. A function of model and shape alone.
+        None, the default, where this model can still represent the surface. Deterministic: depends
+        on model and shape alone. `banded.BandedFlexiCubes` is a model that is replaced.
         """
         del shape
         return None

@@ -42,18 +42,18 @@ _FIRST_PASS = (0.05, 0.6)
 _LATER_PASSES = ((0.05, 0.6), (0.04, 0.7))
 """Difference in sRGB that is agreement, and the share of views that must agree."""
 
-_WORST = 0.12  # larger differences count as this one
-_CONFLICT = 0.05  # mean difference on a lid, at least
-_EXPLAINED = 0.45  # of it may remain behind
-_PLAINER = 0.75  # times what a mirror leaves may remain behind
-_COMPARED = 0.03  # of the colours must be shown by both halves, to tell a mirror
-_DEPTHS = np.arange(0.0, 5.01, 0.5)  # cells inward that are compared
-_BETTER = 0.7  # times the difference at the surface, at most, where it lies deeper
-_SETTLED = 0.01  # mean difference of a surface that need not move
+_WORST = 0.12  # larger differences in sRGB are clipped to this
+_CONFLICT = 0.05  # least mean difference on a lid that may hide a hollow
+_EXPLAINED = 0.45  # largest part of the lid's difference that may remain behind it
+_PLAINER = 0.75  # largest part of a mirror's difference that may remain behind the lid
+_COMPARED = 0.03  # least part of the colours whose directions both halves show, to judge a mirror
+_DEPTHS = np.arange(0.0, 5.01, 0.5)  # cells below the surface at which the views are compared
+_BETTER = 0.7  # a deeper surface must lower the difference to less than this part of it
+_SETTLED = 0.01  # mean difference up to which a surface is not moved
 _EDGE = 0.5  # cells from a carved vertex to the new surface
-_MOUTH = 4  # cells before the mouth of a hollow that are taken for a part of it
-_SMOOTHING = 0.8  # cells; takes the steps of the carved vertices away
-_THIN = 0.1  # cells; distance of a vertex to the surface, at least
+_MOUTH = 4  # cells in front of the mouth of a hollow that are opened with it
+_SMOOTHING = 0.8  # cells; Gaussian that smooths the staircase of carved vertices
+_THIN = 0.1  # least distance of a vertex from the surface, in cells
 
 
 class Candidate(NamedTuple):
@@ -247,7 +247,7 @@ def _of_vertices(
     counts: Bool[np.ndarray, " N"],
     shape: tuple[int, ...],
 ) -> Field:
-    """Mean of what counts of the values of every vertex, 0 where nothing does."""
+    """Average the values of every vertex over the rows that count; 0 for a vertex without any."""
     row = np.ravel_multi_index(tuple(vertices[counts].T), shape)
     size = int(np.prod(shape))
     total = np.bincount(row, weights=values[counts], minlength=size)
@@ -262,7 +262,7 @@ def _without(field: Field, carved: Where) -> Field:
 
 
 class _Judged(NamedTuple):
-    """What one half of the views says about points of whose colour the other half is asked.
+    """How well the colours of points in one half of the views predict those in the other half.
 
     Attributes
     ----------
@@ -291,7 +291,7 @@ def _judged(field: Field, fit: Photographed, judge: Photographed) -> _Judged:
 
 
 def _coarser(field: Field, factor: int) -> Float[np.ndarray, "z y x"]:
-    """Take every so many-th vertex, in cells as large; the last ones may lie on the border."""
+    """Keep every ``factor``-th vertex along each axis, and the last one; values in coarse cells."""
     if factor == 1:
         return field
     rows = [
@@ -309,7 +309,8 @@ def _opened(
 ) -> Field:
     """Take the hollows from the hull: the larger of both distances, in fine cells."""
     solid = (hull < 0.0) & ~hollows
-    # With what is before their mouths, so that no film stays there; walls are not passed.
+    # Empty the cells in front of the mouths as well: a film of the old surface would stay there.
+    # The mask keeps this from passing through walls.
     empty = np.asarray(binary_dilation(hollows, iterations=_MOUTH, mask=~solid), bool)
     away, into = (np.asarray(distance_transform_edt(side)) for side in (~empty, empty))
     signed = into - away

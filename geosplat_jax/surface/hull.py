@@ -33,10 +33,8 @@ _POINTS_OF_A_SLAB = 1 << 20
 _MASK_PIXELS = 400  # larger masks are reduced first; the hull is never sampled that finely
 _COVERED = 0.5
 _FULL, _EMPTY = 1.0 - 1e-3, 1e-3  # coverage beyond these is a whole pixel
-_HAZE = (
-    0.02  # five steps of 8 bits: what compression and mattes leave where nothing or all is covered
-)
-_MUCH_HAZE = 0.05  # pixels of it for every pixel of an outline
+_HAZE = 0.02  # five steps of 8 bits: deviations from 0 and 1 that compression and mattes leave
+_MUCH_HAZE = 0.05  # hazy pixels per pixel of the outline, above which a mask is hazy
 _BAND_CELLS = 1.5  # the looked-up distance is trusted this far from the surface
 _SEARCH_POINTS = 48  # along each side, while the bounds close in on the hull
 _SEARCH_STEPS = 8
@@ -165,8 +163,8 @@ def sight_bounds(
 ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
     """Find a cube around what all cameras look at, where there are no masks.
 
-    Its centre is the point nearest to the cameras' axes. It is as large as half of the views, at
-    least, show whole at that distance, and holds no camera.
+    Its centre is the point nearest to the cameras' axes. Its size is such that at least half of the
+    views show all of it, and that no camera lies inside.
 
     Returns
     -------
@@ -326,12 +324,21 @@ class _Silhouettes:
 
 
 def without_haze(coverage: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
-    """Take pixels that are hardly covered, or nearly wholly, for what they are meant to be.
+    """Set nearly empty pixels of a hazy mask to 0, and nearly full ones to 1.
 
-    In clean masks such pixels lie at outlines and tell where these are; among their like there are
-    only 0 and 1. So nothing is changed unless there are others, a twentieth as many as the outline
-    has pixels. JPEG leaves so much around every outline; below a quality of 90 it also leaves more
-    than a haze.
+    Nearly means within `_HAZE`. In a clean mask, pixels strictly between 0 and 1 occur only along
+    the outline, where they locate the edge. A mask is hazy at 0, or at 1, if it has such pixels
+    away from the outline, more than a twentieth as many as the outline has; otherwise these pixels
+    are left as they are. JPEG leaves such a haze around every outline, and below a quality of 90
+    also larger deviations, which stay.
+
+    Parameters
+    ----------
+    coverage : (H, W) in [0, 1].
+
+    Returns
+    -------
+    (H, W) coverage.
     """
     found = coverage
     outline = ((coverage > _HAZE) & (coverage < 1.0 - _HAZE)).sum()
@@ -432,7 +439,7 @@ def _worst_distance(
     *,
     tolerated: int,
 ):
-    """Find the largest distance over the views but for ``tolerated`` larger ones, and seen counts.
+    """Find the ``tolerated + 1``-th largest distance over the views, and how many see a point.
 
     The ``tolerated + 1`` largest values are kept sorted while passing once over the views.
     """

@@ -116,9 +116,13 @@ class Sight(NamedTuple):
         return np.where(count[:, None] > 0, chosen, 0.0)
 
     def difference(self, color: Float[np.ndarray, "... N 3"]) -> Float[np.ndarray, "V N"]:
-        """How far a colour lies from all in the window, largest over the channels; else 0.
+        """Distance of a colour from the range of colours in the window, (V, N) in sRGB.
 
-        ``color`` : (N, 3) for all views, or (V, N, 3).
+        The largest over the channels; 0 within the range, and where a view does not see the point.
+
+        Parameters
+        ----------
+        color : (N, 3) for all views, or (V, N, 3).
         """
         beyond = np.maximum(self.low - color, color - self.high)
         return np.where(self.seen, np.maximum(beyond, 0.0).max(-1), 0.0)
@@ -195,9 +199,11 @@ class Photographed:
         return self.sample(surface.position, self.visible(surface, solid))
 
     def visible(self, surface: Crossings, solid: Where) -> Bool[np.ndarray, "V N"]:
-        """Tell which views see the points of a surface past the solid, a cell of doubt around it.
+        """Tell which views see the points of a surface, (V, N).
 
-        They must look at its front, and at where it may begin to be clear of its own doubt.
+        A view sees a point that it faces (with a cosine above `_FACING`) if nothing blocks the line
+        of sight. What blocks is the solid, enlarged by one cell because its surface is uncertain;
+        the line of sight begins `_CLEAR` cells above the point, to be clear of its own enlargement.
         """
         steps = int(np.ceil(np.linalg.norm(solid.shape) / _STRIDE))
         doubtful = jnp.asarray(ndimage.binary_dilation(solid))
@@ -214,7 +220,7 @@ class Photographed:
         return Sight(color, low, high, shown & visible)
 
     def reflected(self, surface: Crossings) -> Int[np.ndarray, "V N"]:
-        """Return a number for the direction from which a mirror would show something to a view."""
+        """Return the bin, (V, N), of the direction that a mirror at each point shows to a view."""
         towards = self.centers[:, None] - surface.position[None]
         towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
         normal = surface.normal[None]

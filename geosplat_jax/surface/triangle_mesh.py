@@ -1,18 +1,17 @@
 """A surface of given triangles: faces stay, and the vertices are the parameters (appendix H).
 
-A mesh that is not closed is a *sheet*: it is seen and lit from both sides. In training every
-triangle of it then stands twice in the mesh, as its front with vertices of its own and, in the
-other half of the rows, as its back; the sides share their parameters. What follows (splats that
-look away are left out, a splat is lit from where its face looks) holds for either side as for any
-closed surface. The mesh that leaves the program has every triangle once.
+A mesh that is not closed is a *sheet*: it is seen and lit from both sides. In training the mesh
+then holds every triangle twice: the fronts in the first half of the rows, and the backs, with
+vertices of their own, in the second half. Both sides share their parameters. Back-face culling and
+shading then treat each side as they treat a closed surface. The final mesh has every triangle once.
 
 Penalties. Lengths are in mean edges of the start, so that a weight means the same on a coarse mesh
 and on a fine one:
 
 - ``laplacian``: squared distance of a vertex from the mean of its neighbours (the umbrella, every
   neighbour alike); at an open border only the neighbours along it count, so that holes stay;
-- ``normal_consistency``: one minus the cosine between the normals of faces that share an edge, but
-  for faces that start with hardly any height;
+- ``normal_consistency``: one minus the cosine between the normals of faces that share an edge;
+  faces that start as slivers (see `_LEAST_HEIGHT`) are left out;
 - ``edge_length``: squared change of an edge's length since the start;
 - ``offset``: squared distance of a vertex from its start.
 
@@ -57,14 +56,16 @@ class VertexOffsets(eqx.Module):
 
 
 class Connectivity(NamedTuple):
-    """What is next to what in a mesh; rows of vertices or faces, host side.
+    """Adjacency of a mesh, as rows of vertices or faces (host side).
 
     Attributes
     ----------
-    edges : (E, 2) vertices of every edge, once.
-    neighbours : (N, 2) pairs of a vertex and a neighbour that its umbrella takes, sorted.
-    wings : (P, 2) faces that share an edge which is theirs alone.
-    turned : (P,) whether the two are wound against each other.
+    edges : (E, 2) the two vertices of every edge, once.
+    neighbours : (N, 2) pairs of a vertex and a neighbour in its umbrella, sorted. Umbrellas of
+        vertices at an open border hold their neighbours along the border only.
+    wings : (P, 2) pairs of faces that share an edge of no third face.
+    turned : (P,) whether the two faces run along their edge in the same direction, which faces of
+        one orientation do not.
     """
 
     edges: Int[np.ndarray, "E 2"]
@@ -100,10 +101,10 @@ def connectivity(faces: Int[np.ndarray, "F 3"]) -> Connectivity:
 def _without_slivers(
     near: Connectivity, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Connectivity:
-    """Leave out the wings of faces that start with hardly any height.
+    """Leave out the wings of faces that start as slivers.
 
-    Rounding decides where such faces look, and the gradient of that grows with one over the height:
-    a first step of it stays in Adam's second moment for the rest of a stage.
+    Rounding decides the normal of a sliver, and the gradient of that normal grows as one over the
+    height: that of a single step would stay in Adam's second moment for the rest of a stage.
     """
     sides = vertices[np.roll(faces, -1, axis=1)] - vertices[faces]
     lengths = np.linalg.norm(sides, axis=-1)

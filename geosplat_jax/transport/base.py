@@ -1,8 +1,8 @@
 """How light reaches the points of a surface and leaves them towards a viewer: one interface.
 
-`Transport.prepare` does what no view has a part in, and `Transport.shade` shades points towards
-their viewers; the points are splats, or whatever a `ShadingDomain` of the renderer makes. What a
-method needs beside its settings it builds once, in `TransportSettings.build`.
+`Transport.prepare` computes what all views share, and `Transport.shade` shades points towards their
+viewers. The points are splats or pixels, as the renderer's `ShadingDomain` decides. Tables that a
+transport needs beside its settings are built once, in `TransportSettings.build`.
 """
 
 import abc
@@ -27,9 +27,10 @@ class Shaded(eqx.Module):
     rgb : (N, 3) ``diffuse + specular``, linear.
     diffuse, specular : (N, 3) the two parts, materials included.
     diffuse_light : (N, 3) irradiance / pi: what a white Lambertian point would send out.
-    specular_light : (N, 3) radiance filtered by the lobe. Of the split sum it is what a lossless
-        white reflector of this roughness would send out; sampled transports keep what
-        microfacets hide from each other, with a Fresnel factor of one (.31 of it at roughness 1).
+    specular_light : (N, 3) radiance filtered by the specular lobe. With the split sum it is what a
+        lossless white reflector of this roughness would send out. With sampled transports it is the
+        lobe with a Fresnel factor of one, after the loss by masking and shadowing between
+        microfacets: at roughness 1, seen head-on, .31 of the light is left.
     """
 
     rgb: Float[Array, "N 3"]
@@ -102,20 +103,21 @@ class Transport(eqx.Module):
         index: RayIndex | None,
         carry: Any = None,
     ) -> tuple[Illumination, Any]:
-        """Do what no view has a part in.
+        """Compute what all views share, once per step.
 
         Parameters
         ----------
-        key : of all samples; None for a transport without.
-        points, attributes : all N of the surface, of which a mask will be shaded.
+        key : random key of all samples; None for a transport that draws none.
+        points, attributes : all N points of the surface; ``points.mask`` says which will be shaded.
         light : the environment.
-        index : the surface, for rays; None where nothing blocks them.
-        carry : what the transport kept from the step before; None for most, and at first.
+        index : the surface as rays see it; None where nothing blocks light.
+        carry : state that the step before returned; None for a transport without state, and to
+            begin without any.
 
         Returns
         -------
         illumination : for `shade`.
-        carry : for the next step.
+        carry : state for the next step.
         """
 
     @abc.abstractmethod
@@ -161,51 +163,63 @@ class Transport(eqx.Module):
         *,
         count: int,
     ) -> Float[Array, ""]:
-        """Compare what points have learned to send out with what they do, at random; () mean.
+        """Compare the radiance that points have learned to send out with the radiance they do send.
 
-        Zero for a transport that learns no such thing.
+        Evaluated at random points in random directions. Zero for a transport whose points learn no
+        outgoing radiance.
 
         Parameters
         ----------
-        key : of the points, the directions and their samples.
-        points, attributes, illumination : all N of the surface, as for `prepare`.
+        key : random key of the points, the directions and the light samples.
+        points, attributes, illumination : all N points of the surface, as for `prepare`.
         index : as for `prepare`.
-        count : static; points, each with a direction.
+        count : static; number of points, each with one direction.
+
+        Returns
+        -------
+        () mean squared difference of linear radiance over points and channels.
         """
         del key, points, attributes, illumination, index, count
         return jnp.zeros(())
 
     def for_residual(self) -> "Transport | None":
-        """Return the transport of an image with samples of its own, whose residual a loss takes.
+        """Return the transport of the second image, from which the loss takes its residual.
 
-        None where the residual comes from the image that is differentiated.
+        The second image has samples of its own, see `Pipeline.residual_image`. None where the
+        residual comes from the image that is differentiated.
         """
         return None
 
     def for_each_view(self) -> "Transport":
-        """Return the transport that prepares nothing for single points; `shade` draws its own.
+        """Return the transport whose `shade` draws all samples itself.
 
-        For domains whose points are another set in every view.
+        For domains whose points differ from view to view, such as pixels: `prepare` cannot draw
+        samples for these.
         """
         return self
 
     def for_images(self, sample_count: int) -> "Transport":
-        """Return the transport of one pass of an image to look at, without training's shortcuts.
+        """Return the transport for final images, without the shortcuts of training.
 
-        ``sample_count`` : samples of each kind per point.
+        An image may be the mean of several passes with different samples.
+
+        Parameters
+        ----------
+        sample_count : samples of each kind per point in one pass.
         """
         del sample_count
         return self
 
 
 class Unlit(Transport):
-    """No light at all, in the place of another transport where none is needed.
+    """Placeholder for a transport in programs that compute no light.
 
-    Programs that only differ in the light are then one program.
+    Programs that would differ in the transport alone then share one compilation.
 
     Attributes
     ----------
-    traces : whether the other one traces rays.
+    traces : static; whether the transport that it stands for traces rays, so that assets get a ray
+        index.
     """
 
     traces: bool = eqx.field(static=True)
@@ -240,7 +254,7 @@ class TransportSettings(Variant, abc.ABC):
 
     @property
     def reads_faces(self) -> bool:
-        """Whether blocked directions bring what the points of the face send that is hit."""
+        """Whether a blocked ray brings the light that the points of the face it hits send out."""
         return False
 
     @property
@@ -272,7 +286,7 @@ class TransportSettings(Variant, abc.ABC):
 
     @property
     def numbers_per_splat(self) -> int:
-        """Numbers that a step holds at the same time for every splat at least, of its samples."""
+        """Least count of numbers per splat that a step keeps in memory for its samples."""
         return 0
 
     @abc.abstractmethod

@@ -134,10 +134,16 @@ class Lobe(eqx.Module):
 
 
 def specular_lobe(normals: Components, wi: Components, wo: Components, alpha: Array) -> Lobe:
-    """Evaluate the specular lobe on vectors given by components, which may broadcast.
+    """Evaluate the specular lobe of pairs of directions.
 
-    Components in arrays of their own vectorise; rows of three do not. Unit vectors; ``alpha`` from
-    `ggx_alpha`. Differentiable in everything except that test of signs.
+    Vectors are given as separate arrays of x, y and z, which may broadcast; unlike rows of three
+    these vectorise. Differentiable in all arguments; whether a direction lies above the surface is
+    piecewise constant.
+
+    Parameters
+    ----------
+    normals, wi, wo : unit vectors, world.
+    alpha : width of the GGX distribution, from `ggx_alpha`.
     """
     cosine_i, cosine_o = _along(normals, wi), _along(normals, wo)
     is_above = (cosine_i > 0) & (cosine_o > 0)
@@ -350,7 +356,7 @@ def sample(
     wo: Float[Array, "N 3"],
     uniforms: Float[Array, "N 3"],
 ) -> Float[Array, "N 3"]:
-    """Draw a direction towards the light, visible normals for the coat and a cosine for the base.
+    """Draw ``wi`` after the reflectance: visible normals for the specular lobe, else a cosine.
 
     Parameters
     ----------

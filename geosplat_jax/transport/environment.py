@@ -239,7 +239,8 @@ def rotate_light(
 
     Parameters
     ----------
-    light, rotation : what is rotated, and how; proper.
+    light : (H, W, 3) map.
+    rotation : (3, 3) proper rotation (determinant 1).
     subsamples : directions along each side of a texel whose mean it becomes. One is enough for
         turns about the vertical axis. Elsewhere a sun of half a degree keeps its flux within 5 %
         with one, 30 degrees above the horizon, and within .1 % with four; with one it may be lost

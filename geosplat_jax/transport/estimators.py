@@ -11,8 +11,8 @@ sums up the diffuse light, and `reflect` adds what a viewer sees.
 
 Gradient semantics. The samples, their densities and what they hit are constants of a step: the
 backward pass evaluates the derivative of ``f_r L_i cos`` at the very samples of the forward pass.
-For fixed densities that is an unbiased estimate of the derivative of the integral, but for what
-moves a shadow's edge: visibility has no gradient.
+For fixed densities that is an unbiased estimate of the derivative of the integral, without the part
+that comes from moving the edges of shadows: visibility has no gradient.
 
 Unbiased wherever the light is bounded. The backward pass computes chunks of points again.
 """
@@ -45,7 +45,8 @@ class Gathered(eqx.Module):
     diffuse_light : (N, 3) irradiance / pi.
     directions, radiance, density : (N, L, 3), (N, L, 3) and (N, L) the light's samples, what they
         bring to the specular lobe, and their density; 0 where the mask is false.
-    is_chosen : static; whether the light's samples were chosen by what the unflipped normals see.
+    is_chosen : static; whether reservoirs chose the light's samples. They chose by the normals as
+        given, so that `reflect` leaves these samples out where it flips a normal.
     """
 
     diffuse_light: Float[Array, "N 3"]
@@ -169,7 +170,8 @@ def reflect(
     light, sampler : the environment and its tables.
     index, indirect : see `draw_samples` and `gather`.
     counts, finds_nearest : static, as for `draw_samples`.
-    open_only : static; whether the light's samples leave blocked directions to the lobe's.
+    open_only : static; whether samples of the light stand for open directions only, so that blocked
+        ones are left to samples of the specular lobe.
 
     Returns
     -------

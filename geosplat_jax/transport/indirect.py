@@ -14,7 +14,8 @@ Each model is a class:
 
 An `IndirectSource` becomes one of them once it is known where rays end.
 
-Learned values are logits; ``sigmoid(x - 3)`` gives them the range of a radiance that starts small.
+Learned values x become a radiance that starts small: ``sigmoid(x - 3)``, which is at most one, or
+for `RadiometricIndirect` ``softplus(x - 3)``, which has no upper bound.
 """
 
 import abc
@@ -67,9 +68,9 @@ class Indirect(IndirectSource):
     Attributes
     ----------
     outputs : learned numbers per point.
-    belongs_to_points : whether a row of the values is a point.
-    reads_faces : whether it is a face, the one that a ray hits.
-    values : what it knows, or None.
+    belongs_to_points : whether row i of ``values`` belongs to point i.
+    reads_faces : whether row i of ``values`` belongs to face i, and is read where a ray hits it.
+    values : numbers that the radiance is computed from; None for `NoIndirect`.
     """
 
     outputs: ClassVar[int] = 0
@@ -265,9 +266,9 @@ def outgoing(
 ) -> Float[Array, "F 3"]:
     """Radiance that every face sends out, for `TracedIndirect`.
 
-    The mean over a face's points of their irradiance / pi times what they reflect at normal
-    incidence, in all lobes that they have: seen by way of another surface, a glossy point passes
-    for a matt one. Faces without points are black. Differentiable in the first two arguments.
+    Glossy points are treated as diffuse ones: a point sends out its irradiance / pi times
+    ``albedo (1 - metallic)``, plus ``F0`` where there is a specular lobe, and a face sends the mean
+    over its points. Faces without points are black. Differentiable in the first two arguments.
 
     Parameters
     ----------

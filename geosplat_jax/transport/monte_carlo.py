@@ -52,7 +52,7 @@ class MonteCarloSettings(SampledSettings, TransportSettings, kind="monte_carlo")
 
     @property
     def is_radiometric(self) -> bool:
-        """Where indirect light is."""
+        """Whether indirect light is radiometric."""
         return self.indirect == "radiometric"
 
     @property
@@ -62,7 +62,7 @@ class MonteCarloSettings(SampledSettings, TransportSettings, kind="monte_carlo")
 
     @property
     def reads_faces(self) -> bool:
-        """Where it is traced, or learned by what it comes from."""
+        """Whether indirect light is looked up at the face that is hit: traced or radiometric."""
         return INDIRECT_MODELS[self.indirect].reads_faces
 
     @property
@@ -103,12 +103,12 @@ class MonteCarlo(SampledTransport):
 
     @property
     def uses_rays(self) -> bool:
-        """Unless nothing blocks them."""
+        """Whether shadows are traced, see `MonteCarloSettings.occlusion`."""
         return self.settings.occlusion
 
     @property
     def needs_every_point(self) -> bool:
-        """Where the faces that are hit send indirect light."""
+        """Whether points that no view sees send indirect light to others."""
         return self._model.reads_faces and self.settings.occlusion
 
     @property
@@ -228,10 +228,12 @@ class MonteCarlo(SampledTransport):
         *,
         count: int,
     ) -> Float[Array, ""]:
-        """Mean squared difference of learned and sampled radiance, where the first is learned.
+        """Mean squared difference between learned and sampled radiance; 0 where none is learned.
 
-        Points are drawn evenly, directions by the cosine. Of squares, the noise of samples leaves
-        the gradient of what is learned unbiased; see ``radiometric_gradient``.
+        Points are drawn uniformly, directions with a density proportional to the cosine. Because
+        the difference is squared, the noise of the samples raises the value but leaves the gradient
+        in the learned radiance unbiased. The sampled radiance is differentiated only where
+        ``radiometric_gradient`` is "both".
         """
         if not self.settings.is_radiometric:
             return jnp.zeros(())

@@ -13,12 +13,12 @@ A later vertex sees the mean material and normal of the points that belong to it
 interreflection between splats that belong to no face.
 
 Gradient semantics. Samples, densities, hits and visibility are constants of a step, as in
-`monte_carlo`. At the first vertex light, reflectance and normals are differentiated. What later
-vertices take part in depends on `PathSettings.later_gradient`: nothing, the light that they
-reflect, or that and their materials and normals as well.
+`monte_carlo`. At the first vertex light, reflectance and normals are differentiated. What is
+differentiated at later vertices is `PathSettings.later_gradient`: nothing, the light that they
+reflect, or that light and their materials and normals.
 
-Unbiased for faces of one material, wherever the light is bounded. Rays that go on are brought
-together, so that those which leave cost nothing, and no list can be too short.
+Unbiased where every face has one material and the light is bounded. Only rays that hit the surface
+are followed further; their list has room for all rays, so that it cannot overflow.
 """
 
 from dataclasses import replace
@@ -261,7 +261,10 @@ class PathTracer(IndirectSource):
             Without distances, that is if rays only tell whether they are blocked.
         """
         if distances is None:
-            raise ValueError("paths go on where rays end: trace the nearest hits")
+            raise ValueError(
+                "paths need the distances of the nearest hits, got none; draw the samples with "
+                "finds_nearest=True"
+            )
         count, samples = hits.shape
         total = count * samples
         if total == 0:

@@ -47,7 +47,7 @@ _DIMMEST = 1e-3
 samples must still be possible, since other surfaces may shine there."""
 
 _LANES = 8
-"""Reservoirs kept for a place: its points take turns."""
+"""Reservoirs that the store keeps per place; a point's row modulo this number picks its own."""
 
 _NEIGHBORHOOD = 12
 """Neighbours are at most so many rows away when points are in order of their places."""
@@ -248,7 +248,7 @@ def _offered(
     reach: Float[Array, ""],
     spec: ReservoirSettings,
 ) -> tuple[Reservoirs, SurfacePoints]:
-    """Take what was kept elsewhere where that is near and alike; nothing elsewhere."""
+    """Accept reservoirs of other points that are near and have a similar normal; empty the rest."""
     offset = origin.positions - points.positions
     is_near = jnp.sum(jnp.square(offset), axis=-1) <= jnp.square(reach)
     alike = jnp.sum(origin.normals * points.normals, axis=-1) >= spec.smallest_cosine

@@ -33,8 +33,8 @@ class SampledIllumination(Illumination):
     Attributes
     ----------
     light, sampler : environment and its tables.
-    traced : indirect light by face, where there is such a thing.
-    gathered : what arrives at every point, where views share it.
+    traced : indirect light that faces send out; None where it is not looked up by face.
+    gathered : light that arrives at every point; None where views do not share samples.
     """
 
     light: EnvLight

@@ -68,8 +68,9 @@ class Samples(eqx.Module):
     light_density : (N, L) density of the light's samples, per steradian.
     distances : (N, S) to the faces that are hit, world units, and infinite elsewhere; None where
         rays only tell whether they are blocked.
-    light_factors : (N, L) density of the light's samples times what stands for one over it, where
-        they were chosen from others; None for 1.
+    light_factors : (N, L) for samples of the light that were chosen from candidates (see `Chosen`):
+        the density of `sample_light` times the weight of the choice; None for plain samples, whose
+        factor is 1.
     """
 
     directions: Float[Array, "N S 3"]
@@ -98,7 +99,18 @@ class Chosen(eqx.Module):
 def low_discrepancy(
     offsets: Float[Array, "N 2"], samples: int, dtype: jnp.dtype
 ) -> Float[Array, "S N 2"]:
-    """Hammersley points, turned on the torus by one random offset per point: uniform, and even."""
+    """Hammersley points with a Cranley-Patterson rotation, one random offset per surface point.
+
+    Parameters
+    ----------
+    offsets : (N, 2) in [0, 1), uniform.
+    samples : static; S, samples per surface point.
+    dtype : of the result.
+
+    Returns
+    -------
+    (S, N, 2) in [0, 1): each uniform, and the S of a surface point spread evenly.
+    """
     index = np.arange(samples)
     bits = (index[:, None] >> np.arange(31)[None, :]) & 1
     radical = np.sum(bits * 0.5 ** np.arange(1, 32)[None, :], axis=1)
@@ -122,15 +134,17 @@ def in_chunks(
     rows_at_once: int | None = None,
     has_gradient: bool = True,
 ) -> Any:
-    """Map a function of rows over chunks of them, to be computed again in the backward pass.
+    """Map a function over chunks of rows, which the backward pass computes again.
 
-    Chunks that the mask leaves nothing of give zeros, at no cost.
+    A chunk without a row of the mask is skipped, and gives zeros.
 
     Parameters
     ----------
-    function : of a chunk of ``arguments``, pytrees with N rows.
-    mask : rows that matter. samples : per row, from which follows how many rows are a chunk.
-    rows_at_once : static; how many rows are a chunk whatever the samples.
+    function : takes a chunk of ``arguments``, and returns arrays with as many rows.
+    arguments : pytree of arrays with N rows.
+    mask : (N,) rows that matter.
+    samples : static; samples per row, from which the number of rows in a chunk follows.
+    rows_at_once : static; the number of rows in a chunk, whatever ``samples``.
     has_gradient : static; False where nothing depends on what is differentiated.
     """
     count = mask.shape[0]
@@ -308,8 +322,17 @@ def draw_specular(
 ) -> Samples:
     """Draw the directions of the specular lobe from visible microfacet normals, and trace them.
 
-    The weights of the result are 1: they depend on the material. The density of the light's samples
-    stands beside every direction; with ``open_only`` it is 0 where that is blocked.
+    Parameters
+    ----------
+    key, points, sampler, index, counts, finds_nearest : as for `draw_samples`.
+    roughness : (N,) perceptual.
+    wo : (N, 3) unit, towards the viewer.
+    open_only : static; whether the density of the light is 0 in directions that are blocked.
+
+    Returns
+    -------
+    `Samples` of S directions per point. The weights are 1, since those of the specular lobe depend
+    on the material; ``light_density`` is (N, S), the density of `sample_light` in every direction.
     """
 
     def one_chunk(parts: tuple) -> Samples:

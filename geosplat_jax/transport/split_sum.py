@@ -213,7 +213,7 @@ class SplitSum(Transport):
         index: RayIndex | None,
         carry: Any = None,
     ) -> tuple[PrefilteredIllumination, Any]:
-        """Prefilter the light; of the rest, only the lobes that there are matter."""
+        """Prefilter the light; without a specular lobe, its diffuse level alone."""
         is_matt = not attributes.materials.has_specular
         filtered = prefilter(light, self.operators, diffuse_only=is_matt)
         return PrefilteredIllumination(filtered), carry
