@@ -1,4 +1,4 @@
-"""Search the front of all knobs together by successive halving: many short runs, few long ones.
+"""Find the Pareto front of all knobs together by successive halving: many short, few long runs.
 
 ``python experiments/halving.py SWEEP.toml --scenes ROOT --output DIR [--joint 24] [--rungs 3]``
 takes the runs of a sweep and combinations of them: of every group (a knob), the base or one value.

@@ -1,4 +1,4 @@
-"""Run a sweep: train and evaluate many settings on many scenes; stages that runs share, once.
+"""Run a sweep: train and evaluate many settings on many scenes; shared stages are trained once.
 
 ``python experiments/run.py SWEEP.toml --scenes ROOT --output DIR`` leaves a run folder
 ``DIR/SCENE/NAME`` for every run, and ``DIR/sweep.json`` for ``experiments/report.py``. The same

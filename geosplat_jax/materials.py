@@ -72,10 +72,12 @@ class MaterialSpec:
     """Added to the raw roughness, so that training starts at a plausible material; see
     `MATERIAL_PRIORS`."""
     initial_metallic_logit: Number = 0.0
-    """The same for metallic."""
+    """Added to the raw metallic, so that training starts at a plausible material; see
+    `MATERIAL_PRIORS`."""
     specular: Literal["none", "uniform", "field"] = "field"
-    """The specular lobe: of a roughness that varies over the surface, of a single one that is
-    learned, or none. Without one the surface is Lambertian, and has no metallic either."""
+    """The specular lobe: ``none``, ``uniform`` with a single learned roughness, or ``field`` with a
+    roughness that varies over the surface. Without it the surface is Lambertian and has no
+    metallic."""
     has_metallic: bool = True
     """Without it metallic is zero and has no parameters."""
     has_shift: bool = True

@@ -55,7 +55,7 @@ _FEWEST_HELD = 3
 """Held-back views that say anything."""
 
 _BLOCKED = 0.02
-"""Share of an even sky's light that a surface blocks from itself, from which shadows matter."""
+"""Share of a uniform sky's light that a surface blocks from itself, from which shadows matter."""
 
 _SIZES = ("shift", "hash", "light")
 """Parts that the first stage, which all trials share, does without."""
@@ -217,7 +217,7 @@ def _seen_on_surface(
     """
     before = float(np.mean(trials.decibels(kept, 0)))
     share = trials.blocked_share()
-    note = f"the surface blocks {100 * share:.1f} % of an even sky"
+    note = f"the surface blocks {100 * share:.1f} % of a uniform sky's light from itself"
     if share > _BLOCKED:
         try:
             trials.decibels(wanted, 0)
@@ -251,8 +251,8 @@ class _Trials:
         if len(held) < _FEWEST_HELD or not len(used):
             raise ValueError(
                 f"choosing a model holds back every {how.hold_back}th of {len(dataset.train)} "
-                f"training views, which must be {_FEWEST_HELD} at least; take more photographs, or "
-                "train without --model auto"
+                f"training views; that makes {len(held)}, and at least {_FEWEST_HELD} are needed: "
+                "take more photographs, or train without --model auto"
             )
         self.how, self._config, self._folder, self._listener = how, config, folder, listener
         self._first, self._last = stages[0], stages[-1]

@@ -190,10 +190,10 @@ class FreeSplatSettings(SplatSettings, kind="free"):
     """The splats of the stage before, with parameters of their own; the surface must be frozen."""
 
     darkest_metal: Share = 0.0
-    """Albedo, in its strongest channel, from which on a splat may be a metal. Metallic is what the
-    field says there, zero below half of it, and smooth between; 0 leaves it to the field. Pure
-    metals reflect .4 and more of what falls on them, diamond .17, and photographs hardly tell a
-    darker metal from a dielectric."""
+    """Smallest albedo, in its strongest channel, of a metal. Splats of at least this albedo have
+    the metallic of the field, those of at most half of it have none, with a smooth transition; 0
+    leaves metallic to the field. Pure metals reflect .4 or more of the light, diamond .17, and
+    photographs hardly tell a darker metal from a dielectric."""
 
     @property
     def rate_groups(self) -> tuple[str, ...]:

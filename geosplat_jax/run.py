@@ -632,8 +632,8 @@ def _as_it_began(order: _Order, folder: RunFolder, *, chooses: bool) -> _Order:
     """
     if chooses and not folder.has_chosen_model:
         raise RunError(
-            f"the run in {folder} has begun without choosing a model; leave that out, or begin "
-            "anew with --force"
+            f"the run in {folder} was begun without choosing a model; leave the choice out, or "
+            "begin anew with --force"
         )
     config, mesh, budget, reading = order
     if budget is not None and folder.budget() is None:

@@ -517,7 +517,7 @@ def test_a_budget_that_is_resumed_takes_no_other_settings(dataset, tmp_path, cap
     assert "leave --set, --seed, --mesh, --downscale out" in told
     begun = ["train", "examples/duck", "--output", str(tmp_path / "run"), "--resume"]
     assert cli.main([*begun, "--budget", "2min"]) == 2
-    assert "keeps its budget; leave --budget" in " ".join(capsys.readouterr().err.split())
+    assert "was begun with; leave --budget" in " ".join(capsys.readouterr().err.split())
 
 
 def test_the_command_of_a_budget_goes_on_with_resume_alone(dataset, tmp_path, monkeypatch):

@@ -608,7 +608,7 @@ def test_a_run_is_refined_and_trained_with_what_was_found(run, capsys):
     assert opened.steps()[0]["loss"] != Run(run / "run").steps()[0]["loss"]
     assert train(run, "again", "--cameras", str(path), "--resume") == 0
     assert train(run, "again", "--resume") == 2
-    assert "take the same, or another folder" in capsys.readouterr().err
+    assert "take the same scene, read in the same way, or another folder" in capsys.readouterr().err
     assert cli.main(["render", str(run / "again"), "--output", str(run / "pictures")]) == 0
     # The run keeps what it was trained with, wherever it is moved; a change is noticed.
     path.unlink()

@@ -311,7 +311,7 @@ def test_an_upright_photograph_lies_on_a_canvas_and_the_rest_does_not_count(scen
         expected[:height, :width] = 1
         np.testing.assert_array_equal(valid, expected)
         assert (image[expected == 0] == 0).all()
-    assert any("2 sizes lie on a canvas of 24 x 28" in warning for warning in dataset.warnings)
+    assert any("2 sizes are padded to 24 x 28" in warning for warning in dataset.warnings)
     share = photograph(opengl_poses()[3], size_of(3))[1].mean()
     assert train.coverage[train.names.index("view_03")] == pytest.approx(share)
     assert "pixels that count" in describe(dataset)
@@ -407,7 +407,10 @@ def test_images_with_alpha_need_no_masks_and_leave_those_that_are_there(tmp_path
     write_png(tmp_path / "masks" / "view_04.png", np.zeros((20, 24, 1), np.float32))
     again = load(tmp_path)
     np.testing.assert_array_equal(again.train.images, dataset.train.images)
-    said = "train: 1 mask files are not read: their images have an alpha, view_04.png for one"
+    said = (
+        "train: 1 mask files are ignored because their images have an alpha channel, "
+        "for example view_04.png"
+    )
     assert said in again.warnings
 
 
@@ -512,7 +515,7 @@ def test_the_split_of_nerfstudio_is_taken(copied):
         ({"applied_transform": np.full((3, 4), np.nan).tolist()}, "must be 3 x 4 finite numbers"),
         ({"camera_model": "EQUIRECTANGULAR"}, "frame 0 of .* must be one of PINHOLE,.*EQUIRECT"),
         ({"camera_model": ["OPENCV"]}, "must be one of PINHOLE"),
-        ({"is_latlong": True}, "frame 0 of .* has is_latlong, a camera that is no lens"),
+        ({"is_latlong": True}, "frame 0 of .* has is_latlong, a projection that is not supported"),
         ({"k1": np.nan}, "'k1' of frame 0 of .* must be a finite number, got nan"),
         ({"k2": "0.1"}, "'k2' of frame 0 of .* must be a finite number"),
         ({"distortion_params": [0.1, 0.2]}, "'distortion_params' of frame 0 .* the 6 numbers k1"),

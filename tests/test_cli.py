@@ -198,7 +198,7 @@ def test_resuming_checks_the_scene_and_the_configuration(run, scene, capsys):
     same = [*REDUCED, "--set", "run.preview_every=4", "--resume"]
     assert train(run, *same, scene=scene) == 0
     assert train(run, "--downscale", "2", *same[2:], scene=scene) == 2
-    assert "take the same, or another folder" in capsys.readouterr().err
+    assert "take the same scene, read in the same way, or another folder" in capsys.readouterr().err
     assert train(run, *same, "--seed", "5", scene=scene) == 2
     assert "run.seed: 0 -> 5" in capsys.readouterr().err
     assert train(run, *REDUCED, scene=scene) == 2
@@ -225,7 +225,7 @@ def test_a_run_finds_its_scene_where_it_was_moved_to(run, scene, tmp_path, capsy
 def test_an_existing_output_folder_is_not_touched(tmp_path, capsys):
     (tmp_path / "precious.txt").write_text("data")
     assert train(tmp_path, "--downscale", "4") == 2
-    assert "holds other files, precious.txt for one" in capsys.readouterr().err
+    assert "holds other files, for example precious.txt" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["precious.txt"]
 
 

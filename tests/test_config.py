@@ -433,7 +433,7 @@ def test_differences_name_the_setting_and_both_values():
                 "stages.refine.transport.indirect=radiometric",
                 "stages.monte_carlo.weights.radiometric=1",
             ),
-            ["stages.refine.transport.indirect=radiometric is never compared"],
+            ["stages.refine.transport.indirect=radiometric learns radiance that no loss compares"],
         ),
         (
             (
@@ -442,7 +442,7 @@ def test_differences_name_the_setting_and_both_values():
                 "stages.monte_carlo.vertex_fraction=0.5",
                 "stages.refine.steps=0",
             ),
-            ["surfaces which indirect=traced finds are black"],
+            ["surfaces that rays hit look black to indirect=traced"],
         ),
         (
             (
@@ -451,7 +451,7 @@ def test_differences_name_the_setting_and_both_values():
                 "stages.monte_carlo.splats.kind=vertex",
                 "stages.refine.steps=0",
             ),
-            ["surfaces which kind=paths finds are black"],
+            ["surfaces that rays hit look black to kind=paths"],
         ),
         (
             ('stages.split_sum.domain={kind="per_pixel",points="mesh"}',),

@@ -236,7 +236,7 @@ def test_the_command_takes_any_closed_mesh(tmp_path, capsys):
         ("point.obj", b"v 0 0 0\n", (), "point.obj"),
         ("flat.obj", b"v 0 0 0\nv 0 0 0\nv 1 0 0\nf 1 2 3\n", (), "three different corners"),
         ("nan.obj", b"v 0 0 nan\nv 0 1 0\nv 1 0 0\nf 1 2 3\n", (), "not finite"),
-        ("a.ply", b"", ("--stage", "refine"), "--stage is of runs"),
+        ("a.ply", b"", ("--stage", "refine"), "--stage needs the folder of a run"),
         ("a.ply", b"", ("--size", "0"), "--size must be from 1 to 8192 pixels, got 0"),
         ("a.ply", b"", ("--size", "100000000"), "--size must be from 1 to 8192"),
     ],

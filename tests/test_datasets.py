@@ -531,7 +531,7 @@ def test_a_lens_of_larger_images_is_scaled_to_those_on_disk(blender):
 
 @pytest.mark.parametrize(
     ("width", "height", "said"),
-    [(24, 12, None), (12, 24, "lie on their side"), (24, 24, "were cropped")],
+    [(24, 12, None), (12, 24, "stored on their side"), (24, 24, "were cropped")],
 )
 def test_images_of_another_shape_than_their_lens_are_noticed(tmp_path, width, height, said):
     """A lens of 48 x 24 pixels, of images of half the size, turned, or cut."""
@@ -545,7 +545,7 @@ def test_images_of_another_shape_than_their_lens_are_noticed(tmp_path, width, he
         frames.append({"file_path": f"images/{number}.png", "transform_matrix": pose.tolist()})
     (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
     warnings = load_dataset(tmp_path, bounds=((-0.5,) * 3, (0.5,) * 3)).warnings
-    found = [warning for warning in warnings if "another shape" in warning]
+    found = [warning for warning in warnings if "not in proportion" in warning]
     assert len(found) == 2 * (said is not None)
     assert all(said in warning for warning in found)
 
@@ -706,7 +706,7 @@ def test_two_views_of_one_name_are_refused(blender):
     content = json.loads(path.read_text())
     content["frames"].append(content["frames"][0])
     path.write_text(json.dumps(content))
-    with pytest.raises(SceneError, match="1 image names stand for several views .* 'r_0'"):
+    with pytest.raises(SceneError, match="1 image names occur more than once .* 'r_0'"):
         load(blender)
 
 

@@ -76,7 +76,7 @@ def test_two_hosts_grow_stop_resume_and_refuse_together(tmp_path):
     finished(*(started("train", tmp_path, port, host) for host in (0, 1)))
     first, second = (json.loads((tmp_path / f"host{k}.json").read_text()) for k in (0, 1))
     for host in (first, second):
-        assert "do not train the same" in host["said"]["other settings"]
+        assert "were given different things" in host["said"]["other settings"]
         assert host["said"]["stop"] == "Interrupted: stopped at step 2; continue with --resume"
         assert set(host["said"]) == {"other settings", "stop"}
         assert host["step"] == 4
@@ -171,7 +171,8 @@ def test_devices_without_a_view_are_told_of():
     devices.count = 3
     config = tiny_config("stages.split_sum.batch_views=2")
     assert _idle(devices, config) == [
-        "stages.split_sum.batch_views = 2: of 3 devices, 1 have nothing to do"
+        "stages.split_sum.batch_views = 2 leaves 1 of 3 devices idle; raise it to 3 or more, "
+        "or use fewer devices"
     ]
     devices.count = 2
     assert _idle(devices, config) == []

@@ -117,7 +117,7 @@ def test_the_surface_decides_whether_there_are_shadows(
     chosen = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
     assert names_of(chosen) == ["specular", *(["shadows"] if is_kept else [])]
     (rung,) = (rung for rung in chosen.record()["rungs"] if rung["part"] == "shadows")
-    said = f"the surface blocks {100 * share:.1f} % of an even sky"
+    said = f"the surface blocks {100 * share:.1f} % of a uniform sky's light from itself"
     assert rung_row(rung)[2:] == ("-", "-", f"{'kept' if is_kept else 'left out'}: {said}")
 
 

@@ -223,7 +223,7 @@ def test_what_does_not_fit_is_left_out_and_named(tmp_path, monkeypatch):
     assert tree.find(".//model-viewer") is None
     assert "Left out, since the page would exceed" in texts_of(tree)
     assert "the mesh to turn" in texts_of(tree)
-    with pytest.raises(ValueError, match="fewer runs than 2"):
+    with pytest.raises(ValueError, match="2 runs do not fit into one report"):
         report_html([run, run])
 
 

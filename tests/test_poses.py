@@ -75,7 +75,7 @@ def refuses(root, message, error=SceneError, **arguments):
 
 def test_folders_without_enough_photographs_are_refused(tmp_path):
     refuses(tmp_path / "none", "does not exist", MissingFileError)
-    refuses(photographs(tmp_path, 4), "has 4 photographs .*take 5 at least", PoseError)
+    refuses(photographs(tmp_path, 4), "has 4 photographs .*takes at least 5", PoseError)
 
 
 def test_masks_are_no_photographs(tmp_path):

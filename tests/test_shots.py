@@ -112,7 +112,7 @@ def test_a_bent_lens_is_refused(tmp_path):
 
 def test_a_scene_without_test_views_says_what_to_do():
     bare = replace(DATASET, test=no_views(DATASET.train))
-    with pytest.raises(RunError, match="no test views; take --views train.*--cameras FILE"):
+    with pytest.raises(RunError, match="no test views; use --views train.*--cameras FILE"):
         Cameras("test").shots(bare, CENTER)
     assert len(Cameras(None).shots(bare, CENTER)) == len(bare.train)
 

@@ -128,7 +128,7 @@ is_asked = requests.__enter__()
 def test_a_training_says_at_once_that_it_will_stop():
     """Whoever hears nothing for the rest of a compilation presses Ctrl-C again, and loses steps."""
     status, said, _ = stopped(REQUEST, "is_asked() and (time.sleep(0.6) or True)")
-    assert (status, said) == (0, "stopping after this step; Ctrl-C once more stops at once\n")
+    assert (status, said) == (0, "stopping after this step; press Ctrl-C again to stop at once\n")
 
 
 def test_the_second_ctrl_c_ends_a_training_that_cannot_hear():

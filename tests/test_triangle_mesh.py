@@ -268,7 +268,7 @@ def test_a_mesh_that_cannot_be_used_stops_before_anything_is_written(dataset, fi
     vertices, faces = read_mesh(files["ball"])
     trimesh.Trimesh(100 * vertices, faces, process=False).export(large)
     config = make_config(mesh=large, overrides=SMALL)
-    with pytest.raises(TrainingError, match=r"0\.01 times as large it would"):
+    with pytest.raises(TrainingError, match=r"if it were 0\.01 times as large"):
         fit(dataset, config, tmp_path / "run")
     assert not (tmp_path / "run/run.json").exists()
     changed = with_mesh(make_config(overrides=TINY), large)
@@ -292,7 +292,7 @@ def test_the_inward_shift_of_a_mesh_starts_smaller_unless_it_was_set(files):
 def test_a_mesh_that_is_given_twice_counts_once_and_two_are_refused(files):
     config = make_config(mesh=files["ball"], overrides=("geometry.max_faces=5000",))
     assert with_mesh(config, files["ball"]) == config
-    with pytest.raises(ValueError, match=r"start from .*, and .* is given beside them"):
+    with pytest.raises(ValueError, match=r"start from the mesh .*, but .* was given as well"):
         with_mesh(config, files["bowl"])
 
 
@@ -307,7 +307,9 @@ def test_an_open_mesh_is_not_shaded_behind_its_faces(dataset, files, tmp_path):
     """What little shows through of the far wall draws blended positions into the body."""
     changes = ("stages.refine.steps=1", "stages.refine.domain.kind=per_pixel")
     config = make_config(mesh=files["bowl"], overrides=(*SMALL, *changes))
-    with pytest.raises(TrainingError, match=r"behind its faces; set stages.refine.domain.points"):
+    with pytest.raises(
+        TrainingError, match=r"behind the faces of an open mesh; set stages.refine.domain.points"
+    ):
         fit(dataset, config, tmp_path / "run")
     # The preset `paper` does that, and is sent back before anything is written.
     with pytest.raises(TrainingError, match="geometry.sides=one"):

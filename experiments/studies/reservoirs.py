@@ -7,7 +7,7 @@ measures, of the last ones, the error of the diffuse light of all points and tha
 the light's texels, against many plain samples; the rays of a point; and the processor's seconds of
 both together. It writes a table and, with matplotlib, curves::
 
-    python experiments/studies/reservoirs.py --output DIR [--resolution 16] [--steps 12]
+    python experiments/studies/reservoirs.py --output DIR [--resolution 12] [--steps 12]
 """
 
 import argparse

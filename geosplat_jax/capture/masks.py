@@ -98,14 +98,14 @@ class Certainty:
                 "--box"
             )
         if self.agreement < _LEAST_AGREEMENT:
-            found.append("masks contradict each other; look at the sheet, and give a --box")
+            found.append("masks contradict each other; look at masks.png, and give a --box")
         if self.cut > _MOST_CUT:
             found.append(
                 f"{self.cut:.0%} of the masks' rims lie on the border of the image: the object, or "
-                "what the box holds besides, is cut off there"
+                "something else in the box, is cut off there"
             )
         if self.empty:
-            found.append(f"{len(self.empty)} masks are empty, {self.empty[0]} for one")
+            found.append(f"{len(self.empty)} masks are empty, for example {self.empty[0]}")
         return found
 
 
@@ -150,8 +150,8 @@ class MaskReport:
             f"splats:     {self.splats_total}, {held_back}",
             f"box:        {corners} ({origin}{plane}), {self.splats} splats in it",
             f"masks:      {self.masks} in {self.folder}, {sure.coverage:.1%} of an image each",
-            f"unsure:     half-opaque pixels off the rims are {sure.unsure:.1%} of the masks'",
-            f"agreement:  {sure.agreement:.1%} of the rays through masks meet the others' hull",
+            f"unsure:     {sure.unsure:.1%} half-opaque pixels off the rims, per mask pixel",
+            f"agreement:  {sure.agreement:.1%} of the rays through a mask meet the others' hull",
             *(f"warning: {warning}" for warning in sure.warnings()),
         ]
 
@@ -296,8 +296,8 @@ def _require_free(frames: Sequence[Frame], folder: Path, *, resume: bool, force:
     is_ours = resume and ((folder / REPORT).exists() or of_a_stopped_one)
     if there and not (is_ours or force):
         raise CaptureError(
-            f"{len(there)} of {len(frames)} views have a mask already, {there[0]} for one; replace "
-            "them with --force, or move them away"
+            f"{len(there)} of {len(frames)} views have a mask already, for example {there[0]}; "
+            "replace them with --force, or move them away"
         )
 
 

@@ -28,15 +28,16 @@ _EXTENT_MARGIN = 1.1  # as in the code of Kerbl et al.
 _NEIGHBOURS = 3
 _SMALLEST_DISTANCE = 1e-4  # of neighbours, in quarters of the cameras' extent
 _START_SHARE = 0.5
+"""Share of the capacity that is filled with splats at the beginning, at least."""
 _MOST_DRAWS = 1000
-"""Of a pixel until one counts; a share of a hundredth that counts is missed once in 20,000."""
-"""Of the capacity that there are splats in the beginning."""
+"""Largest number of draws until a pixel counts. Where only one pixel in a hundred counts, all of
+them miss once in 20,000."""
 _NEAREST, _BEYOND, _FARTHEST = 0.5, 1.5, 30.0
 """Depths of random points, in distances to what the cameras look at."""
 
 
 class CaptureError(SceneError):
-    """A capture does not do for splats or masks; the message says why and what to do."""
+    """A capture cannot be used for splats or masks; the message says why and what to do."""
 
 
 def require_trainable(views: Views) -> None:

@@ -7,7 +7,8 @@ from geosplat_jax.core.allocator import retain_freed_memory
 def main(argv: list[str] | None = None) -> int:
     """Run the command line, that of the process by default, and return its status.
 
-    Errors that a user can cure print one line and return 2, what somebody stopped 130.
+    The status is 0 after success, 1 where gradcheck finds a wrong gradient, 2 after an error that a
+    user can cure, which is printed in one line, and 130 where somebody stopped the command.
     """
     retain_freed_memory()
     try:

@@ -62,11 +62,11 @@ def command_line() -> argparse.ArgumentParser:
     _add_masks(_command(commands, "masks", "cut the object out of photographs with cameras"))
     _add_train(_command(commands, "train", "reconstruct a scene"))
     _add_settings(_command(commands, "settings", "list every setting: default, range, meaning"))
-    _add_evaluate(_run_parser(commands, "evaluate", "metrics and pictures of a run's test views"))
-    _add_report(_command(commands, "report", "report.html of a run, or of several to compare"))
+    _add_evaluate(_run_parser(commands, "evaluate", "compare a run with its scene's test views"))
+    _add_report(_command(commands, "report", "write report.html of one run, or of several"))
     _add_consistency(
         _command(
-            commands, "consistency", "how well splats stand for the mesh of a run, or for any mesh"
+            commands, "consistency", "measure how well splats match the mesh that they are put on"
         )
     )
     _add_render(_run_parser(commands, "render", "render a run from its views or any cameras"))
@@ -74,12 +74,12 @@ def command_line() -> argparse.ArgumentParser:
     _add_view(_run_parser(commands, "view", "look at a run in a browser, also while it trains"))
     _add_refine_cameras(
         _run_parser(
-            commands, "refine-cameras", "pose, focal length and colour of every view of a run"
+            commands, "refine-cameras", "refine pose, focal length and exposure of every view"
         )
     )
-    _add_export(_run_parser(commands, "export", "mesh.glb, gaussians.ply and light.exr of a run"))
+    _add_export(_run_parser(commands, "export", "write mesh.glb, gaussians.ply and light.exr"))
     _add_gradcheck(
-        _command(commands, "gradcheck", "prove the gradients: float64 differences of every part")
+        _command(commands, "gradcheck", "compare all gradients with float64 finite differences")
     )
     return parser
 
@@ -102,14 +102,14 @@ def _add_white_balance(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--white-balance",
         action="store_true",
-        help="refine factors of red, green and blue of every view with the cameras, too",
+        help="together with the cameras, refine a white balance (red, green, blue) of every view",
     )
 
 
 def _run_parser(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
     """Add a command that works on a run."""
     parser = _command(commands, name, text)
-    parser.add_argument("run", type=Path)
+    parser.add_argument("run", type=Path, help="folder of the run")
     parser.add_argument("--scene", type=Path, help="where the run's scene is now, if it has moved")
     return parser
 
@@ -123,14 +123,14 @@ def _add_train(train: argparse.ArgumentParser) -> None:
         "--budget",
         type=_measured(parse_duration),
         metavar="TIME",
-        help="90s, 5min, 2h: choose the settings that this machine has time for, and end in time "
-        "(instead of --quality and --preset)",
+        help="time limit, such as 90s, 5min or 2h: choose settings that this machine can finish in "
+        "that time, and adapt the steps so as to end in time (instead of --quality and --preset)",
     )
     train.add_argument(
         "--memory",
         type=_measured(parse_memory),
         metavar="SIZE",
-        help="with --budget: 4GB; as much as the machine has by default",
+        help="with --budget: memory limit, such as 4GB (default: all memory of the machine)",
     )
     train.add_argument(
         "--model",
@@ -144,8 +144,8 @@ def _add_train(train: argparse.ArgumentParser) -> None:
         nargs="?",
         const=1,
         metavar="ROUNDS",
-        help="first train for a short while and set the cameras right with what came out, so often "
-        "(once by default); docs/cameras.md",
+        help="first make this many short trainings, each followed by a refinement of the cameras "
+        "against its result (1 where no number is given); docs/cameras.md",
     )
     _add_white_balance(train)
     train.add_argument(
@@ -158,35 +158,51 @@ def _add_train(train: argparse.ArgumentParser) -> None:
     )
     start = train.add_mutually_exclusive_group()
     start.add_argument(
-        "--resume", action="store_true", help="continue from the last checkpoint, or start again"
+        "--resume",
+        action="store_true",
+        help="continue from the last checkpoint; where there is none, start from the beginning",
     )
     start.add_argument("--force", action="store_true", help="replace the run in the output folder")
     start.add_argument(
-        "--from", dest="source", type=Path, metavar="RUN", help="take the first stages from a run"
+        "--from",
+        dest="source",
+        type=Path,
+        metavar="RUN",
+        help="reuse the first stages of another run of the same scene; needs --stage",
     )
-    train.add_argument("--stage", metavar="NAME", help="with --from: the stage to begin with")
+    train.add_argument(
+        "--stage", metavar="NAME", help="with --from: the first stage that is trained here"
+    )
     _add_devices(train)
 
 
 def _add_settings(settings: argparse.ArgumentParser) -> None:
     """Describe the settings command."""
-    settings.add_argument("prefix", nargs="?", default="", help="of the settings to list")
+    settings.add_argument(
+        "prefix", nargs="?", default="", help="list only the settings whose names begin with this"
+    )
     _add_config_arguments(settings)
 
 
 def _add_evaluate(evaluate: argparse.ArgumentParser) -> None:
     """Describe the evaluate command."""
-    evaluate.add_argument("--protocol", choices=PROTOCOLS, default=PROTOCOLS[0])
+    evaluate.add_argument(
+        "--protocol",
+        choices=PROTOCOLS,
+        default=PROTOCOLS[0],
+        help="whose conventions the metrics follow (default: %(default)s)",
+    )
     _add_samples(evaluate)
     evaluate.add_argument(
         "--relight-indirect",
         choices=RELIGHT_KINDS,
         default="traced",
-        help="light from blocked directions under new lights (default: %(default)s)",
+        help="under new lights, light from directions that the object blocks: traced from what is "
+        "hit there, path traced, none (black), or unshadowed (no rays, so no shadows) "
+        "(default: %(default)s)",
     )
-
     evaluate.add_argument(
-        "--stage", help="what this stage ended with, instead of the run as it is now"
+        "--stage", help="evaluate the end of this stage instead of the latest checkpoint"
     )
 
 
@@ -206,10 +222,10 @@ def _add_consistency(consistency: argparse.ArgumentParser) -> None:
     consistency.add_argument(
         "--scene",
         type=Path,
-        help="where the run's scene is now; or the scene whose cameras see the mesh (default: "
-        f"{DEFAULT_VIEWS} cameras around it)",
+        help="for a run: where its scene is now, if it has moved; for a mesh: the scene whose "
+        f"cameras look at it (default: {DEFAULT_VIEWS} cameras around the mesh)",
     )
-    consistency.add_argument("--stage", help="of a run, as for evaluate")
+    consistency.add_argument("--stage", help="for a run: measure the end of this stage")
     consistency.add_argument(
         "--size", type=int, help="pixels along the longer side of the views (default: the scene's)"
     )
@@ -235,10 +251,13 @@ def _add_view(view: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="FILE",
-        help="environment maps to choose from beside those of the scene; of a folder, all of them",
+        help="further environment maps to choose from, as files or folders of them",
     )
     view.add_argument(
-        "--port", type=int, default=DEFAULT_PORT, help="of this machine (default: %(default)s)"
+        "--port",
+        type=int,
+        default=DEFAULT_PORT,
+        help="port on this machine to serve the viewer at (default: %(default)s)",
     )
 
 
@@ -251,15 +270,29 @@ def _add_refine_cameras(refine: argparse.ArgumentParser) -> None:
 def _add_export(export: argparse.ArgumentParser) -> None:
     """Describe the export command."""
     export.add_argument("--output", type=Path, help="folder (default: RUN/export)")
-    export.add_argument("--vertex-colors", action="store_true", help="instead of textures")
-    export.add_argument("--texture-size", type=int, default=1024)
     export.add_argument(
-        "--faces", type=int, metavar="N", help="reduce to about N faces, with a map of normals"
+        "--vertex-colors",
+        action="store_true",
+        help="store the materials on the vertices instead of in textures",
     )
     export.add_argument(
-        "--obj", action="store_true", help="also mesh.obj, with mesh.mtl and textures as PNG"
+        "--texture-size",
+        type=int,
+        default=1024,
+        help="edge of the square textures in texels (default: %(default)s)",
     )
-    export.add_argument("--usd", action="store_true", help="also mesh.usdc, with textures as PNG")
+    export.add_argument(
+        "--faces",
+        type=int,
+        metavar="N",
+        help="reduce the mesh to about N faces, and bake a normal map of the full one",
+    )
+    export.add_argument(
+        "--obj", action="store_true", help="also write mesh.obj, with mesh.mtl and PNG textures"
+    )
+    export.add_argument(
+        "--usd", action="store_true", help="also write mesh.usdc, with PNG textures"
+    )
 
 
 def _add_gradcheck(gradcheck: argparse.ArgumentParser) -> None:
@@ -281,21 +314,28 @@ def _add_poses(poses: argparse.ArgumentParser) -> None:
         "--size",
         type=int,
         default=standard.size,
-        help="pixels of the longer side that details are looked for in (default: %(default)s)",
+        help="longer side, in pixels, that photographs are reduced to in order to find features "
+        "(default: %(default)s)",
     )
     poses.add_argument(
         "--order",
         choices=get_args(PoseSettings.__annotations__["order"]),
         default=standard.order,
-        help="sequence: compare those that follow each other by name (default: every two)",
+        help="any: match every pair of photographs; sequence: mainly those that are close by name, "
+        "for frames of a movie (default: %(default)s)",
     )
     poses.add_argument(
         "--lens",
         choices=get_args(PoseSettings.__annotations__["lens"]),
         default=standard.lens,
-        help="one for all photographs, or one for each (default: %(default)s)",
+        help="one lens for all photographs, or one for each (default: %(default)s)",
     )
-    poses.add_argument("--seed", type=_seed, default=standard.seed, help="of random searches")
+    poses.add_argument(
+        "--seed",
+        type=_seed,
+        default=standard.seed,
+        help="seed of the random searches (default: %(default)s)",
+    )
 
 
 def _add_masks(masks: argparse.ArgumentParser) -> None:
@@ -307,34 +347,51 @@ def _add_masks(masks: argparse.ArgumentParser) -> None:
         type=float,
         nargs=6,
         metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
-        help="around the object (default: around what all cameras look at)",
+        help="two corners of a box around the object (default: a box that is found where the "
+        "cameras look)",
     )
     masks.add_argument(
-        "--output", type=Path, help="folder of splats and sheet (default: runs/SCENE_masks)"
+        "--output",
+        type=Path,
+        help="folder for the splats and the sheet of pictures (default: runs/SCENE_masks)",
     )
-    masks.add_argument("--steps", type=int, default=standard.steps, help="(default: %(default)s)")
+    masks.add_argument(
+        "--steps",
+        type=int,
+        default=standard.steps,
+        help="training steps of the splats (default: %(default)s)",
+    )
     masks.add_argument(
         "--splats",
         type=int,
         default=standard.capacity,
         metavar="N",
-        help="most that there may be (default: %(default)s)",
+        help="largest number of splats (default: %(default)s)",
     )
     masks.add_argument(
         "--downscale",
         type=_downscale,
         default="auto",
         metavar="N",
-        help="reduce the images by this factor; auto: to at most as many pixels as 270 x 480",
+        help="reduce the images by this factor; auto: until none has more pixels than 270 x 480 "
+        "(default: %(default)s)",
     )
-    masks.add_argument("--seed", type=int, default=standard.seed, help="of every random choice")
+    masks.add_argument(
+        "--seed",
+        type=int,
+        default=standard.seed,
+        help="seed of every random choice (default: %(default)s)",
+    )
     start = masks.add_mutually_exclusive_group()
     start.add_argument(
         "--resume",
         action="store_true",
-        help="continue the training; where it is done, only make the masks again, in another --box",
+        help="continue the training; if it is complete, only make the masks again, for example "
+        "with another --box",
     )
-    start.add_argument("--force", action="store_true", help="replace splats and masks")
+    start.add_argument(
+        "--force", action="store_true", help="train anew; replace the splats and masks"
+    )
 
 
 def _add_devices(train: argparse.ArgumentParser) -> None:
@@ -350,7 +407,8 @@ def _add_devices(train: argparse.ArgumentParser) -> None:
         "--hosts",
         type=_hosts,
         metavar="N",
-        help="this is one of N processes that train together; auto: as Slurm or Open MPI say",
+        help="number of processes that train together, including this one; auto: as Slurm or Open "
+        "MPI report it",
     )
     train.add_argument(
         "--host", type=int, metavar="K", help="with --hosts N: number of this process, from 0"
@@ -358,7 +416,7 @@ def _add_devices(train: argparse.ArgumentParser) -> None:
     train.add_argument(
         "--coordinator",
         metavar="ADDRESS:PORT",
-        help="with --hosts N: of process 0, where all others find it",
+        help="with --hosts N: address of process 0 that all other processes can reach",
     )
 
 
@@ -372,22 +430,29 @@ def _add_cameras(parser: argparse.ArgumentParser, views: str | None) -> None:
     """Add what chooses the cameras to render from."""
     default = "%(default)s" if views else "test, or train where the scene has no test views"
     parser.add_argument(
-        "--views", choices=SPLITS, default=views, help=f"of the scene (default: {default})"
+        "--views",
+        choices=SPLITS,
+        default=views,
+        help=f"render from the cameras of these views of the scene (default: {default})",
     )
     parser.add_argument(
         "--cameras",
         type=Path,
         metavar="FILE",
-        help="instead of views: cameras in the form of a transforms.json, in the scene's world",
+        help="render from the cameras in this file instead; it has the form of a transforms.json, "
+        "in the world of the scene",
     )
     parser.add_argument(
-        "--size", type=int, metavar="N", help="pixels of the longer side (default: the scene's)"
+        "--size",
+        type=int,
+        metavar="N",
+        help="longer side of the images in pixels (default: that of the photographs)",
     )
     parser.add_argument(
         "--field-of-view",
         type=float,
         metavar="DEGREES",
-        help="horizontal, degrees (default: that of the cameras)",
+        help="horizontal field of view in degrees (default: that of the cameras)",
     )
 
 
@@ -399,15 +464,26 @@ def _add_images(parser: argparse.ArgumentParser, aovs: list[str]) -> None:
         nargs="*",
         choices=AOVS,
         default=aovs,
-        help=f"images beside the colour; depth as EXR only (default: {shown})",
+        help=f"further images to write; depth is written as EXR only (default: {shown})",
     )
-    parser.add_argument("--exr", action="store_true", help="also as linear floats in EXR")
+    parser.add_argument(
+        "--exr", action="store_true", help="also write every image as EXR, in linear floats"
+    )
 
 
 def _add_config_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what chooses the settings of a run."""
-    parser.add_argument("--preset", choices=PRESETS, help="method (default: default)")
-    parser.add_argument("--quality", choices=QUALITIES, help="work (default: standard)")
+    parser.add_argument(
+        "--preset",
+        choices=PRESETS,
+        help="method: this project's own (default), the paper's appendix (paper), or the authors' "
+        "program (code)",
+    )
+    parser.add_argument(
+        "--quality",
+        choices=QUALITIES,
+        help="how much work to spend: cells, steps, views and samples (default: standard)",
+    )
     parser.add_argument(
         "--material-prior",
         choices=sorted(MATERIAL_PRIORS),
@@ -443,19 +519,43 @@ def _add_relight(relight: argparse.ArgumentParser) -> None:
         "--turntable", type=int, default=0, metavar="N", help="movie of N frames around the object"
     )
     relight.add_argument(
-        "--rotate-env", type=int, default=0, metavar="N", help="movie of N frames, the light turns"
+        "--rotate-env",
+        type=int,
+        default=0,
+        metavar="N",
+        help="movie of N frames in which the light turns around the object",
     )
-    relight.add_argument("--fps", type=float, default=24.0, help="frames a second of the movies")
-    relight.add_argument("--movie", choices=("gif", "mp4"), help="(default: mp4 if it can be made)")
     relight.add_argument(
-        "--background", choices=BACKGROUNDS, default="light", help="(default: %(default)s)"
+        "--fps", type=float, default=24.0, help="frames per second of the movies (default: 24)"
     )
-    relight.add_argument("--intensity", type=float, default=1.0, help="factor of the light")
     relight.add_argument(
-        "--albedo-scale", type=float, nargs=3, default=(1.0, 1.0, 1.0), metavar=("R", "G", "B")
+        "--movie", choices=("gif", "mp4"), help="format of the movies (default: mp4 if possible)"
+    )
+    relight.add_argument(
+        "--background",
+        choices=BACKGROUNDS,
+        default="light",
+        help="what is shown behind the object (default: %(default)s)",
+    )
+    relight.add_argument(
+        "--intensity", type=float, default=1.0, help="factor on the light (default: 1)"
+    )
+    relight.add_argument(
+        "--albedo-scale",
+        type=float,
+        nargs=3,
+        default=(1.0, 1.0, 1.0),
+        metavar=("R", "G", "B"),
+        help="factors on the albedo (default: 1 1 1)",
     )
     _add_samples(relight)
-    relight.add_argument("--indirect", choices=RELIGHT_KINDS, default="traced")
+    relight.add_argument(
+        "--indirect",
+        choices=RELIGHT_KINDS,
+        default="traced",
+        help="light from directions that the object blocks: traced from what is hit there, path "
+        "traced, none (black), or unshadowed (no rays, so no shadows) (default: %(default)s)",
+    )
 
 
 def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
@@ -465,8 +565,8 @@ def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
         "--downscale",
         type=_downscale,
         metavar="N",
-        help="reduce the images by this factor (default: 1, or what a budget asks for); auto: by "
-        "what the grid's cells can resolve",
+        help="reduce the images by this factor (default: 1, or with train --budget what fits the "
+        "budget); auto: the largest factor that keeps grid cells two pixels wide or more",
     )
     parser.add_argument("--light", help="training light, where a scene has several")
     parser.add_argument(
@@ -477,7 +577,10 @@ def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
         help="box around the object (default: from masks and cameras)",
     )
     parser.add_argument(
-        "--cameras", type=Path, metavar="FILE", help="instead of the scene's: see refine-cameras"
+        "--cameras",
+        type=Path,
+        metavar="FILE",
+        help="use the cameras of this file, written by refine-cameras, instead of the scene's own",
     )
 
 

@@ -57,7 +57,7 @@ from geosplat_jax.viewer.server import ViewerServer, require_free_port, viser_li
 from geosplat_jax.viewer.source import CheckpointWatch, light_files, load_lights
 
 _ONE_LINE = 1000
-"""Columns of a table that no terminal shows."""
+"""Width of the settings table where the output is no terminal, so that no line is wrapped."""
 
 _LARGEST_FACTOR = 1e6
 """Of a light or an albedo; far beyond any that is of use, and single precision holds the result."""
@@ -209,12 +209,12 @@ def _consistency(arguments: argparse.Namespace) -> None:
         found = Run(subject, scene=arguments.scene).consistency(stage=arguments.stage, size=size)
     else:
         found = _consistency_of_mesh(arguments)
-    print(f"reflected direction, mesh against splats  {found.reflection_deg:9.3f} degrees")
-    print(f"distance along the ray, of the diagonal   {found.distance:9.5f}")
+    print(f"angle between reflected directions        {found.reflection_deg:9.3f} degrees")
+    print(f"error of the distance / box diagonal      {found.distance:9.5f}")
     print(f"pixels compared                           {found.pixels:9d}")
-    print(f"pixels of the mesh without splats         {found.uncovered:9.2%}")
+    print(f"mesh pixels covered by less than half     {found.uncovered:9.2%}")
     if found.behind:
-        print(f"pixels that see it from inside, left out  {found.behind:9.2%}")
+        print(f"mesh pixels seen from inside, left out    {found.behind:9.2%}")
     if arguments.json is not None:
         _write_json(arguments.json, asdict(found))
 
@@ -225,7 +225,7 @@ def _consistency_of_mesh(arguments: argparse.Namespace) -> Consistency:
     if not path.exists():
         raise UsageError(f"{path} is neither the folder of a run nor a mesh file")
     if arguments.stage is not None:
-        raise UsageError(f"--stage is of runs, and {path} is a file")
+        raise UsageError(f"--stage needs the folder of a run, and {path} is a file")
     mesh = load_mesh(path)
     if arguments.scene is None:
         cameras = cameras_around(box_of(mesh), size=arguments.size or DEFAULT_SIZE)

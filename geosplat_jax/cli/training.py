@@ -66,7 +66,9 @@ def scene_options(arguments: argparse.Namespace, config: Config) -> dict[str, An
         return {**options, "downscale": arguments.downscale or 1}
     cells = config.geometry.cells_along
     if cells is None:
-        raise UsageError("--downscale auto needs a surface of cells, not a mesh; give a number")
+        raise UsageError(
+            "--downscale auto needs a grid, which a start from a mesh lacks; give a number"
+        )
     corners = arguments.bounds
     reading = {**options, "bounds": None if corners is None else (corners[:3], corners[3:])}
     chosen = choose_downscale(arguments.scene, cells, **reading)
@@ -144,8 +146,8 @@ def _require_no_settings(
     ]
     if told:
         raise UsageError(
-            f"{folder} goes on as it was begun; leave {', '.join(told)} out, or train anew into "
-            "another --output"
+            f"--resume continues {folder} with the settings it was begun with; leave "
+            f"{', '.join(told)} out, or train anew into another --output"
         )
 
 
@@ -155,7 +157,10 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
     if known is not None:
         asked, chooses_size = (arguments.budget, arguments.memory), arguments.downscale == "auto"
         if asked not in ((None, None), (known.seconds, known.memory)):
-            raise UsageError(f"{folder} keeps its budget; leave --budget and --memory out")
+            raise UsageError(
+                f"--resume keeps the budget that {folder} was begun with; leave --budget and "
+                "--memory out"
+            )
         _require_no_settings(arguments, folder, but="--downscale" if chooses_size else None)
         # Its settings were chosen for the budget, and have changed since.
         reading = folder.record()["dataset"]
@@ -199,7 +204,10 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
 def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[str, Any]) -> Path:
     """Set the cameras right before the training proper; say where they are."""
     draft = round_config(arguments.material_prior, seed=arguments.seed)
-    say("cameras first: a short training, a draft with half its split sum and no refinement")
+    say(
+        "cameras first: a short training at quality draft, with half the split-sum steps and no "
+        "free splats"
+    )
     with ProgressDisplay(draft.total_steps) as display:
         cameras = refined_cameras(
             arguments.scene,
@@ -288,8 +296,8 @@ def _devices(arguments: argparse.Namespace) -> Devices:
         of_one_host = (arguments.budget, arguments.refine_cameras, arguments.model)
         if any(value is not None for value in of_one_host):
             raise UsageError(
-                "--hosts trains once, with given settings; leave --budget, --refine-cameras and "
-                "--model out"
+                "--hosts makes a single training with the settings that are given; leave --budget, "
+                "--refine-cameras and --model out"
             )
         connect_hosts(arguments.hosts, host=arguments.host, coordinator=arguments.coordinator)
     return choose_devices(arguments.devices)
@@ -298,8 +306,9 @@ def _devices(arguments: argparse.Namespace) -> Devices:
 def _idle(devices: Devices, config: Config) -> list[str]:
     """Say which stages have fewer views in a step than there are devices."""
     return [
-        f"stages.{stage.name}.batch_views = {stage.batch_views}: of {devices.count} devices, "
-        f"{devices.count - stage.batch_views} have nothing to do"
+        f"stages.{stage.name}.batch_views = {stage.batch_views} leaves "
+        f"{devices.count - stage.batch_views} of {devices.count} devices idle; raise it to "
+        f"{devices.count} or more, or use fewer devices"
         for stage in config.active_stages
         if stage.batch_views < devices.count
     ]
@@ -311,7 +320,10 @@ def train(arguments: argparse.Namespace) -> None:
     if (arguments.source is None) != (arguments.stage is None):
         raise UsageError("--from RUN and --stage NAME belong together")
     if arguments.refine_cameras is not None and (arguments.budget or arguments.source):
-        raise UsageError("--refine-cameras trains before; leave --budget and --from out")
+        raise UsageError(
+            "--refine-cameras trains before the run itself, which --budget and --from do not "
+            "allow; leave --budget and --from out"
+        )
     if arguments.white_balance and arguments.refine_cameras is None:
         raise UsageError("--white-balance belongs to --refine-cameras")
     require_place(arguments.csv, "--csv")

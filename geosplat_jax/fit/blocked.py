@@ -43,7 +43,7 @@ def _share(
 
 
 def blocked_share(model: SurfaceModel, shape: Any, capacities: Capacities) -> float:
-    """Return the share of an even sky's light that a surface keeps from itself, in [0, 1].
+    """Return the share of a uniform sky's light that a surface keeps from itself, in [0, 1].
 
     One minus the mean ambient occlusion factor, by area: 0 for whatever is convex. Rays start in
     the middles of the faces, in directions drawn by the cosine; always the same ones. No gradients.

@@ -37,8 +37,8 @@ _SHORTEST, _LONGEST = 0.4, 3.0
 """How far the steps of a stage may be scaled for a plan, and made more of on the way."""
 
 _PIXELS_PER_CELL = 6.0
-"""Photographs are reduced until their longer side has about so many pixels for each cell; by a
-whole number, so that one and a half times as many may stay."""
+"""Pixels per grid cell, along the longer side, that photographs are reduced to. The factor is a
+whole number, so up to one and a half times as many pixels may remain."""
 
 _TIMED = 5
 """Steps that an estimate takes at least."""
@@ -56,13 +56,14 @@ _FEWEST = 0.1
 """Share of a stage's planned steps that is made however late it is."""
 
 _WORTHWHILE, _WORTHWHILE_ANEW = 30.0, 75.0
-"""Steps, or half of those that were planned, below which a later stage is left out: one that goes
-on from what the stage before it has found, as a refinement does, and one that begins with one
-albedo, as Monte Carlo does, and is worse than none before that is learned."""
+"""A later stage is left out where it would make fewer steps than this, or than half of its planned
+steps if that is less. The first number is for stages that continue the one before, as a refinement
+does; the second is for stages that start with a new albedo of one colour, as Monte Carlo does,
+whose result is worse than none until that albedo is learned."""
 
 _TO_COME_BACK = 1.2
-"""Times these steps, for which a stage that was left out is taken back: a stage that is on the edge
-does not come and go with every look."""
+"""A stage that was left out is taken back when it has this many times those steps, so that a stage
+at the limit does not come and go at every look."""
 
 _UNITS = {"s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
 _BYTES = {"mb": 1e6, "mib": 2.0**20, "gb": 1e9, "gib": 2.0**30}
@@ -157,10 +158,10 @@ def plan(
 ) -> Plan:
     """Choose the settings that a budget pays for.
 
-    The most that fits with the steps of its own, these then scaled to fill the time. Where not even
-    the lowest quality fits, the same of the first stage alone, unless ``overrides`` set something
-    of a later one: in two minutes the first stage alone gave better images, shapes and, but for
-    hard shadows, better relighting (docs/trade.md).
+    It takes the largest settings that fit with their own number of steps, and then scales the steps
+    to fill the time. If not even the lowest quality fits, it does the same with the first stage
+    alone, unless ``overrides`` set something of a later one: in two minutes the first stage alone
+    gave better images and shapes, and better relighting except for hard shadows (docs/trade.md).
 
     Parameters
     ----------
@@ -207,8 +208,8 @@ def plan(
     least = (waits + _SHORTEST * (chosen.seconds - waits)) / max(slowness, 1.0)
     if budget.seconds < least:
         raise TrainingError(
-            f"a budget of {budget.seconds:.0f} s is too short: with programs that are compiled, "
-            f"the least is about {least:.0f} s on idle cores"
+            f"a budget of {budget.seconds:.0f} s is too short: compilation included, a training "
+            f"takes at least about {least:.0f} s on idle cores"
         )
     config = with_steps(chosen.config, min(max(share, _SHORTEST), _LONGEST))
     return replace(chosen, config=config, seconds=expected_seconds(config, chosen.costs))

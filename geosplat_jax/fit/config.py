@@ -81,7 +81,8 @@ class Stage:
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")] = "stage"
     """How commands and files call it."""
     steps: Count = 500
-    """Optimiser steps. Half-lives and warm-ups are steps too and do not follow."""
+    """Optimiser steps. Half-lives and warm-ups are counted in steps, too, and are not changed along
+    with them."""
     batch_views: PositiveCount = 4
     """Full views per step."""
     half_life: Positive = 800.0
@@ -94,8 +95,8 @@ class Stage:
     light_knee: NonNegative = 0.5
     """Radiance above which the light's steps grow with its brightness; 0 is never."""
     light_pyramid: Annotated[float, Field(ge=0, le=1)] = 0.4
-    """Share of a step of the light that each level of its pyramid makes: regions then learn as one,
-    and single texels hold less noise. With 0 texels alone make steps."""
+    """Share of its own step that every level of the light's pyramid contributes: regions then learn
+    together, and single texels hold less noise. 0 turns the pyramid off."""
     transport: Annotated[TransportSettings, ANY_KIND] = SplitSumSettings()
     """How light arrives."""
     splats: Annotated[SplatSettings, ANY_KIND] = FaceSplatSettings()
@@ -174,18 +175,18 @@ class RunSettings:
     """What belongs to no part of the method."""
 
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
-    """Of every random choice; random streams tell no more seeds apart."""
+    """Seed of every random choice; random streams distinguish 2**32 seeds."""
     checkpoint_every: PositiveCount = 100
     """Steps between checkpoints."""
     preview_every: Count = 100
     """Steps between previews; 0 turns them off."""
     window: Annotated[float, Field(ge=0, le=1)] = 0.4
-    """Where a window around the object has at most this share of the photographs' pixels, training
-    looks at nothing else; 0 is never."""
+    """Training uses only a window around the object in every photograph if the window holds at most
+    this share of the pixels; 0 always uses whole photographs."""
     initial_light: NonNegative = 0.5
     """Radiance of every texel at the start."""
     smallest_light: NonNegative = 0.01
-    """Texels are kept at or above this."""
+    """Lower bound of the radiance of every texel of the light."""
 
 
 @settings
@@ -450,7 +451,7 @@ def parse_override(text: str) -> dict[str, Any]:
     name, equals, value = text.partition("=")
     name = name.strip()
     if not equals or not all(name.split(".")):
-        raise ValueError(f"an override reads section.field=value, got {text!r}")
+        raise ValueError(f"an override has the form section.field=value, got {text!r}")
     if name in LABELS:
         raise ValueError(f"{name} is chosen with {LABELS[name]}, not with --set")
     now = moved_setting(name)
@@ -560,15 +561,16 @@ def config_warnings(config: Config) -> list[str]:
             )
         if schedule.is_zero and stage.transport.is_radiometric:
             warnings.append(
-                f"stages.{stage.name}.transport.indirect=radiometric is never compared with what "
-                "is sent out, and surfaces may glow; set "
+                f"stages.{stage.name}.transport.indirect=radiometric learns radiance that no loss "
+                "compares with what the surface reflects, so surfaces may glow; set "
                 f"stages.{stage.name}.weights.radiometric=1"
             )
         has_other_points = not stage.splats.is_six_per_face or stage.vertex_fraction > 0
         if stage.transport.reads_faces and has_other_points:
             warnings.append(
-                f"stages.{stage.name}: splats of vertices belong to no face, so that surfaces "
-                f"which {stage.transport.blocked_light} finds are black; use splats of faces"
+                f"stages.{stage.name}: splats sampled at vertices belong to no face, so the "
+                f"surfaces that rays hit look black to {stage.transport.blocked_light}; use splats "
+                "of faces"
             )
         if stage.domain.uses_rays and stage.transport.blocked_light is None:
             warnings.append(
@@ -589,8 +591,8 @@ def _changes_of_blocked_light(config: Config) -> list[str]:
     traced = [stage for stage in config.active_stages if stage.transport.blocked_light]
     return [
         f"stages.{after.name}.transport.{after.transport.blocked_light} takes the place of "
-        f"stages.{before.name}.transport.{before.transport.blocked_light}: what that found of "
-        "light from blocked directions is dropped; set both alike"
+        f"stages.{before.name}.transport.{before.transport.blocked_light}: the indirect light that "
+        f"{before.name} learned, if any, is dropped; give both stages the same setting"
         for before, after in pairwise(traced)
         if before.transport.blocked_light != after.transport.blocked_light
     ]

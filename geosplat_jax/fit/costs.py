@@ -45,7 +45,7 @@ _FASTEST_CPU, _FASTEST_GPU = 0.2, 0.05
 of them (docs/devices.md)."""
 
 _STARTUP_SECONDS = {"first": 30.0, "next": 20.0}
-"""What stages wait for before their steps, programs being compiled: the first, and any other."""
+"""Seconds before the first step of the first stage, and of any other; they include compilation."""
 
 
 @dataclass(frozen=True)

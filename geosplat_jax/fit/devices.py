@@ -458,7 +458,7 @@ def choose_devices(count: int = 1) -> Devices:
     if len(there) < count:
         raise TrainingError(
             f"--devices {count}: this process has {len(there)} of kind {there[0].platform}; "
-            "ask for fewer (processors are divided only before jax computes anything)"
+            "ask for fewer (a CPU can be split into several devices only before jax first uses it)"
         )
     if count == 1 and jax.process_count() == 1:
         return ONE_DEVICE

@@ -142,7 +142,7 @@ def _require_own(path: Path, own: Path) -> None:
     others = sorted(file.name for file in path.iterdir() if file.name != _LOCK)
     if others:
         raise RunError(
-            f"{path} exists already and holds other files, {others[0]} for one; choose "
+            f"{path} exists already and holds other files, for example {others[0]}; choose "
             "an empty folder"
         )
 
@@ -386,7 +386,8 @@ class RunFolder:
             if name in record and record[name] != now[name]:
                 raise RunError(
                     f"{self._record_path} says that the run was trained on {record['scene']} with "
-                    f"{name} {record[name]}, not {now[name]}; take the same, or another folder"
+                    f"{name} {record[name]}, but now it has {now[name]}; take the same scene, read "
+                    "in the same way, or another folder"
                 )
 
     def amend(self, config: Config) -> None:

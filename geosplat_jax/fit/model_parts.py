@@ -112,7 +112,7 @@ class Shadows(Part):
     """Light that the surface blocks, by rays; without it stages use the split sum.
 
     Under one light a darker albedo explains the same photographs, and is wrong under any other. So
-    the surface decides: whether it blocks enough of an even sky's light from itself.
+    the surface decides: whether it blocks enough of a uniform sky's light from itself.
     """
 
     name, title = "shadows", "traced shadows"

@@ -365,8 +365,8 @@ def with_mesh(config: Config, mesh: str | Path | MeshSettings) -> Config:
     if isinstance(config.geometry, MeshSettings):
         if config.geometry.digest != named.digest:
             raise ValueError(
-                f"the settings start from {config.geometry.path}, and {named.path} is given beside "
-                "them; leave one of the two out"
+                f"the settings start from the mesh {config.geometry.path}, but {named.path} was "
+                "given as well; give only one of the two"
             )
         return config
     edge_pixels = _MESH_EDGES.get(config.quality, _MESH_EDGES["standard"])

@@ -136,13 +136,14 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
     initial: Literal["hull", "sphere", "random"] = "hull"
     """First surface: visual hull of the masks, a sphere, or noise (the paper)."""
     hollows: bool = True
-    """Carve what no mask shows, the inside of a bowl, from the visual hull, where the photographs
-    agree much better on the colours behind its surface."""
+    """Carve hollows that no mask can show, such as the inside of a bowl, out of the visual hull,
+    where the photographs agree much better on the colours behind its surface than on it."""
     band: Literal[0, 3, 5, 7] = 0
-    """Cells across in a band around the surface that hold values and follow it, so that memory and
-    time grow with its area; 0: all cells of the box."""
+    """Thickness, in cells, of a band around the surface. Only its cells hold values, and it follows
+    the surface, so that memory and time grow with the surface's area. 0: all cells of the box."""
     cubic: bool = False
-    """As many cells along every side, as the authors; else only as many as the box needs."""
+    """Use equally many cells along every side, as the authors do, and not only as many as the box
+    needs."""
     reach: Annotated[float, Field(ge=0, le=0.5)] = 0.5
     """A grid vertex moves by at most this share of a cell (the authors: 1/4)."""
     entropy_reduction: Literal["mean", "sum"] = "mean"

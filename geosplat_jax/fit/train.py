@@ -63,7 +63,7 @@ class _StopRequest:
         only when a compilation or a step is over.
     """
 
-    notice = "stopping after this step; Ctrl-C once more stops at once"
+    notice = "stopping after this step; press Ctrl-C again to stop at once"
 
     def __init__(self) -> None:
         self.was_made = False
@@ -213,7 +213,7 @@ def fit(
         After Ctrl-C or SIGTERM; the run can be resumed.
     """
     if pacer is not None and jax.process_count() > 1:
-        raise ValueError("a budget is kept by one clock; leave it out on several hosts")
+        raise ValueError("a time budget works on one host only; leave it out on several hosts")
     run = RunFolder(folder)
     writes = devices.is_first_host
     with ExitStack() as held:
@@ -310,8 +310,8 @@ def _require_same(devices: Devices, different: list[str]) -> None:
     if devices.any_host(bool(different)):
         what = ", ".join(different) or "see the other hosts"
         raise TrainingError(
-            f"the hosts do not train the same ({what}); call all of them alike, on a file system "
-            "that they share"
+            f"the hosts were given different things ({what}); start all of them with the same "
+            "command, on a file system that they share"
         )
 
 

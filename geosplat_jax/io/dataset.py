@@ -73,8 +73,8 @@ _NARROW_DEG = 20.0
 _COARSE_PIXELS = 256
 _COARSE_VIEWS = 16
 _NEEDS_MASKS = (
-    "training and evaluation need to know the object from the rest: write RGBA images, name a "
-    "mask_path for each frame, or add masks/NAME.png, white on the object (docs/captures.md)"
+    "training and evaluation need to tell the object from the background: write RGBA images, name "
+    "a mask_path for each frame, or add masks/NAME.png, white on the object (docs/captures.md)"
 )
 
 

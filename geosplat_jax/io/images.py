@@ -472,9 +472,9 @@ _BRIGHTEST = 1e12
 
 def _require_radiance(pixels: np.ndarray, path: Path) -> None:
     _require_finite(pixels, path)
-    negative = "light never is: clip it, or check the filter that made it"
+    negative = "light cannot be negative: clip it, or check the filter that made it"
     _require_none(pixels < 0.0, pixels, path, "that are negative", negative)
-    bright = "no light is so bright: render or convert it again"
+    bright = "no real light is that bright: render or convert it again"
     _require_none(pixels > _BRIGHTEST, pixels, path, f"above {_BRIGHTEST:g}", bright)
 
 

@@ -132,7 +132,9 @@ def _checked_distortion(values: Mapping[str, Any], where: str) -> Distortion | N
     """Return what bends a lens, None where nothing does."""
     other = [key for key in _OTHER_PROJECTIONS if values.get(key)]
     if other:
-        raise SceneError(f"{where} has {other[0]}, a camera that is no lens; render pinhole images")
+        raise SceneError(
+            f"{where} has {other[0]}, a projection that is not supported; render pinhole images"
+        )
     model = values.get("camera_model")
     if model is None:
         model = "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV"

@@ -86,8 +86,8 @@ def load_views(
     _require_masks_in_all_or_none(frames, has_mask)
     if listing.is_capture and leaves_file.any():
         problems.append(
-            f"{int(leaves_file.sum())} mask files are not read: their images have an alpha, "
-            f"{frames[int(np.argmax(leaves_file))].image.name} for one"
+            f"{int(leaves_file.sum())} mask files are ignored because their images have an alpha "
+            f"channel, for example {frames[int(np.argmax(leaves_file))].image.name}"
         )
     problems += _even_views(frames, is_even)
     marks = Marks.of(valid, height, width)
@@ -127,15 +127,15 @@ def _other_shapes(frames: Sequence[Frame], full: Sequence[tuple[int, int]]) -> l
             turned += fits(width, height, lens.height, lens.width)
     if not other:
         return []
-    cure = "where images were cropped, give the lens that they have now"
+    cure = "if the images were cropped, give the intrinsics of the cropped images"
     if turned == len(other):
         cure = (
-            "they lie on their side, as EXIF may say of them: store them turned, or find the "
+            "they are stored on their side (EXIF orientation): store them upright, or find the "
             "cameras of the images as they are stored"
         )
     return [
-        f"{len(other)} images are of another shape than their lens, which is squeezed to fit, "
-        f"{other[0]} for one; {cure}"
+        f"the width and height of {len(other)} images are not in proportion to those of their "
+        f"intrinsics, which are stretched to fit, for example {other[0]}; {cure}"
     ]
 
 
@@ -237,8 +237,8 @@ def _size_problems(
     if len(kinds) > 1:
         height, width = np.max(full, axis=0)
         problems.append(
-            f"images of {len(kinds)} sizes lie on a canvas of {width} x {height}; what is beside "
-            "them does not count"
+            f"images of {len(kinds)} sizes are padded to {width} x {height} pixels; the padding is "
+            "ignored"
         )
     cut = [(height, width) for height, width in kinds if height % factor or width % factor]
     problems += [
@@ -267,8 +267,8 @@ def _require_distinct(names: Sequence[str]) -> None:
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise SceneError(
-            f"{len(twice)} image names stand for several views of a split, the first "
-            f"{twice[0]!r}; rename the files, folders do not tell them apart"
+            f"{len(twice)} image names occur more than once in a split, the first {twice[0]!r}; "
+            "rename the files: the folders they lie in are not part of the name"
         )
 
 

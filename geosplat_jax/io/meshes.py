@@ -89,8 +89,8 @@ def read_mesh(
         said = f"{path} cannot be read as a mesh: {problem}"
         if Path(path).suffix.lower() == ".ply":
             said += (
-                "; of binary PLY only faces of one number of corners are read: export triangles, "
-                "or OBJ"
+                "; binary PLY can be read only if all faces have the same number of corners: "
+                "export triangles, or OBJ"
             )
         raise ValueError(said) from problem
     mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded

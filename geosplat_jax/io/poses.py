@@ -179,8 +179,8 @@ def _photographs(root: Path) -> list[str]:
         inside_scene(root, (folder / name).relative_to(root).as_posix(), folder)
     if len(names) < _FEWEST:
         raise PoseError(
-            f"{folder} has {len(names)} photographs ({', '.join(sorted(suffixes))}); cameras take "
-            f"{_FEWEST} at least, and a good reconstruction some 50"
+            f"{folder} has {len(names)} photographs ({', '.join(sorted(suffixes))}); finding "
+            f"cameras takes at least {_FEWEST}, and a good reconstruction about 50"
         )
     unlisted = [name for name in names if name.startswith("#") or len(name.split()) != 1]
     if unlisted:

@@ -169,10 +169,10 @@ def _cleaned(mesh: StartMesh, path: str) -> StartMesh:
         raise ValueError(f"{path} must hold a triangle mesh, found no triangle with an area in it")
     used, rows = np.unique(faces, return_inverse=True)
     counts = {
-        "corners at the place of others joined": joined,
+        "duplicate vertices merged": joined,
         "faces without area dropped": given - with_area,
-        "faces that were there twice dropped": with_area - len(faces),
-        "vertices without faces dropped": unused + len(vertices) - len(used),
+        "duplicate faces dropped": with_area - len(faces),
+        "unused vertices dropped": unused + len(vertices) - len(used),
     }
     notes = [f"{count} {what}" for what, count in counts.items() if count]
     faces = rows.reshape(-1, 3).astype(np.int32)
@@ -252,9 +252,9 @@ def _outward(mesh: StartMesh) -> StartMesh:
     if not mesh.is_closed:
         faces, left = _wound_alike(mesh.faces)
         if not np.array_equal(faces, mesh.faces):
-            mesh = mesh.noting("its faces were wound against each other; now alike", faces=faces)
+            mesh = mesh.noting("its faces were wound inconsistently; now alike", faces=faces)
         if left:
-            mesh = mesh.noting(f"{left} faces are of bands that have one side only")
+            mesh = mesh.noting(f"{left} faces belong to one-sided (Moebius) bands")
         if not mesh.is_closed:
             return mesh
     if signed_volume(mesh.vertices, mesh.faces) < 0:
@@ -358,17 +358,17 @@ def require_in_views(mesh: StartMesh, views: Views, path: str) -> None:
     best = max(scaled, key=lambda factor: scaled[factor])
     advice = "bring it into the axes, the place and the units of the cameras"
     if scaled[best] >= max(_AGREES, 2 * found):
-        advice = f"{best:g} times as large it would (agreement {scaled[best]:.2f}): are its units "
-        advice += "others than the cameras'? Scale the file"
+        advice = f"it would fit if it were {best:g} times as large (agreement {scaled[best]:.2f}): "
+        advice += "if its units are not those of the cameras, scale the file"
     turned = agreement_with_views(from_y_up(points), views)
     if turned >= max(_AGREES, 2 * found):
-        advice = f"turned from y-up axes to z-up ones it would (agreement {turned:.2f}): write "
+        advice = f"it would fit if it were turned to have z up (agreement {turned:.2f}): write "
         advice += "it with z up, or as glTF, whose axes are known"
     size = ", ".join(f"{extent:.3g}" for extent in np.ptp(mesh.vertices, axis=0))
     middle = ", ".join(f"{x:.3g}" for x in 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0)))
     raise ValueError(
         f"{path} is not where the cameras see the object (agreement {found:.2f} of 1, at least "
-        f"{_AGREES}): it is {size} large, around ({middle}). {advice}"
+        f"{_AGREES} is needed): its extent is ({size}), its centre ({middle}); {advice}"
     )
 
 

@@ -297,7 +297,7 @@ def report_html(runs: Sequence[Evaluated]) -> str:
     fixed = sum(len(text.encode()) for text in scripts.values())
     room = (LARGEST_PAGE - fixed) // len(runs) - _TEXT_BYTES
     if room < 0:
-        raise ValueError(f"a report holds fewer runs than {len(runs)}; compare some of them")
+        raise ValueError(f"{len(runs)} runs do not fit into one report; compare fewer of them")
     described = []
     for run, name in zip(runs, _names(runs), strict=True):
         try:

@@ -187,10 +187,10 @@ class Cameras:
         else:
             views = getattr(dataset, self.views)
             if not len(views):
-                other = " --views train for those of the training," if self.views == "test" else ""
+                other = " --views train for the training views," if self.views == "test" else ""
                 raise RunError(
-                    f"{dataset.root} has no {self.views} views; take{other} --cameras FILE or, "
-                    "with either, --turntable N"
+                    f"{dataset.root} has no {self.views} views; use{other} --cameras FILE, or "
+                    "either of them with --turntable N"
                 )
             shots = shots_of(views)
         if self.turntable:

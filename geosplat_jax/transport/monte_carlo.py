@@ -47,8 +47,8 @@ class MonteCarloSettings(SampledSettings, TransportSettings, kind="monte_carlo")
     bounces: Annotated[int, Field(ge=1, le=16)] = 1
     """For traced indirect light, how often light goes from surface to surface."""
     radiometric_gradient: Literal["learned", "both"] = "learned"
-    """For radiometric indirect light, what the term of the loss moves: the radiance that was
-    learned, or what it is compared with as well."""
+    """For radiometric indirect light, where the gradient of its loss goes: to the learned radiance
+    only, or also to the radiance that it is compared with."""
 
     @property
     def is_radiometric(self) -> bool:

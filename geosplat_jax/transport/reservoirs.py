@@ -61,10 +61,10 @@ class ReservoirSettings:
     """How the samples of the light are chosen; off by default."""
 
     candidates: Annotated[int, Field(ge=0, le=1024)] = 0
-    """Directions drawn for every sample of the light, of which one is kept; with 0 samples are
-    plain, and nothing is used again."""
+    """Candidate directions drawn for every sample of the light, of which one is kept; 0 turns
+    reservoirs off: samples are plain, and none is reused."""
     reuse_steps: bool = False
-    """Offer what a place kept in the step before."""
+    """Whether a point may reuse the sample that its place on the surface kept in the last step."""
     neighbors: Annotated[int, Field(ge=0, le=8)] = 0
     """Points nearby whose samples of the same step are offered as well."""
     visibility: Literal["ignored", "traced", "assumed"] = "ignored"
@@ -73,11 +73,12 @@ class ReservoirSettings:
     while the surface stands still. Assumed: blocked ones are dropped without asking, which makes
     the edges of shadows darker."""
     confidence: Positive = 20.0
-    """What was kept counts at most so many times as much as a step's own candidates."""
+    """How much a sample kept from earlier steps may count, as a multiple of the step's own
+    candidates."""
     slots: PositiveCount = 65_536
-    """Size of the table from step to step."""
+    """Entries of the table that carries samples from one step to the next."""
     smallest_cosine: Share = 0.5
-    """Between the normals of points that use each other's samples."""
+    """Smallest cosine between the normals of two points that may share samples."""
 
     @property
     def drops_blocked(self) -> bool:

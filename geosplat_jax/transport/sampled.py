@@ -80,8 +80,8 @@ class SampledSettings:
     specular_count: SampleCount = 4
     """Samples of the visible microfacet normals per point, for the specular lobe."""
     residual_count: SampleCount = 0
-    """Samples of each kind of a second image, from which Eq. 13 takes its residual; with 0 it takes
-    that of the image that it differentiates, which biases the gradient."""
+    """Samples of each kind for a second image, from which the residual of Eq. 13 is taken. With 0
+    there is none, and the residual of the differentiated image itself biases the gradient."""
     shares_views: bool = True
     """All views of a batch use the same samples of light and cosine, which are then traced once.
     The noise of the images is then correlated between views; its mean is the same."""
