@@ -411,6 +411,16 @@ def write_plots(
     return paths
 
 
+_LEGEND = (
+    "Arrows point in the direction that is better. *nvs* are test views under the light of the "
+    "training, *relight* those under other lights, and *light* is the recovered environment map. "
+    "Seconds are those of a stage with its compilation; the time of a step is the median. Memory "
+    "is the largest that the training process used; it is smaller for runs that took over the "
+    "first stages of another run."
+)
+"""What stands below the tables of the scenes."""
+
+
 def _describe_runs(sweep: dict[str, Any]) -> list[str]:
     """Say what every run changes, and where its evaluation is not that of the reference."""
     usual = sweep["runs"][0]["evaluate"]
@@ -427,11 +437,14 @@ def _describe_runs(sweep: dict[str, Any]) -> list[str]:
     lines = _table(rows)
     lines[1] = "| --- | --- | --- |"
     common = ", ".join(f"`{override}`" for override in sweep["overrides"])
-    start = f"Preset {sweep['preset']}, quality {sweep['quality']}, material prior "
-    start += f"{sweep['material_prior']}, images "
-    start += f"reduced by {sweep['downscale']}, " if sweep["downscale"] > 1 else "as they are, "
-    start += f"{usual['samples']} samples for evaluation, protocol {usual['protocol']}"
-    return [start + (f"; all runs: {common}." if common else "."), "", *lines]
+    reduced = sweep["downscale"] > 1
+    images = f"images reduced by {sweep['downscale']}" if reduced else "full-size images"
+    start = f"All runs have the preset `{sweep['preset']}`, quality `{sweep['quality']}`, the "
+    start += f"material prior `{sweep['material_prior']}` and {images}"
+    start += f", and the settings {common}. " if common else ". "
+    start += f"They are evaluated with {usual['samples']} samples by the protocol "
+    start += f"`{usual['protocol']}`. PSNR is in dB, errors of normals in degrees."
+    return [start, "", *lines]
 
 
 def problems(sweep: dict[str, Any], entries: dict[str, dict[str, Entry]]) -> list[str]:
@@ -488,18 +501,14 @@ def compose(
         lines += [
             "## Seeds",
             "",
-            f"Means over {len(others) + 1} seeds, and how far these are apart ",
+            f"Means over {len(others) + 1} seeds and their standard deviations, as above, ",
         ]
-        lines[-1] += "(standard deviation): as above, but for the costs."
+        lines[-1] += "without the costs."
         lines.append("")
         lines += [*seed_table(sweep, [entries, *others]), ""]
     for scene, runs in entries.items():
         lines += [f"## {scene}", "", *scene_table(sweep, runs), ""]
-    lines += [
-        "Arrows point to the better side. Seconds are those of a stage with its compilation; "
-    ]
-    lines[-1] += "that of a step is the median. Memory is the training process's largest, which "
-    lines[-1] += "is less where a run took over its first stages."
+    lines.append(_LEGEND)
     lines.append("")
     if plots:
         lines += ["## Curves", "", *(f"![{Path(link).stem}]({link})" for link in plots), ""]
