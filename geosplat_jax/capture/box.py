@@ -1,4 +1,4 @@
-"""Where the object is: a box around the largest cluster of splats that all cameras look at.
+"""The box around the object: the largest cluster of splats that the cameras look at.
 
 What it stands on is left out: the plane that holds many of the splats, with the rest of them and
 the cameras on one side. Everything here is NumPy in float64 and does not depend on the world's

@@ -1,4 +1,4 @@
-"""Training of splats that carry their own colour, one view a step, in a folder that can be resumed.
+"""Training of splats that carry their own colour, one view per step, with resume.
 
 ::
 

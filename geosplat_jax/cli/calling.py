@@ -1,4 +1,4 @@
-"""A call of the command: which part of it runs, and what becomes of its errors."""
+"""A call of the command: which part of it runs, and how its errors are reported."""
 
 import warnings
 

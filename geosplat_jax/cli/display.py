@@ -1,4 +1,4 @@
-"""What a terminal or a log file sees of a command that runs."""
+"""What a command prints to a terminal or a log file while it runs."""
 
 import time
 from dataclasses import asdict

@@ -1,4 +1,4 @@
-"""Ctrl-C ends a command within seconds, also while Python waits for a compiler and cannot notice.
+"""Ctrl-C ends a command within seconds, even while Python waits for a compiler.
 
 Nothing of the package is imported here: this module has to be there before all others.
 """

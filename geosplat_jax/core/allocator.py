@@ -1,4 +1,4 @@
-"""What the memory allocator of this process does with freed memory.
+"""How the memory allocator of this process treats freed memory.
 
 Light, so that a command can set it before it imports or starts anything. Only commands and
 benchmarks call `retain_freed_memory`: a library must not change its host process.

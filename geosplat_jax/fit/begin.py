@@ -1,4 +1,4 @@
-"""How a run begins in its folder: anew, where it was left, or with stages of another run."""
+"""How a run begins in its folder: anew, resumed, or with stages of another run."""
 
 from dataclasses import dataclass, field
 from pathlib import Path

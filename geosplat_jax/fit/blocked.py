@@ -1,4 +1,4 @@
-"""How much light an object keeps from itself: what photographs under one light cannot tell."""
+"""How much light an object blocks from itself, which decides whether shadows are needed."""
 
 from functools import partial
 from typing import Any

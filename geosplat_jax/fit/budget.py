@@ -1,4 +1,4 @@
-"""A training that ends when it should: settings chosen for a time, and a pace that keeps to it.
+"""Training within a time budget: the choice of settings, and a pacer that adapts the steps.
 
 `plan` picks settings between the quality levels by what they are expected to cost on this machine.
 `Pacer` measures the steps while they are made, and makes what is left of every stage shorter or

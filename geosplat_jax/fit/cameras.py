@@ -1,4 +1,4 @@
-"""Cameras refined against what was trained: pose, focal length and colour of every view.
+"""Refinement of cameras against a trained asset: pose, focal length and exposure of each view.
 
 The asset and its light stay as they are, so views are independent of each other: eight parameters
 each (ten with white balance), found by Levenberg-Marquardt from the difference of render and

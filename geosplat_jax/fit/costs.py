@@ -1,4 +1,4 @@
-"""What a training costs: seconds of a step and memory, from its settings, on this machine.
+"""Cost model of a training: seconds per step and memory, from its settings, on this machine.
 
 The model is a sum of terms, each a count of work times a constant that runs were fitted to
 (`experiments/studies/costs.py`, by optimistix). How fast this machine is, a kernel tells whose time

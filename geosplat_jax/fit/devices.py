@@ -1,4 +1,4 @@
-"""The devices that a training computes on: one, or several that share the views of every step.
+"""The devices that a training computes on: one, or several that share the views of each step.
 
 With several, each device holds all parameters and makes the whole asset, since that costs no
 communication; the views of a batch are dealt out, and two sums go over the devices in a step: which

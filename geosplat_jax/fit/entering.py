@@ -1,4 +1,4 @@
-"""Where parameters begin: a training that goes on from another one, and every stage."""
+"""The first parameters of a training, and of each of its stages."""
 
 import abc
 from dataclasses import replace

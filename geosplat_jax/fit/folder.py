@@ -1,4 +1,4 @@
-"""The folder of a run: what lies where, who may write, what survives an interruption.
+"""The folder of a run: its files, its lock, and what survives an interruption.
 
 ::
 

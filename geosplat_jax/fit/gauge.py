@@ -1,4 +1,4 @@
-"""Two sets of cameras of the same views, compared: what differs, and what no photograph tells.
+"""Comparison of two sets of cameras, up to what no photograph can determine.
 
 Where the object is in the world, which way it is turned, and how large it is, photographs leave
 open: cameras that all move with it see the same. That freedom, the gauge, is taken away by the

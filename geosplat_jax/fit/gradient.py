@@ -1,4 +1,4 @@
-"""The gradient of the loss from its parts: programs that do not grow with the number of views.
+"""The gradient of the loss, part by part: programs that do not grow with the number of views.
 
 The chain rule is written out here between compiled programs: the asset, what a view sees, the
 light, the loss of one view, and the way back. That of a view is called once for every view. So a

@@ -1,4 +1,4 @@
-"""Who is told how a training goes: displays, tables, previews, tests."""
+"""The interface of whatever follows a training: displays, tables, previews, tests."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""The memory that a training is certain to take, known from its settings before anything is spent.
+"""Lower bound of a training's memory, computed from its settings before anything is spent.
 
 What is counted has a known size: the photographs, the views of a step, the learned numbers with
 what Adam keeps of them, constants of the light transport, the points of the smoothness terms, and

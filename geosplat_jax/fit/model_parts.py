@@ -1,4 +1,4 @@
-"""The parts of a model that a scene may not need, and how each is left out of the settings.
+"""The optional parts of a model, and how each is removed from the settings.
 
 The settings of a run describe its largest model. Every `Part` knows how to take itself out, so
 that a smaller model is `without` some of them; what is left out has no parameters and is not

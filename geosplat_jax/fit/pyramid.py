@@ -1,4 +1,4 @@
-"""The light learns in a pyramid: steps of whole regions beside those of single texels.
+"""The light's pyramid: whole regions of the light learn together, besides single texels.
 
 Adam moves every texel of a light by its rate at most, whatever the gradient is. What all texels of
 a sky agree on is then learned no faster than the noise of a single one, and noise is all that

@@ -1,4 +1,4 @@
-"""The stage that comes next is planned and compiled while the present one trains."""
+"""Planning and compilation of the next stage while the present one trains."""
 
 from concurrent.futures import wait
 from dataclasses import dataclass, replace

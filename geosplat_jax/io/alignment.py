@@ -1,4 +1,4 @@
-"""A world for a capture: z up, the object at the origin, cameras at distance one.
+"""A coordinate system for a capture: z up, the object at the origin, cameras at distance one.
 
 Photographs alone leave open where the object is, how large it is, and which way is up. People hold
 cameras level, so the cameras' x axes lie in the ground's plane; what they look at is the object.

@@ -1,4 +1,4 @@
-"""A simpler mesh that looks like a fine one: fewer faces, and a map of the normals they lost."""
+"""Mesh decimation, and a normal map with the detail that the smaller mesh has lost."""
 
 import importlib
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Refined cameras as a file: written whole, checked on the way in, put in the place of a scene's.
+"""Files of refined cameras: written, checked when read, and used instead of a scene's cameras.
 
 ::
 

@@ -1,4 +1,4 @@
-"""Scenes in memory: one type for every layout, found out by itself and checked on the way in."""
+"""Scenes in memory: one type for all layouts, which are recognised automatically and checked."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

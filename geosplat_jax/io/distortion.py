@@ -1,4 +1,4 @@
-"""Bent lenses: a photograph, resampled to what a pinhole would have seen.
+"""Lens distortion: photographs resampled to the images of a pinhole camera.
 
 Points are given on the plane z = 1 of the camera, OpenCV axes: x = X / Z, y = Y / Z. A model says
 where the lens shows such a point, which is all that undistorting an image takes. The polynomials of

@@ -1,4 +1,4 @@
-"""JSON that others wrote: whatever it holds, reading it fails with one line."""
+"""JSON files written by other programs: any fault in them becomes an error of one line."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""What every dataset layout is reduced to before a pixel is read: lists of frames, checked.
+"""Lists of frames, to which every dataset layout is reduced before any pixel is read.
 
 A layout reader returns a `Listing`: for each view its pose, its lens and which files hold what.
 Here live the checks that all layouts share: JSON, keys, poses, and paths that must stay inside the

@@ -1,4 +1,4 @@
-"""Frames of a dataset become views: all images are read, reduced and checked against each other."""
+"""Loading of a split's images into views: read, reduced, and checked against each other."""
 
 from collections import Counter
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Many photographs in little memory: the numbers of their files, decoded view by view.
+"""Photographs in little memory: kept as the numbers of their files, decoded view by view.
 
 Of every photograph the rectangle is kept that is not empty. A photograph of 8 or 16 bits that is
 neither reduced nor undistorted keeps the numbers of its file, any other one floats, so nothing is

@@ -1,4 +1,4 @@
-"""Libraries that print their own lines beside the errors that they report."""
+"""Silence for libraries that print lines of their own beside the errors that they report."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""One photograph from its files: image, mask, what counts, as a pinhole sees it, and reduced."""
+"""Reading of one photograph: image, mask and valid pixels, undistorted and reduced."""
 
 import os
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The mesh that a training starts from: read, cleaned, compared with the cameras, sized for them.
+"""The mesh that a training starts from: read, cleaned, checked against the views, and resampled.
 
 Whatever is changed is said in a note; what cannot be right is refused with what to do about it.
 """

@@ -1,4 +1,4 @@
-"""Windows of photographs: training looks at the part around the object, so borders cost nothing."""
+"""Windows of photographs: training uses only the part around the object."""
 
 from dataclasses import replace
 

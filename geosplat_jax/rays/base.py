@@ -1,4 +1,4 @@
-"""What a transport asks of a surface: does a ray hit it, and where first."""
+"""The interface of ray queries on a surface: occlusion, and the nearest hit."""
 
 import abc
 

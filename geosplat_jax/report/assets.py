@@ -1,4 +1,4 @@
-"""What leaves the program: textured mesh, Gaussians and light of trained parameters.
+"""Assets for other programs: textured mesh, Gaussians and light of trained parameters.
 
 Host side, around the jitted stages; `io.export` and `io.meshes` know the file formats.
 """

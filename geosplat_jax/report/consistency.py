@@ -1,4 +1,4 @@
-"""How well splats stand for the mesh that they were sampled from (appendix B.3, Table 5).
+"""How well splats match the mesh that they were sampled from (appendix B.3, Table 5).
 
 For every pixel whose ray meets the mesh from outside, two things are compared with what the splats
 show there:

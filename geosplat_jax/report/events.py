@@ -1,4 +1,4 @@
-"""A run as TensorBoard's event files: scalars of every step, and the previews, while it trains."""
+"""TensorBoard event files: the scalars of every step and the previews, during training."""
 
 import importlib
 import json

@@ -1,4 +1,4 @@
-"""What the report says of a run in words and numbers; knows the files of a run, and no JAX.
+"""Facts about a run for the report, in words and numbers; reads its files, without JAX.
 
 Names and units of figures, times of the stages, settings that differ from the preset, and the
 command that repeats the training.

@@ -1,4 +1,4 @@
-"""Metrics of a recovered environment light beside the true one, as pure functions on the host."""
+"""Metrics of a recovered environment light against the true one, as pure functions."""
 
 import jax.numpy as jnp
 import numpy as np

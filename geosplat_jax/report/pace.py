@@ -1,4 +1,4 @@
-"""Progress of long work: who counts, who listens, and a time left that can be believed."""
+"""Progress of long computations: counting, reporting, and the estimated time left."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence

@@ -1,4 +1,4 @@
-"""``report.html``: what a run, or several, found, as one file that opens anywhere.
+"""``report.html``: the results of one run, or of several, in one self-contained file.
 
 Made of files that training and evaluation left, with no computation of its own. Everything is
 embedded, the scripts in ``web/`` too; a policy in the page forbids the browser any access to the

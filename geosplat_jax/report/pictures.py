@@ -1,4 +1,4 @@
-"""Pictures to look at: normals in colour, clay previews, and the overview sheet of a run.
+"""Pictures for people: normals as colours, clay previews, and the overview sheet of a run.
 
 Pictures are display-referred float32 in [0, 1], (H, W, 3), ready for `io.images.write_png`.
 """

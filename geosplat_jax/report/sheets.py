@@ -1,4 +1,4 @@
-"""Sheets of an evaluation: truth first, what was found beside it, errors, lights and scales."""
+"""Sheets of an evaluation: truth, reconstruction, errors, lights and colour scales."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

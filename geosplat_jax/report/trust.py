@@ -1,4 +1,4 @@
-"""What of a surface can be trusted: how many training views see each place of it."""
+"""Which parts of a surface can be trusted: how many training views see each place of it."""
 
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,4 +1,4 @@
-"""What the method asks of a surface: a mesh, its penalties, and a way for rays to find it."""
+"""The interface of a surface: a mesh, its penalties, and an index for rays."""
 
 import abc
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""What photographs show at points of a solid on a grid: who sees a point, and in which colours.
+"""Which views see the points of a solid on a grid, and in which colours.
 
 Lengths are cells of the grid, from its origin. All of it is host-side preparation and not
 differentiable.

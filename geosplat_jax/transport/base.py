@@ -1,4 +1,4 @@
-"""How light reaches the points of a surface and leaves them towards a viewer: one interface.
+"""The interface of light transport: how light reaches surface points and leaves them.
 
 `Transport.prepare` computes what all views share, and `Transport.shade` shades points towards their
 viewers. The points are splats or pixels, as the renderer's `ShadingDomain` decides. Tables that a

@@ -1,4 +1,4 @@
-"""The light that a point reflects, from samples: sums of Monte Carlo integration.
+"""Monte Carlo estimators of the light that a point reflects.
 
 ``L_o = integral of f_r(wi, wo) L_i(wi) max(n.wi, 0) over wi`` with ``L_i`` the environment where
 nothing is in the way, and indirect light elsewhere (Eq. 20). The two lobes are integrated apart:

@@ -1,4 +1,4 @@
-"""Light that arrives from directions in which the surface itself is in the way.
+"""Indirect light: what arrives from directions that the surface itself blocks.
 
 Each model is a class:
 

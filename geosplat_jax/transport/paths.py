@@ -1,4 +1,4 @@
-"""Light that reaches a point by way of other surfaces, by following paths of any length.
+"""Indirect light by path tracing over any number of bounces (appendix I).
 
 `monte_carlo` samples the light that arrives at a point; where the surface is in the way, a ray goes
 on from there. At every later vertex of its path one direction is drawn towards the environment and

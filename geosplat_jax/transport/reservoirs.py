@@ -1,4 +1,4 @@
-"""Samples of the light that are chosen from many, and used again: weighted reservoir sampling.
+"""Weighted reservoir sampling: samples of the light, chosen from candidates and reused.
 
 A point draws several directions towards the light and keeps one with a probability in proportion to
 its *target*, the brightness of the sky there times the cosine (resampled importance sampling,

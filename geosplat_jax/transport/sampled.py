@@ -1,4 +1,4 @@
-"""What transports by samples of light and lobes have in common; see `estimators`."""
+"""What all transports that draw samples have in common; see `estimators`."""
 
 from dataclasses import replace
 from typing import Annotated, Any

@@ -1,4 +1,4 @@
-"""Directions in which a point looks for light: drawn by importance, and traced; no gradients.
+"""Sampling of light directions by importance, and tracing of these directions; no gradients.
 
 All samples are of low discrepancy. Memory is bounded by chunks of points (`in_chunks`),
 but for paths (`paths`), whose later vertices are kept for all rays of a call.

@@ -1,1 +1,1 @@
-"""A run to look at in a browser, with the program's own renderer, also while it trains."""
+"""The viewer: a run in a browser, drawn by the program's own renderer, also during training."""

@@ -1,4 +1,4 @@
-"""What somebody looks at, and how good the next picture of it should be. No renderer, no server."""
+"""What the viewer shows, and how good its next picture should be. No renderer, no server."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Pictures of a run as somebody wants to see it, drawn by the program's own renderer."""
+"""The pictures of the viewer, drawn by the program's own renderer."""
 
 import math
 import tempfile

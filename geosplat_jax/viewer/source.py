@@ -1,4 +1,4 @@
-"""Where a viewer's run and lights come from: checkpoints, read again as they appear, and files."""
+"""The viewer's run and lights: checkpoints, read again as they appear, and light files."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""TensoIR: a folder a view, with one image a light and ground truth of the test views.
+"""TensoIR: one folder per view, with one image per light and ground truth of the test views.
 
 ``{train,test}_NNN/`` hold ``metadata.json``, ``rgba_<light>.png`` (sRGB, straight alpha) and, on
 test views, ``albedo.png`` (linear values), ``normal.png`` (n = 2v - 1, world, z-up) and, where the
