@@ -35,6 +35,7 @@ from geosplat_jax.fit.model_parts import LADDER, Part, offered_parts, without
 from geosplat_jax.fit.train import TrainingError, fit, load_trained
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.documents import parse_json
+from geosplat_jax.io.images import written_aside
 from geosplat_jax.io.views import Views, some_views
 from geosplat_jax.report.renderer import Renderer, photograph_on_white, render_on_white
 
@@ -363,8 +364,6 @@ class _Trials:
 
     def _save(self, mark: str) -> None:
         """Write what was measured, in one go."""
-        path = self.state_path
-        aside = path.with_suffix(".partial")
         state = {
             "mark": mark,
             "held_back": list(self.held.names),
@@ -373,8 +372,8 @@ class _Trials:
             "trainings": self._measured,
             "blocked": self._blocked,
         }
-        aside.write_text(json.dumps(state, indent=2) + "\n", encoding="utf-8")
-        os.replace(aside, path)
+        with written_aside(self.state_path) as aside:
+            aside.write_text(json.dumps(state, indent=2) + "\n", encoding="utf-8")
 
     def decibels(self, kept: Collection[str], seed: int) -> np.ndarray:
         """Return how well a model explains every held-back view, trained once.
