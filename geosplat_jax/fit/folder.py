@@ -17,6 +17,7 @@
 import csv
 import importlib.metadata
 import json
+import os
 import platform
 import shutil
 from collections.abc import Iterable, Iterator
@@ -102,6 +103,12 @@ def _parsed(path: Path) -> Any:
         return parse_json(path.read_bytes())
     except ValueError as error:
         raise RunError(f"{path} is damaged: {error}") from None
+
+
+def folder_beside(output: str | Path, purpose: str) -> Path:
+    """Return the folder ``OUTPUT_PURPOSE`` beside that of a run, as an absolute path."""
+    path = Path(os.path.abspath(Path(output).expanduser()))
+    return path.with_name(f"{path.name}_{purpose}")
 
 
 @contextmanager

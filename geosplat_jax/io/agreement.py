@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import maximum_filter
 
+from geosplat_jax.core.types import Bounds
 from geosplat_jax.io.views import Views
 from geosplat_jax.surface.hollows import hollow_candidates
 from geosplat_jax.surface.hull import fit_grid, hull_sdf
@@ -32,8 +33,6 @@ not carve the hull of all others away."""
 
 _CELLS = 32
 """Along the longest side of the grid in which hollows are looked for."""
-
-Bounds = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
 
 
 def agreement(views: Views, bounds: Bounds) -> Float[np.ndarray, " V"]:

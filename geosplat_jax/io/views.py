@@ -6,7 +6,7 @@ are read when first asked for (`truth`): they are many, and training never touch
 """
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -208,6 +208,11 @@ def some_views(views: Views, chosen: Sequence[int] | np.ndarray, *, factor: int 
         relight={},
         lights={},
     )
+
+
+def point_text(point: Iterable[float]) -> str:
+    """Write a place or an extent in the world for a reader, with four digits."""
+    return "(" + ", ".join(f"{value:.4g}" for value in point) + ")"
 
 
 def _reduced(

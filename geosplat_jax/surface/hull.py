@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.ndimage import distance_transform_edt
 
-from geosplat_jax.core.types import Grid
+from geosplat_jax.core.types import Bounds, Grid
 
 TOLERANCE = 0.02
 """Fraction of the views whose mask may miss a point of the object."""
@@ -106,7 +106,7 @@ def hull_bounds(
     margin: float = 0.02,
     tolerance: float = TOLERANCE,
     seen_fraction: float = SEEN_FRACTION,
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+) -> Bounds:
     """Find the box around the hull, wherever in the world the cameras look.
 
     The search starts from a cube about the point nearest to the lines of sight through the masks'
@@ -160,7 +160,7 @@ def sight_bounds(
     *,
     height: int,
     width: int,
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+) -> Bounds:
     """Find a cube around what all cameras look at, where there are no masks.
 
     Its centre is the point nearest to the cameras' axes. Its size is such that at least half of the
@@ -237,7 +237,7 @@ def hull_sdf(
 
 
 def fit_grid(
-    bounds: tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]],
+    bounds: Bounds,
     resolution: int,
     *,
     margin_cells: int = 2,
