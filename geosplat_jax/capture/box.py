@@ -13,7 +13,7 @@ from scipy.ndimage import label, maximum_filter
 
 from geosplat_jax.capture.start import CaptureError
 from geosplat_jax.core.types import Bounds
-from geosplat_jax.io.views import Views, point_text
+from geosplat_jax.io.views import Views, in_image, point_text, project
 from geosplat_jax.surface.hull import sight_bounds
 
 _OPAQUE = 0.1
@@ -177,11 +177,8 @@ def _seen_share(positions: np.ndarray, views: Views) -> Float[np.ndarray, " N"]:
     """Share of the cameras that have a point in their image."""
     count = np.zeros(len(positions))
     for pose, lens in zip(views.world_to_camera, views.intrinsics, strict=True):
-        local = positions @ pose[:3, :3].T + pose[:3, 3]
-        is_ahead = local[:, 2] > 0.0
-        depth = np.where(is_ahead, local[:, 2], 1.0)
-        pixel = (local @ lens.T)[:, :2] / depth[:, None]
-        count += is_ahead & (pixel >= 0).all(1) & (pixel < [views.width, views.height]).all(1)
+        pixels, _ = project(positions, pose, lens)
+        count += in_image(pixels, height=views.height, width=views.width)
     return count / len(views)
 
 
