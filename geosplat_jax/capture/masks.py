@@ -204,17 +204,7 @@ def make_masks(
     views = _all_views(dataset)
     clipped, (lo, hi), plane = _clipped(radiance, dataset.train, box, settings.seed)
     write_splats(clipped, folder / "object.ply")
-    _, alpha = render_views(clipped, views.camera())
-    if views.valid is not None:
-        alpha = alpha * views.valid
-    alpha = tidied(alpha)
-    masks = alpha > OPAQUE
-    if not masks.any():
-        raise CaptureError(
-            f"the splats in the box from {_numbers(lo)} to {_numbers(hi)} cover no pixel by more "
-            f"than {OPAQUE:g}, so masks would leave nothing; give another --box, or train longer "
-            "(--force --steps)"
-        )
+    alpha = _alphas(clipped, views, (lo, hi))
     # Whoever is stopped between the first mask and the report can go on.
     begun = folder / _BEGUN
     with written_aside(begun) as aside:
@@ -241,6 +231,26 @@ def make_masks(
         aside.write_text(text + "\n", encoding="utf-8")
     begun.unlink()
     return report
+
+
+def _alphas(clipped: Radiance, views: Views, box: Bounds) -> Float[np.ndarray, "V H W"]:
+    """Render what becomes the masks of views.
+
+    Raises
+    ------
+    CaptureError : it covers no pixel of any view.
+    """
+    _, alpha = render_views(clipped, views.camera())
+    if views.valid is not None:
+        alpha = alpha * views.valid
+    alpha = tidied(alpha)
+    if not (alpha > OPAQUE).any():
+        lo, hi = map(_numbers, box)
+        raise CaptureError(
+            f"the splats in the box from {lo} to {hi} cover no pixel by more than {OPAQUE:g}, so "
+            "masks would leave nothing; give another --box, or train longer (--force --steps)"
+        )
+    return alpha
 
 
 def choose_factor(path: str | Path) -> int:

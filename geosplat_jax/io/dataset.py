@@ -163,7 +163,7 @@ def load_dataset(
     warnings: list[str] = []
     cameras = None if cameras is None else Path(cameras).expanduser()
     refined = {} if cameras is None else read_cameras(cameras)
-    splits = []
+    splits: dict[str, Views] = {}
     for split, frames, limit in (
         ("train", listing.train, train_views),
         ("test", listing.test, test_views),
@@ -173,26 +173,21 @@ def load_dataset(
             chosen = [replace(frame, mask=None) for frame in chosen]
         if not chosen and split == "test":
             warnings.append("there are no test views; nothing can be evaluated")
-            splits.append(no_views(splits[0]))
+            splits[split] = no_views(splits["train"])
             continue
-        views = _load_split(split, chosen, listing, downscale, warnings)
+        splits[split] = _load_split(split, chosen, listing, downscale, warnings)
         if split in refined:
-            views = with_cameras(views, refined[split], str(cameras))
-        splits.append(views)
-    train, test = splits
-    if bare := [name for name, views in (("train", train), ("test", test)) if not views.has_masks]:
+            splits[split] = with_cameras(splits[split], refined[split], str(cameras))
+    if bare := [name for name, views in splits.items() if not views.has_masks]:
         warnings.append(f"the {' and '.join(bare)} views have no masks; {_NEEDS_MASKS}")
-    box = object_bounds(train) if bounds is None else _checked_bounds(bounds)
-    for views in splits:
-        _check_cameras_outside(views, box)
-    _check_sides(train, box, warnings)
-    _check_origin(box, warnings)
+    box = object_bounds(splits["train"]) if bounds is None else _checked_bounds(bounds)
+    _check_box(splits, box, warnings)
     return Dataset(
         name=root.resolve().name,
         layout=layout,
         root=root,
-        train=train,
-        test=test,
+        train=splits["train"],
+        test=splits["test"],
         lights=listing.lights,
         train_light=listing.train_light,
         bounds=box,
@@ -434,6 +429,14 @@ def _check_masks(views: Views, split: str, warnings: list[str]) -> None:
         warnings.append(f"{split}: the mask of {len(empty)} views is empty, {some_names(empty)}")
     if (views.coverage == 1.0).all():
         warnings.append(f"{split}: every mask is full; the images may not be cut out at all")
+
+
+def _check_box(splits: Mapping[str, Views], box: Bounds, warnings: list[str]) -> None:
+    """Refuse cameras within the box around the object; warn of where it lies and is seen from."""
+    for views in splits.values():
+        _check_cameras_outside(views, box)
+    _check_sides(splits["train"], box, warnings)
+    _check_origin(box, warnings)
 
 
 def _check_sides(views: Views, bounds: Bounds, warnings: list[str]) -> None:
