@@ -272,11 +272,6 @@ class Mesh(eqx.Module):
         """True for real faces."""
         return jnp.arange(self.faces.shape[0], dtype=jnp.int32) < self.face_count
 
-    @property
-    def vertex_mask(self) -> Bool[Array, " Cv"]:
-        """True for real vertices."""
-        return jnp.arange(self.vertices.shape[0], dtype=jnp.int32) < self.vertex_count
-
 
 class SurfacePoints(eqx.Module):
     """N points of a surface where light arrives; all unit vectors in the world.

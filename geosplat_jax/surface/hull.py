@@ -40,29 +40,6 @@ _SEARCH_POINTS = 48  # along each side, while the bounds close in on the hull
 _SEARCH_STEPS = 8
 
 
-def visual_hull(
-    world_to_camera: Float[np.ndarray, "V 4 4"],
-    intrinsics: Float[np.ndarray, "V 3 3"],
-    masks: Any,
-    points: Float[np.ndarray, "N 3"],
-    *,
-    valid: Any = None,
-    tolerance: float = TOLERANCE,
-    seen_fraction: float = SEEN_FRACTION,
-) -> Bool[np.ndarray, " N"]:
-    """Tell which points lie inside the visual hull; see `hull_distance` for the parameters."""
-    distance = hull_distance(
-        world_to_camera,
-        intrinsics,
-        masks,
-        points,
-        valid=valid,
-        tolerance=tolerance,
-        seen_fraction=seen_fraction,
-    )
-    return distance < 0.0
-
-
 def hull_distance(
     world_to_camera: Float[np.ndarray, "V 4 4"],
     intrinsics: Float[np.ndarray, "V 3 3"],
