@@ -35,6 +35,7 @@ from geosplat_jax.fit.runtime import enable_compilation_cache
 from geosplat_jax.fit.train import Interrupted
 from geosplat_jax.io.checkpoints import latest_checkpoint
 from geosplat_jax.io.dataset import load_recorded
+from geosplat_jax.io.images import written_aside
 from geosplat_jax.run import Run, train
 
 _POLL_SECONDS = 2.0
@@ -375,10 +376,8 @@ def write_record(sweep: Sweep, scenes: Path, output: Path, command: str) -> None
         values["config"] = sweep.config(run).to_dict()
     record["scene_folders"] = {name: str((scenes / name).resolve()) for name in sweep.scenes}
     record["commands"] = list(dict.fromkeys([*commands, command]))
-    output.mkdir(parents=True, exist_ok=True)
-    aside = output / ".sweep.json.partial"
-    aside.write_text(json.dumps(record, indent=2) + "\n")
-    os.replace(aside, path)
+    with written_aside(path) as aside:
+        aside.write_text(json.dumps(record, indent=2) + "\n")
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -6,7 +6,6 @@ recovers: docs/cameras.md.
 """
 
 import json
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 from geosplat_jax.fit.begin import Resume
 from geosplat_jax.fit.cameras import CameraSettings, ViewProgress
 from geosplat_jax.fit.config import Config
-from geosplat_jax.fit.folder import RunError, RunFolder
+from geosplat_jax.fit.folder import RunError, RunFolder, folder_beside
 from geosplat_jax.fit.listener import NOBODY, Listener
 from geosplat_jax.fit.presets import REFINE, SPLIT_SUM, make_config
 from geosplat_jax.io.dataset import Dataset, load_recorded
@@ -31,8 +30,7 @@ _RECORD = "rounds.json"
 
 def rounds_folder(output: str | Path) -> Path:
     """Return the folder beside a run's own that the rounds are kept in."""
-    path = Path(os.path.abspath(Path(output).expanduser()))
-    return path.with_name(f"{path.name}_cameras")
+    return folder_beside(output, "cameras")
 
 
 def round_config(material_prior: str = "hybrid", *, seed: int | None = None) -> Config:

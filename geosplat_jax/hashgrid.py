@@ -125,14 +125,6 @@ def init_tables(key: Key[Array, ""], spec: HashGridSpec) -> Float[Array, "E F"]:
     return jax.random.uniform(key, shape, minval=-_INITIAL_SCALE, maxval=_INITIAL_SCALE)
 
 
-def level_rows(table: Float[Array, "E F"], spec: HashGridSpec) -> list[Float[Array, "E_l F"]]:
-    """Split the common table into the tables of its levels."""
-    return [
-        table[first : first + count]
-        for first, count in zip(spec.first_rows, spec.entries, strict=True)
-    ]
-
-
 def _hash_line(
     y: Int[Array, "N L"], z: Int[Array, "N L"], offset_count: Float[np.ndarray, "1 L"]
 ) -> Int[Array, "N L"]:

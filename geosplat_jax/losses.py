@@ -85,7 +85,7 @@ class Objective:
     one, and so make the albedo too dark; relative changes made it too bright in our trials."""
 
 
-class Comparison(NamedTuple):
+class ImagePair(NamedTuple):
     """A render and a photograph over one background, and how much they differ.
 
     Attributes
@@ -105,8 +105,8 @@ class Comparison(NamedTuple):
     mse: Float[Array, ""]
     is_encoded: bool = False
 
-    def encoded(self) -> "Comparison":
-        """Return the comparison in sRGB, where differences in dark regions weigh more."""
+    def encoded(self) -> "ImagePair":
+        """Return the pair in sRGB, where differences in dark regions weigh more."""
         if self.is_encoded:
             return self
         images = [linear_to_srgb(image) for image in (self.predicted, self.target)]
@@ -135,7 +135,7 @@ class ViewInputs:
     key: Key[Array, ""]
 
     @cached_property
-    def comparison(self) -> Comparison:
+    def pair(self) -> ImagePair:
         """Both images over one background."""
         objective = self.objective
         background = random_background(
@@ -217,13 +217,13 @@ def compare(
     valid: Float[Array, "V H W"] | None,
     *,
     srgb: bool,
-) -> Comparison:
+) -> ImagePair:
     """Lay premultiplied ``rgb`` and a photograph with straight alpha over one background."""
     mask = image[..., 3]
     predicted = rgb + (1.0 - alpha)[..., None] * background
     target = mask[..., None] * image[..., :3] + (1.0 - mask)[..., None] * background
     mse = _mean((predicted - target) ** 2, valid)
-    images = Comparison(predicted, target, alpha, mask, valid, mse)
+    images = ImagePair(predicted, target, alpha, mask, valid, mse)
     return images.encoded() if srgb else images
 
 
@@ -238,12 +238,12 @@ def _mean(
     return safe_divide(jnp.sum(values * weights), channels * jnp.sum(valid))
 
 
-def image_l1(images: Comparison) -> Float[Array, ""]:
+def image_l1(images: ImagePair) -> Float[Array, ""]:
     """Mean absolute difference of the images (Eq. 13)."""
     return _mean(absolute(images.predicted - images.target), images.valid)
 
 
-def image_dissimilarity(images: Comparison) -> Float[Array, ""]:
+def image_dissimilarity(images: ImagePair) -> Float[Array, ""]:
     """One minus the structural similarity of the images (Eq. 13).
 
     The mean is over the windows all of whose pixels count, as for an image that ends there.
@@ -257,7 +257,7 @@ def image_dissimilarity(images: Comparison) -> Float[Array, ""]:
     return 1.0 - jnp.mean(each)
 
 
-def mask_error(images: Comparison) -> Float[Array, ""]:
+def mask_error(images: ImagePair) -> Float[Array, ""]:
     """Mean squared difference of coverage and mask (Eq. 13)."""
     return _mean((images.alpha - images.mask) ** 2, images.valid)
 
@@ -397,11 +397,11 @@ def edge_aware_smoothness(
 
 
 VIEW_TERMS: dict[str, Callable[[ViewInputs], Float[Array, ""]]] = {
-    "l1": lambda x: image_l1(x.comparison),  # Eq. 13
-    "ssim": lambda x: image_dissimilarity(x.comparison),
-    "mask": lambda x: mask_error(x.comparison),
-    "encoded_l1": lambda x: image_l1(x.comparison.encoded()),
-    "encoded_ssim": lambda x: image_dissimilarity(x.comparison.encoded()),
+    "l1": lambda x: image_l1(x.pair),  # Eq. 13
+    "ssim": lambda x: image_dissimilarity(x.pair),
+    "mask": lambda x: mask_error(x.pair),
+    "encoded_l1": lambda x: image_l1(x.pair.encoded()),
+    "encoded_ssim": lambda x: image_dissimilarity(x.pair.encoded()),
     "light": lambda x: light_agreement(  # Eq. 18
         x.output.aovs["diffuse"],
         x.output.aovs["specular_radiance"],

@@ -10,7 +10,6 @@ interrupted goes on without repeating any.
 import hashlib
 import json
 import math
-import os
 import shutil
 import time
 from collections.abc import Collection, Iterable, Mapping
@@ -25,25 +24,22 @@ import numpy as np
 from geosplat_jax.core.settings import PositiveCount, settings
 from geosplat_jax.fit.begin import ANEW, Begin, Resume
 from geosplat_jax.fit.blocked import blocked_share
-from geosplat_jax.fit.budget import with_steps
+from geosplat_jax.fit.budget import reduction_factor, with_steps
 from geosplat_jax.fit.config import Config, Stage
 from geosplat_jax.fit.entering import Start
 from geosplat_jax.fit.evidence import Rung, compare, every_nth, neighbouring_blocks
-from geosplat_jax.fit.folder import RunError, RunFolder, locked_folder
+from geosplat_jax.fit.folder import RunError, RunFolder, folder_beside, locked_folder
 from geosplat_jax.fit.listener import NOBODY, Listener
 from geosplat_jax.fit.model_parts import LADDER, Part, offered_parts, without
 from geosplat_jax.fit.train import TrainingError, fit, load_trained
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.documents import parse_json
+from geosplat_jax.io.images import written_aside
 from geosplat_jax.io.views import Views, some_views
 from geosplat_jax.report.renderer import Renderer, photograph_on_white, render_on_white
 
-_PIXELS_PER_CELL = 6.0
-"""Photographs are reduced until their longer side has about so many pixels for each cell; by a
-whole number, so that one and a half times as many may stay."""
-
 _USUAL_CELLS = 48
-"""Cells that this counts for a surface without any."""
+"""Cells that photographs are reduced for where the surface has none."""
 
 _SAMPLES = 64
 """Rays per splat of the views that are compared."""
@@ -110,8 +106,7 @@ class ChosenModel:
 
 def choice_folder(output: str | Path) -> Path:
     """Return the folder beside a run's own that trials are made in."""
-    path = Path(os.path.abspath(Path(output).expanduser()))
-    return path.with_name(f"{path.name}_model")
+    return folder_beside(output, "model")
 
 
 def choose_model(
@@ -258,8 +253,7 @@ class _Trials:
         self._first, self._last = stages[0], stages[-1]
         self._offered = offered_parts(config, how.by_hand)
         longest = max(dataset.train.height, dataset.train.width)
-        cells = config.geometry.cells_along or _USUAL_CELLS
-        factor = max(1, math.floor(longest / (_PIXELS_PER_CELL * cells) + 0.5))
+        factor = reduction_factor(longest, config.geometry.cells_along or _USUAL_CELLS)
         self.held = some_views(dataset.train, held, factor=factor)
         self._dataset = replace(
             dataset,
@@ -363,8 +357,6 @@ class _Trials:
 
     def _save(self, mark: str) -> None:
         """Write what was measured, in one go."""
-        path = self.state_path
-        aside = path.with_suffix(".partial")
         state = {
             "mark": mark,
             "held_back": list(self.held.names),
@@ -373,8 +365,8 @@ class _Trials:
             "trainings": self._measured,
             "blocked": self._blocked,
         }
-        aside.write_text(json.dumps(state, indent=2) + "\n", encoding="utf-8")
-        os.replace(aside, path)
+        with written_aside(self.state_path) as aside:
+            aside.write_text(json.dumps(state, indent=2) + "\n", encoding="utf-8")
 
     def decibels(self, kept: Collection[str], seed: int) -> np.ndarray:
         """Return how well a model explains every held-back view, trained once.

@@ -225,7 +225,7 @@ class Pipeline(RenderPipeline):
             rgb = rgb + jax.lax.stop_gradient(residual - rgb)
         inputs = ViewInputs(view, output, rgb, log_exposure, self.objective, background_key)
         terms = view_terms(inputs, self.weights)
-        return self._weighted(terms), ViewReport(terms, inputs.comparison.mse, lists.usage)
+        return self._weighted(terms), ViewReport(terms, inputs.pair.mse, lists.usage)
 
     def shared_loss(
         self, params: Params, asset: Asset, lights: Illumination, batch: Batch

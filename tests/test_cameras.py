@@ -22,7 +22,7 @@ from geosplat_jax.deferred import PerPixel
 from geosplat_jax.fit import cameras as cameras_module
 from geosplat_jax.fit.cameras import (
     CameraSettings,
-    Photograph,
+    PosedPhotograph,
     Subject,
     log_balance,
     moved_camera,
@@ -117,7 +117,7 @@ def photograph(subject, views):
     camera, log_exposure = moved_camera(views.camera([0]), jnp.asarray(TRUTH), box_of(subject))
     image = jnp.asarray(photographed(subject, camera, log_exposure))
     assert 0.1 < float(image[..., 3].mean()) < 0.9
-    return Photograph(views.camera([0]), image, jnp.ones((SIZE, SIZE)))
+    return PosedPhotograph(views.camera([0]), image, jnp.ones((SIZE, SIZE)))
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def test_the_white_balance_of_a_render_is_found_again(subject, views):
     wanted = np.array([0.12, -0.05, -0.07], np.float32)
     gains = jnp.exp(jnp.asarray(wanted))[None, None]
     image = jnp.asarray(photographed(subject, camera, log_exposure, gains))
-    photograph = Photograph(views.camera([0]), image, jnp.ones((SIZE, SIZE)))
+    photograph = PosedPhotograph(views.camera([0]), image, jnp.ones((SIZE, SIZE)))
     result, _ = refine_view(subject, photograph, replace(EXACT, white_balance=True, rounds=2))
     found = 0.01 * np.asarray(result.parameters)
     np.testing.assert_allclose(found[:8], TRUTH, atol=1e-3)
@@ -275,7 +275,7 @@ def test_pixels_that_do_not_count_say_nothing(subject, photograph):
     image = photograph.image.at[SIZE // 2 :].set(0.7)
     seen = baked(subject, photograph.camera)
     parts = [
-        evaluate(jnp.zeros(8), seen, Photograph(photograph.camera, shown, valid), how=EXACT)
+        evaluate(jnp.zeros(8), seen, PosedPhotograph(photograph.camera, shown, valid), how=EXACT)
         for shown in (photograph.image, image)
     ]
     np.testing.assert_array_equal(parts[0][0], parts[1][0])

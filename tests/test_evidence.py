@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geosplat_jax.fit.evidence import (
-    Comparison,
+    Evidence,
     clustered_error,
     compare,
     every_nth,
@@ -91,12 +91,12 @@ def test_a_gain_below_the_spread_over_seeds_is_not_kept():
 @pytest.mark.parametrize(
     ("found", "is_kept"),
     [
-        (Comparison(0.2, 0.1, 0.1), True),
-        (Comparison(0.2, 0.3, 0.1), False),
-        (Comparison(0.2, 0.1, 0.3), False),
-        (Comparison(-0.2, 0.1, 0.1), False),
-        (Comparison(0.0, 0.0, 0.0), False),
-        (Comparison(math.nan, 0.1, 0.1), False),
+        (Evidence(0.2, 0.1, 0.1), True),
+        (Evidence(0.2, 0.3, 0.1), False),
+        (Evidence(0.2, 0.1, 0.3), False),
+        (Evidence(-0.2, 0.1, 0.1), False),
+        (Evidence(0.0, 0.0, 0.0), False),
+        (Evidence(math.nan, 0.1, 0.1), False),
     ],
 )
 def test_a_part_is_kept_for_a_gain_beyond_both_errors(found, is_kept):

@@ -16,7 +16,6 @@ from geosplat_jax.hashgrid import (
     apply_mlp,
     init_mlp,
     init_tables,
-    level_rows,
 )
 
 # One compilation costs less than a hundred eager operations.
@@ -37,6 +36,12 @@ def _table(spec, seed=0, dtype=jnp.float32):
 
 def _points(count=50, seed=1, dtype=jnp.float32):
     return jnp.asarray(np.random.default_rng(seed).uniform(size=(count, 3)), dtype)
+
+
+def level_rows(table, spec):
+    """Split the common table into those of its levels."""
+    ends = np.cumsum(spec.entries)
+    return [table[end - count : end] for end, count in zip(ends, spec.entries, strict=True)]
 
 
 def _slow_row(spec, level, x, y, z):

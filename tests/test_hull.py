@@ -16,7 +16,6 @@ from geosplat_jax.surface.hull import (
     hull_distance,
     hull_sdf,
     sight_bounds,
-    visual_hull,
 )
 
 pytestmark = pytest.mark.usefixtures("products_must_ask")
@@ -67,6 +66,10 @@ def sphere_coverage(poses, intrinsics, center, radius, *, samples=4):
     return np.stack(masks).astype(np.float32)
 
 
+def is_in_hull(*views_and_points, **settings):
+    return hull_distance(*views_and_points, **settings) < 0.0
+
+
 @pytest.fixture(scope="module")
 def sphere():
     poses, intrinsics = cameras_around(np.zeros(3))
@@ -76,8 +79,8 @@ def sphere():
 def test_hull_encloses_the_object_and_little_more(sphere):
     directions = np.random.default_rng(0).normal(size=(2000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    assert visual_hull(*sphere, 0.97 * RADIUS * directions, tolerance=0.0).all()
-    assert not visual_hull(*sphere, 1.12 * RADIUS * directions).any()
+    assert is_in_hull(*sphere, 0.97 * RADIUS * directions, tolerance=0.0).all()
+    assert not is_in_hull(*sphere, 1.12 * RADIUS * directions).any()
 
 
 def test_distance_at_the_surface_is_accurate_to_a_fraction_of_a_pixel(sphere):
@@ -156,17 +159,17 @@ def test_one_wrong_mask_does_not_carve_the_object(sphere):
     torn = masks.copy()
     torn[3, SIZE // 2 :] = 0.0
     points = np.random.default_rng(2).uniform(-0.4, 0.4, (500, 3))
-    assert not visual_hull(poses, intrinsics, torn, points, tolerance=0.0).all()
-    assert visual_hull(poses, intrinsics, torn, points, tolerance=1 / VIEW_COUNT).all()
+    assert not is_in_hull(poses, intrinsics, torn, points, tolerance=0.0).all()
+    assert is_in_hull(poses, intrinsics, torn, points, tolerance=1 / VIEW_COUNT).all()
 
 
 def test_a_view_with_an_empty_mask_is_ignored(sphere):
     poses, intrinsics, masks = sphere
     blank = masks.copy()
     blank[5] = 0.0
-    assert visual_hull(poses, intrinsics, blank, np.zeros((1, 3)), tolerance=0.0).all()
+    assert is_in_hull(poses, intrinsics, blank, np.zeros((1, 3)), tolerance=0.0).all()
     with pytest.raises(ValueError, match="every mask is empty"):
-        visual_hull(poses, intrinsics, 0.0 * masks, np.zeros((1, 3)))
+        is_in_hull(poses, intrinsics, 0.0 * masks, np.zeros((1, 3)))
 
 
 def test_a_view_says_nothing_about_what_it_does_not_see(sphere):
@@ -175,7 +178,7 @@ def test_a_view_says_nothing_about_what_it_does_not_see(sphere):
     shifted[0, 0, 2] -= SIZE / 2  # the left half of the object leaves the image
     cropped[0] = np.pad(masks[0, :, SIZE // 2 :], ((0, 0), (0, SIZE // 2)))
     points = np.random.default_rng(3).uniform(-0.5, 0.5, (200, 3))
-    assert visual_hull(poses, shifted, cropped, points, tolerance=0.0).all()
+    assert is_in_hull(poses, shifted, cropped, points, tolerance=0.0).all()
 
 
 def test_a_point_that_few_views_see_is_outside(sphere):
@@ -184,13 +187,13 @@ def test_a_point_that_few_views_see_is_outside(sphere):
     assert (distance > 0.0).all()
     poses, _, _ = sphere
     eye = -poses[0, :3, :3].T @ poses[0, :3, 3]
-    assert not visual_hull(*sphere, eye[None]).any()
+    assert not is_in_hull(*sphere, eye[None]).any()
 
 
 def test_bool_masks_and_full_masks_are_masks_too(sphere):
     poses, intrinsics, masks = sphere
-    assert visual_hull(poses, intrinsics, masks > 0.5, np.zeros((1, 3))).all()
-    assert visual_hull(poses, intrinsics, np.ones_like(masks), np.zeros((1, 3))).all()
+    assert is_in_hull(poses, intrinsics, masks > 0.5, np.zeros((1, 3))).all()
+    assert is_in_hull(poses, intrinsics, np.ones_like(masks), np.zeros((1, 3))).all()
 
 
 def through_jpeg(mask, *, quality):
@@ -304,9 +307,9 @@ def test_pixels_that_do_not_count_carve_nothing(sphere):
     inside = np.random.default_rng(0).normal(size=(400, 3))
     inside *= 0.97 * RADIUS / np.linalg.norm(inside, axis=1, keepdims=True)
     outside = inside * (1.2 / 0.97)
-    assert not visual_hull(poses, intrinsics, hidden, inside, **settings).all()
-    assert visual_hull(poses, intrinsics, hidden, inside, valid=valid, **settings).all()
-    assert visual_hull(poses, intrinsics, hidden, outside, valid=valid, **settings).mean() < 0.02
+    assert not is_in_hull(poses, intrinsics, hidden, inside, **settings).all()
+    assert is_in_hull(poses, intrinsics, hidden, inside, valid=valid, **settings).all()
+    assert is_in_hull(poses, intrinsics, hidden, outside, valid=valid, **settings).mean() < 0.02
     lo, hi = hull_bounds(poses, intrinsics, hidden, valid=valid)
     exact = hull_bounds(poses, intrinsics, masks)
     np.testing.assert_allclose((lo, hi), exact, atol=0.1)

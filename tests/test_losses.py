@@ -8,7 +8,7 @@ import pytest
 from geosplat_jax.core.color import linear_to_srgb, tone_map
 from geosplat_jax.core.types import Batch, Camera
 from geosplat_jax.losses import (
-    Comparison,
+    ImagePair,
     Objective,
     ViewInputs,
     compare,
@@ -110,7 +110,7 @@ def test_colours_are_compared_linear_unless_the_objective_says_so():
         (Objective(), lambda colours: colours),
         (Objective(srgb=True), linear_to_srgb),
     ):
-        found = ViewInputs(view, output, rgb, jnp.zeros(()), objective, view.key).comparison
+        found = ViewInputs(view, output, rgb, jnp.zeros(()), objective, view.key).pair
         np.testing.assert_allclose(found.predicted, seen(rgb), rtol=ROUNDING)
         np.testing.assert_allclose(found.target, seen(image[..., :3]), rtol=ROUNDING)
 
@@ -127,7 +127,7 @@ def test_pixels_that_do_not_count_change_no_term():
     np.testing.assert_allclose(terms(0.0), terms(7.0), rtol=ROUNDING)
 
 
-def replace_images(images: Comparison, predicted):
+def replace_images(images: ImagePair, predicted):
     return images._replace(
         predicted=predicted, alpha=jnp.where(images.valid == 0, predicted[..., 0], images.alpha)
     )
@@ -143,7 +143,7 @@ def test_similarity_of_a_part_is_that_of_an_image_which_ends_there():
     valid = jnp.zeros((1, 40, 30)).at[:, 3:27, 5:28].set(1.0)
     zeros = jnp.zeros((1, 40, 30))
     found, cropped = (
-        image_dissimilarity(Comparison(x, y, zeros, zeros, v, jnp.zeros(())))
+        image_dissimilarity(ImagePair(x, y, zeros, zeros, v, jnp.zeros(())))
         for x, y, v in ((a, b, valid), (a[:, 3:27, 5:28], b[:, 3:27, 5:28], None))
     )
     assert float(found) == pytest.approx(float(cropped), rel=1e-4)

@@ -408,9 +408,6 @@ def test_smoothness_of_equal_attributes_has_no_gradient_between_its_slopes():
     assert left < -1e-3 < 1e-3 < right
 
 
-# --- detached on purpose
-
-
 def test_the_inward_shift_pulls_through_its_share_and_not_through_the_face():
     grid, geometry = make_ball()
     mesh = _Varied(grid, geometry, "sdf", 0, training=True).surface(1.0).mesh

@@ -11,7 +11,6 @@ from support import double_precision
 from geosplat_jax.core.numerics import (
     LENGTH_EPSILON,
     absolute,
-    clamp_away_from_zero,
     fast_arctan2,
     safe_divide,
     safe_log,
@@ -144,14 +143,6 @@ def test_logarithm_is_exact_above_its_floor_and_flat_below():
     assert np.isnan(safe_log(jnp.asarray(jnp.nan)))
 
 
-def test_clamp_away_from_zero_keeps_the_sign_and_large_values():
-    x = jnp.asarray([-2.0, -1e-5, 0.0, 1e-5, 2.0])
-    clamped = clamp_away_from_zero(x, 1e-3)
-    np.testing.assert_allclose(clamped, [-2, -1e-3, 1e-3, 1e-3, 2])
-    gradient = jax.grad(lambda v: jnp.sum(clamp_away_from_zero(v, 1e-3)))(x)
-    np.testing.assert_array_equal(gradient, [1, 0, 0, 0, 1])
-
-
 @pytest.mark.parametrize("function", [safe_sqrt, safe_log, partial(safe_power, exponent=0.5)])
 def test_scalar_functions_are_finite_on_every_magnitude(function):
     x = jnp.asarray(EXTREMES, jnp.float32)
@@ -164,7 +155,7 @@ def test_precision_in_is_precision_out():
         for dtype in (jnp.float32, jnp.float64):
             x = jnp.ones((2, 3), dtype)
             results = [safe_norm(x), safe_normalize(x), safe_sqrt(x), safe_log(x)]
-            results += [safe_power(x, 0.5), safe_divide(x, x), clamp_away_from_zero(x, 0.1)]
+            results += [safe_power(x, 0.5), safe_divide(x, x)]
             assert all(result.dtype == dtype for result in results)
             assert jax.grad(lambda v: jnp.sum(safe_normalize(v)))(x).dtype == dtype
 

@@ -7,7 +7,7 @@ import pytest
 
 from geosplat_jax.cli import display
 from geosplat_jax.fit.folder import RunFolder
-from geosplat_jax.report.pace import Pace, counted, duration
+from geosplat_jax.report.pace import TimeLeft, counted, duration
 
 
 class Clock:
@@ -21,7 +21,7 @@ class Clock:
 def paced(seconds, total):
     """Estimates after each of some items that took so long."""
     clock = Clock()
-    pace = Pace(clock)
+    pace = TimeLeft(clock)
     found = [pace.left(0, total)]
     for done, length in enumerate(seconds, 1):
         clock.now += length
@@ -40,7 +40,7 @@ def test_one_slow_item_does_not_change_the_estimate_much():
 
 def test_items_that_are_told_together_share_their_time():
     clock = Clock()
-    pace = Pace(clock)
+    pace = TimeLeft(clock)
     pace.left(1, 9)
     clock.now = 8.0
     assert pace.left(5, 9) == pytest.approx(8.0)

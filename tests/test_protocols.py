@@ -301,7 +301,7 @@ def test_relit_values_are_clipped_before_encoding():
         assert protocol_metrics.relight_metrics(row, rgb, mask, image)["psnr"] > 150
     # In linear light the third channel alone errs.
     rgb[..., 2] = 0.25
-    row = dataclasses.replace(IRGS, relight=protocols.Look("linear", 0.0, "mask"))
+    row = dataclasses.replace(IRGS, relight=protocols.Rendition("linear", 0.0, "mask"))
     psnr = protocol_metrics.relight_metrics(row, rgb, mask, image)["psnr"]
     assert psnr == pytest.approx(decibels(0.25**2 / 3), abs=DECIBELS)
 
@@ -541,7 +541,7 @@ def test_figures_of_stanford_orb_are_those_of_its_formula():
         for name, kind in kinds.items()
     }
     same(measured, {name: np.mean(values) for name, values in by_hand.items()}, abs=DECIBELS)
-    new = protocol_metrics.new_view_metrics(rgb[0], alpha[0], image[0], look=ORB.new_views)
+    new = protocol_metrics.new_view_metrics(rgb[0], alpha[0], image[0], rendition=ORB.new_views)
     same(new, {f"nvs.{name}": values[0] for name, values in by_hand.items()}, abs=DECIBELS)
     albedo, alpha, truth, mask = scene(1, 24)
     measured = protocol_metrics.albedo_metrics(ORB, albedo, alpha, truth, mask, np.ones(3))

@@ -10,7 +10,7 @@ from support import ball, sphere_views, tiny_config
 from geosplat_jax.fit.stages import pipeline_at
 from geosplat_jax.io.windows import MARGIN, around_object
 from geosplat_jax.losses import (
-    Comparison,
+    ImagePair,
     edge_aware_smoothness,
     image_dissimilarity,
     image_l1,
@@ -91,7 +91,7 @@ def test_a_mean_over_a_window_is_that_over_the_photograph(views):
     def terms(shown):
         image = jnp.asarray(shown.images)
         mask, color = image[..., 3], image[..., :3] * image[..., 3:]
-        compared = Comparison(0.8 * color, color, 0.9 * mask, mask, None, jnp.zeros(()))
+        compared = ImagePair(0.8 * color, color, 0.9 * mask, mask, None, jnp.zeros(()))
         return np.array([image_l1(compared), mask_error(compared), image_dissimilarity(compared)])
 
     # SSIM has a mean over the pixels around which its window of 11 pixels fits.
@@ -144,7 +144,7 @@ def test_a_share_counts_the_pixels_that_count(views):
     def error(shown):
         images, counts = jnp.asarray(np.array(shown.images)), jnp.asarray(np.array(shown.valid))
         mask, color = images[..., 3], images[..., :3] * images[..., 3:]
-        compared = Comparison(0.8 * color, color, mask, mask, counts, jnp.zeros(()))
+        compared = ImagePair(0.8 * color, color, mask, mask, counts, jnp.zeros(()))
         return float(image_l1(compared))
 
     assert share * error(windows) == pytest.approx(error(views), rel=0.02)

@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import label, maximum_filter
 
 from geosplat_jax.capture.start import CaptureError
-from geosplat_jax.io.views import Views
+from geosplat_jax.core.types import Bounds
+from geosplat_jax.io.views import Views, in_image, point_text, project
 from geosplat_jax.surface.hull import sight_bounds
 
 _OPAQUE = 0.1
@@ -42,8 +43,6 @@ _SPLATS_ABOVE = 0.75
 _TAIL = 0.005
 """Share of the cluster that may lie outside of the box on each side."""
 _MARGIN = 0.05  # of the longest side, on every side
-
-Corners = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
 
 
 class Cloud(NamedTuple):
@@ -111,8 +110,8 @@ def propose_box(cloud: Cloud, views: Views, *, seed: int = 0) -> Proposal:
     is_sure = seen[is_used] >= _SEEN
     if not is_sure.any():
         raise CaptureError(
-            f"there is no opaque splat where the cameras look, between {_corner(lo)} and "
-            f"{_corner(hi)}; train longer (--force --steps), or {cure}"
+            f"there is no opaque splat where the cameras look, between {point_text(lo)} and "
+            f"{point_text(hi)}; train longer (--force --steps), or {cure}"
         )
     centers = views.camera_to_world[:, :3, 3]
     rng = np.random.default_rng(seed)
@@ -144,25 +143,19 @@ def inside_box(
     return ((positions >= lo) & (positions <= hi)).all(1)
 
 
-def require_something_inside(
-    inside: Bool[np.ndarray, " N"], cloud: Cloud, corners: Corners
-) -> None:
+def require_something_inside(inside: Bool[np.ndarray, " N"], cloud: Cloud, corners: Bounds) -> None:
     """Refuse a box without splats; `CaptureError` says where the splats are."""
     if inside.any():
         return
     solid = cloud.positions[cloud.opacities > _OPAQUE]
     low, high = np.quantile(solid if len(solid) else cloud.positions, [0.1, 0.9], axis=0)
     raise CaptureError(
-        f"the box from {_corner(corners[0])} to {_corner(corners[1])} holds no splat; most of them "
-        f"lie between {_corner(low)} and {_corner(high)}, in the units of the cameras"
+        f"the box from {point_text(corners[0])} to {point_text(corners[1])} holds no splat; most "
+        f"of them lie between {point_text(low)} and {point_text(high)}, in the units of the cameras"
     )
 
 
-def _corner(values: np.ndarray) -> str:
-    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
-
-
-def _search(views: Views) -> Corners:
+def _search(views: Views) -> Bounds:
     """Find the cube around what half of the views show at the distance of what they look at.
 
     It holds no camera. `hull.sight_bounds` has the cube within.
@@ -184,11 +177,8 @@ def _seen_share(positions: np.ndarray, views: Views) -> Float[np.ndarray, " N"]:
     """Share of the cameras that have a point in their image."""
     count = np.zeros(len(positions))
     for pose, lens in zip(views.world_to_camera, views.intrinsics, strict=True):
-        local = positions @ pose[:3, :3].T + pose[:3, 3]
-        is_ahead = local[:, 2] > 0.0
-        depth = np.where(is_ahead, local[:, 2], 1.0)
-        pixel = (local @ lens.T)[:, :2] / depth[:, None]
-        count += is_ahead & (pixel >= 0).all(1) & (pixel < [views.width, views.height]).all(1)
+        pixels, _ = project(positions, pose, lens)
+        count += in_image(pixels, height=views.height, width=views.width)
     return count / len(views)
 
 
@@ -274,7 +264,7 @@ def _largest_cluster(
 
 def _cut_at_plane(
     low: np.ndarray, high: np.ndarray, plane: np.ndarray, cluster: np.ndarray
-) -> Corners:
+) -> Bounds:
     """Keep the box off the plane that was left out, where that is about level with an axis."""
     middle = plane.mean(0)
     normal = np.linalg.svd(plane - middle, full_matrices=False)[2][2]

@@ -18,7 +18,6 @@ from scipy.ndimage import binary_fill_holes, label, maximum_filter
 
 from geosplat_jax.capture.box import (
     Cloud,
-    Corners,
     Plane,
     inside_box,
     propose_box,
@@ -33,6 +32,7 @@ from geosplat_jax.capture.training import (
     train_radiance,
 )
 from geosplat_jax.core.harmonics import CONSTANT
+from geosplat_jax.core.types import Bounds
 from geosplat_jax.fit.listener import Progress
 from geosplat_jax.io.agreement import agreement
 from geosplat_jax.io.dataset import LAYOUTS, Dataset, recognise_layout
@@ -42,7 +42,7 @@ from geosplat_jax.io.export import export_gaussians_ply
 from geosplat_jax.io.frames import MASK_FOLDERS, Frame, beside_images, mask_file
 from geosplat_jax.io.images import MissingFileError, image_size, write_png, written_aside
 from geosplat_jax.io.layouts.colmap import read_points
-from geosplat_jax.io.views import COVERED, Views
+from geosplat_jax.io.views import COVERED, Views, point_text
 from geosplat_jax.report.pictures import overview_sheet
 from geosplat_jax.report.renderer import to_picture
 
@@ -137,9 +137,7 @@ class MaskReport:
 
     def lines(self) -> list[str]:
         """Describe the report for a reader."""
-        corners = " to ".join(
-            "(" + ", ".join(f"{x:.4g}" for x in corner) + ")" for corner in (self.lo, self.hi)
-        )
+        corners = f"{point_text(self.lo)} to {point_text(self.hi)}"
         origin = "proposed" if self.proposed else "given"
         plane = ", what it stands on or hangs at left out" if self.plane else ""
         held_back = "no views are held back"
@@ -161,7 +159,7 @@ def make_masks(
     settings: RadianceSettings,
     folder: str | Path,
     *,
-    box: Corners | None = None,
+    box: Bounds | None = None,
     downscale: int = 1,
     resume: bool = False,
     force: bool = False,
@@ -206,17 +204,7 @@ def make_masks(
     views = _all_views(dataset)
     clipped, (lo, hi), plane = _clipped(radiance, dataset.train, box, settings.seed)
     write_splats(clipped, folder / "object.ply")
-    _, alpha = render_views(clipped, views.camera())
-    if views.valid is not None:
-        alpha = alpha * views.valid
-    alpha = tidied(alpha)
-    masks = alpha > OPAQUE
-    if not masks.any():
-        raise CaptureError(
-            f"the splats in the box from {_numbers(lo)} to {_numbers(hi)} cover no pixel by more "
-            f"than {OPAQUE:g}, so masks would leave nothing; give another --box, or train longer "
-            "(--force --steps)"
-        )
+    alpha = _alphas(clipped, views, (lo, hi))
     # Whoever is stopped between the first mask and the report can go on.
     begun = folder / _BEGUN
     with written_aside(begun) as aside:
@@ -243,6 +231,26 @@ def make_masks(
         aside.write_text(text + "\n", encoding="utf-8")
     begun.unlink()
     return report
+
+
+def _alphas(clipped: Radiance, views: Views, box: Bounds) -> Float[np.ndarray, "V H W"]:
+    """Render what becomes the masks of views.
+
+    Raises
+    ------
+    CaptureError : it covers no pixel of any view.
+    """
+    _, alpha = render_views(clipped, views.camera())
+    if views.valid is not None:
+        alpha = alpha * views.valid
+    alpha = tidied(alpha)
+    if not (alpha > OPAQUE).any():
+        lo, hi = map(_numbers, box)
+        raise CaptureError(
+            f"the splats in the box from {lo} to {hi} cover no pixel by more than {OPAQUE:g}, so "
+            "masks would leave nothing; give another --box, or train longer (--force --steps)"
+        )
+    return alpha
 
 
 def choose_factor(path: str | Path) -> int:
@@ -331,8 +339,8 @@ def _all_views(dataset: Dataset) -> Views:
 
 
 def _clipped(
-    radiance: Radiance, views: Views, box: Corners | None, seed: int
-) -> tuple[Radiance, Corners, Plane | None]:
+    radiance: Radiance, views: Views, box: Bounds | None, seed: int
+) -> tuple[Radiance, Bounds, Plane | None]:
     """Keep the splats whose mean lies in the box, and above the plane of a proposed one.
 
     Raises
@@ -411,7 +419,7 @@ def photograph_mask(
     return resample(mask, reduced)[..., 0] > COVERED
 
 
-def certainty(views: Views, alpha: Float[np.ndarray, "V H W"], box: Corners) -> Certainty:
+def certainty(views: Views, alpha: Float[np.ndarray, "V H W"], box: Bounds) -> Certainty:
     """Measure how sure masks are; at least one must not be empty."""
     masks = alpha > OPAQUE
     covered = int(masks.sum())

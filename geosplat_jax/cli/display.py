@@ -13,7 +13,7 @@ from geosplat_jax.fit.evidence import Rung
 from geosplat_jax.fit.listener import Listener
 from geosplat_jax.fit.listener import Progress as StepProgress
 from geosplat_jax.report.facts import rung_row
-from geosplat_jax.report.pace import Pace, duration
+from geosplat_jax.report.pace import TimeLeft, duration
 
 console = Console(stderr=True, highlight=False)
 
@@ -54,7 +54,7 @@ class WorkDisplay:
 
     def __init__(self, *, bars: bool | None = None) -> None:
         has_bars = console.is_terminal if bars is None else bars
-        self._paces: dict[str, Pace] = {}
+        self._times_left: dict[str, TimeLeft] = {}
         self._tasks: dict[str, Any] = {}
         self._said = time.perf_counter()
         self._bar = None
@@ -80,8 +80,8 @@ class WorkDisplay:
 
     def __call__(self, part: str, done: int, total: int) -> None:
         """Display how far a part is; see `poses.OnProgress`."""
-        is_new = part not in self._paces
-        left = self._paces.setdefault(part, Pace()).left(done, total)
+        is_new = part not in self._times_left
+        left = self._times_left.setdefault(part, TimeLeft()).left(done, total)
         if done >= total:
             text = "done"
         elif left is None:

@@ -97,7 +97,7 @@ def _overrides(arguments: argparse.Namespace) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class _Order:
+class _Request:
     """What a training was asked for.
 
     Attributes
@@ -151,7 +151,7 @@ def _require_no_settings(
         )
 
 
-def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
+def _request_of(arguments: argparse.Namespace, folder: RunFolder) -> _Request:
     """Read from the options, or from the run that is resumed, what is to be done; say it."""
     known = folder.budget() if arguments.resume and folder.exists else None
     if known is not None:
@@ -164,12 +164,12 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
         _require_no_settings(arguments, folder, but="--downscale" if chooses_size else None)
         # Its settings were chosen for the budget, and have changed since.
         reading = folder.record()["dataset"]
-        return _Order(folder.config(), reading, known, goes_on=True)
+        return _Request(folder.config(), reading, known, goes_on=True)
     if arguments.resume and folder.exists and arguments.budget is not None:
         raise UsageError(f"{folder} was begun without a budget; leave --budget out")
     if arguments.resume and folder.has_chosen_model:
         _require_no_settings(arguments, folder)
-        return _Order(folder.config(), folder.record()["dataset"], goes_on=True)
+        return _Request(folder.config(), folder.record()["dataset"], goes_on=True)
     if arguments.model is not None and (arguments.budget or arguments.source):
         raise UsageError("--model auto chooses for a whole training; leave --budget and --from out")
     if arguments.budget is None:
@@ -180,7 +180,7 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
         if arguments.model is not None:
             paths = (text.partition("=")[0].strip() for text in arguments.overrides)
             model = ModelChoice(by_hand=tuple(dict.fromkeys(paths)))
-        return _Order(config, scene_options(arguments, config), model=model)
+        return _Request(config, scene_options(arguments, config), model=model)
     if arguments.quality is not None or arguments.preset is not None:
         raise UsageError("--budget chooses the settings; leave --quality and --preset out")
     if arguments.source is not None:
@@ -198,7 +198,7 @@ def _ordered(arguments: argparse.Namespace, folder: RunFolder) -> _Order:
     for line in plan.describe():
         say(line)
     arguments.downscale = plan.downscale
-    return _Order(plan.config, scene_options(arguments, plan.config), budget)
+    return _Request(plan.config, scene_options(arguments, plan.config), budget)
 
 
 def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[str, Any]) -> Path:
@@ -329,14 +329,14 @@ def train(arguments: argparse.Namespace) -> None:
     require_place(arguments.csv, "--csv")
     devices = _devices(arguments)
     folder = arguments.output or Path("runs") / arguments.scene.resolve().name
-    order = _ordered(arguments, RunFolder(folder))
-    config, reading = order.config, dict(order.reading)
+    request = _request_of(arguments, RunFolder(folder))
+    config, reading = request.config, dict(request.reading)
     begun = RunFolder(folder)
     if arguments.refine_cameras is not None and arguments.resume and begun.exists:
         if not begun.record()["dataset"].get("cameras"):
             raise UsageError(f"{folder} was begun without --refine-cameras; leave it out")
     # A run that knows how it reads its scene knows its refined cameras.
-    if arguments.refine_cameras is not None and not order.goes_on:
+    if arguments.refine_cameras is not None and not request.goes_on:
         if not arguments.resume:
             begun.require_free(replace=arguments.force)
         reading["cameras"] = _refined_cameras(arguments, folder, reading)
@@ -361,15 +361,15 @@ def train(arguments: argparse.Namespace) -> None:
             folder,
             config,
             begin=begin_from(arguments),
-            budget=order.budget,
-            began=began if order.budget is not None else None,
-            model=order.model,
+            budget=request.budget,
+            began=began if request.budget is not None else None,
+            model=request.model,
             devices=devices,
             listener=Listeners(display, events),
         )
     if not devices.is_first_host:
         return
-    if order.model is not None:
+    if request.model is not None:
         _say_model(run.folder.record().get("model"))
     seconds = (run.folder.training() or {})["seconds_total"]
     say(f"trained in {seconds:.0f} s; next: geosplat-jax evaluate {folder}")

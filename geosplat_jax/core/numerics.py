@@ -20,15 +20,6 @@ COSINE_EPSILON = 1e-4
 """Smallest cosine used as a divisor in shading."""
 
 
-def clamp_away_from_zero(x: Float[Array, "..."], smallest: float) -> Float[Array, "..."]:
-    """Push values towards infinity until their magnitude is at least ``smallest``.
-
-    Zero is treated as positive. The gradient is 1 where the value is kept and 0 where it is moved.
-    """
-    moved = jnp.where(x < 0, -smallest, smallest).astype(x.dtype)
-    return jnp.where(jnp.abs(x) < smallest, moved, x)
-
-
 @jax.custom_jvp
 def _divide(numerator, denominator):
     return numerator / denominator

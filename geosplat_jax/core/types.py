@@ -13,9 +13,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from geosplat_jax.core.numerics import safe_divide
+
+Bounds = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
+"""The lowest and the highest corner of a box in the world, on the host."""
 
 RATE_GROUP = "rate group"
 """Key of a field's metadata; see `learned`."""
@@ -267,11 +271,6 @@ class Mesh(eqx.Module):
     def face_mask(self) -> Bool[Array, " Cf"]:
         """True for real faces."""
         return jnp.arange(self.faces.shape[0], dtype=jnp.int32) < self.face_count
-
-    @property
-    def vertex_mask(self) -> Bool[Array, " Cv"]:
-        """True for real vertices."""
-        return jnp.arange(self.vertices.shape[0], dtype=jnp.int32) < self.vertex_count
 
 
 class SurfacePoints(eqx.Module):

@@ -220,6 +220,16 @@ def _memory_here() -> int | None:
     return memory_of_machine() if jax.default_backend() == "cpu" else None
 
 
+def reduction_factor(longest: int, cells: int) -> int:
+    """Return the whole number that photographs are reduced by for a grid; see `_PIXELS_PER_CELL`.
+
+    Parameters
+    ----------
+    longest : pixels of their longer side. cells : of the grid, along its longest side.
+    """
+    return max(1, math.floor(longest / (_PIXELS_PER_CELL * cells) + 0.5))
+
+
 def _candidate(
     effort: float,
     config: Config,
@@ -230,8 +240,7 @@ def _candidate(
     """Return the settings of an effort with what they are expected to take."""
     if downscale is None:
         cells = config.geometry.cells_along or between_qualities(effort).geometry.cells_along
-        wanted = _PIXELS_PER_CELL * (cells or max(size))
-        downscale = max(1, math.floor(max(size) / wanted + 0.5))
+        downscale = reduction_factor(max(size), cells or max(size))
     pixels = float((size[0] // downscale) * (size[1] // downscale))
     costs = expected_costs(config, pixels, slowness=slowness)
     seconds = expected_seconds(config, costs)

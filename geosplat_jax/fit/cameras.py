@@ -175,8 +175,8 @@ class Subject(eqx.Module):
         )
 
 
-class Photograph(eqx.Module):
-    """One view to compare with.
+class PosedPhotograph(eqx.Module):
+    """A photograph with its camera, to compare with.
 
     Attributes
     ----------
@@ -241,7 +241,10 @@ def log_balance(parameters: Float[Array, " P"]) -> Float[Array, " 3"]:
 
 
 def view_residual(
-    parameters: Float[Array, " P"], subject: Subject, photograph: Photograph, how: CameraSettings
+    parameters: Float[Array, " P"],
+    subject: Subject,
+    photograph: PosedPhotograph,
+    how: CameraSettings,
 ) -> tuple[Float[Array, " R"], Fit]:
     """Evaluate the residual whose squares are summed, and how well the camera fits.
 
@@ -309,7 +312,7 @@ class Found(eqx.Module):
 
 @partial(jax.jit, static_argnames=("how",))
 def _solve(
-    start: Float[Array, " P"], subject: Subject, photograph: Photograph, *, how: CameraSettings
+    start: Float[Array, " P"], subject: Subject, photograph: PosedPhotograph, *, how: CameraSettings
 ) -> Found:
     """Run Levenberg-Marquardt; valid only where both fits' usage is within the capacities."""
     box = subject.pipeline.surface.box
@@ -336,7 +339,7 @@ def _both(fits: Fit) -> tuple[Fit, Fit]:
 
 
 def refine_view(
-    subject: Subject, photograph: Photograph, how: CameraSettings
+    subject: Subject, photograph: PosedPhotograph, how: CameraSettings
 ) -> tuple[Found, Capacities]:
     """Refine the camera of one view, with buffers that grow until no iterate overflows (host side).
 
@@ -393,7 +396,7 @@ def refine_views(
     how, cameras = how or CameraSettings(), {}
     for index, name in enumerate(views.names):
         valid = np.ones((views.height, views.width), np.float32)
-        photograph = Photograph(
+        photograph = PosedPhotograph(
             camera=views.camera([index]),
             image=jnp.asarray(views.clipped([index])[0]),
             valid=jnp.asarray(valid if views.valid is None else views.valid[index]),

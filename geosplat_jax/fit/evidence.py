@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Evidence:
     """A larger model against a smaller one.
 
     Attributes
@@ -54,7 +54,7 @@ class Rung:
     title: str
     smaller: float
     larger: float | None
-    found: Comparison | None
+    found: Evidence | None
     is_kept: bool
     note: str = ""
 
@@ -111,7 +111,7 @@ def compare(
     larger: Float[np.ndarray, " V"],
     smaller: Sequence[Float[np.ndarray, " V"]],
     blocks: Int[np.ndarray, " V"],
-) -> Comparison:
+) -> Evidence:
     """Compare two models on the same V views.
 
     Parameters
@@ -123,4 +123,4 @@ def compare(
     gains = np.asarray(larger, float) - np.asarray(smaller[0], float)
     means = [float(np.mean(one)) for one in smaller]
     spread = float(np.std(means, ddof=1)) if len(means) > 1 else 0.0
-    return Comparison(float(gains.mean()), clustered_error(gains, blocks), spread)
+    return Evidence(float(gains.mean()), clustered_error(gains, blocks), spread)

@@ -105,6 +105,12 @@ def _parsed(path: Path) -> Any:
         raise RunError(f"{path} is damaged: {error}") from None
 
 
+def folder_beside(output: str | Path, purpose: str) -> Path:
+    """Return the folder ``OUTPUT_PURPOSE`` beside that of a run, as an absolute path."""
+    path = Path(os.path.abspath(Path(output).expanduser()))
+    return path.with_name(f"{path.name}_{purpose}")
+
+
 @contextmanager
 def locked_folder(path: Path, *, own: Path) -> Iterator[None]:
     """Hold a folder for one process, made where it is missing; the lock ends with the process.
@@ -398,9 +404,8 @@ class RunFolder:
 
     def _write_record(self, record: dict[str, Any]) -> None:
         """Replace ``run.json`` in one go."""
-        aside = self._record_path.with_suffix(".partial")
-        aside.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-        os.replace(aside, self._record_path)
+        with written_aside(self._record_path) as aside:
+            aside.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
 
     def metric_lines(self) -> list[dict[str, Any]]:
         """Read ``metrics.jsonl``; a last line that an interruption tore is left out.
@@ -460,9 +465,9 @@ class RunFolder:
             lines = [line for line in everything if line["step"] < step]
             if len(lines) < len(everything) and self.exists:
                 self._write_record({**self.record(), "seconds_lost": used - _seconds(lines)})
-            aside = self.metrics.with_suffix(".partial")
-            aside.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
-            os.replace(aside, self.metrics)
+            text = "".join(json.dumps(line) + "\n" for line in lines)
+            with written_aside(self.metrics) as aside:
+                aside.write_text(text, encoding="utf-8")
 
     def write_training(self, summary: dict[str, Any]) -> None:
         """Note how the training went as a whole."""

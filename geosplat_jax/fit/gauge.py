@@ -15,6 +15,7 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from geosplat_jax.core.types import Bounds
 from geosplat_jax.io.alignment import Similarity
 from geosplat_jax.io.cameras import RefinedSplit, with_cameras
 from geosplat_jax.io.views import Views
@@ -43,10 +44,6 @@ class CameraErrors:
     exposure_percent: Float[np.ndarray, " V"]
     balance_percent: Float[np.ndarray, " V"]
     pixels: Float[np.ndarray, " V"]
-
-
-Bounds = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
-"""lo and hi of a box around the object, see `Dataset.bounds`."""
 
 
 def find_gauge(found: Views, true: Views, bounds: Bounds, *, scales: bool = True) -> Similarity:

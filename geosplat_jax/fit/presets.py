@@ -162,21 +162,8 @@ def _original(
     )
 
 
-def _original_stages(
-    *,
-    split_sum_weights: dict[str, Schedule],
-    monte_carlo_weights: dict[str, Schedule],
-    baked_diffuse: bool,
-    indirect: Literal["constant", "harmonics"],
-    points: Literal["splats", "mesh"],
-) -> tuple[Stage, ...]:
-    """Return the stages that the paper and the authors share: 8 views, 128 rays per splat.
-
-    The refinement is that of the authors' program: 512 rays per pixel, no loss of the mask, and
-    smoothness as sums over channels where theirs are means.
-    """
-    surface = {"deviation": 0.5, "weights": 0.1}
-    split_sum = Stage(
+def _original_split_sum(weights: dict[str, Schedule], *, baked_diffuse: bool) -> Stage:
+    return Stage(
         name=SPLIT_SUM,
         steps=500,
         batch_views=8,
@@ -193,9 +180,17 @@ def _original_stages(
             light=1e-2,
             exposure=5e-3,
         ),
-        weights={**split_sum_weights, **_weights(**surface)},
+        weights=weights,
     )
-    monte_carlo = Stage(
+
+
+def _original_monte_carlo(
+    weights: dict[str, Schedule],
+    *,
+    indirect: Literal["constant", "harmonics"],
+    first_albedo: Literal["grey", "mean"],
+) -> Stage:
+    return Stage(
         name=MONTE_CARLO,
         steps=500,
         batch_views=8,
@@ -204,7 +199,7 @@ def _original_stages(
         transport=MonteCarloSettings(
             light_count=64, diffuse_count=32, specular_count=32, indirect=indirect
         ),
-        enter=(FreshAlbedo("grey" if baked_diffuse else "mean"),),
+        enter=(FreshAlbedo(first_albedo),),
         rates=_rates(
             3e-3,
             surface_warmup=50,
@@ -216,10 +211,17 @@ def _original_stages(
             light=1e-2,
             exposure=5e-3,
         ),
-        weights={**monte_carlo_weights, **_weights(**surface, indirect=0.001)},
+        weights=weights,
     )
-    photometric = {name: split_sum_weights[name] for name in ("l1", "ssim")}
-    refine = Stage(
+
+
+def _original_refinement(
+    photometric: dict[str, Schedule],
+    *,
+    indirect: Literal["constant", "harmonics"],
+    points: Literal["splats", "mesh"],
+) -> Stage:
+    return Stage(
         name=REFINE,
         steps=100,
         batch_views=8,
@@ -236,7 +238,32 @@ def _original_stages(
             **_weights(albedo_smoothness=0.2 / 3, smoothness_roughness_metallic=0.05 / 2),
         },
     )
-    return (split_sum, monte_carlo, refine)
+
+
+def _original_stages(
+    *,
+    split_sum_weights: dict[str, Schedule],
+    monte_carlo_weights: dict[str, Schedule],
+    baked_diffuse: bool,
+    indirect: Literal["constant", "harmonics"],
+    points: Literal["splats", "mesh"],
+) -> tuple[Stage, ...]:
+    """Return the stages that the paper and the authors share: 8 views, 128 rays per splat.
+
+    The refinement is that of the authors' program: 512 rays per pixel, no loss of the mask, and
+    smoothness as sums over channels where theirs are means.
+    """
+    surface = _weights(deviation=0.5, weights=0.1)
+    photometric = {name: split_sum_weights[name] for name in ("l1", "ssim")}
+    return (
+        _original_split_sum({**split_sum_weights, **surface}, baked_diffuse=baked_diffuse),
+        _original_monte_carlo(
+            {**monte_carlo_weights, **surface, **_weights(indirect=0.001)},
+            indirect=indirect,
+            first_albedo="grey" if baked_diffuse else "mean",
+        ),
+        _original_refinement(photometric, indirect=indirect, points=points),
+    )
 
 
 def _paper() -> Config:

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from geosplat_jax.banded import BandedFlexiCubes
 from geosplat_jax.core.settings import PositiveCount, Variant, settings
-from geosplat_jax.core.types import Geometry, Grid
+from geosplat_jax.core.types import Bounds, Geometry, Grid
 from geosplat_jax.geometry import (
     FlexiCubes,
     GridSurface,
@@ -26,9 +26,6 @@ from geosplat_jax.surface.base import SurfaceModel
 from geosplat_jax.surface.grids import closed_at_border, neutral_geometry
 from geosplat_jax.surface.hollows import carve_hollows
 from geosplat_jax.surface.hull import fit_grid, hull_sdf
-
-Bounds = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
-"""lo and hi of a box in the world."""
 
 _SPLATS_PER_CELL = 24
 """Splats of a cell that the surface passes through: of the one quad that it has in the mean."""

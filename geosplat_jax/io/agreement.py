@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import maximum_filter
 
-from geosplat_jax.io.views import Views
+from geosplat_jax.core.types import Bounds
+from geosplat_jax.io.views import Views, in_image, project
 from geosplat_jax.surface.hollows import hollow_candidates
 from geosplat_jax.surface.hull import fit_grid, hull_sdf
 
@@ -32,8 +33,6 @@ not carve the hull of all others away."""
 
 _CELLS = 32
 """Along the longest side of the grid in which hollows are looked for."""
-
-Bounds = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
 
 
 def agreement(views: Views, bounds: Bounds) -> Float[np.ndarray, " V"]:
@@ -111,13 +110,9 @@ def _left_out(views: Views, view: int, lo: np.ndarray, hi: np.ndarray) -> Bool[n
     """Find the voxels that a view sees outside of its mask, in a pixel that counts."""
     axes = [a + (np.arange(_VOXELS) + 0.5) / _VOXELS * (b - a) for a, b in zip(lo, hi, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    pose = views.world_to_camera[view]
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    is_ahead = local[:, 2] > 0
-    depth = np.where(is_ahead, local[:, 2], 1.0)
-    pixel = (local @ views.intrinsics[view].T)[:, :2] / depth[:, None]
-    is_seen = is_ahead & (pixel >= 0).all(1) & (pixel < [views.width, views.height]).all(1)
-    column, row = np.where(is_seen[:, None], pixel, 0).astype(int).T
+    pixels, _ = project(points, views.world_to_camera[view], views.intrinsics[view])
+    is_seen = in_image(pixels, height=views.height, width=views.width)
+    column, row = np.where(is_seen[:, None], pixels, 0).astype(int).T
     if views.valid is not None:
         is_seen &= np.asarray(views.valid[view])[row, column] > 0
     is_out = is_seen & ~views.mask(view)[row, column]

@@ -1,6 +1,5 @@
 """Mesh decimation, and a normal map with the detail that the smaller mesh has lost."""
 
-import importlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +7,7 @@ import trimesh
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from geosplat_jax.io.images import SceneError
+from geosplat_jax.io.extras import optional_package
 from geosplat_jax.io.meshes import facing
 
 # Faces of the fine mesh, by the distance of their centres, that a point may be nearest to.
@@ -44,13 +43,9 @@ def simplified(
     """
     if count < 4:
         raise ValueError(f"a mesh has at least 4 faces, got {count}")
-    try:
-        library = importlib.import_module("fast_simplification")
-    except ImportError:
-        raise SceneError(
-            "fewer faces need the package fast-simplification; install it with "
-            "`pip install 'geosplat_jax[mesh]'`"
-        ) from None
+    library = optional_package(
+        "fast_simplification", "a mesh of fewer faces", extra="mesh", package="fast-simplification"
+    )
     if count >= len(faces):
         return vertices, faces
     middle, scale = _middle_and_scale(np.asarray(vertices, np.float64))

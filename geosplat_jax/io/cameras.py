@@ -13,7 +13,6 @@
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from geosplat_jax.io.documents import parse_json
-from geosplat_jax.io.images import MissingFileError, SceneError
+from geosplat_jax.io.images import MissingFileError, SceneError, written_aside
 from geosplat_jax.io.photographs import Photographs
 from geosplat_jax.io.views import Views, camera_to_world_of
 
@@ -80,10 +79,8 @@ def write_cameras(path: Path, splits: Mapping[str, RefinedSplit]) -> None:
             for name, split in splits.items()
         },
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(path.name + ".partial")
-    aside.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    os.replace(aside, path)
+    with written_aside(path) as aside:
+        aside.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def _to_plain(camera: RefinedCamera) -> dict[str, Any]:

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
+from geosplat_jax.core.types import Bounds
 from geosplat_jax.io.cameras import cameras_digest, read_cameras, with_cameras
 from geosplat_jax.io.frames import Frame, Listing
 from geosplat_jax.io.images import MissingFileError, SceneError, image_size, wide_color_profile
@@ -25,7 +25,7 @@ from geosplat_jax.io.layouts.synthetic4relight import is_synthetic4relight, list
 from geosplat_jax.io.layouts.tensoir import is_tensoir, list_tensoir
 from geosplat_jax.io.layouts.transforms import is_transforms, list_transforms_capture
 from geosplat_jax.io.loading import KEPT_BYTES, load_views, some_names
-from geosplat_jax.io.views import COVERED, OPAQUE, Views, no_views
+from geosplat_jax.io.views import COVERED, OPAQUE, Views, no_views, point_text
 from geosplat_jax.surface.hull import hull_bounds, sight_bounds
 
 
@@ -101,7 +101,7 @@ class Dataset:
     test: Views
     lights: Mapping[str, Path]
     train_light: str | None
-    bounds: tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
+    bounds: Bounds
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -163,7 +163,7 @@ def load_dataset(
     warnings: list[str] = []
     cameras = None if cameras is None else Path(cameras).expanduser()
     refined = {} if cameras is None else read_cameras(cameras)
-    splits = []
+    splits: dict[str, Views] = {}
     for split, frames, limit in (
         ("train", listing.train, train_views),
         ("test", listing.test, test_views),
@@ -173,26 +173,21 @@ def load_dataset(
             chosen = [replace(frame, mask=None) for frame in chosen]
         if not chosen and split == "test":
             warnings.append("there are no test views; nothing can be evaluated")
-            splits.append(no_views(splits[0]))
+            splits[split] = no_views(splits["train"])
             continue
-        views = _load_split(split, chosen, listing, downscale, warnings)
+        splits[split] = _load_split(split, chosen, listing, downscale, warnings)
         if split in refined:
-            views = with_cameras(views, refined[split], str(cameras))
-        splits.append(views)
-    train, test = splits
-    if bare := [name for name, views in (("train", train), ("test", test)) if not views.has_masks]:
+            splits[split] = with_cameras(splits[split], refined[split], str(cameras))
+    if bare := [name for name, views in splits.items() if not views.has_masks]:
         warnings.append(f"the {' and '.join(bare)} views have no masks; {_NEEDS_MASKS}")
-    box = object_bounds(train) if bounds is None else _checked_bounds(bounds)
-    for views in splits:
-        _check_cameras_outside(views, box)
-    _check_sides(train, box, warnings)
-    _check_origin(box, warnings)
+    box = object_bounds(splits["train"]) if bounds is None else _checked_bounds(bounds)
+    _check_box(splits, box, warnings)
     return Dataset(
         name=root.resolve().name,
         layout=layout,
         root=root,
-        train=train,
-        test=test,
+        train=splits["train"],
+        test=splits["test"],
         lights=listing.lights,
         train_light=listing.train_light,
         bounds=box,
@@ -351,9 +346,7 @@ def recognise_layout(root: Path) -> str:
     )
 
 
-def object_bounds(
-    views: Views, *, margin: float = 0.02
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+def object_bounds(views: Views, *, margin: float = 0.02) -> Bounds:
     """Box around the visual hull of the views, or around what they look at without masks.
 
     See `hull.hull_bounds` and `hull.sight_bounds`.
@@ -398,7 +391,8 @@ def describe(dataset: Dataset) -> str:
     maps = ", ".join(f"{name} ({path.name})" for name, path in dataset.lights.items())
     lines.append(f"  {'maps:':<12}{maps or 'none found'}")
     lo, hi = dataset.bounds
-    lines.append(f"  {'bounds:':<12}{_numbers(lo)} to {_numbers(hi)}, size {_numbers(hi - lo)}")
+    box = f"{point_text(lo)} to {point_text(hi)}, size {point_text(hi - lo)}"
+    lines.append(f"  {'bounds:':<12}{box}")
     lines += [f"  note: {note}" for note in dataset.notes]
     lines += [f"  warning: {warning}" for warning in dataset.warnings]
     return "\n".join(lines)
@@ -437,7 +431,15 @@ def _check_masks(views: Views, split: str, warnings: list[str]) -> None:
         warnings.append(f"{split}: every mask is full; the images may not be cut out at all")
 
 
-def _check_sides(views: Views, bounds: tuple[np.ndarray, np.ndarray], warnings: list[str]) -> None:
+def _check_box(splits: Mapping[str, Views], box: Bounds, warnings: list[str]) -> None:
+    """Refuse cameras within the box around the object; warn of where it lies and is seen from."""
+    for views in splits.values():
+        _check_cameras_outside(views, box)
+    _check_sides(splits["train"], box, warnings)
+    _check_origin(box, warnings)
+
+
+def _check_sides(views: Views, bounds: Bounds, warnings: list[str]) -> None:
     """Warn of cameras that see the object from one side only."""
     away = views.camera_to_world[:, :3, 3] - 0.5 * (bounds[0] + bounds[1])
     away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
@@ -450,7 +452,7 @@ def _check_sides(views: Views, bounds: tuple[np.ndarray, np.ndarray], warnings: 
         )
 
 
-def _check_origin(bounds: tuple[np.ndarray, np.ndarray], warnings: list[str]) -> None:
+def _check_origin(bounds: Bounds, warnings: list[str]) -> None:
     """Warn of an object so far from the origin that float32 does not know where its parts are."""
     sizes = np.linalg.norm(0.5 * (bounds[0] + bounds[1])) / np.max(bounds[1] - bounds[0])
     if sizes > _FAR_SIZES:
@@ -460,7 +462,7 @@ def _check_origin(bounds: tuple[np.ndarray, np.ndarray], warnings: list[str]) ->
         )
 
 
-def _check_cameras_outside(views: Views, bounds: tuple[np.ndarray, np.ndarray]) -> None:
+def _check_cameras_outside(views: Views, bounds: Bounds) -> None:
     lo, hi = bounds
     centers = views.camera_to_world[:, :3, 3]
     inside = ((centers > lo) & (centers < hi)).all(1)
@@ -473,12 +475,12 @@ def _check_cameras_outside(views: Views, bounds: tuple[np.ndarray, np.ndarray]) 
             )
         raise SceneError(
             f"{len(names)} cameras are inside the object's bounds, {some_names(names)} (the first "
-            f"at {_numbers(centers[inside][0])}, bounds {_numbers(lo)} to {_numbers(hi)}); check "
-            "the scale of the poses, or give tighter bounds"
+            f"at {point_text(centers[inside][0])}, bounds {point_text(lo)} to {point_text(hi)}); "
+            "check the scale of the poses, or give tighter bounds"
         )
 
 
-def _checked_bounds(bounds) -> tuple[np.ndarray, np.ndarray]:
+def _checked_bounds(bounds) -> Bounds:
     try:
         corners = np.asarray(bounds, np.float64)
     except (TypeError, ValueError):
@@ -497,7 +499,3 @@ def _spread(frames: Sequence[Frame], limit: int | None, name: str) -> Sequence[F
         raise SceneError(f"{name} must be at least 1, got {limit}")
     chosen = np.round(np.linspace(0, len(frames) - 1, limit)).astype(int)
     return [frames[index] for index in chosen]
-
-
-def _numbers(values: np.ndarray) -> str:
-    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from PIL import Image
 from trimesh.exchange.gltf import export_glb
 from trimesh.visual import TextureVisuals
@@ -253,6 +253,13 @@ def _vertex_colored(
     )
 
 
+def _normal_map(normals: Float[np.ndarray, "N 3"], covered: Bool[np.ndarray, "T T"]) -> Image.Image:
+    """Lay unit normals in tangent space, of the texels that faces cover, out as a picture."""
+    shown = np.zeros((*covered.shape, 3), np.float32)
+    shown[covered] = 0.5 + 0.5 * normals
+    return Image.fromarray(_to_bytes(fill_gutters(shown, covered)))
+
+
 def _textured(
     vertices: np.ndarray,
     faces: np.ndarray,
@@ -278,14 +285,14 @@ def _textured(
     rows, weights = charts.faces[face_rows[covered]], barycentrics[covered]
     cut, cut_normals = vertices[charts.vertex_rows], normals[charts.vertex_rows]
     points = np.einsum("nk,nkd->nd", weights, cut[rows]).astype(np.float32)
-    tangents, normal_map = None, None
+    attributes, normal_map = {}, None
     if fine is not None:
         points, wanted = fine.nearest(points, facing(cut[rows]))
         tangents = vertex_tangents(cut, charts.faces, cut_normals, charts.uv)
         interpolated = (np.einsum("nk,nkd->nd", weights, x[rows]) for x in (cut_normals, tangents))
-        shown = np.zeros((texture_size, texture_size, 3), np.float32)
-        shown[covered] = 0.5 + 0.5 * in_tangent_space(wanted, *interpolated)
-        normal_map = Image.fromarray(_to_bytes(fill_gutters(shown, covered)))
+        normal_map = _normal_map(in_tangent_space(wanted, *interpolated), covered)
+        turned = to_gltf_axes(tangents[:, :3])
+        attributes["_TANGENT"] = np.concatenate([turned, tangents[:, 3:]], axis=-1)
     baked = np.zeros((texture_size, texture_size, 5), np.float32)
     baked[covered] = _evaluate_materials(sample_materials, points)
     base_color, metallic_roughness = _textures(fill_gutters(baked, covered))
@@ -300,10 +307,6 @@ def _textured(
         alphaMode="OPAQUE",
         doubleSided=double_sided,
     )
-    attributes = {}
-    if tangents is not None:
-        turned = to_gltf_axes(tangents[:, :3])
-        attributes["_TANGENT"] = np.concatenate([turned, tangents[:, 3:]], axis=-1)
     # trimesh keeps OpenGL's v upwards and flips it when it writes glTF, whose v runs down.
     uv = charts.uv * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)
     mesh = trimesh.Trimesh(

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -38,6 +38,23 @@ _EVEN = 0.02
 _EVEN_STRIDE = 8
 
 
+class _Traits(NamedTuple):
+    """What is known of a photograph once it was read, beside its colours.
+
+    Attributes
+    ----------
+    has_mask, leaves_file, is_opaque : see `reading.Photograph`.
+    is_even : what is covered of it has one even colour.
+    marks : the pixels that count, as `pack_marks` leaves them.
+    """
+
+    has_mask: bool
+    leaves_file: bool
+    is_opaque: bool
+    is_even: bool
+    marks: Any
+
+
 def load_views(
     frames: Sequence[Frame], *, factor: int, listing: Listing, most_bytes: int
 ) -> tuple[Views, list[str]]:
@@ -56,23 +73,23 @@ def load_views(
     canvas = np.max(sizes, axis=0)
     _require_room_for_all(frames, full, canvas, most_bytes)
     height, width = (int(length) for length in canvas)
-    valid: list[Any] = [None] * len(frames)
-    has_mask = np.ones(len(frames), bool)
-    leaves_file, is_even, is_opaque = np.zeros((3, len(frames)), bool)
     kept, threads = PartsInMemory(len(frames), most_bytes), _threads_for(frames, full, factor)
 
-    def fill(index: int) -> None:
+    def read(index: int) -> _Traits:
         photograph = read_photograph(frames[index])
-        has_mask[index], leaves_file[index] = photograph.has_mask, photograph.leaves_file
-        is_opaque[index] = photograph.is_opaque
         if not (photograph.has_mask or listing.is_capture):
             raise SceneError(_no_mask(frames[index]))
         part, seen = photograph.part(frames[index], factor)
-        is_even[index] = _has_even_color(part)
-        valid[index] = pack_marks(_on_canvas(seen, height, width))
         kept.add(index, part)
+        return _Traits(
+            photograph.has_mask,
+            photograph.leaves_file,
+            photograph.is_opaque,
+            _has_even_color(part),
+            pack_marks(_on_canvas(seen, height, width)),
+        )
 
-    in_parallel(fill, range(len(frames)), threads=threads)
+    traits = in_parallel(read, range(len(frames)), threads=threads)
     images = kept.photographs(
         height,
         width,
@@ -80,17 +97,11 @@ def load_views(
         threads=threads,
     )
     forget_lenses()
-    if listing.is_capture and not (has_mask & ~is_opaque).any():
-        # An object may fill one photograph, but where it fills all of them nobody cut it out.
-        has_mask[:] = False
-    _require_masks_in_all_or_none(frames, has_mask)
-    if listing.is_capture and leaves_file.any():
-        problems.append(
-            f"{int(leaves_file.sum())} mask files are ignored because their images have an alpha "
-            f"channel, for example {frames[int(np.argmax(leaves_file))].image.name}"
-        )
-    problems += _even_views(frames, is_even)
-    marks = Marks.of(valid, height, width)
+    has_masks = _have_masks(frames, traits, is_capture=listing.is_capture)
+    if listing.is_capture:
+        problems += _unread_masks(frames, traits)
+    problems += _even_views(frames, traits)
+    marks = Marks.of([one.marks for one in traits], height, width)
     reading = Reading(frames, images, sizes, marks, factor)
     views = Views(
         names=tuple(frame.name for frame in frames),
@@ -100,7 +111,7 @@ def load_views(
         truth=true_maps(reading, listing.albedo_is_srgb, problems),
         relight=relit_images(reading, problems),
         valid=marks,
-        has_masks=bool(has_mask.all()),
+        has_masks=has_masks,
         lights={
             frame.name: ViewLight(frame.light, frame.camera_to_world)
             for frame in frames
@@ -206,9 +217,9 @@ def _has_even_color(part: Part) -> bool:
     return len(covered) > 0
 
 
-def _even_views(frames: Sequence[Frame], is_even: np.ndarray) -> list[str]:
+def _even_views(frames: Sequence[Frame], traits: Sequence[_Traits]) -> list[str]:
     """Warn of single photographs that show the object in one even colour."""
-    names = [frame.name for frame, even in zip(frames, is_even, strict=True) if even]
+    names = [frame.name for frame, one in zip(frames, traits, strict=True) if one.is_even]
     if not 0 < len(names) < 0.5 * len(frames):
         return []
     return [
@@ -257,9 +268,26 @@ def _no_mask(frame: Frame) -> str:
     )
 
 
-def _require_masks_in_all_or_none(frames: Sequence[Frame], has_mask: np.ndarray) -> None:
+def _have_masks(frames: Sequence[Frame], traits: Sequence[_Traits], *, is_capture: bool) -> bool:
+    """Tell whether photographs have masks; refuse a split in which only some do."""
+    if is_capture and not any(one.has_mask and not one.is_opaque for one in traits):
+        # An object may fill one photograph, but where it fills all of them nobody cut it out.
+        return False
+    has_mask = np.array([one.has_mask for one in traits])
     if has_mask.any() and not has_mask.all():
         raise SceneError(_no_mask(frames[int(np.argmin(has_mask))]))
+    return bool(has_mask.all())
+
+
+def _unread_masks(frames: Sequence[Frame], traits: Sequence[_Traits]) -> list[str]:
+    """Warn of files of masks beside images that have an alpha channel."""
+    names = [frame.image.name for frame, one in zip(frames, traits, strict=True) if one.leaves_file]
+    if not names:
+        return []
+    return [
+        f"{len(names)} mask files are ignored because their images have an alpha channel, for "
+        f"example {names[0]}"
+    ]
 
 
 def _require_distinct(names: Sequence[str]) -> None:

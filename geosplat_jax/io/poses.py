@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from geosplat_jax.io.alignment import align_world
 from geosplat_jax.io.dataset import LAYOUTS
+from geosplat_jax.io.extras import optional_package
 from geosplat_jax.io.frames import IMAGE_SUFFIXES, inside_scene, opengl_pose
 from geosplat_jax.io.images import (
     LINEAR_FORMATS,
@@ -122,7 +123,7 @@ def find_poses(
     names = _photographs(root)
     _require_free(root, force)
     _require_sizes(root, names, settings)
-    colmap = _import_pycolmap()
+    colmap = optional_package("pycolmap", "finding cameras", extra="capture")
     level = colmap.logging.minloglevel
     colmap.logging.minloglevel = colmap.logging.FATAL.value  # what fails is said here
     try:
@@ -148,17 +149,6 @@ def find_poses(
 
 def _silent(part: str, done: int, total: int) -> None:
     """Say nothing."""
-
-
-def _import_pycolmap() -> ModuleType:
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise SceneError(
-            "finding cameras needs pycolmap, which is not installed; pip install "
-            "'geosplat_jax[capture]'"
-        ) from error
-    return pycolmap
 
 
 def _photographs(root: Path) -> list[str]:

@@ -27,7 +27,7 @@ from geosplat_jax.io.meshes import (
     split_long_edges,
     surface_area,
 )
-from geosplat_jax.io.views import Views
+from geosplat_jax.io.views import Views, in_image, project
 from geosplat_jax.surface.triangle_mesh import connectivity
 
 LARGEST = 5_000_000
@@ -303,11 +303,9 @@ def _fills(points: np.ndarray, views: Views, view: int, mask: np.ndarray) -> flo
     rows, columns = np.nonzero(mask)
     if not len(rows):
         return 1.0
-    pose = views.world_to_camera[view]
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    local = local[local[:, 2] > 0]
-    pixels = (local @ views.intrinsics[view].T)[:, :2] / local[:, 2:]
-    inside = (pixels >= 0).all(axis=1) & (pixels < mask.shape[::-1]).all(axis=1)
+    pixels, local = project(points, views.world_to_camera[view], views.intrinsics[view])
+    pixels = pixels[local[:, 2] > 0]
+    inside = in_image(pixels, height=views.height, width=views.width)
     if not inside.any():
         return 0.0
     column, row = pixels[inside].astype(int).T

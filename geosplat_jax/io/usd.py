@@ -10,7 +10,8 @@ import trimesh
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from geosplat_jax.io.images import SceneError, written_aside
+from geosplat_jax.io.extras import optional_package
+from geosplat_jax.io.images import written_aside
 
 _COORDINATES = "st"
 """Name of the texture coordinates, by convention."""
@@ -24,12 +25,7 @@ def usd_library() -> Any:
     SceneError
         If they are not installed.
     """
-    try:
-        return importlib.import_module("pxr")
-    except ImportError:
-        raise SceneError(
-            "USD needs the package usd-core; install it with `pip install 'geosplat_jax[usd]'`"
-        ) from None
+    return optional_package("pxr", "USD", extra="usd", package="usd-core")
 
 
 def _modules(*names: str) -> tuple[Any, ...]:

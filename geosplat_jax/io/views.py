@@ -6,7 +6,7 @@ are read when first asked for (`truth`): they are many, and training never touch
 """
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -208,6 +208,36 @@ def some_views(views: Views, chosen: Sequence[int] | np.ndarray, *, factor: int 
         relight={},
         lights={},
     )
+
+
+def project(
+    points: Float[np.ndarray, "N 3"],
+    world_to_camera: Float[np.ndarray, "4 4"],
+    intrinsics: Float[np.ndarray, "3 3"],
+) -> tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 3"]]:
+    """Project points of the world with one camera, on the host.
+
+    Returns
+    -------
+    pixels : columns and rows; what is not in front of the camera gets -1, outside of every image.
+    local : the points along the camera's OpenCV axes, the last of which is their depth.
+    """
+    local = points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    is_ahead = local[:, 2:] > 0.0
+    pixels = (local @ intrinsics.T)[:, :2] / np.where(is_ahead, local[:, 2:], 1.0)
+    return np.where(is_ahead, pixels, -1.0), local
+
+
+def in_image(
+    pixels: Float[np.ndarray, "N 2"], *, height: int, width: int
+) -> Bool[np.ndarray, " N"]:
+    """Tell which pixels (columns, rows) an image of some size has."""
+    return (pixels >= 0).all(axis=1) & (pixels < [width, height]).all(axis=1)
+
+
+def point_text(point: Iterable[float]) -> str:
+    """Write a place or an extent in the world for a reader, with four digits."""
+    return "(" + ", ".join(f"{value:.4g}" for value in point) + ")"
 
 
 def _reduced(

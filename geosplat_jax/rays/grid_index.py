@@ -14,18 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 from geosplat_jax.core.capacity import Capacities, Usage, bit_set, usage
 from geosplat_jax.core.numerics import safe_normalize
 from geosplat_jax.core.types import Grid, Mesh
-from geosplat_jax.rays.walking import (
-    SLACK,
-    T_MIN,
-    WORD_BITS,
-    CellIndex,
-    Lanes,
-    cell_lists,
-    cones_of,
-    cross,
-    dot,
-    words_of,
-)
+from geosplat_jax.rays.cells import SLACK, WORD_BITS, cell_lists, cones_of, words_of
+from geosplat_jax.rays.walking import T_MIN, CellIndex, Lanes, cross, dot
 
 _COUNT_BITS = 8
 """Bits of a cell's count. It lists at most 144 patches: 3 axes of 3 x 4 x 4 edges in reach."""

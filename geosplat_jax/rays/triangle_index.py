@@ -19,18 +19,8 @@ from jaxtyping import Array, Bool, Float, Int
 from geosplat_jax.core.capacity import Capacities, Usage, bit_set, usage
 from geosplat_jax.core.numerics import safe_normalize
 from geosplat_jax.core.types import Grid
-from geosplat_jax.rays.walking import (
-    SLACK,
-    T_MIN,
-    WORD_BITS,
-    CellIndex,
-    Lanes,
-    cell_lists,
-    cones_of,
-    cross,
-    dot,
-    words_of,
-)
+from geosplat_jax.rays.cells import SLACK, WORD_BITS, cell_lists, cones_of, words_of
+from geosplat_jax.rays.walking import T_MIN, CellIndex, Lanes, cross, dot
 
 _TESTED_AT_ONCE = 2
 """Triangles of a cell that a ray is tested against before it may move on."""

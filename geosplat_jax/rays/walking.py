@@ -32,18 +32,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt
 
 from geosplat_jax.core.capacity import bit_set
-from geosplat_jax.core.numerics import safe_normalize
 from geosplat_jax.core.types import Grid
 from geosplat_jax.rays.base import RayIndex
+from geosplat_jax.rays.cells import faces_away
 
 T_MIN = 1e-3
 """Hits nearer to the start of a ray than this, in cells, are ignored."""
-
-SLACK = 1e-4
-"""Enlargement of what is listed in cells, so that rounding along a ray never passes it by."""
-
-WORD_BITS = 31
-"""Bits of a cell's word: how many entries it lists, and which is the first."""
 
 _LANES = 8192
 """Rays that travel together: few enough to stay in the cache of a core."""
@@ -56,16 +50,6 @@ _ACCELERATOR_LANES = 1 << 19
 
 _ACCELERATOR_FEWEST_LANES = 1 << 14
 """Fewer rays than this take an accelerator as long to move on as to move together."""
-
-_DOUBLINGS = 7
-"""Doublings of an empty cube, so that three bits hold how often it was doubled: up to 128 cells."""
-
-_EMPTY = -(1 << WORD_BITS)
-"""Sign of the word of a cell without a list."""
-
-_CONE_MARGIN = 0.02
-"""Added to the sine of a cone, because its axis is rounded to 8 bits per component and may thereby
-become a little longer than 127. Where the sum reaches 1 the cell is stored without a cone."""
 
 _PARALLEL = 1e-12
 """Directions with a smaller component do not move along that axis."""
@@ -97,11 +81,8 @@ class CellIndex(RayIndex):
     Attributes
     ----------
     grid : of the cells.
-    words : (cells,) the low ``count_bits`` hold the number of entries of a cell, the other bits the
-        row of its first entry. The word of a cell without entries is negative, and holds the sizes
-        of its `_empty_cubes`.
-    cones : (cells,) cone around the normals in a cell: in the highest byte its sine, in the others
-        the x, y and z of its axis, offset by 128; see `cones_of`.
+    words : (cells,) what every cell lists; see `cells.words_of`.
+    cones : (cells,) cone around the normals in a cell; see `cells.cones_of`.
     """
 
     grid: Grid
@@ -150,115 +131,6 @@ class CellIndex(RayIndex):
         return _nearest(self, origins, directions, source, mask, two_sided=two_sided)
 
 
-# --- what cells know ----------------------------------------------------------------------------
-
-
-class CellLists(NamedTuple):
-    """The cells that list something, in order, in as many rows as there are entries.
-
-    Attributes
-    ----------
-    cell : number of the cell; the number of all cells on padding.
-    first, length : where its list begins, and how much it lists.
-    row : of every entry, the row here of the cell that lists it.
-    """
-
-    cell: Int[Array, " E"]
-    first: Int[Array, " E"]
-    length: Int[Array, " E"]
-    row: Int[Array, " E"]
-
-
-def cell_lists(cells: Int[Array, " E"], cell_count: int) -> CellLists:
-    """Find the list of every cell; ``cells`` of every entry, sorted, ``cell_count`` on padding."""
-    size = cells.shape[0]
-    numbers = jnp.arange(size, dtype=jnp.int32)
-    begins = jnp.concatenate([jnp.ones((1,), bool), cells[1:] != cells[:-1]])
-    row = jnp.cumsum(begins.astype(jnp.int32)) - 1
-    first = jnp.full((size + 1,), size, jnp.int32)
-    first = first.at[jnp.where(begins, row, size + 1)].set(numbers, mode="drop")
-    cell = jnp.full((size,), cell_count, jnp.int32).at[row].set(cells, indices_are_sorted=True)
-    return CellLists(cell, first[:-1], first[1:] - first[:-1], row)
-
-
-def words_of(lists: CellLists, grid: Grid, *, count_bits: int) -> Int[Array, " K"]:
-    """Build the words of the cells of a grid."""
-    occupied = jnp.zeros((grid.cube_count,), bool).at[lists.cell].set(True, mode="drop")
-    words = _empty_cubes(occupied, grid) | _EMPTY
-    return words.at[lists.cell].set(lists.first << count_bits | lists.length, mode="drop")
-
-
-def _moved(values: UInt[Array, "z y x"], by: int, axis: int) -> UInt[Array, "z y x"]:
-    """Move values along an axis by so many cells; what comes in from outside is zero."""
-    size = values.shape[axis]
-    by = max(-size, min(by, size))
-    kept = jax.lax.slice_in_dim(values, max(-by, 0), size - max(by, 0), axis=axis)
-    beyond = jnp.zeros_like(jax.lax.slice_in_dim(values, 0, abs(by), axis=axis))
-    return jnp.concatenate([beyond, kept] if by > 0 else [kept, beyond], axis=axis)
-
-
-def _empty_cubes(occupied: Bool[Array, " K"], grid: Grid) -> Int[Array, " K"]:
-    """Find how large an empty cube begins with a cell, towards each octant of directions.
-
-    Returns the binary logarithm of its side in cells, three bits an octant; bit i of an octant's
-    number is set where directions are negative along axis i. What lies outside of the grid is
-    empty.
-    """
-    nx, ny, nz = grid.shape
-    meets = jnp.where(occupied.reshape(nz, ny, nx), jnp.uint8(255), jnp.uint8(0))
-    levels = jnp.zeros(meets.shape, jnp.int32)
-    for doubling in range(_DOUBLINGS):
-        # Bit o of `meets`: the cube of this side towards octant o holds an occupied cell.
-        side = 1 << doubling
-        for axis in range(3):
-            forward = sum(1 << octant for octant in range(8) if not octant >> axis & 1)
-            after, before = (_moved(meets, by, 2 - axis) for by in (-side, side))
-            meets = meets | (after & forward) | (before & (255 - forward))
-            # Fused with what follows, every cell would be computed many times over.
-            meets = jax.lax.optimization_barrier(meets)
-        # Spread the eight bits, so that there is one in every three.
-        empty = (~meets).astype(jnp.int32)
-        empty = (empty | empty << 8) & 0xF00F
-        empty = (empty | empty << 4) & 0xC30C3
-        levels = levels + ((empty | empty << 2) & 0x249249)
-    return levels.reshape(-1)
-
-
-def cones_of(
-    normals: Float[Array, "T Q 3"], entries: Int[Array, " E"], lists: CellLists, cell_count: int
-) -> UInt[Array, " K"]:
-    """Cone that holds the normals of all triangles of a cell, packed; see `_faces_away`.
-
-    Parameters
-    ----------
-    normals : unit normals of the T triangles of each of the Q things that cells list; zero where a
-        triangle has none.
-    entries : which of them every entry is.
-    """
-    size = entries.shape[0]
-    axis = jax.ops.segment_sum(
-        jnp.sum(normals, axis=0)[entries], lists.row, size, indices_are_sorted=True
-    )
-    axis = jnp.round(127 * safe_normalize(axis))
-    along = jnp.sum(normals[:, entries] * safe_normalize(axis)[lists.row][None], axis=-1)
-    # Triangles without a normal cannot be hit.
-    is_flat = jnp.all(normals[:, entries] == 0, axis=-1)
-    along = jnp.min(jnp.where(is_flat, 1.0, along), axis=0)
-    smallest = jax.ops.segment_min(along, lists.row, size, indices_are_sorted=True)
-    smallest = jnp.clip(smallest, -1.0, 1.0)
-    sine = jnp.sqrt(1 - smallest**2) + _CONE_MARGIN
-    is_cone = (smallest > 0) & (sine < 1)
-    # Where no cone holds the normals, an axis of zero faces no direction.
-    axis = jnp.where(is_cone[:, None], axis, 0.0)
-    packed = jnp.ceil(255 * jnp.minimum(sine, 1.0)).astype(jnp.uint32)
-    for component in range(3):
-        packed = packed << 8 | (axis[:, component].astype(jnp.int32) + 128).astype(jnp.uint32)
-    return jnp.zeros((cell_count,), jnp.uint32).at[lists.cell].set(packed, mode="drop")
-
-
-# --- travelling ---------------------------------------------------------------------------------
-
-
 def cross(a: tuple[Array, ...], b: tuple[Array, ...]) -> tuple[Array, ...]:
     """Cross product of vectors whose components are arrays of their own."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
@@ -267,18 +139,6 @@ def cross(a: tuple[Array, ...], b: tuple[Array, ...]) -> tuple[Array, ...]:
 def dot(a: tuple[Array, ...], b: tuple[Array, ...]) -> Array:
     """Scalar product of vectors whose components are arrays of their own."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _faces_away(cone: UInt[Array, " n"], direction: tuple[Array, ...]) -> Bool[Array, " n"]:
-    """Whether every normal in the cone has a positive cosine with the direction.
-
-    With all normals within an angle a of the axis, that is so where the direction's cosine with
-    the axis exceeds sin(a).
-    """
-    shifts = (16, 8, 0)
-    axis = [((cone >> s) & 255).astype(jnp.int32) - 128 for s in shifts]
-    sine = (cone >> 24).astype(direction[0].dtype) * (127 / 255)
-    return sum(a.astype(d.dtype) * d for a, d in zip(axis, direction, strict=True)) > sine
 
 
 def _enter(
@@ -299,7 +159,7 @@ def _enter(
     if two_sided:
         return word
     cone = index.cones.at[number].get(mode="promise_in_bounds")
-    is_idle = (index.count(word) > 0) & _faces_away(cone, lanes.direction)
+    is_idle = (index.count(word) > 0) & faces_away(cone, lanes.direction)
     return jnp.where(is_idle, 1 << index.count_bits, word)
 
 

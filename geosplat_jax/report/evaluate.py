@@ -25,7 +25,7 @@ from geosplat_jax.report.assets import MODEL_TEXTURE, MaterialSampler, write_mod
 from geosplat_jax.report.light_metrics import light_metrics
 from geosplat_jax.report.metrics import MASK_THRESHOLD, mask_iou, normal_mae_deg
 from geosplat_jax.report.pace import OnProgress, counted
-from geosplat_jax.report.protocols import Look, Protocol, ScaledLook
+from geosplat_jax.report.protocols import Protocol, Rendition, ScaledRendition
 from geosplat_jax.report.renderer import (
     DEFAULT_SAMPLES,
     RenderedView,
@@ -55,9 +55,9 @@ def _where_counted(view: RenderedView, valid: np.ndarray | None) -> RenderedView
     )
 
 
-def _compared(view: RenderedView, look: Look | ScaledLook) -> np.ndarray:
-    """Return the colours that a look compares: those brighter than white only where it has them."""
-    return view.linear if isinstance(look, ScaledLook) else view.rgb
+def _compared(view: RenderedView, rendition: Rendition | ScaledRendition) -> np.ndarray:
+    """Return colours as they are compared, beyond white only where the rendition has those."""
+    return view.linear if isinstance(rendition, ScaledRendition) else view.rgb
 
 
 def _valid(views: Views, index: int) -> np.ndarray | None:
@@ -83,9 +83,9 @@ def _view_metrics(
     mask = image[..., 3]
     metrics = protocol_metrics.new_view_metrics(view.rgb, view.alpha, image, valid)
     if protocol.new_views is not None:
-        look = protocol.new_views
+        rendition = protocol.new_views
         metrics |= protocol_metrics.new_view_metrics(
-            _compared(view, look), view.alpha, image, valid, look
+            _compared(view, rendition), view.alpha, image, valid, rendition
         )
     metrics["mask.iou"] = float(mask_iou(view.alpha, mask))
     if truth_normal is not None:
@@ -199,7 +199,7 @@ def _relight_metrics(
             rgb[index], alpha[index] = _compared(view, protocol.relight), view.alpha
             if index in chosen:
                 shown[index] = render_on_white(view.rgb, view.alpha)
-        images = views.relight[name]  # read once, since every look reads all of them
+        images = views.relight[name]  # read once, since every rendition reads all of them
         found = protocol_metrics.relight_metrics(protocol, rgb, alpha, images, _all_valid(views))
         metrics |= {f"relight.{name}.{key}": value for key, value in found.items()}
         for row, index in zip(rows, chosen, strict=True):

@@ -1,6 +1,5 @@
 """TensorBoard event files: the scalars of every step and the previews, during training."""
 
-import importlib
 import json
 import shutil
 from typing import Any
@@ -9,27 +8,11 @@ import numpy as np
 
 from geosplat_jax.fit.folder import EVENTS, RunFolder
 from geosplat_jax.fit.listener import Listener, Progress
-from geosplat_jax.io.images import SceneError, read_image
+from geosplat_jax.io.extras import optional_package
+from geosplat_jax.io.images import read_image
 
 _SHOWN = ("loss", "psnr", "splats", "faces", "seconds", "peak_memory_mb")
 _TERM = "term."
-
-
-def _writer_kind() -> Any:
-    """Return the class that writes event files.
-
-    Raises
-    ------
-    SceneError
-        If its package is not installed.
-    """
-    try:
-        return importlib.import_module("tensorboardX").SummaryWriter
-    except ImportError:
-        raise SceneError(
-            "--tensorboard needs the package tensorboardX; install it with "
-            "`pip install 'geosplat_jax[tensorboard]'`"
-        ) from None
 
 
 class EventLog(Listener):
@@ -48,7 +31,8 @@ class EventLog(Listener):
     """
 
     def __init__(self, folder: RunFolder) -> None:
-        self._kind, self._folder = _writer_kind(), folder
+        library = optional_package("tensorboardX", "--tensorboard", extra="tensorboard")
+        self._kind, self._folder = library.SummaryWriter, folder
         self._writer: Any = None
         self._begin_anew()
 

@@ -17,7 +17,7 @@ from geosplat_jax.fit.config import Config, changed_settings
 from geosplat_jax.fit.presets import BETWEEN, make_config
 from geosplat_jax.fit.start_mesh import MeshSettings
 from geosplat_jax.io.dataset import READING
-from geosplat_jax.report.protocols import NEW_VIEWS, Look, Protocol, ScaledLook, protocol
+from geosplat_jax.report.protocols import NEW_VIEWS, Protocol, Rendition, ScaledRendition, protocol
 
 _MEASURES = {
     "psnr": ("PSNR", "dB", "higher"),
@@ -93,13 +93,13 @@ def figure(key: str) -> Figure:
     return Figure(key, title, ", ".join([label, *parts]), unit, better)
 
 
-def _look(look: Look | ScaledLook) -> str:
+def _rendition(rendition: Rendition | ScaledRendition) -> str:
     """Say how pictures are compared."""
-    if isinstance(look, ScaledLook):
+    if isinstance(rendition, ScaledRendition):
         return "on the object alone, each channel of each image scaled by least squares"
     encodings = {"linear": "in linear light", "srgb": "in sRGB", "gamma22": "after gamma 2.2"}
-    grey = {0.0: "black", 1.0: "white"}.get(look.background, f"grey {look.background:g}")
-    return f"{encodings[look.encoding]} on {grey}"
+    grey = {0.0: "black", 1.0: "white"}.get(rendition.background, f"grey {rendition.background:g}")
+    return f"{encodings[rendition.encoding]} on {grey}"
 
 
 def protocol_text(name: str) -> str:
@@ -107,10 +107,10 @@ def protocol_text(name: str) -> str:
     chosen: Protocol = protocol(name)
     scale = {"least_squares": "least squares", "median": "the median of ratios"}
     return (
-        f"Protocol {chosen.name}. New views are compared {_look(NEW_VIEWS)}, albedo "
-        f"{_look(chosen.albedo)} after one factor for each channel by "
-        f"{scale[chosen.albedo_scale]}, relit images {_look(chosen.relight)} with the albedo in "
-        "that scale. Figures of other protocols are not comparable."
+        f"Protocol {chosen.name}. New views are compared {_rendition(NEW_VIEWS)}, albedo "
+        f"{_rendition(chosen.albedo)} after one factor for each channel by "
+        f"{scale[chosen.albedo_scale]}, relit images {_rendition(chosen.relight)} with the albedo "
+        "in that scale. Figures of other protocols are not comparable."
     )
 
 

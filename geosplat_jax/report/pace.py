@@ -24,7 +24,7 @@ def counted(items: Sequence[Item], part: str, on_progress: OnProgress | None) ->
         on_progress(part, len(items), len(items))
 
 
-class Pace:
+class TimeLeft:
     """Estimates the time left of one part of the work.
 
     The first item waits for the compilation of all; it says nothing about the others, and there is

@@ -35,10 +35,10 @@ from geosplat_jax.report.metrics import (
 )
 from geosplat_jax.report.protocols import (
     NEW_VIEWS,
-    Look,
     Protocol,
+    Rendition,
     ScaledFigure,
-    ScaledLook,
+    ScaledRendition,
     scale_views,
 )
 
@@ -140,14 +140,16 @@ def _mean_least_squares(
     return np.where(count > 0, total / np.maximum(count, 1), 1.0)
 
 
-def _picture(colors: np.ndarray, coverage: np.ndarray, look: Look) -> Float[np.ndarray, "H W 3"]:
+def _picture(
+    colors: np.ndarray, coverage: np.ndarray, rendition: Rendition
+) -> Float[np.ndarray, "H W 3"]:
     """Clip and encode straight linear colour, and lay it over the background."""
     encoded = np.clip(colors, 0.0, 1.0).astype(np.float32)
-    if look.encoding == "srgb":
+    if rendition.encoding == "srgb":
         encoded = np.clip(encode_srgb(encoded), 0.0, 1.0)
-    elif look.encoding == "gamma22":
+    elif rendition.encoding == "gamma22":
         encoded = np.power(encoded, np.float32(1 / 2.2))
-    return np.asarray(composite(encoded, coverage.astype(np.float32), look.background))
+    return np.asarray(composite(encoded, coverage.astype(np.float32), rendition.background))
 
 
 _mse, _ssim, _ssim_masked = jax.jit(mse), jax.jit(ssim), jax.jit(ssim_masked)
@@ -165,7 +167,7 @@ def scaled_psnr(
     inside: Bool[np.ndarray, "H W"],
     counted: Bool[np.ndarray, "H W"],
 ) -> float:
-    """Measure one figure of Stanford-ORB on one image, in dB; see `ScaledLook`.
+    """Measure one figure of Stanford-ORB on one image, in dB; see `ScaledRendition`.
 
     Parameters
     ----------
@@ -193,16 +195,16 @@ def _compare_scaled(
     predictions: Iterable[np.ndarray],
     truths: Iterable[np.ndarray],
     mask: np.ndarray,
-    look: ScaledLook,
+    rendition: ScaledRendition,
     valid: np.ndarray | None,
 ) -> dict[str, float]:
-    """Means over the images that have an object after erosion; see `ScaledLook`."""
-    found: dict[str, list[float]] = {figure.name: [] for figure in look.figures}
+    """Means over the images that have an object after erosion; see `ScaledRendition`."""
+    found: dict[str, list[float]] = {figure.name: [] for figure in rendition.figures}
     known = np.ones(mask.shape, bool) if valid is None else valid > MASK_THRESHOLD
     for prediction, truth, covered, counted in zip(predictions, truths, mask, known, strict=True):
         inside = eroded(covered > MASK_THRESHOLD)
         if inside.any():
-            for figure in look.figures:
+            for figure in rendition.figures:
                 found[figure.name].append(scaled_psnr(figure, prediction, truth, inside, counted))
     return {name: float(np.mean(values)) for name, values in found.items() if values}
 
@@ -213,16 +215,16 @@ def _compare(
     truths: Iterable[np.ndarray],
     mask: np.ndarray,
     *,
-    look: Look | ScaledLook,
+    rendition: Rendition | ScaledRendition,
     is_pooled: bool,
     valid: np.ndarray | None,
 ) -> dict[str, float]:
-    """PSNR and SSIM, whole and masked, view by view, of linear images; or what the look measures.
+    """PSNR and SSIM, whole and masked, view by view, of linear images; or a rendition's figures.
 
     Predictions are premultiplied by ``alpha``, truths straight.
     """
-    if isinstance(look, ScaledLook):
-        return _compare_scaled(predictions, truths, mask, look, valid)
+    if isinstance(rendition, ScaledRendition):
+        return _compare_scaled(predictions, truths, mask, rendition, valid)
     errors, similarities, masked_errors, masked_similarities, counts = [], [], [], [], []
     totals = []
     known = [None] * len(mask) if valid is None else valid
@@ -233,8 +235,8 @@ def _compare(
             "solid": drawn > MASK_THRESHOLD,
             "mask": covered,
         }
-        predicted = _picture(straight(prediction, drawn), shown[look.silhouette], look)
-        true = _picture(truth, covered, look)
+        predicted = _picture(straight(prediction, drawn), shown[rendition.silhouette], rendition)
+        true = _picture(truth, covered, rendition)
         errors.append(float(_mse(predicted, true, counted)))
         if counted is None:
             similarities.append(float(_ssim(predicted, true)))
@@ -262,14 +264,14 @@ def _compare_images(
     rgb: np.ndarray,
     alpha: np.ndarray,
     image: np.ndarray,
-    look: Look | ScaledLook,
+    rendition: Rendition | ScaledRendition,
     valid: np.ndarray | None,
 ) -> dict[str, float]:
     """Compare premultiplied renders with straight RGBA images, (V, H, W, 3 and 4)."""
     _require(alpha.shape, alpha=alpha, rgb=(rgb, 3), image=(image, 4))
     _require_black(valid, alpha=alpha, image=image[..., 3])
     true, mask = image[..., :3], image[..., 3]
-    return _compare(rgb, alpha, true, mask, look=look, is_pooled=False, valid=valid)
+    return _compare(rgb, alpha, true, mask, rendition=rendition, is_pooled=False, valid=valid)
 
 
 def new_view_metrics(
@@ -277,18 +279,18 @@ def new_view_metrics(
     alpha: Float[np.ndarray, "..."],
     image: Float[np.ndarray, "..."],
     valid: Shaped[np.ndarray, "..."] | None = None,
-    look: Look | ScaledLook = NEW_VIEWS,
+    rendition: Rendition | ScaledRendition = NEW_VIEWS,
 ) -> dict[str, float]:
     """Compare one view under the training light with its photograph, as `NEW_VIEWS` says.
 
     Parameters
     ----------
     rgb : (H, W, 3) linear, exposed and tone mapped, premultiplied by ``alpha``; clipped here. For a
-        `ScaledLook` not tone mapped: it measures what is brighter than white, too.
+        `ScaledRendition` not tone mapped: it measures what is brighter than white, too.
     alpha : (H, W) predicted coverage.
     image : (H, W, 4) photograph, linear, *straight* alpha, which is the mask.
     valid : (H, W) pixels that count, or None.
-    look : another one, whose figures are then returned.
+    rendition : another one, whose figures are then returned.
 
     Returns
     -------
@@ -300,7 +302,7 @@ def new_view_metrics(
     ValueError : shapes that do not agree, values that are not finite.
     """
     counted = None if valid is None else valid[None]
-    metrics = _compare_images(rgb[None], alpha[None], image[None], look, counted)
+    metrics = _compare_images(rgb[None], alpha[None], image[None], rendition, counted)
     return {f"nvs.{name}": value for name, value in metrics.items()}
 
 
@@ -341,7 +343,7 @@ def albedo_metrics(
         alpha,
         (straight(t, covered) for t, covered in zip(truth, mask, strict=True)),
         mask,
-        look=protocol.albedo,
+        rendition=protocol.albedo,
         is_pooled=protocol.albedo_is_pooled,
         valid=valid,
     )
@@ -415,7 +417,7 @@ def relight_metrics(
     ----------
     protocol : its ``relight`` decides.
     rgb : (V, H, W, 3) linear, premultiplied by ``alpha``, lit with the albedo times its
-        `albedo_scale`, at exposure 1; clipped here. For a `ScaledLook` not tone mapped.
+        `albedo_scale`, at exposure 1; clipped here. For a `ScaledRendition` not tone mapped.
     alpha : (V, H, W) predicted coverage.
     image : (V, H, W, 4) true image, linear, *straight* alpha, which is the mask.
     valid : (V, H, W) pixels that count, or None.

@@ -13,7 +13,7 @@ from jaxtyping import Int
 
 
 @dataclass(frozen=True)
-class Look:
+class Rendition:
     """How pictures are made of linear colour before they are compared.
 
     Attributes
@@ -50,7 +50,7 @@ class ScaledFigure:
 
 
 @dataclass(frozen=True)
-class ScaledLook:
+class ScaledRendition:
     """How Stanford-ORB compares images: on the object alone, after a scale for each image.
 
     The true mask is eroded by 5 x 5 pixels, and what is outside is black in both images. Each
@@ -76,24 +76,24 @@ class Protocol:
     albedo_scale : ``least_squares`` a view, averaged over the views, or ``median`` of all pixels;
         always a channel, in linear colour.
     scale_views : number of views, spread evenly, that the scale is taken from; None for all.
-    albedo, relight : looks of albedo and of relit images.
+    albedo, relight : renditions of albedo and of relit images.
     albedo_is_pooled : one PSNR of the error over all images; otherwise, and for relit images
         always, the mean of the PSNR of every image.
     lpips_nets : networks of the perceptual distance; see `lpips_note`.
-    new_views : look of new views besides `NEW_VIEWS`, or None.
+    new_views : rendition of new views besides `NEW_VIEWS`, or None.
     """
 
     name: str
     albedo_scale: Literal["least_squares", "median"]
     scale_views: int | None
-    albedo: Look | ScaledLook
+    albedo: Rendition | ScaledRendition
     albedo_is_pooled: bool
-    relight: Look | ScaledLook
+    relight: Rendition | ScaledRendition
     lpips_nets: tuple[str, ...]
-    new_views: ScaledLook | None = None
+    new_views: ScaledRendition | None = None
 
 
-_ORB_IMAGES = ScaledLook(
+_ORB_IMAGES = ScaledRendition(
     (
         ScaledFigure("psnr_h", 4.0, is_brightened=True, is_encoded=False),
         ScaledFigure("psnr_l", 1.0, is_brightened=False, is_encoded=True),
@@ -108,34 +108,36 @@ PROTOCOL: Mapping[str, Protocol] = {
             name="geosplatting",
             albedo_scale="least_squares",
             scale_views=None,
-            albedo=Look("srgb", 0.0, "alpha"),
+            albedo=Rendition("srgb", 0.0, "alpha"),
             albedo_is_pooled=False,
-            relight=Look("srgb", 1.0, "alpha"),
+            relight=Rendition("srgb", 1.0, "alpha"),
             lpips_nets=("alex",),
         ),
         Protocol(
             name="tensoir",
             albedo_scale="median",
             scale_views=20,
-            albedo=Look("gamma22", 1.0, "mask"),
+            albedo=Rendition("gamma22", 1.0, "mask"),
             albedo_is_pooled=True,
-            relight=Look("srgb", 1.0, "solid"),
+            relight=Rendition("srgb", 1.0, "solid"),
             lpips_nets=("alex", "vgg"),
         ),
         Protocol(
             name="irgs",
             albedo_scale="median",
             scale_views=None,
-            albedo=Look("linear", 0.0, "mask"),
+            albedo=Rendition("linear", 0.0, "mask"),
             albedo_is_pooled=False,
-            relight=Look("srgb", 0.0, "mask"),
+            relight=Rendition("srgb", 0.0, "mask"),
             lpips_nets=("vgg",),
         ),
         Protocol(
             name="orb",
             albedo_scale="least_squares",
             scale_views=None,
-            albedo=ScaledLook((ScaledFigure("psnr", 1.0, is_brightened=False, is_encoded=False),)),
+            albedo=ScaledRendition(
+                (ScaledFigure("psnr", 1.0, is_brightened=False, is_encoded=False),)
+            ),
             albedo_is_pooled=False,
             relight=_ORB_IMAGES,
             lpips_nets=("vgg",),
@@ -145,7 +147,7 @@ PROTOCOL: Mapping[str, Protocol] = {
 }
 """The protocols by name."""
 
-NEW_VIEWS = Look("srgb", 1.0, "alpha")
+NEW_VIEWS = Rendition("srgb", 1.0, "alpha")
 """How new views under the training light are compared in every protocol."""
 
 PROTOCOLS = tuple(PROTOCOL)

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from geosplat_jax.core.types import Camera
 from geosplat_jax.io.meshes import first_hits
-from geosplat_jax.io.views import Views
+from geosplat_jax.io.views import Views, in_image, project
 from geosplat_jax.report.consistency import resized
 from geosplat_jax.report.scales import SEEN
 
@@ -100,17 +100,13 @@ def _sees(
     # The farthest of the pixels around: where the surface is steep, depth changes within a pixel.
     depth = ndimage.maximum_filter(depth, size=3)
     pose = np.asarray(camera.world_to_camera[0], np.float64)
-    points = vertices @ pose[:3, :3].T + pose[:3, 3]
-    in_front = points[:, 2] > 0
-    z = np.where(in_front, points[:, 2], 1.0)
-    pixels = (points @ np.asarray(camera.intrinsics[0], np.float64).T)[:, :2] / z[:, None]
-    column, row = np.floor(pixels).astype(np.int64).T
-    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    column, row = np.where(inside, column, 0), np.where(inside, row, 0)
+    pixels, points = project(vertices, pose, np.asarray(camera.intrinsics[0], np.float64))
+    inside = in_image(pixels, height=camera.height, width=camera.width)
+    column, row = np.where(inside[:, None], pixels, 0).astype(np.int64).T
     extent = float(np.max(np.ptp(vertices, axis=0)))
     faces_camera = is_two_sided | (np.einsum("nd,nd->n", normals @ pose[:3, :3].T, points) < 0)
-    is_nearest = z <= depth[row, column] + _SLACK * extent
-    seen = in_front & inside & faces_camera & is_nearest
+    is_nearest = points[:, 2] <= depth[row, column] + _SLACK * extent
+    seen = inside & faces_camera & is_nearest
     if valid is not None:
         rows = row * valid.shape[0] // camera.height
         columns = column * valid.shape[1] // camera.width

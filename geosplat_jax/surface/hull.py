@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.ndimage import distance_transform_edt
 
-from geosplat_jax.core.types import Grid
+from geosplat_jax.core.types import Bounds, Grid
 
 TOLERANCE = 0.02
 """Fraction of the views whose mask may miss a point of the object."""
@@ -38,29 +38,6 @@ _MUCH_HAZE = 0.05  # hazy pixels per pixel of the outline, above which a mask is
 _BAND_CELLS = 1.5  # the looked-up distance is trusted this far from the surface
 _SEARCH_POINTS = 48  # along each side, while the bounds close in on the hull
 _SEARCH_STEPS = 8
-
-
-def visual_hull(
-    world_to_camera: Float[np.ndarray, "V 4 4"],
-    intrinsics: Float[np.ndarray, "V 3 3"],
-    masks: Any,
-    points: Float[np.ndarray, "N 3"],
-    *,
-    valid: Any = None,
-    tolerance: float = TOLERANCE,
-    seen_fraction: float = SEEN_FRACTION,
-) -> Bool[np.ndarray, " N"]:
-    """Tell which points lie inside the visual hull; see `hull_distance` for the parameters."""
-    distance = hull_distance(
-        world_to_camera,
-        intrinsics,
-        masks,
-        points,
-        valid=valid,
-        tolerance=tolerance,
-        seen_fraction=seen_fraction,
-    )
-    return distance < 0.0
 
 
 def hull_distance(
@@ -106,7 +83,7 @@ def hull_bounds(
     margin: float = 0.02,
     tolerance: float = TOLERANCE,
     seen_fraction: float = SEEN_FRACTION,
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+) -> Bounds:
     """Find the box around the hull, wherever in the world the cameras look.
 
     The search starts from a cube about the point nearest to the lines of sight through the masks'
@@ -160,7 +137,7 @@ def sight_bounds(
     *,
     height: int,
     width: int,
-) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+) -> Bounds:
     """Find a cube around what all cameras look at, where there are no masks.
 
     Its centre is the point nearest to the cameras' axes. Its size is such that at least half of the
@@ -237,7 +214,7 @@ def hull_sdf(
 
 
 def fit_grid(
-    bounds: tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]],
+    bounds: Bounds,
     resolution: int,
     *,
     margin_cells: int = 2,

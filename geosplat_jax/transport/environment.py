@@ -168,12 +168,6 @@ def to_y_up_map(directions: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
     return jnp.stack([-y, z, -x], axis=-1)
 
 
-def from_y_up_map(directions: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
-    """Invert `to_y_up_map`."""
-    x, y, z = jnp.moveaxis(directions, -1, 0)
-    return jnp.stack([-z, -x, y], axis=-1)
-
-
 @dataclass(frozen=True)
 class _Footprint:
     """The four texels around N directions: flat indices and weights, top row first."""

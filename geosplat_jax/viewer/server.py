@@ -1,6 +1,5 @@
 """The viewer in a browser: a thin layer between `painter.Viewer` and viser."""
 
-import importlib
 import socket
 import time
 from collections.abc import Callable
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from geosplat_jax.io.extras import optional_package
 from geosplat_jax.io.views import Views
 from geosplat_jax.report.relight import BACKGROUNDS
 from geosplat_jax.report.renderer import photograph_on_white
@@ -46,12 +46,7 @@ def viser_library() -> Any:
     ViewerError
         If it is not installed.
     """
-    try:
-        return importlib.import_module("viser")
-    except ImportError:
-        raise ViewerError(
-            "the viewer needs the package viser; install it with `pip install 'geosplat_jax[view]'`"
-        ) from None
+    return optional_package("viser", "the viewer", extra="view", error=ViewerError)
 
 
 def require_free_port(port: int, host: str = _LOCAL) -> None:

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from geosplat_jax.core.types import Grid
-from geosplat_jax.rays.walking import _faces_away, cell_lists, cones_of, words_of
+from geosplat_jax.rays.cells import cell_lists, cones_of, faces_away, words_of
 
 COUNT_BITS = 5
 SHAPE = (20, 9, 37)
@@ -85,7 +85,7 @@ def test_a_cone_passes_no_cell_whose_faces_a_ray_may_meet():
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     cone = jnp.asarray(np.repeat(cones, rays))
     ways = tuple(jnp.asarray(directions.reshape(-1, 3).T, jnp.float32))
-    passes = np.asarray(_faces_away(cone, ways)).reshape(cells, rays)
+    passes = np.asarray(faces_away(cone, ways)).reshape(cells, rays)
     meets = np.any(np.einsum("cnk,crk->crn", normals, directions) < 0, axis=-1)
     assert not np.any(passes & meets)
     assert passes[: cells // 4].mean() > 0.2
