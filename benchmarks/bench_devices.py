@@ -2,8 +2,8 @@
 
     python -m benchmarks.bench_devices --devices 1 2 4 [--views 8] [--quality draft]
 
-Where there is no accelerator the devices share the cores of one processor: the figures then say
-what sharing costs, not what it brings.
+Without an accelerator, the devices share the cores of one processor; the figures then show the cost
+of sharing, and no gain.
 """
 
 import argparse
@@ -29,7 +29,7 @@ _WARM_UP = 3
 
 
 def step_ms(count: int, *, views: int, quality: str, steps: int) -> dict[str, float | str]:
-    """Return the median step of the first stage on so many devices of this process."""
+    """Return the median step of the first stage, ms, on ``count`` devices, and their platform."""
     devices = choose_devices(count)
     names = make_config("default", quality).stage_names
     lengths = [f"stages.{name}.steps=0" for name in names[1:]]

@@ -1,10 +1,10 @@
-"""Time the steps of every stage on a scene of any size, on whatever JAX computes on.
+"""Time the steps of every stage on a scene of any size, on the default device of JAX.
 
     python -m benchmarks.bench_full_size SCENE --quality high --set geometry.resolution=96
 
-Every stage is timed in a run of its own, after a single step of those before it, and none follows
-it, whose programs would be compiled meanwhile. The surface is then close to the visual hull and has
-about as many faces as a trained one.
+Every stage is timed in its own run, after a single step of each earlier stage. No stage follows it,
+since its programs would be compiled in the background at the same time. The surface is then close
+to the visual hull, and has about as many faces as a trained one.
 """
 
 import argparse
@@ -29,7 +29,10 @@ _WARM_UP = 3
 def run(
     scene: Path, *, quality: str, overrides: tuple[str, ...] = (), steps: int = 20
 ) -> dict[str, float | int | str]:
-    """Return median seconds of a step of every stage, first ones apart, and the peak memory."""
+    """Return the median seconds of a step of every stage, without the first ones, and the memory.
+
+    Also facts about device, scene and settings; ``peak_memory_mb`` is that of this process.
+    """
     dataset = load_dataset(scene)
     names = make_config("default", quality, overrides=overrides).stage_names
     times, lines = {}, []

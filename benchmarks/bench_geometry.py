@@ -1,8 +1,8 @@
 """Time the isosurface, forward and with gradients, on a torus at two resolutions.
 
-The scalar is that of the reference measurement: volume, a moment of the triangle areas, and the
-deviation regulariser. PyTorch FlexiCubes takes 203 ms (R=48) and 956 ms (R=96) for it on two
-idle cores of the machine whose calibration is ``exp_ms`` = 6.
+The function is that of the reference measurement: the sum of volume, a moment of the triangle
+areas, and the deviation regulariser. PyTorch FlexiCubes takes 203 ms (R=48) and 956 ms (R=96) for
+it on two idle cores of the machine whose calibration is ``exp_ms`` = 6.
 """
 
 import json

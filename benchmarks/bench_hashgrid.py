@@ -28,7 +28,7 @@ _POINTS_PER_CELL = 24
 
 
 def torus_points(count: int) -> jax.Array:
-    """Points near a torus in the unit cube, in the order an isosurface gives them: (count, 3)."""
+    """Return points near a torus in the unit cube, (count, 3), in the order of an isosurface."""
     rng = np.random.default_rng(0)
     cells = -(-count // _POINTS_PER_CELL)
     major, minor = rng.uniform(0.0, 2 * np.pi, (2, cells))
@@ -80,7 +80,7 @@ def _measure(spec: HashGridSpec, points: jax.Array, repeats: int) -> dict[str, f
 
 
 def run(*, repeats: int = 9, count: int = 72_000) -> dict:
-    """Medians in milliseconds, with the machine's speed before and after."""
+    """Return medians in milliseconds, with the calibration of the machine before and after."""
     points = torus_points(count)
     results: dict = {"jax": jax.__version__, "points": count, "calibration": calibrate()}
     for name, spec in SPECS.items():

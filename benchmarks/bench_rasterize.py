@@ -1,8 +1,8 @@
 """Time the rasteriser, forward and backward, on the splats of a torus mesh.
 
-The yardstick is OpenSplat's C++ CPU rasteriser, given the splats that face the camera, which are
-those that ours draws: 70 ms for projection, forward and backward at 200 x 200, 925 ms at 800 x 800,
-on the two cores of the README. On another machine the speedup says little.
+The yardstick is OpenSplat's C++ CPU rasteriser on the splats that face the camera, which ours draws
+as well: 70 ms for projection, forward and backward at 200 x 200, 925 ms at 800 x 800, on the two
+cores of the README. On another machine the speedup means little.
 """
 
 import argparse
@@ -112,7 +112,7 @@ def _front_facing(scene, center):
 
 @partial(jax.jit, static_argnames=("size", "capacities", "tile_size"))
 def lists_only(inputs, eligible, camera, *, size, capacities, tile_size):
-    """Projection without gradients, visibility, sorting and binning."""
+    """Compute the tile lists of a view: projection without gradients, sorting and binning."""
     footprints = project(
         *inputs[:3], world_to_camera=camera[0], intrinsics=camera[1], height=size, width=size
     )
@@ -129,7 +129,7 @@ def lists_only(inputs, eligible, camera, *, size, capacities, tile_size):
 
 @partial(jax.jit, static_argnames=("size", "capacities", "tile_size"))
 def forward(inputs, eligible, camera, *, size, capacities, tile_size):
-    """Image and alpha."""
+    """Rasterise a view: image, alpha and usage."""
     return rasterize(
         *inputs,
         eligible,
@@ -144,7 +144,7 @@ def forward(inputs, eligible, camera, *, size, capacities, tile_size):
 
 @partial(jax.jit, static_argnames=("size", "capacities", "tile_size"))
 def forward_backward(inputs, eligible, camera, *, size, capacities, tile_size):
-    """Gradient of the mean square of image and alpha."""
+    """Compute mean squares of image and alpha, summed, and their gradient in the splats."""
 
     def loss(inputs):
         image, alpha, _ = forward(
@@ -156,7 +156,7 @@ def forward_backward(inputs, eligible, camera, *, size, capacities, tile_size):
 
 
 def fitted_capacities(inputs, eligible, camera, *, size, tile_size) -> Capacities:
-    """Buffers with the headroom that training gives them once it knows what a view needs."""
+    """Return buffer sizes with the headroom that training leaves once it knows the usage."""
 
     def attempt(capacities: Capacities):
         lists = lists_only(
@@ -169,7 +169,7 @@ def fitted_capacities(inputs, eligible, camera, *, size, tile_size) -> Capacitie
 
 
 def milliseconds(function, *args, repeats: int, **settings) -> tuple[list[float], list[float]]:
-    """Wall and processor times (all threads) after a warm-up call."""
+    """Return wall and processor times (all threads) of repeated calls after a warm-up, ms."""
     jax.block_until_ready(function(*args, **settings))
     wall, processor = [], []
     for _ in range(repeats):
@@ -204,7 +204,7 @@ def _measure(major, minor, size, repeats, tile_size) -> dict:
 
 
 def run(*, repeats: int = 11, large: bool = True, tile_size: int = DEFAULT_TILE_SIZE) -> dict:
-    """Medians in milliseconds, with the yardsticks."""
+    """Return medians in milliseconds, with the yardsticks and the speedups over them."""
     results = {"torus_71k_200": _measure(92, 64, 200, repeats, tile_size)}
     if large:
         results["torus_297k_800"] = _measure(188, 132, 800, max(repeats // 2, 3), tile_size)

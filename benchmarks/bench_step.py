@@ -20,10 +20,10 @@ _WARM_UP = 3
 
 
 def _median_step_ms(quality: str, stage: str, steps: int) -> float:
-    """Median wall time of a step of a stage after its first few, milliseconds.
+    """Return the median wall time of a step of a stage, after the first ones, milliseconds.
 
-    Later stages start from the visual hull, after one step of every stage before: a surface of
-    about as many faces as the trained one.
+    Later stages start from the visual hull, after one step of each earlier stage; that surface has
+    about as many faces as a trained one.
     """
     names = make_config("default", quality).stage_names
     counts = {name: 1 for name in names[: names.index(stage)]} | {stage: 1000}
@@ -47,7 +47,7 @@ def run(*, steps: int = 15) -> dict[str, float]:
 
 
 def run_whole() -> dict[str, float]:
-    """Train a draft from loading to the last step; seconds, decibels and peak memory."""
+    """Train a whole draft run; return milliseconds with loading, last PSNR (dB), and peak MB."""
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
         fit(load_dataset(SCENE), make_config("default", "draft"), folder)

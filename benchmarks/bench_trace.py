@@ -1,10 +1,10 @@
-"""Time rays against a bumpy torus, and Embree on the same rays where it is installed.
+"""Time rays against a bumpy torus, and Embree on the same rays if it is installed.
 
 Rays start on random triangles, sorted by triangle as splats are, and leave into the outer half
-space: what shading asks for. Embree answers the same two questions, whether anything is hit and
-what is hit first, on one core (it has no other mode from Python); ours runs on one, too, since XLA
-does not share a loop between the cores of a CPU. The same triangles are traced by both of our
-indices: that of the isosurface's own grid, and that of any triangles.
+space, as in shading. Embree answers the same two queries, occlusion and the nearest hit, on one
+core (from Python it has no other mode). Ours uses one core as well, since XLA does not distribute a
+loop over the cores of a CPU. The same triangles are traced by both of our indices: that of the
+isosurface's own grid, and that of any triangles.
 
     python -m benchmarks.bench_trace [--mesh FILE ...]
 """
@@ -64,7 +64,7 @@ def _triangles(surface) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _mesh_index(vertices: np.ndarray, faces: np.ndarray) -> Callable[[], object]:
-    """Build the index of any triangles; return what builds it again."""
+    """Find buffer sizes for the index of any triangles; return a function that builds it."""
     build = jax.jit(build_triangle_index, static_argnames=("shape", "is_sheet", "capacities"))
     shape = cells_for(vertices, faces)
     arrays = jnp.asarray(vertices), jnp.asarray(faces)
@@ -94,7 +94,7 @@ def _rays(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, ...]:
 def _embree(
     vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray
 ) -> dict[str, Callable[[], object]]:
-    """Embree's occlusion and nearest hits of the same rays; nothing where it is not installed."""
+    """Return Embree's queries for occlusion and nearest hits, by name; none if not installed."""
     if importlib.util.find_spec("embreex") is None:
         return {}
     import trimesh
@@ -117,7 +117,7 @@ def _seconds(function: Callable[[], object]) -> float:
 
 
 def _times(functions: dict[str, Callable[[], object]], prefix: str) -> dict[str, float]:
-    """Median milliseconds, interleaved, and medians of the ratios to Embree's."""
+    """Time functions in turn; return median milliseconds, and median ratios to Embree's times."""
     for function in functions.values():
         _seconds(function)
     times: dict[str, list[float]] = {name: [] for name in functions}
@@ -138,7 +138,7 @@ def _times(functions: dict[str, Callable[[], object]], prefix: str) -> dict[str,
 
 
 def _mesh_queries(vertices: np.ndarray, faces: np.ndarray) -> dict[str, Callable[[], object]]:
-    """Ask our index of any triangles, and Embree."""
+    """Return the queries of our index of any triangles, and of Embree, by name."""
     origins, directions, source, normals = _rays(vertices, faces)
     arguments = (*map(jnp.asarray, (origins, directions, source)), jnp.ones((RAYS,), bool))
     build = _mesh_index(vertices, faces)

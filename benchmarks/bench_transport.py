@@ -2,10 +2,9 @@
 
     python -m benchmarks.bench_transport [--scene FOLDER] [--quality standard] [--only NAME ...]
 
-The kinds are the runs of `experiments/sweeps/paths.toml`. Each is trained for a few steps, in a
-process of its own, from the visual hull; printed are the median wall time of a step of the Monte
-Carlo stage, its ratio to that of the first run, and the peak memory of the process, compilation
-included.
+The kinds are the runs of `experiments/sweeps/paths.toml`. Each is trained for a few steps from the
+visual hull, in its own process. Prints the median wall time of a step of the Monte Carlo stage, its
+ratio to that of the first run, and the peak memory of the process, with compilation.
 """
 
 import argparse

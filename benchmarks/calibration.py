@@ -1,4 +1,4 @@
-"""Speed of the machine at this moment, from two kernels whose idle cost is known."""
+"""Current speed of the machine, by two kernels whose time on an idle machine is known."""
 
 import json
 
@@ -9,9 +9,9 @@ from geosplat_jax.fit.costs import exponential_milliseconds, kernel_milliseconds
 
 
 def calibrate() -> dict[str, float]:
-    """Median milliseconds of ``sum(exp(x))`` over 16M float32 and of sorting 1M uint32.
+    """Return median milliseconds of ``sum(exp(x))`` over 16M float32 and of sorting 1M uint32.
 
-    About 6 and 75 on two idle AVX-512 cores with jax 0.12.
+    They are about 6 and 75 on two idle AVX-512 cores with jax 0.12.
     """
     keys = jax.random.bits(jax.random.key(0), (1 << 20,), jnp.uint32)
     return {

@@ -1,11 +1,11 @@
 """Run every benchmark; print ratios to the calibration kernels; compare with the baseline.
 
     python -m benchmarks.suite                  # table
-    python -m benchmarks.suite --gate 1.6       # exit 1 where a ratio grew by more than 1.6
+    python -m benchmarks.suite --gate 1.6       # exit 1 if a ratio grew by a factor above 1.6
     python -m benchmarks.suite --save           # write benchmarks/baseline.json (--only: in part)
 
-Machines differ and are shared, so the figure that travels is the ratio of a median to the median
-of ``sum(exp(x))`` over 16M float32, timed right before and right after in the same process.
+Machines differ and are shared. So the comparable figure is the ratio of a median to that of
+``sum(exp(x))`` over 16M float32, timed right before and right after in the same process.
 """
 
 import argparse

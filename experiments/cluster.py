@@ -1,7 +1,7 @@
-"""Runs of a sweep as jobs of submitit: of Slurm, or of processes on this machine.
+"""Runs of a sweep as jobs of submitit, on Slurm or as processes on this machine.
 
-The extra ``cluster``. A job calls a command and ends with it. Where the cluster ends a job for its
-time, it is put into the queue again and goes on from its last checkpoint.
+Needs the extra ``cluster``. A job runs one command. If the cluster stops a job at its time limit,
+the job is queued again, and continues from its last checkpoint.
 """
 
 import subprocess
@@ -11,25 +11,25 @@ from pathlib import Path
 from typing import Any
 
 _TIMEOUT_MIN = 24 * 60
-"""Minutes that a job may take, where nobody says otherwise."""
+"""Default time limit of a job, minutes."""
 
 _PATIENCE = 60.0
-"""Seconds that a command has to end in once its job is cancelled."""
+"""Seconds in which a command can end after its job was cancelled."""
 
 
 class Command:
-    """A command as a job; what it says last is in the error where it fails."""
+    """A command as a job; if it fails, the error holds the last lines of its output."""
 
     def __init__(self, command: list[str]) -> None:
         self.command = command
 
     def __call__(self) -> None:
-        """Run it.
+        """Run the command, and print its output.
 
         Raises
         ------
         RuntimeError
-            With its last lines, where it ends badly.
+            If the command fails; the message holds the last lines of its output.
         """
         tail: deque[str] = deque(maxlen=60)
         with subprocess.Popen(
@@ -40,7 +40,7 @@ class Command:
                     tail.append(line)
                     print(line, end="", flush=True)
             except BaseException:
-                # A job that is cancelled takes its command along, which writes a checkpoint.
+                # A cancelled job ends its command as well, which then writes a checkpoint.
                 child.terminate()
                 try:
                     child.communicate(timeout=_PATIENCE)
@@ -51,25 +51,25 @@ class Command:
             raise RuntimeError(f"the process ended with status {child.returncode}\n{''.join(tail)}")
 
     def checkpoint(self) -> Any:
-        """Tell submitit to call the same again, after a time limit or where others come first."""
+        """Tell submitit to queue the same command again, after a time limit or preemption."""
         import submitit
 
         return submitit.helpers.DelayedSubmission(Command(self.command))
 
 
 def executor(folder: Path, kind: str, parameters: dict[str, Any]) -> Any:
-    """Return what jobs are submitted to.
+    """Return the submitit executor that jobs are submitted to.
 
     Parameters
     ----------
-    folder : for its files, which every node must see.
+    folder : folder for the files of submitit, which every node must see.
     kind : ``slurm`` or ``local``.
-    parameters : of submitit's `AutoExecutor`.
+    parameters : parameters of submitit's `AutoExecutor`.
 
     Raises
     ------
     ImportError
-        Without submitit, with how to install it.
+        If submitit is not installed; the message says how to install it.
     """
     try:
         import submitit
@@ -79,7 +79,7 @@ def executor(folder: Path, kind: str, parameters: dict[str, Any]) -> Any:
         ) from None
     import cloudpickle
 
-    # Nodes have no path to this module.
+    # Nodes cannot import this module, so that it is pickled with the job.
     cloudpickle.register_pickle_by_value(sys.modules[__name__])
     found = submitit.AutoExecutor(folder=folder.resolve(), cluster=kind)
     found.update_parameters(**{"timeout_min": _TIMEOUT_MIN, "name": "geosplat", **parameters})

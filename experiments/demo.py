@@ -11,8 +11,8 @@ from geosplat_jax.fit.runtime import enable_compilation_cache, in_background
 from geosplat_jax.report.relight import RelightOptions
 from geosplat_jax.run import train
 
-# Between draft and standard: the crown's points need cells of their own. It is found to be a metal
-# where materials start between metals and dielectrics.
+# Quality is between draft and standard: each point of the crown needs a cell of its own. The crown
+# is recognised as metal if materials start between metals and dielectrics.
 MATERIAL_PRIOR = "neutral"
 OVERRIDES = (
     "geometry.resolution=44",
@@ -21,7 +21,7 @@ OVERRIDES = (
     "stages.monte_carlo.steps=120",
 )
 FRAMES = 36
-# The same for metrics and movie, so that they share their programs.
+# Metrics and movie have the same number of samples, so that they share compiled programs.
 SAMPLES = 32
 SCENE = Path(__file__).resolve().parents[1] / "examples" / "duck"
 
@@ -36,7 +36,7 @@ def main() -> None:
     began = time.perf_counter()
     config = make_config("default", "draft", material_prior=MATERIAL_PRIOR, overrides=OVERRIDES)
     run = train(SCENE, folder, config, begin=Anew(replace=True))
-    # Beside the movie: both wait for the compiler, which uses one core.
+    # Evaluation runs beside the movie: both wait for the compiler, which uses one core.
     evaluated = in_background(lambda: run.evaluate(samples=SAMPLES))
     movie = RelightOptions(turntable=FRAMES, suffix=".gif", frames_per_second=12.0)
     run.relight(SCENE.parent / "sunset.hdr", options=movie, samples=SAMPLES)

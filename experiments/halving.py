@@ -1,13 +1,13 @@
 """Find the Pareto front of all knobs together by successive halving: many short, few long runs.
 
 ``python experiments/halving.py SWEEP.toml --scenes ROOT --output DIR [--joint 24] [--rungs 3]``
-takes the runs of a sweep and combinations of them: of every group (a knob), the base or one value.
-In the first rung all are trained with a fraction of their steps, schedules shortened with them; the
-best third goes on with three times as many, and so on; the last rung trains in full. Candidates of
-a rung share the stages that they have in common. What is best is a matter of two figures, quality
-and seconds, so whole fronts go on, one after the other, until the places are taken. The same
-command goes on where it was stopped; ``DIR/rung_K`` are sweeps of their own, and ``DIR/front.md``
-is written at the end.
+takes as candidates the runs of a sweep, and random combinations of them: of every group (a knob)
+the base or one of its values. In the first rung all candidates are trained with a fraction of their
+steps, and with schedules shortened accordingly. The best third is trained again with three times as
+many steps, and so on; the last rung trains in full. Candidates of a rung share the stages that they
+have in common. The best candidates are those of the front of quality and seconds, then those of
+the front of the rest, and so on, until the places are taken. The same command continues where it
+was stopped; each ``DIR/rung_K`` is a sweep of its own, and ``DIR/front.md`` is written at the end.
 """
 
 import argparse
@@ -35,14 +35,14 @@ _LENGTHS = (
     "stages.*.rates.*.warmup",
     "stages.*.rates.*.half_life",
 )
-"""Numbers of steps: a training of a fraction of them is the same one, in a hurry."""
+"""Settings that count steps; scaled by one factor, they give the same training in fewer steps."""
 
 
 def joint_runs(sweep: Sweep, count: int, *, seed: int) -> list[SweepRun]:
     """Combine the knobs of a sweep at random: of every group the base or one of its values.
 
-    Combinations whose settings are refused, or known already, are left out and drawn again; a sweep
-    of few values may have fewer than ``count``.
+    Combinations whose settings are refused, or known already, are drawn again; a sweep of few
+    values may give fewer than ``count``.
     """
     groups: dict[str, list[SweepRun]] = {}
     for one in sweep.runs:
@@ -81,7 +81,7 @@ def _settings_of(sweep: Sweep, run: SweepRun) -> str:
 
 
 def shortened(sweep: Sweep, run: SweepRun, factor: float) -> SweepRun:
-    """Return a run with a fraction of its steps, and schedules as much shorter."""
+    """Return a run with a fraction of its steps, and with schedules shortened accordingly."""
     if factor == 1.0:
         return run
     config = sweep.config(run)
@@ -91,11 +91,14 @@ def shortened(sweep: Sweep, run: SweepRun, factor: float) -> SweepRun:
 
 
 def survivors(points: dict[str, tuple[float, float]], count: int) -> list[str]:
-    """Choose names by fronts: all of the first one, then of the next; of the last, spread evenly.
+    """Choose names by Pareto fronts: the first front, then that of the remaining points, and so on.
+
+    If a front has more points than there are places, points spread evenly over it are chosen.
 
     Parameters
     ----------
-    points : cost and quality by name. count : that may go on.
+    points : cost and quality by name.
+    count : number of names to choose.
     """
     chosen: list[str] = []
     left = dict(points)
@@ -103,7 +106,7 @@ def survivors(points: dict[str, tuple[float, float]], count: int) -> list[str]:
         front = trade.pareto(left)
         free = count - len(chosen)
         if len(front) > free:
-            # Both ends and places between; the best alone where there is one place.
+            # Both ends of the front and points between; for a single place, the best quality.
             last = len(front) - 1
             places = {last} if free == 1 else {round(k * last / (free - 1)) for k in range(free)}
             front = [front[k] for k in sorted(places)]
@@ -115,9 +118,10 @@ def survivors(points: dict[str, tuple[float, float]], count: int) -> list[str]:
 
 
 def full_costs(folder: Path, sweep: Sweep, factor: float) -> dict[str, tuple[float, float]]:
-    """Return seconds that the full trainings would take, and quality now, of what is on all scenes.
+    """Return, by run, the seconds of a full training and the quality reached so far.
 
-    Seconds are those of median steps: compilation, which does not shrink, is not among them.
+    Both are means over the scenes; runs that are not complete on all scenes are left out. Seconds
+    follow from median steps, without compilation, which a full training does not repeat.
     """
     record = trade.report._read_sweep(folder)
     figures = trade.quality_figures(record)
@@ -132,19 +136,19 @@ def full_costs(folder: Path, sweep: Sweep, factor: float) -> dict[str, tuple[flo
 
 
 def rung_factors(rungs: int, keep: float) -> list[float]:
-    """Return the share of the steps of every rung; the last one is 1."""
+    """Return the factor on the number of steps in every rung; that of the last is 1."""
     return [keep ** (rungs - 1 - rung) for rung in range(rungs)]
 
 
 def search(
     sweep: Sweep, arguments: argparse.Namespace, run_jobs: Any = runner.run_jobs
 ) -> tuple[Sweep, Path, list[Job]]:
-    """Train all rungs; return the sweep of the last one, its folder, and what failed there.
+    """Train all rungs; return the sweep of the last one, its folder, and the jobs that failed.
 
     Raises
     ------
     SweepError
-        If nothing of a rung came to figures.
+        If no run of a rung has figures on all scenes.
     """
     candidates = [*sweep.runs, *joint_runs(sweep, arguments.joint, seed=arguments.seed)]
     for rung, factor in enumerate(rung_factors(arguments.rungs, arguments.keep)):

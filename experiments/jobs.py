@@ -1,4 +1,4 @@
-"""What there is to do for a sweep: its runs, and the stages that several of them share, once."""
+"""The trainings of a sweep: its runs, and stages that several runs share, trained once."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -12,17 +12,17 @@ from geosplat_jax.fit.config import Config
 
 @dataclass(frozen=True)
 class Job:
-    """What one process does, in a form that JSON keeps.
+    """The work of one process, in a form for JSON.
 
     Attributes
     ----------
     label : ``scene/name``, for messages.
-    scene, folder : where the scene lies, where the run goes.
-    config, options : see `geosplat_jax.run.train`, whose ``reading`` the options are.
-    source, first_stage : run folder whose stages to take over, and the first one to train; None
-        to train all of them.
-    evaluate : keyword arguments of `Run.evaluate`; None leaves evaluation out.
-    evaluate_options : how to read the scene for the evaluation; None as for the training.
+    scene, folder : folder of the scene, and folder of the run.
+    config, options : settings, and options of reading the scene, of `geosplat_jax.run.train`.
+    source, first_stage : folder of a run whose stages are taken over, and the first stage to train;
+        None to train all stages.
+    evaluate : keyword arguments of `Run.evaluate`; None for no evaluation.
+    evaluate_options : how to read the scene for the evaluation; None for as in training.
     """
 
     label: str
@@ -37,7 +37,7 @@ class Job:
 
 
 def homes(sweep: Sweep) -> dict[str, str]:
-    """Name for every run the first one with the same settings and evaluation: it is run once."""
+    """Map every run to the first one with equal settings and evaluation, which alone is trained."""
     settings = {
         run.name: (sweep.config(run), sweep.evaluation(run), run.downscale) for run in sweep.runs
     }
@@ -46,16 +46,16 @@ def homes(sweep: Sweep) -> dict[str, str]:
 
 
 def beginning(config: Config, count: int) -> Config:
-    """Return the settings of a run's first stages; no setting of a later stage has a part in it."""
+    """Return the settings of a run's first ``count`` stages, without those of later stages."""
     return replace(config, stages=config.active_stages[:count])
 
 
 def shared_stages(config: Config, others: Iterable[Config]) -> Config | None:
-    """Return the longest beginning that a run shares with another one and does not end with.
+    """Return the longest beginning that a run shares with another run, or None.
 
-    Stages are shared where they, all before them and whatever is common to all stages have equal
-    settings. The last stage of a run is always its own: nothing would be left to train. Those who
-    go on where this run ends do not count, since they take over from the run itself.
+    A stage is shared if it, all stages before it, and all settings common to the stages are equal.
+    The last stage of a run is never shared, because nothing would be left to train. Runs that
+    continue from the end of this run are not considered: they take over from the run itself.
     """
     count = len(config.active_stages)
     partners = [x for x in others if len(x.active_stages) <= count or not _begins(config, x)]
@@ -67,23 +67,23 @@ def shared_stages(config: Config, others: Iterable[Config]) -> Config | None:
 
 
 def _begins(first: Config, config: Config) -> bool:
-    """Whether a run starts with all stages of another."""
+    """Whether the run of ``config`` starts with all stages of ``first``."""
     count = len(first.active_stages)
     return beginning(config, count) == beginning(first, count)
 
 
 @dataclass(frozen=True)
 class Part:
-    """What is trained of a sweep in every scene: a run, or stages that several runs share.
+    """A training that a sweep needs in every scene: a run, or stages that several runs share.
 
     Attributes
     ----------
-    folder : name of its folder in the scene's.
+    folder : name of its folder within the folder of a scene.
     config : settings.
     source : folder of the part whose stages it takes over; None for none.
-    first_stage : name of the first stage that it trains itself; None with ``source``.
-    run : None for stages that several runs share.
-    downscale : of the images that it is trained on.
+    first_stage : name of the first stage that it trains itself; None where ``source`` is None.
+    run : the run; None for stages that several runs share.
+    downscale : factor by which the training images are reduced.
     """
 
     folder: str
@@ -97,9 +97,10 @@ class Part:
 def parts_of(sweep: Sweep) -> dict[str, Part]:
     """List the parts of a sweep by folder, sources first.
 
-    Shared stages lie in ``_RUN.STAGE``: the first run that has them, and the last of them; names of
-    runs start with a letter or a digit. A run that ends with the shared stages is a source itself.
-    Runs that are trained on images of other sizes share nothing.
+    The folder of shared stages is ``_RUN.STAGE``, named after the first run that has them and after
+    the last of them; no run has such a name, since those start with a letter or a digit. A run that
+    ends with the shared stages is itself the source. Runs that are trained on images of different
+    sizes share nothing.
     """
     where, parts = homes(sweep), {}
     runs = [run for run in sweep.runs if where[run.name] == run.name]
@@ -138,7 +139,7 @@ def _parts_of(sweep: Sweep, runs: list[SweepRun]) -> dict[str, Part]:
         if folder not in configs
     ]
     found = [*shared, *(part(run.name, configs[run.name], run) for run in runs)]
-    # A source has fewer stages than those who need it; otherwise the order is the sweep's.
+    # Sources come before the parts that need them; otherwise the order is that of the sweep.
     parts: dict[str, Part] = {}
 
     def add(one: Part) -> None:
@@ -162,10 +163,17 @@ def _folder_of(first: Config, configs: dict[str, Config]) -> str:
 def plan(
     sweep: Sweep, root: Path, output: Path, *, scenes: Iterable[str], names: Iterable[str]
 ) -> list[Job]:
-    """List what there is to do for some scenes and runs, in the order to do it.
+    """List the jobs for some scenes and runs, in the order to do them.
 
-    Stages that runs share come before the runs that take them over, and are left out where all of
-    these are trained already.
+    Shared stages come before the runs that take them over, and are left out if all of these runs
+    are trained already.
+
+    Parameters
+    ----------
+    sweep : the sweep.
+    root : folder of the scene folders.
+    output : folder of all runs.
+    scenes, names : scenes and runs to train.
     """
     where, parts, jobs = homes(sweep), parts_of(sweep), []
     wanted = {where[name] for name in names}
@@ -202,6 +210,6 @@ def is_trained(job: Job) -> bool:
 
 
 def is_finished(job: Job) -> bool:
-    """Whether a run is trained and, where it is to be, evaluated."""
+    """Whether a run is trained and, if the job asks for it, evaluated."""
     needed = ["training.json"] + ["metrics.json", "evaluation.json"] * (job.evaluate is not None)
     return all((Path(job.folder) / name).exists() for name in needed)

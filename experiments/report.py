@@ -1,8 +1,8 @@
-"""Write a sweep's tables and curves from the figures that its runs left.
+"""Write tables and curves of a sweep from the metrics of its runs.
 
 ``python experiments/report.py DIR --output docs/NAME.md --plots docs/images``, where
-``experiments/run.py`` wrote ``DIR``. Runs that are missing, failed or have other settings than
-``DIR/sweep.json`` are listed as such. Curves need matplotlib (the extra ``plots``).
+``experiments/run.py`` wrote ``DIR``. Runs that are missing, failed, or have settings other than
+those in ``DIR/sweep.json`` are listed as such. Curves need matplotlib (the extra ``plots``).
 """
 
 import argparse
@@ -26,7 +26,7 @@ _DOWN = ("mse", "mae", "direction_error")
 _MEMORY = "memory, MB"
 _NONE = "–"
 _LONGEST = 240
-"""Characters of an error's last line."""
+"""Most characters that are quoted of the last line of an error."""
 
 
 class ReportError(ValueError):
@@ -39,10 +39,10 @@ class Entry:
 
     Attributes
     ----------
-    figures : as in the ``mean`` of ``metrics.json``; empty where ``problem`` says why.
-    costs : some of `cost_names`.
-    problem : what is wrong, or an empty text.
-    notes : what does not spoil the figures but belongs to them.
+    figures : ``mean`` of ``metrics.json``; empty if there is a problem.
+    costs : values of some of `cost_names`.
+    problem : reason why there are no figures, or an empty text.
+    notes : remarks on figures that are valid.
     """
 
     figures: dict[str, float]
@@ -52,7 +52,7 @@ class Entry:
 
 
 def arrow(figure: str) -> str:
-    """Say which way a figure is better: an arrow, or nothing where neither way is."""
+    """Return an arrow in the direction in which a figure is better, or an empty text."""
     last = figure.split(".")[-1]
     if last.startswith("mirrored"):
         return ""
@@ -62,7 +62,7 @@ def arrow(figure: str) -> str:
 
 
 def digits(figure: str, value: float, *, signed: bool = False) -> str:
-    """Write a figure with as many digits as mean something; a difference with its sign."""
+    """Format a figure: two decimals for dB and degrees, else four; a difference with its sign."""
     last = figure.split(".")[-1]
     if not math.isfinite(value):
         return f"{value:+g}" if signed else f"{value:g}"
@@ -86,7 +86,7 @@ def _without_places(text: str) -> str:
 def command_line(script: str, *parts: str | tuple[Path, str]) -> str:
     """Write a command as it can be called from the working folder.
 
-    A place is a path and the name that stands for it where it lies outside.
+    A part may be a pair of a path and a placeholder, which replaces a path outside of the folder.
     """
     said = ["python", script]
     for part in parts:
@@ -104,7 +104,7 @@ def _cell(text: str) -> str:
 
 
 def _last_line(path: Path) -> str:
-    """Return the last line of an error that says something, marked where it is cut."""
+    """Return the last line of an error file that is not empty, shortened with a mark."""
     lines = [line.strip() for line in path.read_text(errors="replace").splitlines()]
     last = _without_places(next((line for line in reversed(lines) if line), "no message"))
     return last if len(last) <= _LONGEST else last[:_LONGEST] + " […]"
@@ -117,16 +117,16 @@ def cost_names(sweep: dict[str, Any]) -> list[str]:
 
 
 def _seconds_of(stage: str) -> tuple[str, str]:
-    """Columns of a stage: all of its seconds, and the median step."""
+    """Return the names of a stage's columns: total seconds, and seconds of the median step."""
     return f"{stage}, s", f"{stage}, s per step"
 
 
 def _costs(
     folder: Path, figures: dict[str, Any], config: Config
 ) -> tuple[dict[str, float], list[str]]:
-    """Seconds of the stages and the largest memory; notes on what is not known.
+    """Return seconds of the stages and peak memory, and notes on values that are missing.
 
-    A run that took its first stages over has no seconds of these.
+    A run that took over its first stages has no seconds for them.
     """
     costs, notes = {}, []
     memory = figures.get("training_peak_memory_mb")
@@ -148,7 +148,7 @@ def _costs(
 
 
 def _with_file_of(recorded: Config, wanted: Config) -> Config:
-    """Return a sweep's settings with a run's mesh: the file of that name in the run's scene."""
+    """Return the settings of a sweep with the mesh of a run, if its path ends in the same name."""
     run, sweep = recorded.geometry, wanted.geometry
     if not (isinstance(run, MeshSettings) and isinstance(sweep, MeshSettings)):
         return wanted
@@ -158,10 +158,10 @@ def _with_file_of(recorded: Config, wanted: Config) -> Config:
 
 
 def _other_images(folder: Path, run: dict[str, Any], sweep: dict[str, Any], scene: str) -> str:
-    """Say where a run saw other images than the sweep wants, or an empty text.
+    """Say how the images of a run differ from those of the sweep; an empty text if they do not.
 
-    Records of earlier versions do not say where the scenes were, nor what size of images a run was
-    evaluated on; they are believed.
+    Records of earlier versions have neither the folders of the scenes nor the size of the images in
+    the evaluation; these are assumed to be right.
     """
     record = json.loads((folder / "run.json").read_text())
     factor = record["dataset"].get("downscale", 1)
@@ -178,7 +178,7 @@ def _other_images(folder: Path, run: dict[str, Any], sweep: dict[str, Any], scen
 
 
 def read_entry(folder: Path, run: dict[str, Any], sweep: dict[str, Any], scene: str) -> Entry:
-    """Read what one run left, and check that it is the run that the sweep wants.
+    """Read the results of one run, and check that it has the settings of the sweep.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def read_entry(folder: Path, run: dict[str, Any], sweep: dict[str, Any], scene: 
 
 
 def read_entries(folder: Path, sweep: dict[str, Any]) -> dict[str, dict[str, Entry]]:
-    """Read all runs, by scene and name; a run that equals another one has the other's figures."""
+    """Read all runs, by scene and name; a run that equals an earlier one has its figures."""
     return {
         scene: {
             run["name"]: read_entry(
@@ -259,7 +259,7 @@ def scene_table(sweep: dict[str, Any], entries: dict[str, Entry]) -> list[str]:
 def _pairs(
     entries: dict[str, dict[str, Entry]], name: str, reference: str, figure: str
 ) -> tuple[list[tuple[float, float]], int]:
-    """Values of a run and of the reference where both are known, and how often the latter is."""
+    """Return values of a run and the reference on scenes that have both, and the latter's count."""
     found = [
         tuple(
             {**runs[which].figures, **runs[which].costs}.get(figure) for which in (name, reference)
@@ -271,10 +271,10 @@ def _pairs(
 
 
 def summary_table(sweep: dict[str, Any], entries: dict[str, dict[str, Entry]]) -> list[str]:
-    """Means over the scenes: the reference's values, and how the other runs differ from them.
+    """Tabulate means over the scenes: values of the reference, and differences of other runs.
 
-    A difference takes in the scenes where both runs have the figure and says how many these are
-    where some lack. Seconds and memory are ratios.
+    A difference is the mean over the scenes on which both runs have the figure; their number is
+    given if some are missing. For seconds and memory, ratios are given.
     """
     reference = sweep["runs"][0]["name"]
     rows, costs = [_header(sweep)], cost_names(sweep)
@@ -304,10 +304,11 @@ def summary_table(sweep: dict[str, Any], entries: dict[str, dict[str, Entry]]) -
 
 
 def seed_table(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Entry]]]) -> list[str]:
-    """Means over the scenes and over several seeds, and the spread over the seeds.
+    """Tabulate means over scenes and seeds, and the spread over the seeds.
 
-    The reference's values, and how the other runs differ from them with the same seed. A seed
-    counts where every scene has the figure; the spread is the standard deviation of the sample.
+    Rows hold values of the reference, and differences of the other runs from the reference with the
+    same seed. A seed counts if every scene has the figure; the spread is the sample standard
+    deviation.
     """
     reference = sweep["runs"][0]["name"]
     rows = [["run", *(f"{name}{arrow(name)}" for name in sweep["figures"])]]
@@ -327,7 +328,7 @@ def seed_table(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Entry]]
 
 
 def _with_spread(figure: str, values: list[float], *, signed: bool) -> str:
-    """Write a mean and how far its values are apart; how many these are where it is one."""
+    """Format the mean and the standard deviation of values; a single value is marked."""
     if not values:
         return _NONE
     mean = digits(figure, statistics.fmean(values), signed=signed)
@@ -339,9 +340,9 @@ def _with_spread(figure: str, values: list[float], *, signed: bool) -> str:
 def curves(
     sweep: dict[str, Any], entries: dict[str, dict[str, Entry]], group: str, figure: str
 ) -> dict[str, list[tuple[float, float, float | None]]]:
-    """Points of a figure along a group, by scene: x, mean, and the spread of several seeds.
+    """Return the points of a figure along a group, by scene: x, mean, and spread over seeds.
 
-    The spread is the standard deviation of the sample, None for one seed.
+    The spread is the sample standard deviation; None for one seed.
     """
     found: dict[str, list[tuple[float, float, float | None]]] = {}
     for scene, runs in entries.items():
@@ -362,7 +363,7 @@ def curves(
 def draw(
     path: Path, sweep: dict[str, Any], entries: dict[str, dict[str, Entry]], group: str
 ) -> None:
-    """Draw every figure of the sweep against x, a panel a figure and a line a scene."""
+    """Plot every figure of the sweep against x: one panel per figure, one line per scene."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -402,7 +403,7 @@ def draw(
 def write_plots(
     sweep: dict[str, Any], entries: dict[str, dict[str, Entry]], folder: Path, stem: str
 ) -> list[Path]:
-    """Draw all groups into ``folder/STEM_GROUP.png`` and list the files."""
+    """Plot every group into ``folder/STEM_GROUP.png``; return the files."""
     groups = dict.fromkeys(run["group"] for run in sweep["runs"] if run["x"] is not None)
     paths = []
     for group in groups:
@@ -418,11 +419,11 @@ _LEGEND = (
     "is the largest that the training process used; it is smaller for runs that took over the "
     "first stages of another run."
 )
-"""What stands below the tables of the scenes."""
+"""Text below the tables of the scenes."""
 
 
 def _describe_runs(sweep: dict[str, Any]) -> list[str]:
-    """Say what every run changes, and where its evaluation is not that of the reference."""
+    """Describe the settings that every run changes, and evaluations unlike the reference's."""
     usual = sweep["runs"][0]["evaluate"]
     rows = [["run", "what it is", "settings"]]
     for run in sweep["runs"]:
@@ -482,15 +483,15 @@ def compose(
     command: str,
     others: list[dict[str, dict[str, Entry]]] | None = None,
 ) -> str:
-    """Put the report together as markdown.
+    """Compose the report as markdown.
 
     Parameters
     ----------
     sweep, entries : from ``sweep.json`` and `read_entries`.
-    others : entries of the same sweep with other seeds.
     plots : links to the curves.
-    notes : said beside missing and failed runs.
-    command : the one that writes the report.
+    notes : further lines for the list of missing and failed runs.
+    command : command that writes the report.
+    others : entries of the same sweep with other seeds.
     """
     about = [sweep["about"], ""] if sweep["about"] else []
     lines = [f"# {sweep['title']}", "", *about, *_describe_runs(sweep), ""]
@@ -520,7 +521,7 @@ def compose(
 
 
 def _read_sweep(folder: Path) -> dict[str, Any]:
-    """Read what experiments/run.py recorded."""
+    """Read ``sweep.json`` of a folder of experiments/run.py; `ReportError` if it cannot be read."""
     try:
         sweep = json.loads((folder / "sweep.json").read_text())
         for run in sweep["runs"]:

@@ -2,9 +2,9 @@
 
 ``python experiments/run.py SWEEP.toml --scenes ROOT --output DIR`` leaves a run folder
 ``DIR/SCENE/NAME`` for every run, and ``DIR/sweep.json`` for ``experiments/report.py``. The same
-command goes on where an earlier one stopped. With ``--cluster slurm`` or ``--cluster local`` it
-hands runs to `submitit` (the extra ``cluster``), up to ``--parallel`` at a time, and waits for
-them; see `cluster`. `sweep.read_sweep` says what a sweep file may hold, `jobs.plan` what is done.
+command continues where an earlier one stopped. With ``--cluster slurm`` or ``--cluster local`` it
+submits runs by `submitit` (the extra ``cluster``), up to ``--parallel`` at a time, and waits for
+them; see `cluster`. Sweep files are described in `sweep.read_sweep`, the jobs in `jobs.plan`.
 """
 
 import argparse
@@ -39,21 +39,21 @@ from geosplat_jax.io.images import written_aside
 from geosplat_jax.run import Run, train
 
 _POLL_SECONDS = 2.0
-"""Between two looks at what was submitted."""
+"""Seconds between two checks of submitted jobs."""
 
 
 class RunFailed(RuntimeError):
-    """The process of a run ended badly; the message ends with what it last said."""
+    """The process of a run failed; the message ends with the last lines of its output."""
 
 
 def _evaluation_of(job: Job) -> dict[str, Any]:
-    """Return what is noted of an evaluation: its arguments, and the factor of its images."""
+    """Return the record of an evaluation: its arguments, and the downscale factor of its images."""
     reading = job.options if job.evaluate_options is None else job.evaluate_options
     return {**(job.evaluate or {}), "downscale": reading.get("downscale", 1)}
 
 
 def _changes(job: Job) -> list[str]:
-    """Say how what lies in a run's folder differs from what is wanted; nothing where it agrees."""
+    """List the differences between the records in a run's folder and the job."""
     folder, wanted = Path(job.folder), config_from_dict(job.config)
     found = []
     if (folder / "run.json").exists():
@@ -79,12 +79,13 @@ def _changes(job: Job) -> list[str]:
 
 
 def check_folders(jobs: Iterable[Job]) -> None:
-    """Refuse to go on in folders that hold runs with other settings.
+    """Refuse folders that hold runs with other settings.
 
     Raises
     ------
     SweepError
-        With every difference, as ``recorded -> wanted``, and how to go on.
+        If there are any; the message lists every difference, as ``recorded -> wanted``, and says
+        what to do.
     """
     found = []
     for job in jobs:
@@ -104,7 +105,7 @@ def check_folders(jobs: Iterable[Job]) -> None:
 
 
 def _evaluate(folder: Path, reading: dict[str, Any] | None = None, **arguments: Any) -> None:
-    """Evaluate the run in a folder, on images as it was trained on or read in another way."""
+    """Evaluate the run in a folder, on images as in its training or as ``reading`` says."""
     run = Run(folder)
     if reading is not None:
         run.dataset = load_recorded(run.folder.record()["scene"], reading)
@@ -112,7 +113,7 @@ def _evaluate(folder: Path, reading: dict[str, Any] | None = None, **arguments: 
 
 
 def _begin(job: Job) -> Begin:
-    """Return how a run begins; a start that came to no whole checkpoint is replaced."""
+    """Return how a run begins: resumed if it has a checkpoint, else anew or from its source."""
     folder = Path(job.folder)
     if latest_checkpoint(folder / "checkpoints") is not None:
         return Resume()
@@ -132,11 +133,12 @@ def execute(
 
     Parameters
     ----------
-    job : see `Job`; `check_folders` has agreed to its folder.
-    train, evaluate : `geosplat_jax.run.train`; and `Run.evaluate` of the run in a folder.
+    job : job whose folder has passed `check_folders`.
+    train, evaluate : functions that are called: `geosplat_jax.run.train`, and `Run.evaluate` of the
+        run in a folder.
     """
     folder = Path(job.folder)
-    # It would vouch for the figures of an evaluation that dies before its end.
+    # If the evaluation failed, the old record would still declare its figures complete.
     (folder / "evaluation.json").unlink(missing_ok=True)
     if not is_trained(job):
         config = config_from_dict(job.config)
@@ -144,7 +146,7 @@ def execute(
     if job.evaluate is not None:
         reading = {} if job.evaluate_options is None else {"reading": job.evaluate_options}
         evaluate(folder, **job.evaluate, **reading)
-        # Last, so that an evaluation without it was interrupted.
+        # Written last: an evaluation without this file was interrupted.
         text = json.dumps(_evaluation_of(job), indent=2) + "\n"
         (folder / "evaluation.json").write_text(text)
 
@@ -160,19 +162,19 @@ def command_of(job: Job) -> list[str]:
 
 
 def in_a_process(job: Job) -> None:
-    """Execute a job in a process of its own, which gives all memory back.
+    """Execute a job in its own process, so that all its memory is freed at the end.
 
     Raises
     ------
     RunFailed
-        With the last lines of a process that did not end well.
+        If the process fails; the message holds the last lines of its output.
     KeyboardInterrupt
-        After Ctrl-C, once the process has written its checkpoint; a second one ends it at once.
+        After Ctrl-C, once the process has written its checkpoint; a second one kills it.
     """
     command = command_of(job)
     tail: deque[str] = deque(maxlen=60)
-    # A session of its own: the terminal's Ctrl-C would otherwise reach it beside ours, and the
-    # second request makes training stop without a checkpoint.
+    # The process gets its own session. Otherwise Ctrl-C would reach it twice, from the terminal and
+    # from us, and the second one stops a training without a checkpoint.
     with subprocess.Popen(
         command,
         stdout=subprocess.PIPE,
@@ -207,7 +209,7 @@ def in_a_process(job: Job) -> None:
 
 
 def _note_failure(job: Job, text: str) -> None:
-    """Write a run's error where the report finds it."""
+    """Write the error of a run to ``error.txt`` in its folder, where the report reads it."""
     folder = Path(job.folder)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "error.txt").write_text(text.rstrip() + "\n")
@@ -215,10 +217,10 @@ def _note_failure(job: Job, text: str) -> None:
 
 
 def run_jobs(jobs: list[Job], *, start: Callable[[Job], None] = in_a_process) -> list[Job]:
-    """Do the jobs one after the other and return those that failed.
+    """Do the jobs one after the other, and return those that failed.
 
-    A failure is written to ``error.txt`` of the run's folder and stops nothing but the runs that
-    take stages over from it.
+    A failure is written to ``error.txt`` in the folder of the run. Only runs that would take over
+    stages from the failed one are skipped.
     """
     failed: list[Job] = []
     for number, job in enumerate(jobs, 1):
@@ -245,12 +247,12 @@ def run_jobs(jobs: list[Job], *, start: Callable[[Job], None] = in_a_process) ->
 
 
 def cluster_of(arguments: argparse.Namespace) -> Any:
-    """Return the executor that the options ask for; None to run here, one after the other.
+    """Return the executor that the options ask for; None to do jobs here, one after the other.
 
     Raises
     ------
     SweepError
-        If submitit is missing, or does not know what it is told.
+        If submitit is missing or refuses a parameter, or an option is not valid.
     """
     if arguments.parallel < 1:
         raise SweepError(f"--parallel must be at least 1, got {arguments.parallel}")
@@ -274,9 +276,10 @@ def cluster_of(arguments: argparse.Namespace) -> Any:
 
 
 def run_on_cluster(jobs: list[Job], executor: Any, *, parallel: int) -> list[Job]:
-    """Do the jobs side by side and return those that failed; sources before what needs them.
+    """Do the jobs in parallel, and return those that failed; see `run_jobs`.
 
-    As `run_jobs`, but for the order. Ctrl-C cancels what was submitted; the same command goes on.
+    Jobs wait until the run whose stages they take over is trained. Ctrl-C cancels submitted jobs;
+    the same command continues later.
     """
     failed: list[Job] = []
     left, running = list(jobs), {}
@@ -336,7 +339,7 @@ def _state(
 
 
 def _chosen(wanted: list[str], known: Iterable[str], option: str) -> list[str]:
-    """Return what the options ask for, or everything; unknown names are errors."""
+    """Return the names that an option asks for, or all names; `SweepError` for unknown ones."""
     known = list(known)
     for name in wanted:
         if name not in known:
@@ -365,7 +368,9 @@ def write_record(sweep: Sweep, scenes: Path, output: Path, command: str) -> None
 
     Parameters
     ----------
-    scenes, output : folders of the scenes and of all runs. command : the one that was called.
+    sweep : the sweep.
+    scenes, output : folder of the scene folders, and folder of all runs.
+    command : command that was called.
     """
     path, where = output / "sweep.json", homes(sweep)
     commands = json.loads(path.read_text())["commands"] if path.exists() else []
@@ -413,7 +418,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run_one(text: str) -> int:
-    """Be the process of one job."""
+    """Execute one job, given as JSON, in this process; return the exit status."""
     enable_compilation_cache()
     retain_freed_memory()
     try:

@@ -79,7 +79,7 @@ class Sweep:
     mesh: str = ""
 
     def config(self, run: SweepRun) -> Config:
-        """Return the settings of a run; those of a mesh name its file within any scene's folder."""
+        """Return the settings of a run; a start mesh is given relative to a scene's folder."""
         overrides = (*self.overrides, *run.overrides)
         return _config(self.preset, self.quality, self.material_prior, self.mesh, overrides)
 
@@ -90,7 +90,7 @@ class Sweep:
 
 
 def _anywhere(mesh: str) -> MeshSettings | None:
-    """Name the mesh that a sweep starts from, in whatever scene; None if it starts from none."""
+    """Return settings of the start mesh, relative to a scene's folder; None without a mesh."""
     return MeshSettings(path=mesh) if mesh else None
 
 
@@ -98,7 +98,7 @@ def _anywhere(mesh: str) -> MeshSettings | None:
 def _config(
     preset: str, quality: str, material_prior: str, mesh: str, overrides: tuple[str, ...]
 ) -> Config:
-    """Build settings, which takes 30 ms, once: a sweep asks for those of every run many times."""
+    """Build settings. Cached: it takes 30 ms, and a sweep needs those of every run many times."""
     return make_config(
         preset,
         quality,
@@ -109,12 +109,12 @@ def _config(
 
 
 def in_scene(config: Config, scene: Path) -> Config:
-    """Return settings of a sweep with the mesh that a scene's folder holds, if they have one.
+    """Return settings of a sweep with the path of the start mesh in a scene, if they have a mesh.
 
     Raises
     ------
     SweepError
-        If there is no such file.
+        If the mesh file does not exist.
     """
     if not isinstance(config.geometry, MeshSettings):
         return config
@@ -130,7 +130,7 @@ def in_scene(config: Config, scene: Path) -> Config:
 def _check_keys(
     values: dict[str, Any], known: dict[str, str], required: Iterable[str], where: str
 ) -> None:
-    """Refuse keys that nobody reads, values of the wrong kind, and missing keys."""
+    """Refuse unknown keys, values of the wrong kind, and missing keys."""
     for key, value in values.items():
         if key not in known:
             raise SweepError(f"{where}: unknown key {key!r}; expected one of {sorted(known)}")
@@ -142,7 +142,7 @@ def _check_keys(
 
 
 def _check_names(names: Iterable[str], what: str, where: str) -> None:
-    """Refuse names that are no folder names, and those that some file systems take for one."""
+    """Refuse names that are no folder names, and names that differ in case only or not at all."""
     seen: dict[str, str] = {}
     for name in names:
         if not _FOLDER_NAME.fullmatch(name):
@@ -161,14 +161,27 @@ def _numbers(config: Config) -> dict[str, float]:
 
 
 def has_numbers(config: Config, pattern: str) -> bool:
-    """Whether a number of the settings has such a path; ``*`` stands for anything."""
+    """Whether the path of a numeric setting matches a pattern; ``*`` stands for any text."""
     return any(fnmatch.fnmatchcase(path, pattern) for path in _numbers(config))
 
 
 def scaled(base: Config, factors: dict[str, Any], where: str) -> tuple[str, ...]:
-    """Write numbers of some settings as overrides, times factors; ``*`` stands for anything.
+    """Return overrides that multiply numeric settings by factors.
 
-    Counts are rounded; what is left out stays out, and what is there stays.
+    Parameters
+    ----------
+    base : settings to multiply.
+    factors : factor above 0 by pattern of paths, in which ``*`` stands for any text.
+    where : place in the sweep file, for messages.
+
+    Returns
+    -------
+    Overrides. Counts are rounded; a count of 0 stays 0, and others stay at least 1.
+
+    Raises
+    ------
+    SweepError
+        If a factor is not above 0, or no numeric setting matches a pattern.
     """
     overrides, numbers = [], _numbers(base)
     for pattern, factor in factors.items():
@@ -213,9 +226,9 @@ def _read_run(values: dict[str, Any], where: str, base: Config, downscale: int) 
 
 
 def _check_settings(sweep: Sweep, where: str) -> None:
-    """Build all settings, so that a bad override is found before training.
+    """Build all settings, so that a bad override is found before any training.
 
-    Runs at the same place of a curve are repetitions, which may differ in their seeds alone.
+    Runs with the same x in a group are repetitions, which may differ only in the seed.
     """
     for run in sweep.runs:
         try:
@@ -258,13 +271,13 @@ def read_sweep(
         ``figures`` (names of ``metrics.json`` to tabulate), ``samples`` of the evaluation,
         ``downscale`` of the images, ``mesh`` (a file in every scene's folder to start from
         instead of the visual hull), and tables ``[[run]]`` with ``name``, ``title``, ``set``,
-        ``scale`` (factors of settings by path, in which ``*`` stands for any stage),
-        ``downscale`` of the images that it is trained on (all are evaluated on the sweep's),
-        ``evaluate`` (keyword arguments of `Run.evaluate`), ``x`` (the run is a point of a
-        curve) and ``group`` (which curve). The first run is the reference. Required are ``title``,
-        ``scenes``, ``figures``, one run, and each run's ``name``.
-    overrides : applied to every run after ``set`` and before its own.
-    quality, mesh, downscale : instead of the file's.
+        ``scale`` (factors on settings by path, in which ``*`` stands for any text),
+        ``downscale`` of the training images (all runs are evaluated on those of the sweep),
+        ``evaluate`` (keyword arguments of `Run.evaluate`), ``x`` (position of the run on a
+        curve) and ``group`` (name of the curve). The first run is the reference. Required are
+        ``title``, ``scenes``, ``figures``, one run, and each run's ``name``.
+    overrides : applied to every run after ``set`` of the file and before that of the run.
+    quality, mesh, downscale : used instead of those in the file, unless None.
 
     Raises
     ------

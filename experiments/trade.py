@@ -1,10 +1,10 @@
-"""What the knobs of a sweep bring for their time: decibels per second, and the Pareto front.
+"""Weigh the quality of a sweep's knobs against their time: decibels per second, Pareto front.
 
 ``python experiments/trade.py DIR [--seeds DIR ...] --output FILE.md``, where ``experiments/run.py``
-wrote ``DIR``. Seconds are those of all stages, also of those that a run took over from another one:
-what it would have taken alone, were nothing compiled. All runs share one cache of programs, so that
-the first one compiles for the others; whole seconds, as measured, stand in a column of their own.
-Error bars are standard errors over the scenes, of means over the seeds.
+wrote ``DIR``. Seconds are those of all stages, also of stages that a run took over from another
+one, without compilation: the time that the run would have taken alone. All runs share a cache of
+compiled programs, so that the first run compiles for the others; whole seconds, as measured, have
+their own column. Error bars are standard errors over the scenes, of means over the seeds.
 """
 
 import argparse
@@ -29,14 +29,15 @@ _NONE = "–"
 
 @dataclass(frozen=True)
 class Point:
-    """A run on a scene.
+    """Costs and figures of a run on a scene.
 
     Attributes
     ----------
-    seconds : of the whole training, with what it compiled. steady : of its steps, were nothing
-        compiled: their number times the median, for every stage.
-    memory_mb : largest of the training's processes.
-    figures : of the evaluation.
+    seconds : seconds of the whole training, with compilation.
+    steady : seconds of its steps without compilation: in every stage, their number times the
+        median.
+    memory_mb : peak memory of the training processes, MB.
+    figures : metrics of the evaluation.
     """
 
     seconds: float
@@ -46,9 +47,10 @@ class Point:
 
 
 def _identity(config: Config, count: int, downscale: int) -> str:
-    """Name the first stages of a run: equal for runs that share them.
+    """Return a key of the first stages of a run, equal for runs that share them.
 
-    A run notes where its mesh is and what was in it, a sweep the name of the file.
+    A run records the path and the digest of its mesh, a sweep only the name of the file, so that
+    the key holds the name.
     """
     if isinstance(config.geometry, MeshSettings):
         name = Path(config.geometry.path).name
@@ -60,9 +62,10 @@ def _identity(config: Config, count: int, downscale: int) -> str:
 
 
 def stage_times(scene: Path) -> dict[str, tuple[float, float, float]]:
-    """Read what every stage of every run of a scene took: seconds, those of its steps, memory.
+    """Read the costs of every stage of every run of a scene, by `_identity` of the stages up to it.
 
-    By the stages up to it. A stage counts where all of its steps are there.
+    Values are seconds, seconds without compilation, and peak memory in MB. Stages whose steps are
+    not complete are left out.
     """
     found = {}
     for path in sorted(scene.glob("*/run.json")):
@@ -104,7 +107,7 @@ def read_points(folder: Path, sweep: dict[str, Any]) -> dict[str, dict[str, Poin
 
 
 def quality_figures(sweep: dict[str, Any]) -> list[str]:
-    """Name the figures in decibels, of which the quality is the mean."""
+    """Return the names of the figures in decibels, whose mean is the quality."""
     found = [name for name in sweep["figures"] if name.endswith("psnr") and "light." not in name]
     if not found:
         raise ReportError("the sweep has no figure in decibels; add nvs.psnr to its figures")
@@ -112,12 +115,12 @@ def quality_figures(sweep: dict[str, Any]) -> list[str]:
 
 
 def quality(point: Point, figures: Iterable[str]) -> float:
-    """Mean of the figures in decibels; not a number where one is missing."""
+    """Mean of figures in decibels; NaN if one is missing."""
     return statistics.fmean(point.figures.get(name, math.nan) for name in figures)
 
 
 def pareto(points: dict[str, tuple[float, float]]) -> list[str]:
-    """Name the points, (cost, quality), than which none is as good for less; by cost."""
+    """Return the names of the Pareto-optimal points (cost, quality), in order of cost."""
     front, best = [], -math.inf
     for name, (_, good) in sorted(points.items(), key=lambda item: (item[1][0], -item[1][1])):
         if good > best:
@@ -129,7 +132,7 @@ def pareto(points: dict[str, tuple[float, float]]) -> list[str]:
 def _pairs(
     repeated: list[dict[str, dict[str, Point]]], name: str, base: str
 ) -> list[list[tuple[Point, Point]]]:
-    """Return a run and the base with the same seed, where both are known, for every scene."""
+    """Return, for every scene, the pairs of a run and the base with the same seed."""
     scenes = dict.fromkeys(scene for points in repeated for scene in points[base])
     return [
         [
@@ -142,7 +145,7 @@ def _pairs(
 
 
 def _finite(groups: Iterable[Iterable[float]]) -> list[list[float]]:
-    """Leave out what is not finite, and scenes of which nothing is left."""
+    """Leave out values that are not finite, and groups that are then empty."""
     kept = ([value for value in values if math.isfinite(value)] for values in groups)
     return [values for values in kept if values]
 
@@ -153,21 +156,23 @@ def _mean(groups: list[list[float]]) -> float:
 
 
 def _standard_error(groups: list[list[float]]) -> float | None:
-    """Return the standard error over scenes, of means over seeds: those of a scene are not apart.
+    """Return the standard error over scenes of means over seeds, or None for a single value.
 
-    Over the seeds where there is one scene; None for a single value.
+    Seeds of a scene are no independent samples of the scenes. For a single scene, it is the
+    standard error over the seeds.
     """
     values = groups[0] if len(groups) == 1 else [statistics.fmean(group) for group in groups]
     return statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else None
 
 
 def _spread(groups: list[list[float]], figure: str, count: int) -> str:
-    """Write the mean of a difference with its standard error.
+    """Format the mean of a difference with its standard error.
 
     Parameters
     ----------
     groups : values of the seeds, for every scene; those that are not finite are left out.
-    count : of the values that there should be; said where some are missing.
+    figure : name of the figure, which decides the number of digits.
+    count : number of values that there should be; shown if some are missing.
     """
     known = _finite(groups)
     if not known:
@@ -179,16 +184,16 @@ def _spread(groups: list[list[float]], figure: str, count: int) -> str:
 
 
 def _of(found: int, count: int) -> str:
-    """Say how many of the values are there, where some are missing."""
+    """Return how many of the values exist, as a text; empty if all do."""
     return f" ({found} of {count})" if found < count else ""
 
 
 def _exchange(gain: float, extra: float) -> str:
-    """Write the decibels per second, where one is paid with the other; in words where it is not.
+    """Format decibels per second if quality is traded for time; otherwise describe it in words.
 
     Parameters
     ----------
-    gain, extra : change of the quality and of the seconds.
+    gain, extra : change of the quality, and of the seconds.
     """
     if gain == extra == 0.0:
         return _NONE
@@ -204,18 +209,20 @@ _COSTS = {
     "whole seconds, ratio": lambda point: point.seconds,
     "memory, ratio": lambda point: point.memory_mb,
 }
-"""Columns of what a run costs, in parts of what the base does."""
+"""Columns of the costs of a run, as ratios to those of the base."""
 
 
 def _knob_row(
     pairs: list[list[tuple[Point, Point]]], names: list[str], figures: list[str], count: int
 ) -> list[str]:
-    """Write what a run costs and brings against the base.
+    """Return the row of a run: its costs and figures in comparison with the base.
 
     Parameters
     ----------
-    pairs : see `_pairs`. names : of all figures. figures : of the quality.
-    count : of the pairs that there should be.
+    pairs : see `_pairs`.
+    names : names of all figures.
+    figures : names of the figures whose mean is the quality.
+    count : number of pairs that there should be.
     """
     row = []
     for cost in _COSTS.values():
@@ -229,7 +236,7 @@ def _knob_row(
         row.append(_spread(change, name, count))
     gains = [[quality(a, figures) - quality(b, figures) for a, b in group] for group in pairs]
     row.append(_spread(gains, "psnr", count))
-    # Of the same pairs: seconds without a quality say nothing.
+    # Seconds are those of the pairs whose quality is known.
     extra = _finite(
         [
             a.steady - b.steady if math.isfinite(gain) else math.nan
@@ -242,11 +249,11 @@ def _knob_row(
 
 
 def knob_tables(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]]]) -> list[str]:
-    """Tabulate every knob: its values, what they cost and what they bring against the base.
+    """Tabulate every knob: costs and figures of its values in comparison with the base.
 
-    Decibels per second are the change of the quality over the change of the seconds: what a second
-    more buys where both are positive, and what one less costs where both are negative. Where their
-    signs differ there is nothing to weigh, and words say so.
+    Decibels per second are the change of the quality over that of the seconds: the gain by a
+    further second if both are positive, the loss by a second less if both are negative. If their
+    signs differ, the cell says in words which run is better and which is cheaper.
     """
     base, figures = sweep["runs"][0]["name"], quality_figures(sweep)
     names, lines = sweep["figures"], []
@@ -264,7 +271,7 @@ def knob_tables(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]
 
 
 def front_table(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]]]) -> list[str]:
-    """Tabulate the runs than which none is as good in less time, over what all have."""
+    """Tabulate the Pareto front of seconds and quality, of runs that are complete on all scenes."""
     figures, count = quality_figures(sweep), len(repeated) * len(sweep["scenes"])
     values, whole, left_out = {}, {}, []
     for run in sweep["runs"]:
@@ -295,7 +302,7 @@ def front_table(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]
 
 
 def compose(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]]]) -> str:
-    """Put the tables together as markdown."""
+    """Compose the tables as markdown."""
     base, figures = sweep["runs"][0]["name"], quality_figures(sweep)
     count = len(repeated)
     over = "the scenes, of means over the seeds"

@@ -25,7 +25,7 @@ from geosplat_jax.io.images import written_aside
 from geosplat_jax.run import train
 
 _RECORD = "rounds.json"
-"""What the rounds of a folder are made with."""
+"""File that says what the rounds of a folder are made with."""
 
 
 def rounds_folder(output: str | Path) -> Path:
@@ -36,12 +36,13 @@ def rounds_folder(output: str | Path) -> Path:
 def round_config(material_prior: str = "hybrid", *, seed: int | None = None) -> Config:
     """Return the settings of a round: a draft with half its split sum and no refinement.
 
-    What rounds recover was measured so (docs/cameras.md); longer rounds and free splats were not
-    tried.
+    What rounds recover was measured with these settings (docs/cameras.md); longer rounds and free
+    splats were not tried.
 
     Parameters
     ----------
-    material_prior : see `make_config`. seed : of every random choice, by default the usual one.
+    material_prior : see `make_config`.
+    seed : seed of every random choice; by default that of the preset.
     """
     overrides = (
         *(() if seed is None else (f"run.seed={seed}",)),
@@ -53,11 +54,12 @@ def round_config(material_prior: str = "hybrid", *, seed: int | None = None) -> 
 
 
 def _require_same(folder: Path, made_with: Mapping[str, Any]) -> None:
-    """Note what the rounds in a folder are made with; refuse those made with something else.
+    """Record what the rounds in a folder are made with; refuse those made with something else.
 
     Raises
     ------
     RunError
+        If the rounds were made with something else, or their record is damaged.
     """
     path, text = folder / _RECORD, json.dumps(made_with, indent=1, default=str) + "\n"
     # What a command has recorded that failed before its first round may be overwritten.
@@ -100,21 +102,22 @@ def refined_cameras(
 
     Parameters
     ----------
-    scene : folder. output : of the run to come; rounds are kept beside it, in ``OUTPUT_cameras``.
-    rounds : of training and refining, at least one.
-    config : of a round; `round_config` by default.
+    scene : folder of the scene.
+    output : folder of the run to come; rounds are kept beside it, in ``OUTPUT_cameras``.
+    rounds : number of rounds of training and refining, at least one.
+    config : settings of a round's training; `round_config` by default.
     reading : how to read the scene, see `load_recorded`; ``cameras`` are those of the first round.
-    how : cameras are refined, see `CameraSettings`.
+    how : settings of the refinement; by default those of `CameraSettings`.
     replace : remove a run that ``output`` holds before the first round.
-    listener : told of the trainings.
-    on_view : called after every refined view with its split.
+    listener : receives the events of the trainings.
+    on_view : called after every refined view, with the name of its split and the progress.
 
     Raises
     ------
     ValueError
-        If there is no round.
+        If ``rounds`` is less than 1.
     RunError
-        If rounds are there that were made with other settings; and see `train`.
+        If there are rounds that were made with other settings; and see `train`.
     SceneError, TrainingError, Interrupted
         See `train`.
     """

@@ -1,10 +1,10 @@
-"""The smallest model that explains a scene: a ladder of parts, each kept where it has earned it.
+"""The smallest model that explains a scene: a ladder of parts, of which those that help are kept.
 
-Beginning with the smallest model, one part after the other is added (`fit.model_parts.LADDER`), and
-the larger model is trained as long as the smaller one, from the same first stage, on the same
-views. Views that were held back tell whether it is better (`fit.evidence`). Trainings are short and
-of reduced photographs; what a training has measured is noted in a file, so that a choice that was
-interrupted goes on without repeating any.
+Beginning with the smallest model, the parts of `fit.model_parts.LADDER` are tried one after the
+other. The larger model is trained as long as the smaller one, from the same first stage and on the
+same views, and views that were held back show whether it is better (`fit.evidence`). Trainings are
+short and use reduced photographs. Every measurement is written to a file, so that a choice that was
+interrupted continues without repeating a training.
 """
 
 import hashlib
@@ -42,16 +42,17 @@ _USUAL_CELLS = 48
 """Cells that photographs are reduced for where the surface has none."""
 
 _SAMPLES = 64
-"""Rays per splat of the views that are compared."""
+"""Rays per splat when held-back views are rendered."""
 
 _BATCH_VIEWS = 2
-"""Views per step of a trial at most."""
+"""Most views per step of a trial."""
 
 _FEWEST_HELD = 3
-"""Held-back views that say anything."""
+"""Fewest held-back views from which models are compared."""
 
 _BLOCKED = 0.02
-"""Share of a uniform sky's light that a surface blocks from itself, from which shadows matter."""
+"""Shadows are kept if the surface blocks more than this share of a uniform sky's light from
+itself."""
 
 _SIZES = ("shift", "hash", "light")
 """Parts that the first stage, which all trials share, does without."""
@@ -64,26 +65,28 @@ class ModelChoice:
     """How a model is chosen."""
 
     by_hand: tuple[str, ...] = ()
-    """Paths of settings that were set by hand; what they decide is not chosen."""
+    """Paths of settings that were set by hand; the parts that they decide are not tried."""
     steps: PositiveCount = 150
-    """Steps of the first stage, and of every trial after it, at most."""
+    """Most steps of the first stage, and of every trial after it."""
     seeds: PositiveCount = 2
-    """Trainings of a model that a gain is measured against."""
+    """Number of trainings of the smaller model, each with its own seed, that a gain is compared
+    with."""
     hold_back: PositiveCount = 8
-    """Every so many-th training view is held back."""
+    """One of this many training views is held back."""
 
 
 @dataclass(frozen=True)
 class ChosenModel:
-    """A model, and why it is that one.
+    """A chosen model, and the evidence for it.
 
     Attributes
     ----------
     config : settings of the training that is to follow, on all views.
-    rungs : of all parts that were tried, in order.
+    rungs : results of all parts that were tried, in order.
     by_hand : titles of the parts that were set by hand, and of those that these need.
-    held_back : names of the views.
-    trainings : how many there were. seconds : that they took, first stage included.
+    held_back : names of the views that were held back.
+    trainings : number of trainings that were measured.
+    seconds : time that they took, first stages included.
     """
 
     config: Config
@@ -94,7 +97,7 @@ class ChosenModel:
     seconds: float
 
     def record(self) -> dict[str, Any]:
-        """Return what ``run.json`` keeps."""
+        """Return the choice as plain values for ``run.json``."""
         return {
             "rungs": [asdict(rung) for rung in self.rungs],
             "by_hand": list(self.by_hand),
@@ -123,14 +126,14 @@ def choose_model(
     Parameters
     ----------
     dataset : the scene.
-    config : the largest model, with what is to be spent on it in the end.
-    output : folder of the run to come; trials are made beside it, in ``OUTPUT_model``, of which
-        the file ``choice.json`` stays, and a lock.
-    how : see `ModelChoice`.
-    begin : `Resume` goes on with a choice that was interrupted; trainings that are done are not
-        made again. `Anew` with ``replace`` begins anew where there was one, and removes a run that
+    config : settings of the largest model, with the steps and samples of the training to follow.
+    output : folder of the run to come. Trials are made beside it, in ``OUTPUT_model``; the file
+        ``choice.json`` and a lock stay there.
+    how : settings of the choice; by default those of `ModelChoice`.
+    begin : `Resume` continues a choice that was interrupted, without repeating trainings that are
+        done. `Anew` with ``replace`` removes a choice that is there already, and a run that
         ``output`` holds.
-    listener : told of every training, and of every part that was tried.
+    listener : receives the events of every training, and the result of every part.
 
     Raises
     ------
@@ -138,7 +141,7 @@ def choose_model(
         If there are too few views to hold any back, or nothing is trained.
     RunError
         If there is a choice already that is neither to be resumed nor replaced, that was begun with
-        other settings or of other photographs, or that another process is making.
+        other settings or photographs, or that another process is making.
     TrainingError, Interrupted
         See `fit.train.fit`; a part whose training fails is left out.
     """
@@ -179,9 +182,9 @@ def _among(names: Iterable[str], parts: Iterable[Part]) -> frozenset[str]:
 
 
 def _tried(trials: "_Trials", part: Part, kept: Collection[str], wanted: Collection[str]) -> Rung:
-    """Compare the model with a part with the one without it.
+    """Compare the models with a part and without it.
 
-    Other seeds of the smaller model are trained only where the gain exceeds its standard error.
+    More seeds of the smaller model are trained only where the gain exceeds its standard error.
     """
     smaller = [trials.decibels(kept, 0)]
     before = float(np.mean(smaller[0]))
@@ -227,8 +230,8 @@ class _Trials:
     Parameters
     ----------
     dataset, config, how : see `choose_model`.
-    folder : of the trainings and of what they have measured.
-    listener : told of every training.
+    folder : folder of the trainings and of the measurements.
+    listener : receives the events of every training.
     """
 
     def __init__(
@@ -276,21 +279,21 @@ class _Trials:
 
     @property
     def seconds(self) -> float:
-        """What all trainings took."""
+        """Seconds that all trainings took, first stages included."""
         trials = sum(float(found["seconds"]) for found in self._measured.values())
         return trials + sum(self._stage_1_seconds.values())
 
     @property
     def state_path(self) -> Path:
-        """File of what was measured."""
+        """File of the measurements."""
         return self._folder / _STATE
 
     def model(self, kept: Collection[str]) -> Config:
-        """Return the settings of a model: of the parts to choose, only those that are named."""
+        """Return the settings with only the named ones of the parts to choose."""
         return without(self._config, [part for part in self._offered if part.name not in kept])
 
     def open(self, begin: Begin) -> None:
-        """Begin, or read what is there already.
+        """Begin a choice, or read one that is there already.
 
         Raises
         ------
@@ -327,7 +330,7 @@ class _Trials:
         self._measured, self._stage_1_seconds = measured, seconds
 
     def _checked(self, found: Mapping[str, Any]) -> dict[str, Any]:
-        """Read what a training has measured; of another form it raises."""
+        """Return a measurement from the file; raise an error where it has another form."""
         seconds = float(found["seconds"])
         if "failure" in found:
             return {"failure": str(found["failure"]), "seconds": seconds}
@@ -344,7 +347,7 @@ class _Trials:
 
     @cached_property
     def _mark(self) -> str:
-        """Return a short text that tells this choice from others."""
+        """Digest of settings, options and photographs, which tells this choice from others."""
         what = (
             self._config.to_dict(),
             asdict(replace(self.how, by_hand=())),
@@ -369,11 +372,12 @@ class _Trials:
             aside.write_text(json.dumps(state, indent=2) + "\n", encoding="utf-8")
 
     def decibels(self, kept: Collection[str], seed: int) -> np.ndarray:
-        """Return how well a model explains every held-back view, trained once.
+        """Return the decibels of a model on every held-back view, (V,); train it first if needed.
 
         Parameters
         ----------
-        kept : names of its parts. seed : added to that of the settings.
+        kept : names of the model's parts.
+        seed : number that is added to the seed of the settings.
 
         Raises
         ------
@@ -401,9 +405,10 @@ class _Trials:
         return np.asarray(self._measured[name]["psnr"], float)
 
     def blocked_share(self) -> float:
-        """Return what the surface of the first stage blocks, see `blocked.blocked_share`.
+        """Return the share of light that the first stage's surface blocks from itself.
 
-        It is noted, since the first stage is removed once the model is chosen.
+        See `blocked.blocked_share`. The share is written to the file, since the first stage is
+        removed once the model is chosen.
         """
         if self._blocked is None:
             self._start(False)
@@ -416,7 +421,10 @@ class _Trials:
         return self._blocked
 
     def _start(self, has_finer_cells: bool) -> Start:
-        """Train the first stage, once for each size of the cells, of all materials."""
+        """Return what a first stage ended with; train it first if that was not done.
+
+        There is one first stage for each size of the cells. It has all parts of the material.
+        """
         left_out = (*_SIZES, *(() if has_finer_cells else ("cells",)))
         name = _first_stage(has_finer_cells)
         parts = [part for part in self._offered if part.name in left_out]

@@ -1,6 +1,7 @@
 """A run: what was trained from a scene, and everything that can be done with it.
 
-`train` makes a `Run`, `Run` opens one. The command ``geosplat-jax`` and Python make the same.
+`train` makes a run and returns it as a `Run`; ``Run(folder)`` opens an existing one. The command
+``geosplat-jax`` makes the same runs as Python.
 """
 
 import time
@@ -53,7 +54,7 @@ REFINEMENT_SAMPLES = 32
 """Rays per splat when cameras are refined: noise averages out over the pixels of a view."""
 
 _PREVIEW_SECONDS = 60.0
-"""What a preview takes at most, usually: its program compiles beside the steps of a new stage."""
+"""Usual upper limit of a preview's time: its program may compile while a new stage trains."""
 
 
 def _true_light(dataset: Dataset, lights: Mapping[str, EnvLight]) -> EnvLight | None:
@@ -76,8 +77,8 @@ class Run:
 
     Parameters
     ----------
-    folder : of the run.
-    scene : where the scene is now, if it has moved; noted in the folder.
+    folder : folder of the run.
+    scene : where the scene is now, if it has moved; the folder's record is updated.
 
     Raises
     ------
@@ -129,10 +130,11 @@ class Run:
         return self.trained.pipeline
 
     def batch(self, step: int = 0) -> Batch:
-        """Return what a step of the training saw, or would see.
+        """Return the views that a step of the training saw, or would see.
 
-        Where photographs are cut to windows around the object (``run.window``), training counts
-        terms that are means over pixels by the share of the windows; `pipeline` does not.
+        Where photographs are cut to windows around the object (``run.window``), training multiplies
+        the weights of terms that are means over pixels by the windows' share of the pixels;
+        `pipeline` does not.
         """
         config = self.config
         views, _ = around_object(self.dataset.train, largest=config.run.window)
@@ -143,7 +145,7 @@ class Run:
         return Renderer.of(self.trained, samples=samples)
 
     def steps(self) -> list[dict[str, Any]]:
-        """Read what was noted of every training step."""
+        """Read the metrics of every training step."""
         return self.folder.metric_lines()
 
     @property
@@ -183,13 +185,16 @@ class Run:
     ) -> dict[str, Any]:
         """Compare the test views with the truth; write metrics, sheets of pictures and a report.
 
-        See `evaluate.EvaluateOptions` for the arguments.
-
         Parameters
         ----------
-        stage : evaluate what this stage ended with, and write to the folder of its checkpoint;
-            the run as it is now by default.
+        protocol, samples, relight_indirect : see `evaluate.EvaluateOptions`.
+        stage : evaluate the state that this stage ended with, and write to the folder of its
+            checkpoint; by default the present state of the run.
         on_progress : called with a part of the work, how much of it is done, and how much there is.
+
+        Returns
+        -------
+        The metrics, which are also written to ``metrics.json``.
 
         Raises
         ------
@@ -228,7 +233,8 @@ class Run:
     def report(self, output: str | Path | None = None, *, others: Sequence["Run"] = ()) -> Path:
         """Write ``report.html``, one self-contained page; return its path.
 
-        Made of what training and the last evaluation left; see `report.page`.
+        The page is made from the files of the training and of the last evaluation; see
+        `report.page`.
 
         Parameters
         ----------
@@ -244,9 +250,9 @@ class Run:
         return write_report(Path(output or self.folder.path / REPORT), runs)
 
     def consistency(self, *, stage: str | None = None, size: int | None = None) -> Consistency:
-        """Measure how well the splats stand for the mesh, over the views to show.
+        """Measure how well the splats represent the mesh, over the test views.
 
-        See `report.consistency`.
+        Over the training views where there are no test views. See `report.consistency`.
 
         Parameters
         ----------
@@ -266,14 +272,16 @@ class Run:
         samples: int = DEFAULT_SAMPLES,
         on_progress: OnProgress | None = None,
     ) -> list[Path]:
-        """Render views, or from any cameras, under the light that was found; return the files.
+        """Render views, or from any cameras, under the learned light; return the files.
 
         Parameters
         ----------
-        split : ``test`` or ``train``, where ``cameras`` are not given.
-        output : folder (default: ``renders`` in the run's).
-        cameras : see `shots.Cameras`. images : what to write, see `shots.Images`.
-        samples : rays per splat. on_progress : as for `evaluate`.
+        split : ``test`` or ``train``; without effect where ``cameras`` are given.
+        output : folder (default: ``renders`` in the run's folder).
+        cameras : cameras to render from, see `shots.Cameras`.
+        images : images to write, see `shots.Images`.
+        samples : rays per splat.
+        on_progress : as for `evaluate`.
 
         Raises
         ------
@@ -310,13 +318,15 @@ class Run:
 
         Parameters
         ----------
-        env : lat-long environment map.
-        output : folder (default: ``relight_NAME`` in the run's).
-        options : which movies, and what is behind the object.
-        cameras : see `shots.Cameras` (default: the test views, or without any the training's).
-        images : what to write besides, see `shots.Images`.
-        intensity : factor of the light. albedo_scale : (3,) factors of the albedo.
-        samples : rays per splat. indirect : see `Renderer.relit`.
+        env : file of a lat-long environment map.
+        output : folder (default: ``relight_NAME`` in the run's folder).
+        options : which movies to make, and what is behind the object.
+        cameras : see `shots.Cameras` (default: the test views, or the training views without any).
+        images : images to write besides, see `shots.Images`.
+        intensity : factor of the light.
+        albedo_scale : (3,) factors of the albedo.
+        samples : rays per splat.
+        indirect : see `Renderer.relit`.
         on_progress : as for `evaluate`.
         """
         options = options or RelightOptions()
@@ -349,17 +359,17 @@ class Run:
         output : file (default: ``cameras.json`` in the run's folder).
         splits : some of ``train`` and ``test``; those without views are left out.
         how : see `fit.cameras.CameraSettings`.
-        samples : rays per splat of the light that the asset is seen in.
-        on_view : called with the split after every view.
+        samples : rays per splat of the light on the asset.
+        on_view : called after every view, with the name of its split and the progress.
 
         Returns
         -------
-        refined : by split, as it was written.
+        The refined splits by name, as they are written.
 
         Raises
         ------
         RunError
-            If no split has views, or the output is what the run itself was trained with.
+            If no split has views, or the run was trained with the cameras in ``output``.
         """
         path = Path(output or self.folder.path / "cameras.json")
         own = self.dataset.options.get("cameras")
@@ -391,9 +401,13 @@ class Run:
         face_count: int | None = None,
         on_progress: OnProgress | None = None,
     ) -> dict[str, str]:
-        """Write the mesh, Gaussians and light; return a line about each file.
+        """Write the mesh, Gaussians and light; return a line of text about each file.
 
-        See `assets.export_assets`; ``on_progress`` as for `evaluate`.
+        Parameters
+        ----------
+        output : folder (default: ``export`` in the run's folder).
+        vertex_colors, texture_size, obj, usd, face_count : see `assets.export_assets`.
+        on_progress : as for `evaluate`.
         """
         return export_assets(
             self.trained,
@@ -408,9 +422,9 @@ class Run:
 
 
 class _Previews(Listener):
-    """Write truth, render and normals of one view side by side, while the training goes on.
+    """Writes photograph, render and normals of one view side by side, in the background.
 
-    A training with a budget begins none that it would have to wait for at its end.
+    Under a budget no preview begins that the training would have to wait for at its end.
     """
 
     def __init__(self, dataset: Dataset, folder: RunFolder, pacer: Pacer | None = None) -> None:
@@ -429,7 +443,7 @@ class _Previews(Listener):
         self._running = in_background(lambda: self._write(copied))
 
     def finish(self) -> None:
-        """Wait for the preview that is being rendered; one that failed is told of once."""
+        """Wait for the preview that is being rendered; warn if it failed."""
         running, self._running = self._running, None
         if running is None:
             return
@@ -455,13 +469,13 @@ def plan_training(
     downscale: int | None = None,
     light: str | None = None,
 ) -> Plan:
-    """Choose settings for a budget on this machine, whose speed is measured for a moment.
+    """Choose settings for a budget on this machine, whose speed is measured first.
 
     Parameters
     ----------
-    scene : folder, or a dataset, whose photographs are then taken as they are.
+    scene : folder, or a dataset; the photographs of a dataset are not reduced any further.
     budget, material_prior, mesh, overrides, downscale : see `budget.plan`.
-    light : that the photographs are to be read under.
+    light : name of the light of the photographs, where the scene has a choice.
 
     Raises
     ------
@@ -509,24 +523,28 @@ def train(
     config : settings, see `make_config`; by default those of ``quality``.
     quality : one of `QUALITIES`, by default ``standard``; not together with a config or a budget.
     mesh : file of a mesh to start from instead of a visual hull, see `fit.presets.with_mesh`. A run
-        that is resumed knows its own.
-    begin : ``Resume()`` goes on with the run that the folder holds, ``Anew(replace=True)`` replaces
-        it, ``TakeOver(run, stage)`` takes the stages before one from another run; by default the
-        folder must hold none.
-    budget : time and memory that the training may take. Without ``config``, settings are chosen for
-        it (`plan_training`), as its memory asks for; in any case steps are made fewer or more on
-        the way, so that it ends in time. A run that is resumed keeps its own, and has what is left
-        of it; one that began without has none.
+        that is resumed keeps its mesh.
+    begin : ``Resume()`` continues the run that the folder holds, ``Anew(replace=True)`` replaces
+        it, and ``TakeOver(run, stage)`` takes the stages before ``stage`` from another run. By
+        default the folder must hold no run.
+    budget : time and memory that the training may take. Without ``config``, settings are chosen
+        that fit both (`plan_training`). The numbers of steps are adapted during the training, so
+        that it ends in time. A run that is resumed keeps its budget, less the time that it has
+        used; a run that began without a budget cannot get one.
     model : ``auto``, or a `ModelChoice`: train the smallest model that explains the scene, see
         `model_choice.choose_model`. Parts of ``config`` whose settings differ from its preset, or
         that `ModelChoice.by_hand` names, stay as they are. A run that is resumed keeps its model.
-    devices : number of those of this process that share the views of every step
-        (docs/devices.md); all processes that `jax.distributed.initialize` connected take part, with
-        so many each. Or what `fit.devices.choose_devices` made of it before.
-    listener : told of every step, compilation, preview, and part of a model that was tried.
+    devices : number of devices of this process that share the views of every step
+        (docs/devices.md), or what `fit.devices.choose_devices` returned. All processes that
+        `jax.distributed.initialize` connected take part, with the same number each.
+    listener : receives every step, compilation, preview, and part of a model that was tried.
     began : `time.perf_counter` when the time of the training began to count; by default now.
-    reading : how to read the scene: ``downscale``, ``light``, ``bounds`` (six numbers),
-        ``cameras`` (a file of `Run.refine_cameras`), and what else `load_dataset` takes.
+    reading : how to read the scene: ``downscale``, ``light``, ``bounds`` (six numbers), ``cameras``
+        (a file of `Run.refine_cameras`), and other options of `load_dataset`.
+
+    Returns
+    -------
+    The run, opened.
 
     Raises
     ------
@@ -562,7 +580,7 @@ def train(
         how = ModelChoice() if model == "auto" else model
         chosen = _chosen_model(dataset, config, folder, how, begin, listener)
         config, evidence = chosen.config, chosen.record()
-        started = time.perf_counter()  # the cost of choosing is stated apart
+        started = time.perf_counter()  # the time of the choice is reported separately
     earlier = (folder.training() or {}).get("seconds_total", 0.0) if goes_on else 0.0
     used = folder.seconds_used() if goes_on else 0.0
     pacer = None
@@ -584,7 +602,7 @@ def train(
     finally:
         previews.finish()
     if devices.is_first_host:
-        # Of a training that was interrupted only its steps are known.
+        # Of an earlier, interrupted part of the training only the steps' seconds are known.
         seconds = max(earlier, used) + time.perf_counter() - started
         folder.write_training({"seconds_total": round(seconds, 2)})
     run = Run(folder.path)
@@ -593,7 +611,7 @@ def train(
 
 
 class _Order(NamedTuple):
-    """What a caller of `train` wants, as far as it was said."""
+    """Those arguments of `train` that a run which is resumed may complete; None where not given."""
 
     config: Config | None
     mesh: str | Path | MeshSettings | None
@@ -625,10 +643,10 @@ def _require_consistent(
 
 
 def _as_it_began(order: _Order, folder: RunFolder, *, chooses: bool) -> _Order:
-    """Complete an order to go on with a run by what that run knows itself.
+    """Complete the order to continue a run with the settings of that run.
 
-    A run whose settings were chosen, for its model or for a budget, keeps them, unless the order
-    has others. Those of a budget have changed with the pace since.
+    Settings that were chosen for the run's model or budget stay, unless the order has others. The
+    pace has changed those of a budget since, so they are compared with the planned ones.
     """
     if chooses and not folder.has_chosen_model:
         raise RunError(
@@ -684,7 +702,7 @@ def _chosen_model(
 
 
 def _pacer(budget: Budget, dataset: Dataset, config: Config, *, began: float) -> Pacer:
-    """Return what keeps a training to its budget, on this machine."""
+    """Return the pacer that keeps a training within its budget on this machine."""
     pixels = float(dataset.train.height * dataset.train.width)
     costs = expected_costs(config, pixels, slowness=slowness_of_machine())
     return Pacer(budget, config, costs, began=began)

@@ -1,11 +1,11 @@
-"""Build two scenes in which much light comes by way of other surfaces, in the TensoIR layout.
+"""Build two scenes with much indirect light, in the TensoIR layout.
 
     pip install 'geosplat_jax[scene]'
     python experiments/scene/make_bounce_scenes.py --output FOLDER [--only bowl]
 
-``bowl`` is white outside and coloured inside, so that its inner wall lights itself and takes on
-the colour of what is opposite; ``pair`` is a white ball beside a red and before a green slab, with
-gaps of a twentieth of its diameter. Rendered by Mitsuba 3 as `make_scene.py` renders the duck.
+``bowl`` is white outside and coloured inside, so that parts of its inner wall light each other with
+their colours. ``pair`` is a white ball between a red and a green slab at right angles, with gaps of
+a twentieth of its diameter. Rendered by Mitsuba 3 as `make_scene.py` renders the duck.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ import scene_duck
 import trimesh
 
 RADIUS, THICKNESS = 1.0, 0.12
-"""Of the bowl; world units."""
+"""Outer radius of the bowl, and thickness of its wall; world units."""
 OPENING = 0.15
 """Height of the bowl's rim above its centre."""
 SECTIONS = 256
 SAVED_SECTIONS = 64
-"""Around the bowl, of the mesh that is rendered and of the one on disk."""
+"""Segments around the bowl, of the mesh that is rendered, and of the one that is written."""
 
 Array = make_scene.Array
 Part = tuple[trimesh.Trimesh, scene_duck.Materials]
 
 
 def _bowl_body(sections: int) -> trimesh.Trimesh:
-    """Turn a round-lipped wall about the z axis; closed and outward."""
+    """Revolve the profile of a wall with a round lip about the z axis; closed, faces outward."""
     inner = RADIUS - THICKNESS
     middle = 0.5 * (RADIUS + inner)
     lip = np.arcsin(OPENING / middle)
@@ -51,7 +51,7 @@ def _bowl_body(sections: int) -> trimesh.Trimesh:
 
 
 def _bowl_materials(body: trimesh.Trimesh) -> scene_duck.Materials:
-    """White outside; red, yellow, green and blue inside, one after the other around the axis."""
+    """Paint the bowl white outside, and red, yellow, green and blue around the axis inside."""
     points = np.asarray(body.vertices) - [0, 0, 0.5 * (RADIUS - OPENING)]
     turn = np.arctan2(points[:, 1], points[:, 0])
     colours = np.array([[0.75, 0.08, 0.06], [0.75, 0.6, 0.08], [0.08, 0.5, 0.12], [0.08, 0.2, 0.7]])
@@ -65,20 +65,20 @@ def _bowl_materials(body: trimesh.Trimesh) -> scene_duck.Materials:
 
 
 def bowl(*, is_saved: bool = False) -> list[Part]:
-    """Return the bowl; `is_saved`: with the larger faces of the mesh on disk."""
+    """Return the bowl; with ``is_saved`` in the coarser mesh that is written."""
     body = _bowl_body(SAVED_SECTIONS if is_saved else SECTIONS)
     return [(body, _bowl_materials(body))]
 
 
 def _slab(extents: tuple[float, float, float], centre: tuple[float, float, float]):
-    """Make a slab, with edges of its own for every side."""
+    """Make a slab as six separate sides, so that its edges are sharp."""
     body = trimesh.creation.box(extents=extents)
     body.apply_translation(centre)
     return [body.submesh([facet], append=True).subdivide().subdivide() for facet in body.facets]
 
 
 def pair(*, is_saved: bool = False) -> list[Part]:
-    """Return the ball and the slabs."""
+    """Return the ball and the slabs; with ``is_saved`` in the coarser mesh that is written."""
     ball = trimesh.creation.icosphere(subdivisions=4 if is_saved else 6, radius=0.5)
     parts = [(ball, make_scene.painted(ball.vertices, [0.8, 0.8, 0.8], 0.5))]
     slabs = (

@@ -4,8 +4,8 @@
     python experiments/scene/make_open_scene.py --output FOLDER
 
 writes `<output>/table/` and the environment maps beside it, as `make_scene.py` does for the duck.
-The ground has no thickness and the cameras stay above it, so that its true mesh, `mesh_gt.ply`, is
-open: what `train --mesh` takes and an isosurface cannot be.
+The ground has no thickness, and the cameras stay above it. So the true mesh, `mesh_gt.ply`, is
+open: `train --mesh` can start from it, whereas an isosurface is always closed.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ import trimesh
 
 NAME = "table"
 GROUND_RADIUS = 1.25
-"""Of the round ground; its middle is the origin."""
+"""Radius of the round ground, whose centre is the origin; world units."""
 SAVED_EDGE = 0.06
-"""Longest edge of the mesh on disk."""
+"""Longest edge of the mesh that is written, world units."""
 LOWEST, HIGHEST = 0.25, 0.95
 """Sines of the elevations of training cameras."""
 
@@ -47,7 +47,7 @@ def _ground() -> trimesh.Trimesh:
 
 
 def _box() -> trimesh.Trimesh:
-    """Make a box that stands on the ground, with edges of its own for every face."""
+    """Make a box on the ground, as six separate sides, so that its edges are sharp."""
     body = trimesh.creation.box(extents=(0.5, 0.4, 0.7))
     turn = trimesh.transformations.rotation_matrix(0.5, [0, 0, 1], point=[0, 0, 0])
     body.apply_transform(turn)
@@ -69,7 +69,7 @@ def _ring() -> trimesh.Trimesh:
 
 
 def _ground_albedo(points: Array) -> Array:
-    """Soft stripes, as fine as the vertices can show."""
+    """Return the albedo (n, 3) of a soft pattern, as fine as the vertices can resolve."""
     wave = 0.5 + 0.5 * np.sin(9.0 * points[:, :1]) * np.sin(9.0 * points[:, 1:2])
     return (wave * [0.62, 0.56, 0.45] + (1 - wave) * [0.16, 0.25, 0.30]).astype(np.float32)
 

@@ -4,12 +4,12 @@
     python experiments/scene/make_scene.py --output examples
 
 writes `<output>/duck/` and the environment maps `<output>/<light>.hdr` beside it. The pictures
-come from an independent path tracer (8 bounces, Disney principled BSDF), so that whoever trains
-on them is not judged by their own renderer.
+come from an independent path tracer (8 bounces, Disney principled BSDF), so that a reconstruction
+is not compared with images of its own renderer.
 
 The `llvm_ad_rgb` variant of Mitsuba is many times faster than `scalar_rgb`, but needs an LLVM
-library of version 16 or newer, found through the environment variable `DRJIT_LIBLLVM_PATH`; the
-latter is taken where the former does not render.
+library of version 16 or newer, found through the environment variable `DRJIT_LIBLLVM_PATH`. Where
+it does not render, `scalar_rgb` is used.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ NAME = "duck"
 CAMERA_DISTANCE = 4.1
 CAMERA_ANGLE_X = 0.68
 MAX_DEPTH = 8
-# The true pictures have no light transport, so only their edges need samples.
+# Ground-truth pictures have no light transport, so that samples only smooth their edges.
 TRUTH_SAMPLE_COUNT = 256
-# Seeds of the views are below it.
+# Offset of the seeds of repeated renderings; seeds of views are smaller.
 OTHER_SEED = 1_000_000
 TRIES = 3
-# The picture is made from a mesh whose edges are shorter than a pixel; the one on disk is coarser.
+# Pictures are rendered from a mesh whose edges are shorter than a pixel; `mesh_gt.ply` is coarser.
 RENDER_RESOLUTION = 200
 SAVED_RESOLUTION = 80
-# Mitsuba interpolates a map by a slightly different rule than ours. Enlarging the map first makes
-# that harmless: the error of a mirror ball under `party` falls from .013 to .002.
+# Mitsuba's rule of interpolation in a map differs slightly from ours. Upsampling the map first
+# removes the difference: the error of a mirror ball under `party` falls from .013 to .002.
 ENVIRONMENT_UPSAMPLING = 8
 # local = (y, z, x) takes the z-up world to the y-up frame of Mitsuba's `envmap`.
 WORLD_TO_ENVIRONMENT = np.array([[0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], float)
@@ -67,7 +67,7 @@ class View:
     camera_to_world
         (4, 4), x right, y up, looking down -z.
     seed
-        Of Mitsuba's sampler; distinct for every view.
+        Seed of Mitsuba's sampler; distinct for every view.
     """
 
     name: str
@@ -102,7 +102,7 @@ def train_views(count: int) -> list[View]:
 
 
 def test_views(count: int) -> list[View]:
-    """Walk once around the object, nodding; the first view is the three-quarter portrait."""
+    """Place cameras around the object at varying heights; the first is a three-quarter view."""
     turn = np.arange(count) / count
     azimuths = 0.62 + 2.0 * np.pi * turn
     heights = 0.26 + 0.42 * np.sin(4.0 * np.pi * turn)
@@ -210,7 +210,7 @@ def _attribute(name: str) -> dict[str, str]:
 
 
 def shaded_scene(mesh_path: Path, light: Array) -> Any:
-    """Build the scene that is photographed."""
+    """Build the scene of the photographs: the mesh with its materials under a light."""
     bsdf = {
         "type": "principled",
         "base_color": _attribute("albedo"),
@@ -246,7 +246,7 @@ def truth_scene(mesh_path: Path, attribute: str) -> Any:
 
 
 def render(scene: Any, view: View, *, size: int, sample_count: int) -> Array:
-    """Render one view; a pixel that one path made not a number gets other paths.
+    """Render one view; pixels that a path made NaN or infinite are rendered with other seeds.
 
     Returns
     -------
@@ -256,7 +256,7 @@ def render(scene: Any, view: View, *, size: int, sample_count: int) -> Array:
     Raises
     ------
     RuntimeError
-        If pixels stay without a number.
+        If some pixels are not finite with any seed.
     """
     from_where = sensor(view, size, sample_count)
     image = np.array(mi.render(scene, sensor=from_where, seed=view.seed), np.float32)
@@ -366,20 +366,20 @@ def render_all(
     args: argparse.Namespace,
     write_render_mesh: Callable[[Path], None],
 ) -> None:
-    """Write cameras, photographs of all views, and the truth and relit pictures of the test views.
+    """Write cameras, photographs of all views, and ground truth and relit pictures of test views.
 
     Parameters
     ----------
     folder
-        Of the scene.
+        Folder of the scene.
     train, test
-        Views of either split.
+        Views of the two splits.
     lights
-        Maps by name; the first lights the training views.
+        Environment maps by name; the first is the training light.
     args
         See `parser`.
     write_render_mesh
-        Writes the mesh with its materials as PLY.
+        Function that writes the mesh with its materials as PLY.
     """
     train_light, *_ = lights
     write_cameras(folder, train, "train", args.size)
@@ -439,7 +439,7 @@ def _positive(text: str) -> int:
 
 
 def parser(documentation: str) -> argparse.ArgumentParser:
-    """Describe the command line of a scene; `documentation` begins with what it builds."""
+    """Describe the command line of a scene; the first line of `documentation` is its help."""
     made = argparse.ArgumentParser(
         description=documentation.split("\n")[0],
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
@@ -457,7 +457,7 @@ def parser(documentation: str) -> argparse.ArgumentParser:
 
 
 def timed_build(args: argparse.Namespace, build: Callable[[argparse.Namespace], Path]) -> None:
-    """Activate a Mitsuba variant, build a scene, and say where it is and what it took."""
+    """Activate a Mitsuba variant, build a scene, and print its folder and the seconds it took."""
     start = time.perf_counter()
     print(choose_variant(args.variant))
     print(f"{build(args)}: {time.perf_counter() - start:.0f} s")

@@ -3,8 +3,8 @@
     pip install 'geosplat_jax[scene]'
     python experiments/scene/make_thin_scene.py --output FOLDER
 
-writes `<output>/basket/` and the environment maps beside it. Five rings and twenty wires, a
-twenty-fifth of the basket's width thick: as wide as two cells where 48 lie along the basket.
+writes `<output>/basket/` and the environment maps beside it. The basket has five rings and twenty
+wires, as thick as a twenty-fifth of its width: two cells of a grid with 48 cells along the basket.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ Array = make_scene.Array
 
 
 def _rings(points: Array) -> Array:
-    """Distance from the middles of the rings."""
+    """Return the distance of points from the centre lines of the rings."""
     across = np.linalg.norm(points[:, :2], axis=1)
     each = [np.hypot(across - radius, points[:, 2] - height) for height, radius in RINGS]
     return np.min(each, axis=0)
 
 
 def _wires(points: Array) -> Array:
-    """Distance from the middles of the wires: polygons from the centre of the floor to the rim."""
+    """Return the distance from the centre lines of the wires: polylines from floor to rim."""
     turn = np.arctan2(points[:, 1], points[:, 0])
     step = 2 * np.pi / WIRES
-    turn = (turn + step / 2) % step - step / 2  # every wire on the x axis
+    turn = (turn + step / 2) % step - step / 2  # folds all wires onto that along the x axis
     across = np.linalg.norm(points[:, :2], axis=1)
     x, y, z = across * np.cos(turn), across * np.sin(turn), points[:, 2]
     corners = np.array([(0.0, FLOOR), *((radius, height) for height, radius in RINGS)])
@@ -83,7 +83,7 @@ def _mesh(cells: int) -> tuple[Array, NDArray[np.int64], Array]:
 
 
 def _materials(points: Array) -> scene_duck.Materials:
-    """Lacquer that turns from red at the floor to cream at the rim."""
+    """Return a lacquer whose albedo changes from red at the floor to cream at the rim."""
     share = np.clip((points[:, 2:] - FLOOR) / (RINGS[-1][0] - FLOOR), 0.0, 1.0)
     albedo = share * np.array([0.75, 0.68, 0.5]) + (1 - share) * np.array([0.55, 0.08, 0.06])
     return make_scene.painted(points, albedo, 0.4)

@@ -2,9 +2,9 @@
 
     python experiments/scene/scene_check.py --scene examples/duck
 
-verifies that a mirror ball rendered by Mitsuba shows the environment where the closed formula
-puts it, that the true mesh projects onto the masks and fills them, that normals face the camera
-and agree with the true mesh, and that no picture touches its frame. Exits non-zero on failure.
+verifies that a mirror ball rendered by Mitsuba shows the environment where the analytic solution
+has it, that the true mesh projects onto the masks and fills them, that normals face the camera
+and agree with the true mesh, and that no mask touches the border. Exits non-zero on failure.
 """
 
 from __future__ import annotations
@@ -79,14 +79,14 @@ def mirror_error(light: Array, view: make_scene.View, *, size: int = 96) -> floa
     origin = view.camera_to_world[:3, 3]
     along = rays @ origin
     discriminant = along**2 - (origin @ origin - 1.0)
-    # Within .95 of the radius a pixel's footprint stays small against the map.
+    # Within .95 of the radius, the footprint of a pixel is small compared to texels of the map.
     inside = discriminant > 1.0 - 0.95**2
     distance = -along - np.sqrt(np.where(inside, discriminant, 1.0))
     normal = origin + distance[..., None] * rays
     reflected = rays - 2.0 * np.sum(rays * normal, -1, keepdims=True) * normal
     expected = scene_lights.lookup(light, reflected)[inside]
     relative = np.abs(rendered[..., :3][inside] - expected) / expected
-    # By channel: turning a smooth map over may change one colour only.
+    # By channel, because mirroring a smooth map may change one colour only.
     return float(np.median(relative, axis=0).max())
 
 
@@ -162,7 +162,7 @@ def main() -> None:
     args = parser.parse_args()
     choose_variant(args.variant)
     results: list[tuple[str, float, float]] = []
-    # Four sides, top and bottom of different colours, varying smoothly: any flip or turn shows.
+    # A smooth map whose sides, top and bottom have different colours reveals any flip or rotation.
     directions = scene_lights.pixel_directions(64)
     asymmetric = (0.6 + 0.5 * directions * [1.0, 0.7, 0.4]).astype(np.float32)
     lights = {"asymmetric": asymmetric} | {

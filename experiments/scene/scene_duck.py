@@ -127,7 +127,7 @@ def _paint(colour) -> Callable[[Array], Array]:
 
 
 def _mirrored(points: Array) -> Array:
-    """Fold y >= 0: the duck is symmetric but for its crown."""
+    """Mirror points to y >= 0: the duck is symmetric, except for its crown."""
     return points * np.float32([1, 0, 1]) + np.abs(points) * np.float32([0, 1, 0])
 
 

@@ -4,9 +4,9 @@ import subprocess
 import sys
 
 VARIANTS = ("llvm_ad_rgb", "scalar_rgb")
-"""Fastest first."""
+"""Variants to try, the fastest first."""
 
-# Run in a process of its own: an LLVM that lacks an instruction aborts instead of raising.
+# Run in another process, since an LLVM that lacks an instruction aborts instead of raising.
 _PROBE = """
 import sys, mitsuba as mi, numpy as np
 mi.set_variant(sys.argv[1])

@@ -1,13 +1,13 @@
-"""What a step of the surface costs with values everywhere and in a band around it.
+"""Compare the cost of a step of the surface on the whole grid and on a band around the surface.
 
     python experiments/studies/band.py [--cells 48 64 96] [--whole-until 128] [--json FILE]
 
-The surface is a rough ball, seven tenths of a cube wide. A step is the isosurface, its penalties,
-their gradient and Adam, in one program; of it, the bytes that the compiler plans (arguments,
-results and what lies between) and the median of the seconds. For the band also the seconds in
-which it follows the surface between two steps, and with --rays those of the index for rays and its
-bytes. Prints what it finds and the exponents of the number of cells along a side that fit the last
-three rows best.
+The surface is a rough ball, seven tenths of a cube wide. A step consists of the isosurface, its
+penalties, their gradient and Adam, in one program. Measured are the bytes that the compiler plans
+for it (arguments, results and temporaries) and the median of its seconds; for the band also the
+seconds in which it follows the surface between two steps, and with --rays the seconds and bytes of
+the index for rays. Prints all values, and the exponents with which they grow with the number of
+cells along a side, fitted to the last three rows.
 """
 
 import argparse
@@ -33,9 +33,9 @@ LAYERS = 1
 RATE = 1e-2
 REPEATS = 5
 ROUGHNESS = 0.2
-"""Cells by which the ball's surface goes up and down, so that it is not the same on all sides."""
+"""Amplitude of the waves on the ball, in cells, so that it is not symmetric."""
 FITTED = 3
-"""Rows, the last ones, that an exponent is fitted to."""
+"""Number of last rows that an exponent is fitted to."""
 
 
 def ball(cells: int) -> tuple[Grid, np.ndarray]:
@@ -52,7 +52,7 @@ def ball(cells: int) -> tuple[Grid, np.ndarray]:
 
 @partial(jax.jit, static_argnames="capacities", donate_argnames=("shape", "moments"))
 def step(model: GridSurface, shape: Geometry, moments: Any, capacities: Capacities) -> Any:
-    """Move a shape against the gradient of a moment of its mesh and of its penalties."""
+    """Make a step of Adam on the penalties of a shape and a function of its vertices."""
 
     def loss(shape: Geometry) -> Any:
         surface = model.extract(shape, capacities=capacities)
@@ -69,13 +69,13 @@ def step(model: GridSurface, shape: Geometry, moments: Any, capacities: Capaciti
 
 @partial(jax.jit, static_argnames="capacities")
 def rays(model: GridSurface, shape: Geometry, capacities: Capacities) -> Any:
-    """Arrange the mesh for rays."""
+    """Build the index of the mesh for rays."""
     surface = model.extract(shape, capacities=capacities)
     return model.ray_index(surface, capacities=capacities)
 
 
 def byte_count(compiled: Any) -> int:
-    """Count what a compiled program needs, as it says."""
+    """Return the bytes that a compiled program needs, by its own memory analysis."""
     sizes = compiled.memory_analysis()
     need = sizes.temp_size_in_bytes + sizes.argument_size_in_bytes + sizes.output_size_in_bytes
     return need - sizes.alias_size_in_bytes
@@ -89,7 +89,7 @@ def seconds_of(function: Any, *arguments: Any) -> tuple[float, Any]:
 
 
 def measured(model: GridSurface, shape: Geometry, *, with_rays: bool) -> dict[str, float]:
-    """Time a surface, and say what it holds."""
+    """Measure the seconds and megabytes of a surface, by name."""
     capacities = model.first_capacities(shape)
     moments = ADAM.init(shape)
     program = step.lower(model, shape, moments, capacities).compile()
@@ -118,7 +118,7 @@ def measured(model: GridSurface, shape: Geometry, *, with_rays: bool) -> dict[st
 
 
 def exponent(cells: list[int], values: list[float]) -> float | None:
-    """Slope of the logarithms of the last rows; None for too few."""
+    """Fit an exponent to the last rows: the slope of logarithms; None for too few rows."""
     if len(values) < FITTED:
         return None
     x, y = np.log(cells[-FITTED:]), np.log(values[-FITTED:])

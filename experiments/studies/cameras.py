@@ -1,17 +1,17 @@
-"""Measure what refining cameras wins back: poses, new views, materials.
+"""Measure how much the refinement of disturbed cameras recovers: poses, new views, materials.
 
     python experiments/studies/cameras.py SCENE --output FOLDER [--rounds 2] [--downscale 2]
 
-Disturbs the training cameras of a scene, trains on them, refines the cameras against what was
-trained, trains anew, and so on; and trains with the true cameras. Runs that are there already are
-opened instead, so an interrupted study goes on where it stopped; those with other settings or
-cameras are refused. Disturbed colours are in no record: take another folder for these.
+Disturbs the training cameras of a scene, trains with them, refines the cameras against the result,
+trains again, and so on; also trains with the true cameras. Existing runs are reused, so that an
+interrupted study continues where it stopped; those with other settings or cameras are refused. Runs
+do not record disturbed colours: use another folder for other ones.
 
-Photographs say nothing about where the object is in the world. The test cameras, which are not
-disturbed, are therefore moved by the similarity that takes the true training cameras to those that
-were trained on (`fit.gauge.find_gauge`), before new views are compared.
+Photographs do not determine the position of the object in the world. Before new views are compared,
+the test cameras, which are not disturbed, are therefore moved by the similarity from the true
+training cameras to those of the training (`fit.gauge.find_gauge`).
 
-Splats stay on the surface in all trainings. The table stands in docs/cameras.md.
+Splats stay on the surface in all trainings. The table is in docs/cameras.md.
 """
 
 import argparse
@@ -49,20 +49,20 @@ def disturbed(
     balance: float,
     seed: int,
 ) -> tuple[Views, Views]:
-    """Disturb every camera and the colours of its photograph; return also the truth about them.
+    """Disturb every camera and the colours of its photograph; also return the truth.
 
-    The truth is the views with their true cameras, with the factors of exposure and white balance
-    that the disturbed photographs have.
+    The truth is the views with their true cameras, and with the factors of exposure and white
+    balance of the disturbed photographs.
 
     Parameters
     ----------
-    views : the true ones.
-    target : (3,) what distances are measured to.
-    rotation_deg, position : angle about a random axis through the camera, and shift in a random
-        direction as a share of the distance; both of exactly this size.
-    focal, exposure, balance : standard deviations of the logarithms of the factors of focal lengths
-        and exposures, and of single channels.
-    seed : of all choices.
+    views : views with true cameras.
+    target : (3,) point that distances are measured to, world.
+    rotation_deg, position : angle about a random axis through the camera, degrees, and shift in a
+        random direction, as a share of the distance to the target; both of exactly this size.
+    focal, exposure, balance : standard deviations of the logarithms of random factors on focal
+        lengths, exposures, and single channels.
+    seed : seed of all random choices.
     """
     rng = np.random.default_rng(seed)
     count = len(views)
@@ -87,12 +87,12 @@ def disturbed(
 
 
 def with_training_views(dataset: Dataset, views: Views) -> Dataset:
-    """Return a scene with other training views, and the box around the object as they see it."""
+    """Return a scene with other training views, and with the box of the object that follows."""
     return replace(dataset, train=views, bounds=object_bounds(views))
 
 
 def train_or_open(dataset: Dataset, folder: Path, arguments: argparse.Namespace) -> Run:
-    """Train, or open the run that the folder holds."""
+    """Train, or open the run in the folder if there is one."""
     config = make_config(quality=arguments.quality, overrides=USUAL)
     if is_trained(folder):
         return open_run(folder, config, dataset)
@@ -113,7 +113,7 @@ MEASURES = {
 def evaluated(run: Run, test: Views, gauge: Similarity | None, samples: int) -> list[str]:
     """Evaluate a run on test views in its gauge; return the cells of a row.
 
-    Metrics that are there already are taken.
+    Existing metrics are reused.
     """
     views = test if gauge is None else gauge.views(test)
     run.dataset = replace(run.dataset, test=views)

@@ -1,14 +1,14 @@
-"""Table 5: how well splats stand for their mesh, for several ways to put them there, and why.
+"""Table 5: how well splats match their mesh, for several ways to place them, and causes of errors.
 
     python experiments/studies/consistency.py RUN|MESH|ball [...] [--views 4] [--sizes 200 800]
         [--cells 48 96] [--only TEXT] [--causes]
 
-Every row places other splats on a mesh and compares both (`report.consistency`); nothing is
-trained. The mesh is that of a run, whose cameras are those of its scene, or that of a file: as it
-is, or for ``--cells`` the isosurface of its signed distance on so many cells (`shapes`), seen by
-cameras around it. ``ball`` is a sphere of radius one.
+Every row places splats on a mesh in another way and compares both (`report.consistency`); nothing
+is trained. The mesh is that of a run, seen by the cameras of its scene, or that of a file, seen by
+cameras around it: as it is, or with ``--cells`` the isosurface of its signed distance on a grid
+with this number of cells (`shapes`). ``ball`` is a sphere of radius one.
 
-``--causes`` asks instead what the angle and the distance consist of: one thing is changed a row.
+``--causes`` prints instead what contributes to the angle and the distance; each row has one change.
 """
 
 import argparse
@@ -63,14 +63,14 @@ PAPER = {
     "hotdog": (0.74, 0.012),
     "jugs": (0.89, 0.013),
 }
-"""Degrees and shares of the bounding box, of the paper's Table 5."""
+"""Angles in degrees, and distances as shares of the box's diagonal, from the paper's Table 5."""
 
 SHIFT = 0.3
-"""Inward shift of splats on meshes of files, in roots of the face's area: the median that a run on
-``spot`` learned."""
+"""Inward shift of splats on meshes from files, in units of the root of the face's area: the median
+that a run on ``spot`` learned."""
 
 SAMPLES = 4
-"""Of the mesh's normals along each side of a pixel, where they are filtered."""
+"""Samples of the mesh's normals along each side of a pixel, for the low-pass filter."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class OneBall(FaceSplats):
     """One isotropic splat in the middle of every face, as wide as the face."""
 
     def place(self, surface: Surface, parameters: Any, box: Box) -> Splats:
-        """Keep the first splat of each face, and make a ball of it."""
+        """Turn the first splat of each face into a ball; the others get opacity 0."""
         mesh = surface.mesh
         splats = face_splats(
             mesh, vertex_normals(mesh), constants=self.constants, unit=box.half_extent
@@ -105,18 +105,18 @@ class OneBall(FaceSplats):
 
 @dataclass(frozen=True)
 class Sunk(FaceSplats):
-    """Six splats per face, all sunk by the same share of the root of its area."""
+    """Six splats per face, all shifted inwards by the same share of the root of its area."""
 
     fraction: float = SHIFT
 
     def place(self, surface: Surface, parameters: Any, box: Box) -> Splats:
-        """Place them and sink them."""
+        """Place the splats and shift them inwards."""
         splats = super().place(surface, parameters, box)
         return shift_inwards(splats, surface.mesh, jnp.full_like(splats.opacities, self.fraction))
 
 
 class Subject(NamedTuple):
-    """A mesh to put splats on, and who looks at it."""
+    """A mesh to place splats on, and cameras that see it; ``trained`` is None for a file."""
 
     name: str
     mesh: Mesh
@@ -126,11 +126,11 @@ class Subject(NamedTuple):
     trained: Trained | None
 
     def body(self, model: FaceSplats | VertexSplats) -> Body:
-        """Put splats on it."""
+        """Place the splats of a model on the mesh."""
         return body_of_mesh(self.mesh, model, self.box)
 
     def ways(self) -> dict[str, Callable[[], Body]]:
-        """Name the ways to place splats, and make what is rendered with each."""
+        """Return, by name, functions that place splats in different ways."""
         constants = self.constants
         models = {
             "faces (Eq. 8-11)": FaceSplats(constants),
@@ -147,7 +147,7 @@ class Subject(NamedTuple):
 
 
 def of_run(trained: Trained) -> dict[str, Callable[[], Body]]:
-    """Return the splats that a run has learned: with the learned shift, and as it ended."""
+    """Return functions that make the splats of a run: as it ended, and with the shift alone."""
     splats = FaceSplats(trained.config.adapter)
     pipeline = replace(trained.pipeline, splats=splats)
     bare = replace(trained, pipeline=pipeline, params=replace(trained.params, splats=None))
@@ -158,7 +158,7 @@ def of_run(trained: Trained) -> dict[str, Callable[[], Body]]:
 
 
 def subjects(name: str, cells: list[int], views: int) -> Iterator[Subject]:
-    """Open a run, or make the meshes of a file."""
+    """Yield the mesh of a run, or those that are made from a file."""
     if Path(name).is_dir():
         run = Run(name)
         trained, chosen = run.trained, run.dataset.views_to_show
@@ -180,7 +180,7 @@ def subjects(name: str, cells: list[int], views: int) -> Iterator[Subject]:
 def print_table(subject: Subject, sizes: list[int], only: str) -> None:
     """Print a row for every way to place splats, and columns for every size of the images.
 
-    ``only`` : part of the names of the rows that are wanted.
+    ``only`` : text that the names of the printed rows contain.
     """
     print(f"\n{subject.name}: {int(subject.mesh.face_count)} faces, {len(subject.cameras)} views\n")
     print("| splats |" + "".join(f" {size} x {size} | not covered |" for size in sizes))
@@ -198,12 +198,12 @@ def print_table(subject: Subject, sizes: list[int], only: str) -> None:
 
 
 def figures(errors: PixelErrors, counts: np.ndarray) -> str:
-    """Write angle and distance of some pixels."""
+    """Format the mean angle and distance of some pixels."""
     return f"{errors.reflection_deg[counts].mean():.2f}°, {errors.distance[counts].mean():.4f}"
 
 
 def print_causes(subject: Subject, size: int) -> None:
-    """Change one thing at a time, for splats on their faces and for those that are sunk."""
+    """Print rows with one change each, for splats on their faces and for shifted splats."""
     cameras = [resized(camera, size) for camera in subject.cameras]
     constants = subject.constants
     print(f"\n{subject.name}, {size} x {size}: angle and distance\n\n| | on faces | shifted |")
@@ -234,14 +234,14 @@ def print_causes(subject: Subject, size: int) -> None:
 
 
 def median_figures(errors: PixelErrors) -> str:
-    """Write the medians of angle and distance."""
+    """Format the medians of angle and distance."""
     counts = errors.is_compared
     angle, distance = (np.median(x[counts]) for x in (errors.reflection_deg, errors.distance))
     return f"{angle:.2f}°, {distance:.4f}"
 
 
 def divided(subject: Subject, shift: float) -> Body:
-    """Cut every face into four on its plane, with interpolated normals, and sink the splats."""
+    """Divide every face in four, with interpolated normals, and shift its splats inwards."""
     coarse = subject.body(FaceSplats(subject.constants))
     vertices, faces, attributes = trimesh.remesh.subdivide(
         coarse.vertices, coarse.faces, vertex_attributes={"normal": coarse.normals}
@@ -258,7 +258,10 @@ def divided(subject: Subject, shift: float) -> Body:
 
 
 def filter_alone(body: Body, cameras: list[Camera]) -> float:
-    """Blur the mesh's normals by the low-pass filter of the splats; mean angle in degrees."""
+    """Return the mean angle, in degrees, that the splats' low-pass filter alone would cause.
+
+    The mesh's own normals are blurred by the filter, and compared with the normals before.
+    """
     found = []
     for camera in cameras:
         size = max(camera.height, camera.width)

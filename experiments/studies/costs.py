@@ -1,13 +1,13 @@
-"""Fit what a step costs (`fit.costs`) to runs that were made on this machine.
+"""Fit the model of the cost of a step (`fit.costs`) to runs that were made on this machine.
 
     python experiments/studies/costs.py RUN [RUN ...] [--slowness S] [--json FILE]
 
-Every stage of every run is a row: the work of a step, counted by its settings and its median number
-of splats, and the seconds that the fastest fifth of its steps stays below, since machines are
-shared. Constants are never negative; Levenberg-Marquardt makes the logarithms of predicted over
-measured seconds small. Prints the constants, divided by how slow the machine was (as it is at this
-moment, or ``--slowness``), and for every row what was measured and what they predict, before and
-after the fit.
+Every stage of every run is a row: the work of a step, which follows from the settings and the
+median number of splats, and the seconds that the fastest fifth of its steps stays below, since
+machines are shared. Constants are never negative; Levenberg-Marquardt minimises the logarithms of
+predicted over measured seconds. Prints the constants, divided by the slowness of the machine
+(measured now, or ``--slowness``), and for every row the seconds that were measured, and those
+predicted before and after the fit.
 """
 
 import argparse
@@ -26,16 +26,16 @@ from geosplat_jax.fit.costs import COST_NAMES, COST_SECONDS, slowness_of_machine
 from geosplat_jax.fit.folder import RunFolder
 
 FASTEST = 0.2
-"""Share of the steps that took less than what is taken for the time of a step."""
+"""Quantile of the seconds of a stage's steps that counts as the time of a step."""
 FIRST, FEWEST = 5, 30
-"""Steps of a stage that are left out, since they compile; and those that a row takes at least."""
+"""First steps of a stage, which are left out since they compile; least number of steps after."""
 SMALLEST = 1e-5
-"""Seconds of a unit of work at least: a logarithm has to begin somewhere."""
+"""Least seconds of a unit of work at the start of the fit, so that its logarithm is finite."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A stage of a run: where it is from, what a step had to do, and its seconds."""
+    """A stage of a run: names of both, work of a step by `COST_NAMES`, and seconds of a step."""
 
     run: str
     stage: str
@@ -61,7 +61,7 @@ def rows_of(path: Path) -> list[Row]:
 
 
 def fitted(rows: list[Row], start: Float[Array, " k"]) -> Float[np.ndarray, " k"]:
-    """Return the seconds of each unit of work that explain the rows best."""
+    """Return the seconds per unit of work, in the order of `COST_NAMES`, that fit the rows best."""
     work = jnp.asarray([[row.work[name] for name in COST_NAMES] for row in rows])
     measured = jnp.log(jnp.asarray([row.seconds for row in rows]))
 

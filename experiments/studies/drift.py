@@ -1,8 +1,8 @@
-"""How far splats move in the refinement, beside the paper's Table 7.
+"""Measure how far splats move in the refinement, for comparison with the paper's Table 7.
 
-Mean absolute change of every splat, between the end of the stage before and the end of `refine`:
-positions and scales in half sides of the box, unit quaternions and normals component by component,
-opacities between 0 and 1::
+Prints the mean absolute change of splats between the end of the previous stage and the end of
+`refine`: of positions and scales in units of half a side of the box, of unit quaternions and
+normals by component, and of opacities in [0, 1]::
 
     python experiments/studies/drift.py RUN [RUN ...]
 """
@@ -27,7 +27,7 @@ PAPER = {
 def drift(before: Splats, after: Splats, half_extent: float) -> tuple[float, ...]:
     """Mean absolute changes, in the order of `COLUMNS`.
 
-    A quaternion and its negative are one rotation; the nearer of the two counts.
+    A quaternion and its negative are the same rotation; the change is that to the nearer one.
     """
     count = int(before.count)
     assert count == int(after.count), "the mesh is frozen, so both have the same splats"

@@ -1,7 +1,7 @@
-"""Runs that an earlier call of a study left, opened where they are those that are wanted now.
+"""Reuse of runs from an earlier call of a study, after a check that they are the wanted ones.
 
-What a study changes of a scene in memory, beyond its cameras and sizes, is in no record and not
-compared: masks, colours, the light of a background. Take another folder for each.
+Changes that a study makes to a scene in memory, other than to cameras and sizes, are not recorded
+and not compared: masks, colours, the light of a background. Use another folder for each change.
 """
 
 from pathlib import Path
@@ -13,22 +13,23 @@ from geosplat_jax.run import Run
 
 
 def is_trained(folder: Path) -> bool:
-    """Whether a folder holds a run that was trained to its end."""
+    """Whether a folder holds a run whose training is complete."""
     return (folder / "training.json").exists()
 
 
 def open_run(folder: Path, config: Config, dataset: Dataset) -> Run:
-    """Open the run that a folder holds; the dataset becomes its own.
+    """Open the run in a folder, and give it a dataset in memory.
 
     Parameters
     ----------
-    config, dataset : what it has to have been trained with.
+    folder : folder of the run.
+    config, dataset : settings and scene that it must have been trained with.
 
     Raises
     ------
     SystemExit
-        With every difference, if it was trained with other settings, on another scene, or on one
-        that was read in another way.
+        If the run was trained with other settings, on another scene, or on one that was read with
+        other options; the message lists every difference.
     """
     run = Run(folder)
     recorded, scene = run.folder.record()["scene"], str(dataset.root.resolve())
@@ -50,16 +51,17 @@ def open_run(folder: Path, config: Config, dataset: Dataset) -> Run:
 
 
 def evaluated_mean(run: Run, samples: int) -> dict[str, float]:
-    """Evaluate a run, or take what its last evaluation found; return the means over the views.
+    """Evaluate a run, or reuse its last evaluation; return the means over the views, by name.
 
     Parameters
     ----------
+    run : the run.
     samples : rays per splat.
 
     Raises
     ------
     SystemExit
-        If the last evaluation was with another number of samples.
+        If the last evaluation had another number of samples.
     """
     path = run.folder.path / "metrics.json"
     if not path.exists():

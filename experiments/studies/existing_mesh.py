@@ -1,25 +1,26 @@
-"""Start from existing meshes (appendix H): what training makes of them, beside the joint method.
+"""Compare trainings that start from existing meshes (appendix H) with the joint method.
 
     python experiments/studies/existing_mesh.py SCENE ... --output FOLDER [--downscale 2]
         [--quality draft] [--noise 1] [--mesh FILE] [--set SECTION.FIELD=VALUE] [--json FILE]
 
-Starts: ``noise``, the true mesh (``mesh_gt.ply`` of the scene) at the size of the pixels whose
-vertices were moved along their normals by so many pixels (standard deviation); ``hull``, marching
-cubes of the visual hull; and ``matt``, the surface of a training without a specular lobe, in the
-folder ``matt_start``. Each is trained twice: with its vertices frozen, which says what the start is
-worth, and with all rates. ``joint`` is trained from the masks alone, as ever.
+Starts: ``noise`` is the true mesh (``mesh_gt.ply`` of the scene), with edges of two pixels, whose
+vertices are moved along their normals by random distances (standard deviation ``--noise`` pixels).
+``hull`` is marching cubes of the visual hull. ``matt`` is the surface of a training without a
+specular lobe, in the folder ``matt_start``. Each start is trained twice: with frozen vertices,
+which shows the quality of the start, and with all rates. ``joint`` is trained from the masks alone,
+as usual.
 
-The paper says that on a specular object such a start loses to the joint method, since the other
-method took reflections for shape. A hull has no such error, and noise is not one; ``matt`` has, as
-every method that looks for points of the same colour in all views. ``--mesh FILE`` adds a mesh of
-any other method (of the first scene). Compare rows of ``knight`` (diffuse) with those of
-``waterbottle`` (metal and glass).
+According to the paper, on a specular object such a start loses to the joint method, since the
+method that made the mesh took reflections for shape. ``hull`` and ``noise`` do not have this error;
+``matt`` does, like every method that looks for points of the same colour in all views. ``--mesh
+FILE`` adds a mesh of any other method (of the first scene). Compare rows of ``knight`` (diffuse)
+with those of ``waterbottle`` (metal and glass).
 
-Splats do not become free (`stages.refine.steps=0`): that leaves the surface where it is.
+Splats are not refined freely (`stages.refine.steps=0`), since that does not change the surface.
 
 Columns: Chamfer distance (mean of both directions, in thousandths of the object's longest side),
-normal error of the test views, PSNR of new views, of relit ones and of albedo. Runs that are there
-already are opened instead, and refused where they have other settings.
+normal error of the test views, and PSNR of new views, relit views and albedo. Existing runs are
+reused, and refused if they have other settings.
 """
 
 import argparse
@@ -43,7 +44,7 @@ from geosplat_jax.run import Run, train
 from geosplat_jax.surface.hull import fit_grid, hull_sdf
 
 POINTS, NEIGHBOURS = 50_000, 1_000_000
-"""Points of either surface that distances are measured at, and to which of the other."""
+"""Number of points on a surface whose distances are measured, and of points on the other one."""
 MOST_FACES = 200_000
 HULL_CELLS = 64
 STARTS = ("noise", "hull", "matt", "joint")
@@ -59,7 +60,7 @@ MEASURES = {
 
 
 def noisy_truth(dataset: Dataset, pixels: float) -> trimesh.Trimesh:
-    """Move the vertices of the true mesh along their normals."""
+    """Return the true mesh with vertices moved along their normals, by ``pixels`` (deviation)."""
     path = str(dataset.root / "mesh_gt.ply")
     views = dataset.train
     mesh = fitted(path, digest_of(path), views, edge_pixels=2.0, most_faces=MOST_FACES)
@@ -83,7 +84,7 @@ def hull_mesh(dataset: Dataset) -> trimesh.Trimesh:
 
 
 def matt_mesh(dataset: Dataset, folder: Path, arguments: argparse.Namespace) -> trimesh.Trimesh:
-    """Train without a specular lobe, so that what is a reflection has to be shape or colour."""
+    """Train without a specular lobe, so that reflections must be explained by shape or colour."""
     overrides = [*arguments.overrides, *MATT]
     run = train_or_open(dataset, folder / "matt_start", overrides, arguments.quality, None)
     vertices, faces, _ = run.renderer().mesh()
@@ -105,7 +106,7 @@ def chamfer(mesh: trimesh.Trimesh, truth: trimesh.Trimesh) -> float:
 
 
 def train_or_open(dataset: Dataset, folder: Path, overrides: list[str], quality: str, mesh) -> Run:
-    """Train, or open the run that the folder holds."""
+    """Train, or open the run in the folder if there is one."""
     config = make_config(quality=quality, mesh=mesh, overrides=(*USUAL, *overrides))
     if is_trained(folder):
         return open_run(folder, config, dataset)

@@ -1,9 +1,8 @@
-"""Train twenty steps at the corners of the settings: each in a process with a limit of memory.
+"""Train twenty steps at extreme settings, each in a process with limited memory.
 
 ``python experiments/studies/extremes.py [NAME ...] [--memory 8] [--steps 20]`` prints a table of
-what became of every corner: its steps, what was refused and why, seconds, and the largest resident
-memory. It ends with 1 where a corner did anything else than train to finite numbers or be refused
-in one line.
+the outcome at every corner: steps, reasons of refusals, seconds, and the largest resident memory.
+The exit status is 1 if a corner neither trains to finite numbers nor is refused in one line.
 """
 
 import argparse
@@ -45,7 +44,7 @@ _BASE = (
     "stages.monte_carlo.transport.specular_count=1",
     "stages.monte_carlo.transport.residual_count=0",
 )
-"""What is not at an extreme is small, so that a corner costs what its own setting costs."""
+"""All other settings are small, so that the cost of a corner is that of its own setting."""
 
 _SAMPLES = tuple(
     f"stages.monte_carlo.transport.{kind}_count" for kind in ("light", "diffuse", "specular")
@@ -58,10 +57,10 @@ class Corner:
 
     Attributes
     ----------
-    name : on the command line.
+    name : name on the command line.
     overrides : see `presets.make_config`; ``stages.*`` stands for both stages.
     size : pixels along the sides of the images.
-    is_refused : whether it asks for more than any machine has, so that it must be refused.
+    is_refused : whether it needs more memory than any machine has, so that it must be refused.
     """
 
     name: str
@@ -129,7 +128,7 @@ CORNERS = (
 
 
 def expanded(overrides: tuple[str, ...]) -> tuple[str, ...]:
-    """Write out what ``stages.*`` stands for."""
+    """Expand overrides of ``stages.*`` into one for each stage."""
     return tuple(
         one.replace("*", stage)
         for one in overrides
@@ -138,7 +137,7 @@ def expanded(overrides: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def resized(dataset: Dataset, size: int) -> Dataset:
-    """Return a dataset whose images have other sizes."""
+    """Return a dataset whose images are resized to ``size`` x ``size`` pixels."""
 
     def views(of: Views) -> Views:
         shape = (size, size, 4)
@@ -152,7 +151,7 @@ def resized(dataset: Dataset, size: int) -> Dataset:
 
 
 def train_corner(corner: Corner, steps: int, gigabytes: float) -> dict[str, Any]:
-    """Train a corner in this process, which may use so much memory."""
+    """Train a corner in this process, whose memory is limited to ``gigabytes``."""
     limit = int(gigabytes * 1e9)
     resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
     each = [f"stages.{stage}.steps={steps // len(_STAGES)}" for stage in _STAGES]
@@ -175,7 +174,7 @@ def train_corner(corner: Corner, steps: int, gigabytes: float) -> dict[str, Any]
 
 
 def verdict(corner: Corner, found: dict[str, Any], steps: int) -> str:
-    """Say whether a corner behaved: ``ok``, or what is wrong with it."""
+    """Return ``ok`` if a corner behaved as it should, or what went wrong."""
     outcome = found["outcome"]
     if outcome.startswith("stopped: "):
         if "\n" in outcome:
@@ -193,7 +192,7 @@ def verdict(corner: Corner, found: dict[str, Any], steps: int) -> str:
 
 
 def in_a_process(corner: Corner, steps: int, gigabytes: float) -> dict[str, Any]:
-    """Train a corner in a process of its own, which cannot take this one with it."""
+    """Train a corner in another process, whose crash does not end this one."""
     command = [sys.executable, __file__, "--one", corner.name]
     command += ["--steps", str(steps), "--memory", str(gigabytes)]
     done = subprocess.run(command, capture_output=True, text=True)

@@ -1,12 +1,12 @@
-"""What is carved from the visual hull, against the true surface: `surface.hollows`.
+"""Compare what `surface.hollows` carves from the visual hull with the true surface.
 
     python experiments/studies/hollows.py SCENE ... [--resolution 32 48] [--candidates]
 
-Every SCENE has a ``mesh_gt.ply`` (without one, only what is carved is counted). Vertices of the
-grid are counted. Columns: those in the hull; those of them outside the true surface before carving
-and after it; those carved that are inside the true surface, and more than 1.5 cells inside; the
-seconds that carving took, compilation included. Inside is what two of three rays leave an odd
-number of times.
+Every SCENE should have a ``mesh_gt.ply``; without one, only carved vertices are counted. Columns
+count vertices of the grid: those in the hull; those of them outside the true surface before
+carving; those that are carved; those outside the true surface after carving; carved ones inside the
+true surface, and more than 1.5 cells inside. The last column has the seconds of carving, with
+compilation. A point is inside a mesh if at least two of three rays cross it an odd number of times.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def rows(scene: Path, resolution: int) -> list[list[str]]:
 
 
 def candidates(scene: Path, resolution: int) -> list[list[str]]:
-    """Return a row for every part of the hull that was judged, the largest first."""
+    """Return a row for every part of the hull that may be a hollow, the largest first."""
     grid, hull, photographs = _hull(scene, resolution)
     judged = hollow_candidates(*photographs[:3], hull, grid, valid=photographs[3])
     return [
@@ -68,7 +68,7 @@ def candidates(scene: Path, resolution: int) -> list[list[str]]:
 
 
 def _hull(scene: Path, resolution: int) -> tuple[Grid, np.ndarray, tuple[Any, ...]]:
-    """Return grid, hull, and what `carve_hollows` is told of the photographs."""
+    """Return grid, hull, and the arguments of `carve_hollows` about the photographs."""
     dataset = load_dataset(scene)
     views, grid = dataset.train, fit_grid(dataset.bounds, resolution)
     cameras = views.world_to_camera, np.asarray(views.intrinsics, np.float64)

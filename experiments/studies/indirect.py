@@ -1,21 +1,21 @@
-"""How right the light is that comes by way of other surfaces, pixel by pixel against Mitsuba.
+"""Compare the indirect light of runs with that of Mitsuba, pixel by pixel.
 
     pip install 'geosplat_jax[scene]'
     python experiments/studies/indirect.py SCENE RUN ... [--samples 256] [--spp 1024]
         [--views 0 2 5 6] [--picture FILE] [--json FILE]
 
-SCENE is one of `experiments/scene/make_bounce_scenes.py`, the runs were trained on it. Mitsuba
-renders the true scene under the light of the photographs twice, with eight segments to a path and
-with one bounce; a run renders its own surface, materials and light with the indirect light that it
-was trained with, and without any. The differences of either pair are the indirect light, in units
-of the photographs, so that an albedo that is too dark under a light that is too bright counts as
-right.
+SCENE is one of `experiments/scene/make_bounce_scenes.py`, on which the runs were trained. Mitsuba
+renders the true scene under the training light twice, with paths of up to eight segments and with
+direct light only. A run renders its own surface, materials and light twice, with the indirect light
+that it was trained with and without any. The difference of each pair is the indirect light, in
+units of the photographs: the product of an albedo that is too dark and a light that is too bright
+counts as right.
 
-Columns: PSNR of the indirect light, and of direct and indirect together, on pixels of the object
-that no photograph clips, with the 99th percentile of the true image as the peak; and the mean of
-the indirect light over the true one's. With black instead of any indirect light, the first says
-how much there is to find. ``--picture`` writes a sheet of one view, the truth first: indirect
-light, four times as bright as it is, albedo, each channel aligned to the truth, and normals.
+Columns: PSNR of the indirect light, and of all light, on pixels of the object that no photograph
+clips, with the 99th percentile of the true image as the peak; and the mean indirect light, as a
+share of the true one. The row ``black`` has no indirect light: its PSNR shows how much there is to
+recover. ``--picture`` writes a sheet of one view, with the truth first: indirect light, brightened
+four times, albedo, with each channel aligned to the truth, and normals.
 """
 
 from __future__ import annotations
@@ -48,17 +48,22 @@ from geosplat_jax.transport.environment import LightSpec  # noqa: E402
 from geosplat_jax.transport.monte_carlo import MonteCarloSettings  # noqa: E402
 
 UNCLIPPED = 0.95
-"""Largest channel of a pixel that counts: photographs hold nothing above 1."""
+"""Pixels count up to this largest channel: photographs hold nothing above 1."""
 
 OPAQUE = 0.99
-"""Smallest coverage of a pixel that counts."""
+"""Pixels with more coverage than this count."""
 
 
 @dataclass(frozen=True)
 class Parts:
-    """One view: (H, W, 3) linear, all light and that of the first bounce; (H, W) coverage.
+    """The parts of one view.
 
-    Albedo, premultiplied by coverage, and normals are (H, W, 3) too.
+    Attributes
+    ----------
+    whole, direct : (H, W, 3) linear, all light and direct light.
+    alpha : (H, W) coverage.
+    albedo : (H, W, 3) linear, premultiplied by coverage.
+    normal : (H, W, 3) world.
     """
 
     whole: np.ndarray
@@ -69,12 +74,12 @@ class Parts:
 
     @property
     def indirect(self) -> np.ndarray:
-        """What came by way of other surfaces."""
+        """Indirect light, (H, W, 3) linear."""
         return self.whole - self.direct
 
 
 def rendered_by_mitsuba(scene: Path, chosen: list[int], spp: int) -> list[Parts]:
-    """Render test views of a scene by path tracing, with and without later bounces."""
+    """Render test views of a scene by path tracing, with and without indirect light."""
     description = json.loads((scene / "scene.json").read_text())
     light = scene_lights.read_hdr(scene.parent / f"{description['train_light']}.hdr")
     size = json.loads((scene / "test_000" / "metadata.json").read_text())["imw"]
@@ -132,7 +137,7 @@ def rendered_by_run(folder: Path, chosen: list[int], samples: int) -> list[Parts
 
 
 def _counted(truth: Parts) -> np.ndarray:
-    """Tell the pixels of the object that photographs say anything about: (H, W) bool."""
+    """Tell which pixels count, (H, W) bool: opaque ones that photographs do not clip."""
     return (truth.alpha > OPAQUE) & (truth.whole.max(-1) < UNCLIPPED)
 
 
@@ -169,7 +174,7 @@ def write_picture(path: Path, truth: Parts, others: list[Parts]) -> None:
 
 
 def _aligned(albedo: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Scale each channel by least squares."""
+    """Scale each channel of an albedo to the truth by least squares."""
     both, own = (np.sum(x * albedo, axis=(0, 1)) for x in (truth, albedo))
     return albedo * (both / np.maximum(own, 1e-12))
 

@@ -1,17 +1,17 @@
-"""Kill commands at random moments, and see what they leave and whether the next call goes on.
+"""Kill commands at random moments, and check their files and that the next call continues.
 
     python experiments/studies/kills.py --output FOLDER [--kills 100] [--seed 0] [--json FILE]
 
-Trains a very small run of the bundled scene without a disturbance, and then again and again with
-signals 2 (Ctrl-C), 9 and 15: after a time that is uniform over a whole command, or as soon as a
-file is seen to appear in its folder (a checkpoint, the end of a stage, a line of
-``metrics.jsonl``), or while it compiles into an empty cache. A run is resumed, and often killed
-again, until it has ended; its arrays and its ``metrics.jsonl`` must then be those of the first one
-to the bit. ``evaluate``, ``export``, ``render`` and ``relight`` of the finished run are killed
-likewise: under no final name may lie half a file, and the command called again must succeed.
+Trains a very small run of the bundled scene without disturbance, and then repeatedly with signals
+2 (Ctrl-C), 9 and 15. A signal is sent at a random time within the duration of the command, as soon
+as a file appears in its folder (a checkpoint, the end of a stage, a line of ``metrics.jsonl``), or
+while it compiles with an empty cache. A run is resumed, and often killed again, until it is
+complete; its arrays and its ``metrics.jsonl`` must then equal those of the first run to the bit.
+``evaluate``, ``export``, ``render`` and ``relight`` of the finished run are killed in the same way:
+no file with a final name may be incomplete, and the next call must succeed.
 
-A command that Ctrl-C reaches says so in at most three lines and ends with status 130. Prints what
-happened by kind of moment and signal, and every deviation; exit status 1 where there is one.
+A command that receives Ctrl-C must say so in at most three lines, and end with status 130. Prints
+the outcomes by moment and signal, and every fault; the exit status is 1 if there is one.
 """
 
 import argparse
@@ -55,26 +55,26 @@ SETTINGS = (
     "light.width=16",
     "objective.smoothness_samples=64",
 )
-"""Two stages of one kind of light, so that the second one needs few programs of its own."""
+"""Both stages have the same light transport, so that the second one has little to compile."""
 
 FAST_COMPILER = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-"""As in the tests: most of the time of so small a run is compilation."""
+"""Compiler flags of the tests: most of the time of so small a run is compilation."""
 
 SIGNALS = (signal.SIGINT, signal.SIGKILL, signal.SIGTERM)
 MOST_KILLS = 4
-"""Of one training or one output, before it is left to end."""
+"""Most kills of one training or one output, before it is left to end."""
 MOST_LINES = 3
-"""That a command prints after Ctrl-C."""
+"""Most lines that a command may print after Ctrl-C."""
 PATIENCE = 900.0
-"""Seconds after which a process that was sent a signal counts as one that swallowed it."""
+"""Seconds after a signal, after which the process counts as having ignored it."""
 LAST_WORDS = "trained in"
-"""What a training prints when all its files are written."""
+"""Text that a training prints when all its files are written."""
 LEAD = 0.03
-"""Seconds after a file was seen in which the signal is sent, at most."""
+"""Largest delay, in seconds, from the appearance of a file to the signal."""
 PROGRESS = re.compile(r", step \d+/|: \d+ of \d+|^compiling|^warning|^\W*$|slow compile| views, ")
-"""Lines that say nothing of a signal."""
+"""Lines of progress, which have nothing to do with a signal."""
 UNMEASURED = ("seconds", "peak_memory_mb")
-"""Numbers of a step that are never the same twice."""
+"""Entries of a step that differ between equal runs."""
 READERS = {
     "evaluate": ("--samples", "1"),
     "export": ("--texture-size", "64"),
@@ -86,14 +86,16 @@ READERS = {
 
 @dataclass
 class Kill:
-    """A signal that was sent, and what became of it.
+    """A signal that was sent, and its outcome.
 
     Attributes
     ----------
-    command, moment, number : what was killed, when, with which signal.
-    outcome : in a word or two. seconds : from the signal to the end of the process.
-    status : of the process. lines : that it printed after the signal.
-    faults : what should not be.
+    command, moment, number : name of the command, moment of the signal, and its number.
+    outcome : outcome in a word or two.
+    seconds : time from the signal to the end of the process.
+    status : exit status of the process; None if it ignored the signal.
+    lines : lines that it printed after the signal.
+    faults : deviations from what is required.
     """
 
     command: str
@@ -107,7 +109,7 @@ class Kill:
 
 
 class Process:
-    """A command of geosplat-jax in a process of its own, whose words go to a file."""
+    """A command of geosplat-jax in another process, whose output goes to a file."""
 
     def __init__(self, arguments: Sequence[str], log: Path, cache: Path) -> None:
         self.log = log
@@ -128,7 +130,7 @@ class Process:
 
     @property
     def has_ended(self) -> bool:
-        """Whether there is nothing left to kill."""
+        """Whether the process has ended."""
         return self._process.poll() is not None
 
     def words(self) -> str:
@@ -158,7 +160,7 @@ def small_scene(folder: Path) -> Path:
 
 
 def seen_files(folder: Path) -> Counter:
-    """Return names and sizes of the files below a folder, those that are being written as well."""
+    """Return sizes plus one of all files below a folder, by path, also of incomplete ones."""
     found = Counter()
     for root, _, names in os.walk(folder):
         for name in names:
@@ -171,7 +173,7 @@ def seen_files(folder: Path) -> Counter:
 
 
 def wait_for_file(process: Process, folder: Path, wanted: Callable[[str], bool], skip: int) -> bool:
-    """Wait until a wanted file has appeared or grown ``skip`` times more; False at the end."""
+    """Wait until a wanted file has changed ``skip + 1`` times; False if the process ends before."""
     before = seen_files(folder)
     while not process.has_ended:
         now = seen_files(folder)
@@ -185,7 +187,7 @@ def wait_for_file(process: Process, folder: Path, wanted: Callable[[str], bool],
 
 
 def wait_for_words(process: Process, words: str) -> bool:
-    """Wait until words were printed; False at the end."""
+    """Wait until a text was printed; False if the process ends before."""
     while not process.has_ended:
         if words in process.words():
             return True
@@ -199,9 +201,9 @@ WATCHED = {
     "step": lambda path: path.endswith("metrics.jsonl"),
     "file": lambda path: True,
 }
-"""Moments that a file tells of."""
+"""Moments that are recognised by changes of files, with tests of their paths."""
 SEEN = {"checkpoint": 12, "end of stage": 2, "step": 12, "file": 6}
-"""How often, at least, files change that tell of them."""
+"""Number of changes that certainly happen, by moment; one of them is drawn."""
 
 
 def killed(
@@ -212,7 +214,7 @@ def killed(
     duration: float,
     draw: random.Random,
 ) -> Kill | None:
-    """Wait for a moment, send a signal, and wait for the end; None where the moment never came."""
+    """Wait for a moment, send a signal, and wait for the end; None if the process ended before."""
     number = draw.choice(SIGNALS)
     if moment == "anywhere":
         end = time.monotonic() + draw.uniform(0.0, duration)
@@ -236,7 +238,7 @@ def killed(
 
 
 def judge(kill: Kill, process: Process) -> None:
-    """Say what became of a signal, and what should not be."""
+    """Record the outcome of a signal, and its faults."""
     text = process.words()
     if kill.status is None:
         kill.outcome = "swallowed"
@@ -247,12 +249,12 @@ def judge(kill: Kill, process: Process) -> None:
     kill.outcome = {0: "had ended", 130: "stopped", -9: "died", -15: "died"}.get(
         kill.status, f"status {kill.status}"
     )
-    # Before the first line of the package nobody can listen.
+    # Until the package is imported, nothing handles the signal.
     has_begun = PACKAGE in text or bool(text.strip()) and "Traceback" not in text
     if kill.number == signal.SIGINT and kill.status == -signal.SIGINT and not has_begun:
         kill.outcome = "not begun"
         return
-    # A command that is over leaves Ctrl-C to the system while Python cleans up; shells show 130.
+    # While Python cleans up after a command, the system handles Ctrl-C; shells then show 130.
     if kill.status == -signal.SIGINT and LAST_WORDS in text and "Traceback" not in text:
         kill.outcome = "had ended"
         return
@@ -265,14 +267,14 @@ def judge(kill: Kill, process: Process) -> None:
         kill.faults.append(f"status {kill.status} after signal {kill.number}")
     if "Traceback" in text:
         kill.faults.append("a traceback")
-    # Progress that was on its way is not meant; what is said of the signal is.
+    # Only lines about the signal count, and not progress that was printed at the same time.
     said = [line for line in kill.lines if not PROGRESS.search(line)]
     if kill.status == 130 and not 1 <= len(said) <= MOST_LINES:
         kill.faults.append(f"{len(said)} lines after Ctrl-C")
 
 
 def differences(run: Path, reference: Path) -> list[str]:
-    """Compare two finished runs to the bit: arrays, what is beside them, and every step."""
+    """Compare two finished runs to the bit: checkpoints of two stages, and every step."""
     found = []
     for part in ("checkpoints", "stages/split_sum"):
         mine, theirs = (latest_checkpoint(root / part) for root in (run, reference))
@@ -295,7 +297,7 @@ def differences(run: Path, reference: Path) -> list[str]:
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a file ends where it should."""
+    """Whether a file is complete, as far as its format tells."""
     try:
         if path.suffix == ".json":
             json.loads(path.read_text())
@@ -315,15 +317,15 @@ def is_whole(path: Path) -> bool:
 
 
 def half_files(folder: Path) -> list[str]:
-    """Name the files below a folder that are not whole, those aside left out."""
+    """Return incomplete files below a folder, except temporary ones."""
     paths = (path for path in folder.rglob("*") if path.is_file())
     final = (p for p in paths if ".partial" not in p.name and p.name != ".lock")
-    # The last line of the steps may be torn: whoever reads them leaves it out.
+    # The last line of the steps may be incomplete: readers leave it out.
     return [str(p.relative_to(folder)) for p in final if p.suffix != ".jsonl" and not is_whole(p)]
 
 
 class Study:
-    """Trials of one output folder, and what they found."""
+    """Trials in one output folder, and their results."""
 
     def __init__(self, folder: Path, seed: int) -> None:
         self.folder, self.draw = folder, random.Random(seed)
@@ -340,13 +342,13 @@ class Study:
         return Process(arguments, self.folder / "log.txt", cache or self.cache)
 
     def train_arguments(self, run: Path) -> list[str]:
-        """Return what trains a run, or resumes it."""
+        """Return the arguments that train a run, or resume it."""
         changed = [part for setting in SETTINGS for part in ("--set", setting)]
         place = ["--output", str(run), "--downscale", "8"]
         return ["train", str(self.scene), *place, "--resume", *changed]
 
     def reader_arguments(self, name: str, run: Path) -> list[str]:
-        """Return what calls a command on a finished run."""
+        """Return the arguments that call a command on a finished run."""
         options = list(READERS[name])
         return [name, str(run), *(["--env"] if name == "relight" else []), *options]
 
@@ -364,7 +366,7 @@ class Study:
         return time.monotonic() - began
 
     def prepare(self) -> None:
-        """Train the reference, and call every command once so that the cache holds its programs."""
+        """Train the reference, and run every command twice: to fill the cache, and to time it."""
         if not (self.reference / "training.json").exists():
             self.whole(self.train_arguments(self.reference))
         again = self.folder / "again"
@@ -379,7 +381,7 @@ class Study:
         print(f"undisturbed: { ({k: round(v, 1) for k, v in self.seconds.items()}) }", flush=True)
 
     def note(self, kill: Kill) -> None:
-        """Keep a kill, and say what was wrong with it."""
+        """Store a kill, and print it with its faults."""
         self.kills.append(kill)
         print(
             f"{len(self.kills):4d} {kill.command:9s} {kill.moment:12s} signal {kill.number:2d}  "
@@ -412,7 +414,7 @@ class Study:
         self.finished += 1
 
     def _require_success(self, name: str, process: Process, last: Kill | None) -> None:
-        """Note against the last kill that a command which was left alone did not succeed."""
+        """Record a fault of the last kill if a command that was left alone did not succeed."""
         status, text = process.wait(), process.words()
         fault = None
         if status != 0:
@@ -429,7 +431,7 @@ class Study:
         print(f"     ! {fault}", flush=True)
 
     def train_trial(self) -> None:
-        """Kill a training until it has ended, and compare it with the reference."""
+        """Kill a training repeatedly, let it end, and compare it with the reference."""
         run = self.folder / "run"
         shutil.rmtree(run, ignore_errors=True)
         moments = ("anywhere", "anywhere", "checkpoint", "checkpoint", "step", "end of stage")
@@ -481,7 +483,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    # A shell lets jobs in the background ignore Ctrl-C, and all that they start.
+    # Jobs in the background of a shell, and processes that they start, ignore Ctrl-C by default.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     study = Study(arguments.output, arguments.seed)
     study.prepare()

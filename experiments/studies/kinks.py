@@ -1,4 +1,4 @@
-"""How much the points without a derivative matter in one real step of training.
+"""Measure how much the points without a derivative matter in one real step of training.
 
     python experiments/studies/kinks.py RUN [--step-from start last] [--json FILE]
 
@@ -7,10 +7,10 @@ counts which discrete states changed: signs, quads, depth order, cells, threshol
 the loss along the update and compares it with what the gradient predicts:
 
 - *first order*: gradient times update;
-- *along the path*: the gradient integrated over sixteen pieces of the update. Kinks and curvature
-  are inside it; what it misses of the true change are the jumps, which no gradient sees.
+- *along the path*: the gradient integrated over sixteen pieces of the update. This includes kinks
+  and curvature; its difference from the true change is due to jumps, which no gradient shows.
 
-The tables of the bundled scene stand in docs/gradients.md.
+The tables of the bundled scene are in docs/gradients.md.
 """
 
 from __future__ import annotations
@@ -77,10 +77,11 @@ class Row:
 
     Attributes
     ----------
-    name, unit : the kind of point and what is counted.
-    population : how many there are.
-    changed : how many differ after the step.
-    near : how many lie within the step's motion of the point, on either side; None if not asked.
+    name, unit : kind of point without a derivative, and what is counted.
+    population : number of units.
+    changed : number of units whose discrete state differs after the step.
+    near : number of units that are as near to such a point, on either side, as they move in the
+        step; None if not counted.
     """
 
     name: str
@@ -117,7 +118,7 @@ def _rectifier_inputs(params: Params, points: jax.Array, pipeline: Pipeline) -> 
 
 
 def _observe_view(asset: Asset, batch: Batch, view: int, pipeline: Pipeline) -> dict[str, Any]:
-    """Evaluate what depends on one view."""
+    """Evaluate the quantities that depend on one view."""
     camera, splats = batch.camera.view(view), asset.splats
     towards = camera.centers - splats.means
     footprints = pipeline.project(splats.means, splats.quats, splats.scales, camera)
@@ -153,7 +154,7 @@ def _residual(rgb: jax.Array, alpha: jax.Array, batch: Batch, pipeline: Pipeline
 
 @jax.jit
 def observe(pipeline: Pipeline, params: Params, batch: Batch) -> dict[str, Any]:
-    """Evaluate everything whose discrete state is counted."""
+    """Evaluate all quantities whose discrete states are counted."""
     asset = pipeline.reconstruct(params)
     output = pipeline.render_views(asset, params.light, batch.camera)
     roughness = asset.attributes.materials.roughness
@@ -196,7 +197,7 @@ def _cells(name: str, unit: str, before: np.ndarray, after: np.ndarray) -> Row:
 
 
 def quad_keys(sdf: np.ndarray, grid: Grid) -> np.ndarray:
-    """Names of the quads, in their order: grid edge and side, alike before and after a step."""
+    """Return keys of the quads, in their order: grid edge and side, comparable between states."""
     nx, ny, nz = grid.shape
     inside = sdf.reshape(nz + 1, ny + 1, nx + 1) < 0
     lower = inside[:-1, :-1, :-1]
@@ -212,7 +213,7 @@ def quad_keys(sdf: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def _surface_vertices(sdf: np.ndarray, grid: Grid) -> np.ndarray:
-    """Flat mask of the grid vertices that end a crossed edge."""
+    """Return a flat mask of the grid vertices at the ends of crossed edges."""
     nx, ny, nz = grid.shape
     inside = sdf.reshape(nz + 1, ny + 1, nx + 1) < 0
     touched = np.zeros(inside.shape, bool)
@@ -249,7 +250,7 @@ def _alpha(view: dict, rows: np.ndarray, tiles: np.ndarray, columns: int, size: 
 def _count_view(
     before: dict, after: dict, rows: tuple[np.ndarray, np.ndarray], config: Config, width: int
 ) -> list[Row]:
-    """Count what depends on one view; ``rows`` are the splats that both states have."""
+    """Count changes that depend on one view; ``rows`` are the splats that both states have."""
     first, second = rows
     partner = np.full(len(before["depths"]), -1)
     partner[first] = second
@@ -294,7 +295,7 @@ def _count_view(
 
 
 def _count_geometry(before: Params, after: Params, grid: Grid) -> list[Row]:
-    """Count signs, quads and weights."""
+    """Count changes of SDF signs, quads and FlexiCubes weights."""
     one, two = (np.asarray(p.geometry.sdf) for p in (before, after))
     ends = _surface_vertices(one, grid)
     keys, later = quad_keys(one, grid), quad_keys(two, grid)
@@ -316,7 +317,7 @@ def _count_geometry(before: Params, after: Params, grid: Grid) -> list[Row]:
 
 
 def _count_fields(one: dict, two: dict, rows: tuple[np.ndarray, ...], config: Config) -> list[Row]:
-    """Count what depends on the splats alone."""
+    """Count changes that depend on splats, but on no view."""
     names = ("points", "rectifiers", "level", "roughness", "normal_uv")
     pair = {name: (one[name][rows[0]], two[name][rows[1]]) for name in names}
     found = []
@@ -336,7 +337,7 @@ def _count_fields(one: dict, two: dict, rows: tuple[np.ndarray, ...], config: Co
 def count_changes(
     before: Params, after: Params, seen: list[dict], config: Config, grid: Grid, width: int
 ) -> list[Row]:
-    """Count every kind of point; ``seen`` is what `observe` returns before and after."""
+    """Count all kinds of points; ``seen`` holds the results of `observe` before and after."""
     rows = _count_geometry(before, after, grid)
     keys = [quad_keys(np.asarray(p.geometry.sdf), grid) for p in (before, after)]
     for key, state in zip(keys, seen, strict=True):
@@ -379,21 +380,21 @@ def _product(gradient: Params, update: Params) -> float:
 
 
 def _move(params: Params, update: Params, fraction: float) -> Params:
-    """Go a fraction of the update."""
+    """Add a fraction of the update to the parameters."""
     return jax.tree.map(lambda p, u: p + fraction * u, params, update)
 
 
 def follow(
     params: Params, update: Params, evaluate: Callable[[Params], tuple[float, dict, Params]]
 ) -> list[dict[str, Any]]:
-    """Compare the loss along the update of every group with what gradients say."""
+    """Compare the loss along the update of every group with predictions by gradients."""
     value, terms, gradient = evaluate(params)
     found = []
     for name, wanted in GROUPS.items():
         part = _chosen(update, wanted)
         slope, path = _product(gradient, part), 0.0
         for segment in range(SEGMENTS):
-            # The middle of a piece stands for it: right also where the path starts on a kink.
+            # The gradient is taken in the middle of a piece, so that a path may start on a kink.
             moved = _move(params, part, (segment + 0.5) / SEGMENTS)
             path += _product(evaluate(moved)[2], part) / SEGMENTS
             fraction = (segment + 1) / SEGMENTS
@@ -423,7 +424,7 @@ def _first_state(dataset: Dataset, config: Config) -> tuple[FlexiCubes, TrainSta
 
 
 def _last_state(run: Run) -> TrainState:
-    """Read the optimiser beside the parameters."""
+    """Read parameters and optimiser state from the last checkpoint."""
     path = latest_checkpoint(run.folder.checkpoints)
     assert path is not None
     like = {
@@ -436,7 +437,7 @@ def _last_state(run: Run) -> TrainState:
 def _advance(
     state: TrainState, batch: Batch, pipeline: Pipeline, rule: UpdateRule
 ) -> tuple[TrainState, StepReport, Pipeline]:
-    """Make the step, with larger buffers as often as needed."""
+    """Make a step, growing buffers as needed."""
 
     def attempt(capacities: Capacities) -> tuple[tuple[TrainState, StepReport], Usage]:
         copied = jax.tree.map(jnp.copy, state)  # the step consumes it
@@ -451,7 +452,7 @@ def _advance(
 def study(
     state: TrainState, dataset: Dataset, config: Config, stage: Stage, pipeline: Pipeline
 ) -> dict[str, Any]:
-    """Make one step from ``state``, count and follow the loss."""
+    """Make one step from ``state``, count changes, and follow the loss."""
     step = int(state.step)
     since = step - config.first_step(stage.name)
     pipeline = pipeline_at(pipeline, config, stage, since)
@@ -519,7 +520,7 @@ def show(result: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Study the asked states of a run and write what was found."""
+    """Study the chosen states of a run, and print and write the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("run", type=Path)
     parser.add_argument(

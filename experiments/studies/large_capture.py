@@ -1,4 +1,4 @@
-"""How long a large capture takes to open, and how much memory: photographs made for it.
+"""Measure time and memory that opening a large capture takes, with synthetic photographs.
 
 ::
 
@@ -6,9 +6,9 @@
     python experiments/studies/large_capture.py --downscale 4 --bent  # reduced, of a bent lens
     python experiments/studies/large_capture.py --bare                # without masks
 
-Writes JPEG files with noise like a photograph's, and masks of a ball that all cameras look at, to a
-temporary folder, and opens it in a process of its own, so that the peak of the memory is that of
-the reading. ``--batches N`` then reads the views of N training steps of two views.
+Writes JPEG files with the noise of photographs, and masks of a ball that all cameras look at, to a
+temporary folder, and opens it in another process, whose peak of memory is that of reading.
+``--batches N`` then reads the views of N training steps of two views each.
 """
 
 import argparse
@@ -26,9 +26,9 @@ import OpenImageIO as oiio
 WIDTH, HEIGHT = 4000, 3000
 FOCAL = 3600.0
 DISTINCT = 6
-"""Different photographs; the others are copies."""
+"""Number of different photographs; the others are copies."""
 RADIUS = 0.7
-"""Of the ball, in distances of the cameras: the mask covers a fifth of the photograph."""
+"""Radius of the ball, world units; with cameras at distance 3 it covers a fifth of each image."""
 
 _OPEN = """
 import json, resource, sys, time
@@ -56,7 +56,7 @@ print(json.dumps({name: round(value, 3) for name, value in found.items()}))
 
 
 def write_image(path: Path, pixels: np.ndarray) -> None:
-    """Write 8-bit pixels; JPEG in the quality of a camera."""
+    """Write 8-bit pixels; JPEG with the quality that cameras use."""
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, oiio.UINT8)
     spec.attribute("compression", "jpeg:92" if path.suffix == ".jpg" else "zip")
@@ -68,7 +68,7 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
 
 
 def photograph(rng: np.random.Generator) -> np.ndarray:
-    """Smooth colours with the noise of a sensor."""
+    """Return (H, W, 3) bytes: coarse blocks of colour, with the noise of a sensor."""
     coarse = rng.random((HEIGHT // 100, WIDTH // 100, 3)).repeat(100, 0).repeat(100, 1)
     noise = rng.normal(0.0, 0.015, (HEIGHT, WIDTH, 1))
     return (255 * np.clip(0.2 + 0.6 * coarse + noise, 0, 1)).astype(np.uint8)
@@ -107,7 +107,7 @@ def write_capture(folder: Path, *, count: int, bare: bool, bent: bool) -> None:
 
 
 def main() -> None:
-    """Write the capture, open it, and print what that took."""
+    """Write a capture, open it, and print time and memory."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=300, help="photographs")
     parser.add_argument("--downscale", type=int, default=1)

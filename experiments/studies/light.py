@@ -1,9 +1,9 @@
-"""Learn the light alone before Monte Carlo, to see whether that is worth while.
+"""Learn the light alone before Monte Carlo, to see whether this improves the result.
 
-The split sum leaves a light that was told apart from materials by an approximation. This study
-takes the split-sum stage of a run, learns nothing but light and exposure for some steps of Monte
-Carlo with the materials of the split sum, and then trains `monte_carlo` and the stages after it as
-ever; compare with the run itself by ``geosplat-jax evaluate``::
+After the split-sum stage, light and materials were separated by means of an approximation. This
+study takes over that stage of a run, learns only light and exposure for some Monte Carlo steps,
+with the materials of the split sum, and then trains `monte_carlo` and the later stages as usual.
+Compare the result with the run itself by ``geosplat-jax evaluate``::
 
     python experiments/studies/light.py RUN --output OTHER [--steps 60] [--rate 0.02]
 """
@@ -36,9 +36,9 @@ def with_light_stage(config: Config, *, steps: int, rate: float) -> Config:
 
     Parameters
     ----------
-    config : of the run; its other stages stay as they are.
-    steps : of the new stage.
-    rate : of the light; exposure learns at half of it.
+    config : settings of the run; its other stages are not changed.
+    steps : number of steps of the new stage.
+    rate : learning rate of the light; that of the exposure is half of it.
     """
     after = config.stage(MONTE_CARLO)
     place = config.stages.index(after)
@@ -54,7 +54,7 @@ def with_light_stage(config: Config, *, steps: int, rate: float) -> Config:
 
 
 def main() -> None:
-    """Train with a stage between the two."""
+    """Train with a stage of light alone before Monte Carlo."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("run", type=Path)
     parser.add_argument("--output", type=Path, required=True)

@@ -1,16 +1,15 @@
-"""How much the masks matter: training with masks that are eroded and dilated by some pixels.
+"""Measure the effect of wrong masks: train with masks that are eroded or dilated by some pixels.
 
     python experiments/studies/mask_margins.py SCENE LIGHT.hdr --output FOLDER [--downscale 2]
         [--margins -4 -1 0 1 4] [--quality draft] [--set SECTION.FIELD=VALUE] [--json FILE]
 
-Training views of a scene with true masks are laid over the environment that lights them, so that a
-mask that is too large shows what is behind the object, and one that is too small cuts it off. The
-first surface, the bounds and the loss see those masks; test views keep the true ones.
+Training views of a scene with true masks are composited over the environment that lights them, so
+that a mask that is too large shows the background, and one that is too small cuts the object off.
+The first surface, the bounds and the loss use these masks; test views have the true ones.
 
-Columns: PSNR of new views, everywhere and where the true mask is, error of normals there, PSNR of
-albedo, IoU of the masks of new views, and that of the masks that were trained on. Runs that are
-there already are opened instead, and refused where they have other settings; the light is not among
-these.
+Columns: PSNR of new views, of whole images and within the true mask, error of normals within it,
+PSNR of albedo, IoU of the masks of new views, and IoU of the masks in training with the true ones.
+Existing runs are reused, and refused if they have other settings; the light is not compared.
 """
 
 import argparse
@@ -52,7 +51,7 @@ def moved_mask(alpha: np.ndarray, margin: int) -> np.ndarray:
 
 
 def with_margin(dataset: Dataset, light: np.ndarray, margin: int) -> tuple[Dataset, float]:
-    """Return the scene with such masks, and the IoU of those with the true ones."""
+    """Return the scene with masks moved by ``margin``, and their mean IoU with the true ones."""
     views, images, overlaps = dataset.train, [], []
     for index in range(len(views)):
         image = views.images[index]

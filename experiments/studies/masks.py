@@ -1,7 +1,7 @@
-"""How well masks from splats agree with true ones, on path-traced objects before a background.
+"""Compare masks from splats with true ones, on path-traced objects in front of a background.
 
-Objects of scenes in the TensoIR layout are laid over the environment that lights them, and, with
-``--ground``, over a chequered plane that they stand on. Their alpha is the true mask:
+Objects of scenes in the TensoIR layout are composited over the environment that lights them and,
+with ``--ground``, over a chequered plane that they stand on. Their alpha is the true mask::
 
     python experiments/studies/masks.py SCENE LIGHT.hdr WORK --ground
     geosplat-jax masks WORK/capture
@@ -23,8 +23,8 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "scene"))
 
 import scene_lights  # noqa: E402
 
-_BRIGHTEST = 1.0  # of a background, which a camera would clip
-_SQUARES = 2.0  # of the ground, per unit of the world
+_BRIGHTEST = 1.0  # backgrounds are clipped here, as a camera does
+_SQUARES = 2.0  # squares of the ground per world unit
 _FADE = 12.0  # distance from the origin at which the ground ends
 
 
@@ -37,7 +37,7 @@ def _ground_height(views: Views) -> float:
 
 
 def background(views: Views, view: int, light: np.ndarray, ground: float | None) -> np.ndarray:
-    """Colours (H, W, 3), linear, of what is behind the object in a view."""
+    """Render the background of a view, (H, W, 3) linear: the light, and the ground if given."""
     x, y = np.meshgrid(np.arange(views.width) + 0.5, np.arange(views.height) + 0.5)
     lens = np.linalg.inv(views.intrinsics[view])
     rays = np.stack([x, y, np.ones_like(x)], -1) @ lens.T * [1.0, -1.0, -1.0]
@@ -93,7 +93,7 @@ def compose(scene: Path, light_file: Path, work: Path, *, has_ground: bool, coun
 
 
 def compare(work: Path) -> None:
-    """Print intersection over union of the masks that were made, and where they differ."""
+    """Print the IoU of masks with the true ones, and shares of missing and excess pixels."""
     overlaps, missing, extra = [], [], []
     for path in sorted((work / "truth").glob("*.png")):
         truth = read_linear(path, is_srgb=False)[..., 0] > 0.5

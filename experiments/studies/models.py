@@ -4,19 +4,19 @@
         [--steps 100] [--size 96] [--views 48] [--full]
 
 Each scene is a shape with materials, rendered under ``examples/studio.hdr`` by this package's own
-Monte Carlo transport from splats on a finer grid than any training has; its models are therefore
-known exactly, and images have no error of a kind that no model could explain. Scenes:
+Monte Carlo transport, from splats on a finer grid than that of any training. So its model is known
+exactly, and the images have no errors that none of the models could explain. Scenes:
 
 ``matt``       a Lambertian ball with a pattern: no specular lobe, nothing blocks light
-``shadowed``   the same pattern on four balls that touch: light is blocked, and comes by others
+``shadowed``   the same pattern on four balls that touch: shadows and indirect light
 ``glossy``     a dielectric ball of roughness .2
 ``two_gloss``  a dielectric ball, polished below and rough above
 ``metal``      a ball of gold and copper, of roughness .3
 
-Printed are what was kept with its gain, and the decibels of eight test views of the chosen model,
-under the light of the training and under `examples/sunset.hdr` (colours aligned by one factor for
-each channel, since photographs leave it open); with ``--full``, also of the whole model, and what
-both trainings took. Splats stay on the surface in all trainings.
+Prints which parts of the model were kept, with their gains, and the PSNR of eight test views of the
+chosen model, under the training light and under `examples/sunset.hdr` (colours are aligned by one
+factor per channel, which photographs do not determine). With ``--full`` also the PSNR of the whole
+model, and the seconds of both trainings. Splats stay on the surface in all trainings.
 """
 
 import argparse
@@ -64,7 +64,7 @@ BOX = (np.full(3, -0.62), np.full(3, 0.62))
 
 
 def pattern(points: jax.Array) -> jax.Array:
-    """Albedo that varies over the surface, (n, 3)."""
+    """Return an albedo (n, 3) that varies over the surface."""
     waves = jnp.sin(jnp.asarray([9.0, 7.0, 11.0])[None, :] * points + points[:, ::-1])
     return 0.45 + 0.3 * waves
 
@@ -75,12 +75,12 @@ def _constant(points: jax.Array, value: float) -> jax.Array:
 
 @dataclass(frozen=True)
 class Recipe:
-    """A scene of a known model.
+    """A scene whose model is known.
 
     Attributes
     ----------
-    balls : centres and radii.
-    materials : of points (n, 3).
+    balls : centre (x, y, z) and radius of each ball.
+    materials : function from points (n, 3) to their materials.
     """
 
     balls: tuple[tuple[float, float, float, float], ...]
@@ -123,7 +123,7 @@ RECIPES = {
 
 
 class _Truth(Renderer):
-    """Renders the materials of a recipe in the place of a field's."""
+    """Renderer of the materials of a recipe instead of those of a field."""
 
     recipe: Recipe
 
@@ -172,7 +172,7 @@ def truth_of(name: str, light: Path) -> _Truth:
 
 
 def make_scene(name: str, *, size: int, count: int) -> Dataset:
-    """Render a recipe from ``count`` training cameras and a few others."""
+    """Render a recipe from ``count`` training cameras and `TEST_VIEWS` test cameras."""
     truth = truth_of(name, LIGHT)
     focal = 0.5 * size / np.tan(0.25)
     intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
@@ -208,7 +208,7 @@ def decibels(run: Run, views: Views) -> float:
 
 
 class _Printed(Listener):
-    """Prints what becomes of every part of a scene's model."""
+    """Prints the verdict on every part of a scene's model."""
 
     def __init__(self, scene: str) -> None:
         self._scene = scene
@@ -219,7 +219,7 @@ class _Printed(Listener):
 
 
 def relit_decibels(run: Run, truth: Renderer, views: Views) -> float:
-    """Mean peak signal-to-noise ratio of views under another light, in sRGB on white."""
+    """Mean PSNR of views under another light, in sRGB on white, after aligning each channel."""
     relit = run.renderer(samples=64).relit(load_light(OTHER_LIGHT))
     pairs = [(relit(views.camera([k])), truth(views.camera([k]))) for k in range(len(views))]
     ours, theirs = (np.stack([np.asarray(pair[n].rgb) for pair in pairs]) for n in (0, 1))

@@ -1,7 +1,7 @@
-"""What float32 costs against float64, and where bfloat16 would pay (docs/numerics.md).
+"""Measure the errors of float32 against float64, and the effects of bfloat16 (docs/numerics.md).
 
-``stages RUN`` measures every stage on a trained run, ``train SCENE`` whole training runs, ``plot``
-draws the figure from what the two left in ``--output``.
+``stages RUN`` measures every stage on a trained run, ``train SCENE`` measures whole training runs,
+``plot`` draws the figure from the results of both in ``--output``.
 """
 
 import argparse
@@ -80,14 +80,17 @@ STORED = (
 
 
 def to_bfloat16(x: jax.Array) -> jax.Array:
-    """Round values to bfloat16, keep the dtype, and let gradients pass as if nothing had been."""
+    """Round values to bfloat16 but keep the dtype; the gradient is that of the identity."""
     rounded = jax.lax.reduce_precision(x, exponent_bits=8, mantissa_bits=7)
     return x + jax.lax.stop_gradient(rounded - x)
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One training run: its precision, its seed, and what the forward pass rounds to bfloat16."""
+    """One training run: precision, seed, and groups that the forward pass rounds to bfloat16.
+
+    ``nudged`` : whether the first SDF values are changed by one rounding step.
+    """
 
     name: str
     dtype: str = "float32"
@@ -97,7 +100,7 @@ class Variant:
 
 
 def flags_of(variant: Variant) -> dict[str, jax.Array]:
-    """Whether each group is rounded."""
+    """Return, for each group, whether a variant rounds it."""
     return {name: jnp.asarray(name in variant.rounded) for name in GROUPS}
 
 
@@ -197,7 +200,7 @@ def run_variant(
 
 
 def train_command(arguments: argparse.Namespace) -> None:
-    """Train every variant; distances are from the float64 run of the same seed."""
+    """Train the variants, and compare each with the first, which is in float64."""
     overrides = (f"stages.{SPLIT_SUM}.steps={arguments.steps}", *arguments.set)
     config = make_config("default", arguments.quality, overrides=overrides)
     dataset = load_dataset(arguments.scene)
@@ -389,7 +392,7 @@ def shading_stages(params: Params, pipeline: Pipeline, got: dict[str, Any]) -> l
 
 
 def image_stages(camera: Camera, pipeline: Pipeline, got: dict[str, Any]) -> list[Stage]:
-    """Stages of footprints and images; the rasteriser uses the same lists in both precisions."""
+    """Return the stages of footprints and images; both precisions rasterise the same lists."""
     parts = ("means2d", "conics", "compensation", "depths")
     tile_size = pipeline.raster.tile_size
 
@@ -439,7 +442,7 @@ def loss_stages(
     """Every term of the loss on its own inputs, and the whole loss from the parameters."""
     photo = {"rgb": got["image"][None], "alpha": got["alpha"][None]}
     photo["exposure"] = params.log_exposure
-    # Where no splat is, the tone map gives 2e-8 instead of 0, and L1 its sign, which nothing reads.
+    # In pixels without splats the tone map gives 2e-8 instead of 0, and L1 a sign of no meaning.
     covered = np.float64(photo["alpha"] > 0)
     background = jax.random.uniform(jax.random.key(0), batch.image[:1, ..., :3].shape)
 
@@ -468,7 +471,7 @@ def loss_stages(
     def whole(x: Any, constants: Any) -> dict[str, Any]:
         batch, pipeline = constants
         total, report = pipeline.loss(_from_groups(x), batch)
-        # Terms that are only read have no cotangent.
+        # Terms are only reported, and get no cotangent.
         return {"total": total, **jax.lax.stop_gradient(report.terms)}
 
     left_out = {
@@ -503,7 +506,7 @@ def loss_stages(
 
 
 def half_rows(params: Params, batch: Batch, pipeline: Pipeline) -> dict[str, Any]:
-    """Effect on image and gradient of one view of rounding one kind of stored value at a time."""
+    """Measure how rounding one kind of stored value changes image and gradient of one view."""
 
     def picture(
         params: Params, batch: Batch, pipeline: Pipeline, is_rounded: dict[str, Any]
@@ -545,7 +548,7 @@ def half_rows(params: Params, batch: Batch, pipeline: Pipeline) -> dict[str, Any
 
 
 def stages_command(arguments: argparse.Namespace) -> None:
-    """Measure every stage on a trained run, the whole chain, and what bfloat16 would do."""
+    """Measure every stage on a trained run, the whole chain, and the effects of bfloat16."""
     run = Run(arguments.run_folder, scene=arguments.scene)
     config, params, pipeline, stage = run.config, run.params, run.pipeline, run.trained.stage
     if not isinstance(pipeline.transport, SplitSum):

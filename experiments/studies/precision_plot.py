@@ -27,7 +27,7 @@ from geosplat_jax.splats.rasterize import MAX_ALPHA, MIN_ALPHA, TileLists
 
 GROUPS = ("geometry", "tables", "heads", "light", "exposure")
 UNDECIDED = 1e-4
-"""An alpha so close to 1/255, relative, may be cut in one precision and not in the other."""
+"""Largest relative distance of an alpha from 1/255 at which the precisions may cut differently."""
 
 
 def cast(tree: Any, dtype: Any) -> Any:
@@ -42,7 +42,7 @@ def cast(tree: Any, dtype: Any) -> Any:
 
 @dataclass
 class Outcome:
-    """What a run leaves: losses, host copies of the parameters at some steps, renders."""
+    """Results of a run: losses, parameters at some steps (host), test renders, figures, time."""
 
     losses: list[float]
     snapshots: dict[int, Params]
@@ -52,7 +52,7 @@ class Outcome:
 
 
 def group_of(path: tuple[Any, ...]) -> str:
-    """Which of `GROUPS` a leaf of the parameters belongs to."""
+    """Return the group, one of `GROUPS`, that a leaf of the parameters belongs to."""
     names = [str(getattr(key, "name", "")) for key in path]
     if names[0] == "material":
         return "tables" if names[1].endswith("_table") else "heads"
@@ -60,9 +60,15 @@ def group_of(path: tuple[Any, ...]) -> str:
 
 
 def errors(single: Any, double: Any) -> dict[str, float]:
-    """Compare trees: relative L2, largest error over largest value, entries off, signs lost.
+    """Compare two trees of arrays, the second in double precision.
 
-    Entries count where the double one is not zero; they are off by their own relative error.
+    Returns
+    -------
+    ``l2`` : relative L2 error.
+    ``worst`` : largest error over the largest value.
+    ``off``, ``sign`` : shares of entries, among those that are not zero in double precision, whose
+        relative error exceeds 1e-3, and whose sign differs.
+    ``spurious`` : share of entries that are zero in double precision only.
     """
     flat = [
         np.concatenate([np.ravel(np.asarray(x, np.float64)) for x in jax.tree.leaves(tree)])
@@ -92,7 +98,7 @@ class Stage:
 
 
 def measure(stage: Stage) -> dict[str, Any]:
-    """Errors of values and gradients in float32 on inputs that both precisions share."""
+    """Return the errors of values and gradients in float32, on inputs shared by both precisions."""
     inputs, constants = cast((stage.inputs, stage.constants), np.float32)
     rng = np.random.default_rng(0)
 
@@ -139,7 +145,7 @@ def raw_alphas(
 
 
 def undecided(got: dict, tile: int, camera: Camera) -> np.ndarray:
-    """Mark the pixels of which some alpha lies at the cut, (H, W)."""
+    """Mark the pixels in which some alpha lies within `UNDECIDED` of the cut, (H, W)."""
     alphas, pixels = raw_alphas(
         got["footprints"], got["opacities"], got["lists"], tile, camera.width
     )
@@ -152,7 +158,7 @@ def undecided(got: dict, tile: int, camera: Camera) -> np.ndarray:
 
 
 def decisions(one: dict, shared: dict, two: dict, config: Config, camera: Camera) -> dict[str, Any]:
-    """Count the discrete choices that differ between precisions, and how many there are."""
+    """Count the discrete choices that differ between precisions; also return their totals."""
     first, second = one["lists"], two["lists"]
     count = int(two["splats"].count)
     rows = [lists.index[lists.index < count] for lists in (first, second)]
@@ -186,7 +192,11 @@ def decisions(one: dict, shared: dict, two: dict, config: Config, camera: Camera
 
 
 def accumulated(one: dict, shared: dict, two: dict) -> dict[str, Any]:
-    """Errors of every intermediate of a chain in float32; per splat and ``same`` on one order."""
+    """Return the errors of every intermediate of the chain in float32.
+
+    ``shared`` is the chain in float32 with the tile lists of double precision, for values that
+    depend on the order of splats; ``one`` has its own lists.
+    """
     read = {
         "vertices": (one, lambda x: x["mesh"].vertices),
         "vertex normals": (one, lambda x: x["vertex normals"]),
@@ -213,7 +223,10 @@ def snapshot_steps(steps: int) -> list[int]:
 
 
 def drift(one: dict[int, Params], other: dict[int, Params]) -> dict[str, list[float]]:
-    """Distance of two runs in units of how far the second has come, by group and step."""
+    """Return the distance between two runs over the distance that the second has travelled.
+
+    By group, for every common step after the first; also the steps.
+    """
     steps = sorted(set(one) & set(other) - {0})
     curves: dict[str, list[float]] = {"step": steps}
     for step in steps:
@@ -326,7 +339,7 @@ def draw_errors(axis: Any, stages: dict[str, Any]) -> None:
 
 
 def draw_drift(axis: Any, runs: dict[str, Any], shown: dict[str, tuple[str, str]]) -> None:
-    """Draw how the geometry departs from float64, or from float32 for the nudged run."""
+    """Draw the drift of the geometry from the float64 run, or from float32 for the nudged run."""
     for name, (colour, style) in shown.items():
         is_nudged = "rounding" in name
         curve = (runs[name]["from float32"] if is_nudged else runs[name])["drift"]
@@ -339,7 +352,7 @@ def draw_drift(axis: Any, runs: dict[str, Any], shown: dict[str, tuple[str, str]
 
 
 def draw_quality(axis: Any, runs: dict[str, Any]) -> None:
-    """Points of the held-out quality of every run."""
+    """Draw the held-out PSNR of every run."""
     names = list(runs)
     values = [runs[name]["psnr"] for name in names]
     axis.plot(values, names, "o", color="#4c72b0", markersize=5)

@@ -1,11 +1,11 @@
-"""What reservoirs are worth: error at equal time and at equal rays, against plain samples.
+"""Compare reservoirs with plain samples: errors at equal time and with equal numbers of rays.
 
-Three scenes of one surface each, on a small grid: an open bowl under a soft sky, the same under a
-small sun, and a ball with a hole, dark inside, under the soft sky. For every way to choose the
-samples of the light and several numbers of them, the study takes some steps with a carry and
-measures, of the last ones, the error of the diffuse light of all points and that of its gradient in
-the light's texels, against many plain samples; the rays of a point; and the processor's seconds of
-both together. It writes a table and, with matplotlib, curves::
+There are three scenes of one surface each, on a small grid: an open bowl under a soft sky, the same
+under a small sun, and a ball with a hole, dark inside, under the soft sky. For every way to choose
+the samples of the light, and several numbers of them, the study takes some steps with a carry. It
+measures the errors of the diffuse light of all points, and of its gradient in the light's texels,
+over the second half of the steps, against many plain samples; also the rays per point, and the
+processor seconds of image and gradient together. It writes a table and, with matplotlib, curves::
 
     python experiments/studies/reservoirs.py --output DIR [--resolution 12] [--steps 12]
 """
@@ -34,7 +34,7 @@ from geosplat_jax.transport.monte_carlo import MonteCarlo, MonteCarloSettings
 from geosplat_jax.transport.reservoirs import ReservoirSettings
 
 REFERENCE_SAMPLES = 48
-"""Of the light and of the cosine, in every pass of the reference."""
+"""Samples of the light, and as many of the cosine, in every pass of the reference."""
 
 REFERENCE_PASSES = 24
 
@@ -49,12 +49,12 @@ WAYS = {
     "both, shadows traced": (replace(_REUSED, neighbors=1, visibility="traced"), (1, 4)),
     "both, shadows assumed": (replace(_REUSED, neighbors=2, visibility="assumed"), (1, 4)),
 }
-"""Settings and numbers of samples of the light, each with as many of the cosine."""
+"""Settings, and numbers of samples of the light, with as many of the cosine, by way."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Points of a surface and how rays find it."""
+    """Points of a surface, its index for rays, and its light."""
 
     points: SurfacePoints
     index: RayIndex
@@ -67,7 +67,7 @@ def _bowl(points: np.ndarray) -> np.ndarray:
 
 
 def _hollow(points: np.ndarray) -> np.ndarray:
-    """Return distances to a thick ball with a hole at the top."""
+    """Return signed distances, (n,), to a thick hollow ball with a hole at the top."""
     radius = np.linalg.norm(points, axis=1)
     hole = 0.34 - np.hypot(points[:, 0], points[:, 1])
     shell = np.abs(radius - 0.7) - 0.18
@@ -96,7 +96,7 @@ _index = partial(jax.jit, static_argnames=("capacities",))(FlexiCubes.ray_index)
 
 
 def make_scenes(resolution: int) -> dict[str, Scene]:
-    """Build all of `SCENES`, with buffers of one size, so that programs are shared."""
+    """Build all of `SCENES` with the same buffer sizes, so that they share compiled programs."""
     capacities = None
     for name in (*SCENES, *SCENES):
         _, capacities = _make_scene(name, resolution, capacities)
@@ -106,7 +106,7 @@ def make_scenes(resolution: int) -> dict[str, Scene]:
 def _make_scene(
     name: str, resolution: int, capacities: Capacities | None
 ) -> tuple[Scene, Capacities]:
-    """Build a scene with a point on every face; also return the buffers that it needs at least."""
+    """Build a scene with a point on every face; also return buffer sizes that hold it."""
     distances, light = SCENES[name]
     cell = 2.2 / resolution
     grid = Grid(
@@ -132,7 +132,7 @@ def _make_scene(
 
 @jax.jit
 def run_step(transport, key, scene_parts, light, carry, cotangent):
-    """Diffuse light (N, 3), its gradient in the texels, and the carry of one step."""
+    """Return the diffuse light (N, 3) of one step, its gradient in the texels, and the carry."""
     points, index, attributes = scene_parts
 
     def diffuse(light):
@@ -147,16 +147,25 @@ def run_step(transport, key, scene_parts, light, carry, cotangent):
 
 
 def rays_of(spec: ReservoirSettings, count: int) -> int:
-    """Count the rays of a point in a step with as many samples of light and cosine."""
+    """Return the rays per point and step, with ``count`` samples of the light and of the cosine."""
     if spec.visibility != "traced":
         return 2 * count
-    # Own winner; the other's sample here and this one there; all pairs among neighbours.
+    # Further rays: of the winner; of either step's sample at the other's point; of all pairs.
     return count * (2 + 1 + 2 * spec.reuse_steps + (spec.neighbors + 1) * spec.neighbors)
 
 
 @dataclass(frozen=True)
 class Row:
-    """One way with one number of samples: errors relative to the reference's size."""
+    """Results of one way with one number of samples.
+
+    Attributes
+    ----------
+    scene, way, count : scene, way of choosing samples, and number of samples.
+    rays : rays per point.
+    seconds : processor seconds per step.
+    image_error, gradient_error : root mean square errors, relative to the reference.
+    image_bias : error of the mean, relative to the reference.
+    """
 
     scene: str
     way: str
@@ -217,7 +226,7 @@ def _measured(name: str, scene: Scene, attributes: Attributes, steps: int) -> It
 
 
 def table(rows: list[Row]) -> str:
-    """Lay out the rows in Markdown."""
+    """Format the rows as a table of Markdown."""
     head = "| scene | way | samples | rays | ms | light | gradient | mean off by |"
     lines = [head, "|---|---|---|---|---|---|---|---|"]
     for row in rows:
@@ -229,7 +238,7 @@ def table(rows: list[Row]) -> str:
 
 
 def draw(rows: list[Row], path: Path) -> None:
-    """Draw the errors of light and gradient over time and over rays, a column a scene."""
+    """Plot the errors of light and gradient over time and over rays, one column per scene."""
     import matplotlib
 
     matplotlib.use("Agg")

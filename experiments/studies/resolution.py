@@ -1,21 +1,22 @@
-"""How quality and cost grow with the cells of the grid (appendix G): the paper's cube and our box.
+"""Measure quality and cost by the number of cells (appendix G): the paper's cube and our box.
 
     python experiments/studies/resolution.py SCENE ... --output FOLDER [--cells 32 48 64 96 128]
         [--grids box cube] [--steps 200] [--proportional] [--quality draft] [--downscale 1]
         [--set SECTION.FIELD=VALUE] [--json FILE] [--plot FILE] [--picture FILE]
 
-Trains the split sum stage alone, every run in a process of its own, so that its largest resident
-memory is its own. ``box`` has its cells along the longest side of the box around the object,
-``cube`` as many along every side (`geometry.cubic`). ``--proportional`` makes steps in
-proportion to the cells, ``--steps`` for the fewest: a finer surface has further to go, in cells.
+Trains the split sum stage alone, each run in its own process, whose peak memory is then measured.
+``box`` has the given number of cells along the longest side of the box around the object, ``cube``
+has as many along every side (`geometry.cubic`). With ``--proportional`` the number of steps is
+proportional to that of cells, ``--steps`` for the smallest grid, because a finer surface has
+further to move, in cells.
 
-Columns: PSNR of new views; normal error; Chamfer distance as in `existing_mesh.py`, where the
-scene has a true mesh; recall of thin parts: of the pixels that an opening of the true mask by a
-disc of 3 pixels takes away, the share that the render covers by more than half; seconds of a step
-(median) and of the whole; largest memory. Below, the powers of the cells that Gaussians, seconds
-of a step and memory grow with, by least squares on logarithms. ``--picture`` shows the object of
-the first scene in its first test view: render, normals and mesh, the truth first. Runs that are
-there already are opened instead, and refused where they have other settings.
+Columns: PSNR of new views; normal error; Chamfer distance as in `existing_mesh.py`, if the scene
+has a true mesh; recall of thin parts, which is the share that the render covers by more than half,
+of pixels that an opening of the true mask by a disc of 3 pixels removes; number of Gaussians;
+median seconds of a step; minutes of the training; peak memory. Below follow the exponents with
+which Gaussians, seconds of a step and memory grow with the cells, by least squares on logarithms.
+``--picture`` shows the first test view of the first scene: render, normals and mesh, the truth
+first. Existing runs are reused, and refused if they have other settings.
 """
 
 import argparse
@@ -47,7 +48,7 @@ COMMAND = "import sys; from geosplat_jax.cli import main; sys.exit(main())"
 def train(
     dataset: Dataset, folder: Path, grid: str, cells: int, arguments: argparse.Namespace
 ) -> Run:
-    """Train in a process of its own, or open the run that the folder holds."""
+    """Train in another process, or open the run in the folder if there is one."""
     steps = arguments.steps
     if arguments.proportional:
         steps = round(steps * cells / min(arguments.cells))
@@ -72,7 +73,7 @@ def train(
 
 
 def thin_recall(run: Run, views: Views) -> float:
-    """Share of the thin parts' pixels that the render covers; NaN where the views show none."""
+    """Return the share of pixels of thin parts that the render covers; NaN if there are none."""
     renderer, covered, count = run.renderer(samples=1), 0, 0
     for k in range(len(views)):
         mask = views.images[k][..., 3] > 0.5
@@ -84,7 +85,7 @@ def thin_recall(run: Run, views: Views) -> float:
 
 
 def row(run: Run, scene: Path, samples: int) -> dict[str, float]:
-    """Evaluate a run; measure its surface and what it took."""
+    """Evaluate a run, and measure its surface, time and memory."""
     mean, steps = evaluated_mean(run, samples), run.steps()
     found = {"NVS PSNR": mean["nvs.psnr"]}
     if "normal.mae_masked_deg" in mean:
@@ -103,7 +104,7 @@ def row(run: Run, scene: Path, samples: int) -> dict[str, float]:
 
 
 def exponent(cells: list[int], values: list[float]) -> float:
-    """Power of the cells that values grow with."""
+    """Fit the exponent with which values grow with the number of cells."""
     return float(np.polyfit(np.log(cells), np.log(values), 1)[0])
 
 
@@ -161,7 +162,7 @@ def plot(found: dict[str, dict[str, dict[int, dict[str, float]]]], path: Path) -
 
 
 def write_picture(runs: list[Path], path: Path) -> None:
-    """Write a sheet of one view with a column for each run, cut to the object."""
+    """Write a sheet of one view, cropped to the object: the truth, then one column per run."""
     views = [json.loads((run / "metrics.json").read_text())["gallery"]["views"][0] for run in runs]
     folders = [runs[0], *runs]
     names = [views[0]["pictures"], *(view["pictures"] for view in views)]

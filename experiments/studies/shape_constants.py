@@ -1,19 +1,20 @@
-"""Fit the constants of the face sampling (Eq. 8-11) to how well splats stand for their mesh.
+"""Fit the constants of face sampling (Eq. 8-11) such that splats match their mesh best.
 
     python experiments/studies/shape_constants.py --fit ball MESH RUN ... --apart MESH RUN ...
         [--cells 48] [--sizes 200 400] [--views 2] [--crop 32] [--coverage .1 .03] [--json FILE]
 
 Constants are u, v, alpha and beta of both rings, thickness, and one inward shift and opacity for
-all splats. Levenberg-Marquardt makes small, over crops of several views of several meshes:
+all splats. Levenberg-Marquardt minimises, over crops of several views of several meshes:
 
 - the difference of the directions reflected at the mesh's normals and at the splats', in degrees;
 - the difference of the distances along the ray, in units of `DISTANCE_UNIT` of the box's diagonal;
-- the difference of the splats' coverage and the share of the pixel that the mesh covers, in units
-  of ``--coverage``: smaller ones ask for denser splats,
+- the difference between the splats' coverage and the share of the pixel that the mesh covers, in
+  units of ``--coverage``: smaller units demand denser splats.
 
-all three beyond three units by their size instead of its square. Derivatives are of forward mode;
-visibility and order are found anew at every iterate and have none. Rows of the table are constants
-set by hand and fitted, columns means over the meshes of the fit and over those held apart.
+Each is squared, but beyond three units it counts linearly. Derivatives are in forward mode;
+visibility and depth order are computed again at every iterate, and have no derivative. The table
+has a row for each set of constants, chosen by hand or fitted; columns are means over the meshes of
+the fit, and over those held apart.
 """
 
 import argparse
@@ -48,16 +49,16 @@ from geosplat_jax.splats.rasterize import composite, find_visible
 
 DISTANCE_UNIT, KNEE = 0.002, 3.0
 MARGIN = 8
-"""Pixels around a crop from which faces may still show in it."""
+"""Margin of a crop, in pixels: splats of faces within it may reach into the crop."""
 SAMPLES = 4
-"""Rays along each side of a pixel that say which share of it the mesh covers."""
+"""Rays along each side of a pixel, by which the share that the mesh covers is estimated."""
 STEPS, ROOM = 15, 1.5
-"""Of the solver at most; and how much longer and wider splats may get."""
+"""Most steps of the solver, and the factor of size of splats that buffers have room for."""
 RASTER = RasterSettings()
 
 
 class Constants(eqx.Module):
-    """`AdapterConstants` that may be traced, and the inward shift."""
+    """Constants of `AdapterConstants` as traced values, with the inward shift."""
 
     u: Any
     v: Any
@@ -98,12 +99,16 @@ NUMBERS = ("alpha", "alpha", "beta", "beta", "thickness", "u", "v", "opacity", "
 
 
 class Crop(eqx.Module):
-    """Part of a view of a mesh, and what its rays meet; P pixels a side.
+    """A square part of a view of a mesh, P pixels wide, and the hits of its rays.
 
     Attributes
     ----------
-    mesh : faces that may show. normals : of its vertices. unit : world length of one.
-    world_to_camera, intrinsics : of the part. near : world. diagonal : of the mesh's box.
+    mesh : faces that may show in the crop.
+    normals : normals of the vertices.
+    unit : unit of length of the adapter, world.
+    world_to_camera, intrinsics : camera of the crop.
+    near : near plane, world.
+    diagonal : diagonal of the bounding box of the whole mesh, world.
     is_hit, towards, mesh_normals, ranges : see `report.consistency.SeenMesh`.
     covered : share of every pixel that the mesh covers.
     """
@@ -122,13 +127,13 @@ class Crop(eqx.Module):
     covered: Float[Array, "P P"]
 
     def camera(self) -> Camera:
-        """Return the camera of the part."""
+        """Return the camera of the crop."""
         height, width = self.ranges.shape
         return Camera(self.world_to_camera, self.intrinsics, height, width)
 
 
 def cut(subject: Subject, camera: Camera, side: int, generator: np.random.Generator) -> Crop:
-    """Cut a square out of a view, around a random pixel of the mesh."""
+    """Crop a view to a square of ``side`` pixels around a random pixel of the mesh."""
     vertices, faces = unpadded(subject.mesh)
     normals = np.asarray(vertex_normals(subject.mesh))[: len(vertices)]
     hit = np.argwhere(first_hits(vertices, faces, camera)[0] >= 0)
@@ -190,7 +195,7 @@ def stacked(crops: list[Crop]) -> Crop:
 def rendered(
     constants: Constants, crop: Crop, capacities: Capacities
 ) -> tuple[Float[Array, "P P 3"], Float[Array, "P P"], Float[Array, "P P"], Usage]:
-    """Blend unit normals and distances of the splats; also coverage and needs of buffers."""
+    """Blend unit normals and distances of the splats; also return coverage and usage."""
     camera = crop.camera()
     splats = face_splats(crop.mesh, crop.normals, constants=constants, unit=crop.unit)
     splats = shift_inwards(splats, crop.mesh, jnp.full_like(splats.opacities, constants.shift))
@@ -228,7 +233,7 @@ def rendered(
 def differences(
     constants: Constants, crop: Crop, capacities: Capacities
 ) -> tuple[Array, Array, Array, Usage]:
-    """Differences of reflected directions (degrees), distances and coverage, in every pixel."""
+    """Return differences of reflected directions (degrees), distances and coverage per pixel."""
     normals, ranges, alpha, usage = rendered(constants, crop, capacities)
 
     def reflected(at: Array) -> Array:
@@ -249,7 +254,7 @@ def shrunk(deviations: Array, squared: Array) -> Array:
 def residual(
     constants: Constants, crop: Crop, coverage_unit: Float[Array, ""], capacities: Capacities
 ) -> tuple[Array, Usage]:
-    """Evaluate what is squared and summed, (P, P, 5), and needs of buffers."""
+    """Return the residuals that the solver squares and sums, (P, P, 5), and the usage."""
     turned, distance, coverage, usage = differences(constants, crop, capacities)
     parts = (turned, (distance / DISTANCE_UNIT)[..., None], (coverage / coverage_unit)[..., None])
     squares = (jnp.sum(part * part, axis=-1, keepdims=True) for part in parts)
@@ -264,7 +269,7 @@ def solved(
     crops: list[Crop],
     capacities: Capacities,
 ) -> tuple[Float[Array, " 9"], Int[Array, ""], Usage]:
-    """Run Levenberg-Marquardt over the free numbers; also its steps and the needs at the end."""
+    """Run Levenberg-Marquardt over the free numbers; also return its steps and the final usage."""
 
     def everything(changes: Array, crops: list[Crop]) -> tuple[Array, Usage]:
         constants = bounded(first + jnp.where(is_free, changes, 0.0))
@@ -275,7 +280,7 @@ def solved(
         usage = capacity_module.combine(*(jax.tree.map(jnp.max, usage) for _, usage in parts))
         count = sum(values.size for values, _ in parts)
         values = jnp.concatenate([values.reshape(-1) for values, _ in parts]) / count**0.5
-        # The solver shall not step to where a buffer overflows, and what it sees is wrong.
+        # Infinite where a buffer overflows and residuals are wrong, so that the step is rejected.
         return jnp.where(capacity_module.fits(usage, capacities), values, jnp.inf), usage
 
     solver = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
@@ -314,7 +319,7 @@ def fit(
 def means_over(
     constants: Constants, crops: Crop, capacities: Capacities
 ) -> tuple[Array, Array, Array, Array, Usage]:
-    """Sum angles, distances and pixels met and seen, and average errors of coverage, per crop."""
+    """Return, per crop, sums of angles, distances and compared pixels, and mean coverage errors."""
 
     def one(crop: Crop) -> tuple[Array, Array, Array, Array, Usage]:
         turned, distance, coverage, usage = differences(constants, crop, capacities)
@@ -327,7 +332,7 @@ def means_over(
 
 
 def score(constants: Constants, crops: list[Crop], capacities: Capacities) -> dict[str, float]:
-    """Average over all pixels of all crops, with buffers that grow."""
+    """Return mean errors over all pixels of all crops, growing buffers as needed."""
     totals = np.zeros(3)
     coverage = []
     for group in crops:
@@ -352,7 +357,7 @@ RINGS = ("alpha", "beta", "u", "v")
 def fits_to_make(
     ours: Constants, coverage_units: list[float]
 ) -> Iterator[tuple[str, Constants, tuple[str, ...], float]]:
-    """Yield names of fits, where they begin, what they may change, and units of coverage."""
+    """Yield the fits: name, first constants, names of free constants, and unit of coverage."""
     sunk = eqx.tree_at(lambda c: c.shift, ours, 0.3)
     yield "fitted: shift", sunk, ("shift",), coverage_units[0]
     for unit in coverage_units:
@@ -364,7 +369,7 @@ def fits_to_make(
 
 
 def described(constants: Constants) -> str:
-    """Write constants as the settings that they would be."""
+    """Format constants as settings."""
     a, b = ([round(float(x), 3) for x in pair] for pair in (constants.alpha, constants.beta))
     return (
         f"u={float(constants.u):.4f} v={float(constants.v):.4f} alpha={a} beta={b} "
@@ -376,7 +381,7 @@ def described(constants: Constants) -> str:
 def crops_of(
     names: list[str], arguments: argparse.Namespace, generator: np.random.Generator
 ) -> list[Crop]:
-    """Cut crops of all meshes; one stack for every size of the image."""
+    """Make crops of all meshes, stacked by size of the image."""
     groups = {size: [] for size in arguments.sizes}
     for name in names:
         for subject in subjects(name, [arguments.cells], arguments.views):
@@ -440,7 +445,7 @@ def main() -> None:
 
 
 def room(constants: Constants, crops: list[Crop]) -> Capacities:
-    """Give buffers room for these constants, and for splats longer and wider by `ROOM`."""
+    """Return buffer sizes that also suffice for splats longer and wider by the factor `ROOM`."""
     wide = eqx.tree_at(
         lambda c: (c.alpha, c.beta),
         constants,

@@ -1,4 +1,4 @@
-"""Meshes of the studies: true ones, as the isosurface of their signed distance shows them."""
+"""Meshes of the studies: true meshes, or isosurfaces of their signed distance on a grid."""
 
 from pathlib import Path
 
@@ -15,16 +15,17 @@ from geosplat_jax.report.consistency import load_mesh, whole_mesh
 from geosplat_jax.surface.hull import fit_grid, grid_points
 
 SAMPLES = 400_000
-"""Points that stand for a surface; their spacing is a tenth of a cell at 96 cells."""
+"""Points that represent a surface; their spacing is a tenth of a cell at 96 cells."""
 
 BALL = "ball"
-"""Name of the sphere of radius one, which no file holds."""
+"""Name of the sphere of radius one, which needs no file."""
 
 
 def shape(name: str, cells: int | None) -> Mesh:
-    """Return the ball or the mesh of a file, anew on so many cells, or as it is for None.
+    """Return the isosurface of the ball or of a mesh file; for None the mesh of the file itself.
 
-    ``cells`` : along the longest side of the grid, margins of two cells included, as in training.
+    ``cells`` : number of cells along the longest side of the grid, with margins of two cells as in
+    training. For the ball, None means 96.
     """
     if name == BALL:
         bounds = (np.full(3, -1.0), np.full(3, 1.0))
@@ -40,7 +41,7 @@ def shape(name: str, cells: int | None) -> Mesh:
 
 
 def isosurface_of(model: FlexiCubes, distance: np.ndarray) -> Mesh:
-    """Extract the mesh of training, four faces a quad, without deformation; rows without padding.
+    """Extract a mesh as in training, four faces per quad, without deformation and padding.
 
     ``distance`` : (grid vertices,) world units, negative inside.
     """
@@ -51,11 +52,12 @@ def isosurface_of(model: FlexiCubes, distance: np.ndarray) -> Mesh:
 
 
 def signed_distance(vertices: np.ndarray, faces: np.ndarray, grid: Grid) -> np.ndarray:
-    """Distances of a grid's vertices to a mesh, (n,): to the plane of the nearest of many samples.
+    """Return signed distances, (n,) world units, from the vertices of a grid to a closed mesh.
 
-    Normals of the samples are interpolated from those of the vertices, so that edges have a side.
-    Good within two cells of a closed mesh, where an isosurface is made of it; vertices further away
-    have the value of the nearest one that is not.
+    The distance is that to the tangent plane at the nearest of many samples of the mesh. Normals of
+    samples are interpolated from those of vertices, so that the sign is defined at edges as well.
+    Distances are accurate within two cells of the mesh, which is enough for an isosurface; vertices
+    farther away have the value of the nearest vertex that is not.
     """
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     samples, rows = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)

@@ -1,12 +1,12 @@
-"""Measure what every shortcut of Monte Carlo costs: bias and noise of images and gradients, time.
+"""Measure the effects of every shortcut of Monte Carlo: bias, noise and time of a gradient.
 
 ``python experiments/studies/shortcuts.py RUN --output shortcuts.json`` takes a trained run and
 evaluates an image and the gradient of the loss on one batch of training views with many seeds, for
 every setting of `shortcuts`, against a reference with many samples and shadows.
 
-Means over few seeds are themselves noisy, those of the reference too. Whatever is compared is
-therefore freed of that noise (`squared_bias`), and where a bias does not exceed twice its standard
-error, the table says what it is below.
+Means over few seeds are noisy themselves, also those of the reference. Estimates of the bias
+therefore subtract that noise (`squared_bias`). Where a bias does not exceed twice its standard
+error, the table gives an upper bound.
 """
 
 import argparse
@@ -42,7 +42,7 @@ REFERENCE_SAMPLES = 16
 """Samples of each kind in a pass of the reference."""
 
 IN_COLOUR = {"l1": 0.8, "ssim": 0.2}
-"""Weights of L1 and SSIM of Eq. 13 alone: the other terms have no samples of light."""
+"""Weights of L1 and SSIM in Eq. 13; the other terms draw no light samples, and are left out."""
 
 
 def _shading(pipeline: Pipeline, **changes: Any) -> Pipeline:
@@ -58,7 +58,7 @@ def _samples(pipeline: Pipeline, count: int) -> Pipeline:
 
 
 def shortcuts(pipeline: Pipeline) -> dict[str, Pipeline]:
-    """Return every setting by what a table calls it, those of the run first."""
+    """Return the pipeline of every row of the table, by name, that of the run first."""
     raster = pipeline.raster
     other_way = replace(raster, cull_backfaces=not raster.cull_backfaces)
     pipelines = {
@@ -81,9 +81,9 @@ def shortcuts(pipeline: Pipeline) -> dict[str, Pipeline]:
 def without_shortcuts(pipeline: Pipeline) -> Pipeline:
     """Return the reference: many samples, shadows, no filter.
 
-    Culling stays as it was trained: what it hides shaped no image and would be a bias everywhere.
-    Views still share samples, which correlates their noise but changes no mean; many samples for
-    every view would not fit into memory.
+    Culling is that of the training: splats that it hid were not trained, and would bias all rows.
+    Views still share samples, which correlates their noise but does not change means; many samples
+    for every view would not fit into memory.
     """
     exact = _samples(pipeline, REFERENCE_SAMPLES)
     return _shading(exact, occlusion=True, denoise=DenoiseSpec(iterations=0))
@@ -106,7 +106,7 @@ def load_scene(folder: Path, views: int) -> Scene:
         raise SystemExit(f"{folder} ended in the stage {stage.name}, which draws no samples")
     stage = replace(stage, batch_views=views)
     batch = make_batch(run.dataset.train, run.trained.step, stage, seed=run.config.run.seed)
-    # Random colours behind the object are noise of another kind.
+    # A fixed background, because random colours would add noise of another kind.
     objective = replace(pipeline.objective, background="black")
     weights = {name: jnp.float32(weight) for name, weight in IN_COLOUR.items()}
     return Scene(run.params, batch, replace(pipeline, objective=objective, weights=weights))
@@ -128,7 +128,10 @@ def _gradient(pipeline: Pipeline, params: Params, batch: Batch) -> dict[str, jax
 
 @dataclass(frozen=True)
 class Estimates:
-    """What K seeds gave: images on covered pixels (K, P), gradients by group (K, n), seconds."""
+    """Results of K seeds: images on covered pixels (K, P), gradients by group (K, n), seconds.
+
+    ``seconds`` : median time of a gradient.
+    """
 
     image: Float[np.ndarray, "K P"]
     gradients: dict[str, Float[np.ndarray, "K n"]]
@@ -136,7 +139,7 @@ class Estimates:
 
 
 def estimate(scene: Scene, pipeline: Pipeline, seeds: range) -> Estimates:
-    """Draw images and gradients with every seed; buffers grow first, and nothing else is timed."""
+    """Compute images and gradients with every seed; only gradients are timed, once compiled."""
 
     def drawn(seed: int) -> Batch:
         return replace(scene.batch, key=jax.random.key(seed))
@@ -168,9 +171,9 @@ def estimate(scene: Scene, pipeline: Pipeline, seeds: range) -> Estimates:
 
 
 def squared_bias(rows: Float[np.ndarray, "K n"], exact: Float[np.ndarray, "R n"]) -> float:
-    """Estimate the squared distance of two means from noisy copies of either; unbiased.
+    """Estimate, without bias, the squared distance between two means from noisy samples of both.
 
-    Below zero by chance where there is none.
+    It may be below zero by chance if the means are equal.
     """
     noise = sum(float(x.var(axis=0, ddof=1).sum()) / len(x) for x in (rows, exact))
     return float(np.sum((rows.mean(axis=0) - exact.mean(axis=0)) ** 2)) - noise
@@ -183,7 +186,7 @@ def jackknife(
 ) -> tuple[float, float]:
     """Return a statistic of two samples and its standard error, from leaving out one row each.
 
-    For a squared bias the error is up to 1.4 times too large where there is none.
+    For a squared bias that is zero, the standard error is up to 1.4 times too large.
     """
     total = 0.0
     for number, sample in enumerate((rows, exact)):
@@ -201,7 +204,7 @@ def _decibels(squared: float) -> float:
 
 
 def compare(found: Estimates, exact: Estimates) -> dict[str, Any]:
-    """Bias and noise of images, and of gradients in units of the length of one of the reference."""
+    """Return bias and noise of images, and of gradients relative to those of the reference."""
     pixels = found.image.shape[1]
     bias, error = jackknife(squared_bias, found.image, exact.image)
     result: dict[str, Any] = {
@@ -219,7 +222,7 @@ def compare(found: Estimates, exact: Estimates) -> dict[str, Any]:
 
 
 def bias_text(bias: dict[str, float], *, decibels: bool) -> str:
-    """Write a bias, or the most that it could be where it does not exceed twice its error."""
+    """Format a bias, or an upper bound if it does not exceed twice its standard error."""
     is_chance = bias["squared"] <= 2 * bias["error"]
     squared = bias["squared"]
     if is_chance:

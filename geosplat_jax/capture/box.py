@@ -1,8 +1,8 @@
 """The box around the object: the largest cluster of splats that the cameras look at.
 
-What it stands on is left out: the plane that holds many of the splats, with the rest of them and
-the cameras on one side. Everything here is NumPy in float64 and does not depend on the world's
-unit.
+The ground that the object stands on is left out: a plane that holds many of the splats, while most
+others and the cameras lie on one side of it. Everything here is NumPy in float64 and does not
+depend on the world's unit.
 """
 
 from typing import Any, NamedTuple
@@ -17,29 +17,32 @@ from geosplat_jax.io.views import Views, in_image, point_text, project
 from geosplat_jax.surface.hull import sight_bounds
 
 _OPAQUE = 0.1
-"""Splats that are less opaque say nothing about where things are."""
+"""Splats of lower opacity are ignored when the object is located."""
 _LEAST_WEIGHT = 0.5
-"""Sum of the opacities in a cell, below which it holds fog and no thing."""
-_LARGEST_SCALE = 0.06  # of the sides of the search; larger splats are the background
+"""Sum of the opacities in a cell below which the cell holds only fog."""
+_LARGEST_SCALE = 0.06  # in sides of the search cube; larger splats are background
 _SEEN = 0.8
 """Share of the cameras that must have a place in sight for the object to be there."""
 _SEEN_IN_PART = 0.4
-"""The same of what is connected with such a place: photographs may cut off a part of the object."""
+"""The same for places that are connected to such a place: photographs may cut off a part of the
+object."""
 _FREE = 0.9
-"""Of the way from the middle of the search to the nearest camera."""
+"""The search cube reaches at most this part of the way from its centre to the nearest camera."""
 _CELLS = 40
-"""Along every side of the search."""
+"""Cells along every side of the search cube."""
 _REACH = 0.2
-"""Standard deviation, in sides of the search, of the weight of what is near its middle."""
-_TRIALS = 400
-_PLANE_THICKNESSES = (0.007, 0.014, 0.028)  # of the sides of the search, to either side
-_PLANE_SHARE = 0.15  # of the splats, that a plane must hold to be what the object stands on
+"""Standard deviation, in sides of the search cube, of the Gaussian weight that favours clusters
+near its centre."""
+_TRIALS = 400  # random planes for each thickness
+_PLANE_THICKNESSES = (0.007, 0.014, 0.028)  # in sides of the search cube, on either side
+_PLANE_SHARE = 0.15  # least share of the splats' weight that the ground must hold
 _MUCH_MORE = 1.15
-"""Of the weight of a thinner plane."""
+"""A thicker plane is chosen if it holds this many times the weight of a thinner one."""
 _CAMERAS_ABOVE = 0.9
-"""Share of the cameras that lie above such a plane."""
+"""Least share of the cameras that must lie above the ground."""
 _SPLATS_ABOVE = 0.75
-"""Share of the other splats that do; what shines on a plane leaves some below."""
+"""Least share of the other splats' weight that must lie above the ground; reflections in a glossy
+ground leave some below."""
 _TAIL = 0.005
 """Share of the cluster that may lie outside of the box on each side."""
 _MARGIN = 0.05  # of the longest side, on every side
@@ -54,27 +57,28 @@ class Cloud(NamedTuple):
 
 
 class Plane(NamedTuple):
-    """What an object stands on or hangs at, however it lies: the points ``normal.x <= height``.
+    """Ground that an object stands on or hangs from, in any orientation.
 
-    ``normal`` : (3,) unit, towards the object and the cameras.
+    The ground is all points x with ``normal . x <= height``. ``normal`` : (3,) unit, towards the
+    object and the cameras.
     """
 
     normal: Float[np.ndarray, " 3"]
     height: float
 
     def is_above(self, positions: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
-        """Tell which points are no part of it."""
+        """Tell which points lie above the ground, (N,)."""
         return positions @ self.normal > self.height
 
 
 class Proposal(NamedTuple):
-    """A box, and what it rests on.
+    """A box, and the ground below the object.
 
     Attributes
     ----------
     lo, hi : (3,) corners in the world.
-    share : of the weight of all splats in the search that the cluster holds.
-    plane : that was left out, which may cross the box; None for none.
+    share : share of the weight of all splats in the search that the cluster holds.
+    plane : ground that was left out, which may cross the box; None where there is none.
     """
 
     lo: Float[np.ndarray, " 3"]
@@ -88,12 +92,13 @@ def propose_box(cloud: Cloud, views: Views, *, seed: int = 0) -> Proposal:
 
     Parameters
     ----------
-    cloud : of all splats. views : whose cameras tell where to search.
-    seed : of the search for a plane.
+    cloud : all splats.
+    views : views whose cameras tell where to search.
+    seed : seed of the search for the ground.
 
     Raises
     ------
-    CaptureError : the cameras do not look at one place, or nothing is there.
+    CaptureError : the cameras do not look at one place, or there are no splats there.
     """
     cure = "give the box by --box X0 Y0 Z0 X1 Y1 Z1"
     try:
@@ -127,7 +132,7 @@ def propose_box(cloud: Cloud, views: Views, *, seed: int = 0) -> Proposal:
     cluster = rest[members]
     low, high = np.quantile(cluster, [_TAIL, 1.0 - _TAIL], axis=0)
     pad = _MARGIN * float((high - low).max())
-    # A single splat has no extent; a cell of the search then is the smallest box.
+    # A cluster of a single splat has no extent; the box is then one cell of the search.
     pad = max(pad, 0.5 * side / _CELLS)
     low, high = low - pad, high + pad
     if not is_above.all():
@@ -156,9 +161,10 @@ def require_something_inside(inside: Bool[np.ndarray, " N"], cloud: Cloud, corne
 
 
 def _search(views: Views) -> Bounds:
-    """Find the cube around what half of the views show at the distance of what they look at.
+    """Find the cube in which the object is searched; it holds no camera.
 
-    It holds no camera. `hull.sight_bounds` has the cube within.
+    It encloses the ball that half of the views show around the point that the cameras look at. The
+    cube of `hull.sight_bounds` lies inside this ball.
 
     Raises
     ------
@@ -189,11 +195,11 @@ def _ground(
     side: float,
     rng: np.random.Generator,
 ) -> Plane | None:
-    """Find the plane that things stand on, or hang at; None where there is no such plane.
+    """Find the plane that things stand on or hang from; None where there is no such plane.
 
-    The plane through three random points that holds the most weight (RANSAC, Fischler and Bolles
-    1981), if the cameras and most other points lie on one side of it. A wall of splats is not flat:
-    a thicker plane is taken where it holds much more.
+    It is the plane through three random points that holds the most weight (RANSAC, Fischler and
+    Bolles 1981), if the cameras and most other points lie on one side of it. Splats of a flat
+    surface do not lie exactly in a plane: a thicker plane is chosen where it holds much more.
     """
     if len(points) < 3:
         return None
@@ -213,7 +219,7 @@ def _ground(
         best = _fitted(points[np.abs(points @ best.normal - best.height) < thickness], best)
         if best.is_above(centers).mean() < _CAMERAS_ABOVE:
             continue
-        # What is below belongs to the ground, too; a plane that leaves nothing is all there is.
+        # Everything below belongs to the ground, too. A plane with nothing above it is no ground.
         ground = best._replace(height=float(best.height + thickness))
         above = weights[ground.is_above(points)].sum()
         if 0.0 < above >= _SPLATS_ABOVE * (weights.sum() - best_weight):
@@ -246,12 +252,16 @@ def _plane_through(
 def _largest_cluster(
     points: np.ndarray, weights: np.ndarray, is_sure: np.ndarray, lo: np.ndarray, hi: np.ndarray
 ) -> Bool[np.ndarray, " N"]:
-    """Find the connected cells whose sure points weigh most, near the middle more than far off."""
+    """Tell which points belong to the connected cells with the largest weight.
+
+    Only sure points have weight, which falls with their distance from the middle of the search.
+    """
     side = float((hi - lo).max())
     cell = np.clip(((points - lo) / side * _CELLS).astype(int), 0, _CELLS - 1)
     density = np.zeros((_CELLS,) * 3)
     np.add.at(density, tuple(cell.T), weights)
-    # Splats of plain surfaces lie apart: those with an empty cell between them are connected.
+    # Splats of uniform surfaces lie far apart, so cells with up to two empty cells between them are
+    # connected.
     is_taken = maximum_filter(density >= _LEAST_WEIGHT, size=3)
     found: Any = label(is_taken, structure=np.ones((3, 3, 3), int))
     numbers = found[0]
@@ -265,7 +275,12 @@ def _largest_cluster(
 def _cut_at_plane(
     low: np.ndarray, high: np.ndarray, plane: np.ndarray, cluster: np.ndarray
 ) -> Bounds:
-    """Keep the box off the plane that was left out, where that is about level with an axis."""
+    """Keep the box from crossing the ground, if that is nearly parallel to a side of the box.
+
+    The normal of the ground must be within 15 degrees of an axis.
+
+    ``plane`` : (M, 3) points of the ground. ``cluster`` : (N, 3) points of the object.
+    """
     middle = plane.mean(0)
     normal = np.linalg.svd(plane - middle, full_matrices=False)[2][2]
     axis = int(np.argmax(np.abs(normal)))

@@ -1,8 +1,8 @@
-"""Masks of an object from photographs that show what is around it, too (appendix F).
+"""Masks of an object from photographs that also show its surroundings (appendix F).
 
-Splats are trained on the photographs as they are; those in a box are kept, and where they are
-opaque is the mask. Masks are files of the photographs' own size and lens, in ``SCENE/masks``, where
-the readers of captures look for them.
+Splats are trained on the whole photographs. Those in a box around the object are kept, and the mask
+is where they are opaque. Masks are written to ``SCENE/masks``, where the readers of captures look
+for them, in the size of the photographs and with the distortion of their lenses.
 """
 
 import json
@@ -56,18 +56,18 @@ _SPECK = 0.02
 _MOST_UNSURE = 0.1
 _LEAST_AGREEMENT = 0.9
 _MOST_CUT = 0.05
-"""Figures beyond which a warning says what looks wrong."""
+"""Limits of the figures in `Certainty`, beyond which there is a warning."""
 _SHEET_VIEWS = 6
-_SHEET_WIDTH = 200  # pixels of a picture of the sheet, at least: the text below is as long as three
-_DIM = 0.12  # of what is outside of the mask, in the sheet
+_SHEET_WIDTH = 200  # least pixels of a picture: the text below the sheet is as wide as three
+_DIM = 0.12  # brightness outside of the mask in the sheet
 _DISSENT = (0.9, 0.35, 0.1)  # colour that half-opaque pixels are marked with
 
 _PIXELS = 270 * 480
-"""Of an image at most, where nobody says otherwise."""
+"""Most pixels of a reduced photograph, see `choose_factor`."""
 
 REPORT = "masks.json"
 _BEGUN = "masks_begun.json"
-"""Which files a command is about to write; it is gone once they are all there."""
+"""File that lists the masks which a command is about to write; removed when all are written."""
 
 
 @dataclass(frozen=True)
@@ -77,9 +77,10 @@ class Certainty:
     Attributes
     ----------
     coverage : mean share of an image that its mask covers.
-    unsure : pixels with alpha from 0.2 to 0.8, next to none of the masks', per pixel of the masks.
+    unsure : number of pixels with alpha from 0.2 to 0.8 that do not touch a mask, per pixel of
+        masks.
     cut : share of the masks' rims that lies on the border of the image.
-    agreement : mean share of the rays through a mask that meet the visual hull of the others.
+    agreement : mean share of the rays through a mask that meet the visual hull of the other masks.
     empty : names of views whose mask is empty.
     """
 
@@ -111,16 +112,19 @@ class Certainty:
 
 @dataclass(frozen=True)
 class MaskReport:
-    """What was written, and how sure it is.
+    """Summary of the masks that were written, and how sure they are.
 
     Attributes
     ----------
-    masks : count of files. folder : where they are.
-    lo, hi : corners of the box. proposed : whether it was found and not given.
-    plane : what the object stands on or hangs at and was left out: the points ``x`` with ``normal.x
-        <= height``, three numbers of the normal and the height; None for no such plane.
-    splats : in the box. splats_total : of the scene.
-    psnr : mean decibels of the splats on views that they did not see; None without such views.
+    masks : number of files.
+    folder : folder of the files.
+    lo, hi : (3,) corners of the box in the world.
+    proposed : whether the box was found by `propose_box`, not given.
+    plane : ground that was left out: three numbers of its normal, then its height, see `box.Plane`.
+        None where there is none.
+    splats : number of splats in the box.
+    splats_total : number of all splats.
+    psnr : mean decibels of the splats on held-back views; None where there are none.
     certainty : how sure the masks are.
     """
 
@@ -169,18 +173,23 @@ def make_masks(
 
     Parameters
     ----------
-    dataset : read with ``mask_files=False``.
-    settings : of the training.
-    folder : of splats, checkpoints, sheet and report.
-    box : lo and hi in the world; proposed where it is not given.
-    downscale : that the dataset was read with.
+    dataset : the capture, read with ``mask_files=False``.
+    settings : settings of the training.
+    folder : folder for splats, checkpoints, sheet and report.
+    box : lo and hi in the world; by default `propose_box` finds one.
+    downscale : factor that the dataset was read with.
     resume : continue a training, or take its splats where it is done.
     force : replace splats in ``folder``, and masks that this command did not write.
+    on_step : called after every step of the training.
+
+    Returns
+    -------
+    The report, which is also written to ``masks.json`` in ``folder``.
 
     Raises
     ------
-    CaptureError : too few views, masks that are there already, a box that holds nothing, masks
-        that leave nothing.
+    CaptureError : there are too few views, masks that are there already, no splats in the box, or
+        nothing that the masks would cover.
     SceneError, RunError, TrainingError, Interrupted : see `train_radiance`.
     """
     folder = Path(folder)
@@ -205,7 +214,7 @@ def make_masks(
     clipped, (lo, hi), plane = _clipped(radiance, dataset.train, box, settings.seed)
     write_splats(clipped, folder / "object.ply")
     alpha = _alphas(clipped, views, (lo, hi))
-    # Whoever is stopped between the first mask and the report can go on.
+    # A command that is stopped between the first mask and the report can be resumed.
     begun = folder / _BEGUN
     with written_aside(begun) as aside:
         aside.write_text(
@@ -254,7 +263,7 @@ def _alphas(clipped: Radiance, views: Views, box: Bounds) -> Float[np.ndarray, "
 
 
 def choose_factor(path: str | Path) -> int:
-    """Return how far to reduce photographs so that one has no more pixels than 270 x 480.
+    """Return the factor that reduces photographs to at most 270 x 480 pixels each.
 
     Raises
     ------
@@ -275,7 +284,8 @@ def _frames(dataset: Dataset) -> list[Frame]:
 
     Raises
     ------
-    CaptureError : masks beside the images would not be read.
+    CaptureError : the images are cut out already, or the scene's files name other masks, so that
+        new ones would not be read.
     """
     listing = LAYOUTS[dataset.layout].list_frames(dataset.root, light=None)
     if not listing.is_capture:
@@ -296,7 +306,7 @@ def _frames(dataset: Dataset) -> list[Frame]:
 
 
 def _require_free(frames: Sequence[Frame], folder: Path, *, resume: bool, force: bool) -> None:
-    """Refuse to replace masks of others, before hours of work."""
+    """Refuse to replace masks that this command did not write, before hours of training."""
     there = [frame.mask for frame in frames if frame.mask is not None]
     begun = folder / _BEGUN
     written = set(parse_json(begun.read_bytes())) if begun.exists() else set()
@@ -341,7 +351,7 @@ def _all_views(dataset: Dataset) -> Views:
 def _clipped(
     radiance: Radiance, views: Views, box: Bounds | None, seed: int
 ) -> tuple[Radiance, Bounds, Plane | None]:
-    """Keep the splats whose mean lies in the box, and above the plane of a proposed one.
+    """Keep the splats whose means lie in the box; with a proposed box, only those above its ground.
 
     Raises
     ------
@@ -382,10 +392,19 @@ def write_splats(radiance: Radiance, path: Path) -> None:
 
 
 def tidied(alpha: Float[np.ndarray, "V H W"]) -> Float[np.ndarray, "V H W"]:
-    """Take specks off the masks, and fill holes in which the splats are half opaque.
+    """Remove specks from masks, and fill holes in which the splats are half opaque.
 
-    A speck is smaller than a fiftieth of the largest part of the mask; its alpha becomes 0. A hole
-    that a mask encloses gets alpha 1 where alpha is above 0.2; what is clearer is a hole indeed.
+    A speck is smaller than a fiftieth of the largest part of the mask; its alpha becomes 0. Pixels
+    of a hole that a mask encloses get alpha 1 where their alpha is above 0.2; pixels with less are
+    taken for a true hole.
+
+    Parameters
+    ----------
+    alpha : (V, H, W) in [0, 1].
+
+    Returns
+    -------
+    (V, H, W) changed copy.
     """
     found = np.array(alpha)
     for values in found:
@@ -403,11 +422,18 @@ def tidied(alpha: Float[np.ndarray, "V H W"]) -> Float[np.ndarray, "V H W"]:
 def photograph_mask(
     alpha: Float[np.ndarray, "H W"], frame: Frame, downscale: int
 ) -> Bool[np.ndarray, "h w"]:
-    """Return the mask of a photograph as large as it is, as its lens shows it.
+    """Return the mask of a photograph in its own size and with the distortion of its lens.
 
     Parameters
     ----------
-    alpha : of the pinhole image that is smaller by ``downscale``; it may be padded at its end.
+    alpha : (H, W) alpha of the undistorted image, reduced by ``downscale``; it may have padding at
+        the ends of its axes.
+    frame : the photograph and its lens.
+    downscale : factor by which ``alpha`` is smaller than the photograph.
+
+    Returns
+    -------
+    (h, w) True on the object.
     """
     height, width = image_size(frame.image)
     where = photograph_lookup(
@@ -420,7 +446,14 @@ def photograph_mask(
 
 
 def certainty(views: Views, alpha: Float[np.ndarray, "V H W"], box: Bounds) -> Certainty:
-    """Measure how sure masks are; at least one must not be empty."""
+    """Measure how sure masks are.
+
+    Parameters
+    ----------
+    views : the photographs and their cameras.
+    alpha : (V, H, W) alpha of the splats in the box; at least one mask must not be empty.
+    box : lo and hi of the box.
+    """
     masks = alpha > OPAQUE
     covered = int(masks.sum())
     rims = (masks[:, 0], masks[:, -1], masks[:, :, 0], masks[:, :, -1])
@@ -434,7 +467,7 @@ def certainty(views: Views, alpha: Float[np.ndarray, "V H W"], box: Bounds) -> C
     masked = replace(views, images=cut_out, has_masks=True)
     shares = agreement(masked, box)
     is_empty = ~masks.any((1, 2))
-    # A rim of a pixel is half opaque around any object.
+    # A rim of one pixel is half opaque around any object, and so is not counted.
     near = np.asarray(maximum_filter(masks, (1, 3, 3)), bool)
     return Certainty(
         coverage=float(masked.coverage.mean()),

@@ -19,21 +19,21 @@ from geosplat_jax.io.views import Views
 from geosplat_jax.splats.radiance import RadianceSplats
 
 FEWEST_VIEWS = 5
-"""Views to train on."""
+"""Fewest views that splats can be trained on."""
 
 _EXTENT = 4.0
-"""Of the cameras once the world is scaled: that of the Blender scenes which the numbers of the
-literature were found on."""
+"""Extent of the cameras in the standard world: that of the Blender scenes for which published
+settings were found."""
 _EXTENT_MARGIN = 1.1  # as in the code of Kerbl et al.
 _NEIGHBOURS = 3
-_SMALLEST_DISTANCE = 1e-4  # of neighbours, in quarters of the cameras' extent
+_SMALLEST_DISTANCE = 1e-4  # least distance of neighbours, in quarters of the cameras' extent
 _START_SHARE = 0.5
-"""Share of the capacity that is filled with splats at the beginning, at least."""
+"""Least share of the capacity that is filled with splats at the start."""
 _MOST_DRAWS = 1000
 """Largest number of draws until a pixel counts. Where only one pixel in a hundred counts, all of
 them miss once in 20,000."""
 _NEAREST, _BEYOND, _FARTHEST = 0.5, 1.5, 30.0
-"""Depths of random points, in distances to what the cameras look at."""
+"""Limits of the depths of random points, in units of the distance to what the cameras look at."""
 
 
 class CaptureError(SceneError):
@@ -63,7 +63,7 @@ def require_trainable(views: Views) -> None:
     try:
         target = common_target(centers, -views.camera_to_world[:, :3, 2])
     except SceneError:
-        # They may look anywhere, as long as they do not stand on a line.
+        # Cameras may look in any direction, as long as they do not stand on a line.
         target = centers.mean(0) + reach
     require_spread(centers, target[None])
 
@@ -80,8 +80,18 @@ def standard_world(views: Views) -> Similarity:
 def random_points(views: Views, count: int, rng: np.random.Generator) -> Points:
     """Draw points that the cameras see, with the colour that one of them sees there.
 
-    Half of them lie between 0.5 and 1.5 times the distance to what the cameras look at, evenly in
-    depth, the others between 1.5 and 30, evenly in the inverse of the depth.
+    Depths are in units of the distance to what the cameras look at. Half of the points lie between
+    0.5 and 1.5, uniformly in depth, the others between 1.5 and 30, uniformly in inverse depth.
+
+    Parameters
+    ----------
+    views : views of the capture.
+    count : number of points.
+    rng : generator of all random numbers.
+
+    Returns
+    -------
+    (count, 3) positions in the world of the views, and (count, 3) colours in sRGB.
     """
     view, row, column = _drawn_pixels(views, count, rng)
     centers = views.camera_to_world[:, :3, 3]
@@ -129,10 +139,21 @@ def _drawn_pixels(
 def first_splats(
     views: Views, points: Points | None, settings: RadianceSettings
 ) -> tuple[RadianceSplats, int]:
-    """Place the first splats, in the world of the views; return them and how many there are.
+    """Place the first splats.
 
-    Points come first, all of them or a random choice; random points that the cameras see fill up to
-    half of the capacity.
+    The given points come first: all of them, or a random choice if they exceed the capacity. Random
+    points that the cameras see fill up to half of the capacity.
+
+    Parameters
+    ----------
+    views : views of the capture.
+    points : points of structure from motion, in the world of the views; None without any.
+    settings : settings of the training.
+
+    Returns
+    -------
+    splats : ``settings.capacity`` rows in the world of the views, of which the last are padding.
+    count : number of rows in use.
     """
     rng = np.random.default_rng(settings.seed)
     wanted = max(1, int(_START_SHARE * settings.capacity))
@@ -159,7 +180,7 @@ def _neighbour_distance(positions: Float[np.ndarray, "N 3"]) -> Float[np.ndarray
 def _padded(
     positions: np.ndarray, colors: np.ndarray, scales: np.ndarray, settings: RadianceSettings
 ) -> RadianceSplats:
-    """Fill rows past the count with padding."""
+    """Make splats of N points; rows past N are padding."""
     capacity, count = settings.capacity, len(positions)
 
     def filled(values: np.ndarray, padding: Any = 0.0) -> Any:

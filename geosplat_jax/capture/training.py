@@ -53,36 +53,39 @@ from geosplat_jax.splats.radiance import RadianceSplats, render_radiance
 from geosplat_jax.splats.relocation import DEAD_OPACITY, exploring_noise, relocate
 
 _RELOCATION_STREAM = 2**31
-"""Random streams of relocations count from here by the step; steps take theirs from 0 on."""
+"""Random streams of relocations are numbered from here, by the step; steps use the streams from 0
+on."""
 
 TILE_SIZE = 8
 """Side of a tile in pixels; splats of a capture are larger than those of a mesh."""
 
 NEAR = 0.2
-"""Splats closer to a camera are not drawn; the cameras' extent is four."""
+"""Splats closer to a camera than this are not drawn, in the standard world with an extent of 4."""
 
 _MOST_HITS = 1 << 26
-"""Pairs of a splat and a tile of one view; more would take many GB."""
+"""Most pairs of a splat and a tile in one view; more would take many GB."""
 
 _HEADROOM = 1.25
-"""Of buffers that grow: the number of splats does, and every new size takes a compilation."""
+"""Headroom of buffers that grow: the number of splats keeps growing, and every new size takes a
+compilation."""
 _STEPS_TIMED = 50
-"""Last steps that the estimate of the time left is made from."""
+"""Number of the last steps from which the time left is estimated."""
 _VIEWS_PLANNED = 8
-"""Views whose needs the first sizes of the buffers are made for."""
+"""Number of views whose needs the first sizes of the buffers hold."""
 
 RECORD = "splats.json"
 
 
 class RadianceState(eqx.Module):
-    """What a step reads and writes.
+    """State that a step reads and writes.
 
     Attributes
     ----------
-    splats : of the standard world.
+    splats : splats in the standard world, see `start.standard_world`; rows past ``count`` are
+        padding.
     optimizer : state of Adam.
-    count : () splats in use.
-    step : () updates made.
+    count : () number of splats in use.
+    step : () number of updates made.
     """
 
     splats: RadianceSplats
@@ -92,14 +95,14 @@ class RadianceState(eqx.Module):
 
 
 class StepWeights(eqx.Module):
-    """Numbers of one step, all traced.
+    """Rates and weights of one step, all traced.
 
     Attributes
     ----------
-    rates : of the groups of `RadianceSplats`.
-    noise : rate of `exploring_noise`.
-    degree : of the harmonics.
-    structure, opacity, scale : weights of the loss.
+    rates : learning rates of the groups of `RadianceSplats`.
+    noise : () rate of `exploring_noise`.
+    degree : () highest degree of the harmonics in use.
+    structure, opacity, scale : () weights of the loss.
     """
 
     rates: dict[str, Float[Array, ""]]
@@ -115,7 +118,10 @@ class RadianceReport(eqx.Module):
 
     Attributes
     ----------
-    total : () loss; mse : () of the image; usage : needs of the buffers.
+    total : () loss.
+    mse : () mean squared error of the image.
+    usage : true needs of the buffers.
+    finite : () whether the loss and all new splats are finite.
     """
 
     total: Float[Array, ""]
@@ -130,9 +136,9 @@ class Radiance:
 
     Attributes
     ----------
-    splats : all rows are in use.
-    near : world units; closer to a camera nothing is drawn.
-    degree : of the harmonics.
+    splats : splats, all of whose rows are in use.
+    near : distance from a camera below which splats are not drawn, world units.
+    degree : highest degree of the harmonics in use.
     """
 
     splats: RadianceSplats
@@ -140,7 +146,7 @@ class Radiance:
     degree: int
 
     def of(self, rows: Bool[np.ndarray, " N"]) -> "Radiance":
-        """Return some of the splats."""
+        """Return the splats in the rows of a mask (N,)."""
         chosen = np.flatnonzero(rows)
         return replace(self, splats=jax.tree.map(lambda leaf: leaf[chosen], self.splats))
 
@@ -154,7 +160,22 @@ def radiance_loss(
     capacities: Capacities,
     background: str,
 ) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Usage]]:
-    """Compare one view with its photograph, as a screen shows both; return loss, MSE and usage."""
+    """Compare the render of one view with its photograph, both in sRGB.
+
+    Parameters
+    ----------
+    splats : splats in the standard world.
+    count : () number of rows in use.
+    batch : a single view.
+    weights : rates and weights of the step.
+    capacities : static; sizes of the buffers.
+    background : static; see `RadianceSettings.background`.
+
+    Returns
+    -------
+    total : () loss.
+    mse, usage : () mean squared error of the image, and true needs of the buffers.
+    """
     rgb, alpha, usage = render_radiance(
         splats,
         count,
@@ -216,7 +237,10 @@ def radiance_step(
 
 @partial(jax.jit, donate_argnames=("state",))
 def relocated(state: RadianceState, count: Int[Array, ""], key: Key[Array, ""]) -> RadianceState:
-    """Put dead splats onto live ones, then add some up to ``count``; see `relocation.relocate`."""
+    """Move dead splats onto live ones, then add splats up to ``count``.
+
+    Adam's moments of all rows that change become zero. See `relocation.relocate`.
+    """
     dead_key, birth_key = jax.random.split(key)
     row = jnp.arange(state.splats.capacity, dtype=jnp.int32)
     in_use = row < state.count
@@ -302,7 +326,7 @@ class _Loop:
             self.capacities = Capacities(**read_meta(path)["capacities"])
 
     def batch(self, step: int) -> Batch:
-        """Return the view of a step: every view once in a random order, then again."""
+        """Return the view of a step: all views in random order, then in another one, and so on."""
         round_, place = divmod(step, len(self.views))
         order = np.random.default_rng((self.settings.seed, round_)).permutation(len(self.views))
         view = order[place : place + 1]
@@ -346,7 +370,7 @@ class _Loop:
         """Return the splats in the world of the capture."""
         count, scale = int(self.state.count), self.world.scale
         splats = jax.tree.map(lambda leaf: leaf[:count], self.state.splats)
-        # Back in double precision, since the capture may lie far from its origin.
+        # Transformed in double precision, since the capture may lie far from its origin.
         means = (np.asarray(splats.means, np.float64) - self.world.translation) / scale
         splats = replace(
             splats,
@@ -368,7 +392,7 @@ def _needs(splats, count, camera, near, *, capacities):
 def _planned(
     splats: RadianceSplats, count: Int[Array, ""] | int, camera: Camera, near: float
 ) -> Capacities:
-    """Choose buffers that hold some views of splats; no view sees more than there are."""
+    """Choose sizes of buffers that hold the needs of some views; ``visible`` holds all splats."""
     capacities = Capacities(visible=bucket(splats.capacity))
     for number in np.unique(np.linspace(0, camera.count - 1, _VIEWS_PLANNED).astype(int)):
         one = camera.view(int(number))
@@ -404,13 +428,19 @@ def train_radiance(
 
     Parameters
     ----------
-    views : without masks; see `start.require_trainable`.
-    points : of structure from motion, in the world of the views, where there are any.
-    folder : made where it is missing, and held while the training runs.
-    resume : continue from the last checkpoint; equals the uninterrupted training bit for bit.
+    views : views without masks; see `start.require_trainable`.
+    settings : settings of the training.
+    folder : made if it is missing, and locked during the training.
+    points : points of structure from motion, in the world of the views; None without any.
+    resume : continue from the last checkpoint; the result equals that of the uninterrupted training
+        bit for bit.
     replace_run : begin anew in a folder that has a training.
     stop_after : stop, with a checkpoint, once so many steps are done.
     on_step : called after every step.
+
+    Returns
+    -------
+    The splats, in the world of the views.
 
     Raises
     ------
@@ -461,7 +491,7 @@ def _progress(loop: _Loop, report: RadianceReport, seconds: float, left: float |
 def _begin(
     folder: Path, views: Views, settings: RadianceSettings, *, resume: bool, replace_run: bool
 ) -> None:
-    """Write what the training is of, or compare it with what is there."""
+    """Write the record of the training, or compare it with that of the training to resume."""
     path = folder / RECORD
     now = {
         "views": f"{len(views)} of {views.width} x {views.height}, {views.fingerprint()}",
@@ -525,7 +555,7 @@ def render_views(
 
 
 def quality(radiance: Radiance, views: Views) -> Float[np.ndarray, " V"]:
-    """PSNR in decibels of new views against photographs, as a screen shows both, over black."""
+    """Return the PSNR of renders against photographs, (V,) decibels, in sRGB over black."""
     rgb, _ = render_views(radiance, views.camera())
     truth = np.asarray(linear_to_srgb(jnp.asarray(views.images[..., :3])))
     shown = np.clip(rgb, 0.0, 1.0)

@@ -5,16 +5,16 @@ from geosplat_jax.core.allocator import retain_freed_memory
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command line, that of the process by default, and return its status.
+    """Run a command line, by default that of the process, and return its exit status.
 
-    The status is 0 after success, 1 where gradcheck finds a wrong gradient, 2 after an error that a
-    user can cure, which is printed in one line, and 130 where somebody stopped the command.
+    The status is 0 after success, 1 if gradcheck finds a wrong gradient, 2 after an error that the
+    user can cure, which is printed in one line, and 130 if the command was stopped by Ctrl-C.
     """
     retain_freed_memory()
     try:
         with stops_soon(with_process=argv is None) as say_stopped:
             try:
-                # Imports take seconds, in which somebody may have second thoughts.
+                # Imports take seconds, during which Ctrl-C must work already.
                 from geosplat_jax.cli.calling import call
 
                 return call(argv)

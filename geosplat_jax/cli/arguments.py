@@ -1,4 +1,4 @@
-"""What the commands take: one function for each group of options."""
+"""Options of the commands: one function for each command or group of options."""
 
 import argparse
 import importlib.metadata
@@ -36,7 +36,7 @@ EXAMPLES = {
     "export": "export runs/duck --faces 20000 --obj",
     "gradcheck": "gradcheck bsdf --sweep",
 }
-"""One call of every command, which its help ends with."""
+"""An example of every command, shown at the end of its help."""
 
 
 _NEGATIVE_NUMBER = re.compile(r"-(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$", re.IGNORECASE)
@@ -395,7 +395,7 @@ def _add_masks(masks: argparse.ArgumentParser) -> None:
 
 
 def _add_devices(train: argparse.ArgumentParser) -> None:
-    """Add what says where a training computes."""
+    """Add options for the devices and processes of a training."""
     train.add_argument(
         "--devices",
         type=_at_least_one,
@@ -427,7 +427,7 @@ def _add_samples(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_cameras(parser: argparse.ArgumentParser, views: str | None) -> None:
-    """Add what chooses the cameras to render from."""
+    """Add options that choose the cameras to render from."""
     default = "%(default)s" if views else "test, or train where the scene has no test views"
     parser.add_argument(
         "--views",
@@ -457,7 +457,7 @@ def _add_cameras(parser: argparse.ArgumentParser, views: str | None) -> None:
 
 
 def _add_images(parser: argparse.ArgumentParser, aovs: list[str]) -> None:
-    """Add what chooses the images to write."""
+    """Add options that choose the images to write."""
     shown = " ".join(aovs) or "none"
     parser.add_argument(
         "--aovs",
@@ -472,7 +472,7 @@ def _add_images(parser: argparse.ArgumentParser, aovs: list[str]) -> None:
 
 
 def _add_config_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what chooses the settings of a run."""
+    """Add options that choose the settings of a run."""
     parser.add_argument(
         "--preset",
         choices=PRESETS,
@@ -559,7 +559,7 @@ def _add_relight(relight: argparse.ArgumentParser) -> None:
 
 
 def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what tells how to read a scene."""
+    """Add the scene, and options for reading it."""
     parser.add_argument("scene", type=Path, help="scene folder")
     parser.add_argument(
         "--downscale",
@@ -585,7 +585,7 @@ def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _measured(parse: Callable[[str], float]) -> Callable[[str], float]:
-    """Let argparse show what is wrong with a quantity."""
+    """Wrap a parser of a quantity, so that argparse shows the message of its `ValueError`."""
 
     def read(text: str) -> float:
         try:

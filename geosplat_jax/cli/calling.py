@@ -1,4 +1,4 @@
-"""A call of the command: which part of it runs, and how its errors are reported."""
+"""Dispatch of a command line to its command, and reports of errors."""
 
 import warnings
 

@@ -60,7 +60,7 @@ _ONE_LINE = 1000
 """Width of the settings table where the output is no terminal, so that no line is wrapped."""
 
 _LARGEST_FACTOR = 1e6
-"""Of a light or an albedo; far beyond any that is of use, and single precision holds the result."""
+"""Largest factor on a light or an albedo: far beyond useful ones, yet safe in single precision."""
 
 
 class GradientError(RuntimeError):
@@ -136,7 +136,7 @@ def _masks(arguments: argparse.Namespace) -> None:
 
 def _settings(arguments: argparse.Namespace) -> None:
     """List settings with their values under the chosen preset and quality."""
-    # Paths stay whole, for --set and grep; where nobody looks on, so does every line.
+    # Paths are never wrapped, for --set and grep; without a terminal no line is.
     table = Table(box=None, pad_edge=False)
     for title in ("setting", "value", "range", "meaning"):
         table.add_column(title, overflow="fold", no_wrap=title == "setting")
@@ -154,7 +154,7 @@ def _settings(arguments: argparse.Namespace) -> None:
 
 
 def _check_samples(arguments: argparse.Namespace) -> None:
-    """Refuse numbers of samples that no image can be made with."""
+    """Refuse numbers of samples that are out of range."""
     if not 1 <= arguments.samples <= LARGEST_SAMPLES:
         raise UsageError(f"--samples must be from 1 to {LARGEST_SAMPLES}, got {arguments.samples}")
 
@@ -194,7 +194,7 @@ def _report(arguments: argparse.Namespace) -> None:
 
 
 def _write_json(path: Path, content: Any) -> None:
-    """Write a file of figures; it appears whole or not at all."""
+    """Write a JSON file atomically."""
     with written_aside(path) as aside:
         aside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
@@ -220,7 +220,7 @@ def _consistency(arguments: argparse.Namespace) -> None:
 
 
 def _consistency_of_mesh(arguments: argparse.Namespace) -> Consistency:
-    """Put splats on the mesh of a file, and compare both."""
+    """Read a mesh, place splats on it, and compare both."""
     path = arguments.subject
     if not path.exists():
         raise UsageError(f"{path} is neither the folder of a run nor a mesh file")

@@ -1,4 +1,4 @@
-"""What a command prints to a terminal or a log file while it runs."""
+"""Messages and progress that a command prints to a terminal or a log file."""
 
 import time
 from dataclasses import asdict
@@ -19,18 +19,18 @@ console = Console(stderr=True, highlight=False)
 
 
 def say(text: str, *, style: str = "", label: str = "") -> None:
-    """Print a message as it is: what looks like markup may be a path."""
+    """Print a message without interpreting markup, since a path may look like it."""
     console.print(Text.assemble((label, style), text), soft_wrap=True)
 
 
 def show_warning(message: Warning | str, *where: Any) -> None:
-    """Show a warning as one line, without the place in the program that it comes from."""
+    """Print a warning as one line, without its position in the source code."""
     del where
     say(str(message), label="warning: ", style="yellow")
 
 
 def say_refined(split: str, progress: ViewProgress) -> None:
-    """Print what became of a camera that was refined."""
+    """Print the result of the refinement of a camera."""
     camera = progress.camera
     say(
         f"{split} {progress.done}/{progress.total} {progress.name}  residual "
@@ -41,15 +41,15 @@ def say_refined(split: str, progress: ViewProgress) -> None:
 
 _USUAL_COMPILATION = "usually 20 to 60 s"
 _LINE_EVERY = 10.0
-"""Seconds between two lines about a part of the work, where there is no terminal."""
+"""Seconds between two lines of progress, if the output is no terminal."""
 
 
 class WorkDisplay:
-    """Parts of a long work: a bar each on a terminal, a line now and then elsewhere.
+    """Shows the progress of a long command: a bar for each part on a terminal, otherwise lines.
 
     Parameters
     ----------
-    bars : whether the output is a terminal.
+    bars : whether to draw bars; None for yes if the output is a terminal.
     """
 
     def __init__(self, *, bars: bool | None = None) -> None:
@@ -79,7 +79,7 @@ class WorkDisplay:
             self._bar.stop()
 
     def __call__(self, part: str, done: int, total: int) -> None:
-        """Display how far a part is; see `poses.OnProgress`."""
+        """Show the progress of a part; see `poses.OnProgress`."""
         is_new = part not in self._times_left
         left = self._times_left.setdefault(part, TimeLeft()).left(done, total)
         if done >= total:
@@ -100,7 +100,7 @@ class WorkDisplay:
 
 
 class ProgressDisplay(Listener):
-    """A training: a bar on a terminal, a line every fiftieth step elsewhere."""
+    """Shows the progress of a training: a bar on a terminal, otherwise a line every 50 steps."""
 
     def __init__(self, steps: int) -> None:
         self._steps = steps
@@ -140,7 +140,7 @@ class ProgressDisplay(Listener):
             self._bar.stop()
 
     def on_compile(self, stage: str) -> None:
-        """Say that the next step waits for a compilation, and for how long."""
+        """Say that the next step waits for a compilation, and how long this usually takes."""
         self._compiling = stage, time.perf_counter()
         known = self._compile_seconds
         usual = _USUAL_COMPILATION if known is None else f"the last took {duration(known)}"
@@ -176,7 +176,7 @@ class ProgressDisplay(Listener):
             )
 
     def on_rung(self, rung: Rung) -> None:
-        """Say what became of a part of the model, as soon as it is known."""
+        """Print the verdict on a part of the model, as soon as it is known."""
         title, _, larger, gain, verdict = rung_row(asdict(rung))
         measured = f"{larger}, gain {gain}: " if rung.found is not None else ""
         say(f"model: {title}: {measured}{verdict}")

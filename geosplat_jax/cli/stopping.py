@@ -1,6 +1,6 @@
 """Ctrl-C ends a command within seconds, even while Python waits for a compiler.
 
-Nothing of the package is imported here: this module has to be there before all others.
+This module imports nothing of the package, because it must be active before the slow imports.
 """
 
 import os
@@ -13,39 +13,40 @@ from contextlib import contextmanager
 from typing import Any
 
 STOPPED = 130
-"""Status of a command that somebody stopped."""
+"""Exit status of a command that was stopped by Ctrl-C."""
 
 _GRACE = 3.0
-"""Seconds in which a command can end in its own way."""
+"""Seconds after Ctrl-C in which a command can end by itself."""
 
 _AGAIN = 0.05
-"""Seconds after which Ctrl-C that was swallowed is raised again: the callback is over by then."""
+"""Seconds after which a swallowed Ctrl-C is sent again; the callback has ended by then."""
 
 
 class _Notice:
-    """Says once that a command was stopped, whoever notices first."""
+    """Prints that a command was stopped; only the first call does, from any thread."""
 
     def __init__(self) -> None:
         self._is_new = threading.Lock()
 
     @property
     def was_given(self) -> bool:
-        """Whether it was said."""
+        """Whether the message was printed."""
         return self._is_new.locked()
 
     def __call__(self) -> None:
-        """Say it, unless that was done."""
+        """Print the message, unless that was done before."""
         if self._is_new.acquire(blocking=False):
             print("stopped", file=sys.stderr, flush=True)
 
 
 def _watch(receiver: socket.socket, has_returned: threading.Event, notice: _Notice) -> None:
-    """End the process some seconds after Ctrl-C, unless it ends before or has plans of its own.
+    """End the process some seconds after Ctrl-C, unless it ends itself or has its own handler.
 
-    Python notices a signal between two of its own instructions, and raises KeyboardInterrupt there.
-    That may be a minute later, after a compilation, or within a function whose errors nobody gets.
-    A handler with a ``notice`` wants to go on for a while: its words are said at once, and only the
-    second signal ends the process. Any other handler is left alone.
+    Python checks for signals between two of its instructions, and raises KeyboardInterrupt there.
+    That may be a minute later, after a compilation, or in a function whose exceptions are lost. A
+    handler with an attribute ``notice`` announces that the command needs some time to end: this
+    text is printed at once, and only a second signal ends the process. Any other handler is
+    respected.
     """
     with receiver:
         was_told = False
@@ -67,7 +68,7 @@ def _watch(receiver: socket.socket, has_returned: threading.Event, notice: _Noti
 
 @contextmanager
 def _heard_in_callbacks() -> Iterator[None]:
-    """Raise Ctrl-C again where a callback of a library has swallowed it, and say nothing."""
+    """Send Ctrl-C again, silently, if a callback of a library has swallowed its exception."""
     previous = sys.unraisablehook
 
     def hook(unraisable: Any) -> None:
@@ -87,18 +88,18 @@ def _heard_in_callbacks() -> Iterator[None]:
 def stops_soon(*, with_process: bool) -> Iterator[Callable[[], None]]:
     """End the process soon after Ctrl-C within the block, see `_watch`.
 
-    A training has a handler of its own, which lets it end its step and write a checkpoint; the
-    second Ctrl-C does not wait for that. What does not run in the main thread is left alone, since
-    signals do not come to it.
+    A training has its own handler, which lets it finish its step and write a checkpoint; a second
+    Ctrl-C does not wait for that. Outside of the main thread, which receives no signals, the block
+    runs as it is.
 
     Parameters
     ----------
-    with_process : whether the process has nothing else to do, so that threads which outlive the
-        block are not waited for either.
+    with_process : whether the process ends with the block, so that it does not wait for threads
+        that outlive the block either.
 
     Yields
     ------
-    What says that the command was stopped; once, however often it is called.
+    Function that prints that the command was stopped; only its first call does.
     """
     notice = _Notice()
     if threading.current_thread() is not threading.main_thread():
@@ -118,7 +119,7 @@ def stops_soon(*, with_process: bool) -> Iterator[Callable[[], None]]:
         if not with_process:
             has_returned.set()
         elif not notice.was_given:
-            # While the process cleans up there is nobody to catch a KeyboardInterrupt.
+            # While the process cleans up, nothing would catch a KeyboardInterrupt.
             signal.signal(signal.SIGINT, signal.SIG_DFL)
-        # Nothing more comes: a watch that was not called for ends.
+        # Closing the socket ends the watch, if no signal came.
         sender.close()

@@ -1,4 +1,4 @@
-"""The train command: what its options ask for, and the training with progress on the terminal."""
+"""The train command: interpretation of its options, and the training with progress."""
 
 import argparse
 import os
@@ -35,12 +35,12 @@ class UsageError(ValueError):
 
 
 def require_place(file: Path | None, option: str) -> None:
-    """Refuse a file that could not be written in the end, before anything is spent.
+    """Refuse an output file that cannot be written, before any work is done.
 
     Parameters
     ----------
-    file : that will be written; None for none. Its folder need not exist yet.
-    option : that names it.
+    file : file that will be written, whose folder need not exist yet; None for no file.
+    option : option that named the file, for the message.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def require_place(file: Path | None, option: str) -> None:
 
 
 def scene_options(arguments: argparse.Namespace, config: Config) -> dict[str, Any]:
-    """Return what `load_recorded` needs, in a form that JSON keeps; say what was chosen."""
+    """Return the options of `load_recorded`, in a form for JSON; print an automatic choice."""
     options = {
         "light": arguments.light,
         "bounds": arguments.bounds,
@@ -79,7 +79,7 @@ def scene_options(arguments: argparse.Namespace, config: Config) -> dict[str, An
 def config_from(arguments: argparse.Namespace, mesh: MeshSettings | None = None) -> Config:
     """Return the configuration that the arguments ask for.
 
-    ``mesh`` : of the run that is resumed, where the arguments name none.
+    ``mesh`` : start mesh of the run that is resumed, used if the arguments name none.
     """
     return make_config(
         arguments.preset or "default",
@@ -91,22 +91,22 @@ def config_from(arguments: argparse.Namespace, mesh: MeshSettings | None = None)
 
 
 def _overrides(arguments: argparse.Namespace) -> tuple[str, ...]:
-    """Return what ``--set`` and ``--seed`` change."""
+    """Return the changes of ``--set`` and ``--seed``."""
     seed = () if arguments.seed is None else (f"run.seed={arguments.seed}",)
     return (*arguments.overrides, *seed)
 
 
 @dataclass(frozen=True)
 class _Request:
-    """What a training was asked for.
+    """What a training has to do.
 
     Attributes
     ----------
-    config : settings.
+    config : settings of the run.
     reading : how to read the scene, see `load_recorded`.
-    budget : that it has to keep to; None for as long as it takes.
+    budget : limits on time and memory; None for none.
     model : how to choose the parts of the model; None for those of the settings.
-    goes_on : whether all of it is from the record of a run that is resumed.
+    goes_on : whether all of this comes from the record of a run that is resumed.
     """
 
     config: Config
@@ -128,15 +128,15 @@ _SETTING_OPTIONS = {
     "--bounds": "bounds",
     "--cameras": "cameras",
 }
-"""Options that a record answers, by the names of their values."""
+"""Options whose values are in the record of a run, with their names in the parsed arguments."""
 
 
 def _require_no_settings(
     arguments: argparse.Namespace, folder: RunFolder, *, but: str | None = None
 ) -> None:
-    """Refuse settings and ways of reading for a run that goes on with those in its record.
+    """Refuse options that a resumed run takes from its record.
 
-    ``but`` : an option that says what the record says.
+    ``but`` : an option that is accepted, because it agrees with the record.
     """
     usual = command_line().parse_args(["train", str(arguments.scene)])
     told = [
@@ -152,7 +152,7 @@ def _require_no_settings(
 
 
 def _request_of(arguments: argparse.Namespace, folder: RunFolder) -> _Request:
-    """Read from the options, or from the run that is resumed, what is to be done; say it."""
+    """Determine what to do from the options, or from the record of a run that is resumed."""
     known = folder.budget() if arguments.resume and folder.exists else None
     if known is not None:
         asked, chooses_size = (arguments.budget, arguments.memory), arguments.downscale == "auto"
@@ -162,7 +162,7 @@ def _request_of(arguments: argparse.Namespace, folder: RunFolder) -> _Request:
                 "--memory out"
             )
         _require_no_settings(arguments, folder, but="--downscale" if chooses_size else None)
-        # Its settings were chosen for the budget, and have changed since.
+        # The settings of the run were chosen for the budget, and have been adapted since.
         reading = folder.record()["dataset"]
         return _Request(folder.config(), reading, known, goes_on=True)
     if arguments.resume and folder.exists and arguments.budget is not None:
@@ -202,7 +202,7 @@ def _request_of(arguments: argparse.Namespace, folder: RunFolder) -> _Request:
 
 
 def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[str, Any]) -> Path:
-    """Set the cameras right before the training proper; say where they are."""
+    """Refine the cameras before the training itself; return and print the file of cameras."""
     draft = round_config(arguments.material_prior, seed=arguments.seed)
     say(
         "cameras first: a short training at quality draft, with half the split-sum steps and no "
@@ -225,7 +225,7 @@ def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[
 
 
 def _say_model(record: Mapping[str, Any] | None) -> None:
-    """Show why the model is what it is."""
+    """Print a table of the parts of the model, and why each was kept or left out."""
     if record is None:
         return
     table = Table(title=f"model, by {len(record['held_back'])} views that were held back")
@@ -241,7 +241,7 @@ def _say_model(record: Mapping[str, Any] | None) -> None:
 
 @contextmanager
 def _events(wanted: bool, folder: Path) -> Iterator[Listener]:
-    """Yield what writes event files while a training goes on, where they are wanted."""
+    """Yield a listener that writes event files during a training, if they are wanted."""
     if not wanted:
         yield NOBODY
         return
@@ -254,9 +254,9 @@ def _events(wanted: bool, folder: Path) -> Iterator[Listener]:
 
 @contextmanager
 def _table(path: Path | None, folder: Path) -> Iterator[None]:
-    """Write the steps of a run as a table when the training ends, however that is.
+    """Write the steps of a run to a CSV file when the training ends, also by an error.
 
-    A command that is refused made no step and leaves the file as it was.
+    A command that is refused has made no step, and does not change the file.
     """
     steps = RunFolder(folder)
     before = _state_of(steps.metrics)
@@ -271,7 +271,7 @@ def _table(path: Path | None, folder: Path) -> Iterator[None]:
 
 
 def _state_of(path: Path) -> tuple[int, int] | None:
-    """Size and time of the last change of a file; None where there is none."""
+    """Return size and modification time of a file; None if it does not exist."""
     if not path.exists():
         return None
     state = path.stat()
@@ -279,14 +279,14 @@ def _state_of(path: Path) -> tuple[int, int] | None:
 
 
 def begin_from(arguments: argparse.Namespace) -> Begin:
-    """Return how the arguments ask a run to begin."""
+    """Return how a run begins by the arguments: anew, resumed, or from stages of another run."""
     if arguments.source is not None:
         return TakeOver(arguments.source, arguments.stage)
     return Resume() if arguments.resume else Anew(replace=arguments.force)
 
 
 def _devices(arguments: argparse.Namespace) -> Devices:
-    """Return what the options ask to compute on; the first thing that a command does with jax."""
+    """Return the devices that the options ask for; must come before any other use of JAX."""
     told = arguments.host is not None, arguments.coordinator is not None
     if arguments.hosts is None and any(told):
         raise UsageError("--host and --coordinator belong to --hosts")
@@ -335,7 +335,7 @@ def train(arguments: argparse.Namespace) -> None:
     if arguments.refine_cameras is not None and arguments.resume and begun.exists:
         if not begun.record()["dataset"].get("cameras"):
             raise UsageError(f"{folder} was begun without --refine-cameras; leave it out")
-    # A run that knows how it reads its scene knows its refined cameras.
+    # The record of a resumed run names its refined cameras already.
     if arguments.refine_cameras is not None and not request.goes_on:
         if not arguments.resume:
             begun.require_free(replace=arguments.force)

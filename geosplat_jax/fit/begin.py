@@ -19,7 +19,7 @@ class Begin:
     ----------
     replace : whether a run that the folder holds is removed.
     start : shape, light and exposure of another training that the run begins, or began, with.
-    resumes : whether a run that the folder holds goes on.
+    resumes : whether a run that the folder holds is continued.
     takes_over : whether the first stages come from another run.
     """
 
@@ -29,31 +29,39 @@ class Begin:
     takes_over: ClassVar[bool] = False
 
     def goes_on(self, run: RunFolder) -> bool:
-        """Whether this goes on with a run that the folder holds."""
+        """Whether this continues a run that the folder holds; False where it holds none."""
         return self.resumes and run.exists
 
     def first_loop(
         self, dataset: Dataset, config: Config, run: RunFolder, devices: Devices
     ) -> Loop:
-        """Build the loop of a new run, before its folder says that there is one.
+        """Build the loop of a new run, before anything is written to its folder.
 
-        With new parameters, and the shape and light of ``start`` where there is one.
+        The parameters are new, except for the shape, light and exposure of ``start`` where it is
+        given.
+
+        Parameters
+        ----------
+        dataset : scene to train on.
+        config : settings of the run.
+        run : folder of the run.
+        devices : devices that the run trains on.
 
         Raises
         ------
         RunError, TrainingError
-            If what it begins with does not fit.
+            If there is nothing to train or to start from, or what the run begins with does not fit.
         """
         return new_loop(dataset, config, run, devices, self.start)
 
 
 @dataclass(frozen=True)
 class Anew(Begin):
-    """Begin with a first surface and new parameters.
+    """Begin with a new surface and new parameters.
 
     Parameters
     ----------
-    replace : whether a run that the folder holds is removed; it is refused otherwise.
+    replace : whether a run that the folder holds is removed; otherwise such a folder is refused.
     start : shape, light and exposure of another training to begin with.
     """
 
@@ -63,13 +71,14 @@ class Anew(Begin):
 
 @dataclass(frozen=True)
 class Resume(Begin):
-    """Go on from the last good checkpoint, or from the start where there is none.
+    """Continue the run that the folder holds, from its last good checkpoint.
 
-    Equals the uninterrupted run bit for bit.
+    Begins anew where the folder holds no run, or the run has no checkpoint. The result equals that
+    of the uninterrupted run bit for bit.
 
     Parameters
     ----------
-    start : that the run began with, or begins with now.
+    start : shape, light and exposure that the run began with, or begins with now.
     """
 
     start: Start | None = field(default=None, repr=False)
@@ -78,12 +87,12 @@ class Resume(Begin):
 
 @dataclass(frozen=True)
 class TakeOver(Begin):
-    """Take the first stages from another run, of the same scene and with the same settings of them.
+    """Take the first stages from another run of the same scene, trained with the same settings.
 
     Parameters
     ----------
-    source : folder of that run.
-    first_stage : the first stage that is not taken from it.
+    source : folder of the other run.
+    first_stage : name of the first stage that is not taken from it.
     replace : as for `Anew`.
     """
 
@@ -95,11 +104,14 @@ class TakeOver(Begin):
     def first_loop(
         self, dataset: Dataset, config: Config, run: RunFolder, devices: Devices
     ) -> Loop:
-        """Build the loop of a run that stands where the other one ended the stage before."""
+        """Build the loop of a run that continues where the other run ended the stage before.
+
+        See `Begin.first_loop`; the scene of the other run must be ``dataset``.
+        """
         other = RunFolder(self.source)
         other.require_same_scene(dataset)
         return adopted_loop(dataset, config, run, other, self.first_stage, devices)
 
 
 ANEW = Anew()
-"""In a folder that holds no run."""
+"""Begin in a folder that holds no run; a folder that holds one is refused."""

@@ -13,7 +13,7 @@ from geosplat_jax.core.numerics import safe_divide, safe_normalize
 from geosplat_jax.surface.base import SurfaceModel
 
 _RAYS = 4
-"""Of every face."""
+"""Rays that start from every face."""
 
 
 @partial(jax.jit, static_argnames="capacities")
@@ -26,7 +26,8 @@ def _share(
     normals, areas = face_normals_and_areas(mesh)
     middles = jnp.mean(mesh.vertices[mesh.faces], axis=1)
     count = mesh.faces.shape[0]
-    # Points of the unit sphere around the tip of the normal lie in directions drawn by the cosine.
+    # A unit normal plus a uniform unit vector has a direction whose density is proportional to the
+    # cosine.
     around = safe_normalize(jax.random.normal(key, (_RAYS, count, 3)))
     directions = safe_normalize(normals[None] + around)
     is_used = jnp.broadcast_to(mesh.face_mask & (areas > 0.0), (_RAYS, count))
@@ -43,15 +44,17 @@ def _share(
 
 
 def blocked_share(model: SurfaceModel, shape: Any, capacities: Capacities) -> float:
-    """Return the share of a uniform sky's light that a surface keeps from itself, in [0, 1].
+    """Return the share of a uniform sky's light that a surface blocks from itself, in [0, 1].
 
-    One minus the mean ambient occlusion factor, by area: 0 for whatever is convex. Rays start in
-    the middles of the faces, in directions drawn by the cosine; always the same ones. No gradients.
+    One minus the ambient occlusion factor, averaged over the surface by area: 0 for a convex
+    surface. Rays start at the centroids of the faces, in directions whose density is proportional
+    to the cosine. The random key is fixed, so the result is deterministic. Not differentiable.
 
     Parameters
     ----------
-    model, shape : the surface.
-    capacities : to begin with; what they lack is guessed, and what is too small grows.
+    model, shape : surface model and its parameters.
+    capacities : buffer sizes to begin with; missing ones are estimated, and those that are too
+        small grow.
     """
     guess = Capacities(**{**model.first_capacities(shape), **capacities})
     share, _ = retry(lambda sizes: _share(model, shape, jax.random.key(0), capacities=sizes), guess)

@@ -1,9 +1,9 @@
 """Training within a time budget: the choice of settings, and a pacer that adapts the steps.
 
-`plan` picks settings between the quality levels by what they are expected to cost on this machine.
-`Pacer` measures the steps while they are made, and makes what is left of every stage shorter or
-longer; schedules are stretched with it, so that a training which is cut short has decayed to its
-end as well.
+`plan` chooses settings between the quality levels, by the time and memory that they are expected to
+take on this machine. `Pacer` measures the steps of the training, and shortens or lengthens what is
+left of every stage. Schedules are stretched along with the steps, so that rates and weights reach
+their final values in a shortened training as well.
 """
 
 import math
@@ -31,39 +31,41 @@ from geosplat_jax.fit.start_mesh import MeshSettings
 from geosplat_jax.io.memory import memory_of_machine
 
 _EFFORTS = tuple(0.25 * number for number in range(4 * (len(QUALITIES) - 1) + 1))
-"""Places between the quality levels that are tried, in order of cost."""
+"""Efforts that `plan` tries, in order of cost: 0, 1 and 2 are the quality levels."""
 
 _SHORTEST, _LONGEST = 0.4, 3.0
-"""How far the steps of a stage may be scaled for a plan, and made more of on the way."""
+"""Smallest and largest factor by which `plan` scales the steps. The largest also limits `Pacer`,
+relative to the planned steps."""
 
 _PIXELS_PER_CELL = 6.0
 """Pixels per grid cell, along the longer side, that photographs are reduced to. The factor is a
 whole number, so up to one and a half times as many pixels may remain."""
 
 _TIMED = 5
-"""Steps that an estimate takes at least."""
+"""Fewest timed steps from which the duration of a step is estimated."""
 
 _RECENT = 20
-"""Steps that an estimate takes at most, the last ones."""
+"""Most steps that this estimate uses: the latest ones."""
 
 _EVERY = 10
-"""Steps between two looks at the clock."""
+"""Steps between two checks of the pace."""
 
 _TOLERANCE = 0.04
-"""A deviation from the time that is left without a change of pace."""
+"""Relative change of a stage's remaining steps up to which the pace stays as it is."""
 
 _FEWEST = 0.1
-"""Share of a stage's planned steps that is made however late it is."""
+"""Least share of its planned steps that a stage makes unless it is left out, however late it is."""
 
 _WORTHWHILE, _WORTHWHILE_ANEW = 30.0, 75.0
-"""A later stage is left out where it would make fewer steps than this, or than half of its planned
-steps if that is less. The first number is for stages that continue the one before, as a refinement
-does; the second is for stages that start with a new albedo of one colour, as Monte Carlo does,
-whose result is worse than none until that albedo is learned."""
+"""Fewest steps for which a later stage is worth its time, or half of its planned steps if that is
+less; a stage that would make fewer is left out. The first number is for stages that continue the
+one before, as a refinement does. The second is for stages that start with a new albedo of one
+colour, as Monte Carlo does: until that albedo is learned, the result is worse than without the
+stage."""
 
 _TO_COME_BACK = 1.2
-"""A stage that was left out is taken back when it has this many times those steps, so that a stage
-at the limit does not come and go at every look."""
+"""A stage that was left out returns when it would make this many times those steps, so that a stage
+near the limit does not come and go at every check."""
 
 _UNITS = {"s": 1.0, "sec": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
 _BYTES = {"mb": 1e6, "mib": 2.0**20, "gb": 1e9, "gib": 2.0**30}
@@ -75,7 +77,7 @@ def parse_duration(text: str) -> float:
     Raises
     ------
     ValueError
-        If it has another form.
+        If the text has another form, or the time is zero.
     """
     return _quantity(text, _UNITS, "a time reads 90s, 5min or 1.5h")
 
@@ -86,7 +88,7 @@ def parse_memory(text: str) -> float:
     Raises
     ------
     ValueError
-        If it has another form.
+        If the text has another form, or the size is zero.
     """
     return _quantity(text, _BYTES, "a memory size reads 800MB, 4GB or 4GiB")
 
@@ -106,9 +108,10 @@ class Plan:
     ----------
     config : the settings.
     downscale : factor that the photographs are to be reduced by.
-    effort : where it lies between the quality levels, 0 to 2.
-    costs : of its stages, by name.
-    seconds, memory : expected; the training and its largest resident memory in bytes.
+    effort : place between the quality levels: 0 is the lowest, 2 the highest.
+    costs : expected cost of every active stage, by name.
+    seconds : expected duration of the training.
+    memory : expected largest resident memory, bytes.
     """
 
     config: Config
@@ -156,26 +159,28 @@ def plan(
     overrides: Sequence[str] = (),
     downscale: int | None = None,
 ) -> Plan:
-    """Choose the settings that a budget pays for.
+    """Choose the settings that fit into a budget.
 
-    It takes the largest settings that fit with their own number of steps, and then scales the steps
-    to fill the time. If not even the lowest quality fits, it does the same with the first stage
-    alone, unless ``overrides`` set something of a later one: in two minutes the first stage alone
-    gave better images and shapes, and better relighting except for hard shadows (docs/trade.md).
+    The largest settings that fit with their own numbers of steps are chosen; then their steps are
+    scaled to fill the time. If not even the lowest quality fits, the same is done with the first
+    stage alone, unless ``overrides`` change a setting of a later stage: in two minutes the first
+    stage alone gave better images and shapes, and better relighting except for hard shadows
+    (docs/trade.md).
 
     Parameters
     ----------
     budget : time and memory.
-    size : height and width of the photographs as they are.
-    slowness : of this machine, see `costs.slowness_of_machine`.
+    size : height and width of the photographs in pixels, before any reduction.
+    slowness : how many times slower than the reference this machine is, see
+        `costs.slowness_of_machine`.
     material_prior, mesh, overrides : see `presets.make_config`.
-    downscale : of the photographs; chosen where it is not given, for a mesh by the cells that an
-        isosurface would have.
+    downscale : factor that the photographs are reduced by. By default it follows from the cells of
+        the grid; for a mesh, from those that an isosurface of the same effort would have.
 
     Raises
     ------
     TrainingError
-        If the time or the memory is too small for anything.
+        If no stage has steps, or the time or the memory is too small for any settings.
     """
     settings_at = partial(
         between_qualities,
@@ -194,7 +199,7 @@ def plan(
             f"more than --memory allows ({budget.memory / 1e9:.1f} GB)"
         )
     limits = [most for most in (budget.memory, _memory_here()) if most is not None]
-    # Expectations err: the least may train where it is expected not to.
+    # Expectations may be wrong: the smallest settings are tried even where they should not fit.
     fitting = [one for one in candidates if one.memory <= min(limits, default=math.inf)]
     candidates = fitting or candidates[:1]
     affordable = [one for one in candidates if one.seconds <= budget.seconds]
@@ -204,7 +209,7 @@ def plan(
     chosen = affordable[-1] if affordable else candidates[0]
     waits = sum(cost.startup for cost in chosen.costs.values())
     share = (budget.seconds - waits) / (chosen.seconds - waits)
-    # What keeps this machine busy now may end; what it cannot do when idle is hopeless.
+    # Other work on this machine may end: a budget is refused only if idle cores cannot meet it.
     least = (waits + _SHORTEST * (chosen.seconds - waits)) / max(slowness, 1.0)
     if budget.seconds < least:
         raise TrainingError(
@@ -216,7 +221,10 @@ def plan(
 
 
 def _memory_here() -> int | None:
-    """Return the memory of the machine where it computes itself: that is what is expected."""
+    """Return the memory of the machine in bytes; None where an accelerator computes.
+
+    Only memory of the machine is estimated, see `costs.expected_memory`.
+    """
     return memory_of_machine() if jax.default_backend() == "cpu" else None
 
 
@@ -237,7 +245,7 @@ def _candidate(
     slowness: float,
     downscale: int | None,
 ) -> Plan:
-    """Return the settings of an effort with what they are expected to take."""
+    """Return the plan for an effort, with the settings' own numbers of steps."""
     if downscale is None:
         cells = config.geometry.cells_along or between_qualities(effort).geometry.cells_along
         downscale = reduction_factor(max(size), cells or max(size))
@@ -248,7 +256,7 @@ def _candidate(
 
 
 def _asks_for_more(overrides: Sequence[str], config: Config) -> bool:
-    """Whether somebody has set something of a stage after the first."""
+    """Whether an override changes a setting of a stage after the first."""
     later = tuple(f"stages.{stage.name}." for stage in config.active_stages[1:])
     return any(text.startswith(later) for text in overrides)
 
@@ -262,7 +270,7 @@ def _first_stage_alone(chosen: Plan) -> Plan:
 
 
 def _without(config: Config, left_out: Sequence[Stage]) -> Config:
-    """Take all steps from some stages."""
+    """Leave some stages out, by setting their steps to 0."""
     names = {stage.name for stage in left_out}
     stages = (replace(s, steps=0, pace=()) if s.name in names else s for s in config.stages)
     return replace(config, stages=tuple(stages))
@@ -276,9 +284,9 @@ def with_steps(config: Config, share: float) -> Config:
 def _scaled(
     stage: Stage, done: int, share: float, fewest: int = 1, most: int | None = None
 ) -> Stage:
-    """Scale the steps that a stage has left after ``done`` ones; its schedules end as they would.
+    """Scale the steps that a stage has left after ``done`` ones; its schedules still end with it.
 
-    ``fewest``, ``most`` : steps of the whole stage.
+    ``fewest``, ``most`` : limits of the steps of the whole stage.
     """
     left = stage.steps - done
     if left <= 0:
@@ -295,21 +303,23 @@ def _scaled(
 
 
 def _length(stage: Stage) -> float:
-    """Return how long a stage's schedules are, in steps of their own; no pace changes that."""
+    """Return the length of a stage's schedules in planned steps, which the pace does not change."""
     return stage.position(stage.steps)
 
 
 class Pacer:
-    """Keeps a training to its time; everything that it knows of time comes from ``clock``.
+    """Keeps a training within its time budget; ``clock`` is its only source of time.
 
-    Every look begins from the schedules as they were planned, whatever the looks before it have
-    made of the stages: what was left out comes back once there is time for it again.
+    Every check starts from the planned schedules, whatever earlier checks have changed. So a stage
+    that was left out returns once there is time for it again.
 
     Parameters
     ----------
-    budget : what the training may take.
-    config : as it was planned. costs : of its stages, as they were expected.
-    clock : seconds, of any start. began : when the command began, by the clock.
+    budget : time that the training may take.
+    config : settings as they were planned.
+    costs : expected cost of every stage, by name.
+    clock : returns seconds since some fixed moment.
+    began : reading of the clock when the command began; by default now.
     """
 
     def __init__(
@@ -330,19 +340,21 @@ class Pacer:
 
     @property
     def seconds_left(self) -> float:
-        """Seconds that the budget leaves."""
+        """Seconds until the budget is used up; negative after that."""
         return self._end - self._clock()
 
     def note(self, stage: str, seconds: float) -> None:
-        """Take the time of a step into account that waited for no compiler."""
+        """Record the seconds of a step that did not wait for a compilation."""
         self._measured.setdefault(stage, []).append(seconds)
 
     def adjusted(self, config: Config, stage: Stage, done: int) -> Config | None:
-        """Return settings with other steps to come; None where those in use will do.
+        """Return settings with other numbers of steps to come; None where no change is needed.
 
         Parameters
         ----------
-        config : in use. stage : that runs. done : its steps that were made.
+        config : settings in use.
+        stage : stage that runs, as in ``config``.
+        done : steps of this stage that are done.
         """
         if done % _EVERY or len(self._measured.get(stage.name, ())) < _TIMED:
             return None
@@ -368,9 +380,12 @@ class Pacer:
         return None if adjusted == config else adjusted
 
     def _share(self, stage: Stage, ahead: float, later: Sequence[Stage]) -> float:
-        """Return the time that is left over what all schedules to come would take as planned.
+        """Return the ratio of the time left to the time that the rest of the plan would take.
 
-        ``ahead`` : of the schedule of ``stage``. ``later`` : stages, as planned.
+        The time before the first steps of later stages is subtracted from the time that is left.
+
+        ``ahead`` : what is left of the schedules of ``stage``, in planned steps. ``later`` : stages
+        to come, as planned.
         """
         work = ahead * self._step_seconds(stage.name)
         work += sum(_length(other) * self._step_seconds(other.name) for other in later)
@@ -380,7 +395,7 @@ class Pacer:
     def _too_short(
         self, later: Sequence[Stage], share: float, in_use: Collection[str]
     ) -> Sequence[Stage]:
-        """Return the first stage that is not worth the steps it would make, and all after it."""
+        """Return the first later stage that would make too few steps, and all stages after it."""
         for number, stage in enumerate(later):
             least = self._least_worthwhile(stage)
             if share * _length(stage) < (least if stage.name in in_use else _TO_COME_BACK * least):
@@ -388,19 +403,23 @@ class Pacer:
         return ()
 
     def _least_worthwhile(self, stage: Stage) -> float:
-        """Return the steps from which on a later stage is worth its time."""
+        """Return the fewest steps for which a later stage is worth its time."""
         anew = any(isinstance(entry, FreshAlbedo) for entry in stage.enter)
         least = _WORTHWHILE_ANEW if anew else _WORTHWHILE
         return min(least, 0.5 * stage.steps)
 
     def _scaled(self, stage: Stage, done: int, remaining: float) -> Stage:
-        """Give a stage so many steps after ``done`` ones, within limits of what was planned."""
+        """Give a stage ``remaining`` steps after ``done`` ones, within limits set by the plan."""
         planned = self._planned.stage(stage.name).steps
         fewest, most = math.ceil(_FEWEST * planned), math.ceil(_LONGEST * planned)
         return _scaled(stage, done, remaining / (stage.steps - done), fewest, most)
 
     def _step_seconds(self, name: str) -> float:
-        """Estimate a step: as measured, or as expected times what was wrong with the last one."""
+        """Estimate the seconds of a step: the median of measurements, or the expected cost.
+
+        An expected cost is corrected by the ratio of measured to expected seconds in the last stage
+        that was measured.
+        """
         measured = self._measured.get(name, [])
         if len(measured) >= _TIMED:
             return statistics.median(measured[-_RECENT:])

@@ -1,22 +1,26 @@
 """Refinement of cameras against a trained asset: pose, focal length and exposure of each view.
 
-The asset and its light stay as they are, so views are independent of each other: eight parameters
-each (ten with white balance), found by Levenberg-Marquardt from the difference of render and
-photograph. The columns of a Jacobian are made in forward mode (`RenderPipeline.forward_mode`),
-which suits few parameters and many pixels; visibility and depth order are found anew at every
-iterate and have no derivative.
+The asset and its light are held fixed, so views are independent of each other. Each has eight
+parameters (ten with white balance), which Levenberg-Marquardt finds from the difference of render
+and photograph. The columns of a Jacobian are computed in forward mode
+(`RenderPipeline.forward_mode`), which suits few parameters and many pixels. Visibility and depth
+order are determined at every iterate and have no derivative.
 
-Splats are shaded towards the camera to begin with, and keep their colours while the solver runs:
-cameras move by less than highlights are wide, and noise of samples would be different at every
-iterate. Then all of it is done once more, from the camera that was found (`CameraSettings.rounds`).
+Splats are shaded towards the initial camera, and keep their colours while the solver runs: cameras
+move by less than highlights are wide, and sampling noise would otherwise change at every iterate.
+Then everything is repeated from the camera that was found (`CameraSettings.rounds`).
 
-Parameters are dimensionless and of comparable effect on the image of the object: a rotation vector
-(radians) about the centre of its box, in camera axes; a shift of the object across the view in half
-extents of the box, and along it in shares of the distance; the logarithms of factors of both focal
-lengths and of the exposure; where white balance is asked for, logarithms of factors of red and
-blue, and their negative sum of green. A tint of all views is the light's: `with_mean_balance` takes
-it from the views. Rotation about the object, instead of the camera, keeps rotation and
-shift apart.
+Parameters are dimensionless, and change the image of the object by comparable amounts:
+
+- a rotation vector in radians, about the centre of the object's box, in camera axes. Rotation about
+  the object, instead of the camera, keeps rotation and shift apart;
+- a shift of the object: across the view in half extents of the box, and along the view in units of
+  the distance;
+- the logarithm of a factor of both focal lengths, and that of a factor of the exposure;
+- with white balance, the logarithms of factors of red and blue. The logarithm for green is minus
+  their sum.
+
+A tint that all views share belongs to the light: `with_mean_balance` removes it from the views.
 """
 
 from collections.abc import Callable, Mapping
@@ -53,38 +57,41 @@ BALANCE_COUNT = 2
 """Logarithms of the factors of red and blue."""
 
 UNIT = 0.01
-"""What the solver takes as one: its damping begins at one of its units."""
+"""The variables of the solver are the parameters divided by this, since its damping begins at 1 in
+units of its variables."""
 
 
 @settings
 class CameraSettings:
     """How cameras are refined; static and hashable.
 
-    The sum of squares that is made small is that of a posterior: differences in units of
-    ``pixel_deviation``, and parameters in units of ``prior_deviation``.
+    The solver minimises a sum of squares that is a negative log posterior, up to a factor: robust
+    differences in units of ``pixel_deviation``, and parameters in units of ``prior_deviation``.
     """
 
     pixel_deviation: Positive = 0.05
-    """Difference of a channel of a pixel that is nothing unusual, linear light."""
+    """Usual difference between render and photograph in one channel of a pixel, in linear light;
+    the unit of the differences."""
     prior_deviation: Positive = 0.002
-    """Deviation of each of the parameters that weighs as much as one such pixel. Errors of
-    neighbouring pixels are alike, so it is smaller than what is to be corrected, and still hardly
-    holds back what the pixels show well. It decides what they leave open, a longer lens further
-    away above all. Large: no prior."""
+    """Change of a parameter that counts as much as one such difference. It is smaller than the
+    errors that are to be corrected, since errors of neighbouring pixels are correlated, and still
+    hardly affects what the pixels determine well. It decides what they leave open, above all a
+    longer lens further away. A large value turns the prior off."""
     coverage_weight: NonNegative = 1.0
     """Weight of the squared difference of coverage and mask, beside one for each colour channel."""
     robust_deviations: Positive = 3.0
-    """Pixels beyond so many deviations count by their difference instead of its square, so that
-    what the asset lacks does not pull at the camera."""
+    """Differences of more than this many deviations count linearly instead of squared, so that
+    whatever the asset lacks does not pull at the camera."""
     rounds: PositiveCount = 2
     """How often the splats are shaded; the solver runs after each time."""
     steps: PositiveCount = 20
-    """Steps of the solver in a round at most, rejected ones included."""
+    """Most steps of the solver in a round, including rejected ones."""
     white_balance: bool = False
-    """Factors of red, green and blue for every view, beside that of the exposure."""
+    """Also find factors of red, green and blue for every view, besides that of the exposure."""
     tolerance: Positive = 1e-2
-    """The solver stops when a step moves the parameters by less than this many hundredths, and the
-    pixels by less than this many deviations, root mean square."""
+    """The solver stops when a step changes the parameters by less than this many hundredths, and
+    the differences by less than this many deviations (root mean square). Relative changes of this
+    size are allowed in addition."""
 
     @property
     def parameter_count(self) -> int:
@@ -103,11 +110,11 @@ class Baked(Illumination):
 
 
 class BakedTransport(Transport):
-    """Light that is in the colours already.
+    """Transport that returns colours which were shaded before.
 
     Attributes
     ----------
-    shaded : of all N splats.
+    shaded : colours and light of all N splats.
     """
 
     shaded: Shaded
@@ -121,7 +128,7 @@ class BakedTransport(Transport):
         index: RayIndex | None,
         carry: Any = None,
     ) -> tuple[Baked, Any]:
-        """Return the colours."""
+        """Return the stored colours as illumination, and the carry as it is."""
         return Baked(self.shaded), carry
 
     def shade(
@@ -133,7 +140,7 @@ class BakedTransport(Transport):
         illumination: Baked,
         index: RayIndex | None,
     ) -> Shaded:
-        """Return the colours."""
+        """Return the colours that the illumination of these M points holds."""
         return illumination.shaded
 
 
@@ -143,7 +150,8 @@ class Subject(eqx.Module):
     Attributes
     ----------
     pipeline, asset, illumination : see `RenderPipeline.render_lit`.
-    log_exposure : () of all views. key : of samples that depend on the viewer.
+    log_exposure : () logarithm of the exposure that all views share.
+    key : random key of the samples that depend on the viewer; None for a transport without any.
     """
 
     pipeline: RenderPipeline
@@ -153,7 +161,7 @@ class Subject(eqx.Module):
     key: Key[Array, ""] | None
 
     def seen_from(self, camera: Camera) -> "Subject":
-        """Return the same, with the colours that it has towards the camera of a single view."""
+        """Return the subject with its splats shaded once, towards the camera of a single view."""
         asset, transport = self.asset, self.pipeline.transport
         towards = camera.centers - asset.splats.means
         is_facing = jnp.sum(asset.splats.outward * towards, axis=-1) > 0
@@ -166,7 +174,7 @@ class Subject(eqx.Module):
             self.illumination,
             asset.index,
         )
-        # The colours are those of the splats, wherever the run evaluates light.
+        # Splats are shaded here, even where the run shades pixels.
         pipeline = replace(
             self.pipeline.forward_mode(), transport=BakedTransport(shaded), domain=PerSplat()
         )
@@ -197,7 +205,8 @@ class Fit(eqx.Module):
     ----------
     cost : () robust sum of squares of the pixels, without the prior.
     rms : () root mean square of the differences of colour and coverage over all pixels that count.
-    rendered, covered : () pixels that count and are covered in the render, and in the mask.
+    rendered : () sum of the render's coverage over the pixels that count.
+    covered : () sum of the mask over these pixels.
     usage : true needs of the buffers of this view.
     """
 
@@ -211,11 +220,17 @@ class Fit(eqx.Module):
 def moved_camera(
     camera: Camera, parameters: Float[Array, " P"], box: Box
 ) -> tuple[Camera, Float[Array, ""]]:
-    """Move the camera of a single view; see the module for the meaning of its parameters.
+    """Move the camera of a single view.
+
+    Parameters
+    ----------
+    camera : camera of a single view.
+    parameters : (P,) dimensionless, as the module describes them; not in units of `UNIT`.
+    box : box around the object; its centre and half extent are used.
 
     Returns
     -------
-    camera : moved; the one that was given, to rounding, where all parameters are zero.
+    camera : the moved camera; where all parameters are zero, the given one up to rounding.
     log_exposure : () logarithm of the factor of the exposure.
     """
     rotation, translation = camera.world_to_camera[0, :3, :3], camera.world_to_camera[0, :3, 3]
@@ -233,7 +248,10 @@ def moved_camera(
 
 
 def log_balance(parameters: Float[Array, " P"]) -> Float[Array, " 3"]:
-    """Logarithms of the factors of red, green and blue, whose sum is zero; zeros without them."""
+    """Return the logarithms of the factors of red, green and blue, (3,), whose sum is zero.
+
+    All are zero where ``parameters`` (P,) include no white balance.
+    """
     if parameters.shape[0] == PARAMETER_COUNT:
         return jnp.zeros(3, parameters.dtype)
     red, blue = parameters[PARAMETER_COUNT], parameters[PARAMETER_COUNT + 1]
@@ -250,12 +268,20 @@ def view_residual(
 
     Differentiable in the parameters, in forward mode if the subject's pipeline is in that mode.
 
-    Where a buffer overflowed all residuals are zero. A solver takes such a step for a perfect one
-    and stays there, so that its result betrays it; see `refine_view`.
+    Where a buffer overflowed, all residuals are zero. The solver takes such a step for a perfect
+    one and stays there, so that the usage of its result shows the overflow; see `refine_view`.
 
     Parameters
     ----------
-    parameters : in units of `UNIT`; zero is the camera of the photograph.
+    parameters : (P,) in units of `UNIT`; zero is the camera of the photograph.
+    subject : asset with colours from `Subject.seen_from`.
+    photograph : view to compare with.
+    how : settings of the refinement.
+
+    Returns
+    -------
+    residual : (R,) robust differences of all pixels and channels, then P residuals of the prior.
+    fit : how well the camera fits, without gradient.
     """
     pipeline = subject.pipeline
     camera, log_exposure = moved_camera(photograph.camera, UNIT * parameters, pipeline.surface.box)
@@ -269,7 +295,7 @@ def view_residual(
     deviations = jnp.concatenate([rgb_difference, weight * coverage_difference], axis=-1)
     robust = _robust(deviations.reshape(-1) / how.pixel_deviation, how.robust_deviations)
     prior = UNIT / how.prior_deviation * parameters
-    # The surface's needs are those of an asset that is whole.
+    # The asset is complete: needs of its own buffers do not count here.
     usage = {n: count for n, count in output.usage.items() if n not in subject.asset.usage}
     fits = capacity_module.fits(usage, pipeline.capacities)
     residual = jnp.where(fits, jnp.concatenate([robust, prior]), 0.0)
@@ -298,9 +324,9 @@ class Found(eqx.Module):
     Attributes
     ----------
     parameters : (P,) in units of `UNIT`, see `moved_camera` and `log_balance`.
-    camera : moved by them.
-    before, after : fits of the camera to begin with and of the one that was found.
-    iterations : () steps of the solver.
+    camera : the camera that these parameters give.
+    before, after : fits of the initial camera and of the refined one.
+    iterations : () steps of the solver, including rejected ones.
     """
 
     parameters: Float[Array, " P"]
@@ -343,10 +369,16 @@ def refine_view(
 ) -> tuple[Found, Capacities]:
     """Refine the camera of one view, with buffers that grow until no iterate overflows (host side).
 
+    Parameters
+    ----------
+    subject : trained asset under its light.
+    photograph : view to compare with, and its initial camera.
+    how : settings of the refinement.
+
     Returns
     -------
-    found : whether or not it is better than the camera to begin with.
-    capacities : that it took.
+    found : the refined camera, which may be worse than the initial one.
+    capacities : buffer sizes that the refinement needed.
     """
 
     def attempt(capacities: Capacities) -> tuple[Found, Usage]:
@@ -366,7 +398,14 @@ def refine_view(
 
 
 class ViewProgress(NamedTuple):
-    """What a display needs to know after a view: how many are done, of how many, and the last."""
+    """Progress of a refinement after a view.
+
+    Attributes
+    ----------
+    done, total : number of views that are done, and of all views.
+    name : name of the last view.
+    camera : its camera.
+    """
 
     done: int
     total: int
@@ -383,15 +422,19 @@ def refine_views(
 ) -> RefinedSplit:
     """Refine the camera and the exposure of every view (host side).
 
-    A view of which nothing is visible, in the render or in the mask, and one whose error did not
-    fall, keep their camera and say so.
+    A view keeps its camera, with a note of the reason, if its render or its mask shows nothing, or
+    if its error did not fall.
 
     Parameters
     ----------
-    subject : what was trained, see `Renderer.subject`.
-    views : with the cameras to begin with.
-    how : by default, see `CameraSettings`.
+    subject : trained asset under its light, see `Renderer.subject`.
+    views : views with their initial cameras.
+    how : settings; by default those of `CameraSettings`.
     on_view : called after every view.
+
+    Returns
+    -------
+    Cameras of all views by name.
     """
     how, cameras = how or CameraSettings(), {}
     for index, name in enumerate(views.names):
@@ -410,7 +453,7 @@ def refine_views(
 
 
 def _refined(found: Found, views: Views, index: int) -> RefinedCamera:
-    """Take over what was found, if it is better."""
+    """Return the refined camera of a view, or the initial one where refinement did not help."""
     note = _refusal(found)
     exposure = 1.0 if views.exposure is None else float(views.exposure[index])
     balance = np.ones(3) if views.white_balance is None else views.white_balance[index]
@@ -445,15 +488,19 @@ def _refined(found: Found, views: Views, index: int) -> RefinedCamera:
 
 
 def with_mean_balance(splits: Mapping[str, RefinedSplit]) -> dict[str, RefinedSplit]:
-    """Divide the factors of white balance, so that the mean over the training views is one.
+    """Divide the factors of white balance by their mean over the training views.
 
-    Photographs that all have a tint look like those of a light that has it; only differences
-    between views are theirs.
+    A tint of all photographs cannot be told from a tint of the light; only differences between
+    views belong to the views.
 
     Parameters
     ----------
-    splits : all of them are divided by the same, the mean over the views of ``train``, or of the
-        first split without it.
+    splits : refined splits by name. All are divided by the same mean: that over the views of
+        ``train``, or of the first split where there is no ``train``.
+
+    Returns
+    -------
+    The splits with the new factors, by name.
     """
     taught = splits.get("train", next(iter(splits.values())))
     mean = np.mean([camera.white_balance for camera in taught.cameras.values()], axis=0)

@@ -1,7 +1,8 @@
-"""Compiling the programs of a step side by side, and before the first step needs them.
+"""Compilation of the programs of a step in parallel, and before the first step needs them.
 
-XLA compiles a program on one core and without the interpreter's lock: so there are as many threads
-as cores, and one that compiles the programs of the next stage does not hold up the present one.
+XLA compiles a program on one core, and without Python's interpreter lock. So as many programs are
+compiled at a time as there are cores, and the compilation of the next stage's programs does not
+hold up the present stage.
 """
 
 import os
@@ -49,7 +50,7 @@ class _Compiling(Runner):
                 compiled = traced.lower().compile()
             require_program_memory(program.__name__.strip("_"), compiled, devices.count_here)
             if not (is_alone or fits_twice(compiled)):
-                self.fits_twice = False  # nobody sets it again, so threads cannot undo each other
+                self.fits_twice = False  # never set to True again, so threads need no lock
 
         self.compiling.append(in_background(finish))
         return devices.shapes(traced.out_info)
@@ -67,19 +68,23 @@ def compile_step(
 ) -> bool:
     """Compile the programs of `step.train_step` for arguments of these shapes; run none of them.
 
-    A later call with such arguments finds them compiled. What does not fit into the memory is
-    refused, see `memory.require_program_memory`.
+    A later call with arguments of these shapes finds the programs compiled.
 
     Parameters
     ----------
     state, batch, pipeline, rule : arrays, or their shapes.
-    devices : that the programs are for.
-    threads : programs that are compiled at a time.
-    is_wanted : asked before each of them; the rest is left out once it says no.
+    devices : devices that the programs run on.
+    threads : programs that are compiled at the same time.
+    is_wanted : asked before each compilation; once it returns False, the rest is left out.
 
     Returns
     -------
-    Whether the memory holds two at a time of those that do not wait for each other.
+    Whether the memory holds two at a time of the programs that may run side by side.
+
+    Raises
+    ------
+    TrainingError
+        If a program does not fit into the memory, see `memory.require_program_memory`.
     """
     compiling = _Compiling(devices, threads, is_wanted)
     try:
@@ -87,7 +92,7 @@ def compile_step(
         for one in compiling.compiling:
             one.result()
     except BaseException:
-        # No thread goes on for a step that will not be made.
+        # Stop the other threads: the step will not be made.
         compiling.is_wanted = lambda: False
         wait(compiling.compiling)
         raise

@@ -45,7 +45,7 @@ TRANSPORTS = (SplitSumSettings, MonteCarloSettings, PathSettings)
 """Transports that a run may name: a kind is known once its class is imported."""
 
 LABELS = {"preset": "--preset", "quality": "--quality", "material_prior": "--material-prior"}
-"""Fields of `Config` that only say what was asked for, and the options that ask."""
+"""Fields of `Config` that only record what was requested, and the options that set them."""
 
 
 @settings
@@ -57,8 +57,8 @@ class Rate:
     warmup: Count = 0
     """Steps over which the rate rises from zero, quadratically."""
     half_life: PositiveOrNone = None
-    """Steps after which the rate has halved; none takes the stage's. Without effect where the stage
-    decays linearly."""
+    """Steps after which the rate has halved; none: the half-life of the stage. Without effect where
+    the stage decays linearly."""
 
 
 @settings
@@ -66,16 +66,16 @@ class Pace:
     """A change of how fast a stage goes through its schedule."""
 
     step: Count = 0
-    """Steps after the stage's start that were made before."""
+    """Number of the stage's steps before the change."""
     speed: Positive = 1.0
-    """Steps of the schedule to one step from here on."""
+    """Steps of the schedules per training step from then on."""
 
 
 @settings
 class Stage:
-    """A part of a run with settings of its own; Adam starts afresh, schedules count from its start.
+    """A part of a run with its own settings; Adam and all schedules start anew with it.
 
-    A stage without steps is left out.
+    A stage with 0 steps is left out.
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")] = "stage"
@@ -88,34 +88,37 @@ class Stage:
     half_life: Positive = 800.0
     """Steps after which rates have halved."""
     decay: Literal["exponential", "linear"] = "exponential"
-    """How rates fall: by half-lives, or all along a line that is zero at the stage's end."""
+    """How rates decay: by half-lives, or linearly to zero at the end of the stage."""
     vertex_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """Share of the stage's steps that sample vertices instead of faces (Eq. 12). It spares memory
-    while a random first surface is rough; a visual hull needs none of it."""
+    """Share of the stage, from its start, in which splats are sampled at vertices instead of faces
+    (Eq. 12). This saves memory while a random first surface is rough; a visual hull does not need
+    it."""
     light_knee: NonNegative = 0.5
-    """Radiance above which the light's steps grow with its brightness; 0 is never."""
+    """Radiance at which the steps of a texel of the light double: they grow with its brightness, by
+    a factor of 1 + radiance / light_knee. 0: they do not grow."""
     light_pyramid: Annotated[float, Field(ge=0, le=1)] = 0.4
     """Share of its own step that every level of the light's pyramid contributes: regions then learn
     together, and single texels hold less noise. 0 turns the pyramid off."""
     transport: Annotated[TransportSettings, ANY_KIND] = SplitSumSettings()
-    """How light arrives."""
+    """Light transport: how the light that reaches a point is computed."""
     splats: Annotated[SplatSettings, ANY_KIND] = FaceSplatSettings()
-    """What is put on the surface."""
+    """Which splats represent the surface."""
     domain: Annotated[ShadingDomain, ANY_KIND] = PerSplat()
-    """Where light transport is evaluated."""
+    """Where light transport is evaluated: per splat or per pixel."""
     enter: tuple[Annotated[Entry, ANY_KIND], ...] = ()
-    """What happens to the parameters at the start of the stage, in order."""
+    """Changes of the parameters at the start of the stage, in order."""
     rates: dict[str, Rate] = field(default_factory=dict)
     """Learning rates by group of parameters."""
     weights: dict[str, Schedule] = field(default_factory=dict)
     """Weights of the loss by term."""
     pace: tuple[Pace, ...] = ()
-    """What a budget of time changed on the way (`budget.Pacer`), in order."""
+    """Changes of speed that a time budget made during the training (`budget.Pacer`), in order."""
 
     def position(self, step: int) -> float:
-        """Tell how far the schedules are, ``step`` steps after the stage's start.
+        """Return how far the schedules have come, ``step`` steps after the stage's start.
 
-        In steps of a stage that keeps its pace: all half-lives and warm-ups are counted in these.
+        Counted in the steps of a stage without changes of pace; half-lives and warm-ups are counted
+        in the same unit.
         """
         begun, reached, speed = 0, 0.0, 1.0
         for change in self.pace:
@@ -126,11 +129,14 @@ class Stage:
         return reached + (step - begun) * speed
 
     def progress(self, step: int) -> float:
-        """Tell the share of the schedules that is behind, from 0 to 1."""
+        """Return the share of the schedules that is done after ``step`` steps, from 0 to 1."""
         return self.position(step) / max(self.position(self.steps), 1.0)
 
     def weights_at(self, step: int) -> dict[str, float]:
-        """Weights of all terms that ever count, ``step`` steps after the stage's start."""
+        """Weights by term, ``step`` steps after the stage's start.
+
+        Terms whose weight is always 0 are left out.
+        """
         progress = self.progress(step)
         return {
             name: schedule.at(progress)
@@ -149,7 +155,7 @@ class Stage:
         }
 
     def _decayed(self, step: int, rate: Rate) -> float:
-        """Tell the share of a rate that its decay leaves."""
+        """Return the factor in [0, 1] by which a rate has decayed."""
         if self.decay == "linear":
             return max(1.0 - self.progress(step), 0.0)
         return 0.5 ** (self.position(step) / (rate.half_life or self.half_life))
@@ -165,9 +171,9 @@ class Budget:
     """What a training may take, see `budget.plan`."""
 
     seconds: Positive
-    """From the start of the command to the last checkpoint, compilation included."""
+    """Seconds from the start of the command to the last checkpoint, compilation included."""
     memory: PositiveOrNone = None
-    """Largest resident memory, bytes; none is as much as the machine has."""
+    """Largest resident memory in bytes; none: as much as the machine has."""
 
 
 @settings
@@ -191,14 +197,14 @@ class RunSettings:
 
 @settings
 class Config:
-    """Everything that a run depends on beside the scene."""
+    """All settings of a run."""
 
     preset: str = "default"
-    """Which method was asked for."""
+    """Name of the requested preset."""
     quality: str = "standard"
-    """How much work was asked for."""
+    """Name of the requested quality level."""
     material_prior: str = "hybrid"
-    """Guess about the material that was asked for."""
+    """Name of the requested material prior."""
     geometry: Annotated[SurfaceSettings, ANY_KIND] = FlexiCubesSettings()
     """The surface and where it starts."""
     adapter: AdapterConstants = AdapterConstants()
@@ -217,7 +223,7 @@ class Config:
     """What is trained, one after the other."""
 
     def __post_init__(self) -> None:
-        """Refuse stages of one name, too many steps, and names that nothing answers to."""
+        """Refuse stages of the same name, too many steps, and unknown weights or rates."""
         names = [stage.name for stage in self.stages]
         if len(set(names)) < len(names):
             raise ValueError(f"stages need names of their own, got {names}")
@@ -241,7 +247,7 @@ class Config:
                     )
 
     def _check_splats(self, stage: Stage, number: int) -> None:
-        """Refuse splats that belong to the faces of a surface which moves, or was not there."""
+        """Refuse free splats where the stage before or the surface does not allow them."""
         if not stage.splats.takes_over or not stage.steps:
             return
         before = [earlier for earlier in self.stages[:number] if earlier.steps]
@@ -307,7 +313,7 @@ class Config:
         return [stage.name for stage in self.stages]
 
     def first_step(self, name: str) -> int:
-        """Step that a stage starts at."""
+        """Return the step of the run at which a stage starts; ValueError for an unknown name."""
         before = self.stages[: self.stage_names.index(self.stage(name).name)]
         return sum(stage.steps for stage in before)
 
@@ -328,7 +334,7 @@ class Config:
 
 
 KNOWN_KINDS = (FreeSplatSettings, MeshSettings, PerPixel)
-"""Kinds of settings that nothing else here imports: one that is not imported cannot be read."""
+"""Kinds of settings that are imported for this alone: only kinds that are imported can be read."""
 
 
 def config_from_dict(values: Any) -> Config:
@@ -337,8 +343,8 @@ def config_from_dict(values: Any) -> Config:
     Raises
     ------
     ValueError
-        With one line for each setting that is unknown, has moved, or has a value that it cannot
-        have.
+        With one line for each setting that is unknown or has an invalid value. For settings of an
+        earlier version: with one line that counts them, and says where the first one is now.
     """
     _require_current(values)
     stages, problems = [], []
@@ -363,7 +369,7 @@ def _stages_of(values: dict[str, Any]) -> dict[str, dict[str, Any]]:
     Raises
     ------
     ValueError
-        If they are no sections.
+        If ``stages``, or one of them, is not a section.
     """
     stages = values.get("stages", {})
     if not isinstance(stages, dict):
@@ -411,11 +417,11 @@ _MOVED = (
     (r"objective\.with_light", r"stages.split_sum.weights.light"),
     (r"kind", r"material_prior"),
 )
-"""Old paths of settings, and where they are now."""
+"""Patterns of the paths that settings had in earlier versions, and their paths now."""
 
 
 def moved_setting(path: str) -> str | None:
-    """Tell where a setting of an earlier version is now; None for any other."""
+    """Return the present path of a setting of an earlier version; None for any other path."""
     if re.match(r"transport\.(rates|loss)\.", path):
         later = moved_setting(path.removeprefix("transport."))
         return later and later.replace("split_sum", "monte_carlo")
@@ -427,7 +433,7 @@ def moved_setting(path: str) -> str | None:
 
 
 def _require_current(values: Any) -> None:
-    """Refuse settings of an earlier version by their new names."""
+    """Refuse settings of an earlier version, and say where the first one is now."""
     if not isinstance(values, dict):
         raise ValueError(f"settings must be an object with sections, got {values!r}")
     old = [path for path in _flat(values) if not path.startswith("stages.")]
@@ -459,7 +465,7 @@ def parse_override(text: str) -> dict[str, Any]:
         raise ValueError(f"the setting {name} is now {now}")
     try:
         parsed = tomllib.loads(f"value = {value}")["value"]
-        # What JSON lacks, which is dates and times, is text.
+        # Dates and times, which JSON lacks, become text.
         parsed = json.loads(json.dumps(parsed, default=str))
     except tomllib.TOMLDecodeError:
         parsed = value.strip()
@@ -470,14 +476,19 @@ def parse_override(text: str) -> dict[str, Any]:
 
 
 _OPEN = re.compile(r"stages\.\w+\.(rates|weights)\.")
-"""Sections that take names which the preset lacks; `Config` checks them."""
+"""Sections in which overrides may add names to those of the preset; `Config` checks the names."""
 
 
 def merge(base: dict[str, Any], changes: dict[str, Any], where: str = "") -> dict[str, Any]:
-    """Overlay nested ``changes`` on ``base``; a name that ``base`` lacks is an error.
+    """Overlay nested ``changes`` on ``base``.
 
-    A number in the place of a section with a ``value`` sets that, and leaves the rest. A section
-    with another ``kind`` replaces the whole.
+    A number in the place of a section with a ``value`` replaces that value, and keeps the rest of
+    the section. A section of another ``kind`` replaces the whole section.
+
+    Raises
+    ------
+    ValueError
+        If ``base`` lacks a name, except in the rates and weights of a stage.
     """
     merged = dict(base)
     for name, value in changes.items():
@@ -513,7 +524,8 @@ def changed_settings(
 ) -> dict[str, tuple[Any, Any]]:
     """Map every setting in which two configurations differ to both values.
 
-    ``stages`` : compare these stages only, beside what all stages share.
+    ``stages`` : names of the stages to compare, by default all. What all stages share is always
+    compared.
     """
 
     def flat(config: Config) -> dict[str, Any]:
@@ -537,7 +549,7 @@ def differences(first: Config, second: Config, *, stages: list[str] | None = Non
 
 
 def config_warnings(config: Config) -> list[str]:
-    """Say what of a configuration has no effect, or hardly one, though it was asked for."""
+    """Return warnings about settings without effect, or with one that is hardly intended."""
     warnings = []
     for stage in config.active_stages:
         for name, rate in stage.rates.items():
@@ -587,7 +599,7 @@ def config_warnings(config: Config) -> list[str]:
 
 
 def _changes_of_blocked_light(config: Config) -> list[str]:
-    """Say where a stage drops what the one before it has found out about blocked directions."""
+    """Describe where a stage drops the indirect light that the stage before it has learned."""
     traced = [stage for stage in config.active_stages if stage.transport.blocked_light]
     return [
         f"stages.{after.name}.transport.{after.transport.blocked_light} takes the place of "

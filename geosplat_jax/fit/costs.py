@@ -1,10 +1,11 @@
 """Cost model of a training: seconds per step and memory, from its settings, on this machine.
 
-The model is a sum of terms, each a count of work times a constant that runs were fitted to
-(`experiments/studies/costs.py`, by optimistix). How fast this machine is, a kernel tells whose time
-is known. The constants explain idle runs of three objects to 8 % where the number of splats is
-known, 12 % since steps that trace rays became faster. Before a run it is not, and a prediction is
-good to a third; `budget.Pacer` measures while the training runs, and corrects.
+The model is a sum of terms, each an amount of work times a constant. The constants were fitted to
+runs (`experiments/studies/costs.py`). The speed of this machine is measured with a kernel whose
+time on the reference machine is known. Where the number of splats is known, the constants explain
+runs of three objects on idle machines to 8 %, and to 12 % since steps that trace rays became
+faster. Before a run this number is not known, and predictions are good to a third; `budget.Pacer`
+corrects them by measurements during the training.
 """
 
 import statistics
@@ -22,10 +23,11 @@ from geosplat_jax.fit.config import Config, Stage
 _SPLATS_UNIT, _PIXELS_UNIT = 1e5, 1e5
 
 _REFERENCE_MS = 2.9
-"""The kernel's time on the machine that the constants are of, two idle cores of an AMD EPYC."""
+"""Time of `exponential_milliseconds` on the machine that the constants were fitted on: two idle
+cores of an AMD EPYC."""
 
 _MEMORY_MB = (1800.0, 3700.0)
-"""Resident memory without splats, and for 100,000 of them, at most; in MB."""
+"""Largest resident memory without splats, and what 100,000 splats add to it, in MB."""
 
 COST_NAMES = ("step", "splats", "rays", "views", "specular", "pixels")
 """The terms of the seconds of a step, see `work_of`."""
@@ -41,8 +43,8 @@ COST_SECONDS: Mapping[str, float] = {
 """Seconds of each unit of `work_of` on the reference machine."""
 
 _FASTEST_CPU, _FASTEST_GPU = 0.2, 0.05
-"""Least slowness that is believed. Steps of the full size took an H200 a quarter of what .2 makes
-of them (docs/devices.md)."""
+"""Least slowness that is assumed for a CPU and for a GPU. Steps of the full size took an H200 a
+quarter of the time that a slowness of 0.2 predicts (docs/devices.md)."""
 
 _STARTUP_SECONDS = {"first": 30.0, "next": 20.0}
 """Seconds before the first step of the first stage, and of any other; they include compilation."""
@@ -50,11 +52,11 @@ _STARTUP_SECONDS = {"first": 30.0, "next": 20.0}
 
 @dataclass(frozen=True)
 class StageCost:
-    """What a stage is expected to take.
+    """Time that a stage is expected to take.
 
     Attributes
     ----------
-    startup : seconds before its first step ends.
+    startup : seconds before its first step ends, compilation included.
     step : seconds of any other step.
     """
 
@@ -63,11 +65,17 @@ class StageCost:
 
 
 def work_of(stage: Stage, splats: float, pixels: float) -> dict[str, float]:
-    """Count the work of a step by the names of `COST_NAMES`.
+    """Return the amount of work in a step, by the names of `COST_NAMES`.
 
     Parameters
     ----------
-    splats : on the surface, whether seen or not. pixels : of a view.
+    stage : settings of the stage.
+    splats : number of splats on the surface, whether seen or not.
+    pixels : number of pixels of a view.
+
+    Returns
+    -------
+    Amounts whose seconds per unit are `COST_SECONDS`. Splats and pixels count in units of 100,000.
     """
     transport, views, hundred_thousand = stage.transport, stage.batch_views, splats / _SPLATS_UNIT
     shared = sum(
@@ -84,12 +92,14 @@ def work_of(stage: Stage, splats: float, pixels: float) -> dict[str, float]:
 
 
 def expected_costs(config: Config, pixels: float, *, slowness: float) -> dict[str, StageCost]:
-    """Predict every active stage, by name.
+    """Predict the cost of every active stage, by name.
 
     Parameters
     ----------
-    pixels : of a view. slowness : of this machine, see `slowness_of_machine`. However fast an
-        accelerator is, programs for it are compiled by a processor.
+    config : settings of the run.
+    pixels : number of pixels of a view.
+    slowness : see `slowness_of_machine`. The startup takes at least the reference time where an
+        accelerator is used, since a processor compiles the programs for it.
     """
     costs, compiling = {}, slowness if jax.default_backend() == "cpu" else max(slowness, 1.0)
     for number, stage in enumerate(config.active_stages):
@@ -115,7 +125,7 @@ def expected_memory(config: Config, pixels: float) -> float:
 
 
 def kernel_milliseconds(function: Callable[[Any], Any], argument: Any, repeats: int = 9) -> float:
-    """Median time of a compiled function."""
+    """Return the median time of calls of a compiled function, ms; the first call is not counted."""
     jax.block_until_ready(function(argument))
     times = []
     for _ in range(repeats):
@@ -126,15 +136,19 @@ def kernel_milliseconds(function: Callable[[Any], Any], argument: Any, repeats: 
 
 
 def exponential_milliseconds(repeats: int = 71) -> float:
-    """Time ``sum(exp(x))`` over 16M float32; long enough that what else runs comes and goes."""
+    """Return the median time of ``sum(exp(x))`` over 16M float32 numbers, ms.
+
+    There are so many repeats that short interruptions by other programs do not matter.
+    """
     values = jnp.linspace(-1.0, 1.0, 1 << 24)
     return kernel_milliseconds(jax.jit(lambda x: jnp.sum(jnp.exp(x))), values, repeats)
 
 
 def slowness_of_machine() -> float:
-    """Tell how many times slower than the reference this machine is at this moment.
+    """Measure how many times slower than the reference this machine is at this moment.
 
-    An accelerator is not as much faster in the steps of a training as in exponentials.
+    At most 10, and at least `_FASTEST_CPU` or `_FASTEST_GPU`: an accelerator gains more in
+    exponentials than in the steps of a training.
     """
     fastest = _FASTEST_CPU if jax.default_backend() == "cpu" else _FASTEST_GPU
     return float(np.clip(exponential_milliseconds() / _REFERENCE_MS, fastest, 10.0))

@@ -1,12 +1,13 @@
 """The devices that a training computes on: one, or several that share the views of each step.
 
-With several, each device holds all parameters and makes the whole asset, since that costs no
-communication; the views of a batch are dealt out, and two sums go over the devices in a step: which
-splats are seen, and the gradient, in which the parameters get the same numbers everywhere. The
-programs are those of one device (`gradient`, `step`), each within a `jax.shard_map`; the mesh spans
-all processes that `jax.distributed` knows, and every process calls the same programs in the same
-order. So whatever decides between two steps has to be the same on all hosts: it comes out of the
-programs, or is asked for with `Devices.any_host` and `Devices.first_host`.
+With several devices, each one holds all parameters and builds the whole asset, which needs no
+communication. The views of a batch are dealt out to them. Two reductions in a step go over all
+devices: which splats are seen, and the sum of the gradients, after which the parameters are the
+same everywhere. The programs are those of one device (`gradient`, `step`), each inside a
+`jax.shard_map`. The mesh of devices spans all processes that `jax.distributed` knows, and every
+process calls the same programs in the same order. Decisions between two steps must therefore be the
+same on all hosts: they follow from results of the programs, or from `Devices.any_host` and
+`Devices.first_host`.
 """
 
 import json
@@ -32,7 +33,8 @@ from geosplat_jax.pipeline import ViewReport
 
 _AXIS = "views"
 _SAME, _OWN = PartitionSpec(), PartitionSpec(_AXIS)
-"""What all devices have alike, and what each has of its own: the first axis counts the devices."""
+"""Placement of arrays that are the same on all devices, and of arrays whose first axis counts the
+devices."""
 
 _FORCED = "xla_force_host_platform_device_count"
 
@@ -40,31 +42,34 @@ _Result = TypeVar("_Result")
 
 
 class Devices:
-    """One device: nothing is placed, and nobody has to be asked; `ManyDevices` for several."""
+    """A single device, which needs no placement of arrays and no agreement of hosts.
+
+    See `ManyDevices` for several devices.
+    """
 
     count = 1
-    """Devices of all hosts."""
+    """Number of devices of all hosts."""
     count_here = 1
-    """Those of this process."""
+    """Number of devices of this process."""
     is_first_host = True
     """Whether this process is the one that writes the run's folder."""
 
     def program(self, program: Any) -> Any:
-        """Return what stands for a program of `gradient` or `step` on these devices."""
+        """Return the version of a program of `gradient` or `step` that runs on these devices."""
         return program
 
     def runner(self, *, fits_twice: bool = False) -> Runner:
-        """Return what calls programs on these devices.
+        """Return the `Runner` that calls programs on these devices.
 
-        ``fits_twice`` : whether the memory holds two of them at a time.
+        ``fits_twice`` : whether the memory holds two programs at a time.
         """
         if jax.default_backend() != "cpu":
             return QUEUED
         return SideBySide() if fits_twice else IN_TURN
 
     def shapes(self, tree: Any) -> Any:
-        """Return a tree with the shapes of its arrays, and where they lie, for compilation."""
-        # Weak types too: another type is another program.
+        """Replace the arrays of a tree by their shapes and placements, for compilation."""
+        # Keep weak types: for another type another program would be compiled.
         return _mapped(
             lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=_is_weak(x)), tree
         )
@@ -74,11 +79,11 @@ class Devices:
         return tree
 
     def place_again(self, tree: Any) -> Any:
-        """Put a tree on all devices, of which most arrays are those of the call before."""
+        """Put arrays on all devices, without copying those that the previous call has placed."""
         return tree
 
     def local(self, tree: Any) -> Any:
-        """Return arrays that all devices have alike as arrays of one device of this process."""
+        """Return arrays that all devices share as arrays of one device of this process."""
         return tree
 
     def share_out(self, batch: Batch) -> Batch | SharedBatch:
@@ -90,16 +95,16 @@ class Devices:
         return flag
 
     def first_host(self, value: Any) -> Any:
-        """Return the first host's value, which JSON can hold."""
+        """Return the value that the first host passed; it must be representable in JSON."""
         return value
 
     def together(self, action: Callable[[], _Result]) -> _Result:
-        """Do on every host what may fail on some; where it does, it fails on all.
+        """Call a function on every host; where it fails on one host, it fails on all.
 
         Raises
         ------
         TrainingError
-            Where it went well here, and failed elsewhere.
+            If the function succeeded on this host and failed on another.
         """
         return action()
 
@@ -118,16 +123,16 @@ def _is_placed(x: Any) -> bool:
 
 
 def _mapped(change: Callable[[Any], Any], tree: Any) -> Any:
-    """Change arrays and their shapes, and leave all else of a tree."""
+    """Apply a function to the arrays of a tree, or their shapes; leave everything else as it is."""
     return jax.tree.map(lambda x: change(x) if hasattr(x, "dtype") else x, tree)
 
 
 class ManyDevices(Devices):
-    """Several devices, of this process or of several.
+    """Several devices, of one or of several processes.
 
     Parameters
     ----------
-    devices : one or more of every process, see `choose_devices`.
+    devices : JAX devices, at least one of every process; see `choose_devices`.
     """
 
     def __init__(self, devices: list[Any]) -> None:
@@ -151,7 +156,7 @@ class ManyDevices(Devices):
         return _programs(self.mesh)[program]
 
     def runner(self, *, fits_twice: bool = False) -> Runner:
-        """See `Devices.runner`; never two at a time, since all hosts need the same order."""
+        """See `Devices.runner`; programs run one at a time, since all hosts need the same order."""
         return _OnAll(self)
 
     def shapes(self, tree: Any) -> Any:
@@ -192,10 +197,10 @@ class ManyDevices(Devices):
         return _mapped(lambda x: x.addressable_data(0) if _is_placed(x) else x, tree)
 
     def share_out(self, batch: Batch) -> SharedBatch:
-        """See `Devices.share_out`: view n lies on device n modulo their number.
+        """See `Devices.share_out`: view n goes to device n modulo the number of devices.
 
-        Where the views do not divide evenly, the last one fills up the last round with a share of
-        0: it costs time that would be waited for anyhow, and adds nothing.
+        Where the views do not divide evenly, copies of the last view fill up the last round. Their
+        share is 0, so they add nothing; they cost no time, since their devices would have to wait.
         """
         count, rounds = batch.count, -(-batch.count // self.count)
         numbers = jnp.arange(count, dtype=jnp.int32)
@@ -238,7 +243,7 @@ class ManyDevices(Devices):
             return value
         text = np.frombuffer(json.dumps(value).encode(), np.uint8)
         length = int(multihost_utils.broadcast_one_to_all(np.int32(text.size)))
-        # Broadcast sizes must agree, whatever another host would have said.
+        # Broadcast arrays must have the same size on all hosts: repeat or cut this text to it.
         mine = np.resize(text, length)
         return json.loads(np.asarray(multihost_utils.broadcast_one_to_all(mine)).tobytes())
 
@@ -255,7 +260,7 @@ class ManyDevices(Devices):
 
 
 class _OnAll(Runner):
-    """Calls programs on many devices; what lies nowhere in particular is put on all before."""
+    """Calls programs on many devices, after placing those arguments that are not placed yet."""
 
     def __init__(self, devices: ManyDevices) -> None:
         self.devices = devices
@@ -276,7 +281,7 @@ def _own(tree: Any) -> Any:
 
 
 def _common(batch: SharedBatch) -> Batch:
-    """Return a batch with key and carry of a step, and a picture of one pixel that nobody reads."""
+    """Return a batch with the key and carry of a step; camera and image are placeholders."""
     eye = jnp.zeros((1, 4, 4)), jnp.zeros((1, 3, 3))
     return Batch(Camera(*eye, 1, 1), jnp.zeros((1, 1, 1, 4)), batch.key, carry=batch.carry)
 
@@ -347,11 +352,11 @@ def _back(
     carry: Any,
     frozen: tuple[str, ...],
 ) -> Any:
-    """See `gradient._back`: every device goes back from its own views, then all are added up.
+    """See `gradient._back`: every device backpropagates its own views; gradients are summed.
 
-    Terms that no view has a part in count on each device for its part of them. What is not added
-    up is taken from the first device, since the same numbers added in another order, as a GPU does
-    it, are other numbers, and parameters must not come apart.
+    Terms that depend on no view are evaluated by every device, with weights divided by the number
+    of devices. Other results are taken from the first device: a GPU may add up the same numbers in
+    another order and round differently, and parameters must stay the same everywhere.
     """
     found, report = _local(views)
     part = 1.0 / jax.lax.axis_size(_AXIS)
@@ -392,14 +397,14 @@ def _of_first_device(tree: Any) -> Any:
 
 @cache
 def _programs(mesh: Mesh) -> dict[Any, Any]:
-    """Return what stands for each program of `gradient` and `step` on the devices of a mesh."""
+    """Map each program of `gradient` and `step` to its version for the devices of a mesh."""
     specs_of_batch: Any = (_OWN, _SAME, _SAME)
     batch = SharedBatch(*specs_of_batch)
 
     def spread(
         body: Callable[..., Any], arguments: Iterable[Any], result: Any, **options: Any
     ) -> Any:
-        """Compile ``body`` for all devices; arguments and result lie as their specs say."""
+        """Compile ``body`` for all devices; specs say how its arguments and results are placed."""
         specs = tuple(arguments)
 
         def program(*values: Any) -> Any:
@@ -432,20 +437,20 @@ def _programs(mesh: Mesh) -> dict[Any, Any]:
 
 
 def choose_devices(count: int = 1) -> Devices:
-    """Return the devices of a training: so many of every process.
+    """Return the devices of a training: ``count`` of every process.
 
-    Where there is no accelerator, the processor is made into so many devices, which share its
-    cores: that is for trying things out. Several processes must be connected before, with
+    Without an accelerator the processor is split into that many devices, which share its cores;
+    this is meant for tests. Several processes must be connected beforehand, with
     `jax.distributed.initialize`.
 
     Parameters
     ----------
-    count : of this process; every process must say the same.
+    count : number of devices of this process; the same in every process.
 
     Raises
     ------
     TrainingError
-        If there are fewer, or none are asked for.
+        If ``count`` is less than 1, or a process has fewer devices.
     """
     if count < 1:
         raise TrainingError(f"a training needs at least one device, got {count}")
@@ -453,7 +458,7 @@ def choose_devices(count: int = 1) -> Devices:
         try:
             jax.config.update("jax_num_cpu_devices", count)
         except RuntimeError:
-            pass  # jax runs already: what it has is counted below
+            pass  # jax is initialised already; its devices are counted below
     there = jax.local_devices()
     if len(there) < count:
         raise TrainingError(
@@ -478,15 +483,15 @@ def connect_hosts(
 
     Parameters
     ----------
-    hosts : number of processes; ``auto`` for what Slurm, Open MPI, Kubernetes or a TPU pod say.
-    host : number of this one, from 0.
-    coordinator : ADDRESS:PORT of the process 0, which all others can reach.
+    hosts : number of processes; ``auto`` to take it from Slurm, Open MPI, Kubernetes or a TPU pod.
+    host : number of this process, from 0.
+    coordinator : ADDRESS:PORT of process 0, which all others must be able to reach.
     patience : seconds without a sign of life after which a process is taken for dead.
 
     Raises
     ------
     TrainingError
-        If they do not find each other, it is not known how many there are, or the coordinator has
+        If the processes do not find each other, their number is not known, or the coordinator has
         no port.
     """
     if coordinator is not None and not re.fullmatch(r".+:\d+", coordinator):

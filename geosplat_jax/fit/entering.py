@@ -25,22 +25,27 @@ from geosplat_jax.surface.base import SurfaceModel
 
 _GREY = 0.5
 _DARKEST = 0.02
-"""A first albedo lies between this and its complement, where the sigmoid still has a slope."""
+"""A new albedo is clipped to the range from this to one minus this, where the sigmoid has a
+slope."""
 
 
 class Start(eqx.Module):
-    """Where a training begins that takes shape, light and exposure over from another one.
+    """Shape, light and exposure of another training, with which a training begins.
 
     Attributes
     ----------
-    surface : model of the surface. params : that the other training ended with.
+    surface : surface model of the other training.
+    params : parameters that the other training ended with.
     """
 
     surface: SurfaceModel
     params: Params
 
     def applied(self, params: Params) -> Params:
-        """Put what is taken over in the place of new parameters; the light takes their size."""
+        """Return new parameters with the shape, light and exposure of the other training.
+
+        Its light is resampled to the size of the light in ``params``.
+        """
         radiance = jax.image.resize(
             self.params.light.radiance, params.light.radiance.shape, "linear", antialias=True
         )
@@ -57,7 +62,8 @@ class IndirectHead(NamedTuple):
 
     Attributes
     ----------
-    outputs : numbers per point. goes_on : whether they mean what they meant in the stage before.
+    outputs : learned numbers per point; 0 for none.
+    goes_on : whether these numbers mean what they meant in the stage before.
     """
 
     outputs: int
@@ -74,9 +80,9 @@ class Entry(Variant, abc.ABC):
 
         Parameters
         ----------
-        params : that the stage before ended with.
-        pipeline : of the stage before.
-        key : of what is drawn.
+        params : parameters that the stage before ended with.
+        pipeline : pipeline of the stage before.
+        key : random key of new values.
         """
 
 
@@ -88,11 +94,11 @@ class FreshAlbedo(Entry, kind="fresh_albedo"):
     """
 
     colour: Literal["mean", "grey"] = "mean"
-    """The mean of the field beside the surface, so that light keeps its colour and brightness; or
-    grey, where the field before stored radiance."""
+    """Colour of the new field. The mean of the old field near the surface keeps the colour and
+    brightness of the light; grey is for an old field that stored radiance."""
 
     def apply(self, params: Params, pipeline: Pipeline, key: Key[Array, ""]) -> Params:
-        """Draw the albedo's part of the field."""
+        """Return parameters with a new albedo head, and a new table where it is not shared."""
         colour = jnp.full((3,), _GREY)
         if self.colour == "mean":
             colour = mean_albedo(params, pipeline)
@@ -105,7 +111,7 @@ class FreshAlbedo(Entry, kind="fresh_albedo"):
 
 @jax.jit
 def mean_albedo(params: Params, pipeline: Pipeline) -> Float[Array, " 3"]:
-    """Average the albedo field beside the surface; grey where there is none."""
+    """Average the albedo field near the surface, (3,) linear; grey where there is no surface."""
     points, weights = pipeline.surface.nearby_points(params.geometry)
     dtype = params.material.albedo_table.dtype
     points, weights, box = jax.tree.map(
@@ -134,16 +140,22 @@ def enter_stage(
 ) -> Params:
     """Turn the parameters that a stage ends with into those that the next one starts with.
 
-    What the entries do not change stays. Indirect light gets a head where the stage learns it, and
-    splats parameters where they learn any.
+    Parameters that no entry changes stay as they are. The head of indirect light is replaced, by
+    none or a new one, unless it keeps its meaning. Free splats get parameters of their own.
 
     Parameters
     ----------
-    params, pipeline : of the stage before; where splats learn, its buffers hold the surface.
-    entries : of the stage to come, in order.
-    splats : of the stage to come.
-    indirect : what the stage to come learns of indirect light.
-    key : of what is drawn.
+    params : parameters that the stage before ended with.
+    pipeline : pipeline of the stage before. Where splats are taken over from it, its buffers must
+        hold the surface of ``params``.
+    entries : changes at the start of the next stage, in order.
+    splats : settings of the next stage's splats.
+    indirect : what the next stage learns of indirect light.
+    key : random key of new values.
+
+    Returns
+    -------
+    The first parameters of the next stage.
     """
     first, indirect_key = jax.random.split(key)
     head = params.material.indirect_head

@@ -1,10 +1,10 @@
 """Whether a larger model explains held-back views better than a smaller one; plain NumPy.
 
 Both models are measured on the same views, in decibels. What makes one view harder than another is
-the same for both and cancels in the difference of each view, so gains are *paired*. Views beside
-each other see the same part of the object and err alike: they count as one block. And a training
-repeated with another seed ends elsewhere: a gain has to be larger than what two seeds differ by in
-their standard deviation, which is a low hurdle (docs/models.md).
+the same for both models and cancels in the difference of each view, so gains are *paired*.
+Neighbouring views see the same part of the object and have similar errors, so they are grouped into
+blocks. A training with another seed also ends with another result: a gain must exceed the standard
+deviation over seeds, which is a low hurdle (docs/models.md).
 """
 
 import math
@@ -32,22 +32,23 @@ class Evidence:
 
     @property
     def is_kept(self) -> bool:
-        """Whether the larger model is the better one beyond both errors."""
+        """Whether the gain exceeds both its standard error and the spread over seeds."""
         return self.gain > self.standard_error and self.gain > self.spread
 
 
 @dataclass(frozen=True)
 class Rung:
-    """What became of a part of a model that was tried.
+    """Result of trying a part of a model.
 
     Attributes
     ----------
-    part, title : its name, in files and for people.
-    smaller, larger : mean decibels of the held-back views without it and with it; None where its
-        training failed.
-    found : the gain and its errors; None likewise.
-    is_kept : whether the model has it.
-    note : why there is nothing to compare, or what came with it that had been left out before.
+    part, title : name of the part in files, and its name for people.
+    smaller : mean decibels of the held-back views without the part.
+    larger : the same with the part; None where its training failed, and for a part that is not
+        chosen by its gain (`Part.is_photographed`).
+    found : the gain and its errors; None where ``larger`` is.
+    is_kept : whether the part was kept.
+    note : why there is no gain to compare, or which other parts were added with this one.
     """
 
     part: str
@@ -62,7 +63,12 @@ class Rung:
 def every_nth(count: int, step: int) -> tuple[Int[np.ndarray, " T"], Int[np.ndarray, " H"]]:
     """Split view numbers into those to train on and every ``step``-th one, which is held back.
 
-    The first that is held back is in the middle of the first ``step`` ones.
+    The first number that is held back is ``step // 2``.
+
+    Returns
+    -------
+    used : (T,) numbers of the views to train on.
+    held : (H,) numbers of the views that are held back.
     """
     numbers = np.arange(count)
     is_held = numbers % step == step // 2
@@ -70,14 +76,18 @@ def every_nth(count: int, step: int) -> tuple[Int[np.ndarray, " T"], Int[np.ndar
 
 
 def neighbouring_blocks(directions: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
-    """Group views into blocks of neighbours; return the block of each.
+    """Group views into blocks of neighbours.
 
-    A walk from view to nearest view that has not been visited, cut into about ``sqrt(2 V)`` pieces
-    of equal length.
+    A path leads from each view to the nearest one that it has not visited yet; it is cut into about
+    ``sqrt(2 V)`` blocks of equal length.
 
     Parameters
     ----------
     directions : (V, 3) unit, from the object towards the cameras.
+
+    Returns
+    -------
+    (V,) number of the block of every view, from 0.
     """
     count = len(directions)
     left = set(range(1, count))
@@ -97,7 +107,13 @@ def clustered_error(values: Float[np.ndarray, " V"], blocks: Int[np.ndarray, " V
     """Return the standard error of the mean of values that are correlated within blocks.
 
     ``SE^2 = B / (B - 1) sum_b (sum_{v in b} (x_v - mean))^2 / V^2`` over B blocks (Liang and Zeger
-    1986, for a mean). With blocks of one view it is the usual standard error.
+    1986, for a mean). With blocks of one view it is the usual standard error. Infinite for fewer
+    than two blocks.
+
+    Parameters
+    ----------
+    values : (V,) values of the views.
+    blocks : (V,) block of each view.
     """
     _, member = np.unique(blocks, return_inverse=True)
     count = int(member.max(initial=-1)) + 1
@@ -117,7 +133,8 @@ def compare(
     Parameters
     ----------
     larger : (V,) decibels of the larger model.
-    smaller : of each seed (V,) decibels of the smaller model, the first with the larger's seed.
+    smaller : (V,) decibels of the smaller model for every seed; the first has the larger model's
+        seed.
     blocks : (V,) block of each view.
     """
     gains = np.asarray(larger, float) - np.asarray(smaller[0], float)

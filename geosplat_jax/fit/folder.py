@@ -6,12 +6,13 @@
     metrics.jsonl         one line per step
     checkpoints/          parameters, optimiser, step, capacities
     stages/NAME/          the checkpoint that stage NAME ended with
-    previews/             truth, render and normals while training
+    previews/             photograph, render and normals during the training
+    given_cameras.json    copy of the refined cameras that the run was trained with, if any
     training.json         how long the whole training took
-    tensorboard/          the steps once more, as event files, where they were asked for
-    metrics.json, *.png   what the last evaluation found
-    evaluation/           its pictures one by one, the mesh and the lights of the report
-    report.html           all of it as one page
+    tensorboard/          the metrics of steps as event files, on request
+    metrics.json, *.png   results of the last evaluation
+    evaluation/           single pictures of the evaluation, and mesh and lights of the report
+    report.html           the training and the evaluation on one page
 """
 
 import csv
@@ -45,14 +46,15 @@ _OWN = (
     *(EVENTS, CAMERAS, "checkpoints", "stages", "previews", "metrics.jsonl", "training.json"),
     "run.json",
 )
-"""What evaluation and training write; the record goes last: it says that the rest is a run."""
+"""Files and folders that training and evaluation write. ``run.json`` is removed last: it shows that
+the others belong to a run."""
 
 
 _LOCK = ".lock"
 
 
 class RunError(RuntimeError):
-    """A run's folder cannot be used as it was asked for; the message says why, and the cure."""
+    """A run's folder cannot be used as requested; the message says why and what to do."""
 
 
 @settings
@@ -65,27 +67,27 @@ class _Scene:
 
 @settings
 class _Reading:
-    """Options of a scene's reading in a record that are checked; see `load_recorded`."""
+    """Reading options of a scene that are checked in a record; see `load_recorded`."""
 
     downscale: PositiveCount = 1
     """Factor that images are reduced by."""
     light: str | None = None
-    """Training light."""
+    """Name of the light of the training photographs."""
     bounds: tuple[float, float, float, float, float, float] | None = None
     """lo and hi of a box around the object."""
     cameras: str | None = None
     """File of refined cameras."""
     cameras_digest: str | None = None
-    """What the file held."""
+    """Digest of that file's content."""
 
 
 def _seconds(lines: Iterable[dict[str, Any]]) -> float:
-    """Add up what steps took."""
+    """Add up the seconds of steps."""
     return sum((float(line.get("seconds", 0.0)) for line in lines), 0.0)
 
 
 def _known_of(options: Any) -> Any:
-    """Return those options that `_Reading` knows; anything but options as it is."""
+    """Return the options that `_Reading` checks; a value that is no dictionary is unchanged."""
     if not isinstance(options, dict):
         return options
     return {f.name: options[f.name] for f in fields(_Reading) if f.name in options}
@@ -113,16 +115,17 @@ def folder_beside(output: str | Path, purpose: str) -> Path:
 
 @contextmanager
 def locked_folder(path: Path, *, own: Path) -> Iterator[None]:
-    """Hold a folder for one process, made where it is missing; the lock ends with the process.
+    """Hold a folder for this process, and make it if it is missing; the lock ends with the process.
 
     Parameters
     ----------
-    path : the folder. own : file of it that shows that its other files are the caller's.
+    path : the folder.
+    own : file in the folder. If it exists, the other files are the caller's own.
 
     Raises
     ------
     RunError
-        If another process holds it, or it lacks ``own`` and has other files.
+        If another process holds the folder, or it has other files but not ``own``.
     """
     _require_own(path, own)
     path.mkdir(parents=True, exist_ok=True)
@@ -154,7 +157,7 @@ def _require_own(path: Path, own: Path) -> None:
 
 
 class RunFolder:
-    """Where a run lives; nothing is read or written until a method says so."""
+    """The folder of a run; files are read and written by its methods only."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path).expanduser()
@@ -194,9 +197,9 @@ class RunFolder:
         return self._record_path.exists()
 
     def record(self) -> dict[str, Any]:
-        """Read what the run says about itself.
+        """Read the record of the run, ``run.json``.
 
-        Refined cameras are those of its own copy, where it has one.
+        The path of refined cameras is replaced by that of the run's own copy, if there is one.
 
         Raises
         ------
@@ -268,9 +271,9 @@ class RunFolder:
             )
 
     def make_room(self, *, replace: bool) -> None:
-        """Remove a run that is to be replaced, before the work that comes before the new one.
+        """Remove a run that is to be replaced, before work that precedes the new run.
 
-        Whoever goes on with that work then finds no other run in its place.
+        If that work is interrupted and continued later, the old run is no longer in the way.
 
         Raises
         ------
@@ -283,12 +286,12 @@ class RunFolder:
                 self.clear()
 
     def budget(self) -> Budget | None:
-        """Read what the run may take; None where nobody said.
+        """Read the budget of the run; None where it has none.
 
         Raises
         ------
         RunError
-            If the record is damaged.
+            If there is no run, or the record is damaged.
         """
         values = self.record().get("budget")
         try:
@@ -298,11 +301,11 @@ class RunFolder:
 
     @property
     def has_chosen_model(self) -> bool:
-        """Whether there is a run whose model was chosen by what its scene needs."""
+        """Whether there is a run whose model was chosen automatically, see `model_choice`."""
         return self.exists and "model" in self.record()
 
     def seconds_used(self) -> float:
-        """Add up what all steps took, those too that were made in vain, see `keep_lines_before`.
+        """Add up the seconds of all steps, including those that were lost, see `keep_lines_before`.
 
         Raises
         ------
@@ -326,12 +329,17 @@ class RunFolder:
     ) -> None:
         """Write the record of a new run; call it with the lock held.
 
-        ``model`` : how its parts were chosen, see `model_choice.choose_model`.
+        Parameters
+        ----------
+        dataset, config : scene and settings of the run.
+        replace : whether a run that the folder holds is removed.
+        budget : time and memory that the run may take, if they are limited.
+        model : record of how the model was chosen, see `model_choice.choose_model`.
 
         Raises
         ------
         RunError
-            See `require_free`.
+            If there is a run and ``replace`` is not set.
         """
         self.require_free(replace=replace)
         cameras = dataset.options.get("cameras")
@@ -363,12 +371,12 @@ class RunFolder:
                 path.unlink(missing_ok=True)
 
     def repoint(self, dataset: Dataset) -> None:
-        """Make a dataset the run's own, which was the same but elsewhere when it was trained.
+        """Record where the scene of the run is now, if it has moved since the training.
 
         Raises
         ------
         RunError
-            If its views are others, or were read in another way.
+            If the views of ``dataset`` are others, or were read in another way.
         """
         record, now = self.record(), _scene_of(dataset)
         self.require_same_scene(dataset)
@@ -378,7 +386,7 @@ class RunFolder:
     def require_same_scene(self, dataset: Dataset) -> None:
         """Refuse a dataset whose views are not those of the run.
 
-        Where a file of cameras lies does not matter, only what it holds.
+        Files of cameras are compared by their content, wherever they are.
 
         Raises
         ------
@@ -397,7 +405,7 @@ class RunFolder:
                 )
 
     def amend(self, config: Config) -> None:
-        """Record other settings, which a training has come to on its way; see `planned`."""
+        """Record settings that have changed during the training; see `planned`."""
         record = self.record()
         planned = record.get("planned", record["config"])
         self._write_record({**record, "planned": planned, "config": config.to_dict()})
@@ -408,7 +416,7 @@ class RunFolder:
             aside.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
 
     def metric_lines(self) -> list[dict[str, Any]]:
-        """Read ``metrics.jsonl``; a last line that an interruption tore is left out.
+        """Read ``metrics.jsonl``; a last line that an interruption cut off is left out.
 
         Raises
         ------
@@ -431,10 +439,10 @@ class RunFolder:
         return lines
 
     def write_csv(self, path: str | Path) -> None:
-        """Write the metrics of all steps as a table: a row a step, a column a number.
+        """Write the metrics of all steps as a CSV table: one row per step, one column per number.
 
-        What a step did not measure is left empty; ``usage`` and ``capacities`` of buffers are named
-        ``usage.NAME``.
+        Numbers that a step lacks are left empty. Numbers of ``usage`` and ``capacities`` have
+        columns such as ``usage.NAME``.
 
         Raises
         ------
@@ -459,7 +467,11 @@ class RunFolder:
             table.writerows(rows)
 
     def keep_lines_before(self, step: int) -> None:
-        """Drop the metrics of steps that a checkpoint does not contain; their time stays known."""
+        """Drop the metrics of steps from ``step`` on.
+
+        A checkpoint at ``step`` does not contain these steps; the training repeats them. Their
+        seconds are kept in the record, see `seconds_used`.
+        """
         if self.metrics.exists():
             used, everything = self.seconds_used(), self.metric_lines()
             lines = [line for line in everything if line["step"] < step]
@@ -475,7 +487,7 @@ class RunFolder:
             aside.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
     def training(self) -> dict[str, Any] | None:
-        """Read what `write_training` noted; None before the end.
+        """Read the summary that `write_training` wrote; None before the training has ended.
 
         Raises
         ------

@@ -1,8 +1,9 @@
 """Comparison of two sets of cameras, up to what no photograph can determine.
 
-Where the object is in the world, which way it is turned, and how large it is, photographs leave
-open: cameras that all move with it see the same. That freedom, the gauge, is taken away by the
-similarity under which both sets see points around the object at the same pixels, or nearly so.
+Photographs do not determine where the object is in the world, which way it is turned, and how large
+it is: if all cameras move along with it, they see the same. This freedom, the gauge, is removed by
+the similarity transform under which both sets of cameras see points around the object at nearly the
+same pixels.
 
 Everything here runs on the host in float64.
 """
@@ -21,7 +22,8 @@ from geosplat_jax.io.cameras import RefinedSplit, with_cameras
 from geosplat_jax.io.views import Views
 
 _RADIUS = 0.7
-"""Of the points that are looked at, in half extents of the box: about where a surface is."""
+"""Radius of the sphere of points that are compared, in half extents of the box: about where the
+surface is."""
 
 
 @dataclass(frozen=True)
@@ -30,12 +32,14 @@ class CameraErrors:
 
     Attributes
     ----------
-    rotation_deg : (V,) angle between the orientations.
-    center_percent : (V,) distance of the positions, per distance to the object.
-    focal_percent : (V,) difference of the focal lengths.
-    exposure_percent : (V,) difference of the exposures.
-    balance_percent : (V,) largest difference of a factor of red, green or blue beside it.
-    pixels : (V,) root mean square distance at which points around the object appear.
+    rotation_deg : (V,) angle between the orientations, degrees.
+    center_percent : (V,) distance of the positions, in percent of the distance to the object.
+    focal_percent : (V,) relative difference of the focal lengths, percent.
+    exposure_percent : (V,) relative difference of the exposures, percent.
+    balance_percent : (V,) largest relative difference of the factors of red, green and blue,
+        percent.
+    pixels : (V,) root mean square distance, in pixels, between the images of points around the
+        object.
     """
 
     rotation_deg: Float[np.ndarray, " V"]
@@ -49,15 +53,19 @@ class CameraErrors:
 def find_gauge(found: Views, true: Views, bounds: Bounds, *, scales: bool = True) -> Similarity:
     """Find the similarity of the world that takes ``true`` cameras closest to ``found`` ones.
 
-    Closest in the image: points on a sphere around the object, moved by it, appear in the found
-    cameras as near as possible to where they appear, unmoved, in the true ones. Unlike an alignment
-    of the positions of cameras it does not take lenses that are all longer, further away, for a
-    larger world.
+    Distances are measured in the image: points on a sphere around the object are projected by the
+    true cameras and, moved by the similarity, by the found ones. Unlike an alignment of the camera
+    positions, this does not mistake longer lenses that are all further away for a larger world.
 
     Parameters
     ----------
-    found, true : cameras of the same views. bounds : of the object, as the true cameras see it.
+    found, true : cameras of the same V views.
+    bounds : lo and hi of the object's box, in the world of the true cameras.
     scales : whether the size of the world is free; False for rigid motions.
+
+    Returns
+    -------
+    The similarity, from the world of ``true`` to that of ``found``.
     """
     points = _points_around(bounds)
     center, half = points.mean(axis=0), 0.5 * float(np.max(bounds[1] - bounds[0]))
@@ -82,7 +90,8 @@ def camera_errors(found: Views, true: Views, bounds: Bounds) -> CameraErrors:
 
     Parameters
     ----------
-    found, true : cameras of the same views. bounds : of the object, as the true cameras see it.
+    found, true : cameras of the same V views.
+    bounds : lo and hi of the object's box, in the world of the true cameras.
     """
     points = _points_around(bounds)
     turns = found.camera_to_world[:, :3, :3] @ true.camera_to_world[:, :3, :3].transpose(0, 2, 1)
@@ -108,13 +117,15 @@ def compare_cameras(
 
     Parameters
     ----------
-    found, true : cameras of the same views. bounds : of the object, as the true cameras see it.
+    found, true : cameras of the same V views.
+    bounds : lo and hi of the object's box, in the world of the true cameras.
     scales : see `find_gauge`.
 
     Returns
     -------
-    errors : of the found cameras; those of the exposures without a common factor, which is the
-        light's. gauge : by which the true cameras were moved.
+    errors : errors of the found cameras. Exposures are compared without a common factor, which
+        belongs to the light.
+    gauge : similarity by which the true cameras were moved.
     """
     gauge = find_gauge(found, true, bounds, scales=scales)
     center, half = np.mean(bounds, axis=0), 0.5 * gauge.scale * (bounds[1] - bounds[0])
@@ -132,8 +143,9 @@ def change_lines(views: Views, split: RefinedSplit, bounds: Bounds) -> list[str]
 
     Parameters
     ----------
-    views : with the cameras to begin with. split : what became of them.
-    bounds : of the object.
+    views : views with their initial cameras.
+    split : refined cameras of these views.
+    bounds : lo and hi of the object's box.
     """
     cameras = [split.cameras[name] for name in views.names]
     changes = camera_errors(with_cameras(views, split, "the refinement"), views, bounds)
@@ -181,7 +193,7 @@ def _pixels(views: Views, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray,
 
 
 def _aligned_poses(found: Views, true: Views, center: np.ndarray, *, scales: bool) -> Similarity:
-    """Align cameras by their axes, then by their positions; good enough to begin with."""
+    """Align cameras by their axes, then by their positions: the initial guess of `find_gauge`."""
     axes = (views.camera_to_world[:, :3, :3] for views in (found, true))
     left, _, right = np.linalg.svd(np.einsum("vij,vkj->ik", *axes))
     left[:, -1] *= np.linalg.det(left @ right)

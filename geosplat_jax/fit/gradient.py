@@ -1,9 +1,10 @@
 """The gradient of the loss, part by part: programs that do not grow with the number of views.
 
-The chain rule is written out here between compiled programs: the asset, what a view sees, the
-light, the loss of one view, and the way back. That of a view is called once for every view. So a
-step of eight views compiles as fast as one of a single view, a buffer that grows costs only the
-programs that it is in, and programs can be compiled side by side, or before they are needed.
+The chain rule is written out here between compiled programs: for the asset, the splats that a view
+sees, the light, the loss of one view, and the backward pass. The program of a view is called once
+per view. So a step of eight views compiles as fast as one of a single view, a buffer that grows
+costs a compilation of only those programs that use it, and programs can be compiled in parallel or
+before they are needed.
 
 `value_and_gradient` equals ``jax.value_and_grad(pipeline.loss, has_aux=True)`` up to rounding.
 """
@@ -29,7 +30,7 @@ from geosplat_jax.splats.tiles import LIST_BUFFERS, TileLists
 from geosplat_jax.transport.base import Illumination
 
 _Parts = tuple[Any, Any]
-"""A pytree cut in two: what has a derivative, and the rest."""
+"""A pytree split in two: floating-point arrays, which have a derivative, and the rest."""
 
 
 class Runner:
@@ -45,27 +46,27 @@ class Runner:
 
 
 IN_TURN = Runner()
-"""The usual one of processors."""
+"""The usual runner on a CPU."""
 
 
 class Queued(Runner):
-    """Calls programs without waiting: an accelerator works them off while the next are prepared."""
+    """Calls programs without waiting: the host prepares the next while the accelerator works."""
 
     def __call__(self, program: Any, *arguments: Any) -> Any:
-        """Put a program into the queue and return what its results will be."""
+        """Enqueue a program and return its future results."""
         return program(*arguments)
 
 
 QUEUED = Queued()
-"""The usual one of accelerators."""
+"""The usual runner on an accelerator."""
 
 
 class SideBySide(Runner):
-    """Calls two programs at a time where they do not wait for each other.
+    """Calls two programs at a time if they do not depend on each other.
 
-    XLA divides the operations of a program among the cores of a CPU, but neither sorts nor loops,
-    and rays travel in loops. So two programs that trace take less time side by side; two of others
-    take more (docs/transport.md). The temporaries of both are in memory at once.
+    XLA spreads the operations of a program over the cores of a CPU, except for sorts and loops, and
+    rays are traced in loops. So two programs that trace rays take less time side by side; two other
+    programs take more (docs/transport.md). The temporaries of both are in memory at once.
     """
 
     def all(self, *calls: tuple[Any, ...]) -> list[Any]:
@@ -85,8 +86,8 @@ class SharedBatch(eqx.Module):
 
     Attributes
     ----------
-    pictures : arrays by name, (devices, views of each, ...); ``keys`` and ``shares`` are those that
-        the views have in the whole batch. A share of 0 is a view that fills up the last round.
+    pictures : arrays by name, (devices, views per device, ...). ``keys`` and ``shares`` are those
+        of the views in the whole batch; the share of a copy that fills up the last round is 0.
     key : typed PRNG key of the step, the same on all devices.
     carry : see `Batch`.
     """
@@ -107,7 +108,7 @@ def _cut(tree: Any) -> _Parts:
 
 @partial(jax.jit, static_argnames=("frozen",))
 def _asset(pipeline: Pipeline, params: Params, frozen: tuple[str, ...]) -> tuple[_Parts, Callable]:
-    """Reconstruct; also return the way back from what moves of the asset to the parameters."""
+    """Reconstruct the asset; also return the pullback from its arrays to the parameters."""
     moving, pull, fixed = jax.vjp(
         lambda params: _cut(pipeline.reconstruct(without_gradient(params, frozen))),
         params,
@@ -142,7 +143,7 @@ def _lights(
     seen: Bool[Array, " N"] | None,
     batch: Batch,
 ) -> tuple[_Parts, Any, Callable]:
-    """Prepare the light; also return the carry and the way back."""
+    """Prepare the light; also return the carry, and the pullback to the asset and the light."""
     moving, fixed = asset
 
     def prepare(moving: Any, light: EnvLight) -> tuple[Any, Any]:
@@ -162,7 +163,7 @@ def _residual_lights(
     seen: Bool[Array, " N"] | None,
     batch: Batch,
 ) -> Illumination | None:
-    """Prepare the light of residuals."""
+    """Prepare the light for residuals; see `Pipeline.residual_lights`."""
     return pipeline.residual_lights(eqx.combine(*asset), light, seen, batch)
 
 
@@ -176,7 +177,7 @@ def _view_gradient(
     lists: TileLists,
     view: tuple[Batch, Float[Array, ""]],
 ) -> tuple[Any, ViewReport]:
-    """Differentiate the loss of a view, times its share, and return both with the report."""
+    """Return the loss of a view times its share, its gradient, and the report of the view."""
     batch, share = view
     residual = pipeline.residual_image(log_exposure, eqx.combine(*asset), others, lists, batch)
 
@@ -199,7 +200,7 @@ def _view_gradient(
 
 @partial(jax.jit, donate_argnums=(0,))
 def _plus(first: tuple[Any, ViewReport], second: tuple[Any, ViewReport]) -> tuple[Any, ViewReport]:
-    """Add what two views found."""
+    """Add the losses, gradients and reports of two views."""
     total = jax.tree.map(jnp.add, first[0], second[0])
     return total, first[1].plus(second[1])
 
@@ -216,7 +217,7 @@ def _back(
     carry: Any,
     frozen: tuple[str, ...],
 ) -> tuple[tuple[Float[Array, ""], LossReport], Params]:
-    """Add the terms of no view, and go back to the parameters."""
+    """Add the terms that depend on no view, and backpropagate to the parameters."""
     moving, fixed = asset
     (value, (by_exposure, by_asset, by_light)), report = views
 
@@ -244,7 +245,7 @@ def _back(
 
 
 def _divided(capacities: Capacities) -> tuple[dict[str, int], dict[str, int]]:
-    """Part the buffers of the lists of a view from all others."""
+    """Separate the buffers of a view's lists from all others."""
     of_lists = {name: size for name, size in capacities.items() if name in LIST_BUFFERS}
     return of_lists, {n: size for n, size in capacities.items() if n not in LIST_BUFFERS}
 
@@ -269,7 +270,7 @@ def value_and_gradient(
     -------
     (total, report), gradient : as from ``jax.value_and_grad``.
     """
-    # Lists of other sizes are another program to make them, and no other to make the asset.
+    # Lists of another size need another program to make them, but the asset's program stays.
     listing, pipeline = (
         replace(pipeline, capacities=Capacities(**sizes)) for sizes in _divided(pipeline.capacities)
     )
@@ -277,7 +278,7 @@ def value_and_gradient(
     asset, pull_asset = run(_asset, pipeline, params, frozen)
     numbers = jax.device_put([np.int32(number) for number in range(batch.count)])
     views = [run(_view, batch, number) for number in numbers]
-    # These sort, in every stage.
+    # Lists are sorted, which uses one core; so they are made side by side in every stage.
     lists = run.all(*((_lists, listing, asset, view) for view, _ in views))
     seen = run(_seen, pipeline, asset, lists)
     lit = (pipeline, asset, params.light, seen, batch)

@@ -12,11 +12,14 @@ class Progress:
 
     Attributes
     ----------
-    step, steps : done, and of all stages.
+    step, steps : number of steps that are done, and of all steps of the run.
     stage : name of the stage.
-    total, psnr, splat_count : of the step.
-    seconds : since the training began or was resumed.
-    seconds_left : estimated; None while a stage has just begun and compiles.
+    total : weighted loss of the step.
+    psnr : decibels of the step's views.
+    splat_count : number of splats in the step.
+    seconds : time since the training began or was resumed.
+    seconds_left : estimated time left, or what a budget leaves; None before enough steps were
+        timed.
     """
 
     step: int
@@ -30,26 +33,26 @@ class Progress:
 
 
 class Listener:
-    """What is told how a training goes; a subclass overrides what it wants to know.
+    """Receives the events of a training; a subclass overrides the methods that it needs.
 
-    Every method does nothing here. The training waits for them, on the first host alone, and what
-    they raise ends it.
+    The methods here do nothing. The training calls them on the first host alone, waits for them,
+    and ends with any exception that they raise.
     """
 
     def on_step(self, progress: Progress) -> None:
-        """Hear of a step that was made."""
+        """Handle the end of a step."""
 
     def on_compile(self, stage: str) -> None:
-        """Hear, before a step of this stage, that it waits for a compilation."""
+        """Handle a compilation that the next step, in the named stage, waits for."""
 
     def on_preview(self, trained: Trained) -> None:
-        """Hear every ``run.preview_every`` steps, and once early, what the parameters are.
+        """Handle the current parameters, every ``run.preview_every`` steps and once early.
 
-        The next step consumes their buffers: copy what is used later.
+        The next step consumes their buffers: copy whatever is used later.
         """
 
     def on_rung(self, rung: Rung) -> None:
-        """Hear what became of a part of the model that was tried, see `model_choice`."""
+        """Handle the result of trying a part of the model, see `model_choice`."""
 
 
 class Listeners(Listener):
@@ -59,25 +62,25 @@ class Listeners(Listener):
         self._listeners = listeners
 
     def on_step(self, progress: Progress) -> None:
-        """Tell all."""
+        """Call all listeners."""
         for listener in self._listeners:
             listener.on_step(progress)
 
     def on_compile(self, stage: str) -> None:
-        """Tell all."""
+        """Call all listeners."""
         for listener in self._listeners:
             listener.on_compile(stage)
 
     def on_preview(self, trained: Trained) -> None:
-        """Tell all."""
+        """Call all listeners."""
         for listener in self._listeners:
             listener.on_preview(trained)
 
     def on_rung(self, rung: Rung) -> None:
-        """Tell all."""
+        """Call all listeners."""
         for listener in self._listeners:
             listener.on_rung(rung)
 
 
 NOBODY = Listener()
-"""Nobody is told."""
+"""A listener that ignores all events."""

@@ -65,13 +65,14 @@ _SHRINK_EVERY = 100
 _WORTH = 100
 """Steps to come in a stage for which smaller buffers are worth the compilation that they take."""
 _FOLLOW_EVERY = 10
-"""Steps between two looks at where the surface is; at usual rates it moves by less than a cell."""
+"""Steps between two checks of where the surface is; at usual rates it moves by less than a cell in
+between."""
 _LOOK_AHEAD = 200
-"""Steps before the end of a stage, at most, at which the next one's programs are compiled."""
+"""Most steps before the end of a stage at which the next stage's programs are compiled."""
 
 
 class First(NamedTuple):
-    """What a stage began with: the surface, and its shape on the host, as steps consume theirs."""
+    """Surface and shape that a stage began with; on the host, since steps consume their buffers."""
 
     surface: SurfaceModel
     shape: Any
@@ -84,17 +85,31 @@ class First(NamedTuple):
 
 @dataclass
 class Loop:
-    """Mutable bookkeeping of a run; everything but the clock goes into checkpoints.
+    """State of a run between two steps; `tree` and `meta` return what checkpoints hold of it.
 
-    ``fallback`` is what the stage began with. The state lies on all ``devices``; ``surface`` and
-    ``pipeline`` on one of this process, where everything between two steps is computed. ``views``
-    are windows of the photographs that hold this ``share`` of their pixels, see
-    `windows.around_object`. ``upcoming`` is the next stage, once it is near; ``to_come`` is what a
-    checkpoint said of it. ``peak`` is the largest need of every buffer since these were last looked
-    at, ``peak_before`` that of the time before. ``has_compiled`` is set by whatever compiles, and
-    reset by whoever measures time; ``is_compiled`` is not reset. ``fits_twice`` is what
-    `compile_step` says; ``on_compile`` is called with the stage's name before anything compiles
-    that a step waits for.
+    Attributes
+    ----------
+    config : settings of the run.
+    views : windows of the training photographs, see `windows.around_object`.
+    folder : folder of the run.
+    surface, pipeline : surface model and pipeline, on one device of this process, where everything
+        between two steps is computed.
+    stage : the present stage.
+    state : parameters, optimiser, step and carry, on all ``devices``.
+    devices : devices that the run trains on.
+    share : share of the photographs' pixels that the windows hold.
+    planned_for : stage and splats that the buffers were planned for.
+    peak : largest need of every buffer since the buffers were last checked; None for no need yet.
+    peak_before : the same for the time between the two checks before.
+    recoveries : number of times that the surface has vanished and was put back.
+    fallback : surface and shape that the stage began with.
+    last_checkpoint : path of the last checkpoint; None where none was written yet.
+    upcoming : the next stage, once it is near.
+    has_compiled : set by whatever compiles, and reset by whoever measures time.
+    is_compiled : set by whatever compiles, and never reset.
+    fits_twice : what `compile_step` returned.
+    to_come : what a checkpoint said about the next stage.
+    on_compile : called with the stage's name before a compilation that a step waits for.
     """
 
     config: Config
@@ -154,9 +169,10 @@ class Loop:
         }
 
     def _known_to_come(self) -> dict[str, Any] | None:
-        """Return what a checkpoint keeps of the next stage; after a resume, what one has kept."""
+        """Return what a checkpoint says about the next stage, or what an earlier one said."""
         if self.upcoming is not None:
-            # What fails there is told when that stage begins, and spares this one's checkpoints.
+            # An error in the plan is raised when that stage begins; until then checkpoints lack the
+            # plan.
             return self.upcoming.meta() if self.upcoming.is_planned else None
         known = self.to_come
         if known is None or known.stage == self.stage.name:
@@ -168,15 +184,16 @@ class Loop:
         return {"state": self.devices.local(self.state), "surface": self.surface}
 
     def save(self) -> Path | None:
-        """Write a checkpoint of the state as it is, on the first host; return the last one."""
+        """Write a checkpoint of the current state on the first host; return the last one's path."""
         self.last_checkpoint = self._saved(self.folder.checkpoints) or self.last_checkpoint
         return self.last_checkpoint
 
     def save_end(self) -> None:
-        """Keep the state as what the stage ended with, on the first host."""
+        """Write the current state as the one that the stage ended with, on the first host."""
         folder = self.folder.end_of(self.stage.name)
         path = self._saved(folder, keep=1)
-        # A stage that was longer before its training was interrupted has ended once already.
+        # A stage may have ended once before, with another number of steps, if its training was
+        # interrupted.
         for other in folder.glob("checkpoint_*") if path is not None else ():
             if other != path:
                 other.unlink()
@@ -192,14 +209,14 @@ class Loop:
         return self.devices.together(written)
 
     def prepare(self, step: int) -> None:
-        """Begin the next stage when it is time; set the weights, plan buffers, compile."""
+        """Begin the next stage if ``step`` is its first; set the weights, plan buffers, compile."""
         stage, known = self.config.stage_at(step), None
         if stage != self.stage:
             known = self._begin(stage)
         self.pipeline = pipeline_at(
             self.pipeline, self.config, self.stage, self._since(step), share=self.share
         )
-        # Another kind of splats, another stage: other needs.
+        # Another kind of splats or another stage needs other buffers.
         planned_for = f"{self.stage.name} {self.pipeline.splats}"
         if planned_for != self.planned_for:
             self.planned_for, self.peak, self.peak_before = planned_for, None, None
@@ -223,7 +240,7 @@ class Loop:
             self.upcoming = Upcoming(following, ends, self.to_come)
 
     def retime(self, config: Config) -> None:
-        """Go on with stages of other lengths; what was done stays as it was."""
+        """Continue with stages of other lengths; steps that are done do not change."""
         if self.devices.is_first_host:
             self.folder.amend(config)
         self.config, self.stage = config, config.stage(self.stage.name)
@@ -231,7 +248,7 @@ class Loop:
             self.upcoming.give_up()
 
     def _announce(self) -> None:
-        """Say that the next step waits for a compilation, unless it was made ahead."""
+        """Call ``on_compile``, unless the programs of the stage were compiled ahead."""
         upcoming = self.upcoming
         is_there = (
             upcoming is not None and upcoming.stage.name == self.stage.name and upcoming.is_ready
@@ -240,14 +257,15 @@ class Loop:
             self.on_compile(self.stage.name)
 
     def close(self) -> None:
-        """Leave nothing behind that still runs."""
+        """Stop the background work on the next stage."""
         if self.upcoming is not None:
             self.upcoming.abandon()
 
     def _planned(self, known: Capacities | None) -> Capacities:
-        """Choose the buffers: as was planned ahead, or for what the surface needs now.
+        """Choose the sizes of the buffers: as planned ahead, or for what the surface needs now.
 
-        ``known`` : sizes that hold what the stage begins with; None where it begins anew.
+        ``known`` : sizes that hold the first splats of the stage; None where the stage must be
+        planned.
         """
         upcoming, noted = self.upcoming, None
         if self.to_come is not None and self.to_come.stage == self.stage.name:
@@ -285,22 +303,22 @@ class Loop:
         self.has_compiled = self.is_compiled = True
 
     def _inputs(self, step: int) -> tuple[Batch | SharedBatch, UpdateRule]:
-        """Return the views of a step, dealt out to the devices, and how far it goes."""
+        """Return the views of a step, dealt out to the devices, and its learning rates."""
         batch = make_batch(self.views, step, self.stage, seed=self.config.run.seed)
         rule = update_rule(self.config, self.stage, self.state.params, self._since(step))
         return self.devices.share_out(batch), rule
 
     def _begin(self, stage: Stage) -> Capacities | None:
-        """Change settings, parameters and optimiser; keep what the stage before ended with.
+        """Save the end of the present stage; begin the next with its settings and parameters.
 
         Returns
         -------
-        Sizes of buffers that hold what the stage begins with; None where they are not known.
+        Buffer sizes that hold the first splats of the stage; None where they are not known.
         """
         self.save_end()
         params, pipeline = self.params, self.pipeline
         if stage.splats.takes_over:
-            # The last update moved the surface once more.
+            # The last update has moved the surface, which may need larger buffers now.
             pipeline = holding(pipeline, params)
         params = begin_stage(params, pipeline, self.config, stage)
         self.stage = stage
@@ -320,7 +338,13 @@ class Loop:
         self.state = self.devices.place(initial_state(params, step=self.step, carry=carry))
 
     def advance(self, step: int) -> StepReport:
-        """Make step ``step``, repeating the same batch with larger buffers as often as needed."""
+        """Make step ``step``, repeating the same batch with larger buffers as often as needed.
+
+        Raises
+        ------
+        TrainingError
+            If a number is not finite, the surface has exploded, or it has vanished too often.
+        """
         batch, rule = self._inputs(step)
 
         def attempt(capacities: Capacities) -> tuple[StepReport, Usage]:
@@ -346,7 +370,7 @@ class Loop:
         return report
 
     def _follow(self, step: int) -> None:
-        """Let a surface that holds only what it needs follow its shape, with the optimiser."""
+        """Replace the surface model if the surface has moved too far for it; carry Adam along."""
         params = self.params
         if set(self.config.geometry.rate_groups) <= set(self.stage.frozen):
             return
@@ -362,28 +386,28 @@ class Loop:
         self._recompile_for_shape(sizes, step)
 
     def _recompile_for_shape(self, sizes: list[tuple[int, ...]], step: int) -> None:
-        """Compile where the shape's arrays had other ``sizes`` before."""
+        """Compile again if the arrays of the shape have other sizes than ``sizes``."""
         if _sizes(self.params.geometry) == sizes:
             return
         if self.upcoming is not None:
             self.upcoming.abandon()
-        # What was planned ahead is of other sizes.
+        # What was planned ahead assumes the old sizes.
         self.upcoming = self.to_come = None
         self._recompile(step)
 
     def _put_surface(self, surface: SurfaceModel) -> None:
-        """Go on with another surface."""
+        """Continue with another surface model."""
         self.surface = surface
         self.pipeline = replace(self.pipeline, surface=surface)
 
     def _resize(self, capacities: Capacities, step: int) -> None:
-        """Change the buffers, which takes new programs; the old ones may be too many to keep."""
+        """Change the sizes of the buffers, and compile programs for them."""
         if capacities != self.pipeline.capacities:
             self.pipeline = replace(self.pipeline, capacities=capacities)
             self._recompile(step)
 
     def _recompile(self, step: int) -> None:
-        """Compile for other sizes."""
+        """Compile again; old programs are released first if they are too many to keep."""
         release_programs_when_crowded()
         self._announce()
         self._compile(step)
@@ -429,10 +453,10 @@ def _sizes(shape: Any) -> list[tuple[int, ...]]:
 
 
 def _refuse_blended_points(config: Config) -> None:
-    """Refuse rays that start between splats, where both sides of a mesh are surface.
+    """Refuse rays that start at blended positions of splats, where a mesh has two sides.
 
-    What little shows through of the wall behind draws a position behind the face, on the whole of
-    which it then lies in its own shadow.
+    The wall behind shines through a little. It pulls the blended position behind the face, so that
+    the whole face would lie in its own shadow.
     """
     for stage in config.active_stages:
         if not stage.domain.shades_splats and not stage.domain.uses_rays:
@@ -461,8 +485,20 @@ def new_loop(
 ) -> Loop:
     """Build the loop of a new run.
 
-    ``start`` : what it takes over, None where it begins anew. ``surface`` : of a checkpoint, where
-    it is not made anew.
+    Parameters
+    ----------
+    dataset, config : scene and settings of the run.
+    folder : folder of the run; nothing is written to it.
+    devices : devices that the run trains on.
+    start : shape, light and exposure of another training to begin with; None for new ones.
+    surface : surface model of a checkpoint, from which the first surface is made; None to make a
+        new model.
+
+    Raises
+    ------
+    TrainingError
+        If no stage has steps, there is no surface to start from, or a setting does not suit the
+        surface.
     """
     shape_key, field_key = start_keys(config)
     is_new = surface is None
@@ -525,7 +561,13 @@ def resumed_loop(
     devices: Devices = ONE_DEVICE,
     start: Start | None = None,
 ) -> Loop:
-    """Rebuild the loop of a run from its last good checkpoint, or from the start without one."""
+    """Rebuild the loop of a run from its last good checkpoint, or from the start without one.
+
+    Raises
+    ------
+    TrainingError
+        If the settings are not those of the run; and see `new_loop` and `read_checkpoint`.
+    """
     changed = differences(folder.config(), config)
     if changed:
         raise TrainingError(
@@ -536,7 +578,7 @@ def resumed_loop(
     before = [stage.name for stage in config.active_stages]
     ends = _ends(config, folder)
     path = own
-    # Where a stage has ended since, or was taken over from another run.
+    # The end of a stage is newer where no checkpoint followed, or where it comes from another run.
     if ends and (own is None or read_step(own) < read_step(ends[-1])):
         path = ends[-1]
     if path is None:
@@ -557,7 +599,7 @@ def resumed_loop(
 
 
 def _ends(config: Config, folder: RunFolder) -> list[Path]:
-    """Find what the stages ended with, in order, as long as these are now."""
+    """Return the checkpoints that stages ended with, in order, where they fit the stages' steps."""
     found = []
     for stage in config.active_stages:
         path = latest_checkpoint(folder.end_of(stage.name))
@@ -575,7 +617,22 @@ def adopted_loop(
     name: str,
     devices: Devices = ONE_DEVICE,
 ) -> Loop:
-    """Build the loop of a run whose stages before ``name`` are those of another run."""
+    """Build the loop of a run whose stages before ``name`` are those of another run.
+
+    Parameters
+    ----------
+    dataset, config : scene and settings of the run.
+    folder : folder of the run.
+    source : folder of the other run.
+    name : first stage that is not taken from the other run.
+    devices : devices that the run trains on.
+
+    Raises
+    ------
+    TrainingError
+        If the stage has no steps or is the first one, or the other run has no checkpoint at the end
+        of the stage before, or had other settings up to there.
+    """
     if not config.stage(name).steps:
         raise TrainingError(f"nothing to train: stages.{name}.steps is 0")
     number = [stage.name for stage in config.active_stages].index(name)

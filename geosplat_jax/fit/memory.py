@@ -1,12 +1,11 @@
 """Lower bound of a training's memory, computed from its settings before anything is spent.
 
-What is counted has a known size: the photographs, the views of a step, the learned numbers with
-what Adam keeps of them, constants of the light transport, the points of the smoothness terms, and
-the samples of as many splats as there are at least. What else depends on how many splats a surface
-has is not known beforehand and not counted; it has a limit of its own (`SurfaceSettings.limits`).
-The sum is therefore a lower bound: what is refused cannot work, and what is not refused may still
-need more. That a program says itself, once it is compiled and before it runs
-(`require_program_memory`).
+Only what has a known size is counted: the photographs, the views of a step, the parameters with
+their gradients and Adam's moments, constants of the light transport, the points of the smoothness
+terms, and the samples of the least number of splats. Whatever else depends on the number of splats
+is not known beforehand; it has its own limit (`SurfaceSettings.limits`). Settings that are refused
+can therefore not work, and others may still need more memory. How much a program needs is known
+once it is compiled, and checked before it runs (`require_program_memory`).
 """
 
 from collections.abc import Mapping
@@ -36,9 +35,9 @@ _PIXEL_BYTES = 4 * _FLOAT_BYTES
 
 
 def training_needs(config: Config, dataset: Dataset) -> list[Need]:
-    """List what a training takes at least at one time, by the settings that decide it.
+    """List the least memory that a training needs at one time, by the settings that decide it.
 
-    Stages follow one another, so of what they take apart the largest counts.
+    Stages follow one another, so where they need different amounts, the largest counts.
     """
     train, test = dataset.train, dataset.test
     pixels = train.height * train.width
@@ -77,14 +76,15 @@ def require_program_memory(name: str, compiled: jax.stages.Compiled, copies: int
 
     Parameters
     ----------
-    name : of the program. compiled : for a processor or an accelerator.
+    name : name of the program.
+    compiled : the program, for a processor or an accelerator.
     copies : devices of this process; processors share the memory of the machine, and every
         accelerator has its own.
 
     Raises
     ------
     TrainingError
-        One line, with what makes it so large.
+        In one line, with the settings that make the program large.
     """
     refusal = _program_refusal(name, compiled, copies)
     if refusal is not None:
@@ -95,12 +95,12 @@ def require_program_memory(name: str, compiled: jax.stages.Compiled, copies: int
 
 
 def fits_twice(compiled: jax.stages.Compiled) -> bool:
-    """Tell whether the memory holds a program of a processor two times at once."""
+    """Whether the memory of the machine holds a program twice; False with an accelerator."""
     return jax.default_backend() == "cpu" and _program_refusal("", compiled, 2) is None
 
 
 def _program_refusal(name: str, compiled: jax.stages.Compiled, copies: int) -> str | None:
-    """Say why so many copies of a program do not fit, if so; see `require_program_memory`."""
+    """Return why ``copies`` copies of a program do not fit into the memory; None where they do."""
     sizes = compiled.memory_analysis()
     if sizes is None:
         return None
@@ -114,17 +114,18 @@ def _program_refusal(name: str, compiled: jax.stages.Compiled, copies: int) -> s
 def require_rendering_memory(
     config: Config, capacities: Mapping[str, int], where: str | Path
 ) -> None:
-    """Refuse to rebuild what a checkpoint describes where that cannot fit into the memory.
+    """Refuse a checkpoint whose parameters and buffers cannot fit into the memory.
 
     Parameters
     ----------
-    config, capacities : of the checkpoint; a row of a buffer counts as one number.
-    where : the file that they are from.
+    config : settings of the checkpoint.
+    capacities : sizes of its buffers; a row of a buffer counts as one number.
+    where : file of the checkpoint.
 
     Raises
     ------
     TrainingError
-        One line, with the file and the settings that take most.
+        In one line, with the file and the settings that need most.
     """
     needs = [
         *_field_needs(config, config.active_stages),
@@ -137,7 +138,7 @@ def require_rendering_memory(
 
 
 def _field_needs(config: Config, stages: tuple[Stage, ...]) -> list[Need]:
-    """Count the numbers of the material field once: its tables and its heads."""
+    """Count the bytes of the material field, once: its tables and its heads."""
     outputs = max((stage.transport.indirect_outputs for stage in stages), default=0)
     field = jax.eval_shape(
         lambda key: init_materials(key, config.material, indirect_outputs=outputs),
@@ -158,19 +159,19 @@ def _light_numbers(config: Config) -> int:
 
 
 def _transport_bytes(config: Config) -> int:
-    """Count the constants of the light transport, of the stage that has most."""
+    """Count the bytes of the light transport's constants, in the stage that has most."""
     stages = config.active_stages
     return max((stage.transport.constant_bytes(config.light) for stage in stages), default=0)
 
 
 def _sample_bytes(config: Config) -> int:
-    """Count what the samples of as many splats take as there are at least."""
+    """Count the bytes that the samples of the least number of splats take."""
     numbers = max((stage.transport.numbers_per_splat for stage in config.active_stages), default=0)
     return _FLOAT_BYTES * config.geometry.fewest_splats * numbers
 
 
 def _smoothness_bytes(config: Config) -> int:
-    """Count the encoded points of the smoothness terms: each, and each displaced (Eq. 16)."""
+    """Count the bytes of the smoothness terms' encoded points and displaced copies (Eq. 16)."""
     if not any(_SMOOTHNESS & set(stage.weights_at(0)) for stage in config.active_stages):
         return 0
     width = config.material.grid.width * config.material.encodings

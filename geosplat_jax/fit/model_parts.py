@@ -1,8 +1,9 @@
 """The optional parts of a model, and how each is removed from the settings.
 
-The settings of a run describe its largest model. Every `Part` knows how to take itself out, so
-that a smaller model is `without` some of them; what is left out has no parameters and is not
-computed. `LADDER` lists the parts from what explains most to what explains least.
+The settings of a run describe its largest model. Every `Part` can remove itself from settings, so
+that a smaller model is the largest one `without` some parts. A part that is left out has no
+parameters and is not computed. `LADDER` lists the parts from the one that explains most to the one
+that explains least.
 """
 
 import abc
@@ -17,7 +18,7 @@ from geosplat_jax.transport.monte_carlo import MonteCarloSettings
 from geosplat_jax.transport.split_sum import SplitSumSettings
 
 _FEWER_CELLS = 2.0 / 3.0
-"""Cells along the box without `FinerCells`, to those with it: 32 to 48."""
+"""Ratio of the cells along the box without `FinerCells` to those with it: 32 to 48."""
 
 _FEWEST_CELLS = 5
 _FEWEST_TEXELS = (4, 8)
@@ -25,16 +26,17 @@ _FEWEST_TEXELS = (4, 8)
 
 
 class Part(abc.ABC):
-    """What a model may have, or may do without.
+    """An optional part of a model.
 
     Attributes
     ----------
-    name : in files. title : for people.
-    settings : patterns of the paths of the settings that decide it; where one of them was set by
-        hand, the part stays as it is.
-    needs : parts that it cannot be without; they come with it.
-    follows : parts without which it is not tried at all.
-    is_photographed : whether photographs under one light can tell that it is missing.
+    name : name in files.
+    title : name for people.
+    settings : patterns of the paths of the settings that decide on the part. If one of them was set
+        by hand, the part stays as it is.
+    needs : names of the parts that it needs; they are added with it.
+    follows : names of the parts without which it is not tried.
+    is_photographed : whether photographs under one light can show that it is missing.
     """
 
     name: ClassVar[str]
@@ -64,7 +66,7 @@ class Specular(Part):
     settings = ("material.specular",)
 
     def removed(self, config: Config) -> Config:
-        """Leave the base."""
+        """Leave the diffuse base alone."""
         return replace(config, material=replace(config.material, specular="none"))
 
 
@@ -109,10 +111,11 @@ def _without_indirect_weight(stage: Stage) -> Stage:
 
 
 class Shadows(Part):
-    """Light that the surface blocks, by rays; without it stages use the split sum.
+    """Shadows that are traced by rays; without them all stages use the split sum.
 
-    Under one light a darker albedo explains the same photographs, and is wrong under any other. So
-    the surface decides: whether it blocks enough of a uniform sky's light from itself.
+    Photographs under one light do not decide: a darker albedo explains them as well, and is wrong
+    under any other light. So the surface decides, by the share of a uniform sky's light that it
+    blocks from itself.
     """
 
     name, title = "shadows", "traced shadows"
@@ -176,7 +179,10 @@ class FinerHash(Part):
     settings = ("material.grid.*",)
 
     def removed(self, config: Config) -> Config:
-        """Leave three quarters of the levels, up to a quarter of the resolution, in half tables."""
+        """Leave 3/4 of the levels, 1/4 of the finest resolution, and half of the table size.
+
+        Returns the settings as they are where that would not make the encoding smaller.
+        """
         grid = config.material.grid
         finest = max(grid.coarsest, grid.finest // 4)
         smaller = replace(
@@ -234,11 +240,14 @@ LADDER: tuple[Part, ...] = (
 
 
 def offered_parts(config: Config, by_hand: Collection[str] = ()) -> tuple[Part, ...]:
-    """Return the parts that settings have and that nobody decided by hand, in order.
+    """Return the parts of the settings on which nothing was decided by hand, in order.
 
-    What a part that was decided by hand needs is decided with it.
+    Where a part was decided by hand, the parts that it needs are decided with it.
 
-    ``by_hand`` : paths of settings.
+    Parameters
+    ----------
+    config : settings of the largest model.
+    by_hand : paths of the settings that were set by hand.
     """
     present = [part for part in LADDER if part.is_in(config)]
     decided = {part.name for part in present if part.is_set(by_hand)}
@@ -249,7 +258,7 @@ def offered_parts(config: Config, by_hand: Collection[str] = ()) -> tuple[Part, 
 
 
 def without(config: Config, parts: Iterable[Part]) -> Config:
-    """Return settings without some parts: what needs others is taken out before these."""
+    """Return settings without some parts; a part is removed before those that it needs."""
     names = {part.name for part in parts}
     for part in reversed(LADDER):
         if part.name in names:

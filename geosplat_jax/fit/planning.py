@@ -29,14 +29,14 @@ def plan_capacities(
 
     Parameters
     ----------
-    pipeline, params : of the stage; the pipeline's own capacities do not matter.
-    camera : of all views.
+    pipeline, params : those of the stage; the pipeline's own capacities do not matter.
+    camera : cameras of all views.
     limits : largest sensible needs, see `SurfaceSettings.limits`.
 
     Raises
     ------
     TrainingError
-        If the surface needs more.
+        If the surface needs more than a limit.
     """
     first = pipeline.surface.first_capacities(params.geometry)
     splats = _SPLATS_PER_QUAD * first["quads"]
@@ -67,12 +67,12 @@ def _needs_of_rays(pipeline: Pipeline, params: Params) -> Usage:
 
 
 def add_rays(pipeline: Pipeline, params: Params, known: Capacities) -> Capacities:
-    """Return capacities that hold the surface's index for rays too, where any are traced.
+    """Return capacities that also hold the index for rays of the surface, if rays are traced.
 
     Parameters
     ----------
-    pipeline, params : of the stage.
-    known : capacities that hold all else.
+    pipeline, params : those of the stage.
+    known : capacities of everything else.
     """
     if not pipeline.uses_rays:
         return known

@@ -43,7 +43,7 @@ SPLIT_SUM, MONTE_CARLO, REFINE = "split_sum", "monte_carlo", "refine"
 
 _SURFACE = ("sdf", "deform", "weights")
 _NEVER = 1e9
-"""A half-life for rates that stay."""
+"""Half-life, in steps, of rates that do not decay."""
 
 
 def _rates(surface: float, *, surface_warmup: int = 0, **others: float | Rate) -> dict[str, Rate]:
@@ -54,7 +54,7 @@ def _rates(surface: float, *, surface_warmup: int = 0, **others: float | Rate) -
 
 
 def _weights(**weights: float | Schedule) -> dict[str, Schedule]:
-    """Make schedules of constant weights."""
+    """Turn numbers into constant schedules; schedules stay as they are."""
     return {n: w if isinstance(w, Schedule) else Schedule(w) for n, w in weights.items()}
 
 
@@ -77,9 +77,9 @@ def _default() -> Config:
         ),
         weights=_weights(**photometric, entropy=Schedule(0.2, 0.01, 0.5), **surface, **smooth),
     )
-    # Materials learn faster than light, and what they have explained, shadows included, light has
-    # no reason to explain again; so they wait. Few samples make noisy gradients, so the surface is
-    # slower than the authors'.
+    # Materials learn faster than the light. What they have absorbed, shadows included, the light no
+    # longer has to explain; so their rates warm up. Few samples make noisy gradients, so the rate
+    # of the surface is lower than the authors'.
     monte_carlo = Stage(
         name=MONTE_CARLO,
         steps=300,
@@ -143,10 +143,11 @@ def _refinement_rates(*, albedo: float, roughness_metallic: float) -> dict[str, 
 def _original(
     name: str, *, adapter: AdapterConstants, material: MaterialSpec, stages: tuple[Stage, ...]
 ) -> Config:
-    """Return what the paper and the authors share.
+    """Return the settings that the paper and the authors' program share.
 
-    96 cells along every side of a cube, noise as the first surface, grid vertices that move by a
-    quarter of a cell, splats that look away rendered too, two encodings that pull on the geometry.
+    These are 96 cells along every side of a cube, noise as the first surface, grid vertices that
+    move by at most a quarter of a cell, no back-face culling, and two encodings, whose attributes
+    pull on the geometry.
     """
     return Config(
         preset=name,
@@ -250,8 +251,9 @@ def _original_stages(
 ) -> tuple[Stage, ...]:
     """Return the stages that the paper and the authors share: 8 views, 128 rays per splat.
 
-    The refinement is that of the authors' program: 512 rays per pixel, no loss of the mask, and
-    smoothness as sums over channels where theirs are means.
+    The refinement is that of the authors' program: 512 rays per pixel and no mask loss. Its weights
+    of smoothness are divided by the number of channels, since terms are sums over channels here and
+    means there.
     """
     surface = _weights(deviation=0.5, weights=0.1)
     photometric = {name: split_sum_weights[name] for name in ("l1", "ssim")}
@@ -267,14 +269,14 @@ def _original_stages(
 
 
 def _paper() -> Config:
-    """Return the numbers of the appendix, the two stages taken from the authors' program."""
+    """Return the settings of the paper's appendix; its stages are those of the authors' program."""
     photometric = {"l1": 1.0, "ssim": 0.2, "mask": 5.0}
     others = {
         "smoothness_albedo": 0.03,
         "smoothness_roughness_metallic": 0.03,
         "light": 0.15,
     }
-    # One ramp of the entropy's weight, which ends in the middle of the whole training.
+    # The weight of the entropy falls in one ramp, which ends in the middle of the whole training.
     stages = _original_stages(
         split_sum_weights=_weights(**photometric, entropy=Schedule(0.2, 0.01), **others),
         monte_carlo_weights=_weights(**photometric, entropy=0.01, **others),
@@ -291,7 +293,11 @@ def _paper() -> Config:
 
 
 def _code(material_prior: str) -> Config:
-    """Return the authors' numbers; smoothness there is a mean over channels, here a sum."""
+    """Return the settings of the authors' program.
+
+    Weights of smoothness are divided by the number of channels, since terms are sums over channels
+    here and means there.
+    """
     photometric = {"l1": 0.8, "ssim": 0.2, "mask": 5.0}
     is_specular = material_prior == "specular"
     stages = _original_stages(
@@ -307,7 +313,7 @@ def _code(material_prior: str) -> Config:
             entropy=Schedule(0.2, 0.01),
             smoothness_albedo=0.03 / 3,
             smoothness_roughness_metallic=0.03 / 2,
-            # Of normals as colours, n / 2 + 1 / 2.
+            # The authors smooth normals as colours, n / 2 + 1 / 2, which halves the weight.
             normal_smoothness=0.03 / 3 / 2 if is_specular else 0.0,
         ),
         baked_diffuse=True,
@@ -333,10 +339,11 @@ def _code(material_prior: str) -> Config:
 
 
 _MESH_RATE = 0.3
-"""Rate of the vertices of a mesh, to that of the values of an isosurface (docs/meshes.md)."""
+"""Ratio of the rate of a mesh's vertices to the largest rate of an isosurface's groups
+(docs/meshes.md)."""
 
 _MESH_RATE_ORIGINAL = 1e-4
-"""The same in appendix H, in half the longest side of the box."""
+"""Rate of a mesh's vertices in appendix H, in units of half the longest side of the box."""
 
 _MESH_WEIGHTS: dict[str, dict[str, float]] = {
     "default": {"laplacian": 0.3, "normal_consistency": 0.1, "edge_length": 0.01, "offset": 0.0},
@@ -347,18 +354,19 @@ _MESH_WEIGHTS["code"] = _MESH_WEIGHTS["paper"]
 not known."""
 
 _MESH_EDGES = {"draft": 3.0, "standard": 2.0, "high": 1.5}
-"""Mean edges of a mesh in pixels; between two levels, those of `standard`."""
+"""Mean edge length of a mesh in pixels, by quality level; between two levels, that of
+`standard`."""
 
 _MESH_SHIFT_LOGIT = -1.0
-"""Where the inward shift of splats starts on a mesh: near a quarter of the root of a face's area
-(docs/meshes.md)."""
+"""Logit from which the inward shift of splats starts on a mesh: about a quarter of the square root
+of a face's area (docs/meshes.md)."""
 
 _MESH_VIEWS = 6
 """Views per step in appendix H."""
 
 
 def mesh_settings(mesh: str | Path | MeshSettings) -> MeshSettings:
-    """Name a file by its place and what it holds; settings that name one already are returned.
+    """Return settings that name a mesh file by its path and digest; settings stay as they are.
 
     Raises
     ------
@@ -373,15 +381,16 @@ def mesh_settings(mesh: str | Path | MeshSettings) -> MeshSettings:
 def with_mesh(config: Config, mesh: str | Path | MeshSettings) -> Config:
     """Return a configuration that starts from a mesh file instead of an isosurface (appendix H).
 
-    The surface's own rates and weights give way to those of a mesh, and the inward shift of splats
-    starts smaller, unless its start was set. Splats that look away are left out, as those of an
-    open mesh must be. The presets of the methods of others take from appendix H: six views per
-    step, smoother roughness and metallic, and no vertex sampling; their shift starts as ever.
+    The surface's own rates and weights are replaced by those of a mesh, and the inward shift of
+    splats starts smaller, unless its start was set. Back-facing splats are culled, as an open mesh
+    requires. The presets ``paper`` and ``code`` also take six views per step from appendix H, no
+    vertex sampling, and its weight of the smoothness of roughness and metallic while the mesh
+    moves; the start of their shift does not change.
 
     Parameters
     ----------
-    config : of an isosurface. One that starts from this mesh already stays as it is.
-    mesh : file, or the settings of a run that started from one, whose file is not looked at.
+    config : settings of an isosurface. Settings that start from this mesh already stay as they are.
+    mesh : file, or the settings of a run that started from one, whose file is not read.
 
     Raises
     ------
@@ -465,7 +474,7 @@ _QUALITY: dict[str, dict[str, Any]] = {
     },
 }
 
-# A draft of another's method: its numbers with less of everything.
+# A draft of the presets `paper` and `code`: their numbers, with less of everything.
 _ORIGINAL_DRAFT: dict[str, Any] = {
     "geometry": {"resolution": 32},
     "material": {"grid": {"levels": 8, "log2_entries": 15, "coarsest": 16, "finest": 256}},
@@ -497,12 +506,13 @@ def between_qualities(
 ) -> Config:
     """Return settings of the preset ``default`` between its quality levels.
 
-    Numbers are interpolated in their logarithms; what is no number, and a stage that the lower
-    level leaves out, are the lower level's until the higher one is reached.
+    Positive numbers are interpolated in their logarithms. Everything else has the lower level's
+    value until the higher level is reached; a stage without steps in the lower level is left out
+    until then.
 
     Parameters
     ----------
-    place : from 0, `QUALITIES`' first, to its last, each one further.
+    place : 0 for the first of `QUALITIES`, 1 for the second, 2 for the third, or between them.
     material_prior, mesh, overrides : see `make_config`.
     """
     below = min(int(place), len(QUALITIES) - 2)
@@ -515,7 +525,7 @@ def between_qualities(
 
 
 def _interpolated(low: Any, high: Any, share: float) -> Any:
-    """Interpolate what two nested dictionaries have as positive numbers."""
+    """Interpolate the positive numbers of two nested dictionaries; all else is that of ``low``."""
     if isinstance(low, dict):
         # A mapping of names, such as rates, may lack some on one side.
         return {
@@ -544,8 +554,8 @@ def make_config(
     Parameters
     ----------
     preset : one of `PRESETS`.
-    quality : one of `QUALITIES`. Of the presets ``paper`` and ``code``, ``draft`` is a smaller
-        version; ``standard`` and ``high`` are their own numbers.
+    quality : one of `QUALITIES`. For the presets ``paper`` and ``code``, ``draft`` is a smaller
+        version, and ``standard`` and ``high`` both stand for the original numbers.
     material_prior : where roughness and metallic start, one of `materials.MATERIAL_PRIORS`.
     mesh : file of a mesh to start from, see `with_mesh`.
     overrides : ``section.field=value`` strings, applied last.
@@ -553,7 +563,8 @@ def make_config(
     Raises
     ------
     ValueError
-        On an unknown name, a value of the wrong type or out of range, or a mesh that is no file.
+        On an unknown name, a value of the wrong type or out of range, or a mesh file that is
+        missing.
     """
     if preset not in PRESETS:
         raise ValueError(f"preset must be one of {PRESETS}, got {preset!r}")
@@ -583,11 +594,12 @@ def _finished(
     mesh: str | Path | MeshSettings | None,
     overrides: tuple[str, ...],
 ) -> Config:
-    """Put a mesh and overrides, in this order, over the values of a preset."""
+    """Apply a mesh, and then overrides, to the values of a preset."""
     if mesh is not None:
         values = with_mesh(config_from_dict(values), mesh).to_dict()
-    # Kinds come first, so that settings of theirs may follow one by one; and with them numbers of
-    # steps, since of a stage without any nothing is asked.
+    # Overrides of kinds are applied first, so that others may set single values of these kinds.
+    # Overrides of steps are applied with them, because a stage with 0 steps is checked less
+    # strictly.
     names = [text.partition("=")[0].strip() for text in overrides]
     if any(name.endswith(".kind") for name in names):
         for name, override in zip(names, overrides, strict=True):

@@ -1,14 +1,14 @@
 """The light's pyramid: whole regions of the light learn together, besides single texels.
 
-Adam moves every texel of a light by its rate at most, whatever the gradient is. What all texels of
-a sky agree on is then learned no faster than the noise of a single one, and noise is all that
-texels have which no highlight looks at. With the light as a sum of levels of half the size each,
-and Adam on the numbers of every level, a region moves as one where its texels agree, and a texel
-alone by a part of the rate only.
+Adam moves every texel of a light by at most its rate, however large the gradient is. A change on
+which all texels of a sky agree is then learned no faster than the noise of a single texel, and
+texels that no highlight reflects receive nothing but noise. Here the light is a sum of levels, each
+of half the size of the one before, and Adam works on the numbers of every level. A region whose
+texels agree then moves as one, while a single texel moves only by a part of the rate.
 
-The sum is taken of the steps, so that parameters, checkpoints and exports hold texels as ever:
-`to_levels` turns the gradient in the texels into that in the levels, which is what the optimiser
-sees, and `from_levels` adds up its steps.
+Only steps are summed, so that parameters, checkpoints and exports hold texels as usual: `to_levels`
+turns the gradient in the texels into the gradient in the levels, which the optimiser sees, and
+`from_levels` adds up its steps.
 """
 
 from typing import Any
@@ -62,23 +62,28 @@ def to_levels(gradient: Any) -> Any:
 
     Parameters
     ----------
-    gradient : of the parameters, or these themselves where only shapes matter.
+    gradient : gradient in the parameters, or the parameters where only shapes matter.
 
     Returns
     -------
-    The same with ``light.radiance`` a tuple: (H, W, 3), (H / 2, W / 2, 3) and so on, while both
-    sizes are even and the smaller one is at least 4. A light of odd sizes has texels alone.
+    The same tree, with a tuple as ``light.radiance``: (H, W, 3), (H / 2, W / 2, 3) and so on. A
+    level is halved while its sizes are even and at least 8; a light of odd size has a single level.
     """
     return eqx.tree_at(lambda tree: tree.light.radiance, gradient, _levels(gradient.light.radiance))
 
 
 def from_levels(steps: Any, share: Float[Array, ""]) -> Any:
-    """Add up the steps of the levels to one of the texels.
+    """Add up the steps of the levels to steps of the texels.
 
     Parameters
     ----------
-    steps : as `to_levels` returns them.
-    share : of its step that every level makes; 0 for the texels alone, with the whole of it.
+    steps : steps in the layout that `to_levels` returns.
+    share : () share of its step that every level contributes; 0 for the whole step of the texels
+        and none of the other levels.
+
+    Returns
+    -------
+    The same tree, with (H, W, 3) steps as ``light.radiance``.
     """
     texels, *coarser = steps.light.radiance
     if coarser:

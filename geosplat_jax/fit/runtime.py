@@ -22,14 +22,16 @@ _CROWDED = 0.5
 """Share of the memory maps from which programs are forgotten."""
 
 _MOST_MAPS = 65_530
-"""Memory maps that count, also where a system grants more: programs take memory, too."""
+"""Limit of memory maps that is assumed even where a system allows more, since programs also take
+memory."""
 
 
 def release_programs_when_crowded() -> bool:
-    """Forget compiled programs if they hold half of the memory maps of this process; tell if so.
+    """Release compiled programs if half of the allowed memory maps are used; tell if so.
 
-    XLA maps the parts of a program apart, some thousands for a training step, and Linux grants a
-    process 65,530 maps; beyond them the compiler crashes. What is needed again is compiled again.
+    XLA maps every part of a program separately, some thousands for a training step. Linux allows a
+    process 65,530 maps; beyond that the compiler crashes. Programs that are needed again are
+    compiled again.
     """
     try:
         granted = min(int(Path("/proc/sys/vm/max_map_count").read_text()), _MOST_MAPS)
@@ -43,10 +45,10 @@ def release_programs_when_crowded() -> bool:
 
 
 def in_background(function: Callable[[], _Result]) -> "Future[_Result]":
-    """Call a function in a thread of its own.
+    """Call a function in its own thread; return the future of its result.
 
-    The process ends after the thread: one that ends while XLA compiles crashes. So let nothing run
-    that nobody wants any more.
+    The process does not end before the thread, since a process that ends while XLA compiles
+    crashes. So make the function stop early once nobody needs its result.
     """
     future: Future[_Result] = Future()
 
@@ -61,10 +63,10 @@ def in_background(function: Callable[[], _Result]) -> "Future[_Result]":
 
 
 def peak_memory_mb() -> int:
-    """Largest memory of this process so far, MB; 0 where the system does not tell.
+    """Largest memory of this process so far, in MB of 2**20 bytes; 0 where it is not known.
 
-    Where JAX computes on accelerators, that is what its allocator gave out of the fullest of them;
-    on a processor, what was resident.
+    On accelerators it is the most that JAX's allocator has given out of one of them; on a CPU it is
+    the resident memory.
     """
     if jax.default_backend() != "cpu":
         stats = [device.memory_stats() or {} for device in jax.local_devices()]
@@ -87,13 +89,13 @@ def _cpu_flags() -> str:
 
 
 def enable_compilation_cache(base: Path | None = None) -> None:
-    """Keep compiled programs between runs, apart for every jaxlib and every kind of processor.
+    """Keep compiled programs on disk between runs, apart for every jaxlib and kind of processor.
 
-    ``JAX_COMPILATION_CACHE_DIR`` overrides the place.
+    Does nothing if ``JAX_COMPILATION_CACHE_DIR`` is set: JAX then uses that folder.
 
     Parameters
     ----------
-    base : folder to keep them below; the user's folder of caches by default.
+    base : folder in which a folder for them is made; by default the user's cache folder.
     """
     if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return

@@ -25,7 +25,8 @@ from geosplat_jax.surface.base import SurfaceModel
 from geosplat_jax.transport.environment import init_light
 
 START_STREAM = 2**31 + 1
-"""Random stream of the first parameters; steps take theirs from 0 on, as keys that are split do."""
+"""Random stream of the first parameters. Steps use the streams from 0 on, as do keys that are
+split."""
 
 _STAGE_STREAM = 2**31
 """Random streams of the starts of stages count down from here."""
@@ -50,8 +51,8 @@ def pipeline_at(
 ) -> Pipeline:
     """Return a stage's pipeline as it is ``step`` steps after the stage's start.
 
-    ``share`` : of the photographs that views show, see `windows.around_object`; what is a mean over
-    all pixels of a view counts so much less.
+    ``share`` : share of the photographs' pixels that the views show, see `windows.around_object`.
+    Weights of terms that are means over all pixels are multiplied by it.
     """
     weights = {
         name: weight * share if name in PIXEL_MEANS else weight
@@ -90,7 +91,7 @@ def _require_rates(groups: Iterable[str], stage: Stage) -> None:
 
 
 def update_rule(config: Config, stage: Stage, params: Params, step: int) -> UpdateRule:
-    """Return the learning rates ``step`` steps after a stage's start.
+    """Return rates and other limits of a step, ``step`` steps after a stage's start.
 
     Raises
     ------
@@ -116,8 +117,9 @@ def initial_params(shape: Any, config: Config, key: Key[Array, ""]) -> Params:
 
     Parameters
     ----------
-    shape : of the surface, see `SurfaceSettings.start`.
-    config : settings of the run. key : of the material field.
+    shape : parameters of the surface, see `SurfaceSettings.start`.
+    config : settings of the run.
+    key : random key of the material field.
     """
     return _first_params(shape, key, config=config, stage=next(iter(config.active_stages), None))
 
@@ -138,12 +140,13 @@ def _first_params(
 
 
 def begin_stage(params: Params, pipeline: Pipeline, config: Config, stage: Stage) -> Params:
-    """Turn the parameters of one stage into the first ones of the next.
+    """Turn the last parameters of one stage into the first ones of the next.
 
     Parameters
     ----------
-    params, pipeline : of the stage before; see `entering.enter_stage`.
-    config : settings of the run. stage : that begins.
+    params, pipeline : those of the stage before; see `entering.enter_stage`.
+    config : settings of the run.
+    stage : the stage that begins.
     """
     number = config.active_stages.index(stage)
     key = jax.random.fold_in(jax.random.key(config.run.seed), _STAGE_STREAM - number)
@@ -168,7 +171,7 @@ def template_params(config: Config, surface: SurfaceModel, shape: Any, stage: St
 
 
 def view_indices(step: int, *, view_count: int, batch_views: int, seed: int) -> np.ndarray:
-    """Choose the views of a step: shuffled epochs, a function of ``seed`` and ``step`` alone."""
+    """Choose the views of a step, (B,), in shuffled epochs; the same for equal arguments."""
     batch_views = min(batch_views, view_count)
     first = step * batch_views
     chosen = []

@@ -14,11 +14,11 @@ from geosplat_jax.surface.base import SurfaceModel
 from geosplat_jax.surface.triangle_mesh import PENALTIES, TriangleMesh, VertexOffsets
 
 _FACES_PER_PIXEL = 2.5
-"""Faces for each square of an edge that a view has room for: the object fills a third of it, and
-has about three times as much surface as outline."""
+"""Faces for each square of one edge length that fits into a view. The object is taken to fill a
+third of the view, and to have a surface about three times as large as its silhouette."""
 
 _SIZES = ("home", "faces", "edges", "neighbours", "wings")
-"""Arrays of a `TriangleMesh` whose rows say how large all of it is."""
+"""Arrays of a `TriangleMesh` whose numbers of rows give the sizes of all its arrays."""
 
 
 @settings
@@ -26,20 +26,21 @@ class MeshSettings(SurfaceSettings, kind="mesh"):
     """A given mesh whose vertices move."""
 
     path: str = ""
-    """File of the mesh: PLY, OBJ, GLB or what else trimesh reads; --mesh sets it."""
+    """File of the mesh: PLY, OBJ, GLB or any other format that trimesh reads; set by --mesh."""
     digest: str = ""
-    """What the file held; --mesh sets it."""
+    """Digest of the file's content; set by --mesh."""
     edge_pixels: Positive = 2.0
-    """Mean edge to decimate or to divide to, in pixels of the training views."""
+    """Mean edge length, in pixels of the training views, to which the mesh is decimated or
+    subdivided."""
     max_faces: Annotated[int, Field(ge=4, le=2_000_000)] = 150_000
     """Largest number of faces after that (about 6 KB per face)."""
     sides: Literal["auto", "one", "both"] = "auto"
-    """Sides that are surface; auto: one of a closed mesh, both of any other, at twice the cost.
-    Both need raster.cull_backfaces."""
+    """Sides of the mesh that are surface; auto: one side of a closed mesh, both of any other mesh,
+    at twice the cost. Both sides need raster.cull_backfaces."""
 
     @property
     def rate_groups(self) -> tuple[str, ...]:
-        """Group of `VertexOffsets`."""
+        """Learning rate of `VertexOffsets`."""
         return ("vertices",)
 
     @property
@@ -48,7 +49,7 @@ class MeshSettings(SurfaceSettings, kind="mesh"):
         return PENALTIES
 
     def expected_splats(self, pixels: float) -> int:
-        """Guess the splats from the pixels of a view: faces have edges of a length in pixels."""
+        """Estimate the number of splats from the pixels of a view and the edge length in pixels."""
         faces = min(_FACES_PER_PIXEL * pixels / self.edge_pixels**2, float(self.max_faces))
         return SPLATS_PER_FACE * round(faces)
 
@@ -92,7 +93,7 @@ class MeshSettings(SurfaceSettings, kind="mesh"):
     def restart(
         self, model: SurfaceModel, dataset: Dataset, key: Key[Array, ""]
     ) -> tuple[TriangleMesh, VertexOffsets]:
-        """Return no offsets; the file is not read again."""
+        """Return the model of the checkpoint with no vertex moved; the file is not read again."""
         del dataset, key
         assert isinstance(model, TriangleMesh)
         return model, model.start

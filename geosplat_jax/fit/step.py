@@ -20,7 +20,7 @@ from geosplat_jax.pipeline import LossReport, Pipeline
 from geosplat_jax.render import Params
 
 ADAM = optax.scale_by_adam(eps=1e-15)
-"""The optimiser of all trainings; rates of the groups come after it."""
+"""Optimiser of all trainings; its steps are multiplied by the rates of the groups."""
 
 
 class TrainState(eqx.Module):
@@ -41,15 +41,16 @@ class TrainState(eqx.Module):
 
 
 class UpdateRule(eqx.Module):
-    """How far a step goes; all but the frozen groups is traced.
+    """How far a step goes; everything except the frozen groups is traced.
 
     Attributes
     ----------
     rates : learning rate of every group (see `core.types.learned`).
-    light_knee : () radiance above which the light's steps grow with its brightness; 0 is never.
+    light_knee : () radiance at which steps of the light double, since they grow as ``1 + radiance /
+        light_knee``; 0 for no growth.
     light_pyramid : () share of its step that every level of the light's pyramid makes, see
         `pyramid.from_levels`.
-    smallest_light : () texels are kept at or above this.
+    smallest_light : () lower bound of a texel while the light is learned.
     frozen : static; groups that are not differentiated.
     """
 
@@ -61,14 +62,14 @@ class UpdateRule(eqx.Module):
 
 
 class StepReport(eqx.Module):
-    """Outcome of a step.
+    """Outcome of a step; the state changed only if ``finite`` and ``fits`` hold.
 
     Attributes
     ----------
     total : () the weighted loss.
     loss : terms, image quality and usage.
-    finite : whether loss and every gradient were finite.
-    fits : whether every buffer was large enough. The state changed only if both hold.
+    finite : () whether loss and every gradient were finite.
+    fits : () whether every buffer was large enough.
     """
 
     total: Float[Array, ""]
@@ -90,7 +91,13 @@ def initial_state(params: Params, *, step: int = 0, carry: Any = None) -> TrainS
 
 
 def with_geometry(optimizer: Any, change: Callable[[Any], Any]) -> Any:
-    """Change what Adam keeps for the numbers of the surface's shape."""
+    """Apply a function to Adam's moments of the surface's shape.
+
+    Parameters
+    ----------
+    optimizer : state of Adam.
+    change : maps a pytree laid out like the old shape to one laid out like the new shape.
+    """
     moments = {
         name: replace(moment, geometry=change(moment.geometry))
         for name, moment in (("mu", optimizer.mu), ("nu", optimizer.nu))
@@ -111,10 +118,11 @@ def descended(params: Any, directions: Any, rates: dict[str, Float[Array, ""]]) 
 
 
 def _moved(params: Params, directions: Params, rule: UpdateRule) -> Params:
-    """Step against the directions, and return to the feasible set."""
+    """Step against the directions, and keep texels of the light above their lower bound."""
     params_moved = descended(params, directions, rule.rates)
-    # Absolute steps below the knee, relative ones above: a sun is thousands of times brighter than
-    # its sky, and Adam's steps know nothing of that. No texel falls below its floor.
+    # Steps are nearly absolute below the knee and relative above it: a sun is thousands of times
+    # brighter than its sky, and Adam's steps do not depend on the brightness. No texel falls below
+    # its lower bound.
     old = params.light.radiance
     knee = rule.light_knee
     growth = jnp.where(knee > 0, 1.0 + old / jnp.where(knee > 0, knee, 1.0), 1.0)
@@ -133,7 +141,7 @@ def _update(
     sizes: dict[str, Int[Array, ""]],
     rule: UpdateRule,
 ) -> tuple[TrainState, StepReport]:
-    """Move the parameters where everything fitted and is finite."""
+    """Move the parameters if every buffer was large enough and every number is finite."""
     total, report = found
     with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integer powers
         updates = pyramid.to_levels(gradient)
@@ -159,9 +167,21 @@ def train_step(
 ) -> tuple[TrainState, StepReport]:
     """Make one update, or none at all.
 
-    Where a buffer overflows or a number is not finite the state comes back unchanged, bit for bit,
-    and the report says so; the host then grows the buffers and repeats the batch, or stops.
-    ``state`` is donated: use only what is returned. ``run`` : see `gradient.value_and_gradient`.
+    Where a buffer overflows or a number is not finite, the state comes back unchanged, bit for bit,
+    and the report says so. The caller then grows the buffers and repeats the batch, or stops.
+
+    Parameters
+    ----------
+    state : parameters and optimiser before the step; donated, so use only what is returned.
+    batch : views of the step; a `SharedBatch` for several devices.
+    pipeline : pipeline of the stage.
+    rule : learning rates of the step.
+    run : see `gradient.value_and_gradient`.
+
+    Returns
+    -------
+    state : parameters and optimiser after the step.
+    report : outcome of the step.
     """
     batch = replace(batch, carry=state.carry)
     found, gradient = value_and_gradient(pipeline, state.params, batch, frozen=rule.frozen, run=run)

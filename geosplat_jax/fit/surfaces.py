@@ -28,10 +28,10 @@ from geosplat_jax.surface.hollows import carve_hollows
 from geosplat_jax.surface.hull import fit_grid, hull_sdf
 
 _SPLATS_PER_CELL = 24
-"""Splats of a cell that the surface passes through: of the one quad that it has in the mean."""
+"""Splats per cell that the surface passes through: on average such a cell has one quad."""
 
 _NUMBERS_PER_CELL = 25
-"""21 weights, and an SDF and a deformation for a vertex."""
+"""Learned numbers per cell: 21 weights, and an SDF value and a deformation of one vertex."""
 
 _FLOAT_BYTES = 4
 
@@ -61,20 +61,20 @@ class SurfaceSettings(Variant, abc.ABC):
         return None
 
     def expected_splats(self, pixels: float) -> int:
-        """Guess how many splats there will be, before any surface is known.
+        """Estimate the number of splats before any surface is known.
 
-        ``pixels`` : of a view.
+        ``pixels`` : number of pixels of a view.
         """
         del pixels
         return 60_000
 
     @property
     def fewest_splats(self) -> int:
-        """Splats that there are at least; 0 where that is not known."""
+        """Least number of splats that a surface has; 0 where it is not known."""
         return 0
 
     def parameter_bytes(self, bounds: Bounds) -> int:
-        """Count the memory that the shape takes which `start` makes; 0 where that is not known.
+        """Count the bytes of the shape that `start` makes; 0 where they are not known.
 
         ``bounds`` : lo (3,) and hi (3,) of the box around the object.
         """
@@ -82,12 +82,12 @@ class SurfaceSettings(Variant, abc.ABC):
         return 0
 
     def notes(self, dataset: Dataset) -> tuple[str, ...]:
-        """Say what `start` does for a scene that its user should know.
+        """Describe what the user should know about what `start` does for a scene.
 
         Raises
         ------
         ValueError
-            As `start`.
+            If `start` would raise it.
         """
         del dataset
         return ()
@@ -95,6 +95,16 @@ class SurfaceSettings(Variant, abc.ABC):
     @abc.abstractmethod
     def start(self, dataset: Dataset, key: Key[Array, ""]) -> tuple[SurfaceModel, Any]:
         """Make the surface and its first shape for a scene.
+
+        Parameters
+        ----------
+        dataset : the scene.
+        key : random key of a first shape that is random.
+
+        Returns
+        -------
+        model : surface model.
+        shape : its parameters.
 
         Raises
         ------
@@ -105,7 +115,9 @@ class SurfaceSettings(Variant, abc.ABC):
     def restart(
         self, model: SurfaceModel, dataset: Dataset, key: Key[Array, ""]
     ) -> tuple[SurfaceModel, Any]:
-        """Make the first surface and shape once more, for a model that a checkpoint holds.
+        """Make the first surface and shape again, for a run whose checkpoint holds ``model``.
+
+        By default the same as `start`.
 
         Raises
         ------
@@ -121,7 +133,7 @@ class SurfaceSettings(Variant, abc.ABC):
 
     @abc.abstractmethod
     def template(self, description: dict[str, Any]) -> tuple[SurfaceModel, Any]:
-        """Make a model and a shape of the described sizes, of any values."""
+        """Make a model and a shape of the described sizes; their values have no meaning."""
 
 
 @settings
@@ -144,14 +156,14 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
     reach: Annotated[float, Field(ge=0, le=0.5)] = 0.5
     """A grid vertex moves by at most this share of a cell (the authors: 1/4)."""
     entropy_reduction: Literal["mean", "sum"] = "mean"
-    """Mean of Eq. 14 over sign-changing edges, or the sum, as printed, which soon outweighs the
-    picture and empties the surface."""
+    """Reduction of Eq. 14 over sign-changing edges: the mean, or the sum as printed in the paper,
+    which soon outweighs the images and empties the surface."""
     max_quads: PositiveCount = 400_000
     """A surface with more quads than this is taken to have exploded (about 25 KB per quad)."""
 
     @property
     def rate_groups(self) -> tuple[str, ...]:
-        """Groups of `Geometry`."""
+        """Learning rates of `Geometry`."""
         return ("sdf", "deform", "weights")
 
     @property
@@ -161,7 +173,7 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
 
     @property
     def limits(self) -> dict[str, int]:
-        """As many quads as ``max_quads``."""
+        """At most ``max_quads`` quads."""
         return {"quads": self.max_quads}
 
     @property
@@ -170,7 +182,7 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
         return self.resolution
 
     def expected_splats(self, pixels: float) -> int:
-        """Guess the splats: from 30 (a bottle) to 60 (a duck) times the square of the cells."""
+        """Estimate the splats: 50 times the squared resolution; a bottle has 30, a duck 60."""
         del pixels
         return 50 * self.resolution**2
 
@@ -198,13 +210,13 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
 
     @property
     def fewest_splats(self) -> int:
-        """A third of what a bottle has: what any object has that is worth so many cells."""
+        """A third of a bottle's splats; an object with fewer is not worth this resolution."""
         return 10 * self.resolution**2
 
     def parameter_bytes(self, bounds: Bounds) -> int:
-        """Count the numbers of the vertices and cells of the grid, or at least of a band."""
+        """Count the bytes of the values of the whole grid, or the least that a band may have."""
         if self.band:
-            # One vertex a cell. Where the object is thin, only the outer layers are certain.
+            # One vertex per cell. In a thin object only the layers outside of it are certain.
             cells = (1 + self.layers) * self.fewest_splats // _SPLATS_PER_CELL
             return cells * _NUMBERS_PER_CELL * _FLOAT_BYTES
         grid = self._grid(bounds)
@@ -220,7 +232,7 @@ class FlexiCubesSettings(SurfaceSettings, kind="flexicubes"):
         return fit_grid((lo, hi), self.resolution)
 
     def _sdf(self, grid: Grid, dataset: Dataset, key: Key[Array, ""]) -> Float[Array, " G"]:
-        """First signed values on the grid."""
+        """Return the first signed values on the grid, negative inside the object."""
         if self.initial == "random":
             return closed_at_border(random_sdf(key, grid), grid)
         if self.initial == "sphere":

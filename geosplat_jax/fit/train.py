@@ -35,10 +35,10 @@ from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.memory import is_out_of_memory
 
 _FIRST_PREVIEW = 4
-"""The first preview comes after this part of the steps between two of them."""
+"""The first preview comes after ``preview_every`` divided by this many steps."""
 
 _STEPS_TIMED = 5
-"""Steps that an estimate of the time left takes at least."""
+"""Fewest timed steps from which the time left is estimated."""
 
 __all__ = [
     "Interrupted",
@@ -55,12 +55,12 @@ class Interrupted(Exception):
 
 
 class _StopRequest:
-    """A signal's handler that notes the first one; the second raises KeyboardInterrupt.
+    """Signal handler that notes the first signal; the second one raises KeyboardInterrupt.
 
     Attributes
     ----------
-    notice : what whoever hears of the signal at once may tell the user: Python calls the handler
-        only when a compilation or a step is over.
+    notice : text for whoever sees the signal at once and wants to tell the user: Python calls this
+        handler only when a compilation or a step is over.
     """
 
     notice = "stopping after this step; press Ctrl-C again to stop at once"
@@ -86,7 +86,7 @@ def stop_requests() -> Iterator[Callable[[], bool]]:
         try:
             previous[number] = signal.signal(number, request)
         except ValueError:
-            # Not in the main thread: signals are somebody else's business.
+            # Only the main thread may handle signals; in any other, they are left alone.
             break
     try:
         yield lambda: request.was_made
@@ -98,7 +98,7 @@ def stop_requests() -> Iterator[Callable[[], bool]]:
 def _record(report: StepReport, step: int, loop: Loop, seconds: float) -> dict[str, Any]:
     """Return one line of metrics.jsonl."""
     loss = replace(report.loss, carry=None)
-    # At once: an accelerator answers for every number apart as slowly as for all.
+    # All numbers in one transfer: an accelerator takes as long for each one alone.
     total, loss = jax.device_get((report.total, loss))
     return {
         "step": step,
@@ -145,14 +145,15 @@ class _Clock:
         return time.perf_counter() - self._began
 
     def note(self, stage: str, seconds: float) -> None:
-        """Take a step into account that compiled nothing."""
+        """Record the seconds of a step that did not compile anything."""
         self._seconds.setdefault(stage, []).append(seconds)
 
     def left(self, done: int) -> float | None:
-        """Seconds left after ``done`` steps; None before a few were timed.
+        """Seconds left after ``done`` steps; None before enough steps were timed.
 
-        Steps of a stage that has not begun count as those of the stage before, times what its light
-        transport costs more. Compilations to come are not foreseen.
+        Steps of a stage without timed steps are taken to last as long as those of the last stage
+        that was timed, times the relative costs of their light transports. Future compilations are
+        not included.
         """
         total, end, known = 0.0, 0, None
         for stage in self.config.active_stages:
@@ -186,29 +187,33 @@ def fit(
     ----------
     dataset : see `io.dataset.load_dataset`.
     config : see `presets.make_config`.
-    folder : of the run; made where it is missing, and held while the training runs.
+    folder : folder of the run; made if it is missing, and locked during the training.
     begin : `begin.Anew`, `begin.Resume` or `begin.TakeOver`.
-    listener : told how it goes.
-    pacer : keeps the training to a budget of time by changing the steps to come; ``run.json`` says
-        how many there were in the end.
-    devices : that the views of a step are shared by, see `devices.choose_devices`. Of several hosts
-        all call this with the same arguments; the first one alone writes the folder, from which all
-        read, and tells its listener.
+    listener : receives the events of the training.
+    pacer : keeps the training within a time budget by changing the numbers of steps to come;
+        ``run.json`` records how many there were in the end.
+    devices : devices that share the views of a step, see `devices.choose_devices`. All hosts call
+        this function with the same arguments. The first host alone writes the folder, which all
+        hosts read, and calls its listener.
     stop_after : stop, with a checkpoint, once so many steps are done (for tests and schedulers).
-    model : what ``run.json`` says of how the model was chosen.
+    model : record of how the model was chosen, for ``run.json``.
+
+    Returns
+    -------
+    The state after the last step, on one device of this process.
 
     Raises
     ------
     ValueError
-        If there is a pacer on several hosts, whose clocks are not one.
+        If there is a pacer on several hosts, whose clocks may differ.
     SceneError
         If the training views have no masks.
     RunError
-        If the folder is another's, or in use.
+        If the folder is in use, holds other files, or holds a run that is not to be replaced.
     TrainingError
-        When the settings ask for more memory than there is, or it runs out, a number is not finite,
-        the surface vanishes or explodes for good, the run to resume or to take over does not fit,
-        or hosts were told different things.
+        If the settings need more memory than there is, the memory runs out, a number is not finite,
+        the surface explodes or vanishes too often, the run to resume or to take over does not fit,
+        or the hosts were given different arguments.
     Interrupted
         After Ctrl-C or SIGTERM; the run can be resumed.
     """
@@ -268,7 +273,7 @@ def _out_of_memory(run: RunFolder, error: Exception) -> str:
 
 
 def _require_possible(dataset: Dataset, config: Config) -> None:
-    """Refuse what cannot be trained, before anything is spent."""
+    """Refuse scenes and settings that cannot be trained, before any work is done."""
     dataset.require_masks("train")
     try:
         require_rates(config)
@@ -280,12 +285,12 @@ def _require_possible(dataset: Dataset, config: Config) -> None:
 def _require_agreement(
     devices: Devices, config: Config, dataset: Dataset, *options: object
 ) -> None:
-    """Refuse hosts that were told different things.
+    """Refuse hosts that were given different settings, scenes or options.
 
     Raises
     ------
     TrainingError
-        On every host, with what is not the same.
+        On every host, with the names of what differs.
     """
     views = dataset.train
     mine = {
@@ -300,7 +305,7 @@ def _require_agreement(
 
 
 def _require_same_start(loop: Loop) -> None:
-    """Refuse hosts that would begin from different states: what they read is not the same."""
+    """Refuse hosts that would begin from different states: they have read different files."""
     mine = [loop.step, loop.stage.name, loop.config.total_steps]
     theirs = loop.devices.first_host(mine)
     _require_same(loop.devices, [] if mine == theirs else [f"checkpoint {mine}, not {theirs}"])
@@ -316,9 +321,9 @@ def _require_same(devices: Devices, different: list[str]) -> None:
 
 
 def _keep_pace(loop: Loop, pacer: Pacer, seconds: float | None) -> None:
-    """Change the steps to come where the time that is left asks for it.
+    """Change the numbers of steps to come if the time that is left requires it.
 
-    ``seconds`` : of the last step; None where it waited for a compiler.
+    ``seconds`` : duration of the last step; None where it waited for a compilation.
     """
     stage = loop.stage
     if seconds is not None:

@@ -26,10 +26,10 @@ from geosplat_jax.render import Params
 
 @settings
 class NextStage:
-    """What a checkpoint knows of the stage to come."""
+    """What a checkpoint says about the next stage."""
 
     stage: str
-    """Its name."""
+    """Name of the next stage."""
     capacities: dict[str, PositiveCount]
     """Sizes of its buffers."""
 
@@ -49,12 +49,13 @@ class Description:
     splats: Any = None
     """Sizes of what splats have learned, see `SplatSettings.describe`."""
     planned_for: str | None = None
-    """What the buffers were planned for."""
+    """Stage and splats that the buffers were planned for."""
     peak: dict[str, Count] | None = None
     peak_before: dict[str, Count] | None = None
-    """Largest needs of the buffers since they were last made smaller."""
+    """Largest needs of the buffers since they were last checked, and between the two checks
+    before."""
     recoveries: Count = 0
-    """How often the surface was put back."""
+    """Number of times that the surface has vanished and was put back."""
     to_come: NextStage | None = None
     """The stage to come, where it is near."""
 
@@ -87,14 +88,24 @@ def _template(config: Config, stage: Stage, described: Description) -> dict[str,
 
 
 def read_checkpoint(path: Path, config: Config) -> tuple[dict[str, Any], Description]:
-    """Read a checkpoint's arrays and the rest; ``config`` is the one it was written with.
+    """Read the arrays of a checkpoint and everything else in it.
+
+    Parameters
+    ----------
+    path : file of the checkpoint.
+    config : settings that the checkpoint was written with.
+
+    Returns
+    -------
+    tree : arrays, in the layout of `loop.Loop.tree`.
+    described : everything else.
 
     Raises
     ------
     CheckpointError
-        If it is damaged, or describes what cannot be.
+        If it is damaged, or describes an impossible state.
     TrainingError
-        If it describes what does not fit into the memory.
+        If its parameters and buffers do not fit into the memory.
     """
     described = read_description(path)
     stage = next((s for s in config.active_stages if s.name == described.stage), None)
@@ -107,7 +118,7 @@ def read_checkpoint(path: Path, config: Config) -> tuple[dict[str, Any], Descrip
     try:
         like = _template(config, stage, described)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        # Sizes belong to kinds of surfaces and splats, which read them each in its own way.
+        # Each kind of surface and of splats reads its own sizes, and may raise any of these errors.
         raise CheckpointError(
             f"checkpoint {path} is damaged: surface {described.surface} and splats "
             f"{described.splats} describe no arrays ({type(error).__name__}: {first_line(error)})"
@@ -118,13 +129,14 @@ def read_checkpoint(path: Path, config: Config) -> tuple[dict[str, Any], Descrip
 
 @dataclass(frozen=True)
 class Trained:
-    """What a run's last good checkpoint holds, ready to render.
+    """The state in a run's last good checkpoint, ready to render.
 
     Attributes
     ----------
-    config, stage : settings of the run, and the stage that the checkpoint was written in.
-    params, pipeline : of that stage.
-    step : steps that were done.
+    config : settings of the run.
+    stage : stage that the checkpoint was written in.
+    params, pipeline : parameters and pipeline of this stage.
+    step : number of steps that were done.
     """
 
     config: Config
@@ -149,10 +161,16 @@ def _checkpoints(run: RunFolder, stage: str | None) -> Path:
 def load_trained(folder: str | Path | RunFolder, *, stage: str | None = None) -> Trained:
     """Read the last good checkpoint of a run, or the one that a stage ended with.
 
+    Parameters
+    ----------
+    folder : folder of the run.
+    stage : name of the stage; None for the last good checkpoint.
+
     Raises
     ------
     TrainingError
-        If the folder holds no readable checkpoint, or one that does not fit into the memory.
+        If the run has no such stage or no readable checkpoint, or the checkpoint does not fit into
+        the memory.
     CheckpointError
         If the checkpoint is damaged.
     RunError

@@ -30,15 +30,15 @@ from geosplat_jax.splats.tiles import LIST_BUFFERS
 
 @dataclass(frozen=True)
 class Ends:
-    """A stage that comes to its end.
+    """The present stage, whose end is near.
 
     Attributes
     ----------
-    config, views : of the run.
-    pipeline : of the stage; what is planned depends on its surface alone.
-    params : as they are now, in buffers that no step consumes.
-    devices : that the run trains on.
-    needed : largest needs of the buffers of late.
+    config, views : settings and training views of the run.
+    pipeline : pipeline of the stage.
+    params : current parameters, in buffers that no step consumes.
+    devices : devices that the run trains on.
+    needed : largest recent need of every buffer.
     """
 
     config: Config
@@ -50,10 +50,18 @@ class Ends:
 
 
 def continued(before: Pipeline, needed: Counts, first: Pipeline, stage: Stage) -> Capacities | None:
-    """Return buffers for the splats of a pipeline, if those of a stage continue them, or None.
+    """Return buffers for the first splats of a stage, if they continue those of the stage before.
 
-    They are no larger than was ``needed`` of late, since the stage has programs of its own. Where
-    splats become parameters, the buffers of the surface stay: rows of splats follow from them.
+    Returns None otherwise. The buffers shrink to recent needs, since the stage has its own programs
+    in any case. Where splats are taken over as parameters, buffers of the surface keep their sizes,
+    from which the number of rows of splats follows.
+
+    Parameters
+    ----------
+    before : pipeline of the stage before.
+    needed : largest recent need of every buffer.
+    first : pipeline of the stage at its first step.
+    stage : the stage that begins.
     """
     if stage.splats.takes_over:
         needed = {name: needed[name] for name in LIST_BUFFERS if name in needed}
@@ -63,12 +71,13 @@ def continued(before: Pipeline, needed: Counts, first: Pipeline, stage: Stage) -
 
 
 class Upcoming:
-    """The stage that comes next: its buffers and programs, made while the present one trains.
+    """The next stage: its buffers and programs, made while the present stage trains.
 
     Parameters
     ----------
-    stage : that comes next. ends : the present one.
-    known : what a checkpoint said of it, in a run that is resumed.
+    stage : the next stage.
+    ends : the present stage.
+    known : what a checkpoint said about the next stage, in a run that was resumed.
     """
 
     def __init__(self, stage: Stage, ends: Ends, known: NextStage | None) -> None:
@@ -110,7 +119,7 @@ class Upcoming:
                 pipeline,
                 rule,
                 devices=devices,
-                threads=THREADS // 2,  # the steps before need the other half
+                threads=THREADS // 2,  # the present stage needs the other half
                 is_wanted=lambda: self._is_wanted,
             )
             release_freed_memory()
@@ -120,7 +129,7 @@ class Upcoming:
 
     @property
     def capacities(self) -> Capacities:
-        """Sizes of the buffers, once they are known."""
+        """Sizes of the buffers; waits until they are planned."""
         return self._planned.result()
 
     @property
@@ -130,7 +139,7 @@ class Upcoming:
 
     @property
     def is_ready(self) -> bool:
-        """Whether the programs are compiled."""
+        """Whether the programs are compiled, or their compilation has failed."""
         return self.compiled.done()
 
     def give_up(self) -> None:

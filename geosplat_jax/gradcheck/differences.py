@@ -3,17 +3,17 @@
 A `Problem` is a function of named groups of numbers with named outputs. Every pair of a group and
 an output gives one `Comparison`:
 
-- *entries*: the Jacobian, entry by entry. All entries of a small group against all entries of a
-  small output; otherwise a sample of the group (its largest gradients and random ones) against
-  random combinations of the output.
+- *entries*: the Jacobian, entry by entry. Of a large group only a sample is compared (its largest
+  gradients and random ones); of a large output only random combinations.
 - *along the gradient* and *random*: directional derivatives of a random combination of the output.
 - *float32*: the same Jacobian computed in single precision, against the double one.
 
 Central differences err by truncation, which falls with the square of the step, and by rounding,
-which grows with its inverse. Each derivative is therefore taken with a ladder of steps, every two
-neighbours are extrapolated (Richardson), and the step is chosen where the estimate has settled,
-counting in what rounding may have done. The choice never looks at the gradient under test. What
-remains is reported as the *uncertainty* of the differences: a gradient cannot be proved better.
+which grows with its inverse. Each derivative is therefore computed with a ladder of steps, and
+every two neighbours are extrapolated (Richardson). The step is chosen at which the estimate changes
+least, with a bound of the rounding added. The choice never looks at the gradient under test. The
+change that remains is reported as the *uncertainty* of the differences: no gradient can be verified
+more closely.
 """
 
 from collections.abc import Callable
@@ -67,8 +67,9 @@ class Problem:
     constants : arrays that are not differentiated; floats follow the precision of the inputs.
     scales : unit of a step, by group; 1 where absent.
     skip : (output, group) pairs that carry no gradient by contract and are not compared.
-    full : compare every entry of every group, if at most this many; larger groups are sampled.
-    projections : how many random combinations of a larger output are compared instead.
+    full : groups and outputs with at most this many entries are compared entry by entry; of larger
+        groups a sample is compared.
+    projections : number of random combinations that are compared of a larger output.
     vectorized : evaluate many points at once; otherwise one after another, which suits functions
         that take long to compile.
     """
@@ -93,16 +94,19 @@ class Comparison:
     Attributes
     ----------
     problem, output, group : names.
-    checked, total : entries of the group that were differentiated, and that there are.
+    checked, total : number of entries of the group that were compared, and of all its entries.
     is_full : whether all entries were compared against all entries of the output.
     norm : Euclidean norm of the compared Jacobian.
-    relative : L2 of the difference. one_minus_cosine : of the angle between both Jacobians.
-    along_gradient, random_direction : errors of directional derivatives, the worst of several.
-    uncertainty : L2 of what the differences themselves may be wrong by. step : median of the steps
-        taken for entries that matter.
-    single : L2 of the float32 Jacobian against the double one; None where not computed.
-    worst : where the largest difference sits. worst_values : differences' value and gradient's.
-    sweep : relative L2 with each step of `STEPS` alone, without extrapolation.
+    relative : L2 norm of the difference of both Jacobians.
+    one_minus_cosine : one minus the cosine of the angle between both Jacobians.
+    along_gradient : error of the derivative along the gradient.
+    random_direction : largest error of the derivatives in several random directions.
+    uncertainty : L2 norm of the estimated errors of the differences themselves.
+    step : median of the chosen steps, over derivatives that are not tiny.
+    single : L2 norm of the float32 Jacobian minus the double one; None where not computed.
+    worst : the entry with the largest difference.
+    worst_values : value of this entry by differences, and by the gradient.
+    sweep : relative L2 error with each step of `STEPS` alone, without extrapolation.
     """
 
     problem: str
@@ -255,7 +259,10 @@ def _one_minus_cosine(first: np.ndarray, second: np.ndarray) -> float:
 def _combinations(
     outputs: dict[str, slice], size: int, problem: Problem, rng: np.random.Generator
 ) -> dict[str, tuple[np.ndarray, bool]]:
-    """Rows (R, m) that read each output: all its entries, or random signs of them."""
+    """Rows (R, m) that select the entries of each output, or add them up with random signs.
+
+    Each with a flag that says whether all entries are selected.
+    """
     made = {}
     for name, span in outputs.items():
         count = span.stop - span.start
@@ -317,7 +324,11 @@ def compare(problem: Problem, *, single: bool = True, seed: int = 0) -> list[Com
     ----------
     problem : what to differentiate.
     single : also compute the Jacobian in float32.
-    seed : of samples and random directions.
+    seed : seed of samples and random directions.
+
+    Returns
+    -------
+    One comparison for every pair of a group and an output that is not skipped.
     """
     rng = np.random.default_rng(seed)
     flat = _Flat(problem, np.float64)

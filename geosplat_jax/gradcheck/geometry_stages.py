@@ -119,7 +119,7 @@ def _mesh(vertices: Any) -> Mesh:
 
 
 def _splats(splats: Splats) -> dict[str, Any]:
-    """Name what an adapter makes."""
+    """Return the outputs of an adapter by name."""
     return {
         "means": splats.means,
         "scales": splats.scales,
@@ -130,7 +130,7 @@ def _splats(splats: Splats) -> dict[str, Any]:
 
 
 def adapter_problems(rng: np.random.Generator) -> list[Problem]:
-    """Both samplings in vertices and normals, and the inward shift."""
+    """Differentiate both samplings, the normals of a mesh, and the inward shift."""
     inputs = _tetrahedron(rng)
 
     def faces(name: str, preset: AdapterConstants) -> Problem:

@@ -84,7 +84,7 @@ def projection_problems(rng: np.random.Generator) -> list[Problem]:
 
 
 def rasteriser_problems(rng: np.random.Generator) -> list[Problem]:
-    """Composite an image and vary all it is made of, background and camera included."""
+    """Differentiate a composited image in all its inputs, including background and camera."""
     count = 16
     inputs = _splats(rng, count)
     inputs["opacities"] = rng.uniform(0.3, 0.95, count)
@@ -111,7 +111,7 @@ def rasteriser_problems(rng: np.random.Generator) -> list[Problem]:
 
 
 def loss_term_problems(rng: np.random.Generator) -> list[Problem]:
-    """Every term of the loss that reads images, before and after the tone map."""
+    """Differentiate the terms of the loss on images, normals and light, and the colour curves."""
     shape = (1, 13, 14)
     image = rng.uniform(0.05, 0.95, (*shape, 4))
 

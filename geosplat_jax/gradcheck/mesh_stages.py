@@ -14,7 +14,10 @@ from geosplat_jax.surface.triangle_mesh import TriangleMesh, VertexOffsets
 
 
 def mesh_problems(rng: np.random.Generator) -> list[Problem]:
-    """Positions, normals, splats and penalties in the offsets, of a closed mesh and of a sheet."""
+    """Differentiate positions, normals, splats and penalties in the offsets of vertices.
+
+    Of a closed mesh, and of an open one that is seen from both sides.
+    """
     ball = trimesh.creation.icosahedron()
     vertices, faces = np.array(ball.vertices), np.asarray(ball.faces, np.int32)
     vertices = vertices * rng.uniform(0.8, 1.2, (len(vertices), 1))

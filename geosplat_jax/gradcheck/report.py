@@ -69,8 +69,12 @@ def check_stage(name: str, *, seed: int = 0, single: bool = True) -> list[Compar
     Parameters
     ----------
     name : a key of `STAGES`.
-    seed : of the problems' numbers, samples and directions.
+    seed : seed of the problems' numbers, samples and directions.
     single : also compare float32 with float64.
+
+    Returns
+    -------
+    One comparison for every pair of an output and a group, of all problems.
 
     Raises
     ------
@@ -95,11 +99,11 @@ def _is_independent(row: Comparison) -> bool:
 
 
 def table(rows: Iterable[Comparison], *, sweep: bool = False) -> str:
-    """Lay out comparisons as text, a block a problem.
+    """Lay out comparisons as text, one block per problem.
 
     Pairs where gradient and differences are both zero share one line. With ``sweep``, each row is
-    followed by the error of plain central differences at every step: truncation on the left,
-    rounding on the right.
+    followed by the errors of plain central differences at every step, from the largest to the
+    smallest: truncation shows on the left, rounding on the right.
     """
     lines: list[str] = []
     by_problem: dict[str, list[Comparison]] = {}
@@ -145,10 +149,10 @@ def _sweep_line(row: Comparison) -> str:
 
 
 def summary(checked: dict[str, list[Comparison]]) -> str:
-    """One line a stage: the worst of everything."""
+    """Lay out one line per stage, with its largest errors."""
     lines = [f"{'stage':<12} {'pairs':>6} {'rel. L2':>8} {'1 - cos':>8} {'directions':>10} float32"]
     for stage, rows in checked.items():
-        # NumPy's maximum of what holds a NaN is NaN, Python's need not be.
+        # np.max is NaN where any value is NaN; Python's max may not be.
         directions = np.max([(row.along_gradient, row.random_direction) for row in rows])
         verdict = "" if all(map(passes, rows)) else "  FAILS"
         lines.append(

@@ -54,7 +54,10 @@ def hash_grid_problems(rng: np.random.Generator) -> list[Problem]:
 
 
 def material_problems(rng: np.random.Generator) -> list[Problem]:
-    """Attributes of a field in its tables, its MLPs and the points; one encoding, and two."""
+    """Differentiate attributes of a field in its tables, its MLPs and the points.
+
+    Once with one encoding, and once with two.
+    """
     points = rng.uniform(-0.9, 0.9, (7, 3))
 
     def field(shared: bool) -> Problem:
@@ -109,7 +112,7 @@ def material_problems(rng: np.random.Generator) -> list[Problem]:
 
 
 def model_problems(rng: np.random.Generator) -> list[Problem]:
-    """Shaded points of every model of the material: its parameters, normals, viewer and light."""
+    """Differentiate shaded points in all inputs, for every model of the material."""
     count, operators = 7, prefilter_operators(_LIGHT)
     points, table = rng.uniform(-0.9, 0.9, (count, 3)), fg_table(cosines=9, roughnesses=7)
     drawn = _surface_points(rng, count)
@@ -165,7 +168,7 @@ def _materials(inputs: dict[str, Any]) -> Materials:
 
 
 def bsdf_problems(rng: np.random.Generator) -> list[Problem]:
-    """Reflectance, both lobes, and the density of samples, in every argument."""
+    """Differentiate both lobes of the reflectance and the density of samples in every argument."""
     inputs = _surface_points(rng, 9)
     wi = unit_vectors(rng, 9)
     inputs["wi"] = np.where(np.sum(inputs["normals"] * wi, axis=1, keepdims=True) < 0, -wi, wi)
@@ -179,7 +182,7 @@ def bsdf_problems(rng: np.random.Generator) -> list[Problem]:
 
 
 def light_problems(rng: np.random.Generator) -> list[Problem]:
-    """Lookup and prefiltered lookups in texels, directions and roughness."""
+    """Differentiate plain and prefiltered lookups in texels, directions and roughness."""
     operators = prefilter_operators(_LIGHT)
 
     def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
@@ -199,7 +202,7 @@ def light_problems(rng: np.random.Generator) -> list[Problem]:
 
 
 def split_sum_problems(rng: np.random.Generator) -> list[Problem]:
-    """Outgoing radiance in materials, normals, view directions and the light's texels."""
+    """Differentiate outgoing radiance in materials, normals, view directions and texels."""
     constants = (prefilter_operators(_LIGHT), fg_table(cosines=9, roughnesses=9))
 
     def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
@@ -218,10 +221,10 @@ def split_sum_problems(rng: np.random.Generator) -> list[Problem]:
 
 
 def transport_problems(rng: np.random.Generator) -> list[Problem]:
-    """Monte Carlo shading over fixed samples, by kind of indirect light.
+    """Differentiate Monte Carlo shading over fixed samples, by kind of indirect light.
 
-    Samples of the light and the cosine, some of them blocked; none of the microfacets, whose
-    directions follow the roughness and are constants of a step by contract.
+    Samples are drawn from the light and the cosine, and some are blocked. There are none from the
+    microfacets: their directions follow the roughness and are constants of a step by contract.
     """
     count, faces, counts = 7, 4, SampleCounts(light=5, diffuse=4, specular=0)
     dtype = jnp.zeros(0).dtype
@@ -268,9 +271,10 @@ def transport_problems(rng: np.random.Generator) -> list[Problem]:
 
 
 def path_problems(rng: np.random.Generator) -> list[Problem]:
-    """Radiance of fixed paths of two vertices in the faces' materials and normals and the light.
+    """Differentiate the radiance of fixed paths in the faces' materials and normals and the light.
 
-    Faces, directions and weights are random; a third of the paths end early.
+    Paths have two vertices. Faces, directions and weights are random; a third of the paths end
+    early.
     """
     count, faces, vertices = 6, 4, 2
     dtype = jnp.zeros(0).dtype

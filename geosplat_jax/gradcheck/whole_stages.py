@@ -109,7 +109,7 @@ def _from_groups(groups: dict[str, Any]) -> Params:
 
 
 def _loss_problem(name: str, config: Config, rng: np.random.Generator) -> Problem:
-    """Vary every group of parameters of the whole loss and of each of its terms."""
+    """Differentiate the whole loss and each of its terms in every group of parameters."""
     corner = np.full(3, 0.6)
     grid = fit_grid((-corner, corner), 6)
     grid = Grid(jnp.asarray(grid.origin), jnp.asarray(grid.cell_size), grid.shape)
@@ -157,10 +157,10 @@ def _doubled(leaf: jax.Array) -> jax.Array:
 
 
 def refinement_problems(rng: np.random.Generator) -> list[Problem]:
-    """Build the loss of free splats, shaded per pixel with the coverage differentiated.
+    """Differentiate the loss of free splats in their parameters, the hash tables and the light.
 
-    As trained, the coverage that attributes are divided by is a constant. What the splats have of
-    a mesh that does not move, and all that the fields and the light learn, is checked besides.
+    Pixels are shaded, and their coverage is differentiated; as trained, the coverage by which
+    attributes are divided is a constant. The mesh is frozen.
     """
     config = make_config(
         overrides=(

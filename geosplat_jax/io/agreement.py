@@ -1,11 +1,13 @@
 """Whether silhouettes, poses and lenses of a scene agree with each other.
 
 Every ray through a pixel of a mask meets the object, and the object lies in the visual hull of all
-other views. So where rays of a view's mask miss the hull of the others, its mask, pose or lens is
-wrong, or those of the others are. What changes all views alike is not seen: a field of view that is
-wrong for every camera around a centred object only makes the object larger or smaller.
+other views. So if rays through a view's mask miss the hull of the other views, the mask, pose or
+lens of that view is wrong, or those of the others are. An error that all views share is not
+noticed: a field of view that is wrong for every camera around a centred object only makes the
+object larger or smaller.
 
-Colours say more than silhouettes: whether the hull closes hollows, which a training begins with.
+Colours show more than silhouettes do: `hollow_line` reports hollows of the object that the hull
+fills, and that a training carves into its first surface.
 """
 
 import numpy as np
@@ -18,21 +20,21 @@ from geosplat_jax.surface.hollows import hollow_candidates
 from geosplat_jax.surface.hull import fit_grid, hull_sdf
 
 AGREES = 0.9
-"""Share of a mask's rays that meet the hull of the other views where everything is right; the rest
-is the thickness of a voxel, and thin parts."""
+"""Least share of a mask's rays that meet the hull of the other views if everything is right. Some
+rays miss it even then, because of the size of a voxel and of thin parts."""
 
 _VOXELS = 40
-"""Along every side of the box."""
+"""Voxels along every side of the box."""
 _RAYS = 400
-"""Pixels of a mask that are tried."""
+"""Most pixels of a mask whose rays are tested."""
 _STEPS = 2 * _VOXELS
-"""Points of a ray within the box."""
+"""Points that are tested along a ray."""
 _DISSENT = 0.1
-"""Share of the other views that may leave a point out of their masks, so that a few wrong views do
-not carve the hull of all others away."""
+"""Share of the other views that may see a point of the hull outside their masks, so that a few
+wrong views do not carve away the hull of all others."""
 
 _CELLS = 32
-"""Along the longest side of the grid in which hollows are looked for."""
+"""Cells along the longest side of the grid in which hollows are looked for."""
 
 
 def agreement(views: Views, bounds: Bounds) -> Float[np.ndarray, " V"]:
@@ -40,7 +42,8 @@ def agreement(views: Views, bounds: Bounds) -> Float[np.ndarray, " V"]:
 
     Parameters
     ----------
-    views : with masks. bounds : lo and hi of a box around the object.
+    views : views with masks.
+    bounds : lo and hi of a world box around the object.
 
     Returns
     -------
@@ -52,7 +55,7 @@ def agreement(views: Views, bounds: Bounds) -> Float[np.ndarray, " V"]:
     allowed = _DISSENT * (len(views) - 1)
     shares = np.full(len(views), np.nan)
     for view in range(len(views)):
-        # A voxel more on every side: rays pass between the middles of voxels.
+        # The hull is enlarged by one voxel, because rays pass between the centres of voxels.
         hull = np.asarray(maximum_filter(total - left_out[view] <= allowed, size=3), bool)
         points = _points_on_rays(views, view, lo, hi)
         if len(points):
@@ -88,7 +91,7 @@ def agreement_lines(views: Views, bounds: Bounds) -> list[str]:
 
 
 def hollow_line(views: Views, bounds: Bounds) -> str:
-    """Say which part of the visual hull is a hollow, by the colours of the photographs."""
+    """Say in a line of text how much of the visual hull is hollow, judged by colours."""
     cameras = views.world_to_camera, np.asarray(views.intrinsics, np.float64)
     try:
         grid = fit_grid(bounds, _CELLS)
@@ -122,14 +125,14 @@ def _left_out(views: Views, view: int, lo: np.ndarray, hi: np.ndarray) -> Bool[n
 def _points_on_rays(
     views: Views, view: int, lo: np.ndarray, hi: np.ndarray
 ) -> Float[np.ndarray, "R S 3"]:
-    """Spread points over the rays of some pixels of a mask, as far as the box reaches."""
+    """Place S world points along each of the rays through R pixels of a mask, around the box."""
     rows, columns = np.nonzero(views.mask(view))
     chosen = np.unique(np.linspace(0, len(rows) - 1, _RAYS).astype(int)) if len(rows) else []
     pixels = np.stack([columns[chosen] + 0.5, rows[chosen] + 0.5, np.ones(len(chosen))], -1)
     pose = views.world_to_camera[view]
     rays = pixels @ np.linalg.inv(views.intrinsics[view]).T @ pose[:3, :3]
     center = views.camera_to_world[view, :3, 3]
-    # Depths of the ball around the box, along the axis of the camera.
+    # The points span the depths, along the camera's axis, of the ball around the box.
     middle, radius = 0.5 * (lo + hi), 0.5 * float(np.linalg.norm(hi - lo))
     depth = float(pose[2, :3] @ middle + pose[2, 3])
     steps = np.linspace(max(depth - radius, 0.0), max(depth + radius, 0.0), _STEPS)

@@ -1,8 +1,8 @@
 """A coordinate system for a capture: z up, the object at the origin, cameras at distance one.
 
-Photographs alone leave open where the object is, how large it is, and which way is up. People hold
-cameras level, so the cameras' x axes lie in the ground's plane; what they look at is the object.
-Everything here is NumPy in float64.
+Photographs alone leave open where the object is, how large it is, and which way is up. Since people
+hold cameras level, the cameras' x axes are taken to be parallel to the ground, and the object to be
+what the cameras look at. Everything here is NumPy in float64.
 """
 
 from dataclasses import dataclass, replace
@@ -15,13 +15,16 @@ from geosplat_jax.io.views import Views, camera_to_world_of
 from geosplat_jax.surface.hull import meeting_point
 
 _SMALLEST_SPREAD = 0.02
-"""Of the cameras' positions, per distance to the object; below it they stand at one point."""
+"""Standard deviation of the cameras' positions, as a share of their distance to the scene, up to
+which they count as one point."""
 _FLATTEST = 0.01
-"""Spread across a line per spread along it; below it the cameras stand on the line."""
+"""Spread of the cameras across a line, as a share of that along it, up to which they count as
+standing on the line."""
 _SMALLEST_TURN = np.sin(np.radians(5.0)) ** 2
-"""Second moment of the x axes' directions; below it they are one direction and no plane."""
+"""Least middle eigenvalue of the x axes' second moments; below it the axes all point along one
+direction, and span no plane."""
 _REWEIGHTINGS = 20
-_SMALLEST_TILT = 1e-3  # sine; where weights of tilted cameras stop to grow
+_SMALLEST_TILT = 1e-3  # sine of a camera's tilt, below which its weight no longer grows
 
 
 class AlignmentError(SceneError):
@@ -34,7 +37,9 @@ class Similarity:
 
     Attributes
     ----------
-    rotation : (3, 3). translation : (3,) world units. scale : positive.
+    rotation : (3, 3) rotation matrix.
+    translation : (3,) units of the new world.
+    scale : positive factor.
     """
 
     rotation: Float[np.ndarray, "3 3"]
@@ -46,7 +51,7 @@ class Similarity:
         return self.scale * points @ self.rotation.T + self.translation
 
     def views(self, views: Views) -> Views:
-        """Move cameras with the world: they see of moved points what they saw before."""
+        """Move cameras with the world, so that moved points keep their pixels."""
         poses = views.world_to_camera
         moved = poses.copy()
         moved[:, :3, :3] = poses[:, :3, :3] @ self.rotation.T
@@ -59,14 +64,15 @@ def align_world(
 ) -> Similarity:
     """Find the map to a world with z up, the object at the origin, and cameras at distance one.
 
-    Up is at right angles to the cameras' x axes, on the side of their y axes; the origin is the
-    point nearest to their optical axes, and one is the median distance of the cameras to it. The
-    first camera looks towards y.
+    Up is the direction at right angles to the cameras' x axes, on the side of their y axes. The
+    origin is the point nearest to the optical axes, and the median distance of the cameras to it
+    becomes one. The first camera looks along y, as seen from above.
 
     Parameters
     ----------
     camera_to_world : OpenGL axes (x right, y up, z backwards), rigid, in any world.
-    points : of the scene; their median distance tells what is far.
+    points : points of the scene in that world. Their median distance from the cameras is what the
+        movement of the cameras is compared with.
 
     Raises
     ------
@@ -87,12 +93,17 @@ def up_direction(
 ) -> Float[np.ndarray, " 3"]:
     """Find the direction that most cameras' x axes are at right angles to.
 
-    It minimises the sum of the absolute sines, so that a few photographs with the camera on its
-    side have no say. Where all x axes point the same way, it is the mean of the y axes.
+    It minimises the sum of the absolute dot products with the x axes, which is robust against a few
+    photographs with the camera on its side. Where all x axes are parallel, it is the mean y axis,
+    made orthogonal to them.
 
     Parameters
     ----------
     right, up : unit x and y axes of the cameras.
+
+    Returns
+    -------
+    (3,) unit vector.
     """
     mean = up.mean(axis=0)
     moments, directions = np.linalg.eigh(right.T @ right / len(right))
@@ -118,11 +129,16 @@ def _perpendicular(vector: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 
 def require_spread(centers: np.ndarray, points: np.ndarray) -> None:
-    """Refuse cameras that hardly moved, or along a line only; ``points`` tell what is far.
+    """Refuse cameras that hardly moved, or only along a line.
+
+    Parameters
+    ----------
+    centers : (V, 3) positions of the cameras.
+    points : (N, 3) points of the scene; their median distance is what movement is compared with.
 
     Raises
     ------
-    AlignmentError
+    AlignmentError : the spread of the cameras is too small.
     """
     middle = centers.mean(axis=0)
     spread = np.linalg.svd(centers - middle, compute_uv=False) / np.sqrt(len(centers))
@@ -140,11 +156,17 @@ def require_spread(centers: np.ndarray, points: np.ndarray) -> None:
 
 
 def common_target(centers: np.ndarray, sight: np.ndarray) -> np.ndarray:
-    """Point that cameras look at whose axes point along ``sight``.
+    """Find the point, (3,), that cameras look at: the one nearest to their optical axes.
+
+    Parameters
+    ----------
+    centers : (V, 3) positions of the cameras.
+    sight : (V, 3) unit directions in which they look.
 
     Raises
     ------
-    AlignmentError : the axes are parallel, or most point away from where they come closest.
+    AlignmentError : the axes are parallel, or more than half of the cameras look away from the
+        point.
     """
     cure = "keep the object in the middle of every photograph"
     try:

@@ -1,4 +1,4 @@
-"""Mesh decimation, and a normal map with the detail that the smaller mesh has lost."""
+"""Mesh decimation, and normal maps that show the detail which a decimated mesh has lost."""
 
 from dataclasses import dataclass
 
@@ -10,17 +10,17 @@ from scipy.spatial import KDTree
 from geosplat_jax.io.extras import optional_package
 from geosplat_jax.io.meshes import facing
 
-# Faces of the fine mesh, by the distance of their centres, that a point may be nearest to.
+# Faces of the fine mesh whose nearest point is computed: those with the nearest centres.
 _CANDIDATES = 8
 # Points that are looked up at once: bounds memory at about 100 MB.
 _POINTS_PER_CALL = 1 << 16
 _SIZE = 100.0
-"""Longest side of what libraries are given, whose thresholds are lengths: neither of the two below
-knows how long an edge is."""
+"""Longest side that meshes are scaled to for fast_simplification and trimesh, which have absolute
+lengths as thresholds."""
 
 
 def _middle_and_scale(vertices: Float[np.ndarray, "V 3"]) -> tuple[np.ndarray, float]:
-    """Return where a mesh lies and the factor that makes it `_SIZE` long, for ``(x - m) * f``."""
+    """Return the middle m of a mesh, and the factor f such that ``(x - m) * f`` is `_SIZE` long."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size = float(np.max(high - low))
     return 0.5 * (low + high), _SIZE / size if size > 0 else 1.0
@@ -31,13 +31,17 @@ def simplified(
 ) -> tuple[Float[np.ndarray, "W 3"], Int[np.ndarray, "G 3"]]:
     """Reduce a mesh to about ``count`` faces by collapsing edges (quadric error).
 
-    Where it lies and how large it is does not matter. More faces stay where it has many without
-    area, whose edges are not collapsed.
+    The result does not depend on the position and size of the mesh. Edges of faces without area are
+    not collapsed, so that more faces remain where there are many of these.
+
+    Returns
+    -------
+    vertices, faces : of the reduced mesh; those given if there are no more than ``count`` faces.
 
     Raises
     ------
     SceneError
-        If the package that does it is not installed.
+        If the package fast-simplification is not installed.
     ValueError
         If fewer than four faces are asked for.
     """
@@ -60,11 +64,12 @@ def simplified(
 
 @dataclass(frozen=True)
 class FineSurface:
-    """A mesh to look up the nearest point of.
+    """A mesh whose points nearest to others are looked up.
 
     Attributes
     ----------
-    vertices, normals : (V, 3). faces : (F, 3).
+    vertices, normals : (V, 3) positions, and normals at the vertices.
+    faces : (F, 3) rows of the vertices.
     """
 
     vertices: Float[np.ndarray, "V 3"]
@@ -76,12 +81,13 @@ class FineSurface:
     ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
         """Return the nearest points of the surface, and its unit normals there.
 
-        Of the eight faces whose centres are nearest, and of those that look the wanted way where
-        any does: of a thin wall the other side may be nearer.
+        Only the eight faces whose centres are nearest are considered, and of these only the ones
+        that face the wanted direction, if any do: the other side of a thin wall may be nearer.
 
         Parameters
         ----------
-        towards : direction, of any length, that the surface is to look to at each point.
+        points : query points.
+        towards : direction, of any length, that the surface should face at each point.
         """
         middle, scale = _middle_and_scale(np.asarray(self.vertices, np.float64))
         corners = ((self.vertices - middle) * scale)[self.faces]
@@ -108,7 +114,7 @@ class FineSurface:
 
 
 def unit(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-    """Scale to unit length; vectors of no length stay."""
+    """Scale vectors to unit length; zero vectors stay zero."""
     length = np.sqrt((np.asarray(vectors, np.float64) ** 2).sum(-1, keepdims=True))
     return vectors / np.where(length > 0, length, 1.0)
 
@@ -121,24 +127,29 @@ def vertex_tangents(
 ) -> Float[np.ndarray, "V 4"]:
     """Return glTF's tangents by MikkTSpace: the direction of growing u, and the bitangent's sign.
 
-    The convention of Blender, Substance and most engines (Mikkelsen 2008, "Simulation of Wrinkled
-    Surfaces Revisited"), so that a program that makes tangents of its own reads the map alike. The
-    directions of a vertex's faces, each of unit length across the normal, count by the angle of
-    their corner there, as seen along the normal. The bitangent, the sign times normal x tangent,
-    points to the top of the texture.
+    This is the convention of Blender, Substance and most engines (Mikkelsen 2008, "Simulation of
+    Wrinkled Surfaces Revisited"): a program that computes its own tangents reads the normal map in
+    the same way. A tangent is the sum over the faces at a vertex of their directions of growing u,
+    projected orthogonally to the normal and of unit length, weighted by the projected angle of the
+    face at the vertex. The bitangent, which is the sign times normal x tangent, points to the top
+    of the texture.
 
     Parameters
     ----------
-    normals : (V, 3), of unit length.
-    uv : (V, 2), ``v`` downwards; vertices are cut where charts meet, and no chart is mirrored in
-        part, so that all faces of a vertex have one sign.
+    normals : (V, 3) unit normals.
+    uv : (V, 2) texture coordinates, ``v`` downwards. Vertices are duplicated where charts meet, and
+        charts are mirrored as a whole or not at all, so that all faces of a vertex have one sign.
+
+    Returns
+    -------
+    (V, 4) float32: unit tangent, and sign.
     """
     corners, places = np.asarray(vertices, np.float64)[faces], np.asarray(uv, np.float64)[faces]
     edges, steps = corners[:, 1:] - corners[:, :1], places[:, 1:] - places[:, :1]
     steps[..., 1] *= -1.0  # from downwards to upwards
     area = steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 1, 0] * steps[:, 0, 1]
     sign = np.sign(area)
-    # Times the area on the texture, whose sign is all that matters of it.
+    # The directions are scaled by areas on the texture; only the sign of an area matters.
     towards_u = sign[:, None] * (steps[:, 1, 1:] * edges[:, 0] - steps[:, 0, 1:] * edges[:, 1])
     tangents, side = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
     for corner in range(3):
@@ -151,7 +162,7 @@ def vertex_tangents(
         angle = np.arccos(np.clip((before * after).sum(-1), -1.0, 1.0))
         np.add.at(tangents, rows, angle[:, None] * unit(_across(towards_u, normal)))
         np.add.at(side, rows, angle * sign)
-    # Where the texture says nothing, any direction across the normal will do.
+    # Where texture coordinates define no direction, any one orthogonal to the normal will do.
     axis = np.eye(3)[np.abs(normals).argmin(axis=1)]
     lost = (tangents**2).sum(-1, keepdims=True) <= 0
     tangents = unit(np.where(lost, np.cross(normals, axis), tangents))
@@ -171,12 +182,16 @@ def in_tangent_space(
     normals: Float[np.ndarray, "N 3"],
     tangents: Float[np.ndarray, "N 4"],
 ) -> Float[np.ndarray, "N 3"]:
-    """Write normals as a map holds them: along tangent, bitangent and normal of the mesh, unit.
+    """Return unit normals in tangent space, as a normal map holds them.
 
     Parameters
     ----------
-    wanted : (N, 3) normals to show.
-    normals, tangents : of the mesh, interpolated.
+    wanted : (N, 3) normals to convert, world.
+    normals, tangents : interpolated normals and tangents of the mesh at the same points.
+
+    Returns
+    -------
+    (N, 3) unit; components along tangent, bitangent and normal.
     """
     up, along = unit(normals), unit(tangents[:, :3])
     across = np.sign(tangents[:, 3:]) * np.cross(up, along)

@@ -5,10 +5,10 @@
     {"format": "geosplat_jax cameras", "version": 1,
      "splits": {"train": {"width": 200, "height": 200, "views": {NAME: {
          "world_to_camera": 4 x 4, OpenCV axes, "fx": .., "fy": .., "cx": .., "cy": .., pixels
-         "exposure": factor by which the photograph is brighter than the scene renders,
-         "white_balance": factors of red, green and blue beside it; ones where the key is missing,
+         "exposure": factor by which the photograph is brighter than the render,
+         "white_balance": further factors of red, green and blue; 1 where the key is missing,
          "residual_before": .., "residual_after": .., "iterations": .., "accepted": ..,
-         "note": why a camera was left as it was}}}}}
+         "note": reason why a camera was not changed}}}}}
 """
 
 import hashlib
@@ -32,17 +32,18 @@ _RIGID_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class RefinedCamera:
-    """The camera of one view, and how it was found.
+    """The refined camera of one view, and how it was found.
 
     Attributes
     ----------
-    world_to_camera : (4, 4) rigid, OpenCV axes. intrinsics : (3, 3) pixels.
-    exposure : the photograph, in linear light, is this times what the scene renders.
+    world_to_camera : (4, 4) rigid, OpenCV axes.
+    intrinsics : (3, 3) pixels.
+    exposure : factor, in linear light, from the render to the photograph.
     residual_before, residual_after : root of the mean squared difference to the photograph.
-    iterations : of the solver, trial steps included.
-    accepted : False where the camera is the one that the search began with.
-    note : why it is; "" where accepted.
-    white_balance : (3,) factors of red, green and blue, beside the exposure.
+    iterations : number of iterations of the solver, trial steps included.
+    accepted : False where the camera was not changed.
+    note : reason why the camera was not changed; "" where accepted.
+    white_balance : (3,) further factors of red, green and blue, beside the exposure.
     """
 
     world_to_camera: Float[np.ndarray, "4 4"]
@@ -66,7 +67,7 @@ class RefinedSplit:
 
 
 def write_cameras(path: Path, splits: Mapping[str, RefinedSplit]) -> None:
-    """Write refined cameras in one go; a file that is there is replaced."""
+    """Write refined cameras, by split, to a file, atomically; an existing file is replaced."""
     content = {
         "format": _FORMAT,
         "version": _VERSION,
@@ -102,12 +103,12 @@ def _to_plain(camera: RefinedCamera) -> dict[str, Any]:
 
 
 def cameras_digest(path: str | Path) -> str:
-    """Return a short text that tells the content of a file from any other.
+    """Return a short digest of the content of a file.
 
     Raises
     ------
     MissingFileError
-        If it is not there.
+        If the file does not exist.
     """
     try:
         return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16]
@@ -116,12 +117,12 @@ def cameras_digest(path: str | Path) -> str:
 
 
 def read_cameras(path: str | Path) -> dict[str, RefinedSplit]:
-    """Read what `write_cameras` wrote.
+    """Read a file of `write_cameras`: refined cameras, by split.
 
     Raises
     ------
     MissingFileError
-        If the file is not there.
+        If the file does not exist.
     SceneError
         If it is damaged, or of another version.
     """
@@ -179,15 +180,17 @@ def _from_plain(values: Mapping[str, Any]) -> RefinedCamera:
 
 
 def with_cameras(views: Views, split: RefinedSplit, where: str) -> Views:
-    """Return views with refined cameras, and photographs without exposures and white balance.
+    """Return views with refined cameras, and photographs corrected for exposure and white balance.
 
-    Colours are divided by the refined factors in linear light; alpha is not. Pixels that the sensor
-    clipped are divided like all others, although they may have been brighter. A factor is that of
-    the photograph as it was read, whatever the views were divided by before.
+    Colours are divided by the refined factors in linear light; alpha is unchanged. Pixels that the
+    sensor clipped are divided like all others, although they may have been brighter. Factors refer
+    to the photograph as it was read: what the views were divided by before is undone.
 
     Parameters
     ----------
-    views : as they were read. split : of the same views. where : the file, for messages.
+    views : views to correct.
+    split : refined cameras of these views.
+    where : name of the file, for messages.
 
     Raises
     ------

@@ -1,10 +1,11 @@
-"""Checkpoints: a pytree of arrays in one ``.npz`` file, bit for bit, without pickle.
+"""Checkpoints: a pytree of arrays in one ``.npz`` file, exact to the bit and without pickle.
 
 Each leaf is a member named by its path in the tree (``['params'].geometry.sdf.npy``); one more
 member holds JSON: the step, the caller's metadata, and each leaf's shape and type. Types that
-NumPy does not know (bfloat16) travel as unsigned integers, typed PRNG keys as their data and the
-name of their generator. A file is written aside, flushed to the disk, read back, and only then
-renamed and its elders removed: at any moment the last good checkpoint is whole.
+NumPy does not know (bfloat16) are stored as unsigned integers, typed PRNG keys as their data and
+the name of their generator. A file is written under another name, flushed to the disk and read
+back; only then is it renamed, and older ones are removed. So there is a whole checkpoint at any
+moment.
 """
 
 import json
@@ -26,7 +27,7 @@ from geosplat_jax.core.settings import Count, first_line, from_plain, settings
 from geosplat_jax.io.documents import parse_json
 
 FORMAT = 1
-"""Version of the file's own layout."""
+"""Version of the file format."""
 
 _META = "__meta__"
 _NAME = re.compile(r"checkpoint_(\d{8,})\.npz")
@@ -39,7 +40,7 @@ _DAMAGE = (
     OSError,
     NotImplementedError,
 )
-"""What a file raises that is not as it was written; a zip archive knows many ways."""
+"""Errors that reading a damaged file may raise; zip archives fail in many ways."""
 _CARRIERS = {1: np.uint8, 2: np.uint16, 4: np.uint32, 8: np.uint64}
 
 
@@ -52,37 +53,37 @@ class _Leaf:
     """A leaf of the tree as a checkpoint describes it."""
 
     shape: tuple[Annotated[int, Field(ge=0)], ...]
-    """Of the array."""
+    """Shape of the array, or of the array of keys."""
     dtype: str | None = None
-    """Of an array."""
+    """Type of an array; None for typed PRNG keys."""
     key: str | None = None
-    """Generator of a typed PRNG key."""
+    """Name of the generator of typed PRNG keys; None for arrays."""
 
 
 @settings
 class _Header:
-    """What a checkpoint says about itself."""
+    """Description of a checkpoint, stored as JSON in its file."""
 
     format: Literal[1]
     """See `FORMAT`."""
     step: Count
-    """That it was saved at."""
+    """Step that the checkpoint was saved at."""
     meta: dict[str, Any]
-    """Of the caller."""
+    """Metadata of the caller."""
     leaves: dict[str, _Leaf]
-    """By their paths in the tree."""
+    """Leaves by their paths in the tree."""
 
 
 def save_checkpoint(folder: str | Path, step: int, *, tree: Any, meta: dict, keep: int = 2) -> Path:
-    """Write a checkpoint and remove the ones it makes superfluous.
+    """Write a checkpoint, and remove older ones that are no longer needed.
 
     Parameters
     ----------
-    folder : made when missing.
-    step : names the file; an existing file of this step is replaced.
+    folder : created if it does not exist.
+    step : step that the file is named after; an existing file of this step is replaced.
     tree : pytree of arrays, typed PRNG keys and Python numbers.
-    meta : anything JSON can hold; read back by `read_meta` and `load_checkpoint`.
-    keep : how many checkpoints up to this step stay, this one included.
+    meta : metadata that JSON can hold; read back by `read_meta` and `load_checkpoint`.
+    keep : number of checkpoints up to this step that stay, this one included.
 
     Returns
     -------
@@ -90,8 +91,9 @@ def save_checkpoint(folder: str | Path, step: int, *, tree: Any, meta: dict, kee
 
     Raises
     ------
-    CheckpointError : the disk is full or not writable (earlier checkpoints are then untouched and
-        nothing partial is left), or a leaf is no array.
+    CheckpointError : the disk is full or not writable (earlier checkpoints are then untouched, and
+        no partial file remains), a leaf is not an array of numbers, the metadata are not JSON, or
+        ``step`` or ``keep`` is out of range.
     """
     if step < 0 or keep < 1:
         raise CheckpointError(f"step must be >= 0 and keep >= 1, got {step} and {keep}")
@@ -138,13 +140,14 @@ def load_checkpoint(path: str | Path, *, like: Any) -> tuple[Any, dict]:
 
     Returns
     -------
-    tree : NumPy leaves where ``like`` has them, else JAX arrays; bitwise what was saved.
+    tree : structure of ``like``, bitwise as saved. Leaves are Python numbers or NumPy arrays where
+        those of ``like`` are, else JAX arrays.
     meta : the caller's metadata.
 
     Raises
     ------
-    CheckpointError : missing or damaged file, or a leaf that is missing, superfluous or of another
-        shape or type, as when the configuration has changed.
+    CheckpointError : the file is missing or damaged, or its leaves differ from those of ``like`` in
+        number, shape or type, as when the configuration has changed.
     """
     path = Path(path)
     header = _header(path)
@@ -163,9 +166,9 @@ def load_checkpoint(path: str | Path, *, like: Any) -> tuple[Any, dict]:
 
 
 def latest_checkpoint(folder: str | Path) -> Path | None:
-    """Find the newest checkpoint that is whole, or None.
+    """Find the newest undamaged checkpoint; None if there is none.
 
-    Every file is read through. Damaged ones are passed over with a `RuntimeWarning`.
+    Files are read completely, the newest first. Damaged ones are skipped with a `RuntimeWarning`.
     """
     for path in _listed(Path(folder)):
         problem = _damage(path)
@@ -265,7 +268,7 @@ def _require_same_leaves(path: Path, stored: set[str], wanted: set[str]) -> None
 
 
 def _write_npz(path: Path, members: dict[str, np.ndarray]) -> None:
-    """Write like `numpy.savez`, which however reserves some names, and flush to the disk."""
+    """Write arrays as `numpy.savez` does, but under any names, and flush them to the disk."""
     with open(path, "wb") as file:
         with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
             for name, array in members.items():
@@ -276,22 +279,22 @@ def _write_npz(path: Path, members: dict[str, np.ndarray]) -> None:
 
 
 _ENCRYPTED = 1
-"""Flag of a member."""
+"""Flag that marks an encrypted member of a zip archive."""
 
 
 def _require_plain(info: zipfile.ZipInfo) -> None:
-    """Refuse a member that may unfold to more than the file holds, or is not to be read."""
+    """Refuse members that are compressed, and may expand to any size, or encrypted."""
     if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & _ENCRYPTED:
         raise ValueError(f"{info.filename} is compressed or encrypted")
 
 
 def _read_member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    """Read an array that is as large as it says; memory is spent only where the file has data.
+    """Read an array; memory is taken for data in the file only, whatever size the header claims.
 
     Raises
     ------
     ValueError
-        If it is not as it was written.
+        If the member is not as `_write_npz` writes it.
     """
     info = archive.getinfo(name + ".npy")
     _require_plain(info)
@@ -329,7 +332,7 @@ def _header(path: Path) -> _Header:
 
 
 def _damage(path: Path) -> str | None:
-    """Read the whole file and check its sums; None where it is good."""
+    """Read the whole file and verify its checksums; return the problem, or None."""
     try:
         _header(path)
         with zipfile.ZipFile(path) as archive:
@@ -357,7 +360,7 @@ def _remove(path: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Flush the rename itself, where the system lets a folder be opened."""
+    """Flush the renaming to the disk, on systems that let a folder be opened."""
     if os.name == "posix":
         handle = os.open(folder, os.O_RDONLY)
         try:

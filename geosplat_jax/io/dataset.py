@@ -36,7 +36,7 @@ class Layout(NamedTuple):
     list_frames: Callable[..., Listing]
 
 
-# The most specific first.
+# Tried in this order when a layout is recognised: the most specific ones come first.
 LAYOUTS: dict[str, Layout] = {
     "stanford_orb": Layout(is_stanford_orb, list_stanford_orb),
     "tensoir": Layout(is_tensoir, list_tensoir),
@@ -62,14 +62,15 @@ READING: tuple[tuple[str, Any], ...] = (
 """Options of `load_dataset` that a record keeps as they are, and their defaults."""
 
 READING_OPTIONS = (*(name for name, _ in READING), "bounds", "cameras")
-"""All by which a scene may be read, see `load_recorded`."""
+"""Names of all options that decide how a scene is read, see `load_recorded`."""
 
 _FAR_SIZES = 1000.0
-"""Objects farther from the origin than so many times their size are warned of: by then a point of
-them may lie .04 pixels beside where it is drawn, for a focal length of 800 pixels."""
+"""An object that lies farther from the origin than this many times its size causes a warning: at
+that distance rounding may draw its points .04 pixels off, for a focal length of 800 pixels."""
 
 _NARROW_DEG = 20.0
-"""Cameras around the object within a smaller angle see one side of it."""
+"""Degrees. If the largest angle between two cameras, as seen from the object, is smaller, the
+cameras see one side of the object only."""
 _COARSE_PIXELS = 256
 _COARSE_VIEWS = 16
 _NEEDS_MASKS = (
@@ -84,14 +85,16 @@ class Dataset:
 
     Attributes
     ----------
-    name : of the folder; layout : one of `LAYOUTS`; root : the folder.
+    name : name of the folder.
+    layout : one of `LAYOUTS`.
+    root : the folder.
     train, test : views.
-    lights : environment maps found on disk, by light (lat-long in the z-up world, see `EnvLight`).
-    train_light : light of the training images, where the layout names lights.
-    bounds : lo (3,) and hi (3,), a world box around the object.
-    warnings : what looks wrong but does not stop the work.
-    notes : what was chosen where the files leave it open.
-    options : how it was read, for `load_recorded`.
+    lights : files of environment maps, by light (lat-long in the z-up world, see `EnvLight`).
+    train_light : name of the light of the training images; None where the layout names no lights.
+    bounds : lo (3,) and hi (3,), corners of a world box around the object.
+    warnings : problems that do not prevent a training.
+    notes : choices that were made where the files leave them open.
+    options : options that the scene was read with, for `load_recorded`.
     """
 
     name: str
@@ -114,7 +117,7 @@ class Dataset:
 
     @property
     def views_to_show(self) -> Views:
-        """The test views; those of the training where there are none."""
+        """The test views, or the training views if there are no test views."""
         return self.test if self.test.names else self.train
 
 
@@ -137,17 +140,17 @@ def load_dataset(
     path : the scene folder.
     layout : one of `LAYOUTS`; recognised when not given.
     downscale : integer factor that images and intrinsics are reduced by.
-    light : training light, where the layout has a choice.
-    bounds : lo and hi of a box around the object; by default that of the visual hull.
-    train_views, test_views : at most this many views, spread evenly over the list.
-    cameras : file of refined cameras, which take the place of the scene's in the splits that it
-        names; see `cameras.with_cameras` for what becomes of the photographs.
-    mask_files : False leaves files of masks unread; an image's own alpha stays.
+    light : name of the training light, where the layout has several.
+    bounds : lo and hi of a world box around the object; by default that of `object_bounds`.
+    train_views, test_views : use at most this many views, spread evenly over the list.
+    cameras : file of refined cameras. They replace the cameras of the scene in the splits that the
+        file names, and the photographs are corrected as `cameras.with_cameras` describes.
+    mask_files : False ignores mask files; the alpha of the images themselves is still used.
 
     Raises
     ------
-    MissingFileError : the folder or a file in it is not there.
-    SceneError : anything in it cannot be used; the message says what, why and the cure.
+    MissingFileError : the folder or a file in it does not exist.
+    SceneError : something in the folder cannot be used; the message says what, why, and the cure.
     """
     root = Path(path).expanduser()
     if not root.is_dir():
@@ -222,7 +225,7 @@ def _load_split(
 
 
 def _recorded(cameras: Path) -> dict[str, str]:
-    """Return what a run notes of its refined cameras: where they are, and what they were."""
+    """Return what a run records of its file of refined cameras: the path, and a digest."""
     return {
         "cameras": str(cameras.resolve()),
         "cameras_digest": cameras_digest(cameras),
@@ -232,13 +235,16 @@ def _recorded(cameras: Path) -> dict[str, str]:
 def load_recorded(path: str | Path, options: Mapping[str, Any]) -> Dataset:
     """Load a scene folder as a run read it, by the options in its record.
 
-    ``options`` may have ``bounds`` (six numbers, lo then hi) and all else that `load_dataset` takes
-    by name; anything else in it is left alone.
+    Parameters
+    ----------
+    path : the scene folder.
+    options : as in `Dataset.options`: keyword arguments of `load_dataset`, with ``bounds`` as six
+        numbers (lo, then hi). Missing ones take their defaults; other keys are ignored.
 
     Raises
     ------
     SceneError
-        As `load_dataset`, and if the file of the cameras is not what it was when it was recorded.
+        As `load_dataset`, and if the file of refined cameras has changed since it was recorded.
     """
     bounds, cameras = options.get("bounds"), options.get("cameras")
     digest = options.get("cameras_digest")
@@ -258,7 +264,7 @@ def load_recorded(path: str | Path, options: Mapping[str, Any]) -> Dataset:
 def photograph_size(
     path: str | Path, *, layout: str | None = None, light: str | None = None
 ) -> tuple[int, int]:
-    """Height and width of a scene's first training photograph, as it is on disk.
+    """Height and width in pixels of a scene's first training photograph, before any reduction.
 
     Raises
     ------
@@ -272,23 +278,24 @@ def photograph_size(
 
 
 class Downscale(NamedTuple):
-    """A factor to read a scene with, and a sentence that says why."""
+    """Factor to reduce the images of a scene by, and the reason for it in a sentence."""
 
     factor: int
     reason: str
 
 
 def choose_downscale(path: str | Path, cells: int, **options: Any) -> Downscale:
-    """Choose how far photographs can be reduced before the grid's cells show more than they do.
+    """Choose how far photographs can be reduced without showing less detail than the grid holds.
 
-    It is the largest factor at which a pixel, at the distance of the object, is at most half as
-    wide as a cell; 1 where the photographs are coarser than that. Some of the views are read, as
-    small as they tell where the object is.
+    The result is the largest factor at which a pixel, at the distance of the object, is at most
+    half as wide as a cell; 1 where the photographs are coarser than that already. To find the
+    object, some of the views are read at low resolution.
 
     Parameters
     ----------
-    path : the scene folder. cells : along the longest side of the object's box.
-    options : of `load_dataset`, without ``downscale``.
+    path : the scene folder.
+    cells : number of grid cells along the longest side of the object's box.
+    options : options of `load_dataset`, except ``downscale``.
 
     Raises
     ------
@@ -301,7 +308,7 @@ def choose_downscale(path: str | Path, cells: int, **options: Any) -> Downscale:
     listing = LAYOUTS[layout].list_frames(root, light=options.get("light"))
     shortest = min(min(image_size(frame.image)) for frame in (*listing.train, *listing.test))
     coarse = max(1, shortest // _COARSE_PIXELS)
-    # Cameras that were refined belong to images of one size; here they would change little.
+    # Refined cameras belong to images of one size, and would change the factor little.
     own = ("cameras", "train_views", "test_views")
     reading = {name: value for name, value in options.items() if name not in own}
     found = load_dataset(path, **reading, downscale=coarse, train_views=_COARSE_VIEWS, test_views=1)
@@ -328,7 +335,7 @@ def _layout_of(root: Path, layout: str | None) -> str:
 
 
 def recognise_layout(root: Path) -> str:
-    """Tell the layout of a scene folder by the files that are there.
+    """Return the layout of a scene folder, recognised by the files in it; one of `LAYOUTS`.
 
     Raises
     ------
@@ -347,9 +354,19 @@ def recognise_layout(root: Path) -> str:
 
 
 def object_bounds(views: Views, *, margin: float = 0.02) -> Bounds:
-    """Box around the visual hull of the views, or around what they look at without masks.
+    """Find a box around the object, from the masks or else from the lines of sight.
 
-    See `hull.hull_bounds` and `hull.sight_bounds`.
+    With masks it is the box of the visual hull, `hull.hull_bounds`; without masks it surrounds what
+    the cameras look at, `hull.sight_bounds`.
+
+    Parameters
+    ----------
+    views : the training views.
+    margin : added on every side of the hull, as a share of its longest side.
+
+    Returns
+    -------
+    lo, hi : (3,) corners of the box, world.
 
     Raises
     ------
@@ -432,7 +449,10 @@ def _check_masks(views: Views, split: str, warnings: list[str]) -> None:
 
 
 def _check_box(splits: Mapping[str, Views], box: Bounds, warnings: list[str]) -> None:
-    """Refuse cameras within the box around the object; warn of where it lies and is seen from."""
+    """Refuse cameras inside the box around the object.
+
+    Add a warning if all cameras are on one side of the object, or if it lies far from the origin.
+    """
     for views in splits.values():
         _check_cameras_outside(views, box)
     _check_sides(splits["train"], box, warnings)
@@ -453,7 +473,7 @@ def _check_sides(views: Views, bounds: Bounds, warnings: list[str]) -> None:
 
 
 def _check_origin(bounds: Bounds, warnings: list[str]) -> None:
-    """Warn of an object so far from the origin that float32 does not know where its parts are."""
+    """Warn of an object so far from the origin that float32 cannot resolve its shape."""
     sizes = np.linalg.norm(0.5 * (bounds[0] + bounds[1])) / np.max(bounds[1] - bounds[0])
     if sizes > _FAR_SIZES:
         warnings.append(

@@ -1,9 +1,9 @@
 """Lens distortion: photographs resampled to the images of a pinhole camera.
 
-Points are given on the plane z = 1 of the camera, OpenCV axes: x = X / Z, y = Y / Z. A model says
-where the lens shows such a point, which is all that undistorting an image takes. The polynomials of
-both models turn back far outside the photograph they were fitted to, where they would show a part
-of it a second time; the plane ends there.
+Points are given on the plane z = 1 of the camera, OpenCV axes: x = X / Z, y = Y / Z. A model maps
+such a point to where the lens shows it, which is all that undistorting an image needs. Far outside
+the photograph that they were fitted to, the polynomials of both models decrease again and would
+show a part of the photograph a second time; points from that radius on are left out.
 """
 
 from collections.abc import Callable
@@ -13,13 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-_SAMPLES = 4096  # of the radius, to see where a polynomial turns back
-_WHOLE = 1.0 - 1e-3  # a sample that counts takes all of its weight from pixels that count
+_SAMPLES = 4096  # radii at which a polynomial is evaluated to find where it decreases
+_WHOLE = 1.0 - 1e-3  # least weight of pixels that count in a sample that counts
 _SMALLEST_ALPHA = 1e-6
 _ROWS_AT_ONCE = 16
 _INVERSIONS = 60
-_INVERTED = 0.02  # pixels that an inverted lens may be off
-_WIDEST = 2.0  # radii of the photograph, beyond which no pixel of it is looked for
+_INVERTED = 0.02  # largest error of an inverted lens, in pixels
+_WIDEST = 2.0  # the inverse is searched up to this many radii of the photograph
 
 
 def _powers(squared: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
@@ -46,7 +46,7 @@ class Brown:
     divisor: tuple[float, ...] = ()
 
     def profile(self, radius: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """Radius at which a radius is shown, without the tangential part."""
+        """Map a radius on the plane z = 1 to the distorted radius, without the tangential part."""
         squared = radius * radius
         return radius * _powers(squared, self.radial) / _nonzero(_powers(squared, self.divisor))
 
@@ -75,7 +75,7 @@ class Fisheye:
     radial: tuple[float, ...]
 
     def profile(self, radius: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """Radius at which a radius is shown."""
+        """Map a radius on the plane z = 1 to the distorted radius."""
         angle = np.arctan(radius)
         return angle * _powers(angle * angle, self.radial)
 
@@ -98,7 +98,7 @@ def _nonzero(values: np.ndarray) -> np.ndarray:
 
 
 def largest_radius(distortion: Distortion, reach: float) -> float:
-    """Radius on the plane z = 1, at most ``reach``, up to which what is shown moves outwards."""
+    """Find the radius on the plane z = 1, at most ``reach``, up to which the profile increases."""
     radius = np.linspace(0.0, reach, _SAMPLES)
     turns_back = np.diff(distortion.profile(radius)) <= 0.0
     return float(radius[np.argmax(turns_back)]) if turns_back.any() else reach
@@ -118,7 +118,7 @@ class Lookup(NamedTuple):
     inside: Bool[np.ndarray, "H W"]
 
     def part(self, rows: slice) -> "Lookup":
-        """Return some rows of it."""
+        """Return some rows of the lookup."""
         return Lookup(self.rows[rows], self.columns[rows], self.inside[rows])
 
 
@@ -151,7 +151,8 @@ def photograph_lookup(
     """Find the pixels of a photograph in the pinhole image of the same intrinsics and size.
 
     The inverse of `pinhole_lookup`, by fixed-point iteration: ``x <- x + target - distort(x)``.
-    Pixels at which it does not settle, or that the pinhole does not show, are not inside.
+    Pixels at which the iteration does not converge, or that the pinhole image does not show, are
+    not ``inside``.
     """
     fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
     target_x, target_y = np.meshgrid(
@@ -160,7 +161,7 @@ def photograph_lookup(
     x, y = target_x.copy(), target_y.copy()
     is_settled = np.ones(x.shape, bool)
     if distortion is not None:
-        # What a pinhole shows lies within its own border, so nothing leaves it on the way.
+        # Iterates are kept within the radius up to which the distortion is invertible.
         limit = largest_radius(distortion, _WIDEST * float(np.hypot(x, y).max()))
         for _ in range(_INVERSIONS):
             shown_x, shown_y = distortion.distort(x, y)
@@ -179,10 +180,10 @@ def photograph_lookup(
 def resample(
     pixels: Float[np.ndarray, "H W C"], lookup: Lookup
 ) -> Float[np.ndarray, "rows columns C"]:
-    """Sample linear pixels bilinearly where a lookup says; zero where it is not inside.
+    """Sample linear pixels bilinearly at the positions of a lookup; zero where it is not inside.
 
-    Colour of four-channel images is weighted by alpha, the last channel, as `images.downscale`
-    does. Within half a pixel of the border, that of the last pixel is taken.
+    Colour of four-channel images is weighted by alpha, the last channel, as in `images.downscale`.
+    Within half a pixel of the border, the border's pixel is taken.
     """
     values = np.asarray(pixels, np.float32)
     if values.shape[-1] == 4:
@@ -194,17 +195,21 @@ def resample(
 def resample_at(
     pixels_at: Callable[[np.ndarray], np.ndarray], shape: tuple[int, ...], lookup: Lookup
 ) -> Float[np.ndarray, "rows columns C"]:
-    """Sample as `resample` does what is not in memory as linear floats.
+    """Sample as `resample` does, from an image that is not in memory as linear floats.
 
     Parameters
     ----------
-    pixels_at : makes the values (..., C) at indices of the flattened image; colour of four channels
-        is multiplied by alpha.
-    shape : of the image, (H, W, C).
-    lookup : where to sample.
+    pixels_at : function from indices of the flattened image to linear float values (..., C); with
+        four channels, colour must be premultiplied by alpha.
+    shape : (H, W, C) of the image.
+    lookup : positions to sample at.
+
+    Returns
+    -------
+    (rows, columns, C) float32; colour of four channels has straight alpha.
     """
     sampled = np.zeros((*lookup.rows.shape, shape[-1]), np.float32)
-    # A few rows at a time: what a pass makes then stays in the cache.
+    # A few rows at a time, so that temporary arrays stay in the processor's cache.
     for start in range(0, len(sampled), _ROWS_AT_ONCE):
         rows = slice(start, start + _ROWS_AT_ONCE)
         part = _bilinear(pixels_at, shape, lookup.rows[rows], lookup.columns[rows])
@@ -222,7 +227,7 @@ def _bilinear(
     rows: Float[np.ndarray, "h w"],
     columns: Float[np.ndarray, "h w"],
 ) -> Float[np.ndarray, "h w C"]:
-    """Sample at pixel coordinates, whose centres lie at + 0.5; beyond the border, its pixels."""
+    """Sample at pixel coordinates, centres at + 0.5; beyond the border its pixels are repeated."""
     height, width = shape[:2]
     row = np.clip(rows - 0.5, 0.0, height - 1.0)
     column = np.clip(columns - 0.5, 0.0, width - 1.0)

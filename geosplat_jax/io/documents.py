@@ -5,23 +5,23 @@ import math
 from typing import Any
 
 _MOST_DIGITS = 300
-"""Of a whole number; a longer one has no floating-point number near it."""
+"""Most characters of a whole number that is converted; the largest float has 309 digits."""
 
 
 def _whole_number(text: str) -> int | float:
-    """Read a whole number; one beyond all floating-point numbers is infinite."""
+    """Read a whole number; one of more than `_MOST_DIGITS` characters becomes infinite."""
     if len(text) <= _MOST_DIGITS:
         return int(text)
     return -math.inf if text.startswith("-") else math.inf
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse a JSON document; whole numbers beyond all floating-point numbers are infinite.
+    """Parse a JSON document; whole numbers of more than 300 characters become infinite.
 
     Raises
     ------
     ValueError
-        If it is no JSON, not UTF-8, or nested more deeply than Python follows.
+        If the text is not JSON, not UTF-8, or nested too deeply for Python's parser.
     """
     try:
         decoded = text.decode("utf-8") if isinstance(text, bytes) else text

@@ -46,15 +46,15 @@ LARGEST_TEXTURE = 16_384
 """Edge of the largest textures, texels; few programs open larger ones."""
 
 _TEXEL_BYTES = 130
-"""Of a texel while a texture is baked, measured: its face, barycentric coordinates and materials,
-and copies of these."""
+"""Memory per texel while a texture is baked (measured): its face, barycentric coordinates and
+materials, and copies of these."""
 
 # glTF's targets of a buffer: vertex attributes and indices.
 _VERTEX_BUFFER, _INDEX_BUFFER = 34962, 34963
 
 _SAMPLES_PER_CALL = 1 << 16
 _VIEWERS_SIGNS = np.array([(-1.0) ** m for degree in (1, 2, 3) for m in range(-degree, degree + 1)])
-"""Of the harmonics of degree 1 to 3: (-1)^m, the phase of Condon and Shortley."""
+"""Signs (-1)^m of the harmonics of degree 1 to 3 that viewers expect: the Condon-Shortley phase."""
 # Keeps the logarithm of a flat Gaussian finite, whatever the size of the scene.
 _SMALLEST_SCALE = float(np.finfo(np.float32).tiny)
 _OPACITY_MARGIN = 1e-6
@@ -101,7 +101,7 @@ def _textures(materials: Float[np.ndarray, "S S 5"]) -> tuple[Image.Image, Image
 
 
 def _agrees(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> bool:
-    """Whether normals lie on the side that the faces look to, by area."""
+    """Whether vertex normals point to the front of the faces, in the mean weighted by area."""
     a, b, c = np.moveaxis(np.asarray(vertices, np.float64)[faces], 1, 0)
     return bool(np.sum(np.cross(b - a, c - a) * normals[faces].sum(1)) >= 0)
 
@@ -129,7 +129,7 @@ def _checked_mesh(
     flipped = closed and signed_volume(vertices, kept) < 0
     if flipped:
         kept = kept[:, ::-1]
-        # Normals made from the faces point inward with them; those that were right stay.
+        # Normals that were computed from inverted faces point inward too; correct ones are kept.
         normals = np.where(_agrees(vertices, kept, normals), normals, -normals)
     used, rows = np.unique(kept, return_inverse=True)
     info = {"dropped_faces": len(faces) - len(kept), "closed": closed, "flipped": flipped}
@@ -137,7 +137,7 @@ def _checked_mesh(
 
 
 def _write_glb(path: str | Path, mesh: trimesh.Trimesh) -> None:
-    """Serialise one mesh with its normals, and say of each buffer what it holds."""
+    """Write one mesh with its normals, and declare each buffer as vertices or indices."""
 
     def complete(tree: dict) -> None:
         _standardize(tree)
@@ -158,8 +158,8 @@ def _write_glb(path: str | Path, mesh: trimesh.Trimesh) -> None:
 def _write_textures(path: Path, mesh: trimesh.Trimesh, *, mark: str = "") -> dict[str, str]:
     """Write the textures of a mesh as PNG beside ``path``; return the files' names.
 
-    Roughness and metallic are grey pictures of their own. ``mark`` keeps the files of a format
-    apart from those of another, which may be of another mesh.
+    Roughness and metallic are separate grey images. ``mark`` is part of the file names; it keeps
+    the files of one format apart from those of another, which may belong to another mesh.
     """
     visual = mesh.visual
     assert isinstance(visual, TextureVisuals)
@@ -190,14 +190,14 @@ _OBJ_MAPS = {
     "metallic": "map_Pm",
     "normal": "norm",
 }
-"""Lines of a material in MTL that name textures."""
+"""Keywords of an MTL material that name its textures."""
 
 
 def _write_obj(path: str | Path, mesh: trimesh.Trimesh) -> None:
     """Write a textured mesh as OBJ, its material beside it as MTL, and its textures as PNG.
 
-    Roughness and metallic have no place in the format's first version; their maps, ``map_Pr`` and
-    ``map_Pm``, are those of its usual extension, and grey.
+    The original format has no roughness and metallic; their grey maps, ``map_Pr`` and ``map_Pm``,
+    are those of its usual PBR extension.
     """
     path, visual = Path(path), mesh.visual
     assert isinstance(visual, TextureVisuals)
@@ -215,7 +215,7 @@ def _write_obj(path: str | Path, mesh: trimesh.Trimesh) -> None:
 
 
 def _standardize(tree: dict) -> None:
-    """Give attributes that trimesh does not know, or would round, their standard names."""
+    """Restore the standard names of attributes that trimesh does not know, or would round."""
     for primitive in (p for mesh in tree["meshes"] for p in mesh["primitives"]):
         attributes = primitive["attributes"]
         for name in {"_COLOR_0", "_TANGENT"} & set(attributes):
@@ -229,7 +229,10 @@ def _vertex_colored(
     sample_materials: SampleMaterials,
     double_sided: bool,
 ) -> trimesh.Trimesh:
-    """Mesh with linear albedo on its vertices; roughness and metallic as constants and extras."""
+    """Make a mesh with linear albedo at its vertices.
+
+    The material has the medians of roughness and metallic; vertex attributes hold their values.
+    """
     materials = _evaluate_materials(sample_materials, vertices)
     material = PBRMaterial(
         name="material",
@@ -254,7 +257,13 @@ def _vertex_colored(
 
 
 def _normal_map(normals: Float[np.ndarray, "N 3"], covered: Bool[np.ndarray, "T T"]) -> Image.Image:
-    """Lay unit normals in tangent space, of the texels that faces cover, out as a picture."""
+    """Write unit normals in tangent space into the covered texels of a normal map.
+
+    Parameters
+    ----------
+    normals : (N, 3), one for each covered texel, row by row.
+    covered : (T, T) texels that a face covers.
+    """
     shown = np.zeros((*covered.shape, 3), np.float32)
     shown[covered] = 0.5 + 0.5 * normals
     return Image.fromarray(_to_bytes(fill_gutters(shown, covered)))
@@ -269,10 +278,10 @@ def _textured(
     texture_size: int,
     fine: FineSurface | None,
 ) -> tuple[trimesh.Trimesh, dict[str, Any]]:
-    """Mesh with baked textures, and what the baking took.
+    """Make a mesh with baked textures; also return counts, coverage and seconds of the baking.
 
-    ``fine`` : surface that materials and a map of normals are taken from; None for the mesh itself,
-    whose normals need no map.
+    ``fine`` : surface that materials and a normal map are baked from; None for the mesh itself,
+    which needs no normal map.
     """
     charts = unwrap(vertices, faces, normals, texture_size=texture_size)
     start = time.perf_counter()
@@ -326,7 +335,7 @@ def _textured(
 
 
 def _require_texture(size: int) -> None:
-    """Refuse textures of no size, or of one that cannot be made."""
+    """Refuse textures of an impossible size, or that do not fit into the memory."""
     if not 1 <= size <= LARGEST_TEXTURE:
         raise ValueError(f"texture_size must be from 1 to {LARGEST_TEXTURE}, got {size}")
     refusal = memory_refusal([Need(f"textures of {size} x {size}", _TEXEL_BYTES * size**2)])
@@ -349,11 +358,12 @@ def export_mesh_glb(
 ) -> dict[str, Any]:
     """Write a mesh and its materials as a binary glTF 2.0 file.
 
-    The z-up world becomes glTF's y-up. Textures hold the materials at texel centres: base colour
-    sRGB-encoded, metallic-roughness linear (green, blue), gutters filled. With ``vertex_colors``
-    nothing is unwrapped: the linear albedo goes to ``COLOR_0``, the medians of roughness and
-    metallic to the material, their values to the attributes ``_ROUGHNESS`` and ``_METALLIC``.
-    Degenerate faces are dropped; a closed mesh is turned outward and made single-sided.
+    The z-up world is turned into glTF's y-up axes. Textures hold the materials at texel centres:
+    base colour in sRGB, roughness (green) and metallic (blue) linear, with gutters filled. With
+    ``vertex_colors`` the mesh is not unwrapped: linear albedo goes into ``COLOR_0``, the medians of
+    roughness and metallic into the material, and their values into the attributes ``_ROUGHNESS``
+    and ``_METALLIC``. Degenerate faces are dropped; a closed mesh is turned outward and made
+    single-sided.
 
     Parameters
     ----------
@@ -361,14 +371,14 @@ def export_mesh_glb(
     vertices : (V, 3) world positions, z up, without padding.
     faces : (F, 3) rows of ``vertices``, counter-clockwise from outside.
     normals : (V, 3) unit shading normals.
-    sample_materials : maps world points (N, 3) to albedo (N, 3) linear, roughness (N,) and
-        metallic (N,); called with one N throughout.
-    vertex_colors : colours on the vertices instead of textures.
-    texture_size : width and height of the textures.
-    face_count : reduce the mesh to about so many faces first, and put its normals into a map, with
-        tangents; None for the mesh as it is.
-    obj_path : also write the same mesh and textures there as OBJ, with MTL and PNG beside it.
-    usd_path : likewise as USD, ``*.usdc``.
+    sample_materials : function from world points (N, 3) to albedo (N, 3) linear, roughness (N,) and
+        metallic (N,); always called with the same N.
+    vertex_colors : write colours at the vertices instead of textures.
+    texture_size : width and height of the textures, texels.
+    obj_path : also write the mesh and its textures as OBJ, with MTL and PNG files beside it.
+    usd_path : also write them as USD, ``*.usdc``, with PNG files beside it.
+    face_count : first reduce the mesh to about this many faces, and write the normals of the full
+        mesh into a normal map, with tangents; None for the mesh as it is.
 
     Returns
     -------
@@ -379,11 +389,12 @@ def export_mesh_glb(
     Raises
     ------
     SceneError
-        If fewer faces or a USD are asked for and the package for it is not installed.
+        If fewer faces or a USD file are asked for, and the package for it is not installed.
     ValueError
-        If an OBJ, a USD or fewer faces are asked for with colours on the vertices, the mesh is
-        empty or not finite, ``sample_materials`` returns a wrong shape, or the textures are of no
-        size, of one above `LARGEST_TEXTURE`, or do not fit into the memory.
+        If an OBJ, a USD or fewer faces are asked for with colours at the vertices, the mesh is
+        empty or not finite, ``sample_materials`` returns a wrong shape or values that are not
+        finite, or the textures show nothing of the mesh, are not from 1 to `LARGEST_TEXTURE` texels
+        wide, or do not fit into the memory.
     """
     start = time.perf_counter()
     for kind, other in (("an OBJ", obj_path), ("a USD", usd_path)):
@@ -440,19 +451,21 @@ def export_gaussians_ply(
     """Write Gaussians in the binary PLY layout of 3D Gaussian Splatting, which viewers open.
 
     Scales are stored as logarithms, opacities as logits, the colour as the constant spherical
-    harmonic ``(rgb - 0.5) / 0.28209``, quaternions as (w, x, y, z) of unit length. Pass real rows
-    only, no padding.
+    harmonic ``(rgb - 0.5) / 0.28209``, quaternions as (w, x, y, z) of unit length. Rows of padding
+    must be left out.
 
     Parameters
     ----------
     path : destination, ``*.ply``.
-    means : (N, 3) world; quats : (N, 4) wxyz; scales : (N, 3) standard deviations;
-        opacities : (N,) in [0, 1], kept 1e-6 away from both ends.
-    rgb : (N, 3) *display* colour, that is sRGB-encoded: of the constant harmonic alone.
-    normals : (N, 3).
+    means : (N, 3) world.
+    quats : (N, 4) wxyz, of any length but zero.
+    scales : (N, 3) standard deviations, world units.
+    opacities : (N,) in [0, 1]; kept 1e-6 away from both ends.
+    rgb : (N, 3) *display* colour, that is in sRGB, without the harmonics of ``rest``.
+    normals : (N, 3) written as they are.
     rest : (N, 15, 3) coefficients of the harmonics of degree 1 to 3 (`core.harmonics`), for splats
-        whose colour depends on the viewer. They are written as ``f_rest``, all of one channel
-        before those of the next, with the alternating sign that viewers expect.
+        whose colour depends on the direction of view. They are written as ``f_rest``, one channel
+        after the other, with the alternating sign that viewers expect.
 
     Raises
     ------

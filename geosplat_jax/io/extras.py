@@ -1,4 +1,4 @@
-"""Packages that only some parts need: they come with an extra of the installation."""
+"""Import of optional packages, which only some functions need; an extra installs each of them."""
 
 import importlib
 from types import ModuleType
@@ -14,19 +14,20 @@ def optional_package(
     package: str | None = None,
     error: type[Exception] = SceneError,
 ) -> ModuleType:
-    """Import a package, or say how to install it.
+    """Import an optional package; the error for a missing one shows how to install it.
 
     Parameters
     ----------
-    module : name to import. purpose : what needs it, the beginning of the message.
-    extra : of the installation, that brings the package.
-    package : its name where that is not the module's.
-    error : to raise where it is not installed.
+    module : name of the module to import.
+    purpose : what needs the package, the first words of the error message.
+    extra : extra of ``geosplat_jax`` that installs the package.
+    package : name of the package in the registry; None if it is that of the module.
+    error : class of the error.
 
     Raises
     ------
     SceneError
-        If it is not installed, or ``error``.
+        If the package is not installed; another class if ``error`` names one.
     """
     try:
         return importlib.import_module(module)

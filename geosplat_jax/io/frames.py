@@ -1,8 +1,8 @@
 """Lists of frames, to which every dataset layout is reduced before any pixel is read.
 
-A layout reader returns a `Listing`: for each view its pose, its lens and which files hold what.
-Here live the checks that all layouts share: JSON, keys, poses, and paths that must stay inside the
-scene folder.
+A layout reader returns a `Listing`: for each view its pose, its lens and its files. This module
+also has the checks that all layouts share: of JSON, keys and poses, and of paths, which must stay
+inside the scene folder.
 """
 
 import os
@@ -26,7 +26,7 @@ MAP_SUFFIXES = (".hdr", ".exr")
 _RIGID_TOLERANCE = 1e-3
 _QUATERNION_TOLERANCE = 1e-2
 TEST_EVERY = 8
-"""Where a capture names no test views, every eighth is one."""
+"""Every eighth view is a test view where a capture names none."""
 
 _OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _IMAGE_FOLDERS = ("images", "image", "blended_images")
@@ -43,10 +43,10 @@ class Frame:
     name : unique within its split.
     camera_to_world : (4, 4) rigid, OpenGL/Blender axes.
     lens : see `AngleLens` and `PinholeLens`.
-    image : colour, with alpha unless there is a ``mask``.
-    mask : coverage in channel 0, or None.
-    valid : file that is black where pixels do not count, or None; of the image's size.
-    ignored : likewise, black where they *do* count.
+    image : file of the photograph; its alpha channel, if it has one, is the mask.
+    mask : file of the mask, or None; see `reading.read_photograph` for which one is used.
+    valid : file of the image's size that is black where pixels do not count, or None.
+    ignored : file of the image's size that is black where pixels *do* count, or None.
     light : environment map of this view, lat-long in the frame of its camera; see `ViewLight`.
     truth : files of the ground truth, by ``albedo | normal | roughness | metallic``.
     relight : files of the same view under other lights, by light.
@@ -71,11 +71,12 @@ class Listing:
     Attributes
     ----------
     train, test : frames in the order of the scene.
-    lights : environment maps that were found, by light.
-    train_light : the light of the training images, where the layout names lights.
-    albedo_is_srgb : how the albedo files encode their values.
-    is_capture : photographs, whose sizes may differ and whose masks may be missing altogether.
-    notes : what was chosen that the files leave open, for the user to read.
+    lights : files of environment maps, by light.
+    train_light : name of the light of the training images; None where the layout names no lights.
+    albedo_is_srgb : whether albedo files are in sRGB; otherwise they are linear.
+    is_capture : whether images are photographs, whose sizes may differ, and which may all be
+        without masks.
+    notes : choices that were made where the files leave them open, in sentences for the user.
     """
 
     train: tuple[Frame, ...]
@@ -116,7 +117,15 @@ def require(content: Mapping[str, Any], key: str, where: Path | str) -> Any:
 
 
 class ListedFrame(NamedTuple):
-    """A frame of a ``transforms*.json``: its path, camera, and keys with those of the file."""
+    """A frame of a ``transforms*.json``.
+
+    Attributes
+    ----------
+    file_path : as the file names it.
+    pose : (4, 4) camera-to-world, OpenGL axes.
+    lens : lens of the frame.
+    values : all keys of the frame, and those of the whole file where the frame has none.
+    """
 
     file_path: str
     pose: Float[np.ndarray, "4 4"]
@@ -125,11 +134,11 @@ class ListedFrame(NamedTuple):
 
 
 def require_no_light(light: str | None) -> None:
-    """Refuse the name of a light, for layouts whose photographs have one without a name.
+    """Refuse the name of a light, for layouts that have a single light without a name.
 
     Raises
     ------
-    SceneError
+    SceneError : ``light`` is not None.
     """
     if light is not None:
         raise SceneError(f"this layout has one unnamed light, got light={light!r}; leave it out")
@@ -146,14 +155,16 @@ def read_transforms(path: Path) -> list[tuple[str, np.ndarray, Lens]]:
 def list_transforms(content: Mapping[str, Any], path: Path) -> list[ListedFrame]:
     """Check the frames of a ``transforms*.json``.
 
-    Lenses are ``camera_angle_x``, or ``fl_x, fl_y, cx, cy`` in pixels of an image of ``w`` by
-    ``h``, for all frames or for each. Without ``fl_y`` pixels are square, without ``cx`` or ``cy``
-    the axis is in the middle, and without ``fl_x`` the angle gives it. ``camera_model``,
-    ``is_fisheye``, ``k1`` to ``k4``, ``p1, p2`` or ``distortion_params`` bend them.
+    A lens is given by ``camera_angle_x``, or by ``fl_x, fl_y, cx, cy`` in pixels of an image of
+    ``w`` by ``h``, once for all frames or in each frame. A missing ``fl_x`` is computed from the
+    angle, a missing ``fl_y`` from ``camera_angle_y``, or else it equals ``fl_x``; a missing ``cx``
+    or ``cy`` is the middle of the image. ``camera_model``, ``is_fisheye``, ``k1`` to ``k4``, ``p1,
+    p2`` or ``distortion_params`` describe the distortion.
 
     Parameters
     ----------
-    content : of the file. path : of it, for messages.
+    content : content of the file.
+    path : path of the file, for messages.
 
     Raises
     ------
@@ -194,14 +205,14 @@ def checked_numbers(values: Any, shape: tuple[int, ...], what: str) -> Float[np.
 def opengl_pose(
     rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, " 3"], where: str
 ) -> Float[np.ndarray, "4 4"]:
-    """Return camera-to-world with OpenGL axes of ``x_camera = R x + t`` with OpenCV axes.
+    """Convert a pose ``x_camera = R x + t`` with OpenCV axes to camera-to-world with OpenGL axes.
 
     Raises
     ------
     SceneError : see `checked_pose`.
     """
     pose = np.eye(4)
-    # Inverted after the check, so that what is singular is named and not divided by.
+    # The pose is inverted after the check, which reports a singular one.
     pose[:3, :3], pose[:3, 3] = rotation, translation
     rigid = checked_pose(pose, where)
     turned = np.eye(4)
@@ -226,9 +237,9 @@ def quaternion_to_rotation(
 
 
 def checked_pose(matrix: Any, where: str) -> Float[np.ndarray, "4 4"]:
-    """Return a camera-to-world matrix that is a rigid motion, exactly orthonormal.
+    """Check a camera-to-world matrix, and return it as an exactly rigid transform.
 
-    Rounding up to 1e-3 is repaired: the nearest rotation is taken.
+    Deviations up to 1e-3, as rounding leaves them, are repaired by taking the nearest rotation.
 
     Raises
     ------
@@ -265,12 +276,12 @@ def checked_pose(matrix: Any, where: str) -> Float[np.ndarray, "4 4"]:
 
 
 def inside_scene(root: Path, relative: str, where: Path | str) -> Path:
-    """Join a path that a scene file names, refusing one that leaves the scene folder.
+    """Join the scene folder and a path that a scene file names; the result must lie inside.
 
     Raises
     ------
-    SceneError : the path is absolute, climbs with ``..``, or follows a link out of the folder; no
-        file can have such a name.
+    SceneError : the path is absolute, contains ``..``, follows a link out of the folder, or is no
+        possible name of a file.
     """
     if "\0" in relative:
         raise SceneError(f"{relative!r}, named in {where}, is no name of a file")
@@ -293,12 +304,12 @@ def image_stem(root: Path, relative: str, where: Path | str) -> Path:
 
 
 def existing(root: Path, candidates: list[Path], what: str) -> Path:
-    """Return the first path that exists and, links followed, lies within ``root``.
+    """Return the first of some paths that is a file.
 
     Raises
     ------
-    MissingFileError : none exists.
-    SceneError : it leads out of the scene folder.
+    MissingFileError : none is a file.
+    SceneError : the file is a link that leads out of ``root``, the scene folder.
     """
     for path in candidates:
         if path.is_file():
@@ -320,7 +331,7 @@ def optional_files(root: Path, candidates: Mapping[str, Path]) -> dict[str, Path
 
 def find_lights(root: Path, names: list[str]) -> dict[str, Path]:
     """Find environment maps by name in the folder of a scene, or else in the one above it."""
-    folders = [root, Path(os.path.abspath(root)).parent]  # of the path ".", too
+    folders = [root, Path(os.path.abspath(root)).parent]  # since Path(".").parent is "." again
     found = {}
     for name in names:
         candidates = [folder / f"{name}{suffix}" for folder in folders for suffix in MAP_SUFFIXES]
@@ -337,7 +348,7 @@ def _within_images(root: Path, image: Path) -> Path:
 
 
 def mask_file(root: Path, image: Path) -> Path:
-    """Where the mask of an image is looked for first, whether it is there or not."""
+    """Return the path where the mask of an image is looked for first; it need not exist."""
     return root / MASK_FOLDERS[0] / _within_images(root, image).with_suffix(".png")
 
 
@@ -374,11 +385,11 @@ def captured_frame(
 
 
 def images_in(root: Path, folders: tuple[str, ...]) -> list[Path]:
-    """Return the images of the first of the folders that is there, by name.
+    """Return the images in the first of the folders that exists, sorted by name.
 
     Raises
     ------
-    MissingFileError : none is there, or it has no image.
+    MissingFileError : no folder exists, or the folder has no image.
     """
     folder = next((root / name for name in folders if (root / name).is_dir()), None)
     found = [] if folder is None else sorted(folder.iterdir())
@@ -394,9 +405,10 @@ def images_in(root: Path, folders: tuple[str, ...]) -> list[Path]:
 
 
 def split_capture(frames: Sequence[Frame], *, notes: tuple[str, ...] = ()) -> Listing:
-    """Choose test views where nobody did: by name, the first and every eighth after it.
+    """Split a capture that names no test views.
 
-    A single view is kept for training.
+    Sorted by name, the first view and every eighth after it are test views, the others are for
+    training. A single view is for training.
 
     Raises
     ------

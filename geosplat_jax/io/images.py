@@ -1,10 +1,9 @@
 """Images on disk: reading, writing and reducing, with alpha and transfer curve accounted for.
 
-Conventions. Arrays are float32, (H, W, C), row 0 at the top. Alpha is *straight* (colour is not
-multiplied by it), as PNG stores it; OpenEXR, and TIFF with associated alpha, store premultiplied
-colour, which reading divides out; `write_exr` multiplies it in. Every file is written aside and
-then renamed, so that a reader never meets half a file and a full disk never destroys the previous
-one.
+Arrays are float32, (H, W, C), row 0 at the top. Alpha is *straight* (colour is not multiplied by
+it), as in PNG. OpenEXR, and TIFF with associated alpha, store premultiplied colour: reading divides
+it by alpha, and `write_exr` multiplies it. Every file is written under another name and then
+renamed, so that no reader gets half a file, and a full disk does not destroy the previous one.
 """
 
 import os
@@ -30,7 +29,7 @@ LINEAR_FORMATS = frozenset({".exr", ".hdr"})
 
 _SMALLEST_ALPHA = 1e-6
 _WIDE = re.compile(r"\bP3\b|Adobe RGB|ProPhoto|2020|Wide Gamut", re.IGNORECASE)
-"""Names of colour spaces that are wider than sRGB, as profiles have them."""
+"""Names in colour profiles that mean a gamut wider than that of sRGB."""
 
 
 class SceneError(ValueError):
@@ -49,8 +48,8 @@ class ImageReadError(SceneError):
 def written_aside(path: str | Path) -> Iterator[Path]:
     """Provide a path to write to, and rename it to ``path`` when the block ends without error.
 
-    The name aside lies in the same folder and keeps the suffix, from which image libraries tell
-    the format. On any error it is removed and a previous ``path`` stays as it was.
+    The temporary file lies in the same folder and has the same suffix, by which image libraries
+    recognise the format. On any error it is removed, and an existing ``path`` is not changed.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -93,9 +92,9 @@ def image_size(path: str | Path) -> tuple[int, int]:
 
 
 def image_orientation(path: str | Path) -> int:
-    """Return how a photograph is to be shown, as EXIF counts it: 1 as it is stored, to 8.
+    """Return the EXIF orientation of a photograph, 1 to 8; 1 shows the pixels as they are stored.
 
-    Pixels are read and compared as they are stored.
+    Other functions ignore the orientation: they read pixels as they are stored.
 
     Raises
     ------
@@ -109,9 +108,9 @@ def image_orientation(path: str | Path) -> int:
 
 
 def wide_color_profile(path: str | Path) -> str | None:
-    """Return the name of an embedded profile whose colours reach beyond sRGB; None without one.
+    """Return the name of an embedded colour profile wider than sRGB; None without such a profile.
 
-    Reading does not convert colours: they are taken for sRGB.
+    Reading does not convert colours from a profile, but takes them for sRGB.
 
     Raises
     ------
@@ -145,12 +144,13 @@ def read_image(path: str | Path) -> Float[np.ndarray, "H W C"]:
 
 
 def read_stored(path: str | Path) -> Shaped[np.ndarray, "H W C"]:
-    """Read an image in the numbers of its file, which `decoding_table` turns into values.
+    """Read an image as the numbers in its file, which `decoding_table` turns into values.
 
     Returns
     -------
-    (H, W, C) uint8 or uint16 where the file has integers (of 32 bits the upper 16), and float32
-    where it has floats, as `read_image` returns it. Alpha is straight, but in OpenEXR.
+    (H, W, C) uint8 or uint16 where the file has integers (the upper 16 of 32 bits), and float32
+    where it has floats, as `read_image` returns it. Alpha is straight, except in OpenEXR, whose
+    colour is premultiplied.
 
     Raises
     ------
@@ -197,9 +197,16 @@ def _numbers_of(spec: Any) -> Any:
 
 @cache
 def decoding_table(numbers: np.dtype, *, is_srgb: bool) -> Float[np.ndarray, " N"]:
-    """Tabulate the value of every number of an integer image: linear light, or [0, 1] as it is.
+    """Tabulate the value of every number that an integer image may have.
 
-    ``numbers`` : uint8 or uint16.
+    Parameters
+    ----------
+    numbers : uint8 or uint16.
+    is_srgb : whether to decode the sRGB curve to linear light; otherwise numbers are only scaled.
+
+    Returns
+    -------
+    (N,) float32 in [0, 1], read-only; N is 256 or 65536.
     """
     largest = np.iinfo(numbers).max
     values = np.arange(largest + 1, dtype=np.float32) * np.float32(1.0 / largest)
@@ -213,16 +220,21 @@ _COPIES_READING = 3
 
 
 def reading_bytes(width: int, height: int, channels: int) -> int:
-    """Count the memory that it takes to read an image of this size."""
+    """Estimate the memory, in bytes, that reading an image of this size takes."""
     return _COPIES_READING * width * height * channels * np.dtype(np.float32).itemsize
 
 
 def require_room(needs: Sequence[Need], cure: str) -> None:
-    """Refuse images that do not fit into the memory, before it is spent.
+    """Refuse images that do not fit into the memory, before any of it is allocated.
+
+    Parameters
+    ----------
+    needs : amounts of memory that will be needed together.
+    cure : what the user can do about it, for the message.
 
     Raises
     ------
-    SceneError
+    SceneError : the needs exceed the memory of this machine.
     """
     refusal = memory_refusal(needs)
     if refusal is not None:
@@ -230,20 +242,21 @@ def require_room(needs: Sequence[Need], cure: str) -> None:
 
 
 def _require_room_for(layout: "_Layout", path: Path) -> None:
-    """Refuse an image that does not fit into the memory by what its header says."""
+    """Refuse an image that, by its header, does not fit into the memory."""
     width, height = layout.shown[2:]
     needed = reading_bytes(width, height, len(layout.channels))
     require_room([Need(f"{path} of {width} x {height} pixels", needed)], "write a smaller image")
 
 
 class _Layout(NamedTuple):
-    """What is needed of the header of an image.
+    """The part of an image's header that is needed.
 
     Attributes
     ----------
-    channels : names. alpha : which of them is alpha, -1 if none.
+    channels : names of the channels.
+    alpha : index of the alpha channel; -1 for none.
     is_associated : whether colours are stored multiplied by alpha.
-    shown, whole : windows as (x, y, width, height).
+    shown, whole : data window and display window as (x, y, width, height).
     """
 
     channels: tuple[str, ...]
@@ -265,7 +278,7 @@ def _layout(spec: Any) -> _Layout:
 
 
 def _require_plain(layout: _Layout, path: Path) -> None:
-    """Refuse channels beside colour and alpha, and an image that shows a part of its frame only."""
+    """Refuse channels other than colour and alpha, and images that hold only a part of a frame."""
     count = len(layout.channels)
     if count > 4 or (count in (2, 4) and layout.alpha != count - 1):
         raise ImageReadError(
@@ -450,9 +463,9 @@ def _color_channels(pixels: np.ndarray) -> int:
 def straight(
     premultiplied: Float[np.ndarray, "..."], alpha: Shaped[np.ndarray, "..."]
 ) -> Float[np.ndarray, "..."]:
-    """Divide blended values by their coverage; zero where (almost) nothing is covered.
+    """Divide premultiplied values by their alpha; zero where alpha is at most 1e-6.
 
-    ``alpha`` : of the leading axes of the values.
+    ``alpha`` has the leading axes of the values.
     """
     alpha = alpha.reshape(alpha.shape + (1,) * (premultiplied.ndim - alpha.ndim))
     covered = alpha > _SMALLEST_ALPHA
@@ -481,7 +494,7 @@ def _require_radiance(pixels: np.ndarray, path: Path) -> None:
 def _require_none(
     is_bad: np.ndarray, pixels: np.ndarray, path: Path, what: str, advice: str
 ) -> None:
-    """Refuse an image of which a pixel is bad, with its place."""
+    """Refuse an image with bad pixels; the message gives the position of the first one."""
     if is_bad.any():
         row, column, channel = (int(i) for i in np.argwhere(is_bad)[0])
         raise SceneError(
@@ -492,7 +505,7 @@ def _require_none(
 
 
 def _write(path: str | Path, pixels: np.ndarray, pixel_format, *, suffix: str) -> None:
-    """Write ``pixels`` in ``pixel_format``, aside first."""
+    """Write ``pixels`` in ``pixel_format``, by way of `written_aside`."""
     path = Path(path)
     if path.suffix.lower() != suffix:
         raise SceneError(f"the file must end in {suffix}, got {path.name}")
@@ -513,7 +526,7 @@ def _write(path: str | Path, pixels: np.ndarray, pixel_format, *, suffix: str) -
 
 
 def _one_line(text: str) -> str:
-    """Join the lines of a library's message, without those that say the same again."""
+    """Join the lines of a library's message into one, without repeated ones."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     return "; ".join(dict.fromkeys(lines))
 

@@ -15,13 +15,13 @@ _LENS_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 _FOCAL_TOLERANCE = 0.01
 """Share by which a focal length may differ from the one that the camera's angle gives."""
 _LONGEST = 1e9
-"""Pixels; no lens is longer, and no image larger."""
+"""Bound on focal lengths and image sizes, in pixels, and on distortion coefficients."""
 
 _RADIAL, _TANGENTIAL = ("k1", "k2", "k3", "k4"), ("p1", "p2")
 _PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 _FISHEYE_MODELS = ("OPENCV_FISHEYE",)
 _OTHER_PROJECTIONS = ("ftheta_p0", "is_latlong", "is_equirectangular", "is_orthographic")
-"""Keys of instant-ngp for cameras that are no lens with a focal length."""
+"""Keys by which instant-ngp marks projections without a focal length."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,10 @@ class AngleLens:
 
     Attributes
     ----------
-    angle_x : horizontal field of view in radians, as a pinhole sees it.
+    angle_x : horizontal field of view of the undistorted pinhole, radians.
     distortion : None for a pinhole.
-    size : width and height of images that are to be made, where they are given; those that exist
-        have their own.
+    size : width and height in pixels that the file gives for images, or None; used for images that
+        do not exist yet.
     """
 
     angle_x: float
@@ -41,7 +41,7 @@ class AngleLens:
     size: tuple[int, int] | None = None
 
     def intrinsics(self, width: int, height: int) -> Float[np.ndarray, "3 3"]:
-        """Return the matrix of an image of this size, in its pixels."""
+        """Return the intrinsic matrix for an image of this size, in its pixels."""
         focal = 0.5 * width / np.tan(0.5 * self.angle_x)
         return _matrix(focal, focal, 0.5 * width, 0.5 * height)
 
@@ -72,7 +72,7 @@ class PinholeLens:
         return self.width, self.height
 
     def intrinsics(self, width: int, height: int) -> Float[np.ndarray, "3 3"]:
-        """Return the matrix of the same view as an image of this size, in its pixels."""
+        """Return the intrinsic matrix for the same view in an image of this size, in its pixels."""
         x, y = width / self.width, height / self.height
         return _matrix(self.fx * x, self.fy * y, self.cx * x, self.cy * y)
 
@@ -89,7 +89,8 @@ def checked_lens(values: Mapping[str, Any], where: str) -> Lens:
 
     Raises
     ------
-    SceneError : it is incomplete, contradicts itself, is of another kind, or a value is no lens's.
+    SceneError : the lens is incomplete, contradicts itself or is of an unsupported kind, or a value
+        is out of range.
     """
     distortion = _checked_distortion(values, where)
     given = {key: checked_length(values[key], key, where) for key in _LENS_KEYS if key in values}
@@ -129,7 +130,7 @@ def checked_lens(values: Mapping[str, Any], where: str) -> Lens:
 
 
 def _checked_distortion(values: Mapping[str, Any], where: str) -> Distortion | None:
-    """Return what bends a lens, None where nothing does."""
+    """Return the distortion of a lens, None for a pinhole; `SceneError` if it is not supported."""
     other = [key for key in _OTHER_PROJECTIONS if values.get(key)]
     if other:
         raise SceneError(
@@ -166,16 +167,16 @@ def _is_number(value: Any) -> bool:
 
 
 def checked_coefficient(value: Any, key: str, where: str) -> float:
-    """Return a number that bends a lens: finite, of either sign."""
+    """Check a coefficient of distortion, a finite number of either sign; `SceneError` otherwise."""
     if not _is_number(value) or not abs(value) < _LONGEST:
         raise SceneError(f"{key!r} of {where} must be a finite number, got {value!r}")
     return float(value)
 
 
 def checked_length(value: Any, key: str, where: str) -> float:
-    """Return a length of a lens in pixels: finite and positive, and whole if it is a size."""
+    """Check a length in pixels: positive, and whole if it is a size; `SceneError` otherwise."""
     is_size = key in ("w", "h")
-    # An integer of JSON may be too large for a float, so it is compared and not converted.
+    # Compared before it is converted, because an integer of JSON may be too large for a float.
     if not _is_number(value) or not 0 < value < _LONGEST or (is_size and value != int(value)):
         kind = "a positive whole number" if is_size else "a positive number"
         raise SceneError(f"{key!r} of {where} must be {kind} of pixels, got {value!r}")
@@ -183,7 +184,7 @@ def checked_length(value: Any, key: str, where: str) -> float:
 
 
 def checked_angle(angle: Any, where: str) -> float:
-    """Return a field of view in radians, between 0 and pi."""
+    """Check a field of view in radians, between 0 and pi; `SceneError` otherwise."""
     if not _is_number(angle) or not 0.0 < angle < math.pi:
         raise SceneError(f"the camera angle of {where} must be in (0, pi) radians, got {angle!r}")
     return float(angle)

@@ -23,29 +23,30 @@ from geosplat_jax.io.truth import Reading, relit_images, true_maps
 from geosplat_jax.io.views import COVERED, ViewLight, Views
 
 KEPT_BYTES = {"train": 3 << 29, "test": 1 << 28}
-"""Memory for the colours of a split, 1.5 GiB and a sixth of that; photographs beyond it are read
-again when they are needed."""
+"""Most memory for the colours of a split: 1.5 GiB for training, a sixth of that for testing.
+Photographs that do not fit are read from their files again whenever they are needed."""
 
 _READING_BYTES = 5 << 28
-"""Memory that images may take which are read at the same time, but for the first."""
+"""Most memory that images take which are read at the same time; a single image may take more."""
 
 _CODED_PIXEL_BYTES = 12
-"""Memory for a pixel while an image of integers is read whose floats are made in strips."""
+"""Memory per pixel while an image of integers is read; floats are computed in strips."""
 _SHAPE_PIXELS, _SHAPE_TOLERANCE = 1.5, 0.02
-"""How far the width of an image may be from that of the shape of its lens, pixels or a share."""
+"""Largest deviation of an image's width from the aspect ratio of its lens: pixels, or a share of
+the width, whichever is larger."""
 _EVEN = 0.02
-"""Linear colours of an object that differ by no more are one colour."""
+"""Linear colours of an object that differ by at most this in every channel count as one colour."""
 _EVEN_STRIDE = 8
 
 
 class _Traits(NamedTuple):
-    """What is known of a photograph once it was read, beside its colours.
+    """Properties of one photograph that are kept after it was read, besides its colours.
 
     Attributes
     ----------
     has_mask, leaves_file, is_opaque : see `reading.Photograph`.
-    is_even : what is covered of it has one even colour.
-    marks : the pixels that count, as `pack_marks` leaves them.
+    is_even : whether the object in it has one even colour.
+    marks : pixels that count, packed by `pack_marks`.
     """
 
     has_mask: bool
@@ -58,9 +59,19 @@ class _Traits(NamedTuple):
 def load_views(
     frames: Sequence[Frame], *, factor: int, listing: Listing, most_bytes: int
 ) -> tuple[Views, list[str]]:
-    """Read the images of frames, several at a time; return the views and warnings.
+    """Read the images of frames, several at a time.
 
-    ``most_bytes`` : that their colours may take in memory.
+    Parameters
+    ----------
+    frames : frames of a split, at least one.
+    factor : integer factor that images and intrinsics are reduced by.
+    listing : list of the scene that the frames belong to.
+    most_bytes : most memory for the colours of the views, bytes.
+
+    Returns
+    -------
+    views : the views, in the order of the frames.
+    problems : warnings, one sentence each.
 
     Raises
     ------
@@ -122,7 +133,7 @@ def load_views(
 
 
 def _other_shapes(frames: Sequence[Frame], full: Sequence[tuple[int, int]]) -> list[str]:
-    """Say which images are of another shape than their lens; reduced ones are rounded."""
+    """Warn of images whose aspect ratio is not that of their lens, apart from rounding."""
 
     def fits(width: int, height: int, across: int, along: int) -> bool:
         allowed = max(_SHAPE_PIXELS, _SHAPE_TOLERANCE * width)
@@ -166,7 +177,7 @@ def _intrinsics(
 def _require_room_for_all(
     frames: Sequence[Frame], full: list[tuple[int, int]], canvas: np.ndarray, most_bytes: int
 ) -> None:
-    """Refuse views that do not fit into the memory, before it is spent."""
+    """Refuse views that do not fit into the memory, before any of it is allocated."""
     largest = max(full, key=lambda size: size[0] * size[1])
     height, width = largest
     pixels = len(frames) * int(np.prod(canvas)) * 4 * np.dtype(np.float32).itemsize
@@ -196,7 +207,7 @@ def _threads_for(frames: Sequence[Frame], full: Sequence[tuple[int, int]], facto
 
 
 def _on_canvas(seen: np.ndarray, height: int, width: int) -> Bool[np.ndarray, "H W"]:
-    """Lay what counts of a photograph into the upper left corner; nothing counts beside it."""
+    """Place the pixels that count in the upper left corner of a canvas; none count beside them."""
     if seen.shape == (height, width):
         return seen
     placed = np.zeros((height, width), bool)
@@ -205,8 +216,8 @@ def _on_canvas(seen: np.ndarray, height: int, width: int) -> Bool[np.ndarray, "H
 
 
 def _has_even_color(part: Part) -> bool:
-    """Tell whether what is covered of a photograph has one even colour."""
-    # Few pixels tell most photographs; all are looked at where those are alike.
+    """Tell whether the object in a photograph has one even colour."""
+    # A few pixels show that most photographs do not; all pixels are compared only if those agree.
     for stride in (_EVEN_STRIDE, 1):
         color, alpha = part.color[::stride, ::stride], part.alpha[::stride, ::stride]
         covered = color[values_of(alpha, is_srgb=False) > COVERED]
@@ -218,7 +229,7 @@ def _has_even_color(part: Part) -> bool:
 
 
 def _even_views(frames: Sequence[Frame], traits: Sequence[_Traits]) -> list[str]:
-    """Warn of single photographs that show the object in one even colour."""
+    """Warn of photographs that show the object in one even colour, unless most of them do."""
     names = [frame.name for frame, one in zip(frames, traits, strict=True) if one.is_even]
     if not 0 < len(names) < 0.5 * len(frames):
         return []
@@ -231,7 +242,7 @@ def _even_views(frames: Sequence[Frame], traits: Sequence[_Traits]) -> list[str]
 def _size_problems(
     frames: Sequence[Frame], full: list[tuple[int, int]], factor: int, listing: Listing
 ) -> list[str]:
-    """Say which sizes were met; refuse several of them outside captures."""
+    """Warn of images that are padded or cut; refuse images of several sizes outside captures."""
     problems = []
     for frame, (height, width) in zip(frames, full, strict=True):
         if not 1 <= factor <= min(height, width):
@@ -269,9 +280,9 @@ def _no_mask(frame: Frame) -> str:
 
 
 def _have_masks(frames: Sequence[Frame], traits: Sequence[_Traits], *, is_capture: bool) -> bool:
-    """Tell whether photographs have masks; refuse a split in which only some do."""
+    """Tell whether the photographs of a split have masks; refuse a split in which only some do."""
     if is_capture and not any(one.has_mask and not one.is_opaque for one in traits):
-        # An object may fill one photograph, but where it fills all of them nobody cut it out.
+        # An object may fill a photograph, but if it fills all of them, none was cut out.
         return False
     has_mask = np.array([one.has_mask for one in traits])
     if has_mask.any() and not has_mask.all():
@@ -280,7 +291,7 @@ def _have_masks(frames: Sequence[Frame], traits: Sequence[_Traits], *, is_captur
 
 
 def _unread_masks(frames: Sequence[Frame], traits: Sequence[_Traits]) -> list[str]:
-    """Warn of files of masks beside images that have an alpha channel."""
+    """Warn of mask files that are ignored because their images have an alpha channel."""
     names = [frame.image.name for frame, one in zip(frames, traits, strict=True) if one.leaves_file]
     if not names:
         return []
@@ -291,7 +302,7 @@ def _unread_masks(frames: Sequence[Frame], traits: Sequence[_Traits]) -> list[st
 
 
 def _require_distinct(names: Sequence[str]) -> None:
-    """Refuse two views of one name: what is written of one would overwrite the other."""
+    """Refuse two views of one name: files that are written for one would overwrite the other's."""
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise SceneError(

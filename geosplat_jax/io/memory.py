@@ -1,4 +1,4 @@
-"""Memory of the machine, and refusals before it is spent."""
+"""Memory of the machine, and messages about needs that exceed it."""
 
 import os
 from collections.abc import Sequence
@@ -11,17 +11,17 @@ _CONTAINER_LIMITS = (
     Path("/sys/fs/cgroup/memory.max"),
     Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
 )
-"""Where Linux says how much memory a container may use, in either version of control groups."""
+"""Files in which Linux gives the memory limit of a container, in either version of cgroups."""
 
 
 @dataclass(frozen=True)
 class Need:
-    """Memory that something is certain to take.
+    """An amount of memory that will certainly be needed.
 
     Attributes
     ----------
-    what : names the setting or the file that asks for it.
-    byte_count : of memory.
+    what : name of the setting or of the file that needs it.
+    byte_count : bytes of memory.
     """
 
     what: str
@@ -29,11 +29,10 @@ class Need:
 
 
 def memory_of_machine() -> int | None:
-    """Count the bytes of memory that this process may use at most.
+    """Return the most memory, in bytes, that this process may use; None if unknown, as on Windows.
 
-    That is the memory of the machine, of the container that the process runs in, or what a limit
-    (``ulimit``) leaves the process; what others hold of it at the moment does not matter. None
-    where the system does not tell, as on Windows.
+    It is the smallest of the physical memory, the limit of the container, and the limits of the
+    process (``ulimit``). Memory that other processes use is not subtracted.
     """
     try:
         physical = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -44,7 +43,7 @@ def memory_of_machine() -> int | None:
 
 
 def _limits_of_process() -> list[int]:
-    """Return the limits of the data and of the addresses of this process, where it has some."""
+    """Return the limits of this process on its data and its address space, if it has any, bytes."""
     try:
         import resource
     except ImportError:  # not on Windows
@@ -63,7 +62,7 @@ def _limit_in(path: Path) -> int | None:
 
 
 def memory_of_accelerator() -> int | None:
-    """Count the bytes that JAX may use of each accelerator; None where it computes on none."""
+    """Return the bytes that JAX may use of each accelerator; None on CPU, or if unknown."""
     if jax.default_backend() == "cpu":
         return None
     limits = [(device.memory_stats() or {}).get("bytes_limit") for device in jax.local_devices()]
@@ -71,12 +70,12 @@ def memory_of_accelerator() -> int | None:
 
 
 def memory_refusal(needs: Sequence[Need]) -> str | None:
-    """Say why needs cannot be met, the largest first; None where they fit, or nobody knows."""
+    """Say that needs exceed the machine's memory; None where they fit, or if it is unknown."""
     return _refusal(needs, memory_of_machine())
 
 
 def accelerator_refusal(needs: Sequence[Need]) -> str | None:
-    """Say what `memory_refusal` says, of needs that the memory of an accelerator has to meet."""
+    """Return a message like that of `memory_refusal`, for the memory of an accelerator."""
     return _refusal(needs, memory_of_accelerator())
 
 
@@ -93,7 +92,7 @@ def _refusal(needs: Sequence[Need], available: int | None) -> str | None:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether an error says that memory could not be had, of Python or of XLA."""
+    """Whether an error, of Python or of XLA, means that memory ran out."""
     if isinstance(error, MemoryError):
         return True
     return isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" in str(error)

@@ -20,10 +20,10 @@ from scipy import ndimage
 from geosplat_jax.core.types import Camera, Mesh
 
 Y_UP_FORMATS = frozenset({".glb", ".gltf"})
-"""Formats whose files say that y is up."""
+"""Suffixes of formats that define y as up."""
 
 Y_UP_LINE = "# y is up"
-"""First line of an OBJ file that says so, as ours do; the format itself knows no axes."""
+"""First line of OBJ files whose y axis is up, as in ours; the format itself defines no axes."""
 
 _PACKED = frozenset(
     {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_mesh_quantization"}
@@ -41,7 +41,8 @@ _PAIRS_PER_CHUNK = 1 << 20
 # Faces that come nearer to the camera than this share of the mesh's extent are not drawn.
 _NEAR_SHARE = 1e-3
 _ROUNDING = 1e-3
-"""Share of a polygon's area by which a triangle of it may look away."""
+"""Share of a convex polygon's area that a triangle in its fan may have in the opposite orientation,
+by rounding."""
 
 # Pixel centres this far outside a face (in barycentric units) still count as covered.
 _COVERAGE_SLACK = 1e-4
@@ -125,9 +126,9 @@ def _require_plain(path: Path) -> None:
 
 
 def _require_convex(path: Path) -> None:
-    """Refuse an OBJ with faces of four and more corners that fans of triangles do not cover.
+    """Refuse an OBJ with faces that are not convex: a fan of triangles would overlap itself.
 
-    Of what it cannot read, the reader of the format says what is wrong.
+    Files that cannot be parsed here are left to the reader of the format, which reports the fault.
     """
     if path.suffix.lower() != ".obj" or not path.is_file():
         return
@@ -156,11 +157,11 @@ def _require_convex(path: Path) -> None:
 
 
 def _count_folded(polygons: Float[np.ndarray, "N C 3"]) -> int:
-    """Count polygons whose triangles around their first corner do not all look alike."""
+    """Count polygons whose fan of triangles, around the first corner, changes orientation."""
     spokes = polygons[:, 1:] - polygons[:, :1]
     fan = np.cross(spokes[:, :-1], spokes[:, 1:])
     whole = fan.sum(axis=1, keepdims=True)
-    # Corners on a straight side make triangles of hardly any area, which may look anywhere.
+    # Corners on a straight side make triangles of nearly no area, of any orientation.
     turned = (fan * whole).sum(axis=-1) < -_ROUNDING * (whole**2).sum(axis=-1)
     return int(turned.any(axis=1).sum())
 
@@ -180,7 +181,7 @@ def from_y_up(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
 
 
 def unpadded(mesh: Mesh) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
-    """Copy the real rows of a padded `Mesh` to the host: vertices and faces."""
+    """Copy a padded `Mesh` to the host, without the padding: vertices, world, and faces."""
     vertex_count, face_count = int(mesh.vertex_count), int(mesh.face_count)
     return np.asarray(mesh.vertices)[:vertex_count], np.asarray(mesh.faces)[:face_count]
 
@@ -188,12 +189,12 @@ def unpadded(mesh: Mesh) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3
 def nondegenerate(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Bool[np.ndarray, " F"]:
-    """Tell which faces have three distinct corners and a height above 1e-7 of the size of all."""
+    """Tell which faces are higher than 1e-7 of the bounding box's diagonal."""
     corners = np.asarray(vertices, np.float64)[faces]
     edges = corners[:, [1, 2, 0]] - corners
     longest = np.sqrt((edges**2).sum(-1).max(-1))
     double_area = np.sqrt((np.cross(edges[:, 0], edges[:, 1]) ** 2).sum(-1))
-    # Of what faces have corners at; vertices that none has may lie anywhere.
+    # Only corners of faces count: vertices that belong to no face may lie anywhere.
     extent = np.ptp(corners.reshape(-1, 3), axis=0) if len(faces) else np.zeros(3)
     size = np.sqrt((extent**2).sum())
     return double_area > _DEGENERATE_HEIGHT * size * longest
@@ -240,7 +241,13 @@ def unwrap(
     """Cut a mesh into charts and pack them into one square texture (xatlas).
 
     Faces must not be degenerate (`nondegenerate`). Charts stay a few texels apart. Deterministic,
-    and the same for a mesh of any size.
+    and independent of the position and scale of the mesh.
+
+    Parameters
+    ----------
+    vertices, normals : (V, 3).
+    faces : (F, 3) rows of the vertices.
+    texture_size : width and height of the texture, texels.
     """
     start = time.perf_counter()
     # xatlas drops areas below thresholds of its own, which suit a mesh about as large as 1.
@@ -348,22 +355,24 @@ def first_hits(
     *,
     supersampling: int = 1,
 ) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W 3"]]:
-    """Find where the rays through the pixel centres of one view first meet a mesh, on the host.
+    """Find the first hits of the rays through the pixel centres of one view, on the host.
 
-    A depth buffer in float64. Faces that reach behind the camera are left out; both sides of a face
-    are met. An empty mesh is met nowhere.
+    Uses a depth buffer in float64. Faces that reach behind the camera are left out; front and back
+    faces are hit alike. An empty mesh is hit nowhere.
 
     Parameters
     ----------
-    vertices : (V, 3) in the world; faces : (F, 3).
+    vertices : (V, 3) world.
+    faces : (F, 3) rows of the vertices.
     camera : one view (V = 1).
-    supersampling : samples a pixel along each axis; H and W are those of the samples.
+    supersampling : samples per pixel along each axis; H and W count samples.
 
     Returns
     -------
-    face_rows : (H, W) face that is met, -1 for none.
-    weights : (H, W, 3) barycentric coordinates of the hit in its face, over the depth of the hit
-        along the camera's axis: their sum is one over that depth. Zero where nothing is met.
+    face_rows : (H, W) face that is hit, -1 for none.
+    weights : (H, W, 3) barycentric coordinates of the hit in its face, divided by the depth of the
+        hit along the camera's axis, so that their sum is the reciprocal of the depth. Zero where
+        nothing is hit.
     """
     height, width = camera.height * supersampling, camera.width * supersampling
     world_to_camera = np.asarray(camera.world_to_camera[0], np.float64)
@@ -379,13 +388,13 @@ def first_hits(
     face_rows = np.full((height, width), -1, np.int32)
     drawn = np.zeros((height, width, 3))
     for row, column, face, weights in _covered_pixels(pixels[faces], height=height, width=width):
-        # 1/z is linear on the screen, and weights divided by z interpolate in perspective.
+        # 1/z is linear on the screen; weights divided by z interpolate perspective-correctly.
         weights = weights * inverse_depth[faces[face]]
         closeness = weights.sum(axis=-1)
         order = np.argsort(closeness, kind="stable")
         order = order[closeness[order] > nearest[row[order], column[order]]]
         row, column = row[order], column[order]
-        # Of repeated pixels the last assignment, the nearest, stays.
+        # Where a pixel occurs several times, the last assignment holds: that of the nearest face.
         nearest[row, column] = closeness[order]
         face_rows[row, column] = in_front[face[order]]
         drawn[row, column] = weights[order]
@@ -393,7 +402,7 @@ def first_hits(
 
 
 def facing(corners: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 3"]:
-    """Return the direction that triangles look in, of twice their area's length."""
+    """Return the normals of triangles, on their front, with twice their area as length."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
@@ -417,20 +426,21 @@ def render_mesh_normals(
 ) -> tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W"]]:
     """Draw the interpolated vertex normals of a mesh with a depth buffer, on the host.
 
-    For previews and for the mesh's own normal error; see `first_hits`. An empty mesh gives an empty
-    picture.
+    For previews, and for the error of the mesh's own normals; see `first_hits`. An empty mesh gives
+    an empty picture.
 
     Parameters
     ----------
-    vertices, normals : (V, 3) in the world; faces : (F, 3).
+    vertices, normals : (V, 3) world.
+    faces : (F, 3) rows of the vertices.
     camera : one view (V = 1).
-    supersampling : samples a pixel along each axis.
-    is_two_sided : the back of a face has a normal too, which looks the other way.
+    supersampling : samples per pixel along each axis.
+    is_two_sided : whether normals are flipped where the back of a face is seen.
 
     Returns
     -------
     normals : (H, W, 3) unit, in *OpenCV camera axes* (x right, y down, z forward); zero outside.
-    alpha : (H, W) covered share of each pixel.
+    alpha : (H, W) covered share of each pixel, in [0, 1].
     """
     face_rows, weights = first_hits(vertices, faces, camera, supersampling=supersampling)
     is_hit = face_rows >= 0
@@ -476,10 +486,10 @@ def split_long_edges(
     longest: float,
     most_faces: int,
 ) -> tuple[Float[np.ndarray, "W 3"], Int[np.ndarray, "G 3"]]:
-    """Split edges at their middles until none is longer than a length; the longest ones first.
+    """Split edges at their middles, the longest ones first, until none is longer than ``longest``.
 
     All faces at an edge are split with it, so that a closed mesh stays closed; the surface does not
-    change. It ends early rather than make more than ``most_faces``.
+    change. Splitting ends early if there would be more than ``most_faces`` faces.
     """
     while True:
         start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
@@ -503,12 +513,13 @@ def _split_faces(
     faces: Int[np.ndarray, "F 3"],
     middle: Int[np.ndarray, "F 3"],
 ) -> Int[np.ndarray, "G 3"]:
-    """Make the faces of triangles whose edges have vertices in their middles, or -1 for none.
+    """Split triangles at the middles of their edges.
 
-    Edge k of a face goes from its corner k to the next one.
+    ``middle`` : row of the vertex in the middle of each edge, -1 where the edge is not split. Edge
+    k of a face goes from corner k to the next one.
     """
     count = (middle >= 0).sum(axis=1)
-    # Turned so that a single split edge is the first one, and a single whole edge the last one.
+    # Corners are rotated so that a single split edge is the first, a single whole edge the last.
     odd = np.where(count == 1, np.argmax(middle >= 0, axis=1), (np.argmin(middle, axis=1) + 1) % 3)
     turn = (odd[:, None] + np.arange(3)) % 3
     corners, middles = (np.take_along_axis(x, turn, axis=1) for x in (faces, middle))
@@ -521,7 +532,7 @@ def _split_faces(
 
     add(count == 1, (0, 3, 2), (3, 1, 2))
     add(count == 3, (0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))
-    # What two splits leave has four corners, and is cut along its shorter diagonal.
+    # With two split edges a quadrilateral remains, which is cut along its shorter diagonal.
     two = count == 2
     ends = np.where(two[:, None], middles, 0)
     first = np.linalg.norm(vertices[corners[:, 0]] - vertices[ends[:, 1]], axis=-1)

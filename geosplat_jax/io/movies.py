@@ -31,16 +31,16 @@ _MAX_GIF_RATE, _MAX_MP4_RATE = 50.0, 1000.0
 # GIF counts hundredths of a second in sixteen bits.
 _MIN_RATE = 0.1
 
-# The shared palette is made from at most so many pixels, spread over the whole film.
+# The shared palette is computed from at most this many pixels, spread over the whole film.
 _PALETTE_PIXELS = 1_000_000
 
 _ERROR_LENGTH = 600
 
 
 def _encoder() -> str | None:
-    """Find an ``ffmpeg`` that writes H.264: on the PATH, or that of the package imageio-ffmpeg.
+    """Find an ``ffmpeg`` that writes H.264: on the PATH, or in the package imageio-ffmpeg.
 
-    None without either.
+    Returns its path or name; None if there is none.
     """
     for find in (lambda: shutil.which(_ENCODER), _bundled_encoder):
         program = find()
@@ -62,7 +62,7 @@ def _bundled_encoder() -> str | None:
 
 @cache
 def _writes_h264(program: str) -> bool:
-    """Ask a program for its encoders; some systems leave those of H.264 out."""
+    """Whether a program lists an H.264 encoder; the ffmpeg of some systems has none."""
     asked = [program, "-hide_banner", "-encoders"]
     try:
         told = subprocess.run(asked, capture_output=True, text=True, timeout=60, check=False)
@@ -111,19 +111,20 @@ def _checked(frames: Iterable[ArrayLike]) -> list[UInt8[np.ndarray, "H W 3"]]:
 def _shared_palette(frames: list[UInt8[np.ndarray, "H W 3"]]) -> Image.Image:
     """Choose 256 colours for the whole film.
 
-    One palette, lest still parts flicker. Maximum coverage reaches the extremes between which
-    dithering mixes: after a slight blur its error is less than half that of median cut.
+    With a palette for each frame, still parts of the film would flicker. Pillow's method of maximum
+    coverage includes the extreme colours, between which dithering mixes: after a slight blur its
+    error is less than half that of median cut.
     """
     height, width, _ = frames[0].shape
     stride = -(-len(frames) * height * width // _PALETTE_PIXELS)
-    while math.gcd(stride, width) > 1:  # lest it meets the same columns in every row
+    while math.gcd(stride, width) > 1:  # otherwise every row is sampled at the same columns
         stride += 1
     sample = np.concatenate([frame.reshape(-1, 3)[::stride] for frame in frames])
     return Image.fromarray(sample[None]).quantize(256, method=Image.Quantize.MAXCOVERAGE)
 
 
 def _gif_durations(count: int, rate: float) -> list[int]:
-    """Milliseconds of each frame, whole hundredths, whose sums follow the exact times."""
+    """Return the milliseconds of each frame: whole hundredths of a second, without drift."""
     ends = np.rint(np.arange(count + 1) * (100.0 / rate)).astype(int)
     return [10 * int(hundredths) for hundredths in np.diff(ends)]
 
@@ -157,10 +158,10 @@ def _even(frame: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def _encoder_command(encoder: str, path: Path, width: int, height: int, rate: float) -> list[str]:
-    """Arguments that encode raw RGB from standard input.
+    """Return the command that encodes raw RGB from standard input.
 
-    The colour space is named, since players otherwise guess it from the image size; as options too,
-    for releases of the program that forget what the filters say.
+    It names the colour space, since players otherwise guess it from the image size, both in the
+    filters and as options: some releases of ffmpeg ignore the filters.
     """
     colors = "range=tv:colorspace=bt709:color_primaries=bt709:color_trc=iec61966-2-1"
     convert = f"scale=out_color_matrix=bt709:out_range=tv,format=yuv420p,setparams={colors}"
@@ -177,7 +178,7 @@ def _encoder_command(encoder: str, path: Path, width: int, height: int, rate: fl
 
 
 def _feed(process: subprocess.Popen[bytes], frames: list[UInt8[np.ndarray, "H W 3"]]) -> None:
-    """Send all frames and wait for the end; an encoder that stops early says why by its status."""
+    """Send all frames and wait for the encoder; if it stops early, its exit status tells."""
     assert process.stdin is not None
     with contextlib.suppress(BrokenPipeError), process.stdin:
         for frame in frames:
@@ -241,17 +242,17 @@ def write_movie(
 ) -> None:
     """Write frames to an animated GIF or to H.264 in MP4, by suffix.
 
-    GIF: loops for ever, one palette of 256 colours for the film, Floyd-Steinberg dithering; frames
-    last whole hundredths of a second, chosen so that the whole film has its true length, and equal
-    consecutive frames become one that lasts longer. MP4: needs ``ffmpeg``; 4:2:0 colour, so sizes
-    that are odd grow by a repeated row or column.
+    GIF loops for ever; it has one palette of 256 colours for the film, and Floyd-Steinberg
+    dithering. Its frames last whole hundredths of a second, chosen so that the film as a whole has
+    its true length, and equal consecutive frames become one longer frame. MP4 needs ``ffmpeg``; its
+    colour is 4:2:0, so that an odd width or height grows by a repeated column or row.
 
     Parameters
     ----------
-    path : file ending in ``.gif`` or ``.mp4``; its folder is made when missing.
-    frames : one or more (H, W, 3) of one size, sRGB; values outside [0, 1] are clipped. Of those
-        that are made when they are asked for, bytes stay in memory and not floats.
-    frames_per_second : 0.1 to 50 for GIF, to 1000 for MP4.
+    path : file ending in ``.gif`` or ``.mp4``; its folder is created if it does not exist.
+    frames : one or more (H, W, 3) of one size, sRGB; values outside [0, 1] are clipped. An iterator
+        may compute frames one by one; only their 8-bit copies stay in memory.
+    frames_per_second : 0.1 to 50 for GIF, 0.1 to 1000 for MP4.
 
     Raises
     ------

@@ -1,10 +1,9 @@
-"""Photographs in little memory: kept as the numbers of their files, decoded view by view.
+"""Photographs in little memory: stored as the numbers of their files, decoded view by view.
 
-Of every photograph the rectangle is kept that is not empty. A photograph of 8 or 16 bits that is
-neither reduced nor undistorted keeps the numbers of its file, any other one floats, so nothing is
-rounded. Where all of that is more than a given number of bytes, the colours of the views after
-it are read again from their files whenever they are asked for; what tells the object from the rest
-always stays.
+Only the rectangle of a photograph that is not empty is stored. A photograph of 8 or 16 bits that is
+neither reduced nor undistorted is stored as the numbers of its file, any other as floats, so that
+nothing is rounded. Once colours fill a given number of bytes, those of further views are not
+stored, but read from their files again whenever they are needed; alpha is always stored.
 """
 
 import abc
@@ -25,13 +24,13 @@ _FLOAT_BYTES = 4
 
 @dataclass(frozen=True)
 class Part:
-    """What is not empty of one photograph.
+    """The rectangle of a photograph that is not empty.
 
     Attributes
     ----------
-    top, left : of the rectangle in the photograph.
-    color : (h, w, 3) numbers of the file (sRGB), or linear float32; zero where alpha is.
-    alpha : (h, w) likewise; numbers of a file are linear.
+    top, left : position of the rectangle in the photograph, pixels.
+    color : (h, w, 3) numbers of the file (sRGB), or linear float32; zero where alpha is zero.
+    alpha : (h, w) numbers of the file (linear), or float32 in [0, 1].
     """
 
     top: int
@@ -41,7 +40,7 @@ class Part:
 
     @classmethod
     def of(cls, color: Shaped[np.ndarray, "H W 3"], alpha: Shaped[np.ndarray, "H W"]) -> "Part":
-        """Cut out the rectangle around what is covered; copies, so that the rest can go."""
+        """Copy the rectangle around the pixels whose alpha is not zero."""
         top, bottom = _reach((alpha > 0).any(axis=1))
         left, right = _reach((alpha > 0).any(axis=0))
         inside = slice(top, bottom), slice(left, right)
@@ -62,9 +61,9 @@ def _reach(used: Bool[np.ndarray, " N"]) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class _Packed:
-    """A part in memory; ``color`` is None where the file is read again, and alpha then is deflated.
+    """A part in memory; without ``color`` the file is read again, and alpha is compressed.
 
-    ``numbers`` : kind of the numbers of alpha.
+    ``numbers`` : type of the numbers of alpha.
     """
 
     top: int
@@ -84,7 +83,7 @@ class _Packed:
 
     @property
     def byte_count(self) -> int:
-        """Memory that is taken."""
+        """Memory that is taken, in bytes."""
         color = 0 if self.color is None else self.color.nbytes
         if isinstance(self.alpha, bytes):
             return color + len(self.alpha)
@@ -97,11 +96,12 @@ class _Packed:
 
 
 class PartsInMemory:
-    """Gathers the parts of photographs, from any thread, until their colours take too much memory.
+    """Collects the parts of photographs, from any thread, up to a limit on memory.
 
     Attributes
     ----------
-    most_bytes : that colours may take; of later photographs alpha alone is kept.
+    most_bytes : most memory for colours, bytes. Where the colours of a part do not fit, only its
+        alpha is stored.
     """
 
     def __init__(self, count: int, most_bytes: int):
@@ -110,7 +110,7 @@ class PartsInMemory:
         self._lock, self._taken = threading.Lock(), 0
 
     def add(self, index: int, part: Part) -> None:
-        """Take the part of a view."""
+        """Store the part of a view; thread-safe."""
         with self._lock:
             fits = self._taken + part.color.nbytes <= self.most_bytes
             self._taken += part.color.nbytes if fits else 0
@@ -119,9 +119,13 @@ class PartsInMemory:
     def photographs(
         self, height: int, width: int, read: Callable[[int], Part], *, threads: int
     ) -> "Photographs":
-        """Return the photographs, all of whose parts were added.
+        """Return the photographs once all their parts were added.
 
-        ``read`` : reads the part of a view again, by so many threads at most.
+        Parameters
+        ----------
+        height, width : size of the photographs in pixels.
+        read : function that reads the part of a view again.
+        threads : most threads that do so at the same time.
         """
         packed = [part for part in self._packed if part is not None]
         count = len(self._packed)
@@ -131,14 +135,14 @@ class PartsInMemory:
 
 
 class _Stack(abc.ABC):
-    """What behaves like an array of V things that are made when they are asked for."""
+    """Base of classes that act as an array of V images, each of which is computed when indexed."""
 
     shape: tuple[int, ...]
     dtype = np.dtype(np.float32)
 
     @abc.abstractmethod
     def _make(self, index: int) -> np.ndarray:
-        """Make the thing of a view."""
+        """Compute the image of a view."""
 
     def _make_all(self, indices: Sequence[int]) -> list[np.ndarray]:
         return [self._make(index) for index in indices]
@@ -153,18 +157,18 @@ class _Stack(abc.ABC):
         return self.shape[0]
 
     def __iter__(self) -> Iterator[np.ndarray]:
-        """Make one after the other."""
+        """Compute one image after the other."""
         return (self._make(index) for index in range(len(self)))
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        """Make all of them."""
+        """Compute all images."""
         if copy is False:
             raise ValueError("the array is made anew, so it is always a copy")
         made = self[:]
         return made if dtype is None else made.astype(dtype)
 
     def __getitem__(self, key: Any) -> np.ndarray:
-        """Make one view, or some, as an array does; further indices are applied to those."""
+        """Compute the images of some views, as indexing an array would; other axes follow."""
         first, rest = (key[0], key[1:]) if isinstance(key, tuple) and key else (key, ())
         if isinstance(first, int | np.integer):
             index = range(len(self))[first]
@@ -180,15 +184,15 @@ class _Stack(abc.ABC):
 
 @dataclass(frozen=True, eq=False)
 class Photographs(_Stack):
-    """V photographs of one size, (V, H, W, 4) float32 linear RGB with straight alpha when asked.
+    """V photographs of one size, which decode to (V, H, W, 4) float32 linear RGB, straight alpha.
 
-    Indexing with a number, a list or a slice makes the arrays of those views; `numpy.asarray`
-    makes all of them.
+    Indexing with a number, a list or a slice computes the arrays of those views; `numpy.asarray`
+    computes all of them.
 
     Attributes
     ----------
     shape : (V, H, W, 4).
-    divisors : (V, 3) that colours are divided by; None for one.
+    divisors : (V, 3) factors that linear colours are divided by; None for 1.
     """
 
     shape: tuple[int, int, int, int]
@@ -200,7 +204,7 @@ class Photographs(_Stack):
 
     @classmethod
     def of(cls, images: "Images") -> "Photographs":
-        """Return images as photographs; an array is looked at and not copied."""
+        """Return images as photographs; an array is not copied."""
         if isinstance(images, Photographs):
             return images
         packed = tuple(
@@ -212,7 +216,7 @@ class Photographs(_Stack):
 
     @property
     def nbytes(self) -> int:
-        """Memory that is taken."""
+        """Memory that is taken, in bytes."""
         return sum(part.byte_count for part in self._packed)
 
     @property
@@ -226,22 +230,23 @@ class Photographs(_Stack):
         return Alphas(self)
 
     def windows(self, corners: Int[np.ndarray, "V 2"], height: int, width: int) -> "Photographs":
-        """Look at a part of every photograph; nothing is copied.
+        """Return windows of the photographs, without a copy.
 
         Parameters
         ----------
-        corners : (V, 2) row and column of the upper left pixels. height, width : of all parts.
+        corners : (V, 2) row and column of the upper left pixel of each window.
+        height, width : size of all windows, pixels.
         """
         shape = (len(self), height, width, 4)
         return replace(self, shape=shape, _corners=self._corners + corners)
 
     def divided(self, factors: Float[np.ndarray, "V 3"]) -> "Photographs":
-        """Divide colours by factors of every view and channel; alpha is not."""
+        """Divide linear colours by a factor for every view and channel; alpha is unchanged."""
         before = 1.0 if self.divisors is None else self.divisors
         return replace(self, divisors=before * factors)
 
     def _placed(self, index: int, out: np.ndarray, values: np.ndarray) -> None:
-        """Lay values of the part of a view where they are in its window."""
+        """Write values of a view's part to their place in the window ``out``."""
         packed, (row, column) = self._packed[index], self._corners[index]
         top, left = packed.top - int(row), packed.left - int(column)
         height, width = packed.shape
@@ -283,9 +288,9 @@ class Photographs(_Stack):
 
 
 def values_of(numbers: np.ndarray, *, is_srgb: bool) -> np.ndarray:
-    """Return the values that numbers of a file stand for; floats are values already.
+    """Decode integers of a file to linear float32; floats are returned as they are.
 
-    ``is_srgb`` : whether they are colours, which files of integers encode.
+    ``is_srgb`` : whether integers are colours in sRGB; otherwise they are linear.
     """
     if numbers.dtype.kind == "f":
         return numbers
@@ -294,13 +299,13 @@ def values_of(numbers: np.ndarray, *, is_srgb: bool) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Alphas(_Stack):
-    """Alpha of V photographs, (V, H, W) float32 when asked."""
+    """Alpha of V photographs, which decodes to (V, H, W) float32."""
 
     photographs: Photographs
     shape: tuple[int, int, int] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Take the size over."""
+        """Take the shape of the photographs."""
         object.__setattr__(self, "shape", self.photographs.shape[:3])
 
     def _make(self, index: int) -> np.ndarray:
@@ -314,7 +319,7 @@ def pack_marks(marks: Bool[np.ndarray, "H W"]) -> Shaped[np.ndarray, "H bytes"] 
 
 @dataclass(frozen=True, eq=False)
 class Marks(_Stack):
-    """V images of zeros and ones, (V, H, W) float32 when asked; a bit each in memory."""
+    """V images of zeros and ones, one bit per pixel, which decode to (V, H, W) float32."""
 
     shape: tuple[int, int, int]
     _bits: Sequence[np.ndarray]
@@ -325,7 +330,7 @@ class Marks(_Stack):
     def of(
         cls, bits: Sequence[Shaped[np.ndarray, "H bytes"] | None], height: int, width: int
     ) -> "Marks | None":
-        """Return images that `pack_marks` packed, None for all ones; None where all images are."""
+        """Return images from the results of `pack_marks`; None if all pixels of all are one."""
         if all(image is None for image in bits):
             return None
         ones = np.broadcast_to(np.uint8(255), (height, -(-width // 8)))
@@ -335,7 +340,7 @@ class Marks(_Stack):
 
     @classmethod
     def of_array(cls, marks: "np.ndarray | Marks") -> "Marks":
-        """Return images of zeros and ones, (V, H, W), packed."""
+        """Pack images (V, H, W); values above zero become one."""
         if isinstance(marks, Marks):
             return marks
         bits = [np.packbits(image > 0, axis=1) for image in marks]
@@ -343,11 +348,11 @@ class Marks(_Stack):
 
     @property
     def nbytes(self) -> int:
-        """Memory that is taken."""
+        """Memory that is taken, in bytes."""
         return sum(bits.nbytes for bits in self._bits if any(bits.strides))
 
     def windows(self, corners: Int[np.ndarray, "V 2"], height: int, width: int) -> "Marks":
-        """Look at a part of every image, which holds it; see `Photographs.windows`."""
+        """Return windows, which lie inside of the images; see `Photographs.windows`."""
         shape = (len(self), height, width)
         return replace(self, shape=shape, _corners=self._corners + corners)
 

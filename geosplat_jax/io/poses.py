@@ -1,9 +1,10 @@
 """Cameras of photographs by structure from motion, as a COLMAP model beside them.
 
 pycolmap does the work (extra ``capture``). The same photographs and settings give the same model,
-whatever the number of threads: photographs are numbered by name, every search has a seed, and what
-sums in the order of its threads has one. Nothing but ``sparse/0`` is written; photographs stay as
-they are, and are undistorted when the scene is read, together with masks that were drawn on them.
+whatever the number of processor cores: photographs are numbered by name, random searches are
+seeded, and mapping, whose sums depend on the order of threads, uses a single thread. Only
+``sparse/0`` is written. Photographs are not changed; reading the scene undistorts them, together
+with masks that were drawn on them.
 """
 
 import shutil
@@ -38,18 +39,18 @@ MODEL_FOLDER = "sparse/0"
 
 _FEWEST = 5
 _SMALLEST_SHARE = 0.5
-"""Of the photographs, that must fit together for a model to be written."""
-_GROUP = 8  # photographs whose features are found at a time, between two signs of life
-_BLOCK = 16  # photographs that are compared with as many others at a time
-_NEIGHBOURS = 10  # of a photograph in a sequence, in either direction
+"""Least share of the photographs that must get a camera for a model to be written."""
+_GROUP = 8  # photographs whose features are computed between two reports of progress
+_BLOCK = 16  # photographs that are matched with as many others at a time
+_NEIGHBOURS = 10  # photographs before and after one in a sequence that it is matched with
 _FEW_FEATURES = 300
 _FEW_PARTNERS = 4.0
 _UPRIGHT_DEGREES = {3: 180, 4: 180, 5: 90, 6: 90, 7: -90, 8: -90}
-"""Angle, by EXIF orientation, from the y axis of the pixels to what was up."""
+"""Angle from the y axis of the stored image to where up was, in degrees, by EXIF orientation."""
 
 
 class PoseError(SceneError):
-    """The photographs give no cameras; the message says why and how to photograph instead."""
+    """No cameras can be found; the message says why, and how to take better photographs."""
 
 
 @dataclass(frozen=True)
@@ -59,10 +60,10 @@ class PoseSettings:
     Attributes
     ----------
     size : pixels of the longer side that photographs are reduced to for features.
-    order : ``any`` compares every two photographs; ``sequence`` those that are close by name, for
-        frames of a movie.
-    lens : ``one`` for all photographs, which then are of one size, or one for ``each``.
-    seed : of random searches.
+    order : ``any`` matches every photograph with every other; ``sequence`` matches those whose
+        names are close in alphabetical order, for frames of a movie.
+    lens : ``one`` for all photographs, which must then be of one size, or one for ``each``.
+    seed : seed of random searches.
     """
 
     size: int = 1600
@@ -73,15 +74,16 @@ class PoseSettings:
 
 @dataclass(frozen=True)
 class PoseReport:
-    """What was found.
+    """Result of a search for cameras.
 
     Attributes
     ----------
-    model : folder that it was written to.
-    registered : count of photographs with a camera. missing : names of the others.
-    error : mean distance in pixels between points and where the photographs show them.
-    points : count of points in space.
-    seconds : by ``features``, ``matching``, ``mapping``.
+    model : folder that the model was written to.
+    registered : number of photographs with a camera.
+    missing : names of the other photographs.
+    error : mean reprojection error of the points, pixels.
+    points : number of points in space.
+    seconds : time of each part: ``features``, ``matching`` and ``mapping``.
     """
 
     model: Path
@@ -110,14 +112,17 @@ def find_poses(
     Parameters
     ----------
     root : folder with photographs, in ``images/`` or directly.
-    force : replace a model that is there.
+    settings : see `PoseSettings`; None for the default ones.
+    force : replace an existing model.
+    on_progress : see `OnProgress`.
 
     Raises
     ------
-    MissingFileError : the folder or the photographs are not there.
+    MissingFileError : the folder does not exist.
     SceneError : pycolmap is missing, the folder has cameras already, or it has photographs that
         cannot be used.
-    PoseError, AlignmentError : too few of them fit together, or all were taken from one place.
+    PoseError, AlignmentError : there are too few photographs, too few of them fit together, or all
+        were taken from one place.
     """
     root, settings = Path(root).expanduser(), settings or PoseSettings()
     names = _photographs(root)
@@ -125,7 +130,7 @@ def find_poses(
     _require_sizes(root, names, settings)
     colmap = optional_package("pycolmap", "finding cameras", extra="capture")
     level = colmap.logging.minloglevel
-    colmap.logging.minloglevel = colmap.logging.FATAL.value  # what fails is said here
+    colmap.logging.minloglevel = colmap.logging.FATAL.value  # failures are reported by this module
     try:
         with tempfile.TemporaryDirectory(prefix="geosplat_poses_") as work:
             search = _Search(
@@ -174,7 +179,7 @@ def _photographs(root: Path) -> list[str]:
         )
     unlisted = [name for name in names if name.startswith("#") or len(name.split()) != 1]
     if unlisted:
-        # COLMAP reads pairs of names from lines, and leaves out what it does not find.
+        # COLMAP reads pairs of names, divided by a space, and skips names that it does not know.
         raise SceneError(
             f"{len(unlisted)} photographs in {folder} have a space in their name or begin with #, "
             f"{unlisted[0]!r} for one, which COLMAP cannot match; rename them"
@@ -187,7 +192,7 @@ def _photographs(root: Path) -> list[str]:
 
 
 def _require_free(root: Path, force: bool) -> None:
-    """Refuse a folder that has cameras, unless ours would replace them."""
+    """Refuse a folder that has cameras, unless ``force`` is set and ours would be read instead."""
     found = next((name for name, layout in LAYOUTS.items() if layout.recognise(root)), None)
     if found is None:
         return
@@ -215,16 +220,17 @@ def _require_sizes(root: Path, names: list[str], settings: PoseSettings) -> None
 
 
 def _pairs(count: int, order: str) -> list[tuple[int, int]]:
-    """Photographs to compare, by number."""
+    """Return pairs of photographs to match, by number."""
     pairs = list(combinations(range(count), 2))
     if order == "any":
         return pairs
-    # Powers of two close loops: a step back in a movie of one turn shows the same again.
+    # Neighbours, and pairs at distances that are powers of two: these close loops in a movie that
+    # shows the same again after a turn around the object.
     return [(i, j) for i, j in pairs if j - i <= _NEIGHBOURS or not (j - i) & (j - i - 1)]
 
 
 def _in_blocks(pairs: list[tuple[int, int]]) -> Iterator[list[tuple[int, int]]]:
-    """Group pairs such that few photographs take part in a group."""
+    """Group pairs such that every group has few photographs."""
 
     def block(pair: tuple[int, int]) -> tuple[int, int]:
         return pair[0] // _BLOCK, pair[1] // _BLOCK
@@ -234,12 +240,14 @@ def _in_blocks(pairs: list[tuple[int, int]]) -> Iterator[list[tuple[int, int]]]:
 
 
 class _Matches(NamedTuple):
-    """What is known before photographs are put together.
+    """Result of matching, from which advice for better photographs follows.
 
     Attributes
     ----------
-    photographs : count. features : mean count on a photograph.
-    pairs : count of those that show something in common, of ``compared``.
+    photographs : number of photographs.
+    features : mean number of features per photograph.
+    pairs : number of pairs of photographs that match.
+    compared : number of pairs that were compared.
     """
 
     photographs: int
@@ -301,9 +309,9 @@ class _Search:
         is_one = self.settings.lens == "one"
         mode = modes.SINGLE if is_one else modes.PER_IMAGE
         reader = self.colmap.ImageReaderOptions()
-        # A lens of one photograph has few points to tell its numbers from.
+        # A single photograph has too few points to determine more parameters.
         reader.camera_model = "OPENCV" if is_one else "SIMPLE_RADIAL"
-        # Numbered here, since features come in the order of the threads.
+        # Photographs are numbered here: extraction would number them in the order of its threads.
         self.colmap.import_images(self.database, self.images, mode, self.names, reader)
         extraction = self.colmap.FeatureExtractionOptions()
         extraction.max_image_size = self.settings.size
@@ -337,7 +345,7 @@ class _Search:
         options.min_model_size = _FEWEST
         for part in (options, options.mapper, options.triangulation):
             part.random_seed = self.settings.seed
-        # The first two photographs come as a pair, without a call.
+        # The first two photographs are registered as a pair, without a callback.
         registered = 2
 
         def count() -> None:
@@ -361,7 +369,7 @@ class _Search:
 
 
 def _upright(pose: Float[np.ndarray, "4 4"], orientation: int) -> Float[np.ndarray, "4 4"]:
-    """Turn a camera around its axis to how its photograph is shown, by EXIF orientation."""
+    """Rotate a camera about its axis so that its y axis points up, by EXIF orientation."""
     turned = pose.copy()
     angle = _UPRIGHT_DEGREES.get(orientation, 0)
     turned[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", angle, degrees=True).as_matrix()
@@ -369,7 +377,7 @@ def _upright(pose: Float[np.ndarray, "4 4"], orientation: int) -> Float[np.ndarr
 
 
 def _align(colmap: ModuleType, model: Any, images: Path) -> None:
-    """Turn, move and scale a model to `align_world`."""
+    """Transform a model in place into the world of `align_world`."""
     poses = []
     for image in sorted(model.images.values(), key=lambda image: image.name):
         if image.has_pose:
@@ -382,7 +390,7 @@ def _align(colmap: ModuleType, model: Any, images: Path) -> None:
 
 
 def _write(model: Any, folder: Path) -> None:
-    """Write a model aside, then in the place of the one before."""
+    """Write a model to a temporary folder, then replace an existing one by it."""
     aside = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(aside, ignore_errors=True)
     aside.mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Silence for libraries that print lines of their own beside the errors that they report."""
+"""Suppression of lines that libraries print in addition to the errors that they report."""
 
 import os
 import sys
@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import IO
 
 _NOISE = (b"libpng ",)
-"""How the lines begin that are dropped: an error that names the file follows them."""
+"""Beginnings of the lines that are dropped; our own error follows them, and names the file."""
 
 _lock = threading.Lock()
 _users = 0
@@ -19,10 +19,10 @@ _aside: IO[bytes] | None = None
 
 @contextmanager
 def without_decoder_lines() -> Iterator[None]:
-    """Keep lines of image decoders from the standard error stream while files are read.
+    """Drop lines that image decoders print to the standard error stream while files are read.
 
-    Libraries write them past Python, so the stream of the whole process goes aside meanwhile; what
-    else was written to it appears at the end. Several threads may use it at a time.
+    Libraries print them without Python, so the stream of the whole process is redirected to a
+    temporary file; other lines are printed at the end. Several threads may use it at the same time.
     """
     _begin()
     try:

@@ -25,23 +25,23 @@ from geosplat_jax.io.quiet import without_decoder_lines
 from geosplat_jax.io.views import COVERED
 
 THREADS = min(8, os.cpu_count() or 1)
-"""Images that are read at the same time at most."""
+"""Most images that are read at the same time."""
 
 _STRIP_ROWS = 64
-"""Rows that are turned into floats at once."""
+"""Rows of a photograph that are converted to floats at once."""
 
 
 class Photograph(NamedTuple):
-    """One view as large as it is, as its lens shows it.
+    """One view in full size and with the distortion of its lens.
 
     Attributes
     ----------
-    color : (H, W, 3) numbers of the file, see `Part`; zero where alpha is.
-    alpha : (H, W) likewise; zero where the view does not count.
+    color : (H, W, 3) numbers of the file, see `Part`; zero where alpha is zero.
+    alpha : (H, W) numbers of the file; zero where pixels do not count.
     valid : (H, W) pixels that count.
-    has_mask : False where alpha is one because nothing is known of it.
-    leaves_file : True where the image's own alpha is taken and not the file of a mask.
-    is_opaque : True where the image's own alpha is one everywhere and there is no file of a mask.
+    has_mask : False if there is neither an alpha channel nor a mask file; alpha is then one.
+    leaves_file : True if the image's own alpha is used although there is a mask file.
+    is_opaque : True if the image's own alpha is one everywhere and there is no mask file.
     """
 
     color: Shaped[np.ndarray, "H W 3"]
@@ -52,15 +52,15 @@ class Photograph(NamedTuple):
     is_opaque: bool
 
     def part(self, frame: Frame, factor: int) -> tuple[Part, Bool[np.ndarray, "h w"]]:
-        """Return what is not empty, as a pinhole sees it and reduced, and the pixels that count.
+        """Return the non-empty rectangle, undistorted and reduced, and the pixels that count.
 
-        A pixel of the smaller image counts where all pixels count that it is made of.
+        A pixel of the reduced image counts if all pixels that it is the mean of count.
         """
         if factor == 1 and frame.lens.distortion is None:
             return Part.of(self.color, self.alpha), self.valid
         height, width = self.alpha.shape
         lookup = _lookup_of(frame, width, height)
-        # Strip by strip: a large photograph as floats takes half a gigabyte.
+        # The work is done in strips: as floats, a large photograph takes half a gigabyte.
         strip = factor * max(1, _STRIP_ROWS // factor)
         parts, counted = [], []
         for start in range(0, height - height % factor, strip):
@@ -94,7 +94,15 @@ class Photograph(NamedTuple):
 
 
 def read_photograph(frame: Frame) -> Photograph:
-    """Read one view, without a change to its numbers if they are of 8 or 16 bits."""
+    """Read one view; numbers of 8 or 16 bits stay as they are in the file.
+
+    The image's own alpha is its mask, unless it is one everywhere and there is a mask file.
+
+    Raises
+    ------
+    MissingFileError, ImageReadError : see `images.read_stored`.
+    SceneError : a mask has another size than the image, or alpha exceeds one.
+    """
     pixels = read_stored(frame.image)
     if pixels.dtype == np.float32 or frame.image.suffix.lower() in LINEAR_FORMATS:
         pixels = linear_values(pixels, frame.image)
@@ -136,7 +144,7 @@ def _read_mask(
 ) -> Shaped[np.ndarray, "H W"]:
     """Read channel 0 of a mask file of the image's size, in the numbers of the file.
 
-    ``may_be_alpha`` : take the alpha channel of a cut-out, whose alpha is not one everywhere.
+    ``may_be_alpha`` : use the alpha channel instead, if there is one that is not one everywhere.
     """
     mask = read_stored(path)
     if mask.dtype == np.float32:
@@ -152,13 +160,13 @@ def _read_mask(
 
 
 def undistorted(frame: Frame, pixels: np.ndarray) -> np.ndarray:
-    """Return pixels of a view as a pinhole sees them."""
+    """Return linear pixels of a view without the distortion of its lens; see `resample`."""
     lookup = _lookup_of(frame, pixels.shape[1], pixels.shape[0])
     return pixels if lookup is None else resample(pixels, lookup)
 
 
 def _lookup_of(frame: Frame, width: int, height: int) -> Lookup | None:
-    """Find where the pinhole's pixels are in a photograph; None where there is no distortion."""
+    """Return the lookup that undistorts a view; None where the lens has no distortion."""
     distortion = frame.lens.distortion
     if distortion is None:
         return None
@@ -175,7 +183,7 @@ def _lookup(
 
 
 def as_rgba_or_rgb(pixels: np.ndarray) -> np.ndarray:
-    """Repeat the grey of one- and two-channel images."""
+    """Convert grey images, of one or two channels, to RGB or RGBA."""
     if pixels.shape[-1] in (3, 4):
         return pixels
     return np.concatenate([np.repeat(pixels[..., :1], 3, -1), pixels[..., 1:]], -1)
@@ -188,5 +196,5 @@ def in_parallel(function: Callable, items, *, threads: int = THREADS) -> list:
 
 
 def forget_lenses() -> None:
-    """Give back what was kept of the last lens."""
+    """Free the memory of the lookup that is cached for the last lens."""
     _lookup.cache_clear()

@@ -1,6 +1,7 @@
 """The mesh that a training starts from: read, cleaned, checked against the views, and resampled.
 
-Whatever is changed is said in a note; what cannot be right is refused with what to do about it.
+Every change of the mesh is reported in a note. A mesh that cannot be right is refused; the message
+says what to do about it.
 """
 
 import hashlib
@@ -31,31 +32,31 @@ from geosplat_jax.io.views import Views, in_image, project
 from geosplat_jax.surface.triangle_mesh import connectivity
 
 LARGEST = 5_000_000
-"""Faces of a mesh that is read at most; decimating more takes minutes and gigabytes."""
+"""Most faces of a mesh that is read; decimating more takes minutes and gigabytes."""
 
 _SAME_PLACE = 1e-6
-"""Corners nearer to each other than this share of the mesh's size are one vertex: parts that were
-moved in single precision meet to within some 1e-7."""
+"""Corners nearer to each other than this share of the mesh's size become one vertex: parts that
+were moved in single precision agree to within about 1e-7."""
 
 _SAMPLES = 4000
 """Points of the surface that are projected to compare it with the masks."""
 
 _VIEWS = 12
-"""Views that they are projected into, at most."""
+"""Most views that the points are projected into."""
 
 _AGREES = 0.3
-"""Least agreement with the views of a mesh that is where the object is. The object at half or twice
-its size has .25 or less, marching cubes of a visual hull nearly 1."""
+"""Least `agreement_with_views` of a mesh that is accepted. The object at half or twice its size has
+.25 or less, marching cubes of a visual hull nearly 1."""
 
 _FACTORS = (1e-3, 1e-2, 1e-1, 10.0, 1e2, 1e3)
-"""Changes of units that a message suggests where they would help."""
+"""Changes of units that are tried, so that a message can suggest one."""
 
 _WORTHWHILE = 0.8
-"""A mesh is decimated where at most this share of its faces is to stay."""
+"""A mesh is decimated if less than this share of its faces is to stay."""
 
 _LONG = 2.0
-"""Edges longer than the wanted one by this factor are split: Gaussians are as long as their faces,
-and a material cannot change along one."""
+"""Edges longer than this factor times the wanted length are split: a Gaussian is as long as its
+face, and materials do not vary within a Gaussian."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,9 @@ class StartMesh:
 
     Attributes
     ----------
-    vertices : (V, 3) float64 world; each belongs to a face. faces : (F, 3) int32.
-    notes : what was done to it, one sentence each.
+    vertices : (V, 3) float64 world; each belongs to a face.
+    faces : (F, 3) int32 rows of the vertices.
+    notes : what was done to the mesh, one sentence each.
     """
 
     vertices: Float[np.ndarray, "V 3"]
@@ -74,19 +76,19 @@ class StartMesh:
 
     @property
     def is_closed(self) -> bool:
-        """Whether faces bound a volume: every edge is passed as often one way as the other.
+        """Whether faces bound a volume: every edge occurs equally often in both directions.
 
-        Unlike for `meshes.is_closed`, four faces may meet at an edge.
+        Unlike in `meshes.is_closed`, four faces may meet at an edge.
         """
         return not _open_edges(self.faces).any()
 
     def noting(self, *notes: str, **changes: Any) -> "StartMesh":
-        """Return the mesh with changes and what is to be said of them."""
+        """Return the mesh with changes of its fields, and notes about them."""
         return replace(self, notes=(*self.notes, *notes), **changes)
 
 
 def _open_edges(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " E"]:
-    """Count how often every edge is passed one way, less how often the other."""
+    """Return, for every edge, the difference between its numbers of uses in the two directions."""
     start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
     stride = int(faces.max(initial=0)) + 1
     edge = np.minimum(start, end) * stride + np.maximum(start, end)
@@ -96,7 +98,7 @@ def _open_edges(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " E"]:
 
 
 def digest_of(path: str | Path) -> str:
-    """Return a short text that tells what a file holds from anything else.
+    """Return a short digest of the content of a file.
 
     Raises
     ------
@@ -112,20 +114,22 @@ def digest_of(path: str | Path) -> str:
 
 @lru_cache(maxsize=1)
 def read_start(path: str, digest: str) -> StartMesh:
-    """Read a mesh file and clean what it holds, in the axes of the world.
+    """Read a mesh file, clean the mesh, and turn it into the axes of the world.
 
-    Corners at one place become one vertex; faces without area, faces that are there twice and
-    vertices without faces are dropped; faces of a closed mesh are turned outward.
+    Corners at one place become one vertex. Faces without area, duplicate faces and vertices without
+    faces are dropped; a closed mesh keeps slivers, which close it. Faces are oriented consistently,
+    and those of a closed mesh outward.
 
     Parameters
     ----------
-    path : of the file. digest : see `digest_of`.
+    path : path of the file.
+    digest : expected digest of the file, see `digest_of`.
 
     Raises
     ------
     ValueError
-        If the file is not what it was, holds no face that can be used, more than `LARGEST`, or
-        vertices that are not finite.
+        If the file does not have the digest, holds no face that can be used or more than `LARGEST`,
+        or has vertices that do not exist or are not finite.
     """
     if digest_of(path) != digest:
         raise ValueError(f"{path} is not the mesh that it was (its digest was {digest})")
@@ -152,7 +156,7 @@ def read_start(path: str, digest: str) -> StartMesh:
 
 
 def _cleaned(mesh: StartMesh, path: str) -> StartMesh:
-    """Join corners at one place; drop faces that are none, and vertices without faces."""
+    """Join corners at one place; drop degenerate and duplicate faces, and unused vertices."""
     used, rows = np.unique(mesh.faces, return_inverse=True)
     unused = len(mesh.vertices) - len(used)
     vertices, place = _joined(mesh.vertices[used])
@@ -160,7 +164,7 @@ def _cleaned(mesh: StartMesh, path: str) -> StartMesh:
     given, joined = len(faces), len(used) - len(vertices)
     following = np.roll(faces, -1, axis=1)
     faces = faces[(faces != following).all(axis=1)]
-    # Slivers close a surface as other faces do; of an open one they are no part.
+    # Slivers close a surface as other faces do, but add nothing to an open one.
     if _open_edges(faces).any():
         faces = faces[nondegenerate(vertices, faces)]
     with_area = len(faces)
@@ -180,11 +184,11 @@ def _cleaned(mesh: StartMesh, path: str) -> StartMesh:
 
 
 def _joined(points: Float[np.ndarray, "V 3"]) -> tuple[np.ndarray, Int[np.ndarray, " V"]]:
-    """Make one of points at one place; with the row of each in the result.
+    """Merge points at one place; return the merged points, and the row of each given point in them.
 
-    Those nearer to each other than `_SAME_PLACE`, some up to 3.5 times as far, and chains of such.
-    They share a cube of twice that in one at least of eight grids, each shifted by half a cube
-    along some axes.
+    Points nearer to each other than `_SAME_PLACE` are merged, some that are up to 3.5 times as far,
+    and chains of such points. Two points as near as that share a cube of twice the side in at least
+    one of eight grids, which are shifted by half a cube along some of the axes.
     """
     low = points.min(axis=0)
     size = float(np.max(points.max(axis=0) - low))
@@ -205,10 +209,11 @@ def _joined(points: Float[np.ndarray, "V 3"]) -> tuple[np.ndarray, Int[np.ndarra
 
 
 def _single(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "G 3"]:
-    """Keep one of the faces that share three corners; of two that cancel in a closed surface none.
+    """Remove duplicates among faces that share three corners.
 
-    Two cancel as the wall between two rooms does, where they end at faces that stay. Others, such
-    as a flag that has a front and a back, are a part of what is to be seen, and one of two stays.
+    In general one of them stays, as of a flag that has a front and a back. None stays of a wall
+    between two rooms: a sheet of duplicates inside a closed surface, whose whole border lies on
+    faces without duplicates.
     """
     _, only, number, count = np.unique(
         np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
@@ -222,7 +227,7 @@ def _single(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "G 3"]:
 
 
 def _within(walls: Int[np.ndarray, "F 3"], faces: Int[np.ndarray, "G 3"]) -> np.ndarray:
-    """Tell of each face of some sheets whether all of its sheet's border lies on other faces."""
+    """Tell for each wall whether its sheet has a border, all of which lies on other faces, (F,)."""
 
     def edges(rows: np.ndarray) -> np.ndarray:
         ends = np.sort(np.stack([rows, np.roll(rows, -1, axis=1)], axis=-1), axis=-1)
@@ -243,11 +248,12 @@ def _within(walls: Int[np.ndarray, "F 3"], faces: Int[np.ndarray, "G 3"]) -> np.
 
 
 def _outward(mesh: StartMesh) -> StartMesh:
-    """Wind faces alike that meet at an edge of two, and turn a closed mesh outward.
+    """Orient faces consistently, and those of a closed mesh outward.
 
-    Parts inside of others, and inverted parts beside right ones, stay as they are: the volume of
-    all decides. Where more than two faces meet at an edge, nobody knows which belong together, and
-    one-sided bands cannot be wound alike.
+    A closed mesh is turned as a whole, by the sign of its volume: parts inside of others, and
+    inverted parts beside correct ones, stay as they are. Faces are not oriented across edges of
+    more than two faces, where it is unknown which belong together; one-sided bands have no
+    consistent orientation.
     """
     if not mesh.is_closed:
         faces, left = _wound_alike(mesh.faces)
@@ -264,10 +270,12 @@ def _outward(mesh: StartMesh) -> StartMesh:
 
 
 def _wound_alike(faces: Int[np.ndarray, "F 3"]) -> tuple[Int[np.ndarray, "F 3"], int]:
-    """Wind faces that meet at an edge of two alike, turning the fewest of each part.
+    """Orient faces consistently across edges of two faces, turning the fewest of each part.
 
-    Also returns the number of faces that cannot be, which stay as they are. Every face is a node
-    as it is, and one turned; edges tie what goes together, which makes two parts of each.
+    Also returns the number of faces on one-sided parts, which stay as they are. In a graph every
+    face has two nodes, one as it is and one turned, and links join nodes that are consistent. Each
+    part of the mesh gives two connected components, one the reverse of the other, and a one-sided
+    part gives a single component.
     """
     count, near = len(faces), connectivity(faces)
     first, second = near.wings[:, 0], near.wings[:, 1]
@@ -281,7 +289,7 @@ def _wound_alike(faces: Int[np.ndarray, "F 3"]) -> tuple[Int[np.ndarray, "F 3"],
     kept, turned = part[:count], part[count:]
     is_one_sided = kept == turned
     size = np.bincount(kept, minlength=int(part.max(initial=-1)) + 1)
-    # Of two parts that are each other's other side the one that turns fewer; then either.
+    # Of the two components of a part, the one that turns fewer faces; if equal, the first.
     is_turned = ~is_one_sided & (
         (size[kept] < size[turned]) | ((size[kept] == size[turned]) & (kept > turned))
     )
@@ -289,10 +297,11 @@ def _wound_alike(faces: Int[np.ndarray, "F 3"]) -> tuple[Int[np.ndarray, "F 3"],
 
 
 def agreement_with_views(points: Float[np.ndarray, "P 3"], views: Views) -> float:
-    """Tell how well points of a surface fill the masks, or the images where there are no masks.
+    """Measure, in [0, 1], how well points of a surface fill the masks, or images without masks.
 
-    Share of the points that some pixel of the mask sees, times the common share of the rectangles
-    around points and mask; the mean over some views. The second factor is left out without masks.
+    For a view it is the share of the points that lie inside the mask, times the intersection over
+    union of the bounding rectangles of points and mask; without masks, the share of the points
+    inside the image. The result is the mean over some views.
     """
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _VIEWS)).astype(int))
     return float(np.mean([_fills(points, views, v, views.mask(v)) for v in map(int, chosen)]))
@@ -310,7 +319,7 @@ def _fills(points: np.ndarray, views: Views, view: int, mask: np.ndarray) -> flo
         return 0.0
     column, row = pixels[inside].astype(int).T
     if views.valid is not None:
-        # Nobody knows what pixels show that do not count.
+        # Points in pixels that do not count are left out.
         counts = np.ones(len(pixels), bool)
         counts[inside] = np.asarray(views.valid[view])[row, column] > 0
         column, row = column[counts[inside]], row[counts[inside]]
@@ -331,7 +340,7 @@ def _fills(points: np.ndarray, views: Views, view: int, mask: np.ndarray) -> flo
 
 
 def _points_on(mesh: StartMesh) -> Float[np.ndarray, "P 3"]:
-    """Spread points over the surface."""
+    """Draw points on the surface, uniformly by area, with a fixed seed."""
     corners = mesh.vertices[mesh.faces]
     rng = np.random.default_rng(0)
     edges = corners[:, 1:] - corners[:, :1]
@@ -343,10 +352,17 @@ def _points_on(mesh: StartMesh) -> Float[np.ndarray, "P 3"]:
 def require_in_views(mesh: StartMesh, views: Views, path: str) -> None:
     """Refuse a mesh that is not where the views see the object, or has other units.
 
+    Parameters
+    ----------
+    mesh : the mesh.
+    views : views of the object.
+    path : name of the mesh's file, for messages.
+
     Raises
     ------
     ValueError
-        With how much of it the views see, and the factor that would help, where one does.
+        If `agreement_with_views` is below 0.3. The message gives the agreement, and a factor or
+        turn of the axes that would help, if there is one.
     """
     points = _points_on(mesh)
     found = agreement_with_views(points, views)
@@ -371,25 +387,33 @@ def require_in_views(mesh: StartMesh, views: Views, path: str) -> None:
 
 
 def pixel_length(mesh: StartMesh, views: Views) -> float:
-    """Return the width of a pixel at the middle of the mesh, in the world; the views' median."""
+    """Return the width of a pixel at the middle of the mesh, world units; median over the views."""
     middle = 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
     depth = views.world_to_camera[:, 2, :3] @ middle + views.world_to_camera[:, 2, 3]
     return float(np.median(np.abs(depth) / views.intrinsics[:, 0, 0]))
 
 
 def sized(mesh: StartMesh, edge: float, *, most_faces: int, path: str) -> StartMesh:
-    """Decimate or divide a mesh to edges of a length, as far as a number of faces allows.
+    """Decimate or divide a mesh such that its edges have about a given length.
 
-    The number of faces is what their area asks for; faces that are still too long, as those of flat
-    parts are in meshes made by hand or decimated, are then split.
+    The number of faces is that of equilateral triangles that would cover the surface, at most
+    ``most_faces``. Edges that are still too long, as in flat parts of meshes that were modelled by
+    hand or decimated, are then split.
+
+    Parameters
+    ----------
+    mesh : the mesh.
+    edge : wanted length of edges, world units.
+    most_faces : most faces of the result.
+    path : name of the mesh's file, for messages.
 
     Raises
     ------
     ValueError
-        If it has too many faces, and the package that decimates is missing, or leaves too many.
+        If the mesh has too many faces, and fast-simplification is not installed or leaves too many.
     """
     area = surface_area(mesh.vertices, mesh.faces)
-    # As many equilateral triangles as cover the surface.
+    # The number of equilateral triangles that cover the surface.
     wanted = max(int(area / (0.25 * np.sqrt(3.0) * edge**2)), 4)
     target = min(wanted, most_faces)
     if len(mesh.faces) > most_faces or target < _WORTHWHILE * len(mesh.faces):
@@ -411,7 +435,7 @@ def sized(mesh: StartMesh, edge: float, *, most_faces: int, path: str) -> StartM
 
 
 def _divided(mesh: StartMesh, target: int) -> StartMesh:
-    """Divide every face in four, as often as a number of faces allows."""
+    """Divide every face in four, as often as at most ``target`` faces allow."""
     count, vertices, faces = len(mesh.faces), mesh.vertices, mesh.faces
     while 4 * len(faces) <= target:
         vertices, faces = trimesh.remesh.subdivide(vertices, faces)[:2]
@@ -422,7 +446,7 @@ def _divided(mesh: StartMesh, target: int) -> StartMesh:
 
 
 def _decimated(mesh: StartMesh, target: int, *, most_faces: int, path: str) -> StartMesh:
-    """Reduce a mesh to about so many faces by quadric errors."""
+    """Reduce a mesh to about ``target`` faces by quadric errors."""
     count = len(mesh.faces)
     try:
         vertices, faces = simplified(mesh.vertices, mesh.faces, target)
@@ -458,8 +482,14 @@ def fitted(
     Parameters
     ----------
     path, digest : see `read_start`.
-    views : of the training.
-    edge_pixels : mean edge to aim at, in pixels. most_faces : of the result, at most.
+    views : training views.
+    edge_pixels : wanted length of edges, in pixels of the views.
+    most_faces : most faces of the result.
+
+    Raises
+    ------
+    ValueError
+        See the three functions.
     """
     mesh = read_start(path, digest)
     require_in_views(mesh, views, path)

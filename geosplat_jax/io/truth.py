@@ -12,11 +12,11 @@ from geosplat_jax.io.photographs import Marks, Photographs, values_of
 from geosplat_jax.io.reading import as_rgba_or_rgb, in_parallel, read_photograph, undistorted
 
 TRUTH_CHANNELS = {"albedo": 3, "normal": 3, "roughness": 1, "metallic": 1}
-_SHORTEST_NORMAL = 0.1  # below this a decoded normal is background, not rounding
+_SHORTEST_NORMAL = 0.1  # a decoded normal up to this length is background
 
 
 class _OnDemand(Mapping[str, np.ndarray]):
-    """A mapping whose values are read when they are asked for, and kept only where that is said."""
+    """A mapping whose values are read when they are looked up, and cached if ``keeps`` is set."""
 
     def __init__(self, makers: dict[str, Callable[[], np.ndarray]], *, keeps: bool):
         self._makers = makers
@@ -39,7 +39,16 @@ class _OnDemand(Mapping[str, np.ndarray]):
 
 
 class Reading(NamedTuple):
-    """What the images of the truth must fit: frames, their images, sizes, and the reduction."""
+    """How the photographs of a split were read, which its ground truth must match.
+
+    Attributes
+    ----------
+    frames : frames of the split.
+    images : photographs as they were read.
+    sizes : height and width of each photograph after reduction, pixels.
+    valid : pixels that count; None where all do.
+    factor : factor that images were reduced by.
+    """
 
     frames: Sequence[Frame]
     images: Photographs
@@ -48,7 +57,7 @@ class Reading(NamedTuple):
     factor: int
 
     def reduced(self, index: int, pixels: np.ndarray, path: Path) -> np.ndarray:
-        """Undistort and reduce pixels of a file, and lay them where the image of the view lies."""
+        """Undistort and reduce an image, and place it as the photograph of its view was placed."""
         pixels = undistorted(self.frames[index], pixels)
         small = downscale(pixels, self.factor)
         height, width = self.sizes[index]
@@ -61,9 +70,10 @@ class Reading(NamedTuple):
 
 
 def true_maps(reading: Reading, albedo_is_srgb: bool, problems: list[str]) -> Mapping[str, Any]:
-    """Return the true maps that all views have, by name; they are kept once they are read.
+    """Return the ground-truth maps that all views have, by name; they are cached once read.
 
-    ``problems`` : gets a line about every map that only some views have.
+    Values are (V, H, W, C) float32, zero on the background: albedo linear, normals unit. A line
+    about every map that only some views have is appended to ``problems``.
     """
 
     def maker(key: str) -> Callable[[], np.ndarray]:
@@ -78,9 +88,9 @@ def true_maps(reading: Reading, albedo_is_srgb: bool, problems: list[str]) -> Ma
 
 
 def _for_reduction(reading: Reading, frame: Frame, pixels: np.ndarray, path: Path) -> np.ndarray:
-    """Give an image that will be resampled the alpha of its view, where it has none of its own.
+    """Add the alpha of its view to an image that will be resampled, unless it has its own.
 
-    Otherwise the background would be averaged into the rim.
+    Without alpha, resampling would mix the background into the outline of the object.
     """
     pixels = as_rgba_or_rgb(pixels)
     is_resampled = reading.factor > 1 or frame.lens.distortion is not None
@@ -108,9 +118,10 @@ def _read_truth(reading: Reading, index: int, key: str, is_srgb: bool) -> np.nda
 
 
 def relit_images(reading: Reading, problems: list[str]) -> Mapping[str, Any]:
-    """Return the images of all views under other lights, by light; they are read anew each time.
+    """Return the images of all views under other lights, by light; every lookup reads them again.
 
-    ``problems`` : gets a line about every light that only some views have.
+    Values are (V, H, W, 4) float32 linear RGB with straight alpha. A line about every light that
+    only some views have is appended to ``problems``.
     """
 
     def maker(light: str) -> Callable[[], np.ndarray]:
@@ -119,7 +130,7 @@ def relit_images(reading: Reading, problems: list[str]) -> Mapping[str, Any]:
             path = frame.relight[light]
             pixels = _for_reduction(reading, frame, read_linear(path), path)
             relit = reading.reduced(index, pixels, path)
-            # Without an alpha of its own it has that of the view: the object has not moved.
+            # An image without alpha has that of its view, since the object has not moved.
             alpha = (
                 relit[..., 3:] if relit.shape[-1] == 4 else reading.images.alpha(index)[..., None]
             )
@@ -134,7 +145,7 @@ def relit_images(reading: Reading, problems: list[str]) -> Mapping[str, Any]:
 
 
 def _in_all(listed: list[Mapping[str, Path]], what: str, problems: list[str]) -> list[str]:
-    """Keys that every view has; those that only some have are reported."""
+    """Return the keys that all views have; those that only some have are reported."""
     keys = list(dict.fromkeys(key for files in listed for key in files))
     complete = []
     for key in keys:

@@ -14,7 +14,7 @@ from geosplat_jax.io.extras import optional_package
 from geosplat_jax.io.images import written_aside
 
 _COORDINATES = "st"
-"""Name of the texture coordinates, by convention."""
+"""Conventional name of the texture coordinates."""
 
 
 def usd_library() -> Any:
@@ -95,14 +95,14 @@ def _add_material(stage: Any, textures: Mapping[str, str]) -> Any:
 
 
 def write_usd(path: str | Path, mesh: trimesh.Trimesh, textures: Mapping[str, str]) -> None:
-    """Write a mesh, y up, whose unit is a metre.
+    """Write a textured mesh as USD, with y up and metres as units.
 
     Parameters
     ----------
     path : destination, ``*.usdc``.
-    mesh : with texture coordinates, ``v`` upwards.
-    textures : files beside it, by ``base_color`` (sRGB), ``roughness`` and ``metallic`` (grey), and
-        ``normal``.
+    mesh : mesh with texture coordinates, ``v`` upwards.
+    textures : names of files in the same folder, by ``base_color`` (sRGB), ``roughness`` and
+        ``metallic`` (grey), and ``normal``.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""Views in memory: images, cameras and what counts of them.
+"""Views in memory: images, cameras, and the pixels that count.
 
 Colour is linear with straight alpha, alpha is the mask, poses are camera-to-world with Blender
-axes in float64. Photographs lie in memory as `Photographs` describes. Ground truth and relit images
-are read when first asked for (`truth`): they are many, and training never touches them.
+axes in float64. Photographs are stored as `Photographs` describes. Ground truth and relit images
+are read when they are first needed (`truth`): they are many, and training does not use them.
 """
 
 import hashlib
@@ -24,19 +24,19 @@ COVERED = 0.5
 """A pixel belongs to the object where its alpha exceeds this."""
 
 OPAQUE = 0.95
-"""Masks of which no pixel reaches this alpha are taken for a mistake."""
+"""If no mask reaches this alpha anywhere, the masks are taken for a mistake."""
 
 _BLENDER_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 class ViewLight(NamedTuple):
-    """The environment of one view, as its camera saw it.
+    """The environment light of one view, in the frame of its camera.
 
     Attributes
     ----------
     path : lat-long map in the camera's OpenGL axes (x right, y up, z backwards), y up:
         ``u = 0.5 + atan2(x, -z) / (2 pi)``, ``v = acos(y) / pi``.
-    camera_to_world : (4, 4) of the camera, which turns the map into the world.
+    camera_to_world : (4, 4) pose of the camera, whose rotation takes the map into the world.
     """
 
     path: Path
@@ -47,25 +47,25 @@ class ViewLight(NamedTuple):
 class Views:
     """V views of one size; see the module for conventions.
 
-    Photographs of several sizes lie in the upper left corner of an image as large as the largest;
-    pixels beside them do not count.
+    Photographs of several sizes are placed in the upper left corner of images as large as the
+    largest; pixels of the padding do not count.
 
     Attributes
     ----------
-    names : one a view.
+    names : one name per view.
     camera_to_world : (V, 4, 4) float64, rigid, OpenGL/Blender axes.
     intrinsics : (V, 3, 3) pixels.
-    images : (V, H, W, 4) float32 linear RGB, straight alpha; colour is zero where alpha is. An
-        array, or what makes the arrays of those views that it is indexed with.
-    truth : (V, H, W, C) by ``albedo`` (linear), ``normal`` (unit, world), ``roughness``,
-        ``metallic``; zero on the background.
-    relight : (V, H, W, 4) linear, by light; read anew each time, since they are large.
-    valid : (V, H, W) float32 pixels that count, 0 or 1, like ``images``; None where all do. Others
-        are zero in all images.
-    has_masks : False where nothing tells the object from what is behind it; alpha is then one.
-    lights : environment maps of single views, by their names.
-    exposure : (V,) factors that the photographs were divided by; None where they are as they were.
-    white_balance : (V, 3) likewise, of each channel.
+    images : (V, H, W, 4) float32 linear RGB, straight alpha; colour is zero where alpha is zero.
+        An array, or `Photographs`, which decode the views that they are indexed with.
+    truth : (V, H, W, C) ground truth by ``albedo`` (linear), ``normal`` (unit, world),
+        ``roughness`` and ``metallic``; zero on the background.
+    relight : (V, H, W, 4) linear, by light; read from files at every lookup, since they are large.
+    valid : (V, H, W) float32, 1 for pixels that count and 0 for others, an array or `Marks`; None
+        where all count. Pixels that do not count are zero in all images.
+    has_masks : False where neither alpha nor masks separate the object; alpha is then one.
+    lights : environment maps of single views, by the names of the views.
+    exposure : (V,) factors that linear colours were divided by; None where they were not.
+    white_balance : (V, 3) further factors, by channel, that they were divided by, or None.
     """
 
     names: tuple[str, ...]
@@ -96,13 +96,13 @@ class Views:
 
     @property
     def alphas(self) -> Any:
-        """Alpha of the views, (V, H, W) like ``images``; no file is read again for it."""
+        """Alpha of the views, (V, H, W), an array or `Alphas`; no file is read for it."""
         return self.images.alphas if isinstance(self.images, Photographs) else self.images[..., 3]
 
     def clipped(self, indices: Sequence[int] | np.ndarray) -> Float[np.ndarray, "K H W 4"]:
-        """Photographs of some views, with colours that end at white as those of a render do.
+        """Return the photographs of some views, clipped at white as tone-mapped renders are.
 
-        Those of float images, and those that were divided by an exposure, may go beyond it.
+        Only photographs from float files, or after a correction of exposure, exceed white.
         """
         return np.minimum(self.images[np.asarray(indices, int)], np.float32(1.0))
 
@@ -112,18 +112,18 @@ class Views:
 
     @property
     def masks(self) -> Bool[np.ndarray, "V H W"]:
-        """Pixels of the object in all views; of many large photographs, take `mask`."""
+        """Pixels of the object in all views; `mask` takes less memory for many photographs."""
         return np.stack([self.mask(index) for index in range(len(self))])
 
     @cached_property
     def coverage(self) -> Float[np.ndarray, " V"]:
-        """Share of each view's pixels that count which the object covers."""
+        """Share of the pixels of each view, among those that count, that the object covers."""
         covered = [np.count_nonzero(self.mask(index)) for index in range(len(self))]
         return np.array(covered) / np.maximum(self.valid_counts, 1.0)
 
     @cached_property
     def mean_colors(self) -> Float[np.ndarray, "V 3"]:
-        """Mean of pixels of each view, linear; tells photographs from others of their name."""
+        """Mean linear colour of each view; detects photographs that changed under their names."""
         step, found = max(1, max(self.height, self.width) // 512), np.zeros((len(self), 3))
         for first in range(0, len(self), 4):
             rows = np.arange(first, min(first + 4, len(self)))
@@ -133,7 +133,7 @@ class Views:
 
     @property
     def has_opaque_pixel(self) -> bool:
-        """Whether alpha reaches one, or nearly, in any view."""
+        """Whether alpha reaches `OPAQUE` in any view."""
         return any(np.max(alpha, initial=0.0) >= OPAQUE for alpha in self.alphas)
 
     @cached_property
@@ -146,11 +146,11 @@ class Views:
     @property
     def world_to_camera(self) -> Float[np.ndarray, "V 4 4"]:
         """Rigid transforms to OpenCV camera axes, (V, 4, 4) float64."""
-        # Right-multiplied: it turns the camera's own axes, not the world's.
+        # Multiplied from the right, which changes the axes of the camera and not of the world.
         return _rigid_inverse(self.camera_to_world @ _BLENDER_TO_OPENCV)
 
     def fingerprint(self) -> str:
-        """Return a short text that tells these views from others: names, cameras, size."""
+        """Return a short digest of the views' names, cameras and size."""
         digest = hashlib.sha256(repr((self.names, self.height, self.width)).encode())
         for array in (self.camera_to_world, self.intrinsics):
             digest.update(np.ascontiguousarray(array, np.float64).tobytes())
@@ -180,7 +180,7 @@ def no_views(like: Views) -> Views:
 
 
 def some_views(views: Views, chosen: Sequence[int] | np.ndarray, *, factor: int = 1) -> Views:
-    """Return some of the views, reduced by an integer factor; truth and other lights stay behind.
+    """Return some of the views, reduced by an integer factor, without ground truth and lights.
 
     Raises
     ------
@@ -215,12 +215,19 @@ def project(
     world_to_camera: Float[np.ndarray, "4 4"],
     intrinsics: Float[np.ndarray, "3 3"],
 ) -> tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 3"]]:
-    """Project points of the world with one camera, on the host.
+    """Project world points into the image of one camera, on the host.
+
+    Parameters
+    ----------
+    points : (N, 3) world.
+    world_to_camera : (4, 4) pose of the camera, OpenCV axes.
+    intrinsics : (3, 3) pinhole camera matrix, pixels.
 
     Returns
     -------
-    pixels : columns and rows; what is not in front of the camera gets -1, outside of every image.
-    local : the points along the camera's OpenCV axes, the last of which is their depth.
+    pixels : (N, 2) column and row; both are -1, outside of every image, for a point that is not in
+        front of the camera.
+    local : (N, 3) the points in the frame of the camera; the last coordinate is the depth.
     """
     local = points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
     is_ahead = local[:, 2:] > 0.0
@@ -231,19 +238,19 @@ def project(
 def in_image(
     pixels: Float[np.ndarray, "N 2"], *, height: int, width: int
 ) -> Bool[np.ndarray, " N"]:
-    """Tell which pixels (columns, rows) an image of some size has."""
+    """Tell which positions (column, row) lie inside an image of ``height`` x ``width`` pixels."""
     return (pixels >= 0).all(axis=1) & (pixels < [width, height]).all(axis=1)
 
 
 def point_text(point: Iterable[float]) -> str:
-    """Write a place or an extent in the world for a reader, with four digits."""
+    """Format a point or a size in the world as text, with four significant digits."""
     return "(" + ", ".join(f"{value:.4g}" for value in point) + ")"
 
 
 def _reduced(
     rgba: Float[np.ndarray, "H W 4"], valid: Bool[np.ndarray, "H W"], factor: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return colours and what counts of a smaller image: pixels of which all parts count."""
+    """Reduce an image; a pixel of the result counts if all pixels that it is the mean of count."""
     small = downscale(rgba, factor)
     if valid.all():
         return small, np.ones(small.shape[:2], bool)

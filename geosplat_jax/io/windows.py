@@ -9,30 +9,30 @@ from geosplat_jax.io.photographs import Marks, Photographs
 from geosplat_jax.io.views import Views
 
 MARGIN = 16
-"""Pixels around the object that a window keeps at least: splats that stand out are seen there."""
+"""Least margin of a window around the object, in pixels: it shows splats outside of the mask."""
 
 _RELATIVE_MARGIN = 0.1
-"""The same as a share of the object's size in the image."""
+"""Least margin as a share of the object's size in the image."""
 
 
 def around_object(views: Views, *, largest: float) -> tuple[Views, float]:
-    """Cut views to windows of one size around the object; principal points move along.
+    """Crop views to windows of one size around the object; principal points move accordingly.
 
-    Every window holds the pixels of its view with any alpha and a margin, as far as the photograph
-    reaches. Truth and relit images are left behind: training never looks at them.
+    Every window holds all pixels of its view whose alpha is not zero, and a margin, as far as the
+    photograph reaches. Ground truth and relit images are dropped: training does not use them.
 
     Parameters
     ----------
-    views : with masks; others are returned as they are.
-    largest : share of the pixels up to which windows pay; 0 for whole photographs always.
+    views : views with masks; others are returned as they are.
+    largest : windows are used if they hold at most this share of the pixels; 0 for never.
 
     Returns
     -------
-    views : cut, or whole.
-    share : of the photographs' pixels that are left, of those that count, in (0, 1]. A mean over a
-        window is that over the photograph divided by this, where render and photograph are both
-        empty outside. (SSIM leaves out a border of five pixels of either, so its mean falls a
-        little more.)
+    views : cropped views, or those given.
+    share : share of the pixels that the windows hold, among those that count, in (0, 1]. Where
+        render and photograph are both empty outside the window, the mean of an error over the
+        window is its mean over the photograph divided by this share. (SSIM leaves out a border of
+        five pixels of either image, so that its mean falls a little more.)
     """
     if not views.has_masks or largest <= 0.0:
         return views, 1.0

@@ -1,1 +1,1 @@
-"""Looking at a run: renderer, metrics, evaluation, relighting, exports. Host side."""
+"""Results of a run: renderer, metrics, evaluation, relighting, exports. Host side."""

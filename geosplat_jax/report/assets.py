@@ -31,20 +31,20 @@ _materials_at = partial(jax.jit, static_argnames=("spec",))(materials_at)
 
 
 _NEAREST = 4
-"""Splats that a point takes its refined albedo from."""
+"""Number of splats that the refined materials at a point are interpolated from."""
 
 
 class MaterialSampler:
-    """Evaluate the materials of a surface at any number of points of it.
+    """Function that evaluates the materials of a surface at any number of points on it.
 
-    Fields are evaluated in chunks of one compiled size. What splats have learned of their own
-    (`refinement.FreeSplats`) is added: by how much albedo and metallic of the four nearest differ
-    from the field, weighted by the inverse of the squared distance.
+    Fields are evaluated in chunks of one compiled size. Where splats have materials of their own
+    (`refinement.FreeSplats`), the differences of their albedo and metallic from the field are
+    added: those of the four nearest splats, weighted by the inverse of the squared distance.
 
     Parameters
     ----------
     trained : parameters of a run.
-    asset : of the same.
+    asset : surface and splats of the same run.
     """
 
     def __init__(self, trained: Trained, asset: Asset) -> None:
@@ -105,19 +105,25 @@ def export_assets(
 ) -> dict[str, str]:
     """Write ``mesh.glb``, ``gaussians.ply`` and ``light.exr``; return a line about each.
 
-    The mesh uses the evaluation triangulation (two triangles a quad) and carries base colour,
-    roughness and metallic. The light has the exposure that was learned multiplied in. The Gaussians
-    carry the albedo as display colour, since their shaded colour depends on the view.
+    The mesh uses the evaluation triangulation (two triangles per quad) and has base colour,
+    roughness and metallic. The light is multiplied by the learned exposure. The Gaussians have the
+    albedo as display colour, since their shaded colour depends on the view.
 
     Parameters
     ----------
-    trained : parameters of a run. folder : existing folder.
-    vertex_colors : colours on vertices instead of an unwrapped texture.
+    trained : parameters of a run.
+    folder : existing folder.
+    vertex_colors : write colours at the vertices instead of textures.
     texture_size : edge of the square textures, texels.
     obj : also write ``mesh.obj``, with ``mesh.mtl`` and textures as PNG.
-    usd : also write ``mesh.usdc``, with the same textures.
-    face_count : reduce the mesh to about so many faces, with a map of its normals.
+    usd : also write ``mesh.usdc``, with textures as PNG.
+    face_count : reduce the mesh to about this many faces, and add a normal map of the full mesh;
+        None for the mesh as it is.
     on_progress : see `poses.OnProgress`.
+
+    Returns
+    -------
+    dict from the path of each file to a line about it.
 
     Raises
     ------
@@ -181,20 +187,22 @@ def write_model(
     eye: np.ndarray,
     texture_size: int = MODEL_TEXTURE,
 ) -> dict[str, Any] | None:
-    """Write the mesh and the lights that a report shows it under.
+    """Write the model of a report: the mesh, and the lights that it is shown under.
 
     Parameters
     ----------
-    folder : of ``metrics.json``; the files go to its folder `gallery.FOLDER`.
-    mesh : vertices, faces and normals.
-    lights : lat-long maps of linear radiance by title; reduced to 128 rows.
-    eye : (3,) place in the world that it is seen from at first.
+    folder : folder of ``metrics.json``; the files go into its subfolder `gallery.FOLDER`.
+    mesh : vertices (V, 3) world, faces (F, 3) and vertex normals (V, 3).
+    sampler : materials of the surface.
+    lights : lat-long maps of linear radiance by title; reduced to at most 128 rows.
+    eye : (3,) world position that the model is first seen from.
+    texture_size : edge of the textures, texels.
 
     Returns
     -------
-    dict of ``mesh``, ``faces``, ``lights`` by title, with paths below ``folder``, and ``orbit``,
-    the angles in degrees around glTF's vertical axis (from +z) and from it; None for an empty
-    surface.
+    dict of ``mesh`` and ``lights`` (by title), paths below ``folder``; of ``faces``, their number;
+    and of ``orbit``, two angles of the eye in degrees, azimuth around glTF's vertical axis from +z,
+    and polar angle from that axis. None for an empty surface.
     """
     own = folder / FOLDER
     own.mkdir(exist_ok=True)

@@ -1,16 +1,15 @@
 """How well splats match the mesh that they were sampled from (appendix B.3, Table 5).
 
-For every pixel whose ray meets the mesh from outside, two things are compared with what the splats
-show there:
+For every pixel whose ray hits the mesh from outside, two values of mesh and splats are compared:
 
-- the direction in which the viewing ray is reflected, from the mesh's normal (vertex normals,
-  interpolated at the hit) and from the normal of the splats (blended, of unit length): degrees;
-- the distance of the hit from the camera, and the distance of the splats' means from the camera
-  (blended, divided by coverage; along the ray, not along the axis): a share of the diagonal of the
-  mesh's bounding box.
+- the direction of the reflected viewing ray, by the mesh's normal (vertex normals, interpolated at
+  the hit) and by the splats' normal (blended, then normalised): angle in degrees;
+- the distance from the camera, of the hit and of the splats' means (blended, then divided by
+  coverage; along the ray, not along the camera's axis): difference as a share of the diagonal of
+  the mesh's bounding box.
 
-Light that is reflected, and rays that start at what is seen, go as wrong as these two say. Rays go
-through the pixel centres and are exact (float64, on the host).
+These are the errors of reflected light, and of the origins of rays that start at visible points.
+Rays go through the pixel centres; hits are exact (float64, on the host).
 """
 
 from collections.abc import Iterable
@@ -37,16 +36,17 @@ from geosplat_jax.splats.rasterize import rasterize
 from geosplat_jax.surface.base import Surface
 
 _SEEN = 0.5
-"""Coverage from which a pixel shows splats at all."""
+"""Only pixels with more coverage than this are compared."""
 
 DEFAULT_VIEWS, DEFAULT_SIZE = 12, 400
-"""Views of a mesh without a scene, and pixels along their sides."""
+"""Number of views of a mesh without a scene, and pixels along their sides."""
 
 _FIELD_OF_VIEW = 0.69
-"""Of those views, radians."""
+"""Field of view of those views, radians."""
 
 _DISTANCE = 3.4
-"""Of those cameras from the middle, in half the longest side of the mesh's bounding box."""
+"""Distance of those cameras from the middle, in units of half the longest side of the mesh's
+bounding box."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,12 @@ class Consistency:
     Attributes
     ----------
     reflection_deg : angle between the reflected directions, degrees.
-    distance : difference of the distances, as a share of the box's diagonal.
-    pixels : that were compared.
-    uncovered : share of the pixels on the mesh that the splats cover by less than a half.
-    behind : share of the pixels on the mesh that see the back of a face, and are not compared.
+    distance : absolute difference of the distances, as a share of the box's diagonal.
+    pixels : number of pixels that were compared.
+    uncovered : share of the pixels whose rays hit the mesh from outside that splats cover by at
+        most a half; they are not compared.
+    behind : share of the pixels whose rays hit the mesh that see the back of a face; they are not
+        compared.
     """
 
     reflection_deg: float
@@ -71,13 +73,15 @@ class Consistency:
 
 @dataclass(frozen=True)
 class Body:
-    """A mesh, and the splats that stand for it.
+    """A mesh, and the splats that represent it.
 
     Attributes
     ----------
-    vertices : (V, 3) world; faces : (F, 3); normals : (V, 3) unit normals of the vertices; host.
-    splats : to compare the mesh with.
-    raster : how they become pixels.
+    vertices : (V, 3) world, on the host.
+    faces : (F, 3) rows of the vertices.
+    normals : (V, 3) unit normals of the vertices.
+    splats : splats that the mesh is compared with.
+    raster : settings of the rasteriser.
     near : near plane, world units.
     is_two_sided : whether both sides of a face are surface.
     """
@@ -92,12 +96,12 @@ class Body:
 
     @property
     def diagonal(self) -> float:
-        """Diagonal of the mesh's bounding box."""
+        """Diagonal of the mesh's bounding box, world units."""
         corners = self.vertices[self.faces].reshape(-1, 3)
         return float(_length(np.ptp(corners.astype(np.float64), axis=0)[None])[0])
 
     def seen(self, camera: Camera) -> "SeenMesh":
-        """Meet the mesh with the rays of a single view."""
+        """Intersect the mesh with the rays of a single view."""
         return see_mesh(
             self.vertices, self.faces, self.normals, camera, is_two_sided=self.is_two_sided
         )
@@ -105,15 +109,16 @@ class Body:
 
 @dataclass(frozen=True)
 class PixelErrors:
-    """What is compared, for all P pixels whose ray meets the mesh.
+    """Errors at all P pixels whose rays hit the mesh, over all views.
 
     Attributes
     ----------
-    reflection_deg : as in `Consistency`; of no meaning where coverage is zero.
-    ranges, shown : distances of the hit and of the splats, as shares of the box's diagonal.
-    coverage : of the splats.
-    facing : cosine between the way back to the camera and the mesh's interpolated normal.
-    is_outside : whether the face that is met looks towards the camera.
+    reflection_deg : as in `Consistency`; meaningless where coverage is zero.
+    ranges, shown : distances of the hit and of the splats from the camera, as shares of the box's
+        diagonal.
+    coverage : coverage by splats, in [0, 1].
+    facing : cosine between the mesh's interpolated normal and the direction to the camera.
+    is_outside : whether the front of a face is hit.
     """
 
     reflection_deg: Float[np.ndarray, " P"]
@@ -130,20 +135,21 @@ class PixelErrors:
 
     @property
     def is_compared(self) -> Bool[np.ndarray, " P"]:
-        """Pixels that show splats where the mesh is met from outside."""
+        """Pixels that are compared: splats cover them, and the mesh is hit from outside."""
         return self.is_outside & (self.coverage > _SEEN)
 
 
 @dataclass(frozen=True)
 class SeenMesh:
-    """What the rays through the pixel centres of one view meet; all (H, W, ...) or (H, W).
+    """Hits of the rays through the pixel centres of one view on a mesh.
 
     Attributes
     ----------
-    is_hit : whether anything; what follows is zero where nothing is.
-    is_outside : whether the face looks towards the camera.
-    towards : unit directions of the rays, everywhere.
-    normals : unit, interpolated. ranges : distances from the camera.
+    is_hit : (H, W) whether a ray hits the mesh; all others but ``towards`` are zero where not.
+    is_outside : (H, W) whether the front of a face is hit.
+    towards : (H, W, 3) unit directions of the rays, world.
+    normals : (H, W, 3) interpolated vertex normals, unit, world.
+    ranges : (H, W) distances from the camera, world units.
     """
 
     is_hit: Bool[np.ndarray, "H W"]
@@ -171,9 +177,14 @@ def see_mesh(
     *,
     is_two_sided: bool = False,
 ) -> SeenMesh:
-    """Meet a mesh with the rays of a single view; see `io.meshes.first_hits`.
+    """Intersect a mesh with the rays of a single view; see `io.meshes.first_hits`.
 
-    ``is_two_sided`` : the back of a face is met from outside, too, with the other normal.
+    Parameters
+    ----------
+    vertices, normals : (V, 3) world.
+    faces : (F, 3) rows of the vertices.
+    camera : one view (V = 1).
+    is_two_sided : whether hits on the back of a face count as outside, with the normal reversed.
     """
     rows, weights = first_hits(vertices, faces, camera)
     is_hit = rows >= 0
@@ -201,7 +212,7 @@ def see_mesh(
 
 
 def _ray_directions(camera: Camera) -> Float[np.ndarray, "H W 3"]:
-    """Aim the rays through the pixel centres of a single view; unit directions."""
+    """Return unit directions, in the world, of the rays through the pixel centres of a view."""
     lens, pose = (np.asarray(x[0], np.float64) for x in (camera.intrinsics, camera.world_to_camera))
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     local = np.stack([(x - lens[0, 2]) / lens[0, 0], (y - lens[1, 2]) / lens[1, 1], x * 0 + 1], -1)
@@ -217,7 +228,7 @@ def _blended(
     raster: RasterSettings,
     capacities: Capacities,
 ) -> tuple[Float[Array, "H W 3"], Float[Array, "H W"], Float[Array, "H W"], Usage]:
-    """Blend normals and distances of the splats in one view; also coverage and needs of buffers."""
+    """Blend the normals (premultiplied) and mean distances of splats; also coverage and usage."""
     ranges = safe_norm(splats.means - camera.centers, keepdims=True)
     image, alpha, usage = rasterize(
         splats.means,
@@ -238,7 +249,7 @@ def _blended(
 
 
 def _first_capacities(splats: Splats) -> Capacities:
-    """Guess what a view of all these splats needs."""
+    """Guess the buffer sizes that a view of all these splats needs."""
     rows = splats.means.shape[0]
     return Capacities(visible=bucket(rows // 2), hits=bucket(2 * rows), chunks=bucket(rows // 3))
 
@@ -273,7 +284,7 @@ def reflection_angle_deg(
     normals: Float[np.ndarray, "P 3"],
     others: Float[np.ndarray, "P 3"],
 ) -> Float[np.ndarray, " P"]:
-    """Angle between unit directions reflected at two unit normals each; exact for small ones."""
+    """Angle between reflections of unit directions at two unit normals; exact for small angles."""
     first, second = _reflect(directions, normals), _reflect(directions, others)
     return np.rad2deg(2.0 * np.arctan2(_length(first - second), _length(first + second)))
 
@@ -287,9 +298,13 @@ def _reflect(
 def pixel_errors(
     body: Body, cameras: Iterable[Camera], capacities: Capacities | None = None
 ) -> PixelErrors:
-    """Compare mesh and splats in some single views, pixel by pixel (host side).
+    """Compare mesh and splats in views, pixel by pixel (host side).
 
-    ``capacities`` : sizes of the buffers to begin with (default: a guess); they grow.
+    Parameters
+    ----------
+    body : mesh and splats.
+    cameras : single views.
+    capacities : first sizes of the buffers, which grow as needed; None for a guess.
     """
     capacities, views = capacities or _first_capacities(body.splats), []
     for camera in cameras:
@@ -305,7 +320,7 @@ def measure(body: Body, cameras: Iterable[Camera]) -> Consistency:
     Raises
     ------
     ValueError
-        If no view's rays meet the mesh from outside where splats are seen.
+        If no ray hits the mesh from outside in a pixel that splats cover.
     """
     errors = pixel_errors(body, cameras)
     hit, outside = errors.is_outside.size, int(errors.is_outside.sum())
@@ -325,12 +340,12 @@ def measure(body: Body, cameras: Iterable[Camera]) -> Consistency:
 
 
 def body_of_run(trained: Trained) -> Body:
-    """Return the mesh that a run's splats sit on, and the splats as it ended."""
+    """Return the mesh that the splats of a run lie on, and the splats, at the end of the run."""
     asset = build_asset(trained.pipeline, trained.params)
     raster, surface = trained.pipeline.raster, trained.pipeline.surface
     vertices, faces, normals = trim_mesh(asset.mesh)
     if surface.is_two_sided:
-        faces = faces[: len(faces) // 2]  # Of two faces at one place, nobody knows which is met.
+        faces = faces[: len(faces) // 2]  # Front and back coincide: only fronts can be hit.
     return Body(
         vertices,
         faces,
@@ -343,9 +358,13 @@ def body_of_run(trained: Trained) -> Body:
 
 
 def body_of_mesh(mesh: Mesh, model: SplatModel | None = None, box: Box | None = None) -> Body:
-    """Return a mesh, and splats on it that follow it alone (default: those of `FaceSplats`).
+    """Return a mesh, and splats that depend on this mesh alone.
 
-    ``box`` : whose half is the unit of length (default: `box_of` the mesh).
+    Parameters
+    ----------
+    mesh : the mesh.
+    model : how splats are placed on it; None for `FaceSplats`.
+    box : box whose half extent is the unit of length; None for `box_of` the mesh.
     """
     raster, box = RasterSettings(), box or box_of(mesh)
     place = jax.jit((model or FaceSplats()).place)
@@ -364,16 +383,17 @@ def box_of(mesh: Mesh) -> Box:
 
 
 def load_mesh(path: str | Path) -> Mesh:
-    """Read a mesh file to be compared with splats; corners at one position become one vertex.
+    """Read a mesh file to be compared with splats.
 
-    Files repeat vertices along the seams of textures. Normals are then those of the whole surface.
-    A file that says that y is up is turned into the axes of the world, whose z is up.
+    Vertices at exactly one position become one, because files repeat vertices along the seams of
+    textures, across which normals must be averaged. A file that declares y as up is turned into
+    the axes of the world, where z is up.
 
     Raises
     ------
     ValueError
-        If the file cannot be read as triangles, or holds positions that are not finite or all
-        alike.
+        If the file cannot be read as triangles, has positions that are not finite, or has no face
+        with three different corners.
     """
     vertices, faces = read_mesh(path)
     vertices = (from_y_up(vertices) if is_y_up(path) else vertices).astype(np.float32)
@@ -397,9 +417,9 @@ def whole_mesh(vertices: Float[np.ndarray, "V 3"], faces: np.ndarray) -> Mesh:
 def cameras_around(
     box: Box, *, views: int = DEFAULT_VIEWS, size: int = DEFAULT_SIZE
 ) -> list[Camera]:
-    """Return single views of ``size`` x ``size`` pixels that look at a box, evenly from all sides.
+    """Return single views of ``size`` x ``size`` pixels, spread evenly on a sphere around a box.
 
-    Lens and distance are those of the usual synthetic scenes.
+    Field of view and distance are those of the usual synthetic scenes.
     """
     center = np.asarray(box.center, np.float64)
     focal = 0.5 * size / np.tan(0.5 * _FIELD_OF_VIEW)
@@ -428,6 +448,6 @@ def resized(camera: Camera, size: int) -> Camera:
 
 
 def single_cameras(views: Views, size: int | None = None) -> list[Camera]:
-    """Return the cameras of some views one by one; ``size`` : see `resized` (default: as is)."""
+    """Return the cameras of views one by one, `resized` to ``size`` unless that is None."""
     cameras = [views.camera([number]) for number in range(len(views))]
     return cameras if size is None else [resized(camera, size) for camera in cameras]

@@ -42,7 +42,7 @@ _MATERIALS = ("roughness", "metallic")
 
 
 def _where_counted(view: RenderedView, valid: np.ndarray | None) -> RenderedView:
-    """Leave of a render what counts; ``valid`` is (H, W), or None for all of it."""
+    """Set pixels of a render that do not count to zero; ``valid`` is (H, W), or None for all."""
     if valid is None:
         return view
     counted = valid[..., None]
@@ -56,7 +56,7 @@ def _where_counted(view: RenderedView, valid: np.ndarray | None) -> RenderedView
 
 
 def _compared(view: RenderedView, rendition: Rendition | ScaledRendition) -> np.ndarray:
-    """Return colours as they are compared, beyond white only where the rendition has those."""
+    """Return the colours that a rendition compares: exposed radiance, or the tone-mapped image."""
     return view.linear if isinstance(rendition, ScaledRendition) else view.rgb
 
 
@@ -76,9 +76,9 @@ def _view_metrics(
     valid: np.ndarray | None,
     protocol: Protocol,
 ) -> dict:
-    """Metrics of one view; ``image`` is (H, W, 4) linear with straight alpha.
+    """Compute the metrics of one view; ``image`` is (H, W, 4) linear with straight alpha.
 
-    Metrics of the mask's pixels are left out where it has none.
+    Metrics over the pixels of the mask are left out where the mask is empty.
     """
     mask = image[..., 3]
     metrics = protocol_metrics.new_view_metrics(view.rgb, view.alpha, image, valid)
@@ -104,14 +104,14 @@ def _view_metrics(
 
 
 class _Rendered(NamedTuple):
-    """What is kept of all test views.
+    """What is stored of the renders of all test views.
 
     Attributes
     ----------
-    metrics : of every view.
+    metrics : metrics of every view.
     alpha : (V, H, W) coverage.
-    maps : (V, H, W, c) by name, those of the materials that there is truth to compare with.
-    shown : whole views, by index, for the sheets.
+    maps : (V, H, W, c) by name, of the materials for which there is ground truth.
+    shown : whole renders for the sheets, by index of the view.
     """
 
     metrics: list[dict[str, Any]]
@@ -127,7 +127,7 @@ def _render_all(
     protocol: Protocol,
     on_progress: OnProgress | None,
 ) -> _Rendered:
-    """Render every view once, and keep of it no more than is needed: views may be many."""
+    """Render every view once; only what is needed is stored, since there may be many views."""
     metrics, shown, alpha = [], {}, []
     maps = {name: [] for name in ("albedo", *_MATERIALS) if name in views.truth}
     for index, name in counted([*enumerate(views.names)], "new views", on_progress):
@@ -148,7 +148,7 @@ def _render_all(
 def _material_metrics(
     protocol: Protocol, rendered: _Rendered, views: Views
 ) -> tuple[dict[str, Any], np.ndarray]:
-    """Metrics of albedo, roughness and metallic where there is truth, and the albedo's scale."""
+    """Compute metrics of the materials with ground truth; also return the scale of the albedo."""
     alpha, maps, mask = rendered.alpha, rendered.maps, np.asarray(views.alphas)
     metrics: dict[str, Any] = {}
     scale = np.ones(3)
@@ -176,9 +176,9 @@ def _relight_metrics(
     chosen: np.ndarray,
     on_progress: OnProgress | None,
 ) -> tuple[dict[str, float], list[dict[str, np.ndarray]]]:
-    """Metrics of the views under every light that has true images and a map, and rows of a sheet.
+    """Compute metrics under every light with true images and a map; also return rows of a sheet.
 
-    One light is in memory at a time, and of its renders only what is compared.
+    To save memory, lights are processed one by one, and only what is compared is stored.
     """
     metrics: dict[str, float] = {}
     found: dict[str, float] = {}
@@ -215,7 +215,7 @@ def _relight_metrics(
 def _relight_programs(
     renderer: Renderer, views: Views, lights: Mapping[str, EnvLight], indirect: str
 ) -> Future[None]:
-    """Compile what relights while the views are rendered under the light that was trained."""
+    """Compile the programs for relighting in the background, while views are rendered."""
     names = sorted(set(views.relight) & set(lights))
 
     def render_once() -> None:
@@ -227,14 +227,14 @@ def _relight_programs(
 
 @dataclass(frozen=True)
 class Truth:
-    """What a run is compared with.
+    """Ground truth that a run is compared with.
 
     Attributes
     ----------
-    views : test views; there are metrics of what their ``truth`` and ``relight`` hold.
+    views : test views; metrics are computed for what their ``truth`` and ``relight`` hold.
     lights : environment maps by the names of ``views.relight``.
-    train_light : true light of the training images, to compare the recovered one with.
-    train_views : those of the training, to count how many of them see each place.
+    train_light : true light of the training images, to compare the recovered one with, or None.
+    train_views : training views, to count how many of them see each point of the surface, or None.
     """
 
     views: Views
@@ -250,7 +250,7 @@ class EvaluateOptions:
     Attributes
     ----------
     protocol : one of `protocols.PROTOCOLS`.
-    samples : rays a splat of the images.
+    samples : rays per splat in every image, see `Renderer`.
     relight_indirect : see `Renderer.relit`.
     sheet_views : number of views on the sheets, spread evenly.
     model_texture : texels along the edge of the model that the report shows; None for no model.
@@ -264,12 +264,12 @@ class EvaluateOptions:
 
 
 class _Measured(NamedTuple):
-    """Metrics of all views, and what the sheets need beside them.
+    """Metrics of all views, and further data for the sheets.
 
     Attributes
     ----------
     views : metrics of every view.
-    mean : of every metric, by name.
+    mean : mean over the views of every metric, and metrics over all views, by name.
     rendered : see `_Rendered`.
     albedo_scale : (3,) factors that the albedo is aligned to the truth with.
     relit : pictures by title under each light, for every view that is shown.
@@ -289,9 +289,9 @@ def _measure(
     radiance: np.ndarray,
     on_progress: OnProgress | None,
 ) -> _Measured:
-    """Render every view, as trained and under every light, and compare.
+    """Render every view, under the recovered light and under every other, and compare.
 
-    ``radiance`` is the light that was found.
+    ``radiance`` is the recovered light.
     """
     protocol, views = protocols.protocol(options.protocol), truth.views
     compiled = _relight_programs(renderer, views, truth.lights, options.relight_indirect)
@@ -385,21 +385,25 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """Render every test view, write metrics and sheets, return the metrics.
 
-    Writes ``metrics.json``, ``overview.png`` and, where the scene has the truth of them,
-    ``materials.png`` and ``relight.png``, and their pictures one by one (see `gallery`). New views
-    are always compared in sRGB on white, as the mean over the images of the measure of each;
-    normals once over the mask's pixels and once over all of them, with (0, 0, 1) behind the object.
-    Pixels that do not count have no part in any of it, and are empty on the sheets. See `protocols`
-    for the rest.
+    Writes ``metrics.json``, ``overview.png`` and, where the scene has the ground truth,
+    ``materials.png`` and ``relight.png``; also every picture as a file (see `gallery`). New views
+    are always compared in sRGB on white; metrics are means over the images. Normals are compared
+    twice: over the pixels of the mask, and over all pixels, with (0, 0, 1) as normal of the
+    background. Pixels that do not count are left out of all metrics, and are empty on the sheets.
+    All other choices are those of the protocol, see `protocols`.
 
     Parameters
     ----------
     trained : see `train.load_trained`.
-    truth : what to compare with.
-    folder : receives the files.
+    truth : ground truth to compare with.
+    folder : existing folder for the files.
     options : see `EvaluateOptions`.
-    meta : recorded with the metrics (step, scene, training seconds).
+    meta : entries that are recorded with the metrics, such as step, scene and training seconds.
     on_progress : see `poses.OnProgress`.
+
+    Returns
+    -------
+    dict, the content of ``metrics.json``.
     """
     began = time.perf_counter()
     tell = on_progress or (lambda part, done, total: None)
@@ -429,7 +433,7 @@ def evaluate_run(
     }
 
     def written(**found: Any) -> dict[str, Any]:
-        """Write the metrics, with what else was found and what it took."""
+        """Write and return the metrics, with further entries, seconds and peak memory."""
         effort = {
             "seconds": round(time.perf_counter() - began, 2),
             "peak_memory_mb": peak_memory_mb(),
@@ -439,7 +443,7 @@ def evaluate_run(
             aside.write_text(text + "\n", encoding="utf-8")
         return metrics | effort | found
 
-    written(gallery={}, seen=None)  # pictures may fail, for want of memory say
+    written(gallery={}, seen=None)  # metrics are safe if the pictures fail, by lack of memory say
     tell("pictures and model", 0, 1)
     shown, gallery = _show(renderer, truth, measured, folder, options.protocol, radiance)
     if options.model_texture is not None:

@@ -16,13 +16,14 @@ _TERM = "term."
 
 
 class EventLog(Listener):
-    """Follows ``metrics.jsonl`` and the previews of a run into ``tensorboard/`` in its folder.
+    """Copies ``metrics.jsonl`` and the previews of a run into ``tensorboard/`` in its folder.
 
-    Written anew from the first step on, so that a resumed run has no step twice.
+    When a run is resumed, the event files are written again from the first step, so that no step
+    occurs twice.
 
     Parameters
     ----------
-    folder : of the run; need not exist yet.
+    folder : folder of the run, which need not exist yet.
 
     Raises
     ------
@@ -37,7 +38,7 @@ class EventLog(Listener):
         self._begin_anew()
 
     def _begin_anew(self) -> None:
-        """Forget what has been written, and of which file."""
+        """Reset the state, so that `note` writes new event files from the first step."""
         if self._writer is not None:
             self._writer.close()
         self._writer = None
@@ -51,7 +52,7 @@ class EventLog(Listener):
         self.note()
 
     def note(self) -> None:
-        """Write what has been added since the last call; all of it where the run is another one."""
+        """Write what was added since the last call, or everything if ``metrics.jsonl`` is new."""
         if not self._folder.metrics.exists():
             return
         file = self._folder.metrics.stat().st_ino
@@ -84,7 +85,7 @@ class EventLog(Listener):
                 self._writer.add_scalar(f"terms/{name.removeprefix(_TERM)}", value, line["step"])
 
     def close(self) -> None:
-        """Write what is left and close the files; nothing where `note` has written nothing."""
+        """Write what is left and close the files, if `note` has written any."""
         if self._writer is not None:
             self.note()
             self._writer.close()

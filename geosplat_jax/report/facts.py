@@ -35,7 +35,7 @@ _MEASURES = {
     "is_mirrored": ("the map is mirrored: 1 for yes", "", "lower"),
     "mirrored_correlation": ("correlation of the mirrored map", "", ""),
 }
-"""Name, unit and which way is better, of what a figure's name ends with."""
+"""Title, unit and better direction of a figure, by the end of its key."""
 
 _REGIONS = {
     "masked": "object's pixels",
@@ -65,8 +65,9 @@ class Figure:
 
     Attributes
     ----------
-    key : name in ``metrics.json``. group, label, unit : in words.
-    better : ``higher``, ``lower``, or empty where neither is.
+    key : name in ``metrics.json``.
+    group, label, unit : texts for the table.
+    better : ``higher``, ``lower``, or empty where neither is better.
     """
 
     key: str
@@ -77,7 +78,7 @@ class Figure:
 
 
 def figure(key: str) -> Figure:
-    """Describe a figure of ``metrics.json`` by its name; what is not known keeps its name."""
+    """Describe a figure of ``metrics.json`` by its key; an unknown one keeps its key as label."""
     group, _, rest = key.partition(".")
     title = _GROUPS.get(group, group)
     if group == "relight":
@@ -115,12 +116,13 @@ def protocol_text(name: str) -> str:
 
 
 def curves(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Take the curves out of the lines of a training.
+    """Extract the curves from the lines of ``metrics.jsonl``.
 
     Returns
     -------
-    ``step``, ``loss``, ``psnr``, ``splats``, ``memory`` (MB) of every ``every``-th step and the
-    last, and ``stages``: name and first step of each.
+    dict of lists ``step``, ``loss``, ``psnr`` (dB), ``splats`` and ``memory`` (MB), over every
+    ``every``-th step and the last one; of ``every``; and of ``stages``, the name and first step of
+    each.
     """
     every = -(-len(lines) // _LONGEST_CURVE) if lines else 1
     kept = [line for n, line in enumerate(lines) if n % every == 0 or n == len(lines) - 1]
@@ -135,7 +137,7 @@ def curves(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def rung_row(rung: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
-    """Lay out a rung of ``run.json``: part, decibels without and with it, gain, verdict."""
+    """Format a rung of ``run.json``: part of the model, PSNR without and with it, gain, verdict."""
     found, with_it, gain = rung["found"], "-", "-"
     if found is not None:
         with_it = f"{rung['larger']:.2f} dB"
@@ -155,7 +157,10 @@ def _finite(value: Any) -> float | int | None:
 
 
 def stage_times(lines: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Tell of each stage its steps, seconds, the median step and the longest, where it compiled."""
+    """Summarise each stage: number of steps, seconds, median step and longest step, in seconds.
+
+    The longest step includes the compilation.
+    """
     seconds: dict[str, list[float]] = {}
     for line in lines:
         seconds.setdefault(line["stage"], []).append(float(line["seconds"]))
@@ -177,7 +182,7 @@ def _level_of(config: Config) -> str:
 
 
 def _preset_of(config: Config, overrides: Sequence[str] = ()) -> Config:
-    """Return the preset at that level, under the label of ``config``."""
+    """Return the preset of ``config`` at its level, labelled with the quality of ``config``."""
     geometry = config.geometry
     found = make_config(
         config.preset,
@@ -190,20 +195,21 @@ def _preset_of(config: Config, overrides: Sequence[str] = ()) -> Config:
 
 
 def changed_from_preset(config: Config) -> dict[str, tuple[Any, Any]]:
-    """Map each setting that differs from the preset's at its quality to both values."""
+    """Map each setting that differs from the preset to both values, that of the preset first."""
     return changed_settings(_preset_of(config), config)
 
 
 _NAMED = ("downscale", "light")
-"""Ways of reading a scene that the command has an option for; Python has more."""
+"""Options of `READING` that the command has as well; the others exist in Python only."""
 
 
 def command(record: Mapping[str, Any], config: Config) -> tuple[str, bool]:
-    """Return the command that trains the run again, and whether its settings are all in it.
+    """Return the command that trains the run again, and whether it holds all settings.
 
     Parameters
     ----------
-    record : ``run.json``. config : the settings in it.
+    record : content of ``run.json``.
+    config : the settings in it.
     """
     words = ["geosplat-jax", "train", str(record["scene"]), "--output", "runs/again"]
     words += ["--preset", config.preset, "--quality", _level_of(config)]
@@ -232,7 +238,7 @@ def command(record: Mapping[str, Any], config: Config) -> tuple[str, bool]:
 
 
 def _folded(words: Sequence[str]) -> str:
-    """Quote for a shell, an option a line."""
+    """Quote words for a shell, with each option on its own line."""
     starts = [0, *(n for n, word in enumerate(words) if word.startswith("--")), len(words)]
     lines = [shlex.join(words[first:last]) for first, last in pairwise(starts)]
     return " \\\n    ".join(lines)

@@ -1,10 +1,11 @@
-"""Pictures of an evaluation: composed into sheets, and one by one as files for the report.
+"""Pictures of an evaluation as single files, for the report.
 
 ::
 
     evaluation/000_00.png ...   each picture of each view that is shown
-    evaluation/light.png        the light that was found, tone mapped; true_light.png where known
-    evaluation/mesh.glb         the mesh with its materials; NAME.hdr the lights it is shown under
+    evaluation/light.png        the recovered light, tone mapped; true_light.png where known
+    evaluation/mesh.glb         the mesh with its materials
+    evaluation/light_00.hdr ... the lights that the report shows the mesh under
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,14 +18,14 @@ from geosplat_jax.io.images import write_png
 from geosplat_jax.report.pictures import tone_map_light
 
 FOLDER = "evaluation"
-"""Name of the folder, in that of the run or of a stage's end."""
+"""Name of the folder of pictures, beside ``metrics.json``."""
 
 
 def comparisons(titles: Sequence[str]) -> list[tuple[str, str]]:
-    """Pair the titles of true pictures with those of what was found, in order.
+    """Pair the titles of true pictures with those of the reconstruction, in order.
 
-    ``truth`` belongs to ``render``, ``true X`` to ``X, aligned`` where there is such a picture, and
-    to ``X`` otherwise.
+    ``truth`` is paired with ``render``; ``true X`` with ``X, aligned`` if there is such a picture,
+    or else with ``X``.
     """
     pairs = [("truth", "render")] if {"truth", "render"} <= set(titles) else []
     for title in titles:
@@ -46,13 +47,13 @@ def write_gallery(
     Parameters
     ----------
     folder : receives the folder `FOLDER`; pictures of an earlier evaluation are replaced.
-    rows : pictures by title, by the name of the view; display-referred floats in [0, 1].
+    rows : for each view, by name, its pictures (H, W, 3) by title; sRGB floats in [0, 1].
     lights : lat-long maps of linear radiance by title.
 
     Returns
     -------
-    dict, for ``metrics.json``: ``views`` (``view``, and ``pictures`` by title) and ``lights``, with
-    paths below ``folder``.
+    dict for ``metrics.json``, with paths below ``folder``: ``views``, a list of ``view`` (the name)
+    and ``pictures`` (paths by title), and ``lights``, paths by title.
     """
     own = folder / FOLDER
     own.mkdir(exist_ok=True)
@@ -62,7 +63,7 @@ def write_gallery(
     for number, (view, row) in enumerate(rows.items()):
         files = {}
         for column, (title, picture) in enumerate(row.items()):
-            # Titles may hold the names of lights, which a file system need not like.
+            # Files are numbered: titles hold names of lights, which may be no valid file names.
             files[title] = f"{FOLDER}/{number:03d}_{column:02d}.png"
             write_png(folder / files[title], picture)
         views.append({"view": view, "pictures": files})

@@ -8,18 +8,18 @@ from geosplat_jax.core.color import luminance
 from geosplat_jax.report.metrics import psnr_of_mse
 from geosplat_jax.transport.environment import light_directions, texel_solid_angles
 
-# Mean direction over mean luminance: float32 directions of a uniform map leave about 1e-8.
+# Least length of the mean direction per mean luminance: a uniform map has about 1e-8 in float32.
 _SMALLEST_RESULTANT = 1e-5
-# Correlations that differ by less are equal: rounding of the transforms is about 1e-15.
+# Correlations that differ by less count as equal: rounding of the transforms is about 1e-15.
 _CORRELATION_TIE = 1e-9
-# Maps that are nearly their own mirror image differ by noise of this size.
+# The two correlations of a map that is nearly its own mirror image differ by noise of this size.
 _MIRROR_MARGIN = 0.01
-# A product of variances below this share of the product of second moments is rounding.
+# Up to this share of the product of second moments, a product of variances is only rounding.
 _CONSTANT = 1e-24
 
 
 def _overlap(edges_out: np.ndarray, edges_in: np.ndarray) -> Float[np.ndarray, "n m"]:
-    """Share of every input interval in every output interval; rows sum to one."""
+    """Return the share that every input interval has in every output interval; rows sum to one."""
     low = np.maximum(edges_out[:-1, None], edges_in[None, :-1])
     high = np.minimum(edges_out[1:, None], edges_in[None, 1:])
     return np.maximum(high - low, 0.0) / np.diff(edges_out)[:, None]
@@ -28,9 +28,18 @@ def _overlap(edges_out: np.ndarray, edges_in: np.ndarray) -> Float[np.ndarray, "
 def resize_light(
     radiance: Float[np.ndarray, "H W C"], height: int, width: int
 ) -> Float[np.ndarray, "h w C"]:
-    """Bring a lat-long map to any size by averaging over the solid angle of every new texel.
+    """Resample a lat-long map to any size by averaging over the solid angle of every new texel.
 
-    Texels are constant and their parts exact, so flux is preserved whatever the two sizes are.
+    Texels are taken as constant, and overlaps are exact, so that flux is preserved for any sizes.
+
+    Parameters
+    ----------
+    radiance : (H, W, C) map.
+    height, width : size of the result.
+
+    Returns
+    -------
+    (height, width, C) float64.
     """
     # The solid angle between two parallels is proportional to the difference of their heights.
     old_v, new_v, old_u, new_u = (
@@ -80,10 +89,11 @@ def _direction_error_deg(a: np.ndarray, b: np.ndarray, weights: np.ndarray) -> f
 def _best_turn(
     recovered: np.ndarray, truth: np.ndarray, weights: np.ndarray
 ) -> tuple[float, float]:
-    """Turn about the vertical, degrees, that brings one map onto the other, and their correlation.
+    """Find the rotation about the vertical, in degrees, that best aligns two maps.
 
-    Means of rows are taken out: no such turn changes their part. Of equally good turns the
-    smallest is returned, so 0 where nothing can be told, and then the correlation is 0 too.
+    Also returns their correlation after it. The mean of every row is subtracted first, since no
+    such rotation changes it. Of equally good rotations the smallest is returned; if a map has no
+    variation along its rows, both results are 0.
     """
     width = truth.shape[1]
     a, b = (x - x.mean(axis=1, keepdims=True) for x in (recovered, truth))
@@ -103,9 +113,9 @@ def _best_turn(
 def _direction_metrics(
     recovered: np.ndarray, truth: np.ndarray, weights: np.ndarray
 ) -> dict[str, float | bool]:
-    # Luminance as it is would show the sun alone, and one sun is its own mirror image: of ten
-    # outdoor and studio maps, blurred and with noise, four were then called mirrored or not by
-    # chance; of logarithms, one.
+    # Logarithms are correlated. In linear luminance only the sun would matter, and a single sun is
+    # its own mirror image: of ten outdoor and studio maps, blurred and with noise, chance decided
+    # for four whether they were called mirrored; with logarithms, for one.
     level = float(np.sum(weights * truth)) or 1.0
     a, b = np.log1p(recovered / level), np.log1p(truth / level)
     yaw, correlation = _best_turn(a, b, weights)
@@ -126,33 +136,36 @@ def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def light_metrics(
     recovered: Float[np.ndarray, "..."], truth: Float[np.ndarray, "..."]
 ) -> dict[str, float | bool | tuple[float, ...]]:
-    """Compare a recovered environment map with the true one, up to one scale a channel.
+    """Compare a recovered environment map with the true one, up to one scale per channel.
 
-    All means and correlations weigh texels by solid angle. The truth is first averaged to the size
-    of the recovered map (`resize_light`); detail that the recovered map cannot hold is no error.
+    All means and correlations weight texels by solid angle. The truth is first averaged to the size
+    of the recovered map (`resize_light`), so that detail which the recovered map cannot hold does
+    not count as an error.
 
     Parameters
     ----------
-    recovered : (H, W, 3) linear radiance in the layout of `scene.EnvLight`.
+    recovered : (H, W, 3) linear radiance in the layout of `core.types.EnvLight`.
     truth : (H', W', 3) of any size, same layout.
 
     Returns
     -------
-    ``light.scale`` : factors, by least squares, that take the recovered light to the true one; 1
-        for a black channel. The next two metrics are taken after it, those of directions after
-        equal flux in every channel, which no turn or flip upsets.
+    ``light.scale`` : least-squares factors, by channel, from the recovered light to the true one; 1
+        for a black channel. The next two metrics are computed after this scaling. Metrics of
+        directions are computed after scaling to equal flux in every channel, because flux does not
+        change when a map is rotated or mirrored.
     ``light.psnr`` : dB, of x / (1 + x). Radiance has no largest value, and in a linear measure the
         sun alone would count; this curve has the range [0, 1) that a PSNR needs, a logarithm none.
     ``light.correlation`` : Pearson, of log(1 + luminance); 0 for a uniform map.
-    ``light.direction_error_deg`` : angle between the luminance-weighted mean directions; 90 where
-        one of the maps has none (uniform).
-    ``light.yaw_error_deg`` : turn of the recovered map about z, counter-clockwise from above, in
-        (-180, 180] and to a column, that best correlates the logarithms of luminance. 0 where the
-        map is turned right, or where its rows are uniform.
-    ``light.yaw_correlation``, ``light.mirrored_correlation`` : what that turn reaches, and what
-        the best turn of the mirrored map (y to -y) does, means of rows left out.
-    ``light.is_mirrored`` : whether the latter is larger by .01: a flipped map. A map with nearly
-        mirrored sides cannot be told from its flip; the two correlations are then alike.
+    ``light.direction_error_deg`` : angle between the luminance-weighted mean directions; 90 if one
+        of the maps has none, as a uniform one.
+    ``light.yaw_error_deg`` : rotation of the recovered map about z, counter-clockwise from above,
+        in (-180, 180] and in steps of a column, at which the logarithms of luminance correlate
+        best. 0 for a map that is aligned, or whose rows are uniform.
+    ``light.yaw_correlation``, ``light.mirrored_correlation`` : correlation at that rotation, and at
+        the best rotation of the mirrored map (y to -y), both without the means of rows.
+    ``light.is_mirrored`` : whether the latter is larger by more than .01, as for a flipped map. A
+        map that is nearly mirror-symmetric cannot be told from its flip; the two correlations are
+        then nearly equal.
 
     Raises
     ------
@@ -174,7 +187,8 @@ def light_metrics(
     # In float64: a uniform map must stay uniform, or its rounding is what is correlated.
     channels = np.asarray(luminance(jnp.eye(3)), float)
     true_bright, fitted = truth @ channels, scaled @ channels
-    # A fit of maps that are turned against each other is wrong in a colour of its own; flux is not.
+    # A least-squares fit of maps that are rotated against each other has a wrong colour; flux has
+    # the right one.
     bright = (_ratio(mean(truth), mean(recovered)) * recovered) @ channels
     return {
         "light.scale": tuple(scale.tolist()),

@@ -34,7 +34,7 @@ _BACKGROUND_NORMAL = (0.0, 0.0, 1.0)
 
 
 def _inside(mask: Shaped[ArrayLike, "*size"]) -> Bool[Array, "*size"]:
-    """Booleans of a boolean or fractional mask."""
+    """Convert a boolean or fractional mask to booleans."""
     mask = jnp.asarray(mask)
     return mask if mask.dtype == jnp.bool_ else mask > MASK_THRESHOLD
 
@@ -61,7 +61,7 @@ def psnr_of_mse(error: Float[ArrayLike, ""]) -> Float[Array, ""]:
     """
     error = jnp.asarray(error)
     decibels = (-10.0 / jnp.log(jnp.asarray(10.0, error.dtype))) * safe_log(error)
-    # The floor would make an image of NaN the best of all.
+    # Without this the floor would give an image of NaN the highest PSNR.
     return jnp.where(jnp.isnan(error), error, decibels)
 
 
@@ -87,13 +87,13 @@ def ssim_masked(
 ) -> Float[Array, ""]:
     """Mean structural similarity over the windows that touch the mask; 1 for an empty mask.
 
-    Pixels outside the mask are black in both images, so that the background says nothing; the edge
-    of the mask, which is then equal in both, raises the figure of small objects. The windows are
-    those of `ssim`: 11 pixels wide and wholly inside the image.
+    Pixels outside the mask are black in both images, so that the background does not matter. The
+    edge of the mask is then equal in both images, which raises the value for small objects. The
+    windows are those of `ssim`: 11 pixels wide and wholly inside the image.
     """
     inside = _inside(mask)
-    # Windows without a pixel of the mask are equal and count exactly one, so the mean over the
-    # others follows from the mean over all of them.
+    # Windows without a pixel of the mask are equal in both images, with a similarity of exactly
+    # one. So the mean over the other windows follows from the mean over all.
     cut = [jnp.where(inside[..., None], jnp.asarray(x), 0.0) for x in (image, truth)]
     missing = [(0, max(0, WINDOW_SIZE - size)) for size in inside.shape]
     padded = jnp.pad(inside, missing, mode="edge").astype(jnp.float32)
@@ -120,20 +120,20 @@ def normal_mae_deg(
     full: bool = False,
     valid: Shaped[ArrayLike, "H W"] | None = None,
 ) -> Float[Array, ""]:
-    """Mean angle in degrees between two normal maps of any vector lengths.
+    """Mean angle in degrees between two normal maps, whose vectors may have any length.
 
-    Masked (the default), the mean runs over the pixels of the true ``mask``; a pixel without a
-    predicted normal (zero vector) counts 90 degrees, and an empty mask gives 0. With ``full`` the
-    mean runs over *all* pixels, background normals set to (0, 0, 1): the figure that public code
-    of the field prints, smaller by about the coverage of the object.
+    By default the mean is over the pixels of the true ``mask``. A pixel without a predicted normal
+    (zero vector) counts as 90 degrees, and an empty mask gives 0. With ``full`` the mean is over
+    *all* pixels, with (0, 0, 1) as normal of the background: this is the figure that public code
+    of the field prints. It is smaller, about by the share of the image that the object covers.
 
     Parameters
     ----------
     normals, truth : (H, W, 3) in the same frame.
     mask : (H, W) true mask.
-    predicted_mask : (H, W) where the prediction is an object, used by ``full``; ``mask`` if None.
-    full : average over all pixels.
-    valid : (H, W) pixels that count, the only ones that ``full`` averages over; None for all.
+    predicted_mask : (H, W) mask of the prediction, used with ``full``; None for ``mask``.
+    full : whether to average over all pixels.
+    valid : (H, W) pixels that count, used with ``full``, which averages over these; None for all.
     """
     inside = _inside(mask)
     predicted, true = (safe_normalize(jnp.asarray(x)) for x in (normals, truth))
@@ -159,8 +159,9 @@ def albedo_scale_least_squares(
 ) -> Float[Array, " 3"]:
     """Per-channel scale ``sum(pred gt) / sum(pred^2)`` that fits an albedo map to the truth.
 
-    Protocol `geosplatting`: both maps linear, on a black background, one scale a view; the caller
-    averages it over the test views. A channel that is black everywhere gets scale 1.
+    For protocols ``geosplatting`` and ``orb``: both maps are linear, on a black background. Each
+    view has its own scale, which the caller averages over the test views. A channel that is black
+    everywhere gets scale 1.
     """
     albedo, truth = (jnp.asarray(x).reshape(-1, 3) for x in (albedo, truth))
     return safe_divide(
@@ -175,8 +176,8 @@ def albedo_scale_median(
 ) -> Float[Array, " 3"]:
     """Per-channel median of ``truth / albedo`` over the masked pixels of one or of all views.
 
-    Protocols `tensoir` and `irgs`, in linear colour. Predictions below 1e-4 are raised to it, and
-    an empty mask gives scale 1.
+    For protocols ``tensoir`` and ``irgs``, in linear colour. Predictions below 1e-4 are raised to
+    1e-4, and an empty mask gives scale 1.
     """
     inside = _inside(mask)[..., None]
     albedo, truth = jnp.asarray(albedo), jnp.asarray(truth)

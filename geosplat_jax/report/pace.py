@@ -11,11 +11,11 @@ from geosplat_jax.io.poses import OnProgress
 Item = TypeVar("Item")
 
 _RECENT = 20
-"""Items that the pace is taken from."""
+"""Number of last items whose median time is taken as the pace."""
 
 
 def counted(items: Sequence[Item], part: str, on_progress: OnProgress | None) -> Iterator[Item]:
-    """Go through items and tell after each, and before the first, how many are done."""
+    """Iterate over items, and report before the first and after each how many are done."""
     for done, item in enumerate(items):
         if on_progress is not None:
             on_progress(part, done, len(items))
@@ -27,8 +27,8 @@ def counted(items: Sequence[Item], part: str, on_progress: OnProgress | None) ->
 class TimeLeft:
     """Estimates the time left of one part of the work.
 
-    The first item waits for the compilation of all; it says nothing about the others, and there is
-    no estimate before the second is done.
+    The first item includes the compilation and is left out, so that there is no estimate before the
+    second item is done.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class TimeLeft:
         self._seconds: list[float] = []
 
     def left(self, done: int, total: int) -> float | None:
-        """Note that ``done`` items are done; return the seconds left, None before it is known."""
+        """Record that ``done`` items are done; return the seconds left, None while unknown."""
         now = self._clock()
         fresh = done - self._done
         if fresh > 0:
@@ -59,7 +59,7 @@ class TimeLeft:
 
 
 def duration(seconds: float) -> str:
-    """Say a time as people do: ``40 s``, ``3 min``, ``1 h 20 min``."""
+    """Format a time in seconds: ``40 s``, ``3 min``, ``1 h 20 min``."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)

@@ -1,8 +1,8 @@
 """``report.html``: the results of one run, or of several, in one self-contained file.
 
-Made of files that training and evaluation left, with no computation of its own. Everything is
-embedded, the scripts in ``web/`` too; a policy in the page forbids the browser any access to the
-network. Texts are escaped by the template engine, so that no name of a scene, a view or a light is
+The page is made from the files of training and evaluation; nothing is computed anew. Everything is
+embedded, also the scripts in ``web/``, and a policy in the page forbids the browser any access to
+the network. The template engine escapes texts, so that no name of a scene, a view or a light is
 taken for markup.
 """
 
@@ -45,9 +45,9 @@ LARGEST_PAGE = 15_000_000
 _WEB = Path(__file__).parent / "web"
 _LONGEST_SIDE = 640
 _QUALITY = 90
-# Of what the scripts leave, the share for pictures; models have the rest.
+# Share of a run's bytes that pictures may take; the model may take the rest.
 _PICTURES_SHARE = 0.5
-# Room for texts, tables and curves of a run.
+# Bytes that are reserved for the texts, tables and curves of a run.
 _TEXT_BYTES = 250_000
 
 _HEADLINES = ("nvs.psnr", "nvs.ssim", "normal.mae_masked_deg", "albedo.psnr", "relight.mean.psnr")
@@ -55,7 +55,7 @@ _HEADLINES = ("nvs.psnr", "nvs.ssim", "normal.mae_masked_deg", "albedo.psnr", "r
 
 @dataclass
 class _Allowance:
-    """Bytes that may still be embedded; what was refused is counted."""
+    """Number of bytes that may still be embedded, and names of what did not fit."""
 
     left: int
     refused: list[str] = field(default_factory=list)
@@ -82,7 +82,7 @@ def _picture_bytes(path: Path) -> bytes:
 
 
 def _below(folder: Path, name: Any) -> Path | None:
-    """Find a file of the folder by the name in its metrics; nothing outside is ever read."""
+    """Return a file by its name in the metrics; None for anything outside of the folder."""
     if not isinstance(name, str):
         return None
     path = (folder / name).resolve()
@@ -91,12 +91,12 @@ def _below(folder: Path, name: Any) -> Path | None:
 
 @dataclass(frozen=True)
 class Evaluated:
-    """A run as a report sees it.
+    """A run, or the state at the end of one of its stages, whose results a report shows.
 
     Attributes
     ----------
-    folder : of the run.
-    results : folder of ``metrics.json``: that of the run, or of what a stage ended with.
+    folder : folder of the run.
+    results : folder of ``metrics.json``: that of the run, or that of the end of a stage.
     """
 
     folder: RunFolder
@@ -104,18 +104,18 @@ class Evaluated:
 
     @classmethod
     def of(cls, folder: RunFolder, *, stage: str | None = None) -> "Evaluated":
-        """Return the run as it is now, or as a stage ended."""
+        """Return the run as it is now, or at the end of a stage."""
         return cls(folder, folder.path if stage is None else folder.end_of(stage))
 
     def trained_steps(self) -> int:
-        """Count the steps of the last checkpoint; 0 of what a stage ended with, which stays."""
+        """Return the step of the last checkpoint; 0 for the end of a stage, which never changes."""
         if self.results != self.folder.path:
             return 0
         path = latest_checkpoint(self.folder.checkpoints)
         return 0 if path is None else read_step(path)
 
     def metrics(self) -> dict[str, Any]:
-        """Read what the evaluation found; empty where there was none.
+        """Read the metrics of the evaluation; an empty dict if there was none.
 
         Raises
         ------
@@ -161,7 +161,7 @@ def _views(gallery: Mapping[str, Any], run: Evaluated, allowance: _Allowance) ->
 
 
 def _model(gallery: Mapping[str, Any], run: Evaluated, allowance: _Allowance) -> dict | None:
-    """Embed the mesh and the lights that it is shown under."""
+    """Embed the mesh and the lights that it is shown under; None without a mesh that fits."""
     listed = gallery.get("model") or {}
     path = _below(run.results, listed.get("mesh"))
     if path is None:
@@ -247,7 +247,7 @@ def _figure_groups(
 
 
 def _names(runs: Sequence[Evaluated]) -> list[str]:
-    """Name each run by its folder, with as many folders above it as tell them apart."""
+    """Name each run by its folder, with as many parent folders as make the names distinct."""
     parts = [run.folder.path.resolve().parts for run in runs]
     for count in range(1, max(map(len, parts)) + 1):
         names = ["/".join(part[-count:]) for part in parts]
@@ -275,14 +275,14 @@ def _web(name: str) -> Markup:
 
 
 def report_html(runs: Sequence[Evaluated]) -> str:
-    """Compose the page.
+    """Return the page as HTML.
 
     Raises
     ------
     RunError
         If a folder holds no run, or a file in it is damaged.
     ValueError
-        If there is no run.
+        If there is no run, or there are too many for one page.
     """
     if not runs:
         raise ValueError("a report needs a run, got none")
@@ -319,7 +319,7 @@ def report_html(runs: Sequence[Evaluated]) -> str:
 
 
 def write_report(path: Path, runs: Sequence[Evaluated]) -> Path:
-    """Write the page, aside first; see `report_html`.
+    """Write the page atomically and return its path; see `report_html`.
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""Pictures for people: normals as colours, clay previews, and the overview sheet of a run.
+"""Pictures to look at: normals as colours, clay previews, and the overview sheet of a run.
 
-Pictures are display-referred float32 in [0, 1], (H, W, 3), ready for `io.images.write_png`.
+Pictures are sRGB float32 in [0, 1], (H, W, 3), as `io.images.write_png` takes them.
 """
 
 import math
@@ -20,8 +20,8 @@ _CELL_COLOR = (0.149, 0.153, 0.161)
 _TEXT_COLOR = (208, 210, 214)
 _FAINT_TEXT_COLOR = (134, 138, 146)
 _LARGEST_CELL = 800
-"""Pixels of a picture's longer side on a sheet, at most: sheets of photographs would be larger than
-programs open, and take gigabytes to make."""
+"""Most pixels of a picture's longer side on a sheet: sheets of full-size photographs would be too
+large for programs to open, and take gigabytes to make."""
 
 _GUTTER = 4
 _MARGIN = 16
@@ -48,7 +48,7 @@ _WHITE_PERCENTILE = 99.5
 
 @dataclass(frozen=True)
 class _Text:
-    """Words at a place of the sheet: (x, y) in pixels, and which point of the text lies there."""
+    """A text on the sheet: its words, position (x, y) in pixels, and Pillow's anchor."""
 
     words: str
     position: tuple[float | int, float | int]
@@ -58,7 +58,7 @@ class _Text:
 
 
 def _unit(vectors: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
-    """Scale to unit length; vectors of no length become zero."""
+    """Scale vectors to unit length; those shorter than 1e-8 become zero."""
     length = np.sqrt((vectors.astype(np.float32) ** 2).sum(-1, keepdims=True))
     has_length = length > _SMALLEST_LENGTH
     return np.where(has_length, vectors / np.where(has_length, length, 1.0), 0.0).astype(np.float32)
@@ -78,7 +78,7 @@ def _over_cell(
 def normals_to_rgb(
     normals: Float[np.ndarray, "H W 3"], alpha: Float[np.ndarray, "H W"] | None = None
 ) -> Float[np.ndarray, "H W 3"]:
-    """Show normals as colour, ``(n + 1) / 2``, over the dark of a cell.
+    """Show normals as colour, ``(n + 1) / 2``, over the dark colour of a cell.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def normals_to_rgb(
 def shade_mesh_preview(
     normals: Float[np.ndarray, "H W 3"], alpha: Float[np.ndarray, "H W"]
 ) -> Float[np.ndarray, "H W 3"]:
-    """Shade normals as clay: a key light, a headlight and a faint rim, over the dark of a cell.
+    """Shade normals as clay with a key light, a headlight and a faint rim, over a dark cell.
 
     Parameters
     ----------
@@ -112,9 +112,10 @@ def shade_mesh_preview(
 
 
 def tone_map_light(radiance: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
-    """Make linear radiance of any range displayable: log-average exposure, then a soft white.
+    """Tone map linear radiance of any range to sRGB: log-average exposure, then a soft white point.
 
-    Reinhard et al. 2002, Eq. 1 and 4, on the largest channel, so that hues stay. Black stays black.
+    Reinhard et al. 2002, Eq. 1 and 4, applied to the largest channel, so that hues are preserved.
+    Black stays black.
     """
     radiance = np.maximum(np.asarray(radiance, np.float32), 0.0)
     value = radiance.max(axis=-1, keepdims=True)
@@ -146,7 +147,7 @@ def _as_picture(image: np.ndarray, name: str) -> Float[np.ndarray, "H W 3"]:
 def _resized(
     picture: Float[np.ndarray, "H W 3"], height: int, width: int
 ) -> Float[np.ndarray, "h w 3"]:
-    """Resize a picture by area-aware bicubic filtering; nothing happens at its own size."""
+    """Resize a picture with Pillow's bicubic filter; one of that size is returned as it is."""
     if picture.shape[:2] == (height, width):
         return picture
     channels = [
@@ -177,7 +178,7 @@ def _write_texts(
 
 
 def _reduced(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "h w 3"]:
-    """Reduce a picture to the largest that a sheet shows."""
+    """Reduce a picture to at most `_LARGEST_CELL` pixels along its longer side."""
     size = picture.shape[:2]
     factor = _LARGEST_CELL / max(size)
     if factor >= 1.0:
@@ -186,7 +187,7 @@ def _reduced(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "h w 3"]:
 
 
 def _place(cell: Float[np.ndarray, "h w 3"], picture: Float[np.ndarray, "H W 3"]) -> None:
-    """Fit a picture into a view of the sheet, centred, keeping its proportions."""
+    """Draw a picture into a cell in place: as large as fits, centred, with its aspect ratio."""
     height, width = cell.shape[:2]
     factor = min(height / picture.shape[0], width / picture.shape[1])
     h, w = (max(1, round(factor * extent)) for extent in picture.shape[:2])
@@ -218,7 +219,7 @@ def _grid_of_cells(
 def _light_strip(
     light: Float[np.ndarray, "h w 3"], cell_height: int, cell_width: int, columns: int
 ) -> Float[np.ndarray, "H W 3"]:
-    """Tone map the light and make it as many whole columns wide as its height permits."""
+    """Tone map a light, and resize it to as many whole columns as its largest height allows."""
     aspect = light.shape[0] / light.shape[1]
     largest_height = _LIGHT_ROWS * (cell_height + _GUTTER) - _GUTTER
     widths = [n * (cell_width + _GUTTER) - _GUTTER for n in range(1, columns + 1)]
@@ -260,7 +261,7 @@ def _captions(
 
 
 class _Footer(NamedTuple):
-    """What stands below the views: pictures at (y, x), the height of it all, and its texts."""
+    """The part of the sheet below the views: pictures at (y, x), total height, and texts."""
 
     parts: list[tuple[int, int, np.ndarray]]
     height: int
@@ -276,7 +277,7 @@ def _footer(
 ) -> _Footer:
     """Place lights side by side, notes to their right, and the scales of colours below.
 
-    ``lights`` : tone mapped, with their titles. ``left, top`` : of the footer, in pixels.
+    ``lights`` : titles and tone-mapped lights. ``left, top`` : corner of the footer, pixels.
     """
     parts: list[tuple[int, int, np.ndarray]] = []
     texts, x, y = [], left, top
@@ -316,23 +317,23 @@ def overview_sheet(
     row_labels: Sequence[str] | None = None,
     notes: Sequence[str] = (),
 ) -> Float[np.ndarray, "H W 3"]:
-    """Compose labelled pictures into one sheet: a row a view, a column a name, lights below.
+    """Compose labelled pictures into one sheet, with a row per view and lights below the rows.
 
-    Columns are the names of all rows in order of first appearance; a picture that a row lacks
-    leaves its cell empty. Cells have the size of the first picture; others are fitted into it.
-    Pictures whose longer side has more than `_LARGEST_CELL` pixels are reduced.
-    Pixels of pictures that are narrower than the columns' names are repeated until those fit.
+    Columns are the titles in all rows, in order of first appearance; a cell whose row has no such
+    picture stays empty. Cells have the size of the first picture, and others are fitted into it.
+    Pictures whose longer side exceeds `_LARGEST_CELL` pixels are reduced. Pictures that are
+    narrower than a column's title are enlarged by repeating pixels.
 
     Parameters
     ----------
-    rows : one mapping a view, from the column's title to a picture: (H, W), (H, W, 1) or
-        (H, W, 3); display-referred floats in [0, 1] or 8-bit.
-    lights : lat-long maps of *linear* radiance by title, each tone mapped for itself into a strip
+    rows : one mapping per view, from the title of a column to a picture: (H, W), (H, W, 1) or
+        (H, W, 3); sRGB floats in [0, 1], or 8-bit.
+    lights : lat-long maps of *linear* radiance by title, each tone mapped separately, and drawn
         below the views.
-    scales : of the colours in the pictures, drawn below.
+    scales : colour scales of the pictures, drawn at the bottom.
     title : heading of the sheet.
-    row_labels : one text a row, to its left; it may have several lines.
-    notes : lines of text beside the lights, such as the figures of the run.
+    row_labels : one text per row, drawn to its left; it may have several lines.
+    notes : lines of text beside the lights, such as metrics of the run.
 
     Returns
     -------
@@ -365,7 +366,7 @@ def overview_sheet(
     texts += footer.texts
     placed = [(top, left, grid), *footer.parts]
     ends = [x + part.shape[1] for _, x, part in placed]
-    # Texts that stand at the left of their place may reach beyond the pictures.
+    # Left-aligned texts may extend beyond the pictures.
     ends += [
         int(text.position[0]) + _text_width(text.words, text.size)
         for text in texts

@@ -1,18 +1,18 @@
 """Metrics of the evaluation protocols (`protocols`), as pure functions on the host.
 
-Conventions. Maps are NumPy, V views of one size. Predicted *and* true maps are premultiplied by
-their coverage (predicted ``alpha``, true ``mask``), hence zero on the background; the truth of
-`io.views.Views` is straight and is multiplied by the mask first. Only ``image`` of
-`relight_metrics` is straight RGBA, as `Views.relight` holds it. Where coverage is partial, the
-straight colour is clipped to [0, 1], encoded, and then laid over the background: so do the public
-codes with the PNG files of the data sets, and so is truth and prediction treated here.
+Maps are NumPy arrays of V views of one size. Predicted *and* true maps are premultiplied by their
+coverage (predicted ``alpha``, true ``mask``), hence zero on the background; the ground truth of
+`io.views.Views` is straight, and the caller multiplies it by the mask. Only the ``image`` of
+`new_view_metrics` and `relight_metrics` is straight RGBA, as `Views` holds it. Where coverage is
+partial, the straight colour is clipped to [0, 1], encoded, and then composited over the background.
+Public code treats the PNG files of the data sets in this way; here truth and prediction are.
 
-Pixels that do not count (``valid``) have no part in any figure. Whoever calls has set them to zero
-in all maps, predicted and true; where ``valid`` is None, all count. SSIM is then the mean over the
-windows that touch a pixel that counts, the others being black in both images.
+Pixels that do not count (``valid``) are left out of all figures. The caller must set them to zero
+in all maps, predicted and true; if ``valid`` is None, all pixels count. Otherwise SSIM is the mean
+over the windows that touch a pixel that counts, with all others black in both images.
 
-Every ``*_masked`` figure compares the same pictures over the pixels of the true mask only; views
-without an object have no part in it. SSIM is always the mean over images.
+Figures ``*_masked`` compare the same pictures over the pixels of the true mask only; views without
+an object are left out of them. SSIM is always a mean over images.
 """
 
 from collections.abc import Iterable, Mapping
@@ -47,7 +47,7 @@ _MATERIALS = ("roughness", "metallic")
 
 
 def _require(shape: tuple[int, ...], **maps: np.ndarray | tuple[np.ndarray, int]) -> None:
-    """Check that maps have the (V, H, W) of alpha, then their channels, and finite values."""
+    """Check that maps have the shape (V, H, W) of alpha, their channels, and finite values."""
     for name, entry in maps.items():
         values, *channels = entry if isinstance(entry, tuple) else (entry,)
         wanted = (*shape, *channels)
@@ -89,16 +89,16 @@ def albedo_scale(
     truth: Float[np.ndarray, "..."],
     mask: Shaped[np.ndarray, "..."],
 ) -> Float[np.ndarray, " 3"]:
-    """Fit one factor a channel that takes the predicted albedo to the true one.
+    """Fit one factor per channel that takes the predicted albedo to the true one.
 
-    Albedo and light share a factor that no photograph can tell apart, so albedo is compared, and
-    relit, after this one is multiplied in.
+    Photographs determine the product of albedo and light, but not a factor between them. So albedo
+    is compared, and used for relighting, after multiplication by this factor.
 
     Parameters
     ----------
-    protocol : its ``albedo_scale`` and ``scale_views`` decide. ``least_squares`` fits the
-        premultiplied maps, which is on black; ``median`` takes the ratio of *straight* values over
-        the pixels of the mask where something was drawn.
+    protocol : protocol whose ``albedo_scale`` and ``scale_views`` are used. ``least_squares`` fits
+        premultiplied maps, that is on black; ``median`` takes the ratio of *straight* values over
+        the pixels of the mask that the prediction covers.
     albedo : (V, H, W, 3) linear, premultiplied by ``alpha``.
     alpha : (V, H, W) predicted coverage.
     truth : (V, H, W, 3) linear, premultiplied by ``mask``.
@@ -106,8 +106,8 @@ def albedo_scale(
 
     Returns
     -------
-    (3,) float64. Views without an object have no part in it; nor, for least squares, has a channel
-    of a view that was predicted black. A channel without any evidence gets 1.
+    (3,) float64. Views without an object are left out, and by least squares also each channel of a
+    view whose prediction is black. A channel for which nothing is left gets 1.
 
     Raises
     ------
@@ -130,7 +130,7 @@ def albedo_scale(
 def _mean_least_squares(
     albedo: np.ndarray, truth: np.ndarray, inside: Bool[np.ndarray, "K H W"]
 ) -> Float[np.ndarray, " 3"]:
-    """Average the scale of every view over the views that know it."""
+    """Average the scales of the views that have an object and a prediction, by channel."""
     scales = np.array(
         [albedo_scale_least_squares(a, t) for a, t in zip(albedo, truth, strict=True)]
     )
@@ -156,7 +156,7 @@ _mse, _ssim, _ssim_masked = jax.jit(mse), jax.jit(ssim), jax.jit(ssim_masked)
 
 
 def eroded(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Pixels of a mask whose 5 x 5 neighbours, as far as there are any, all belong to it."""
+    """Erode a mask by 5 x 5 pixels; pixels beyond the border of the image count as inside."""
     return binary_erosion(mask, np.ones((5, 5), bool), border_value=1)
 
 
@@ -167,11 +167,14 @@ def scaled_psnr(
     inside: Bool[np.ndarray, "H W"],
     counted: Bool[np.ndarray, "H W"],
 ) -> float:
-    """Measure one figure of Stanford-ORB on one image, in dB; see `ScaledRendition`.
+    """Compute one figure of Stanford-ORB for one image, in dB; see `ScaledRendition`.
 
     Parameters
     ----------
-    rgb, truth : linear. inside : eroded mask, not empty. counted : pixels that errors are means of.
+    figure : which figure.
+    rgb, truth : (H, W, 3) linear.
+    inside : (H, W) eroded mask, not empty.
+    counted : (H, W) pixels that errors are averaged over.
     """
     predicted = np.where(inside[..., None], rgb, 0.0).astype(float)
     true = np.maximum(np.where(inside[..., None], truth, 0.0).astype(float), 0.0)
@@ -198,7 +201,7 @@ def _compare_scaled(
     rendition: ScaledRendition,
     valid: np.ndarray | None,
 ) -> dict[str, float]:
-    """Means over the images that have an object after erosion; see `ScaledRendition`."""
+    """Average figures over the images whose eroded mask is not empty; see `ScaledRendition`."""
     found: dict[str, list[float]] = {figure.name: [] for figure in rendition.figures}
     known = np.ones(mask.shape, bool) if valid is None else valid > MASK_THRESHOLD
     for prediction, truth, covered, counted in zip(predictions, truths, mask, known, strict=True):
@@ -219,9 +222,10 @@ def _compare(
     is_pooled: bool,
     valid: np.ndarray | None,
 ) -> dict[str, float]:
-    """PSNR and SSIM, whole and masked, view by view, of linear images; or a rendition's figures.
+    """Compute PSNR and SSIM of linear images, whole and masked, or the figures of the rendition.
 
-    Predictions are premultiplied by ``alpha``, truths straight.
+    Predictions are premultiplied by ``alpha``, truths are straight. With ``is_pooled`` there is one
+    PSNR of the error over all images, otherwise the mean of the PSNR of each.
     """
     if isinstance(rendition, ScaledRendition):
         return _compare_scaled(predictions, truths, mask, rendition, valid)
@@ -281,21 +285,23 @@ def new_view_metrics(
     valid: Shaped[np.ndarray, "..."] | None = None,
     rendition: Rendition | ScaledRendition = NEW_VIEWS,
 ) -> dict[str, float]:
-    """Compare one view under the training light with its photograph, as `NEW_VIEWS` says.
+    """Compare one view under the training light with its photograph.
 
     Parameters
     ----------
     rgb : (H, W, 3) linear, exposed and tone mapped, premultiplied by ``alpha``; clipped here. For a
-        `ScaledRendition` not tone mapped: it measures what is brighter than white, too.
+        `ScaledRendition` it must not be tone mapped, since colours brighter than white are
+        compared too.
     alpha : (H, W) predicted coverage.
     image : (H, W, 4) photograph, linear, *straight* alpha, which is the mask.
     valid : (H, W) pixels that count, or None.
-    rendition : another one, whose figures are then returned.
+    rendition : how the images are compared.
 
     Returns
     -------
     ``nvs.psnr`` (dB) and ``nvs.ssim`` of the whole image; ``nvs.psnr_masked`` and
-    ``nvs.ssim_masked`` of the pixels of the mask, where it has any.
+    ``nvs.ssim_masked`` over the pixels of the mask, unless it is empty. For a
+    `ScaledRendition` its figures, such as ``nvs.psnr_h``, if the eroded mask is not empty.
 
     Raises
     ------
@@ -326,9 +332,9 @@ def albedo_metrics(
     Returns
     -------
     ``albedo.psnr`` (dB) and ``albedo.ssim`` of whole images, ``albedo.psnr_masked`` and
-    ``albedo.ssim_masked`` of the pixels of the mask. A pixel of the mask where nothing was drawn
-    shows the background, or black where the protocol cuts by the true mask. Of protocol ``orb``
-    only ``albedo.psnr``.
+    ``albedo.ssim_masked`` over the pixels of the mask. A pixel of the mask that the prediction does
+    not cover shows the background, or black in protocols that use the true mask as silhouette.
+    Protocol ``orb`` has ``albedo.psnr`` only.
 
     Raises
     ------
@@ -359,24 +365,25 @@ def material_metrics(
 ) -> dict[str, float]:
     """Mean squared errors of roughness and metallic; the same in all protocols.
 
-    Values are *mapped*: what the shading uses, roughness after its floor, and no raw output of a
+    Values are those that shading uses, such as roughness above its floor, and not raw outputs of a
     network. No scale is fitted.
 
     Parameters
     ----------
     materials : predicted (V, H, W) by ``roughness`` and ``metallic``, premultiplied by ``alpha``.
     alpha : (V, H, W) predicted coverage.
-    truth : (V, H, W) by either name or both, premultiplied by ``mask``; what is missing here is
-        left out of the metrics.
+    truth : true (V, H, W) by either name or both, premultiplied by ``mask``; a material that is
+        missing here is left out of the metrics.
     mask : (V, H, W) true coverage, fraction or boolean.
     valid : (V, H, W) pixels that count, or None.
 
     Returns
     -------
-    ``roughness.mse`` of straight values over the pixels of the mask, a pixel where nothing was
-    drawn counting as zero, and ``roughness.mse_full`` of premultiplied values over the whole
-    image, black behind both, which is smaller by about the object's share of it. Both are means
-    over the images, the first over those with an object. Likewise ``metallic``.
+    ``roughness.mse`` of straight values over the pixels of the mask, where a pixel that the
+    prediction does not cover counts as zero; the mean over the images with an object.
+    ``roughness.mse_full`` of premultiplied values over whole images, on black; the mean over all
+    images, smaller by about the share of the image that the object covers. Likewise
+    ``metallic.mse`` and ``metallic.mse_full``.
 
     Raises
     ------
@@ -415,17 +422,18 @@ def relight_metrics(
 
     Parameters
     ----------
-    protocol : its ``relight`` decides.
-    rgb : (V, H, W, 3) linear, premultiplied by ``alpha``, lit with the albedo times its
-        `albedo_scale`, at exposure 1; clipped here. For a `ScaledRendition` not tone mapped.
+    protocol : protocol whose ``relight`` is used.
+    rgb : (V, H, W, 3) linear, premultiplied by ``alpha``, rendered with the albedo times its
+        `albedo_scale` at exposure 1; clipped here. For a `ScaledRendition` it must not be tone
+        mapped.
     alpha : (V, H, W) predicted coverage.
     image : (V, H, W, 4) true image, linear, *straight* alpha, which is the mask.
     valid : (V, H, W) pixels that count, or None.
 
     Returns
     -------
-    ``psnr`` (dB) and ``ssim`` of whole images, ``psnr_masked`` and ``ssim_masked`` of the pixels
-    of the mask, all means over the images. Of protocol ``orb`` ``psnr_h`` and ``psnr_l``.
+    ``psnr`` (dB) and ``ssim`` of whole images, ``psnr_masked`` and ``ssim_masked`` over the pixels
+    of the mask, all means over the images. Protocol ``orb`` has ``psnr_h`` and ``psnr_l`` instead.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""The evaluation protocols of the field, as data; `protocol_metrics` measures by them.
+"""The evaluation protocols of the field, as data; `protocol_metrics` computes their metrics.
 
-Numbers of papers with different protocols are not comparable, so a protocol is named and is data:
-one row of a table a name (`PROTOCOL`).
+Numbers of papers with different protocols are not comparable. So every protocol has a name, and is
+a row of the table `PROTOCOL`.
 """
 
 from collections.abc import Mapping
@@ -14,16 +14,16 @@ from jaxtyping import Int
 
 @dataclass(frozen=True)
 class Rendition:
-    """How pictures are made of linear colour before they are compared.
+    """How linear colours become pictures before they are compared.
 
     Attributes
     ----------
     encoding : ``linear``, ``srgb`` or ``gamma22``, value^(1/2.2).
     background : grey behind the object, encoded.
-    silhouette : where the prediction lies over the background. ``alpha`` blends it by its own
-        alpha; ``solid`` shows it unblended where its alpha exceeds one half; ``mask`` blends it by
-        the true mask, so that what was drawn beside the object does not count. The truth is always
-        blended by its mask.
+    silhouette : how the prediction is composited over the background. ``alpha`` blends it by its
+        own alpha; ``solid`` shows it unblended where its alpha exceeds one half; ``mask`` blends it
+        by the true mask, so that predictions outside of the object do not count. The truth is
+        always blended by its mask.
     """
 
     encoding: Literal["linear", "srgb", "gamma22"]
@@ -37,10 +37,11 @@ class ScaledFigure:
 
     Attributes
     ----------
-    name : of the figure.
+    name : name of the figure.
     largest : linear values are clipped to [0, largest]; the peak of the PSNR is always one.
-    is_brightened : both images are multiplied first by what the sRGB curve brightens the truth.
-    is_encoded : compared in sRGB, after clipping.
+    is_brightened : whether both images are first multiplied by the factor by which the sRGB curve
+        raises the sum of the truth.
+    is_encoded : whether images are compared in sRGB, after clipping.
     """
 
     name: str
@@ -53,14 +54,15 @@ class ScaledFigure:
 class ScaledRendition:
     """How Stanford-ORB compares images: on the object alone, after a scale for each image.
 
-    The true mask is eroded by 5 x 5 pixels, and what is outside is black in both images. Each
+    The true mask is eroded by 5 x 5 pixels, and pixels outside are black in both images. Each
     channel of each image is scaled by least squares over the pixels inside. Errors are means over
-    *all* pixels, so that they are smaller by the object's share; an image counts at least as much
-    as the grey 0.5 inside the mask would. The benchmark's images are 512 x 512.
+    *all* pixels, and so smaller by the share of the image that the object covers. The PSNR of an
+    image is at least that of a uniform grey of 0.5 inside the mask. The benchmark's images have
+    512 x 512 pixels.
 
     Attributes
     ----------
-    figures : what is measured.
+    figures : figures that are computed.
     """
 
     figures: tuple[ScaledFigure, ...]
@@ -72,13 +74,13 @@ class Protocol:
 
     Attributes
     ----------
-    name : as in `PROTOCOLS`.
-    albedo_scale : ``least_squares`` a view, averaged over the views, or ``median`` of all pixels;
-        always a channel, in linear colour.
-    scale_views : number of views, spread evenly, that the scale is taken from; None for all.
+    name : one of `PROTOCOLS`.
+    albedo_scale : ``least_squares`` for each view, averaged over the views, or ``median`` of the
+        ratios of all pixels; always per channel, in linear colour.
+    scale_views : number of views, spread evenly, that the scale is fitted to; None for all.
     albedo, relight : renditions of albedo and of relit images.
-    albedo_is_pooled : one PSNR of the error over all images; otherwise, and for relit images
-        always, the mean of the PSNR of every image.
+    albedo_is_pooled : whether the PSNR of albedo is that of the error over all images; otherwise,
+        and for relit images always, it is the mean of the PSNR of every image.
     lpips_nets : networks of the perceptual distance; see `lpips_note`.
     new_views : rendition of new views besides `NEW_VIEWS`, or None.
     """
@@ -155,11 +157,11 @@ PROTOCOLS = tuple(PROTOCOL)
 
 
 def protocol(name: str) -> Protocol:
-    """Look a protocol up.
+    """Return the protocol of a name.
 
     Raises
     ------
-    ValueError : there is none of that name.
+    ValueError : there is no protocol of that name.
     """
     if name not in PROTOCOL:
         raise ValueError(f"there is no protocol {name!r}; choose one of {', '.join(PROTOCOLS)}")
@@ -176,9 +178,10 @@ def lpips_note(protocol: Protocol) -> str:
 
 
 def scale_views(protocol: Protocol, count: int) -> Int[np.ndarray, " K"]:
-    """Choose the views, of ``count``, that the albedo scale is taken from.
+    """Choose the views, among ``count``, that the albedo scale is fitted to.
 
-    Every ``count // scale_views``-th view from the first on; all where there are no more of them.
+    These are every ``count // scale_views``-th view from the first on, at most ``scale_views``; all
+    views if there are no more than that.
     """
     wanted = min(count, protocol.scale_views or count)
     return np.arange(wanted) * (count // max(wanted, 1))

@@ -1,4 +1,4 @@
-"""A trained run under another environment light: stills, a turntable, a turning light.
+"""A trained run under another environment light: stills, turntables and rotating lights.
 
 Host side, around `renderer.Renderer`.
 """
@@ -24,18 +24,18 @@ from geosplat_jax.report.shots import Images, Shot, about_z, orbit, require_fram
 from geosplat_jax.transport.environment import lookup, rotate_light, to_y_up_map
 
 LARGEST_LIGHT = 256
-"""Rows of an environment map for lighting; finer detail is averaged, since it is only noise to a
-few hundred samples."""
+"""Most rows of an environment map for lighting. Larger maps are averaged: with a few hundred
+samples, finer detail is only noise."""
 
 SMALLEST_MOVIE = 384
-"""Pixels along the longer side of movies, at least."""
+"""Least number of pixels along the longer side of movies."""
 
 BACKGROUNDS = ("light", "white", "black")
 
 _lookup = jax.jit(lookup)
 _rotate_light = jax.jit(rotate_light)
 _SUBSAMPLES = 4
-"""Directions along each side of a texel of a light that is turned about any axis."""
+"""Sample directions along each side of a texel, when a light is rotated about any axis."""
 
 
 def load_light(path: str | Path, *, largest: int = LARGEST_LIGHT) -> EnvLight:
@@ -51,7 +51,7 @@ def load_light(path: str | Path, *, largest: int = LARGEST_LIGHT) -> EnvLight:
         radiance.
     """
     stored = read_stored(path)
-    # A light is everywhere, whatever a fourth channel says.
+    # A light has no alpha: a fourth channel is ignored.
     pixels = linear_values(np.ascontiguousarray(stored[..., :3]), Path(path))
     if pixels.ndim != 3 or pixels.shape[-1] < 3 or pixels.shape[1] != 2 * pixels.shape[0]:
         raise SceneError(
@@ -88,7 +88,7 @@ def turned(light: EnvLight, angle: float) -> EnvLight:
 
 
 def _behind(camera: Camera, light: EnvLight) -> np.ndarray:
-    """Environment as a single camera sees it, (H, W, 3) linear."""
+    """Render the environment light as seen by a single camera, (H, W, 3) linear."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     inverse = np.linalg.inv(np.asarray(camera.intrinsics[0], np.float64))
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ inverse.T
@@ -100,7 +100,7 @@ def _behind(camera: Camera, light: EnvLight) -> np.ndarray:
 
 
 def picture(view: RenderedView, camera: Camera, light: EnvLight, background: str) -> np.ndarray:
-    """Lay a rendered view over its background; sRGB in [0, 1], (H, W, 3).
+    """Composite a rendered view over a background, one of `BACKGROUNDS`; sRGB in [0, 1], (H, W, 3).
 
     Raises
     ------
@@ -122,11 +122,11 @@ class RelightOptions:
 
     Attributes
     ----------
-    turntable : frames of a camera that goes round; 0 for none.
-    rotate_env : frames of a light that turns; 0 for none.
-    background : of the pictures in movies, one of `BACKGROUNDS`.
-    suffix : ``".mp4"`` or ``".gif"``; None for MP4 where an encoder is found.
-    frames_per_second : of movies.
+    turntable : number of frames of a movie whose camera circles the object; 0 for no such movie.
+    rotate_env : number of frames of a movie whose light rotates; 0 for no such movie.
+    background : background of stills and movies, one of `BACKGROUNDS`.
+    suffix : ``".mp4"`` or ``".gif"``; None for MP4 if there is an encoder, or else GIF.
+    frames_per_second : frame rate of movies.
     """
 
     turntable: int = 0
@@ -136,7 +136,7 @@ class RelightOptions:
     frames_per_second: float = 24.0
 
     def movie_suffix(self) -> str:
-        """Kind of movie that will be written."""
+        """Return the suffix of the movies that will be written."""
         if self.suffix is not None:
             return self.suffix
         return ".mp4" if has_encoder(".mp4") else ".gif"
@@ -147,7 +147,7 @@ class RelightOptions:
         Raises
         ------
         SceneError, MissingEncoderError : see `io.movies.check_movie`.
-        ValueError : for more frames than can be looked at.
+        ValueError : a number of frames is negative or above `shots.MOST_FRAMES`.
         """
         require_frames("a turntable", self.turntable)
         require_frames("a turn of the light", self.rotate_env)
@@ -156,7 +156,7 @@ class RelightOptions:
 
 
 def _for_movies(camera: Camera) -> Camera:
-    """Enlarge a small camera: dithering shows in small GIFs."""
+    """Raise the resolution of a small camera, because dithering is visible in small GIFs."""
     is_small = max(camera.height, camera.width) < SMALLEST_MOVIE
     return resized(camera, SMALLEST_MOVIE) if is_small else camera
 
@@ -171,16 +171,18 @@ def relight_views(
     *,
     on_progress: OnProgress | None = None,
 ) -> list[Path]:
-    """Write stills from every camera and the movies that were asked for; return the files.
+    """Write stills from every camera, and the movies that were asked for; return the files.
 
     Parameters
     ----------
-    relit : from `Renderer.relit` with ``light``.
-    shots : cameras; the movies start from the first one, and have at least
-        `SMALLEST_MOVIE` pixels along the longer side.
-    folder : existing; receives ``NAME_rgba.png`` with straight alpha, ``NAME.png`` over the
-        background, ``turntable`` and ``rotate_env``.
-    images : what else to write (default: nothing).
+    relit : renderer from `Renderer.relit` with ``light``.
+    light : the light, for backgrounds, and to rotate it.
+    shots : cameras. Movies start from the first one, and have at least `SMALLEST_MOVIE` pixels
+        along the longer side.
+    folder : existing folder, for ``NAME_rgba.png`` with straight alpha, ``NAME.png`` over the
+        background, and movies ``turntable`` and ``rotate_env``.
+    options : see `RelightOptions`.
+    images : further images of each still; None for none.
     on_progress : see `poses.OnProgress`.
 
     Raises
@@ -200,7 +202,7 @@ def relight_views(
     first = _for_movies(shots[0].camera)
     center = relit.center()
     if options.rotate_env:
-        relit.plan(first)  # once for the renderers of all frames
+        relit.plan(first)  # the renderers of all frames then share the sizes of buffers
 
     def on_turntable(angle: float) -> np.ndarray:
         camera = orbit(first, center, angle)

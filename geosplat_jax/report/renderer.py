@@ -1,7 +1,7 @@
 """Render trained parameters from any camera and under any light, on the host.
 
-Images average many samples: the light that arrives is gathered once per light, in several passes of
-a size that fits memory, and serves every view.
+Images average many samples. Incident light is computed once per light, in several passes that fit
+into the memory, and used for every view.
 """
 
 import copy
@@ -32,32 +32,32 @@ from geosplat_jax.transport.paths import PathSettings
 
 EVALUATION_AOVS = ("albedo", "roughness", "metallic", "normal")
 DEFAULT_SAMPLES = 128
-"""Rays per splat, over all passes, in images that people look at and metrics are made from."""
+"""Rays per splat, over all passes, in final images and for metrics."""
 
 LARGEST_SAMPLES = 1_000_000
-"""Rays per splat at most, over all passes."""
+"""Most rays per splat, over all passes."""
 
 _PASS_SAMPLES = 16
-"""Samples of each kind in a pass, at most."""
+"""Most samples of each kind in a pass."""
 
 _SPECULAR_PASSES = 4
-"""Passes that specular light is averaged over at most; each keeps its samples of the light."""
+"""Most passes that specular light is averaged over; the light samples of each stay in memory."""
 
 _SPECULAR_SAMPLES_PER_PIXEL = 128
-"""Samples of the specular lobe that are enough for a covered pixel, over its splats and passes."""
+"""Samples of the specular lobe that suffice for a covered pixel, over all its splats and passes."""
 
 _PIXEL_PASSES = 2
-"""Passes of an image whose points are pixels, to one of an image of splats, of which a pixel
-averages several."""
+"""Factor on the number of passes where pixels are shaded instead of splats: a pixel averages
+several splats, and so their samples."""
 
 _HEADROOM = 1.25
-"""Of the lists, over what the first view of a size needs, where they must grow."""
+"""Where buffers must grow: their size over what the first view of an image size needs."""
 
 RELIGHT_BOUNCES = 2
-"""How often light goes from surface to surface under a new light."""
+"""Number of bounces of light between surfaces under a new light."""
 
 RELIGHT_KINDS = ("traced", "paths", "none", "unshadowed")
-"""How blocked directions look under a new light: see `relight_transport`."""
+"""What blocked directions bring under a new light, see `relight_transport`."""
 
 _reconstruct = jax.jit(Pipeline.reconstruct)
 _illuminate = jax.jit(Pipeline.illuminate)
@@ -72,7 +72,7 @@ def _extract(pipeline: RenderPipeline, params: Params, *, final: bool) -> Surfac
 
 @jax.jit
 def _needs(pipeline: RenderPipeline, splats: Splats, camera: Camera) -> Usage:
-    """Count what the lists of a view need."""
+    """Count the entries that the buffers of a view need."""
     return pipeline.visible(splats, camera).usage
 
 
@@ -83,8 +83,8 @@ class RenderedView:
     Attributes
     ----------
     rgb : (H, W, 3) linear, exposed and tone mapped.
-    alpha : (H, W).
-    linear : (H, W, 3) exposed radiance, of any size: what is tone mapped.
+    alpha : (H, W) coverage in [0, 1].
+    linear : (H, W, 3) exposed radiance before tone mapping, without upper bound.
     aovs : albedo, roughness, metallic, normal, and those of `Renderer.with_aovs`; (H, W, c) each.
     """
 
@@ -95,7 +95,7 @@ class RenderedView:
 
 
 def build_asset(pipeline: Pipeline, params: Params) -> Asset:
-    """Run what depends on neither light nor view, growing buffers as needed."""
+    """Compute surface, splats and attributes, growing buffers as needed."""
     unlit = pipeline.unlit()
 
     def attempt(capacities: Capacities) -> tuple[Asset, Usage]:
@@ -106,11 +106,12 @@ def build_asset(pipeline: Pipeline, params: Params) -> Asset:
 
 
 def relight_transport(indirect: str = "traced") -> MonteCarloSettings | PathSettings:
-    """Return the light transport under a light that was never trained on.
+    """Return the light transport under a new light.
 
-    What was learned of indirect light does not hold there: blocked directions bring traced light,
-    light that paths bring by way of as many surfaces, or none. Unshadowed, only a splat's own face
-    blocks, as for those who do not trace rays.
+    Indirect light that was learned in training does not hold under a new light. By ``indirect``,
+    blocked directions bring instead light that is looked up at the face that is hit (``traced``),
+    light of paths with as many bounces (``paths``), or none (``none``). Without shadows
+    (``unshadowed``) no rays are traced, and a splat is only blocked by its own face.
 
     Raises
     ------
@@ -130,7 +131,7 @@ def relight_transport(indirect: str = "traced") -> MonteCarloSettings | PathSett
 
 
 def _passes_of(samples: int) -> tuple[int, int]:
-    """Return the number of passes for so many rays per splat, and of samples of each kind in one.
+    """Return the number of passes for a number of rays per splat, and samples per kind and pass.
 
     Raises
     ------
@@ -151,12 +152,12 @@ class Renderer:
     Parameters
     ----------
     pipeline, params : see `train.load_trained`.
-    samples : rays per splat for the diffuse light, half of them towards the light and half after
-        the cosine, where the transport traces any; rounded up to equal passes of at most 32, see
-        `samples`. The noise falls as the square root. The specular lobe, which every view
-        integrates anew, has half as many of its own, from four passes at most, and from fewer where
-        the splats of a pixel average it anyway.
-    seed : of the samples.
+    samples : rays per splat for diffuse light, for transports that sample: half of them follow the
+        light, half the cosine. The number is rounded up to equal passes of at most 32, see the
+        property `samples`; the noise falls as its square root. The specular lobe, which is
+        integrated anew for every view, has half as many samples, from at most four passes, or fewer
+        where a pixel averages enough splats.
+    seed : seed of the samples.
     """
 
     def __init__(
@@ -206,13 +207,18 @@ class Renderer:
     ) -> "Renderer":
         """Return a renderer of the same surface and materials under another light.
 
-        Always Monte Carlo, whatever the parameters were trained with, and at exposure 1.
+        The transport is Monte Carlo, whatever the run was trained with; the exposure is 1.
 
         Parameters
         ----------
-        light : in the layout of `EnvLight`, of any size.
-        albedo_scale : (3,) factors of the albedo, which photographs leave open.
-        indirect : one of `RELIGHT_KINDS`.
+        light : environment map of any size.
+        albedo_scale : (3,) factors of the albedo, which photographs do not determine.
+        indirect : one of `RELIGHT_KINDS`, see `relight_transport`.
+
+        Raises
+        ------
+        ValueError
+            If ``indirect`` is not one of `RELIGHT_KINDS`.
         """
         transport = relight_transport(indirect).build(LightSpec())  # keeps no table of a light
         other = Renderer(
@@ -249,13 +255,13 @@ class Renderer:
         return other
 
     def hurried(self) -> "Renderer":
-        """Return a renderer of a single pass: noisier, and made of the same programs."""
+        """Return a renderer of a single pass: noisier, with the same compiled programs."""
         other = self._copy()
         other._passes, other._illuminations = 1, []
         return other
 
     def _copy(self) -> "Renderer":
-        """Return a renderer like this one, which remembers apart for what it has planned."""
+        """Return a copy of this renderer, with its own set of planned image sizes."""
         other = copy.copy(self)
         other._planned = set(self._planned)
         return other
@@ -278,9 +284,9 @@ class Renderer:
         return self._asset
 
     def subject(self) -> Subject:
-        """Return what cameras are refined against: this asset under this light.
+        """Return the scene that cameras are refined against: this asset under this light.
 
-        Diffuse light is the mean of all passes, the specular lobe that of the first.
+        Diffuse light is the mean over all passes; the specular lobe has the samples of the first.
         """
         illumination = self._illuminated()[0]
         key = jax.random.fold_in(self._key, self._passes)
@@ -288,7 +294,11 @@ class Renderer:
         return Subject(self._pipeline, self.asset(), illumination, exposure, key)
 
     def _illuminated(self) -> list[Illumination]:
-        """Gather the light, once: the mean of all passes, with the light's samples of a few."""
+        """Compute incident light, once; one result for each pass of specular light.
+
+        All of them hold the mean of diffuse light over all passes, each the light samples of its
+        own pass.
+        """
         if self._illuminations:
             return self._illuminations
         passes = self._passes if self._pipeline.transport.needs_key else 1
@@ -305,9 +315,10 @@ class Renderer:
         return self._illuminations
 
     def plan(self, camera: Camera) -> None:
-        """Grow the lists for the first view of a size, before a larger program is compiled.
+        """Grow buffers for the first view of an image size, before the renderer is compiled.
 
-        Rendering does so by itself; renderers made `under` other lights afterwards need not.
+        Rendering does this itself. When it is called first, renderers that are made by `under`
+        afterwards share the result.
         """
         size, unlit = (camera.height, camera.width), self._pipeline.unlit()
         if size in self._planned:
@@ -332,7 +343,7 @@ class Renderer:
             output = _render_lit(
                 pipeline, self.asset(), illumination, camera, aov_names=self._aov_names, key=key
             )
-            # The surface's needs are those of an asset that is whole.
+            # The asset is complete, so that only needs of the view may exceed their buffers.
             names = set(output.usage) - set(self.asset().usage)
             return output, {name: output.usage[name] for name in names}
 
@@ -357,9 +368,9 @@ class Renderer:
         )
 
     def _passes_needed(self, output: RenderOutput) -> int:
-        """Count the passes after which a covered pixel has its samples of the specular lobe.
+        """Return the number of passes after which covered pixels have enough specular samples.
 
-        Pixels that are points themselves have samples of their own in every pass.
+        Where pixels are shaded instead of splats, each pass adds samples to every pixel.
         """
         if not self._pipeline.domain.shades_splats:
             return self._passes * _PIXEL_PASSES if self._pipeline.transport.needs_key else 1
@@ -374,9 +385,9 @@ class Renderer:
         return self._pipeline.surface.is_two_sided
 
     def mesh(self, *, training: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Extract the surface: vertices (n, 3), faces (m, 3) and vertex normals (n, 3).
+        """Extract the surface: vertices (n, 3) world, faces (m, 3) and vertex normals (n, 3).
 
-        ``training`` : the mesh that splats sit on, instead of the one that is exported.
+        ``training`` : return the mesh that splats lie on, instead of the one for export.
         """
         unlit = self._pipeline.unlit()
 
@@ -389,7 +400,7 @@ class Renderer:
 
 
 def trim_mesh(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Drop padding: vertices, faces and vertex normals on the host."""
+    """Return the vertices, faces and vertex normals of a mesh on the host, without padding."""
     normals = np.asarray(_vertex_normals(mesh))
     vertex_count, face_count = int(mesh.vertex_count), int(mesh.face_count)
     return (
@@ -400,7 +411,7 @@ def trim_mesh(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def to_picture(linear: np.ndarray) -> np.ndarray:
-    """Return sRGB in [0, 1] on the host."""
+    """Clip linear values to [0, 1] and encode them in sRGB, on the host."""
     return np.clip(encode_srgb(np.clip(linear, 0.0, 1.0)), 0.0, 1.0)
 
 

@@ -1,4 +1,4 @@
-"""Numbers as colours: errors, roughness, counts of views, each with the scale that explains it."""
+"""Colour scales for numbers: errors, roughness, counts of views."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 _GREY = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-# Black through purple, red and orange to pale yellow; each is lighter than the one before.
+# From black through purple, red and orange to pale yellow, with increasing lightness.
 _HEAT = (
     (0.00, 0.00, 0.02),
     (0.23, 0.06, 0.44),
@@ -15,25 +15,27 @@ _HEAT = (
     (0.99, 0.62, 0.43),
     (0.99, 0.99, 0.75),
 )
-# Red for none through yellow to blue: what few views saw stands out.
+# From red for none through yellow to blue, so that places which few views see stand out.
 _TRUST = ((0.70, 0.09, 0.17), (0.96, 0.60, 0.35), (0.99, 0.95, 0.70), (0.45, 0.72, 0.78))
 _TRUST = (*_TRUST, (0.15, 0.36, 0.60))
 
 DISTANCE_COLORS = _HEAT[::-1]
-"""Of depths: what is near is bright."""
+"""Colours of depths; near points are bright."""
 
 LARGEST_ERROR = 0.2
-"""Difference of sRGB values that the scale of errors ends at."""
+"""Upper end of the scale of errors, a difference of sRGB values."""
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Which colour a number gets.
+    """A colour scale: the map from numbers to colours.
 
     Attributes
     ----------
-    name : what is shown. low, high : ends of the scale; numbers beyond have the colours of the
-        ends. colors : at equal distances from low to high, sRGB in [0, 1]. unit : of the numbers.
+    name : name of the quantity.
+    low, high : ends of the scale; numbers beyond have the colours of the ends.
+    colors : colours at equal distances from low to high, sRGB in [0, 1].
+    unit : unit of the numbers, or a word after the upper end.
     """
 
     name: str
@@ -61,7 +63,7 @@ class Scale:
         return f"{self.low:g}", f"{self.high:g}{unit}"
 
     def described(self) -> dict[str, object]:
-        """Return what JSON and a style sheet need to draw the scale."""
+        """Return name, texts of the ends and hexadecimal colours, for JSON and a style sheet."""
         hexes = ["#" + "".join(f"{round(255 * c):02x}" for c in color) for color in self.colors]
         return {"name": self.name, "ends": self.ends, "colors": hexes}
 
@@ -75,8 +77,5 @@ SEEN = Scale("training views that see the place", 0.0, 16.0, _TRUST, "or more")
 def error_map(
     first: Float[np.ndarray, "H W 3"], second: Float[np.ndarray, "H W 3"]
 ) -> Float[np.ndarray, "H W 3"]:
-    """Show where two sRGB pictures differ: the mean over the channels of the absolute difference.
-
-    The scale is `ERROR`.
-    """
+    """Show the absolute difference of two sRGB pictures, mean over channels, on scale `ERROR`."""
     return ERROR.picture(np.abs(first - second).mean(axis=-1))

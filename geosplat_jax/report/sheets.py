@@ -24,7 +24,7 @@ from geosplat_jax.report.scales import ERROR, METALLIC, ROUGHNESS, SEEN, error_m
 from geosplat_jax.report.trust import Sightings
 
 SHEETS = ("overview.png", "materials.png", "relight.png")
-"""What an evaluation may write; the latter two where the scene has the truth of them."""
+"""Sheets that an evaluation may write; the last two need ground truth of the scene."""
 
 
 def _grey(values: np.ndarray) -> np.ndarray:
@@ -33,19 +33,20 @@ def _grey(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Shown:
-    """What is known of the views that are shown.
+    """Content of the sheets.
 
     Attributes
     ----------
     views : all test views.
-    psnr : of every view, dB.
-    rendered : by index, those that are shown.
-    mesh : vertices, faces and normals. is_two_sided : whether both sides of it are surface.
-    seen : by how many training views; None where that was not counted.
-    albedo_scale : (3,) factors that the albedo is aligned to the truth with.
-    relit : pictures by title under each light, for every view that is shown; empty without lights.
-    relit_figures : lines about them.
-    lights : linear radiance by title, the true one first where it is known.
+    psnr : PSNR of every test view, dB.
+    rendered : renders of the views that are shown, by index.
+    mesh : vertices, faces and normals.
+    is_two_sided : whether both sides of the mesh are surface.
+    seen : by how many training views each vertex is seen; None where that was not counted.
+    albedo_scale : (3,) factors that align the albedo with the truth.
+    relit : for every view that is shown, pictures by title under each light; empty without lights.
+    relit_figures : lines of text about the relit pictures.
+    lights : (H, W, 3) linear radiance by title, the true light first where it is known.
     """
 
     views: Views
@@ -60,9 +61,9 @@ class Shown:
     lights: Mapping[str, np.ndarray]
 
     def write(self, folder: Path) -> dict[str, Any]:
-        """Write the sheets, and every picture for itself; return what `write_gallery` does.
+        """Write the sheets, and every picture as a file; return the result of `write_gallery`.
 
-        Sheets of an earlier evaluation are removed, also those that are not made anew.
+        All sheets of an earlier evaluation are removed first.
         """
         overview, materials = self.overview_rows(), self.material_rows()
         for name in SHEETS:
@@ -87,12 +88,12 @@ class Shown:
 
     @property
     def _labels(self) -> list[str]:
-        """Name every view that is shown, with how well it was met."""
+        """Names of the views that are shown, each with its PSNR."""
         names = self.views.names
         return [f"{names[index]}\n{self.psnr[index]:.2f} dB" for index in self.rendered]
 
     def overview_rows(self) -> list[dict[str, np.ndarray]]:
-        """Make the pictures that need no truth but the photograph."""
+        """Return pictures by title for each view, without those that need true materials."""
         rows = []
         for index, view in self.rendered.items():
             truth = photograph_on_white(self.views.images[index])
@@ -115,7 +116,7 @@ class Shown:
         return rows
 
     def material_rows(self) -> list[dict[str, np.ndarray]]:
-        """Make pictures of attributes beside the truth, where there is some."""
+        """Return pictures of materials and normals beside their ground truth, where it exists."""
         rows = []
         for index, view in self.rendered.items():
             mask, row = self.views.images[index][..., 3:], {}
@@ -136,7 +137,7 @@ class Shown:
         return rows
 
     def _overview_sheet(self, rows: list[dict[str, np.ndarray]]) -> np.ndarray:
-        """Compose the sheet: a row a view, and the lights below."""
+        """Compose the overview sheet: a row for each view, and the lights below."""
         scales = [ERROR, ROUGHNESS, METALLIC]
         if self.seen is not None:
             scales.append(SEEN)
@@ -146,7 +147,7 @@ class Shown:
         )
 
     def _material_sheet(self, rows: list[dict[str, np.ndarray]]) -> np.ndarray:
-        """Compose the sheet of attributes beside the truth."""
+        """Compose the sheet of materials and normals beside their ground truth."""
         notes = []
         if "albedo" in self.views.truth:
             factors = zip("RGB", self.albedo_scale, strict=True)

@@ -19,29 +19,29 @@ from geosplat_jax.report.consistency import resized
 from geosplat_jax.report.renderer import RenderedView, straight_rgba, to_picture
 
 AOVS = ("albedo", "roughness", "metallic", "normal", "depth")
-"""Images beside the colour that can be written."""
+"""Names of further images that can be written beside the colour."""
 
 SPLITS = ("test", "train")
 
 LARGEST_SIZE = 8192
-"""Pixels along the longer side of an image, at most."""
+"""Most pixels along the longer side of an image."""
 
 MOST_FRAMES = 10_000
-"""Pictures on a way around the object, at most."""
+"""Most pictures of a turntable."""
 
 
 class Shot(NamedTuple):
-    """A camera of one view, and the stem of the files that are written of it."""
+    """The camera of one view, and the stem of its files."""
 
     name: str
     camera: Camera
 
 
 def _stems(names: Sequence[str]) -> list[str]:
-    """Turn names of views into names of files, no two of which share a file.
+    """Turn names of views into stems of files, such that no two views share a file.
 
-    Some file systems take small and capital letters for the same, and a view ``a`` has a file
-    ``a_normal.png``, which would be the picture of a view ``a_normal``.
+    Some file systems ignore case. And the file ``a_normal.png`` of a view ``a`` would be that of a
+    view ``a_normal``.
     """
     stems: list[str] = []
     taken: set[str] = set()
@@ -70,13 +70,13 @@ def shots_of(views: Views) -> list[Shot]:
 def read_shots(path: Path, like: Camera) -> list[Shot]:
     """Read cameras from a file like ``transforms.json``.
 
-    Poses are camera-to-world with OpenGL axes, in the world of the scene. Images are as large as
-    the file says (``w`` and ``h``), or as that of ``like`` where it does not.
+    Poses are camera-to-world with OpenGL axes, in the world of the scene. The size of images is
+    that of the file (``w`` and ``h``), or that of ``like`` if the file has none.
 
     Raises
     ------
     SceneError
-        If the file cannot be read, a pose or lens is unusable, or a lens is bent.
+        If the file cannot be read, a pose or lens is unusable, or a lens has distortion.
     """
     listed = read_transforms(path)
     shots = []
@@ -101,7 +101,7 @@ def about_z(angle: float) -> np.ndarray:
 
 
 def orbit(camera: Camera, center: np.ndarray, angle: float) -> Camera:
-    """Carry a single camera around the vertical axis through ``center`` (3,)."""
+    """Rotate a single camera about the vertical axis through ``center`` (3,), by radians."""
     turned = np.eye(4)
     turned[:3, :3] = about_z(angle)
     turned[:3, 3] = center - turned[:3, :3] @ center
@@ -110,7 +110,7 @@ def orbit(camera: Camera, center: np.ndarray, angle: float) -> Camera:
 
 
 def require_frames(what: str, count: int) -> None:
-    """Refuse a number of pictures that nobody can look at; ``what`` : that has them.
+    """Refuse a number of pictures outside of 0 to `MOST_FRAMES`; ``what`` names them.
 
     Raises
     ------
@@ -121,7 +121,7 @@ def require_frames(what: str, count: int) -> None:
 
 
 def with_field_of_view(camera: Camera, degrees: float) -> Camera:
-    """Change the horizontal field of view; pixels keep their shape, the axis its place."""
+    """Change the horizontal field of view; pixel aspect and principal point stay the same."""
     wanted = 0.5 * camera.width / math.tan(0.5 * math.radians(degrees))
     factor = wanted / float(camera.intrinsics[0, 0, 0])
     scale = np.array([[factor, factor, 1.0], [factor, factor, 1.0], [1.0, 1.0, 1.0]])
@@ -131,16 +131,16 @@ def with_field_of_view(camera: Camera, degrees: float) -> Camera:
 
 @dataclass(frozen=True)
 class Cameras:
-    """Which cameras to render from.
+    """Cameras to render from.
 
     Attributes
     ----------
-    views : ``test`` or ``train``; None for the test views, or those of the training without any.
-    file : cameras like those of a ``transforms.json``, instead of views.
-    turntable : so many cameras on a circle around the object, from the first of the others on;
-        0 for those themselves.
-    size : pixels along the longer side (default: those of the photographs).
-    field_of_view : horizontal, degrees (default: that of the photographs).
+    views : ``test`` or ``train``; None for the test views, or the training views if there are none.
+    file : file of cameras like ``transforms.json``, which are used instead of views; or None.
+    turntable : number of cameras on a circle around the object, through the first of the cameras
+        above, to use instead of these; 0 for the cameras themselves.
+    size : pixels along the longer side; None for those of the cameras.
+    field_of_view : horizontal field of view, degrees; None for those of the cameras.
     """
 
     views: str | None = "test"
@@ -150,7 +150,7 @@ class Cameras:
     field_of_view: float | None = None
 
     def check(self) -> None:
-        """Refuse what cannot be rendered.
+        """Refuse options that are out of range.
 
         Raises
         ------
@@ -168,7 +168,7 @@ class Cameras:
             )
 
     def shots(self, dataset: Dataset, center: np.ndarray) -> list[Shot]:
-        """List the cameras; ``center`` : (3,) of the object.
+        """Return the cameras; ``center`` is the (3,) centre of the object, world.
 
         Raises
         ------
@@ -210,7 +210,7 @@ class Cameras:
 
 @dataclass(frozen=True)
 class Images:
-    """What to write of each render.
+    """Files to write for each render.
 
     Attributes
     ----------
@@ -235,11 +235,11 @@ class Images:
     def write(self, folder: Path, name: str, view: RenderedView) -> list[Path]:
         """Write the images of a view; return the files.
 
-        ``NAME_rgba.png`` has straight alpha. PNG of AOVs: albedo in sRGB, roughness and metallic
-        as they are, unit normals as (n + 1) / 2, all with straight alpha. ``.exr`` are linear:
-        exposed radiance of any size, with alpha, as ``NAME_rgba.exr``, AOVs as straight values,
-        zero where nothing was hit. Normals are in world axes; depth, along the camera's axis in the
-        scene's unit, is written as EXR only.
+        ``NAME_rgba.png`` is sRGB. PNG files of AOVs hold albedo in sRGB, roughness and metallic as
+        linear values, and unit normals as (n + 1) / 2. All have straight alpha. EXR files are
+        linear: ``NAME_rgba.exr`` holds exposed radiance without upper bound, with alpha; those of
+        AOVs hold straight values, zero where alpha is zero. Normals are in world axes. Depth, along
+        the camera's axis in world units, is written as EXR only.
         """
         written = [folder / f"{name}_rgba.png"]
         write_png(written[0], straight_rgba(view))

@@ -1,4 +1,4 @@
-"""Which parts of a surface can be trusted: how many training views see each place of it."""
+"""Confidence in parts of a surface: the number of training views that see each vertex."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,13 +15,13 @@ from geosplat_jax.report.consistency import resized
 from geosplat_jax.report.scales import SEEN
 
 LARGEST_COUNT = 64
-"""Views that are asked, at most; spread evenly over all."""
+"""Most views that are checked; they are spread evenly over all."""
 
 _SIZE = 160
 """Pixels along the longer side of the depth buffers."""
 
 _SLACK = 0.02
-"""Share of the surface's extent that a place may lie behind the depth that its pixel sees."""
+"""Share of the surface's extent by which a visible vertex may lie behind the depth of its pixel."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,13 @@ class Sightings:
 
     Attributes
     ----------
-    vertices : (V, 3) world. faces : (F, 3).
-    counts : (V,) views that see a vertex: it is in the picture, in front of every other surface,
-        its normal looks to the camera unless both sides are surface, and its pixel counts.
-    asked : views that were asked. available : views of the training.
+    vertices : (V, 3) world.
+    faces : (F, 3) rows of the vertices.
+    counts : (V,) number of views that see a vertex. A view sees it if it lies inside the image, no
+        other surface hides it, its normal faces the camera or both sides are surface, and its pixel
+        counts.
+    asked : number of views that were checked.
+    available : number of training views.
     """
 
     vertices: Float[np.ndarray, "V 3"]
@@ -51,9 +54,9 @@ class Sightings:
         return sums.astype(np.float64)
 
     def shares(self) -> list[dict[str, float | str]]:
-        """Tell which share of the area how many views see: none, one or two, three to seven, more.
+        """Return the shares of the area seen by no view, 1 or 2, 3 to 7, and 8 or more views.
 
-        Of an empty surface there is nothing to tell.
+        The list is empty for an empty surface.
         """
         total = self._areas.sum()
         if total <= 0:
@@ -70,7 +73,7 @@ class Sightings:
         ]
 
     def described(self) -> dict[str, Any]:
-        """Return what ``metrics.json`` keeps."""
+        """Return the entry of ``metrics.json``."""
         return {"asked": self.asked, "available": self.available, "shares": self.shares()}
 
     def picture(self, camera: Camera) -> Float[np.ndarray, "H W 3"]:
@@ -97,7 +100,7 @@ def _sees(
     inverse_depth = weights.sum(axis=-1)
     hit = inverse_depth > 0
     depth = np.where(hit, 1.0 / np.where(hit, inverse_depth, 1.0), np.inf)
-    # The farthest of the pixels around: where the surface is steep, depth changes within a pixel.
+    # The largest depth in 3 x 3 pixels: on steep parts of a surface, depth varies within a pixel.
     depth = ndimage.maximum_filter(depth, size=3)
     pose = np.asarray(camera.world_to_camera[0], np.float64)
     pixels, points = project(vertices, pose, np.asarray(camera.intrinsics[0], np.float64))
@@ -126,10 +129,11 @@ def sightings(
 
     Parameters
     ----------
-    vertices, normals : (V, 3) in the world; faces : (F, 3).
-    views : of the training; of more than `LARGEST_COUNT`, so many are asked, and `Sightings` says
-        so.
-    is_two_sided : both sides of a face are surface, and either may be seen.
+    vertices, normals : (V, 3) world.
+    faces : (F, 3) rows of the vertices.
+    views : training views. Only `LARGEST_COUNT` are checked if there are more, which `Sightings`
+        records.
+    is_two_sided : whether both sides of a face are surface, either of which may be seen.
     """
     vertices, normals = np.asarray(vertices, np.float64), np.asarray(normals, np.float64)
     count = min(len(views), LARGEST_COUNT)

@@ -1,4 +1,4 @@
-"""What the viewer shows, and how good its next picture should be. No renderer, no server."""
+"""Views that the viewer shows, and the quality of the next picture. No renderer, no server."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from geosplat_jax.core.types import Camera
 
 AS_TRAINED = "as trained"
-"""Name of the light that was found."""
+"""Name of the recovered light."""
 
 MODES = ("render", "albedo", "roughness", "metallic", "normal", "depth")
 """What a picture can show."""
@@ -18,11 +18,12 @@ MODES = ("render", "albedo", "roughness", "metallic", "normal", "depth")
 
 @dataclass(frozen=True)
 class Level:
-    """How good a picture is.
+    """Quality of a picture.
 
     Attributes
     ----------
-    width, height : pixels. samples : rays per splat, see `Renderer`.
+    width, height : size of the picture in pixels.
+    samples : rays per splat, see `Renderer`.
     """
 
     width: int
@@ -31,23 +32,24 @@ class Level:
 
 
 LEVELS = (Level(192, 128, 4), Level(384, 256, 4), Level(768, 512, 64))
-"""From quick to good. Every size is a program of its own, so there are few, of one shape: pixels
-are stretched to the shape of the window."""
+"""Levels from fast to good. Every size is compiled separately, so there are few, of one aspect
+ratio: pictures are stretched to the window."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """What somebody wants to see.
+    """What the user wants to see: camera, mode and light.
 
     Attributes
     ----------
-    position : of the camera in the world.
+    position : position of the camera, world.
     rotation : quaternion (w, x, y, z) from OpenCV camera axes to the world.
-    field_of_view : vertical, radians.
+    field_of_view : vertical field of view, radians.
     aspect : width of the window over its height.
     mode : one of `MODES`.
-    light : name of a light; turn : degrees that it is turned by about the vertical axis,
-        counter-clockwise seen from above; intensity : factor of it.
+    light : name of the light.
+    turn : rotation of the light about the vertical axis, degrees, counter-clockwise from above.
+    intensity : factor on the light.
     background : one of `relight.BACKGROUNDS`.
     """
 
@@ -62,7 +64,7 @@ class Look:
     background: str = "white"
 
     def camera(self, level: Level) -> Camera:
-        """Return the camera, whose pixels have the shape that fills the window."""
+        """Return the camera at a level; its pixels are not square if the window is not 3 : 2."""
         w, x, y, z = self.rotation
         to_world = Rotation.from_quat((x, y, z, w)).as_matrix()
         pose = np.eye(4)
@@ -85,18 +87,18 @@ class Look:
 
 
 class Ladder:
-    """Chooses the level of the next picture: quick while things move, better when they rest.
+    """Chooses the level of the next picture: fast while the look changes, better when it does not.
 
-    The first picture of a look has the best level that took less than ``seconds`` when it was last
-    drawn. A look that stays climbs to the best level, one at a time; levels that are slower, or
-    that nobody has drawn yet, wait until it has stayed for ``rest``.
+    The first picture of a look has the best level that took at most ``seconds`` when it was last
+    drawn. While the look does not change, the level rises to the best, one at a time; levels that
+    are slower, or whose time is unknown, are only drawn after ``rest`` seconds without a change.
 
     Parameters
     ----------
-    levels : from quick to good.
-    seconds : that a picture may take while things move.
+    levels : levels from fast to good.
+    seconds : longest time of a picture while the look changes.
     rest : seconds without a change after which slow pictures are drawn.
-    clock : seconds, monotonic.
+    clock : function that returns monotonic seconds.
     """
 
     def __init__(
@@ -134,7 +136,7 @@ class Ladder:
         return self._levels[self._next]
 
     def note(self, level: Level, seconds: float) -> None:
-        """Learn what a picture took; the first one of a level also waited for its compilation."""
+        """Record the time of a picture; the first of a level is ignored, as it was compiled."""
         number = self._levels.index(level)
         if self._has_compiled[number]:
             self._paces[number] = seconds
@@ -142,5 +144,5 @@ class Ladder:
         self._next = number + 1
 
     def forget(self) -> None:
-        """Draw the same look anew, since what is looked at has changed."""
+        """Let the same look be drawn again, because the run has changed."""
         self._look = None

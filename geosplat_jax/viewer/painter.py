@@ -26,21 +26,23 @@ from geosplat_jax.viewer.looks import AS_TRAINED, LEVELS, Ladder, Level, Look
 from geosplat_jax.viewer.source import CheckpointWatch, same_size
 
 _GREY = 0.2
-"""What is behind pictures that do not show colour, sRGB."""
+"""Grey background, in sRGB, of pictures that do not show colour."""
 
 _BEHIND_EVERYTHING = 150.0
-"""Depth where nothing is, below the largest that a browser is sent (167)."""
+"""Depth of the background; the largest that can be sent to a browser is 167."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """What a browser shows.
+    """A picture for a browser.
 
     Attributes
     ----------
     rgb : (H, W, 3) sRGB, bytes.
-    depth : (H, W) along the camera's axis, scene units; large where nothing is.
-    level : how good it is. step : of the training. seconds : that it took.
+    depth : (H, W) depth along the camera's axis, world units; large on the background.
+    level : quality of the picture.
+    step : training step of the parameters.
+    seconds : time that drawing took.
     """
 
     rgb: UInt8[np.ndarray, "H W 3"]
@@ -52,12 +54,14 @@ class Picture:
 
 @dataclass(frozen=True)
 class Gaussians:
-    """Splats as other viewers draw them.
+    """Splats in the form that viser draws.
 
     Attributes
     ----------
-    means : (N, 3). covariances : (N, 3, 3). colors : (N, 3) albedo in sRGB, [0, 1].
-    opacities : (N, 1).
+    means : (N, 3) world.
+    covariances : (N, 3, 3) world.
+    colors : (N, 3) albedo in sRGB, [0, 1].
+    opacities : (N, 1) in [0, 1].
     """
 
     means: Float[np.ndarray, "N 3"]
@@ -67,15 +71,15 @@ class Gaussians:
 
 
 class Painter:
-    """Draws looks at the parameters of one checkpoint.
+    """Draws pictures of the parameters of one checkpoint.
 
-    The light that was found is shown as it was trained, with exposure and what was learned of
-    indirect light; turned, it is a new light like any other, and its blocked directions are traced.
+    The recovered light is shown as in training, with exposure and learned indirect light. When it
+    is rotated or scaled, it is treated like any new light: indirect light is traced.
 
     Parameters
     ----------
     trained : parameters of a run.
-    lights : by name; all of one size, see `source.same_size`.
+    lights : environment maps by name, all of one size, see `source.same_size`.
     """
 
     def __init__(self, trained: Trained, lights: Mapping[str, EnvLight]) -> None:
@@ -92,7 +96,7 @@ class Painter:
         return EnvLight(light.radiance * look.intensity)
 
     def _renderer(self, look: Look, samples: int) -> Renderer:
-        """Return a renderer with the light of a look; the last ones are kept."""
+        """Return a renderer with the light of a look; the last one of each kind is cached."""
         key = look.light, look.turn, look.intensity
         is_found = key == (AS_TRAINED, 0.0, 1.0)
         last = self._prepared.get((samples, is_found))
@@ -111,12 +115,12 @@ class Painter:
         return renderer
 
     def paint(self, look: Look, level: Level) -> Picture:
-        """Draw a look.
+        """Draw the picture of a look at a level.
 
         Raises
         ------
         KeyError
-            If there is no such light.
+            If there is no light of the name in the look.
         """
         began = time.perf_counter()
         camera = look.camera(level)
@@ -135,7 +139,7 @@ class Painter:
         )
 
     def _aov(self, look: Look, view: RenderedView) -> np.ndarray:
-        """Show what is not colour, over grey."""
+        """Return the picture of an AOV over grey, sRGB."""
         if look.mode == "normal":
             return normals_to_rgb(view.aovs["normal"], view.alpha)
         alpha = np.clip(view.alpha, 0.0, 1.0)[..., None]
@@ -148,7 +152,7 @@ class Painter:
         return np.broadcast_to(over_grey, (*view.alpha.shape, 3))
 
     def _depth_scale(self, look: Look) -> Scale:
-        """Return the scale of distances over the box around the object."""
+        """Return a scale of depth from the near to the far end of the box around the object."""
         box = self.trained.pipeline.surface.box
         reach = math.sqrt(3.0) * float(box.half_extent)
         far = float(np.linalg.norm(np.asarray(box.center) - np.asarray(look.position)))
@@ -180,12 +184,14 @@ class Painter:
 
 
 class Viewer:
-    """Pictures of a run for several people, and of a newer checkpoint when there is one.
+    """Draws pictures of a run for several users, always of the newest checkpoint.
 
     Parameters
     ----------
-    watch : reads the run. lights : by name; all of one size.
-    levels : from quick to good. clock : seconds, monotonic.
+    watch : reader of the run.
+    lights : environment maps by name, all of one size.
+    levels : levels from fast to good.
+    clock : function that returns monotonic seconds.
     """
 
     def __init__(
@@ -205,11 +211,11 @@ class Viewer:
 
     @property
     def lights(self) -> tuple[str, ...]:
-        """Names of the lights, that which was found first."""
+        """Names of the lights, the recovered one first."""
         return (AS_TRAINED, *self._given)
 
     def refresh(self) -> bool:
-        """Take over a newer checkpoint; tell whether there was one."""
+        """Read a newer checkpoint if there is one; return whether there was."""
         trained = self._watch.newer()
         if trained is None:
             return False
@@ -219,7 +225,7 @@ class Viewer:
         return True
 
     def draw(self, person: int, look: Look) -> Picture | None:
-        """Draw what is due for somebody; None where the last picture is as good as it gets."""
+        """Draw the next picture for a user; None if there is nothing to draw at present."""
         if person not in self._ladders:
             self._ladders[person] = Ladder(self._levels, clock=self._clock)
         ladder = self._ladders[person]
@@ -231,5 +237,5 @@ class Viewer:
         return drawn
 
     def leave(self, person: int) -> None:
-        """Forget somebody."""
+        """Forget a user who has disconnected."""
         self._ladders.pop(person, None)

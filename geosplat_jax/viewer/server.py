@@ -20,17 +20,17 @@ DEFAULT_PORT = 8080
 
 _LOCAL = "127.0.0.1"
 _RISE = 0.35
-"""Height of the first camera above the middle of the object, per distance from it."""
+"""Wanted height of the first camera above the middle of the object, per distance from it."""
 _PHOTOGRAPH = 160
-"""Pixels of the longer side of the photographs on frustums, about."""
+"""Approximate longer side of the photographs on camera frustums, pixels."""
 
 _REFRESH = 2.0
-"""Seconds between two looks for a newer checkpoint."""
+"""Seconds between two checks for a newer checkpoint."""
 
 _PAUSE = 0.02
-"""Seconds to wait where nothing is to be drawn."""
+"""Seconds to wait if there is nothing to draw."""
 
-# From glTF's axes, y up, to the scene's, z up: a quarter turn about x.
+# Quaternion (w, x, y, z) from glTF's axes, y up, to those of the scene, z up: 90 degrees about x.
 _UPRIGHT = (2**-0.5, 2**-0.5, 0.0, 0.0)
 
 
@@ -39,18 +39,18 @@ class ViewerError(ValueError):
 
 
 def viser_library() -> Any:
-    """Return the library that talks to the browser.
+    """Return the module viser, which serves the browser.
 
     Raises
     ------
     ViewerError
-        If it is not installed.
+        If viser is not installed.
     """
     return optional_package("viser", "the viewer", extra="view", error=ViewerError)
 
 
 def require_free_port(port: int, host: str = _LOCAL) -> None:
-    """Refuse a port that cannot be listened on.
+    """Refuse a port that is out of range, or that this process cannot listen on.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def require_free_port(port: int, host: str = _LOCAL) -> None:
 
 
 class _Person:
-    """Somebody with a browser: the camera, and what the controls say."""
+    """A connected browser: its camera, and its controls."""
 
     def __init__(self, client: Any, lights: tuple[str, ...]) -> None:
         self._client = client
@@ -82,7 +82,7 @@ class _Person:
         self._status = gui.add_markdown("the first pictures wait for a compilation")
 
     def look(self) -> Look | None:
-        """Return what is to be seen; None before the window has a size."""
+        """Return the look that the controls ask for; None before the window has a size."""
         camera = self._client.camera
         if not camera.image_height or not camera.image_width:
             return None
@@ -100,7 +100,7 @@ class _Person:
         )
 
     def show(self, viewer: Viewer) -> bool:
-        """Show the next picture that is due; tell whether there was one."""
+        """Draw and show the next picture; return whether there was one to draw."""
         look = self.look()
         drawn = None if look is None else viewer.draw(self._client.client_id, look)
         if drawn is None:
@@ -117,9 +117,9 @@ class _Person:
 
 
 class _Things:
-    """What is in the scene beside the pictures: the mesh, the Gaussians, the photographs.
+    """Objects in the scene beside the pictures: mesh, Gaussians and photographs.
 
-    Mesh and Gaussians are sent when they are first asked for, and again after a newer checkpoint.
+    Mesh and Gaussians are sent when they are switched on, and again after a newer checkpoint.
     """
 
     def __init__(self, server: Any, viewer: Viewer, views: Views | None) -> None:
@@ -165,7 +165,7 @@ class _Things:
             frustum.visible = bool(self._cameras.value)
 
     def update(self) -> None:
-        """Send what was asked for, take away what was not."""
+        """Send objects that were switched on, and remove those that were switched off."""
         for name, box in self._boxes.items():
             if box.value and name not in self._sent:
                 self._sent[name] = self._send(name)
@@ -173,7 +173,7 @@ class _Things:
                 self._remove(name)
 
     def renew(self) -> None:
-        """Send everything again, since the run has a newer checkpoint."""
+        """Remove objects of an older checkpoint, so that `update` sends them again."""
         for name in tuple(self._sent):
             self._remove(name)
 
@@ -198,7 +198,7 @@ class _Things:
 
 
 def _to_camera(pose: np.ndarray, field_of_view: float, name: str) -> Callable[[Any], None]:
-    """Make what a click on a photograph does: take its camera."""
+    """Return the function that a click on a photograph calls: it moves the view to its camera."""
 
     def go(event: Any) -> None:
         client = event.client
@@ -214,12 +214,13 @@ def _to_camera(pose: np.ndarray, field_of_view: float, name: str) -> Callable[[A
 
 
 class ViewerServer:
-    """A viewer that browsers on this machine can open, whatever page they show.
+    """A server of the viewer for browsers on this machine; any page in them can connect to it.
 
     Parameters
     ----------
-    viewer : what is shown. views : photographs to show with their cameras; None for none.
-    port : to listen on, of this machine alone.
+    viewer : draws the pictures.
+    views : photographs to show with their cameras; None for none.
+    port : port to listen on, on this machine only.
 
     Raises
     ------
@@ -242,7 +243,7 @@ class ViewerServer:
         self._refreshed = time.perf_counter()
 
     def _look_at_the_object(self, views: Views | None) -> None:
-        """Start at the photograph that looks down a little, or beside the object."""
+        """Start at the camera that looks down a little; without views, beside the object."""
         box = self._viewer.painter.trained.pipeline.surface.box
         center, start = np.asarray(box.center, np.float64), self._server.initial_camera
         if views is None:
@@ -264,7 +265,7 @@ class ViewerServer:
         self._viewer.leave(client.client_id)
 
     def work(self) -> bool:
-        """Do what is due for everybody; tell whether there was anything."""
+        """Do one round of work for all users; return whether there was anything to do."""
         worked = False
         now = time.perf_counter()
         if now - self._refreshed > _REFRESH:

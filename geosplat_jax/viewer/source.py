@@ -1,4 +1,4 @@
-"""The viewer's run and lights: checkpoints, read again as they appear, and light files."""
+"""The run and the lights of a viewer: newer checkpoints as they appear, and environment maps."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -15,7 +15,7 @@ from geosplat_jax.report.light_metrics import resize_light
 from geosplat_jax.report.relight import load_light
 
 LIGHT_ROWS = 128
-"""Rows of all lights in a viewer: programs depend on the size."""
+"""Rows of all lights in a viewer: with one size, programs are compiled once."""
 
 _LIGHT_SUFFIXES = (".hdr", ".exr")
 
@@ -25,7 +25,7 @@ class CheckpointWatch:
 
     Parameters
     ----------
-    folder : of the run.
+    folder : folder of the run.
     """
 
     def __init__(self, folder: RunFolder) -> None:
@@ -33,7 +33,7 @@ class CheckpointWatch:
         self._seen: tuple[tuple[str, int], ...] | None = None
 
     def _listed(self) -> tuple[tuple[str, int], ...]:
-        """Name the checkpoints and when they were written."""
+        """Return the names of the checkpoints, and the times when they were written."""
         files = []
         for path in sorted(self._folder.checkpoints.glob("*.npz")):
             try:
@@ -43,14 +43,15 @@ class CheckpointWatch:
         return tuple(files)
 
     def newer(self) -> Trained | None:
-        """Return the last checkpoint if it was not returned before.
+        """Return the parameters of the last checkpoint if they are new, otherwise None.
 
-        A folder that is being written, or replaced, is looked at again in the next call.
+        None as well if reading fails because the folder is being written; the next call tries
+        again.
 
         Raises
         ------
-        TrainingError, RunError, CheckpointError
-            If there has been none yet, and none can be read.
+        TrainingError, RunError, CheckpointError, OSError
+            If the first call cannot read a checkpoint.
         """
         listed = self._listed()
         if listed == self._seen:
@@ -72,7 +73,7 @@ def same_size(light: EnvLight) -> EnvLight:
 
 
 def light_files(paths: Iterable[Path]) -> list[Path]:
-    """List environment maps: files as they are, and the HDR and EXR of folders.
+    """List environment maps: the given files, and the HDR and EXR files in the given folders.
 
     Raises
     ------
@@ -96,12 +97,13 @@ def load_lights(files: Iterable[Path], known: Mapping[str, Path]) -> dict[str, E
 
     Parameters
     ----------
-    files : maps, named after their files. known : others by name, such as those of a scene.
+    files : maps that are named after their files.
+    known : further maps by name, such as those of a scene.
 
     Raises
     ------
     SceneError
-        If two files have one name, or see `load_light`.
+        If two files have the same name, or a map cannot be read, see `load_light`.
     """
     paths: dict[str, Path] = {}
     for path in files:

@@ -10,8 +10,9 @@
 
     smallest depth, step of depth, ...
 
-Principal points are taken as they are. Images that end in ``_masked`` are left alone: their
-background is black, but black is no mask. Masks lie in ``masks/`` (`frames.beside_images`).
+Principal points are used as they are. Images whose names end in ``_masked`` are not read: their
+background is painted black, which is not a mask. Masks lie in ``masks/``
+(`frames.beside_images`).
 """
 
 from pathlib import Path
@@ -38,7 +39,7 @@ _MASKED = "_masked"
 
 
 def is_blended_mvs(root: Path) -> bool:
-    """Whether there are text files of cameras."""
+    """Whether there are camera files ``cams/*_cam.txt``."""
     return any((root / CAMERA_FOLDER).glob("*_cam.txt"))
 
 
@@ -48,7 +49,7 @@ def list_blended_mvs(root: Path, *, light: str | None = None) -> Listing:
     Raises
     ------
     MissingFileError : there are no images, or one has no camera.
-    SceneError : a camera's file is damaged; a light is asked for.
+    SceneError : all images are masked ones; a camera's file is damaged; a light is asked for.
     """
     require_no_light(light)
     images = [path for path in images_in(root, _IMAGE_FOLDERS) if not path.stem.endswith(_MASKED)]

@@ -1,9 +1,10 @@
 """COLMAP: photographs and a sparse model, ``cameras`` and ``images`` as ``.bin`` or ``.txt``.
 
-Photographs lie in ``images/``, or without it in the folder itself; the model in ``sparse/0``,
-``sparse`` or ``colmap/sparse/0``. Where both kinds of files are there, the binary one is read.
-Points are read for splats of their own only (`read_points`). ``x_camera = R(q) x + t`` with OpenCV
-axes, quaternions (w, x, y, z), pixel centres at + 0.5, binary numbers in little-endian order.
+Photographs lie in ``images/`` or, if there is no such folder, in the scene folder itself. The model
+lies in ``sparse/0``, ``sparse`` or ``colmap/sparse/0``; binary files are preferred to text files.
+Points of the model are read by `read_points` only, for splats that start from them.
+``x_camera = R(q) x + t`` with OpenCV axes, quaternions (w, x, y, z), pixel centres at + 0.5; binary
+numbers are little-endian.
 """
 
 import struct
@@ -33,12 +34,12 @@ from geosplat_jax.io.lenses import PinholeLens, checked_length
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 IMAGE_FOLDER = "images"
 
-_POINT_BYTES = 24  # x, y and the number of the point of each feature
-_OBSERVATION_BYTES = 8  # the number of an image and of its feature
+_POINT_BYTES = 24  # per feature of an image: x, y, and the number of its point
+_OBSERVATION_BYTES = 8  # per observation of a point: the numbers of an image and of its feature
 
 
 class _Model(NamedTuple):
-    """A camera model: its name, and how many numbers describe it."""
+    """A camera model: its name, and its number of parameters."""
 
     name: str
     numbers: int
@@ -64,7 +65,7 @@ _BY_NAME = {model.name: model for model in _MODELS.values()}
 
 
 class _Image(NamedTuple):
-    """A registered image."""
+    """A registered image: its number, world-to-camera pose, number of its camera, and file name."""
 
     number: int
     quaternion: tuple[float, ...]
@@ -74,12 +75,12 @@ class _Image(NamedTuple):
 
 
 def is_colmap(root: Path) -> bool:
-    """Whether there is a sparse model."""
+    """Whether the folder has a sparse model in one of `MODEL_FOLDERS`."""
     return _model_folder(root) is not None
 
 
 def image_folder(root: Path) -> Path:
-    """Return where photographs lie: in ``images/``, or without it in the folder itself."""
+    """Return the folder of the photographs: ``images/`` if it exists, else the scene folder."""
     return root / IMAGE_FOLDER if (root / IMAGE_FOLDER).is_dir() else root
 
 
@@ -88,8 +89,9 @@ def list_colmap(root: Path, *, light: str | None = None) -> Listing:
 
     Raises
     ------
-    MissingFileError : half of the model, or a registered image, is not there.
-    SceneError : the model is damaged, or a camera of a kind that is not read; a light is asked for.
+    MissingFileError : a file of the model, or a registered image, does not exist.
+    SceneError : the model is damaged or empty, or has a camera model that is not supported; a light
+        is asked for.
     """
     require_no_light(light)
     folder = _model_folder(root)
@@ -121,7 +123,7 @@ class Points(NamedTuple):
 
 
 def read_points(root: Path) -> Points | None:
-    """Read the points of a sparse model; None where there is no model, or none of its points.
+    """Read the points of a sparse model; None where there is no model, or no file of its points.
 
     Raises
     ------
@@ -149,7 +151,7 @@ def _model_folder(root: Path) -> Path | None:
 
 
 def _distinct(pairs, where: Path) -> dict:
-    """Collect by number; `SceneError` where one is given twice."""
+    """Collect numbered values in a dictionary; `SceneError` where a number occurs twice."""
     found = {}
     for number, value in pairs:
         if number in found:
@@ -171,7 +173,7 @@ def _frame(root: Path, image: _Image, lenses: Mapping[int, PinholeLens], where: 
 
 
 def _lens(model: _Model, width: int, height: int, numbers: tuple[float, ...], what: str):
-    """Return the lens of a camera, its numbers checked."""
+    """Check the parameters of a camera, and return its lens."""
     if model.name in _UNREAD:
         raise SceneError(f"{what} has the model {model.name}, which is not read; {_UNDISTORT}")
     checked_numbers(numbers, (model.numbers,), f"the numbers of {what} ({model.name})")
@@ -215,13 +217,13 @@ class _Bytes:
         return len(self._content) - self._at
 
     def numbers(self, layout: str) -> tuple:
-        """Read numbers of a `struct` layout."""
+        """Read numbers in a layout of `struct`, such as ``3d``; little-endian."""
         layout = "<" + layout
         at = self._skipped(struct.calcsize(layout))
         return struct.unpack_from(layout, self._content, at)
 
     def skip(self, size: int) -> None:
-        """Pass over bytes."""
+        """Skip a number of bytes."""
         self._skipped(size)
 
     def text(self) -> str:
@@ -236,7 +238,7 @@ class _Bytes:
             raise SceneError(f"{self.path} has a name that is no text ({error.reason})") from error
 
     def end(self) -> None:
-        """Refuse what is left over."""
+        """Raise `SceneError` if bytes are left over."""
         if self.left:
             raise SceneError(
                 f"{self.path} has {self.left} bytes more than its count says; write the model again"
@@ -347,7 +349,8 @@ def _text_images(path: Path) -> Iterator[_Image]:
                 f"line {number + 1} of {path} must hold points of three numbers each, got "
                 f"{len(points)} numbers; write the model again"
             )
-        # Names are words: a model without these lines would lose every second image.
+        # In a file without these lines, every second image would be taken for points. Its last
+        # words are a name and not numbers, so that this is noticed here.
         _floats(points[-3:], f"line {number + 1} of {path}, which holds points,")
         yield _Image(image, pose[:4], pose[4:], camera, words[9].strip())
 

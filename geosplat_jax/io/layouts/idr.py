@@ -1,8 +1,8 @@
-"""IDR, NeuS and their DTU: ``image/``, ``mask/`` and projections in ``cameras*.npz``.
+"""IDR and NeuS, and DTU in their layout: ``image/``, ``mask/`` and matrices in ``cameras*.npz``.
 
 ``world_mat_i @ scale_mat_i`` projects the unit sphere, which holds the object, to pixels of the
-i-th image by name. It is taken apart into a lens and a pose with OpenCV axes. Rays go through whole
-numbers there, so half a pixel is added to the principal point.
+i-th image by name. It is decomposed into a lens and a pose with OpenCV axes. In this layout pixel
+centres have integer coordinates, so half a pixel is added to the principal point.
 """
 
 import re
@@ -32,12 +32,12 @@ CAMERA_FILES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
 _IMAGE_FOLDERS = ("image", "images")
 _PIXEL_CENTER = 0.5
 _SKEW_TOLERANCE = 1e-3
-"""Share of the focal length by which the axes of the pixels may be off a right angle."""
+"""Largest skew that is taken for rounding, as a share of the focal length."""
 _SMALLEST_PIVOT = 1e-12
 
 
 def is_idr(root: Path) -> bool:
-    """Whether there are projections."""
+    """Whether there is a file of projection matrices, one of `CAMERA_FILES`."""
     return _camera_file(root) is not None
 
 
@@ -47,7 +47,8 @@ def list_idr(root: Path, *, light: str | None = None) -> Listing:
     Raises
     ------
     MissingFileError : there are no images.
-    SceneError : as many projections as images are not there, or one is none; a light is asked for.
+    SceneError : the numbers of projections and of images differ, or a matrix is not a projection; a
+        light is asked for.
     """
     require_no_light(light)
     where = _camera_file(root)
@@ -71,9 +72,10 @@ def list_idr(root: Path, *, light: str | None = None) -> Listing:
 
 
 def _masks(root: Path, images: list[Path]) -> list[Path | None]:
-    """Return the masks in ``mask/`` by number, where none is named after its image.
+    """Pair masks with images by number if no mask is named after its image.
 
-    Scenes of DTU have ``image/000000.png`` beside ``mask/000.png``.
+    Scenes of DTU have ``image/000000.png`` beside ``mask/000.png``. If masks are named after their
+    images, or there are none, all results are None: `captured_frame` finds masks by name.
 
     Raises
     ------
@@ -92,7 +94,7 @@ def _masks(root: Path, images: list[Path]) -> list[Path | None]:
 
 
 _DAMAGES = (OSError, ValueError, EOFError, KeyError, TypeError, RuntimeError)
-"""Errors of `numpy.load` where a file is no archive of arrays, or not a whole one."""
+"""Errors that `numpy.load` raises for a file that is no archive of arrays, or is truncated."""
 
 
 def _camera_file(root: Path) -> Path | None:
@@ -100,7 +102,7 @@ def _camera_file(root: Path) -> Path | None:
 
 
 def _read_matrices(where: Path) -> dict[str, np.ndarray]:
-    """Read the arrays; those that would run code are refused."""
+    """Read all matrices but inverses, by name; pickled arrays could run code and are refused."""
     try:
         with where.open("rb") as file, np.load(file, allow_pickle=False) as content:
             return {key: content[key] for key in content.files if not key.endswith("inv")}
@@ -138,13 +140,13 @@ def _frame(
 
 
 def _taken_apart(projection: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return K, R and t of ``projection ~ K [R | t]``, K with a positive diagonal and K_33 = 1.
+    """Decompose ``projection ~ K [R | t]``; K has a positive diagonal and K_33 = 1.
 
     Raises
     ------
-    SceneError : it is singular, or its pixels are no rectangles.
+    SceneError : the projection is singular, or its pixels are not rectangles.
     """
-    # A projection is the same times any number; this sign makes R a rotation.
+    # A projection is defined up to a factor; the sign is chosen such that R is a rotation.
     if np.linalg.det(projection[:, :3]) < 0.0:
         projection = -projection
     lens, rotation = rq(projection[:, :3])

@@ -2,9 +2,9 @@
 
 Images are sRGB with straight alpha; the world is z-up. Shiny Blender adds, for each image, a
 normal map in world axes (``r_0_normal.png``, n = 2v - 1) and a mask (``r_0_alpha.png``), which is
-used where the image itself has no alpha. NeRF-synthetic keeps its normals in camera-dependent
-files of another kind (``r_0_normal_0001.png``), which are not ground truth in world axes and are
-left alone, as is its validation split.
+used where the image itself has no alpha. NeRF-synthetic has normal maps of another kind
+(``r_0_normal_0001.png``): they depend on the camera and are not in world axes. These maps and its
+validation split are not read.
 """
 
 from pathlib import Path
@@ -23,12 +23,12 @@ from geosplat_jax.io.frames import (
 
 
 def is_nerf_synthetic(root: Path) -> bool:
-    """Whether the folder holds the transforms that this layout is made of."""
+    """Whether the folder holds ``transforms_train.json``."""
     return (root / "transforms_train.json").is_file()
 
 
 def is_shiny_blender(root: Path) -> bool:
-    """Whether it is NeRF-synthetic with maps named after the images."""
+    """Whether the layout is that of NeRF-synthetic, with normal maps or masks beside the images."""
     maps = ("*_normal.png", "*_alpha.png")
     folders = [root / "train", root / "test"]
     return is_nerf_synthetic(root) and any(

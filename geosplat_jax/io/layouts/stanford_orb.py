@@ -1,10 +1,10 @@
 """Stanford-ORB: photographs with masks, and an environment map for each test view.
 
 ``blender_LDR/SCENE`` or ``blender_HDR/SCENE`` hold ``transforms_{train,test}.json``, images
-``{train,test}/NNNN.png`` or ``.exr`` and masks ``{train,test}_mask/NNNN.png``. Beside them lies
-``ground_truth/SCENE/env_map/NNNN.exr``, the light of each test view in the frame of its camera;
-``env_map/`` in the scene folder itself is taken, too. Views of other scenes
-(``transforms_novel.json``) are left alone.
+``{train,test}/NNNN.png`` or ``.exr`` and masks ``{train,test}_mask/NNNN.png``. Beside
+``blender_LDR`` lies ``ground_truth/SCENE/env_map/NNNN.exr``, the light of each test view in the
+frame of its camera; a folder ``env_map/`` in the scene folder itself takes precedence. Views of
+other scenes (``transforms_novel.json``) are not read.
 """
 
 from pathlib import Path
@@ -23,7 +23,7 @@ _LIGHTS = "env_map"
 
 
 def is_stanford_orb(root: Path) -> bool:
-    """Whether there are masks in a folder of their own beside the training images."""
+    """Whether the folder holds ``transforms_train.json`` and a folder ``train_mask``."""
     return (root / "transforms_train.json").is_file() and (root / "train_mask").is_dir()
 
 
@@ -61,7 +61,7 @@ def _frames(root: Path, split: str) -> tuple[Frame, ...]:
 
 
 def _light(root: Path, name: str) -> Path | None:
-    """Environment map of a test view, beside the folder of all scenes or in the scene."""
+    """Find the environment map of a test view, in the scene folder or in ``ground_truth``."""
     folders = [
         root / _LIGHTS,
         root.resolve().parent.parent / "ground_truth" / root.resolve().name / _LIGHTS,

@@ -1,9 +1,9 @@
 """Synthetic4Relight: linear HDR for training, sRGB images and materials for testing.
 
 Training images are ``<frame>_rgb.exr`` (linear) with ``<frame>_mask.png``; test frames have
-``_rgba.png`` (sRGB, straight alpha), ``_albedo.png`` (sRGB) and ``_rough.png`` (channel 0 as it
-is). ``test_rli/envmap6_<stem>.png`` and ``envmap12_<stem>.png`` show the test views under two
-other lights; ``envmap{3,6,12}.exr`` lie in or beside the scene folder, 3 being the training light.
+``_rgba.png`` (sRGB, straight alpha), ``_albedo.png`` (sRGB) and ``_rough.png`` (linear, in channel
+0). ``test_rli/envmap6_<stem>.png`` and ``envmap12_<stem>.png`` show the test views under two other
+lights. ``envmap{3,6,12}.exr`` lie in or beside the scene folder; 3 is the training light.
 """
 
 from pathlib import Path
@@ -50,7 +50,7 @@ def list_synthetic4relight(root: Path, *, light: str | None = None) -> Listing:
 
 
 def _listed(root: Path, split: str):
-    """Yield stem, pose and lens; a file path may or may not end in ``_rgb`` or ``_rgba``."""
+    """Yield path stem, pose and lens of every frame; an ending ``_rgb`` or ``_rgba`` is removed."""
     where = root / f"transforms_{split}.json"
     if split == "test" and not where.exists():
         return

@@ -1,10 +1,10 @@
 """TensoIR: one folder per view, with one image per light and ground truth of the test views.
 
-``{train,test}_NNN/`` hold ``metadata.json``, ``rgba_<light>.png`` (sRGB, straight alpha) and, on
-test views, ``albedo.png`` (linear values), ``normal.png`` (n = 2v - 1, world, z-up) and, where the
-maker could, ``roughness.png`` and ``metallic.png``. Views are listed by ``transforms_*.json`` or,
-without it, by the folders. Environment maps lie in or beside the scene folder. A ``scene.json``
-may name the training light.
+``{train,test}_NNN/`` hold ``metadata.json``, ``rgba_<light>.png`` (sRGB, straight alpha) and, for
+test views, ``albedo.png`` (linear values), ``normal.png`` (n = 2v - 1, world, z-up) and, if they
+exist, ``roughness.png`` and ``metallic.png``. Views are listed by ``transforms_*.json``; without
+this file, every folder is a view. Environment maps lie in or beside the scene folder. A
+``scene.json`` may name the training light.
 """
 
 import re
@@ -33,7 +33,7 @@ _VIEW_FOLDER = re.compile(r"(train|test|val)_\d+")
 
 
 def is_tensoir(root: Path) -> bool:
-    """Whether there are view folders."""
+    """Whether there are folders of views, such as ``train_000``."""
     return any(_VIEW_FOLDER.fullmatch(folder.name) for folder in _folders(root))
 
 
@@ -42,12 +42,13 @@ def list_tensoir(root: Path, *, light: str | None = None) -> Listing:
 
     Parameters
     ----------
-    light : which light the training images are taken under; by default the one that
-        ``scene.json`` names, then ``sunset``, then the only one there is.
+    light : light that the training images are taken under. By default the one that ``scene.json``
+        names; without such a name ``sunset``, if it exists, or else the only light.
 
     Raises
     ------
-    SceneError : see `read_transforms`; no view has the light, or the choice is open.
+    SceneError : see `read_transforms`; a view has no image under the light, or no light is given
+        and there are several.
     """
     views = {split: _views(root, split) for split in ("train", "test")}
     train_light = light or _train_light(root, [folder for folder, _, _ in views["train"]])
@@ -91,7 +92,7 @@ def _views(root: Path, split: str) -> list[tuple[Path, np.ndarray, Lens]]:
 
 
 def _view_folder(root: Path, file_path: str, where: Path) -> Path:
-    """Folder of ``./test_000/rgba``, or of ``./test_000``."""
+    """Return the folder of a view that is listed as ``./test_000/rgba`` or ``./test_000``."""
     stem = image_stem(root, file_path, where)
     return stem if stem.is_dir() else stem.parent
 

@@ -1,14 +1,14 @@
 """nerfstudio, instant-ngp and nvdiffrec: one ``transforms.json`` for all photographs.
 
-Poses are camera-to-world with OpenGL axes. The lens stands in the file or in each frame
+Poses are camera-to-world with OpenGL axes. The lens is given once for all frames or in each frame
 (`frames.list_transforms`). ``mask_path`` names the object's mask, white on the object; without it,
-``masks/`` is looked into (`frames.beside_images`). ``dynamic_mask_NAME.png`` beside an image, as
-instant-ngp has it, is not black where pixels do not count.
+the mask is looked for in ``masks/`` (`frames.beside_images`). instant-ngp excludes pixels by a file
+``dynamic_mask_NAME.png`` beside an image: pixels that are not black in it do not count.
 
-``train_filenames``, ``val_filenames`` and ``test_filenames`` are the split of nerfstudio: views to
-test are those of the last, or else of ``val_filenames``. ``applied_transform`` says how nerfstudio
-turned the world before it wrote the poses, which are taken as they are. ``aabb_scale``, ``near``,
-``far`` and point clouds are not needed.
+nerfstudio gives the split by ``train_filenames``, ``val_filenames`` and ``test_filenames``. Test
+views are those of ``test_filenames`` or, if there are none, of ``val_filenames``.
+``applied_transform`` records how nerfstudio transformed the world before it wrote the poses; the
+poses are used as they are written. ``aabb_scale``, ``near``, ``far`` and point clouds are not read.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,7 +40,7 @@ _SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 
 
 def is_transforms(root: Path) -> bool:
-    """Whether there is a single file of transforms."""
+    """Whether the folder holds ``transforms.json``."""
     return (root / FILE).is_file()
 
 
@@ -49,8 +49,9 @@ def list_transforms_capture(root: Path, *, light: str | None = None) -> Listing:
 
     Raises
     ------
-    SceneError : see `frames.list_transforms`; a split names a file that no frame has, or shares
-        one; a light is asked for.
+    SceneError : see `frames.list_transforms`; two frames have one name; the split names a file
+        that no frame has, uses a view both for training and for testing, or leaves no view to
+        train on; a light is asked for.
     """
     require_no_light(light)
     where = root / FILE
@@ -72,7 +73,7 @@ def list_transforms_capture(root: Path, *, light: str | None = None) -> Listing:
 
 
 def _plain(path: str) -> str:
-    """Write equal paths equally: ``./images/1.jpg`` as ``images/1.jpg``."""
+    """Normalise a path, so that ``./images/1.jpg`` and ``images/1.jpg`` compare equal."""
     return str(PurePosixPath(path.replace("\\", "/")))
 
 
@@ -97,7 +98,7 @@ def _frame(root: Path, listed: ListedFrame, where: Path) -> Frame:
 def _names(
     content: Mapping[str, Any], key: str, where: Path, frames: Mapping[str, Frame]
 ) -> list[str]:
-    """Return the frames that a split names."""
+    """Return the normalised names of the frames in a split."""
     names = content[key]
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise SceneError(f"{key!r} of {where} must be a list of names, got {names!r}")
