@@ -45,8 +45,8 @@ class AdapterConstants:
     """Orient by the interpolated normal (the paper's text) instead of the face's (the authors'
     code)."""
     shift: Share = 0.0
-    """Inward shift of the splats of a face in roots of its area, where none is learned
-    (``material.has_shift`` is off); see `shift_inwards`."""
+    """Inward shift of the splats of a face, in units of the square root of its area, where none is
+    learned (``material.has_shift`` is off); see `shift_inwards`."""
     vertex_area_divisor: Positive = 2.5
     """The k in ``S = sqrt(area / k)`` of the vertex sampling."""
 
@@ -107,7 +107,12 @@ def face_splats(
     ----------
     mesh : faces to sample; rows past ``face_count`` become inert splats.
     normals : (Cv, 3) unit vertex normals.
-    constants, unit : see `AdapterConstants`; world length of one unit of its thickness.
+    constants : static; see `AdapterConstants`.
+    unit : () length of one unit of ``constants.thickness``, world units.
+
+    Returns
+    -------
+    `Splats`, six for every row of faces.
     """
     # Components come first, (corner, xyz, face): the arithmetic runs along contiguous faces.
     both = jnp.concatenate([mesh.vertices, normals], axis=1)[mesh.faces.T].transpose(0, 2, 1)
@@ -134,7 +139,8 @@ def face_splats(
     else:
         quats = [_frame(edge, face_normal) for edge in edges] * 2
 
-    # Materialised here: fused into the stacks below, every chain would be compiled several times.
+    # Without the barrier XLA fuses these chains into the stacks below, and compiles each several
+    # times.
     means, shading, scales, quats = jax.lax.optimization_barrier((means, shading, scales, quats))
 
     def rows(parts: list[Float[Array, "c F"]]) -> Float[Array, "N c"]:
@@ -179,7 +185,17 @@ def vertex_splats(
     in the authors' code: the paper's sum has no such cosine. The splats belong to no face.
     Differentiable in vertices and normals. The tangent frame (and so the quaternion) is arbitrary
     about the normal and jumps where ``n_z`` changes sign, which the round footprint hides.
-    ``unit`` : world length of one unit of thickness.
+
+    Parameters
+    ----------
+    mesh : vertices to sample; rows past ``vertex_count`` become inert splats.
+    normals : (Cv, 3) unit vertex normals.
+    constants : static; see `AdapterConstants`.
+    unit : () length of one unit of ``constants.thickness``, world units.
+
+    Returns
+    -------
+    `Splats`, one for every row of vertices.
     """
     face_normal, area = face_normals_and_areas(mesh)
     corner_normals = normals[mesh.faces]
@@ -245,7 +261,7 @@ class SplatModel(abc.ABC):
         return attributes
 
     def settle(self, splats: Splats, surface: Surface, attributes: Attributes) -> Splats:
-        """Move the splats as their attributes say."""
+        """Move the splats by their attributes, such as the inward shift; by default not at all."""
         del surface, attributes
         return splats
 
@@ -311,7 +327,7 @@ class SplatSettings(Variant, abc.ABC):
 
     @property
     def takes_over(self) -> bool:
-        """Whether a stage begins with the splats of the one before, whose surface is then fixed."""
+        """Whether a stage begins with the splats of the stage before, on a fixed surface."""
         return False
 
     @property
@@ -331,12 +347,12 @@ class SplatSettings(Variant, abc.ABC):
         return None
 
     def describe(self, parameters: Any) -> Any:
-        """Return the sizes of learned parameters that JSON can hold, for `template`."""
+        """Return the sizes of learned parameters, as values that JSON can hold, for `template`."""
         del parameters
         return None
 
     def template(self, description: Any) -> Any:
-        """Make parameters of the described sizes, of any values; None where nothing is learned."""
+        """Make parameters of the described sizes, with any values; None where none are learned."""
         del description
         return None
 
@@ -361,7 +377,7 @@ class FaceSplatSettings(SplatSettings, kind="face"):
 
 @settings
 class DiscSplatSettings(SplatSettings, kind="disc"):
-    """Six round discs per face, which know its normal and area but not its shape."""
+    """Six round discs per face, which follow its normal and area but not its shape."""
 
     @property
     def is_six_per_face(self) -> bool:

@@ -1,6 +1,6 @@
-"""The isosurface of values in a band around it, so that cost and memory grow with its area.
+"""An isosurface whose values are stored in a band around it: cost and memory grow with its area.
 
-It is the isosurface of `geometry` in every respect: only where the values are held differs.
+The isosurface itself is that of `geometry`; only the storage of its values differs.
 """
 
 from dataclasses import replace
@@ -20,12 +20,12 @@ from geosplat_jax.surface.lattice import Lattice
 
 
 class BandedFlexiCubes(GridSurface):
-    """Values in a band around the surface, which follows it; cost and memory grow with its area.
+    """The isosurface of values in a band of cells, which follows the surface.
 
     Attributes
     ----------
-    band : cells and vertices that hold values; they are the rows of the shape.
-    layers : static; cells on each side of those that the surface passes through.
+    band : cells and vertices that hold values; their rows are the rows of the shape.
+    layers : static; layers of cells on each side of those that the surface passes through.
     entropy_reduction : see `GridSurface.reduction`.
     """
 
@@ -54,6 +54,12 @@ class BandedFlexiCubes(GridSurface):
         """Make the model and shape of a surface from values on all vertices of a grid (host side).
 
         There is no deformation, and weights are neutral.
+
+        Parameters
+        ----------
+        sdf : (V,) signed values of the vertices, cells, x fastest.
+        grid : the grid.
+        layers, entropy_reduction : static; see the class.
         """
         band, values = band_from(grid, sdf, layers)
         return cls(band, layers, entropy_reduction), neutral_geometry(
@@ -61,7 +67,7 @@ class BandedFlexiCubes(GridSurface):
         )
 
     def following(self, shape: Geometry) -> Following | None:
-        """Make the band around where the surface is now; see `Band.following`."""
+        """Move the band to where the surface is now; see `Band.following`."""
         found = self.band.following(shape.sdf, self.layers)
         if found is None:
             return None

@@ -1,10 +1,11 @@
 """Deferred shading: attributes of splats are blended first, then every covered pixel is shaded.
 
 The attributes of the visible splats are rasterised and divided by their coverage (Eq. 21), and the
-rendering equation is evaluated once for every pixel with what remains (Eq. 22). Any
-`transport.base.Transport` serves: a pixel is a point like another.
+rendering equation is evaluated once for every pixel with the result (Eq. 22). Any
+`transport.base.Transport` can be used, since a pixel is a surface point like any other.
 
-The samples of light, what they hit and the hits of the pixels' own rays carry no gradient.
+The samples of light, what they hit, and the points where rays through pixels hit the mesh carry no
+gradient.
 """
 
 from dataclasses import replace
@@ -25,7 +26,7 @@ from geosplat_jax.splats.rasterize import TileLists
 from geosplat_jax.transport.base import Illumination, Transport
 
 _THINNEST = 1e-6
-"""Coverage below this does not divide; a splat that is drawn at all covers 1/255."""
+"""Least coverage that attributes are divided by; a pixel with a visible splat has 1/255 or more."""
 
 _SHADED = ("rgb", "diffuse", "specular", "specular_radiance")
 """Images that come from light; all others are blended from the splats."""
@@ -39,28 +40,28 @@ class PerPixel(ShadingDomain, kind="per_pixel"):
     """Where rays start: at the blended positions of the splats (the paper), or where the mesh is
     first hit (the authors' code). Pixels whose ray misses the mesh take the blended position."""
     ray_offset: NonNegative = 1e-3
-    """How far above its point a ray starts, in half the longest side of the box; rays from the
-    mesh start on their face, which they never hit, and need none."""
+    """How far above its point a ray starts, in half the longest side of the box. Rays from the
+    mesh start on their face, which they never hit, and need no offset."""
     detach_coverage: bool = True
     """Attributes and colours take the coverage as a constant, as in the authors' code: opacities
     and shapes then learn from what is blended and from the mask, not from the division."""
 
     @property
     def uses_rays(self) -> bool:
-        """Where points lie on the mesh."""
+        """Whether points lie on the mesh, where rays through the pixels hit it."""
         return self.points == "mesh"
 
     def without_rays(self) -> "PerPixel":
-        """Blend positions, too."""
+        """Return the domain whose points are blended from the positions of the splats."""
         return replace(self, points="splats")
 
     @property
     def shades_splats(self) -> bool:
-        """Every view has its own pixels."""
+        """False: the points are the pixels of a view."""
         return False
 
     def adapted(self, transport: Transport) -> Transport:
-        """Let every view draw its own samples: no two share a point."""
+        """Return the transport that draws samples in every view: views share no point."""
         return transport.for_each_view()
 
     def images(
@@ -139,7 +140,7 @@ class PerPixel(ShadingDomain, kind="per_pixel"):
         mask: Bool[Array, " P"],
         camera: Camera,
     ) -> SurfacePoints:
-        """Say where the pixels' rays start."""
+        """Build the points at which pixels are shaded, where rays towards the light start."""
         normals, positions = safe_normalize(straight["normal"]), straight["position"]
         offset = self.ray_offset * pipeline.surface.box.half_extent
         starts, outward = positions + offset * normals, normals
@@ -159,10 +160,18 @@ def first_surface(
 ) -> tuple[Float[Array, "P 3"], Int[Array, " P"]]:
     """Find where the rays through the pixel centres of a single view first meet the mesh.
 
+    Not differentiable.
+
+    Parameters
+    ----------
+    index : the mesh.
+    mask : (P,) pixels whose rays are traced, of all H W pixels, row by row; the others hit nothing.
+    camera : of a single view.
+
     Returns
     -------
-    positions : (P, 3) world, row by row; the camera's centre where nothing is hit.
-    faces : (P,) face that is hit, -1 for none. No gradients.
+    positions : (P, 3) world; the camera's centre where nothing is hit.
+    faces : (P,) face that is hit; -1 for none.
     """
     camera = jax.lax.stop_gradient(camera)
     rotation, intrinsics = camera.world_to_camera[0, :3, :3], camera.intrinsics[0]

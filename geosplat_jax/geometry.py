@@ -2,13 +2,13 @@
 
 Dual marching cubes: every patch that the surface cuts out of a cell gives a dual vertex, every
 interior grid edge it crosses gives a quad between the four cells around it. On a regular grid both
-follow from index arithmetic. Only tests of signs visit all cells that hold values; all else is
-done for those at the surface, so that the cost grows with its area.
+follow from index arithmetic. Only tests of signs visit all cells that hold values; all other work
+is done for the cells at the surface, so that the cost grows with its area.
 
 Edges on the border of the grid have fewer than four cells and make no quad: a surface that runs
 into the border is open there. Keep the outermost vertices positive for a closed one.
 
-Where values are held, for all cells of the grid or for some, is a `Lattice`'s business.
+A `Lattice` says which cells and vertices of the grid hold values: all, or only some.
 
 Reference: Shen et al., "Flexible Isosurface Extraction for Gradient-Based Mesh Optimization", 2023.
 """
@@ -74,7 +74,8 @@ _SDF_EPSILON = 1e-12
 gradient: the true gradient grows as 1 / |sdf| and would leave the range of float32."""
 
 _SPLIT_EPSILON = 1e-8
-"""Added to the weights of the two diagonals by the original, kept for equality with it."""
+"""Added to the sum of the diagonals' weights, as in the original FlexiCubes code, for equal
+results."""
 
 
 class IsoSurface(Surface):
@@ -82,8 +83,8 @@ class IsoSurface(Surface):
 
     Attributes
     ----------
-    mesh : triangles; vertex rows are the dual vertices, then in training the centres of the quads.
-        In training quad q has the faces 4 q to 4 q + 3.
+    mesh : triangles. The first vertex rows are the dual vertices; in training the centres of the
+        quads follow, and quad q has the faces 4 q to 4 q + 3.
     usage : true counts of surface cells, dual vertices and quads.
     deviation : () mean absolute deviation of the distances between the crossing points of a patch
         and its dual vertex (FlexiCubes Eq. 8), world units; 0 for an empty surface.
@@ -179,7 +180,7 @@ def _surface_cells(values: Float[Array, " G"], lattice: Lattice, *, capacity: in
     coordinates, signs, case = describe(row)
     signs, case = jnp.where(is_real, signs, 0), jnp.where(is_real, case, 0)
     through = jnp.cumsum(_rows(patch_count, case), dtype=jnp.int32)
-    # After an overflow the compacted cells do not tell the true needs, so all cells are asked.
+    # After an overflow the compacted cells are incomplete: the true needs are counted over all.
     vertex_count, quad_count = jax.lax.cond(
         bits.count > capacity,
         lambda: count(*describe(jnp.arange(lattice.cell_rows, dtype=jnp.int32))),
@@ -199,7 +200,7 @@ def _surface_cells(values: Float[Array, " G"], lattice: Lattice, *, capacity: in
 
 
 class _Duals(NamedTuple):
-    """Dual vertices, relative to the centre of the grid, and what belongs to them."""
+    """Dual vertices, relative to the centre of the grid, and data of their cells and patches."""
 
     points: Float[Array, "3 Cd"]
     gamma: Float[Array, " Cd"]
@@ -290,7 +291,7 @@ def _dual_vertices(geometry: Geometry, lattice: Lattice, cells: _Cells, *, capac
 def _deviations(
     offsets: Float[Array, "3 12 n"], crosses: Bool[Array, "12 n"]
 ) -> Float[Array, "12 n"]:
-    """Deviation of the length of each patch's offsets from their mean; 0 where none crosses."""
+    """Absolute deviations of the lengths of a patch's offsets from their mean; 0 on other edges."""
     lengths = jnp.where(crosses, safe_norm(offsets, axis=0), 0.0)
     count = jnp.maximum(jnp.sum(crosses, axis=0, dtype=jnp.int32), 1).astype(lengths.dtype)
     mean = jnp.sum(lengths, axis=0) / count
@@ -298,7 +299,7 @@ def _deviations(
 
 
 class _Quads(NamedTuple):
-    """Quads between dual vertices, one a crossed interior edge of the grid."""
+    """Quads between dual vertices, one per crossed interior edge of the grid."""
 
     corners: Int[Array, "4 Cq"]  # counter-clockwise seen from outside
     prefers_first_on_tie: Bool[Array, " Cq"]
@@ -324,8 +325,8 @@ def _quads(lattice: Lattice, cells: _Cells, *, capacity: int) -> _Quads:
     # The surface faces the positive side: along the axis if its lower end is inside.
     is_inside = cells.signs[row] & 1 == 1
     corners = jnp.where(is_inside[None, :], corners, corners[np.array([0, 3, 2, 1])])
-    # The original compares diagonals in an order that depends on the sign of the first end of an
-    # edge, and lists edges along y from their upper end. It matters for equal weights only.
+    # The original code compares diagonals in an order that depends on the sign of the first end of
+    # an edge, and lists edges along y from their upper end. This matters for equal weights only.
     prefers_first = is_inside ^ (axis == 1)
     corners = jnp.where(is_real[None, :], corners, 0)
     return _Quads(corners=corners, prefers_first_on_tie=prefers_first, mask=is_real)
@@ -351,7 +352,7 @@ def _quad_centres(
 
 
 def _fan_faces(quads: _Quads, first_centre: Int[Array, ""]) -> Int[Array, "F 3"]:
-    """Four triangles a quad, from each side to the centre."""
+    """Four triangles per quad, each from a side to the centre."""
     capacity = quads.corners.shape[1]
     centre = first_centre + jnp.arange(capacity, dtype=jnp.int32)
     sides = jnp.stack([quads.corners, jnp.roll(quads.corners, -1, axis=0)], axis=-1)
@@ -361,7 +362,7 @@ def _fan_faces(quads: _Quads, first_centre: Int[Array, ""]) -> Int[Array, "F 3"]
 
 
 def _split_faces(gamma: Float[Array, " Cd"], quads: _Quads) -> Int[Array, "F 3"]:
-    """Two triangles a quad, along the diagonal with the larger weight."""
+    """Two triangles per quad, split along the diagonal with the larger weight."""
     first, second = _diagonal_weights(_rows(gamma, quads.corners))
     takes_first = (first > second) | ((first == second) & quads.prefers_first_on_tie)
     along_first = quads.corners[np.array([0, 1, 2, 0, 2, 3])]
@@ -372,7 +373,7 @@ def _split_faces(gamma: Float[Array, " Cd"], quads: _Quads) -> Int[Array, "F 3"]
 def _cells_and_duals(
     geometry: Geometry, lattice: Lattice, capacities: Capacities
 ) -> tuple[_Cells, _Duals]:
-    """Find the cells at the surface, and place its vertices in them."""
+    """Find the cells at the surface, and place the dual vertices in them."""
     geometry = replace(geometry, sdf=lattice.values(geometry.sdf))
     cells = _surface_cells(geometry.sdf, lattice, capacity=capacities["surface_cubes"])
     duals = _dual_vertices(geometry, lattice, cells, capacity=capacities["dual_vertices"])
@@ -393,11 +394,12 @@ def isosurface(
     Parameters
     ----------
     geometry : raw SDF, deformations and weights (see `Geometry`).
-    grid : box of cells they live on, or what holds values of some of its cells.
+    grid : the grid, or the `Lattice` that says which of its cells and vertices hold values.
     capacities : static sizes; ``surface_cubes``, ``dual_vertices`` and ``quads`` are used.
         If ``usage`` exceeds them the mesh is wrong and must be discarded (see `capacity`).
-    training : static. True: four triangles a quad around a centre that blends both diagonals by
-        gamma, which lets gamma learn. False: two triangles, split along the heavier diagonal.
+    training : static. True: four triangles per quad around a centre that blends both diagonals by
+        gamma, which lets gamma learn. False: two triangles per quad, split along the diagonal with
+        the larger weight.
 
     Returns
     -------
@@ -450,7 +452,17 @@ def isosurface(
 def edge_deviations(
     geometry: Geometry, grid: Grid | Lattice, *, capacities: Capacities
 ) -> tuple[Float[Array, "12 Cd"], Bool[Array, "12 Cd"]]:
-    """Return the terms whose mean is `IsoSurface.deviation`, and which of them are real."""
+    """Return the terms whose mean is `IsoSurface.deviation`.
+
+    Parameters
+    ----------
+    geometry, grid, capacities : see `isosurface`.
+
+    Returns
+    -------
+    deviations : (12, Cd) for every edge of a dual vertex's cell, world units.
+    crosses : (12, Cd) whether the patch of the dual vertex crosses the edge; the other terms are 0.
+    """
     _, duals = _cells_and_duals(geometry, lattice_of(grid), capacities)
     return duals.deviations, duals.crosses
 
@@ -466,9 +478,9 @@ class GridSurface(SurfaceModel):
     @property
     @abc.abstractmethod
     def reduction(self) -> Literal["mean", "sum"]:
-        """Mean over the edges of Eq. 14, or their sum, as printed (static).
+        """Whether Eq. 14 is a mean over the edges or, as printed, their sum (static).
 
-        The sum grows with the number of crossed edges and soon outweighs the picture.
+        The sum grows with the number of crossed edges and soon outweighs the terms of the images.
         """
 
     @property
@@ -479,11 +491,15 @@ class GridSurface(SurfaceModel):
     def extract(
         self, shape: Geometry, *, capacities: Capacities, final: bool = False
     ) -> IsoSurface:
-        """Extract the isosurface: four triangles a quad, two in the final mesh."""
+        """Extract the isosurface: four triangles per quad, or two in the final mesh."""
         return isosurface(shape, self.lattice, capacities=capacities, training=not final)
 
     def penalties(self, shape: Geometry, surface: IsoSurface) -> dict[str, Float[Array, ""]]:
-        """Evaluate ``entropy`` (Eq. 14), ``deviation`` (L_dev, in half boxes) and ``weights``."""
+        """Evaluate the penalties of the isosurface by name.
+
+        ``entropy`` is Eq. 14, see `sdf_entropy`; ``deviation`` is L_dev of FlexiCubes, in units of
+        half the box's side; ``weights`` is `weight_magnitude`.
+        """
         lattice = self.lattice
         return {
             "entropy": sdf_entropy(shape, lattice, reduction=self.reduction),
@@ -496,7 +512,7 @@ class GridSurface(SurfaceModel):
         return build_grid_index(surface, self.lattice.grid, capacities=capacities)
 
     def nearby_points(self, shape: Geometry) -> tuple[Float[Array, "G 3"], Float[Array, " G"]]:
-        """Return the grid's vertices, those with an edge that the surface crosses weighing one."""
+        """Return the grid's vertices; those at an edge that the surface crosses have weight 1."""
         lattice = self.lattice
         points = lattice.vertex_positions().astype(shape.sdf.dtype)
         crossings = lattice.crossed_edges(lattice.values(shape.sdf))
@@ -516,11 +532,11 @@ class GridSurface(SurfaceModel):
 
 
 class FlexiCubes(GridSurface):
-    """Values everywhere on a grid.
+    """The isosurface of values on all vertices and cells of a grid.
 
     Attributes
     ----------
-    grid : where the values live.
+    grid : the grid.
     entropy_reduction : see `GridSurface.reduction`.
     """
 

@@ -11,7 +11,7 @@ a cell are therefore four pairs of adjacent rows, which halves the hashing and t
 
 Gradients. `encode` has a hand-written reverse mode, 3 times faster on a CPU than autodiff of
 `_reference_encode`; forward mode and second derivatives are not available. Gradients of hash tables
-are small and sparse; the authors scale them up by 16, to which Adam is indifferent.
+are small and sparse; the authors multiply them by 16, which does not change the steps of Adam.
 """
 
 import math
@@ -35,8 +35,8 @@ _INITIAL_SCALE = 1e-4
 """Half-width of the uniform distribution that tables start from."""
 
 _BACKWARD_CHUNK = 8192
-"""Points a step of the backward pass: large enough to hide the cost of a step, small enough that
-the scattered rows (4 x 2 x features floats a point and level) stay in cache and off the heap."""
+"""Points per step of the backward pass: enough to hide the cost of a step, but few enough that the
+scattered rows (4 x 2 x features floats per point and level) stay in cache and off the heap."""
 
 
 @settings
@@ -57,13 +57,13 @@ class HashGridSpec:
     levels: Annotated[int, Field(ge=1, le=64)] = 8
     """Number of grids."""
     features: Annotated[int, Field(ge=1, le=64)] = 4
-    """Numbers that a vertex holds in each of them."""
+    """Numbers that a vertex of a grid holds."""
     log2_entries: Annotated[int, Field(ge=1, le=30)] = 15
     """Base-2 logarithm of the rows of the largest table."""
     coarsest: PositiveCount = 16
     """Cells along an axis of the first level."""
     finest: PositiveCount = 512
-    """Cells along an axis of the last level; without effect where there is but one."""
+    """Cells along an axis of the last level; no effect with a single level."""
 
     def __post_init__(self) -> None:
         """Check the sizes."""
@@ -194,7 +194,7 @@ def _interpolate(table: Float[Array, "E F"], cells: _Cells) -> Float[Array, "N L
 def _reference_encode(
     table: Float[Array, "E F"], points: Float[Array, "N 3"], spec: HashGridSpec
 ) -> Float[Array, "N W"]:
-    """Encode with plain operations, differentiated by autodiff: the meaning of `encode`."""
+    """Encode with plain operations that autodiff differentiates; the reference of `encode`."""
     is_inside = (points >= 0) & (points <= 1)
     clamped = jnp.where(is_inside, points, jnp.clip(jax.lax.stop_gradient(points), 0.0, 1.0))
     located = _locate(jax.lax.stop_gradient(points), spec)
@@ -202,7 +202,7 @@ def _reference_encode(
     fractions = []
     for axis in range(3):
         scaled = clamped[:, axis, None] * cells
-        # The same fractions again, now with a derivative: the corner is constant.
+        # The same fractions, but with a derivative: the corner of the cell is a constant.
         corner = jax.lax.stop_gradient(scaled) - located.fractions[axis]
         fractions.append(scaled - corner)
     features = _interpolate(table, _Cells(located.rows, tuple(fractions)))
@@ -219,7 +219,7 @@ def _scatter_rows(
         for w in _line_weights(cells)
     ]
     pair_shape = (2, gradient.shape[1])
-    # One window of two adjacent rows a pair.
+    # One window of two adjacent rows per pair.
     numbers = jax.lax.ScatterDimensionNumbers(
         update_window_dims=(1, 2), inserted_window_dims=(), scatter_dims_to_operand_dims=(0,)
     )
@@ -238,10 +238,10 @@ def _point_gradient(
     cotangent: Float[Array, "N L F"],
     spec: HashGridSpec,
 ) -> Float[Array, "N 3"]:
-    """Differentiate along the axes of a point; zero along those on which it was clamped.
+    """Differentiate with respect to the points; zero along axes on which a point was clamped.
 
-    Entries of the table's columns summed in one unrolled chain take half the time of rows reduced
-    over so short an axis.
+    Single entries of the table's columns are summed in one unrolled chain. That takes half the time
+    of gathering whole rows and summing over so short an axis.
     """
     cells = _locate(points, spec)
     tx, ty, tz = cells.fractions
@@ -278,7 +278,7 @@ def _encode_forward(table, points, spec, position_gradient):
 
 
 def _encode_backward(spec, position_gradient, residuals, cotangent):
-    """Scatter a chunk of points at a time; cells are found again instead of stored."""
+    """Scatter a chunk of points at a time; cells are computed again instead of stored."""
     table, points = residuals
     count = points.shape[0]
     chunk = min(_BACKWARD_CHUNK, max(count, 1))
@@ -341,7 +341,7 @@ class Layer(eqx.Module):
     Attributes
     ----------
     weights : (inputs, outputs).
-    bias : (outputs,) or None, which holds no parameter.
+    bias : (outputs,); None for a layer without bias.
     """
 
     weights: Float[Array, "I O"]
@@ -353,7 +353,13 @@ def init_mlp(key: Key[Array, ""], widths: tuple[int, ...], *, bias: bool) -> tup
 
     Parameters
     ----------
-    widths : inputs, hidden widths and outputs.
+    key : random key of the weights.
+    widths : numbers of inputs, of every hidden layer, and of outputs.
+    bias : whether layers have biases.
+
+    Returns
+    -------
+    Layers in order, one fewer than ``widths`` has entries; see `apply_mlp`.
     """
     layers = []
     keys = jax.random.split(key, len(widths) - 1)
@@ -365,7 +371,7 @@ def init_mlp(key: Key[Array, ""], widths: tuple[int, ...], *, bias: bool) -> tup
 
 
 def apply_mlp(layers: tuple[Layer, ...], x: Float[Array, "N I"]) -> Float[Array, "N O"]:
-    """Evaluate an MLP with rectified hidden layers and a linear output."""
+    """Evaluate an MLP with rectified (ReLU) hidden layers and a linear output."""
     for index, layer in enumerate(layers):
         x = jnp.matmul(x, layer.weights, precision="highest")
         if layer.bias is not None:

@@ -1,8 +1,9 @@
 """The terms of the training objective (Eq. 13-19), as tables: name and function.
 
-A term is a function of one view (`ViewInputs`) or of none (`SharedInputs`), and is computed only
-where it is asked for by name; a surface adds penalties of its own (`SurfaceModel.penalties`).
-Weights are not known here: `pipeline.Pipeline.loss` sums the terms (Eq. 19).
+A term belongs to one view (a function of `ViewInputs`) or to no view (a function of
+`SharedInputs`), and is computed only if it is asked for by name; a surface adds penalties of its
+own (`SurfaceModel.penalties`). Weights are applied by `pipeline.Pipeline.loss`, which sums the
+terms (Eq. 19).
 
 Differentiable in the parameters only. Not differentiable by contract: visibility and depth order,
 topology, the random background, the noise of the smoothness term, samples of light.
@@ -37,7 +38,8 @@ from geosplat_jax.transport.base import Illumination, Transport
 from geosplat_jax.transport.environment import texel_solid_angles
 
 _RADIOMETRIC_STREAM = 2**31
-"""Of random directions; `SharedInputs.changes` splits the same key, which counts from 0."""
+"""Number that is folded into a key for `radiometric_disagreement`; `SharedInputs.changes` splits
+the same key, which counts from 0."""
 
 
 @settings
@@ -59,7 +61,7 @@ class Schedule:
 
     @property
     def is_zero(self) -> bool:
-        """Whether the term never counts."""
+        """Whether the weight is zero throughout the stage."""
         return self.value == 0 and not self.end
 
 
@@ -75,7 +77,8 @@ class Objective:
     """Splats, each with a direction, at which learned and sampled radiance are compared in one
     step."""
     background: Literal["pixel", "view", "black"] = "pixel"
-    """Behind both images: one random colour per pixel (as the authors), one per view, or black."""
+    """Background of render and photograph: one random colour per pixel (as in the authors' code),
+    one per view, or black."""
     srgb: bool = False
     """Compare encoded instead of linear colours."""
     relative_albedo: Share = 0.0
@@ -90,11 +93,11 @@ class ImagePair(NamedTuple):
 
     Attributes
     ----------
-    predicted, target : (V, H, W, 3) as they are compared.
-    alpha, mask : (V, H, W) coverage, and what it should be.
-    valid : (V, H, W) pixels that count, or None.
+    predicted, target : (V, H, W, 3) render and photograph over the background.
+    alpha, mask : (V, H, W) coverage of the render, and mask of the photograph.
+    valid : (V, H, W) pixels that count, 0 or 1; None where all do.
     mse : () mean squared difference of the linear images.
-    is_encoded : whether the images are as a screen shows them.
+    is_encoded : whether the images are in sRGB; otherwise they are linear.
     """
 
     predicted: Float[Array, "V H W 3"]
@@ -115,16 +118,16 @@ class ImagePair(NamedTuple):
 
 @dataclass(frozen=True)
 class ViewInputs:
-    """What the terms of a single view are made from.
+    """Inputs of the loss terms of a single view.
 
     Attributes
     ----------
     view : batch of one view.
-    output : its images.
-    rgb : (1, H, W, 3) premultiplied, exposed and tone mapped.
-    log_exposure : () of the render.
+    output : rendered images of the view.
+    rgb : (1, H, W, 3) the render, premultiplied, exposed and tone mapped.
+    log_exposure : () natural logarithm of the exposure.
     objective : as in the pipeline.
-    key : of the background.
+    key : random key of the background.
     """
 
     view: Batch
@@ -136,7 +139,7 @@ class ViewInputs:
 
     @cached_property
     def pair(self) -> ImagePair:
-        """Both images over one background."""
+        """Render and photograph over the same background."""
         objective = self.objective
         background = random_background(
             self.key, self.rgb.shape, self.rgb.dtype, objective.background
@@ -218,7 +221,23 @@ def compare(
     *,
     srgb: bool,
 ) -> ImagePair:
-    """Lay premultiplied ``rgb`` and a photograph with straight alpha over one background."""
+    """Lay a render and a photograph over the same background.
+
+    Differentiable in ``rgb`` and ``alpha``.
+
+    Parameters
+    ----------
+    rgb : (V, H, W, 3) render, linear, premultiplied, exposed and tone mapped.
+    alpha : (V, H, W) coverage of the render.
+    image : (V, H, W, 4) photograph, linear RGB with straight alpha.
+    background : (V, H, W, 3) linear.
+    valid : (V, H, W) pixels that count, 0 or 1; None where all do.
+    srgb : static; whether to encode both images in sRGB. The mean squared difference stays linear.
+
+    Returns
+    -------
+    `ImagePair` of the V views.
+    """
     mask = image[..., 3]
     predicted = rgb + (1.0 - alpha)[..., None] * background
     target = mask[..., None] * image[..., :3] + (1.0 - mask)[..., None] * background
@@ -246,12 +265,12 @@ def image_l1(images: ImagePair) -> Float[Array, ""]:
 def image_dissimilarity(images: ImagePair) -> Float[Array, ""]:
     """One minus the structural similarity of the images (Eq. 13).
 
-    The mean is over the windows all of whose pixels count, as for an image that ends there.
+    Only windows all of whose pixels count enter the mean, as if the images ended there.
     """
     predicted, target, valid = images.predicted, images.target, images.valid
     if valid is None:
         return 1.0 - jnp.mean(jax.vmap(ssim)(predicted, target))
-    # Whatever the others hold, it must not reach the sums, not even as a NaN.
+    # Values of pixels that do not count must not reach the sums, not even as a NaN.
     predicted, target = (jnp.where(valid[..., None] > 0, x, 0.0) for x in (predicted, target))
     each = jax.vmap(lambda a, b, counts: ssim(a, b, valid=counts))(predicted, target, valid)
     return 1.0 - jnp.mean(each)
@@ -269,14 +288,23 @@ def light_agreement(
     image: Float[Array, "V H W 4"],
     valid: Float[Array, "V H W"] | None = None,
 ) -> Float[Array, ""]:
-    """Tie the demodulated light to the image's value inside the mask (Eq. 18).
+    """Mean absolute difference between light and the value (HSV) of the photograph (Eq. 18).
+
+    The light is the mean over the channels of the sum of both lobes, exposed and tone mapped as the
+    render is; the value is that over black. Differences are weighted by the mask, and averaged over
+    all pixels that count.
 
     Parameters
     ----------
-    diffuse : diffuse light without albedo.
-    specular_radiance : what the specular lobe adds, its Fresnel factor and tint included.
-    log_exposure : the sum is exposed and tone mapped as the render is.
-    image : photograph with straight alpha. valid : pixels that count.
+    diffuse : (V, H, W, 3) light of the diffuse lobe, without albedo, linear.
+    specular_radiance : (V, H, W, 3) radiance of the specular lobe, with its Fresnel factor.
+    log_exposure : () natural logarithm of the exposure.
+    image : (V, H, W, 4) photograph, linear RGB with straight alpha.
+    valid : (V, H, W) pixels that count, 0 or 1; None where all do.
+
+    Returns
+    -------
+    () not negative.
     """
     light = jnp.mean(tone_map(diffuse + specular_radiance, log_exposure), axis=-1)
     mask = image[..., 3]
@@ -294,7 +322,7 @@ def indirect_magnitude(asset: Asset) -> Float[Array, ""]:
 
 
 def radiometric_disagreement(x: SharedInputs) -> Float[Array, ""]:
-    """See `Transport.disagreement`; 0 where points learn nothing of what they send out."""
+    """See `Transport.disagreement`; 0 where points learn no outgoing radiance."""
     key = jax.random.fold_in(x.key, _RADIOMETRIC_STREAM)
     return x.transport.disagreement(
         key,
@@ -316,9 +344,10 @@ def mean_metallic(metallic: Float[Array, " N"], mask: Bool[Array, " N"]) -> Floa
 
 
 def metallic_mixture(metallic: Float[Array, " N"], mask: Bool[Array, " N"]) -> Float[Array, ""]:
-    """Average m (1 - m) over the splats: surfaces are metals or dielectrics, seldom between.
+    """Mean of m (1 - m) over the splats with metallic m, () in [0, 1/4]; 0 without splats.
 
-    What the photographs leave open goes to the nearer of both; a clear metal loses nothing.
+    As a penalty it makes metals or dielectrics of splats in between, whichever is nearer, where the
+    photographs leave it open. Splats with metallic 0 or 1 cost nothing.
     """
     return mean_metallic(metallic * (1.0 - metallic), mask)
 
@@ -351,10 +380,10 @@ def light_cast(radiance: Float[Array, "H W 3"]) -> Float[Array, ""]:
 
 
 def light_smoothness(radiance: Float[Array, "H W 3"]) -> Float[Array, ""]:
-    """Mean absolute difference of the logarithms of neighbouring texels, around and upwards.
+    """Mean absolute difference of the logarithms of neighbouring texels, along rows and columns.
 
-    A sun costs the logarithm of its contrast along its rim, so that it may stay; noise costs
-    everywhere. Each texel counts by its solid angle.
+    Each texel counts by its solid angle. A sun costs little, the logarithm of its contrast along
+    its rim only, while noise costs in every texel.
     """
     values = safe_log(radiance)
     weight = _solid_angle_shares(radiance)
@@ -364,7 +393,7 @@ def light_smoothness(radiance: Float[Array, "H W 3"]) -> Float[Array, ""]:
 
 
 def _solid_angle_shares(radiance: Float[Array, "H W 3"]) -> Float[Array, "H W"]:
-    """Parts of the sphere that texels cover."""
+    """Share of the sphere that each texel covers."""
     solid_angles = texel_solid_angles(*radiance.shape[:2])
     return (solid_angles / (4 * math.pi)).astype(radiance.dtype)
 
@@ -376,10 +405,24 @@ def edge_aware_smoothness(
     *,
     relative: float = 0.0,
 ) -> Float[Array, ""]:
-    """Differences of neighbouring pixels inside the mask, where the photograph has no edge.
+    """Mean difference of neighbouring pixels inside the mask, less at edges of the photograph.
 
-    ``relative`` : power of twice the mean inside the mask by which differences are divided, channel
-    by channel: 0 leaves them absolute, 1 makes them independent of brightness.
+    The absolute difference of a pair of pixels, summed over channels, is multiplied by
+    ``exp(-edge)``, where the edge is the mean absolute difference of their colours in the
+    photograph.
+
+    Parameters
+    ----------
+    values : (V, H, W, c) image to be smooth.
+    image : (V, H, W, 4) photograph, linear RGB with straight alpha.
+    valid : (V, H, W) pixels that count, 0 or 1; None where all do.
+    relative : differences are divided by twice the mean of the values inside the mask, raised to
+        this power, channel by channel: 0 leaves them absolute, 1 makes them independent of
+        brightness.
+
+    Returns
+    -------
+    () sum of the means over pairs along rows and along columns.
     """
     inside = image[..., 3] if valid is None else image[..., 3] * valid
     total = jnp.sum(inside[..., None] * values, axis=(0, 1, 2))
@@ -422,8 +465,8 @@ VIEW_TERMS: dict[str, Callable[[ViewInputs], Float[Array, ""]]] = {
 """Terms of a single view by the name of their weight; the loss takes their mean over the views."""
 
 PIXEL_MEANS = frozenset({"l1", "ssim", "mask", "encoded_l1", "encoded_ssim", "light"})
-"""Those that are means over all pixels that count, so that empty borders make them smaller. The
-others are means inside the mask."""
+"""Terms of a view that are means over all pixels that count, so that empty borders make them
+smaller. The other terms of a view are means inside the mask."""
 
 SHARED_TERMS: dict[str, Callable[[SharedInputs], Float[Array, ""]]] = {
     "smoothness_albedo": lambda x: x.changes.albedo,  # Eq. 15-17
@@ -446,16 +489,16 @@ TERM_AOVS: dict[str, tuple[str, ...]] = {
     "normal_smoothness": ("normal",),
     "albedo_smoothness": ("albedo",),
 }
-"""Extra images that a term of a view looks at."""
+"""Extra images that a term of a view uses."""
 
 
 def term_names() -> tuple[str, ...]:
-    """Name all terms that every surface has; a term is known as soon as it is in a table."""
+    """Name all terms except the penalties of surfaces: those in the two tables above."""
     return (*VIEW_TERMS, *SHARED_TERMS)
 
 
 def term_aovs(names: Iterable[str]) -> tuple[str, ...]:
-    """List the extra images that some terms look at."""
+    """List the extra images that some terms use."""
     return tuple(dict.fromkeys(aov for name in names for aov in TERM_AOVS.get(name, ())))
 
 
@@ -465,7 +508,7 @@ def view_terms(x: ViewInputs, names: Iterable[str]) -> dict[str, Float[Array, ""
 
 
 def shared_terms(x: SharedInputs, names: Iterable[str]) -> dict[str, Float[Array, ""]]:
-    """Compute the terms among ``names`` that belong to no view, unweighted.
+    """Compute the terms among ``names`` that do not depend on a view, unweighted.
 
     Raises
     ------

@@ -41,16 +41,16 @@ MATERIAL_PRIORS: dict[str, tuple[float, float]] = {
     "glossy": (-3.0, 0.0),
     "neutral": (-1.2, -1.0),
 }
-"""First (roughness, metallic) logits by a guess about the material.
+"""Initial logits (roughness, metallic) for a guess about the material, by name.
 
-Those of the authors' code, and ``neutral``, which starts at roughness .31 and metallic .27, nearer
-to what most objects are. A logit of 0 starts at roughness 0.55 or metallic 0.5; one of -3 at
-roughness 0.14 or metallic 0.05.
+All but ``neutral`` are those of the authors' code. ``neutral`` starts at roughness .31 and metallic
+.27, which is nearer to most objects. A logit of 0 starts at roughness 0.55 or metallic 0.5; one of
+-3 at roughness 0.14 or metallic 0.05.
 """
 
 
 Width = Annotated[int, Field(ge=1, le=1024)]
-"""Numbers between two layers of a head."""
+"""Width of a hidden layer of a head."""
 
 
 @settings
@@ -76,14 +76,14 @@ class MaterialSpec:
     `MATERIAL_PRIORS`."""
     specular: Literal["none", "uniform", "field"] = "field"
     """The specular lobe: ``none``, ``uniform`` with a single learned roughness, or ``field`` with a
-    roughness that varies over the surface. Without it the surface is Lambertian and has no
+    roughness that varies over the surface. With ``none`` the surface is Lambertian and has no
     metallic."""
     has_metallic: bool = True
-    """Without it metallic is zero and has no parameters."""
+    """Whether metallic is learned; otherwise it is zero and has no parameters."""
     has_shift: bool = True
     """Whether there is a head for the inward shift of splats."""
     initial_shift_logit: Number = 0.0
-    """Added to the raw shift; the sigmoid of it is where the shift starts, near 1/2 at zero."""
+    """Added to the raw shift: the shift starts near the sigmoid of this, which is 1/2 for zero."""
     position_gradient: bool = False
     """Whether attributes pull on the geometry: the field is differentiated in the positions. Off,
     the gradient takes attributes as fixed to the moving surface. On in the paper's and the authors'
@@ -110,11 +110,13 @@ class MaterialField(eqx.Module):
     albedo_table : (E, F) encoding of albedo and indirect light, or of everything when shared.
     surface_table : (E, F) encoding of roughness, metallic and shift; None when shared, or where
         there is none of these.
-    albedo_head : 3 outputs. surface_head : roughness and metallic, those of them that vary over the
-        surface, or None.
-    shift_head : 1 output or None. indirect_head : learned indirect light, or None.
-    roughness_logit : () added to the initial logit of a roughness that is the same everywhere, or
-        None.
+    albedo_head : 3 outputs.
+    surface_head : outputs roughness and metallic, as far as they vary over the surface; None where
+        neither does.
+    shift_head : 1 output; None without shift.
+    indirect_head : outputs the numbers of learned indirect light; None where none is learned.
+    roughness_logit : () added to the initial logit of a roughness that is the same everywhere; None
+        where roughness varies or there is no specular lobe.
     """
 
     albedo_table: Float[Array, "E F"] = learned("albedo")
@@ -127,12 +129,12 @@ class MaterialField(eqx.Module):
 
 
 class Attributes(eqx.Module):
-    """What a field says about N points.
+    """Attributes of N points.
 
     Attributes
     ----------
-    materials : albedo in (0, 1), roughness in [0.1, 1] and metallic in (0, 1), or 0 for a field
-        without metallic; roughness 1 and metallic 0 for one without a specular lobe.
+    materials : albedo in (0, 1), roughness in [0.1, 1] and metallic in (0, 1). A field without
+        metallic has metallic 0; one without a specular lobe has roughness 1 and metallic 0.
     shift : (N,) share in (0, 1) of ``sqrt(face area)`` by which a splat sinks below its face,
         ``sigmoid(z(mu))``, starting near 1/2 (see `MaterialSpec.initial_shift_logit`); None for a
         field without shift. Not differentiable in the points.
@@ -147,7 +149,7 @@ class Attributes(eqx.Module):
 def init_materials(
     key: Key[Array, ""], spec: MaterialSpec, *, indirect_outputs: int = 0
 ) -> MaterialField:
-    """Draw the parameters of a field: nearly constant attributes at the initial logits.
+    """Draw the parameters of a field whose attributes are nearly constant, at the initial logits.
 
     ``indirect_outputs`` : learned numbers of indirect light per point; 0 for no such head.
     """
@@ -225,7 +227,7 @@ def attributes_at(
 def _surface_attributes(
     field: MaterialField, features: Float[Array, "N W"], spec: MaterialSpec
 ) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
-    """Evaluate roughness and metallic; what the model lacks is 1 and 0."""
+    """Evaluate roughness and metallic; a model without them has roughness 1 and metallic 0."""
     one, zero = jnp.ones_like(features[:, 0]), jnp.zeros_like(features[:, 0])
     if spec.specular == "none":
         return one, zero
@@ -295,13 +297,14 @@ def smoothness(
 
     Parameters
     ----------
-    points : (M, 3) world. mask : (M,) false for padding.
-    key : for the displacements.
-    box, spec : see `attributes_at`.
-    std : in units of half the box.
-    relative : power of twice the albedo's mean over both sets of points by which its changes are
-        divided, channel by channel: with 0 they are those of Eq. 17, with 1 a darker albedo in a
-        brighter light is no smoother.
+    field, box, spec : see `attributes_at`.
+    points : (M, 3) world.
+    mask : (M,) false for padding.
+    key : random key of the displacements.
+    std : standard deviation of a displacement along each axis, in units of half the box's side.
+    relative : the change of the albedo is divided by twice the mean of the albedo over both sets of
+        points, raised to this power, channel by channel: 0 gives Eq. 17; with 1 a darker albedo
+        does not count as smoother.
     """
     # Drawn in float32 at any precision, so that a run in float64 sees the same numbers.
     noise = jax.random.normal(key, points.shape, jnp.float32).astype(points.dtype)

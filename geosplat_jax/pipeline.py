@@ -40,11 +40,11 @@ _RESIDUAL_STREAM = 2**31 + 2
 
 
 class ViewReport(eqx.Module):
-    """What one view, or the mean of several, says about itself.
+    """Report about one view, or the mean over several views.
 
     Attributes
     ----------
-    terms : unweighted, by name.
+    terms : unweighted terms of the loss, by name.
     mse : () mean squared difference of the linear images.
     usage : true needs of the view's buffers.
     """
@@ -54,7 +54,7 @@ class ViewReport(eqx.Module):
     usage: Usage
 
     def times(self, share: Float[Array, ""]) -> "ViewReport":
-        """Scale what is averaged."""
+        """Multiply terms and squared difference by the share of a view in a mean."""
         terms = {name: share * term for name, term in self.terms.items()}
         return ViewReport(terms, share * self.mse, self.usage)
 
@@ -65,7 +65,7 @@ class ViewReport(eqx.Module):
 
 
 class LossReport(eqx.Module):
-    """What a step says about itself.
+    """Report about a training step.
 
     Attributes
     ----------
@@ -150,7 +150,7 @@ class Pipeline(RenderPipeline):
     def residual_lights(
         self, asset: Asset, light: EnvLight, seen: Bool[Array, " N"] | None, batch: Batch
     ) -> Illumination | None:
-        """Prepare the light with other samples, as constants, for `residual_image`.
+        """Prepare the light with other samples for `residual_image`; not differentiable.
 
         None where the residual comes from the image that is differentiated.
         """
@@ -204,12 +204,17 @@ class Pipeline(RenderPipeline):
 
         Parameters
         ----------
-        log_exposure : of the parameters.
+        log_exposure : () that of the parameters.
         asset, lights : see `reconstruct` and `lights`.
         lists : what the view can see, see `visible`.
-        view : see `Batch.view`.
-        residual : image whose values are taken in place of the rendered ones, see
-            `residual_image`; None for those.
+        view : batch of one view, see `Batch.view`.
+        residual : (1, H, W, 3) image that replaces the values of the rendered image, but not its
+            derivative, see `residual_image`; None to use the rendered image for both.
+
+        Returns
+        -------
+        value : () weighted sum of the view's terms.
+        report : see `ViewReport`.
         """
         background_key, sample_key = jax.random.split(view.key)
         output = self.render_view(

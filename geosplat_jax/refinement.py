@@ -32,14 +32,14 @@ from geosplat_jax.materials import Attributes
 from geosplat_jax.surface.base import Surface
 
 _LEAST = 0.01
-"""Albedo is shown within [0.01, 0.99]. The authors' code keeps the parameter there; here it may
-leave, and comes back by its gradient."""
+"""Albedo is clipped to [0.01, 0.99] when it is used. The authors' code clips the parameter itself;
+here the parameter may leave the range, and its gradient can bring it back."""
 
 _FAINTEST = 1e-4
-"""First opacities are kept this far from 0 and 1, where the logit ends."""
+"""Initial opacities are kept this far from 0 and 1, where the logit is infinite."""
 
 _OFF_THE_EDGE = 0.01
-"""Rays start so far within the edges of a face, as a share of its size."""
+"""Share by which faces are shrunk about their centres, so that rays start off their edges."""
 
 
 class FreeSplatParameters(eqx.Module):
@@ -48,11 +48,11 @@ class FreeSplatParameters(eqx.Module):
     Attributes
     ----------
     means : (N, 3) in half sides of the box, from its centre.
-    log_scales : (N, 3) natural logarithms, of the same unit.
+    log_scales : (N, 3) natural logarithms of the standard deviations, in half sides of the box.
     quats : (N, 4) (w, x, y, z), of any length.
     normals : (N, 3) shading normals, of any length.
     opacity_logits : (N,).
-    albedo : (N, 3) linear; what lies outside [0.01, 0.99] is shown at the border.
+    albedo : (N, 3) linear; clipped to [0.01, 0.99] when it is used.
     indirect : (N, c) logits of indirect light (see `transport.indirect`); None where none is
         learned.
     """
@@ -82,13 +82,13 @@ RATE_GROUPS = (
 
 
 def free(splats: Splats, attributes: Attributes, box: Box) -> FreeSplatParameters:
-    """Turn splats on a mesh into parameters that say the same.
+    """Turn splats on a mesh into parameters that reproduce them.
 
     Parameters
     ----------
     splats : six of every face, in the order of the faces (`adapter.face_splats`).
-    attributes : of the same rows.
-    box : of the scene.
+    attributes : those of the splats.
+    box : the box of the scene.
     """
     opacities = jnp.clip(splats.opacities, _FAINTEST, 1.0 - _FAINTEST)
     return FreeSplatParameters(
@@ -103,7 +103,7 @@ def free(splats: Splats, attributes: Attributes, box: Box) -> FreeSplatParameter
 
 
 def _kept_within(values: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Clip to where an albedo lies; the gradient is that of the identity, so values come back."""
+    """Clip an albedo to [0.01, 0.99], with the gradient of the identity: values can come back."""
     return values + jax.lax.stop_gradient(jnp.clip(values, _LEAST, 1.0 - _LEAST) - values)
 
 
@@ -202,12 +202,12 @@ class FreeSplatSettings(SplatSettings, kind="free"):
 
     @property
     def takes_over(self) -> bool:
-        """A splat belongs to a face by its row."""
+        """True: the row of a splat says which face it belongs to."""
         return True
 
     @property
     def is_six_per_face(self) -> bool:
-        """A splat keeps the row that it began in."""
+        """True: a splat keeps its initial row."""
         return True
 
     def begin(

@@ -106,9 +106,9 @@ class Asset(eqx.Module):
 
     Attributes
     ----------
-    surface : with its mesh.
-    splats : N of them on it.
-    attributes : of the N splats.
+    surface : the extracted surface, with its mesh.
+    splats : N splats on the surface.
+    attributes : those of the N splats.
     index : the surface as rays see it; None where no rays are traced.
     usage : true needs of the buffers so far.
     """
@@ -182,10 +182,17 @@ class ShadingDomain(Variant, abc.ABC):
 
         Parameters
         ----------
-        key : of the samples that depend on the viewer.
-        asset, illumination : what is seen, and in which light.
+        pipeline : whose transport, projection and blending are used.
+        key : random key of the samples that depend on the viewer; None for a transport that draws
+            none.
+        asset, illumination : the asset, and its light as `Transport.prepare` returned it.
         lists, camera : what the view can see, and its camera.
-        names : of extra images, some of `AOV_CHANNELS`.
+        names : static; names of extra images, some of `AOV_CHANNELS`.
+
+        Returns
+        -------
+        images : (H, W, c) each, by name, premultiplied.
+        alpha : (H, W) coverage.
         """
 
 
@@ -268,7 +275,7 @@ class RenderPipeline(eqx.Module):
         return replace(self, compositor=composite_tiles_forward)
 
     def unlit(self) -> "RenderPipeline":
-        """Return a pipeline that builds the same assets and lists, whatever the light transport."""
+        """Return the pipeline without its light transport; it builds the same assets and lists."""
         return replace(self, transport=Unlit(self.transport.uses_rays))
 
     @property
@@ -280,7 +287,7 @@ class RenderPipeline(eqx.Module):
         """Build surface, splats and attributes: all that depends on neither light nor view."""
         surface = self.surface.extract(params.geometry, capacities=self.capacities)
         splats = self.splats.place(surface, params.splats, self.surface.box)
-        # Attributes belong to the surface, where a baked texture will be looked up, not to the
+        # Attributes are looked up on the surface, where a baked texture will be, and not at the
         # splat below it.
         attributes = attributes_at(
             params.material, splats.anchors, self.surface.box, spec=self.fields
@@ -381,7 +388,7 @@ class RenderPipeline(eqx.Module):
         aov_names: tuple[str, ...] = (),
         key: Key[Array, ""] | None = None,
     ) -> RenderOutput:
-        """Render a prepared light from a single camera; see `visible` and `render_views`."""
+        """Render an asset under a prepared light from one camera; see `visible`, `render_views`."""
         _require_known(aov_names)
         names = tuple(dict.fromkeys(aov_names + self.transport.filter_inputs))
         images, alpha = self.domain.images(self, key, asset, illumination, lists, camera, names)
@@ -418,9 +425,16 @@ class RenderPipeline(eqx.Module):
 
         Parameters
         ----------
+        asset : from `reconstruct`.
+        light : the environment.
+        camera : V views.
         aov_names : static; some of `AOV_CHANNELS`.
-        key : of all samples; a transport without samples needs none.
-        carry : what the transport kept from the step before.
+        key : random key of all samples; None for a transport that draws none.
+        carry : state that the transport returned in the step before, or None.
+
+        Returns
+        -------
+        `RenderOutput` of the V views.
 
         Raises
         ------

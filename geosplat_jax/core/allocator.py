@@ -1,7 +1,8 @@
 """How the memory allocator of this process treats freed memory.
 
-Light, so that a command can set it before it imports or starts anything. Only commands and
-benchmarks call `retain_freed_memory`: a library must not change its host process.
+This module imports nothing heavy, so that a command can call it before it imports JAX or starts a
+thread. Only commands and benchmarks call `retain_freed_memory`: a library must not change its host
+process.
 """
 
 import ctypes
@@ -25,9 +26,11 @@ def retain_freed_memory() -> bool:
     """Make glibc reuse freed memory instead of returning it; False where that is impossible.
 
     XLA allocates the temporaries of a program anew for every call. glibc maps and unmaps large
-    ones each time, and the page faults cost a tenth to a fifth of a training step. Call it before
-    the first thread is started: glibc gives a thread an arena of its own until it is told not to,
-    and puts later threads into that one, too; but only the first arena holds large blocks.
+    ones each time, and the page faults cost a tenth to a fifth of a training step.
+
+    Call it before the first thread starts. A thread that started earlier has an arena of its own,
+    into which glibc then puts later threads as well, and only the first arena can hold large
+    blocks.
     """
     libc = _glibc()
     return libc is not None and all(libc.mallopt(*option) for option in _RETAINING.items())

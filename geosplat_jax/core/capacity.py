@@ -19,14 +19,14 @@ _LADDER_RATIO = 1.1
 _LADDER_STEP = 128
 _SHRINK_BELOW = 0.5
 UNSIZED = 1024
-"""Rows of a buffer that nobody has sized yet."""
+"""Rows of a buffer whose size has not been set."""
 
 
 class Capacities(Mapping[str, int]):
     """Static sizes of bounded buffers by name; hashable, so that it can be a static jit argument.
 
-    Whoever compacts names its own buffer and asks for ``capacities[name]``; one that was never
-    sized has `UNSIZED` rows. The package's own:
+    Code that fills a buffer chooses its name, and reads its size as ``capacities[name]``; a buffer
+    whose size has not been set has `UNSIZED` rows. The buffers of the package are:
 
     - ``surface_cubes`` : grid cells that the isosurface passes through;
     - ``dual_vertices`` : dual vertices of those cells (one to four per cell);
@@ -35,9 +35,10 @@ class Capacities(Mapping[str, int]):
     - ``hits`` : pairs of a visible splat and a tile it may touch, in one view;
     - ``chunks`` : groups of consecutive hits of one tile, in one view;
     - ``cell_patches`` : pairs of a grid cell and a quad that may touch it, for tracing rays;
-    - ``triangle_boxes``, ``triangle_cells``, ``cell_triangles`` : the same for any triangles: pairs
-      of a triangle and a cell that its bounding box meets, those that may truly touch, and the
-      triangles of the fullest cell.
+    - ``triangle_boxes`` : pairs of a triangle and a cell that its bounding box meets, for tracing
+      rays against a mesh without a grid;
+    - ``triangle_cells`` : those of these pairs whose triangle may touch the cell;
+    - ``cell_triangles`` : triangles that the fullest cell lists.
     """
 
     def __init__(self, **sizes: int) -> None:
@@ -71,10 +72,11 @@ class Capacities(Mapping[str, int]):
 
 
 Usage = dict[str, Int[Array, ""]]
-"""True int32 needs of bounded buffers by name (see `Capacities`); a part lists its own only."""
+"""True needs of bounded buffers by name (see `Capacities`), () int32 each. Every part of a program
+reports only the buffers that it fills itself."""
 
 Counts = Mapping[str, Int[Array, ""] | Int[np.ndarray, ""] | int]
-"""The same on the host."""
+"""True needs of bounded buffers by name, as numbers that the host can read."""
 
 
 def usage(**counts: Int[Array, ""]) -> Usage:
@@ -83,7 +85,7 @@ def usage(**counts: Int[Array, ""]) -> Usage:
 
 
 def combine(*usages: Usage) -> Usage:
-    """Largest need of every buffer: that of a computation that runs all parts."""
+    """Largest need of every buffer over several parts: the need of a program that runs them all."""
     names = sorted({name for part in usages for name in part})
     return {
         name: jnp.max(jnp.stack([part[name] for part in usages if name in part])) for name in names
@@ -121,9 +123,10 @@ def grow(capacities: Capacities, needed: Counts, *, headroom: float = 1.2) -> Ca
 
 
 def shrink(capacities: Capacities, needed: Counts, *, headroom: float = 1.25) -> Capacities:
-    """Capacities with generous buffers cut down, where less than half of them is in use.
+    """Capacities in which every buffer that is less than half full becomes smaller.
 
-    Call rarely, with the largest usage seen over many steps: every change costs a compilation.
+    Its new size is the smallest of the ladder that holds ``headroom`` times its need. Call rarely,
+    with the largest usage seen over many steps: every change costs a compilation.
     """
     smaller = {}
     for name, count in needed.items():
@@ -145,7 +148,7 @@ def tightened(capacities: Capacities, needed: Counts, *, headroom: float = 1.1) 
 
 
 def largest(first: Counts | None, second: Counts | None) -> dict[str, int]:
-    """Larger of two counts of every buffer (host side); None counts nothing."""
+    """Larger of two counts for every buffer (host side); None stands for no counts."""
     first, second = first or {}, second or {}
     names = sorted({*first, *second})
     return {name: max(int(first.get(name, 0)), int(second.get(name, 0))) for name in names}
@@ -160,18 +163,18 @@ def retry(
     *,
     headroom: float = 1.2,
 ) -> tuple[_Result, Capacities]:
-    """Call ``attempt`` with growing capacities until everything it needed fitted (host side).
+    """Call ``attempt`` with growing capacities until all of its buffers fit (host side).
 
     Parameters
     ----------
-    attempt : takes capacities; returns a result, and what it truly needed.
-    capacities : to begin with.
+    attempt : function of the capacities that returns a result and the true needs of its buffers.
+    capacities : those of the first attempt.
     headroom : see `grow`.
 
     Returns
     -------
-    result : of the first attempt that fitted; the others are dropped.
-    capacities : that it ran with.
+    result : that of the first attempt whose buffers fit; earlier results are discarded.
+    capacities : those of that attempt.
     """
     while True:
         result, needed = attempt(capacities)

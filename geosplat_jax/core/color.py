@@ -10,7 +10,7 @@ _SRGB_KNEE_LINEAR = 0.0031308
 _SRGB_KNEE_ENCODED = 0.04045
 
 _LARGEST_LOG_EXPOSURE = 60.0
-"""Beyond it exposed radiance of 1e5 would leave float32 (e^60 = 1e26)."""
+"""Largest logarithm of an exposure: e^60 = 1e26 times a radiance of 1e5 is finite in float32."""
 
 
 def linear_to_srgb(linear: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -38,7 +38,8 @@ def expose(rgb: Float[Array, "... 3"], log_exposure: Float[Array, ""]) -> Float[
     Parameters
     ----------
     rgb : (..., 3) linear radiance.
-    log_exposure : () natural logarithm of the exposure; held, with zero gradient, above 60.
+    log_exposure : () natural logarithm of the exposure; values above 60 count as 60, and have no
+        gradient.
     """
     return jnp.exp(jnp.minimum(log_exposure, _LARGEST_LOG_EXPOSURE)) * rgb
 
@@ -55,7 +56,8 @@ def tone_map(
     Parameters
     ----------
     rgb : (..., 3) linear radiance.
-    log_exposure : () natural logarithm of the exposure; held, with zero gradient, above 60.
+    log_exposure : () natural logarithm of the exposure; values above 60 count as 60, and have no
+        gradient.
     sharpness : the beta of the softplus.
     """
     headroom = 1.0 - expose(rgb, log_exposure)

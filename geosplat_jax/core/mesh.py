@@ -8,9 +8,10 @@ from geosplat_jax.core.types import Mesh
 
 
 def _doubled_area_vectors(mesh: Mesh) -> Float[Array, "3 Cf"]:
-    """Cross product of two edges of every face, zero on padding; one row a component.
+    """Cross product of two edges of every face, one row per component; zero on padding.
 
-    Components come first, so that the arithmetic runs along contiguous faces.
+    Its length is twice the area of the face. Components come first, so that the arithmetic runs
+    along contiguous faces.
     """
     corners = mesh.vertices.at[mesh.faces.T].get(mode="clip")
     a, b, c = jnp.moveaxis(corners, -1, 1)
@@ -28,7 +29,13 @@ def face_normals_and_areas(
 ) -> tuple[Float[Array, "Cf 3"], Float[Array, " Cf"]]:
     """Compute unit outward normals and areas of the faces.
 
-    Both are zero on padding, and on faces without area, where their gradient is zero too.
+    Differentiable in the vertices. Both are zero on padding and on faces without area, where their
+    gradient is zero too.
+
+    Returns
+    -------
+    normals : (Cf, 3) unit.
+    areas : (Cf,) square world units.
     """
     vectors = _doubled_area_vectors(mesh)
     return safe_normalize(vectors, axis=0).T, 0.5 * safe_norm(vectors, axis=0)
@@ -64,7 +71,7 @@ def closest_on_faces(
     projected = points.T - jnp.sum(away[:, 0] * normals, axis=0, keepdims=True) * normals
     inwards = jnp.cross(normals[:, None, :], edges, axis=0)
     is_within = jnp.all(jnp.sum(inwards * away, axis=0) >= 0.0, axis=0)
-    is_within &= jnp.any(normals != 0.0, axis=0)  # without area it has edges only
+    is_within &= jnp.any(normals != 0.0, axis=0)  # a face without area has only edges
     part = safe_divide(jnp.sum(away * edges, axis=0), jnp.sum(edges * edges, axis=0))
     on_edges = corners + jnp.clip(part, 0.0, 1.0)[None] * edges
     first, second, third = jnp.sum((points.T[:, None, :] - on_edges) ** 2, axis=0)

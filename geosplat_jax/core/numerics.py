@@ -27,8 +27,8 @@ def _divide(numerator, denominator):
 
 @_divide.defjvp
 def _divide_jvp(primals, tangents):
-    # JAX's own rule squares the denominator, which leaves float32 below 1e-19 (0 * inf = NaN) and
-    # above 1e19 (the term is lost); this form never does.
+    # JAX's own rule squares the denominator. In float32 the square underflows below 1e-19, which
+    # gives 0 * inf = NaN, and overflows above 1e19, which loses the term. This form has no square.
     (_, denominator), (d_numerator, d_denominator) = primals, tangents
     quotient = _divide(*primals)
     return quotient, (d_numerator - quotient * d_denominator) / denominator
@@ -51,10 +51,10 @@ def safe_divide(
 
 
 def absolute(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Magnitude, with gradient 0 at 0, in the middle of both slopes.
+    """Magnitude of ``x``, with gradient 0 at 0, the mean of the slopes on both sides.
 
-    JAX gives +1 there, so that whatever starts at exactly zero, like the weights of an isosurface,
-    is pushed to the negative side by its own magnitude.
+    The gradient of `jax.numpy.abs` is +1 there: a penalty on magnitudes would push parameters that
+    start at exactly zero, such as the weights of an isosurface, to the negative side.
     """
     return x * jax.lax.stop_gradient(jnp.sign(x))
 
@@ -80,7 +80,7 @@ def safe_power(x: Float[Array, "..."], exponent: float) -> Float[Array, "..."]:
 def safe_log(x: Float[Array, "..."], *, smallest: float = LENGTH_EPSILON) -> Float[Array, "..."]:
     """Logarithm of ``max(x, smallest)``; the gradient is zero where the floor is active.
 
-    What is not a number stays so.
+    A NaN stays a NaN.
     """
     return jnp.log(jnp.where(x <= smallest, smallest, x))
 
@@ -95,7 +95,7 @@ def safe_norm(
     """
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True))
     has_length = largest > 0
-    # XLA may multiply by the inverse, which is zero for the largest numbers.
+    # XLA may multiply by the reciprocal of the scale, which is zero for the largest numbers.
     largest = jnp.minimum(largest, float(jnp.finfo(x.dtype).max) ** _LARGEST_SCALE)
     scale = jnp.where(has_length, largest, 1.0)
     squared = jnp.sum((x / scale) ** 2, axis=axis, keepdims=True)
@@ -129,11 +129,12 @@ _ARCTAN_COEFFICIENTS = (
 
 
 def fast_arctan2(y: Float[Array, "..."], x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Angle of (x, y) in [-pi, pi], zero at the origin; within 3e-7 in float32.
+    """Angle of (x, y) in radians, in [-pi, pi]; zero at the origin. Float32 errs by at most 3e-7.
 
-    XLA calls the scalar library function, 36 ns a value on a CPU; in float32 this uses an odd
-    minimax polynomial of arctan on [0, 1], which vectorises (1 ns). Other precisions go to the
-    library. The gradient at the origin is not defined: wrap with `jax.custom_jvp`.
+    `jax.numpy.arctan2` calls a scalar library function, which takes 36 ns per value on a CPU. In
+    float32 this function evaluates an odd minimax polynomial of arctan on [0, 1] instead, which
+    vectorises (1 ns per value); other dtypes use the library. The gradient at the origin is not
+    defined: wrap with `jax.custom_jvp`.
     """
     if y.dtype != jnp.float32:
         return jnp.arctan2(y, x)

@@ -6,7 +6,8 @@ from jaxtyping import Array, Float
 from geosplat_jax.core.numerics import safe_norm, safe_normalize
 
 _SMALL_ANGLE = 1e-2
-"""Radians below which sines come from their series, exact to 1e-11 there."""
+"""Angle in radians below which `rotation_vector_to_matrix` uses Taylor series, whose error is below
+1e-11 there."""
 
 
 def quaternion_to_matrix(quats: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
@@ -27,9 +28,17 @@ def quaternion_to_matrix(quats: Float[Array, "... 4"]) -> Float[Array, "... 3 3"
 
 
 def rotation_vector_to_matrix(vector: Float[Array, " 3"]) -> Float[Array, "3 3"]:
-    """Rotation about the direction of ``vector`` by its length in radians (Rodrigues 1840).
+    """Convert a rotation vector to a rotation matrix (Rodrigues 1840).
 
-    The derivative is exact everywhere, at no rotation as well.
+    Differentiable everywhere; the derivative is exact also at the zero vector.
+
+    Parameters
+    ----------
+    vector : (3,) unit axis of the rotation times its angle in radians.
+
+    Returns
+    -------
+    (3, 3) rotation matrix.
     """
     squared = jnp.sum(vector * vector)
     is_small = squared < _SMALL_ANGLE**2
@@ -50,13 +59,15 @@ def axes_to_quaternion(
 ) -> Float[Array, "4 ..."]:
     """Convert orthonormal frames, components first, to unit quaternions (w, x, y, z).
 
-    The best conditioned of the four classical formulas is selected for each frame; the choice is
-    piecewise constant, so the sign of the result may jump between frames, never the rotation.
-    Axes of length zero give the identity. Selection by `where`, not by a gather, and components
-    first, because that keeps value and gradient inside fused loops (ten times faster).
+    The best conditioned of the four classical formulas is selected for each frame. The choice is
+    piecewise constant: the sign of the result may jump between frames, but not the rotation. Axes
+    of length zero give the identity.
+
+    Components come first, and the formula is selected by `where` instead of a gather: both keep
+    value and gradient inside fused loops, which is ten times faster.
     """
     (m00, m10, m20), (m01, m11, m21), (m02, m12, m22) = x_axis, y_axis, z_axis
-    # Each candidate is proportional to the quaternion; `square` is 4 times the leading component's.
+    # Each candidate is proportional to the quaternion; the squares are 4 w^2, 4 x^2, 4 y^2, 4 z^2.
     squares = (1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22)
     wx, wy, wz = m21 - m12, m02 - m20, m10 - m01
     xy, xz, yz = m10 + m01, m20 + m02, m21 + m12

@@ -30,10 +30,11 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 _CONFIG = ConfigDict(extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)
 
 NONE = "none"
-"""How people write that a setting has no value; JSON has null for it."""
+"""Word for a setting without a value on the command line and in TOML; JSON has null for it."""
 
 _SMALLEST, _LARGEST = 1e-30, 1e30
-"""Sizes of numbers other than 0, well within single precision, in which they are used."""
+"""Least and largest magnitude of a setting other than 0; both are well within the range of single
+precision, in which settings are used."""
 
 
 def _of_single_precision(value: float) -> float:
@@ -48,12 +49,12 @@ def _of_single_precision(value: float) -> float:
 
 
 def _infinite_or_of_single_precision(value: float) -> float:
-    """Refuse what `_of_single_precision` does, but for infinity."""
+    """Accept infinity; refuse other numbers as `_of_single_precision` does."""
     return value if math.isinf(value) else _of_single_precision(value)
 
 
 def _none_by_its_word(value: Any) -> Any:
-    """Let ``none`` be written where TOML and ``--set`` have no other word for it."""
+    """Read the word ``none`` as None: TOML and ``--set`` have no other way to write it."""
     return None if value == NONE else value
 
 
@@ -88,10 +89,10 @@ PositiveShare = Annotated[float, Field(gt=0, le=1), AfterValidator(_of_single_pr
 """A number above 0, up to 1."""
 
 _NESTED = "nested_settings"
-"""Type of an error whose text names its place with `_HERE`."""
+"""Type of an error about nested settings, in whose text `_HERE` stands for their path."""
 
 _HERE = "\0"
-"""Stands for the path of nested settings where only what lies within them is known."""
+"""Placeholder for the path of nested settings in messages that are written before it is known."""
 
 _Class = TypeVar("_Class")
 
@@ -169,6 +170,12 @@ def to_plain(value: Any) -> Any:
 def from_plain(kind: type[_Class], values: Any, where: str = "") -> _Class:
     """Build settings from what `to_plain` returned, possibly after a trip through JSON.
 
+    Parameters
+    ----------
+    kind : class of the settings.
+    values : their plain values.
+    where : path of these settings, with which the paths in messages begin.
+
     Raises
     ------
     ValueError
@@ -186,21 +193,21 @@ def as_written(value: Any) -> str:
 
 
 def first_line(error: Exception) -> str:
-    """Return the first line of an error, where one will do."""
+    """Return the first line of an error's text, for messages of a single line."""
     return str(error).partition("\n")[0]
 
 
 def _problems(error: ValidationError, where: str, names: Sequence[str] = ()) -> str:
     """Describe everything that pydantic refused, one line each.
 
-    ``names`` : of the fields, where values may have been given by their place.
+    ``names`` : the fields in their order, for values that were given by position.
     """
     details = error.errors(include_url=False)
     return "\n".join(line for detail in details for line in _lines(detail, where, names))
 
 
 def _lines(detail: Any, where: str, names: Sequence[str]) -> list[str]:
-    """Describe one thing that pydantic refused; settings of some kind may hold several."""
+    """Describe one error of pydantic; an error about a `Variant` may take several lines."""
     place = list(detail["loc"])
     if place and isinstance(place[0], int) and place[0] < len(names):
         place[0] = names[place[0]]
@@ -228,7 +235,7 @@ _LONGEST_VALUE = 200
 
 
 def _short(value: Any) -> str:
-    """Write a value, only its beginning where it is long."""
+    """Write a value, cut off after `_LONGEST_VALUE` characters."""
     text = repr(value)
     return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]} ..."
 
@@ -251,7 +258,7 @@ def listed(value: Any, where: str = "") -> Iterator[tuple[str, Any, str, str]]:
 
 
 def _meaning(kind: type, name: str) -> str:
-    """Return what stands below a field, in the class itself or in the one that it comes from."""
+    """Return the docstring of a field, from the class itself or from the base that declares it."""
     for base in kind.__mro__:
         field = getattr(base, "__pydantic_fields__", {}).get(name)
         if field is not None and field.description:

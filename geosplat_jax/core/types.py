@@ -66,17 +66,17 @@ def rate_groups(params: Any) -> list[str]:
 
 
 def without_gradient(params: Any, groups: tuple[str, ...]) -> Any:
-    """Take the parameters of some groups as constants."""
+    """Stop the gradients of the parameters whose learning rates ``groups`` name."""
     return _replaced(params, groups, jax.lax.stop_gradient)
 
 
 def zero_gradient(gradient: Any, groups: tuple[str, ...]) -> Any:
-    """Set the gradient of some groups to zero."""
+    """Set the gradients of the parameters whose learning rates ``groups`` name to zero."""
     return _replaced(gradient, groups, jnp.zeros_like)
 
 
 def _replaced(params: Any, groups: tuple[str, ...], change: Callable[[Array], Array]) -> Any:
-    """Change the leaves of some groups."""
+    """Apply ``change`` to the leaves of some groups."""
     leaves, structure = jax.tree.flatten(params)
     changed = [
         change(leaf) if name in groups else leaf
@@ -129,7 +129,8 @@ class Batch(eqx.Module):
     key : typed PRNG key.
     views : (V,) int32 numbers of the views within their split; None where they have none.
     valid : (V, H, W) pixels that count, 0 or 1; None where all do.
-    carry : what a light transport keeps from one step to the next; None for most.
+    carry : state that the light transport returned in the step before; None for a transport without
+        state.
     """
 
     camera: Camera
@@ -154,9 +155,9 @@ class Batch(eqx.Module):
         return self.camera.count
 
     def view(self, number: Int[Array, ""] | int) -> "Batch":
-        """Return the batch of a single view, with randomness of its own and no carry.
+        """Return the batch of a single view, with a random key of its own and without carry.
 
-        Pixels that do not count are black and empty there, whatever they were.
+        Colour and alpha of pixels that do not count are set to zero.
         """
 
         def one(values: Array) -> Array:
@@ -170,7 +171,7 @@ class Batch(eqx.Module):
         image = one(self.image)
         valid = None if self.valid is None else one(self.valid)
         if valid is not None:
-            # Weights of zero would keep what is not finite.
+            # A weight of zero would not remove values that are not finite: 0 * NaN is NaN.
             image = jnp.where(valid[..., None] > 0, image, 0.0)
         return Batch(
             camera=camera,
@@ -187,7 +188,7 @@ class Box(eqx.Module):
     Attributes
     ----------
     center : (3,) world.
-    half_extent : () half of the cube's side, the world length of one unit of the paper.
+    half_extent : () half of the cube's side, world units; the unit of length of the paper.
     """
 
     center: Float[Array, " 3"]
@@ -242,8 +243,9 @@ class Geometry(eqx.Module):
     ----------
     sdf : (grid vertices,) signed values, negative inside, in units of a cell.
     deform : (grid vertices, 3); a vertex moves by ``tanh(deform) * reach`` cells (see `Grid`).
-    alpha : (cells, 8) corner weights; beta : (cells, 12) edge weights; gamma : (cells,) split
-        weights, all raw.
+    alpha : (cells, 8) raw weights of the corners.
+    beta : (cells, 12) raw weights of the edges.
+    gamma : (cells,) raw weights by which quads are split.
     """
 
     sdf: Float[Array, " G"] = learned("sdf")
@@ -258,7 +260,8 @@ class Mesh(eqx.Module):
 
     Attributes
     ----------
-    vertices : (Cv, 3) world positions; faces : (Cf, 3) int32 vertex rows.
+    vertices : (Cv, 3) world positions.
+    faces : (Cf, 3) int32 vertex rows.
     vertex_count, face_count : () int32 true counts.
     """
 
@@ -274,12 +277,13 @@ class Mesh(eqx.Module):
 
 
 class SurfacePoints(eqx.Module):
-    """N points of a surface where light arrives; all unit vectors in the world.
+    """N points of a surface that are shaded, in world coordinates.
 
     Attributes
     ----------
-    positions : (N, 3) where rays start, on the surface.
-    normals : (N, 3) shading normals. outward : (N, 3) normals of the faces.
+    positions : (N, 3) points on the surface where rays start.
+    normals : (N, 3) unit shading normals.
+    outward : (N, 3) unit geometric normals; directions below them are blocked.
     faces : (N,) face of each point, which its rays never hit; -1 for none.
     mask : (N,) rows to shade; the others give zero.
     """
@@ -296,8 +300,11 @@ class Splats(eqx.Module):
 
     Attributes
     ----------
-    means : (N, 3) world; quats : (N, 4) unit (w, x, y, z); scales : (N, 3) standard deviations,
-        world units; opacities : (N,) in [0, 1]; normals : (N, 3) unit shading normals.
+    means : (N, 3) world.
+    quats : (N, 4) unit (w, x, y, z).
+    scales : (N, 3) standard deviations, world units.
+    opacities : (N,) in [0, 1].
+    normals : (N, 3) unit shading normals.
     outward : (N, 3) unit geometric normals, by which back-facing splats are culled.
     anchors : (N, 3) points on the surface, world, where attributes are looked up and rays start.
     parents : (N,) int32 face that each splat belongs to; -1 for none.
@@ -320,7 +327,7 @@ class Splats(eqx.Module):
         return jnp.arange(self.means.shape[0], dtype=jnp.int32) < self.count
 
     def points(self, mask: Bool[Array, " N"] | None = None) -> SurfacePoints:
-        """Return the splats as light sees them: all of them, or those of a mask."""
+        """Return the splats as points to shade: all of them, or those of a mask."""
         chosen = self.mask if mask is None else self.mask & mask
         return SurfacePoints(self.anchors, self.normals, self.outward, self.parents, chosen)
 
@@ -330,8 +337,9 @@ class Materials(eqx.Module):
 
     Attributes
     ----------
-    albedo : (N, 3) linear base colour in [0, 1]; roughness : (N,) perceptual, GGX alpha is its
-        square; metallic : (N,) in [0, 1].
+    albedo : (N, 3) linear base colour in [0, 1].
+    roughness : (N,) perceptual; GGX alpha is its square.
+    metallic : (N,) in [0, 1].
     has_specular : static; whether there is a specular lobe. Without one, roughness is 1, metallic
         is 0, and the light of the lobe is not computed.
     """

@@ -10,7 +10,7 @@ from geosplat_jax.core.capacity import Usage
 
 
 class RayIndex(eqx.Module):
-    """A surface, arranged so that rays find it fast. Exact, and without gradients.
+    """A surface in a structure that rays are traced against. Exact, and without gradients.
 
     Attributes
     ----------
@@ -31,16 +31,18 @@ class RayIndex(eqx.Module):
         return jnp.asarray(jnp.inf)
 
     def places(self, positions: Float[Array, "N 3"], faces: Int[Array, " N"]) -> Int[Array, " N"]:
-        """Name places on the surface that outlive a training step: here the rows of the faces.
+        """Return the number of the place that each point lies on: here the row of its face.
+
+        A place keeps its number from one training step to the next.
 
         Parameters
         ----------
         positions : (N, 3) world, on the surface.
-        faces : (N,) that they lie on; -1 for none, which has no place.
+        faces : (N,) face that each point lies on; -1 for none.
 
         Returns
         -------
-        (N,) at least 0, or -1 for none.
+        (N,) number of the place, at least 0; -1 for a point without a place.
         """
         del positions
         return faces
@@ -63,6 +65,10 @@ class RayIndex(eqx.Module):
         source : (N,) face that a ray starts on and never hits; -1 for none.
         mask : (N,) rays to trace; the others are not occluded, and cost little.
         two_sided : static; whether back faces count.
+
+        Returns
+        -------
+        (N,) True for rays that hit the surface.
         """
 
     @abc.abstractmethod

@@ -85,7 +85,7 @@ def _moved(values: UInt[Array, "z y x"], by: int, axis: int) -> UInt[Array, "z y
 def _empty_cubes(occupied: Bool[Array, " K"], grid: Grid) -> Int[Array, " K"]:
     """Find how large an empty cube begins with a cell, towards each octant of directions.
 
-    Returns the binary logarithm of its side in cells, three bits an octant; bit i of an octant's
+    Returns the binary logarithm of its side in cells, three bits per octant; bit i of an octant's
     number is set where directions are negative along axis i. What lies outside of the grid is
     empty.
     """

@@ -18,10 +18,11 @@ from geosplat_jax.rays.cells import SLACK, WORD_BITS, cell_lists, cones_of, word
 from geosplat_jax.rays.walking import T_MIN, CellIndex, Lanes, cross, dot
 
 _COUNT_BITS = 8
-"""Bits of a cell's count. It lists at most 144 patches: 3 axes of 3 x 4 x 4 edges in reach."""
+"""Bits for the number of patches that a cell lists. It is at most 144: a patch belongs to a grid
+edge, and of each of the 3 axes 3 x 4 x 4 edges are in reach of a cell."""
 
 _LARGEST_LIST = 1 << (WORD_BITS - _COUNT_BITS)
-"""The other bits of a word say where a cell's list begins."""
+"""Most entries in the lists of all cells: the other bits of a word hold a cell's first entry."""
 
 _REACH = 4
 """Most cells that a patch touches along an axis: its corners belong to two neighbouring cells, and
@@ -30,11 +31,11 @@ may lie up to half a cell outside of them."""
 
 @runtime_checkable
 class PatchMesh(Protocol):
-    """A mesh of patches: quads with a centre, of which patch q has the faces 4 q to 4 q + 3."""
+    """A mesh of patches, which are quads with a centre; patch q has the faces 4 q to 4 q + 3."""
 
     @property
     def mesh(self) -> Mesh:
-        """Triangles, four a patch: from each side of the quad, in order, to the centre."""
+        """Triangles, four per patch: each joins a side of the quad, in order, to the centre."""
         ...
 
     @property
@@ -53,8 +54,8 @@ class GridIndex(CellIndex):
 
     Attributes
     ----------
-    entries : (entry capacity,) patches, cell after cell.
-    patches : (quads, 16) corners and centre.
+    entries : (entry capacity,) patches that the cells list, cell after cell.
+    patches : (quads, 16) x, y and z of the four corners and of the centre, then a column of zeros.
     usage : true need of the buffer ``cell_patches``. Where it exceeds the capacity, results are
         wrong and must be discarded.
     """
@@ -65,7 +66,7 @@ class GridIndex(CellIndex):
 
     @property
     def face_capacity(self) -> int:
-        """Rows of faces: four a patch."""
+        """Rows of faces: four per patch."""
         return 4 * self.patches.shape[0]
 
     @property
@@ -75,11 +76,11 @@ class GridIndex(CellIndex):
 
     @property
     def place_size(self) -> Float[Array, ""]:
-        """A cell."""
+        """Edge length of a cell, world units."""
         return self.grid.cell_size
 
     def places(self, positions: Float[Array, "N 3"], faces: Int[Array, " N"]) -> Int[Array, " N"]:
-        """Name places by the cell that they lie in: rows of faces change with the topology."""
+        """Return the cell of each point, because rows of faces change with the topology."""
         del faces
         local = (positions - self.grid.origin[None, :]) / self.grid.cell_size
         number = jnp.zeros(positions.shape[:1], jnp.int32)
@@ -92,9 +93,10 @@ class GridIndex(CellIndex):
     def test(self, lanes: Lanes, *, two_sided: bool, any_hit: bool) -> Lanes:
         """Test the next patch of the cell, four triangles at once, by signed volumes.
 
-        With corners a, b and centre c relative to the ray's start, the ray passes on the same side
-        of all three edges where ``d.(a x b)``, ``d.(b x c)`` and ``d.(c x a)`` have one sign; their
-        sum is ``d.n`` of the unnormalised normal n, and the distance ``c.(a x b)`` over that sum.
+        Take corners a and b and centre c relative to the origin of a ray with direction d. The line
+        of the ray passes through the triangle where ``d.(a x b)``, ``d.(b x c)`` and ``d.(c x a)``
+        have the same sign. Their sum is ``d.n`` with the unnormalised normal n of the triangle, and
+        the distance of the hit is ``c.(a x b)`` divided by that sum.
         """
         is_testing = lanes.is_travelling & (lanes.tested < self.count(lanes.word))
         entry = jnp.where(is_testing, self.first(lanes.word) + lanes.tested, 0)
@@ -125,7 +127,7 @@ class GridIndex(CellIndex):
             is_blocked = is_blocked | is_hit
             hits.append(jnp.where(is_hit, at, jnp.inf))
         lanes = lanes._replace(tested=lanes.tested + is_testing.astype(jnp.int32))
-        # Each of the two arrays that change would repeat the whole computation.
+        # Without the barriers XLA repeats the whole test for each of the two arrays that change.
         if any_hit:
             is_blocked = jax.lax.optimization_barrier(is_blocked)
             return lanes._replace(
@@ -149,7 +151,7 @@ def _patches(surface: PatchMesh, grid: Grid) -> Float[Array, "Q 16"]:
 
 
 def _fan(patches: Float[Array, "Q 16"]) -> list[tuple[Array, Array, Array]]:
-    """Corners of the four triangles, each (3, Q)."""
+    """Return the corners of the four triangles of every patch, each (3, Q)."""
     points = [patches[:, 3 * i : 3 * i + 3].T for i in range(5)]
     return [(points[i], points[(i + 1) % 4], points[4]) for i in range(4)]
 
@@ -178,11 +180,12 @@ def _touched_cells(
         above = jnp.maximum(jnp.maximum(a, b), c)[None] >= corner - SLACK
         below = jnp.minimum(jnp.minimum(a, b), c)[None] <= corner + (1 + SLACK)
         normal = jnp.cross(b - a, c - a, axis=0)
-        # How far the plane is from the middle of a cell: a term for each of its coordinates.
+        # Distance of the plane from the middle of a cell, times the length of the normal: one term
+        # per coordinate of the cell.
         terms = normal[None] * (corner + 0.5 - a[None])
         reach = half * jnp.sum(jnp.abs(normal), axis=0)
         triangles.append((above & below & inside, terms, reach[None, None, None]))
-    # Fused with what follows, these would be computed again for each of the 64 cells.
+    # Without the barrier XLA computes these again for each of the 64 cells.
     triangles = jax.lax.optimization_barrier(triangles)
     touches = jnp.zeros((_REACH, _REACH, _REACH, is_real.shape[0]), bool)
     for meets, terms, reach in triangles:
@@ -197,14 +200,14 @@ def build_grid_index(surface: PatchMesh, grid: Grid, *, capacities: Capacities) 
 
     Parameters
     ----------
-    surface : with a centre in every quad, such as from `isosurface` with ``training=True``.
-    grid : the grid it was extracted from.
+    surface : mesh whose quads have centres, such as that of `isosurface` with ``training=True``.
+    grid : grid that the surface was extracted from.
     capacities : static; ``cell_patches`` is used.
 
     Raises
     ------
     ValueError
-        If ``cell_patches`` is more than 8.4 million, which the words cannot count.
+        If ``cell_patches`` is more than 8.4 million: the words of cells cannot number more entries.
     """
     if capacities["cell_patches"] > _LARGEST_LIST:
         raise ValueError(
@@ -231,7 +234,7 @@ def build_grid_index(surface: PatchMesh, grid: Grid, *, capacities: Capacities) 
     x, y, z = lowest[:, patch] + steps
     nx, ny, _ = padded.shape
     cells = jnp.where(is_entry, x + nx * (y + ny * z), cell_count)
-    # One stable sort: pairs of a cell keep the order of their candidates, hence are reproducible.
+    # The sort is stable: the pairs of a cell keep their order, so that results are reproducible.
     cells, patch = jax.lax.sort((cells, patch), num_keys=1, is_stable=True)
     entries = jnp.where(cells < cell_count, patch, 0)
     lists = cell_lists(cells, cell_count)

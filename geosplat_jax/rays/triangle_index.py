@@ -5,9 +5,9 @@ cell lists the triangles that may touch it, and the corners of a cell's triangle
 other, so that a ray tests several at once. How rays walk from cell to cell, and what they never
 hit, is said in `walking`.
 
-Triangles need not be closed, oriented, connected, or of one size; cells that hold many of them are
-slow, not wrong. Of a *sheet* both sides are met: every triangle stands for two faces, row f for
-its front and row ``f + triangles`` for its back.
+Triangles need not form a closed, oriented or connected surface, nor be of equal size; where a cell
+holds many of them, rays are slow but exact. A *sheet* can be hit from both sides: every triangle
+stands for two faces, row f for its front and row ``f + triangles`` for its back.
 """
 
 import equinox as eqx
@@ -26,26 +26,36 @@ _TESTED_AT_ONCE = 2
 """Triangles of a cell that a ray is tested against before it may move on."""
 
 _CELL_EDGES = 1.0
-"""Size of a cell in median edges of the triangles. Smaller cells make rays faster, and building
-slower by more than that."""
+"""Edge length of a cell, in median edge lengths of the triangles. Smaller cells would save less
+time in tracing than they would cost in building the index."""
 
 _MOST_CELLS = 1 << 20
-"""Cells of a grid, about; 4 MB for their words."""
+"""Most cells of a grid; their words take 4 MB."""
 
 _MOST_BOXES = 1 << 25
-"""Pairs of a triangle and a cell that its bounding box meets, at most: some gigabytes."""
+"""Most pairs of a triangle and a cell that its bounding box meets; so many take some gigabytes."""
 
 _NUMBER = 9
-"""Column of a row that holds the number of the triangle, exactly up to 2**24."""
+"""Column of `TriangleIndex.rows` with the number of the triangle, which is exact up to 2**24."""
 
 _MARGIN = 1.0
-"""Cells around the triangles, so that what rounding adds lies inside."""
+"""Cells between the triangles and every side of the grid, so that rounding keeps them inside."""
 
 
 def cells_for(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> tuple[int, int, int]:
-    """Choose the numbers of cells along each axis for triangles of this size (host side)."""
+    """Choose the numbers of cells along each axis for triangles of this size (host side).
+
+    Parameters
+    ----------
+    vertices : (V, 3) world.
+    faces : (F, 3) rows of the vertices.
+
+    Returns
+    -------
+    (nx, ny, nz), together at most 2**20 cells, margins included.
+    """
     corners = np.asarray(vertices, np.float64)[faces]
     edges = corners - np.roll(corners, 1, axis=1)
     edge = float(np.median(np.sqrt(np.sum(edges**2, axis=-1))))
@@ -63,13 +73,14 @@ class TriangleIndex(CellIndex):
 
     Attributes
     ----------
-    rows : (entry capacity, 10) corners and number of the triangles, cell after cell.
+    rows : (entry capacity, 10) triangles that the cells list, cell after cell: x, y and z of the
+        three corners, then the number of the triangle.
     usage : true needs of the buffers ``triangle_boxes`` (pairs of a triangle and a cell that its
         bounding box meets), ``triangle_cells`` (those pairs that may truly touch) and
         ``cell_triangles`` (triangles of the fullest cell). Where they exceed their capacities,
         results are wrong and must be discarded.
-    triangle_count : static.
-    is_sheet : static; both sides of every triangle are met.
+    triangle_count : static number of triangles.
+    is_sheet : static; whether rays can hit both sides of every triangle.
     most_in_cell : static capacity of ``cell_triangles``.
     """
 
@@ -81,7 +92,7 @@ class TriangleIndex(CellIndex):
 
     @property
     def face_capacity(self) -> int:
-        """Rows of faces: one a triangle, two of a sheet."""
+        """Rows of faces: one per triangle, or two per triangle of a sheet."""
         return (2 if self.is_sheet else 1) * self.triangle_count
 
     @property
@@ -98,7 +109,7 @@ class TriangleIndex(CellIndex):
         *,
         two_sided: bool = False,
     ) -> Bool[Array, " N"]:
-        """Tell which rays hit the surface anywhere; of a sheet, on either side."""
+        """Tell which rays hit the surface anywhere; rays hit a sheet on either side."""
         sides = two_sided or self.is_sheet
         return super().occluded(origins, directions, source, mask, two_sided=sides)
 
@@ -111,7 +122,7 @@ class TriangleIndex(CellIndex):
         *,
         two_sided: bool = False,
     ) -> tuple[Float[Array, " N"], Int[Array, " N"]]:
-        """Find the first hit of every ray; of a sheet, the face of the side that is met."""
+        """Find the first hit of every ray; on a sheet, the face stands for the side that is hit."""
         sides = two_sided or self.is_sheet
         rays = (origins, directions, source, mask)
         distance, place = super().nearest(*rays, two_sided=sides)
@@ -124,8 +135,8 @@ class TriangleIndex(CellIndex):
     def test(self, lanes: Lanes, *, two_sided: bool, any_hit: bool) -> Lanes:
         """Test the next triangles of the cell by signed volumes; see `GridIndex.test`.
 
-        The face of a hit is twice its row, plus one where the back is met, until `nearest` reads
-        which triangle that is.
+        Here the face of a hit is twice its row in ``rows``, plus one if the back is hit; `nearest`
+        replaces it by the face of the mesh.
         """
         left = self.count(lanes.word) - lanes.tested
         is_testing = lanes.is_travelling & (left > 0)
@@ -153,14 +164,14 @@ class TriangleIndex(CellIndex):
         at = dot(c, normal) / jnp.where(total == 0, 1.0, total)
         is_hit = is_hit & (at > T_MIN)
         lanes = lanes._replace(tested=lanes.tested + jnp.where(is_testing, _TESTED_AT_ONCE, 0))
-        # Every array that leaves the test costs the whole computation once more, so only one does.
+        # XLA repeats the whole test for every array that leaves it, so only one array does.
         if any_hit:
             is_blocked = jax.lax.optimization_barrier(jnp.any(is_hit, axis=0))
             return lanes._replace(
                 face=jnp.where(is_blocked, 0, lanes.face),
                 is_travelling=lanes.is_travelling & ~is_blocked,
             )
-        # A distance is positive; its sign tells the side that is met.
+        # Distances are positive, so that a negative sign can mark a hit of the back.
         found = jnp.where(is_hit, jnp.where(total > 0, -at, at), jnp.inf)
         found = jax.lax.optimization_barrier(found)
         distance, face = lanes.distance, lanes.face
@@ -176,7 +187,7 @@ def _grid_around(vertices: Float[Array, "V 3"], shape: tuple[int, int, int]) -> 
     low, high = jnp.min(vertices, axis=0), jnp.max(vertices, axis=0)
     counts = jnp.asarray(shape, vertices.dtype)
     cell = jnp.max((high - low) / (counts - 2 * _MARGIN))
-    # One point, or none: any cell will do.
+    # Where all vertices coincide, any size of a cell will do.
     cell = jnp.where(cell > 0, cell, 1.0)
     return Grid(0.5 * (low + high - cell * counts), cell, shape)
 
@@ -186,7 +197,7 @@ def _boxed(
 ) -> tuple[Int[Array, " P"], Int[Array, "3 P"], Int[Array, ""]]:
     """List the pairs of a triangle and a cell that its bounding box meets, and count them.
 
-    Rows past the count, and all after an overflow, are of no meaning.
+    Rows past the count are meaningless, and after an overflow all rows are.
     """
     first = jnp.floor(jnp.min(corners, axis=0) - SLACK).astype(jnp.int32)
     size = jnp.floor(jnp.max(corners, axis=0) + SLACK).astype(jnp.int32) - first + 1
@@ -198,19 +209,19 @@ def _boxed(
     size, first = size[:, triangle], first[:, triangle]
     z, rest = jnp.divmod(step, size[0] * size[1])
     y, x = jnp.divmod(rest, size[0])
-    # Triangles as large as the grid may meet more cells together than 32 bits can count.
+    # Together, triangles as large as the grid may meet more cells than 32 bits can count.
     is_countable = jnp.sum(count.astype(corners.dtype)) < _MOST_BOXES
     return triangle, first + jnp.stack([x, y, z]), jnp.where(is_countable, through[-1], 2**31 - 1)
 
 
 def _touches(corners: Float[Array, "3 3 P"], cell: Int[Array, "3 P"]) -> Bool[Array, " P"]:
-    """Whether the plane of a triangle, and its outline seen along each axis, meet a cell."""
+    """Whether a cell meets the plane of a triangle, and meets the triangle seen along each axis."""
     middle = cell.astype(corners.dtype) + 0.5
     a, b, c = (corner - middle for corner in corners)
     normal = jnp.cross(b - a, c - a, axis=0)
     half = 0.5 + SLACK
     touch = jnp.abs(jnp.sum(normal * a, axis=0)) <= half * jnp.sum(jnp.abs(normal), axis=0)
-    # Separating axes: of an edge seen along an axis, in the plane of the other two.
+    # Separating axes: the normals of the edges, projected to the plane of two axes.
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3
         for start, end, other in ((a, b, c), (b, c, a), (c, a, b)):
@@ -234,7 +245,8 @@ def build_triangle_index(
 
     Parameters
     ----------
-    vertices, faces : triangles, without padding.
+    vertices : (V, 3) world.
+    faces : (F, 3) rows of the vertices, without padding.
     shape : static numbers of cells, see `cells_for`.
     is_sheet : static; see `TriangleIndex`.
     capacities : static; ``triangle_boxes``, ``triangle_cells`` and ``cell_triangles`` are used.
@@ -242,7 +254,7 @@ def build_triangle_index(
     Raises
     ------
     ValueError
-        If the triangles are too crowded, or too many, for the words of the cells.
+        If the lists of the cells are too long for their words, or ``triangle_boxes`` exceeds 2**25.
     """
     most, capacity = capacities["cell_triangles"], capacities["triangle_cells"]
     largest = 1 << (WORD_BITS - most.bit_length())
@@ -269,7 +281,7 @@ def build_triangle_index(
     pair = touch.first(capacity=capacity)
     is_entry = jnp.arange(capacity, dtype=jnp.int32) < touch.count
     cells = jnp.where(is_entry, number[pair], grid.cube_count)
-    # Stable: triangles of a cell keep their order, hence are reproducible.
+    # The sort is stable: triangles of a cell keep their order, so that results are reproducible.
     cells, entries = jax.lax.sort(
         (cells, jnp.where(is_entry, triangle[pair], 0)), num_keys=1, is_stable=True
     )

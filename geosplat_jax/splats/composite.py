@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from geosplat_jax.splats.tiles import MIN_ALPHA
 
 MAX_ALPHA = 0.999
-"""No Gaussian is more opaque than this in any pixel; where it clamps, the gradient is zero."""
+"""Largest alpha of a Gaussian in a pixel; where alpha is clamped to it, the gradient is zero."""
 
 GEOMETRY_COLUMNS = 6
 """Columns of a row table before the features: mean x, y; conic xx, xy, yy; log opacity."""
@@ -36,14 +36,14 @@ def _pixel_offsets(tile_size: int, dtype) -> tuple[Float[Array, " P"], Float[Arr
 def _slot_rows(
     table: Float[Array, "M columns"], ranks: Int[Array, " K"], centers: Float[Array, "K 2"]
 ) -> Float[Array, "K columns"]:
-    """Gather one row a chunk, with the mean relative to the centre of the chunk's tile."""
+    """Gather one row per chunk, with the mean relative to the centre of the chunk's tile."""
     rows = table[ranks]
     # Not by `.at[:, :2].add`, for which XLA copies the rows.
     return jnp.concatenate([rows[:, :2] - centers, rows[:, 2:]], axis=-1)
 
 
 def _alpha(rows: Float[Array, "K columns"], tile_size: int) -> Float[Array, "K P"]:
-    """Alpha of one Gaussian a chunk in every pixel of the chunk's tile."""
+    """Alpha of one Gaussian per chunk in every pixel of the chunk's tile."""
     u, v = _pixel_offsets(tile_size, rows.dtype)
     x, y, xx, xy, yy, log_opacity = (rows[:, i, None] for i in range(GEOMETRY_COLUMNS))
     dx, dy = u[None] - x, v[None] - y
@@ -145,7 +145,7 @@ def _tile_centers(
 
 
 def _with_padding_row(table: Float[Array, "M columns"]) -> Float[Array, "M+1 columns"]:
-    """Append the row of padding slots, transparent everywhere."""
+    """Append the row that padding slots refer to; it is transparent everywhere."""
     padding = jnp.zeros((1, table.shape[1]), table.dtype).at[0, 5].set(_LOG_NOTHING)
     return jnp.concatenate([table, padding])
 
@@ -232,7 +232,7 @@ def _composite_backward(tile_size, grid, residuals, cotangent):
         passing, behind, d_table = state
         rows = _slot_rows(padded, ranks, centers)
         alpha = _alpha(rows, tile_size)
-        # The inverse of the step above, to rounding: `CHUNK_SIZE` factors never underflow.
+        # Undo the step of `front_to_back`, up to rounding: `CHUNK_SIZE` factors never underflow.
         passing = jax.lax.optimization_barrier(passing / (1.0 - alpha))
         weight, contrast = alpha * passing, gain_of(rows) - behind
         d_log_alpha = jnp.where(alpha < MAX_ALPHA, before * weight * contrast, 0.0)

@@ -2,8 +2,8 @@
 
 Zwicker et al., "EWA splatting" (2002), with the low-pass filter and the antialiasing compensation
 of Yu et al., "Mip-Splatting" (2024), in the form of gsplat's "antialiased" mode. Both determinants
-are written as sums of non-negative terms, so flat and needle-like Gaussians, which this method is
-made of, lose no digits in float32.
+are written as sums of non-negative terms, so that flat and needle-like Gaussians, which are the
+rule in this method, lose no digits in float32.
 """
 
 import equinox as eqx
@@ -19,7 +19,8 @@ Columns = list[Float[Array, " N"]]
 """Components of N vectors, one array each: XLA fuses and vectorises these, not (N, 3) rows."""
 
 _FIELD_OF_VIEW_MARGIN = 0.3
-"""The Jacobian is taken at most this share of the half field of view outside the image."""
+"""Largest distance from the image at which the Jacobian is evaluated, as a share of half the size
+of the image."""
 
 
 class Footprints(eqx.Module):
@@ -105,7 +106,7 @@ def project(
     world_to_camera : (4, 4) rigid transform to OpenCV camera axes.
     intrinsics : (3, 3) ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`` in pixels.
     height, width : static image size in pixels, used only by the clamp.
-    near : smallest depth that counts as in front, world units.
+    near : a mean counts as in front if its depth is greater than this, world units.
     """
     fx, fy, cx, cy = (intrinsics[i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     rotation = world_to_camera[:3, :3]

@@ -1,8 +1,8 @@
 """Splats that carry their own colour: vanilla 3D Gaussian splatting (Kerbl et al. 2023).
 
-Nothing stands behind them, neither a mesh nor a light: a splat has a colour that depends on the
-direction it is seen from, by spherical harmonics up to degree 3. Arrays are as long as the most
-splats that there may ever be; rows past the count are padding. Differentiable in all parameters.
+There is neither a mesh nor a light: the colour of a splat depends on the direction that it is seen
+from, by spherical harmonics up to degree 3. Arrays have as many rows as there may ever be splats;
+rows past the count are padding. Differentiable in all parameters.
 """
 
 from typing import Any
@@ -31,7 +31,7 @@ class RadianceSplats(eqx.Module):
     log_scales : (N, 3) natural logarithms of standard deviations in world units.
     quats : (N, 4) (w, x, y, z), of any length.
     opacity_logits : (N,).
-    base : (N, 3) coefficients of the constant harmonic, of the colour as a screen shows it (sRGB).
+    base : (N, 3) coefficients of the constant harmonic, for colours in sRGB.
     rest : (N, 15, 3) coefficients of the others, in the order of `core.harmonics.harmonics`.
     """
 
@@ -44,7 +44,7 @@ class RadianceSplats(eqx.Module):
 
     @property
     def capacity(self) -> int:
-        """Rows, with the padding."""
+        """Number of rows, padding included."""
         return self.means.shape[0]
 
     @property
@@ -95,16 +95,18 @@ def render_radiance(
 
     Parameters
     ----------
-    splats : of which the first ``count`` rows are in use.
+    splats : N splats.
+    count : number of splats in use, which are the first rows.
     camera : of a single view.
     degree : highest degree of the harmonics; may be traced.
     capacities, tile_size : static; see `rasterize`.
-    near : world units.
+    near : depth of the near plane, world units.
 
     Returns
     -------
-    rgb : (H, W, 3) sRGB, premultiplied; alpha : (H, W); usage : true needs of the buffers. Where
-    it exceeds ``capacities`` the image must be discarded.
+    rgb : (H, W, 3) sRGB, premultiplied.
+    alpha : (H, W) coverage in [0, 1].
+    usage : true needs of the buffers. Where it exceeds ``capacities`` the image must be discarded.
     """
     view: dict[str, Any] = {
         "world_to_camera": camera.world_to_camera[0],

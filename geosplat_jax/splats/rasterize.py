@@ -155,7 +155,9 @@ def rasterize(
 
     Returns
     -------
-    image : (H, W, C) premultiplied; alpha : (H, W); usage : true needs of the bounded buffers.
+    image : (H, W, C) premultiplied.
+    alpha : (H, W) coverage in [0, 1].
+    usage : true needs of the bounded buffers.
     """
     frame: dict[str, Any] = {"height": height, "width": width}
     all_splats = project(

@@ -23,15 +23,24 @@ _HIGHEST_OPACITY = 1.0 - 1e-6
 """Largest shared opacity; at 1 the logit would be infinite."""
 _GATE_SHARPNESS = 100.0
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
-_FARTHEST = 4.5  # standard deviations times sqrt(2); the rest of the integral is below 1e-9
+_FARTHEST = 4.5  # end of the integral over t in Eq. 9; the rest is below 1e-9
 
 
 def shared_opacity(
     opacities: Float[Array, " N"], sharers: Float[Array, " N"]
 ) -> Float[Array, " N"]:
-    """Opacity of each of several splats at one place that together are as opaque as one was.
+    """Opacity of several equal splats at one place that together are as opaque as a single one.
 
     ``1 - (1 - o)^(1 / n)``, in a form that keeps its digits for small opacities.
+
+    Parameters
+    ----------
+    opacities : (N,) o, of the single splat, in [0, 1).
+    sharers : (N,) n, number of splats that replace it, at least 1.
+
+    Returns
+    -------
+    (N,) opacity of each of them, in [0, 1).
     """
     return -jnp.expm1(jnp.log1p(-opacities) / sharers)
 
@@ -39,18 +48,22 @@ def shared_opacity(
 def shared_scale_factor(
     opacities: Float[Array, " N"], shared: Float[Array, " N"], sharers: Float[Array, " N"]
 ) -> Float[Array, " N"]:
-    """Factor of the scales of several splats at one place that stand for one.
+    """Factor on the scales of several equal splats at one place that replace a single one.
 
-    The integral of alpha along any line through their centre is then what it was (Eq. 9):
-    ``o / D`` with ``D = 2 / sqrt(pi) times the integral of 1 - (1 - o' exp(-t^2))^n`` over t > 0,
-    by a Gauss-Legendre rule of 16 points, right to 4e-7 at opacities up to .999
-    and to 2e-5 at any.
+    It keeps the integral of alpha along any line through their centre (Eq. 9). The factor is
+    ``o / D``, where D is ``2 / sqrt(pi)`` times the integral of ``1 - (1 - o' exp(-t^2))^n`` over
+    t > 0. A Gauss-Legendre rule of 16 points evaluates it with an error of 4e-7 at opacities up to
+    .999, and of 2e-5 at any opacity.
 
     Parameters
     ----------
-    opacities : of the one splat, in (0, 1).
-    shared : of each of the several; see `shared_opacity`.
-    sharers : how many there are, at least 1.
+    opacities : (N,) o, of the single splat, in (0, 1).
+    shared : (N,) o', of each of the splats that replace it; see `shared_opacity`.
+    sharers : (N,) n, number of splats that replace it, at least 1.
+
+    Returns
+    -------
+    (N,) positive.
     """
     place = jnp.asarray(0.5 * _FARTHEST * (_NODES + 1.0), opacities.dtype)
     weights = jnp.asarray(0.5 * _FARTHEST * _WEIGHTS * 2.0 / np.sqrt(np.pi), opacities.dtype)
@@ -63,7 +76,7 @@ def _drawn_rows(
     weights: Float[Array, " N"], key: Key[Array, ""], count: int
 ) -> Int[Array, " count"]:
     """Draw rows with a probability in proportion to their weights; never one without weight."""
-    # In float32 the sums of a parallel scan may fall, and grow where there is no weight.
+    # In float32 the sums of a parallel scan may decrease, and may grow at rows without weight.
     through = jax.lax.cummax(jnp.where(weights > 0.0, jnp.cumsum(weights), 0.0))
     last = jnp.max(jnp.where(weights > 0.0, jnp.arange(weights.shape[0]), 0)).astype(jnp.int32)
     place = jax.random.uniform(key, (count,), weights.dtype) * through[-1]
@@ -121,13 +134,20 @@ def relocate(
 def exploring_noise(
     splats: RadianceSplats, key: Key[Array, ""], *, rate: Float[Array, ""] | float
 ) -> Float[Array, "N 3"]:
-    """Noise of positions: as wide as the splat is, and none where it is opaque (Eq. 8).
+    """Draw noise for the positions: as wide as the splat, and nearly none on opaque ones (Eq. 8).
 
-    ``rate Sigma xi sigmoid(-100 (o - 0.005))`` with normal xi.
+    ``rate Sigma xi sigmoid(-100 (o - 0.005))`` with the covariance Sigma of the splat, its opacity
+    o, and standard normal numbers xi.
 
     Parameters
     ----------
-    rate : learning rate of the positions times the strength of the noise.
+    splats : N splats.
+    key : random key of the noise.
+    rate : () learning rate of the positions times the strength of the noise.
+
+    Returns
+    -------
+    (N, 3) displacements, world.
     """
     normal = jax.random.normal(key, splats.means.shape, jnp.float32).astype(splats.means.dtype)
     rotation = quaternion_to_matrix(splats.quats)

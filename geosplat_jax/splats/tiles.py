@@ -34,7 +34,7 @@ _INFINITY = 0x7F800000
 """Bit pattern of an infinite float32."""
 
 _CANCELLATION = 2e-6
-"""Rounding of an exponent in float32, as a share of the terms that it is the sum of; generous."""
+"""Generous bound on the rounding error of an exponent in float32, as a share of its terms."""
 
 _LARGEST_COUNT = 2**31 - 1
 
@@ -103,7 +103,7 @@ def _digit_order(digits: UInt[Array, " n"], digit_bits: int) -> Int[Array, " n"]
     n, place_bits = digits.shape[0], 32 - digit_bits
     blocks = max(-(-n >> place_bits), 1)
     size = -(-n // blocks)
-    # What fills the last block follows every entry of the largest digit, and is cut off again.
+    # Entries that fill up the last block are sorted behind all others, and cut off at the end.
     filled = jnp.pad(digits, (0, blocks * size - n), constant_values=(1 << digit_bits) - 1)
     filled = filled.reshape(blocks, size).astype(jnp.uint32)
     place = jnp.arange(size, dtype=jnp.int32)[None, :]
@@ -139,8 +139,8 @@ def _stable_argsort(keys: UInt[Array, " n"], key_bits: int) -> Int[Array, " n"]:
 def _depth_order(depths: Float[Array, " n"]) -> Int[Array, " n"]:
     """Stable order of positive depths (infinity on padding), nearest first."""
     if depths.dtype == jnp.float32:
-        # Positive IEEE floats order as their bit patterns do. Beginning with the nearest one, 30
-        # bits hold them up to a ratio of 2^128.
+        # Positive IEEE floats have the order of their bit patterns. Counted from the pattern of the
+        # nearest depth, 30 bits hold all depths up to 2^128 times the nearest.
         bits = jax.lax.bitcast_convert_type(depths, jnp.uint32)
         keys = jnp.minimum(bits - jnp.min(bits, initial=_INFINITY), (1 << _DEPTH_BITS) - 1)
         return _stable_argsort(keys.astype(jnp.uint32), _DEPTH_BITS)
@@ -167,7 +167,7 @@ def _pixel_bounds(
 
 
 def _ellipses(splats: Footprints, opacities: Float[Array, " N"]) -> Float[Array, "N 6"]:
-    """Where alpha is at least 1/255: centre, conic, and the largest exponent, a little enlarged."""
+    """Slightly enlarged ellipses where alpha is at least 1/255: centre, conic, largest exponent."""
     reach = safe_log(opacities * splats.compensation / MIN_ALPHA)
     reach = reach * (1.0 + _EXTENT_SLACK) + _EXTENT_SLACK
     return jnp.concatenate([splats.means2d, splats.conics, reach[:, None]], axis=-1)
@@ -176,9 +176,10 @@ def _ellipses(splats: Footprints, opacities: Float[Array, " N"]) -> Float[Array,
 def _meets_tile(
     ellipses: Float[Array, "h 6"], tile_x: Int[Array, " h"], tile_y: Int[Array, " h"], size: int
 ) -> Bool[Array, " h"]:
-    """Whether an ellipse meets the pixel centres' rectangle of a tile.
+    """Whether an ellipse meets the rectangle that the pixel centres of a tile span.
 
-    The exponent is least where the centre is, or on an edge of the rectangle that faces it.
+    The exponent is least at the ellipse's centre if that lies in the rectangle, and otherwise on an
+    edge of the rectangle that faces the centre.
     """
     x, y, xx, xy, yy, reach = ellipses.T
 
@@ -191,7 +192,7 @@ def _meets_tile(
 
     def least(a: Array, b: Array) -> Array:
         squares, product = 0.5 * (xx * a * a + yy * b * b), xy * a * b
-        # Of thin ellipses the two nearly cancel.
+        # For thin ellipses the two terms nearly cancel.
         return squares + product - _CANCELLATION * (squares + jnp.abs(product))
 
     along_y = jnp.clip(-xy * near_x * safe_divide(jnp.ones_like(yy), yy), low_y, high_y)
@@ -268,8 +269,8 @@ def find_visible(
 
     Not differentiable: gradients of all inputs are stopped. A Gaussian is visible when it is
     eligible, in front of the near plane, and some pixel centre of the image lies in the bounding
-    box of the ellipse where its alpha is at least 1/255. Tiles that meet the box and not the
-    ellipse count as ``hits``, and are in no chunk.
+    box of the ellipse where its alpha is at least 1/255. Tiles that meet the box but not the
+    ellipse count as hits in the usage, but are in no chunk.
 
     Parameters
     ----------
@@ -278,6 +279,10 @@ def find_visible(
     is_eligible : (N,) False on padding rows and on what the caller culls, such as back faces.
     height, width, tile_size : static pixels.
     capacities : static sizes; ``visible``, ``hits`` and ``chunks`` are used here.
+
+    Returns
+    -------
+    `TileLists`. Where its usage exceeds ``capacities`` the lists are incomplete.
     """
     splats, opacities = jax.lax.stop_gradient((splats, opacities))
     rows, columns = tile_grid(height, width, tile_size)

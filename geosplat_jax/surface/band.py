@@ -1,14 +1,14 @@
 """A band of cells around a surface, outside of which a grid holds no values.
 
 The band consists of the cells that the surface passes through and some layers of cells around them.
-Beyond it every vertex keeps its side. So that nothing contradicts this, the vertices at the band's
-border (those with a cell around them that is not in the band) are read as lying on the side that
-they had when the band was made: the surface comes as near to them as it likes and never leaves.
-Where it has moved, `Band.following` makes the band around it anew.
+A vertex outside of the band stays inside or outside of the surface, as it was when the band was
+made. To ensure this, a vertex at the border of the band (one with a neighbouring cell that is not
+in the band) is read as lying on its original side, whatever its value: the surface may come close
+to it, but cannot leave the band. After the surface has moved, `Band.following` makes a new band.
 
-Only the band's cells and vertices have rows of values, so that a step costs as much as the surface
-is large. What remains of the volume is a bit per cell, to find its row. Making a band is host-side
-and not differentiable.
+Only the band's cells and vertices have rows of values, so that the cost of a step grows with the
+area of the surface. Of the other cells only one bit each is stored, from which rows are found.
+Making a band is host-side and not differentiable.
 """
 
 from typing import NamedTuple
@@ -44,12 +44,13 @@ class Band(Lattice):
 
     Attributes
     ----------
-    grid : that they are of.
-    cells : (K,) numbers; 0 on padding. vertices : (G,) likewise.
-    corners : (8, K) rows of the vertices at the corners of cells; on padding one vertex.
-    neighbours : (6, G) rows of the next vertices before and after along x, y and z; where there is
-        none in the band, the vertex itself.
-    fixed : (G,) the side of a vertex at the border, -1 or 1; 0 for all others.
+    grid : the grid that the cells and vertices belong to.
+    cells : (K,) numbers of the cells in the grid; 0 on padding.
+    vertices : (G,) numbers of the vertices in the grid; 0 on padding.
+    corners : (8, K) rows of the vertices at the corners of cells; on padding all are row 0.
+    neighbours : (6, G) rows of the vertices before and after a vertex along x, y and z; where the
+        band has no such vertex, the row of the vertex itself.
+    fixed : (G,) the side of a border vertex, -1 inside or 1 outside; 0 for all other vertices.
     bits : the cells of the grid that are in the band.
     """
 
@@ -63,7 +64,7 @@ class Band(Lattice):
 
     @classmethod
     def blank(cls, grid: Grid, cell_rows: int, vertex_rows: int) -> "Band":
-        """Make a band of no cell."""
+        """Make a band without cells, with the given numbers of rows."""
         words = -(-grid.cube_count // 32)
         return cls(
             grid,
@@ -86,22 +87,22 @@ class Band(Lattice):
         return self.vertices.shape[0]
 
     def values(self, sdf: Float[Array, " G"]) -> Float[Array, " G"]:
-        """Return signed values with every vertex at the border on its side."""
+        """Return signed values in which every border vertex lies on its fixed side."""
         side = self.fixed.astype(sdf.dtype)
         return jnp.where(side == 0, sdf, side * jnp.maximum(side * sdf, _HELD))
 
     def cell_numbers(self, rows: Int[Array, "*n"]) -> Int[Array, "*n"]:
-        """Look the numbers up."""
+        """Look up the numbers of the cells in some rows."""
         return self.cells.at[rows].get(mode="clip")
 
     def rows_of_cells(self, numbers: Int[Array, "*n"]) -> Int[Array, "*n"]:
-        """Count the cells of the band before each."""
+        """Return the rows of cells: the number of cells of the band before each of them."""
         return self.bits.rank(numbers)
 
     def corner_rows(
         self, rows: Int[Array, " n"], coordinates: Int[Array, "3 n"]
     ) -> Int[Array, "8 n"]:
-        """Look the rows up."""
+        """Look up the rows of the vertices at the corners of cells."""
         del coordinates
         return self.corners.at[:, rows].get(mode="clip")
 
@@ -114,7 +115,7 @@ class Band(Lattice):
         return signs
 
     def crossed_edges(self, values: Float[Array, " G"]) -> Int[Array, " G"]:
-        """Count the crossed edges at every vertex; none leaves the band."""
+        """Count the crossed edges at every vertex; no edge that leaves the band is crossed."""
         inside = values < 0
         crossings = jnp.zeros(inside.shape, jnp.int32)
         for neighbour in range(6):
@@ -123,7 +124,7 @@ class Band(Lattice):
         return crossings
 
     def vertex_positions(self) -> Float[Array, "G 3"]:
-        """Rest positions of the band's vertices; any on padding."""
+        """Rest positions of the band's vertices, world; meaningless on padding."""
         vx, vy, _ = self.grid.vertex_shape
         number = self.vertices
         steps = jnp.stack([number % vx, number // vx % vy, number // (vx * vy)], axis=1)
@@ -169,7 +170,7 @@ class Band(Lattice):
         if np.array_equal(cells, old_cells):
             return None
         layout = _layout(self.grid, cells)
-        # Real vertices have a cell, and the last of them is the largest number.
+        # Every real vertex is a corner of a cell: the largest row of a corner is the last real one.
         old_vertices = np.asarray(self.vertices)[: int(np.asarray(self.corners).max()) + 1]
         move = Move(
             cells=_rows_before(old_cells, cells),
@@ -183,24 +184,25 @@ class Band(Lattice):
 
 
 class Move(NamedTuple):
-    """Rows of an earlier band that the rows of a band come from; -1 where from none.
+    """The row of an earlier band that each row of a band comes from; -1 for a new row.
 
     Attributes
     ----------
-    cells : (K,). vertices : (G,).
+    cells : (K,) for the rows of cells.
+    vertices : (G,) for the rows of vertices.
     """
 
     cells: Int[np.ndarray, " K"]
     vertices: Int[np.ndarray, " G"]
 
     def padded(self, band: Band) -> "Move":
-        """Add the rows of padding."""
+        """Add rows of padding, up to the number of rows of ``band``."""
         return Move(
             _filled(self.cells, band.cell_rows, -1), _filled(self.vertices, band.vertex_rows, -1)
         )
 
     def carried(self, geometry: Geometry) -> Geometry:
-        """Bring numbers of an earlier band into the rows of this one; 0 where there were none."""
+        """Bring the numbers of an earlier band into the rows of this one; new rows become 0."""
 
         def moved(array: Array, rows: np.ndarray) -> Array:
             found = np.asarray(array)[rows]
@@ -229,11 +231,18 @@ class _Layout(NamedTuple):
 def band_from(
     grid: Grid, sdf: Float[np.ndarray, " V"], layers: int
 ) -> tuple[Band, Float[np.ndarray, " G"]]:
-    """Make the band around a surface of values on all vertices of a grid (host side).
+    """Make the band around a surface, from values on all vertices of a grid (host side).
+
+    Parameters
+    ----------
+    grid : the grid.
+    sdf : (V,) signed values of its vertices, cells, x fastest.
+    layers : layers of cells on each side of the surface.
 
     Returns
     -------
-    band, and the values of its vertices.
+    band : the cells near the surface.
+    values : (G,) signed values of the band's vertices, cells; 0 on padding.
     """
     nx, ny, nz = grid.shape
     inside = (np.asarray(sdf) < 0).reshape(nz + 1, ny + 1, nx + 1)
@@ -252,7 +261,7 @@ def band_from(
 def cells_around(
     cells: Int[np.ndarray, " n"], shape: tuple[int, int, int], layers: int
 ) -> Int[np.ndarray, " K"]:
-    """Return the numbers of cells and of all within so many layers of them, ascending."""
+    """Return the numbers of ``cells`` and of all cells within ``layers`` of them, ascending."""
     nx, ny, nz = shape
     x, y, z = cells % nx, cells // nx % ny, cells // (nx * ny)
     mask = np.zeros(nx * ny * nz, bool)
@@ -266,7 +275,7 @@ def cells_around(
 
 
 def _layout(grid: Grid, cells: Int[np.ndarray, " K"]) -> _Layout:
-    """Find the vertices of cells, and what lies beside what."""
+    """Find the vertices of cells, which vertices are neighbours, and which are at the border."""
     nx, ny, _ = grid.shape
     sizes = grid.vertex_shape
     strides = (1, sizes[0], sizes[0] * sizes[1])
@@ -275,7 +284,7 @@ def _layout(grid: Grid, cells: Int[np.ndarray, " K"]) -> _Layout:
     is_held = np.zeros(grid.vertex_count, bool)
     is_held[numbers] = True
     vertices = np.flatnonzero(is_held).astype(np.int32)
-    # Only rows of vertices that are held are written, or read.
+    # Not initialised: only the entries of vertices of the band are written, and later read.
     row_of = np.empty(grid.vertex_count, np.int32)
     own = row_of[vertices] = np.arange(vertices.size, dtype=np.int32)
     corners = row_of[numbers]
@@ -321,7 +330,7 @@ def _padded(
 
 
 def _row_count(count: int, have: int) -> int:
-    """Choose a number of rows: as before where that is enough and not far too much."""
+    """Keep ``have`` rows if they are enough, and at most `_MANY` times as many as are wanted."""
     wanted = bucket(int(_HEADROOM * count))
     return have if count <= have <= _MANY * wanted else wanted
 
@@ -334,7 +343,7 @@ def _filled(values: np.ndarray, rows: int, padding: int = 0) -> np.ndarray:
 
 
 def _rows_before(old: np.ndarray, new: np.ndarray) -> Int[np.ndarray, " n"]:
-    """Find ascending numbers among those before; -1 for one that was not there."""
+    """Find the row that each of ``new`` has in the ascending ``old``; -1 where it is not there."""
     place = np.minimum(np.searchsorted(old, new), old.size - 1)
     return np.where(old[place] == new, place, -1).astype(np.int32)
 

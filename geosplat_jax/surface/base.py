@@ -17,7 +17,7 @@ class Surface(eqx.Module):
 
     Attributes
     ----------
-    mesh : triangles, outward; a face is known by its row.
+    mesh : triangles that face outwards; a face is identified by its row.
     usage : true needs of the buffers. Where they exceed their capacities the mesh is wrong and must
         be discarded.
     """
@@ -42,7 +42,10 @@ class Following(NamedTuple):
 
 
 class SurfaceModel(eqx.Module):
-    """A way to make a mesh of learned parameters, its *shape*: a pytree of whatever it needs."""
+    """A representation of a surface, which turns learned parameters into a mesh.
+
+    These parameters are called its *shape*; they are a pytree of any structure.
+    """
 
     @property
     @abc.abstractmethod
@@ -56,23 +59,36 @@ class SurfaceModel(eqx.Module):
 
     @abc.abstractmethod
     def extract(self, shape: Any, *, capacities: Capacities, final: bool = False) -> Surface:
-        """Build the mesh of a shape; differentiable in what moves its vertices.
+        """Build the mesh of a shape; its vertices are differentiable in the shape.
 
         Parameters
         ----------
         shape : learned parameters of the surface.
         capacities : static sizes of buffers.
-        final : static; the mesh that leaves the program, where that differs from the one that is
-            trained.
+        final : static; whether to build the mesh that is exported, where that differs from the one
+            that is trained.
         """
 
     @abc.abstractmethod
     def penalties(self, shape: Any, surface: Any) -> dict[str, Float[Array, ""]]:
-        """Evaluate the surface's own terms of the loss, by name."""
+        """Evaluate the surface's own terms of the loss; differentiable in the shape.
+
+        Parameters
+        ----------
+        shape : learned parameters of the surface.
+        surface : what `extract` returned for them.
+
+        Returns
+        -------
+        () unweighted value of every term, by the name of its weight.
+        """
 
     @abc.abstractmethod
     def ray_index(self, surface: Any, *, capacities: Capacities) -> RayIndex:
-        """Arrange a surface from `extract` for rays; no gradients."""
+        """Build the structure that rays are traced against, from a surface of `extract`.
+
+        Not differentiable. Its ``usage`` tells whether its buffers fit the static ``capacities``.
+        """
 
     @abc.abstractmethod
     def nearby_points(self, shape: Any) -> tuple[Float[Array, "N 3"], Float[Array, " N"]]:

@@ -91,8 +91,10 @@ def _derive() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 
 PATCH_COUNT, PATCH_EDGES, PATCH_OF_EDGE, PROBLEM_OFFSET = _derive()
-"""(256,) patches of a case; (256, 4) their edges as 12-bit sets, 0 for no patch; (256, 12) the
-patch of each crossing edge; (256, 3) the step to the neighbour across the problem face, or 0."""
+"""Tables of the 256 cases. ``PATCH_COUNT`` (256,): number of patches. ``PATCH_EDGES`` (256, 4): the
+edges of each patch as a 12-bit set, 0 for no patch. ``PATCH_OF_EDGE`` (256, 12): the patch of each
+crossing edge. ``PROBLEM_OFFSET`` (256, 3): the step to the cell across the ambiguous face whose two
+arcs belong to one patch, 0 for a case without such a face."""
 
 
 def _quad_tables() -> tuple[np.ndarray, np.ndarray]:
@@ -110,5 +112,6 @@ def _quad_tables() -> tuple[np.ndarray, np.ndarray]:
 
 
 QUAD_CELLS, QUAD_EDGES = _quad_tables()
-"""(3, 4, 3) steps from a cell to the cells around the edge that leaves its lowest corner along
-each axis, counter-clockwise seen from the upper end; (3, 4) that edge's number in those cells."""
+"""Tables of the edges that leave the lowest corner of a cell along each axis. ``QUAD_CELLS``
+(3, 4, 3): steps from the cell to the four cells around the edge, counter-clockwise seen from the
+edge's upper end. ``QUAD_EDGES`` (3, 4): number of the edge in each of these cells."""

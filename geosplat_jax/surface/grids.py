@@ -13,12 +13,18 @@ from geosplat_jax.surface.lattice import Lattice, grid_vertices, lattice_of
 
 
 def deformed_vertices(geometry: Geometry, grid: Grid) -> Float[Array, "G 3"]:
-    """Positions of the grid vertices, each moved by at most ``grid.reach`` cells along an axis."""
+    """World positions of the grid vertices, moved by at most ``grid.reach`` cells on each axis."""
     return grid_vertices(grid) + grid.cell_size * grid.reach * jnp.tanh(geometry.deform)
 
 
 def initial_geometry(grid: Grid, sdf: Float[Array, " G"]) -> Geometry:
-    """Geometry with this SDF (in units of a cell), no deformation and neutral weights."""
+    """Geometry with this SDF (in units of a cell), no deformation and neutral weights.
+
+    Raises
+    ------
+    ValueError
+        If ``sdf`` does not have one value per vertex of the grid.
+    """
     if sdf.shape != (grid.vertex_count,):
         raise ValueError(
             f"sdf must have one value for each of the {grid.vertex_count} grid vertices, "
@@ -28,7 +34,13 @@ def initial_geometry(grid: Grid, sdf: Float[Array, " G"]) -> Geometry:
 
 
 def neutral_geometry(sdf: Float[Array, " G"], cells: int) -> Geometry:
-    """Geometry with this SDF, no deformation and neutral weights of so many cells."""
+    """Geometry with this SDF (in units of a cell), no deformation and neutral weights.
+
+    Parameters
+    ----------
+    sdf : (G,) values of any number of vertices.
+    cells : number of rows of the weights.
+    """
     dtype = sdf.dtype
     return Geometry(
         sdf=sdf,
@@ -46,7 +58,17 @@ def sphere_sdf(grid: Grid, *, radius: float | Float[Array, ""]) -> Float[Array, 
 
 
 def closed_at_border(sdf: Float[Array, " G"], grid: Grid) -> Float[Array, " G"]:
-    """Cut a shape, in cells, half a cell inside the box: its surface then has no holes there."""
+    """Cut a shape off half a cell inside the box, so that its surface has no holes there.
+
+    Parameters
+    ----------
+    sdf : (G,) in cells, negative inside.
+    grid : the box.
+
+    Returns
+    -------
+    (G,) in cells.
+    """
     last = jnp.asarray(grid.shape, sdf.dtype) * grid.cell_size
     points = grid_vertices(grid) - grid.origin[None, :]
     outside = jnp.max(jnp.maximum(-points, points - last[None, :]), axis=-1) / grid.cell_size
@@ -77,11 +99,11 @@ def _interpolate(
 
 
 def resample(geometry: Geometry, grid: Grid, new_grid: Grid) -> Geometry:
-    """Carry the shape to another grid: trilinear SDF there, no deformation, neutral weights.
+    """Resample a shape on another grid: trilinear SDF, no deformation, neutral weights.
 
-    The deformation of the old grid is taken into account by three fixed-point steps of its
-    inverse. SDF values are rescaled to the new cell. Outside the old box the nearest value there
-    plus the distance to it is used, so that a surface that is closed stays closed.
+    The deformation of the old grid is inverted by three fixed-point steps. SDF values are rescaled
+    to the new cell. A vertex outside of the old box takes the value at the nearest point of the box
+    plus the distance to that point, so that a closed surface stays closed.
     """
     world = (grid_vertices(new_grid) - grid.origin[None, :]) / grid.cell_size
     moves = grid.reach * jnp.tanh(geometry.deform)
@@ -99,14 +121,23 @@ def sdf_entropy(
 ) -> Float[Array, ""]:
     """Cross entropy of signs over the grid edges whose ends differ in sign (paper Eq. 14).
 
-    ``BCE(sigmoid(a), sign(b)) + BCE(sigmoid(b), sign(a))`` summed, or averaged over those edges.
-    Zero counts as outside. An SDF of one sign gives 0 with zero gradient. ``grid`` : or what holds
-    values of some of its vertices.
+    ``BCE(sigmoid(a), sign(b)) + BCE(sigmoid(b), sign(a))``, summed or averaged over those edges.
+    Zero counts as outside. An SDF of one sign gives 0 with zero gradient.
+
+    Parameters
+    ----------
+    geometry : of which ``sdf`` is used.
+    grid : the grid, or the `Lattice` that says which of its vertices hold values.
+    reduction : static; mean or sum over the edges.
+
+    Returns
+    -------
+    () not negative; differentiable in the SDF.
     """
     lattice = lattice_of(grid)
     sdf = lattice.values(geometry.sdf)
-    # Ends of opposite sign: BCE(sigmoid(a), sign(b)) = softplus(|a|), so that the sum over edges
-    # is one over vertices, each weighted with the number of its crossed edges.
+    # For ends of opposite sign BCE(sigmoid(a), sign(b)) = softplus(|a|). The sum over edges is
+    # therefore a sum over vertices, each weighted by the number of its crossed edges.
     crossings = lattice.crossed_edges(sdf)
     size = jnp.where(sdf < 0, -sdf, sdf)
     total = jnp.sum(crossings.astype(size.dtype) * jax.nn.softplus(size))
@@ -116,11 +147,15 @@ def sdf_entropy(
 
 
 def weight_magnitude(geometry: Geometry, cell_count: int | None = None) -> Float[Array, ""]:
-    """Mean magnitude of all raw alpha and beta weights; gamma is free (FlexiCubes).
+    """Mean magnitude of all raw alpha and beta weights; gamma is not penalised (FlexiCubes).
 
-    Its minimum, where its gradient is zero, is plain dual cubes, from which training starts.
-    ``cell_count`` : cells of the whole grid, where the geometry holds weights of some of them and
-    those of the others are neutral.
+    It is zero, with zero gradient, for neutral weights, with which training starts.
+
+    Parameters
+    ----------
+    geometry : of which ``alpha`` and ``beta`` are used.
+    cell_count : number of cells in the mean; by default the rows of the weights. For a geometry
+        that holds weights of some cells, the number of all cells: the others have neutral weights.
     """
     weights = (geometry.alpha, geometry.beta)
     total = jnp.sum(jnp.stack([jnp.sum(absolute(weight)) for weight in weights]))

@@ -5,17 +5,17 @@ the lid has the colours of the bottom, from another side those of the wall. That
 what gives it away (photo-consistency). Four steps find what lies behind:
 
 1. Points of the surface on whose colour the views disagree are carved, again and again (space
-   carving, Kutulakos and Seitz 2000). Views are taken to agree with the median colour where
-   anything in a window of 3 x 3 pixels does (the shuffle transform, Kutulakos 2000), so that
-   texture, and a surface that is a cell out of place, are no disagreement.
-2. This uses one half of the views. The other half judges: a hollow stays where it explains their
-   colours much better than the lid did, and better than a mirror would. On metals and glossy
-   surfaces views also disagree, but a dent does not explain what they reflect.
-3. The hollows that stay are carved once more, with all views and less tolerance.
-4. Then their surface moves inward while the views agree better on what lies a few cells deeper.
+   carving, Kutulakos and Seitz 2000). A view agrees with the median colour if that lies within, or
+   close to, the range of its colours in a window of 3 x 3 pixels (after the shuffle transform,
+   Kutulakos 2000), so that views agree in spite of texture or of a surface that is a cell off.
+2. Step 1 uses one half of the views, and the other half judges: a hollow is kept if it explains the
+   colours of the other half much better than the lid does, and better than a mirror would. On
+   metals and glossy surfaces views also disagree, but a dent does not explain what they reflect.
+3. The hollows that are kept are carved once more, with all views and less tolerance.
+4. Their surface then moves inward as long as the views agree better on points a few cells deeper.
 
-Small grids do: what is found on at most 48 cells along the longest side is interpolated. All of it
-is host-side preparation and not differentiable.
+A small grid is enough: hollows are found on at most 48 cells along the longest side, and the result
+is interpolated. All of it is host-side preparation and not differentiable.
 """
 
 from typing import Any, NamedTuple
@@ -35,12 +35,13 @@ from geosplat_jax.surface.sightings import Field, Photographed, Where, crossings
 
 _LONGEST = 48  # cells along the longest side of the grid that is carved
 _FEWEST_VIEWS = 8  # two halves of four
-_FEWEST_JUDGING = 3  # of either half
-_FEWEST_POINTS = 10  # of a lid, and of what lies behind it
+_FEWEST_JUDGING = 3  # least observations of a point in each half, and of a direction
+_FEWEST_POINTS = 10  # least number of points on a lid, and on the surface behind it
 
 _FIRST_PASS = (0.05, 0.6)
 _LATER_PASSES = ((0.05, 0.6), (0.04, 0.7))
-"""Difference in sRGB that is agreement, and the share of views that must agree."""
+"""For every pass of carving, the difference in sRGB below which a view agrees, and the share of the
+views that must agree on a point of the surface."""
 
 _WORST = 0.12  # larger differences in sRGB are clipped to this
 _CONFLICT = 0.05  # least mean difference on a lid that may hide a hollow
@@ -57,13 +58,14 @@ _THIN = 0.1  # least distance of a vertex from the surface, in cells
 
 
 class Candidate(NamedTuple):
-    """A part of the hull on whose surface views disagree, and how well what is behind explains it.
+    """A part of the hull that may be hollow, and how well the surface behind it explains the views.
 
-    Differences are means in sRGB, of one half of the views from what the other half shows.
+    Differences are in sRGB: the colours of one half of the views are predicted from the other half,
+    and their distances from the prediction are averaged.
 
     Attributes
     ----------
-    region : vertices of the grid that is carved, as z, y and x.
+    region : mask of the carved vertices of the grid, indexed by z, y and x.
     lid : difference on the surface of the hull.
     behind : difference on the surface behind the region.
     mirror : difference from what a mirror would show in place of the hull's surface; inf where the
@@ -77,7 +79,7 @@ class Candidate(NamedTuple):
 
     @property
     def is_hollow(self) -> bool:
-        """Whether what is behind explains the views far better than the lid and than a mirror."""
+        """Whether the surface behind explains the views far better than the lid and a mirror."""
         explains = self.lid > _CONFLICT and self.behind < _EXPLAINED * self.lid
         return explains and self.behind < _PLAINER * self.mirror
 
@@ -95,16 +97,18 @@ def carve_hollows(
 
     Parameters
     ----------
-    world_to_camera : (V, 4, 4) rigid, OpenCV axes; intrinsics : (V, 3, 3) pixels.
-    images : (V, H, W, 4) linear RGB and coverage, straight; an array, or what makes one view when
-        indexed.
+    world_to_camera : (V, 4, 4) rigid, OpenCV axes.
+    intrinsics : (V, 3, 3) pixels.
+    images : (V, H, W, 4) linear RGB with straight alpha; an array, or an object that makes one view
+        when it is indexed.
     sdf : (grid vertices,) signed distance to the hull in cells, x fastest, negative inside.
+    grid : the grid of ``sdf``.
     valid : (V, H, W) pixels that count, 0 or 1; None where all do.
 
     Returns
     -------
-    (grid vertices,) float32 in cells: ``sdf`` itself where there is no hollow, or fewer than 8
-    views. Nothing that is outside the hull comes inside.
+    (grid vertices,) float32 signed values in cells, nowhere below ``sdf``; ``sdf`` itself if there
+    is no hollow, or if there are fewer than 8 views.
     """
     if len(images) < _FEWEST_VIEWS:
         return sdf
@@ -130,7 +134,7 @@ def hollow_candidates(
     *,
     valid: Any = None,
 ) -> list[Candidate]:
-    """Return what `carve_hollows` chooses from, for the same arguments; none for few views."""
+    """Return the candidates of `carve_hollows` for the same arguments; none for under 8 views."""
     if len(images) < _FEWEST_VIEWS:
         return []
     fine, factor = _laid_out(sdf, grid)
@@ -139,7 +143,7 @@ def hollow_candidates(
 
 
 def _laid_out(sdf: Float[np.ndarray, " G"], grid: Grid) -> tuple[Field, int]:
-    """Lay values out as z, y and x, and say how many cells are taken as one."""
+    """Arrange values by z, y and x, and choose how many cells are one coarse cell on each axis."""
     fine = np.asarray(sdf, np.float32).reshape(grid.vertex_shape[::-1])
     return fine, -(-max(grid.shape) // _LONGEST)
 
@@ -192,11 +196,16 @@ def _mirrored(hull: Field, region: Where, fit: Photographed, judge: Photographed
 def _carved(
     field: Field, views: Photographed, region: Where, tolerance: float, share: float
 ) -> tuple[Field, Where]:
-    """Carve from a region outward while fewer than a share of the views agree on a point.
+    """Carve points of the surface in and around a region on which too few views agree, repeatedly.
+
+    Parameters
+    ----------
+    tolerance, share : see `_FIRST_PASS`.
 
     Returns
     -------
-    field, region : the region has what was carved, too.
+    field : signed values after carving.
+    region : the given region and all vertices that were carved.
     """
     field, region = field.copy(), region.copy()
     for _ in range(2 * max(field.shape)):
@@ -307,7 +316,7 @@ def _opened(
     hollows: Bool[np.ndarray, "z y x"],
     factor: int,
 ) -> Field:
-    """Take the hollows from the hull: the larger of both distances, in fine cells."""
+    """Subtract the hollows from the hull: the larger of the two signed distances, in fine cells."""
     solid = (hull < 0.0) & ~hollows
     # Empty the cells in front of the mouths as well: a film of the old surface would stay there.
     # The mask keeps this from passing through walls.
@@ -315,7 +324,8 @@ def _opened(
     away, into = (np.asarray(distance_transform_edt(side)) for side in (~empty, empty))
     signed = into - away
     smooth = gaussian_filter(signed - 0.5 * np.sign(signed), _SMOOTHING)
-    # Walls as thin as a cell stay walls.
+    # Solid vertices stay inside and hollow ones outside: smoothing would open walls that are as
+    # thin as a cell.
     distance = np.where(
         solid, np.minimum(smooth, -_THIN), np.where(hollows, np.maximum(smooth, _THIN), smooth)
     )

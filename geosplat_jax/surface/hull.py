@@ -1,14 +1,15 @@
 """The visual hull of masks: where the object can be, and a first signed distance field.
 
-A point is inside the hull when it lies on the mask in every view that sees it. Rather than carving
-voxels, each mask becomes a signed distance image with sub-pixel edges (its coverage, when
-antialiased, says where the edge crosses the pixel); a point looks its distance up in every view,
-scaled from pixels to world units at its depth, and keeps the worst. That is the distance to an
-intersection of cones: sub-pixel accurate at the surface from one sample a grid vertex, where
-binary carving needs many. All of this is host-side preparation and not differentiable.
+A point is inside the hull when it lies on the mask in every view that sees it. Instead of carving
+voxels, each mask is turned into an image of signed distances with sub-pixel edges (in an
+antialiased mask, coverage says where the edge crosses a pixel). The distance of a point is looked
+up in every view and scaled from pixels to world units at the depth of the point; the largest of
+them is the distance to the intersection of the silhouette cones. At the surface it is sub-pixel
+accurate with one sample per grid vertex, where binary carving needs many. All of this is host-side
+preparation and not differentiable.
 
 Cameras are rigid world-to-camera transforms to OpenCV axes; masks are bool, or coverage in [0, 1].
-A view whose mask is empty is taken as a failed mask and ignored.
+A view whose mask is empty is ignored, because its mask is taken to have failed.
 """
 
 from functools import partial
@@ -26,9 +27,10 @@ TOLERANCE = 0.02
 """Fraction of the views whose mask may miss a point of the object."""
 
 SEEN_FRACTION = 0.5
-"""A point that fewer of the views see is outside: few cones meet far away, where nobody looks."""
+"""Points that a smaller fraction of the views see are outside: far away, where few cameras look,
+the few cones that meet would otherwise add to the hull."""
 
-_POINTS_AT_ONCE = 1 << 15  # what a pass holds then stays in the cache
+_POINTS_AT_ONCE = 1 << 15  # the arrays of one pass then fit into the cache
 _POINTS_OF_A_SLAB = 1 << 20
 _MASK_PIXELS = 400  # larger masks are reduced first; the hull is never sampled that finely
 _COVERED = 0.5
@@ -54,8 +56,10 @@ def hull_distance(
 
     Parameters
     ----------
-    world_to_camera : (V, 4, 4); intrinsics : (V, 3, 3) pixels.
-    masks : (V, H, W) bool, or coverage in [0, 1]; an array, or what makes one view when indexed.
+    world_to_camera : (V, 4, 4) rigid.
+    intrinsics : (V, 3, 3) pixels.
+    masks : (V, H, W) bool, or coverage in [0, 1]; an array, or an object that makes one view when
+        it is indexed.
     points : (N, 3) world.
     valid : (V, H, W) pixels that count, 0 or 1; a view does not see what lies on the others.
     tolerance : a point is inside when the masks of all but ``floor(tolerance * V)`` views agree.
@@ -87,11 +91,12 @@ def hull_bounds(
     """Find the box around the hull, wherever in the world the cameras look.
 
     The search starts from a cube about the point nearest to the lines of sight through the masks'
-    centroids, as large as the cameras' distance, and closes in on the hull.
+    centroids, whose half side is the median distance of the cameras from that point. It is then
+    reduced step by step to the part that may hold the hull.
 
     Parameters
     ----------
-    valid : see `hull_distance`.
+    world_to_camera, intrinsics, masks, valid, tolerance, seen_fraction : see `hull_distance`.
     margin : added on every side, as a fraction of the longest side; at least one pixel at the
         object's distance.
 
@@ -142,6 +147,12 @@ def sight_bounds(
 
     Its centre is the point nearest to the cameras' axes. Its size is such that at least half of the
     views show all of it, and that no camera lies inside.
+
+    Parameters
+    ----------
+    world_to_camera : (V, 4, 4) rigid.
+    intrinsics : (V, 3, 3) pixels.
+    height, width : size of the images, pixels.
 
     Returns
     -------
@@ -221,7 +232,8 @@ def fit_grid(
 ) -> Grid:
     """Lay cubic cells around a box: ``resolution`` of them along its longest side.
 
-    Margins are included in the count, at least ``margin_cells`` on each side; the box is centred.
+    The count includes a margin of at least ``margin_cells`` on each side of the box, which lies in
+    the centre of the grid.
 
     Raises
     ------
@@ -246,7 +258,7 @@ def fit_grid(
 def grid_points(grid: Grid, first: int = 0, last: int | None = None) -> Float[np.ndarray, "G 3"]:
     """World positions of the grid's vertices, x fastest, float64 on the host.
 
-    ``first``, ``last`` : of the layers of vertices along z; None for all.
+    ``first``, ``last`` : range of the layers along z, as in a slice.
     """
     origin, cell = np.asarray(grid.origin, np.float64), float(grid.cell_size)
     axes = [origin[i] + cell * np.arange(grid.vertex_shape[i]) for i in range(3)]
@@ -328,7 +340,7 @@ def without_haze(coverage: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]
 
 
 def _grown(where: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Add the eight pixels around each."""
+    """Add the eight neighbours of every pixel."""
     padded = np.pad(where, 1)
     rows = padded[:-2] | padded[1:-1] | padded[2:]
     return rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
@@ -337,7 +349,7 @@ def _grown(where: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
 def _continued(coverage: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Give pixels that do not count the coverage of the nearest one that does.
 
-    A mask that is cut off there has no edge there.
+    A mask that is cut off by such pixels then has no edge along them.
     """
     if known.all() or not known.any():
         return coverage
@@ -385,7 +397,7 @@ def _signed_pixels(coverage: np.ndarray) -> np.ndarray:
 def _evaluate(
     view: _Silhouettes, points: np.ndarray, *, tolerance: float, seen_fraction: float
 ) -> np.ndarray:
-    """Look the points up in every view, a fixed number at a time (one compilation)."""
+    """Evaluate the distance of points to the hull, a fixed number at a time (one compilation)."""
     view_count = view.distances.shape[0]
     tolerated = int(tolerance * view_count)
     least_seen = max(1, int(np.ceil(seen_fraction * view_count)))
@@ -476,7 +488,21 @@ def _distance_in_view(pinhole, intrinsics, distances, counts, points):
 def meeting_point(
     centers: Float[np.ndarray, "V 3"], directions: Float[np.ndarray, "V 3"]
 ) -> Float[np.ndarray, " 3"]:
-    """Find the point nearest to lines through ``centers``; `ValueError` where they are parallel."""
+    """Find the point with the least sum of squared distances to V lines.
+
+    Parameters
+    ----------
+    centers : (V, 3) a point of each line, world.
+    directions : (V, 3) of the lines, of any length above zero.
+
+    Returns
+    -------
+    (3,) world.
+
+    Raises
+    ------
+    ValueError : the lines are nearly parallel, or there is only one.
+    """
     sight = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     # Normal equations of min Σ |(I - d dᵀ)(x - c)|².
     across = np.eye(3)[None] - sight[:, :, None] * sight[:, None, :]

@@ -1,9 +1,9 @@
 """Which cells and vertices of a grid hold values, and in which rows.
 
-The isosurface, its penalties and whatever else looks values up ask a `Lattice` where they are. On a
-`WholeGrid` every cell and every vertex has a row, and the row is its number; on a `band.Band` only
-those near the surface have one. What is computed from them is the same code and gives the same
-numbers.
+The isosurface, its penalties and all other code that looks values up ask a `Lattice` for their
+rows. On a `WholeGrid` every cell and every vertex has a row, and the row is its number; on a
+`band.Band` only those near the surface have one. The code that uses the values is the same for
+both, and gives the same results.
 """
 
 import abc
@@ -18,11 +18,11 @@ from geosplat_jax.surface.flexicubes_tables import CORNERS
 
 
 class Lattice(eqx.Module):
-    """Rows of a grid's cells and vertices; rows that belong to none are padding.
+    """Rows of a grid's cells and vertices; rows without a cell or a vertex are padding.
 
     Attributes
     ----------
-    grid : whose cells and vertices are numbered with x fastest.
+    grid : the grid; its cells and vertices are numbered with x fastest.
     """
 
     grid: eqx.AbstractVar[Grid]
@@ -38,11 +38,11 @@ class Lattice(eqx.Module):
 
     @abc.abstractmethod
     def cell_numbers(self, rows: Int[Array, "*n"]) -> Int[Array, "*n"]:
-        """Return the numbers of the cells in some rows; any on padding."""
+        """Return the numbers of the cells in some rows; an arbitrary number on padding."""
 
     @abc.abstractmethod
     def rows_of_cells(self, numbers: Int[Array, "*n"]) -> Int[Array, "*n"]:
-        """Return the rows of cells; any for a cell that has none."""
+        """Return the rows of the cells with some numbers; arbitrary for a cell without a row."""
 
     @abc.abstractmethod
     def corner_rows(
@@ -50,7 +50,10 @@ class Lattice(eqx.Module):
     ) -> Int[Array, "8 n"]:
         """Return the rows of the vertices at the corners of cells.
 
-        ``rows`` and ``coordinates`` are of the same cells.
+        Parameters
+        ----------
+        rows : (n,) rows of the cells.
+        coordinates : (3, n) their places (i, j, k) in the grid.
         """
 
     @abc.abstractmethod
@@ -88,19 +91,19 @@ class WholeGrid(Lattice):
 
     @property
     def cell_rows(self) -> int:
-        """All cells."""
+        """Number of cells; no row is padding."""
         return self.grid.cube_count
 
     def values(self, sdf: Float[Array, " G"]) -> Float[Array, " G"]:
-        """Return them as they are."""
+        """Return the values unchanged."""
         return sdf
 
     def cell_numbers(self, rows: Int[Array, "*n"]) -> Int[Array, "*n"]:
-        """Return the rows."""
+        """Return the rows: the number of a cell is its row."""
         return rows
 
     def rows_of_cells(self, numbers: Int[Array, "*n"]) -> Int[Array, "*n"]:
-        """Return the numbers."""
+        """Return the numbers: the row of a cell is its number."""
         return numbers
 
     def corner_rows(
@@ -139,12 +142,12 @@ class WholeGrid(Lattice):
         return grid_vertices(self.grid)
 
     def crossing_count(self, values: Float[Array, " G"]) -> int:
-        """Count the crossed edges along every axis."""
+        """Count the crossed edges of all three axes together."""
         vx, vy, vz = self.grid.vertex_shape
         inside = (np.asarray(values) < 0).reshape(vz, vy, vx)
         return sum(int(np.sum(np.diff(inside, axis=axis))) for axis in range(3))
 
 
 def lattice_of(grid: Grid | Lattice) -> Lattice:
-    """Take a grid as holding values everywhere."""
+    """Return a lattice as it is, and for a grid the lattice of all its cells and vertices."""
     return grid if isinstance(grid, Lattice) else WholeGrid(grid)

@@ -1,7 +1,7 @@
 """Which views see the points of a solid on a grid, and in which colours.
 
-Lengths are cells of the grid, from its origin. All of it is host-side preparation and not
-differentiable.
+Positions are relative to the origin of the grid, in units of its cells. All of it is host-side
+preparation and not differentiable.
 """
 
 from dataclasses import dataclass, replace
@@ -23,12 +23,12 @@ Field = Float[np.ndarray, "Z Y X"]
 """Signed distances of the vertices of a grid, negative inside."""
 
 Where = Bool[np.ndarray, "Z Y X"]
-"""Some of the vertices of a grid."""
+"""Mask of the vertices of a grid."""
 
 FEWEST_SEEN = 4
-"""Views that must see a point to say anything about it."""
+"""Least number of views that must see a point for its colours to be compared."""
 
-_MOST_VIEWS = 64  # evenly chosen; time grows with them
+_MOST_VIEWS = 64  # of more views so many are chosen evenly: time grows with their number
 _FACING = 0.25  # least cosine between a point's normal and the direction to a view
 _CLEAR = 2.0  # cells above a point at which its line of sight begins
 _STRIDE = 0.7  # cells between looks along a line of sight
@@ -38,14 +38,14 @@ _POINTS_AT_ONCE = 2048
 
 
 class Crossings(NamedTuple):
-    """Where the edges of the grid leave the solid.
+    """N points at which edges of the grid cross the surface of the solid.
 
     Attributes
     ----------
-    inside : (N, 3) the edge's vertex in the solid, as z, y and x.
-    outside : (N, 3) its other one.
-    position : (N, 3) where it leaves, x, y and z in cells.
-    normal : (N, 3) outward.
+    inside : (N, 3) z, y and x of the edge's vertex in the solid.
+    outside : (N, 3) z, y and x of the edge's other vertex.
+    position : (N, 3) x, y and z of the point, in cells.
+    normal : (N, 3) unit outward normal, x, y and z.
     """
 
     inside: Int[np.ndarray, "N 3"]
@@ -92,8 +92,8 @@ class Sight(NamedTuple):
 
     Attributes
     ----------
-    color : (V, N, 3).
-    low, high : (V, N, 3) least and largest in the window around it.
+    color : (V, N, 3) colour at the point.
+    low, high : (V, N, 3) least and largest value of each channel in a window around the point.
     seen : (V, N) whether the view shows the point.
     """
 
@@ -108,7 +108,10 @@ class Sight(NamedTuple):
         return self.seen.sum(0) >= FEWEST_SEEN
 
     def median(self) -> Float[np.ndarray, "N 3"]:
-        """Median colour over the views that see a point, the lower one of two; else 0."""
+        """Median colour over the views that see a point, channel by channel; 0 where none does.
+
+        For an even number of views it is the lower one of the two middle values.
+        """
         ordered = np.sort(np.where(self.seen[..., None], self.color, np.inf), axis=0)
         count = self.seen.sum(0)
         middle = np.maximum(count - 1, 0) // 2
@@ -134,15 +137,16 @@ class Sight(NamedTuple):
 
 @dataclass(frozen=True)
 class Photographed:
-    """Photographs of about a pixel a cell, with cameras in units of cells from the grid's origin.
+    """Photographs, reduced to about one pixel per cell, and their cameras in units of cells.
 
     Attributes
     ----------
-    pinholes : (V, 3, 4) from cells to the camera's axes.
-    centers : (V, 3) of the cameras, cells.
-    intrinsics : (V, 3, 3) pixels.
-    color, low, high : (V, H, W, 3) sRGB; the latter two over windows of 3 x 3 pixels.
-    shows : (V, H, W) pixels that show the object alone, and count.
+    pinholes : (V, 3, 4) rigid transforms from the grid to the camera's axes, in cells.
+    centers : (V, 3) positions of the cameras, cells.
+    intrinsics : (V, 3, 3) pixels of the reduced photographs.
+    color : (V, H, W, 3) sRGB.
+    low, high : (V, H, W, 3) least and largest sRGB in windows of 3 x 3 pixels.
+    shows : (V, H, W) whether a pixel counts and shows nothing but the object.
     """
 
     pinholes: Float[np.ndarray, "V 3 4"]
@@ -163,7 +167,10 @@ class Photographed:
         grid: Grid,
         factor: int,
     ) -> "Photographed":
-        """Choose views, reduce them and put their cameras into a grid of larger cells."""
+        """Choose views, reduce their images, and express their cameras in larger cells.
+
+        ``factor`` : cells of ``grid`` along the side of a larger cell.
+        """
         origin, cell = np.asarray(grid.origin, np.float64), factor * float(grid.cell_size)
         number = min(len(images), _MOST_VIEWS)
         chosen = np.unique(np.linspace(0, len(images) - 1, number).round().astype(int))
@@ -190,7 +197,7 @@ class Photographed:
         )
 
     def every_second(self, first: int) -> "Photographed":
-        """Return one half of the views."""
+        """Return every second view, from number ``first`` on."""
         arrays = {name: getattr(self, name)[first::2] for name in self.__dataclass_fields__}
         return replace(self, **arrays)
 
@@ -214,7 +221,13 @@ class Photographed:
         )[0]
 
     def sample(self, points: Float[np.ndarray, "N 3"], visible: Bool[np.ndarray, "V N"]) -> Sight:
-        """Look points up in the images of all views, of which some see them."""
+        """Look up the colours of points in the images of all views.
+
+        Parameters
+        ----------
+        points : (N, 3) cells.
+        visible : (V, N) whether a view sees a point.
+        """
         arrays = (self.pinholes, self.intrinsics, self.color, self.low, self.high, self.shows)
         color, low, high, shown = _in_parts(lambda part: _sample(*arrays, part), points)
         return Sight(color, low, high, shown & visible)
@@ -250,7 +263,7 @@ def _visible(
     *,
     steps: int,
 ) -> tuple[Bool[Array, "V N"]]:
-    """March from points to cameras, to where the grid ends."""
+    """March from points towards cameras, through the whole grid, and tell which see the points."""
     last = jnp.asarray(solid.shape[::-1]) - 1
     flat = solid.reshape(-1)
     strides = jnp.asarray([1, solid.shape[2], solid.shape[1] * solid.shape[2]])
@@ -283,7 +296,7 @@ def _sample(
     shows: Bool[Array, "V H W"],
     points: Float[Array, "N 3"],
 ) -> tuple[Array, ...]:
-    """Look up colours between pixels, the window around the own one, and whether it shows them."""
+    """Look up interpolated colours, windows of the pixels, and whether these show the object."""
     height, width = shows.shape[1:]
 
     def one(view):
@@ -332,7 +345,10 @@ def _small(
 def _encoded(
     linear: Float[np.ndarray, "V H W 3"], shows: Bool[np.ndarray, "V H W"]
 ) -> Float[np.ndarray, "V H W 3"]:
-    """Encode in sRGB, where equal steps look alike; radiance above white is exposed down first."""
+    """Encode in sRGB, where equal steps look alike.
+
+    If the 99th percentile of the colours exceeds one, all are divided by it first.
+    """
     brightest = np.quantile(linear[shows], 0.99) if shows.any() else 1.0
     exposed = np.clip(linear / max(1.0, float(brightest)), 0.0, 1.0)
     return np.asarray(linear_to_srgb(jnp.asarray(exposed, jnp.float32)))

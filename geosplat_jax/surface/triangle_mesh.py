@@ -5,8 +5,8 @@ then holds every triangle twice: the fronts in the first half of the rows, and t
 vertices of their own, in the second half. Both sides share their parameters. Back-face culling and
 shading then treat each side as they treat a closed surface. The final mesh has every triangle once.
 
-Penalties. Lengths are in mean edges of the start, so that a weight means the same on a coarse mesh
-and on a fine one:
+Penalties. Their unit of length is the mean edge length at the start, so that a weight means the
+same on a coarse mesh and on a fine one:
 
 - ``laplacian``: squared distance of a vertex from the mean of its neighbours (the umbrella, every
   neighbour alike); at an open border only the neighbours along it count, so that holes stay;
@@ -15,7 +15,7 @@ and on a fine one:
 - ``edge_length``: squared change of an edge's length since the start;
 - ``offset``: squared distance of a vertex from its start.
 
-Each is a mean over what it is summed over.
+Each term is a mean over the vertices, pairs of faces or edges of the mesh.
 """
 
 from typing import Any, NamedTuple
@@ -36,12 +36,12 @@ PENALTIES = ("laplacian", "normal_consistency", "edge_length", "offset")
 """Terms of `TriangleMesh.penalties`."""
 
 _BOX_MARGIN = 1.1
-"""Size of the box over that of the mesh: vertices move, and the fields end at its sides."""
+"""Size of the box divided by that of the mesh: vertices move, and fields are constant outside."""
 
 _SPLATS_PER_FACE = 6
 
 _LEAST_HEIGHT = 1e-3
-"""Height over its longest edge, in mean edges of the mesh, from which a face has a direction."""
+"""A face is a sliver if its height over its longest edge is at most this, in mean edge lengths."""
 
 
 class VertexOffsets(eqx.Module):
@@ -49,7 +49,7 @@ class VertexOffsets(eqx.Module):
 
     Attributes
     ----------
-    offsets : (V, 3) way of every vertex from its start, in half the longest side of the box.
+    offsets : (V, 3) displacement of every vertex from its start, in units of half the box's side.
     """
 
     offsets: Float[Array, "V 3"] = learned("vertices")
@@ -119,13 +119,16 @@ class TriangleMesh(SurfaceModel):
 
     Attributes
     ----------
-    home : (V, 3) where the vertices start, world. faces : (F, 3) rows of them.
-    edges, neighbours, wings : see `Connectivity`; wings are those of faces that have a height.
-    wing_signs : (P,) -1 where faces are wound against each other, else 1.
-    edge_lengths : (E,) at the start. degrees : (V,) numbers of neighbours, at least 1.
-    unit : () mean length of an edge at the start.
+    home : (V, 3) positions of the vertices at the start, world.
+    faces : (F, 3) rows of the vertices.
+    edges, neighbours, wings : see `Connectivity`; without the wings of slivers.
+    wing_signs : (P,) -1 where the two faces have opposite orientations, else 1.
+    edge_lengths : (E,) at the start, world units.
+    degrees : (V,) numbers of neighbours, at least 1.
+    unit : () mean edge length at the start, world units.
     bounds : the cube around the mesh.
-    cells : static numbers of cells for rays. is_sheet : static; both sides are surface.
+    cells : static; numbers of cells of the grid that rays walk through, along each axis.
+    is_sheet : static; whether both sides of the triangles are surface.
     """
 
     home: Float[Array, "V 3"]
@@ -187,7 +190,7 @@ class TriangleMesh(SurfaceModel):
         cells: tuple[int, int, int],
         is_sheet: bool,
     ) -> "TriangleMesh":
-        """Make a surface of arrays of so many rows, all zero."""
+        """Make a surface whose arrays have the given numbers of rows, all zero."""
         pairs = (edges, neighbours, wings)
         return cls(
             jnp.zeros((vertices, 3)),
@@ -216,7 +219,7 @@ class TriangleMesh(SurfaceModel):
     def extract(
         self, shape: VertexOffsets, *, capacities: Capacities, final: bool = False
     ) -> Surface:
-        """Return the mesh; in training, of a sheet fronts and then backs."""
+        """Return the mesh; in training that of a sheet holds all fronts, then all backs."""
         vertices, faces = self.positions(shape), self.faces
         if self.is_sheet and not final:
             backs = faces[:, ::-1] + vertices.shape[0]
@@ -226,7 +229,7 @@ class TriangleMesh(SurfaceModel):
         return Surface(Mesh(vertices, faces, *counts), {})
 
     def penalties(self, shape: VertexOffsets, surface: Surface) -> dict[str, Float[Array, ""]]:
-        """Evaluate the terms that the module describes."""
+        """Evaluate the penalties that the docstring of the module describes, by name."""
         vertices = self.positions(shape) / self.unit
         return {
             "laplacian": self._laplacian(vertices),
@@ -244,7 +247,7 @@ class TriangleMesh(SurfaceModel):
         return jnp.mean(jnp.sum((total / self.degrees[:, None]) ** 2, axis=-1))
 
     def _normal_consistency(self, mesh: Mesh) -> Float[Array, ""]:
-        # The backs of a sheet say the same as its fronts, which come first.
+        # The fronts of a sheet come first; its backs would only repeat their terms.
         normals, _ = face_normals_and_areas(mesh)
         cosine = jnp.sum(normals[self.wings[:, 0]] * normals[self.wings[:, 1]], axis=-1)
         return jnp.sum(1.0 - self.wing_signs * cosine) / max(self.wings.shape[0], 1)
@@ -254,7 +257,7 @@ class TriangleMesh(SurfaceModel):
         return jnp.mean((lengths - self.edge_lengths / self.unit) ** 2)
 
     def ray_index(self, surface: Surface, *, capacities: Capacities) -> TriangleIndex:
-        """List the triangles of cells around the mesh; see `build_triangle_index`."""
+        """Build the ray index of the triangles; see `build_triangle_index`."""
         return build_triangle_index(
             surface.mesh.vertices[: self.home.shape[0]],
             self.faces,
@@ -264,11 +267,11 @@ class TriangleMesh(SurfaceModel):
         )
 
     def nearby_points(self, shape: VertexOffsets) -> tuple[Float[Array, "V 3"], Float[Array, " V"]]:
-        """Return the vertices."""
+        """Return the vertices (V, 3), world, all with a weight of one."""
         return self.positions(shape), jnp.ones_like(shape.offsets[:, 0])
 
     def first_capacities(self, shape: VertexOffsets) -> Capacities:
-        """Guess sizes from the number of faces; a view sees half of them, of a sheet one side."""
+        """Guess sizes from the number of faces: a view sees half, or one side of a sheet."""
         face_count = self.faces.shape[0]
         visible = _SPLATS_PER_FACE * face_count
         if not self.is_sheet:

@@ -50,18 +50,18 @@ def matt(materials: Materials, diffuse_light: Float[Array, "N 3"]) -> Shaded:
 
 
 class Illumination(eqx.Module):
-    """A light, prepared for every view; each transport has its own."""
+    """What a transport has prepared for all views; each transport has a class of its own."""
 
     @abc.abstractmethod
     def take(self, rows: Int[Array, " M"]) -> "Illumination":
-        """Return what belongs to some of the points it was prepared for; zero beyond the last."""
+        """Return the illumination of some of its points; zero for rows past the last point."""
 
     def averaged_parts(self) -> Any:
-        """Return the arrays whose mean over several passes is less noisy; () where none is."""
+        """Return the arrays whose mean over several passes is less noisy; () if there are none."""
         return ()
 
     def with_parts(self, parts: Any) -> "Illumination":
-        """Put averaged parts back."""
+        """Return this illumination with averaged parts in place of its own."""
         del parts
         return self
 
@@ -81,7 +81,7 @@ class Transport(eqx.Module):
 
     @property
     def needs_every_point(self) -> bool:
-        """Whether light comes by way of points that no view sees."""
+        """Whether the light of visible points depends on points that no view sees."""
         return False
 
     @property
@@ -134,10 +134,15 @@ class Transport(eqx.Module):
 
         Parameters
         ----------
-        key : of the samples that depend on the viewer; None for a transport without.
-        points, attributes, illumination : of the M points.
+        key : random key of the samples that depend on the viewer; None for a transport that draws
+            none.
+        points, attributes, illumination : those of the M points.
         wo : (M, 3) unit, towards the viewer.
         index : as for `prepare`.
+
+        Returns
+        -------
+        `Shaded` light of the M points, linear.
         """
 
     def filtered(
@@ -146,9 +151,17 @@ class Transport(eqx.Module):
         alpha: Float[Array, "H W"],
         focal: Float[Array, ""],
     ) -> dict[str, Float[Array, "H W c"]]:
-        """Clean one view's images, by name and premultiplied by ``alpha``, of noise.
+        """Remove noise from the images of one view.
 
-        ``focal`` : () focal length in pixels.
+        Parameters
+        ----------
+        images : by name, premultiplied by ``alpha``; `filter_inputs` names those that are needed.
+        alpha : (H, W) coverage.
+        focal : () focal length in pixels.
+
+        Returns
+        -------
+        The same images by name, of which some are filtered.
         """
         del alpha, focal
         return images
@@ -226,15 +239,15 @@ class Unlit(Transport):
 
     @property
     def uses_rays(self) -> bool:
-        """As the other one."""
+        """Whether the transport that it stands for traces rays."""
         return self.traces
 
     def prepare(self, *arguments: Any, **named: Any) -> tuple[Illumination, Any]:
-        """Refuse."""
+        """Raise `TypeError`: a placeholder computes no light."""
         raise TypeError("there is no light to prepare")
 
     def shade(self, *arguments: Any, **named: Any) -> Shaded:
-        """Refuse."""
+        """Raise `TypeError`: a placeholder computes no light."""
         raise TypeError("there is no light to shade with")
 
 
@@ -264,7 +277,7 @@ class TransportSettings(Variant, abc.ABC):
 
     @property
     def relative_cost(self) -> float:
-        """About how much longer a training step takes than with the split sum."""
+        """Approximate time of a training step, divided by that of a step with the split sum."""
         return 1.0
 
     @property
@@ -277,7 +290,7 @@ class TransportSettings(Variant, abc.ABC):
         return []
 
     def constant_bytes(self, light: LightSpec) -> int:
-        """Count the memory that the constants take which `build` computes; 0 where there are none.
+        """Count the bytes of the constants that `build` computes; 0 where there are none.
 
         ``light`` : size of the lights.
         """

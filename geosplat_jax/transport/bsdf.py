@@ -6,9 +6,9 @@ unit, in the world, and point away from the surface: ``wi`` towards the light, `
 viewer. Pure functions on rows; a row is one surface point with one pair of directions. Materials
 without a specular lobe (`Materials.has_specular`) have the base alone.
 
-The base is not dimmed by what the coat reflects, as in the authors' code. A white dielectric
-therefore returns more light than it receives (up to 4% head-on, more at grazing angles); each lobe
-by itself returns at most 1.
+As in the authors' code, the Lambertian base does not lose the light that the specular lobe
+reflects. A white dielectric therefore returns more light than it receives (up to 4% head-on, more
+at grazing angles); each lobe by itself returns at most as much as it receives.
 """
 
 import math
@@ -30,10 +30,11 @@ DIELECTRIC_F0 = 0.04
 """Normal reflectance of a non-metal: refractive index 1.5."""
 
 _OPPOSITE = 1e-10
-"""Directions whose sum is shorter are opposite: no half vector, and nothing is reflected."""
+"""Two directions whose sum is shorter than this are opposite: they have no half vector, and nothing
+is reflected."""
 
 _LOBE_PROBABILITY_FLOOR = 0.1
-"""Least share of samples for the specular lobe: bounds the weight of a sample it would miss."""
+"""Least share of samples for the specular lobe, which bounds the weight of any sample in it."""
 
 
 Components = tuple[Array, ...]
@@ -115,7 +116,7 @@ def smith_visibility(
 
 
 class Lobe(eqx.Module):
-    """What the specular lobe of a pair of directions consists of, any shape.
+    """Factors of the specular lobe for pairs of directions, in arrays of any shape.
 
     Attributes
     ----------
@@ -123,7 +124,7 @@ class Lobe(eqx.Module):
     strength : ``D G / (4 (n.wi)(n.wo))``, zero where either direction lies below the surface.
     grazing : ``(1 - wi.half)^5``: the Fresnel reflectance is ``f0 + (1 - f0) grazing``.
     is_above : whether both directions lie above the surface.
-    density : of `sample_specular` per steradian.
+    density : density per steradian with which `sample_specular` draws ``wi``.
     """
 
     cosine: Float[Array, "..."]
@@ -158,8 +159,9 @@ def specular_lobe(normals: Components, wi: Components, wo: Components, alpha: Ar
     strength = distribution * smith_visibility(floored_i, floored_o, alpha)
     # wi . half = wo . half = |wi + wo| / 2.
     rest = 1 - jnp.minimum(0.5 * length, 1.0)
-    # G1(wo) D / (4 n.wo), Heitz 2018 Eq. 3 and 17, with G1 = 2 n.wo / (n.wo + root). No floor above
-    # zero here nor in the sampling: the root is at least alpha, and both must agree.
+    # G1(wo) D / (4 n.wo), Heitz 2018 Eq. 3 and 17, with G1 = 2 n.wo / (n.wo + root). As in the
+    # sampling, with which the density must agree, the cosine has no floor above zero: the root is
+    # at least alpha.
     seen = jnp.maximum(cosine_o, 0.0)
     return Lobe(
         cosine=jnp.maximum(cosine_i, 0.0),
@@ -180,8 +182,9 @@ def evaluate_factors(
 
     Returns
     -------
-    base : (N,) ``1 / pi``, and fresnel : (N, 3), strength : (N,) ``D G / (4 (n.wi)(n.wo))``. Base
-    and strength are zero where either direction lies below the surface.
+    base : (N,) ``1 / pi``; zero where either direction lies below the surface.
+    fresnel : (N, 3) Fresnel reflectance.
+    strength : (N,) ``D G / (4 (n.wi)(n.wo))``; zero where either direction lies below the surface.
     """
     alpha = ggx_alpha(materials.roughness)
     lobe = specular_lobe(_components(normals), _components(wi), _components(wo), alpha)
@@ -223,8 +226,8 @@ def evaluate(
     Returns
     -------
     (N, 3), per steradian; zero where either direction lies below the surface. Reciprocal.
-    Differentiable in everything except that sign test. Cosines are clamped at 1e-4, so the value
-    is finite at grazing angles.
+    Differentiable in all arguments; whether a direction lies below the surface is piecewise
+    constant. Cosines are clamped at 1e-4, so that the value is finite at grazing angles.
     """
     diffuse, specular = evaluate_lobes(materials, normals, wi, wo)
     return diffuse + specular

@@ -7,9 +7,8 @@ linear in the light, so that noise of mean zero stays of mean zero, in values an
 
 Filter light *before* it is multiplied by albedo; texture then survives, whatever its contrast.
 
-Every pair of pixels has one weight, the same seen from either: ``w(p, q) = w(q, p)``. Half of the
-24 weights a pixel are therefore computed, and the transpose that the gradient needs is the filter
-itself.
+The weight of a pair of pixels is symmetric, ``w(p, q) = w(q, p)``. Therefore only half of the 24
+weights per pixel are computed, and the transposed sum, which the gradient needs, is the sum itself.
 """
 
 import math
@@ -51,11 +50,11 @@ class DenoiseSpec:
     the power ``cos^sharpness``; 0 ignores normals. At 64 the weight is 0.37 at 10 degrees and 2e-4
     at 30."""
     depth_sigma: _Sigma = 1.0
-    """Distance of a neighbouring pixel from the surface's tangent plane where the weight is 0.37,
-    in widths of a pixel on the surface; it grows with the square root of the pixels between. The
-    unit of length does not enter. Infinity ignores depth."""
+    """Distance of a neighbouring pixel from the surface's tangent plane at which the weight is
+    0.37, in widths of a pixel on the surface; it grows with the square root of the distance between
+    the pixels. The value does not depend on the unit of length. Infinity ignores depth."""
     albedo_sigma: _Sigma = 0.1
-    """Distance of linear RGB albedos where the weight is 0.37; infinity ignores albedo."""
+    """Distance of two linear RGB albedos at which the weight is 0.37; infinity ignores albedo."""
 
 
 def _shifted(maps: Float[Array, "... H W"], dy: int, dx: int) -> Float[Array, "... H W"]:
@@ -96,12 +95,12 @@ def _guide_maps(
     focal: Float[Array, ""],
     spec: DenoiseSpec,
 ) -> tuple[Float[Array, "6 H W"], Float[Array, "4 H W"]]:
-    """Prepare what weights are made of: features, whose squared distance counts, and depth.
+    """Prepare the maps from which weights are computed: features, and heights.
 
-    Depth enters as ``focal * log(depth)``: its change from pixel to pixel is the slope of the
-    surface against the image plane, whatever the unit of length. The maps of the second result are
-    this height, its two gradients, and the squared cosine between surface and image plane, divided
-    by the square of its sigma.
+    Features are compared by their squared distance. The height of a pixel is
+    ``focal * log(depth)``: its change from pixel to pixel is the slope of the surface against the
+    image plane, whatever the unit of length. The second result holds the height, its two gradients,
+    and the squared cosine between surface and image plane, divided by ``depth_sigma**2``.
     """
     is_visible = (alpha > 0).astype(alpha.dtype)
     unit = safe_normalize(normals)
@@ -122,7 +121,7 @@ def _pad(maps: Float[Array, "... H W"], spread: int) -> Float[Array, "... H2 W2"
     """Add a border of zeros that every tap inside the image's extent fits into."""
     borders = [min(2 * spread, size) for size in maps.shape[-2:]]
     widths = [(0, 0)] * (maps.ndim - 2) + [(border, border) for border in borders]
-    # Unless it is a buffer of its own, every tap asks anew whether it reads the border.
+    # Without the barrier XLA fuses the padding into every tap, which then tests for the border.
     return jax.lax.optimization_barrier(jnp.pad(maps, widths))
 
 
@@ -147,8 +146,8 @@ def _taps(shape: tuple[int, int], spread: int) -> list[tuple[int, int]]:
 def _harmonic_mean(a: Float[Array, "H W"], b: Float[Array, "H W"]) -> Float[Array, "H W"]:
     """Average two slopes by van Leer's limiter: 0 where signs differ, at most twice the smaller.
 
-    Where they agree it is as accurate as the mean. Where one pixel lies astride a jump, its slope
-    is large and wrong, and the other one's counts.
+    Where the slopes agree, the result is as accurate as their mean. At a pixel on a jump the slope
+    is large and wrong; the result then follows the smaller slope, of the other pixel.
     """
     agree = a * b > 0
     return jnp.where(agree, 2 * a * b / jnp.where(agree, a + b, 1.0), 0.0)
@@ -170,7 +169,8 @@ def _pair_weights(
             spread * (dy * maps[7] + dx * maps[8]), spread * (dy * other[7] + dx * other[8])
         )
         off = other[6] - maps[6] - rise
-        # The less tilted of both: a pixel astride a jump looks steep, and must not excuse itself.
+        # The cosine of the less tilted pixel: one on a jump seems steep, and a small cosine would
+        # make its weights large.
         stiffness = jnp.maximum(other[9], maps[9]) / (spread * math.hypot(dy, dx))
         kernel = _B3[abs(dy)] * _B3[abs(dx)]
         weights.append(kernel * other[10] * jnp.exp(-(distance + off * off * stiffness)))
@@ -182,7 +182,7 @@ def _pair_weights(
 def _gather_primal(
     values: Float[Array, "C H W"], weights: Float[Array, "taps H W"], spread: int
 ) -> Float[Array, "C H W"]:
-    """Sum over the taps of every pixel, each pair of pixels with its one weight."""
+    """Sum over the taps of every pixel; both pixels of a pair use the same weight."""
     shape = values.shape[1], values.shape[2]
     padded, padded_weights = _pad(values, spread), _pad(weights, spread)
     total = _B3[0] * _B3[0] * values
@@ -224,21 +224,21 @@ def denoise(
     spec: DenoiseSpec,
     focal: Float[ArrayLike, ""] | None = None,
 ) -> Float[Array, "H W C"]:
-    """Smooth light within surfaces, across noise but not across their edges.
+    """Smooth light within surfaces, but not across their edges.
 
-    ``out_p = alpha_p * sum_q w(p, q) light_q / sum_q w(p, q) alpha_q`` in every pass, so that what
-    is not covered neither bleeds in nor darkens the edge of what is.
+    ``out_p = alpha_p * sum_q w(p, q) light_q / sum_q w(p, q) alpha_q`` in every pass, so that
+    pixels without coverage neither bleed into their neighbours nor darken them.
 
-    Linear in the light, and keeps constants: light that is alpha times a constant stays. The total
-    of the light is not kept exactly, for the divisor differs from pixel to pixel.
+    Linear in the light. Light that is alpha times a constant does not change. The sum over the
+    image is not conserved exactly, because the divisor differs from pixel to pixel.
 
-    Reverse mode only. The gradient in the light is the transpose; alpha has its gradient as
-    coverage, in the formula above. The weights are constants: normals, depth, albedo and the focal
-    length have zero gradient, and so has alpha where it divides them.
+    Differentiable in reverse mode only: in the light, and in alpha where it stands in the formula
+    above. The weights are constants, so that normals, depth, albedo and focal length have zero
+    gradient, and alpha has none where it divides them.
 
     Parameters
     ----------
-    light : (H, W, C) any linear quantity that arrives, times alpha. Ignored where alpha is 0.
+    light : (H, W, C) any linear measure of arriving light, times alpha. Ignored where alpha is 0.
     alpha : (H, W) coverage, not negative.
     normals : (H, W, 3) blended unit normals, in any frame.
     depth : (H, W) blended positive depth along the camera's axis, times alpha.
@@ -249,7 +249,8 @@ def denoise(
 
     Returns
     -------
-    (H, W, C), times alpha; zero where alpha is. The light itself, bit by bit, for no iterations.
+    (H, W, C) filtered light, times alpha; zero where alpha is zero. With no iterations, ``light``
+    itself.
     """
     if spec.iterations == 0 or light.size == 0:
         return light
@@ -300,7 +301,8 @@ def denoised(
     images : by name, premultiplied by ``alpha``: ``rgb``, ``diffuse`` and ``specular`` (light),
         ``specular_radiance``, ``albedo``, ``metallic``, ``normal`` and ``depth``.
     alpha : (H, W) coverage.
-    spec : static. focal : () focal length in pixels.
+    spec : static.
+    focal : () focal length in pixels.
 
     Returns
     -------

@@ -7,7 +7,7 @@ is an integral of that interpolant, so lookup and prefilter agree.
 
 Prefiltering is linear in the radiance and its kernels are rotationally symmetric about the lobe
 axis. On a lat-long grid such an operator is circulant along a row, so the discrete Fourier
-transform along rows makes it block diagonal: one small (rows, rows) matrix a frequency instead of
+transform along rows makes it block diagonal: one small (rows, rows) matrix per frequency instead of
 one (texels, texels) matrix. This is exact, and a full-resolution prefilter costs a few
 milliseconds at 64 x 128 where the dense matrices would take gigabytes.
 """
@@ -43,7 +43,7 @@ class LightSpec:
     """
 
     height: Annotated[int, Field(ge=1, le=4096)] = 64
-    """Rows of the environment map; one row is a light without elevation."""
+    """Rows of the environment map; with a single row the light does not vary with elevation."""
     width: Annotated[int, Field(ge=2, le=8192)] = 128
     """Columns of the environment map, an even number."""
     roughness: tuple[float, ...] = (0.0, 0.08, 0.12, 0.17, 0.24, 0.33, 0.45, 0.6, 0.8, 1.0)
@@ -71,7 +71,7 @@ class LightSpec:
 class PrefilterOperators(eqx.Module):
     """Constant matrices of `prefilter`; pass them as an argument of jitted functions.
 
-    Embedded as constants they would slow compilation down; they carry no gradient of interest.
+    As constants inside of a program they would slow its compilation down.
 
     Attributes
     ----------
@@ -235,10 +235,10 @@ def rotate_light(
     ----------
     light : (H, W, 3) map.
     rotation : (3, 3) proper rotation (determinant 1).
-    subsamples : directions along each side of a texel whose mean it becomes. One is enough for
-        turns about the vertical axis. Elsewhere a sun of half a degree keeps its flux within 5 %
-        with one, 30 degrees above the horizon, and within .1 % with four; with one it may be lost
-        beside the poles, where texels are narrow.
+    subsamples : static; each texel becomes the mean over this many directions along each of its
+        sides. One is enough for rotations about the vertical axis. With other rotations a sun of
+        half a degree, 30 degrees above the horizon, keeps its flux within 5 % with one direction
+        and within .1 % with four. With one it may be lost near the poles, where texels are narrow.
     """
     height, width, channels = light.radiance.shape
     rows, columns = height * subsamples, width * subsamples
@@ -288,8 +288,8 @@ def _lobe_rings(roughness: float, count: int) -> tuple[np.ndarray, np.ndarray]:
     density = ggx_lobe(np.cos(angle), roughness) * np.sin(angle)
     mass = np.concatenate([[0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(angle))])
     mass /= mass[-1]
-    # Rings equal in the mean of mass and angle: fine inside the peak, and still finer than a texel
-    # in the tails, where a sun would otherwise print rings.
+    # Rings have equal shares in the mean of mass and angle. They are fine inside the peak, and
+    # still finer than a texel in the tails, where a sun would otherwise leave visible rings.
     blend = 0.5 * mass + 0.5 * angle / angle[-1]
     edges = np.interp(np.linspace(0, 1, count + 1), blend, angle)
     centres = np.interp((np.arange(count) + 0.5) / count, blend, angle)
@@ -300,7 +300,7 @@ def _lobe_row(polar: float, rings, spokes: int, height: int, width: int) -> np.n
     """Weights (H, W) of the texels in the lobe about a texel centre, columns relative to it."""
     tilt, mass = rings
     # Half the spokes (the others mirror them), turned by the golden ratio from ring to ring so that
-    # the samples do not line up: a single bright texel is then weighed to half a percent.
+    # the samples do not line up: a single bright texel is then weighted right to half a percent.
     turn = np.arange(tilt.size)[:, None] * 0.6180339887 % 1.0
     spoke = (np.arange(spokes)[None, :] + turn) / spokes * np.pi
     sin_t, cos_t = np.sin(tilt)[:, None], np.cos(tilt)[:, None]
@@ -347,7 +347,7 @@ def operator_bytes(spec: LightSpec) -> int:
 
 
 def prefilter_operators(spec: LightSpec) -> PrefilterOperators:
-    """Build, once a process and spec, the constant operators of `prefilter` on the host.
+    """Build the constant operators of `prefilter` on the host, once per process and spec.
 
     Each output texel's lobe is cut into rings and spokes finer than the texels, and every piece
     deposits its exact mass on the four texels that the bilinear lookup would read. Rows therefore
@@ -365,7 +365,7 @@ def prefilter(
     Parameters
     ----------
     light : (H, W, 3) map of the size the operators were built for.
-    operators : from `prefilter_operators`; not differentiated unless asked for.
+    operators : from `prefilter_operators`.
     diffuse_only : static; compute the last level alone, for surfaces without a specular lobe.
 
     Returns

@@ -6,8 +6,9 @@ the diffuse one from samples of the light and of the cosine, the specular one fr
 of the light and from samples of the visible microfacet normals. Each pair is combined by the
 balance heuristic of Veach and Guibas (1995).
 
-What does not depend on the viewer is computed once for all views: `draw_samples` traces, `gather`
-sums up the diffuse light, and `reflect` adds what a viewer sees.
+Two steps do not depend on the viewer, so that all views can share them: `draw_samples` draws and
+traces directions, and `gather` sums the diffuse light. `reflect` then adds the specular light that
+a viewer sees.
 
 Gradient semantics. The samples, their densities and what they hit are constants of a step: the
 backward pass evaluates the derivative of ``f_r L_i cos`` at the very samples of the forward pass.
@@ -43,8 +44,10 @@ class Gathered(eqx.Module):
     Attributes
     ----------
     diffuse_light : (N, 3) irradiance / pi.
-    directions, radiance, density : (N, L, 3), (N, L, 3) and (N, L) the light's samples, what they
-        bring to the specular lobe, and their density; 0 where the mask is false.
+    directions : (N, L, 3) unit, the samples of the light.
+    radiance : (N, L, 3) that the samples bring to the specular lobe; 0 where the mask is false.
+        Samples that reservoirs chose include the factor of their choice, see `Samples`.
+    density : (N, L) of the samples, per steradian.
     is_chosen : static; whether reservoirs chose the light's samples. They chose by the normals as
         given, so that `reflect` leaves these samples out where it flips a normal.
     """
@@ -72,7 +75,7 @@ def _arriving(
 
 
 def _split(indirect: Indirect) -> tuple[Array | None, Callable[[Array | None], Indirect]]:
-    """Rows to cut into chunks with the points, and how to put them back."""
+    """Return the values to cut into chunks with the points, and a function that puts them back."""
     if indirect.belongs_to_points:
         return indirect.values, lambda rows: replace(indirect, values=rows)
     return None, lambda rows: indirect
@@ -86,10 +89,21 @@ def gather(
     *,
     has_specular: bool = True,
 ) -> Gathered:
-    """Sum up the diffuse light of N points, and keep what the light's samples bring.
+    """Sum the diffuse light of N points, and keep the light's samples for the specular lobe.
 
-    Differentiable in the points' normals, the light and the indirect light. ``has_specular`` :
-    static; false where no point has a specular lobe, for which nothing is then kept.
+    Differentiable in the points' normals, the light and the indirect light.
+
+    Parameters
+    ----------
+    points : N points.
+    samples : those of the points, see `draw_samples`.
+    light : the environment.
+    indirect : light from blocked directions; black by default.
+    has_specular : static; whether points have a specular lobe. Without one no samples are kept.
+
+    Returns
+    -------
+    `Gathered` light of the N points; zero where the mask is false.
     """
     total = samples.weights.shape[1]
     shared = samples.light_density.shape[1] if has_specular else 0
@@ -126,7 +140,8 @@ def _specular_sums(
 ) -> tuple[Float[Array, "N 3"], Float[Array, "N 3"]]:
     """Weighted sums over rays of the specular lobe, with its Fresnel factor and without.
 
-    Rays are directions, what they bring, and the density of the light's samples there.
+    ``rays`` : their directions, the radiance that they bring, and the density of the light's
+    samples in these directions.
     """
     wi, radiance, light_density = rays
     alpha = bsdf.ggx_alpha(materials.roughness)[None, :]
@@ -163,10 +178,10 @@ def reflect(
 
     Parameters
     ----------
-    key : of the directions of the specular lobe.
+    key : random key of the directions of the specular lobe.
     points, materials, wo : the points, their materials and unit directions to the viewer. The
         specular lobe flips shading normals that face away from the viewer.
-    gathered : of the same points, see `gather`.
+    gathered : diffuse light and samples of the same points, see `gather`.
     light, sampler : the environment and its tables.
     index, indirect : see `draw_samples` and `gather`.
     counts, finds_nearest : static, as for `draw_samples`.
@@ -195,7 +210,7 @@ def reflect(
         open_only=open_only,
     )
     if gathered.is_chosen:
-        # Samples chosen above the unflipped normal have never looked above the flipped one.
+        # Reservoirs chose by the unflipped normal: they hold no samples above the flipped one.
         faces_viewer = cosine >= 0
         gathered = replace(
             gathered,

@@ -6,13 +6,14 @@ Each model is a class:
 - `ConstantIndirect`: two learned radiances per point, one for each lobe (the authors' code).
 - `HarmonicIndirect`: a learned radiance that varies with the direction, by spherical harmonics of
   degree 2 (the paper).
-- `TracedIndirect`: what the point that is hit sends out. It learns nothing and holds under any
-  light.
-- `RadiometricIndirect`: what the point that is hit has learned to send out, which a term of the
-  loss compares with what it does send out (Radiometrically Consistent Gaussian Surfels, 2025).
-- `KnownIndirect`: a radiance for every single ray, from whoever followed it further.
+- `TracedIndirect`: the radiance that the face which is hit sends out. It learns nothing and holds
+  under any light.
+- `RadiometricIndirect`: the radiance that the face which is hit has learned to send out, which a
+  term of the loss compares with what it does send out (Radiometrically Consistent Gaussian Surfels,
+  2025).
+- `KnownIndirect`: a known radiance for every single ray, such as a path tracer has computed.
 
-An `IndirectSource` becomes one of them once it is known where rays end.
+An `IndirectSource` returns one of these models once it is known where rays end.
 
 Learned values x become a radiance that starts small: ``sigmoid(x - 3)``, which is at most one, or
 for `RadiometricIndirect` ``softplus(x - 3)``, which has no upper bound.
@@ -39,11 +40,11 @@ Lobes = tuple[Float[Array, "N 3"], Float[Array, "N 3"]]
 """Radiance for the diffuse lobe and for the specular one."""
 
 RayLobes = tuple[Float[Array, "S N 3"], Float[Array, "S N 3"]]
-"""The same for S rays of each of N points."""
+"""Radiance for the diffuse lobe and for the specular one, of S rays from each of N points."""
 
 
 class IndirectSource(eqx.Module):
-    """What can tell the light of blocked rays once they are traced."""
+    """A source of indirect light, which gives a model of blocked rays once they are traced."""
 
     @abc.abstractmethod
     def followed(
@@ -57,7 +58,7 @@ class IndirectSource(eqx.Module):
 
         Parameters
         ----------
-        points : where S rays start from each.
+        points : N points, from each of which S rays start.
         directions, hits, distances : see `sampling.Samples`.
         """
 
@@ -85,7 +86,7 @@ class Indirect(IndirectSource):
         hits: Int[Array, "N S"],
         distances: Float[Array, "N S"] | None,
     ) -> "Indirect":
-        """Return itself: it knows any ray."""
+        """Return itself: the model holds for any ray."""
         del points, directions, hits, distances
         return self
 
@@ -108,8 +109,8 @@ class Indirect(IndirectSource):
         Parameters
         ----------
         directions : (N, 3) unit, away from the point.
-        hits : (N,) face that each ray hits; negative where that is not known, which is black where
-            light is traced.
+        hits : (N,) face that each ray hits; negative where it is not known. Models that look up
+            faces are black there.
         """
 
 
@@ -132,7 +133,7 @@ class ConstantIndirect(Indirect):
     values: Float[Array, "N 6"]
 
     def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
-        """Return what was learned, whatever the direction."""
+        """Return the learned radiance of each lobe, which does not depend on the direction."""
         radiance = jax.nn.sigmoid(self.values - _OFFSET)
         return radiance[:, :3], radiance[:, 3:]
 
@@ -145,7 +146,7 @@ class HarmonicIndirect(Indirect):
     values: Float[Array, "N 27"]
 
     def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
-        """Evaluate the harmonics; both lobes see the same."""
+        """Evaluate the harmonics; both lobes receive the same radiance."""
         radiance = jax.nn.sigmoid(_colors(self.values, directions) - _OFFSET)
         return radiance, radiance
 
@@ -184,7 +185,7 @@ class RadiometricIndirect(Indirect):
         return cls(mean[:, :-1], mean[:, -1] > 0)
 
     def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
-        """Evaluate the harmonics of the face that is hit, towards where the ray comes from."""
+        """Evaluate the harmonics of the face that is hit, in the direction back along the ray."""
         values = self.values.at[jnp.maximum(hits, 0)].get(mode="clip")
         is_lit = hits >= 0
         if self.is_known is not None:
@@ -200,12 +201,12 @@ class KnownIndirect(Indirect):
     values: Float[Array, "N S 3"]
 
     def along(self, directions: Float[Array, "S N 3"], hits: Int[Array, "S N"]) -> RayLobes:
-        """Return what is known."""
+        """Return the known radiance, the same for both lobes."""
         radiance = jnp.moveaxis(self.values, 1, 0)
         return radiance, radiance
 
     def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
-        """Return what is known of all rays, in the order of the values."""
+        """Return the known radiance of all rays, in the order of the values."""
         radiance = self.values.reshape(-1, 3)
         return radiance, radiance
 
@@ -272,8 +273,14 @@ def outgoing(
 
     Parameters
     ----------
-    materials, diffuse_light : of N points. points : which face each belongs to.
-    face_count : static; rows to return.
+    materials : those of N points.
+    diffuse_light : (N, 3) irradiance / pi.
+    points : the N points, with the face that each belongs to.
+    face_count : static; F, rows to return.
+
+    Returns
+    -------
+    (F, 3) linear radiance.
     """
     matt = materials.albedo * (1 - materials.metallic)[:, None]
     if materials.has_specular:

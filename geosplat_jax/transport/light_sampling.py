@@ -2,8 +2,8 @@
 
 A texel is drawn with a probability proportional to its brightness and solid angle, its row first
 and then its column, and a direction uniformly within the texel, so that the density is constant
-there. Each of the two steps has a number of its own, so that points spread evenly over the unit
-square are spread evenly over rows and columns, too. The brightness of a texel is the largest
+there. Row and column are drawn from two separate random numbers, so that numbers spread evenly over
+the unit square give even spreads over rows and columns. The brightness of a texel is the largest
 channel, blurred over its neighbours: the map is bilinear between texels, so that light reaches into
 the texels around it, and the density is positive wherever the map is.
 
@@ -67,7 +67,7 @@ def light_sampler(light: EnvLight) -> LightSampler:
 
 
 def _cumulative(share: Float[Array, "R n"]) -> Float[Array, "R n"]:
-    """Sum up to each entry of a row, over the sum of all."""
+    """Cumulative sums along every row, divided by the sum of the row."""
     sums = jax.lax.cummax(jnp.cumsum(share, axis=1), axis=1)
     return sums / sums[:, -1:]
 
@@ -75,7 +75,10 @@ def _cumulative(share: Float[Array, "R n"]) -> Float[Array, "R n"]:
 def _drawn(
     tables: Float[Array, "R n"], row: Int[Array, " N"], uniforms: Float[Array, " N"]
 ) -> tuple[Int[Array, " N"], Float[Array, " N"]]:
-    """Entry of a row of a table that a number in [0, 1) falls into, and where in its share."""
+    """Find the entry of a row into whose interval a number in [0, 1) falls, and the place in it.
+
+    ``tables`` holds the upper ends of the intervals; the place is from 0 to 1.
+    """
     length = tables.shape[1]
     flat, first = tables.reshape(-1), row * length
 
@@ -103,8 +106,9 @@ def sample_light(
 
     Parameters
     ----------
-    uniforms : (N, 2) in [0, 1); stratify them. The first chooses the row, and what is left of it
-        the elevation within; the second the column and the azimuth.
+    sampler : tables of the light.
+    uniforms : (N, 2) in [0, 1); stratify them. The first number chooses the row, and its place in
+        the row's interval the elevation; the second chooses column and azimuth in the same way.
 
     Returns
     -------

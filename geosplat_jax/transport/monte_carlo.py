@@ -72,12 +72,12 @@ class MonteCarloSettings(SampledSettings, TransportSettings, kind="monte_carlo")
 
     @property
     def relative_cost(self) -> float:
-        """Measured: each ray per splat adds a fifth."""
+        """Measured: each ray per splat adds a fifth; the second image has three kinds of rays."""
         drawn = self.light_count + self.diffuse_count + self.specular_count
         return 1.0 + 0.2 * (drawn + 3 * self.residual_count)
 
     def warnings(self) -> list[str]:
-        """Say that traced light needs rays, and what belongs to another kind of indirect light."""
+        """Name settings that have no effect with the others, such as traced light without rays."""
         texts = SampledSettings.warnings(self)
         if self.reads_faces and not self.occlusion:
             texts.append(
@@ -116,7 +116,7 @@ class MonteCarlo(SampledTransport):
         return INDIRECT_MODELS[self.settings.indirect]
 
     def _own_rays(self, index: RayIndex | None) -> RayIndex | None:
-        """Leave rays out that only the shading domain has asked for."""
+        """Return the index if shadows are traced; it may serve the shading domain only."""
         return index if self.settings.occlusion else None
 
     def _finds_nearest(self, index: RayIndex | None) -> bool:
@@ -144,7 +144,7 @@ class MonteCarlo(SampledTransport):
         index: RayIndex | None,
         carry: Any = None,
     ) -> tuple[SampledIllumination, Any]:
-        """Draw and trace what views share, and sum up the diffuse light.
+        """Draw and trace the samples that views share, and sum their diffuse light.
 
         Raises
         ------
@@ -169,7 +169,7 @@ class MonteCarlo(SampledTransport):
             how: dict[str, Any] = {"has_specular": has_specular}
             arriving = traced or self._learned(attributes)
             gathered = gather(points, samples, light, arriving, **how)
-            # Traced indirect light is what it was, one bounce ago.
+            # What faces send out after one bounce is the indirect light of the next.
             for _ in range(self.settings.bounces if is_traced else 0):
                 assert index is not None
                 sent = outgoing(
@@ -190,7 +190,7 @@ class MonteCarlo(SampledTransport):
         illumination: SampledIllumination,
         index: RayIndex | None,
     ) -> Shaded:
-        """Add what each viewer sees; see `reflect`."""
+        """Compute the light that points send to their viewers; see `reflect`."""
         assert key is not None
         index = self._own_rays(index)
         light, sampler, gathered = illumination.light, illumination.sampler, illumination.gathered

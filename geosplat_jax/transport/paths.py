@@ -1,16 +1,16 @@
 """Indirect light by path tracing over any number of bounces (appendix I).
 
-`monte_carlo` samples the light that arrives at a point; where the surface is in the way, a ray goes
-on from there. At every later vertex of its path one direction is drawn towards the environment and
-one after the reflectance of the face that was hit, combined by the balance heuristic where they
-reach the environment; where the second one hits the surface the path goes on, up to
-`PathSettings.bounce_count` surfaces. Nothing else ends a path: no Russian roulette, so that the
-number of vertices is static. The first vertex is that of `monte_carlo`: points may be splats or
-pixels, and all views share what does not depend on the viewer.
+`monte_carlo` samples the light that arrives at a point. Here a ray that hits the surface is
+continued to a path. At every later vertex two directions are drawn: one towards the environment,
+and one by the reflectance of the face that was hit. Where they reach the environment, they are
+combined by the balance heuristic; where the second one hits the surface, the path continues, over
+at most `PathSettings.bounce_count` surfaces. There is no Russian roulette, so that the number of
+vertices is static. The first vertex is that of `monte_carlo`: points may be splats or pixels, and
+all views share what does not depend on the viewer.
 
-A later vertex sees the mean material and normal of the points that belong to its face
-(`FaceTable`), at the exact position of the hit. Faces without points are black; so is all
-interreflection between splats that belong to no face.
+A later vertex has the mean material and normal of the points that belong to its face
+(`FaceTable`), at the exact position of the hit. Faces without points are black, and so is all
+indirect light between splats that belong to no face.
 
 Gradient semantics. Samples, densities, hits and visibility are constants of a step, as in
 `monte_carlo`. At the first vertex light, reflectance and normals are differentiated. What is
@@ -100,9 +100,10 @@ def face_table(points: SurfacePoints, materials: Materials, face_count: int) -> 
 
 
 class _Vertex(eqx.Module):
-    """Where n paths are: their faces as seen from the vertex before, towards which ``wo`` points.
+    """One vertex of n paths: the surface there, and the direction ``wo`` to the vertex before.
 
-    ``is_known`` : (n,) false where nothing is known of the face, which is black.
+    ``is_known`` : (n,) false where a path has ended, or hit a back or a face without points; such a
+    vertex is black.
     """
 
     materials: Materials
@@ -123,7 +124,7 @@ class _Vertex(eqx.Module):
 
 
 def _vertex(table: FaceTable, faces: Int[Array, " n"], wo: Float[Array, "n 3"]) -> _Vertex:
-    """Look up the faces that were hit; a shading normal that faces away gives way to the face's."""
+    """Look up the faces that were hit; the face's normal replaces a shading normal facing away."""
 
     def rows(values: Array) -> Array:
         return values.at[jnp.maximum(faces, 0)].get(mode="clip")
@@ -140,16 +141,19 @@ def _vertex(table: FaceTable, faces: Int[Array, " n"], wo: Float[Array, "n 3"]) 
 
 
 class Leg(eqx.Module):
-    """What n paths did at one vertex; constants of a step.
+    """The two directions that n paths take at one vertex; constants of a step.
 
     Attributes
     ----------
-    faces : (n,) where they are; -1 for a path that has ended.
-    to_light : (n, 3) direction drawn from the light; light_weight : (n,) one over the density of
-        both techniques, 0 where the surface is in the way.
-    onward : (n, 3) direction drawn after the reflectance; open_weight : (n,) the same weight where
-        it reaches the environment; onward_weight : (n,) one over its own density where it hits the
-        surface. One of the two is 0.
+    faces : (n,) face of the vertex; -1 for a path that has ended.
+    to_light : (n, 3) unit direction drawn from the light.
+    light_weight : (n,) one over the sum of both techniques' densities; 0 where the surface blocks
+        the direction.
+    onward : (n, 3) unit direction drawn by the reflectance.
+    open_weight : (n,) one over the sum of both densities where ``onward`` reaches the environment,
+        else 0.
+    onward_weight : (n,) one over the density of ``onward`` itself where it hits the surface, else
+        0.
     """
 
     faces: Int[Array, " n"]
@@ -171,7 +175,7 @@ def _step(
     *,
     is_last: bool,
 ) -> tuple[Leg, Float[Array, "n 3"], Int[Array, " n"]]:
-    """Draw and trace both directions of one vertex; also return where the paths go on."""
+    """Draw and trace both directions of one vertex; also return the next vertices and faces."""
     at = _vertex(table, faces, wo)
     to_light, _ = sample_light(sampler, uniforms[:, :2])
     onward = bsdf.sample(at.materials, at.normals, wo, uniforms[:, 2:5])
@@ -209,9 +213,19 @@ def _step(
 def path_radiance(
     legs: tuple[Leg, ...], wo: Float[Array, "n 3"], table: FaceTable, light: EnvLight
 ) -> Float[Array, "n 3"]:
-    """Add up what arrives at every vertex of n paths and leaves their first one along ``wo``.
+    """Sum the light that n paths collect at all vertices and send from the first along ``wo``.
 
     Differentiable in table and light; the legs are constants.
+
+    Parameters
+    ----------
+    legs : vertices of the paths, in their order.
+    wo : (n, 3) unit, from the first vertex.
+    table, light : the surface and the environment.
+
+    Returns
+    -------
+    (n, 3) linear radiance.
     """
     total, throughput = jnp.zeros_like(wo), jnp.ones_like(wo)
     for leg in legs:
@@ -227,15 +241,15 @@ def path_radiance(
 
 
 class PathTracer(IndirectSource):
-    """Follows blocked rays further.
+    """A source of indirect light that continues blocked rays to paths.
 
     Attributes
     ----------
-    key : of all samples.
+    key : random key of all samples.
     table : what paths find on the surface.
     light, sampler, index : the environment, its tables, and the surface.
-    vertex_count : static; later vertices of a path at most.
-    gradient : static; see the module.
+    vertex_count : static; most vertices of a path after its first.
+    gradient : static; see `PathSettings.later_gradient`.
     """
 
     key: Key[Array, ""]
@@ -258,7 +272,7 @@ class PathTracer(IndirectSource):
         Raises
         ------
         ValueError
-            Without distances, that is if rays only tell whether they are blocked.
+            Without distances, which are missing if rays were only tested for being blocked.
         """
         if distances is None:
             raise ValueError(
@@ -271,7 +285,8 @@ class PathTracer(IndirectSource):
             return KnownIndirect(jnp.zeros_like(directions))
         hits, wi = hits.reshape(-1), directions.reshape(-1, 3)
         starts = jnp.repeat(points.positions, samples, axis=0)
-        # Rows that no chunk has traced are no points, and say that they hit face 0.
+        # Chunks that were skipped hold zeros, as if their rays had hit face 0: the mask leaves
+        # them out.
         going = bit_set((hits >= 0) & jnp.repeat(points.mask, samples))
         ray = going.first(capacity=total)
         is_real = jnp.arange(total, dtype=jnp.int32) < going.count
@@ -285,7 +300,7 @@ class PathTracer(IndirectSource):
         legs = self.draw(origins, faces, wo, is_real)
         radiance = self.evaluate(legs, wo, is_real)
         target = jnp.where(is_real, ray, total)
-        # Rays are numbered once each; only those that go on bring anything.
+        # Every ray has a row of its own; rays that are not followed bring no light.
         brought = jnp.zeros_like(radiance).at[target].set(radiance, mode="drop")
         return KnownIndirect(brought.reshape(count, samples, 3))
 
@@ -298,7 +313,7 @@ class PathTracer(IndirectSource):
     ) -> tuple[Leg, ...]:
         """Draw and trace all later vertices; no gradients.
 
-        Random numbers and legs are of all rays at once: their memory grows with rays and vertices.
+        Random numbers and legs of all rays are in memory at once, for every vertex.
         """
         table, sampler = jax.lax.stop_gradient((self.table, self.sampler))
         width = self.vertex_count * _NUMBERS
@@ -331,7 +346,7 @@ class PathTracer(IndirectSource):
     def evaluate(
         self, legs: tuple[Leg, ...], wo: Float[Array, "n 3"], is_real: Bool[Array, " n"]
     ) -> Float[Array, "n 3"]:
-        """Add up what the paths bring."""
+        """Sum the light that the paths bring; what is differentiated is set by ``gradient``."""
         table, light = self.table, self.light
         if self.gradient != "all":
             table = jax.lax.stop_gradient(table)
@@ -351,11 +366,11 @@ class PathTracer(IndirectSource):
 
 
 class PathIllumination(SampledIllumination):
-    """Light of N points, and what paths find on the surface.
+    """What `Paths` prepares for N points.
 
     Attributes
     ----------
-    table : of all faces; None where nothing blocks rays.
+    table : what paths find on the surface; None where nothing blocks rays.
     """
 
     table: FaceTable | None = None
@@ -369,25 +384,25 @@ class PathSettings(SampledSettings, TransportSettings, kind="paths"):
     """Samples of each kind of a second image, from which Eq. 13 takes its residual; with 0 it takes
     that of the image that it differentiates, which biases the gradient."""
     bounce_count: Annotated[int, Field(ge=2, le=64)] = 2
-    """Surfaces on a path of light at most, the one that is seen included: with 2, light that came
+    """Most surfaces on a path of light, including the one that is seen: 2 adds light that arrives
     by way of one other surface. There is no Russian roulette."""
     later_gradient: LaterGradient = "none"
-    """What is differentiated at the vertices of a path after the first: nothing, the light that
-    they reflect, or that and their materials and normals."""
+    """What is differentiated at the vertices of a path after the first: nothing (none), the light
+    that they reflect (light), or that light and their materials and normals (all)."""
 
     @property
     def reads_faces(self) -> bool:
-        """Paths go on from the face that they hit."""
+        """True: a path continues from the face that it hits."""
         return True
 
     @property
     def blocked_light(self) -> str:
-        """All that paths find."""
+        """The kind of transport: blocked directions bring what paths collect."""
         return "kind=paths"
 
     @property
     def relative_cost(self) -> float:
-        """As for one bounce, and a ray in three goes on."""
+        """As with one bounce, but every further surface adds half the cost of the rays."""
         drawn = self.light_count + self.diffuse_count + self.specular_count
         onward = 1.0 + 0.5 * (self.bounce_count - 1)
         return 1.0 + 0.2 * onward * (drawn + 3 * self.residual_count)
@@ -421,7 +436,7 @@ class Paths(SampledTransport):
         table: FaceTable | None,
         index: RayIndex | None,
     ) -> dict[str, Any]:
-        """Return how `gather` and `reflect` learn of blocked directions; black without rays."""
+        """Return the argument ``indirect`` of `gather` and `reflect`; none (black) without rays."""
         if index is None or table is None:
             return {}
         count = self.settings.bounce_count - 1
@@ -437,7 +452,7 @@ class Paths(SampledTransport):
         index: RayIndex | None,
         carry: Any = None,
     ) -> tuple[PathIllumination, Any]:
-        """Average faces, follow what views share, and sum up the diffuse light.
+        """Tabulate faces, follow the samples that views share, and sum their diffuse light.
 
         Raises
         ------
@@ -469,7 +484,7 @@ class Paths(SampledTransport):
         illumination: PathIllumination,
         index: RayIndex | None,
     ) -> Shaded:
-        """Add what each viewer sees; see `estimators.reflect`."""
+        """Compute the light that points send to their viewers; see `estimators.reflect`."""
         assert key is not None
         light, sampler, gathered = illumination.light, illumination.sampler, illumination.gathered
         keys = jax.random.split(key, 4)
@@ -485,6 +500,6 @@ class Paths(SampledTransport):
         return reflect(keys[3], points, *rest, **source, open_only=open_only, **how)
 
     def for_images(self, sample_count: int) -> "SampledTransport":
-        """Share the views' samples and leave the filter out; nothing is differentiated."""
+        """Return a transport as `SampledTransport` does, without gradients at later vertices."""
         shared = super().for_images(sample_count)
         return replace(shared, settings=replace(shared.settings, later_gradient="none"))

@@ -12,16 +12,18 @@ balance heuristic over their confidences and targets (Lin et al. 2022)::
 
     m_j(w) = c_j p_j(w) / sum_k c_k p_k(w),    weight_j = m_j(w_j) p(w_j) W_j
 
-with p_k the target of the point that reservoir k comes from. Sums of m_j are 1 wherever the target
-is positive, so that joined reservoirs are unbiased if the targets tell which directions their
-points can have kept. `ReservoirSettings.visibility` says whether these are the visible ones.
+with p_k the target of the point that reservoir k comes from. The m_j sum to 1 wherever a target is
+positive. Joined reservoirs are therefore unbiased if the target of a point is positive exactly in
+the directions that the point can have kept. `ReservoirSettings.visibility` says whether these are
+the visible ones.
 
-A step's reservoirs are kept under the place of their points on the surface, `RayIndex.places`, in a
-table of fixed size. A point takes what lies under its own place if that comes from nearby and from
-a surface of about the same direction; else it begins anew. Where several places or points share a
-slot, the last row keeps it, whatever it holds, so that the choice favours no direction.
+The reservoirs of a step are stored under the places of their points on the surface
+(`RayIndex.places`), in a table of fixed size. A point takes the reservoirs under its own place if
+they come from nearby and from a surface with a similar normal; otherwise it starts without any.
+Where several points share a slot, it stores the reservoirs of the one in the last row, whatever
+they hold, so that the choice favours no direction.
 
-Reservoirs, their weights and what they were chosen by carry no gradient.
+Reservoirs, their weights and the targets carry no gradient.
 """
 
 from typing import Annotated, Any, Literal
@@ -43,14 +45,14 @@ from geosplat_jax.transport.light_sampling import LightSampler, sample_light
 from geosplat_jax.transport.sampling import OPEN, cast, in_chunks, low_discrepancy
 
 _DIMMEST = 1e-3
-"""Share of the mean brightness that every direction has in a target: where the sky is black,
-samples must still be possible, since other surfaces may shine there."""
+"""Least brightness of a direction in a target, as a share of the mean brightness: samples must be
+possible also where the sky is black, since other surfaces may shine from there."""
 
 _LANES = 8
 """Reservoirs that the store keeps per place; a point's row modulo this number picks its own."""
 
 _NEIGHBORHOOD = 12
-"""Neighbours are at most so many rows away when points are in order of their places."""
+"""Most rows between a point and its neighbours, with the points sorted by their places."""
 
 _SCATTER = np.int32(0x9E3779B1 - 2**32)
 """An odd number that spreads keys over the slots."""
@@ -68,13 +70,13 @@ class ReservoirSettings:
     neighbors: Annotated[int, Field(ge=0, le=8)] = 0
     """Points nearby whose samples of the same step are offered as well."""
     visibility: Literal["ignored", "traced", "assumed"] = "ignored"
-    """What reused samples know of shadows. Ignored: nothing, which is unbiased and costs no rays.
-    Traced: blocked ones are dropped, and rays tell who could have kept them, which is unbiased
-    while the surface stands still. Assumed: blocked ones are dropped without asking, which makes
-    the edges of shadows darker."""
+    """How the reuse of samples treats shadows. Ignored: not at all, which is unbiased and costs no
+    rays. Traced: blocked samples are dropped, and rays test which points could have kept a sample,
+    which is unbiased while the surface does not move. Assumed: blocked samples are dropped without
+    such a test, which makes the edges of shadows darker."""
     confidence: Positive = 20.0
-    """How much a sample kept from earlier steps may count, as a multiple of the step's own
-    candidates."""
+    """Most candidates that a sample from earlier steps may stand for, as a multiple of those of a
+    single step."""
     slots: PositiveCount = 65_536
     """Entries of the table that carries samples from one step to the next."""
     smallest_cosine: Share = 0.5
@@ -91,8 +93,9 @@ class Reservoirs(eqx.Module):
 
     Attributes
     ----------
-    directions : (N, R, 3) unit. weights : (N, R) unbiased for one over the density; 0 for none.
-    confidences : (N,) candidates that they stand for.
+    directions : (N, R, 3) unit.
+    weights : (N, R) unbiased estimate of one over the density of the direction; 0 for no sample.
+    confidences : (N,) number of candidates that each reservoir of a point stands for.
     """
 
     directions: Float[Array, "N R 3"]
@@ -101,13 +104,13 @@ class Reservoirs(eqx.Module):
 
 
 class ReservoirStore(eqx.Module):
-    """What a step leaves to the next, slot by slot.
+    """Reservoirs that a step leaves to the next, in T slots.
 
     Attributes
     ----------
-    keys : (T,) place and lane; -1 for an empty slot.
-    reservoirs : of the slots.
-    points : that they come from.
+    keys : (T,) number of place and lane; -1 for an empty slot.
+    reservoirs : T rows of reservoirs.
+    points : the T points that the reservoirs come from.
     """
 
     keys: Int[Array, " T"]
@@ -124,12 +127,12 @@ def empty_store(spec: ReservoirSettings, count: int) -> ReservoirStore:
         jnp.zeros((slots, count, 3)), jnp.zeros((slots, count)), jnp.zeros((slots,))
     )
     points = SurfacePoints(vector, vector, vector, nowhere, jnp.zeros((slots,), bool))
-    # Arrays of their own: a step consumes the buffers of its state.
+    # Copies, so that no two leaves share a buffer: a step consumes the buffers of its state.
     return jax.tree.map(jnp.array, ReservoirStore(nowhere, nothing, points))
 
 
 def _keys(points: SurfacePoints, index: RayIndex | None) -> Int[Array, " N"]:
-    """Name place and lane of every point; -1 where it has no place."""
+    """Combine place and lane of every point into a number; -1 for a point without a place."""
     places = points.faces if index is None else index.places(points.positions, points.faces)
     lanes = jnp.arange(places.shape[0], dtype=jnp.int32) % _LANES
     return jnp.where(places < 0, -1, places * _LANES + lanes)
@@ -180,7 +183,7 @@ def _own(
     count, dtype = uniforms.shape[1], points.normals.dtype
     numbers = low_discrepancy(offsets, count * spec.candidates, dtype)
     drawn, density = sample_light(sampler, numbers.reshape(-1, 2))
-    # Candidates of one reservoir lie as far apart as those of all.
+    # Every ``count``-th candidate belongs to the same reservoir: they spread over the whole sky.
     shape = (spec.candidates, count, points.normals.shape[0])
     drawn, density = drawn.reshape(*shape, 3), density.reshape(shape)
     cosine = jnp.maximum(jnp.sum(points.normals[None, None] * drawn, axis=-1), 0.0)
@@ -191,7 +194,7 @@ def _own(
 
 
 class _Source(eqx.Module):
-    """A reservoir that is offered to n points: (R, n, 3), (R, n), (n,) and where it comes from."""
+    """R reservoirs that are offered to each of n points, and the points that they come from."""
 
     directions: Float[Array, "R n 3"]
     weights: Float[Array, "R n"]
@@ -202,7 +205,7 @@ class _Source(eqx.Module):
 def _is_open(
     source: _Source, directions: Float[Array, "R n 3"], index: RayIndex | None
 ) -> Bool[Array, "R n"]:
-    """Trace directions from where a source comes from."""
+    """Trace directions from the points that a source comes from; True for open ones."""
     return cast(source.points, directions, index) == OPEN
 
 
@@ -275,7 +278,7 @@ def _recalled(
     reach: Float[Array, ""],
     spec: ReservoirSettings,
 ) -> tuple[Reservoirs, SurfacePoints]:
-    """Look up what the points' places kept."""
+    """Look up the reservoirs that are stored under the points' places."""
     keys = _keys(points, index)
     slot = _slots(keys, spec.slots)
     taken, origin = _rows((store.reservoirs, store.points), slot)
@@ -288,7 +291,7 @@ def _recalled(
 def _beside(
     key: Key[Array, ""], points: SurfacePoints, index: RayIndex | None, count: int
 ) -> list[Int[Array, " N"]]:
-    """Name other points of the same place or the next one, ``count`` for each; -1 for none."""
+    """Draw ``count`` points near each point in the order of their places; -1 for none."""
     places = points.faces if index is None else index.places(points.positions, points.faces)
     size = places.shape[0]
     last = jnp.iinfo(jnp.int32).max
@@ -319,10 +322,16 @@ def resample(
 
     Parameters
     ----------
-    key : of all random numbers.
-    points, light, sampler, index : who looks for light, the environment, its tables, the surface.
-    store : what the step before left; None for nothing.
-    spec : static; with at least one candidate. count : static.
+    key : random key of all numbers.
+    points : N points.
+    light, sampler, index : the environment, its tables, and the surface.
+    store : reservoirs that the step before left; None for none.
+    spec : static; with at least one candidate.
+    count : static; R, samples of the light per point.
+
+    Returns
+    -------
+    `Reservoirs`, R for each of the N points.
     """
     points, light, sampler = jax.lax.stop_gradient((points, light, sampler))
     size, traces = points.normals.shape[0], spec.visibility == "traced"
@@ -380,9 +389,19 @@ def kept(
     *,
     spec: ReservoirSettings,
 ) -> ReservoirStore:
-    """Put a step's reservoirs into the store; slots that no point of the mask claims stay.
+    """Put the reservoirs of a step into the store; slots that no point of the mask claims stay.
 
-    ``hits`` : of the reservoirs' directions, see `sampling.Samples`.
+    Parameters
+    ----------
+    store : that of the step before.
+    points, reservoirs : N points and their reservoirs.
+    hits : (N, R) where rays in the reservoirs' directions end, see `sampling.Samples`.
+    index : the surface.
+    spec : static; unless visibility is ignored, blocked samples are stored with a weight of 0.
+
+    Returns
+    -------
+    The store for the next step.
     """
     points, reservoirs = jax.lax.stop_gradient((points, reservoirs))
     if spec.visibility != "ignored":

@@ -28,7 +28,7 @@ from geosplat_jax.transport.sampling import Chosen, SampleCounts, Samples, draw_
 
 
 class SampledIllumination(Illumination):
-    """Light of N points.
+    """What transports by samples prepare for N points.
 
     Attributes
     ----------
@@ -88,8 +88,8 @@ class SampledSettings:
     denoise: DenoiseSpec = DenoiseSpec(iterations=0)
     """Filter of the demodulated light in the image, off by default."""
     reservoirs: ReservoirSettings = ReservoirSettings()
-    """Choice of the light's samples from many, and their use in later steps; where views share
-    them."""
+    """How samples of the light are chosen from candidates and reused in later steps. Used only
+    where views share samples."""
 
     @property
     def numbers_per_splat(self) -> int:
@@ -102,7 +102,7 @@ class SampledSettings:
         return self.reservoirs.candidates > 0 and self.light_count > 0 and self.shares_views
 
     def warnings(self) -> list[str]:
-        """Say where nothing is chosen from reservoirs, though it was asked for."""
+        """Say why reservoirs are not used although they were asked for."""
         chosen = self.reservoirs
         if chosen.candidates == 0:
             if chosen.reuse_steps or chosen.neighbors > 0 or chosen.visibility != "ignored":
@@ -140,7 +140,7 @@ class SampledTransport(Transport):
 
     @property
     def filter_inputs(self) -> tuple[str, ...]:
-        """See `denoised`."""
+        """Names of the images that `denoised` needs; () where the filter is off."""
         return DENOISER_INPUTS if self.settings.denoise.iterations > 0 else ()
 
     @property
@@ -149,7 +149,7 @@ class SampledTransport(Transport):
         return SampleCounts(settings.light_count, settings.diffuse_count, settings.specular_count)
 
     def first_carry(self) -> ReservoirStore | None:
-        """Return an empty store, where samples are used again."""
+        """Return an empty store where samples are reused in later steps, else None."""
         spec, count = self.settings.reservoirs, self.settings.light_count
         uses_store = spec.candidates > 0 and spec.reuse_steps and self.settings.shares_views
         return empty_store(spec, count) if uses_store and count else None
@@ -165,7 +165,7 @@ class SampledTransport(Transport):
         *,
         finds_nearest: bool,
     ) -> tuple[Samples, Any]:
-        """Draw and trace what views share; also return what the next step gets."""
+        """Draw and trace the samples that views share; also return the carry of the next step."""
         spec, counts = self.settings.reservoirs, self._counts
         how: dict[str, Any] = {"counts": counts, "finds_nearest": finds_nearest}
         if not spec.candidates or not counts.light:
@@ -183,7 +183,7 @@ class SampledTransport(Transport):
 
     @property
     def _open_only(self) -> bool:
-        """Whether the light's samples that views share leave blocked directions to others."""
+        """Whether shared samples of the light leave blocked directions to the other techniques."""
         return self.settings.reservoirs.drops_blocked and self.settings.light_count > 0
 
     def filtered(
@@ -203,12 +203,12 @@ class SampledTransport(Transport):
         return self._with_counts(count, residual_count=0) if count else None
 
     def for_each_view(self) -> "SampledTransport":
-        """Draw the samples of light and cosine in every view, and use none again."""
+        """Return a transport that draws all samples in every view, and reuses none."""
         plain = replace(self.settings, shares_views=False, reservoirs=ReservoirSettings())
         return replace(self, settings=plain)
 
     def for_images(self, sample_count: int) -> "SampledTransport":
-        """Share the views' samples, and leave out filter and reservoirs."""
+        """Return a transport whose views share samples, without filter and reservoirs."""
         plain = {"denoise": DenoiseSpec(iterations=0), "reservoirs": ReservoirSettings()}
         return self._with_counts(sample_count, shares_views=True, **plain)
 

@@ -1,7 +1,7 @@
 """Sampling of light directions by importance, and tracing of these directions; no gradients.
 
-All samples are of low discrepancy. Memory is bounded by chunks of points (`in_chunks`),
-but for paths (`paths`), whose later vertices are kept for all rays of a call.
+All samples have low discrepancy. Points are processed in chunks, which bounds the memory
+(`in_chunks`); the exception is `paths`, which holds the later vertices of all rays of a call.
 """
 
 from collections.abc import Callable
@@ -21,10 +21,10 @@ from geosplat_jax.transport import bsdf
 from geosplat_jax.transport.light_sampling import LightSampler, light_density, sample_light
 
 OPEN = -1
-"""A ray that reaches the environment."""
+"""Value of `Samples.hits` for a ray that reaches the environment."""
 
 BLOCKED = -2
-"""A ray that does not; by what is not known."""
+"""Value of `Samples.hits` for a ray that is blocked, where the face is not known."""
 
 _RAYS_AT_ONCE = 4_194_304
 
@@ -82,11 +82,12 @@ class Samples(eqx.Module):
 
 
 class Chosen(eqx.Module):
-    """Samples of the light that were chosen from others.
+    """Samples of the light that were chosen from candidates.
 
     Attributes
     ----------
-    directions, weights : (N, L, 3) and (N, L), the weight being unbiased for one over the density.
+    directions : (N, L, 3) unit.
+    weights : (N, L) unbiased estimate of one over the density of the direction.
     is_open : static; whether blocked directions have no part in the choice, so that they are left
         to the other techniques.
     """
@@ -182,7 +183,14 @@ def cast(
 
     Parameters
     ----------
-    finds_nearest : static; tell the face that is hit first, which takes longer.
+    points : N points where rays start.
+    directions : (S, N, 3) unit.
+    index : the surface that blocks rays; None for no occlusion.
+    finds_nearest : static; whether to find the face that is hit first, which takes longer.
+
+    Returns
+    -------
+    (S, N) int32 face, `OPEN` or `BLOCKED`.
     """
     if finds_nearest and index is not None:
         return cast_to_faces(points, directions, index)[0]
@@ -197,7 +205,7 @@ def cast(
 def cast_to_faces(
     points: SurfacePoints, directions: Float[Array, "S N 3"], index: RayIndex
 ) -> tuple[Int[Array, "S N"], Float[Array, "S N"]]:
-    """Tell the face that rays hit first, as `cast` does, and how far away; no gradients."""
+    """Find where rays end, as `cast` does, and the distances of the faces; no gradients."""
     points, directions = jax.lax.stop_gradient((points, directions))
     is_below = _below(points, directions)
     distance, hits = index.nearest(*_rays(points, directions, is_below))
@@ -214,7 +222,7 @@ def _below(points: SurfacePoints, directions: Float[Array, "S N 3"]) -> Bool[Arr
 def _rays(
     points: SurfacePoints, directions: Float[Array, "S N 3"], is_below: Bool[Array, "S N"]
 ) -> tuple[Array, Array, Array, Array]:
-    """Lay out what a `RayIndex` is asked: origins, directions, faces to start from, mask."""
+    """Arrange the arguments of a `RayIndex`: origins, directions, faces to start from, mask."""
     samples = directions.shape[0]
 
     def repeated(values: Array) -> Array:
@@ -236,7 +244,7 @@ def _ends(
     index: RayIndex | None,
     finds_nearest: bool,
 ) -> tuple[Int[Array, "N S"], Float[Array, "N S"] | None]:
-    """Tell where rays end, and how far away the faces are where they are found; point by point."""
+    """Tell where rays end, and the distances of faces if these are found; one row per point."""
     if finds_nearest and index is not None:
         hits, distances = cast_to_faces(points, directions, index)
         return hits.T, distances.T
@@ -257,12 +265,12 @@ def draw_samples(
 
     Parameters
     ----------
-    key : of all random numbers.
-    points : where rays start.
+    key : random key of all samples.
+    points : N points where rays start.
     sampler : tables of the light.
     index : the surface that blocks rays; None for no occlusion.
     counts, finds_nearest : static; see `SampleCounts` and `cast`.
-    chosen : what to take for the light's samples; drawn here by default.
+    chosen : samples of the light to use; by default they are drawn here.
     """
     points, sampler = jax.lax.stop_gradient((points, sampler))
     count, dtype = points.normals.shape[0], points.normals.dtype
@@ -292,7 +300,7 @@ def draw_samples(
         if chosen is None:
             return Samples(directions, weights, hits, shared[:, : counts.light], distances)
         if chosen.is_open:
-            # Blocked directions are the cosine's alone.
+            # In blocked directions only the samples of the cosine count.
             is_open = hits == OPEN
             alone = safe_divide(jnp.ones_like(cosine), counts.diffuse * cosine).T
             alone = jnp.where(points.mask[:, None], alone, 0.0)

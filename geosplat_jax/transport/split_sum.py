@@ -51,7 +51,8 @@ def directional_albedo(
 
     Parameters
     ----------
-    n_dot_v : (...,) cosines in [0, 1]; roughness : (...,) perceptual, same shape.
+    n_dot_v : (...,) cosines in [0, 1].
+    roughness : (...,) perceptual, same shape.
     samples : points along each of the two dimensions.
 
     Returns
@@ -247,7 +248,7 @@ class SplitSumSettings(TransportSettings, kind="split_sum"):
     authors' first stage."""
 
     def constant_bytes(self, light: LightSpec) -> int:
-        """Count the operators of the prefilter twice: they are kept on the host, and copied."""
+        """Count the operators of the prefilter twice: a cache on the host keeps a second copy."""
         return 2 * operator_bytes(light)
 
     def build(self, light: LightSpec) -> SplitSum:
