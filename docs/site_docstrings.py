@@ -9,13 +9,23 @@ _RULE = re.compile(r"^-{3,}$")
 
 
 def _items(lines: list[str]) -> list[str]:
-    """Return the items of a section as a list of Markdown."""
+    """Return the items of a section as a list of Markdown.
+
+    A line continues an item if it is indented, or if both it and the item are prose without a name,
+    as in sections that say in sentences what is returned.
+    """
     items: list[list[str]] = []
+    is_prose = False
     for line in filter(str.strip, lines):
-        if line.startswith(" ") and items:
+        has_name = " : " in line
+        if items and line.startswith(" "):
             items[-1].append(line.strip())
+            is_prose = False
+        elif items and is_prose and not has_name:
+            items[-1][0] += " " + line.strip()
         else:
             items.append([line.strip()])
+            is_prose = not has_name
     listed = []
     for first, *more in items:
         name, colon, text = first.partition(" : ")

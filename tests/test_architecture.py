@@ -1,6 +1,7 @@
 """The order of the modules, the purity of the jitted ones, docstrings on all that is public."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 import geosplat_jax
 
 PACKAGE = Path(geosplat_jax.__file__).parent
+PAGE = Path(__file__).parent.parent / "docs" / "architecture.md"
 NAME = "geosplat_jax"
 
 # Lowest first: a module imports only modules above its own line. A folder is one layer; within it,
@@ -60,6 +62,7 @@ SOURCES = {
 }
 MODULES = sorted(name for name in SOURCES if name)
 """All but the package itself, which imports the names that it exports."""
+IN_FOLDERS = [m for m in MODULES if "." in m and not (PACKAGE / m.replace(".", "/")).is_dir()]
 
 
 def layer(module):
@@ -100,6 +103,20 @@ def test_every_module_has_its_place_in_the_order(module):
         f"{NAME}.{module} has no place in the architecture: add {layer(module)!r} to ORDER in "
         "tests/test_architecture.py (below all that it imports) and to docs/architecture.md"
     )
+
+
+def test_the_page_has_the_layers_in_their_order():
+    table = PAGE.read_text().partition("| layer |")[2].partition("\n\n")[0]
+    first_cells = [row.split("|")[1] for row in table.splitlines()[2:]]
+    assert re.findall(r"`(\w+)/?`", " ".join(first_cells)) == ORDER
+
+
+@pytest.mark.parametrize("module", IN_FOLDERS)
+def test_the_page_lists_every_module_by_its_first_line(module):
+    folder, _, name = module.rpartition(".")
+    section = PAGE.read_text().partition(f"### {folder.replace('.', '/')}\n")[2].partition("\n#")[0]
+    summary = " ".join(ast.get_docstring(SOURCES[module]).split("\n\n")[0].split())
+    assert f"- `{name}`: {summary.replace('``', '`')}" in section.splitlines()
 
 
 @pytest.mark.parametrize("module", [m for m in MODULES if layer(m) in ORDER])

@@ -153,15 +153,20 @@ def test_docstrings_of_the_site_are_lists():
     exec((DOCS / "site_docstrings.py").read_text(), names)
     text = (
         "Render.\n\nAs in::\n\n    code\n\nParameters\n----------\na, b : first\n    and more.\n"
-        "c : second\n\nRaises\n------\nValueError\n    If not."
+        "c : second\n\nReturns\n-------\n() in [0, 1]. It is\nsmall.\n\n"
+        "Raises\n------\nValueError\n    If not."
     )
     assert names["as_markdown"]("A plain one.") == "A plain one."
-    assert names["as_markdown"](text).splitlines()[-9:] == [
+    assert names["as_markdown"](text).splitlines()[-13:] == [
         "",
         "**Parameters**",
         "",
         "- `a, b`: first and more.",
         "- `c`: second",
+        "",
+        "**Returns**",
+        "",
+        "- () in [0, 1]. It is small.",
         "",
         "**Raises**",
         "",
