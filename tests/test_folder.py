@@ -114,6 +114,18 @@ def test_a_folder_with_other_files_is_never_used(dataset, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
+def test_a_file_half_written_by_a_process_that_was_killed_is_in_nobodys_way(dataset, tmp_path):
+    code = "import os, signal; from geosplat_jax.io.images import written_aside\n"
+    code += f"with written_aside({str(tmp_path / 'run.json')!r}) as aside:\n"
+    code += "    aside.write_text('{'); os.kill(os.getpid(), signal.SIGKILL)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == -9
+    assert len(list(tmp_path.iterdir())) == 1
+    folder = RunFolder(tmp_path)
+    with folder.locked():
+        folder.begin(dataset, tiny_config(), replace=False)
+    assert folder.config() == tiny_config()
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -33,7 +33,7 @@ from geosplat_jax.core.settings import PositiveCount, first_line, from_plain, se
 from geosplat_jax.fit.config import Budget, Config, config_from_dict
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.documents import parse_json
-from geosplat_jax.io.images import written_aside
+from geosplat_jax.io.images import is_left_aside, written_aside
 
 _PACKAGES = ("jax", "jaxlib", "numpy", "optax", "geosplat_jax")
 EVENTS = "tensorboard"
@@ -148,7 +148,8 @@ def _require_own(path: Path, own: Path) -> None:
         return
     if not path.is_dir():
         raise RunError(f"{path} exists already, and is no folder; choose another")
-    others = sorted(file.name for file in path.iterdir() if file.name != _LOCK)
+    files = (file for file in path.iterdir() if not is_left_aside(file))
+    others = sorted(file.name for file in files if file.name != _LOCK)
     if others:
         raise RunError(
             f"{path} exists already and holds other files, for example {others[0]}; choose "

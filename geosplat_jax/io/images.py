@@ -61,6 +61,11 @@ def written_aside(path: str | Path) -> Iterator[Path]:
         aside.unlink(missing_ok=True)
 
 
+def is_left_aside(path: Path) -> bool:
+    """Tell whether a file was left by a process that was killed inside `written_aside`."""
+    return re.fullmatch(r"\..*\.\d+\.partial(\..*)?", path.name) is not None
+
+
 def _opened(path: Path) -> Any:
     """Open an image; `MissingFileError` or `ImageReadError` where that cannot be done."""
     if path.is_dir():
