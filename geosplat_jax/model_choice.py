@@ -72,7 +72,7 @@ class ModelChoice:
     """Number of trainings of the smaller model, each with its own seed, that a gain is compared
     with."""
     hold_back: PositiveCount = 8
-    """One of this many training views is held back."""
+    """One in this many training views is held back."""
 
 
 @dataclass(frozen=True)

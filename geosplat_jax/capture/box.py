@@ -163,8 +163,8 @@ def require_something_inside(inside: Bool[np.ndarray, " N"], cloud: Cloud, corne
 def _search(views: Views) -> Bounds:
     """Find the cube in which the object is searched; it holds no camera.
 
-    It encloses the ball that half of the views show around the point that the cameras look at. The
-    cube of `hull.sight_bounds` lies inside this ball.
+    It encloses the ball that half of the views show around the point that the cameras look at,
+    unless a camera is too near for that. The cube of `hull.sight_bounds` lies inside this ball.
 
     Raises
     ------

@@ -143,7 +143,7 @@ class MaskReport:
         """Describe the report for a reader."""
         corners = f"{point_text(self.lo)} to {point_text(self.hi)}"
         origin = "proposed" if self.proposed else "given"
-        plane = ", what it stands on or hangs at left out" if self.plane else ""
+        plane = ", without what it stands on or hangs from" if self.plane else ""
         held_back = "no views are held back"
         if self.psnr is not None:
             held_back = f"{self.psnr:.2f} dB on views that are held back"

@@ -8,7 +8,8 @@ def main(argv: list[str] | None = None) -> int:
     """Run a command line, by default that of the process, and return its exit status.
 
     The status is 0 after success, 1 if gradcheck finds a wrong gradient, 2 after an error that the
-    user can cure, which is printed in one line, and 130 if the command was stopped by Ctrl-C.
+    user can cure, which is printed in one line, and 130 if the command was stopped by Ctrl-C, or a
+    training by SIGTERM.
     """
     retain_freed_memory()
     try:

@@ -301,7 +301,12 @@ def _add_gradcheck(gradcheck: argparse.ArgumentParser) -> None:
         "stages", nargs="*", metavar="PART", help=f"some of {', '.join(STAGES)} (default: all)"
     )
     gradcheck.add_argument("--sweep", action="store_true", help="show the error at every step size")
-    gradcheck.add_argument("--seed", type=_seed, default=0, help="of numbers, samples, directions")
+    gradcheck.add_argument(
+        "--seed",
+        type=_seed,
+        default=0,
+        help="seed of numbers, samples and directions (default: %(default)s)",
+    )
     gradcheck.add_argument("--json", type=Path, help="also write every comparison to this file")
 
 

@@ -89,8 +89,8 @@ def stops_soon(*, with_process: bool) -> Iterator[Callable[[], None]]:
     """End the process soon after Ctrl-C within the block, see `_watch`.
 
     A training has its own handler, which lets it finish its step and write a checkpoint; a second
-    Ctrl-C does not wait for that. Outside of the main thread, which receives no signals, the block
-    runs as it is.
+    Ctrl-C does not wait for that. In any thread but the main one the block runs as it is, since
+    only the main thread receives signals.
 
     Parameters
     ----------

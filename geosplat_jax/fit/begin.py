@@ -35,7 +35,7 @@ class Begin:
     def first_loop(
         self, dataset: Dataset, config: Config, run: RunFolder, devices: Devices
     ) -> Loop:
-        """Build the loop of a new run, before anything is written to its folder.
+        """Build the loop of a new run, before its record is written to the folder.
 
         The parameters are new, except for the shape, light and exposure of ``start`` where it is
         given.

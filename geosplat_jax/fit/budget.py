@@ -233,7 +233,8 @@ def reduction_factor(longest: int, cells: int) -> int:
 
     Parameters
     ----------
-    longest : pixels of their longer side. cells : of the grid, along its longest side.
+    longest : longer side of the photographs, pixels.
+    cells : number of cells along the longest side of the grid.
     """
     return max(1, math.floor(longest / (_PIXELS_PER_CELL * cells) + 0.5))
 

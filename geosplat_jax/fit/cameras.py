@@ -188,7 +188,7 @@ class PosedPhotograph(eqx.Module):
 
     Attributes
     ----------
-    camera : of the single view, to begin with.
+    camera : initial camera of this single view.
     image : (H, W, 4) linear colour, straight alpha.
     valid : (H, W) pixels that count, 0 or 1.
     """

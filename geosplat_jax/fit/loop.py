@@ -453,7 +453,7 @@ def _sizes(shape: Any) -> list[tuple[int, ...]]:
 
 
 def _refuse_blended_points(config: Config) -> None:
-    """Refuse rays that start at blended positions of splats, where a mesh has two sides.
+    """Refuse rays that start at blended positions of splats, for a mesh with surface on both sides.
 
     The wall behind shines through a little. It pulls the blended position behind the face, so that
     the whole face would lie in its own shadow.

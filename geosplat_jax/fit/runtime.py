@@ -19,7 +19,7 @@ import jax
 _Result = TypeVar("_Result")
 
 _CROWDED = 0.5
-"""Share of the memory maps from which programs are forgotten."""
+"""Used share of the allowed memory maps from which on programs are released."""
 
 _MOST_MAPS = 65_530
 """Limit of memory maps that is assumed even where a system allows more, since programs also take
@@ -65,8 +65,8 @@ def in_background(function: Callable[[], _Result]) -> "Future[_Result]":
 def peak_memory_mb() -> int:
     """Largest memory of this process so far, in MB of 2**20 bytes; 0 where it is not known.
 
-    On accelerators it is the most that JAX's allocator has given out of one of them; on a CPU it is
-    the resident memory.
+    On accelerators it is the most that JAX's allocator has had in use on any one of them; on a CPU
+    it is the resident memory.
     """
     if jax.default_backend() != "cpu":
         stats = [device.memory_stats() or {} for device in jax.local_devices()]

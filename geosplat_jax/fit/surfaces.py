@@ -87,7 +87,7 @@ class SurfaceSettings(Variant, abc.ABC):
         Raises
         ------
         ValueError
-            If `start` would raise it.
+            For the reasons of `start`, as far as the notes need the same preparation.
         """
         del dataset
         return ()

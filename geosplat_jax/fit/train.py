@@ -35,7 +35,7 @@ from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.memory import is_out_of_memory
 
 _FIRST_PREVIEW = 4
-"""The first preview comes after ``preview_every`` divided by this many steps."""
+"""The number of steps before the first preview is ``preview_every`` divided by this."""
 
 _STEPS_TIMED = 5
 """Fewest timed steps from which the time left is estimated."""

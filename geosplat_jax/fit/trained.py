@@ -129,12 +129,12 @@ def read_checkpoint(path: Path, config: Config) -> tuple[dict[str, Any], Descrip
 
 @dataclass(frozen=True)
 class Trained:
-    """The state in a run's last good checkpoint, ready to render.
+    """A state of a run, ready to render: that of a checkpoint, or the present one for a preview.
 
     Attributes
     ----------
     config : settings of the run.
-    stage : stage that the checkpoint was written in.
+    stage : stage that the state belongs to.
     params, pipeline : parameters and pipeline of this stage.
     step : number of steps that were done.
     """

@@ -298,9 +298,9 @@ def _directional_errors(
     """Errors (R, 2) of R combinations: along their gradient, and the worst of random directions."""
     count = span.stop - span.start
     norms = np.sqrt(np.sum(np.square(gradients), axis=1))
-    # Directions along a gradient are as long as random ones, so that a typical derivative is the
-    # norm. Where a few entries hold all of the gradient they are shorter: those entries would
-    # otherwise move by hundreds of steps, past kinks of the function.
+    # Directions along a gradient are as long as random ones, along which a typical derivative is
+    # the norm of the gradient. Where a few entries hold all of it they are shorter: those entries
+    # would otherwise move by hundreds of steps, past kinks of the function.
     unit = gradients / np.where(norms > 0, norms, 1.0)[:, None]
     largest = np.max(np.abs(unit), axis=1)
     lengths = np.minimum(np.sqrt(count), _LARGEST_ENTRY / np.where(norms > 0, largest, 1.0))

@@ -55,7 +55,10 @@ def _splats(rng: np.random.Generator, count: int) -> dict[str, Any]:
 
 
 def projection_problems(rng: np.random.Generator) -> list[Problem]:
-    """Differentiate footprints in Gaussians and camera, inside and far outside the image."""
+    """Differentiate footprints in Gaussians and camera.
+
+    Inside the image, and far outside of it, where slopes are clamped.
+    """
 
     def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
         splats = project(
@@ -111,7 +114,7 @@ def rasteriser_problems(rng: np.random.Generator) -> list[Problem]:
 
 
 def loss_term_problems(rng: np.random.Generator) -> list[Problem]:
-    """Differentiate the terms of the loss on images, normals and light, and the colour curves."""
+    """Differentiate terms of the loss on images, normals, albedo and light, and colour curves."""
     shape = (1, 13, 14)
     image = rng.uniform(0.05, 0.95, (*shape, 4))
 

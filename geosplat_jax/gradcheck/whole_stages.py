@@ -130,8 +130,9 @@ def loss_problems(rng: np.random.Generator) -> list[Problem]:
     """Build two problems: the loss as trained, and the loss with every detached path open.
 
     As trained, attributes do not pull on positions, and the inward shift takes the normals and
-    areas of faces as constants: by design the gradient in the geometry is not the whole derivative.
-    That problem leaves out the geometry and the smoothness terms. With
+    areas of faces as constants. By design, the gradient in the geometry, and that of the smoothness
+    terms in the shift, are then not the whole derivatives; so the first problem leaves out the
+    geometry and the smoothness terms. With
     ``material.position_gradient`` and without the shift the gradient is the whole derivative, and
     all of it is compared.
     """

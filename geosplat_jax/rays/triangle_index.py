@@ -30,7 +30,7 @@ _CELL_EDGES = 1.0
 time in tracing than they would cost in building the index."""
 
 _MOST_CELLS = 1 << 20
-"""Most cells of a grid; their words take 4 MB."""
+"""Most cells of a grid, about; their words take 4 MB."""
 
 _MOST_BOXES = 1 << 25
 """Most pairs of a triangle and a cell that its bounding box meets; so many take some gigabytes."""
@@ -54,7 +54,7 @@ def cells_for(
 
     Returns
     -------
-    (nx, ny, nz), together at most 2**20 cells, margins included.
+    (nx, ny, nz), together about 2**20 cells at most, margins included.
     """
     corners = np.asarray(vertices, np.float64)[faces]
     edges = corners - np.roll(corners, 1, axis=1)

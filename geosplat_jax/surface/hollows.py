@@ -65,7 +65,7 @@ class Candidate(NamedTuple):
 
     Attributes
     ----------
-    region : mask of the carved vertices of the grid, indexed by z, y and x.
+    region : mask of the carved vertices, indexed by z, y and x, on the coarse grid that is carved.
     lid : difference on the surface of the hull.
     behind : difference on the surface behind the region.
     mirror : difference from what a mirror would show in place of the hull's surface; inf where the

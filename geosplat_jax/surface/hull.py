@@ -146,7 +146,8 @@ def sight_bounds(
     """Find a cube around what all cameras look at, where there are no masks.
 
     Its centre is the point nearest to the cameras' axes. Its size is such that at least half of the
-    views show all of it, and that no camera lies inside.
+    views that look towards it show all of it at the distance of the centre, and that no camera lies
+    inside.
 
     Parameters
     ----------

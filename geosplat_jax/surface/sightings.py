@@ -208,9 +208,10 @@ class Photographed:
     def visible(self, surface: Crossings, solid: Where) -> Bool[np.ndarray, "V N"]:
         """Tell which views see the points of a surface, (V, N).
 
-        A view sees a point that it faces (with a cosine above `_FACING`) if nothing blocks the line
-        of sight. What blocks is the solid, enlarged by one cell because its surface is uncertain;
-        the line of sight begins `_CLEAR` cells above the point, to be clear of its own enlargement.
+        A view sees a point whose normal faces it (with a cosine above `_FACING`) if nothing blocks
+        the line of sight. What blocks is the solid, enlarged by one cell because its surface is
+        uncertain; the line of sight begins `_CLEAR` cells above the point, to be clear of its own
+        enlargement.
         """
         steps = int(np.ceil(np.linalg.norm(solid.shape) / _STRIDE))
         doubtful = jnp.asarray(ndimage.binary_dilation(solid))

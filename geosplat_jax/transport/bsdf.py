@@ -359,7 +359,7 @@ def sample(
     wo: Float[Array, "N 3"],
     uniforms: Float[Array, "N 3"],
 ) -> Float[Array, "N 3"]:
-    """Draw ``wi`` after the reflectance: visible normals for the specular lobe, else a cosine.
+    """Draw ``wi`` by the reflectance: visible normals for the specular lobe, else a cosine.
 
     Parameters
     ----------

@@ -268,8 +268,9 @@ def outgoing(
     """Radiance that every face sends out, for `TracedIndirect`.
 
     Glossy points are treated as diffuse ones: a point sends out its irradiance / pi times
-    ``albedo (1 - metallic)``, plus ``F0`` where there is a specular lobe, and a face sends the mean
-    over its points. Faces without points are black. Differentiable in the first two arguments.
+    ``albedo (1 - metallic) + F0``, where ``F0`` is left out without a specular lobe. A face sends
+    the mean over its points; faces without points are black. Differentiable in the first two
+    arguments.
 
     Parameters
     ----------

@@ -61,7 +61,7 @@ _ROWS_AT_ONCE = 65_536
 """Paths that are followed together; chunks beyond the last path cost nothing."""
 
 _NUMBERS = 5
-"""Random numbers of a vertex: two towards the light, three after the reflectance."""
+"""Random numbers of a vertex: two for the light's direction, three for the reflectance's."""
 
 
 class FaceTable(eqx.Module):

@@ -136,7 +136,10 @@ class Ladder:
         return self._levels[self._next]
 
     def note(self, level: Level, seconds: float) -> None:
-        """Record the time of a picture; the first of a level is ignored, as it was compiled."""
+        """Record the time of a picture.
+
+        That of the first picture of a level is ignored, since it includes the compilation.
+        """
         number = self._levels.index(level)
         if self._has_compiled[number]:
             self._paces[number] = seconds

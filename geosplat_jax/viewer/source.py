@@ -51,7 +51,7 @@ class CheckpointWatch:
         Raises
         ------
         TrainingError, RunError, CheckpointError, OSError
-            If the first call cannot read a checkpoint.
+            If no checkpoint can be read, and none was read by an earlier call.
         """
         listed = self._listed()
         if listed == self._seen:
