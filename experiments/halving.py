@@ -121,7 +121,7 @@ def full_costs(folder: Path, sweep: Sweep, factor: float) -> dict[str, tuple[flo
     """Return, by run, the seconds of a full training and the quality reached so far.
 
     Both are means over the scenes; runs that are not complete on all scenes are left out. Seconds
-    follow from median steps, without compilation, which a full training does not repeat.
+    follow from median steps, without compilation, which does not grow with the number of steps.
     """
     record = trade.report._read_sweep(folder)
     figures = trade.quality_figures(record)
@@ -143,7 +143,7 @@ def rung_factors(rungs: int, keep: float) -> list[float]:
 def search(
     sweep: Sweep, arguments: argparse.Namespace, run_jobs: Any = runner.run_jobs
 ) -> tuple[Sweep, Path, list[Job]]:
-    """Train all rungs; return the sweep of the last one, its folder, and the jobs that failed.
+    """Train all rungs; return the sweep of the last one, its folder, and its jobs that failed.
 
     Raises
     ------

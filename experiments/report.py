@@ -440,7 +440,8 @@ def _describe_runs(sweep: dict[str, Any]) -> list[str]:
     common = ", ".join(f"`{override}`" for override in sweep["overrides"])
     reduced = sweep["downscale"] > 1
     images = f"images reduced by {sweep['downscale']}" if reduced else "full-size images"
-    start = f"All runs have the preset `{sweep['preset']}`, quality `{sweep['quality']}`, the "
+    start = "Unless the table says otherwise, all runs have the preset "
+    start += f"`{sweep['preset']}`, quality `{sweep['quality']}`, the "
     start += f"material prior `{sweep['material_prior']}` and {images}"
     start += f", and the settings {common}. " if common else ". "
     start += f"They are evaluated with {usual['samples']} samples by the protocol "

@@ -113,7 +113,10 @@ def _evaluate(folder: Path, reading: dict[str, Any] | None = None, **arguments: 
 
 
 def _begin(job: Job) -> Begin:
-    """Return how a run begins: resumed if it has a checkpoint, else anew or from its source."""
+    """Return how a run begins: resumed if it has a checkpoint, else anew or from its source.
+
+    A start that came to no undamaged checkpoint is replaced.
+    """
     folder = Path(job.folder)
     if latest_checkpoint(folder / "checkpoints") is not None:
         return Resume()

@@ -17,9 +17,10 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from geosplat_jax.core.settings import PositiveCount, settings
 from geosplat_jax.fit.begin import ANEW, Begin, Resume
@@ -71,7 +72,7 @@ class ModelChoice:
     seeds: PositiveCount = 2
     """Number of trainings of the smaller model, each with its own seed, that a gain is compared
     with."""
-    hold_back: PositiveCount = 8
+    hold_back: Annotated[int, Field(ge=2)] = 8
     """One in this many training views is held back."""
 
 
@@ -246,7 +247,7 @@ class _Trials:
         if not stages:
             raise ValueError("there is no model to choose: no stage has steps")
         used, held = every_nth(len(dataset.train), how.hold_back)
-        if len(held) < _FEWEST_HELD or not len(used):
+        if len(held) < _FEWEST_HELD:
             raise ValueError(
                 f"choosing a model holds back every {how.hold_back}th of {len(dataset.train)} "
                 f"training views; that makes {len(held)}, and at least {_FEWEST_HELD} are needed: "

@@ -48,7 +48,7 @@ TRIES = 3
 RENDER_RESOLUTION = 200
 SAVED_RESOLUTION = 80
 # Mitsuba's rule of interpolation in a map differs slightly from ours. Upsampling the map first
-# removes the difference: the error of a mirror ball under `party` falls from .013 to .002.
+# makes that harmless: the error of a mirror ball under `party` falls from .013 to .002.
 ENVIRONMENT_UPSAMPLING = 8
 # local = (y, z, x) takes the z-up world to the y-up frame of Mitsuba's `envmap`.
 WORLD_TO_ENVIRONMENT = np.array([[0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], float)

@@ -1,4 +1,4 @@
-"""Measure the effects of every shortcut of Monte Carlo: bias, noise and time of a gradient.
+"""Measure every shortcut of Monte Carlo: bias and noise of images and gradients, and time.
 
 ``python experiments/studies/shortcuts.py RUN --output shortcuts.json`` takes a trained run and
 evaluates an image and the gradient of the loss on one batch of training views with many seeds, for

@@ -147,7 +147,7 @@ def load_checkpoint(path: str | Path, *, like: Any) -> tuple[Any, dict]:
     Raises
     ------
     CheckpointError : the file is missing or damaged, or its leaves differ from those of ``like`` in
-        number, shape or type, as when the configuration has changed.
+        name, shape or type, as when the configuration has changed.
     """
     path = Path(path)
     header = _header(path)

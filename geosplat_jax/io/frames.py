@@ -158,8 +158,8 @@ def list_transforms(content: Mapping[str, Any], path: Path) -> list[ListedFrame]
     A lens is given by ``camera_angle_x``, or by ``fl_x, fl_y, cx, cy`` in pixels of an image of
     ``w`` by ``h``, once for all frames or in each frame. A missing ``fl_x`` is computed from the
     angle, a missing ``fl_y`` from ``camera_angle_y``, or else it equals ``fl_x``; a missing ``cx``
-    or ``cy`` is the middle of the image. ``camera_model``, ``is_fisheye``, ``k1`` to ``k4``, ``p1,
-    p2`` or ``distortion_params`` describe the distortion.
+    or ``cy`` is the middle of the image. ``camera_model``, ``is_fisheye``, ``k1`` to ``k4``, ``p1``
+    and ``p2``, or ``distortion_params``, describe the distortion.
 
     Parameters
     ----------

@@ -70,7 +70,10 @@ def memory_of_accelerator() -> int | None:
 
 
 def memory_refusal(needs: Sequence[Need]) -> str | None:
-    """Say that needs exceed the machine's memory; None where they fit, or if it is unknown."""
+    """Say that needs exceed the machine's memory; None where they fit, or if it is unknown.
+
+    The message names the three largest needs, the largest first.
+    """
     return _refusal(needs, memory_of_machine())
 
 

@@ -181,7 +181,7 @@ def from_y_up(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
 
 
 def unpadded(mesh: Mesh) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]:
-    """Copy a padded `Mesh` to the host, without the padding: vertices, world, and faces."""
+    """Copy a padded `Mesh` to the host, without the padding: its vertices (world) and faces."""
     vertex_count, face_count = int(mesh.vertex_count), int(mesh.face_count)
     return np.asarray(mesh.vertices)[:vertex_count], np.asarray(mesh.faces)[:face_count]
 

@@ -168,7 +168,7 @@ class _Stack(abc.ABC):
         return made if dtype is None else made.astype(dtype)
 
     def __getitem__(self, key: Any) -> np.ndarray:
-        """Compute the images of some views, as indexing an array would; other axes follow."""
+        """Compute the images of some views, indexed as an array; further indices apply to these."""
         first, rest = (key[0], key[1:]) if isinstance(key, tuple) and key else (key, ())
         if isinstance(first, int | np.integer):
             index = range(len(self))[first]
@@ -330,7 +330,7 @@ class Marks(_Stack):
     def of(
         cls, bits: Sequence[Shaped[np.ndarray, "H bytes"] | None], height: int, width: int
     ) -> "Marks | None":
-        """Return images from the results of `pack_marks`; None if all pixels of all are one."""
+        """Return images from results of `pack_marks`; None if all pixels of all images are one."""
         if all(image is None for image in bits):
             return None
         ones = np.broadcast_to(np.uint8(255), (height, -(-width // 8)))
@@ -352,7 +352,7 @@ class Marks(_Stack):
         return sum(bits.nbytes for bits in self._bits if any(bits.strides))
 
     def windows(self, corners: Int[np.ndarray, "V 2"], height: int, width: int) -> "Marks":
-        """Return windows, which lie inside of the images; see `Photographs.windows`."""
+        """Return windows, which must lie inside the images; see `Photographs.windows`."""
         shape = (len(self), height, width)
         return replace(self, shape=shape, _corners=self._corners + corners)
 

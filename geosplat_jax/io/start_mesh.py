@@ -128,8 +128,8 @@ def read_start(path: str, digest: str) -> StartMesh:
     Raises
     ------
     ValueError
-        If the file does not have the digest, holds no face that can be used or more than `LARGEST`,
-        or has vertices that do not exist or are not finite.
+        If the file does not have the digest, or holds no face that can be used, more than
+        `LARGEST`, or faces of vertices that do not exist or are not finite.
     """
     if digest_of(path) != digest:
         raise ValueError(f"{path} is not the mesh that it was (its digest was {digest})")
@@ -187,8 +187,8 @@ def _joined(points: Float[np.ndarray, "V 3"]) -> tuple[np.ndarray, Int[np.ndarra
     """Merge points at one place; return the merged points, and the row of each given point in them.
 
     Points nearer to each other than `_SAME_PLACE` are merged, some that are up to 3.5 times as far,
-    and chains of such points. Two points as near as that share a cube of twice the side in at least
-    one of eight grids, which are shifted by half a cube along some of the axes.
+    and chains of such points. Two points as near as that share a cube, whose side is twice that
+    distance, in at least one of eight grids, which are shifted by half a cube along some axes.
     """
     low = points.min(axis=0)
     size = float(np.max(points.max(axis=0) - low))

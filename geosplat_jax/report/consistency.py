@@ -345,7 +345,7 @@ def body_of_run(trained: Trained) -> Body:
     raster, surface = trained.pipeline.raster, trained.pipeline.surface
     vertices, faces, normals = trim_mesh(asset.mesh)
     if surface.is_two_sided:
-        faces = faces[: len(faces) // 2]  # Front and back coincide: only fronts can be hit.
+        faces = faces[: len(faces) // 2]  # Front and back coincide, and a ray could hit either.
     return Body(
         vertices,
         faces,

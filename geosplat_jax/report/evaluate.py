@@ -199,7 +199,7 @@ def _relight_metrics(
             rgb[index], alpha[index] = _compared(view, protocol.relight), view.alpha
             if index in chosen:
                 shown[index] = render_on_white(view.rgb, view.alpha)
-        images = views.relight[name]  # read once, since every rendition reads all of them
+        images = views.relight[name]  # read once, since every lookup reads all of them
         found = protocol_metrics.relight_metrics(protocol, rgb, alpha, images, _all_valid(views))
         metrics |= {f"relight.{name}.{key}": value for key, value in found.items()}
         for row, index in zip(rows, chosen, strict=True):
@@ -387,10 +387,10 @@ def evaluate_run(
 
     Writes ``metrics.json``, ``overview.png`` and, where the scene has the ground truth,
     ``materials.png`` and ``relight.png``; also every picture as a file (see `gallery`). New views
-    are always compared in sRGB on white; metrics are means over the images. Normals are compared
-    twice: over the pixels of the mask, and over all pixels, with (0, 0, 1) as normal of the
-    background. Pixels that do not count are left out of all metrics, and are empty on the sheets.
-    All other choices are those of the protocol, see `protocols`.
+    are always compared in sRGB on white; their metrics are means over the images. Normals are
+    compared twice: over the pixels of the mask, and over all pixels, with (0, 0, 1) as normal of
+    the background. Pixels that do not count are left out of all metrics, and are empty on the
+    sheets. All other choices are those of the protocol, see `protocols`.
 
     Parameters
     ----------

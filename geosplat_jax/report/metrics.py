@@ -125,7 +125,7 @@ def normal_mae_deg(
     By default the mean is over the pixels of the true ``mask``. A pixel without a predicted normal
     (zero vector) counts as 90 degrees, and an empty mask gives 0. With ``full`` the mean is over
     *all* pixels, with (0, 0, 1) as normal of the background: this is the figure that public code
-    of the field prints. It is smaller, about by the share of the image that the object covers.
+    of the field prints. It is smaller: about the first one times the object's share of the image.
 
     Parameters
     ----------

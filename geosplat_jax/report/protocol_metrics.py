@@ -5,7 +5,8 @@ coverage (predicted ``alpha``, true ``mask``), hence zero on the background; the
 `io.views.Views` is straight, and the caller multiplies it by the mask. Only the ``image`` of
 `new_view_metrics` and `relight_metrics` is straight RGBA, as `Views` holds it. Where coverage is
 partial, the straight colour is clipped to [0, 1], encoded, and then composited over the background.
-Public code treats the PNG files of the data sets in this way; here truth and prediction are.
+Public code treats the PNG files of the data sets in this way; here it is done to truth and
+prediction alike.
 
 Pixels that do not count (``valid``) are left out of all figures. The caller must set them to zero
 in all maps, predicted and true; if ``valid`` is None, all pixels count. Otherwise SSIM is the mean
@@ -382,7 +383,7 @@ def material_metrics(
     ``roughness.mse`` of straight values over the pixels of the mask, where a pixel that the
     prediction does not cover counts as zero; the mean over the images with an object.
     ``roughness.mse_full`` of premultiplied values over whole images, on black; the mean over all
-    images, smaller by about the share of the image that the object covers. Likewise
+    images, which is about the former times the object's share of the image. Likewise
     ``metallic.mse`` and ``metallic.mse_full``.
 
     Raises

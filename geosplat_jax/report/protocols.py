@@ -56,9 +56,9 @@ class ScaledRendition:
 
     The true mask is eroded by 5 x 5 pixels, and pixels outside are black in both images. Each
     channel of each image is scaled by least squares over the pixels inside. Errors are means over
-    *all* pixels, and so smaller by the share of the image that the object covers. The PSNR of an
-    image is at least that of a uniform grey of 0.5 inside the mask. The benchmark's images have
-    512 x 512 pixels.
+    *all* pixels, that is those over the object times its share of the image. The PSNR of an image
+    is at least that of a uniform grey of 0.5 inside the mask. The benchmark's images have 512 x 512
+    pixels.
 
     Attributes
     ----------

@@ -27,7 +27,7 @@ LARGEST_SIZE = 8192
 """Most pixels along the longer side of an image."""
 
 MOST_FRAMES = 10_000
-"""Most pictures of a turntable."""
+"""Most pictures of a turntable, or of a turn of the light."""
 
 
 class Shot(NamedTuple):
