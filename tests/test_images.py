@@ -1,4 +1,4 @@
-"""Images survive the disk, and reduction keeps light and edges."""
+"""Images are written and read back, and downscaling keeps light and edges."""
 
 import numpy as np
 import OpenImageIO as oiio
@@ -20,7 +20,7 @@ from geosplat_jax.io.images import (
     write_png,
 )
 
-RGBE_TOLERANCE = 1 / 128  # Radiance HDR: 8-bit mantissas under one exponent, of the brightest
+RGBE_TOLERANCE = 1 / 128  # Radiance HDR: 8-bit mantissas, and the exponent of the brightest channel
 
 
 def random_pixels(*shape, seed=0):
@@ -247,7 +247,7 @@ def test_a_fourth_channel_that_is_no_alpha_is_refused(tmp_path):
 
 @pytest.mark.parametrize("ending", ["exr", "tif"])
 def test_channels_beside_colour_and_alpha_are_refused(tmp_path, ending):
-    """Of floats, and of whole numbers, which would become grey."""
+    """Float files and integer files are both refused; the integer ones would be read as grey."""
     path, kind = tmp_path / f"five.{ending}", oiio.FLOAT if ending == "exr" else oiio.UINT8
     spec = oiio.ImageSpec(6, 4, 5, kind)
     spec.channelnames = ("R", "G", "B", "A", "selection")

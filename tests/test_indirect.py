@@ -1,4 +1,4 @@
-"""Indirect light: the harmonics, the four models and their ranges, what faces send out."""
+"""Indirect light: the harmonics, the four models and their ranges, and the light faces send."""
 
 from functools import partial
 
@@ -39,7 +39,10 @@ def unit(count, seed=0):
 
 
 def sphere_rule(rows=12, columns=24):
-    """Gauss-Legendre by equal steps: exact for polynomials of degree 23 on the sphere."""
+    """Nodes and weights on the sphere, exact for polynomials up to degree 23.
+
+    They are Gauss-Legendre nodes in z times equal steps in azimuth.
+    """
     z, weights = np.polynomial.legendre.leggauss(rows)
     angle = np.arange(columns) * 2 * np.pi / columns
     ring = np.sqrt(1 - z**2)[:, None]
@@ -50,7 +53,7 @@ def sphere_rule(rows=12, columns=24):
 
 
 def values_of(model, seed=1):
-    """Random values: a row for each ray, or for each of four faces."""
+    """Random values: one row per ray, or one per face for models that read faces."""
     shape = (4 if model.reads_faces else RAYS, model.outputs or 3)
     return np.random.default_rng(seed).uniform(-2, 2, shape)
 
@@ -144,7 +147,7 @@ def test_traced_light_is_what_the_face_sends_and_black_where_none_is_known():
 
 
 def test_faces_send_what_they_learned_towards_where_the_ray_comes_from():
-    """Along the ray backwards; black where the face is not known."""
+    """Radiance is evaluated in the direction opposite to the ray; without a face it is black."""
     values, hits, directions = values_of(RadiometricIndirect), np.asarray(HITS), unit(RAYS, 3)
     diffuse, specular = arriving(RadiometricIndirect, values, directions, HITS)
     own = values[np.maximum(hits, 0)].reshape(RAYS, 3, 9)
@@ -181,7 +184,7 @@ def test_learned_light_starts_small_and_stays_between_zero_and_one(model):
     "model", [ConstantIndirect, HarmonicIndirect, TracedIndirect, RadiometricIndirect]
 )
 def test_the_gradient_is_that_of_the_values_alone(model):
-    """In the values it agrees with central differences of every entry; directions have none."""
+    """The gradient in the values agrees with central differences; that in directions is zero."""
     step = 1e-5
     with double_precision():
         values, directions = jnp.asarray(values_of(model)), jnp.asarray(unit(RAYS))
@@ -214,7 +217,7 @@ def random_materials(count, seed=4):
 
 
 def points_on(faces, mask=None):
-    """Points of these faces; where they lie does not matter."""
+    """Points on these faces; their positions do not matter."""
     faces = np.asarray(faces)
     nowhere = jnp.zeros((len(faces), 3))
     mask = np.ones(len(faces), bool) if mask is None else mask
@@ -224,7 +227,10 @@ def points_on(faces, mask=None):
 
 
 def sent_by(materials, light):
-    """What each point sends: matt share and reflectance at normal incidence, .04 without metal."""
+    """Light that each point sends: the incoming light times diffuse albedo plus F0.
+
+    F0 is .04 without metal.
+    """
     metallic, albedo = np.asarray(materials.metallic)[:, None], np.asarray(materials.albedo)
     reflected = albedo * (1 - metallic) + 0.04 * (1 - metallic) + albedo * metallic
     return reflected * np.asarray(light)
@@ -237,7 +243,8 @@ def random_light(count, seed=5):
 @pytest.mark.parametrize(
     "faces",
     [
-        np.repeat(np.arange(5), 6)[:18],  # three faces of six points, in order, and two of none
+        # three faces with six points each, in order, and two faces without points
+        np.repeat(np.arange(5), 6)[:18],
         np.random.default_rng(6).permutation([0] * 3 + [2] * 9 + [3] + [4] * 5),
         np.array([4, -1, 0, 4, -1, 4, 2, 0, 2, 2, 0, -1, 4, 4, 2, 0, 0, 2]),
     ],
@@ -289,6 +296,7 @@ def test_outgoing_light_is_differentiable_in_material_and_light():
         return jnp.sum(eager_outgoing(*inputs, points_on([0] * 6), 1))
 
     total, (by_material, by_light) = run((materials, light))
-    # Linear in both: (1 - m) + m is the share of albedo, whatever the metallic.
+    # The total is linear in the light and in the albedo, whose factor is (1 - m) + m = 1 for every
+    # metallic m.
     np.testing.assert_allclose(by_material.albedo, 0.7 / 6, rtol=1e-5)
     np.testing.assert_allclose(jnp.sum(by_light * light), total, rtol=1e-5)

@@ -1,4 +1,4 @@
-"""A recovered light beside the true one: scale, turn, flip, and resizing that keeps flux."""
+"""Recovered light against the true one: scale, rotation, mirroring, resizing that keeps flux."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from geosplat_jax.transport.environment import (
     texel_solid_angles,
 )
 
-# Decibels of float32 images.
+# Tolerance in decibels, for float32 images.
 DECIBELS = 2e-3
 GAIN = np.array([0.5, 2.0, 1.25])
 
@@ -28,7 +28,7 @@ FOUR_COLORS = np.array([[4.0, 0.2, 0.1], [0.1, 1.0, 0.2], [0.2, 0.1, 0.5], [0.6,
 
 
 def four_sides(height=8, width=16):
-    """A light whose four sides have four colours, brighter upwards; never its own mirror image."""
+    """A light with another colour on each of four sides, brighter upwards; mirroring changes it."""
     sides = np.repeat(FOUR_COLORS, width // 4, axis=0)
     slope = np.linspace(1.5, 0.5, height)
     return (slope[:, None, None] * sides).astype(np.float32)
@@ -72,7 +72,7 @@ def test_a_mirrored_light_is_found_at_any_turn():
 
 
 def test_a_sun_does_not_hide_a_flip():
-    # One texel outshines everything; what tells the sides apart is the dim rest.
+    # One texel outshines all others, but only the dim texels tell the sides apart.
     truth = four_sides(16, 32)
     truth[3, 5] = 2000.0
     noise = np.random.default_rng(3).lognormal(0.0, 0.2, truth.shape)
@@ -106,7 +106,7 @@ def test_lights_without_direction_are_finite():
 
 
 def test_light_psnr_and_scale_by_hand():
-    # One row: two texels of equal solid angle.
+    # The map has one row, so both texels have the same solid angle.
     recovered = np.array([[[1.0] * 3, [2.0] * 3]], np.float32)
     truth = np.array([[[1.0] * 3, [1.0] * 3]], np.float32)
     found = light_metrics(recovered, truth)

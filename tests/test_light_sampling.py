@@ -1,4 +1,4 @@
-"""Sampling of environment maps: the density is that of the samples, and covers the light."""
+"""Sampling of environment maps: samples follow the density, which covers all of the light."""
 
 import jax
 import jax.numpy as jnp
@@ -54,14 +54,14 @@ def test_the_density_integrates_to_one(name):
 
 
 def test_the_seam_of_the_map_is_no_border():
-    """Turning a light by whole texels turns its density, and sets no more of it aside."""
+    """Rotating a light by whole texels rotates its density and changes nothing else."""
     light = EnvLight(jnp.zeros((6, 10, 3)).at[2, 0].set(5.0).at[4, 9].set(2.0))
     density = np.asarray(light_sampler(light).density)
     for columns in (1, 5):
         turned = EnvLight(jnp.roll(light.radiance, columns, axis=1))
         found = np.asarray(light_sampler(turned).density)
         np.testing.assert_allclose(found, np.roll(density, columns, axis=1), rtol=1e-5)
-    # Next to a bright texel light is expected too, also across the seam.
+    # The density is also raised beside a bright texel, equally on both sides of the seam.
     np.testing.assert_allclose(density[2, 9], density[2, 1], rtol=1e-5)
 
 
@@ -72,7 +72,7 @@ def test_samples_are_unit_and_report_the_density_of_their_direction(name):
     lengths = np.linalg.norm(np.asarray(directions, np.float64), axis=1)
     np.testing.assert_allclose(lengths, 1.0, atol=2e-6)
     assert float(jnp.min(density)) > 0
-    # Samples within rounding of a texel's border may be looked up in its neighbour.
+    # By rounding, a sample close to a texel's border may be looked up in the neighbouring texel.
     same = np.isclose(light_density(sampler, directions), density, rtol=1e-5)
     assert same.mean() > 0.99
 
@@ -112,14 +112,15 @@ def test_the_density_is_positive_wherever_light_arrives():
     density = np.asarray(light_density(sampler, directions))
     lit = radiance > 0
     assert lit.sum() > 20
-    # The weight of a sample is bounded: no fireflies from light between texels.
+    # The weight of a sample is bounded, so that light interpolated between texels makes no
+    # fireflies.
     weight = radiance[lit] / density[lit]
     mean = float(jnp.sum(light.radiance[..., 0] * texel_solid_angles(16, 32)))
     assert weight.max() < 4.5 * mean
 
 
 def test_every_texel_of_a_large_map_can_be_drawn():
-    """One table of two million texels would have 2^24 places, and leave out a fifth of them."""
+    """One table over two million texels, in steps of 2^-24, would leave out a fifth of them."""
     radiance = np.random.default_rng(0).uniform(0.5, 1.0, (1024, 2048, 3)).astype(np.float32)
     radiance[160, 400] = 3e4
     sampler = jax.jit(light_sampler)(EnvLight(jnp.asarray(radiance)))
@@ -129,7 +130,7 @@ def test_every_texel_of_a_large_map_can_be_drawn():
     assert np.all(columns > 0)
     share = np.asarray(sampler.density) * np.asarray(texel_solid_angles(1024, 2048))
     np.testing.assert_allclose(rows[0], share.sum(axis=1), rtol=1e-3, atol=1e-7)
-    # Rows next to the poles are a few millionths of all, in steps of 2^-24.
+    # Rows next to the poles have a few millionths of the probability, rounded to steps of 2^-24.
     np.testing.assert_allclose(rows.T * columns, share, rtol=0.04)
 
 
@@ -157,7 +158,7 @@ def test_a_sampled_flux_is_that_of_quadrature(name):
     sampler = light_sampler(light)
     directions, density = sample_light(sampler, grid_uniforms(900))
     found = jnp.mean(lookup(light.radiance, directions) / density[:, None], axis=0)
-    # Midpoints, far finer than the texels, of the bilinear map.
+    # The reference is a midpoint rule on the bilinear map, with a grid far finer than the texels.
     rows, columns = 600, 1200
     polar = (np.arange(rows) + 0.5) / rows * np.pi
     azimuth = (np.arange(columns) + 0.5) / columns * 2 * np.pi
@@ -208,7 +209,7 @@ def test_precision_in_is_precision_out_and_jit_equals_eager():
 
 @pytest.mark.parametrize("axis", [0, 2])
 def test_points_that_are_spread_evenly_take_noise_away_in_both_directions(axis):
-    """Of sixteen samples of a flat sky, evenly over the unit square and at random."""
+    """Compare the variance of sixteen low-discrepancy samples of a flat sky with random ones."""
     light = EnvLight(jnp.ones((16, 32, 3)))
 
     def variance(uniforms):

@@ -1,4 +1,4 @@
-"""What happens between two steps, with a step that is told what to answer: nothing is compiled."""
+"""The training loop between two steps, with a stand-in for the step: nothing is compiled."""
 
 from dataclasses import replace
 
@@ -46,7 +46,7 @@ def folder(dataset, tmp_path):
 
 
 class Steps:
-    """Stands for `train_step`: notes what it is given, and needs the hits it is told."""
+    """Stand-in for `train_step`: records its arguments, and needs given numbers of hits."""
 
     def __init__(self, *needs):
         self.needs = list(needs)
@@ -67,14 +67,14 @@ class Steps:
 
 @pytest.fixture
 def steps(monkeypatch):
-    """Put `Steps` in the place of the true step, and plan and compile nothing."""
+    """Replace the real step by `Steps`, and skip planning and compilation."""
 
     def install(*needs):
         told = Steps(*needs)
         monkeypatch.setattr(loop_module, "train_step", told)
         monkeypatch.setattr(loop_module, "compile_step", lambda *a, **k: True)
         monkeypatch.setattr(loop_module, "plan_capacities", lambda *a, **k: Capacities(hits=128))
-        # Else the next stage would be planned and compiled beside these steps.
+        # Otherwise the next stage would be planned and compiled in the background.
         monkeypatch.setattr(loop_module.Loop, "_following", lambda *a: None)
         return told
 
@@ -111,7 +111,7 @@ def test_a_step_that_overflows_is_repeated_with_the_same_batch(dataset, folder, 
 def test_programs_of_trainings_before_are_forgotten_before_a_training_compiles(
     dataset, folder, steps, monkeypatch
 ):
-    """A process that trains again and again, to choose a model, would run out of memory maps."""
+    """Choosing a model trains many times in one process, which would run out of memory maps."""
     order = []
     steps()
     monkeypatch.setattr(
@@ -166,7 +166,7 @@ def test_what_was_noted_between_steps_returns_when_a_run_is_resumed(dataset, fol
 
 
 def test_what_is_known_of_the_next_stage_is_kept_until_it_begins(dataset, folder, steps):
-    """A run that is resumed where a stage has just ended writes what the other one wrote."""
+    """A run resumed at the end of a stage writes the same records as an uninterrupted run."""
     steps()
     loop = new_loop(dataset, CONFIG, folder)
     noted = {"stage": "monte_carlo", "capacities": {"hits": 256}}
@@ -195,7 +195,7 @@ def test_what_fails_for_the_next_stage_spares_the_checkpoints_of_this_one(datase
 
 
 def test_a_run_goes_on_from_the_end_of_a_stage_where_that_is_newer(dataset, folder, steps):
-    """It may have been killed while the programs of the next one compiled."""
+    """A run may have been killed while it compiled the programs of the next stage."""
     steps()
     loop = new_loop(dataset, CONFIG, folder)
     for step in range(6):
@@ -206,14 +206,17 @@ def test_a_run_goes_on_from_the_end_of_a_stage_where_that_is_newer(dataset, fold
     loop.save_end()
     resumed = resumed_loop(dataset, CONFIG, folder)
     assert (resumed.step, resumed.stage, resumed.last_checkpoint) == (6, CONFIG.stages[0], saved)
-    # Not from where a stage of another length ended.
+    # The end of a stage is not used if the stage has another number of steps now.
     longer = replace(CONFIG, stages=(replace(CONFIG.stages[0], steps=9), *CONFIG.stages[1:]))
     folder.amend(longer)
     assert resumed_loop(dataset, longer, folder).step == 3
 
 
 def test_what_a_stage_continues_gets_buffers_for_what_was_needed_of_late(dataset, folder, steps):
-    """Where splats become parameters their rows follow from the surface's buffers, which stay."""
+    """Where splats become parameters, their number of rows follows from the surface's buffers.
+
+    Those buffers then keep their size.
+    """
     steps(100)
     loop = new_loop(dataset, CONFIG, folder)
     sizes = {"hits": 4096, "quads": 4096, "visible": 128}

@@ -1,4 +1,4 @@
-"""The terms of the loss: zero where they should be, exact on small cases, blind where told."""
+"""Terms of the loss: zero where they should be, exact in small cases, ignoring masked pixels."""
 
 import jax
 import jax.numpy as jnp
@@ -94,7 +94,7 @@ def test_encoded_images_are_compared_as_they_are_seen():
     # Dark differences grow when they are encoded; the mean squared error stays linear.
     assert float(image_l1(encoded)) > 2 * float(image_l1(plain))
     assert float(encoded.mse) == float(plain.mse)
-    # The terms that ask for encoded images find them encoded once, whichever they get.
+    # Terms that need encoded images encode linear ones, and do not encode others a second time.
     assert float(image_l1(encoded.encoded())) == float(image_l1(encoded))
     assert float(image_l1(plain.encoded())) == float(image_l1(encoded))
 
@@ -116,7 +116,7 @@ def test_colours_are_compared_linear_unless_the_objective_says_so():
 
 
 def test_pixels_that_do_not_count_change_no_term():
-    """Whatever is there, in the render or in the photograph."""
+    """Pixels that are not valid may have any value, in the render or in the photograph."""
     valid = jnp.ones(SHAPE).at[:, :5].set(0.0)
     spoiled = valid[..., None] == 0
 
@@ -192,7 +192,7 @@ def test_a_tint_of_the_light_is_relative_and_counts_by_solid_angle():
     red = jnp.zeros((4, 8, 3)).at[..., 0].set(0.9)
     assert float(light_tint(red)) == pytest.approx((0.6 + 0.3 + 0.3) / 0.9, rel=1e-5)
     assert float(light_tint(7.0 * red)) == pytest.approx(float(light_tint(red)), rel=1e-5)
-    # A tinted row at the pole is less of the sphere than one at the equator.
+    # A tinted row at the pole covers less of the sphere than one at the equator.
     pole, equator = (grey.at[row, :, 0].multiply(3.0) for row in (0, 1))
     assert float(light_tint(pole)) < float(light_tint(equator))
 
@@ -208,7 +208,7 @@ def test_colours_of_the_light_that_balance_each_other_are_no_cast():
 
 
 def test_noise_of_the_light_costs_more_than_a_sun():
-    """As much light in one bright patch, and in as many texels here and there."""
+    """Compare light in one bright patch with the same light in as many scattered texels."""
     sky = jnp.full((8, 16, 3), 0.5)
     assert float(light_smoothness(sky)) == pytest.approx(0.0, abs=1e-6)
     sun = sky.at[3:5, 4:8].set(20.0)
@@ -216,10 +216,10 @@ def test_noise_of_the_light_costs_more_than_a_sun():
     assert float(sun.sum()) == float(noise.sum())
     assert float(light_smoothness(sun)) < 0.6 * float(light_smoothness(noise))
     brighter = sky.at[3:5, 4:8].set(200.0)
-    # The logarithm of the contrast: 10 times the light costs 62 % more.
+    # The term grows with the logarithm of the contrast: 10 times the light costs 62 % more.
     ratio = float(light_smoothness(brighter)) / float(light_smoothness(sun))
     assert ratio == pytest.approx(np.log(400) / np.log(40), rel=1e-4)
-    # It goes around, and not over the poles.
+    # The term wraps around in azimuth, but does not cross the poles.
     seam = float(light_smoothness(jnp.roll(sun, 11, axis=1)))
     assert seam == pytest.approx(float(light_smoothness(sun)), rel=1e-5)
 

@@ -1,4 +1,4 @@
-"""Masks of captures: the box that is proposed, the files that are written, what is refused."""
+"""Masks of captures: the proposed box, the written files, and refused input."""
 
 from dataclasses import replace
 
@@ -58,7 +58,7 @@ def ring(count=12, distance=5.0, scale=1.0):
 
 @pytest.mark.parametrize("scale", [1.0, 250.0])
 def test_the_box_is_that_of_the_object_without_what_it_stands_on(scale):
-    # The middle of the ball is off what the cameras look at.
+    # The cameras do not look at the centre of the ball.
     middle = np.array([0.2, -0.15, 0.0])
     cloud = cloud_of(
         scale * on_ball(1500, middle, 0.6),
@@ -76,7 +76,7 @@ def test_the_box_is_that_of_the_object_without_what_it_stands_on(scale):
 
 
 def test_a_thick_wall_that_no_axis_follows_is_cut_off():
-    """As a trophy hangs at one: splats behind the wall, and the cameras on one side of it."""
+    """Like a wall with a trophy on it: splats lie behind it, and all cameras are in front of it."""
     turn = np.linalg.qr(np.array([[1.0, 0.6, 0.3], [-0.5, 1.0, 0.2], [0.1, -0.4, 1.0]]))[0]
     turn = turn * np.sign(np.linalg.det(turn))
     rng = np.random.default_rng(5)
@@ -105,7 +105,7 @@ def test_a_larger_cluster_at_the_edge_is_not_the_object():
 
 
 def test_what_some_photographs_cut_off_belongs_to_the_object_where_it_is_connected():
-    """As a muzzle that sticks out towards the camera of close photographs."""
+    """Such a part is a muzzle that sticks out towards the camera in close photographs."""
     rod = (
         on_ball(900, radius=0.12) * [1.0, 1.0, 0.0]
         + [0.0, 0.0, 1.0] * np.linspace(0.3, 1.25, 900)[:, None]
@@ -129,7 +129,7 @@ def _tip_is_seen(views, index, point):
 
 @pytest.mark.parametrize("axes", [[2, 0, 1], [0, 1, 2]])
 def test_a_board_through_the_object_is_no_ground(axes):
-    # As many points on either side of the plane, so nothing stands on it.
+    # Equally many points lie on both sides of the plane, so nothing stands on it.
     board = on_plane(2000, 0.0, reach=0.7)[:, axes]
     cloud = cloud_of(on_ball(1500, radius=0.5), board)
     assert propose_box(cloud, ring()).plane is None
@@ -160,7 +160,7 @@ def test_corners_of_a_box_belong_to_it():
 
 
 def a_ball_before_a_wall(opacity=0.999):
-    """Splats of the ball of `test_captures`, and of another, far larger one around everything."""
+    """Splats of the ball of `test_captures`, and of a far larger ball around everything."""
     count, beyond = 1200, 600
     positions = np.concatenate([on_ball(count, CENTER, RADIUS - 0.11), on_ball(beyond, CENTER, 9)])
     sizes = np.repeat([0.05, 0.7], [count, beyond])[:, None] * np.ones(3)
@@ -181,7 +181,7 @@ def a_ball_before_a_wall(opacity=0.999):
 
 @pytest.fixture
 def capture(tmp_path, monkeypatch):
-    """A capture without masks, whose splats are known before they are trained."""
+    """A capture without masks; known splats stand in for the training of splats."""
     root = tmp_path / "scene"
     write_transforms(root, masks=None)
     monkeypatch.setattr(masks_module, "train_radiance", lambda *a, **b: a_ball_before_a_wall())
@@ -218,7 +218,7 @@ def test_masks_are_those_of_the_object_and_are_read_by_training(capture):
         mask = found[name][: truth.shape[0], : truth.shape[1]]
         overlaps.append((mask & truth).sum() / (mask | truth).sum())
         assert read_image(root / "masks" / f"{name}.png").shape[:2] == truth.shape
-    # The ball is seventeen pixels wide: its rim is a fifth of it.
+    # The ball is seventeen pixels wide, so its rim is a fifth of its area.
     assert np.mean(overlaps) > 0.93
     assert np.min(overlaps) > 0.88
     assert report.splats == 1200
@@ -317,7 +317,7 @@ def test_a_mask_is_as_large_as_its_photograph(tmp_path):
     frame = Frame("a", np.eye(4), lens, tmp_path / "a.png")
     alpha = np.zeros((12, 16), np.float32)
     alpha[2:6, 3:9] = 1.0
-    # The image was cut to 20 x 30 pixels, and lies on a larger canvas.
+    # The photograph was cropped to 20 x 30 pixels and halved; alpha lies on a larger canvas.
     mask = photograph_mask(alpha, frame, 2)
     rows, columns = np.nonzero(mask)
     assert mask.shape == (21, 31)
@@ -365,11 +365,11 @@ def test_specks_go_and_half_opaque_holes_are_filled():
     alpha = np.zeros((2, 40, 40), np.float32)
     alpha[:, 5:35, 5:35] = 0.9
     alpha[0, 10:14, 10:14] = 0.4  # half opaque, enclosed
-    alpha[0, 20:26, 20:26] = 0.1  # a hole indeed
+    alpha[0, 20:26, 20:26] = 0.1  # a real hole
     alpha[0, 30:35, 5:8] = 0.5  # half opaque, open to the outside
     alpha[0, 1:3, 1:3] = 0.95  # a speck: 4 pixels of about 850
     alpha[1, 1:4, 36:39] = 0.95
-    alpha[1, 5:35, 5:35] = 0.0  # nothing but nine pixels, which are no speck then
+    alpha[1, 5:35, 5:35] = 0.0  # only nine pixels are left, so they are no speck
     before = alpha.copy()
     found = masks_module.tidied(alpha)
     np.testing.assert_array_equal(alpha, before)
@@ -387,9 +387,10 @@ def test_half_opaque_pixels_and_cut_masks_raise_warnings():
     alpha[:, 5:35, 12:18] = 0.5
     alpha[5] = 0.0
     sure = masks_module.certainty(views, alpha, (np.full(3, -1.5), np.full(3, 1.5)))
-    # Six columns, of which one is next to the mask.
+    # Of the six half opaque columns, the one next to the mask is not counted.
     assert sure.unsure == pytest.approx(30 * 5 / (40 * 4))
-    # Eight pixels of a rim of 2 x 40 and 2 x 2 lie on the border.
+    # The rim of the mask has 2 x 40 and 2 x 2 pixels, of which eight lie on the border of the
+    # image.
     assert sure.cut == pytest.approx(8 / 84)
     assert sure.empty == (views.names[5],)
     assert sure.coverage == pytest.approx(5 / 6 * 0.1)

@@ -1,4 +1,4 @@
-"""Models of the material: what each has, and that what it lacks is not computed."""
+"""Models of the material: the parts of each, and that missing parts are not computed."""
 
 import math
 from dataclasses import replace
@@ -172,7 +172,7 @@ def test_monte_carlo_draws_nothing_for_a_lobe_that_is_not_there(scene):
     np.testing.assert_array_equal(found.rgb, found.diffuse)
     np.testing.assert_array_equal(found.specular_light, 0.0)
     assert float(jnp.min(expected.specular)) > 0
-    # Two keys make numbers: of the light and the cosine, and of the lobe.
+    # Random numbers come from two keys: one for light and cosine samples, one for lobe samples.
     counted = [len(operations("random_bits", lambda m=m: shade(m))) for m in (both, materials)]
     assert counted == [2, 1]
 

@@ -1,4 +1,4 @@
-"""Material fields: ranges, initial values, only the parameters a model uses, smoothness."""
+"""Material fields: ranges, initial values, the parameters of each model, and smoothness."""
 
 from dataclasses import replace
 from functools import partial
@@ -145,13 +145,14 @@ def test_points_outside_the_box_have_the_attributes_of_its_border():
 
 @pytest.mark.parametrize("shared", [False, True])
 def test_attributes_pull_on_the_points_where_that_is_chosen_and_the_shift_never_does(shared):
-    """Of each output, the gradient in the points, against differences."""
+    """The gradient of each output in the points agrees with central differences."""
     step = 1e-6
     with double_precision():
         spec = spec_of(shared=shared, bias=True, position_gradient=True)
         field = lively(spec, indirect_outputs=6, dtype=jnp.float64)
         box = jax.tree.map(lambda x: x.astype(jnp.float64), BOX)
-        # Fractions in the middle of the finest cells; coarser resolutions divide eight.
+        # Points keep off the borders of the finest cells, and of coarser ones, whose resolutions
+        # divide 8.
         rng = np.random.default_rng(0)
         unit = (rng.integers(0, 8, (20, 3)) + rng.uniform(0.2, 0.8, (20, 3))) / 8
         points = box.center[None, :] + 1.5 * jnp.asarray(2 * unit - 1)
@@ -179,10 +180,10 @@ def test_attributes_pull_on_the_points_where_that_is_chosen_and_the_shift_never_
             change = float(ahead[name] - behind[name]) / (2 * step)
             assert abs(derivative) > 1e-3
             np.testing.assert_allclose(derivative, change, rtol=DIFFERENCES)
-        # It does vary in space.
+        # The shift does vary in space.
         assert abs(float(ahead["shift"] - behind["shift"])) > 0.1 * step * float(ahead["shift"])
         np.testing.assert_array_equal(pulls["shift"], 0.0)
-        # Where it is not chosen nothing pulls, and the values are the same.
+        # Without the position gradient nothing pulls on the points, and the values are the same.
         off = replace(spec, position_gradient=False)
         same, pulls = values_and_gradients(points, off)
         ahead, _ = values_and_gradients(points, spec)
@@ -207,7 +208,7 @@ def test_smoothness_is_zero_for_a_constant_field_and_positive_otherwise():
 
 
 def test_smoothness_is_the_mean_of_the_absolute_changes_of_each_attribute():
-    """Over the points of the mask; a change of albedo is the sum over its channels."""
+    """The mean is over the points in the mask; the change of the albedo is summed over channels."""
     spec = spec_of()
     field, points, key = lively(spec), points_in_the_box(), jax.random.key(2)
     moved = points + 0.05 * BOX.half_extent * jax.random.normal(key, points.shape)
@@ -222,7 +223,7 @@ def test_smoothness_is_the_mean_of_the_absolute_changes_of_each_attribute():
 
 @pytest.mark.parametrize("power", [0.5, 1.0])
 def test_relative_smoothness_does_not_reward_a_darker_albedo(monkeypatch, power):
-    """Half the albedo changes half as much, which against its mean is as much."""
+    """Half the albedo changes by half as much, which is the same change relative to its mean."""
     spec = spec_of()
     field, points, key = lively(spec), points_in_the_box(), jax.random.key(2)
     mask = jnp.arange(60) < 40

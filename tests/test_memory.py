@@ -1,4 +1,4 @@
-"""What cannot fit into the memory is refused before it is spent, with the setting that asks."""
+"""Needs that exceed the memory are refused beforehand, with the setting that causes them."""
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +33,7 @@ GIGA = 10**9
 
 @pytest.fixture
 def machine(monkeypatch):
-    """Set the memory of the machine, GB."""
+    """Return a function that sets the memory of the machine, in GB."""
 
     def set_to(gigabytes):
         count = None if gigabytes is None else int(gigabytes * GIGA)
@@ -103,7 +103,7 @@ def test_settings_that_cannot_fit_are_refused_by_their_names(machine, overrides,
 
 
 def test_a_program_that_does_not_fit_is_refused_once_it_is_compiled(machine):
-    """A table of all products of a thousand numbers: four megabytes between two small arrays."""
+    """The program has a small input and output, and an outer product of four megabytes between."""
 
     @jax.jit
     def program(x):
@@ -123,7 +123,7 @@ def test_a_program_that_does_not_fit_is_refused_once_it_is_compiled(machine):
 
 
 class Accelerator:
-    """Tells of its memory as JAX's devices do."""
+    """Reports its memory as JAX's devices do."""
 
     def __init__(self, limit, peak):
         self.stats = {"bytes_limit": limit, "peak_bytes_in_use": peak}
@@ -133,7 +133,10 @@ class Accelerator:
 
 
 def test_an_accelerator_has_memory_of_its_own(machine, monkeypatch):
-    """Programs have to fit into that, each into one of several; the machine's says nothing."""
+    """Programs have to fit into the memory of an accelerator, whatever memory the machine has.
+
+    Several accelerators hold one copy each.
+    """
     program = jax.jit(lambda x: jnp.sum(jnp.sort(jnp.outer(x, x), axis=0)))
     compiled = program.trace(jax.ShapeDtypeStruct((1000,), jnp.float32)).lower().compile()
     there = [Accelerator(8 * GIGA, 3 * GIGA), Accelerator(4_500_000, 2**20)]
@@ -147,7 +150,7 @@ def test_an_accelerator_has_memory_of_its_own(machine, monkeypatch):
     with pytest.raises(TrainingError, match="there are 0.0 GB: the program program 0.0 GB"):
         require_program_memory("program", compiled)
     there[:] = [there[1]]
-    there[0].stats = None  # as of devices that do not tell
+    there[0].stats = None  # some devices report no memory
     require_program_memory("program", compiled)
     assert peak_memory_mb() == 0
 
@@ -187,7 +190,8 @@ def test_what_is_counted_is_what_a_training_makes():
     surface, shape = config.geometry.start(dataset, jax.random.key(0))
     params = initial_params(shape, config, jax.random.key(0))
     state = initial_state(params)
-    # Beside the parameters and both moments stands a gradient; exposure and counters are scalars.
+    # The memory holds the parameters, both moments of Adam and a gradient. Exposure and counters
+    # are scalars, which the tolerance covers.
     learned = byte_count((state.params, state.optimizer)) + byte_count(params)
     operators = 2 * operator_bytes(config.light)
     parts = ("geometry", "light", "material.grid", "material.*_hidden")

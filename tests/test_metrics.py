@@ -15,7 +15,7 @@ SSIM_TOLERANCE = 2e-6
 # float64 against float64: rounding only.
 EXACT = 1e-12
 
-# Compiled once a shape: the many small operations cost seconds when dispatched one by one.
+# Compiled once per shape: dispatched one by one, the many small operations cost seconds.
 ssim = jax.jit(metrics.ssim, static_argnames="data_range")
 ssim_masked = jax.jit(metrics.ssim_masked)
 normal_mae_deg = jax.jit(metrics.normal_mae_deg, static_argnames="full")

@@ -1,4 +1,4 @@
-"""The choice of a model: what is kept, what is trained for it, and how it goes on after a stop."""
+"""The choice of a model: kept parts, the trainings it needs, and resuming after a stop."""
 
 import json
 from dataclasses import replace
@@ -36,10 +36,11 @@ _BLOCKED_SHARE = model_choice._Trials.blocked_share
 
 
 class _Trainings:
-    """Stands for training and rendering: views are as good as the parts of a model make them.
+    """Stand-in for training and rendering: the quality of views follows from a model's parts.
 
-    ``gains`` : decibels by part. ``made`` : names of the trainings, in order. ``fails`` : parts
-    whose trainings fail. ``stops_at`` : the training that is interrupted.
+    ``gains`` : decibels that each part adds. ``made`` : names of the trainings, in order.
+    ``fails`` : parts whose trainings fail. ``stops_at`` : number of the training that is
+    interrupted.
     """
 
     def __init__(self, monkeypatch, gains):
@@ -96,7 +97,7 @@ def test_parts_are_kept_for_what_they_gain(dataset, trainings, tmp_path):
 
 
 def test_a_part_brings_along_what_it_needs(dataset, trainings, tmp_path):
-    """One roughness explains nothing where metal is polished in places; the field does."""
+    """On metal that is polished in places, one roughness gains nothing, but a field of it does."""
     trainings.gains, trainings.blocked = {"roughness": 1.0, "indirect": 0.3}, 0.1
     chosen = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
     assert names_of(chosen) == ["roughness", "shadows", "indirect"]
@@ -111,7 +112,7 @@ def test_a_part_brings_along_what_it_needs(dataset, trainings, tmp_path):
 def test_the_surface_decides_whether_there_are_shadows(
     share, is_kept, dataset, trainings, tmp_path
 ):
-    """Photographs under one light cannot tell: here they would say the opposite."""
+    """Photographs under one light cannot decide this: here they would favour the opposite."""
     trainings.gains = {"specular": 2.0, "shadows": -5.0 if is_kept else 5.0}
     trainings.blocked = share
     chosen = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
@@ -124,7 +125,7 @@ def test_the_surface_decides_whether_there_are_shadows(
 def test_what_the_surface_blocks_is_noted_with_the_other_figures(
     dataset, trainings, tmp_path, monkeypatch
 ):
-    """The first stage is gone when the choice is repeated."""
+    """The choice must be repeatable without the first stage, whose folder is gone by then."""
     looked = []
 
     def surface_of(folder):
@@ -154,7 +155,7 @@ def test_shadows_whose_training_fails_are_left_out(dataset, trainings, tmp_path)
 def test_other_seeds_are_trained_for_gains_alone(dataset, trainings, tmp_path):
     choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
     second = [name for name in trainings.made if name.endswith("seed_1")]
-    # The models that metallic, specular and light were better than.
+    # A second seed is trained only for the models that specular, metallic and light improved on.
     assert second == ["smallest_seed_1", "specular_seed_1", "specular_metallic_seed_1"]
     assert len(set(trainings.made)) == len(trainings.made)
     assert trainings.configs["smallest_seed_1"].run.seed == 1
@@ -179,13 +180,13 @@ def test_trials_are_short_and_see_no_view_that_is_held_back(dataset, trainings, 
         (stage,) = trial.active_stages
         assert stage.steps == 60
         assert stage.batch_views == 2
-        # Schedules end as they would have ended.
+        # The shortened schedules end with the same values as the full ones.
         full = config.stage(stage.name)
         assert stage.progress(60) == pytest.approx(1.0)
         assert stage.rates_at(60)["light"] == pytest.approx(full.rates_at(full.steps)["light"])
         is_first = name.startswith("first_stage")
         assert stage.name == ("split_sum" if is_first else "monte_carlo")
-    # Shapes are of another size with finer cells, and need a first stage of their own.
+    # With finer cells the shape has another size, so it needs a first stage of its own.
     first = [name for name in trainings.made if name.startswith("first_stage")]
     assert first == ["first_stage", "first_stage_cells"]
     assert trainings.configs["first_stage"].geometry.resolution == 32
@@ -204,7 +205,7 @@ def test_a_choice_that_was_stopped_goes_on_and_ends_alike(dataset, trainings, tm
     assert trainings.made == expected
     assert again.config == whole.config
     assert replace(again, seconds=0.0) == replace(whole, seconds=0.0)
-    # What remains are the figures, from which it can be repeated at no cost.
+    # Only the figures remain, from which the choice can be repeated without training.
     left = {path.name for path in choice_folder(tmp_path / "run").iterdir()}
     assert left == {".lock", "choice.json"}
     choose_model(dataset, config, tmp_path / "run", begin=Resume())
@@ -280,7 +281,7 @@ def test_a_part_whose_training_fails_is_left_out_and_says_so(dataset, trainings,
     (rung,) = (rung for rung in chosen.record()["rungs"] if rung["part"] == "metallic")
     assert rung["note"] == "the surface has exploded"
     assert rung_row(rung)[-1] == "left out: the surface has exploded"
-    # It is not tried again.
+    # The part that failed is not tried again.
     before = len(trainings.made)
     again = choose_model(dataset, make_config(quality="draft"), tmp_path / "run", begin=Resume())
     assert len(trainings.made) == before
@@ -327,7 +328,7 @@ def test_some_views_are_those_views_reduced(dataset):
     found = some_views(counted, [3, 7], factor=2)
     assert found.names == ("view_3", "view_7")
     assert found.images.shape == (2, 4, 4, 4)
-    # A pixel counts where all of its parts do.
+    # A reduced pixel is valid where all pixels that it covers are.
     np.testing.assert_array_equal(found.valid[:, 0], [[1, 1, 0, 0]] * 2)
     np.testing.assert_array_equal(found.images[:, :, 2:], 0.0)
     np.testing.assert_allclose(found.intrinsics[:, :2], 0.5 * views.intrinsics[[3, 7], :2])
@@ -343,7 +344,7 @@ def test_the_command_refuses_what_does_not_go_together(options, tmp_path, capsys
 
 
 class _StoppedAt(Listener):
-    """Interrupts after so many steps of any trainings."""
+    """Interrupts after a number of steps, counted over all trainings."""
 
     def __init__(self, steps):
         self._left = steps
@@ -358,7 +359,7 @@ class _StoppedAt(Listener):
 @pytest.mark.long
 @pytest.mark.computes
 def test_a_model_is_chosen_recorded_and_trained_on_all_views(tmp_path, capsys):
-    """Only one part is left to choose; the run of few steps is stopped while it chooses."""
+    """Only one part is left to choose; the first attempt is interrupted during the choice."""
     duck = Path(__file__).resolve().parents[1] / "examples" / "duck"
     settings = (*TINY, "material.specular=uniform", "material.has_metallic=false")
     flags = [word for override in settings for word in ("--set", override)]
@@ -380,11 +381,11 @@ def test_a_model_is_chosen_recorded_and_trained_on_all_views(tmp_path, capsys):
     assert (run.params.material.shift_head is not None) == run.config.material.has_shift
     assert len(run.dataset.train) == 40
     assert load_trained(output).step == config.total_steps
-    # What is done is not done again; the model is the run's own.
+    # A finished choice is not repeated: the run keeps its model.
     measured = (choice_folder(output) / "choice.json").stat().st_mtime_ns
     assert cli.main(["train", str(duck), "--output", str(output), "--resume"]) == 0
     assert (choice_folder(output) / "choice.json").stat().st_mtime_ns == measured
-    # Its own, also where the settings are named that it was chosen from.
+    # The run also keeps its model when the settings that it was chosen from are given again.
     for named in (None, config):
         again = gs.train(duck, output, named, begin=gs.Resume(), model="auto", downscale=8)
         assert again.config == run.config

@@ -1,4 +1,4 @@
-"""Parts of a model: each can be left out, alone and with others, and what is left is sound."""
+"""Parts of a model: each can be left out, alone or with others, and a valid model remains."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ NAMES = [part.name for part in LADDER]
 
 
 def changed_by(name, config):
-    """Paths of the settings that the part's absence changes."""
+    """Paths of the settings that change when the part is left out."""
     part = LADDER[NAMES.index(name)]
     return {line.partition(":")[0] for line in differences(config, part.removed(config))}
 
@@ -34,7 +34,7 @@ def test_every_smaller_model_has_settings_that_can_be_written_and_trained(preset
         assert config_from_dict(smaller.to_dict()) == smaller
         found = {part.name for part in offered_parts(smaller)}
         left = {part.name for part in offered[:count]}
-        # What is chosen by size can be reduced again.
+        # Parts that are chosen by size can be reduced once more.
         assert left <= found <= left | {"hash", "light", "cells"}
         assert config_warnings(smaller) == config_warnings(config)
 
@@ -49,7 +49,7 @@ def test_the_default_model_has_all_parts_and_the_smallest_none():
     assert smallest.geometry.resolution == 32
     assert material.grid == make_config(quality="draft").material.grid
     assert {type(stage.transport) for stage in smallest.stages} == {SplitSumSettings}
-    # The parts that are chosen by size can be halved again; the others are out for good.
+    # Parts that are chosen by size can be halved once more; the others cannot be left out again.
     assert {part.name for part in offered_parts(smallest)} <= {"hash", "light", "cells"}
 
 
@@ -69,7 +69,7 @@ def test_what_needs_another_part_is_taken_out_with_its_own_settings_only():
     ("paths", "missing"),
     [
         (["material.specular"], {"specular", "roughness"}),
-        (["material.has_metallic"], {"metallic", "specular"}),  # with what it needs
+        (["material.has_metallic"], {"metallic", "specular"}),  # with the part that it needs
         (["stages.monte_carlo.transport.occlusion"], {"shadows"}),
         (["stages.monte_carlo.transport.indirect"], {"indirect", "shadows"}),
         (["material.grid.levels", "light.width"], {"hash", "light"}),
@@ -97,7 +97,7 @@ def test_parts_that_settings_lack_or_never_use_are_not_offered(overrides, missin
 
 
 def test_what_is_left_out_has_no_parameters():
-    """Every part adds some, but for shadows and indirect light, which are no parameters here."""
+    """Every part adds parameters, except shadows and indirect light, and cells of a given shape."""
     config = tiny_config("light.height=16", "light.width=32", "material.grid.finest=64")
     shape = {"sdf": jax.numpy.zeros(3)}
 

@@ -28,7 +28,7 @@ POINTS = 12
 
 
 def shade(key, points, materials, wo, light, index, indirect=NO_INDIRECT, *, counts):
-    """Estimate what each point sends to a viewer of its own; both lobes flip their normals."""
+    """Estimate the radiance from each point to its viewer; normals are flipped towards viewers."""
     cosine = jnp.sum(points.normals * wo, axis=-1, keepdims=True)
     points = replace(points, normals=jnp.where(cosine < 0, -points.normals, points.normals))
     sampler = light_sampler(light)
@@ -108,7 +108,7 @@ COUNTS = {
 
 @pytest.fixture(scope="module")
 def integral():
-    """Return what `quadrature` finds for `scene`."""
+    """Return the result of `quadrature` for `scene`."""
     return np.asarray(quadrature(*scene(), rows=240), np.float64)
 
 
@@ -131,7 +131,7 @@ def many_estimates(number, *arguments, counts):
 def test_the_estimate_is_the_integral(name, integral):
     points, materials, wo, light = scene()
     found = shade_jitted(jax.random.key(0), points, materials, wo, light, None, counts=COUNTS[name])
-    # Two thousand samples a point.
+    # There are two thousand samples per point.
     assert relative(found.rgb, integral) < (0.006 if name == "both" else 0.03)
     np.testing.assert_allclose(found.rgb, found.diffuse + found.specular, rtol=1e-6)
 
@@ -151,7 +151,7 @@ def test_the_estimate_has_no_bias_at_one_sample_of_each_kind(integral, single_sa
 
 
 def test_the_error_falls_with_the_samples(integral, single_samples):
-    """At least as the inverse root of their number; stratification may do better."""
+    """It falls at least with the inverse root of their number; stratification may do better."""
     sixteen = many_estimates(64, *scene(), counts=SampleCounts(16, 16, 16))
     few, many = (np.sqrt(np.mean((x - integral) ** 2)) for x in (single_samples, sixteen))
     assert many < 0.27 * few  # a quarter of the error
@@ -160,7 +160,7 @@ def test_the_error_falls_with_the_samples(integral, single_samples):
 @pytest.mark.slow
 @pytest.mark.long
 def test_combining_is_never_much_worse_than_the_better_technique():
-    """A glossy metal under a broad light, and a diffuse point under a sun."""
+    """The cases are a glossy metal under a broad light, and a diffuse point under a sun."""
     points, materials, wo, light = scene()
     sun = EnvLight(jnp.full((8, 16, 3), 0.01).at[2, 5].set(50.0))
     glossy = replace(materials, roughness=jnp.full((POINTS,), 0.15), metallic=jnp.ones((POINTS,)))
@@ -174,7 +174,8 @@ def test_combining_is_never_much_worse_than_the_better_technique():
 
         both = error(SampleCounts(8, 8, 8))
         alone = [error(SampleCounts(16, 0, 0)), error(SampleCounts(0, 16, 16))]
-        # Half of the samples each, of points whose error falls faster than their inverse root.
+        # Combined, each technique has half of the samples, and the error of stratified samples
+        # falls faster than the inverse root of their number.
         assert both < 8 * min(alone)
         assert both < 0.2 * max(alone)
 
@@ -196,7 +197,7 @@ def test_a_white_furnace():
 
 
 def test_normals_that_face_away_are_flipped_to_the_viewer():
-    """By `reflect`, for the specular lobe."""
+    """`reflect` flips them for the specular lobe."""
     points, materials, wo, light = scene()
     sampler, counts = light_sampler(light), SampleCounts(2, 2, 2)
 
@@ -232,14 +233,15 @@ def ball_index():
 
 
 def test_a_ball_overhead_takes_its_solid_angle_of_the_light(ball_index):
-    """Under constant light, irradiance / pi is one less sin^2 of the ball's half angle."""
+    """Under constant light, irradiance / pi is 1 - sin^2 of the ball's half angle."""
     points, materials, _, _ = scene()
     distance = np.linspace(0.9, 2.0, POINTS)
     up = jnp.broadcast_to(jnp.asarray([0.0, 0.0, 1.0]), (POINTS, 3))
     below = jnp.asarray(-distance[:, None], jnp.float32) * up
     points = replace(points, positions=below, normals=up, outward=up)
     key, arguments = jax.random.key(0), (points, materials, up, EnvLight(jnp.ones((8, 16, 3))))
-    # What is blocked shines with the indirect light: sigmoid(30 - 3) is 1, sigmoid(-30 - 3) is 0.
+    # Blocked directions have the radiance of the indirect light: sigmoid(30 - 3) is 1, and
+    # sigmoid(-30 - 3) is 0.
     shadowed, filled = (
         shade_jitted(
             key,
@@ -264,7 +266,7 @@ def repeated(tree, times):
 
 
 def test_without_occlusion_rays_that_are_there_for_others_block_nothing(ball_index):
-    """A shading domain may have asked for them, to find the mesh."""
+    """There may be rays only because a shading domain finds the mesh with them."""
     count = 50
     up = jnp.tile(jnp.asarray([[0.0, 0, 1]]), (count, 1))
     nowhere = jnp.full((count,), -1, jnp.int32)
@@ -287,14 +289,14 @@ def test_without_occlusion_rays_that_are_there_for_others_block_nothing(ball_ind
 
 
 def test_chunks_and_masks_change_nothing_for_the_others(ball_index, monkeypatch):
-    """Points in chunks have the values of all at once; masked ones are black."""
+    """Points in chunks have the same values as all points at once; masked points are black."""
     points, materials, wo, light = scene()
     points, materials, wo = repeated((points, materials, wo), 50)  # 600 points
     points = replace(points, positions=-0.9 * points.outward)  # below the ball
     number, counts = jnp.arange(600), SampleCounts(2, 2, 2)
 
     def shaded(mask):
-        """Shade with the shadows of the diffuse light alone: rays take long to compile."""
+        """Shade with shadows in the diffuse light only, since rays take long to compile."""
         chosen, sampler = replace(points, mask=mask), light_sampler(light)
         first, second = jax.random.split(jax.random.key(0))
         samples = draw_samples(first, chosen, sampler, ball_index, counts=counts)
@@ -303,7 +305,8 @@ def test_chunks_and_masks_change_nothing_for_the_others(ball_index, monkeypatch)
 
     whole = jax.jit(lambda mask: shaded(mask))(jnp.ones(600, bool))
     monkeypatch.setattr(sampling, "_RAYS_AT_ONCE", 0)
-    # Chunks of 256: every second point of the first, none of the second, all of the third.
+    # Chunks have 256 points. The mask has every second point of the first chunk, none of the
+    # second, and all of the third.
     mask = jnp.where(number < 256, number % 2 == 0, number >= 512)
     in_chunks = jax.jit(lambda mask: shaded(mask))
     parts, masked = in_chunks(jnp.ones(600, bool)), in_chunks(mask)

@@ -1,4 +1,4 @@
-"""Films hold their frames, rate and colours; what cannot be written leaves the old file."""
+"""Films have the right frames, rate and colours; a failed write leaves the old file in place."""
 
 import json
 import os
@@ -43,7 +43,7 @@ def read_gif(path):
 
 
 def blurred(frames):
-    """Means over blocks of four by four pixels, which is what dithering keeps."""
+    """Means over blocks of four by four pixels, which dithering preserves."""
     count, height, width, _ = frames.shape
     return frames.reshape(count, height // 4, 4, width // 4, 4, 3).mean((2, 4))
 
@@ -85,7 +85,7 @@ def test_gif_colours_that_fit_a_palette_are_exact_and_still_in_all_frames(tmp_pa
 
 
 def test_frames_may_be_made_when_they_are_asked_for(tmp_path):
-    """Floats of one frame exist at a time, however long the film is."""
+    """Only one frame exists as floats at a time, however long the film is."""
     frames, alive = ramp_frames(5), []
 
     def made():
@@ -172,9 +172,9 @@ def test_unusable_rates_are_refused(tmp_path, name, rate):
 
 
 def install_fake(folder, monkeypatch, body, *, encoder="libx264"):
-    """Put a program named ffmpeg on the PATH, alone; ``body`` sees arguments and input.
+    """Make a fake ffmpeg the only program on the PATH; ``body`` is its code.
 
-    ``encoder`` : that it says it has.
+    ``encoder`` : name of the encoder that it lists.
     """
     folder.mkdir()
     program = folder / "ffmpeg"
@@ -212,7 +212,7 @@ def test_encoder_receives_even_frames_and_h264_settings(tmp_path, monkeypatch):
     assert following["-s"] == "8x6"
     assert following["-framerate"] == "24"
     assert following["-c:v"] == "libx264"
-    # Input and output each name their layout; the dictionary keeps the output's.
+    # The pixel formats of input and output are both given; the dictionary holds the output's.
     assert following["-pix_fmt"] == "yuv420p"
     assert arguments.index("rgb24") < arguments.index("-i") < arguments.index("yuv420p")
     assert sorted(os.listdir(tmp_path)) == ["bin", "film.mp4"]
@@ -223,7 +223,7 @@ def test_encoder_receives_even_frames_and_h264_settings(tmp_path, monkeypatch):
     "body",
     [
         "sys.stdin.buffer.read()\nprint('Unknown encoder libx264', file=sys.stderr)\nsys.exit(3)",
-        # Stops before it has read anything: writing to it fails.
+        # This one stops before it has read anything, so writing to it fails.
         "print('Unknown encoder libx264', file=sys.stderr)\nsys.exit(3)",
     ],
 )
@@ -231,7 +231,7 @@ def test_failure_of_the_encoder_is_told_and_the_old_film_stays(tmp_path, monkeyp
     install_fake(tmp_path / "bin", monkeypatch, body)
     path = tmp_path / "film.mp4"
     path.write_bytes(b"old")
-    # Larger than any pipe holds.
+    # These frames are larger than the buffer of any pipe.
     frames = [np.zeros((300, 400, 3), np.float32)] * 2
     with pytest.raises(OSError, match=r"status 3 \(Unknown encoder libx264\).*\.gif"):
         write_movie(path, frames, frames_per_second=24)

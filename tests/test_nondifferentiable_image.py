@@ -1,6 +1,7 @@
 """Points without a derivative: projection, rasteriser, visibility, colour.
 
-What the code returns there, and one-sided differences on both sides; listed in `docs/gradients.md`.
+The gradient that the code returns at these points is compared with one-sided differences on both
+sides. The points are listed in `docs/gradients.md`.
 """
 
 from dataclasses import replace
@@ -84,7 +85,8 @@ def test_the_near_plane_ends_a_splat_and_its_gradient():
         for d in (0.5 - 1e-9, 0.5, 0.5 + 1e-9)
     ]
     assert in_front == [False, False, True]
-    # In front the true slope; on the plane and behind it depth 1, without slope.
+    # In front of the plane the slope is the true one. On the plane and behind it, the depth is 1
+    # and has no slope.
     assert float(mean(0.5 + 1e-9)) == pytest.approx(8 + 20 * 0.1 / 0.5)
     assert float(mean(0.5)) == pytest.approx(8 + 20 * 0.1)
     assert float(jax.grad(mean)(0.5 + 1e-9)) == pytest.approx(-20 * 0.1 / 0.25)
@@ -93,7 +95,7 @@ def test_the_near_plane_ends_a_splat_and_its_gradient():
 
 def test_the_clamp_of_the_field_of_view_is_continuous_with_the_mean_of_both_slopes():
     def variance(x):
-        # Along y the clamped slope of x does not enter; along x it does.
+        # Clamping the slope in x changes the variance along x, but not the one along y.
         return _projected(x, jnp.asarray(2.0), _quat()).covariances2d[0, 0]
 
     edge = 1.3 * 8.0 / 20.0 * 2.0
@@ -102,7 +104,7 @@ def test_the_clamp_of_the_field_of_view_is_continuous_with_the_mean_of_both_slop
     assert left > 1e-2
     assert right == pytest.approx(0, abs=1e-6)
     returned = float(jax.grad(variance)(edge))
-    # Rounding of x / z decides the side, or the clamp passes half.
+    # Rounding of x / z decides on which side it is; exactly on the edge the clamp passes half.
     assert min(abs(returned - c * left) for c in (0.0, 0.5, 1.0)) < 1e-5
     # The mean itself is not clamped.
     assert_smooth_at(lambda x: _projected(x, jnp.asarray(2.0), _quat()).means2d[0, 0], [edge])
@@ -128,7 +130,10 @@ SMALL = Capacities(visible=128, hits=128, chunks=128)
 @jax.jit
 @partial(jax.value_and_grad, argnums=(0, 1, 2))
 def _composited(opacities, depths, width, chosen):
-    """Two splats on pixel (1, 1) of 4 x 4; ``chosen`` weighs its colour and alpha at (1, 3)."""
+    """Weighted sum of the colour of pixel (1, 1) and the alpha of pixel (1, 3), of 4 x 4 pixels.
+
+    Two splats lie on pixel (1, 1); ``chosen`` holds both weights.
+    """
     ones = jnp.broadcast_to(jnp.array([1.0, 0.0, 1.0]), (2, 3))
     footprints = Footprints(
         means2d=jnp.full((2, 2), 1.5),
@@ -181,7 +186,7 @@ def test_below_the_alpha_threshold_a_pixel_and_its_gradient_are_zero():
     assert above == pytest.approx(MIN_ALPHA)
     assert slope == pytest.approx(1.0)
     assert below == none == 0
-    # On the threshold rounding of exp(log) decides which of the two it is.
+    # Exactly on the threshold, rounding of exp(log) decides between the two.
     on, slope_on = alone(MIN_ALPHA)
     assert (on, slope_on) == (0.0, 0.0) or (on, slope_on) == pytest.approx((MIN_ALPHA, 1.0))
     assert alone(0.0) == alone(1e-4) == (0.0, 0.0)
@@ -207,7 +212,7 @@ def test_the_alpha_clamp_is_continuous_and_passes_nothing_above():
     below, above = (alone(MAX_ALPHA * (1 + s)) for s in (-1e-9, 1e-9))
     assert below == pytest.approx((MAX_ALPHA, 1.0), abs=1e-8)
     assert above == (MAX_ALPHA, 0.0)
-    # On the clamp rounding of exp(log) decides between both slopes.
+    # Exactly on the clamp, rounding of exp(log) decides between the two slopes.
     on, slope = alone(MAX_ALPHA)
     assert on == pytest.approx(MAX_ALPHA, abs=1e-12)
     assert min(slope, abs(slope - 1)) < 1e-9
@@ -266,14 +271,14 @@ RIGHT_ANGLE = np.pi / 2
 
 
 def test_culling_a_flat_splat_at_right_angles_changes_nothing_that_was_seen():
-    """Seen edge-on, a splat without thickness has faded below the threshold before it turns."""
+    """A splat without thickness fades below the threshold before it is seen exactly edge-on."""
 
     def flat(tilt):
         return _card()(jnp.asarray(1e-9), jnp.asarray(tilt), jnp.asarray(0.0))[0]
 
     assert float(flat(0.0)) > 5
     assert float(flat(RIGHT_ANGLE - 0.2)) > 0.5
-    # Fading is continuous down to one threshold a pixel.
+    # Coverage falls continuously, except for a last step of one alpha threshold per pixel.
     tilts = RIGHT_ANGLE - np.logspace(-1, -6, 60)
     seen = np.array([float(flat(t)) for t in tilts])
     assert seen[-1] == 0
@@ -288,7 +293,7 @@ def test_culling_a_thick_splat_jumps_and_its_normal_has_no_gradient():
     front, back = (float(thick(RIGHT_ANGLE + t)[0]) for t in (-1e-6, 1e-6))
     assert front > 5
     assert back == 0
-    # The direction that decides it carries no gradient.
+    # The normal that decides about culling carries no gradient.
     for extra in (-0.1, 0.0, 0.1):
         assert thick(RIGHT_ANGLE - 0.5, extra)[1] == 0
     # Exactly edge-on counts as turned away.
@@ -325,7 +330,7 @@ def test_the_knee_of_srgb_is_continuous_and_its_slopes_differ_by_two_percent():
 
 
 def test_the_floor_of_variances_is_no_kink_of_the_similarity():
-    """A flat image stands on the floor, where the variance has no slope of its own."""
+    """The variance of a flat image is at the floor, where its own slope is zero as well."""
     rng = np.random.default_rng(0)
     towards = jnp.asarray(rng.standard_normal((12, 12, 3)))
     flat = jnp.full((12, 12, 3), 0.4)
@@ -375,7 +380,7 @@ def test_attributes_pull_on_the_geometry_only_when_asked(position_gradient, whic
 
 
 def test_lists_carry_no_gradient_from_any_of_their_inputs():
-    """Lists are integers; what is gathered through them still has the gradient of its values."""
+    """Lists are integers; values that are gathered through them still have their gradient."""
 
     def through(scale):
         footprints = Footprints(
@@ -404,7 +409,7 @@ def test_lists_carry_no_gradient_from_any_of_their_inputs():
 
 
 def test_random_picks_move_with_the_count_and_carry_no_gradient():
-    """Directions drawn for the light's lobe, and points where smoothness is measured."""
+    """The picks are sampled directions of a lobe, and points where smoothness is measured."""
     uniforms = jnp.array([[0.3, 0.4, 0.6]])
 
     def drawn(cosine):

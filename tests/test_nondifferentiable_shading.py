@@ -1,6 +1,7 @@
 """Points without a derivative: reflectance and light.
 
-What the code returns there, and one-sided differences on both sides; listed in `docs/gradients.md`.
+The gradient that the code returns at these points is compared with one-sided differences on both
+sides. The points are listed in `docs/gradients.md`.
 """
 
 import jax
@@ -65,7 +66,7 @@ def test_reflectance_jumps_at_the_horizon_and_reflected_light_does_not(which):
 
     below, on, above = (float(reflectance(c)) for c in (-1e-9, 0.0, 1e-9))
     assert below == on == 0
-    # What is above is the full value: the diffuse base alone is albedo (1 - metallic) / pi.
+    # Just above, the value is the full one: its diffuse base alone is albedo (1 - metallic) / pi.
     assert above > 0.6 * 0.7 / np.pi
     assert jax.grad(reflectance)(0.0) == jax.grad(reflectance)(-1e-3) == 0
     for cosine in (1e-5, 1e-2):
@@ -77,21 +78,21 @@ def test_reflectance_jumps_at_the_horizon_and_reflected_light_does_not(which):
 
 
 def test_the_clamp_of_the_cosine_is_continuous_with_the_mean_of_both_slopes():
-    # Above the surface at the height of the clamp, which bounds masking alone.
+    # This direction is above the surface, at the clamp, which only limits masking.
     edge = COSINE_EPSILON
     normals = up()
     cosines = jnp.array([0.3])
 
     @jax.jit
     def visibility(cosine):
-        # Of the lobe, masking is what is left once its distribution is divided out.
+        # Dividing the lobe by its distribution leaves the masking.
         arguments = (normals, direction_at(cosine), direction_at(cosines[0]))
         lobe = bsdf.specular_lobe(*(tuple(x.T) for x in arguments), jnp.array([0.16]))
         half = safe_normalize(arguments[1] + arguments[2])
         return (lobe.strength / bsdf.ggx_distribution(half, normals, jnp.array([0.16])))[0]
 
     left, right = (one_sided(visibility, jnp.asarray(edge), s) for s in (-1e-9, 1e-9))
-    assert left == pytest.approx(0, abs=1e-4)  # but for the rounding of the quotient
+    assert left == pytest.approx(0, abs=1e-4)  # up to the rounding of the quotient
     assert right < -0.1
     mean = float(jax.grad(visibility)(edge))
     assert mean == pytest.approx(0.5 * right, rel=1e-4)
@@ -124,7 +125,7 @@ def test_the_flip_of_a_normal_jumps_in_the_diffuse_part_only():
     np.testing.assert_allclose(on.specular, above.specular, atol=1e-7)
     np.testing.assert_allclose(on.specular, below.specular, atol=1e-7)
     np.testing.assert_allclose(on.diffuse, above.diffuse, atol=1e-7)
-    # The light from behind instead of that from the front.
+    # Below, the diffuse part has the light from behind instead of that from the front.
     normal = np.asarray(normal_at(jnp.asarray(0.0)))
     front, back = (np.asarray(lookup(light.diffuse, jnp.asarray(s * normal))) for s in (1.0, -1.0))
     jump = 0.6 * 0.7 * (front - back)
@@ -157,7 +158,8 @@ def test_levels_of_roughness_are_kinks_and_their_ends_are_flat():
     inner = [float(jax.grad(read_at)(r)) for r in (0.15, 0.45, 0.8)]
     for edge, width, left, right in ((0.3, 0.3, *inner[:2]), (0.6, 0.3, *inner[1:])):
         upper = 0.3 if edge == 0.3 else 0.4
-        # On the border: the values of the upper interval, at the mean rate of the level index.
+        # On the border the values are those of the upper interval, and the rate of the level index
+        # is the mean of both sides.
         expected = right * upper * 0.5 * (1 / width + 1 / upper)
         assert_kink(read_at, edge, left=left, right=right, returned=expected, tolerance=1e-5)
     assert_kink(read_at, 0.0, left=0.0, right=inner[0], returned="mean")
@@ -209,7 +211,7 @@ def test_beyond_the_first_and_last_row_the_light_is_flat_in_elevation():
     assert abs(inner) > 1e-2
     assert one_sided(read, jnp.asarray(row), -STEP) == pytest.approx(0, abs=1e-6)
     assert jax.grad(read)(row - 1e-3) == pytest.approx(0, abs=1e-9)
-    # On the row itself rounding decides the side, or the clamp passes half.
+    # Exactly on the row, rounding decides on which side it is, or the clamp passes half.
     returned = float(jax.grad(read)(row))
     assert min(abs(returned - c * inner) for c in (0.0, 0.5, 1.0)) < 1e-5
 
@@ -245,7 +247,7 @@ def test_the_floor_of_the_light_is_a_projection_after_the_step_and_no_kink():
         light = EnvLight(radiance.at[2, 3, 1].set(value))
         return 100 * prefilter(light, operators).specular[1, 2, 3, 1]
 
-    # Through the floor, through zero: the loss sees radiance linearly.
+    # The prefiltered light is linear in radiance, also at the floor and below zero.
     assert_smooth_at(jax.jit(level), [-0.01, 0.0, 0.01], step=1e-5)
     spec = MaterialSpec(grid=GRID)
     params = Params(

@@ -1,6 +1,7 @@
 """Points without a derivative: surface, splats, fields and the loss's absolute values.
 
-What the code returns there, and one-sided differences on both sides; listed in `docs/gradients.md`.
+The gradient that the code returns at these points is compared with one-sided differences on both
+sides. The points are listed in `docs/gradients.md`.
 """
 
 from dataclasses import replace
@@ -46,7 +47,7 @@ from geosplat_jax.materials import MaterialSpec, init_materials, smoothness, to_
 from geosplat_jax.splats.projection import project
 
 AT_ZERO_OF_ABS = 0.0
-"""Slope of `numerics.absolute` at 0, between both sides; JAX itself gives that of the right."""
+"""Slope of `numerics.absolute` at 0, between those of both sides; JAX returns that of the right."""
 
 ROOM = Capacities(surface_cubes=256, dual_vertices=256, quads=256)
 
@@ -105,13 +106,13 @@ def test_where_a_vertex_changes_sign_the_surface_jumps_by_less_than_a_cell():
     vertex = int(inside[np.argmax(np.asarray(geometry.sdf)[inside])])
     varied = _Varied(grid, geometry, "sdf", vertex, training=True)
     below, on, above = (varied.surface(v) for v in (-1e-9, 0.0, 1e-9))
-    # Zero counts as outside: on the point the value is that of the outer side.
+    # Zero counts as outside, so at zero the surface is that of the outer side.
     np.testing.assert_array_equal(on.mesh.faces, above.mesh.faces)
     np.testing.assert_allclose(on.mesh.vertices, above.mesh.vertices, atol=1e-8)
     jump = varied.area(0.0) - varied.area(-1e-9)
     assert 1e-4 < abs(jump) < 6 * float(grid.cell_size) ** 2
     assert 0.05 < _largest_gap(below.mesh, on.mesh) / float(grid.cell_size) < 1.0
-    # The gradient knows nothing of the jump: it is the slope of its own side.
+    # The gradient ignores the jump: it is the slope on the side of the point itself.
     for value, side in ((-1e-3, -1), (-1e-3, 1), (1e-3, -1), (1e-3, 1), (0.0, 1)):
         found = one_sided(varied.area, value, side * STEP)
         np.testing.assert_allclose(varied.slope(value), found, rtol=1e-4, atol=1e-6)
@@ -145,7 +146,7 @@ def test_the_choice_of_a_diagonal_jumps_and_has_no_gradient():
     grid, geometry = make_ball()
     cell = int(_Varied(grid, geometry, "sdf", 0, training=False).surface(1.0).vertex_cells[3])
     varied = _Varied(grid, geometry, "gamma", cell, training=False)
-    # All weights start equal: every quad stands on the tie.
+    # All weights start equal, so every quad is at the tie between its diagonals.
     assert not np.any(geometry.gamma)
     less, tie, more = (varied.surface(v).mesh for v in (-1e-9, 0.0, 1e-9))
     np.testing.assert_array_equal(less.vertices, tie.vertices)
@@ -157,7 +158,7 @@ def test_the_choice_of_a_diagonal_jumps_and_has_no_gradient():
     assert varied.slope(0.0) == 0
     for value in (-1e-3, 1e-3):
         assert varied.slope(value) == one_sided(varied.area, value, np.copysign(STEP, value)) == 0
-    # In training the centre blends both diagonals, and gamma has its slope at the tie.
+    # In training, the centre of a quad blends both diagonals, and gamma has its slope at the tie.
     blended = _Varied(grid, geometry, "gamma", cell, training=True)
     for side in (-STEP, STEP):
         found = one_sided(blended.area, 0.0, side)
@@ -173,7 +174,8 @@ def test_deviation_of_equal_lengths_has_a_gradient_between_its_slopes():
         return jnp.sum(_deviations(offsets.at[0, 0, 0].add(change), crosses))
 
     assert deviation(0.0) == 0
-    # Compiled, the mean of three ones is one up to rounding, whose sign each length then follows.
+    # In compiled code the mean of three ones is one up to rounding, and the slope of each length
+    # has the sign of that rounding.
     assert_kink(deviation, 0.0, left=-4 / 3, right=4 / 3, returned="between")
 
 
@@ -184,7 +186,7 @@ def test_raw_weights_start_on_the_kink_of_their_magnitude():
     gradient = jax.grad(weight_magnitude)(geometry)
     for leaf in (gradient.alpha, gradient.beta):
         np.testing.assert_allclose(count * leaf, AT_ZERO_OF_ABS)
-    np.testing.assert_array_equal(gradient.gamma, 0.0)  # it has no part
+    np.testing.assert_array_equal(gradient.gamma, 0.0)  # the magnitude excludes gamma
 
     def magnitude(value):
         moved = replace(geometry, beta=geometry.beta.at[3, 2].set(value))
@@ -203,7 +205,7 @@ def test_entropy_jumps_where_a_vertex_changes_sign_and_is_smooth_beside():
         moved = replace(geometry, sdf=geometry.sdf.at[vertex].set(value))
         return sdf_entropy(moved, grid, reduction="sum")
 
-    # As many terms as crossed edges: the sum jumps with their number.
+    # The sum has one term per crossed edge, so it jumps with their number.
     assert abs(float(entropy(0.0) - entropy(-1e-9))) > 0.1
     assert entropy(0.0) == pytest.approx(float(entropy(1e-9)), abs=1e-8)
     assert_smooth_at(entropy, [-1e-3, 1e-3])
@@ -242,7 +244,7 @@ def test_a_face_without_area_is_the_kink_of_its_area_and_has_no_gradient():
 
 
 def test_a_quaternion_may_change_its_sign_but_its_rotation_and_gradient_go_on():
-    """About x, the formula changes at +-90 degrees; at -90 the sign changes with it."""
+    """About x, the formula changes at +-90 degrees, and at -90 the quaternion changes its sign."""
 
     def axes(angle):
         c, s, zero, one = jnp.cos(angle), jnp.sin(angle), 0 * angle, 0 * angle + 1
@@ -383,7 +385,8 @@ def test_light_equal_to_the_value_of_the_image_stands_on_a_kink():
 
     assert term(0.0) == 0
     assert jax.grad(term)(0.0) == AT_ZERO_OF_ABS
-    # Compiled, the tone map of black is black up to rounding, whose sign the slope then follows.
+    # In compiled code the tone map of black is black up to rounding, and the slope has the sign of
+    # that rounding.
     assert_kink(term, 0.0, left=-1.0, right=1.0, returned="between")
 
 
@@ -395,14 +398,14 @@ def test_smoothness_of_equal_attributes_has_no_gradient_between_its_slopes():
 
     @jax.jit
     def term(change):
-        # A smooth slope of features through the box, so that neighbours differ.
+        # The features form a ramp over the rows of the table, so that neighbours differ.
         ramp = jnp.arange(empty.albedo_table.shape[0]) / empty.albedo_table.shape[0]
         moved = replace(empty, albedo_table=change * jnp.stack([ramp, ramp], axis=-1))
         mask, key, box = jnp.ones((16,), bool), jax.random.key(2), unit_box()
         return sum(smoothness(moved, points, mask, key, box, spec=spec, std=0.1))
 
     assert term(0.0) == 0
-    # Features of zero also stand on the rectifiers' kinks, which pass nothing.
+    # Features of zero are also at the kinks of the rectifiers, which pass no gradient.
     assert jax.grad(term)(0.0) == 0
     left, right = (one_sided(term, jnp.asarray(0.0), s) for s in (-1e-6, 1e-6))
     assert left < -1e-3 < 1e-3 < right
@@ -423,6 +426,6 @@ def test_the_inward_shift_pulls_through_its_share_and_not_through_the_face():
     value, (by_vertices, by_fraction) = moved(mesh.vertices, fraction)
     assert not np.any(by_vertices)
     assert np.any(by_fraction)
-    # It would have one: the value does depend on the area, and on the normal.
+    # The true gradient is not zero, since the value depends on the area and on the normal.
     assert float(moved(1.1 * mesh.vertices, fraction)[0] - value) != 0
     assert float(moved(mesh.vertices[:, ::-1], fraction)[0] - value) != 0

@@ -1,6 +1,7 @@
 """Points without a derivative: light transport, over fixed samples of the light.
 
-What the code returns there, and one-sided differences on both sides; listed in `docs/gradients.md`.
+The gradient that the code returns at these points is compared with one-sided differences on both
+sides. The points are listed in `docs/gradients.md`.
 """
 
 from dataclasses import replace
@@ -28,7 +29,7 @@ def _double():
 
 
 def leaning(tilt):
-    """A direction in the plane of y and z, upright at no tilt."""
+    """A direction in the yz plane; without tilt it is +z."""
     return jnp.stack([0.0 * tilt, jnp.sin(tilt), jnp.cos(tilt)])
 
 
@@ -44,7 +45,7 @@ def point(normal, outward):
 
 
 def samples(*directions):
-    """Open samples of the light, of density .5."""
+    """Unblocked samples of the light, with a density of .5."""
     count = len(directions)
     return Samples(
         directions=jnp.asarray(directions, jnp.float64)[None],
@@ -61,7 +62,7 @@ def sky(radiance=RADIANCE):
 def test_the_edge_of_a_face_jumps_and_carries_no_gradient():
     """The face tilts until it hides a direction that the shading normal still sees."""
     drawn = samples([0.0, 0.8, -0.6], [0.0, 0.0, 1.0])
-    edge = float(np.arctan2(0.6, 0.8))  # the tilt at which the first one lies in the face
+    edge = float(np.arctan2(0.6, 0.8))  # tilt at which the first sample lies in the face
     normal = leaning(jnp.asarray(1.2))
 
     @jax.jit
@@ -74,7 +75,7 @@ def test_the_edge_of_a_face_jumps_and_carries_no_gradient():
     below, on, above = (float(light(jnp.asarray(edge + s))[0]) for s in (-1e-9, 0.0, 1e-9))
     cosine = float(normal @ jnp.asarray([0.0, 0.8, -0.6]))
     assert cosine > 0.3
-    # A weight of 1 for each of the samples, three channels.
+    # Each sample has a weight of 1, in each of three channels.
     assert above - below == pytest.approx(3 * RADIANCE * cosine / np.pi, rel=1e-9)
     assert on in (below, above)
     for tilt in (edge - 0.1, edge, edge + 0.1):
@@ -85,7 +86,7 @@ def test_the_horizon_of_the_shading_normal_is_a_kink():
     drawn = samples([0.0, 1.0, 0.0])
 
     def light(tilt):
-        """At no tilt the sample lies in the horizon, beyond it the normal sees it."""
+        """Without tilt the sample lies in the horizon; with a positive tilt the normal faces it."""
         points = point(leaning(tilt), leaning(tilt))
         return jnp.sum(gather(points, drawn, sky()).diffuse_light)
 
@@ -94,7 +95,7 @@ def test_the_horizon_of_the_shading_normal_is_a_kink():
 
 
 def test_the_flip_of_a_normal_jumps_in_the_specular_part_only():
-    """A normal that turns away from its viewer mirrors what is behind it; its irradiance stays."""
+    """A normal that faces away reflects the light from behind; its irradiance does not change."""
     drawn = samples([0.0, 0.6, 0.8], [0.0, 0.6, -0.8])
     radiance = jnp.concatenate([jnp.full((2, 8, 3), 3.0), jnp.full((2, 8, 3), 1.0)])
     light, viewer = EnvLight(radiance), jnp.asarray([[0.0, 1.0, 0.0]])

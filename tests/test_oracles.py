@@ -34,10 +34,12 @@ DATA = Path(__file__).parent / "data"
 VALUE_TOLERANCE = 1e-10
 # The stored gradients come from complex steps, so they are as exact as the values.
 GRADIENT_TOLERANCE = 1e-9
-# Another machine may round otherwise; the smoothest lobe amplifies that some ten thousand times.
+# Another machine may round differently, and the lobe of the smoothest surface amplifies that some
+# ten thousand times.
 REPRODUCTION_TOLERANCE = 1e-10
-# Central differences, extrapolated twice: truncation and rounding are both below. The step is small
-# against the distance to every kink and threshold, and against the width of the sharpest lobe.
+# Central differences, extrapolated twice, have smaller truncation and rounding errors than this.
+# The step is small compared to the distance to every kink and threshold, and to the width of the
+# sharpest lobe.
 DIFFERENCE_TOLERANCE = 1e-7
 DIFFERENCE_STEP = {"splats_small": 1e-5, "bsdf_rows": 1e-4}
 ROOM = Capacities(
@@ -68,7 +70,7 @@ def assert_gradients(got, data):
 
 
 def puller(function):
-    """Compile a function of a dictionary: its values, and the gradient of their contraction."""
+    """Compile a function of a dictionary, to give its values and the gradient of a contraction."""
 
     def scalar(inputs, cotangents):
         outputs = function(inputs)
@@ -213,7 +215,7 @@ def test_the_clashing_cells_are_there_and_the_mesh_is_a_manifold_with_border():
 def test_projection_equals_the_slow_one():
     data = load("splats_small")
     inputs, visible = unpacked(data, "in"), data["visible"]
-    assert set(data["out_clamped_axes"]) == {0, 1, 2}  # the field of view is left in each way
+    assert set(data["out_clamped_axes"]) == {0, 1, 2}  # means leave the view in 0, 1 or 2 axes
     with double_precision():
         footprints = jax.jit(partial(project, **SPLAT_FRAME))(
             *(jnp.asarray(inputs[k]) for k in ("means", "quats", "scales")),
@@ -290,7 +292,8 @@ def test_reflectance_equals_the_slow_one():
 
     def outputs(inputs):
         materials = Materials(inputs["albedo"], inputs["roughness"], inputs["metallic"])
-        # Normalised here, so that both sides extend the model alike off the unit sphere.
+        # Directions are normalised here, so that both implementations extend the model off the unit
+        # sphere in the same way.
         directions = [safe_normalize(inputs[k]) for k in ("normals", "wi", "wo")]
         diffuse, specular = evaluate_lobes(materials, *directions)
         return {"diffuse": diffuse, "specular": specular}
@@ -304,7 +307,7 @@ def test_reflectance_equals_the_slow_one():
     np.testing.assert_array_equal(gradient["roughness"][is_below_floor], 0.0)
     assert_values(values, data)
     assert_gradients(gradient, data)
-    # Mirrors dominate the norm; every row by itself must agree too.
+    # Mirror-like rows dominate the norm, so every row must also agree by itself.
     for name in gradient:
         for got, wanted in zip(np.asarray(gradient[name]), data[f"grad_{name}"], strict=True):
             assert np.linalg.norm(got - wanted) <= GRADIENT_TOLERANCE * max(

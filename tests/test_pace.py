@@ -1,4 +1,4 @@
-"""Progress: a time left that leaves the compilation out, and lines that a log file can hold."""
+"""Progress: an estimate of the time left without compilation, and lines fit for a log file."""
 
 import csv
 import json
@@ -19,7 +19,7 @@ class Clock:
 
 
 def paced(seconds, total):
-    """Estimates after each of some items that took so long."""
+    """Estimates of the time left, before and after each of some items that took ``seconds``."""
     clock = Clock()
     pace = TimeLeft(clock)
     found = [pace.left(0, total)]
@@ -44,7 +44,7 @@ def test_items_that_are_told_together_share_their_time():
     pace.left(1, 9)
     clock.now = 8.0
     assert pace.left(5, 9) == pytest.approx(8.0)
-    # Told twice, nothing changes.
+    # Reporting the same count twice changes nothing.
     assert pace.left(5, 9) == pytest.approx(8.0)
 
 

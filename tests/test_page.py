@@ -1,4 +1,4 @@
-"""The report: one valid page that needs no network, holds what it should, and believes no name."""
+"""The report: one valid page that needs no network, is complete, and escapes every name."""
 
 import json
 import re
@@ -30,7 +30,7 @@ def picture(seed, size=24):
 
 
 def make_run(folder, *, name="test_000", light="noon", config=None, size=24):
-    """Write what a training and an evaluation leave, without either."""
+    """Write the files of a training and an evaluation, without running either."""
     folder.mkdir(parents=True)
     config = config or make_config("default", "draft", overrides=("run.seed=7",))
     record = {
@@ -306,14 +306,14 @@ def test_the_command_of_the_report_makes_the_same_settings():
     assert "'/a b'" in text
     assert "--light 'x y'" in text
     assert "--bounds" not in text
-    # What no option of the command says is not left out without a word.
+    # If no option of the command expresses a setting, the command counts as incomplete.
     for more in ({"train_views": 4}, {"layout": "colmap"}, {"mask_files": False}):
         reading = {**record["dataset"], **more}
         assert not command({**record, "dataset": reading}, config)[1]
 
 
 def test_settings_between_two_levels_are_said_beside_the_standard_ones():
-    """Those of a budget, which no quality level names."""
+    """Such settings come from a budget, and no quality level names them."""
     config = between_qualities(0.6)
     changed = changed_from_preset(config)
     assert changed["geometry.resolution"] == (48, config.geometry.resolution)
@@ -341,7 +341,7 @@ def test_the_command_of_a_run_from_a_mesh_names_the_file(tmp_path):
 def test_settings_that_options_cannot_say_are_not_pretended(monkeypatch):
     config = make_config("default", "draft", overrides=("run.seed=3",))
     assert command({"scene": "s", "dataset": {}}, config)[1]
-    for unsayable in ("nothing", "7"):  # refused; and taken for something else
+    for unsayable in ("nothing", "7"):  # one is refused, the other read as another value
         monkeypatch.setattr(facts, "as_written", lambda value, text=unsayable: text)
         text, is_whole = command({"scene": "s", "dataset": {}}, config)
         assert not is_whole

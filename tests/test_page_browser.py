@@ -87,7 +87,7 @@ def ball(points):
 
 
 def asked(command, page):
-    """Return what the page says of itself; None where the browser closed it before."""
+    """Return the answer of the page; None where the browser closed it before there was one."""
     printed = subprocess.run(
         [*command, "--virtual-time-budget=60000", "--dump-dom", page.as_uri()],
         capture_output=True,
@@ -111,7 +111,7 @@ def test_the_page_works_in_a_browser(tmp_path):
     asking = html.replace("<head>", f"<head>{LISTEN}", 1).replace("</body>", f"{ASK}</body>")
     page = tmp_path / "asking.html"
     page.write_text(asking)
-    # Virtual time does not wait for what draws: on a busy machine some tries are early.
+    # Virtual time does not wait for rendering, so on a busy machine some attempts come too early.
     for number in range(5):
         answer = asked([command, *FLAGS, f"--user-data-dir={tmp_path / str(number)}"], page)
         if answer is not None and answer["colors"] > 50:

@@ -1,4 +1,4 @@
-"""Paths over several surfaces: closed forms between two plates, and what is differentiated."""
+"""Paths over several surfaces: closed forms between two plates, and which gradients exist."""
 
 from dataclasses import replace
 from typing import Annotated
@@ -21,16 +21,16 @@ from geosplat_jax.transport.light_sampling import light_sampler
 from geosplat_jax.transport.paths import FaceTable, PathSettings, PathTracer, face_table
 from geosplat_jax.transport.sampling import OPEN
 
-COVER = 0.6  # share of the upper plate that is there
+COVER = 0.6  # share of the upper plate that is not a hole
 ALBEDO = 0.7
 POINTS, RAYS = 64, 256
-STANDARD_ERRORS = 4.5  # chance: 7 in a million, a comparison
+STANDARD_ERRORS = 4.5  # exceeded by chance in 7 of a million comparisons
 
 
 class Plates(RayIndex):
-    """Two endless plates a unit apart, of which the upper one has small holes everywhere.
+    """Two infinite plates at unit distance; the upper one has small holes everywhere.
 
-    Face 0 is the floor, seen from above, face 1 the ceiling, seen from below.
+    Face 0 is the floor, seen from above; face 1 is the ceiling, seen from below.
     """
 
     usage: dict = eqx.field(default_factory=dict)
@@ -43,7 +43,7 @@ class Plates(RayIndex):
         height = directions[:, 2]
         distance = 1.0 / jnp.maximum(jnp.abs(height), 1e-3)
         place = origins[:, :2] + distance[:, None] * directions[:, :2]
-        # Holes of a hundredth by integers, which no compiler rounds.
+        # Holes are squares with sides of .01, placed by an integer hash, which no compiler rounds.
         x, y = jnp.floor(100.0 * place).astype(jnp.int32).T
         mixed = x * jnp.int32(73856093) ^ y * jnp.int32(19349663)
         mixed = (mixed ^ (mixed >> 13)) * jnp.int32(1274126177)
@@ -57,7 +57,7 @@ class Plates(RayIndex):
 
 
 def plate_points(count=POINTS, seed=0):
-    """Points of the floor, and a last one of the ceiling."""
+    """Points on the floor, except for the last one, which is on the ceiling."""
     places = np.random.default_rng(seed).uniform(-3, 3, (count, 3))
     places[:, 2], places[-1, 2] = 0, 1
     normals = np.tile([0.0, 0, 1], (count, 1))
@@ -73,7 +73,7 @@ def one_material(count, albedo=ALBEDO):
 
 
 def expected(vertices, albedo=ALBEDO):
-    """Radiance that leaves the ceiling and the floor after so many vertices, in a white sky."""
+    """Radiance that ceiling and floor send by paths of so many vertices, under a white sky."""
     ceiling = floor = 0.0
     for _ in range(vertices):
         ceiling, floor = albedo * floor, albedo * (1 - COVER + COVER * ceiling)
@@ -106,7 +106,7 @@ def tracer(vertices, light=None, gradient="light", albedo=ALBEDO):
 
 @pytest.fixture(scope="module", autouse=True)
 def matt():
-    """Leave out the coat, which no closed form knows."""
+    """Leave out the specular lobe, for which there is no closed form here."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bsdf, "evaluate", lambda *args: bsdf.evaluate_lobes(*args)[0])
         yield
@@ -114,7 +114,7 @@ def matt():
 
 @pytest.fixture(scope="module")
 def paths():
-    """Legs of paths of three vertices that begin at the floor, and where they came from."""
+    """Segments of paths of three vertices that start on the floor, with ``wo`` and the mask."""
     wo, _, _ = (x.reshape(-1, *x.shape[2:]) for x in ceiling_hits())
     starts = jnp.repeat(plate_points().positions, RAYS, axis=0)
     faces, real = jnp.zeros(len(wo), jnp.int32), jnp.ones(len(wo), bool)
@@ -124,7 +124,7 @@ def paths():
 
 @pytest.fixture(scope="module")
 def radiance(paths):
-    """What paths bring by their number of vertices."""
+    """Radiance that paths bring, by their number of vertices."""
     legs, wo, real = paths
     run = jax.jit(lambda tracer: [tracer.evaluate(legs[:k], wo, real) for k in (1, 3)])
     return dict(zip((1, 3), map(np.asarray, run(tracer(3))), strict=True))
@@ -158,7 +158,7 @@ def test_white_plates_send_out_no_more_than_they_receive(paths):
 
 
 def test_only_rays_that_hit_go_on_and_each_gets_its_own_light():
-    """Every ray that hits the ceiling brings light, the others none; the floor is black."""
+    """Rays that hit the ceiling bring its radiance; the others bring nothing."""
     wi, hits, distances = ceiling_hits()
     one = tracer(2)
     brought = jax.jit(lambda tracer: tracer.followed(plate_points(), wi, hits, distances).values)
@@ -201,7 +201,7 @@ def test_what_is_differentiated_at_later_vertices_is_a_setting(paths):
     ):
         value, (by_table, by_light) = run(inputs, gradient)
         assert float(value) != 0.0
-        # Linear in the light, and in the albedo of a single vertex.
+        # The result is linear in the light, and in the albedo of a single vertex.
         parts = (
             (by_light.radiance * base.light.radiance, moves_light),
             (by_table.materials.albedo * base.table.materials.albedo, moves_table),

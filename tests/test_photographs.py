@@ -31,7 +31,7 @@ def pose(index: int) -> list[list[float]]:
 
 @pytest.fixture
 def capture(tmp_path):
-    """Photographs of noise with soft masks in files of their own, of 8 bits unless asked."""
+    """Photographs of noise with soft masks in separate files, of 8 bits by default."""
 
     def write(*, bits: int = 8, suffix: str = ".png", lens: dict | None = None):
         rng = np.random.default_rng(5)
@@ -57,12 +57,12 @@ def capture(tmp_path):
 
 
 def read(folder, **options):
-    """Read a capture; a given box saves finding the visual hull."""
+    """Read a capture with a given box, which saves the computation of the visual hull."""
     return load_dataset(folder, bounds=([-0.5] * 3, [0.5] * 3), **options)
 
 
 def values_of_files(folder, name, suffix=".png"):
-    """What a reader that keeps floats makes of a view."""
+    """Values of a view, read directly from its files as floats."""
     rgb = read_linear(folder / "images" / f"{name}{suffix}")
     alpha = read_linear(folder / "masks" / f"{name}.png", is_srgb=False)[..., :1]
     return np.concatenate([np.where(alpha > 0, rgb, 0.0), alpha], -1)
@@ -75,7 +75,8 @@ def test_values_are_those_of_the_files_to_the_bit(capture, bits, suffix):
     assert isinstance(train.images, Photographs)
     for name, image in zip(train.names, train.images, strict=True):
         np.testing.assert_array_equal(image, values_of_files(folder, name, suffix))
-    # Three colours in the numbers of the file and alpha in 8 bits, where the object is.
+    # Only pixels of the object are stored: three colours in the bit depth of the file, and alpha in
+    # 8 bits.
     covered = len(train) * 20 * 24
     assert train.images.nbytes == covered * (3 * bits // 8 + 1)
 
@@ -125,7 +126,7 @@ def test_windows_and_exposures_are_parts_and_quotients_of_the_whole(capture):
 
 
 def photographs(rng, shape=(4, 7, 9)):
-    """Photographs whose parts lie anywhere, one of them empty, and the array of them."""
+    """Photographs whose stored parts lie anywhere, one of them empty; and the same as an array."""
     whole = np.zeros((*shape, 4), np.float32)
     whole[0, 2:5, 3:9] = rng.random((3, 6, 4), np.float32) + 0.1
     whole[1] = rng.random(shape[1:] + (4,), np.float32) + 0.1

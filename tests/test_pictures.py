@@ -65,7 +65,7 @@ def test_large_pictures_are_reduced_in_proportion(monkeypatch):
     sheet = pictures.overview_sheet([{"a": flat(0.5, 400, 600), "b": flat(0.9, 800, 900)}])
     a, b = find(sheet, [0.5] * 3), find(sheet, [0.9] * 3)
     assert (a[1] - a[0], a[3] - a[2]) == (200, 300)
-    # The second is fitted into a cell of the size of the first.
+    # The second picture is fitted into a cell that has the size of the first.
     assert (b[1] - b[0], b[3] - b[2]) == (200, 225)
 
 
@@ -97,7 +97,7 @@ def test_scales_and_several_lights_stand_below_with_their_titles():
     lights = {"true light": flat(0.1, 8, 16), "light": flat(0.2, 8, 16)}
     plain = pictures.overview_sheet(rows)
     sheet = pictures.overview_sheet(rows, lights=lights, scales=[ERROR])
-    # Each is exposed for itself, so that both have one grey here.
+    # Each light is exposed by itself, so that both have the same grey here.
     strips = find(sheet, pictures.tone_map_light(lights["light"])[0, 0])
     assert strips[3] - strips[2] > 2 * 200
     bar = find(sheet, ERROR.colors[-1])

@@ -57,9 +57,9 @@ def sky(seed=0):
 
 
 def problem(*overrides, stage="monte_carlo"):
-    """Settings, pipeline, parameters away from any symmetry, and a batch of two views.
+    """Settings, pipeline, parameters without any symmetry, and a batch of two views.
 
-    Its shapes are those of every test that differentiates the whole loss, which compiles for half a
+    All tests that differentiate the whole loss use the same shapes, since it compiles for half a
     minute.
     """
     config = tiny_config(*SMALL, *overrides)
@@ -115,7 +115,7 @@ def second():
     ("stage", "domain"), [("split_sum", "per_pixel"), ("monte_carlo", "per_splat")]
 )
 def test_every_matrix_product_of_a_step_is_of_full_precision(stage, domain):
-    """GPUs multiply with 10 bits unless told otherwise, and positions would be a pixel off."""
+    """By default GPUs multiply with 10-bit mantissas, which would move positions by a pixel."""
     _, pipeline, params, batch = problem(f"stages.{stage}.domain.kind={domain}", stage=stage)
     step = jax.value_and_grad(pipeline.loss, has_aux=True)
     products = operations("dot_general", step, params, batch)
@@ -196,7 +196,7 @@ def test_what_is_in_pixels_that_do_not_count_does_not_matter(second):
 
 
 def test_the_near_plane_is_measured_in_the_box():
-    """A scene is the same in any unit, also right before the camera."""
+    """The near plane scales with the box, so that results do not depend on units."""
     pipeline, _ = ball(tiny_config("geometry.resolution=6"))
     camera = views_from([[2.0, 0.0, 0.0]]).camera([0])
     near = pipeline.raster.near * float(pipeline.surface.box.half_extent)
@@ -225,7 +225,7 @@ def test_unknown_aovs_are_refused_before_anything_is_built(second):
 def test_an_empty_surface_shows_the_background_and_has_zero_gradient():
     _, pipeline, params, batch = problem(stage="split_sum")
     gone = replace(params, geometry=replace(params.geometry, sdf=jnp.abs(params.geometry.sdf) + 1))
-    # The regularisers of the weights pull whether there is a surface or not.
+    # Regularisers of the surface's weights have a gradient with and without a surface.
     weights = {**pipeline.weights, "weights": jnp.float32(0.0)}
     (total, report), gradient = evaluate(replace(pipeline, weights=weights), gone, batch)
     assert np.isfinite(total)
@@ -239,7 +239,7 @@ def test_an_empty_surface_shows_the_background_and_has_zero_gradient():
 
 
 def test_eq_18_takes_what_the_specular_lobe_really_adds():
-    """Fresnel and tint included: of these materials a fraction of what a mirror would send."""
+    """Fresnel and tint are included; here that is a fraction of the light of a mirror."""
     _, pipeline, params, batch = problem(stage="split_sum")
     (_, report), _ = evaluate(pipeline, params, batch)
     aovs = draw(pipeline, params, batch.camera, aov_names=AOVS).aovs
@@ -261,7 +261,7 @@ def test_a_rendered_sphere_covers_its_disc_and_its_normals_face_the_camera():
     alpha = np.asarray(output.alpha[0])
     assert alpha[6:8, 6:8].min() > 0.9
     assert alpha[0, 0] == 0.0
-    # The four pixels around the middle: cells are as large as pixels here.
+    # Four pixels around the middle are averaged, since cells are as large as pixels here.
     normal = np.asarray(output.aovs["normal"][0, 6:8, 6:8]).sum((0, 1)) / alpha[6:8, 6:8].sum()
     towards = np.asarray(batch.camera.centers[0])
     assert normal @ towards / np.linalg.norm(towards) > 0.9
@@ -276,14 +276,14 @@ def with_settings(pipeline, **changes):
 @pytest.mark.slow
 @pytest.mark.long
 def test_a_residual_of_its_own_has_its_own_samples(second):
-    """The loss has the value of the second image; what has no samples keeps its gradient."""
+    """The loss has the value of the second image; terms without samples keep their gradient."""
     _, pipeline, params, batch = second
     (total, report), gradient = evaluate(pipeline, params, batch)
     apart = with_settings(pipeline, residual_count=1)
     (other_total, other), other_gradient = evaluate(apart, params, batch)
     assert float(other.terms["l1"]) != float(report.terms["l1"])
     assert float(other_total) != float(total)
-    # Eq. 18 and the mask are of the image that is differentiated.
+    # Eq. 18 and the mask term use the image that is differentiated.
     for name in ("light", "mask"):
         assert float(other.terms[name]) == pytest.approx(float(report.terms[name]), rel=1e-6)
     for name, group in groups_of(other_gradient).items():
@@ -297,9 +297,9 @@ def test_a_residual_of_its_own_has_its_own_samples(second):
 @pytest.mark.computes
 @pytest.mark.long
 def test_a_residual_of_its_own_takes_the_bias_from_the_gradient(second):
-    """Where the mean image is the photograph, nothing should pull on the brightness of the light.
+    """Where the mean image equals the photograph, nothing should pull on the light's brightness.
 
-    Residuals from the samples of the derivative pull it down, since less light makes less noise.
+    Residuals from the samples of the derivative pull it down, since less light has less noise.
     """
     _, pipeline, params, batch = second
     params = replace(params, light=EnvLight(0.3 * params.light.radiance))
@@ -320,7 +320,7 @@ def test_a_residual_of_its_own_takes_the_bias_from_the_gradient(second):
             objective=replace(pipeline.objective, background="black"),
         )
 
-        # In the light alone, which spares the way back to the surface.
+        # The gradient is in the light alone, which saves the backward pass to the surface.
         @jax.jit
         def pull(pipeline, key):
             def total(light):
@@ -332,16 +332,16 @@ def test_a_residual_of_its_own_takes_the_bias_from_the_gradient(second):
         return np.array([float(pull(noisy, key)) for key in keys])
 
     same, apart = pulls(0), pulls(1)
-    # The derivative has the same samples in both, so that noise goes with the difference.
+    # Both use the same samples for the derivative, so the difference cancels their noise.
     bias = same - apart
     assert bias.mean() > 3 * bias.std() / np.sqrt(len(keys))
     assert abs(apart.mean()) < 3.5 * apart.std() / np.sqrt(len(keys))
 
 
 DIFFERENCES = {
-    # No light samples: neither light nor metallic, albedo or exposure moves a sample.
+    # Without light samples, no sample depends on light, metallic, albedo or exposure.
     "constant": ("light_count=0", "diffuse_count=2", "specular_count=2", "indirect=constant"),
-    # No samples of the lobe: roughness moves none.
+    # Without samples of the lobe, no sample depends on roughness.
     "harmonics": ("light_count=2", "diffuse_count=2", "specular_count=0", "indirect=harmonics"),
 }
 
@@ -350,7 +350,7 @@ DIFFERENCES = {
 @pytest.mark.computes
 @pytest.mark.parametrize("kind", [pytest.param("constant", marks=pytest.mark.long), "harmonics"])
 def test_the_gradient_of_the_whole_loss_agrees_with_differences(kind):
-    """In float64 and for fixed samples, in all parameters that do not move them."""
+    """They are in float64, with fixed samples, and in all parameters that move no sample."""
     overrides = [f"stages.monte_carlo.transport.{text}" for text in DIFFERENCES[kind]]
     single = problem(*overrides)[1:]
     with double_precision():
@@ -398,12 +398,12 @@ def _in_double(parts):
 
 
 def _free_direction(kind, path, direction):
-    """A direction of a leaf that moves no sample; None where there is none."""
+    """Part of a direction in a leaf that moves no sample; None if there is no such part."""
     if "shift" in path or "surface_table" in path:
         return None  # moves the splats, or the roughness
     if "surface_head" in path:
         if kind != "harmonics":
-            # Only the last layer tells roughness (column 0) from metallic (column 1).
+            # Only the last layer separates roughness (column 0) from metallic (column 1).
             if direction.shape[-1] != 2:
                 return None
             direction[..., 0] = 0.0

@@ -15,7 +15,7 @@ from geosplat_jax.io.images import MissingFileError, SceneError, write_png
 from geosplat_jax.io.poses import PoseError, _Matches, _pairs, _upright, find_poses
 
 HEIGHT, WIDTH, FOCAL = 150, 200, 190.0
-# Cameras from some thousand details that are found to a third of a pixel.
+# Error of cameras that follow from some thousand features, each found to a third of a pixel.
 DISTANCE = 0.02
 COUNT = 9
 
@@ -61,7 +61,7 @@ def room(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found_room(room):
-    """The room with its cameras, what was said of them, and the parts of the search."""
+    """The room with its cameras, the report on them, and the progress of the search."""
     pytest.importorskip("pycolmap")
     parts = []
     report = find_poses(room, on_progress=lambda *done: parts.append(done))
@@ -139,7 +139,7 @@ def test_advice_names_the_cause(features, pairs, message):
 
 def test_photographs_stored_on_their_side_are_turned_up():
     pose = level_poses(np.array([[0.0, -1.0, 0.0]]))[0]
-    # Orientation 6: the left column of the pixels is the top; 8: the right one is.
+    # In orientation 6 the left column of the stored pixels is the top; in 8 the right one is.
     for orientation, axis, sign in ((1, 1, 1), (3, 1, -1), (6, 0, -1), (8, 0, 1)):
         stored = _upright(pose, orientation)
         np.testing.assert_allclose(stored[:3, 1], sign * pose[:3, axis], atol=1e-12)
@@ -154,7 +154,7 @@ def test_photographs_of_a_room_give_its_cameras(found_room):
     dataset = load_dataset(room)
     assert dataset.layout == "colmap"
     views = dataset.train
-    # Both worlds are brought to the same one, so that cameras can be compared as they are.
+    # Both sets of cameras are aligned to the same world, so that they can be compared directly.
     true = moved(cameras(), align_world(cameras(), np.zeros((1, 3))))
     chosen = [int(name) for name in views.names]
     np.testing.assert_allclose(views.camera_to_world, true[chosen], atol=DISTANCE)

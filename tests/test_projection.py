@@ -9,7 +9,7 @@ from geosplat_jax.core.rotation import quaternion_to_matrix
 from geosplat_jax.splats import projection
 from geosplat_jax.splats.projection import LOW_PASS_VARIANCE
 
-# Compiled once a shape; op-by-op dispatch would compile every small operation on its own.
+# Compiled once per shape; eager dispatch would compile every small operation on its own.
 project = jax.jit(projection.project, static_argnames=("height", "width"))
 ORACLES = Path(__file__).parents[2] / "shared" / "oracles"
 # float64 on both sides, some hundred operations deep.
@@ -68,7 +68,7 @@ def test_matches_the_oracle(name, x64):
     np.testing.assert_allclose(footprints.means2d, data["means2d"], rtol=EXACT, atol=EXACT)
     np.testing.assert_allclose(footprints.conics, data["conics"], rtol=1e-11, atol=EXACT)
     np.testing.assert_allclose(footprints.depths, data["depths"], rtol=EXACT)
-    # The oracle's determinant cancels; ours does not, so agreement is that of the oracle.
+    # The oracle loses digits by cancellation in its determinant, which limits the agreement.
     np.testing.assert_allclose(footprints.compensation, data["compensations"], rtol=1e-9)
 
 
@@ -90,7 +90,7 @@ def test_covariance_is_the_linearised_image_of_the_splat(x64):
     np.testing.assert_allclose(xy, expected[:, 0, 1], rtol=1e-9, atol=1e-10)
     np.testing.assert_allclose(yy, expected[:, 1, 1], rtol=1e-10)
     np.testing.assert_allclose(footprints.means2d, jax.vmap(pixel)(means), rtol=1e-12)
-    # What is spread over a larger area is fainter by the root of both areas' squares.
+    # A splat that is spread over a larger area is fainter by the ratio of the areas.
     sharp = expected - LOW_PASS_VARIANCE * jnp.eye(2)[None]
     shares = jnp.linalg.det(sharp) / jnp.linalg.det(expected)
     np.testing.assert_allclose(footprints.compensation**2, shares, rtol=1e-6, atol=1e-12)
@@ -111,7 +111,7 @@ def test_flat_splats_keep_their_digits_in_float32():
     flat = scales * jnp.array([[1.0, 1.0, 1e-4]], jnp.float32)
     settings = camera(jnp.float32)
     footprints = project(means, quats, flat, **settings)
-    # The same from float64 numpy, with the determinant as a cross product.
+    # The reference is the same in float64 NumPy, with the determinant as a cross product.
     rotation = np.asarray(quaternion_to_matrix(quats), np.float64)
     axes = rotation * np.asarray(flat, np.float64)[:, None, :]
     point = np.asarray(means, np.float64) + np.array([0, 0, 3.0])

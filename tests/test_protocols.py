@@ -1,4 +1,4 @@
-"""Protocols by hand-made maps: encodings, backgrounds, silhouettes, scales, and what is refused."""
+"""Protocols on hand-made maps: encodings, backgrounds, silhouettes, scales, and refused input."""
 
 import dataclasses
 
@@ -11,14 +11,14 @@ from scipy.ndimage import minimum_filter
 from geosplat_jax.report import metrics, protocol_metrics, protocols
 from geosplat_jax.report.protocols import PROTOCOL, PROTOCOLS, protocol
 
-# Decibels of float32 images.
+# Tolerance in decibels, for float32 images.
 DECIBELS = 2e-3
-# Those that compare pictures; `orb` has its own figures.
+# The protocols that compare whole pictures; `orb` has its own figures.
 PICTURES = PROTOCOLS[:3]
 GEOSPLATTING, TENSOIR, IRGS = ROWS = tuple(PROTOCOL[name] for name in PICTURES)
 ORB = PROTOCOL["orb"]
 GAIN = np.array([0.5, 2.0, 1.25])
-# Compiled once a shape: eager, the many small operations take seconds.
+# Compiled once per shape, since the many small operations take seconds in eager mode.
 ssim, ssim_masked = jax.jit(metrics.ssim), jax.jit(metrics.ssim_masked)
 
 
@@ -80,7 +80,7 @@ def test_tensoir_takes_the_scale_from_twenty_views():
     np.testing.assert_array_equal(protocols.scale_views(TENSOIR, 39), np.arange(20))
     np.testing.assert_array_equal(protocols.scale_views(TENSOIR, 7), np.arange(7))
     np.testing.assert_array_equal(protocols.scale_views(IRGS, 200), np.arange(200))
-    # A view between the twenty has no say under tensoir, and has under irgs.
+    # A view between the twenty does not count under `tensoir`, but does under `irgs`.
     truth = flat([0.5, 0.5, 0.5], (41, 1, 1))
     truth[1::2] = 1.0
     ones = np.ones((41, 1, 1), np.float32)
@@ -110,7 +110,7 @@ def test_least_squares_scale_is_the_mean_over_views_with_an_object():
     mask[2], truth[2] = 0, 0
     scale = protocol_metrics.albedo_scale(GEOSPLATTING, albedo, mask, truth, mask)
     np.testing.assert_allclose(scale, (0.4 + 1.0) / 2, rtol=1e-6)
-    albedo[1, ..., 0] = 0  # one channel of one view is black: that view says nothing about it
+    albedo[1, ..., 0] = 0  # view 1 is black in channel 0, and does not count there
     scale = protocol_metrics.albedo_scale(GEOSPLATTING, albedo, mask, truth, mask)
     np.testing.assert_allclose(scale, [0.4, 0.7, 0.7], rtol=1e-6)
 
@@ -148,7 +148,7 @@ def test_albedo_metrics_by_hand():
     truth = flat([0.5, 0.5, 0.5]) * mask[..., None]
     albedo = flat([0.1, 0.1, 0.1]) * mask[..., None]
     scale = np.array([2.0, 2.0, 2.0])
-    # Half of the image errs; the encoding is the protocol's.
+    # Half of the image is wrong; each protocol has its own encoding.
     for row, encode in (
         (GEOSPLATTING, srgb),
         (TENSOIR, lambda v: v ** (1 / 2.2)),
@@ -174,7 +174,8 @@ def test_only_geosplatting_counts_albedo_beside_the_object():
 
 
 def test_backgrounds_differ_where_coverage_is_partial():
-    # Truth covers all of it, the prediction of the same colour 60 %: black or white shows through.
+    # The truth is opaque. The prediction has the same colour and 60 % coverage, so that the black
+    # or white background shows through.
     mask, alpha = flat(1.0), flat(0.6)
     truth = flat([0.5, 0.5, 0.5])
     albedo = truth * alpha[..., None]
@@ -184,7 +185,8 @@ def test_backgrounds_differ_where_coverage_is_partial():
     image = np.concatenate([truth, mask[..., None]], -1)
     white = decibels((0.4 * (1 - srgb(0.5))) ** 2)
     psnr = [protocol_metrics.relight_metrics(row, albedo, alpha, image)["psnr"] for row in ROWS]
-    # `tensoir` shows it whole above one half, `irgs` cuts by the true mask.
+    # `tensoir` makes the prediction opaque where its alpha exceeds one half; `irgs` cuts it out
+    # with the true mask.
     assert psnr == pytest.approx([white, 200.0, 200.0], abs=DECIBELS)
     alpha[:] = 0.4
     thin = protocol_metrics.relight_metrics(TENSOIR, truth * 0.4, alpha, image)["psnr"]
@@ -276,14 +278,14 @@ def test_masked_metrics_ignore_the_background(name):
 @pytest.mark.parametrize("name", PICTURES)
 def test_perfect_predictions_are_perfect(name):
     _, _, truth, mask = scene(views=2)
-    mask[:, 7, :3], truth[:, 7, :3] = 0.3, 0.15  # partial coverage, too
+    mask[:, 7, :3], truth[:, 7, :3] = 0.3, 0.15  # partial coverage in places
     image = np.concatenate([np.where(mask[..., None] > 0, truth, 0), mask[..., None]], -1)
     image[:, 7, :3, :3] /= 0.3
     row = protocol(name)
     albedo = protocol_metrics.albedo_metrics(row, truth, mask, truth, mask, np.ones(3))
     relight = protocol_metrics.relight_metrics(row, truth, mask, image)
     if name == "tensoir":
-        # It cuts the prediction at one half, and blends the truth.
+        # `tensoir` thresholds the coverage of the prediction at one half, but blends the truth.
         assert relight.pop("psnr") < 60
         assert relight.pop("ssim") < 1
     for key, value in (albedo | relight).items():
@@ -299,7 +301,7 @@ def test_relit_values_are_clipped_before_encoding():
     rgb = flat([1.0, 7.0, 0.5])
     for row in ROWS:
         assert protocol_metrics.relight_metrics(row, rgb, mask, image)["psnr"] > 150
-    # In linear light the third channel alone errs.
+    # In linear light only the third channel is wrong.
     rgb[..., 2] = 0.25
     row = dataclasses.replace(IRGS, relight=protocols.Rendition("linear", 0.0, "mask"))
     psnr = protocol_metrics.relight_metrics(row, rgb, mask, image)["psnr"]
@@ -323,7 +325,8 @@ def test_material_metrics_by_hand():
     truth = {"roughness": 0.6 * mask}
     measured = protocol_metrics.material_metrics(materials, alpha, truth, mask)
     assert measured == {
-        # Straight .4 against .6 inside; premultiplied .2 against .6 and, outside, 0.
+        # Inside the mask, straight .4 is compared with .6. Over the whole image, premultiplied .2
+        # is compared with .6 inside and with 0 outside.
         "roughness.mse": pytest.approx(0.04),
         "roughness.mse_full": pytest.approx((0.16 + 0.04) / 2),
     }
@@ -426,9 +429,9 @@ def test_masked_ssim_is_what_the_protocols_print():
 
 
 def spoiled(views=2, size=26):
-    """A scene, half of whose pixels do not count and are zero; and one with a part cut away."""
+    """Masks of valid pixels, and the maps of a scene, which are zero in invalid pixels."""
     albedo, alpha, truth, mask = scene(views, size)
-    # A border of unequal width for each view, so that pooling has to weigh.
+    # Views have different numbers of valid pixels, so that pooling has to weight them.
     valid = np.zeros(mask.shape, np.float32)
     valid[0, :, : size // 2] = 1
     valid[1:, 4:] = 1
@@ -437,7 +440,7 @@ def spoiled(views=2, size=26):
 
 
 def cut(maps, columns):
-    """Only the columns that count, of the first view."""
+    """Cut the first view to its valid columns."""
     return [values[:1, :, :columns] for values in maps]
 
 
@@ -449,7 +452,7 @@ def test_figures_are_those_of_the_pixels_that_count_alone(name):
     small = cut(maps, 13)
     found = protocol_metrics.albedo_metrics(row, *one, GAIN, valid[:1])
     expected = protocol_metrics.albedo_metrics(row, *small, GAIN)
-    # Windows across the border see black in both, so only means over pixels are equal.
+    # Windows of SSIM also see invalid pixels near the border, so only means over pixels are equal.
     for key in ("albedo.psnr", "albedo.psnr_masked"):
         assert found[key] == pytest.approx(expected[key], abs=DECIBELS)
     assert 0 < found["albedo.ssim"] < 1
@@ -504,7 +507,7 @@ def test_coverage_where_pixels_do_not_count_is_refused():
 
 
 def orb_by_hand(rgb, image, *, largest, is_brightened, is_encoded):
-    """One figure of Stanford-ORB of one image, written down once more."""
+    """One figure of Stanford-ORB for one image, implemented a second time."""
     inside = minimum_filter((image[..., 3] > 0.5).astype(int), 5, mode="nearest") == 1
     found, true = (np.where(inside[..., None], x[..., :3], 0).astype(float) for x in (rgb, image))
     if is_brightened:
@@ -588,6 +591,6 @@ def test_stanford_orb_means_over_the_pixels_that_count():
     kept = valid[..., None]
     half = protocol_metrics.relight_metrics(ORB, rgb * kept, alpha * valid, image * kept, valid)
     whole = protocol_metrics.relight_metrics(ORB, rgb * kept, alpha * valid, image * kept)
-    # The same error over fewer pixels.
+    # The same error is averaged over fewer pixels.
     for name in whole:
         assert whole[name] - half[name] == pytest.approx(-decibels(24 / 21), abs=DECIBELS)

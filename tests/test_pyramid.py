@@ -1,4 +1,4 @@
-"""The light's pyramid: levels have the gradient of what they are interpolated to."""
+"""The light's pyramid: the gradient of levels is that of the light they are interpolated to."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ def with_light(params, radiance):
 
 
 def steps_of(params, *levels):
-    """Levels with these values, zero where there is None."""
+    """Parameters whose levels have these values, or zero for None."""
     steps = to_levels(params)
     values = [
         jnp.full_like(level, 0.0 if value is None else value)
@@ -35,7 +35,7 @@ def steps_of(params, *levels):
 
 
 def with_levels(steps, values):
-    """Put other values into the levels."""
+    """Replace the values of the levels."""
     return eqx.tree_at(lambda tree: tree.light.radiance, steps, tuple(values))
 
 
@@ -48,7 +48,10 @@ def test_levels_halve_while_they_can(params):
 
 
 def test_the_gradient_of_a_level_is_that_of_the_light_that_it_makes(params):
-    """Adam on levels then descends: the change of any function is that along the texels' step."""
+    """The change of a function along a step of the levels is that along the step of the texels.
+
+    So Adam on the levels descends.
+    """
     gradient = to_levels(params).light.radiance
     rng = np.random.default_rng(1)
     steps = to_levels(params)

@@ -1,4 +1,4 @@
-"""Splats with colours of their own: harmonics, relocation, training, and the file viewers open."""
+"""Splats with colours of their own: harmonics, relocation, training, and files for viewers."""
 
 from dataclasses import replace
 
@@ -161,7 +161,7 @@ def camera_at(center, size=49, focal=30.0):
 
 @pytest.mark.parametrize("opacity", [0.006, 0.3, 0.999])
 def test_scales_of_several_splats_are_those_of_the_binomial_sum(opacity):
-    # The sum of Eq. 9 alternates, so its terms are added in double precision and up to 20 only.
+    # Terms of the sum of Eq. 9 alternate in sign, so it is computed in double precision, up to 20.
     for sharers in (1, 2, 5, 20):
         shared = 1.0 - (1.0 - opacity) ** (1.0 / sharers)
         total = sum(
@@ -176,7 +176,7 @@ def test_scales_of_several_splats_are_those_of_the_binomial_sum(opacity):
 
 
 def one_splat():
-    """Rows of one splat of five pixels, so that the rasteriser's low-pass filter hardly matters."""
+    """Equal rows of a splat of five pixels, so that the low-pass filter hardly matters."""
     ones = jnp.ones((ROWS, 3), jnp.float32)
     return RadianceSplats(
         means=0.0 * ones,
@@ -199,7 +199,7 @@ def test_relocation_keeps_the_image_of_the_splat_that_it_shares(sharers):
     many, lazy = (np.asarray(render(x, sharers, camera)[1]) for x in (after, unscaled))
     middle = 24
     assert many[middle, middle] == pytest.approx(one[middle, middle], abs=0.01)
-    # Along a line through the middle the integral is kept, not every value.
+    # The integral along a line through the middle is preserved, but not every value.
     assert many[middle].sum() == pytest.approx(one[middle].sum(), rel=0.01)
     assert lazy[middle].sum() > 1.05 * one[middle].sum()
     assert np.abs(many - one).mean() < 0.5 * np.abs(lazy - one).mean()
@@ -224,13 +224,13 @@ def test_dead_splats_go_to_live_ones_in_proportion_to_their_opacity():
     assert bool(is_changed[:3000].all())
     assert not bool(is_changed[3000:].any())
     np.testing.assert_array_equal(at[3000:], np.asarray(splats.means)[3000:])
-    # Copies are what their source has become.
+    # Copies equal their source after its own change.
     first = int(np.argmax(np.all(at[2:] == at[0], axis=1))) + 2
     assert float(moved.opacity_logits[first]) == float(moved.opacity_logits[0])
 
 
 def test_rows_without_weight_are_never_drawn():
-    """A hundred thousand of them: sums in float32 grow there, and fall elsewhere."""
+    """With so many rows, cumulative sums in float32 may grow at such rows, and fall at others."""
     rng = np.random.default_rng(0)
     weights = jnp.asarray(rng.uniform(size=300_000) * (rng.uniform(size=300_000) > 0.3), "f4")
     drawn = jax.jit(_drawn_rows, static_argnums=2)(weights, jax.random.key(0), 300_000)
@@ -258,7 +258,8 @@ def test_noise_is_shaped_like_the_splat_and_spares_opaque_ones():
     )
     noise = np.asarray(exploring_noise(splats, jax.random.key(0), rate=2.0))
     gate = 1.0 / (1.0 + np.exp(100.0 * (1.0 / (1.0 + np.exp(9.0)) - 0.005)))
-    # A quarter turn about z: the long axis lies along y. Noise is Sigma xi, of deviation s^2.
+    # After a quarter turn about z the long axis lies along y. Noise is Sigma xi, with a deviation
+    # of s^2.
     spread = noise[: count // 2].std(0)
     np.testing.assert_allclose(spread, 2.0 * gate * np.array([0.04, 0.25, 0.01]), rtol=0.03)
     assert np.abs(noise[count // 2 :]).max() < 1e-12
@@ -268,7 +269,7 @@ BALLS = (((0.0, 0.0, 0.0), (0.9, 0.5, 0.1)), ((0.6, 0.3, 0.2), (0.1, 0.3, 0.9)))
 
 
 def scene_views(count=9, size=32):
-    """Views, as a pinhole sees them, of two bright balls before a gradient that no ray leaves."""
+    """Pinhole views of two bright balls, before a background that depends on the direction only."""
     heights = np.resize([0.4, 1.6], count)
     angle = np.linspace(0.0, 4.5, count)
     centers = np.stack([3 * np.cos(angle), 3 * np.sin(angle), heights], -1)
@@ -323,7 +324,7 @@ def trained(tmp_path_factory):
 def test_training_lowers_the_loss_and_fills_the_capacity(trained):
     radiance, reports, _ = trained
     totals = [report.total for report in reports]
-    # Of the nine views, each once.
+    # Both means are over nine steps, in which each of the nine views occurs once.
     assert np.mean(totals[-9:]) < 0.85 * np.mean(totals[:9])
     assert [report.step for report in reports] == list(range(1, 61))
     counts = [report.splat_count for report in reports]
@@ -477,7 +478,7 @@ def test_ply_has_the_standard_layout(tmp_path):
 
 
 def viewers_color(found, center):
-    """Colour of the file's columns as the code of Kerbl et al. has it (utils/sh_utils.py)."""
+    """Colour from the file's columns by the formulas of Kerbl et al. (utils/sh_utils.py)."""
     mean = np.stack([found[axis] for axis in "xyz"], -1)
     towards = mean - center
     x, y, z = (towards / np.linalg.norm(towards, axis=-1, keepdims=True)).T

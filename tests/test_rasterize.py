@@ -20,9 +20,9 @@ from geosplat_jax.splats.rasterize import (
 from geosplat_jax.splats.tiles import MIN_ALPHA, _sort_hits, _stable_argsort
 
 ORACLES = Path(__file__).parents[2] / "shared" / "oracles"
-# float64; a few hundred products deep, the oracle's own rounding included.
+# float64 after a few hundred products, including the rounding of the oracle itself.
 ORACLE_TOLERANCE = 1e-11
-# The compositor against dense autodiff, both float64.
+# The compositor is compared with dense autodiff, both in float64.
 REFERENCE_TOLERANCE = 1e-11
 AMPLE = Capacities(visible=512, hits=8192, chunks=2048)
 
@@ -63,7 +63,7 @@ def scene(seed, count, dtype, *, opacity=(0.0, 1.0), channels=3, extent=1.2):
 
 
 STATIC = ("height", "width", "capacities", "tile_size")
-# Compiled once a shape; op-by-op dispatch would compile every small operation on its own.
+# Compiled once per shape; eager dispatch would compile every small operation on its own.
 compiled_rasterize = jax.jit(rasterize, static_argnames=STATIC)
 
 
@@ -77,7 +77,7 @@ def draw(inputs, settings, *, capacities=AMPLE, tile_size=4, eligible=None):
 
 @partial(jax.jit, static_argnames=STATIC)
 def loss_and_gradient(inputs, eligible, **settings):
-    """Value of `scalar`, (image, alpha, usage), gradient; one compilation for most tests."""
+    """Return `scalar`, (image, alpha, usage) and the gradient; most tests share one compilation."""
 
     def loss(inputs):
         image, alpha, needed = rasterize(*inputs, eligible, **settings)
@@ -96,14 +96,14 @@ def differentiate(inputs, *, eligible=None, capacities=AMPLE):
 
 
 def padded(*rows):
-    """Repeat the first row up to 40 rows, with the mask of the given ones."""
+    """Pad the rows to 40 with copies of the first one; also return the mask of the given rows."""
     count = rows[0].shape[0]
     filled = tuple(jnp.concatenate([x, jnp.repeat(x[:1], 40 - count, axis=0)]) for x in rows)
     return filled, jnp.arange(40) < count
 
 
 def dense(inputs, settings):
-    """Depth sort everything in front and composite it in every pixel."""
+    """Sort everything in front of the camera by depth, and composite it in every pixel."""
     depths = jax.lax.stop_gradient(project(*inputs[:3], **settings).depths)
     order = jnp.argsort(depths, stable=True)
     means, quats, scales, opacities, features = (x[order] for x in inputs)
@@ -219,7 +219,7 @@ def test_custom_vjp_equals_autodiff_for_every_input_of_the_compositor(x64):
 
 
 def test_gradients_match_finite_differences_along_random_directions(x64):
-    # Soft and overlapping, so that no pixel crosses a threshold within a step.
+    # The splats are soft and overlap, so that no pixel crosses a threshold within a step.
     settings = camera(jnp.float64, 10, 12)
     means, quats, _, _, features = scene(3, 6, jnp.float64, extent=0.4)
     rng = np.random.default_rng(5)
@@ -245,7 +245,7 @@ def test_gradients_match_finite_differences_along_random_directions(x64):
 
 
 def test_float32_gradients_stay_close_behind_opaque_layers():
-    # Twenty nearly opaque sheets: dividing by 1 - alpha or subtracting prefix sums fails here.
+    # With twenty nearly opaque sheets, dividing by 1 - alpha or subtracting prefix sums would fail.
     count, settings = 20, camera(jnp.float32, 12, 12)
     rng = np.random.default_rng(6)
     means = np.stack([np.zeros(count), np.zeros(count), np.linspace(0, 1, count)], -1)
@@ -263,7 +263,8 @@ def test_float32_gradients_stay_close_behind_opaque_layers():
     expected = jax.jit(jax.grad(lambda x: scalar(*dense(x, settings))))(inputs)
     visible = np.abs(np.asarray(expected[4])) > 0
     assert visible.all()
-    # Relative to each row: the last sheet sees 1e-28 of the light and must still be right.
+    # The tolerance is relative for each row: the last sheet gets 1e-28 of the light, and its
+    # gradient must still be right.
     np.testing.assert_allclose(got[4], expected[4], rtol=1e-3)
     assert_close_gradients(got[3], expected[3], relative=1e-4, cosine=1e-6)
 
@@ -345,7 +346,7 @@ def test_an_astronomic_number_of_hits_saturates_instead_of_wrapping():
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_depth_order_is_exact_and_ties_keep_row_order(dtype, x64):
     rng = np.random.default_rng(10)
-    # Neighbouring floats, repeated: only an exact, stable sort gets these right.
+    # Neighbouring floats are repeated, which only an exact, stable sort orders correctly.
     base = np.nextafter(np.full(50, 2.0, dtype), np.inf, dtype=dtype)
     depths = np.concatenate([base, np.full(50, 2.0), rng.uniform(0.02, 1e6, 100)]).astype(dtype)
     depths = rng.permutation(depths)
@@ -481,7 +482,7 @@ def test_vmap_and_scan_over_views_equal_the_loop():
 
 
 def test_tiles_list_the_splats_that_their_pixels_may_see_and_hardly_any_other():
-    """Thin ellipses above all: a box around one that runs across the image meets every tile."""
+    """This matters for thin ellipses: the bounding box of a diagonal one meets every tile."""
     count, size, tile = 300, 96, 8
     rng = np.random.default_rng(5)
     long, thin = rng.uniform(2.0, 25.0, count), rng.uniform(0.3, 2.0, count)
@@ -527,6 +528,6 @@ def test_tiles_list_the_splats_that_their_pixels_may_see_and_hardly_any_other():
     blocks = is_seen.reshape(count, size // tile, tile, size // tile, tile)
     needed = blocks.any(axis=(2, 4)).reshape(count, -1)
     assert not np.any(needed & ~listed)
-    # An ellipse may pass between the centres of pixels.
+    # A listed ellipse may pass between the centres of the pixels of a tile.
     assert listed.sum() < 1.1 * needed.sum()
     assert int(lists.usage["hits"]) > 1.3 * listed.sum()

@@ -1,4 +1,4 @@
-"""Free splats: they start as the mesh's, learn apart from it, and train, resume and render."""
+"""Free splats: they start as those of the mesh, then train on their own, resume and render."""
 
 from dataclasses import replace
 
@@ -37,7 +37,7 @@ build = jax.jit(RenderPipeline.reconstruct)
 
 @pytest.fixture(scope="module")
 def start():
-    """Pipelines before and in the refinement of a ball, and the first parameters of it."""
+    """Pipelines of a ball before and in refinement, and the initial parameters of the latter."""
     config = tiny_config("stages.refine.steps=3")
     pipeline, params = ball(config)
     before = build(pipeline, params)
@@ -68,7 +68,7 @@ def test_free_splats_begin_as_the_splats_of_the_mesh(start):
 
 
 def test_parameters_are_counted_in_half_sides_of_the_box(start):
-    """The box of the tests has a half side of about one, which would hide a unit."""
+    """The box of other tests has a half side of about one, which would hide a wrong unit."""
     splats, half = start[0].splats, 2.5
     center = np.array([1.0, 2.0, 3.0])
     box = Box(jnp.asarray(center, jnp.float32), jnp.float32(half))
@@ -79,7 +79,7 @@ def test_parameters_are_counted_in_half_sides_of_the_box(start):
 
 
 def test_a_splat_that_moves_along_its_face_takes_its_anchor_with_it(start):
-    """A move along the normal leaves the anchor on the plane of the face; one across follows."""
+    """A move along the normal leaves the anchor in place; a move within the face moves it too."""
     _, refining, params = start
     asset = build(refining, params)
     half = float(refining.surface.box.half_extent)
@@ -90,7 +90,7 @@ def test_a_splat_that_moves_along_its_face_takes_its_anchor_with_it(start):
     np.testing.assert_allclose(lifted.splats.anchors, asset.splats.anchors, atol=1e-6)
     change = np.asarray(lifted.splats.means - asset.splats.means)
     np.testing.assert_allclose(change[real], shift[real], atol=1e-6)
-    # A tenth of the way to the middle of its face a splat is still on it.
+    # A splat that moves a tenth of the way to the middle of its face is still on the face.
     faces = np.asarray(asset.mesh.faces)[np.asarray(asset.splats.parents)]
     middles = np.asarray(asset.mesh.vertices, float)[faces].mean(axis=1)
     anchors = np.asarray(asset.splats.anchors, float)
@@ -105,7 +105,7 @@ def test_a_splat_that_moves_along_its_face_takes_its_anchor_with_it(start):
 
 
 def test_a_splat_that_leaves_its_face_is_shaded_on_it(start):
-    """Beyond an edge the plane of a face may lie behind another face."""
+    """Beyond an edge of the face, its plane may lie behind another face."""
     _, refining, params = start
     rng = np.random.default_rng(3)
     moves = jnp.asarray(rng.normal(scale=0.05, size=params.splats.means.shape), jnp.float32)
@@ -203,7 +203,7 @@ def test_a_surface_that_moves_is_refused():
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A whole run of three stages, and one of the same start that was stopped in the last."""
+    """An uninterrupted run of three stages, and one that was stopped in the last and resumed."""
     dataset, config = sphere_dataset(), tiny_config(*REFINE)
     whole, parted = (tmp_path_factory.mktemp(name) / "run" for name in ("whole", "parted"))
     state = fit(dataset, config, whole)
@@ -238,7 +238,7 @@ def test_refined_splats_are_rendered_and_relit(run):
     dataset, folder, _ = run
     trained = load_trained(folder)
     assert trained.stage.name == "refine"
-    # A place that is too dark for a metal, among others.
+    # Some places are too dark for a metal.
     dark = trained.params.splats.means[:, :1] > 0
     splats = trained.params.splats
     splats = replace(splats, albedo=jnp.where(dark, 0.05, splats.albedo))
@@ -247,7 +247,7 @@ def test_refined_splats_are_rendered_and_relit(run):
     image = renderer(dataset.train.camera([0]))
     assert image.alpha.max() > 0.9
     assert np.all(np.isfinite(image.rgb))
-    # What is baked into textures is what the splats have learned.
+    # Textures are baked from the materials that the splats have learned.
     asset = renderer.asset()
     count = int(asset.splats.count)
     anchors = np.asarray(asset.splats.anchors)[:count]

@@ -1,4 +1,4 @@
-"""A run under another light: its orientation, the cameras' way round, files and errors."""
+"""A run under another light: orientation of the light, orbits of cameras, files and errors."""
 
 from dataclasses import replace
 
@@ -45,7 +45,7 @@ AXES = {
     "+y": np.array([0, 1.0, 0]),
 }
 SIZE = 16
-# Eager, each of their many small operations would be compiled on its own.
+# In eager mode, each of their many small operations would be compiled on its own.
 lookup = jax.jit(environment.lookup)
 rotate_light = jax.jit(environment.rotate_light)
 
@@ -54,7 +54,7 @@ def four_colours(height=16):
     """Red at +x, green at -y, blue at -x, yellow at +y; white above and black below."""
     width = 2 * height
     polar = (np.arange(height) + 0.5) / height * np.pi
-    # Written out once more, so that the test does not lean on what it tests.
+    # The convention is implemented again, so that the test does not rely on the code under test.
     azimuth = (0.5 - (np.arange(width) + 0.5) / width) * 2 * np.pi
     texels = np.zeros((height, width, 3))
     for column, angle in enumerate(azimuth):
@@ -73,10 +73,10 @@ def light():
 
 def relit_ball(light, **material):
     pipeline, params = ball_of_one_material(tiny_config("material.bias=true"), **material)
-    # What was trained on is black: nothing but the new light may show.
+    # The light of the training is black, so that only the new light can show.
     params = replace(params, light=EnvLight(jnp.zeros_like(params.light.radiance)))
     renderer = Renderer(replace(pipeline, capacities=AMPLE), params, samples=64)
-    # A ball shadows nothing but its own far side; without rays the programs are half as large.
+    # A ball only shadows its own far side, so rays are left out, which halves the programs.
     return renderer.relit(light, indirect="unshadowed")
 
 
@@ -91,13 +91,13 @@ def mirror(light):
 
 
 def hue(colour):
-    """Colour with its white part taken out, and of unit length."""
+    """Colour without its white part, normalised to unit length."""
     bare = np.asarray(colour, float) - np.min(colour)
     return bare / np.linalg.norm(bare)
 
 
 def has_colour(found, expected, factor=1.7):
-    """Whether every channel of a colour outshines all the others by a factor."""
+    """Whether the lit channels of a colour exceed all its other channels by a factor."""
     lit = np.asarray(expected) > 0.5
     return np.min(np.asarray(found)[lit]) > factor * np.max(np.asarray(found)[~lit])
 
@@ -117,7 +117,7 @@ def camera_from(eye, **kwargs):
 
 @pytest.mark.parametrize("kind", ["matt", "mirror"])
 def test_every_side_of_a_ball_has_the_colour_that_shines_on_it(kind, request):
-    """Seen straight on: the ball's +x side is red, and so on round."""
+    """Each side is seen from the front: the ball's +x side is red, and so on."""
     relit = request.getfixturevalue(kind)
     for side, axis in AXES.items():
         view = relit(camera_from(3 * axis))
@@ -127,7 +127,7 @@ def test_every_side_of_a_ball_has_the_colour_that_shines_on_it(kind, request):
 
 
 def test_a_matt_ball_shows_the_irradiance_of_the_map(matt):
-    """The sum over texels, written out: albedo / pi times radiance, cosine and solid angle."""
+    """The reference is a sum over texels: albedo / pi times radiance, cosine and solid angle."""
     texels = four_colours().astype(float)
     height, width, _ = texels.shape
     polar = (np.arange(height) + 0.5) / height * np.pi
@@ -141,12 +141,13 @@ def test_a_matt_ball_shows_the_irradiance_of_the_map(matt):
         cosine = np.maximum(towards @ axis, 0)
         expected = 0.95 * np.sum((share * cosine)[..., None] * texels, axis=(0, 1))
         found = where_the_surface_faces(matt(camera_from(3 * axis)), axis)
-        # Splats mix some twenty degrees of normals, and the specular lobe adds 4 %.
+        # A pixel mixes splats whose normals differ by some twenty degrees, and the specular lobe
+        # adds 4 %.
         np.testing.assert_allclose(found, expected, atol=0.08)
 
 
 def test_a_camera_between_two_sides_sees_both_where_they_are(matt):
-    """The side is the world's, whatever the camera: right of a view from -y lies +x."""
+    """Sides belong to the world, not to the camera: in a view from -y, +x lies to the right."""
     for eye in ([2.2, -2.2, 0.5], [2.2, -2.2, 0.0]):
         view = matt(camera_from(eye))
         for side in ("+x", "-y"):
@@ -164,7 +165,7 @@ def test_a_mirror_shows_the_sky_above_and_the_dark_ground_below(mirror):
     straight = view.rgb / np.maximum(view.alpha, 0.5)[..., None]
     middle = SIZE // 2
 
-    # A surface that leans 45 degrees towards the zenith mirrors it into a level view.
+    # A surface whose normal leans upwards by 45 degrees reflects the zenith to a level camera.
     def at(lean):
         normal = np.array([np.cos(lean), 0.0, np.sin(lean)])
         score = np.where(covered, view.aovs["normal"] @ normal, -np.inf)
@@ -185,7 +186,7 @@ def test_turning_the_light_by_a_quarter_moves_red_from_x_to_y(light, matt):
     np.testing.assert_allclose(seen[list(AXES).index("+y")], RED, atol=1e-3)
     view = matt.under(turned)(camera_from([0.0, 3.0, 0.0]))
     assert has_colour(where_the_surface_faces(view, AXES["+y"]), RED)
-    # The renderer that it came from still shows yellow there.
+    # The renderer with the first light still shows yellow there.
     before = matt(camera_from([0.0, 3.0, 0.0]))
     assert has_colour(where_the_surface_faces(before, AXES["+y"]), YELLOW)
 
@@ -207,7 +208,7 @@ def test_the_background_towards_a_side_has_its_colour(light, side):
 
 
 def test_the_background_is_upright_and_not_mirrored(light):
-    """Towards +x, 120 degrees wide: yellow (+y) lies left, green (-y) right, white above."""
+    """In a view of 120 degrees towards +x, yellow (+y) is left, green (-y) right, white above."""
     camera = camera_from([-3.0, 0.0, 0.0], field_of_view=2 * np.arctan(np.sqrt(3)))
     shown = picture(nothing(), camera, light, "light")
     middle = SIZE // 2
@@ -337,11 +338,11 @@ def test_the_orbit_goes_counter_clockwise_and_keeps_distance_and_view():
         expected = center + about_z(angle) @ (eye - center)
         np.testing.assert_allclose(moved.centers[0], expected, atol=1e-5)
         assert np.linalg.norm(moved.centers[0] - center) == pytest.approx(np.sqrt(5), rel=1e-5)
-        # The centre stays where it was in the camera's axes.
+        # The centre of the orbit keeps its place in camera axes.
         point = np.asarray([*center, 1.0], np.float32)
         here, there = (np.asarray(x.world_to_camera[0]) @ point for x in (moved, camera))
         np.testing.assert_allclose(here, there, atol=1e-5)
-    # From +x to +y, seen from above.
+    # A quarter turn moves the camera from +x to +y.
     quarter = orbit(camera_from([3.0, 0.0, 0.0]), np.zeros(3), np.pi / 2)
     np.testing.assert_allclose(quarter.centers[0], [0, 3, 0], atol=1e-5)
 
@@ -383,7 +384,7 @@ def test_relighting_writes_stills_and_movies(light, matt, tmp_path, monkeypatch)
     assert rgba.shape == (SIZE, SIZE, 4)
     assert rgba[0, 0, 3] == 0
     assert rgba[SIZE // 2, SIZE // 2, 3] > 200
-    # Towards -x: blue behind, the red side in front.
+    # In this view towards -x, the background is blue, and the front of the ball is red.
     assert hue(shown[0, 0]) @ hue(BLUE) > 0.97
     assert has_colour(shown[SIZE // 2, SIZE // 2], RED, 1.2)
     for path in written[4:]:
@@ -393,7 +394,8 @@ def test_relighting_writes_stills_and_movies(light, matt, tmp_path, monkeypatch)
             for k in range(2):
                 film.seek(k)
                 frames.append(np.asarray(film.convert("RGB"), float) / 255)
-        # Half a turn of camera or light: the ball's other side is seen, or lit.
+        # Half a turn of the camera shows the blue side of the ball; half a turn of the light brings
+        # blue light to the side in view.
         first, second = (frame[SIZE // 2, SIZE // 2] for frame in frames)
         assert has_colour(first, RED, 1.2)
         assert has_colour(second, BLUE, 1.2)

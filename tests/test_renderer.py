@@ -1,4 +1,4 @@
-"""Renderers on the host: what they equal, what they average, and what a new light leaves alone."""
+"""Renderers on the host: results, averages, and what a new light does not change."""
 
 from dataclasses import replace
 
@@ -34,8 +34,8 @@ BUFFERS = ("surface_cubes", "dual_vertices", "quads", "visible", "hits", "chunks
 AMPLE = Capacities(**dict(zip(BUFFERS, (256, 256, 256, 4096, 8192, 2048, 4096), strict=True)))
 COMMON = ("material.bias=true", "stages.monte_carlo.enter=[]", *MONTE_CARLO)
 CONFIG = tiny_config(*COMMON)
-# As under a new light without shadows, so that both share their programs. Rays double what there is
-# to compile; the evaluation's tests trace them.
+# These are the settings of relighting without shadows, so that both share their programs. Rays
+# would double the compilation; the tests of the evaluation trace them.
 DIRECT = tiny_config(
     *COMMON,
     "stages.monte_carlo.transport.occlusion=false",
@@ -53,7 +53,7 @@ def sky(scale=1.0, seed=0):
 
 
 def second_stage(config, pipeline):
-    """The pipeline of the second stage, on the surface of another one."""
+    """The pipeline of the second stage, on the surface of another pipeline."""
     built = build_pipeline(config, config.stage("monte_carlo"), pipeline.surface)
     return replace(built, capacities=AMPLE)
 
@@ -122,7 +122,7 @@ def test_too_small_buffers_grow_and_change_no_pixel(matt, camera):
     ample, grown = (
         Renderer(replace(pipeline, capacities=size), params)(camera) for size in (AMPLE, tight)
     )
-    # Programs of other sizes fuse otherwise: the last bit of a float32.
+    # Programs of other sizes are fused differently, which changes the last bit of float32.
     np.testing.assert_allclose(grown.rgb, ample.rgb, atol=1e-6)
     np.testing.assert_allclose(grown.alpha, ample.alpha, atol=1e-6)
     for name in EVALUATION_AOVS:
@@ -130,7 +130,7 @@ def test_too_small_buffers_grow_and_change_no_pixel(matt, camera):
 
 
 def test_the_program_of_assets_serves_every_light(direct, matt):
-    """Whatever the transport, its samples, and the light."""
+    """It does not depend on the transport, its samples, or the light."""
     renderer = Renderer(direct, matt[1], samples=32)
     renderer.asset()
     before = renderer_module._reconstruct._cache_size()
@@ -192,8 +192,8 @@ def test_the_noise_falls_with_the_samples(direct, camera, material):
     _, params = ball_of_one_material(CONFIG, **material)
     params = replace(params, light=sky())
     few, many = (noise(direct, params, camera, samples) for samples in (32, 128))
-    # The inverse root of 4 would be .5. Highlights take no further passes once the many splats of a
-    # pixel leave so little noise.
+    # Four times the samples would halve the noise. Highlights get no further passes once the splats
+    # of a pixel average to so little noise.
     assert 0 < many < max(0.75 * few, 0.002)
 
 
@@ -209,7 +209,7 @@ def test_the_same_seed_gives_the_same_image_and_another_one_does_not(direct, mat
 def test_relighting_does_not_know_the_light_and_exposure_of_the_training(
     in_second_stage, relit, camera
 ):
-    """Nor what was learned of indirect light, nor in which stage a run stopped."""
+    """Relighting also ignores the learned indirect light, and the stage in which a run stopped."""
     pipeline, params = in_second_stage
     changed = replace(params, light=sky(3.0, seed=9), log_exposure=jnp.float32(-1.0))
     learned = Renderer(pipeline, changed, samples=32)
@@ -224,7 +224,7 @@ def test_another_light_changes_the_colours_alone(relit, camera):
     for name in EVALUATION_AOVS:
         np.testing.assert_array_equal(view.aovs[name], before.aovs[name])
     assert np.mean(np.abs(view.rgb - before.rgb)) > 1e-3
-    # And the first renderer still has its own.
+    # The first renderer still has its own light.
     assert_same_view(relit(camera), before)
 
 
@@ -234,7 +234,7 @@ def test_another_light_is_the_same_as_relighting_with_it(matt, relit, camera):
 
 
 def test_what_a_renderer_has_planned_binds_no_other(relit):
-    """Frames under a light that turns would each grow their buffers, or render once in vain."""
+    """`under` keeps the plan; otherwise each frame under a turning light would grow its buffers."""
     other = relit.under(sky(seed=6))
     other.plan(views_from([[2.2, -1.8, 1.0]], size=200).camera())
     assert other._pipeline.capacities != relit._pipeline.capacities
@@ -253,7 +253,7 @@ def test_a_matt_ball_under_uniform_light_has_the_radiance_of_its_albedo(relit, c
     uniform = EnvLight(jnp.full((8, 16, 3), 0.5, jnp.float32))
     view = relit.under(uniform)(camera)
     straight = (view.rgb / np.maximum(view.alpha, 0.5)[..., None])[view.alpha > 0.95]
-    # .3 of the diffuse lobe, and a few percent of .5 of the specular one.
+    # The diffuse lobe gives .3, and the specular one a few percent of .5.
     assert 0.29 < straight.mean() < 0.36
 
 
@@ -267,7 +267,8 @@ def test_the_scale_multiplies_the_albedo(matt, camera):
     np.testing.assert_allclose(
         scaled.aovs["albedo"], scale * whole.aovs["albedo"], rtol=1e-5, atol=1e-6
     )
-    # Of a dielectric only the diffuse lobe has it as a factor; the samples are the same.
+    # With a dielectric, only the diffuse lobe is proportional to the albedo; the samples are the
+    # same.
     diffuse = whole.rgb - black.rgb
     np.testing.assert_allclose(scaled.rgb, black.rgb + scale * diffuse, atol=2e-4)
     np.testing.assert_array_equal(scaled.aovs["roughness"], whole.aovs["roughness"])
@@ -292,7 +293,7 @@ def test_the_mesh_is_trimmed_and_lies_on_the_ball(relit):
     assert faces.max() == len(vertices) - 1
     assert normals.shape == vertices.shape
     radii = np.linalg.norm(vertices - relit.center(), axis=1)
-    # Vertices lie inside the sphere by a part of the cells' 0.12.
+    # Vertices lie inside the sphere by a fraction of the cell size, which is 0.12.
     np.testing.assert_allclose(radii, 0.4, atol=0.04)
     # The caps at the poles are flat, and a little crooked.
     assert np.all(np.sum(normals * vertices, axis=1) > 0.8 * radii)

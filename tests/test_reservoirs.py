@@ -1,4 +1,4 @@
-"""Reservoirs: their mean equals brute force with every kind of reuse, and faults show."""
+"""Reservoirs: means equal brute force with every kind of reuse, and known faults are detected."""
 
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -25,11 +25,12 @@ from geosplat_jax.transport.sampling import OPEN, cast
 
 KINDS, COPIES, COUNT = 4, 3000, 2
 POINTS = KINDS * COPIES
-STEPS, GROUPS = 4, 100  # copies of a group may share samples, groups hardly
-STANDARD_ERRORS = 5.0  # chance: 6 in ten million, a comparison
+STEPS, GROUPS = 4, 100  # copies in a group may share samples, groups hardly do
+STANDARD_ERRORS = 5.0  # exceeded by chance in 6 of ten million comparisons
 ROWS = 4
 
-# Normals of four points that share a place, up to 80 degrees apart, and where they stand.
+# Normals and x coordinates of four points that share a place; the normals are up to 80 degrees
+# apart.
 NORMALS = np.array([[0, 0, 1], [0.64, 0, 0.77], [-0.64, 0, 0.77], [0, 0.5, 0.866]])
 PLACES = np.array([0.0, 0.35, -0.35, 0.1])
 
@@ -59,7 +60,7 @@ class Wall(RayIndex):
 
 
 def scene():
-    """Copies of four points, side by side, whose faces never block."""
+    """Copies of four points, one after the other; their own faces never block light."""
     normals = NORMALS / np.linalg.norm(NORMALS, axis=1, keepdims=True)
     positions = np.zeros((KINDS, 3))
     positions[:, 0] = PLACES
@@ -83,7 +84,7 @@ def truth():
 
 
 def irradiance(normals, largest_x):
-    """Irradiance / pi in green by brute force: texels cut in 40 x 40, bilinear between centres."""
+    """Irradiance / pi in green by brute force: 40 x 40 bilinear lookups per texel."""
     fine = 40 * ROWS
     directions = np.asarray(light_directions(fine, 2 * fine), float).reshape(-1, 3)
     share = np.asarray(texel_solid_angles(fine, 2 * fine), float)
@@ -100,7 +101,7 @@ def irradiance(normals, largest_x):
 
 @partial(jax.jit, static_argnames=("spec",))
 def one_step(key, store, spec):
-    """Estimates (points,) of one step, and what it leaves."""
+    """Return the estimates of one step, (points,), and the store that it leaves."""
     points, light, index = scene(), sky(), Wall()
     sampler = light_sampler(light)
     found = resample(key, points, light, sampler, index, store, spec=spec, count=COUNT)
@@ -114,7 +115,7 @@ def one_step(key, store, spec):
 
 
 def errors(spec, seed=0):
-    """Return bias of the kinds after some steps, and its standard error, relative to the truth."""
+    """Return the relative bias of each kind of point after some steps, and its standard error."""
     store = empty_store(spec, COUNT) if spec.reuse_steps else None
     for step in range(STEPS):
         key = jax.random.fold_in(jax.random.key(seed), step)
@@ -150,12 +151,12 @@ def test_the_mean_over_seeds_is_brute_force(how):
 
 
 def test_which_neighbour_is_asked_does_not_decide_what_is_chosen():
-    # Two groups of points in a row: the side of a neighbour says which group it is from. With one
-    # sample of one neighbour, both choices take as many random bits.
+    # Two groups of points in a row, so that the side of a neighbour tells its group. With one
+    # sample of one neighbour, both choices take equally many random bits.
     each, keys = 12, 20_000
     normals = np.repeat([[0, 0, 1], [0.77, 0, 0.64]], each, axis=0)
     normals = jnp.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True), jnp.float32)
-    count, light, wall = 2 * each, sky(), 0.3  # what no target knows
+    count, light, wall = 2 * each, sky(), 0.3  # no target function knows the wall
     faces = jnp.arange(count, dtype=jnp.int32)
     points = SurfacePoints(jnp.zeros_like(normals), normals, normals, faces, faces >= 0)
     sampler, spec = light_sampler(light), replace(PLAIN, candidates=2, neighbors=1)
@@ -215,7 +216,7 @@ def shaded(key, carry, settings):
     """Diffuse light, specular colour and carry of one step of a whole transport."""
     points, transport = scene(), settings.build(LightSpec())
     materials = Materials(jnp.full((POINTS, 3), 0.5), jnp.full(POINTS, 0.6), jnp.ones(POINTS))
-    # Blocked directions bring the logistic function of -1, of 0 less 3 by default.
+    # Blocked directions have a radiance of sigmoid(2 - 3); the default would be sigmoid(0 - 3).
     attributes = Attributes(materials, None, jnp.full((POINTS, 6), 2.0))
     first, second = jax.random.split(key)
     prepared, carry = transport.prepare(first, points, attributes, sky(), Wall(), carry)
@@ -243,7 +244,7 @@ def test_blocked_directions_are_counted_once_when_reservoirs_leave_them_out():
 
 
 def test_normals_that_face_away_lose_no_highlight_to_reservoirs():
-    """Samples were chosen above the normal; the specular lobe looks above the flipped one."""
+    """Samples are above the normal, but the specular lobe needs those above the flipped normal."""
     count = 4000
 
     def rows(angle):
@@ -274,7 +275,7 @@ def test_normals_that_face_away_lose_no_highlight_to_reservoirs():
 
 
 def test_what_a_place_kept_is_used_only_nearby_and_on_a_surface_of_that_direction():
-    """And counts at most half as much as the step's own four candidates, as the setting says."""
+    """It counts at most half as much as the four candidates of the step, as the setting says."""
     spec = replace(REUSE["steps"], candidates=4, confidence=0.5)
     points, light, index = scene(), sky(), Wall()
     store = empty_store(spec, COUNT)
@@ -293,7 +294,7 @@ def test_what_a_place_kept_is_used_only_nearby_and_on_a_surface_of_that_directio
     turned = replace(points, normals=-points.normals)
     for now, is_used in ((points, True), (moved, True), (far, False), (turned, False)):
         found = np.asarray(run(jax.random.key(1), now, store).confidences)
-        # Lanes and collisions: some places lie in slots that others took.
+        # Because of lanes and collisions, some places lie in slots that other places took.
         assert (np.mean(found == 6.0) > 0.5) == is_used
         assert set(np.unique(found)) <= ({4.0, 6.0} if is_used else {4.0})
     # A step that sees no point leaves the store as it is.

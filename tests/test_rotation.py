@@ -17,7 +17,7 @@ ROUNDING = 2e-6  # a few float32 roundings of unit-size numbers
 
 def _quaternions(count=200, seed=0):
     quats = np.random.default_rng(seed).standard_normal((count, 4))
-    # Half turns about each axis, and nearly so, where single-formula conversions fail.
+    # Half turns about each axis, exact and approximate, where conversions by a single formula fail.
     edges = np.concatenate([np.eye(4), np.eye(4) + 1e-4])
     return np.concatenate([quats, edges])
 

@@ -46,7 +46,7 @@ def run(folder):
 
 @pytest.fixture(scope="module")
 def commanded(run, folder):
-    """The same from the command."""
+    """The same run from the command line."""
     assert command(*train_arguments(folder / "duck", folder / "command")) == 0
     return gs.Run(folder / "command")
 
@@ -216,7 +216,7 @@ def test_every_setting_is_listed_with_its_default_range_and_meaning(capsys):
     assert "geometry.resolution 32 >= 5, <= 512" in shown
     assert "longest side" in shown
     assert command("settings", "nothing") == 2
-    # Where nobody looks on, a line is a line: paths are found by grep.
+    # Output that is not a terminal is not wrapped, so that grep finds whole paths.
     assert command("settings", "stages.monte_carlo") == 0
     lines = capsys.readouterr().out.splitlines()
     assert any(

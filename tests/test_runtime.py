@@ -1,4 +1,4 @@
-"""Process settings: the cache's place, and an allocator call that never fails loudly."""
+"""Process settings: the place of the cache, and an allocator call that never raises."""
 
 import sys
 
@@ -37,7 +37,7 @@ def test_a_cache_chosen_by_the_user_is_respected(monkeypatch, cache_setting):
 def test_programs_are_forgotten_when_they_hold_too_many_maps(monkeypatch):
     double = jax.jit(lambda x: 2 * x)
     double(jax.numpy.ones(3))
-    monkeypatch.setattr(runtime, "_CROWDED", 1.0)  # whatever tests before this one have compiled
+    monkeypatch.setattr(runtime, "_CROWDED", 1.0)  # whatever earlier tests have compiled
     assert runtime.release_programs_when_crowded() is False
     assert double._cache_size() == 1
     monkeypatch.setattr(runtime, "_CROWDED", 0.0)

@@ -1,8 +1,8 @@
-"""A surface, a light transport, splats and a stage of one's own train through the same loop.
+"""A user's own surface, light transport, splats and stage train through the same loop.
 
 Nothing in the package knows the classes of this file: a surface of plain triangles whose vertices
 are the parameters, with rays by brute force, and a third stage with a transport that keeps a carry.
-docs/extending.md shows what stands between the marks.
+docs/extending.md shows the code between the marks.
 """
 
 import json
@@ -107,7 +107,7 @@ class TrianglesSettings(SurfaceSettings, kind="triangles"):
     """An icosphere."""
 
     radius: NonNegative = 0.45
-    """Of the sphere."""
+    """Radius of the sphere."""
 
     @property
     def rate_groups(self):
@@ -136,7 +136,7 @@ class TrianglesSettings(SurfaceSettings, kind="triangles"):
 
 
 class LampLight(Illumination):
-    """Nothing but a number."""
+    """Light that is a single number."""
 
     brightness: jax.Array
 
@@ -145,7 +145,7 @@ class LampLight(Illumination):
 
 
 class Lamp(Transport):
-    """A light at the camera that grows with the steps it has seen."""
+    """A light at the camera that gets brighter with every step."""
 
     growth: jax.Array
 
@@ -181,7 +181,7 @@ class Darken(Entry, kind="darken"):
     """Multiply the light when the stage begins."""
 
     factor: NonNegative = 0.5
-    """Of the radiance."""
+    """Factor of the radiance."""
 
     def apply(self, params, pipeline, key):
         return replace(

@@ -1,4 +1,4 @@
-"""What the studies of shape consistency stand on: meshes from distances, crops, free constants."""
+"""Helpers of the studies of shape consistency: meshes from distances, crops, free constants."""
 
 import sys
 from pathlib import Path
@@ -39,7 +39,7 @@ def a_ball():
 
 
 def test_a_crop_is_the_part_of_the_view_that_it_was_cut_from():
-    """With the faces that show in it, and no others far away."""
+    """The crop has the faces that are visible in it, and no others far away."""
     ball = a_ball()
     camera = ball.cameras[0]
     crop = shape_constants.cut(ball, camera, 16, np.random.default_rng(3))

@@ -1,4 +1,4 @@
-"""The study of shortcuts: what noise leaves in means is taken out of biases."""
+"""The study of shortcuts: biases are corrected for the noise that is left in means."""
 
 import sys
 from pathlib import Path
@@ -37,9 +37,10 @@ def test_a_bias_is_found_on_average_and_its_error_is_not_too_small(true):
     values, errors = np.array(found).T
     spread = float(values.std(ddof=1))
     assert abs(float(values.mean()) - true**2) < 4 * spread / np.sqrt(len(values))
-    # A plain distance of the means would be larger by the noise of both: 40 (1 + .25) / 8.
+    # The plain squared distance of the means would be larger by the noise of both: 40 (1 + .25) /
+    # 8.
     assert abs(float(values.mean()) - true**2) < 0.2 * 6.25
-    # Twice the variance where there is no bias: errors err on the safe side.
+    # Without a bias, the variance is estimated twice as large, so errors err on the safe side.
     assert 0.8 * spread < float(np.median(errors)) < 1.7 * spread
 
 
@@ -84,5 +85,5 @@ def test_every_shortcut_differs_from_the_run_and_the_reference_has_none():
     pipelines = shortcuts.shortcuts(_pipeline())
     choices = [(p.transport.settings, p.raster) for p in pipelines.values()]
     assert len(set(choices)) == len(choices)
-    # With other seeds, this row shows what chance alone does.
+    # This row has the same transport with other seeds, and shows the effect of chance alone.
     assert pipelines["16 samples"].transport == exact.transport

@@ -1,4 +1,4 @@
-"""Cameras to render from: views, files and circles, of any size and angle; and what is written."""
+"""Cameras to render from, out of views, files and circles, of any size; and the written files."""
 
 import json
 from dataclasses import replace
@@ -163,7 +163,7 @@ def rendered():
 
 
 def test_floats_are_straight_linear_values_and_zero_beside_the_object(tmp_path):
-    """Of colours brighter than white, too."""
+    """This also holds for colours brighter than white."""
     view, rgb, straight = rendered()
     assert np.max(rgb[view.alpha > 0]) > 2.0
     names = ("albedo", "roughness", "metallic", "normal", "depth")

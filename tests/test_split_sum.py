@@ -31,7 +31,7 @@ FG_QUADRATURE = 1e-3  # 64 x 64 midpoint rule
 FG_TABLE = 4e-3  # bilinear interpolation in 128 x 32 entries, n.v >= .02
 SPEC = LightSpec(16, 32, (0.0, 0.3, 0.6, 1.0))
 
-# Compiled once a shape: eager execution compiles every operation by itself.
+# Compiled once per shape; eager execution compiles every operation by itself.
 prefiltered = jax.jit(prefilter)
 shade = jax.jit(split_sum, static_argnames=("two_sided", "baked_diffuse"))
 
@@ -177,7 +177,8 @@ def test_a_diffuse_sphere_equals_direct_integration():
     spec = LightSpec(32, 64, (0.0, 1.0))
     light = _light(4, spec)
     normals = np.asarray(light_directions(8, 16), np.float64).reshape(-1, 3)
-    # Direct integration: every texel of a map four times finer, as a small light source.
+    # Direct integration takes every texel of a map that is four times finer as a small light
+    # source.
     fine = np.asarray(light_directions(128, 256), np.float64).reshape(-1, 3)
     radiance = np.asarray(lookup(light.radiance, jnp.asarray(fine, jnp.float32)), np.float64)
     radiance *= np.asarray(texel_solid_angles(128, 256), np.float64).reshape(-1, 1)
@@ -211,7 +212,8 @@ def test_split_sum_is_close_to_the_rendering_integral_under_smooth_light(roughne
             prefiltered(light, prefilter_operators(spec)),
             fg_table(),
         )
-        # The approximation itself: lobes are not stretched. Head on it is nearly exact.
+        # The tolerance is that of the approximation itself, which does not stretch lobes. At normal
+        # incidence it is nearly exact.
         np.testing.assert_allclose(shaded.rgb[0], expected, atol=0.01 if n_dot_v == 1 else 0.15)
 
 

@@ -1,4 +1,4 @@
-"""From one stage to the next: what enters, what stays, and runs through both stages."""
+"""From one stage to the next: entries, kept parameters, and runs through both stages."""
 
 import json
 from dataclasses import replace
@@ -43,7 +43,7 @@ def test_a_stage_keeps_or_redraws_the_albedo_as_asked(shared, fresh):
 
     before, after = params.material, begun.material
     assert same(before.albedo_head, after.albedo_head) is not fresh
-    # One encoding of everything cannot be drawn anew for the albedo alone.
+    # A shared encoding cannot be initialised again for the albedo alone.
     assert same(before.albedo_table, after.albedo_table) is (shared or not fresh)
     assert same(before.surface_table, after.surface_table)
     assert same(before.surface_head, after.surface_head)
@@ -96,7 +96,7 @@ def test_a_fresh_albedo_is_the_mean_of_the_stage_before_beside_the_surface():
     ],
 )
 def test_a_fresh_albedo_is_grey_where_asked_and_where_there_is_no_surface(override, radius):
-    """Radiance is no albedo, and there is no mean over an empty surface."""
+    """The first case asks for grey; in the second there is no mean over an empty surface."""
     config, pipeline, params = _varied_ball(override, radius=radius)
     begun = _begun(config, params, pipeline)
     np.testing.assert_allclose(_albedo(begun, np.zeros((4, 3)), pipeline), 0.5, rtol=1e-6)
@@ -106,7 +106,7 @@ def test_a_fresh_albedo_is_grey_where_asked_and_where_there_is_no_surface(overri
     ("after", "is_kept"), [("harmonics", True), ("radiometric", False), ("constant", False)]
 )
 def test_a_head_of_indirect_light_is_kept_where_it_means_the_same(after, is_kept):
-    """Harmonics and radiometric light have equally many numbers, of what arrives and is sent."""
+    """Harmonics (arriving light) and radiometric (sent light) have equally many coefficients."""
     config = tiny_config(
         "geometry.resolution=6",
         "stages.monte_carlo.steps=1",
@@ -191,7 +191,7 @@ def dataset():
 
 @pytest.fixture(scope="module")
 def whole(dataset, tmp_path_factory):
-    """A run through both stages, three steps each, in one go."""
+    """An uninterrupted run through both stages, with three steps each."""
     folder = tmp_path_factory.mktemp("runs") / "whole"
     return folder, fit(dataset, tiny_config(*RUN), folder)
 
@@ -204,7 +204,7 @@ def test_a_run_goes_through_both_stages(whole):
     assert [line["stage"] for line in lines] == ["split_sum"] * 3 + ["monte_carlo"] * 3
     assert all(np.isfinite(line["loss"]) for line in lines)
     assert ["cell_patches" in line["usage"] for line in lines] == [False] * 3 + [True] * 3
-    # The second stage begins with buffers for what the first one needed, and counts what is new.
+    # The second stage starts with buffers for what the first one needed, and adds new ones.
     before, after = lines[2]["capacities"], lines[3]["capacities"]
     assert set(after) - set(before) == {"cell_patches"}
     assert all(lines[2]["usage"][name] <= after[name] <= size for name, size in before.items())
@@ -241,7 +241,7 @@ def test_the_first_stage_of_another_run_can_be_taken_over_bit_for_bit(
         state, fit(dataset, tiny_config(*RUN), tmp_path, begin=TakeOver(folder, "monte_carlo"))
     )
     assert [line["step"] for line in lines_of(tmp_path)] == [3, 4, 5]
-    # Also when it was stopped before its first step: what it took over is in its own folder.
+    # This also holds for a run stopped before its first step: its own folder has what it took over.
     early = tmp_path.parent / f"{tmp_path.name}_early"
 
     def stop(*arguments, **others):
@@ -260,14 +260,14 @@ def test_the_first_stage_of_another_run_can_be_taken_over_bit_for_bit(
 
 @pytest.mark.slow
 def test_a_run_that_ended_with_its_first_stage_can_be_taken_further(dataset, whole, tmp_path):
-    """Its later stages need not be the same; here it had none."""
+    """The later stages of the first run may differ; here it had none."""
     first, later = tmp_path / "first", tmp_path / "later"
     fit(dataset, tiny_config(*RUN, "stages.monte_carlo.steps=0"), first)
     assert not (first / "stages").exists()
     assert_same(
         whole[1], fit(dataset, tiny_config(*RUN), later, begin=TakeOver(first, "monte_carlo"))
     )
-    # And a run that took a stage over can be resumed.
+    # A run that took over a stage can be resumed as well.
     third = tmp_path / "third"
     fit(dataset, tiny_config(*RUN), third, begin=TakeOver(first, "monte_carlo"), stop_after=4)
     assert_same(whole[1], fit(dataset, tiny_config(*RUN), third, begin=Resume()))
@@ -323,7 +323,7 @@ def test_a_surface_that_vanishes_later_is_put_back_as_its_stage_began(
         if step == 3 and not emptied:
             emptied.append(self.state.params.geometry)
             gone = replace(emptied[0], sdf=jnp.abs(emptied[0].sdf) + 1.0)
-            # A copy: the step consumes the buffers of what it is given.
+            # This is a copy, since the step consumes the buffers of its arguments.
             emptied[0] = jax.tree.map(np.array, emptied[0])
             self.state = replace(self.state, params=replace(self.state.params, geometry=gone))
         return advance(self, step)

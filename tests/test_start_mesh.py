@@ -1,4 +1,4 @@
-"""Meshes to start from: what is cleaned, what is refused, and that the cameras have a say."""
+"""Meshes to start from: cleaning, refused meshes, and agreement with the cameras."""
 
 import sys
 from dataclasses import replace
@@ -74,7 +74,7 @@ def test_what_is_no_surface_is_dropped_and_said(tmp_path):
     away = np.array([[9.0, 9, 9]])
     doubled = np.concatenate([vertices, vertices[:1] + 1e-9, away])
     split = np.where((faces == 0) & (np.arange(80) < 40)[:, None], len(vertices), faces)
-    middle = [[3, 3, 7], [0, 42, 5]]  # two corners at one place
+    middle = [[3, 3, 7], [0, 42, 5]]  # faces with two corners at the same place
     again = [faces[7], faces[9][::-1]]
     mesh = read(written(tmp_path, doubled, np.concatenate([split, middle, again])))
     assert mesh.is_closed
@@ -115,9 +115,9 @@ def test_an_open_mesh_is_wound_alike_where_that_is_possible(tmp_path):
     mesh = read(written(tmp_path, body.vertices, mixed))
     assert not mesh.is_closed
     outward = np.einsum("fd,fd->f", normals_of(mesh), mesh.vertices[mesh.faces].mean(axis=1))
-    assert (outward > 0).all()  # as most were
+    assert (outward > 0).all()  # as most faces were
     assert any("now alike" in note for note in mesh.notes)
-    # A band with a half turn.
+    # A band with a half turn, which has no orientation.
     around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     across = np.array([-0.2, 0.2])[:, None]
     radius = 1 + across * np.cos(0.5 * around)
@@ -160,7 +160,7 @@ def test_a_flag_with_a_front_and_a_back_stays_and_a_wall_between_rooms_goes(tmp_
     assert len(mesh.faces) == 12
     two = trimesh.util.concatenate(rooms)
     faces, wall = np.array(two.faces), np.isclose(two.triangles_center[:, 0], 1.0)
-    # One diagonal for both sides of the wall.
+    # Both sides of the wall have the same diagonal.
     corners = {tuple(p): n for n, p in enumerate(np.round(two.vertices, 6).tolist())}
     a, b, c, d = (corners[1.0, y, z] for y, z in ((0, 0), (1, 0), (1, 1), (0, 1)))
     panels = np.array([[a, b, c], [a, c, d], [c, b, a], [d, c, a]])
@@ -200,7 +200,7 @@ def test_faces_of_many_corners_are_read_if_they_are_convex(tmp_path):
 
 
 def test_corners_on_a_straight_side_and_lines_that_go_on_are_no_faults(tmp_path):
-    """As CAD programs write them, with six decimals."""
+    """CAD programs write such corners, with six decimals."""
     outline = np.array([[0, 0, 0], [2, 0, 0], [4, 0, 0], [4, 3, 0], [0, 3, 0]], float)
     path = tmp_path / "plate.obj"
     for seed in range(40):
@@ -241,7 +241,7 @@ def test_meshes_that_cannot_be_used_are_refused(tmp_path, monkeypatch):
     written(tmp_path, 2 * vertices, faces)
     with pytest.raises(ValueError, match="is not the mesh that it was"):
         read_start(path, digest)
-    # Ten million faces, without their memory.
+    # Ten million faces by broadcasting, which takes no memory.
     many = np.broadcast_to(np.array([[0, 1, 2]], np.int32), (10_000_000, 3))
     monkeypatch.setattr(start_mesh, "read_mesh", lambda path: (vertices, many))
     read_start.cache_clear()
@@ -323,12 +323,12 @@ def test_agreement_falls_with_the_size_to_either_side(views):
     assert right > 0.8
     for factor in (0.5, 2.0):
         assert agreement_with_views(factor * points, views) < 0.3
-    # A start that is a tenth too thick is still one.
+    # A mesh that is a tenth too thick still agrees enough to start from.
     assert agreement_with_views(1.1 * points, views) > 0.5
 
 
 def test_a_pixel_is_as_wide_as_the_cameras_say(views):
-    # From a distance of 3: see `support.look_at_poses`.
+    # The cameras are at a distance of 3: see `support.look_at_poses`.
     mesh = start_mesh.StartMesh(*ball())
     assert pixel_length(mesh, views) == pytest.approx(3 / views.intrinsics[0, 0, 0], rel=1e-6)
 
@@ -346,7 +346,7 @@ def test_coarse_meshes_are_divided_and_fine_ones_decimated(monkeypatch):
     assert len(finer.faces) == 16 * 80
     assert finer.is_closed
     assert any("divided to 16" in note for note in finer.notes)
-    # The limit holds for dividing too.
+    # The limit also holds for subdivision.
     assert len(sized(mesh, edge / 4.5, most_faces=400, path="x").faces) == 320
 
     def halved(vertices, faces, face_count):
@@ -365,7 +365,7 @@ def test_coarse_meshes_are_divided_and_fine_ones_decimated(monkeypatch):
     )
     with pytest.raises(ValueError, match="1280 faces, more than geometry.max_faces = 1000"):
         sized(finer, edge, most_faces=1000, path="x")
-    # Also where it has hardly more, and faces of the size that is wanted.
+    # It is also refused if it has only few faces too many, of the size that is wanted.
     with pytest.raises(ValueError, match="1280 faces, more than geometry.max_faces = 1200"):
         sized(finer, edge / 4.5, most_faces=1200, path="x")
 
@@ -387,7 +387,7 @@ def test_long_edges_are_split_and_the_surface_stays(body):
     assert nondegenerate(*found).all()
     assert surface_area(*found) == pytest.approx(surface_area(vertices, faces), rel=1e-9)
     assert signed_volume(*found) == pytest.approx(signed_volume(vertices, faces), rel=1e-9)
-    # The corners that were there keep their rows.
+    # The original corners keep their rows.
     assert np.array_equal(found[0][: len(vertices)], vertices)
 
 
@@ -428,7 +428,7 @@ def test_a_fine_mesh_is_truly_decimated():
 
 
 def test_a_vertex_of_no_face_may_lie_anywhere(tmp_path):
-    """It says nothing of the size of the mesh, nor need it be a number."""
+    """Such a vertex does not affect the size of the mesh, and may be NaN."""
     ball = trimesh.creation.icosphere(2, 1.0)
     faces = ball.faces[: len(ball.faces) // 2]
     for place in ([0.0, 0.0, 0.0], [np.nan] * 3):

@@ -80,7 +80,7 @@ def test_light_steps_grow_with_its_brightness_and_stop_at_its_floor(params):
     params = replace(params, light=replace(params.light, radiance=radiance))
     directions = jax.tree.map(jnp.ones_like, params)
     moved = _moved(params, directions, rule(light_knee=jnp.float32(0.5)))
-    # Twice at the knee what it is in the dark, and in proportion far above.
+    # The step at the knee is twice that in the dark; far above, it is proportional to the radiance.
     expected = np.maximum(radiance - 0.01 * (1 + radiance / 0.5), 0.0)
     np.testing.assert_allclose(moved.light.radiance, expected, atol=1e-5)
     floored = _moved(params, directions, rule(smallest_light=jnp.float32(0.3)))
@@ -106,7 +106,7 @@ class Bowl(Pipeline):
 
 @pytest.fixture
 def whole_gradient(monkeypatch):
-    """Differentiate the loss of a pipeline as it is, since a bowl has no parts."""
+    """Differentiate the loss of a pipeline as a whole, since a `Bowl` has no parts."""
 
     def value_and_gradient(pipeline, params, batch, *, frozen, run):
         def objective(params):
@@ -138,7 +138,7 @@ def test_a_sound_step_lowers_the_loss_counts_and_carries_on(params):
     state, report = run_step(params, target=1.0)
     assert bool(report.fits)
     assert bool(report.finite)
-    # Adam's first step is the rate, towards the target.
+    # Adam's first step has the size of the rate, towards the target.
     assert float(state.params.log_exposure) == pytest.approx(0.01, rel=1e-4)
     nearer = float(jnp.mean((state.params.light.radiance - 1.0) ** 2))
     assert nearer < float(jnp.mean((params.light.radiance - 1.0) ** 2))

@@ -1,4 +1,4 @@
-"""Ctrl-C ends a command soon, in a line, whatever it is doing, and with a status of its own."""
+"""Ctrl-C ends a command soon, with one line and its own exit status, whatever it is doing."""
 
 import signal
 import subprocess
@@ -33,7 +33,7 @@ with stopping.stops_soon(with_process=True):
 
 
 def stopped(handler="", ends="False"):
-    """Start a program that has no ear for KeyboardInterrupt, and send Ctrl-C."""
+    """Start a program that swallows KeyboardInterrupt, and send Ctrl-C."""
     process = subprocess.Popen(
         [sys.executable, "-c", SWALLOWS.format(handler=handler, ends=ends)],
         stdout=subprocess.PIPE,
@@ -55,7 +55,7 @@ def test_a_program_that_swallows_ctrl_c_ends_all_the_same():
 
 
 def test_threads_that_outlive_a_command_are_not_waited_for():
-    """They compile what nobody wants any more; `stopped` is said once all the same."""
+    """Such threads compile programs that nobody needs any more; `stopped` is still printed once."""
     program = """
 import signal, threading, time
 from geosplat_jax.cli import stopping
@@ -76,7 +76,7 @@ with stopping.stops_soon(with_process={alone}) as say_stopped:
 
 
 def test_ctrl_c_that_a_callback_swallows_is_raised_again():
-    """Python only reports what is raised where nobody can catch it, and goes on."""
+    """Python only reports exceptions that nobody can catch, as in such a callback, and goes on."""
     program = """
 import signal, time
 from geosplat_jax.cli import stopping
@@ -98,7 +98,7 @@ with stopping.stops_soon(with_process=False):
 
 
 def test_ctrl_c_after_the_end_of_a_command_is_silent():
-    """Libraries clean up for some tenths of a second, and would show where they were."""
+    """Libraries clean up for some tenths of a second, and would print a traceback."""
     program = """
 import atexit, signal
 from geosplat_jax.cli import stopping
@@ -122,17 +122,17 @@ from geosplat_jax.fit.train import stop_requests
 requests = stop_requests()
 is_asked = requests.__enter__()
 """
-"""What a training does; here it is in the middle of something that takes long."""
+"""Code of a training that is in the middle of a long operation."""
 
 
 def test_a_training_says_at_once_that_it_will_stop():
-    """Whoever hears nothing for the rest of a compilation presses Ctrl-C again, and loses steps."""
+    """A user who gets no reply during a compilation would press Ctrl-C again, and lose steps."""
     status, said, _ = stopped(REQUEST, "is_asked() and (time.sleep(0.6) or True)")
     assert (status, said) == (0, "stopping after this step; press Ctrl-C again to stop at once\n")
 
 
 def test_the_second_ctrl_c_ends_a_training_that_cannot_hear():
-    """Python calls handlers between its own instructions, of which a compilation has none."""
+    """Python calls signal handlers between its instructions, but a compilation is a single one."""
     program = """
 import hashlib, os, signal, threading
 from geosplat_jax.cli import stopping

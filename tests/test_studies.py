@@ -1,4 +1,4 @@
-"""The studies: each can be called, and what they compute beside the package agrees with it."""
+"""The studies: each can be called, and their own computations agree with the package."""
 
 import importlib
 import json
@@ -26,7 +26,7 @@ from geosplat_jax.fit.folder import RunFolder  # noqa: E402
 from geosplat_jax.fit.presets import make_config  # noqa: E402
 
 IMAGE = 1e-5
-"""Relative L2 between the same sums in another order, float32; what the study itself asks for."""
+"""Relative L2 between float32 sums in different orders; the study itself asks for this."""
 
 OPTIONAL = ("drjit", "matplotlib", "mitsuba")
 """Modules that not every installation has."""
@@ -86,7 +86,7 @@ def test_a_stage_for_the_light_leaves_all_other_stages_as_they_are():
 
 
 def _trained(folder, dataset, config):
-    """Leave the records of a run that was trained, and evaluated with 16 samples."""
+    """Write the records of a run that was trained, and evaluated with 16 samples."""
     folder.mkdir()
     RunFolder(folder).begin(dataset, config, replace=False)
     (folder / "training.json").write_text("{}")

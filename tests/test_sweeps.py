@@ -1,4 +1,4 @@
-"""Sweeps: strict files, shared stages, going on after a stop, and a report that hides nothing.
+"""Sweeps: strict files, shared stages, continuation after a stop, and complete reports.
 
 Training and evaluation are replaced by functions that write the files the real ones write; one
 slow test runs a sweep for real.
@@ -85,7 +85,7 @@ def _arguments(folder, *more):
 
 
 class Fakes:
-    """Stand-ins that leave a run folder, note their calls, and fail where they are told to."""
+    """Stand-ins that write a run folder, record their calls, and fail where they are told to."""
 
     def __init__(self, *, broken=()):
         self.trained, self.evaluated, self.broken = [], [], set(broken)
@@ -222,7 +222,7 @@ def test_a_stage_is_shared_where_only_later_ones_differ(override, shares):
 
 
 def _several_stages(preset, quality, *, material_prior, mesh, overrides):
-    """Stand in for `make_config`: overrides are stages, such as ``a=3`` for three steps of a."""
+    """Stand in for `make_config`: overrides are stages, ``a=3`` for three steps of stage a."""
     named = [text.split("=") for text in overrides]
     return Config(stages=tuple(Stage(name=name, steps=int(steps)) for name, steps in named))
 
@@ -326,7 +326,7 @@ def test_runs_with_the_same_settings_are_made_once(tmp_path):
     assert [label for label, *_ in fakes.trained] == [f"one/{SHARED}", "one/full"]
     record = json.loads((tmp_path / "runs" / "sweep.json").read_text())
     assert {r["name"]: r["same_as"] for r in record["runs"]}["again"] == "full"
-    # Another evaluation makes it another run.
+    # With another evaluation it is a run of its own.
     other = again + 'evaluate = { relight_indirect = "none" }\n'
     sweep = read_sweep(_write(tmp_path, other))
     assert homes(sweep)["again"] == "again"
@@ -390,7 +390,7 @@ def test_settings_of_later_stages_leave_the_shared_ones_as_they_are(tmp_path, ca
     fakes = Fakes()
     assert _run(tmp_path, fakes, *more) == 0
     assert fakes.trained == [("one/many", False, SHARED)]
-    # Those of the shared stage itself do not.
+    # Changed settings of the shared stage itself are refused.
     path = tmp_path / "runs" / "one" / SHARED / "run.json"
     record = json.loads(path.read_text())
     record["config"]["stages"]["split_sum"]["rates"]["sdf"]["value"] = 0.5
@@ -425,7 +425,7 @@ def test_an_interrupted_evaluation_is_repeated_without_training(tmp_path):
 
 
 def test_an_evaluation_of_what_was_replaced_vouches_for_no_other(tmp_path):
-    """An evaluation that dies after its figures is not finished, whatever lay there before."""
+    """An evaluation that fails after its figures is unfinished, whatever was there before."""
     _write(tmp_path)
     some = ["--only", "full", "--scene", "one"]
     assert _run(tmp_path, Fakes(), *some) == 0
@@ -509,7 +509,7 @@ def test_ctrl_c_ends_the_sweep_with_its_own_status(tmp_path, capsys):
 
 
 def test_being_ended_is_as_ctrl_c_while_runs_go_on(tmp_path):
-    """Schedulers end a job by SIGTERM."""
+    """Schedulers end a job with SIGTERM."""
     _write(tmp_path)
     before, handlers = signal.getsignal(signal.SIGTERM), []
 
@@ -565,7 +565,7 @@ def test_ctrl_c_asks_for_a_checkpoint_and_a_second_one_ends_the_process(
     with pytest.raises(KeyboardInterrupt):
         runner.in_a_process(job)
     assert made[0].calls == calls
-    # The terminal's own Ctrl-C would be a second one.
+    # The child has its own session; otherwise the terminal's Ctrl-C would reach it a second time.
     assert made[0].options["start_new_session"]
 
 
@@ -697,7 +697,7 @@ def test_other_seeds_give_a_spread_of_paired_differences(tmp_path):
     other = _other_seed(tmp_path, "again", (30.5, 32.5))
     text = _report(tmp_path, "--seeds", other)
     seeds = _rows(text, "Seeds")
-    # The reference has 30.5 and 32.5, no-shadow differs by -1.5 and -2: means over both scenes.
+    # Means are over both scenes: the reference has 30.5 and 32.5, no-shadow differs by -1.5 and -2.
     assert seeds["full (reference)"] == ["31.50 ± 1.41", "0.0150 (1 seed)"]
     assert seeds["no-shadow"] == ["−1.75 ± 0.35", "+0.0000 (1 seed)"]
     assert "- seed 2: one/full: has no roughness.mse" in text

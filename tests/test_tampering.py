@@ -1,4 +1,4 @@
-"""Files of a run that somebody changed: one line that names the file, and never a traceback."""
+"""Changed files of a run are reported in one line that names the file, never by a traceback."""
 
 import io
 import json
@@ -45,7 +45,7 @@ def npy(array):
 
 
 def rewrite(run, change, *, compression=zipfile.ZIP_STORED):
-    """Write the checkpoint again; ``change`` : of its members and its header."""
+    """Write the checkpoint again, with ``change`` applied to its members and its header."""
     path = latest_checkpoint(run.checkpoints)
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
@@ -234,7 +234,7 @@ def test_textures_of_impossible_sizes_are_refused(run, capsys, size):
 
 
 def test_whole_numbers_beyond_floating_point_are_infinite():
-    """What asks for a finite number then says whose it is; Python's own error names nothing."""
+    """Then the check for finite numbers names the entry; Python's own error names nothing."""
     assert parse_json(f"[{10**200}]") == [10**200]
     for sign, digits in (("", 400), ("-", 400), ("", 5000)):
         (found,) = parse_json(f"[{sign}1{'0' * digits}]")

@@ -1,4 +1,4 @@
-"""What a sweep says of time against quality, the search of the front, and runs on a cluster."""
+"""Time against quality from a sweep, the search for the Pareto front, and runs on a cluster."""
 
 import json
 import signal
@@ -24,7 +24,7 @@ from geosplat_jax.fit.presets import make_config  # noqa: E402
 from geosplat_jax.fit.start_mesh import MeshSettings  # noqa: E402
 
 try:
-    # Here and not within a test: it takes the streams of its log when it is imported.
+    # Imported here and not in a test, since it binds the streams of its log when it is imported.
     import submitit
 except ImportError:
     submitit = None
@@ -162,7 +162,8 @@ def test_the_sweep_of_all_knobs_is_sound():
         where = homes(sweep)
         configs = {run.name: sweep.config(run) for run in sweep.runs}
         assert len({run.group for run in sweep.runs if run.x is not None}) >= 14
-        # Most differ from the base; what a level has already is trained once.
+        # Most runs differ from the base; settings that a quality level already has are trained
+        # once.
         assert sum(where[name] == "base" for name in where) <= 4
         linear = configs["decay-linear"].stage("split_sum")
         assert linear.decay == "linear"
@@ -174,7 +175,7 @@ def test_rates_fall_along_a_line_to_the_end_of_their_stage():
     rates = {"sdf": {"value": 2.0}}
     stage = Stage(steps=10, decay="linear", rates=rates)
     assert [stage.rates_at(k)["sdf"] for k in (0, 5, 10)] == [2.0, 1.0, 0.0]
-    # A pace goes through the line faster, and still ends at zero.
+    # A higher pace goes through the line faster, and still ends at zero.
     hurried = Stage(steps=6, decay="linear", rates=rates, pace=({"step": 2, "speed": 2.0},))
     assert hurried.rates_at(4)["sdf"] == pytest.approx(2.0 * 0.4)
     assert hurried.rates_at(6)["sdf"] == 0.0
@@ -193,14 +194,14 @@ def test_the_tables_say_decibels_per_second_and_the_front(tmp_path, capsys):
     sweep = read_sweep(tmp_path / "sweep.toml")
     base = sweep.config(sweep.runs[0])
     cells, light = base.geometry.resolution, base.stages[1].transport.light_count
-    # 90 steps, which runs share that differ in samples only, and 30 of their own.
+    # Runs that differ only in samples share 90 steps, and have 30 steps of their own.
     seconds = 0.01 * cells * (90 + 30 * light)
     many = _rows(text, "samples")["4 (many)"]
     more = 0.01 * cells * 30 * 3 * light
     assert many[0] == f"×{(seconds + more) / seconds:.2f}"
     assert many[1] != many[0]
     assert many[2] == "×4.00"
-    # One and two decibels for each sample, in the two scenes.
+    # Each sample adds one decibel in one scene, and two in the other.
     assert many[3] == f"+{4.5 * light:.2f} ± {1.5 * light:.2f}"
     assert many[-1] == f"{4.5 * light / more:+.4f}"
     half = _rows(text, "cells")["0.5 (half)"]
@@ -216,13 +217,13 @@ def test_the_tables_say_decibels_per_second_and_the_front(tmp_path, capsys):
 
 
 def _point(psnr, *, seconds=10.0, whole=None, memory=1000.0):
-    """Return a training's point; None for a figure that it lacks."""
+    """Return a point of a training; None stands for a missing figure."""
     figures = {} if psnr is None else {"nvs.psnr": psnr}
     return trade.Point(seconds if whole is None else whole, seconds, memory, figures)
 
 
 def _record(scenes):
-    """Return as much of a sweep's record as the tables read: a base, and one value of a knob."""
+    """Return what the tables read of a sweep's record: a base, and one value of a knob."""
     runs = [
         {"name": "base", "title": "as ever", "x": None, "group": "x"},
         {"name": "more", "title": "more of it", "x": 2.0, "group": "knob"},
@@ -232,9 +233,9 @@ def _record(scenes):
 
 
 def _more(scenes, *seeds):
-    """Return the row of the knob's value; seeds hold, by scene, the base's point and the value's.
+    """Return the row of the knob's value, and the text of the tables.
 
-    A point may be missing.
+    ``seeds`` : by scene, the points of the base and of the value; None for a missing point.
     """
     repeated = [
         {
@@ -248,15 +249,15 @@ def _more(scenes, *seeds):
 
 
 def test_an_error_is_that_over_scenes_of_means_over_seeds():
-    """Two seeds of a scene share what is particular to it: they are not two scenes."""
-    # Scenes differ by far more than the change; what it brings differs by 1 between them.
+    """Two seeds of a scene share its peculiarities, so they do not count as two scenes."""
+    # Scenes differ by far more than the change does; the change brings 0, 1 and 2.
     levels = {"a": (20.0, 20.0), "b": (30.0, 31.0), "c": (40.0, 42.0)}
     seed = {scene: tuple(_point(psnr) for psnr in both) for scene, both in levels.items()}
     row, text = _more("abc", seed, seed)
     assert row[3] == f"+1.00 ± {1 / 3**0.5:.2f}"
     assert row[4] == row[3]
     assert "over the scenes, of means over the seeds" in text
-    # One seed less of a scene changes how sure its mean is, not how much the scene counts.
+    # With one seed less, the mean of a scene is less certain, but the scene counts as much.
     without_last = {**seed, "c": (seed["c"][0], None)}
     row, _ = _more("abc", seed, without_last)
     assert row[3] == f"+1.00 ± {1 / 3**0.5:.2f} (5 of 6)"
@@ -303,14 +304,14 @@ def test_a_missing_figure_leaves_a_scene_out_and_is_said():
     whole = (_point(20.0), _point(22.0, seconds=20.0))
     row, text = _more("ab", {"a": whole, "b": (_point(20.0), _point(None, seconds=400.0))})
     assert row[3:5] == ["+2.00 (1 of 2)"] * 2
-    # The seconds of the scene without the figure have no part in it.
+    # The scene without the figure does not contribute its seconds either.
     assert row[-1] == "+0.2000"
     assert "hence not compared: more (1 of 2)" in text
     assert "nan" not in text
 
 
 def _left(scene, name, config, lines):
-    """Leave what the tables read of a training."""
+    """Write the files of a training that the tables read."""
     folder = scene / name
     folder.mkdir(parents=True)
     (folder / "run.json").write_text(
@@ -356,7 +357,7 @@ def test_a_run_that_is_being_written_is_read_and_a_damaged_one_left_out(tmp_path
 
 
 def test_a_command_on_a_cluster_ends_with_its_job(monkeypatch):
-    """Its child is told to end, and is gone when the job is."""
+    """The child process is terminated, and has ended when the job ends."""
     started = []
 
     class Child(subprocess.Popen):
@@ -376,7 +377,7 @@ def test_a_command_on_a_cluster_ends_with_its_job(monkeypatch):
 
 
 def test_figures_on_images_of_another_size_are_another_evaluation(tmp_path, capsys):
-    """A run that is trained on reduced images is evaluated on those of the sweep."""
+    """A run that is trained on reduced images is still evaluated on the images of the sweep."""
     _write(tmp_path, SWEEP)
     some = _arguments(tmp_path, "--scene", "one", "--only")
     assert runner.main([*some, "coarse"], start=Trained().start) == 0
@@ -390,7 +391,7 @@ def test_figures_on_images_of_another_size_are_another_evaluation(tmp_path, caps
 
 
 def test_a_run_from_a_mesh_is_that_of_the_sweep_which_names_its_file():
-    """Where the file is and what was in it is noted by the run alone."""
+    """Only the run records the folder and the digest of the file."""
 
     def of(path, digest=""):
         config = make_config(quality="draft", mesh=MeshSettings(path, digest))
@@ -406,7 +407,7 @@ def test_a_front_holds_what_nothing_beats():
     assert halving.survivors(points, 3) == ["a", "b", "e"]
     assert halving.survivors(points, 4) == ["a", "b", "e", "d"]
     assert halving.survivors(points, 2) == ["a", "e"]
-    # Where there is one place the best goes on, not the cheapest.
+    # If only one may go on, it is the best, not the cheapest.
     assert halving.survivors(points, 1) == ["e"]
 
 
@@ -494,7 +495,7 @@ if job["evaluate"]:
 
 @pytest.mark.skipif(submitit is None, reason="submitit is not installed")
 def test_runs_on_a_cluster_wait_for_their_sources_and_go_on(tmp_path, capsys, monkeypatch):
-    """By submitit's local executor; what a job does is replaced by a script."""
+    """Jobs run in submitit's local executor; a script replaces their work."""
     _write(tmp_path, SWEEP)
     script = tmp_path / "job.py"
     script.write_text(FAKE_JOB)

@@ -37,7 +37,7 @@ def dataset():
 
 
 class _Notes(Listener):
-    """Notes the steps, and before which of them something compiled."""
+    """Records the steps, and before which of them something was compiled."""
 
     def __init__(self):
         self.steps, self.compiled = [], []
@@ -46,7 +46,7 @@ class _Notes(Listener):
         self.steps.append(progress)
 
     def on_compile(self, stage):
-        # What a step waits for is told before that step.
+        # A compilation is reported before the step that waits for it.
         self.compiled.append((stage, len(self.steps)))
 
 
@@ -84,7 +84,7 @@ def test_training_reports_every_step_and_lowers_the_loss(finished):
     assert int(state.step) == 4
     assert all(np.isfinite(line["loss"]) for line in lines)
     assert all(line["splats"] == 6 * line["faces"] for line in lines)
-    # From 0.60 to 0.18 where the update goes downhill.
+    # The loss falls from 0.60 to 0.18 if the updates go downhill.
     assert lines[-1]["loss"] < 0.5 * lines[0]["loss"]
 
 
@@ -105,7 +105,7 @@ def test_buffers_are_made_smaller_only_where_steps_follow(dataset, tmp_path, mon
     monkeypatch.setattr(loop_module, "_SHRINK_EVERY", 2)
     monkeypatch.setattr(loop_module, "_WORTH", 2)
     fit(dataset, tiny_config(), tmp_path)
-    # After the second of four steps, and not after the last.
+    # The buffers are checked after the second of four steps, and not after the last.
     assert len(asked) == 1
     assert asked[0] > 0
 
@@ -123,7 +123,7 @@ def test_every_step_is_told_with_its_stage(finished):
     *_, seen = finished
     assert [(p.step, p.steps, p.stage) for p in seen] == [(k, 4, "split_sum") for k in (1, 2, 3, 4)]
     assert isinstance(seen[0], Progress)
-    # The first step compiles: of what is left it says nothing.
+    # The first step compiles, so it gives no estimate of the time left.
     assert seen[0].seconds_left is None
     assert seen[-1].seconds_left == 0.0
 
@@ -135,7 +135,7 @@ def test_the_time_left_comes_from_steps_that_do_not_compile():
     assert ratio > 1
     for _ in range(4):
         clock.note("split_sum", 2.0)
-        assert clock.left(4) is None  # a single slow step would promise nonsense
+        assert clock.left(4) is None  # a single slow step would spoil the estimate
     clock.note("split_sum", 60.0)
     assert clock.left(5) == pytest.approx(2.0 * (5 + 20 * ratio))
     for _ in range(5):
@@ -168,7 +168,7 @@ def test_a_second_training_into_a_folder_is_refused_and_harms_nothing(dataset, f
 
 
 def test_a_run_without_a_checkpoint_is_resumed_from_the_start(dataset, finished, tmp_path):
-    """Also one that was interrupted while it compiled, or whose last line is torn."""
+    """This includes a run interrupted while it compiled, or whose last line is incomplete."""
     folder = tmp_path / "run"
     with pytest.raises(Interrupted, match="--resume"):
         fit(dataset, tiny_config("run.checkpoint_every=100"), folder, listener=_Stopped())
@@ -190,7 +190,7 @@ def test_an_overflowing_step_is_repeated_and_equals_one_with_ample_room(
 ):
     """The run that had to grow its buffers makes the same steps on the same batches.
 
-    Also where programs are forgotten at every growth.
+    This also holds where programs are released whenever buffers grow.
     """
     folder, _, _ = finished
     monkeypatch.setattr(runtime, "_CROWDED", 0.0)
@@ -202,7 +202,7 @@ def test_an_overflowing_step_is_repeated_and_equals_one_with_ample_room(
     ample, tight = _lines(folder), _lines(tmp_path)
     assert tight[0]["capacities"]["hits"] > 128
     for first, second in zip(ample, tight, strict=True):
-        # Buffers of another size sum in another order: equal up to rounding.
+        # With other buffer sizes, sums have another order, so values are equal up to rounding.
         assert second["loss"] == pytest.approx(first["loss"], rel=1e-4)
         assert second["faces"] == first["faces"]
 
@@ -211,7 +211,7 @@ def test_a_whole_run_compiles_the_step_once(dataset, tmp_path):
     programs = (_asset, _view_gradient, _back, _update)
     before = [program._cache_size() for program in programs]
     fit(dataset, tiny_config("run.seed=3"), tmp_path)
-    # Weights and rates change at every step; neither costs a program.
+    # Weights and rates change at every step, but need no new program.
     for program, count in zip(programs, before, strict=True):
         assert program._cache_size() - count <= 1
 

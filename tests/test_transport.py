@@ -160,7 +160,7 @@ def test_light_of_faces_without_rays_is_warned_about(kind):
 
 
 def arguments_of(asset):
-    """What `prepare` takes beside a key."""
+    """Arguments of `prepare` after the key."""
     return asset.splats.points(), asset.attributes, sky(), asset.index
 
 
@@ -184,7 +184,7 @@ def rows_of(asset, count):
 
 @pytest.mark.parametrize("make", [split_sum, few])
 def test_what_was_prepared_for_all_points_serves_any_rows_of_them(ball, make):
-    """Rows beyond the last are padding: without light, and harmless."""
+    """Rows beyond the last are padding, which has no light and does no harm."""
     (_, _, asset), transport = ball, make()
     points, attributes, towards = rows_of(asset, 60)
     first, second = jax.random.split(jax.random.key(0))
@@ -212,7 +212,7 @@ def test_what_was_prepared_for_all_points_serves_any_rows_of_them(ball, make):
 
 @pytest.mark.slow
 def test_sharing_samples_between_views_does_not_change_the_mean(ball):
-    """Over many keys, within the standard error."""
+    """Means over many keys agree within their standard error."""
     points, attributes, towards = rows_of(ball[2], 60)
     index, number = ball[2].index, 400
 
@@ -299,7 +299,7 @@ def bowl_lit(bowl):
     count = points.mask.shape[0]
 
     def found(albedo, metallic, **kwargs):
-        # Of samples of the cosine alone, diffuse light is the plain mean of what rays bring.
+        # With cosine samples only, diffuse light is the plain mean of the radiance along the rays.
         transport = few(light_count=0, diffuse_count=16, **kwargs)
         materials = Materials(
             jnp.full((count, 3), albedo), jnp.ones((count,)), jnp.full((count,), metallic)
@@ -317,7 +317,7 @@ def bowl_light(bowl_lit):
 
 
 def test_parts_that_are_averaged_can_be_put_back(ball, bowl_lit):
-    """The diffuse light of samples and the light that faces send; of maps there are none."""
+    """Samples have two such parts, diffuse light and light sent by faces; maps have none."""
     maps = prepare(split_sum(), None, *arguments_of(ball[2]))
     sampled = bowl_lit(0.5, 0.0, indirect="traced")
     for lit, count in ((maps, 0), (sampled, 2)):
@@ -386,7 +386,7 @@ def even_radiance(level):
 
 @pytest.mark.parametrize("moves", ["learned", pytest.param("both", marks=pytest.mark.slow)])
 def test_disagreement_is_the_squared_difference_and_moves_what_it_should(ball, moves):
-    """A ball blocks nothing of its own sky: matt, it sends albedo times the light, which is 1."""
+    """A ball does not occlude itself; a matt one sends its albedo times the light, which is 1."""
     _, _, asset = ball
     transport = few(indirect="radiometric", radiometric_gradient=moves, diffuse_count=16)
     light = EnvLight(jnp.ones((8, 16, 3)))
@@ -416,7 +416,7 @@ def test_disagreement_is_the_squared_difference_and_moves_what_it_should(ball, m
     for level in (0.3, 0.54, 0.9):
         values = jnp.asarray(even_radiance(level), jnp.float32)
         found[level], (in_values, in_albedo) = run(zeros, materials.albedo, values)
-        # It moves the mean towards what is sent, about .54 with the specular 4 %.
+        # The gradient moves the mean towards the light that is sent, .54 with the specular 4 %.
         pull = float(jnp.sum(in_values @ jnp.asarray(np.tile(EVEN, 3), jnp.float32)))
         assert level == 0.54 or np.sign(pull) == np.sign(level - 0.54)
         assert bool(jnp.any(in_albedo != 0)) == (moves == "both")
@@ -429,7 +429,7 @@ def test_disagreement_is_the_squared_difference_and_moves_what_it_should(ball, m
 @pytest.mark.computes
 @pytest.mark.long
 def test_faces_that_agree_with_themselves_send_the_light_of_many_bounces(bowl, monkeypatch):
-    """The fixed point of learned radiance in a white bowl, against eight traced bounces."""
+    """Compare the fixed point of learned radiance in a bright bowl with eight traced bounces."""
 
     def matt(normal, wi, wo, alpha):
         lobe = specular_lobe(normal, wi, wo, alpha)
@@ -469,7 +469,7 @@ def test_faces_that_agree_with_themselves_send_the_light_of_many_bounces(bowl, m
 
     values = jnp.zeros((points.mask.shape[0], 27))
     state = rule.init(values)
-    with jax.numpy_dtype_promotion("standard"):  # as Optax counts
+    with jax.numpy_dtype_promotion("standard"):  # for the counter of Optax
         for number in range(300):
             values, state = step(values, state, jax.random.key(number))
     found = []
@@ -522,7 +522,7 @@ def test_splats_that_no_view_sees_need_no_light_of_their_own(pictures):
 @pytest.mark.slow
 @pytest.mark.long
 def test_the_denoiser_brings_the_image_closer_and_leaves_its_outline(pictures):
-    """Against the mean over many keys, on the pixels of the object."""
+    """Errors are against the mean over many keys, in pixels of the object."""
     found = pictures[0]
     noisy = [found(key) for key in range(4)]
     reference = np.mean([found(key).rgb for key in range(10, 50)], axis=0)
@@ -532,7 +532,8 @@ def test_the_denoiser_brings_the_image_closer_and_leaves_its_outline(pictures):
     def error(outputs):
         return np.sqrt(np.mean([(np.asarray(o.rgb) - reference)[solid] ** 2 for o in outputs]))
 
-    # A ball of 20 pixels turns by 11 degrees from one to the next: few neighbours count.
+    # Normals of a ball of 20 pixels turn by 11 degrees from pixel to pixel, so few neighbours
+    # count.
     assert error(smooth) < 0.9 * error(noisy)
     np.testing.assert_array_equal(smooth[0].alpha, noisy[0].alpha)
 
@@ -564,7 +565,7 @@ def test_the_filter_without_passes_is_the_identity_to_the_bit():
 @pytest.mark.slow
 @pytest.mark.long
 def test_paths_over_two_surfaces_bring_what_traced_light_brings(ball, bowl, monkeypatch):
-    """Where reflectance is the same in all directions, as traced light takes it to be."""
+    """Reflectance is made equal in all directions, as traced light assumes it to be."""
 
     def matt(materials, normals, wi, wo):
         sent = materials.albedo * (1 - materials.metallic)[:, None]

@@ -1,4 +1,4 @@
-"""Rays against any triangles: equal to testing every one, however they lie."""
+"""Rays against arbitrary triangles: results equal those of testing every triangle."""
 
 from functools import partial
 
@@ -90,7 +90,7 @@ def test_every_ray_equals_brute_force(scene, kind, two_sided):
     origins, directions, source = rays_of_kind(kind, surface, np.random.default_rng(1), RAYS)
     rays = as_rays(origins, directions, source)
     t_min = T_MIN * float(index.grid.cell_size)
-    # The sides of a sheet share their plane: neither is met by a ray that starts on the other.
+    # Both sides of a sheet share their plane, so a ray that starts on one side misses the other.
     twins = np.where(source >= FACES, source - FACES, np.where(source >= 0, source + FACES, -1))
     distance, face, unclear = brute_force(
         surface,
@@ -125,7 +125,7 @@ def test_a_sheet_says_which_of_its_sides_is_met():
     assert index.face_capacity == 2 * FACES
     assert np.unique(np.asarray(face)[: RAYS // 2]).tolist() == [0]
     assert np.unique(np.asarray(face)[RAYS // 2 :]).tolist() == [FACES]
-    # Neither side is in the way of a ray that starts on one of them.
+    # Neither side blocks a ray that starts on one of them.
     starts = np.tile([[0.3, 0.1, 1e-2]], (RAYS, 1)), np.tile([[0.0, 0.0, -1.0]], (RAYS, 1))
     for own, hits in ((-1, True), (0, False), (FACES, False), (1, True)):
         found = index.occluded(*as_rays(*starts, np.full(RAYS, own)))
@@ -158,7 +158,7 @@ def test_a_list_too_long_to_be_counted_is_refused(ball):
 def test_more_cells_than_can_be_counted_are_refused_and_not_wrapped(ball):
     whole = np.array([[0.0, 0, 0], [99, 0, 99], [0, 99, 99]])
     corners = jnp.asarray(np.repeat(whole[:, :, None], 4400, axis=2), jnp.float32)
-    assert 4400 * 100**3 % 2**32 < 2**31  # it would look like a small positive number
+    assert 4400 * 100**3 % 2**32 < 2**31  # wrapped to 32 bits, it would look like a small count
     assert int(triangle_index._boxed(corners, 8)[2]) == 2**31 - 1
     mesh, _ = ball
     with pytest.raises(ValueError, match="sizes of the mesh's faces differ too much"):
@@ -172,7 +172,7 @@ def test_the_grid_follows_the_vertices_wherever_they_go(ball):
     directions = unit(rng.normal(size=(RAYS, 3)))
     distance, face = index.nearest(*as_rays(origins, directions, np.full(RAYS, -1)))
     assert 0.1 < np.mean(np.asarray(face) >= 0) < 0.9
-    # A power of two and a move that rounds nothing: the hits are the same to the bit.
+    # Scaling by a power of two rounds nothing, so the hits are the same to the bit.
     scale, move = 2.0**10, np.array([4096.0, 0.0, -8192.0])
     far = index_of(scale * vertices + 0 * move, faces, is_sheet=False)
     found, same = far.nearest(*as_rays(scale * origins, directions, np.full(RAYS, -1)))

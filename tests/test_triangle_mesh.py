@@ -1,4 +1,4 @@
-"""The surface of a given mesh: what it extracts and penalises, and that a run trains it."""
+"""The surface of a given mesh: extraction, penalties, and training in a run."""
 
 import json
 from pathlib import Path
@@ -34,7 +34,7 @@ def ball(subdivisions=1, radius=0.45):
 
 
 def bowl():
-    """The lower two thirds of a ball; the border is no plane curve."""
+    """The lower two thirds of a ball; the border is not planar."""
     vertices, faces = ball()
     faces = faces[vertices[faces][..., 2].mean(axis=1) < 0.15]
     used, rows = np.unique(faces, return_inverse=True)
@@ -56,7 +56,7 @@ def penalties_of(model, shape):
 
 
 def slow_penalties(model, shape):
-    """The definitions, face by face and vertex by vertex, in float64."""
+    """Penalties by their definitions, face by face and vertex by vertex, in float64."""
     half, unit = float(model.box.half_extent), float(model.unit)
     home = np.asarray(model.home, np.float64)
     now = home + half * np.asarray(shape.offsets, np.float64)
@@ -131,8 +131,8 @@ def test_nothing_changes_at_the_start_and_flat_surfaces_cost_nothing():
     flat = TriangleMesh.of(np.array(square.vertices), np.array(square.faces), is_sheet=True)
     found = penalties_of(flat, flat.start)
     assert found["normal_consistency"] < 1e-6
-    # Every inner vertex, and every one along a side, is in the middle of its neighbours; the four
-    # corners are half a diagonal from theirs.
+    # Every vertex inside or along a side is the mean of its neighbours; the four corners are half a
+    # diagonal away from the mean of theirs.
     corner = 0.5 / float(flat.unit) ** 2
     assert found["laplacian"] == pytest.approx(4 * corner / 25, rel=1e-4)
 
@@ -151,7 +151,7 @@ def test_a_mesh_with_an_edge_of_three_faces_has_no_wings_there():
 
 
 def test_faces_without_height_do_not_pull_on_their_neighbours():
-    """As T-junctions that were closed, and boolean operations, leave them."""
+    """Closed T-junctions and boolean operations leave such faces."""
     vertices, faces = ball(2)
     split = np.arange(0, len(faces), 40)
     middles = vertices[faces[split]][:, :2].mean(axis=1)
@@ -186,7 +186,7 @@ def test_a_sheet_has_two_sides_in_training_and_one_in_the_file():
     assert int(mesh.face_count) == 2 * count
     corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
     np.testing.assert_array_equal(corners[:count], corners[count:, ::-1])
-    # No vertex serves both sides, so that their normals do not cancel.
+    # The two sides share no vertex, so that their normals do not cancel.
     assert not set(np.asarray(mesh.faces)[:count].ravel()) & set(
         np.asarray(mesh.faces)[count:].ravel()
     )
@@ -241,7 +241,7 @@ def test_a_run_starts_from_the_file_says_so_and_resumes_bit_for_bit(dataset, fil
     assert {line["faces"] for line in lines} == {80}
     assert {"term.laplacian", "term.normal_consistency"} <= set(lines[0])
     assert all(np.isfinite(line["loss"]) for line in lines)
-    # Four steps of about the rate, in half extents.
+    # Four steps move vertices by about the rate each, in half extents of the box.
     assert 3e-3 < float(jnp.max(jnp.abs(whole.params.geometry.offsets))) < 2e-2
     record = json.loads((tmp_path / "whole/run.json").read_text())
     assert record["config"]["geometry"]["path"] == str(Path(files["ball"]).resolve())
@@ -251,12 +251,12 @@ def test_a_run_starts_from_the_file_says_so_and_resumes_bit_for_bit(dataset, fil
     copy.write_bytes(Path(files["ball"]).read_bytes())
     moved = make_config(mesh=copy, overrides=SMALL)
     fit(dataset, moved, tmp_path / "halves", stop_after=2)
-    # Neither the file nor its name is asked for again.
+    # Resuming needs neither the file nor its name.
     copy.unlink()
     read_start.cache_clear()
     given = make_config(mesh=mesh_of_run(RunFolder(tmp_path / "halves")), overrides=SMALL)
     leaves_equal(whole, fit(dataset, given, tmp_path / "halves", begin=Resume()))
-    # What is written of a run no longer needs the file.
+    # Reading a finished run does not need the file either.
     trained = Run(tmp_path / "whole").trained
     leaves_equal(trained.params, whole.params)
     vertices, faces, _ = Run(tmp_path / "whole").renderer().mesh()
@@ -304,14 +304,14 @@ def test_an_open_mesh_needs_culling(dataset, files, tmp_path):
 
 
 def test_an_open_mesh_is_not_shaded_behind_its_faces(dataset, files, tmp_path):
-    """What little shows through of the far wall draws blended positions into the body."""
+    """The far wall shows through a little, which draws blended positions into the body."""
     changes = ("stages.refine.steps=1", "stages.refine.domain.kind=per_pixel")
     config = make_config(mesh=files["bowl"], overrides=(*SMALL, *changes))
     with pytest.raises(
         TrainingError, match=r"behind the faces of an open mesh; set stages.refine.domain.points"
     ):
         fit(dataset, config, tmp_path / "run")
-    # The preset `paper` does that, and is sent back before anything is written.
+    # The preset `paper` shades that way, and is refused before anything is written.
     with pytest.raises(TrainingError, match="geometry.sides=one"):
         fit(
             dataset,

@@ -1,4 +1,4 @@
-"""What training views saw, against places whose answer is known; colours of numbers."""
+"""Which places training views saw, in cases with known answers; and colours of numbers."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def seen_by(eyes, vertices=VERTICES, faces=FACES, normals=NORMALS, **kwargs):
 def test_a_camera_sees_the_side_that_looks_to_it():
     counts = seen_by([[3.0, 0, 0]]).counts
     towards = VERTICES[:, 0]
-    # The horizon of a ball of .4 from a distance of 3 lies at x = .4^2 / 3.
+    # Seen from a distance of 3, the horizon of a ball of radius .4 lies at x = .4^2 / 3.
     assert np.all(counts[towards > 0.12] == 1)
     assert np.all(counts[towards < 0.04] == 0)
 
@@ -53,7 +53,7 @@ def test_places_outside_the_picture_are_not_seen():
 def test_shares_of_the_area_are_of_the_whole_surface():
     shares = {part["views"]: part["share"] for part in seen_by([[3.0, 0, 0]]).shares()}
     assert sum(shares.values()) == pytest.approx(1.0)
-    # A little less than a half sees a camera at a finite distance.
+    # A camera at a finite distance sees a little less than half of the ball.
     assert shares["1 or 2"] == pytest.approx((1 - 0.4 / 3) / 2, abs=0.03)
     assert shares["none"] == pytest.approx((1 + 0.4 / 3) / 2, abs=0.03)
 

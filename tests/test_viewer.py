@@ -22,7 +22,7 @@ from geosplat_jax.viewer.server import ViewerError, require_free_port, viser_lib
 from geosplat_jax.viewer.source import CheckpointWatch, light_files, load_lights, same_size
 
 LOOK = Look((0.0, -3.0, 0.0), (0.5**0.5, -(0.5**0.5), 0.0, 0.0), 0.5, 1.5)
-"""From the front at the ball in the origin, z up."""
+"""A look from the front at the ball in the origin, with z up."""
 
 QUICK, GOOD, BEST = LEVELS
 
@@ -40,7 +40,7 @@ def clock():
 
 
 def drawn(ladder, clock, look, *, seconds, wait=0.0):
-    """Levels that a look is drawn at until nothing is due any more; each takes its time."""
+    """Levels at which a look is drawn until nothing is due; ``seconds`` : durations by level."""
     levels = []
     clock.now += wait
     while (level := ladder.next(look)) is not None:
@@ -58,7 +58,7 @@ def test_a_look_that_stays_is_drawn_ever_better_and_then_no_more(clock):
     ladder = Ladder(clock=clock)
     seconds = {QUICK: 0.1, GOOD: 0.1, BEST: 2.0}
     assert drawn(ladder, clock, LOOK, seconds=seconds) == [QUICK]
-    assert drawn(ladder, clock, LOOK, seconds=seconds) == []  # it has not rested
+    assert drawn(ladder, clock, LOOK, seconds=seconds) == []  # the look has not rested long enough
     assert drawn(ladder, clock, LOOK, seconds=seconds, wait=0.5) == [GOOD, BEST]
     assert drawn(ladder, clock, LOOK, seconds=seconds, wait=9.0) == []
 
@@ -66,7 +66,7 @@ def test_a_look_that_stays_is_drawn_ever_better_and_then_no_more(clock):
 def test_what_moves_is_drawn_at_the_best_level_that_keeps_up(clock):
     ladder = Ladder(clock=clock)
     seconds = {QUICK: 0.05, GOOD: 0.2, BEST: 2.0}
-    for number in range(2):  # the first picture of a level says nothing of its pace
+    for number in range(2):  # the first picture of a level does not count as its pace
         drawn(ladder, clock, moved(number), seconds=seconds)
         drawn(ladder, clock, moved(number), seconds=seconds, wait=1.0)
     assert [ladder.next(moved(number)) for number in range(2, 5)] == [GOOD] * 3
@@ -83,7 +83,7 @@ def test_a_compilation_does_not_count_as_a_pace(clock):
     clock.now = 1.0
     ladder.next(moved(1))
     ladder.note(GOOD, 0.1)
-    assert ladder.next(moved(2)) == QUICK  # the first of GOOD was left out as well
+    assert ladder.next(moved(2)) == QUICK  # the first time of GOOD does not count either
     ladder.forget()
     assert ladder.next(moved(2)) == QUICK
 
@@ -92,7 +92,7 @@ def test_the_camera_of_a_look_fills_the_window_whatever_its_shape():
     wide, square = (replace(LOOK, aspect=aspect).camera(GOOD) for aspect in (2.0, 1.0))
     for camera in (wide, square):
         np.testing.assert_allclose(camera.centers[0], LOOK.position, atol=1e-6)
-        # The origin is in the middle, z points up: to smaller rows.
+        # The origin is in the middle of the image; z points up, to smaller rows.
         middle, above = (
             np.asarray(camera.intrinsics[0] @ (camera.world_to_camera[0] @ jnp.array(p))[:3])
             for p in ([0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.5, 1.0])
@@ -108,7 +108,7 @@ TINY_LEVELS = (Level(12, 8, 1), Level(24, 16, 2))
 
 
 def make_trained(step=7):
-    """What a viewer looks at of a run: its box, and a light that comes from y > 0."""
+    """The parts of a run that a viewer reads: its box, and a light that comes from y > 0."""
     radiance = np.full((8, 16, 3), 0.2, np.float32)
     radiance[:, :8] = 0.6
     box = Box(jnp.zeros(3), jnp.float32(0.6))
@@ -121,7 +121,7 @@ def make_trained(step=7):
 
 
 class Watch(CheckpointWatch):
-    """Hands out checkpoints as a test wants them."""
+    """Returns the checkpoints that a test provides, one after the other."""
 
     def __init__(self, *checkpoints):
         self.waiting = list(checkpoints)
@@ -131,9 +131,9 @@ class Watch(CheckpointWatch):
 
 
 class Recorder(Renderer):
-    """Stands for a renderer: notes under which light and with how many samples it draws.
+    """Stand-in for a renderer: records the light and the number of samples of each picture.
 
-    It sees a disc of one material, 2.6 away, that looks towards -y.
+    It shows a disc of one material at a distance of 2.6, which faces -y.
     """
 
     def __init__(self, log, light="found", count=None):
@@ -185,7 +185,8 @@ def test_every_mode_shows_what_it_says(recorded):
         assert picture.step == 7
         assert picture.depth[8, 12] == pytest.approx(2.6)
         assert picture.depth[0, 0] > 100
-    # Nine tenths of the sRGB of .6, and of the numbers; the rest is the grey behind.
+    # Nine tenths come from the sRGB value of .6, or from the numbers; the rest is the grey
+    # background.
     np.testing.assert_allclose(middle(shown["albedo"]), 0.9 * 0.797 + 0.02, atol=0.01)
     np.testing.assert_allclose(middle(shown["roughness"]), 0.9 * 0.8 + 0.02, atol=0.01)
     np.testing.assert_allclose(middle(shown["metallic"]), 0.9 * 0.25 + 0.02, atol=0.01)
@@ -195,7 +196,8 @@ def test_every_mode_shows_what_it_says(recorded):
         painter.paint(replace(LOOK, mode="depth", position=(0.0, -y, 0.0)), TINY_LEVELS[1])
         for y in (2.6, 3.4)
     )
-    # The scale goes with the camera: of the box that is further away, this is the front.
+    # The scale follows the distance of the camera to the box: seen from further away, a depth of
+    # 2.6 is at the front of the box.
     assert middle(far).sum() > middle(near).sum() + 0.3
 
 
@@ -215,9 +217,9 @@ def test_lights_are_swapped_turned_and_scaled(recorded):
     half = sky.shape[1] // 2
     assert sky[:, 4 : half - 4].min() > 0.99
     assert sky[:, half + 4 : -4].max() < 0.01
-    # Counter-clockwise seen from above, against which columns run.
+    # The light turns counter-clockwise seen from above; columns run the other way.
     np.testing.assert_allclose(turned, 2.0 * np.roll(sky, -half // 2, axis=1), atol=1e-3)
-    assert dimmed.mean() == pytest.approx(0.2, abs=0.01)  # half of what was found
+    assert dimmed.mean() == pytest.approx(0.2, abs=0.01)  # half of the trained light
     assert dimmed.shape == sky.shape
 
 
@@ -230,7 +232,7 @@ def test_a_camera_that_moves_keeps_the_light_it_has(recorded, monkeypatch):
         painter.paint(look, TINY_LEVELS[0])
     first = len(made)
     painter.paint(replace(look, turn=5.0), TINY_LEVELS[0])
-    assert (first, len(made)) == (2, 3)  # relit, and with its samples; then turned
+    assert (first, len(made)) == (2, 3)  # two for the first light, one for the turn
 
 
 def test_a_newer_checkpoint_is_drawn_without_being_asked_for(monkeypatch, clock):
@@ -244,7 +246,7 @@ def test_a_newer_checkpoint_is_drawn_without_being_asked_for(monkeypatch, clock)
     clock.now = 9.0
     assert viewer.draw(1, LOOK).level == TINY_LEVELS[1]
     assert viewer.draw(1, LOOK) is None
-    assert viewer.draw(2, LOOK).step == 7  # somebody else
+    assert viewer.draw(2, LOOK).step == 7  # another client
     assert not viewer.refresh()
     watch.waiting.append(newer)
     assert viewer.refresh()

@@ -1,4 +1,4 @@
-"""The viewer's server: it starts, sends what is asked for, and says when it cannot."""
+"""The viewer's server: it starts, answers requests, and reports when it cannot."""
 
 import urllib.request
 import warnings
@@ -21,7 +21,7 @@ with warnings.catch_warnings():
 
 
 class Browser:
-    """What viser hands over of somebody: camera, controls, and a window that takes pictures."""
+    """Stand-in for a client of viser: camera, controls, and a window that receives pictures."""
 
     client_id = 3
 
@@ -131,7 +131,8 @@ def test_a_click_on_a_photograph_goes_there(server, views):
     pose = np.linalg.inv(views.world_to_camera[1])
     serving._to_camera(pose, 0.6, "view_1")(SimpleNamespace(client=browser))
     np.testing.assert_allclose(browser.camera.position, pose[:3, 3])
-    # Its distance to what it looked at stays; OpenCV's axes: forward is z, up is -y.
+    # The camera keeps its distance to the point it looks at. In OpenCV axes, forward is z and up is
+    # -y.
     np.testing.assert_allclose(browser.camera.look_at, 0.0, atol=1e-6)
     np.testing.assert_allclose(browser.camera.up_direction, -pose[:3, 1])
     assert browser.camera.fov == 0.6

@@ -48,7 +48,7 @@ def test_windows_hold_the_whole_object_and_a_margin(views):
 def test_a_pixel_of_a_window_has_the_ray_that_it_had(views):
     windows, _ = around_object(views, largest=0.5)
     for index in range(len(views)):
-        # The first covered pixel, in both.
+        # Take the first covered pixel in both images.
         whole = np.argwhere(views.images[index, ..., 3] > 0)[0]
         cut = np.argwhere(windows.images[index, ..., 3] > 0)[0]
         rays = [
@@ -94,7 +94,7 @@ def test_a_mean_over_a_window_is_that_over_the_photograph(views):
         compared = ImagePair(0.8 * color, color, 0.9 * mask, mask, None, jnp.zeros(()))
         return np.array([image_l1(compared), mask_error(compared), image_dissimilarity(compared)])
 
-    # SSIM has a mean over the pixels around which its window of 11 pixels fits.
+    # SSIM is averaged over the pixels whose window of 11 x 11 pixels fits into the image.
     inner = (windows.height - 10) * (windows.width - 10) / (SIZE - 10) ** 2
     whole = terms(views)
     assert (whole > 0).all()
