@@ -1,11 +1,11 @@
-"""Strictness for every test, and a compiler in a hurry, since most of a test is compilation."""
+"""Strict settings for every test, and quick compilation, which is most of a test's time."""
 
 import os
 import sys
 from pathlib import Path
 
-# Before jax reads them. Laws are tested here, not speed: code that the compiler did not polish
-# keeps them as well, and is there in two thirds of the time.
+# Set before jax reads it. The tests check laws, not speed: code that the compiler has not optimized
+# keeps them as well, and the tests take two thirds of the time.
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true",
@@ -23,14 +23,14 @@ from geosplat_jax.fit.runtime import (  # noqa: E402
     release_programs_when_crowded,
 )
 
-# The same examples in every run; `--hypothesis-profile=default` looks for others.
+# Hypothesis tries the same examples in every run; `--hypothesis-profile=default` looks for others.
 settings.register_profile("same examples", derandomize=True)
 settings.load_profile("same examples")
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# In the environment's folder: files, workers and runs share what they compile.
+# The cache is in the environment's folder: files, workers and runs share compiled programs.
 enable_compilation_cache(Path(sys.prefix) / "cache")
 
 
@@ -63,17 +63,17 @@ LONGEST = (
 
 
 def pytest_collection_modifyitems(items):
-    """Begin with the files that take longest: no process waits for another one at the end."""
+    """Start with the files that take longest, so that no process waits for another at the end."""
     order = {name: number for number, name in enumerate(LONGEST)}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _release_compiled_programs():
-    """Forget what was compiled once that is too much for one process, where that can be told.
+    """Release compiled programs after a file; on Linux, only when they are too many for a process.
 
-    Every program holds memory maps, without which the compiler crashes. Until then, files find each
-    other's programs without tracing them again.
+    Every program holds memory maps, and the compiler crashes where a process has too many of them.
+    Programs that are kept need not be traced again for the next file.
     """
     yield
     if sys.platform.startswith("linux"):
@@ -84,10 +84,10 @@ def _release_compiled_programs():
 
 @pytest.fixture(scope="module")
 def products_must_ask():
-    """Refuse products of matrices that do not ask for the precision of their factors.
+    """Refuse matrix products that do not state the precision of their factors.
 
-    GPUs round the factors of such products to 10 bits. A processor cannot, and where that is the
-    default, a product that leaves it at the default is an error.
+    GPUs round the factors of such products to 10 bits. A processor does not support this precision:
+    with it as the default, a product that leaves its precision at the default is an error.
     """
     jax.config.update("jax_default_matmul_precision", "TF32_TF32_F32")
     yield

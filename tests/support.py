@@ -1,4 +1,4 @@
-"""Shared by the tests: double precision, and where the optional shared data lies."""
+"""Helpers that the tests share: views, small settings, balls, and the optional shared data."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -38,7 +38,7 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
 def shared_path(*parts):
-    """A path below the optional shared data, or skip the test where that is absent."""
+    """Return a path below the optional shared data; skip the test where it does not exist."""
     path = SHARED.joinpath(*parts)
     if not path.exists():
         pytest.skip(f"{'/'.join(parts)} is not on this machine")
@@ -46,7 +46,10 @@ def shared_path(*parts):
 
 
 def level_poses(centers, target=(0.0, 0.0, 0.0)):
-    """Camera-to-world matrices (Blender axes) at points, none above the target that they show."""
+    """Return camera-to-world matrices (Blender axes) at points, looking at a target.
+
+    The cameras are level; none may be straight above or below the target.
+    """
     poses = np.tile(np.eye(4), (len(centers), 1, 1))
     for pose, center in zip(poses, np.asarray(centers, float), strict=True):
         back = center - np.asarray(target)
@@ -97,7 +100,7 @@ def sphere_views(count=6, *, size=24, radius=0.5, field_of_view=0.6):
 
 
 def sphere_dataset(**kwargs):
-    """Return the views of `sphere_views` as training and test split of a dataset."""
+    """Return a dataset whose training views and test views are those of `sphere_views`."""
     views = sphere_views(**kwargs)
     return Dataset(
         name="sphere",
@@ -143,8 +146,8 @@ MONTE_CARLO = (
 
 
 TWO_STAGES = (*MONTE_CARLO, "stages.split_sum.steps=3", "stages.monte_carlo.weights.light=0.15")
-"""Overrides of a run of both stages. Files that train on `sphere_dataset` with them find each
-other's programs in the cache, as do those with `TINY` alone."""
+"""Overrides of a run of both stages. Files that train on `sphere_dataset` with these overrides
+share compiled programs through the cache, and so do files that use `TINY` alone."""
 
 
 def tiny_config(*overrides):
@@ -153,9 +156,11 @@ def tiny_config(*overrides):
 
 
 def ball(config, *, radius=0.4, stage=None):
-    """Return pipeline and first parameters of a ball in the box [-0.6, 0.6]^3.
+    """Return the pipeline and the first parameters of a ball in the box [-0.6, 0.6]^3.
 
-    ``stage`` : name of the stage (default: the first one). The pipeline has room for the ball.
+    The capacities of the pipeline suffice for the ball.
+
+    ``stage`` : name of the stage (default: the first one).
     """
     grid = fit_grid((np.full(3, -0.6), np.full(3, 0.6)), config.geometry.resolution)
     surface = FlexiCubes(grid)
@@ -171,7 +176,10 @@ def ball(config, *, radius=0.4, stage=None):
 
 
 def views_from(eyes, *, size=16, field_of_view=0.5):
-    """Black views from points of the world (none on the vertical axis) towards the origin."""
+    """Return black views of the origin from points of the world.
+
+    None of the points may be on the vertical axis.
+    """
     poses = level_poses(eyes)
     focal = 0.5 * size / np.tan(0.5 * field_of_view)
     intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
@@ -184,7 +192,7 @@ def views_from(eyes, *, size=16, field_of_view=0.5):
 
 
 def with_constant_material(params, spec, *, albedo, roughness, metallic):
-    """Return parameters whose heads (with biases) give the same attributes everywhere."""
+    """Return parameters that give the same material everywhere; their heads must have biases."""
 
     def constant(head, logits):
         layers = [jax.tree.map(jnp.zeros_like, layer) for layer in head]
@@ -209,7 +217,10 @@ def with_constant_material(params, spec, *, albedo, roughness, metallic):
 
 
 def ball_of_one_material(config, *, albedo, roughness, metallic, radius=0.4, stage=None):
-    """Pipeline and parameters of a ball (see `ball`); ``config`` must give the heads biases."""
+    """Return the pipeline and the parameters of a ball of one material, see `ball`.
+
+    ``config`` must give the heads biases.
+    """
     pipeline, params = ball(config, radius=radius, stage=stage)
     params = with_constant_material(
         params, config.material, albedo=albedo, roughness=roughness, metallic=metallic
@@ -218,7 +229,7 @@ def ball_of_one_material(config, *, albedo, roughness, metallic, radius=0.4, sta
 
 
 def operations(name, function, *arguments):
-    """Operations of a name in a program, those of its inner programs included."""
+    """Return the operations of a name in a program, including those of its inner programs."""
     found = []
 
     def walk(jaxpr):

@@ -33,12 +33,12 @@ SAMPLERS = {"face": face_splats, "vertex": vertex_splats}
 
 @partial(jax.jit, static_argnames=("kind", "constants"))
 def place_padded(mesh, unit=1.0, *, kind="face", constants=CODE):
-    """All rows of the splats of a mesh, whose shading normals are those of its vertices."""
+    """Place splats with a mesh's vertex normals as shading normals; return all rows."""
     return SAMPLERS[kind](mesh, vertex_normals(mesh), constants=constants, unit=unit)
 
 
 def place(mesh, unit=1.0, **choices):
-    """The real rows only, as NumPy arrays."""
+    """Place splats as `place_padded` does; return only the real rows, as NumPy arrays."""
     splats = place_padded(mesh, unit, **choices)
     count = int(splats.count)
     return jax.tree.map(lambda x: np.asarray(x)[:count] if x.ndim else x, splats)
@@ -52,7 +52,7 @@ def normals_and_areas(mesh):
 rotations_of = jax.jit(quaternion_to_matrix)
 sink = jax.jit(shift_inwards)
 ROWS = 12
-"""Of vertices and of faces in most tests: each new shape costs a compilation."""
+"""Rows of vertices and of faces in most tests, since each new shape costs a compilation."""
 
 
 def _mesh(vertices, faces, extra_vertices=None, extra_faces=None, dtype=jnp.float32):
@@ -118,7 +118,7 @@ def test_equations_8_to_11_by_hand():
 
 @pytest.mark.parametrize("constants", [PAPER, CODE], ids=["paper", "code"])
 def test_every_splat_has_the_normal_of_the_point_where_it_lies(constants):
-    """Normals that are linear over a face are told apart by place, in either ring."""
+    """Where vertex normals differ, the six splats of a face have six different normals."""
     points = np.random.default_rng(1).normal(size=(3, 3))
     mesh = _mesh(points, np.array([[0, 1, 2]]))
     corner_normals = np.array([[1.0, 0.2, 0.1], [0.1, 1.0, -0.3], [-0.2, 0.3, 1.0]])
@@ -127,7 +127,8 @@ def test_every_splat_has_the_normal_of_the_point_where_it_lies(constants):
     shares, _ = _shares_and_heights(splats.means[:6], mesh, np.zeros(6, int))
     expected = shares @ corner_normals
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
-    # Means of two points of which each has a unit normal: equal but for their lengths.
+    # A splat's normal is the mean of two unit normals; ``expected`` interpolates without
+    # normalizing those two, so the results agree only up to their lengths.
     np.testing.assert_allclose(splats.normals[:6], expected, atol=0.05)
     apart = np.linalg.norm(expected[:, None] - expected[None], axis=-1) + np.eye(6)
     assert apart.min() > 0.15
@@ -213,7 +214,7 @@ def test_six_splats_in_a_row_belong_to_their_face_and_know_its_normal():
     parents = np.asarray(splats.parents)
     np.testing.assert_array_equal(parents[:48], np.repeat(np.arange(8), SPLATS_PER_FACE))
     np.testing.assert_array_equal(splats.outward, np.asarray(face_normal)[parents])
-    # Each lies inside of the face that it names, in its plane.
+    # Every splat lies inside the face that it names, and in its plane.
     corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)[parents[:48]]]
     shares = np.linalg.solve(corners.transpose(0, 2, 1), np.asarray(splats.means)[:48, :, None])
     assert np.all(shares > 0.01)
@@ -243,7 +244,7 @@ def _shares_and_heights(points, mesh, parents):
 def test_the_inward_shift_moves_the_means_and_leaves_the_anchors_on_the_face():
     mesh = _octahedron()
     splats = place_padded(mesh)
-    # The padding has a share as well.
+    # Rows of padding have a share as well.
     fraction = jnp.linspace(0.0, 1.0, splats.means.shape[0])
     moved = sink(splats, mesh, fraction)
     count, parents = int(splats.count), np.asarray(splats.parents)[:48]
@@ -252,7 +253,7 @@ def test_the_inward_shift_moves_the_means_and_leaves_the_anchors_on_the_face():
     shares, height = _shares_and_heights(moved.means[:count], mesh, parents)
     expected = -np.asarray(fraction)[:count] * np.sqrt(np.asarray(area))[parents]
     np.testing.assert_allclose(height, expected, atol=1e-6)
-    # Straight down: the foot of each mean is where it was, and there the anchor stays.
+    # The shift is straight down: the foot of each mean is where it was, and so is the anchor.
     for points in (splats.means, moved.anchors):
         at_rest, rest_height = _shares_and_heights(points[:count], mesh, parents)
         np.testing.assert_allclose(shares, at_rest, atol=1e-5)
@@ -313,7 +314,7 @@ def test_splats_of_a_surface_settle_as_their_attributes_say():
     np.testing.assert_allclose(settled.means, sink(placed, mesh, share).means, atol=TOLERANCE)
     assert np.any(settled.means != placed.means)
     assert FaceSplats(CODE).settle(placed, surface, Attributes(nothing, None, None)) is placed
-    # Splats of vertices do not sink, whatever the field says.
+    # Splats of vertices do not sink, whatever their attributes say.
     rounds = put(VertexSplats(CODE), surface, box)
     np.testing.assert_allclose(rounds.scales[:6, 2], 2.0 * CODE.thickness, rtol=TOLERANCE)
     share = jnp.full(rounds.opacities.shape, 0.25)

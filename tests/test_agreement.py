@@ -1,4 +1,4 @@
-"""Masks, poses and lenses that contradict each other are told, by the views that do."""
+"""Views whose mask, pose or lens contradicts the other views are named."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ def test_one_wrong_mask_is_named_and_no_other(views, kind):
 
 
 def test_pixels_that_do_not_count_contradict_nobody(views):
-    """Nothing counts in the lower part of every second view; the mask there is empty."""
+    """In the lower part of every second view no pixel counts, and the mask is empty."""
     valid = np.ones(views.images.shape[:3], np.float32)
     valid[::2, 20:] = 0.0
     images = np.array(views.images)

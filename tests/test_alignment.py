@@ -1,4 +1,4 @@
-"""The world of a capture: what is up, where the object is, how far cameras are from it."""
+"""The world of a capture: its up direction, the object's place, the distance of the cameras."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from support import level_poses
 
 from geosplat_jax.io.alignment import AlignmentError, Similarity, align_world, up_direction
 
-# Of float64 geometry, after some linear algebra.
+# Rounding of float64 geometry after some linear algebra.
 EXACT = 1e-9
 
 
@@ -19,7 +19,7 @@ def ring(count=12, *, heights=(0.3, 0.8), radius=1.0, turn=2 * np.pi):
 
 
 def moved(poses, map_):
-    """Cameras in another world."""
+    """Return the cameras in another world."""
     other = poses.copy()
     other[:, :3, :3] = map_.rotation @ poses[:, :3, :3]
     other[:, :3, 3] = map_.points(poses[:, :3, 3])
@@ -65,7 +65,7 @@ def test_shaken_hands_tilt_the_world_little():
         pose[:3, :3] = pose[:3, :3] @ roll
     up = up_direction(poses[:, :3, 0], poses[:, :3, 1])
     assert np.degrees(np.arccos(up[2])) < 2.0
-    # The mean of the y axes leans back: it is no substitute.
+    # The mean of the cameras' y axes leans back, so it cannot be used instead.
     mean = poses[:, :3, 1].mean(axis=0)
     assert np.degrees(np.arccos(mean[2] / np.linalg.norm(mean))) > 10.0
 

@@ -1,4 +1,4 @@
-"""What commands make of the memory allocator, looked at in processes of their own."""
+"""How commands set up the memory allocator, tested in processes of their own."""
 
 import subprocess
 import sys
@@ -29,7 +29,7 @@ from geosplat_jax.cli import main
 sys.exit(main([]))
 """
 
-# The memory is not touched: this takes addresses only.
+# The memory is not touched, so this only takes addresses.
 _LARGE = """
 from geosplat_jax.core.allocator import retain_freed_memory
 assert retain_freed_memory()

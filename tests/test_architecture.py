@@ -1,4 +1,4 @@
-"""The order of the modules, the purity of the jitted ones, docstrings on all that is public."""
+"""The order of modules, the purity of the jitted ones, and docstrings of everything public."""
 
 import ast
 import re
@@ -61,7 +61,7 @@ SOURCES = {
     for path in sorted(PACKAGE.rglob("*.py"))
 }
 MODULES = sorted(name for name in SOURCES if name)
-"""All but the package itself, which imports the names that it exports."""
+"""All modules except the package itself, which imports the names that it exports."""
 IN_FOLDERS = [m for m in MODULES if "." in m and not (PACKAGE / m.replace(".", "/")).is_dir()]
 
 
@@ -70,14 +70,14 @@ def layer(module):
 
 
 def resolve(dotted):
-    """Longest prefix of a dotted name that is a module of the package, or None."""
+    """Return the longest prefix of a dotted name that is a module of the package, or None."""
     parts = dotted.split(".")
     names = (".".join(parts[:end]) for end in range(len(parts), 0, -1))
     return next((name for name in names if name in SOURCES), None)
 
 
 def imports(module):
-    """Modules of this package, and foreign top-level packages, that a module imports anywhere."""
+    """Return the package's own modules and the foreign packages that a module imports anywhere."""
     own, foreign = set(), set()
     for node in ast.walk(SOURCES[module]):
         if isinstance(node, ast.Import):

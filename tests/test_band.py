@@ -1,4 +1,4 @@
-"""Laws of a band of cells: the surface of the whole grid, which the band follows."""
+"""Laws of a band of cells: it gives the surface of the whole grid, and follows this surface."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ from geosplat_jax.pipeline import LossReport
 from geosplat_jax.surface import band as band_module
 from geosplat_jax.surface.flexicubes_tables import CORNERS
 
-ROUNDING = 2e-6  # relative to the largest: sums of some hundred float32 in another order
+ROUNDING = 2e-6  # relative to the largest value: sums of some hundred float32 in another order
 SHAPE = (9, 8, 10)
 ROOM = Capacities(surface_cubes=512, dual_vertices=512, quads=512)
 
@@ -34,7 +34,7 @@ def grid_of(shape=SHAPE):
 
 
 def ball(radius, grid=None, *, noise=0.0, seed=0):
-    """Signed distances in cells to a ball about the middle of the grid, NumPy."""
+    """Return signed distances, in cells, to a ball in the middle of the grid (NumPy)."""
     grid = grid or grid_of()
     vx, vy, vz = grid.vertex_shape
     z, y, x = np.meshgrid(np.arange(vz), np.arange(vy), np.arange(vx), indexing="ij")
@@ -46,7 +46,7 @@ def ball(radius, grid=None, *, noise=0.0, seed=0):
 
 
 def cell_corners(numbers, shape=SHAPE):
-    """Numbers of the vertices at the corners of cells, (8, n)."""
+    """Return the numbers of the vertices at the corners of cells, (8, n)."""
     nx, ny, _ = shape
     at = np.stack([numbers % nx, numbers // nx % ny, numbers // (nx * ny)])
     x, y, z = at[:, None, :] + CORNERS.T[:, :, None]
@@ -88,7 +88,7 @@ def rows_from(dense, model):
 
 
 def varied(geometry):
-    """Give deformations and weights values of their own."""
+    """Give deformations and weights random values."""
     rng = np.random.default_rng(1)
 
     def one(array):
@@ -152,7 +152,7 @@ def whole():
     """Evaluate a rough ball on all cells: its mesh has ambiguous cells and several patches."""
     sdf = ball(2.4, noise=0.9)
     dense = varied(initial_geometry(grid_of(), jnp.asarray(sdf)))
-    # Away from the surface weights are as they began, so that their penalty leaves them there.
+    # Far from the surface, weights keep their initial value 0, where their penalty vanishes.
     is_far = np.ones(np.prod(SHAPE), bool)
     is_far[band_module.cells_around(surface_of(sdf), SHAPE, 1)] = False
     for name in ("alpha", "beta"):
@@ -193,7 +193,7 @@ def test_first_capacities_are_those_of_the_whole_grid(whole):
 
 
 def numbered(shape):
-    """Numbers that say which row and array they are from."""
+    """Fill arrays with distinct numbers, which tell the array and the row that they come from."""
     leaves, structure = jax.tree.flatten(shape)
     start, filled = 1, []
     for leaf in leaves:
@@ -203,7 +203,7 @@ def numbered(shape):
 
 
 def with_values(model, shape, sdf):
-    """Set the SDF of a shape to values of the whole grid."""
+    """Set the SDF of a band's shape to values that are given on the whole grid."""
     return replace(
         shape, sdf=rows_from(initial_geometry(model.band.grid, jnp.asarray(sdf)), model).sdf
     )
@@ -267,7 +267,7 @@ def test_a_surface_never_leaves_its_band_and_the_band_follows_it_to_the_sides_of
     while True:
         passes += 1
         assert passes < 10, "the band does not arrive at the sides"
-        # Whatever is learned: all of the band is to be inside.
+        # Whatever training might learn: here, all of the band moves inside.
         shape = replace(shape, sdf=jnp.full_like(shape.sdf, -1.0))
         values, side = np.asarray(model.band.values(shape.sdf)), np.asarray(model.band.fixed)
         assert (values[side > 0] > 0).all()
@@ -293,7 +293,7 @@ def test_a_band_keeps_its_rows_where_they_are_enough_and_not_far_too_many():
 
 
 def test_where_there_is_no_surface_the_band_stays():
-    # Everything in the band is outside; no vertex is held inside by a cell beyond its border.
+    # All of the band is outside, and no vertex is held inside by a cell beyond its border.
     model, shape = BandedFlexiCubes.around(ball(0.6), grid_of(), 1)
     assert not (np.asarray(model.band.fixed) < 0).any()
     assert model.following(replace(shape, sdf=jnp.ones_like(shape.sdf))) is None
@@ -312,7 +312,7 @@ def dataset():
 
 
 def grown(state):
-    """Move the surface of a state outwards by a third of a cell, and fill what Adam keeps."""
+    """Move the surface of a state outwards by a third of a cell, and fill the moments of Adam."""
     geometry = replace(state.params.geometry, sdf=state.params.geometry.sdf - 0.3)
     moments = to_levels(replace(state.params, geometry=numbered(geometry)))
     optimizer = state.optimizer._replace(mu=moments, nu=jax.tree.map(jnp.square, moments))
@@ -325,7 +325,7 @@ def grown(state):
 
 
 def steps_that_grow(monkeypatch):
-    """Put a step that only moves the surface in the place of the true one; compile nothing."""
+    """Replace the training step by one that only moves the surface, and compilation by a record."""
     compiled = []
 
     def step(state, batch, pipeline, rule, *, run):
@@ -381,7 +381,7 @@ def test_between_two_steps_the_band_follows_with_all_that_adam_keeps(dataset, fo
     assert_same(loop.state.params.geometry, following.shape)
     assert_same(loop.state.optimizer.mu.geometry, following.carried(before.optimizer.mu.geometry))
     assert_same(loop.state.optimizer.nu.geometry, following.carried(before.optimizer.nu.geometry))
-    # What is no part of the shape stays as it is.
+    # The moments of parameters that are not part of the shape stay as they are.
     assert_same(loop.state.optimizer.mu.light, before.optimizer.mu.light)
     has_grown = rows_of(first) != rows_of(loop.surface)
     assert len(compiled) == count + has_grown
@@ -396,7 +396,7 @@ def test_a_run_that_goes_on_from_a_checkpoint_has_the_band_that_it_had(
     resumed = resumed_loop(dataset, CONFIG, folder)
     count = len(compiled)
     resumed.prepare(resumed.step)
-    # Side by side, and before a step waits for it.
+    # The programs are compiled side by side, before a step waits for them.
     assert len(compiled) == count + 1
     assert resumed.has_compiled
     assert_same(resumed.surface, loop.surface)
@@ -412,7 +412,7 @@ def test_a_run_that_goes_on_from_a_checkpoint_has_the_band_that_it_had(
 def test_a_stage_that_ends_earlier_than_before_an_interruption_leaves_one_end(
     dataset, folder, monkeypatch
 ):
-    """A budget may shorten a stage that had ended already when its process was killed."""
+    """A budget may shorten a stage that had already ended when its process was killed."""
     steps_that_grow(monkeypatch)
     loop = new_loop(dataset, CONFIG, folder)
     for steps in (8, 5):
@@ -465,7 +465,7 @@ def test_a_surface_that_vanishes_is_put_back_with_its_band(dataset, folder, monk
 @pytest.mark.slow
 @pytest.mark.long
 def test_training_in_a_band_is_training_on_the_whole_grid(dataset, tmp_path, monkeypatch):
-    """Until a cell leaves the band and comes back, and up to the order of sums."""
+    """The two agree up to the order of sums, until a cell leaves the band and comes back."""
     monkeypatch.setattr(loop_module, "_FOLLOW_EVERY", 2)
     whole = tiny_config("geometry.resolution=10", "stages.split_sum.steps=5")
     banded = tiny_config("geometry.resolution=10", "stages.split_sum.steps=5", "geometry.band=3")

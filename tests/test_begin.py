@@ -1,4 +1,7 @@
-"""How a run begins, and who is told of it; what is trained: test_train, test_stages, test_seams."""
+"""How a run begins, and which listeners are told of it.
+
+What is trained is tested in `test_train.py`, `test_stages.py` and `test_seams.py`.
+"""
 
 from pathlib import Path
 
@@ -44,7 +47,7 @@ EVENTS = {
 
 
 class _Notes(Listener):
-    """Notes what it is told; knows every event by itself."""
+    """Notes what it is told; has a method of its own for every event."""
 
     def __init__(self, told, name):
         for event in EVENTS:

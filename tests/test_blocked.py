@@ -1,4 +1,4 @@
-"""The share of the light that a surface keeps from itself, against closed forms."""
+"""The share of light that a surface blocks from itself, against closed forms."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +10,7 @@ from geosplat_jax.surface.grids import grid_vertices
 from geosplat_jax.surface.hull import fit_grid
 
 MIDDLE, WALL = 0.4, 0.06
-"""Radius of the middle of a bowl's wall, and half its thickness."""
+"""Radius of the middle of a bowl's wall, and half the thickness of the wall."""
 
 
 def ball(x, y, z):
@@ -23,7 +23,11 @@ def bowl(x, y, z):
 
 
 def bowl_share():
-    """Half of what leaves the inside of a hemisphere meets it again; no other part sees any."""
+    """Return the closed form for `bowl`, as a share of its whole area.
+
+    Half of the light for the inside of a hemisphere is blocked by the hemisphere itself, and none
+    for its outside and its rim.
+    """
     inner, outer = 2 * np.pi * (MIDDLE - WALL) ** 2, 2 * np.pi * (MIDDLE + WALL) ** 2
     rim = 0.5 * (outer - inner)
     return 0.5 * inner / (inner + outer + rim)
@@ -40,6 +44,6 @@ def surface(distance):
 )
 def test_a_surface_blocks_what_a_closed_form_says(distance, share, tolerance):
     model, larger = surface(bowl)
-    # One program for both.
+    # With the capacities of the bowl, one program serves both surfaces.
     capacities = model.first_capacities(larger)
     assert blocked_share(*surface(distance), capacities) == pytest.approx(share, abs=tolerance)

@@ -49,7 +49,7 @@ def _hemisphere(count, seed=0):
 
 
 def _sphere_quadrature(pole, angles=160, azimuths=200):
-    """Directions and weights of the sphere, graded towards a pole: (Q, 3), (Q,)."""
+    """Return directions (Q, 3) and weights (Q,) of a quadrature of the sphere, finest at a pole."""
     nodes, weights = np.polynomial.legendre.leggauss(angles)
     # Angles from the pole, quadratically spaced, so that narrow lobes there are resolved.
     s = 0.5 * (nodes + 1)
@@ -71,7 +71,7 @@ def _mirror(normal, wo):
 
 
 def _integrals(degrees, normal=UP, **material):
-    """Of the diffuse and the specular lobe times cosine, and of the density, in float64."""
+    """Integrate the diffuse and the specular lobe times the cosine, and the density, in float64."""
     with double_precision():
         wo = _view(degrees, normal)
         directions, weights = _sphere_quadrature(_mirror(normal, wo))
@@ -116,7 +116,7 @@ def test_a_white_furnace_is_never_brighter_than_its_walls(roughness):
     for degrees in (0.0, 40.0, 80.0):
         _, specular, _ = _integrals(degrees, albedo=1.0, roughness=roughness, metallic=1.0)
         assert specular <= 1.0 + 1e-3
-        # What is missing went into multiple scattering: little between smooth facets.
+        # The missing energy is that of multiple scattering, which is small between smooth facets.
         assert specular > (0.85 if roughness <= 0.3 else 0.3)
 
 
@@ -180,7 +180,7 @@ def test_samples_follow_their_density(degrees, roughness, metallic):
     expected = count * np.bincount(cells(z, phi), weights=mass, minlength=rows * columns)
     np.testing.assert_allclose(expected.sum(), count, rtol=5e-3)
 
-    # Pool the cells too rare for the chi-square law.
+    # Pool the cells whose expected counts are too small for the chi-square law.
     is_common = expected >= 10
     observed = np.append(observed[is_common], observed[~is_common].sum())
     expected = np.append(expected[is_common], max(expected[~is_common].sum(), 1e-9))

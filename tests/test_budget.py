@@ -1,4 +1,4 @@
-"""Budgets: what is chosen for a time, and a pace that keeps to it on any machine."""
+"""Budgets: settings chosen for a time, and a pacer that keeps to the time on any machine."""
 
 import time
 from dataclasses import replace
@@ -42,7 +42,7 @@ SIZE = (200, 200)
 
 @pytest.fixture(autouse=True)
 def _large_machine(monkeypatch):
-    """Choices are those of a machine with memory for any of them."""
+    """Make the memory of the machine large enough for any settings."""
     monkeypatch.setattr(budget_module, "memory_of_machine", lambda: 10**12)
 
 
@@ -94,7 +94,7 @@ def test_more_time_chooses_more_work():
     assert all(a.effort < b.effort or a.seconds < b.seconds for a, b in pairwise(plans))
     assert _cells(plans[0].config) < _cells(plans[-1].config)
     for one, seconds in zip(plans, (90, 180, 600, 2400), strict=True):
-        # Steps are whole numbers.
+        # Only approximately, since steps are whole numbers.
         assert one.seconds == pytest.approx(seconds, rel=0.01)
 
 
@@ -132,7 +132,8 @@ def test_no_more_memory_is_asked_for_than_the_machine_has(monkeypatch):
     tight = plan(Budget(1200.0), SIZE, slowness=1.0)
     assert tight.memory <= 5e9 < free.memory
     assert plan(Budget(1200.0, memory=20e9), SIZE, slowness=1.0).memory == tight.memory
-    # What a training takes is only expected: the least is tried, and refused once it is known.
+    # The memory of a training is only estimated: the smallest settings are tried all the same, and
+    # the training is refused once its memory is known.
     monkeypatch.setattr(budget_module, "memory_of_machine", lambda: int(1e9))
     assert plan(Budget(1200.0), SIZE, slowness=1.0).memory < tight.memory
     monkeypatch.setattr(budget_module, "memory_of_machine", lambda: None)
@@ -175,7 +176,8 @@ def test_a_shortened_stage_ends_its_schedules():
 
 def test_a_stage_of_several_paces_is_continuous():
     stage = Stage(name="s", steps=100, half_life=10.0, rates={"albedo": Rate(1.0)})
-    # 40 steps as they were, 20 of twice the speed, the other 20 in 40.
+    # The first 40 steps are as planned; the next 20 cover 40 planned steps at twice the speed; the
+    # last 40 cover the remaining 20 planned steps.
     stage = replace(
         stage,
         steps=100,
@@ -187,7 +189,7 @@ def test_a_stage_of_several_paces_is_continuous():
 
 
 class _Machine:
-    """A clock, and a training that costs what a function of the time says."""
+    """A clock, and a training whose costs are multiplied by a function of time."""
 
     def __init__(self, config, costs, speed):
         self.now, self.config, self.costs, self.speed = 1000.0, config, costs, speed
@@ -242,7 +244,7 @@ def test_a_training_ends_in_time_on_a_machine_of_another_speed(speed, tolerance)
 
 
 def test_what_later_stages_wait_for_is_set_aside():
-    """Of 290 s that are left, 190 steps of a second and a compilation of 100 s are just enough."""
+    """The 290 s that are left just suffice for 190 steps of one second and 100 s of compilation."""
     stages = tuple(Stage(name=name, steps=100, rates={"albedo": Rate(1.0)}) for name in "ab")
     config = replace(make_config("default", "draft"), stages=stages)
     costs = {name: StageCost(startup=100.0, step=1.0) for name in "ab"}
@@ -291,7 +293,7 @@ def test_a_later_stage_that_would_come_too_short_is_left_out_and_its_time_used()
 
 @pytest.mark.parametrize("slow_steps", [15, 60], ids=["at the start", "for a third of the stage"])
 def test_a_stage_left_out_comes_back_once_the_machine_is_fast_again(slow_steps):
-    """What a training makes that was slow for some steps is what it would have planned for them."""
+    """A training that was slow only for some steps still makes all its stages in the end."""
     stages = (
         Stage(name="split_sum", steps=200, rates={"albedo": Rate(1.0)}),
         Stage(name="monte_carlo", steps=100, rates={"albedo": Rate(1.0)}),
@@ -319,7 +321,7 @@ def test_a_stage_left_out_comes_back_once_the_machine_is_fast_again(slow_steps):
     seconds, after = machine.run(pacer)
     assert any(left_out)
     assert seconds == pytest.approx(640.0, rel=0.03)
-    # All schedules have the same length as they were planned, and later stages share one pace.
+    # All schedules reach their planned ends, and later stages share one pace.
     assert [stage.name for stage in after.active_stages] == [s.name for s in stages]
     for stage in after.stages:
         assert stage.rates_at(stage.steps) == pytest.approx(
@@ -335,7 +337,10 @@ def test_a_stage_left_out_comes_back_once_the_machine_is_fast_again(slow_steps):
     ids=["in time", "a short refinement stays", "a shorter one goes", "Monte Carlo takes it along"],
 )
 def test_what_is_too_short_to_be_worth_it_goes_with_all_after_it(seconds_left, monte_carlo, refine):
-    """A refinement is worth 30 steps, Monte Carlo 75; 100 steps of the first stage are to come."""
+    """A refinement is worth its time from 30 steps on, and Monte Carlo from 75 steps on.
+
+    100 steps of the first stage are still to come.
+    """
     stages = (
         Stage(name="split_sum", steps=110),
         Stage(name="monte_carlo", steps=200, enter=(FreshAlbedo("mean"),)),
@@ -382,7 +387,7 @@ def test_a_mesh_keeps_what_is_set_of_it(tmp_path):
     ]
     assert edges == pytest.approx([3.0, 6.0**0.5, 2.0, 1.5])
     assert with_mesh(between_qualities(0.5), file).geometry.edge_pixels == 2.0
-    # Four times as many faces are as many splats.
+    # Half the edge length gives four times as many faces, and so four times as many splats.
     finer = plan(Budget(600.0), SIZE, slowness=1.0, mesh=file, overrides=["geometry.edge_pixels=2"])
     pixels = float(SIZE[0] * SIZE[1])
     ratio = finer.config.geometry.expected_splats(pixels) / geometry.expected_splats(pixels)
@@ -412,7 +417,7 @@ def dataset():
 
 
 class _LateClock:
-    """An hour later at every look."""
+    """A clock that is an hour later at every reading."""
 
     def __init__(self):
         self.now = 0.0
@@ -476,7 +481,7 @@ def test_python_resumes_a_budget_with_the_same_call_or_a_shorter_one(
     assert run.config != config
     assert run.trained.step == run.config.total_steps
     assert run.folder.budget() == Budget(60.0)
-    # With less than a minute left no preview is begun, which the end would have to wait for.
+    # With less than a minute left no preview is begun, since the run would wait for it at its end.
     assert not run.folder.previews.exists()
 
 
@@ -494,7 +499,7 @@ def test_a_run_that_was_begun_without_a_budget_takes_none_later(dataset, tmp_pat
 
 
 def test_the_time_of_a_budget_counts_from_when_it_is_said_to(dataset, tmp_path, monkeypatch):
-    """Commands have read the scene before."""
+    """Commands read the scene before the training, and this time counts."""
     seen = []
     monkeypatch.setattr(run_module, "_pacer", lambda *a, began: seen.append(began))
 
@@ -521,7 +526,7 @@ def test_a_budget_that_is_resumed_takes_no_other_settings(dataset, tmp_path, cap
 
 
 def test_the_command_of_a_budget_goes_on_with_resume_alone(dataset, tmp_path, monkeypatch):
-    """The scene is read as it was, the budget is its own, and reading counts."""
+    """The scene is read as before, the budget is the recorded one, and reading counts."""
     config = tiny_config("stages.split_sum.steps=40", "stages.monte_carlo.steps=0")
     _paced_run(dataset, tmp_path / "run", config, stop_after=12)
     asked = {}

@@ -1,4 +1,7 @@
-"""Rounds of training and refining: each reads the cameras of the one before, none is made twice."""
+"""Rounds of training and refining: each reads the cameras that the previous round found.
+
+No round is made twice.
+"""
 
 import json
 
@@ -18,7 +21,7 @@ from geosplat_jax.run import Run
 
 
 class _Views:
-    """Views that are told from others by a number, their masks and their colours."""
+    """Views that differ from others in a number, their masks and their colours."""
 
     def __init__(self, number, coverage, brightness):
         self.number, self.coverage = number, [coverage]
@@ -33,7 +36,7 @@ class _Views:
 
 
 class _Scene(Dataset):
-    """What a scene would be read with, and its views."""
+    """A scene that holds only its views and the options that it was read with."""
 
     def __init__(self, options, poses=0, coverage=0.5, brightness=0.3):
         object.__setattr__(self, "options", dict(options))
@@ -42,7 +45,7 @@ class _Scene(Dataset):
 
 
 class _Round(Run):
-    """A run that is over, whose cameras come out as a number."""
+    """A finished run, whose refined cameras are just a number."""
 
     def __init__(self, number):
         self.number = number
@@ -126,7 +129,7 @@ def test_rounds_of_other_settings_are_not_taken_for_these(made, tmp_path, change
 def test_rounds_of_other_poses_or_photographs_are_not_taken_for_these(
     made, tmp_path, monkeypatch, new, what
 ):
-    """The scene's own were found anew since."""
+    """The poses or the photographs of the scene itself have changed since."""
     refined_cameras("scene", tmp_path / "fox")
     monkeypatch.setattr(
         camera_rounds, "load_recorded", lambda scene, options: _Scene(options, **new)
@@ -137,7 +140,7 @@ def test_rounds_of_other_poses_or_photographs_are_not_taken_for_these(
 
 
 def test_a_run_that_is_to_be_replaced_is_gone_before_the_first_round(made, tmp_path):
-    """Whoever is interrupted in a round goes on with it, not with that run."""
+    """A command interrupted in a round goes on with the round, not with the run to be replaced."""
     old = RunFolder(tmp_path / "fox")
     with old.locked():
         old.begin(sphere_dataset(), tiny_config(), replace=False)
@@ -193,7 +196,7 @@ def test_no_round_at_all_is_refused(made, tmp_path):
 
 
 def _resumed(monkeypatch, folder, *, reading, chosen):
-    """Resume a run whose record says so; return what its training was asked for."""
+    """Resume a run whose record holds ``reading``; return the datasets that training is given."""
     config, asked = make_config(quality="draft"), []
     scene = load_dataset("examples/duck", downscale=8)
     run = RunFolder(folder)

@@ -1,4 +1,4 @@
-"""Refined cameras: what is found, how it is differentiated, compared, written and read."""
+"""Refined cameras: solutions, derivatives, comparisons, and files that are written and read."""
 
 import json
 import shutil
@@ -60,7 +60,7 @@ SIZE = 32
 BOUNDS = (np.full(3, -0.6), np.full(3, 0.6))
 AMPLE = Capacities(visible=2048, hits=8192, chunks=1024)
 SMALL = Capacities(visible=256, hits=512, chunks=1024)
-# Without a prior, until nothing moves any more: the minimum is the truth.
+# Hardly any prior, and iterations until nothing moves any more, so the minimum is the truth.
 EXACT = CameraSettings(prior_deviation=1e4, tolerance=1e-3, rounds=3)
 TRUTH = np.array([0.02, -0.015, 0.03, 0.02, -0.03, 0.02, 0.015, 0.05], np.float32)
 
@@ -113,7 +113,7 @@ def box_of(subject):
 
 @pytest.fixture(scope="module")
 def photograph(subject, views):
-    """What a camera sees that `TRUTH` moves away from the one that is known."""
+    """A photograph by a camera that is `TRUTH` away from the known one."""
     camera, log_exposure = moved_camera(views.camera([0]), jnp.asarray(TRUTH), box_of(subject))
     image = jnp.asarray(photographed(subject, camera, log_exposure))
     assert 0.1 < float(image[..., 3].mean()) < 0.9
@@ -122,13 +122,13 @@ def photograph(subject, views):
 
 @pytest.fixture(scope="module")
 def found(subject, photograph):
-    """What the solver finds, and the buffers that it took."""
+    """The result of the solver, and the capacities that it used."""
     return refine_view(subject, photograph, EXACT)
 
 
 def test_the_camera_and_the_exposure_of_a_render_are_found_again(found):
     result, _ = found
-    # Only a longer lens further away is hard to tell; float32 leaves 1e-4 of it.
+    # Only a longer lens further away is hard to distinguish: float32 leaves an error of 1e-4.
     np.testing.assert_allclose(0.01 * np.asarray(result.parameters), TRUTH, atol=5e-4)
     assert float(result.after.rms) < 2e-3 * float(result.before.rms) + 1e-4
     assert float(result.before.rms) > 0.02
@@ -178,12 +178,12 @@ def test_buffers_grow_until_every_iterate_fits(monkeypatch, subject, photograph,
 
     monkeypatch.setattr(cameras_module, "_solve", solve)
     result, capacities = refine_view(with_capacities(subject, SMALL), photograph, EXACT)
-    # Two attempts of three rounds; what overflowed only at the end was noticed, too.
+    # Two attempts of three rounds each: an overflow that occurs only at the end is noticed, too.
     assert [c["hits"] >= 9000 for c in tried] == [False] * 3 + [True] * 3
     assert capacities["visible"] >= 300
     assert capacities["chunks"] == SMALL["chunks"]
     assert int(result.iterations) == 12
-    # Every round goes on where the one before ended, and an attempt begins anew.
+    # Every round starts where the previous one ended, and a new attempt starts from zero.
     np.testing.assert_array_equal(seen[3], np.zeros(8))
     np.testing.assert_array_equal(seen[4], found[0].parameters)
 
@@ -224,7 +224,7 @@ def test_forward_reverse_and_differences_give_one_jacobian(subject, photograph):
         )
     assert forward.dtype == np.float64
     np.testing.assert_allclose(weights @ forward, pulled, rtol=1e-9, atol=1e-9)
-    # A cut at alpha = 1/255 is a jump that no derivative sees; it moves single pixels.
+    # The cut at alpha = 1/255 is a jump that has no derivative; it changes single pixels.
     apart = np.abs(differences - forward)
     assert np.quantile(apart, 0.995) < 1e-6 * np.abs(forward).max()
     assert all(np.abs(forward).max(axis=0) > 1e-3)
@@ -259,7 +259,7 @@ def test_unseen_objects_and_empty_masks_keep_their_camera(subject, views, photog
     fine = split.cameras["fine"]
     assert fine.accepted
     assert fine.residual_after < 0.02 * fine.residual_before
-    # What the photograph was divided by before belongs to the whole factor.
+    # The exposure that the photograph was divided by before is part of the whole factor.
     assert fine.exposure == pytest.approx(2 * np.exp(TRUTH[7]), rel=1e-3)
     expected = moved_camera(views.camera(), jnp.asarray(TRUTH), box_of(subject))[0]
     np.testing.assert_allclose(fine.world_to_camera, expected.world_to_camera[0], atol=2e-3)
@@ -352,7 +352,7 @@ def test_a_common_motion_is_no_error(count, scale):
 
 
 def test_a_common_brightness_is_no_error():
-    """It is the light's; what a single view has beside it is told."""
+    """It belongs to the light; the exposure error of a single view is still reported."""
     true = replace(many_views(6), exposure=np.array([1.0, 1.2, 0.9, 1.0, 1.1, 1.0]))
     found = replace(true, exposure=1.5 * true.exposure)
     errors, _ = compare_cameras(found, true, BOUNDS)
@@ -400,7 +400,7 @@ def a_camera(views, index=0, **changes):
 
 @pytest.fixture
 def file(tmp_path):
-    """Cameras of three views, on disk."""
+    """Write cameras of three views to a file; return the file, the views and the cameras."""
     views = many_views(3)
     cameras = {name: a_camera(views, k) for k, name in enumerate(views.names)}
     cameras["view_2"] = a_camera(views, 2, accepted=False, note="why", exposure=1.0)
@@ -434,7 +434,7 @@ def test_views_take_their_cameras_by_name_and_lose_their_exposure(file):
     np.testing.assert_array_equal(changed.white_balance[1], [0.5, 1.0, 2.0])
     np.testing.assert_array_equal(changed.images[..., 3], views.images[..., 3])
     np.testing.assert_array_equal(changed.exposure, [1.0, 1.25, 1.25])
-    # The file holds whole factors: a second time changes nothing.
+    # The file holds whole factors, so that applying it a second time changes nothing.
     twice = with_cameras(changed, read_cameras(path)["train"], str(path))
     np.testing.assert_array_equal(twice.images, changed.images)
     np.testing.assert_array_equal(twice.exposure, changed.exposure)
@@ -604,13 +604,14 @@ def test_a_run_is_refined_and_trained_with_what_was_found(run, capsys):
         opened.dataset.train.names, opened.dataset.train.world_to_camera, strict=True
     ):
         np.testing.assert_allclose(pose, refined["train"].cameras[name].world_to_camera, atol=1e-12)
-    # Another loss from the first step on: these cameras and photographs were trained on.
+    # The loss is different from the first step on, so the run used these cameras and exposures.
     assert opened.steps()[0]["loss"] != Run(run / "run").steps()[0]["loss"]
     assert train(run, "again", "--cameras", str(path), "--resume") == 0
     assert train(run, "again", "--resume") == 2
     assert "take the same scene, read in the same way, or another folder" in capsys.readouterr().err
     assert cli.main(["render", str(run / "again"), "--output", str(run / "pictures")]) == 0
-    # The run keeps what it was trained with, wherever it is moved; a change is noticed.
+    # The run keeps the cameras that it was trained with wherever it is moved, and a change of their
+    # file is noticed.
     path.unlink()
     moved = (run / "again").rename(run / "moved")
     assert cli.main(["render", str(moved), "--output", str(run / "pictures")]) == 0

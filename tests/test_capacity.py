@@ -67,7 +67,7 @@ def test_compaction_of_nothing():
 
 @partial(jax.jit, static_argnames="capacity")
 def pack(mask, capacity):
-    """The packed mask, the first entries with enough and too little room, and all ranks."""
+    """Return the packed mask, its first entries with enough and with too little room, and ranks."""
     packed = bit_set(mask)
     everything = jnp.arange(mask.shape[0], dtype=jnp.int32)
     few = packed.first(capacity=capacity // 4)
@@ -90,7 +90,7 @@ def test_a_bit_set_agrees_with_compaction_and_rank_inverts_it(size, density):
 
 
 def counts(**needed):
-    """A `usage` from plain numbers."""
+    """Return a `usage` of plain numbers."""
     return usage(**{name: jnp.asarray(count, jnp.int32) for name, count in needed.items()})
 
 
@@ -170,7 +170,7 @@ def test_capacities_are_values_whatever_the_order_of_their_names():
     assert eval(repr(one)) == one
     for other in (Capacities(), Capacities(hits=1), one.resized(hits=3), dict(one)):
         assert one != other
-    # Explicit is not the same as unsized: only the former survives a change of the default.
+    # An explicit size is not the same as none: only the former survives a change of the default.
     assert Capacities(hits=UNSIZED) != Capacities()
 
 
@@ -215,7 +215,8 @@ class _Stages:
 
 
 def test_retry_grows_until_everything_fits():
-    # What an early buffer drops, the later ones do not count: their need shows only afterwards.
+    # Later buffers do not count what an early one drops, so their needs show only once it has
+    # grown.
     stages = _Stages(9000, 70_000, 500_000)
     result, capacities = retry(stages, Capacities(first=128, second=128, third=128))
     assert len(stages.tried) == 4
@@ -245,7 +246,7 @@ def test_retry_never_returns_a_result_that_overflowed(seed):
     result, capacities = retry(attempt, Capacities())
     assert bool(fits(reported[result], capacities))
     assert [int(n) for n in reported[result].values()] == needs
-    # Every attempt before it overflowed, and none was tried with less than the one before it.
+    # Every earlier attempt overflowed, and none was tried with less than the one before it.
     assert all(overflowed(reported[f"result {i + 1}"], c) for i, c in enumerate(stages.tried[:-1]))
     for less, more in zip(stages.tried, stages.tried[1:], strict=False):
         assert all(more[name] >= less[name] for name in ("first", "second", "third"))

@@ -24,7 +24,7 @@ COUNT = 10
 CENTER, RADIUS, DISTANCE = np.array([3.0, -2.0, 1.0]), 0.8, 4.0
 BOX = (CENTER - 1, CENTER + 1)
 LENS = SimpleNamespace(fx=40.0, fy=36.0, cx=11.0, cy=12.5)
-STEP = 1 / 255  # of eight bits
+STEP = 1 / 255  # one step of eight bits
 
 
 def size_of(number, *, several=True):
@@ -53,7 +53,7 @@ def opencv_extrinsics(pose):
 
 
 def photograph(pose, size):
-    """The ball, coloured by its normals, before grey: (H, W, 3), and its mask (H, W, 1)."""
+    """Return an image (H, W, 3) of the ball, coloured by normals on grey, and a mask (H, W, 1)."""
     rotation, _ = opencv_extrinsics(pose)
     v, u = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5, indexing="ij")
     rays = np.stack([(u - LENS.cx) / LENS.fx, (v - LENS.cy) / LENS.fy, np.ones_like(u)], -1)
@@ -69,7 +69,7 @@ def photograph(pose, size):
 
 
 def write_photographs(root, folder, *, masks="masks", several=True, rgba=False, start="view_"):
-    """Write all photographs, and masks where they have a folder; return the names."""
+    """Write all photographs, and their masks where ``masks`` names a folder; return the names."""
     names = []
     for number, pose in enumerate(opengl_poses()):
         rgb, mask = photograph(pose, size_of(number, several=several))
@@ -85,7 +85,7 @@ def write_photographs(root, folder, *, masks="masks", several=True, rgba=False, 
 def write_transforms(root, *, masks="masks", rgba=False, several=True, **more):
     names = write_photographs(root, "images", masks=None, rgba=rgba, several=several)
     frames = []
-    # Not in the order of their names.
+    # The frames are not in the order of their names.
     for number in [*range(5, COUNT), *range(5)]:
         pose, (height, width) = opengl_poses()[number], size_of(number, several=several)
         frame = {"file_path": f"./images/{names[number]}", "transform_matrix": pose.tolist()}
@@ -103,13 +103,16 @@ def colmap_quaternion(rotation):
 
 
 def colmap_cameras():
-    """Number, model, size and numbers; the upright photograph has a camera of its own."""
+    """Return number, model, size and parameters of the cameras.
+
+    The upright photograph has a camera of its own.
+    """
     numbers = (LENS.fx, LENS.fy, LENS.cx, LENS.cy)
     return [(1, 1, *size_of(0)[::-1], numbers), (7, 1, *size_of(3)[::-1], numbers)]
 
 
 def colmap_images(names):
-    """Number, quaternion, translation, camera and name, in an order of their own."""
+    """Return number, quaternion, translation, camera and name of every image, in reverse order."""
     listed = []
     for number in reversed(range(COUNT)):
         rotation, translation = opencv_extrinsics(opengl_poses()[number])
@@ -166,12 +169,12 @@ SCALE = np.diag([2.0, 2.0, 2.0, 1.0]) + np.array([[0, 0, 0, c] for c in (5.0, 6.
 
 
 def write_idr(root):
-    """The world of the file is twice as large and elsewhere; scale_mat takes it back."""
+    """Write a capture in whose world the object is larger and elsewhere; scale_mat undoes this."""
     write_photographs(root, "image", masks="mask", start="")
     arrays = {}
     for number, pose in enumerate(opengl_poses()):
         rotation, translation = opencv_extrinsics(pose)
-        # Rays go through whole numbers there.
+        # In this layout, pixel centres lie at whole numbers.
         lens = np.array([[LENS.fx, 0, LENS.cx - 0.5], [0, LENS.fy, LENS.cy - 0.5], [0, 0, 1.0]])
         projection = np.eye(4)
         projection[:3] = -3.0 * lens @ np.concatenate([rotation, translation[:, None]], -1)
@@ -196,7 +199,7 @@ def write_blended_mvs(root):
 
 
 def light_of(pose):
-    """A map that is bright where the world's +x is, as a camera sees it: (8, 16, 3)."""
+    """Return a map (8, 16, 3) in a camera's axes that is bright where the world's +x is."""
     right, up, forward = pose[0, 0], pose[0, 1], -pose[0, 2]
     # u = .5 + atan2(x, -z) / 2 pi: forwards in the middle, +z at the left edge, y up.
     column = int((0.5 + np.arctan2(right, forward) / (2 * np.pi)) * 16) % 16
@@ -207,7 +210,7 @@ def light_of(pose):
 
 
 def write_stanford_orb(root):
-    """The frames of NeRF-synthetic, whose lenses are in the middle."""
+    """Write frames as NeRF-synthetic does, each with a lens of its own."""
     for split, numbers in (("train", range(2, COUNT)), ("test", range(2))):
         frames = []
         for number in numbers:
@@ -249,12 +252,12 @@ def scenes(tmp_path_factory):
 
 @pytest.fixture
 def copied(scenes, tmp_path):
-    """Copies to spoil."""
+    """Copies of captures for tests that damage them."""
     return lambda layout: shutil.copytree(scenes[layout], tmp_path / "ball")
 
 
 def load(root, **settings):
-    """Load with given bounds, which most tests do not need found."""
+    """Load with given bounds, since most tests do not need to find them."""
     return load_dataset(root, **{"bounds": BOX, **settings})
 
 
@@ -349,10 +352,10 @@ def test_images_are_reduced_to_half_a_cell(scenes):
     chosen = choose_downscale(root, 500)
     assert chosen.factor == 1
     assert "images stay in full size: a cell" in chosen.reason
-    # Half the box has half the cells for the same size.
+    # A box of half the size has half as many cells of the same size.
     half = (middle - 0.25 * (hi - lo), middle + 0.25 * (hi - lo))
     assert choose_downscale(root, 1, bounds=half) == choose_downscale(root, 2)
-    # Of other options it takes those that tell how to read the scene.
+    # It also takes the other options that tell how to read the scene.
     assert choose_downscale(root, 2, train_views=4, test_views=1) == choose_downscale(root, 2)
     for chosen in (choose_downscale, photograph_size):
         with pytest.raises(SceneError, match="layout must be one of"):
@@ -415,7 +418,7 @@ def test_images_with_alpha_need_no_masks_and_leave_those_that_are_there(tmp_path
 
 
 def test_an_alpha_that_is_one_in_all_photographs_cuts_nothing_out(tmp_path):
-    """Screenshots and converters write one; a single photograph may be filled by the object."""
+    """Screenshots and converters write such an alpha; one photograph may show only the object."""
     write_transforms(tmp_path, masks=None)
     for path in (tmp_path / "images").iterdir():
         write_png(path, np.concatenate([read_image(path), np.ones((*size(path), 1))], -1))
@@ -455,7 +458,7 @@ def test_pixels_that_do_not_count_are_apart_from_the_mask(copied):
     valid = np.ones((20, 24, 1), np.float32)
     valid[4:9, 6:11] = 0.0
     write_png(root / "valid" / "view_05.png", valid)
-    # instant-ngp marks what moves, and not what stays.
+    # Masks with this name, as instant-ngp has them, mark the moving pixels, which do not count.
     write_png(root / "images" / "dynamic_mask_view_06.png", 1.0 - valid)
     for factor in (1, 2):
         views = load(root, downscale=factor).train
@@ -479,7 +482,7 @@ def test_a_distorted_capture_becomes_a_pinhole_with_its_border_marked(tmp_path):
     edit(tmp_path, lambda content: content.update(k1=0.4))
     bent = load(tmp_path).train
     np.testing.assert_array_equal(bent.intrinsics, straight.intrinsics)
-    # A corner of the pinhole lies outside of the photograph, the middle stays where it is.
+    # A corner of the pinhole image lies outside the photograph; the middle stays where it is.
     assert (bent.valid[:, 0, 0] == 0).all()
     assert (bent.valid[:, 12, 11] == 1).all()
     assert (np.asarray(bent.images)[np.asarray(bent.valid) == 0] == 0).all()
@@ -590,7 +593,7 @@ def test_a_binary_model_that_ends_early_is_refused_wherever_it_ends(copied):
 
 
 def spoiled_image(**changes):
-    """Bytes of images of which the first is spoiled."""
+    """Return the bytes of images, of which the first has the given changes."""
     images = colmap_images([f"view_{k:02d}.png" for k in range(COUNT)])
     fields = dict(
         zip(("number", "quaternion", "translation", "camera", "name"), images[0], strict=True)
@@ -671,7 +674,7 @@ def test_a_spoiled_text_model_is_named(copied, name, old, new, message):
 
 @pytest.mark.parametrize("name", ["{}", "my {}", "my cat {}"])
 def test_a_text_model_without_lines_of_points_is_refused(copied, name):
-    """Every second image would be taken for points, of which a line may have any number."""
+    """Every second image would be taken for points, since a line of points may have any length."""
     root = copied("colmap_text")
     path = root / "sparse" / "images.txt"
     head, *lines = path.read_text().splitlines()
@@ -693,7 +696,7 @@ def test_models_beside_the_one_that_is_read_are_said(copied):
 
 
 def test_a_distorted_colmap_camera_is_that_of_transforms(copied, tmp_path):
-    """The same lens in either layout, numbers in either order."""
+    """The same lens in both layouts, each of which writes its numbers in its own way."""
     root = copied("colmap")
     bend = {"k1": -0.15, "k2": 0.03, "p1": 0.02, "p2": -0.01}
     cameras = [

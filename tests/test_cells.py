@@ -1,4 +1,4 @@
-"""What the cells of a grid know: their lists, and how far a ray may go where there are none."""
+"""Cells of a grid: their lists, and how far a ray may skip where they list nothing."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +17,10 @@ def words(cells):
 
 
 def largest_empty_cube(occupied, x, y, z, octant):
-    """Side of the largest cube, a power of two, that begins with a cell and lists nothing."""
+    """Return the side, a power of two, of the largest empty cube that begins at a cell.
+
+    The cube extends from the cell towards an octant.
+    """
     side = 1
     while side < 128:
         spans = []
@@ -64,7 +67,7 @@ def test_a_cell_with_a_list_says_where_it_begins_and_how_long_it_is():
 
 
 def test_a_cone_passes_no_cell_whose_faces_a_ray_may_meet():
-    """Of normals that spread narrowly, widely, or over more than half a sphere."""
+    """The normals of a cell spread narrowly, widely, or over more than half a sphere."""
     rng = np.random.default_rng(0)
     cells, each, rays = 400, 4, 200
     axes = rng.standard_normal((cells, 1, 3))
@@ -77,7 +80,7 @@ def test_a_cone_passes_no_cell_whose_faces_a_ray_may_meet():
     flat = jnp.asarray(normals.reshape(1, -1, 3), jnp.float32)
     cones = np.asarray(cones_of(flat, jnp.asarray(entries, jnp.int32), lists, cells))
 
-    # Directions around the axis, where a cone passes the most, and anywhere.
+    # Directions near the axis, along which rays pass the most cells, and directions anywhere.
     middle = normals.sum(axis=1, keepdims=True)
     middle /= np.linalg.norm(middle, axis=-1, keepdims=True)
     width = rng.choice([0.03, 0.3, 30.0], (cells, rays, 1))

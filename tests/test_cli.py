@@ -44,7 +44,7 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(scene, tmp_path_factory):
-    """A run of a few steps; that of a folder without one begins, also with ``--resume``."""
+    """A run of a few steps; with ``--resume`` a run begins where the folder does not hold one."""
     folder = tmp_path_factory.mktemp("cli") / "run"
     arguments = [*REDUCED, "--set", "run.preview_every=4", "--resume"]
     assert train(folder, *arguments, scene=scene) == 0
@@ -107,7 +107,7 @@ def test_training_leaves_a_complete_run_folder(run):
     assert record["dataset"] == {"downscale": 4, "light": None, "bounds": None}
     assert len((run / "metrics.jsonl").read_text().splitlines()) == 4
     preview = read_image(run / "previews" / "step_000004.png")
-    # Four pictures of 32 x 32, and what they are.
+    # Four pictures of 32 x 32 pixels, and their captions.
     assert preview.shape[0] > 32
     assert preview.shape[1] > 4 * 32
     assert len(list((run / "checkpoints").glob("*.npz"))) == 2
@@ -230,7 +230,7 @@ def test_an_existing_output_folder_is_not_touched(tmp_path, capsys):
 
 
 def test_a_table_of_steps_is_written_only_by_a_command_that_made_some(tmp_path):
-    """Not by one that is refused because the folder holds another run."""
+    """A command that is refused because the folder holds another run leaves the table alone."""
     run, table = RunFolder(tmp_path / "run"), tmp_path / "steps.csv"
     run.path.mkdir()
     (run.path / "run.json").write_text("{}")

@@ -1,4 +1,4 @@
-"""Programs that are compiled before they are needed."""
+"""Programs are compiled before they are needed."""
 
 import logging
 import threading
@@ -24,7 +24,7 @@ LARGE = ("_asset", "_view_gradient", "_back", "_update")
 
 
 def compiled_programs(caplog):
-    """Names of the large programs that XLA was asked for."""
+    """Return the names of the large programs that XLA was asked to compile."""
     return {
         name
         for name in LARGE
@@ -34,7 +34,7 @@ def compiled_programs(caplog):
 
 
 def test_a_step_finds_its_programs_compiled(caplog):
-    """From shapes alone, without a run of any program; the step then compiles none of them."""
+    """Programs are compiled from shapes alone and without a run; the step then compiles none."""
     config, pipeline, params, batch = problem(stage="split_sum")
     pipeline = replace(pipeline, capacities=TIGHT.resized(visible=6272))
     rule = update_rule(config, config.stage("split_sum"), params, 0)
@@ -48,7 +48,7 @@ def test_a_step_finds_its_programs_compiled(caplog):
 
 
 def test_a_run_that_stops_early_leaves_no_thread_behind(tmp_path, monkeypatch):
-    """A process that ends while a thread of it compiles crashes, after Ctrl-C above all."""
+    """A process that ends while one of its threads compiles crashes, above all after Ctrl-C."""
     begun = []
 
     def slowly(*arguments, is_wanted=lambda: True, **others):
@@ -66,11 +66,11 @@ def test_a_run_that_stops_early_leaves_no_thread_behind(tmp_path, monkeypatch):
 
 
 NOTHING: Any = [object.__new__(kind) for kind in (TrainState, Batch, Pipeline, UpdateRule)]
-"""Arguments of `compile_step` where nothing looks at them."""
+"""Arguments of `compile_step` for tests in which nothing looks at them."""
 
 
 class _Program:
-    """Stands for a program of a step; ``seconds`` : that looking at its memory takes."""
+    """Stands for a program of a step; ``seconds`` : how long checking its memory takes."""
 
     __name__ = "program"
     out_info = None
@@ -85,7 +85,7 @@ class _Program:
 
 
 def test_one_program_that_does_not_fit_twice_decides_for_all(monkeypatch):
-    """Also where one that fits is looked at for longer, by another thread."""
+    """This holds even where another thread needs longer to check a program that fits."""
 
     def fits_twice(program):
         time.sleep(program.seconds)
@@ -108,7 +108,7 @@ def test_a_compilation_that_fails_is_told(monkeypatch):
 
 
 def test_no_thread_compiles_on_for_a_step_that_failed(monkeypatch):
-    """The next training would wait for it, and so would the end of the process."""
+    """The next training would wait for such a thread, and so would the end of the process."""
     ended = []
 
     class Slow(_Program):

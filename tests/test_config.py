@@ -58,14 +58,14 @@ def test_presets_carry_the_numbers_of_the_paper_and_of_the_authors_code():
     assert paper.stages[1].transport.indirect == "harmonics"
     assert code.stages[1].transport.indirect == "constant"
     for config in (paper, code, make_config()):
-        # The authors' exp(-10), and linear images.
+        # The thickness is the authors' exp(-10), and images are compared in linear light.
         assert config.adapter.thickness == pytest.approx(np.exp(-10), rel=1e-3)
         assert config.objective.srgb is False
     for config in (paper, code):
         assert config.geometry.resolution == 96
         assert config.geometry.cubic
         assert config.geometry.reach == 0.25
-        # The sum of Eq. 14 outweighs the picture and empties the surface.
+        # The sum of Eq. 14 would outweigh the image losses and empty the surface.
         assert config.geometry.entropy_reduction == "mean"
         assert not config.raster.cull_backfaces
         assert config.material.position_gradient
@@ -89,7 +89,7 @@ def test_the_originals_have_the_schedule_of_the_authors_code(preset):
         assert stage.rates["light"] == Rate(1e-2)
         assert stage.rates["exposure"] == Rate(5e-3)
         assert stage.rates["shift"] == Rate(3e-3)
-    # 5 % of the whole training.
+    # This is 5 % of the steps of the whole training.
     assert split_sum.vertex_fraction * split_sum.steps == 50
     for name in ("sdf", "deform", "weights"):
         assert split_sum.rates[name] == Rate(1e-2)
@@ -100,11 +100,11 @@ def test_the_originals_have_the_schedule_of_the_authors_code(preset):
     assert monte_carlo.rates["indirect"] == Rate(1e-2)
     transport = monte_carlo.transport
     assert isinstance(transport, MonteCarloSettings)
-    # 8 x 8 strata with a sample of the light and one of the BRDF each.
+    # 8 x 8 strata, each with one sample of the light and one of the BRDF.
     assert transport.light_count == 64
     assert transport.diffuse_count + transport.specular_count == 64
     assert transport.residual_count == 0
-    # The refinement: 512 rays per pixel, a mesh that does not move, and what decays.
+    # The refinement has 512 rays per pixel, a fixed mesh, and rates of which some decay.
     assert (refine.steps, refine.transport.light_count) == (100, 256)
     assert isinstance(refine.domain, PerPixel)
     assert refine.domain.points == {"paper": "splats", "code": "mesh"}[preset]
@@ -130,7 +130,7 @@ def test_the_weights_of_the_entropy_and_the_smoothness_follow_paper_and_code():
     split_sum, monte_carlo, refine = make_config("code").stages
     assert [split_sum.weights_at(n)["entropy"] for n in (0, 500)] == pytest.approx([0.2, 0.12])
     assert [monte_carlo.weights_at(n)["entropy"] for n in (0, 500)] == pytest.approx([0.2, 0.01])
-    # Means over channels there, sums here.
+    # The authors' code has means over channels, and ours sums.
     assert split_sum.weights_at(0)["smoothness_albedo"] == 0
     assert split_sum.weights_at(500)["smoothness_albedo"] == pytest.approx(0.03 / 3)
     assert split_sum.weights_at(500)["smoothness_roughness_metallic"] == pytest.approx(0.001 / 2)

@@ -1,4 +1,4 @@
-"""Consistency of mesh and splats: exact on a plane, and blind to nothing that it names."""
+"""Consistency of mesh and splats: exact on a plane, and sensitive to every error it reports."""
 
 import json
 from dataclasses import replace
@@ -30,7 +30,7 @@ EYE = [0.6, 0.3, 2.4]
 
 
 def plane(cells=16):
-    """Vertices and faces of a square from -1 to 1 at z = 0, seen from above."""
+    """Return the mesh of a square from -1 to 1 at z = 0 that faces upwards."""
     x, y = np.meshgrid(*[np.linspace(-1, 1, cells + 1)] * 2)
     vertices = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
     corner = np.arange(cells * (cells + 1)).reshape(cells, -1)[:, :-1].reshape(-1, 1)
@@ -69,7 +69,7 @@ def away_from(eye, body):
 
 
 def test_a_plane_is_what_its_splats_are(body, cameras):
-    """But for the distance of a splat's mean, which is not that of the pixel's centre."""
+    """Only distances differ, since that of a splat's mean is not that of the pixel's centre."""
     found = measure(body, cameras)
     assert found.pixels == 32 * 32
     assert found.reflection_deg < 0.01
@@ -79,7 +79,8 @@ def test_a_plane_is_what_its_splats_are(body, cameras):
 
 def test_normals_that_are_turned_turn_the_reflection_by_twice_as_much(body, cameras):
     eye = np.asarray(EYE) / np.linalg.norm(EYE)
-    # Within the plane of sight of the middle of the picture, where the angle doubles exactly.
+    # The normal turns in the plane that holds the line of sight to the middle of the picture, where
+    # the angle doubles exactly.
     across = eye - eye[2] * np.array([0, 0, 1.0])
     across /= np.linalg.norm(across)
     angle = np.deg2rad(10.0)
@@ -93,7 +94,8 @@ def test_splats_that_sink_change_the_distance_by_as_much(body, cameras):
     sunk = with_splats(body, means=body.splats.means + 0.1 * away_from(EYE, body))
     raised = with_splats(body, means=body.splats.means - 0.1 * away_from(EYE, body))
     far, near = (measure(b, cameras).distance for b in (sunk, raised))
-    # A slant shows the nearer of two splats, so both are a little closer than their means.
+    # At a slant the nearer of two splats shows, so both surfaces are a little closer than the
+    # means.
     assert body.diagonal == pytest.approx(np.sqrt(8))
     assert 0.5 * (far + near) == pytest.approx(0.1 / body.diagonal, rel=0.05)
 
@@ -169,7 +171,7 @@ def test_of_a_sheet_both_sides_are_outside_with_a_normal_of_their_own(tmp_path):
 
 
 def test_seams_of_a_file_are_sewn(tmp_path):
-    """A file that repeats the corners of every face has the normals of the whole."""
+    """A file that repeats the corners of every face gives the normals of the connected mesh."""
     ball = trimesh.creation.icosphere(subdivisions=2)
     torn = trimesh.Trimesh(
         ball.vertices[ball.faces].reshape(-1, 3),
@@ -204,7 +206,7 @@ def test_a_larger_image_has_the_same_field_of_view():
 
 
 def test_constants_of_the_splats_change_what_is_found(tmp_path):
-    """Rotating nothing, only spreading the splats: the curved ball tells, by its angle."""
+    """Wider splats on a curved ball change the reflection, although no normal is turned."""
     mesh = load_mesh(saved(trimesh.creation.icosphere(subdivisions=2), tmp_path))
     cameras = cameras_around(box_of(mesh), views=1, size=32)
     wide = FaceSplats(AdapterConstants(alpha=(2.0, 5.0)))

@@ -1,4 +1,7 @@
-"""Settings at their extremes: a handful at once; `experiments/studies/extremes.py` trains all."""
+"""Settings at their extremes, several at once in a training.
+
+`experiments/studies/extremes.py` trains with each of the extremes.
+"""
 
 import json
 import sys

@@ -32,7 +32,7 @@ SIZE, ANGLE, RADIUS, DISTANCE = 24, 0.7, 0.8, 4.0
 ALBEDO, RADIANCE = np.array([0.8, 0.2, 0.05]), np.array([0.5, 0.25, 0.1])
 ROUGHNESS = 0.4
 COUNTS = {"train": 8, "test": 3}
-STEP = 1 / 255  # of eight bits
+STEP = 1 / 255  # one step of eight bits
 
 BOX = (np.full(3, -1.0), np.full(3, 1.0))
 
@@ -69,7 +69,7 @@ def sphere_view(pose):
 
 
 def constant(alpha, color):
-    """RGBA of one colour; what is behind the mask is white, to see whether it leaks."""
+    """Return RGBA of one colour; outside the mask it is white, so that a leak would be visible."""
     rgb = np.where(alpha > 0, np.asarray(color, np.float32), 1.0)
     return np.concatenate([rgb, alpha], -1).astype(np.float32)
 
@@ -174,23 +174,23 @@ def scenes(tmp_path_factory):
 
 @pytest.fixture
 def blender(scenes, tmp_path):
-    """A NeRF-synthetic scene to spoil."""
+    """A copy of a NeRF-synthetic scene for tests that damage it."""
     return shutil.copytree(scenes["nerf_synthetic"], tmp_path / "ball")
 
 
 @pytest.fixture
 def tensoir(scenes, tmp_path):
-    """A TensoIR scene to spoil."""
+    """A copy of a TensoIR scene for tests that damage it."""
     return shutil.copytree(scenes["tensoir"], tmp_path / "ball")
 
 
 def load(root, **settings):
-    """Load with given bounds, which the tests of bad input do not need found."""
+    """Load with given bounds, since tests of bad input do not need to find them."""
     return load_dataset(root, **{"bounds": BOX, **settings})
 
 
 def paint(path, colors):
-    """Give the object of a picture other colours, (H, W, 3)."""
+    """Replace the colours of a picture, (H, W, 3), and keep its alpha."""
     pixels = np.array(read_image(path))
     pixels[..., :3] = colors
     write_png(path, pixels)
@@ -240,7 +240,7 @@ def test_a_damaged_picture_is_one_line_and_the_decoder_is_silent(blender, spoil,
 
 
 def test_a_process_without_a_stream_of_errors_reads_scenes(scenes, monkeypatch):
-    """As services and ``pythonw`` are."""
+    """Services and ``pythonw`` have none."""
     monkeypatch.setattr(sys, "stderr", None)
     assert len(load(scenes["nerf_synthetic"]).train)
 
@@ -487,7 +487,7 @@ INTRINSICS = np.array([[40.0, 0.0, 13.5], [0.0, 30.0, 10.25], [0.0, 0.0, 1.0]])
 
 
 def with_lens(root, lens, *, split="train"):
-    """Put a lens in the place of the angle."""
+    """Replace the angle of view in a file by a lens."""
 
     def change(content):
         del content["camera_angle_x"]
@@ -534,7 +534,7 @@ def test_a_lens_of_larger_images_is_scaled_to_those_on_disk(blender):
     [(24, 12, None), (12, 24, "stored on their side"), (24, 24, "were cropped")],
 )
 def test_images_of_another_shape_than_their_lens_are_noticed(tmp_path, width, height, said):
-    """A lens of 48 x 24 pixels, of images of half the size, turned, or cut."""
+    """The lens has 48 x 24 pixels; images have half that size, or are turned or cropped as well."""
     lens = {"fl_x": 60.0, "w": 48, "h": 24}
     (tmp_path / "images").mkdir()
     frames = []
@@ -591,7 +591,8 @@ def test_a_distorted_lens_bends_truth_and_images_alike(scenes, tmp_path):
     for name in ("transforms_train.json", "transforms_test.json"):
         edit(root, lambda content: content.update(k1=0.5), name=name)
     straight, bent = load(scenes["shiny_blender"]).test, load(root).test
-    # The ball's rim is 5 pixels of 33 from the axis: shown further out, so the pinhole's is nearer.
+    # The ball's rim is 7 pixels from the axis, at a focal length of 33. The lens shows it further
+    # out, so it is nearer to the axis in the pinhole image.
     assert 0.8 < bent.images[..., 3].sum() / straight.images[..., 3].sum() < 0.99
     assert bent.valid is not None
     inside = bent.images[..., 3] > 0.999
@@ -612,7 +613,7 @@ def test_truth_of_another_size_is_named_and_not_its_image(scenes, tmp_path):
 
 
 def test_an_image_of_any_format_may_be_named_with_its_ending(blender):
-    """Endings are left out in this layout, of which only the usual ones are tried."""
+    """In this layout names may lack their endings, and then only the usual endings are tried."""
     for path in sorted((blender / "train").glob("r_?.png")):
         write_png(path.with_suffix(".tga.png"), read_image(path))
         path.with_suffix(".tga.png").rename(path.with_suffix(".tga"))
@@ -687,7 +688,7 @@ def test_a_dataset_remembers_how_it_was_read(scenes):
     read = load_dataset(scenes["tensoir"], downscale=2, light="noon", bounds=corners)
     options = {"downscale": 2, "light": "noon", "bounds": [-1.0, -1.5, -1.0, 1.0, 1.0, 2.0]}
     assert read.options == options
-    # As a run keeps it, through JSON.
+    # The options pass through JSON, as in the record of a run.
     again = load_recorded(scenes["tensoir"], json.loads(json.dumps(dict(read.options))))
     assert again.options == options
     assert again.train.fingerprint() == read.train.fingerprint()
@@ -732,7 +733,7 @@ def test_truth_of_another_size_is_named(tensoir):
 
 @pytest.mark.parametrize("channels", [2, 4])
 def test_a_mask_may_be_the_alpha_of_a_cut_out(scenes, tmp_path, channels):
-    """Its colours, which say nothing of the object's outline, are not looked at."""
+    """Its colours say nothing about the object's outline, and are ignored."""
     root = shutil.copytree(scenes["synthetic4relight"], tmp_path / "scene")
     for path in (root / "train").glob("*_mask.png"):
         mask = read_image(path)
@@ -743,7 +744,7 @@ def test_a_mask_may_be_the_alpha_of_a_cut_out(scenes, tmp_path, channels):
 
 
 def test_masks_that_are_numbers_or_colours_of_labels_are_noticed(scenes, tmp_path):
-    """Read as numbers of 1 they are empty, and as a colour of 128 half transparent."""
+    """Masks of label 1 would be read as empty, and masks of colour 128 as half transparent."""
     root = shutil.copytree(scenes["synthetic4relight"], tmp_path / "scene")
     masks = {path: read_image(path) > 0.5 for path in (root / "train").glob("*_mask.png")}
     for path, mask in masks.items():

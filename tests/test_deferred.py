@@ -49,14 +49,14 @@ def images(pipeline, asset, camera, domain, names=ALL):
 
 
 def flat(asset):
-    """The asset with one normal, as a facet that faces the camera would have."""
+    """Return the asset with one normal everywhere, that of a facet that faces the camera."""
     normals = jnp.zeros_like(asset.splats.normals).at[:].set(jnp.array([0.8, -0.4, 0.45]))
     normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
     return replace(asset, splats=replace(asset.splats, normals=normals))
 
 
 def test_attributes_that_do_not_vary_make_both_domains_agree(scene):
-    """Far away, so that the direction to the camera does not vary either."""
+    """The camera is far away, so that the direction towards it does not vary either."""
     pipeline, asset, _ = scene
     far = views_from([[2000.0, -1000.0, 700.0]], size=SIZE, field_of_view=6e-4).camera([0])
     per_splat = images(pipeline, flat(asset), far, pipeline.domain)
@@ -71,7 +71,7 @@ def test_attributes_that_do_not_vary_make_both_domains_agree(scene):
 
 
 def test_the_domains_differ_where_normals_do(scene):
-    """Shading of a mean normal is not the mean of shadings: the test above is not empty."""
+    """Shading of a mean normal is not the mean of shadings, so the test above says something."""
     pipeline, asset, camera = scene
     materials = asset.attributes.materials
     shiny = replace(materials, roughness=jnp.full_like(materials.roughness, 0.15))
@@ -121,7 +121,7 @@ def test_opacity_moves_colours_only_where_the_coverage_is_differentiated(scene, 
 
 @pytest.fixture(scope="module")
 def traced(scene):
-    """The ball with an index for rays, shaded by one sample of each kind."""
+    """The ball with an index for rays, shaded by a few samples of each kind."""
     pipeline, _, camera = scene
     _, params = ball_of_one_material(CONFIG, albedo=0.5, roughness=0.6, metallic=0.0)
     pipeline = replace(
@@ -171,7 +171,7 @@ def test_points_of_the_mesh_lie_on_it(traced):
 
 
 def test_views_do_not_share_their_samples(traced):
-    """Light that was prepared for splats says nothing about pixels."""
+    """Light gathered for splats says nothing about pixels, so none is gathered in advance."""
     pipeline, asset, camera = traced
     adapted = replace(pipeline, domain=PerPixel())
     illumination, _ = jax.jit(RenderPipeline.illuminate)(

@@ -20,7 +20,8 @@ from geosplat_jax.transport.denoise import (
 ROUNDING = 2e-6
 # float64: the same.
 DOUBLE_ROUNDING = 1e-12
-# What may pass an edge, in shares of the light on its other side: far below a step of 8-bit colour.
+# Most light that may pass an edge, relative to that on its other side: far below one step of 8-bit
+# colour.
 LEAK = 1e-5
 # Settings that ignore every guide.
 OFF = {"normal_sharpness": 0.0, "depth_sigma": np.inf, "albedo_sigma": np.inf}
@@ -50,7 +51,7 @@ def rough_guides(height, width, seed=0, dtype=np.float32):
 
 @cache
 def filter_of(spec):
-    """Compile once for each precision and shape that a file of tests asks for."""
+    """Return the filter, compiled once for each precision and shape that the tests use."""
     return jax.jit(lambda *x: denoise(*x[:-1], spec=spec, focal=x[-1]))
 
 
@@ -62,7 +63,7 @@ def run(light, guides, spec=None, *, focal=None):
 
 
 def composed_kernel(iterations):
-    """Weights of all passes together on a flat surface, one axis."""
+    """Return the weights of all passes together, along one axis of a flat surface."""
     kernel = np.ones(1)
     for iteration in range(iterations):
         taps = np.zeros(4 * 2**iteration + 1)
@@ -72,7 +73,7 @@ def composed_kernel(iterations):
 
 
 def dense_pass(light, alpha, normals, depth, albedo, spread, spec, focal):
-    """One pass in float64, pixel by pixel and tap by tap, from the formulas."""
+    """Compute one pass in float64 from the formulas, pixel by pixel and tap by tap."""
     height, width = alpha.shape
     covered = alpha > 0
     divisor = np.where(covered, alpha, 1.0)
@@ -154,7 +155,7 @@ def test_light_where_nothing_is_does_not_bleed_in():
     guides = rough_guides(12, 12)
     light = guides[0][..., None] * np.ones(2, np.float32)
     stray = np.where(guides[0][..., None] > 0, light, np.float32(1e6))
-    # With every guide ignored, nothing else keeps it out.
+    # With every guide ignored, only the coverage keeps the stray light out.
     spec = DenoiseSpec(2, **OFF)
     np.testing.assert_array_equal(run(stray, guides, spec), run(light, guides, spec))
 
@@ -194,7 +195,7 @@ def test_hand_written_transpose_equals_automatic_differentiation(spread):
     with double_precision():
         values, cotangent = (jnp.asarray(x) for x in rng.normal(size=(2, 2, 9, 11)))
         taps = sum(abs(dy) * spread < 9 and abs(dx) * spread < 11 for dy, dx in _HALF_OF_TAPS)
-        # Weights must vanish where the partner is outside: made so by a map of ones.
+        # Weights must vanish where the other pixel of a pair is outside the image.
         weights = rng.random((taps, 9, 11))
         kept = [t for t in _HALF_OF_TAPS if abs(t[0]) * spread < 9 and abs(t[1]) * spread < 11]
         for k, (dy, dx) in enumerate(kept):
@@ -226,7 +227,8 @@ def test_guides_carry_no_gradient_and_alpha_one_as_coverage():
         gradients = jax.jit(jax.grad(objective, argnums=tuple(range(6))))(*inputs, focal)
         for gradient in gradients[2:]:
             np.testing.assert_array_equal(gradient, 0.0)
-        # Straight guides do not change when all that is multiplied by alpha is scaled with it.
+        # Straight guides do not change when everything that is multiplied by alpha is scaled with
+        # it.
         direction = jnp.asarray(rng.normal(size=(8, 9)))
 
         def along(step):
@@ -270,7 +272,7 @@ def test_light_does_not_cross_an_edge_of_one_guide(kind, transposed):
         guides, light = [np.swapaxes(x, 0, 1) for x in guides], light.T
     stopped = run(light[..., None], guides, DenoiseSpec(2, **(OFF | ONE[kind])))[..., 0]
     np.testing.assert_allclose(stopped, light, rtol=0, atol=LEAK)
-    # It crosses when that guide is ignored too.
+    # The light crosses the edge once that guide is ignored as well.
     crossed = run(light[..., None], guides, DenoiseSpec(2, **OFF))[..., 0]
     assert np.abs(crossed - light).max() > 0.3
 
@@ -280,14 +282,14 @@ def test_light_does_not_cross_a_jump_through_pixels_that_mix_both_sides():
     depth = guides[2].copy()
     depth[:, 12] = 0.5 * (depth[:, 11] + depth[:, 13])
     light = np.where(right, 1.0, 0.0).astype(np.float32)[:, None] * np.ones((24, 1, 1), np.float32)
-    # A jump of 24 pixels.
+    # At this focal length, the jump in depth is as large as 24 pixels.
     guides[2], spec = depth, DenoiseSpec(2, **(OFF | ONE["depth"]))
     found = run(light, guides, spec, focal=60.0)
     np.testing.assert_allclose(found, light, rtol=0, atol=LEAK)
 
 
 def tilted_depth(size, focal, tilt, offset=3.0):
-    """Depth of a plane that recedes along the rows by ``tilt`` a unit of length."""
+    """Return the depth of a plane that recedes along the rows by ``tilt`` per unit of length."""
     slope = (np.arange(size) + 0.5 - size / 2) / focal
     return np.float32(np.ones((size, 1)) * (offset / (1 - tilt * slope)))
 
@@ -321,7 +323,7 @@ def test_noise_on_a_flat_wall_falls_by_the_stated_factor_and_keeps_its_mean():
 
 
 def sphere_guides(size=49, radius=0.8):
-    """Guides of a sphere seen from a distance of 3, and where it is."""
+    """Return guides of a sphere that is seen from a distance of 3, and the focal length."""
     focal = 1.4 * size
     steps = (np.arange(size) + 0.5 - size / 2) / focal
     x, y = np.meshgrid(steps, steps)

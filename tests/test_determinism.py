@@ -1,8 +1,8 @@
 """Same input, same numbers: across processes, capacities and compilation.
 
-`test_train.py` has the two laws of a run: the same seed gives the same parameters, and resuming
-equals the uninterrupted run, both bit for bit; `test_pipeline.py` that the key is all the
-randomness.
+Related laws are tested elsewhere. In `test_train.py`: the same seed gives the same parameters, and
+resuming equals the uninterrupted run, both bit for bit. In `test_pipeline.py`: the key is the only
+source of randomness.
 """
 
 import subprocess
@@ -26,11 +26,11 @@ CONFIG = tiny_config("geometry.resolution=8")
 SIZES = {"surface_cubes": 384, "dual_vertices": 384, "quads": 384}
 AMPLE = Capacities(**SIZES, visible=5120, hits=7168, chunks=2048)
 DOUBLE = Capacities(**{name: 2 * size for name, size in AMPLE.items()})
-# The ends of buffers are not vectorised: a few float32 roundings of single numbers.
+# The ends of buffers are not vectorised, which changes single numbers by a few roundings.
 ROUNDING = 1e-6
 # Longer buffers and other fusions sum the same numbers in another order.
 GRADIENT_TOLERANCE = 1e-5
-# Materials at their start are nearly constant: their gradients are sums that nearly cancel.
+# Materials are nearly constant at the start, so their gradients are sums that nearly cancel.
 EAGER_TOLERANCE = 2e-4
 
 evaluate = jax.jit(
@@ -41,7 +41,7 @@ draw = jax.jit(Pipeline.render)
 
 @pytest.fixture(scope="module")
 def setting():
-    """A ball with dents: on a perfect one, equal distances put L_dev exactly on its kink."""
+    """A ball with dents; on a perfect one, distances are equal and L_dev is exactly at its kink."""
     pipeline, params = ball(CONFIG)
     rng = np.random.default_rng(0)
     sdf = params.geometry.sdf
@@ -86,7 +86,8 @@ def test_compiled_equals_eager(setting):
     (eager, eager_report), eager_gradient = eager_value(params, batch)
     assert float(eager) == pytest.approx(float(compiled), rel=1e-6)
     for name, value in report.terms.items():
-        # The smoothness of a nearly constant field is a difference of equals: eight decimals.
+        # The smoothness of a nearly constant field is a difference of nearly equal numbers, and
+        # only exact to eight decimals.
         assert float(eager_report.terms[name]) == pytest.approx(float(value), rel=1e-3, abs=1e-8)
     _assert_close(gradient, eager_gradient, EAGER_TOLERANCE)
 
@@ -107,7 +108,7 @@ fit(sphere_dataset(), tiny_config(), Path(sys.argv[2]))
 @pytest.mark.slow
 @pytest.mark.long
 def test_another_process_trains_the_same_bits(tmp_path):
-    """Compiled anew, with other addresses and another hash seed."""
+    """The other process compiles anew, with other addresses and another hash seed."""
     here, there = tmp_path / "here", tmp_path / "there"
     fit(sphere_dataset(), tiny_config(), here)
     tests = str(Path(__file__).parent)

@@ -38,7 +38,7 @@ def started(*arguments):
 
 
 def finished(*processes, seconds=540):
-    """Wait for processes, which must end well; none is left behind."""
+    """Wait for processes, which must all succeed; none of them is left behind."""
     try:
         outputs = [process.communicate(timeout=seconds)[0] for process in processes]
     finally:
@@ -50,7 +50,7 @@ def finished(*processes, seconds=540):
 
 @pytest.mark.slow
 def test_two_devices_give_the_loss_and_the_gradient_of_one(tmp_path):
-    """Three views on two devices, of which one counts for less; the light is frozen."""
+    """There are three views on two devices, and one view counts for less; the light is frozen."""
     finished(started("gradient", tmp_path))
     found = np.load(tmp_path / "gradient.npz")
     names = [name.removeprefix("one") for name in found if name.startswith("one")]
@@ -62,14 +62,14 @@ def test_two_devices_give_the_loss_and_the_gradient_of_one(tmp_path):
         np.testing.assert_allclose(two, one, rtol=2e-4, atol=2e-5 * scale)
         moving += bool(np.any(one))
     assert moving > 15
-    # Parameters must not come apart: both devices hold the same bits.
+    # The parameters of the devices must not diverge: both devices hold the same bits.
     assert not found["apart"].any()
 
 
 @pytest.mark.slow
 @pytest.mark.long
 def test_two_hosts_grow_stop_resume_and_refuse_together(tmp_path):
-    """Two processes: a refusal, an overflow, a Ctrl-C at one of them, a checkpoint, the end."""
+    """Two processes go through a refusal, an overflow, Ctrl-C at one of them, and a checkpoint."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = free.getsockname()[1]
@@ -80,7 +80,7 @@ def test_two_hosts_grow_stop_resume_and_refuse_together(tmp_path):
         assert host["said"]["stop"] == "Interrupted: stopped at step 2; continue with --resume"
         assert set(host["said"]) == {"other settings", "stop"}
         assert host["step"] == 4
-    # Both began with the first one's buffers and grew them to the same size, in the same step.
+    # Both began with the first host's buffers, and grew them to the same size in the same step.
     assert first["sizes"] == second["sizes"]
     grown = [(step, new) for step, old, new in first["sizes"] if new > old]
     assert len(grown) == 1
@@ -99,7 +99,7 @@ def test_two_hosts_grow_stop_resume_and_refuse_together(tmp_path):
 
 
 def test_views_that_do_not_divide_are_filled_up_with_shares_of_nothing(monkeypatch):
-    """Three views on two devices, laid out without any: what each of them gets."""
+    """Three views are shared out to two devices that are simulated on one."""
     here = jax.devices()[0]
 
     class Two(ManyDevices):

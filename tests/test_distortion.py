@@ -1,4 +1,7 @@
-"""Undistorted photographs show what a pinhole would have seen; formulas here are written anew."""
+"""Undistorted photographs show what a pinhole camera would have seen.
+
+The formulas of lenses are written here independently of the package.
+"""
 
 import numpy as np
 import pytest
@@ -17,7 +20,7 @@ from geosplat_jax.io.distortion import (
 
 WIDTH, HEIGHT = 48, 40
 LENS = np.array([[46.0, 0.0, 22.5], [0.0, 50.0, 21.0], [0.0, 0.0, 1.0]])
-# Bilinear samples of a colour that turns by about a tenth of a radian a pixel.
+# Error of bilinear samples of colours whose phase turns by about a tenth of a radian per pixel.
 TOLERANCE = 3e-3
 
 MODELS = {
@@ -32,11 +35,11 @@ MODELS = {
     "RADIAL_FISHEYE": (Fisheye((0.1, -0.05)), (0.1, -0.05)),
     "OPENCV_FISHEYE": (Fisheye((0.1, -0.05, 0.02, -0.01)), (0.1, -0.05, 0.02, -0.01)),
 }
-"""Our model, and the numbers of the same in the order of OpenCV and COLMAP."""
+"""Our model of each lens, and its parameters in the order of OpenCV and COLMAP."""
 
 
 def shown(name, numbers, x, y):
-    """Where a lens shows (x, y, 1), as the manual of OpenCV writes it, one point at a time."""
+    """Return where a lens shows (x, y, 1), by the formulas in the manual of OpenCV."""
     if name.endswith("FISHEYE"):
         k = [*numbers, 0.0, 0.0, 0.0, 0.0]
         r = (x**2 + y**2) ** 0.5
@@ -57,7 +60,7 @@ def shown(name, numbers, x, y):
 
 
 def unbent(name, numbers, u, v):
-    """Point of the plane that a lens shows at (u, v), by Newton's method."""
+    """Return the point of the plane that a lens shows at (u, v), by Newton's method."""
     x, y = u, v
     step = 1e-6
     for _ in range(8):
@@ -71,7 +74,7 @@ def unbent(name, numbers, u, v):
 
 
 def color(x, y):
-    """Smooth and different in every direction."""
+    """Return colours that are smooth and different in every direction."""
     z = np.sqrt(1 + x * x + y * y)
     a, b = x / z, y / z
     waves = [np.sin(4 * a + b), np.cos(3 * b - a), np.sin(2 * a - 4 * b + 1)]
@@ -84,7 +87,7 @@ def pixel_plane():
 
 
 def photograph(name, numbers):
-    """What the lens takes of the colours at infinity, pixel by pixel."""
+    """Return what the lens photographs of the colours at infinity, pixel by pixel."""
     u, v = pixel_plane()
     points = [unbent(name, numbers, *point) for point in zip(u.ravel(), v.ravel(), strict=True)]
     x, y = np.array(points).T
@@ -98,7 +101,7 @@ def test_an_undistorted_photograph_is_that_of_a_pinhole(name):
     found = resample(photograph(name, numbers), lookup)
     expected = color(*pixel_plane())
     assert 0.8 < lookup.inside.mean() <= 1.0
-    # Within half a pixel of the border the last pixel stands for what lies beyond its centre.
+    # Within half a pixel of the border, the last pixel stands for everything beyond its centre.
     is_inner = (np.abs(lookup.rows - HEIGHT / 2) < HEIGHT / 2 - 0.5) & (
         np.abs(lookup.columns - WIDTH / 2) < WIDTH / 2 - 0.5
     )
@@ -139,7 +142,7 @@ def test_where_the_polynomial_turns_back_nothing_is_seen_twice():
     wide = np.array([[12.0, 0.0, 24.0], [0.0, 12.0, 20.0], [0.0, 0.0, 1.0]])
     lookup = pinhole_lookup(bent, wide, WIDTH, HEIGHT)
     x, y = np.meshgrid((np.arange(WIDTH) - 23.5) / 12, (np.arange(HEIGHT) - 19.5) / 12)
-    # The plane goes on beyond the limit, and the photograph has pixels there.
+    # Points of the plane beyond the limit would fall on pixels of the photograph.
     is_beyond = np.hypot(x, y) > limit
     within = (lookup.rows > 0) & (lookup.rows < HEIGHT)
     within &= (lookup.columns > 0) & (lookup.columns < WIDTH)

@@ -48,7 +48,7 @@ def test_links_lead_to_files_and_headings(path):
 
 @pytest.mark.parametrize("name", ["gradients.md", "numerics.md"])
 def test_tables_name_what_the_code_and_its_tests_have(name):
-    """Of rows about a point or a guard, the function or constant, and the tests."""
+    """Rows name a function or constant and the tests for it, and all of these must exist."""
     files = sorted((ROOT / "geosplat_jax").rglob("*.py"))
     tests = "".join(path.read_text() for path in sorted((ROOT / "tests").glob("test_*.py")))
     text = (DOCS / name).read_text()
@@ -102,7 +102,7 @@ def test_the_table_of_settings_has_them_all():
 
 @pytest.fixture
 def examples():
-    """What the Python blocks of the page define; what they registered is taken back."""
+    """Names that the Python blocks of the page define; what they register is removed at the end."""
     text = (DOCS / "extending.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     assert len(blocks) == 3

@@ -30,7 +30,7 @@ prefiltered_specular = jax.jit(environment.prefiltered_specular)
 prefiltered_diffuse = jax.jit(environment.prefiltered_diffuse)
 
 ROUNDING = 5e-6  # float32 coordinates, and values between neighbouring texels
-QUADRATURE = 2e-3  # rings and spokes of the operators against brute force on noise
+QUADRATURE = 2e-3  # quadrature of the operators, on rings and spokes, against brute force on noise
 SUN_QUADRATURE = 1e-2  # the same for one texel, relative to the level's peak
 
 SMALL = LightSpec(16, 32, (0.0, 0.3, 0.6, 1.0))
@@ -192,11 +192,11 @@ def test_a_rotated_light_shines_from_the_rotated_direction():
     probes = _unit(300, seed=8)
     before = lookup(light.radiance, jnp.asarray(probes, jnp.float32))
     after = lookup(turned.radiance, jnp.asarray(probes @ rotation.T, jnp.float32))
-    np.testing.assert_allclose(after, before, atol=0.02)  # constant caps of half a texel
+    np.testing.assert_allclose(after, before, atol=0.02)  # half a texel at the poles is constant
 
 
 def test_a_sun_keeps_its_flux_whatever_the_light_is_turned_by():
-    """Texels are narrow beside the poles, and single directions would meet a sun by chance."""
+    """Texels are narrow near the poles: one sample per texel would meet a sun only by chance."""
     height, width = 64, 128
     solid_angles = np.asarray(environment.texel_solid_angles(height, width))
     rng, changes = np.random.default_rng(9), {1: [], 4: []}

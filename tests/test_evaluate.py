@@ -1,4 +1,4 @@
-"""Evaluation against truth that the parameters themselves made: near perfect, and complete."""
+"""Evaluation against truth that was rendered from the parameters: nearly perfect, and complete."""
 
 import json
 from dataclasses import replace
@@ -32,7 +32,7 @@ AMPLE = Capacities(
     chunks=2048,
     cell_patches=4096,
 )
-# As under a new light, so that both share their programs.
+# The transport is that of a new light, so that both share their compiled programs.
 CONFIG = tiny_config(
     "material.bias=true",
     *MONTE_CARLO,
@@ -86,7 +86,7 @@ def run():
 
 
 def test_highlights_brighter_than_white_are_compared_where_a_protocol_has_them():
-    """Stanford-ORB does; the sRGB pictures of all protocols end at white."""
+    """Stanford-ORB compares them; the sRGB pictures of all protocols are clipped at white."""
     linear = np.full((24, 24, 3), 0.3, np.float32)
     linear[8:14, 8:14] = 3.0
     alpha = np.ones((24, 24), np.float32)
@@ -107,9 +107,9 @@ def straight(values, alpha):
 
 @pytest.fixture(scope="module")
 def views(run):
-    """Two views whose pictures, materials and relit pictures the parameters made.
+    """Two views whose pictures, materials and relit pictures are rendered from the parameters.
 
-    The true albedo is the parameters' times `SCALE`, and so are the relit pictures.
+    The true albedo is that of the parameters times `SCALE`, also in the relit pictures.
     """
     cameras = views_from([[2.2, -1.8, 1.0], [-2.0, 0.5, 1.5]], size=16)
     renderer = Renderer.of(run, samples=SAMPLES)
@@ -181,7 +181,7 @@ def test_truth_of_the_own_making_is_met(perfect):
         assert mean[f"{name}.mse_full"] < 1e-8
     np.testing.assert_allclose([mean[f"albedo.scale_{c}"] for c in "rgb"], SCALE, rtol=1e-4)
     for name in LIGHT_NAMES:
-        # The fitted scale is not SCALE to the last bit.
+        # The fitted scale differs from SCALE in the last bits.
         assert mean[f"relight.{name}.psnr"] > 60
     assert mean["light.psnr"] > 100
     assert mean["light.correlation"] == pytest.approx(1.0)
@@ -224,7 +224,7 @@ def test_the_files_are_written(perfect):
 
 
 def test_without_truth_there_are_no_metrics_of_it(run, views, tmp_path):
-    """Nor sheets, of which an earlier evaluation had left one."""
+    """There are no sheets either, although an earlier evaluation has left one."""
     (tmp_path / "relight.png").write_bytes(b"of an earlier evaluation")
     bare = replace(views, truth={}, relight={})
     metrics = evaluate(run, bare, tmp_path)
@@ -250,7 +250,7 @@ def test_every_picture_is_there_for_itself_truth_beside_it(perfect):
     assert {"noon", "evening", "normal", "roughness", "metallic"} <= {name for _, name in pairs}
     for true, found in pairs:
         pixels = [np.asarray(Image.open(folder / files[name]), float) for name in (true, found)]
-        # The parameters made the truth, and 8 bits hold both.
+        # The truth was rendered from the parameters, and both pictures are stored in 8 bits.
         assert np.abs(pixels[0] - pixels[1]).mean() < 2, found
     assert list(gallery["lights"]) == ["true light", "light"]
     assert all((folder / file).is_file() for file in gallery["lights"].values())
@@ -308,7 +308,7 @@ def test_protocols_change_their_looks_and_nothing_else(run, views, perfect, tmp_
     same = ("nvs.psnr", "nvs.ssim", "mask.iou", "normal.mae_full_deg", "roughness.mse")
     for key in same:
         assert len({mean[key] for mean in by_name.values()}) == 1, key
-    # Unblended silhouettes against blended ones: edges differ, in this protocol alone.
+    # This protocol alone compares unblended silhouettes with blended ones, which differ at edges.
     assert by_name["tensoir"]["relight.mean.psnr"] < 45
     assert by_name["irgs"]["relight.mean.psnr"] > 50
     for mean in by_name.values():

@@ -1,4 +1,4 @@
-"""Event files: every step once, terms and previews, also after a resume."""
+"""Event files hold every step once, its terms and the previews, also after a resume."""
 
 import json
 import shutil
@@ -23,7 +23,7 @@ def add_steps(folder, *steps):
 
 
 def events(folder):
-    """Step and value by tag, as the files have them; pictures have a size instead of a value."""
+    """Return steps and values by tag, as in the files; the value of a picture is its size."""
     kind = pytest.importorskip("tensorboardX.proto.event_pb2").Event
     found = {}
     (path,) = (folder.path / "tensorboard").glob("events.*")

@@ -35,7 +35,7 @@ def test_with_blocks_of_one_view_the_error_is_the_usual_one():
 
 
 def test_a_view_that_is_there_four_times_tells_no_more_than_once():
-    """The usual error would be half as large."""
+    """The usual standard error would be half as large."""
     values = np.random.default_rng(0).normal(size=6)
     copies, blocks = np.repeat(values, 4), np.repeat(np.arange(6), 4)
     once = clustered_error(values, np.arange(6))
@@ -44,7 +44,10 @@ def test_a_view_that_is_there_four_times_tells_no_more_than_once():
 
 
 def test_the_error_covers_the_mean_as_often_as_it_says():
-    """Blocks of unequal sizes with a common error each: one standard error holds two of three."""
+    """The blocks have unequal sizes and a common error each.
+
+    An interval of one standard error to either side holds the mean in two of three cases.
+    """
     rng, sizes = np.random.default_rng(0), (1, 2, 3, 2, 4, 3, 2, 1, 3, 2)
     blocks = np.repeat(np.arange(len(sizes)), sizes)
     hits, alone = [], []
@@ -62,7 +65,7 @@ def test_one_block_says_nothing():
 
 
 def test_gains_are_paired():
-    """Views differ by ten decibels, models by a twentieth: only pairs of views can tell."""
+    """Views differ by ten decibels and models by a twentieth, which only paired views can show."""
     rng, blocks = np.random.default_rng(0), np.arange(12)
     smaller = rng.uniform(20, 40, 12)
     larger = smaller + 0.05 + 0.02 * rng.normal(size=12)
@@ -84,7 +87,7 @@ def test_a_gain_below_the_spread_over_seeds_is_not_kept():
     assert found.spread == pytest.approx(0.6 / math.sqrt(2))
     assert not found.is_kept
     assert compare(views + 0.5, apart, np.arange(8)).is_kept
-    # The first seed is the larger model's own, which the gain is measured against.
+    # The first seed is that of the larger model, and the gain is measured against it.
     assert compare(views + 0.3, apart[::-1], np.arange(8)).gain == pytest.approx(-0.3)
 
 

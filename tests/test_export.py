@@ -24,7 +24,8 @@ pytestmark = pytest.mark.usefixtures("products_must_ask")
 
 DATA = Path(__file__).parent / "data"
 
-# Half a texel across a chart's border, where a filled gutter is constant; 8 bits are far finer.
+# Error of half a texel at a chart's border, where the filled gutter is constant; the error of 8
+# bits is far smaller.
 COLOR_TOLERANCE = 0.03
 MEAN_COLOR_TOLERANCE = 0.004
 TEXTURE = 256
@@ -37,7 +38,7 @@ def sphere(subdivisions=3, radius=0.8):
 
 
 def materials(points):
-    """Smooth, and different on all six sides of the world."""
+    """Return materials that are smooth, and different on all six sides of the world."""
     points = np.asarray(points)
     albedo = 0.5 + 0.45 * np.sin(points * np.array([1.0, 1.7, 2.3]) + np.array([0.3, 1.1, 2.0]))
     return albedo, 0.5 + 0.4 * points[:, 2], 0.5 - 0.5 * points[:, 0]
@@ -112,7 +113,7 @@ def test_glb_base_color_is_srgb_and_roughness_is_linear(tmp_path):
 
     export.export_mesh_glb(tmp_path / "a.glb", vertices, faces, normals, constant, texture_size=32)
     material = only_mesh(tmp_path / "a.glb").visual.material
-    # Filled gutters: no texel, in or out of the charts, is anything else.
+    # Gutters are filled: no texel, inside or outside of the charts, has another value.
     assert np.unique(np.asarray(material.baseColorTexture)).tolist() == [124]
     assert np.unique(np.asarray(material.metallicRoughnessTexture)[..., 1]).tolist() == [51]
     assert np.unique(np.asarray(material.metallicRoughnessTexture)[..., 2]).tolist() == [153]
@@ -264,7 +265,7 @@ def test_an_obj_is_the_mesh_of_the_glb_with_the_same_textures(tmp_path):
 
 
 def test_textures_of_another_format_leave_those_of_an_obj_alone(tmp_path):
-    """A later export, of a mesh that was reduced, say, has charts of its own."""
+    """A later export, for example of a mesh that was reduced, has charts of its own."""
     export.export_mesh_glb(
         tmp_path / "mesh.glb",
         *sphere(),
@@ -362,7 +363,7 @@ def test_a_usd_without_its_package_is_refused_before_anything_is_written(tmp_pat
 
 
 def bumpy(directions):
-    """A ball with waves: points and unit normals of it in directions (N, 3)."""
+    """Return points and unit normals of a ball with waves, in directions (N, 3)."""
     unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     frequency, height = 9.0, 0.02
     radius = 1 + height * np.sin(frequency * unit).sum(1)
@@ -385,7 +386,7 @@ def accessor(path, tree, number):
 
 
 def decoded_normals(path, count=4000):
-    """Points, and normals as a renderer decodes them from map and tangents; and the mesh's own."""
+    """Return points, the normals that a renderer decodes from map and tangents, and the mesh's."""
     tree = glb_tree(path)
     (primitive,) = tree["meshes"][0]["primitives"]
     names = ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_0")
@@ -464,8 +465,8 @@ def test_tangents_follow_u_and_the_bitangent_points_to_the_top_of_the_texture():
 
 
 def test_tangents_are_those_of_mikktspace():
-    # Two bent sheets, one with a mirrored texture, and what Mikkelsen's own program makes of them
-    # (`mikktspace` 1.1.1 of npm, in WebAssembly; v runs upwards there, and downwards here).
+    # Two bent sheets, one of them with a mirrored texture, and their tangents by Mikkelsen's own
+    # program (`mikktspace` 1.1.1 of npm, in WebAssembly; v runs upwards there, and downwards here).
     with np.load(DATA / "mikktspace.npz") as known:
         names = ("vertices", "faces", "normals", "uv")
         found = baking.vertex_tangents(*(known[name] for name in names))
@@ -491,7 +492,7 @@ def test_the_nearest_point_of_a_surface_is_that_of_all_its_faces():
 
 @pytest.mark.parametrize("scale", [1e-4, 1e3])
 def test_points_of_tiny_meshes_are_as_near_as_those_of_large_ones(scale):
-    """The library that finds them takes edges below 5e-4 for points."""
+    """The library that finds the nearest points takes edges shorter than 5e-4 for points."""
     vertices, faces, normals = sphere(4)
     points = np.random.default_rng(0).normal(size=(200, 3))
     points *= (1.01 / np.linalg.norm(points, axis=1))[:, None]
@@ -518,7 +519,7 @@ def test_the_side_of_a_thin_wall_is_that_which_looks_the_same_way():
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
 def test_fewer_faces_are_as_good_in_any_unit(scale):
-    """The library that simplifies has thresholds in units of length."""
+    """The library that simplifies meshes has thresholds in units of length."""
     pytest.importorskip("fast_simplification")
     vertices, faces, _ = sphere(4)
     far = np.array([3.0, -2.0, 1.0])
@@ -527,7 +528,7 @@ def test_fewer_faces_are_as_good_in_any_unit(scale):
     assert len(rows) <= 1010
     simple = baking.FineSurface(places / scale - far, places, rows)
     error = np.linalg.norm(simple.nearest(relief, relief)[0] - relief, axis=1)
-    # Measured: .0016 in all of them; in the units of the file .0023, .0018 and .0016.
+    # Measured: .0016 at every scale. Simplified in the unit of the file: .0023, .0018 and .0016.
     assert np.mean(error) < 1.7e-3
 
 
@@ -719,7 +720,7 @@ def gaussians(count=17):
 
 
 def read_ply(path):
-    """Independent reader: names and rows of a binary table of floats."""
+    """Read a binary table of floats, independently of the package; return its columns by name."""
     header, body = path.read_bytes().split(b"end_header\n", 1)
     lines = header.decode().splitlines()
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]

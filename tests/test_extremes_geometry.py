@@ -1,4 +1,4 @@
-"""The isosurface and the adapter at their extremes: not only finite, but what should come out.
+"""The isosurface and the adapter at their extremes: results are correct, and not only finite.
 
 Float32 is compared with independent float64 formulas, or with the same code in float64.
 """
@@ -33,7 +33,7 @@ from geosplat_jax.geometry import (
 from geosplat_jax.surface.flexicubes_tables import CORNERS, EDGES
 
 ROUNDING = float(np.finfo(np.float32).eps)
-POSITION = 20 * ROUNDING  # of cells, in a grid of some cells: a few dozen operations
+POSITION = 20 * ROUNDING  # in cells, for a grid of few cells: a few dozen operations
 GRADIENT = 1e-4  # relative L2 between float32 and float64, hundreds of operations
 ROOM = Capacities(surface_cubes=128, dual_vertices=256, quads=256)
 SHAPE = (4, 3, 5)
@@ -81,7 +81,10 @@ def extract(geometry, grid, *, capacities=ROOM, training=False):
 
 @jax.jit
 def differentiate(geometry, grid, pull=1.0):
-    """Value and gradient of a scalar that sees every vertex and the deviation, and the surface."""
+    """Return value and gradient of a scalar that depends on every vertex and on the deviation.
+
+    The surface is returned as well.
+    """
 
     def scalar(geometry):
         surface = isosurface(geometry, grid, capacities=ROOM, training=True)
@@ -94,7 +97,10 @@ def differentiate(geometry, grid, pull=1.0):
 
 
 def reference_duals(geometry, grid, surface, crosses):
-    """Dual vertices and their crossing points in float64, in the world, by the plain formula."""
+    """Return dual vertices, crossing points and crossed edges, in float64 by the plain formula.
+
+    Positions are those of the world.
+    """
     count = int(surface.mesh.vertex_count)
     cell = np.asarray(surface.vertex_cells)[:count]
     wide = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), geometry)
@@ -144,9 +150,9 @@ def test_dual_vertices_are_the_weighted_mean_of_crossings_over_40_decades(
     duals, crossing, used = reference_duals(geometry, grid, surface, crosses)
     count = len(duals)
     actual = np.asarray(surface.mesh.vertices)[:count]
-    # A relative error of a crossing's weights is one of its place between the ends of the edge.
+    # A relative error of a crossing's weights moves it along its edge by as large a share.
     np.testing.assert_allclose(actual, duals, atol=2 * POSITION * 0.25)
-    # The hull of the crossings, along each axis.
+    # Every vertex lies within the bounds of its crossings along each axis.
     low = np.where(used[..., None], crossing, np.inf).min(axis=1)
     high = np.where(used[..., None], crossing, -np.inf).max(axis=1)
     slack = POSITION * 0.25
@@ -167,8 +173,8 @@ def test_gradients_over_40_decades_equal_those_in_float64():
         size = 10.0 ** rng.uniform(low, high, size=grid.vertex_count)
         sdf = jnp.asarray(signs(grid, seed) * size, jnp.float32)
         cases.append(make_geometry(grid, sdf, weight=weight, deform=deform, seed=seed))
-    # Without the deviation, a sum of magnitudes: where crossings meet in a vertex of the grid the
-    # distances are equal, and rounding decides on which side of the kink each term lies.
+    # The deviation, a sum of magnitudes, is left out: where crossings meet in a vertex of the grid,
+    # distances are equal, and rounding decides on which side of its kink each term lies.
     single = [differentiate(geometry, grid, 0.0)[1] for geometry in cases]
     with double_precision():
         wide = make_grid(SHAPE, jnp.float64)
@@ -249,7 +255,7 @@ def test_centres_of_quads_lie_between_their_corners(weight):
 def test_an_sdf_of_one_sign_gives_an_empty_surface_and_zero_gradients(value):
     grid = make_grid(SHAPE)
     sdf = jnp.full((grid.vertex_count,), value, jnp.float32)
-    # Zero counts as outside: mixed with positive values it makes no surface either.
+    # Zero counts as outside: together with positive values it makes no surface either.
     for field in (sdf, sdf.at[::2].set(0.0) if value > 0 else sdf):
         geometry = make_geometry(grid, field, weight=50.0, deform=50.0)
         value, gradient, surface = differentiate(geometry, grid)
@@ -331,7 +337,8 @@ def test_small_grids_have_one_quad_for_each_crossed_interior_edge(shape):
 
 @pytest.mark.parametrize("size", [1e-30, 1.0, 1e10])
 def test_one_inner_vertex_is_enclosed_by_a_cube(size):
-    # The only vertex inside of a grid of 2 cells a side; its neighbours are as far out.
+    # Only the middle vertex of a grid of 2 cells per side is inside; its neighbours are as far
+    # outside.
     grid = make_grid((2, 2, 2))
     sdf = jnp.full((27,), size, jnp.float32).at[13].set(-size)
     surface, _ = extract(initial_geometry(grid, sdf), grid)
@@ -347,14 +354,15 @@ def test_entropy_at_the_extremes_is_that_of_its_definition(size):
     grid = make_grid(SHAPE)
     geometry = make_geometry(grid, jnp.asarray(size * signs(grid), jnp.float32))
     value, gradient = jax.jit(jax.value_and_grad(sdf_entropy))(geometry, grid)
-    # softplus(0) at either end of an edge, or the sizes of both.
+    # Both ends of an edge contribute: softplus(0) each at tiny values, their magnitudes at huge
+    # ones.
     expected = {0.0: 0.0, 1e-30: 2 * np.log(2.0), 1e10: 2e10}[size]
     np.testing.assert_allclose(value, expected, rtol=1e-6)
     assert np.isfinite(gradient.sdf).all()
     steepness = {0.0: 0.0, 1e-30: 0.5, 1e10: 1.0}[size]
     slopes = np.asarray(gradient.sdf)
     pushes = slopes * signs(grid)
-    # Descent moves crossing values towards zero, with total steepness of one an edge.
+    # Descent moves values at crossed edges towards zero, at each end with the slope of softplus.
     assert (pushes >= 0).all()
     np.testing.assert_allclose(pushes.sum(), 2 * steepness, rtol=1e-5)
 
@@ -368,7 +376,7 @@ def test_resampling_keeps_the_sign_of_extreme_values_and_stays_in_range(size):
     for source in (geometry, plain):
         fresh = carry(source, grid, replace(finer, origin=grid.origin))
         assert np.abs(np.asarray(fresh.sdf)).max() <= 2 * size * (1 + 10 * ROUNDING)
-    # Every second vertex is one of the old ones; values count in cells, which are half as large.
+    # Every second vertex coincides with an old one; values are in cells, which are half as large.
     kept = np.asarray(fresh.sdf).reshape(11, 7, 9)[::2, ::2, ::2].reshape(-1)
     np.testing.assert_allclose(kept, 2 * geometry.sdf, rtol=1e-5)
 
@@ -502,14 +510,15 @@ def test_needles_and_specks_with_exact_edges_equal_float64(sample, constants):
     assert (error <= 4 * ROUNDING * np.repeat(sides.max(axis=1), each)[:, None]).all()
     np.testing.assert_allclose(one.normals[rows], two.normals[rows], atol=1e-5)
     np.testing.assert_allclose(frame[rows], wide_frame[rows], atol=1e-5)
-    # Below the smallest length the cross product has no direction; then its size is left, which
-    # leaves the range of float32 at the very end.
+    # The smallest cross products have no direction. What remains is their size, which at the very
+    # end leaves the range of float32.
     is_real = doubled > 1e-30
     rows = rows_of(sample, is_real)
     np.testing.assert_allclose(one.scales[rows], two.scales[rows], rtol=1e-5)
     assert all(np.isfinite(leaf).all() for leaf in gradient)
-    # The functional turns with the normal, so that the gradient grows as 1 / height, to 1e19. What
-    # cancels, such as a width when the short side is stretched, leaves a rounding of 1 / side.
+    # The functional depends on the direction of the normal, so that its gradient grows as 1 /
+    # height, to 1e19. Terms that cancel, such as a width when the short side is stretched, leave a
+    # rounding of 1 / side.
     slack = ROUNDING / np.maximum(sides.min(axis=1), 1e-21)
     normal = two.normals.reshape(-1, each, 3)[:count, :1]
     for k in range(2):
@@ -537,10 +546,10 @@ def test_needles_in_every_direction_are_exact_up_to_a_rounding_of_their_length(s
     else:
         areas = [x.scales[:, 0] ** 2 for x in (one, two)]
         np.testing.assert_allclose(*areas, rtol=1e-5, atol=4 * ROUNDING)
-    # So the normal is known to within a rounding of the length over the height.
+    # Hence the normal is known to within a rounding of the length over the height.
     tolerance = 10 * ROUNDING / np.repeat(height, each)
     assert (np.linalg.norm(one.normals - two.normals, axis=1) <= tolerance + 1e-5).all()
-    # And however wrong the normal, the frame is a rotation about it.
+    # However wrong the normal is, the frame is a rotation.
     products = frame @ frame.transpose(0, 2, 1)
     np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), products.shape), atol=1e-5)
     if sample is vertex_splats or constants.shading_frame:
@@ -578,7 +587,7 @@ def test_triangles_with_coinciding_vertices_have_no_width_and_only_move(constant
     np.testing.assert_array_equal(scales[..., 1], 0.0)
     np.testing.assert_array_equal(scales[..., 2], np.float32(constants.thickness))
     np.testing.assert_array_equal(splats.normals, 0.0)
-    # Where two vertices are left, the segments lie along the line between them.
+    # Where two different vertices are left, splats lie along the line between them.
     is_line = np.arange(FACES) % 4 != 3
     matrices = np.asarray(frame).reshape(FACES, 6, 3, 3)
     line = np.max(scales[..., 0], axis=1)
@@ -593,7 +602,7 @@ def test_triangles_with_coinciding_vertices_have_no_width_and_only_move(constant
     along = np.abs(np.sum(matrices[..., 0] * unit, axis=-1))
     has_length = scales[..., 0] > 0
     np.testing.assert_allclose(along[has_length], 1.0, atol=1e-5)
-    # A point has no size, no direction: its gradient is that of the six means alone.
+    # A triangle that is a point has neither size nor direction: only its six means have a gradient.
     weights = np.random.default_rng(3).normal(size=splats.means.shape).reshape(FACES, 6, 3)
     expected = np.zeros((FACES, 3, 3))
     for ring, corner in enumerate((constants.u, constants.v)):
@@ -628,7 +637,7 @@ def test_a_face_listed_twice_doubles_its_stars_and_a_reversed_twin_cancels_them(
         expected = np.sqrt(2) * np.asarray(single.scales[:used, :2])
         np.testing.assert_allclose(double.scales[:used, :2], expected, rtol=1e-5)
     else:
-        # What is left of an area is the rounding of the products that make it.
+        # Areas cancel up to the rounding of the products that make them.
         reach = np.linalg.norm(some_triangles(), axis=(1, 2))[:half].repeat(3)[:, None]
         assert (np.asarray(double.scales[:used, :2]) <= np.sqrt(ROUNDING) * reach).all()
         assert np.isfinite(gradient[0]).all()

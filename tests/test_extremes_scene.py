@@ -26,7 +26,7 @@ CONFIG = tiny_config("geometry.resolution=8")
 ROOM = Capacities(
     surface_cubes=256, dual_vertices=256, quads=256, visible=2048, hits=4096, chunks=1024
 )
-SIZE = (13, 7)  # no tile divides it
+SIZE = (13, 7)  # not a multiple of the tile size
 FIELD_OF_VIEW = 0.6
 POWERS = [2.0**-20, 2.0**20]  # exact in float32: every rounding is the same
 DECIMALS = [1e-3, 1e3]
@@ -48,7 +48,7 @@ def scaled_bounds(scale):
 
 
 def scaled_pipeline(scale):
-    """The first stage in a world ``scale`` times as large, with the term of the light as well."""
+    """Return the first stage in a world ``scale`` times as large, with the light's term as well."""
     grid = fit_grid(scaled_bounds(scale), CONFIG.geometry.resolution)
     pipeline = build_pipeline(CONFIG, CONFIG.stage("split_sum"), FlexiCubes(grid))
     weights = pipeline.weights | {"light": jnp.float32(0.1)}
@@ -72,7 +72,7 @@ def camera_of(size, *, field_of_view=FIELD_OF_VIEW, scale=1.0, distance=3.0) -> 
 
 
 def make_batch(size, *, key=1, **settings) -> Batch:
-    """One view and a smooth picture whose mask has every coverage."""
+    """Return one view and a smooth picture, whose mask has all degrees of coverage."""
     height, width = size
     y, x = np.meshgrid(np.arange(height), np.arange(width), indexing="ij")
     image = 0.5 + 0.4 * np.sin(0.9 * x + 0.5 * y + np.arange(4)[:, None, None])
@@ -103,7 +103,7 @@ def make_params(sdf=None):
     )
 
 
-# Compiling takes far longer than running: half the time without these passes.
+# Compiling takes far longer than running, and half as long without these passes.
 FAST = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 
 
@@ -122,7 +122,7 @@ everything = jax.jit(_everything, compiler_options=FAST)  # and every channel of
 
 
 def assert_sound(total, report, gradient, output=None):
-    """Buffers suffice, every number is finite, coverage is a share."""
+    """Check that buffers suffice, that every number is finite, and that coverage is in [0, 1]."""
     assert bool(fits(report.usage, ROOM))
     for leaf in jax.tree.leaves((total, report.terms, report.psnr, gradient, output)):
         assert np.all(np.isfinite(np.asarray(leaf, np.float64)))
@@ -259,7 +259,7 @@ def unit_run(tmp_path_factory):
 
 
 def run_of(scale, folder):
-    """Losses of the first two steps of a run in a world of this scale."""
+    """Return the metrics of the first two steps of a run in a world of this scale."""
     dataset = sphere_dataset()
     poses = dataset.train.camera_to_world.copy()
     poses[:, :3, 3] *= scale
@@ -272,7 +272,7 @@ def run_of(scale, folder):
 
 
 def numbers(line):
-    """What a step says about the loss."""
+    """Return what the metrics of a step say about the loss."""
     return {k: v for k, v in line.items() if k in ("loss", "psnr", "faces") or k[:5] == "term."}
 
 
@@ -285,10 +285,11 @@ def test_training_takes_the_very_same_steps_in_units_of_a_power_of_two(unit_run,
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", DECIMALS)
 def test_training_takes_the_same_steps_in_any_unit(unit_run, scale, tmp_path):
-    """Up to rounding, which decides where the first step moves what has hardly any gradient.
+    """Losses agree up to rounding, except for the smoothness after the first step.
 
-    That step goes by the sign of the gradient, hence entries of the encodings may go the other way,
-    which shows in the smoothness after it and nowhere else.
+    Rounding decides the sign of gradients that are almost zero, and the first step goes by the
+    sign. So entries of the encodings may move the other way, which shows in the smoothness and
+    nowhere else.
     """
     for step, (mine, theirs) in enumerate(zip(run_of(scale, tmp_path), unit_run, strict=True)):
         mine, theirs = numbers(mine), numbers(theirs)
@@ -302,7 +303,7 @@ def test_training_takes_the_same_steps_in_any_unit(unit_run, scale, tmp_path):
 
 
 def disc_area(size, field_of_view, distance, radius=0.4):
-    """Pixels that the sphere covers when it is seen in the middle of the image."""
+    """Return how many pixels the sphere covers when it is seen in the middle of the image."""
     focal = 0.5 * min(size) / np.tan(0.5 * field_of_view)
     return np.pi * (focal * radius) ** 2 / (distance**2 - radius**2)
 
@@ -360,13 +361,13 @@ def test_a_field_of_one_sign_has_no_surface_and_nothing_but_the_background(unit_
 
 
 def _light_of_black():
-    """Eq. 18 where no light arrives: the mask times the value of the picture."""
+    """Return Eq. 18 where no light arrives: the mask times the value of the picture."""
     image = np.asarray(make_batch(SIZE).image)
     return np.mean(image[..., 3] ** 2 * image[..., :3].max(-1))
 
 
 def test_a_single_quad_is_rendered_and_differentiated():
-    """One negative vertex on a side of the box: its edge inwards is the only one with a quad."""
+    """One vertex on a side of the box is negative; its inward edge is the only one with a quad."""
     grid = scaled_pipeline(1.0).surface.grid
     sdf = np.ones(grid.vertex_shape[::-1])
     pose = look_at_poses(5)[1]

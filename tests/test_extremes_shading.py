@@ -1,4 +1,4 @@
-"""Shading at its extremes: what should come out at grazing angles, for mirrors, suns and nothing.
+"""Shading at its extremes is correct: at grazing angles, for mirrors, for suns and in the dark.
 
 Float32 is compared with the same code in float64 on the same numbers, or with a closed form.
 """
@@ -32,7 +32,7 @@ from geosplat_jax.transport.environment import (
 from geosplat_jax.transport.split_sum import fg_lookup, fg_table, split_sum
 
 ROUNDING = 2e-6  # a handful of float32 operations
-COSINES = [1.0, 0.5, 1e-2, 3e-4, 1e-6, 0.0, -1e-6, -0.5, -1.0]  # off the kink at 1e-4
+COSINES = [1.0, 0.5, 1e-2, 3e-4, 1e-6, 0.0, -1e-6, -0.5, -1.0]  # none at the kink at 1e-4
 ALMOST_ONE = float(np.nextafter(np.float32(1), np.float32(0)))
 
 
@@ -42,7 +42,7 @@ def typed(tree, dtype):
 
 
 def in_both(function, *arguments):
-    """Results in float32 and in float64 of one function of the same float32 numbers."""
+    """Return the results of a function of the same float32 numbers, in float32 and in float64."""
     single = jax.device_get(jax.jit(function)(*typed(arguments, jnp.float32)))
     with double_precision():
         double = jax.device_get(jax.jit(function)(*typed(arguments, jnp.float64)))
@@ -57,7 +57,7 @@ def direction(cosine, azimuth):
 
 
 def columns(*choices):
-    """Every combination, one array a choice."""
+    """Return every combination of the choices, as one array per choice."""
     return [np.array(column) for column in zip(*product(*choices), strict=True)]
 
 
@@ -186,7 +186,7 @@ def test_samples_are_unit_directions_of_bounded_weight(normal):
     np.testing.assert_allclose(np.linalg.norm(wi, axis=-1), 1.0, atol=ROUNDING)
     assert np.isfinite(density).all()
     assert density.min() >= 0.0
-    # The least share of the coat is a tenth, so a grey sample weighs at most ten.
+    # The coat has at least a tenth of the samples, so that a sample of grey weighs at most ten.
     assert np.all(value <= 10.001 * density[:, None])
     above = (wi @ normal > 1e-5) & (np.asarray(wo, np.float64) @ normal > 0)
     assert above.sum() > 300
@@ -222,7 +222,8 @@ def test_a_sun_keeps_its_flux_and_stays_positive(size):
     if size[0] == 1:  # a circulant: its columns sum to one as its rows do
         np.testing.assert_allclose(flux, np.broadcast_to(flux[:, :1], flux.shape), rtol=1e-5)
     if size[0] == 8:
-        # The narrow level is exact but for the bilinear texels being no solid angles.
+        # The flux is kept, except that weights of bilinear texels are not exactly their solid
+        # angles.
         np.testing.assert_allclose(flux.sum(0), np.broadcast_to(flux.sum(0)[:1], (4, 3)), rtol=0.03)
     dark = np.asarray(run(jnp.zeros_like(suns(size))))
     np.testing.assert_array_equal(dark, 0.0)
@@ -316,14 +317,15 @@ def test_split_sum_is_that_of_float64_at_every_extreme(size):
     materials = make_materials(albedo, roughness, metallic)
     single, double = in_both(both, materials, normals, views.astype(np.float32), sky)
     (value, gradient), (exact, exact_gradient) = single, double
-    # A sun in the map: an absolute error of its rounding everywhere.
+    # With a sun in the map, the rounding of the sun is an absolute error everywhere.
     assert_rows_close(value, exact, rtol=1e-4, atol=1e-6 * SUN)
     assert_rows_close(gradient[3], exact_gradient[3], rtol=1e-4, atol=1e-4)
     for leaf in jax.tree.leaves(gradient):
         assert np.isfinite(leaf).all()
     for name in ("albedo", "roughness", "metallic"):
         mine, true = getattr(gradient[0], name), getattr(exact_gradient[0], name)
-        # At n.v = 0 and at the knots of the levels the slope of one side or the other is right.
+        # At n.v = 0 and at the roughness of a level, either one-sided slope is right, so these rows
+        # are left out.
         smooth = (np.abs(cosine) > 1e-5) & ~np.isin(roughness, [0.0, 1.0])
         assert_rows_close(mine[smooth], true[smooth], rtol=1e-3, atol=3e-5 * SUN)
 
@@ -377,7 +379,7 @@ def test_huge_tables_are_interpolated_between_their_rows(size):
     np.testing.assert_array_equal(values, np.asarray(clamped, np.float64))
     # Weights of a point sum to one in every level, and no table changes them.
     np.testing.assert_allclose(into_table.sum(0), len(points) * GRID.levels, rtol=1e-5)
-    outside = (points < -1e-35) | (points > 1)  # XLA takes denormal numbers as zero
+    outside = (points < -1e-35) | (points > 1)  # XLA treats denormal numbers as zero
     np.testing.assert_array_equal(into_points[outside], 0.0)
     assert 0 < np.abs(into_points).max() <= 4 * size * sum(GRID.resolutions)
     constant, _, slope = run(jnp.full_like(table, size), points)
@@ -386,7 +388,7 @@ def test_huge_tables_are_interpolated_between_their_rows(size):
 
 
 def test_a_cell_border_is_its_vertex():
-    """From either side of a border the value is that of the border itself, to rounding."""
+    """From either side of a border, values agree with that of the border itself up to rounding."""
     table = init_tables(jax.random.key(0), GRID) * 1e4
     borders = np.float32([k / n for n in GRID.resolutions for k in range(n + 1)])
     rows = [np.nextafter(borders, np.float32(side)) for side in (-9, 9)]
@@ -477,7 +479,7 @@ def test_similarity_of_flat_images_is_that_of_their_means(shape):
     assert np.all(np.abs(values) <= 1 + ROUNDING)
     floor = 0.01**2
     expected = (2 * first * second + floor) / (first**2 + second**2 + floor)
-    # Beyond some tens of the data range the variance of a flat image is rounding.
+    # For values beyond some tens of the data range, the variance of a flat image is mere rounding.
     resolved = (np.maximum(first, second) <= 1.0) | (first == second)
     np.testing.assert_allclose(values[resolved], expected[resolved], atol=2e-3)
     for gradient in gradients:

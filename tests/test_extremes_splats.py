@@ -1,4 +1,4 @@
-"""Projection and rasteriser at their extremes: not only finite, but what should come out."""
+"""Projection and rasteriser at their extremes: results are correct, and not only finite."""
 
 from functools import partial
 
@@ -18,7 +18,7 @@ ROUNDING = float(np.finfo(np.float32).eps)
 FIELD = 1e-5  # float32 rendering against float64, a dozen layers deep
 FEW = settings(max_examples=25, deadline=None)
 COUNT = 48
-SIZE = 11  # no tile divides it
+SIZE = 11  # not a multiple of the tile size
 AMPLE = Capacities(visible=512, hits=8192, chunks=2048)
 STATIC = ("height", "width", "capacities", "tile_size", "near")
 
@@ -56,7 +56,10 @@ def scalar(image, alpha):
 
 @partial(jax.jit, static_argnames=STATIC)
 def draw(inputs, eligible, **settings):
-    """Image, alpha, usage and gradient of `scalar` in the five inputs; one trace a shape."""
+    """Return image, alpha, usage, and the gradient of `scalar` with respect to the five inputs.
+
+    Every shape is traced once.
+    """
 
     def loss(inputs):
         image, alpha, needed = rasterize(*inputs, eligible, **settings)
@@ -68,7 +71,10 @@ def draw(inputs, eligible, **settings):
 
 @partial(jax.jit, static_argnames=("height", "width"))
 def draw_dense(inputs, eligible, **settings):
-    """The same by sorting all in front and compositing everything everywhere."""
+    """Return what `draw` does, except usage, by compositing all splats in every pixel.
+
+    The splats in front of the camera are sorted by depth.
+    """
     shape = {k: settings[k] for k in ("height", "width")}
 
     def loss(inputs):
@@ -126,7 +132,7 @@ def all_finite(tree):
 
 
 def assert_sane(image, alpha, features):
-    """The laws of coverage: what any set of splats may do to a pixel."""
+    """Check the laws of coverage, which hold for any set of splats."""
     assert float(alpha.min()) >= 0.0
     assert float(alpha.max()) <= 1.0
     assert float(image.min()) >= 0.0
@@ -150,7 +156,7 @@ forward = jax.jit(rasterize, static_argnames=STATIC)
 
 
 def assert_equals_textbook(inputs, settings, *, tile_size=4):
-    """Compare images with NumPy: gradients of every shape would take long to compile."""
+    """Compare images with NumPy, but no gradients: they take long to compile for every shape."""
     eligible = jnp.ones(inputs[0].shape[0], bool)
     image, alpha, needed = forward(
         *inputs, eligible, capacities=AMPLE, tile_size=tile_size, **settings
@@ -166,7 +172,10 @@ def assert_equals_textbook(inputs, settings, *, tile_size=4):
 
 
 def numpy_projection(inputs, settings):
-    """Means, depths and covariances in float64 by the textbook: J W R S S R W J + low pass."""
+    """Return the projection in float64 by the textbook: J W R S S R W J + low pass.
+
+    The result holds means, depths, covariances, and an upper bound of every splat's axes in pixels.
+    """
     means, quats, scales = (np.asarray(x, np.float64) for x in inputs[:3])
     pose, intrinsics = (
         np.asarray(settings[k], np.float64) for k in ("world_to_camera", "intrinsics")
@@ -252,7 +261,7 @@ def test_projection_equals_the_textbook_in_float64(field_of_view, exponents, dep
     focal = 0.5 * SIZE / np.tan(0.5 * np.radians(field_of_view))
     settings = camera(focal=focal, distance=0.0)
     means, quats, _, *rest = (np.asarray(x) for x in scene(seed))
-    # In and far outside the field of view, at one magnitude of depth.
+    # Means lie inside and far outside the field of view, at one magnitude of depth.
     means = means * [2, 2, 0.5] + [0, 0, 1.0]
     means[:, :2] *= np.tan(0.5 * np.radians(field_of_view))
     means *= 10.0**depth
@@ -263,7 +272,7 @@ def test_projection_equals_the_textbook_in_float64(field_of_view, exponents, dep
     np.testing.assert_allclose(footprints.depths, depths, rtol=1e-6)
     np.testing.assert_allclose(footprints.means2d, pixels, rtol=1e-5, atol=1e-5 * SIZE)
     xx, xy, yy = (covariance[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-    # A projected axis errs by roundings of its whole length, foreshortened as it may be.
+    # A projected axis has the rounding errors of its whole length, even where it is foreshortened.
     for got, wanted, square in zip(
         footprints.covariances2d.T, (xx, xy, yy), (xx, np.sqrt(xx * yy), yy), strict=True
     ):
@@ -340,7 +349,8 @@ def test_splats_of_every_size_and_place_equal_dense_compositing(power, place, se
         means[:, 2] = (
             -3.0 + 0.01 + rng.choice([-1, 1], size=COUNT) * 10 ** rng.uniform(-3, 0, COUNT)
         )
-    # Round ones, since float32 cannot place a needle that starts thousands of pixels away (below).
+    # The splats are round: float32 cannot place a needle that starts thousands of pixels away, see
+    # the test of needles below.
     scales = np.full((COUNT, 3), 10.0**power)
     inputs = tuple(jnp.asarray(np.float32(x)) for x in (means, quats, scales, opacities, features))
     image, alpha, _, gradient = render(inputs)
@@ -379,7 +389,7 @@ def test_a_splat_on_a_pixel_centre_or_border_is_symmetric(offset):
     _, alpha, _, _ = render(inputs, settings, eligible=eligible)
     middle = SIZE // 2
     around = np.asarray(alpha)[1:, 1:] if offset else np.asarray(alpha)
-    # Away from the axis of the camera perspective leaves only the diagonal and the point.
+    # Off the axis of the camera, perspective leaves only the symmetries about diagonal and point.
     mirrored = (around.T, around[::-1, ::-1], *(() if offset else (around[::-1], around[:, ::-1])))
     for other in mirrored:
         np.testing.assert_allclose(around, other, atol=2 * ROUNDING)
@@ -416,7 +426,7 @@ def test_thousands_at_one_depth_are_composited_in_row_order():
     backwards = tuple(x[::-1] for x in inputs)
     reverse_image, reverse_alpha, _, _ = render(backwards, settings, capacities=room)
     np.testing.assert_allclose(reverse_alpha, alpha, atol=10 * FIELD)
-    # And the order matters.
+    # The order does matter.
     assert np.abs(np.asarray(reverse_image) - np.asarray(image)).max() > 1e-3
 
 
@@ -437,14 +447,14 @@ def test_coverage_behind_thousands_does_not_round_to_above_one(opacity):
     ("factor", "is_seen"), [(0.0, False), (0.99999, False), (1.00001, True), (255.0, True)]
 )
 def test_opacity_at_its_borders(factor, is_seen):
-    # So large that neither the low-pass filter nor the distance from the mean is felt.
+    # The splat is so large that neither the low-pass filter nor the distance from its mean matters.
     inputs, eligible = one([0, 0, 0.0], 1e4, np.float32(MIN_ALPHA) * factor)
     _, alpha, needed, gradient = render(inputs, eligible=eligible)
     assert int(needed["visible"]) == int(is_seen)
     expected = min(MIN_ALPHA * factor, MAX_ALPHA) if is_seen else 0.0
     np.testing.assert_allclose(alpha, expected, rtol=1e-5)
     if factor in (0.0, 0.99999, 255.0):
-        # Cut or clamped: nothing to learn from, except the colour of what is seen.
+        # Alpha is cut or clamped, so that only the colour of a visible splat has a gradient.
         assert not any(np.any(leaf) for leaf in gradient[:4])
     assert bool(np.any(gradient[4])) == is_seen
 
@@ -509,7 +519,7 @@ def test_narrow_and_wide_views_equal_dense_compositing(field_of_view):
     half = np.tan(0.5 * np.radians(field_of_view))
     settings = camera(focal=0.5 * SIZE / half, distance=0.0)
     means, quats, scales, opacities, features = (np.asarray(x) for x in scene(9))
-    # The same picture of the same splats: wider views of larger things.
+    # Wider views show larger splats, so the picture is the same.
     means = means * [3 * half, 3 * half, 1] + [0, 0, 3.0]
     inputs = (means, quats, scales * half, opacities, features)
     inputs = tuple(jnp.asarray(np.float32(x)) for x in inputs)

@@ -1,4 +1,4 @@
-"""The list of planted faults fits the package: each line is there, and each test that notices."""
+"""The list of faults fits the package: every line is there, and so are the tests that notice."""
 
 import re
 import sys
@@ -32,5 +32,5 @@ def test_every_part_of_the_package_has_a_fault():
     package = HERE.parent / "geosplat_jax"
     parts = {path.stem for path in package.iterdir() if not path.stem.startswith("__")}
     planted = {Path(fault.file).parts[0].removesuffix(".py") for fault in FAULTS}
-    # A table of numbers, and what is tested by planting faults itself.
+    # Only these parts may have no fault; the tests of `gradcheck` plant faults themselves.
     assert parts - planted <= {"gradcheck", "run", "camera_rounds", "model_choice"}

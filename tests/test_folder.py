@@ -35,7 +35,7 @@ def test_a_new_run_says_what_it_was_made_from(run, dataset):
 
 
 def test_a_run_keeps_the_cameras_that_it_was_trained_with(dataset, tmp_path):
-    """The file that they were read from may go, and the run may be moved."""
+    """The file that they were read from may be deleted, and the run may be moved."""
     file = tmp_path / "refined.json"
     file.write_text("cameras")
     options = {**dataset.options, "cameras": str(file), "cameras_digest": "abc"}

@@ -94,7 +94,7 @@ def noisy_geometry(grid, *, seed=0, closed=True):
 
 
 def to_trimesh(mesh):
-    """The real rows, with vertices and faces as they are."""
+    """Return the real rows of a mesh, without merging or reordering any."""
     return trimesh.Trimesh(
         np.asarray(mesh.vertices, np.float64)[: int(mesh.vertex_count)],
         np.asarray(mesh.faces)[: int(mesh.face_count)],
@@ -131,7 +131,7 @@ def test_patches_partition_the_crossing_edges():
         crossing = [e for e, (a, b) in enumerate(EDGES.tolist()) if (case >> a ^ case >> b) & 1]
         patches = [int(bits) for bits in PATCH_EDGES[case] if bits]
         assert len(patches) == PATCH_COUNT[case] <= 4, case
-        # Disjoint, since each edge would otherwise carry over.
+        # The patches are disjoint: an edge in two of them would carry over in the sum of bits.
         assert sum(patches) == sum(1 << e for e in crossing), case
         assert all(bits.bit_count() >= 3 for bits in patches), case
         for slot, bits in enumerate(patches):
@@ -178,9 +178,10 @@ def test_clashing_cases_have_one_ambiguous_face_and_their_complements_separate_i
 
 
 def load_oracle(name):
-    """The oracle's arrays in our order, and the chain-rule factor of the deformation.
+    """Return the oracle's file, its geometry and its gradient, with rows in our order.
 
-    The original rounds rest positions to five decimals; the difference is put into `deform`.
+    The original rounds rest positions to five decimals. `deform` absorbs the difference, and its
+    gradient is multiplied by the chain-rule factor of this change.
     """
     data = np.load(shared_path("oracles", f"flexicubes_{name}.npz"))
     resolution = int(data["res"])
@@ -543,7 +544,7 @@ def test_vertices_move_by_at_most_the_reach_of_the_grid_and_by_half_a_cell_by_de
 
 
 def test_the_surface_is_that_of_vertices_moved_by_the_reach():
-    """Half the reach is the same surface as the whole one with half the displacement."""
+    """A smaller reach gives the same surface as the default one with smaller displacements."""
     grid, share = make_grid(SMALL_SHAPE), 0.25
     geometry = noisy_geometry(grid)
     moves = share * np.tanh(np.asarray(geometry.deform, np.float64))
@@ -618,7 +619,7 @@ def test_the_penalties_of_flexicubes_are_entropy_deviation_and_weights(reduction
     assert set(found) == {"entropy", "deviation", "weights"}
     assert float(found["entropy"]) == float(entropy_of(geometry, grid, reduction=reduction))
     assert FlexiCubes(grid).entropy_reduction == "mean"
-    # A length of the box is two units, whose longest side is 3 here.
+    # Lengths are in units of half the longest side of the box, which is 3 here.
     np.testing.assert_allclose(found["deviation"], float(surface.deviation) / 1.5, rtol=1e-6)
     assert float(surface.deviation) > 0
     np.testing.assert_allclose(found["weights"], weights_gradient(geometry)[0], rtol=1e-6)

@@ -29,7 +29,7 @@ SLOW_STAGES = {
 
 
 LONG_STAGES = {"loss", "refinement"}
-"""Minutes each; `make test-long`."""
+"""Stages whose check takes minutes; `make test-long` runs them."""
 
 
 def marks(stage):
@@ -47,7 +47,7 @@ def test_every_gradient_agrees_with_differences(stage):
     failed = [row for row in rows if not passes(row)]
     assert rows
     assert not failed, table(failed)
-    # A table of zeros would pass: most pairs must truly depend on each other.
+    # A table of zeros would pass, so many of the pairs must truly depend on each other.
     assert np.mean([row.norm > 0 for row in rows]) > 0.4
 
 
@@ -62,7 +62,7 @@ _faulty_square.defvjp(
 
 
 def _square_problem(factor):
-    """``x^2`` with a gradient that is wrong by ``factor`` (an array, a factor an entry)."""
+    """Return ``x^2`` with a gradient that is wrong by ``factor``, an array with one per entry."""
 
     def function(inputs, constants):
         factors = jnp.asarray(factor, inputs["x"].dtype)
@@ -121,7 +121,7 @@ def test_pairs_that_carry_no_gradient_by_contract_are_left_out():
 
 
 def test_a_fault_in_a_sampled_group_is_found():
-    """Too many entries to try each: the combination along the gradient still sees it."""
+    """The entries are too many to try each; the combination along the gradient shows the fault."""
     factors = np.ones(4000)
     factors[:400] = 1.01
     weights = np.random.default_rng(0).uniform(0.5, 1.5, 4000)
@@ -149,12 +149,12 @@ def test_steps_tell_truncation_from_rounding():
 
     x = {"x": np.linspace(0.1, 1.0, 4)}
     sharp, blurred = _only(Problem("c", curved, x)), _only(Problem("o", offset, x))
-    assert sharp.sweep[2] > 1e-3  # truncation rules at large steps,
+    assert sharp.sweep[2] > 1e-3  # truncation dominates at large steps,
     assert sharp.sweep[3] / sharp.sweep[4] == pytest.approx(16, rel=0.05)  # and falls as h^2;
-    assert blurred.sweep[-1] > 1e-5  # rounding rules at small ones.
+    assert blurred.sweep[-1] > 1e-5  # rounding dominates at small ones.
     assert sharp.step < blurred.step
     assert sharp.relative < 1e-7
-    # The row says that these differences prove no more than they can.
+    # The row says how little these differences prove.
     assert blurred.uncertainty > blurred.relative
     assert len(sharp.sweep) == len(STEPS)
 

@@ -1,4 +1,4 @@
-"""The gradient by parts is that of the whole loss."""
+"""The gradient that is computed in parts is that of the whole loss."""
 
 import threading
 import time
@@ -37,8 +37,11 @@ def assert_close(found, expected):
 @pytest.mark.slow
 @pytest.mark.long
 def test_the_parts_of_monte_carlo_give_the_gradient_of_the_whole_loss():
-    """Two views, of which one counts for less, a residual with samples of its own, and a term of
-    no view that looks at the light."""
+    """The problem has parts of several kinds.
+
+    There are two views, of which one counts for less; a residual with samples of its own; and a
+    term that belongs to no view and depends on the light.
+    """
     _, pipeline, params, batch = problem(
         "stages.monte_carlo.transport.residual_count=1",
         "stages.monte_carlo.transport.indirect=radiometric",
@@ -57,7 +60,7 @@ def test_the_parts_of_monte_carlo_give_the_gradient_of_the_whole_loss():
 
 
 def test_two_programs_run_at_a_time_and_their_results_stay_in_order():
-    """Each of two waits for the other; one after the other they would never end."""
+    """Each of the two waits for the other, so that one after the other they would never end."""
     both = threading.Barrier(2, timeout=20)
 
     def program(number):
@@ -69,7 +72,7 @@ def test_two_programs_run_at_a_time_and_their_results_stay_in_order():
 
 
 def test_accelerators_are_given_programs_without_waiting(monkeypatch):
-    """What a program returns may still be in the making: nobody asks whether it is ready."""
+    """The result of a program may not be ready yet, and nothing waits for it."""
 
     class Unfinished:
         def block_until_ready(self):
@@ -120,7 +123,7 @@ def test_only_programs_that_sort_or_trace_rays_are_called_side_by_side(stage):
 
 
 def test_split_sum_by_parts_with_a_frozen_group():
-    """The surface gets no gradient, and the others the same as without that."""
+    """Frozen groups have no gradient, and the others have the same gradient as without freezing."""
     _, pipeline, params, batch = problem(stage="split_sum")
     batch = uneven(batch)
     (total, report), expected = evaluate(pipeline, params, batch)
@@ -137,8 +140,8 @@ def test_split_sum_by_parts_with_a_frozen_group():
             assert_close(a, b)
 
 
-def test_more_views_are_no_new_program_and_larger_lists_only_two():
-    """Programs are counted: those of a view serve every view."""
+def test_more_views_are_no_new_program_and_larger_lists_only_three():
+    """Compiled programs are counted: those of a view serve every view."""
     _, pipeline, params, batch = problem(stage="split_sum")
     value_and_gradient(pipeline, params, first_view(batch), frozen=())
     before = {name: getattr(gradient, name)._cache_size() for name in PROGRAMS}

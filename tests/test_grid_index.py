@@ -55,7 +55,7 @@ def traced(geometry, grid, capacities=AMPLE):
 
 @pytest.fixture(scope="module")
 def torus():
-    """The surface that most tests ask about, and its index."""
+    """The surface that most tests use, and its index."""
     surface, index = traced(bumpy_torus(torus_grid()), torus_grid())
     assert not overflowed(index.usage, AMPLE)
     return surface, index
@@ -101,12 +101,12 @@ def test_every_ray_equals_brute_force(scene, kind, two_sided):
 
 
 def test_a_ray_meets_what_is_a_hundredth_of_a_cell_away_and_not_what_it_starts_on(torus):
-    """A thousandth of a cell is the border; it is written out here, so that it cannot drift."""
+    """The limit is a thousandth of a cell; it is written out here, so that it cannot drift."""
     surface, index = torus
     corners = triangles(surface)
     cell = float(index.grid.cell_size)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    # Of large triangles only, whose middles rays meet whatever the rounding.
+    # Only large triangles are used, whose centroids rays meet in spite of rounding.
     large = np.linalg.norm(normals, axis=1) > 0.2 * cell**2
     chosen = np.flatnonzero(large)[np.arange(RAYS) % large.sum()]
     normal, middle = unit(normals[chosen]), corners[chosen].mean(axis=1)
@@ -128,7 +128,7 @@ def test_a_ray_from_far_away_meets_what_one_from_nearby_does(torus, far):
     start = origins - 3.0 * directions
     distance, face = index.nearest(start, directions, source, mask)
     away, same = index.nearest(start - far * directions, directions, source, mask)
-    # What rounding moves over an edge of a face may meet another.
+    # Rounding may move a ray over an edge of a face, so that it meets another face.
     is_same = np.asarray(same) == np.asarray(face)
     assert is_same.mean() > 0.97
     is_hit = is_same & (np.asarray(face) >= 0)
@@ -190,7 +190,7 @@ def test_a_ray_never_hits_the_face_it_starts_from(torus):
     centres = corners.mean(axis=1)
     normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     source = jnp.asarray(chosen, jnp.int32)
-    # From just below the face, through it: its own face is in the way, and must not be.
+    # Rays start just below a face and go through it: their own face is in the way, and is ignored.
     start = jnp.asarray(centres - 0.02 * normals, jnp.float32)
     arguments = (start, jnp.asarray(normals, jnp.float32))
     everything = jnp.ones((len(corners),), bool)

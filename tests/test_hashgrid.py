@@ -39,7 +39,7 @@ def _points(count=50, seed=1, dtype=jnp.float32):
 
 
 def level_rows(table, spec):
-    """Split the common table into those of its levels."""
+    """Split the common table into the tables of its levels."""
     ends = np.cumsum(spec.entries)
     return [table[end - count : end] for end, count in zip(ends, spec.entries, strict=True)]
 
@@ -57,7 +57,7 @@ def _slow_row(spec, level, x, y, z):
 
 
 def _slow_encode(table, points, spec):
-    """Loops over points, levels and corners."""
+    """Encode points in loops over points, levels and corners."""
     features = np.zeros((len(points), spec.levels, spec.features))
     for n, point in enumerate(points):
         for level, cells in enumerate(spec.resolutions):
@@ -264,7 +264,7 @@ def test_rows_with_zero_cotangent_leave_no_trace():
         )(table)
 
     padded = jnp.concatenate([points, jnp.full((13, 3), 0.123)])
-    # Equal bits on a processor; accelerators add up what meets in an entry in any order.
+    # Processors give equal bits; accelerators add what belongs to one entry in any order.
     np.testing.assert_allclose(gradient(points), gradient(padded), rtol=1e-6, atol=1e-6)
 
 

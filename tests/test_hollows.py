@@ -1,4 +1,4 @@
-"""Hollows: half a hollow ball, whose inside no silhouette shows, and bodies that have none."""
+"""Hollows: the inside of a bowl, which no silhouette shows, and bodies that have none."""
 
 import re
 from dataclasses import replace
@@ -32,12 +32,12 @@ def bowl(points):
 
 
 def half_ball(points):
-    """Signed distance bound of the same with a flat lid."""
+    """Signed distance bound of half a ball with a flat lid."""
     return np.maximum(np.linalg.norm(points, axis=-1) - OUTER, points[..., 2])
 
 
 def painted(points, rays):
-    """Colours that change around the axis, of a surface that looks alike from everywhere."""
+    """Return colours that change around the axis and do not depend on the viewer."""
     del rays
     angle = np.arctan2(points[..., 1], points[..., 0])
     waves = [np.cos(2 * angle), np.sin(2 * angle), np.cos(angle)]
@@ -45,26 +45,26 @@ def painted(points, rays):
 
 
 def reflected(points, rays):
-    """Directions from which the lid and the ball, both polished, reflect what rays see."""
+    """Return the directions into which the polished lid and ball reflect rays."""
     ball = points / np.linalg.norm(points, axis=-1, keepdims=True)
     normal = np.where(points[..., 2:] > -0.02, [0.0, 0.0, 1.0], ball)
     return rays - 2 * (rays * normal).sum(-1, keepdims=True) * normal
 
 
 def mirrored(points, rays):
-    """What they show of a colourful world."""
+    """Return the colours of a polished body in a colourful world."""
     x, y, z = np.moveaxis(reflected(points, rays), -1, 0)
     waves = [np.sin(5 * x + 3 * y), np.sin(4 * z - 3 * x), np.cos(6 * y + 2 * z)]
     return 0.4 + 0.3 * np.stack(waves, axis=-1)
 
 
 def reflecting_softly(points, rays):
-    """What they show of a light that changes slowly."""
+    """Return the colours of a polished body under a light that changes slowly."""
     return 0.5 + 0.3 * reflected(points, rays)
 
 
 def photographed(distance, color, *, count=COUNT):
-    """Views of a body, by sphere tracing."""
+    """Render views of a body by sphere tracing."""
     poses = look_at_poses(count, distance=DISTANCE)
     steps = (np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL
     x, y = np.meshgrid(steps, -steps)
@@ -89,7 +89,7 @@ def photographed(distance, color, *, count=COUNT):
 
 
 def carved(views, *, resolution=24):
-    """Return the grid's points, the hull and what is carved from it."""
+    """Return the grid, the hull, and the hull after hollows were carved from it."""
     grid = fit_grid(BOUNDS, resolution)
     cameras = views.world_to_camera, views.intrinsics
     hull = hull_sdf(*cameras, views.alphas, grid, valid=views.valid)
@@ -97,7 +97,10 @@ def carved(views, *, resolution=24):
 
 
 def found(grid, hull, sdf):
-    """Share of the hollow that was found, and the deepest that the wall was cut into, in cells."""
+    """Return the share of the hollow that was found, and the depth of the deepest cut in the wall.
+
+    The depth is in cells.
+    """
     cell = float(grid.cell_size)
     distance = bowl(grid_points(grid)) / cell
     hollow = (hull < 0) & (distance > 1.0)

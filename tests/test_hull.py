@@ -1,4 +1,4 @@
-"""The visual hull of a sphere is known: its distance, its box, and what masks may do to it."""
+"""The visual hull of a sphere is known: its distance, its box, and how masks may change it."""
 
 import io
 import json
@@ -212,7 +212,7 @@ def test_a_haze_of_compression_is_neither_object_nor_background(sphere):
     hazes.append(np.stack([through_jpeg(mask, quality=95) for mask in masks]))
     for hazy in hazes:
         found = hull_distance(poses, pinholes, hazy, points)
-        # A pixel is .044 wide there.
+        # A pixel is .044 wide at the sphere.
         np.testing.assert_allclose(found, clean, atol=0.02)
         for corner, expected in zip(
             hull_bounds(poses, pinholes, hazy), hull_bounds(poses, pinholes, masks), strict=True
@@ -223,7 +223,7 @@ def test_a_haze_of_compression_is_neither_object_nor_background(sphere):
 def test_large_masks_are_reduced_without_moving_the_edge():
     poses, intrinsics = cameras_around(np.zeros(3), count=8)
     masks = sphere_coverage(poses, intrinsics, np.zeros(3), RADIUS)
-    large = np.repeat(np.repeat(masks, 7, 1), 7, 2)[:, :-3]  # 445 x 448: no multiple of two
+    large = np.repeat(np.repeat(masks, 7, 1), 7, 2)[:, :-3]  # 445 x 448 pixels: the height is odd
     scaled = intrinsics * np.array([[7.0], [7.0], [1.0]])
     points = np.random.default_rng(4).uniform(-1.2, 1.2, (3000, 3))
     first, second = (
@@ -297,7 +297,7 @@ def test_hull_of_a_path_traced_scene_encloses_its_true_mesh(name):
 
 def test_pixels_that_do_not_count_carve_nothing(sphere):
     poses, intrinsics, masks = sphere
-    # A bar hides a part of every ball, in the mask too, and the border of the image is unknown.
+    # In every view a bar hides a part of the ball, also in the mask; the upper border is unknown.
     valid = np.ones(masks.shape, np.float32)
     valid[:, :, 34:40] = 0.0
     valid[:, :6] = 0.0
@@ -316,14 +316,14 @@ def test_pixels_that_do_not_count_carve_nothing(sphere):
     grid = fit_grid(exact, 16)
     sdf = hull_sdf(poses, intrinsics, hidden, grid, valid=valid)
     np.testing.assert_allclose(sdf, hull_sdf(poses, intrinsics, masks, grid), atol=1.0)
-    # Nothing was written to what was given.
+    # The masks that were given are not changed.
     np.testing.assert_array_equal(hidden, before)
 
 
 def test_where_all_pixels_count_the_hull_is_the_same(sphere):
     points = np.random.default_rng(3).uniform(-1.2, 1.2, (500, 3))
     every = hull_distance(*sphere, points, valid=np.ones(sphere[2].shape, bool))
-    # Another program, so another rounding.
+    # This is another program, which may round differently.
     np.testing.assert_allclose(every, hull_distance(*sphere, points), atol=1e-6)
 
 

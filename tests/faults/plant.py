@@ -1,10 +1,10 @@
-"""Plant the faults of ``faults.toml`` one after the other, and see which of them the tests notice.
+"""Plant the faults of ``faults.toml`` one at a time, and see which of them the tests notice.
 
     python tests/faults/plant.py [--only NAME] [--jobs N] [--all-tests] [--sound]
 
-Every fault goes into a copy of the package in a temporary folder; the checkout stays as it is. The
-tests that are named beside the fault run against the copy. Prints for each whether it was noticed,
-and in how many seconds; exit status 1 where fewer than 90 % are.
+Every fault is planted in a copy of the package in a temporary folder; the checkout stays as it is.
+The tests that the list names for the fault run against the copy. Prints for every fault whether it
+was noticed, and after how many seconds; the exit status is 1 where fewer than 90 % are noticed.
 """
 
 import argparse
@@ -27,15 +27,15 @@ WANTED = 0.9
 """Share of the faults that the default tests have to notice."""
 
 _BESIDE = ("benchmarks", "docs", "examples", "experiments", "pyproject.toml", "README.md")
-"""What tests look at, apart from the package and themselves."""
+"""Files and folders that tests read, apart from the package and the tests themselves."""
 
 _PASSED, _FAILED = 0, 1
-"""Statuses of pytest; any other one says that the tests did not run."""
+"""Exit statuses of pytest; any other status means that the tests did not run."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A line as it is and as it would be, see ``faults.toml``."""
+    """A line of the package and the line with the fault, see ``faults.toml``."""
 
     name: str
     file: str
@@ -46,7 +46,7 @@ class Fault:
 
     @property
     def source(self) -> Path:
-        """The file that it would be made in."""
+        """The file that the fault is planted in."""
         return ROOT / PACKAGE / self.file
 
     def planted(self) -> str:
@@ -55,7 +55,8 @@ class Fault:
         Raises
         ------
         ValueError
-            If the line is not there exactly once: the list is older than the package.
+            If the file does not hold the line exactly once, since the list is older than the
+            package, or if the fault changes nothing.
         """
         text = self.source.read_text(encoding="utf-8")
         count = text.count(self.old)
@@ -70,12 +71,12 @@ class Fault:
 
 
 def read_faults() -> list[Fault]:
-    """Read the list.
+    """Read the list of faults.
 
     Raises
     ------
     ValueError
-        If two faults have one name.
+        If two faults have the same name.
     """
     rows = tomllib.loads(LIST.read_text(encoding="utf-8"))["fault"]
     faults = [Fault(**{**row, "tests": tuple(row["tests"])}) for row in rows]
@@ -87,7 +88,7 @@ def read_faults() -> list[Fault]:
 
 
 def copied(folder: Path) -> Path:
-    """Copy the package and its tests into a folder; what stands beside them is linked."""
+    """Copy the package and its tests into a folder, and link the other files that tests read."""
     ignored = shutil.ignore_patterns("__pycache__")
     for name in (PACKAGE, "tests"):
         shutil.copytree(ROOT / name, folder / name, ignore=ignored)
@@ -97,9 +98,9 @@ def copied(folder: Path) -> Path:
 
 
 def run_tests(folder: Path, tests: Sequence[str]) -> tuple[int, str]:
-    """Run tests of a copy; return the status of pytest and the end of what it said.
+    """Run tests of a copy; return the exit status of pytest and the end of its output.
 
-    Without any given the whole default run.
+    If no tests are given, the whole default run is made.
     """
     paths = [str(folder / "tests" / test) for test in tests] or [str(folder / "tests")]
     options = ["-x", "-q", "-n0", "-p", "no:cacheprovider", "--no-header"]
@@ -114,7 +115,7 @@ def run_tests(folder: Path, tests: Sequence[str]) -> tuple[int, str]:
 
 
 def verdict(fault: Fault, *, all_tests: bool) -> str:
-    """Plant a fault and say what the tests say: killed, survived, or why there is no telling."""
+    """Plant a fault and return the verdict of the tests: killed, survived, or why it is unclear."""
     text = fault.planted()
     with tempfile.TemporaryDirectory(prefix="fault_") as temporary:
         folder = copied(Path(temporary))
@@ -128,7 +129,7 @@ def verdict(fault: Fault, *, all_tests: bool) -> str:
 
 
 def timed(fault: Fault, *, all_tests: bool) -> str:
-    """Print the verdict of a fault beside its seconds, and return it."""
+    """Print the verdict on a fault and the seconds that it took; return the verdict."""
     began = time.monotonic()
     found = verdict(fault, all_tests=all_tests)
     seconds = time.monotonic() - began
@@ -139,7 +140,7 @@ def timed(fault: Fault, *, all_tests: bool) -> str:
 
 
 def main() -> int:
-    """Plant what was asked for, and sum up."""
+    """Plant the faults that were asked for, and print a summary."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", metavar="NAME", action="append", help="some of the faults")
     parser.add_argument("--jobs", type=int, default=1, help="faults at a time")

@@ -1,22 +1,23 @@
 """Direct light by `geosplat_jax.transport.monte_carlo` against Mitsuba 3, an independent renderer.
 
-One mesh that shadows itself, one camera, two environment maps, two materials: a diffuse one, and a
-GGX metal (`principled` in Mitsuba). Both renderers see the same triangles, vertex normals and
-light, filter pixels by a box, and stop after one bounce. For every pair this prints how well the
-images agree, what their noise alone would give, and the bias, and it writes both images and their
-difference.
+The scene is one mesh that shadows itself, seen by one camera, under two environment maps and with
+two materials: a diffuse one, and a GGX metal (`principled` in Mitsuba). Both renderers use the same
+triangles, vertex normals and light, filter pixels by a box, and stop after one bounce. For every
+light and material this prints how well the images agree, how well they would agree if they differed
+by noise alone, and the bias. It also writes both images and their difference.
 
-What differs by design and stays in the figures:
+Some differences are by design and remain in the figures:
 
 * Masking. Mitsuba's is separable, ``G1(wi) G1(wo)``; ours is height-correlated and so at least as
-  large, the more so for rough surfaces seen or lit at a slant: under the sky by a thousandth of
-  the mean at roughness 0.4, by 3% at 0.8. Distribution, the width ``roughness**2`` and Schlick's
-  Fresnel are the same for a metal.
-* Shading normals that face away from the viewer, of 0.3% of the hits, at the silhouette. Mitsuba
-  returns black; we flip them.
+  large. They differ most for rough surfaces that are seen or lit at a slant: under the sky by a
+  thousandth of the mean at roughness 0.4, and by 3% at 0.8. The distribution, its width
+  ``roughness**2`` and Schlick's Fresnel are the same for a metal.
+* Shading normals that face away from the viewer, for 0.3% of the hits, at the silhouette. Mitsuba
+  returns black; we flip these normals.
 
-Light that arrives from below the face but above the shading normal is blocked in both: here by a
-test, in Mitsuba because the shadow ray then starts inside a closed mesh.
+Light that arrives from below the face but above the horizon of the shading normal is blocked in
+both renderers: in ours by a test, in Mitsuba because the shadow ray then starts inside a closed
+mesh.
 """
 
 import argparse
@@ -56,20 +57,21 @@ from geosplat_jax.transport.light_sampling import light_sampler
 from geosplat_jax.transport.sampling import SampleCounts, draw_samples
 
 FIELD_OF_VIEW = 0.62
-"""Horizontal and vertical, radians."""
+"""Horizontal and vertical field of view, radians."""
 
 ALBEDO = (0.8, 0.55, 0.35)
-"""Of both materials; the reflectance at normal incidence of the metal."""
+"""Albedo of both materials; for the metal, this is the reflectance at normal incidence."""
 
 PERCENTILE = 99.0
-"""Of Mitsuba's radiance over the object's pixels: what counts as white, and where values clip."""
+"""Percentile of Mitsuba's radiance over the object's pixels that counts as white; larger values are
+clipped."""
 
 DIFFERENCE_GAIN = 8.0
 
 _POINTS_AT_ONCE = 65_536
-"""At most, so that what a block takes fits into memory."""
+"""Most hits that are shaded at once, so that their intermediate arrays fit into memory."""
 
-# A z-up world in Mitsuba's y-up envmap: local = (y, z, x).
+# Our world is z-up and Mitsuba's envmap y-up: local = (y, z, x) of the world.
 _ENVMAP_TO_WORLD = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
 
 
@@ -79,11 +81,15 @@ class Settings:
 
     Attributes
     ----------
-    size : height and width of the images. resolution : cells of the grid along each axis.
-    strata : our primary rays a pixel and pass are its square. passes : independent halves and more
-        of our image, at least 2. counts : samples a primary hit.
-    mitsuba_samples, mitsuba_passes : primary rays a pixel and pass, and passes, at least 2.
-    roughness : of the metal. seed : of all random numbers.
+    size : height and width of the images.
+    resolution : cells of the grid along each axis.
+    strata : the square root of our primary rays per pixel and pass.
+    passes : number of our passes, at least 2; halves of them are compared to measure the noise.
+    counts : samples per primary hit.
+    mitsuba_samples : Mitsuba's primary rays per pixel and pass.
+    mitsuba_passes : number of Mitsuba's passes, at least 2.
+    roughness : roughness of the metal.
+    seed : seed of all random numbers.
     """
 
     size: int = 128
@@ -99,7 +105,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Scene:
-    """What both renderers see, and the surface as rays of ours see it."""
+    """Mesh and camera of both renderers, and the surface and its index for our rays."""
 
     surface: IsoSurface
     index: RayIndex
@@ -113,8 +119,8 @@ class Scene:
 class Image:
     """Linear radiance (H, W, 3) on black, the coverage (H, W) of its pixels, and its noise.
 
-    ``noise`` (H, W, 3) is half the difference of two independent halves of the samples: as large,
-    on average, as the error of their mean.
+    ``noise`` (H, W, 3) is half the difference between the means of two independent halves of the
+    samples. On average it is as large as the error of the mean of all samples.
     """
 
     radiance: np.ndarray
@@ -124,10 +130,15 @@ class Image:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well two images agree: decibels over the object's pixels, over all, and by noise alone.
+    """How well two images agree.
 
-    ``bias`` is the difference of the object's mean radiance, ours less Mitsuba's, relative to
-    Mitsuba's, ``bias_error`` its standard error, and ``white`` the radiance that counts as 1.
+    Attributes
+    ----------
+    object_psnr, image_psnr : decibels over the object's pixels, and over all pixels.
+    noise_psnr : decibels over the object's pixels if the images differed by noise alone.
+    bias : our mean radiance over the object's pixels less Mitsuba's, relative to Mitsuba's.
+    bias_error : standard error of the bias.
+    white : radiance that counts as 1.
     """
 
     object_psnr: float
@@ -139,7 +150,10 @@ class Agreement:
 
 
 def _distances(points: np.ndarray) -> np.ndarray:
-    """Distance to a ball within a torus below a smaller ball: each shadows the others."""
+    """Return signed distances to a ball within a torus, with a smaller ball above them.
+
+    Each of the three shadows the others.
+    """
     x, y, z = points.T
     torus = np.hypot(np.hypot(x, y) - 0.68, z + 0.12) - 0.19
     ball = np.sqrt(x**2 + y**2 + z**2) - 0.36
@@ -167,9 +181,9 @@ def make_scene(
     distances_at: Callable[[np.ndarray], np.ndarray] = _distances,
     eye: tuple[float, float, float] = (1.6, -2.2, 1.5),
 ) -> Scene:
-    """Extract the mesh on a grid of so many cells along each axis, and arrange it for rays.
+    """Extract the mesh on a grid with ``resolution`` cells along each axis, and index it for rays.
 
-    ``distances_at`` : signed distances of points (N, 3). ``eye`` : where the camera stands.
+    ``distances_at`` : returns signed distances at points (N, 3). ``eye`` : position of the camera.
     """
     cell = 2.2 / resolution
     shape = (resolution, resolution, resolution)
@@ -198,7 +212,7 @@ def make_scene(
 
 
 def make_lights(height: int = 32) -> dict[str, EnvLight]:
-    """Two maps: a smooth sky whose horizon has four colours, and a dim one with a small sun."""
+    """Return two maps: a smooth sky with four colours at its horizon, and a dim one with a sun."""
     directions = np.asarray(light_directions(height, 2 * height), np.float64)
     x, y, z = np.moveaxis(directions, -1, 0)
     horizon = np.exp(-((z / 0.4) ** 2))[..., None]
@@ -216,7 +230,7 @@ def make_lights(height: int = 32) -> dict[str, EnvLight]:
 
 @dataclass(frozen=True)
 class Hits:
-    """Where primary rays meet the surface: pixel and face (M,), the others (M, 3)."""
+    """Where primary rays meet the surface: pixels and faces (M,), and other arrays (M, 3)."""
 
     pixels: np.ndarray
     faces: np.ndarray
@@ -229,7 +243,7 @@ class Hits:
 def _primary_rays(
     rng: np.random.Generator, settings: Settings, pose: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels, origins and unit directions of jittered rays, one a stratum of every pixel."""
+    """Return pixels, origins and unit directions of jittered rays, one per stratum of a pixel."""
     size, strata = settings.size, settings.strata
     row, column, i, j = np.indices((size, size, strata, strata)).reshape(4, -1)
     jitter = rng.uniform(size=(2, row.size))
@@ -280,9 +294,9 @@ def all_passes(scene: Scene, settings: Settings) -> list[Hits]:
 
 @partial(jax.jit, static_argnames=("counts",))
 def shaded_lobes(key, points, materials, wo, light, index, *, counts):
-    """Our estimator, and the only call of it: diffuse and specular radiance, (N, 3) each.
+    """Return the diffuse and the specular radiance of our estimator, (N, 3) each.
 
-    Both lobes flip shading normals that face away.
+    Both lobes flip shading normals that face away from the viewer.
     """
     cosine = jnp.sum(points.normals * wo, axis=-1, keepdims=True)
     points = replace(points, normals=jnp.where(cosine < 0, -points.normals, points.normals))
@@ -295,7 +309,7 @@ def shaded_lobes(key, points, materials, wo, light, index, *, counts):
 
 
 def block_of(passes: list[Hits], *, most: int = _POINTS_AT_ONCE) -> int:
-    """Return how many hits are shaded at once: one size for all passes, which compiles once."""
+    """Return how many hits are shaded at once: one number for all passes, to compile only once."""
     largest = max(len(hits.pixels) for hits in passes)
     return min(most, 1 << largest.bit_length())
 
@@ -310,7 +324,7 @@ def _shade_hits(
     material: str,
     block: int,
 ) -> np.ndarray:
-    """Radiance (M, 3) of the hits, in blocks of a size."""
+    """Return the radiance (M, 3) of the hits, which are shaded in blocks of one size."""
     count = len(hits.pixels)
     metallic = {"diffuse": 0.0, "metal": 1.0}[material]
     materials = Materials(
@@ -367,31 +381,32 @@ def our_image(
 
 
 def combined(images: list[np.ndarray], coverages: list[np.ndarray], size: int) -> Image:
-    """Average passes; their noise is half the difference of those at even and odd places."""
+    """Average passes; the noise is half the difference between the means of even and odd passes."""
     stack = np.stack(images).reshape(-1, size, size, 3)
-    even = len(images) // 2 * 2  # of an odd number the last says nothing about noise
+    even = len(images) // 2 * 2  # the last pass of an odd number has no partner
     halves = np.mean(stack[:even:2], axis=0) - np.mean(stack[1:even:2], axis=0)
     coverage = np.mean(np.stack(coverages).reshape(-1, size, size), axis=0)
     return Image(np.mean(stack, axis=0), coverage, 0.5 * halves)
 
 
 def _envmap_texels(light: EnvLight) -> np.ndarray:
-    """Texels of a Mitsuba envmap that is the same function of direction as our light.
+    """Return texels of a Mitsuba envmap that is the same function of direction as our light.
 
-    Columns lie at half integers in both. Mitsuba's rows lie at ``j / (rows - 1)``: of twice as many
-    and one, every other is one of ours, and a bilinear function stays itself on a finer grid.
+    Columns lie at half integers in both. Mitsuba's rows lie at ``j / (rows - 1)``, so every other
+    one of ``2 * height + 1`` rows coincides with one of ours. On the finer grid, bilinear
+    interpolation gives the same function.
     """
     height, width, _ = light.radiance.shape
     u = (np.arange(width) + 0.5) / width
-    # Beyond the first and last row centre our map is constant along a meridian, and at the pole
-    # itself the azimuth would be lost.
+    # Beyond the centres of the first and last rows our map is constant along a meridian. Clipping
+    # keeps the rows off the poles, where the azimuth would be lost.
     v = np.clip(np.arange(2 * height + 1) / (2 * height), 0.25 / height, 1 - 0.25 / height)
     azimuth, polar = np.meshgrid((0.5 - u) * 2 * np.pi, v * np.pi)
     directions = np.stack(
         [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1
     )
     found = lookup(light.radiance, jnp.asarray(directions.reshape(-1, 3), jnp.float32))
-    # A copy: Mitsuba takes no array that is read-only.
+    # A copy, since Mitsuba does not take arrays that are read-only.
     return np.array(found, np.float32).reshape(2 * height + 1, width, 3)
 
 
@@ -411,12 +426,12 @@ def light_error(emitter, light: EnvLight) -> float:
 
 
 def mitsuba_light(light: EnvLight):
-    """Build the envmap of a light.
+    """Build Mitsuba's envmap of a light.
 
     Raises
     ------
     RuntimeError
-        If it gives other light in the same directions: Mitsuba changed its conventions.
+        If the envmap is not the same function of direction: Mitsuba has changed its conventions.
     """
     import mitsuba as mi
 
@@ -436,9 +451,9 @@ def mitsuba_mesh(
     albedo: tuple[float, float, float] = ALBEDO,
     chosen: np.ndarray | None = None,
 ):
-    """Hand the triangles and vertex normals to Mitsuba, with one of both materials.
+    """Give the triangles and vertex normals to Mitsuba, with one of the two materials.
 
-    ``chosen`` : (faces,) bool, which of them; all by default.
+    ``chosen`` : (faces,) bool, the faces to take; all by default.
 
     Raises
     ------
@@ -510,8 +525,8 @@ def _normalized(values: np.ndarray, white: float) -> np.ndarray:
 def compare(ours: Image, reference: Image) -> Agreement:
     """Measure agreement on linear radiance, divided by `PERCENTILE` of the reference and clipped.
 
-    The object's pixels are those that either renderer covers, if only in part. The bias is of
-    radiance that is not clipped.
+    The object's pixels are those that either renderer covers at least in part. The bias is that of
+    the radiance before clipping.
     """
     white = float(np.percentile(reference.radiance[reference.coverage > 0], PERCENTILE))
     mask = (ours.coverage > 0) | (reference.coverage > 0)
@@ -521,7 +536,7 @@ def compare(ours: Image, reference: Image) -> Agreement:
     visible = np.where(is_clipped, 0.0, noise / white**2)[mask]
     mean = float(np.mean(reference.radiance[mask]))
     difference = float(np.mean(ours.radiance[mask] - reference.radiance[mask]))
-    # The noise of a pixel's three channels is one and the same path's.
+    # The three channels of a pixel share their paths, so their errors are averaged before squaring.
     spread = np.sqrt(np.sum(np.mean(np.sqrt(noise[mask]), axis=-1) ** 2)) / mask.sum()
     return Agreement(
         object_psnr=float(psnr(*pair, mask=mask)),
@@ -552,7 +567,7 @@ class Comparison:
 
 
 def comparisons(scene: Scene, passes: list[Hits], settings: Settings) -> Iterator[Comparison]:
-    """Render and compare both materials under both lights; needs `choose_variant` before."""
+    """Render and compare both materials under both lights; call `choose_variant` before."""
     for light_name, light in make_lights().items():
         for material in ("diffuse", "metal"):
             ours = our_image(scene, passes, light, settings, material=material)

@@ -1,19 +1,20 @@
 """An exported GLB in Mitsuba 3, beside our own relighting of the run that it came from.
 
-The file is read by trimesh, as by any program: y up, base colour in sRGB, roughness in green and
-metallic in blue, both linear, ``v`` downwards in the file. Mitsuba's `principled` takes these as
-they are. Both renderers see the same cameras and the same light::
+The file is read by trimesh, as any program would read it: y up, base colour in sRGB, roughness in
+green and metallic in blue, both linear, ``v`` downwards in the file. Mitsuba's `principled` takes
+these values as they are. Both renderers use the same cameras and the same light::
 
     python tests/slow/elsewhere.py RUN --env FILE.hdr
 
 prints for every view how well the images agree, over all pixels on black and over those of the
-object, and how well they would if a convention were misread: the right reading must be the best.
+object. For the first view it also prints how well they would agree if a convention were misread:
+the right reading must be the best.
 
-What differs by design and stays in the figures: our images are of Gaussians that stand for the
-mesh, not of the mesh, which shows at silhouettes; textures are sampled from the same fields, and
-blurred by a texel; `principled` has Disney's diffuse lobe, darker at grazing angles where it is
-smooth, and dims it by what the coat reflects, and masks separably; ours has Lambert's, and Smith's
-correlated masking.
+Some differences are by design and remain in the figures. Our images show Gaussians that stand for
+the mesh, and not the mesh itself, which is visible at silhouettes. Textures are sampled from the
+same fields, and blurred by a texel. `principled` has Disney's diffuse lobe, which is darker at
+grazing angles on smooth surfaces and is dimmed by the reflectance of the coat, and separable
+masking; ours has Lambert's lobe and Smith's correlated masking.
 """
 
 import argparse
@@ -37,7 +38,7 @@ from geosplat_jax.report.renderer import to_picture
 from geosplat_jax.run import Run
 
 BOUNCES = 3
-"""Surfaces that light meets on its way to the viewer, at most, in both."""
+"""Most surfaces that light meets on its way to the viewer, in both renderers."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def read_glb(path: Path) -> Asset:
     """Read a textured GLB."""
     mesh = trimesh.load(path, force="mesh", process=False)
     material = mesh.visual.material
-    # From y up to z up: (x, y, z) was (x, z, -y).
+    # From y up to z up: the point (x, y, z) of the world is (x, z, -y) in the file.
     to_world = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     return Asset(
         np.asarray(mesh.vertices) @ to_world.T,
@@ -76,16 +77,16 @@ def read_glb(path: Path) -> Asset:
 
 
 def _texture(pixels: np.ndarray, *, raw: bool):
-    """Make a texture of bytes; ``raw`` ones are not decoded from sRGB."""
+    """Make a texture from bytes; ``raw`` bytes are not decoded from sRGB."""
     import mitsuba as mi
 
-    bitmap = mi.Bitmap(np.array(pixels))  # a copy: no array that is read-only is taken
+    bitmap = mi.Bitmap(np.array(pixels))  # a copy, since read-only arrays are refused
     bitmap.set_srgb_gamma(not raw)
     return {"type": "bitmap", "bitmap": bitmap, "raw": raw, "wrap_mode": "clamp"}
 
 
 def mitsuba_mesh(asset: Asset):
-    """Hand mesh and textures to Mitsuba."""
+    """Give the mesh and its textures to Mitsuba."""
     import mitsuba as mi
 
     roughness, metallic = (np.repeat(asset.orm[..., k : k + 1], 3, axis=-1) for k in (1, 2))
@@ -136,13 +137,14 @@ def mitsuba_sensor(camera: Camera):
 
 
 def render(asset: Asset, light: EnvLight, camera: Camera, *, samples: int) -> np.ndarray:
-    """Render a view, (H, W, 4) linear on black, with coverage."""
+    """Render a view as (H, W, 4): linear radiance on black, and coverage."""
     import mitsuba as mi
 
     scene = mi.load_dict(
         {
             "type": "scene",
-            # One more than surfaces: the first edge of a path is that from the camera.
+            # Mitsuba counts the edges of a path, beginning at the camera: one more than its
+            # surfaces.
             "integrator": {"type": "path", "max_depth": BOUNCES + 1, "hide_emitters": True},
             "light": against.mitsuba_light(light),
             "mesh": mitsuba_mesh(asset),
@@ -153,12 +155,12 @@ def render(asset: Asset, light: EnvLight, camera: Camera, *, samples: int) -> np
 
 
 def shown(linear: np.ndarray) -> np.ndarray:
-    """Expose, tone map and encode as our images are."""
+    """Expose, tone map and encode an image in the same way as ours."""
     return to_picture(np.asarray(tone_map(jnp.asarray(linear), jnp.zeros(()))))
 
 
 def misread(asset: Asset, light: EnvLight) -> dict[str, tuple[Asset, EnvLight]]:
-    """Return what a program would see that gets one convention wrong, by what that is."""
+    """Return what a program that misreads one convention would see, by the name of the mistake."""
     rough = asset.orm[..., 1].astype(np.float64) / 255.0
 
     def with_roughness(values: np.ndarray) -> Asset:

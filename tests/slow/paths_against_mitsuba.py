@@ -1,14 +1,15 @@
 """Paths of `geosplat_jax.transport.paths` against the path tracer of Mitsuba 3.
 
-A bowl with a red and a green half and a ball in it, seen from above, under the two lights of
-`against_mitsuba`, of a diffuse material and of a GGX metal, with paths of 2, 3 and 5 segments from
-the camera to the light: one, two and four surfaces. For every pair this prints how well the images
-agree, what their noise alone would give, and the bias, and it writes both images and their
-difference.
+The scene is a bowl with a ball in it, red on one side and green on the other, seen from above under
+the two lights of `against_mitsuba`. Its material is diffuse or a GGX metal, and paths have 2, 3 or
+5 segments from the camera to the light: one, two or four surfaces. For every combination this
+prints how well the images agree, how well they would agree if they differed by noise alone, and the
+bias. It also writes both images and their difference.
 
-What differs by design and stays in the figures, beside what `against_mitsuba` names: later vertices
-of our paths take the mean normal of a face, Mitsuba's interpolate within it, and ours flip shading
-normals to the face's own where Mitsuba returns black.
+Two more differences than those that `against_mitsuba` names are by design and remain in the
+figures. At later vertices our paths take the mean normal of a face, where Mitsuba interpolates
+normals within it; and our paths flip shading normals to the side of the face's own normal, where
+Mitsuba returns black.
 """
 
 import argparse
@@ -33,10 +34,10 @@ from geosplat_jax.transport.paths import FaceTable, PathTracer
 from geosplat_jax.transport.sampling import SampleCounts, draw_samples
 
 COLORS = ((0.85, 0.25, 0.15), (0.2, 0.8, 0.25))
-"""Albedo of the faces with x below 0 and above."""
+"""Albedo of the faces with x below 0, and of the others."""
 
 SEGMENTS = (2, 3, 5)
-"""From the camera to the light: ``max_depth`` of Mitsuba."""
+"""Numbers of segments from the camera to the light: ``max_depth`` of Mitsuba."""
 
 _POINTS_AT_ONCE = 32_768
 
@@ -58,7 +59,7 @@ def is_red(scene: against.Scene) -> np.ndarray:
 
 
 def face_materials(scene: against.Scene, roughness: float, material: str) -> Materials:
-    """Materials of all rows of faces."""
+    """Return the materials of all rows of faces, including padding."""
     count = scene.index.face_capacity
     albedo = np.zeros((count, 3), np.float32)
     albedo[: len(scene.faces)] = np.where(is_red(scene)[:, None], *map(np.asarray, COLORS))
@@ -69,7 +70,7 @@ def face_materials(scene: against.Scene, roughness: float, material: str) -> Mat
 
 
 def table_of(scene: against.Scene, materials: Materials) -> FaceTable:
-    """What paths find: the mean of a face's vertex normals, and its own."""
+    """Return what paths find at a face: its material, its mean vertex normal and its own normal."""
     normals = np.zeros((scene.index.face_capacity, 3), np.float32)
     normals[: len(scene.faces)] = scene.normals[scene.faces].mean(axis=1)
     outward, _ = against.face_normals_and_areas(scene.surface.mesh)
@@ -99,7 +100,7 @@ def shaded(key, points, table, wo, light, index, *, counts, segments, material):
 
 
 def without_coat(material: str):
-    """Leave the coat of a diffuse material out of later vertices: Mitsuba's has none."""
+    """Leave out the coat of a diffuse material at later vertices, since Mitsuba's has no coat."""
     if material == "metal":
         return mock.patch.object(bsdf, "evaluate", bsdf.evaluate)
     return mock.patch.object(bsdf, "evaluate", lambda *args: bsdf.evaluate_lobes(*args)[0])
@@ -162,7 +163,7 @@ def mitsuba_image(
 def comparisons(
     scene: against.Scene, settings: against.Settings, *, lights=("sky", "sun"), segments=SEGMENTS
 ) -> Iterator[against.Comparison]:
-    """Render and compare both materials under the lights; needs `choose_variant` before."""
+    """Render and compare both materials under the lights; call `choose_variant` before."""
     passes = against.all_passes(scene, settings)
     for light_name in lights:
         light = against.make_lights()[light_name]

@@ -11,22 +11,23 @@ import against_mitsuba as against  # noqa: E402
 
 from geosplat_jax.core.types import EnvLight  # noqa: E402
 
-# One group: its tests share images, which one process then renders once.
+# The tests share images: in one group, a single process renders them once.
 pytestmark = [pytest.mark.slow, pytest.mark.computes, pytest.mark.xdist_group("mitsuba")]
 
 SETTINGS = against.Settings(size=48, resolution=24)
 COARSE = replace(SETTINGS, strata=4, mitsuba_passes=2)
 
-# Decibels over the object's pixels, which is stricter than over the whole image.
+# Required decibels over the object's pixels, a stricter measure than over the whole image.
 MARKS = {"diffuse": 42.0, "metal": 30.0}
 
-# Noise explains the difference to within this: under the sky systematic errors are below two thirds
-# of the noise (10^(1.5 / 10) = 1.41), whatever the marks. Separable masking in Mitsuba costs less
-# at this roughness. The small sun is seen in few pixels, and the noise itself is known to some two
-# decibels only: three seeds gave -1.9, +1.2 and -0.3.
+# The agreement may be this many decibels below that of noise alone. Under the sky, systematic
+# errors are then below two thirds of the noise (10^(1.5 / 10) = 1.41), whatever the marks;
+# Mitsuba's separable masking costs less than that at this roughness. The small sun is seen in few
+# pixels, where the noise itself is known to about two decibels only: three seeds gave -1.9, +1.2
+# and -0.3.
 NOISE_MARGIN = {"sky": 1.5, "sun": 3.0}
 
-# A wrong light, visibility or material is worse than noise by at least so much.
+# A wrong light, visibility or material costs at least this many decibels more than noise.
 ERROR_MARGIN = 4.0
 
 

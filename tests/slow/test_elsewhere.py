@@ -1,4 +1,4 @@
-"""What Mitsuba reads from an exported GLB is what was exported, at the place in the world."""
+"""Mitsuba reads the exported materials from a GLB, at the right places of the world."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from geosplat_jax.io.images import decode_srgb  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.computes]
 
-# Eight bits of sRGB, and a texel of 256 across the ball.
+# Errors of eight bits of sRGB, and of a texel of the 256 x 256 texture of a ball.
 TOLERANCE = 0.02
 
 
@@ -29,7 +29,7 @@ def asset(tmp_path_factory):
 
 
 def read_at_hits(asset):
-    """Points of the world that rays from all sides hit, and the materials that Mitsuba finds."""
+    """Return points of the world that rays from all sides hit, and what materials Mitsuba finds."""
     import mitsuba as mi
 
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Our paths over two surfaces equal those of Mitsuba 3, and one surface more or fewer shows."""
+"""Our paths over two surfaces equal those of Mitsuba 3, and paths over one are too dark."""
 
 import pytest
 
