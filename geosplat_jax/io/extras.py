@@ -14,7 +14,7 @@ def optional_package(
     package: str | None = None,
     error: type[Exception] = SceneError,
 ) -> ModuleType:
-    """Import an optional package; the error for a missing one shows how to install it.
+    """Import an optional package; the error for a missing or broken one shows how to install it.
 
     Parameters
     ----------
@@ -27,12 +27,17 @@ def optional_package(
     Raises
     ------
     SceneError
-        If the package is not installed; another class if ``error`` names one.
+        If the package is not installed or cannot be imported; another class if ``error`` names one.
     """
+    needs = f"{purpose} needs the package {package or module}"
+    install = f"`pip install 'geosplat_jax[{extra}]'`"
     try:
         return importlib.import_module(module)
-    except ImportError:
+    except ImportError as cause:
+        top_level = module.partition(".")[0]
+        if isinstance(cause, ModuleNotFoundError) and cause.name == top_level:
+            raise error(f"{needs}; install it with {install}") from None
         raise error(
-            f"{purpose} needs the package {package or module}; install it with "
-            f"`pip install 'geosplat_jax[{extra}]'`"
-        ) from None
+            f"{needs}, which is installed but cannot be imported ({cause}); install what it lacks, "
+            f"or the package anew with {install}"
+        ) from cause

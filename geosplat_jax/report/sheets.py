@@ -141,7 +141,7 @@ class Shown:
         scales = [ERROR, ROUGHNESS, METALLIC]
         if self.seen is not None:
             scales.append(SEEN)
-        notes = ["albedo: as it was found", "lights: each exposed for itself"]
+        notes = ["albedo: as reconstructed", "lights: each exposed for itself"]
         return overview_sheet(
             rows, row_labels=self._labels, lights=self.lights, scales=scales, notes=notes
         )
@@ -152,7 +152,7 @@ class Shown:
         if "albedo" in self.views.truth:
             factors = zip("RGB", self.albedo_scale, strict=True)
             text = ", ".join(f"{channel} x {factor:.3f}" for channel, factor in factors)
-            notes = [f"albedo, aligned: as it was found, times {text} (linear)"]
+            notes = [f"albedo, aligned: as reconstructed, times {text} (linear)"]
         known = [scale for scale in (ROUGHNESS, METALLIC) if scale.name in rows[0]]
         return overview_sheet(rows, row_labels=self._labels, scales=known, notes=notes)
 
