@@ -66,15 +66,18 @@ def main() -> int:
         print(json.dumps(step_ms(options.one, **settings)))
         return 0
     print(f"{'devices':>8s} {'ms a step':>10s} {'speed':>6s}")
-    first = None
+    baseline_ms = None
     for count in options.devices:
         command = [sys.executable, "-m", "benchmarks.bench_devices", "--one", str(count)]
-        command += [part for name, x in settings.items() for part in (f"--{name}", str(x))]
-        done = subprocess.run(command, check=True, capture_output=True, text=True)
-        found = json.loads(done.stdout.splitlines()[-1])
-        first = first or found["ms"]
-        print(f"{count:8d} {found['ms']:10.1f} {first / found['ms']:6.2f}", flush=True)
-    if found["platform"] == "cpu":
+        command += [part for name, value in settings.items() for part in (f"--{name}", str(value))]
+        process = subprocess.run(command, check=True, capture_output=True, text=True)
+        measurement = json.loads(process.stdout.splitlines()[-1])
+        baseline_ms = baseline_ms or measurement["ms"]
+        print(
+            f"{count:8d} {measurement['ms']:10.1f} {baseline_ms / measurement['ms']:6.2f}",
+            flush=True,
+        )
+    if measurement["platform"] == "cpu":
         print(f"all devices share the {os.cpu_count()} cores of this machine")
     return 0
 

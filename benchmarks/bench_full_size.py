@@ -45,8 +45,8 @@ def run(
         with tempfile.TemporaryDirectory() as folder:
             fit(dataset, config, folder, stop_after=number + _WARM_UP + steps)
             lines = [x for x in RunFolder(folder).metric_lines() if x["stage"] == name]
-        timed = [line["seconds"] for line in lines[_WARM_UP:]]
-        times[f"step_{name}_s"] = round(statistics.median(timed), 4)
+        seconds = [line["seconds"] for line in lines[_WARM_UP:]]
+        times[f"step_{name}_s"] = round(statistics.median(seconds), 4)
     results: dict[str, float | int | str] = {
         "device": jax.devices()[0].device_kind,
         "cores": os.cpu_count() or 0,
@@ -70,10 +70,10 @@ def main() -> None:
     options = parser.parse_args()
     enable_compilation_cache()
     retain_freed_memory()
-    measured = run(
+    results = run(
         options.scene, quality=options.quality, overrides=tuple(options.set), steps=options.steps
     )
-    print(json.dumps(measured, indent=1))
+    print(json.dumps(results, indent=1))
 
 
 if __name__ == "__main__":

@@ -61,9 +61,9 @@ def run() -> dict[str, float]:
     results = {}
     for resolution in RESOLUTIONS:
         geometry, grid = torus(resolution)
-        small = Capacities()
-        needed = isosurface(geometry, grid, capacities=small, training=True).usage
-        capacities = grow(small, needed)
+        first_capacities = Capacities()
+        usage = isosurface(geometry, grid, capacities=first_capacities, training=True).usage
+        capacities = grow(first_capacities, usage)
 
         def forward(geometry, grid=grid, capacities=capacities):
             return _scalar(geometry, grid, capacities, True)

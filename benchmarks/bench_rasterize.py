@@ -49,9 +49,9 @@ def torus(major_count: int, minor_count: int) -> tuple[np.ndarray, np.ndarray]:
 def mesh_splats(vertices: np.ndarray, faces: np.ndarray) -> dict[str, jax.Array]:
     """Make six splats per face (Eq. 8-11), with random colours."""
     points = vertices[faces]
-    doubled = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
-    length = np.linalg.norm(doubled, axis=1, keepdims=True)
-    normals, areas = doubled / length, length / 2
+    cross_products = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+    length = np.linalg.norm(cross_products, axis=1, keepdims=True)
+    normals, areas = cross_products / length, length / 2
     means, scales, frames = [], [], []
     for u, alpha, beta in _ADAPTER_RINGS:
         corners = [
@@ -62,14 +62,14 @@ def mesh_splats(vertices: np.ndarray, faces: np.ndarray) -> dict[str, jax.Array]
             middle = (corners[k] + corners[(k + 1) % 3]) / 2
             half = corners[(k + 1) % 3] - middle
             extent = np.linalg.norm(half, axis=1, keepdims=True)
-            along = half / extent
+            tangents = half / extent
             means.append(middle)
             scales.append(
                 np.concatenate(
                     [alpha * extent, areas / (beta * extent), np.full_like(extent, _THICKNESS)], 1
                 )
             )
-            frames.append(np.stack([along, np.cross(normals, along), normals], -1))
+            frames.append(np.stack([tangents, np.cross(normals, tangents), normals], -1))
     count = 6 * len(faces)
     colors = np.random.default_rng(0).uniform(size=(count, 3))
     return {
@@ -186,12 +186,12 @@ def _measure(major, minor, size, repeats, tile_size) -> dict:
     inputs, eligible = _inputs(scene), _front_facing(scene, center)
     capacities = fitted_capacities(inputs, eligible, camera, size=size, tile_size=tile_size)
     settings = {"size": size, "capacities": capacities, "tile_size": tile_size}
-    used = lists_only(inputs, eligible, camera, **settings).usage
+    usage = lists_only(inputs, eligible, camera, **settings).usage
     result = {
         "splats": int(scene["means"].shape[0]),
-        "visible": int(used["visible"]),
-        "hits": int(used["hits"]),
-        "chunks": int(used["chunks"]),
+        "visible": int(usage["visible"]),
+        "hits": int(usage["hits"]),
+        "chunks": int(usage["chunks"]),
     }
     for function in (lists_only, forward, forward_backward):
         wall, processor = milliseconds(

@@ -29,9 +29,9 @@ def _median_step_ms(quality: str, stage: str, steps: int) -> float:
     counts = {name: 1 for name in names[: names.index(stage)]} | {stage: 1000}
     overrides = [f"stages.{name}.steps={counts.get(name, 0)}" for name in names]
     config = make_config("default", quality, overrides=("run.preview_every=0", *overrides))
-    last = config.first_step(stage) + steps + _WARM_UP
+    last_step = config.first_step(stage) + steps + _WARM_UP
     with tempfile.TemporaryDirectory() as folder:
-        fit(load_dataset(SCENE), config, folder, stop_after=last)
+        fit(load_dataset(SCENE), config, folder, stop_after=last_step)
         lines = RunFolder(folder).metric_lines()
     times = [line["seconds"] for line in lines if line["stage"] == stage]
     return 1e3 * statistics.median(times[_WARM_UP:])
@@ -52,10 +52,10 @@ def run_whole() -> dict[str, float]:
         began = time.perf_counter()
         fit(load_dataset(SCENE), make_config("default", "draft"), folder)
         seconds = time.perf_counter() - began
-        last = RunFolder(folder).metric_lines()[-1]
+        last_line = RunFolder(folder).metric_lines()[-1]
     return {
         "whole_draft_ms": round(1e3 * seconds, 1),
-        "whole_draft_psnr": round(last["psnr"], 2),
+        "whole_draft_psnr": round(last_line["psnr"], 2),
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
     }
 

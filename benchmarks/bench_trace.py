@@ -44,8 +44,10 @@ def _scene(resolution: int):
     values = np.sqrt(ring**2 + z**2) - 0.27 + 0.03 * np.sin(9 * x) * np.sin(8 * y) * np.sin(7 * z)
     geometry = initial_geometry(grid, jnp.asarray(values * resolution / 2, jnp.float32))
     rng = np.random.default_rng(0)
-    moved = jnp.asarray(rng.uniform(-0.3, 0.3, geometry.deform.shape), jnp.float32)
-    geometry = type(geometry)(geometry.sdf, moved, geometry.alpha, geometry.beta, geometry.gamma)
+    deformation = jnp.asarray(rng.uniform(-0.3, 0.3, geometry.deform.shape), jnp.float32)
+    geometry = type(geometry)(
+        geometry.sdf, deformation, geometry.alpha, geometry.beta, geometry.gamma
+    )
 
     def attempt(capacities: Capacities):
         surface = _extract(geometry, grid, capacities=capacities, training=True)

@@ -38,11 +38,11 @@ def step_of(overrides: list[str], *, scene: Path, quality: str, steps: int) -> d
     dict[str, float]
         ``step_ms``, the median of a step, and ``peak_memory_mb`` of this process.
     """
-    few = ("stages.split_sum.steps=1", "stages.refine.steps=0", "run.preview_every=0")
-    config = make_config("default", quality, overrides=(*few, *overrides))
-    last = config.first_step(MONTE_CARLO) + _WARM_UP + steps
+    stage_overrides = ("stages.split_sum.steps=1", "stages.refine.steps=0", "run.preview_every=0")
+    config = make_config("default", quality, overrides=(*stage_overrides, *overrides))
+    last_step = config.first_step(MONTE_CARLO) + _WARM_UP + steps
     with tempfile.TemporaryDirectory() as folder:
-        fit(load_dataset(scene), config, folder, stop_after=last)
+        fit(load_dataset(scene), config, folder, stop_after=last_step)
         lines = RunFolder(folder).metric_lines()
     times = [line["seconds"] for line in lines if line["stage"] == MONTE_CARLO]
     return {
@@ -77,15 +77,15 @@ def main() -> None:
         command = [sys.executable, "-m", "benchmarks.bench_transport", "--one", name]
         for option in ("scene", "quality", "steps"):
             command += [f"--{option}", str(getattr(arguments, option))]
-        done = subprocess.run(
+        process = subprocess.run(
             command, cwd=ROOT, env=os.environ, check=True, capture_output=True, text=True
         )
-        found = json.loads(done.stdout.splitlines()[-1])
-        reference = reference or found["step_ms"]
+        measurement = json.loads(process.stdout.splitlines()[-1])
+        reference = reference or measurement["step_ms"]
         cells = (
-            f"{found['step_ms']:.0f}",
-            f"{found['step_ms'] / reference:.2f}",
-            f"{found['peak_memory_mb']:.0f}",
+            f"{measurement['step_ms']:.0f}",
+            f"{measurement['step_ms'] / reference:.2f}",
+            f"{measurement['peak_memory_mb']:.0f}",
         )
         print(f"| {name} | {' | '.join(cells)} |", flush=True)
 

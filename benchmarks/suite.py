@@ -27,22 +27,22 @@ BASELINE = Path(__file__).with_name("baseline.json")
 
 def _flat(values: dict, prefix: str = "") -> dict[str, float]:
     """Flatten nested results to the entries that are median wall times in milliseconds."""
-    found = {}
+    medians = {}
     for name, value in values.items():
         if isinstance(value, dict):
-            found |= _flat(value, f"{prefix}{name}.")
+            medians |= _flat(value, f"{prefix}{name}.")
         elif name.endswith("_ms") and not name.endswith(
             ("min_ms", "processor_ms", "exp_ms", "sort_ms", "yardstick_ms")
         ):
-            found[prefix + name] = float(value)
-    return found
+            medians[prefix + name] = float(value)
+    return medians
 
 
 def measure(name: str, benchmark: Callable[[], dict]) -> dict[str, dict[str, float]]:
     """Run one benchmark between two calibrations; milliseconds and ratio of each median."""
-    before = calibrate()["exp_ms"]
+    first_exp_ms = calibrate()["exp_ms"]
     results = _flat(benchmark())
-    reference = 0.5 * (before + calibrate()["exp_ms"])
+    reference = 0.5 * (first_exp_ms + calibrate()["exp_ms"])
     return {
         f"{name}.{key}": {"ms": round(value, 2), "ratio": round(value / reference, 2)}
         for key, value in results.items()
@@ -71,29 +71,31 @@ def main() -> int:
     if options.whole:
         benchmarks["run"] = bench_step.run_whole
     baseline = json.loads(BASELINE.read_text())["results"] if BASELINE.exists() else {}
-    results, worse, others = {}, [], dict(baseline)
+    results, problems, other_results = {}, [], dict(baseline)
     print(f"{'benchmark':58s} {'ms':>10s} {'ratio':>9s} {'baseline':>9s}")
     for name, benchmark in benchmarks.items():
         if options.only and options.only not in name:
             continue
-        others = {key: entry for key, entry in others.items() if key.split(".")[0] != name}
+        other_results = {
+            key: entry for key, entry in other_results.items() if key.split(".")[0] != name
+        }
         for key, entry in measure(name, benchmark).items():
             results[key] = entry
-            known = baseline.get(key, {}).get("ratio")
-            print(f"{key:58s} {entry['ms']:10.1f} {entry['ratio']:9.2f} {known or '-':>9}")
-            if options.gate and known is None:
-                worse.append(f"{key} is not in the baseline; save a new one")
-            elif options.gate and entry["ratio"] > options.gate * known:
-                worse.append(f"{key} is slower: ratio {entry['ratio']} against {known}")
+            baseline_ratio = baseline.get(key, {}).get("ratio")
+            print(f"{key:58s} {entry['ms']:10.1f} {entry['ratio']:9.2f} {baseline_ratio or '-':>9}")
+            if options.gate and baseline_ratio is None:
+                problems.append(f"{key} is not in the baseline; save a new one")
+            elif options.gate and entry["ratio"] > options.gate * baseline_ratio:
+                problems.append(f"{key} is slower: ratio {entry['ratio']} against {baseline_ratio}")
     if options.gate and not options.only:
-        worse += [f"{key} is in the baseline only" for key in baseline if key not in results]
+        problems += [f"{key} is in the baseline only" for key in baseline if key not in results]
     if options.save:
-        results = others | results if options.only else results
+        results = other_results | results if options.only else results
         machine = {"jax": jax.__version__, "python": platform.python_version()}
         BASELINE.write_text(json.dumps({"machine": machine, "results": results}, indent=1) + "\n")
-    for line in worse:
+    for line in problems:
         print(line, file=sys.stderr)
-    return 1 if worse else 0
+    return 1 if problems else 0
 
 
 if __name__ == "__main__":

@@ -26,16 +26,16 @@ def _items(lines: list[str]) -> list[str]:
         else:
             items.append([line.strip()])
             is_prose = not has_name
-    listed = []
-    for first, *more in items:
-        name, colon, text = first.partition(" : ")
+    bullets = []
+    for first_line, *more_lines in items:
+        name, colon, text = first_line.partition(" : ")
         if colon:
-            listed.append(f"- `{name}`: {' '.join([text, *more])}")
-        elif more:
-            listed.append(f"- `{first}`: {' '.join(more)}")
+            bullets.append(f"- `{name}`: {' '.join([text, *more_lines])}")
+        elif more_lines:
+            bullets.append(f"- `{first_line}`: {' '.join(more_lines)}")
         else:
-            listed.append(f"- {first}")
-    return listed
+            bullets.append(f"- {first_line}")
+    return bullets
 
 
 def as_markdown(text: str) -> str:
@@ -43,10 +43,10 @@ def as_markdown(text: str) -> str:
     lines = text.splitlines()
     starts = [number for number in range(len(lines) - 1) if _RULE.match(lines[number + 1])]
     prose = lines[: starts[0]] if starts else lines
-    written = [re.sub(r"::$", ":", line) for line in prose]
+    markdown_lines = [re.sub(r"::$", ":", line) for line in prose]
     for start, end in zip(starts, [*starts, len(lines)][1:], strict=True):
-        written += ["", f"**{lines[start]}**", "", *_items(lines[start + 2 : end])]
-    return "\n".join(written)
+        markdown_lines += ["", f"**{lines[start]}**", "", *_items(lines[start + 2 : end])]
+    return "\n".join(markdown_lines)
 
 
 class Docstrings(griffe.Extension):

@@ -13,9 +13,9 @@ def settings_table() -> str:
     """Return every setting of quality ``standard`` as Markdown, a section for each first part."""
     lines, section = [], ""
     for path, value, limits, meaning in all_settings(make_config()):
-        first = ".".join(path.split(".")[: 2 if path.startswith("stages.") else 1])
-        if first != section:
-            section = first
+        heading = ".".join(path.split(".")[: 2 if path.startswith("stages.") else 1])
+        if heading != section:
+            section = heading
             lines += ["", f"## {section}", "", "| setting | value | range | meaning |"]
             lines.append("|---|---|---|---|")
         cells = (f"`{path}`", f"`{as_written(value)}`", html.escape(limits), html.escape(meaning))

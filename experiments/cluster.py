@@ -31,13 +31,13 @@ class Command:
         RuntimeError
             If the command fails; the message holds the last lines of its output.
         """
-        tail: deque[str] = deque(maxlen=60)
+        last_lines: deque[str] = deque(maxlen=60)
         with subprocess.Popen(
             self.command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         ) as child:
             try:
                 for line in child.stdout or ():
-                    tail.append(line)
+                    last_lines.append(line)
                     print(line, end="", flush=True)
             except BaseException:
                 # A cancelled job ends its command as well, which then writes a checkpoint.
@@ -48,7 +48,9 @@ class Command:
                     child.kill()
                 raise
         if child.returncode:
-            raise RuntimeError(f"the process ended with status {child.returncode}\n{''.join(tail)}")
+            raise RuntimeError(
+                f"the process ended with status {child.returncode}\n{''.join(last_lines)}"
+            )
 
     def checkpoint(self) -> Any:
         """Tell submitit to queue the same command again, after a time limit or preemption."""
@@ -81,9 +83,11 @@ def executor(folder: Path, kind: str, parameters: dict[str, Any]) -> Any:
 
     # Nodes cannot import this module, so that it is pickled with the job.
     cloudpickle.register_pickle_by_value(sys.modules[__name__])
-    found = submitit.AutoExecutor(folder=folder.resolve(), cluster=kind)
-    found.update_parameters(**{"timeout_min": _TIMEOUT_MIN, "name": "geosplat", **parameters})
-    return found
+    auto_executor = submitit.AutoExecutor(folder=folder.resolve(), cluster=kind)
+    auto_executor.update_parameters(
+        **{"timeout_min": _TIMEOUT_MIN, "name": "geosplat", **parameters}
+    )
+    return auto_executor
 
 
 def submit(executor: Any, command: list[str]) -> Any:

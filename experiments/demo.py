@@ -37,11 +37,11 @@ def main() -> None:
     config = make_config("default", "draft", material_prior=MATERIAL_PRIOR, overrides=OVERRIDES)
     run = train(SCENE, folder, config, begin=Anew(replace=True))
     # Evaluation runs beside the movie: both wait for the compiler, which uses one core.
-    evaluated = in_background(lambda: run.evaluate(samples=SAMPLES))
+    evaluation = in_background(lambda: run.evaluate(samples=SAMPLES))
     movie = RelightOptions(turntable=FRAMES, suffix=".gif", frames_per_second=12.0)
     run.relight(SCENE.parent / "sunset.hdr", options=movie, samples=SAMPLES)
     run.export()
-    evaluated.result()
+    evaluation.result()
     print(
         f"\nDone in {time.perf_counter() - began:.0f} s. Look at:\n"
         f"  {folder / 'report.html'}  all of it as one page\n"

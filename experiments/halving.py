@@ -45,22 +45,22 @@ def joint_runs(sweep: Sweep, count: int, *, seed: int) -> list[SweepRun]:
     values may give fewer than ``count``.
     """
     groups: dict[str, list[SweepRun]] = {}
-    for one in sweep.runs:
-        if one.x is not None:
-            groups.setdefault(one.group, []).append(one)
-    base, draw = sweep.runs[0], random.Random(seed)
-    known = {_settings_of(sweep, run) for run in sweep.runs}
-    found: list[SweepRun] = []
+    for sweep_run in sweep.runs:
+        if sweep_run.x is not None:
+            groups.setdefault(sweep_run.group, []).append(sweep_run)
+    base, generator = sweep.runs[0], random.Random(seed)
+    known_settings = {_settings_of(sweep, run) for run in sweep.runs}
+    combinations: list[SweepRun] = []
     for _ in range(100 * count):
-        if len(found) == count:
+        if len(combinations) == count:
             break
-        chosen = [draw.choice(runs) for runs in groups.values() if draw.random() < 0.5]
-        texts = (*base.overrides, *(text for run in chosen for text in run.overrides))
-        factors = [run.downscale for run in chosen if run.downscale != base.downscale]
+        knob_runs = [generator.choice(runs) for runs in groups.values() if generator.random() < 0.5]
+        texts = (*base.overrides, *(text for run in knob_runs for text in run.overrides))
+        factors = [run.downscale for run in knob_runs if run.downscale != base.downscale]
         candidate = replace(
             base,
-            name=f"joint-{len(found):03d}",
-            title=", ".join(run.name for run in chosen),
+            name=f"joint-{len(combinations):03d}",
+            title=", ".join(run.name for run in knob_runs),
             overrides=tuple(dict.fromkeys(texts)),
             downscale=factors[0] if factors else base.downscale,
             x=None,
@@ -69,10 +69,10 @@ def joint_runs(sweep: Sweep, count: int, *, seed: int) -> list[SweepRun]:
             settings = _settings_of(sweep, candidate)
         except ValueError:
             continue
-        if settings not in known and sweep.config(candidate).active_stages:
-            known.add(settings)
-            found.append(candidate)
-    return found
+        if settings not in known_settings and sweep.config(candidate).active_stages:
+            known_settings.add(settings)
+            combinations.append(candidate)
+    return combinations
 
 
 def _settings_of(sweep: Sweep, run: SweepRun) -> str:
@@ -85,9 +85,9 @@ def shortened(sweep: Sweep, run: SweepRun, factor: float) -> SweepRun:
     if factor == 1.0:
         return run
     config = sweep.config(run)
-    present = [p for p in _LENGTHS if has_numbers(config, p)]
-    shorter = scaled(config, dict.fromkeys(present, factor), run.name)
-    return replace(run, overrides=(*run.overrides, *shorter))
+    length_paths = [p for p in _LENGTHS if has_numbers(config, p)]
+    length_overrides = scaled(config, dict.fromkeys(length_paths, factor), run.name)
+    return replace(run, overrides=(*run.overrides, *length_overrides))
 
 
 def survivors(points: dict[str, tuple[float, float]], count: int) -> list[str]:
@@ -100,21 +100,27 @@ def survivors(points: dict[str, tuple[float, float]], count: int) -> list[str]:
     points : cost and quality by name.
     count : number of names to choose.
     """
-    chosen: list[str] = []
-    left = dict(points)
-    while left and len(chosen) < count:
-        front = trade.pareto(left)
-        free = count - len(chosen)
-        if len(front) > free:
+    names: list[str] = []
+    remaining_points = dict(points)
+    while remaining_points and len(names) < count:
+        front = trade.pareto(remaining_points)
+        free_places = count - len(names)
+        if len(front) > free_places:
             # Both ends of the front and points between; for a single place, the best quality.
-            last = len(front) - 1
-            places = {last} if free == 1 else {round(k * last / (free - 1)) for k in range(free)}
+            last_index = len(front) - 1
+            places = (
+                {last_index}
+                if free_places == 1
+                else {round(k * last_index / (free_places - 1)) for k in range(free_places)}
+            )
             front = [front[k] for k in sorted(places)]
-            chosen += front
+            names += front
             break
-        chosen += front
-        left = {name: value for name, value in left.items() if name not in front}
-    return chosen
+        names += front
+        remaining_points = {
+            name: value for name, value in remaining_points.items() if name not in front
+        }
+    return names
 
 
 def full_costs(folder: Path, sweep: Sweep, factor: float) -> dict[str, tuple[float, float]]:
@@ -129,9 +135,11 @@ def full_costs(folder: Path, sweep: Sweep, factor: float) -> dict[str, tuple[flo
     for name, scenes in trade.read_points(folder, record).items():
         if len(scenes) == len(sweep.scenes):
             cost = statistics.fmean(point.steady for point in scenes.values()) / factor
-            good = statistics.fmean(trade.quality(point, figures) for point in scenes.values())
-            if math.isfinite(good):
-                values[name] = (cost, good)
+            mean_quality = statistics.fmean(
+                trade.quality(point, figures) for point in scenes.values()
+            )
+            if math.isfinite(mean_quality):
+                values[name] = (cost, mean_quality)
     return values
 
 
@@ -153,22 +161,24 @@ def search(
     candidates = [*sweep.runs, *joint_runs(sweep, arguments.joint, seed=arguments.seed)]
     for rung, factor in enumerate(rung_factors(arguments.rungs, arguments.keep)):
         runs = tuple(shortened(sweep, run, factor) for run in candidates)
-        here = replace(sweep, runs=runs, title=f"{sweep.title}, rung {rung}: ×{factor:.3g} steps")
+        rung_sweep = replace(
+            sweep, runs=runs, title=f"{sweep.title}, rung {rung}: ×{factor:.3g} steps"
+        )
         folder = arguments.output / f"rung_{rung}"
         names = [run.name for run in runs]
-        jobs = plan(here, arguments.scenes, folder, scenes=here.scenes, names=names)
+        jobs = plan(rung_sweep, arguments.scenes, folder, scenes=rung_sweep.scenes, names=names)
         runner.check_folders(jobs)
         command = f"python experiments/halving.py {arguments.sweep.name}"
-        runner.write_record(here, arguments.scenes, folder, command)
-        failed = run_jobs(jobs)
+        runner.write_record(rung_sweep, arguments.scenes, folder, command)
+        failures = run_jobs(jobs)
         if factor == 1.0:
-            return here, folder, failed
-        values = full_costs(folder, here, factor)
+            return rung_sweep, folder, failures
+        values = full_costs(folder, rung_sweep, factor)
         if not values:
             raise SweepError(f"rung {rung}: no run has figures on all scenes; see {folder}")
-        going_on = survivors(values, math.ceil(len(candidates) * arguments.keep))
+        survivor_names = survivors(values, math.ceil(len(candidates) * arguments.keep))
         # The base stays, since all is compared with it.
-        names = list(dict.fromkeys([candidates[0].name, *going_on]))
+        names = list(dict.fromkeys([candidates[0].name, *survivor_names]))
         candidates = [run for run in candidates if run.name in names]
         runner._say(f"rung {rung}: {len(candidates)} go on: {', '.join(names)}")
     raise AssertionError("the last rung trains in full")
@@ -187,14 +197,14 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--quality", choices=QUALITIES, help="instead of the sweep's")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="S.F=VALUE")
     arguments = parser.parse_args(argv)
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    previous_handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         if arguments.rungs < 1 or not 0 < arguments.keep < 1 or arguments.joint < 0:
             raise SweepError("--rungs must be at least 1, --keep between 0 and 1, --joint not < 0")
         sweep = read_sweep(
             arguments.sweep, overrides=arguments.overrides, quality=arguments.quality
         )
-        here, folder, failed = search(sweep, arguments)
+        last_sweep, folder, failures = search(sweep, arguments)
         record = trade.report._read_sweep(folder)
         text = trade.compose(record, [trade.read_points(folder, record)])
     except (SweepError, ReportError, OSError) as error:
@@ -204,12 +214,12 @@ def main(argv: list[str] | None = None) -> int:
         runner._say("interrupted; the same command goes on from the last checkpoint")
         return 130
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGTERM, previous_handler)
     (arguments.output / "front.md").write_text(text, encoding="utf-8")
-    runner._say(f"front of {len(here.runs)} runs: {arguments.output / 'front.md'}")
-    if failed:
-        labels = ", ".join(job.label for job in failed)
-        runner._say(f"{len(failed)} of the last rung failed, and are not compared: {labels}")
+    runner._say(f"front of {len(last_sweep.runs)} runs: {arguments.output / 'front.md'}")
+    if failures:
+        labels = ", ".join(job.label for job in failures)
+        runner._say(f"{len(failures)} of the last rung failed, and are not compared: {labels}")
         return 1
     return 0
 

@@ -58,18 +58,22 @@ def shared_stages(config: Config, others: Iterable[Config]) -> Config | None:
     continue from the end of this run are not considered: they take over from the run itself.
     """
     count = len(config.active_stages)
-    partners = [x for x in others if len(x.active_stages) <= count or not _begins(config, x)]
+    partners = [
+        candidate
+        for candidate in others
+        if len(candidate.active_stages) <= count or not _begins(config, candidate)
+    ]
     for length in range(count - 1, 0, -1):
-        first = beginning(config, length)
-        if any(_begins(first, other) for other in partners):
-            return first
+        prefix = beginning(config, length)
+        if any(_begins(prefix, partner) for partner in partners):
+            return prefix
     return None
 
 
-def _begins(first: Config, config: Config) -> bool:
+def _begins(prefix: Config, config: Config) -> bool:
     """Whether the run of ``config`` starts with all stages of ``first``."""
-    count = len(first.active_stages)
-    return beginning(config, count) == beginning(first, count)
+    count = len(prefix.active_stages)
+    return beginning(config, count) == beginning(prefix, count)
 
 
 @dataclass(frozen=True)
@@ -102,8 +106,8 @@ def parts_of(sweep: Sweep) -> dict[str, Part]:
     ends with the shared stages is itself the source. Runs that are trained on images of different
     sizes share nothing.
     """
-    where, parts = homes(sweep), {}
-    runs = [run for run in sweep.runs if where[run.name] == run.name]
+    home_names, parts = homes(sweep), {}
+    runs = [run for run in sweep.runs if home_names[run.name] == run.name]
     for factor in dict.fromkeys(run.downscale for run in runs):
         parts |= _parts_of(sweep, [run for run in runs if run.downscale == factor])
     return parts
@@ -113,51 +117,51 @@ def _parts_of(sweep: Sweep, runs: list[SweepRun]) -> dict[str, Part]:
     """List the parts of runs that are trained on the same images."""
     downscale = runs[0].downscale
     configs = {run.name: sweep.config(run) for run in runs}
-    wanted: list[Config] = []
+    prefixes: list[Config] = []
     for name, config in configs.items():
-        others = [other for key, other in configs.items() if key != name]
-        first = shared_stages(config, others)
-        if first is not None and first not in wanted:
-            wanted.append(first)
-    folders = [_folder_of(first, configs) for first in wanted]
+        other_configs = [other for key, other in configs.items() if key != name]
+        prefix = shared_stages(config, other_configs)
+        if prefix is not None and prefix not in prefixes:
+            prefixes.append(prefix)
+    folders = [_folder_of(prefix, configs) for prefix in prefixes]
 
     def part(folder: str, config: Config, run: SweepRun | None) -> Part:
         count = len(config.active_stages)
-        before = [
-            (len(first.stages), name)
-            for first, name in zip(wanted, folders, strict=True)
-            if len(first.stages) < count and _begins(first, config)
+        sources = [
+            (len(prefix.stages), name)
+            for prefix, name in zip(prefixes, folders, strict=True)
+            if len(prefix.stages) < count and _begins(prefix, config)
         ]
-        if not before:
+        if not sources:
             return Part(folder, config, None, None, run, downscale)
-        length, source = max(before)
+        length, source = max(sources)
         return Part(folder, config, source, config.active_stages[length].name, run, downscale)
 
-    shared = [
-        part(folder, first, None)
-        for first, folder in zip(wanted, folders, strict=True)
+    shared_parts = [
+        part(folder, prefix, None)
+        for prefix, folder in zip(prefixes, folders, strict=True)
         if folder not in configs
     ]
-    found = [*shared, *(part(run.name, configs[run.name], run) for run in runs)]
+    all_parts = [*shared_parts, *(part(run.name, configs[run.name], run) for run in runs)]
     # Sources come before the parts that need them; otherwise the order is that of the sweep.
     parts: dict[str, Part] = {}
 
-    def add(one: Part) -> None:
-        if one.source is not None and one.source not in parts:
-            add(next(other for other in found if other.folder == one.source))
-        parts.setdefault(one.folder, one)
+    def add(new_part: Part) -> None:
+        if new_part.source is not None and new_part.source not in parts:
+            add(next(origin for origin in all_parts if origin.folder == new_part.source))
+        parts.setdefault(new_part.folder, new_part)
 
-    for one in found:
-        if one.run is not None:
-            add(one)
+    for new_part in all_parts:
+        if new_part.run is not None:
+            add(new_part)
     return parts
 
 
-def _folder_of(first: Config, configs: dict[str, Config]) -> str:
+def _folder_of(prefix: Config, configs: dict[str, Config]) -> str:
     """Name the folder of shared stages: that of a run that ends with them, if there is one."""
-    having = [name for name, config in configs.items() if _begins(first, config)]
-    ending = [n for n in having if len(configs[n].active_stages) == len(first.stages)]
-    return ending[0] if ending else f"_{having[0]}.{first.stages[-1].name}"
+    matching_names = [name for name, config in configs.items() if _begins(prefix, config)]
+    exact_names = [n for n in matching_names if len(configs[n].active_stages) == len(prefix.stages)]
+    return exact_names[0] if exact_names else f"_{matching_names[0]}.{prefix.stages[-1].name}"
 
 
 def plan(
@@ -175,32 +179,32 @@ def plan(
     output : folder of all runs.
     scenes, names : scenes and runs to train.
     """
-    where, parts, jobs = homes(sweep), parts_of(sweep), []
-    wanted = {where[name] for name in names}
-    usual = {"downscale": sweep.downscale, "light": None, "bounds": None}
+    home_names, parts, jobs = homes(sweep), parts_of(sweep), []
+    wanted_folders = {home_names[name] for name in names}
+    default_options = {"downscale": sweep.downscale, "light": None, "bounds": None}
     for scene in scenes:
 
         def job(part: Part, scene: str = scene) -> Job:
-            is_wanted = part.folder in wanted
+            is_wanted = part.folder in wanted_folders
             return Job(
                 label=f"{scene}/{part.folder}",
                 scene=str((root / scene).resolve()),
                 folder=str(output / scene / part.folder),
                 config=in_scene(part.config, root / scene).to_dict(),
-                options=usual | {"downscale": part.downscale},
+                options=default_options | {"downscale": part.downscale},
                 source=None if part.source is None else str(output / scene / part.source),
                 first_stage=part.first_stage,
                 evaluate=sweep.evaluation(part.run) if part.run and is_wanted else None,
-                evaluate_options=None if part.downscale == sweep.downscale else usual,
+                evaluate_options=None if part.downscale == sweep.downscale else default_options,
             )
 
         all_jobs = {name: job(part) for name, part in parts.items()}
-        needed = set(wanted)
+        needed_folders = set(wanted_folders)
         for name in reversed(parts):
             source = parts[name].source
-            if source is not None and name in needed and not is_trained(all_jobs[name]):
-                needed.add(source)
-        jobs += [one for name, one in all_jobs.items() if name in needed]
+            if source is not None and name in needed_folders and not is_trained(all_jobs[name]):
+                needed_folders.add(source)
+        jobs += [scene_job for name, scene_job in all_jobs.items() if name in needed_folders]
     return jobs
 
 
@@ -211,5 +215,7 @@ def is_trained(job: Job) -> bool:
 
 def is_finished(job: Job) -> bool:
     """Whether a run is trained and, if the job asks for it, evaluated."""
-    needed = ["training.json"] + ["metrics.json", "evaluation.json"] * (job.evaluate is not None)
-    return all((Path(job.folder) / name).exists() for name in needed)
+    file_names = ["training.json"] + ["metrics.json", "evaluation.json"] * (
+        job.evaluate is not None
+    )
+    return all((Path(job.folder) / name).exists() for name in file_names)

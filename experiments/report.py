@@ -53,20 +53,20 @@ class Entry:
 
 def arrow(figure: str) -> str:
     """Return an arrow in the direction in which a figure is better, or an empty text."""
-    last = figure.split(".")[-1]
-    if last.startswith("mirrored"):
+    metric = figure.split(".")[-1]
+    if metric.startswith("mirrored"):
         return ""
-    if any(part in last for part in _UP):
+    if any(part in metric for part in _UP):
         return " ↑"
-    return " ↓" if last.startswith(_DOWN) else ""
+    return " ↓" if metric.startswith(_DOWN) else ""
 
 
 def digits(figure: str, value: float, *, signed: bool = False) -> str:
     """Format a figure: two decimals for dB and degrees, else four; a difference with its sign."""
-    last = figure.split(".")[-1]
+    metric = figure.split(".")[-1]
     if not math.isfinite(value):
         return f"{value:+g}" if signed else f"{value:g}"
-    places = 2 if "psnr" in last or last.endswith("_deg") else 4
+    places = 2 if "psnr" in metric or metric.endswith("_deg") else 4
     text = f"{value:{'+' if signed else ''}.{places}f}"
     return text.replace("-", "−")
 
@@ -88,14 +88,18 @@ def command_line(script: str, *parts: str | tuple[Path, str]) -> str:
 
     A part may be a pair of a path and a placeholder, which replaces a path outside of the folder.
     """
-    said = ["python", script]
+    words = ["python", script]
     for part in parts:
         if isinstance(part, tuple):
-            path, otherwise = part[0].resolve(), part[1]
-            here = Path.cwd()
-            part = path.relative_to(here).as_posix() if path.is_relative_to(here) else otherwise
-        said.append(part)
-    return shlex.join(said)
+            path, placeholder = part[0].resolve(), part[1]
+            working_folder = Path.cwd()
+            part = (
+                path.relative_to(working_folder).as_posix()
+                if path.is_relative_to(working_folder)
+                else placeholder
+            )
+        words.append(part)
+    return shlex.join(words)
 
 
 def _cell(text: str) -> str:
@@ -106,14 +110,14 @@ def _cell(text: str) -> str:
 def _last_line(path: Path) -> str:
     """Return the last line of an error file that is not empty, shortened with a mark."""
     lines = [line.strip() for line in path.read_text(errors="replace").splitlines()]
-    last = _without_places(next((line for line in reversed(lines) if line), "no message"))
-    return last if len(last) <= _LONGEST else last[:_LONGEST] + " […]"
+    message = _without_places(next((line for line in reversed(lines) if line), "no message"))
+    return message if len(message) <= _LONGEST else message[:_LONGEST] + " […]"
 
 
 def cost_names(sweep: dict[str, Any]) -> list[str]:
     """Name the columns of costs: seconds of the stages that runs end with, and memory."""
-    lasts = [config_from_dict(run["config"]).active_stages[-1].name for run in sweep["runs"]]
-    return [*(name for last in dict.fromkeys(lasts) for name in _seconds_of(last)), _MEMORY]
+    last_stages = [config_from_dict(run["config"]).active_stages[-1].name for run in sweep["runs"]]
+    return [*(name for stage in dict.fromkeys(last_stages) for name in _seconds_of(stage)), _MEMORY]
 
 
 def _seconds_of(stage: str) -> tuple[str, str]:
@@ -134,27 +138,27 @@ def _costs(
         costs[_MEMORY] = float(memory)
     path = folder / "metrics.jsonl"
     lines = [json.loads(x) for x in path.read_text().splitlines()] if path.exists() else []
-    *_, last = config.active_stages
+    *_, last_stage = config.active_stages
     for stage in config.active_stages:
         seconds = [float(line["seconds"]) for line in lines if line["stage"] == stage.name]
-        if not seconds and stage != last:
+        if not seconds and stage != last_stage:
             continue
         if len(seconds) != stage.steps:
             notes.append(f"metrics.jsonl has {len(seconds)} of {stage.steps} steps of {stage.name}")
             continue
-        whole, step = _seconds_of(stage.name)
-        costs[whole], costs[step] = sum(seconds), statistics.median(seconds)
+        total_name, step_name = _seconds_of(stage.name)
+        costs[total_name], costs[step_name] = sum(seconds), statistics.median(seconds)
     return costs, notes
 
 
-def _with_file_of(recorded: Config, wanted: Config) -> Config:
+def _with_file_of(recorded_config: Config, wanted_config: Config) -> Config:
     """Return the settings of a sweep with the mesh of a run, if its path ends in the same name."""
-    run, sweep = recorded.geometry, wanted.geometry
+    run, sweep = recorded_config.geometry, wanted_config.geometry
     if not (isinstance(run, MeshSettings) and isinstance(sweep, MeshSettings)):
-        return wanted
+        return wanted_config
     if not Path(run.path).as_posix().endswith(f"/{sweep.path}"):
-        return wanted
-    return replace(wanted, geometry=replace(sweep, path=run.path, digest=run.digest))
+        return wanted_config
+    return replace(wanted_config, geometry=replace(sweep, path=run.path, digest=run.digest))
 
 
 def _other_images(folder: Path, run: dict[str, Any], sweep: dict[str, Any], scene: str) -> str:
@@ -170,8 +174,8 @@ def _other_images(folder: Path, run: dict[str, Any], sweep: dict[str, Any], scen
     if record["scene"] != sweep.get("scene_folders", {}).get(scene, record["scene"]):
         return "trained on a scene in another folder than that of the last --scenes"
     path = folder / "evaluation.json"
-    evaluated = json.loads(path.read_text()) if path.exists() else {}
-    factor = evaluated.get("downscale", sweep["downscale"])
+    evaluation = json.loads(path.read_text()) if path.exists() else {}
+    factor = evaluation.get("downscale", sweep["downscale"])
     if factor != sweep["downscale"]:
         return f"evaluated on images reduced by {factor} instead of {sweep['downscale']}"
     return ""
@@ -194,23 +198,23 @@ def read_entry(folder: Path, run: dict[str, Any], sweep: dict[str, Any], scene: 
         return Entry({}, {}, state)
     try:
         record = json.loads((folder / "metrics.json").read_text())
-        recorded = config_from_dict(record["config"])
-        config = _with_file_of(recorded, config_from_dict(run["config"]))
-        changed = differences(recorded, config)
-        if changed:
-            problem = f"other settings than the sweep (recorded -> wanted): {'; '.join(changed)}"
+        recorded_config = config_from_dict(record["config"])
+        config = _with_file_of(recorded_config, config_from_dict(run["config"]))
+        changes = differences(recorded_config, config)
+        if changes:
+            problem = f"other settings than the sweep (recorded -> wanted): {'; '.join(changes)}"
             return Entry({}, {}, problem)
-        other = _other_images(folder, run, sweep, scene)
-        if other:
-            return Entry({}, {}, other)
+        image_difference = _other_images(folder, run, sweep, scene)
+        if image_difference:
+            return Entry({}, {}, image_difference)
         if record["step"] != config.total_steps:
             return Entry({}, {}, f"evaluated at step {record['step']} of {config.total_steps}")
         costs, notes = _costs(folder, record, config)
         figures = {name: float(value) for name, value in record["mean"].items()}
     except (OSError, ValueError, KeyError, TypeError) as error:
         return Entry({}, {}, f"unreadable: {_without_places(repr(error))}")
-    for name, wanted in run["evaluate"].items():
-        if record.get(name) != wanted:
+    for name, expected in run["evaluate"].items():
+        if record.get(name) != expected:
             notes.append(f"evaluated with {name} = {record.get(name)}")
     return Entry(figures, costs, "", tuple(notes))
 
@@ -230,9 +234,9 @@ def read_entries(folder: Path, sweep: dict[str, Any]) -> dict[str, dict[str, Ent
 
 def _table(rows: list[list[str]]) -> list[str]:
     """Lay out a markdown table; the first row is the header, the first column holds names."""
-    head, *body = [[_cell(cell) for cell in row] for row in rows]
-    rule = ["---", *["---:"] * (len(head) - 1)]
-    return [f"| {' | '.join(row)} |" for row in (head, rule, *body)]
+    header, *body = [[_cell(cell) for cell in row] for row in rows]
+    rule = ["---", *["---:"] * (len(header) - 1)]
+    return [f"| {' | '.join(row)} |" for row in (header, rule, *body)]
 
 
 def _header(sweep: dict[str, Any]) -> list[str]:
@@ -260,14 +264,15 @@ def _pairs(
     entries: dict[str, dict[str, Entry]], name: str, reference: str, figure: str
 ) -> tuple[list[tuple[float, float]], int]:
     """Return values of a run and the reference on scenes that have both, and the latter's count."""
-    found = [
+    values = [
         tuple(
-            {**runs[which].figures, **runs[which].costs}.get(figure) for which in (name, reference)
+            {**runs[run_name].figures, **runs[run_name].costs}.get(figure)
+            for run_name in (name, reference)
         )
         for runs in entries.values()
     ]
-    known = sum(second is not None for _, second in found)
-    return [(a, b) for a, b in found if a is not None and b is not None], known
+    reference_count = sum(second is not None for _, second in values)
+    return [(a, b) for a, b in values if a is not None and b is not None], reference_count
 
 
 def summary_table(sweep: dict[str, Any], entries: dict[str, dict[str, Entry]]) -> list[str]:
@@ -282,22 +287,24 @@ def summary_table(sweep: dict[str, Any], entries: dict[str, dict[str, Entry]]) -
         name = run["name"]
         row = [f"{name} (reference)" if name == reference else name]
         for figure in (*sweep["figures"], *costs):
-            pairs, known = _pairs(entries, name, reference, figure)
+            pairs, reference_count = _pairs(entries, name, reference, figure)
             if not pairs:
                 row.append(_NONE)
                 continue
-            ours, theirs = (statistics.fmean(values) for values in zip(*pairs, strict=True))
+            run_mean, reference_mean = (
+                statistics.fmean(values) for values in zip(*pairs, strict=True)
+            )
             is_cost = figure in costs
             if name == reference:
-                cell = _cost_digits(figure, ours) if is_cost else digits(figure, ours)
-                known = len(entries)
+                cell = _cost_digits(figure, run_mean) if is_cost else digits(figure, run_mean)
+                reference_count = len(entries)
             elif is_cost:
-                cell = f"×{ours / theirs:.2f}" if theirs > 0 else _NONE
+                cell = f"×{run_mean / reference_mean:.2f}" if reference_mean > 0 else _NONE
             else:
                 change = statistics.fmean(a - b for a, b in pairs)
                 cell = digits(figure, change, signed=True)
-            if len(pairs) < known:
-                cell += f" ({len(pairs)} of {known} scenes)"
+            if len(pairs) < reference_count:
+                cell += f" ({len(pairs)} of {reference_count} scenes)"
             row.append(cell)
         rows.append(row)
     return _table(rows)
@@ -320,8 +327,8 @@ def seed_table(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Entry]]
             for entries in repeated:
                 pairs, _ = _pairs(entries, name, reference, figure)
                 if len(pairs) == len(entries):
-                    other = 0.0 if name == reference else 1.0
-                    values.append(statistics.fmean(a - other * b for a, b in pairs))
+                    reference_weight = 0.0 if name == reference else 1.0
+                    values.append(statistics.fmean(a - reference_weight * b for a, b in pairs))
             row.append(_with_spread(figure, values, signed=name != reference))
         rows.append(row)
     return _table(rows)
@@ -344,7 +351,7 @@ def curves(
 
     The spread is the sample standard deviation; None for one seed.
     """
-    found: dict[str, list[tuple[float, float, float | None]]] = {}
+    scene_curves: dict[str, list[tuple[float, float, float | None]]] = {}
     for scene, runs in entries.items():
         values: dict[float, list[float]] = {}
         for run in sweep["runs"]:
@@ -356,8 +363,8 @@ def curves(
             for x, v in sorted(values.items())
         ]
         if points:
-            found[scene] = points
-    return found
+            scene_curves[scene] = points
+    return scene_curves
 
 
 def draw(
@@ -373,17 +380,21 @@ def draw(
     columns = min(len(names), 3)
     rows = math.ceil(len(names) / columns)
     size = (4 * columns, 3.2 * rows)
-    drawn, axes = plt.subplots(rows, columns, figsize=size, squeeze=False)
+    plot, axes = plt.subplots(rows, columns, figsize=size, squeeze=False)
     xs = [run["x"] for run in sweep["runs"] if run["x"] is not None and run["group"] == group]
     is_wide = min(xs) > 0 and max(xs) >= 8 * min(xs)
     for axis, figure in zip(axes.flat, names, strict=False):
         for scene, points in curves(sweep, entries, group, figure).items():
             x, mean, spread = zip(*points, strict=True)
             (line,) = axis.plot(x, mean, "o-", markersize=4, label=scene)
-            repeated = [k for k, width in enumerate(spread) if width is not None]
-            if repeated:
-                at, middle, width = ([part[k] for k in repeated] for part in (x, mean, spread))
-                axis.errorbar(at, middle, width, fmt="none", capsize=3, color=line.get_color())
+            spread_indices = [k for k, width in enumerate(spread) if width is not None]
+            if spread_indices:
+                positions, middle, width = (
+                    [values[k] for k in spread_indices] for values in (x, mean, spread)
+                )
+                axis.errorbar(
+                    positions, middle, width, fmt="none", capsize=3, color=line.get_color()
+                )
         if is_wide:
             axis.set_xscale("log", base=2)
             axis.set_xticks(sorted(set(xs)), [f"{x:g}" for x in sorted(set(xs))])
@@ -394,10 +405,10 @@ def draw(
             axis.text(0.5, 0.5, "no figures", ha="center", transform=axis.transAxes)
     for axis in axes.flat[len(names) :]:
         axis.remove()
-    drawn.tight_layout()
+    plot.tight_layout()
     path.parent.mkdir(parents=True, exist_ok=True)
-    drawn.savefig(path, dpi=95)
-    plt.close(drawn)
+    plot.savefig(path, dpi=95)
+    plt.close(plot)
 
 
 def write_plots(
@@ -424,28 +435,30 @@ _LEGEND = (
 
 def _describe_runs(sweep: dict[str, Any]) -> list[str]:
     """Describe the settings that every run changes, and evaluations unlike the reference's."""
-    usual = sweep["runs"][0]["evaluate"]
+    reference_evaluation = sweep["runs"][0]["evaluate"]
     rows = [["run", "what it is", "settings"]]
     for run in sweep["runs"]:
         title = run["title"]
         if run["same_as"]:
             title += f" (the same settings as {run['same_as']}, trained once)"
-        other = [f"{k} = {v}" for k, v in run["evaluate"].items() if v != usual.get(k)]
-        if other:
-            title += f" (evaluated with {', '.join(other)})"
+        deviations = [
+            f"{k} = {v}" for k, v in run["evaluate"].items() if v != reference_evaluation.get(k)
+        ]
+        if deviations:
+            title += f" (evaluated with {', '.join(deviations)})"
         changes = ", ".join(f"`{override}`" for override in run["overrides"])
         rows.append([run["name"], title, changes or _NONE])
     lines = _table(rows)
     lines[1] = "| --- | --- | --- |"
-    common = ", ".join(f"`{override}`" for override in sweep["overrides"])
+    common_settings = ", ".join(f"`{override}`" for override in sweep["overrides"])
     reduced = sweep["downscale"] > 1
     images = f"images reduced by {sweep['downscale']}" if reduced else "full-size images"
     start = "Unless the table says otherwise, all runs have the preset "
     start += f"`{sweep['preset']}`, quality `{sweep['quality']}`, the "
     start += f"material prior `{sweep['material_prior']}` and {images}"
-    start += f", and the settings {common}. " if common else ". "
-    start += f"They are evaluated with {usual['samples']} samples by the protocol "
-    start += f"`{usual['protocol']}`. PSNR is in dB, errors of normals in degrees."
+    start += f", and the settings {common_settings}. " if common_settings else ". "
+    start += f"They are evaluated with {reference_evaluation['samples']} samples by the protocol "
+    start += f"`{reference_evaluation['protocol']}`. PSNR is in dB, errors of normals in degrees."
     return [start, "", *lines]
 
 
@@ -457,9 +470,12 @@ def problems(sweep: dict[str, Any], entries: dict[str, dict[str, Entry]]) -> lis
             if entry.problem:
                 lines.append(f"- {scene}/{name}: {entry.problem}")
                 continue
-            absent = [figure for figure in sweep["figures"] if figure not in entry.figures]
-            said = [*entry.notes, *([f"has no {', '.join(absent)}"] if absent else [])]
-            lines += [f"- {scene}/{name}: {note}" for note in said]
+            missing_figures = [figure for figure in sweep["figures"] if figure not in entry.figures]
+            remarks = [
+                *entry.notes,
+                *([f"has no {', '.join(missing_figures)}"] if missing_figures else []),
+            ]
+            lines += [f"- {scene}/{name}: {note}" for note in remarks]
     return lines
 
 
@@ -470,8 +486,8 @@ def all_problems(
 ) -> list[str]:
     """List the problems of a sweep and of its repetitions with other seeds; see `problems`."""
     lines = problems(sweep, entries)
-    for number, repeated in enumerate(others or (), 2):
-        lines += [f"- seed {number}: {line[2:]}" for line in problems(sweep, repeated)]
+    for number, repetition in enumerate(others or (), 2):
+        lines += [f"- seed {number}: {line[2:]}" for line in problems(sweep, repetition)]
     return lines
 
 
@@ -494,8 +510,8 @@ def compose(
     command : command that writes the report.
     others : entries of the same sweep with other seeds.
     """
-    about = [sweep["about"], ""] if sweep["about"] else []
-    lines = [f"# {sweep['title']}", "", *about, *_describe_runs(sweep), ""]
+    introduction = [sweep["about"], ""] if sweep["about"] else []
+    lines = [f"# {sweep['title']}", "", *introduction, *_describe_runs(sweep), ""]
     lines += ["## Summary", "", f"Means over {', '.join(sweep['scenes'])}: values of the first "]
     lines[-1] += "run, differences of the others from it, and ratios of seconds and memory."
     lines += ["", *summary_table(sweep, entries), ""]
@@ -538,30 +554,32 @@ def _read_repetitions(
     sweep: dict[str, Any], folders: list[Path]
 ) -> list[dict[str, dict[str, Entry]]]:
     """Read the entries of sweeps that differ from this one in their seeds alone."""
-    found, seeds = [], {sweep["runs"][0]["config"]["run"]["seed"]}
+    repetitions, seeds = [], {sweep["runs"][0]["config"]["run"]["seed"]}
     for folder in folders:
-        other = _read_sweep(folder)
-        same = [
-            all(one.get(key) == two.get(key) for key in ("name", "evaluate", "downscale"))
-            and [line.split(":")[0] for line in _differences(one, two)] == ["run.seed"]
-            for one, two in zip(sweep["runs"], other["runs"], strict=False)
+        repetition = _read_sweep(folder)
+        matches = [
+            all(run.get(key) == repeated_run.get(key) for key in ("name", "evaluate", "downscale"))
+            and [line.split(":")[0] for line in _differences(run, repeated_run)] == ["run.seed"]
+            for run, repeated_run in zip(sweep["runs"], repetition["runs"], strict=False)
         ]
-        alike = len(sweep["runs"]) == len(other["runs"]) and all(
-            sweep.get(key) == other.get(key) for key in ("scenes", "downscale")
+        is_same_sweep = len(sweep["runs"]) == len(repetition["runs"]) and all(
+            sweep.get(key) == repetition.get(key) for key in ("scenes", "downscale")
         )
-        seed = other["runs"][0]["config"]["run"]["seed"]
-        if not (alike and all(same)) or seed in seeds:
+        seed = repetition["runs"][0]["config"]["run"]["seed"]
+        if not (is_same_sweep and all(matches)) or seed in seeds:
             raise ReportError(
                 f"{folder} does not repeat the sweep with another seed: runs, scenes, sizes of "
                 "images and settings must be the same but for run.seed"
             )
         seeds.add(seed)
-        found.append(read_entries(folder, other))
-    return found
+        repetitions.append(read_entries(folder, repetition))
+    return repetitions
 
 
-def _differences(one: dict[str, Any], two: dict[str, Any]) -> list[str]:
-    return differences(config_from_dict(one["config"]), config_from_dict(two["config"]))
+def _differences(first_run: dict[str, Any], second_run: dict[str, Any]) -> list[str]:
+    return differences(
+        config_from_dict(first_run["config"]), config_from_dict(second_run["config"])
+    )
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -581,7 +599,7 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     try:
         sweep = _read_sweep(arguments.folder)
-        others = _read_repetitions(sweep, arguments.seeds)
+        repetitions = _read_repetitions(sweep, arguments.seeds)
     except ReportError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -602,10 +620,10 @@ def main(argv: list[str] | None = None) -> int:
     if arguments.plots is not None:
         places += ["--plots", (arguments.plots, "IMAGES")]
     command = command_line("experiments/report.py", *places)
-    text = compose(sweep, entries, plots=links, notes=notes, command=command, others=others)
+    text = compose(sweep, entries, plots=links, notes=notes, command=command, others=repetitions)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     arguments.output.write_text(text, encoding="utf-8")
-    for line in [*all_problems(sweep, entries, others), *(f"- {note}" for note in notes)]:
+    for line in [*all_problems(sweep, entries, repetitions), *(f"- {note}" for note in notes)]:
         print(line, file=sys.stderr)
     return 0
 

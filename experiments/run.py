@@ -54,27 +54,29 @@ def _evaluation_of(job: Job) -> dict[str, Any]:
 
 def _changes(job: Job) -> list[str]:
     """List the differences between the records in a run's folder and the job."""
-    folder, wanted = Path(job.folder), config_from_dict(job.config)
-    found = []
+    folder, wanted_config = Path(job.folder), config_from_dict(job.config)
+    changes = []
     if (folder / "run.json").exists():
         record = json.loads((folder / "run.json").read_text())
-        recorded = config_from_dict(record["config"])
-        found += differences(recorded, wanted)
-        read = {"scene": job.scene, "dataset": job.options}
-        found += [f"{k}: {record[k]!r} -> {v!r}" for k, v in read.items() if record[k] != v]
-    if found or not is_finished(job) or job.evaluate is None:
-        return found
+        recorded_config = config_from_dict(record["config"])
+        changes += differences(recorded_config, wanted_config)
+        wanted_inputs = {"scene": job.scene, "dataset": job.options}
+        changes += [
+            f"{k}: {record[k]!r} -> {v!r}" for k, v in wanted_inputs.items() if record[k] != v
+        ]
+    if changes or not is_finished(job) or job.evaluate is None:
+        return changes
     figures = json.loads((folder / "metrics.json").read_text())
-    found += differences(config_from_dict(figures["config"]), wanted)
-    evaluated = json.loads((folder / "evaluation.json").read_text())
-    evaluated |= {name: figures[name] for name in job.evaluate}
+    changes += differences(config_from_dict(figures["config"]), wanted_config)
+    evaluation = json.loads((folder / "evaluation.json").read_text())
+    evaluation |= {name: figures[name] for name in job.evaluate}
     wanted_evaluation = _evaluation_of(job)
     # Earlier versions did not note the size of the images.
-    evaluated.setdefault("downscale", wanted_evaluation["downscale"])
-    return found + [
-        f"evaluate.{name}: {evaluated.get(name)!r} -> {now!r}"
-        for name, now in wanted_evaluation.items()
-        if evaluated.get(name) != now
+    evaluation.setdefault("downscale", wanted_evaluation["downscale"])
+    return changes + [
+        f"evaluate.{name}: {evaluation.get(name)!r} -> {wanted_value!r}"
+        for name, wanted_value in wanted_evaluation.items()
+        if evaluation.get(name) != wanted_value
     ]
 
 
@@ -87,18 +89,18 @@ def check_folders(jobs: Iterable[Job]) -> None:
         If there are any; the message lists every difference, as ``recorded -> wanted``, and says
         what to do.
     """
-    found = []
+    conflicts = []
     for job in jobs:
         try:
-            changed = _changes(job)
+            changes = _changes(job)
         except (OSError, ValueError, KeyError, TypeError) as error:
-            changed = [f"its records cannot be read ({error!r})"]
-        if changed:
-            found.append(f"{job.label}: {'; '.join(changed)}")
-    if found:
+            changes = [f"its records cannot be read ({error!r})"]
+        if changes:
+            conflicts.append(f"{job.label}: {'; '.join(changes)}")
+    if conflicts:
         raise SweepError(
             "these folders hold runs with other settings (recorded -> wanted):\n  "
-            + "\n  ".join(found)
+            + "\n  ".join(conflicts)
             + "\nTake another --output, undo the change, or remove the folders to train anew "
             "(evaluation.json alone, where only evaluate differs, to evaluate anew)."
         )
@@ -175,7 +177,7 @@ def in_a_process(job: Job) -> None:
         After Ctrl-C, once the process has written its checkpoint; a second one kills it.
     """
     command = command_of(job)
-    tail: deque[str] = deque(maxlen=60)
+    last_lines: deque[str] = deque(maxlen=60)
     # The process gets its own session. Otherwise Ctrl-C would reach it twice, from the terminal and
     # from us, and the second one stops a training without a checkpoint.
     with subprocess.Popen(
@@ -190,7 +192,7 @@ def in_a_process(job: Job) -> None:
 
         def forward() -> None:
             for line in child.stdout or ():
-                tail.append(line)
+                last_lines.append(line)
                 _say(f"  {line.rstrip()}")
 
         try:
@@ -205,10 +207,10 @@ def in_a_process(job: Job) -> None:
                 child.kill()
             raise
     if child.returncode:
-        what = f"the process ended with status {child.returncode}"
+        reason = f"the process ended with status {child.returncode}"
         if child.returncode < 0:
-            what = f"the process was ended by signal {-child.returncode}; was the memory enough?"
-        raise RunFailed(f"{what}\n{''.join(tail)}")
+            reason = f"the process was ended by signal {-child.returncode}; was the memory enough?"
+        raise RunFailed(f"{reason}\n{''.join(last_lines)}")
 
 
 def _note_failure(job: Job, text: str) -> None:
@@ -225,28 +227,28 @@ def run_jobs(jobs: list[Job], *, start: Callable[[Job], None] = in_a_process) ->
     A failure is written to ``error.txt`` in the folder of the run. Only runs that would take over
     stages from the failed one are skipped.
     """
-    failed: list[Job] = []
+    failures: list[Job] = []
     for number, job in enumerate(jobs, 1):
-        head = f"[{number}/{len(jobs)}] {job.label}"
+        prefix = f"[{number}/{len(jobs)}] {job.label}"
         if is_finished(job):
-            _say(f"{head}: finished already")
+            _say(f"{prefix}: finished already")
             (Path(job.folder) / "error.txt").unlink(missing_ok=True)
             continue
-        source = next((bad for bad in failed if bad.folder == job.source), None)
+        source = next((failure for failure in failures if failure.folder == job.source), None)
         if source is not None and not is_trained(job) and not is_trained(source):
             name = Path(source.folder).name
             _note_failure(job, f"the stages to take over failed; see ../{name}/error.txt")
-            failed.append(job)
+            failures.append(job)
             continue
-        _say(f"{head}: {'evaluating' if is_trained(job) else 'training'}")
+        _say(f"{prefix}: {'evaluating' if is_trained(job) else 'training'}")
         (Path(job.folder) / "error.txt").unlink(missing_ok=True)
         try:
             start(job)
         except Exception as error:
-            is_told = isinstance(error, RunFailed)
-            _note_failure(job, str(error) if is_told else traceback.format_exc())
-            failed.append(job)
-    return failed
+            is_run_failure = isinstance(error, RunFailed)
+            _note_failure(job, str(error) if is_run_failure else traceback.format_exc())
+            failures.append(job)
+    return failures
 
 
 def cluster_of(arguments: argparse.Namespace) -> Any:
@@ -265,8 +267,8 @@ def cluster_of(arguments: argparse.Namespace) -> Any:
         return None
     parameters = {}
     for text in arguments.cluster_set:
-        name, equals, value = text.partition("=")
-        if not equals:
+        name, separator, value = text.partition("=")
+        if not separator:
             raise SweepError(f"--cluster-set reads NAME=VALUE, got {text!r}")
         try:
             parameters[name] = tomllib.loads(f"value = {value}")["value"]
@@ -284,70 +286,77 @@ def run_on_cluster(jobs: list[Job], executor: Any, *, parallel: int) -> list[Job
     Jobs wait until the run whose stages they take over is trained. Ctrl-C cancels submitted jobs;
     the same command continues later.
     """
-    failed: list[Job] = []
-    left, running = list(jobs), {}
+    failures: list[Job] = []
+    pending_jobs, running_jobs = list(jobs), {}
     try:
-        while left or running:
-            for job in list(left):
-                if len(running) >= parallel:
+        while pending_jobs or running_jobs:
+            for job in list(pending_jobs):
+                if len(running_jobs) >= parallel:
                     break
-                state = _state(job, left, running, failed)
+                state = _state(job, pending_jobs, running_jobs, failures)
                 if state == "waits":
                     continue
-                left.remove(job)
-                head = f"[{len(jobs) - len(left)}/{len(jobs)}] {job.label}"
+                pending_jobs.remove(job)
+                prefix = f"[{len(jobs) - len(pending_jobs)}/{len(jobs)}] {job.label}"
                 (Path(job.folder) / "error.txt").unlink(missing_ok=True)
                 if state == "finished":
-                    _say(f"{head}: finished already")
+                    _say(f"{prefix}: finished already")
                 elif state == "lost":
                     name = Path(job.source or "").name
                     _note_failure(job, f"the stages to take over failed; see ../{name}/error.txt")
-                    failed.append(job)
+                    failures.append(job)
                 else:
-                    submitted = cluster.submit(executor, command_of(job))
-                    running[job.label] = (job, submitted)
-                    _say(f"{head}: submitted as {submitted.job_id}")
-            for label, (job, submitted) in list(running.items()):
-                if not submitted.done():
+                    cluster_job = cluster.submit(executor, command_of(job))
+                    running_jobs[job.label] = (job, cluster_job)
+                    _say(f"{prefix}: submitted as {cluster_job.job_id}")
+            for label, (job, cluster_job) in list(running_jobs.items()):
+                if not cluster_job.done():
                     continue
-                del running[label]
-                error = submitted.exception()
+                del running_jobs[label]
+                error = cluster_job.exception()
                 if error is None and is_finished(job):
                     _say(f"{label}: done")
                 else:
                     _note_failure(job, str(error or "it ended without its figures"))
-                    failed.append(job)
-            if running:
+                    failures.append(job)
+            if running_jobs:
                 time.sleep(_POLL_SECONDS)
     except KeyboardInterrupt:
-        for _, submitted in running.values():
-            submitted.cancel()
+        for _, cluster_job in running_jobs.values():
+            cluster_job.cancel()
         raise
-    return failed
+    return failures
 
 
 def _state(
-    job: Job, left: list[Job], running: dict[str, tuple[Job, Any]], failed: list[Job]
+    job: Job, pending_jobs: list[Job], running_jobs: dict[str, tuple[Job, Any]], failures: list[Job]
 ) -> str:
     """Tell whether a job is ``finished``, ``ready``, ``waits`` for its source, or ``lost`` it."""
     if is_finished(job):
         return "finished"
     if job.source is None or is_trained(job):
         return "ready"
-    going_on = [*left, *(one for one, _ in running.values())]
-    source = next((one for one in [*going_on, *failed] if one.folder == job.source), None)
+    unfinished_jobs = [*pending_jobs, *(candidate for candidate, _ in running_jobs.values())]
+    source = next(
+        (
+            candidate
+            for candidate in [*unfinished_jobs, *failures]
+            if candidate.folder == job.source
+        ),
+        None,
+    )
     if source is None or is_trained(source):
         return "ready"
-    return "waits" if source in going_on else "lost"
+    return "waits" if source in unfinished_jobs else "lost"
 
 
-def _chosen(wanted: list[str], known: Iterable[str], option: str) -> list[str]:
+def _chosen(requested_names: list[str], names: Iterable[str], option: str) -> list[str]:
     """Return the names that an option asks for, or all names; `SweepError` for unknown ones."""
-    known = list(known)
-    for name in wanted:
-        if name not in known:
-            raise SweepError(f"{option} {name}: the sweep has only {', '.join(known)}")
-    return [name for name in known if name in wanted] if wanted else known
+    names = list(names)
+    for name in requested_names:
+        if name not in names:
+            raise SweepError(f"{option} {name}: the sweep has only {', '.join(names)}")
+    return [name for name in names if name in requested_names] if requested_names else names
 
 
 def _command_line(arguments: argparse.Namespace) -> str:
@@ -375,17 +384,17 @@ def write_record(sweep: Sweep, scenes: Path, output: Path, command: str) -> None
     scenes, output : folder of the scene folders, and folder of all runs.
     command : command that was called.
     """
-    path, where = output / "sweep.json", homes(sweep)
+    path, home_names = output / "sweep.json", homes(sweep)
     commands = json.loads(path.read_text())["commands"] if path.exists() else []
     record = asdict(sweep)
     for values, run in zip(record["runs"], sweep.runs, strict=True):
-        values["same_as"] = None if where[run.name] == run.name else where[run.name]
+        values["same_as"] = None if home_names[run.name] == run.name else home_names[run.name]
         values["evaluate"] = sweep.evaluation(run)
         values["config"] = sweep.config(run).to_dict()
     record["scene_folders"] = {name: str((scenes / name).resolve()) for name in sweep.scenes}
     record["commands"] = list(dict.fromkeys([*commands, command]))
-    with written_aside(path) as aside:
-        aside.write_text(json.dumps(record, indent=2) + "\n")
+    with written_aside(path) as temporary_path:
+        temporary_path.write_text(json.dumps(record, indent=2) + "\n")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -458,19 +467,19 @@ def main(argv: list[str] | None = None, *, start: Callable[[Job], None] = in_a_p
     except (SweepError, OSError) as error:
         _say(f"error: {error}")
         return 2
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    previous_handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         if executor is None:
-            failed = run_jobs(jobs, start=start)
+            failures = run_jobs(jobs, start=start)
         else:
-            failed = run_on_cluster(jobs, executor, parallel=arguments.parallel)
+            failures = run_on_cluster(jobs, executor, parallel=arguments.parallel)
     except KeyboardInterrupt:
         _say("interrupted; the same command goes on from the last checkpoint")
         return 130
     finally:
-        signal.signal(signal.SIGTERM, before)
-    if failed:
-        _say(f"{len(failed)} of {len(jobs)} failed: {', '.join(job.label for job in failed)}")
+        signal.signal(signal.SIGTERM, previous_handler)
+    if failures:
+        _say(f"{len(failures)} of {len(jobs)} failed: {', '.join(job.label for job in failures)}")
         return 1
     return 0
 

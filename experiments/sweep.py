@@ -85,8 +85,8 @@ class Sweep:
 
     def evaluation(self, run: SweepRun) -> dict[str, Any]:
         """Return all keyword arguments of a run's evaluation."""
-        usual = {"protocol": PROTOCOLS[0], "samples": self.samples, "relight_indirect": "traced"}
-        return usual | run.evaluate
+        defaults = {"protocol": PROTOCOLS[0], "samples": self.samples, "relight_indirect": "traced"}
+        return defaults | run.evaluate
 
 
 def _anywhere(mesh: str) -> MeshSettings | None:
@@ -128,30 +128,30 @@ def in_scene(config: Config, scene: Path) -> Config:
 
 
 def _check_keys(
-    values: dict[str, Any], known: dict[str, str], required: Iterable[str], where: str
+    values: dict[str, Any], kinds: dict[str, str], required: Iterable[str], where: str
 ) -> None:
     """Refuse unknown keys, values of the wrong kind, and missing keys."""
     for key, value in values.items():
-        if key not in known:
-            raise SweepError(f"{where}: unknown key {key!r}; expected one of {sorted(known)}")
-        if not _KINDS[known[key]](value):
-            raise SweepError(f"{where}: {key} must be {known[key]}, got {value!r}")
+        if key not in kinds:
+            raise SweepError(f"{where}: unknown key {key!r}; expected one of {sorted(kinds)}")
+        if not _KINDS[kinds[key]](value):
+            raise SweepError(f"{where}: {key} must be {kinds[key]}, got {value!r}")
     for key in required:
         if key not in values:
             raise SweepError(f"{where}: {key!r} is missing")
 
 
-def _check_names(names: Iterable[str], what: str, where: str) -> None:
+def _check_names(names: Iterable[str], kind: str, where: str) -> None:
     """Refuse names that are no folder names, and names that differ in case only or not at all."""
     seen: dict[str, str] = {}
     for name in names:
         if not _FOLDER_NAME.fullmatch(name):
             raise SweepError(
-                f"{where}: the {what} {name!r} is no folder name; take letters, digits, '.', '-' "
+                f"{where}: the {kind} {name!r} is no folder name; take letters, digits, '.', '-' "
                 "and '_', a letter or digit first"
             )
         if name.lower() in seen:
-            raise SweepError(f"{where}: the {what} {name!r} appears twice")
+            raise SweepError(f"{where}: the {kind} {name!r} appears twice")
         seen[name.lower()] = name
 
 
@@ -191,9 +191,9 @@ def scaled(base: Config, factors: dict[str, Any], where: str) -> tuple[str, ...]
         if not paths:
             raise SweepError(f"{where}, scale: no number is called {pattern}")
         for path in paths:
-            now, value = numbers[path], numbers[path] * factor
-            is_count = type(now) is int
-            overrides.append(f"{path}={max(round(value), min(now, 1)) if is_count else value}")
+            number, value = numbers[path], numbers[path] * factor
+            is_count = type(number) is int
+            overrides.append(f"{path}={max(round(value), min(number, 1)) if is_count else value}")
     return tuple(overrides)
 
 
@@ -245,12 +245,12 @@ def _check_settings(sweep: Sweep, where: str) -> None:
     for (group, x), runs in points.items():
         first, *others = runs
         for other in others:
-            changed = differences(sweep.config(first), sweep.config(other))
-            if [line.split(":")[0] for line in changed] != ["run.seed"]:
+            changes = differences(sweep.config(first), sweep.config(other))
+            if [line.split(":")[0] for line in changes] != ["run.seed"]:
                 raise SweepError(
                     f"{where}: {first.name!r} and {other.name!r} are both at x = {x:g} of group "
                     f"{group!r}; repetitions differ in run.seed alone, these differ in "
-                    f"{'; '.join(changed) or 'nothing'}"
+                    f"{'; '.join(changes) or 'nothing'}"
                 )
 
 
@@ -295,7 +295,7 @@ def read_sweep(
             raise SweepError(f"{where}: {key} must not be empty")
     if len(set(values["figures"])) < len(values["figures"]):
         raise SweepError(f"{where}: figures must not name one twice, got {values['figures']}")
-    usual = {
+    config_options = {
         "preset": values.get("preset", "default"),
         "quality": quality or values.get("quality", "standard"),
         "material_prior": values.get("material_prior", "hybrid"),
@@ -303,7 +303,7 @@ def read_sweep(
     }
     mesh = values.get("mesh", "") if mesh is None else mesh
     try:
-        base = make_config(**usual, mesh=_anywhere(mesh))
+        base = make_config(**config_options, mesh=_anywhere(mesh))
     except ValueError as error:
         raise SweepError(f"{where}: {error}") from error
     downscale = values.get("downscale", 1) if downscale is None else downscale
@@ -314,7 +314,7 @@ def read_sweep(
         file=path.name,
         title=values["title"],
         about=values.get("about", "").strip(),
-        **usual,
+        **config_options,
         scenes=tuple(values["scenes"]),
         figures=tuple(values["figures"]),
         samples=values.get("samples", DEFAULT_SAMPLES),

@@ -56,8 +56,10 @@ def _identity(config: Config, count: int, downscale: int) -> str:
         name = Path(config.geometry.path).name
         config = replace(config, geometry=replace(config.geometry, path=name, digest=""))
     plain = config.to_dict()
-    kept = {stage.name for stage in config.active_stages[:count]}
-    plain["stages"] = {name: stage for name, stage in plain["stages"].items() if name in kept}
+    stage_names = {stage.name for stage in config.active_stages[:count]}
+    plain["stages"] = {
+        name: stage for name, stage in plain["stages"].items() if name in stage_names
+    }
     return json.dumps([plain, downscale], sort_keys=True)
 
 
@@ -67,7 +69,7 @@ def stage_times(scene: Path) -> dict[str, tuple[float, float, float]]:
     Values are seconds, seconds without compilation, and peak memory in MB. Stages whose steps are
     not complete are left out.
     """
-    found = {}
+    costs = {}
     for path in sorted(scene.glob("*/run.json")):
         run = RunFolder(path.parent)
         try:
@@ -77,14 +79,14 @@ def stage_times(scene: Path) -> dict[str, tuple[float, float, float]]:
             print(f"left out: {error}", file=sys.stderr)
             continue
         for number, stage in enumerate(config.active_stages, 1):
-            own = [line for line in lines if line["stage"] == stage.name]
-            if len(own) == stage.steps:
-                seconds = [line["seconds"] for line in own]
+            stage_lines = [line for line in lines if line["stage"] == stage.name]
+            if len(stage_lines) == stage.steps:
+                seconds = [line["seconds"] for line in stage_lines]
                 name = _identity(config, number, downscale)
                 steady = stage.steps * statistics.median(seconds)
-                memory = max(line.get("peak_memory_mb", 0) for line in own)
-                found[name] = (sum(seconds), steady, memory)
-    return found
+                memory = max(line.get("peak_memory_mb", 0) for line in stage_lines)
+                costs[name] = (sum(seconds), steady, memory)
+    return costs
 
 
 def read_points(folder: Path, sweep: dict[str, Any]) -> dict[str, dict[str, Point]]:
@@ -108,10 +110,10 @@ def read_points(folder: Path, sweep: dict[str, Any]) -> dict[str, dict[str, Poin
 
 def quality_figures(sweep: dict[str, Any]) -> list[str]:
     """Return the names of the figures in decibels, whose mean is the quality."""
-    found = [name for name in sweep["figures"] if name.endswith("psnr") and "light." not in name]
-    if not found:
+    names = [name for name in sweep["figures"] if name.endswith("psnr") and "light." not in name]
+    if not names:
         raise ReportError("the sweep has no figure in decibels; add nvs.psnr to its figures")
-    return found
+    return names
 
 
 def quality(point: Point, figures: Iterable[str]) -> float:
@@ -122,10 +124,12 @@ def quality(point: Point, figures: Iterable[str]) -> float:
 def pareto(points: dict[str, tuple[float, float]]) -> list[str]:
     """Return the names of the Pareto-optimal points (cost, quality), in order of cost."""
     front, best = [], -math.inf
-    for name, (_, good) in sorted(points.items(), key=lambda item: (item[1][0], -item[1][1])):
-        if good > best:
+    for name, (_, point_quality) in sorted(
+        points.items(), key=lambda item: (item[1][0], -item[1][1])
+    ):
+        if point_quality > best:
             front.append(name)
-            best = good
+            best = point_quality
     return front
 
 
@@ -146,8 +150,8 @@ def _pairs(
 
 def _finite(groups: Iterable[Iterable[float]]) -> list[list[float]]:
     """Leave out values that are not finite, and groups that are then empty."""
-    kept = ([value for value in values if math.isfinite(value)] for values in groups)
-    return [values for values in kept if values]
+    finite_groups = ([value for value in values if math.isfinite(value)] for values in groups)
+    return [values for values in finite_groups if values]
 
 
 def _mean(groups: list[list[float]]) -> float:
@@ -174,34 +178,36 @@ def _spread(groups: list[list[float]], figure: str, count: int) -> str:
     figure : name of the figure, which decides the number of digits.
     count : number of values that there should be; shown if some are missing.
     """
-    known = _finite(groups)
-    if not known:
+    finite_groups = _finite(groups)
+    if not finite_groups:
         return _NONE
-    text, error = digits(figure, _mean(known), signed=True), _standard_error(known)
+    text, error = digits(figure, _mean(finite_groups), signed=True), _standard_error(finite_groups)
     if error is not None:
         text += f" ± {digits(figure, error)}"
-    return text + _of(sum(len(values) for values in known), count)
+    return text + _of(sum(len(values) for values in finite_groups), count)
 
 
-def _of(found: int, count: int) -> str:
+def _of(present_count: int, count: int) -> str:
     """Return how many of the values exist, as a text; empty if all do."""
-    return f" ({found} of {count})" if found < count else ""
+    return f" ({present_count} of {count})" if present_count < count else ""
 
 
-def _exchange(gain: float, extra: float) -> str:
+def _exchange(gain: float, extra_seconds: float) -> str:
     """Format decibels per second if quality is traded for time; otherwise describe it in words.
 
     Parameters
     ----------
-    gain, extra : change of the quality, and of the seconds.
+    gain, extra_seconds : change of the quality, and of the seconds.
     """
-    if gain == extra == 0.0:
+    if gain == extra_seconds == 0.0:
         return _NONE
-    if gain * extra > 0.0:
-        return f"{gain / extra:+.4f}"
-    good = "as good" if gain == 0.0 else "better" if gain > 0.0 else "worse"
-    cost = "as dear" if extra == 0.0 else "cheaper" if extra < 0.0 else "dearer"
-    return f"{good}, {cost}"
+    if gain * extra_seconds > 0.0:
+        return f"{gain / extra_seconds:+.4f}"
+    quality_text = "as good" if gain == 0.0 else "better" if gain > 0.0 else "worse"
+    cost_text = (
+        "as dear" if extra_seconds == 0.0 else "cheaper" if extra_seconds < 0.0 else "dearer"
+    )
+    return f"{quality_text}, {cost_text}"
 
 
 _COSTS = {
@@ -226,8 +232,8 @@ def _knob_row(
     """
     row = []
     for cost in _COSTS.values():
-        known = _finite([cost(a) / cost(b) for a, b in group if cost(b)] for group in pairs)
-        row.append(f"×{_mean(known):.2f}" if known else _NONE)
+        ratios = _finite([cost(a) / cost(b) for a, b in group if cost(b)] for group in pairs)
+        row.append(f"×{_mean(ratios):.2f}" if ratios else _NONE)
     for name in names:
         change = [
             [a.figures.get(name, math.nan) - b.figures.get(name, math.nan) for a, b in group]
@@ -237,14 +243,14 @@ def _knob_row(
     gains = [[quality(a, figures) - quality(b, figures) for a, b in group] for group in pairs]
     row.append(_spread(gains, "psnr", count))
     # Seconds are those of the pairs whose quality is known.
-    extra = _finite(
+    extra_seconds = _finite(
         [
             a.steady - b.steady if math.isfinite(gain) else math.nan
             for (a, b), gain in zip(group, values, strict=True)
         ]
         for group, values in zip(pairs, gains, strict=True)
     )
-    row.append(_exchange(_mean(_finite(gains)), _mean(extra)) if extra else _NONE)
+    row.append(_exchange(_mean(_finite(gains)), _mean(extra_seconds)) if extra_seconds else _NONE)
     return row
 
 
@@ -259,8 +265,8 @@ def knob_tables(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]
     names, lines = sweep["figures"], []
     count = sum(len(points[base]) for points in repeated)
     for group in dict.fromkeys(run["group"] for run in sweep["runs"] if run["x"] is not None):
-        head = ["value", *_COSTS, *(f"{name}{arrow(name)}" for name in names)]
-        rows = [[*head, "quality, dB", "dB per second"]]
+        header = ["value", *_COSTS, *(f"{name}{arrow(name)}" for name in names)]
+        rows = [[*header, "quality, dB", "dB per second"]]
         members = [r for r in sweep["runs"] if r["x"] is not None and r["group"] == group]
         for run in sorted(members, key=lambda run: run["x"]):
             pairs = _pairs(repeated, run["name"], base)
@@ -273,31 +279,34 @@ def knob_tables(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]
 def front_table(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]]]) -> list[str]:
     """Tabulate the Pareto front of seconds and quality, of runs that are complete on all scenes."""
     figures, count = quality_figures(sweep), len(repeated) * len(sweep["scenes"])
-    values, whole, left_out = {}, {}, []
+    values, whole_seconds, incomplete_runs = {}, {}, []
     for run in sweep["runs"]:
         name = run["name"]
         points = [p for points in repeated for p in points[name].values()]
-        found = [p for p in points if math.isfinite(quality(p, figures))]
-        if len(found) < count:
-            left_out.append(f"{name} ({len(found)} of {count})")
+        finite_points = [p for p in points if math.isfinite(quality(p, figures))]
+        if len(finite_points) < count:
+            incomplete_runs.append(f"{name} ({len(finite_points)} of {count})")
             continue
-        good = statistics.fmean(quality(p, figures) for p in found)
-        values[name] = (statistics.fmean(p.steady for p in found), good)
-        whole[name] = statistics.fmean(p.seconds for p in found)
+        mean_quality = statistics.fmean(quality(p, figures) for p in finite_points)
+        values[name] = (statistics.fmean(p.steady for p in finite_points), mean_quality)
+        whole_seconds[name] = statistics.fmean(p.seconds for p in finite_points)
     titles = {run["name"]: run["title"] for run in sweep["runs"]}
-    head = ["run", "seconds", "whole seconds", "quality, dB", "dB per second more", "what it is"]
-    rows, before = [head], None
+    header = ["run", "seconds", "whole seconds", "quality, dB", "dB per second more", "what it is"]
+    rows, previous_point = [header], None
     for name in pareto(values):
-        seconds, good = values[name]
+        seconds, mean_quality = values[name]
         slope = _NONE
-        if before is not None:
-            slope = f"{(good - before[1]) / (seconds - before[0]):.4f}"
-        costs = [f"{seconds:.0f}", f"{whole[name]:.0f}"]
-        rows.append([name, *costs, f"{good:.2f}", slope, titles[name]])
-        before = (seconds, good)
+        if previous_point is not None:
+            slope = f"{(mean_quality - previous_point[1]) / (seconds - previous_point[0]):.4f}"
+        costs = [f"{seconds:.0f}", f"{whole_seconds[name]:.0f}"]
+        rows.append([name, *costs, f"{mean_quality:.2f}", slope, titles[name]])
+        previous_point = (seconds, mean_quality)
     lines = [*report._table(rows), ""]
-    if left_out:
-        lines += [f"Without figures of all scenes, hence not compared: {', '.join(left_out)}.", ""]
+    if incomplete_runs:
+        lines += [
+            f"Without figures of all scenes, hence not compared: {', '.join(incomplete_runs)}.",
+            "",
+        ]
     return lines
 
 
@@ -305,13 +314,13 @@ def compose(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]]]) 
     """Compose the tables as markdown."""
     base, figures = sweep["runs"][0]["name"], quality_figures(sweep)
     count = len(repeated)
-    over = "the scenes, of means over the seeds"
+    basis = "the scenes, of means over the seeds"
     if len(sweep["scenes"]) == 1:
-        over = "the seeds, since there is one scene"
-    about = (
+        basis = "the seeds, since there is one scene"
+    introduction = (
         f"Against `{base}` at quality {sweep['quality']}, on {', '.join(sweep['scenes'])}, "
         f"{count} seed{'s' if count > 1 else ''}. Quality is the mean of {', '.join(figures)}. "
-        f"± is the standard error over {over}. Seconds are those of median steps, were nothing "
+        f"± is the standard error over {basis}. Seconds are those of median steps, were nothing "
         "compiled; whole seconds are with what a run happened to compile. Where figures are "
         "missing, (1 of 2) says how many trainings have them."
     )
@@ -319,7 +328,7 @@ def compose(sweep: dict[str, Any], repeated: list[dict[str, dict[str, Point]]]) 
         [
             f"# {sweep['title']}",
             "",
-            about,
+            introduction,
             "",
             "## The front",
             "",

@@ -62,17 +62,17 @@ CODE = AdapterConstants(u=1 / 9 - 1 / 24, v=2 / 9)
 
 def _inert(splats: Splats) -> Splats:
     """Overwrite the rows past the count with harmless values."""
-    real = splats.mask
+    is_real = splats.mask
     dtype = splats.means.dtype
     unit_quat = jnp.array([[1.0, 0.0, 0.0, 0.0]], dtype)
-    means = jnp.where(real[:, None], splats.means, 0.0)
+    means = jnp.where(is_real[:, None], splats.means, 0.0)
     return replace(
         splats,
         means=means,
-        quats=jnp.where(real[:, None], splats.quats, unit_quat),
-        scales=jnp.where(real[:, None], splats.scales, 1.0),
-        opacities=jnp.where(real, splats.opacities, 0.0),
-        normals=jnp.where(real[:, None], splats.normals, 0.0),
+        quats=jnp.where(is_real[:, None], splats.quats, unit_quat),
+        scales=jnp.where(is_real[:, None], splats.scales, 1.0),
+        opacities=jnp.where(is_real, splats.opacities, 0.0),
+        normals=jnp.where(is_real[:, None], splats.normals, 0.0),
         anchors=means,
     )
 
@@ -115,36 +115,38 @@ def face_splats(
     `Splats`, six for every row of faces.
     """
     # Components come first, (corner, xyz, face): the arithmetic runs along contiguous faces.
-    both = jnp.concatenate([mesh.vertices, normals], axis=1)[mesh.faces.T].transpose(0, 2, 1)
-    corners, corner_normals = both[:, :3], both[:, 3:]
+    values = jnp.concatenate([mesh.vertices, normals], axis=1)[mesh.faces.T].transpose(0, 2, 1)
+    corners, corner_normals = values[:, :3], values[:, 3:]
     face_normal, area = (x.T for x in face_normals_and_areas(mesh))
     # The segments of both rings are parallel to the same three edges: P2-P3, P1-P2, P3-P1.
     p1, p2, p3 = corners
     edges = (p2 - p3, p1 - p2, p3 - p1)
     lengths = [safe_norm(edge, axis=0) for edge in edges]
 
-    means, shading, scales = [], [], []
+    means, shading_normals, scales = [], [], []
     for ring, corner in enumerate((constants.u, constants.v)):
         means += _blend(corners, corner)
         ring_normals = [safe_normalize(n, axis=0) for n in _blend(corner_normals, corner)]
-        shading += ring_normals
+        shading_normals += ring_normals
         for length in lengths:
             segment = (1.0 - 3.0 * corner) * length
-            along = 0.5 * constants.alpha[ring] * segment  # Eq. 10
-            across = safe_divide(2.0 * area, constants.beta[ring] * segment)
-            thickness = jnp.full_like(along, constants.thickness * unit)
-            scales.append(jnp.stack([along, across, thickness]))
+            scale_x = 0.5 * constants.alpha[ring] * segment  # Eq. 10
+            scale_y = safe_divide(2.0 * area, constants.beta[ring] * segment)
+            thickness = jnp.full_like(scale_x, constants.thickness * unit)
+            scales.append(jnp.stack([scale_x, scale_y, thickness]))
     if constants.shading_frame:
-        quats = [_frame(edge, n) for edge, n in zip(edges * 2, shading, strict=True)]
+        quats = [_frame(edge, n) for edge, n in zip(edges * 2, shading_normals, strict=True)]
     else:
         quats = [_frame(edge, face_normal) for edge in edges] * 2
 
     # Without the barrier XLA fuses these chains into the stacks below, and compiles each several
     # times.
-    means, shading, scales, quats = jax.lax.optimization_barrier((means, shading, scales, quats))
+    means, shading_normals, scales, quats = jax.lax.optimization_barrier(
+        (means, shading_normals, scales, quats)
+    )
 
-    def rows(parts: list[Float[Array, "c F"]]) -> Float[Array, "N c"]:
-        stacked = jnp.stack(parts)  # (6, c, F)
+    def rows(arrays: list[Float[Array, "c F"]]) -> Float[Array, "N c"]:
+        stacked = jnp.stack(arrays)  # (6, c, F)
         return stacked.transpose(2, 0, 1).reshape(-1, stacked.shape[1])
 
     means = rows(means)
@@ -154,7 +156,7 @@ def face_splats(
         quats=rows(quats),
         scales=rows(scales),
         opacities=jnp.full((SPLATS_PER_FACE * area.shape[0],), constants.opacity, area.dtype),
-        normals=rows(shading),
+        normals=rows(shading_normals),
         outward=jnp.repeat(face_normal.T, SPLATS_PER_FACE, axis=0),
         anchors=means,
         parents=jnp.repeat(faces, SPLATS_PER_FACE),
@@ -199,8 +201,8 @@ def vertex_splats(
     """
     face_normal, area = face_normals_and_areas(mesh)
     corner_normals = normals[mesh.faces]
-    facing = jnp.sum(face_normal[:, None, :] * corner_normals, axis=-1)
-    share = jnp.where(mesh.face_mask[:, None], 2.0 * area[:, None] * facing / 6.0, 0.0)
+    cosines = jnp.sum(face_normal[:, None, :] * corner_normals, axis=-1)
+    share = jnp.where(mesh.face_mask[:, None], 2.0 * area[:, None] * cosines / 6.0, 0.0)
     zero = jnp.zeros((mesh.vertices.shape[0],), mesh.vertices.dtype)
     star_area = zero.at[mesh.faces.reshape(-1)].add(share.reshape(-1))
     radius = safe_sqrt(star_area / constants.vertex_area_divisor)
@@ -234,11 +236,11 @@ def shift_inwards(splats: Splats, mesh: Mesh, fraction: Float[Array, " N"]) -> S
     fraction : (N,) distance in units of the square root of the face's area.
     """
     normal, area = face_normals_and_areas(mesh)
-    step = jax.lax.stop_gradient(normal * safe_sqrt(area)[:, None])
-    per_row = step.at[splats.parents].get(mode="clip")
-    moves = splats.mask & (splats.parents >= 0)
-    moved = splats.means - per_row * fraction[:, None]
-    return replace(splats, means=jnp.where(moves[:, None], moved, splats.means))
+    face_steps = jax.lax.stop_gradient(normal * safe_sqrt(area)[:, None])
+    splat_steps = face_steps.at[splats.parents].get(mode="clip")
+    is_moving = splats.mask & (splats.parents >= 0)
+    shifted_means = splats.means - splat_steps * fraction[:, None]
+    return replace(splats, means=jnp.where(is_moving[:, None], shifted_means, splats.means))
 
 
 class SplatModel(abc.ABC):

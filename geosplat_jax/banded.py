@@ -68,9 +68,9 @@ class BandedFlexiCubes(GridSurface):
 
     def following(self, shape: Geometry) -> Following | None:
         """Move the band to where the surface is now; see `Band.following`."""
-        found = self.band.following(shape.sdf, self.layers)
-        if found is None:
+        band_update = self.band.following(shape.sdf, self.layers)
+        if band_update is None:
             return None
-        band, move, sdf = found
-        moved = replace(move.carried(shape), sdf=jnp.array(sdf))
-        return Following(replace(self, band=band), moved, move.carried)
+        band, move, sdf = band_update
+        new_shape = replace(move.carried(shape), sdf=jnp.array(sdf))
+        return Following(replace(self, band=band), new_shape, move.carried)

@@ -53,7 +53,7 @@ def round_config(material_prior: str = "hybrid", *, seed: int | None = None) -> 
     return make_config(quality="draft", material_prior=material_prior, overrides=overrides)
 
 
-def _require_same(folder: Path, made_with: Mapping[str, Any]) -> None:
+def _require_same(folder: Path, provenance: Mapping[str, Any]) -> None:
     """Record what the rounds in a folder are made with; refuse those made with something else.
 
     Raises
@@ -61,24 +61,26 @@ def _require_same(folder: Path, made_with: Mapping[str, Any]) -> None:
     RunError
         If the rounds were made with something else, or their record is damaged.
     """
-    path, text = folder / _RECORD, json.dumps(made_with, indent=1, default=str) + "\n"
+    path, text = folder / _RECORD, json.dumps(provenance, indent=1, default=str) + "\n"
     # What a command has recorded that failed before its first round may be overwritten.
     if not path.exists() or not any(folder.glob("round_*")):
-        with written_aside(path) as aside:
-            aside.write_text(text, encoding="utf-8")
+        with written_aside(path) as temporary_path:
+            temporary_path.write_text(text, encoding="utf-8")
         return
     try:
-        before = parse_json(path.read_bytes())
+        old_record = parse_json(path.read_bytes())
     except ValueError as error:
         raise RunError(f"{path} is damaged: {error}; delete {folder} to begin again") from None
-    if not isinstance(before, dict):
+    if not isinstance(old_record, dict):
         raise RunError(f"{path} is damaged: it is no record; delete {folder} to begin again")
-    now = parse_json(text)
+    new_record = parse_json(text)
     # An earlier version may have recorded less: only what it recorded is compared.
-    changed = sorted(name for name in now if name in before and now[name] != before[name])
-    if changed:
+    differences = sorted(
+        name for name in new_record if name in old_record and new_record[name] != old_record[name]
+    )
+    if differences:
         raise RunError(
-            f"the cameras in {folder} were refined with other {' and '.join(changed)}; delete "
+            f"the cameras in {folder} were refined with other {' and '.join(differences)}; delete "
             "that folder to refine them again, or take another output"
         )
 
@@ -124,11 +126,11 @@ def refined_cameras(
     if rounds < 1:
         raise ValueError(f"refining cameras takes one round at least, got {rounds}")
     config = config or round_config()
-    beside, options = rounds_folder(output), dict(reading or {})
+    rounds_path, options = rounds_folder(output), dict(reading or {})
     cameras, how = Path(), how or CameraSettings()
     dataset: Dataset | None = load_recorded(scene, options)
     assert dataset is not None
-    made_with = {
+    provenance = {
         "scene": str(Path(scene).resolve()),
         "reading": options,
         "views": [dataset.train.fingerprint(), dataset.test.fingerprint()],
@@ -137,12 +139,12 @@ def refined_cameras(
         "config": config.to_dict(),
         "refinement": asdict(how),
     }
-    _require_same(beside, made_with)
+    _require_same(rounds_path, provenance)
     if replace:
         dataset.require_masks("train")
         RunFolder(output).make_room(replace=True)
     for number in range(1, rounds + 1):
-        folder = beside / f"round_{number}"
+        folder = rounds_path / f"round_{number}"
         cameras = folder.with_suffix(".json")
         if not cameras.exists():
             if dataset is None:

@@ -79,19 +79,19 @@ class PerPixel(ShadingDomain, kind="per_pixel"):
         height, width = alpha.shape
         coverage = jax.lax.stop_gradient(alpha) if self.detach_coverage else alpha
         share = jnp.maximum(coverage, _THINNEST).reshape(-1, 1)
-        straight = {n: x.reshape(height * width, -1) / share for n, x in images.items()}
+        straight_values = {n: x.reshape(height * width, -1) / share for n, x in images.items()}
         materials = replace(
             asset.attributes.materials,
-            albedo=straight["albedo"],
-            roughness=straight["roughness"][:, 0],
-            metallic=straight["metallic"][:, 0],
+            albedo=straight_values["albedo"],
+            roughness=straight_values["roughness"][:, 0],
+            metallic=straight_values["metallic"][:, 0],
         )
-        points = self._points(pipeline, asset, straight, alpha.reshape(-1) > 0, camera)
+        points = self._points(pipeline, asset, straight_values, alpha.reshape(-1) > 0, camera)
         shaded = self.adapted(pipeline.transport).shade(
             key,
             points,
-            Attributes(materials, None, straight.get("indirect")),
-            safe_normalize(camera.centers - straight["position"]),
+            Attributes(materials, None, straight_values.get("indirect")),
+            safe_normalize(camera.centers - straight_values["position"]),
             illumination,
             asset.index,
         )
@@ -101,47 +101,47 @@ class PerPixel(ShadingDomain, kind="per_pixel"):
             "specular": shaded.specular_light,
             "specular_radiance": shaded.specular,
         }
-        found = {}
+        outputs = {}
         for name in ("rgb", *names):
             if name in _SHADED:
-                found[name] = light[name].reshape(height, width, -1) * coverage[..., None]
+                outputs[name] = light[name].reshape(height, width, -1) * coverage[..., None]
             else:
-                found[name] = images[name]
-        return found, alpha
+                outputs[name] = images[name]
+        return outputs, alpha
 
     def _blended(
         self, pipeline: RenderPipeline, asset: Asset, lists: TileLists, camera: Camera
     ) -> tuple[dict[str, Float[Array, "H W c"]], Float[Array, "H W"]]:
         """Rasterise the attributes, premultiplied (Eq. 21)."""
-        splats, seen = asset.splats, lists.gather
-        attributes = jax.tree.map(seen, asset.attributes)
+        splats, gather = asset.splats, lists.gather
+        attributes = jax.tree.map(gather, asset.attributes)
         materials = attributes.materials
         footprints = pipeline.project(
-            seen(splats.means), seen(splats.quats), seen(splats.scales, padding=1.0), camera
+            gather(splats.means), gather(splats.quats), gather(splats.scales, padding=1.0), camera
         )
         channels = {
-            "normal": seen(splats.normals),
+            "normal": gather(splats.normals),
             "albedo": materials.albedo,
             "roughness": materials.roughness[:, None],
             "metallic": materials.metallic[:, None],
-            "position": seen(splats.anchors),
+            "position": gather(splats.anchors),
             "depth": footprints.depths[:, None],
         }
         if attributes.indirect is not None:
             channels["indirect"] = attributes.indirect
         assert {name for name in AOV_CHANNELS if name not in _SHADED} <= set(channels)
-        return pipeline.blend(footprints, seen(splats.opacities), channels, lists, camera)
+        return pipeline.blend(footprints, gather(splats.opacities), channels, lists, camera)
 
     def _points(
         self,
         pipeline: RenderPipeline,
         asset: Asset,
-        straight: dict[str, Float[Array, "P c"]],
+        straight_values: dict[str, Float[Array, "P c"]],
         mask: Bool[Array, " P"],
         camera: Camera,
     ) -> SurfacePoints:
         """Build the points at which pixels are shaded, where rays towards the light start."""
-        normals, positions = safe_normalize(straight["normal"]), straight["position"]
+        normals, positions = safe_normalize(straight_values["normal"]), straight_values["position"]
         offset = self.ray_offset * pipeline.surface.box.half_extent
         starts, outward = positions + offset * normals, normals
         faces = jnp.full(mask.shape, -1, jnp.int32)
@@ -177,12 +177,12 @@ def first_surface(
     rotation, intrinsics = camera.world_to_camera[0, :3, :3], camera.intrinsics[0]
     dtype = rotation.dtype
     x, y = jnp.meshgrid(*(jnp.arange(n, dtype=dtype) + 0.5 for n in (camera.width, camera.height)))
-    across = (x - intrinsics[0, 2]) / intrinsics[0, 0]
-    down = (y - intrinsics[1, 2]) / intrinsics[1, 1]
-    local = jnp.stack([across, down, jnp.ones_like(across)], axis=-1).reshape(-1, 3)
+    slope_x = (x - intrinsics[0, 2]) / intrinsics[0, 0]
+    slope_y = (y - intrinsics[1, 2]) / intrinsics[1, 1]
+    local = jnp.stack([slope_x, slope_y, jnp.ones_like(slope_x)], axis=-1).reshape(-1, 3)
     directions = safe_normalize(jnp.einsum("pk,kc->pc", local, rotation, precision="highest"))
     origins = jnp.broadcast_to(camera.centers, directions.shape)
-    nowhere = jnp.full(mask.shape, -1, jnp.int32)
-    distance, faces = index.nearest(origins, directions, nowhere, mask)
-    reached = jnp.where(faces >= 0, distance, 0.0)
-    return origins + reached[:, None] * directions, faces
+    no_faces = jnp.full(mask.shape, -1, jnp.int32)
+    distance, faces = index.nearest(origins, directions, no_faces, mask)
+    hit_distance = jnp.where(faces >= 0, distance, 0.0)
+    return origins + hit_distance[:, None] * directions, faces

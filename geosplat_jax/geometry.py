@@ -139,12 +139,12 @@ def _resolved_case(
     step = _rows(jnp.asarray(PROBLEM_OFFSET.astype(np.int32)), signs).T
     neighbour = coordinates + step
     limit = jnp.asarray((nx, ny, nz), jnp.int32)[:, None]
-    exists = jnp.all((neighbour >= 0) & (neighbour < limit), axis=0)
-    number = jnp.where(exists, neighbour[0] + nx * (neighbour[1] + ny * neighbour[2]), 0)
+    has_neighbour = jnp.all((neighbour >= 0) & (neighbour < limit), axis=0)
+    number = jnp.where(has_neighbour, neighbour[0] + nx * (neighbour[1] + ny * neighbour[2]), 0)
     # The surface passes through both cells, so that the other one holds values too.
     row = lattice.rows_of_cells(number)
-    clashes = exists & _rows(is_problem, _rows(sign_sets, row).astype(jnp.int32))
-    return jnp.where(_rows(is_problem, signs) & clashes, 255 - signs, signs)
+    is_clash = has_neighbour & _rows(is_problem, _rows(sign_sets, row).astype(jnp.int32))
+    return jnp.where(_rows(is_problem, signs) & is_clash, 255 - signs, signs)
 
 
 def _owned_crossings(signs: Int[Array, " n"], coordinates: Int[Array, "3 n"]) -> Bool[Array, "n 3"]:
@@ -152,11 +152,11 @@ def _owned_crossings(signs: Int[Array, " n"], coordinates: Int[Array, "3 n"]) ->
 
     Every interior edge leaves the lowest corner of exactly one cell, which owns its quad.
     """
-    inner = coordinates > 0
+    is_inner = coordinates > 0
     columns = []
     for axis in range(3):
         is_crossed = (signs ^ signs >> (1 << axis)) & 1 == 1
-        columns.append(is_crossed & inner[(axis + 1) % 3] & inner[(axis + 2) % 3])
+        columns.append(is_crossed & is_inner[(axis + 1) % 3] & is_inner[(axis + 2) % 3])
     return jnp.stack(columns, axis=1)
 
 
@@ -179,7 +179,7 @@ def _surface_cells(values: Float[Array, " G"], lattice: Lattice, *, capacity: in
     is_real = jnp.arange(capacity, dtype=jnp.int32) < bits.count
     coordinates, signs, case = describe(row)
     signs, case = jnp.where(is_real, signs, 0), jnp.where(is_real, case, 0)
-    through = jnp.cumsum(_rows(patch_count, case), dtype=jnp.int32)
+    running_sum = jnp.cumsum(_rows(patch_count, case), dtype=jnp.int32)
     # After an overflow the compacted cells are incomplete: the true needs are counted over all.
     vertex_count, quad_count = jax.lax.cond(
         bits.count > capacity,
@@ -192,7 +192,7 @@ def _surface_cells(values: Float[Array, " G"], lattice: Lattice, *, capacity: in
         coordinates=coordinates,
         signs=signs,
         case=case,
-        first_vertex=through - _rows(patch_count, case),
+        first_vertex=running_sum - _rows(patch_count, case),
         bits=bits,
         vertex_count=vertex_count,
         quad_count=quad_count,
@@ -215,9 +215,9 @@ def _edge_ends(corners: Float[Array, "*b 8 n"]) -> tuple[Array, Array]:
     cube = corners.reshape(*corners.shape[:-2], 2, 2, 2, count)  # z, y, x
 
     def at_side(side: int) -> Array:
-        along = (cube[..., :, :, side, :], cube[..., :, side, :, :], cube[..., side, :, :, :])
+        axis_groups = (cube[..., :, :, side, :], cube[..., :, side, :, :], cube[..., side, :, :, :])
         return jnp.concatenate(
-            [part.reshape(*cube.shape[:-4], 4, count) for part in along], axis=-2
+            [group.reshape(*cube.shape[:-4], 4, count) for group in axis_groups], axis=-2
         )
 
     # Without the barrier XLA recomputes each edge's gradient for all of a corner's three edges.
@@ -228,12 +228,12 @@ def _crossing_fraction(
     lower: Float[Array, "12 n"], upper: Float[Array, "12 n"], crosses: Bool[Array, "12 n"]
 ) -> Float[Array, "12 n"]:
     """Zero of the linear interpolant along each crossed edge, as a fraction from its lower end."""
-    size = jax.lax.stop_gradient(jnp.maximum(jnp.abs(lower), jnp.abs(upper)))
-    usable = crosses & (size > _SDF_EPSILON)
+    magnitude = jax.lax.stop_gradient(jnp.maximum(jnp.abs(lower), jnp.abs(upper)))
+    is_usable = crosses & (magnitude > _SDF_EPSILON)
     # The fraction does not change when both ends are scaled; unit size keeps squares in range.
-    scale = jnp.where(usable, size, 1.0)
-    low = jnp.where(usable, lower / scale, -1.0)
-    high = jnp.where(usable, upper / scale, 1.0)
+    scale = jnp.where(is_usable, magnitude, 1.0)
+    low = jnp.where(is_usable, lower / scale, -1.0)
+    high = jnp.where(is_usable, upper / scale, 1.0)
     return low / (low - high)
 
 
@@ -243,11 +243,11 @@ def _corner_values(
     """SDF and deformed positions, in cells from the centre of the grid, of the cells' corners."""
     dtype, grid = geometry.sdf.dtype, lattice.grid
     vertex = lattice.corner_rows(rows, coordinates)
-    moved = jnp.moveaxis(grid.reach * jnp.tanh(_rows(geometry.deform, vertex)), -1, 0)
+    displacements = jnp.moveaxis(grid.reach * jnp.tanh(_rows(geometry.deform, vertex)), -1, 0)
     centre = jnp.asarray(np.array(grid.shape) / 2, dtype)
     corner = jnp.asarray(CORNERS.T, dtype)[:, :, None]
-    rest = (coordinates.astype(dtype) - centre[:, None])[:, None, :] + corner
-    return _rows(geometry.sdf, vertex), rest + moved
+    rest_positions = (coordinates.astype(dtype) - centre[:, None])[:, None, :] + corner
+    return _rows(geometry.sdf, vertex), rest_positions + displacements
 
 
 def _dual_vertices(geometry: Geometry, lattice: Lattice, cells: _Cells, *, capacity: int) -> _Duals:
@@ -257,8 +257,8 @@ def _dual_vertices(geometry: Geometry, lattice: Lattice, cells: _Cells, *, capac
     is_real = row_number < cells.vertex_count
     slot = row_number - cells.first_vertex[row]
     patch = _rows(jnp.asarray(PATCH_EDGES.astype(np.int32).reshape(-1)), cells.case[row] * 4 + slot)
-    crosses = (patch[None, :] >> jnp.arange(12, dtype=jnp.int32)[:, None]) & 1 == 1
-    crosses = crosses & is_real[None, :]
+    is_crossed = (patch[None, :] >> jnp.arange(12, dtype=jnp.int32)[:, None]) & 1 == 1
+    is_crossed = is_crossed & is_real[None, :]
     index, cell_size = cells.row[row], lattice.grid.cell_size
 
     sdf, corners = _corner_values(geometry, lattice, index, cells.coordinates[:, row])
@@ -268,23 +268,25 @@ def _dual_vertices(geometry: Geometry, lattice: Lattice, cells: _Cells, *, capac
     gamma = gamma * _WEIGHT_SCALE + 0.5 * (1.0 - _WEIGHT_SCALE)
 
     start, end = _edge_ends(corners)
-    along = end - start
+    edge_vectors = end - start
     # Flexible weights: crossings of the alpha-scaled field, then their beta-weighted mean.
-    fraction = _crossing_fraction(*_edge_ends(sdf * alpha), crosses)
-    weight = jnp.where(crosses, beta, 0.0)
+    fraction = _crossing_fraction(*_edge_ends(sdf * alpha), is_crossed)
+    weight = jnp.where(is_crossed, beta, 0.0)
     total = jnp.where(is_real, jnp.sum(weight, axis=0), 1.0)
-    crossing = start + fraction[None, :, :] * along
-    points = jnp.sum(weight[None, :, :] * crossing, axis=1) / total[None, :]
+    crossing_points = start + fraction[None, :, :] * edge_vectors
+    points = jnp.sum(weight[None, :, :] * crossing_points, axis=1) / total[None, :]
     # FlexiCubes Eq. 8 measures the plain crossings, without alpha.
-    plain = start + _crossing_fraction(*_edge_ends(sdf), crosses)[None, :, :] * along
-    deviations = _deviations(plain - points[:, None, :], crosses)
+    plain_points = (
+        start + _crossing_fraction(*_edge_ends(sdf), is_crossed)[None, :, :] * edge_vectors
+    )
+    deviations = _deviations(plain_points - points[:, None, :], is_crossed)
     points = jnp.where(is_real[None, :], points, 0.0)
     return _Duals(
         points=points * cell_size,
         gamma=gamma,
         cells=jnp.where(is_real, cells.number[row], 0),
         deviations=deviations * cell_size,
-        crosses=crosses,
+        crosses=is_crossed,
     )
 
 
@@ -308,19 +310,19 @@ class _Quads(NamedTuple):
 
 def _quads(lattice: Lattice, cells: _Cells, *, capacity: int) -> _Quads:
     """Join the dual vertices of the four cells around every crossed interior edge."""
-    owned = _owned_crossings(cells.signs, cells.coordinates)
-    owner = bit_set(owned.reshape(-1)).first(capacity=capacity)
+    is_owned = _owned_crossings(cells.signs, cells.coordinates)
+    owner = bit_set(is_owned.reshape(-1)).first(capacity=capacity)
     row, axis = owner // 3, owner % 3
     is_real = jnp.arange(capacity, dtype=jnp.int32) < cells.quad_count
 
     nx, ny, nz = lattice.grid.shape
     steps = QUAD_CELLS @ np.array([1, nx, nx * ny], np.int32)
     number = cells.number[row][None, :] + _rows(jnp.asarray(steps), axis).T
-    around = cells.bits.rank(lattice.rows_of_cells(jnp.clip(number, 0, nx * ny * nz - 1)))
+    cell_ranks = cells.bits.rank(lattice.rows_of_cells(jnp.clip(number, 0, nx * ny * nz - 1)))
     edge = _rows(jnp.asarray(QUAD_EDGES), axis).T
     patch_of_edge = jnp.asarray(PATCH_OF_EDGE.astype(np.int32).reshape(-1))
-    slot = _rows(patch_of_edge, _rows(cells.case, around) * 12 + edge)
-    corners = _rows(cells.first_vertex, around) + slot
+    slot = _rows(patch_of_edge, _rows(cells.case, cell_ranks) * 12 + edge)
+    corners = _rows(cells.first_vertex, cell_ranks) + slot
 
     # The surface faces the positive side: along the axis if its lower end is inside.
     is_inside = cells.signs[row] & 1 == 1
@@ -343,11 +345,11 @@ def _quad_centres(
     """Blend the middles of the two diagonals by gamma; zero on padding."""
     rows = jnp.concatenate([points, gamma[None, :]]).T
     corner = jnp.moveaxis(_rows(rows, quads.corners), -1, 0)
-    first, second = _diagonal_weights(corner[3])
+    first_weight, second_weight = _diagonal_weights(corner[3])
     middle_first = 0.5 * (corner[:3, 0] + corner[:3, 2])
     middle_second = 0.5 * (corner[:3, 1] + corner[:3, 3])
-    blended = middle_first * first[None, :] + middle_second * second[None, :]
-    centres = blended / (first + second + _SPLIT_EPSILON)[None, :]
+    blended = middle_first * first_weight[None, :] + middle_second * second_weight[None, :]
+    centres = blended / (first_weight + second_weight + _SPLIT_EPSILON)[None, :]
     return jnp.where(quads.mask[None, :], centres, 0.0).T
 
 
@@ -363,8 +365,10 @@ def _fan_faces(quads: _Quads, first_centre: Int[Array, ""]) -> Int[Array, "F 3"]
 
 def _split_faces(gamma: Float[Array, " Cd"], quads: _Quads) -> Int[Array, "F 3"]:
     """Two triangles per quad, split along the diagonal with the larger weight."""
-    first, second = _diagonal_weights(_rows(gamma, quads.corners))
-    takes_first = (first > second) | ((first == second) & quads.prefers_first_on_tie)
+    first_weight, second_weight = _diagonal_weights(_rows(gamma, quads.corners))
+    takes_first = (first_weight > second_weight) | (
+        (first_weight == second_weight) & quads.prefers_first_on_tie
+    )
     along_first = quads.corners[np.array([0, 1, 2, 0, 2, 3])]
     along_second = quads.corners[np.array([0, 1, 3, 3, 1, 2])]
     return jnp.where(takes_first[None, :], along_first, along_second).T.reshape(-1, 3)
@@ -422,7 +426,7 @@ def isosurface(
     else:
         faces = _split_faces(duals.gamma, quads)
         quad_centers = jnp.zeros(quads.mask.shape, jnp.int32)
-    faces_each = 4 if training else 2
+    faces_per_quad = 4 if training else 2
 
     grid = lattice.grid
     centre = grid.origin + grid.cell_size * 0.5 * jnp.asarray(grid.shape, grid.origin.dtype)
@@ -431,18 +435,18 @@ def isosurface(
         vertices=jnp.where(is_vertex[:, None], vertices + centre[None, :], 0.0),
         faces=faces,
         vertex_count=vertex_count,
-        face_count=faces_each * cells.quad_count,
+        face_count=faces_per_quad * cells.quad_count,
     )
-    needed = usage(
+    needs = usage(
         surface_cubes=cells.bits.count, dual_vertices=cells.vertex_count, quads=cells.quad_count
     )
-    elements = jnp.maximum(jnp.sum(duals.crosses, dtype=jnp.int32), 1).astype(
+    crossing_count = jnp.maximum(jnp.sum(duals.crosses, dtype=jnp.int32), 1).astype(
         duals.deviations.dtype
     )
     return IsoSurface(
         mesh=mesh,
-        usage=needed,
-        deviation=jnp.sum(duals.deviations) / elements,
+        usage=needs,
+        deviation=jnp.sum(duals.deviations) / crossing_count,
         vertex_cells=duals.cells,
         quads=quads.corners.T,
         centers=quad_centers,

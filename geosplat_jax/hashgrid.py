@@ -133,9 +133,9 @@ def _hash_line(
     The upper 24 bits of the hash scale an interval; float32 holds them exactly and the product
     never rounds up to ``offset_count``. (An integer remainder would not vectorise.)
     """
-    mixed = (y.astype(jnp.uint32) * _HASH_Y) ^ (z.astype(jnp.uint32) * _HASH_Z)
-    mixed = (mixed ^ (mixed >> 15)) * _HASH_FINAL
-    fraction = (mixed >> 8).astype(jnp.float32)
+    hashes = (y.astype(jnp.uint32) * _HASH_Y) ^ (z.astype(jnp.uint32) * _HASH_Z)
+    hashes = (hashes ^ (hashes >> 15)) * _HASH_FINAL
+    fraction = (hashes >> 8).astype(jnp.float32)
     return (fraction * (offset_count * np.float32(2.0**-24))).astype(jnp.int32)
 
 
@@ -164,9 +164,9 @@ def _locate(points: Float[Array, "N 3"], spec: HashGridSpec) -> _Cells:
         dense_line = ((z + dz) * (cells + 1) + (y + dy)) * (cells + 1)
         line = jnp.where(is_dense, dense_line, _hash_line(y + dy, z + dz, offset_count))
         rows.append(first_rows + line + x)
-    located = _Cells(tuple(rows), tuple(fractions))
+    locations = _Cells(tuple(rows), tuple(fractions))
     # Without the barrier XLA repeats the hashing for every feature of every corner (x1.6 time).
-    return jax.lax.optimization_barrier(located)
+    return jax.lax.optimization_barrier(locations)
 
 
 def _line_weights(cells: _Cells) -> list[Float[Array, "N L"]]:
@@ -197,15 +197,15 @@ def _reference_encode(
     """Encode with plain operations that autodiff differentiates; the reference of `encode`."""
     is_inside = (points >= 0) & (points <= 1)
     clamped = jnp.where(is_inside, points, jnp.clip(jax.lax.stop_gradient(points), 0.0, 1.0))
-    located = _locate(jax.lax.stop_gradient(points), spec)
+    locations = _locate(jax.lax.stop_gradient(points), spec)
     cells = jnp.asarray(spec.resolutions, points.dtype)[None, :]
     fractions = []
     for axis in range(3):
         scaled = clamped[:, axis, None] * cells
         # The same fractions, but with a derivative: the corner of the cell is a constant.
-        corner = jax.lax.stop_gradient(scaled) - located.fractions[axis]
+        corner = jax.lax.stop_gradient(scaled) - locations.fractions[axis]
         fractions.append(scaled - corner)
-    features = _interpolate(table, _Cells(located.rows, tuple(fractions)))
+    features = _interpolate(table, _Cells(locations.rows, tuple(fractions)))
     return features.reshape(points.shape[0], spec.width)
 
 
@@ -263,7 +263,7 @@ def _point_gradient(
     along_z = (line[2] - line[0]) * (1 - ty) + (line[3] - line[1]) * ty
     # The chain rule of scaling a point to a level's cells.
     sizes = jnp.asarray(spec.resolutions, points.dtype)[None, :]
-    gradient = [jnp.sum(along * sizes, axis=1) for along in (along_x, along_y, along_z)]
+    gradient = [jnp.sum(slope * sizes, axis=1) for slope in (along_x, along_y, along_z)]
     return jnp.where((points >= 0) & (points <= 1), jnp.stack(gradient, axis=-1), 0.0)
 
 

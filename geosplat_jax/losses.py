@@ -181,12 +181,12 @@ class SharedInputs:
         """Eq. 15-17 on a random subset of the splats: unbiased, at a fraction of the cost."""
         splats, objective = self.asset.splats, self.objective
         choice_key, displacement_key = jax.random.split(self.key)
-        drawn = jax.random.uniform(choice_key, (objective.smoothness_samples,), jnp.float32)
-        picked = jnp.floor(drawn * splats.count.astype(jnp.float32)).astype(jnp.int32)
+        uniforms = jax.random.uniform(choice_key, (objective.smoothness_samples,), jnp.float32)
+        rows = jnp.floor(uniforms * splats.count.astype(jnp.float32)).astype(jnp.int32)
         return smoothness(
             self.params.material,
-            splats.anchors[picked],
-            jnp.broadcast_to(splats.count > 0, picked.shape),
+            splats.anchors[rows],
+            jnp.broadcast_to(splats.count > 0, rows.shape),
             displacement_key,
             self.surface.box,
             spec=self.fields,
@@ -206,9 +206,9 @@ def random_background(
     """Colours behind both images, by `Objective.background`."""
     if kind == "black":
         return jnp.zeros(shape, dtype)
-    drawn = shape if kind == "pixel" else (shape[0], 1, 1, 3)
+    sample_shape = shape if kind == "pixel" else (shape[0], 1, 1, 3)
     # Drawn in float32 at any precision, so that a run in float64 sees the same numbers.
-    colors = jax.random.uniform(key, drawn, jnp.float32).astype(dtype)
+    colors = jax.random.uniform(key, sample_shape, jnp.float32).astype(dtype)
     return jnp.broadcast_to(colors, shape)
 
 
@@ -272,8 +272,8 @@ def image_dissimilarity(images: ImagePair) -> Float[Array, ""]:
         return 1.0 - jnp.mean(jax.vmap(ssim)(predicted, target))
     # Values of pixels that do not count must not reach the sums, not even as a NaN.
     predicted, target = (jnp.where(valid[..., None] > 0, x, 0.0) for x in (predicted, target))
-    each = jax.vmap(lambda a, b, counts: ssim(a, b, valid=counts))(predicted, target, valid)
-    return 1.0 - jnp.mean(each)
+    similarities = jax.vmap(lambda a, b, counts: ssim(a, b, valid=counts))(predicted, target, valid)
+    return 1.0 - jnp.mean(similarities)
 
 
 def mask_error(images: ImagePair) -> Float[Array, ""]:
@@ -387,9 +387,11 @@ def light_smoothness(radiance: Float[Array, "H W 3"]) -> Float[Array, ""]:
     """
     values = safe_log(radiance)
     weight = _solid_angle_shares(radiance)
-    around = jnp.mean(absolute(jnp.roll(values, 1, axis=1) - values), axis=-1)
-    upwards = jnp.mean(absolute(values[1:] - values[:-1]), axis=-1)
-    return jnp.sum(weight * around) + jnp.sum(0.5 * (weight[1:] + weight[:-1]) * upwards)
+    row_changes = jnp.mean(absolute(jnp.roll(values, 1, axis=1) - values), axis=-1)
+    column_changes = jnp.mean(absolute(values[1:] - values[:-1]), axis=-1)
+    return jnp.sum(weight * row_changes) + jnp.sum(
+        0.5 * (weight[1:] + weight[:-1]) * column_changes
+    )
 
 
 def _solid_angle_shares(radiance: Float[Array, "H W 3"]) -> Float[Array, "H W"]:
@@ -426,12 +428,12 @@ def edge_aware_smoothness(
     """
     inside = image[..., 3] if valid is None else image[..., 3] * valid
     total = jnp.sum(inside[..., None] * values, axis=(0, 1, 2))
-    twice = 2.0 * safe_divide(total, jnp.sum(inside))
-    values = safe_divide(values, safe_power(twice, relative)[None, None, None])
+    doubled_mean = 2.0 * safe_divide(total, jnp.sum(inside))
+    values = safe_divide(values, safe_power(doubled_mean, relative)[None, None, None])
     terms = []
     for axis in (1, 2):
-        ends = (slice(None),) * axis
-        first, second = (*ends, slice(None, -1)), (*ends, slice(1, None))
+        leading_axes = (slice(None),) * axis
+        first, second = (*leading_axes, slice(None, -1)), (*leading_axes, slice(1, None))
         edge = jnp.mean(absolute(image[first] - image[second])[..., :3], axis=-1)
         weight = inside[first] * inside[second]
         change = jnp.sum(absolute(values[first] - values[second]), axis=-1)
@@ -522,6 +524,6 @@ def shared_terms(x: SharedInputs, names: Iterable[str]) -> dict[str, Float[Array
         elif name in x.penalties:
             terms[name] = x.penalties[name]
         elif name not in VIEW_TERMS:
-            known = sorted((*term_names(), *x.penalties))
-            raise ValueError(f"unknown term of the loss {name!r}; expected some of {known}")
+            known_names = sorted((*term_names(), *x.penalties))
+            raise ValueError(f"unknown term of the loss {name!r}; expected some of {known_names}")
     return terms

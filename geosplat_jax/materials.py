@@ -228,17 +228,17 @@ def _surface_attributes(
     field: MaterialField, features: Float[Array, "N W"], spec: MaterialSpec
 ) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
     """Evaluate roughness and metallic; a model without them has roughness 1 and metallic 0."""
-    one, zero = jnp.ones_like(features[:, 0]), jnp.zeros_like(features[:, 0])
+    ones, zeros = jnp.ones_like(features[:, 0]), jnp.zeros_like(features[:, 0])
     if spec.specular == "none":
-        return one, zero
-    raw, metallic = jnp.zeros_like(features[:, :0]), zero
+        return ones, zeros
+    raw, metallic = jnp.zeros_like(features[:, :0]), zeros
     if field.surface_head is not None:
         raw = apply_mlp(field.surface_head, features)
     if spec.specular == "field":
         logit = raw[:, 0]
     else:
         assert field.roughness_logit is not None
-        logit = field.roughness_logit * one
+        logit = field.roughness_logit * ones
     roughness = jax.nn.sigmoid(logit + spec.initial_roughness_logit)
     roughness = roughness * (1 - ROUGHNESS_MINIMUM) + ROUGHNESS_MINIMUM
     if spec.has_metallic:
@@ -309,21 +309,21 @@ def smoothness(
     # Drawn in float32 at any precision, so that a run in float64 sees the same numbers.
     noise = jax.random.normal(key, points.shape, jnp.float32).astype(points.dtype)
     moved = points + std * box.half_extent * noise
-    both = materials_at(field, jnp.concatenate([points, moved]), box, spec=spec)  # Eq. 15, 16
-    half = points.shape[0]
+    materials = materials_at(field, jnp.concatenate([points, moved]), box, spec=spec)  # Eq. 15, 16
+    count = points.shape[0]
     total = jnp.sum(mask).astype(points.dtype)
 
     def mean(change: Float[Array, " M"]) -> Float[Array, ""]:
         return safe_divide(jnp.sum(jnp.where(mask, change, 0.0)), total)
 
     def albedo_change() -> Float[Array, ""]:
-        first, second = both.albedo[:half], both.albedo[half:]
+        first, second = materials.albedo[:count], materials.albedo[count:]
         change = jax.vmap(mean, in_axes=1)(absolute(first - second))
-        twice = jax.vmap(mean, in_axes=1)(first + second)
-        return jnp.sum(safe_divide(change, safe_power(twice, relative)))
+        doubled_mean = jax.vmap(mean, in_axes=1)(first + second)
+        return jnp.sum(safe_divide(change, safe_power(doubled_mean, relative)))
 
     return Changes(  # Eq. 17
         albedo_change(),
-        mean(absolute(both.roughness[:half] - both.roughness[half:])),
-        mean(absolute(both.metallic[:half] - both.metallic[half:])),
+        mean(absolute(materials.roughness[:count] - materials.roughness[count:])),
+        mean(absolute(materials.metallic[:count] - materials.metallic[count:])),
     )

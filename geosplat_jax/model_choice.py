@@ -148,29 +148,31 @@ def choose_model(
     """
     how = how or ModelChoice()
     trials = _Trials(dataset, config, choice_folder(output), how, listener)
-    offered = offered_parts(config, how.by_hand)
-    kept: frozenset[str] = frozenset()
+    candidate_parts = offered_parts(config, how.by_hand)
+    kept_names: frozenset[str] = frozenset()
     rungs = []
     with locked_folder(trials.state_path.parent, own=trials.state_path):
         trials.open(begin)
         if begin.replace:
             RunFolder(output).make_room(replace=True)
-        for part in offered:
-            if not kept.issuperset(_among(part.follows, offered)):
+        for part in candidate_parts:
+            if not kept_names.issuperset(_among(part.follows, candidate_parts)):
                 continue
-            wanted = kept | {part.name} | _among(part.needs, offered)
+            trial_names = kept_names | {part.name} | _among(part.needs, candidate_parts)
             if part.is_photographed:
-                rung = _tried(trials, part, kept, wanted)
+                rung = _tried(trials, part, kept_names, trial_names)
             else:
-                rung = _seen_on_surface(trials, part, kept, wanted)
-            kept = frozenset(wanted) if rung.is_kept else kept
+                rung = _seen_on_surface(trials, part, kept_names, trial_names)
+            kept_names = frozenset(trial_names) if rung.is_kept else kept_names
             rungs.append(rung)
             listener.on_rung(rung)
         trials.close()
     return ChosenModel(
-        config=trials.model(kept),
+        config=trials.model(kept_names),
         rungs=tuple(rungs),
-        by_hand=tuple(part.title for part in LADDER if part.is_in(config) and part not in offered),
+        by_hand=tuple(
+            part.title for part in LADDER if part.is_in(config) and part not in candidate_parts
+        ),
         held_back=trials.held.names,
         trainings=trials.count,
         seconds=trials.seconds,
@@ -182,47 +184,53 @@ def _among(names: Iterable[str], parts: Iterable[Part]) -> frozenset[str]:
     return frozenset(names) & {part.name for part in parts}
 
 
-def _tried(trials: "_Trials", part: Part, kept: Collection[str], wanted: Collection[str]) -> Rung:
+def _tried(
+    trials: "_Trials", part: Part, kept_names: Collection[str], trial_names: Collection[str]
+) -> Rung:
     """Compare the models with a part and without it.
 
     More seeds of the smaller model are trained only where the gain exceeds its standard error.
     """
-    smaller = [trials.decibels(kept, 0)]
-    before = float(np.mean(smaller[0]))
+    smaller = [trials.decibels(kept_names, 0)]
+    smaller_mean = float(np.mean(smaller[0]))
     try:
-        larger = trials.decibels(wanted, 0)
+        larger = trials.decibels(trial_names, 0)
     except TrainingError as error:
-        return Rung(part.name, part.title, before, None, None, False, str(error))
-    brought = [other.title for other in LADDER if other.name in set(wanted) - {*kept, part.name}]
-    note = f"with {', '.join(brought)}" if brought else ""
-    found = compare(larger, smaller, trials.blocks)
-    if found.is_kept:
+        return Rung(part.name, part.title, smaller_mean, None, None, False, str(error))
+    added_titles = [
+        added_part.title
+        for added_part in LADDER
+        if added_part.name in set(trial_names) - {*kept_names, part.name}
+    ]
+    note = f"with {', '.join(added_titles)}" if added_titles else ""
+    evidence = compare(larger, smaller, trials.blocks)
+    if evidence.is_kept:
         for seed in range(1, trials.how.seeds):
             # A seed whose training fails says nothing of the others.
             with suppress(TrainingError):
-                smaller.append(trials.decibels(kept, seed))
-        found = compare(larger, smaller, trials.blocks)
-    after = float(np.mean(larger))
-    return Rung(part.name, part.title, before, after, found, found.is_kept, note)
+                smaller.append(trials.decibels(kept_names, seed))
+        evidence = compare(larger, smaller, trials.blocks)
+    larger_mean = float(np.mean(larger))
+    return Rung(part.name, part.title, smaller_mean, larger_mean, evidence, evidence.is_kept, note)
 
 
 def _seen_on_surface(
-    trials: "_Trials", part: Part, kept: Collection[str], wanted: Collection[str]
+    trials: "_Trials", part: Part, kept_names: Collection[str], trial_names: Collection[str]
 ) -> Rung:
     """Keep a part, such as shadows, if the surface blocks enough light from itself.
 
     For parts that photographs under one light cannot judge (`Part.is_photographed`). A part that
     would be kept is trained once, and left out if that training fails.
     """
-    before = float(np.mean(trials.decibels(kept, 0)))
+    smaller_mean = float(np.mean(trials.decibels(kept_names, 0)))
     share = trials.blocked_share()
     note = f"the surface blocks {100 * share:.1f} % of a uniform sky's light from itself"
     if share > _BLOCKED:
         try:
-            trials.decibels(wanted, 0)
+            trials.decibels(trial_names, 0)
         except TrainingError as error:
-            return Rung(part.name, part.title, before, None, None, False, str(error))
-    return Rung(part.name, part.title, before, None, None, share > _BLOCKED, note)
+            return Rung(part.name, part.title, smaller_mean, None, None, False, str(error))
+    return Rung(part.name, part.title, smaller_mean, None, None, share > _BLOCKED, note)
 
 
 class _Trials:
@@ -256,8 +264,8 @@ class _Trials:
         self.how, self._config, self._folder, self._listener = how, config, folder, listener
         self._first, self._last = stages[0], stages[-1]
         self._offered = offered_parts(config, how.by_hand)
-        longest = max(dataset.train.height, dataset.train.width)
-        factor = reduction_factor(longest, config.geometry.cells_along or _USUAL_CELLS)
+        longest_side = max(dataset.train.height, dataset.train.width)
+        factor = reduction_factor(longest_side, config.geometry.cells_along or _USUAL_CELLS)
         self.held = some_views(dataset.train, held, factor=factor)
         self._dataset = replace(
             dataset,
@@ -266,9 +274,9 @@ class _Trials:
             options={**dataset.options, "reduced": factor, "held_back": how.hold_back},
         )
         center = 0.5 * (np.asarray(dataset.bounds[0]) + np.asarray(dataset.bounds[1]))
-        towards = self.held.camera_to_world[:, :3, 3] - center
-        lengths = np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
-        self.blocks = neighbouring_blocks(towards / lengths)
+        view_vectors = self.held.camera_to_world[:, :3, 3] - center
+        lengths = np.maximum(np.linalg.norm(view_vectors, axis=1, keepdims=True), 1e-12)
+        self.blocks = neighbouring_blocks(view_vectors / lengths)
         self._measured: dict[str, dict[str, Any]] = {}
         self._stage_1_seconds: dict[str, float] = {}
         self._blocked: float | None = None
@@ -281,8 +289,10 @@ class _Trials:
     @property
     def seconds(self) -> float:
         """Seconds that all trainings took, first stages included."""
-        trials = sum(float(found["seconds"]) for found in self._measured.values())
-        return trials + sum(self._stage_1_seconds.values())
+        trial_seconds = sum(
+            float(measurement["seconds"]) for measurement in self._measured.values()
+        )
+        return trial_seconds + sum(self._stage_1_seconds.values())
 
     @property
     def state_path(self) -> Path:
@@ -315,27 +325,29 @@ class _Trials:
             )
         try:
             state = parse_json(path.read_bytes())
-            seconds = {name: float(taken) for name, taken in state["first_stages"].items()}
-            measured = {name: self._checked(found) for name, found in state["trainings"].items()}
-            blocked = state.get("blocked")
-            self._blocked = None if blocked is None else float(blocked)
-            was = state["mark"]
+            seconds = {name: float(value) for name, value in state["first_stages"].items()}
+            measurements = {
+                name: self._checked(measurement) for name, measurement in state["trainings"].items()
+            }
+            share = state.get("blocked")
+            self._blocked = None if share is None else float(share)
+            old_mark = state["mark"]
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise RunError(f"{path} is damaged: {error}; begin anew with --force") from None
-        if was != mark:
+        if old_mark != mark:
             raise RunError(
                 f"{path} was begun with other settings or other views, or these were read with "
                 "other options, or by another version; use the same again, or begin anew with "
                 "--force"
             )
-        self._measured, self._stage_1_seconds = measured, seconds
+        self._measured, self._stage_1_seconds = measurements, seconds
 
-    def _checked(self, found: Mapping[str, Any]) -> dict[str, Any]:
+    def _checked(self, measurement: Mapping[str, Any]) -> dict[str, Any]:
         """Return a measurement from the file; raise an error where it has another form."""
-        seconds = float(found["seconds"])
-        if "failure" in found:
-            return {"failure": str(found["failure"]), "seconds": seconds}
-        decibels = [float(value) for value in found["psnr"]]
+        seconds = float(measurement["seconds"])
+        if "failure" in measurement:
+            return {"failure": str(measurement["failure"]), "seconds": seconds}
+        decibels = [float(value) for value in measurement["psnr"]]
         if len(decibels) != len(self.held) or not np.isfinite(decibels).all():
             raise ValueError(f"a number for each of {len(self.held)} views is expected")
         return {"psnr": decibels, "seconds": seconds}
@@ -349,14 +361,14 @@ class _Trials:
     @cached_property
     def _mark(self) -> str:
         """Digest of settings, options and photographs, which tells this choice from others."""
-        what = (
+        identity = (
             self._config.to_dict(),
             asdict(replace(self.how, by_hand=())),
             [part.name for part in self._offered],
             {name: text for name, text in self._dataset.options.items() if name != "cameras"},
             [[x.fingerprint(), x.mean_colors.tolist()] for x in (self._dataset.train, self.held)],
         )
-        text = json.dumps(what, sort_keys=True, default=str)
+        text = json.dumps(identity, sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def _save(self, mark: str) -> None:
@@ -369,8 +381,8 @@ class _Trials:
             "trainings": self._measured,
             "blocked": self._blocked,
         }
-        with written_aside(self.state_path) as aside:
-            aside.write_text(json.dumps(state, indent=2) + "\n", encoding="utf-8")
+        with written_aside(self.state_path) as temporary_path:
+            temporary_path.write_text(json.dumps(state, indent=2) + "\n", encoding="utf-8")
 
     def decibels(self, kept: Collection[str], seed: int) -> np.ndarray:
         """Return the decibels of a model on every held-back view, (V,); train it first if needed.
@@ -389,16 +401,16 @@ class _Trials:
         if name not in self._measured:
             start = self._start("cells" in kept)
             folder = self._folder / name
-            began = time.perf_counter() - _seconds_used(folder)
+            start_time = time.perf_counter() - _seconds_used(folder)
             config = self._trial(self.model(kept), self._last, seed)
-            found: dict[str, Any] = {}
+            measurement: dict[str, Any] = {}
             try:
                 self._fit(config, folder, start)
-                found["psnr"] = self._measure(folder).tolist()
+                measurement["psnr"] = self._measure(folder).tolist()
             except TrainingError as error:
-                found["failure"] = str(error)
-            found["seconds"] = round(time.perf_counter() - began, 2)
-            self._measured[name] = found
+                measurement["failure"] = str(error)
+            measurement["seconds"] = round(time.perf_counter() - start_time, 2)
+            self._measured[name] = measurement
             self._save(self._mark)
             shutil.rmtree(folder, ignore_errors=True)  # it may hold nothing yet
         if "failure" in self._measured[name]:
@@ -426,29 +438,33 @@ class _Trials:
 
         There is one first stage for each size of the cells. It has all parts of the material.
         """
-        left_out = (*_SIZES, *(() if has_finer_cells else ("cells",)))
+        omitted_names = (*_SIZES, *(() if has_finer_cells else ("cells",)))
         name = _first_stage(has_finer_cells)
-        parts = [part for part in self._offered if part.name in left_out]
+        omitted_parts = [part for part in self._offered if part.name in omitted_names]
         folder = self._folder / name
         if name not in self._stage_1_seconds:
-            began = time.perf_counter() - _seconds_used(folder)
-            self._fit(self._trial(without(self._config, parts), self._first, 0), folder, None)
-            self._stage_1_seconds[name] = round(time.perf_counter() - began, 2)
+            start_time = time.perf_counter() - _seconds_used(folder)
+            self._fit(
+                self._trial(without(self._config, omitted_parts), self._first, 0), folder, None
+            )
+            self._stage_1_seconds[name] = round(time.perf_counter() - start_time, 2)
             self._save(self._mark)
         return _start_of(folder)
 
     def _trial(self, config: Config, stage: Stage, seed: int) -> Config:
         """Return settings of a short training of one stage."""
-        chosen = config.stage(stage.name)
-        chosen = replace(chosen, batch_views=min(chosen.batch_views, _BATCH_VIEWS), enter=())
+        trial_stage = config.stage(stage.name)
+        trial_stage = replace(
+            trial_stage, batch_views=min(trial_stage.batch_views, _BATCH_VIEWS), enter=()
+        )
         run = replace(
             config.run,
             seed=(config.run.seed + seed) % 2**32,
             checkpoint_every=max(1, self.how.steps // 3),
             preview_every=0,
         )
-        single = replace(config, run=run, stages=(chosen,))
-        return with_steps(single, min(1.0, self.how.steps / chosen.steps))
+        trial_config = replace(config, run=run, stages=(trial_stage,))
+        return with_steps(trial_config, min(1.0, self.how.steps / trial_stage.steps))
 
     def _fit(self, config: Config, folder: Path, start: Start | None) -> None:
         begin = Resume(start=start)
@@ -462,11 +478,13 @@ class _Trials:
 
 def _decibels(renderer: Renderer, views: Views, view: int) -> float:
     """Peak signal-to-noise ratio of one view over the pixels that count."""
-    found = renderer(views.camera([view]))
-    error = render_on_white(found.rgb, found.alpha) - photograph_on_white(views.images[view])
-    counted = np.ones(error.shape[:2]) if views.valid is None else views.valid[view]
-    mean = float(np.sum(counted[..., None] * error**2) / (3.0 * max(float(counted.sum()), 1.0)))
-    return -10.0 * math.log10(max(mean, 1e-20))
+    output = renderer(views.camera([view]))
+    error = render_on_white(output.rgb, output.alpha) - photograph_on_white(views.images[view])
+    pixel_weights = np.ones(error.shape[:2]) if views.valid is None else views.valid[view]
+    mean_square = float(
+        np.sum(pixel_weights[..., None] * error**2) / (3.0 * max(float(pixel_weights.sum()), 1.0))
+    )
+    return -10.0 * math.log10(max(mean_square, 1e-20))
 
 
 def _first_stage(has_finer_cells: bool) -> str:

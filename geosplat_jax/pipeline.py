@@ -111,15 +111,17 @@ class Pipeline(RenderPipeline):
         asset = self.reconstruct(params)
         views = [batch.view(number) for number in range(batch.camera.count)]
         lists = [self.visible(asset.splats, view.camera) for view in views]
-        seen = self.points_seen(asset, lists)
-        lights, carry = self.lights(asset, params.light, seen, batch)
-        others = self.residual_lights(asset, params.light, seen, batch)
+        is_seen = self.points_seen(asset, lists)
+        lights, carry = self.lights(asset, params.light, is_seen, batch)
+        second_lights = self.residual_lights(asset, params.light, is_seen, batch)
         total, shared = self.shared_loss(params, asset, lights, batch)
         reports = []
-        for view, listed, share in zip(views, lists, batch.shares, strict=True):
-            residual = self.residual_image(params.log_exposure, asset, others, listed, view)
+        for view, view_lists, share in zip(views, lists, batch.shares, strict=True):
+            residual = self.residual_image(
+                params.log_exposure, asset, second_lights, view_lists, view
+            )
             value, report = self.view_loss(
-                params.log_exposure, asset, lights, listed, view, residual
+                params.log_exposure, asset, lights, view_lists, view, residual
             )
             total = total + share * value
             reports.append(report.times(share))
@@ -269,5 +271,5 @@ class Pipeline(RenderPipeline):
 
     def _weighted(self, terms: dict[str, Float[Array, ""]]) -> Float[Array, ""]:
         """Sum up terms with their weights (Eq. 19)."""
-        parts = [self.weights[name] * term for name, term in terms.items()]
-        return jnp.sum(jnp.stack(parts)) if parts else jnp.zeros(())
+        weighted_terms = [self.weights[name] * term for name, term in terms.items()]
+        return jnp.sum(jnp.stack(weighted_terms)) if weighted_terms else jnp.zeros(())

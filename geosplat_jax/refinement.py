@@ -126,8 +126,8 @@ def possible_metal(albedo: Float[Array, "N 3"], darkest: float) -> Float[Array, 
     if darkest == 0:
         return jnp.ones_like(albedo[:, 0])
     brightest = jnp.max(jax.lax.stop_gradient(albedo), axis=1)
-    along = jnp.clip(2.0 * brightest / darkest - 1.0, 0.0, 1.0)
-    return along**2 * (3.0 - 2.0 * along)
+    ramp = jnp.clip(2.0 * brightest / darkest - 1.0, 0.0, 1.0)
+    return ramp**2 * (3.0 - 2.0 * ramp)
 
 
 @dataclass(frozen=True)
@@ -155,17 +155,19 @@ class FreeSplats(SplatModel):
         outward = normals.at[parents].get(mode="clip")
         means = box.center[None, :] + box.half_extent * parameters.means
         anchors = closest_on_faces(mesh, parents, means, margin=_OFF_THE_EDGE)
-        real = jnp.arange(count, dtype=jnp.int32) < mesh.face_count * SPLATS_PER_FACE
-        means = jnp.where(real[:, None], means, 0.0)
+        is_real = jnp.arange(count, dtype=jnp.int32) < mesh.face_count * SPLATS_PER_FACE
+        means = jnp.where(is_real[:, None], means, 0.0)
         unit_quat = jnp.array([[1.0, 0.0, 0.0, 0.0]], means.dtype)
         return Splats(
             means=means,
-            quats=jnp.where(real[:, None], safe_normalize(parameters.quats), unit_quat),
-            scales=jnp.where(real[:, None], box.half_extent * jnp.exp(parameters.log_scales), 1.0),
-            opacities=jnp.where(real, jax.nn.sigmoid(parameters.opacity_logits), 0.0),
-            normals=jnp.where(real[:, None], safe_normalize(parameters.normals), 0.0),
+            quats=jnp.where(is_real[:, None], safe_normalize(parameters.quats), unit_quat),
+            scales=jnp.where(
+                is_real[:, None], box.half_extent * jnp.exp(parameters.log_scales), 1.0
+            ),
+            opacities=jnp.where(is_real, jax.nn.sigmoid(parameters.opacity_logits), 0.0),
+            normals=jnp.where(is_real[:, None], safe_normalize(parameters.normals), 0.0),
             outward=outward,
-            anchors=jnp.where(real[:, None], anchors, 0.0),
+            anchors=jnp.where(is_real[:, None], anchors, 0.0),
             parents=parents,
             count=mesh.face_count * SPLATS_PER_FACE,
         )

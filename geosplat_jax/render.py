@@ -211,20 +211,20 @@ class PerSplat(ShadingDomain, kind="per_splat"):
         names: tuple[str, ...],
     ) -> tuple[dict[str, Float[Array, "H W c"]], Float[Array, "H W"]]:
         """Shade the visible splats towards the camera, then blend colours and attributes."""
-        splats, seen = asset.splats, lists.gather
-        means, normals = seen(splats.means), seen(splats.normals)
-        attributes = jax.tree.map(seen, asset.attributes)
+        splats, gather = asset.splats, lists.gather
+        means, normals = gather(splats.means), gather(splats.normals)
+        attributes = jax.tree.map(gather, asset.attributes)
         materials = attributes.materials
         shaded = pipeline.transport.shade(
             key,
-            jax.tree.map(seen, splats.points()),
+            jax.tree.map(gather, splats.points()),
             attributes,
             safe_normalize(camera.centers - means),
             illumination.take(lists.index),
             asset.index,
         )
         footprints = pipeline.project(
-            means, seen(splats.quats), seen(splats.scales, padding=1.0), camera
+            means, gather(splats.quats), gather(splats.scales, padding=1.0), camera
         )
         channels = {
             "rgb": shaded.rgb,
@@ -238,7 +238,7 @@ class PerSplat(ShadingDomain, kind="per_splat"):
             "specular_radiance": shaded.specular,
         }
         channels = {name: channels[name] for name in ("rgb", *names)}
-        return pipeline.blend(footprints, seen(splats.opacities), channels, lists, camera)
+        return pipeline.blend(footprints, gather(splats.opacities), channels, lists, camera)
 
 
 class RenderPipeline(eqx.Module):
@@ -345,8 +345,8 @@ class RenderPipeline(eqx.Module):
             compositor=self.compositor,
         )
         widths = [values.shape[-1] for values in channels.values()]
-        parts = jnp.split(image, np.cumsum(widths)[:-1], axis=-1)
-        return dict(zip(channels, parts, strict=True)), alpha
+        images = jnp.split(image, np.cumsum(widths)[:-1], axis=-1)
+        return dict(zip(channels, images, strict=True)), alpha
 
     def visible(self, splats: Splats, camera: Camera) -> TileLists:
         """List what a camera with a single view can see; no gradients."""
@@ -477,19 +477,19 @@ class RenderPipeline(eqx.Module):
             return self.visible(splats, Camera(pose, intrinsics, camera.height, camera.width)).usage
 
         views = jax.lax.map(one_view, (camera.world_to_camera, camera.intrinsics))
-        parts = [surface.usage, jax.tree.map(jnp.max, views)]
+        usages = [surface.usage, jax.tree.map(jnp.max, views)]
         if self.uses_rays:
-            parts.append(self.surface.ray_index(surface, capacities=self.capacities).usage)
-        return capacity_module.combine(*parts)
+            usages.append(self.surface.ray_index(surface, capacities=self.capacities).usage)
+        return capacity_module.combine(*usages)
 
     def points_seen(self, asset: Asset, lists: list[TileLists]) -> Bool[Array, " N"] | None:
         """Tell which splats some view sees; None where the transport needs the others as well."""
         if self.transport.needs_every_point:
             return None
-        seen = jnp.zeros(asset.splats.opacities.shape, bool)
-        for listed in lists:
-            seen = seen.at[listed.index].set(True, mode="drop")
-        return seen
+        is_seen = jnp.zeros(asset.splats.opacities.shape, bool)
+        for view_lists in lists:
+            is_seen = is_seen.at[view_lists.index].set(True, mode="drop")
+        return is_seen
 
     def _lists(self, asset: Asset, camera: Camera) -> list[TileLists]:
         """List what every view can see."""
@@ -510,12 +510,12 @@ class RenderPipeline(eqx.Module):
             self.render_view(
                 asset,
                 illumination,
-                listed,
+                view_lists,
                 camera.view(view),
                 aov_names=aov_names,
                 key=None if key is None else jax.random.fold_in(key, view),
             )
-            for view, listed in enumerate(lists)
+            for view, view_lists in enumerate(lists)
         ]
         usage = capacity_module.combine(*(view.usage for view in views))
         images = [(view.rgb, view.alpha, view.aovs) for view in views]

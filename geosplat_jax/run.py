@@ -59,11 +59,11 @@ _PREVIEW_SECONDS = 60.0
 
 def _true_light(dataset: Dataset, lights: Mapping[str, EnvLight]) -> EnvLight | None:
     """Return the light of the training images: by its name, or as the first test view saw it."""
-    named = lights.get(dataset.train_light or "")
-    if named is not None:
-        return named
-    first = next(iter(dataset.test.lights.values()), None)
-    return None if first is None else load_view_light(first)
+    light = lights.get(dataset.train_light or "")
+    if light is not None:
+        return light
+    view_light = next(iter(dataset.test.lights.values()), None)
+    return None if view_light is None else load_view_light(view_light)
 
 
 def mesh_of_run(folder: RunFolder) -> MeshSettings | None:
@@ -157,10 +157,10 @@ class Run:
         RunError
             If there was none, or its file is damaged.
         """
-        found = Evaluated.of(self.folder).metrics()
-        if not found:
+        results = Evaluated.of(self.folder).metrics()
+        if not results:
             raise RunError(f"{self.folder} has not been evaluated; do so first")
-        return found
+        return results
 
     def _views(self, split: str) -> Views:
         """Return a split that has views."""
@@ -170,9 +170,9 @@ class Run:
         return views
 
     def _output(self, folder: str | Path | None, name: str) -> Path:
-        chosen = self.folder.path / name if folder is None else Path(folder).expanduser()
-        chosen.mkdir(parents=True, exist_ok=True)
-        return chosen
+        path = self.folder.path / name if folder is None else Path(folder).expanduser()
+        path.mkdir(parents=True, exist_ok=True)
+        return path
 
     def evaluate(
         self,
@@ -211,11 +211,11 @@ class Run:
         trained = self.trained if stage is None else load_trained(self.folder, stage=stage)
         lights = {name: load_light(path) for name, path in dataset.lights.items()}
         peaks = [line["peak_memory_mb"] for line in self.steps() if "peak_memory_mb" in line]
-        evaluated = Evaluated.of(self.folder, stage=stage)
+        evaluation = Evaluated.of(self.folder, stage=stage)
         metrics = evaluate_run(
             trained,
             Truth(views, lights, _true_light(dataset, lights), dataset.train),
-            evaluated.results,
+            evaluation.results,
             EvaluateOptions(protocol, samples, relight_indirect),
             meta={
                 "scene": record["scene"],
@@ -227,7 +227,7 @@ class Run:
             },
             on_progress=on_progress,
         )
-        write_report(evaluated.results / REPORT, [evaluated])
+        write_report(evaluation.results / REPORT, [evaluation])
         return metrics
 
     def report(self, output: str | Path | None = None, *, others: Sequence["Run"] = ()) -> Path:
@@ -294,11 +294,11 @@ class Run:
         cameras.check()
         images.check()
         renderer = self.renderer(samples=samples).with_aovs(*images.aovs)
-        shots, written = cameras.shots(self.dataset, renderer.center()), []
+        shots, files = cameras.shots(self.dataset, renderer.center()), []
         folder = self._output(output, "renders")
         for name, camera in counted(shots, "views", on_progress):
-            written += images.write(folder, name, renderer(camera))
-        return written
+            files += images.write(folder, name, renderer(camera))
+        return files
 
     def relight(
         self,
@@ -334,12 +334,14 @@ class Run:
         cameras = cameras or Cameras(views=None)
         cameras.check()
         light = EnvLight(intensity * load_light(env).radiance)
-        relit = self.renderer(samples=samples).relit(
+        relit_renderer = self.renderer(samples=samples).relit(
             light, albedo_scale=albedo_scale, indirect=indirect
         )
-        shots = cameras.shots(self.dataset, relit.center())
+        shots = cameras.shots(self.dataset, relit_renderer.center())
         folder = self._output(output, f"relight_{Path(env).stem}")
-        return relight_views(relit, light, shots, folder, options, images, on_progress=on_progress)
+        return relight_views(
+            relit_renderer, light, shots, folder, options, images, on_progress=on_progress
+        )
 
     def refine_cameras(
         self,
@@ -372,23 +374,23 @@ class Run:
             If no split has views, or the run was trained with the cameras in ``output``.
         """
         path = Path(output or self.folder.path / "cameras.json")
-        own = self.dataset.options.get("cameras")
-        if own is not None and Path(own) == path.resolve():
+        own_cameras = self.dataset.options.get("cameras")
+        if own_cameras is not None and Path(own_cameras) == path.resolve():
             raise RunError(
                 f"{path} holds the cameras that {self.folder} was trained with; write to another "
                 "file with --output"
             )
-        chosen = [name for name in splits if getattr(self.dataset, name).names]
-        if not chosen:
+        split_names = [name for name in splits if getattr(self.dataset, name).names]
+        if not split_names:
             raise RunError(f"{self.dataset.root} has no {' and no '.join(splits)} views")
         subject = self.renderer(samples=samples).subject()
-        refined: dict[str, RefinedSplit] = {}
-        for split in chosen:
-            tell = None if on_view is None else partial(on_view, split)
-            refined[split] = refine_views(subject, self._views(split), how, on_view=tell)
-        refined = with_mean_balance(refined)
-        write_cameras(path, refined)
-        return refined
+        refined_splits: dict[str, RefinedSplit] = {}
+        for split in split_names:
+            callback = None if on_view is None else partial(on_view, split)
+            refined_splits[split] = refine_views(subject, self._views(split), how, on_view=callback)
+        refined_splits = with_mean_balance(refined_splits)
+        write_cameras(path, refined_splits)
+        return refined_splits
 
     def export(
         self,
@@ -439,15 +441,15 @@ class _Previews(Listener):
             return
         self.finish()
         # A copy, since the next step consumes the buffers of the parameters.
-        copied = replace(trained, params=jax.tree.map(jnp.array, trained.params))
-        self._running = in_background(lambda: self._write(copied))
+        snapshot = replace(trained, params=jax.tree.map(jnp.array, trained.params))
+        self._running = in_background(lambda: self._write(snapshot))
 
     def finish(self) -> None:
         """Wait for the preview that is being rendered; warn if it failed."""
-        running, self._running = self._running, None
-        if running is None:
+        future, self._running = self._running, None
+        if future is None:
             return
-        error = running.exception()
+        error = future.exception()
         if isinstance(error, Exception):
             warnings.warn(f"a preview could not be made: {error}", stacklevel=2)
         elif error is not None:
@@ -564,29 +566,29 @@ def train(
             "quality cannot be given with a config or a budget, which decide how much is spent; "
             "leave quality out"
         )
-    started, folder = time.perf_counter() if began is None else began, RunFolder(output)
+    start_time, folder = time.perf_counter() if began is None else began, RunFolder(output)
     if isinstance(devices, int):
         devices = choose_devices(devices)
     if model is not None and jax.process_count() > 1:  # asked after the devices were made
         raise ValueError("a model is chosen by one host; leave model out")
-    goes_on = begin.goes_on(folder)
+    is_resumed = begin.goes_on(folder)
     order = _Order(config, mesh, budget, reading)
-    if goes_on:
+    if is_resumed:
         order = _as_it_began(order, folder, chooses=model is not None)
     config, budget, reading = _settled(order, scene, quality=quality or "standard")
     dataset = scene if isinstance(scene, Dataset) else load_recorded(scene, reading)
     evidence = None
-    if model is not None and not goes_on:
+    if model is not None and not is_resumed:
         how = ModelChoice() if model == "auto" else model
-        chosen = _chosen_model(dataset, config, folder, how, begin, listener)
-        config, evidence = chosen.config, chosen.record()
-        started = time.perf_counter()  # the time of the choice is reported separately
-    earlier = (folder.training() or {}).get("seconds_total", 0.0) if goes_on else 0.0
-    used = folder.seconds_used() if goes_on else 0.0
+        choice = _chosen_model(dataset, config, folder, how, begin, listener)
+        config, evidence = choice.config, choice.record()
+        start_time = time.perf_counter()  # the time of the choice is reported separately
+    earlier_seconds = (folder.training() or {}).get("seconds_total", 0.0) if is_resumed else 0.0
+    used_seconds = folder.seconds_used() if is_resumed else 0.0
     pacer = None
     if budget is not None:
-        planned = folder.planned() if goes_on else config
-        pacer = _pacer(budget, dataset, planned, began=started - used)
+        planned_config = folder.planned() if is_resumed else config
+        pacer = _pacer(budget, dataset, planned_config, began=start_time - used_seconds)
     previews = _Previews(dataset, folder, pacer)
     try:
         fit(
@@ -603,7 +605,7 @@ def train(
         previews.finish()
     if devices.is_first_host:
         # Of an earlier, interrupted part of the training only the steps' seconds are known.
-        seconds = max(earlier, used) + time.perf_counter() - started
+        seconds = max(earlier_seconds, used_seconds) + time.perf_counter() - start_time
         folder.write_training({"seconds_total": round(seconds, 2)})
     run = Run(folder.path)
     run.dataset = dataset
@@ -628,9 +630,9 @@ def _require_consistent(
     begin: Begin,
 ) -> None:
     """Raise TypeError or ValueError, see `train`, if its arguments do not go together."""
-    if unknown := sorted(set(reading) - set(READING_OPTIONS)):
+    if unknown_options := sorted(set(reading) - set(READING_OPTIONS)):
         raise TypeError(
-            f"train takes no {', '.join(unknown)}; a scene is read by "
+            f"train takes no {', '.join(unknown_options)}; a scene is read by "
             f"{', '.join(sorted(READING_OPTIONS))}, and settings belong into the config"
         )
     if isinstance(scene, Dataset) and reading:
@@ -673,14 +675,14 @@ def _settled(
     """Return settings, budget and how to read the scene: as ordered, chosen, or by default."""
     config, mesh, budget, reading = order
     if config is None and budget is not None:
-        chosen = plan_training(
+        training_plan = plan_training(
             scene,
             budget,
             mesh=mesh,
             downscale=reading.get("downscale"),
             light=reading.get("light"),
         )
-        return chosen.config, budget, {**reading, "downscale": chosen.downscale}
+        return training_plan.config, budget, {**reading, "downscale": training_plan.downscale}
     config = config or make_config(quality=quality)
     return (config if mesh is None else with_mesh(config, mesh)), budget, reading
 

@@ -23,8 +23,8 @@ def assert_smooth_at(function, points, *, step=STEP, tolerance=TOLERANCE):
     function, slope = jax.jit(function), jax.jit(jax.grad(function))
     for x in map(jnp.asarray, points):
         for side in (-step, step):
-            found = one_sided(function, x, side)
-            np.testing.assert_allclose(float(slope(x)), found, rtol=tolerance, atol=tolerance)
+            difference = one_sided(function, x, side)
+            np.testing.assert_allclose(float(slope(x)), difference, rtol=tolerance, atol=tolerance)
 
 
 def assert_kink(function, x, *, left, right, returned, step=STEP, tolerance=TOLERANCE):

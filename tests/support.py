@@ -79,12 +79,12 @@ def sphere_views(count=6, *, size=24, radius=0.5, field_of_view=0.6):
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     images, normals = [], []
     for pose in poses:
-        towards = rays @ pose[:3, :3].T
-        along = towards @ pose[:3, 3]
-        root = along**2 - (pose[:3, 3] @ pose[:3, 3] - radius**2)
-        hit = root > 0
-        travelled = -along - np.sqrt(np.where(hit, root, 0.0))
-        normal = (pose[:3, 3] + travelled[..., None] * towards) / radius
+        directions = rays @ pose[:3, :3].T
+        projection = directions @ pose[:3, 3]
+        discriminant = projection**2 - (pose[:3, 3] @ pose[:3, 3] - radius**2)
+        hit = discriminant > 0
+        distance = -projection - np.sqrt(np.where(hit, discriminant, 0.0))
+        normal = (pose[:3, 3] + distance[..., None] * directions) / radius
         normal = np.where(hit[..., None], normal, 0.0)
         color = np.where(hit[..., None], 0.5 + 0.4 * normal, 0.0)
         images.append(np.concatenate([color, hit[..., None]], axis=-1))
@@ -167,11 +167,11 @@ def ball(config, *, radius=0.4, stage=None):
     params = initial_params(
         initial_geometry(grid, sphere_sdf(grid, radius=radius)), config, jax.random.key(0)
     )
-    chosen = config.active_stages[0] if stage is None else config.stage(stage)
+    chosen_stage = config.active_stages[0] if stage is None else config.stage(stage)
     pipeline = build_pipeline(config, config.active_stages[0], surface)
-    if chosen != config.active_stages[0]:
-        params = begin_stage(params, pipeline, config, chosen)
-        pipeline = build_pipeline(config, chosen, surface)
+    if chosen_stage != config.active_stages[0]:
+        params = begin_stage(params, pipeline, config, chosen_stage)
+        pipeline = build_pipeline(config, chosen_stage, surface)
     return replace(pipeline, capacities=surface.first_capacities(params.geometry)), params
 
 
@@ -230,16 +230,16 @@ def ball_of_one_material(config, *, albedo, roughness, metallic, radius=0.4, sta
 
 def operations(name, function, *arguments):
     """Return the operations of a name in a program, including those of its inner programs."""
-    found = []
+    equations = []
 
     def walk(jaxpr):
         for equation in jaxpr.eqns:
             if equation.primitive.name == name:
-                found.append(equation)
+                equations.append(equation)
             for value in jax.tree.leaves(list(equation.params.values())):
                 inner = getattr(value, "jaxpr", value)
                 if hasattr(inner, "eqns"):
                     walk(inner)
 
     walk(jax.make_jaxpr(function)(*arguments).jaxpr)
-    return found
+    return equations

@@ -255,7 +255,7 @@ def test_every_picture_is_there_for_itself_truth_beside_it(perfect):
     assert list(gallery["lights"]) == ["true light", "light"]
     assert all((folder / file).is_file() for file in gallery["lights"].values())
     model = gallery["model"]
-    assert list(model["lights"]) == ["light as found", *LIGHT_NAMES]
+    assert list(model["lights"]) == ["reconstructed light", *LIGHT_NAMES]
     assert (folder / model["mesh"]).read_bytes()[:4] == b"glTF"
     for file in model["lights"].values():
         assert read_image(folder / file).shape == (8, 16, 3)

@@ -42,20 +42,22 @@ def gradients():
     batch = replace(
         batch, camera=views.camera(range(VIEWS)), image=jnp.asarray(views.images), valid=valid
     )
-    one = value_and_gradient(pipeline, params, batch, frozen=("light",))
-    two = value_and_gradient(
+    single = value_and_gradient(pipeline, params, batch, frozen=("light",))
+    sharded = value_and_gradient(
         devices.place(pipeline),
         devices.place(params),
         devices.share_out(batch),
         frozen=("light",),
         run=devices.runner(),
     )
-    copies = [[part.data for part in leaf.addressable_shards] for leaf in jax.tree.leaves(two)]
-    assert all(len(parts) == 2 for parts in copies)
+    copies = [
+        [shard.data for shard in leaf.addressable_shards] for leaf in jax.tree.leaves(sharded)
+    ]
+    assert all(len(shards) == 2 for shards in copies)
     return {
-        "one": jax.tree.leaves(one),
-        "two": jax.tree.leaves(devices.local(two)),
-        "apart": np.array([not np.array_equal(*parts) for parts in copies]),
+        "one": jax.tree.leaves(single),
+        "two": jax.tree.leaves(devices.local(sharded)),
+        "apart": np.array([not np.array_equal(*shards) for shards in copies]),
     }
 
 
@@ -63,25 +65,25 @@ def trained(folder, host):
     """Train with interruptions, overflows and a refusal; return what this host saw."""
     devices = choose_devices(1)
     dataset = sphere_dataset()
-    said = {}
+    errors = {}
 
     def attempt(name, config, **options):
         try:
             fit(dataset, config, folder, devices=devices, **options)
         except (Interrupted, TrainingError) as error:
-            said[name] = f"{type(error).__name__}: {error}"
+            errors[name] = f"{type(error).__name__}: {error}"
 
     config = tiny_config("stages.split_sum.batch_views=2")
     if host == 1:
         attempt("other settings", replace(config, run=replace(config.run, seed=5)))
     else:
         attempt("other settings", config)
-    stopped = []
+    stop_signals = []
 
     def too_small(*args, **kwargs):
-        planned = plan(*args, **kwargs)
+        planned_capacities = plan(*args, **kwargs)
         # The hosts plan differently, and the first one's buffers are too small.
-        return planned.resized(hits=128 if host == 0 else planned["hits"])
+        return planned_capacities.resized(hits=128 if host == 0 else planned_capacities["hits"])
 
     plan, loop_module.plan_capacities = loop_module.plan_capacities, too_small
     resize, sizes = loop_module.Loop._resize, []
@@ -89,33 +91,33 @@ def trained(folder, host):
     def noted(loop, capacities, step):
         sizes.append([step, loop.pipeline.capacities["hits"], capacities["hits"]])
         resize(loop, capacities, step)
-        if host == 1 and loop.step == 1 and not stopped:
+        if host == 1 and loop.step == 1 and not stop_signals:
             # Only the second host is asked to stop, in its second step.
-            stopped.append(True)
+            stop_signals.append(True)
             os.kill(os.getpid(), signal.SIGINT)
 
     loop_module.Loop._resize = noted
     attempt("stop", config)
     attempt("resume", config, begin=Resume())
     state = fit(dataset, config, folder, devices=devices, begin=Resume())
-    return {"said": said, "sizes": sizes, "step": int(state.step)}, jax.tree.leaves(state.params)
+    return {"said": errors, "sizes": sizes, "step": int(state.step)}, jax.tree.leaves(state.params)
 
 
 def main():
     """Run what the arguments ask for, and leave it in the folder."""
-    what, folder, *rest = sys.argv[1:]
+    task, folder, *other_arguments = sys.argv[1:]
     enable_compilation_cache(Path(sys.prefix) / "cache")
     folder = Path(folder)
-    if what == "gradient":
-        found = gradients()
-        arrays = {f"{name}{k}": x for name in ("one", "two") for k, x in enumerate(found[name])}
-        np.savez(folder / "gradient.npz", apart=found["apart"], **arrays)
+    if task == "gradient":
+        results = gradients()
+        arrays = {f"{name}{k}": x for name in ("one", "two") for k, x in enumerate(results[name])}
+        np.savez(folder / "gradient.npz", apart=results["apart"], **arrays)
         return
-    port, host = rest
+    port, host = other_arguments
     # Machines of tests may stand still for minutes.
     connect_hosts("2", host=int(host), coordinator=f"localhost:{port}", patience=3600)
-    said, leaves = trained(folder / "run", int(host))
-    (folder / f"host{host}.json").write_text(json.dumps(said))
+    report, leaves = trained(folder / "run", int(host))
+    (folder / f"host{host}.json").write_text(json.dumps(report))
     np.savez(folder / f"host{host}.npz", *leaves)
 
 

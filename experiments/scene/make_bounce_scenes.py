@@ -37,12 +37,12 @@ def _bowl_body(sections: int) -> trimesh.Trimesh:
     middle = 0.5 * (RADIUS + inner)
     lip = np.arcsin(OPENING / middle)
     steps = sections // 3
-    along = np.linspace(-np.pi / 2, lip, steps)
-    outside = RADIUS * np.stack([np.cos(along), np.sin(along)], -1)
-    inside = inner * np.stack([np.cos(along[::-1]), np.sin(along[::-1])], -1)
-    turn = lip + np.linspace(0, np.pi, max(steps // 8, 4))[1:-1]
+    latitudes = np.linspace(-np.pi / 2, lip, steps)
+    outside = RADIUS * np.stack([np.cos(latitudes), np.sin(latitudes)], -1)
+    inside = inner * np.stack([np.cos(latitudes[::-1]), np.sin(latitudes[::-1])], -1)
+    rim_angles = lip + np.linspace(0, np.pi, max(steps // 8, 4))[1:-1]
     top = middle * np.array([np.cos(lip), np.sin(lip)])
-    rim = top + 0.5 * THICKNESS * np.stack([np.cos(turn), np.sin(turn)], -1)
+    rim = top + 0.5 * THICKNESS * np.stack([np.cos(rim_angles), np.sin(rim_angles)], -1)
     profile = np.concatenate([outside, rim, inside])
     profile[[0, -1], 0] = 0.0  # exactly on the axis
     body = trimesh.creation.revolve(profile, sections=sections)
@@ -53,10 +53,10 @@ def _bowl_body(sections: int) -> trimesh.Trimesh:
 def _bowl_materials(body: trimesh.Trimesh) -> scene_duck.Materials:
     """Paint the bowl white outside, and red, yellow, green and blue around the axis inside."""
     points = np.asarray(body.vertices) - [0, 0, 0.5 * (RADIUS - OPENING)]
-    turn = np.arctan2(points[:, 1], points[:, 0])
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
     colours = np.array([[0.75, 0.08, 0.06], [0.75, 0.6, 0.08], [0.08, 0.5, 0.12], [0.08, 0.2, 0.7]])
     centres = np.arange(4) * np.pi / 2
-    share = np.exp(4.0 * np.cos(turn[:, None] - centres))
+    share = np.exp(4.0 * np.cos(azimuth[:, None] - centres))
     inside = (share / share.sum(axis=1, keepdims=True)) @ colours
     depth = RADIUS - 0.5 * THICKNESS - np.linalg.norm(points, axis=1)
     blend = np.clip(0.5 + depth / (0.5 * THICKNESS), 0.0, 1.0)[:, None]
@@ -99,11 +99,11 @@ def build(name: str, args: argparse.Namespace) -> Path:
     folder = args.output / name
     folder.mkdir(parents=True, exist_ok=True)
     lights = make_scene.write_lights(args.output)
-    saved = trimesh.util.concatenate([body for body, _ in SCENES[name](is_saved=True)])
-    saved.merge_vertices()
-    if not saved.is_volume:
+    mesh = trimesh.util.concatenate([body for body, _ in SCENES[name](is_saved=True)])
+    mesh.merge_vertices()
+    if not mesh.is_volume:
         raise RuntimeError(f"the mesh of {name} is not closed and outward")
-    saved.export(folder / "mesh_gt.ply")
+    mesh.export(folder / "mesh_gt.ply")
     train, test = make_scene.train_views(args.views), make_scene.test_views(args.test_views)
     make_scene.render_all(
         folder, train, test, lights, args, lambda path: make_scene.write_parts(path, SCENES[name]())

@@ -33,24 +33,30 @@ def _ground() -> trimesh.Trimesh:
     """Make a disc of rings of triangles, upward."""
     rings, sectors = 24, 96
     angle = 2 * np.pi * np.arange(sectors) / sectors
-    around = np.stack([np.cos(angle), np.sin(angle), np.zeros(sectors)], -1)
+    directions = np.stack([np.cos(angle), np.sin(angle), np.zeros(sectors)], -1)
     radii = GROUND_RADIUS * np.arange(1, rings + 1) / rings
-    vertices = np.concatenate([np.zeros((1, 3)), *(radius * around for radius in radii)])
-    here = np.arange(sectors)
-    after = (here + 1) % sectors
-    faces = [np.stack([np.zeros(sectors, int), 1 + here, 1 + after], -1)]
+    vertices = np.concatenate([np.zeros((1, 3)), *(radius * directions for radius in radii)])
+    sector = np.arange(sectors)
+    next_sector = (sector + 1) % sectors
+    faces = [np.stack([np.zeros(sectors, int), 1 + sector, 1 + next_sector], -1)]
     for ring in range(rings - 1):
-        low, high = 1 + ring * sectors, 1 + (ring + 1) * sectors
-        faces.append(np.stack([low + here, high + here, high + after], -1))
-        faces.append(np.stack([low + here, high + after, low + after], -1))
+        inner_start, outer_start = 1 + ring * sectors, 1 + (ring + 1) * sectors
+        faces.append(
+            np.stack([inner_start + sector, outer_start + sector, outer_start + next_sector], -1)
+        )
+        faces.append(
+            np.stack(
+                [inner_start + sector, outer_start + next_sector, inner_start + next_sector], -1
+            )
+        )
     return trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
 
 
 def _box() -> trimesh.Trimesh:
     """Make a box on the ground, as six separate sides, so that its edges are sharp."""
     body = trimesh.creation.box(extents=(0.5, 0.4, 0.7))
-    turn = trimesh.transformations.rotation_matrix(0.5, [0, 0, 1], point=[0, 0, 0])
-    body.apply_transform(turn)
+    rotation = trimesh.transformations.rotation_matrix(0.5, [0, 0, 1], point=[0, 0, 0])
+    body.apply_transform(rotation)
     body.apply_translation([0.45, 0.35, 0.33])
     sides = [body.submesh([facet], append=True) for facet in body.facets]
     return trimesh.util.concatenate([side.subdivide().subdivide().subdivide() for side in sides])
@@ -97,8 +103,8 @@ def write_scene_mesh(path: Path) -> None:
 
 def write_true_mesh(path: Path) -> None:
     """Write the mesh to start from and to compare with: all parts, with short edges."""
-    whole = trimesh.util.concatenate([body for body, _ in parts()])
-    vertices, faces = trimesh.remesh.subdivide_to_size(whole.vertices, whole.faces, SAVED_EDGE)
+    mesh = trimesh.util.concatenate([body for body, _ in parts()])
+    vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, SAVED_EDGE)
     trimesh.Trimesh(vertices, faces, process=False).export(path)
 
 

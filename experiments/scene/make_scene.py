@@ -103,9 +103,9 @@ def train_views(count: int) -> list[View]:
 
 def test_views(count: int) -> list[View]:
     """Place cameras around the object at varying heights; the first is a three-quarter view."""
-    turn = np.arange(count) / count
-    azimuths = 0.62 + 2.0 * np.pi * turn
-    heights = 0.26 + 0.42 * np.sin(4.0 * np.pi * turn)
+    fractions = np.arange(count) / count
+    azimuths = 0.62 + 2.0 * np.pi * fractions
+    heights = 0.26 + 0.42 * np.sin(4.0 * np.pi * fractions)
     return [
         View(f"test_{i:03d}", look_at_origin(position(a, h)), 2000 + i)
         for i, (a, h) in enumerate(zip(azimuths, heights, strict=True))
@@ -119,10 +119,10 @@ def _transform(matrix: NDArray[np.float64]) -> Any:
 def environment(image: Array) -> dict[str, Any]:
     """Describe a z-up lat-long map (H, 2H, 3) as a Mitsuba emitter."""
     height = ENVIRONMENT_UPSAMPLING * image.shape[0]
-    fine = scene_lights.lookup(image, scene_lights.pixel_directions(height))
+    texels = scene_lights.lookup(image, scene_lights.pixel_directions(height))
     return {
         "type": "envmap",
-        "bitmap": mi.Bitmap(np.ascontiguousarray(fine, np.float32)),
+        "bitmap": mi.Bitmap(np.ascontiguousarray(texels, np.float32)),
         "to_world": _transform(WORLD_TO_ENVIRONMENT.T),
     }
 
@@ -258,14 +258,14 @@ def render(scene: Any, view: View, *, size: int, sample_count: int) -> Array:
     RuntimeError
         If some pixels are not finite with any seed.
     """
-    from_where = sensor(view, size, sample_count)
-    image = np.array(mi.render(scene, sensor=from_where, seed=view.seed), np.float32)
+    view_sensor = sensor(view, size, sample_count)
+    image = np.array(mi.render(scene, sensor=view_sensor, seed=view.seed), np.float32)
     for seed in range(view.seed + OTHER_SEED, view.seed + OTHER_SEED + TRIES):
         is_bad = ~np.isfinite(image).all(-1)
         if not is_bad.any():
             return image
-        again = np.array(mi.render(scene, sensor=from_where, seed=seed), np.float32)
-        image[is_bad] = again[is_bad]
+        retry_image = np.array(mi.render(scene, sensor=view_sensor, seed=seed), np.float32)
+        image[is_bad] = retry_image[is_bad]
     if not np.isfinite(image).all():
         raise RuntimeError(f"{view.name}: {TRIES} more renderings left pixels without a number")
     return image
@@ -273,9 +273,9 @@ def render(scene: Any, view: View, *, size: int, sample_count: int) -> Array:
 
 def straight(premultiplied: Array, alpha: Array) -> Array:
     """Divide by coverage where there is any: (H, W, C) and (H, W) to (H, W, C)."""
-    covered = alpha > 0.0
+    is_covered = alpha > 0.0
     return np.where(
-        covered[..., None], premultiplied / np.where(covered, alpha, 1.0)[..., None], 0.0
+        is_covered[..., None], premultiplied / np.where(is_covered, alpha, 1.0)[..., None], 0.0
     )
 
 
@@ -440,20 +440,30 @@ def _positive(text: str) -> int:
 
 def parser(documentation: str) -> argparse.ArgumentParser:
     """Describe the command line of a scene; the first line of `documentation` is its help."""
-    made = argparse.ArgumentParser(
+    argument_parser = argparse.ArgumentParser(
         description=documentation.split("\n")[0],
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    made.add_argument("--output", type=Path, default=Path("examples"), help="parent folder")
-    made.add_argument("--views", type=_positive, default=40, help="number of training views")
-    made.add_argument("--test-views", type=_positive, default=8, help="number of test views")
-    made.add_argument("--size", type=_positive, default=128, help="width and height in pixels")
-    made.add_argument("--spp", type=_positive, default=484, help="paths a pixel, a square at best")
-    made.add_argument("--variant", default="auto", help="Mitsuba variant, or auto")
-    made.add_argument(
+    argument_parser.add_argument(
+        "--output", type=Path, default=Path("examples"), help="parent folder"
+    )
+    argument_parser.add_argument(
+        "--views", type=_positive, default=40, help="number of training views"
+    )
+    argument_parser.add_argument(
+        "--test-views", type=_positive, default=8, help="number of test views"
+    )
+    argument_parser.add_argument(
+        "--size", type=_positive, default=128, help="width and height in pixels"
+    )
+    argument_parser.add_argument(
+        "--spp", type=_positive, default=484, help="paths a pixel, a square at best"
+    )
+    argument_parser.add_argument("--variant", default="auto", help="Mitsuba variant, or auto")
+    argument_parser.add_argument(
         "--contact-sheet", type=Path, default=None, help="also lay out the test views in this PNG"
     )
-    return made
+    return argument_parser
 
 
 def timed_build(args: argparse.Namespace, build: Callable[[argparse.Namespace], Path]) -> None:

@@ -35,25 +35,31 @@ Array = make_scene.Array
 
 def _rings(points: Array) -> Array:
     """Return the distance of points from the centre lines of the rings."""
-    across = np.linalg.norm(points[:, :2], axis=1)
-    each = [np.hypot(across - radius, points[:, 2] - height) for height, radius in RINGS]
-    return np.min(each, axis=0)
+    radial_distance = np.linalg.norm(points[:, :2], axis=1)
+    ring_distances = [
+        np.hypot(radial_distance - radius, points[:, 2] - height) for height, radius in RINGS
+    ]
+    return np.min(ring_distances, axis=0)
 
 
 def _wires(points: Array) -> Array:
     """Return the distance from the centre lines of the wires: polylines from floor to rim."""
-    turn = np.arctan2(points[:, 1], points[:, 0])
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
     step = 2 * np.pi / WIRES
-    turn = (turn + step / 2) % step - step / 2  # folds all wires onto that along the x axis
-    across = np.linalg.norm(points[:, :2], axis=1)
-    x, y, z = across * np.cos(turn), across * np.sin(turn), points[:, 2]
+    azimuth = (azimuth + step / 2) % step - step / 2  # folds all wires onto that along the x axis
+    radial_distance = np.linalg.norm(points[:, :2], axis=1)
+    x, y, z = radial_distance * np.cos(azimuth), radial_distance * np.sin(azimuth), points[:, 2]
     corners = np.array([(0.0, FLOOR), *((radius, height) for height, radius in RINGS)])
     best = np.full(len(points), np.inf)
     for start, end in zip(corners[:-1], corners[1:], strict=True):
-        way = end - start
-        along = np.clip(((x - start[0]) * way[0] + (z - start[1]) * way[1]) / (way @ way), 0, 1)
-        off = np.hypot(x - start[0] - along * way[0], z - start[1] - along * way[1])
-        best = np.minimum(best, np.hypot(off, y))
+        segment = end - start
+        fraction = np.clip(
+            ((x - start[0]) * segment[0] + (z - start[1]) * segment[1]) / (segment @ segment), 0, 1
+        )
+        plane_distance = np.hypot(
+            x - start[0] - fraction * segment[0], z - start[1] - fraction * segment[1]
+        )
+        best = np.minimum(best, np.hypot(plane_distance, y))
     return best
 
 
@@ -74,8 +80,8 @@ def _mesh(cells: int) -> tuple[Array, NDArray[np.int64], Array]:
     vertices = vertices.astype(np.float64) - HALF_EXTENT
     step = 1e-3
     slope = [
-        signed_distance(vertices + step * way) - signed_distance(vertices - step * way)
-        for way in np.eye(3)
+        signed_distance(vertices + step * direction) - signed_distance(vertices - step * direction)
+        for direction in np.eye(3)
     ]
     normals = np.stack(slope, -1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
@@ -101,10 +107,10 @@ def build(args: argparse.Namespace) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     lights = make_scene.write_lights(args.output)
     vertices, faces, _ = _mesh(SAVED_CELLS)
-    saved = trimesh.Trimesh(vertices, faces, process=False)
-    if not saved.is_volume:
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    if not mesh.is_volume:
         raise RuntimeError(f"the mesh of {len(faces)} faces is not closed and outward")
-    saved.export(folder / "mesh_gt.ply")
+    mesh.export(folder / "mesh_gt.ply")
     train, test = make_scene.train_views(args.views), make_scene.test_views(args.test_views)
     make_scene.render_all(folder, train, test, lights, args, write_render_mesh)
     return folder

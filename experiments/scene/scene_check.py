@@ -72,20 +72,20 @@ def mirror_error(light: Array, view: make_scene.View, *, size: int = 96) -> floa
             "light": make_scene.environment(light),
         }
     )
-    rendered = make_scene.render(scene, view, size=size, sample_count=256)
+    image = make_scene.render(scene, view, size=size, sample_count=256)
     focal = 0.5 * size / np.tan(0.5 * make_scene.CAMERA_ANGLE_X)
     intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
     rays = camera_rays(view.camera_to_world, intrinsics, size)
     origin = view.camera_to_world[:3, 3]
-    along = rays @ origin
-    discriminant = along**2 - (origin @ origin - 1.0)
+    projection = rays @ origin
+    discriminant = projection**2 - (origin @ origin - 1.0)
     # Within .95 of the radius, the footprint of a pixel is small compared to texels of the map.
     inside = discriminant > 1.0 - 0.95**2
-    distance = -along - np.sqrt(np.where(inside, discriminant, 1.0))
+    distance = -projection - np.sqrt(np.where(inside, discriminant, 1.0))
     normal = origin + distance[..., None] * rays
     reflected = rays - 2.0 * np.sum(rays * normal, -1, keepdims=True) * normal
     expected = scene_lights.lookup(light, reflected)[inside]
-    relative = np.abs(rendered[..., :3][inside] - expected) / expected
+    relative = np.abs(image[..., :3][inside] - expected) / expected
     # By channel, because mirroring a smooth map may change one colour only.
     return float(np.median(relative, axis=0).max())
 
@@ -109,9 +109,9 @@ def mask_errors(scene: Path, mesh: trimesh.Trimesh) -> tuple[float, float, bool]
         for folder, matrix, intrinsics in read_cameras(scene, split):
             alpha = np.array(Image.open(folder / f"rgba_{light}.png"))[..., 3]
             cross = ndimage.generate_binary_structure(2, 2)
-            grown = ndimage.binary_dilation(alpha > 0, cross)
+            dilated_mask = ndimage.binary_dilation(alpha > 0, cross)
             column, row = np.floor(project(points, matrix, intrinsics)).astype(int).T
-            outside = max(outside, 1.0 - grown[row, column].mean())
+            outside = max(outside, 1.0 - dilated_mask[row, column].mean())
             hit = np.zeros(alpha.shape, bool)
             hit[row, column] = True
             solid = alpha == 255
@@ -147,9 +147,11 @@ def normal_errors(scene: Path, mesh: trimesh.Trimesh) -> tuple[float, float]:
         flat = pixel[:, 1] * len(picture) + pixel[:, 0]
         depth = np.sum((points - matrix[:3, 3]) ** 2, -1)
         order = np.lexsort((depth, flat))
-        seen, first = np.unique(flat[order], return_index=True)
-        truth = mesh.face_normals[face[order[first]]]
-        cosine = np.sum(truth * normal.reshape(-1, 3)[seen], -1)[solid.ravel()[seen]]
+        visible_pixels, first_samples = np.unique(flat[order], return_index=True)
+        truth = mesh.face_normals[face[order[first_samples]]]
+        cosine = np.sum(truth * normal.reshape(-1, 3)[visible_pixels], -1)[
+            solid.ravel()[visible_pixels]
+        ]
         angles.append(np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0))))
     return float(backfacing), float(np.median(np.concatenate(angles)))
 

@@ -99,9 +99,9 @@ def _capsule(points: Array, start, end, radius_start: float, radius_end: float) 
     """Distance to a segment whose radius varies linearly."""
     start = np.asarray(start, np.float32)
     axis = np.asarray(end, np.float32) - start
-    along = np.clip((points - start) @ axis / (axis @ axis), 0.0, 1.0)
-    radius = radius_start + (radius_end - radius_start) * along
-    return _length(points - start - along[:, None] * axis) - radius
+    fraction = np.clip((points - start) @ axis / (axis @ axis), 0.0, 1.0)
+    radius = radius_start + (radius_end - radius_start) * fraction
+    return _length(points - start - fraction[:, None] * axis) - radius
 
 
 def _smooth_union(a: Array, b: Array, width: float) -> Array:

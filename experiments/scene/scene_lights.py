@@ -149,8 +149,8 @@ LIGHTS: dict[str, Callable[[Array], Array]] = {"studio": studio, "sunset": sunse
 
 def make(name: str, height: int = 64) -> Array:
     """Build one light as a (height, 2 height, 3) radiance map, averaging 4 x 4 samples a pixel."""
-    fine = LIGHTS[name](pixel_directions(4 * height))
-    return fine.reshape(height, 4, 2 * height, 4, 3).mean((1, 3)).astype(np.float32)
+    samples = LIGHTS[name](pixel_directions(4 * height))
+    return samples.reshape(height, 4, 2 * height, 4, 3).mean((1, 3)).astype(np.float32)
 
 
 def write_hdr(path: Path, image: Array) -> None:

@@ -36,14 +36,14 @@ def choose_variant(requested: str = "auto") -> str:
     if requested != "auto":
         mitsuba.set_variant(requested)
         return requested
-    last = ""
+    last_error = ""
     for variant in VARIANTS:
         if variant not in mitsuba.variants():
             continue
         command = [sys.executable, "-c", _PROBE, variant]
-        found = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-        if found.returncode == 0:
+        process = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+        if process.returncode == 0:
             mitsuba.set_variant(variant)
             return variant
-        last = found.stderr[-2000:]
-    raise RuntimeError(f"no variant of {VARIANTS} renders here; the last one said: {last}")
+        last_error = process.stderr[-2000:]
+    raise RuntimeError(f"no variant of {VARIANTS} renders here; the last one said: {last_error}")

@@ -60,11 +60,11 @@ def step(model: GridSurface, shape: Geometry, moments: Any, capacities: Capaciti
         moment = jnp.sum(jnp.sin(5.0 * surface.mesh.vertices))
         return moment + jnp.sum(jnp.stack(list(penalties.values()))), surface.usage
 
-    (_, needed), gradient = jax.value_and_grad(loss, has_aux=True)(shape)
+    (_, usage), gradient = jax.value_and_grad(loss, has_aux=True)(shape)
     with jax.numpy_dtype_promotion("standard"):
         directions, moments = ADAM.update(gradient, moments)
-    moved = jax.tree.map(lambda x, way: x - RATE * way, shape, directions)
-    return moved, moments, needed
+    next_shape = jax.tree.map(lambda x, direction: x - RATE * direction, shape, directions)
+    return next_shape, moments, usage
 
 
 @partial(jax.jit, static_argnames="capacities")
@@ -77,8 +77,10 @@ def rays(model: GridSurface, shape: Geometry, capacities: Capacities) -> Any:
 def byte_count(compiled: Any) -> int:
     """Return the bytes that a compiled program needs, by its own memory analysis."""
     sizes = compiled.memory_analysis()
-    need = sizes.temp_size_in_bytes + sizes.argument_size_in_bytes + sizes.output_size_in_bytes
-    return need - sizes.alias_size_in_bytes
+    total_bytes = (
+        sizes.temp_size_in_bytes + sizes.argument_size_in_bytes + sizes.output_size_in_bytes
+    )
+    return total_bytes - sizes.alias_size_in_bytes
 
 
 def seconds_of(function: Any, *arguments: Any) -> tuple[float, Any]:
@@ -99,17 +101,17 @@ def measured(model: GridSurface, shape: Geometry, *, with_rays: bool) -> dict[st
     }
     seconds = []
     for _ in range(REPEATS + 1):
-        spent, (shape, moments, needed) = seconds_of(program, model, shape, moments)
-        seconds.append(spent)
-    assert all(int(count) <= capacities[name] for name, count in needed.items())
+        step_seconds, (shape, moments, usage) = seconds_of(program, model, shape, moments)
+        seconds.append(step_seconds)
+    assert all(int(count) <= capacities[name] for name, count in usage.items())
     row["step_s"] = statistics.median(seconds[1:])
     if isinstance(model, BandedFlexiCubes):
         began = time.perf_counter()
-        following = model.following(shape)
-        if following is not None:
-            following.carried(moments.mu), following.carried(moments.nu)
+        next_model = model.following(shape)
+        if next_model is not None:
+            next_model.carried(moments.mu), next_model.carried(moments.nu)
         row["follow_s"] = time.perf_counter() - began
-        row["has_followed"] = following is not None
+        row["has_followed"] = next_model is not None
     if with_rays:
         index = rays.lower(model, shape, capacities).compile()
         row["rays_mb"] = 1e-6 * byte_count(index)
@@ -148,10 +150,12 @@ def main() -> None:
             shape = initial_geometry(grid, jnp.asarray(values))
             rows["whole"][cells] = measured(FlexiCubes(grid), shape, with_rays=arguments.rays)
             print("whole", cells, rows["whole"][cells], flush=True)
-    for kind, found in rows.items():
+    for kind, rows_by_cells in rows.items():
         for name in ("learned_mb", "step_mb", "step_s", "follow_s", "rays_mb", "rays_s"):
-            values = [row[name] for row in found.values() if name in row]
-            slope = exponent(list(found), values) if len(values) == len(found) else None
+            values = [row[name] for row in rows_by_cells.values() if name in row]
+            slope = (
+                exponent(list(rows_by_cells), values) if len(values) == len(rows_by_cells) else None
+            )
             if slope is not None:
                 print(f"{kind} {name}: cells to the power of {slope:.2f}")
     if arguments.json is not None:

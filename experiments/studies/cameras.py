@@ -68,8 +68,8 @@ def disturbed(
     count = len(views)
 
     def directions() -> np.ndarray:
-        drawn = rng.normal(size=(count, 3))
-        return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+        vectors = rng.normal(size=(count, 3))
+        return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
     poses, lenses = views.camera_to_world.copy(), views.intrinsics.copy()
     turns = Rotation.from_rotvec(np.radians(rotation_deg) * directions()).as_matrix()
@@ -82,8 +82,8 @@ def disturbed(
     tints = np.exp(tints - tints.mean(axis=1, keepdims=True))
     tints /= tints.mean(axis=0)
     images = Photographs.of(views.images).divided(1.0 / (factors[:, None] * tints))
-    moved = replace(views, camera_to_world=poses, intrinsics=lenses, images=images)
-    return moved, replace(views, exposure=factors, white_balance=tints)
+    disturbed_views = replace(views, camera_to_world=poses, intrinsics=lenses, images=images)
+    return disturbed_views, replace(views, exposure=factors, white_balance=tints)
 
 
 def with_training_views(dataset: Dataset, views: Views) -> Dataset:
@@ -203,8 +203,8 @@ def main() -> None:
     for cells in (titles, ["---"] * len(titles)):
         print(f"| {' | '.join(cells)} |")
     for run, gauge, cells in reversed(rows):
-        measured = evaluated(run, base.test, gauge, arguments.samples)
-        print(f"| {' | '.join([*cells, *measured])} |", flush=True)
+        scores = evaluated(run, base.test, gauge, arguments.samples)
+        print(f"| {' | '.join([*cells, *scores])} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -88,18 +88,18 @@ class OneBall(FaceSplats):
         # The standard deviation of a round disc of the face's area.
         radius = 0.5 * jnp.sqrt(area / np.pi)
         normals = safe_normalize(jnp.mean(vertex_normals(mesh)[mesh.faces], axis=1))
-        first = jnp.arange(splats.means.shape[0]) % SPLATS_PER_FACE == 0
-        chosen = splats.mask & first
+        is_first = jnp.arange(splats.means.shape[0]) % SPLATS_PER_FACE == 0
+        is_ball = splats.mask & is_first
         parents = splats.parents
-        means = jnp.where(chosen[:, None], middle[parents], splats.means)
-        scales = jnp.where(chosen[:, None], radius[parents][:, None], 1.0)
+        means = jnp.where(is_ball[:, None], middle[parents], splats.means)
+        scales = jnp.where(is_ball[:, None], radius[parents][:, None], 1.0)
         return replace(
             splats,
             means=means,
             anchors=means,
             scales=scales,
-            normals=jnp.where(chosen[:, None], normals[parents], 0.0),
-            opacities=jnp.where(chosen, splats.opacities, 0.0),
+            normals=jnp.where(is_ball[:, None], normals[parents], 0.0),
+            opacities=jnp.where(is_ball, splats.opacities, 0.0),
         )
 
 
@@ -140,31 +140,39 @@ class Subject(NamedTuple):
             "one isotropic splat per face": OneBall(constants),
             "vertices (Eq. 12)": VertexSplats(constants),
         }
-        sunk = {f"faces (Eq. 8-11), shifted by {SHIFT:g}": lambda: self.body(Sunk(constants))}
+        shifted_bodies = {
+            f"faces (Eq. 8-11), shifted by {SHIFT:g}": lambda: self.body(Sunk(constants))
+        }
         if self.trained is not None:
-            sunk = of_run(self.trained)
-        return {**sunk, **{n: lambda model=m: self.body(model) for n, m in models.items()}}
+            shifted_bodies = of_run(self.trained)
+        return {
+            **shifted_bodies,
+            **{n: lambda model=m: self.body(model) for n, m in models.items()},
+        }
 
 
 def of_run(trained: Trained) -> dict[str, Callable[[], Body]]:
     """Return functions that make the splats of a run: as it ended, and with the shift alone."""
     splats = FaceSplats(trained.config.adapter)
     pipeline = replace(trained.pipeline, splats=splats)
-    bare = replace(trained, pipeline=pipeline, params=replace(trained.params, splats=None))
-    found = {"as the run ended": lambda: body_of_run(trained)}
+    shift_only = replace(trained, pipeline=pipeline, params=replace(trained.params, splats=None))
+    body_makers = {"as the run ended": lambda: body_of_run(trained)}
     if trained.params.material.shift_head is not None:
-        found = {"faces (Eq. 8-11), shifted as learned": lambda: body_of_run(bare), **found}
-    return found
+        body_makers = {
+            "faces (Eq. 8-11), shifted as learned": lambda: body_of_run(shift_only),
+            **body_makers,
+        }
+    return body_makers
 
 
 def subjects(name: str, cells: list[int], views: int) -> Iterator[Subject]:
     """Yield the mesh of a run, or those that are made from a file."""
     if Path(name).is_dir():
         run = Run(name)
-        trained, chosen = run.trained, run.dataset.views_to_show
+        trained, shown_views = run.trained, run.dataset.views_to_show
         mesh = build_asset(trained.pipeline, trained.params).mesh
-        rows = np.unique(np.linspace(0, len(chosen) - 1, views).round().astype(int))
-        cameras = [single_cameras(chosen)[row] for row in rows]
+        rows = np.unique(np.linspace(0, len(shown_views) - 1, views).round().astype(int))
+        cameras = [single_cameras(shown_views)[row] for row in rows]
         constants, box = trained.config.adapter, trained.pipeline.surface.box
         yield Subject(f"run {run.folder.path.name}", mesh, box, constants, cameras, trained)
         return
@@ -172,9 +180,9 @@ def subjects(name: str, cells: list[int], views: int) -> Iterator[Subject]:
     title = path.parent.name if path.stem.startswith("mesh") else path.stem
     for count in cells or [None]:
         mesh = shape(name, count)
-        made = f", {count} cells" if count else ", as it is"
+        suffix = f", {count} cells" if count else ", as it is"
         cameras = cameras_around(box_of(mesh), views=views)
-        yield Subject(title + made, mesh, box_of(mesh), AdapterConstants(), cameras, None)
+        yield Subject(title + suffix, mesh, box_of(mesh), AdapterConstants(), cameras, None)
 
 
 def print_table(subject: Subject, sizes: list[int], only: str) -> None:
@@ -185,10 +193,10 @@ def print_table(subject: Subject, sizes: list[int], only: str) -> None:
     print(f"\n{subject.name}: {int(subject.mesh.face_count)} faces, {len(subject.cameras)} views\n")
     print("| splats |" + "".join(f" {size} x {size} | not covered |" for size in sizes))
     print("|---|" + "---|---|" * len(sizes))
-    for name, make in subject.ways().items():
+    for name, make_body in subject.ways().items():
         if only not in name:
             continue
-        body, cells = make(), []
+        body, cells = make_body(), []
         for size in sizes:
             errors = pixel_errors(body, [resized(camera, size) for camera in subject.cameras])
             counts = errors.is_compared
@@ -209,28 +217,30 @@ def print_causes(subject: Subject, size: int) -> None:
     print(f"\n{subject.name}, {size} x {size}: angle and distance\n\n| | on faces | shifted |")
     print("|---|---|---|")
     bodies = [subject.body(model) for model in (FaceSplats(constants), Sunk(constants))]
-    fine = [divided(subject, share) for share in (0.0, SHIFT)]
-    found = [pixel_errors(body, cameras) for body in bodies]
+    divided_bodies = [divided(subject, share) for share in (0.0, SHIFT)]
+    errors = [pixel_errors(body, cameras) for body in bodies]
 
     def row(name: str, texts: list[str]) -> None:
         print(f"| {name} | {' | '.join(texts)} |", flush=True)
 
-    row("all", [figures(e, e.is_compared) for e in found])
-    row("median", [median_figures(e) for e in found])
-    for least in (0.3, 0.6, 0.9):
-        name = f"pixels that face the camera by more than {least:g}"
-        row(name, [figures(e, e.is_compared & (e.facing > least)) for e in found])
-    row("pixels covered by more than .98", [figures(e, e.coverage > 0.98) for e in found])
+    row("all", [figures(e, e.is_compared) for e in errors])
+    row("median", [median_figures(e) for e in errors])
+    for threshold in (0.3, 0.6, 0.9):
+        name = f"pixels that face the camera by more than {threshold:g}"
+        row(name, [figures(e, e.is_compared & (e.facing > threshold)) for e in errors])
+    row("pixels covered by more than .98", [figures(e, e.coverage > 0.98) for e in errors])
     both_sides = RasterSettings(cull_backfaces=False)
-    seen = [pixel_errors(replace(b, raster=both_sides), cameras) for b in bodies]
-    row("splats that look away as well", [figures(e, e.is_compared) for e in seen])
-    seen = [pixel_errors(body, cameras) for body in fine]
-    row("four faces in the place of each", [figures(e, e.is_compared) for e in seen])
-    whole = [np.abs(e.shown * e.coverage - e.ranges)[e.is_compared].mean() for e in found]
-    row("distance not divided by coverage", [f"{share:.4f}" for share in whole])
-    row("mean of 1 - coverage", [f"{1 - e.coverage[e.is_compared].mean():.4f}" for e in found])
-    alone = f"{filter_alone(bodies[0], cameras):.2f}°"
-    row("the mesh's own normals, filtered as a splat is", [alone, alone])
+    variant_errors = [pixel_errors(replace(b, raster=both_sides), cameras) for b in bodies]
+    row("splats that look away as well", [figures(e, e.is_compared) for e in variant_errors])
+    variant_errors = [pixel_errors(body, cameras) for body in divided_bodies]
+    row("four faces in the place of each", [figures(e, e.is_compared) for e in variant_errors])
+    distance_errors = [
+        np.abs(e.shown * e.coverage - e.ranges)[e.is_compared].mean() for e in errors
+    ]
+    row("distance not divided by coverage", [f"{share:.4f}" for share in distance_errors])
+    row("mean of 1 - coverage", [f"{1 - e.coverage[e.is_compared].mean():.4f}" for e in errors])
+    filter_angle = f"{filter_alone(bodies[0], cameras):.2f}°"
+    row("the mesh's own normals, filtered as a splat is", [filter_angle, filter_angle])
 
 
 def median_figures(errors: PixelErrors) -> str:
@@ -262,22 +272,24 @@ def filter_alone(body: Body, cameras: list[Camera]) -> float:
 
     The mesh's own normals are blurred by the filter, and compared with the normals before.
     """
-    found = []
+    angles = []
     for camera in cameras:
         size = max(camera.height, camera.width)
-        fine = body.seen(resized(camera, SAMPLES * size))
+        fine_view = body.seen(resized(camera, SAMPLES * size))
         deviation = SAMPLES * LOW_PASS_VARIANCE**0.5
-        blurred = ndimage.gaussian_filter(fine.normals, deviation, axes=(0, 1))
+        blurred = ndimage.gaussian_filter(fine_view.normals, deviation, axes=(0, 1))
         blocks = blurred.reshape(camera.height, SAMPLES, camera.width, SAMPLES, 3)
         middle = slice(SAMPLES // 2 - 1, SAMPLES // 2 + 1)
         centers = blocks[:, middle, :, middle].mean(axis=(1, 3))
-        seen = body.seen(camera)
-        hit = seen.is_outside
+        mesh_view = body.seen(camera)
+        hit = mesh_view.is_outside
         length = np.sqrt((centers[hit] ** 2).sum(axis=-1, keepdims=True))
-        found.append(
-            reflection_angle_deg(seen.towards[hit], seen.normals[hit], centers[hit] / length)
+        angles.append(
+            reflection_angle_deg(
+                mesh_view.towards[hit], mesh_view.normals[hit], centers[hit] / length
+            )
         )
-    return float(np.concatenate(found).mean())
+    return float(np.concatenate(angles).mean())
 
 
 def main() -> None:

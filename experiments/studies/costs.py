@@ -63,15 +63,15 @@ def rows_of(path: Path) -> list[Row]:
 def fitted(rows: list[Row], start: Float[Array, " k"]) -> Float[np.ndarray, " k"]:
     """Return the seconds per unit of work, in the order of `COST_NAMES`, that fit the rows best."""
     work = jnp.asarray([[row.work[name] for name in COST_NAMES] for row in rows])
-    measured = jnp.log(jnp.asarray([row.seconds for row in rows]))
+    log_seconds = jnp.log(jnp.asarray([row.seconds for row in rows]))
 
     def residual(logs: Float[Array, " k"], unused: None) -> Float[Array, " n"]:
-        return jnp.log(work @ jnp.exp(logs)) - measured
+        return jnp.log(work @ jnp.exp(logs)) - log_seconds
 
     solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6)
-    first = jnp.log(jnp.maximum(start, SMALLEST))
-    found = optx.least_squares(residual, solver, first, max_steps=500, throw=False)
-    return np.exp(np.asarray(found.value))
+    first_logs = jnp.log(jnp.maximum(start, SMALLEST))
+    solution = optx.least_squares(residual, solver, first_logs, max_steps=500, throw=False)
+    return np.exp(np.asarray(solution.value))
 
 
 def main() -> None:
@@ -85,25 +85,31 @@ def main() -> None:
     if len(rows) < len(COST_NAMES):
         raise SystemExit(f"{len(rows)} stages are too few to fit {len(COST_NAMES)} constants")
     slowness = arguments.slowness or slowness_of_machine()
-    before = slowness * np.array([COST_SECONDS[name] for name in COST_NAMES])
-    after = fitted(rows, jnp.asarray(before))
+    previous_costs = slowness * np.array([COST_SECONDS[name] for name in COST_NAMES])
+    fitted_costs = fitted(rows, jnp.asarray(previous_costs))
     print(f"the machine is {slowness:.2f} times as slow as the reference")
     print(f"{'unit of work':12s} {'before':>10s} {'fitted':>10s}   seconds on the reference")
-    for name, old, new in zip(COST_NAMES, before, after, strict=True):
+    for name, old, new in zip(COST_NAMES, previous_costs, fitted_costs, strict=True):
         print(f"{name:12s} {old / slowness:10.5f} {new / slowness:10.5f}")
     print(f"{'run':24s} {'stage':12s} {'seconds':>8s} {'before':>8s} {'fitted':>8s}")
     deviations = []
     for row in rows:
         work = np.array([row.work[name] for name in COST_NAMES])
-        old, new = float(work @ before), float(work @ after)
+        old, new = float(work @ previous_costs), float(work @ fitted_costs)
         deviations.append(np.log(new / row.seconds))
         print(f"{row.run[:24]:24s} {row.stage:12s} {row.seconds:8.3f} {old:8.3f} {new:8.3f}")
     print(
         f"typical deviation after the fit: {np.expm1(np.sqrt(np.mean(np.square(deviations)))):.0%}"
     )
     if arguments.json is not None:
-        found = {name: float(x / slowness) for name, x in zip(COST_NAMES, after, strict=True)}
-        document = {"seconds": found, "slowness": slowness, "rows": [asdict(row) for row in rows]}
+        reference_costs = {
+            name: float(x / slowness) for name, x in zip(COST_NAMES, fitted_costs, strict=True)
+        }
+        document = {
+            "seconds": reference_costs,
+            "slowness": slowness,
+            "rows": [asdict(row) for row in rows],
+        }
         arguments.json.write_text(json.dumps(document, indent=2) + "\n")
 
 

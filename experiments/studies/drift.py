@@ -38,12 +38,14 @@ def drift(before: Splats, after: Splats, half_extent: float) -> tuple[float, ...
     def change(name: str) -> float:
         return float(np.mean(np.abs(rows(after, name) - rows(before, name))))
 
-    first, last = rows(before, "quats"), rows(after, "quats")
-    last = last * np.where(np.sum(first * last, axis=1, keepdims=True) < 0, -1.0, 1.0)
+    first_quats, last_quats = rows(before, "quats"), rows(after, "quats")
+    last_quats = last_quats * np.where(
+        np.sum(first_quats * last_quats, axis=1, keepdims=True) < 0, -1.0, 1.0
+    )
     return (
         change("means") / half_extent,
         change("scales") / half_extent,
-        float(np.mean(np.abs(last - first))),
+        float(np.mean(np.abs(last_quats - first_quats))),
         change("opacities"),
         change("normals"),
     )
@@ -66,8 +68,8 @@ def main() -> None:
     enable_compilation_cache()
     print(f"| | {' | '.join(COLUMNS)} |")
     print("|---" * (len(COLUMNS) + 1) + "|")
-    found = {folder.name: of_run(folder) for folder in arguments.runs}
-    for name, values in {**found, **PAPER}.items():
+    drifts = {folder.name: of_run(folder) for folder in arguments.runs}
+    for name, values in {**drifts, **PAPER}.items():
         print(f"| {name} | {' | '.join(f'{value:.4f}' for value in values)} |")
 
 

@@ -32,18 +32,18 @@ def open_run(folder: Path, config: Config, dataset: Dataset) -> Run:
         other options; the message lists every difference.
     """
     run = Run(folder)
-    recorded, scene = run.folder.record()["scene"], str(dataset.root.resolve())
-    changed = differences(run.config, config)
-    if recorded != scene:
-        changed.append(f"scene: {recorded!r} -> {scene!r}")
+    recorded_scene, scene = run.folder.record()["scene"], str(dataset.root.resolve())
+    changes = differences(run.config, config)
+    if recorded_scene != scene:
+        changes.append(f"scene: {recorded_scene!r} -> {scene!r}")
     try:
         run.folder.require_same_scene(dataset)
     except RunError as error:
-        changed.append(str(error))
-    if changed:
+        changes.append(str(error))
+    if changes:
         raise SystemExit(
             f"error: {folder} holds a run with other settings (recorded -> wanted):\n  "
-            + "\n  ".join(changed)
+            + "\n  ".join(changes)
             + "\nTake another --output, undo the change, or remove the folder to train anew."
         )
     run.dataset = dataset

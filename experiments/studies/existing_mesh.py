@@ -66,8 +66,8 @@ def noisy_truth(dataset: Dataset, pixels: float) -> trimesh.Trimesh:
     mesh = fitted(path, digest_of(path), views, edge_pixels=2.0, most_faces=MOST_FACES)
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     steps = np.random.default_rng(0).normal(size=(len(mesh.vertices), 1))
-    way = pixels * pixel_length(mesh, views) * steps * body.vertex_normals
-    return trimesh.Trimesh(mesh.vertices + way, mesh.faces, process=False)
+    offsets = pixels * pixel_length(mesh, views) * steps * body.vertex_normals
+    return trimesh.Trimesh(mesh.vertices + offsets, mesh.faces, process=False)
 
 
 def hull_mesh(dataset: Dataset) -> trimesh.Trimesh:
@@ -95,11 +95,11 @@ def chamfer(mesh: trimesh.Trimesh, truth: trimesh.Trimesh) -> float:
     """Mean distance of points of either surface to the other, per mille of the truth's size."""
 
     def mean_distance(start: trimesh.Trimesh, end: trimesh.Trimesh) -> float:
-        points, others = (
+        points, neighbours = (
             np.asarray(trimesh.sample.sample_surface(mesh, count, seed=0)[0])
             for mesh, count in ((start, POINTS), (end, NEIGHBOURS))
         )
-        return float(np.mean(cKDTree(others).query(points)[0]))
+        return float(np.mean(cKDTree(neighbours).query(points)[0]))
 
     size = float(np.max(truth.extents))
     return 1e3 * 0.5 * (mean_distance(mesh, truth) + mean_distance(truth, mesh)) / size
@@ -151,8 +151,8 @@ def study(scene: Path, arguments: argparse.Namespace) -> dict[str, dict[str, flo
             plans = plans[1:] if arguments.skip_frozen else plans
         for title, mesh, changes in plans:
             overrides = [*arguments.overrides, *changes]
-            place = folder / title.replace(", ", "_")
-            run = train_or_open(dataset, place, overrides, arguments.quality, mesh)
+            run_folder = folder / title.replace(", ", "_")
+            run = train_or_open(dataset, run_folder, overrides, arguments.quality, mesh)
             rows[title] = row(run, truth, arguments.samples)
             cells = "  ".join(f"{key} {value:.2f}" for key, value in rows[title].items())
             print(f"{scene.name:14s} {title:16s} {cells}", flush=True)
@@ -161,8 +161,8 @@ def study(scene: Path, arguments: argparse.Namespace) -> dict[str, dict[str, flo
 
 def print_table(found: dict[str, dict[str, dict[str, float]]]) -> None:
     """Print the rows of all scenes as a table of Markdown."""
-    everything = [row for rows in found.values() for row in rows.values()]
-    names = list(dict.fromkeys(key for row in everything for key in row))
+    all_rows = [row for rows in found.values() for row in rows.values()]
+    names = list(dict.fromkeys(key for row in all_rows for key in row))
     for cells in (["scene", "start", *names], ["---"] * (2 + len(names))):
         print(f"| {' | '.join(cells)} |")
     for scene, rows in found.items():
@@ -191,10 +191,10 @@ def main() -> None:
     arguments = parser.parse_args()
     enable_compilation_cache()
     retain_freed_memory()
-    found = {scene.name: study(scene, arguments) for scene in arguments.scenes}
-    print_table(found)
+    results = {scene.name: study(scene, arguments) for scene in arguments.scenes}
+    print_table(results)
     if arguments.json is not None:
-        arguments.json.write_text(json.dumps(found, indent=1), encoding="utf-8")
+        arguments.json.write_text(json.dumps(results, indent=1), encoding="utf-8")
 
 
 if __name__ == "__main__":

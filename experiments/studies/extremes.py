@@ -130,9 +130,9 @@ CORNERS = (
 def expanded(overrides: tuple[str, ...]) -> tuple[str, ...]:
     """Expand overrides of ``stages.*`` into one for each stage."""
     return tuple(
-        one.replace("*", stage)
-        for one in overrides
-        for stage in (_STAGES if one.startswith("stages.*") else ("",))
+        override.replace("*", stage)
+        for override in overrides
+        for stage in (_STAGES if override.startswith("stages.*") else ("",))
     )
 
 
@@ -154,11 +154,11 @@ def train_corner(corner: Corner, steps: int, gigabytes: float) -> dict[str, Any]
     """Train a corner in this process, whose memory is limited to ``gigabytes``."""
     limit = int(gigabytes * 1e9)
     resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
-    each = [f"stages.{stage}.steps={steps // len(_STAGES)}" for stage in _STAGES]
+    step_overrides = [f"stages.{stage}.steps={steps // len(_STAGES)}" for stage in _STAGES]
     began, outcome = time.perf_counter(), "trained"
     with tempfile.TemporaryDirectory() as folder:
         try:
-            overrides = (*expanded(_BASE), *each, *expanded(corner.overrides))
+            overrides = (*expanded(_BASE), *step_overrides, *expanded(corner.overrides))
             config = make_config("default", "draft", overrides=overrides)
             fit(resized(load_dataset(SCENE), corner.size), config, folder)
         except (TrainingError, ValueError) as error:
@@ -195,12 +195,12 @@ def in_a_process(corner: Corner, steps: int, gigabytes: float) -> dict[str, Any]
     """Train a corner in another process, whose crash does not end this one."""
     command = [sys.executable, __file__, "--one", corner.name]
     command += ["--steps", str(steps), "--memory", str(gigabytes)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    if done.returncode == 0:
-        return json.loads(done.stdout.splitlines()[-1])
-    lines = [line for line in done.stderr.splitlines() if line.strip()] or ["no message"]
+    process = subprocess.run(command, capture_output=True, text=True)
+    if process.returncode == 0:
+        return json.loads(process.stdout.splitlines()[-1])
+    lines = [line for line in process.stderr.splitlines() if line.strip()] or ["no message"]
     return {
-        "outcome": f"ended with status {done.returncode}: {lines[-1][:160]}",
+        "outcome": f"ended with status {process.returncode}: {lines[-1][:160]}",
         "steps": 0,
         "finite": False,
         "seconds": float("nan"),
@@ -211,34 +211,34 @@ def in_a_process(corner: Corner, steps: int, gigabytes: float) -> dict[str, Any]
 def main() -> int:
     """Print a row for every corner."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    by_name = {corner.name: corner for corner in CORNERS}
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(by_name)}")
+    corners_by_name = {corner.name: corner for corner in CORNERS}
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(corners_by_name)}")
     parser.add_argument("--steps", type=int, default=20, help="half of them in each stage")
     parser.add_argument("--memory", type=float, default=8.0, help="GB that a process may use")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    unknown = sorted(set(options.names) - set(by_name))
+    unknown = sorted(set(options.names) - set(corners_by_name))
     if unknown:
         parser.error(f"no corner is called {unknown[0]}")
     if options.one:
         enable_compilation_cache()
         retain_freed_memory()
-        print(json.dumps(train_corner(by_name[options.one], options.steps, options.memory)))
+        print(json.dumps(train_corner(corners_by_name[options.one], options.steps, options.memory)))
         return 0
     print("| corner | verdict | steps | s | MB | what it said |")
     print("| --- | --- | ---: | ---: | ---: | --- |")
-    bad = 0
-    for corner in [by_name[name] for name in options.names] or CORNERS:
-        found = in_a_process(corner, options.steps, options.memory)
-        said = verdict(corner, found, options.steps)
-        bad += said != "ok"
-        what = found["outcome"] if found["outcome"] != "trained" else ""
+    failure_count = 0
+    for corner in [corners_by_name[name] for name in options.names] or CORNERS:
+        result = in_a_process(corner, options.steps, options.memory)
+        judgement = verdict(corner, result, options.steps)
+        failure_count += judgement != "ok"
+        outcome = result["outcome"] if result["outcome"] != "trained" else ""
         print(
-            f"| {corner.name} | {said} | {found['steps']} | {found['seconds']:.0f} | "
-            f"{found['memory_mb']} | {what} |",
+            f"| {corner.name} | {judgement} | {result['steps']} | {result['seconds']:.0f} | "
+            f"{result['memory_mb']} | {outcome} |",
             flush=True,
         )
-    return 1 if bad else 0
+    return 1 if failure_count else 0
 
 
 if __name__ == "__main__":

@@ -31,39 +31,51 @@ _DIRECTIONS = ((0.01, 0.02, 1.0), (1.0, 0.013, 0.017), (0.011, 1.0, 0.019))
 
 def is_inside(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
     """Tell which points (N, 3) a mesh encloses."""
-    odd = np.zeros(len(points), int)
+    odd_count = np.zeros(len(points), int)
     for direction in _DIRECTIONS:
         rays = np.tile(direction, (len(points), 1))
         _, row, _ = mesh.ray.intersects_location(points, rays, multiple_hits=True)
-        odd += np.bincount(row, minlength=len(points)) % 2
-    return odd >= 2
+        odd_count += np.bincount(row, minlength=len(points)) % 2
+    return odd_count >= 2
 
 
 def rows(scene: Path, resolution: int) -> list[list[str]]:
     """Carve the hull of a scene and count; one row."""
     grid, hull, photographs = _hull(scene, resolution)
     began = time.perf_counter()
-    opened = carve_hollows(*photographs[:3], hull, grid, valid=photographs[3])
+    carved_hull = carve_hollows(*photographs[:3], hull, grid, valid=photographs[3])
     seconds = time.perf_counter() - began
-    carved = (hull < 0.0) & (opened >= 0.0)
+    is_carved = (hull < 0.0) & (carved_hull >= 0.0)
     truth = scene / "mesh_gt.ply"
-    counts = _against(truth, grid, hull, opened, carved) if truth.is_file() else ["", "", "", ""]
-    excess, left, wrong, deep = counts
-    inside, taken = int((hull < 0).sum()), int(carved.sum())
-    return [[str(inside), excess, str(taken), left, wrong, deep, f"{seconds:.1f}"]]
+    counts = (
+        _against(truth, grid, hull, carved_hull, is_carved) if truth.is_file() else ["", "", "", ""]
+    )
+    excess, excess_after, wrong_count, deep_count = counts
+    inside_count, carved_count = int((hull < 0).sum()), int(is_carved.sum())
+    return [
+        [
+            str(inside_count),
+            excess,
+            str(carved_count),
+            excess_after,
+            wrong_count,
+            deep_count,
+            f"{seconds:.1f}",
+        ]
+    ]
 
 
 def candidates(scene: Path, resolution: int) -> list[list[str]]:
     """Return a row for every part of the hull that may be a hollow, the largest first."""
     grid, hull, photographs = _hull(scene, resolution)
-    judged = hollow_candidates(*photographs[:3], hull, grid, valid=photographs[3])
+    possible_hollows = hollow_candidates(*photographs[:3], hull, grid, valid=photographs[3])
     return [
         [
             str(int(part.region.sum())),
             *(f"{value:.4f}" for value in (part.lid, part.behind, part.mirror)),
             "yes" if part.is_hollow else "no",
         ]
-        for part in sorted(judged, key=lambda part: -int(part.region.sum()))
+        for part in sorted(possible_hollows, key=lambda part: -int(part.region.sum()))
     ]
 
 
@@ -77,16 +89,21 @@ def _hull(scene: Path, resolution: int) -> tuple[Grid, np.ndarray, tuple[Any, ..
 
 
 def _against(
-    truth: Path, grid: Grid, hull: np.ndarray, opened: np.ndarray, carved: np.ndarray
+    truth: Path, grid: Grid, hull: np.ndarray, carved_hull: np.ndarray, is_carved: np.ndarray
 ) -> list[str]:
     """Count vertices outside the true surface before and after, and carved ones inside it."""
     mesh = trimesh.load(truth, force="mesh")
     assert isinstance(mesh, trimesh.Trimesh)
-    inside = is_inside(mesh, grid_points(grid))
-    depth = distance_transform_edt(inside.reshape(grid.vertex_shape[::-1]))
-    deep = np.asarray(depth).reshape(-1) > 1.5
-    parts = (hull < 0) & ~inside, (opened < 0) & ~inside, carved & inside, carved & deep
-    return [str(int(part.sum())) for part in parts]
+    is_enclosed = is_inside(mesh, grid_points(grid))
+    depth = distance_transform_edt(is_enclosed.reshape(grid.vertex_shape[::-1]))
+    is_deep = np.asarray(depth).reshape(-1) > 1.5
+    masks = (
+        (hull < 0) & ~is_enclosed,
+        (carved_hull < 0) & ~is_enclosed,
+        is_carved & is_enclosed,
+        is_carved & is_deep,
+    )
+    return [str(int(mask.sum())) for mask in masks]
 
 
 def main() -> None:

@@ -84,7 +84,7 @@ def rendered_by_mitsuba(scene: Path, chosen: list[int], spp: int) -> list[Parts]
     light = scene_lights.read_hdr(scene.parent / f"{description['train_light']}.hdr")
     size = json.loads((scene / "test_000" / "metadata.json").read_text())["imw"]
     cameras = json.loads((scene / "transforms_test.json").read_text())["frames"]
-    known = load_dataset(scene).test.truth
+    true_maps = load_dataset(scene).test.truth
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "mesh.ply"
         make_scene.write_parts(path, make_bounce_scenes.SCENES[scene.name]())
@@ -93,7 +93,7 @@ def rendered_by_mitsuba(scene: Path, chosen: list[int], spp: int) -> list[Parts]
             mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
             for depth in (make_scene.MAX_DEPTH, 2)
         ]
-        found = []
+        renders = []
         for number in chosen:
             pose = np.asarray(cameras[number]["transform_matrix"])
             view = make_scene.View("", pose, 7000 + number)
@@ -110,30 +110,30 @@ def rendered_by_mitsuba(scene: Path, chosen: list[int], spp: int) -> list[Parts]
                 for integrator in integrators
             )
             alpha = np.clip(whole[..., 3:], 0.0, 1.0)
-            albedo, normal = (np.asarray(known[name][number]) for name in ("albedo", "normal"))
-            found.append(
+            albedo, normal = (np.asarray(true_maps[name][number]) for name in ("albedo", "normal"))
+            renders.append(
                 Parts(whole[..., :3], direct[..., :3], alpha[..., 0], albedo * alpha, normal)
             )
-    return found
+    return renders
 
 
 def rendered_by_run(folder: Path, chosen: list[int], samples: int) -> list[Parts]:
     """Render the same views of a run's own scene, with its indirect light and without any."""
     trained = load_trained(folder)
-    without = MonteCarloSettings(indirect="none").build(LightSpec())
-    pipelines = (trained.pipeline, replace(trained.pipeline, transport=without))
-    renderers = [Renderer(one, trained.params, samples=samples) for one in pipelines]
+    direct_transport = MonteCarloSettings(indirect="none").build(LightSpec())
+    pipelines = (trained.pipeline, replace(trained.pipeline, transport=direct_transport))
+    renderers = [Renderer(pipeline, trained.params, samples=samples) for pipeline in pipelines]
     views = Run(folder).dataset.test
 
     def view_of(renderer: Renderer, number: int) -> RenderedView:
         return renderer(views.camera(np.array([number])))
 
-    found = []
+    renders = []
     for number in chosen:
         whole, direct = (view_of(renderer, number) for renderer in renderers)
         maps = (whole.aovs["albedo"], whole.aovs["normal"])
-        found.append(Parts(whole.rgb, direct.rgb, whole.alpha, *maps))
-    return found
+        renders.append(Parts(whole.rgb, direct.rgb, whole.alpha, *maps))
+    return renders
 
 
 def _counted(truth: Parts) -> np.ndarray:
@@ -143,11 +143,11 @@ def _counted(truth: Parts) -> np.ndarray:
 
 def compared(found: list[Parts], truth: list[Parts]) -> dict[str, float]:
     """Compare the views of a run with the true ones."""
-    counted = [_counted(view) for view in truth]
+    masks = [_counted(view) for view in truth]
 
     def pixels(views: list[Parts], part: str) -> np.ndarray:
         return np.concatenate(
-            [getattr(view, part)[where] for view, where in zip(views, counted, strict=True)]
+            [getattr(view, part)[mask] for view, mask in zip(views, masks, strict=True)]
         )
 
     peak = float(np.percentile(pixels(truth, "whole"), 99))
@@ -175,8 +175,8 @@ def write_picture(path: Path, truth: Parts, others: list[Parts]) -> None:
 
 def _aligned(albedo: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Scale each channel of an albedo to the truth by least squares."""
-    both, own = (np.sum(x * albedo, axis=(0, 1)) for x in (truth, albedo))
-    return albedo * (both / np.maximum(own, 1e-12))
+    cross_sums, square_sums = (np.sum(x * albedo, axis=(0, 1)) for x in (truth, albedo))
+    return albedo * (cross_sums / np.maximum(square_sums, 1e-12))
 
 
 def main() -> None:

@@ -118,10 +118,10 @@ class Process:
             "XDG_CACHE_HOME": str(cache),
             "XLA_FLAGS": os.environ.get("XLA_FLAGS", FAST_COMPILER),
         }
-        with log.open("wb") as words:
+        with log.open("wb") as log_file:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "geosplat_jax", *arguments],
-                stdout=words,
+                stdout=log_file,
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,
                 env=environment,
@@ -161,27 +161,29 @@ def small_scene(folder: Path) -> Path:
 
 def seen_files(folder: Path) -> Counter:
     """Return sizes plus one of all files below a folder, by path, also of incomplete ones."""
-    found = Counter()
+    sizes = Counter()
     for root, _, names in os.walk(folder):
         for name in names:
             path = os.path.join(root, name)
             try:
-                found[path] = os.stat(path).st_size + 1
+                sizes[path] = os.stat(path).st_size + 1
             except OSError:  # renamed in between
                 continue
-    return found
+    return sizes
 
 
 def wait_for_file(process: Process, folder: Path, wanted: Callable[[str], bool], skip: int) -> bool:
     """Wait until a wanted file has changed ``skip + 1`` times; False if the process ends before."""
-    before = seen_files(folder)
+    previous_sizes = seen_files(folder)
     while not process.has_ended:
-        now = seen_files(folder)
-        if any(wanted(path) and now[path] != before[path] for path in now):
+        current_sizes = seen_files(folder)
+        if any(
+            wanted(path) and current_sizes[path] != previous_sizes[path] for path in current_sizes
+        ):
             if not skip:
                 return True
             skip -= 1
-        before = now
+        previous_sizes = current_sizes
         time.sleep(0.001)
     return False
 
@@ -217,8 +219,8 @@ def killed(
     """Wait for a moment, send a signal, and wait for the end; None if the process ended before."""
     number = draw.choice(SIGNALS)
     if moment == "anywhere":
-        end = time.monotonic() + draw.uniform(0.0, duration)
-        while time.monotonic() < end and not process.has_ended:
+        deadline = time.monotonic() + draw.uniform(0.0, duration)
+        while time.monotonic() < deadline and not process.has_ended:
             time.sleep(0.005)
     elif moment == "compilation":
         if wait_for_words(process, "compiling stage"):
@@ -228,11 +230,11 @@ def killed(
     if process.has_ended:
         return None
     kill = Kill(name, moment, int(number))
-    printed, began = len(process.words()), time.monotonic()
+    printed_length, began = len(process.words()), time.monotonic()
     process.send(number)
     kill.status = process.wait(PATIENCE)
     kill.seconds = time.monotonic() - began
-    kill.lines = [line for line in process.words()[printed:].splitlines() if line.strip()]
+    kill.lines = [line for line in process.words()[printed_length:].splitlines() if line.strip()]
     judge(kill, process)
     return kill
 
@@ -258,42 +260,48 @@ def judge(kill: Kill, process: Process) -> None:
     if kill.status == -signal.SIGINT and LAST_WORDS in text and "Traceback" not in text:
         kill.outcome = "had ended"
         return
-    allowed = {
+    allowed_statuses = {
         signal.SIGINT: (0, 130),
         signal.SIGKILL: (0, -9),
         signal.SIGTERM: (0, 130, -15),
     }[signal.Signals(kill.number)]
-    if kill.status not in allowed:
+    if kill.status not in allowed_statuses:
         kill.faults.append(f"status {kill.status} after signal {kill.number}")
     if "Traceback" in text:
         kill.faults.append("a traceback")
     # Only lines about the signal count, and not progress that was printed at the same time.
-    said = [line for line in kill.lines if not PROGRESS.search(line)]
-    if kill.status == 130 and not 1 <= len(said) <= MOST_LINES:
-        kill.faults.append(f"{len(said)} lines after Ctrl-C")
+    signal_lines = [line for line in kill.lines if not PROGRESS.search(line)]
+    if kill.status == 130 and not 1 <= len(signal_lines) <= MOST_LINES:
+        kill.faults.append(f"{len(signal_lines)} lines after Ctrl-C")
 
 
 def differences(run: Path, reference: Path) -> list[str]:
     """Compare two finished runs to the bit: checkpoints of two stages, and every step."""
-    found = []
-    for part in ("checkpoints", "stages/split_sum"):
-        mine, theirs = (latest_checkpoint(root / part) for root in (run, reference))
-        if mine is None or theirs is None or mine.name != theirs.name:
-            found.append(f"{part}: {mine}, not {theirs}")
+    mismatches = []
+    for subfolder in ("checkpoints", "stages/split_sum"):
+        run_checkpoint, reference_checkpoint = (
+            latest_checkpoint(root / subfolder) for root in (run, reference)
+        )
+        if (
+            run_checkpoint is None
+            or reference_checkpoint is None
+            or run_checkpoint.name != reference_checkpoint.name
+        ):
+            mismatches.append(f"{subfolder}: {run_checkpoint}, not {reference_checkpoint}")
             continue
-        with zipfile.ZipFile(mine) as a, zipfile.ZipFile(theirs) as b:
+        with zipfile.ZipFile(run_checkpoint) as a, zipfile.ZipFile(reference_checkpoint) as b:
             if set(a.namelist()) != set(b.namelist()):
-                found.append(f"{part}: other arrays")
+                mismatches.append(f"{subfolder}: other arrays")
                 continue
-            found += [f"{part}: {n}" for n in a.namelist() if a.read(n) != b.read(n)]
+            mismatches += [f"{subfolder}: {n}" for n in a.namelist() if a.read(n) != b.read(n)]
     steps = [
         [{k: v for k, v in line.items() if k not in UNMEASURED} for line in lines]
         for lines in (RunFolder(root).metric_lines() for root in (run, reference))
     ]
     if len(steps[0]) != len(steps[1]):
-        found.append(f"{len(steps[0])} steps are written down, not {len(steps[1])}")
-    changed = [a["step"] for a, b in zip(*steps, strict=False) if a != b]
-    return found + ([f"steps {changed}"] if changed else [])
+        mismatches.append(f"{len(steps[0])} steps are written down, not {len(steps[1])}")
+    changed_steps = [a["step"] for a, b in zip(*steps, strict=False) if a != b]
+    return mismatches + ([f"steps {changed_steps}"] if changed_steps else [])
 
 
 def is_whole(path: Path) -> bool:
@@ -343,9 +351,9 @@ class Study:
 
     def train_arguments(self, run: Path) -> list[str]:
         """Return the arguments that train a run, or resume it."""
-        changed = [part for setting in SETTINGS for part in ("--set", setting)]
-        place = ["--output", str(run), "--downscale", "8"]
-        return ["train", str(self.scene), *place, "--resume", *changed]
+        overrides = [part for setting in SETTINGS for part in ("--set", setting)]
+        options = ["--output", str(run), "--downscale", "8"]
+        return ["train", str(self.scene), *options, "--resume", *overrides]
 
     def reader_arguments(self, name: str, run: Path) -> list[str]:
         """Return the arguments that call a command on a finished run."""
@@ -369,15 +377,15 @@ class Study:
         """Train the reference, and run every command twice: to fill the cache, and to time it."""
         if not (self.reference / "training.json").exists():
             self.whole(self.train_arguments(self.reference))
-        again = self.folder / "again"
-        shutil.rmtree(again, ignore_errors=True)
-        self.seconds["train"] = self.whole(self.train_arguments(again))
-        found = differences(again, self.reference)
-        if found:
-            raise RuntimeError(f"two undisturbed runs differ: {found}")
+        second_run = self.folder / "again"
+        shutil.rmtree(second_run, ignore_errors=True)
+        self.seconds["train"] = self.whole(self.train_arguments(second_run))
+        mismatches = differences(second_run, self.reference)
+        if mismatches:
+            raise RuntimeError(f"two undisturbed runs differ: {mismatches}")
         for name in READERS:
-            self.whole(self.reader_arguments(name, again))
-            self.seconds[name] = self.whole(self.reader_arguments(name, again))
+            self.whole(self.reader_arguments(name, second_run))
+            self.seconds[name] = self.whole(self.reader_arguments(name, second_run))
         print(f"undisturbed: { ({k: round(v, 1) for k, v in self.seconds.items()}) }", flush=True)
 
     def note(self, kill: Kill) -> None:
@@ -393,27 +401,27 @@ class Study:
 
     def chain(self, name: str, run: Path, arguments: Sequence[str], moments: Sequence[str]) -> None:
         """Kill a command some times, then let it end, and look at what there is."""
-        planned = self.draw.randint(1, MOST_KILLS)
-        last: Kill | None = None
-        for _ in range(planned):
+        kill_count = self.draw.randint(1, MOST_KILLS)
+        last_kill: Kill | None = None
+        for _ in range(kill_count):
             moment = self.draw.choice(moments)
             is_cold = moment == "compilation"
-            cold = self.folder / "cold"
-            shutil.rmtree(cold, ignore_errors=True)
-            process = self.process(arguments, cache=cold if is_cold else None)
+            cold_cache = self.folder / "cold"
+            shutil.rmtree(cold_cache, ignore_errors=True)
+            process = self.process(arguments, cache=cold_cache if is_cold else None)
             kill = killed(name, process, run, moment, self.seconds[name], self.draw)
             if kill is None:
-                self._require_success(name, process, last)
+                self._require_success(name, process, last_kill)
                 continue
-            last = kill
+            last_kill = kill
             kill.faults += [f"half a file: {path}" for path in half_files(run)]
             self.note(kill)
         process = self.process(arguments)
         process.wait()
-        self._require_success(name, process, last)
+        self._require_success(name, process, last_kill)
         self.finished += 1
 
-    def _require_success(self, name: str, process: Process, last: Kill | None) -> None:
+    def _require_success(self, name: str, process: Process, last_kill: Kill | None) -> None:
         """Record a fault of the last kill if a command that was left alone did not succeed."""
         status, text = process.wait(), process.words()
         fault = None
@@ -422,12 +430,12 @@ class Study:
         elif "damaged" in text:
             fault = f"the next call of {name} found damage: {text[-500:]}"
         if fault is not None:
-            self._blame(last, fault)
+            self._blame(last_kill, fault)
 
-    def _blame(self, last: Kill | None, fault: str) -> None:
-        if last is not None:
-            last.faults.append(fault)
-        self.other_faults += last is None
+    def _blame(self, last_kill: Kill | None, fault: str) -> None:
+        if last_kill is not None:
+            last_kill.faults.append(fault)
+        self.other_faults += last_kill is None
         print(f"     ! {fault}", flush=True)
 
     def train_trial(self) -> None:
@@ -437,12 +445,12 @@ class Study:
         moments = ("anywhere", "anywhere", "checkpoint", "checkpoint", "step", "end of stage")
         if self.draw.random() < 0.15:
             moments = ("compilation", "anywhere")
-        before = len(self.kills)
+        first_count = len(self.kills)
         self.chain("train", run, self.train_arguments(run), moments)
-        found = differences(run, self.reference)
-        if found:
-            last = self.kills[-1] if len(self.kills) > before else None
-            self._blame(last, f"the run is not that of the reference: {found}")
+        mismatches = differences(run, self.reference)
+        if mismatches:
+            last_kill = self.kills[-1] if len(self.kills) > first_count else None
+            self._blame(last_kill, f"the run is not that of the reference: {mismatches}")
 
     def reader_trial(self) -> None:
         """Kill a command on a copy of the finished run."""
@@ -467,10 +475,10 @@ class Study:
             lines.append(
                 f"Ctrl-C took {waits[len(waits) // 2]:.1f} s (median), {waits[-1]:.1f} s at most"
             )
-        bad = sum(bool(kill.faults) for kill in self.kills)
+        faulty_count = sum(bool(kill.faults) for kill in self.kills)
         lines.append(
             f"{len(self.kills)} kills, after which {self.finished} commands were left to end; "
-            f"{bad} kills with a fault, {self.other_faults} faults after none"
+            f"{faulty_count} kills with a fault, {self.other_faults} faults after none"
         )
         return "\n".join(lines)
 

@@ -93,42 +93,42 @@ class Row:
 
 def _hidden_inputs(layers: tuple[Layer, ...], features: jax.Array) -> jax.Array:
     """Lay the inputs of all rectifiers of an MLP side by side."""
-    found = []
+    inputs = []
     for layer in layers[:-1]:
         features = features @ layer.weights
         if layer.bias is not None:
             features = features + layer.bias[None, :]
-        found.append(features)
+        inputs.append(features)
         features = jax.nn.relu(features)
-    return jnp.concatenate(found, axis=-1)
+    return jnp.concatenate(inputs, axis=-1)
 
 
 def _rectifier_inputs(params: Params, points: jax.Array, pipeline: Pipeline) -> jax.Array:
     """Evaluate the inputs of the rectifiers of every head at points of the unit cube."""
     material, spec = params.material, pipeline.fields.grid
-    first = encode(material.albedo_table, points, spec=spec)
-    second = first
+    albedo_features = encode(material.albedo_table, points, spec=spec)
+    surface_features = albedo_features
     if material.surface_table is not None:
-        second = encode(material.surface_table, points, spec=spec)
-    heads = [_hidden_inputs(material.albedo_head, first)]
-    heads.append(_hidden_inputs(material.surface_head, second))
+        surface_features = encode(material.surface_table, points, spec=spec)
+    heads = [_hidden_inputs(material.albedo_head, albedo_features)]
+    heads.append(_hidden_inputs(material.surface_head, surface_features))
     if material.shift_head is not None:
-        heads.append(_hidden_inputs(material.shift_head, second))
+        heads.append(_hidden_inputs(material.shift_head, surface_features))
     return jnp.concatenate(heads, axis=-1)
 
 
 def _observe_view(asset: Asset, batch: Batch, view: int, pipeline: Pipeline) -> dict[str, Any]:
     """Evaluate the quantities that depend on one view."""
     camera, splats = batch.camera.view(view), asset.splats
-    towards = camera.centers - splats.means
+    camera_offsets = camera.centers - splats.means
     footprints = pipeline.project(splats.means, splats.quats, splats.scales, camera)
     lists = pipeline.visible(splats, camera)
-    viewer = safe_normalize(towards)
-    cosine = jnp.sum(splats.normals * viewer, axis=-1)
+    view_directions = safe_normalize(camera_offsets)
+    cosine = jnp.sum(splats.normals * view_directions, axis=-1)
     return {
-        "outward": jnp.sum(splats.outward * towards, axis=-1),
+        "outward": jnp.sum(splats.outward * camera_offsets, axis=-1),
         "cosine": cosine,
-        "reflected": direction_to_uv(2 * cosine[:, None] * splats.normals - viewer),
+        "reflected": direction_to_uv(2 * cosine[:, None] * splats.normals - view_directions),
         "means2d": footprints.means2d,
         "conics": footprints.conics,
         "opacity": splats.opacities * footprints.compensation,
@@ -142,13 +142,13 @@ def _observe_view(asset: Asset, batch: Batch, view: int, pipeline: Pipeline) -> 
 def _residual(rgb: jax.Array, alpha: jax.Array, batch: Batch, pipeline: Pipeline) -> jax.Array:
     """Subtract the composited photographs from the composited images, as the loss does."""
     kind, shape = pipeline.objective.background, (1, *rgb.shape[1:])
-    behind = []
+    backgrounds = []
     for number in range(rgb.shape[0]):
         # The first of the view's two keys, see `Pipeline.view_loss`.
         key = jax.random.split(batch.view(number).key)[0]
-        behind.append(random_background(key, shape, rgb.dtype, kind))
-    behind = jnp.concatenate(behind)
-    images = compare(rgb, alpha, batch.image, behind, batch.valid, srgb=False)
+        backgrounds.append(random_background(key, shape, rgb.dtype, kind))
+    backgrounds = jnp.concatenate(backgrounds)
+    images = compare(rgb, alpha, batch.image, backgrounds, batch.valid, srgb=False)
     return images.predicted - images.target
 
 
@@ -185,15 +185,17 @@ def _near_border(position: np.ndarray, step: np.ndarray) -> np.ndarray:
 
 def _crossing(name: str, unit: str, before: np.ndarray, after: np.ndarray) -> Row:
     """Count changes of sign of a quantity."""
-    near = np.abs(before) <= np.abs(after - before)
-    return Row(name, unit, before.size, int(np.sum((before < 0) != (after < 0))), int(near.sum()))
+    is_near = np.abs(before) <= np.abs(after - before)
+    return Row(
+        name, unit, before.size, int(np.sum((before < 0) != (after < 0))), int(is_near.sum())
+    )
 
 
 def _cells(name: str, unit: str, before: np.ndarray, after: np.ndarray) -> Row:
     """Count rows (n, axes) whose integer part changed along any axis."""
-    changed = np.any(np.floor(before) != np.floor(after), axis=1)
-    near = np.any(_near_border(before, after - before), axis=1)
-    return Row(name, unit, len(before), int(changed.sum()), int(near.sum()))
+    has_changed = np.any(np.floor(before) != np.floor(after), axis=1)
+    is_near = np.any(_near_border(before, after - before), axis=1)
+    return Row(name, unit, len(before), int(has_changed.sum()), int(is_near.sum()))
 
 
 def quad_keys(sdf: np.ndarray, grid: Grid) -> np.ndarray:
@@ -204,11 +206,11 @@ def quad_keys(sdf: np.ndarray, grid: Grid) -> np.ndarray:
     k, j, i = np.indices((nz, ny, nx))
     inner = {0: i > 0, 1: j > 0, 2: k > 0}
     upper = (inside[:-1, :-1, 1:], inside[:-1, 1:, :-1], inside[1:, :-1, :-1])
-    crossed = np.stack(
+    is_crossed = np.stack(
         [(lower != upper[a]) & inner[(a + 1) % 3] & inner[(a + 2) % 3] for a in range(3)],
         axis=-1,
     )
-    owners = np.flatnonzero(crossed)
+    owners = np.flatnonzero(is_crossed)
     return 2 * owners + lower.reshape(-1)[owners // 3]
 
 
@@ -216,14 +218,14 @@ def _surface_vertices(sdf: np.ndarray, grid: Grid) -> np.ndarray:
     """Return a flat mask of the grid vertices at the ends of crossed edges."""
     nx, ny, nz = grid.shape
     inside = sdf.reshape(nz + 1, ny + 1, nx + 1) < 0
-    touched = np.zeros(inside.shape, bool)
+    is_endpoint = np.zeros(inside.shape, bool)
     for axis in range(3):
-        changes = np.diff(inside, axis=axis)
+        is_crossed = np.diff(inside, axis=axis)
         padding = [(0, 0)] * 3
         for side in ((1, 0), (0, 1)):
             padding[axis] = side
-            touched |= np.pad(changes, padding)
-    return touched.reshape(-1)
+            is_endpoint |= np.pad(is_crossed, padding)
+    return is_endpoint.reshape(-1)
 
 
 def _hits(view: dict[str, np.ndarray], splat_count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -231,10 +233,10 @@ def _hits(view: dict[str, np.ndarray], splat_count: int) -> tuple[np.ndarray, np
     ranks = view["chunk_ranks"]
     tiles = np.repeat(view["chunk_tiles"], ranks.shape[0])
     ranks = ranks.T.reshape(-1)
-    real = ranks < len(view["index"])
-    rows = view["index"][ranks[real]]
+    is_real = ranks < len(view["index"])
+    rows = view["index"][ranks[is_real]]
     assert np.all(rows < splat_count)
-    return tiles[real], rows
+    return tiles[is_real], rows
 
 
 def _alpha(view: dict, rows: np.ndarray, tiles: np.ndarray, columns: int, size: int) -> np.ndarray:
@@ -251,87 +253,122 @@ def _count_view(
     before: dict, after: dict, rows: tuple[np.ndarray, np.ndarray], config: Config, width: int
 ) -> list[Row]:
     """Count changes that depend on one view; ``rows`` are the splats that both states have."""
-    first, second = rows
+    old_rows, new_rows = rows
     partner = np.full(len(before["depths"]), -1)
-    partner[first] = second
-    lit = np.intersect1d(before["index"], first)
-    kept = partner[lit]
-    one, two = before["outward"][first], after["outward"][second]
-    found = [_crossing("back-face culling", "splats", one, two)]
-    one, two = before["cosine"][lit], after["cosine"][kept]
-    found.append(_crossing("flip of the shading normal", "visible splats", one, two))
+    partner[old_rows] = new_rows
+    lit = np.intersect1d(before["index"], old_rows)
+    lit_partners = partner[lit]
+    old_values, new_values = before["outward"][old_rows], after["outward"][new_rows]
+    counts = [_crossing("back-face culling", "splats", old_values, new_values)]
+    old_values, new_values = before["cosine"][lit], after["cosine"][lit_partners]
+    counts.append(_crossing("flip of the shading normal", "visible splats", old_values, new_values))
     tiles, hit = _hits(before, len(partner))
     adjacent = (tiles[1:] == tiles[:-1]) & (partner[hit[1:]] >= 0) & (partner[hit[:-1]] >= 0)
     front, back = hit[:-1][adjacent], hit[1:][adjacent]
     gap = before["depths"][back] - before["depths"][front]
     gap_after = after["depths"][partner[back]] - after["depths"][partner[front]]
-    found.append(_crossing("depth order", "neighbours in a tile's list", gap, gap_after))
-    swapped = (gap < 0) != (gap_after < 0)
-    close = (front // PER_QUAD == back // PER_QUAD)[swapped]
-    found.append(Row("swapped within one quad", "swapped pairs", close.size, int(close.sum()), 0))
+    counts.append(_crossing("depth order", "neighbours in a tile's list", gap, gap_after))
+    is_swapped = (gap < 0) != (gap_after < 0)
+    is_same_quad = (front // PER_QUAD == back // PER_QUAD)[is_swapped]
+    counts.append(
+        Row(
+            "swapped within one quad",
+            "swapped pairs",
+            is_same_quad.size,
+            int(is_same_quad.sum()),
+            0,
+        )
+    )
 
     size = config.raster.tile_size
     columns = -(-width // size)
-    back_to = np.full(len(after["depths"]), -1)
-    back_to[second] = first
-    later = _hits(after, len(back_to))
+    inverse_partner = np.full(len(after["depths"]), -1)
+    inverse_partner[new_rows] = old_rows
+    later_hits = _hits(after, len(inverse_partner))
     pairs = [np.stack([tiles, hit])[:, partner[hit] >= 0]]
-    pairs.append(np.stack([later[0], back_to[later[1]]])[:, back_to[later[1]] >= 0])
+    pairs.append(
+        np.stack([later_hits[0], inverse_partner[later_hits[1]]])[
+            :, inverse_partner[later_hits[1]] >= 0
+        ]
+    )
     tiles, hit = np.unique(np.concatenate(pairs, axis=1), axis=1)
-    one = _alpha(before, hit, tiles, columns, size)
-    two = _alpha(after, partner[hit], tiles, columns, size)
-    seen = (one >= MIN_ALPHA) | (two >= MIN_ALPHA)
-    one, two = np.log(one[seen]), np.log(two[seen])
+    old_values = _alpha(before, hit, tiles, columns, size)
+    new_values = _alpha(after, partner[hit], tiles, columns, size)
+    is_visible = (old_values >= MIN_ALPHA) | (new_values >= MIN_ALPHA)
+    old_values, new_values = np.log(old_values[is_visible]), np.log(new_values[is_visible])
     for name, limit in (("alpha threshold 1/255", MIN_ALPHA), ("alpha clamp .999", MAX_ALPHA)):
-        found.append(
-            _crossing(name, "(splat, pixel) pairs", one - np.log(limit), two - np.log(limit))
+        counts.append(
+            _crossing(
+                name, "(splat, pixel) pairs", old_values - np.log(limit), new_values - np.log(limit)
+            )
         )
     texels = np.array([config.light.width, config.light.height])
-    one, two = before["reflected"][lit] * texels - 0.5, after["reflected"][kept] * texels - 0.5
-    found.append(_cells("texel of the reflected view", "visible splats", one, two))
-    one, two = (127 * np.abs(x)[:, None] for x in (before["cosine"][lit], after["cosine"][kept]))
-    found.append(_cells("cell of the FG table in n.v", "visible splats", one, two))
-    return found
+    old_values, new_values = (
+        before["reflected"][lit] * texels - 0.5,
+        after["reflected"][lit_partners] * texels - 0.5,
+    )
+    counts.append(_cells("texel of the reflected view", "visible splats", old_values, new_values))
+    old_values, new_values = (
+        127 * np.abs(x)[:, None] for x in (before["cosine"][lit], after["cosine"][lit_partners])
+    )
+    counts.append(_cells("cell of the FG table in n.v", "visible splats", old_values, new_values))
+    return counts
 
 
 def _count_geometry(before: Params, after: Params, grid: Grid) -> list[Row]:
     """Count changes of SDF signs, quads and FlexiCubes weights."""
-    one, two = (np.asarray(p.geometry.sdf) for p in (before, after))
-    ends = _surface_vertices(one, grid)
-    keys, later = quad_keys(one, grid), quad_keys(two, grid)
-    found = [_crossing("sign of the SDF", "ends of crossed edges", one[ends], two[ends])]
-    died, born = len(np.setdiff1d(keys, later)), len(np.setdiff1d(later, keys))
-    found.append(Row("quads that died", "quads", len(keys), died, None))
-    found.append(Row("quads that were born", "quads", len(keys), born, None))
+    old_sdf, new_sdf = (np.asarray(p.geometry.sdf) for p in (before, after))
+    is_endpoint = _surface_vertices(old_sdf, grid)
+    old_keys, new_keys = quad_keys(old_sdf, grid), quad_keys(new_sdf, grid)
+    counts = [
+        _crossing(
+            "sign of the SDF", "ends of crossed edges", old_sdf[is_endpoint], new_sdf[is_endpoint]
+        )
+    ]
+    died_count, born_count = (
+        len(np.setdiff1d(old_keys, new_keys)),
+        len(np.setdiff1d(new_keys, old_keys)),
+    )
+    counts.append(Row("quads that died", "quads", len(old_keys), died_count, None))
+    counts.append(Row("quads that were born", "quads", len(old_keys), born_count, None))
 
     def weights(params: Params) -> np.ndarray:
         geometry = params.geometry
-        parts = (geometry.alpha, geometry.beta, geometry.gamma)
-        return np.concatenate([np.asarray(x).reshape(-1) for x in parts])
+        weight_arrays = (geometry.alpha, geometry.beta, geometry.gamma)
+        return np.concatenate([np.asarray(x).reshape(-1) for x in weight_arrays])
 
-    raw, moved = weights(before), weights(after)
-    zero = int(np.sum(raw == 0))
-    found.append(Row("raw weights at exactly 0", "weights", raw.size, zero, None))
-    found.append(_crossing("sign of a raw weight", "weights", raw[raw != 0], moved[raw != 0]))
-    return found
+    old_weights, new_weights = weights(before), weights(after)
+    zero_count = int(np.sum(old_weights == 0))
+    counts.append(Row("raw weights at exactly 0", "weights", old_weights.size, zero_count, None))
+    counts.append(
+        _crossing(
+            "sign of a raw weight",
+            "weights",
+            old_weights[old_weights != 0],
+            new_weights[old_weights != 0],
+        )
+    )
+    return counts
 
 
-def _count_fields(one: dict, two: dict, rows: tuple[np.ndarray, ...], config: Config) -> list[Row]:
+def _count_fields(
+    old_state: dict, new_state: dict, rows: tuple[np.ndarray, ...], config: Config
+) -> list[Row]:
     """Count changes that depend on splats, but on no view."""
     names = ("points", "rectifiers", "level", "roughness", "normal_uv")
-    pair = {name: (one[name][rows[0]], two[name][rows[1]]) for name in names}
-    found = []
+    pair = {name: (old_state[name][rows[0]], new_state[name][rows[1]]) for name in names}
+    counts = []
     for level, cells in enumerate(config.material.grid.resolutions):
         name = f"hash cell, level {level} ({cells})"
-        found.append(_cells(name, "splats", *(x * cells for x in pair["points"])))
-    found.append(_crossing("rectifiers of the heads", "(splat, unit) pairs", *pair["rectifiers"]))
-    found.append(_cells("level of roughness", "splats", *(x[:, None] for x in pair["level"])))
-    above = (x - ROUGHNESS_FLOOR for x in pair["roughness"])
-    found.append(_crossing("roughness floor .08", "splats", *above))
+        counts.append(_cells(name, "splats", *(x * cells for x in pair["points"])))
+    counts.append(_crossing("rectifiers of the heads", "(splat, unit) pairs", *pair["rectifiers"]))
+    counts.append(_cells("level of roughness", "splats", *(x[:, None] for x in pair["level"])))
+    excess = (x - ROUGHNESS_FLOOR for x in pair["roughness"])
+    counts.append(_crossing("roughness floor .08", "splats", *excess))
     texels = np.array([config.light.width, config.light.height])
-    at = (x * texels - 0.5 for x in pair["normal_uv"])
-    found.append(_cells("texel of the normal", "splats", *at))
-    return found
+    texel_positions = (x * texels - 0.5 for x in pair["normal_uv"])
+    counts.append(_cells("texel of the normal", "splats", *texel_positions))
+    return counts
 
 
 def count_changes(
@@ -343,32 +380,43 @@ def count_changes(
     for key, state in zip(keys, seen, strict=True):
         assert len(key) == int(state["usage"]["quads"])
     _, *quads = np.intersect1d(*keys, assume_unique=True, return_indices=True)
-    both = tuple((q[:, None] * PER_QUAD + np.arange(PER_QUAD)).reshape(-1) for q in quads)
+    common_rows = tuple((q[:, None] * PER_QUAD + np.arange(PER_QUAD)).reshape(-1) for q in quads)
     views = [
-        _count_view(a, b, both, config, width)
+        _count_view(a, b, common_rows, config, width)
         for a, b in zip(seen[0]["views"], seen[1]["views"], strict=True)
     ]
-    for parts in zip(*views, strict=True):
-        sums = {n: sum(getattr(p, n) for p in parts) for n in ("population", "changed", "near")}
-        rows.append(replace(parts[0], **sums))
-    rows += _count_fields(*seen, both, config)
-    one, two = (state["residual"].reshape(-1) for state in seen)
-    some = (one != 0) | (two != 0)
-    rows.append(_crossing("sign of the L1 residual", "pixel channels", one[some], two[some]))
-    zero = int(np.sum(~some))
-    rows.append(Row("L1 residual at exactly 0", "pixel channels", one.size, zero, None))
+    for kind_rows in zip(*views, strict=True):
+        sums = {n: sum(getattr(p, n) for p in kind_rows) for n in ("population", "changed", "near")}
+        rows.append(replace(kind_rows[0], **sums))
+    rows += _count_fields(*seen, common_rows, config)
+    old_residual, new_residual = (state["residual"].reshape(-1) for state in seen)
+    is_nonzero = (old_residual != 0) | (new_residual != 0)
+    rows.append(
+        _crossing(
+            "sign of the L1 residual",
+            "pixel channels",
+            old_residual[is_nonzero],
+            new_residual[is_nonzero],
+        )
+    )
+    zero_count = int(np.sum(~is_nonzero))
+    rows.append(
+        Row("L1 residual at exactly 0", "pixel channels", old_residual.size, zero_count, None)
+    )
     light = np.asarray(after.light.radiance)
-    floor = int(np.sum(light <= np.float32(config.run.smallest_light)))
-    rows.append(Row("texels put back to their floor", "texel channels", light.size, floor, None))
+    floor_count = int(np.sum(light <= np.float32(config.run.smallest_light)))
+    rows.append(
+        Row("texels put back to their floor", "texel channels", light.size, floor_count, None)
+    )
     return rows
 
 
-def _chosen(update: Params, wanted: tuple[str, ...]) -> Params:
+def _chosen(update: Params, prefixes: tuple[str, ...]) -> Params:
     """Keep the update of one group and set the others to zero."""
 
     def pick(path: Any, leaf: jax.Array) -> jax.Array:
-        kept = jax.tree_util.keystr(path).startswith(wanted)
-        return leaf if kept else jnp.zeros_like(leaf)
+        is_kept = jax.tree_util.keystr(path).startswith(prefixes)
+        return leaf if is_kept else jnp.zeros_like(leaf)
 
     return jax.tree_util.tree_map_with_path(pick, update)
 
@@ -389,30 +437,30 @@ def follow(
 ) -> list[dict[str, Any]]:
     """Compare the loss along the update of every group with predictions by gradients."""
     value, terms, gradient = evaluate(params)
-    found = []
-    for name, wanted in GROUPS.items():
-        part = _chosen(update, wanted)
-        slope, path = _product(gradient, part), 0.0
+    results = []
+    for name, prefixes in GROUPS.items():
+        group_update = _chosen(update, prefixes)
+        slope, path = _product(gradient, group_update), 0.0
         for segment in range(SEGMENTS):
             # The gradient is taken in the middle of a piece, so that a path may start on a kink.
-            moved = _move(params, part, (segment + 0.5) / SEGMENTS)
-            path += _product(evaluate(moved)[2], part) / SEGMENTS
+            moved_params = _move(params, group_update, (segment + 0.5) / SEGMENTS)
+            path += _product(evaluate(moved_params)[2], group_update) / SEGMENTS
             fraction = (segment + 1) / SEGMENTS
             if segment + 1 not in SHOWN:
                 continue
-            there, last_terms, _ = evaluate(_move(params, part, fraction))
-            found.append(
+            moved_value, last_terms, _ = evaluate(_move(params, group_update, fraction))
+            results.append(
                 {
                     "group": name,
                     "fraction": fraction,
-                    "change": there - value,
+                    "change": moved_value - value,
                     "first_order": fraction * slope,
                     "path": path,
-                    "jumps": there - value - path,
+                    "jumps": moved_value - value - path,
                 }
             )
-        found[-1]["terms"] = {key: last_terms[key] - terms[key] for key in terms}
-    return found
+        results[-1]["terms"] = {key: last_terms[key] - terms[key] for key in terms}
+    return results
 
 
 def _first_state(dataset: Dataset, config: Config) -> tuple[FlexiCubes, TrainState]:
@@ -427,11 +475,11 @@ def _last_state(run: Run) -> TrainState:
     """Read parameters and optimiser state from the last checkpoint."""
     path = latest_checkpoint(run.folder.checkpoints)
     assert path is not None
-    like = {
+    template = {
         "state": jax.eval_shape(lambda: initial_state(run.params)),
         "surface": jax.eval_shape(lambda: run.pipeline.surface),
     }
-    return load_checkpoint(path, like=like)[0]["state"]
+    return load_checkpoint(path, like=template)[0]["state"]
 
 
 def _advance(
@@ -440,13 +488,13 @@ def _advance(
     """Make a step, growing buffers as needed."""
 
     def attempt(capacities: Capacities) -> tuple[tuple[TrainState, StepReport], Usage]:
-        copied = jax.tree.map(jnp.copy, state)  # the step consumes it
-        sized = replace(pipeline, capacities=capacities)
-        after, report = train_step(copied, batch, sized, rule)
-        return (after, report), report.loss.usage
+        state_copy = jax.tree.map(jnp.copy, state)  # the step consumes it
+        resized_pipeline = replace(pipeline, capacities=capacities)
+        next_state, report = train_step(state_copy, batch, resized_pipeline, rule)
+        return (next_state, report), report.loss.usage
 
-    (after, report), capacities = capacity.retry(attempt, pipeline.capacities)
-    return after, report, replace(pipeline, capacities=capacities)
+    (next_state, report), capacities = capacity.retry(attempt, pipeline.capacities)
+    return next_state, report, replace(pipeline, capacities=capacities)
 
 
 def study(
@@ -454,39 +502,41 @@ def study(
 ) -> dict[str, Any]:
     """Make one step from ``state``, count changes, and follow the loss."""
     step = int(state.step)
-    since = step - config.first_step(stage.name)
-    pipeline = pipeline_at(pipeline, config, stage, since)
+    stage_step = step - config.first_step(stage.name)
+    pipeline = pipeline_at(pipeline, config, stage, stage_step)
     if not isinstance(pipeline.splats, FaceSplats):
         raise SystemExit(f"step {step} samples vertices; only face sampling is counted here")
     assert isinstance(pipeline.surface, FlexiCubes)
     batch = make_batch(dataset.train, step, stage, seed=config.run.seed)
-    before = state.params
-    rule = update_rule(config, stage, before, since)
-    advanced, report, pipeline = _advance(state, batch, pipeline, rule)
-    after = advanced.params
+    old_params = state.params
+    rule = update_rule(config, stage, old_params, stage_step)
+    next_state, report, pipeline = _advance(state, batch, pipeline, rule)
+    new_params = next_state.params
 
     def look(params: Params) -> dict[str, Any]:
-        seen = observe(pipeline, params, batch)
-        assert bool(capacity.fits(seen["usage"], pipeline.capacities))
-        return jax.device_get(seen)
+        observations = observe(pipeline, params, batch)
+        assert bool(capacity.fits(observations["usage"], pipeline.capacities))
+        return jax.device_get(observations)
 
     def evaluate(params: Params) -> tuple[float, dict[str, float], Params]:
-        (total, found), gradient = _value_and_gradient(pipeline, params, batch)
-        assert bool(capacity.fits(found.usage, pipeline.capacities))
-        terms = {n: float(pipeline.weights[n]) * float(value) for n, value in found.terms.items()}
+        (total, loss_report), gradient = _value_and_gradient(pipeline, params, batch)
+        assert bool(capacity.fits(loss_report.usage, pipeline.capacities))
+        terms = {
+            n: float(pipeline.weights[n]) * float(value) for n, value in loss_report.terms.items()
+        }
         return float(total), terms, gradient
 
-    seen = [look(before), look(after)]
+    observations = [look(old_params), look(new_params)]
     grid = pipeline.surface.grid
-    rows = count_changes(before, after, seen, config, grid, batch.camera.width)
-    update = jax.tree.map(jnp.subtract, after, before)
+    rows = count_changes(old_params, new_params, observations, config, grid, batch.camera.width)
+    update = jax.tree.map(jnp.subtract, new_params, old_params)
     return {
         "step": step,
         "loss": float(report.total),
-        "parameters": sum(leaf.size for leaf in jax.tree.leaves(before)),
+        "parameters": sum(leaf.size for leaf in jax.tree.leaves(old_params)),
         "parameters_moved": sum(int(jnp.sum(leaf != 0)) for leaf in jax.tree.leaves(update)),
         "counts": [vars(row) for row in rows],
-        "along": follow(before, update, evaluate),
+        "along": follow(old_params, update, evaluate),
     }
 
 
@@ -499,10 +549,10 @@ def show(result: dict[str, Any]) -> None:
     print(f"{'point':<34} {'of':<28} {'number':>9} {'changed':>9} {'share':>8} {'near':>8}")
     for row in result["counts"]:
         size = max(row["population"], 1)
-        near = "" if row["near"] is None else f"{row['near'] / size:8.3%}"
+        near_share = "" if row["near"] is None else f"{row['near'] / size:8.3%}"
         print(
             f"{row['name']:<34} {row['unit']:<28} {row['population']:>9} {row['changed']:>9} "
-            f"{row['changed'] / size:8.3%} {near:>8}"
+            f"{row['changed'] / size:8.3%} {near_share:>8}"
         )
     print(
         f"\n{'update of':<22} {'fraction':>8} {'change':>11} {'first order':>11} {'path':>11} "
@@ -515,8 +565,8 @@ def show(result: dict[str, Any]) -> None:
             f"{row['first_order']:11.3e} {row['path']:11.3e} {row['jumps']:11.3e} {ratio:21.3f}"
         )
         if "terms" in row:
-            parts = ", ".join(f"{n} {v:+.1e}" for n, v in row["terms"].items() if v)
-            print(f"    by term: {parts}")
+            term_changes = ", ".join(f"{n} {v:+.1e}" for n, v in row["terms"].items() if v)
+            print(f"    by term: {term_changes}")
 
 
 def main() -> None:
@@ -533,20 +583,22 @@ def main() -> None:
     retain_freed_memory()
 
     run = Run(arguments.run, scene=arguments.scene)
-    config, last = run.config, run.trained.stage
+    config, last_stage = run.config, run.trained.stage
     if not isinstance(run.pipeline.transport, SplitSum):
-        parser.error(f"{arguments.run} ended in {last.name}; train it without that stage's steps")
+        parser.error(
+            f"{arguments.run} ended in {last_stage.name}; train it without that stage's steps"
+        )
     results = {}
-    for which in arguments.step_from:
-        if which == "start":
+    for state_name in arguments.step_from:
+        if state_name == "start":
             stage = config.active_stages[0]
             surface, state = _first_state(run.dataset, config)
             pipeline = build_pipeline(config, stage, surface)
             pipeline = replace(pipeline, capacities=run.pipeline.capacities)
         else:
-            stage, pipeline, state = last, run.pipeline, _last_state(run)
-        results[which] = study(state, run.dataset, config, stage, pipeline)
-        show(results[which])
+            stage, pipeline, state = last_stage, run.pipeline, _last_state(run)
+        results[state_name] = study(state, run.dataset, config, stage, pipeline)
+        show(results[state_name])
     path = arguments.json or arguments.run / "kinks.json"
     path.write_text(json.dumps(results, indent=1) + "\n")
     print(f"\nfigures: {path}")

@@ -40,17 +40,17 @@ def with_light_stage(config: Config, *, steps: int, rate: float) -> Config:
     steps : number of steps of the new stage.
     rate : learning rate of the light; that of the exposure is half of it.
     """
-    after = config.stage(MONTE_CARLO)
-    place = config.stages.index(after)
-    learned = {"light": Rate(rate), "exposure": Rate(0.5 * rate)}
+    next_stage = config.stage(MONTE_CARLO)
+    position = config.stages.index(next_stage)
+    learned_rates = {"light": Rate(rate), "exposure": Rate(0.5 * rate)}
     light = replace(
-        after,
+        next_stage,
         name="light",
         steps=steps,
         enter=(),
-        rates={name: learned.get(name, Rate(0.0)) for name in after.rates},
+        rates={name: learned_rates.get(name, Rate(0.0)) for name in next_stage.rates},
     )
-    return replace(config, stages=(*config.stages[:place], light, *config.stages[place:]))
+    return replace(config, stages=(*config.stages[:position], light, *config.stages[position:]))
 
 
 def main() -> None:

@@ -44,10 +44,10 @@ def moved_mask(alpha: np.ndarray, margin: int) -> np.ndarray:
         return alpha
     mask = alpha > 0.5
     if margin > 0:
-        moved = distance_transform_edt(~mask) <= margin
+        new_mask = distance_transform_edt(~mask) <= margin
     else:
-        moved = distance_transform_edt(mask) > -margin
-    return moved.astype(np.float32)
+        new_mask = distance_transform_edt(mask) > -margin
+    return new_mask.astype(np.float32)
 
 
 def with_margin(dataset: Dataset, light: np.ndarray, margin: int) -> tuple[Dataset, float]:
@@ -55,15 +55,19 @@ def with_margin(dataset: Dataset, light: np.ndarray, margin: int) -> tuple[Datas
     views, images, overlaps = dataset.train, [], []
     for index in range(len(views)):
         image = views.images[index]
-        alpha, behind = image[..., 3], background(views, index, light, None)
-        shown = alpha[..., None] * image[..., :3] + (1.0 - alpha[..., None]) * behind
-        moved = moved_mask(alpha, margin)
-        images.append(np.concatenate([shown * (moved > 0)[..., None], moved[..., None]], -1))
-        true, found = alpha > 0.5, moved > 0.5
-        overlaps.append((true & found).sum() / max((true | found).sum(), 1))
+        alpha, backdrop = image[..., 3], background(views, index, light, None)
+        composite = alpha[..., None] * image[..., :3] + (1.0 - alpha[..., None]) * backdrop
+        new_alpha = moved_mask(alpha, margin)
+        images.append(
+            np.concatenate([composite * (new_alpha > 0)[..., None], new_alpha[..., None]], -1)
+        )
+        true_mask, new_mask = alpha > 0.5, new_alpha > 0.5
+        overlaps.append((true_mask & new_mask).sum() / max((true_mask | new_mask).sum(), 1))
     stacked = np.stack(images).astype(np.float32)
-    changed = replace(views, images=stacked, truth={}, relight={})
-    return replace(dataset, train=changed, bounds=object_bounds(changed)), float(np.mean(overlaps))
+    new_views = replace(views, images=stacked, truth={}, relight={})
+    return replace(dataset, train=new_views, bounds=object_bounds(new_views)), float(
+        np.mean(overlaps)
+    )
 
 
 def main() -> None:

@@ -32,8 +32,10 @@ def _ground_height(views: Views) -> float:
     """Height of the lowest point of the object, from its masks."""
     from geosplat_jax.surface.hull import hull_bounds
 
-    lo, _ = hull_bounds(views.world_to_camera, views.intrinsics, views.images[..., 3], margin=0.0)
-    return float(lo[2])
+    lower_corner, _ = hull_bounds(
+        views.world_to_camera, views.intrinsics, views.images[..., 3], margin=0.0
+    )
+    return float(lower_corner[2])
 
 
 def background(views: Views, view: int, light: np.ndarray, ground: float | None) -> np.ndarray:
@@ -46,14 +48,20 @@ def background(views: Views, view: int, light: np.ndarray, ground: float | None)
     color = scene_lights.lookup(light, rays.astype(np.float32))
     if ground is not None:
         eye = views.camera_to_world[view, :3, 3]
-        down = rays[..., 2] < -1e-3
-        depth = np.where(down, (ground - eye[2]) / np.where(down, rays[..., 2], -1.0), 0.0)
-        place = eye + depth[..., None] * rays
-        squares = np.floor(_SQUARES * place[..., :2]).astype(int)
+        is_downward = rays[..., 2] < -1e-3
+        depth = np.where(
+            is_downward, (ground - eye[2]) / np.where(is_downward, rays[..., 2], -1.0), 0.0
+        )
+        ground_points = eye + depth[..., None] * rays
+        squares = np.floor(_SQUARES * ground_points[..., :2]).astype(int)
         shade = 0.25 + 0.3 * ((squares.sum(-1) % 2) == 0)
         tint = 0.5 + 0.5 * np.sin(np.stack([squares[..., 0], squares[..., 1], squares.sum(-1)], -1))
         paint = shade[..., None] * (0.5 + 0.5 * tint)
-        is_ground = down & (depth > 0) & (np.hypot(place[..., 0], place[..., 1]) < _FADE)
+        is_ground = (
+            is_downward
+            & (depth > 0)
+            & (np.hypot(ground_points[..., 0], ground_points[..., 1]) < _FADE)
+        )
         color = np.where(is_ground[..., None], paint, color)
     return np.clip(color, 0.0, _BRIGHTEST)
 
@@ -63,17 +71,17 @@ def compose(scene: Path, light_file: Path, work: Path, *, has_ground: bool, coun
     views = load_dataset(scene).train
     light = read_linear(light_file)[..., :3]
     ground = _ground_height(views) if has_ground else None
-    above = np.ones(len(views), bool)
+    is_above = np.ones(len(views), bool)
     if ground is not None:
-        above = views.camera_to_world[:, 2, 3] > ground + 0.3
-    chosen = np.flatnonzero(above)
-    chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, count).astype(int))]
+        is_above = views.camera_to_world[:, 2, 3] > ground + 0.3
+    view_indices = np.flatnonzero(is_above)
+    view_indices = view_indices[np.unique(np.linspace(0, len(view_indices) - 1, count).astype(int))]
     frames = []
-    for view in chosen:
+    for view in view_indices:
         name, image = views.names[view], views.images[view]
         alpha = image[..., 3:]
-        behind = background(views, int(view), light, ground)
-        pixels = alpha * image[..., :3] + (1.0 - alpha) * behind
+        backdrop = background(views, int(view), light, ground)
+        pixels = alpha * image[..., :3] + (1.0 - alpha) * backdrop
         write_png(work / "capture" / "images" / f"{name}.png", pixels, is_linear=True)
         write_png(work / "truth" / f"{name}.png", alpha, is_linear=True)
         pose = views.camera_to_world[view].tolist()
@@ -94,15 +102,15 @@ def compose(scene: Path, light_file: Path, work: Path, *, has_ground: bool, coun
 
 def compare(work: Path) -> None:
     """Print the IoU of masks with the true ones, and shares of missing and excess pixels."""
-    overlaps, missing, extra = [], [], []
+    overlaps, missing, excess = [], [], []
     for path in sorted((work / "truth").glob("*.png")):
         truth = read_linear(path, is_srgb=False)[..., 0] > 0.5
         mask = read_linear(work / "capture" / "masks" / path.name, is_srgb=False)[..., 0] > 0.5
         overlaps.append((mask & truth).sum() / max((mask | truth).sum(), 1))
         missing.append((truth & ~mask).sum() / max(truth.sum(), 1))
-        extra.append((mask & ~truth).sum() / max(truth.sum(), 1))
+        excess.append((mask & ~truth).sum() / max(truth.sum(), 1))
     print(f"views {len(overlaps)}  IoU mean {np.mean(overlaps):.4f}  worst {np.min(overlaps):.4f}")
-    print(f"of the object, missing {np.mean(missing):.2%}, too much {np.mean(extra):.2%}")
+    print(f"of the object, missing {np.mean(missing):.2%}, too much {np.mean(excess):.2%}")
 
 
 def main() -> None:

@@ -88,13 +88,13 @@ class Recipe:
 
     def sdf(self, points: np.ndarray) -> np.ndarray:
         """Distance from the union of the balls."""
-        each = [np.linalg.norm(points - np.array(b[:3]), axis=1) - b[3] for b in self.balls]
-        return np.min(each, axis=0)
+        distances = [np.linalg.norm(points - np.array(b[:3]), axis=1) - b[3] for b in self.balls]
+        return np.min(distances, axis=0)
 
 
 def _matt(points: jax.Array) -> Materials:
-    one, zero = _constant(points, 1.0), _constant(points, 0.0)
-    return Materials(pattern(points), one, zero, has_specular=False)
+    ones, zeros = _constant(points, 1.0), _constant(points, 0.0)
+    return Materials(pattern(points), ones, zeros, has_specular=False)
 
 
 def _glossy(points: jax.Array) -> Materials:
@@ -186,9 +186,9 @@ def make_scene(name: str, *, size: int, count: int) -> Dataset:
         )
         images = []
         for k in range(len(poses)):
-            found = truth(black.camera([k]))
-            alpha = found.alpha[..., None]
-            straight = np.where(alpha > 0, found.rgb / np.where(alpha > 0, alpha, 1.0), 0.0)
+            rendered_view = truth(black.camera([k]))
+            alpha = rendered_view.alpha[..., None]
+            straight = np.where(alpha > 0, rendered_view.rgb / np.where(alpha > 0, alpha, 1.0), 0.0)
             images.append(np.concatenate([straight, np.clip(alpha, 0.0, 1.0)], axis=-1))
         return replace(black, images=np.stack(images).astype(np.float32))
 
@@ -199,12 +199,12 @@ def make_scene(name: str, *, size: int, count: int) -> Dataset:
 
 def decibels(run: Run, views: Views) -> float:
     """Mean peak signal-to-noise ratio of views, in sRGB on white."""
-    renderer, found = run.renderer(samples=64), []
+    renderer, scores = run.renderer(samples=64), []
     for k in range(len(views)):
         view = renderer(views.camera([k]))
         truth = photograph_on_white(views.images[k])
-        found.append(float(psnr(render_on_white(view.rgb, view.alpha), truth)))
-    return float(np.mean(found))
+        scores.append(float(psnr(render_on_white(view.rgb, view.alpha), truth)))
+    return float(np.mean(scores))
 
 
 class _Printed(Listener):
@@ -220,15 +220,21 @@ class _Printed(Listener):
 
 def relit_decibels(run: Run, truth: Renderer, views: Views) -> float:
     """Mean PSNR of views under another light, in sRGB on white, after aligning each channel."""
-    relit = run.renderer(samples=64).relit(load_light(OTHER_LIGHT))
-    pairs = [(relit(views.camera([k])), truth(views.camera([k]))) for k in range(len(views))]
-    ours, theirs = (np.stack([np.asarray(pair[n].rgb) for pair in pairs]) for n in (0, 1))
-    factor = np.sum(ours * theirs, axis=(0, 1, 2)) / np.sum(ours**2, axis=(0, 1, 2))
-    found = [
+    relit_renderer = run.renderer(samples=64).relit(load_light(OTHER_LIGHT))
+    pairs = [
+        (relit_renderer(views.camera([k])), truth(views.camera([k]))) for k in range(len(views))
+    ]
+    run_images, true_images = (
+        np.stack([np.asarray(pair[n].rgb) for pair in pairs]) for n in (0, 1)
+    )
+    factor = np.sum(run_images * true_images, axis=(0, 1, 2)) / np.sum(
+        run_images**2, axis=(0, 1, 2)
+    )
+    scores = [
         float(psnr(render_on_white(factor * a.rgb, a.alpha), render_on_white(b.rgb, b.alpha)))
         for a, b in pairs
     ]
-    return float(np.mean(found))
+    return float(np.mean(scores))
 
 
 def main() -> None:
@@ -247,7 +253,7 @@ def main() -> None:
     config = make_config(quality=arguments.quality, overrides=("stages.refine.steps=0",))
     for name in arguments.scenes.split(","):
         dataset = make_scene(name, size=arguments.size, count=arguments.views)
-        other = truth_of(name, OTHER_LIGHT)
+        relit_truth = truth_of(name, OTHER_LIGHT)
         model = ModelChoice(steps=arguments.steps)
         output = arguments.output / name
         run = train(
@@ -264,15 +270,15 @@ def main() -> None:
         result = {
             "kept": [rung["part"] for rung in record["rungs"] if rung["is_kept"]],
             "decibels": decibels(run, dataset.test),
-            "relit": relit_decibels(run, other, dataset.test),
+            "relit": relit_decibels(run, relit_truth, dataset.test),
             "choosing": record["seconds"],
             "training": (run.folder.training() or {})["seconds_total"],
         }
         if arguments.full:
-            whole = train(dataset, arguments.output / f"{name}_full", config, begin=Resume())
-            result["full decibels"] = decibels(whole, dataset.test)
-            result["full relit"] = relit_decibels(whole, other, dataset.test)
-            result["full training"] = (whole.folder.training() or {})["seconds_total"]
+            full_run = train(dataset, arguments.output / f"{name}_full", config, begin=Resume())
+            result["full decibels"] = decibels(full_run, dataset.test)
+            result["full relit"] = relit_decibels(full_run, relit_truth, dataset.test)
+            result["full training"] = (full_run.folder.training() or {})["seconds_total"]
         print(name, json.dumps(result), flush=True)
 
 

@@ -150,9 +150,9 @@ def start(dataset: Dataset, config: Config, variant: Variant) -> tuple[Params, R
     if variant.nudged:
         sdf = jnp.nextafter(params.geometry.sdf, jnp.inf)
         params = replace(params, geometry=replace(params.geometry, sdf=sdf))
-    plain = build_pipeline(config, config.stage(SPLIT_SUM), surface)
-    parts = {f.name: getattr(plain, f.name) for f in fields(plain)}
-    return params, RoundedPipeline(**parts, is_rounded=flags_of(variant))
+    base_pipeline = build_pipeline(config, config.stage(SPLIT_SUM), surface)
+    field_values = {f.name: getattr(base_pipeline, f.name) for f in fields(base_pipeline)}
+    return params, RoundedPipeline(**field_values, is_rounded=flags_of(variant))
 
 
 def run_variant(
@@ -162,11 +162,11 @@ def run_variant(
     config = replace(config, run=replace(config.run, seed=variant.seed))
     stage = config.stage(SPLIT_SUM)
     params, pipeline = start(dataset, config, variant)
-    keep, losses, seconds = set(measures.snapshot_steps(stage.steps)), [], []
+    snapshot_steps, losses, seconds = set(measures.snapshot_steps(stage.steps)), [], []
     snapshots = {0: jax.device_get(params)}
 
     def train() -> None:
-        state, room = initial_state(cast(params, variant.dtype)), capacities
+        state, buffer_sizes = initial_state(cast(params, variant.dtype)), capacities
         for step in range(stage.steps):
             batch = make_batch(dataset.train, step, stage, seed=config.run.seed)
             began = time.perf_counter()
@@ -175,20 +175,23 @@ def run_variant(
                 pipeline_at(pipeline, config, stage, step),
                 update_rule(config, stage, params, step),
             )
-            batch, current, rule = cast(inputs, variant.dtype)
+            batch, step_pipeline, rule = cast(inputs, variant.dtype)
 
             def attempt(
-                room: Capacities, batch: Batch = batch, current: Any = current, rule: Any = rule
+                buffer_sizes: Capacities,
+                batch: Batch = batch,
+                step_pipeline: Any = step_pipeline,
+                rule: Any = rule,
             ) -> tuple[StepReport, Usage]:
                 nonlocal state
-                sized = replace(current, capacities=room)
-                state, report = train_step(state, batch, sized, rule)
+                resized_pipeline = replace(step_pipeline, capacities=buffer_sizes)
+                state, report = train_step(state, batch, resized_pipeline, rule)
                 return report, report.loss.usage
 
-            report, room = capacity_module.retry(attempt, room)
+            report, buffer_sizes = capacity_module.retry(attempt, buffer_sizes)
             losses.append(float(report.total))
             seconds.append(time.perf_counter() - began)
-            if step + 1 in keep:
+            if step + 1 in snapshot_steps:
                 snapshots[step + 1] = jax.device_get(state.params)
 
     if variant.dtype == "float64":
@@ -205,13 +208,17 @@ def train_command(arguments: argparse.Namespace) -> None:
     config = make_config("default", arguments.quality, overrides=overrides)
     dataset = load_dataset(arguments.scene)
     params, pipeline = start(dataset, config, Variant("float32"))
-    room = plan_capacities(pipeline, params, dataset.train.camera(), limits=config.geometry.limits)
-    room = Capacities(**{k: capacity_module.bucket(int(1.15 * v)) for k, v in room.items()})
-    pipeline = replace(pipeline, capacities=room)
+    capacities = plan_capacities(
+        pipeline, params, dataset.train.camera(), limits=config.geometry.limits
+    )
+    capacities = Capacities(
+        **{k: capacity_module.bucket(int(1.15 * v)) for k, v in capacities.items()}
+    )
+    pipeline = replace(pipeline, capacities=capacities)
     outcomes, records = {}, {}
     for variant in VARIANTS[: arguments.variants]:
-        trained = run_variant(variant, dataset, config, room)
-        losses, snapshots, seconds = trained
+        result = run_variant(variant, dataset, config, capacities)
+        losses, snapshots, seconds = result
         final = rounded_where(cast(snapshots[max(snapshots)], np.float32), flags_of(variant))
         images, figures = measures.held_out(final, pipeline, dataset.test)
         outcome = Outcome(losses, snapshots, images, figures, seconds)
@@ -286,18 +293,20 @@ def chain(
     table = store("hash tables", params.material.albedo_table)
     encoded = store("MLP activations", encode(table, unit, spec=spec.grid))
     materials, shift, active = heads(params.material, encoded, spec, store)
-    moved = shift_inwards(splats, mesh, shift)
+    shifted_splats = shift_inwards(splats, mesh, shift)
     if lists is None:
-        lists = pipeline.visible(moved, camera)
-    seen = lists.gather
+        lists = pipeline.visible(shifted_splats, camera)
+    gather = lists.gather
     light = EnvLight(store("light texels", params.light.radiance))
     light = prefilter(light, pipeline.transport.operators)
     light = replace(light, specular=store("prefiltered light", light.specular))
-    means, lit = seen(moved.means), jax.tree.map(seen, materials)
+    means, lit = gather(shifted_splats.means), jax.tree.map(gather, materials)
     view = safe_normalize(camera.centers - means)
-    shaded = split_sum(lit, seen(moved.normals), view, light, pipeline.transport.fg_table)
-    splat_inputs = {"means": means, "quats": seen(moved.quats)}
-    splat_inputs["scales"] = seen(moved.scales, padding=1.0)
+    shaded = split_sum(
+        lit, gather(shifted_splats.normals), view, light, pipeline.transport.fg_table
+    )
+    splat_inputs = {"means": means, "quats": gather(shifted_splats.quats)}
+    splat_inputs["scales"] = gather(shifted_splats.scales, padding=1.0)
     footprints = pipeline.project(**splat_inputs, camera=camera)
     footprints = replace(
         footprints,
@@ -305,7 +314,7 @@ def chain(
         conics=store("conics", footprints.conics),
     )
     colours = store("splat colours", shaded.rgb)
-    opacities = seen(moved.opacities)
+    opacities = gather(shifted_splats.opacities)
     features = jnp.concatenate([colours, shaded.diffuse_light, shaded.specular], axis=1)
     image, alpha = composite(
         footprints,
@@ -316,12 +325,17 @@ def chain(
         width=camera.width,
         tile_size=pipeline.raster.tile_size,
     )
-    got = {"mesh": mesh, "vertex normals": normals, "splats": splats, "unit": unit}
-    got |= {"encoded": encoded, "active": active, "materials": materials, "shift": shift}
-    got |= {"lists": lists, "light": light, "lit": lit, "seen normals": seen(moved.normals)}
-    got |= {"view": view, "colours": colours, "splat inputs": splat_inputs}
-    got |= {"footprints": footprints, "opacities": opacities}
-    return got | {"image": image[..., :3], "lights": image[..., 3:], "alpha": alpha}
+    intermediates = {"mesh": mesh, "vertex normals": normals, "splats": splats, "unit": unit}
+    intermediates |= {"encoded": encoded, "active": active, "materials": materials, "shift": shift}
+    intermediates |= {
+        "lists": lists,
+        "light": light,
+        "lit": lit,
+        "seen normals": gather(shifted_splats.normals),
+    }
+    intermediates |= {"view": view, "colours": colours, "splat inputs": splat_inputs}
+    intermediates |= {"footprints": footprints, "opacities": opacities}
+    return intermediates | {"image": image[..., :3], "lights": image[..., 3:], "alpha": alpha}
 
 
 def surface_stages(params: Params, pipeline: Pipeline, got: dict[str, Any]) -> list[Stage]:
@@ -342,21 +356,21 @@ def surface_stages(params: Params, pipeline: Pipeline, got: dict[str, Any]) -> l
 
     def adapter(x: Any, constants: Any) -> dict[str, Any]:
         mesh, pipeline = constants
-        made = face_splats(
+        splats = face_splats(
             replace(mesh, vertices=x["vertices"]),
             x["normals"],
             constants=pipeline.splats.constants,
             unit=pipeline.surface.box.half_extent,
         )
-        return {name: getattr(made, name) for name in ("means", "quats", "scales", "normals")}
+        return {name: getattr(splats, name) for name in ("means", "quats", "scales", "normals")}
 
     mesh, vertices = got["mesh"], {"vertices": got["mesh"].vertices}
-    both = {**vertices, "normals": got["vertex normals"]}
+    adapter_inputs = {**vertices, "normals": got["vertex normals"]}
     return [
         Stage("isosurface", surface, geometry, pipeline),
         Stage("L_dev", deviation, geometry, pipeline),
         Stage("vertex normals", normals, vertices, mesh),
-        Stage("adapter", adapter, both, (mesh, pipeline)),
+        Stage("adapter", adapter, adapter_inputs, (mesh, pipeline)),
     ]
 
 
@@ -382,10 +396,10 @@ def shading_stages(params: Params, pipeline: Pipeline, got: dict[str, Any]) -> l
 
     shade_inputs = {"materials": got["lit"], "normals": got["seen normals"], "view": got["view"]}
     shade_inputs["levels"] = got["light"].specular
-    rest = replace(field, albedo_table=None)
+    head_params = replace(field, albedo_table=None)
     return [
         Stage("hash grid", hash_grid, {"tables": field.albedo_table}, got["unit"]),
-        Stage("MLPs", mlps, {"heads": rest, "features": got["encoded"]}),
+        Stage("MLPs", mlps, {"heads": head_params, "features": got["encoded"]}),
         Stage("prefilter", light, {"light": params.light.radiance}, pipeline.transport.operators),
         Stage("split sum", shade, shade_inputs, pipeline.transport.fg_table),
     ]
@@ -393,17 +407,17 @@ def shading_stages(params: Params, pipeline: Pipeline, got: dict[str, Any]) -> l
 
 def image_stages(camera: Camera, pipeline: Pipeline, got: dict[str, Any]) -> list[Stage]:
     """Return the stages of footprints and images; both precisions rasterise the same lists."""
-    parts = ("means2d", "conics", "compensation", "depths")
+    footprint_fields = ("means2d", "conics", "compensation", "depths")
     tile_size = pipeline.raster.tile_size
 
     def projection(x: Any, constants: Any) -> dict[str, Any]:
         camera, pipeline = constants
         footprints = pipeline.project(**x, camera=camera)
-        return {name: getattr(footprints, name) for name in parts}
+        return {name: getattr(footprints, name) for name in footprint_fields}
 
     def rasteriser(x: Any, constants: Any) -> dict[str, Any]:
-        footprints, lists, kept = constants
-        footprints = replace(footprints, **{name: x[name] for name in parts[:3]})
+        footprints, lists, pixel_mask = constants
+        footprints = replace(footprints, **{name: x[name] for name in footprint_fields[:3]})
         image, alpha = composite(
             footprints,
             x["opacities"],
@@ -413,18 +427,18 @@ def image_stages(camera: Camera, pipeline: Pipeline, got: dict[str, Any]) -> lis
             width=camera.width,
             tile_size=tile_size,
         )
-        return {"image": kept[..., None] * image, "alpha": kept * alpha}
+        return {"image": pixel_mask[..., None] * image, "alpha": pixel_mask * alpha}
 
-    inputs = {name: getattr(got["footprints"], name) for name in parts[:3]}
+    inputs = {name: getattr(got["footprints"], name) for name in footprint_fields[:3]}
     inputs |= {"opacities": got["opacities"], "colours": got["colours"]}
-    real = int(np.sum(np.asarray(got["lists"].index) < len(got["shift"])))
-    splat_inputs = {name: x[:real] for name, x in got["splat inputs"].items()}
-    both = (got["footprints"], got["lists"])
-    clear = np.float64(~measures.undecided(got, tile_size, camera))
+    splat_count = int(np.sum(np.asarray(got["lists"].index) < len(got["shift"])))
+    splat_inputs = {name: x[:splat_count] for name, x in got["splat inputs"].items()}
+    raster_constants = (got["footprints"], got["lists"])
+    decided_mask = np.float64(~measures.undecided(got, tile_size, camera))
     return [
         Stage("projection", projection, splat_inputs, (camera, pipeline)),
-        Stage("rasteriser", rasteriser, inputs, (*both, np.ones_like(clear))),
-        Stage("- undecided pixels", rasteriser, inputs, (*both, clear)),
+        Stage("rasteriser", rasteriser, inputs, (*raster_constants, np.ones_like(decided_mask))),
+        Stage("- undecided pixels", rasteriser, inputs, (*raster_constants, decided_mask)),
     ]
 
 
@@ -443,24 +457,24 @@ def loss_stages(
     photo = {"rgb": got["image"][None], "alpha": got["alpha"][None]}
     photo["exposure"] = params.log_exposure
     # In pixels without splats the tone map gives 2e-8 instead of 0, and L1 a sign of no meaning.
-    covered = np.float64(photo["alpha"] > 0)
+    coverage_mask = np.float64(photo["alpha"] > 0)
     background = jax.random.uniform(jax.random.key(0), batch.image[:1, ..., :3].shape)
 
     def photometric(term: str) -> Stage:
         def function(x: Any, constants: Any) -> dict[str, Any]:
-            image, behind, covered = constants
-            rgb = covered[..., None] * tone_map(x["rgb"], x["exposure"])
-            images = compare(rgb, covered * x["alpha"], image, behind, None, srgb=False)
+            image, backdrop, coverage_mask = constants
+            rgb = coverage_mask[..., None] * tone_map(x["rgb"], x["exposure"])
+            images = compare(rgb, coverage_mask * x["alpha"], image, backdrop, None, srgb=False)
             return {term: PHOTOMETRIC[term](images)}
 
-        return Stage(f"loss: {term}", function, photo, (batch.image[:1], background, covered))
+        return Stage(f"loss: {term}", function, photo, (batch.image[:1], background, coverage_mask))
 
     def smooth(x: Any, constants: Any) -> dict[str, Any]:
         points, mask, key, pipeline = constants
-        changes = smoothness(
+        variations = smoothness(
             x["material"], points, mask, key, pipeline.surface.box, spec=pipeline.fields
         )
-        return {"smoothness": changes.albedo + changes.roughness + changes.metallic}
+        return {"smoothness": variations.albedo + variations.roughness + variations.metallic}
 
     def light(x: Any, image: Any) -> dict[str, Any]:
         return {"light": light_agreement(x["diffuse"], x["specular"], x["exposure"], image)}
@@ -474,7 +488,7 @@ def loss_stages(
         # Terms are only reported, and get no cotangent.
         return {"total": total, **jax.lax.stop_gradient(report.terms)}
 
-    left_out = {
+    excluded_terms = {
         "whole loss": (),
         "- smoothness": ("smoothness",),
         "- smoothness, L1": ("smoothness", "l1"),
@@ -485,20 +499,20 @@ def loss_stages(
             weights={
                 name: jnp.float32(weight)
                 for name, weight in last_weights.items()
-                if not name.startswith(without)
+                if not name.startswith(prefixes)
             },
         )
-        for title, without in left_out.items()
+        for title, prefixes in excluded_terms.items()
     }
     count = pipeline.objective.smoothness_samples
-    picked = np.linspace(0, int(got["splats"].count) - 1, count).astype(int)
-    points, mask = np.asarray(got["splats"].means)[picked], np.ones(count, bool)
+    sample_rows = np.linspace(0, int(got["splats"].count) - 1, count).astype(int)
+    points, mask = np.asarray(got["splats"].means)[sample_rows], np.ones(count, bool)
     lights = {"diffuse": got["lights"][None, ..., :3], "specular": got["lights"][None, ..., 3:]}
     lights["exposure"] = params.log_exposure
-    chosen = (points, mask, jax.random.key(1), pipeline)
+    smoothness_constants = (points, mask, jax.random.key(1), pipeline)
     return [
         *(photometric(term) for term in PHOTOMETRIC),
-        Stage("loss: smoothness", smooth, {"material": params.material}, chosen),
+        Stage("loss: smoothness", smooth, {"material": params.material}, smoothness_constants),
         Stage("loss: light", light, lights, batch.image[:1]),
         Stage("loss: entropy", entropy, {"geometry": params.geometry}, pipeline),
         *(Stage(name, whole, _groups(params), (batch, p)) for name, p in losses.items()),
@@ -514,37 +528,38 @@ def half_rows(params: Params, batch: Batch, pipeline: Pipeline) -> dict[str, Any
         def store(name: str, x: jax.Array) -> jax.Array:
             return jnp.where(is_rounded[name], to_bfloat16(x), x)
 
-        got = chain(params, batch.camera, pipeline, store=store)
-        rgb = tone_map(got["image"], params.log_exposure)
+        intermediates = chain(params, batch.camera, pipeline, store=store)
+        rgb = tone_map(intermediates["image"], params.log_exposure)
         target = batch.image[:1]
         black = jnp.zeros_like(target[..., :3])
-        images = compare(rgb[None], got["alpha"][None], target, black, None, srgb=False)
+        images = compare(rgb[None], intermediates["alpha"][None], target, black, None, srgb=False)
         weights = {"l1": 0.8, "ssim": 0.2, "mask": 5.0}
         total = sum(weight * PHOTOMETRIC[name](images) for name, weight in weights.items())
-        return total, rgb + (1.0 - got["alpha"])[..., None]
+        return total, rgb + (1.0 - intermediates["alpha"])[..., None]
 
     run = jax.jit(jax.value_and_grad(picture, has_aux=True))
     choices = {"nothing (float32)": ()} | {name: (name,) for name in STORED}
     choices["all but conics, means2d, SDF"] = STORED[:6]
     choices["everything"] = STORED
     flags = {
-        n: {name: np.array(name in chosen) for name in STORED} for n, chosen in choices.items()
+        n: {name: np.array(name in selection) for name in STORED}
+        for n, selection in choices.items()
     }
     with double_precision():
         inputs = cast((params, batch, pipeline), np.float64)
         exact_result = jax.device_get(run(*inputs, flags["nothing (float32)"]))
-    found = {}
-    for name, chosen in flags.items():
-        (_, image), gradient = jax.device_get(run(params, batch, pipeline, chosen))
+    records = {}
+    for name, selection in flags.items():
+        (_, image), gradient = jax.device_get(run(params, batch, pipeline, selection))
         (_, exact_image), exact_gradient = exact_result
         error = np.mean((encode_srgb(image.clip(0, 1)) - encode_srgb(exact_image.clip(0, 1))) ** 2)
         groups, exact_groups = _groups(gradient), _groups(exact_gradient)
-        found[name] = {
+        records[name] = {
             "psnr": float(-10 * np.log10(error)),
             "worst": float(np.max(np.abs(image - exact_image))),
             **{k: errors(groups[k], exact_groups[k])["l2"] for k in groups},
         }
-    return found
+    return records
 
 
 def stages_command(arguments: argparse.Namespace) -> None:
@@ -555,42 +570,42 @@ def stages_command(arguments: argparse.Namespace) -> None:
         raise SystemExit(f"{run.folder} ended in {stage.name}; train it without that stage's steps")
     batch = make_batch(run.dataset.train, run.trained.step, stage, seed=config.run.seed)
     camera = batch.camera.view(0)
-    first = replace(batch, camera=camera, image=batch.image[:1])
+    first_batch = replace(batch, camera=camera, image=batch.image[:1])
     forward = jax.jit(chain)
-    one = jax.device_get(forward(params, camera, pipeline))
+    single = jax.device_get(forward(params, camera, pipeline))
     with double_precision():
-        two = jax.device_get(forward(*cast((params, camera, pipeline), np.float64)))
-    shared = jax.device_get(forward(params, camera, pipeline, lists=two["lists"]))
+        double = jax.device_get(forward(*cast((params, camera, pipeline), np.float64)))
+    single_shared = jax.device_get(forward(params, camera, pipeline, lists=double["lists"]))
     expected = jax.jit(Pipeline.render)(pipeline, params, camera).rgb[0]
-    assert errors(one["image"], expected)["l2"] < 1e-5, "the chain differs from render"
+    assert errors(single["image"], expected)["l2"] < 1e-5, "the chain differs from render"
 
     stages = [
-        *surface_stages(params, pipeline, two),
-        *shading_stages(params, pipeline, two),
-        *image_stages(camera, pipeline, two),
-        *loss_stages(params, batch, pipeline, two, stage.weights_at(stage.steps)),
+        *surface_stages(params, pipeline, double),
+        *shading_stages(params, pipeline, double),
+        *image_stages(camera, pipeline, double),
+        *loss_stages(params, batch, pipeline, double, stage.weights_at(stage.steps)),
     ]
     record: dict[str, Any] = {"stages": {}}
     print(f"{'stage':18s} | values: L2, worst, off | gradients: L2, worst, off, other sign")
     for part in stages:
-        found = record["stages"][part.name] = measures.measure(part)
-        v, g = found["values"]["all"], found["gradients"]["all"]
+        figures = record["stages"][part.name] = measures.measure(part)
+        v, g = figures["values"]["all"], figures["gradients"]["all"]
         print(
             f"{part.name:18s} | {v['l2']:.1e} {v['worst']:.1e} {v['off']:.1e} "
             f"| {g['l2']:.1e} {g['worst']:.1e} {g['off']:.1e} {g['sign']:.1e}",
             flush=True,
         )
         save(arguments.output / "stages.json", record)
-    record["decisions"] = measures.decisions(one, shared, two, config, camera)
-    record["chain"] = measures.accumulated(one, shared, two)
-    record["bfloat16"] = half_rows(params, first, pipeline)
-    points = two["unit"][: int(two["splats"].count)]
+    record["decisions"] = measures.decisions(single, single_shared, double, config, camera)
+    record["chain"] = measures.accumulated(single, single_shared, double)
+    record["bfloat16"] = half_rows(params, first_batch, pipeline)
+    points = double["unit"][: int(double["splats"].count)]
     specs = {"draft": config.material.grid, "standard": HashGridSpec()}
     record["times"] = {name: measures.half_times(points, spec) for name, spec in specs.items()}
     for part in ("decisions", "chain", "bfloat16", "times"):
         print(f"\n{part}")
-        for name, found in record[part].items():
-            print(f"  {name:28s} {found}")
+        for name, figures in record[part].items():
+            print(f"  {name:28s} {figures}")
     save(arguments.output / "stages.json", record)
 
 
@@ -611,7 +626,7 @@ def main() -> None:
     stages.set_defaults(run=stages_command)
     plot = commands.add_parser("plot", help="the figure")
     plot.add_argument("--image", type=Path, default=Path("docs/images/precision.png"))
-    plot.set_defaults(run=lambda given: measures.figure(given.output, given.image))
+    plot.set_defaults(run=lambda options: measures.figure(options.output, options.image))
     for command in (train, stages, plot):
         command.add_argument("--output", type=Path, default=Path("runs/precision"))
     arguments = parser.parse_args()

@@ -75,15 +75,17 @@ def errors(single: Any, double: Any) -> dict[str, float]:
         for tree in (single, double)
     ]
     a, b = flat
-    error, size, counted = np.abs(a - b), np.abs(b), b != 0
+    error, size, is_nonzero = np.abs(a - b), np.abs(b), b != 0
     return {
         "l2": float(np.sqrt(np.sum(error**2) / max(np.sum(b**2), 1e-300))),
         "worst": float(np.max(error) / max(np.max(size), 1e-300)),
-        "off": float(np.mean(error[counted] > 1e-3 * size[counted])) if counted.any() else 0.0,
-        "sign": float(np.mean(np.sign(a[counted]) != np.sign(b[counted])))
-        if counted.any()
+        "off": float(np.mean(error[is_nonzero] > 1e-3 * size[is_nonzero]))
+        if is_nonzero.any()
         else 0.0,
-        "spurious": float(np.mean((a != 0) & ~counted)),
+        "sign": float(np.mean(np.sign(a[is_nonzero]) != np.sign(b[is_nonzero])))
+        if is_nonzero.any()
+        else 0.0,
+        "spurious": float(np.mean((a != 0) & ~is_nonzero)),
     }
 
 
@@ -102,14 +104,14 @@ def measure(stage: Stage) -> dict[str, Any]:
     inputs, constants = cast((stage.inputs, stage.constants), np.float32)
     rng = np.random.default_rng(0)
 
-    def cotangent(out: Any) -> Any:
-        if out.ndim == 0:
+    def cotangent(output: Any) -> Any:
+        if output.ndim == 0:
             return np.float32(1)
-        return np.float32(rng.standard_normal(out.shape))
+        return np.float32(rng.standard_normal(output.shape))
 
     def run(inputs: Any, constants: Any, cotangents: Any) -> Any:
-        values, pull = jax.vjp(lambda x: stage.function(x, constants), inputs)
-        return values, pull(cotangents)[0]
+        values, pullback = jax.vjp(lambda x: stage.function(x, constants), inputs)
+        return values, pullback(cotangents)[0]
 
     shapes = jax.eval_shape(stage.function, *cast((inputs, constants), np.float32))
     cotangents = jax.tree.map(cotangent, shapes)
@@ -119,10 +121,15 @@ def measure(stage: Stage) -> dict[str, Any]:
         double = jax.device_get(jax.jit(run)(*cast(arguments, np.float64)))
     return {
         part: {
-            **{name: errors(one[name], other[name]) for name in one},
-            "all": max((errors(one[n], other[n]) for n in one), key=lambda e: e["l2"]),
+            **{name: errors(single_values[name], double_values[name]) for name in single_values},
+            "all": max(
+                (errors(single_values[n], double_values[n]) for n in single_values),
+                key=lambda e: e["l2"],
+            ),
         }
-        for part, one, other in zip(("values", "gradients"), single, double, strict=True)
+        for part, single_values, double_values in zip(
+            ("values", "gradients"), single, double, strict=True
+        )
     }
 
 
@@ -130,8 +137,8 @@ def raw_alphas(
     footprints: Footprints, opacities: Any, lists: TileLists, tile: int, width: int
 ) -> Any:
     """Compute alphas before cut and clamp in the pixels of each hit's tile, and those pixels."""
-    real = lists.chunk_ranks < len(lists.index)
-    ranks = np.where(real, lists.chunk_ranks, 0)
+    is_real = lists.chunk_ranks < len(lists.index)
+    ranks = np.where(is_real, lists.chunk_ranks, 0)
     columns = -(-width // tile)
     corner = tile * np.stack([lists.chunk_tiles % columns, lists.chunk_tiles // columns], -1)
     inside = np.stack(np.meshgrid(np.arange(tile), np.arange(tile)), -1).reshape(-1, 2) + 0.5
@@ -141,7 +148,7 @@ def raw_alphas(
     xx, xy, yy = np.moveaxis(np.asarray(footprints.conics)[ranks][..., None], 2, 0)
     sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
     alphas = (opacities * footprints.compensation)[ranks][..., None] * np.exp(-sigma)
-    return alphas[real], pixels[real]
+    return alphas[is_real], pixels[is_real]
 
 
 def undecided(got: dict, tile: int, camera: Camera) -> np.ndarray:
@@ -149,9 +156,9 @@ def undecided(got: dict, tile: int, camera: Camera) -> np.ndarray:
     alphas, pixels = raw_alphas(
         got["footprints"], got["opacities"], got["lists"], tile, camera.width
     )
-    close = np.abs(alphas - MIN_ALPHA) < UNDECIDED * MIN_ALPHA
+    is_close = np.abs(alphas - MIN_ALPHA) < UNDECIDED * MIN_ALPHA
     mark = np.zeros((camera.height, camera.width), bool)
-    x, y = pixels[close].astype(int).T
+    x, y = pixels[is_close].astype(int).T
     inside = (x < camera.width) & (y < camera.height)
     mark[y[inside], x[inside]] = True
     return mark
@@ -159,20 +166,20 @@ def undecided(got: dict, tile: int, camera: Camera) -> np.ndarray:
 
 def decisions(one: dict, shared: dict, two: dict, config: Config, camera: Camera) -> dict[str, Any]:
     """Count the discrete choices that differ between precisions; also return their totals."""
-    first, second = one["lists"], two["lists"]
+    single_lists, double_lists = one["lists"], two["lists"]
     count = int(two["splats"].count)
-    rows = [lists.index[lists.index < count] for lists in (first, second)]
+    rows = [lists.index[lists.index < count] for lists in (single_lists, double_lists)]
     rank = np.full(count, -1)
     rank[rows[0]] = np.arange(len(rows[0]))
     order = rank[rows[1]]
     hits = []
-    for lists in (first, second):
-        real = lists.chunk_ranks < len(lists.index)
-        owner = lists.index[np.where(real, lists.chunk_ranks, 0)].astype(np.int64)
-        hits.append((lists.chunk_tiles[None, :] * (count + 1) + owner)[real])
+    for lists in (single_lists, double_lists):
+        is_real = lists.chunk_ranks < len(lists.index)
+        owner = lists.index[np.where(is_real, lists.chunk_ranks, 0)].astype(np.int64)
+        hits.append((lists.chunk_tiles[None, :] * (count + 1) + owner)[is_real])
     tile = config.raster.tile_size
     a, b = (
-        raw_alphas(x["footprints"], x["opacities"], second, tile, camera.width)[0]
+        raw_alphas(x["footprints"], x["opacities"], double_lists, tile, camera.width)[0]
         for x in (shared, two)
     )
     cells = np.array(config.material.grid.resolutions, np.float32)
@@ -197,7 +204,7 @@ def accumulated(one: dict, shared: dict, two: dict) -> dict[str, Any]:
     ``shared`` is the chain in float32 with the tile lists of double precision, for values that
     depend on the order of splats; ``one`` has its own lists.
     """
-    read = {
+    quantities = {
         "vertices": (one, lambda x: x["mesh"].vertices),
         "vertex normals": (one, lambda x: x["vertex normals"]),
         "splat means": (one, lambda x: x["splats"].means),
@@ -213,7 +220,7 @@ def accumulated(one: dict, shared: dict, two: dict) -> dict[str, Any]:
         "image, own lists": (one, lambda x: x["image"]),
         "alpha, own lists": (one, lambda x: x["alpha"]),
     }
-    return {name: errors(get(run), get(two)) for name, (run, get) in read.items()}
+    return {name: errors(select(run), select(two)) for name, (run, select) in quantities.items()}
 
 
 def snapshot_steps(steps: int) -> list[int]:
@@ -230,17 +237,17 @@ def drift(one: dict[int, Params], other: dict[int, Params]) -> dict[str, list[fl
     steps = sorted(set(one) & set(other) - {0})
     curves: dict[str, list[float]] = {"step": steps}
     for step in steps:
-        apart, travelled = dict.fromkeys(GROUPS, 0.0), dict.fromkeys(GROUPS, 0.0)
+        squared_distances, squared_travel = dict.fromkeys(GROUPS, 0.0), dict.fromkeys(GROUPS, 0.0)
         leaves = (
             jax.tree_util.tree_leaves_with_path(t) for t in (one[step], other[step], other[0])
         )
-        for (path, a), (_, b), (_, first) in zip(*leaves, strict=True):
+        for (path, a), (_, b), (_, origin) in zip(*leaves, strict=True):
             group = group_of(path)
-            a, b, first = (np.asarray(x, np.float64) for x in (a, b, first))
-            apart[group] += float(np.sum((a - b) ** 2))
-            travelled[group] += float(np.sum((b - first) ** 2))
+            a, b, origin = (np.asarray(x, np.float64) for x in (a, b, origin))
+            squared_distances[group] += float(np.sum((a - b) ** 2))
+            squared_travel[group] += float(np.sum((b - origin) ** 2))
         for group in GROUPS:
-            distance = np.sqrt(apart[group] / max(travelled[group], 1e-300))
+            distance = np.sqrt(squared_distances[group] / max(squared_travel[group], 1e-300))
             curves.setdefault(group, []).append(float(distance))
     return curves
 
@@ -271,9 +278,9 @@ def held_out(
     images, scores, angles = [], [], []
     for index in range(len(test)):
         view, image = renderer(test.camera(np.array([index]))), test.images[index]
-        truth, shown = photograph_on_white(image), render_on_white(view.rgb, view.alpha)
-        images.append(shown)
-        scores.append(float(psnr(shown, truth)))
+        truth, picture = photograph_on_white(image), render_on_white(view.rgb, view.alpha)
+        images.append(picture)
+        scores.append(float(psnr(picture, truth)))
         if "normal" in test.truth:
             normal = test.truth["normal"][index]
             angles.append(float(normal_mae_deg(view.aovs["normal"], normal, image[..., 3])))
@@ -287,26 +294,26 @@ def half_times(points: Any, spec: HashGridSpec, repeats: int = 21) -> dict[str, 
     """Time encoding and its table gradient with float32 and bfloat16 tables, interleaved."""
     table = jax.random.normal(jax.random.key(0), (spec.total_entries, spec.features))
     points = jnp.asarray(points, jnp.float32)
-    pull = jax.random.normal(jax.random.key(1), (len(points), spec.levels, spec.features))
-    chunks = 8192
+    cotangents = jax.random.normal(jax.random.key(1), (len(points), spec.levels, spec.features))
+    chunk_size = 8192
 
-    def gradient(points: Any, pull: Any, dtype: Any) -> jax.Array:
-        def step(total: Any, part: Any) -> Any:
-            cells = hashgrid._locate(part[0], spec)
-            return hashgrid._scatter_rows(total, cast(cells, dtype), part[1].astype(dtype)), None
+    def gradient(points: Any, cotangents: Any, dtype: Any) -> jax.Array:
+        def step(total: Any, block: Any) -> Any:
+            cells = hashgrid._locate(block[0], spec)
+            return hashgrid._scatter_rows(total, cast(cells, dtype), block[1].astype(dtype)), None
 
-        count = len(points) // chunks * chunks
-        parts = [x[:count].reshape(-1, chunks, *x.shape[1:]) for x in (points, pull)]
-        return jax.lax.scan(step, jnp.zeros(table.shape, dtype), tuple(parts))[0]
+        count = len(points) // chunk_size * chunk_size
+        blocks = [x[:count].reshape(-1, chunk_size, *x.shape[1:]) for x in (points, cotangents)]
+        return jax.lax.scan(step, jnp.zeros(table.shape, dtype), tuple(blocks))[0]
 
-    half = table.astype(jnp.bfloat16)
+    half_table = table.astype(jnp.bfloat16)
     forward = jax.jit(partial(encode, spec=spec))
-    back = jax.jit(gradient, static_argnames="dtype")
+    backward = jax.jit(gradient, static_argnames="dtype")
     jobs = {
         "forward, float32": lambda: forward(table, points),
-        "forward, bfloat16 table": lambda: forward(half, points),
-        "table gradient, float32": lambda: back(points, pull, jnp.float32),
-        "table gradient, bfloat16": lambda: back(points, pull, jnp.bfloat16),
+        "forward, bfloat16 table": lambda: forward(half_table, points),
+        "table gradient, float32": lambda: backward(points, cotangents, jnp.float32),
+        "table gradient, bfloat16": lambda: backward(points, cotangents, jnp.bfloat16),
     }
     times: dict[str, list[float]] = {name: [] for name in jobs}
     for _ in range(repeats + 1):
@@ -314,24 +321,26 @@ def half_times(points: Any, spec: HashGridSpec, repeats: int = 21) -> dict[str, 
             began = time.perf_counter()
             jax.block_until_ready(job())
             times[name].append(1e3 * (time.perf_counter() - began))
-    summed = [np.asarray(back(points, pull, d), np.float64) for d in (jnp.bfloat16, jnp.float32)]
+    summed_gradients = [
+        np.asarray(backward(points, cotangents, d), np.float64) for d in (jnp.bfloat16, jnp.float32)
+    ]
     return {
         "points": len(points),
         "table_mb": table.size * 4 / 2**20,
         "milliseconds": {name: float(np.median(t[1:])) for name, t in times.items()},
-        "gradient summed in bfloat16": errors(*summed)["l2"],
+        "gradient summed in bfloat16": errors(*summed_gradients)["l2"],
     }
 
 
 def draw_errors(axis: Any, stages: dict[str, Any]) -> None:
     """Bars of the relative L2 error of values and gradients, a pair per stage."""
     names = [name for name in stages if not name.startswith("-")]
-    place = np.arange(len(names))
+    positions = np.arange(len(names))
     for shift, part, colour in ((-0.2, "values", "#4c72b0"), (0.2, "gradients", "#dd8452")):
         sizes = [max(stages[name][part]["all"]["l2"], 1e-9) for name in names]
-        axis.barh(place + shift, sizes, height=0.4, color=colour, label=part)
+        axis.barh(positions + shift, sizes, height=0.4, color=colour, label=part)
     axis.axvline(float(np.finfo(np.float32).eps) / 2, color="grey", linewidth=0.8, linestyle=":")
-    axis.set_yticks(place, names)
+    axis.set_yticks(positions, names)
     axis.invert_yaxis()
     axis.set(xscale="log", xlim=(2e-9, 1e-3), xlabel="relative L2 error, float32 against float64")
     axis.set_title("Each stage on the same inputs", fontsize=10)
@@ -378,17 +387,17 @@ def figure(folder: Path, path: Path) -> None:
 
     stages = json.loads((folder / "stages.json").read_text())["stages"]
     runs = json.loads((folder / "train.json").read_text())
-    shown = {
+    styles = {
         "another seed": ("#7f7f7f", "-"),
         "bfloat16: everything": ("#c44e52", "-"),
         "bfloat16: light": ("#dd8452", "-"),
         "float32": ("#4c72b0", "-"),
         "first SDF one rounding off": ("#55a868", "--"),
     }
-    drawn, axes = plt.subplots(1, 3, figsize=(13, 4.6), width_ratios=(1.1, 1, 0.8))
+    plot, axes = plt.subplots(1, 3, figsize=(13, 4.6), width_ratios=(1.1, 1, 0.8))
     draw_errors(axes[0], stages)
-    draw_drift(axes[1], runs, shown)
+    draw_drift(axes[1], runs, styles)
     draw_quality(axes[2], runs)
-    drawn.tight_layout()
-    drawn.savefig(path, dpi=95)
-    plt.close(drawn)
+    plot.tight_layout()
+    plot.savefig(path, dpi=95)
+    plt.close(plot)

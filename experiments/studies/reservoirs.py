@@ -120,14 +120,16 @@ def _make_scene(
         index = _index(model, surface, capacities=capacities)
         return (surface, index), combine(surface.usage, index.usage)
 
-    first = model.first_capacities(shape).resized(cell_patches=4_096)
-    (surface, index), needed = retry(attempt, first if capacities is None else capacities)
+    first_capacities = model.first_capacities(shape).resized(cell_patches=4_096)
+    (surface, index), final_capacities = retry(
+        attempt, first_capacities if capacities is None else capacities
+    )
     mesh = surface.mesh
     normals, _ = face_normals_and_areas(mesh)
     centers = jnp.mean(mesh.vertices[mesh.faces], axis=1)
     faces = jnp.arange(centers.shape[0], dtype=jnp.int32)
     points = SurfacePoints(centers, normals, normals, faces, mesh.face_mask)
-    return Scene(points, index, light()), needed
+    return Scene(points, index, light()), final_capacities
 
 
 @jax.jit
@@ -136,14 +138,14 @@ def run_step(transport, key, scene_parts, light, carry, cotangent):
     points, index, attributes = scene_parts
 
     def diffuse(light):
-        prepared, after = transport.prepare(key, points, attributes, light, index, carry)
+        prepared, next_carry = transport.prepare(key, points, attributes, light, index, carry)
         return jnp.sum(prepared.gathered.diffuse_light * cotangent), (
             prepared.gathered.diffuse_light,
-            after,
+            next_carry,
         )
 
-    gradient, (found, after) = jax.grad(diffuse, has_aux=True)(light)
-    return found, gradient.radiance, after
+    gradient, (diffuse_light, next_carry) = jax.grad(diffuse, has_aux=True)(light)
+    return diffuse_light, gradient.radiance, next_carry
 
 
 def rays_of(spec: ReservoirSettings, count: int) -> int:
@@ -178,13 +180,13 @@ class Row:
 
 
 def _measured(name: str, scene: Scene, attributes: Attributes, steps: int) -> Iterator[Row]:
-    parts = (scene.points, scene.index, attributes)
+    scene_parts = (scene.points, scene.index, attributes)
     rng = np.random.default_rng(0)
     cotangent = jnp.asarray(rng.uniform(0, 1, scene.points.normals.shape), jnp.float32)
 
     def step(transport, key, carry):
-        out = run_step(transport, key, parts, scene.light, carry, cotangent)
-        return jax.block_until_ready(out)
+        outputs = run_step(transport, key, scene_parts, scene.light, carry, cotangent)
+        return jax.block_until_ready(outputs)
 
     def transport_of(spec, count):
         settings = MonteCarloSettings(
@@ -192,24 +194,27 @@ def _measured(name: str, scene: Scene, attributes: Attributes, steps: int) -> It
         )
         return MonteCarlo(settings)
 
-    many = transport_of(ReservoirSettings(), REFERENCE_SAMPLES)
-    passes = [step(many, jax.random.key(1000 + k), None)[:2] for k in range(REFERENCE_PASSES)]
+    reference_transport = transport_of(ReservoirSettings(), REFERENCE_SAMPLES)
+    passes = [
+        step(reference_transport, jax.random.key(1000 + k), None)[:2]
+        for k in range(REFERENCE_PASSES)
+    ]
     is_real = np.asarray(scene.points.mask)
     image, gradient = (np.mean([np.asarray(p[i], float) for p in passes], 0) for i in (0, 1))
     image = image[is_real]
     for way, (spec, counts) in WAYS.items():
         for count in counts:
             transport = transport_of(spec, count)
-            carry, found, seconds = transport.first_carry(), [], []
+            carry, estimates, seconds = transport.first_carry(), [], []
             step(transport, jax.random.key(0), carry)
             for number in range(steps):
-                before = time.process_time()
+                began = time.process_time()
                 *values, carry = step(transport, jax.random.key(number), carry)
-                seconds.append(time.process_time() - before)
+                seconds.append(time.process_time() - began)
                 if number >= steps // 2:
-                    found.append([np.asarray(value, float) for value in values])
-                    found[-1][0] = found[-1][0][is_real]
-            images, gradients = (np.stack([f[i] for f in found]) for i in (0, 1))
+                    estimates.append([np.asarray(value, float) for value in values])
+                    estimates[-1][0] = estimates[-1][0][is_real]
+            images, gradients = (np.stack([f[i] for f in estimates]) for i in (0, 1))
             size, length = np.sqrt(np.mean(image**2)), np.linalg.norm(gradient)
             yield Row(
                 scene=name,
@@ -227,8 +232,8 @@ def _measured(name: str, scene: Scene, attributes: Attributes, steps: int) -> It
 
 def table(rows: list[Row]) -> str:
     """Format the rows as a table of Markdown."""
-    head = "| scene | way | samples | rays | ms | light | gradient | mean off by |"
-    lines = [head, "|---|---|---|---|---|---|---|---|"]
+    header = "| scene | way | samples | rays | ms | light | gradient | mean off by |"
+    lines = [header, "|---|---|---|---|---|---|---|---|"]
     for row in rows:
         lines.append(
             f"| {row.scene} | {row.way} | {row.count} | {row.rays} | {1e3 * row.seconds:.0f} | "
@@ -252,15 +257,15 @@ def draw(rows: list[Row], path: Path) -> None:
         ("seconds", "gradient_error", "gradient"),
     )
     for column, scene in enumerate(SCENES):
-        for line, (across, up, title) in enumerate(kinds):
+        for line, (x_field, y_field, title) in enumerate(kinds):
             axis = axes[line][column]
             for way in WAYS:
-                own = [row for row in rows if row.scene == scene and row.way == way]
-                x, y = ([getattr(row, name) for row in own] for name in (across, up))
+                way_rows = [row for row in rows if row.scene == scene and row.way == way]
+                x, y = ([getattr(row, name) for row in way_rows] for name in (x_field, y_field))
                 axis.loglog(x, y, "o-" if way == "plain" else ".-", label=way)
             axis.set_title(f"{scene}: error of the {title}")
             axis.xaxis.set_minor_formatter(NullFormatter())
-            unit = "processor seconds" if across == "seconds" else "rays of a point"
+            unit = "processor seconds" if x_field == "seconds" else "rays of a point"
             axis.set_xlabel(f"{unit} of a step")
     axes[0][0].legend(fontsize=7)
     figure.tight_layout()

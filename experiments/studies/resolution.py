@@ -74,33 +74,33 @@ def train(
 
 def thin_recall(run: Run, views: Views) -> float:
     """Return the share of pixels of thin parts that the render covers; NaN if there are none."""
-    renderer, covered, count = run.renderer(samples=1), 0, 0
+    renderer, covered_count, count = run.renderer(samples=1), 0, 0
     for k in range(len(views)):
         mask = views.images[k][..., 3] > 0.5
         thin = mask & ~opening(mask, disk(THIN_RADIUS))
         alpha = np.asarray(renderer(views.camera([k])).alpha)
-        covered += int(np.sum(alpha[thin] > 0.5))
+        covered_count += int(np.sum(alpha[thin] > 0.5))
         count += int(np.sum(thin))
-    return covered / count if count else float("nan")
+    return covered_count / count if count else float("nan")
 
 
 def row(run: Run, scene: Path, samples: int) -> dict[str, float]:
     """Evaluate a run, and measure its surface, time and memory."""
     mean, steps = evaluated_mean(run, samples), run.steps()
-    found = {"NVS PSNR": mean["nvs.psnr"]}
+    figures = {"NVS PSNR": mean["nvs.psnr"]}
     if "normal.mae_masked_deg" in mean:
-        found["normals, degrees"] = mean["normal.mae_masked_deg"]
+        figures["normals, degrees"] = mean["normal.mae_masked_deg"]
     if (scene / "mesh_gt.ply").exists():
         truth = trimesh.Trimesh(*read_mesh(scene / "mesh_gt.ply"), process=False)
         vertices, faces, _ = run.renderer().mesh()
         mesh = trimesh.Trimesh(vertices, faces, process=False)
-        found["Chamfer"] = chamfer(mesh, truth)
-    found["thin recall"] = thin_recall(run, run.dataset.test)
-    found["Gaussians"] = steps[-1]["splats"]
-    found["s a step"] = float(np.median([line["seconds"] for line in steps]))
-    found["minutes"] = (run.folder.training() or {})["seconds_total"] / 60
-    found["memory, GB"] = max(line["peak_memory_mb"] for line in steps) / 1000
-    return found
+        figures["Chamfer"] = chamfer(mesh, truth)
+    figures["thin recall"] = thin_recall(run, run.dataset.test)
+    figures["Gaussians"] = steps[-1]["splats"]
+    figures["s a step"] = float(np.median([line["seconds"] for line in steps]))
+    figures["minutes"] = (run.folder.training() or {})["seconds_total"] / 60
+    figures["memory, GB"] = max(line["peak_memory_mb"] for line in steps) / 1000
+    return figures
 
 
 def exponent(cells: list[int], values: list[float]) -> float:
@@ -123,19 +123,19 @@ def study(scene: Path, arguments: argparse.Namespace) -> dict[str, dict[int, dic
                     f"| {scene.name} | {grid} | {cells} | refused or failed: {error.returncode} |"
                 )
                 continue
-            found = row(run, scene, arguments.samples)
+            figures = row(run, scene, arguments.samples)
             if not rows[grid]:
-                print(f"| scene | grid | cells | {' | '.join(found)} |")
-            numbers = " | ".join(f"{value:.4g}" for value in found.values())
+                print(f"| scene | grid | cells | {' | '.join(figures)} |")
+            numbers = " | ".join(f"{value:.4g}" for value in figures.values())
             print(f"| {scene.name} | {grid} | {cells} | {numbers} |", flush=True)
-            rows[grid][cells] = found
+            rows[grid][cells] = figures
         if len(rows[grid]) > 1:
             powers = {
-                name: exponent(list(rows[grid]), [one[name] for one in rows[grid].values()])
+                name: exponent(list(rows[grid]), [entry[name] for entry in rows[grid].values()])
                 for name in ("Gaussians", "s a step", "memory, GB")
             }
-            told = ", ".join(f"{name} {power:.2f}" for name, power in powers.items())
-            print(f"{scene.name}, {grid}: exponents of cells: {told}", flush=True)
+            exponents = ", ".join(f"{name} {power:.2f}" for name, power in powers.items())
+            print(f"{scene.name}, {grid}: exponents of cells: {exponents}", flush=True)
     return rows
 
 
@@ -148,9 +148,9 @@ def plot(found: dict[str, dict[str, dict[int, dict[str, float]]]], path: Path) -
     for axis, name in zip(axes.flat, names, strict=True):
         for scene, grids in found.items():
             for grid, rows in grids.items():
-                known = {cells: one[name] for cells, one in rows.items() if name in one}
+                curve = {cells: entry[name] for cells, entry in rows.items() if name in entry}
                 style = "o-" if grid == "box" else "s--"
-                axis.plot(list(known), list(known.values()), style, label=f"{scene}, {grid}")
+                axis.plot(list(curve), list(curve.values()), style, label=f"{scene}, {grid}")
         axis.set(title=name, xlabel="cells", xscale="log")
         axis.set_xticks(sorted({c for g in found.values() for rows in g.values() for c in rows}))
         axis.get_xaxis().set_major_formatter("{x:.0f}")
@@ -167,16 +167,16 @@ def write_picture(runs: list[Path], path: Path) -> None:
     folders = [runs[0], *runs]
     names = [views[0]["pictures"], *(view["pictures"] for view in views)]
     rows = []
-    for true, found in (("truth", "render"), ("true normal", "normal"), (None, "mesh")):
-        keys = [true, *(found for _ in runs)]
+    for true_key, render_key in (("truth", "render"), ("true normal", "normal"), (None, "mesh")):
+        keys = [true_key, *(render_key for _ in runs)]
         row = [
             np.asarray(Image.open(folder / names[k][key]).convert("RGB")) if key else None
             for k, (folder, key) in enumerate(zip(folders, keys, strict=True))
         ]
         blank = np.zeros_like(row[-1])
         rows.append([blank if picture is None else picture for picture in row])
-    covered = np.argwhere(np.any(rows[0][0] < 255, axis=-1))
-    (top, left), (bottom, right) = covered.min(axis=0), covered.max(axis=0) + 1
+    object_pixels = np.argwhere(np.any(rows[0][0] < 255, axis=-1))
+    (top, left), (bottom, right) = object_pixels.min(axis=0), object_pixels.max(axis=0) + 1
     sheet = [np.concatenate([p[top:bottom, left:right] for p in row], axis=1) for row in rows]
     Image.fromarray(np.concatenate(sheet)).save(path)
 
@@ -202,13 +202,13 @@ def main() -> None:
     arguments = parser.parse_args()
     enable_compilation_cache()
     retain_freed_memory()
-    found = {scene.name: study(scene, arguments) for scene in arguments.scenes}
+    results = {scene.name: study(scene, arguments) for scene in arguments.scenes}
     if arguments.json is not None:
-        arguments.json.write_text(json.dumps(found, indent=1), encoding="utf-8")
+        arguments.json.write_text(json.dumps(results, indent=1), encoding="utf-8")
     if arguments.plot is not None:
-        plot(found, arguments.plot)
+        plot(results, arguments.plot)
     if arguments.picture is not None:
-        scene, grids = next(iter(found.items()))
+        scene, grids = next(iter(results.items()))
         runs = [f"{grid}_{cells}" for grid, rows in grids.items() for cells in rows]
         write_picture([arguments.output / scene / run for run in runs], arguments.picture)
 

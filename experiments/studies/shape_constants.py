@@ -141,28 +141,28 @@ def cut(subject: Subject, camera: Camera, side: int, generator: np.random.Genera
     offset = np.array([column - side // 2, row - side // 2])
     lens = np.asarray(camera.intrinsics).copy()
     lens[0, :2, 2] -= offset
-    part = Camera(camera.world_to_camera, jnp.asarray(lens), side, side)
-    seen = see_mesh(vertices, faces, normals, part)
-    fine, _ = first_hits(vertices, faces, part, supersampling=SAMPLES)
-    covered = (fine >= 0).reshape(side, SAMPLES, side, SAMPLES).mean(axis=(1, 3))
+    crop_camera = Camera(camera.world_to_camera, jnp.asarray(lens), side, side)
+    mesh_view = see_mesh(vertices, faces, normals, crop_camera)
+    fine_hits, _ = first_hits(vertices, faces, crop_camera, supersampling=SAMPLES)
+    coverage = (fine_hits >= 0).reshape(side, SAMPLES, side, SAMPLES).mean(axis=(1, 3))
     pose = np.asarray(camera.world_to_camera[0], np.float64)
     points = (vertices @ pose[:3, :3].T + pose[:3, 3]) @ lens[0].T
     pixels = points[:, :2] / points[:, 2:]
     corners = pixels[faces]
     may_show = (corners.max(axis=1) > -MARGIN) & (corners.min(axis=1) < side + MARGIN)
-    used, rows = np.unique(faces[may_show.all(axis=1)], return_inverse=True)
+    used_vertices, rows = np.unique(faces[may_show.all(axis=1)], return_inverse=True)
     mesh = Mesh(
-        jnp.asarray(vertices[used]),
+        jnp.asarray(vertices[used_vertices]),
         jnp.asarray(rows.reshape(-1, 3), jnp.int32),
-        jnp.asarray(len(used), jnp.int32),
+        jnp.asarray(len(used_vertices), jnp.int32),
         jnp.asarray(rows.size // 3, jnp.int32),
     )
     half = subject.box.half_extent
     diagonal = np.sqrt((np.ptp(vertices.astype(np.float64), axis=0) ** 2).sum())
-    numbers = (seen.is_hit, seen.towards, seen.normals, seen.ranges, covered)
+    numbers = (mesh_view.is_hit, mesh_view.towards, mesh_view.normals, mesh_view.ranges, coverage)
     return Crop(
         mesh,
-        jnp.asarray(normals[used]),
+        jnp.asarray(normals[used_vertices]),
         half,
         camera.world_to_camera,
         jnp.asarray(lens),
@@ -215,13 +215,13 @@ def rendered(
         **frame,
     )
 
-    seen = lists.gather
-    means = seen(splats.means)
+    gather = lists.gather
+    means = gather(splats.means)
     ranges = safe_norm(means - camera.centers, keepdims=True)
     image, alpha = composite(
-        project(means, seen(splats.quats), seen(splats.scales, padding=1.0), **lens),
-        seen(splats.opacities),
-        jnp.concatenate([seen(splats.normals), ranges], axis=-1),
+        project(means, gather(splats.quats), gather(splats.scales, padding=1.0), **lens),
+        gather(splats.opacities),
+        jnp.concatenate([gather(splats.normals), ranges], axis=-1),
         lists,
         tile_size=RASTER.tile_size,
         compositor=composite_tiles_forward,
@@ -236,14 +236,14 @@ def differences(
     """Return differences of reflected directions (degrees), distances and coverage per pixel."""
     normals, ranges, alpha, usage = rendered(constants, crop, capacities)
 
-    def reflected(at: Array) -> Array:
-        return crop.towards - 2.0 * jnp.sum(crop.towards * at, axis=-1, keepdims=True) * at
+    def reflected(normal: Array) -> Array:
+        return crop.towards - 2.0 * jnp.sum(crop.towards * normal, axis=-1, keepdims=True) * normal
 
     is_seen = crop.is_hit & (alpha > 0)
-    turned = jnp.rad2deg(reflected(normals) - reflected(crop.mesh_normals))
+    direction_errors = jnp.rad2deg(reflected(normals) - reflected(crop.mesh_normals))
     distance = (ranges - crop.ranges) / crop.diagonal
-    turned = jnp.where(is_seen[..., None], turned, 0.0)
-    return turned, jnp.where(is_seen, distance, 0.0), alpha - crop.covered, usage
+    direction_errors = jnp.where(is_seen[..., None], direction_errors, 0.0)
+    return direction_errors, jnp.where(is_seen, distance, 0.0), alpha - crop.covered, usage
 
 
 def shrunk(deviations: Array, squared: Array) -> Array:
@@ -255,10 +255,14 @@ def residual(
     constants: Constants, crop: Crop, coverage_unit: Float[Array, ""], capacities: Capacities
 ) -> tuple[Array, Usage]:
     """Return the residuals that the solver squares and sums, (P, P, 5), and the usage."""
-    turned, distance, coverage, usage = differences(constants, crop, capacities)
-    parts = (turned, (distance / DISTANCE_UNIT)[..., None], (coverage / coverage_unit)[..., None])
-    squares = (jnp.sum(part * part, axis=-1, keepdims=True) for part in parts)
-    return jnp.concatenate([shrunk(p, s) for p, s in zip(parts, squares, strict=True)], -1), usage
+    direction_errors, distance, coverage, usage = differences(constants, crop, capacities)
+    terms = (
+        direction_errors,
+        (distance / DISTANCE_UNIT)[..., None],
+        (coverage / coverage_unit)[..., None],
+    )
+    squares = (jnp.sum(term * term, axis=-1, keepdims=True) for term in terms)
+    return jnp.concatenate([shrunk(p, s) for p, s in zip(terms, squares, strict=True)], -1), usage
 
 
 @eqx.filter_jit
@@ -273,13 +277,15 @@ def solved(
 
     def everything(changes: Array, crops: list[Crop]) -> tuple[Array, Usage]:
         constants = bounded(first + jnp.where(is_free, changes, 0.0))
-        parts = [
+        group_results = [
             jax.lax.map(lambda crop: residual(constants, crop, coverage_unit, capacities), group)
             for group in crops
         ]
-        usage = capacity_module.combine(*(jax.tree.map(jnp.max, usage) for _, usage in parts))
-        count = sum(values.size for values, _ in parts)
-        values = jnp.concatenate([values.reshape(-1) for values, _ in parts]) / count**0.5
+        usage = capacity_module.combine(
+            *(jax.tree.map(jnp.max, usage) for _, usage in group_results)
+        )
+        count = sum(values.size for values, _ in group_results)
+        values = jnp.concatenate([values.reshape(-1) for values, _ in group_results]) / count**0.5
         # Infinite where a buffer overflows and residuals are wrong, so that the step is rejected.
         return jnp.where(capacity_module.fits(usage, capacities), values, jnp.inf), usage
 
@@ -309,9 +315,14 @@ def fit(
     value, steps, usage = solved(
         free(start), is_free, jnp.asarray(coverage_unit), crops, capacities
     )
-    needed = {name: int(count) for name, count in usage.items()}
-    assert not capacity_module.overflowed(needed, capacities), "the solver ends where it has room"
-    print(f"  {int(steps)} steps of the solver over {', '.join(names)}; needs {needed}", flush=True)
+    usage_counts = {name: int(count) for name, count in usage.items()}
+    assert not capacity_module.overflowed(usage_counts, capacities), (
+        "the solver ends where it has room"
+    )
+    print(
+        f"  {int(steps)} steps of the solver over {', '.join(names)}; needs {usage_counts}",
+        flush=True,
+    )
     return jax.tree.map(float, bounded(value))
 
 
@@ -322,9 +333,11 @@ def means_over(
     """Return, per crop, sums of angles, distances and compared pixels, and mean coverage errors."""
 
     def one(crop: Crop) -> tuple[Array, Array, Array, Array, Usage]:
-        turned, distance, coverage, usage = differences(constants, crop, capacities)
+        direction_errors, distance, coverage, usage = differences(constants, crop, capacities)
         counts = crop.is_hit & (coverage + crop.covered > 0.5)
-        angle = 2.0 * jnp.rad2deg(jnp.arcsin(jnp.clip(0.5 * jnp.deg2rad(safe_norm(turned)), 0, 1)))
+        angle = 2.0 * jnp.rad2deg(
+            jnp.arcsin(jnp.clip(0.5 * jnp.deg2rad(safe_norm(direction_errors)), 0, 1))
+        )
         sums = (jnp.sum(jnp.where(counts, x, 0.0)) for x in (angle, jnp.abs(distance)))
         return *sums, jnp.sum(counts), jnp.mean(jnp.abs(coverage)), usage
 
@@ -358,14 +371,14 @@ def fits_to_make(
     ours: Constants, coverage_units: list[float]
 ) -> Iterator[tuple[str, Constants, tuple[str, ...], float]]:
     """Yield the fits: name, first constants, names of free constants, and unit of coverage."""
-    sunk = eqx.tree_at(lambda c: c.shift, ours, 0.3)
-    yield "fitted: shift", sunk, ("shift",), coverage_units[0]
+    shifted_constants = eqx.tree_at(lambda c: c.shift, ours, 0.3)
+    yield "fitted: shift", shifted_constants, ("shift",), coverage_units[0]
     for unit in coverage_units:
-        which = f", coverage {unit:g}"
-        yield f"fitted: rings, no shift{which}", ours, (*RINGS, "thickness"), unit
+        suffix = f", coverage {unit:g}"
+        yield f"fitted: rings, no shift{suffix}", ours, (*RINGS, "thickness"), unit
         names = (*RINGS, "thickness", "shift")
-        yield f"fitted: rings and shift{which}", sunk, names, unit
-        yield f"fitted: rings, shift, opacity{which}", sunk, (*names, "opacity"), unit
+        yield f"fitted: rings and shift{suffix}", shifted_constants, names, unit
+        yield f"fitted: rings, shift, opacity{suffix}", shifted_constants, (*names, "opacity"), unit
 
 
 def described(constants: Constants) -> str:
@@ -410,7 +423,7 @@ def main() -> None:
     arguments = parser.parse_args()
     enable_compilation_cache()
     generator = np.random.default_rng(arguments.seed)
-    seen, apart = (
+    fit_crops, held_out_crops = (
         crops_of(names, arguments, generator) for names in (arguments.fit, arguments.apart)
     )
     ours = with_shift(AdapterConstants(), 0.0)
@@ -420,11 +433,11 @@ def main() -> None:
         "ours": ours,
         "ours, shift .3": with_shift(AdapterConstants(), 0.3),
     }
-    capacities = room(ours, seen)
+    capacities = room(ours, fit_crops)
     for name, start, names, unit in fits_to_make(ours, arguments.coverage):
         if arguments.only not in name:
             continue
-        rows[name] = fit(start, names, unit, seen, capacities)
+        rows[name] = fit(start, names, unit, fit_crops, capacities)
         print(f"  {described(rows[name])}", flush=True)
     print(
         "\n| constants | fitted meshes | coverage | held apart | coverage |\n|---|---|---|---|---|"
@@ -432,7 +445,7 @@ def main() -> None:
     for name, constants in rows.items():
         cells = [
             f"{s['reflection_deg']:.2f}°, {s['distance']:.4f} | {s['coverage']:.4f}"
-            for s in (score(constants, crops, capacities) for crops in (seen, apart))
+            for s in (score(constants, crops, capacities) for crops in (fit_crops, held_out_crops))
         ]
         print(f"| {name} | {' | '.join(cells)} |", flush=True)
     print()

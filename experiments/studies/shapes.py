@@ -65,9 +65,9 @@ def signed_distance(vertices: np.ndarray, faces: np.ndarray, grid: Grid) -> np.n
     normals = np.einsum("nk,nkd->nd", shares, mesh.vertex_normals[faces[rows]])
     normals /= np.sqrt((normals**2).sum(axis=1, keepdims=True))
     points = grid_points(grid)
-    near = 2.0 * float(grid.cell_size)
-    away, nearest = cKDTree(samples).query(points, distance_upper_bound=near)
-    is_near = np.isfinite(away)
+    reach = 2.0 * float(grid.cell_size)
+    distances, nearest = cKDTree(samples).query(points, distance_upper_bound=reach)
+    is_near = np.isfinite(distances)
     nearest = np.where(is_near, nearest, 0)
     signed = ((points - samples[nearest]) * normals[nearest]).sum(axis=1)
     volume = grid.vertex_shape[::-1]

@@ -145,8 +145,8 @@ def estimate(scene: Scene, pipeline: Pipeline, seeds: range) -> Estimates:
         return replace(scene.batch, key=jax.random.key(seed))
 
     def attempt(capacities: Capacities) -> tuple[None, Usage]:
-        sized = replace(pipeline, capacities=capacities)
-        return None, _image(sized, scene.params, drawn(0)).usage
+        resized_pipeline = replace(pipeline, capacities=capacities)
+        return None, _image(resized_pipeline, scene.params, drawn(0)).usage
 
     _, capacities = capacity.retry(attempt, pipeline.capacities)
     pipeline = replace(pipeline, capacities=capacities)
@@ -164,7 +164,7 @@ def estimate(scene: Scene, pipeline: Pipeline, seeds: range) -> Estimates:
         gradients.append(descend(seed))
         seconds.append(time.perf_counter() - start)
     groups = {
-        name: np.stack([found[name] for found in gradients]).astype(np.float64)
+        name: np.stack([gradient[name] for gradient in gradients]).astype(np.float64)
         for name in gradients[0]
     }
     return Estimates(np.stack(images), groups, statistics.median(seconds))
@@ -190,12 +190,12 @@ def jackknife(
     """
     total = 0.0
     for number, sample in enumerate((rows, exact)):
-        left = []
+        estimates = []
         for index in range(len(sample)):
-            both = [rows, exact]
-            both[number] = np.delete(sample, index, axis=0)
-            left.append(function(*both))
-        total += (len(left) - 1) * float(np.var(left))
+            samples = [rows, exact]
+            samples[number] = np.delete(sample, index, axis=0)
+            estimates.append(function(*samples))
+        total += (len(estimates) - 1) * float(np.var(estimates))
     return function(rows, exact), math.sqrt(total)
 
 
@@ -215,9 +215,9 @@ def compare(found: Estimates, exact: Estimates) -> dict[str, Any]:
         rows = found.gradients[name]
         length = float(np.mean(np.sum(true**2, axis=1)))
         spread = float(rows.var(axis=0, ddof=1).sum())
-        off, error = jackknife(squared_bias, rows, true)
+        gradient_bias, error = jackknife(squared_bias, rows, true)
         result[f"{name}, noise"] = math.sqrt(spread / length)
-        result[f"{name}, bias"] = {"squared": off / length, "error": error / length}
+        result[f"{name}, bias"] = {"squared": gradient_bias / length, "error": error / length}
     return result | {"seconds": found.seconds}
 
 

@@ -109,10 +109,10 @@ def propose_box(cloud: Cloud, views: Views, *, seed: int = 0) -> Proposal:
     positions = np.asarray(cloud.positions, np.float64)
     is_solid = (cloud.opacities > _OPAQUE) & (cloud.sizes < _LARGEST_SCALE * side)
     is_near = ((positions > lo) & (positions < hi)).all(1)
-    seen = _seen_share(positions, views)
-    is_used = is_solid & is_near & (seen >= _SEEN_IN_PART)
+    seen_shares = _seen_share(positions, views)
+    is_used = is_solid & is_near & (seen_shares >= _SEEN_IN_PART)
     points, weights = positions[is_used], np.asarray(cloud.opacities, np.float64)[is_used]
-    is_sure = seen[is_used] >= _SEEN
+    is_sure = seen_shares[is_used] >= _SEEN
     if not is_sure.any():
         raise CaptureError(
             f"there is no opaque splat where the cameras look, between {point_text(lo)} and "
@@ -122,14 +122,14 @@ def propose_box(cloud: Cloud, views: Views, *, seed: int = 0) -> Proposal:
     rng = np.random.default_rng(seed)
     plane = _ground(points[is_sure], weights[is_sure], centers, side, rng)
     is_above = np.ones(len(points), bool) if plane is None else plane.is_above(points)
-    rest, rest_weights = points[is_above], weights[is_above]
-    members = _largest_cluster(rest, rest_weights, is_sure[is_above], lo, hi)
+    points_above, weights_above = points[is_above], weights[is_above]
+    members = _largest_cluster(points_above, weights_above, is_sure[is_above], lo, hi)
     if not members.any():
         raise CaptureError(
             "where the cameras look there is nothing but fog; train longer (--force --steps), or "
             f"{cure}"
         )
-    cluster = rest[members]
+    cluster = points_above[members]
     low, high = np.quantile(cluster, [_TAIL, 1.0 - _TAIL], axis=0)
     pad = _MARGIN * float((high - low).max())
     # A cluster of a single splat has no extent; the box is then one cell of the search.
@@ -137,7 +137,7 @@ def propose_box(cloud: Cloud, views: Views, *, seed: int = 0) -> Proposal:
     low, high = low - pad, high + pad
     if not is_above.all():
         low, high = _cut_at_plane(low, high, points[~is_above & is_sure], cluster)
-    share = float(rest_weights[members].sum() / weights.sum())
+    share = float(weights_above[members].sum() / weights.sum())
     return Proposal(low, high, share, plane)
 
 
@@ -152,8 +152,10 @@ def require_something_inside(inside: Bool[np.ndarray, " N"], cloud: Cloud, corne
     """Refuse a box without splats; `CaptureError` says where the splats are."""
     if inside.any():
         return
-    solid = cloud.positions[cloud.opacities > _OPAQUE]
-    low, high = np.quantile(solid if len(solid) else cloud.positions, [0.1, 0.9], axis=0)
+    opaque_positions = cloud.positions[cloud.opacities > _OPAQUE]
+    low, high = np.quantile(
+        opaque_positions if len(opaque_positions) else cloud.positions, [0.1, 0.9], axis=0
+    )
     raise CaptureError(
         f"the box from {point_text(corners[0])} to {point_text(corners[1])} holds no splat; most "
         f"of them lie between {point_text(low)} and {point_text(high)}, in the units of the cameras"
@@ -174,9 +176,9 @@ def _search(views: Views) -> Bounds:
         views.world_to_camera, views.intrinsics, height=views.height, width=views.width
     )
     middle = 0.5 * (lo + hi)
-    free = np.abs(views.camera_to_world[:, :3, 3] - middle).max(1).min()
-    half = min(np.sqrt(3.0) * 0.5 * float((hi - lo).max()), _FREE * float(free))
-    return middle - half, middle + half
+    clearance = np.abs(views.camera_to_world[:, :3, 3] - middle).max(1).min()
+    half_extent = min(np.sqrt(3.0) * 0.5 * float((hi - lo).max()), _FREE * float(clearance))
+    return middle - half_extent, middle + half_extent
 
 
 def _seen_share(positions: np.ndarray, views: Views) -> Float[np.ndarray, " N"]:
@@ -203,28 +205,30 @@ def _ground(
     """
     if len(points) < 3:
         return None
-    chosen, least = None, _PLANE_SHARE * weights.sum()
+    best_ground, least_weight = None, _PLANE_SHARE * weights.sum()
     for thickness in side * np.array(_PLANE_THICKNESSES):
-        best, best_weight = None, least
+        best_plane, best_weight = None, least_weight
         for corners in rng.integers(len(points), size=(_TRIALS, 3)):
             a, b, c = points[corners]
-            found = _plane_through(a, b, c, centers, side)
-            if found is None:
+            plane = _plane_through(a, b, c, centers, side)
+            if plane is None:
                 continue
-            weight = weights[np.abs(points @ found.normal - found.height) < thickness].sum()
+            weight = weights[np.abs(points @ plane.normal - plane.height) < thickness].sum()
             if weight > best_weight:
-                best, best_weight = found, weight
-        if best is None:
+                best_plane, best_weight = plane, weight
+        if best_plane is None:
             continue
-        best = _fitted(points[np.abs(points @ best.normal - best.height) < thickness], best)
-        if best.is_above(centers).mean() < _CAMERAS_ABOVE:
+        best_plane = _fitted(
+            points[np.abs(points @ best_plane.normal - best_plane.height) < thickness], best_plane
+        )
+        if best_plane.is_above(centers).mean() < _CAMERAS_ABOVE:
             continue
         # Everything below belongs to the ground, too. A plane with nothing above it is no ground.
-        ground = best._replace(height=float(best.height + thickness))
-        above = weights[ground.is_above(points)].sum()
-        if 0.0 < above >= _SPLATS_ABOVE * (weights.sum() - best_weight):
-            chosen, least = ground, _MUCH_MORE * best_weight
-    return chosen
+        ground = best_plane._replace(height=float(best_plane.height + thickness))
+        weight_above = weights[ground.is_above(points)].sum()
+        if 0.0 < weight_above >= _SPLATS_ABOVE * (weights.sum() - best_weight):
+            best_ground, least_weight = ground, _MUCH_MORE * best_weight
+    return best_ground
 
 
 def _fitted(points: np.ndarray, plane: Plane) -> Plane:
@@ -257,17 +261,17 @@ def _largest_cluster(
     Only sure points have weight, which falls with their distance from the middle of the search.
     """
     side = float((hi - lo).max())
-    cell = np.clip(((points - lo) / side * _CELLS).astype(int), 0, _CELLS - 1)
+    cells = np.clip(((points - lo) / side * _CELLS).astype(int), 0, _CELLS - 1)
     density = np.zeros((_CELLS,) * 3)
-    np.add.at(density, tuple(cell.T), weights)
+    np.add.at(density, tuple(cells.T), weights)
     # Splats of uniform surfaces lie far apart, so cells with up to two empty cells between them are
     # connected.
     is_taken = maximum_filter(density >= _LEAST_WEIGHT, size=3)
-    found: Any = label(is_taken, structure=np.ones((3, 3, 3), int))
-    numbers = found[0]
-    cluster = np.where(density[tuple(cell.T)] >= _LEAST_WEIGHT, numbers[tuple(cell.T)], 0)
-    away = np.linalg.norm(points - 0.5 * (lo + hi), axis=1) / (_REACH * side)
-    totals = np.bincount(cluster, is_sure * weights * np.exp(-0.5 * away**2))
+    labelling: Any = label(is_taken, structure=np.ones((3, 3, 3), int))
+    labels = labelling[0]
+    cluster = np.where(density[tuple(cells.T)] >= _LEAST_WEIGHT, labels[tuple(cells.T)], 0)
+    distances = np.linalg.norm(points - 0.5 * (lo + hi), axis=1) / (_REACH * side)
+    totals = np.bincount(cluster, is_sure * weights * np.exp(-0.5 * distances**2))
     totals[0] = 0.0
     return (cluster == int(np.argmax(totals))) & (totals.max() > 0.0)
 

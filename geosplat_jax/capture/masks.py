@@ -92,22 +92,22 @@ class Certainty:
 
     def warnings(self) -> list[str]:
         """Say what looks wrong, and what to do."""
-        found = []
+        messages = []
         if self.unsure > _MOST_UNSURE:
-            found.append(
+            messages.append(
                 "many pixels are half opaque; train longer (--force --steps), or give a tighter "
                 "--box"
             )
         if self.agreement < _LEAST_AGREEMENT:
-            found.append("masks contradict each other; look at masks.png, and give a --box")
+            messages.append("masks contradict each other; look at masks.png, and give a --box")
         if self.cut > _MOST_CUT:
-            found.append(
+            messages.append(
                 f"{self.cut:.0%} of the masks' rims lie on the border of the image: the object, or "
                 "something else in the box, is cut off there"
             )
         if self.empty:
-            found.append(f"{len(self.empty)} masks are empty, for example {self.empty[0]}")
-        return found
+            messages.append(f"{len(self.empty)} masks are empty, for example {self.empty[0]}")
+        return messages
 
 
 @dataclass(frozen=True)
@@ -144,17 +144,17 @@ class MaskReport:
         corners = f"{point_text(self.lo)} to {point_text(self.hi)}"
         origin = "proposed" if self.proposed else "given"
         plane = ", without what it stands on or hangs from" if self.plane else ""
-        held_back = "no views are held back"
+        psnr_text = "no views are held back"
         if self.psnr is not None:
-            held_back = f"{self.psnr:.2f} dB on views that are held back"
-        sure = self.certainty
+            psnr_text = f"{self.psnr:.2f} dB on views that are held back"
+        figures = self.certainty
         return [
-            f"splats:     {self.splats_total}, {held_back}",
+            f"splats:     {self.splats_total}, {psnr_text}",
             f"box:        {corners} ({origin}{plane}), {self.splats} splats in it",
-            f"masks:      {self.masks} in {self.folder}, {sure.coverage:.1%} of an image each",
-            f"unsure:     {sure.unsure:.1%} half-opaque pixels off the rims, per mask pixel",
-            f"agreement:  {sure.agreement:.1%} of the rays through a mask meet the others' hull",
-            *(f"warning: {warning}" for warning in sure.warnings()),
+            f"masks:      {self.masks} in {self.folder}, {figures.coverage:.1%} of an image each",
+            f"unsure:     {figures.unsure:.1%} half-opaque pixels off the rims, per mask pixel",
+            f"agreement:  {figures.agreement:.1%} of the rays through a mask meet the others' hull",
+            *(f"warning: {warning}" for warning in figures.warnings()),
         ]
 
 
@@ -215,9 +215,9 @@ def make_masks(
     write_splats(clipped, folder / "object.ply")
     alpha = _alphas(clipped, views, (lo, hi))
     # A command that is stopped between the first mask and the report can be resumed.
-    begun = folder / _BEGUN
-    with written_aside(begun) as aside:
-        aside.write_text(
+    marker = folder / _BEGUN
+    with written_aside(marker) as temporary_path:
+        temporary_path.write_text(
             json.dumps([str(file.resolve()) for file in files]) + "\n", encoding="utf-8"
         )
     for frame, file, values in zip(frames, files, alpha, strict=True):
@@ -236,9 +236,9 @@ def make_masks(
     )
     write_png(folder / "masks.png", mask_sheet(views, alpha, report.lines()))
     text = json.dumps(asdict(report), indent=2)
-    with written_aside(folder / REPORT) as aside:
-        aside.write_text(text + "\n", encoding="utf-8")
-    begun.unlink()
+    with written_aside(folder / REPORT) as temporary_path:
+        temporary_path.write_text(text + "\n", encoding="utf-8")
+    marker.unlink()
     return report
 
 
@@ -293,11 +293,11 @@ def _frames(dataset: Dataset) -> list[Frame]:
             f"{dataset.root} is of the layout {dataset.layout}, whose images are cut out; masks "
             "are made for captures (docs/captures.md)"
         )
-    known = {frame.name: frame for frame in (*listing.train, *listing.test)}
-    frames = [known[name] for name in (*dataset.train.names, *dataset.test.names)]
+    frames_by_name = {frame.name: frame for frame in (*listing.train, *listing.test)}
+    frames = [frames_by_name[name] for name in (*dataset.train.names, *dataset.test.names)]
     for frame in frames:
-        beside = beside_images(dataset.root, frame.image, MASK_FOLDERS)
-        if frame.mask is not None and frame.mask != beside:
+        mask_path = beside_images(dataset.root, frame.image, MASK_FOLDERS)
+        if frame.mask is not None and frame.mask != mask_path:
             raise CaptureError(
                 f"the files of the scene name the mask {frame.mask} for {frame.image.name}, which "
                 "would be read instead of a new one; remove mask_path from transforms.json"
@@ -307,14 +307,16 @@ def _frames(dataset: Dataset) -> list[Frame]:
 
 def _require_free(frames: Sequence[Frame], folder: Path, *, resume: bool, force: bool) -> None:
     """Refuse to replace masks that this command did not write, before hours of training."""
-    there = [frame.mask for frame in frames if frame.mask is not None]
-    begun = folder / _BEGUN
-    written = set(parse_json(begun.read_bytes())) if begun.exists() else set()
-    of_a_stopped_one = bool(written) and {str(mask.resolve()) for mask in there} <= written
-    is_ours = resume and ((folder / REPORT).exists() or of_a_stopped_one)
-    if there and not (is_ours or force):
+    masks = [frame.mask for frame in frames if frame.mask is not None]
+    marker = folder / _BEGUN
+    recorded_masks = set(parse_json(marker.read_bytes())) if marker.exists() else set()
+    is_of_stopped_run = (
+        bool(recorded_masks) and {str(mask.resolve()) for mask in masks} <= recorded_masks
+    )
+    is_ours = resume and ((folder / REPORT).exists() or is_of_stopped_run)
+    if masks and not (is_ours or force):
         raise CaptureError(
-            f"{len(there)} of {len(frames)} views have a mask already, for example {there[0]}; "
+            f"{len(masks)} of {len(frames)} views have a mask already, for example {masks[0]}; "
             "replace them with --force, or move them away"
         )
 
@@ -326,16 +328,16 @@ def _all_views(dataset: Dataset) -> Views:
         return train
     height, width = max(train.height, test.height), max(train.width, test.width)
 
-    def grown(stored: Any, padding: float = 0.0) -> np.ndarray:
-        values = np.asarray(stored)
-        short = [(0, 0), (0, height - values.shape[1]), (0, width - values.shape[2])]
+    def grown(pixels: Any, padding: float = 0.0) -> np.ndarray:
+        values = np.asarray(pixels)
+        widths = [(0, 0), (0, height - values.shape[1]), (0, width - values.shape[2])]
         return np.pad(
-            values, [*short, *[(0, 0)] * (values.ndim - 3)], constant_values=np.float32(padding)
+            values, [*widths, *[(0, 0)] * (values.ndim - 3)], constant_values=np.float32(padding)
         )
 
     def valid_of(views: Views) -> np.ndarray:
-        known = views.valid
-        return grown(np.ones(views.images.shape[:3], np.float32) if known is None else known)
+        marks = views.valid
+        return grown(np.ones(views.images.shape[:3], np.float32) if marks is None else marks)
 
     valid = np.concatenate([valid_of(train), valid_of(test)])
     return Views(
@@ -369,11 +371,11 @@ def _clipped(
         corners, plane = (proposal.lo, proposal.hi), proposal.plane
     else:
         corners = (np.asarray(box[0], np.float64), np.asarray(box[1], np.float64))
-    inside = inside_box(cloud.positions, *corners)
+    is_inside = inside_box(cloud.positions, *corners)
     if plane is not None:
-        inside &= plane.is_above(cloud.positions)
-    require_something_inside(inside, cloud, corners)
-    return radiance.of(inside), corners, plane
+        is_inside &= plane.is_above(cloud.positions)
+    require_something_inside(is_inside, cloud, corners)
+    return radiance.of(is_inside), corners, plane
 
 
 def write_splats(radiance: Radiance, path: Path) -> None:
@@ -406,17 +408,17 @@ def tidied(alpha: Float[np.ndarray, "V H W"]) -> Float[np.ndarray, "V H W"]:
     -------
     (V, H, W) changed copy.
     """
-    found = np.array(alpha)
-    for values in found:
+    alphas = np.array(alpha)
+    for values in alphas:
         mask = values > OPAQUE
-        parts: Any = label(mask, structure=np.ones((3, 3), int))
-        sizes = np.bincount(parts[0].ravel())
+        labelling: Any = label(mask, structure=np.ones((3, 3), int))
+        sizes = np.bincount(labelling[0].ravel())
         sizes[0] = sizes[1:].max(initial=0)
-        is_speck = (sizes < _SPECK * sizes[0])[parts[0]]
+        is_speck = (sizes < _SPECK * sizes[0])[labelling[0]]
         values[is_speck] = 0.0
         holes = binary_fill_holes(mask & ~is_speck) & ~mask
         values[holes & (values > _UNSURE[0])] = 1.0
-    return found
+    return alphas
 
 
 def photograph_mask(
@@ -436,13 +438,13 @@ def photograph_mask(
     (h, w) True on the object.
     """
     height, width = image_size(frame.image)
-    where = photograph_lookup(
+    lookup = photograph_lookup(
         frame.lens.distortion, frame.lens.intrinsics(width, height), width, height
     )
     rows, columns = height // downscale, width // downscale
-    reduced = Lookup(where.rows / downscale, where.columns / downscale, where.inside)
+    reduced_lookup = Lookup(lookup.rows / downscale, lookup.columns / downscale, lookup.inside)
     mask = (alpha[:rows, :columns, None] > OPAQUE).astype(np.float32)
-    return resample(mask, reduced)[..., 0] > COVERED
+    return resample(mask, reduced_lookup)[..., 0] > COVERED
 
 
 def certainty(views: Views, alpha: Float[np.ndarray, "V H W"], box: Bounds) -> Certainty:
@@ -455,26 +457,26 @@ def certainty(views: Views, alpha: Float[np.ndarray, "V H W"], box: Bounds) -> C
     box : lo and hi of the box.
     """
     masks = alpha > OPAQUE
-    covered = int(masks.sum())
+    mask_area = int(masks.sum())
     rims = (masks[:, 0], masks[:, -1], masks[:, :, 0], masks[:, :, -1])
-    on_border = sum(int(rim.sum()) for rim in rims)
+    border_count = sum(int(rim.sum()) for rim in rims)
     around = np.pad(masks, ((0, 0), (1, 1), (1, 1)))
-    inner = around.copy()
+    interior = around.copy()
     for axis, step in ((1, 1), (1, -1), (2, 1), (2, -1)):
-        inner &= np.roll(around, step, axis)
-    rim = covered - int(inner.sum())
-    cut_out = np.concatenate([views.images[..., :3], masks[..., None].astype(np.float32)], axis=-1)
-    masked = replace(views, images=cut_out, has_masks=True)
+        interior &= np.roll(around, step, axis)
+    rim = mask_area - int(interior.sum())
+    rgba = np.concatenate([views.images[..., :3], masks[..., None].astype(np.float32)], axis=-1)
+    masked = replace(views, images=rgba, has_masks=True)
     shares = agreement(masked, box)
     is_empty = ~masks.any((1, 2))
     # A rim of one pixel is half opaque around any object, and so is not counted.
-    near = np.asarray(maximum_filter(masks, (1, 3, 3)), bool)
+    dilated_masks = np.asarray(maximum_filter(masks, (1, 3, 3)), bool)
     return Certainty(
         coverage=float(masked.coverage.mean()),
-        unsure=float(((alpha > _UNSURE[0]) & ~near).sum() / covered),
-        cut=on_border / max(rim, on_border, 1),
+        unsure=float(((alpha > _UNSURE[0]) & ~dilated_masks).sum() / mask_area),
+        cut=border_count / max(rim, border_count, 1),
         agreement=float(shares[np.isfinite(shares)].mean()),
-        empty=tuple(name for name, no in zip(views.names, is_empty, strict=True) if no),
+        empty=tuple(name for name, is_blank in zip(views.names, is_empty, strict=True) if is_blank),
     )
 
 
@@ -490,24 +492,24 @@ def mask_sheet(
 
     Half-opaque pixels are orange in the mask.
     """
-    chosen = np.unique(np.linspace(0, len(views) - 1, _SHEET_VIEWS).astype(int))
+    view_indices = np.unique(np.linspace(0, len(views) - 1, _SHEET_VIEWS).astype(int))
     zoom = math.ceil(_SHEET_WIDTH / views.width)
     rows: list[dict[str, Any]] = []
-    for view in chosen:
+    for view in view_indices:
         picture = to_picture(views.images[view, ..., :3])
         mask = (alpha[view] > OPAQUE)[..., None]
         is_unsure = (alpha[view] > _UNSURE[0])[..., None] & ~mask
-        shown = np.where(is_unsure, np.asarray(_DISSENT), mask.astype(np.float32))
+        mask_picture = np.where(is_unsure, np.asarray(_DISSENT), mask.astype(np.float32))
         rows.append(
             {
                 name: np.repeat(np.repeat(image, zoom, 0), zoom, 1)
                 for name, image in (
                     ("capture", picture),
-                    ("mask", shown.astype(np.float32)),
+                    ("mask", mask_picture.astype(np.float32)),
                     ("masked", np.where(mask, picture, _DIM * picture)),
                 )
             }
         )
     return overview_sheet(
-        rows, title="masks", row_labels=[views.names[view] for view in chosen], notes=notes
+        rows, title="masks", row_labels=[views.names[view] for view in view_indices], notes=notes
     )

@@ -59,12 +59,12 @@ def require_trainable(views: Views) -> None:
             "is around it cannot be learned"
         )
     centers = views.camera_to_world[:, :3, 3]
-    reach = np.linalg.norm(centers - centers.mean(0), axis=1).max()
+    radius = np.linalg.norm(centers - centers.mean(0), axis=1).max()
     try:
         target = common_target(centers, -views.camera_to_world[:, :3, 2])
     except SceneError:
         # Cameras may look in any direction, as long as they do not stand on a line.
-        target = centers.mean(0) + reach
+        target = centers.mean(0) + radius
     require_spread(centers, target[None])
 
 
@@ -95,21 +95,23 @@ def random_points(views: Views, count: int, rng: np.random.Generator) -> Points:
     """
     view, row, column = _drawn_pixels(views, count, rng)
     centers = views.camera_to_world[:, :3, 3]
-    sight = -views.camera_to_world[:, :3, 2]
+    directions = -views.camera_to_world[:, :3, 2]
     try:
-        target = common_target(centers, sight)
-        distance = np.einsum("vi,vi->v", target - centers, sight)
+        target = common_target(centers, directions)
+        distance = np.einsum("vi,vi->v", target - centers, directions)
     except SceneError:
         distance = np.full(len(views), np.linalg.norm(centers - centers.mean(0), axis=1).max())
     distance = np.maximum(distance, np.median(distance) * _NEAREST)
-    near = rng.uniform(_NEAREST, _BEYOND, count)
-    far = 1.0 / rng.uniform(1.0 / _FARTHEST, 1.0 / _BEYOND, count)
-    depth = distance[view] * np.where(np.arange(count) % 2, near, far)
+    near_depths = rng.uniform(_NEAREST, _BEYOND, count)
+    far_depths = 1.0 / rng.uniform(1.0 / _FARTHEST, 1.0 / _BEYOND, count)
+    depth = distance[view] * np.where(np.arange(count) % 2, near_depths, far_depths)
     pixels = np.stack([column + 0.5, row + 0.5, np.ones(count)], -1)
-    local = np.einsum("nij,nj->ni", np.linalg.inv(views.intrinsics)[view], pixels) * depth[:, None]
-    local *= [1.0, -1.0, -1.0]
+    camera_points = (
+        np.einsum("nij,nj->ni", np.linalg.inv(views.intrinsics)[view], pixels) * depth[:, None]
+    )
+    camera_points *= [1.0, -1.0, -1.0]
     poses = views.camera_to_world[view]
-    positions = np.einsum("nij,nj->ni", poses[:, :3, :3], local) + poses[:, :3, 3]
+    positions = np.einsum("nij,nj->ni", poses[:, :3, :3], camera_points) + poses[:, :3, 3]
     return Points(positions, np.asarray(encode_srgb(views.images[view, row, column, :3])))
 
 
@@ -121,18 +123,18 @@ def _drawn_pixels(
     view, row, column = (rng.integers(limit, size=count) for limit in limits)
     if views.valid is None:
         return view, row, column
-    again = np.arange(count)
+    pending = np.arange(count)
     for _ in range(_MOST_DRAWS):
-        counts = np.zeros(len(again), bool)
-        for number in np.unique(view[again]):
-            here = view[again] == number
-            marks = np.asarray(views.valid[number])
-            counts[here] = marks[row[again[here]], column[again[here]]] > 0
-        again = again[~counts]
-        if not len(again):
+        is_valid = np.zeros(len(pending), bool)
+        for view_index in np.unique(view[pending]):
+            is_in_view = view[pending] == view_index
+            marks = np.asarray(views.valid[view_index])
+            is_valid[is_in_view] = marks[row[pending[is_in_view]], column[pending[is_in_view]]] > 0
+        pending = pending[~is_valid]
+        if not len(pending):
             break
-        for drawn, limit in zip((view, row, column), limits, strict=True):
-            drawn[again] = rng.integers(limit, size=len(again))
+        for coordinates, limit in zip((view, row, column), limits, strict=True):
+            coordinates[pending] = rng.integers(limit, size=len(pending))
     return view, row, column
 
 
@@ -156,14 +158,14 @@ def first_splats(
     count : number of rows in use.
     """
     rng = np.random.default_rng(settings.seed)
-    wanted = max(1, int(_START_SHARE * settings.capacity))
-    given = Points(np.zeros((0, 3)), np.zeros((0, 3))) if points is None else points
-    if len(given.positions) > settings.capacity:
-        chosen = np.sort(rng.choice(len(given.positions), settings.capacity, replace=False))
-        given = Points(given.positions[chosen], given.colors[chosen])
-    drawn = random_points(views, max(0, wanted - len(given.positions)), rng)
-    positions = np.concatenate([given.positions, drawn.positions])
-    colors = np.concatenate([given.colors, drawn.colors])
+    target_count = max(1, int(_START_SHARE * settings.capacity))
+    seed_points = Points(np.zeros((0, 3)), np.zeros((0, 3))) if points is None else points
+    if len(seed_points.positions) > settings.capacity:
+        rows = np.sort(rng.choice(len(seed_points.positions), settings.capacity, replace=False))
+        seed_points = Points(seed_points.positions[rows], seed_points.colors[rows])
+    random_samples = random_points(views, max(0, target_count - len(seed_points.positions)), rng)
+    positions = np.concatenate([seed_points.positions, random_samples.positions])
+    colors = np.concatenate([seed_points.colors, random_samples.colors])
     scales = settings.first_scale * _neighbour_distance(positions)
     return _padded(positions, colors, scales, settings), len(positions)
 

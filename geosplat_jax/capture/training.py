@@ -147,8 +147,8 @@ class Radiance:
 
     def of(self, rows: Bool[np.ndarray, " N"]) -> "Radiance":
         """Return the splats in the rows of a mask (N,)."""
-        chosen = np.flatnonzero(rows)
-        return replace(self, splats=jax.tree.map(lambda leaf: leaf[chosen], self.splats))
+        indices = np.flatnonzero(rows)
+        return replace(self, splats=jax.tree.map(lambda leaf: leaf[indices], self.splats))
 
 
 def radiance_loss(
@@ -188,8 +188,8 @@ def radiance_loss(
     photograph = jnp.concatenate(
         [linear_to_srgb(batch.image[..., :3]), batch.image[..., 3:]], axis=-1
     )
-    behind = random_background(batch.key, (1, *rgb.shape), rgb.dtype, background)
-    images = compare(rgb[None], alpha[None], photograph, behind, batch.valid, srgb=False)
+    backdrop = random_background(batch.key, (1, *rgb.shape), rgb.dtype, background)
+    images = compare(rgb[None], alpha[None], photograph, backdrop, batch.valid, srgb=False)
     in_use = (jnp.arange(splats.capacity, dtype=jnp.int32) < count).astype(rgb.dtype)
     share = in_use / jnp.maximum(count, 1).astype(rgb.dtype)
     total = (
@@ -225,14 +225,14 @@ def radiance_step(
     splats = descended(state.splats, directions, weights.rates)
     noise = exploring_noise(splats, noise_key, rate=weights.noise)
     splats = replace(splats, means=splats.means + noise)
-    finite = jnp.isfinite(total) & jnp.all(
+    is_finite = jnp.isfinite(total) & jnp.all(
         jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(splats)])
     )
     sizes = {name: jnp.int32(capacities[name]) for name in usage}
-    is_sound = finite & capacity_module.fits(usage, sizes)
-    advanced = RadianceState(splats, optimizer, state.count, state.step + 1)
-    chosen = jax.tree.map(lambda new, old: jnp.where(is_sound, new, old), advanced, state)
-    return chosen, RadianceReport(total, mse, usage, finite)
+    is_sound = is_finite & capacity_module.fits(usage, sizes)
+    updated_state = RadianceState(splats, optimizer, state.count, state.step + 1)
+    next_state = jax.tree.map(lambda new, old: jnp.where(is_sound, new, old), updated_state, state)
+    return next_state, RadianceReport(total, mse, usage, is_finite)
 
 
 @partial(jax.jit, donate_argnames=("state",))
@@ -242,13 +242,13 @@ def relocated(state: RadianceState, count: Int[Array, ""], key: Key[Array, ""]) 
     Adam's moments of all rows that change become zero. See `relocation.relocate`.
     """
     dead_key, birth_key = jax.random.split(key)
-    row = jnp.arange(state.splats.capacity, dtype=jnp.int32)
-    in_use = row < state.count
+    rows = jnp.arange(state.splats.capacity, dtype=jnp.int32)
+    in_use = rows < state.count
     is_dead = in_use & (state.splats.opacities <= DEAD_OPACITY)
     splats, first = relocate(state.splats, is_dead, in_use, dead_key)
-    is_born = (row >= state.count) & (row < count)
+    is_born = (rows >= state.count) & (rows < count)
     splats, second = relocate(splats, is_born, in_use, birth_key)
-    grown = jnp.where(jnp.any(second & is_born), jnp.maximum(count, state.count), state.count)
+    new_count = jnp.where(jnp.any(second & is_born), jnp.maximum(count, state.count), state.count)
     is_changed = first | second
 
     def cleared(moments: Any) -> Any:
@@ -259,33 +259,33 @@ def relocated(state: RadianceState, count: Int[Array, ""], key: Key[Array, ""]) 
     optimizer = state.optimizer._replace(
         mu=cleared(state.optimizer.mu), nu=cleared(state.optimizer.nu)
     )
-    return RadianceState(splats, optimizer, grown, state.step)
+    return RadianceState(splats, optimizer, new_count, state.step)
 
 
 def weights_at(settings: RadianceSettings, step: int) -> StepWeights:
     """Return the numbers of a step: the rate of positions decays, the degree rises."""
     rates = settings.rates
-    through = step / max(settings.steps - 1, 1)
+    progress = step / max(settings.steps - 1, 1)
     # Rates are in units of the extent, which is four in the standard world.
-    means = 4.0 * rates.means * (rates.means_last / rates.means) ** through
+    means_rate = 4.0 * rates.means * (rates.means_last / rates.means) ** progress
     groups = {
         name: getattr(rates, name) for name in ("scales", "quats", "opacities", "base", "rest")
     }
-    number = partial(jnp.asarray, dtype=jnp.float32)
+    to_float32 = partial(jnp.asarray, dtype=jnp.float32)
     return StepWeights(
-        rates={name: number(rate) for name, rate in {**groups, "means": means}.items()},
-        noise=number(means * settings.relocation.noise),
+        rates={name: to_float32(rate) for name, rate in {**groups, "means": means_rate}.items()},
+        noise=to_float32(means_rate * settings.relocation.noise),
         degree=jnp.int32(min(settings.degree, step // settings.degree_every)),
-        structure=number(settings.structure),
-        opacity=number(settings.opacity_penalty),
-        scale=number(settings.scale_penalty),
+        structure=to_float32(settings.structure),
+        opacity=to_float32(settings.opacity_penalty),
+        scale=to_float32(settings.scale_penalty),
     )
 
 
 def relocates_after(settings: RadianceSettings, step: int) -> bool:
     """Whether splats are relocated after ``step`` updates."""
-    when = settings.relocation
-    return step % when.every == 0 and when.first <= step <= when.until * settings.steps
+    schedule = settings.relocation
+    return step % schedule.every == 0 and schedule.first <= step <= schedule.until * settings.steps
 
 
 class _Loop:
@@ -327,9 +327,9 @@ class _Loop:
 
     def batch(self, step: int) -> Batch:
         """Return the view of a step: all views in random order, then in another one, and so on."""
-        round_, place = divmod(step, len(self.views))
-        order = np.random.default_rng((self.settings.seed, round_)).permutation(len(self.views))
-        view = order[place : place + 1]
+        epoch, position = divmod(step, len(self.views))
+        order = np.random.default_rng((self.settings.seed, epoch)).permutation(len(self.views))
+        view = order[position : position + 1]
         valid = self.views.valid
         return Batch(
             camera=self.views.camera(view),
@@ -360,9 +360,9 @@ class _Loop:
                 f"{self.folder / 'checkpoints'}"
             )
         if relocates_after(self.settings, step + 1):
-            grown = int(self.settings.relocation.growth * int(self.state.count))
+            grown_count = int(self.settings.relocation.growth * int(self.state.count))
             key = jax.random.fold_in(jax.random.key(self.settings.seed), _RELOCATION_STREAM + step)
-            count = jnp.int32(min(self.settings.capacity, grown))
+            count = jnp.int32(min(self.settings.capacity, grown_count))
             self.state = relocated(self.state, count, key)
         return report
 
@@ -377,8 +377,8 @@ class _Loop:
             means=jnp.asarray(means, jnp.float32),
             log_scales=splats.log_scales - jnp.float32(np.log(scale)),
         )
-        done = min(self.settings.degree, (self.settings.steps - 1) // self.settings.degree_every)
-        return Radiance(splats, NEAR / scale, done)
+        degree = min(self.settings.degree, (self.settings.steps - 1) // self.settings.degree_every)
+        return Radiance(splats, NEAR / scale, degree)
 
 
 @partial(jax.jit, static_argnames=("capacities",))
@@ -394,11 +394,11 @@ def _planned(
 ) -> Capacities:
     """Choose sizes of buffers that hold the needs of some views; ``visible`` holds all splats."""
     capacities = Capacities(visible=bucket(splats.capacity))
-    for number in np.unique(np.linspace(0, camera.count - 1, _VIEWS_PLANNED).astype(int)):
-        one = camera.view(int(number))
+    for view_index in np.unique(np.linspace(0, camera.count - 1, _VIEWS_PLANNED).astype(int)):
+        view = camera.view(int(view_index))
 
-        def attempt(sizes: Capacities, one: Camera = one) -> tuple[None, Usage]:
-            return None, _needs(splats, count, one, jnp.float32(near), capacities=sizes)
+        def attempt(sizes: Capacities, view: Camera = view) -> tuple[None, Usage]:
+            return None, _needs(splats, count, view, jnp.float32(near), capacities=sizes)
 
         _, capacities = retry(attempt, capacities, headroom=_HEADROOM)
     return capacities
@@ -456,26 +456,36 @@ def train_radiance(
         loop = _Loop(views, points, settings, folder)
         if resume:
             loop.load()
-        began, last = time.perf_counter(), min(settings.steps, stop_after or settings.steps)
-        took: deque[float] = deque(maxlen=_STEPS_TIMED)
+        start_time, last = time.perf_counter(), min(settings.steps, stop_after or settings.steps)
+        step_seconds: deque[float] = deque(maxlen=_STEPS_TIMED)
         for step in range(int(loop.state.step), last):
-            before, sizes = time.perf_counter(), loop.capacities
+            step_start, sizes = time.perf_counter(), loop.capacities
             report = loop.advance(step)
-            done, now = step + 1, time.perf_counter()
+            steps_done, now = step + 1, time.perf_counter()
             if loop.capacities == sizes and loop.has_compiled:
-                took.append(now - before)
+                step_seconds.append(now - step_start)
             loop.has_compiled = True
             if on_step is not None:
-                left = float(np.median(took)) * (settings.steps - done) if took else None
-                on_step(_progress(loop, report, now - began, left))
-            if done % settings.checkpoint_every == 0 or done == last or stop_requested():
+                seconds_left = (
+                    float(np.median(step_seconds)) * (settings.steps - steps_done)
+                    if step_seconds
+                    else None
+                )
+                on_step(_progress(loop, report, now - start_time, seconds_left))
+            if (
+                steps_done % settings.checkpoint_every == 0
+                or steps_done == last
+                or stop_requested()
+            ):
                 loop.save()
-            if stop_requested() and done < last:
-                raise Interrupted(f"stopped at step {done}; continue with --resume")
+            if stop_requested() and steps_done < last:
+                raise Interrupted(f"stopped at step {steps_done}; continue with --resume")
         return loop.result()
 
 
-def _progress(loop: _Loop, report: RadianceReport, seconds: float, left: float | None) -> Progress:
+def _progress(
+    loop: _Loop, report: RadianceReport, seconds: float, seconds_left: float | None
+) -> Progress:
     return Progress(
         step=int(loop.state.step),
         steps=loop.settings.steps,
@@ -484,7 +494,7 @@ def _progress(loop: _Loop, report: RadianceReport, seconds: float, left: float |
         psnr=float(psnr_of_mse(report.mse)),
         splat_count=int(loop.state.count),
         seconds=seconds,
-        seconds_left=left,
+        seconds_left=seconds_left,
     )
 
 
@@ -493,7 +503,7 @@ def _begin(
 ) -> None:
     """Write the record of the training, or compare it with that of the training to resume."""
     path = folder / RECORD
-    now = {
+    new_record = {
         "views": f"{len(views)} of {views.width} x {views.height}, {views.fingerprint()}",
         "settings": to_plain(settings),
     }
@@ -502,7 +512,7 @@ def _begin(
             record = parse_json(path.read_bytes())
         except ValueError as error:
             raise RunError(f"{path} is damaged: {error}; start again with --force") from None
-        if record != now:
+        if record != new_record:
             raise RunError(
                 f"{path} is of other views or settings; give the same as then, or start again "
                 "with --force"
@@ -513,10 +523,10 @@ def _begin(
             f"{folder} has splats already; continue with --resume, replace them with --force, or "
             "choose another --output"
         )
-    for old in (folder / "checkpoints").glob("checkpoint_*.npz"):
-        old.unlink()
-    with written_aside(path) as aside:
-        aside.write_text(json.dumps(now, indent=2) + "\n", encoding="utf-8")
+    for old_checkpoint in (folder / "checkpoints").glob("checkpoint_*.npz"):
+        old_checkpoint.unlink()
+    with written_aside(path) as temporary_path:
+        temporary_path.write_text(json.dumps(new_record, indent=2) + "\n", encoding="utf-8")
 
 
 @partial(jax.jit, static_argnames=("capacities", "degree"))
@@ -539,12 +549,12 @@ def render_views(
     capacities = _planned(radiance.splats, radiance.splats.capacity, camera, radiance.near)
     colors, alphas = [], []
     near = jnp.float32(radiance.near)
-    for number in range(camera.count):
-        one = camera.view(number)
+    for view_index in range(camera.count):
+        view = camera.view(view_index)
 
-        def attempt(sizes: Capacities, one: Camera = one) -> tuple[Any, Usage]:
+        def attempt(sizes: Capacities, view: Camera = view) -> tuple[Any, Usage]:
             rgb, alpha, usage = _rendered(
-                radiance.splats, one, near, capacities=sizes, degree=radiance.degree
+                radiance.splats, view, near, capacities=sizes, degree=radiance.degree
             )
             return (rgb, alpha), usage
 
@@ -558,6 +568,6 @@ def quality(radiance: Radiance, views: Views) -> Float[np.ndarray, " V"]:
     """Return the PSNR of renders against photographs, (V,) decibels, in sRGB over black."""
     rgb, _ = render_views(radiance, views.camera())
     truth = np.asarray(linear_to_srgb(jnp.asarray(views.images[..., :3])))
-    shown = np.clip(rgb, 0.0, 1.0)
-    valid = np.ones(shown.shape[:3], np.float32) if views.valid is None else views.valid
-    return np.array([float(psnr(*view)) for view in zip(shown, truth, valid, strict=True)])
+    renders = np.clip(rgb, 0.0, 1.0)
+    valid = np.ones(renders.shape[:3], np.float32) if views.valid is None else views.valid
+    return np.array([float(psnr(*view)) for view in zip(renders, truth, valid, strict=True)])

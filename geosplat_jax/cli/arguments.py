@@ -156,14 +156,16 @@ def _add_train(train: argparse.ArgumentParser) -> None:
         action="store_true",
         help="also write steps and previews as event files, to the run's folder",
     )
-    start = train.add_mutually_exclusive_group()
-    start.add_argument(
+    start_group = train.add_mutually_exclusive_group()
+    start_group.add_argument(
         "--resume",
         action="store_true",
         help="continue from the last checkpoint; where there is none, start from the beginning",
     )
-    start.add_argument("--force", action="store_true", help="replace the run in the output folder")
-    start.add_argument(
+    start_group.add_argument(
+        "--force", action="store_true", help="replace the run in the output folder"
+    )
+    start_group.add_argument(
         "--from",
         dest="source",
         type=Path,
@@ -312,40 +314,40 @@ def _add_gradcheck(gradcheck: argparse.ArgumentParser) -> None:
 
 def _add_poses(poses: argparse.ArgumentParser) -> None:
     """Describe the poses command."""
-    standard = PoseSettings()
+    defaults = PoseSettings()
     poses.add_argument("folder", type=Path, help="photographs, in FOLDER/images or FOLDER")
     poses.add_argument("--force", action="store_true", help="replace the cameras in FOLDER")
     poses.add_argument(
         "--size",
         type=int,
-        default=standard.size,
+        default=defaults.size,
         help="longer side, in pixels, that photographs are reduced to in order to find features "
         "(default: %(default)s)",
     )
     poses.add_argument(
         "--order",
         choices=get_args(PoseSettings.__annotations__["order"]),
-        default=standard.order,
+        default=defaults.order,
         help="any: match every pair of photographs; sequence: mainly those that are close by name, "
         "for frames of a movie (default: %(default)s)",
     )
     poses.add_argument(
         "--lens",
         choices=get_args(PoseSettings.__annotations__["lens"]),
-        default=standard.lens,
+        default=defaults.lens,
         help="one lens for all photographs, or one for each (default: %(default)s)",
     )
     poses.add_argument(
         "--seed",
         type=_seed,
-        default=standard.seed,
+        default=defaults.seed,
         help="seed of the random searches (default: %(default)s)",
     )
 
 
 def _add_masks(masks: argparse.ArgumentParser) -> None:
     """Describe the masks command."""
-    standard = RadianceSettings()
+    defaults = RadianceSettings()
     masks.add_argument("scene", type=Path, help="folder of a capture; SCENE/masks is written")
     masks.add_argument(
         "--box",
@@ -363,13 +365,13 @@ def _add_masks(masks: argparse.ArgumentParser) -> None:
     masks.add_argument(
         "--steps",
         type=int,
-        default=standard.steps,
+        default=defaults.steps,
         help="training steps of the splats (default: %(default)s)",
     )
     masks.add_argument(
         "--splats",
         type=int,
-        default=standard.capacity,
+        default=defaults.capacity,
         metavar="N",
         help="largest number of splats (default: %(default)s)",
     )
@@ -384,17 +386,17 @@ def _add_masks(masks: argparse.ArgumentParser) -> None:
     masks.add_argument(
         "--seed",
         type=int,
-        default=standard.seed,
+        default=defaults.seed,
         help="seed of every random choice (default: %(default)s)",
     )
-    start = masks.add_mutually_exclusive_group()
-    start.add_argument(
+    start_group = masks.add_mutually_exclusive_group()
+    start_group.add_argument(
         "--resume",
         action="store_true",
         help="continue the training; if it is complete, only make the masks again, for example "
         "with another --box",
     )
-    start.add_argument(
+    start_group.add_argument(
         "--force", action="store_true", help="train anew; replace the splats and masks"
     )
 
@@ -463,13 +465,13 @@ def _add_cameras(parser: argparse.ArgumentParser, views: str | None) -> None:
 
 def _add_images(parser: argparse.ArgumentParser, aovs: list[str]) -> None:
     """Add options that choose the images to write."""
-    shown = " ".join(aovs) or "none"
+    default_names = " ".join(aovs) or "none"
     parser.add_argument(
         "--aovs",
         nargs="*",
         choices=AOVS,
         default=aovs,
-        help=f"further images to write; depth is written as EXR only (default: {shown})",
+        help=f"further images to write; depth is written as EXR only (default: {default_names})",
     )
     parser.add_argument(
         "--exr", action="store_true", help="also write every image as EXR, in linear floats"

@@ -91,7 +91,9 @@ def _poses(arguments: argparse.Namespace) -> None:
     if report.missing:
         print(f"without a camera, hence left out: {', '.join(report.missing)}")
     print(f"reprojection error: {report.error:.2f} pixels, {report.points} points")
-    print("time: " + ", ".join(f"{part} {s:.0f} s" for part, s in report.seconds.items()))
+    print(
+        "time: " + ", ".join(f"{part} {seconds:.0f} s" for part, seconds in report.seconds.items())
+    )
     print(f"model: {report.model}")
     print(
         f"next: masks of the object (docs/captures.md), then geosplat-jax train {arguments.folder}"
@@ -195,8 +197,8 @@ def _report(arguments: argparse.Namespace) -> None:
 
 def _write_json(path: Path, content: Any) -> None:
     """Write a JSON file atomically."""
-    with written_aside(path) as aside:
-        aside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    with written_aside(path) as temporary_path:
+        temporary_path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def _consistency(arguments: argparse.Namespace) -> None:
@@ -206,17 +208,17 @@ def _consistency(arguments: argparse.Namespace) -> None:
         raise UsageError(f"--size must be from 1 to {LARGEST_SIZE} pixels, got {size}")
     require_place(arguments.json, "--json")
     if subject.is_dir():
-        found = Run(subject, scene=arguments.scene).consistency(stage=arguments.stage, size=size)
+        figures = Run(subject, scene=arguments.scene).consistency(stage=arguments.stage, size=size)
     else:
-        found = _consistency_of_mesh(arguments)
-    print(f"angle between reflected directions        {found.reflection_deg:9.3f} degrees")
-    print(f"error of the distance / box diagonal      {found.distance:9.5f}")
-    print(f"pixels compared                           {found.pixels:9d}")
-    print(f"mesh pixels covered by less than half     {found.uncovered:9.2%}")
-    if found.behind:
-        print(f"mesh pixels seen from inside, left out    {found.behind:9.2%}")
+        figures = _consistency_of_mesh(arguments)
+    print(f"angle between reflected directions        {figures.reflection_deg:9.3f} degrees")
+    print(f"error of the distance / box diagonal      {figures.distance:9.5f}")
+    print(f"pixels compared                           {figures.pixels:9d}")
+    print(f"mesh pixels covered by less than half     {figures.uncovered:9.2%}")
+    if figures.behind:
+        print(f"mesh pixels seen from inside, left out    {figures.behind:9.2%}")
     if arguments.json is not None:
-        _write_json(arguments.json, asdict(found))
+        _write_json(arguments.json, asdict(figures))
 
 
 def _consistency_of_mesh(arguments: argparse.Namespace) -> Consistency:
@@ -244,7 +246,7 @@ def _relight(arguments: argparse.Namespace) -> None:
     _check_samples(arguments)
     cameras = _cameras_from(arguments)
     with WorkDisplay() as display:
-        written = Run(arguments.run, scene=arguments.scene).relight(
+        paths = Run(arguments.run, scene=arguments.scene).relight(
             arguments.env,
             arguments.output,
             options=RelightOptions(
@@ -262,7 +264,7 @@ def _relight(arguments: argparse.Namespace) -> None:
             indirect=arguments.indirect,
             on_progress=display,
         )
-    print(f"{len(written)} files: {written[0].parent}")
+    print(f"{len(paths)} files: {paths[0].parent}")
 
 
 def _cameras_from(arguments: argparse.Namespace, turntable: int = 0) -> Cameras:
@@ -287,15 +289,15 @@ def _render(arguments: argparse.Namespace) -> None:
     _check_samples(arguments)
     cameras, images = _cameras_from(arguments, arguments.turntable), _images_from(arguments)
     with WorkDisplay() as display:
-        written = Run(arguments.run, scene=arguments.scene).render(
+        paths = Run(arguments.run, scene=arguments.scene).render(
             output=arguments.output,
             cameras=cameras,
             images=images,
             samples=arguments.samples,
             on_progress=display,
         )
-    count = sum(path.name.endswith("_rgba.png") for path in written)
-    print(f"{count} views, {len(written)} files: {written[0].parent}")
+    count = sum(path.name.endswith("_rgba.png") for path in paths)
+    print(f"{count} views, {len(paths)} files: {paths[0].parent}")
 
 
 def _view(arguments: argparse.Namespace) -> None:
@@ -303,12 +305,12 @@ def _view(arguments: argparse.Namespace) -> None:
     viser_library()
     require_free_port(arguments.port)
     run = Run(arguments.run, scene=arguments.scene)
-    known, views = {}, None
+    scene_lights, views = {}, None
     try:
-        known, views = run.dataset.lights, run.dataset.train
+        scene_lights, views = run.dataset.lights, run.dataset.train
     except (RunError, SceneError) as error:
         say(f"without photographs: {error}", label="warning: ", style="yellow")
-    lights = load_lights(light_files(arguments.env), known)
+    lights = load_lights(light_files(arguments.env), scene_lights)
     viewer = Viewer(CheckpointWatch(run.folder), lights)
     server = ViewerServer(viewer, views, port=arguments.port)
     print(f"open {server.url} in a browser; Ctrl-C ends", flush=True)
@@ -320,9 +322,9 @@ def _refine_cameras(arguments: argparse.Namespace) -> None:
     """Refine the cameras of a run and print what changed."""
     require_place(arguments.output, "--output")
     run = Run(arguments.run, scene=arguments.scene)
-    how = CameraSettings(white_balance=arguments.white_balance)
-    refined = run.refine_cameras(arguments.output, how=how, on_view=say_refined)
-    for split, cameras in refined.items():
+    settings = CameraSettings(white_balance=arguments.white_balance)
+    refined_splits = run.refine_cameras(arguments.output, how=settings, on_view=say_refined)
+    for split, cameras in refined_splits.items():
         views = run.dataset.test if split == "test" else run.dataset.train
         for line in change_lines(views, cameras, run.dataset.bounds):
             print(f"{split}: {line}")
@@ -356,22 +358,22 @@ def _export(arguments: argparse.Namespace) -> None:
 def _gradcheck(arguments: argparse.Namespace) -> None:
     """Compare gradients with float64 differences and print the tables."""
     names = list(dict.fromkeys(arguments.stages)) or list(STAGES)
-    unknown = [name for name in names if name not in STAGES]
-    if unknown:
-        raise UsageError(f"unknown part {unknown[0]!r}; expected some of {', '.join(STAGES)}")
+    unknown_names = [name for name in names if name not in STAGES]
+    if unknown_names:
+        raise UsageError(f"unknown part {unknown_names[0]!r}; expected some of {', '.join(STAGES)}")
     require_place(arguments.json, "--json")
-    checked = {}
+    results = {}
     for name in names:
-        checked[name] = check_stage(name, seed=arguments.seed)
-        print(f"{table(checked[name], sweep=arguments.sweep)}\n", flush=True)
-    print(summary(checked))
+        results[name] = check_stage(name, seed=arguments.seed)
+        print(f"{table(results[name], sweep=arguments.sweep)}\n", flush=True)
+    print(summary(results))
     if arguments.json is not None:
-        _write_json(arguments.json, to_records(checked))
-    failed = [row for rows in checked.values() for row in rows if not passes(row)]
-    if failed:
+        _write_json(arguments.json, to_records(results))
+    failures = [row for rows in results.values() for row in rows if not passes(row)]
+    if failures:
         raise GradientError(
-            f"{len(failed)} comparisons exceed {TOLERANCE:g} (float64) or {SINGLE_TOLERANCE:g} "
-            f"(float32); the first: {failed[0].problem}, {failed[0].worst}"
+            f"{len(failures)} comparisons exceed {TOLERANCE:g} (float64) or {SINGLE_TOLERANCE:g} "
+            f"(float32); the first: {failures[0].problem}, {failures[0].worst}"
         )
 
 

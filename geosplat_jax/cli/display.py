@@ -81,13 +81,13 @@ class WorkDisplay:
     def __call__(self, part: str, done: int, total: int) -> None:
         """Show the progress of a part; see `poses.OnProgress`."""
         is_new = part not in self._times_left
-        left = self._times_left.setdefault(part, TimeLeft()).left(done, total)
+        seconds_left = self._times_left.setdefault(part, TimeLeft()).left(done, total)
         if done >= total:
             text = "done"
-        elif left is None:
+        elif seconds_left is None:
             text = "the first one compiles" if total > 1 else ""
         else:
-            text = f"{duration(left)} left"
+            text = f"{duration(seconds_left)} left"
         if self._bar is not None:
             if is_new:
                 self._tasks[part] = self._bar.add_task(part, total=total, left=text)
@@ -142,20 +142,22 @@ class ProgressDisplay(Listener):
     def on_compile(self, stage: str) -> None:
         """Say that the next step waits for a compilation, and how long this usually takes."""
         self._compiling = stage, time.perf_counter()
-        known = self._compile_seconds
-        usual = _USUAL_COMPILATION if known is None else f"the last took {duration(known)}"
+        seconds = self._compile_seconds
+        estimate = _USUAL_COMPILATION if seconds is None else f"the last took {duration(seconds)}"
         if self._bar is not None:
-            self._bar.update(self._task, stage=stage, left=f"compiling, {usual}")
+            self._bar.update(self._task, stage=stage, left=f"compiling, {estimate}")
         else:
-            say(f"compiling stage {stage}, {usual} ...")
+            say(f"compiling stage {stage}, {estimate} ...")
 
     def on_step(self, progress: StepProgress) -> None:
         """Display one step."""
         if self._compiling is not None:
             self._compile_seconds = time.perf_counter() - self._compiling[1]
             self._compiling = None
-        left = progress.seconds_left
-        remaining = "measuring the pace" if left is None else f"{duration(left)} left"
+        seconds_left = progress.seconds_left
+        time_text = (
+            "measuring the pace" if seconds_left is None else f"{duration(seconds_left)} left"
+        )
         if self._bar is not None:
             self._bar.update(
                 self._task,
@@ -165,18 +167,18 @@ class ProgressDisplay(Listener):
                 loss=progress.total,
                 psnr=progress.psnr,
                 splats=progress.splat_count,
-                left=remaining,
+                left=time_text,
             )
         elif progress.step % 50 == 0 or progress.step in (1, progress.steps):
             say(
                 f"{progress.stage}, step {progress.step}/{progress.steps}  "
                 f"loss {progress.total:.4f}  "
                 f"{progress.psnr:.2f} dB  {progress.splat_count:,} splats  "
-                f"{progress.seconds:.0f} s, {remaining}"
+                f"{progress.seconds:.0f} s, {time_text}"
             )
 
     def on_rung(self, rung: Rung) -> None:
         """Print the verdict on a part of the model, as soon as it is known."""
-        title, _, larger, gain, verdict = rung_row(asdict(rung))
-        measured = f"{larger}, gain {gain}: " if rung.found is not None else ""
-        say(f"model: {title}: {measured}{verdict}")
+        title, _, larger_psnr, gain, verdict = rung_row(asdict(rung))
+        gain_text = f"{larger_psnr}, gain {gain}: " if rung.found is not None else ""
+        say(f"model: {title}: {gain_text}{verdict}")

@@ -49,15 +49,15 @@ def _watch(receiver: socket.socket, has_returned: threading.Event, notice: _Noti
     respected.
     """
     with receiver:
-        was_told = False
-        while number := receiver.recv(1):
-            handler = signal.getsignal(number[0])
-            words = getattr(handler, "notice", None)
-            if handler is signal.default_int_handler or (words and was_told):
+        is_notified = False
+        while signal_byte := receiver.recv(1):
+            handler = signal.getsignal(signal_byte[0])
+            message = getattr(handler, "notice", None)
+            if handler is signal.default_int_handler or (message and is_notified):
                 break
-            if words:
-                print(words, file=sys.stderr, flush=True)
-                was_told = True
+            if message:
+                print(message, file=sys.stderr, flush=True)
+                is_notified = True
         else:
             return
         if has_returned.wait(_GRACE):
@@ -69,19 +69,19 @@ def _watch(receiver: socket.socket, has_returned: threading.Event, notice: _Noti
 @contextmanager
 def _heard_in_callbacks() -> Iterator[None]:
     """Send Ctrl-C again, silently, if a callback of a library has swallowed its exception."""
-    previous = sys.unraisablehook
+    previous_hook = sys.unraisablehook
 
     def hook(unraisable: Any) -> None:
         if issubclass(unraisable.exc_type, KeyboardInterrupt):
             threading.Timer(_AGAIN, os.kill, (os.getpid(), signal.SIGINT)).start()
         else:
-            previous(unraisable)
+            previous_hook(unraisable)
 
     sys.unraisablehook = hook
     try:
         yield
     finally:
-        sys.unraisablehook = previous
+        sys.unraisablehook = previous_hook
 
 
 @contextmanager
@@ -107,15 +107,15 @@ def stops_soon(*, with_process: bool) -> Iterator[Callable[[], None]]:
         return
     receiver, sender = socket.socketpair()
     sender.setblocking(False)
-    previous = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+    previous_descriptor = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
     has_returned = threading.Event()
-    watch = threading.Thread(target=_watch, args=(receiver, has_returned, notice), daemon=True)
-    watch.start()
+    thread = threading.Thread(target=_watch, args=(receiver, has_returned, notice), daemon=True)
+    thread.start()
     try:
         with _heard_in_callbacks():
             yield notice
     finally:
-        signal.set_wakeup_fd(previous)
+        signal.set_wakeup_fd(previous_descriptor)
         if not with_process:
             has_returned.set()
         elif not notice.was_given:

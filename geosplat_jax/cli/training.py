@@ -50,9 +50,9 @@ def require_place(file: Path | None, option: str) -> None:
         return
     if file.is_dir():
         raise UsageError(f"{option} needs a file, and {file} is a folder")
-    above = next(folder for folder in file.absolute().parents if folder.exists())
-    if not above.is_dir() or not os.access(above, os.W_OK):
-        raise UsageError(f"{option} {file}: nothing can be written in {above}")
+    parent = next(folder for folder in file.absolute().parents if folder.exists())
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        raise UsageError(f"{option} {file}: nothing can be written in {parent}")
 
 
 def scene_options(arguments: argparse.Namespace, config: Config) -> dict[str, Any]:
@@ -71,9 +71,9 @@ def scene_options(arguments: argparse.Namespace, config: Config) -> dict[str, An
         )
     corners = arguments.bounds
     reading = {**options, "bounds": None if corners is None else (corners[:3], corners[3:])}
-    chosen = choose_downscale(arguments.scene, cells, **reading)
-    say(chosen.reason)
-    return {**options, "downscale": chosen.factor}
+    choice = choose_downscale(arguments.scene, cells, **reading)
+    say(choice.reason)
+    return {**options, "downscale": choice.factor}
 
 
 def config_from(arguments: argparse.Namespace, mesh: MeshSettings | None = None) -> Config:
@@ -138,25 +138,25 @@ def _require_no_settings(
 
     ``but`` : an option that is accepted, because it agrees with the record.
     """
-    usual = command_line().parse_args(["train", str(arguments.scene)])
-    told = [
+    defaults = command_line().parse_args(["train", str(arguments.scene)])
+    explicit_options = [
         option
         for option, name in _SETTING_OPTIONS.items()
-        if option != but and getattr(arguments, name) != getattr(usual, name)
+        if option != but and getattr(arguments, name) != getattr(defaults, name)
     ]
-    if told:
+    if explicit_options:
         raise UsageError(
             f"--resume continues {folder} with the settings it was begun with; leave "
-            f"{', '.join(told)} out, or train anew into another --output"
+            f"{', '.join(explicit_options)} out, or train anew into another --output"
         )
 
 
 def _request_of(arguments: argparse.Namespace, folder: RunFolder) -> _Request:
     """Determine what to do from the options, or from the record of a run that is resumed."""
-    known = folder.budget() if arguments.resume and folder.exists else None
-    if known is not None:
-        asked, chooses_size = (arguments.budget, arguments.memory), arguments.downscale == "auto"
-        if asked not in ((None, None), (known.seconds, known.memory)):
+    recorded_budget = folder.budget() if arguments.resume and folder.exists else None
+    if recorded_budget is not None:
+        limits, chooses_size = (arguments.budget, arguments.memory), arguments.downscale == "auto"
+        if limits not in ((None, None), (recorded_budget.seconds, recorded_budget.memory)):
             raise UsageError(
                 f"--resume keeps the budget that {folder} was begun with; leave --budget and "
                 "--memory out"
@@ -164,7 +164,7 @@ def _request_of(arguments: argparse.Namespace, folder: RunFolder) -> _Request:
         _require_no_settings(arguments, folder, but="--downscale" if chooses_size else None)
         # The settings of the run were chosen for the budget, and have been adapted since.
         reading = folder.record()["dataset"]
-        return _Request(folder.config(), reading, known, goes_on=True)
+        return _Request(folder.config(), reading, recorded_budget, goes_on=True)
     if arguments.resume and folder.exists and arguments.budget is not None:
         raise UsageError(f"{folder} was begun without a budget; leave --budget out")
     if arguments.resume and folder.has_chosen_model:
@@ -203,17 +203,17 @@ def _request_of(arguments: argparse.Namespace, folder: RunFolder) -> _Request:
 
 def _refined_cameras(arguments: argparse.Namespace, folder: Path, reading: dict[str, Any]) -> Path:
     """Refine the cameras before the training itself; return and print the file of cameras."""
-    draft = round_config(arguments.material_prior, seed=arguments.seed)
+    draft_config = round_config(arguments.material_prior, seed=arguments.seed)
     say(
         "cameras first: a short training at quality draft, with half the split-sum steps and no "
         "free splats"
     )
-    with ProgressDisplay(draft.total_steps) as display:
+    with ProgressDisplay(draft_config.total_steps) as display:
         cameras = refined_cameras(
             arguments.scene,
             folder,
             rounds=arguments.refine_cameras,
-            config=draft,
+            config=draft_config,
             reading=reading,
             how=CameraSettings(white_balance=arguments.white_balance),
             replace=arguments.force,
@@ -240,9 +240,9 @@ def _say_model(record: Mapping[str, Any] | None) -> None:
 
 
 @contextmanager
-def _events(wanted: bool, folder: Path) -> Iterator[Listener]:
+def _events(is_enabled: bool, folder: Path) -> Iterator[Listener]:
     """Yield a listener that writes event files during a training, if they are wanted."""
-    if not wanted:
+    if not is_enabled:
         yield NOBODY
         return
     log = EventLog(RunFolder(folder))
@@ -259,13 +259,13 @@ def _table(path: Path | None, folder: Path) -> Iterator[None]:
     A command that is refused has made no step, and does not change the file.
     """
     steps = RunFolder(folder)
-    before = _state_of(steps.metrics)
-    ended = False
+    initial_state = _state_of(steps.metrics)
+    has_ended = False
     try:
         yield
-        ended = True
+        has_ended = True
     finally:
-        has_steps = ended or _state_of(steps.metrics) != before
+        has_steps = has_ended or _state_of(steps.metrics) != initial_state
         if path is not None and has_steps and steps.exists:
             steps.write_csv(path)
 
@@ -287,14 +287,14 @@ def begin_from(arguments: argparse.Namespace) -> Begin:
 
 def _devices(arguments: argparse.Namespace) -> Devices:
     """Return the devices that the options ask for; must come before any other use of JAX."""
-    told = arguments.host is not None, arguments.coordinator is not None
-    if arguments.hosts is None and any(told):
+    has_value = arguments.host is not None, arguments.coordinator is not None
+    if arguments.hosts is None and any(has_value):
         raise UsageError("--host and --coordinator belong to --hosts")
     if arguments.hosts is not None:
-        if arguments.hosts != "auto" and not all(told):
+        if arguments.hosts != "auto" and not all(has_value):
             raise UsageError("--hosts N needs --host K and --coordinator ADDRESS:PORT")
-        of_one_host = (arguments.budget, arguments.refine_cameras, arguments.model)
-        if any(value is not None for value in of_one_host):
+        single_host_options = (arguments.budget, arguments.refine_cameras, arguments.model)
+        if any(value is not None for value in single_host_options):
             raise UsageError(
                 "--hosts makes a single training with the settings that are given; leave --budget, "
                 "--refine-cameras and --model out"
@@ -316,7 +316,7 @@ def _idle(devices: Devices, config: Config) -> list[str]:
 
 def train(arguments: argparse.Namespace) -> None:
     """Train a scene into a run's folder, with progress on the terminal."""
-    began = time.perf_counter()
+    start_time = time.perf_counter()
     if (arguments.source is None) != (arguments.stage is None):
         raise UsageError("--from RUN and --stage NAME belong together")
     if arguments.refine_cameras is not None and (arguments.budget or arguments.source):
@@ -331,18 +331,18 @@ def train(arguments: argparse.Namespace) -> None:
     folder = arguments.output or Path("runs") / arguments.scene.resolve().name
     request = _request_of(arguments, RunFolder(folder))
     config, reading = request.config, dict(request.reading)
-    begun = RunFolder(folder)
-    if arguments.refine_cameras is not None and arguments.resume and begun.exists:
-        if not begun.record()["dataset"].get("cameras"):
+    run_folder = RunFolder(folder)
+    if arguments.refine_cameras is not None and arguments.resume and run_folder.exists:
+        if not run_folder.record()["dataset"].get("cameras"):
             raise UsageError(f"{folder} was begun without --refine-cameras; leave it out")
     # The record of a resumed run names its refined cameras already.
     if arguments.refine_cameras is not None and not request.goes_on:
         if not arguments.resume:
-            begun.require_free(replace=arguments.force)
+            run_folder.require_free(replace=arguments.force)
         reading["cameras"] = _refined_cameras(arguments, folder, reading)
     dataset = load_recorded(arguments.scene, reading)
-    if arguments.resume and begun.exists:
-        notes = begun.record().get("notes", dataset.notes)
+    if arguments.resume and run_folder.exists:
+        notes = run_folder.record().get("notes", dataset.notes)
     else:
         notes = (*dataset.notes, *config.geometry.notes(dataset))
     for note in notes:
@@ -354,7 +354,7 @@ def train(arguments: argparse.Namespace) -> None:
     with (
         ProgressDisplay(config.total_steps) as display,
         _table(arguments.csv if devices.is_first_host else None, folder),
-        _events(arguments.tensorboard and devices.is_first_host, folder) as events,
+        _events(arguments.tensorboard and devices.is_first_host, folder) as event_listener,
     ):
         run = train_run(
             dataset,
@@ -362,10 +362,10 @@ def train(arguments: argparse.Namespace) -> None:
             config,
             begin=begin_from(arguments),
             budget=request.budget,
-            began=began if request.budget is not None else None,
+            began=start_time if request.budget is not None else None,
             model=request.model,
             devices=devices,
-            listener=Listeners(display, events),
+            listener=Listeners(display, event_listener),
         )
     if not devices.is_first_host:
         return

@@ -49,7 +49,7 @@ class Capacities(Mapping[str, int]):
         return dict(self._sizes).get(name, UNSIZED)
 
     def __contains__(self, name: object) -> bool:
-        return any(name == sized for sized, _ in self._sizes)
+        return any(name == buffer_name for buffer_name, _ in self._sizes)
 
     def __iter__(self) -> Iterator[str]:
         return (name for name, _ in self._sizes)
@@ -130,9 +130,9 @@ def shrink(capacities: Capacities, needed: Counts, *, headroom: float = 1.25) ->
     """
     smaller = {}
     for name, count in needed.items():
-        have, need = capacities[name], int(count)
+        capacity, need = capacities[name], int(count)
         size = bucket(int(need * headroom))
-        if need < _SHRINK_BELOW * have and size < have:
+        if need < _SHRINK_BELOW * capacity and size < capacity:
             smaller[name] = size
     return capacities.resized(**smaller)
 
@@ -197,8 +197,8 @@ def compact(
     size = mask.shape[0]
     count = position[-1] + 1 if size else jnp.zeros((), jnp.int32)
     target = jnp.where(mask, position, capacity)
-    empty = jnp.full((capacity,), size, jnp.int32)
-    index = empty.at[target].set(jnp.arange(size, dtype=jnp.int32), mode="drop")
+    padding = jnp.full((capacity,), size, jnp.int32)
+    index = padding.at[target].set(jnp.arange(size, dtype=jnp.int32), mode="drop")
     return index, count
 
 
@@ -225,29 +225,29 @@ class BitSet(eqx.Module):
 
     def first(self, *, capacity: int) -> Int[Array, " capacity"]:
         """Find the indices of the first true entries, in order; rows past the count are 0."""
-        wanted = jnp.arange(capacity, dtype=jnp.int32)
-        word = jnp.searchsorted(self.before, wanted, side="right").astype(jnp.int32) - 1
-        bits, rest = self.words[word], wanted - self.before[word]
+        ranks = jnp.arange(capacity, dtype=jnp.int32)
+        word = jnp.searchsorted(self.before, ranks, side="right").astype(jnp.int32) - 1
+        bits, local_rank = self.words[word], ranks - self.before[word]
         position = 32 * word
         for width in (16, 8, 4, 2, 1):
-            lower = _popcount(bits & jnp.uint32((1 << width) - 1))
-            is_above = rest >= lower
-            rest = jnp.where(is_above, rest - lower, rest)
+            lower_count = _popcount(bits & jnp.uint32((1 << width) - 1))
+            is_above = local_rank >= lower_count
+            local_rank = jnp.where(is_above, local_rank - lower_count, local_rank)
             bits = jnp.where(is_above, bits >> width, bits)
             position = jnp.where(is_above, position + width, position)
-        return jnp.where(wanted < self.count, position, 0)
+        return jnp.where(ranks < self.count, position, 0)
 
     def rank(self, index: Int[Array, "..."]) -> Int[Array, "..."]:
         """Count the true entries before each index: the row of a true entry in `first`."""
         word, bit = index >> 5, (index & 31).astype(jnp.uint32)
-        below = (jnp.uint32(1) << bit) - jnp.uint32(1)
-        return self.before[word] + _popcount(self.words[word] & below)
+        lower_bits = (jnp.uint32(1) << bit) - jnp.uint32(1)
+        return self.before[word] + _popcount(self.words[word] & lower_bits)
 
 
 def bit_set(mask: Bool[Array, " n"]) -> BitSet:
     """Pack a mask of any length; entries past its end are false."""
     bits = jnp.pad(mask, (0, -mask.shape[0] % 32)).reshape(-1, 32).astype(jnp.uint32)
     words = jnp.sum(bits << jnp.arange(32, dtype=jnp.uint32)[None, :], axis=1, dtype=jnp.uint32)
-    through = jnp.cumsum(_popcount(words), dtype=jnp.int32)
-    count = through[-1] if through.size else jnp.zeros((), through.dtype)
-    return BitSet(words=words, before=through - _popcount(words), count=count)
+    running_sum = jnp.cumsum(_popcount(words), dtype=jnp.int32)
+    count = running_sum[-1] if running_sum.size else jnp.zeros((), running_sum.dtype)
+    return BitSet(words=words, before=running_sum - _popcount(words), count=count)

@@ -67,17 +67,17 @@ def closest_on_faces(
     corners = corners - margin * (corners - jnp.mean(corners, axis=1, keepdims=True))
     edges = jnp.roll(corners, -1, axis=1) - corners
     normals = safe_normalize(jnp.cross(edges[:, 0], edges[:, 1], axis=0), axis=0)
-    away = points.T[:, None, :] - corners
-    projected = points.T - jnp.sum(away[:, 0] * normals, axis=0, keepdims=True) * normals
-    inwards = jnp.cross(normals[:, None, :], edges, axis=0)
-    is_within = jnp.all(jnp.sum(inwards * away, axis=0) >= 0.0, axis=0)
+    offsets = points.T[:, None, :] - corners
+    projected = points.T - jnp.sum(offsets[:, 0] * normals, axis=0, keepdims=True) * normals
+    inward_normals = jnp.cross(normals[:, None, :], edges, axis=0)
+    is_within = jnp.all(jnp.sum(inward_normals * offsets, axis=0) >= 0.0, axis=0)
     is_within &= jnp.any(normals != 0.0, axis=0)  # a face without area has only edges
-    part = safe_divide(jnp.sum(away * edges, axis=0), jnp.sum(edges * edges, axis=0))
-    on_edges = corners + jnp.clip(part, 0.0, 1.0)[None] * edges
-    first, second, third = jnp.sum((points.T[:, None, :] - on_edges) ** 2, axis=0)
-    nearest = jnp.where((second < first)[None], on_edges[:, 1], on_edges[:, 0])
+    fractions = safe_divide(jnp.sum(offsets * edges, axis=0), jnp.sum(edges * edges, axis=0))
+    edge_points = corners + jnp.clip(fractions, 0.0, 1.0)[None] * edges
+    first, second, third = jnp.sum((points.T[:, None, :] - edge_points) ** 2, axis=0)
+    nearest = jnp.where((second < first)[None], edge_points[:, 1], edge_points[:, 0])
     is_third = third < jnp.minimum(first, second)
-    nearest = jnp.where(is_third[None], on_edges[:, 2], nearest)
+    nearest = jnp.where(is_third[None], edge_points[:, 2], nearest)
     return jnp.where(is_within[None], projected, nearest).T
 
 

@@ -45,9 +45,9 @@ def safe_divide(
 
     Finite wherever the quotient and the derivatives ``1 / d`` and ``n / d^2`` are representable.
     """
-    usable = jnp.abs(denominator) >= smallest
-    quotient = _divide(numerator, jnp.where(usable, denominator, 1.0))
-    return jnp.where(usable, quotient, otherwise)
+    is_usable = jnp.abs(denominator) >= smallest
+    quotient = _divide(numerator, jnp.where(is_usable, denominator, 1.0))
+    return jnp.where(is_usable, quotient, otherwise)
 
 
 def absolute(x: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -61,8 +61,8 @@ def absolute(x: Float[Array, "..."]) -> Float[Array, "..."]:
 
 def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """Square root of the positive part; zero with zero gradient where ``x <= 0``."""
-    positive = x > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+    is_positive = x > 0
+    return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, x, 1.0)), 0.0)
 
 
 def safe_power(x: Float[Array, "..."], exponent: float) -> Float[Array, "..."]:
@@ -73,8 +73,8 @@ def safe_power(x: Float[Array, "..."], exponent: float) -> Float[Array, "..."]:
     """
     if exponent == 0.0:
         return jnp.ones_like(x)
-    positive = x > 0
-    return jnp.where(positive, jnp.where(positive, x, 1.0) ** exponent, 0.0)
+    is_positive = x > 0
+    return jnp.where(is_positive, jnp.where(is_positive, x, 1.0) ** exponent, 0.0)
 
 
 def safe_log(x: Float[Array, "..."], *, smallest: float = LENGTH_EPSILON) -> Float[Array, "..."]:

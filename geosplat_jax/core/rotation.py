@@ -49,9 +49,9 @@ def rotation_vector_to_matrix(vector: Float[Array, " 3"]) -> Float[Array, "3 3"]
     second = jnp.where(is_small, 0.5 - squared / 24 + squared**2 / 720, 2 * half * half)
     x, y, z = vector
     zero = jnp.zeros_like(x)
-    cross = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+    skew = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
     identity = jnp.eye(3, dtype=vector.dtype)
-    return identity + first * cross + second * jnp.matmul(cross, cross, precision="highest")
+    return identity + first * skew + second * jnp.matmul(skew, skew, precision="highest")
 
 
 def axes_to_quaternion(
@@ -77,14 +77,14 @@ def axes_to_quaternion(
         (wy, xy, squares[2], yz),
         (wz, xz, yz, squares[3]),
     )
-    best, chosen = squares[0], candidates[0]
+    largest_square, quaternion = squares[0], candidates[0]
     for square, candidate in zip(squares[1:], candidates[1:], strict=True):
-        is_better = square > best
-        best = jnp.where(is_better, square, best)
-        chosen = tuple(
-            jnp.where(is_better, new, old) for new, old in zip(candidate, chosen, strict=True)
+        is_better = square > largest_square
+        largest_square = jnp.where(is_better, square, largest_square)
+        quaternion = tuple(
+            jnp.where(is_better, new, old) for new, old in zip(candidate, quaternion, strict=True)
         )
-    return safe_normalize(jnp.stack(chosen), axis=0)
+    return safe_normalize(jnp.stack(quaternion), axis=0)
 
 
 def matrix_to_quaternion(matrices: Float[Array, "... 3 3"]) -> Float[Array, "... 4"]:

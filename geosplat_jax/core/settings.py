@@ -103,18 +103,18 @@ def settings(kind: type[_Class]) -> type[_Class]:
 
     Making an instance raises `ValueError` with one line for each value that is wrong.
     """
-    made: Any = _checked_dataclass(frozen=True, config=_CONFIG)(kind)
-    check, names = made.__init__, [field.name for field in fields(made)]
+    checked_class: Any = _checked_dataclass(frozen=True, config=_CONFIG)(kind)
+    initializer, names = checked_class.__init__, [field.name for field in fields(checked_class)]
 
-    @wraps(check)
+    @wraps(initializer)
     def checked(self: Any, *values: Any, **named: Any) -> None:
         try:
-            check(self, *values, **named)
+            initializer(self, *values, **named)
         except ValidationError as error:
             raise ValueError(_problems(error, kind.__name__, names)) from None
 
-    made.__init__ = checked
-    return made
+    checked_class.__init__ = checked
+    return checked_class
 
 
 class Variant:
@@ -140,12 +140,12 @@ class _AnyKind:
         def choose(value: Any, check: Callable[[Any], Any]) -> Any:
             if isinstance(value, base) or not isinstance(value, dict):
                 return check(value)
-            rest = dict(value)
-            kind = rest.pop("kind", None)
+            plain_fields = dict(value)
+            kind = plain_fields.pop("kind", None)
             if not isinstance(kind, str) or kind not in base.kinds:
                 raise ValueError(f"kind must be one of {sorted(base.kinds)}, got {kind!r}")
             try:
-                return from_plain(base.kinds[kind], rest, _HERE)
+                return from_plain(base.kinds[kind], plain_fields, _HERE)
             except ValueError as error:
                 raise PydanticCustomError(_NESTED, "{text}", {"text": str(error)}) from None
 
@@ -208,10 +208,10 @@ def _problems(error: ValidationError, where: str, names: Sequence[str] = ()) -> 
 
 def _lines(detail: Any, where: str, names: Sequence[str]) -> list[str]:
     """Describe one error of pydantic; an error about a `Variant` may take several lines."""
-    place = list(detail["loc"])
-    if place and isinstance(place[0], int) and place[0] < len(names):
-        place[0] = names[place[0]]
-    path = ".".join(filter(None, [where, *map(str, place)]))
+    location = list(detail["loc"])
+    if location and isinstance(location[0], int) and location[0] < len(names):
+        location[0] = names[location[0]]
+    path = ".".join(filter(None, [where, *map(str, location)]))
     if detail["type"] == "unexpected_keyword_argument":
         return [f"unknown setting {path}"]
     if detail["type"] == _NESTED:
@@ -251,8 +251,8 @@ def listed(value: Any, where: str = "") -> Iterator[tuple[str, Any, str, str]]:
         if is_dataclass(item) or (isinstance(item, dict) and item):
             yield from listed(item, f"{path}.")
         elif isinstance(item, tuple) and item and hasattr(item[0], "name"):
-            for part in item:
-                yield from listed(part, f"{path}.{part.name}.")
+            for entry in item:
+                yield from listed(entry, f"{path}.{entry.name}.")
         else:
             yield path, to_plain(item), _range(field), _meaning(type(value), name)
 
@@ -271,14 +271,14 @@ _LIMITS = ((">=", Ge, "ge"), (">", Gt, "gt"), ("<=", Le, "le"), ("<", Lt, "lt"))
 
 def _range(field: Any) -> str:
     """Write the limits of a field, and whether it may have no value."""
-    parts = get_args(field.annotation)
-    marks = [mark for part in parts for mark in getattr(part, "__metadata__", ())]
-    inner = [limit for mark in marks for limit in getattr(mark, "metadata", ())]
-    written = [
+    members = get_args(field.annotation)
+    marks = [mark for member in members for mark in getattr(member, "__metadata__", ())]
+    inner_limits = [limit for mark in marks for limit in getattr(mark, "metadata", ())]
+    limits = [
         f"{sign} {getattr(limit, name)}"
-        for limit in (*field.metadata, *inner)
+        for limit in (*field.metadata, *inner_limits)
         for sign, kind, name in _LIMITS
         if isinstance(limit, kind)
     ]
-    alternatives = [", ".join(written)] + [NONE] * (type(None) in parts)
+    alternatives = [", ".join(limits)] + [NONE] * (type(None) in members)
     return " or ".join(filter(None, alternatives))

@@ -71,10 +71,10 @@ _blur.defvjp(_blur_forward, _blur_backward)
 
 def _pad_to_window(image: Float[Array, "H W C"]) -> Float[Array, "H2 W2 C"]:
     """Replicate the last row and column until one window fits."""
-    missing = [max(0, WINDOW_SIZE - size) for size in image.shape[:2]]
-    if not any(missing):
+    padding = [max(0, WINDOW_SIZE - size) for size in image.shape[:2]]
+    if not any(padding):
         return image
-    return jnp.pad(image, ((0, missing[0]), (0, missing[1]), (0, 0)), mode="edge")
+    return jnp.pad(image, ((0, padding[0]), (0, padding[1]), (0, 0)), mode="edge")
 
 
 def ssim(
@@ -132,6 +132,6 @@ def ssim(
     counts = jax.lax.reduce_window(
         jax.lax.stop_gradient(counts), 1.0, jax.lax.min, window, (1, 1), "valid"
     )
-    unlike = (1.0 - similarity / divisor).reshape(*counts.shape, channels)
-    total = jnp.sum(unlike * counts[..., None])
+    dissimilarity = (1.0 - similarity / divisor).reshape(*counts.shape, channels)
+    total = jnp.sum(dissimilarity * counts[..., None])
     return 1.0 - safe_divide(total, channels * jnp.sum(counts))

@@ -78,11 +78,11 @@ def zero_gradient(gradient: Any, groups: tuple[str, ...]) -> Any:
 def _replaced(params: Any, groups: tuple[str, ...], change: Callable[[Array], Array]) -> Any:
     """Apply ``change`` to the leaves of some groups."""
     leaves, structure = jax.tree.flatten(params)
-    changed = [
+    new_leaves = [
         change(leaf) if name in groups else leaf
         for leaf, name in zip(leaves, rate_groups(params), strict=True)
     ]
-    return jax.tree.unflatten(structure, changed)
+    return jax.tree.unflatten(structure, new_leaves)
 
 
 class Camera(eqx.Module):
@@ -113,8 +113,8 @@ class Camera(eqx.Module):
 
     def view(self, number: int) -> "Camera":
         """Return the camera of a single view."""
-        one = slice(number, number + 1)
-        pose, intrinsics = self.world_to_camera[one], self.intrinsics[one]
+        view_slice = slice(number, number + 1)
+        pose, intrinsics = self.world_to_camera[view_slice], self.intrinsics[view_slice]
         return Camera(pose, intrinsics, self.height, self.width)
 
 
@@ -146,8 +146,8 @@ class Batch(eqx.Module):
         if self.valid is None:
             count = self.image.shape[0]
             return jnp.full((count,), 1.0 / count, self.image.dtype)
-        counted = jnp.sum(self.valid, axis=(1, 2))
-        return safe_divide(counted, jnp.sum(counted))
+        pixel_counts = jnp.sum(self.valid, axis=(1, 2))
+        return safe_divide(pixel_counts, jnp.sum(pixel_counts))
 
     @property
     def count(self) -> int:
@@ -328,8 +328,8 @@ class Splats(eqx.Module):
 
     def points(self, mask: Bool[Array, " N"] | None = None) -> SurfacePoints:
         """Return the splats as points to shade: all of them, or those of a mask."""
-        chosen = self.mask if mask is None else self.mask & mask
-        return SurfacePoints(self.anchors, self.normals, self.outward, self.parents, chosen)
+        point_mask = self.mask if mask is None else self.mask & mask
+        return SurfacePoints(self.anchors, self.normals, self.outward, self.parents, point_mask)
 
 
 class Materials(eqx.Module):

@@ -108,9 +108,9 @@ class TakeOver(Begin):
 
         See `Begin.first_loop`; the scene of the other run must be ``dataset``.
         """
-        other = RunFolder(self.source)
-        other.require_same_scene(dataset)
-        return adopted_loop(dataset, config, run, other, self.first_stage, devices)
+        source_run = RunFolder(self.source)
+        source_run.require_same_scene(dataset)
+        return adopted_loop(dataset, config, run, source_run, self.first_stage, devices)
 
 
 ANEW = Anew()

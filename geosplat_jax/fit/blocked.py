@@ -24,16 +24,16 @@ def _share(
     index = model.ray_index(surface, capacities=capacities)
     mesh = surface.mesh
     normals, areas = face_normals_and_areas(mesh)
-    middles = jnp.mean(mesh.vertices[mesh.faces], axis=1)
+    centroids = jnp.mean(mesh.vertices[mesh.faces], axis=1)
     count = mesh.faces.shape[0]
     # A unit normal plus a uniform unit vector has a direction whose density is proportional to the
     # cosine.
-    around = safe_normalize(jax.random.normal(key, (_RAYS, count, 3)))
-    directions = safe_normalize(normals[None] + around)
+    sphere_samples = safe_normalize(jax.random.normal(key, (_RAYS, count, 3)))
+    directions = safe_normalize(normals[None] + sphere_samples)
     is_used = jnp.broadcast_to(mesh.face_mask & (areas > 0.0), (_RAYS, count))
     is_used = is_used & (jnp.sum(directions * normals[None], axis=-1) > 0.0)
     is_blocked = index.occluded(
-        jnp.broadcast_to(middles, directions.shape).reshape(-1, 3),
+        jnp.broadcast_to(centroids, directions.shape).reshape(-1, 3),
         directions.reshape(-1, 3),
         jnp.broadcast_to(jnp.arange(count, dtype=jnp.int32), is_used.shape).reshape(-1),
         is_used.reshape(-1),

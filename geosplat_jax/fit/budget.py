@@ -128,10 +128,12 @@ class Plan:
             f"({self.costs[stage.name].step:.2f} s each)"
             for stage in self.config.active_stages
         )
-        left_out = [stage.name for stage in self.config.stages if not stage.steps]
-        place = _place(self.effort) + (f", without {' and '.join(left_out)}" if left_out else "")
-        along = self.config.geometry.cells_along
-        cells = "" if along is None else f"{along} cells, "
+        skipped_names = [stage.name for stage in self.config.stages if not stage.steps]
+        place = _place(self.effort) + (
+            f", without {' and '.join(skipped_names)}" if skipped_names else ""
+        )
+        cell_count = self.config.geometry.cells_along
+        cells = "" if cell_count is None else f"{cell_count} cells, "
         size = "in full size" if self.downscale == 1 else f"reduced by {self.downscale}"
         return [
             f"budget: {place}; {cells}photographs {size}",
@@ -142,11 +144,11 @@ class Plan:
 
 def _place(effort: float) -> str:
     """Say where an effort lies."""
-    below = min(int(effort), len(QUALITIES) - 2)
-    share = effort - below
+    level = min(int(effort), len(QUALITIES) - 2)
+    share = effort - level
     if share in (0.0, 1.0):
-        return f"as much as quality {QUALITIES[below + int(share)]}"
-    return f"{share:.0%} of the way from quality {QUALITIES[below]} to {QUALITIES[below + 1]}"
+        return f"as much as quality {QUALITIES[level + int(share)]}"
+    return f"{share:.0%} of the way from quality {QUALITIES[level]} to {QUALITIES[level + 1]}"
 
 
 def plan(
@@ -198,26 +200,30 @@ def plan(
             f"about {candidates[0].memory / 1e9:.1f} GB are the least that a training takes, "
             f"more than --memory allows ({budget.memory / 1e9:.1f} GB)"
         )
-    limits = [most for most in (budget.memory, _memory_here()) if most is not None]
+    limits = [limit for limit in (budget.memory, _memory_here()) if limit is not None]
     # Expectations may be wrong: the smallest settings are tried even where they should not fit.
-    fitting = [one for one in candidates if one.memory <= min(limits, default=math.inf)]
-    candidates = fitting or candidates[:1]
-    affordable = [one for one in candidates if one.seconds <= budget.seconds]
+    feasible = [
+        candidate for candidate in candidates if candidate.memory <= min(limits, default=math.inf)
+    ]
+    candidates = feasible or candidates[:1]
+    affordable = [candidate for candidate in candidates if candidate.seconds <= budget.seconds]
     if not affordable and not _asks_for_more(overrides, candidates[0].config):
-        candidates = [_first_stage_alone(one) for one in candidates]
-        affordable = [one for one in candidates if one.seconds <= budget.seconds]
-    chosen = affordable[-1] if affordable else candidates[0]
-    waits = sum(cost.startup for cost in chosen.costs.values())
-    share = (budget.seconds - waits) / (chosen.seconds - waits)
+        candidates = [_first_stage_alone(candidate) for candidate in candidates]
+        affordable = [candidate for candidate in candidates if candidate.seconds <= budget.seconds]
+    base_plan = affordable[-1] if affordable else candidates[0]
+    startup_seconds = sum(cost.startup for cost in base_plan.costs.values())
+    share = (budget.seconds - startup_seconds) / (base_plan.seconds - startup_seconds)
     # Other work on this machine may end: a budget is refused only if idle cores cannot meet it.
-    least = (waits + _SHORTEST * (chosen.seconds - waits)) / max(slowness, 1.0)
-    if budget.seconds < least:
+    least_seconds = (startup_seconds + _SHORTEST * (base_plan.seconds - startup_seconds)) / max(
+        slowness, 1.0
+    )
+    if budget.seconds < least_seconds:
         raise TrainingError(
             f"a budget of {budget.seconds:.0f} s is too short: compilation included, a training "
-            f"takes at least about {least:.0f} s on idle cores"
+            f"takes at least about {least_seconds:.0f} s on idle cores"
         )
-    config = with_steps(chosen.config, min(max(share, _SHORTEST), _LONGEST))
-    return replace(chosen, config=config, seconds=expected_seconds(config, chosen.costs))
+    config = with_steps(base_plan.config, min(max(share, _SHORTEST), _LONGEST))
+    return replace(base_plan, config=config, seconds=expected_seconds(config, base_plan.costs))
 
 
 def _memory_here() -> int | None:
@@ -262,17 +268,17 @@ def _asks_for_more(overrides: Sequence[str], config: Config) -> bool:
     return any(text.startswith(later) for text in overrides)
 
 
-def _first_stage_alone(chosen: Plan) -> Plan:
+def _first_stage_alone(candidate: Plan) -> Plan:
     """Leave all stages out but the first."""
-    first = chosen.config.active_stages[0]
-    config = _without(chosen.config, chosen.config.active_stages[1:])
-    costs = {first.name: chosen.costs[first.name]}
-    return replace(chosen, config=config, costs=costs, seconds=expected_seconds(config, costs))
+    first_stage = candidate.config.active_stages[0]
+    config = _without(candidate.config, candidate.config.active_stages[1:])
+    costs = {first_stage.name: candidate.costs[first_stage.name]}
+    return replace(candidate, config=config, costs=costs, seconds=expected_seconds(config, costs))
 
 
-def _without(config: Config, left_out: Sequence[Stage]) -> Config:
+def _without(config: Config, skipped_stages: Sequence[Stage]) -> Config:
     """Leave some stages out, by setting their steps to 0."""
-    names = {stage.name for stage in left_out}
+    names = {stage.name for stage in skipped_stages}
     stages = (replace(s, steps=0, pace=()) if s.name in names else s for s in config.stages)
     return replace(config, stages=tuple(stages))
 
@@ -289,18 +295,18 @@ def _scaled(
 
     ``fewest``, ``most`` : limits of the steps of the whole stage.
     """
-    left = stage.steps - done
-    if left <= 0:
+    steps_left = stage.steps - done
+    if steps_left <= 0:
         return stage
-    remaining = round(share * left)
+    new_steps_left = round(share * steps_left)
     if most is not None:
-        remaining = min(remaining, most - done)
-    remaining = max(remaining, min(fewest - done, left), 1)
-    if remaining == left:
+        new_steps_left = min(new_steps_left, most - done)
+    new_steps_left = max(new_steps_left, min(fewest - done, steps_left), 1)
+    if new_steps_left == steps_left:
         return stage
-    speed = (stage.position(stage.steps) - stage.position(done)) / remaining
+    speed = (stage.position(stage.steps) - stage.position(done)) / new_steps_left
     pace = (*(change for change in stage.pace if change.step < done), Pace(done, speed))
-    return replace(stage, steps=done + remaining, pace=pace)
+    return replace(stage, steps=done + new_steps_left, pace=pace)
 
 
 def _length(stage: Stage) -> float:
@@ -359,26 +365,28 @@ class Pacer:
         """
         if done % _EVERY or len(self._measured.get(stage.name, ())) < _TIMED:
             return None
-        left = stage.steps - done
-        if left <= _EVERY:
+        steps_left = stage.steps - done
+        if steps_left <= _EVERY:
             return None
-        here = config.stage_names.index(stage.name)
-        later = [other for other in self._planned.stages[here + 1 :] if other.steps]
+        stage_index = config.stage_names.index(stage.name)
+        later = [other for other in self._planned.stages[stage_index + 1 :] if other.steps]
         ahead = _length(stage) - stage.position(done)
-        in_use = {other.name for other in config.stages[here + 1 :] if other.steps}
+        active_names = {other.name for other in config.stages[stage_index + 1 :] if other.steps}
         share = self._share(stage, ahead, later)
-        while left_out := self._too_short(later, share, in_use):
-            later = [other for other in later if other not in left_out]
+        while short_stages := self._too_short(later, share, active_names):
+            later = [other for other in later if other not in short_stages]
             share = self._share(stage, ahead, later)
-        is_same = in_use == {other.name for other in later}
-        if is_same and abs(share * ahead / left - 1.0) <= _TOLERANCE:
+        is_same = active_names == {other.name for other in later}
+        if is_same and abs(share * ahead / steps_left - 1.0) <= _TOLERANCE:
             return None
-        changed = {stage.name: self._scaled(stage, done, share * ahead)}
-        changed |= {other.name: self._scaled(other, 0, share * _length(other)) for other in later}
-        behind = _without(config, config.stages[here + 1 :])
-        stages = tuple(changed.get(other.name, other) for other in behind.stages)
-        adjusted = replace(config, stages=stages)
-        return None if adjusted == config else adjusted
+        retimed_stages = {stage.name: self._scaled(stage, done, share * ahead)}
+        retimed_stages |= {
+            other.name: self._scaled(other, 0, share * _length(other)) for other in later
+        }
+        trimmed_config = _without(config, config.stages[stage_index + 1 :])
+        stages = tuple(retimed_stages.get(other.name, other) for other in trimmed_config.stages)
+        adjusted_config = replace(config, stages=stages)
+        return None if adjusted_config == config else adjusted_config
 
     def _share(self, stage: Stage, ahead: float, later: Sequence[Stage]) -> float:
         """Return the ratio of the time left to the time that the rest of the plan would take.
@@ -388,31 +396,33 @@ class Pacer:
         ``ahead`` : what is left of the schedules of ``stage``, in planned steps. ``later`` : stages
         to come, as planned.
         """
-        work = ahead * self._step_seconds(stage.name)
-        work += sum(_length(other) * self._step_seconds(other.name) for other in later)
-        waits = sum(self._costs[other.name].startup for other in later)
-        return max(self.seconds_left - waits, 0.0) / max(work, 1e-9)
+        work_seconds = ahead * self._step_seconds(stage.name)
+        work_seconds += sum(_length(other) * self._step_seconds(other.name) for other in later)
+        startup_seconds = sum(self._costs[other.name].startup for other in later)
+        return max(self.seconds_left - startup_seconds, 0.0) / max(work_seconds, 1e-9)
 
     def _too_short(
-        self, later: Sequence[Stage], share: float, in_use: Collection[str]
+        self, later: Sequence[Stage], share: float, active_names: Collection[str]
     ) -> Sequence[Stage]:
         """Return the first later stage that would make too few steps, and all stages after it."""
         for number, stage in enumerate(later):
-            least = self._least_worthwhile(stage)
-            if share * _length(stage) < (least if stage.name in in_use else _TO_COME_BACK * least):
+            least_steps = self._least_worthwhile(stage)
+            if share * _length(stage) < (
+                least_steps if stage.name in active_names else _TO_COME_BACK * least_steps
+            ):
                 return later[number:]
         return ()
 
     def _least_worthwhile(self, stage: Stage) -> float:
         """Return the fewest steps for which a later stage is worth its time."""
-        anew = any(isinstance(entry, FreshAlbedo) for entry in stage.enter)
-        least = _WORTHWHILE_ANEW if anew else _WORTHWHILE
-        return min(least, 0.5 * stage.steps)
+        has_fresh_albedo = any(isinstance(entry, FreshAlbedo) for entry in stage.enter)
+        least_steps = _WORTHWHILE_ANEW if has_fresh_albedo else _WORTHWHILE
+        return min(least_steps, 0.5 * stage.steps)
 
     def _scaled(self, stage: Stage, done: int, remaining: float) -> Stage:
         """Give a stage ``remaining`` steps after ``done`` ones, within limits set by the plan."""
-        planned = self._planned.stage(stage.name).steps
-        fewest, most = math.ceil(_FEWEST * planned), math.ceil(_LONGEST * planned)
+        planned_steps = self._planned.stage(stage.name).steps
+        fewest, most = math.ceil(_FEWEST * planned_steps), math.ceil(_LONGEST * planned_steps)
         return _scaled(stage, done, remaining / (stage.steps - done), fewest, most)
 
     def _step_seconds(self, name: str) -> float:
@@ -421,12 +431,12 @@ class Pacer:
         An expected cost is corrected by the ratio of measured to expected seconds in the last stage
         that was measured.
         """
-        measured = self._measured.get(name, [])
-        if len(measured) >= _TIMED:
-            return statistics.median(measured[-_RECENT:])
+        durations = self._measured.get(name, [])
+        if len(durations) >= _TIMED:
+            return statistics.median(durations[-_RECENT:])
         expected = self._costs[name].step
-        timed = [n for n, times in self._measured.items() if len(times) >= _TIMED]
-        if not timed:
+        timed_stages = [n for n, times in self._measured.items() if len(times) >= _TIMED]
+        if not timed_stages:
             return expected
-        last = timed[-1]
-        return expected * self._step_seconds(last) / self._costs[last].step
+        last_stage = timed_stages[-1]
+        return expected * self._step_seconds(last_stage) / self._costs[last_stage].step

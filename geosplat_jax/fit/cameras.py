@@ -163,14 +163,14 @@ class Subject(eqx.Module):
     def seen_from(self, camera: Camera) -> "Subject":
         """Return the subject with its splats shaded once, towards the camera of a single view."""
         asset, transport = self.asset, self.pipeline.transport
-        towards = camera.centers - asset.splats.means
-        is_facing = jnp.sum(asset.splats.outward * towards, axis=-1) > 0
+        view_vectors = camera.centers - asset.splats.means
+        is_facing = jnp.sum(asset.splats.outward * view_vectors, axis=-1) > 0
         mask = is_facing if self.pipeline.raster.cull_backfaces else None
         shaded = transport.shade(
             self.key,
             asset.splats.points(mask),
             asset.attributes,
-            safe_normalize(towards),
+            safe_normalize(view_vectors),
             self.illumination,
             asset.index,
         )
@@ -237,10 +237,12 @@ def moved_camera(
     product = partial(jnp.matmul, precision="highest")
     center = product(rotation, box.center) + translation
     lengths = jnp.stack([box.half_extent, box.half_extent, center[2]])
-    turn = rotation_vector_to_matrix(parameters[:3])
-    turned = product(turn, rotation)
-    moved = center + parameters[3:6] * lengths - product(turned, box.center)
-    pose = jnp.eye(4, dtype=rotation.dtype).at[:3, :3].set(turned).at[:3, 3].set(moved)
+    rotation_change = rotation_vector_to_matrix(parameters[:3])
+    new_rotation = product(rotation_change, rotation)
+    new_translation = center + parameters[3:6] * lengths - product(new_rotation, box.center)
+    pose = (
+        jnp.eye(4, dtype=rotation.dtype).at[:3, :3].set(new_rotation).at[:3, 3].set(new_translation)
+    )
     focal = jnp.exp(parameters[6])
     factors = jnp.ones((3, 3), rotation.dtype).at[(0, 1), (0, 1)].set(focal)
     lens = camera.intrinsics[0] * factors
@@ -352,8 +354,8 @@ def _solve(
     solution = optx.least_squares(
         residual, solver, start, has_aux=True, max_steps=how.steps, throw=False
     )
-    ends = jnp.stack([start, solution.value])
-    before, after = _both(jax.lax.map(lambda y: residual(y, None)[1], ends))
+    iterates = jnp.stack([start, solution.value])
+    before, after = _both(jax.lax.map(lambda y: residual(y, None)[1], iterates))
     camera, _ = moved_camera(photograph.camera, UNIT * solution.value, box)
     return Found(solution.value, camera, before, after, solution.stats["num_steps"])
 
@@ -383,16 +385,16 @@ def refine_view(
 
     def attempt(capacities: Capacities) -> tuple[Found, Usage]:
         pipeline = replace(subject.pipeline, capacities=capacities)
-        sized = replace(subject, pipeline=pipeline)
+        sized_subject = replace(subject, pipeline=pipeline)
         start = jnp.zeros(how.parameter_count, photograph.image.dtype)
         rounds = []
         for _ in range(how.rounds):
-            rounds.append(_solve(start, sized, photograph, how=how))
+            rounds.append(_solve(start, sized_subject, photograph, how=how))
             start = rounds[-1].parameters
-        fits = [fit for found in rounds for fit in (found.before, found.after)]
-        steps = sum((found.iterations for found in rounds[1:]), rounds[0].iterations)
-        found = replace(rounds[-1], before=rounds[0].before, iterations=steps)
-        return found, capacity_module.combine(*(fit.usage for fit in fits))
+        fits = [fit for result in rounds for fit in (result.before, result.after)]
+        steps = sum((result.iterations for result in rounds[1:]), rounds[0].iterations)
+        result = replace(rounds[-1], before=rounds[0].before, iterations=steps)
+        return result, capacity_module.combine(*(fit.usage for fit in fits))
 
     return capacity_module.retry(attempt, subject.pipeline.capacities)
 
@@ -444,46 +446,46 @@ def refine_views(
             image=jnp.asarray(views.clipped([index])[0]),
             valid=jnp.asarray(valid if views.valid is None else views.valid[index]),
         )
-        found, capacities = refine_view(subject, photograph, how)
+        result, capacities = refine_view(subject, photograph, how)
         subject = replace(subject, pipeline=replace(subject.pipeline, capacities=capacities))
-        cameras[name] = _refined(found, views, index)
+        cameras[name] = _refined(result, views, index)
         if on_view is not None:
             on_view(ViewProgress(index + 1, len(views), name, cameras[name]))
     return RefinedSplit(views.width, views.height, cameras)
 
 
-def _refined(found: Found, views: Views, index: int) -> RefinedCamera:
+def _refined(result: Found, views: Views, index: int) -> RefinedCamera:
     """Return the refined camera of a view, or the initial one where refinement did not help."""
-    note = _refusal(found)
+    note = _refusal(result)
     exposure = 1.0 if views.exposure is None else float(views.exposure[index])
     balance = np.ones(3) if views.white_balance is None else views.white_balance[index]
-    before = float(found.before.rms)
-    kept = RefinedCamera(
+    initial_rms = float(result.before.rms)
+    initial_camera = RefinedCamera(
         world_to_camera=views.world_to_camera[index],
         intrinsics=views.intrinsics[index],
         exposure=exposure,
-        residual_before=before,
-        residual_after=before,
-        iterations=int(found.iterations),
+        residual_before=initial_rms,
+        residual_after=initial_rms,
+        iterations=int(result.iterations),
         accepted=False,
         note=note,
         white_balance=balance,
     )
     if note:
-        return kept
-    pose = np.asarray(found.camera.world_to_camera[0], np.float64)
+        return initial_camera
+    pose = np.asarray(result.camera.world_to_camera[0], np.float64)
     left, _, right = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = left @ right  # rigid in double precision
     lens = views.intrinsics[index].astype(np.float64)
-    lens[[0, 1], [0, 1]] *= np.exp(UNIT * float(found.parameters[6]))
+    lens[[0, 1], [0, 1]] *= np.exp(UNIT * float(result.parameters[6]))
     return replace(
-        kept,
+        initial_camera,
         world_to_camera=pose,
         intrinsics=lens,
-        exposure=exposure * float(np.exp(UNIT * float(found.parameters[7]))),
-        residual_after=float(found.after.rms),
+        exposure=exposure * float(np.exp(UNIT * float(result.parameters[7]))),
+        residual_after=float(result.after.rms),
         accepted=True,
-        white_balance=balance * np.exp(np.asarray(log_balance(UNIT * found.parameters), float)),
+        white_balance=balance * np.exp(np.asarray(log_balance(UNIT * result.parameters), float)),
     )
 
 
@@ -502,12 +504,14 @@ def with_mean_balance(splits: Mapping[str, RefinedSplit]) -> dict[str, RefinedSp
     -------
     The splits with the new factors, by name.
     """
-    taught = splits.get("train", next(iter(splits.values())))
-    mean = np.mean([camera.white_balance for camera in taught.cameras.values()], axis=0)
+    reference_split = splits.get("train", next(iter(splits.values())))
+    mean_balance = np.mean(
+        [camera.white_balance for camera in reference_split.cameras.values()], axis=0
+    )
 
     def divided(split: RefinedSplit) -> RefinedSplit:
         cameras = {
-            name: replace(camera, white_balance=camera.white_balance / mean)
+            name: replace(camera, white_balance=camera.white_balance / mean_balance)
             for name, camera in split.cameras.items()
         }
         return replace(split, cameras=cameras)
@@ -515,12 +519,12 @@ def with_mean_balance(splits: Mapping[str, RefinedSplit]) -> dict[str, RefinedSp
     return {name: divided(split) for name, split in splits.items()}
 
 
-def _refusal(found: Found) -> str:
+def _refusal(result: Found) -> str:
     """Say why a view keeps its camera; "" where it does not."""
-    if float(found.before.covered) == 0:
+    if float(result.before.covered) == 0:
         return "the mask is empty"
-    if float(found.before.rendered) == 0:
+    if float(result.before.rendered) == 0:
         return "nothing of the object is visible"
-    if not float(found.after.cost) < float(found.before.cost):
+    if not float(result.after.cost) < float(result.before.cost):
         return "the error did not fall"
     return ""

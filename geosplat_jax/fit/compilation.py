@@ -37,7 +37,7 @@ class _Compiling(Runner):
 
     def all(self, *calls: tuple[Any, ...]) -> list[Any]:
         """Compile programs that may run side by side."""
-        return [self._compile(program, rest, is_alone=False) for program, *rest in calls]
+        return [self._compile(program, arguments, is_alone=False) for program, *arguments in calls]
 
     def _compile(self, program: Any, arguments: Any, *, is_alone: bool) -> Any:
         devices = self.devices
@@ -86,14 +86,14 @@ def compile_step(
     TrainingError
         If a program does not fit into the memory, see `memory.require_program_memory`.
     """
-    compiling = _Compiling(devices, threads, is_wanted)
+    compiler = _Compiling(devices, threads, is_wanted)
     try:
-        train_step(state, batch, pipeline, rule, run=compiling)
-        for one in compiling.compiling:
-            one.result()
+        train_step(state, batch, pipeline, rule, run=compiler)
+        for future in compiler.compiling:
+            future.result()
     except BaseException:
         # Stop the other threads: the step will not be made.
-        compiling.is_wanted = lambda: False
-        wait(compiling.compiling)
+        compiler.is_wanted = lambda: False
+        wait(compiler.compiling)
         raise
-    return compiling.fits_twice
+    return compiler.fits_twice

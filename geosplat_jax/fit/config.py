@@ -120,13 +120,13 @@ class Stage:
         Counted in the steps of a stage without changes of pace; half-lives and warm-ups are counted
         in the same unit.
         """
-        begun, reached, speed = 0, 0.0, 1.0
+        segment_start, schedule_steps, speed = 0, 0.0, 1.0
         for change in self.pace:
             if step <= change.step:
                 break
-            reached += (change.step - begun) * speed
-            begun, speed = change.step, change.speed
-        return reached + (step - begun) * speed
+            schedule_steps += (change.step - segment_start) * speed
+            segment_start, speed = change.step, change.speed
+        return schedule_steps + (step - segment_start) * speed
 
     def progress(self, step: int) -> float:
         """Return the share of the schedules that is done after ``step`` steps, from 0 to 1."""
@@ -235,29 +235,29 @@ class Config:
         groups = self.rate_groups
         for number, stage in enumerate(self.stages):
             self._check_splats(stage, number)
-            for what, given, known in (
+            for table, entries, allowed_names in (
                 ("weights", stage.weights, terms),
                 ("rates", stage.rates, groups),
             ):
-                unknown = sorted(set(given) - set(known))
+                unknown = sorted(set(entries) - set(allowed_names))
                 if unknown:
                     raise ValueError(
-                        f"unknown setting stages.{stage.name}.{what}.{unknown[0]}; expected some "
-                        f"of {sorted(known)}"
+                        f"unknown setting stages.{stage.name}.{table}.{unknown[0]}; expected some "
+                        f"of {sorted(allowed_names)}"
                     )
 
     def _check_splats(self, stage: Stage, number: int) -> None:
         """Refuse free splats where the stage before or the surface does not allow them."""
         if not stage.splats.takes_over or not stage.steps:
             return
-        before = [earlier for earlier in self.stages[:number] if earlier.steps]
-        if not before:
+        earlier_stages = [earlier for earlier in self.stages[:number] if earlier.steps]
+        if not earlier_stages:
             raise ValueError(
                 f"stages.{stage.name}.splats: {stage.splats.kind} splats need a stage before"
             )
-        if not before[-1].splats.is_six_per_face:
+        if not earlier_stages[-1].splats.is_six_per_face:
             raise ValueError(
-                f"stages.{before[-1].name}.splats: {stage.splats.kind} splats, which "
+                f"stages.{earlier_stages[-1].name}.splats: {stage.splats.kind} splats, which "
                 f"stages.{stage.name} has, start from the six splats of every face; set it to face"
             )
         if stage.vertex_fraction:
@@ -265,24 +265,24 @@ class Config:
                 f"stages.{stage.name}.vertex_fraction: {stage.splats.kind} splats are no samples "
                 "of vertices or faces; set it to 0"
             )
-        moving = sorted(set(self.geometry.rate_groups) - set(stage.frozen))
-        if moving:
+        learned_groups = sorted(set(self.geometry.rate_groups) - set(stage.frozen))
+        if learned_groups:
             raise ValueError(
                 f"stages.{stage.name}.splats: {stage.splats.kind} splats need a frozen surface; "
-                f"set stages.{stage.name}.rates.{moving[0]} to 0"
+                f"set stages.{stage.name}.rates.{learned_groups[0]} to 0"
             )
 
     @property
     def rate_groups(self) -> tuple[str, ...]:
         """Names that a learning rate may have."""
-        declared = {
+        field_groups = {
             f.metadata[RATE_GROUP]
             for kind in (Params, MaterialField, EnvLight)
             for f in fields(kind)
             if RATE_GROUP in f.metadata
         }
-        splats = (group for stage in self.stages for group in stage.splats.rate_groups)
-        return tuple(sorted({*declared, *self.geometry.rate_groups, *splats}))
+        splat_groups = (group for stage in self.stages for group in stage.splats.rate_groups)
+        return tuple(sorted({*field_groups, *self.geometry.rate_groups, *splat_groups}))
 
     @property
     def active_stages(self) -> tuple[Stage, ...]:
@@ -314,8 +314,8 @@ class Config:
 
     def first_step(self, name: str) -> int:
         """Return the step of the run at which a stage starts; ValueError for an unknown name."""
-        before = self.stages[: self.stage_names.index(self.stage(name).name)]
-        return sum(stage.steps for stage in before)
+        earlier_stages = self.stages[: self.stage_names.index(self.stage(name).name)]
+        return sum(stage.steps for stage in earlier_stages)
 
     def stage_at(self, step: int) -> Stage:
         """Return the stage that makes step ``step``; the last one for any later step."""
@@ -328,9 +328,9 @@ class Config:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionary, ready for JSON; stages by name, in order."""
-        plain = to_plain(self)
-        plain["stages"] = {stage.pop("name"): stage for stage in plain["stages"]}
-        return plain
+        values = to_plain(self)
+        values["stages"] = {stage.pop("name"): stage for stage in values["stages"]}
+        return values
 
 
 KNOWN_KINDS = (FreeSplatSettings, MeshSettings, PerPixel)
@@ -423,12 +423,12 @@ _MOVED = (
 def moved_setting(path: str) -> str | None:
     """Return the present path of a setting of an earlier version; None for any other path."""
     if re.match(r"transport\.(rates|loss)\.", path):
-        later = moved_setting(path.removeprefix("transport."))
-        return later and later.replace("split_sum", "monte_carlo")
-    for pattern, now in _MOVED:
+        split_sum_path = moved_setting(path.removeprefix("transport."))
+        return split_sum_path and split_sum_path.replace("split_sum", "monte_carlo")
+    for pattern, replacement in _MOVED:
         match = re.fullmatch(pattern, path)
         if match:
-            return match.expand(now)
+            return match.expand(replacement)
     return None
 
 
@@ -436,12 +436,12 @@ def _require_current(values: Any) -> None:
     """Refuse settings of an earlier version, and say where the first one is now."""
     if not isinstance(values, dict):
         raise ValueError(f"settings must be an object with sections, got {values!r}")
-    old = [path for path in _flat(values) if not path.startswith("stages.")]
-    moved = {path: now for path in old if (now := moved_setting(path)) and now != path}
-    if moved:
-        path, now = next(iter(moved.items()))
+    paths = [path for path in _flat(values) if not path.startswith("stages.")]
+    moves = {path: target for path in paths if (target := moved_setting(path)) and target != path}
+    if moves:
+        path, target = next(iter(moves.items()))
         raise ValueError(
-            f"{len(moved)} settings are of an earlier version, the first: {path} is now {now}; "
+            f"{len(moves)} settings are of an earlier version, the first: {path} is now {target}; "
             "train the scene anew"
         )
 
@@ -460,9 +460,9 @@ def parse_override(text: str) -> dict[str, Any]:
         raise ValueError(f"an override has the form section.field=value, got {text!r}")
     if name in LABELS:
         raise ValueError(f"{name} is chosen with {LABELS[name]}, not with --set")
-    now = moved_setting(name)
-    if now is not None:
-        raise ValueError(f"the setting {name} is now {now}")
+    new_path = moved_setting(name)
+    if new_path is not None:
+        raise ValueError(f"the setting {name} is now {new_path}")
     try:
         parsed = tomllib.loads(f"value = {value}")["value"]
         # Dates and times, which JSON lacks, become text.
@@ -470,8 +470,8 @@ def parse_override(text: str) -> dict[str, Any]:
     except tomllib.TOMLDecodeError:
         parsed = value.strip()
     nested: Any = parsed
-    for part in reversed(name.split(".")):
-        nested = {part: nested}
+    for key in reversed(name.split(".")):
+        nested = {key: nested}
     return nested
 
 
@@ -492,17 +492,17 @@ def merge(base: dict[str, Any], changes: dict[str, Any], where: str = "") -> dic
     """
     merged = dict(base)
     for name, value in changes.items():
-        now = base.get(name)
-        kind = now.get("kind") if isinstance(now, dict) else None
+        base_value = base.get(name)
+        kind = base_value.get("kind") if isinstance(base_value, dict) else None
         if name not in base and not _OPEN.fullmatch(where):
             raise ValueError(f"unknown setting {where}{name}; expected one of {sorted(base)}")
         if isinstance(value, dict) and value.get("kind", kind) != kind:
             merged[name] = value
-        elif isinstance(value, dict) and isinstance(now, dict):
-            merged[name] = merge(now, value, f"{where}{name}.")
-        elif isinstance(now, dict) and "value" in now:
-            merged[name] = {**now, "value": value}
-        elif now is None and _OPEN.fullmatch(where) and not isinstance(value, dict):
+        elif isinstance(value, dict) and isinstance(base_value, dict):
+            merged[name] = merge(base_value, value, f"{where}{name}.")
+        elif isinstance(base_value, dict) and "value" in base_value:
+            merged[name] = {**base_value, "value": value}
+        elif base_value is None and _OPEN.fullmatch(where) and not isinstance(value, dict):
             merged[name] = {"value": value}
         else:
             merged[name] = value
@@ -534,9 +534,13 @@ def changed_settings(
             values["stages"] = {n: s for n, s in values["stages"].items() if n in stages}
         return _flat(values)
 
-    one, two = flat(first), flat(second)
-    names = sorted(set(one) | set(two))
-    return {n: (one.get(n), two.get(n)) for n in names if one.get(n) != two.get(n)}
+    first_values, second_values = flat(first), flat(second)
+    names = sorted(set(first_values) | set(second_values))
+    return {
+        n: (first_values.get(n), second_values.get(n))
+        for n in names
+        if first_values.get(n) != second_values.get(n)
+    }
 
 
 def differences(first: Config, second: Config, *, stages: list[str] | None = None) -> list[str]:
@@ -544,8 +548,8 @@ def differences(first: Config, second: Config, *, stages: list[str] | None = Non
 
     ``stages`` : see `changed_settings`.
     """
-    changed = changed_settings(first, second, stages=stages)
-    return [f"{name}: {old!r} -> {new!r}" for name, (old, new) in changed.items()]
+    changes = changed_settings(first, second, stages=stages)
+    return [f"{name}: {old!r} -> {new!r}" for name, (old, new) in changes.items()]
 
 
 def config_warnings(config: Config) -> list[str]:
@@ -600,11 +604,11 @@ def config_warnings(config: Config) -> list[str]:
 
 def _changes_of_blocked_light(config: Config) -> list[str]:
     """Describe where a stage drops the indirect light that the stage before it has learned."""
-    traced = [stage for stage in config.active_stages if stage.transport.blocked_light]
+    tracing_stages = [stage for stage in config.active_stages if stage.transport.blocked_light]
     return [
         f"stages.{after.name}.transport.{after.transport.blocked_light} takes the place of "
         f"stages.{before.name}.transport.{before.transport.blocked_light}: the indirect light that "
         f"{before.name} learned, if any, is dropped; give both stages the same setting"
-        for before, after in pairwise(traced)
+        for before, after in pairwise(tracing_stages)
         if before.transport.blocked_light != after.transport.blocked_light
     ]

@@ -78,13 +78,13 @@ def work_of(stage: Stage, splats: float, pixels: float) -> dict[str, float]:
     Amounts whose seconds per unit are `COST_SECONDS`. Splats and pixels count in units of 100,000.
     """
     transport, views, hundred_thousand = stage.transport, stage.batch_views, splats / _SPLATS_UNIT
-    shared = sum(
+    shared_rays = sum(
         getattr(transport, name, 0) for name in ("light_count", "diffuse_count", "residual_count")
     )
     return {
         "step": 1.0,
         "splats": hundred_thousand,
-        "rays": hundred_thousand * shared,
+        "rays": hundred_thousand * shared_rays,
         "views": hundred_thousand * views,
         "specular": hundred_thousand * views * getattr(transport, "specular_count", 0),
         "pixels": views * pixels / _PIXELS_UNIT,
@@ -101,12 +101,12 @@ def expected_costs(config: Config, pixels: float, *, slowness: float) -> dict[st
     slowness : see `slowness_of_machine`. The startup takes at least the reference time where an
         accelerator is used, since a processor compiles the programs for it.
     """
-    costs, compiling = {}, slowness if jax.default_backend() == "cpu" else max(slowness, 1.0)
+    costs, startup_slowness = {}, slowness if jax.default_backend() == "cpu" else max(slowness, 1.0)
     for number, stage in enumerate(config.active_stages):
         work = work_of(stage, float(config.geometry.expected_splats(pixels)), pixels)
         seconds = sum(COST_SECONDS[name] * amount for name, amount in work.items())
         startup = _STARTUP_SECONDS["next" if number else "first"]
-        costs[stage.name] = StageCost(startup * compiling, seconds * slowness)
+        costs[stage.name] = StageCost(startup * startup_slowness, seconds * slowness)
     return costs
 
 
@@ -129,9 +129,9 @@ def kernel_milliseconds(function: Callable[[Any], Any], argument: Any, repeats: 
     jax.block_until_ready(function(argument))
     times = []
     for _ in range(repeats):
-        began = time.perf_counter()
+        start_time = time.perf_counter()
         jax.block_until_ready(function(argument))
-        times.append(1e3 * (time.perf_counter() - began))
+        times.append(1e3 * (time.perf_counter() - start_time))
     return statistics.median(times)
 
 
@@ -150,5 +150,5 @@ def slowness_of_machine() -> float:
     At most 10, and at least `_FASTEST_CPU` or `_FASTEST_GPU`: an accelerator gains more in
     exponentials than in the steps of a training.
     """
-    fastest = _FASTEST_CPU if jax.default_backend() == "cpu" else _FASTEST_GPU
-    return float(np.clip(exponential_milliseconds() / _REFERENCE_MS, fastest, 10.0))
+    least_slowness = _FASTEST_CPU if jax.default_backend() == "cpu" else _FASTEST_GPU
+    return float(np.clip(exponential_milliseconds() / _REFERENCE_MS, least_slowness, 10.0))

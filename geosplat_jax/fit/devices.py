@@ -148,8 +148,10 @@ class ManyDevices(Devices):
     @property
     def _mine(self) -> list[tuple[int, Any]]:
         """Devices of this process, with their numbers among all."""
-        here = jax.process_index()
-        return [(n, d) for n, d in enumerate(self.mesh.devices.flat) if d.process_index == here]
+        own_index = jax.process_index()
+        return [
+            (n, d) for n, d in enumerate(self.mesh.devices.flat) if d.process_index == own_index
+        ]
 
     def program(self, program: Any) -> Any:
         """See `Devices.program`."""
@@ -175,11 +177,11 @@ class ManyDevices(Devices):
 
     def place_again(self, tree: Any) -> Any:
         """See `Devices.place_again`."""
-        before, self._placed = self._placed, {}
+        placements, self._placed = self._placed, {}
 
         def placed(x: Any) -> Any:
-            known = before.get(id(x))
-            copy = known[1] if known is not None and known[0] is x else self._copied(x)
+            placement = placements.get(id(x))
+            copy = placement[1] if placement is not None and placement[0] is x else self._copied(x)
             self._placed[id(x)] = (x, copy)
             return copy
 
@@ -215,16 +217,16 @@ class ManyDevices(Devices):
         }
 
         def dealt(name: str, values: Array) -> Array:
-            parts = []
+            shards = []
             for number, device in self._mine:
                 rows = number + self.count * np.arange(rounds)
-                part = values[np.minimum(rows, count - 1)]
+                shard = values[np.minimum(rows, count - 1)]
                 if name == "shares":
-                    part = jnp.where(rows < count, part, 0.0)
-                parts.append(jax.device_put(part[None], device))
-            shape = (self.count, *parts[0].shape[1:])
+                    shard = jnp.where(rows < count, shard, 0.0)
+                shards.append(jax.device_put(shard[None], device))
+            shape = (self.count, *shards[0].shape[1:])
             sharding = NamedSharding(self.mesh, _OWN)
-            return jax.make_array_from_single_device_arrays(shape, sharding, parts)
+            return jax.make_array_from_single_device_arrays(shape, sharding, shards)
 
         return SharedBatch(
             {name: dealt(name, x) for name, x in pictures.items() if x is not None},
@@ -244,8 +246,8 @@ class ManyDevices(Devices):
         text = np.frombuffer(json.dumps(value).encode(), np.uint8)
         length = int(multihost_utils.broadcast_one_to_all(np.int32(text.size)))
         # Broadcast arrays must have the same size on all hosts: repeat or cut this text to it.
-        mine = np.resize(text, length)
-        return json.loads(np.asarray(multihost_utils.broadcast_one_to_all(mine)).tobytes())
+        resized_text = np.resize(text, length)
+        return json.loads(np.asarray(multihost_utils.broadcast_one_to_all(resized_text)).tobytes())
 
     def together(self, action: Callable[[], _Result]) -> _Result:
         """See `Devices.together`."""
@@ -282,8 +284,8 @@ def _own(tree: Any) -> Any:
 
 def _common(batch: SharedBatch) -> Batch:
     """Return a batch with the key and carry of a step; camera and image are placeholders."""
-    eye = jnp.zeros((1, 4, 4)), jnp.zeros((1, 3, 3))
-    return Batch(Camera(*eye, 1, 1), jnp.zeros((1, 1, 1, 4)), batch.key, carry=batch.carry)
+    placeholders = jnp.zeros((1, 4, 4)), jnp.zeros((1, 3, 3))
+    return Batch(Camera(*placeholders, 1, 1), jnp.zeros((1, 1, 1, 4)), batch.key, carry=batch.carry)
 
 
 def _view(batch: SharedBatch, number: Int[Array, ""]) -> Any:
@@ -291,11 +293,11 @@ def _view(batch: SharedBatch, number: Int[Array, ""]) -> Any:
     pictures = _local(batch.pictures)
     height, width = pictures["image"].shape[1:3]
     camera = Camera(pictures["world_to_camera"], pictures["intrinsics"], height, width)
-    mine = Batch(
+    local_view = Batch(
         camera, pictures["image"], batch.key, pictures.get("views"), pictures.get("valid")
     ).view(number)
-    mine = eqx.tree_at(lambda view: view.key, mine, pictures["keys"][number])
-    return _own((mine, pictures["shares"][number]))
+    local_view = eqx.tree_at(lambda view: view.key, local_view, pictures["keys"][number])
+    return _own((local_view, pictures["shares"][number]))
 
 
 def _lists(pipeline: Any, asset: Any, view: Any) -> Any:
@@ -324,14 +326,14 @@ def _view_gradient(
     log_exposure: Float[Array, ""],
     asset: Any,
     lights: Any,
-    others: Any,
+    residual_lights: Any,
     lists: Any,
     view: Any,
 ) -> Any:
     """See `gradient._view_gradient`."""
     return _own(
         gradient._view_gradient(
-            pipeline, log_exposure, asset, lights, others, _local(lists), _local(view)
+            pipeline, log_exposure, asset, lights, residual_lights, _local(lists), _local(view)
         )
     )
 
@@ -346,7 +348,7 @@ def _back(
     params: Any,
     asset: Any,
     lights: Any,
-    pulls: Any,
+    pullbacks: Any,
     views: Any,
     batch: SharedBatch,
     carry: Any,
@@ -358,27 +360,27 @@ def _back(
     of devices. Other results are taken from the first device: a GPU may add up the same numbers in
     another order and round differently, and parameters must stay the same everywhere.
     """
-    found, report = _local(views)
-    part = 1.0 / jax.lax.axis_size(_AXIS)
-    weights = {name: part * weight for name, weight in pipeline.weights.items()}
+    loss_gradient, report = _local(views)
+    share = 1.0 / jax.lax.axis_size(_AXIS)
+    weights = {name: share * weight for name, weight in pipeline.weights.items()}
     pipeline = eqx.tree_at(lambda p: p.weights, pipeline, weights)
     usage = jax.lax.pmax(report.usage, _AXIS)
     terms, mse = jax.lax.psum((report.terms, report.mse), _AXIS)
-    (total, whole), gradient_here = gradient._back(
+    (total, loss_report), local_gradient = gradient._back(
         pipeline,
         params,
         asset,
         lights,
-        pulls,
-        (found, ViewReport(terms, mse, usage)),
+        pullbacks,
+        (loss_gradient, ViewReport(terms, mse, usage)),
         _common(batch),
         carry,
         frozen,
     )
-    total, gradient_sum = jax.lax.psum((total, gradient_here), _AXIS)
-    usage, whole = jax.lax.pmax(whole.usage, _AXIS), _of_first_device(whole)
-    whole = eqx.tree_at(lambda report: report.usage, whole, usage)
-    return (total, whole), gradient_sum
+    total, gradient_sum = jax.lax.psum((total, local_gradient), _AXIS)
+    usage, loss_report = jax.lax.pmax(loss_report.usage, _AXIS), _of_first_device(loss_report)
+    loss_report = eqx.tree_at(lambda report: report.usage, loss_report, usage)
+    return (total, loss_report), gradient_sum
 
 
 def _of_first_device(tree: Any) -> Any:
@@ -409,14 +411,14 @@ def _programs(mesh: Mesh) -> dict[Any, Any]:
 
         def program(*values: Any) -> Any:
             arrays, static = values[: len(specs)], values[len(specs) :]
-            shared = jax.shard_map(
+            sharded_body = jax.shard_map(
                 lambda *blocks: body(*blocks, *static),
                 mesh=mesh,
                 in_specs=specs,
                 out_specs=result,
                 check_vma=False,
             )
-            return shared(*arrays)
+            return sharded_body(*arrays)
 
         program.__name__ = body.__name__
         return jax.jit(program, **options)
@@ -459,10 +461,10 @@ def choose_devices(count: int = 1) -> Devices:
             jax.config.update("jax_num_cpu_devices", count)
         except RuntimeError:
             pass  # jax is initialised already; its devices are counted below
-    there = jax.local_devices()
-    if len(there) < count:
+    devices = jax.local_devices()
+    if len(devices) < count:
         raise TrainingError(
-            f"--devices {count}: this process has {len(there)} of kind {there[0].platform}; "
+            f"--devices {count}: this process has {len(devices)} of kind {devices[0].platform}; "
             "ask for fewer (a CPU can be split into several devices only before jax first uses it)"
         )
     if count == 1 and jax.process_count() == 1:
@@ -470,10 +472,12 @@ def choose_devices(count: int = 1) -> Devices:
     by_process: dict[int, list[Any]] = {}
     for device in jax.devices():
         by_process.setdefault(device.process_index, []).append(device)
-    fewest = min(map(len, by_process.values()))
-    if fewest < count:
-        raise TrainingError(f"--devices {count}: a host has {fewest} only; ask for fewer")
-    return ManyDevices([d for _, mine in sorted(by_process.items()) for d in mine[:count]])
+    fewest_devices = min(map(len, by_process.values()))
+    if fewest_devices < count:
+        raise TrainingError(f"--devices {count}: a host has {fewest_devices} only; ask for fewer")
+    return ManyDevices(
+        [d for _, process_devices in sorted(by_process.items()) for d in process_devices[:count]]
+    )
 
 
 def connect_hosts(
@@ -496,11 +500,11 @@ def connect_hosts(
     """
     if coordinator is not None and not re.fullmatch(r".+:\d+", coordinator):
         raise TrainingError(f"--coordinator reads ADDRESS:PORT, got {coordinator!r}")
-    known = {} if hosts == "auto" else {"num_processes": int(hosts), "process_id": host}
+    process_options = {} if hosts == "auto" else {"num_processes": int(hosts), "process_id": host}
     try:
         jax.distributed.initialize(
-            coordinator_address=coordinator, heartbeat_timeout_seconds=patience, **known
+            coordinator_address=coordinator, heartbeat_timeout_seconds=patience, **process_options
         )
     except (ValueError, RuntimeError) as error:
-        first = str(error).splitlines()[0]
-        raise TrainingError(f"the hosts cannot be connected: {first}") from error
+        message = str(error).splitlines()[0]
+        raise TrainingError(f"the hosts cannot be connected: {message}") from error

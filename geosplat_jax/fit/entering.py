@@ -103,9 +103,9 @@ class FreshAlbedo(Entry, kind="fresh_albedo"):
         if self.colour == "mean":
             colour = mean_albedo(params, pipeline)
         field = params.material
-        fresh = init_materials(key, pipeline.fields)
-        table = field.albedo_table if pipeline.fields.shared else fresh.albedo_table
-        head = _one_colour(fresh.albedo_head, colour)
+        new_field = init_materials(key, pipeline.fields)
+        table = field.albedo_table if pipeline.fields.shared else new_field.albedo_table
+        head = _one_colour(new_field.albedo_head, colour)
         return replace(params, material=replace(field, albedo_table=table, albedo_head=head))
 
 
@@ -124,10 +124,10 @@ def mean_albedo(params: Params, pipeline: Pipeline) -> Float[Array, " 3"]:
 
 def _one_colour(head: tuple[Layer, ...], albedo: Float[Array, " 3"]) -> tuple[Layer, ...]:
     """Return the albedo head with a last layer that gives one colour everywhere."""
-    *hidden, last = head
-    albedo = jnp.clip(albedo.astype(last.weights.dtype), _DARKEST, 1.0 - _DARKEST)
+    *hidden_layers, last_layer = head
+    albedo = jnp.clip(albedo.astype(last_layer.weights.dtype), _DARKEST, 1.0 - _DARKEST)
     logits = jnp.log(albedo) - jnp.log1p(-albedo)
-    return (*hidden, Layer(jnp.zeros_like(last.weights), logits))
+    return (*hidden_layers, Layer(jnp.zeros_like(last_layer.weights), logits))
 
 
 def enter_stage(
@@ -157,15 +157,15 @@ def enter_stage(
     -------
     The first parameters of the next stage.
     """
-    first, indirect_key = jax.random.split(key)
+    entry_key, indirect_key = jax.random.split(key)
     head = params.material.indirect_head
     if head is None or not indirect.goes_on:
         head = init_indirect_head(indirect_key, pipeline.fields, indirect.outputs)
     params = replace(params, material=replace(params.material, indirect_head=head))
     for number, entry in enumerate(entries):
-        params = entry.apply(params, pipeline, jax.random.fold_in(first, number))
-    learned = splats.begin(lambda: _placed(pipeline, params), pipeline.surface.box)
-    return replace(params, splats=learned)
+        params = entry.apply(params, pipeline, jax.random.fold_in(entry_key, number))
+    splat_parameters = splats.begin(lambda: _placed(pipeline, params), pipeline.surface.box)
+    return replace(params, splats=splat_parameters)
 
 
 @jax.jit

@@ -90,15 +90,17 @@ def neighbouring_blocks(directions: Float[np.ndarray, "V 3"]) -> Int[np.ndarray,
     (V,) number of the block of every view, from 0.
     """
     count = len(directions)
-    left = set(range(1, count))
+    unvisited = set(range(1, count))
     order = [0] if count else []
-    while left:
-        here = directions[order[-1]]
-        order.append(min(left, key=lambda view: (-float(directions[view] @ here), view)))
-        left.remove(order[-1])
+    while unvisited:
+        last_direction = directions[order[-1]]
+        order.append(
+            min(unvisited, key=lambda view: (-float(directions[view] @ last_direction), view))
+        )
+        unvisited.remove(order[-1])
     blocks = np.zeros(count, int)
-    pieces = min(count, max(round(math.sqrt(2 * count)), 1))
-    for block, views in enumerate(np.array_split(np.asarray(order, int), max(pieces, 1))):
+    block_count = min(count, max(round(math.sqrt(2 * count)), 1))
+    for block, views in enumerate(np.array_split(np.asarray(order, int), max(block_count, 1))):
         blocks[views] = block
     return blocks
 
@@ -115,11 +117,11 @@ def clustered_error(values: Float[np.ndarray, " V"], blocks: Int[np.ndarray, " V
     values : (V,) values of the views.
     blocks : (V,) block of each view.
     """
-    _, member = np.unique(blocks, return_inverse=True)
-    count = int(member.max(initial=-1)) + 1
+    _, block_indices = np.unique(blocks, return_inverse=True)
+    count = int(block_indices.max(initial=-1)) + 1
     if count < 2:
         return math.inf
-    sums = np.bincount(member, weights=values - values.mean())
+    sums = np.bincount(block_indices, weights=values - values.mean())
     return float(np.sqrt(count / (count - 1) * np.sum(sums**2)) / len(values))
 
 
@@ -138,6 +140,6 @@ def compare(
     blocks : (V,) block of each view.
     """
     gains = np.asarray(larger, float) - np.asarray(smaller[0], float)
-    means = [float(np.mean(one)) for one in smaller]
+    means = [float(np.mean(decibels)) for decibels in smaller]
     spread = float(np.std(means, ddof=1)) if len(means) > 1 else 0.0
     return Evidence(float(gains.mean()), clustered_error(gains, blocks), spread)

@@ -149,10 +149,10 @@ def _require_own(path: Path, own: Path) -> None:
     if not path.is_dir():
         raise RunError(f"{path} exists already, and is no folder; choose another")
     files = (file for file in path.iterdir() if not is_left_aside(file))
-    others = sorted(file.name for file in files if file.name != _LOCK)
-    if others:
+    foreign_names = sorted(file.name for file in files if file.name != _LOCK)
+    if foreign_names:
         raise RunError(
-            f"{path} exists already and holds other files, for example {others[0]}; choose "
+            f"{path} exists already and holds other files, for example {foreign_names[0]}; choose "
             "an empty folder"
         )
 
@@ -210,9 +210,13 @@ class RunFolder:
         if not self.exists:
             raise RunError(f"{self.path} is not a run (it has no run.json)")
         record = _parsed(self._record_path)
-        missing = {"scene", "dataset", "config"} - set(record if isinstance(record, dict) else ())
-        if missing:
-            raise RunError(f"{self._record_path} lacks {sorted(missing)}; it is no record of a run")
+        missing_keys = {"scene", "dataset", "config"} - set(
+            record if isinstance(record, dict) else ()
+        )
+        if missing_keys:
+            raise RunError(
+                f"{self._record_path} lacks {sorted(missing_keys)}; it is no record of a run"
+            )
         try:
             from_plain(_Reading, _known_of(record["dataset"]), "dataset")
             from_plain(_Scene, {"scene": record["scene"]})
@@ -314,10 +318,10 @@ class RunFolder:
             If the record or the metrics are damaged.
         """
         try:
-            lost = float(self.record().get("seconds_lost", 0.0)) if self.exists else 0.0
+            lost_seconds = float(self.record().get("seconds_lost", 0.0)) if self.exists else 0.0
         except (TypeError, ValueError):
             raise RunError(f"{self._record_path} is damaged: seconds_lost") from None
-        return lost + _seconds(self.metric_lines())
+        return lost_seconds + _seconds(self.metric_lines())
 
     def begin(
         self,
@@ -344,10 +348,10 @@ class RunFolder:
         """
         self.require_free(replace=replace)
         cameras = dataset.options.get("cameras")
-        given = None if cameras is None else Path(cameras).read_bytes()
+        camera_bytes = None if cameras is None else Path(cameras).read_bytes()
         self.clear()
-        if given is not None:
-            (self.path / CAMERAS).write_bytes(given)
+        if camera_bytes is not None:
+            (self.path / CAMERAS).write_bytes(camera_bytes)
         self._write_record(
             {
                 **_scene_of(dataset),
@@ -395,8 +399,8 @@ class RunFolder:
             With the first difference.
         """
         record, now = self.record(), _scene_of(dataset)
-        for one in (record, now):
-            one["dataset"].pop("cameras", None)
+        for values in (record, now):
+            values["dataset"].pop("cameras", None)
         for name in ("dataset", "views"):
             if name in record and record[name] != now[name]:
                 raise RunError(
@@ -408,13 +412,13 @@ class RunFolder:
     def amend(self, config: Config) -> None:
         """Record settings that have changed during the training; see `planned`."""
         record = self.record()
-        planned = record.get("planned", record["config"])
-        self._write_record({**record, "planned": planned, "config": config.to_dict()})
+        planned_values = record.get("planned", record["config"])
+        self._write_record({**record, "planned": planned_values, "config": config.to_dict()})
 
     def _write_record(self, record: dict[str, Any]) -> None:
         """Replace ``run.json`` in one go."""
-        with written_aside(self._record_path) as aside:
-            aside.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        with written_aside(self._record_path) as temporary_path:
+            temporary_path.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
 
     def metric_lines(self) -> list[dict[str, Any]]:
         """Read ``metrics.jsonl``; a last line that an interruption cut off is left out.
@@ -454,13 +458,13 @@ class RunFolder:
         """
         rows = []
         for line in self.metric_lines():
-            flat = {}
+            columns = {}
             for name, value in line.items():
-                parts = value if isinstance(value, dict) else {}
-                flat |= {f"{name}.{part}": number for part, number in parts.items()} or {
+                entries = value if isinstance(value, dict) else {}
+                columns |= {f"{name}.{entry}": number for entry, number in entries.items()} or {
                     name: value
                 }
-            rows.append(flat)
+            rows.append(columns)
         names = list(dict.fromkeys(name for row in rows for name in row))
         with written_aside(path) as aside, aside.open("w", encoding="utf-8", newline="") as file:
             table = csv.DictWriter(file, names)
@@ -474,18 +478,20 @@ class RunFolder:
         seconds are kept in the record, see `seconds_used`.
         """
         if self.metrics.exists():
-            used, everything = self.seconds_used(), self.metric_lines()
-            lines = [line for line in everything if line["step"] < step]
-            if len(lines) < len(everything) and self.exists:
-                self._write_record({**self.record(), "seconds_lost": used - _seconds(lines)})
+            used_seconds, all_lines = self.seconds_used(), self.metric_lines()
+            lines = [line for line in all_lines if line["step"] < step]
+            if len(lines) < len(all_lines) and self.exists:
+                self._write_record(
+                    {**self.record(), "seconds_lost": used_seconds - _seconds(lines)}
+                )
             text = "".join(json.dumps(line) + "\n" for line in lines)
-            with written_aside(self.metrics) as aside:
-                aside.write_text(text, encoding="utf-8")
+            with written_aside(self.metrics) as temporary_path:
+                temporary_path.write_text(text, encoding="utf-8")
 
     def write_training(self, summary: dict[str, Any]) -> None:
         """Note how the training went as a whole."""
-        with written_aside(self.path / "training.json") as aside:
-            aside.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+        with written_aside(self.path / "training.json") as temporary_path:
+            temporary_path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
     def training(self) -> dict[str, Any] | None:
         """Read the summary that `write_training` wrote; None before the training has ended.

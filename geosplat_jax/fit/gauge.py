@@ -68,18 +68,18 @@ def find_gauge(found: Views, true: Views, bounds: Bounds, *, scales: bool = True
     The similarity, from the world of ``true`` to that of ``found``.
     """
     points = _points_around(bounds)
-    center, half = points.mean(axis=0), 0.5 * float(np.max(bounds[1] - bounds[0]))
-    wanted = _pixels(true, points)
-    first = _aligned_poses(found, true, center, scales=scales)
+    center, half_extent = points.mean(axis=0), 0.5 * float(np.max(bounds[1] - bounds[0]))
+    true_pixels = _pixels(true, points)
+    initial_guess = _aligned_poses(found, true, center, scales=scales)
 
     def similarity(values: np.ndarray) -> Similarity:
-        scale = first.scale * float(np.exp(values[6])) if scales else first.scale
-        rotation = Rotation.from_rotvec(values[:3]).as_matrix() @ first.rotation
-        middle = first.points(center[None])[0] + half * values[3:6]
-        return Similarity(rotation, middle - scale * rotation @ center, scale)
+        scale = initial_guess.scale * float(np.exp(values[6])) if scales else initial_guess.scale
+        rotation = Rotation.from_rotvec(values[:3]).as_matrix() @ initial_guess.rotation
+        moved_center = initial_guess.points(center[None])[0] + half_extent * values[3:6]
+        return Similarity(rotation, moved_center - scale * rotation @ center, scale)
 
     def residual(values: np.ndarray) -> np.ndarray:
-        return np.ravel(_pixels(found, similarity(values).points(points)) - wanted)
+        return np.ravel(_pixels(found, similarity(values).points(points)) - true_pixels)
 
     tolerances = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
     return similarity(least_squares(residual, np.zeros(7 if scales else 6), **tolerances).x)
@@ -94,19 +94,21 @@ def camera_errors(found: Views, true: Views, bounds: Bounds) -> CameraErrors:
     bounds : lo and hi of the object's box, in the world of the true cameras.
     """
     points = _points_around(bounds)
-    turns = found.camera_to_world[:, :3, :3] @ true.camera_to_world[:, :3, :3].transpose(0, 2, 1)
-    positions, wanted = found.camera_to_world[:, :3, 3], true.camera_to_world[:, :3, 3]
-    distance = np.linalg.norm(wanted - points.mean(axis=0), axis=-1)
-    apart = np.linalg.norm(_pixels(found, points) - _pixels(true, points), axis=-1)
+    relative_rotations = found.camera_to_world[:, :3, :3] @ true.camera_to_world[
+        :, :3, :3
+    ].transpose(0, 2, 1)
+    positions, true_positions = found.camera_to_world[:, :3, 3], true.camera_to_world[:, :3, 3]
+    object_distances = np.linalg.norm(true_positions - points.mean(axis=0), axis=-1)
+    pixel_distances = np.linalg.norm(_pixels(found, points) - _pixels(true, points), axis=-1)
     ones = np.ones(len(true))
     exposures = (ones if v.exposure is None else v.exposure for v in (found, true))
     return CameraErrors(
-        rotation_deg=np.degrees(Rotation.from_matrix(turns).magnitude()),
-        center_percent=100 * np.linalg.norm(positions - wanted, axis=-1) / distance,
+        rotation_deg=np.degrees(Rotation.from_matrix(relative_rotations).magnitude()),
+        center_percent=100 * np.linalg.norm(positions - true_positions, axis=-1) / object_distances,
         focal_percent=100 * np.abs(found.intrinsics[:, 0, 0] / true.intrinsics[:, 0, 0] - 1),
         exposure_percent=100 * np.abs(np.divide(*exposures) - 1),
         balance_percent=100 * np.abs(_balance(found) / _balance(true) - 1).max(axis=1),
-        pixels=np.sqrt(np.mean(apart**2, axis=-1)),
+        pixels=np.sqrt(np.mean(pixel_distances**2, axis=-1)),
     )
 
 
@@ -128,14 +130,20 @@ def compare_cameras(
     gauge : similarity by which the true cameras were moved.
     """
     gauge = find_gauge(found, true, bounds, scales=scales)
-    center, half = np.mean(bounds, axis=0), 0.5 * gauge.scale * (bounds[1] - bounds[0])
-    moved = gauge.points(center[None])[0]
+    center, half_extent = np.mean(bounds, axis=0), 0.5 * gauge.scale * (bounds[1] - bounds[0])
+    moved_center = gauge.points(center[None])[0]
     ones = np.ones(len(true))
-    ratio = np.divide(*(ones if v.exposure is None else v.exposure for v in (found, true)))
-    brightness = float(np.exp(np.mean(np.log(ratio))))
-    there = gauge.views(true)
-    there = replace(there, exposure=brightness * (ones if true.exposure is None else true.exposure))
-    return camera_errors(found, there, (moved - half, moved + half)), gauge
+    exposure_ratios = np.divide(
+        *(ones if v.exposure is None else v.exposure for v in (found, true))
+    )
+    brightness = float(np.exp(np.mean(np.log(exposure_ratios))))
+    moved_views = gauge.views(true)
+    moved_views = replace(
+        moved_views, exposure=brightness * (ones if true.exposure is None else true.exposure)
+    )
+    return camera_errors(
+        found, moved_views, (moved_center - half_extent, moved_center + half_extent)
+    ), gauge
 
 
 def change_lines(views: Views, split: RefinedSplit, bounds: Bounds) -> list[str]:
@@ -167,9 +175,9 @@ def change_lines(views: Views, split: RefinedSplit, bounds: Bounds) -> list[str]
     )
     lines.append(f"rms residual {before:.5f} before, {after:.5f} after")
     notes = Counter(camera.note for camera in cameras if not camera.accepted)
-    why = "; ".join(f"{note}: {count}" for note, count in notes.items())
+    reasons = "; ".join(f"{note}: {count}" for note, count in notes.items())
     unchanged = f"{sum(notes.values())} of {len(cameras)} views keep their cameras"
-    return [*lines, f"{unchanged} ({why})" if why else unchanged]
+    return [*lines, f"{unchanged} ({reasons})" if reasons else unchanged]
 
 
 def _balance(views: Views) -> Float[np.ndarray, "V 3"]:
@@ -180,16 +188,16 @@ def _points_around(bounds: Bounds) -> Float[np.ndarray, "14 3"]:
     """Points on a sphere around the object, towards the corners and faces of a cube."""
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     faces = np.concatenate([np.eye(3), -np.eye(3)])
-    around = np.concatenate([corners / np.sqrt(3.0), faces])
-    return np.mean(bounds, axis=0) + _RADIUS * 0.5 * np.max(bounds[1] - bounds[0]) * around
+    directions = np.concatenate([corners / np.sqrt(3.0), faces])
+    return np.mean(bounds, axis=0) + _RADIUS * 0.5 * np.max(bounds[1] - bounds[0]) * directions
 
 
 def _pixels(views: Views, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "V N 2"]:
     """Where points appear in every view."""
     poses = views.world_to_camera
-    seen = np.einsum("vij,nj->vni", poses[:, :3, :3], points) + poses[:, None, :3, 3]
-    seen = np.einsum("vij,vnj->vni", views.intrinsics, seen)
-    return seen[..., :2] / seen[..., 2:]
+    projected = np.einsum("vij,nj->vni", poses[:, :3, :3], points) + poses[:, None, :3, 3]
+    projected = np.einsum("vij,vnj->vni", views.intrinsics, projected)
+    return projected[..., :2] / projected[..., 2:]
 
 
 def _aligned_poses(found: Views, true: Views, center: np.ndarray, *, scales: bool) -> Similarity:
@@ -198,11 +206,11 @@ def _aligned_poses(found: Views, true: Views, center: np.ndarray, *, scales: boo
     left, _, right = np.linalg.svd(np.einsum("vij,vkj->ik", *axes))
     left[:, -1] *= np.linalg.det(left @ right)
     rotation = left @ right
-    positions, wanted = found.camera_to_world[:, :3, 3], true.camera_to_world[:, :3, 3]
-    spread, wanted_spread = (x - x.mean(axis=0) for x in (positions, wanted))
-    size, wanted_size = np.linalg.norm(spread), np.linalg.norm(wanted_spread)
-    is_known = scales and wanted_size > 1e-6 * np.linalg.norm(wanted - center)
-    scale = float(size / wanted_size) if is_known else 1.0
+    positions, true_positions = found.camera_to_world[:, :3, 3], true.camera_to_world[:, :3, 3]
+    spread, true_spread = (x - x.mean(axis=0) for x in (positions, true_positions))
+    size, true_size = np.linalg.norm(spread), np.linalg.norm(true_spread)
+    has_scale = scales and true_size > 1e-6 * np.linalg.norm(true_positions - center)
+    scale = float(size / true_size) if has_scale else 1.0
     return Similarity(
-        rotation, positions.mean(axis=0) - scale * rotation @ wanted.mean(axis=0), scale
+        rotation, positions.mean(axis=0) - scale * rotation @ true_positions.mean(axis=0), scale
     )

@@ -71,14 +71,14 @@ class SideBySide(Runner):
 
     def all(self, *calls: tuple[Any, ...]) -> list[Any]:
         """See `Runner.all`; every second call is made by another thread."""
-        others = in_background(lambda: super(SideBySide, self).all(*calls[1::2]))
+        odd_results = in_background(lambda: super(SideBySide, self).all(*calls[1::2]))
         try:
-            mine = super().all(*calls[::2])
+            even_results = super().all(*calls[::2])
         finally:
-            wait([others])
-        found = [None] * len(calls)
-        found[::2], found[1::2] = mine, others.result()
-        return found
+            wait([odd_results])
+        results = [None] * len(calls)
+        results[::2], results[1::2] = even_results, odd_results.result()
+        return results
 
 
 class SharedBatch(eqx.Module):
@@ -109,12 +109,12 @@ def _cut(tree: Any) -> _Parts:
 @partial(jax.jit, static_argnames=("frozen",))
 def _asset(pipeline: Pipeline, params: Params, frozen: tuple[str, ...]) -> tuple[_Parts, Callable]:
     """Reconstruct the asset; also return the pullback from its arrays to the parameters."""
-    moving, pull, fixed = jax.vjp(
+    asset_arrays, pullback, asset_constants = jax.vjp(
         lambda params: _cut(pipeline.reconstruct(without_gradient(params, frozen))),
         params,
         has_aux=True,
     )
-    return (moving, fixed), pull
+    return (asset_arrays, asset_constants), pullback
 
 
 @jax.jit
@@ -144,15 +144,19 @@ def _lights(
     batch: Batch,
 ) -> tuple[_Parts, Any, Callable]:
     """Prepare the light; also return the carry, and the pullback to the asset and the light."""
-    moving, fixed = asset
+    asset_arrays, asset_constants = asset
 
-    def prepare(moving: Any, light: EnvLight) -> tuple[Any, Any]:
-        lights, carry = pipeline.lights(eqx.combine(moving, fixed), light, seen, batch)
-        changing, rest = _cut(lights)
-        return changing, (rest, carry)
+    def prepare(asset_arrays: Any, light: EnvLight) -> tuple[Any, Any]:
+        lights, carry = pipeline.lights(
+            eqx.combine(asset_arrays, asset_constants), light, seen, batch
+        )
+        light_arrays, light_constants = _cut(lights)
+        return light_arrays, (light_constants, carry)
 
-    changing, pull, (rest, carry) = jax.vjp(prepare, moving, light, has_aux=True)
-    return (changing, rest), carry, pull
+    light_arrays, pullback, (light_constants, carry) = jax.vjp(
+        prepare, asset_arrays, light, has_aux=True
+    )
+    return (light_arrays, light_constants), carry, pullback
 
 
 @jax.jit
@@ -173,19 +177,21 @@ def _view_gradient(
     log_exposure: Float[Array, ""],
     asset: _Parts,
     lights: _Parts,
-    others: Illumination | None,
+    residual_lights: Illumination | None,
     lists: TileLists,
     view: tuple[Batch, Float[Array, ""]],
 ) -> tuple[Any, ViewReport]:
     """Return the loss of a view times its share, its gradient, and the report of the view."""
     batch, share = view
-    residual = pipeline.residual_image(log_exposure, eqx.combine(*asset), others, lists, batch)
+    residual = pipeline.residual_image(
+        log_exposure, eqx.combine(*asset), residual_lights, lists, batch
+    )
 
-    def loss(log_exposure: Array, moving: Any, changing: Any) -> tuple[Array, ViewReport]:
+    def loss(log_exposure: Array, asset_arrays: Any, light_arrays: Any) -> tuple[Array, ViewReport]:
         value, report = pipeline.view_loss(
             log_exposure,
-            eqx.combine(moving, asset[1]),
-            eqx.combine(changing, lights[1]),
+            eqx.combine(asset_arrays, asset[1]),
+            eqx.combine(light_arrays, lights[1]),
             lists,
             batch,
             residual,
@@ -211,43 +217,45 @@ def _back(
     params: Params,
     asset: _Parts,
     lights: _Parts,
-    pulls: tuple[Callable, Callable],
+    pullbacks: tuple[Callable, Callable],
     views: tuple[Any, ViewReport],
     batch: Batch,
     carry: Any,
     frozen: tuple[str, ...],
 ) -> tuple[tuple[Float[Array, ""], LossReport], Params]:
     """Add the terms that depend on no view, and backpropagate to the parameters."""
-    moving, fixed = asset
+    asset_arrays, asset_constants = asset
     (value, (by_exposure, by_asset, by_light)), report = views
 
-    def shared_loss(params: Params, moving: Any, changing: Any) -> tuple[Array, dict[str, Array]]:
+    def shared_loss(
+        params: Params, asset_arrays: Any, light_arrays: Any
+    ) -> tuple[Array, dict[str, Array]]:
         return pipeline.shared_loss(
             without_gradient(params, frozen),
-            eqx.combine(moving, fixed),
-            eqx.combine(changing, lights[1]),
+            eqx.combine(asset_arrays, asset_constants),
+            eqx.combine(light_arrays, lights[1]),
             batch,
         )
 
-    (shared, terms), (direct, from_shared, shared_by_light) = jax.value_and_grad(
+    (shared_value, terms), (direct_gradient, from_shared, shared_by_light) = jax.value_and_grad(
         shared_loss, (0, 1, 2), has_aux=True
-    )(params, moving, lights[0])
-    from_light, light = pulls[1](jax.tree.map(jnp.add, by_light, shared_by_light))
-    (gradient,) = pulls[0](jax.tree.map(lambda *x: sum(x), by_asset, from_light, from_shared))
-    gradient = jax.tree.map(jnp.add, gradient, direct)
+    )(params, asset_arrays, lights[0])
+    from_light, light_gradient = pullbacks[1](jax.tree.map(jnp.add, by_light, shared_by_light))
+    (gradient,) = pullbacks[0](jax.tree.map(lambda *x: sum(x), by_asset, from_light, from_shared))
+    gradient = jax.tree.map(jnp.add, gradient, direct_gradient)
     gradient = replace(
         gradient,
-        light=jax.tree.map(jnp.add, gradient.light, light),
+        light=jax.tree.map(jnp.add, gradient.light, light_gradient),
         log_exposure=gradient.log_exposure + by_exposure,
     )
-    whole = pipeline.report(eqx.combine(moving, fixed), report, terms, carry)
-    return (value + shared, whole), zero_gradient(gradient, frozen)
+    loss_report = pipeline.report(eqx.combine(asset_arrays, asset_constants), report, terms, carry)
+    return (value + shared_value, loss_report), zero_gradient(gradient, frozen)
 
 
 def _divided(capacities: Capacities) -> tuple[dict[str, int], dict[str, int]]:
     """Separate the buffers of a view's lists from all others."""
-    of_lists = {name: size for name, size in capacities.items() if name in LIST_BUFFERS}
-    return of_lists, {n: size for n, size in capacities.items() if n not in LIST_BUFFERS}
+    list_sizes = {name: size for name, size in capacities.items() if name in LIST_BUFFERS}
+    return list_sizes, {n: size for n, size in capacities.items() if n not in LIST_BUFFERS}
 
 
 def value_and_gradient(
@@ -271,23 +279,28 @@ def value_and_gradient(
     (total, report), gradient : as from ``jax.value_and_grad``.
     """
     # Lists of another size need another program to make them, but the asset's program stays.
-    listing, pipeline = (
+    listing_pipeline, pipeline = (
         replace(pipeline, capacities=Capacities(**sizes)) for sizes in _divided(pipeline.capacities)
     )
-    together = run.all if pipeline.uses_rays else partial(Runner.all, run)
-    asset, pull_asset = run(_asset, pipeline, params, frozen)
+    run_all = run.all if pipeline.uses_rays else partial(Runner.all, run)
+    asset, asset_pullback = run(_asset, pipeline, params, frozen)
     numbers = jax.device_put([np.int32(number) for number in range(batch.count)])
     views = [run(_view, batch, number) for number in numbers]
     # Lists are sorted, which uses one core; so they are made side by side in every stage.
-    lists = run.all(*((_lists, listing, asset, view) for view, _ in views))
+    lists = run.all(*((_lists, listing_pipeline, asset, view) for view, _ in views))
     seen = run(_seen, pipeline, asset, lists)
-    lit = (pipeline, asset, params.light, seen, batch)
-    (lights, carry, pull_lights), others = together((_lights, *lit), (_residual_lights, *lit))
-    of_all = (pipeline, params.log_exposure, asset, lights, others)
-    total, *parts = together(
-        *((_view_gradient, *of_all, *one) for one in zip(lists, views, strict=True))
+    light_arguments = (pipeline, asset, params.light, seen, batch)
+    (lights, carry, lights_pullback), residual_lights = run_all(
+        (_lights, *light_arguments), (_residual_lights, *light_arguments)
     )
-    for part in parts:
-        total = run(_plus, total, part)
-    pulls = (pull_asset, pull_lights)
-    return run(_back, pipeline, params, asset, lights, pulls, total, batch, carry, frozen)
+    shared_arguments = (pipeline, params.log_exposure, asset, lights, residual_lights)
+    total, *view_results = run_all(
+        *(
+            (_view_gradient, *shared_arguments, *view_arguments)
+            for view_arguments in zip(lists, views, strict=True)
+        )
+    )
+    for view_result in view_results:
+        total = run(_plus, total, view_result)
+    pullbacks = (asset_pullback, lights_pullback)
+    return run(_back, pipeline, params, asset, lights, pullbacks, total, batch, carry, frozen)

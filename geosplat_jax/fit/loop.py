@@ -174,10 +174,10 @@ class Loop:
             # An error in the plan is raised when that stage begins; until then checkpoints lack the
             # plan.
             return self.upcoming.meta() if self.upcoming.is_planned else None
-        known = self.to_come
-        if known is None or known.stage == self.stage.name:
+        next_stage = self.to_come
+        if next_stage is None or next_stage.stage == self.stage.name:
             return None
-        return {"stage": known.stage, "capacities": dict(known.capacities)}
+        return {"stage": next_stage.stage, "capacities": dict(next_stage.capacities)}
 
     def tree(self) -> dict[str, Any]:
         """All arrays of a checkpoint."""
@@ -194,9 +194,9 @@ class Loop:
         path = self._saved(folder, keep=1)
         # A stage may have ended once before, with another number of steps, if its training was
         # interrupted.
-        for other in folder.glob("checkpoint_*") if path is not None else ():
-            if other != path:
-                other.unlink()
+        for checkpoint in folder.glob("checkpoint_*") if path is not None else ():
+            if checkpoint != path:
+                checkpoint.unlink()
 
     def _saved(self, folder: Path, **options: int) -> Path | None:
         """Write a checkpoint into a folder; None on other hosts than the first."""
@@ -210,9 +210,9 @@ class Loop:
 
     def prepare(self, step: int) -> None:
         """Begin the next stage if ``step`` is its first; set the weights, plan buffers, compile."""
-        stage, known = self.config.stage_at(step), None
+        stage, first_capacities = self.config.stage_at(step), None
         if stage != self.stage:
-            known = self._begin(stage)
+            first_capacities = self._begin(stage)
         self.pipeline = pipeline_at(
             self.pipeline, self.config, self.stage, self._since(step), share=self.share
         )
@@ -223,21 +223,21 @@ class Loop:
             self._announce()
             if self.upcoming is None:  # else its programs are there already
                 release_programs_when_crowded()
-            planned = self.devices.together(lambda: self._planned(known))
-            sizes = self.devices.first_host(dict(planned))
+            planned_sizes = self.devices.together(lambda: self._planned(first_capacities))
+            sizes = self.devices.first_host(dict(planned_sizes))
             self.pipeline = replace(self.pipeline, capacities=Capacities(**sizes))
             self._compile(step)
         elif not self.is_compiled:  # resumed: all is planned, but nothing is compiled
             self._announce()
             self._compile(step)
-        following = self._following(step)
-        if following is not None and self.upcoming is None:
+        next_stage = self._following(step)
+        if next_stage is not None and self.upcoming is None:
             # A copy, since the steps to come consume the buffers of the state.
             params = jax.tree.map(jnp.array, self.params)
             ends = Ends(
                 self.config, self.views, self.pipeline, params, self.devices, self._needed()
             )
-            self.upcoming = Upcoming(following, ends, self.to_come)
+            self.upcoming = Upcoming(next_stage, ends, self.to_come)
 
     def retime(self, config: Config) -> None:
         """Continue with stages of other lengths; steps that are done do not change."""
@@ -267,15 +267,15 @@ class Loop:
         ``known`` : sizes that hold the first splats of the stage; None where the stage must be
         planned.
         """
-        upcoming, noted = self.upcoming, None
+        upcoming, checkpoint_plan = self.upcoming, None
         if self.to_come is not None and self.to_come.stage == self.stage.name:
-            noted, self.to_come = self.to_come, None
+            checkpoint_plan, self.to_come = self.to_come, None
         if upcoming is not None and upcoming.stage.name == self.stage.name:
             self.upcoming = None
             upcoming.compiled.result()
             return upcoming.capacities
-        if noted is not None:
-            return Capacities(**noted.capacities)
+        if checkpoint_plan is not None:
+            return Capacities(**checkpoint_plan.capacities)
         if known is not None:
             return add_rays(self.pipeline, self.params, known)
         return plan_capacities(
@@ -324,8 +324,8 @@ class Loop:
         self.stage = stage
         self.pipeline = build_pipeline(self.config, stage, self.surface)
         self.start(params)
-        first = pipeline_at(self.pipeline, self.config, stage, 0)
-        return continued(pipeline, self._needed(), first, stage)
+        first_pipeline = pipeline_at(self.pipeline, self.config, stage, 0)
+        return continued(pipeline, self._needed(), first_pipeline, stage)
 
     def _needed(self) -> dict[str, int]:
         """Return the largest need of every buffer in the last hundred steps at least."""
@@ -358,8 +358,8 @@ class Loop:
         report, _ = capacity_module.retry(attempt, self.pipeline.capacities)
         if not bool(report.finite):
             raise TrainingError(self._not_finite(step, report))
-        needed = {name: int(count) for name, count in report.loss.usage.items()}
-        self.peak = capacity_module.largest(self.peak, needed)
+        needs = {name: int(count) for name, count in report.loss.usage.items()}
+        self.peak = capacity_module.largest(self.peak, needs)
         if int(report.loss.face_count) == 0:
             self._recover(step)
         elif self.step % _SHRINK_EVERY == 0 and self.stage.steps - self.steps_of_stage >= _WORTH:
@@ -374,15 +374,15 @@ class Loop:
         params = self.params
         if set(self.config.geometry.rate_groups) <= set(self.stage.frozen):
             return
-        following = self.surface.following(params.geometry)
-        if following is None:
+        replacement = self.surface.following(params.geometry)
+        if replacement is None:
             return
         state = self.devices.local(self.state)
-        optimizer = with_geometry(state.optimizer, following.carried)
+        optimizer = with_geometry(state.optimizer, replacement.carried)
         sizes = _sizes(params.geometry)
-        params = replace(params, geometry=following.shape)
+        params = replace(params, geometry=replacement.shape)
         self.state = self.devices.place(replace(state, params=params, optimizer=optimizer))
-        self._put_surface(following.model)
+        self._put_surface(replacement.model)
         self._recompile_for_shape(sizes, step)
 
     def _recompile_for_shape(self, sizes: list[tuple[int, ...]], step: int) -> None:
@@ -414,20 +414,22 @@ class Loop:
 
     def _not_finite(self, step: int, report: StepReport) -> str:
         """Say which term broke, when, and where the last good state is."""
-        bad = [name for name, value in report.loss.terms.items() if not np.isfinite(value)]
-        what = f"the term {', '.join(bad)}" if bad else "a gradient (every term is finite)"
-        where = self.last_checkpoint or "none was written yet"
+        bad_terms = [name for name, value in report.loss.terms.items() if not np.isfinite(value)]
+        culprit = (
+            f"the term {', '.join(bad_terms)}" if bad_terms else "a gradient (every term is finite)"
+        )
+        last_good = self.last_checkpoint or "none was written yet"
         return (
-            f"step {step}: {what} is not finite. Parameters were left as before the step; the "
-            f"last good checkpoint: {where}. Start a new run with lower rates: {self._lower()}."
+            f"step {step}: {culprit} is not finite. Parameters were left as before the step; the "
+            f"last good checkpoint: {last_good}. Start a new run with lower rates: {self._lower()}."
         )
 
     def _lower(self) -> str:
         """Say how to start again with lower rates of the stage that runs."""
         name = self.stage.name
-        again = f"--set stages.{name}.rates.GROUP=..."
+        rate_option = f"--set stages.{name}.rates.GROUP=..."
         is_first = self.stage == self.config.active_stages[0]
-        return again if is_first else f"--from {self.folder} --stage {name} {again}"
+        return rate_option if is_first else f"--from {self.folder} --stage {name} {rate_option}"
 
     def _recover(self, step: int) -> None:
         """Put the stage's first surface back after every face has vanished."""
@@ -541,17 +543,17 @@ def new_loop(
     return loop
 
 
-def _put(loop: Loop, tree: dict[str, Any], described: Description) -> None:
+def _put(loop: Loop, tree: dict[str, Any], description: Description) -> None:
     """Set a loop to a checkpoint."""
     loop.surface = tree["surface"]
-    loop.stage = loop.config.stage(described.stage)
+    loop.stage = loop.config.stage(description.stage)
     pipeline = build_pipeline(loop.config, loop.stage, loop.surface)
-    loop.pipeline = replace(pipeline, capacities=Capacities(**described.capacities))
+    loop.pipeline = replace(pipeline, capacities=Capacities(**description.capacities))
     loop.state = loop.devices.place(tree["state"])
-    loop.planned_for, loop.peak = described.planned_for, described.peak
-    loop.peak_before = described.peak_before
-    loop.recoveries = described.recoveries
-    loop.to_come = described.to_come
+    loop.planned_for, loop.peak = description.planned_for, description.peak
+    loop.peak_before = description.peak_before
+    loop.recoveries = description.recoveries
+    loop.to_come = description.to_come
 
 
 def resumed_loop(
@@ -568,45 +570,47 @@ def resumed_loop(
     TrainingError
         If the settings are not those of the run; and see `new_loop` and `read_checkpoint`.
     """
-    changed = differences(folder.config(), config)
-    if changed:
+    changes = differences(folder.config(), config)
+    if changes:
         raise TrainingError(
             "cannot resume with another configuration; start a new run, or undo: "
-            + "; ".join(changed)
+            + "; ".join(changes)
         )
-    own = latest_checkpoint(folder.checkpoints)
-    before = [stage.name for stage in config.active_stages]
-    ends = _ends(config, folder)
-    path = own
+    own_checkpoint = latest_checkpoint(folder.checkpoints)
+    stage_names = [stage.name for stage in config.active_stages]
+    end_checkpoints = _ends(config, folder)
+    path = own_checkpoint
     # The end of a stage is newer where no checkpoint followed, or where it comes from another run.
-    if ends and (own is None or read_step(own) < read_step(ends[-1])):
-        path = ends[-1]
+    if end_checkpoints and (
+        own_checkpoint is None or read_step(own_checkpoint) < read_step(end_checkpoints[-1])
+    ):
+        path = end_checkpoints[-1]
     if path is None:
         return new_loop(dataset, config, folder, devices, start)
-    tree, described = read_checkpoint(path, config)
+    tree, description = read_checkpoint(path, config)
     loop = new_loop(dataset, config, folder, devices, start, surface=tree["surface"])
-    _put(loop, tree, described)
-    loop.last_checkpoint = own
-    if path != own:
+    _put(loop, tree, description)
+    loop.last_checkpoint = own_checkpoint
+    if path != own_checkpoint:
         return loop
-    number = before.index(loop.stage.name)
+    number = stage_names.index(loop.stage.name)
     if number:
-        ended = latest_checkpoint(folder.end_of(before[number - 1]))
-        if ended is not None:
-            tree, _ = read_checkpoint(ended, config)
+        previous_end = latest_checkpoint(folder.end_of(stage_names[number - 1]))
+        if previous_end is not None:
+            tree, _ = read_checkpoint(previous_end, config)
             loop.fallback = First.of(tree["surface"], tree["state"].params.geometry)
     return loop
 
 
 def _ends(config: Config, folder: RunFolder) -> list[Path]:
     """Return the checkpoints that stages ended with, in order, where they fit the stages' steps."""
-    found = []
+    checkpoints = []
     for stage in config.active_stages:
         path = latest_checkpoint(folder.end_of(stage.name))
         end = config.first_step(stage.name) + stage.steps
         if path is not None and read_step(path) == end:
-            found.append(path)
-    return found
+            checkpoints.append(path)
+    return checkpoints
 
 
 def adopted_loop(
@@ -638,28 +642,28 @@ def adopted_loop(
     number = [stage.name for stage in config.active_stages].index(name)
     if number == 0:
         raise TrainingError(f"{name} is the first stage; there is nothing to take over")
-    last = config.active_stages[number - 1]
-    path = latest_checkpoint(source.end_of(last.name)) or latest_checkpoint(source.checkpoints)
+    previous = config.active_stages[number - 1]
+    path = latest_checkpoint(source.end_of(previous.name)) or latest_checkpoint(source.checkpoints)
     if path is None:
-        raise TrainingError(f"{source} holds no checkpoint to take the stage {last.name} from")
+        raise TrainingError(f"{source} holds no checkpoint to take the stage {previous.name} from")
     try:
-        theirs = config_from_dict(read_description(path).config)
+        source_config = config_from_dict(read_description(path).config)
     except ValueError as error:
         raise TrainingError(f"{path}: {first_line(error)}") from None
-    kept = [stage.name for stage in config.active_stages[:number]]
-    changed = differences(theirs, config, stages=kept)
-    if changed:
+    stage_names = [stage.name for stage in config.active_stages[:number]]
+    changes = differences(source_config, config, stages=stage_names)
+    if changes:
         raise TrainingError(
-            f"up to the stage {last.name}, {source} had other settings: {'; '.join(changed)}; "
+            f"up to the stage {previous.name}, {source} had other settings: {'; '.join(changes)}; "
             "train it anew"
         )
-    tree, described = read_checkpoint(path, theirs)
-    done, end = int(tree["state"].step), config.first_step(name)
-    if described.stage != last.name or done != end:
+    tree, description = read_checkpoint(path, source_config)
+    steps_done, end = int(tree["state"].step), config.first_step(name)
+    if description.stage != previous.name or steps_done != end:
         raise TrainingError(
-            f"{path} is at step {done}, in the stage {described.stage}, not at the end of "
-            f"{last.name} ({end} steps)"
+            f"{path} is at step {steps_done}, in the stage {description.stage}, not at the end of "
+            f"{previous.name} ({end} steps)"
         )
     loop = new_loop(dataset, config, folder, devices)
-    _put(loop, tree, described)
+    _put(loop, tree, description)
     return loop

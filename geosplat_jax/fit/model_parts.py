@@ -185,15 +185,15 @@ class FinerHash(Part):
         """
         grid = config.material.grid
         finest = max(grid.coarsest, grid.finest // 4)
-        smaller = replace(
+        smaller_grid = replace(
             grid,
             levels=max(1, round(0.75 * grid.levels)),
             finest=finest,
             log2_entries=max(grid.log2_entries - 1, (2 * finest).bit_length(), 1),
         )
-        if smaller.total_entries >= grid.total_entries:
+        if smaller_grid.total_entries >= grid.total_entries:
             return config
-        return replace(config, material=replace(config.material, grid=smaller))
+        return replace(config, material=replace(config.material, grid=smaller_grid))
 
 
 class LargerLight(Part):
@@ -206,8 +206,10 @@ class LargerLight(Part):
         """Leave a quarter of the rows and of the columns."""
         light, (rows, columns) = config.light, _FEWEST_TEXELS
         height, width = max(light.height // 4, rows), max(light.width // 8 * 2, columns)
-        smaller = replace(light, height=min(height, light.height), width=min(width, light.width))
-        return replace(config, light=smaller)
+        smaller_light = replace(
+            light, height=min(height, light.height), width=min(width, light.width)
+        )
+        return replace(config, light=smaller_light)
 
 
 class FinerCells(Part):
@@ -221,8 +223,8 @@ class FinerCells(Part):
         geometry = config.geometry
         if not isinstance(geometry, FlexiCubesSettings):
             return config
-        fewer = max(_FEWEST_CELLS, round(_FEWER_CELLS * geometry.resolution))
-        return replace(config, geometry=replace(geometry, resolution=fewer))
+        cell_count = max(_FEWEST_CELLS, round(_FEWER_CELLS * geometry.resolution))
+        return replace(config, geometry=replace(geometry, resolution=cell_count))
 
 
 LADDER: tuple[Part, ...] = (
@@ -249,12 +251,12 @@ def offered_parts(config: Config, by_hand: Collection[str] = ()) -> tuple[Part, 
     config : settings of the largest model.
     by_hand : paths of the settings that were set by hand.
     """
-    present = [part for part in LADDER if part.is_in(config)]
-    decided = {part.name for part in present if part.is_set(by_hand)}
-    for part in reversed(present):  # what is needed stands before what needs it
-        if part.name in decided:
-            decided.update(part.needs)
-    return tuple(part for part in present if part.name not in decided)
+    present_parts = [part for part in LADDER if part.is_in(config)]
+    decided_names = {part.name for part in present_parts if part.is_set(by_hand)}
+    for part in reversed(present_parts):  # what is needed stands before what needs it
+        if part.name in decided_names:
+            decided_names.update(part.needs)
+    return tuple(part for part in present_parts if part.name not in decided_names)
 
 
 def without(config: Config, parts: Iterable[Part]) -> Config:

@@ -38,21 +38,21 @@ def plan_capacities(
     TrainingError
         If the surface needs more than a limit.
     """
-    first = pipeline.surface.first_capacities(params.geometry)
-    splats = _SPLATS_PER_QUAD * first["quads"]
+    surface_sizes = pipeline.surface.first_capacities(params.geometry)
+    splats = _SPLATS_PER_QUAD * surface_sizes["quads"]
     guess = Capacities(
         visible=capacity_module.bucket(int(0.5 * splats)),
         hits=capacity_module.bucket(int(1.7 * splats)),
         chunks=capacity_module.bucket(int(0.33 * splats)),
-    ).resized(**first)
+    ).resized(**surface_sizes)
 
     def attempt(capacities: Capacities) -> tuple[Usage, Usage]:
-        needed = _needs_of(replace(pipeline, capacities=capacities), params, camera)
-        check_limits(needed, limits)
-        return needed, needed
+        needs = _needs_of(replace(pipeline, capacities=capacities), params, camera)
+        check_limits(needs, limits)
+        return needs, needs
 
-    needed, _ = capacity_module.retry(attempt, guess)
-    return Capacities(**{name: _with_headroom(count) for name, count in needed.items()})
+    needs, _ = capacity_module.retry(attempt, guess)
+    return Capacities(**{name: _with_headroom(count) for name, count in needs.items()})
 
 
 def _with_headroom(count: Int[Array, ""]) -> int:
@@ -79,12 +79,12 @@ def add_rays(pipeline: Pipeline, params: Params, known: Capacities) -> Capacitie
     guess = pipeline.surface.first_capacities(params.geometry)
 
     def attempt(capacities: Capacities) -> tuple[Usage, Usage]:
-        needed = _needs_of_rays(replace(pipeline, capacities=capacities), params)
-        return needed, needed
+        needs = _needs_of_rays(replace(pipeline, capacities=capacities), params)
+        return needs, needs
 
-    needed, _ = capacity_module.retry(attempt, Capacities(**{**guess, **known}))
-    names = set(needed) - set(known)
-    return known.resized(**{name: _with_headroom(needed[name]) for name in names})
+    needs, _ = capacity_module.retry(attempt, Capacities(**{**guess, **known}))
+    names = set(needs) - set(known)
+    return known.resized(**{name: _with_headroom(needs[name]) for name in names})
 
 
 _needs_of_asset = jax.jit(lambda pipeline, params: pipeline.reconstruct(params).usage)

@@ -49,8 +49,8 @@ _NEVER = 1e9
 def _rates(surface: float, *, surface_warmup: int = 0, **others: float | Rate) -> dict[str, Rate]:
     """Give the three groups of the isosurface one rate, and every other group its own."""
     rates = dict.fromkeys(_SURFACE, Rate(surface, surface_warmup))
-    named = {n: r if isinstance(r, Rate) else Rate(r) for n, r in others.items()}
-    return rates | named
+    other_rates = {n: r if isinstance(r, Rate) else Rate(r) for n, r in others.items()}
+    return rates | other_rates
 
 
 def _weights(**weights: float | Schedule) -> dict[str, Schedule]:
@@ -271,15 +271,15 @@ def _original_stages(
 def _paper() -> Config:
     """Return the settings of the paper's appendix; its stages are those of the authors' program."""
     photometric = {"l1": 1.0, "ssim": 0.2, "mask": 5.0}
-    others = {
+    other_weights = {
         "smoothness_albedo": 0.03,
         "smoothness_roughness_metallic": 0.03,
         "light": 0.15,
     }
     # The weight of the entropy falls in one ramp, which ends in the middle of the whole training.
     stages = _original_stages(
-        split_sum_weights=_weights(**photometric, entropy=Schedule(0.2, 0.01), **others),
-        monte_carlo_weights=_weights(**photometric, entropy=0.01, **others),
+        split_sum_weights=_weights(**photometric, entropy=Schedule(0.2, 0.01), **other_weights),
+        monte_carlo_weights=_weights(**photometric, entropy=0.01, **other_weights),
         baked_diffuse=False,
         indirect="harmonics",
         points="splats",
@@ -397,27 +397,27 @@ def with_mesh(config: Config, mesh: str | Path | MeshSettings) -> Config:
     ValueError
         If there is no such file, or the configuration starts from another mesh.
     """
-    named = mesh_settings(mesh)
+    new_mesh = mesh_settings(mesh)
     if isinstance(config.geometry, MeshSettings):
-        if config.geometry.digest != named.digest:
+        if config.geometry.digest != new_mesh.digest:
             raise ValueError(
-                f"the settings start from the mesh {config.geometry.path}, but {named.path} was "
+                f"the settings start from the mesh {config.geometry.path}, but {new_mesh.path} was "
                 "given as well; give only one of the two"
             )
         return config
     edge_pixels = _MESH_EDGES.get(config.quality, _MESH_EDGES["standard"])
-    geometry = MeshSettings(path=named.path, digest=named.digest, edge_pixels=edge_pixels)
-    old, is_original = config.geometry, config.preset != "default"
+    geometry = MeshSettings(path=new_mesh.path, digest=new_mesh.digest, edge_pixels=edge_pixels)
+    old_geometry, is_original = config.geometry, config.preset != "default"
     stages = []
     for stage in config.stages:
-        rates = {n: r for n, r in stage.rates.items() if n not in old.rate_groups}
-        weights = {n: w for n, w in stage.weights.items() if n not in old.penalty_names}
-        before = [stage.rates[name] for name in old.rate_groups if name in stage.rates]
-        is_frozen = not before or all(rate.value == 0 for rate in before)
+        rates = {n: r for n, r in stage.rates.items() if n not in old_geometry.rate_groups}
+        weights = {n: w for n, w in stage.weights.items() if n not in old_geometry.penalty_names}
+        old_rates = [stage.rates[name] for name in old_geometry.rate_groups if name in stage.rates]
+        is_frozen = not old_rates or all(rate.value == 0 for rate in old_rates)
         rate = Rate(0.0)
         if not is_frozen:
-            value = _MESH_RATE * max(rate.value for rate in before)
-            warmup = max(rate.warmup for rate in before)
+            value = _MESH_RATE * max(rate.value for rate in old_rates)
+            warmup = max(rate.warmup for rate in old_rates)
             rate = Rate(_MESH_RATE_ORIGINAL if is_original else value, warmup)
             weights |= _weights(**_MESH_WEIGHTS[config.preset])
         if is_original and not is_frozen:
@@ -515,12 +515,12 @@ def between_qualities(
     place : 0 for the first of `QUALITIES`, 1 for the second, 2 for the third, or between them.
     material_prior, mesh, overrides : see `make_config`.
     """
-    below = min(int(place), len(QUALITIES) - 2)
+    level = min(int(place), len(QUALITIES) - 2)
     low, high = (
         make_config("default", quality, material_prior=material_prior, mesh=mesh).to_dict()
-        for quality in QUALITIES[below : below + 2]
+        for quality in QUALITIES[level : level + 2]
     )
-    values = {**_interpolated(low, high, place - below), "quality": BETWEEN}
+    values = {**_interpolated(low, high, place - level), "quality": BETWEEN}
     return _finished(values, mesh, overrides)
 
 

@@ -29,9 +29,9 @@ def _doubled(values: Float[Array, "H W 3"]) -> Float[Array, "2*H 2*W 3"]:
     """Interpolate linearly to twice the rows and columns; columns go around."""
 
     def along(values: Array, before: Array, after: Array, axis: int) -> Array:
-        parts = (_NEAR * values + _FAR * before, _NEAR * values + _FAR * after)
+        halves = (_NEAR * values + _FAR * before, _NEAR * values + _FAR * after)
         shape = tuple(2 * n if k == axis else n for k, n in enumerate(values.shape))
-        return jnp.stack(parts, axis=axis + 1).reshape(shape)
+        return jnp.stack(halves, axis=axis + 1).reshape(shape)
 
     above = jnp.concatenate([values[:1], values[:-1]])
     below = jnp.concatenate([values[1:], values[-1:]])
@@ -85,10 +85,10 @@ def from_levels(steps: Any, share: Float[Array, ""]) -> Any:
     -------
     The same tree, with (H, W, 3) steps as ``light.radiance``.
     """
-    texels, *coarser = steps.light.radiance
-    if coarser:
-        *between, total = coarser
-        for level in reversed(between):
+    texels, *coarser_levels = steps.light.radiance
+    if coarser_levels:
+        *middle_levels, total = coarser_levels
+        for level in reversed(middle_levels):
             total = _doubled(total) + level
         texels = jnp.where(share > 0, share * (texels + _doubled(total)), texels)
     return eqx.tree_at(

@@ -34,11 +34,11 @@ def release_programs_when_crowded() -> bool:
     compiled again.
     """
     try:
-        granted = min(int(Path("/proc/sys/vm/max_map_count").read_text()), _MOST_MAPS)
-        held = Path("/proc/self/maps").read_bytes().count(b"\n")
+        map_limit = min(int(Path("/proc/sys/vm/max_map_count").read_text()), _MOST_MAPS)
+        map_count = Path("/proc/self/maps").read_bytes().count(b"\n")
     except OSError:  # not on Linux
         return False
-    if held < _CROWDED * granted:
+    if map_count < _CROWDED * map_limit:
         return False
     jax.clear_caches()
     return True
@@ -70,7 +70,9 @@ def peak_memory_mb() -> int:
     """
     if jax.default_backend() != "cpu":
         stats = [device.memory_stats() or {} for device in jax.local_devices()]
-        return max(one.get("peak_bytes_in_use", 0) for one in stats) // (1024 * 1024)
+        return max(device_stats.get("peak_bytes_in_use", 0) for device_stats in stats) // (
+            1024 * 1024
+        )
     try:
         import resource
     except ImportError:  # not on Windows

@@ -150,23 +150,23 @@ def begin_stage(params: Params, pipeline: Pipeline, config: Config, stage: Stage
     """
     number = config.active_stages.index(stage)
     key = jax.random.fold_in(jax.random.key(config.run.seed), _STAGE_STREAM - number)
-    before, after = config.active_stages[number - 1].transport, stage.transport
-    goes_on = before.blocked_light == after.blocked_light
-    indirect = IndirectHead(after.indirect_outputs, goes_on)
+    old_transport, new_transport = config.active_stages[number - 1].transport, stage.transport
+    goes_on = old_transport.blocked_light == new_transport.blocked_light
+    indirect = IndirectHead(new_transport.indirect_outputs, goes_on)
     return enter_stage(params, pipeline, stage.enter, stage.splats, indirect, key)
 
 
 def template_params(config: Config, surface: SurfaceModel, shape: Any, stage: Stage) -> Params:
     """Return parameters as they are in a stage, for their structure and sizes."""
     params = initial_params(shape, config, jax.random.key(0))
-    before = None
+    previous_stage = None
     for current in config.active_stages:
-        if before is not None:
-            pipeline = build_pipeline(config, before, surface)
+        if previous_stage is not None:
+            pipeline = build_pipeline(config, previous_stage, surface)
             params = begin_stage(params, pipeline, config, current)
         if current == stage:
             break
-        before = current
+        previous_stage = current
     return params
 
 
@@ -174,23 +174,23 @@ def view_indices(step: int, *, view_count: int, batch_views: int, seed: int) -> 
     """Choose the views of a step, (B,), in shuffled epochs; the same for equal arguments."""
     batch_views = min(batch_views, view_count)
     first = step * batch_views
-    chosen = []
+    indices = []
     for position in range(first, first + batch_views):
         epoch, offset = divmod(position, view_count)
         order = np.random.default_rng([seed, epoch]).permutation(view_count)
-        chosen.append(order[offset])
-    return np.array(chosen)
+        indices.append(order[offset])
+    return np.array(indices)
 
 
 def make_batch(views: Views, step: int, stage: Stage, *, seed: int) -> Batch:
     """Gather the views of a step of the run; the key depends on seed and step alone."""
-    index = view_indices(
+    indices = view_indices(
         step, view_count=len(views.names), batch_views=stage.batch_views, seed=seed
     )
     return Batch(
-        camera=views.camera(index),
-        image=jnp.asarray(views.clipped(index)),
+        camera=views.camera(indices),
+        image=jnp.asarray(views.clipped(indices)),
         key=jax.random.fold_in(jax.random.key(seed), step),
-        views=jnp.asarray(index, jnp.int32),
-        valid=None if views.valid is None else jnp.asarray(views.valid[index]),
+        views=jnp.asarray(indices, jnp.int32),
+        valid=None if views.valid is None else jnp.asarray(views.valid[indices]),
     )

@@ -77,10 +77,12 @@ class MeshSettings(SurfaceSettings, kind="mesh"):
     def notes(self, dataset: Dataset) -> tuple[str, ...]:
         """Say what is done to the file's mesh, and whether both of its sides count."""
         mesh = self.mesh(dataset)
-        what = "open, both sides are surface" if self._is_sheet(mesh) else "one side is surface"
+        sides_note = (
+            "open, both sides are surface" if self._is_sheet(mesh) else "one side is surface"
+        )
         return (
             *mesh.notes,
-            f"start: {len(mesh.vertices)} vertices, {len(mesh.faces)} faces, {what}",
+            f"start: {len(mesh.vertices)} vertices, {len(mesh.faces)} faces, {sides_note}",
         )
 
     def start(self, dataset: Dataset, key: Key[Array, ""]) -> tuple[TriangleMesh, VertexOffsets]:

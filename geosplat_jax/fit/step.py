@@ -108,53 +108,55 @@ def with_geometry(optimizer: Any, change: Callable[[Any], Any]) -> Any:
 def descended(params: Any, directions: Any, rates: dict[str, Float[Array, ""]]) -> Any:
     """Step against the directions, every group of parameters with its own learning rate."""
     leaves, structure = jax.tree.flatten(params)
-    moved = [
+    new_leaves = [
         leaf - rates[name].astype(leaf.dtype) * direction
         for leaf, direction, name in zip(
             leaves, jax.tree.leaves(directions), rate_groups(params), strict=True
         )
     ]
-    return jax.tree.unflatten(structure, moved)
+    return jax.tree.unflatten(structure, new_leaves)
 
 
 def _moved(params: Params, directions: Params, rule: UpdateRule) -> Params:
     """Step against the directions, and keep texels of the light above their lower bound."""
-    params_moved = descended(params, directions, rule.rates)
+    new_params = descended(params, directions, rule.rates)
     # Steps are nearly absolute below the knee and relative above it: a sun is thousands of times
     # brighter than its sky, and Adam's steps do not depend on the brightness. No texel falls below
     # its lower bound.
-    old = params.light.radiance
+    old_radiance = params.light.radiance
     knee = rule.light_knee
-    growth = jnp.where(knee > 0, 1.0 + old / jnp.where(knee > 0, knee, 1.0), 1.0)
-    radiance = old + growth * (params_moved.light.radiance - old)
+    growth = jnp.where(knee > 0, 1.0 + old_radiance / jnp.where(knee > 0, knee, 1.0), 1.0)
+    radiance = old_radiance + growth * (new_params.light.radiance - old_radiance)
     is_learned = "light" not in rule.frozen
     floor = rule.smallest_light if is_learned else -jnp.inf
     light = replace(params.light, radiance=jnp.maximum(radiance, floor))
-    return replace(params_moved, light=light)
+    return replace(new_params, light=light)
 
 
 @partial(jax.jit, donate_argnames=("state",))
 def _update(
     state: TrainState,
     gradient: Params,
-    found: tuple[Float[Array, ""], LossReport],
+    loss_and_report: tuple[Float[Array, ""], LossReport],
     sizes: dict[str, Int[Array, ""]],
     rule: UpdateRule,
 ) -> tuple[TrainState, StepReport]:
     """Move the parameters if every buffer was large enough and every number is finite."""
-    total, report = found
+    total, report = loss_and_report
     with jax.numpy_dtype_promotion("standard"):  # optax raises floats to integer powers
         updates = pyramid.to_levels(gradient)
         directions, optimizer = ADAM.update(updates, state.optimizer)
-    moved = pyramid.from_levels(directions, rule.light_pyramid)
-    params = _moved(state.params, moved, rule)
+    steps = pyramid.from_levels(directions, rule.light_pyramid)
+    params = _moved(state.params, steps, rule)
     finite = jnp.isfinite(total) & jnp.all(
         jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient)])
     )
     fits = capacity_module.fits(report.usage, sizes)
-    advanced = TrainState(params, optimizer, state.step + 1, report.carry)
-    chosen = jax.tree.map(lambda new, old: jnp.where(finite & fits, new, old), advanced, state)
-    return chosen, StepReport(total, replace(report, carry=None), finite, fits)
+    advanced_state = TrainState(params, optimizer, state.step + 1, report.carry)
+    new_state = jax.tree.map(
+        lambda new, old: jnp.where(finite & fits, new, old), advanced_state, state
+    )
+    return new_state, StepReport(total, replace(report, carry=None), finite, fits)
 
 
 def train_step(
@@ -184,6 +186,8 @@ def train_step(
     report : outcome of the step.
     """
     batch = replace(batch, carry=state.carry)
-    found, gradient = value_and_gradient(pipeline, state.params, batch, frozen=rule.frozen, run=run)
-    sizes = jax.device_put({n: np.int32(pipeline.capacities[n]) for n in found[1].usage})
-    return run(_update, state, gradient, found, sizes, rule)
+    loss_and_report, gradient = value_and_gradient(
+        pipeline, state.params, batch, frozen=rule.frozen, run=run
+    )
+    sizes = jax.device_put({n: np.int32(pipeline.capacities[n]) for n in loss_and_report[1].usage})
+    return run(_update, state, gradient, loss_and_report, sizes, rule)

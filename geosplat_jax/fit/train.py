@@ -81,17 +81,17 @@ def stop_requests() -> Iterator[Callable[[], bool]]:
 
     A second signal does not wait: it raises KeyboardInterrupt wherever the program is.
     """
-    request, previous = _StopRequest(), {}
+    request, previous_handlers = _StopRequest(), {}
     for number in (signal.SIGINT, signal.SIGTERM):
         try:
-            previous[number] = signal.signal(number, request)
+            previous_handlers[number] = signal.signal(number, request)
         except ValueError:
             # Only the main thread may handle signals; in any other, they are left alone.
             break
     try:
         yield lambda: request.was_made
     finally:
-        for number, handler in previous.items():
+        for number, handler in previous_handlers.items():
             signal.signal(number, handler)
 
 
@@ -116,7 +116,7 @@ def _record(report: StepReport, step: int, loop: Loop, seconds: float) -> dict[s
 
 
 def _progress(
-    line: Mapping[str, Any], config: Config, seconds: float, left: float | None
+    line: Mapping[str, Any], config: Config, seconds: float, seconds_left: float | None
 ) -> Progress:
     """Return what a listener hears of a step, from its line of metrics.jsonl."""
     return Progress(
@@ -127,7 +127,7 @@ def _progress(
         psnr=line["psnr"],
         splat_count=line["splats"],
         seconds=seconds,
-        seconds_left=left,
+        seconds_left=seconds_left,
     )
 
 
@@ -155,17 +155,17 @@ class _Clock:
         that was timed, times the relative costs of their light transports. Future compilations are
         not included.
         """
-        total, end, known = 0.0, 0, None
+        total, end, seconds_per_cost = 0.0, 0, None
         for stage in self.config.active_stages:
             end += stage.steps
             steps = self._seconds.get(stage.name, [])
             cost = stage.transport.relative_cost
             if len(steps) >= _STEPS_TIMED:
-                known = float(np.median(steps[-50:])) / cost
+                seconds_per_cost = float(np.median(steps[-50:])) / cost
             remaining = min(max(end - done, 0), stage.steps)
-            if remaining and known is None:
+            if remaining and seconds_per_cost is None:
                 return None
-            total += remaining * (known or 0.0) * cost
+            total += remaining * (seconds_per_cost or 0.0) * cost
         return total
 
 
@@ -220,32 +220,32 @@ def fit(
     if pacer is not None and jax.process_count() > 1:
         raise ValueError("a time budget works on one host only; leave it out on several hosts")
     run = RunFolder(folder)
-    writes = devices.is_first_host
-    with ExitStack() as held:
-        stop_requested = held.enter_context(stop_requests())
+    is_writer = devices.is_first_host
+    with ExitStack() as stack:
+        stop_requested = stack.enter_context(stop_requests())
         has_begun = False
         try:
             devices.together(lambda: _require_possible(dataset, config))
             _require_agreement(devices, config, dataset, begin, stop_after)
-            devices.together(lambda: held.enter_context(run.locked()) if writes else None)
+            devices.together(lambda: stack.enter_context(run.locked()) if is_writer else None)
             if not devices.first_host(begin.goes_on(run)):
-                devices.together(lambda: writes and run.require_free(replace=begin.replace))
+                devices.together(lambda: is_writer and run.require_free(replace=begin.replace))
                 loop = devices.together(lambda: begin.first_loop(dataset, config, run, devices))
                 budget = None if pacer is None else pacer.budget
-                if writes:
+                if is_writer:
                     run.begin(dataset, config, replace=begin.replace, budget=budget, model=model)
                     has_begun = True
                 if begin.takes_over:
                     loop.save_end()
             else:
-                devices.together(lambda: writes and run.repoint(dataset))
+                devices.together(lambda: is_writer and run.repoint(dataset))
                 loop = devices.together(
                     lambda: resumed_loop(dataset, config, run, devices, begin.start)
                 )
             _require_same_start(loop)
             try:
-                told = listener if writes else NOBODY
-                return _train(loop, told, pacer, stop_after, stop_requested)
+                active_listener = listener if is_writer else NOBODY
+                return _train(loop, active_listener, pacer, stop_after, stop_requested)
             finally:
                 loop.close()
         except KeyboardInterrupt:
@@ -263,12 +263,12 @@ def fit(
 def _out_of_memory(run: RunFolder, error: Exception) -> str:
     """Say in one line that memory ran out, and what to do."""
     detail = first_line(error) or type(error).__name__
-    again = ""
+    resume_hint = ""
     if run.metric_lines():
-        again = f"; {run} keeps its last checkpoint, for --resume where more is free"
+        resume_hint = f"; {run} keeps its last checkpoint, for --resume where more is free"
     return (
         f"memory ran out ({detail}): lower geometry.resolution, stages.*.transport.*_count, "
-        f"stages.*.batch_views or the size of the images (--downscale){again}"
+        f"stages.*.batch_views or the size of the images (--downscale){resume_hint}"
     )
 
 
@@ -293,29 +293,34 @@ def _require_agreement(
         On every host, with the names of what differs.
     """
     views = dataset.train
-    mine = {
+    own_arguments = {
         "settings": json.loads(json.dumps(config.to_dict())),
         "views": f"{len(views)} of {views.width} x {views.height}",
         "cameras": views.fingerprint() if devices.count > 1 else None,
         "options": [str(option) for option in options],
         "devices": devices.count,
     }
-    theirs = devices.first_host(mine)
-    _require_same(devices, [name for name in mine if mine[name] != theirs[name]])
+    first_arguments = devices.first_host(own_arguments)
+    _require_same(
+        devices, [name for name in own_arguments if own_arguments[name] != first_arguments[name]]
+    )
 
 
 def _require_same_start(loop: Loop) -> None:
     """Refuse hosts that would begin from different states: they have read different files."""
-    mine = [loop.step, loop.stage.name, loop.config.total_steps]
-    theirs = loop.devices.first_host(mine)
-    _require_same(loop.devices, [] if mine == theirs else [f"checkpoint {mine}, not {theirs}"])
+    own_state = [loop.step, loop.stage.name, loop.config.total_steps]
+    first_state = loop.devices.first_host(own_state)
+    _require_same(
+        loop.devices,
+        [] if own_state == first_state else [f"checkpoint {own_state}, not {first_state}"],
+    )
 
 
-def _require_same(devices: Devices, different: list[str]) -> None:
-    if devices.any_host(bool(different)):
-        what = ", ".join(different) or "see the other hosts"
+def _require_same(devices: Devices, differences: list[str]) -> None:
+    if devices.any_host(bool(differences)):
+        details = ", ".join(differences) or "see the other hosts"
         raise TrainingError(
-            f"the hosts were given different things ({what}); start all of them with the same "
+            f"the hosts were given different things ({details}); start all of them with the same "
             "command, on a file system that they share"
         )
 
@@ -328,9 +333,9 @@ def _keep_pace(loop: Loop, pacer: Pacer, seconds: float | None) -> None:
     stage = loop.stage
     if seconds is not None:
         pacer.note(stage.name, seconds)
-    adjusted = pacer.adjusted(loop.config, stage, loop.steps_of_stage)
-    if adjusted is not None:
-        loop.retime(adjusted)
+    adjusted_config = pacer.adjusted(loop.config, stage, loop.steps_of_stage)
+    if adjusted_config is not None:
+        loop.retime(adjusted_config)
 
 
 def _train(
@@ -341,40 +346,46 @@ def _train(
     stop_requested: Callable[[], bool],
 ) -> TrainState:
     """Make steps until all are done, or ``stop_after``."""
-    clock, writes = _Clock(loop.config), loop.devices.is_first_host
+    clock, is_writer = _Clock(loop.config), loop.devices.is_first_host
     loop.on_compile = listener.on_compile
-    if writes:
+    if is_writer:
         loop.folder.keep_lines_before(loop.step)
 
     def last_step() -> int:
         return min(loop.config.total_steps, stop_after or loop.config.total_steps)
 
-    lines = loop.folder.metrics if writes else Path(os.devnull)
-    with lines.open("a", encoding="utf-8") as metrics:
+    metrics_path = loop.folder.metrics if is_writer else Path(os.devnull)
+    with metrics_path.open("a", encoding="utf-8") as metrics_file:
         while (step := loop.step) < last_step():
-            began, loop.has_compiled = time.perf_counter(), False
+            step_start, loop.has_compiled = time.perf_counter(), False
             loop.prepare(step)
             report = loop.advance(step)
-            seconds = time.perf_counter() - began
+            seconds = time.perf_counter() - step_start
             line = _record(report, step, loop, seconds)
-            metrics.write(json.dumps(line) + "\n")
-            metrics.flush()
-            done = step + 1
+            metrics_file.write(json.dumps(line) + "\n")
+            metrics_file.flush()
+            steps_done = step + 1
             if not loop.has_compiled:
                 clock.note(loop.stage.name, seconds)
             if pacer is not None:
                 _keep_pace(loop, pacer, None if loop.has_compiled else seconds)
                 clock.config = loop.config
-            config, last = loop.config, last_step()
-            left = clock.left(done) if pacer is None else pacer.seconds_left
-            listener.on_step(_progress(line, config, clock.elapsed, left))
+            config, final_step = loop.config, last_step()
+            seconds_left = clock.left(steps_done) if pacer is None else pacer.seconds_left
+            listener.on_step(_progress(line, config, clock.elapsed, seconds_left))
             is_stopped = loop.devices.any_host(stop_requested())
-            if done % config.run.checkpoint_every == 0 or done == last or is_stopped:
+            if (
+                steps_done % config.run.checkpoint_every == 0
+                or steps_done == final_step
+                or is_stopped
+            ):
                 loop.save()
-            if is_stopped and done < last:
-                raise Interrupted(f"stopped at step {done}; continue with --resume")
-            every = config.run.preview_every
-            is_early = done == every // _FIRST_PREVIEW
-            if writes and every and (is_early or done % every == 0):
-                listener.on_preview(Trained(config, loop.stage, loop.params, loop.pipeline, done))
+            if is_stopped and steps_done < final_step:
+                raise Interrupted(f"stopped at step {steps_done}; continue with --resume")
+            preview_interval = config.run.preview_every
+            is_early = steps_done == preview_interval // _FIRST_PREVIEW
+            if is_writer and preview_interval and (is_early or steps_done % preview_interval == 0):
+                listener.on_preview(
+                    Trained(config, loop.stage, loop.params, loop.pipeline, steps_done)
+                )
     return loop.devices.local(loop.state)

@@ -74,13 +74,13 @@ def read_description(path: Path) -> Description:
         raise CheckpointError(f"checkpoint {path} is damaged: {first_line(error)}") from None
 
 
-def _template(config: Config, stage: Stage, described: Description) -> dict[str, Any]:
+def _template(config: Config, stage: Stage, description: Description) -> dict[str, Any]:
     """Return a checkpoint's arrays as shapes only."""
 
     def build() -> dict[str, Any]:
-        model, shape = config.geometry.template(described.surface)
+        model, shape = config.geometry.template(description.surface)
         params = template_params(config, model, shape, stage)
-        params = replace(params, splats=stage.splats.template(described.splats))
+        params = replace(params, splats=stage.splats.template(description.splats))
         carry = build_pipeline(config, stage, model).transport.first_carry()
         return {"state": initial_state(params, carry=carry), "surface": model}
 
@@ -98,7 +98,7 @@ def read_checkpoint(path: Path, config: Config) -> tuple[dict[str, Any], Descrip
     Returns
     -------
     tree : arrays, in the layout of `loop.Loop.tree`.
-    described : everything else.
+    description : everything else.
 
     Raises
     ------
@@ -107,24 +107,24 @@ def read_checkpoint(path: Path, config: Config) -> tuple[dict[str, Any], Descrip
     TrainingError
         If its parameters and buffers do not fit into the memory.
     """
-    described = read_description(path)
-    stage = next((s for s in config.active_stages if s.name == described.stage), None)
+    description = read_description(path)
+    stage = next((s for s in config.active_stages if s.name == description.stage), None)
     if stage is None:
         raise CheckpointError(
-            f"checkpoint {path} was written in the stage {described.stage!r}, which its settings "
+            f"checkpoint {path} was written in the stage {description.stage!r}, which its settings "
             "do not have, or not with any steps"
         )
-    require_rendering_memory(config, described.capacities, path)
+    require_rendering_memory(config, description.capacities, path)
     try:
-        like = _template(config, stage, described)
+        template = _template(config, stage, description)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
         # Each kind of surface and of splats reads its own sizes, and may raise any of these errors.
         raise CheckpointError(
-            f"checkpoint {path} is damaged: surface {described.surface} and splats "
-            f"{described.splats} describe no arrays ({type(error).__name__}: {first_line(error)})"
+            f"checkpoint {path} is damaged: surface {description.surface} and splats "
+            f"{description.splats} describe no arrays ({type(error).__name__}: {first_line(error)})"
         ) from error
-    tree, _ = load_checkpoint(path, like=like)
-    return tree, described
+    tree, _ = load_checkpoint(path, like=template)
+    return tree, description
 
 
 @dataclass(frozen=True)
@@ -186,9 +186,9 @@ def load_trained(folder: str | Path | RunFolder, *, stage: str | None = None) ->
         config = config_from_dict(read_description(path).config)
     except ValueError as error:
         raise RunError(f"{path}: {first_line(error)}") from None
-    tree, described = read_checkpoint(path, config)
-    current = config.stage(described.stage)
+    tree, description = read_checkpoint(path, config)
+    current = config.stage(description.stage)
     step = int(tree["state"].step)
     pipeline = build_pipeline(config, current, tree["surface"])
-    pipeline = replace(pipeline, capacities=Capacities(**described.capacities))
+    pipeline = replace(pipeline, capacities=Capacities(**description.capacities))
     return Trained(config, current, tree["state"].params, pipeline, step)

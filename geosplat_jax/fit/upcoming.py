@@ -83,29 +83,33 @@ class Upcoming:
     def __init__(self, stage: Stage, ends: Ends, known: NextStage | None) -> None:
         self.stage = stage
         self._is_wanted = True
-        config, views, before = ends.config, ends.views, ends.pipeline
+        config, views, present_pipeline = ends.config, ends.views, ends.pipeline
         params, devices = ends.params, ends.devices
 
         def first_pipeline(capacities: Capacities) -> Pipeline:
-            pipeline = pipeline_at(build_pipeline(config, stage, before.surface), config, stage, 0)
+            pipeline = pipeline_at(
+                build_pipeline(config, stage, present_pipeline.surface), config, stage, 0
+            )
             return replace(pipeline, capacities=capacities)
 
         def plan() -> Capacities:
             if known is not None and known.stage == stage.name:
                 return Capacities(**known.capacities)
-            first = begin_stage(params, before, config, stage)
+            first_params = begin_stage(params, present_pipeline, config, stage)
             pipeline = first_pipeline(Capacities())
-            carried = continued(before, ends.needed, pipeline, stage)
-            if carried is not None:
-                return add_rays(pipeline, first, carried)
-            return plan_capacities(pipeline, first, views.camera(), limits=config.geometry.limits)
+            carried_capacities = continued(present_pipeline, ends.needed, pipeline, stage)
+            if carried_capacities is not None:
+                return add_rays(pipeline, first_params, carried_capacities)
+            return plan_capacities(
+                pipeline, first_params, views.camera(), limits=config.geometry.limits
+            )
 
         def compile_all() -> None:
             pipeline = first_pipeline(self.capacities)
             carry = pipeline.transport.first_carry()
             state = jax.eval_shape(
                 lambda params: initial_state(
-                    begin_stage(params, before, config, stage), carry=carry
+                    begin_stage(params, present_pipeline, config, stage), carry=carry
                 ),
                 params,
             )

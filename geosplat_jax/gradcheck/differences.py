@@ -177,14 +177,14 @@ class _Flat:
         def value(vector: jax.Array, constants: Any) -> jax.Array:
             return ravel_pytree(problem.function(restore(vector), constants))[0]
 
-        together = _CHUNK if problem.vectorized else None
+        batch_size = _CHUNK if problem.vectorized else None
 
         def values(points: jax.Array, constants: Any) -> jax.Array:
-            return jax.lax.map(lambda p: value(p, constants), points, batch_size=together)
+            return jax.lax.map(lambda p: value(p, constants), points, batch_size=batch_size)
 
         def pull(vector: jax.Array, cotangents: jax.Array, constants: Any) -> jax.Array:
             _, pullback = jax.vjp(lambda p: value(p, constants), vector)
-            return jax.lax.map(lambda c: pullback(c)[0], cotangents, batch_size=together)
+            return jax.lax.map(lambda c: pullback(c)[0], cotangents, batch_size=batch_size)
 
         shapes = jax.eval_shape(problem.function, inputs, constants)
         self.point = np.asarray(point)
@@ -202,12 +202,12 @@ class _Flat:
     def _chunked(self, compiled: Callable[[np.ndarray], jax.Array], rows: np.ndarray) -> np.ndarray:
         """Run a function of `_CHUNK` rows over any number of them."""
         rows = np.asarray(rows, self.point.dtype)
-        missing = -len(rows) % _CHUNK
-        padded = np.concatenate([rows, np.repeat(rows[:1], missing, axis=0)])
-        parts = [
+        padding = -len(rows) % _CHUNK
+        padded = np.concatenate([rows, np.repeat(rows[:1], padding, axis=0)])
+        chunks = [
             np.asarray(compiled(padded[i : i + _CHUNK])) for i in range(0, len(padded), _CHUNK)
         ]
-        return np.concatenate(parts)[: len(rows)]
+        return np.concatenate(chunks)[: len(rows)]
 
 
 def _differences(
@@ -215,37 +215,39 @@ def _differences(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Plain central differences with every step, (D, K, R), and the rounding each may hold."""
     steps = np.array(STEPS)
-    floor = np.finfo(flat.point.dtype).eps
+    epsilon = np.finfo(flat.point.dtype).eps
     signed = np.stack([steps, -steps], axis=1).reshape(-1)
-    plain, rounding = [], []
+    differences, rounding = [], []
     for first in range(0, len(directions), _CHUNK):
         block = directions[first : first + _CHUNK]
         points = flat.point + signed[None, :, None] * block[:, None, :]
         outputs = flat.values(points.reshape(-1, points.shape[-1]))
         outputs = outputs.reshape(len(block), len(steps), 2, -1)
-        change = (outputs[:, :, 0] - outputs[:, :, 1]) @ combinations.T
-        plain.append(change / (2 * steps[:, None]))
-        size = np.max(np.abs(outputs), axis=(0, 1, 2)) @ np.abs(combinations).T
-        rounding.append(np.broadcast_to(floor * size / steps[:, None], change.shape))
-    return np.concatenate(plain), np.concatenate(rounding)
+        changes = (outputs[:, :, 0] - outputs[:, :, 1]) @ combinations.T
+        differences.append(changes / (2 * steps[:, None]))
+        magnitudes = np.max(np.abs(outputs), axis=(0, 1, 2)) @ np.abs(combinations).T
+        rounding.append(np.broadcast_to(epsilon * magnitudes / steps[:, None], changes.shape))
+    return np.concatenate(differences), np.concatenate(rounding)
 
 
-def _settled(plain: np.ndarray, rounding: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _settled(
+    differences: np.ndarray, rounding: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Choose, for every derivative, the extrapolated value that changes least between steps.
 
     Returns values, their uncertainty and the index of the step, each (D, R).
     """
-    extrapolated = (16 * plain[:, 1:] - plain[:, :-1]) / 15
-    doubt = np.abs(extrapolated[:, 1:] - extrapolated[:, :-1]) + rounding[:, 2:]
-    best = np.argmin(doubt, axis=1)[:, None]
-    value = np.take_along_axis(extrapolated[:, 1:], best, axis=1)[:, 0]
-    return value, np.take_along_axis(doubt, best, axis=1)[:, 0], best[:, 0] + 2
+    extrapolated = (16 * differences[:, 1:] - differences[:, :-1]) / 15
+    uncertainty = np.abs(extrapolated[:, 1:] - extrapolated[:, :-1]) + rounding[:, 2:]
+    best_steps = np.argmin(uncertainty, axis=1)[:, None]
+    values = np.take_along_axis(extrapolated[:, 1:], best_steps, axis=1)[:, 0]
+    return values, np.take_along_axis(uncertainty, best_steps, axis=1)[:, 0], best_steps[:, 0] + 2
 
 
 def _relative(error: np.ndarray, norm: float) -> float:
     """L2 of an error in units of ``norm``, absolute where that is zero."""
-    size = float(np.sqrt(np.sum(np.square(error))))
-    return size / norm if norm > 0 else size
+    error_norm = float(np.sqrt(np.sum(np.square(error))))
+    return error_norm / norm if norm > 0 else error_norm
 
 
 def _one_minus_cosine(first: np.ndarray, second: np.ndarray) -> float:
@@ -263,14 +265,14 @@ def _combinations(
 
     Each with a flag that says whether all entries are selected.
     """
-    made = {}
+    combinations = {}
     for name, span in outputs.items():
         count = span.stop - span.start
         is_full = count <= problem.full
         rows = np.zeros((count if is_full else problem.projections, size))
         rows[:, span] = np.eye(count) if is_full else rng.choice([-1.0, 1.0], (len(rows), count))
-        made[name] = (rows, is_full)
-    return made
+        combinations[name] = (rows, is_full)
+    return combinations
 
 
 def _chosen_entries(
@@ -280,11 +282,11 @@ def _chosen_entries(
     count = span.stop - span.start
     if count <= limit:
         return np.arange(span.start, span.stop)
-    size = np.sqrt(np.sum(np.square(gradients[:, span]), axis=0))
-    largest = np.argsort(-size, kind="stable")[: _SAMPLED_ENTRIES // 2]
-    rest = np.setdiff1d(np.arange(count), largest)
-    drawn = rng.choice(rest, _SAMPLED_ENTRIES // 2, replace=False)
-    return span.start + np.sort(np.concatenate([largest, drawn]))
+    magnitudes = np.sqrt(np.sum(np.square(gradients[:, span]), axis=0))
+    largest_entries = np.argsort(-magnitudes, kind="stable")[: _SAMPLED_ENTRIES // 2]
+    other_entries = np.setdiff1d(np.arange(count), largest_entries)
+    random_entries = rng.choice(other_entries, _SAMPLED_ENTRIES // 2, replace=False)
+    return span.start + np.sort(np.concatenate([largest_entries, random_entries]))
 
 
 def _directional_errors(
@@ -301,16 +303,21 @@ def _directional_errors(
     # Directions along a gradient are as long as random ones, along which a typical derivative is
     # the norm of the gradient. Where a few entries hold all of it they are shorter: those entries
     # would otherwise move by hundreds of steps, past kinks of the function.
-    unit = gradients / np.where(norms > 0, norms, 1.0)[:, None]
-    largest = np.max(np.abs(unit), axis=1)
-    lengths = np.minimum(np.sqrt(count), _LARGEST_ENTRY / np.where(norms > 0, largest, 1.0))
+    unit_gradients = gradients / np.where(norms > 0, norms, 1.0)[:, None]
+    largest_entries = np.max(np.abs(unit_gradients), axis=1)
+    lengths = np.minimum(np.sqrt(count), _LARGEST_ENTRY / np.where(norms > 0, largest_entries, 1.0))
     lengths = np.where(norms > 0, lengths, np.sqrt(count))
-    along = np.where(norms[:, None] > 0, lengths[:, None] * unit, 1.0)
-    inside = np.concatenate([along, rng.standard_normal((_RANDOM_DIRECTIONS, count))])
-    directions = np.zeros((len(inside), len(flat.point)))
-    directions[:, span] = scale * inside
-    found = _settled(*_differences(flat, directions, combinations))[0] / scale
-    error = np.abs(found - inside @ gradients.T) / np.where(norms > 0, norms, 1.0)[None, :]
+    gradient_directions = np.where(norms[:, None] > 0, lengths[:, None] * unit_gradients, 1.0)
+    group_directions = np.concatenate(
+        [gradient_directions, rng.standard_normal((_RANDOM_DIRECTIONS, count))]
+    )
+    directions = np.zeros((len(group_directions), len(flat.point)))
+    directions[:, span] = scale * group_directions
+    derivatives = _settled(*_differences(flat, directions, combinations))[0] / scale
+    error = (
+        np.abs(derivatives - group_directions @ gradients.T)
+        / np.where(norms > 0, norms, 1.0)[None, :]
+    )
     rows = np.arange(len(gradients))
     return np.stack([error[rows, rows] / lengths, np.max(error[len(rows) :], axis=0)], axis=1)
 
@@ -335,75 +342,81 @@ def compare(problem: Problem, *, single: bool = True, seed: int = 0) -> list[Com
     flat_single = _Flat(problem, np.float32) if single else None
     inputs, outputs = _spans(flat.inputs), _spans(flat.outputs)
     size = sum(span.stop - span.start for span in outputs.values())
-    names_in, names_out = _entry_names(flat.inputs), _entry_names(flat.outputs)
-    read = _combinations(outputs, size, problem, rng)
-    gradients = {name: flat.pull(rows) for name, (rows, _) in read.items()}
-    singles = {name: flat_single.pull(read[name][0]) for name in read} if flat_single else {}
+    input_names, output_names = _entry_names(flat.inputs), _entry_names(flat.outputs)
+    combinations = _combinations(outputs, size, problem, rng)
+    gradients = {name: flat.pull(rows) for name, (rows, _) in combinations.items()}
+    singles = (
+        {name: flat_single.pull(combinations[name][0]) for name in combinations}
+        if flat_single
+        else {}
+    )
 
-    found = []
+    comparisons = []
     for group, span in inputs.items():
-        compared = [name for name in read if (name, group) not in problem.skip]
-        if not compared:
+        compared_outputs = [name for name in combinations if (name, group) not in problem.skip]
+        if not compared_outputs:
             continue
         scale = problem.scales.get(group, 1.0)
         entries = _chosen_entries(
-            np.concatenate([gradients[name] for name in compared]), span, problem.full, rng
+            np.concatenate([gradients[name] for name in compared_outputs]), span, problem.full, rng
         )
         directions = np.zeros((len(entries), len(flat.point)))
         directions[np.arange(len(entries)), entries] = scale
-        rows = np.concatenate([read[name][0] for name in compared])
-        plain, rounding = (x / scale for x in _differences(flat, directions, rows))
-        mixes = {name: rng.standard_normal(len(read[name][0])) for name in compared}
+        rows = np.concatenate([combinations[name][0] for name in compared_outputs])
+        differences, rounding = (x / scale for x in _differences(flat, directions, rows))
+        coefficients = {
+            name: rng.standard_normal(len(combinations[name][0])) for name in compared_outputs
+        }
         directional = _directional_errors(
             flat,
             span,
             scale,
-            np.stack([mixes[name] @ read[name][0] for name in compared]),
-            np.stack([mixes[name] @ gradients[name][:, span] for name in compared]),
+            np.stack([coefficients[name] @ combinations[name][0] for name in compared_outputs]),
+            np.stack([coefficients[name] @ gradients[name][:, span] for name in compared_outputs]),
             rng,
         )
         start = 0
-        for output, errors in zip(compared, directional, strict=True):
-            combination, is_full = read[output]
-            part = slice(start, start + len(combination))
-            start = part.stop
+        for output, errors in zip(compared_outputs, directional, strict=True):
+            combination, is_full = combinations[output]
+            columns = slice(start, start + len(combination))
+            start = columns.stop
             expected = gradients[output][:, entries].T
-            other = singles[output][:, entries].T if singles else None
-            labels = [names_in[e] for e in entries], names_out[outputs[output]]
-            found.append(
+            single_gradient = singles[output][:, entries].T if singles else None
+            labels = [input_names[e] for e in entries], output_names[outputs[output]]
+            comparisons.append(
                 _summary(
                     (problem.name, output, group),
                     expected,
-                    other,
-                    _settled(plain[:, :, part], rounding[:, :, part]),
+                    single_gradient,
+                    _settled(differences[:, :, columns], rounding[:, :, columns]),
                     (float(errors[0]), float(errors[1])),
                     (labels[0], labels[1] if is_full else None),
                     span.stop - span.start,
-                    plain[:, :, part],
+                    differences[:, :, columns],
                 )
             )
-    return found
+    return comparisons
 
 
 def _summary(
     names: tuple[str, str, str],
     expected: np.ndarray,
     single: np.ndarray | None,
-    settled: tuple[np.ndarray, np.ndarray, np.ndarray],
+    estimates: tuple[np.ndarray, np.ndarray, np.ndarray],
     directional: tuple[float, float],
     labels: tuple[list[str], list[str] | None],
     total: int,
-    plain: np.ndarray,
+    differences: np.ndarray,
 ) -> Comparison:
     """Condense the Jacobians (entries, outputs) of one pair into a row of the table."""
     problem, output, group = names
-    value, doubt, step = settled
+    values, uncertainty, step = estimates
     norm = float(np.sqrt(np.sum(np.square(expected))))
-    error = value - expected
-    matters = np.abs(value) >= 1e-3 * np.max(np.abs(value))
+    error = values - expected
+    is_significant = np.abs(values) >= 1e-3 * np.max(np.abs(values))
     row, column = np.unravel_index(np.argmax(np.abs(error)), error.shape)
     entry_names, output_names = labels
-    read = output_names[column] if output_names else f"(combination {column})"
+    output_label = output_names[column] if output_names else f"(combination {column})"
     return Comparison(
         problem=problem,
         output=output,
@@ -413,13 +426,13 @@ def _summary(
         is_full=output_names is not None and len(entry_names) == total,
         norm=norm,
         relative=_relative(error, norm),
-        one_minus_cosine=_one_minus_cosine(value, expected),
+        one_minus_cosine=_one_minus_cosine(values, expected),
         along_gradient=directional[0],
         random_direction=directional[1],
-        uncertainty=_relative(doubt, norm),
-        step=float(np.median(np.array(STEPS)[step[matters]])),
+        uncertainty=_relative(uncertainty, norm),
+        step=float(np.median(np.array(STEPS)[step[is_significant]])),
         single=None if single is None else _relative(single - expected, norm),
-        worst=f"d {output}{read} / d {group}{entry_names[row]}",
-        worst_values=(float(value[row, column]), float(expected[row, column])),
-        sweep=tuple(_relative(plain[:, k] - expected, norm) for k in range(len(STEPS))),
+        worst=f"d {output}{output_label} / d {group}{entry_names[row]}",
+        worst_values=(float(values[row, column]), float(expected[row, column])),
+        sweep=tuple(_relative(differences[:, k] - expected, norm) for k in range(len(STEPS))),
     )

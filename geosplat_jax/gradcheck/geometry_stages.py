@@ -62,22 +62,22 @@ def isosurface_problems(rng: np.random.Generator) -> list[Problem]:
     def surface(name: str, lattice: Any, inputs: dict[str, Any], *, training: bool) -> Problem:
         def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
             geometry = Geometry(**inputs)
-            found = isosurface(geometry, constants, capacities=capacities, training=training)
+            extraction = isosurface(geometry, constants, capacities=capacities, training=training)
             return {
-                "vertices": found.mesh.vertices,
-                "normals": vertex_normals(found.mesh),
-                "L_dev": found.deviation,
+                "vertices": extraction.mesh.vertices,
+                "normals": vertex_normals(extraction.mesh),
+                "L_dev": extraction.deviation,
                 "entropy": sdf_entropy(geometry, constants),
                 "weight magnitude": weight_magnitude(geometry),
             }
 
         return Problem(f"isosurface, {name}", function, inputs, lattice, full=500)
 
-    banded = _in_band(inputs, _grid())
+    band_arguments = _in_band(inputs, _grid())
     return [
         surface("training", grid, inputs, training=True),
         surface("evaluation", grid, inputs, training=False),
-        surface("band", *banded, training=True),
+        surface("band", *band_arguments, training=True),
     ]
 
 
@@ -152,15 +152,15 @@ def adapter_problems(rng: np.random.Generator) -> list[Problem]:
     def shift(inputs: dict[str, Any], constants: dict[str, Any]) -> dict[str, Any]:
         mesh = _mesh(constants["vertices"])
         splats = face_splats(mesh, constants["normals"], constants=CODE)
-        moved = replace(splats, means=splats.means + inputs["means"])
-        return {"means": shift_inwards(moved, mesh, inputs["fraction"]).means}
+        moved_splats = replace(splats, means=splats.means + inputs["means"])
+        return {"means": shift_inwards(moved_splats, mesh, inputs["fraction"]).means}
 
     rows = 6 * (len(_FACES) + 1)
-    shifted = {"means": np.zeros((rows, 3)), "fraction": rng.uniform(0.2, 0.8, rows)}
+    shift_inputs = {"means": np.zeros((rows, 3)), "fraction": rng.uniform(0.2, 0.8, rows)}
     return [
         faces("paper", PAPER),
         faces("code", CODE),
         Problem("adapter, vertices", vertices, inputs),
         Problem("mesh normals", normals, {"vertices": inputs["vertices"]}),
-        Problem("adapter, inward shift", shift, shifted, inputs),
+        Problem("adapter, inward shift", shift, shift_inputs, inputs),
     ]

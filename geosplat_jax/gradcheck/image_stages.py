@@ -156,9 +156,9 @@ def loss_term_problems(rng: np.random.Generator) -> list[Problem]:
         }
 
     def curves(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
-        mapped = jax.vmap(lambda rgb, exposure: tone_map(rgb, exposure))
+        batched_tone_map = jax.vmap(lambda rgb, exposure: tone_map(rgb, exposure))
         return {
-            "tone map": mapped(inputs["rgb"], inputs["log_exposure"]),
+            "tone map": batched_tone_map(inputs["rgb"], inputs["log_exposure"]),
             "sRGB": linear_to_srgb(inputs["rgb"]),
         }
 

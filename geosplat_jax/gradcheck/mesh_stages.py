@@ -23,8 +23,8 @@ def mesh_problems(rng: np.random.Generator) -> list[Problem]:
     vertices = vertices * rng.uniform(0.8, 1.2, (len(vertices), 1))
     # A bowl, one of whose faces is wound against the others.
     bowl = faces[np.all(vertices[faces][..., 2] < 0.7, axis=1)]
-    used, rows = np.unique(bowl, return_inverse=True)
-    bowl = rows.reshape(-1, 3).astype(np.int32)
+    old_indices, new_indices = np.unique(bowl, return_inverse=True)
+    bowl = new_indices.reshape(-1, 3).astype(np.int32)
     bowl[0] = bowl[0, ::-1]
 
     def problem(name: str, vertices: np.ndarray, faces: np.ndarray, is_sheet: bool) -> Problem:
@@ -49,5 +49,5 @@ def mesh_problems(rng: np.random.Generator) -> list[Problem]:
 
     return [
         problem("mesh, closed", vertices, faces, False),
-        problem("mesh, open, both sides", vertices[used], bowl, True),
+        problem("mesh, open, both sides", vertices[old_indices], bowl, True),
     ]

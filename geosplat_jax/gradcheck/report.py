@@ -109,14 +109,16 @@ def table(rows: Iterable[Comparison], *, sweep: bool = False) -> str:
     by_problem: dict[str, list[Comparison]] = {}
     for row in rows:
         by_problem.setdefault(row.problem, []).append(row)
-    for problem, group in by_problem.items():
+    for problem, problem_rows in by_problem.items():
         lines += ["", problem, _HEADER]
-        for row in group:
+        for row in problem_rows:
             if not _is_independent(row):
                 lines += [_line(row)] + ([_sweep_line(row)] if sweep else [])
-        zero = [f"{row.output} <- {row.group}" for row in group if _is_independent(row)]
-        if zero:
-            lines.append(f"no dependence, zero in both: {'; '.join(zero)}")
+        zero_pairs = [
+            f"{row.output} <- {row.group}" for row in problem_rows if _is_independent(row)
+        ]
+        if zero_pairs:
+            lines.append(f"no dependence, zero in both: {'; '.join(zero_pairs)}")
     return "\n".join(lines[1:])
 
 
@@ -126,7 +128,7 @@ def _single_text(row: Comparison) -> str:
 
 def _line(row: Comparison) -> str:
     entries = f"{row.checked}/{row.total}{' J' if row.is_full else '  '}"
-    found, expected = row.worst_values
+    difference, gradient = row.worst_values
     errors = (
         row.relative,
         row.one_minus_cosine,
@@ -139,7 +141,7 @@ def _line(row: Comparison) -> str:
     verdict = "" if passes(row) else "  FAILS"
     return (
         f"{row.output + ' <- ' + row.group:<36} {entries:>11} {numbers}  "
-        f"{row.worst}: {found:.9g}, {expected:.9g}{verdict}"
+        f"{row.worst}: {difference:.9g}, {gradient:.9g}{verdict}"
     )
 
 

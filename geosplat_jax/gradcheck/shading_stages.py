@@ -73,11 +73,11 @@ def material_problems(rng: np.random.Generator) -> list[Problem]:
         )
         template = init_materials(jax.random.key(0), spec)
         leaves, structure = jax.tree.flatten(template)
-        drawn = [rng.uniform(-1, 1, leaf.shape) for leaf in leaves]
-        params = jax.tree.unflatten(structure, drawn)
+        random_leaves = [rng.uniform(-1, 1, leaf.shape) for leaf in leaves]
+        params = jax.tree.unflatten(structure, random_leaves)
 
         def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
-            found = attributes_at(
+            attributes = attributes_at(
                 MaterialField(
                     albedo_table=inputs["tables"]["albedo"],
                     surface_table=inputs["tables"]["surface"],
@@ -89,12 +89,12 @@ def material_problems(rng: np.random.Generator) -> list[Problem]:
                 unit_box(inputs["points"].dtype),
                 spec=spec,
             )
-            materials = found.materials
+            materials = attributes.materials
             return {
                 "albedo": materials.albedo,
                 "roughness": materials.roughness,
                 "metallic": materials.metallic,
-                "shift": found.shift,
+                "shift": attributes.shift,
             }
 
         inputs = {
@@ -115,13 +115,13 @@ def model_problems(rng: np.random.Generator) -> list[Problem]:
     """Differentiate shaded points in all inputs, for every model of the material."""
     count, operators = 7, prefilter_operators(_LIGHT)
     points, table = rng.uniform(-0.9, 0.9, (count, 3)), fg_table(cosines=9, roughnesses=7)
-    drawn = _surface_points(rng, count)
+    surface_inputs = _surface_points(rng, count)
     texels = rng.uniform(0.1, 2.0, (_LIGHT.height, _LIGHT.width, 3))
 
     def model(name: str, **kind: Any) -> Problem:
         spec = MaterialSpec(grid=_GRID, albedo_hidden=(5,), surface_hidden=(5,), bias=True, **kind)
         leaves, structure = jax.tree.flatten(init_materials(jax.random.key(0), spec))
-        varied = [rng.uniform(-1, 1, leaf.shape) for leaf in leaves]
+        random_leaves = [rng.uniform(-1, 1, leaf.shape) for leaf in leaves]
 
         def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
             operators, table, points = constants
@@ -135,9 +135,9 @@ def model_problems(rng: np.random.Generator) -> list[Problem]:
             return {"rgb": shaded.rgb}
 
         inputs = {
-            "parameters": jax.tree.unflatten(structure, varied),
-            "normals": drawn["normals"],
-            "wo": drawn["wo"],
+            "parameters": jax.tree.unflatten(structure, random_leaves),
+            "normals": surface_inputs["normals"],
+            "wo": surface_inputs["wo"],
             "texels": texels,
         }
         return Problem(f"model, {name}", function, inputs, (operators, table, points))
@@ -231,12 +231,12 @@ def transport_problems(rng: np.random.Generator) -> list[Problem]:
     inputs = _surface_points(rng, count)
     inputs["texels"] = rng.uniform(0.1, 2.0, (_LIGHT.height, _LIGHT.width, 3))
     normals = jnp.asarray(inputs["normals"], dtype)
-    none, every = jnp.full(count, -1, jnp.int32), jnp.ones(count, bool)
-    points = SurfacePoints(jnp.zeros_like(normals), normals, normals, none, every)
+    no_faces, all_points = jnp.full(count, -1, jnp.int32), jnp.ones(count, bool)
+    points = SurfacePoints(jnp.zeros_like(normals), normals, normals, no_faces, all_points)
     sampler = light_sampler(EnvLight(jnp.asarray(inputs["texels"], dtype)))
-    drawn = draw_samples(jax.random.key(0), points, sampler, None, counts=counts)
-    ends = rng.integers(BLOCKED, faces, drawn.hits.shape)
-    samples = replace(drawn, hits=jnp.asarray(ends, jnp.int32))
+    base_samples = draw_samples(jax.random.key(0), points, sampler, None, counts=counts)
+    hits = rng.integers(BLOCKED, faces, base_samples.hits.shape)
+    samples = replace(base_samples, hits=jnp.asarray(hits, jnp.int32))
 
     def problem(kind: str) -> Problem:
         def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
@@ -264,8 +264,10 @@ def transport_problems(rng: np.random.Generator) -> list[Problem]:
 
         model = INDIRECT_MODELS[kind]
         shape = (faces if model.reads_faces else count, model.outputs or 3)
-        varied = {**inputs, "indirect": rng.uniform(0.2, 1.0, shape)}
-        return Problem(f"transport, indirect {kind}", function, varied, (points, samples, sampler))
+        problem_inputs = {**inputs, "indirect": rng.uniform(0.2, 1.0, shape)}
+        return Problem(
+            f"transport, indirect {kind}", function, problem_inputs, (points, samples, sampler)
+        )
 
     return [problem(kind) for kind in ("constant", "harmonics", "traced", "radiometric")]
 
@@ -281,25 +283,27 @@ def path_problems(rng: np.random.Generator) -> list[Problem]:
     inputs = _surface_points(rng, faces)
     inputs["texels"] = rng.uniform(0.1, 2.0, (_LIGHT.height, _LIGHT.width, 3))
     outward = inputs["normals"]
-    first = inputs.pop("wo")
+    view_directions = inputs.pop("wo")
     hit = rng.integers(0, faces, (vertices, count))
     hit[1:, ::3] = -1
 
     def away(rows: np.ndarray) -> np.ndarray:
         """Directions that leave the faces."""
-        drawn = unit_vectors(rng, count)
-        below = np.sum(drawn * outward[rows], axis=1, keepdims=True) < 0
-        return np.where(below, -drawn, drawn)
+        directions = unit_vectors(rng, count)
+        is_below = np.sum(directions * outward[rows], axis=1, keepdims=True) < 0
+        return np.where(is_below, -directions, directions)
 
-    legs, wo = [], first[hit[0]]
+    legs, wo = [], view_directions[hit[0]]
     for k in range(vertices):
         # The next vertex must see this one: its face is turned towards where the path comes from.
-        onward = away(hit[k])
+        next_directions = away(hit[k])
         if k + 1 < vertices:
-            onward = -away(hit[k + 1])
+            next_directions = -away(hit[k + 1])
         weights = rng.uniform(0.5, 2.0, (3, count))
-        made = (away(hit[k]), weights[0], onward, weights[1], weights[2])
-        legs.append(Leg(jnp.asarray(hit[k], jnp.int32), *(jnp.asarray(x, dtype) for x in made)))
+        leg_arrays = (away(hit[k]), weights[0], next_directions, weights[1], weights[2])
+        legs.append(
+            Leg(jnp.asarray(hit[k], jnp.int32), *(jnp.asarray(x, dtype) for x in leg_arrays))
+        )
 
     def function(inputs: dict[str, Any], constants: Any) -> dict[str, Any]:
         legs, wo, outward = constants

@@ -136,19 +136,19 @@ def loss_problems(rng: np.random.Generator) -> list[Problem]:
     ``material.position_gradient`` and without the shift the gradient is the whole derivative, and
     all of it is compared.
     """
-    off = tuple(
+    smoothness_off = tuple(
         f"stages.split_sum.weights.smoothness_{name}=0" for name in ("albedo", "roughness_metallic")
     )
-    trained = make_config(overrides=(*_SETTINGS, *off))
-    opened = make_config(
+    trained_config = make_config(overrides=(*_SETTINGS, *smoothness_off))
+    open_config = make_config(
         overrides=(*_SETTINGS, "material.position_gradient=true", "material.has_shift=false")
     )
-    outputs = ("total", *trained.stages[0].weights)
-    detached = {(name, group) for name in outputs for group in ("sdf", "deform", "weights")}
-    problem = _loss_problem("loss, as trained", trained, rng)
+    outputs = ("total", *trained_config.stages[0].weights)
+    detached_pairs = {(name, group) for name in outputs for group in ("sdf", "deform", "weights")}
+    problem = _loss_problem("loss, as trained", trained_config, rng)
     return [
-        replace(problem, skip=frozenset(detached)),
-        _loss_problem("loss, all paths", opened, rng),
+        replace(problem, skip=frozenset(detached_pairs)),
+        _loss_problem("loss, all paths", open_config, rng),
     ]
 
 
@@ -178,12 +178,12 @@ def refinement_problems(rng: np.random.Generator) -> list[Problem]:
     corner = np.full(3, 0.6)
     grid = fit_grid((-corner, corner), 6)
     grid = Grid(jnp.asarray(grid.origin), jnp.asarray(grid.cell_size), grid.shape)
-    first, last = (
+    first_pipeline, last_pipeline = (
         replace(build_pipeline(config, stage, FlexiCubes(grid)), capacities=_CAPACITIES)
         for stage in config.active_stages
     )
-    first, params = jax.tree.map(_doubled, (first, _params(rng, grid, config)))
-    start = begin_stage(params, first, config, config.stage("refine"))
+    first_pipeline, params = jax.tree.map(_doubled, (first_pipeline, _params(rng, grid, config)))
+    start = begin_stage(params, first_pipeline, config, config.stage("refine"))
     splats = jax.tree.map(
         lambda x: x + 0.03 * rng.uniform(-1, 1, x.shape) * (jnp.abs(x) + 0.1), start.splats
     )
@@ -211,7 +211,7 @@ def refinement_problems(rng: np.random.Generator) -> list[Problem]:
         "tables": start.material.albedo_table,
         "light": start.light.radiance,
     }
-    constants = (_batch(rng), last, start)
+    constants = (_batch(rng), last_pipeline, start)
     return [Problem("refinement", function, inputs, constants, full=100, vectorized=False)]
 
 

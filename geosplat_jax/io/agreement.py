@@ -50,18 +50,20 @@ def agreement(views: Views, bounds: Bounds) -> Float[np.ndarray, " V"]:
     (V,) in [0, 1]; NaN for a view whose mask is empty.
     """
     lo, hi = (np.asarray(corner, np.float64) for corner in bounds)
-    left_out = np.stack([_left_out(views, view, lo, hi) for view in range(len(views))])
-    total = left_out.sum(0)
-    allowed = _DISSENT * (len(views) - 1)
+    carved_voxels = np.stack([_left_out(views, view, lo, hi) for view in range(len(views))])
+    carve_counts = carved_voxels.sum(0)
+    dissent_limit = _DISSENT * (len(views) - 1)
     shares = np.full(len(views), np.nan)
     for view in range(len(views)):
         # The hull is enlarged by one voxel, because rays pass between the centres of voxels.
-        hull = np.asarray(maximum_filter(total - left_out[view] <= allowed, size=3), bool)
+        hull = np.asarray(
+            maximum_filter(carve_counts - carved_voxels[view] <= dissent_limit, size=3), bool
+        )
         points = _points_on_rays(views, view, lo, hi)
         if len(points):
-            place = ((points - lo) / (hi - lo) * _VOXELS).astype(int)
-            is_inside = ((place >= 0) & (place < _VOXELS)).all(-1)
-            x, y, z = np.moveaxis(np.clip(place, 0, _VOXELS - 1), -1, 0)
+            voxel_indices = ((points - lo) / (hi - lo) * _VOXELS).astype(int)
+            is_inside = ((voxel_indices >= 0) & (voxel_indices < _VOXELS)).all(-1)
+            x, y, z = np.moveaxis(np.clip(voxel_indices, 0, _VOXELS - 1), -1, 0)
             shares[view] = (hull[x, y, z] & is_inside).any(1).mean()
     return shares
 
@@ -71,20 +73,20 @@ def agreement_lines(views: Views, bounds: Bounds) -> list[str]:
     if len(views) < 3:
         return ["agreement:  not checked, it takes three views"]
     shares = agreement(views, bounds)
-    known = shares[np.isfinite(shares)]
-    if not len(known):
+    finite = shares[np.isfinite(shares)]
+    if not len(finite):
         return ["agreement:  not checked, every mask is empty"]
     lines = [
-        f"agreement:  {known.mean():.1%} of the rays through masks meet the hull of the other "
-        f"views (worst view {known.min():.1%})"
+        f"agreement:  {finite.mean():.1%} of the rays through masks meet the hull of the other "
+        f"views (worst view {finite.min():.1%})"
     ]
     wrong = [k for k in np.argsort(shares) if shares[k] < AGREES]
     if wrong:
-        shown = ", ".join(f"{views.names[k]} ({shares[k]:.0%})" for k in wrong[:5])
+        examples = ", ".join(f"{views.names[k]} ({shares[k]:.0%})" for k in wrong[:5])
         more = ", ..." if len(wrong) > 5 else ""
         lines.append(
             f"warning: silhouettes, poses and lenses of {len(wrong)} of {len(views)} views do not "
-            f"agree with the others: {shown}{more}; check their masks, their order and the axes "
+            f"agree with the others: {examples}{more}; check their masks, their order and the axes "
             "and field of view of the cameras"
         )
     return lines
@@ -98,8 +100,8 @@ def hollow_line(views: Views, bounds: Bounds) -> str:
         hull = hull_sdf(*cameras, views.alphas, grid, valid=views.valid)
     except ValueError as error:
         return f"hollows:    not looked for: {error}"
-    judged = hollow_candidates(*cameras, views.images, hull, grid, valid=views.valid)
-    sizes = [int(part.region.sum()) for part in judged if part.is_hollow]
+    candidates = hollow_candidates(*cameras, views.images, hull, grid, valid=views.valid)
+    sizes = [int(candidate.region.sum()) for candidate in candidates if candidate.is_hollow]
     if not sizes:
         return "hollows:    none that the colours of the photographs show"
     share = sum(sizes) / max(int((hull < 0.0).sum()), 1)
@@ -118,8 +120,8 @@ def _left_out(views: Views, view: int, lo: np.ndarray, hi: np.ndarray) -> Bool[n
     column, row = np.where(is_seen[:, None], pixels, 0).astype(int).T
     if views.valid is not None:
         is_seen &= np.asarray(views.valid[view])[row, column] > 0
-    is_out = is_seen & ~views.mask(view)[row, column]
-    return is_out.reshape(_VOXELS, _VOXELS, _VOXELS)
+    is_outside = is_seen & ~views.mask(view)[row, column]
+    return is_outside.reshape(_VOXELS, _VOXELS, _VOXELS)
 
 
 def _points_on_rays(
@@ -127,8 +129,8 @@ def _points_on_rays(
 ) -> Float[np.ndarray, "R S 3"]:
     """Place S world points along each of the rays through R pixels of a mask, around the box."""
     rows, columns = np.nonzero(views.mask(view))
-    chosen = np.unique(np.linspace(0, len(rows) - 1, _RAYS).astype(int)) if len(rows) else []
-    pixels = np.stack([columns[chosen] + 0.5, rows[chosen] + 0.5, np.ones(len(chosen))], -1)
+    indices = np.unique(np.linspace(0, len(rows) - 1, _RAYS).astype(int)) if len(rows) else []
+    pixels = np.stack([columns[indices] + 0.5, rows[indices] + 0.5, np.ones(len(indices))], -1)
     pose = views.world_to_camera[view]
     rays = pixels @ np.linalg.inv(views.intrinsics[view]).T @ pose[:3, :3]
     center = views.camera_to_world[view, :3, 3]

@@ -53,10 +53,12 @@ class Similarity:
     def views(self, views: Views) -> Views:
         """Move cameras with the world, so that moved points keep their pixels."""
         poses = views.world_to_camera
-        moved = poses.copy()
-        moved[:, :3, :3] = poses[:, :3, :3] @ self.rotation.T
-        moved[:, :3, 3] = self.scale * poses[:, :3, 3] - moved[:, :3, :3] @ self.translation
-        return replace(views, camera_to_world=camera_to_world_of(moved))
+        moved_poses = poses.copy()
+        moved_poses[:, :3, :3] = poses[:, :3, :3] @ self.rotation.T
+        moved_poses[:, :3, 3] = (
+            self.scale * poses[:, :3, 3] - moved_poses[:, :3, :3] @ self.translation
+        )
+        return replace(views, camera_to_world=camera_to_world_of(moved_poses))
 
 
 def align_world(
@@ -109,23 +111,23 @@ def up_direction(
     moments, directions = np.linalg.eigh(right.T @ right / len(right))
     if moments[1] < _SMALLEST_TURN:
         return _perpendicular(mean, directions[:, 2])
-    found = directions[:, 0]
+    direction = directions[:, 0]
     for _ in range(_REWEIGHTINGS):
-        weights = 1.0 / np.maximum(np.abs(right @ found), _SMALLEST_TILT)
-        found = np.linalg.eigh((right * weights[:, None]).T @ right)[1][:, 0]
-    return found if found @ mean >= 0.0 else -found
+        weights = 1.0 / np.maximum(np.abs(right @ direction), _SMALLEST_TILT)
+        direction = np.linalg.eigh((right * weights[:, None]).T @ right)[1][:, 0]
+    return direction if direction @ mean >= 0.0 else -direction
 
 
 def _perpendicular(vector: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Return the part of ``vector`` at right angles to ``normal``, of length one."""
-    across = vector - normal * (normal @ vector)
-    length = np.linalg.norm(across)
+    component = vector - normal * (normal @ vector)
+    length = np.linalg.norm(component)
     if length < 1e-6:
         raise AlignmentError(
             "the first photograph was taken with the camera on its side; hold it level, or leave "
             "the photograph out"
         )
-    return across / length
+    return component / length
 
 
 def require_spread(centers: np.ndarray, points: np.ndarray) -> None:

@@ -94,23 +94,27 @@ class FineSurface:
         outward = facing(corners)
         tree = KDTree(corners.mean(axis=1))
         count = min(_CANDIDATES, len(self.faces))
-        places, normals = np.empty((2, len(points), 3), np.float32)
-        for first in range(0, len(points), _POINTS_PER_CALL):
-            chosen = slice(first, first + _POINTS_PER_CALL)
-            asked = (points[chosen] - middle) * scale
-            rows = tree.query(asked, k=count)[1].reshape(len(asked), count)
-            repeated = np.repeat(asked, count, axis=0)
-            close = trimesh.triangles.closest_point(corners[rows.ravel()], repeated)
-            distance = ((close - repeated) ** 2).sum(-1).reshape(-1, count)
-            looks_away = np.einsum("nkd,nd->nk", outward[rows], towards[chosen]) <= 0
+        positions, normals = np.empty((2, len(points), 3), np.float32)
+        for start in range(0, len(points), _POINTS_PER_CALL):
+            chunk = slice(start, start + _POINTS_PER_CALL)
+            queries = (points[chunk] - middle) * scale
+            rows = tree.query(queries, k=count)[1].reshape(len(queries), count)
+            repeated_queries = np.repeat(queries, count, axis=0)
+            closest_points = trimesh.triangles.closest_point(
+                corners[rows.ravel()], repeated_queries
+            )
+            distance = ((closest_points - repeated_queries) ** 2).sum(-1).reshape(-1, count)
+            looks_away = np.einsum("nkd,nd->nk", outward[rows], towards[chunk]) <= 0
             distance[looks_away & ~looks_away.all(axis=1, keepdims=True)] = np.inf
-            best = np.arange(len(asked)) * count + distance.argmin(axis=1)
-            face = rows.ravel()[best]
-            places[chosen] = close[best] / scale + middle
-            weights = trimesh.triangles.points_to_barycentric(corners[face], close[best])
+            nearest_indices = np.arange(len(queries)) * count + distance.argmin(axis=1)
+            face = rows.ravel()[nearest_indices]
+            positions[chunk] = closest_points[nearest_indices] / scale + middle
+            weights = trimesh.triangles.points_to_barycentric(
+                corners[face], closest_points[nearest_indices]
+            )
             blended = np.einsum("nk,nkd->nd", weights, self.normals[self.faces[face]])
-            normals[chosen] = unit(blended)
-        return places, normals
+            normals[chunk] = unit(blended)
+        return positions, normals
 
 
 def unit(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
@@ -144,29 +148,31 @@ def vertex_tangents(
     -------
     (V, 4) float32: unit tangent, and sign.
     """
-    corners, places = np.asarray(vertices, np.float64)[faces], np.asarray(uv, np.float64)[faces]
-    edges, steps = corners[:, 1:] - corners[:, :1], places[:, 1:] - places[:, :1]
-    steps[..., 1] *= -1.0  # from downwards to upwards
-    area = steps[:, 0, 0] * steps[:, 1, 1] - steps[:, 1, 0] * steps[:, 0, 1]
-    sign = np.sign(area)
+    corners, corner_uv = np.asarray(vertices, np.float64)[faces], np.asarray(uv, np.float64)[faces]
+    edges, uv_edges = corners[:, 1:] - corners[:, :1], corner_uv[:, 1:] - corner_uv[:, :1]
+    uv_edges[..., 1] *= -1.0  # from downwards to upwards
+    area = uv_edges[:, 0, 0] * uv_edges[:, 1, 1] - uv_edges[:, 1, 0] * uv_edges[:, 0, 1]
+    orientation = np.sign(area)
     # The directions are scaled by areas on the texture; only the sign of an area matters.
-    towards_u = sign[:, None] * (steps[:, 1, 1:] * edges[:, 0] - steps[:, 0, 1:] * edges[:, 1])
-    tangents, side = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
+    u_directions = orientation[:, None] * (
+        uv_edges[:, 1, 1:] * edges[:, 0] - uv_edges[:, 0, 1:] * edges[:, 1]
+    )
+    tangents, handedness = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
     for corner in range(3):
         rows = faces[:, corner]
         normal = normals[rows]
-        before, after = (
+        to_previous, to_next = (
             unit(_across(corners[:, (corner + step) % 3] - corners[:, corner], normal))
             for step in (2, 1)
         )
-        angle = np.arccos(np.clip((before * after).sum(-1), -1.0, 1.0))
-        np.add.at(tangents, rows, angle[:, None] * unit(_across(towards_u, normal)))
-        np.add.at(side, rows, angle * sign)
+        angle = np.arccos(np.clip((to_previous * to_next).sum(-1), -1.0, 1.0))
+        np.add.at(tangents, rows, angle[:, None] * unit(_across(u_directions, normal)))
+        np.add.at(handedness, rows, angle * orientation)
     # Where texture coordinates define no direction, any one orthogonal to the normal will do.
     axis = np.eye(3)[np.abs(normals).argmin(axis=1)]
-    lost = (tangents**2).sum(-1, keepdims=True) <= 0
-    tangents = unit(np.where(lost, np.cross(normals, axis), tangents))
-    signs = np.where(side < 0, -1.0, 1.0)[:, None]
+    is_undefined = (tangents**2).sum(-1, keepdims=True) <= 0
+    tangents = unit(np.where(is_undefined, np.cross(normals, axis), tangents))
+    signs = np.where(handedness < 0, -1.0, 1.0)[:, None]
     return np.concatenate([tangents, signs], axis=-1).astype(np.float32)
 
 
@@ -193,7 +199,7 @@ def in_tangent_space(
     -------
     (N, 3) unit; components along tangent, bitangent and normal.
     """
-    up, along = unit(normals), unit(tangents[:, :3])
-    across = np.sign(tangents[:, 3:]) * np.cross(up, along)
-    parts = [(wanted * axis).sum(-1) for axis in (along, across, up)]
-    return unit(np.stack(parts, axis=-1))
+    unit_normals, unit_tangents = unit(normals), unit(tangents[:, :3])
+    bitangents = np.sign(tangents[:, 3:]) * np.cross(unit_normals, unit_tangents)
+    components = [(wanted * axis).sum(-1) for axis in (unit_tangents, bitangents, unit_normals)]
+    return unit(np.stack(components, axis=-1))

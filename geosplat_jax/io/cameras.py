@@ -80,8 +80,8 @@ def write_cameras(path: Path, splits: Mapping[str, RefinedSplit]) -> None:
             for name, split in splits.items()
         },
     }
-    with written_aside(path) as aside:
-        aside.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    with written_aside(path) as temporary_path:
+        temporary_path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def _to_plain(camera: RefinedCamera) -> dict[str, Any]:
@@ -149,8 +149,8 @@ def read_cameras(path: str | Path) -> dict[str, RefinedSplit]:
             for name, split in content["splits"].items()
         }
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        what = f"no {error}" if isinstance(error, KeyError) else str(error)
-        raise SceneError(f"{path} is damaged: {what}; refine the cameras again") from None
+        problem = f"no {error}" if isinstance(error, KeyError) else str(error)
+        raise SceneError(f"{path} is damaged: {problem}; refine the cameras again") from None
 
 
 def _from_plain(values: Mapping[str, Any]) -> RefinedCamera:
@@ -158,8 +158,10 @@ def _from_plain(values: Mapping[str, Any]) -> RefinedCamera:
     fx, fy, cx, cy = (float(values[name]) for name in ("fx", "fy", "cx", "cy"))
     exposure = float(values["exposure"])
     balance = np.array(values.get("white_balance", [1.0, 1.0, 1.0]), np.float64)
-    turn = pose[:3, :3] @ pose[:3, :3].T if pose.shape == (4, 4) else np.zeros((3, 3))
-    is_rigid = np.allclose(turn, np.eye(3), atol=_RIGID_TOLERANCE) and np.isfinite(pose).all()
+    gram_matrix = pose[:3, :3] @ pose[:3, :3].T if pose.shape == (4, 4) else np.zeros((3, 3))
+    is_rigid = (
+        np.allclose(gram_matrix, np.eye(3), atol=_RIGID_TOLERANCE) and np.isfinite(pose).all()
+    )
     if not is_rigid or np.linalg.det(pose[:3, :3]) < 0 or pose[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
         raise ValueError("a world_to_camera is not a rigid 4 x 4 matrix")
     if not (min(fx, fy, exposure) > 0 and np.isfinite([fx, fy, cx, cy, exposure]).all()):

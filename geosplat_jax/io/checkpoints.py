@@ -99,7 +99,7 @@ def save_checkpoint(folder: str | Path, step: int, *, tree: Any, meta: dict, kee
         raise CheckpointError(f"step must be >= 0 and keep >= 1, got {step} and {keep}")
     folder = Path(folder)
     path = folder / f"checkpoint_{step:08d}.npz"
-    aside = folder / f".{path.name}.partial"
+    temporary_path = folder / f".{path.name}.partial"
     members, leaves = _pack(tree)
     try:
         header = json.dumps({"format": FORMAT, "step": step, "meta": meta, "leaves": leaves})
@@ -108,24 +108,24 @@ def save_checkpoint(folder: str | Path, step: int, *, tree: Any, meta: dict, kee
     members[_META] = np.frombuffer(header.encode(), np.uint8)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _write_npz(aside, members)
-        problem = _damage(aside)
+        _write_npz(temporary_path, members)
+        problem = _damage(temporary_path)
         if problem:
             raise OSError(f"reading it back failed: {problem}")
-        os.replace(aside, path)
+        os.replace(temporary_path, path)
         _sync_folder(folder)
     except OSError as error:
-        _remove(aside)
+        _remove(temporary_path)
         raise CheckpointError(
             f"cannot write checkpoint {path}: {error}; earlier checkpoints are untouched. Free "
             "disk space or choose another folder, then resume"
         ) from error
     except BaseException:
-        _remove(aside)
+        _remove(temporary_path)
         raise
-    earlier = [old for old in _listed(folder) if _step(old) < step]
-    for old in earlier[keep - 1 :]:
-        _remove(old)
+    older_paths = [old_path for old_path in _listed(folder) if _step(old_path) < step]
+    for old_path in older_paths[keep - 1 :]:
+        _remove(old_path)
     return path
 
 
@@ -151,14 +151,14 @@ def load_checkpoint(path: str | Path, *, like: Any) -> tuple[Any, dict]:
     """
     path = Path(path)
     header = _header(path)
-    named, structure = jax.tree_util.tree_flatten_with_path(like)
-    wanted = {_leaf_name(key_path): leaf for key_path, leaf in named}
-    _require_same_leaves(path, set(header.leaves), set(wanted))
+    keyed_leaves, structure = jax.tree_util.tree_flatten_with_path(like)
+    expected_leaves = {_leaf_name(key_path): leaf for key_path, leaf in keyed_leaves}
+    _require_same_leaves(path, set(header.leaves), set(expected_leaves))
     try:
         with zipfile.ZipFile(path) as archive:
             leaves = [
                 _unpack(path, name, header.leaves[name], _read_member(archive, name), leaf)
-                for name, leaf in wanted.items()
+                for name, leaf in expected_leaves.items()
             ]
     except _DAMAGE as error:
         raise CheckpointError(f"checkpoint {path} is damaged ({error}); use another") from error
@@ -212,57 +212,57 @@ def _is_key(leaf: Any) -> bool:
 
 def _pack(tree: Any) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
     """Turn leaves into plain arrays, and describe them."""
-    members, described = {}, {}
+    members, descriptions = {}, {}
     for key_path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         name = _leaf_name(key_path)
         if _is_key(leaf):
             generator = str(jax.random.key_impl(leaf))
             array = np.asarray(jax.random.key_data(leaf))
-            described[name] = {"key": generator, "shape": list(leaf.shape)}
+            descriptions[name] = {"key": generator, "shape": list(leaf.shape)}
         else:
             array = np.asarray(leaf)
             if array.dtype.hasobject or array.dtype.kind in "USmM":
                 raise CheckpointError(f"leaf {name} must be an array of numbers, got {leaf!r}")
-            described[name] = {"dtype": array.dtype.name, "shape": list(array.shape)}
+            descriptions[name] = {"dtype": array.dtype.name, "shape": list(array.shape)}
             if array.dtype.kind == "V":  # an extension type such as bfloat16
                 array = array.view(_CARRIERS[array.dtype.itemsize])
         members[name] = array
-    return members, described
+    return members, descriptions
 
 
-def _unpack(path: Path, name: str, described: _Leaf, array: np.ndarray, like: Any) -> Any:
+def _unpack(path: Path, name: str, description: _Leaf, array: np.ndarray, like: Any) -> Any:
     """Turn a plain array back into a leaf, checking it against ``like``."""
-    stored = {"key": described.key, "dtype": described.dtype, "shape": list(described.shape)}
-    wanted: dict[str, Any] = {"shape": list(np.shape(like))}
+    actual = {"key": description.key, "dtype": description.dtype, "shape": list(description.shape)}
+    expected: dict[str, Any] = {"shape": list(np.shape(like))}
     if _is_key(like):
-        wanted["key"] = str(jax.random.key_impl(like)) if isinstance(like, jax.Array) else None
+        expected["key"] = str(jax.random.key_impl(like)) if isinstance(like, jax.Array) else None
     else:
-        wanted["dtype"] = np.dtype(getattr(like, "dtype", np.asarray(like).dtype)).name
-    for what in ("key", "dtype", "shape"):
-        is_open = what == "key" and what in wanted and wanted[what] is None
-        if not is_open and wanted.get(what) != stored[what]:
+        expected["dtype"] = np.dtype(getattr(like, "dtype", np.asarray(like).dtype)).name
+    for trait in ("key", "dtype", "shape"):
+        is_open = trait == "key" and trait in expected and expected[trait] is None
+        if not is_open and expected.get(trait) != actual[trait]:
             raise CheckpointError(
-                f"leaf {name} of {path} has {what} {stored[what]}, but the run has "
-                f"{wanted.get(what)}; resume with the configuration the checkpoint was made with"
+                f"leaf {name} of {path} has {trait} {actual[trait]}, but the run has "
+                f"{expected.get(trait)}; resume with the configuration the checkpoint was made with"
             )
-    if described.key is not None:
-        return jax.random.wrap_key_data(jnp.asarray(array), impl=described.key)
-    array = array.view(np.dtype(jnp.dtype(described.dtype))).reshape(described.shape)
+    if description.key is not None:
+        return jax.random.wrap_key_data(jnp.asarray(array), impl=description.key)
+    array = array.view(np.dtype(jnp.dtype(description.dtype))).reshape(description.shape)
     if isinstance(like, bool | int | float | complex):
         return array.item()
     return array if isinstance(like, np.ndarray | np.generic) else jnp.asarray(array)
 
 
-def _require_same_leaves(path: Path, stored: set[str], wanted: set[str]) -> None:
-    missing, extra = sorted(wanted - stored), sorted(stored - wanted)
+def _require_same_leaves(path: Path, stored_names: set[str], expected_names: set[str]) -> None:
+    missing, extra = sorted(expected_names - stored_names), sorted(stored_names - expected_names)
     if missing or extra:
-        parts = [
-            f"{word} {len(names)} leaves ({', '.join(names[:3])}{', ...' if names[3:] else ''})"
-            for word, names in (("lacks", missing), ("has besides", extra))
+        clauses = [
+            f"{verb} {len(names)} leaves ({', '.join(names[:3])}{', ...' if names[3:] else ''})"
+            for verb, names in (("lacks", missing), ("has besides", extra))
             if names
         ]
         raise CheckpointError(
-            f"checkpoint {path} does not fit the run: it {' and '.join(parts)}; resume with the "
+            f"checkpoint {path} does not fit the run: it {' and '.join(clauses)}; resume with the "
             "configuration it was made with"
         )
 
@@ -338,10 +338,10 @@ def _damage(path: Path) -> str | None:
         with zipfile.ZipFile(path) as archive:
             for info in archive.infolist():
                 _require_plain(info)
-            bad = archive.testzip()
+            bad_member = archive.testzip()
     except (CheckpointError, *_DAMAGE) as error:
         return str(error)
-    return None if bad is None else f"checksum of {bad}"
+    return None if bad_member is None else f"checksum of {bad_member}"
 
 
 def _listed(folder: Path) -> list[Path]:

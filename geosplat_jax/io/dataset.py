@@ -155,7 +155,7 @@ def load_dataset(
     root = Path(path).expanduser()
     if not root.is_dir():
         raise MissingFileError(f"scene folder {root} does not exist")
-    asked = {
+    arguments = {
         "layout": layout,
         "train_views": train_views,
         "test_views": test_views,
@@ -165,24 +165,24 @@ def load_dataset(
     listing = LAYOUTS[layout].list_frames(root, light=light)
     warnings: list[str] = []
     cameras = None if cameras is None else Path(cameras).expanduser()
-    refined = {} if cameras is None else read_cameras(cameras)
+    refined_splits = {} if cameras is None else read_cameras(cameras)
     splits: dict[str, Views] = {}
     for split, frames, limit in (
         ("train", listing.train, train_views),
         ("test", listing.test, test_views),
     ):
-        chosen = _spread(frames, limit, f"{split}_views")
+        split_frames = _spread(frames, limit, f"{split}_views")
         if not mask_files:
-            chosen = [replace(frame, mask=None) for frame in chosen]
-        if not chosen and split == "test":
+            split_frames = [replace(frame, mask=None) for frame in split_frames]
+        if not split_frames and split == "test":
             warnings.append("there are no test views; nothing can be evaluated")
             splits[split] = no_views(splits["train"])
             continue
-        splits[split] = _load_split(split, chosen, listing, downscale, warnings)
-        if split in refined:
-            splits[split] = with_cameras(splits[split], refined[split], str(cameras))
-    if bare := [name for name, views in splits.items() if not views.has_masks]:
-        warnings.append(f"the {' and '.join(bare)} views have no masks; {_NEEDS_MASKS}")
+        splits[split] = _load_split(split, split_frames, listing, downscale, warnings)
+        if split in refined_splits:
+            splits[split] = with_cameras(splits[split], refined_splits[split], str(cameras))
+    if unmasked_splits := [name for name, views in splits.items() if not views.has_masks]:
+        warnings.append(f"the {' and '.join(unmasked_splits)} views have no masks; {_NEEDS_MASKS}")
     box = object_bounds(splits["train"]) if bounds is None else _checked_bounds(bounds)
     _check_box(splits, box, warnings)
     return Dataset(
@@ -201,7 +201,11 @@ def load_dataset(
             "light": light,
             "bounds": None if bounds is None else np.ravel(bounds).tolist(),
             **({} if cameras is None else _recorded(cameras)),
-            **{name: asked[name] for name, usual in READING if asked.get(name, usual) != usual},
+            **{
+                name: arguments[name]
+                for name, default in READING
+                if arguments.get(name, default) != default
+            },
         },
     )
 
@@ -257,7 +261,7 @@ def load_recorded(path: str | Path, options: Mapping[str, Any]) -> Dataset:
         path,
         bounds=None if bounds is None else (bounds[:3], bounds[3:]),
         cameras=cameras,
-        **{name: options.get(name, usual) for name, usual in READING},
+        **{name: options.get(name, default) for name, default in READING},
     )
 
 
@@ -307,15 +311,17 @@ def choose_downscale(path: str | Path, cells: int, **options: Any) -> Downscale:
     layout = _layout_of(root, options.get("layout"))
     listing = LAYOUTS[layout].list_frames(root, light=options.get("light"))
     shortest = min(min(image_size(frame.image)) for frame in (*listing.train, *listing.test))
-    coarse = max(1, shortest // _COARSE_PIXELS)
+    coarse_factor = max(1, shortest // _COARSE_PIXELS)
     # Refined cameras belong to images of one size, and would change the factor little.
-    own = ("cameras", "train_views", "test_views")
-    reading = {name: value for name, value in options.items() if name not in own}
-    found = load_dataset(path, **reading, downscale=coarse, train_views=_COARSE_VIEWS, test_views=1)
-    lo, hi = found.bounds
-    views = found.train
+    excluded_names = ("cameras", "train_views", "test_views")
+    reading_options = {name: value for name, value in options.items() if name not in excluded_names}
+    dataset = load_dataset(
+        path, **reading_options, downscale=coarse_factor, train_views=_COARSE_VIEWS, test_views=1
+    )
+    lo, hi = dataset.bounds
+    views = dataset.train
     distance = np.linalg.norm(views.camera_to_world[:, :3, 3] - 0.5 * (lo + hi), axis=1)
-    pixel = float(np.median(distance / (coarse * views.intrinsics[:, 0, 0])))
+    pixel = float(np.median(distance / (coarse_factor * views.intrinsics[:, 0, 0])))
     cell = float((hi - lo).max()) / cells
     factor = int(np.clip(cell / (_PIXELS_OF_A_CELL * pixel), 1, shortest))
     size = "stay in full size" if factor == 1 else f"are reduced by {factor}"
@@ -430,8 +436,8 @@ def _check_pixels(views: Views, split: str) -> None:
 def _check_masks(views: Views, split: str, warnings: list[str]) -> None:
     if not views.has_masks:
         return
-    covered = views.coverage > 0.0
-    if not covered.any():
+    has_object = views.coverage > 0.0
+    if not has_object.any():
         raise SceneError(
             f"the mask of every {split} view is empty (no alpha above {COVERED}); check the alpha "
             "channel of the images, or the mask files, which must be 255 on the object"
@@ -441,9 +447,13 @@ def _check_masks(views: Views, split: str, warnings: list[str]) -> None:
             f"{split}: no pixel of any view is opaque (alpha of {OPAQUE} or more); masks must be "
             "255 on the object, and not the colour of a label"
         )
-    if not covered.all():
-        empty = [name for name, has in zip(views.names, covered, strict=True) if not has]
-        warnings.append(f"{split}: the mask of {len(empty)} views is empty, {some_names(empty)}")
+    if not has_object.all():
+        empty_names = [
+            name for name, is_covered in zip(views.names, has_object, strict=True) if not is_covered
+        ]
+        warnings.append(
+            f"{split}: the mask of {len(empty_names)} views is empty, {some_names(empty_names)}"
+        )
     if (views.coverage == 1.0).all():
         warnings.append(f"{split}: every mask is full; the images may not be cut out at all")
 
@@ -461,9 +471,9 @@ def _check_box(splits: Mapping[str, Views], box: Bounds, warnings: list[str]) ->
 
 def _check_sides(views: Views, bounds: Bounds, warnings: list[str]) -> None:
     """Warn of cameras that see the object from one side only."""
-    away = views.camera_to_world[:, :3, 3] - 0.5 * (bounds[0] + bounds[1])
-    away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-    widest = np.degrees(np.arccos(np.clip((away @ away.T).min(), -1.0, 1.0)))
+    directions = views.camera_to_world[:, :3, 3] - 0.5 * (bounds[0] + bounds[1])
+    directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
+    widest = np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1.0, 1.0)))
     if len(views) > 1 and widest < _NARROW_DEG:
         warnings.append(
             f"train: all {len(views)} cameras see the object from one side, within {widest:.1f} "
@@ -517,5 +527,5 @@ def _spread(frames: Sequence[Frame], limit: int | None, name: str) -> Sequence[F
         return frames
     if limit < 1:
         raise SceneError(f"{name} must be at least 1, got {limit}")
-    chosen = np.round(np.linspace(0, len(frames) - 1, limit)).astype(int)
-    return [frames[index] for index in chosen]
+    indices = np.round(np.linspace(0, len(frames) - 1, limit)).astype(int)
+    return [frames[index] for index in indices]

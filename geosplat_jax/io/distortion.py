@@ -127,22 +127,22 @@ def pinhole_lookup(
 ) -> Lookup:
     """Find the pixels of a pinhole with the same intrinsics and size in a photograph."""
     fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
-    across = (np.arange(width) + 0.5 - cx) / fx
-    along = (np.arange(height) + 0.5 - cy) / fy
-    reach = float(np.hypot(np.abs(across).max(), np.abs(along).max()))
+    column_x = (np.arange(width) + 0.5 - cx) / fx
+    row_y = (np.arange(height) + 0.5 - cy) / fy
+    reach = float(np.hypot(np.abs(column_x).max(), np.abs(row_y).max()))
     limit = largest_radius(distortion, reach)
     shape = (height, width)
-    found = Lookup(np.empty(shape), np.empty(shape), np.empty(shape, bool))
+    lookup = Lookup(np.empty(shape), np.empty(shape), np.empty(shape, bool))
     # A few rows at a time, as in `resample_at`.
     for start in range(0, height, _ROWS_AT_ONCE):
-        part = found.part(slice(start, start + _ROWS_AT_ONCE))
-        x, y = np.meshgrid(across, along[start : start + _ROWS_AT_ONCE])
-        shown_x, shown_y = distortion.distort(x, y)
-        part.columns[:], part.rows[:] = fx * shown_x + cx, fy * shown_y + cy
-        inside = (part.columns >= 0.0) & (part.columns <= width)
-        inside &= (part.rows >= 0.0) & (part.rows <= height)
-        part.inside[:] = inside & (np.hypot(x, y) <= limit)
-    return found
+        strip = lookup.part(slice(start, start + _ROWS_AT_ONCE))
+        x, y = np.meshgrid(column_x, row_y[start : start + _ROWS_AT_ONCE])
+        distorted_x, distorted_y = distortion.distort(x, y)
+        strip.columns[:], strip.rows[:] = fx * distorted_x + cx, fy * distorted_y + cy
+        inside = (strip.columns >= 0.0) & (strip.columns <= width)
+        inside &= (strip.rows >= 0.0) & (strip.rows <= height)
+        strip.inside[:] = inside & (np.hypot(x, y) <= limit)
+    return lookup
 
 
 def photograph_lookup(
@@ -164,12 +164,12 @@ def photograph_lookup(
         # Iterates are kept within the radius up to which the distortion is invertible.
         limit = largest_radius(distortion, _WIDEST * float(np.hypot(x, y).max()))
         for _ in range(_INVERSIONS):
-            shown_x, shown_y = distortion.distort(x, y)
-            off_x, off_y = target_x - shown_x, target_y - shown_y
-            is_settled = np.hypot(fx * off_x, fy * off_y) < _INVERTED
+            distorted_x, distorted_y = distortion.distort(x, y)
+            residual_x, residual_y = target_x - distorted_x, target_y - distorted_y
+            is_settled = np.hypot(fx * residual_x, fy * residual_y) < _INVERTED
             if is_settled.all():
                 break
-            x, y = x + off_x, y + off_y
+            x, y = x + residual_x, y + residual_y
             shrink = np.minimum(1.0, limit / np.maximum(np.hypot(x, y), limit))
             x, y = x * shrink, y * shrink
     columns, rows = fx * x + cx, fy * y + cy
@@ -188,8 +188,8 @@ def resample(
     values = np.asarray(pixels, np.float32)
     if values.shape[-1] == 4:
         values = np.concatenate([values[..., :3] * values[..., 3:], values[..., 3:]], -1)
-    flat = values.reshape(-1, values.shape[-1])
-    return resample_at(lambda index: flat[index], values.shape, lookup)
+    flat_values = values.reshape(-1, values.shape[-1])
+    return resample_at(lambda index: flat_values[index], values.shape, lookup)
 
 
 def resample_at(
@@ -208,17 +208,17 @@ def resample_at(
     -------
     (rows, columns, C) float32; colour of four channels has straight alpha.
     """
-    sampled = np.zeros((*lookup.rows.shape, shape[-1]), np.float32)
+    samples = np.zeros((*lookup.rows.shape, shape[-1]), np.float32)
     # A few rows at a time, so that temporary arrays stay in the processor's cache.
-    for start in range(0, len(sampled), _ROWS_AT_ONCE):
+    for start in range(0, len(samples), _ROWS_AT_ONCE):
         rows = slice(start, start + _ROWS_AT_ONCE)
-        part = _bilinear(pixels_at, shape, lookup.rows[rows], lookup.columns[rows])
+        strip = _bilinear(pixels_at, shape, lookup.rows[rows], lookup.columns[rows])
         if shape[-1] == 4:
-            covered = part[..., 3:] > _SMALLEST_ALPHA
-            divisor = np.where(covered, part[..., 3:], 1.0)
-            part[..., :3] = np.where(covered, part[..., :3] / divisor, 0.0)
-        sampled[rows] = np.where(lookup.inside[rows, :, None], part, 0.0)
-    return sampled
+            is_covered = strip[..., 3:] > _SMALLEST_ALPHA
+            divisor = np.where(is_covered, strip[..., 3:], 1.0)
+            strip[..., :3] = np.where(is_covered, strip[..., :3] / divisor, 0.0)
+        samples[rows] = np.where(lookup.inside[rows, :, None], strip, 0.0)
+    return samples
 
 
 def _bilinear(
@@ -231,16 +231,22 @@ def _bilinear(
     height, width = shape[:2]
     row = np.clip(rows - 0.5, 0.0, height - 1.0)
     column = np.clip(columns - 0.5, 0.0, width - 1.0)
-    top = np.minimum(row.astype(np.int64), max(height - 2, 0))
-    left = np.minimum(column.astype(np.int64), max(width - 2, 0))
-    down = (row - top).astype(np.float32)[..., None]
-    right = (column - left).astype(np.float32)[..., None]
-    corner = top * width + left
-    step, below = min(1, width - 1), width * min(1, height - 1)
-    upper = pixels_at(corner) * (1.0 - right) + pixels_at(corner + step) * right
-    corner += below
-    lower = pixels_at(corner) * (1.0 - right) + pixels_at(corner + step) * right
-    return upper * (1.0 - down) + lower * down
+    top_row = np.minimum(row.astype(np.int64), max(height - 2, 0))
+    left_column = np.minimum(column.astype(np.int64), max(width - 2, 0))
+    row_fraction = (row - top_row).astype(np.float32)[..., None]
+    column_fraction = (column - left_column).astype(np.float32)[..., None]
+    corner = top_row * width + left_column
+    right_offset, lower_offset = min(1, width - 1), width * min(1, height - 1)
+    upper = (
+        pixels_at(corner) * (1.0 - column_fraction)
+        + pixels_at(corner + right_offset) * column_fraction
+    )
+    corner += lower_offset
+    lower = (
+        pixels_at(corner) * (1.0 - column_fraction)
+        + pixels_at(corner + right_offset) * column_fraction
+    )
+    return upper * (1.0 - row_fraction) + lower * row_fraction
 
 
 def resample_valid(

@@ -70,17 +70,17 @@ def _evaluate_materials(
     count = len(points)
     size = min(count, _SAMPLES_PER_CALL)
     values = np.empty((count, 5), np.float32)
-    for first in range(0, count, size):
-        rows = np.minimum(np.arange(first, first + size), count - 1)
+    for start in range(0, count, size):
+        rows = np.minimum(np.arange(start, start + size), count - 1)
         albedo, roughness, metallic = (np.asarray(x) for x in sample_materials(points[rows]))
         if albedo.shape != (size, 3) or roughness.shape != (size,) or metallic.shape != (size,):
             raise ValueError(
                 f"sample_materials must return albedo ({size}, 3), roughness ({size},) and "
                 f"metallic ({size},), got {albedo.shape}, {roughness.shape}, {metallic.shape}"
             )
-        kept = min(size, count - first)
+        row_count = min(size, count - start)
         block = np.concatenate([albedo, roughness[:, None], metallic[:, None]], axis=-1)
-        values[first : first + kept] = block[:kept]
+        values[start : start + row_count] = block[:row_count]
     if not np.all(np.isfinite(values)):
         raise ValueError("sample_materials returned values that are not finite")
     return np.clip(values, 0.0, 1.0)
@@ -119,21 +119,21 @@ def _checked_mesh(
         )
     if not np.all(np.isfinite(vertices[faces])):
         raise ValueError("vertices must be finite, some used by a face are not")
-    kept = faces[nondegenerate(vertices, faces)] if len(faces) else faces
-    if len(kept) == 0:
+    valid_faces = faces[nondegenerate(vertices, faces)] if len(faces) else faces
+    if len(valid_faces) == 0:
         raise ValueError(
             f"the mesh must have a face of positive area, got {len(faces)} faces; "
             "an empty surface cannot be exported"
         )
-    closed = is_closed(kept)
-    flipped = closed and signed_volume(vertices, kept) < 0
+    closed = is_closed(valid_faces)
+    flipped = closed and signed_volume(vertices, valid_faces) < 0
     if flipped:
-        kept = kept[:, ::-1]
+        valid_faces = valid_faces[:, ::-1]
         # Normals that were computed from inverted faces point inward too; correct ones are kept.
-        normals = np.where(_agrees(vertices, kept, normals), normals, -normals)
-    used, rows = np.unique(kept, return_inverse=True)
-    info = {"dropped_faces": len(faces) - len(kept), "closed": closed, "flipped": flipped}
-    return vertices[used], rows.reshape(-1, 3).astype(np.int32), normals[used], info
+        normals = np.where(_agrees(vertices, valid_faces, normals), normals, -normals)
+    vertex_rows, rows = np.unique(valid_faces, return_inverse=True)
+    info = {"dropped_faces": len(faces) - len(valid_faces), "closed": closed, "flipped": flipped}
+    return vertices[vertex_rows], rows.reshape(-1, 3).astype(np.int32), normals[vertex_rows], info
 
 
 def _write_glb(path: str | Path, mesh: trimesh.Trimesh) -> None:
@@ -151,8 +151,8 @@ def _write_glb(path: str | Path, mesh: trimesh.Trimesh) -> None:
     data = export_glb(
         trimesh.Scene({"mesh": mesh}), include_normals=True, tree_postprocessor=complete
     )
-    with written_aside(path) as aside:
-        aside.write_bytes(data)
+    with written_aside(path) as temporary_path:
+        temporary_path.write_bytes(data)
 
 
 def _write_textures(path: Path, mesh: trimesh.Trimesh, *, mark: str = "") -> dict[str, str]:
@@ -172,16 +172,16 @@ def _write_textures(path: Path, mesh: trimesh.Trimesh, *, mark: str = "") -> dic
         "metallic": Image.fromarray(packed[..., 2]),
         "normal": material.normalTexture,
     }
-    written = {}
+    file_names = {}
     for name, image in images.items():
         file = path.with_name(f"{path.stem}{mark}_{name}.png")
         if image is None:
             file.unlink(missing_ok=True)  # of an earlier export
         else:
-            with written_aside(file) as aside:
-                image.save(aside, format="PNG")
-            written[name] = file.name
-    return written
+            with written_aside(file) as temporary_path:
+                image.save(temporary_path, format="PNG")
+            file_names[name] = file.name
+    return file_names
 
 
 _OBJ_MAPS = {
@@ -203,10 +203,10 @@ def _write_obj(path: str | Path, mesh: trimesh.Trimesh) -> None:
     assert isinstance(visual, TextureVisuals)
     lines = ["newmtl material", "Kd 1 1 1", "Pr 1", "Pm 1"]
     lines += [f"{_OBJ_MAPS[name]} {file}" for name, file in _write_textures(path, mesh).items()]
-    with written_aside(path.with_suffix(".mtl")) as aside:
-        aside.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    with written_aside(path.with_suffix(".mtl")) as temporary_path:
+        temporary_path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     uv, faces = np.asarray(visual.uv), np.asarray(mesh.faces) + 1
-    with written_aside(path) as aside, aside.open("w", encoding="utf-8") as file:
+    with written_aside(path) as temporary_path, temporary_path.open("w", encoding="utf-8") as file:
         file.write(f"{Y_UP_LINE}\nmtllib {path.with_suffix('.mtl').name}\nusemtl material\n")
         np.savetxt(file, np.asarray(mesh.vertices), "v %.7g %.7g %.7g")
         np.savetxt(file, uv, "vt %.7g %.7g")
@@ -256,17 +256,19 @@ def _vertex_colored(
     )
 
 
-def _normal_map(normals: Float[np.ndarray, "N 3"], covered: Bool[np.ndarray, "T T"]) -> Image.Image:
+def _normal_map(
+    normals: Float[np.ndarray, "N 3"], is_covered: Bool[np.ndarray, "T T"]
+) -> Image.Image:
     """Write unit normals in tangent space into the covered texels of a normal map.
 
     Parameters
     ----------
     normals : (N, 3), one for each covered texel, row by row.
-    covered : (T, T) texels that a face covers.
+    is_covered : (T, T) texels that a face covers.
     """
-    shown = np.zeros((*covered.shape, 3), np.float32)
-    shown[covered] = 0.5 + 0.5 * normals
-    return Image.fromarray(_to_bytes(fill_gutters(shown, covered)))
+    texels = np.zeros((*is_covered.shape, 3), np.float32)
+    texels[is_covered] = 0.5 + 0.5 * normals
+    return Image.fromarray(_to_bytes(fill_gutters(texels, is_covered)))
 
 
 def _textured(
@@ -286,25 +288,25 @@ def _textured(
     charts = unwrap(vertices, faces, normals, texture_size=texture_size)
     start = time.perf_counter()
     face_rows, barycentrics = rasterize_charts(charts.uv, charts.faces, texture_size=texture_size)
-    covered = face_rows >= 0
-    if not covered.any():
+    is_covered = face_rows >= 0
+    if not is_covered.any():
         raise ValueError(
             f"textures of {texture_size} x {texture_size} show nothing of the mesh; raise the size"
         )
-    rows, weights = charts.faces[face_rows[covered]], barycentrics[covered]
-    cut, cut_normals = vertices[charts.vertex_rows], normals[charts.vertex_rows]
-    points = np.einsum("nk,nkd->nd", weights, cut[rows]).astype(np.float32)
+    rows, weights = charts.faces[face_rows[is_covered]], barycentrics[is_covered]
+    cut_vertices, cut_normals = vertices[charts.vertex_rows], normals[charts.vertex_rows]
+    points = np.einsum("nk,nkd->nd", weights, cut_vertices[rows]).astype(np.float32)
     attributes, normal_map = {}, None
     if fine is not None:
-        points, wanted = fine.nearest(points, facing(cut[rows]))
-        tangents = vertex_tangents(cut, charts.faces, cut_normals, charts.uv)
+        points, fine_normals = fine.nearest(points, facing(cut_vertices[rows]))
+        tangents = vertex_tangents(cut_vertices, charts.faces, cut_normals, charts.uv)
         interpolated = (np.einsum("nk,nkd->nd", weights, x[rows]) for x in (cut_normals, tangents))
-        normal_map = _normal_map(in_tangent_space(wanted, *interpolated), covered)
-        turned = to_gltf_axes(tangents[:, :3])
-        attributes["_TANGENT"] = np.concatenate([turned, tangents[:, 3:]], axis=-1)
-    baked = np.zeros((texture_size, texture_size, 5), np.float32)
-    baked[covered] = _evaluate_materials(sample_materials, points)
-    base_color, metallic_roughness = _textures(fill_gutters(baked, covered))
+        normal_map = _normal_map(in_tangent_space(fine_normals, *interpolated), is_covered)
+        gltf_tangents = to_gltf_axes(tangents[:, :3])
+        attributes["_TANGENT"] = np.concatenate([gltf_tangents, tangents[:, 3:]], axis=-1)
+    texels = np.zeros((texture_size, texture_size, 5), np.float32)
+    texels[is_covered] = _evaluate_materials(sample_materials, points)
+    base_color, metallic_roughness = _textures(fill_gutters(texels, is_covered))
     material = PBRMaterial(
         name="material",
         baseColorFactor=[255, 255, 255, 255],
@@ -319,7 +321,7 @@ def _textured(
     # trimesh keeps OpenGL's v upwards and flips it when it writes glTF, whose v runs down.
     uv = charts.uv * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)
     mesh = trimesh.Trimesh(
-        to_gltf_axes(cut),
+        to_gltf_axes(cut_vertices),
         charts.faces,
         vertex_normals=to_gltf_axes(cut_normals),
         visual=TextureVisuals(uv=uv, material=material),
@@ -328,7 +330,7 @@ def _textured(
     )
     return mesh, {
         "charts": charts.chart_count,
-        "texture_coverage": float(covered.mean()),
+        "texture_coverage": float(is_covered.mean()),
         "unwrap_seconds": charts.seconds,
         "bake_seconds": time.perf_counter() - start,
     }
@@ -397,8 +399,8 @@ def export_mesh_glb(
         wide, or do not fit into the memory.
     """
     start = time.perf_counter()
-    for kind, other in (("an OBJ", obj_path), ("a USD", usd_path)):
-        if vertex_colors and other is not None:
+    for kind, optional_path in (("an OBJ", obj_path), ("a USD", usd_path)):
+        if vertex_colors and optional_path is not None:
             raise ValueError(f"{kind} has textures; leave out the colours on vertices")
     if vertex_colors and face_count is not None:
         raise ValueError("a map of normals is a texture; leave out the colours on vertices")
@@ -416,9 +418,9 @@ def export_mesh_glb(
         fine = FineSurface(vertices, normals, faces)
         vertices, faces = simplified(vertices, faces, face_count)
         faces = faces[nondegenerate(vertices, faces)]
-        summed = np.zeros(vertices.shape)
-        np.add.at(summed, faces, facing(vertices[faces])[:, None])
-        normals = fine.nearest(vertices, summed)[1]
+        normal_sums = np.zeros(vertices.shape)
+        np.add.at(normal_sums, faces, facing(vertices[faces])[:, None])
+        normals = fine.nearest(vertices, normal_sums)[1]
         info["closed"] = is_closed(faces)
     double_sided = not info["closed"]
     if vertex_colors:
@@ -496,8 +498,10 @@ def export_gaussians_ply(
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
     header += [f"property float {name}" for name in names] + ["end_header\n"]
-    with written_aside(path) as aside:
-        aside.write_bytes("\n".join(header).encode("ascii") + table.astype("<f4").tobytes())
+    with written_aside(path) as temporary_path:
+        temporary_path.write_bytes(
+            "\n".join(header).encode("ascii") + table.astype("<f4").tobytes()
+        )
 
 
 def export_light_exr(path: str | Path, radiance: Float[Array | np.ndarray, "H W 3"]) -> None:

@@ -173,7 +173,7 @@ def list_transforms(content: Mapping[str, Any], path: Path) -> list[ListedFrame]
     frames = require(content, "frames", path)
     if not isinstance(frames, list) or not frames:
         raise SceneError(f"{path} has no frames; 'frames' must be a list with at least one view")
-    listed = []
+    listed_frames = []
     for number, frame in enumerate(frames):
         where = f"frame {number} of {path}"
         if not isinstance(frame, dict):
@@ -181,12 +181,14 @@ def list_transforms(content: Mapping[str, Any], path: Path) -> list[ListedFrame]
         file_path = require(frame, "file_path", where)
         if not isinstance(file_path, str) or not file_path:
             raise SceneError(f"'file_path' of {where} must be a name, got {file_path!r}")
-        both = {**content, **frame}
-        if "fl_x" not in both and "camera_angle_x" not in both:
+        merged_values = {**content, **frame}
+        if "fl_x" not in merged_values and "camera_angle_x" not in merged_values:
             require(content, "camera_angle_x", path)
         pose = checked_pose(require(frame, "transform_matrix", where), where)
-        listed.append(ListedFrame(file_path, pose, checked_lens(both, where), both))
-    return listed
+        listed_frames.append(
+            ListedFrame(file_path, pose, checked_lens(merged_values, where), merged_values)
+        )
+    return listed_frames
 
 
 def checked_numbers(values: Any, shape: tuple[int, ...], what: str) -> Float[np.ndarray, "..."]:
@@ -197,8 +199,8 @@ def checked_numbers(values: Any, shape: tuple[int, ...], what: str) -> Float[np.
         numbers = np.empty(0)
     if numbers.shape != shape or not np.isfinite(numbers).all():
         size = " x ".join(str(length) for length in shape)
-        shown = values.tolist() if isinstance(values, np.ndarray) else values
-        raise SceneError(f"{what} must be {size} finite numbers, got {shown!r}")
+        plain_values = values.tolist() if isinstance(values, np.ndarray) else values
+        raise SceneError(f"{what} must be {size} finite numbers, got {plain_values!r}")
     return numbers
 
 
@@ -215,10 +217,10 @@ def opengl_pose(
     # The pose is inverted after the check, which reports a singular one.
     pose[:3, :3], pose[:3, 3] = rotation, translation
     rigid = checked_pose(pose, where)
-    turned = np.eye(4)
-    turned[:3, :3] = rigid[:3, :3].T
-    turned[:3, 3] = -rigid[:3, :3].T @ rigid[:3, 3]
-    return turned @ _OPENCV_TO_OPENGL
+    camera_to_world = np.eye(4)
+    camera_to_world[:3, :3] = rigid[:3, :3].T
+    camera_to_world[:3, 3] = -rigid[:3, :3].T @ rigid[:3, 3]
+    return camera_to_world @ _OPENCV_TO_OPENGL
 
 
 def quaternion_to_rotation(
@@ -256,12 +258,12 @@ def checked_pose(matrix: Any, where: str) -> Float[np.ndarray, "4 4"]:
             f"the last row of the pose of {where} must be 0 0 0 1, got {pose[3].tolist()}; "
             "the matrix may be transposed"
         )
-    left, stretch, right = np.linalg.svd(pose[:3, :3])
-    if stretch[2] < 1e-8:
+    left, stretches, right = np.linalg.svd(pose[:3, :3])
+    if stretches[2] < 1e-8:
         raise SceneError(f"the pose of {where} is singular; it must be a rotation and a position")
-    if np.abs(stretch - 1.0).max() > _RIGID_TOLERANCE:
+    if np.abs(stretches - 1.0).max() > _RIGID_TOLERANCE:
         raise SceneError(
-            f"the pose of {where} is not rigid: it stretches by {np.round(stretch, 4).tolist()} "
+            f"the pose of {where} is not rigid: it stretches by {np.round(stretches, 4).tolist()} "
             "where 1 is expected; remove scale and shear from the camera"
         )
     rotation = left @ right
@@ -332,13 +334,13 @@ def optional_files(root: Path, candidates: Mapping[str, Path]) -> dict[str, Path
 def find_lights(root: Path, names: list[str]) -> dict[str, Path]:
     """Find environment maps by name in the folder of a scene, or else in the one above it."""
     folders = [root, Path(os.path.abspath(root)).parent]  # since Path(".").parent is "." again
-    found = {}
+    light_paths = {}
     for name in names:
         candidates = [folder / f"{name}{suffix}" for folder in folders for suffix in MAP_SUFFIXES]
         path = next((path for path in candidates if path.is_file()), None)
         if path is not None:
-            found[name] = path
-    return found
+            light_paths[name] = path
+    return light_paths
 
 
 def _within_images(root: Path, image: Path) -> Path:
@@ -358,8 +360,11 @@ def beside_images(root: Path, image: Path, folders: tuple[str, ...]) -> Path | N
     It is named after the image, with or without the image's own ending (``IMG_1.png``,
     ``IMG_1.jpg.png``), and lies in ``root/FOLDER`` as the image lies in ``root/images``.
     """
-    inner = _within_images(root, image)
-    names = (inner.with_suffix(".png"), inner.with_name(inner.name + ".png"))
+    relative_path = _within_images(root, image)
+    names = (
+        relative_path.with_suffix(".png"),
+        relative_path.with_name(relative_path.name + ".png"),
+    )
     candidates = [root / folder / name for folder in folders for name in names]
     path = next((path for path in candidates if path.is_file()), None)
     return None if path is None else inside_scene(root, str(path.relative_to(root)), image)
@@ -392,10 +397,10 @@ def images_in(root: Path, folders: tuple[str, ...]) -> list[Path]:
     MissingFileError : no folder exists, or the folder has no image.
     """
     folder = next((root / name for name in folders if (root / name).is_dir()), None)
-    found = [] if folder is None else sorted(folder.iterdir())
+    entries = [] if folder is None else sorted(folder.iterdir())
     images = [
         path
-        for path in found
+        for path in entries
         if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
     ]
     if not images:
@@ -415,12 +420,12 @@ def split_capture(frames: Sequence[Frame], *, notes: tuple[str, ...] = ()) -> Li
     SceneError : two views have one name.
     """
     ordered = sorted(frames, key=lambda frame: frame.name)
-    for one, other in pairwise(ordered):
-        if one.name == other.name:
+    for first, second in pairwise(ordered):
+        if first.name == second.name:
             raise SceneError(
-                f"{one.image} and {other.image} are both named {one.name!r}; rename one"
+                f"{first.image} and {second.image} are both named {first.name!r}; rename one"
             )
     test = ordered[::TEST_EVERY] if len(ordered) > 1 else []
     train = [ordered[i] for i in range(len(ordered)) if i % TEST_EVERY or not test]
-    chosen = f"no split is given: {len(test)} test views of {len(ordered)}, every {TEST_EVERY}th"
-    return Listing(tuple(train), tuple(test), is_capture=True, notes=(*notes, chosen))
+    note = f"no split is given: {len(test)} test views of {len(ordered)}, every {TEST_EVERY}th"
+    return Listing(tuple(train), tuple(test), is_capture=True, notes=(*notes, note))

@@ -53,12 +53,12 @@ def written_aside(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    temporary_path = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
-        yield aside
-        os.replace(aside, path)
+        yield temporary_path
+        os.replace(temporary_path, path)
     finally:
-        aside.unlink(missing_ok=True)
+        temporary_path.unlink(missing_ok=True)
 
 
 def is_left_aside(path: Path) -> bool:
@@ -142,10 +142,10 @@ def read_image(path: str | Path) -> Float[np.ndarray, "H W C"]:
     ------
     MissingFileError, ImageReadError
     """
-    stored = read_stored(path)
-    if stored.dtype == np.float32:
-        return stored
-    return decoding_table(stored.dtype, is_srgb=False)[stored]
+    pixels = read_stored(path)
+    if pixels.dtype == np.float32:
+        return pixels
+    return decoding_table(pixels.dtype, is_srgb=False)[pixels]
 
 
 def read_stored(path: str | Path) -> Shaped[np.ndarray, "H W C"]:
@@ -194,10 +194,10 @@ def _divided_by_alpha(pixels: Shaped[np.ndarray, "H W C"]) -> Shaped[np.ndarray,
 
 def _numbers_of(spec: Any) -> Any:
     """Choose the numbers to read an image in: 8 or 16 bits for integers, else floats."""
-    own = spec.format.basetype
-    if own in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE) or spec.channelformats:
+    base_type = spec.format.basetype
+    if base_type in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE) or spec.channelformats:
         return oiio.FLOAT
-    return own if own == oiio.UINT8 else oiio.UINT16
+    return base_type if base_type == oiio.UINT8 else oiio.UINT16
 
 
 @cache
@@ -249,8 +249,10 @@ def require_room(needs: Sequence[Need], cure: str) -> None:
 def _require_room_for(layout: "_Layout", path: Path) -> None:
     """Refuse an image that, by its header, does not fit into the memory."""
     width, height = layout.shown[2:]
-    needed = reading_bytes(width, height, len(layout.channels))
-    require_room([Need(f"{path} of {width} x {height} pixels", needed)], "write a smaller image")
+    byte_count = reading_bytes(width, height, len(layout.channels))
+    require_room(
+        [Need(f"{path} of {width} x {height} pixels", byte_count)], "write a smaller image"
+    )
 
 
 class _Layout(NamedTuple):
@@ -340,11 +342,11 @@ def linear_values(
     return pixels
 
 
-def _decoded(stored: np.ndarray, colors: int, is_srgb: bool) -> Float[np.ndarray, "H W C"]:
+def _decoded(integers: np.ndarray, colors: int, is_srgb: bool) -> Float[np.ndarray, "H W C"]:
     """Look up the values of an integer image; alpha, after the colours, is stored as it is."""
-    pixels = np.empty(stored.shape, np.float32)
-    pixels[..., :colors] = decoding_table(stored.dtype, is_srgb=is_srgb)[stored[..., :colors]]
-    pixels[..., colors:] = decoding_table(stored.dtype, is_srgb=False)[stored[..., colors:]]
+    pixels = np.empty(integers.shape, np.float32)
+    pixels[..., :colors] = decoding_table(integers.dtype, is_srgb=is_srgb)[integers[..., :colors]]
+    pixels[..., colors:] = decoding_table(integers.dtype, is_srgb=False)[integers[..., colors:]]
     return pixels
 
 
@@ -473,9 +475,9 @@ def straight(
     ``alpha`` has the leading axes of the values.
     """
     alpha = alpha.reshape(alpha.shape + (1,) * (premultiplied.ndim - alpha.ndim))
-    covered = alpha > _SMALLEST_ALPHA
-    divisor = np.where(covered, alpha, 1).astype(premultiplied.dtype)
-    return np.where(covered, premultiplied / divisor, 0).astype(premultiplied.dtype)
+    is_covered = alpha > _SMALLEST_ALPHA
+    divisor = np.where(is_covered, alpha, 1).astype(premultiplied.dtype)
+    return np.where(is_covered, premultiplied / divisor, 0).astype(premultiplied.dtype)
 
 
 def _require_finite(pixels: np.ndarray, path: Path) -> None:
@@ -490,20 +492,20 @@ _BRIGHTEST = 1e12
 
 def _require_radiance(pixels: np.ndarray, path: Path) -> None:
     _require_finite(pixels, path)
-    negative = "light cannot be negative: clip it, or check the filter that made it"
-    _require_none(pixels < 0.0, pixels, path, "that are negative", negative)
-    bright = "no real light is that bright: render or convert it again"
-    _require_none(pixels > _BRIGHTEST, pixels, path, f"above {_BRIGHTEST:g}", bright)
+    negative_advice = "light cannot be negative: clip it, or check the filter that made it"
+    _require_none(pixels < 0.0, pixels, path, "that are negative", negative_advice)
+    bright_advice = "no real light is that bright: render or convert it again"
+    _require_none(pixels > _BRIGHTEST, pixels, path, f"above {_BRIGHTEST:g}", bright_advice)
 
 
 def _require_none(
-    is_bad: np.ndarray, pixels: np.ndarray, path: Path, what: str, advice: str
+    is_bad: np.ndarray, pixels: np.ndarray, path: Path, problem: str, advice: str
 ) -> None:
     """Refuse an image with bad pixels; the message gives the position of the first one."""
     if is_bad.any():
         row, column, channel = (int(i) for i in np.argwhere(is_bad)[0])
         raise SceneError(
-            f"{path} has {int(is_bad.sum())} values {what}, the first "
+            f"{path} has {int(is_bad.sum())} values {problem}, the first "
             f"{pixels[row, column, channel]} at row {row}, column {column}, channel {channel}; "
             f"{advice}"
         )
@@ -515,16 +517,16 @@ def _write(path: str | Path, pixels: np.ndarray, pixel_format, *, suffix: str) -
     if path.suffix.lower() != suffix:
         raise SceneError(f"the file must end in {suffix}, got {path.name}")
     _color_channels(pixels)
-    with written_aside(path) as aside:
+    with written_aside(path) as temporary_path:
         height, width, channels = pixels.shape
         spec = oiio.ImageSpec(width, height, channels, pixel_format)
         spec.attribute("oiio:UnassociatedAlpha", int(suffix == ".png"))
         if suffix == ".exr":
             spec.attribute("compression", "zip")
-        sink = oiio.ImageOutput.create(str(aside))
+        sink = oiio.ImageOutput.create(str(temporary_path))
         if sink is None:
             raise OSError(f"cannot write {path}: {_last_error()}")
-        ok = sink.open(str(aside), spec) and sink.write_image(np.ascontiguousarray(pixels))
+        ok = sink.open(str(temporary_path), spec) and sink.write_image(np.ascontiguousarray(pixels))
         ok = sink.close() and ok  # buffered data reaches the disk, or fails to, only here
         if not ok:
             raise OSError(f"cannot write {path}: {_one_line(sink.geterror()) or _last_error()}")

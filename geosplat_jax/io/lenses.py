@@ -93,36 +93,36 @@ def checked_lens(values: Mapping[str, Any], where: str) -> Lens:
         is out of range.
     """
     distortion = _checked_distortion(values, where)
-    given = {key: checked_length(values[key], key, where) for key in _LENS_KEYS if key in values}
+    lengths = {key: checked_length(values[key], key, where) for key in _LENS_KEYS if key in values}
     angle = None
     if "camera_angle_x" in values:
         angle = checked_angle(values["camera_angle_x"], where)
-    if "camera_angle_y" in values and "fl_y" not in given and {"w", "h"} <= given.keys():
-        half = 0.5 * checked_angle(values["camera_angle_y"], where)
-        given["fl_y"] = 0.5 * given["h"] / math.tan(half)
-    if angle is not None and not given.keys() - {"w", "h"}:
-        size = (int(given["w"]), int(given["h"])) if {"w", "h"} <= given.keys() else None
+    if "camera_angle_y" in values and "fl_y" not in lengths and {"w", "h"} <= lengths.keys():
+        half_angle = 0.5 * checked_angle(values["camera_angle_y"], where)
+        lengths["fl_y"] = 0.5 * lengths["h"] / math.tan(half_angle)
+    if angle is not None and not lengths.keys() - {"w", "h"}:
+        size = (int(lengths["w"]), int(lengths["h"])) if {"w", "h"} <= lengths.keys() else None
         return AngleLens(angle, distortion, size)
-    missing = [key for key in ("w", "h") if key not in given]
+    missing = [key for key in ("w", "h") if key not in lengths]
     if missing:
         raise SceneError(
-            f"the lens of {where} has {', '.join(given)} but no {' and no '.join(missing)}; add "
+            f"the lens of {where} has {', '.join(lengths)} but no {' and no '.join(missing)}; add "
             "the size of the images that it is in pixels of"
         )
-    width, height = given["w"], given["h"]
+    width, height = lengths["w"], lengths["h"]
     if angle is not None:
         expected = 0.5 * width / math.tan(0.5 * angle)
-        focal = given.setdefault("fl_x", expected)
+        focal = lengths.setdefault("fl_x", expected)
         if abs(focal / expected - 1.0) > _FOCAL_TOLERANCE:
             raise SceneError(
                 f"{where} contradicts itself: with w = {width:g}, fl_x is {focal:g}, but "
                 f"camera_angle_x = {angle:g} makes it {expected:g}; remove the wrong one"
             )
     return PinholeLens(
-        fx=given["fl_x"],
-        fy=given.get("fl_y", given["fl_x"]),
-        cx=given.get("cx", 0.5 * width),
-        cy=given.get("cy", 0.5 * height),
+        fx=lengths["fl_x"],
+        fy=lengths.get("fl_y", lengths["fl_x"]),
+        cx=lengths.get("cx", 0.5 * width),
+        cy=lengths.get("cy", 0.5 * height),
         width=int(width),
         height=int(height),
         distortion=distortion,
@@ -140,8 +140,8 @@ def _checked_distortion(values: Mapping[str, Any], where: str) -> Distortion | N
     if model is None:
         model = "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV"
     if model not in (*_PERSPECTIVE_MODELS, *_FISHEYE_MODELS):
-        known = ", ".join((*_PERSPECTIVE_MODELS, *_FISHEYE_MODELS))
-        raise SceneError(f"the camera_model of {where} must be one of {known}, got {model!r}")
+        models = ", ".join((*_PERSPECTIVE_MODELS, *_FISHEYE_MODELS))
+        raise SceneError(f"the camera_model of {where} must be one of {models}, got {model!r}")
     names = (*_RADIAL, *_TANGENTIAL)
     numbers = [values.get(name, 0.0) for name in names]
     if "distortion_params" in values:

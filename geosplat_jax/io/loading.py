@@ -78,30 +78,35 @@ def load_views(
     MissingFileError, SceneError : see `load_dataset`.
     """
     _require_distinct([frame.name for frame in frames])
-    full = in_parallel(lambda frame: image_size(frame.image), frames)
-    problems = _size_problems(frames, full, factor, listing) + _other_shapes(frames, full)
-    sizes = [(height // factor, width // factor) for height, width in full]
+    full_sizes = in_parallel(lambda frame: image_size(frame.image), frames)
+    problems = _size_problems(frames, full_sizes, factor, listing) + _other_shapes(
+        frames, full_sizes
+    )
+    sizes = [(height // factor, width // factor) for height, width in full_sizes]
     canvas = np.max(sizes, axis=0)
-    _require_room_for_all(frames, full, canvas, most_bytes)
+    _require_room_for_all(frames, full_sizes, canvas, most_bytes)
     height, width = (int(length) for length in canvas)
-    kept, threads = PartsInMemory(len(frames), most_bytes), _threads_for(frames, full, factor)
+    store, threads = (
+        PartsInMemory(len(frames), most_bytes),
+        _threads_for(frames, full_sizes, factor),
+    )
 
     def read(index: int) -> _Traits:
         photograph = read_photograph(frames[index])
         if not (photograph.has_mask or listing.is_capture):
             raise SceneError(_no_mask(frames[index]))
-        part, seen = photograph.part(frames[index], factor)
-        kept.add(index, part)
+        part, is_valid = photograph.part(frames[index], factor)
+        store.add(index, part)
         return _Traits(
             photograph.has_mask,
             photograph.leaves_file,
             photograph.is_opaque,
             _has_even_color(part),
-            pack_marks(_on_canvas(seen, height, width)),
+            pack_marks(_on_canvas(is_valid, height, width)),
         )
 
     traits = in_parallel(read, range(len(frames)), threads=threads)
-    images = kept.photographs(
+    images = store.photographs(
         height,
         width,
         lambda index: read_photograph(frames[index]).part(frames[index], factor)[0],
@@ -112,12 +117,12 @@ def load_views(
     if listing.is_capture:
         problems += _unread_masks(frames, traits)
     problems += _even_views(frames, traits)
-    marks = Marks.of([one.marks for one in traits], height, width)
+    marks = Marks.of([view_traits.marks for view_traits in traits], height, width)
     reading = Reading(frames, images, sizes, marks, factor)
     views = Views(
         names=tuple(frame.name for frame in frames),
         camera_to_world=np.stack([frame.camera_to_world for frame in frames]),
-        intrinsics=_intrinsics(frames, full, factor),
+        intrinsics=_intrinsics(frames, full_sizes, factor),
         images=images,
         truth=true_maps(reading, listing.albedo_is_srgb, problems),
         relight=relit_images(reading, problems),
@@ -132,42 +137,42 @@ def load_views(
     return views, problems
 
 
-def _other_shapes(frames: Sequence[Frame], full: Sequence[tuple[int, int]]) -> list[str]:
+def _other_shapes(frames: Sequence[Frame], full_sizes: Sequence[tuple[int, int]]) -> list[str]:
     """Warn of images whose aspect ratio is not that of their lens, apart from rounding."""
 
-    def fits(width: int, height: int, across: int, along: int) -> bool:
-        allowed = max(_SHAPE_PIXELS, _SHAPE_TOLERANCE * width)
-        return abs(width - across * height / along) <= allowed
+    def fits(width: int, height: int, lens_width: int, lens_height: int) -> bool:
+        tolerance = max(_SHAPE_PIXELS, _SHAPE_TOLERANCE * width)
+        return abs(width - lens_width * height / lens_height) <= tolerance
 
-    other, turned = [], 0
-    for frame, (height, width) in zip(frames, full, strict=True):
+    misfits, rotated_count = [], 0
+    for frame, (height, width) in zip(frames, full_sizes, strict=True):
         lens = frame.lens
         if isinstance(lens, PinholeLens) and not fits(width, height, lens.width, lens.height):
-            other.append(
+            misfits.append(
                 f"{frame.image.name} ({width} x {height}, its lens {lens.width} x {lens.height})"
             )
-            turned += fits(width, height, lens.height, lens.width)
-    if not other:
+            rotated_count += fits(width, height, lens.height, lens.width)
+    if not misfits:
         return []
     cure = "if the images were cropped, give the intrinsics of the cropped images"
-    if turned == len(other):
+    if rotated_count == len(misfits):
         cure = (
             "they are stored on their side (EXIF orientation): store them upright, or find the "
             "cameras of the images as they are stored"
         )
     return [
-        f"the width and height of {len(other)} images are not in proportion to those of their "
-        f"intrinsics, which are stretched to fit, for example {other[0]}; {cure}"
+        f"the width and height of {len(misfits)} images are not in proportion to those of their "
+        f"intrinsics, which are stretched to fit, for example {misfits[0]}; {cure}"
     ]
 
 
 def _intrinsics(
-    frames: Sequence[Frame], full: Sequence[tuple[int, int]], factor: int
+    frames: Sequence[Frame], full_sizes: Sequence[tuple[int, int]], factor: int
 ) -> Float[np.ndarray, "V 3 3"]:
     """Return the lenses of reduced images in pixels."""
     lenses = [
         frame.lens.intrinsics(width, height)
-        for frame, (height, width) in zip(frames, full, strict=True)
+        for frame, (height, width) in zip(frames, full_sizes, strict=True)
     ]
     intrinsics = np.stack(lenses)
     intrinsics[:, :2] /= factor
@@ -175,16 +180,16 @@ def _intrinsics(
 
 
 def _require_room_for_all(
-    frames: Sequence[Frame], full: list[tuple[int, int]], canvas: np.ndarray, most_bytes: int
+    frames: Sequence[Frame], full_sizes: list[tuple[int, int]], canvas: np.ndarray, most_bytes: int
 ) -> None:
     """Refuse views that do not fit into the memory, before any of it is allocated."""
-    largest = max(full, key=lambda size: size[0] * size[1])
-    height, width = largest
+    largest_size = max(full_sizes, key=lambda size: size[0] * size[1])
+    height, width = largest_size
     pixels = len(frames) * int(np.prod(canvas)) * 4 * np.dtype(np.float32).itemsize
     require_room(
         [
             Need(
-                f"{len(frames)} images like {frames[full.index(largest)].image}",
+                f"{len(frames)} images like {frames[full_sizes.index(largest_size)].image}",
                 min(pixels, most_bytes),
             ),
             Need(f"reading images of {width} x {height} pixels", reading_bytes(width, height, 4)),
@@ -193,7 +198,9 @@ def _require_room_for_all(
     )
 
 
-def _threads_for(frames: Sequence[Frame], full: Sequence[tuple[int, int]], factor: int) -> int:
+def _threads_for(
+    frames: Sequence[Frame], full_sizes: Sequence[tuple[int, int]], factor: int
+) -> int:
     """Choose how many images are read at the same time."""
 
     def bytes_of(frame: Frame, size: tuple[int, int]) -> int:
@@ -202,17 +209,17 @@ def _threads_for(frames: Sequence[Frame], full: Sequence[tuple[int, int]], facto
             return reading_bytes(size[1], size[0], 4)
         return _CODED_PIXEL_BYTES * size[0] * size[1]
 
-    largest = max(map(bytes_of, frames, full))
-    return max(1, min(THREADS, len(full), _READING_BYTES // largest))
+    largest_bytes = max(map(bytes_of, frames, full_sizes))
+    return max(1, min(THREADS, len(full_sizes), _READING_BYTES // largest_bytes))
 
 
-def _on_canvas(seen: np.ndarray, height: int, width: int) -> Bool[np.ndarray, "H W"]:
+def _on_canvas(is_valid: np.ndarray, height: int, width: int) -> Bool[np.ndarray, "H W"]:
     """Place the pixels that count in the upper left corner of a canvas; none count beside them."""
-    if seen.shape == (height, width):
-        return seen
-    placed = np.zeros((height, width), bool)
-    placed[: seen.shape[0], : seen.shape[1]] = seen
-    return placed
+    if is_valid.shape == (height, width):
+        return is_valid
+    canvas = np.zeros((height, width), bool)
+    canvas[: is_valid.shape[0], : is_valid.shape[1]] = is_valid
+    return canvas
 
 
 def _has_even_color(part: Part) -> bool:
@@ -220,17 +227,19 @@ def _has_even_color(part: Part) -> bool:
     # A few pixels show that most photographs do not; all pixels are compared only if those agree.
     for stride in (_EVEN_STRIDE, 1):
         color, alpha = part.color[::stride, ::stride], part.alpha[::stride, ::stride]
-        covered = color[values_of(alpha, is_srgb=False) > COVERED]
-        if len(covered):
-            ends = np.stack([covered.min(axis=0), covered.max(axis=0)])
-            if np.ptp(values_of(ends, is_srgb=True), axis=0).max() > _EVEN:
+        object_colors = color[values_of(alpha, is_srgb=False) > COVERED]
+        if len(object_colors):
+            extremes = np.stack([object_colors.min(axis=0), object_colors.max(axis=0)])
+            if np.ptp(values_of(extremes, is_srgb=True), axis=0).max() > _EVEN:
                 return False
-    return len(covered) > 0
+    return len(object_colors) > 0
 
 
 def _even_views(frames: Sequence[Frame], traits: Sequence[_Traits]) -> list[str]:
     """Warn of photographs that show the object in one even colour, unless most of them do."""
-    names = [frame.name for frame, one in zip(frames, traits, strict=True) if one.is_even]
+    names = [
+        frame.name for frame, view_traits in zip(frames, traits, strict=True) if view_traits.is_even
+    ]
     if not 0 < len(names) < 0.5 * len(frames):
         return []
     return [
@@ -240,32 +249,34 @@ def _even_views(frames: Sequence[Frame], traits: Sequence[_Traits]) -> list[str]
 
 
 def _size_problems(
-    frames: Sequence[Frame], full: list[tuple[int, int]], factor: int, listing: Listing
+    frames: Sequence[Frame], full_sizes: list[tuple[int, int]], factor: int, listing: Listing
 ) -> list[str]:
     """Warn of images that are padded or cut; refuse images of several sizes outside captures."""
     problems = []
-    for frame, (height, width) in zip(frames, full, strict=True):
+    for frame, (height, width) in zip(frames, full_sizes, strict=True):
         if not 1 <= factor <= min(height, width):
             raise SceneError(
                 f"downscale factor must be between 1 and the image size, got {factor} for "
                 f"{frame.image}, which is {width} x {height}"
             )
-        if (height, width) != full[0] and not listing.is_capture:
+        if (height, width) != full_sizes[0] and not listing.is_capture:
             raise SceneError(
                 f"{frame.image} is {width} x {height} pixels, but {frames[0].image} is "
-                f"{full[0][1]} x {full[0][0]}; all images of a split must agree"
+                f"{full_sizes[0][1]} x {full_sizes[0][0]}; all images of a split must agree"
             )
-    kinds = Counter(full)
+    kinds = Counter(full_sizes)
     if len(kinds) > 1:
-        height, width = np.max(full, axis=0)
+        height, width = np.max(full_sizes, axis=0)
         problems.append(
             f"images of {len(kinds)} sizes are padded to {width} x {height} pixels; the padding is "
             "ignored"
         )
-    cut = [(height, width) for height, width in kinds if height % factor or width % factor]
+    cropped_sizes = [
+        (height, width) for height, width in kinds if height % factor or width % factor
+    ]
     problems += [
         f"images of {width} x {height} are cut to a multiple of the downscale factor {factor}"
-        for height, width in cut
+        for height, width in cropped_sizes
     ]
     return problems
 
@@ -281,10 +292,12 @@ def _no_mask(frame: Frame) -> str:
 
 def _have_masks(frames: Sequence[Frame], traits: Sequence[_Traits], *, is_capture: bool) -> bool:
     """Tell whether the photographs of a split have masks; refuse a split in which only some do."""
-    if is_capture and not any(one.has_mask and not one.is_opaque for one in traits):
+    if is_capture and not any(
+        view_traits.has_mask and not view_traits.is_opaque for view_traits in traits
+    ):
         # An object may fill a photograph, but if it fills all of them, none was cut out.
         return False
-    has_mask = np.array([one.has_mask for one in traits])
+    has_mask = np.array([view_traits.has_mask for view_traits in traits])
     if has_mask.any() and not has_mask.all():
         raise SceneError(_no_mask(frames[int(np.argmin(has_mask))]))
     return bool(has_mask.all())
@@ -292,7 +305,11 @@ def _have_masks(frames: Sequence[Frame], traits: Sequence[_Traits], *, is_captur
 
 def _unread_masks(frames: Sequence[Frame], traits: Sequence[_Traits]) -> list[str]:
     """Warn of mask files that are ignored because their images have an alpha channel."""
-    names = [frame.image.name for frame, one in zip(frames, traits, strict=True) if one.leaves_file]
+    names = [
+        frame.image.name
+        for frame, view_traits in zip(frames, traits, strict=True)
+        if view_traits.leaves_file
+    ]
     if not names:
         return []
     return [

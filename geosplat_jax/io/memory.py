@@ -48,8 +48,10 @@ def _limits_of_process() -> list[int]:
         import resource
     except ImportError:  # not on Windows
         return []
-    soft = [resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_DATA, resource.RLIMIT_AS)]
-    return [limit for limit in soft if limit != resource.RLIM_INFINITY]
+    soft_limits = [
+        resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_DATA, resource.RLIMIT_AS)
+    ]
+    return [limit for limit in soft_limits if limit != resource.RLIM_INFINITY]
 
 
 def _limit_in(path: Path) -> int | None:
@@ -86,11 +88,11 @@ def _refusal(needs: Sequence[Need], available: int | None) -> str | None:
     total = sum(need.byte_count for need in needs)
     if available is None or total <= available:
         return None
-    largest = sorted(needs, key=lambda need: need.byte_count, reverse=True)
-    parts = [f"{need.what} {_gigabytes(need.byte_count)}" for need in largest[:3]]
+    sorted_needs = sorted(needs, key=lambda need: need.byte_count, reverse=True)
+    entries = [f"{need.what} {_gigabytes(need.byte_count)}" for need in sorted_needs[:3]]
     return (
         f"at least {_gigabytes(total)} of memory would be needed, and there are "
-        f"{_gigabytes(available)}: {', '.join(parts)}"
+        f"{_gigabytes(available)}: {', '.join(entries)}"
     )
 
 

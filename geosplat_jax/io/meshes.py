@@ -83,18 +83,18 @@ def read_mesh(
     _require_plain(Path(path))
     _require_convex(Path(path))
     try:
-        loaded = trimesh.load(path, process=False)
+        geometry = trimesh.load(path, process=False)
     except OSError:
         raise
     except Exception as problem:  # whatever the parser of a format raises
-        said = f"{path} cannot be read as a mesh: {problem}"
+        message = f"{path} cannot be read as a mesh: {problem}"
         if Path(path).suffix.lower() == ".ply":
-            said += (
+            message += (
                 "; binary PLY can be read only if all faces have the same number of corners: "
                 "export triangles, or OBJ"
             )
-        raise ValueError(said) from problem
-    mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
+        raise ValueError(message) from problem
+    mesh = geometry.to_mesh() if isinstance(geometry, trimesh.Scene) else geometry
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise ValueError(f"{path} must hold a triangle mesh, found no triangle in it")
     return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
@@ -108,16 +108,16 @@ def _require_plain(path: Path) -> None:
     with path.open("rb") as file:
         # A GLB begins with 12 bytes, the length of its JSON, and four letters.
         if suffix == ".glb":
-            start = file.read(20)
-            text = file.read(int.from_bytes(start[12:16], "little")) if len(start) == 20 else b""
+            header = file.read(20)
+            text = file.read(int.from_bytes(header[12:16], "little")) if len(header) == 20 else b""
         else:
             text = file.read()
     try:
         tree = json.loads(text)
     except ValueError:
         return  # The reader of the format says what is wrong.
-    required = tree.get("extensionsRequired", []) if isinstance(tree, dict) else []
-    packed = sorted(_PACKED & set(required))
+    extensions = tree.get("extensionsRequired", []) if isinstance(tree, dict) else []
+    packed = sorted(_PACKED & set(extensions))
     if packed:
         raise ValueError(
             f"{path} is compressed ({', '.join(packed)}), which is not read; export it without "
@@ -148,22 +148,24 @@ def _require_convex(path: Path) -> None:
     if not polygons:
         return
     try:
-        places = np.array([line.split()[1:4] for line in points], np.float64)
-        concave = sum(_count_folded(places[np.array(rows)]) for rows in polygons.values())
+        positions = np.array([line.split()[1:4] for line in points], np.float64)
+        concave_count = sum(_count_folded(positions[np.array(rows)]) for rows in polygons.values())
     except (ValueError, IndexError):
         return
-    if concave:
-        raise ValueError(f"{path} has {concave} faces that are not convex; export it as triangles")
+    if concave_count:
+        raise ValueError(
+            f"{path} has {concave_count} faces that are not convex; export it as triangles"
+        )
 
 
 def _count_folded(polygons: Float[np.ndarray, "N C 3"]) -> int:
     """Count polygons whose fan of triangles, around the first corner, changes orientation."""
     spokes = polygons[:, 1:] - polygons[:, :1]
-    fan = np.cross(spokes[:, :-1], spokes[:, 1:])
-    whole = fan.sum(axis=1, keepdims=True)
+    normals = np.cross(spokes[:, :-1], spokes[:, 1:])
+    totals = normals.sum(axis=1, keepdims=True)
     # Corners on a straight side make triangles of nearly no area, of any orientation.
-    turned = (fan * whole).sum(axis=-1) < -_ROUNDING * (whole**2).sum(axis=-1)
-    return int(turned.any(axis=1).sum())
+    is_flipped = (normals * totals).sum(axis=-1) < -_ROUNDING * (totals**2).sum(axis=-1)
+    return int(is_flipped.any(axis=1).sum())
 
 
 def is_y_up(path: str | Path) -> bool:
@@ -204,8 +206,8 @@ def is_closed(faces: Int[np.ndarray, "F 3"]) -> bool:
     """Whether every directed edge is matched by exactly one opposite edge."""
     start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel().astype(np.int64)
     stride = int(faces.max(initial=0)) + 1
-    edges, opposite = np.sort(start * stride + end), np.sort(end * stride + start)
-    return bool(np.array_equal(edges, opposite) and np.all(edges[1:] != edges[:-1]))
+    edges, opposite_edges = np.sort(start * stride + end), np.sort(end * stride + start)
+    return bool(np.array_equal(edges, opposite_edges) and np.all(edges[1:] != edges[:-1]))
 
 
 def signed_volume(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> float:
@@ -317,14 +319,14 @@ def _covered_pixels(
     for level in np.unique(exponent[side > 0]):
         members = np.flatnonzero((exponent == level) & (side > 0))
         step = max(1, _PAIRS_PER_CHUNK >> (2 * int(level)))
-        for first in range(0, len(members), step):
-            chosen = members[first : first + step]
+        for start in range(0, len(members), step):
+            chunk = members[start : start + step]
             triangle, pixel, weights = _covered_in_blocks(
-                corners[chosen], low[chosen], 1 << int(level)
+                corners[chunk], low[chunk], 1 << int(level)
             )
             is_inside = (pixel[:, 0] < width) & (pixel[:, 1] < height)
             column, row = pixel[is_inside].T
-            yield row, column, chosen[triangle[is_inside]], weights[is_inside]
+            yield row, column, chunk[triangle[is_inside]], weights[is_inside]
 
 
 def rasterize_charts(
@@ -384,21 +386,21 @@ def first_hits(
     faces = faces[in_front]
     inverse_depth = 1.0 / np.maximum(points[:, 2], near)
     pixels = (points @ intrinsics.T)[:, :2] * inverse_depth[:, None] * supersampling
-    nearest = np.zeros((height, width))
+    depth_buffer = np.zeros((height, width))
     face_rows = np.full((height, width), -1, np.int32)
-    drawn = np.zeros((height, width, 3))
+    pixel_weights = np.zeros((height, width, 3))
     for row, column, face, weights in _covered_pixels(pixels[faces], height=height, width=width):
         # 1/z is linear on the screen; weights divided by z interpolate perspective-correctly.
         weights = weights * inverse_depth[faces[face]]
         closeness = weights.sum(axis=-1)
         order = np.argsort(closeness, kind="stable")
-        order = order[closeness[order] > nearest[row[order], column[order]]]
+        order = order[closeness[order] > depth_buffer[row[order], column[order]]]
         row, column = row[order], column[order]
         # Where a pixel occurs several times, the last assignment holds: that of the nearest face.
-        nearest[row, column] = closeness[order]
+        depth_buffer[row, column] = closeness[order]
         face_rows[row, column] = in_front[face[order]]
-        drawn[row, column] = weights[order]
-    return face_rows, drawn
+        pixel_weights[row, column] = weights[order]
+    return face_rows, pixel_weights
 
 
 def facing(corners: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 3"]:
@@ -444,18 +446,18 @@ def render_mesh_normals(
     """
     face_rows, weights = first_hits(vertices, faces, camera, supersampling=supersampling)
     is_hit = face_rows >= 0
-    turned = (
+    camera_normals = (
         np.asarray(normals, np.float64)
         @ np.asarray(camera.world_to_camera[0, :3, :3], np.float64).T
     )
-    drawn = np.zeros(weights.shape)
-    corners = turned[faces[face_rows[is_hit]]]
-    drawn[is_hit] = np.einsum("nk,nkd->nd", weights[is_hit], corners)
+    normal_image = np.zeros(weights.shape)
+    corners = camera_normals[faces[face_rows[is_hit]]]
+    normal_image[is_hit] = np.einsum("nk,nkd->nd", weights[is_hit], corners)
     if is_two_sided:
-        drawn[is_hit] *= sides(vertices, faces[face_rows[is_hit]], camera)[:, None]
+        normal_image[is_hit] *= sides(vertices, faces[face_rows[is_hit]], camera)[:, None]
     blocks = (camera.height, supersampling, camera.width, supersampling)
-    lengths = np.sqrt((drawn**2).sum(-1, keepdims=True))
-    unit = drawn / np.where(lengths > 0, lengths, 1.0)
+    lengths = np.sqrt((normal_image**2).sum(-1, keepdims=True))
+    unit = normal_image / np.where(lengths > 0, lengths, 1.0)
     mean = unit.reshape(*blocks, 3).mean(axis=(1, 3))
     lengths = np.sqrt((mean**2).sum(-1, keepdims=True))
     mean = mean / np.where(lengths > 0, lengths, 1.0)
@@ -494,16 +496,16 @@ def split_long_edges(
     while True:
         start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
         keys = np.minimum(start, end) * len(vertices) + np.maximum(start, end)  # one an edge
-        keys, number = np.unique(keys, return_inverse=True)
+        keys, edge_index = np.unique(keys, return_inverse=True)
         edges = np.stack(np.divmod(keys, len(vertices)), axis=-1)
         lengths = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=-1)
         is_long = lengths > max(longest, 0.7 * float(lengths.max(initial=0.0)))
-        is_split = is_long[number.reshape(-1)].reshape(-1, 3)
+        is_split = is_long[edge_index.reshape(-1)].reshape(-1, 3)
         if not is_long.any() or len(faces) + is_split.sum() > most_faces:
             return vertices, faces
-        row = np.full(len(edges), -1)
-        row[is_long] = len(vertices) + np.arange(is_long.sum())
-        middle = row[number.reshape(-1)].reshape(-1, 3)
+        new_rows = np.full(len(edges), -1)
+        new_rows[is_long] = len(vertices) + np.arange(is_long.sum())
+        middle = new_rows[edge_index.reshape(-1)].reshape(-1, 3)
         vertices = np.concatenate([vertices, vertices[edges[is_long]].mean(axis=1)])
         faces = _split_faces(vertices, faces, middle).astype(np.int32)
 
@@ -520,24 +522,28 @@ def _split_faces(
     """
     count = (middle >= 0).sum(axis=1)
     # Corners are rotated so that a single split edge is the first, a single whole edge the last.
-    odd = np.where(count == 1, np.argmax(middle >= 0, axis=1), (np.argmin(middle, axis=1) + 1) % 3)
-    turn = (odd[:, None] + np.arange(3)) % 3
-    corners, middles = (np.take_along_axis(x, turn, axis=1) for x in (faces, middle))
-    found = [faces[count == 0]]
+    first_corner = np.where(
+        count == 1, np.argmax(middle >= 0, axis=1), (np.argmin(middle, axis=1) + 1) % 3
+    )
+    corner_order = (first_corner[:, None] + np.arange(3)) % 3
+    corners, middles = (np.take_along_axis(x, corner_order, axis=1) for x in (faces, middle))
+    face_groups = [faces[count == 0]]
 
     def add(where: np.ndarray, *triangles: tuple[int, int, int]) -> None:
         """Add triangles of corners, 0 to 2, and of the middles of their edges, 3 to 5."""
-        both = np.concatenate([corners, middles], axis=1)[where]
-        found.extend(both[:, list(triangle)] for triangle in triangles)
+        nodes = np.concatenate([corners, middles], axis=1)[where]
+        face_groups.extend(nodes[:, list(triangle)] for triangle in triangles)
 
     add(count == 1, (0, 3, 2), (3, 1, 2))
     add(count == 3, (0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))
     # With two split edges a quadrilateral remains, which is cut along its shorter diagonal.
-    two = count == 2
-    ends = np.where(two[:, None], middles, 0)
-    first = np.linalg.norm(vertices[corners[:, 0]] - vertices[ends[:, 1]], axis=-1)
-    second = np.linalg.norm(vertices[ends[:, 0]] - vertices[corners[:, 2]], axis=-1)
-    add(two, (3, 1, 4))
-    add(two & (first <= second), (0, 3, 4), (0, 4, 2))
-    add(two & (first > second), (0, 3, 2), (3, 4, 2))
-    return np.concatenate(found)
+    has_two_splits = count == 2
+    safe_middles = np.where(has_two_splits[:, None], middles, 0)
+    first_diagonal = np.linalg.norm(vertices[corners[:, 0]] - vertices[safe_middles[:, 1]], axis=-1)
+    second_diagonal = np.linalg.norm(
+        vertices[safe_middles[:, 0]] - vertices[corners[:, 2]], axis=-1
+    )
+    add(has_two_splits, (3, 1, 4))
+    add(has_two_splits & (first_diagonal <= second_diagonal), (0, 3, 4), (0, 4, 2))
+    add(has_two_splits & (first_diagonal > second_diagonal), (0, 3, 2), (3, 4, 2))
+    return np.concatenate(face_groups)

@@ -42,8 +42,8 @@ def _encoder() -> str | None:
 
     Returns its path or name; None if there is none.
     """
-    for find in (lambda: shutil.which(_ENCODER), _bundled_encoder):
-        program = find()
+    for finder in (lambda: shutil.which(_ENCODER), _bundled_encoder):
+        program = finder()
         if program is not None and _writes_h264(program):
             return program
     return None
@@ -51,11 +51,11 @@ def _encoder() -> str | None:
 
 def _bundled_encoder() -> str | None:
     try:
-        bundled = importlib.import_module("imageio_ffmpeg")
+        package = importlib.import_module("imageio_ffmpeg")
     except ImportError:
         return None
     try:
-        return str(bundled.get_ffmpeg_exe())
+        return str(package.get_ffmpeg_exe())
     except RuntimeError:  # it was installed without its program
         return None
 
@@ -63,12 +63,12 @@ def _bundled_encoder() -> str | None:
 @cache
 def _writes_h264(program: str) -> bool:
     """Whether a program lists an H.264 encoder; the ffmpeg of some systems has none."""
-    asked = [program, "-hide_banner", "-encoders"]
+    command = [program, "-hide_banner", "-encoders"]
     try:
-        told = subprocess.run(asked, capture_output=True, text=True, timeout=60, check=False)
+        result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     except (OSError, subprocess.TimeoutExpired):
         return False
-    return _H264 in told.stdout.split()
+    return _H264 in result.stdout.split()
 
 
 class MissingEncoderError(SceneError):
@@ -83,7 +83,7 @@ def has_encoder(suffix: str) -> bool:
 
 def _checked(frames: Iterable[ArrayLike]) -> list[UInt8[np.ndarray, "H W 3"]]:
     """Check all frames and reduce them to eight bits."""
-    reduced = []
+    byte_frames = []
     for index, frame in enumerate(frames):
         values = np.asarray(frame)
         if values.ndim != 3 or values.shape[-1] != 3 or values.size == 0:
@@ -92,20 +92,20 @@ def _checked(frames: Iterable[ArrayLike]) -> list[UInt8[np.ndarray, "H W 3"]]:
             raise SceneError(
                 f"frame {index} must be floats in [0, 1], got {values.dtype}; divide bytes by 255"
             )
-        if reduced and values.shape != reduced[0].shape:
+        if byte_frames and values.shape != byte_frames[0].shape:
             raise SceneError(
                 f"all frames must have one size, got {values.shape} for frame {index} after "
-                f"{reduced[0].shape}; render them with one camera size"
+                f"{byte_frames[0].shape}; render them with one camera size"
             )
         if not np.isfinite(values).all():
             raise SceneError(
                 f"frame {index} has {int((~np.isfinite(values)).sum())} values that are not "
                 "finite; render it again"
             )
-        reduced.append(np.rint(np.clip(values, 0.0, 1.0) * 255).astype(np.uint8))
-    if not reduced:
+        byte_frames.append(np.rint(np.clip(values, 0.0, 1.0) * 255).astype(np.uint8))
+    if not byte_frames:
         raise SceneError("a movie needs at least one frame, got none")
-    return reduced
+    return byte_frames
 
 
 def _shared_palette(frames: list[UInt8[np.ndarray, "H W 3"]]) -> Image.Image:
@@ -125,8 +125,8 @@ def _shared_palette(frames: list[UInt8[np.ndarray, "H W 3"]]) -> Image.Image:
 
 def _gif_durations(count: int, rate: float) -> list[int]:
     """Return the milliseconds of each frame: whole hundredths of a second, without drift."""
-    ends = np.rint(np.arange(count + 1) * (100.0 / rate)).astype(int)
-    return [10 * int(hundredths) for hundredths in np.diff(ends)]
+    frame_ends = np.rint(np.arange(count + 1) * (100.0 / rate)).astype(int)
+    return [10 * int(hundredths) for hundredths in np.diff(frame_ends)]
 
 
 def _write_gif(path: Path, frames: list[UInt8[np.ndarray, "H W 3"]], rate: float) -> None:
@@ -139,9 +139,9 @@ def _write_gif(path: Path, frames: list[UInt8[np.ndarray, "H W 3"]], rate: float
             )
 
     images = indexed()
-    with written_aside(path) as aside:
+    with written_aside(path) as temporary_path:
         next(images).save(
-            aside,
+            temporary_path,
             format="GIF",
             save_all=True,
             append_images=images,
@@ -190,8 +190,8 @@ def _write_mp4(path: Path, frames: list[UInt8[np.ndarray, "H W 3"]], rate: float
     encoder = _encoder() or _ENCODER
     height, width, _ = _even(frames[0]).shape
     # Messages go to a file: a full pipe would stop the encoder while frames are being written.
-    with written_aside(path) as aside, tempfile.TemporaryFile() as messages:
-        command = _encoder_command(encoder, aside, width, height, rate)
+    with written_aside(path) as temporary_path, tempfile.TemporaryFile() as messages:
+        command = _encoder_command(encoder, temporary_path, width, height, rate)
         process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=messages
         )
@@ -201,12 +201,12 @@ def _write_mp4(path: Path, frames: list[UInt8[np.ndarray, "H W 3"]], rate: float
             process.kill()
             process.wait()
             raise
-        if process.returncode != 0 or not aside.is_file():
+        if process.returncode != 0 or not temporary_path.is_file():
             messages.seek(0)
-            said = messages.read().decode(errors="replace").strip()[-_ERROR_LENGTH:]
+            error_text = messages.read().decode(errors="replace").strip()[-_ERROR_LENGTH:]
             raise OSError(
                 f"cannot write {path}: {_ENCODER} ended with status {process.returncode} "
-                f"({said or 'no message'}); write a .gif instead"
+                f"({error_text or 'no message'}); write a .gif instead"
             )
 
 
@@ -220,10 +220,10 @@ def check_movie(suffix: str, frames_per_second: float | int) -> None:
     """
     if suffix not in FORMATS:
         raise SceneError(f"a movie must end in {' or '.join(FORMATS)}, got {suffix!r}")
-    fastest = _MAX_GIF_RATE if suffix == ".gif" else _MAX_MP4_RATE
-    if not _MIN_RATE <= frames_per_second <= fastest:
+    largest_rate = _MAX_GIF_RATE if suffix == ".gif" else _MAX_MP4_RATE
+    if not _MIN_RATE <= frames_per_second <= largest_rate:
         raise SceneError(
-            f"{suffix} movies have {_MIN_RATE:g} to {fastest:g} frames per second, got "
+            f"{suffix} movies have {_MIN_RATE:g} to {largest_rate:g} frames per second, got "
             f"{frames_per_second}"
         )
     if suffix == ".mp4" and _encoder() is None:

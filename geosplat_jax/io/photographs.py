@@ -43,20 +43,20 @@ class Part:
         """Copy the rectangle around the pixels whose alpha is not zero."""
         top, bottom = _reach((alpha > 0).any(axis=1))
         left, right = _reach((alpha > 0).any(axis=0))
-        inside = slice(top, bottom), slice(left, right)
-        kept = alpha[inside]
-        if kept.size and kept.min() == kept.max():
-            kept = np.broadcast_to(kept.flat[0].copy(), kept.shape)  # takes no memory
+        window = slice(top, bottom), slice(left, right)
+        crop = alpha[window]
+        if crop.size and crop.min() == crop.max():
+            crop = np.broadcast_to(crop.flat[0].copy(), crop.shape)  # takes no memory
         else:
-            kept = kept.copy()
-        return cls(top, left, color[inside].copy(), kept)
+            crop = crop.copy()
+        return cls(top, left, color[window].copy(), crop)
 
 
-def _reach(used: Bool[np.ndarray, " N"]) -> tuple[int, int]:
+def _reach(is_used: Bool[np.ndarray, " N"]) -> tuple[int, int]:
     """First used entry, and the one after the last; (0, 0) where none is."""
-    if not used.any():
+    if not is_used.any():
         return 0, 0
-    return int(used.argmax()), int(used.size - used[::-1].argmax())
+    return int(is_used.argmax()), int(is_used.size - is_used[::-1].argmax())
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,10 @@ class _Packed:
     @classmethod
     def of(cls, part: Part, *, keeps_color: bool) -> "_Packed":
         alpha = part.alpha
-        common = (part.top, part.left, alpha.shape, alpha.dtype)
+        common_fields = (part.top, part.left, alpha.shape, alpha.dtype)
         if keeps_color or not any(alpha.strides):
-            return cls(*common, part.color if keeps_color else None, alpha)
-        return cls(*common, None, zlib.compress(alpha.tobytes(), 1))
+            return cls(*common_fields, part.color if keeps_color else None, alpha)
+        return cls(*common_fields, None, zlib.compress(alpha.tobytes(), 1))
 
     @property
     def byte_count(self) -> int:
@@ -112,9 +112,9 @@ class PartsInMemory:
     def add(self, index: int, part: Part) -> None:
         """Store the part of a view; thread-safe."""
         with self._lock:
-            fits = self._taken + part.color.nbytes <= self.most_bytes
-            self._taken += part.color.nbytes if fits else 0
-        self._packed[index] = _Packed.of(part, keeps_color=fits)
+            has_room = self._taken + part.color.nbytes <= self.most_bytes
+            self._taken += part.color.nbytes if has_room else 0
+        self._packed[index] = _Packed.of(part, keeps_color=has_room)
 
     def photographs(
         self, height: int, width: int, read: Callable[[int], Part], *, threads: int
@@ -164,21 +164,21 @@ class _Stack(abc.ABC):
         """Compute all images."""
         if copy is False:
             raise ValueError("the array is made anew, so it is always a copy")
-        made = self[:]
-        return made if dtype is None else made.astype(dtype)
+        images = self[:]
+        return images if dtype is None else images.astype(dtype)
 
     def __getitem__(self, key: Any) -> np.ndarray:
         """Compute the images of some views, indexed as an array; further indices apply to these."""
-        first, rest = (key[0], key[1:]) if isinstance(key, tuple) and key else (key, ())
-        if isinstance(first, int | np.integer):
-            index = range(len(self))[first]
-            return self._make(index)[rest] if rest else self._make(index)
-        is_list = not rest and first is not Ellipsis and np.ndim(first) == 1
-        if isinstance(first, slice) or is_list:
-            chosen = np.arange(len(self))[first]
-            made = self._make_all([int(index) for index in chosen])
-            views = np.stack(made) if made else np.empty((0, *self.shape[1:]), np.float32)
-            return views[(slice(None), *rest)] if rest else views
+        view_key, pixel_key = (key[0], key[1:]) if isinstance(key, tuple) and key else (key, ())
+        if isinstance(view_key, int | np.integer):
+            index = range(len(self))[view_key]
+            return self._make(index)[pixel_key] if pixel_key else self._make(index)
+        is_list = not pixel_key and view_key is not Ellipsis and np.ndim(view_key) == 1
+        if isinstance(view_key, slice) or is_list:
+            indices = np.arange(len(self))[view_key]
+            images = self._make_all([int(index) for index in indices])
+            views = np.stack(images) if images else np.empty((0, *self.shape[1:]), np.float32)
+            return views[(slice(None), *pixel_key)] if pixel_key else views
         return self[:][key]
 
 
@@ -242,8 +242,8 @@ class Photographs(_Stack):
 
     def divided(self, factors: Float[np.ndarray, "V 3"]) -> "Photographs":
         """Divide linear colours by a factor for every view and channel; alpha is unchanged."""
-        before = 1.0 if self.divisors is None else self.divisors
-        return replace(self, divisors=before * factors)
+        old_divisors = 1.0 if self.divisors is None else self.divisors
+        return replace(self, divisors=old_divisors * factors)
 
     def _placed(self, index: int, out: np.ndarray, values: np.ndarray) -> None:
         """Write values of a view's part to their place in the window ``out``."""
@@ -359,8 +359,8 @@ class Marks(_Stack):
     def _make(self, index: int) -> Float[np.ndarray, "H W"]:
         (row, column), (height, width) = self._corners[index], self.shape[1:]
         rows = self._bits[index][row : row + height]
-        whole = np.unpackbits(rows, axis=1, count=self._width)
-        return whole[:, column : column + width].astype(np.float32)
+        unpacked_rows = np.unpackbits(rows, axis=1, count=self._width)
+        return unpacked_rows[:, column : column + width].astype(np.float32)
 
 
 Images = np.ndarray | Photographs

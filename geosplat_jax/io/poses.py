@@ -129,25 +129,25 @@ def find_poses(
     _require_free(root, force)
     _require_sizes(root, names, settings)
     colmap = optional_package("pycolmap", "finding cameras", extra="capture")
-    level = colmap.logging.minloglevel
+    log_level = colmap.logging.minloglevel
     colmap.logging.minloglevel = colmap.logging.FATAL.value  # failures are reported by this module
     try:
-        with tempfile.TemporaryDirectory(prefix="geosplat_poses_") as work:
+        with tempfile.TemporaryDirectory(prefix="geosplat_poses_") as folder:
             search = _Search(
-                colmap, image_folder(root), names, Path(work), settings, on_progress or _silent
+                colmap, image_folder(root), names, Path(folder), settings, on_progress or _silent
             )
-            best = search.run()
-            _align(colmap, best, image_folder(root))
-            _write(best, root / MODEL_FOLDER)
+            best_model = search.run()
+            _align(colmap, best_model, image_folder(root))
+            _write(best_model, root / MODEL_FOLDER)
     finally:
-        colmap.logging.minloglevel = level
-    found = {image.name for image in best.images.values() if image.has_pose}
+        colmap.logging.minloglevel = log_level
+    registered_names = {image.name for image in best_model.images.values() if image.has_pose}
     return PoseReport(
         model=root / MODEL_FOLDER,
-        registered=len(found),
-        missing=tuple(name for name in names if name not in found),
-        error=float(best.compute_mean_reprojection_error()),
-        points=int(best.num_points3D()),
+        registered=len(registered_names),
+        missing=tuple(name for name in names if name not in registered_names),
+        error=float(best_model.compute_mean_reprojection_error()),
+        points=int(best_model.num_points3D()),
         seconds=search.seconds,
     )
 
@@ -163,10 +163,10 @@ def _photographs(root: Path) -> list[str]:
     folder = image_folder(root)
     suffixes = set(IMAGE_SUFFIXES) - LINEAR_FORMATS
     # Without images/, folders below may hold anything, masks for one.
-    listed = folder.iterdir() if folder == root else folder.rglob("*")
+    candidates = folder.iterdir() if folder == root else folder.rglob("*")
     paths = [
         path
-        for path in listed
+        for path in candidates
         if path.suffix.lower() in suffixes and path.is_file() and not path.name.startswith(".")
     ]
     names = sorted(path.relative_to(folder).as_posix() for path in paths)
@@ -177,12 +177,12 @@ def _photographs(root: Path) -> list[str]:
             f"{folder} has {len(names)} photographs ({', '.join(sorted(suffixes))}); finding "
             f"cameras takes at least {_FEWEST}, and a good reconstruction about 50"
         )
-    unlisted = [name for name in names if name.startswith("#") or len(name.split()) != 1]
-    if unlisted:
+    bad_names = [name for name in names if name.startswith("#") or len(name.split()) != 1]
+    if bad_names:
         # COLMAP reads pairs of names, divided by a space, and skips names that it does not know.
         raise SceneError(
-            f"{len(unlisted)} photographs in {folder} have a space in their name or begin with #, "
-            f"{unlisted[0]!r} for one, which COLMAP cannot match; rename them"
+            f"{len(bad_names)} photographs in {folder} have a space in their name or begin with #, "
+            f"{bad_names[0]!r} for one, which COLMAP cannot match; rename them"
         )
     stems = Counter("_".join(Path(name).with_suffix("").parts) for name in names)
     stem, count = stems.most_common(1)[0]
@@ -193,17 +193,19 @@ def _photographs(root: Path) -> list[str]:
 
 def _require_free(root: Path, force: bool) -> None:
     """Refuse a folder that has cameras, unless ``force`` is set and ours would be read instead."""
-    found = next((name for name, layout in LAYOUTS.items() if layout.recognise(root)), None)
-    if found is None:
+    layout_name = next((name for name, layout in LAYOUTS.items() if layout.recognise(root)), None)
+    if layout_name is None:
         return
     order = list(LAYOUTS)
-    if order.index(found) < order.index("colmap"):
+    if order.index(layout_name) < order.index("colmap"):
         raise SceneError(
-            f"{root} is a scene with cameras already, of layout {found}, which would be read "
+            f"{root} is a scene with cameras already, of layout {layout_name}, which would be read "
             "instead of those found here; move its file of cameras away"
         )
     if not force:
-        raise SceneError(f"{root} has cameras already, of layout {found}; --force replaces them")
+        raise SceneError(
+            f"{root} has cameras already, of layout {layout_name}; --force replaces them"
+        )
 
 
 def _require_sizes(root: Path, names: list[str], settings: PoseSettings) -> None:
@@ -292,36 +294,36 @@ class _Search:
         self.colmap.Database.open(self.database).close()
         self.seconds = {}
         for part, search in (("features", self._features), ("matching", self._match)):
-            began = time.perf_counter()
+            start_time = time.perf_counter()
             search()
-            self.seconds[part] = time.perf_counter() - began
-        began = time.perf_counter()
+            self.seconds[part] = time.perf_counter() - start_time
+        start_time = time.perf_counter()
         models = self._map()
-        self.seconds["mapping"] = time.perf_counter() - began
-        best = max(models, key=lambda model: model.num_reg_images(), default=None)
-        count = 0 if best is None else best.num_reg_images()
-        if best is None or count < max(_FEWEST, _SMALLEST_SHARE * len(self.names)):
+        self.seconds["mapping"] = time.perf_counter() - start_time
+        best_model = max(models, key=lambda model: model.num_reg_images(), default=None)
+        count = 0 if best_model is None else best_model.num_reg_images()
+        if best_model is None or count < max(_FEWEST, _SMALLEST_SHARE * len(self.names)):
             raise PoseError(self._matches().advice(count))
-        return best
+        return best_model
 
     def _features(self) -> None:
-        modes = self.colmap.CameraMode
-        is_one = self.settings.lens == "one"
-        mode = modes.SINGLE if is_one else modes.PER_IMAGE
+        camera_modes = self.colmap.CameraMode
+        is_single_lens = self.settings.lens == "one"
+        mode = camera_modes.SINGLE if is_single_lens else camera_modes.PER_IMAGE
         reader = self.colmap.ImageReaderOptions()
         # A single photograph has too few points to determine more parameters.
-        reader.camera_model = "OPENCV" if is_one else "SIMPLE_RADIAL"
+        reader.camera_model = "OPENCV" if is_single_lens else "SIMPLE_RADIAL"
         # Photographs are numbered here: extraction would number them in the order of its threads.
         self.colmap.import_images(self.database, self.images, mode, self.names, reader)
         extraction = self.colmap.FeatureExtractionOptions()
         extraction.max_image_size = self.settings.size
         extraction.use_gpu = False
-        for first in range(0, len(self.names), _GROUP):
-            group = self.names[first : first + _GROUP]
+        for start in range(0, len(self.names), _GROUP):
+            group = self.names[start : start + _GROUP]
             self.colmap.extract_features(
                 self.database, self.images, group, mode, reader, extraction
             )
-            self.tell("features", first + len(group), len(self.names))
+            self.tell("features", start + len(group), len(self.names))
 
     def _match(self) -> None:
         pairs = _pairs(len(self.names), self.settings.order)
@@ -331,20 +333,20 @@ class _Search:
         geometry.ransac.random_seed = self.settings.seed
         pairing = self.colmap.ImportedPairingOptions()
         pairing.match_list_path = self.work / "pairs.txt"
-        done = 0
+        matched_count = 0
         for group in _in_blocks(pairs):
             lines = [f"{self.names[i]} {self.names[j]}\n" for i, j in group]
             (self.work / "pairs.txt").write_text("".join(lines), encoding="utf-8")
             self.colmap.match_image_pairs(self.database, matching, pairing, geometry)
-            done += len(group)
-            self.tell("matching", done, len(pairs))
+            matched_count += len(group)
+            self.tell("matching", matched_count, len(pairs))
 
     def _map(self) -> list[Any]:
         options = self.colmap.IncrementalPipelineOptions()
         options.num_threads = 1
         options.min_model_size = _FEWEST
-        for part in (options, options.mapper, options.triangulation):
-            part.random_seed = self.settings.seed
+        for stage_options in (options, options.mapper, options.triangulation):
+            stage_options.random_seed = self.settings.seed
         # The first two photographs are registered as a pair, without a callback.
         registered = 2
 
@@ -370,10 +372,10 @@ class _Search:
 
 def _upright(pose: Float[np.ndarray, "4 4"], orientation: int) -> Float[np.ndarray, "4 4"]:
     """Rotate a camera about its axis so that its y axis points up, by EXIF orientation."""
-    turned = pose.copy()
+    upright_pose = pose.copy()
     angle = _UPRIGHT_DEGREES.get(orientation, 0)
-    turned[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", angle, degrees=True).as_matrix()
-    return turned
+    upright_pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", angle, degrees=True).as_matrix()
+    return upright_pose
 
 
 def _align(colmap: ModuleType, model: Any, images: Path) -> None:
@@ -381,8 +383,10 @@ def _align(colmap: ModuleType, model: Any, images: Path) -> None:
     poses = []
     for image in sorted(model.images.values(), key=lambda image: image.name):
         if image.has_pose:
-            placed = image.cam_from_world()
-            pose = opengl_pose(placed.rotation.matrix(), placed.translation, image.name)
+            camera_from_world = image.cam_from_world()
+            pose = opengl_pose(
+                camera_from_world.rotation.matrix(), camera_from_world.translation, image.name
+            )
             poses.append(_upright(pose, image_orientation(images / image.name)))
     points = np.stack([point.xyz for point in model.points3D.values()])
     world = align_world(np.stack(poses), points)
@@ -391,13 +395,13 @@ def _align(colmap: ModuleType, model: Any, images: Path) -> None:
 
 def _write(model: Any, folder: Path) -> None:
     """Write a model to a temporary folder, then replace an existing one by it."""
-    aside = folder.with_name(f".{folder.name}.partial")
-    shutil.rmtree(aside, ignore_errors=True)
-    aside.mkdir(parents=True)
+    temporary_folder = folder.with_name(f".{folder.name}.partial")
+    shutil.rmtree(temporary_folder, ignore_errors=True)
+    temporary_folder.mkdir(parents=True)
     try:
-        model.write(aside)
+        model.write(temporary_folder)
         if folder.exists():
             shutil.rmtree(folder)
-        aside.rename(folder)
+        temporary_folder.rename(folder)
     finally:
-        shutil.rmtree(aside, ignore_errors=True)
+        shutil.rmtree(temporary_folder, ignore_errors=True)

@@ -45,16 +45,16 @@ def _put_aside() -> None:
         return  # a process without the stream has nothing to keep clean
     sys.stderr.flush()
     try:
-        saved = os.dup(2)
+        descriptor = os.dup(2)
     except OSError:
         return
     try:
-        aside = tempfile.TemporaryFile()
+        buffer = tempfile.TemporaryFile()
     except OSError:
-        os.close(saved)
+        os.close(descriptor)
         raise
-    os.dup2(aside.fileno(), 2)
-    _saved, _aside = saved, aside
+    os.dup2(buffer.fileno(), 2)
+    _saved, _aside = descriptor, buffer
 
 
 def _end() -> None:
@@ -68,8 +68,8 @@ def _end() -> None:
         os.dup2(_saved, 2)
         os.close(_saved)
         _aside.seek(0)
-        kept = [line for line in _aside if not line.startswith(_NOISE)]
+        lines = [line for line in _aside if not line.startswith(_NOISE)]
         _aside.close()
         _saved, _aside = -1, None
-        if kept:
-            os.write(2, b"".join(kept))
+        if lines:
+            os.write(2, b"".join(lines))

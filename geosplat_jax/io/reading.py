@@ -62,15 +62,15 @@ class Photograph(NamedTuple):
         lookup = _lookup_of(frame, width, height)
         # The work is done in strips: as floats, a large photograph takes half a gigabyte.
         strip = factor * max(1, _STRIP_ROWS // factor)
-        parts, counted = [], []
+        rgba_strips, valid_strips = [], []
         for start in range(0, height - height % factor, strip):
             rows = slice(start, min(start + strip, height - height % factor))
             rgba, valid = self._linear(rows, lookup)
             share = downscale(valid[..., None].astype(np.float32), factor)[..., 0]
-            counted.append(share == 1.0)
-            parts.append(np.where(counted[-1][..., None], downscale(rgba, factor), 0.0))
-        small = np.concatenate(parts)
-        return Part.of(small[..., :3], small[..., 3]), np.concatenate(counted)
+            valid_strips.append(share == 1.0)
+            rgba_strips.append(np.where(valid_strips[-1][..., None], downscale(rgba, factor), 0.0))
+        reduced_rgba = np.concatenate(rgba_strips)
+        return Part.of(reduced_rgba[..., :3], reduced_rgba[..., 3]), np.concatenate(valid_strips)
 
     def _linear(
         self, rows: slice, lookup: Lookup | None
@@ -80,9 +80,9 @@ class Photograph(NamedTuple):
             alpha = values_of(self.alpha[rows], is_srgb=False)
             rgb = values_of(self.color[rows], is_srgb=True)
             return np.concatenate([rgb, alpha[..., None]], -1), self.valid[rows]
-        part = lookup.part(rows)
-        valid = resample_valid(self.valid, part)
-        rgba = resample_at(self._premultiplied, (*self.alpha.shape, 4), part)
+        row_lookup = lookup.part(rows)
+        valid = resample_valid(self.valid, row_lookup)
+        rgba = resample_at(self._premultiplied, (*self.alpha.shape, 4), row_lookup)
         rgba[~valid] = 0.0
         return rgba, valid
 

@@ -92,9 +92,9 @@ def _open_edges(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " E"]:
     start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
     stride = int(faces.max(initial=0)) + 1
     edge = np.minimum(start, end) * stride + np.maximum(start, end)
-    _, number = np.unique(edge, return_inverse=True)
-    ways = np.where(start < end, 1.0, -1.0).ravel()
-    return np.rint(np.bincount(number.reshape(-1), ways)).astype(np.int64)
+    _, edge_index = np.unique(edge, return_inverse=True)
+    edge_signs = np.where(start < end, 1.0, -1.0).ravel()
+    return np.rint(np.bincount(edge_index.reshape(-1), edge_signs)).astype(np.int64)
 
 
 def digest_of(path: str | Path) -> str:
@@ -141,9 +141,9 @@ def read_start(path: str, digest: str) -> StartMesh:
         )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError(f"{path} has faces of vertices that it does not have")
-    used = np.zeros(len(vertices), bool)
-    used[faces.reshape(-1)] = True
-    broken = used & ~np.isfinite(vertices).all(axis=1)
+    is_used = np.zeros(len(vertices), bool)
+    is_used[faces.reshape(-1)] = True
+    broken = is_used & ~np.isfinite(vertices).all(axis=1)
     if broken.any():
         raise ValueError(
             f"{path}: {broken.sum()} of {len(vertices)} vertices are not finite numbers, the first "
@@ -157,30 +157,30 @@ def read_start(path: str, digest: str) -> StartMesh:
 
 def _cleaned(mesh: StartMesh, path: str) -> StartMesh:
     """Join corners at one place; drop degenerate and duplicate faces, and unused vertices."""
-    used, rows = np.unique(mesh.faces, return_inverse=True)
-    unused = len(mesh.vertices) - len(used)
-    vertices, place = _joined(mesh.vertices[used])
-    faces = place[rows.reshape(-1, 3)].astype(np.int32)
-    given, joined = len(faces), len(used) - len(vertices)
-    following = np.roll(faces, -1, axis=1)
-    faces = faces[(faces != following).all(axis=1)]
+    used_rows, rows = np.unique(mesh.faces, return_inverse=True)
+    unused_count = len(mesh.vertices) - len(used_rows)
+    vertices, merged_rows = _joined(mesh.vertices[used_rows])
+    faces = merged_rows[rows.reshape(-1, 3)].astype(np.int32)
+    initial_count, merged_count = len(faces), len(used_rows) - len(vertices)
+    next_corners = np.roll(faces, -1, axis=1)
+    faces = faces[(faces != next_corners).all(axis=1)]
     # Slivers close a surface as other faces do, but add nothing to an open one.
     if _open_edges(faces).any():
         faces = faces[nondegenerate(vertices, faces)]
-    with_area = len(faces)
+    valid_count = len(faces)
     faces = _single(faces)
     if not len(faces) or not nondegenerate(vertices, faces).any():
         raise ValueError(f"{path} must hold a triangle mesh, found no triangle with an area in it")
-    used, rows = np.unique(faces, return_inverse=True)
+    used_rows, rows = np.unique(faces, return_inverse=True)
     counts = {
-        "duplicate vertices merged": joined,
-        "faces without area dropped": given - with_area,
-        "duplicate faces dropped": with_area - len(faces),
-        "unused vertices dropped": unused + len(vertices) - len(used),
+        "duplicate vertices merged": merged_count,
+        "faces without area dropped": initial_count - valid_count,
+        "duplicate faces dropped": valid_count - len(faces),
+        "unused vertices dropped": unused_count + len(vertices) - len(used_rows),
     }
-    notes = [f"{count} {what}" for what, count in counts.items() if count]
+    notes = [f"{count} {description}" for description, count in counts.items() if count]
     faces = rows.reshape(-1, 3).astype(np.int32)
-    return mesh.noting(*notes, vertices=vertices[used], faces=faces)
+    return mesh.noting(*notes, vertices=vertices[used_rows], faces=faces)
 
 
 def _joined(points: Float[np.ndarray, "V 3"]) -> tuple[np.ndarray, Int[np.ndarray, " V"]]:
@@ -193,19 +193,19 @@ def _joined(points: Float[np.ndarray, "V 3"]) -> tuple[np.ndarray, Int[np.ndarra
     low = points.min(axis=0)
     size = float(np.max(points.max(axis=0) - low))
     count = len(points)
-    within = (points - low) / (2.0 * _SAME_PLACE * size if size > 0 else 1.0)
-    ends = []
+    grid_points = (points - low) / (2.0 * _SAME_PLACE * size if size > 0 else 1.0)
+    link_ends = []
     for shift in np.ndindex(2, 2, 2):
-        cube = np.floor(within + 0.5 * np.array(shift)).astype(np.int64)
-        _, first, row = np.unique(
+        cube = np.floor(grid_points + 0.5 * np.array(shift)).astype(np.int64)
+        _, first_rows, cell_index = np.unique(
             cube @ np.array([1 << 42, 1 << 21, 1]), return_index=True, return_inverse=True
         )
-        ends.append(first[row.reshape(-1)].astype(np.int32))
-    starts = np.tile(np.arange(count, dtype=np.int32), len(ends))
-    links = (np.ones(len(starts), bool), (np.concatenate(ends), starts))
+        link_ends.append(first_rows[cell_index.reshape(-1)].astype(np.int32))
+    starts = np.tile(np.arange(count, dtype=np.int32), len(link_ends))
+    links = (np.ones(len(starts), bool), (np.concatenate(link_ends), starts))
     group = connected_components(coo_matrix(links, shape=(count, count)), directed=False)[1]
-    _, first = np.unique(group, return_index=True)
-    return points[first], group
+    _, first_rows = np.unique(group, return_index=True)
+    return points[first_rows], group
 
 
 def _single(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "G 3"]:
@@ -215,36 +215,40 @@ def _single(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "G 3"]:
     between two rooms: a sheet of duplicates inside a closed surface, whose whole border lies on
     faces without duplicates.
     """
-    _, only, number, count = np.unique(
+    _, first_rows, group_index, count = np.unique(
         np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
     )
-    kept, is_alone = faces[np.sort(only)], count[number.reshape(-1)] == 1
-    alone = faces[is_alone]
-    if not _open_edges(kept).any() or not len(alone) or _open_edges(alone).any():
-        return kept
-    doubled = faces[np.sort(only[count > 1])]
-    return np.concatenate([alone, doubled[~_within(doubled, alone)]])
+    unique_faces, is_alone = faces[np.sort(first_rows)], count[group_index.reshape(-1)] == 1
+    single_faces = faces[is_alone]
+    if (
+        not _open_edges(unique_faces).any()
+        or not len(single_faces)
+        or _open_edges(single_faces).any()
+    ):
+        return unique_faces
+    duplicate_faces = faces[np.sort(first_rows[count > 1])]
+    return np.concatenate([single_faces, duplicate_faces[~_within(duplicate_faces, single_faces)]])
 
 
 def _within(walls: Int[np.ndarray, "F 3"], faces: Int[np.ndarray, "G 3"]) -> np.ndarray:
     """Tell for each wall whether its sheet has a border, all of which lies on other faces, (F,)."""
 
-    def edges(rows: np.ndarray) -> np.ndarray:
-        ends = np.sort(np.stack([rows, np.roll(rows, -1, axis=1)], axis=-1), axis=-1)
-        return ends.reshape(-1, 2).astype(np.int64) @ np.array([stride, 1])
+    def edges(triangles: np.ndarray) -> np.ndarray:
+        edge_ends = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1), axis=-1)
+        return edge_ends.reshape(-1, 2).astype(np.int64) @ np.array([stride, 1])
 
     stride = int(max(walls.max(initial=0), faces.max(initial=0))) + 1
-    of_walls = edges(walls)
-    _, number, count = np.unique(of_walls, return_inverse=True, return_counts=True)
-    number = number.reshape(-1)
-    face = np.arange(len(of_walls)) // 3
-    links = coo_matrix((np.ones(len(face), bool), (face, len(walls) + number)))
+    wall_edges = edges(walls)
+    _, edge_index, count = np.unique(wall_edges, return_inverse=True, return_counts=True)
+    edge_index = edge_index.reshape(-1)
+    face = np.arange(len(wall_edges)) // 3
+    links = coo_matrix((np.ones(len(face), bool), (face, len(walls) + edge_index)))
     links.resize((len(walls) + len(count),) * 2)
     sheet = connected_components(links, directed=False)[1][: len(walls)]
-    is_free = (count[number] == 1) & ~np.isin(of_walls, edges(faces))
-    ends_freely = np.bincount(sheet[face], is_free) > 0
-    has_border = np.bincount(sheet[face], count[number] == 1) > 0
-    return (has_border & ~ends_freely)[sheet]
+    is_free = (count[edge_index] == 1) & ~np.isin(wall_edges, edges(faces))
+    has_free_edge = np.bincount(sheet[face], is_free) > 0
+    has_border = np.bincount(sheet[face], count[edge_index] == 1) > 0
+    return (has_border & ~has_free_edge)[sheet]
 
 
 def _outward(mesh: StartMesh) -> StartMesh:
@@ -256,11 +260,11 @@ def _outward(mesh: StartMesh) -> StartMesh:
     consistent orientation.
     """
     if not mesh.is_closed:
-        faces, left = _wound_alike(mesh.faces)
+        faces, one_sided_count = _wound_alike(mesh.faces)
         if not np.array_equal(faces, mesh.faces):
             mesh = mesh.noting("its faces were wound inconsistently; now alike", faces=faces)
-        if left:
-            mesh = mesh.noting(f"{left} faces belong to one-sided (Moebius) bands")
+        if one_sided_count:
+            mesh = mesh.noting(f"{one_sided_count} faces belong to one-sided (Moebius) bands")
         if not mesh.is_closed:
             return mesh
     if signed_volume(mesh.vertices, mesh.faces) < 0:
@@ -277,21 +281,22 @@ def _wound_alike(faces: Int[np.ndarray, "F 3"]) -> tuple[Int[np.ndarray, "F 3"],
     part of the mesh gives two connected components, one the reverse of the other, and a one-sided
     part gives a single component.
     """
-    count, near = len(faces), connectivity(faces)
-    first, second = near.wings[:, 0], near.wings[:, 1]
-    other = second + count * near.turned
-    ends = (
-        np.concatenate([first, first + count]),
-        np.concatenate([other, (other + count) % (2 * count)]),
+    count, adjacency = len(faces), connectivity(faces)
+    first_faces, second_faces = adjacency.wings[:, 0], adjacency.wings[:, 1]
+    linked_faces = second_faces + count * adjacency.turned
+    link_ends = (
+        np.concatenate([first_faces, first_faces + count]),
+        np.concatenate([linked_faces, (linked_faces + count) % (2 * count)]),
     )
-    links = coo_matrix((np.ones(len(ends[0]), bool), ends), shape=(2 * count, 2 * count))
-    part = connected_components(links, directed=False)[1]
-    kept, turned = part[:count], part[count:]
-    is_one_sided = kept == turned
-    size = np.bincount(kept, minlength=int(part.max(initial=-1)) + 1)
+    links = coo_matrix((np.ones(len(link_ends[0]), bool), link_ends), shape=(2 * count, 2 * count))
+    components = connected_components(links, directed=False)[1]
+    kept_component, flipped_component = components[:count], components[count:]
+    is_one_sided = kept_component == flipped_component
+    size = np.bincount(kept_component, minlength=int(components.max(initial=-1)) + 1)
     # Of the two components of a part, the one that turns fewer faces; if equal, the first.
     is_turned = ~is_one_sided & (
-        (size[kept] < size[turned]) | ((size[kept] == size[turned]) & (kept > turned))
+        (size[kept_component] < size[flipped_component])
+        | ((size[kept_component] == size[flipped_component]) & (kept_component > flipped_component))
     )
     return np.where(is_turned[:, None], faces[:, ::-1], faces), int(is_one_sided.sum())
 
@@ -303,8 +308,10 @@ def agreement_with_views(points: Float[np.ndarray, "P 3"], views: Views) -> floa
     union of the bounding rectangles of points and mask; without masks, the share of the points
     inside the image. The result is the mean over some views.
     """
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _VIEWS)).astype(int))
-    return float(np.mean([_fills(points, views, v, views.mask(v)) for v in map(int, chosen)]))
+    view_indices = np.unique(np.linspace(0, len(views) - 1, min(len(views), _VIEWS)).astype(int))
+    return float(
+        np.mean([_fills(points, views, view, views.mask(view)) for view in map(int, view_indices)])
+    )
 
 
 def _fills(points: np.ndarray, views: Views, view: int, mask: np.ndarray) -> float:
@@ -312,31 +319,31 @@ def _fills(points: np.ndarray, views: Views, view: int, mask: np.ndarray) -> flo
     rows, columns = np.nonzero(mask)
     if not len(rows):
         return 1.0
-    pixels, local = project(points, views.world_to_camera[view], views.intrinsics[view])
-    pixels = pixels[local[:, 2] > 0]
-    inside = in_image(pixels, height=views.height, width=views.width)
-    if not inside.any():
+    pixels, camera_points = project(points, views.world_to_camera[view], views.intrinsics[view])
+    pixels = pixels[camera_points[:, 2] > 0]
+    is_inside = in_image(pixels, height=views.height, width=views.width)
+    if not is_inside.any():
         return 0.0
-    column, row = pixels[inside].astype(int).T
+    column, row = pixels[is_inside].astype(int).T
     if views.valid is not None:
         # Points in pixels that do not count are left out.
-        counts = np.ones(len(pixels), bool)
-        counts[inside] = np.asarray(views.valid[view])[row, column] > 0
-        column, row = column[counts[inside]], row[counts[inside]]
-        unknown, pixels = len(pixels) - int(counts.sum()), pixels[counts]
+        is_valid = np.ones(len(pixels), bool)
+        is_valid[is_inside] = np.asarray(views.valid[view])[row, column] > 0
+        column, row = column[is_valid[is_inside]], row[is_valid[is_inside]]
+        invalid_count, pixels = len(pixels) - int(is_valid.sum()), pixels[is_valid]
         if not len(column):
             return 1.0
     else:
-        unknown = 0
-    share = float(mask[row, column].sum() / (len(points) - unknown))
+        invalid_count = 0
+    share = float(mask[row, column].sum() / (len(points) - invalid_count))
     if not views.has_masks:
         return share
     low, high = np.percentile(pixels, (1, 99), axis=0)
-    first = np.array([columns.min(), rows.min()], float)
-    last = np.array([columns.max(), rows.max()], float) + 1
-    common = np.prod(np.maximum(np.minimum(high, last) - np.maximum(low, first), 0))
-    union = np.prod(high - low) + np.prod(last - first) - common
-    return share * float(common / union)
+    mask_low = np.array([columns.min(), rows.min()], float)
+    mask_high = np.array([columns.max(), rows.max()], float) + 1
+    intersection = np.prod(np.maximum(np.minimum(high, mask_high) - np.maximum(low, mask_low), 0))
+    union = np.prod(high - low) + np.prod(mask_high - mask_low) - intersection
+    return share * float(intersection / union)
 
 
 def _points_on(mesh: StartMesh) -> Float[np.ndarray, "P 3"]:
@@ -365,23 +372,23 @@ def require_in_views(mesh: StartMesh, views: Views, path: str) -> None:
         turn of the axes that would help, if there is one.
     """
     points = _points_on(mesh)
-    found = agreement_with_views(points, views)
-    if found >= _AGREES:
+    agreement = agreement_with_views(points, views)
+    if agreement >= _AGREES:
         return
     scaled = {factor: agreement_with_views(factor * points, views) for factor in _FACTORS}
     best = max(scaled, key=lambda factor: scaled[factor])
     advice = "bring it into the axes, the place and the units of the cameras"
-    if scaled[best] >= max(_AGREES, 2 * found):
+    if scaled[best] >= max(_AGREES, 2 * agreement):
         advice = f"it would fit if it were {best:g} times as large (agreement {scaled[best]:.2f}): "
         advice += "if its units are not those of the cameras, scale the file"
     turned = agreement_with_views(from_y_up(points), views)
-    if turned >= max(_AGREES, 2 * found):
+    if turned >= max(_AGREES, 2 * agreement):
         advice = f"it would fit if it were turned to have z up (agreement {turned:.2f}): write "
         advice += "it with z up, or as glTF, whose axes are known"
     size = ", ".join(f"{extent:.3g}" for extent in np.ptp(mesh.vertices, axis=0))
     middle = ", ".join(f"{x:.3g}" for x in 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0)))
     raise ValueError(
-        f"{path} is not where the cameras see the object (agreement {found:.2f} of 1, at least "
+        f"{path} is not where the cameras see the object (agreement {agreement:.2f} of 1, at least "
         f"{_AGREES} is needed): its extent is ({size}), its centre ({middle}); {advice}"
     )
 
@@ -414,8 +421,8 @@ def sized(mesh: StartMesh, edge: float, *, most_faces: int, path: str) -> StartM
     """
     area = surface_area(mesh.vertices, mesh.faces)
     # The number of equilateral triangles that cover the surface.
-    wanted = max(int(area / (0.25 * np.sqrt(3.0) * edge**2)), 4)
-    target = min(wanted, most_faces)
+    face_count = max(int(area / (0.25 * np.sqrt(3.0) * edge**2)), 4)
+    target = min(face_count, most_faces)
     if len(mesh.faces) > most_faces or target < _WORTHWHILE * len(mesh.faces):
         mesh = _decimated(mesh, target, most_faces=most_faces, path=path)
     else:

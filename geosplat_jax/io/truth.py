@@ -26,10 +26,10 @@ class _OnDemand(Mapping[str, np.ndarray]):
     def __getitem__(self, key: str) -> np.ndarray:
         if key in self._made:
             return self._made[key]
-        made = self._makers[key]()
+        images = self._makers[key]()
         if self._keeps:
-            self._made[key] = made
-        return made
+            self._made[key] = images
+        return images
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._makers)
@@ -59,14 +59,14 @@ class Reading(NamedTuple):
     def reduced(self, index: int, pixels: np.ndarray, path: Path) -> np.ndarray:
         """Undistort and reduce an image, and place it as the photograph of its view was placed."""
         pixels = undistorted(self.frames[index], pixels)
-        small = downscale(pixels, self.factor)
+        reduced_pixels = downscale(pixels, self.factor)
         height, width = self.sizes[index]
-        _require_size(small, self.sizes[index], path, " after reduction")
-        placed = np.zeros((*self.images.shape[1:3], small.shape[-1]), np.float32)
-        placed[:height, :width] = small
+        _require_size(reduced_pixels, self.sizes[index], path, " after reduction")
+        canvas = np.zeros((*self.images.shape[1:3], reduced_pixels.shape[-1]), np.float32)
+        canvas[:height, :width] = reduced_pixels
         if self.valid is None:
-            return placed
-        return np.where(self.valid[index][..., None] > 0.0, placed, 0.0)
+            return canvas
+        return np.where(self.valid[index][..., None] > 0.0, canvas, 0.0)
 
 
 def true_maps(reading: Reading, albedo_is_srgb: bool, problems: list[str]) -> Mapping[str, Any]:
@@ -82,8 +82,8 @@ def true_maps(reading: Reading, albedo_is_srgb: bool, problems: list[str]) -> Ma
 
         return lambda: np.stack(in_parallel(read, range(len(reading.frames))))
 
-    listed = [frame.truth for frame in reading.frames]
-    keys = _in_all(listed, "ground truth", problems)
+    view_files = [frame.truth for frame in reading.frames]
+    keys = _in_all(view_files, "ground truth", problems)
     return _OnDemand({key: maker(key) for key in keys}, keeps=True)
 
 
@@ -113,8 +113,8 @@ def _read_truth(reading: Reading, index: int, key: str, is_srgb: bool) -> np.nda
         length = np.sqrt((values**2).sum(-1, keepdims=True))
         is_normal = length > _SHORTEST_NORMAL
         values = np.where(is_normal, values / np.where(is_normal, length, 1.0), 0.0)
-    covered = reading.images.alpha(index)[..., None] > 0.0
-    return np.where(covered, values, 0.0).astype(np.float32)
+    is_covered = reading.images.alpha(index)[..., None] > 0.0
+    return np.where(is_covered, values, 0.0).astype(np.float32)
 
 
 def relit_images(reading: Reading, problems: list[str]) -> Mapping[str, Any]:
@@ -129,37 +129,37 @@ def relit_images(reading: Reading, problems: list[str]) -> Mapping[str, Any]:
             frame = reading.frames[index]
             path = frame.relight[light]
             pixels = _for_reduction(reading, frame, read_linear(path), path)
-            relit = reading.reduced(index, pixels, path)
+            image = reading.reduced(index, pixels, path)
             # An image without alpha has that of its view, since the object has not moved.
             alpha = (
-                relit[..., 3:] if relit.shape[-1] == 4 else reading.images.alpha(index)[..., None]
+                image[..., 3:] if image.shape[-1] == 4 else reading.images.alpha(index)[..., None]
             )
-            rgb = np.where(alpha > 0.0, relit[..., :3], 0.0)
+            rgb = np.where(alpha > 0.0, image[..., :3], 0.0)
             return np.concatenate([rgb, alpha], -1).astype(np.float32)
 
         return lambda: np.stack(in_parallel(read, range(len(reading.frames))))
 
-    listed = [frame.relight for frame in reading.frames]
-    keys = _in_all(listed, "light", problems)
+    view_files = [frame.relight for frame in reading.frames]
+    keys = _in_all(view_files, "light", problems)
     return _OnDemand({light: maker(light) for light in keys}, keeps=False)
 
 
-def _in_all(listed: list[Mapping[str, Path]], what: str, problems: list[str]) -> list[str]:
+def _in_all(view_files: list[Mapping[str, Path]], kind: str, problems: list[str]) -> list[str]:
     """Return the keys that all views have; those that only some have are reported."""
-    keys = list(dict.fromkeys(key for files in listed for key in files))
-    complete = []
+    keys = list(dict.fromkeys(key for files in view_files for key in files))
+    complete_keys = []
     for key in keys:
-        count = sum(key in files for files in listed)
-        if count == len(listed):
-            complete.append(key)
+        count = sum(key in files for files in view_files)
+        if count == len(view_files):
+            complete_keys.append(key)
         else:
-            problems.append(f"{what} {key!r} is left out: only {count} of {len(listed)} views")
-    return complete
+            problems.append(f"{kind} {key!r} is left out: only {count} of {len(view_files)} views")
+    return complete_keys
 
 
-def _require_size(pixels: np.ndarray, size: Sequence[int], path: Path, when: str = "") -> None:
+def _require_size(pixels: np.ndarray, size: Sequence[int], path: Path, suffix: str = "") -> None:
     if pixels.shape[:2] != tuple(size):
         raise SceneError(
-            f"{path} is {pixels.shape[1]} x {pixels.shape[0]} pixels{when}, but its "
+            f"{path} is {pixels.shape[1]} x {pixels.shape[0]} pixels{suffix}, but its "
             f"view is {size[1]} x {size[0]}; they must agree"
         )

@@ -117,5 +117,5 @@ def write_usd(path: str | Path, mesh: trimesh.Trimesh, textures: Mapping[str, st
     shape = _add_mesh(stage, mesh)
     material = _add_material(stage, textures)
     usd_shade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(material)
-    with written_aside(path) as aside:
-        stage.GetRootLayer().Export(str(aside))
+    with written_aside(path) as temporary_path:
+        stage.GetRootLayer().Export(str(temporary_path))

@@ -118,18 +118,18 @@ class Views:
     @cached_property
     def coverage(self) -> Float[np.ndarray, " V"]:
         """Share of the pixels of each view, among those that count, that the object covers."""
-        covered = [np.count_nonzero(self.mask(index)) for index in range(len(self))]
-        return np.array(covered) / np.maximum(self.valid_counts, 1.0)
+        pixel_counts = [np.count_nonzero(self.mask(index)) for index in range(len(self))]
+        return np.array(pixel_counts) / np.maximum(self.valid_counts, 1.0)
 
     @cached_property
     def mean_colors(self) -> Float[np.ndarray, "V 3"]:
         """Mean linear colour of each view; detects photographs that changed under their names."""
-        step, found = max(1, max(self.height, self.width) // 512), np.zeros((len(self), 3))
-        for first in range(0, len(self), 4):
-            rows = np.arange(first, min(first + 4, len(self)))
-            pixels = np.asarray(self.images[rows])[:, ::step, ::step, :3]
-            found[rows] = pixels.mean((1, 2), dtype=np.float64)
-        return np.round(found, 4)
+        stride, colors = max(1, max(self.height, self.width) // 512), np.zeros((len(self), 3))
+        for start in range(0, len(self), 4):
+            rows = np.arange(start, min(start + 4, len(self)))
+            pixels = np.asarray(self.images[rows])[:, ::stride, ::stride, :3]
+            colors[rows] = pixels.mean((1, 2), dtype=np.float64)
+        return np.round(colors, 4)
 
     @property
     def has_opaque_pixel(self) -> bool:
@@ -158,10 +158,10 @@ class Views:
 
     def camera(self, indices: Sequence[int] | np.ndarray | None = None) -> Camera:
         """Cameras of all or some views for the renderer, float32 and OpenCV axes."""
-        chosen = np.arange(len(self)) if indices is None else np.asarray(indices, int).reshape(-1)
+        rows = np.arange(len(self)) if indices is None else np.asarray(indices, int).reshape(-1)
         return Camera(
-            jnp.asarray(self.world_to_camera[chosen], jnp.float32),
-            jnp.asarray(self.intrinsics[chosen], jnp.float32),
+            jnp.asarray(self.world_to_camera[rows], jnp.float32),
+            jnp.asarray(self.intrinsics[rows], jnp.float32),
             height=self.height,
             width=self.width,
         )
@@ -188,9 +188,9 @@ def some_views(views: Views, chosen: Sequence[int] | np.ndarray, *, factor: int 
         See `images.downscale`.
     """
     chosen = np.asarray(chosen, int)
-    full = np.ones((views.height, views.width), bool)
+    full_mask = np.ones((views.height, views.width), bool)
     pairs = [
-        _reduced(views.images[k], full if views.valid is None else views.valid[k] > 0, factor)
+        _reduced(views.images[k], full_mask if views.valid is None else views.valid[k] > 0, factor)
         for k in chosen
     ]
     intrinsics = views.intrinsics[chosen].copy()
@@ -227,12 +227,12 @@ def project(
     -------
     pixels : (N, 2) column and row; both are -1, outside of every image, for a point that is not in
         front of the camera.
-    local : (N, 3) the points in the frame of the camera; the last coordinate is the depth.
+    camera_points : (N, 3) the points in the frame of the camera; the last coordinate is the depth.
     """
-    local = points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
-    is_ahead = local[:, 2:] > 0.0
-    pixels = (local @ intrinsics.T)[:, :2] / np.where(is_ahead, local[:, 2:], 1.0)
-    return np.where(is_ahead, pixels, -1.0), local
+    camera_points = points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    is_ahead = camera_points[:, 2:] > 0.0
+    pixels = (camera_points @ intrinsics.T)[:, :2] / np.where(is_ahead, camera_points[:, 2:], 1.0)
+    return np.where(is_ahead, pixels, -1.0), camera_points
 
 
 def in_image(
@@ -251,11 +251,11 @@ def _reduced(
     rgba: Float[np.ndarray, "H W 4"], valid: Bool[np.ndarray, "H W"], factor: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Reduce an image; a pixel of the result counts if all pixels that it is the mean of count."""
-    small = downscale(rgba, factor)
+    reduced_rgba = downscale(rgba, factor)
     if valid.all():
-        return small, np.ones(small.shape[:2], bool)
+        return reduced_rgba, np.ones(reduced_rgba.shape[:2], bool)
     is_whole = downscale(valid[..., None].astype(np.float32), factor)[..., 0] == 1.0
-    return np.where(is_whole[..., None], small, 0.0), is_whole
+    return np.where(is_whole[..., None], reduced_rgba, 0.0), is_whole
 
 
 def _rigid_inverse(matrices: np.ndarray) -> np.ndarray:

@@ -56,9 +56,13 @@ def around_object(views: Views, *, largest: float) -> tuple[Views, float]:
         relight={},
     )
     if views.valid is not None:
-        whole = views.valid_counts
-        some = whole > 0
-        share = float(np.mean(windows.valid_counts[some] / whole[some])) if some.any() else 1.0
+        full_counts = views.valid_counts
+        has_pixels = full_counts > 0
+        share = (
+            float(np.mean(windows.valid_counts[has_pixels] / full_counts[has_pixels]))
+            if has_pixels.any()
+            else 1.0
+        )
     return windows, share
 
 
@@ -69,12 +73,12 @@ def _windows(views: Views) -> tuple[Int[np.ndarray, "V 2"], Int[np.ndarray, " 2"
     used_rows = np.zeros((len(views), views.height), bool)
     used_columns = np.zeros((len(views), views.width), bool)
     for index, alpha in enumerate(views.alphas):
-        covered = alpha > 0.0
-        used_rows[index], used_columns[index] = covered.any(axis=1), covered.any(axis=0)
-    for axis, used in enumerate((used_rows, used_columns)):
-        length = used.shape[1]
-        low = np.where(used.any(1), used.argmax(1), length // 2)
-        high = np.where(used.any(1), length - used[:, ::-1].argmax(1), length // 2)
+        is_covered = alpha > 0.0
+        used_rows[index], used_columns[index] = is_covered.any(axis=1), is_covered.any(axis=0)
+    for axis, is_used in enumerate((used_rows, used_columns)):
+        length = is_used.shape[1]
+        low = np.where(is_used.any(1), is_used.argmax(1), length // 2)
+        high = np.where(is_used.any(1), length - is_used[:, ::-1].argmax(1), length // 2)
         widest = int((high - low).max(initial=0))
         margin = max(MARGIN, round(_RELATIVE_MARGIN * widest))
         size[axis] = min(length, widest + 2 * margin)

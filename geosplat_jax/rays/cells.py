@@ -53,10 +53,10 @@ def cell_lists(cells: Int[Array, " E"], cell_count: int) -> CellLists:
     """Find the list of every cell; ``cells`` of every entry, sorted, ``cell_count`` on padding."""
     size = cells.shape[0]
     numbers = jnp.arange(size, dtype=jnp.int32)
-    begins = jnp.concatenate([jnp.ones((1,), bool), cells[1:] != cells[:-1]])
-    row = jnp.cumsum(begins.astype(jnp.int32)) - 1
+    is_start = jnp.concatenate([jnp.ones((1,), bool), cells[1:] != cells[:-1]])
+    row = jnp.cumsum(is_start.astype(jnp.int32)) - 1
     first = jnp.full((size + 1,), size, jnp.int32)
-    first = first.at[jnp.where(begins, row, size + 1)].set(numbers, mode="drop")
+    first = first.at[jnp.where(is_start, row, size + 1)].set(numbers, mode="drop")
     cell = jnp.full((size,), cell_count, jnp.int32).at[row].set(cells, indices_are_sorted=True)
     return CellLists(cell, first[:-1], first[1:] - first[:-1], row)
 
@@ -68,21 +68,21 @@ def words_of(lists: CellLists, grid: Grid, *, count_bits: int) -> Int[Array, " K
     its first entry. The word of a cell without entries is negative, and holds the sizes of its
     `_empty_cubes`.
     """
-    occupied = jnp.zeros((grid.cube_count,), bool).at[lists.cell].set(True, mode="drop")
-    words = _empty_cubes(occupied, grid) | _EMPTY
+    is_occupied = jnp.zeros((grid.cube_count,), bool).at[lists.cell].set(True, mode="drop")
+    words = _empty_cubes(is_occupied, grid) | _EMPTY
     return words.at[lists.cell].set(lists.first << count_bits | lists.length, mode="drop")
 
 
-def _moved(values: UInt[Array, "z y x"], by: int, axis: int) -> UInt[Array, "z y x"]:
+def _moved(values: UInt[Array, "z y x"], shift: int, axis: int) -> UInt[Array, "z y x"]:
     """Move values along an axis by so many cells; what comes in from outside is zero."""
     size = values.shape[axis]
-    by = max(-size, min(by, size))
-    kept = jax.lax.slice_in_dim(values, max(-by, 0), size - max(by, 0), axis=axis)
-    beyond = jnp.zeros_like(jax.lax.slice_in_dim(values, 0, abs(by), axis=axis))
-    return jnp.concatenate([beyond, kept] if by > 0 else [kept, beyond], axis=axis)
+    shift = max(-size, min(shift, size))
+    overlap = jax.lax.slice_in_dim(values, max(-shift, 0), size - max(shift, 0), axis=axis)
+    padding = jnp.zeros_like(jax.lax.slice_in_dim(values, 0, abs(shift), axis=axis))
+    return jnp.concatenate([padding, overlap] if shift > 0 else [overlap, padding], axis=axis)
 
 
-def _empty_cubes(occupied: Bool[Array, " K"], grid: Grid) -> Int[Array, " K"]:
+def _empty_cubes(is_occupied: Bool[Array, " K"], grid: Grid) -> Int[Array, " K"]:
     """Find how large an empty cube begins with a cell, towards each octant of directions.
 
     Returns the binary logarithm of its side in cells, three bits per octant; bit i of an octant's
@@ -90,22 +90,26 @@ def _empty_cubes(occupied: Bool[Array, " K"], grid: Grid) -> Int[Array, " K"]:
     empty.
     """
     nx, ny, nz = grid.shape
-    meets = jnp.where(occupied.reshape(nz, ny, nx), jnp.uint8(255), jnp.uint8(0))
-    levels = jnp.zeros(meets.shape, jnp.int32)
+    occupancy = jnp.where(is_occupied.reshape(nz, ny, nx), jnp.uint8(255), jnp.uint8(0))
+    levels = jnp.zeros(occupancy.shape, jnp.int32)
     for doubling in range(_DOUBLINGS):
-        # Bit o of `meets`: the cube of this side towards octant o holds an occupied cell.
+        # Bit o of `occupancy`: the cube of this side towards octant o holds an occupied cell.
         side = 1 << doubling
         for axis in range(3):
-            forward = sum(1 << octant for octant in range(8) if not octant >> axis & 1)
-            after, before = (_moved(meets, by, 2 - axis) for by in (-side, side))
-            meets = meets | (after & forward) | (before & (255 - forward))
+            forward_bits = sum(1 << octant for octant in range(8) if not octant >> axis & 1)
+            next_bits, previous_bits = (
+                _moved(occupancy, shift, 2 - axis) for shift in (-side, side)
+            )
+            occupancy = (
+                occupancy | (next_bits & forward_bits) | (previous_bits & (255 - forward_bits))
+            )
             # Fused with what follows, every cell would be computed many times over.
-            meets = jax.lax.optimization_barrier(meets)
+            occupancy = jax.lax.optimization_barrier(occupancy)
         # Spread the eight bits, so that there is one in every three.
-        empty = (~meets).astype(jnp.int32)
-        empty = (empty | empty << 8) & 0xF00F
-        empty = (empty | empty << 4) & 0xC30C3
-        levels = levels + ((empty | empty << 2) & 0x249249)
+        empty_bits = (~occupancy).astype(jnp.int32)
+        empty_bits = (empty_bits | empty_bits << 8) & 0xF00F
+        empty_bits = (empty_bits | empty_bits << 4) & 0xC30C3
+        levels = levels + ((empty_bits | empty_bits << 2) & 0x249249)
     return levels.reshape(-1)
 
 
@@ -127,14 +131,14 @@ def cones_of(
         jnp.sum(normals, axis=0)[entries], lists.row, size, indices_are_sorted=True
     )
     axis = jnp.round(127 * safe_normalize(axis))
-    along = jnp.sum(normals[:, entries] * safe_normalize(axis)[lists.row][None], axis=-1)
+    cosines = jnp.sum(normals[:, entries] * safe_normalize(axis)[lists.row][None], axis=-1)
     # Triangles without a normal cannot be hit.
     is_flat = jnp.all(normals[:, entries] == 0, axis=-1)
-    along = jnp.min(jnp.where(is_flat, 1.0, along), axis=0)
-    smallest = jax.ops.segment_min(along, lists.row, size, indices_are_sorted=True)
-    smallest = jnp.clip(smallest, -1.0, 1.0)
-    sine = jnp.sqrt(1 - smallest**2) + _CONE_MARGIN
-    is_cone = (smallest > 0) & (sine < 1)
+    cosines = jnp.min(jnp.where(is_flat, 1.0, cosines), axis=0)
+    smallest_cosine = jax.ops.segment_min(cosines, lists.row, size, indices_are_sorted=True)
+    smallest_cosine = jnp.clip(smallest_cosine, -1.0, 1.0)
+    sine = jnp.sqrt(1 - smallest_cosine**2) + _CONE_MARGIN
+    is_cone = (smallest_cosine > 0) & (sine < 1)
     # Where no cone holds the normals, an axis of zero faces no direction.
     axis = jnp.where(is_cone[:, None], axis, 0.0)
     packed = jnp.ceil(255 * jnp.minimum(sine, 1.0)).astype(jnp.uint32)

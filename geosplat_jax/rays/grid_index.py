@@ -110,22 +110,22 @@ class GridIndex(CellIndex):
             points = jax.lax.optimization_barrier(points)
         moment = cross(lanes.direction, points[4])
         spokes = [dot(points[i], moment) for i in range(4)]  # d.(c x a)
-        is_blocked, hits = jnp.zeros_like(is_testing), []
+        is_blocked, hit_distances = jnp.zeros_like(is_testing), []
         for i in range(4):
             j = (i + 1) % 4
             normal = cross(points[i], points[j])
             side, volume = dot(lanes.direction, normal), dot(points[4], normal)
-            parts = (side, -spokes[j], spokes[i])
-            total = parts[0] + parts[1] + parts[2]
+            volumes = (side, -spokes[j], spokes[i])
+            total = volumes[0] + volumes[1] + volumes[2]
             # Outward faces seen from the front have d.n < 0.
-            is_hit = (parts[0] <= 0) & (parts[1] <= 0) & (parts[2] <= 0)
+            is_hit = (volumes[0] <= 0) & (volumes[1] <= 0) & (volumes[2] <= 0)
             if two_sided:
-                is_hit = is_hit | ((parts[0] >= 0) & (parts[1] >= 0) & (parts[2] >= 0))
+                is_hit = is_hit | ((volumes[0] >= 0) & (volumes[1] >= 0) & (volumes[2] >= 0))
             is_hit = is_hit & (total != 0) & is_testing & (4 * patch + i != lanes.source)
-            at = volume / jnp.where(total == 0, 1.0, total)
-            is_hit = is_hit & (at > T_MIN)
+            hit_distance = volume / jnp.where(total == 0, 1.0, total)
+            is_hit = is_hit & (hit_distance > T_MIN)
             is_blocked = is_blocked | is_hit
-            hits.append(jnp.where(is_hit, at, jnp.inf))
+            hit_distances.append(jnp.where(is_hit, hit_distance, jnp.inf))
         lanes = lanes._replace(tested=lanes.tested + is_testing.astype(jnp.int32))
         # Without the barriers XLA repeats the whole test for each of the two arrays that change.
         if any_hit:
@@ -134,11 +134,11 @@ class GridIndex(CellIndex):
                 face=jnp.where(is_blocked, 0, lanes.face),
                 is_travelling=lanes.is_travelling & ~is_blocked,
             )
-        hits = jax.lax.optimization_barrier(hits)
+        hit_distances = jax.lax.optimization_barrier(hit_distances)
         distance, face = lanes.distance, lanes.face
-        for i, at in enumerate(hits):
-            face = jnp.where(at < distance, 4 * patch + i, face)
-            distance = jnp.minimum(distance, at)
+        for i, hit_distance in enumerate(hit_distances):
+            face = jnp.where(hit_distance < distance, 4 * patch + i, face)
+            distance = jnp.minimum(distance, hit_distance)
         return lanes._replace(distance=distance, face=face)
 
 
@@ -172,26 +172,28 @@ def _touched_cells(
     first = jnp.floor(lowest - SLACK).astype(jnp.int32)
     cell = first[None] + jnp.arange(_REACH, dtype=jnp.int32)[:, None, None]
     limit = jnp.array(grid.shape, jnp.int32)[None, :, None]
-    inside = (cell >= 0) & (cell < limit) & is_real[None, None]
+    is_inside = (cell >= 0) & (cell < limit) & is_real[None, None]
     corner = cell.astype(patches.dtype)
     half = 0.5 + SLACK
     triangles = []
     for a, b, c in _fan(patches):
-        above = jnp.maximum(jnp.maximum(a, b), c)[None] >= corner - SLACK
-        below = jnp.minimum(jnp.minimum(a, b), c)[None] <= corner + (1 + SLACK)
+        is_above = jnp.maximum(jnp.maximum(a, b), c)[None] >= corner - SLACK
+        is_below = jnp.minimum(jnp.minimum(a, b), c)[None] <= corner + (1 + SLACK)
         normal = jnp.cross(b - a, c - a, axis=0)
         # Distance of the plane from the middle of a cell, times the length of the normal: one term
         # per coordinate of the cell.
         terms = normal[None] * (corner + 0.5 - a[None])
         reach = half * jnp.sum(jnp.abs(normal), axis=0)
-        triangles.append((above & below & inside, terms, reach[None, None, None]))
+        triangles.append((is_above & is_below & is_inside, terms, reach[None, None, None]))
     # Without the barrier XLA computes these again for each of the 64 cells.
     triangles = jax.lax.optimization_barrier(triangles)
     touches = jnp.zeros((_REACH, _REACH, _REACH, is_real.shape[0]), bool)
-    for meets, terms, reach in triangles:
+    for overlaps, terms, reach in triangles:
         x, y, z = terms[:, None, None, 0], terms[None, :, None, 1], terms[None, None, :, 2]
-        near = meets[:, None, None, 0] & meets[None, :, None, 1] & meets[None, None, :, 2]
-        touches = touches | (near & (jnp.abs(x + y + z) <= reach))
+        is_near = (
+            overlaps[:, None, None, 0] & overlaps[None, :, None, 1] & overlaps[None, None, :, 2]
+        )
+        touches = touches | (is_near & (jnp.abs(x + y + z) <= reach))
     return touches.reshape(_REACH**3, -1), first
 
 
@@ -225,10 +227,10 @@ def build_grid_index(surface: PatchMesh, grid: Grid, *, capacities: Capacities) 
     is_real = 4 * jnp.arange(quads, dtype=jnp.int32) < surface.mesh.face_count
     touches, lowest = _touched_cells(patches, is_real, padded)
 
-    found = bit_set(touches.reshape(-1))
+    pair_set = bit_set(touches.reshape(-1))
     capacity = capacities["cell_patches"]
-    pair = found.first(capacity=capacity)
-    is_entry = jnp.arange(capacity, dtype=jnp.int32) < found.count
+    pair = pair_set.first(capacity=capacity)
+    is_entry = jnp.arange(capacity, dtype=jnp.int32) < pair_set.count
     step, patch = jnp.divmod(pair, quads)
     steps = jnp.stack([step // _REACH**axis % _REACH for axis in (2, 1, 0)])
     x, y, z = lowest[:, patch] + steps
@@ -248,5 +250,5 @@ def build_grid_index(surface: PatchMesh, grid: Grid, *, capacities: Capacities) 
         cones=cones_of(normals, entries, lists, cell_count),
         entries=entries,
         patches=patches,
-        usage=usage(cell_patches=found.count),
+        usage=usage(cell_patches=pair_set.count),
     )

@@ -125,12 +125,12 @@ class TriangleIndex(CellIndex):
         """Find the first hit of every ray; on a sheet, the face stands for the side that is hit."""
         sides = two_sided or self.is_sheet
         rays = (origins, directions, source, mask)
-        distance, place = super().nearest(*rays, two_sided=sides)
-        number = self.rows.at[jnp.maximum(place, 0) >> 1, _NUMBER].get(mode="clip")
+        distance, hit_code = super().nearest(*rays, two_sided=sides)
+        number = self.rows.at[jnp.maximum(hit_code, 0) >> 1, _NUMBER].get(mode="clip")
         face = number.astype(jnp.int32)
         if self.is_sheet:
-            face = face + self.triangle_count * (place & 1)
-        return distance, jnp.where(place >= 0, face, -1)
+            face = face + self.triangle_count * (hit_code & 1)
+        return distance, jnp.where(hit_code >= 0, face, -1)
 
     def test(self, lanes: Lanes, *, two_sided: bool, any_hit: bool) -> Lanes:
         """Test the next triangles of the cell by signed volumes; see `GridIndex.test`.
@@ -138,31 +138,31 @@ class TriangleIndex(CellIndex):
         Here the face of a hit is twice its row in ``rows``, plus one if the back is hit; `nearest`
         replaces it by the face of the mesh.
         """
-        left = self.count(lanes.word) - lanes.tested
-        is_testing = lanes.is_travelling & (left > 0)
+        remaining_count = self.count(lanes.word) - lanes.tested
+        is_testing = lanes.is_travelling & (remaining_count > 0)
         start = jnp.where(is_testing, self.first(lanes.word) + lanes.tested, 0)
         step = jnp.arange(_TESTED_AT_ONCE, dtype=jnp.int32)[:, None]
-        place = jnp.minimum(start[None] + step, self.rows.shape[0] - 1)
-        row = self.rows.at[place].get(mode="promise_in_bounds")
+        row_index = jnp.minimum(start[None] + step, self.rows.shape[0] - 1)
+        row = self.rows.at[row_index].get(mode="promise_in_bounds")
         a, b, c = (
             tuple(row[..., 3 * i + axis] - lanes.origin[axis][None] for axis in range(3))
             for i in range(3)
         )
         direction = tuple(component[None] for component in lanes.direction)
         moment, normal = cross(direction, c), cross(a, b)
-        parts = (dot(direction, normal), -dot(b, moment), dot(a, moment))
-        total = parts[0] + parts[1] + parts[2]
+        volumes = (dot(direction, normal), -dot(b, moment), dot(a, moment))
+        total = volumes[0] + volumes[1] + volumes[2]
         # Outward faces seen from the front have d.n < 0.
-        is_hit = (parts[0] <= 0) & (parts[1] <= 0) & (parts[2] <= 0)
+        is_hit = (volumes[0] <= 0) & (volumes[1] <= 0) & (volumes[2] <= 0)
         if two_sided:
-            is_hit = is_hit | ((parts[0] >= 0) & (parts[1] >= 0) & (parts[2] >= 0))
+            is_hit = is_hit | ((volumes[0] >= 0) & (volumes[1] >= 0) & (volumes[2] >= 0))
         source = lanes.source
         if self.is_sheet:
             source = jnp.where(source >= self.triangle_count, source - self.triangle_count, source)
         is_hit = is_hit & (total != 0) & (row[..., _NUMBER] != source.astype(row.dtype)[None])
-        is_hit = is_hit & is_testing[None] & (step < left[None])
-        at = dot(c, normal) / jnp.where(total == 0, 1.0, total)
-        is_hit = is_hit & (at > T_MIN)
+        is_hit = is_hit & is_testing[None] & (step < remaining_count[None])
+        hit_distance = dot(c, normal) / jnp.where(total == 0, 1.0, total)
+        is_hit = is_hit & (hit_distance > T_MIN)
         lanes = lanes._replace(tested=lanes.tested + jnp.where(is_testing, _TESTED_AT_ONCE, 0))
         # XLA repeats the whole test for every array that leaves it, so only one array does.
         if any_hit:
@@ -172,13 +172,17 @@ class TriangleIndex(CellIndex):
                 is_travelling=lanes.is_travelling & ~is_blocked,
             )
         # Distances are positive, so that a negative sign can mark a hit of the back.
-        found = jnp.where(is_hit, jnp.where(total > 0, -at, at), jnp.inf)
-        found = jax.lax.optimization_barrier(found)
+        signed_distances = jnp.where(
+            is_hit, jnp.where(total > 0, -hit_distance, hit_distance), jnp.inf
+        )
+        signed_distances = jax.lax.optimization_barrier(signed_distances)
         distance, face = lanes.distance, lanes.face
         for k in range(_TESTED_AT_ONCE):
-            is_nearer = jnp.abs(found[k]) < distance
-            distance = jnp.where(is_nearer, jnp.abs(found[k]), distance)
-            face = jnp.where(is_nearer, 2 * (start + k) + (found[k] < 0).astype(jnp.int32), face)
+            is_nearer = jnp.abs(signed_distances[k]) < distance
+            distance = jnp.where(is_nearer, jnp.abs(signed_distances[k]), distance)
+            face = jnp.where(
+                is_nearer, 2 * (start + k) + (signed_distances[k] < 0).astype(jnp.int32), face
+            )
         return lanes._replace(distance=distance, face=face)
 
 
@@ -202,16 +206,20 @@ def _boxed(
     first = jnp.floor(jnp.min(corners, axis=0) - SLACK).astype(jnp.int32)
     size = jnp.floor(jnp.max(corners, axis=0) + SLACK).astype(jnp.int32) - first + 1
     count = size[0] * size[1] * size[2]
-    through = jnp.cumsum(count)
-    starts = jnp.zeros((capacity,), jnp.int32).at[through[:-1]].add(1, mode="drop")
+    running_sum = jnp.cumsum(count)
+    starts = jnp.zeros((capacity,), jnp.int32).at[running_sum[:-1]].add(1, mode="drop")
     triangle = jnp.cumsum(starts)
-    step = jnp.arange(capacity, dtype=jnp.int32) - (through - count)[triangle]
+    step = jnp.arange(capacity, dtype=jnp.int32) - (running_sum - count)[triangle]
     size, first = size[:, triangle], first[:, triangle]
-    z, rest = jnp.divmod(step, size[0] * size[1])
-    y, x = jnp.divmod(rest, size[0])
+    z, remainder = jnp.divmod(step, size[0] * size[1])
+    y, x = jnp.divmod(remainder, size[0])
     # Together, triangles as large as the grid may meet more cells than 32 bits can count.
     is_countable = jnp.sum(count.astype(corners.dtype)) < _MOST_BOXES
-    return triangle, first + jnp.stack([x, y, z]), jnp.where(is_countable, through[-1], 2**31 - 1)
+    return (
+        triangle,
+        first + jnp.stack([x, y, z]),
+        jnp.where(is_countable, running_sum[-1], 2**31 - 1),
+    )
 
 
 def _touches(corners: Float[Array, "3 3 P"], cell: Int[Array, "3 P"]) -> Bool[Array, " P"]:
@@ -220,17 +228,21 @@ def _touches(corners: Float[Array, "3 3 P"], cell: Int[Array, "3 P"]) -> Bool[Ar
     a, b, c = (corner - middle for corner in corners)
     normal = jnp.cross(b - a, c - a, axis=0)
     half = 0.5 + SLACK
-    touch = jnp.abs(jnp.sum(normal * a, axis=0)) <= half * jnp.sum(jnp.abs(normal), axis=0)
+    is_touching = jnp.abs(jnp.sum(normal * a, axis=0)) <= half * jnp.sum(jnp.abs(normal), axis=0)
     # Separating axes: the normals of the edges, projected to the plane of two axes.
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3
-        for start, end, other in ((a, b, c), (b, c, a), (c, a, b)):
-            across = (start[v] - end[v], end[u] - start[u])
-            near = across[0] * start[u] + across[1] * start[v]
-            far = across[0] * other[u] + across[1] * other[v]
-            reach = half * (jnp.abs(across[0]) + jnp.abs(across[1]))
-            touch = touch & (jnp.minimum(near, far) <= reach) & (jnp.maximum(near, far) >= -reach)
-    return touch
+        for start, end, opposite in ((a, b, c), (b, c, a), (c, a, b)):
+            edge_normal = (start[v] - end[v], end[u] - start[u])
+            edge_projection = edge_normal[0] * start[u] + edge_normal[1] * start[v]
+            corner_projection = edge_normal[0] * opposite[u] + edge_normal[1] * opposite[v]
+            reach = half * (jnp.abs(edge_normal[0]) + jnp.abs(edge_normal[1]))
+            is_touching = (
+                is_touching
+                & (jnp.minimum(edge_projection, corner_projection) <= reach)
+                & (jnp.maximum(edge_projection, corner_projection) >= -reach)
+            )
+    return is_touching
 
 
 def build_triangle_index(
@@ -256,11 +268,11 @@ def build_triangle_index(
     ValueError
         If the lists of the cells are too long for their words, or ``triangle_boxes`` exceeds 2**25.
     """
-    most, capacity = capacities["cell_triangles"], capacities["triangle_cells"]
-    largest = 1 << (WORD_BITS - most.bit_length())
+    most_in_cell, capacity = capacities["cell_triangles"], capacities["triangle_cells"]
+    largest = 1 << (WORD_BITS - most_in_cell.bit_length())
     if capacity > largest:
         raise ValueError(
-            f"where a cell lists {most} triangles, all cells list at most {largest}, not "
+            f"where a cell lists {most_in_cell} triangles, all cells list at most {largest}, not "
             f"{capacity}: the mesh has too many faces, or sizes that differ too much; decimate it"
         )
     if capacities["triangle_boxes"] > _MOST_BOXES:
@@ -275,11 +287,11 @@ def build_triangle_index(
     corners = jnp.moveaxis(local[faces], 0, -1)  # (corner, xyz, F)
     triangle, cell, box_count = _boxed(corners, capacities["triangle_boxes"])
     is_real = jnp.arange(triangle.shape[0], dtype=jnp.int32) < box_count
-    touch = bit_set(_touches(corners[:, :, triangle], cell) & is_real)
+    pair_set = bit_set(_touches(corners[:, :, triangle], cell) & is_real)
     number = cell[0] + nx * (cell[1] + ny * cell[2])
 
-    pair = touch.first(capacity=capacity)
-    is_entry = jnp.arange(capacity, dtype=jnp.int32) < touch.count
+    pair = pair_set.first(capacity=capacity)
+    is_entry = jnp.arange(capacity, dtype=jnp.int32) < pair_set.count
     cells = jnp.where(is_entry, number[pair], grid.cube_count)
     # The sort is stable: triangles of a cell keep their order, so that results are reproducible.
     cells, entries = jax.lax.sort(
@@ -291,17 +303,17 @@ def build_triangle_index(
     normals = safe_normalize(jnp.cross(b - a, c - a, axis=0), axis=0).T
     return TriangleIndex(
         grid=grid,
-        words=words_of(lists, grid, count_bits=most.bit_length()),
+        words=words_of(lists, grid, count_bits=most_in_cell.bit_length()),
         cones=cones_of(normals[None], entries, lists, grid.cube_count),
         rows=jnp.concatenate(
             [local[faces].reshape(-1, 9)[entries], entries.astype(local.dtype)[:, None]], axis=1
         ),
         usage=usage(
             triangle_boxes=box_count,
-            triangle_cells=touch.count,
+            triangle_cells=pair_set.count,
             cell_triangles=jnp.max(jnp.where(lists.cell < grid.cube_count, lists.length, 0)),
         ),
         triangle_count=faces.shape[0],
         is_sheet=is_sheet,
-        most_in_cell=most,
+        most_in_cell=most_in_cell,
     )

@@ -169,14 +169,14 @@ def _advance(lanes: Lanes, index: CellIndex, *, two_sided: bool) -> Lanes:
     is_moving = lanes.is_travelling & (lanes.tested >= count)
     skip = jnp.where(count > 0, 1, index.first(lanes.word))
     dtype = lanes.distance.dtype
-    leave = []
+    exits = []
     for o, d, inverse, c in zip(
         lanes.origin, lanes.direction, lanes.inverse, lanes.cell, strict=True
     ):
         border = jnp.where(d > 0, c + skip, c - skip + 1).astype(dtype)
-        leave.append(jnp.where(jnp.isinf(inverse), jnp.inf, (border - o) * inverse))
-    exit_distance = jnp.minimum(jnp.minimum(leave[0], leave[1]), leave[2])
-    leave, exit_distance, skip = jax.lax.optimization_barrier((leave, exit_distance, skip))
+        exits.append(jnp.where(jnp.isinf(inverse), jnp.inf, (border - o) * inverse))
+    exit_distance = jnp.minimum(jnp.minimum(exits[0], exits[1]), exits[2])
+    exits, exit_distance, skip = jax.lax.optimization_barrier((exits, exit_distance, skip))
 
     # The axis of the exit is stepped exactly; the others follow from the position, in bounds.
     is_open = jnp.ones_like(is_moving)
@@ -184,14 +184,14 @@ def _advance(lanes: Lanes, index: CellIndex, *, two_sided: bool) -> Lanes:
     cells = []
     for axis, size in enumerate(index.grid.shape):
         o, d, c = lanes.origin[axis], lanes.direction[axis], lanes.cell[axis]
-        at_exit = jnp.floor(o + jnp.where(is_outside, 0.0, exit_distance) * d).astype(jnp.int32)
-        ahead, behind = jnp.where(d < 0, 0, skip - 1), jnp.where(d < 0, skip - 1, 0)
-        at_exit = jnp.clip(at_exit, c - behind, c + ahead)
-        is_exit = is_open & (leave[axis] <= exit_distance)
+        exit_cell = jnp.floor(o + jnp.where(is_outside, 0.0, exit_distance) * d).astype(jnp.int32)
+        cells_ahead, cells_behind = jnp.where(d < 0, 0, skip - 1), jnp.where(d < 0, skip - 1, 0)
+        exit_cell = jnp.clip(exit_cell, c - cells_behind, c + cells_ahead)
+        is_exit = is_open & (exits[axis] <= exit_distance)
         is_open = is_open & ~is_exit
-        following = jnp.where(is_exit, jnp.where(d > 0, c + skip, c - skip), at_exit)
-        is_outside = is_outside | (following < 0) | (following >= size)
-        cells.append(jnp.where(is_moving, jnp.clip(following, 0, size - 1), c))
+        next_cell = jnp.where(is_exit, jnp.where(d > 0, c + skip, c - skip), exit_cell)
+        is_outside = is_outside | (next_cell < 0) | (next_cell >= size)
+        cells.append(jnp.where(is_moving, jnp.clip(next_cell, 0, size - 1), c))
     # A hit is final once the ray has left the cells that lie before it.
     is_over = is_moving & (is_outside | (lanes.distance <= exit_distance))
     word = _enter(lanes, tuple(cells), index, two_sided)
@@ -224,10 +224,12 @@ def _entered(
     for o, d, size in zip(origins.T, directions.T, shape, strict=True):
         reciprocal = _inverse(d)
         is_still = jnp.isinf(reciprocal)
-        one, two = (0.0 - o) * reciprocal, (size - o) * reciprocal
+        low_distance, high_distance = (0.0 - o) * reciprocal, (size - o) * reciprocal
         is_between = (o >= 0) & (o <= size)
-        lowest = jnp.where(is_still, jnp.where(is_between, 0.0, jnp.inf), jnp.minimum(one, two))
-        highest = jnp.where(is_still, jnp.inf, jnp.maximum(one, two))
+        lowest = jnp.where(
+            is_still, jnp.where(is_between, 0.0, jnp.inf), jnp.minimum(low_distance, high_distance)
+        )
+        highest = jnp.where(is_still, jnp.inf, jnp.maximum(low_distance, high_distance))
         near, far = jnp.maximum(near, lowest), jnp.minimum(far, highest)
     meets = (near <= far) & jnp.isfinite(near)
     return jnp.where(meets, near, 0.0), meets
@@ -277,12 +279,13 @@ def _halve(lanes: Lanes, nobody: int) -> Lanes:
     Lanes left over belong to the ray ``nobody``, whose result is dropped.
     """
     size = lanes.ray.shape[0]
-    travelling = bit_set(lanes.is_travelling)
-    index = travelling.first(capacity=size // 2)
-    is_real = jnp.arange(size // 2, dtype=jnp.int32) < travelling.count
-    kept = jax.tree.map(lambda x: x.at[index].get(mode="promise_in_bounds"), lanes)
-    return kept._replace(
-        is_travelling=kept.is_travelling & is_real, ray=jnp.where(is_real, kept.ray, nobody)
+    active_set = bit_set(lanes.is_travelling)
+    index = active_set.first(capacity=size // 2)
+    is_real = jnp.arange(size // 2, dtype=jnp.int32) < active_set.count
+    active_lanes = jax.tree.map(lambda x: x.at[index].get(mode="promise_in_bounds"), lanes)
+    return active_lanes._replace(
+        is_travelling=active_lanes.is_travelling & is_real,
+        ray=jnp.where(is_real, active_lanes.ray, nobody),
     )
 
 
@@ -319,53 +322,55 @@ def trace(
     distance : (N,) world units; infinite where nothing is hit, and everywhere with ``any_hit``.
     face : (N,) of the hit, as `CellIndex.test` numbers it (0 with ``any_hit``); -1 for none.
     """
-    nobody, grid = origins.shape[0], index.grid
-    if nobody == 0:
+    ray_count, grid = origins.shape[0], index.grid
+    if ray_count == 0:
         return jnp.zeros((0,), origins.dtype), jnp.zeros((0,), jnp.int32)
-    most, fewest = _lane_counts()
-    half = min(most, max(fewest, -(-nobody // fewest) * fewest)) // 2
+    most_lanes, fewest_lanes = _lane_counts()
+    half = min(most_lanes, max(fewest_lanes, -(-ray_count // fewest_lanes) * fewest_lanes)) // 2
     local = (origins - grid.origin[None, :]) / grid.cell_size
-    is_waiting = bit_set(mask)
-    queue, total = jnp.pad(is_waiting.first(capacity=nobody), (0, half)), is_waiting.count
+    waiting_set = bit_set(mask)
+    queue, total = jnp.pad(waiting_set.first(capacity=ray_count), (0, half)), waiting_set.count
 
-    def next_ones(begin: Int[Array, ""]) -> Lanes:
-        rows = jax.lax.dynamic_slice(queue, (begin,), (half,))
-        is_real = begin + jnp.arange(half, dtype=jnp.int32) < total
-        starts, ways, own = (
+    def next_ones(queue_start: Int[Array, ""]) -> Lanes:
+        rows = jax.lax.dynamic_slice(queue, (queue_start,), (half,))
+        is_real = queue_start + jnp.arange(half, dtype=jnp.int32) < total
+        lane_origins, lane_directions, lane_sources = (
             values.at[rows].get(mode="promise_in_bounds") for values in (local, directions, source)
         )
-        lanes = _start(starts, ways, own, is_real, index=index, two_sided=two_sided)
-        return lanes._replace(ray=jnp.where(is_real, rows, nobody))
+        lanes = _start(
+            lane_origins, lane_directions, lane_sources, is_real, index=index, two_sided=two_sided
+        )
+        return lanes._replace(ray=jnp.where(is_real, rows, ray_count))
 
     def step(lanes: Lanes) -> Lanes:
         lanes = _advance(lanes, index, two_sided=two_sided)
         return index.test(lanes, two_sided=two_sided, any_hit=any_hit)
 
-    def travel(lanes: Lanes, found: _Hits, limit: int) -> tuple[Lanes, _Hits]:
+    def travel(lanes: Lanes, hits: _Hits, limit: int) -> tuple[Lanes, _Hits]:
         """Go on while more than so many travel, and note what was hit."""
 
         def goes_on(lanes: Lanes) -> Bool[Array, ""]:
             return jnp.sum(lanes.is_travelling, dtype=jnp.int32) > limit
 
         lanes = jax.lax.while_loop(goes_on, step, lanes)
-        distance, face = found
+        distance, face = hits
         distance = distance.at[lanes.ray].set(lanes.distance, mode="drop")
         return lanes, (distance, face.at[lanes.ray].set(lanes.face, mode="drop"))
 
     def refill(state: tuple[Array, Lanes, _Hits]) -> tuple[Array, Lanes, _Hits]:
-        begin, lanes, found = state
-        lanes = jax.tree.map(lambda *x: jnp.concatenate(x), lanes, next_ones(begin))
-        lanes, found = travel(lanes, found, half)
-        return begin + half, _halve(lanes, nobody), found
+        queue_start, lanes, hits = state
+        lanes = jax.tree.map(lambda *x: jnp.concatenate(x), lanes, next_ones(queue_start))
+        lanes, hits = travel(lanes, hits, half)
+        return queue_start + half, _halve(lanes, ray_count), hits
 
-    found = (jnp.full((nobody,), jnp.inf, origins.dtype), jnp.full((nobody,), -1, jnp.int32))
-    state = (jnp.zeros((), jnp.int32), next_ones(total), found)
-    _, lanes, found = jax.lax.while_loop(lambda state: state[0] < total, refill, state)
-    while half > fewest:
+    hits = (jnp.full((ray_count,), jnp.inf, origins.dtype), jnp.full((ray_count,), -1, jnp.int32))
+    state = (jnp.zeros((), jnp.int32), next_ones(total), hits)
+    _, lanes, hits = jax.lax.while_loop(lambda state: state[0] < total, refill, state)
+    while half > fewest_lanes:
         half //= 2
-        lanes, found = travel(lanes, found, half)
-        lanes = _halve(lanes, nobody)
-    distance, face = travel(lanes, found, 0)[1]
+        lanes, hits = travel(lanes, hits, half)
+        lanes = _halve(lanes, ray_count)
+    distance, face = travel(lanes, hits, 0)[1]
     entry, _ = _entered(local, directions, grid.shape)
     return (entry + distance) * grid.cell_size, face
 

@@ -55,13 +55,13 @@ class MaterialSampler:
         if trained.params.splats is not None:
             count = int(asset.splats.count)
             anchors = np.asarray(asset.splats.anchors)[:count]
-            learned = asset.attributes.materials
+            materials = asset.attributes.materials
             albedo, _, metallic = self._of_fields(anchors)
             self._nearest = KDTree(anchors)
             self._own = np.column_stack(
                 [
-                    np.asarray(learned.albedo)[:count] - albedo,
-                    np.asarray(learned.metallic)[:count] - metallic,
+                    np.asarray(materials.albedo)[:count] - albedo,
+                    np.asarray(materials.metallic)[:count] - metallic,
                 ]
             )
 
@@ -72,22 +72,22 @@ class MaterialSampler:
             distance, rows = self._nearest.query(points, k=_NEAREST)
             weights = 1.0 / np.maximum(distance, 1e-6 * float(self._box.half_extent)) ** 2
             weights /= weights.sum(axis=1, keepdims=True)
-            own = np.einsum("nk,nkc->nc", weights, self._own[rows])
-            albedo = np.clip(albedo + own[:, :3], 0.0, 1.0).astype(np.float32)
-            metallic = np.clip(metallic + own[:, 3], 0.0, 1.0).astype(np.float32)
+            residuals = np.einsum("nk,nkc->nc", weights, self._own[rows])
+            albedo = np.clip(albedo + residuals[:, :3], 0.0, 1.0).astype(np.float32)
+            metallic = np.clip(metallic + residuals[:, 3], 0.0, 1.0).astype(np.float32)
         return albedo, roughness, metallic
 
     def _of_fields(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Evaluate the fields alone."""
-        parts = []
+        outputs = []
         for start in range(0, max(len(points), 1), _MATERIAL_CHUNK):
             chunk = np.asarray(points[start : start + _MATERIAL_CHUNK], np.float32)
             padded = np.zeros((_MATERIAL_CHUNK, 3), np.float32)
             padded[: len(chunk)] = chunk
-            found = _materials_at(self._field, jnp.asarray(padded), self._box, spec=self._spec)
-            parts.append([np.asarray(leaf)[: len(chunk)] for leaf in jax.tree.leaves(found)])
+            materials = _materials_at(self._field, jnp.asarray(padded), self._box, spec=self._spec)
+            outputs.append([np.asarray(leaf)[: len(chunk)] for leaf in jax.tree.leaves(materials)])
         albedo, roughness, metallic = (
-            np.concatenate(column) for column in zip(*parts, strict=True)
+            np.concatenate(column) for column in zip(*outputs, strict=True)
         )
         return albedo, roughness, metallic
 
@@ -166,7 +166,7 @@ def export_assets(
     if usd:
         others[str(folder / "mesh.usdc")] = "the same mesh, with PNG"
     return others | {
-        str(folder / "mesh.glb"): ", ".join(f"{k} {v}" for k, v in mesh_info.items()),
+        str(folder / "mesh.glb"): ", ".join(f"{key} {value}" for key, value in mesh_info.items()),
         str(folder / "gaussians.ply"): f"{count} Gaussians",
         str(folder / "light.exr"): f"{width} x {height} lat-long, z-up, exposure included",
     }
@@ -204,16 +204,16 @@ def write_model(
     and of ``orbit``, two angles of the eye in degrees, azimuth around glTF's vertical axis from +z,
     and polar angle from that axis. None for an empty surface.
     """
-    own = folder / FOLDER
-    own.mkdir(exist_ok=True)
-    for old in own.glob("*.hdr"):
-        old.unlink()
+    model_folder = folder / FOLDER
+    model_folder.mkdir(exist_ok=True)
+    for old_light in model_folder.glob("*.hdr"):
+        old_light.unlink()
     vertices, faces, normals = mesh
     if not nondegenerate(vertices, faces).any():
-        (own / "mesh.glb").unlink(missing_ok=True)
+        (model_folder / "mesh.glb").unlink(missing_ok=True)
         return None
     info = export_mesh_glb(
-        own / "mesh.glb", vertices, faces, normals, sampler, texture_size=texture_size
+        model_folder / "mesh.glb", vertices, faces, normals, sampler, texture_size=texture_size
     )
     files = {}
     for number, (title, radiance) in enumerate(lights.items()):

@@ -191,23 +191,23 @@ def see_mesh(
     shares = weights[is_hit] / weights[is_hit].sum(axis=-1, keepdims=True)
     corners = np.asarray(vertices, np.float64)[faces[rows[is_hit]]]
     center = np.asarray(camera.centers[0], np.float64)
-    hits = np.einsum("nk,nkd->nd", shares, corners) - center
+    hit_offsets = np.einsum("nk,nkd->nd", shares, corners) - center
     side = sides(vertices, faces[rows[is_hit]], camera)
-    found = np.einsum("nk,nkd->nd", shares, normals[faces[rows[is_hit]]])
+    hit_normals = np.einsum("nk,nkd->nd", shares, normals[faces[rows[is_hit]]])
     if is_two_sided:
-        found, side = side[:, None] * found, np.ones_like(side)
+        hit_normals, side = side[:, None] * hit_normals, np.ones_like(side)
 
     def image(values: np.ndarray) -> np.ndarray:
-        filled = np.zeros((*rows.shape, *values.shape[1:]), values.dtype)
-        filled[is_hit] = values
-        return filled
+        pixels = np.zeros((*rows.shape, *values.shape[1:]), values.dtype)
+        pixels[is_hit] = values
+        return pixels
 
     return SeenMesh(
         is_hit,
         image(side > 0),
         _ray_directions(camera),
-        image(_unit(found)),
-        image(_length(hits)),
+        image(_unit(hit_normals)),
+        image(_length(hit_offsets)),
     )
 
 
@@ -215,8 +215,10 @@ def _ray_directions(camera: Camera) -> Float[np.ndarray, "H W 3"]:
     """Return unit directions, in the world, of the rays through the pixel centres of a view."""
     lens, pose = (np.asarray(x[0], np.float64) for x in (camera.intrinsics, camera.world_to_camera))
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    local = np.stack([(x - lens[0, 2]) / lens[0, 0], (y - lens[1, 2]) / lens[1, 1], x * 0 + 1], -1)
-    return _unit(local @ pose[:3, :3])
+    camera_rays = np.stack(
+        [(x - lens[0, 2]) / lens[0, 0], (y - lens[1, 2]) / lens[1, 1], x * 0 + 1], -1
+    )
+    return _unit(camera_rays @ pose[:3, :3])
 
 
 @partial(jax.jit, static_argnames=("raster", "capacities"))
@@ -264,17 +266,17 @@ def _compare(body: Body, camera: Camera, capacities: Capacities) -> tuple[PixelE
         return (images[0], images[1], images[2]), usage
 
     images, capacities = capacity_module.retry(attempt, capacities)
-    shown, blended, coverage = (np.asarray(image, np.float64) for image in images)
-    seen = body.seen(camera)
-    hit = seen.is_hit
-    towards, normals = seen.towards[hit], seen.normals[hit]
+    splat_normals, splat_ranges, coverage = (np.asarray(image, np.float64) for image in images)
+    mesh_view = body.seen(camera)
+    is_hit = mesh_view.is_hit
+    towards, normals = mesh_view.towards[is_hit], mesh_view.normals[is_hit]
     errors = PixelErrors(
-        reflection_angle_deg(towards, normals, _unit(shown[hit])),
-        seen.ranges[hit] / body.diagonal,
-        blended[hit] / body.diagonal,
-        coverage[hit],
+        reflection_angle_deg(towards, normals, _unit(splat_normals[is_hit])),
+        mesh_view.ranges[is_hit] / body.diagonal,
+        splat_ranges[is_hit] / body.diagonal,
+        coverage[is_hit],
         -(towards * normals).sum(axis=-1),
-        seen.is_outside[hit],
+        mesh_view.is_outside[is_hit],
     )
     return errors, capacities
 
@@ -323,19 +325,19 @@ def measure(body: Body, cameras: Iterable[Camera]) -> Consistency:
         If no ray hits the mesh from outside in a pixel that splats cover.
     """
     errors = pixel_errors(body, cameras)
-    hit, outside = errors.is_outside.size, int(errors.is_outside.sum())
-    if hit and not outside:
+    hit_count, outside_count = errors.is_outside.size, int(errors.is_outside.sum())
+    if hit_count and not outside_count:
         raise ValueError("every view sees the mesh from inside; do its faces look inwards?")
-    counts = errors.is_compared
-    compared = int(counts.sum())
-    if not compared:
+    is_compared = errors.is_compared
+    compared_count = int(is_compared.sum())
+    if not compared_count:
         raise ValueError("no view sees the mesh where splats cover it; is the surface empty?")
     return Consistency(
-        float(errors.reflection_deg[counts].mean()),
-        float(errors.distance[counts].mean()),
-        compared,
-        1.0 - compared / outside,
-        1.0 - outside / hit,
+        float(errors.reflection_deg[is_compared].mean()),
+        float(errors.distance[is_compared].mean()),
+        compared_count,
+        1.0 - compared_count / outside_count,
+        1.0 - outside_count / hit_count,
     )
 
 
@@ -424,18 +426,18 @@ def cameras_around(
     center = np.asarray(box.center, np.float64)
     focal = 0.5 * size / np.tan(0.5 * _FIELD_OF_VIEW)
     lens = jnp.asarray([[focal, 0, 0.5 * size], [0, focal, 0.5 * size], [0, 0, 1]], jnp.float32)
-    found = []
+    cameras = []
     for number in range(views):
         height = 1.0 - 2.0 * (number + 0.5) / views
-        turn = np.pi * (3.0 - np.sqrt(5.0)) * number
+        azimuth = np.pi * (3.0 - np.sqrt(5.0)) * number
         ring = np.sqrt(1.0 - height**2)
-        away = np.array([ring * np.cos(turn), ring * np.sin(turn), height])
-        right = np.array([-np.sin(turn), np.cos(turn), 0.0])
+        direction = np.array([ring * np.cos(azimuth), ring * np.sin(azimuth), height])
+        right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         pose = np.eye(4)
-        pose[:3, :3] = np.stack([right, np.cross(-away, right), -away])
-        pose[:3, 3] = -pose[:3, :3] @ (center + _DISTANCE * float(box.half_extent) * away)
-        found.append(Camera(jnp.asarray(pose[None], jnp.float32), lens[None], size, size))
-    return found
+        pose[:3, :3] = np.stack([right, np.cross(-direction, right), -direction])
+        pose[:3, 3] = -pose[:3, :3] @ (center + _DISTANCE * float(box.half_extent) * direction)
+        cameras.append(Camera(jnp.asarray(pose[None], jnp.float32), lens[None], size, size))
+    return cameras
 
 
 def resized(camera: Camera, size: int) -> Camera:

@@ -45,13 +45,13 @@ def _where_counted(view: RenderedView, valid: np.ndarray | None) -> RenderedView
     """Set pixels of a render that do not count to zero; ``valid`` is (H, W), or None for all."""
     if valid is None:
         return view
-    counted = valid[..., None]
+    mask = valid[..., None]
     return replace(
         view,
-        rgb=view.rgb * counted,
-        linear=view.linear * counted,
+        rgb=view.rgb * mask,
+        linear=view.linear * mask,
         alpha=view.alpha * valid,
-        aovs={name: values * counted for name, values in view.aovs.items()},
+        aovs={name: values * mask for name, values in view.aovs.items()},
     )
 
 
@@ -123,26 +123,26 @@ class _Rendered(NamedTuple):
 def _render_all(
     renderer: Renderer,
     views: Views,
-    chosen: np.ndarray,
+    sheet_indices: np.ndarray,
     protocol: Protocol,
     on_progress: OnProgress | None,
 ) -> _Rendered:
     """Render every view once; only what is needed is stored, since there may be many views."""
-    metrics, shown, alpha = [], {}, []
+    metrics, sheet_views, alpha = [], {}, []
     maps = {name: [] for name in ("albedo", *_MATERIALS) if name in views.truth}
     for index, name in counted([*enumerate(views.names)], "new views", on_progress):
         valid = _valid(views, index)
         view = _where_counted(renderer(views.camera(np.array([index]))), valid)
         normal = views.truth["normal"][index] if "normal" in views.truth else None
-        found = _view_metrics(view, views.images[index], normal, valid, protocol)
-        metrics.append({"view": name, **found})
+        view_metrics = _view_metrics(view, views.images[index], normal, valid, protocol)
+        metrics.append({"view": name, **view_metrics})
         alpha.append(view.alpha)
-        for key, kept in maps.items():
-            kept.append(view.aovs[key])
-        if index in chosen:
-            shown[index] = view
-    stacked = {name: np.stack(kept) for name, kept in maps.items()}
-    return _Rendered(metrics, np.stack(alpha), stacked, shown)
+        for key, images in maps.items():
+            images.append(view.aovs[key])
+        if index in sheet_indices:
+            sheet_views[index] = view
+    stacked_maps = {name: np.stack(images) for name, images in maps.items()}
+    return _Rendered(metrics, np.stack(alpha), stacked_maps, sheet_views)
 
 
 def _material_metrics(
@@ -158,11 +158,15 @@ def _material_metrics(
         metrics |= protocol_metrics.albedo_metrics(
             protocol, maps["albedo"], alpha, truth, mask, scale, _all_valid(views)
         )
-        metrics |= {f"albedo.scale_{c}": float(x) for c, x in zip("rgb", scale, strict=True)}
-    known = {name: views.truth[name][..., 0] * mask for name in _MATERIALS if name in maps}
-    if known:
-        found = {name: maps[name][..., 0] for name in known}
-        metrics |= protocol_metrics.material_metrics(found, alpha, known, mask, _all_valid(views))
+        metrics |= {
+            f"albedo.scale_{channel}": float(x) for channel, x in zip("rgb", scale, strict=True)
+        }
+    true_maps = {name: views.truth[name][..., 0] * mask for name in _MATERIALS if name in maps}
+    if true_maps:
+        predicted_maps = {name: maps[name][..., 0] for name in true_maps}
+        metrics |= protocol_metrics.material_metrics(
+            predicted_maps, alpha, true_maps, mask, _all_valid(views)
+        )
     return metrics, scale
 
 
@@ -173,7 +177,7 @@ def _relight_metrics(
     lights: Mapping[str, EnvLight],
     albedo_scale: np.ndarray,
     indirect: str,
-    chosen: np.ndarray,
+    sheet_indices: np.ndarray,
     on_progress: OnProgress | None,
 ) -> tuple[dict[str, float], list[dict[str, np.ndarray]]]:
     """Compute metrics under every light with true images and a map; also return rows of a sheet.
@@ -181,32 +185,36 @@ def _relight_metrics(
     To save memory, lights are processed one by one, and only what is compared is stored.
     """
     metrics: dict[str, float] = {}
-    found: dict[str, float] = {}
-    rows: list[dict[str, np.ndarray]] = [{} for _ in chosen]
+    light_figures: dict[str, float] = {}
+    rows: list[dict[str, np.ndarray]] = [{} for _ in sheet_indices]
     names = sorted(set(views.relight) & set(lights))
-    relit = renderer
+    relit_renderer = renderer
     for number, name in enumerate(names):
         if number:
-            relit = relit.under(lights[name])
+            relit_renderer = relit_renderer.under(lights[name])
         else:
-            relit = renderer.relit(lights[name], albedo_scale=albedo_scale, indirect=indirect)
+            relit_renderer = renderer.relit(
+                lights[name], albedo_scale=albedo_scale, indirect=indirect
+            )
         rgb = np.empty((*views.images.shape[:3], 3), np.float32)
         alpha = np.empty(views.images.shape[:3])
-        shown: dict[int, np.ndarray] = {}
+        sheet_pictures: dict[int, np.ndarray] = {}
         for index in counted(range(len(views)), f"under {name}", on_progress):
-            view = relit(views.camera(np.array([index])))
+            view = relit_renderer(views.camera(np.array([index])))
             view = _where_counted(view, _valid(views, index))
             rgb[index], alpha[index] = _compared(view, protocol.relight), view.alpha
-            if index in chosen:
-                shown[index] = render_on_white(view.rgb, view.alpha)
+            if index in sheet_indices:
+                sheet_pictures[index] = render_on_white(view.rgb, view.alpha)
         images = views.relight[name]  # read once, since every lookup reads all of them
-        found = protocol_metrics.relight_metrics(protocol, rgb, alpha, images, _all_valid(views))
-        metrics |= {f"relight.{name}.{key}": value for key, value in found.items()}
-        for row, index in zip(rows, chosen, strict=True):
-            truth, render = photograph_on_white(images[index]), shown[index]
+        light_figures = protocol_metrics.relight_metrics(
+            protocol, rgb, alpha, images, _all_valid(views)
+        )
+        metrics |= {f"relight.{name}.{key}": value for key, value in light_figures.items()}
+        for row, index in zip(rows, sheet_indices, strict=True):
+            truth, render = photograph_on_white(images[index]), sheet_pictures[index]
             row |= {f"true {name}": truth, name: render, f"error {name}": error_map(truth, render)}
     if names:
-        for key in found:
+        for key in light_figures:
             values = [metrics[f"relight.{name}.{key}"] for name in names]
             metrics[f"relight.mean.{key}"] = float(np.mean(values))
     return metrics, rows if names else []
@@ -295,34 +303,38 @@ def _measure(
     """
     protocol, views = protocols.protocol(options.protocol), truth.views
     compiled = _relight_programs(renderer, views, truth.lights, options.relight_indirect)
-    chosen = np.unique(np.linspace(0, len(views) - 1, options.sheet_views).round().astype(int))
-    rendered = _render_all(renderer, views, chosen, protocol, on_progress)
+    sheet_indices = np.unique(
+        np.linspace(0, len(views) - 1, options.sheet_views).round().astype(int)
+    )
+    rendered = _render_all(renderer, views, sheet_indices, protocol, on_progress)
     lines = rendered.metrics
     names = dict.fromkeys(key for line in lines for key in line if key != "view")
     mean = {key: float(np.mean([line[key] for line in lines if key in line])) for key in names}
     materials, scale = _material_metrics(protocol, rendered, views)
     compiled.result()
-    relights, relit = _relight_metrics(
+    relights, relit_rows = _relight_metrics(
         protocol,
         renderer,
         views,
         truth.lights,
         scale,
         options.relight_indirect,
-        chosen,
+        sheet_indices,
         on_progress,
     )
     mean |= materials | relights
     if truth.train_light is not None:
-        found = light_metrics(radiance, np.asarray(truth.train_light.radiance))
-        mean |= {key: value for key, value in found.items() if isinstance(value, int | float)}
-    return _Measured(lines, mean, rendered, scale, relit)
+        light_figures = light_metrics(radiance, np.asarray(truth.train_light.radiance))
+        mean |= {
+            key: value for key, value in light_figures.items() if isinstance(value, int | float)
+        }
+    return _Measured(lines, mean, rendered, scale, relit_rows)
 
 
 def _show(
     renderer: Renderer,
     truth: Truth,
-    measured: _Measured,
+    results: _Measured,
     folder: Path,
     protocol: str,
     radiance: np.ndarray,
@@ -334,42 +346,44 @@ def _show(
     lights = {"light": radiance}
     if truth.train_light is not None:
         lights = {"true light": np.asarray(truth.train_light.radiance)} | lights
-    shown = Shown(
+    sheets = Shown(
         views=truth.views,
-        psnr=[line["nvs.psnr"] for line in measured.views],
-        rendered=measured.rendered.shown,
+        psnr=[line["nvs.psnr"] for line in results.views],
+        rendered=results.rendered.shown,
         mesh=mesh,
         is_two_sided=is_two_sided,
         seen=seen,
-        albedo_scale=measured.albedo_scale,
-        relit=measured.relit,
+        albedo_scale=results.albedo_scale,
+        relit=results.relit,
         relit_figures=[
             f"{key.removeprefix('relight.').removesuffix('.psnr')}: {value:.2f} dB, {protocol}"
-            for key, value in measured.mean.items()
+            for key, value in results.mean.items()
             if key.startswith("relight.") and key.endswith(".psnr")
         ],
         lights=lights,
     )
-    return shown, shown.write(folder)
+    return sheets, sheets.write(folder)
 
 
 def _write_model(
     trained: Trained,
     sampler: MaterialSampler,
-    shown: Shown,
+    sheets: Shown,
     lights: Mapping[str, EnvLight],
     folder: Path,
     texture_size: int,
 ) -> dict[str, Any] | None:
     """Write the mesh with its materials, and lights to see it under; see `assets.write_model`."""
-    exposed = np.asarray(trained.params.light.radiance) * np.exp(float(trained.params.log_exposure))
+    exposed_radiance = np.asarray(trained.params.light.radiance) * np.exp(
+        float(trained.params.log_exposure)
+    )
     maps = {name: np.asarray(light.radiance) for name, light in lights.items()}
     return write_model(
         folder,
-        shown.mesh,
+        sheets.mesh,
         sampler,
-        lights={"light as found": exposed} | maps,
-        eye=shown.views.camera_to_world[0, :3, 3],
+        lights={"reconstructed light": exposed_radiance} | maps,
+        eye=sheets.views.camera_to_world[0, :3, 3],
         texture_size=texture_size,
     )
 
@@ -405,21 +419,24 @@ def evaluate_run(
     -------
     dict, the content of ``metrics.json``.
     """
-    began = time.perf_counter()
+    start_time = time.perf_counter()
     tell = on_progress or (lambda part, done, total: None)
     protocol = protocols.protocol(options.protocol)
     renderer = Renderer.of(trained, samples=options.samples)
     radiance = np.asarray(trained.params.light.radiance)
-    measured = _measure(renderer, truth, options, radiance, on_progress)
-    no_map = sorted(set(truth.views.relight) - set(truth.lights))
+    results = _measure(renderer, truth, options, radiance, on_progress)
+    unmapped_lights = sorted(set(truth.views.relight) - set(truth.lights))
     metrics = {
         "protocol": options.protocol,
         "notes": [
             protocols.lpips_note(protocol),
-            *(f"{name}: images but no environment map, so no relit metrics" for name in no_map),
+            *(
+                f"{name}: images but no environment map, so no relit metrics"
+                for name in unmapped_lights
+            ),
         ],
-        "mean": measured.mean,
-        "views": measured.views,
+        "mean": results.mean,
+        "views": results.views,
         "samples": options.samples,
         "samples_drawn": renderer.samples,
         "relight_indirect": options.relight_indirect,
@@ -432,23 +449,23 @@ def evaluate_run(
         **meta,
     }
 
-    def written(**found: Any) -> dict[str, Any]:
+    def written(**entries: Any) -> dict[str, Any]:
         """Write and return the metrics, with further entries, seconds and peak memory."""
         effort = {
-            "seconds": round(time.perf_counter() - began, 2),
+            "seconds": round(time.perf_counter() - start_time, 2),
             "peak_memory_mb": peak_memory_mb(),
         }
-        with written_aside(folder / "metrics.json") as aside:
-            text = json.dumps(metrics | effort | found, indent=2)
-            aside.write_text(text + "\n", encoding="utf-8")
-        return metrics | effort | found
+        with written_aside(folder / "metrics.json") as temporary_path:
+            text = json.dumps(metrics | effort | entries, indent=2)
+            temporary_path.write_text(text + "\n", encoding="utf-8")
+        return metrics | effort | entries
 
     written(gallery={}, seen=None)  # metrics are safe if the pictures fail, by lack of memory say
     tell("pictures and model", 0, 1)
-    shown, gallery = _show(renderer, truth, measured, folder, options.protocol, radiance)
+    sheets, gallery = _show(renderer, truth, results, folder, options.protocol, radiance)
     if options.model_texture is not None:
         sampler = MaterialSampler(trained, renderer.asset())
         size = options.model_texture
-        gallery["model"] = _write_model(trained, sampler, shown, truth.lights, folder, size)
+        gallery["model"] = _write_model(trained, sampler, sheets, truth.lights, folder, size)
     tell("pictures and model", 1, 1)
-    return written(gallery=gallery, seen=None if shown.seen is None else shown.seen.described())
+    return written(gallery=gallery, seen=None if sheets.seen is None else sheets.seen.described())

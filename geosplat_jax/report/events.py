@@ -65,10 +65,10 @@ class EventLog(Listener):
             self._writer = self._kind(logdir=str(target))
         with self._folder.metrics.open("rb") as file:
             file.seek(self._read)
-            added = file.read()
-        whole = added[: added.rfind(b"\n") + 1]
-        self._read += len(whole)
-        for text in whole.splitlines():
+            new_bytes = file.read()
+        whole_lines = new_bytes[: new_bytes.rfind(b"\n") + 1]
+        self._read += len(whole_lines)
+        for text in whole_lines.splitlines():
             self._write_step(json.loads(text))
         for path in sorted(self._folder.previews.glob("step_*.png")):
             if path.name not in self._shown:

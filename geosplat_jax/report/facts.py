@@ -79,19 +79,19 @@ class Figure:
 
 def figure(key: str) -> Figure:
     """Describe a figure of ``metrics.json`` by its key; an unknown one keeps its key as label."""
-    group, _, rest = key.partition(".")
+    group, _, measure_key = key.partition(".")
     title = _GROUPS.get(group, group)
     if group == "relight":
-        light, _, rest = rest.rpartition(".")
+        light, _, measure_key = measure_key.rpartition(".")
         title = "New lights, mean" if light == "mean" else f"New light: {light}"
-    name, parts = rest.removesuffix("_deg"), []
+    name, qualifiers = measure_key.removesuffix("_deg"), []
     while name not in _MEASURES and "_" in name:
         name, _, region = name.rpartition("_")
-        parts.append(_REGIONS.get(region, region))
+        qualifiers.append(_REGIONS.get(region, region))
     if name not in _MEASURES:
-        return Figure(key, title, rest, "", "")
+        return Figure(key, title, measure_key, "", "")
     label, unit, better = _MEASURES[name]
-    return Figure(key, title, ", ".join([label, *parts]), unit, better)
+    return Figure(key, title, ", ".join([label, *qualifiers]), unit, better)
 
 
 def _rendition(rendition: Rendition | ScaledRendition) -> str:
@@ -105,12 +105,12 @@ def _rendition(rendition: Rendition | ScaledRendition) -> str:
 
 def protocol_text(name: str) -> str:
     """Say in sentences what a protocol compares, and how."""
-    chosen: Protocol = protocol(name)
+    rules: Protocol = protocol(name)
     scale = {"least_squares": "least squares", "median": "the median of ratios"}
     return (
-        f"Protocol {chosen.name}. New views are compared {_rendition(NEW_VIEWS)}, albedo "
-        f"{_rendition(chosen.albedo)} after one factor for each channel by "
-        f"{scale[chosen.albedo_scale]}, relit images {_rendition(chosen.relight)} with the albedo "
+        f"Protocol {rules.name}. New views are compared {_rendition(NEW_VIEWS)}, albedo "
+        f"{_rendition(rules.albedo)} after one factor for each channel by "
+        f"{scale[rules.albedo_scale]}, relit images {_rendition(rules.relight)} with the albedo "
         "in that scale. Figures of other protocols are not comparable."
     )
 
@@ -124,31 +124,38 @@ def curves(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     ``every``-th step and the last one; of ``every``; and of ``stages``, the name and first step of
     each.
     """
-    every = -(-len(lines) // _LONGEST_CURVE) if lines else 1
-    kept = [line for n, line in enumerate(lines) if n % every == 0 or n == len(lines) - 1]
-    stages, before = [], None
+    stride = -(-len(lines) // _LONGEST_CURVE) if lines else 1
+    sampled_lines = [line for n, line in enumerate(lines) if n % stride == 0 or n == len(lines) - 1]
+    stages, last_stage = [], None
     for line in lines:
-        if line["stage"] != before:
-            before = line["stage"]
-            stages.append({"name": before, "step": line["step"]})
+        if line["stage"] != last_stage:
+            last_stage = line["stage"]
+            stages.append({"name": last_stage, "step": line["step"]})
     columns = {"loss": "loss", "psnr": "psnr", "splats": "splats", "memory": "peak_memory_mb"}
-    values = {name: [_finite(line.get(key)) for line in kept] for name, key in columns.items()}
-    return {"step": [line["step"] for line in kept], **values, "stages": stages, "every": every}
+    values = {
+        name: [_finite(line.get(key)) for line in sampled_lines] for name, key in columns.items()
+    }
+    return {
+        "step": [line["step"] for line in sampled_lines],
+        **values,
+        "stages": stages,
+        "every": stride,
+    }
 
 
 def rung_row(rung: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
     """Format a rung of ``run.json``: part of the model, PSNR without and with it, gain, verdict."""
-    found, with_it, gain = rung["found"], "-", "-"
-    if found is not None:
-        with_it = f"{rung['larger']:.2f} dB"
-        gain = f"{found['gain']:+.2f} +- {found['standard_error']:.2f} dB"
-        if found["spread"]:
-            gain += f", seeds {found['spread']:.2f}"
+    comparison, larger_psnr, gain = rung["found"], "-", "-"
+    if comparison is not None:
+        larger_psnr = f"{rung['larger']:.2f} dB"
+        gain = f"{comparison['gain']:+.2f} +- {comparison['standard_error']:.2f} dB"
+        if comparison["spread"]:
+            gain += f", seeds {comparison['spread']:.2f}"
     verdict = "kept" if rung["is_kept"] else "left out"
     if rung["note"]:
-        joint = ": " if found is None else ", " if rung["is_kept"] else ", even "
-        verdict += joint + rung["note"]
-    return rung["title"], f"{rung['smaller']:.2f} dB", with_it, gain, verdict
+        separator = ": " if comparison is None else ", " if rung["is_kept"] else ", even "
+        verdict += separator + rung["note"]
+    return rung["title"], f"{rung['smaller']:.2f} dB", larger_psnr, gain, verdict
 
 
 def _finite(value: Any) -> float | int | None:
@@ -184,14 +191,14 @@ def _level_of(config: Config) -> str:
 def _preset_of(config: Config, overrides: Sequence[str] = ()) -> Config:
     """Return the preset of ``config`` at its level, labelled with the quality of ``config``."""
     geometry = config.geometry
-    found = make_config(
+    preset = make_config(
         config.preset,
         _level_of(config),
         material_prior=config.material_prior,
         mesh=geometry if isinstance(geometry, MeshSettings) else None,
         overrides=tuple(overrides),
     )
-    return replace(found, quality=config.quality)
+    return replace(preset, quality=config.quality)
 
 
 def changed_from_preset(config: Config) -> dict[str, tuple[Any, Any]]:
@@ -231,7 +238,7 @@ def command(record: Mapping[str, Any], config: Config) -> tuple[str, bool]:
         is_whole = not changed_settings(_preset_of(config, overrides), config)
     except ValueError:
         is_whole = False
-    is_whole &= all(reading.get(n, usual) == usual for n, usual in READING if n not in _NAMED)
+    is_whole &= all(reading.get(n, default) == default for n, default in READING if n not in _NAMED)
     if is_whole:
         words += [word for override in overrides for word in ("--set", override)]
     return _folded(words), is_whole
@@ -240,5 +247,5 @@ def command(record: Mapping[str, Any], config: Config) -> tuple[str, bool]:
 def _folded(words: Sequence[str]) -> str:
     """Quote words for a shell, with each option on its own line."""
     starts = [0, *(n for n, word in enumerate(words) if word.startswith("--")), len(words)]
-    lines = [shlex.join(words[first:last]) for first, last in pairwise(starts)]
+    lines = [shlex.join(words[start:end]) for start, end in pairwise(starts)]
     return " \\\n    ".join(lines)

@@ -30,9 +30,9 @@ def comparisons(titles: Sequence[str]) -> list[tuple[str, str]]:
     pairs = [("truth", "render")] if {"truth", "render"} <= set(titles) else []
     for title in titles:
         name = title.removeprefix("true ")
-        found = f"{name}, aligned" if f"{name}, aligned" in titles else name
-        if name != title and found in titles:
-            pairs.append((title, found))
+        partner = f"{name}, aligned" if f"{name}, aligned" in titles else name
+        if name != title and partner in titles:
+            pairs.append((title, partner))
     return pairs
 
 
@@ -55,10 +55,10 @@ def write_gallery(
     dict for ``metrics.json``, with paths below ``folder``: ``views``, a list of ``view`` (the name)
     and ``pictures`` (paths by title), and ``lights``, paths by title.
     """
-    own = folder / FOLDER
-    own.mkdir(exist_ok=True)
-    for old in own.glob("*.png"):
-        old.unlink()
+    gallery_folder = folder / FOLDER
+    gallery_folder.mkdir(exist_ok=True)
+    for old_picture in gallery_folder.glob("*.png"):
+        old_picture.unlink()
     views = []
     for number, (view, row) in enumerate(rows.items()):
         files = {}
@@ -67,8 +67,8 @@ def write_gallery(
             files[title] = f"{FOLDER}/{number:03d}_{column:02d}.png"
             write_png(folder / files[title], picture)
         views.append({"view": view, "pictures": files})
-    shown = {}
+    light_files = {}
     for title, radiance in lights.items():
-        shown[title] = f"{FOLDER}/{title.replace(' ', '_')}.png"
-        write_png(folder / shown[title], tone_map_light(np.asarray(radiance)))
-    return {"views": views, "lights": shown}
+        light_files[title] = f"{FOLDER}/{title.replace(' ', '_')}.png"
+        write_png(folder / light_files[title], tone_map_light(np.asarray(radiance)))
+    return {"views": views, "lights": light_files}

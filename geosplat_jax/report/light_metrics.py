@@ -102,12 +102,12 @@ def _best_turn(
         return 0.0, 0.0
     # c[k] = sum_j a[j] b[j + k] on the circle, every k at once.
     spectrum = np.conj(np.fft.rfft(a, axis=1)) * np.fft.rfft(b, axis=1)
-    by_shift = np.fft.irfft(np.sum(weights * spectrum, axis=0), n=width) / np.sqrt(variance)
+    correlations = np.fft.irfft(np.sum(weights * spectrum, axis=0), n=width) / np.sqrt(variance)
     shifts = (np.arange(width) + width // 2) % width - width // 2
-    candidates = np.flatnonzero(by_shift >= by_shift.max() - _CORRELATION_TIE)
-    best = candidates[np.argmin(np.abs(shifts[candidates]))]
+    candidates = np.flatnonzero(correlations >= correlations.max() - _CORRELATION_TIE)
+    best_column = candidates[np.argmin(np.abs(shifts[candidates]))]
     # Columns to the right are clockwise seen from above: u = 0.5 - azimuth / (2 pi).
-    return float(-int(shifts[best]) * 360.0 / width), float(by_shift[best])
+    return float(-int(shifts[best_column]) * 360.0 / width), float(correlations[best_column])
 
 
 def _direction_metrics(
@@ -186,13 +186,15 @@ def light_metrics(
     error = scaled / (1 + scaled) - truth / (1 + truth)
     # In float64: a uniform map must stay uniform, or its rounding is what is correlated.
     channels = np.asarray(luminance(jnp.eye(3)), float)
-    true_bright, fitted = truth @ channels, scaled @ channels
+    true_luminance, fitted_luminance = truth @ channels, scaled @ channels
     # A least-squares fit of maps that are rotated against each other has a wrong colour; flux has
     # the right one.
-    bright = (_ratio(mean(truth), mean(recovered)) * recovered) @ channels
+    flux_luminance = (_ratio(mean(truth), mean(recovered)) * recovered) @ channels
     return {
         "light.scale": tuple(scale.tolist()),
         "light.psnr": float(psnr_of_mse(float(np.mean(mean(error**2))))),
-        "light.correlation": _correlation(np.log1p(fitted), np.log1p(true_bright), weights),
-        **_direction_metrics(bright, true_bright, weights),
+        "light.correlation": _correlation(
+            np.log1p(fitted_luminance), np.log1p(true_luminance), weights
+        ),
+        **_direction_metrics(flux_luminance, true_luminance, weights),
     }

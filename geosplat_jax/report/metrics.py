@@ -94,12 +94,12 @@ def ssim_masked(
     inside = _inside(mask)
     # Windows without a pixel of the mask are equal in both images, with a similarity of exactly
     # one. So the mean over the other windows follows from the mean over all.
-    cut = [jnp.where(inside[..., None], jnp.asarray(x), 0.0) for x in (image, truth)]
-    missing = [(0, max(0, WINDOW_SIZE - size)) for size in inside.shape]
-    padded = jnp.pad(inside, missing, mode="edge").astype(jnp.float32)
+    masked_images = [jnp.where(inside[..., None], jnp.asarray(x), 0.0) for x in (image, truth)]
+    pad_widths = [(0, max(0, WINDOW_SIZE - size)) for size in inside.shape]
+    padded = jnp.pad(inside, pad_widths, mode="edge").astype(jnp.float32)
     window = (WINDOW_SIZE, WINDOW_SIZE)
     touches = jax.lax.reduce_window(padded, 0.0, jax.lax.max, window, (1, 1), "valid")
-    dissimilarity = 1.0 - ssim(*cut)
+    dissimilarity = 1.0 - ssim(*masked_images)
     return 1.0 - safe_divide(dissimilarity, jnp.mean(touches).astype(dissimilarity.dtype))
 
 
@@ -145,12 +145,14 @@ def normal_mae_deg(
         background = jnp.broadcast_to(
             jnp.asarray(_BACKGROUND_NORMAL, predicted.dtype), predicted.shape
         )
-        drawn = inside if predicted_mask is None else _inside(predicted_mask)
-        predicted = jnp.where(drawn[..., None], predicted, background)
+        is_predicted = inside if predicted_mask is None else _inside(predicted_mask)
+        predicted = jnp.where(is_predicted[..., None], predicted, background)
         true = jnp.where(inside[..., None], true, background)
         angles = angle_between(predicted, true)
-        counted = jnp.ones_like(angles) if valid is None else _inside(valid).astype(angles.dtype)
-        mean = safe_divide(jnp.sum(counted * angles), jnp.sum(counted))
+        valid_weight = (
+            jnp.ones_like(angles) if valid is None else _inside(valid).astype(angles.dtype)
+        )
+        mean = safe_divide(jnp.sum(valid_weight * angles), jnp.sum(valid_weight))
     return jnp.rad2deg(mean)
 
 
@@ -201,5 +203,5 @@ def composite(
     """
     rgb = jnp.asarray(rgb)
     coverage = jnp.asarray(alpha)[..., None]
-    behind = jnp.broadcast_to(jnp.asarray(background, rgb.dtype), rgb.shape)
-    return coverage * rgb + (1.0 - coverage) * behind
+    backdrop = jnp.broadcast_to(jnp.asarray(background, rgb.dtype), rgb.shape)
+    return coverage * rgb + (1.0 - coverage) * backdrop

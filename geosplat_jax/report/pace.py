@@ -16,9 +16,9 @@ _RECENT = 20
 
 def counted(items: Sequence[Item], part: str, on_progress: OnProgress | None) -> Iterator[Item]:
     """Iterate over items, and report before the first and after each how many are done."""
-    for done, item in enumerate(items):
+    for done_count, item in enumerate(items):
         if on_progress is not None:
-            on_progress(part, done, len(items))
+            on_progress(part, done_count, len(items))
         yield item
     if on_progress is not None:
         on_progress(part, len(items), len(items))
@@ -44,10 +44,10 @@ class TimeLeft:
     def left(self, done: int, total: int) -> float | None:
         """Record that ``done`` items are done; return the seconds left, None while unknown."""
         now = self._clock()
-        fresh = done - self._done
-        if fresh > 0:
+        new_count = done - self._done
+        if new_count > 0:
             if self._done > 0:
-                self._seconds += [(now - self._before) / fresh] * fresh
+                self._seconds += [(now - self._before) / new_count] * new_count
             self._before, self._done = now, done
         if done >= total:
             return 0.0

@@ -126,12 +126,12 @@ class Evaluated:
         if not path.exists():
             return {}
         try:
-            found = parse_json(path.read_bytes())
+            content = parse_json(path.read_bytes())
         except ValueError as error:
             raise RunError(f"{path} is damaged: {error}; evaluate the run again") from None
-        if not isinstance(found, dict) or not isinstance(found.get("mean"), dict):
+        if not isinstance(content, dict) or not isinstance(content.get("mean"), dict):
             raise RunError(f"{path} is damaged: it has no figures; evaluate the run again")
-        return found
+        return content
 
 
 def _views(gallery: Mapping[str, Any], run: Evaluated, allowance: _Allowance) -> list[dict]:
@@ -146,15 +146,19 @@ def _views(gallery: Mapping[str, Any], run: Evaluated, allowance: _Allowance) ->
         }
         urls = {title: url for title, url in urls.items() if url is not None}
         pairs = comparisons(list(urls))
-        paired = {title for pair in pairs for title in pair}
+        paired_titles = {title for pair in pairs for title in pair}
         views.append(
             {
                 "name": entry["view"],
                 "pairs": [
-                    {"true": true, "found": found, "urls": (urls[true], urls[found])}
-                    for true, found in pairs
+                    {
+                        "true": true_title,
+                        "found": found_title,
+                        "urls": (urls[true_title], urls[found_title]),
+                    }
+                    for true_title, found_title in pairs
                 ],
-                "others": {title: url for title, url in urls.items() if title not in paired},
+                "others": {title: url for title, url in urls.items() if title not in paired_titles},
             }
         )
     return [view for view in views if view["pairs"] or view["others"]]
@@ -162,15 +166,15 @@ def _views(gallery: Mapping[str, Any], run: Evaluated, allowance: _Allowance) ->
 
 def _model(gallery: Mapping[str, Any], run: Evaluated, allowance: _Allowance) -> dict | None:
     """Embed the mesh and the lights that it is shown under; None without a mesh that fits."""
-    listed = gallery.get("model") or {}
-    path = _below(run.results, listed.get("mesh"))
+    model = gallery.get("model") or {}
+    path = _below(run.results, model.get("mesh"))
     if path is None:
         return None
     url = allowance.embed(path.read_bytes(), "model/gltf-binary", "the mesh to turn")
     if url is None:
         return None
     lights = []
-    for title, name in listed.get("lights", {}).items():
+    for title, name in model.get("lights", {}).items():
         light = _below(run.results, name)
         if light is not None:
             data = allowance.embed(light.read_bytes(), "application/octet-stream", f"light {title}")
@@ -180,8 +184,8 @@ def _model(gallery: Mapping[str, Any], run: Evaluated, allowance: _Allowance) ->
     return {
         "mesh": url,
         "lights": lights,
-        "faces": listed.get("faces"),
-        "orbit": listed.get("orbit"),
+        "faces": model.get("faces"),
+        "orbit": model.get("orbit"),
     }
 
 
@@ -201,16 +205,18 @@ def _described(run: Evaluated, name: str, room: int) -> dict[str, Any]:
     models = _Allowance(room - int(_PICTURES_SHARE * room) + pictures.left)
     model = _model(gallery, run, models)
     psnr = {line["view"]: line["nvs.psnr"] for line in metrics.get("views", [])}
-    again, is_whole = command(record, config)
+    command_text, is_whole = command(record, config)
     seen = metrics.get("seen")
-    evaluated, trained = metrics.get("step"), run.trained_steps()
+    evaluated_step, trained_step = metrics.get("step"), run.trained_steps()
     return {
         "name": name,
         "folder": str(run.results),
         "record": record,
         "config": config,
         "metrics": metrics,
-        "older": evaluated if evaluated is not None and evaluated < trained else None,
+        "older": evaluated_step
+        if evaluated_step is not None and evaluated_step < trained_step
+        else None,
         "figures": [(figure(key), value) for key, value in mean.items()],
         "headlines": [
             (figure(key), metrics["mean"][key])
@@ -227,7 +233,7 @@ def _described(run: Evaluated, name: str, room: int) -> dict[str, Any]:
         "total_seconds": (run.folder.training() or {}).get("seconds_total"),
         "rungs": [rung_row(rung) for rung in record.get("model", {}).get("rungs", [])],
         "changed": changed_from_preset(config),
-        "command": again,
+        "command": command_text,
         "command_is_whole": is_whole,
         "refused": pictures.refused + models.refused,
         "curves": curves(lines),
@@ -239,10 +245,10 @@ def _figure_groups(
 ) -> dict[str, list[tuple[Figure, list[float | None]]]]:
     """Align the figures of all runs, by group, in the order of first appearance."""
     values = [{f.key: value for f, value in run["figures"]} for run in runs]
-    known = {f.key: f for run in runs for f, _ in run["figures"]}
+    figures_by_key = {f.key: f for run in runs for f, _ in run["figures"]}
     groups: dict[str, list[tuple[Figure, list[float | None]]]] = {}
-    for key, f in known.items():
-        groups.setdefault(f.group, []).append((f, [of_run.get(key) for of_run in values]))
+    for key, f in figures_by_key.items():
+        groups.setdefault(f.group, []).append((f, [run_values.get(key) for run_values in values]))
     return groups
 
 
@@ -294,14 +300,14 @@ def report_html(runs: Sequence[Evaluated]) -> str:
         "style": _web("report.css"),
         "licences": (_WEB / "LICENSES.txt").read_text(encoding="utf-8"),
     }
-    fixed = sum(len(text.encode()) for text in scripts.values())
-    room = (LARGEST_PAGE - fixed) // len(runs) - _TEXT_BYTES
+    fixed_bytes = sum(len(text.encode()) for text in scripts.values())
+    room = (LARGEST_PAGE - fixed_bytes) // len(runs) - _TEXT_BYTES
     if room < 0:
         raise ValueError(f"{len(runs)} runs do not fit into one report; compare fewer of them")
-    described = []
+    descriptions = []
     for run, name in zip(runs, _names(runs), strict=True):
         try:
-            described.append(_described(run, name, room))
+            descriptions.append(_described(run, name, room))
         except (AttributeError, KeyError, TypeError) as error:
             raise RunError(
                 f"{run.results / 'metrics.json'} or a file beside it is damaged "
@@ -309,10 +315,10 @@ def report_html(runs: Sequence[Evaluated]) -> str:
             ) from None
     page = _environment().get_template("report.html.jinja")
     return page.render(
-        runs=described,
-        figures=_figure_groups(described),
+        runs=descriptions,
+        figures=_figure_groups(descriptions),
         scripts=scripts,
-        data={"runs": [{"name": run["name"], **run["curves"]} for run in described]},
+        data={"runs": [{"name": run["name"], **run["curves"]} for run in descriptions]},
         error_scale=ERROR.described(),
         grey_scale=ROUGHNESS.described(),
     )
@@ -327,6 +333,6 @@ def write_report(path: Path, runs: Sequence[Evaluated]) -> Path:
         See `report_html`.
     """
     html = report_html(runs)
-    with written_aside(path) as aside:
-        aside.write_text(html, encoding="utf-8")
+    with written_aside(path) as temporary_path:
+        temporary_path.write_text(html, encoding="utf-8")
     return path

@@ -171,10 +171,10 @@ def _write_texts(
     for text in texts:
         font = ImageFont.load_default(text.size)
         draw.text(text.position, text.words, fill=text.color, font=font, anchor=text.anchor)
-    written = np.asarray(canvas)
+    text_pixels = np.asarray(canvas)
     # Pixels without text keep their full precision.
-    is_written = np.any(written != eight_bits, axis=-1, keepdims=True)
-    return np.where(is_written, written.astype(np.float32) / 255.0, sheet)
+    is_written = np.any(text_pixels != eight_bits, axis=-1, keepdims=True)
+    return np.where(is_written, text_pixels.astype(np.float32) / 255.0, sheet)
 
 
 def _reduced(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "h w 3"]:
@@ -223,8 +223,8 @@ def _light_strip(
     aspect = light.shape[0] / light.shape[1]
     largest_height = _LIGHT_ROWS * (cell_height + _GUTTER) - _GUTTER
     widths = [n * (cell_width + _GUTTER) - _GUTTER for n in range(1, columns + 1)]
-    fitting = [width for width in widths if width * aspect <= largest_height]
-    width = fitting[-1] if fitting else widths[0]
+    fitting_widths = [width for width in widths if width * aspect <= largest_height]
+    width = fitting_widths[-1] if fitting_widths else widths[0]
     return _resized(tone_map_light(light), max(1, round(width * aspect)), width)
 
 
@@ -233,12 +233,12 @@ def _enlarged(
 ) -> list[Mapping[str, np.ndarray]]:
     """Repeat the pixels of small pictures until every name fits above its column."""
     font = ImageFont.load_default(_LABEL_SIZE)
-    needed = max(font.getlength(name) for name in names)
+    label_width = max(font.getlength(name) for name in names)
     width = next(iter(next(row for row in rows if row).values())).shape[1]
-    times = max(1, math.ceil(needed / width))
-    if times == 1:
+    repeats = max(1, math.ceil(label_width / width))
+    if repeats == 1:
         return list(rows)
-    return [{n: im.repeat(times, 0).repeat(times, 1) for n, im in row.items()} for row in rows]
+    return [{n: im.repeat(repeats, 0).repeat(repeats, 1) for n, im in row.items()} for row in rows]
 
 
 def _captions(
@@ -288,16 +288,16 @@ def _footer(
         texts.append(_Text(name, (x, y - _LABEL_RISE), "ls"))
         x += strip.shape[1] + _MARGIN
     for line, note in enumerate(notes):
-        place = (x, y + line * _LINE_HEIGHT)
-        texts.append(_Text(note, place, "lt", color=_FAINT_TEXT_COLOR))
+        position = (x, y + line * _LINE_HEIGHT)
+        texts.append(_Text(note, position, "lt", color=_FAINT_TEXT_COLOR))
     y += max([len(notes) * _LINE_HEIGHT, *(strip.shape[0] for _, strip in lights)])
     for scale in scales:
         y += _LABEL_RISE
         parts.append((y, left, scale.bar(_BAR_HEIGHT, _BAR_WIDTH)))
         low, high = scale.ends
         words = f"{low} to {high}   {scale.name}"
-        place = (left + _BAR_WIDTH + _LABEL_GAP, y + _BAR_HEIGHT // 2)
-        texts.append(_Text(words, place, "lm", color=_FAINT_TEXT_COLOR))
+        position = (left + _BAR_WIDTH + _LABEL_GAP, y + _BAR_HEIGHT // 2)
+        texts.append(_Text(words, position, "lm", color=_FAINT_TEXT_COLOR))
         y += _BAR_HEIGHT
     return _Footer(parts, y - top, texts)
 
@@ -364,17 +364,17 @@ def overview_sheet(
     ]
     footer = _footer(strips, scales, notes, left, top + grid.shape[0] + _GUTTER)
     texts += footer.texts
-    placed = [(top, left, grid), *footer.parts]
-    ends = [x + part.shape[1] for _, x, part in placed]
+    blocks = [(top, left, grid), *footer.parts]
+    right_ends = [x + block.shape[1] for _, x, block in blocks]
     # Left-aligned texts may extend beyond the pictures.
-    ends += [
+    right_ends += [
         int(text.position[0]) + _text_width(text.words, text.size)
         for text in texts
         if text.anchor.startswith("l")
     ]
     height = top + grid.shape[0] + (_GUTTER + footer.height if footer.height else 0)
-    size = (height + _MARGIN, max(ends) + _MARGIN, 3)
+    size = (height + _MARGIN, max(right_ends) + _MARGIN, 3)
     sheet = np.broadcast_to(np.asarray(_SHEET_COLOR, np.float32), size).copy()
-    for y, x, part in placed:
-        sheet[y : y + part.shape[0], x : x + part.shape[1]] = part
+    for y, x, block in blocks:
+        sheet[y : y + block.shape[0], x : x + block.shape[1]] = block
     return _write_texts(sheet, texts)

@@ -51,10 +51,10 @@ def _require(shape: tuple[int, ...], **maps: np.ndarray | tuple[np.ndarray, int]
     """Check that maps have the shape (V, H, W) of alpha, their channels, and finite values."""
     for name, entry in maps.items():
         values, *channels = entry if isinstance(entry, tuple) else (entry,)
-        wanted = (*shape, *channels)
-        if len(shape) != 3 or 0 in shape or values.shape != wanted:
+        target = (*shape, *channels)
+        if len(shape) != 3 or 0 in shape or values.shape != target:
             raise ValueError(
-                f"{name} must be (V, H, W{', C' * len(channels)}) = {wanted}, at least one view of "
+                f"{name} must be (V, H, W{', C' * len(channels)}) = {target}, at least one view of "
                 f"the size of alpha, got {values.shape}; render and load the same views"
             )
         bad = int(np.size(values) - np.count_nonzero(np.isfinite(values)))
@@ -115,16 +115,16 @@ def albedo_scale(
     ValueError : shapes that do not agree, values that are not finite, no object in the views.
     """
     _require(alpha.shape, alpha=alpha, mask=mask, albedo=(albedo, 3), truth=(truth, 3))
-    chosen = scale_views(protocol, len(alpha))
-    inside = mask[chosen] > MASK_THRESHOLD
+    view_indices = scale_views(protocol, len(alpha))
+    inside = mask[view_indices] > MASK_THRESHOLD
     _require_object(inside)
     if protocol.albedo_scale == "least_squares":
-        return _mean_least_squares(albedo[chosen], truth[chosen], inside)
-    known = inside & (alpha[chosen] > _SMALLEST_ALPHA)
-    if not known.any():
+        return _mean_least_squares(albedo[view_indices], truth[view_indices], inside)
+    is_covered = inside & (alpha[view_indices] > _SMALLEST_ALPHA)
+    if not is_covered.any():
         return np.ones(3)
-    predicted = straight(albedo[chosen][known], alpha[chosen][known])
-    true = straight(truth[chosen][known], mask[chosen][known])
+    predicted = straight(albedo[view_indices][is_covered], alpha[view_indices][is_covered])
+    true = straight(truth[view_indices][is_covered], mask[view_indices][is_covered])
     return np.asarray(albedo_scale_median(predicted, true, np.ones(len(true), bool)), float)
 
 
@@ -133,11 +133,14 @@ def _mean_least_squares(
 ) -> Float[np.ndarray, " 3"]:
     """Average the scales of the views that have an object and a prediction, by channel."""
     scales = np.array(
-        [albedo_scale_least_squares(a, t) for a, t in zip(albedo, truth, strict=True)]
+        [
+            albedo_scale_least_squares(predicted, true)
+            for predicted, true in zip(albedo, truth, strict=True)
+        ]
     )
-    known = inside.any(axis=(1, 2))[:, None] & (albedo != 0).any(axis=(1, 2))
-    count = known.sum(axis=0)
-    total = np.where(known, scales, 0.0).sum(axis=0, dtype=float)
+    is_valid = inside.any(axis=(1, 2))[:, None] & (albedo != 0).any(axis=(1, 2))
+    count = is_valid.sum(axis=0)
+    total = np.where(is_valid, scales, 0.0).sum(axis=0, dtype=float)
     return np.where(count > 0, total / np.maximum(count, 1), 1.0)
 
 
@@ -180,9 +183,11 @@ def scaled_psnr(
     predicted = np.where(inside[..., None], rgb, 0.0).astype(float)
     true = np.maximum(np.where(inside[..., None], truth, 0.0).astype(float), 0.0)
     if figure.is_brightened:
-        shown = np.clip(true, 0.0, 1.0)
-        total = shown.sum()
-        gain = encode_srgb(shown).sum() / total if total > 1e-8 * shown.size else 1.0
+        clipped_truth = np.clip(true, 0.0, 1.0)
+        total = clipped_truth.sum()
+        gain = (
+            encode_srgb(clipped_truth).sum() / total if total > 1e-8 * clipped_truth.size else 1.0
+        )
         predicted, true = gain * predicted, gain * true
     power = (predicted**2).sum(axis=(0, 1))
     is_lit = power > 1e-6
@@ -203,14 +208,18 @@ def _compare_scaled(
     valid: np.ndarray | None,
 ) -> dict[str, float]:
     """Average figures over the images whose eroded mask is not empty; see `ScaledRendition`."""
-    found: dict[str, list[float]] = {figure.name: [] for figure in rendition.figures}
-    known = np.ones(mask.shape, bool) if valid is None else valid > MASK_THRESHOLD
-    for prediction, truth, covered, counted in zip(predictions, truths, mask, known, strict=True):
-        inside = eroded(covered > MASK_THRESHOLD)
+    psnr_values: dict[str, list[float]] = {figure.name: [] for figure in rendition.figures}
+    valid_masks = np.ones(mask.shape, bool) if valid is None else valid > MASK_THRESHOLD
+    for prediction, truth, coverage, valid_mask in zip(
+        predictions, truths, mask, valid_masks, strict=True
+    ):
+        inside = eroded(coverage > MASK_THRESHOLD)
         if inside.any():
             for figure in rendition.figures:
-                found[figure.name].append(scaled_psnr(figure, prediction, truth, inside, counted))
-    return {name: float(np.mean(values)) for name, values in found.items() if values}
+                psnr_values[figure.name].append(
+                    scaled_psnr(figure, prediction, truth, inside, valid_mask)
+                )
+    return {name: float(np.mean(values)) for name, values in psnr_values.items() if values}
 
 
 def _compare(
@@ -232,23 +241,27 @@ def _compare(
         return _compare_scaled(predictions, truths, mask, rendition, valid)
     errors, similarities, masked_errors, masked_similarities, counts = [], [], [], [], []
     totals = []
-    known = [None] * len(mask) if valid is None else valid
-    views = zip(predictions, alpha, truths, mask, known, strict=True)
-    for prediction, drawn, truth, covered, counted in views:
-        shown = {
-            "alpha": np.clip(drawn, 0.0, 1.0),
-            "solid": drawn > MASK_THRESHOLD,
-            "mask": covered,
+    valid_masks = [None] * len(mask) if valid is None else valid
+    views = zip(predictions, alpha, truths, mask, valid_masks, strict=True)
+    for prediction, predicted_alpha, truth, coverage, valid_mask in views:
+        silhouettes = {
+            "alpha": np.clip(predicted_alpha, 0.0, 1.0),
+            "solid": predicted_alpha > MASK_THRESHOLD,
+            "mask": coverage,
         }
-        predicted = _picture(straight(prediction, drawn), shown[rendition.silhouette], rendition)
-        true = _picture(truth, covered, rendition)
-        errors.append(float(_mse(predicted, true, counted)))
-        if counted is None:
+        predicted = _picture(
+            straight(prediction, predicted_alpha), silhouettes[rendition.silhouette], rendition
+        )
+        true = _picture(truth, coverage, rendition)
+        errors.append(float(_mse(predicted, true, valid_mask)))
+        if valid_mask is None:
             similarities.append(float(_ssim(predicted, true)))
         else:
-            similarities.append(float(_ssim_masked(predicted, true, counted)))
-        totals.append(covered.size if counted is None else int((counted > MASK_THRESHOLD).sum()))
-        inside = covered > MASK_THRESHOLD
+            similarities.append(float(_ssim_masked(predicted, true, valid_mask)))
+        totals.append(
+            coverage.size if valid_mask is None else int((valid_mask > MASK_THRESHOLD).sum())
+        )
+        inside = coverage > MASK_THRESHOLD
         if inside.any():
             masked_errors.append(float(_mse(predicted, true, inside)))
             masked_similarities.append(float(_ssim_masked(predicted, true, inside)))
@@ -308,8 +321,8 @@ def new_view_metrics(
     ------
     ValueError : shapes that do not agree, values that are not finite.
     """
-    counted = None if valid is None else valid[None]
-    metrics = _compare_images(rgb[None], alpha[None], image[None], rendition, counted)
+    valid_views = None if valid is None else valid[None]
+    metrics = _compare_images(rgb[None], alpha[None], image[None], rendition, valid_views)
     return {f"nvs.{name}": value for name, value in metrics.items()}
 
 
@@ -348,7 +361,7 @@ def albedo_metrics(
     metrics = _compare(
         (view * factor for view in albedo),
         alpha,
-        (straight(t, covered) for t, covered in zip(truth, mask, strict=True)),
+        (straight(true, coverage) for true, coverage in zip(truth, mask, strict=True)),
         mask,
         rendition=protocol.albedo,
         is_pooled=protocol.albedo_is_pooled,
@@ -396,7 +409,7 @@ def material_metrics(
     _require_black(valid, alpha=alpha, mask=mask)
     inside = mask > MASK_THRESHOLD
     _require_object(inside)
-    counted = np.ones(mask.shape, bool) if valid is None else valid > MASK_THRESHOLD
+    is_valid = np.ones(mask.shape, bool) if valid is None else valid > MASK_THRESHOLD
     for name in (name for name in _MATERIALS if name in truth):
         if name not in materials:
             raise ValueError(f"there is a true {name} but no predicted one; render it too")
@@ -404,11 +417,13 @@ def material_metrics(
         _require(alpha.shape, **{f"predicted {name}": predicted, f"true {name}": true})
         squared = (straight(predicted, alpha) - straight(true, mask)) ** 2
         views = [
-            np.mean(x[i], dtype=float) for x, i in zip(squared, inside, strict=True) if i.any()
+            np.mean(errors[is_object], dtype=float)
+            for errors, is_object in zip(squared, inside, strict=True)
+            if is_object.any()
         ]
         metrics[f"{name}.mse"] = float(np.mean(views))
-        whole = np.sum((predicted - true) ** 2, axis=(1, 2), dtype=float, where=counted)
-        metrics[f"{name}.mse_full"] = float(np.mean(whole / counted.sum(axis=(1, 2))))
+        error_sums = np.sum((predicted - true) ** 2, axis=(1, 2), dtype=float, where=is_valid)
+        metrics[f"{name}.mse_full"] = float(np.mean(error_sums / is_valid.sum(axis=(1, 2))))
     return metrics
 
 

@@ -170,10 +170,10 @@ def protocol(name: str) -> Protocol:
 
 def lpips_note(protocol: Protocol) -> str:
     """Say which networks the protocol's perceptual distance would use, and why it is missing."""
-    nets = " and ".join(protocol.lpips_nets)
+    networks = " and ".join(protocol.lpips_nets)
     return (
         f"LPIPS is left out: protocol {protocol.name!r} measures it with the trained weights of "
-        f"{nets}, which are a download and no part of this package"
+        f"{networks}, which are a download and no part of this package"
     )
 
 
@@ -183,5 +183,5 @@ def scale_views(protocol: Protocol, count: int) -> Int[np.ndarray, " K"]:
     These are every ``count // scale_views``-th view from the first on, at most ``scale_views``; all
     views if there are no more than that.
     """
-    wanted = min(count, protocol.scale_views or count)
-    return np.arange(wanted) * (count // max(wanted, 1))
+    view_count = min(count, protocol.scale_views or count)
+    return np.arange(view_count) * (count // max(view_count, 1))

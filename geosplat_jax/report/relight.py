@@ -50,9 +50,9 @@ def load_light(path: str | Path, *, largest: int = LARGEST_LIGHT) -> EnvLight:
         If the file cannot be read, is not twice as wide as high, or holds negative or infinite
         radiance.
     """
-    stored = read_stored(path)
+    stored_pixels = read_stored(path)
     # A light has no alpha: a fourth channel is ignored.
-    pixels = linear_values(np.ascontiguousarray(stored[..., :3]), Path(path))
+    pixels = linear_values(np.ascontiguousarray(stored_pixels[..., :3]), Path(path))
     if pixels.ndim != 3 or pixels.shape[-1] < 3 or pixels.shape[1] != 2 * pixels.shape[0]:
         raise SceneError(
             f"{path} has shape {pixels.shape}; an environment map is twice as wide as high and has "
@@ -77,9 +77,9 @@ def load_view_light(light: ViewLight, *, largest: int = LARGEST_LIGHT) -> EnvLig
         See `load_light`.
     """
     axes = np.asarray(to_y_up_map(jnp.eye(3)), np.float64).T
-    turn = light.camera_to_world[:3, :3] @ axes
-    read = load_light(light.path, largest=largest)
-    return rotate_light(read, jnp.asarray(turn, jnp.float32), subsamples=_SUBSAMPLES)
+    rotation = light.camera_to_world[:3, :3] @ axes
+    camera_light = load_light(light.path, largest=largest)
+    return rotate_light(camera_light, jnp.asarray(rotation, jnp.float32), subsamples=_SUBSAMPLES)
 
 
 def turned(light: EnvLight, angle: float) -> EnvLight:
@@ -95,8 +95,8 @@ def _behind(camera: Camera, light: EnvLight) -> np.ndarray:
     # Rows of d^T R are R^T d: from camera axes back to the world.
     rays = rays @ np.asarray(camera.world_to_camera[0, :3, :3], np.float64)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    found = _lookup(light.radiance, jnp.asarray(rays.reshape(-1, 3), jnp.float32))
-    return np.asarray(found).reshape(camera.height, camera.width, 3)
+    colors = _lookup(light.radiance, jnp.asarray(rays.reshape(-1, 3), jnp.float32))
+    return np.asarray(colors).reshape(camera.height, camera.width, 3)
 
 
 def picture(view: RenderedView, camera: Camera, light: EnvLight, background: str) -> np.ndarray:
@@ -110,10 +110,10 @@ def picture(view: RenderedView, camera: Camera, light: EnvLight, background: str
     if background not in BACKGROUNDS:
         raise ValueError(f"background must be one of {BACKGROUNDS}, got {background!r}")
     if background == "light":
-        behind = np.clip(_behind(camera, light), 0.0, 1.0)
+        backdrop = np.clip(_behind(camera, light), 0.0, 1.0)
     else:
-        behind = np.full(view.rgb.shape, float(background == "white"))
-    return to_picture(view.rgb + (1.0 - view.alpha[..., None]) * behind)
+        backdrop = np.full(view.rgb.shape, float(background == "white"))
+    return to_picture(view.rgb + (1.0 - view.alpha[..., None]) * backdrop)
 
 
 @dataclass(frozen=True)
@@ -193,24 +193,26 @@ def relight_views(
     images = images or Images(aovs=())
     images.check()
     relit = relit.with_aovs(*images.aovs)
-    written = []
+    paths = []
     for name, camera in counted(shots, "stills", on_progress):
         view = relit(camera)
-        written += images.write(folder, name, view)
-        written.append(folder / f"{name}.png")
-        write_png(written[-1], picture(view, camera, light, options.background))
-    first = _for_movies(shots[0].camera)
+        paths += images.write(folder, name, view)
+        paths.append(folder / f"{name}.png")
+        write_png(paths[-1], picture(view, camera, light, options.background))
+    first_camera = _for_movies(shots[0].camera)
     center = relit.center()
     if options.rotate_env:
-        relit.plan(first)  # the renderers of all frames then share the sizes of buffers
+        relit.plan(first_camera)  # the renderers of all frames then share the sizes of buffers
 
     def on_turntable(angle: float) -> np.ndarray:
-        camera = orbit(first, center, angle)
+        camera = orbit(first_camera, center, angle)
         return picture(relit(camera), camera, light, options.background)
 
     def under_turning_light(angle: float) -> np.ndarray:
-        at_angle = turned(light, angle)
-        return picture(relit.under(at_angle)(first), first, at_angle, options.background)
+        turned_light = turned(light, angle)
+        return picture(
+            relit.under(turned_light)(first_camera), first_camera, turned_light, options.background
+        )
 
     movies: list[tuple[str, int, Callable[[float], np.ndarray]]] = [
         ("turntable", options.turntable, on_turntable),
@@ -220,6 +222,6 @@ def relight_views(
         if count:
             angles = (2 * np.pi * np.arange(count) / count).tolist()
             frames = (frame(angle) for angle in counted(angles, f"{name} frames", on_progress))
-            written.append((folder / name).with_suffix(options.movie_suffix()))
-            write_movie(written[-1], frames, frames_per_second=options.frames_per_second)
-    return written
+            paths.append((folder / name).with_suffix(options.movie_suffix()))
+            write_movie(paths[-1], frames, frames_per_second=options.frames_per_second)
+    return paths

@@ -221,50 +221,50 @@ class Renderer:
             If ``indirect`` is not one of `RELIGHT_KINDS`.
         """
         transport = relight_transport(indirect).build(LightSpec())  # keeps no table of a light
-        other = Renderer(
+        relit_renderer = Renderer(
             replace(self._trained, transport=transport), self._params, samples=self.samples
         )
-        other._keeps_indirect = False
-        other._key = self._key
-        other._light = light
-        other._log_exposure = jnp.zeros(())
-        other._albedo_scale = np.asarray(albedo_scale, np.float32)
-        other._aov_names = self._aov_names
-        return other
+        relit_renderer._keeps_indirect = False
+        relit_renderer._key = self._key
+        relit_renderer._light = light
+        relit_renderer._log_exposure = jnp.zeros(())
+        relit_renderer._albedo_scale = np.asarray(albedo_scale, np.float32)
+        relit_renderer._aov_names = self._aov_names
+        return relit_renderer
 
     def under(self, light: EnvLight) -> "Renderer":
         """Return a renderer that differs in the light alone; the surface is not built again."""
-        other = self._copy()
-        other._light = light
-        other._illuminations = []
-        return other
+        renderer = self._copy()
+        renderer._light = light
+        renderer._illuminations = []
+        return renderer
 
     def with_samples(self, samples: int) -> "Renderer":
         """Return a renderer of the same surface with another number of rays per splat."""
         self.asset()
-        other = self._copy()
-        other._passes, other._pass_samples = _passes_of(samples)
-        other._pipeline = other._for_images(other._pipeline)
-        other._illuminations = []
-        return other
+        renderer = self._copy()
+        renderer._passes, renderer._pass_samples = _passes_of(samples)
+        renderer._pipeline = renderer._for_images(renderer._pipeline)
+        renderer._illuminations = []
+        return renderer
 
     def with_aovs(self, *names: str) -> "Renderer":
         """Return a renderer whose views have these AOVs too, some of `render.AOV_CHANNELS`."""
-        other = self._copy()
-        other._aov_names = tuple(dict.fromkeys((*self._aov_names, *names)))
-        return other
+        renderer = self._copy()
+        renderer._aov_names = tuple(dict.fromkeys((*self._aov_names, *names)))
+        return renderer
 
     def hurried(self) -> "Renderer":
         """Return a renderer of a single pass: noisier, with the same compiled programs."""
-        other = self._copy()
-        other._passes, other._illuminations = 1, []
-        return other
+        renderer = self._copy()
+        renderer._passes, renderer._illuminations = 1, []
+        return renderer
 
     def _copy(self) -> "Renderer":
         """Return a copy of this renderer, with its own set of planned image sizes."""
-        other = copy.copy(self)
-        other._planned = set(self._planned)
-        return other
+        renderer = copy.copy(self)
+        renderer._planned = set(self._planned)
+        return renderer
 
     def center(self) -> np.ndarray:
         """Centre of the box around the object in the world, (3,) float64."""
@@ -302,16 +302,16 @@ class Renderer:
         if self._illuminations:
             return self._illuminations
         passes = self._passes if self._pipeline.transport.needs_key else 1
-        total, first = None, []
-        for number in range(passes):
-            key = jax.random.fold_in(self._key, number)
-            prepared, _ = _illuminate(self._pipeline, self.asset(), self._light, key=key)
-            parts = prepared.averaged_parts()
+        total, illuminations = None, []
+        for pass_index in range(passes):
+            key = jax.random.fold_in(self._key, pass_index)
+            illumination, _ = _illuminate(self._pipeline, self.asset(), self._light, key=key)
+            parts = illumination.averaged_parts()
             total = parts if total is None else jax.tree.map(jnp.add, total, parts)
-            if number < _SPECULAR_PASSES:
-                first.append(prepared)
+            if pass_index < _SPECULAR_PASSES:
+                illuminations.append(illumination)
         mean = jax.tree.map(lambda x: x * (1.0 / passes), total)
-        self._illuminations = [prepared.with_parts(mean) for prepared in first]
+        self._illuminations = [illumination.with_parts(mean) for illumination in illuminations]
         return self._illuminations
 
     def plan(self, camera: Camera) -> None:
@@ -333,10 +333,10 @@ class Renderer:
         self._pipeline = replace(self._pipeline, capacities=capacities)
         self._planned.add(size)
 
-    def _render(self, camera: Camera, illumination: Illumination, number: int) -> RenderOutput:
+    def _render(self, camera: Camera, illumination: Illumination, pass_index: int) -> RenderOutput:
         """Render one pass of a view, growing buffers as needed."""
         self.plan(camera)
-        key = jax.random.fold_in(self._key, self._passes + number)
+        key = jax.random.fold_in(self._key, self._passes + pass_index)
 
         def attempt(capacities: Capacities) -> tuple[RenderOutput, Usage]:
             pipeline = replace(self._pipeline, capacities=capacities)
@@ -355,16 +355,16 @@ class Renderer:
         """Render the single view of ``camera``, with every AOV of the evaluation."""
         illuminations = self._illuminated()
         outputs = [self._render(camera, illuminations[0], 0)]
-        for number in range(1, self._passes_needed(outputs[0])):
-            illumination = illuminations[number % len(illuminations)]
-            outputs.append(self._render(camera, illumination, number))
+        for pass_index in range(1, self._passes_needed(outputs[0])):
+            illumination = illuminations[pass_index % len(illuminations)]
+            outputs.append(self._render(camera, illumination, pass_index))
         linear = jnp.mean(jnp.stack([output.rgb[0] for output in outputs]), axis=0)
-        first = outputs[0]
+        first_output = outputs[0]
         return RenderedView(
             np.asarray(tone_map(linear, self._log_exposure)),
-            np.asarray(first.alpha[0]),
+            np.asarray(first_output.alpha[0]),
             np.asarray(expose(linear, self._log_exposure)),
-            {name: np.asarray(image[0]) for name, image in first.aovs.items()},
+            {name: np.asarray(image[0]) for name, image in first_output.aovs.items()},
         )
 
     def _passes_needed(self, output: RenderOutput) -> int:
@@ -374,10 +374,10 @@ class Renderer:
         """
         if not self._pipeline.domain.shades_splats:
             return self._passes * _PIXEL_PASSES if self._pipeline.transport.needs_key else 1
-        covered, drawn = float(jnp.sum(output.alpha)), int(output.usage["visible"])
-        wanted = _SPECULAR_SAMPLES_PER_PIXEL * covered
-        needed = math.ceil(wanted / max(drawn * self._pass_samples, 1))
-        return min(needed, len(self._illuminations))
+        covered_pixels, splat_count = float(jnp.sum(output.alpha)), int(output.usage["visible"])
+        sample_count = _SPECULAR_SAMPLES_PER_PIXEL * covered_pixels
+        pass_count = math.ceil(sample_count / max(splat_count * self._pass_samples, 1))
+        return min(pass_count, len(self._illuminations))
 
     @property
     def is_two_sided(self) -> bool:

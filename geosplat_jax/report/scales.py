@@ -47,8 +47,8 @@ class Scale:
     def picture(self, values: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W 3"]:
         """Return the colours of numbers, sRGB float32."""
         share = np.clip((values - self.low) / (self.high - self.low), 0.0, 1.0)
-        places = np.linspace(0.0, 1.0, len(self.colors))
-        channels = [np.interp(share, places, channel) for channel in np.transpose(self.colors)]
+        stops = np.linspace(0.0, 1.0, len(self.colors))
+        channels = [np.interp(share, stops, channel) for channel in np.transpose(self.colors)]
         return np.stack(channels, axis=-1).astype(np.float32)
 
     def bar(self, height: int, width: int) -> Float[np.ndarray, "H W 3"]:
@@ -64,7 +64,10 @@ class Scale:
 
     def described(self) -> dict[str, object]:
         """Return name, texts of the ends and hexadecimal colours, for JSON and a style sheet."""
-        hexes = ["#" + "".join(f"{round(255 * c):02x}" for c in color) for color in self.colors]
+        hexes = [
+            "#" + "".join(f"{round(255 * channel):02x}" for channel in color)
+            for color in self.colors
+        ]
         return {"name": self.name, "ends": self.ends, "colors": hexes}
 
 

@@ -77,11 +77,11 @@ class Shown:
                 self.relit, row_labels=names, scales=[ERROR], notes=self.relit_figures
             )
             write_png(folder / "relight.png", sheet)
-        relit = self.relit or [{}] * len(overview)
+        relit_rows = self.relit or [{}] * len(overview)
         rows = {
-            self.views.names[index]: {**first, **second, **third}
-            for index, first, second, third in zip(
-                self.rendered, overview, materials, relit, strict=True
+            self.views.names[index]: {**overview_row, **material_row, **relit_row}
+            for index, overview_row, material_row, relit_row in zip(
+                self.rendered, overview, materials, relit_rows, strict=True
             )
         }
         return write_gallery(folder, rows, lights=self.lights)
@@ -108,8 +108,8 @@ class Shown:
                 "metallic": _grey(view.aovs["metallic"]),
             }
             camera = self.views.camera(np.array([index]))
-            drawn = render_mesh_normals(*self.mesh, camera, is_two_sided=self.is_two_sided)
-            row["mesh"] = shade_mesh_preview(*drawn)
+            mesh_normals = render_mesh_normals(*self.mesh, camera, is_two_sided=self.is_two_sided)
+            row["mesh"] = shade_mesh_preview(*mesh_normals)
             if self.seen is not None:
                 row["seen by"] = self.seen.picture(camera)
             rows.append(row)
@@ -123,16 +123,16 @@ class Shown:
             for name in ("albedo", "roughness", "metallic", "normal"):
                 if name not in self.views.truth:
                     continue
-                true, found = self.views.truth[name][index], view.aovs[name]
+                true, predicted = self.views.truth[name][index], view.aovs[name]
                 if name == "albedo":
                     row["true albedo"] = to_picture(true * mask)
-                    row["albedo, aligned"] = to_picture(found * self.albedo_scale)
+                    row["albedo, aligned"] = to_picture(predicted * self.albedo_scale)
                     continue
                 if name == "normal":
                     row["true normal"] = normals_to_rgb(true, mask[..., 0])
-                    row["normal"] = normals_to_rgb(found, view.alpha)
+                    row["normal"] = normals_to_rgb(predicted, view.alpha)
                 else:
-                    row[f"true {name}"], row[name] = _grey(true * mask), _grey(found)
+                    row[f"true {name}"], row[name] = _grey(true * mask), _grey(predicted)
             rows.append(row)
         return rows
 
@@ -141,7 +141,7 @@ class Shown:
         scales = [ERROR, ROUGHNESS, METALLIC]
         if self.seen is not None:
             scales.append(SEEN)
-        notes = ["albedo: as reconstructed", "lights: each exposed for itself"]
+        notes = ["albedo: as reconstructed", "lights: each with its own exposure"]
         return overview_sheet(
             rows, row_labels=self._labels, lights=self.lights, scales=scales, notes=notes
         )
@@ -153,8 +153,8 @@ class Shown:
             factors = zip("RGB", self.albedo_scale, strict=True)
             text = ", ".join(f"{channel} x {factor:.3f}" for channel, factor in factors)
             notes = [f"albedo, aligned: as reconstructed, times {text} (linear)"]
-        known = [scale for scale in (ROUGHNESS, METALLIC) if scale.name in rows[0]]
-        return overview_sheet(rows, row_labels=self._labels, scales=known, notes=notes)
+        material_scales = [scale for scale in (ROUGHNESS, METALLIC) if scale.name in rows[0]]
+        return overview_sheet(rows, row_labels=self._labels, scales=material_scales, notes=notes)
 
 
 def preview_image(trained: Trained, views: Views) -> np.ndarray:

@@ -58,7 +58,7 @@ def _stems(names: Sequence[str]) -> list[str]:
 
 def _files(stem: str) -> set[str]:
     """Return the stems of all files of a view, in small letters."""
-    return {f"{stem}{ending}".casefold() for ending in ("", "_rgba", *(f"_{a}" for a in AOVS))}
+    return {f"{stem}{ending}".casefold() for ending in ("", "_rgba", *(f"_{aov}" for aov in AOVS))}
 
 
 def shots_of(views: Views) -> list[Shot]:
@@ -78,19 +78,19 @@ def read_shots(path: Path, like: Camera) -> list[Shot]:
     SceneError
         If the file cannot be read, a pose or lens is unusable, or a lens has distortion.
     """
-    listed = read_transforms(path)
+    entries = read_transforms(path)
     shots = []
-    for (name, pose, lens), stem in zip(listed, _stems([n for n, *_ in listed]), strict=True):
+    for (name, pose, lens), stem in zip(entries, _stems([n for n, *_ in entries]), strict=True):
         if lens.distortion is not None:
             raise SceneError(f"{path} bends the lens of {name}; images are made without distortion")
         width, height = lens.size or (like.width, like.height)
-        one = Views(
+        view = Views(
             (name,),
             np.asarray(pose, np.float64)[None],
             lens.intrinsics(width, height)[None],
             np.zeros((1, height, width, 4), np.float32),
         )
-        shots.append(Shot(stem, one.camera()))
+        shots.append(Shot(stem, view.camera()))
     return shots
 
 
@@ -102,10 +102,10 @@ def about_z(angle: float) -> np.ndarray:
 
 def orbit(camera: Camera, center: np.ndarray, angle: float) -> Camera:
     """Rotate a single camera about the vertical axis through ``center`` (3,), by radians."""
-    turned = np.eye(4)
-    turned[:3, :3] = about_z(angle)
-    turned[:3, 3] = center - turned[:3, :3] @ center
-    pose = np.asarray(camera.world_to_camera[0], np.float64) @ np.linalg.inv(turned)
+    transform = np.eye(4)
+    transform[:3, :3] = about_z(angle)
+    transform[:3, 3] = center - transform[:3, :3] @ center
+    pose = np.asarray(camera.world_to_camera[0], np.float64) @ np.linalg.inv(transform)
     return replace(camera, world_to_camera=jnp.asarray(pose[None], jnp.float32))
 
 
@@ -122,8 +122,8 @@ def require_frames(what: str, count: int) -> None:
 
 def with_field_of_view(camera: Camera, degrees: float) -> Camera:
     """Change the horizontal field of view; pixel aspect and principal point stay the same."""
-    wanted = 0.5 * camera.width / math.tan(0.5 * math.radians(degrees))
-    factor = wanted / float(camera.intrinsics[0, 0, 0])
+    focal_length = 0.5 * camera.width / math.tan(0.5 * math.radians(degrees))
+    factor = focal_length / float(camera.intrinsics[0, 0, 0])
     scale = np.array([[factor, factor, 1.0], [factor, factor, 1.0], [1.0, 1.0, 1.0]])
     scale[:2, 2] = 1.0
     return replace(camera, intrinsics=camera.intrinsics * jnp.asarray(scale[None], jnp.float32))
@@ -187,17 +187,17 @@ class Cameras:
         else:
             views = getattr(dataset, self.views)
             if not len(views):
-                other = " --views train for the training views," if self.views == "test" else ""
+                hint = " --views train for the training views," if self.views == "test" else ""
                 raise RunError(
-                    f"{dataset.root} has no {self.views} views; use{other} --cameras FILE, or "
+                    f"{dataset.root} has no {self.views} views; use{hint} --cameras FILE, or "
                     "either of them with --turntable N"
                 )
             shots = shots_of(views)
         if self.turntable:
             angles = 2 * np.pi * np.arange(self.turntable) / self.turntable
-            first = shots[0].camera
+            first_camera = shots[0].camera
             shots = [
-                Shot(f"turntable_{number:04d}", orbit(first, center, float(angle)))
+                Shot(f"turntable_{number:04d}", orbit(first_camera, center, float(angle)))
                 for number, angle in enumerate(angles)
             ]
         return [Shot(name, self._framed(camera)) for name, camera in shots]
@@ -241,28 +241,28 @@ class Images:
         AOVs hold straight values, zero where alpha is zero. Normals are in world axes. Depth, along
         the camera's axis in world units, is written as EXR only.
         """
-        written = [folder / f"{name}_rgba.png"]
-        write_png(written[0], straight_rgba(view))
+        paths = [folder / f"{name}_rgba.png"]
+        write_png(paths[0], straight_rgba(view))
         if self.exr:
-            written.append(folder / f"{name}_rgba.exr")
+            paths.append(folder / f"{name}_rgba.exr")
             colors = straight(view.linear, view.alpha)
-            write_exr(written[-1], np.concatenate([colors, view.alpha[..., None]], axis=-1))
+            write_exr(paths[-1], np.concatenate([colors, view.alpha[..., None]], axis=-1))
         for aov in self.aovs:
             values = straight(view.aovs[aov], view.alpha)
             if aov != "depth":
-                written.append(folder / f"{name}_{aov}.png")
-                write_png(written[-1], _picture(aov, values, view))
+                paths.append(folder / f"{name}_{aov}.png")
+                write_png(paths[-1], _picture(aov, values, view))
             if self.exr or aov == "depth":
-                written.append(folder / f"{name}_{aov}.exr")
-                write_exr(written[-1], values)
-        return written
+                paths.append(folder / f"{name}_{aov}.exr")
+                write_exr(paths[-1], values)
+        return paths
 
 
 def _picture(aov: str, values: np.ndarray, view: RenderedView) -> np.ndarray:
     """Make a picture of an AOV, with straight alpha."""
     if aov == "normal":
         length = np.linalg.norm(values, axis=-1, keepdims=True)
-        shown = 0.5 + 0.5 * values / np.maximum(length, 1e-6)
+        colors = 0.5 + 0.5 * values / np.maximum(length, 1e-6)
     else:
-        shown = to_picture(values) if aov == "albedo" else np.clip(values, 0.0, 1.0)
-    return np.concatenate([shown, np.clip(view.alpha, 0.0, 1.0)[..., None]], axis=-1)
+        colors = to_picture(values) if aov == "albedo" else np.clip(values, 0.0, 1.0)
+    return np.concatenate([colors, np.clip(view.alpha, 0.0, 1.0)[..., None]], axis=-1)

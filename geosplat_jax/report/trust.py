@@ -50,8 +50,10 @@ class Sightings:
         """Area that belongs to each vertex: a third of its faces."""
         a, b, c = np.moveaxis(np.asarray(self.vertices, np.float64)[self.faces], 1, 0)
         area = np.sqrt((np.cross(b - a, c - a) ** 2).sum(-1)) / 6.0
-        sums = np.bincount(self.faces.ravel(), np.repeat(area, 3), minlength=len(self.vertices))
-        return sums.astype(np.float64)
+        vertex_areas = np.bincount(
+            self.faces.ravel(), np.repeat(area, 3), minlength=len(self.vertices)
+        )
+        return vertex_areas.astype(np.float64)
 
     def shares(self) -> list[dict[str, float | str]]:
         """Return the shares of the area seen by no view, 1 or 2, 3 to 7, and 8 or more views.
@@ -81,8 +83,8 @@ class Sightings:
         face_rows, weights = first_hits(self.vertices, self.faces, camera)
         is_hit = face_rows >= 0
         image = np.zeros(face_rows.shape)
-        part = weights[is_hit] / weights[is_hit].sum(axis=-1, keepdims=True)
-        image[is_hit] = (part * self.counts[self.faces[face_rows[is_hit]]]).sum(axis=-1)
+        barycentrics = weights[is_hit] / weights[is_hit].sum(axis=-1, keepdims=True)
+        image[is_hit] = (barycentrics * self.counts[self.faces[face_rows[is_hit]]]).sum(axis=-1)
         colors = SEEN.picture(image)
         return np.where(is_hit[..., None], colors, np.float32(1.0))
 
@@ -98,23 +100,23 @@ def _sees(
     """Which vertices a single view sees, (V,) bool."""
     _, weights = first_hits(vertices, faces, camera)
     inverse_depth = weights.sum(axis=-1)
-    hit = inverse_depth > 0
-    depth = np.where(hit, 1.0 / np.where(hit, inverse_depth, 1.0), np.inf)
+    is_hit = inverse_depth > 0
+    depth = np.where(is_hit, 1.0 / np.where(is_hit, inverse_depth, 1.0), np.inf)
     # The largest depth in 3 x 3 pixels: on steep parts of a surface, depth varies within a pixel.
     depth = ndimage.maximum_filter(depth, size=3)
     pose = np.asarray(camera.world_to_camera[0], np.float64)
     pixels, points = project(vertices, pose, np.asarray(camera.intrinsics[0], np.float64))
-    inside = in_image(pixels, height=camera.height, width=camera.width)
-    column, row = np.where(inside[:, None], pixels, 0).astype(np.int64).T
+    is_inside = in_image(pixels, height=camera.height, width=camera.width)
+    column, row = np.where(is_inside[:, None], pixels, 0).astype(np.int64).T
     extent = float(np.max(np.ptp(vertices, axis=0)))
     faces_camera = is_two_sided | (np.einsum("nd,nd->n", normals @ pose[:3, :3].T, points) < 0)
     is_nearest = points[:, 2] <= depth[row, column] + _SLACK * extent
-    seen = inside & faces_camera & is_nearest
+    is_seen = is_inside & faces_camera & is_nearest
     if valid is not None:
         rows = row * valid.shape[0] // camera.height
         columns = column * valid.shape[1] // camera.width
-        seen &= valid[rows, columns] > 0
-    return seen
+        is_seen &= valid[rows, columns] > 0
+    return is_seen
 
 
 def sightings(
@@ -137,12 +139,14 @@ def sightings(
     """
     vertices, normals = np.asarray(vertices, np.float64), np.asarray(normals, np.float64)
     count = min(len(views), LARGEST_COUNT)
-    chosen = np.unique(np.linspace(0, len(views) - 1, count).round().astype(int)) if count else []
+    view_indices = (
+        np.unique(np.linspace(0, len(views) - 1, count).round().astype(int)) if count else []
+    )
     counts = np.zeros(len(vertices), np.int64)
-    for number in chosen if len(faces) else ():
-        camera = views.camera(np.array([number]))
+    for view_index in view_indices if len(faces) else ():
+        camera = views.camera(np.array([view_index]))
         if max(camera.height, camera.width) > _SIZE:
             camera = resized(camera, _SIZE)
-        valid = None if views.valid is None else views.valid[number]
+        valid = None if views.valid is None else views.valid[view_index]
         counts += _sees(vertices, faces, normals, camera, valid, is_two_sided)
-    return Sightings(vertices, faces, counts, len(chosen), len(views))
+    return Sightings(vertices, faces, counts, len(view_indices), len(views))

@@ -93,13 +93,13 @@ def _place_in_run(labels: Int[Array, " K"], *, reverse: bool = False) -> Int[Arr
 
 
 def _transmittance_before(
-    passing: Float[Array, "K P"], place: Int[Array, " K"]
+    transmittance: Float[Array, "K P"], place: Int[Array, " K"]
 ) -> Float[Array, "K P"]:
-    """Product of ``passing`` over the earlier chunks of each chunk's tile.
+    """Product of ``transmittance`` over the earlier chunks of each chunk's tile.
 
     Doubling (Hillis and Steele 1986): as many steps as the longest list has binary digits.
     """
-    chunk = jnp.arange(passing.shape[0], dtype=jnp.int32)
+    chunk = jnp.arange(transmittance.shape[0], dtype=jnp.int32)
 
     def shifted(x, step):
         return jnp.where((place >= step)[:, None], x[jnp.maximum(chunk - step, 0)], 1.0)
@@ -110,28 +110,28 @@ def _transmittance_before(
 
     longest = jnp.max(place)
     _, inclusive = jax.lax.while_loop(
-        lambda state: state[0] <= longest, double, (jnp.ones((), jnp.int32), passing)
+        lambda state: state[0] <= longest, double, (jnp.ones((), jnp.int32), transmittance)
     )
     return shifted(inclusive, 1)
 
 
 def _seen_behind(
-    seen: Float[Array, "K P"], passing: Float[Array, "K P"], place: Int[Array, " K"]
+    color: Float[Array, "K P"], transmittance: Float[Array, "K P"], place: Int[Array, " K"]
 ) -> Float[Array, "K P"]:
-    """Compose the maps ``x -> seen + passing x`` of all later chunks of the tile, at zero."""
-    chunk_count = passing.shape[0]
+    """Compose the maps ``x -> color + transmittance x`` of all later chunks of a tile, at zero."""
+    chunk_count = transmittance.shape[0]
     chunk = jnp.arange(chunk_count, dtype=jnp.int32)
 
     def double(state):
         step, offset, factor = state
         source = jnp.minimum(chunk + step, chunk_count - 1)
-        has = (place >= step)[:, None]
-        offset = offset + factor * jnp.where(has, offset[source], 0.0)
-        return 2 * step, offset, factor * jnp.where(has, factor[source], 1.0)
+        has_source = (place >= step)[:, None]
+        offset = offset + factor * jnp.where(has_source, offset[source], 0.0)
+        return 2 * step, offset, factor * jnp.where(has_source, factor[source], 1.0)
 
     longest = jnp.max(place)
     _, inclusive, _ = jax.lax.while_loop(
-        lambda state: state[0] <= longest, double, (jnp.ones((), jnp.int32), seen, passing)
+        lambda state: state[0] <= longest, double, (jnp.ones((), jnp.int32), color, transmittance)
     )
     return jnp.where((place >= 1)[:, None], inclusive[jnp.minimum(chunk + 1, chunk_count - 1)], 0.0)
 
@@ -157,22 +157,24 @@ def _composite_forward(tile_size, grid, table, chunk_ranks, chunk_tiles):
     channels = table.shape[1] - GEOMETRY_COLUMNS
 
     def front_to_back(state, ranks):
-        passing, seen = state
+        transmittance, color = state
         rows = _slot_rows(padded, ranks, centers)
         alpha = _alpha(rows, tile_size)
-        seen = seen + (alpha * passing)[:, None] * rows[:, GEOMETRY_COLUMNS:, None]
-        return (passing * (1.0 - alpha), seen), None
+        color = color + (alpha * transmittance)[:, None] * rows[:, GEOMETRY_COLUMNS:, None]
+        return (transmittance * (1.0 - alpha), color), None
 
-    clear = jnp.ones(shape, table.dtype)
-    nothing = jnp.zeros((shape[0], channels, shape[1]), table.dtype)
-    (passing, seen), _ = jax.lax.scan(front_to_back, (clear, nothing), chunk_ranks, unroll=True)
-    before = _transmittance_before(passing, _place_in_run(chunk_tiles))
+    initial_transmittance = jnp.ones(shape, table.dtype)
+    initial_color = jnp.zeros((shape[0], channels, shape[1]), table.dtype)
+    (transmittance, color), _ = jax.lax.scan(
+        front_to_back, (initial_transmittance, initial_color), chunk_ranks, unroll=True
+    )
+    transmittance_before = _transmittance_before(transmittance, _place_in_run(chunk_tiles))
     # Coverage comes from the last chunk of a tile alone: a sum over chunks may round to above 1.
     is_last = jnp.concatenate([chunk_tiles[1:] != chunk_tiles[:-1], jnp.ones((1,), bool)])
-    coverage = jnp.where(is_last[:, None], 1.0 - before * passing, 0.0)
-    seen = jnp.concatenate([seen * before[:, None], coverage[:, None]], axis=1)
-    tiles = jax.ops.segment_sum(seen, chunk_tiles, grid[0] * grid[1], indices_are_sorted=True)
-    return tiles, (table, chunk_ranks, chunk_tiles, before)
+    coverage = jnp.where(is_last[:, None], 1.0 - transmittance_before * transmittance, 0.0)
+    color = jnp.concatenate([color * transmittance_before[:, None], coverage[:, None]], axis=1)
+    tiles = jax.ops.segment_sum(color, chunk_tiles, grid[0] * grid[1], indices_are_sorted=True)
+    return tiles, (table, chunk_ranks, chunk_tiles, transmittance_before)
 
 
 def composite_tiles_forward(
@@ -206,44 +208,47 @@ composite_tiles = jax.custom_vjp(composite_tiles_forward, nondiff_argnums=(0, 1)
 
 
 def _composite_backward(tile_size, grid, residuals, cotangent):
-    table, chunk_ranks, chunk_tiles, before = residuals
+    table, chunk_ranks, chunk_tiles, transmittance_before = residuals
     padded = _with_padding_row(table)
     centers = _tile_centers(chunk_tiles, grid[1], tile_size, table.dtype)
-    arriving = cotangent.at[chunk_tiles].get(mode="fill", fill_value=0.0)
-    weighted = before[:, None] * arriving[:, :-1]
+    chunk_cotangent = cotangent.at[chunk_tiles].get(mode="fill", fill_value=0.0)
+    weighted = transmittance_before[:, None] * chunk_cotangent[:, :-1]
 
     def gain_of(rows):
-        gain = arriving[:, -1]
-        for c in range(arriving.shape[1] - 1):
-            gain = gain + rows[:, GEOMETRY_COLUMNS + c, None] * arriving[:, c]
+        gain = chunk_cotangent[:, -1]
+        for c in range(chunk_cotangent.shape[1] - 1):
+            gain = gain + rows[:, GEOMETRY_COLUMNS + c, None] * chunk_cotangent[:, c]
         return gain
 
     def front_to_back(state, ranks):
-        passing, seen = state
+        transmittance, chunk_gain = state
         rows = _slot_rows(padded, ranks, centers)
         alpha = _alpha(rows, tile_size)
-        return (passing * (1.0 - alpha), seen + alpha * passing * gain_of(rows)), None
+        return (
+            transmittance * (1.0 - alpha),
+            chunk_gain + alpha * transmittance * gain_of(rows),
+        ), None
 
-    state = (jnp.ones_like(before), jnp.zeros_like(before))
-    (passing, seen), _ = jax.lax.scan(front_to_back, state, chunk_ranks, unroll=True)
-    behind = _seen_behind(seen, passing, _place_in_run(chunk_tiles, reverse=True))
+    state = (jnp.ones_like(transmittance_before), jnp.zeros_like(transmittance_before))
+    (transmittance, chunk_gain), _ = jax.lax.scan(front_to_back, state, chunk_ranks, unroll=True)
+    gain_behind = _seen_behind(chunk_gain, transmittance, _place_in_run(chunk_tiles, reverse=True))
 
     def back_to_front(state, ranks):
-        passing, behind, d_table = state
+        transmittance, gain_behind, d_table = state
         rows = _slot_rows(padded, ranks, centers)
         alpha = _alpha(rows, tile_size)
         # Undo the step of `front_to_back`, up to rounding: `CHUNK_SIZE` factors never underflow.
-        passing = jax.lax.optimization_barrier(passing / (1.0 - alpha))
-        weight, contrast = alpha * passing, gain_of(rows) - behind
-        d_log_alpha = jnp.where(alpha < MAX_ALPHA, before * weight * contrast, 0.0)
+        transmittance = jax.lax.optimization_barrier(transmittance / (1.0 - alpha))
+        weight, contrast = alpha * transmittance, gain_of(rows) - gain_behind
+        d_log_alpha = jnp.where(alpha < MAX_ALPHA, transmittance_before * weight * contrast, 0.0)
         d_geometry = _geometry_vjp(rows, _moments(d_log_alpha, tile_size))
         d_features = jnp.einsum("kcp,kp->kc", weighted, weight, precision="highest")
         d_rows = jnp.concatenate([jnp.stack(d_geometry, axis=-1), d_features], axis=-1)
         d_table = d_table.at[ranks].add(d_rows, mode="drop")
-        behind = jax.lax.optimization_barrier(behind + alpha * contrast)
-        return (passing, behind, d_table), None
+        gain_behind = jax.lax.optimization_barrier(gain_behind + alpha * contrast)
+        return (transmittance, gain_behind, d_table), None
 
-    state = (passing, behind, jnp.zeros_like(table))
+    state = (transmittance, gain_behind, jnp.zeros_like(table))
     (_, _, d_table), _ = jax.lax.scan(back_to_front, state, chunk_ranks, reverse=True, unroll=True)
     return d_table, None, None
 

@@ -75,9 +75,11 @@ def _unit_columns(quats: Float[Array, "N 4"]) -> Columns:
 def _rotate_back(unit: Columns, vector: Columns) -> Columns:
     """Apply the transposed rotation of unit quaternions: ``v - 2 w (q x v) + 2 q x (q x v)``."""
     w, axis = unit[0], unit[1:]
-    once = _cross(axis, vector)
-    twice = _cross(axis, once)
-    return [v + 2.0 * (b - w * a) for v, a, b in zip(vector, once, twice, strict=True)]
+    first_cross = _cross(axis, vector)
+    second_cross = _cross(axis, first_cross)
+    return [
+        v + 2.0 * (b - w * a) for v, a, b in zip(vector, first_cross, second_cross, strict=True)
+    ]
 
 
 def project(
@@ -111,8 +113,8 @@ def project(
     fx, fy, cx, cy = (intrinsics[i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     rotation = world_to_camera[:3, :3]
     # By default GPUs multiply matrices with a mantissa of 10 bits (TF32): an error of a pixel.
-    turned = jnp.matmul(means, rotation.T, precision="highest")
-    camera_means = turned + world_to_camera[None, :3, 3]
+    rotated_means = jnp.matmul(means, rotation.T, precision="highest")
+    camera_means = rotated_means + world_to_camera[None, :3, 3]
     depths = camera_means[:, 2]
     is_in_front = depths > near
     inverse_depth = 1.0 / jnp.where(is_in_front, depths, 1.0)

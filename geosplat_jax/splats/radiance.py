@@ -72,8 +72,8 @@ def colors_seen_from(
     center : (3,) the point, world.
     degree : highest degree of the harmonics that are used; may be traced.
     """
-    towards = safe_normalize(splats.means - center[None, :])
-    basis = harmonics(towards, degree=HIGHEST_DEGREE)
+    directions = safe_normalize(splats.means - center[None, :])
+    basis = harmonics(directions, degree=HIGHEST_DEGREE)
     is_used = jnp.asarray(harmonic_degrees(HIGHEST_DEGREE)) <= degree
     basis = jnp.where(is_used[None, :], basis, 0.0)
     coefficients = jnp.concatenate([splats.base[:, None, :], splats.rest], axis=1)

@@ -114,11 +114,13 @@ def _reference_composite(
     xx, xy, yy = (splats.conics[:, None, i] for i in range(3))
     dx, dy = offset[..., 0], offset[..., 1]
     sigma = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
-    raw = (opacities * splats.compensation)[:, None] * jnp.exp(-sigma)
-    alpha = jnp.where(raw >= MIN_ALPHA, jnp.minimum(raw, MAX_ALPHA), 0.0)
-    after = jnp.cumprod(1.0 - alpha, axis=0)
-    before = jnp.concatenate([jnp.ones_like(after[:1]), after[:-1]])
-    image = jnp.einsum("mp,mc->pc", alpha * before, features, precision="highest")
+    raw_alpha = (opacities * splats.compensation)[:, None] * jnp.exp(-sigma)
+    alpha = jnp.where(raw_alpha >= MIN_ALPHA, jnp.minimum(raw_alpha, MAX_ALPHA), 0.0)
+    transmittance_after = jnp.cumprod(1.0 - alpha, axis=0)
+    transmittance_before = jnp.concatenate(
+        [jnp.ones_like(transmittance_after[:1]), transmittance_after[:-1]]
+    )
+    image = jnp.einsum("mp,mc->pc", alpha * transmittance_before, features, precision="highest")
     coverage = 1.0 - jnp.prod(1.0 - alpha, axis=0)
     return image.reshape(height, width, -1), coverage.reshape(height, width)
 

@@ -65,11 +65,11 @@ def shared_scale_factor(
     -------
     (N,) positive.
     """
-    place = jnp.asarray(0.5 * _FARTHEST * (_NODES + 1.0), opacities.dtype)
+    nodes = jnp.asarray(0.5 * _FARTHEST * (_NODES + 1.0), opacities.dtype)
     weights = jnp.asarray(0.5 * _FARTHEST * _WEIGHTS * 2.0 / np.sqrt(np.pi), opacities.dtype)
-    alpha = shared[:, None] * jnp.exp(-place * place)[None, :]
-    covered = -jnp.expm1(sharers[:, None] * jnp.log1p(-alpha))
-    return opacities / jnp.sum(covered * weights[None, :], axis=1)
+    alpha = shared[:, None] * jnp.exp(-nodes * nodes)[None, :]
+    coverage = -jnp.expm1(sharers[:, None] * jnp.log1p(-alpha))
+    return opacities / jnp.sum(coverage * weights[None, :], axis=1)
 
 
 def _drawn_rows(
@@ -77,11 +77,11 @@ def _drawn_rows(
 ) -> Int[Array, " count"]:
     """Draw rows with a probability in proportion to their weights; never one without weight."""
     # In float32 the sums of a parallel scan may decrease, and may grow at rows without weight.
-    through = jax.lax.cummax(jnp.where(weights > 0.0, jnp.cumsum(weights), 0.0))
-    last = jnp.max(jnp.where(weights > 0.0, jnp.arange(weights.shape[0]), 0)).astype(jnp.int32)
-    place = jax.random.uniform(key, (count,), weights.dtype) * through[-1]
-    found = jnp.searchsorted(through, place, side="right").astype(jnp.int32)
-    return jnp.minimum(found, last)
+    running_sum = jax.lax.cummax(jnp.where(weights > 0.0, jnp.cumsum(weights), 0.0))
+    last_row = jnp.max(jnp.where(weights > 0.0, jnp.arange(weights.shape[0]), 0)).astype(jnp.int32)
+    draws = jax.random.uniform(key, (count,), weights.dtype) * running_sum[-1]
+    rows = jnp.searchsorted(running_sum, draws, side="right").astype(jnp.int32)
+    return jnp.minimum(rows, last_row)
 
 
 def relocate(
@@ -111,24 +111,26 @@ def relocate(
         no longer valid.
     """
     opacities = splats.opacities
-    may_be_drawn = is_live & ~is_free & (opacities > DEAD_OPACITY)
-    weights = jnp.where(may_be_drawn, opacities, 0.0)
-    drawn = _drawn_rows(weights, key, splats.capacity)
-    is_free = is_free & jnp.any(may_be_drawn)
-    copies = jnp.zeros_like(opacities).at[drawn].add(is_free.astype(opacities.dtype))
+    is_candidate = is_live & ~is_free & (opacities > DEAD_OPACITY)
+    weights = jnp.where(is_candidate, opacities, 0.0)
+    target_rows = _drawn_rows(weights, key, splats.capacity)
+    is_free = is_free & jnp.any(is_candidate)
+    copies = jnp.zeros_like(opacities).at[target_rows].add(is_free.astype(opacities.dtype))
     sharers = 1.0 + copies
-    old = jnp.clip(opacities, DEAD_OPACITY, _HIGHEST_OPACITY)
-    shared = shared_opacity(old, sharers)
-    factor = shared_scale_factor(old, shared, sharers)
-    shared = jnp.clip(shared, DEAD_OPACITY, _HIGHEST_OPACITY)
-    is_drawn = copies > 0.0
-    logits = jnp.where(is_drawn, safe_log(shared) - jnp.log1p(-shared), splats.opacity_logits)
+    old_opacities = jnp.clip(opacities, DEAD_OPACITY, _HIGHEST_OPACITY)
+    shared_opacities = shared_opacity(old_opacities, sharers)
+    factor = shared_scale_factor(old_opacities, shared_opacities, sharers)
+    shared_opacities = jnp.clip(shared_opacities, DEAD_OPACITY, _HIGHEST_OPACITY)
+    is_target = copies > 0.0
+    logits = jnp.where(
+        is_target, safe_log(shared_opacities) - jnp.log1p(-shared_opacities), splats.opacity_logits
+    )
     log_scales = jnp.where(
-        is_drawn[:, None], splats.log_scales + safe_log(factor)[:, None], splats.log_scales
+        is_target[:, None], splats.log_scales + safe_log(factor)[:, None], splats.log_scales
     )
     thinned = replace(splats, opacity_logits=logits, log_scales=log_scales)
-    source = jnp.where(is_free, drawn, jnp.arange(splats.capacity, dtype=jnp.int32))
-    return jax.tree.map(lambda leaf: leaf[source], thinned), is_free | is_drawn
+    source = jnp.where(is_free, target_rows, jnp.arange(splats.capacity, dtype=jnp.int32))
+    return jax.tree.map(lambda leaf: leaf[source], thinned), is_free | is_target
 
 
 def exploring_noise(
@@ -149,9 +151,9 @@ def exploring_noise(
     -------
     (N, 3) displacements, world.
     """
-    normal = jax.random.normal(key, splats.means.shape, jnp.float32).astype(splats.means.dtype)
+    noise = jax.random.normal(key, splats.means.shape, jnp.float32).astype(splats.means.dtype)
     rotation = quaternion_to_matrix(splats.quats)
-    local = jnp.einsum("nji,nj->ni", rotation, normal, precision="highest")
+    local = jnp.einsum("nji,nj->ni", rotation, noise, precision="highest")
     spread = jnp.einsum(
         "nij,nj->ni", rotation, jnp.exp(2.0 * splats.log_scales) * local, precision="highest"
     )

@@ -104,17 +104,17 @@ def _digit_order(digits: UInt[Array, " n"], digit_bits: int) -> Int[Array, " n"]
     blocks = max(-(-n >> place_bits), 1)
     size = -(-n // blocks)
     # Entries that fill up the last block are sorted behind all others, and cut off at the end.
-    filled = jnp.pad(digits, (0, blocks * size - n), constant_values=(1 << digit_bits) - 1)
-    filled = filled.reshape(blocks, size).astype(jnp.uint32)
+    padded = jnp.pad(digits, (0, blocks * size - n), constant_values=(1 << digit_bits) - 1)
+    padded = padded.reshape(blocks, size).astype(jnp.uint32)
     place = jnp.arange(size, dtype=jnp.int32)[None, :]
-    packed = jnp.sort((filled << place_bits) | place.astype(jnp.uint32), axis=1)
+    packed = jnp.sort((padded << place_bits) | place.astype(jnp.uint32), axis=1)
     source = (packed & jnp.uint32((1 << place_bits) - 1)).astype(jnp.int32)
     if blocks == 1:
         return source[0]
 
     block = jnp.arange(blocks, dtype=jnp.int32)[:, None]
     counts = jnp.zeros((blocks, 1 << digit_bits), jnp.int32)
-    counts = counts.at[block, filled.astype(jnp.int32)].add(1)
+    counts = counts.at[block, padded.astype(jnp.int32)].add(1)
     totals = jnp.sum(counts, axis=0, keepdims=True)
     smaller, earlier = jnp.cumsum(totals, axis=1) - totals, jnp.cumsum(counts, axis=0) - counts
     within_block = jnp.cumsum(counts, axis=1) - counts
@@ -215,9 +215,9 @@ def _runs(
 
 def _saturating_sum(counts: Int[Array, " n"]) -> Int[Array, ""]:
     """Sum of non-negative counts that stops at the largest int32 instead of wrapping."""
-    approximate = jnp.sum(counts.astype(jnp.float32))
+    approximate_sum = jnp.sum(counts.astype(jnp.float32))
     return jnp.where(
-        approximate < 2.0e9, jnp.sum(counts, dtype=jnp.int32), jnp.int32(_LARGEST_COUNT)
+        approximate_sum < 2.0e9, jnp.sum(counts, dtype=jnp.int32), jnp.int32(_LARGEST_COUNT)
     )
 
 
@@ -240,15 +240,15 @@ def _chunk_lists(
 ) -> tuple[Int[Array, "slots chunks"], Int[Array, " chunks"], Int[Array, ""]]:
     """Cut sorted hits into chunks of one tile each; also return the true number of chunks."""
     ends = jnp.searchsorted(tiles, jnp.arange(tile_count + 1, dtype=jnp.int32)).astype(jnp.int32)
-    starts, hits = ends[:-1], ends[1:] - ends[:-1]
-    chunks = -(-hits // CHUNK_SIZE)
-    first_chunk = jnp.cumsum(chunks, dtype=jnp.int32) - chunks
-    total = jnp.sum(chunks, dtype=jnp.int32)
-    tile = _runs(first_chunk, chunks, capacity)
+    starts, hit_counts = ends[:-1], ends[1:] - ends[:-1]
+    chunk_counts = -(-hit_counts // CHUNK_SIZE)
+    first_chunk = jnp.cumsum(chunk_counts, dtype=jnp.int32) - chunk_counts
+    total = jnp.sum(chunk_counts, dtype=jnp.int32)
+    tile = _runs(first_chunk, chunk_counts, capacity)
     chunk = jnp.arange(capacity, dtype=jnp.int32)
     is_chunk = chunk < total
-    begin = starts[tile] + (chunk - first_chunk[tile]) * CHUNK_SIZE
-    slot = begin[None, :] + jnp.arange(CHUNK_SIZE, dtype=jnp.int32)[:, None]
+    first_slot = starts[tile] + (chunk - first_chunk[tile]) * CHUNK_SIZE
+    slot = first_slot[None, :] + jnp.arange(CHUNK_SIZE, dtype=jnp.int32)[:, None]
     is_hit = (slot < ends[tile + 1][None, :]) & is_chunk[None, :]
     slot_rank = ranks[jnp.clip(slot, 0, ranks.shape[0] - 1)]
     chunk_ranks = jnp.where(is_hit, slot_rank, pad_rank)
@@ -290,10 +290,10 @@ def find_visible(
     is_bright = opacities * splats.compensation >= MIN_ALPHA
     is_touching = jnp.all(first <= last, axis=-1)
     is_visible = is_eligible & splats.is_in_front & is_bright & is_touching
-    found, visible_count = compact(is_visible, capacity=capacities["visible"])
+    visible_rows, visible_count = compact(is_visible, capacity=capacities["visible"])
 
-    depths = gather_visible(found, splats.depths, padding=float("inf"))
-    index = found[_depth_order(depths)]
+    depths = gather_visible(visible_rows, splats.depths, padding=float("inf"))
+    index = visible_rows[_depth_order(depths)]
     bounds = jnp.concatenate([first, last], axis=-1) // tile_size
     low, high = jnp.split(gather_visible(index, bounds), 2, axis=-1)
     is_row = jnp.arange(capacities["visible"], dtype=jnp.int32) < visible_count
@@ -305,9 +305,9 @@ def find_visible(
     ranks = _runs(starts, counts, capacities["hits"])
     hit = jnp.arange(capacities["hits"], dtype=jnp.int32)
     rows_of_hits = jnp.stack([starts, low[:, 0], low[:, 1], size[:, 0]], axis=-1)[ranks]
-    within, hit_columns = hit - rows_of_hits[:, 0], jnp.maximum(rows_of_hits[:, 3], 1)
-    tile_y = rows_of_hits[:, 2] + within // hit_columns
-    tile_x = rows_of_hits[:, 1] + within % hit_columns
+    tile_offset, hit_columns = hit - rows_of_hits[:, 0], jnp.maximum(rows_of_hits[:, 3], 1)
+    tile_y = rows_of_hits[:, 2] + tile_offset // hit_columns
+    tile_x = rows_of_hits[:, 1] + tile_offset % hit_columns
     ellipses = gather_visible(index, _ellipses(splats, opacities))[ranks]
     is_hit = (hit < hit_count) & _meets_tile(ellipses, tile_x, tile_y, tile_size)
     tiles = jnp.where(is_hit, tile_y * columns + tile_x, rows * columns)
@@ -315,5 +315,5 @@ def find_visible(
     chunk_ranks, chunk_tiles, chunk_count = _chunk_lists(
         tiles, ranks, rows * columns, capacities["visible"], capacities["chunks"]
     )
-    needed = usage(visible=visible_count, hits=hit_count, chunks=chunk_count)
-    return TileLists(index=index, chunk_ranks=chunk_ranks, chunk_tiles=chunk_tiles, usage=needed)
+    needs = usage(visible=visible_count, hits=hit_count, chunks=chunk_count)
+    return TileLists(index=index, chunk_ranks=chunk_ranks, chunk_tiles=chunk_tiles, usage=needs)

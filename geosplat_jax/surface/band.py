@@ -162,11 +162,11 @@ class Band(Lattice):
             smallest sum of a neighbour's magnitude and the distance to it, at most `REACH`.
         """
         values = np.asarray(self.values(sdf))
-        at_surface = self.surface_cells(values)
-        if not at_surface.size:
+        crossed_cells = self.surface_cells(values)
+        if not crossed_cells.size:
             return None
         old_cells = np.asarray(self.cells)[: int(self.bits.count)]
-        cells = cells_around(at_surface, self.grid.shape, layers)
+        cells = cells_around(crossed_cells, self.grid.shape, layers)
         if np.array_equal(cells, old_cells):
             return None
         layout = _layout(self.grid, cells)
@@ -177,10 +177,12 @@ class Band(Lattice):
             vertices=_rows_before(old_vertices, layout.vertices),
         )
         is_known = move.vertices >= 0
-        read = _extended(np.where(is_known, values[move.vertices], 0), is_known, layout.corners)
-        raw = np.where(is_known, np.asarray(sdf)[move.vertices], read)
-        band = _padded(self.grid, layout, read, self.cell_rows, self.vertex_rows)
-        return band, move.padded(band), _filled(raw, band.vertex_rows)
+        extended_values = _extended(
+            np.where(is_known, values[move.vertices], 0), is_known, layout.corners
+        )
+        new_values = np.where(is_known, np.asarray(sdf)[move.vertices], extended_values)
+        band = _padded(self.grid, layout, extended_values, self.cell_rows, self.vertex_rows)
+        return band, move.padded(band), _filled(new_values, band.vertex_rows)
 
 
 class Move(NamedTuple):
@@ -205,9 +207,9 @@ class Move(NamedTuple):
         """Bring the numbers of an earlier band into the rows of this one; new rows become 0."""
 
         def moved(array: Array, rows: np.ndarray) -> Array:
-            found = np.asarray(array)[rows]
-            found[rows < 0] = 0
-            return jnp.array(found)
+            new_values = np.asarray(array)[rows]
+            new_values[rows < 0] = 0
+            return jnp.array(new_values)
 
         return Geometry(
             sdf=moved(geometry.sdf, self.vertices),
@@ -251,8 +253,8 @@ def band_from(
         corner = inside[z : z + nz, y : y + ny, x : x + nx]
         is_any |= corner
         is_all &= corner
-    at_surface = np.flatnonzero(is_any & ~is_all)
-    layout = _layout(grid, cells_around(at_surface, grid.shape, layers))
+    crossed_cells = np.flatnonzero(is_any & ~is_all)
+    layout = _layout(grid, cells_around(crossed_cells, grid.shape, layers))
     values = np.asarray(sdf)[layout.vertices]
     band = _padded(grid, layout, values, 0, 0)
     return band, _filled(values, band.vertex_rows)
@@ -281,24 +283,24 @@ def _layout(grid: Grid, cells: Int[np.ndarray, " K"]) -> _Layout:
     strides = (1, sizes[0], sizes[0] * sizes[1])
     base = cells % nx + strides[1] * (cells // nx % ny) + strides[2] * (cells // (nx * ny))
     numbers = base[None, :] + (CORNERS @ np.array(strides, np.int32))[:, None]
-    is_held = np.zeros(grid.vertex_count, bool)
-    is_held[numbers] = True
-    vertices = np.flatnonzero(is_held).astype(np.int32)
+    is_band_vertex = np.zeros(grid.vertex_count, bool)
+    is_band_vertex[numbers] = True
+    vertices = np.flatnonzero(is_band_vertex).astype(np.int32)
     # Not initialised: only the entries of vertices of the band are written, and later read.
     row_of = np.empty(grid.vertex_count, np.int32)
-    own = row_of[vertices] = np.arange(vertices.size, dtype=np.int32)
+    own_rows = row_of[vertices] = np.arange(vertices.size, dtype=np.int32)
     corners = row_of[numbers]
     neighbours = []
-    cells_beside = np.ones(vertices.shape, np.int32)
+    incident_counts = np.ones(vertices.shape, np.int32)
     for size, stride in zip(sizes, strides, strict=True):
-        place = vertices // stride % size
-        cells_beside *= np.where((place > 0) & (place < size - 1), 2, 1)
+        coordinate = vertices // stride % size
+        incident_counts *= np.where((coordinate > 0) & (coordinate < size - 1), 2, 1)
         for step in (-1, 1):
-            exists = (place + step >= 0) & (place + step < size)
-            beside = np.where(exists, vertices + step * stride, vertices)
-            beside = np.where(is_held[beside], beside, vertices)
-            neighbours.append(row_of[beside])
-    is_border = np.bincount(corners.reshape(-1), minlength=own.size) < cells_beside
+            has_neighbour = (coordinate + step >= 0) & (coordinate + step < size)
+            neighbour = np.where(has_neighbour, vertices + step * stride, vertices)
+            neighbour = np.where(is_band_vertex[neighbour], neighbour, vertices)
+            neighbours.append(row_of[neighbour])
+    is_border = np.bincount(corners.reshape(-1), minlength=own_rows.size) < incident_counts
     return _Layout(cells, vertices, corners, np.stack(neighbours), is_border)
 
 
@@ -309,8 +311,8 @@ def _padded(
     cell_rows = _row_count(layout.cells.size, cell_rows)
     vertex_rows = _row_count(layout.vertices.size, vertex_rows)
     side = np.where(values < 0, -1, 1).astype(np.int8)
-    own = np.arange(vertex_rows, dtype=np.int32)
-    neighbours = np.tile(own, (6, 1))
+    own_rows = np.arange(vertex_rows, dtype=np.int32)
+    neighbours = np.tile(own_rows, (6, 1))
     neighbours[:, : layout.vertices.size] = layout.neighbours
     corners = np.zeros((8, cell_rows), np.int32)
     corners[:, : layout.cells.size] = layout.corners
@@ -329,23 +331,23 @@ def _padded(
     )
 
 
-def _row_count(count: int, have: int) -> int:
-    """Keep ``have`` rows if they are enough, and at most `_MANY` times as many as are wanted."""
-    wanted = bucket(int(_HEADROOM * count))
-    return have if count <= have <= _MANY * wanted else wanted
+def _row_count(count: int, old_count: int) -> int:
+    """Keep ``old_count`` rows if they suffice and are at most `_MANY` times as many as wanted."""
+    target_count = bucket(int(_HEADROOM * count))
+    return old_count if count <= old_count <= _MANY * target_count else target_count
 
 
 def _filled(values: np.ndarray, rows: int, padding: int = 0) -> np.ndarray:
     """Add rows of padding."""
-    full = np.full(rows, padding, values.dtype)
-    full[: values.size] = values
-    return full
+    padded = np.full(rows, padding, values.dtype)
+    padded[: values.size] = values
+    return padded
 
 
 def _rows_before(old: np.ndarray, new: np.ndarray) -> Int[np.ndarray, " n"]:
     """Find the row that each of ``new`` has in the ascending ``old``; -1 where it is not there."""
-    place = np.minimum(np.searchsorted(old, new), old.size - 1)
-    return np.where(old[place] == new, place, -1).astype(np.int32)
+    rows = np.minimum(np.searchsorted(old, new), old.size - 1)
+    return np.where(old[rows] == new, rows, -1).astype(np.int32)
 
 
 def _extended(
@@ -357,19 +359,19 @@ def _extended(
     """
     values, is_known = values.copy(), is_known.copy()
     while not is_known.all():
-        known = is_known[corners]
-        cells = corners[:, known.any(axis=0) & ~known.all(axis=0)]
-        size = np.full(values.shape, np.inf, values.dtype)
+        is_corner_known = is_known[corners]
+        cells = corners[:, is_corner_known.any(axis=0) & ~is_corner_known.all(axis=0)]
+        magnitude = np.full(values.shape, np.inf, values.dtype)
         side = np.zeros(values.shape, values.dtype)
         for source, target in np.ndindex(8, 8):
-            taken = is_known[cells[source]] & ~is_known[cells[target]]
-            start, end = cells[source][taken], cells[target][taken]
-            way = values.dtype.type(_CORNER_DISTANCE[source, target])
-            np.minimum.at(size, end, np.abs(values[start]) + way)
+            is_fillable = is_known[cells[source]] & ~is_known[cells[target]]
+            start, end = cells[source][is_fillable], cells[target][is_fillable]
+            distance = values.dtype.type(_CORNER_DISTANCE[source, target])
+            np.minimum.at(magnitude, end, np.abs(values[start]) + distance)
             side[end] = np.where(values[start] < 0, -1, 1)
-        reached = np.isfinite(size)
+        is_reached = np.isfinite(magnitude)
         # Every layer of cells around the surface touches the one before.
-        assert reached.any(), "a band of cells that do not touch"
-        values[reached] = side[reached] * np.minimum(size[reached], REACH)
-        is_known |= reached
+        assert is_reached.any(), "a band of cells that do not touch"
+        values[is_reached] = side[is_reached] * np.minimum(magnitude[is_reached], REACH)
+        is_known |= is_reached
     return values

@@ -42,10 +42,10 @@ def _joined_pairs(case: int, corners: list[int]) -> list[list[int]]:
     """Pairs of crossing edges that the surface joins across one face."""
     inside = {c for c in corners if case >> c & 1}
     edges = [e for e, ends in enumerate(EDGES) if set(ends) <= set(corners)]
-    crossing = [e for e in edges if len(set(EDGES[e]) & inside) == 1]
-    if len(crossing) == 4:
-        return [[e for e in crossing if c in EDGES[e]] for c in sorted(inside)]
-    return [crossing] if crossing else []
+    crossing_edges = [e for e in edges if len(set(EDGES[e]) & inside) == 1]
+    if len(crossing_edges) == 4:
+        return [[e for e in crossing_edges if c in EDGES[e]] for c in sorted(inside)]
+    return [crossing_edges] if crossing_edges else []
 
 
 def _patches(case: int) -> list[list[int]]:
@@ -53,22 +53,22 @@ def _patches(case: int) -> list[list[int]]:
     label = list(range(12))
     for _, _, corners in _faces():
         for first, second in _joined_pairs(case, corners):
-            old, new = label[second], label[first]
-            label = [new if value == old else value for value in label]
-    crossing = [e for e, (a, b) in enumerate(EDGES) if (case >> a & 1) != (case >> b & 1)]
-    groups = [[e for e in crossing if label[e] == value] for value in dict.fromkeys(label)]
+            old_label, new_label = label[second], label[first]
+            label = [new_label if value == old_label else value for value in label]
+    crossing_edges = [e for e, (a, b) in enumerate(EDGES) if (case >> a & 1) != (case >> b & 1)]
+    groups = [[e for e in crossing_edges if label[e] == value] for value in dict.fromkeys(label)]
     return sorted(group for group in groups if group)
 
 
 def _problem_faces(case: int) -> list[tuple[int, int]]:
     """List (axis, side) of the ambiguous faces whose two arcs belong to one patch."""
-    found = []
+    problems = []
     for axis, side, corners in _faces():
         pairs = _joined_pairs(case, corners)
-        touched = {e for pair in pairs for e in pair}
-        if len(pairs) == 2 and any(touched <= set(patch) for patch in _patches(case)):
-            found.append((axis, side))
-    return found
+        joined_edges = {e for pair in pairs for e in pair}
+        if len(pairs) == 2 and any(joined_edges <= set(patch) for patch in _patches(case)):
+            problems.append((axis, side))
+    return problems
 
 
 def _derive() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

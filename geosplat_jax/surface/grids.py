@@ -71,8 +71,8 @@ def closed_at_border(sdf: Float[Array, " G"], grid: Grid) -> Float[Array, " G"]:
     """
     last = jnp.asarray(grid.shape, sdf.dtype) * grid.cell_size
     points = grid_vertices(grid) - grid.origin[None, :]
-    outside = jnp.max(jnp.maximum(-points, points - last[None, :]), axis=-1) / grid.cell_size
-    return jnp.maximum(sdf, outside + 0.5)
+    distance = jnp.max(jnp.maximum(-points, points - last[None, :]), axis=-1) / grid.cell_size
+    return jnp.maximum(sdf, distance + 0.5)
 
 
 def random_sdf(key: Key[Array, ""], grid: Grid) -> Float[Array, " G"]:
@@ -86,15 +86,15 @@ def _interpolate(
     """Trilinear values at points given in cells from the grid's origin, clamped to the box."""
     vx, vy, _ = grid.vertex_shape
     last = jnp.asarray(grid.shape, coordinates.dtype)[None, :]
-    inside = jnp.clip(coordinates, 0.0, last)
-    lowest = jnp.minimum(jnp.floor(inside), last - 1.0)
-    part = inside - lowest
+    clamped = jnp.clip(coordinates, 0.0, last)
+    lowest = jnp.minimum(jnp.floor(clamped), last - 1.0)
+    fractions = clamped - lowest
     i, j, k = lowest.astype(jnp.int32).T
     result = jnp.zeros((coordinates.shape[0], values.shape[1]), values.dtype)
     for corner in CORNERS.tolist():
         index = i + corner[0] + vx * (j + corner[1] + vy * (k + corner[2]))
-        sides = [part[:, a] if corner[a] else 1.0 - part[:, a] for a in range(3)]
-        result = result + (sides[0] * sides[1] * sides[2])[:, None] * values[index]
+        weights = [fractions[:, a] if corner[a] else 1.0 - fractions[:, a] for a in range(3)]
+        result = result + (weights[0] * weights[1] * weights[2])[:, None] * values[index]
     return result
 
 
@@ -105,14 +105,14 @@ def resample(geometry: Geometry, grid: Grid, new_grid: Grid) -> Geometry:
     to the new cell. A vertex outside of the old box takes the value at the nearest point of the box
     plus the distance to that point, so that a closed surface stays closed.
     """
-    world = (grid_vertices(new_grid) - grid.origin[None, :]) / grid.cell_size
-    moves = grid.reach * jnp.tanh(geometry.deform)
-    rest = world
+    points = (grid_vertices(new_grid) - grid.origin[None, :]) / grid.cell_size
+    displacements = grid.reach * jnp.tanh(geometry.deform)
+    rest_positions = points
     for _ in range(3):
-        rest = world - _interpolate(moves, grid, rest)
-    last = jnp.asarray(grid.shape, world.dtype)[None, :]
-    outside = safe_norm(world - jnp.clip(world, 0.0, last))
-    sdf = _interpolate(geometry.sdf[:, None], grid, rest)[:, 0] + outside
+        rest_positions = points - _interpolate(displacements, grid, rest_positions)
+    last = jnp.asarray(grid.shape, points.dtype)[None, :]
+    distance = safe_norm(points - jnp.clip(points, 0.0, last))
+    sdf = _interpolate(geometry.sdf[:, None], grid, rest_positions)[:, 0] + distance
     return initial_geometry(new_grid, sdf * (grid.cell_size / new_grid.cell_size))
 
 
@@ -139,11 +139,11 @@ def sdf_entropy(
     # For ends of opposite sign BCE(sigmoid(a), sign(b)) = softplus(|a|). The sum over edges is
     # therefore a sum over vertices, each weighted by the number of its crossed edges.
     crossings = lattice.crossed_edges(sdf)
-    size = jnp.where(sdf < 0, -sdf, sdf)
-    total = jnp.sum(crossings.astype(size.dtype) * jax.nn.softplus(size))
+    magnitude = jnp.where(sdf < 0, -sdf, sdf)
+    total = jnp.sum(crossings.astype(magnitude.dtype) * jax.nn.softplus(magnitude))
     if reduction == "sum":
         return total
-    return total / jnp.maximum(jnp.sum(crossings, dtype=jnp.int32) // 2, 1).astype(size.dtype)
+    return total / jnp.maximum(jnp.sum(crossings, dtype=jnp.int32) // 2, 1).astype(magnitude.dtype)
 
 
 def weight_magnitude(geometry: Geometry, cell_count: int | None = None) -> Float[Array, ""]:

@@ -112,17 +112,17 @@ def carve_hollows(
     """
     if len(images) < _FEWEST_VIEWS:
         return sdf
-    fine, factor = _laid_out(sdf, grid)
-    hull = _coarser(fine, factor)
+    fine_field, factor = _laid_out(sdf, grid)
+    hull = _coarser(fine_field, factor)
     views = Photographed.of(world_to_camera, intrinsics, images, valid, grid, factor)
-    kept = [candidate.region for candidate in _candidates(hull, views) if candidate.is_hollow]
-    if not kept:
+    hollows = [candidate.region for candidate in _candidates(hull, views) if candidate.is_hollow]
+    if not hollows:
         return sdf
-    field, region = hull, np.any(kept, axis=0)
+    field, region = hull, np.any(hollows, axis=0)
     for tolerance, share in _LATER_PASSES:
         field, region = _carved(field, views, region, tolerance, share)
     field = _advanced(field, views, region)
-    return _opened(fine, hull, (hull < 0.0) & (field >= 0.0), factor).reshape(-1)
+    return _opened(fine_field, hull, (hull < 0.0) & (field >= 0.0), factor).reshape(-1)
 
 
 def hollow_candidates(
@@ -137,37 +137,45 @@ def hollow_candidates(
     """Return the candidates of `carve_hollows` for the same arguments; none for under 8 views."""
     if len(images) < _FEWEST_VIEWS:
         return []
-    fine, factor = _laid_out(sdf, grid)
+    fine_field, factor = _laid_out(sdf, grid)
     views = Photographed.of(world_to_camera, intrinsics, images, valid, grid, factor)
-    return _candidates(_coarser(fine, factor), views)
+    return _candidates(_coarser(fine_field, factor), views)
 
 
 def _laid_out(sdf: Float[np.ndarray, " G"], grid: Grid) -> tuple[Field, int]:
     """Arrange values by z, y and x, and choose how many cells are one coarse cell on each axis."""
-    fine = np.asarray(sdf, np.float32).reshape(grid.vertex_shape[::-1])
-    return fine, -(-max(grid.shape) // _LONGEST)
+    fine_field = np.asarray(sdf, np.float32).reshape(grid.vertex_shape[::-1])
+    return fine_field, -(-max(grid.shape) // _LONGEST)
 
 
 def _candidates(hull: Field, views: Photographed) -> list[Candidate]:
     """Carve with one half of the views, and let the other half judge every connected part."""
-    fit, judge = views.every_second(0), views.every_second(1)
-    field, _ = _carved(hull, fit, np.ones(hull.shape, bool), *_FIRST_PASS)
-    found: Any = label((hull < 0.0) & (field >= 0.0), np.ones((3, 3, 3)))
-    parts, count = found
+    fit_views, judge_views = views.every_second(0), views.every_second(1)
+    field, _ = _carved(hull, fit_views, np.ones(hull.shape, bool), *_FIRST_PASS)
+    label_result: Any = label((hull < 0.0) & (field >= 0.0), np.ones((3, 3, 3)))
+    labels, count = label_result
     if not count:
         return []
-    before, after = _judged(hull, fit, judge), _judged(field, fit, judge)
+    hull_points, carved_points = (
+        _judged(hull, fit_views, judge_views),
+        _judged(field, fit_views, judge_views),
+    )
     candidates = []
     for number in range(1, count + 1):
-        region = parts == number
-        lid, behind = before.of(before.inside, region), after.of(after.outside, region)
+        region = labels == number
+        lid, behind = (
+            hull_points.of(hull_points.inside, region),
+            carved_points.of(carved_points.outside, region),
+        )
         if min(len(lid), len(behind)) >= _FEWEST_POINTS:
-            mirror = _mirrored(hull, region, fit, judge)
+            mirror = _mirrored(hull, region, fit_views, judge_views)
             candidates.append(Candidate(region, float(lid.mean()), float(behind.mean()), mirror))
     return candidates
 
 
-def _mirrored(hull: Field, region: Where, fit: Photographed, judge: Photographed) -> float:
+def _mirrored(
+    hull: Field, region: Where, fit_views: Photographed, judge_views: Photographed
+) -> float:
     """Difference from a hull that mirrors its surroundings.
 
     The colour of a mirror depends on the direction of reflection alone: the mean over what one
@@ -175,22 +183,22 @@ def _mirrored(hull: Field, region: Where, fit: Photographed, judge: Photographed
     """
     surface = crossings(hull)
     surface = surface.of(region[tuple(surface.inside.T)])
-    asked, judging = (views.look(surface, hull < 0.0) for views in (fit, judge))
-    asked_bin, judging_bin = (views.reflected(surface) for views in (fit, judge))
-    weight = asked.seen.reshape(-1).astype(float)
-    size = int(max(asked_bin.max(), judging_bin.max())) + 1
-    row = asked_bin.reshape(-1)
-    seen = np.bincount(row, weights=weight, minlength=size)
+    fit_sight, judge_sight = (views.look(surface, hull < 0.0) for views in (fit_views, judge_views))
+    fit_bin, judge_bin = (views.reflected(surface) for views in (fit_views, judge_views))
+    weight = fit_sight.seen.reshape(-1).astype(float)
+    size = int(max(fit_bin.max(), judge_bin.max())) + 1
+    row = fit_bin.reshape(-1)
+    bin_counts = np.bincount(row, weights=weight, minlength=size)
     total = [
-        np.bincount(row, weights=weight * asked.color[..., channel].reshape(-1), minlength=size)
+        np.bincount(row, weights=weight * fit_sight.color[..., channel].reshape(-1), minlength=size)
         for channel in range(3)
     ]
-    mean = np.stack(total, axis=-1) / np.maximum(seen, 1.0)[:, None]
-    compared = judging.seen & (seen[judging_bin] >= _FEWEST_JUDGING)
-    if compared.sum() < _COMPARED * judging.seen.sum() or not compared.any():
+    mean = np.stack(total, axis=-1) / np.maximum(bin_counts, 1.0)[:, None]
+    is_compared = judge_sight.seen & (bin_counts[judge_bin] >= _FEWEST_JUDGING)
+    if is_compared.sum() < _COMPARED * judge_sight.seen.sum() or not is_compared.any():
         return np.inf
-    difference = judging.difference(mean[judging_bin])
-    return float(np.minimum(difference, _WORST)[compared].mean())
+    difference = judge_sight.difference(mean[judge_bin])
+    return float(np.minimum(difference, _WORST)[is_compared].mean())
 
 
 def _carved(
@@ -212,13 +220,15 @@ def _carved(
         surface = crossings(field)
         surface = surface.of(binary_dilation(region)[tuple(surface.inside.T)])
         sight = views.look(surface, field < 0.0)
-        agrees = sight.difference(sight.median()) < tolerance
-        disagreeing = 1.0 - sight.mean(agrees.astype(np.float64))
-        wrong = _of_vertices(surface.inside, disagreeing, sight.counts, field.shape) > 1.0 - share
-        if not wrong.any():
+        is_consistent = sight.difference(sight.median()) < tolerance
+        disagreement = 1.0 - sight.mean(is_consistent.astype(np.float64))
+        carve_mask = (
+            _of_vertices(surface.inside, disagreement, sight.counts, field.shape) > 1.0 - share
+        )
+        if not carve_mask.any():
             break
-        field = _without(field, wrong)
-        region |= wrong
+        field = _without(field, carve_mask)
+        region |= carve_mask
     return field, region
 
 
@@ -228,46 +238,48 @@ def _advanced(field: Field, views: Photographed, region: Where) -> Field:
     for _ in range(2 * max(field.shape)):
         surface = crossings(field)
         surface = surface.of(binary_dilation(region)[tuple(surface.inside.T)])
-        seen = views.visible(surface, field < 0.0)
+        is_visible = views.visible(surface, field < 0.0)
         differences = []
         for depth in _DEPTHS:
-            sight = views.sample(surface.position - np.float32(depth) * surface.normal, seen)
+            sight = views.sample(surface.position - np.float32(depth) * surface.normal, is_visible)
             spread = np.abs(sight.color - sight.median()).max(-1)
             mean = sight.mean(np.minimum(spread, _WORST))
             differences.append(np.where(sight.counts, mean, np.inf))
-        compared = np.stack(differences)
-        best = compared.argmin(0)
-        here = compared[0]
-        counts = np.isfinite(here)
-        lies_deeper = (_DEPTHS[best] >= 1.0) & (here > _SETTLED)
-        lies_deeper &= compared.min(0) < _BETTER * np.where(counts, here, 0.0)
-        share = _of_vertices(surface.inside, lies_deeper.astype(float), counts, field.shape)
-        deeper = share > 0.5
-        if not deeper.any():
+        depth_differences = np.stack(differences)
+        best_index = depth_differences.argmin(0)
+        surface_difference = depth_differences[0]
+        is_counted = np.isfinite(surface_difference)
+        is_deeper = (_DEPTHS[best_index] >= 1.0) & (surface_difference > _SETTLED)
+        is_deeper &= depth_differences.min(0) < _BETTER * np.where(
+            is_counted, surface_difference, 0.0
+        )
+        share = _of_vertices(surface.inside, is_deeper.astype(float), is_counted, field.shape)
+        carve_mask = share > 0.5
+        if not carve_mask.any():
             break
-        field = _without(field, deeper)
-        region |= deeper
+        field = _without(field, carve_mask)
+        region |= carve_mask
     return field
 
 
 def _of_vertices(
     vertices: Int[np.ndarray, "N 3"],
     values: Float[np.ndarray, " N"],
-    counts: Bool[np.ndarray, " N"],
+    is_counted: Bool[np.ndarray, " N"],
     shape: tuple[int, ...],
 ) -> Field:
     """Average the values of every vertex over the rows that count; 0 for a vertex without any."""
-    row = np.ravel_multi_index(tuple(vertices[counts].T), shape)
+    row = np.ravel_multi_index(tuple(vertices[is_counted].T), shape)
     size = int(np.prod(shape))
-    total = np.bincount(row, weights=values[counts], minlength=size)
+    total = np.bincount(row, weights=values[is_counted], minlength=size)
     return (total / np.maximum(np.bincount(row, minlength=size), 1)).reshape(shape)
 
 
-def _without(field: Field, carved: Where) -> Field:
+def _without(field: Field, carve_mask: Where) -> Field:
     """Put vertices outside, and the surface half a cell from them."""
-    field = np.where(carved, np.float32(_EDGE), field)
-    beside = np.asarray(binary_dilation(carved), bool) & (field < -_EDGE)
-    return np.where(beside, np.float32(-_EDGE), field)
+    field = np.where(carve_mask, np.float32(_EDGE), field)
+    is_neighbour = np.asarray(binary_dilation(carve_mask), bool) & (field < -_EDGE)
+    return np.where(is_neighbour, np.float32(-_EDGE), field)
 
 
 class _Judged(NamedTuple):
@@ -288,14 +300,16 @@ class _Judged(NamedTuple):
         return self.difference[region[tuple(vertices.T)]]
 
 
-def _judged(field: Field, fit: Photographed, judge: Photographed) -> _Judged:
+def _judged(field: Field, fit_views: Photographed, judge_views: Photographed) -> _Judged:
     """Compare the median colour of some views with the colours of others."""
     surface, solid = crossings(field), field < 0.0
-    asked, judging = fit.look(surface, solid), judge.look(surface, solid)
-    counts = np.minimum(asked.seen.sum(0), judging.seen.sum(0)) >= _FEWEST_JUDGING
-    difference = np.minimum(judging.difference(asked.median()), _WORST)
+    fit_sight, judge_sight = fit_views.look(surface, solid), judge_views.look(surface, solid)
+    is_counted = np.minimum(fit_sight.seen.sum(0), judge_sight.seen.sum(0)) >= _FEWEST_JUDGING
+    difference = np.minimum(judge_sight.difference(fit_sight.median()), _WORST)
     return _Judged(
-        surface.inside[counts], surface.outside[counts], judging.mean(difference)[counts]
+        surface.inside[is_counted],
+        surface.outside[is_counted],
+        judge_sight.mean(difference)[is_counted],
     )
 
 
@@ -311,7 +325,7 @@ def _coarser(field: Field, factor: int) -> Float[np.ndarray, "z y x"]:
 
 
 def _opened(
-    fine: Field,
+    fine_field: Field,
     hull: Float[np.ndarray, "z y x"],
     hollows: Bool[np.ndarray, "z y x"],
     factor: int,
@@ -320,16 +334,20 @@ def _opened(
     solid = (hull < 0.0) & ~hollows
     # Empty the cells in front of the mouths as well: a film of the old surface would stay there.
     # The mask keeps this from passing through walls.
-    empty = np.asarray(binary_dilation(hollows, iterations=_MOUTH, mask=~solid), bool)
-    away, into = (np.asarray(distance_transform_edt(side)) for side in (~empty, empty))
-    signed = into - away
-    smooth = gaussian_filter(signed - 0.5 * np.sign(signed), _SMOOTHING)
+    cavity = np.asarray(binary_dilation(hollows, iterations=_MOUTH, mask=~solid), bool)
+    solid_depth, cavity_depth = (
+        np.asarray(distance_transform_edt(side)) for side in (~cavity, cavity)
+    )
+    signed = cavity_depth - solid_depth
+    smooth_distance = gaussian_filter(signed - 0.5 * np.sign(signed), _SMOOTHING)
     # Solid vertices stay inside and hollow ones outside: smoothing would open walls that are as
     # thin as a cell.
     distance = np.where(
-        solid, np.minimum(smooth, -_THIN), np.where(hollows, np.maximum(smooth, _THIN), smooth)
+        solid,
+        np.minimum(smooth_distance, -_THIN),
+        np.where(hollows, np.maximum(smooth_distance, _THIN), smooth_distance),
     )
     if factor > 1:
-        places = np.indices(fine.shape, np.float32) / factor
-        distance = map_coordinates(distance, places, order=1, mode="nearest") * factor
-    return np.maximum(fine, distance).astype(np.float32)
+        coordinates = np.indices(fine_field.shape, np.float32) / factor
+        distance = map_coordinates(distance, coordinates, order=1, mode="nearest") * factor
+    return np.maximum(fine_field, distance).astype(np.float32)

@@ -74,8 +74,8 @@ def hull_distance(
     ------
     ValueError : every mask is empty.
     """
-    view = _Silhouettes(world_to_camera, intrinsics, masks, valid)
-    return _evaluate(view, points, tolerance=tolerance, seen_fraction=seen_fraction)
+    silhouettes = _Silhouettes(world_to_camera, intrinsics, masks, valid)
+    return _evaluate(silhouettes, points, tolerance=tolerance, seen_fraction=seen_fraction)
 
 
 def hull_bounds(
@@ -108,31 +108,31 @@ def hull_bounds(
     ------
     ValueError : the lines of sight do not meet, or no point lies on all masks.
     """
-    view = _Silhouettes(world_to_camera, intrinsics, masks, valid)
+    silhouettes = _Silhouettes(world_to_camera, intrinsics, masks, valid)
     settings = {"tolerance": tolerance, "seen_fraction": seen_fraction}
-    center, reach = _common_target(view, intrinsics)
+    center, reach = _common_target(silhouettes, intrinsics)
     lo, hi = center - reach, center + reach
     for _ in range(_SEARCH_STEPS):
         points, cell = _box_points(lo, hi)
         # A cell may hold part of the hull when its centre is closer than its half diagonal.
-        near = _evaluate(view, points, **settings) < 0.5 * np.linalg.norm(cell)
-        if not near.any():
+        is_near = _evaluate(silhouettes, points, **settings) < 0.5 * np.linalg.norm(cell)
+        if not is_near.any():
             raise ValueError(
                 "the masks and cameras have no volume in common: check that the poses are "
                 "camera-to-world with Blender axes and match the images, or give the bounds"
             )
-        closer_lo = np.maximum(points[near].min(0) - cell, lo)
-        closer_hi = np.minimum(points[near].max(0) + cell, hi)
-        shrunk = 1.0 - (closer_hi - closer_lo) / (hi - lo)
+        closer_lo = np.maximum(points[is_near].min(0) - cell, lo)
+        closer_hi = np.minimum(points[is_near].max(0) + cell, hi)
+        shrinkage = 1.0 - (closer_hi - closer_lo) / (hi - lo)
         lo, hi = closer_lo, closer_hi
-        if shrunk.max() < 0.1:
+        if shrinkage.max() < 0.1:
             break
     points, cell = _box_points(lo, hi)
-    inside = points[_evaluate(view, points, **settings) < 0.5 * cell.min()]
+    inside = points[_evaluate(silhouettes, points, **settings) < 0.5 * cell.min()]
     if inside.shape[0]:
         lo, hi = np.maximum(inside.min(0) - cell, lo), np.minimum(inside.max(0) + cell, hi)
     # Where the object is a few pixels wide, its silhouette is only known to about one.
-    pad = max(margin * (hi - lo).max(), reach * view.pixel_angle)
+    pad = max(margin * (hi - lo).max(), reach * silhouettes.pixel_angle)
     return lo - pad, hi + pad
 
 
@@ -167,17 +167,19 @@ def sight_bounds(
     centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
     center = meeting_point(centers, poses[:, 2, :3])
     depth = poses[:, 2, :3] @ center + poses[:, 2, 3]
-    ahead = depth > 0.0
-    if not ahead.mean() > SEEN_FRACTION:
+    is_ahead = depth > 0.0
+    if not is_ahead.mean() > SEEN_FRACTION:
         raise ValueError(
-            f"{int((~ahead).sum())} of {len(depth)} cameras look away from the point that their "
+            f"{int((~is_ahead).sum())} of {len(depth)} cameras look away from the point that their "
             "axes are nearest to: check that the poses are camera-to-world, or give the bounds"
         )
-    lens = np.asarray(intrinsics, np.float64)[ahead]
-    shown = depth[ahead] * np.minimum(0.5 * width / lens[:, 0, 0], 0.5 * height / lens[:, 1, 1])
-    free = np.abs(centers - center).max(1).min()
+    lens = np.asarray(intrinsics, np.float64)[is_ahead]
+    visible_extents = depth[is_ahead] * np.minimum(
+        0.5 * width / lens[:, 0, 0], 0.5 * height / lens[:, 1, 1]
+    )
+    clearance = np.abs(centers - center).max(1).min()
     # The cube's corners lie sqrt(3) as far from its centre as its faces.
-    half = min(float(np.median(shown)) / np.sqrt(3.0), 0.9 * free)
+    half = min(float(np.median(visible_extents)) / np.sqrt(3.0), 0.9 * clearance)
     return center - half, center + half
 
 
@@ -204,25 +206,25 @@ def hull_sdf(
     ValueError : no vertex lies inside.
     """
     cell = float(grid.cell_size)
-    view = _Silhouettes(world_to_camera, intrinsics, masks, valid)
+    silhouettes = _Silhouettes(world_to_camera, intrinsics, masks, valid)
     lo = np.asarray(grid.origin, np.float64)
     hi = lo + cell * np.asarray(grid.shape)
     vx, vy, vz = grid.vertex_shape
-    near = np.empty(grid.vertex_count, np.float32)
+    near_values = np.empty(grid.vertex_count, np.float32)
     # A few layers at a time: the points of a fine grid take many times the memory of its values.
     thickness = -(-_POINTS_OF_A_SLAB // (vx * vy))
     for first in range(0, vz, thickness):
         last = min(first + thickness, vz)
         points = grid_points(grid, first, last)
-        distance = _evaluate(view, points, tolerance=tolerance, seen_fraction=seen_fraction)
-        outside_box = np.maximum(lo - points, points - hi).max(1) / cell + 1.0
-        near[first * vx * vy : last * vx * vy] = np.maximum(distance / cell, outside_box)
-    if not (near < 0.0).any():
+        distance = _evaluate(silhouettes, points, tolerance=tolerance, seen_fraction=seen_fraction)
+        box_distance = np.maximum(lo - points, points - hi).max(1) / cell + 1.0
+        near_values[first * vx * vy : last * vx * vy] = np.maximum(distance / cell, box_distance)
+    if not (near_values < 0.0).any():
         raise ValueError(
             "the visual hull holds no vertex of the grid: the object is thinner than a cell, or "
             "the grid lies elsewhere; raise the resolution or use the bounds of the scene"
         )
-    return _extend(near.reshape(vz, vy, vx)).reshape(-1)
+    return _extend(near_values.reshape(vz, vy, vx)).reshape(-1)
 
 
 def fit_grid(
@@ -244,12 +246,12 @@ def fit_grid(
     extent = hi - lo
     if lo.shape != (3,) or not np.isfinite(extent).all() or not (extent > 0.0).all():
         raise ValueError(f"bounds must be (lo, hi) with lo < hi on every axis, got {lo} and {hi}")
-    inner = resolution - 2 * margin_cells
-    if inner < 1:
+    inner_cells = resolution - 2 * margin_cells
+    if inner_cells < 1:
         raise ValueError(
             f"resolution must exceed twice the margin of {margin_cells} cells, got {resolution}"
         )
-    cell = extent.max() / inner
+    cell = extent.max() / inner_cells
     cells = np.ceil(extent / cell - 1e-6).astype(int) + 2 * margin_cells
     origin = 0.5 * (lo + hi) - 0.5 * cell * cells
     nx, ny, nz = (int(n) for n in cells)
@@ -281,32 +283,32 @@ class _Silhouettes:
     def __init__(self, world_to_camera, intrinsics, masks, valid=None):
         # One view after the other: photographs may be many and large.
         factor = max(1, -(-max(masks.shape[1:]) // _MASK_PIXELS))
-        used, coverage, counts, centroids = np.zeros(len(masks), bool), [], [], []
+        is_used, coverage, counts, centroids = np.zeros(len(masks), bool), [], [], []
         for view, mask in enumerate(masks):
             image = without_haze(np.asarray(mask, np.float32))
-            used[view] = (image > _COVERED).any()
-            if not used[view]:
+            is_used[view] = (image > _COVERED).any()
+            if not is_used[view]:
                 continue
             centroids.append(_centroid(image))
             if valid is not None:
-                known = np.asarray(valid[view]) > _COVERED
-                image = _continued(image, known)
-                counts.append(_reduced(known.astype(np.float32), factor) > _FULL)
+                is_known = np.asarray(valid[view]) > _COVERED
+                image = _continued(image, is_known)
+                counts.append(_reduced(is_known.astype(np.float32), factor) > _FULL)
             coverage.append(_reduced(image, factor))
-        if not used.any():
+        if not is_used.any():
             raise ValueError("every mask is empty; check the alpha channel or the mask files")
         self.counts = np.stack(counts) if counts else None
         self.centroids = np.stack(centroids)
-        poses = np.asarray(world_to_camera, np.float64)[used]
+        poses = np.asarray(world_to_camera, np.float64)[is_used]
         centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
-        self.used = used
+        self.used = is_used
         self.rotations = poses[:, :3, :3]
         self.centers = centers
         # Capture coordinates may be large; relative to the cameras float32 suffices.
         self.origin = centers.mean(0)
-        shifted = np.einsum("vij,vj->vi", self.rotations, self.origin - centers)
-        self.pinholes = np.concatenate([self.rotations, shifted[..., None]], -1)
-        self.intrinsics = np.asarray(intrinsics, np.float64)[used] / np.array(
+        translations = np.einsum("vij,vj->vi", self.rotations, self.origin - centers)
+        self.pinholes = np.concatenate([self.rotations, translations[..., None]], -1)
+        self.intrinsics = np.asarray(intrinsics, np.float64)[is_used] / np.array(
             [[factor], [factor], [1.0]]
         )
         self.pixel_angle = 1.0 / float(np.median(self.intrinsics[:, 0, 0]))
@@ -330,31 +332,31 @@ def without_haze(coverage: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]
     -------
     (H, W) coverage.
     """
-    found = coverage
+    clear_coverage = coverage
     outline = ((coverage > _HAZE) & (coverage < 1.0 - _HAZE)).sum()
-    for whole in (0.0, 1.0):
-        is_near = np.abs(coverage - whole) <= _HAZE
-        is_among = is_near & ~_grown(~is_near)
-        if (is_among & (coverage != whole)).sum() > _MUCH_HAZE * outline:
-            found = np.where(is_near, np.float32(whole), found)
-    return found
+    for level in (0.0, 1.0):
+        is_near = np.abs(coverage - level) <= _HAZE
+        is_off_outline = is_near & ~_grown(~is_near)
+        if (is_off_outline & (coverage != level)).sum() > _MUCH_HAZE * outline:
+            clear_coverage = np.where(is_near, np.float32(level), clear_coverage)
+    return clear_coverage
 
 
-def _grown(where: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+def _grown(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     """Add the eight neighbours of every pixel."""
-    padded = np.pad(where, 1)
+    padded = np.pad(mask, 1)
     rows = padded[:-2] | padded[1:-1] | padded[2:]
     return rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
 
 
-def _continued(coverage: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _continued(coverage: np.ndarray, is_known: np.ndarray) -> np.ndarray:
     """Give pixels that do not count the coverage of the nearest one that does.
 
     A mask that is cut off by such pixels then has no edge along them.
     """
-    if known.all() or not known.any():
+    if is_known.all() or not is_known.any():
         return coverage
-    _, nearest = _nearest(known)
+    _, nearest = _nearest(is_known)
     return coverage[nearest]
 
 
@@ -371,10 +373,10 @@ def _reduced(coverage: np.ndarray, factor: int) -> np.ndarray:
 def _nearest(target: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
     """Distance of every element to the nearest one in ``target``, and the index of that one."""
     shape = target.shape
-    steps = np.empty(shape)
+    distances = np.empty(shape)
     index = np.empty((target.ndim, *shape), np.int32)
-    distance_transform_edt(~target, return_indices=True, distances=steps, indices=index)
-    return steps, tuple(np.asarray(axis) for axis in index)
+    distance_transform_edt(~target, return_indices=True, distances=distances, indices=index)
+    return distances, tuple(np.asarray(axis) for axis in index)
 
 
 def _signed_pixels(coverage: np.ndarray) -> np.ndarray:
@@ -383,39 +385,40 @@ def _signed_pixels(coverage: np.ndarray) -> np.ndarray:
     Within a partly covered pixel the edge lies ``coverage - 1/2`` from its centre (exact along the
     axes); every other pixel adds its distance to the nearest pixel that the edge may cross.
     """
-    beyond = float(sum(coverage.shape))
+    far_distance = float(sum(coverage.shape))
     signed = coverage - 0.5
-    for whole, sign in ((coverage >= _FULL, 1.0), (coverage <= _EMPTY, -1.0)):
-        if whole.all():
-            return np.full(coverage.shape, sign * beyond, np.float32)
-        if whole.any():
-            steps, nearest = _nearest(~whole)
-            further = sign * steps + coverage[nearest] - 0.5
-            signed = np.where(whole, further, signed)
+    for is_whole, sign in ((coverage >= _FULL, 1.0), (coverage <= _EMPTY, -1.0)):
+        if is_whole.all():
+            return np.full(coverage.shape, sign * far_distance, np.float32)
+        if is_whole.any():
+            distances, nearest = _nearest(~is_whole)
+            far_values = sign * distances + coverage[nearest] - 0.5
+            signed = np.where(is_whole, far_values, signed)
     return signed.astype(np.float32)
 
 
 def _evaluate(
-    view: _Silhouettes, points: np.ndarray, *, tolerance: float, seen_fraction: float
+    silhouettes: _Silhouettes, points: np.ndarray, *, tolerance: float, seen_fraction: float
 ) -> np.ndarray:
     """Evaluate the distance of points to the hull, a fixed number at a time (one compilation)."""
-    view_count = view.distances.shape[0]
+    view_count = silhouettes.distances.shape[0]
     tolerated = int(tolerance * view_count)
     least_seen = max(1, int(np.ceil(seen_fraction * view_count)))
     pinholes, intrinsics, distances = (
-        jnp.asarray(x, jnp.float32) for x in (view.pinholes, view.intrinsics, view.distances)
+        jnp.asarray(x, jnp.float32)
+        for x in (silhouettes.pinholes, silhouettes.intrinsics, silhouettes.distances)
     )
-    counts = None if view.counts is None else jnp.asarray(view.counts)
+    counts = None if silhouettes.counts is None else jnp.asarray(silhouettes.counts)
     results = []
     for start in range(0, points.shape[0], _POINTS_AT_ONCE):
-        part = points[start : start + _POINTS_AT_ONCE] - view.origin
+        chunk = points[start : start + _POINTS_AT_ONCE] - silhouettes.origin
         padded = np.zeros((_POINTS_AT_ONCE, 3), np.float32)
-        padded[: part.shape[0]] = part
-        worst, seen = _worst_distance(
+        padded[: chunk.shape[0]] = chunk
+        worst, seen_counts = _worst_distance(
             pinholes, intrinsics, distances, counts, jnp.asarray(padded), tolerated=tolerated
         )
-        kept = np.where(np.asarray(seen) >= least_seen, np.asarray(worst), np.inf)
-        results.append(kept[: part.shape[0]].astype(np.float32))
+        values = np.where(np.asarray(seen_counts) >= least_seen, np.asarray(worst), np.inf)
+        results.append(values[: chunk.shape[0]].astype(np.float32))
     return np.concatenate(results) if results else np.zeros(0, np.float32)
 
 
@@ -435,19 +438,19 @@ def _worst_distance(
     """
 
     def look(carry, view):
-        largest, seen = carry
-        pinhole, matrix, distance, counted = view
-        value, is_seen = _distance_in_view(pinhole, matrix, distance, counted, points)
-        kept = []
+        largest, seen_counts = carry
+        pinhole, matrix, distance, is_counted = view
+        value, is_seen = _distance_in_view(pinhole, matrix, distance, is_counted, points)
+        new_largest = []
         for current in largest:
-            kept.append(jnp.maximum(current, value))
+            new_largest.append(jnp.maximum(current, value))
             value = jnp.minimum(current, value)
-        return (tuple(kept), seen + is_seen.astype(jnp.int32)), None
+        return (tuple(new_largest), seen_counts + is_seen.astype(jnp.int32)), None
 
-    nothing = jnp.full(points.shape[:1], -jnp.inf, points.dtype)
-    start = ((nothing,) * (tolerated + 1), jnp.zeros(points.shape[:1], jnp.int32))
-    (largest, seen), _ = jax.lax.scan(look, start, (pinholes, intrinsics, distances, counts))
-    return largest[-1], seen
+    unseen_value = jnp.full(points.shape[:1], -jnp.inf, points.dtype)
+    start = ((unseen_value,) * (tolerated + 1), jnp.zeros(points.shape[:1], jnp.int32))
+    (largest, seen_counts), _ = jax.lax.scan(look, start, (pinholes, intrinsics, distances, counts))
+    return largest[-1], seen_counts
 
 
 def _distance_in_view(pinhole, intrinsics, distances, counts, points):
@@ -455,12 +458,12 @@ def _distance_in_view(pinhole, intrinsics, distances, counts, points):
     height, width = distances.shape
     local = jnp.matmul(points, pinhole[:, :3].T, precision="highest") + pinhole[None, :, 3]
     x, y, z = jnp.moveaxis(local, -1, 0)
-    ahead = z > 0.0
-    depth = jnp.where(ahead, z, 1.0)
+    is_ahead = z > 0.0
+    depth = jnp.where(is_ahead, z, 1.0)
     fx, fy = intrinsics[0, 0], intrinsics[1, 1]
     u = fx * x / depth + intrinsics[0, 2]
     v = fy * y / depth + intrinsics[1, 2]
-    seen = ahead & (u >= 0.0) & (u < width) & (v >= 0.0) & (v < height)
+    is_seen = is_ahead & (u >= 0.0) & (u < width) & (v >= 0.0) & (v < height)
     # Pixel centres lie at + 0.5; within half a pixel of the border the edge value is used.
     column = jnp.clip(u - 0.5, 0.0, width - 1.0)
     row = jnp.clip(v - 0.5, 0.0, height - 1.0)
@@ -472,18 +475,18 @@ def _distance_in_view(pinhole, intrinsics, distances, counts, points):
     corner = top * width + left
     flat = distances.reshape(-1).at
     if counts is not None:
-        own = jnp.minimum(v.astype(jnp.int32), height - 1) * width
-        own = own + jnp.minimum(u.astype(jnp.int32), width - 1)
-        own = jnp.where(seen, own, 0)
-        seen &= counts.reshape(-1).at[own].get(mode="promise_in_bounds")
+        pixel_index = jnp.minimum(v.astype(jnp.int32), height - 1) * width
+        pixel_index = pixel_index + jnp.minimum(u.astype(jnp.int32), width - 1)
+        pixel_index = jnp.where(is_seen, pixel_index, 0)
+        is_seen &= counts.reshape(-1).at[pixel_index].get(mode="promise_in_bounds")
     upper_left, upper_right, lower_left, lower_right = (
         flat[corner + step].get(mode="promise_in_bounds") for step in (0, right, down, right + down)
     )
     upper = (1.0 - s) * upper_left + s * upper_right
     lower = (1.0 - s) * lower_left + s * lower_right
-    pixels = (1.0 - t) * upper + t * lower
-    world = -pixels * depth * 2.0 / (fx + fy)
-    return jnp.where(seen, world, -jnp.inf), seen
+    pixel_distance = (1.0 - t) * upper + t * lower
+    world_distance = -pixel_distance * depth * 2.0 / (fx + fy)
+    return jnp.where(is_seen, world_distance, -jnp.inf), is_seen
 
 
 def meeting_point(
@@ -504,16 +507,16 @@ def meeting_point(
     ------
     ValueError : the lines are nearly parallel, or there is only one.
     """
-    sight = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    unit_directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     # Normal equations of min Σ |(I - d dᵀ)(x - c)|².
-    across = np.eye(3)[None] - sight[:, :, None] * sight[:, None, :]
-    matrix = across.sum(0)
+    projectors = np.eye(3)[None] - unit_directions[:, :, None] * unit_directions[:, None, :]
+    matrix = projectors.sum(0)
     if np.linalg.cond(matrix) > 1e6:
         raise ValueError(
             "the lines of sight are parallel or there is only one view, so the masks do not bound "
             "a volume; give the bounds"
         )
-    return np.linalg.solve(matrix, np.einsum("vij,vj->i", across, centers))
+    return np.linalg.solve(matrix, np.einsum("vij,vj->i", projectors, centers))
 
 
 def _centroid(coverage: Float[np.ndarray, "H W"]) -> Float[np.ndarray, " 2"]:
@@ -525,11 +528,11 @@ def _centroid(coverage: Float[np.ndarray, "H W"]) -> Float[np.ndarray, " 2"]:
     return np.array([column, row])
 
 
-def _common_target(view: _Silhouettes, intrinsics) -> tuple[np.ndarray, float]:
+def _common_target(silhouettes: _Silhouettes, intrinsics) -> tuple[np.ndarray, float]:
     """Point nearest to the lines of sight through the masks' centroids, and how far to search."""
-    pinhole = np.asarray(intrinsics, np.float64)[view.used]
-    u, v = view.centroids.T
-    sight = np.stack(
+    pinhole = np.asarray(intrinsics, np.float64)[silhouettes.used]
+    u, v = silhouettes.centroids.T
+    directions = np.stack(
         [
             (u - pinhole[:, 0, 2]) / pinhole[:, 0, 0],
             (v - pinhole[:, 1, 2]) / pinhole[:, 1, 1],
@@ -537,25 +540,25 @@ def _common_target(view: _Silhouettes, intrinsics) -> tuple[np.ndarray, float]:
         ],
         -1,
     )
-    sight = np.einsum("vji,vj->vi", view.rotations, sight)
-    center = meeting_point(view.centers, sight)
-    return center, float(np.median(np.linalg.norm(view.centers - center[None], axis=1)))
+    directions = np.einsum("vji,vj->vi", silhouettes.rotations, directions)
+    center = meeting_point(silhouettes.centers, directions)
+    return center, float(np.median(np.linalg.norm(silhouettes.centers - center[None], axis=1)))
 
 
-def _extend(near: Float[np.ndarray, "Z Y X"]) -> Float[np.ndarray, "Z Y X"]:
+def _extend(near_values: Float[np.ndarray, "Z Y X"]) -> Float[np.ndarray, "Z Y X"]:
     """Turn values that are right near the surface into a distance everywhere, in cells.
 
     Past the trusted band a vertex takes its distance to the nearest vertex of the band on its own
     side, plus that vertex's value.
     """
-    signed = near
+    signed = near_values
     for side in (1.0, -1.0):
-        value = side * near
+        value = side * near_values
         in_band = (value >= 0.0) & (value <= _BAND_CELLS)
         is_far = value > _BAND_CELLS
         if not in_band.any() or not is_far.any():
             continue
-        steps, nearest = _nearest(in_band)
-        further = side * (steps + value[nearest])
-        signed = np.where(is_far, further, signed)
+        distances, nearest = _nearest(in_band)
+        far_values = side * (distances + value[nearest])
+        signed = np.where(is_far, far_values, signed)
     return np.where(np.isfinite(signed), signed, _BAND_CELLS).astype(np.float32)

@@ -66,17 +66,20 @@ def crossings(field: Field) -> Crossings:
         lower = [slice(None)] * 3
         upper = [slice(None)] * 3
         lower[axis], upper[axis] = slice(0, -1), slice(1, None)
-        below, above = solid[tuple(lower)], solid[tuple(upper)]
+        lower_solid, upper_solid = solid[tuple(lower)], solid[tuple(upper)]
         step = np.eye(3, dtype=int)[axis]
-        for leaves, first, second in ((below & ~above, 0, 1), (above & ~below, 1, 0)):
-            corner = np.argwhere(leaves)
-            inside.append(corner + first * step)
-            outside.append(corner + second * step)
+        for is_crossing, inside_offset, outside_offset in (
+            (lower_solid & ~upper_solid, 0, 1),
+            (upper_solid & ~lower_solid, 1, 0),
+        ):
+            corner = np.argwhere(is_crossing)
+            inside.append(corner + inside_offset * step)
+            outside.append(corner + outside_offset * step)
     start, end = np.concatenate(inside), np.concatenate(outside)
     low, high = field[tuple(start.T)], field[tuple(end.T)]
     share = np.clip(low / (low - high), 0.02, 0.98)
-    smooth = np.asarray(ndimage.gaussian_filter(np.clip(field, -1.5, 1.5), 1.0))
-    slope = np.stack([np.gradient(smooth, axis=axis) for axis in range(3)], axis=-1)
+    smooth_field = np.asarray(ndimage.gaussian_filter(np.clip(field, -1.5, 1.5), 1.0))
+    slope = np.stack([np.gradient(smooth_field, axis=axis) for axis in range(3)], axis=-1)
     normal = slope[tuple(start.T)] + slope[tuple(end.T)]
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     return Crossings(
@@ -112,11 +115,11 @@ class Sight(NamedTuple):
 
         For an even number of views it is the lower one of the two middle values.
         """
-        ordered = np.sort(np.where(self.seen[..., None], self.color, np.inf), axis=0)
+        sorted_colors = np.sort(np.where(self.seen[..., None], self.color, np.inf), axis=0)
         count = self.seen.sum(0)
         middle = np.maximum(count - 1, 0) // 2
-        chosen = np.take_along_axis(ordered, middle[None, :, None], 0)[0]
-        return np.where(count[:, None] > 0, chosen, 0.0)
+        median_color = np.take_along_axis(sorted_colors, middle[None, :, None], 0)[0]
+        return np.where(count[:, None] > 0, median_color, 0.0)
 
     def difference(self, color: Float[np.ndarray, "... N 3"]) -> Float[np.ndarray, "V N"]:
         """Distance of a colour from the range of colours in the window, (V, N) in sRGB.
@@ -127,8 +130,8 @@ class Sight(NamedTuple):
         ----------
         color : (N, 3) for all views, or (V, N, 3).
         """
-        beyond = np.maximum(self.low - color, color - self.high)
-        return np.where(self.seen, np.maximum(beyond, 0.0).max(-1), 0.0)
+        excess = np.maximum(self.low - color, color - self.high)
+        return np.where(self.seen, np.maximum(excess, 0.0).max(-1), 0.0)
 
     def mean(self, values: Float[np.ndarray, "V N"]) -> Float[np.ndarray, " N"]:
         """Mean over the views that see a point, 0 where none does."""
@@ -172,27 +175,29 @@ class Photographed:
         ``factor`` : cells of ``grid`` along the side of a larger cell.
         """
         origin, cell = np.asarray(grid.origin, np.float64), factor * float(grid.cell_size)
-        number = min(len(images), _MOST_VIEWS)
-        chosen = np.unique(np.linspace(0, len(images) - 1, number).round().astype(int))
-        poses = np.asarray(world_to_camera, np.float64)[chosen]
+        view_count = min(len(images), _MOST_VIEWS)
+        view_indices = np.unique(np.linspace(0, len(images) - 1, view_count).round().astype(int))
+        poses = np.asarray(world_to_camera, np.float64)[view_indices]
         rotation, shift = poses[:, :3, :3], poses[:, :3, 3] + poses[:, :3, :3] @ origin
         centers = -np.einsum("vji,vj->vi", rotation, shift) / cell
-        lens = np.asarray(intrinsics, np.float64)[chosen]
+        lens = np.asarray(intrinsics, np.float64)[view_indices]
         middle = 0.5 * np.asarray(grid.shape) / factor
-        away = np.median(np.linalg.norm(centers - middle, axis=1))
-        pixels = max(1, round(float(np.median(lens[:, 0, 0]) / away)))
-        pictures = [_small(images[k], None if valid is None else valid[k], pixels) for k in chosen]
-        color, shows = (np.stack(part) for part in zip(*pictures, strict=True))
+        distance = np.median(np.linalg.norm(centers - middle, axis=1))
+        block_size = max(1, round(float(np.median(lens[:, 0, 0]) / distance)))
+        pictures = [
+            _small(images[k], None if valid is None else valid[k], block_size) for k in view_indices
+        ]
+        color, shows = (np.stack(maps) for maps in zip(*pictures, strict=True))
         color = _encoded(color, shows)
-        hidden = ~shows[..., None]
+        is_hidden = ~shows[..., None]
         window = (1, 3, 3, 1)
         return cls(
             np.concatenate([rotation, shift[..., None] / cell], -1).astype(np.float32),
             centers.astype(np.float32),
-            (lens / np.array([[pixels], [pixels], [1.0]])).astype(np.float32),
+            (lens / np.array([[block_size], [block_size], [1.0]])).astype(np.float32),
             np.stack([_filled(c, s) for c, s in zip(color, shows, strict=True)]),
-            ndimage.minimum_filter(np.where(hidden, np.float32(np.inf), color), window),
-            ndimage.maximum_filter(np.where(hidden, np.float32(-np.inf), color), window),
+            ndimage.minimum_filter(np.where(is_hidden, np.float32(np.inf), color), window),
+            ndimage.maximum_filter(np.where(is_hidden, np.float32(-np.inf), color), window),
             shows,
         )
 
@@ -214,9 +219,9 @@ class Photographed:
         enlargement.
         """
         steps = int(np.ceil(np.linalg.norm(solid.shape) / _STRIDE))
-        doubtful = jnp.asarray(ndimage.binary_dilation(solid))
+        dilated_solid = jnp.asarray(ndimage.binary_dilation(solid))
         return _in_parts(
-            lambda *points: _visible(doubtful, self.centers, *points, steps=steps),
+            lambda *points: _visible(dilated_solid, self.centers, *points, steps=steps),
             surface.position,
             surface.normal,
         )[0]
@@ -230,29 +235,31 @@ class Photographed:
         visible : (V, N) whether a view sees a point.
         """
         arrays = (self.pinholes, self.intrinsics, self.color, self.low, self.high, self.shows)
-        color, low, high, shown = _in_parts(lambda part: _sample(*arrays, part), points)
-        return Sight(color, low, high, shown & visible)
+        color, low, high, is_shown = _in_parts(lambda chunk: _sample(*arrays, chunk), points)
+        return Sight(color, low, high, is_shown & visible)
 
     def reflected(self, surface: Crossings) -> Int[np.ndarray, "V N"]:
         """Return the bin, (V, N), of the direction that a mirror at each point shows to a view."""
-        towards = self.centers[:, None] - surface.position[None]
-        towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+        view_directions = self.centers[:, None] - surface.position[None]
+        view_directions /= np.linalg.norm(view_directions, axis=-1, keepdims=True)
         normal = surface.normal[None]
-        mirrored = 2.0 * (towards * normal).sum(-1, keepdims=True) * normal - towards
-        place = np.floor(mirrored * _DIRECTIONS + 0.5).astype(int) + _DIRECTIONS + 1
-        return (place * (2 * _DIRECTIONS + 3) ** np.arange(3)).sum(-1)
+        mirrored = (
+            2.0 * (view_directions * normal).sum(-1, keepdims=True) * normal - view_directions
+        )
+        bins = np.floor(mirrored * _DIRECTIONS + 0.5).astype(int) + _DIRECTIONS + 1
+        return (bins * (2 * _DIRECTIONS + 3) ** np.arange(3)).sum(-1)
 
 
 def _in_parts(function: Any, *points: Float[np.ndarray, "N 3"]) -> tuple[np.ndarray, ...]:
     """Apply a function of (N, 3) arrays a fixed number at a time (one compilation)."""
     count = len(points[0])
-    parts = []
+    chunks = []
     for start in range(0, max(count, 1), _POINTS_AT_ONCE):
         rows = [array[start : start + _POINTS_AT_ONCE] for array in points]
-        room = ((0, _POINTS_AT_ONCE - len(rows[0])), (0, 0))
-        results = function(*(jnp.asarray(np.pad(array, room)) for array in rows))
-        parts.append([np.asarray(array)[:, : len(rows[0])] for array in results])
-    return tuple(np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
+        padding = ((0, _POINTS_AT_ONCE - len(rows[0])), (0, 0))
+        results = function(*(jnp.asarray(np.pad(array, padding)) for array in rows))
+        chunks.append([np.asarray(array)[:, : len(rows[0])] for array in results])
+    return tuple(np.concatenate(arrays, axis=1) for arrays in zip(*chunks, strict=True))
 
 
 @partial(jax.jit, static_argnames="steps")
@@ -273,16 +280,16 @@ def _visible(
     def seen_by(center):
         direction = safe_normalize(center[None] - points)
 
-        def look(step, blocked):
-            place = jnp.round(start + direction * (step.astype(start.dtype) * _STRIDE)).astype(
+        def look(step, is_blocked):
+            vertices = jnp.round(start + direction * (step.astype(start.dtype) * _STRIDE)).astype(
                 jnp.int32
             )
-            is_inside = jnp.all((place >= 0) & (place <= last[None]), axis=-1)
-            row = jnp.where(is_inside, (place * strides[None]).sum(-1), 0)
-            return blocked | (is_inside & flat.at[row].get(mode="promise_in_bounds"))
+            is_inside = jnp.all((vertices >= 0) & (vertices <= last[None]), axis=-1)
+            row = jnp.where(is_inside, (vertices * strides[None]).sum(-1), 0)
+            return is_blocked | (is_inside & flat.at[row].get(mode="promise_in_bounds"))
 
-        blocked = jax.lax.fori_loop(0, steps, look, jnp.zeros(points.shape[:1], bool))
-        return ((direction * normals).sum(-1) > _FACING) & ~blocked
+        is_blocked = jax.lax.fori_loop(0, steps, look, jnp.zeros(points.shape[:1], bool))
+        return ((direction * normals).sum(-1) > _FACING) & ~is_blocked
 
     return (jax.lax.map(seen_by, centers),)
 
@@ -301,7 +308,7 @@ def _sample(
     height, width = shows.shape[1:]
 
     def one(view):
-        pinhole, lens, image, least, largest, counted = view
+        pinhole, lens, image, least, largest, is_shown = view
         local = jnp.matmul(points, pinhole[:, :3].T, precision="highest") + pinhole[None, :, 3]
         x, y, z = jnp.moveaxis(local, -1, 0)
         depth = jnp.maximum(z, 1e-6)
@@ -316,12 +323,12 @@ def _sample(
         t = (row - top.astype(row.dtype))[:, None]
         upper = (1.0 - s) * image[top, left] + s * image[top, right]
         lower = (1.0 - s) * image[bottom, left] + s * image[bottom, right]
-        own = own_row, own_column
+        pixel = own_row, own_column
         return (
             (1.0 - t) * upper + t * lower,
-            least[own],
-            largest[own],
-            is_inside & counted[own],
+            least[pixel],
+            largest[pixel],
+            is_inside & is_shown[pixel],
         )
 
     return jax.lax.map(one, (pinholes, intrinsics, color, low, high, shows))
@@ -337,10 +344,10 @@ def _small(
         coverage = coverage * (np.asarray(valid) > 0.5)
     weighted = np.concatenate([rgba[..., :3] * coverage[..., None], coverage[..., None]], -1)
     height, width = (-(-size // factor) for size in rgba.shape[:2])
-    room = ((0, height * factor - rgba.shape[0]), (0, width * factor - rgba.shape[1]), (0, 0))
-    blocks = np.pad(weighted, room).reshape(height, factor, width, factor, 4).mean((1, 3))
-    covered = blocks[..., 3]
-    return blocks[..., :3] / np.maximum(covered, 1e-6)[..., None], covered >= _WHOLE
+    padding = ((0, height * factor - rgba.shape[0]), (0, width * factor - rgba.shape[1]), (0, 0))
+    blocks = np.pad(weighted, padding).reshape(height, factor, width, factor, 4).mean((1, 3))
+    block_coverage = blocks[..., 3]
+    return blocks[..., :3] / np.maximum(block_coverage, 1e-6)[..., None], block_coverage >= _WHOLE
 
 
 def _encoded(

@@ -76,30 +76,30 @@ class Connectivity(NamedTuple):
 
 def connectivity(faces: Int[np.ndarray, "F 3"]) -> Connectivity:
     """Find edges, neighbours and neighbouring faces; edges of three or more faces have no wings."""
-    directed = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
-    rows = np.sort(directed, axis=1)
-    edges, edge_of, count = np.unique(rows, axis=0, return_inverse=True, return_counts=True)
+    directed_edges = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+    sorted_edges = np.sort(directed_edges, axis=1)
+    edges, edge_of, count = np.unique(sorted_edges, axis=0, return_inverse=True, return_counts=True)
     edge_of = edge_of.reshape(-1)
     border = edges[count == 1]
     is_border = np.zeros(int(faces.max(initial=-1)) + 1, bool)
     is_border[border] = True
-    both = np.concatenate([edges, edges[:, ::-1]])
-    along = np.tile(count == 1, 2)
-    neighbours = both[~is_border[both[:, 0]] | along]
+    vertex_pairs = np.concatenate([edges, edges[:, ::-1]])
+    is_border_edge = np.tile(count == 1, 2)
+    neighbours = vertex_pairs[~is_border[vertex_pairs[:, 0]] | is_border_edge]
     neighbours = neighbours[np.lexsort((neighbours[:, 1], neighbours[:, 0]))]
     order = np.argsort(edge_of, kind="stable")
     pairs = order[np.isin(edge_of[order], np.flatnonzero(count == 2))].reshape(-1, 2)
-    forward = directed[pairs, 0] == rows[pairs, 0]
+    is_forward = directed_edges[pairs, 0] == sorted_edges[pairs, 0]
     return Connectivity(
         edges.astype(np.int32),
         neighbours.astype(np.int32),
         (pairs // 3).astype(np.int32),
-        forward[:, 0] == forward[:, 1],
+        is_forward[:, 0] == is_forward[:, 1],
     )
 
 
 def _without_slivers(
-    near: Connectivity, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+    adjacency: Connectivity, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Connectivity:
     """Leave out the wings of faces that start as slivers.
 
@@ -108,10 +108,10 @@ def _without_slivers(
     """
     sides = vertices[np.roll(faces, -1, axis=1)] - vertices[faces]
     lengths = np.linalg.norm(sides, axis=-1)
-    doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1)
-    is_sliver = doubled <= _LEAST_HEIGHT * lengths.mean() * lengths.max(axis=1)
-    kept = ~is_sliver[near.wings].any(axis=1)
-    return near._replace(wings=near.wings[kept], turned=near.turned[kept])
+    doubled_areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1)
+    is_sliver = doubled_areas <= _LEAST_HEIGHT * lengths.mean() * lengths.max(axis=1)
+    is_kept = ~is_sliver[adjacency.wings].any(axis=1)
+    return adjacency._replace(wings=adjacency.wings[is_kept], turned=adjacency.turned[is_kept])
 
 
 class TriangleMesh(SurfaceModel):
@@ -160,14 +160,14 @@ class TriangleMesh(SurfaceModel):
     ) -> "TriangleMesh":
         """Make the surface of a mesh in which every vertex belongs to a face (host side)."""
         vertices = np.asarray(vertices, np.float64)
-        near = _without_slivers(connectivity(faces), vertices, faces)
-        ends = vertices[near.edges]
+        adjacency = _without_slivers(connectivity(faces), vertices, faces)
+        ends = vertices[adjacency.edges]
         lengths = np.sqrt(np.sum((ends[:, 1] - ends[:, 0]) ** 2, axis=-1))
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         half = 0.5 * _BOX_MARGIN * float(np.max(high - low))
-        degrees = np.bincount(near.neighbours[:, 0], minlength=len(vertices))
-        signs = np.where(near.turned, -1.0, 1.0)
-        indices = (faces.astype(np.int32), near.edges, near.neighbours, near.wings)
+        degrees = np.bincount(adjacency.neighbours[:, 0], minlength=len(vertices))
+        signs = np.where(adjacency.turned, -1.0, 1.0)
+        indices = (faces.astype(np.int32), adjacency.edges, adjacency.neighbours, adjacency.wings)
         numbers = (signs, lengths, np.maximum(degrees, 1), lengths.mean())
         return cls(
             jnp.asarray(vertices, dtype),
@@ -222,9 +222,9 @@ class TriangleMesh(SurfaceModel):
         """Return the mesh; in training that of a sheet holds all fronts, then all backs."""
         vertices, faces = self.positions(shape), self.faces
         if self.is_sheet and not final:
-            backs = faces[:, ::-1] + vertices.shape[0]
+            back_faces = faces[:, ::-1] + vertices.shape[0]
             vertices = jnp.concatenate([vertices, vertices])
-            faces = jnp.concatenate([faces, backs])
+            faces = jnp.concatenate([faces, back_faces])
         counts = (jnp.int32(vertices.shape[0]), jnp.int32(faces.shape[0]))
         return Surface(Mesh(vertices, faces, *counts), {})
 
@@ -242,8 +242,8 @@ class TriangleMesh(SurfaceModel):
 
     def _laplacian(self, vertices: Float[Array, "V 3"]) -> Float[Array, ""]:
         vertex, neighbour = self.neighbours[:, 0], self.neighbours[:, 1]
-        ways = vertices[neighbour] - vertices.at[vertex].get(indices_are_sorted=True)
-        total = jnp.zeros_like(vertices).at[vertex].add(ways, indices_are_sorted=True)
+        offsets = vertices[neighbour] - vertices.at[vertex].get(indices_are_sorted=True)
+        total = jnp.zeros_like(vertices).at[vertex].add(offsets, indices_are_sorted=True)
         return jnp.mean(jnp.sum((total / self.degrees[:, None]) ** 2, axis=-1))
 
     def _normal_consistency(self, mesh: Mesh) -> Float[Array, ""]:

@@ -45,8 +45,8 @@ def matt(materials: Materials, diffuse_light: Float[Array, "N 3"]) -> Shaded:
 
     ``diffuse_light`` : (N, 3) irradiance / pi.
     """
-    diffuse, none = materials.albedo * diffuse_light, jnp.zeros_like(diffuse_light)
-    return Shaded(diffuse, diffuse, none, diffuse_light, none)
+    diffuse, no_light = materials.albedo * diffuse_light, jnp.zeros_like(diffuse_light)
+    return Shaded(diffuse, diffuse, no_light, diffuse_light, no_light)
 
 
 class Illumination(eqx.Module):

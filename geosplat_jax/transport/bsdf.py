@@ -68,8 +68,8 @@ def specular_f0(
 
 def schlick(f0: Float[Array, "N 3"], cosine: Float[Array, " N"]) -> Float[Array, "N 3"]:
     """Fresnel reflectance at an angle (Schlick 1994); the cosine is clamped to [0, 1]."""
-    rest = 1 - jnp.clip(cosine, 0.0, 1.0)
-    return f0 + (1 - f0) * (rest**5)[:, None]
+    complement = 1 - jnp.clip(cosine, 0.0, 1.0)
+    return f0 + (1 - f0) * (complement**5)[:, None]
 
 
 def _cross_squared(first: Components, second: Components) -> Array:
@@ -150,25 +150,25 @@ def specular_lobe(normals: Components, wi: Components, wo: Components, alpha: Ar
     is_above = (cosine_i > 0) & (cosine_o > 0)
     floored_i = jnp.maximum(cosine_i, COSINE_EPSILON)
     floored_o = jnp.maximum(cosine_o, COSINE_EPSILON)
-    between = tuple(a + b for a, b in zip(wi, wo, strict=True))
-    length = safe_sqrt(_along(between, between))
+    half_vector = tuple(a + b for a, b in zip(wi, wo, strict=True))
+    length = safe_sqrt(_along(half_vector, half_vector))
     inverse = safe_divide(jnp.ones_like(length), length, smallest=_OPPOSITE)
-    cosine_h = _along(normals, between) * inverse
-    sine_squared = _cross_squared(between, normals) * jnp.square(inverse)
+    cosine_h = _along(normals, half_vector) * inverse
+    sine_squared = _cross_squared(half_vector, normals) * jnp.square(inverse)
     distribution = _distribution(cosine_h, sine_squared, alpha)
     strength = distribution * smith_visibility(floored_i, floored_o, alpha)
     # wi . half = wo . half = |wi + wo| / 2.
-    rest = 1 - jnp.minimum(0.5 * length, 1.0)
+    complement = 1 - jnp.minimum(0.5 * length, 1.0)
     # G1(wo) D / (4 n.wo), Heitz 2018 Eq. 3 and 17, with G1 = 2 n.wo / (n.wo + root). As in the
     # sampling, with which the density must agree, the cosine has no floor above zero: the root is
     # at least alpha.
-    seen = jnp.maximum(cosine_o, 0.0)
+    clamped_o = jnp.maximum(cosine_o, 0.0)
     return Lobe(
         cosine=jnp.maximum(cosine_i, 0.0),
         strength=jnp.where(is_above, strength, 0.0),
-        grazing=rest**5,
+        grazing=complement**5,
         is_above=is_above,
-        density=distribution / (2 * (seen + _smith_root(seen, alpha))),
+        density=distribution / (2 * (clamped_o + _smith_root(clamped_o, alpha))),
     )
 
 
@@ -319,17 +319,17 @@ def specular_directions(
     """
     alpha, normals, wo = jax.lax.stop_gradient((alpha, normals, wo))
     tangent, bitangent = _frame(normals)
-    up = jnp.maximum(_along(wo, normals), 0.0)
-    local = (_along(wo, tangent), _along(wo, bitangent), up)
-    view = _unit((alpha * local[0], alpha * local[1], up))
+    cosine = jnp.maximum(_along(wo, normals), 0.0)
+    local = (_along(wo, tangent), _along(wo, bitangent), cosine)
+    view = _unit((alpha * local[0], alpha * local[1], cosine))
     azimuth = 2 * math.pi * first
     # A uniform point of the spherical cap that a mirror hemisphere reflects the view into.
     z = (1 - second) * (1 + view[2]) - view[2]
     radius = safe_sqrt(1 - z * z)
     cap = (radius * jnp.cos(azimuth) + view[0], radius * jnp.sin(azimuth) + view[1], z + view[2])
     half = jax.lax.optimization_barrier(_unit((alpha * cap[0], alpha * cap[1], cap[2])))
-    twice = 2 * _along(local, half)
-    mirrored = tuple(twice * h - v for h, v in zip(half, local, strict=True))
+    twice_cosine = 2 * _along(local, half)
+    mirrored = tuple(twice_cosine * h - v for h, v in zip(half, local, strict=True))
     return jax.lax.stop_gradient(_to_world(mirrored, (tangent, bitangent, normals)))
 
 
@@ -337,8 +337,8 @@ def sample_cosine(
     normals: Float[Array, "N 3"], uniforms: Float[Array, "N 2"]
 ) -> Float[Array, "N 3"]:
     """Draw unit directions with density `cosine_pdf` about unit normals; no gradients."""
-    found = cosine_directions(_components(normals), uniforms[:, 0], uniforms[:, 1])
-    return jnp.stack(found, axis=-1)
+    directions = cosine_directions(_components(normals), uniforms[:, 0], uniforms[:, 1])
+    return jnp.stack(directions, axis=-1)
 
 
 def sample_specular(

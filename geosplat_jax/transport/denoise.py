@@ -60,9 +60,9 @@ class DenoiseSpec:
 def _shifted(maps: Float[Array, "... H W"], dy: int, dx: int) -> Float[Array, "... H W"]:
     """Values ``(dy, dx)`` further on; zero outside the image."""
     height, width = maps.shape[-2:]
-    none = [(0, 0)] * (maps.ndim - 2)
-    sides = [*none, (max(-dy, 0), max(dy, 0)), (max(-dx, 0), max(dx, 0))]
-    padded = jnp.pad(maps, sides)
+    leading_widths = [(0, 0)] * (maps.ndim - 2)
+    widths = [*leading_widths, (max(-dy, 0), max(dy, 0)), (max(-dx, 0), max(dx, 0))]
+    padded = jnp.pad(maps, widths)
     top, left = max(dy, 0), max(dx, 0)
     return padded[..., top : top + height, left : left + width]
 
@@ -75,10 +75,10 @@ def _gradient(
     A jump on one side does not count, nor does a neighbour without a surface.
     """
     step = (1, 0) if axis == 0 else (0, 1)
-    back = (-step[0], -step[1])
+    back_step = (-step[0], -step[1])
     forward = _shifted(values, *step) - values
-    backward = values - _shifted(values, *back)
-    has_next, has_previous = _shifted(is_visible, *step) > 0, _shifted(is_visible, *back) > 0
+    backward = values - _shifted(values, *back_step)
+    has_next, has_previous = _shifted(is_visible, *step) > 0, _shifted(is_visible, *back_step) > 0
     forward, backward = (
         jnp.where(has_next, forward, jnp.where(has_previous, backward, 0.0)),
         jnp.where(has_previous, backward, jnp.where(has_next, forward, 0.0)),
@@ -103,11 +103,15 @@ def _guide_maps(
     and the squared cosine between surface and image plane, divided by ``depth_sigma**2``.
     """
     is_visible = (alpha > 0).astype(alpha.dtype)
-    unit = safe_normalize(normals)
-    straight = safe_divide(albedo, alpha[..., None])
+    unit_normals = safe_normalize(normals)
+    straight_albedo = safe_divide(albedo, alpha[..., None])
     # |n - m|^2 / 2 = 1 - cos.
     features = jnp.concatenate(
-        [math.sqrt(0.5 * spec.normal_sharpness) * unit, straight / spec.albedo_sigma], axis=-1
+        [
+            math.sqrt(0.5 * spec.normal_sharpness) * unit_normals,
+            straight_albedo / spec.albedo_sigma,
+        ],
+        axis=-1,
     )
     height = focal * safe_log(safe_divide(depth, alpha))
     slope_y = _gradient(height, is_visible, 0)
@@ -149,8 +153,8 @@ def _harmonic_mean(a: Float[Array, "H W"], b: Float[Array, "H W"]) -> Float[Arra
     Where the slopes agree, the result is as accurate as their mean. At a pixel on a jump the slope
     is large and wrong; the result then follows the smaller slope, of the other pixel.
     """
-    agree = a * b > 0
-    return jnp.where(agree, 2 * a * b / jnp.where(agree, a + b, 1.0), 0.0)
+    has_same_sign = a * b > 0
+    return jnp.where(has_same_sign, 2 * a * b / jnp.where(has_same_sign, a + b, 1.0), 0.0)
 
 
 def _pair_weights(
@@ -163,17 +167,19 @@ def _pair_weights(
     padded = _pad(maps, spread)
     weights = []
     for dy, dx in _taps(shape, spread):
-        other = _window(padded, shape, dy, dx, spread)
-        distance = sum((other[k] - maps[k]) ** 2 for k in range(6))
+        neighbour = _window(padded, shape, dy, dx, spread)
+        distance = sum((neighbour[k] - maps[k]) ** 2 for k in range(6))
         rise = _harmonic_mean(
-            spread * (dy * maps[7] + dx * maps[8]), spread * (dy * other[7] + dx * other[8])
+            spread * (dy * maps[7] + dx * maps[8]), spread * (dy * neighbour[7] + dx * neighbour[8])
         )
-        off = other[6] - maps[6] - rise
+        plane_offset = neighbour[6] - maps[6] - rise
         # The cosine of the less tilted pixel: one on a jump seems steep, and a small cosine would
         # make its weights large.
-        stiffness = jnp.maximum(other[9], maps[9]) / (spread * math.hypot(dy, dx))
+        stiffness = jnp.maximum(neighbour[9], maps[9]) / (spread * math.hypot(dy, dx))
         kernel = _B3[abs(dy)] * _B3[abs(dx)]
-        weights.append(kernel * other[10] * jnp.exp(-(distance + off * off * stiffness)))
+        weights.append(
+            kernel * neighbour[10] * jnp.exp(-(distance + plane_offset * plane_offset * stiffness))
+        )
     if not weights:
         return jnp.zeros((0, *shape), features.dtype)
     return jax.lax.optimization_barrier(jnp.stack(weights))
@@ -187,10 +193,10 @@ def _gather_primal(
     padded, padded_weights = _pad(values, spread), _pad(weights, spread)
     total = _B3[0] * _B3[0] * values
     for k, (dy, dx) in enumerate(_taps(shape, spread)):
-        ahead = _window(padded, shape, dy, dx, spread)
-        behind = _window(padded, shape, -dy, -dx, spread)
+        values_ahead = _window(padded, shape, dy, dx, spread)
+        values_behind = _window(padded, shape, -dy, -dx, spread)
         weight_behind = _window(padded_weights[k], shape, -dy, -dx, spread)
-        total = total + weights[k][None] * ahead + weight_behind[None] * behind
+        total = total + weights[k][None] * values_ahead + weight_behind[None] * values_behind
     return jax.lax.optimization_barrier(total)
 
 

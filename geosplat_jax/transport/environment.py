@@ -60,8 +60,8 @@ class LightSpec:
                 "64 x 128"
             )
         levels = self.roughness
-        increasing = all(a < b for a, b in zip(levels, levels[1:], strict=False))
-        if len(levels) < 2 or not increasing or levels[0] < 0 or levels[-1] != 1.0:
+        is_increasing = all(a < b for a, b in zip(levels, levels[1:], strict=False))
+        if len(levels) < 2 or not is_increasing or levels[0] < 0 or levels[-1] != 1.0:
             raise ValueError(
                 f"roughness levels must increase from >= 0 to exactly 1, got {levels}; "
                 "use e.g. (0.0, 0.2, 0.5, 1.0)"
@@ -244,8 +244,8 @@ def rotate_light(
     rows, columns = height * subsamples, width * subsamples
     directions = jnp.asarray(_texel_directions(rows, columns).reshape(-1, 3), rotation.dtype)
     # Rows of d^T R are R^T d.
-    turned = jnp.matmul(directions, rotation, precision="highest")
-    radiance = lookup(light.radiance, turned).reshape(rows, columns, channels)
+    source_directions = jnp.matmul(directions, rotation, precision="highest")
+    radiance = lookup(light.radiance, source_directions).reshape(rows, columns, channels)
     return downsample_light(EnvLight(radiance), factor=subsamples)
 
 
@@ -325,9 +325,9 @@ def _lobe_row(polar: float, rings, spokes: int, height: int, width: int) -> np.n
 def _zonal_matrices(spec: LightSpec) -> np.ndarray:
     """Build the float32 (W/2+1, K*H, H) matrices of the filtered levels."""
     height, width = spec.height, spec.width
-    filtered = [r for r in spec.roughness if r > 0]
-    matrices = np.empty((len(filtered), height, height, width // 2 + 1), np.float32)
-    for level, roughness in enumerate(filtered):
+    roughnesses = [r for r in spec.roughness if r > 0]
+    matrices = np.empty((len(roughnesses), height, height, width // 2 + 1), np.float32)
+    for level, roughness in enumerate(roughnesses):
         rings = _lobe_rings(roughness, 2 * height + 128)
         for i in range((height + 1) // 2):
             polar = (i + 0.5) / height * np.pi
@@ -336,14 +336,14 @@ def _zonal_matrices(spec: LightSpec) -> np.ndarray:
             spectrum = np.fft.rfft(weights, axis=1).real
             matrices[level, i] = spectrum
             matrices[level, height - 1 - i] = spectrum[::-1]
-    stacked = matrices.reshape(len(filtered) * height, height, width // 2 + 1)
+    stacked = matrices.reshape(len(roughnesses) * height, height, width // 2 + 1)
     return np.ascontiguousarray(np.moveaxis(stacked, -1, 0))
 
 
 def operator_bytes(spec: LightSpec) -> int:
     """Count the bytes of `prefilter_operators`: ``4 K H^2 (W/2+1)`` for K filtered levels."""
-    filtered = sum(roughness > 0 for roughness in spec.roughness)
-    return 4 * filtered * spec.height**2 * (spec.width // 2 + 1)
+    level_count = sum(roughness > 0 for roughness in spec.roughness)
+    return 4 * level_count * spec.height**2 * (spec.width // 2 + 1)
 
 
 def prefilter_operators(spec: LightSpec) -> PrefilterOperators:
@@ -387,11 +387,11 @@ def prefilter(
             "build them with prefilter_operators(LightSpec(height, width))"
         )
     spectrum = jnp.fft.rfft(radiance, axis=1)  # (H, M, 3)
-    parts = jnp.concatenate([spectrum.real, spectrum.imag], axis=-1)
+    coefficients = jnp.concatenate([spectrum.real, spectrum.imag], axis=-1)
     zonal = operators.zonal.astype(radiance.dtype)
     if diffuse_only:
         zonal = zonal[:, -height:]
-    filtered = jnp.einsum("moi,imc->mco", zonal, parts, precision="highest")  # (M, 6, K*H)
+    filtered = jnp.einsum("moi,imc->mco", zonal, coefficients, precision="highest")  # (M, 6, K*H)
     filtered = jax.lax.complex(filtered[:, :3], filtered[:, 3:])
     rows = jnp.fft.irfft(filtered, n=width, axis=0)  # (W, 3, K*H)
     levels = rows.reshape(width, 3, -1, height).transpose(2, 3, 0, 1)

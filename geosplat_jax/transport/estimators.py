@@ -105,29 +105,31 @@ def gather(
     -------
     `Gathered` light of the N points; zero where the mask is false.
     """
-    total = samples.weights.shape[1]
-    shared = samples.light_density.shape[1] if has_specular else 0
-    followed = indirect.followed(points, samples.directions, samples.hits, samples.distances)
-    rows, restore = _split(followed)
+    sample_count = samples.weights.shape[1]
+    light_count = samples.light_density.shape[1] if has_specular else 0
+    model = indirect.followed(points, samples.directions, samples.hits, samples.distances)
+    rows, restore = _split(model)
 
-    def one_chunk(parts: tuple) -> tuple[Array, Array]:
-        normals, samples, rows = parts
+    def one_chunk(inputs: tuple) -> tuple[Array, Array]:
+        normals, samples, rows = inputs
         directions = jnp.moveaxis(samples.directions, 1, 0)
         diffuse, specular = _arriving(light, restore(rows), directions, samples.hits.T)
         cosine = jnp.maximum(jnp.sum(normals[None] * directions, axis=-1), 0.0)
         share = samples.weights.T * cosine / np.pi
         diffuse_light = jnp.sum(diffuse * share[..., None], axis=0)
-        is_used = samples.weights[:, :shared, None] > 0
-        brought = jnp.moveaxis(specular[:shared], 0, 1)
+        is_used = samples.weights[:, :light_count, None] > 0
+        light_radiance = jnp.moveaxis(specular[:light_count], 0, 1)
         if samples.light_factors is not None:
-            brought = brought * samples.light_factors[:, :shared, None]
-        return diffuse_light, jnp.where(is_used, brought, 0.0)
+            light_radiance = light_radiance * samples.light_factors[:, :light_count, None]
+        return diffuse_light, jnp.where(is_used, light_radiance, 0.0)
 
     arguments = (points.normals, samples, rows)
-    diffuse_light, radiance = in_chunks(one_chunk, arguments, points.mask, total)
-    density = samples.light_density[:, :shared]
+    diffuse_light, radiance = in_chunks(one_chunk, arguments, points.mask, sample_count)
+    density = samples.light_density[:, :light_count]
     is_chosen = samples.light_factors is not None
-    return Gathered(diffuse_light, samples.directions[:, :shared], radiance, density, is_chosen)
+    return Gathered(
+        diffuse_light, samples.directions[:, :light_count], radiance, density, is_chosen
+    )
 
 
 def _specular_sums(
@@ -152,11 +154,11 @@ def _specular_sums(
     weight = jnp.where(mask[None, :], safe_divide(jnp.ones_like(density), density), 0.0)
     share = weight * lobe.strength * lobe.cosine
     # The Fresnel factor is f0 + (1 - f0) grazing, and f0 does not depend on the direction.
-    bare = jnp.stack([jnp.sum(share * channel, axis=0) for channel in radiance], axis=-1)
+    bare_sum = jnp.stack([jnp.sum(share * channel, axis=0) for channel in radiance], axis=-1)
     share = share * lobe.grazing
-    at_grazing = jnp.stack([jnp.sum(share * channel, axis=0) for channel in radiance], axis=-1)
+    grazing_sum = jnp.stack([jnp.sum(share * channel, axis=0) for channel in radiance], axis=-1)
     f0 = bsdf.specular_f0(materials.albedo, materials.metallic)
-    return f0 * bare + (1 - f0) * at_grazing, bare
+    return f0 * bare_sum + (1 - f0) * grazing_sum, bare_sum
 
 
 def reflect(
@@ -211,25 +213,27 @@ def reflect(
     )
     if gathered.is_chosen:
         # Reservoirs chose by the unflipped normal: they hold no samples above the flipped one.
-        faces_viewer = cosine >= 0
+        is_facing = cosine >= 0
         gathered = replace(
             gathered,
-            radiance=jnp.where(faces_viewer[..., None], gathered.radiance, 0.0),
-            density=jnp.where(faces_viewer, gathered.density, 0.0),
+            radiance=jnp.where(is_facing[..., None], gathered.radiance, 0.0),
+            density=jnp.where(is_facing, gathered.density, 0.0),
         )
-        rays = replace(rays, light_density=jnp.where(faces_viewer, rays.light_density, 0.0))
-    followed = indirect.followed(points, rays.directions, rays.hits, rays.distances)
-    rows, restore = _split(followed)
+        rays = replace(rays, light_density=jnp.where(is_facing, rays.light_density, 0.0))
+    model = indirect.followed(points, rays.directions, rays.hits, rays.distances)
+    rows, restore = _split(model)
 
-    def one_chunk(parts: tuple) -> tuple[Array, Array]:
-        points, materials, wo, gathered, rays, rows = parts
-        drawn = rays.directions
-        _, brought = _arriving(light, restore(rows), jnp.moveaxis(drawn, 1, 0), rays.hits.T)
-        wi = jnp.concatenate([gathered.directions.T, drawn.T], axis=1)
-        radiance = [gathered.radiance.T, jnp.moveaxis(brought, -1, 0)]
-        light_part = jnp.concatenate([gathered.density.T, rays.light_density.T])
-        found = (wi, jnp.concatenate(radiance, axis=1), light_part)
-        return _specular_sums(materials, points.normals, wo, found, points.mask, counts)
+    def one_chunk(inputs: tuple) -> tuple[Array, Array]:
+        points, materials, wo, gathered, rays, rows = inputs
+        directions = rays.directions
+        _, ray_radiance = _arriving(
+            light, restore(rows), jnp.moveaxis(directions, 1, 0), rays.hits.T
+        )
+        wi = jnp.concatenate([gathered.directions.T, directions.T], axis=1)
+        radiance = [gathered.radiance.T, jnp.moveaxis(ray_radiance, -1, 0)]
+        light_density = jnp.concatenate([gathered.density.T, rays.light_density.T])
+        merged_rays = (wi, jnp.concatenate(radiance, axis=1), light_density)
+        return _specular_sums(materials, points.normals, wo, merged_rays, points.mask, counts)
 
     samples = counts.light + counts.specular
     arguments = (points, materials, wo, gathered, rays, rows)

@@ -159,8 +159,8 @@ class TracedIndirect(Indirect):
 
     def incoming(self, directions: Float[Array, "N 3"], hits: Int[Array, " N"]) -> Lobes:
         """Look up the face that is hit."""
-        sent = self.values.at[jnp.maximum(hits, 0)].get(mode="clip")
-        radiance = jnp.where((hits >= 0)[:, None], sent, 0.0)
+        face_radiance = self.values.at[jnp.maximum(hits, 0)].get(mode="clip")
+        radiance = jnp.where((hits >= 0)[:, None], face_radiance, 0.0)
         return radiance, radiance
 
 
@@ -283,7 +283,7 @@ def outgoing(
     -------
     (F, 3) linear radiance.
     """
-    matt = materials.albedo * (1 - materials.metallic)[:, None]
+    reflectance = materials.albedo * (1 - materials.metallic)[:, None]
     if materials.has_specular:
-        matt = matt + specular_f0(materials.albedo, materials.metallic)
-    return mean_over_faces(points, matt * diffuse_light, face_count)
+        reflectance = reflectance + specular_f0(materials.albedo, materials.metallic)
+    return mean_over_faces(points, reflectance * diffuse_light, face_count)

@@ -43,9 +43,9 @@ class LightSampler(eqx.Module):
 
 def _blurred(brightness: Float[Array, "H W"]) -> Float[Array, "H W"]:
     """Average over neighbours with weights 1 2 1; columns wrap, rows repeat at the poles."""
-    along = 0.25 * (jnp.roll(brightness, 1, 1) + jnp.roll(brightness, -1, 1)) + 0.5 * brightness
-    padded = jnp.concatenate([along[:1], along, along[-1:]])
-    return 0.25 * (padded[:-2] + padded[2:]) + 0.5 * along
+    means = 0.25 * (jnp.roll(brightness, 1, 1) + jnp.roll(brightness, -1, 1)) + 0.5 * brightness
+    padded = jnp.concatenate([means[:1], means, means[-1:]])
+    return 0.25 * (padded[:-2] + padded[2:]) + 0.5 * means
 
 
 def light_sampler(light: EnvLight) -> LightSampler:
@@ -62,8 +62,8 @@ def light_sampler(light: EnvLight) -> LightSampler:
     share = jnp.where(total > 0, power / jnp.where(total > 0, total, 1.0), 0.0)
     uniform = solid_angle / (4 * math.pi)
     share = jnp.where(total > 0, (1 - _UNIFORM_SHARE) * share + _UNIFORM_SHARE * uniform, uniform)
-    in_row = jnp.sum(share, axis=1)
-    return LightSampler(_cumulative(in_row[None]), _cumulative(share), share / solid_angle)
+    row_shares = jnp.sum(share, axis=1)
+    return LightSampler(_cumulative(row_shares[None]), _cumulative(share), share / solid_angle)
 
 
 def _cumulative(share: Float[Array, "R n"]) -> Float[Array, "R n"]:
@@ -95,8 +95,8 @@ def _drawn(
     entry = jax.lax.optimization_barrier(entry)
     lower = jnp.where(entry > 0, at(jnp.maximum(entry - 1, 0)), 0.0)
     width = at(entry) - lower
-    rest = (uniforms - lower) / jnp.where(width > 0, width, 1.0)
-    return entry, jnp.clip(rest, 0.0, 1.0)
+    fraction = (uniforms - lower) / jnp.where(width > 0, width, 1.0)
+    return entry, jnp.clip(fraction, 0.0, 1.0)
 
 
 def sample_light(

@@ -73,8 +73,8 @@ class MonteCarloSettings(SampledSettings, TransportSettings, kind="monte_carlo")
     @property
     def relative_cost(self) -> float:
         """Measured: each ray per splat adds a fifth; the second image has three kinds of rays."""
-        drawn = self.light_count + self.diffuse_count + self.specular_count
-        return 1.0 + 0.2 * (drawn + 3 * self.residual_count)
+        sample_count = self.light_count + self.diffuse_count + self.specular_count
+        return 1.0 + 0.2 * (sample_count + 3 * self.residual_count)
 
     def warnings(self) -> list[str]:
         """Name settings that have no effect with the others, such as traced light without rays."""
@@ -166,17 +166,17 @@ class MonteCarlo(SampledTransport):
                 key, points, light, sampler, index, carry, finds_nearest=finds_nearest
             )
             has_specular = attributes.materials.has_specular
-            how: dict[str, Any] = {"has_specular": has_specular}
-            arriving = traced or self._learned(attributes)
-            gathered = gather(points, samples, light, arriving, **how)
+            options: dict[str, Any] = {"has_specular": has_specular}
+            indirect = traced or self._learned(attributes)
+            gathered = gather(points, samples, light, indirect, **options)
             # What faces send out after one bounce is the indirect light of the next.
             for _ in range(self.settings.bounces if is_traced else 0):
                 assert index is not None
-                sent = outgoing(
+                face_radiance = outgoing(
                     attributes.materials, gathered.diffuse_light, points, index.face_capacity
                 )
-                traced = TracedIndirect(sent)
-                gathered = gather(points, samples, light, traced, **how)
+                traced = TracedIndirect(face_radiance)
+                gathered = gather(points, samples, light, traced, **options)
         if not self.settings.shares_views:
             gathered = None
         return SampledIllumination(light, sampler, traced, gathered), carry
@@ -197,11 +197,11 @@ class MonteCarlo(SampledTransport):
         indirect = illumination.traced
         if indirect is None:
             indirect = self._learned(attributes)
-        how = {"counts": self._counts, "finds_nearest": self._finds_nearest(index)}
+        options = {"counts": self._counts, "finds_nearest": self._finds_nearest(index)}
         own_key, shared_key = jax.random.split(key)
         open_only = self._open_only and gathered is not None
         if gathered is None:
-            samples = draw_samples(shared_key, points, sampler, index, **how)
+            samples = draw_samples(shared_key, points, sampler, index, **options)
             has_specular = attributes.materials.has_specular
             gathered = gather(points, samples, light, indirect, has_specular=has_specular)
         return reflect(
@@ -215,7 +215,7 @@ class MonteCarlo(SampledTransport):
             index,
             indirect,
             open_only=open_only,
-            **how,
+            **options,
         )
 
     def disagreement(
@@ -240,8 +240,8 @@ class MonteCarlo(SampledTransport):
         row_key, direction_key, sample_key = jax.random.split(key, 3)
         # Real rows come first.
         total = jnp.sum(points.mask).astype(jnp.float32)
-        drawn = jax.random.uniform(row_key, (count,), jnp.float32)
-        rows = jnp.floor(drawn * total).astype(jnp.int32)
+        uniforms = jax.random.uniform(row_key, (count,), jnp.float32)
+        rows = jnp.floor(uniforms * total).astype(jnp.int32)
         points, attributes = jax.tree.map(lambda x: x[rows], (points, attributes))
         numbers = jax.random.uniform(direction_key, (count, 2), jnp.float32)
         wo = bsdf.sample_cosine(points.outward, numbers.astype(points.outward.dtype))
@@ -250,5 +250,5 @@ class MonteCarlo(SampledTransport):
             shaded = jax.lax.stop_gradient(shaded)
         assert attributes.indirect is not None
         squared = (learned_radiance(attributes.indirect, wo) - shaded) ** 2
-        seen = points.mask.astype(squared.dtype)
-        return safe_divide(jnp.sum(squared * seen[:, None]), 3.0 * jnp.sum(seen))
+        weights = points.mask.astype(squared.dtype)
+        return safe_divide(jnp.sum(squared * weights[:, None]), 3.0 * jnp.sum(weights))

@@ -176,38 +176,40 @@ def _step(
     is_last: bool,
 ) -> tuple[Leg, Float[Array, "n 3"], Int[Array, " n"]]:
     """Draw and trace both directions of one vertex; also return the next vertices and faces."""
-    at = _vertex(table, faces, wo)
+    vertex = _vertex(table, faces, wo)
     to_light, _ = sample_light(sampler, uniforms[:, :2])
-    onward = bsdf.sample(at.materials, at.normals, wo, uniforms[:, 2:5])
+    onward = bsdf.sample(vertex.materials, vertex.normals, wo, uniforms[:, 2:5])
 
     def densities(wi: Float[Array, "n 3"]) -> tuple[Array, Array]:
-        return light_density(sampler, wi), bsdf.pdf(at.materials, at.normals, wi, wo)
+        return light_density(sampler, wi), bsdf.pdf(vertex.materials, vertex.normals, wi, wo)
 
     light_part, reflected_part = densities(to_light)
     weight = safe_divide(jnp.ones_like(light_part), light_part + reflected_part)
-    is_lit = at.is_known & at.is_above(to_light)
+    is_lit = vertex.is_known & vertex.is_above(to_light)
     is_lit = is_lit & ~index.occluded(origins, to_light, faces, is_lit)
-    light_part, own = densities(onward)
-    both = safe_divide(jnp.ones_like(own), light_part + own)
-    is_going = at.is_known & at.is_above(onward) & (own > 0)
+    light_part, onward_density = densities(onward)
+    balance_weight = safe_divide(jnp.ones_like(onward_density), light_part + onward_density)
+    is_going = vertex.is_known & vertex.is_above(onward) & (onward_density > 0)
     if is_last:
         is_hit = index.occluded(origins, onward, faces, is_going)
-        distance, following = jnp.zeros_like(own), jnp.full_like(faces, -1)
+        distance, next_faces = jnp.zeros_like(onward_density), jnp.full_like(faces, -1)
     else:
-        distance, following = index.nearest(origins, onward, faces, is_going)
-        is_hit = following >= 0
-    goes_on = is_going & is_hit
+        distance, next_faces = index.nearest(origins, onward, faces, is_going)
+        is_hit = next_faces >= 0
+    is_continued = is_going & is_hit
     leg = Leg(
-        faces=jnp.where(at.is_known, faces, -1),
+        faces=jnp.where(vertex.is_known, faces, -1),
         to_light=to_light,
         light_weight=jnp.where(is_lit, weight, 0.0),
         onward=onward,
-        open_weight=jnp.where(is_going & ~is_hit, both, 0.0),
-        onward_weight=jnp.where(goes_on, safe_divide(jnp.ones_like(own), own), 0.0),
+        open_weight=jnp.where(is_going & ~is_hit, balance_weight, 0.0),
+        onward_weight=jnp.where(
+            is_continued, safe_divide(jnp.ones_like(onward_density), onward_density), 0.0
+        ),
     )
-    reached = jnp.where(goes_on, distance, 0.0)
-    ends = origins + reached[:, None] * onward
-    return leg, ends, jnp.where(goes_on, following, -1)
+    hit_distance = jnp.where(is_continued, distance, 0.0)
+    ends = origins + hit_distance[:, None] * onward
+    return leg, ends, jnp.where(is_continued, next_faces, -1)
 
 
 def path_radiance(
@@ -229,12 +231,12 @@ def path_radiance(
     """
     total, throughput = jnp.zeros_like(wo), jnp.ones_like(wo)
     for leg in legs:
-        at = _vertex(table, leg.faces, wo)
-        lit = at.reflected(leg.to_light) * leg.light_weight[:, None]
-        onward = at.reflected(leg.onward)
-        arriving = lit * lookup(light.radiance, leg.to_light)
-        arriving = arriving + onward * leg.open_weight[:, None] * lookup(light.radiance, leg.onward)
-        total = total + throughput * arriving
+        vertex = _vertex(table, leg.faces, wo)
+        direct = vertex.reflected(leg.to_light) * leg.light_weight[:, None]
+        onward = vertex.reflected(leg.onward)
+        radiance = direct * lookup(light.radiance, leg.to_light)
+        radiance = radiance + onward * leg.open_weight[:, None] * lookup(light.radiance, leg.onward)
+        total = total + throughput * radiance
         throughput = throughput * onward * leg.onward_weight[:, None]
         wo = -leg.onward
     return total
@@ -287,22 +289,22 @@ class PathTracer(IndirectSource):
         starts = jnp.repeat(points.positions, samples, axis=0)
         # Chunks that were skipped hold zeros, as if their rays had hit face 0: the mask leaves
         # them out.
-        going = bit_set((hits >= 0) & jnp.repeat(points.mask, samples))
-        ray = going.first(capacity=total)
-        is_real = jnp.arange(total, dtype=jnp.int32) < going.count
+        active_set = bit_set((hits >= 0) & jnp.repeat(points.mask, samples))
+        ray = active_set.first(capacity=total)
+        is_real = jnp.arange(total, dtype=jnp.int32) < active_set.count
 
         def rows(values: Array) -> Array:
             return values.at[ray].get(mode="promise_in_bounds")
 
         wo, faces = -rows(wi), jnp.where(is_real, rows(hits), -1)
-        reached = jnp.where(is_real, rows(distances.reshape(-1)), 0.0)
-        origins = jax.lax.stop_gradient(rows(starts) - reached[:, None] * wo)
+        hit_distance = jnp.where(is_real, rows(distances.reshape(-1)), 0.0)
+        origins = jax.lax.stop_gradient(rows(starts) - hit_distance[:, None] * wo)
         legs = self.draw(origins, faces, wo, is_real)
         radiance = self.evaluate(legs, wo, is_real)
         target = jnp.where(is_real, ray, total)
         # Every ray has a row of its own; rays that are not followed bring no light.
-        brought = jnp.zeros_like(radiance).at[target].set(radiance, mode="drop")
-        return KnownIndirect(brought.reshape(count, samples, 3))
+        ray_radiance = jnp.zeros_like(radiance).at[target].set(radiance, mode="drop")
+        return KnownIndirect(ray_radiance.reshape(count, samples, 3))
 
     def draw(
         self,
@@ -320,8 +322,8 @@ class PathTracer(IndirectSource):
         # In float32 at any precision, so that a run in float64 sees the same numbers.
         numbers = jax.random.uniform(self.key, (wo.shape[0], width), jnp.float32).astype(wo.dtype)
 
-        def one_chunk(parts: tuple[Array, Array, Array, Array]) -> tuple[Leg, ...]:
-            origins, faces, wo, numbers = parts
+        def one_chunk(inputs: tuple[Array, Array, Array, Array]) -> tuple[Leg, ...]:
+            origins, faces, wo, numbers = inputs
             legs = []
             for vertex in range(self.vertex_count):
                 leg, origins, faces = _step(
@@ -353,8 +355,8 @@ class PathTracer(IndirectSource):
         if self.gradient == "none":
             light = jax.lax.stop_gradient(light)
 
-        def one_chunk(parts: tuple[tuple[Leg, ...], Array]) -> Array:
-            return path_radiance(*parts, table, light)
+        def one_chunk(inputs: tuple[tuple[Leg, ...], Array]) -> Array:
+            return path_radiance(*inputs, table, light)
 
         return in_chunks(
             one_chunk,
@@ -403,9 +405,9 @@ class PathSettings(SampledSettings, TransportSettings, kind="paths"):
     @property
     def relative_cost(self) -> float:
         """As with one bounce, but every further surface adds half the cost of the rays."""
-        drawn = self.light_count + self.diffuse_count + self.specular_count
-        onward = 1.0 + 0.5 * (self.bounce_count - 1)
-        return 1.0 + 0.2 * onward * (drawn + 3 * self.residual_count)
+        sample_count = self.light_count + self.diffuse_count + self.specular_count
+        bounce_factor = 1.0 + 0.5 * (self.bounce_count - 1)
+        return 1.0 + 0.2 * bounce_factor * (sample_count + 3 * self.residual_count)
 
     def build(self, light: LightSpec) -> "Paths":
         """Make the transport; it has no constants."""
@@ -488,18 +490,18 @@ class Paths(SampledTransport):
         assert key is not None
         light, sampler, gathered = illumination.light, illumination.sampler, illumination.gathered
         keys = jax.random.split(key, 4)
-        how = {"counts": self._counts, "finds_nearest": True}
+        options = {"counts": self._counts, "finds_nearest": True}
         open_only = self._open_only and gathered is not None
         if gathered is None:
-            samples = draw_samples(keys[0], points, sampler, index, **how)
+            samples = draw_samples(keys[0], points, sampler, index, **options)
             source = self._tracer(keys[1], light, sampler, illumination.table, index)
             has_specular = attributes.materials.has_specular
             gathered = gather(points, samples, light, has_specular=has_specular, **source)
         source = self._tracer(keys[2], light, sampler, illumination.table, index)
-        rest = (attributes.materials, wo, gathered, light, sampler, index)
-        return reflect(keys[3], points, *rest, **source, open_only=open_only, **how)
+        arguments = (attributes.materials, wo, gathered, light, sampler, index)
+        return reflect(keys[3], points, *arguments, **source, open_only=open_only, **options)
 
     def for_images(self, sample_count: int) -> "SampledTransport":
         """Return a transport as `SampledTransport` does, without gradients at later vertices."""
-        shared = super().for_images(sample_count)
-        return replace(shared, settings=replace(shared.settings, later_gradient="none"))
+        transport = super().for_images(sample_count)
+        return replace(transport, settings=replace(transport.settings, later_gradient="none"))

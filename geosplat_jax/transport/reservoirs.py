@@ -122,13 +122,13 @@ def empty_store(spec: ReservoirSettings, count: int) -> ReservoirStore:
     """Return a store without content for ``count`` samples of the light per point."""
     slots = spec.slots
     vector = jnp.zeros((slots, 3))
-    nowhere = jnp.full((slots,), -1, jnp.int32)
-    nothing = Reservoirs(
+    empty_keys = jnp.full((slots,), -1, jnp.int32)
+    reservoirs = Reservoirs(
         jnp.zeros((slots, count, 3)), jnp.zeros((slots, count)), jnp.zeros((slots,))
     )
-    points = SurfacePoints(vector, vector, vector, nowhere, jnp.zeros((slots,), bool))
+    points = SurfacePoints(vector, vector, vector, empty_keys, jnp.zeros((slots,), bool))
     # Copies, so that no two leaves share a buffer: a step consumes the buffers of its state.
-    return jax.tree.map(jnp.array, ReservoirStore(nowhere, nothing, points))
+    return jax.tree.map(jnp.array, ReservoirStore(empty_keys, reservoirs, points))
 
 
 def _keys(points: SurfacePoints, index: RayIndex | None) -> Int[Array, " N"]:
@@ -140,24 +140,24 @@ def _keys(points: SurfacePoints, index: RayIndex | None) -> Int[Array, " N"]:
 
 def _slots(keys: Int[Array, " N"], count: int) -> Int[Array, " N"]:
     """Spread keys over the slots."""
-    mixed = keys * _SCATTER
-    return ((mixed ^ (mixed >> 15)) & 0x7FFFFFFF) % count
+    hashes = keys * _SCATTER
+    return ((hashes ^ (hashes >> 15)) & 0x7FFFFFFF) % count
 
 
 def _brightness(light: EnvLight, directions: Float[Array, "... 3"]) -> Float[Array, "..."]:
     """Brightness of the sky in directions, never 0 unless the whole sky is black."""
-    found = luminance(lookup(light.radiance, directions.reshape(-1, 3)))
+    brightness = luminance(lookup(light.radiance, directions.reshape(-1, 3)))
     floor = _DIMMEST * jnp.mean(luminance(light.radiance))
-    return jnp.maximum(found, floor).reshape(directions.shape[:-1])
+    return jnp.maximum(brightness, floor).reshape(directions.shape[:-1])
 
 
 def _chosen(
     uniforms: Float[Array, "R n"], weights: Float[Array, "K R n"]
 ) -> tuple[Int[Array, "R n"], Float[Array, "R n"]]:
     """Choose one of K in proportion to its weight; also return the sum of the weights."""
-    through = jnp.cumsum(weights, axis=0)
-    total = through[-1]
-    choice = jnp.sum((through <= (uniforms * total)[None]).astype(jnp.int32), axis=0)
+    running_sum = jnp.cumsum(weights, axis=0)
+    total = running_sum[-1]
+    choice = jnp.sum((running_sum <= (uniforms * total)[None]).astype(jnp.int32), axis=0)
     return jnp.minimum(choice, weights.shape[0] - 1), total
 
 
@@ -182,15 +182,15 @@ def _own(
     """Choose from a step's own candidates: directions (R, n, 3) and weights (R, n)."""
     count, dtype = uniforms.shape[1], points.normals.dtype
     numbers = low_discrepancy(offsets, count * spec.candidates, dtype)
-    drawn, density = sample_light(sampler, numbers.reshape(-1, 2))
+    directions, density = sample_light(sampler, numbers.reshape(-1, 2))
     # Every ``count``-th candidate belongs to the same reservoir: they spread over the whole sky.
     shape = (spec.candidates, count, points.normals.shape[0])
-    drawn, density = drawn.reshape(*shape, 3), density.reshape(shape)
-    cosine = jnp.maximum(jnp.sum(points.normals[None, None] * drawn, axis=-1), 0.0)
-    target = _brightness(light, drawn) * cosine
+    directions, density = directions.reshape(*shape, 3), density.reshape(shape)
+    cosine = jnp.maximum(jnp.sum(points.normals[None, None] * directions, axis=-1), 0.0)
+    target = _brightness(light, directions) * cosine
     choice, total = _chosen(uniforms.T, target / (spec.candidates * density))
     weight = safe_divide(total, _take(target, choice))
-    return _take(drawn, choice), weight
+    return _take(directions, choice), weight
 
 
 class _Source(eqx.Module):
@@ -209,9 +209,9 @@ def _is_open(
     return cast(source.points, directions, index) == OPEN
 
 
-def _balance(parts: list[Array], j: int) -> Array:
+def _balance(terms: list[Array], j: int) -> Array:
     """Share of source j by the balance heuristic."""
-    return safe_divide(parts[j], jnp.sum(jnp.stack(parts), axis=0))
+    return safe_divide(terms[j], jnp.sum(jnp.stack(terms), axis=0))
 
 
 def _joined(
@@ -225,41 +225,45 @@ def _joined(
     """Choose one of several reservoirs, of which the first is the points' own."""
     brightness = [_brightness(light, source.directions) for source in sources]
 
-    def target(at: _Source, k: int, j: int) -> Array:
+    def target(receiver: _Source, k: int, j: int) -> Array:
         """Target at source k of the sample of source j."""
-        value = brightness[j] * _cosine(at.points.normals, sources[j].directions)
+        value = brightness[j] * _cosine(receiver.points.normals, sources[j].directions)
         if traces and k != j:
-            value = jnp.where(_is_open(at, sources[j].directions, index), value, 0.0)
+            value = jnp.where(_is_open(receiver, sources[j].directions, index), value, 0.0)
         return value
 
-    own, weights = sources[0], []
+    own_source, weights = sources[0], []
     for j, source in enumerate(sources):
-        values = [target(at, k, j) for k, at in enumerate(sources)]
-        parts = [at.confidences[None] * x for at, x in zip(sources, values, strict=True)]
-        weights.append(_balance(parts, j) * values[0] * source.weights)
+        values = [target(receiver, k, j) for k, receiver in enumerate(sources)]
+        terms = [
+            receiver.confidences[None] * x for receiver, x in zip(sources, values, strict=True)
+        ]
+        weights.append(_balance(terms, j) * values[0] * source.weights)
     choice, total = _chosen(uniforms, jnp.stack(weights))
     directions = _take(jnp.stack([source.directions for source in sources]), choice)
-    chosen = _take(jnp.stack(brightness), choice) * _cosine(own.points.normals, directions)
+    target_value = _take(jnp.stack(brightness), choice) * _cosine(
+        own_source.points.normals, directions
+    )
     confidences = jnp.sum(jnp.stack([source.confidences for source in sources]), axis=0)
-    return _Source(directions, safe_divide(total, chosen), confidences, own.points)
+    return _Source(directions, safe_divide(total, target_value), confidences, own_source.points)
 
 
 def _offered(
-    taken: Reservoirs,
+    reservoirs: Reservoirs,
     origin: SurfacePoints,
     points: SurfacePoints,
-    is_there: Bool[Array, " N"],
+    is_present: Bool[Array, " N"],
     reach: Float[Array, ""],
     spec: ReservoirSettings,
 ) -> tuple[Reservoirs, SurfacePoints]:
     """Accept reservoirs of other points that are near and have a similar normal; empty the rest."""
     offset = origin.positions - points.positions
     is_near = jnp.sum(jnp.square(offset), axis=-1) <= jnp.square(reach)
-    alike = jnp.sum(origin.normals * points.normals, axis=-1) >= spec.smallest_cosine
-    is_good = is_there & is_near & alike & origin.mask & points.mask
-    confidences = jnp.where(is_good, taken.confidences, 0.0)
-    weights = jnp.where(is_good[:, None], taken.weights, 0.0)
-    return Reservoirs(taken.directions, weights, confidences), origin
+    is_similar = jnp.sum(origin.normals * points.normals, axis=-1) >= spec.smallest_cosine
+    is_good = is_present & is_near & is_similar & origin.mask & points.mask
+    confidences = jnp.where(is_good, reservoirs.confidences, 0.0)
+    weights = jnp.where(is_good[:, None], reservoirs.weights, 0.0)
+    return Reservoirs(reservoirs.directions, weights, confidences), origin
 
 
 def _source(reservoirs: Reservoirs, points: SurfacePoints) -> _Source:
@@ -281,11 +285,15 @@ def _recalled(
     """Look up the reservoirs that are stored under the points' places."""
     keys = _keys(points, index)
     slot = _slots(keys, spec.slots)
-    taken, origin = _rows((store.reservoirs, store.points), slot)
-    is_there = (keys >= 0) & (store.keys[slot] == keys)
-    most = spec.confidence * spec.candidates
-    taken = Reservoirs(taken.directions, taken.weights, jnp.minimum(taken.confidences, most))
-    return _offered(taken, origin, points, is_there, reach, spec)
+    reservoirs, origin = _rows((store.reservoirs, store.points), slot)
+    is_present = (keys >= 0) & (store.keys[slot] == keys)
+    confidence_limit = spec.confidence * spec.candidates
+    reservoirs = Reservoirs(
+        reservoirs.directions,
+        reservoirs.weights,
+        jnp.minimum(reservoirs.confidences, confidence_limit),
+    )
+    return _offered(reservoirs, origin, points, is_present, reach, spec)
 
 
 def _beside(
@@ -301,9 +309,9 @@ def _beside(
     # Row by row, so that a point draws the same numbers whatever the buffer's size.
     steps = jax.random.randint(step_key, (size, count), 1, _NEIGHBORHOOD + 1, jnp.int32).T
     signs = jax.random.bernoulli(sign_key, 0.5, (size, count)).T
-    place = rank[None] + jnp.where(signs, steps, -steps)
-    is_inside = (place >= 0) & (place < size)
-    rows = order.at[jnp.clip(place, 0, size - 1)].get(mode="promise_in_bounds")
+    neighbor_ranks = rank[None] + jnp.where(signs, steps, -steps)
+    is_inside = (neighbor_ranks >= 0) & (neighbor_ranks < size)
+    rows = order.at[jnp.clip(neighbor_ranks, 0, size - 1)].get(mode="promise_in_bounds")
     return list(jnp.where(is_inside, rows, -1))
 
 
@@ -340,43 +348,47 @@ def resample(
     dtype = points.normals.dtype
     uniforms = [jax.random.uniform(k, (size, count), jnp.float32).astype(dtype) for k in keys[1:3]]
     reach = jnp.asarray(jnp.inf, dtype) if index is None else index.place_size.astype(dtype)
-    recalled = None
+    previous_reservoirs = None
     if store is not None and spec.reuse_steps:
-        recalled = _recalled(jax.lax.stop_gradient(store), points, index, reach, spec)
+        previous_reservoirs = _recalled(jax.lax.stop_gradient(store), points, index, reach, spec)
 
-    def one_chunk(parts: tuple) -> Reservoirs:
-        points, offsets, uniforms, recalled = parts
+    def one_chunk(inputs: tuple) -> Reservoirs:
+        points, offsets, uniforms, previous_reservoirs = inputs
         directions, weights = _own(points, offsets, uniforms[0], light, sampler, spec)
         confidences = jnp.full(points.faces.shape, float(spec.candidates), dtype)
-        found = _Source(directions, weights, confidences, points)
+        reservoirs = _Source(directions, weights, confidences, points)
         if traces:
-            is_open = _is_open(found, directions, index)
-            found = _Source(directions, jnp.where(is_open, weights, 0.0), confidences, points)
-        if recalled is not None:
-            sources = [found, _source(*recalled)]
-            found = _joined(sources, uniforms[1].T, light, index, traces=traces)
-        return Reservoirs(jnp.moveaxis(found.directions, 0, 1), found.weights.T, found.confidences)
+            is_open = _is_open(reservoirs, directions, index)
+            reservoirs = _Source(directions, jnp.where(is_open, weights, 0.0), confidences, points)
+        if previous_reservoirs is not None:
+            sources = [reservoirs, _source(*previous_reservoirs)]
+            reservoirs = _joined(sources, uniforms[1].T, light, index, traces=traces)
+        return Reservoirs(
+            jnp.moveaxis(reservoirs.directions, 0, 1), reservoirs.weights.T, reservoirs.confidences
+        )
 
     def in_all(function: Any, arguments: Any, samples: int) -> Reservoirs:
         return in_chunks(function, arguments, points.mask, samples, has_gradient=False)
 
-    found = in_all(one_chunk, (points, offsets, uniforms, recalled), count * spec.candidates)
+    reservoirs = in_all(
+        one_chunk, (points, offsets, uniforms, previous_reservoirs), count * spec.candidates
+    )
     if not spec.neighbors:
-        return found
+        return reservoirs
     numbers = jax.random.uniform(keys[4], (size, count), jnp.float32)
-    others = [
-        _offered(_rows(found, rows), _rows(points, rows), points, rows >= 0, 2 * reach, spec)
+    neighbors = [
+        _offered(_rows(reservoirs, rows), _rows(points, rows), points, rows >= 0, 2 * reach, spec)
         for rows in _beside(keys[3], points, index, spec.neighbors)
     ]
 
-    def with_neighbors(parts: tuple) -> Reservoirs:
-        points, found, others, numbers = parts
-        sources = [_source(found, points), *(_source(*other) for other in others)]
-        joined = _joined(sources, numbers.T, light, index, traces=traces)
-        directions = jnp.moveaxis(joined.directions, 0, 1)
-        return Reservoirs(directions, joined.weights.T, joined.confidences)
+    def with_neighbors(inputs: tuple) -> Reservoirs:
+        points, reservoirs, neighbors, numbers = inputs
+        sources = [_source(reservoirs, points), *(_source(*neighbor) for neighbor in neighbors)]
+        joined_source = _joined(sources, numbers.T, light, index, traces=traces)
+        directions = jnp.moveaxis(joined_source.directions, 0, 1)
+        return Reservoirs(directions, joined_source.weights.T, joined_source.confidences)
 
-    arguments = (points, found, others, numbers.astype(dtype))
+    arguments = (points, reservoirs, neighbors, numbers.astype(dtype))
     return in_all(with_neighbors, arguments, count * (spec.neighbors + 1) ** 2)
 
 
@@ -412,10 +424,10 @@ def kept(
     slot = jnp.where((keys >= 0) & points.mask, _slots(keys, spec.slots), spec.slots)
     row = jnp.full((spec.slots,), -1, jnp.int32)
     row = row.at[slot].max(jnp.arange(size, dtype=jnp.int32), mode="drop")
-    fresh = _rows(ReservoirStore(keys, reservoirs, points), row)
+    new_store = _rows(ReservoirStore(keys, reservoirs, points), row)
 
     def chosen(new: Array, old: Array) -> Array:
         is_new = (row >= 0).reshape(-1, *[1] * (new.ndim - 1))
         return jnp.where(is_new, new, old).astype(old.dtype)
 
-    return jax.tree.map(chosen, fresh, store)
+    return jax.tree.map(chosen, new_store, store)

@@ -103,9 +103,9 @@ class SampledSettings:
 
     def warnings(self) -> list[str]:
         """Say why reservoirs are not used although they were asked for."""
-        chosen = self.reservoirs
-        if chosen.candidates == 0:
-            if chosen.reuse_steps or chosen.neighbors > 0 or chosen.visibility != "ignored":
+        spec = self.reservoirs
+        if spec.candidates == 0:
+            if spec.reuse_steps or spec.neighbors > 0 or spec.visibility != "ignored":
                 return ["reservoirs have no effect without candidates: samples are plain"]
             return []
         if self.light_count == 0:
@@ -167,18 +167,18 @@ class SampledTransport(Transport):
     ) -> tuple[Samples, Any]:
         """Draw and trace the samples that views share; also return the carry of the next step."""
         spec, counts = self.settings.reservoirs, self._counts
-        how: dict[str, Any] = {"counts": counts, "finds_nearest": finds_nearest}
+        options: dict[str, Any] = {"counts": counts, "finds_nearest": finds_nearest}
         if not spec.candidates or not counts.light:
-            return draw_samples(key, points, sampler, index, **how), carry
+            return draw_samples(key, points, sampler, index, **options), carry
         own_key, key = jax.random.split(key)
-        found = resample(
+        reservoirs = resample(
             own_key, points, light, sampler, index, carry, spec=spec, count=counts.light
         )
-        chosen = Chosen(found.directions, found.weights, spec.drops_blocked)
-        samples = draw_samples(key, points, sampler, index, chosen=chosen, **how)
+        light_samples = Chosen(reservoirs.directions, reservoirs.weights, spec.drops_blocked)
+        samples = draw_samples(key, points, sampler, index, chosen=light_samples, **options)
         if carry is not None:
             hits = samples.hits[:, : counts.light]
-            carry = kept(carry, points, found, hits, index, spec=spec)
+            carry = kept(carry, points, reservoirs, hits, index, spec=spec)
         return samples, carry
 
     @property
@@ -204,13 +204,13 @@ class SampledTransport(Transport):
 
     def for_each_view(self) -> "SampledTransport":
         """Return a transport that draws all samples in every view, and reuses none."""
-        plain = replace(self.settings, shares_views=False, reservoirs=ReservoirSettings())
-        return replace(self, settings=plain)
+        plain_settings = replace(self.settings, shares_views=False, reservoirs=ReservoirSettings())
+        return replace(self, settings=plain_settings)
 
     def for_images(self, sample_count: int) -> "SampledTransport":
         """Return a transport whose views share samples, without filter and reservoirs."""
-        plain = {"denoise": DenoiseSpec(iterations=0), "reservoirs": ReservoirSettings()}
-        return self._with_counts(sample_count, shares_views=True, **plain)
+        overrides = {"denoise": DenoiseSpec(iterations=0), "reservoirs": ReservoirSettings()}
+        return self._with_counts(sample_count, shares_views=True, **overrides)
 
     def _with_counts(self, count: int, **others: Any) -> "SampledTransport":
         counts = dict.fromkeys(("light_count", "diffuse_count", "specular_count"), count)

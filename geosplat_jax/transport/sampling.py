@@ -116,9 +116,9 @@ def low_discrepancy(
     bits = (index[:, None] >> np.arange(31)[None, :]) & 1
     radical = np.sum(bits * 0.5 ** np.arange(1, 32)[None, :], axis=1)
     points = jnp.asarray(np.stack([index / max(samples, 1), radical], axis=1), jnp.float32)
-    turned = points[:, None, :] + offsets[None]
+    rotated_points = points[:, None, :] + offsets[None]
     # Below one even where the sum rounds up.
-    return jnp.minimum(turned - jnp.floor(turned), 1 - 2.0**-24).astype(dtype)
+    return jnp.minimum(rotated_points - jnp.floor(rotated_points), 1 - 2.0**-24).astype(dtype)
 
 
 def _offsets(key: Key[Array, ""], count: int, numbers: int) -> Float[Array, "N k"]:
@@ -149,25 +149,27 @@ def in_chunks(
     has_gradient : static; False where nothing depends on what is differentiated.
     """
     count = mask.shape[0]
-    wanted = max(256, _RAYS_AT_ONCE // max(samples, 1)) if rows_at_once is None else rows_at_once
-    chunk = min(wanted, max(count, 1))
-    rows = -(-max(count, 1) // chunk)
+    limit = max(256, _RAYS_AT_ONCE // max(samples, 1)) if rows_at_once is None else rows_at_once
+    chunk_size = min(limit, max(count, 1))
+    chunk_count = -(-max(count, 1) // chunk_size)
 
     def chunks(values: Array) -> Array:
-        widths = ((0, rows * chunk - count),) + ((0, 0),) * (values.ndim - 1)
-        return jnp.pad(values, widths).reshape(rows, chunk, *values.shape[1:])
+        widths = ((0, chunk_count * chunk_size - count),) + ((0, 0),) * (values.ndim - 1)
+        return jnp.pad(values, widths).reshape(chunk_count, chunk_size, *values.shape[1:])
 
-    def nothing(parts: Any) -> Any:
-        shapes = jax.eval_shape(function, parts)
+    def nothing(inputs: Any) -> Any:
+        shapes = jax.eval_shape(function, inputs)
         return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
-    def one_chunk(parts: tuple[Array, Any]) -> Any:
-        is_used, arguments = parts
-        again = jax.checkpoint(function) if has_gradient else function
-        return jax.lax.cond(jnp.any(is_used), again, nothing, arguments)
+    def one_chunk(inputs: tuple[Array, Any]) -> Any:
+        is_used, arguments = inputs
+        checkpointed = jax.checkpoint(function) if has_gradient else function
+        return jax.lax.cond(jnp.any(is_used), checkpointed, nothing, arguments)
 
-    found = jax.lax.map(one_chunk, jax.tree.map(chunks, (mask, arguments)))
-    return jax.tree.map(lambda x: x.reshape(rows * chunk, *x.shape[2:])[:count], found)
+    results = jax.lax.map(one_chunk, jax.tree.map(chunks, (mask, arguments)))
+    return jax.tree.map(
+        lambda x: x.reshape(chunk_count * chunk_size, *x.shape[2:])[:count], results
+    )
 
 
 def cast(
@@ -275,41 +277,41 @@ def draw_samples(
     points, sampler = jax.lax.stop_gradient((points, sampler))
     count, dtype = points.normals.shape[0], points.normals.dtype
 
-    def one_chunk(parts: tuple[SurfacePoints, Array, Chosen | None]) -> Samples:
-        points, offsets, chosen = parts
-        drawn = []
+    def one_chunk(inputs: tuple[SurfacePoints, Array, Chosen | None]) -> Samples:
+        points, offsets, chosen = inputs
+        direction_sets = []
         if chosen is not None:
-            drawn.append(jnp.moveaxis(chosen.directions, 1, 0))
+            direction_sets.append(jnp.moveaxis(chosen.directions, 1, 0))
         elif counts.light:
             uniforms = low_discrepancy(offsets[:, :2], counts.light, dtype)
-            found, _ = sample_light(sampler, uniforms.reshape(-1, 2))
-            drawn.append(found.reshape(counts.light, -1, 3))
+            new_directions, _ = sample_light(sampler, uniforms.reshape(-1, 2))
+            direction_sets.append(new_directions.reshape(counts.light, -1, 3))
         if counts.diffuse:
             uniforms = low_discrepancy(offsets[:, 2:], counts.diffuse, dtype)
             normals = tuple(points.normals.T[:, None, :])
-            found = bsdf.cosine_directions(normals, uniforms[..., 0], uniforms[..., 1])
-            drawn.append(jnp.stack(found, axis=-1))
-        directions = jnp.concatenate(drawn)
+            new_directions = bsdf.cosine_directions(normals, uniforms[..., 0], uniforms[..., 1])
+            direction_sets.append(jnp.stack(new_directions, axis=-1))
+        directions = jnp.concatenate(direction_sets)
         flat = directions.reshape(-1, 3)
         light = light_density(sampler, flat).reshape(directions.shape[:2])
         cosine = jax.vmap(lambda wi: bsdf.cosine_pdf(points.normals, wi))(directions)
         density = counts.light * light + counts.diffuse * cosine
         weights = jnp.where(points.mask[None], safe_divide(jnp.ones_like(density), density), 0.0)
         hits, distances = _ends(points, directions, index, finds_nearest)
-        directions, weights, shared = jnp.moveaxis(directions, 0, 1), weights.T, light.T
+        directions, weights, light_densities = jnp.moveaxis(directions, 0, 1), weights.T, light.T
         if chosen is None:
-            return Samples(directions, weights, hits, shared[:, : counts.light], distances)
+            return Samples(directions, weights, hits, light_densities[:, : counts.light], distances)
         if chosen.is_open:
             # In blocked directions only the samples of the cosine count.
             is_open = hits == OPEN
-            alone = safe_divide(jnp.ones_like(cosine), counts.diffuse * cosine).T
-            alone = jnp.where(points.mask[:, None], alone, 0.0)
+            cosine_weights = safe_divide(jnp.ones_like(cosine), counts.diffuse * cosine).T
+            cosine_weights = jnp.where(points.mask[:, None], cosine_weights, 0.0)
             is_light = jnp.arange(weights.shape[1]) < counts.light
-            weights = jnp.where(is_open, weights, jnp.where(is_light[None], 0.0, alone))
-        shared = shared[:, : counts.light]
-        factors = shared * chosen.weights
+            weights = jnp.where(is_open, weights, jnp.where(is_light[None], 0.0, cosine_weights))
+        light_densities = light_densities[:, : counts.light]
+        factors = light_densities * chosen.weights
         weights = weights.at[:, : counts.light].multiply(factors)
-        return Samples(directions, weights, hits, shared, distances, factors)
+        return Samples(directions, weights, hits, light_densities, distances, factors)
 
     samples = counts.light + counts.diffuse
     arguments = (points, _offsets(key, count, 4), chosen)
@@ -343,18 +345,22 @@ def draw_specular(
     on the material; ``light_density`` is (N, S), the density of `sample_light` in every direction.
     """
 
-    def one_chunk(parts: tuple) -> Samples:
-        points, roughness, wo, offsets = parts
+    def one_chunk(inputs: tuple) -> Samples:
+        points, roughness, wo, offsets = inputs
         uniforms = low_discrepancy(offsets[:, :2], counts.specular, wo.dtype)
         alpha = bsdf.ggx_alpha(roughness)[None, :]
         normals, views = (tuple(x.T[:, None, :]) for x in (points.normals, wo))
-        found = bsdf.specular_directions(alpha, normals, views, uniforms[..., 0], uniforms[..., 1])
-        drawn = jnp.stack(found, axis=-1)
-        hits, distances = _ends(points, drawn, index, finds_nearest)
-        density = light_density(sampler, drawn.reshape(-1, 3)).reshape(drawn.shape[:2]).T
+        components = bsdf.specular_directions(
+            alpha, normals, views, uniforms[..., 0], uniforms[..., 1]
+        )
+        directions = jnp.stack(components, axis=-1)
+        hits, distances = _ends(points, directions, index, finds_nearest)
+        density = light_density(sampler, directions.reshape(-1, 3)).reshape(directions.shape[:2]).T
         if open_only:
             density = jnp.where(hits == OPEN, density, 0.0)
-        return Samples(jnp.moveaxis(drawn, 0, 1), jnp.ones_like(density), hits, density, distances)
+        return Samples(
+            jnp.moveaxis(directions, 0, 1), jnp.ones_like(density), hits, density, distances
+        )
 
     count = wo.shape[0]
     arguments = jax.lax.stop_gradient((points, roughness, wo, _offsets(key, count, 2)))

@@ -80,14 +80,14 @@ def directional_albedo(
     length = np.sqrt(hx**2 + hy**2 + hz**2)
     v_dot_h = np.clip((sin_v * hx + cos_v * hz) / length, 0, 1)
     cos_l = 2 * v_dot_h * hz / length - cos_v
-    lit = cos_l > 0
-    cos_l = np.where(lit, cos_l, 1.0)
+    is_lit = cos_l > 0
+    cos_l = np.where(is_lit, cos_l, 1.0)
     # G2 / G1 of the height-correlated Smith function, with n.v cancelled.
     weight = cos_l * (cos_v + smith(cos_v)) / (cos_v * smith(cos_l) + cos_l * smith(cos_v))
-    weight = np.where(lit, weight, 0.0) * mass
+    weight = np.where(is_lit, weight, 0.0) * mass
     fresnel = (1 - v_dot_h) ** 5
-    split = [weight * (1 - fresnel), weight * fresnel]
-    return np.stack([part.sum((-2, -1)) for part in split], axis=-1)
+    terms = [weight * (1 - fresnel), weight * fresnel]
+    return np.stack([term.sum((-2, -1)) for term in terms], axis=-1)
 
 
 @lru_cache(maxsize=4)
@@ -162,19 +162,19 @@ def split_sum(
     """
     cosine = jnp.sum(normals * view_directions, axis=-1)
     if two_sided:
-        facing = jnp.where(cosine < 0, -1.0, 1.0).astype(normals.dtype)
-        normals, cosine = normals * facing[:, None], cosine * facing
+        sign = jnp.where(cosine < 0, -1.0, 1.0).astype(normals.dtype)
+        normals, cosine = normals * sign[:, None], cosine * sign
     diffuse_light = prefiltered_diffuse(prefiltered, normals)
     if not materials.has_specular:
         shaded, albedo = matt(materials, diffuse_light), materials.albedo
         return replace(shaded, rgb=albedo, diffuse=albedo) if baked_diffuse else shaded
     reflected = 2 * cosine[:, None] * normals - view_directions
-    dielectric = (1 - materials.metallic)[:, None]
+    dielectric_share = (1 - materials.metallic)[:, None]
     f0 = specular_f0(materials.albedo, materials.metallic)
 
     specular_light = prefiltered_specular(prefiltered, reflected, materials.roughness)
     scale, bias = fg_lookup(table, cosine, materials.roughness)
-    base = materials.albedo * dielectric
+    base = materials.albedo * dielectric_share
     diffuse = base if baked_diffuse else base * diffuse_light
     specular = specular_light * (f0 * scale[:, None] + bias[:, None])
     return Shaded(diffuse + specular, diffuse, specular, diffuse_light, specular_light)

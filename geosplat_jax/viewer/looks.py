@@ -70,11 +70,11 @@ class Look:
         pose = np.eye(4)
         pose[:3, :3] = to_world.T
         pose[:3, 3] = -to_world.T @ np.asarray(self.position)
-        half = np.tan(0.5 * self.field_of_view)
+        half_height = np.tan(0.5 * self.field_of_view)
         lens = np.array(
             [
-                [0.5 * level.width / (half * self.aspect), 0.0, 0.5 * level.width],
-                [0.0, 0.5 * level.height / half, 0.5 * level.height],
+                [0.5 * level.width / (half_height * self.aspect), 0.0, 0.5 * level.width],
+                [0.0, 0.5 * level.height / half_height, 0.5 * level.height],
                 [0.0, 0.0, 1.0],
             ]
         )
@@ -126,8 +126,8 @@ class Ladder:
         now = self._clock()
         if look != self._look:
             self._look, self._since = look, now
-            quick = [number for number in range(len(self._levels)) if self._keeps_up(number)]
-            self._next = max(quick, default=0)
+            quick_levels = [number for number in range(len(self._levels)) if self._keeps_up(number)]
+            self._next = max(quick_levels, default=0)
             return self._levels[self._next]
         if self._next >= len(self._levels):
             return None

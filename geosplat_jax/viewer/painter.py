@@ -86,8 +86,8 @@ class Painter:
         self.trained = trained
         self._found = Renderer.of(trained).with_aovs("depth")
         exposure = math.exp(float(trained.params.log_exposure))
-        own = EnvLight(trained.params.light.radiance * exposure)
-        self._lights = {AS_TRAINED: same_size(own), **lights}
+        trained_light = EnvLight(trained.params.light.radiance * exposure)
+        self._lights = {AS_TRAINED: same_size(trained_light), **lights}
         self._relit: Renderer | None = None
         self._prepared: dict[tuple[int, bool], tuple[tuple[str, float, float], Renderer]] = {}
 
@@ -99,13 +99,13 @@ class Painter:
         """Return a renderer with the light of a look; the last one of each kind is cached."""
         key = look.light, look.turn, look.intensity
         is_found = key == (AS_TRAINED, 0.0, 1.0)
-        last = self._prepared.get((samples, is_found))
-        if last is not None and last[0] == key:
-            return last[1]
+        cache_entry = self._prepared.get((samples, is_found))
+        if cache_entry is not None and cache_entry[0] == key:
+            return cache_entry[1]
         if is_found:
             renderer = self._found.with_samples(samples)
-        elif last is not None:  # its buffers have grown to what this surface needs
-            renderer = last[1].under(self._light_of(look))
+        elif cache_entry is not None:  # its buffers have grown to what this surface needs
+            renderer = cache_entry[1].under(self._light_of(look))
         else:
             light = self._light_of(look)
             if self._relit is None:
@@ -122,20 +122,20 @@ class Painter:
         KeyError
             If there is no light of the name in the look.
         """
-        began = time.perf_counter()
+        start_time = time.perf_counter()
         camera = look.camera(level)
         view = self._renderer(look, level.samples)(camera)
         if look.mode == "render":
-            shown = picture(view, camera, self._light_of(look), look.background)
+            rgb = picture(view, camera, self._light_of(look), look.background)
         else:
-            shown = self._aov(look, view)
+            rgb = self._aov(look, view)
         depth = straight(view.aovs["depth"], view.alpha)[..., 0]
         return Picture(
-            np.round(255.0 * shown).astype(np.uint8),
+            np.round(255.0 * rgb).astype(np.uint8),
             np.where(view.alpha > 0.5, depth, _BEHIND_EVERYTHING).astype(np.float32),
             level,
             self.trained.step,
-            time.perf_counter() - began,
+            time.perf_counter() - start_time,
         )
 
     def _aov(self, look: Look, view: RenderedView) -> np.ndarray:
@@ -145,18 +145,18 @@ class Painter:
         alpha = np.clip(view.alpha, 0.0, 1.0)[..., None]
         values = straight(view.aovs[look.mode], view.alpha)
         if look.mode == "depth":
-            shown = self._depth_scale(look).picture(values[..., 0])
+            rgb = self._depth_scale(look).picture(values[..., 0])
         else:
-            shown = to_picture(values) if look.mode == "albedo" else np.clip(values, 0.0, 1.0)
-        over_grey = alpha * shown + (1.0 - alpha) * _GREY
+            rgb = to_picture(values) if look.mode == "albedo" else np.clip(values, 0.0, 1.0)
+        over_grey = alpha * rgb + (1.0 - alpha) * _GREY
         return np.broadcast_to(over_grey, (*view.alpha.shape, 3))
 
     def _depth_scale(self, look: Look) -> Scale:
         """Return a scale of depth from the near to the far end of the box around the object."""
         box = self.trained.pipeline.surface.box
-        reach = math.sqrt(3.0) * float(box.half_extent)
-        far = float(np.linalg.norm(np.asarray(box.center) - np.asarray(look.position)))
-        return Scale("depth", max(far - reach, 0.0), far + reach, DISTANCE_COLORS)
+        radius = math.sqrt(3.0) * float(box.half_extent)
+        distance = float(np.linalg.norm(np.asarray(box.center) - np.asarray(look.position)))
+        return Scale("depth", max(distance - radius, 0.0), distance + radius, DISTANCE_COLORS)
 
     def mesh_glb(self) -> bytes | None:
         """Return the mesh with colours on its vertices as GLB, y up; None for an empty surface."""
@@ -232,9 +232,9 @@ class Viewer:
         level = ladder.next(look)
         if level is None:
             return None
-        drawn = self.painter.paint(look, level)
-        ladder.note(level, drawn.seconds)
-        return drawn
+        next_picture = self.painter.paint(look, level)
+        ladder.note(level, next_picture.seconds)
+        return next_picture
 
     def leave(self, person: int) -> None:
         """Forget a user who has disconnected."""

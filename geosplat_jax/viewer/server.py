@@ -102,16 +102,16 @@ class _Person:
     def show(self, viewer: Viewer) -> bool:
         """Draw and show the next picture; return whether there was one to draw."""
         look = self.look()
-        drawn = None if look is None else viewer.draw(self._client.client_id, look)
-        if drawn is None:
+        next_picture = None if look is None else viewer.draw(self._client.client_id, look)
+        if next_picture is None:
             return False
         self._client.scene.set_background_image(
-            drawn.rgb, format="jpeg", jpeg_quality=90, depth=drawn.depth
+            next_picture.rgb, format="jpeg", jpeg_quality=90, depth=next_picture.depth
         )
-        level = drawn.level
+        level = next_picture.level
         self._status.content = (
-            f"step {drawn.step}, {level.width} x {level.height}, {level.samples} samples, "
-            f"{drawn.seconds:.2f} s"
+            f"step {next_picture.step}, {level.width} x {level.height}, {level.samples} samples, "
+            f"{next_picture.seconds:.2f} s"
         )
         return True
 
@@ -140,19 +140,19 @@ class _Things:
 
     def _add_photographs(self, views: Views) -> None:
         """Put a frustum at every camera; a click on it goes there."""
-        step = max(1, max(views.height, views.width) // _PHOTOGRAPH)
+        stride = max(1, max(views.height, views.width) // _PHOTOGRAPH)
         poses = np.linalg.inv(np.asarray(views.world_to_camera, np.float64))
-        reach = float(np.median(np.linalg.norm(poses[:, :3, 3] - poses[:, :3, 3].mean(0), axis=1)))
+        radius = float(np.median(np.linalg.norm(poses[:, :3, 3] - poses[:, :3, 3].mean(0), axis=1)))
         for number, (name, pose) in enumerate(zip(views.names, poses, strict=True)):
-            small = photograph_on_white(np.asarray(views.images[number][::step, ::step]))
+            thumbnail = photograph_on_white(np.asarray(views.images[number][::stride, ::stride]))
             field_of_view = 2.0 * np.arctan(0.5 * views.height / views.intrinsics[number, 1, 1])
             x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
             frustum = self._server.scene.add_camera_frustum(
                 f"/photographs/{number:04d}",
                 fov=float(field_of_view),
                 aspect=views.width / views.height,
-                scale=0.08 * max(reach, 1e-6),
-                image=np.round(255.0 * small).astype(np.uint8),
+                scale=0.08 * max(radius, 1e-6),
+                image=np.round(255.0 * thumbnail).astype(np.uint8),
                 wxyz=(w, x, y, z),
                 position=tuple(pose[:3, 3]),
                 visible=False,
@@ -245,17 +245,19 @@ class ViewerServer:
     def _look_at_the_object(self, views: Views | None) -> None:
         """Start at the camera that looks down a little; without views, beside the object."""
         box = self._viewer.painter.trained.pipeline.surface.box
-        center, start = np.asarray(box.center, np.float64), self._server.initial_camera
+        center, camera = np.asarray(box.center, np.float64), self._server.initial_camera
         if views is None:
-            start.position = center + 3.0 * float(box.half_extent) * np.array([1.0, -1.0, 0.7])
+            camera.position = center + 3.0 * float(box.half_extent) * np.array([1.0, -1.0, 0.7])
         else:
             positions = np.linalg.inv(np.asarray(views.world_to_camera, np.float64))[:, :3, 3]
-            away = positions - center
-            rise = away[:, 2] / np.maximum(np.linalg.norm(away, axis=1), 1e-12)
-            first = int(np.argmin(np.abs(rise - _RISE)))
-            start.position = positions[first]
-            start.fov = float(2.0 * np.arctan(0.5 * views.height / views.intrinsics[first, 1, 1]))
-        start.look_at = center
+            offsets = positions - center
+            elevations = offsets[:, 2] / np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
+            view_index = int(np.argmin(np.abs(elevations - _RISE)))
+            camera.position = positions[view_index]
+            camera.fov = float(
+                2.0 * np.arctan(0.5 * views.height / views.intrinsics[view_index, 1, 1])
+            )
+        camera.look_at = center
 
     def _enter(self, client: Any) -> None:
         self._people[client.client_id] = _Person(client, self._viewer.lights)
@@ -266,17 +268,17 @@ class ViewerServer:
 
     def work(self) -> bool:
         """Do one round of work for all users; return whether there was anything to do."""
-        worked = False
+        has_worked = False
         now = time.perf_counter()
         if now - self._refreshed > _REFRESH:
             self._refreshed = now
             if self._viewer.refresh():
                 self._things.renew()
-                worked = True
+                has_worked = True
         self._things.update()
         for person in tuple(self._people.values()):
-            worked |= person.show(self._viewer)
-        return worked
+            has_worked |= person.show(self._viewer)
+        return has_worked
 
     def serve(self) -> None:
         """Work until Ctrl-C."""

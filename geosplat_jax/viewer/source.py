@@ -53,8 +53,8 @@ class CheckpointWatch:
         TrainingError, RunError, CheckpointError, OSError
             If no checkpoint can be read, and none was read by an earlier call.
         """
-        listed = self._listed()
-        if listed == self._seen:
+        checkpoint_times = self._listed()
+        if checkpoint_times == self._seen:
             return None
         try:
             trained = load_trained(self._folder)
@@ -62,7 +62,7 @@ class CheckpointWatch:
             if self._seen is None:
                 raise
             return None
-        self._seen = listed
+        self._seen = checkpoint_times
         return trained
 
 
@@ -85,10 +85,10 @@ def light_files(paths: Iterable[Path]) -> list[Path]:
         if not path.is_dir():
             files.append(path)
             continue
-        found = sorted(p for p in path.iterdir() if p.suffix.lower() in _LIGHT_SUFFIXES)
-        if not found:
+        light_maps = sorted(p for p in path.iterdir() if p.suffix.lower() in _LIGHT_SUFFIXES)
+        if not light_maps:
             raise SceneError(f"{path} holds no environment map (.hdr or .exr)")
-        files += found
+        files += light_maps
     return files
 
 

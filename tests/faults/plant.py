@@ -81,9 +81,9 @@ def read_faults() -> list[Fault]:
     rows = tomllib.loads(LIST.read_text(encoding="utf-8"))["fault"]
     faults = [Fault(**{**row, "tests": tuple(row["tests"])}) for row in rows]
     names = [fault.name for fault in faults]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ValueError(f"faults of one name: {', '.join(twice)}")
+    duplicates = sorted({name for name in names if names.count(name) > 1})
+    if duplicates:
+        raise ValueError(f"faults of one name: {', '.join(duplicates)}")
     return faults
 
 
@@ -104,14 +104,14 @@ def run_tests(folder: Path, tests: Sequence[str]) -> tuple[int, str]:
     """
     paths = [str(folder / "tests" / test) for test in tests] or [str(folder / "tests")]
     options = ["-x", "-q", "-n0", "-p", "no:cacheprovider", "--no-header"]
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", "pytest", *options, "--rootdir", str(folder), *paths],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"},
         capture_output=True,
         text=True,
     )
-    return done.returncode, (done.stdout + done.stderr)[-2000:]
+    return process.returncode, (process.stdout + process.stderr)[-2000:]
 
 
 def verdict(fault: Fault, *, all_tests: bool) -> str:
@@ -120,23 +120,23 @@ def verdict(fault: Fault, *, all_tests: bool) -> str:
     with tempfile.TemporaryDirectory(prefix="fault_") as temporary:
         folder = copied(Path(temporary))
         (folder / PACKAGE / fault.file).write_text(text, encoding="utf-8")
-        status, said = run_tests(folder, fault.tests)
+        status, output = run_tests(folder, fault.tests)
         if status == _PASSED and all_tests:
-            status, said = run_tests(folder, ())
+            status, output = run_tests(folder, ())
     if status not in (_PASSED, _FAILED):
-        return f"unclear: pytest ended with status {status}\n{said}"
+        return f"unclear: pytest ended with status {status}\n{output}"
     return "killed" if status == _FAILED else "survived"
 
 
 def timed(fault: Fault, *, all_tests: bool) -> str:
     """Print the verdict on a fault and the seconds that it took; return the verdict."""
     began = time.monotonic()
-    found = verdict(fault, all_tests=all_tests)
+    result = verdict(fault, all_tests=all_tests)
     seconds = time.monotonic() - began
-    print(f"{found.splitlines()[0]:10s} {seconds:6.1f} s  {fault.file}: {fault.name}", flush=True)
-    if not found.startswith("killed"):
-        print(f"           {fault.harm}\n{found.partition(chr(10))[2]}", flush=True)
-    return found
+    print(f"{result.splitlines()[0]:10s} {seconds:6.1f} s  {fault.file}: {fault.name}", flush=True)
+    if not result.startswith("killed"):
+        print(f"           {fault.harm}\n{result.partition(chr(10))[2]}", flush=True)
+    return result
 
 
 def main() -> int:
@@ -155,24 +155,24 @@ def main() -> int:
     for fault in faults:
         fault.planted()
     if arguments.only is not None:
-        unknown = sorted(set(arguments.only) - {fault.name for fault in faults})
-        if unknown:
-            parser.error(f"there is no fault {unknown[0]!r}")
+        unknown_names = sorted(set(arguments.only) - {fault.name for fault in faults})
+        if unknown_names:
+            parser.error(f"there is no fault {unknown_names[0]!r}")
         faults = [fault for fault in faults if fault.name in arguments.only]
     if arguments.sound:
         tests = sorted({test for fault in faults for test in fault.tests})
         with tempfile.TemporaryDirectory(prefix="fault_") as temporary:
-            status, said = run_tests(copied(Path(temporary)), tests)
-        print(said)
+            status, output = run_tests(copied(Path(temporary)), tests)
+        print(output)
         return status
     with ThreadPoolExecutor(arguments.jobs) as pool:
-        found = list(pool.map(lambda one: timed(one, all_tests=arguments.all_tests), faults))
-    killed = found.count("killed")
-    print(f"{killed} of {len(found)} killed ({killed / len(found):.0%})")
-    survived = [fault.name for fault, one in zip(faults, found, strict=True) if one != "killed"]
-    if survived:
-        print("not noticed: " + "; ".join(survived))
-    return int(killed < WANTED * len(found))
+        verdicts = list(pool.map(lambda one: timed(one, all_tests=arguments.all_tests), faults))
+    killed_count = verdicts.count("killed")
+    print(f"{killed_count} of {len(verdicts)} killed ({killed_count / len(verdicts):.0%})")
+    survivors = [fault.name for fault, one in zip(faults, verdicts, strict=True) if one != "killed"]
+    if survivors:
+        print("not noticed: " + "; ".join(survivors))
+    return int(killed_count < WANTED * len(verdicts))
 
 
 if __name__ == "__main__":

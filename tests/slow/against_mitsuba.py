@@ -197,8 +197,8 @@ def make_scene(
         index = _index(model, surface, capacities=capacities)
         return (surface, index), combine(surface.usage, index.usage)
 
-    first = model.first_capacities(geometry).resized(cell_patches=65_536)
-    (surface, index), _ = retry(attempt, first)
+    first_capacities = model.first_capacities(geometry).resized(cell_patches=65_536)
+    (surface, index), _ = retry(attempt, first_capacities)
     mesh = surface.mesh
     count = int(mesh.vertex_count)
     return Scene(
@@ -219,8 +219,8 @@ def make_lights(height: int = 32) -> dict[str, EnvLight]:
     up = np.clip(0.5 + 0.5 * z, 0, 1)[..., None]
     sky = up * np.array([0.35, 0.5, 0.8]) + (1 - up) * np.array([0.25, 0.2, 0.15])
     sides = ((x, (2, 0.2, 0.1)), (y, (0.1, 1.6, 0.3)), (-x, (0.2, 0.3, 2)), (-y, (2, 2, 0.2)))
-    for towards, color in sides:
-        facing = np.maximum(towards, 0.0)[..., None] ** 3
+    for component, color in sides:
+        facing = np.maximum(component, 0.0)[..., None] ** 3
         sky = sky + horizon * facing * np.array(color)
     sun = np.broadcast_to(0.3 * up * np.array([0.5, 0.7, 1.0]), sky.shape).copy()
     row, column = height // 4, height // 2 + height // 8
@@ -301,10 +301,12 @@ def shaded_lobes(key, points, materials, wo, light, index, *, counts):
     cosine = jnp.sum(points.normals * wo, axis=-1, keepdims=True)
     points = replace(points, normals=jnp.where(cosine < 0, -points.normals, points.normals))
     sampler = light_sampler(light)
-    shared_key, own_key = jax.random.split(key)
+    shared_key, reflect_key = jax.random.split(key)
     samples = draw_samples(shared_key, points, sampler, index, counts=counts)
     gathered = gather(points, samples, light)
-    shaded = reflect(own_key, points, materials, wo, gathered, light, sampler, index, counts=counts)
+    shaded = reflect(
+        reflect_key, points, materials, wo, gathered, light, sampler, index, counts=counts
+    )
     return shaded.diffuse, shaded.specular
 
 
@@ -332,22 +334,22 @@ def _shade_hits(
         roughness=jnp.full((block,), settings.roughness, jnp.float32),
         metallic=jnp.full((block,), metallic, jnp.float32),
     )
-    found = []
-    for first in range(0, count, block):
-        rows = np.minimum(np.arange(first, first + block), count - 1)
-        key, this = jax.random.split(key)
+    radiances = []
+    for start in range(0, count, block):
+        rows = np.minimum(np.arange(start, start + block), count - 1)
+        key, block_key = jax.random.split(key)
         vectors = (hits.positions, hits.normals, hits.outward)
         points = SurfacePoints(
             *(jnp.asarray(x[rows], jnp.float32) for x in vectors),
             faces=jnp.asarray(hits.faces[rows], jnp.int32),
-            mask=jnp.asarray(np.arange(first, first + block) < count),
+            mask=jnp.asarray(np.arange(start, start + block) < count),
         )
         wo = jnp.asarray(hits.wo[rows], jnp.float32)
         diffuse, specular = shaded_lobes(
-            this, points, materials, wo, light, index, counts=settings.counts
+            block_key, points, materials, wo, light, index, counts=settings.counts
         )
-        found.append(np.asarray(diffuse if material == "diffuse" else specular))
-    return np.concatenate(found)[:count] if found else np.zeros((0, 3), np.float32)
+        radiances.append(np.asarray(diffuse if material == "diffuse" else specular))
+    return np.concatenate(radiances)[:count] if radiances else np.zeros((0, 3), np.float32)
 
 
 def binned(hits: Hits, radiance: np.ndarray, settings: Settings) -> np.ndarray:
@@ -372,9 +374,9 @@ def our_image(
     total = settings.size**2
     images, coverages = [], []
     keys = jax.random.split(jax.random.key(settings.seed), len(passes))
-    how = {"material": material, "block": block_of(passes)}
+    options = {"material": material, "block": block_of(passes)}
     for key, hits in zip(keys, passes, strict=True):
-        radiance = _shade_hits(hits, light, index, settings, key, **how)
+        radiance = _shade_hits(hits, light, index, settings, key, **options)
         images.append(binned(hits, radiance, settings))
         coverages.append(np.bincount(hits.pixels, minlength=total) / settings.strata**2)
     return combined(images, coverages, settings.size)
@@ -383,8 +385,8 @@ def our_image(
 def combined(images: list[np.ndarray], coverages: list[np.ndarray], size: int) -> Image:
     """Average passes; the noise is half the difference between the means of even and odd passes."""
     stack = np.stack(images).reshape(-1, size, size, 3)
-    even = len(images) // 2 * 2  # the last pass of an odd number has no partner
-    halves = np.mean(stack[:even:2], axis=0) - np.mean(stack[1:even:2], axis=0)
+    even_count = len(images) // 2 * 2  # the last pass of an odd number has no partner
+    halves = np.mean(stack[:even_count:2], axis=0) - np.mean(stack[1:even_count:2], axis=0)
     coverage = np.mean(np.stack(coverages).reshape(-1, size, size), axis=0)
     return Image(np.mean(stack, axis=0), coverage, 0.5 * halves)
 
@@ -405,9 +407,9 @@ def _envmap_texels(light: EnvLight) -> np.ndarray:
     directions = np.stack(
         [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1
     )
-    found = lookup(light.radiance, jnp.asarray(directions.reshape(-1, 3), jnp.float32))
+    texels = lookup(light.radiance, jnp.asarray(directions.reshape(-1, 3), jnp.float32))
     # A copy, since Mitsuba does not take arrays that are read-only.
-    return np.array(found, np.float32).reshape(2 * height + 1, width, 3)
+    return np.array(texels, np.float32).reshape(2 * height + 1, width, 3)
 
 
 def light_error(emitter, light: EnvLight) -> float:
@@ -416,13 +418,13 @@ def light_error(emitter, light: EnvLight) -> float:
 
     directions = np.random.default_rng(0).normal(size=(200, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    found = []
+    radiances = []
     for direction in directions:
         interaction = mi.SurfaceInteraction3f()
         interaction.wi = mi.Vector3f(*(-float(x) for x in direction))
-        found.append(np.array(emitter.eval(interaction)).reshape(-1))
+        radiances.append(np.array(emitter.eval(interaction)).reshape(-1))
     ours = np.asarray(lookup(light.radiance, jnp.asarray(directions, jnp.float32)))
-    return float(np.max(np.abs(np.stack(found) - ours)) / np.max(np.asarray(light.radiance)))
+    return float(np.max(np.abs(np.stack(radiances) - ours)) / np.max(np.asarray(light.radiance)))
 
 
 def mitsuba_light(light: EnvLight):
@@ -474,8 +476,8 @@ def mitsuba_mesh(
         path.write_bytes(export_ply(mesh, vertex_normal=True))
         shape = mi.load_dict({"type": "ply", "filename": str(path), "bsdf": bsdf})
     params = mi.traverse(shape)
-    given = {"vertex_positions": scene.vertices, "vertex_normals": scene.normals}
-    for name, ours in {**given, "faces": faces}.items():
+    vertex_arrays = {"vertex_positions": scene.vertices, "vertex_normals": scene.normals}
+    for name, ours in {**vertex_arrays, "faces": faces}.items():
         theirs = np.array(params[name]).reshape(-1, 3)
         if theirs.shape != ours.shape or not np.allclose(theirs, ours, atol=1e-6):
             raise RuntimeError(f"Mitsuba's mesh has other {name} than ours")
@@ -505,15 +507,15 @@ def render_by_mitsuba(
         "film": film,
         "sampler": {"type": "multijitter", "sample_count": samples},
     }
-    parts = {
+    description = {
         "integrator": {**integrator, "hide_emitters": True},
         "sensor": sensor,
         "light": mitsuba_light(light),
         **shapes,
     }
-    loaded = mi.load_dict({"type": "scene", **parts})
+    mitsuba_scene = mi.load_dict({"type": "scene", **description})
     seeds = range(settings.seed, settings.seed + settings.mitsuba_passes)
-    passes = [np.array(mi.render(loaded, spp=samples, seed=k)) for k in seeds]
+    passes = [np.array(mi.render(mitsuba_scene, spp=samples, seed=k)) for k in seeds]
     images = [x[..., :3].astype(np.float64) for x in passes]
     return combined(images, [x[..., 3].astype(np.float64) for x in passes], size)
 
@@ -558,11 +560,11 @@ class Comparison:
     agreement: Agreement
 
     def __str__(self) -> str:
-        found = self.agreement
+        score = self.agreement
         return (
-            f"{self.name}: object {found.object_psnr:.1f} dB, whole image {found.image_psnr:.1f} "
-            f"dB, noise alone {found.noise_psnr:.1f} dB, bias {found.bias:+.3%} +- "
-            f"{found.bias_error:.3%}, white {found.white:.3f}"
+            f"{self.name}: object {score.object_psnr:.1f} dB, whole image {score.image_psnr:.1f} "
+            f"dB, noise alone {score.noise_psnr:.1f} dB, bias {score.bias:+.3%} +- "
+            f"{score.bias_error:.3%}, white {score.white:.3f}"
         )
 
 
@@ -602,11 +604,11 @@ def main() -> None:
     print(f"Mitsuba variant {choose_variant()}, {settings}", flush=True)
     scene = make_scene(settings.resolution)
     passes = all_passes(scene, settings)
-    away = np.mean(np.concatenate([np.sum(h.normals * h.wo, axis=1) < 0 for h in passes]))
-    print(f"{len(scene.faces)} faces; {away:.2%} of hits have a shading normal that faces away")
-    for found in comparisons(scene, passes, settings):
-        print(found, flush=True)
-        save_images(output, found)
+    share = np.mean(np.concatenate([np.sum(h.normals * h.wo, axis=1) < 0 for h in passes]))
+    print(f"{len(scene.faces)} faces; {share:.2%} of hits have a shading normal that faces away")
+    for comparison in comparisons(scene, passes, settings):
+        print(comparison, flush=True)
+        save_images(output, comparison)
 
 
 if __name__ == "__main__":

@@ -206,28 +206,31 @@ def main() -> None:
         solid = view.alpha > 0.99
 
         def agreement(other: np.ndarray, ours=view.rgb, inside=solid) -> str:
-            first, second = to_picture(ours), shown(other[..., :3])
-            whole, solid_part = psnr(first, second), psnr(first, second, inside)
-            return f"{float(whole):6.2f} dB, inside {float(solid_part):6.2f} dB"
+            our_picture, other_picture = to_picture(ours), shown(other[..., :3])
+            whole_psnr, solid_psnr = (
+                psnr(our_picture, other_picture),
+                psnr(our_picture, other_picture, inside),
+            )
+            return f"{float(whole_psnr):6.2f} dB, inside {float(solid_psnr):6.2f} dB"
 
         truth = render(asset, light, camera, samples=arguments.paths)
         print(f"view {number}: {agreement(truth)}", flush=True)
-        covered = float(np.abs(truth[..., 3] - view.alpha).mean())
+        coverage_error = float(np.abs(truth[..., 3] - view.alpha).mean())
         mean = [image[..., :3][solid].mean() for image in (view.rgb, truth)]
         print(
-            f"  coverage differs by {covered:.4f}; mean radiance ours / Mitsuba "
+            f"  coverage differs by {coverage_error:.4f}; mean radiance ours / Mitsuba "
             f"{mean[0]:.4f} / {mean[1]:.4f}"
         )
         if arguments.output is not None:
             arguments.output.mkdir(parents=True, exist_ok=True)
-            both = np.concatenate([to_picture(view.rgb), shown(truth[..., :3])], axis=1)
-            gap = 4.0 * np.abs(both[:, : camera.width] - both[:, camera.width :])
-            picture = np.concatenate([both, np.clip(gap, 0.0, 1.0)], axis=1)
+            pictures = np.concatenate([to_picture(view.rgb), shown(truth[..., :3])], axis=1)
+            gap = 4.0 * np.abs(pictures[:, : camera.width] - pictures[:, camera.width :])
+            picture = np.concatenate([pictures, np.clip(gap, 0.0, 1.0)], axis=1)
             write_png(arguments.output / f"view_{number}.png", picture)
         if number == 0:
-            for what, (other, other_light) in misread(asset, light).items():
-                wrong = render(other, other_light, camera, samples=arguments.paths // 4)
-                print(f"  {what}: {agreement(wrong)}", flush=True)
+            for mistake, (other, other_light) in misread(asset, light).items():
+                wrong_image = render(other, other_light, camera, samples=arguments.paths // 4)
+                print(f"  {mistake}: {agreement(wrong_image)}", flush=True)
 
 
 if __name__ == "__main__":

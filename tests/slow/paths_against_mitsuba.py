@@ -85,18 +85,18 @@ def shaded(key, points, table, wo, light, index, *, counts, segments, material):
     materials = jax.tree.map(lambda x: x[points.faces], table.materials)
     sampler = light_sampler(light)
     keys = jax.random.split(key, 4)
-    how = {"counts": counts, "finds_nearest": segments > 2}
+    options = {"counts": counts, "finds_nearest": segments > 2}
 
     def indirect(key):
         if segments == 2:
             return NO_INDIRECT
         return PathTracer(key, table, light, sampler, index, segments - 2, "none")
 
-    samples = draw_samples(keys[0], points, sampler, index, **how)
+    samples = draw_samples(keys[0], points, sampler, index, **options)
     gathered = gather(points, samples, light, indirect(keys[1]))
-    rest = (materials, wo, gathered, light, sampler, index, indirect(keys[2]))
-    found = reflect(keys[3], points, *rest, **how)
-    return found.diffuse if material == "diffuse" else found.specular
+    reflect_arguments = (materials, wo, gathered, light, sampler, index, indirect(keys[2]))
+    lobes = reflect(keys[3], points, *reflect_arguments, **options)
+    return lobes.diffuse if material == "diffuse" else lobes.specular
 
 
 def without_coat(material: str):
@@ -119,22 +119,24 @@ def our_image(
     table = table_of(scene, face_materials(scene, settings.roughness, material))
     key, images, coverages = jax.random.key(settings.seed), [], []
     block = against.block_of(passes, most=_POINTS_AT_ONCE)
-    how = {"counts": settings.counts, "segments": segments, "material": material}
+    options = {"counts": settings.counts, "segments": segments, "material": material}
     for hits in passes:
-        count, found = len(hits.pixels), []
-        for first in range(0, count, block):
-            rows = np.minimum(np.arange(first, first + block), count - 1)
+        count, radiances = len(hits.pixels), []
+        for start in range(0, count, block):
+            rows = np.minimum(np.arange(start, start + block), count - 1)
             vectors = (hits.positions, hits.normals, hits.outward)
             points = SurfacePoints(
                 *(jnp.asarray(x[rows], jnp.float32) for x in vectors),
                 faces=jnp.asarray(hits.faces[rows], jnp.int32),
-                mask=jnp.asarray(np.arange(first, first + block) < count),
+                mask=jnp.asarray(np.arange(start, start + block) < count),
             )
-            key, own = jax.random.split(key)
+            key, block_key = jax.random.split(key)
             wo = jnp.asarray(hits.wo[rows], jnp.float32)
             with without_coat(material):
-                found.append(np.asarray(shaded(own, points, table, wo, light, scene.index, **how)))
-        images.append(against.binned(hits, np.concatenate(found)[:count], settings))
+                radiances.append(
+                    np.asarray(shaded(block_key, points, table, wo, light, scene.index, **options))
+                )
+        images.append(against.binned(hits, np.concatenate(radiances)[:count], settings))
         coverage = np.bincount(hits.pixels, minlength=settings.size**2)
         coverages.append(coverage / settings.strata**2)
     return against.combined(images, coverages, settings.size)
@@ -169,9 +171,9 @@ def comparisons(
         light = against.make_lights()[light_name]
         for material in ("diffuse", "metal"):
             for count in segments:
-                how = {"material": material, "segments": count}
-                ours = our_image(scene, passes, light, settings, **how)
-                reference = mitsuba_image(scene, light, settings, **how)
+                options = {"material": material, "segments": count}
+                ours = our_image(scene, passes, light, settings, **options)
+                reference = mitsuba_image(scene, light, settings, **options)
                 name = f"paths_{light_name}_{material}_{count}"
                 agreement = against.compare(ours, reference)
                 yield against.Comparison(name, ours, reference, agreement)
@@ -181,10 +183,10 @@ def main() -> None:
     """Parse the command line and run."""
     parser = argparse.ArgumentParser(description="Paths over several surfaces against Mitsuba 3.")
     parser.add_argument("--output", type=Path, required=True, help="folder of the images")
-    usual = against.Settings(size=96, resolution=24, strata=5)
+    defaults = against.Settings(size=96, resolution=24, strata=5)
     for name in ("size", "resolution", "strata", "passes", "mitsuba_samples", "mitsuba_passes"):
         option = f"--{name.replace('_', '-')}"
-        parser.add_argument(option, type=int, default=getattr(usual, name))
+        parser.add_argument(option, type=int, default=getattr(defaults, name))
     parser.add_argument("--samples", type=int, default=8, help="of each technique, a primary hit")
     parser.add_argument("--lights", nargs="*", default=("sky", "sun"), help="some of sky and sun")
     options = vars(parser.parse_args())
@@ -193,9 +195,9 @@ def main() -> None:
     print(f"Mitsuba variant {against.choose_variant()}, {settings}", flush=True)
     scene = against.make_scene(settings.resolution, bowl_distances, EYE)
     print(f"{len(scene.faces)} faces", flush=True)
-    for found in comparisons(scene, settings, lights=lights):
-        print(found, flush=True)
-        against.save_images(output, found)
+    for comparison in comparisons(scene, settings, lights=lights):
+        print(comparison, flush=True)
+        against.save_images(output, comparison)
 
 
 if __name__ == "__main__":

@@ -40,19 +40,21 @@ def scene():
 @pytest.fixture(scope="module")
 def comparisons(scene):
     passes = against.all_passes(scene, SETTINGS)
-    return {found.name: found for found in against.comparisons(scene, passes, SETTINGS)}
+    return {
+        comparison.name: comparison for comparison in against.comparisons(scene, passes, SETTINGS)
+    }
 
 
 @pytest.mark.parametrize("light", ["sky", "sun"])
 @pytest.mark.parametrize("material", ["diffuse", "metal"])
 def test_our_image_equals_that_of_mitsuba(comparisons, light, material):
-    found = comparisons[f"{light}_{material}"]
-    agreement = found.agreement
-    assert agreement.object_psnr >= MARKS[material], found
-    assert agreement.object_psnr >= agreement.noise_psnr - NOISE_MARGIN[light], found
+    comparison = comparisons[f"{light}_{material}"]
+    agreement = comparison.agreement
+    assert agreement.object_psnr >= MARKS[material], comparison
+    assert agreement.object_psnr >= agreement.noise_psnr - NOISE_MARGIN[light], comparison
     # Separable masking leaves Mitsuba's metal a tenth of a percent darker.
-    assert abs(agreement.bias) <= 4 * agreement.bias_error + 0.002, found
-    assert abs(found.ours.coverage - found.reference.coverage).mean() < 2e-3
+    assert abs(agreement.bias) <= 4 * agreement.bias_error + 0.002, comparison
+    assert abs(comparison.ours.coverage - comparison.reference.coverage).mean() < 2e-3
 
 
 def test_the_light_is_the_same_function_of_direction_and_its_mirror_image_is_not(scene):
@@ -65,16 +67,18 @@ def test_the_light_is_the_same_function_of_direction_and_its_mirror_image_is_not
 @pytest.mark.parametrize("fault", ["mirrored light", "no occlusion", "rougher metal"])
 def test_a_fault_shows(scene, fault):
     light, material = against.make_lights()["sky"], "diffuse"
-    seen, settings, occlusion = light, COARSE, True
+    our_light, settings, occlusion = light, COARSE, True
     if fault == "mirrored light":
-        seen = EnvLight(jnp.flip(light.radiance, axis=1))
+        our_light = EnvLight(jnp.flip(light.radiance, axis=1))
     elif fault == "no occlusion":
         occlusion = False
     else:
         material, settings = "metal", replace(COARSE, roughness=1.1 * COARSE.roughness)
     passes = against.all_passes(scene, COARSE)
-    ours = against.our_image(scene, passes, seen, settings, material=material, occlusion=occlusion)
+    ours = against.our_image(
+        scene, passes, our_light, settings, material=material, occlusion=occlusion
+    )
     reference = against.mitsuba_image(scene, light, COARSE, material=material)
-    found = against.compare(ours, reference)
-    assert found.object_psnr < MARKS[material] or material == "metal", found
-    assert found.object_psnr < found.noise_psnr - ERROR_MARGIN, found
+    agreement = against.compare(ours, reference)
+    assert agreement.object_psnr < MARKS[material] or material == "metal", agreement
+    assert agreement.object_psnr < agreement.noise_psnr - ERROR_MARGIN, agreement

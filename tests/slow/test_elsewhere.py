@@ -39,25 +39,25 @@ def read_at_hits(asset):
     grey = np.repeat(asset.orm[..., 1:2], 3, axis=-1), np.repeat(asset.orm[..., 2:], 3, axis=-1)
     color = mi.load_dict(elsewhere._texture(asset.base_color, raw=False))
     rough, metal = (mi.load_dict(elsewhere._texture(pixels, raw=True)) for pixels in grey)
-    points, found = [], []
+    points, samples = [], []
     for direction in directions:
-        origin, towards = (
+        origin, ray_direction = (
             mi.Point3f(*map(float, 3 * direction)),
             mi.Vector3f(*map(float, -direction)),
         )
-        hit = scene.ray_intersect(mi.Ray3f(origin, towards))
+        hit = scene.ray_intersect(mi.Ray3f(origin, ray_direction))
         points.append(np.array(hit.p).ravel())
         values = [np.array(color.eval(hit)).ravel()]
         values += [np.array(texture.eval(hit)).ravel()[:1] for texture in (rough, metal)]
-        found.append(np.concatenate(values))
-    return np.array(points), np.array(found)
+        samples.append(np.concatenate(values))
+    return np.array(points), np.array(samples)
 
 
 def error(asset):
-    points, found = read_at_hits(asset)
+    points, samples = read_at_hits(asset)
     albedo, roughness, metallic = materials(points)
     expected = np.concatenate([albedo, roughness[:, None], metallic[:, None]], axis=-1)
-    return np.median(np.abs(found - np.clip(expected, 0, 1)), axis=0)
+    return np.median(np.abs(samples - np.clip(expected, 0, 1)), axis=0)
 
 
 def test_mitsuba_reads_the_materials_that_were_exported(asset):
@@ -66,7 +66,7 @@ def test_mitsuba_reads_the_materials_that_were_exported(asset):
 
 @pytest.mark.parametrize("what", ["upside down", "swapped", "decoded twice", "y up"])
 def test_a_convention_that_is_misread_would_be_noticed(asset, what):
-    changed = {
+    changes = {
         "upside down": {"uv": asset.uv * [1, -1] + [0, 1]},
         "swapped": {"orm": asset.orm[..., [0, 2, 1]]},
         "decoded twice": {
@@ -74,4 +74,4 @@ def test_a_convention_that_is_misread_would_be_noticed(asset, what):
         },
         "y up": {"vertices": asset.vertices[:, [0, 2, 1]] * [1, 1, -1]},
     }[what]
-    assert error(replace(asset, **changed)).max() > 3 * TOLERANCE
+    assert error(replace(asset, **changes)).max() > 3 * TOLERANCE

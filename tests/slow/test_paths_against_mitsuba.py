@@ -32,8 +32,8 @@ def test_light_by_way_of_another_surface_equals_that_of_mitsuba():
     hits = against.all_passes(scene, SETTINGS)
     reference = paths.mitsuba_image(scene, light, SETTINGS, material="diffuse", segments=3)
     ours = paths.our_image(scene, hits, light, SETTINGS, material="diffuse", segments=3)
-    found = against.compare(ours, reference)
-    assert found.object_psnr >= found.noise_psnr - NOISE_MARGIN, found
-    assert abs(found.bias) <= 4 * found.bias_error + BIAS, found
+    agreement = against.compare(ours, reference)
+    assert agreement.object_psnr >= agreement.noise_psnr - NOISE_MARGIN, agreement
+    assert abs(agreement.bias) <= 4 * agreement.bias_error + BIAS, agreement
     direct = paths.our_image(scene, hits, light, SETTINGS, material="diffuse", segments=2)
     assert against.compare(direct, reference).bias < -10 * BIAS

@@ -61,23 +61,25 @@ def list_blended_mvs(root: Path, *, light: str | None = None) -> Listing:
 def _frame(root: Path, image: Path) -> Frame:
     where = existing(root, [root / CAMERA_FOLDER / f"{image.stem}_cam.txt"], str(image))
     extrinsic, intrinsic = _read_camera(where)
-    what = f"the camera {where}"
+    label = f"the camera {where}"
     if np.abs(intrinsic[[0, 1, 2, 2], [1, 0, 0, 1]]).max() > 0 or intrinsic[2, 2] != 1.0:
         raise SceneError(
-            f"{what} has a skew, or a last row that is not 0 0 1: {intrinsic.tolist()}"
+            f"{label} has a skew, or a last row that is not 0 0 1: {intrinsic.tolist()}"
         )
     if np.abs(extrinsic[3] - [0, 0, 0, 1]).max() > 0:
         raise SceneError(f"the extrinsic of {where} must end in 0 0 0 1, got {extrinsic[3]}")
     height, width = image_size(image)
     lens = PinholeLens(
-        fx=checked_length(float(intrinsic[0, 0]), "fx", what),
-        fy=checked_length(float(intrinsic[1, 1]), "fy", what),
+        fx=checked_length(float(intrinsic[0, 0]), "fx", label),
+        fy=checked_length(float(intrinsic[1, 1]), "fy", label),
         cx=float(intrinsic[0, 2]),
         cy=float(intrinsic[1, 2]),
         width=width,
         height=height,
     )
-    return captured_frame(root, image, opengl_pose(extrinsic[:3, :3], extrinsic[:3, 3], what), lens)
+    return captured_frame(
+        root, image, opengl_pose(extrinsic[:3, :3], extrinsic[:3, 3], label), lens
+    )
 
 
 def _read_camera(where: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -108,10 +108,10 @@ def list_colmap(root: Path, *, light: str | None = None) -> Listing:
     if not images:
         raise SceneError(f"{images_file} has no registered image; run the mapper again")
     frames = [_frame(root, image, lenses, images_file) for image in images.values()]
-    others = sorted(path.name for path in folder.parent.iterdir() if path.name.isdigit())
+    model_names = sorted(path.name for path in folder.parent.iterdir() if path.name.isdigit())
     notes = ()
-    if folder.name.isdigit() and len(others) > 1:
-        notes = (f"of {len(others)} models, sparse/{folder.name} is read",)
+    if folder.name.isdigit() and len(model_names) > 1:
+        notes = (f"of {len(model_names)} models, sparse/{folder.name} is read",)
     return split_capture(frames, notes=notes)
 
 
@@ -132,10 +132,10 @@ def read_points(root: Path) -> Points | None:
     folder = _model_folder(root)
     if folder is None:
         return None
-    for suffix, read in ((".bin", _binary_points), (".txt", _text_points)):
+    for suffix, reader in ((".bin", _binary_points), (".txt", _text_points)):
         path = folder / f"points3D{suffix}"
         if path.is_file():
-            rows = np.array(list(read(path)), np.float64).reshape(-1, 6)
+            rows = np.array(list(reader(path)), np.float64).reshape(-1, 6)
             if not np.isfinite(rows).all():
                 raise SceneError(f"{path} has points that are not finite; write the model again")
             return Points(rows[:, :3], np.clip(rows[:, 3:] / 255.0, 0.0, 1.0))
@@ -152,55 +152,55 @@ def _model_folder(root: Path) -> Path | None:
 
 def _distinct(pairs, where: Path) -> dict:
     """Collect numbered values in a dictionary; `SceneError` where a number occurs twice."""
-    found = {}
+    values_by_number = {}
     for number, value in pairs:
-        if number in found:
+        if number in values_by_number:
             raise SceneError(f"{where} has the number {number} twice; write the model again")
-        found[number] = value
-    return found
+        values_by_number[number] = value
+    return values_by_number
 
 
 def _frame(root: Path, image: _Image, lenses: Mapping[int, PinholeLens], where: Path) -> Frame:
-    what = f"image {image.name!r} of {where}"
+    label = f"image {image.name!r} of {where}"
     if image.camera not in lenses:
-        raise SceneError(f"{what} is of camera {image.camera}, which cameras{where.suffix} lacks")
-    translation = checked_numbers(image.translation, (3,), f"the translation of {what}")
-    rotation = quaternion_to_rotation(np.array(image.quaternion), what)
-    pose = opengl_pose(rotation, translation, what)
+        raise SceneError(f"{label} is of camera {image.camera}, which cameras{where.suffix} lacks")
+    translation = checked_numbers(image.translation, (3,), f"the translation of {label}")
+    rotation = quaternion_to_rotation(np.array(image.quaternion), label)
+    pose = opengl_pose(rotation, translation, label)
     folder = image_folder(root).relative_to(root)
     path = inside_scene(root, f"{folder.as_posix()}/{image.name}", where)
-    return captured_frame(root, existing(root, [path], what), pose, lenses[image.camera])
+    return captured_frame(root, existing(root, [path], label), pose, lenses[image.camera])
 
 
-def _lens(model: _Model, width: int, height: int, numbers: tuple[float, ...], what: str):
+def _lens(model: _Model, width: int, height: int, numbers: tuple[float, ...], label: str):
     """Check the parameters of a camera, and return its lens."""
     if model.name in _UNREAD:
-        raise SceneError(f"{what} has the model {model.name}, which is not read; {_UNDISTORT}")
-    checked_numbers(numbers, (model.numbers,), f"the numbers of {what} ({model.name})")
-    has_two = model.name in ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV")
-    fx, fy = numbers[0], numbers[1] if has_two else numbers[0]
-    cx, cy = numbers[2 if has_two else 1 :][:2]
-    bend = numbers[4 if has_two else 3 :]
+        raise SceneError(f"{label} has the model {model.name}, which is not read; {_UNDISTORT}")
+    checked_numbers(numbers, (model.numbers,), f"the numbers of {label} ({model.name})")
+    has_two_focals = model.name in ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV")
+    fx, fy = numbers[0], numbers[1] if has_two_focals else numbers[0]
+    cx, cy = numbers[2 if has_two_focals else 1 :][:2]
+    coefficients = numbers[4 if has_two_focals else 3 :]
     return PinholeLens(
-        fx=checked_length(fx, "fx", what),
-        fy=checked_length(fy, "fy", what),
+        fx=checked_length(fx, "fx", label),
+        fy=checked_length(fy, "fy", label),
         cx=cx,
         cy=cy,
-        width=int(checked_length(width, "w", what)),
-        height=int(checked_length(height, "h", what)),
-        distortion=_distortion(model.name, bend),
+        width=int(checked_length(width, "w", label)),
+        height=int(checked_length(height, "h", label)),
+        distortion=_distortion(model.name, coefficients),
     )
 
 
-def _distortion(model: str, bend: tuple[float, ...]) -> Distortion | None:
+def _distortion(model: str, coefficients: tuple[float, ...]) -> Distortion | None:
     if model.endswith("FISHEYE"):
-        return Fisheye(tuple(bend))
-    if not any(bend):
+        return Fisheye(tuple(coefficients))
+    if not any(coefficients):
         return None
     if model in ("SIMPLE_RADIAL", "RADIAL"):
-        return Brown(tuple(bend))
-    k1, k2, p1, p2, *more = bend
-    return Brown((k1, k2, *more[:1]), (p1, p2), tuple(more[1:]))
+        return Brown(tuple(coefficients))
+    k1, k2, p1, p2, *higher = coefficients
+    return Brown((k1, k2, *higher[:1]), (p1, p2), tuple(higher[1:]))
 
 
 class _Bytes:
@@ -231,9 +231,9 @@ class _Bytes:
         end = self._content.find(b"\0", self._at)
         if end < 0:
             raise SceneError(f"{self.path} ends within a name; write the model again")
-        at = self._skipped(end + 1 - self._at)
+        start = self._skipped(end + 1 - self._at)
         try:
-            return self._content[at:end].decode("utf-8")
+            return self._content[start:end].decode("utf-8")
         except UnicodeDecodeError as error:
             raise SceneError(f"{self.path} has a name that is no text ({error.reason})") from error
 
@@ -259,11 +259,11 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, PinholeLens]]:
     (count,) = content.numbers("Q")
     for _ in range(count):
         number, kind, width, height = content.numbers("IiQQ")
-        what = f"camera {number} of {path}"
+        label = f"camera {number} of {path}"
         if kind not in _MODELS:
-            raise SceneError(f"{what} has the unknown model {kind}; {_UNDISTORT}")
+            raise SceneError(f"{label} has the unknown model {kind}; {_UNDISTORT}")
         model = _MODELS[kind]
-        yield number, _lens(model, width, height, content.numbers(f"{model.numbers}d"), what)
+        yield number, _lens(model, width, height, content.numbers(f"{model.numbers}d"), label)
     content.end()
 
 

@@ -118,14 +118,14 @@ def _frame(
     where: Path,
     mask: Path | None,
 ) -> Frame:
-    both = []
+    checked_matrices = []
     for name in (f"world_mat_{number}", f"scale_mat_{number}"):
         if name not in matrices:
             raise SceneError(f"{where} has no {name}; cameras are numbered from 0 without gaps")
-        both.append(checked_numbers(matrices[name], (4, 4), f"{name} of {where}"))
-    world, scale = both
-    what = f"world_mat_{number} @ scale_mat_{number} of {where}"
-    lens, rotation, translation = _taken_apart((world @ scale)[:3], what)
+        checked_matrices.append(checked_numbers(matrices[name], (4, 4), f"{name} of {where}"))
+    world, scale = checked_matrices
+    label = f"world_mat_{number} @ scale_mat_{number} of {where}"
+    lens, rotation, translation = _taken_apart((world @ scale)[:3], label)
     height, width = image_size(image)
     pinhole = PinholeLens(
         fx=lens[0, 0],
@@ -135,11 +135,11 @@ def _frame(
         width=width,
         height=height,
     )
-    pose = opengl_pose(rotation, translation, what)
+    pose = opengl_pose(rotation, translation, label)
     return captured_frame(root, image, pose, pinhole, mask=mask)
 
 
-def _taken_apart(projection: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _taken_apart(projection: np.ndarray, label: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Decompose ``projection ~ K [R | t]``; K has a positive diagonal and K_33 = 1.
 
     Raises
@@ -152,14 +152,14 @@ def _taken_apart(projection: np.ndarray, what: str) -> tuple[np.ndarray, np.ndar
     lens, rotation = rq(projection[:, :3])
     pivots = np.diag(lens)
     if np.abs(pivots).min() <= _SMALLEST_PIVOT * np.abs(pivots).max():
-        raise SceneError(f"{what} is singular; it must be K [R | t]")
+        raise SceneError(f"{label} is singular; it must be K [R | t]")
     signs = np.diag(np.sign(pivots))
     lens, rotation = lens @ signs, signs @ rotation
     translation = np.linalg.solve(lens, projection[:, 3])
     lens = lens / lens[2, 2]
     if abs(lens[0, 1]) > _SKEW_TOLERANCE * lens[0, 0]:
         raise SceneError(
-            f"{what} has a skew of {lens[0, 1]:g} pixels at a focal length of {lens[0, 0]:g}; "
+            f"{label} has a skew of {lens[0, 1]:g} pixels at a focal length of {lens[0, 0]:g}; "
             "pixels must be rectangles"
         )
     return lens, rotation, translation

@@ -72,15 +72,17 @@ def _frames(root: Path, split: str, *, has_maps: bool) -> tuple[Frame, ...]:
     for file_path, pose, lens in read_transforms(where):
         stem = image_stem(root, file_path, where)
         candidates = [stem.with_name(stem.name + suffix) for suffix in IMAGE_SUFFIXES]
-        asked = inside_scene(root, file_path, where)
+        listed_path = inside_scene(root, file_path, where)
         image = existing(
-            root, [asked] if asked != stem else [*candidates, asked], f"{file_path} of {where.name}"
+            root,
+            [listed_path] if listed_path != stem else [*candidates, listed_path],
+            f"{file_path} of {where.name}",
         )
         maps = {}
         if has_maps:
             names = {"normal": "_normal.png", "mask": "_alpha.png"}
             maps = optional_files(
-                root, {key: stem.with_name(stem.name + end) for key, end in names.items()}
+                root, {key: stem.with_name(stem.name + ending) for key, ending in names.items()}
             )
         mask = maps.pop("mask", None)
         frames.append(Frame(stem.name, pose, lens, image, mask=mask, truth=maps))

@@ -36,10 +36,10 @@ def list_stanford_orb(root: Path, *, light: str | None = None) -> Listing:
     """
     require_no_light(light)
     train, test = (_frames(root, split) for split in ("train", "test"))
-    lit = sum(frame.light is not None for frame in test)
+    lit_count = sum(frame.light is not None for frame in test)
     notes = ()
-    if 0 < lit < len(test):
-        notes = (f"{len(test) - lit} of {len(test)} test views have no environment map",)
+    if 0 < lit_count < len(test):
+        notes = (f"{len(test) - lit_count} of {len(test)} test views have no environment map",)
     return Listing(train=train, test=test, is_capture=True, notes=notes)
 
 
@@ -51,10 +51,10 @@ def _frames(root: Path, split: str) -> tuple[Frame, ...]:
     for file_path, pose, lens in read_transforms(where):
         stem = image_stem(root, file_path, where)
         candidates = [stem.with_name(stem.name + suffix) for suffix in _SUFFIXES]
-        what = f"{file_path} of {where.name}"
-        image = existing(root, candidates, what)
+        label = f"{file_path} of {where.name}"
+        image = existing(root, candidates, label)
         masks = stem.parent.with_name(f"{stem.parent.name}_mask")
-        mask = existing(root, [masks / f"{stem.name}.png"], f"the mask of {what}")
+        mask = existing(root, [masks / f"{stem.name}.png"], f"the mask of {label}")
         light = _light(root, stem.name) if split == "test" else None
         frames.append(Frame(stem.name, pose, lens, image, mask=mask, light=light))
     return tuple(frames)

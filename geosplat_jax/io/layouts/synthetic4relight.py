@@ -42,8 +42,8 @@ def list_synthetic4relight(root: Path, *, light: str | None = None) -> Listing:
     if light not in (None, TRAIN_LIGHT):
         raise SceneError(f"training images show {TRAIN_LIGHT} only, got light={light!r}")
     return Listing(
-        train=tuple(_train_frame(root, *listed) for listed in _listed(root, "train")),
-        test=tuple(_test_frame(root, *listed) for listed in _listed(root, "test")),
+        train=tuple(_train_frame(root, *entry) for entry in _listed(root, "train")),
+        test=tuple(_test_frame(root, *entry) for entry in _listed(root, "test")),
         lights=find_lights(root, [TRAIN_LIGHT, *TEST_LIGHTS]),
         train_light=TRAIN_LIGHT,
     )
@@ -56,7 +56,7 @@ def _listed(root: Path, split: str):
         return
     for file_path, pose, lens in read_transforms(where):
         stem = image_stem(root, file_path, where)
-        ending = next((end for end in _ENDINGS if stem.name.endswith(end)), "")
+        ending = next((candidate for candidate in _ENDINGS if stem.name.endswith(candidate)), "")
         yield stem.with_name(stem.name.removesuffix(ending)), pose, lens
 
 
@@ -73,14 +73,14 @@ def _train_frame(root: Path, stem: Path, pose, lens: Lens) -> Frame:
 def _test_frame(root: Path, stem: Path, pose, lens: Lens) -> Frame:
     image = existing(root, [_beside(stem, "_rgba.png")], stem.name)
     mask = optional_files(root, {"mask": _beside(stem, "_mask.png")}).get("mask")
-    truth = {"albedo": _beside(stem, "_albedo.png"), "roughness": _beside(stem, "_rough.png")}
-    relit = {light: root / "test_rli" / f"{light}_{stem.name}.png" for light in TEST_LIGHTS}
+    truth_paths = {"albedo": _beside(stem, "_albedo.png"), "roughness": _beside(stem, "_rough.png")}
+    relit_paths = {light: root / "test_rli" / f"{light}_{stem.name}.png" for light in TEST_LIGHTS}
     return Frame(
         stem.name,
         pose,
         lens,
         image,
         mask=mask,
-        truth=optional_files(root, truth),
-        relight=optional_files(root, relit),
+        truth=optional_files(root, truth_paths),
+        relight=optional_files(root, relit_paths),
     )

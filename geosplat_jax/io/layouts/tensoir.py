@@ -53,8 +53,8 @@ def list_tensoir(root: Path, *, light: str | None = None) -> Listing:
     views = {split: _views(root, split) for split in ("train", "test")}
     train_light = light or _train_light(root, [folder for folder, _, _ in views["train"]])
     splits = {
-        split: tuple(_frame(root, *view, train_light) for view in listed)
-        for split, listed in views.items()
+        split: tuple(_frame(root, *view, train_light) for view in split_views)
+        for split, split_views in views.items()
     }
     lights = {train_light: None}
     for frame in splits["test"]:
@@ -117,35 +117,35 @@ def _lights_of(folder: Path) -> list[str]:
 
 
 def _train_light(root: Path, folders: list[Path]) -> str:
-    present = _lights_of(folders[0])
-    if not present:
+    lights = _lights_of(folders[0])
+    if not lights:
         raise MissingFileError(f"{folders[0]} has no image rgba_<light>.png; check it is complete")
     if (root / "scene.json").is_file():
-        named = read_json(root / "scene.json").get("train_light")
-        if named is not None:
-            if named not in present:
+        named_light = read_json(root / "scene.json").get("train_light")
+        if named_light is not None:
+            if named_light not in lights:
                 raise SceneError(
-                    f"{root / 'scene.json'} names the training light {named!r}, but "
-                    f"{folders[0].name} has images under {present}"
+                    f"{root / 'scene.json'} names the training light {named_light!r}, but "
+                    f"{folders[0].name} has images under {lights}"
                 )
-            return named
-    if USUAL_TRAIN_LIGHT in present:
+            return named_light
+    if USUAL_TRAIN_LIGHT in lights:
         return USUAL_TRAIN_LIGHT
-    if len(present) != 1:
+    if len(lights) != 1:
         raise SceneError(
-            f"{folders[0]} has images under the lights {present}; choose one with light=..."
+            f"{folders[0]} has images under the lights {lights}; choose one with light=..."
         )
-    return present[0]
+    return lights[0]
 
 
 def _frame(root: Path, folder: Path, pose: np.ndarray, lens: Lens, light: str) -> Frame:
-    present = _lights_of(folder)
-    if light not in present:
+    lights = _lights_of(folder)
+    if light not in lights:
         raise MissingFileError(
-            f"{folder} has no image under the light {light!r} (rgba_{light}.png); it has {present}"
+            f"{folder} has no image under the light {light!r} (rgba_{light}.png); it has {lights}"
         )
     image = existing(root, [folder / f"rgba_{light}.png"], folder.name)
-    others = [name for name in present if name != light]
+    others = [name for name in lights if name != light]
     maps = ("albedo", "normal", "roughness", "metallic")
     return Frame(
         folder.name,

@@ -61,11 +61,11 @@ def list_transforms_capture(root: Path, *, light: str | None = None) -> Listing:
         shape = (4, 4) if isinstance(rows, list) and len(rows) == 4 else (3, 4)
         checked_numbers(rows, shape, f"'applied_transform' of {where}")
     frames: dict[str, Frame] = {}
-    for listed in list_transforms(content, where):
-        name = _plain(listed.file_path)
+    for listed_frame in list_transforms(content, where):
+        name = _plain(listed_frame.file_path)
         if name in frames:
             raise SceneError(f"{where} names {name!r} for two frames; remove one")
-        frames[name] = _frame(root, listed, where)
+        frames[name] = _frame(root, listed_frame, where)
     splits = {key: _names(content, key, where, frames) for key in _SPLITS if key in content}
     if not splits:
         return split_capture(list(frames.values()))
@@ -77,20 +77,23 @@ def _plain(path: str) -> str:
     return str(PurePosixPath(path.replace("\\", "/")))
 
 
-def _frame(root: Path, listed: ListedFrame, where: Path) -> Frame:
-    asked = inside_scene(root, listed.file_path, where)
-    stem = image_stem(root, listed.file_path, where)
-    candidates = [asked]
-    if asked == stem:  # no ending, or one that is not known
-        candidates = [*(stem.with_name(stem.name + suffix) for suffix in IMAGE_SUFFIXES), asked]
-    image = existing(root, candidates, f"{listed.file_path} of {where.name}")
-    mask, name = None, listed.values.get("mask_path")
+def _frame(root: Path, listed_frame: ListedFrame, where: Path) -> Frame:
+    listed_path = inside_scene(root, listed_frame.file_path, where)
+    stem = image_stem(root, listed_frame.file_path, where)
+    candidates = [listed_path]
+    if listed_path == stem:  # no ending, or one that is not known
+        candidates = [
+            *(stem.with_name(stem.name + suffix) for suffix in IMAGE_SUFFIXES),
+            listed_path,
+        ]
+    image = existing(root, candidates, f"{listed_frame.file_path} of {where.name}")
+    mask, name = None, listed_frame.values.get("mask_path")
     if name is not None:
         if not isinstance(name, str) or not name:
-            raise SceneError(f"'mask_path' of {listed.file_path} in {where} must be a name")
+            raise SceneError(f"'mask_path' of {listed_frame.file_path} in {where} must be a name")
         path = inside_scene(root, name, where)
-        mask = existing(root, [path], f"the mask of {listed.file_path} of {where.name}")
-    frame = captured_frame(root, image, listed.pose, listed.lens, mask=mask)
+        mask = existing(root, [path], f"the mask of {listed_frame.file_path} of {where.name}")
+    frame = captured_frame(root, image, listed_frame.pose, listed_frame.lens, mask=mask)
     ignored = {"ignored": image.with_name(f"dynamic_mask_{image.stem}.png")}
     return replace(frame, **optional_files(root, ignored))
 
@@ -121,16 +124,16 @@ def _given_split(
     else:
         others = {name for names in splits.values() for name in names}
         train = [name for name in frames if name not in others]
-    both = set(train) & set(test)
-    if both:
-        raise SceneError(f"{where} names {min(both)!r} to train on and to test; choose one")
+    shared_names = set(train) & set(test)
+    if shared_names:
+        raise SceneError(f"{where} names {min(shared_names)!r} to train on and to test; choose one")
     if not train:
         raise SceneError(f"the split of {where} leaves no view to train on")
-    left = len(frames) - len(set(train) | set(test))
-    notes = (f"{left} views that the split of {where.name} leaves out are not used",)
+    unused_count = len(frames) - len(set(train) | set(test))
+    notes = (f"{unused_count} views that the split of {where.name} leaves out are not used",)
     return Listing(
         train=tuple(frames[name] for name in train),
         test=tuple(frames[name] for name in test),
         is_capture=True,
-        notes=notes if left else (),
+        notes=notes if unused_count else (),
     )
