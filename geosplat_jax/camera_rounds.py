@@ -75,12 +75,12 @@ def _require_same(folder: Path, provenance: Mapping[str, Any]) -> None:
         raise RunError(f"{path} is damaged: it is no record; delete {folder} to begin again")
     new_record = parse_json(text)
     # An earlier version may have recorded less: only what it recorded is compared.
-    differences = sorted(
+    changed_keys = sorted(
         name for name in new_record if name in old_record and new_record[name] != old_record[name]
     )
-    if differences:
+    if changed_keys:
         raise RunError(
-            f"the cameras in {folder} were refined with other {' and '.join(differences)}; delete "
+            f"the cameras in {folder} were refined with other {' and '.join(changed_keys)}; delete "
             "that folder to refine them again, or take another output"
         )
 

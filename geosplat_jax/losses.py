@@ -387,11 +387,9 @@ def light_smoothness(radiance: Float[Array, "H W 3"]) -> Float[Array, ""]:
     """
     values = safe_log(radiance)
     weight = _solid_angle_shares(radiance)
-    row_changes = jnp.mean(absolute(jnp.roll(values, 1, axis=1) - values), axis=-1)
-    column_changes = jnp.mean(absolute(values[1:] - values[:-1]), axis=-1)
-    return jnp.sum(weight * row_changes) + jnp.sum(
-        0.5 * (weight[1:] + weight[:-1]) * column_changes
-    )
+    horizontal = jnp.mean(absolute(jnp.roll(values, 1, axis=1) - values), axis=-1)
+    vertical = jnp.mean(absolute(values[1:] - values[:-1]), axis=-1)
+    return jnp.sum(weight * horizontal) + jnp.sum(0.5 * (weight[1:] + weight[:-1]) * vertical)
 
 
 def _solid_angle_shares(radiance: Float[Array, "H W 3"]) -> Float[Array, "H W"]:

@@ -113,12 +113,12 @@ class Pipeline(RenderPipeline):
         lists = [self.visible(asset.splats, view.camera) for view in views]
         is_seen = self.points_seen(asset, lists)
         lights, carry = self.lights(asset, params.light, is_seen, batch)
-        second_lights = self.residual_lights(asset, params.light, is_seen, batch)
+        residual_lights = self.residual_lights(asset, params.light, is_seen, batch)
         total, shared = self.shared_loss(params, asset, lights, batch)
         reports = []
         for view, view_lists, share in zip(views, lists, batch.shares, strict=True):
             residual = self.residual_image(
-                params.log_exposure, asset, second_lights, view_lists, view
+                params.log_exposure, asset, residual_lights, view_lists, view
             )
             value, report = self.view_loss(
                 params.log_exposure, asset, lights, view_lists, view, residual

@@ -82,10 +82,8 @@ def steps(monkeypatch):
 
 
 def same(first, second):
-    a, b = (
-        jax.tree.leaves((first.image, first.views)),
-        jax.tree.leaves((second.image, second.views)),
-    )
+    a = jax.tree.leaves((first.image, first.views))
+    b = jax.tree.leaves((second.image, second.views))
     key = np.array_equal(jax.random.key_data(first.key), jax.random.key_data(second.key))
     return key and all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
 

@@ -102,10 +102,8 @@ def test_encoded_images_are_compared_as_they_are_seen():
 def test_colours_are_compared_linear_unless_the_objective_says_so():
     rgb, image = uniform(1, 1, 4, 4, 3), uniform(2, 1, 4, 4, 4).at[..., 3].set(1.0)
     camera = Camera(jnp.eye(4)[None], jnp.eye(3)[None], 4, 4)
-    view, output = (
-        Batch(camera, image, jax.random.key(0)),
-        RenderOutput(rgb, jnp.ones((1, 4, 4)), {}, {}),
-    )
+    view = Batch(camera, image, jax.random.key(0))
+    output = RenderOutput(rgb, jnp.ones((1, 4, 4)), {}, {})
     for objective, seen in (
         (Objective(), lambda colours: colours),
         (Objective(srgb=True), linear_to_srgb),

@@ -219,10 +219,8 @@ def test_pooled_and_mean_of_images_differ():
     albedo[1] = 0.9 * mask[1][..., None]
     linear = dataclasses.replace(IRGS, albedo_is_pooled=True)
     args = (albedo, mask, truth, mask, np.ones(3))
-    mean, pooled = (
-        protocol_metrics.albedo_metrics(IRGS, *args),
-        protocol_metrics.albedo_metrics(linear, *args),
-    )
+    mean = protocol_metrics.albedo_metrics(IRGS, *args)
+    pooled = protocol_metrics.albedo_metrics(linear, *args)
     assert mean["albedo.psnr"] == pytest.approx(
         (decibels(0.01) + decibels(0.16 / 2)) / 2, abs=DECIBELS
     )

@@ -303,10 +303,8 @@ def _count_view(
             )
         )
     texels = np.array([config.light.width, config.light.height])
-    old_values, new_values = (
-        before["reflected"][lit] * texels - 0.5,
-        after["reflected"][lit_partners] * texels - 0.5,
-    )
+    old_values = before["reflected"][lit] * texels - 0.5
+    new_values = after["reflected"][lit_partners] * texels - 0.5
     counts.append(_cells("texel of the reflected view", "visible splats", old_values, new_values))
     old_values, new_values = (
         127 * np.abs(x)[:, None] for x in (before["cosine"][lit], after["cosine"][lit_partners])
@@ -325,10 +323,8 @@ def _count_geometry(before: Params, after: Params, grid: Grid) -> list[Row]:
             "sign of the SDF", "ends of crossed edges", old_sdf[is_endpoint], new_sdf[is_endpoint]
         )
     ]
-    died_count, born_count = (
-        len(np.setdiff1d(old_keys, new_keys)),
-        len(np.setdiff1d(new_keys, old_keys)),
-    )
+    died_count = len(np.setdiff1d(old_keys, new_keys))
+    born_count = len(np.setdiff1d(new_keys, old_keys))
     counts.append(Row("quads that died", "quads", len(old_keys), died_count, None))
     counts.append(Row("quads that were born", "quads", len(old_keys), born_count, None))
 

@@ -132,8 +132,8 @@ class Plan:
         place = _place(self.effort) + (
             f", without {' and '.join(skipped_names)}" if skipped_names else ""
         )
-        cell_count = self.config.geometry.cells_along
-        cells = "" if cell_count is None else f"{cell_count} cells, "
+        cells_along = self.config.geometry.cells_along
+        cells = "" if cells_along is None else f"{cells_along} cells, "
         size = "in full size" if self.downscale == 1 else f"reduced by {self.downscale}"
         return [
             f"budget: {place}; {cells}photographs {size}",
@@ -211,12 +211,10 @@ def plan(
         candidates = [_first_stage_alone(candidate) for candidate in candidates]
         affordable = [candidate for candidate in candidates if candidate.seconds <= budget.seconds]
     base_plan = affordable[-1] if affordable else candidates[0]
-    startup_seconds = sum(cost.startup for cost in base_plan.costs.values())
-    share = (budget.seconds - startup_seconds) / (base_plan.seconds - startup_seconds)
+    startup = sum(cost.startup for cost in base_plan.costs.values())
+    share = (budget.seconds - startup) / (base_plan.seconds - startup)
     # Other work on this machine may end: a budget is refused only if idle cores cannot meet it.
-    least_seconds = (startup_seconds + _SHORTEST * (base_plan.seconds - startup_seconds)) / max(
-        slowness, 1.0
-    )
+    least_seconds = (startup + _SHORTEST * (base_plan.seconds - startup)) / max(slowness, 1.0)
     if budget.seconds < least_seconds:
         raise TrainingError(
             f"a budget of {budget.seconds:.0f} s is too short: compilation included, a training "
@@ -398,8 +396,8 @@ class Pacer:
         """
         work_seconds = ahead * self._step_seconds(stage.name)
         work_seconds += sum(_length(other) * self._step_seconds(other.name) for other in later)
-        startup_seconds = sum(self._costs[other.name].startup for other in later)
-        return max(self.seconds_left - startup_seconds, 0.0) / max(work_seconds, 1e-9)
+        startup = sum(self._costs[other.name].startup for other in later)
+        return max(self.seconds_left - startup, 0.0) / max(work_seconds, 1e-9)
 
     def _too_short(
         self, later: Sequence[Stage], share: float, active_names: Collection[str]

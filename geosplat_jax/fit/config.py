@@ -534,13 +534,9 @@ def changed_settings(
             values["stages"] = {n: s for n, s in values["stages"].items() if n in stages}
         return _flat(values)
 
-    first_values, second_values = flat(first), flat(second)
-    names = sorted(set(first_values) | set(second_values))
-    return {
-        n: (first_values.get(n), second_values.get(n))
-        for n in names
-        if first_values.get(n) != second_values.get(n)
-    }
+    left, right = flat(first), flat(second)
+    names = sorted(set(left) | set(right))
+    return {n: (left.get(n), right.get(n)) for n in names if left.get(n) != right.get(n)}
 
 
 def differences(first: Config, second: Config, *, stages: list[str] | None = None) -> list[str]:

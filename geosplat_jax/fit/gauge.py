@@ -94,16 +94,14 @@ def camera_errors(found: Views, true: Views, bounds: Bounds) -> CameraErrors:
     bounds : lo and hi of the object's box, in the world of the true cameras.
     """
     points = _points_around(bounds)
-    relative_rotations = found.camera_to_world[:, :3, :3] @ true.camera_to_world[
-        :, :3, :3
-    ].transpose(0, 2, 1)
+    rotation = found.camera_to_world[:, :3, :3] @ true.camera_to_world[:, :3, :3].transpose(0, 2, 1)
     positions, true_positions = found.camera_to_world[:, :3, 3], true.camera_to_world[:, :3, 3]
     object_distances = np.linalg.norm(true_positions - points.mean(axis=0), axis=-1)
     pixel_distances = np.linalg.norm(_pixels(found, points) - _pixels(true, points), axis=-1)
     ones = np.ones(len(true))
     exposures = (ones if v.exposure is None else v.exposure for v in (found, true))
     return CameraErrors(
-        rotation_deg=np.degrees(Rotation.from_matrix(relative_rotations).magnitude()),
+        rotation_deg=np.degrees(Rotation.from_matrix(rotation).magnitude()),
         center_percent=100 * np.linalg.norm(positions - true_positions, axis=-1) / object_distances,
         focal_percent=100 * np.abs(found.intrinsics[:, 0, 0] / true.intrinsics[:, 0, 0] - 1),
         exposure_percent=100 * np.abs(np.divide(*exposures) - 1),

@@ -223,8 +223,8 @@ class FinerCells(Part):
         geometry = config.geometry
         if not isinstance(geometry, FlexiCubesSettings):
             return config
-        cell_count = max(_FEWEST_CELLS, round(_FEWER_CELLS * geometry.resolution))
-        return replace(config, geometry=replace(geometry, resolution=cell_count))
+        resolution = max(_FEWEST_CELLS, round(_FEWER_CELLS * geometry.resolution))
+        return replace(config, geometry=replace(geometry, resolution=resolution))
 
 
 LADDER: tuple[Part, ...] = (

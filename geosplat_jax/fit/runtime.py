@@ -70,9 +70,7 @@ def peak_memory_mb() -> int:
     """
     if jax.default_backend() != "cpu":
         stats = [device.memory_stats() or {} for device in jax.local_devices()]
-        return max(device_stats.get("peak_bytes_in_use", 0) for device_stats in stats) // (
-            1024 * 1024
-        )
+        return max(entry.get("peak_bytes_in_use", 0) for entry in stats) // (1024 * 1024)
     try:
         import resource
     except ImportError:  # not on Windows

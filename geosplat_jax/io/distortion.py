@@ -233,20 +233,14 @@ def _bilinear(
     column = np.clip(columns - 0.5, 0.0, width - 1.0)
     top_row = np.minimum(row.astype(np.int64), max(height - 2, 0))
     left_column = np.minimum(column.astype(np.int64), max(width - 2, 0))
-    row_fraction = (row - top_row).astype(np.float32)[..., None]
-    column_fraction = (column - left_column).astype(np.float32)[..., None]
+    t = (row - top_row).astype(np.float32)[..., None]
+    s = (column - left_column).astype(np.float32)[..., None]
     corner = top_row * width + left_column
     right_offset, lower_offset = min(1, width - 1), width * min(1, height - 1)
-    upper = (
-        pixels_at(corner) * (1.0 - column_fraction)
-        + pixels_at(corner + right_offset) * column_fraction
-    )
+    upper = pixels_at(corner) * (1.0 - s) + pixels_at(corner + right_offset) * s
     corner += lower_offset
-    lower = (
-        pixels_at(corner) * (1.0 - column_fraction)
-        + pixels_at(corner + right_offset) * column_fraction
-    )
-    return upper * (1.0 - row_fraction) + lower * row_fraction
+    lower = pixels_at(corner) * (1.0 - s) + pixels_at(corner + right_offset) * s
+    return upper * (1.0 - t) + lower * t
 
 
 def resample_valid(

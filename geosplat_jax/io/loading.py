@@ -86,10 +86,8 @@ def load_views(
     canvas = np.max(sizes, axis=0)
     _require_room_for_all(frames, full_sizes, canvas, most_bytes)
     height, width = (int(length) for length in canvas)
-    store, threads = (
-        PartsInMemory(len(frames), most_bytes),
-        _threads_for(frames, full_sizes, factor),
-    )
+    store = PartsInMemory(len(frames), most_bytes)
+    threads = _threads_for(frames, full_sizes, factor)
 
     def read(index: int) -> _Traits:
         photograph = read_photograph(frames[index])

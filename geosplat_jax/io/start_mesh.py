@@ -283,10 +283,10 @@ def _wound_alike(faces: Int[np.ndarray, "F 3"]) -> tuple[Int[np.ndarray, "F 3"],
     """
     count, adjacency = len(faces), connectivity(faces)
     first_faces, second_faces = adjacency.wings[:, 0], adjacency.wings[:, 1]
-    linked_faces = second_faces + count * adjacency.turned
+    linked_nodes = second_faces + count * adjacency.turned
     link_ends = (
         np.concatenate([first_faces, first_faces + count]),
-        np.concatenate([linked_faces, (linked_faces + count) % (2 * count)]),
+        np.concatenate([linked_nodes, (linked_nodes + count) % (2 * count)]),
     )
     links = coo_matrix((np.ones(len(link_ends[0]), bool), link_ends), shape=(2 * count, 2 * count))
     components = connected_components(links, directed=False)[1]

@@ -206,20 +206,16 @@ def _boxed(
     first = jnp.floor(jnp.min(corners, axis=0) - SLACK).astype(jnp.int32)
     size = jnp.floor(jnp.max(corners, axis=0) + SLACK).astype(jnp.int32) - first + 1
     count = size[0] * size[1] * size[2]
-    running_sum = jnp.cumsum(count)
-    starts = jnp.zeros((capacity,), jnp.int32).at[running_sum[:-1]].add(1, mode="drop")
+    ends = jnp.cumsum(count)
+    starts = jnp.zeros((capacity,), jnp.int32).at[ends[:-1]].add(1, mode="drop")
     triangle = jnp.cumsum(starts)
-    step = jnp.arange(capacity, dtype=jnp.int32) - (running_sum - count)[triangle]
+    step = jnp.arange(capacity, dtype=jnp.int32) - (ends - count)[triangle]
     size, first = size[:, triangle], first[:, triangle]
     z, remainder = jnp.divmod(step, size[0] * size[1])
     y, x = jnp.divmod(remainder, size[0])
     # Together, triangles as large as the grid may meet more cells than 32 bits can count.
     is_countable = jnp.sum(count.astype(corners.dtype)) < _MOST_BOXES
-    return (
-        triangle,
-        first + jnp.stack([x, y, z]),
-        jnp.where(is_countable, running_sum[-1], 2**31 - 1),
-    )
+    return (triangle, first + jnp.stack([x, y, z]), jnp.where(is_countable, ends[-1], 2**31 - 1))
 
 
 def _touches(corners: Float[Array, "3 3 P"], cell: Int[Array, "3 P"]) -> Bool[Array, " P"]:

@@ -125,22 +125,15 @@ def curves(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     each.
     """
     stride = -(-len(lines) // _LONGEST_CURVE) if lines else 1
-    sampled_lines = [line for n, line in enumerate(lines) if n % stride == 0 or n == len(lines) - 1]
+    rows = [line for n, line in enumerate(lines) if n % stride == 0 or n == len(lines) - 1]
     stages, last_stage = [], None
     for line in lines:
         if line["stage"] != last_stage:
             last_stage = line["stage"]
             stages.append({"name": last_stage, "step": line["step"]})
     columns = {"loss": "loss", "psnr": "psnr", "splats": "splats", "memory": "peak_memory_mb"}
-    values = {
-        name: [_finite(line.get(key)) for line in sampled_lines] for name, key in columns.items()
-    }
-    return {
-        "step": [line["step"] for line in sampled_lines],
-        **values,
-        "stages": stages,
-        "every": stride,
-    }
+    values = {name: [_finite(line.get(key)) for line in rows] for name, key in columns.items()}
+    return {"step": [line["step"] for line in rows], **values, "stages": stages, "every": stride}
 
 
 def rung_row(rung: Mapping[str, Any]) -> tuple[str, str, str, str, str]:

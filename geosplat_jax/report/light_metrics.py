@@ -189,12 +189,12 @@ def light_metrics(
     true_luminance, fitted_luminance = truth @ channels, scaled @ channels
     # A least-squares fit of maps that are rotated against each other has a wrong colour; flux has
     # the right one.
-    flux_luminance = (_ratio(mean(truth), mean(recovered)) * recovered) @ channels
+    recovered_luminance = (_ratio(mean(truth), mean(recovered)) * recovered) @ channels
     return {
         "light.scale": tuple(scale.tolist()),
         "light.psnr": float(psnr_of_mse(float(np.mean(mean(error**2))))),
         "light.correlation": _correlation(
             np.log1p(fitted_luminance), np.log1p(true_luminance), weights
         ),
-        **_direction_metrics(flux_luminance, true_luminance, weights),
+        **_direction_metrics(recovered_luminance, true_luminance, weights),
     }

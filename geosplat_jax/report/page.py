@@ -207,16 +207,14 @@ def _described(run: Evaluated, name: str, room: int) -> dict[str, Any]:
     psnr = {line["view"]: line["nvs.psnr"] for line in metrics.get("views", [])}
     command_text, is_whole = command(record, config)
     seen = metrics.get("seen")
-    evaluated_step, trained_step = metrics.get("step"), run.trained_steps()
+    step, trained_step = metrics.get("step"), run.trained_steps()
     return {
         "name": name,
         "folder": str(run.results),
         "record": record,
         "config": config,
         "metrics": metrics,
-        "older": evaluated_step
-        if evaluated_step is not None and evaluated_step < trained_step
-        else None,
+        "older": step if step is not None and step < trained_step else None,
         "figures": [(figure(key), value) for key, value in mean.items()],
         "headlines": [
             (figure(key), metrics["mean"][key])

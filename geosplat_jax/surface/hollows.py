@@ -156,17 +156,13 @@ def _candidates(hull: Field, views: Photographed) -> list[Candidate]:
     labels, count = label_result
     if not count:
         return []
-    hull_points, carved_points = (
-        _judged(hull, fit_views, judge_views),
-        _judged(field, fit_views, judge_views),
-    )
+    uncarved = _judged(hull, fit_views, judge_views)
+    carved = _judged(field, fit_views, judge_views)
     candidates = []
     for number in range(1, count + 1):
         region = labels == number
-        lid, behind = (
-            hull_points.of(hull_points.inside, region),
-            carved_points.of(carved_points.outside, region),
-        )
+        lid = uncarved.of(uncarved.inside, region)
+        behind = carved.of(carved.outside, region)
         if min(len(lid), len(behind)) >= _FEWEST_POINTS:
             mirror = _mirrored(hull, region, fit_views, judge_views)
             candidates.append(Candidate(region, float(lid.mean()), float(behind.mean()), mirror))
@@ -335,17 +331,15 @@ def _opened(
     # Empty the cells in front of the mouths as well: a film of the old surface would stay there.
     # The mask keeps this from passing through walls.
     cavity = np.asarray(binary_dilation(hollows, iterations=_MOUTH, mask=~solid), bool)
-    solid_depth, cavity_depth = (
+    outside_depth, cavity_depth = (
         np.asarray(distance_transform_edt(side)) for side in (~cavity, cavity)
     )
-    signed = cavity_depth - solid_depth
-    smooth_distance = gaussian_filter(signed - 0.5 * np.sign(signed), _SMOOTHING)
+    signed = cavity_depth - outside_depth
+    blurred = gaussian_filter(signed - 0.5 * np.sign(signed), _SMOOTHING)
     # Solid vertices stay inside and hollow ones outside: smoothing would open walls that are as
     # thin as a cell.
     distance = np.where(
-        solid,
-        np.minimum(smooth_distance, -_THIN),
-        np.where(hollows, np.maximum(smooth_distance, _THIN), smooth_distance),
+        solid, np.minimum(blurred, -_THIN), np.where(hollows, np.maximum(blurred, _THIN), blurred)
     )
     if factor > 1:
         coordinates = np.indices(fine_field.shape, np.float32) / factor

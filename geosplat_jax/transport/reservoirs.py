@@ -356,15 +356,15 @@ def resample(
         points, offsets, uniforms, previous_reservoirs = inputs
         directions, weights = _own(points, offsets, uniforms[0], light, sampler, spec)
         confidences = jnp.full(points.faces.shape, float(spec.candidates), dtype)
-        reservoirs = _Source(directions, weights, confidences, points)
+        source = _Source(directions, weights, confidences, points)
         if traces:
-            is_open = _is_open(reservoirs, directions, index)
-            reservoirs = _Source(directions, jnp.where(is_open, weights, 0.0), confidences, points)
+            is_open = _is_open(source, directions, index)
+            source = _Source(directions, jnp.where(is_open, weights, 0.0), confidences, points)
         if previous_reservoirs is not None:
-            sources = [reservoirs, _source(*previous_reservoirs)]
-            reservoirs = _joined(sources, uniforms[1].T, light, index, traces=traces)
+            sources = [source, _source(*previous_reservoirs)]
+            source = _joined(sources, uniforms[1].T, light, index, traces=traces)
         return Reservoirs(
-            jnp.moveaxis(reservoirs.directions, 0, 1), reservoirs.weights.T, reservoirs.confidences
+            jnp.moveaxis(source.directions, 0, 1), source.weights.T, source.confidences
         )
 
     def in_all(function: Any, arguments: Any, samples: int) -> Reservoirs:

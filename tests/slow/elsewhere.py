@@ -207,10 +207,8 @@ def main() -> None:
 
         def agreement(other: np.ndarray, ours=view.rgb, inside=solid) -> str:
             our_picture, other_picture = to_picture(ours), shown(other[..., :3])
-            whole_psnr, solid_psnr = (
-                psnr(our_picture, other_picture),
-                psnr(our_picture, other_picture, inside),
-            )
+            whole_psnr = psnr(our_picture, other_picture)
+            solid_psnr = psnr(our_picture, other_picture, inside)
             return f"{float(whole_psnr):6.2f} dB, inside {float(solid_psnr):6.2f} dB"
 
         truth = render(asset, light, camera, samples=arguments.paths)

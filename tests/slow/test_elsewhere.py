@@ -41,10 +41,8 @@ def read_at_hits(asset):
     rough, metal = (mi.load_dict(elsewhere._texture(pixels, raw=True)) for pixels in grey)
     points, samples = [], []
     for direction in directions:
-        origin, ray_direction = (
-            mi.Point3f(*map(float, 3 * direction)),
-            mi.Vector3f(*map(float, -direction)),
-        )
+        origin = mi.Point3f(*map(float, 3 * direction))
+        ray_direction = mi.Vector3f(*map(float, -direction))
         hit = scene.ray_intersect(mi.Ray3f(origin, ray_direction))
         points.append(np.array(hit.p).ravel())
         values = [np.array(color.eval(hit)).ravel()]
