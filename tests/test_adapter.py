@@ -93,17 +93,17 @@ def test_equations_8_to_11_by_hand():
     constants = PAPER
     splats = place(mesh, constants=constants)
     u, v = constants.u, constants.v
-    outer = np.array([[u, u, 1 - 2 * u], [u, 1 - 2 * u, u], [1 - 2 * u, u, u]]) @ points
-    inner = np.array([[v, v, 1 - 2 * v], [v, 1 - 2 * v, v], [1 - 2 * v, v, v]]) @ points
+    outer_points = np.array([[u, u, 1 - 2 * u], [u, 1 - 2 * u, u], [1 - 2 * u, u, u]]) @ points
+    inner_points = np.array([[v, v, 1 - 2 * v], [v, 1 - 2 * v, v], [1 - 2 * v, v, v]]) @ points
     area = 0.5 * np.linalg.norm(np.cross(points[1] - points[0], points[2] - points[0]))
     rotations = np.asarray(rotations_of(splats.quats))
-    for ring, triple in enumerate((outer, inner)):
+    for ring, corners in enumerate((outer_points, inner_points)):
         for k in range(3):
             row = 3 * ring + k
-            first, second = triple[k], triple[(k + 1) % 3]
-            delta = second - first
+            start, end = corners[k], corners[(k + 1) % 3]
+            delta = end - start
             length = np.linalg.norm(delta)
-            np.testing.assert_allclose(splats.means[row], (first + second) / 2, atol=TOLERANCE)
+            np.testing.assert_allclose(splats.means[row], (start + end) / 2, atol=TOLERANCE)
             np.testing.assert_allclose(
                 splats.scales[row],
                 [
@@ -122,16 +122,16 @@ def test_every_splat_has_the_normal_of_the_point_where_it_lies(constants):
     points = np.random.default_rng(1).normal(size=(3, 3))
     mesh = _mesh(points, np.array([[0, 1, 2]]))
     corner_normals = np.array([[1.0, 0.2, 0.1], [0.1, 1.0, -0.3], [-0.2, 0.3, 1.0]])
-    given = jnp.zeros_like(mesh.vertices).at[:3].set(jnp.asarray(corner_normals, jnp.float32))
-    splats = face_splats(mesh, given, constants=constants)
+    normals = jnp.zeros_like(mesh.vertices).at[:3].set(jnp.asarray(corner_normals, jnp.float32))
+    splats = face_splats(mesh, normals, constants=constants)
     shares, _ = _shares_and_heights(splats.means[:6], mesh, np.zeros(6, int))
     expected = shares @ corner_normals
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
     # A splat's normal is the mean of two unit normals; ``expected`` interpolates without
     # normalizing those two, so the results agree only up to their lengths.
     np.testing.assert_allclose(splats.normals[:6], expected, atol=0.05)
-    apart = np.linalg.norm(expected[:, None] - expected[None], axis=-1) + np.eye(6)
-    assert apart.min() > 0.15
+    distances = np.linalg.norm(expected[:, None] - expected[None], axis=-1) + np.eye(6)
+    assert distances.min() > 0.15
 
 
 @pytest.mark.parametrize("constants", [PAPER, CODE], ids=["paper", "code"])
@@ -151,29 +151,35 @@ def test_equivariance_under_similarity():
     rotation = np.array(
         [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
     )
-    moved = replace(mesh, vertices=jnp.asarray(mesh.vertices @ rotation.T * 3 + 0.5, jnp.float32))
-    first = place(mesh)
-    second = place(moved, 3.0)
-    np.testing.assert_allclose(second.means, first.means @ rotation.T * 3 + 0.5, atol=1e-5)
-    np.testing.assert_allclose(second.scales, first.scales * 3, rtol=1e-5)
+    moved_mesh = replace(
+        mesh, vertices=jnp.asarray(mesh.vertices @ rotation.T * 3 + 0.5, jnp.float32)
+    )
+    splats = place(mesh)
+    moved_splats = place(moved_mesh, 3.0)
+    np.testing.assert_allclose(moved_splats.means, splats.means @ rotation.T * 3 + 0.5, atol=1e-5)
+    np.testing.assert_allclose(moved_splats.scales, splats.scales * 3, rtol=1e-5)
     for name in ("normals", "outward"):
-        expected = getattr(first, name) @ rotation.T
-        np.testing.assert_allclose(getattr(second, name), expected, atol=1e-5)
-    np.testing.assert_allclose(second.anchors, first.anchors @ rotation.T * 3 + 0.5, atol=1e-5)
+        expected = getattr(splats, name) @ rotation.T
+        np.testing.assert_allclose(getattr(moved_splats, name), expected, atol=1e-5)
+    np.testing.assert_allclose(
+        moved_splats.anchors, splats.anchors @ rotation.T * 3 + 0.5, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("kind", SAMPLERS)
 def test_padding_is_inert_and_changes_nothing(kind):
-    tight, padded = _octahedron(extra_vertices=0, extra_faces=0), _octahedron()
-    first, second = place_padded(tight, kind=kind), place_padded(padded, kind=kind)
-    count = int(first.count)
-    assert int(second.count) == count
-    assert int(np.sum(second.mask)) == count
+    mesh, padded_mesh = _octahedron(extra_vertices=0, extra_faces=0), _octahedron()
+    splats, padded_splats = place_padded(mesh, kind=kind), place_padded(padded_mesh, kind=kind)
+    count = int(splats.count)
+    assert int(padded_splats.count) == count
+    assert int(np.sum(padded_splats.mask)) == count
     rows = ("means", "quats", "scales", "opacities", "normals", "outward", "anchors", "parents")
     for name in rows:
-        np.testing.assert_array_equal(getattr(second, name)[:count], getattr(first, name)[:count])
-    assert np.all(np.asarray(second.opacities[count:]) == 0)
-    assert np.all(np.asarray(second.scales[count:]) == 1)
+        np.testing.assert_array_equal(
+            getattr(padded_splats, name)[:count], getattr(splats, name)[:count]
+        )
+    assert np.all(np.asarray(padded_splats.opacities[count:]) == 0)
+    assert np.all(np.asarray(padded_splats.scales[count:]) == 1)
 
 
 @pytest.mark.parametrize("kind", SAMPLERS)
@@ -236,9 +242,9 @@ def _shares_and_heights(points, mesh, parents):
     size = np.sum(normal**2, axis=1)
     offset = np.asarray(points, np.float64) - a
     height = np.sum(offset * normal, axis=1) / np.sqrt(size)
-    second = np.sum(np.cross(offset, c - a) * normal, axis=1) / size
-    third = np.sum(np.cross(b - a, offset) * normal, axis=1) / size
-    return np.stack([1 - second - third, second, third], axis=1), height
+    second_share = np.sum(np.cross(offset, c - a) * normal, axis=1) / size
+    third_share = np.sum(np.cross(b - a, offset) * normal, axis=1) / size
+    return np.stack([1 - second_share - third_share, second_share, third_share], axis=1), height
 
 
 def test_the_inward_shift_moves_the_means_and_leaves_the_anchors_on_the_face():
@@ -246,21 +252,21 @@ def test_the_inward_shift_moves_the_means_and_leaves_the_anchors_on_the_face():
     splats = place_padded(mesh)
     # Rows of padding have a share as well.
     fraction = jnp.linspace(0.0, 1.0, splats.means.shape[0])
-    moved = sink(splats, mesh, fraction)
+    sunk_splats = sink(splats, mesh, fraction)
     count, parents = int(splats.count), np.asarray(splats.parents)[:48]
     assert count == 48
     _, area = normals_and_areas(mesh)
-    shares, height = _shares_and_heights(moved.means[:count], mesh, parents)
+    shares, height = _shares_and_heights(sunk_splats.means[:count], mesh, parents)
     expected = -np.asarray(fraction)[:count] * np.sqrt(np.asarray(area))[parents]
     np.testing.assert_allclose(height, expected, atol=1e-6)
     # The shift is straight down: the foot of each mean is where it was, and so is the anchor.
-    for points in (splats.means, moved.anchors):
-        at_rest, rest_height = _shares_and_heights(points[:count], mesh, parents)
-        np.testing.assert_allclose(shares, at_rest, atol=1e-5)
+    for points in (splats.means, sunk_splats.anchors):
+        rest_shares, rest_height = _shares_and_heights(points[:count], mesh, parents)
+        np.testing.assert_allclose(shares, rest_shares, atol=1e-5)
         np.testing.assert_allclose(rest_height, 0.0, atol=1e-6)
     for name in ("quats", "scales", "opacities", "normals", "outward", "anchors", "parents"):
-        np.testing.assert_array_equal(getattr(moved, name), getattr(splats, name))
-    np.testing.assert_array_equal(moved.means[count:], splats.means[count:])
+        np.testing.assert_array_equal(getattr(sunk_splats, name), getattr(splats, name))
+    np.testing.assert_array_equal(sunk_splats.means[count:], splats.means[count:])
 
 
 def test_the_constant_shift_is_used_where_none_is_learned():
@@ -270,18 +276,20 @@ def test_the_constant_shift_is_used_where_none_is_learned():
     materials = Materials(jnp.zeros((rows, 3)), jnp.zeros(rows), jnp.zeros(rows))
     settle = jax.jit(lambda model, shift: model.settle(splats, surface, shift), static_argnums=0)
     model = FaceSplats(AdapterConstants(shift=0.3))
-    moved = settle(model, Attributes(materials, None, None))
-    np.testing.assert_array_equal(moved.means, sink(splats, mesh, jnp.full(rows, 0.3)).means)
-    learned = settle(model, Attributes(materials, jnp.full(rows, 0.5), None))
-    np.testing.assert_array_equal(learned.means, sink(splats, mesh, jnp.full(rows, 0.5)).means)
+    sunk_splats = settle(model, Attributes(materials, None, None))
+    np.testing.assert_array_equal(sunk_splats.means, sink(splats, mesh, jnp.full(rows, 0.3)).means)
+    learned_splats = settle(model, Attributes(materials, jnp.full(rows, 0.5), None))
+    np.testing.assert_array_equal(
+        learned_splats.means, sink(splats, mesh, jnp.full(rows, 0.5)).means
+    )
     assert FaceSplats().settle(splats, surface, Attributes(materials, None, None)) is splats
 
 
 def test_the_inward_shift_leaves_splats_without_a_face_where_they_are():
     mesh = _octahedron()
     splats = place_padded(mesh, kind="vertex")
-    moved = sink(splats, mesh, jnp.ones((ROWS,)))
-    np.testing.assert_array_equal(moved.means, splats.means)
+    sunk_splats = sink(splats, mesh, jnp.ones((ROWS,)))
+    np.testing.assert_array_equal(sunk_splats.means, splats.means)
 
 
 def test_the_inward_shift_has_no_gradient_by_the_face():
@@ -292,8 +300,8 @@ def test_the_inward_shift_has_no_gradient_by_the_face():
     @jax.jit
     @partial(jax.grad, argnums=(0, 1))
     def offset(vertices, fraction):
-        moved = shift_inwards(splats, replace(mesh, vertices=vertices), fraction)
-        return jnp.sum(moved.means**2)
+        sunk_splats = shift_inwards(splats, replace(mesh, vertices=vertices), fraction)
+        return jnp.sum(sunk_splats.means**2)
 
     by_vertices, by_fraction = offset(mesh.vertices, jnp.full(splats.opacities.shape, 0.25))
     np.testing.assert_array_equal(by_vertices, 0.0)
@@ -304,22 +312,28 @@ def test_the_inward_shift_has_no_gradient_by_the_face():
 def test_splats_of_a_surface_settle_as_their_attributes_say():
     mesh = _octahedron()
     surface, box = Surface(mesh, {}), Box(jnp.zeros(3), jnp.float32(2.0))
-    nothing = Materials(jnp.zeros((0, 3)), jnp.zeros(0), jnp.zeros(0))
-    put = jax.jit(lambda model, surface, box: model.place(surface, None, box), static_argnums=0)
-    placed = put(FaceSplats(CODE), surface, box)
-    np.testing.assert_allclose(placed.scales[:48, 2], 2.0 * CODE.thickness, rtol=TOLERANCE)
-    np.testing.assert_array_equal(placed.means, place_padded(mesh, 2.0).means)
-    share = jnp.full(placed.opacities.shape, 0.25)
-    settled = FaceSplats(CODE).settle(placed, surface, Attributes(nothing, share, None))
-    np.testing.assert_allclose(settled.means, sink(placed, mesh, share).means, atol=TOLERANCE)
-    assert np.any(settled.means != placed.means)
-    assert FaceSplats(CODE).settle(placed, surface, Attributes(nothing, None, None)) is placed
+    no_materials = Materials(jnp.zeros((0, 3)), jnp.zeros(0), jnp.zeros(0))
+    place_splats = jax.jit(
+        lambda model, surface, box: model.place(surface, None, box), static_argnums=0
+    )
+    splats = place_splats(FaceSplats(CODE), surface, box)
+    np.testing.assert_allclose(splats.scales[:48, 2], 2.0 * CODE.thickness, rtol=TOLERANCE)
+    np.testing.assert_array_equal(splats.means, place_padded(mesh, 2.0).means)
+    share = jnp.full(splats.opacities.shape, 0.25)
+    settled_splats = FaceSplats(CODE).settle(splats, surface, Attributes(no_materials, share, None))
+    np.testing.assert_allclose(
+        settled_splats.means, sink(splats, mesh, share).means, atol=TOLERANCE
+    )
+    assert np.any(settled_splats.means != splats.means)
+    assert FaceSplats(CODE).settle(splats, surface, Attributes(no_materials, None, None)) is splats
     # Splats of vertices do not sink, whatever their attributes say.
-    rounds = put(VertexSplats(CODE), surface, box)
-    np.testing.assert_allclose(rounds.scales[:6, 2], 2.0 * CODE.thickness, rtol=TOLERANCE)
-    share = jnp.full(rounds.opacities.shape, 0.25)
-    kept = VertexSplats(CODE).settle(rounds, surface, Attributes(nothing, share, None))
-    assert kept is rounds
+    round_splats = place_splats(VertexSplats(CODE), surface, box)
+    np.testing.assert_allclose(round_splats.scales[:6, 2], 2.0 * CODE.thickness, rtol=TOLERANCE)
+    share = jnp.full(round_splats.opacities.shape, 0.25)
+    settled_round_splats = VertexSplats(CODE).settle(
+        round_splats, surface, Attributes(no_materials, share, None)
+    )
+    assert settled_round_splats is round_splats
 
 
 @pytest.mark.slow
@@ -344,8 +358,10 @@ def test_gradient_equals_finite_differences(constants):
         _, gradient = scalar(vertices)
         direction = jnp.asarray(rng.normal(size=vertices.shape), jnp.float64)
         step = 1e-6
-        ahead, behind = (scalar(vertices + s * step * direction)[0] for s in (1, -1))
-        numeric = (ahead - behind) / (2 * step)
+        forward_value, backward_value = (
+            scalar(vertices + s * step * direction)[0] for s in (1, -1)
+        )
+        numeric = (forward_value - backward_value) / (2 * step)
         np.testing.assert_allclose(jnp.sum(gradient * direction), numeric, rtol=1e-7)
 
 

@@ -76,7 +76,7 @@ def test_empty_masks_and_few_views_are_said(views):
     empty = with_mask(views, 0, 0.0)
     assert np.isnan(agreement(empty, BOX)[0])
     assert not any("12 views" in line for line in agreement_lines(empty, BOX))
-    none = replace(views, images=0 * np.asarray(views.images))
-    assert agreement_lines(none, BOX) == ["agreement:  not checked, every mask is empty"]
-    few = sphere_views(2, size=8)
-    assert agreement_lines(few, BOX) == ["agreement:  not checked, it takes three views"]
+    empty_views = replace(views, images=0 * np.asarray(views.images))
+    assert agreement_lines(empty_views, BOX) == ["agreement:  not checked, every mask is empty"]
+    few_views = sphere_views(2, size=8)
+    assert agreement_lines(few_views, BOX) == ["agreement:  not checked, it takes three views"]

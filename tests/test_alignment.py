@@ -14,16 +14,16 @@ EXACT = 1e-9
 def ring(count=12, *, heights=(0.3, 0.8), radius=1.0, turn=2 * np.pi):
     angle = np.linspace(0.0, turn, count, endpoint=False) - np.pi / 2
     height = np.resize(heights, count)
-    flat = np.sqrt(1.0 - height**2)
-    return radius * np.stack([flat * np.cos(angle), flat * np.sin(angle), height], -1)
+    ring_radius = np.sqrt(1.0 - height**2)
+    return radius * np.stack([ring_radius * np.cos(angle), ring_radius * np.sin(angle), height], -1)
 
 
 def moved(poses, map_):
     """Return the cameras in another world."""
-    other = poses.copy()
-    other[:, :3, :3] = map_.rotation @ poses[:, :3, :3]
-    other[:, :3, 3] = map_.points(poses[:, :3, 3])
-    return other
+    moved_poses = poses.copy()
+    moved_poses[:, :3, :3] = map_.rotation @ poses[:, :3, :3]
+    moved_poses[:, :3, 3] = map_.points(poses[:, :3, 3])
+    return moved_poses
 
 
 ANYWHERE = Similarity(
@@ -34,19 +34,19 @@ POINTS = np.random.default_rng(0).normal(size=(200, 3)) * 0.1
 
 def test_the_world_is_found_again_from_any_other():
     poses = level_poses(ring())
-    found = align_world(moved(poses, ANYWHERE), ANYWHERE.points(POINTS))
+    similarity = align_world(moved(poses, ANYWHERE), ANYWHERE.points(POINTS))
     # The ring is at distance one around the origin, and its first camera looks towards y.
-    np.testing.assert_allclose(found.points(ANYWHERE.points(POINTS)), POINTS, atol=EXACT)
-    np.testing.assert_allclose(moved(moved(poses, ANYWHERE), found), poses, atol=EXACT)
-    assert np.linalg.det(found.rotation) == pytest.approx(1.0)
+    np.testing.assert_allclose(similarity.points(ANYWHERE.points(POINTS)), POINTS, atol=EXACT)
+    np.testing.assert_allclose(moved(moved(poses, ANYWHERE), similarity), poses, atol=EXACT)
+    assert np.linalg.det(similarity.rotation) == pytest.approx(1.0)
 
 
 def test_one_is_the_median_distance_and_the_target_the_origin():
     centers = ring(radius=3.0) + [1.0, 2.0, 3.0]
     centers[0] = (centers[0] - [1, 2, 3]) * 20 + [1, 2, 3]
-    found = align_world(level_poses(centers, (1.0, 2.0, 3.0)), POINTS + [1.0, 2.0, 3.0])
-    assert np.median(np.linalg.norm(found.points(centers), axis=1)) == pytest.approx(1.0)
-    np.testing.assert_allclose(found.points(np.array([[1.0, 2.0, 3.0]])), 0.0, atol=EXACT)
+    similarity = align_world(level_poses(centers, (1.0, 2.0, 3.0)), POINTS + [1.0, 2.0, 3.0])
+    assert np.median(np.linalg.norm(similarity.points(centers), axis=1)) == pytest.approx(1.0)
+    np.testing.assert_allclose(similarity.points(np.array([[1.0, 2.0, 3.0]])), 0.0, atol=EXACT)
 
 
 def test_cameras_on_their_side_have_no_say():
@@ -78,8 +78,8 @@ def test_cameras_that_did_not_turn_say_what_is_up_by_their_y_axes():
 
 def test_cameras_below_the_object_keep_up_above():
     poses = level_poses(ring(heights=(-0.7, -0.4)))
-    found = align_world(poses, POINTS)
-    np.testing.assert_allclose(found.rotation[2], [0, 0, 1], atol=EXACT)
+    similarity = align_world(poses, POINTS)
+    np.testing.assert_allclose(similarity.rotation[2], [0, 0, 1], atol=EXACT)
 
 
 @pytest.mark.parametrize(

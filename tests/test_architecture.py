@@ -78,7 +78,7 @@ def resolve(dotted):
 
 def imports(module):
     """Return the package's own modules and the foreign packages that a module imports anywhere."""
-    own, foreign = set(), set()
+    own_modules, foreign_packages = set(), set()
     for node in ast.walk(SOURCES[module]):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
@@ -91,10 +91,10 @@ def imports(module):
             continue
         for name in names:
             if layer(name) != NAME:
-                foreign.add(layer(name))
+                foreign_packages.add(layer(name))
             elif "." in name and (target := resolve(name.split(".", 1)[1])):
-                own.add(target)
-    return own, foreign
+                own_modules.add(target)
+    return own_modules, foreign_packages
 
 
 @pytest.mark.parametrize("module", MODULES)
@@ -123,32 +123,34 @@ def test_the_page_lists_every_module_by_its_first_line(module):
 def test_imports_go_only_to_lower_modules(module):
     rank = ORDER.index(layer(module))
     upward = {
-        other
-        for other in imports(module)[0]
-        if layer(other) != layer(module)
-        and (layer(other) not in ORDER or ORDER.index(layer(other)) >= rank)
+        imported_module
+        for imported_module in imports(module)[0]
+        if layer(imported_module) != layer(module)
+        and (layer(imported_module) not in ORDER or ORDER.index(layer(imported_module)) >= rank)
     }
     assert not upward, f"{module} imports {sorted(upward)}, not below it in ORDER"
 
 
 @pytest.mark.parametrize("module", [m for m in MODULES if layer(m) in JITTED])
 def test_jitted_modules_import_no_host_library(module):
-    forbidden = imports(module)[1] & HOST_ONLY
-    assert not forbidden, f"{module} may run inside jit; move its use of {sorted(forbidden)} to io"
+    host_imports = imports(module)[1] & HOST_ONLY
+    assert not host_imports, (
+        f"{module} may run inside jit; move its use of {sorted(host_imports)} to io"
+    )
 
 
 def test_modules_of_one_layer_have_no_import_cycle():
-    finished, path = set(), []
+    visited, path = set(), []
 
     def visit(module):
         assert module not in path, f"import cycle: {' -> '.join([*path, module])}"
-        if module in finished:
+        if module in visited:
             return
         path.append(module)
-        for other in sorted(imports(module)[0] - {module}):
-            visit(other)
+        for imported_module in sorted(imports(module)[0] - {module}):
+            visit(imported_module)
         path.pop()
-        finished.add(module)
+        visited.add(module)
 
     for module in MODULES:
         visit(module)
@@ -169,8 +171,10 @@ def public_definitions(module):
 
 @pytest.mark.parametrize("module", [m for m in MODULES if SOURCES[m].body])
 def test_public_functions_and_classes_have_docstrings(module):
-    bare = [name for name, node in public_definitions(module) if not ast.get_docstring(node)]
-    assert not bare, f"without a docstring: {bare}"
+    undocumented_names = [
+        name for name, node in public_definitions(module) if not ast.get_docstring(node)
+    ]
+    assert not undocumented_names, f"without a docstring: {undocumented_names}"
 
 
 def test_public_names_and_modules_are_there_when_they_are_asked_for():

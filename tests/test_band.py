@@ -74,11 +74,11 @@ CELL_NUMBERS = tuple((name, cells_of) for name in ("alpha", "beta", "gamma"))
 def rows_from(dense, model):
     """Take the rows of a band from a geometry of the whole grid; the padding is zero."""
 
-    def taken(array, numbers, rows):
+    def taken(array, grid_rows, rows):
         array = np.asarray(array)
-        full = np.zeros((rows, *array.shape[1:]), array.dtype)
-        full[: len(numbers)] = array[numbers]
-        return jnp.asarray(full)
+        band_rows = np.zeros((rows, *array.shape[1:]), array.dtype)
+        band_rows[: len(grid_rows)] = array[grid_rows]
+        return jnp.asarray(band_rows)
 
     cells, vertices, band = cells_of(model), vertices_of(model), model.band
     return Geometry(
@@ -94,8 +94,8 @@ def varied(geometry):
     def one(array):
         return jnp.asarray(rng.uniform(-0.6, 0.6, array.shape), jnp.float32)
 
-    moved = jax.tree.map(one, geometry)
-    return replace(moved, sdf=geometry.sdf)
+    varied_geometry = jax.tree.map(one, geometry)
+    return replace(varied_geometry, sdf=geometry.sdf)
 
 
 @pytest.mark.parametrize("layers", [1, 2])
@@ -104,8 +104,8 @@ def test_the_band_is_the_cells_within_some_layers_of_the_surface(layers):
     model, shape = BandedFlexiCubes.around(sdf, grid_of(), layers)
     nx, ny, nz = SHAPE
     near = np.zeros((nz, ny, nx), bool)
-    for number in surface_of(sdf):
-        k, j, i = number // (nx * ny), number // nx % ny, number % nx
+    for cell in surface_of(sdf):
+        k, j, i = cell // (nx * ny), cell // nx % ny, cell % nx
         low = [max(at - layers, 0) for at in (k, j, i)]
         near[tuple(slice(a, at + layers + 1) for a, at in zip(low, (k, j, i), strict=True))] = True
     expected = np.flatnonzero(near)
@@ -114,8 +114,8 @@ def test_the_band_is_the_cells_within_some_layers_of_the_surface(layers):
     corners = cell_corners(expected)
     np.testing.assert_array_equal(vertices_of(model), np.unique(corners))
     band = model.band
-    found = np.asarray(band.vertices)[np.asarray(band.corners)[:, : len(expected)]]
-    np.testing.assert_array_equal(found, corners)
+    corner_vertices = np.asarray(band.vertices)[np.asarray(band.corners)[:, : len(expected)]]
+    np.testing.assert_array_equal(corner_vertices, corners)
     np.testing.assert_array_equal(
         band.rows_of_cells(band.cells)[: len(expected)], range(len(expected))
     )
@@ -126,9 +126,9 @@ def test_the_band_is_the_cells_within_some_layers_of_the_surface(layers):
 def test_a_vertex_is_held_where_a_cell_around_it_is_not_in_the_band():
     sdf = ball(2.4, noise=0.4)
     model, _ = BandedFlexiCubes.around(sdf, grid_of(), 1)
-    outside = np.setdiff1d(np.arange(np.prod(SHAPE)), cells_of(model))
+    outside_cells = np.setdiff1d(np.arange(np.prod(SHAPE)), cells_of(model))
     vertices = vertices_of(model)
-    is_border = np.isin(vertices, cell_corners(outside))
+    is_border = np.isin(vertices, cell_corners(outside_cells))
     assert 0 < is_border.sum() < len(vertices)
     side = np.where(is_border, np.where(sdf[vertices] < 0, -1, 1), 0)
     np.testing.assert_array_equal(np.asarray(model.band.fixed)[: len(vertices)], side)
@@ -167,22 +167,27 @@ def test_mesh_penalties_and_gradients_are_those_of_the_whole_grid(whole, layers)
     dense, ((_, expected), gradient) = whole
     model, _ = BandedFlexiCubes.around(np.asarray(dense.sdf), grid_of(), layers)
     assert (len(cells_of(model)) == np.prod(SHAPE)) == (layers == 6)
-    (_, (surface, penalties, near)), found = _evaluated(model, rows_from(dense, model))
+    (_, (surface, penalties, nearby_points)), band_gradient = _evaluated(
+        model, rows_from(dense, model)
+    )
     assert int(surface.mesh.face_count) > 200
     jax.tree.map(np.testing.assert_array_equal, surface, expected[0])
     for name, value in expected[1].items():
         np.testing.assert_allclose(penalties[name], value, rtol=ROUNDING)
     points, weights = (np.asarray(x) for x in expected[2])
-    own_points, own_weights = (np.asarray(x) for x in near)
+    own_points, own_weights = (np.asarray(x) for x in nearby_points)
     np.testing.assert_array_equal(own_points[own_weights > 0], points[weights > 0])
-    for name, numbers in (*VERTEX_NUMBERS, *CELL_NUMBERS):
-        rows = numbers(model)
-        full, part = np.asarray(getattr(gradient, name)), np.asarray(getattr(found, name))
-        tolerance = ROUNDING * np.abs(full).max()
+    for name, numbers_of in (*VERTEX_NUMBERS, *CELL_NUMBERS):
+        rows = numbers_of(model)
+        dense_leaf = np.asarray(getattr(gradient, name))
+        band_leaf = np.asarray(getattr(band_gradient, name))
+        tolerance = ROUNDING * np.abs(dense_leaf).max()
         assert tolerance > 0
-        np.testing.assert_allclose(part[: len(rows)], full[rows], rtol=0, atol=tolerance)
-        assert not part[len(rows) :].any(), "padding has a gradient"
-        assert not np.delete(full, rows, axis=0).any(), "what is not in the band has a gradient"
+        np.testing.assert_allclose(band_leaf[: len(rows)], dense_leaf[rows], rtol=0, atol=tolerance)
+        assert not band_leaf[len(rows) :].any(), "padding has a gradient"
+        assert not np.delete(dense_leaf, rows, axis=0).any(), (
+            "what is not in the band has a gradient"
+        )
 
 
 def test_first_capacities_are_those_of_the_whole_grid(whole):
@@ -195,11 +200,13 @@ def test_first_capacities_are_those_of_the_whole_grid(whole):
 def numbered(shape):
     """Fill arrays with distinct numbers, which tell the array and the row that they come from."""
     leaves, structure = jax.tree.flatten(shape)
-    start, filled = 1, []
+    next_number, numbered_leaves = 1, []
     for leaf in leaves:
-        filled.append(jnp.arange(start, start + leaf.size, dtype=jnp.float32).reshape(leaf.shape))
-        start += leaf.size
-    return jax.tree.unflatten(structure, filled)
+        numbered_leaves.append(
+            jnp.arange(next_number, next_number + leaf.size, dtype=jnp.float32).reshape(leaf.shape)
+        )
+        next_number += leaf.size
+    return jax.tree.unflatten(structure, numbered_leaves)
 
 
 def with_values(model, shape, sdf):
@@ -215,25 +222,26 @@ def test_what_stays_in_the_band_keeps_its_numbers_and_the_rest_starts_anew():
     shape = with_values(model, varied(shape), ball(2.4))
     following = model.following(shape)
     assert following is not None
-    new = following.model
+    new_model = following.model
     # The surface is the same as before, and the band is around it.
     np.testing.assert_array_equal(
-        cells_of(new), band_module.cells_around(surface_of(ball(2.4)), SHAPE, 1)
+        cells_of(new_model), band_module.cells_around(surface_of(ball(2.4)), SHAPE, 1)
     )
-    assert new.following(following.shape) is None
+    assert new_model.following(following.shape) is None
     moments = numbered(shape)
-    carried = following.carried(moments)
-    for name, numbers in (*VERTEX_NUMBERS, *CELL_NUMBERS):
-        old, now = numbers(model), numbers(new)
-        stays = np.isin(now, old)
-        assert 0 < stays.sum() < len(now)
-        rows = np.searchsorted(old, now[stays])
-        for first, second in ((moments, carried), (shape, following.shape)):
-            one, two = np.asarray(getattr(first, name)), np.asarray(getattr(second, name))
-            np.testing.assert_array_equal(two[: len(now)][stays], one[rows])
-            assert not two[len(now) :].any()
-            if second is carried or name != "sdf":
-                assert not two[: len(now)][~stays].any()
+    carried_moments = following.carried(moments)
+    for name, numbers_of in (*VERTEX_NUMBERS, *CELL_NUMBERS):
+        old_numbers, new_numbers = numbers_of(model), numbers_of(new_model)
+        is_kept = np.isin(new_numbers, old_numbers)
+        assert 0 < is_kept.sum() < len(new_numbers)
+        rows = np.searchsorted(old_numbers, new_numbers[is_kept])
+        for source, result in ((moments, carried_moments), (shape, following.shape)):
+            old_values = np.asarray(getattr(source, name))
+            new_values = np.asarray(getattr(result, name))
+            np.testing.assert_array_equal(new_values[: len(new_numbers)][is_kept], old_values[rows])
+            assert not new_values[len(new_numbers) :].any()
+            if result is carried_moments or name != "sdf":
+                assert not new_values[: len(new_numbers)][~is_kept].any()
 
 
 def test_a_vertex_that_enters_the_band_lies_as_far_out_as_those_beside_it_and_the_way_from_there():
@@ -244,29 +252,38 @@ def test_a_vertex_that_enters_the_band_lies_as_far_out_as_those_beside_it_and_th
     np.testing.assert_array_equal(model.band.values(shape.sdf), shape.sdf)
     following = model.following(shape)
     assert following is not None
-    old, now = vertices_of(model), vertices_of(following.model)
-    values = np.asarray(following.shape.sdf)[: len(now)]
-    new = np.flatnonzero(~np.isin(now, old))
-    assert len(new) > 20
-    known = np.full(np.prod(grid.vertex_shape), np.nan)
-    known[old] = sdf[old]
+    old_vertices, new_vertices = vertices_of(model), vertices_of(following.model)
+    values = np.asarray(following.shape.sdf)[: len(new_vertices)]
+    entering_rows = np.flatnonzero(~np.isin(new_vertices, old_vertices))
+    assert len(entering_rows) > 20
+    known_values = np.full(np.prod(grid.vertex_shape), np.nan)
+    known_values[old_vertices] = sdf[old_vertices]
     corners = cell_corners(cells_of(following.model))
-    for row in new:
-        cells = corners[:, (corners == now[row]).any(0)]
-        beside = cells[~np.isnan(known[cells])]
-        at = np.stack(np.unravel_index(np.append(beside, now[row]), grid.vertex_shape[::-1]), 1)
-        way = np.sqrt(((at[:-1] - at[-1]) ** 2).sum(1))
-        expected = min(np.min(np.abs(known[beside]) + way), band_module.REACH)
-        assert values[row] == pytest.approx(np.sign(known[beside[0]]) * expected, rel=1e-6)
+    for row in entering_rows:
+        cells = corners[:, (corners == new_vertices[row]).any(0)]
+        adjacent_vertices = cells[~np.isnan(known_values[cells])]
+        coordinates = np.stack(
+            np.unravel_index(
+                np.append(adjacent_vertices, new_vertices[row]), grid.vertex_shape[::-1]
+            ),
+            1,
+        )
+        distances = np.sqrt(((coordinates[:-1] - coordinates[-1]) ** 2).sum(1))
+        expected = min(
+            np.min(np.abs(known_values[adjacent_vertices]) + distances), band_module.REACH
+        )
+        assert values[row] == pytest.approx(
+            np.sign(known_values[adjacent_vertices[0]]) * expected, rel=1e-6
+        )
 
 
 def test_a_surface_never_leaves_its_band_and_the_band_follows_it_to_the_sides_of_the_box():
     grid = grid_of((12, 12, 12))
     model, shape = BandedFlexiCubes.around(ball(1.6, grid), grid, 1)
-    passes = 0
+    iterations = 0
     while True:
-        passes += 1
-        assert passes < 10, "the band does not arrive at the sides"
+        iterations += 1
+        assert iterations < 10, "the band does not arrive at the sides"
         # Whatever training might learn: here, all of the band moves inside.
         shape = replace(shape, sdf=jnp.full_like(shape.sdf, -1.0))
         values, side = np.asarray(model.band.values(shape.sdf)), np.asarray(model.band.fixed)
@@ -274,12 +291,12 @@ def test_a_surface_never_leaves_its_band_and_the_band_follows_it_to_the_sides_of
         assert (values[side <= 0] == -1.0).all()
         if not (side > 0).any():
             break
-        reached = cells_of(model)
+        old_cells = cells_of(model)
         following = model.following(shape)
         assert following is not None
         model, shape = following.model, following.shape
-        assert not set(cells_of(model)) <= set(reached)
-    assert passes > 3
+        assert not set(cells_of(model)) <= set(old_cells)
+    assert iterations > 3
     assert {0, 11, 12**3 - 1} <= set(cells_of(model))
 
 
@@ -368,22 +385,26 @@ def advanced(loop, steps):
 def test_between_two_steps_the_band_follows_with_all_that_adam_keeps(dataset, folder, monkeypatch):
     compiled = steps_that_grow(monkeypatch)
     loop = new_loop(dataset, CONFIG, folder)
-    first = loop.surface
+    first_surface = loop.surface
     advanced(loop, 1)
-    assert loop.surface is first
-    before = grown(loop.state)
+    assert loop.surface is first_surface
+    grown_state = grown(loop.state)
     count = len(compiled)
     advanced(loop, 1)
     assert loop.surface is loop.pipeline.surface
-    assert cells_of(loop.surface).tolist() != cells_of(first).tolist()
-    following = first.following(before.params.geometry)
+    assert cells_of(loop.surface).tolist() != cells_of(first_surface).tolist()
+    following = first_surface.following(grown_state.params.geometry)
     assert following is not None
     assert_same(loop.state.params.geometry, following.shape)
-    assert_same(loop.state.optimizer.mu.geometry, following.carried(before.optimizer.mu.geometry))
-    assert_same(loop.state.optimizer.nu.geometry, following.carried(before.optimizer.nu.geometry))
+    assert_same(
+        loop.state.optimizer.mu.geometry, following.carried(grown_state.optimizer.mu.geometry)
+    )
+    assert_same(
+        loop.state.optimizer.nu.geometry, following.carried(grown_state.optimizer.nu.geometry)
+    )
     # The moments of parameters that are not part of the shape stay as they are.
-    assert_same(loop.state.optimizer.mu.light, before.optimizer.mu.light)
-    has_grown = rows_of(first) != rows_of(loop.surface)
+    assert_same(loop.state.optimizer.mu.light, grown_state.optimizer.mu.light)
+    has_grown = rows_of(first_surface) != rows_of(loop.surface)
     assert len(compiled) == count + has_grown
 
 
@@ -393,20 +414,20 @@ def test_a_run_that_goes_on_from_a_checkpoint_has_the_band_that_it_had(
     compiled = steps_that_grow(monkeypatch)
     loop = advanced(new_loop(dataset, CONFIG, folder), 3)
     assert loop.save() is not None
-    resumed = resumed_loop(dataset, CONFIG, folder)
+    second_loop = resumed_loop(dataset, CONFIG, folder)
     count = len(compiled)
-    resumed.prepare(resumed.step)
+    second_loop.prepare(second_loop.step)
     # The programs are compiled side by side, before a step waits for them.
     assert len(compiled) == count + 1
-    assert resumed.has_compiled
-    assert_same(resumed.surface, loop.surface)
-    assert_same(resumed.state, loop.state)
-    assert_same(resumed.fallback, loop.fallback)
-    assert cells_of(resumed.surface).tolist() != cells_of(resumed.fallback.surface).tolist()
-    for one in (loop, resumed):
-        advanced(one, 3)
-    assert_same(resumed.surface, loop.surface)
-    assert_same(resumed.state, loop.state)
+    assert second_loop.has_compiled
+    assert_same(second_loop.surface, loop.surface)
+    assert_same(second_loop.state, loop.state)
+    assert_same(second_loop.fallback, loop.fallback)
+    assert cells_of(second_loop.surface).tolist() != cells_of(second_loop.fallback.surface).tolist()
+    for active_loop in (loop, second_loop):
+        advanced(active_loop, 3)
+    assert_same(second_loop.surface, loop.surface)
+    assert_same(second_loop.state, loop.state)
 
 
 def test_a_stage_that_ends_earlier_than_before_an_interruption_leaves_one_end(
@@ -418,23 +439,23 @@ def test_a_stage_that_ends_earlier_than_before_an_interruption_leaves_one_end(
     for steps in (8, 5):
         loop.state = replace(loop.state, step=jnp.int32(steps))
         loop.save_end()
-    ends = list(folder.end_of("split_sum").iterdir())
-    assert [path.name for path in ends] == ["checkpoint_00000005.npz"]
+    checkpoints = list(folder.end_of("split_sum").iterdir())
+    assert [path.name for path in checkpoints] == ["checkpoint_00000005.npz"]
 
 
 def test_the_memory_that_a_band_is_certain_to_take_is_less_than_it_takes(dataset):
     _, shape = CONFIG.geometry.start(dataset, jax.random.key(0))
-    taken = sum(leaf.nbytes for leaf in jax.tree.leaves(shape))
-    certain = CONFIG.geometry.parameter_bytes(dataset.bounds)
-    assert 0.05 * taken < certain < taken
-    whole = tiny_config("geometry.resolution=10").geometry
-    assert certain < whole.parameter_bytes(dataset.bounds)
+    actual_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(shape))
+    certain_bytes = CONFIG.geometry.parameter_bytes(dataset.bounds)
+    assert 0.05 * actual_bytes < certain_bytes < actual_bytes
+    dense_geometry = tiny_config("geometry.resolution=10").geometry
+    assert certain_bytes < dense_geometry.parameter_bytes(dataset.bounds)
 
 
 def test_a_band_whose_rows_are_no_numbers_of_rows_is_refused():
-    described = {"grid_shape": [4, 4, 4], "cell_rows": 128, "vertex_rows": 0}
+    description = {"grid_shape": [4, 4, 4], "cell_rows": 128, "vertex_rows": 0}
     with pytest.raises(ValueError, match="cell_rows and vertex_rows"):
-        CONFIG.geometry.template(described)
+        CONFIG.geometry.template(description)
 
 
 def test_a_stage_that_leaves_the_surface_alone_leaves_the_band_alone(dataset, folder, monkeypatch):
@@ -443,22 +464,22 @@ def test_a_stage_that_leaves_the_surface_alone_leaves_the_band_alone(dataset, fo
     rates = dict.fromkeys(CONFIG.geometry.rate_groups, Rate(0.0))
     loop.stage = replace(loop.stage, rates={**loop.stage.rates, **rates})
     loop.state = grown(grown(loop.state))
-    first = loop.surface
-    assert first.following(loop.state.params.geometry) is not None
+    first_surface = loop.surface
+    assert first_surface.following(loop.state.params.geometry) is not None
     loop._follow(2)
-    assert loop.surface is first
+    assert loop.surface is first_surface
 
 
 def test_a_surface_that_vanishes_is_put_back_with_its_band(dataset, folder, monkeypatch):
     compiled = steps_that_grow(monkeypatch)
     loop = new_loop(dataset, CONFIG, folder)
-    first = loop.surface
-    while rows_of(loop.surface) == rows_of(first):
+    first_surface = loop.surface
+    while rows_of(loop.surface) == rows_of(first_surface):
         advanced(loop, 2)
     count = len(compiled)
     loop._recover(loop.step)
     assert len(compiled) == count + 1
-    assert loop.surface is loop.pipeline.surface is first
+    assert loop.surface is loop.pipeline.surface is first_surface
     assert_same(loop.params.geometry, jax.tree.map(jnp.asarray, loop.fallback.shape))
 
 
@@ -467,16 +488,18 @@ def test_a_surface_that_vanishes_is_put_back_with_its_band(dataset, folder, monk
 def test_training_in_a_band_is_training_on_the_whole_grid(dataset, tmp_path, monkeypatch):
     """The two agree up to the order of sums, until a cell leaves the band and comes back."""
     monkeypatch.setattr(loop_module, "_FOLLOW_EVERY", 2)
-    whole = tiny_config("geometry.resolution=10", "stages.split_sum.steps=5")
-    banded = tiny_config("geometry.resolution=10", "stages.split_sum.steps=5", "geometry.band=3")
+    dense_config = tiny_config("geometry.resolution=10", "stages.split_sum.steps=5")
+    banded_config = tiny_config(
+        "geometry.resolution=10", "stages.split_sum.steps=5", "geometry.band=3"
+    )
     states = [
         fit(dataset, config, tmp_path / name)
-        for name, config in (("whole", whole), ("band", banded))
+        for name, config in (("whole", dense_config), ("band", banded_config))
     ]
     lines = [RunFolder(tmp_path / name).metric_lines() for name in ("whole", "band")]
-    for one, two in zip(*lines, strict=True):
-        assert one["faces"] == two["faces"]
-        assert two["loss"] == pytest.approx(one["loss"], rel=1e-4)
-    stopped = tmp_path / "stopped"
-    fit(dataset, banded, stopped, stop_after=3)
-    assert_same(fit(dataset, banded, stopped, begin=Resume()), states[1])
+    for dense_line, banded_line in zip(*lines, strict=True):
+        assert dense_line["faces"] == banded_line["faces"]
+        assert banded_line["loss"] == pytest.approx(dense_line["loss"], rel=1e-4)
+    stopped_folder = tmp_path / "stopped"
+    fit(dataset, banded_config, stopped_folder, stop_after=3)
+    assert_same(fit(dataset, banded_config, stopped_folder, begin=Resume()), states[1])

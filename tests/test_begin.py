@@ -30,12 +30,12 @@ def test_options_say_how_a_run_begins(options, expected):
 
 
 def test_only_resuming_goes_on_with_a_run_and_only_where_there_is_one(tmp_path):
-    run, ways = RunFolder(tmp_path), (ANEW, Anew(replace=True), TakeOver("a", "b"), Resume())
-    assert [way.goes_on(run) for way in ways] == [False] * 4
+    run, beginnings = RunFolder(tmp_path), (ANEW, Anew(replace=True), TakeOver("a", "b"), Resume())
+    assert [beginning.goes_on(run) for beginning in beginnings] == [False] * 4
     (tmp_path / "run.json").write_text("{}")
-    assert [way.goes_on(run) for way in ways] == [False, False, False, True]
-    assert [way.replace for way in ways] == [False, True, False, False]
-    assert [way.takes_over for way in ways] == [False, False, True, False]
+    assert [beginning.goes_on(run) for beginning in beginnings] == [False, False, False, True]
+    assert [beginning.replace for beginning in beginnings] == [False, True, False, False]
+    assert [beginning.takes_over for beginning in beginnings] == [False, False, True, False]
 
 
 EVENTS = {
@@ -51,13 +51,13 @@ class _Notes(Listener):
 
     def __init__(self, told, name):
         for event in EVENTS:
-            setattr(self, event, lambda what, event=event: told.append((name, event, what)))
+            setattr(self, event, lambda argument, event=event: told.append((name, event, argument)))
 
 
 def test_several_listeners_are_told_everything_in_turn():
-    told = []
-    several = Listeners(_Notes(told, "a"), NOBODY, _Notes(told, "b"))
+    notes = []
+    listeners = Listeners(_Notes(notes, "a"), NOBODY, _Notes(notes, "b"))
     assert {name for name in vars(Listener) if name.startswith("on_")} == set(EVENTS)
-    for event, what in EVENTS.items():
-        getattr(several, event)(what)
-    assert told == [(name, event, what) for event, what in EVENTS.items() for name in "ab"]
+    for event, argument in EVENTS.items():
+        getattr(listeners, event)(argument)
+    assert notes == [(name, event, argument) for event, argument in EVENTS.items() for name in "ab"]

@@ -28,9 +28,9 @@ def bowl_share():
     Half of the light for the inside of a hemisphere is blocked by the hemisphere itself, and none
     for its outside and its rim.
     """
-    inner, outer = 2 * np.pi * (MIDDLE - WALL) ** 2, 2 * np.pi * (MIDDLE + WALL) ** 2
-    rim = 0.5 * (outer - inner)
-    return 0.5 * inner / (inner + outer + rim)
+    inner_area, outer_area = 2 * np.pi * (MIDDLE - WALL) ** 2, 2 * np.pi * (MIDDLE + WALL) ** 2
+    rim_area = 0.5 * (outer_area - inner_area)
+    return 0.5 * inner_area / (inner_area + outer_area + rim_area)
 
 
 def surface(distance):
@@ -43,7 +43,7 @@ def surface(distance):
     ("distance", "share", "tolerance"), [(ball, 0.0, 0.002), (bowl, bowl_share(), 0.006)]
 )
 def test_a_surface_blocks_what_a_closed_form_says(distance, share, tolerance):
-    model, larger = surface(bowl)
+    model, bowl_geometry = surface(bowl)
     # With the capacities of the bowl, one program serves both surfaces.
-    capacities = model.first_capacities(larger)
+    capacities = model.first_capacities(bowl_geometry)
     assert blocked_share(*surface(distance), capacities) == pytest.approx(share, abs=tolerance)

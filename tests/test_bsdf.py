@@ -58,12 +58,12 @@ def _sphere_quadrature(pole, angles=160, azimuths=200):
     tangent = np.cross(pole, [0.3, 0.9, -0.2])
     tangent /= np.linalg.norm(tangent)
     bitangent = np.cross(pole, tangent)
-    around = np.cos(azimuth)[:, None] * tangent + np.sin(azimuth)[:, None] * bitangent
+    circle = np.cos(azimuth)[:, None] * tangent + np.sin(azimuth)[:, None] * bitangent
     directions = (
-        np.cos(angle)[:, None, None] * pole + np.sin(angle)[:, None, None] * around[None, :]
+        np.cos(angle)[:, None, None] * pole + np.sin(angle)[:, None, None] * circle[None, :]
     )
-    solid = (np.sin(angle) * angle_weight)[:, None] * np.full(azimuths, 2 * np.pi / azimuths)
-    return directions.reshape(-1, 3), solid.reshape(-1)
+    solid_angles = (np.sin(angle) * angle_weight)[:, None] * np.full(azimuths, 2 * np.pi / azimuths)
+    return directions.reshape(-1, 3), solid_angles.reshape(-1)
 
 
 def _mirror(normal, wo):
@@ -107,8 +107,8 @@ def test_the_distribution_of_normals_covers_the_surface_once():
         for roughness in (0.1, 0.3, 1.0):
             alpha = ggx_alpha(jnp.full(count, roughness, jnp.float64))
             density = ggx_distribution(half, _rows(UP, count, jnp.float64), alpha)
-            total = np.sum(np.asarray(density) * directions[:, 2] * weights)
-            np.testing.assert_allclose(total, 1.0, rtol=1e-4)
+            projected_area = np.sum(np.asarray(density) * directions[:, 2] * weights)
+            np.testing.assert_allclose(projected_area, 1.0, rtol=1e-4)
 
 
 @pytest.mark.parametrize("roughness", [0.1, 0.3, 0.7, 1.0])
@@ -138,8 +138,8 @@ def test_the_base_reflects_its_albedo():
     [(0.0, 0.1, 1.0), (35.0, 0.3, 0.0), (60.0, 0.6, 0.5), (80.0, 0.9, 1.0), (85.0, 0.2, 0.0)],
 )
 def test_the_density_integrates_to_one(degrees, roughness, metallic):
-    _, _, total = _integrals(degrees, TILTED, roughness=roughness, metallic=metallic)
-    np.testing.assert_allclose(total, 1.0, rtol=2e-3)
+    _, _, integral = _integrals(degrees, TILTED, roughness=roughness, metallic=metallic)
+    np.testing.assert_allclose(integral, 1.0, rtol=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -147,13 +147,13 @@ def test_the_density_integrates_to_one(degrees, roughness, metallic):
     [(10.0, 0.3, 1.0), (50.0, 0.5, 0.3), (75.0, 0.8, 1.0), (40.0, 1.0, 0.0)],
 )
 def test_samples_follow_their_density(degrees, roughness, metallic):
-    count, rows, columns, inner = 100_000, 24, 24, 12
+    count, rows, columns, subdivisions = 100_000, 24, 24, 12
     wo = _view(degrees, TILTED)
     uniforms = jax.random.uniform(jax.random.key(7), (count, 3))
     materials = _materials(count, roughness=roughness, metallic=metallic)
-    drawn = sample(materials, _rows(TILTED, count), _rows(wo, count), uniforms)
-    drawn = np.asarray(drawn, np.float64)
-    np.testing.assert_allclose(np.linalg.norm(drawn, axis=1), 1.0, atol=1e-5)
+    samples = sample(materials, _rows(TILTED, count), _rows(wo, count), uniforms)
+    samples = np.asarray(samples, np.float64)
+    np.testing.assert_allclose(np.linalg.norm(samples, axis=1), 1.0, atol=1e-5)
 
     # Cells of equal solid angle in (z, azimuth) about the world axis, not the normal.
     def cells(z, azimuth):
@@ -161,11 +161,11 @@ def test_samples_follow_their_density(degrees, roughness, metallic):
         column = np.clip((azimuth / (2 * np.pi) * columns).astype(int), 0, columns - 1)
         return row * columns + column
 
-    azimuth = np.arctan2(drawn[:, 1], drawn[:, 0]) % (2 * np.pi)
-    observed = np.bincount(cells(drawn[:, 2], azimuth), minlength=rows * columns)
+    azimuth = np.arctan2(samples[:, 1], samples[:, 0]) % (2 * np.pi)
+    observed = np.bincount(cells(samples[:, 2], azimuth), minlength=rows * columns)
 
-    z = (np.arange(rows * inner) + 0.5) / (rows * inner) * 2 - 1
-    phi = (np.arange(columns * inner) + 0.5) / (columns * inner) * 2 * np.pi
+    z = (np.arange(rows * subdivisions) + 0.5) / (rows * subdivisions) * 2 - 1
+    phi = (np.arange(columns * subdivisions) + 0.5) / (columns * subdivisions) * 2 * np.pi
     z, phi = (grid.ravel() for grid in np.meshgrid(z, phi, indexing="ij"))
     radius = np.sqrt(1 - z * z)
     wi = jnp.asarray(np.stack([radius * np.cos(phi), radius * np.sin(phi), z], -1), jnp.float32)
@@ -198,8 +198,8 @@ def test_a_sampled_estimate_has_the_reflectance_of_quadrature():
     cosine = jnp.maximum(wi[:, 2], 0.0)
     weights = evaluate(materials, normals, wi, wo)[:, 0] * cosine / pdf(materials, normals, wi, wo)
     diffuse, specular, _ = _integrals(degrees, roughness=0.5, metallic=0.2)
-    spread = float(jnp.std(weights)) / np.sqrt(count)
-    assert abs(float(jnp.mean(weights)) - diffuse - specular) < 4 * spread
+    standard_error = float(jnp.std(weights)) / np.sqrt(count)
+    assert abs(float(jnp.mean(weights)) - diffuse - specular) < 4 * standard_error
 
 
 def test_values_and_gradients_are_finite_at_the_extremes():
@@ -219,18 +219,22 @@ def test_values_and_gradients_are_finite_at_the_extremes():
     for albedo, roughness, metallic in product((0.0, 1.0), (0.0, 0.1, 1.0), (0.0, 1.0)):
         materials = _materials(count, albedo, roughness, metallic)
         value, gradient = differentiate(materials, normals, wi, wo)
-        drawn = sample(materials, normals, wo, uniforms)
-        for leaf in jax.tree.leaves((value, gradient, drawn)):
+        samples = sample(materials, normals, wo, uniforms)
+        for leaf in jax.tree.leaves((value, gradient, samples)):
             assert bool(jnp.all(jnp.isfinite(leaf)))
 
 
 def test_nothing_is_reflected_below_the_surface():
-    below = _hemisphere(50) * [1, 1, -1]
-    above = jnp.asarray(_hemisphere(50, seed=1), jnp.float32)
+    lower_directions = _hemisphere(50) * [1, 1, -1]
+    upper_directions = jnp.asarray(_hemisphere(50, seed=1), jnp.float32)
     materials, normals = _materials(50), _rows(UP, 50)
-    below = jnp.asarray(below, jnp.float32)
-    np.testing.assert_array_equal(evaluate(materials, normals, below, above), 0.0)
-    np.testing.assert_array_equal(evaluate(materials, normals, above, below), 0.0)
+    lower_directions = jnp.asarray(lower_directions, jnp.float32)
+    np.testing.assert_array_equal(
+        evaluate(materials, normals, lower_directions, upper_directions), 0.0
+    )
+    np.testing.assert_array_equal(
+        evaluate(materials, normals, upper_directions, lower_directions), 0.0
+    )
 
 
 def test_roughness_has_a_floor():

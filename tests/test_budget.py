@@ -77,13 +77,15 @@ def test_at_a_quality_level_the_settings_are_its_own(place):
 
 
 def test_between_two_levels_every_number_lies_between_theirs():
-    low, middle, high = (between_qualities(place) for place in (0.0, 0.5, 1.0))
+    low, middle, high = (between_qualities(position) for position in (0.0, 0.5, 1.0))
     assert [_cells(config) for config in (low, middle, high)] == [32, 39, 48]
     for name in ("split_sum", "monte_carlo"):
-        below, here, above = (config.stage(name) for config in (low, middle, high))
-        assert below.steps < here.steps < above.steps
-        assert below.batch_views <= here.batch_views <= above.batch_views
-        assert below.half_life < here.half_life < above.half_life
+        lower_stage, middle_stage, upper_stage = (
+            config.stage(name) for config in (low, middle, high)
+        )
+        assert lower_stage.steps < middle_stage.steps < upper_stage.steps
+        assert lower_stage.batch_views <= middle_stage.batch_views <= upper_stage.batch_views
+        assert lower_stage.half_life < middle_stage.half_life < upper_stage.half_life
     refinements = [config.stage("refine") for config in (low, middle, high)]
     assert [stage.steps for stage in refinements] == [100, 100, 100]
     assert [stage.batch_views for stage in refinements] == [2, 3, 4]
@@ -93,16 +95,16 @@ def test_more_time_chooses_more_work():
     plans = [plan(Budget(seconds), SIZE, slowness=1.0) for seconds in (90, 180, 600, 2400)]
     assert all(a.effort < b.effort or a.seconds < b.seconds for a, b in pairwise(plans))
     assert _cells(plans[0].config) < _cells(plans[-1].config)
-    for one, seconds in zip(plans, (90, 180, 600, 2400), strict=True):
+    for budget_plan, seconds in zip(plans, (90, 180, 600, 2400), strict=True):
         # Only approximately, since steps are whole numbers.
-        assert one.seconds == pytest.approx(seconds, rel=0.01)
+        assert budget_plan.seconds == pytest.approx(seconds, rel=0.01)
 
 
 def test_a_slow_machine_is_given_less_work():
-    fast, slow = (plan(Budget(600.0), SIZE, slowness=slowness) for slowness in (1.0, 5.0))
-    assert slow.config.total_steps < fast.config.total_steps
-    assert len(slow.config.active_stages) < len(fast.config.active_stages)
-    assert slow.seconds == pytest.approx(600, rel=0.01)
+    fast_plan, slow_plan = (plan(Budget(600.0), SIZE, slowness=slowness) for slowness in (1.0, 5.0))
+    assert slow_plan.config.total_steps < fast_plan.config.total_steps
+    assert len(slow_plan.config.active_stages) < len(fast_plan.config.active_stages)
+    assert slow_plan.seconds == pytest.approx(600, rel=0.01)
 
 
 @pytest.mark.parametrize("slowness", [0.3, 1.0, 8.0])
@@ -113,31 +115,31 @@ def test_a_time_that_compilation_would_fill_is_refused(slowness):
 
 def test_a_fast_machine_and_a_busy_one_take_what_is_short_but_possible():
     for slowness in (0.5, 1.0, 5.0):
-        chosen = plan(Budget(120.0), SIZE, slowness=slowness)
-        assert all(stage.steps >= 60 for stage in chosen.config.active_stages)
+        budget_plan = plan(Budget(120.0), SIZE, slowness=slowness)
+        assert all(stage.steps >= 60 for stage in budget_plan.config.active_stages)
 
 
 def test_little_memory_chooses_fewer_cells_or_is_refused():
-    free = plan(Budget(1200.0), SIZE, slowness=1.0)
-    tight = plan(Budget(1200.0, memory=5e9), SIZE, slowness=1.0)
-    assert tight.memory <= 5e9 < free.memory
-    assert _cells(tight.config) < _cells(free.config)
+    unlimited_plan = plan(Budget(1200.0), SIZE, slowness=1.0)
+    limited_plan = plan(Budget(1200.0, memory=5e9), SIZE, slowness=1.0)
+    assert limited_plan.memory <= 5e9 < unlimited_plan.memory
+    assert _cells(limited_plan.config) < _cells(unlimited_plan.config)
     with pytest.raises(TrainingError, match="more than --memory allows"):
         plan(Budget(1200.0, memory=1e9), SIZE, slowness=1.0)
 
 
 def test_no_more_memory_is_asked_for_than_the_machine_has(monkeypatch):
-    free = plan(Budget(1200.0), SIZE, slowness=1.0)
+    unlimited_plan = plan(Budget(1200.0), SIZE, slowness=1.0)
     monkeypatch.setattr(budget_module, "memory_of_machine", lambda: int(5e9))
-    tight = plan(Budget(1200.0), SIZE, slowness=1.0)
-    assert tight.memory <= 5e9 < free.memory
-    assert plan(Budget(1200.0, memory=20e9), SIZE, slowness=1.0).memory == tight.memory
+    limited_plan = plan(Budget(1200.0), SIZE, slowness=1.0)
+    assert limited_plan.memory <= 5e9 < unlimited_plan.memory
+    assert plan(Budget(1200.0, memory=20e9), SIZE, slowness=1.0).memory == limited_plan.memory
     # The memory of a training is only estimated: the smallest settings are tried all the same, and
     # the training is refused once its memory is known.
     monkeypatch.setattr(budget_module, "memory_of_machine", lambda: int(1e9))
-    assert plan(Budget(1200.0), SIZE, slowness=1.0).memory < tight.memory
+    assert plan(Budget(1200.0), SIZE, slowness=1.0).memory < limited_plan.memory
     monkeypatch.setattr(budget_module, "memory_of_machine", lambda: None)
-    assert plan(Budget(1200.0), SIZE, slowness=1.0).memory == free.memory
+    assert plan(Budget(1200.0), SIZE, slowness=1.0).memory == unlimited_plan.memory
 
 
 def test_a_training_without_steps_is_refused():
@@ -152,16 +154,16 @@ def test_a_run_on_its_pace_is_left_alone_whichever_stage_it_begins_with():
     now = [0.0]
     budget = Budget(0.1 * config.total_steps)
     pacer, stage = Pacer(budget, config, costs, clock=lambda: now[0]), config.stage("monte_carlo")
-    for done in range(1, 41):
+    for steps_done in range(1, 41):
         now[0] += 0.1
         pacer.note(stage.name, 0.1)
-        assert pacer.adjusted(config, stage, done) is None
+        assert pacer.adjusted(config, stage, steps_done) is None
 
 
 def test_large_photographs_are_reduced_to_what_the_cells_show():
-    chosen = plan(Budget(120.0), (3000, 4000), slowness=1.0)
-    side = 4000 / chosen.downscale
-    assert 4 <= side / _cells(chosen.config) <= 8
+    budget_plan = plan(Budget(120.0), (3000, 4000), slowness=1.0)
+    side = 4000 / budget_plan.downscale
+    assert 4 <= side / _cells(budget_plan.config) <= 8
     assert plan(Budget(120.0), (3000, 4000), slowness=1.0, downscale=10).downscale == 10
 
 
@@ -199,18 +201,18 @@ class _Machine:
 
     def run(self, pacer):
         """Make all steps as `fit.train` does; return the seconds and the settings at the end."""
-        began, config = self.now, self.config
+        start_time, config = self.now, self.config
         for name in [stage.name for stage in config.active_stages]:
-            done = 0
-            while done < config.stage(name).steps:
-                seconds = self.costs[name].startup if done == 0 else self.costs[name].step
-                seconds *= self.speed(self.now - began)
+            steps_done = 0
+            while steps_done < config.stage(name).steps:
+                seconds = self.costs[name].startup if steps_done == 0 else self.costs[name].step
+                seconds *= self.speed(self.now - start_time)
                 self.now += seconds
-                if done:
+                if steps_done:
                     pacer.note(name, seconds)
-                done += 1
-                config = pacer.adjusted(config, config.stage(name), done) or config
-        return self.now - began, config
+                steps_done += 1
+                config = pacer.adjusted(config, config.stage(name), steps_done) or config
+        return self.now - start_time, config
 
 
 @pytest.mark.parametrize(
@@ -234,13 +236,17 @@ class _Machine:
 )
 def test_a_training_ends_in_time_on_a_machine_of_another_speed(speed, tolerance):
     budget = Budget(480.0)
-    chosen = plan(budget, SIZE, slowness=1.0)
-    machine = _Machine(chosen.config, chosen.costs, speed)
-    seconds, config = machine.run(Pacer(budget, chosen.config, chosen.costs, clock=machine))
+    budget_plan = plan(budget, SIZE, slowness=1.0)
+    machine = _Machine(budget_plan.config, budget_plan.costs, speed)
+    seconds, config = machine.run(
+        Pacer(budget, budget_plan.config, budget_plan.costs, clock=machine)
+    )
     assert seconds == pytest.approx(480.0, rel=tolerance)
-    for after in config.active_stages:
-        before = chosen.config.stage(after.name)
-        assert after.rates_at(after.steps) == pytest.approx(before.rates_at(before.steps))
+    for adjusted_stage in config.active_stages:
+        planned_stage = budget_plan.config.stage(adjusted_stage.name)
+        assert adjusted_stage.rates_at(adjusted_stage.steps) == pytest.approx(
+            planned_stage.rates_at(planned_stage.steps)
+        )
 
 
 def test_what_later_stages_wait_for_is_set_aside():
@@ -255,39 +261,45 @@ def test_what_later_stages_wait_for_is_set_aside():
     now[0] = 10.0
     assert pacer.adjusted(config, config.stage("a"), 10) is None
     now[0] = 60.0
-    slower = pacer.adjusted(config, config.stage("a"), 10)
-    assert slower is not None
-    assert slower.stage("a").steps == 10 + round(90 * 140 / 190)
+    slower_config = pacer.adjusted(config, config.stage("a"), 10)
+    assert slower_config is not None
+    assert slower_config.stage("a").steps == 10 + round(90 * 140 / 190)
 
 
 def test_a_very_fast_machine_makes_no_more_steps_than_are_worth_it():
     budget = Budget(480.0)
-    chosen = plan(budget, SIZE, slowness=1.0)
-    machine = _Machine(chosen.config, chosen.costs, lambda now: 0.02)
-    _, config = machine.run(Pacer(budget, chosen.config, chosen.costs, clock=machine))
-    for before, after in zip(chosen.config.active_stages, config.active_stages, strict=True):
-        assert after.steps <= 3 * before.steps
+    budget_plan = plan(budget, SIZE, slowness=1.0)
+    machine = _Machine(budget_plan.config, budget_plan.costs, lambda now: 0.02)
+    _, config = machine.run(Pacer(budget, budget_plan.config, budget_plan.costs, clock=machine))
+    for planned_stage, adjusted_stage in zip(
+        budget_plan.config.active_stages, config.active_stages, strict=True
+    ):
+        assert adjusted_stage.steps <= 3 * planned_stage.steps
 
 
 def test_a_training_that_is_hopelessly_late_still_makes_its_last_steps():
     budget = Budget(480.0)
-    chosen = plan(budget, SIZE, slowness=1.0)
-    machine = _Machine(chosen.config, chosen.costs, lambda now: 20.0)
-    _, config = machine.run(Pacer(budget, chosen.config, chosen.costs, clock=machine))
-    (after,), before = config.active_stages, chosen.config.active_stages[0]
-    assert 0.1 * before.steps <= after.steps < 0.3 * before.steps
-    assert after.rates_at(after.steps) == pytest.approx(before.rates_at(before.steps))
+    budget_plan = plan(budget, SIZE, slowness=1.0)
+    machine = _Machine(budget_plan.config, budget_plan.costs, lambda now: 20.0)
+    _, config = machine.run(Pacer(budget, budget_plan.config, budget_plan.costs, clock=machine))
+    (adjusted_stage,), planned_stage = config.active_stages, budget_plan.config.active_stages[0]
+    assert 0.1 * planned_stage.steps <= adjusted_stage.steps < 0.3 * planned_stage.steps
+    assert adjusted_stage.rates_at(adjusted_stage.steps) == pytest.approx(
+        planned_stage.rates_at(planned_stage.steps)
+    )
 
 
 def test_a_later_stage_that_would_come_too_short_is_left_out_and_its_time_used():
     budget = Budget(480.0)
-    chosen = plan(budget, SIZE, slowness=1.0)
-    first, *later = chosen.config.active_stages
-    assert later
-    machine = _Machine(chosen.config, chosen.costs, lambda now: 4.0)
-    seconds, config = machine.run(Pacer(budget, chosen.config, chosen.costs, clock=machine))
-    assert [stage.name for stage in config.active_stages] == [first.name]
-    assert all(config.stage(stage.name).steps == 0 for stage in later)
+    budget_plan = plan(budget, SIZE, slowness=1.0)
+    first_stage, *later_stages = budget_plan.config.active_stages
+    assert later_stages
+    machine = _Machine(budget_plan.config, budget_plan.costs, lambda now: 4.0)
+    seconds, config = machine.run(
+        Pacer(budget, budget_plan.config, budget_plan.costs, clock=machine)
+    )
+    assert [stage.name for stage in config.active_stages] == [first_stage.name]
+    assert all(config.stage(stage.name).steps == 0 for stage in later_stages)
     assert seconds == pytest.approx(480.0, rel=0.1)
 
 
@@ -301,33 +313,33 @@ def test_a_stage_left_out_comes_back_once_the_machine_is_fast_again(slow_steps):
     )
     config = replace(make_config("default", "draft"), stages=stages)
     costs = {stage.name: StageCost(startup=20.0, step=1.0) for stage in stages}
-    made = [0]
+    steps_made = [0]
 
     def speed(now):
-        made[0] += 1
-        return 6.0 if 1 < made[0] <= slow_steps else 1.0
+        steps_made[0] += 1
+        return 6.0 if 1 < steps_made[0] <= slow_steps else 1.0
 
     machine = _Machine(config, costs, speed)
-    left_out = []
+    omissions = []
     pacer = Pacer(Budget(640.0), config, costs, clock=machine)
     pacer_adjusted = pacer.adjusted
 
-    def noted(before, stage, done):
-        after = pacer_adjusted(before, stage, done)
-        left_out.append(any(not s.steps for s in (after or before).stages))
-        return after
+    def noted(old_config, stage, steps_done):
+        new_config = pacer_adjusted(old_config, stage, steps_done)
+        omissions.append(any(not s.steps for s in (new_config or old_config).stages))
+        return new_config
 
     pacer.adjusted = noted
-    seconds, after = machine.run(pacer)
-    assert any(left_out)
+    seconds, new_config = machine.run(pacer)
+    assert any(omissions)
     assert seconds == pytest.approx(640.0, rel=0.03)
     # All schedules reach their planned ends, and later stages share one pace.
-    assert [stage.name for stage in after.active_stages] == [s.name for s in stages]
-    for stage in after.stages:
+    assert [stage.name for stage in new_config.active_stages] == [s.name for s in stages]
+    for stage in new_config.stages:
         assert stage.rates_at(stage.steps) == pytest.approx(
             config.stage(stage.name).rates_at(config.stage(stage.name).steps)
         )
-    monte_carlo, refine = (after.stage(name).steps for name in ("monte_carlo", "refine"))
+    monte_carlo, refine = (new_config.stage(name).steps for name in ("monte_carlo", "refine"))
     assert monte_carlo == pytest.approx(refine, rel=0.1)
 
 
@@ -351,15 +363,18 @@ def test_what_is_too_short_to_be_worth_it_goes_with_all_after_it(seconds_left, m
     pacer = Pacer(Budget(seconds_left), config, costs, clock=lambda: 0.0)
     for _ in range(10):
         pacer.note("split_sum", 1.0)
-    adjusted = pacer.adjusted(config, config.stage("split_sum"), 10) or config
-    assert adjusted.stage("monte_carlo").steps == monte_carlo
-    assert adjusted.stage("refine").steps == refine
+    adjusted_config = pacer.adjusted(config, config.stage("split_sum"), 10) or config
+    assert adjusted_config.stage("monte_carlo").steps == monte_carlo
+    assert adjusted_config.stage("refine").steps == refine
 
 
 def test_a_later_stage_of_which_something_was_set_is_not_left_out():
     overrides = ["stages.monte_carlo.batch_views=2", "stages.refine.steps=0"]
-    chosen = plan(Budget(150.0), SIZE, slowness=1.0, overrides=overrides)
-    assert [stage.name for stage in chosen.config.active_stages] == ["split_sum", "monte_carlo"]
+    budget_plan = plan(Budget(150.0), SIZE, slowness=1.0, overrides=overrides)
+    assert [stage.name for stage in budget_plan.config.active_stages] == [
+        "split_sum",
+        "monte_carlo",
+    ]
 
 
 def test_all_stages_share_a_budget_that_pays_for_a_draft():
@@ -376,39 +391,42 @@ def test_all_stages_share_a_budget_that_pays_for_a_draft():
 def test_a_mesh_keeps_what_is_set_of_it(tmp_path):
     file = tmp_path / "ball.ply"
     trimesh.creation.icosphere().export(file)
-    changes = ["geometry.edge_pixels=4", "stages.split_sum.rates.vertices=0"]
-    chosen = plan(Budget(600.0), SIZE, slowness=1.0, mesh=file, overrides=changes)
-    geometry, split_sum = chosen.config.geometry, chosen.config.stage("split_sum")
+    overrides = ["geometry.edge_pixels=4", "stages.split_sum.rates.vertices=0"]
+    budget_plan = plan(Budget(600.0), SIZE, slowness=1.0, mesh=file, overrides=overrides)
+    geometry, split_sum = budget_plan.config.geometry, budget_plan.config.stage("split_sum")
     assert (geometry.path, geometry.edge_pixels) == (str(file), 4.0)
     assert split_sum.rates["vertices"].value == 0
-    assert "cells" not in chosen.describe()[0]
+    assert "cells" not in budget_plan.describe()[0]
     edges = [
-        between_qualities(place, mesh=file).geometry.edge_pixels for place in (0.0, 0.5, 1.0, 2.0)
+        between_qualities(position, mesh=file).geometry.edge_pixels
+        for position in (0.0, 0.5, 1.0, 2.0)
     ]
     assert edges == pytest.approx([3.0, 6.0**0.5, 2.0, 1.5])
     assert with_mesh(between_qualities(0.5), file).geometry.edge_pixels == 2.0
     # Half the edge length gives four times as many faces, and so four times as many splats.
-    finer = plan(Budget(600.0), SIZE, slowness=1.0, mesh=file, overrides=["geometry.edge_pixels=2"])
+    finer_plan = plan(
+        Budget(600.0), SIZE, slowness=1.0, mesh=file, overrides=["geometry.edge_pixels=2"]
+    )
     pixels = float(SIZE[0] * SIZE[1])
-    ratio = finer.config.geometry.expected_splats(pixels) / geometry.expected_splats(pixels)
+    ratio = finer_plan.config.geometry.expected_splats(pixels) / geometry.expected_splats(pixels)
     assert ratio == pytest.approx(4.0, rel=0.01)
 
 
 def test_kinds_may_be_set_together_with_what_they_have():
-    changes = ("stages.refine.domain.points=mesh", "stages.refine.domain.kind=per_pixel")
-    config = between_qualities(0.6, overrides=changes)
+    overrides = ("stages.refine.domain.points=mesh", "stages.refine.domain.kind=per_pixel")
+    config = between_qualities(0.6, overrides=overrides)
     assert config.stage("refine").domain.points == "mesh"
 
 
 def test_what_is_too_short_for_all_stages_goes_to_the_first():
-    chosen = plan(Budget(110.0), SIZE, slowness=1.0)
-    assert [stage.name for stage in chosen.config.active_stages] == ["split_sum"]
-    assert chosen.seconds == pytest.approx(110.0, rel=0.05)
-    assert "without monte_carlo and refine" in chosen.describe()[0]
-    assert "in full size" in chosen.describe()[0]
-    smaller = plan(Budget(110.0), SIZE, slowness=1.0, downscale=2)
-    assert "reduced by 2" in smaller.describe()[0]
-    assert set(chosen.costs) == {"split_sum"}
+    budget_plan = plan(Budget(110.0), SIZE, slowness=1.0)
+    assert [stage.name for stage in budget_plan.config.active_stages] == ["split_sum"]
+    assert budget_plan.seconds == pytest.approx(110.0, rel=0.05)
+    assert "without monte_carlo and refine" in budget_plan.describe()[0]
+    assert "in full size" in budget_plan.describe()[0]
+    reduced_plan = plan(Budget(110.0), SIZE, slowness=1.0, downscale=2)
+    assert "reduced by 2" in reduced_plan.describe()[0]
+    assert set(budget_plan.costs) == {"split_sum"}
 
 
 @pytest.fixture(scope="module")
@@ -436,10 +454,10 @@ def _paced_run(dataset, folder, config, **options):
 def test_the_record_of_a_shortened_run_repeats_it_bit_for_bit(dataset, tmp_path):
     config = tiny_config("stages.split_sum.steps=40", "stages.monte_carlo.steps=0")
     state = _paced_run(dataset, tmp_path / "paced", config)
-    done = RunFolder(tmp_path / "paced").config()
-    assert int(state.step) == done.total_steps < 40
-    again = fit(dataset, done, tmp_path / "again")
-    for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(again), strict=True):
+    recorded_config = RunFolder(tmp_path / "paced").config()
+    assert int(state.step) == recorded_config.total_steps < 40
+    repeated_state = fit(dataset, recorded_config, tmp_path / "again")
+    for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(repeated_state), strict=True):
         np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
 
 
@@ -457,13 +475,13 @@ def test_a_shortened_run_that_was_stopped_goes_on_with_its_own_settings(dataset,
 def test_a_resumed_budget_measures_itself_against_what_was_planned(dataset, tmp_path, monkeypatch):
     config = tiny_config("stages.split_sum.steps=40", "stages.monte_carlo.steps=0")
     _paced_run(dataset, tmp_path / "run", config, stop_after=12)
-    planned = []
+    planned_configs = []
     true_pacer = run_module.Pacer
     monkeypatch.setattr(
-        run_module, "Pacer", lambda *a, **k: planned.append(a[1]) or true_pacer(*a, **k)
+        run_module, "Pacer", lambda *a, **k: planned_configs.append(a[1]) or true_pacer(*a, **k)
     )
     run = train(dataset, tmp_path / "run", begin=Resume())
-    assert planned == [config]
+    assert planned_configs == [config]
     assert run.config.total_steps < 40
 
 
@@ -474,10 +492,10 @@ def test_python_resumes_a_budget_with_the_same_call_or_a_shorter_one(
     config = tiny_config("stages.split_sum.steps=40", "stages.monte_carlo.steps=0")
     config = replace(config, run=replace(config.run, preview_every=2))
     _paced_run(dataset, tmp_path / "run", config, stop_after=12)
-    same = {"config": config, "budget": Budget(60.0)} if names_settings else {}
+    same_settings = {"config": config, "budget": Budget(60.0)} if names_settings else {}
     with pytest.raises(RunError, match="without choosing a model"):
         train(dataset, tmp_path / "run", begin=Resume(), model="auto")
-    run = train(dataset, tmp_path / "run", begin=Resume(), **same)
+    run = train(dataset, tmp_path / "run", begin=Resume(), **same_settings)
     assert run.config != config
     assert run.trained.step == run.config.total_steps
     assert run.folder.budget() == Budget(60.0)
@@ -500,8 +518,8 @@ def test_a_run_that_was_begun_without_a_budget_takes_none_later(dataset, tmp_pat
 
 def test_the_time_of_a_budget_counts_from_when_it_is_said_to(dataset, tmp_path, monkeypatch):
     """Commands read the scene before the training, and this time counts."""
-    seen = []
-    monkeypatch.setattr(run_module, "_pacer", lambda *a, began: seen.append(began))
+    start_times = []
+    monkeypatch.setattr(run_module, "_pacer", lambda *a, began: start_times.append(began))
 
     def nothing(*arguments, **others):
         raise RunError("told enough")
@@ -509,7 +527,7 @@ def test_the_time_of_a_budget_counts_from_when_it_is_said_to(dataset, tmp_path, 
     monkeypatch.setattr(run_module, "fit", nothing)
     with pytest.raises(RunError, match="told enough"):
         train(dataset, tmp_path / "run", tiny_config(), budget=Budget(600.0), began=123.0)
-    assert seen == [123.0]
+    assert start_times == [123.0]
 
 
 def test_a_budget_that_is_resumed_takes_no_other_settings(dataset, tmp_path, capsys):
@@ -518,10 +536,10 @@ def test_a_budget_that_is_resumed_takes_no_other_settings(dataset, tmp_path, cap
     options = ["--set", "foo.bar=1", "--seed", "5", "--downscale", "4", "--mesh", "nope.ply"]
     command = ["train", "examples/duck", "--output", str(tmp_path / "run"), "--resume", *options]
     assert cli.main(command) == 2
-    told = " ".join(capsys.readouterr().err.split())
-    assert "leave --set, --seed, --mesh, --downscale out" in told
-    begun = ["train", "examples/duck", "--output", str(tmp_path / "run"), "--resume"]
-    assert cli.main([*begun, "--budget", "2min"]) == 2
+    error_text = " ".join(capsys.readouterr().err.split())
+    assert "leave --set, --seed, --mesh, --downscale out" in error_text
+    resume_command = ["train", "examples/duck", "--output", str(tmp_path / "run"), "--resume"]
+    assert cli.main([*resume_command, "--budget", "2min"]) == 2
     assert "was begun with; leave --budget" in " ".join(capsys.readouterr().err.split())
 
 
@@ -529,19 +547,19 @@ def test_the_command_of_a_budget_goes_on_with_resume_alone(dataset, tmp_path, mo
     """The scene is read as before, the budget is the recorded one, and reading counts."""
     config = tiny_config("stages.split_sum.steps=40", "stages.monte_carlo.steps=0")
     _paced_run(dataset, tmp_path / "run", config, stop_after=12)
-    asked = {}
+    train_options = {}
 
     def noted(scene, output, config, **options):
-        asked.update(options)
+        train_options.update(options)
         raise RunError("told enough")
 
     monkeypatch.setattr(training, "train_run", noted)
     monkeypatch.setattr(training, "load_recorded", lambda scene, options: dataset)
     command = ["train", "examples/duck", "--output", str(tmp_path / "run"), "--resume"]
-    before = time.perf_counter()
+    start_time = time.perf_counter()
     assert cli.main([*command, "--budget", "60s", "--downscale", "auto"]) == 2
-    assert asked["budget"] == Budget(60.0)
-    assert before <= asked["began"] <= time.perf_counter()
+    assert train_options["budget"] == Budget(60.0)
+    assert start_time <= train_options["began"] <= time.perf_counter()
 
 
 @pytest.mark.parametrize(
@@ -576,7 +594,9 @@ def test_the_work_of_a_step_that_shows_nothing_is_its_constant():
 def test_expected_seconds_add_up():
     config = make_config("default", "draft")
     costs = expected_costs(config, 40_000.0, slowness=2.0)
-    single = expected_costs(config, 40_000.0, slowness=1.0)
-    assert costs["split_sum"].step == pytest.approx(2 * single["split_sum"].step)
-    by_hand = sum(costs[s.name].startup + s.steps * costs[s.name].step for s in config.stages)
-    assert expected_seconds(config, costs) == pytest.approx(by_hand)
+    unit_costs = expected_costs(config, 40_000.0, slowness=1.0)
+    assert costs["split_sum"].step == pytest.approx(2 * unit_costs["split_sum"].step)
+    expected_total = sum(
+        costs[s.name].startup + s.steps * costs[s.name].step for s in config.stages
+    )
+    assert expected_seconds(config, costs) == pytest.approx(expected_total)

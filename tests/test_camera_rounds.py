@@ -73,9 +73,9 @@ def made(monkeypatch):
 
 def test_a_round_reads_what_the_one_before_has_found(made, tmp_path):
     output = tmp_path / "fox"
-    found = refined_cameras("scene", output, rounds=2, reading={"downscale": 2})
+    cameras_path = refined_cameras("scene", output, rounds=2, reading={"downscale": 2})
     folder = rounds_folder(output)
-    assert found == folder / "round_2.json"
+    assert cameras_path == folder / "round_2.json"
     assert folder != output
     assert made == [
         ({"downscale": 2}, round_config(), True),
@@ -86,9 +86,9 @@ def test_a_round_reads_what_the_one_before_has_found(made, tmp_path):
 
 
 def test_the_digest_of_given_cameras_is_not_that_of_the_next(made, tmp_path):
-    given = {"cameras": tmp_path / "given.json", "cameras_digest": "abc"}
-    refined_cameras("scene", tmp_path / "fox", rounds=2, reading=given)
-    assert made[0][0] == given
+    reading = {"cameras": tmp_path / "given.json", "cameras_digest": "abc"}
+    refined_cameras("scene", tmp_path / "fox", rounds=2, reading=reading)
+    assert made[0][0] == reading
     assert made[1][0] == {"cameras": rounds_folder(tmp_path / "fox") / "round_1.json"}
 
 
@@ -114,11 +114,11 @@ def test_rounds_that_are_done_are_not_made_again(made, tmp_path):
     ],
 )
 def test_rounds_of_other_settings_are_not_taken_for_these(made, tmp_path, changed, what):
-    usual = {"rounds": 1, "reading": {"downscale": 2}}
-    refined_cameras("scene", tmp_path / "fox", **usual)
+    arguments = {"rounds": 1, "reading": {"downscale": 2}}
+    refined_cameras("scene", tmp_path / "fox", **arguments)
     with pytest.raises(RunError, match=f"refined with other {what}; delete"):
-        refined_cameras("scene", tmp_path / "fox", **{**usual, **changed})
-    refined_cameras("scene", tmp_path / "fox", **{**usual, "rounds": 2})
+        refined_cameras("scene", tmp_path / "fox", **{**arguments, **changed})
+    refined_cameras("scene", tmp_path / "fox", **{**arguments, "rounds": 2})
     assert len(made) == 2
 
 
@@ -141,15 +141,15 @@ def test_rounds_of_other_poses_or_photographs_are_not_taken_for_these(
 
 def test_a_run_that_is_to_be_replaced_is_gone_before_the_first_round(made, tmp_path):
     """A command interrupted in a round goes on with the round, not with the run to be replaced."""
-    old = RunFolder(tmp_path / "fox")
-    with old.locked():
-        old.begin(sphere_dataset(), tiny_config(), replace=False)
-    (old.path / "notes.txt").write_text("mine")
-    refined_cameras("scene", old.path)
-    assert old.exists
-    refined_cameras("scene", old.path, replace=True)
-    assert not old.exists
-    assert (old.path / "notes.txt").exists()
+    old_run = RunFolder(tmp_path / "fox")
+    with old_run.locked():
+        old_run.begin(sphere_dataset(), tiny_config(), replace=False)
+    (old_run.path / "notes.txt").write_text("mine")
+    refined_cameras("scene", old_run.path)
+    assert old_run.exists
+    refined_cameras("scene", old_run.path, replace=True)
+    assert not old_run.exists
+    assert (old_run.path / "notes.txt").exists()
 
 
 def test_the_seed_of_a_training_is_that_of_its_rounds():
@@ -161,8 +161,8 @@ def test_a_command_that_failed_before_its_first_round_can_be_corrected(made, tmp
     def is_not_there(scene, options):
         raise SceneError(f"{scene} does not exist")
 
-    with monkeypatch.context() as broken:
-        broken.setattr(camera_rounds, "load_recorded", is_not_there)
+    with monkeypatch.context() as patch:
+        patch.setattr(camera_rounds, "load_recorded", is_not_there)
         with pytest.raises(SceneError):
             refined_cameras("seen", tmp_path / "fox")
     assert refined_cameras("scene", tmp_path / "fox").exists()
@@ -197,7 +197,7 @@ def test_no_round_at_all_is_refused(made, tmp_path):
 
 def _resumed(monkeypatch, folder, *, reading, chosen):
     """Resume a run whose record holds ``reading``; return the datasets that training is given."""
-    config, asked = make_config(quality="draft"), []
+    config, datasets = make_config(quality="draft"), []
     scene = load_dataset("examples/duck", downscale=8)
     run = RunFolder(folder)
     model = {"held_back": [], "rungs": [], "by_hand": [], "seconds": 0, "trainings": 0}
@@ -208,7 +208,7 @@ def _resumed(monkeypatch, folder, *, reading, chosen):
     (folder / "run.json").write_text(json.dumps(record))
 
     def train(dataset, output, config, **options):
-        asked.append(dataset)
+        datasets.append(dataset)
         raise RunError("told enough")
 
     monkeypatch.setattr(training, "train_run", train)
@@ -217,7 +217,7 @@ def _resumed(monkeypatch, folder, *, reading, chosen):
     command = ["train", "examples/duck", "--output", str(folder), "--resume", "--refine-cameras"]
     options = ["--model", "auto"] if chosen else ["--quality", "draft", "--downscale", "8"]
     assert cli.main([*command, *options]) == 2
-    return asked
+    return datasets
 
 
 def test_a_resumed_run_with_a_chosen_model_keeps_its_refined_cameras(monkeypatch, tmp_path):

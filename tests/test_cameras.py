@@ -84,8 +84,8 @@ def subject():
         material=jax.tree.map(varied, params.material),
         light=EnvLight(jnp.asarray(sky, jnp.float32)),
     )
-    found = Renderer(pipeline, params).subject()
-    return replace(found, pipeline=replace(found.pipeline, capacities=AMPLE))
+    base_subject = Renderer(pipeline, params).subject()
+    return replace(base_subject, pipeline=replace(base_subject.pipeline, capacities=AMPLE))
 
 
 @pytest.fixture(scope="module")
@@ -103,8 +103,8 @@ def photographed(subject, camera, log_exposure, gains=1.0):
     output = draw(subject, camera)
     alpha = np.asarray(output.alpha[0])[..., None]
     rgb = np.asarray(tone_map(output.rgb[0] * gains, subject.log_exposure + log_exposure))
-    straight = np.where(alpha > 0, rgb / np.where(alpha > 0, alpha, 1), 0)
-    return np.concatenate([straight, alpha], axis=-1).astype(np.float32)
+    straight_rgb = np.where(alpha > 0, rgb / np.where(alpha > 0, alpha, 1), 0)
+    return np.concatenate([straight_rgb, alpha], axis=-1).astype(np.float32)
 
 
 def box_of(subject):
@@ -138,14 +138,14 @@ def test_the_camera_and_the_exposure_of_a_render_are_found_again(found):
 @pytest.mark.long
 def test_the_white_balance_of_a_render_is_found_again(subject, views):
     camera, log_exposure = moved_camera(views.camera([0]), jnp.asarray(TRUTH), box_of(subject))
-    wanted = np.array([0.12, -0.05, -0.07], np.float32)
-    gains = jnp.exp(jnp.asarray(wanted))[None, None]
+    log_gains = np.array([0.12, -0.05, -0.07], np.float32)
+    gains = jnp.exp(jnp.asarray(log_gains))[None, None]
     image = jnp.asarray(photographed(subject, camera, log_exposure, gains))
     photograph = PosedPhotograph(views.camera([0]), image, jnp.ones((SIZE, SIZE)))
     result, _ = refine_view(subject, photograph, replace(EXACT, white_balance=True, rounds=2))
-    found = 0.01 * np.asarray(result.parameters)
-    np.testing.assert_allclose(found[:8], TRUTH, atol=1e-3)
-    np.testing.assert_allclose(log_balance(jnp.asarray(found)), wanted, atol=1e-3)
+    parameters = 0.01 * np.asarray(result.parameters)
+    np.testing.assert_allclose(parameters[:8], TRUTH, atol=1e-3)
+    np.testing.assert_allclose(log_balance(jnp.asarray(parameters)), log_gains, atol=1e-3)
     np.testing.assert_array_equal(log_balance(jnp.asarray(TRUTH)), 0.0)
 
 
@@ -158,41 +158,43 @@ evaluate = partial(jax.jit, static_argnames=("how",))(view_residual)
 
 
 def test_a_step_into_an_overflow_is_taken_for_a_perfect_one(subject, photograph):
-    seen = baked(subject, photograph.camera)
-    residual, fit = evaluate(jnp.zeros(8), with_capacities(seen, SMALL), photograph, how=EXACT)
+    baked_subject = baked(subject, photograph.camera)
+    residual, fit = evaluate(
+        jnp.zeros(8), with_capacities(baked_subject, SMALL), photograph, how=EXACT
+    )
     assert not np.any(np.asarray(residual))
     assert int(fit.usage["visible"]) > SMALL["visible"]
     assert int(fit.usage["visible"]) <= AMPLE["visible"]
 
 
 def test_buffers_grow_until_every_iterate_fits(monkeypatch, subject, photograph, found):
-    seen, tried = [], []
-    needs = {"visible": jnp.int32(300), "hits": jnp.int32(400)}
-    later = {"visible": jnp.int32(300), "hits": jnp.int32(9000)}
+    starts, tried_capacities = [], []
+    first_usage = {"visible": jnp.int32(300), "hits": jnp.int32(400)}
+    later_usage = {"visible": jnp.int32(300), "hits": jnp.int32(9000)}
 
     def solve(start, subject, photograph, *, how):
-        tried.append(subject.pipeline.capacities)
-        seen.append(np.asarray(start))
-        before, after = (replace(found[0].before, usage=u) for u in (needs, later))
+        tried_capacities.append(subject.pipeline.capacities)
+        starts.append(np.asarray(start))
+        before, after = (replace(found[0].before, usage=u) for u in (first_usage, later_usage))
         return replace(found[0], before=before, after=after, iterations=jnp.int32(4))
 
     monkeypatch.setattr(cameras_module, "_solve", solve)
     result, capacities = refine_view(with_capacities(subject, SMALL), photograph, EXACT)
     # Two attempts of three rounds each: an overflow that occurs only at the end is noticed, too.
-    assert [c["hits"] >= 9000 for c in tried] == [False] * 3 + [True] * 3
+    assert [c["hits"] >= 9000 for c in tried_capacities] == [False] * 3 + [True] * 3
     assert capacities["visible"] >= 300
     assert capacities["chunks"] == SMALL["chunks"]
     assert int(result.iterations) == 12
     # Every round starts where the previous one ended, and a new attempt starts from zero.
-    np.testing.assert_array_equal(seen[3], np.zeros(8))
-    np.testing.assert_array_equal(seen[4], found[0].parameters)
+    np.testing.assert_array_equal(starts[3], np.zeros(8))
+    np.testing.assert_array_equal(starts[4], found[0].parameters)
 
 
 @pytest.mark.slow
 @pytest.mark.long
 def test_forward_reverse_and_differences_give_one_jacobian(subject, photograph):
     # A low knee, so that the robust function is differentiated where it bends.
-    how = CameraSettings(robust_deviations=0.2)
+    settings = CameraSettings(robust_deviations=0.2)
     ample = replace(subject.pipeline, capacities=AMPLE)
     with double_precision():
 
@@ -202,49 +204,58 @@ def test_forward_reverse_and_differences_give_one_jacobian(subject, photograph):
                 tree,
             )
 
-        seen = baked(replace(subject, pipeline=ample), photograph.camera)
-        seen, shot = double((seen, photograph))
-        at = jnp.asarray(np.linspace(-0.4, 0.6, 8))
+        baked_subject = baked(replace(subject, pipeline=ample), photograph.camera)
+        baked_subject, double_photograph = double((baked_subject, photograph))
+        parameters = jnp.asarray(np.linspace(-0.4, 0.6, 8))
 
         def residual(y, pipeline):
-            return view_residual(y, replace(seen, pipeline=pipeline), shot, how)[0]
+            return view_residual(
+                y, replace(baked_subject, pipeline=pipeline), double_photograph, settings
+            )[0]
 
-        forward = np.asarray(jax.jit(jax.jacfwd(residual))(at, seen.pipeline))
-        reverse = replace(seen.pipeline, compositor=ample.compositor)
+        forward = np.asarray(jax.jit(jax.jacfwd(residual))(parameters, baked_subject.pipeline))
+        reverse = replace(baked_subject.pipeline, compositor=ample.compositor)
         weights = np.random.default_rng(0).normal(size=forward.shape[0])
-        pulled = jax.jit(jax.grad(lambda y, p: residual(y, p) @ weights))(at, reverse)
+        gradient = jax.jit(jax.grad(lambda y, p: residual(y, p) @ weights))(parameters, reverse)
         value, step = jax.jit(residual), 1e-5
         differences = np.stack(
             [
-                (value(at.at[k].add(step), reverse) - value(at.at[k].add(-step), reverse))
+                (
+                    value(parameters.at[k].add(step), reverse)
+                    - value(parameters.at[k].add(-step), reverse)
+                )
                 / (2 * step)
                 for k in range(8)
             ],
             axis=-1,
         )
     assert forward.dtype == np.float64
-    np.testing.assert_allclose(weights @ forward, pulled, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(weights @ forward, gradient, rtol=1e-9, atol=1e-9)
     # The cut at alpha = 1/255 is a jump that has no derivative; it changes single pixels.
-    apart = np.abs(differences - forward)
-    assert np.quantile(apart, 0.995) < 1e-6 * np.abs(forward).max()
+    deviations = np.abs(differences - forward)
+    assert np.quantile(deviations, 0.995) < 1e-6 * np.abs(forward).max()
     assert all(np.abs(forward).max(axis=0) > 1e-3)
 
 
 def test_unseen_objects_and_empty_masks_keep_their_camera(subject, views, photograph):
-    away = views_from([[2.2, -1.8, 1.0]], size=SIZE).camera_to_world
-    away[:, :3, :3] = away[:, :3, :3] @ Rotation.from_rotvec([0.0, 2.0, 0.0]).as_matrix()
+    turned_poses = views_from([[2.2, -1.8, 1.0]], size=SIZE).camera_to_world
+    turned_poses[:, :3, :3] = (
+        turned_poses[:, :3, :3] @ Rotation.from_rotvec([0.0, 2.0, 0.0]).as_matrix()
+    )
     image = np.asarray(photograph.image)
     cases = replace(
         views,
         names=("away", "empty", "fine"),
-        camera_to_world=np.concatenate([away, views.camera_to_world, views.camera_to_world]),
+        camera_to_world=np.concatenate(
+            [turned_poses, views.camera_to_world, views.camera_to_world]
+        ),
         intrinsics=np.repeat(views.intrinsics, 3, axis=0),
         images=np.stack([image, np.zeros_like(image), image]),
         exposure=np.array([1.0, 1.0, 2.0]),
     )
-    seen = []
-    split = refine_views(subject, cases, EXACT, on_view=seen.append)
-    assert [(p.done, p.total, p.name) for p in seen] == [
+    progress = []
+    split = refine_views(subject, cases, EXACT, on_view=progress.append)
+    assert [(p.done, p.total, p.name) for p in progress] == [
         (1, 3, "away"),
         (2, 3, "empty"),
         (3, 3, "fine"),
@@ -256,14 +267,14 @@ def test_unseen_objects_and_empty_masks_keep_their_camera(subject, views, photog
         np.testing.assert_array_equal(camera.world_to_camera, cases.world_to_camera[index])
         np.testing.assert_array_equal(camera.intrinsics, cases.intrinsics[index])
         assert camera.residual_after == camera.residual_before
-    fine = split.cameras["fine"]
-    assert fine.accepted
-    assert fine.residual_after < 0.02 * fine.residual_before
+    fine_camera = split.cameras["fine"]
+    assert fine_camera.accepted
+    assert fine_camera.residual_after < 0.02 * fine_camera.residual_before
     # The exposure that the photograph was divided by before is part of the whole factor.
-    assert fine.exposure == pytest.approx(2 * np.exp(TRUTH[7]), rel=1e-3)
+    assert fine_camera.exposure == pytest.approx(2 * np.exp(TRUTH[7]), rel=1e-3)
     expected = moved_camera(views.camera(), jnp.asarray(TRUTH), box_of(subject))[0]
-    np.testing.assert_allclose(fine.world_to_camera, expected.world_to_camera[0], atol=2e-3)
-    np.testing.assert_allclose(np.linalg.det(fine.world_to_camera), 1.0, atol=1e-12)
+    np.testing.assert_allclose(fine_camera.world_to_camera, expected.world_to_camera[0], atol=2e-3)
+    np.testing.assert_allclose(np.linalg.det(fine_camera.world_to_camera), 1.0, atol=1e-12)
     lines = "\n".join(change_lines(cases, split, BOUNDS))
     assert "2 of 3 views keep their cameras" in lines
     assert "exposure changed by" in lines
@@ -273,19 +284,24 @@ def test_pixels_that_do_not_count_say_nothing(subject, photograph):
     rows = jnp.arange(SIZE) < SIZE // 2
     valid = jnp.broadcast_to(rows[:, None], (SIZE, SIZE)).astype(jnp.float32)
     image = photograph.image.at[SIZE // 2 :].set(0.7)
-    seen = baked(subject, photograph.camera)
-    parts = [
-        evaluate(jnp.zeros(8), seen, PosedPhotograph(photograph.camera, shown, valid), how=EXACT)
-        for shown in (photograph.image, image)
+    baked_subject = baked(subject, photograph.camera)
+    evaluations = [
+        evaluate(
+            jnp.zeros(8),
+            baked_subject,
+            PosedPhotograph(photograph.camera, picture, valid),
+            how=EXACT,
+        )
+        for picture in (photograph.image, image)
     ]
-    np.testing.assert_array_equal(parts[0][0], parts[1][0])
-    assert float(parts[0][1].rms) == float(parts[1][1].rms) > 0
+    np.testing.assert_array_equal(evaluations[0][0], evaluations[1][0])
+    assert float(evaluations[0][1].rms) == float(evaluations[1][1].rms) > 0
 
 
 def test_an_error_that_does_not_fall_leaves_the_camera(monkeypatch, subject, views, found):
     result, capacities = found
-    worse = replace(result, after=replace(result.after, cost=result.before.cost))
-    monkeypatch.setattr(cameras_module, "refine_view", lambda *_: (worse, capacities))
+    worse_result = replace(result, after=replace(result.after, cost=result.before.cost))
+    monkeypatch.setattr(cameras_module, "refine_view", lambda *_: (worse_result, capacities))
     camera = refine_views(subject, views, EXACT).cameras[views.names[0]]
     assert camera.note == "the error did not fall"
     np.testing.assert_array_equal(camera.world_to_camera, views.world_to_camera[0])
@@ -293,31 +309,33 @@ def test_an_error_that_does_not_fall_leaves_the_camera(monkeypatch, subject, vie
 
 def test_zero_parameters_are_the_camera_and_turns_are_about_the_box(views):
     box = Box(jnp.asarray([0.1, -0.2, 0.05]), jnp.asarray(0.5))
-    same, log_exposure = moved_camera(views.camera(), jnp.zeros(8), box)
-    np.testing.assert_allclose(same.world_to_camera, views.camera().world_to_camera, atol=1e-6)
-    np.testing.assert_array_equal(same.intrinsics, views.camera().intrinsics)
+    same_camera, log_exposure = moved_camera(views.camera(), jnp.zeros(8), box)
+    np.testing.assert_allclose(
+        same_camera.world_to_camera, views.camera().world_to_camera, atol=1e-6
+    )
+    np.testing.assert_array_equal(same_camera.intrinsics, views.camera().intrinsics)
     assert float(log_exposure) == 0
-    turned, _ = moved_camera(views.camera(), jnp.zeros(8).at[1].set(0.3), box)
+    turned_camera, _ = moved_camera(views.camera(), jnp.zeros(8).at[1].set(0.3), box)
 
     def place(camera):
         pose = np.asarray(camera.world_to_camera[0])
         return pose[:3, :3] @ np.asarray(box.center) + pose[:3, 3]
 
-    np.testing.assert_allclose(place(turned), place(same), atol=1e-6)
-    nearer, _ = moved_camera(views.camera(), jnp.zeros(8).at[5].set(-0.5), box)
-    np.testing.assert_allclose(place(nearer), place(same) * [1, 1, 0.5], atol=1e-6)
+    np.testing.assert_allclose(place(turned_camera), place(same_camera), atol=1e-6)
+    nearer_camera, _ = moved_camera(views.camera(), jnp.zeros(8).at[5].set(-0.5), box)
+    np.testing.assert_allclose(place(nearer_camera), place(same_camera) * [1, 1, 0.5], atol=1e-6)
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-3, 9.9e-3, 1.01e-2, 1.0, 3.0])
 def test_rotation_vectors_agree_with_scipy_and_have_a_derivative_at_zero(length):
     axis = np.array([0.48, -0.6, 0.64])
     with double_precision():
-        found = rotation_vector_to_matrix(jnp.asarray(length * axis))
+        matrix = rotation_vector_to_matrix(jnp.asarray(length * axis))
         slope = jax.jvp(
             rotation_vector_to_matrix, (jnp.asarray(length * axis),), (jnp.asarray(axis),)
         )[1]
     expected = Rotation.from_rotvec(length * axis).as_matrix()
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(matrix, expected, atol=1e-12)
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     np.testing.assert_allclose(slope, cross @ expected, atol=1e-11)
@@ -337,51 +355,55 @@ def many_views(count=6):
 @pytest.mark.parametrize("count", [2, 6])
 @pytest.mark.parametrize("scale", [1.0, 1.3])
 def test_a_common_motion_is_no_error(count, scale):
-    true = many_views(count)
+    true_views = many_views(count)
     motion = Similarity(
         Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix(), np.array([3.0, -1.0, 0.5]), scale
     )
-    moved = motion.views(true)
-    errors, gauge = compare_cameras(moved, true, BOUNDS, scales=scale != 1.0)
+    moved_views = motion.views(true_views)
+    errors, gauge = compare_cameras(moved_views, true_views, BOUNDS, scales=scale != 1.0)
     np.testing.assert_allclose(gauge.rotation, motion.rotation, atol=1e-8)
     np.testing.assert_allclose(gauge.translation, motion.translation, atol=1e-7)
     assert gauge.scale == pytest.approx(scale, rel=1e-8)
     for values in vars(errors).values():
         np.testing.assert_allclose(values, 0, atol=1e-5)
-    assert camera_errors(moved, true, BOUNDS).rotation_deg.min() > 10
+    assert camera_errors(moved_views, true_views, BOUNDS).rotation_deg.min() > 10
 
 
 def test_a_common_brightness_is_no_error():
     """It belongs to the light; the exposure error of a single view is still reported."""
-    true = replace(many_views(6), exposure=np.array([1.0, 1.2, 0.9, 1.0, 1.1, 1.0]))
-    found = replace(true, exposure=1.5 * true.exposure)
-    errors, _ = compare_cameras(found, true, BOUNDS)
+    true_views = replace(many_views(6), exposure=np.array([1.0, 1.2, 0.9, 1.0, 1.1, 1.0]))
+    brighter_views = replace(true_views, exposure=1.5 * true_views.exposure)
+    errors, _ = compare_cameras(brighter_views, true_views, BOUNDS)
     np.testing.assert_allclose(errors.exposure_percent, 0, atol=1e-9)
-    one = found.exposure * np.array([1.0, 1.0, 1.0, 1.1, 1.0, 1.0])
-    errors, _ = compare_cameras(replace(found, exposure=one), true, BOUNDS)
+    exposures = brighter_views.exposure * np.array([1.0, 1.0, 1.0, 1.1, 1.0, 1.0])
+    errors, _ = compare_cameras(replace(brighter_views, exposure=exposures), true_views, BOUNDS)
     assert errors.exposure_percent.argmax() == 3
     assert errors.exposure_percent[3] > 5
 
 
 def test_an_error_of_one_camera_is_still_seen_without_the_gauge():
-    true = many_views(12)
-    wrong = true.camera_to_world.copy()
-    wrong[0, :3, :3] = Rotation.from_rotvec([0, 0, np.radians(1)]).as_matrix() @ wrong[0, :3, :3]
-    lenses = true.intrinsics.copy()
+    true_views = many_views(12)
+    wrong_poses = true_views.camera_to_world.copy()
+    wrong_poses[0, :3, :3] = (
+        Rotation.from_rotvec([0, 0, np.radians(1)]).as_matrix() @ wrong_poses[0, :3, :3]
+    )
+    lenses = true_views.intrinsics.copy()
     lenses[1, [0, 1], [0, 1]] *= 1.02
-    found = replace(true, camera_to_world=wrong, intrinsics=lenses)
-    errors, _ = compare_cameras(found, true, BOUNDS)
+    wrong_views = replace(true_views, camera_to_world=wrong_poses, intrinsics=lenses)
+    errors, _ = compare_cameras(wrong_views, true_views, BOUNDS)
     assert errors.rotation_deg[0] == pytest.approx(1.0, abs=0.2)
     assert errors.rotation_deg[2:].max() < 0.2
     assert errors.focal_percent[1] == pytest.approx(2.0)
 
 
 def test_longer_lenses_further_away_are_no_larger_world():
-    true = many_views()
-    poses, lenses = true.camera_to_world.copy(), true.intrinsics.copy()
+    true_views = many_views()
+    poses, lenses = true_views.camera_to_world.copy(), true_views.intrinsics.copy()
     poses[:, :3, 3] *= 1.05
     lenses[:, [0, 1], [0, 1]] *= 1.05
-    gauge = find_gauge(replace(true, camera_to_world=poses, intrinsics=lenses), true, BOUNDS)
+    gauge = find_gauge(
+        replace(true_views, camera_to_world=poses, intrinsics=lenses), true_views, BOUNDS
+    )
     assert gauge.scale == pytest.approx(1.0, abs=0.005)
 
 
@@ -424,40 +446,40 @@ def test_views_take_their_cameras_by_name_and_lose_their_exposure(file):
     path, views, _ = file
     images = np.asarray(views.images) + 0.5
     views = replace(views, images=images, names=("view_2", "view_0", "view_1"))
-    changed = with_cameras(views, read_cameras(path)["train"], str(path))
+    changed_views = with_cameras(views, read_cameras(path)["train"], str(path))
     order = [2, 0, 1]
     np.testing.assert_allclose(
-        changed.camera_to_world, many_views(3).camera_to_world[order], atol=1e-12
+        changed_views.camera_to_world, many_views(3).camera_to_world[order], atol=1e-12
     )
-    np.testing.assert_allclose(changed.images[:, 0, 0, 0], [0.5, 0.8, 0.4], rtol=1e-6)
-    np.testing.assert_allclose(changed.images[1, 0, 0, :3], [0.8, 0.4, 0.2], rtol=1e-6)
-    np.testing.assert_array_equal(changed.white_balance[1], [0.5, 1.0, 2.0])
-    np.testing.assert_array_equal(changed.images[..., 3], views.images[..., 3])
-    np.testing.assert_array_equal(changed.exposure, [1.0, 1.25, 1.25])
+    np.testing.assert_allclose(changed_views.images[:, 0, 0, 0], [0.5, 0.8, 0.4], rtol=1e-6)
+    np.testing.assert_allclose(changed_views.images[1, 0, 0, :3], [0.8, 0.4, 0.2], rtol=1e-6)
+    np.testing.assert_array_equal(changed_views.white_balance[1], [0.5, 1.0, 2.0])
+    np.testing.assert_array_equal(changed_views.images[..., 3], views.images[..., 3])
+    np.testing.assert_array_equal(changed_views.exposure, [1.0, 1.25, 1.25])
     # The file holds whole factors, so that applying it a second time changes nothing.
-    twice = with_cameras(changed, read_cameras(path)["train"], str(path))
-    np.testing.assert_array_equal(twice.images, changed.images)
-    np.testing.assert_array_equal(twice.exposure, changed.exposure)
+    reapplied_views = with_cameras(changed_views, read_cameras(path)["train"], str(path))
+    np.testing.assert_array_equal(reapplied_views.images, changed_views.images)
+    np.testing.assert_array_equal(reapplied_views.exposure, changed_views.exposure)
 
 
 def damaged(content, kind):
-    first = content["splits"]["train"]["views"]["view_0"]
+    first_view = content["splits"]["train"]["views"]["view_0"]
     if kind == "version":
         content["version"] = 2
     elif kind == "format":
         content.pop("format")
     elif kind == "number":
-        first["fx"] = -1.0
+        first_view["fx"] = -1.0
     elif kind == "pose":
-        first["world_to_camera"][0][0] = 7.0
+        first_view["world_to_camera"][0][0] = 7.0
     elif kind == "mirror":
-        first["world_to_camera"][0] = [-x for x in first["world_to_camera"][0]]
+        first_view["world_to_camera"][0] = [-x for x in first_view["world_to_camera"][0]]
     elif kind == "row":
-        first["world_to_camera"][3] = [5.0, 0.0, 0.0, 1.0]
+        first_view["world_to_camera"][3] = [5.0, 0.0, 0.0, 1.0]
     elif kind == "balance":
-        first["white_balance"] = [1.0, 0.0, 1.0]
+        first_view["white_balance"] = [1.0, 0.0, 1.0]
     elif kind == "key":
-        first.pop("exposure")
+        first_view.pop("exposure")
     return json.dumps(content)
 
 
@@ -477,10 +499,10 @@ def damaged(content, kind):
 def test_a_broken_file_is_one_line(file, kind, message):
     path, *_ = file
     path.write_text(damaged(json.loads(path.read_text()), kind))
-    with pytest.raises(SceneError, match=message) as caught:
+    with pytest.raises(SceneError, match=message) as error_info:
         read_cameras(path)
-    assert "\n" not in str(caught.value)
-    assert str(path) in str(caught.value)
+    assert "\n" not in str(error_info.value)
+    assert str(path) in str(error_info.value)
 
 
 def test_a_file_without_white_balance_is_read(file):
@@ -502,9 +524,9 @@ def test_a_tint_of_all_training_views_is_the_lights():
         for rows in ((0, 1, 2), (3,))
     )
     split = with_mean_balance({"test": test, "train": train})
-    found = np.stack([camera.white_balance for camera in split["train"].cameras.values()])
-    np.testing.assert_allclose(found.mean(axis=0), 1.0, rtol=1e-12)
-    np.testing.assert_allclose(found, gains[:3] / gains[:3].mean(axis=0), rtol=1e-12)
+    balances = np.stack([camera.white_balance for camera in split["train"].cameras.values()])
+    np.testing.assert_allclose(balances.mean(axis=0), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(balances, gains[:3] / gains[:3].mean(axis=0), rtol=1e-12)
     balance = split["test"].cameras["3"].white_balance
     np.testing.assert_allclose(balance, gains[3] / gains[:3].mean(axis=0), rtol=1e-12)
 
@@ -548,9 +570,9 @@ def test_a_scene_is_read_with_the_cameras_of_a_file_and_remembers_it(tmp_path, c
     assert with_file.test.fingerprint() == scene.test.fingerprint()
     assert set(scene.options) == {"downscale", "light", "bounds"}
     options = json.loads(json.dumps(with_file.options))
-    again = load_recorded(DUCK, options)
-    assert again.train.fingerprint() == with_file.train.fingerprint()
-    assert again.options == with_file.options
+    reread_scene = load_recorded(DUCK, options)
+    assert reread_scene.train.fingerprint() == with_file.train.fingerprint()
+    assert reread_scene.options == with_file.options
     arguments = ["info", str(DUCK), "--cameras", str(path)]
     assert cli.main([*arguments, "--downscale", "4"]) == 2
     assert "--downscale" in capsys.readouterr().err
@@ -561,9 +583,9 @@ def test_a_scene_is_read_with_the_cameras_of_a_file_and_remembers_it(tmp_path, c
 
 def test_refining_what_is_no_run_is_one_line(tmp_path, capsys):
     assert cli.main(["refine-cameras", str(tmp_path)]) == 2
-    said = capsys.readouterr().err
-    assert "is not a run" in said
-    assert said.count("\n") == 1
+    error_text = capsys.readouterr().err
+    assert "is not a run" in error_text
+    assert error_text.count("\n") == 1
 
 
 @pytest.fixture(scope="module")
@@ -579,7 +601,7 @@ def run(tmp_path_factory):
 
 
 def train(root, name, *arguments):
-    settings = [part for setting in STEPS for part in ("--set", setting)]
+    settings = [argument for setting in STEPS for argument in ("--set", setting)]
     output = str(root / name)
     scene = str(root / "duck")
     return cli.main(["train", scene, "--output", output, "--downscale", "8", *arguments, *settings])
@@ -589,9 +611,9 @@ def train(root, name, *arguments):
 @pytest.mark.long
 def test_a_run_is_refined_and_trained_with_what_was_found(run, capsys):
     assert cli.main(["refine-cameras", str(run / "run")]) == 0
-    said = capsys.readouterr().out
-    for words in ("train: rotation changed", "test: exposure changed", "rms residual", "5 views"):
-        assert words in said
+    output_text = capsys.readouterr().out
+    for phrase in ("train: rotation changed", "test: exposure changed", "rms residual", "5 views"):
+        assert phrase in output_text
     path = run / "run" / "cameras.json"
     refined = read_cameras(path)
     assert (len(refined["train"].cameras), len(refined["test"].cameras)) == (5, 1)
@@ -599,13 +621,13 @@ def test_a_run_is_refined_and_trained_with_what_was_found(run, capsys):
     assert train(run, "again", "--cameras", str(path)) == 0
     record = json.loads((run / "again" / "run.json").read_text())
     assert record["dataset"]["cameras"] == str(path.resolve())
-    opened = Run(run / "again")
+    opened_run = Run(run / "again")
     for name, pose in zip(
-        opened.dataset.train.names, opened.dataset.train.world_to_camera, strict=True
+        opened_run.dataset.train.names, opened_run.dataset.train.world_to_camera, strict=True
     ):
         np.testing.assert_allclose(pose, refined["train"].cameras[name].world_to_camera, atol=1e-12)
     # The loss is different from the first step on, so the run used these cameras and exposures.
-    assert opened.steps()[0]["loss"] != Run(run / "run").steps()[0]["loss"]
+    assert opened_run.steps()[0]["loss"] != Run(run / "run").steps()[0]["loss"]
     assert train(run, "again", "--cameras", str(path), "--resume") == 0
     assert train(run, "again", "--resume") == 2
     assert "take the same scene, read in the same way, or another folder" in capsys.readouterr().err
@@ -613,13 +635,13 @@ def test_a_run_is_refined_and_trained_with_what_was_found(run, capsys):
     # The run keeps the cameras that it was trained with wherever it is moved, and a change of their
     # file is noticed.
     path.unlink()
-    moved = (run / "again").rename(run / "moved")
-    assert cli.main(["render", str(moved), "--output", str(run / "pictures")]) == 0
-    own = moved / CAMERAS
-    assert cli.main(["refine-cameras", str(moved), "--output", str(own)]) == 2
+    moved_folder = (run / "again").rename(run / "moved")
+    assert cli.main(["render", str(moved_folder), "--output", str(run / "pictures")]) == 0
+    own_path = moved_folder / CAMERAS
+    assert cli.main(["refine-cameras", str(moved_folder), "--output", str(own_path)]) == 2
     assert "was trained with; write to another file" in capsys.readouterr().err
-    own.write_text(own.read_text() + " ")
-    assert cli.main(["render", str(moved), "--output", str(run / "pictures")]) == 2
+    own_path.write_text(own_path.read_text() + " ")
+    assert cli.main(["render", str(moved_folder), "--output", str(run / "pictures")]) == 2
     assert "has changed since the run" in capsys.readouterr().err
 
 
@@ -627,6 +649,8 @@ def test_colours_stay_those_of_the_splats_where_a_run_shades_per_pixel(subject, 
     """A run that shades pixels is refined against the same pictures as one that shades splats."""
     camera = views.camera([0])
     per_pixel = replace(subject, pipeline=replace(subject.pipeline, domain=PerPixel()))
-    expected, found = (draw(baked(one, camera), camera).rgb for one in (subject, per_pixel))
-    np.testing.assert_array_equal(found, expected)
+    expected, actual = (
+        draw(baked(shaded_subject, camera), camera).rgb for shaded_subject in (subject, per_pixel)
+    )
+    np.testing.assert_array_equal(actual, expected)
     assert float(jnp.max(expected)) > 0

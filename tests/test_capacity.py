@@ -69,22 +69,22 @@ def test_compaction_of_nothing():
 def pack(mask, capacity):
     """Return the packed mask, its first entries with enough and with too little room, and ranks."""
     packed = bit_set(mask)
-    everything = jnp.arange(mask.shape[0], dtype=jnp.int32)
-    few = packed.first(capacity=capacity // 4)
-    return packed, packed.first(capacity=capacity), few, packed.rank(everything)
+    indices = jnp.arange(mask.shape[0], dtype=jnp.int32)
+    first_quarter = packed.first(capacity=capacity // 4)
+    return packed, packed.first(capacity=capacity), first_quarter, packed.rank(indices)
 
 
 @pytest.mark.parametrize("size", [1, 31, 32, 33, 1000])
 @pytest.mark.parametrize("density", [0.0, 0.03, 0.5, 1.0])
 def test_a_bit_set_agrees_with_compaction_and_rank_inverts_it(size, density):
     mask = np.random.default_rng(size).random(size) < density
-    packed, first, few, rank = pack(jnp.asarray(mask), capacity=size + 3)
+    packed, first_rows, first_quarter, rank = pack(jnp.asarray(mask), capacity=size + 3)
     assert isinstance(packed, BitSet)
     expected = np.flatnonzero(mask)
     assert int(packed.count) == expected.size
-    np.testing.assert_array_equal(first[: expected.size], expected)
-    np.testing.assert_array_equal(first[expected.size :], 0)
-    np.testing.assert_array_equal(few, np.asarray(first)[: few.size])
+    np.testing.assert_array_equal(first_rows[: expected.size], expected)
+    np.testing.assert_array_equal(first_rows[expected.size :], 0)
+    np.testing.assert_array_equal(first_quarter, np.asarray(first_rows)[: first_quarter.size])
     np.testing.assert_array_equal(np.asarray(rank)[mask], np.arange(expected.size))
     np.testing.assert_array_equal(rank, np.cumsum(mask) - mask)
 
@@ -95,9 +95,9 @@ def counts(**needed):
 
 
 def test_a_usage_lists_the_buffers_of_its_part_only():
-    needed = counts(hits=5)
-    assert {name: int(count) for name, count in needed.items()} == {"hits": 5}
-    assert needed["hits"].dtype == jnp.int32
+    buffer_usage = counts(hits=5)
+    assert {name: int(count) for name, count in buffer_usage.items()} == {"hits": 5}
+    assert buffer_usage["hits"].dtype == jnp.int32
     assert bool(fits({}, Capacities()))
     assert overflowed({}, Capacities()) == []
 
@@ -105,42 +105,46 @@ def test_a_usage_lists_the_buffers_of_its_part_only():
 def test_fits_and_overflowed_agree():
     capacities = Capacities(hits=1024)
     for count, expected in ((1024, True), (1025, False)):
-        needed = counts(hits=count)
-        assert bool(fits(needed, capacities)) is expected
-        assert overflowed(needed, capacities) == ([] if expected else ["hits"])
+        buffer_usage = counts(hits=count)
+        assert bool(fits(buffer_usage, capacities)) is expected
+        assert overflowed(buffer_usage, capacities) == ([] if expected else ["hits"])
 
 
 def test_one_overflow_among_many_buffers_is_enough():
     capacities = Capacities(hits=1024, quads=128, visible=256)
-    needed = counts(hits=10, quads=129, visible=256)
-    assert not bool(fits(needed, capacities))
-    assert overflowed(needed, capacities) == ["quads"]
+    buffer_usage = counts(hits=10, quads=129, visible=256)
+    assert not bool(fits(buffer_usage, capacities))
+    assert overflowed(buffer_usage, capacities) == ["quads"]
 
 
 def test_combine_takes_the_largest_of_each_buffer_of_any_part():
-    both = combine(counts(hits=5, quads=1), counts(hits=3, quads=4), counts(chunks=0))
-    assert {name: int(n) for name, n in both.items()} == {"chunks": 0, "hits": 5, "quads": 4}
+    combined_usage = combine(counts(hits=5, quads=1), counts(hits=3, quads=4), counts(chunks=0))
+    assert {name: int(n) for name, n in combined_usage.items()} == {
+        "chunks": 0,
+        "hits": 5,
+        "quads": 4,
+    }
     assert combine() == {}
 
 
 def test_growth_suffices_and_leaves_what_fits():
     capacities = Capacities(quads=256)
-    needed = counts(hits=100_000, quads=10)
-    grown = grow(capacities, needed)
-    assert bool(fits(needed, grown))
-    assert grown["hits"] >= 110_000
-    assert grown["quads"] == capacities["quads"]
-    assert grow(grown, needed) == grown
+    buffer_usage = counts(hits=100_000, quads=10)
+    grown_capacities = grow(capacities, buffer_usage)
+    assert bool(fits(buffer_usage, grown_capacities))
+    assert grown_capacities["hits"] >= 110_000
+    assert grown_capacities["quads"] == capacities["quads"]
+    assert grow(grown_capacities, buffer_usage) == grown_capacities
 
 
 def test_shrinking_still_fits_and_does_not_oscillate_with_growth():
     capacities = Capacities(hits=1_000_000)
-    needed = counts(hits=10_000)
-    smaller = shrink(capacities, needed)
-    assert smaller["hits"] < capacities["hits"]
-    assert bool(fits(needed, smaller))
-    assert shrink(smaller, needed) == smaller
-    assert grow(smaller, needed) == smaller
+    buffer_usage = counts(hits=10_000)
+    smaller_capacities = shrink(capacities, buffer_usage)
+    assert smaller_capacities["hits"] < capacities["hits"]
+    assert bool(fits(buffer_usage, smaller_capacities))
+    assert shrink(smaller_capacities, buffer_usage) == smaller_capacities
+    assert grow(smaller_capacities, buffer_usage) == smaller_capacities
     assert shrink(capacities, counts(hits=600_000))["hits"] == capacities["hits"]
 
 
@@ -149,9 +153,9 @@ def test_a_buffer_that_nobody_sized_has_a_common_size_and_grows_from_it():
     assert "hits" not in dict(Capacities())
     assert bool(fits(counts(hits=UNSIZED), Capacities()))
     assert overflowed(counts(hits=UNSIZED + 1), Capacities()) == ["hits"]
-    grown = grow(Capacities(quads=7), counts(hits=UNSIZED + 1))
-    assert grown["hits"] > UNSIZED
-    assert grown["quads"] == 7
+    grown_capacities = grow(Capacities(quads=7), counts(hits=UNSIZED + 1))
+    assert grown_capacities["hits"] > UNSIZED
+    assert grown_capacities["quads"] == 7
 
 
 def test_only_sized_buffers_are_contained():
@@ -162,23 +166,28 @@ def test_only_sized_buffers_are_contained():
 
 
 def test_capacities_are_values_whatever_the_order_of_their_names():
-    one, two = Capacities(hits=1, quads=2), Capacities(quads=2, hits=1)
-    assert one == two
-    assert hash(one) == hash(two)
-    assert {one: "found"}[two] == "found"
-    assert dict(one) == {"hits": 1, "quads": 2}
-    assert eval(repr(one)) == one
-    for other in (Capacities(), Capacities(hits=1), one.resized(hits=3), dict(one)):
-        assert one != other
+    capacities, reordered = Capacities(hits=1, quads=2), Capacities(quads=2, hits=1)
+    assert capacities == reordered
+    assert hash(capacities) == hash(reordered)
+    assert {capacities: "found"}[reordered] == "found"
+    assert dict(capacities) == {"hits": 1, "quads": 2}
+    assert eval(repr(capacities)) == capacities
+    for different in (
+        Capacities(),
+        Capacities(hits=1),
+        capacities.resized(hits=3),
+        dict(capacities),
+    ):
+        assert capacities != different
     # An explicit size is not the same as none: only the former survives a change of the default.
     assert Capacities(hits=UNSIZED) != Capacities()
 
 
 def test_resizing_makes_a_copy():
-    one = Capacities(hits=1, quads=2)
-    two = one.resized(quads=3, chunks=4)
-    assert dict(one) == {"hits": 1, "quads": 2}
-    assert dict(two) == {"chunks": 4, "hits": 1, "quads": 3}
+    capacities = Capacities(hits=1, quads=2)
+    resized_capacities = capacities.resized(quads=3, chunks=4)
+    assert dict(capacities) == {"hits": 1, "quads": 2}
+    assert dict(resized_capacities) == {"chunks": 4, "hits": 1, "quads": 3}
 
 
 def test_equal_capacities_share_one_compiled_program():
@@ -206,12 +215,12 @@ class _Stages:
 
     def __call__(self, capacities):
         self.tried.append(capacities)
-        kept, needed = 1.0, {}
+        kept_share, buffer_usage = 1.0, {}
         for name, need in zip(("first", "second", "third"), self.needs, strict=True):
-            seen = int(kept * need)
-            needed[name] = seen
-            kept *= min(1.0, capacities[name] / max(seen, 1))
-        return f"result {len(self.tried)}", counts(**needed)
+            demand = int(kept_share * need)
+            buffer_usage[name] = demand
+            kept_share *= min(1.0, capacities[name] / max(demand, 1))
+        return f"result {len(self.tried)}", counts(**buffer_usage)
 
 
 def test_retry_grows_until_everything_fits():
@@ -227,40 +236,40 @@ def test_retry_grows_until_everything_fits():
 
 def test_retry_keeps_the_result_of_the_first_attempt_that_fitted():
     stages = _Stages(100, 200, 300)
-    enough = Capacities(first=128, second=200, third=512)
-    result, capacities = retry(stages, enough)
-    assert (result, capacities) == ("result 1", enough)
-    assert stages.tried == [enough]
+    start_capacities = Capacities(first=128, second=200, third=512)
+    result, capacities = retry(stages, start_capacities)
+    assert (result, capacities) == ("result 1", start_capacities)
+    assert stages.tried == [start_capacities]
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_retry_never_returns_a_result_that_overflowed(seed):
     needs = np.random.default_rng(seed).integers(1, 10**6, 3).tolist()
-    stages, reported = _Stages(*needs), {}
+    stages, usages = _Stages(*needs), {}
 
     def attempt(capacities):
-        result, needed = stages(capacities)
-        reported[result] = needed
-        return result, needed
+        result, buffer_usage = stages(capacities)
+        usages[result] = buffer_usage
+        return result, buffer_usage
 
     result, capacities = retry(attempt, Capacities())
-    assert bool(fits(reported[result], capacities))
-    assert [int(n) for n in reported[result].values()] == needs
+    assert bool(fits(usages[result], capacities))
+    assert [int(n) for n in usages[result].values()] == needs
     # Every earlier attempt overflowed, and none was tried with less than the one before it.
-    assert all(overflowed(reported[f"result {i + 1}"], c) for i, c in enumerate(stages.tried[:-1]))
-    for less, more in zip(stages.tried, stages.tried[1:], strict=False):
-        assert all(more[name] >= less[name] for name in ("first", "second", "third"))
+    assert all(overflowed(usages[f"result {i + 1}"], c) for i, c in enumerate(stages.tried[:-1]))
+    for earlier, later in zip(stages.tried, stages.tried[1:], strict=False):
+        assert all(later[name] >= earlier[name] for name in ("first", "second", "third"))
 
 
 def test_tightened_buffers_hold_what_was_needed_and_none_grows():
     capacities = Capacities(hits=8192, visible=1024, quads=512)
-    found = tightened(capacities, {"hits": 1000, "visible": 1020})
-    assert 1100 <= found["hits"] <= 1280
-    assert (found["visible"], found["quads"]) == (1024, 512)
+    tight_capacities = tightened(capacities, {"hits": 1000, "visible": 1020})
+    assert 1100 <= tight_capacities["hits"] <= 1280
+    assert (tight_capacities["visible"], tight_capacities["quads"]) == (1024, 512)
 
 
 def test_the_largest_of_two_needs_knows_every_buffer():
-    first, second = {"hits": 3, "quads": 9}, {"hits": 5, "chunks": 1}
-    assert largest(first, second) == {"hits": 5, "quads": 9, "chunks": 1}
-    assert largest(None, first) == largest(first, None) == first
+    first_usage, second_usage = {"hits": 3, "quads": 9}, {"hits": 5, "chunks": 1}
+    assert largest(first_usage, second_usage) == {"hits": 5, "quads": 9, "chunks": 1}
+    assert largest(None, first_usage) == largest(first_usage, None) == first_usage
     assert largest(None, None) == {}

@@ -59,10 +59,10 @@ def photograph(pose, size):
     rays = np.stack([(u - LENS.cx) / LENS.fx, (v - LENS.cy) / LENS.fy, np.ones_like(u)], -1)
     rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ rotation
     from_center = pose[:3, 3] - CENTER
-    along = -rays @ from_center
-    inside = RADIUS**2 - DISTANCE**2 + along**2
-    is_hit = inside > 0
-    depth = along - np.sqrt(np.where(is_hit, inside, 0.0))
+    closest_depth = -rays @ from_center
+    discriminant = RADIUS**2 - DISTANCE**2 + closest_depth**2
+    is_hit = discriminant > 0
+    depth = closest_depth - np.sqrt(np.where(is_hit, discriminant, 0.0))
     normals = (from_center + depth[..., None] * rays) / RADIUS
     rgb = np.where(is_hit[..., None], 0.5 + 0.5 * normals, 0.5)
     return rgb.astype(np.float32), is_hit[..., None].astype(np.float32)
@@ -107,37 +107,37 @@ def colmap_cameras():
 
     The upright photograph has a camera of its own.
     """
-    numbers = (LENS.fx, LENS.fy, LENS.cx, LENS.cy)
-    return [(1, 1, *size_of(0)[::-1], numbers), (7, 1, *size_of(3)[::-1], numbers)]
+    parameters = (LENS.fx, LENS.fy, LENS.cx, LENS.cy)
+    return [(1, 1, *size_of(0)[::-1], parameters), (7, 1, *size_of(3)[::-1], parameters)]
 
 
 def colmap_images(names):
     """Return number, quaternion, translation, camera and name of every image, in reverse order."""
-    listed = []
+    images = []
     for number in reversed(range(COUNT)):
         rotation, translation = opencv_extrinsics(opengl_poses()[number])
         quaternion = colmap_quaternion(rotation)
-        listed.append(
+        images.append(
             (100 + number, quaternion, translation, 7 if number == 3 else 1, names[number])
         )
-    return listed
+    return images
 
 
 def camera_bytes(cameras):
-    parts = [struct.pack("<Q", len(cameras))]
-    for number, model, width, height, numbers in cameras:
-        parts.append(struct.pack("<iiQQ", number, model, width, height))
-        parts.append(struct.pack(f"<{len(numbers)}d", *numbers))
-    return b"".join(parts)
+    chunks = [struct.pack("<Q", len(cameras))]
+    for camera_id, model, width, height, parameters in cameras:
+        chunks.append(struct.pack("<iiQQ", camera_id, model, width, height))
+        chunks.append(struct.pack(f"<{len(parameters)}d", *parameters))
+    return b"".join(chunks)
 
 
 def image_bytes(images, *, points=2):
-    parts = [struct.pack("<Q", len(images))]
-    for number, quaternion, translation, camera, name in images:
-        parts.append(struct.pack("<i7di", number, *quaternion, *translation, camera))
-        parts.append(name.encode() + b"\0" + struct.pack("<Q", points))
-        parts.append(struct.pack("<ddq", 1.5, 2.5, -1) * points)
-    return b"".join(parts)
+    chunks = [struct.pack("<Q", len(images))]
+    for image_id, quaternion, translation, camera, name in images:
+        chunks.append(struct.pack("<i7di", image_id, *quaternion, *translation, camera))
+        chunks.append(name.encode() + b"\0" + struct.pack("<Q", points))
+        chunks.append(struct.pack("<ddq", 1.5, 2.5, -1) * points)
+    return b"".join(chunks)
 
 
 def write_colmap(root, *, sparse="sparse/0"):
@@ -152,8 +152,8 @@ def write_colmap_text(root):
     folder = root / "sparse"
     folder.mkdir()
     lines = ["# Camera list", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
-    for number, _, width, height, numbers in colmap_cameras():
-        lines.append(f"{number} PINHOLE {width} {height} {' '.join(map(repr, numbers))}")
+    for number, _, width, height, parameters in colmap_cameras():
+        lines.append(f"{number} PINHOLE {width} {height} {' '.join(map(repr, parameters))}")
     (folder / "cameras.txt").write_text("\n".join(lines) + "\n")
     lines = ["# Image list with two lines of data per image:"]
     for position, (number, quaternion, translation, camera, name) in enumerate(
@@ -211,14 +211,14 @@ def light_of(pose):
 
 def write_stanford_orb(root):
     """Write frames as NeRF-synthetic does, each with a lens of its own."""
-    for split, numbers in (("train", range(2, COUNT)), ("test", range(2))):
+    for split, view_numbers in (("train", range(2, COUNT)), ("test", range(2))):
         frames = []
-        for number in numbers:
-            pose, name = opengl_poses()[number], f"{number:04d}"
-            rgb, mask = photograph(pose, size_of(number))
+        for view_number in view_numbers:
+            pose, name = opengl_poses()[view_number], f"{view_number:04d}"
+            rgb, mask = photograph(pose, size_of(view_number))
             write_png(root / split / f"{name}.png", rgb)
             write_png(root / f"{split}_mask" / f"{name}.png", mask)
-            height, width = size_of(number)
+            height, width = size_of(view_number)
             lens = {"fl_x": LENS.fx, "fl_y": LENS.fy, "cx": LENS.cx, "cy": LENS.cy}
             frame = {"file_path": f"./{split}/{name}", "transform_matrix": pose.tolist()}
             frames.append({**frame, **lens, "w": width, "h": height})
@@ -241,13 +241,13 @@ WRITERS = {
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory):
     """One pristine capture of each layout."""
-    made = {}
+    roots = {}
     for layout, write in WRITERS.items():
         root = tmp_path_factory.mktemp(layout) / "blender_LDR" / "ball"
         root.mkdir(parents=True)
         write(root)
-        made[layout] = root
-    return made
+        roots[layout] = root
+    return roots
 
 
 @pytest.fixture
@@ -272,17 +272,20 @@ def number_of(name):
 
 
 def refuses(root, message, kind=SceneError, **settings):
-    with pytest.raises(kind, match=message) as caught:
+    with pytest.raises(kind, match=message) as error_info:
         load(root, **settings)
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(error_info.value)
 
 
 @pytest.mark.parametrize("layout", list(WRITERS))
 def test_every_capture_is_recognised_and_read_as_it_was_written(scenes, layout):
     dataset = load(scenes[layout])
     assert dataset.layout == layout.removesuffix("_text")
-    tests = {0, 1} if layout == "stanford_orb" else {0, 8}
-    for views, expected in ((dataset.test, tests), (dataset.train, set(range(COUNT)) - tests)):
+    test_numbers = {0, 1} if layout == "stanford_orb" else {0, 8}
+    for views, expected in (
+        (dataset.test, test_numbers),
+        (dataset.train, set(range(COUNT)) - test_numbers),
+    ):
         numbers = [number_of(name) for name in views.names]
         assert sorted(numbers) == numbers
         assert set(numbers) == expected
@@ -330,10 +333,12 @@ def test_bounds_are_those_of_the_ball_wherever_it_is(scenes, layout):
 
 
 def test_half_the_size_is_the_same_capture(scenes):
-    full, half = (load(scenes["colmap"], downscale=factor).train for factor in (1, 2))
-    np.testing.assert_allclose(half.intrinsics * np.array([[2], [2], [1]]), full.intrinsics)
-    assert half.images.shape == (8, 14, 12, 4)
-    assert np.asarray(half.valid).sum() == np.asarray(full.valid).sum() / 4
+    full_views, half_views = (load(scenes["colmap"], downscale=factor).train for factor in (1, 2))
+    np.testing.assert_allclose(
+        half_views.intrinsics * np.array([[2], [2], [1]]), full_views.intrinsics
+    )
+    assert half_views.images.shape == (8, 14, 12, 4)
+    assert np.asarray(half_views.valid).sum() == np.asarray(full_views.valid).sum() / 4
 
 
 def test_images_are_reduced_to_half_a_cell(scenes):
@@ -364,8 +369,8 @@ def test_images_are_reduced_to_half_a_cell(scenes):
 
 def test_the_size_that_was_chosen_is_said(scenes, capsys):
     assert cli.main(["info", str(scenes["idr"]), "--downscale", "auto"]) == 0
-    said = capsys.readouterr()
-    assert "images stay in full size" in said.err
+    captured = capsys.readouterr()
+    assert "images stay in full size" in captured.err
     assert cli.main(["info", str(scenes["idr"]), "--downscale", "2"]) == 0
     assert "reduced" not in capsys.readouterr().err
 
@@ -408,13 +413,13 @@ def test_images_with_alpha_need_no_masks_and_leave_those_that_are_there(tmp_path
     assert dataset.train.has_masks
     assert not any("mask" in warning for warning in dataset.warnings)
     write_png(tmp_path / "masks" / "view_04.png", np.zeros((20, 24, 1), np.float32))
-    again = load(tmp_path)
-    np.testing.assert_array_equal(again.train.images, dataset.train.images)
-    said = (
+    masked_dataset = load(tmp_path)
+    np.testing.assert_array_equal(masked_dataset.train.images, dataset.train.images)
+    message = (
         "train: 1 mask files are ignored because their images have an alpha channel, "
         "for example view_04.png"
     )
-    assert said in again.warnings
+    assert message in masked_dataset.warnings
 
 
 def test_an_alpha_that_is_one_in_all_photographs_cuts_nothing_out(tmp_path):
@@ -440,9 +445,9 @@ def test_masks_of_dtu_belong_to_the_images_by_number(copied):
     expected = load(root).train
     for number, path in enumerate(sorted((root / "mask").iterdir())):
         path.rename(path.with_name(f"m{number:03d}.png"))
-    found = load(root).train
-    assert found.has_masks
-    np.testing.assert_array_equal(found.images, expected.images)
+    actual = load(root).train
+    assert actual.has_masks
+    np.testing.assert_array_equal(actual.images, expected.images)
     (root / "mask" / "m003.png").unlink()
     refuses(root, "has 9 masks for 10 images")
 
@@ -464,9 +469,9 @@ def test_pixels_that_do_not_count_are_apart_from_the_mask(copied):
         views = load(root, downscale=factor).train
         for name in ("view_05", "view_06"):
             index = views.names.index(name)
-            shown = views.valid[index][: 20 // factor, : 24 // factor]
+            view_valid = views.valid[index][: 20 // factor, : 24 // factor]
             rows = valid[..., 0].reshape(20 // factor, factor, 24 // factor, factor)
-            np.testing.assert_array_equal(shown, rows.min((1, 3)))
+            np.testing.assert_array_equal(view_valid, rows.min((1, 3)))
             assert (views.images[index][views.valid[index] == 0] == 0).all()
             assert (views.images[index][views.valid[index] == 1][:, 3] > 0).any()
     write_png(root / "valid" / "view_05.png", np.zeros((20, 24, 1), np.float32))
@@ -477,16 +482,18 @@ def test_pixels_that_do_not_count_are_apart_from_the_mask(copied):
 
 def test_a_distorted_capture_becomes_a_pinhole_with_its_border_marked(tmp_path):
     write_transforms(tmp_path, several=False, k1=-0.0, p1=0.0)
-    straight = load(tmp_path).train
-    assert straight.valid is None
+    pinhole_views = load(tmp_path).train
+    assert pinhole_views.valid is None
     edit(tmp_path, lambda content: content.update(k1=0.4))
-    bent = load(tmp_path).train
-    np.testing.assert_array_equal(bent.intrinsics, straight.intrinsics)
+    distorted_views = load(tmp_path).train
+    np.testing.assert_array_equal(distorted_views.intrinsics, pinhole_views.intrinsics)
     # A corner of the pinhole image lies outside the photograph; the middle stays where it is.
-    assert (bent.valid[:, 0, 0] == 0).all()
-    assert (bent.valid[:, 12, 11] == 1).all()
-    assert (np.asarray(bent.images)[np.asarray(bent.valid) == 0] == 0).all()
-    np.testing.assert_allclose(bent.images[:, 12, 11], straight.images[:, 12, 11], atol=0.02)
+    assert (distorted_views.valid[:, 0, 0] == 0).all()
+    assert (distorted_views.valid[:, 12, 11] == 1).all()
+    assert (np.asarray(distorted_views.images)[np.asarray(distorted_views.valid) == 0] == 0).all()
+    np.testing.assert_allclose(
+        distorted_views.images[:, 12, 11], pinhole_views.images[:, 12, 11], atol=0.02
+    )
 
 
 def test_the_split_of_nerfstudio_is_taken(copied):
@@ -553,16 +560,16 @@ def test_what_a_transforms_file_names_must_be_there(copied):
 
 
 def test_distortion_params_and_keys_say_the_same(tmp_path):
-    found = []
+    view_images = []
     keys = {"k1": -0.1, "k2": 0.02, "k3": 0.01, "k4": 0.005, "p1": 0.01, "p2": -0.02}
-    for more in (keys, {"distortion_params": list(keys.values())}):
-        write_transforms(tmp_path, **more)
-        found.append(load(tmp_path).train.images)
-    np.testing.assert_array_equal(*found)
+    for distortion in (keys, {"distortion_params": list(keys.values())}):
+        write_transforms(tmp_path, **distortion)
+        view_images.append(load(tmp_path).train.images)
+    np.testing.assert_array_equal(*view_images)
     write_transforms(tmp_path, **keys, camera_model="PINHOLE")
-    np.testing.assert_array_equal(load(tmp_path).train.images, found[0])
+    np.testing.assert_array_equal(load(tmp_path).train.images, view_images[0])
     write_transforms(tmp_path, is_fisheye=True)
-    assert not np.array_equal(load(tmp_path).train.images, found[0])
+    assert not np.array_equal(load(tmp_path).train.images, view_images[0])
 
 
 def test_several_frames_of_one_file_are_refused(copied):
@@ -575,20 +582,20 @@ def test_a_binary_model_that_ends_early_is_refused_wherever_it_ends(copied):
     root = copied("colmap")
     for name in ("cameras.bin", "images.bin"):
         path = root / "sparse" / "0" / name
-        whole = path.read_bytes()
-        for size in range(0, len(whole), 7):
-            path.write_bytes(whole[:size])
+        whole_bytes = path.read_bytes()
+        for size in range(0, len(whole_bytes), 7):
+            path.write_bytes(whole_bytes[:size])
             with pytest.raises(SceneError, match=rf"{name} (is truncated|ends within a name)"):
                 list_colmap(root)
-        path.write_bytes(whole + b"\0\0\0")
+        path.write_bytes(whole_bytes + b"\0\0\0")
         refuses(root, rf"{name} has 3 bytes more than its count says")
         for count in (0, 1, 2**63):
-            path.write_bytes(struct.pack("<Q", count) + whole[8:])
+            path.write_bytes(struct.pack("<Q", count) + whole_bytes[8:])
             refuses(root, rf"{name} (has \d+ bytes more|is truncated)")
-        path.write_bytes(whole)
+        path.write_bytes(whole_bytes)
     points = image_bytes(colmap_images([f"view_{k:02d}.png" for k in range(COUNT)]))
-    lying = points.replace(struct.pack("<Q", 2), struct.pack("<Q", 2**61), 1)
-    path.write_bytes(lying)
+    false_points = points.replace(struct.pack("<Q", 2), struct.pack("<Q", 2**61), 1)
+    path.write_bytes(false_points)
     refuses(root, r"images\.bin is truncated: \d+ more bytes are announced")
 
 
@@ -677,9 +684,9 @@ def test_a_text_model_without_lines_of_points_is_refused(copied, name):
     """Every second image would be taken for points, since a line of points may have any length."""
     root = copied("colmap_text")
     path = root / "sparse" / "images.txt"
-    head, *lines = path.read_text().splitlines()
+    header, *lines = path.read_text().splitlines()
     images = [line.rsplit(" ", 1) for line in lines[::2]]
-    path.write_text("\n".join([head, *(f"{a} {name.format(b)}" for a, b in images)]) + "\n")
+    path.write_text("\n".join([header, *(f"{a} {name.format(b)}" for a, b in images)]) + "\n")
     refuses(root, r"line 3 of .*images\.txt")
 
 
@@ -698,18 +705,18 @@ def test_models_beside_the_one_that_is_read_are_said(copied):
 def test_a_distorted_colmap_camera_is_that_of_transforms(copied, tmp_path):
     """The same lens in both layouts, each of which writes its numbers in its own way."""
     root = copied("colmap")
-    bend = {"k1": -0.15, "k2": 0.03, "p1": 0.02, "p2": -0.01}
+    distortion = {"k1": -0.15, "k2": 0.03, "p1": 0.02, "p2": -0.01}
     cameras = [
-        (number, 4, width, height, (*numbers, *bend.values()))
-        for number, _, width, height, numbers in colmap_cameras()
+        (camera_id, 4, width, height, (*parameters, *distortion.values()))
+        for camera_id, _, width, height, parameters in colmap_cameras()
     ]
     (root / "sparse" / "0" / "cameras.bin").write_bytes(camera_bytes(cameras))
-    other = tmp_path / "other"
-    write_transforms(other, **bend)
-    read, expected = load(root).train, load(other).train
-    assert read.names == expected.names
-    np.testing.assert_allclose(read.images, expected.images, atol=1e-5)
-    np.testing.assert_array_equal(read.valid, expected.valid)
+    other_root = tmp_path / "other"
+    write_transforms(other_root, **distortion)
+    actual, expected = load(root).train, load(other_root).train
+    assert actual.names == expected.names
+    np.testing.assert_allclose(actual.images, expected.images, atol=1e-5)
+    np.testing.assert_array_equal(actual.valid, expected.valid)
 
 
 def test_colmap_itself_writes_what_is_read(copied):
@@ -726,10 +733,10 @@ def test_colmap_itself_writes_what_is_read(copied):
         rotation, translation = opencv_extrinsics(opengl_poses()[number - 100])
         image = pycolmap.Image(name=name, camera_id=camera, image_id=number)
         image.points2D = [pycolmap.Point2D(np.array([1.5, 2.5])) for _ in range(number % 3)]
-        placed = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
-        model.add_image_with_trivial_frame(image, placed)
-    for place, color in POINTS:
-        model.add_point3D(np.array(place), pycolmap.Track(), np.array(color, np.uint8))
+        world_pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
+        model.add_image_with_trivial_frame(image, world_pose)
+    for position, color in POINTS:
+        model.add_point3D(np.array(position), pycolmap.Track(), np.array(color, np.uint8))
     for kind, suffix in ((model.write_binary, "bin"), (model.write_text, "txt")):
         (root / "sparse" / "0").mkdir(parents=True)
         kind(str(root / "sparse" / "0"))
@@ -741,7 +748,7 @@ def test_colmap_itself_writes_what_is_read(copied):
         np.testing.assert_allclose(views.intrinsics[:, 0, 2], LENS.cx)
         points = read_points(root)
         order = np.argsort(points.positions[:, 0])
-        np.testing.assert_allclose(points.positions[order], [place for place, _ in POINTS])
+        np.testing.assert_allclose(points.positions[order], [position for position, _ in POINTS])
         np.testing.assert_allclose(points.colors[order], np.array([c for _, c in POINTS]) / 255)
         shutil.rmtree(root / "sparse")
 
@@ -750,11 +757,11 @@ POINTS = [((0.5, -1.0, 2.0), (255, 0, 51)), ((3.0, 4.0, -5.0), (0, 102, 255))]
 
 
 def point_bytes(points=POINTS, *, count=None):
-    parts = [struct.pack("<Q", len(points) if count is None else count)]
-    for number, (place, color) in enumerate(points):
-        parts.append(struct.pack("<Q3d3Bd", number, *place, *color, 0.7))
-        parts.append(struct.pack("<Q", number) + struct.pack("<ii", 1, 2) * number)
-    return b"".join(parts)
+    chunks = [struct.pack("<Q", len(points) if count is None else count)]
+    for point_id, (position, color) in enumerate(points):
+        chunks.append(struct.pack("<Q3d3Bd", point_id, *position, *color, 0.7))
+        chunks.append(struct.pack("<Q", point_id) + struct.pack("<ii", 1, 2) * point_id)
+    return b"".join(chunks)
 
 
 def test_points_of_a_model_are_read_in_both_kinds_of_files(tmp_path):
@@ -769,7 +776,7 @@ def test_points_of_a_model_are_read_in_both_kinds_of_files(tmp_path):
     ):
         (folder / name).write_bytes(content)
         points = read_points(tmp_path)
-        np.testing.assert_array_equal(points.positions, [place for place, _ in POINTS])
+        np.testing.assert_array_equal(points.positions, [position for position, _ in POINTS])
         np.testing.assert_allclose(points.colors, np.array([c for _, c in POINTS]) / 255)
 
 
@@ -823,9 +830,9 @@ def test_wrong_projections_are_named(copied, change, message):
 def test_a_damaged_or_dangerous_archive_is_refused(copied):
     root = copied("idr")
     path = root / "cameras_sphere.npz"
-    whole = path.read_bytes()
-    for size in (0, 10, len(whole) // 2, len(whole) - 30):
-        path.write_bytes(whole[:size])
+    whole_bytes = path.read_bytes()
+    for size in (0, 10, len(whole_bytes) // 2, len(whole_bytes) - 30):
+        path.write_bytes(whole_bytes[:size])
         refuses(root, r"cameras_sphere\.npz is damaged")
     edit_source = {"world_mat_0": np.array([{"a": 1}], dtype=object)}
     np.savez(path, **edit_source, allow_pickle=True)
@@ -842,14 +849,16 @@ def test_no_flipped_byte_of_a_compressed_archive_is_a_traceback(copied):
     path = root / "cameras_sphere.npz"
     with np.load(path) as arrays:
         np.savez_compressed(path, **{name: arrays[name] for name in arrays.files[:2]})
-    whole, refused = path.read_bytes(), 0
-    for place in range(0, len(whole), 3):
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0x55]) + whole[place + 1 :])
+    whole_bytes, refusal_count = path.read_bytes(), 0
+    for offset in range(0, len(whole_bytes), 3):
+        path.write_bytes(
+            whole_bytes[:offset] + bytes([whole_bytes[offset] ^ 0x55]) + whole_bytes[offset + 1 :]
+        )
         try:
             _read_matrices(path)
         except SceneError:
-            refused += 1
-    assert refused > 10
+            refusal_count += 1
+    assert refusal_count > 10
 
 
 @pytest.mark.parametrize(
@@ -885,26 +894,28 @@ def test_the_light_of_a_test_view_shines_from_the_same_side_in_every_view(scenes
     views = load(scenes["stanford_orb"]).test
     assert list(views.lights) == list(views.names)
     for light in views.lights.values():
-        found = np.asarray(load_view_light(light).radiance)[..., 0]
-        row, column = np.unravel_index(np.argmax(found), found.shape)
+        radiance = np.asarray(load_view_light(light).radiance)[..., 0]
+        row, column = np.unravel_index(np.argmax(radiance), radiance.shape)
         # The world's +x is in the middle of the map, where four texels meet.
         assert row in (3, 4)
         assert column in (7, 8)
-        assert found.max() > 4 * np.delete(np.delete(found, [3, 4], 0), [7, 8], 1).max()
+        assert radiance.max() > 4 * np.delete(np.delete(radiance, [3, 4], 0), [7, 8], 1).max()
 
 
 def test_a_view_light_in_a_level_camera_is_the_map_of_a_world_with_y_up(tmp_path):
     """A camera that looks along +y of the z-up world: its right is x, its up is z."""
-    across = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    azimuths = np.linspace(0, 2 * np.pi, 64, endpoint=False)
     rows = np.linspace(0.2, 1.0, 32)[:, None, None]  # no two sides are alike
-    radiance = rows * (1 + 0.5 * np.stack([np.cos(across), np.sin(across), np.sin(2 * across)], 1))
+    radiance = rows * (
+        1 + 0.5 * np.stack([np.cos(azimuths), np.sin(azimuths), np.sin(2 * azimuths)], 1)
+    )
     radiance = radiance.astype(np.float32)
     write_exr(tmp_path / "a.exr", radiance)
     pose = np.eye(4)
     pose[:3, :3] = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
-    found = np.asarray(load_view_light(ViewLight(tmp_path / "a.exr", pose)).radiance)
+    loaded_radiance = np.asarray(load_view_light(ViewLight(tmp_path / "a.exr", pose)).radiance)
     # Forwards, +y, is in the middle of the camera's map, and at u = .5 - .25 of the world's.
-    np.testing.assert_allclose(found, np.roll(radiance, -16, axis=1), atol=0.015)
+    np.testing.assert_allclose(loaded_radiance, np.roll(radiance, -16, axis=1), atol=0.015)
 
 
 def test_stanford_orb_needs_its_masks(copied):

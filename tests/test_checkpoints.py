@@ -56,8 +56,8 @@ def assert_same_bits(first, second):
 def test_every_leaf_returns_bit_for_bit(tmp_path):
     tree, meta = example_tree(1 / 3), {"preset": "paper", "nested": [1, 2.5, None]}
     path = save_checkpoint(tmp_path, 40, tree=tree, meta=meta)
-    loaded, loaded_meta = load_checkpoint(path, like=example_tree())
-    assert_same_bits(loaded, tree)
+    loaded_tree, loaded_meta = load_checkpoint(path, like=example_tree())
+    assert_same_bits(loaded_tree, tree)
     assert loaded_meta == read_meta(path) == meta
     assert read_step(path) == 40
 
@@ -65,15 +65,15 @@ def test_every_leaf_returns_bit_for_bit(tmp_path):
 def test_the_restored_key_continues_the_same_stream(tmp_path):
     key = jax.random.key(3)
     path = save_checkpoint(tmp_path, 0, tree=key, meta={})
-    loaded, _ = load_checkpoint(path, like=jax.random.key(0))
-    np.testing.assert_array_equal(jax.random.normal(loaded, (4,)), jax.random.normal(key, (4,)))
+    loaded_key, _ = load_checkpoint(path, like=jax.random.key(0))
+    np.testing.assert_array_equal(jax.random.normal(loaded_key, (4,)), jax.random.normal(key, (4,)))
 
 
 def test_shapes_alone_suffice_to_load(tmp_path):
     tree = {"w": jnp.ones((3, 2))}
     path = save_checkpoint(tmp_path, 1, tree=tree, meta={})
-    loaded, _ = load_checkpoint(path, like={"w": jax.ShapeDtypeStruct((3, 2), jnp.float32)})
-    assert_same_bits(loaded, tree)
+    loaded_tree, _ = load_checkpoint(path, like={"w": jax.ShapeDtypeStruct((3, 2), jnp.float32)})
+    assert_same_bits(loaded_tree, tree)
 
 
 def test_the_file_opens_with_plain_numpy_and_without_pickle(tmp_path):
@@ -138,12 +138,12 @@ def test_an_interrupted_run_leaves_nothing_partial(tmp_path, monkeypatch):
 @pytest.mark.parametrize("damage", ["truncated", "flipped", "empty", "text"])
 def test_a_damaged_file_is_passed_over_with_a_warning(tmp_path, damage):
     tree = {"w": jnp.arange(1000.0)}
-    good = save_checkpoint(tmp_path, 1, tree=tree, meta={})
-    bad = save_checkpoint(tmp_path, 2, tree=tree, meta={})
-    content = bytearray(bad.read_bytes())
+    good_path = save_checkpoint(tmp_path, 1, tree=tree, meta={})
+    bad_path = save_checkpoint(tmp_path, 2, tree=tree, meta={})
+    content = bytearray(bad_path.read_bytes())
     if damage == "flipped":
         content[2000] ^= 0xFF
-    bad.write_bytes(
+    bad_path.write_bytes(
         {
             "truncated": bytes(content[: len(content) // 2]),
             "flipped": bytes(content),
@@ -152,9 +152,9 @@ def test_a_damaged_file_is_passed_over_with_a_warning(tmp_path, damage):
         }[damage]
     )
     with pytest.warns(RuntimeWarning, match="00000002.npz is damaged"):
-        assert latest_checkpoint(tmp_path) == good
+        assert latest_checkpoint(tmp_path) == good_path
     with pytest.raises(CheckpointError, match="is damaged"):
-        load_checkpoint(bad, like=tree)
+        load_checkpoint(bad_path, like=tree)
 
 
 def test_another_configuration_is_refused_by_leaf(tmp_path):
@@ -170,9 +170,9 @@ def test_another_configuration_is_refused_by_leaf(tmp_path):
         ({"sdf": jnp.ones(5), "key": key, "b": 1}, r"lacks 1 leaves \(\['b'\]\)"),
         ({"sdf": jnp.ones(5)}, r"has besides 1 leaves \(\['key'\]\)"),
     ]
-    for like, message in cases:
+    for template, message in cases:
         with pytest.raises(CheckpointError, match=message):
-            load_checkpoint(path, like=like)
+            load_checkpoint(path, like=template)
 
 
 def test_what_cannot_be_stored_is_refused(tmp_path):

@@ -53,26 +53,26 @@ def run(scene, tmp_path_factory):
 
 def test_info_says_what_was_recognised(capsys):
     assert main(["info", str(DUCK)]) == 0
-    said = capsys.readouterr().out
+    output_text = capsys.readouterr().out
     for word in ("tensoir", "40", "8", "128", "studio", "albedo"):
-        assert word in said
+        assert word in output_text
 
 
 @pytest.mark.parametrize("words", [["info", "s", "--bounds"], ["masks", "s", "--box"]])
 def test_small_negative_numbers_are_no_options(words):
     box = ["-1e-05", "-0.4", "-.1", "4e-1", "0.4", "0.5"]
-    found = vars(command_line().parse_args([*words, *box]))[words[-1].removeprefix("--")]
-    assert np.ravel(found).tolist() == [float(x) for x in box]
+    parsed_value = vars(command_line().parse_args([*words, *box]))[words[-1].removeprefix("--")]
+    assert np.ravel(parsed_value).tolist() == [float(x) for x in box]
 
 
 def test_the_help_is_short_and_names_every_command(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["--help"])
-    said = capsys.readouterr().out
+    help_text = capsys.readouterr().out
     assert stop.value.code == 0
-    assert len(said.splitlines()) <= 30
+    assert len(help_text.splitlines()) <= 30
     for name in COMMANDS:
-        assert re.search(rf"^ +{name}\b", said, re.MULTILINE)
+        assert re.search(rf"^ +{name}\b", help_text, re.MULTILINE)
 
 
 def test_the_package_run_as_a_module_is_the_command(capsys, monkeypatch):
@@ -119,7 +119,7 @@ def test_evaluate_writes_metrics_and_the_sheet(run, capsys):
     with pytest.raises(RunError, match="has not been evaluated"):
         Run(run).metrics  # noqa: B018
     assert main(["evaluate", str(run), *FEW, "--relight-indirect", "unshadowed"]) == 0
-    said = capsys.readouterr().out
+    output_text = capsys.readouterr().out
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["protocol"] == "geosplatting"
     assert metrics["samples"] == 4
@@ -134,36 +134,36 @@ def test_evaluate_writes_metrics_and_the_sheet(run, capsys):
     ):
         values = [view[name] for view in metrics["views"]]
         assert metrics["mean"][name] == pytest.approx(np.mean(values))
-        assert name in said
+        assert name in output_text
     for name in ("albedo.psnr", "relight.party.psnr", "relight.sunset.psnr", "light.psnr"):
         assert name in metrics["mean"]
     for name in ("seconds", "peak_memory_mb", "versions", "seed", "config", "scene", "step"):
         assert name in metrics
     for sheet in ("overview.png", "materials.png", "relight.png"):
         assert read_image(run / sheet).ndim == 3
-        assert sheet in said
+        assert sheet in output_text
     assert Run(run).metrics == metrics
     assert (run / "report.html").stat().st_size > 1_000_000
-    assert "report.html" in said
+    assert "report.html" in output_text
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("style", [["--texture-size", "64"], ["--vertex-colors"]])
 def test_export_writes_assets_that_load(run, tmp_path, style, capsys):
     assert main(["export", str(run), "--output", str(tmp_path), *style]) == 0
-    said = capsys.readouterr().out
-    assert "16 x 8 lat-long" in said
+    output_text = capsys.readouterr().out
+    assert "16 x 8 lat-long" in output_text
     mesh = trimesh.load(tmp_path / "mesh.glb", force="mesh")
     assert len(mesh.faces) > 50
-    assert f"faces {len(mesh.faces)}," in said
+    assert f"faces {len(mesh.faces)}," in output_text
     header = (tmp_path / "gaussians.ply").read_bytes()[:400].decode("ascii", "replace")
     assert header.startswith("ply")
     assert "f_dc_0" in header
     params = load_trained(run).params
-    exposed = np.exp(float(params.log_exposure)) * np.asarray(params.light.radiance)
-    assert exposed.shape == (8, 16, 3)
+    exposed_radiance = np.exp(float(params.log_exposure)) * np.asarray(params.light.radiance)
+    assert exposed_radiance.shape == (8, 16, 3)
     assert float(params.log_exposure) != 0
-    np.testing.assert_allclose(read_image(tmp_path / "light.exr"), exposed, rtol=1e-5)
+    np.testing.assert_allclose(read_image(tmp_path / "light.exr"), exposed_radiance, rtol=1e-5)
 
 
 @pytest.mark.slow
@@ -186,7 +186,7 @@ def test_relight_writes_stills_beside_the_run(run, capsys):
         assert "4 files" in capsys.readouterr().out
         folder = run / "relight_sunset"
         assert sorted(path.name for path in folder.iterdir()) == [
-            f"test_{number}{end}.png" for number in ("000", "001") for end in ("", "_rgba")
+            f"test_{number}{suffix}.png" for number in ("000", "001") for suffix in ("", "_rgba")
         ]
         pictures.append(read_image(folder / "test_000_rgba.png"))
     np.testing.assert_array_equal(pictures[0][..., 3], pictures[1][..., 3])
@@ -195,11 +195,11 @@ def test_relight_writes_stills_beside_the_run(run, capsys):
 
 @pytest.mark.slow
 def test_resuming_checks_the_scene_and_the_configuration(run, scene, capsys):
-    same = [*REDUCED, "--set", "run.preview_every=4", "--resume"]
-    assert train(run, *same, scene=scene) == 0
-    assert train(run, "--downscale", "2", *same[2:], scene=scene) == 2
+    same_arguments = [*REDUCED, "--set", "run.preview_every=4", "--resume"]
+    assert train(run, *same_arguments, scene=scene) == 0
+    assert train(run, "--downscale", "2", *same_arguments[2:], scene=scene) == 2
     assert "take the same scene, read in the same way, or another folder" in capsys.readouterr().err
-    assert train(run, *same, "--seed", "5", scene=scene) == 2
+    assert train(run, *same_arguments, "--seed", "5", scene=scene) == 2
     assert "run.seed: 0 -> 5" in capsys.readouterr().err
     assert train(run, *REDUCED, scene=scene) == 2
     assert "holds a run; continue it with --resume, replace it with --force" in (
@@ -210,16 +210,16 @@ def test_resuming_checks_the_scene_and_the_configuration(run, scene, capsys):
 
 @pytest.mark.slow
 def test_a_run_finds_its_scene_where_it_was_moved_to(run, scene, tmp_path, capsys):
-    moved = shutil.copytree(run, tmp_path / "run")
-    record = json.loads((moved / "run.json").read_text())
-    (moved / "run.json").write_text(json.dumps({**record, "scene": str(tmp_path / "gone")}))
-    assert main(["export", str(moved), "--vertex-colors"]) == 0
-    assert main(["render", str(moved)]) == 2
+    moved_folder = shutil.copytree(run, tmp_path / "run")
+    record = json.loads((moved_folder / "run.json").read_text())
+    (moved_folder / "run.json").write_text(json.dumps({**record, "scene": str(tmp_path / "gone")}))
+    assert main(["export", str(moved_folder), "--vertex-colors"]) == 0
+    assert main(["render", str(moved_folder)]) == 2
     assert "is not at" in capsys.readouterr().err
-    opened = Run(moved, scene=scene)
-    assert opened.folder.record()["scene"] == str(scene.resolve())
-    assert Run(moved).dataset.train.fingerprint() == opened.dataset.train.fingerprint()
-    assert Run(moved).batch(3).image.shape == (1, 32, 32, 4)
+    opened_run = Run(moved_folder, scene=scene)
+    assert opened_run.folder.record()["scene"] == str(scene.resolve())
+    assert Run(moved_folder).dataset.train.fingerprint() == opened_run.dataset.train.fingerprint()
+    assert Run(moved_folder).batch(3).image.shape == (1, 32, 32, 4)
 
 
 def test_an_existing_output_folder_is_not_touched(tmp_path, capsys):
@@ -258,13 +258,13 @@ def test_a_failed_start_leaves_no_folder_behind(tmp_path, capsys):
 
 
 def test_a_first_stage_that_does_not_fit_leaves_the_folder_free(scene, tmp_path, capsys):
-    settings = [part for override in MONTE_CARLO for part in ("--set", override)]
-    other, folder = tmp_path / "other", tmp_path / "run"
-    other.mkdir()
+    settings = [argument for override in MONTE_CARLO for argument in ("--set", override)]
+    source_folder, folder = tmp_path / "other", tmp_path / "run"
+    source_folder.mkdir()
     options = {"downscale": 4, "light": None, "bounds": None}
     record = {"scene": str(scene), "dataset": options, "config": {}}
-    (other / "run.json").write_text(json.dumps(record))
-    arguments = [*REDUCED, *settings, "--from", str(other), "--stage", "monte_carlo"]
+    (source_folder / "run.json").write_text(json.dumps(record))
+    arguments = [*REDUCED, *settings, "--from", str(source_folder), "--stage", "monte_carlo"]
     for _ in range(2):
         assert train(folder, *arguments, scene=scene) == 2
         assert "holds no checkpoint to take the stage split_sum from" in capsys.readouterr().err
@@ -279,9 +279,9 @@ def test_a_first_stage_that_does_not_fit_leaves_the_folder_free(scene, tmp_path,
 def test_the_viewer_without_its_package_is_one_line(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     assert main(["view", str(tmp_path)]) == 2
-    said = capsys.readouterr().err
-    assert "pip install 'geosplat_jax[view]'" in said
-    assert said.count("\n") == 1
+    error_text = capsys.readouterr().err
+    assert "pip install 'geosplat_jax[view]'" in error_text
+    assert error_text.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -305,12 +305,12 @@ def test_factors_of_a_light_are_checked(tmp_path, capsys, name, value):
 )
 def test_a_file_that_could_not_be_written_is_refused_at_once(tmp_path, capsys, arguments):
     (tmp_path / "file").write_text("")
-    for place, message in ((tmp_path, "is a folder"), (tmp_path / "file" / "x", "nothing can be")):
-        assert main([*arguments, str(place)]) == 2
-        said = capsys.readouterr().err
-        assert f"{arguments[-1]} " in said
-        assert message in said
-        assert said.count("\n") == 1
+    for path, message in ((tmp_path, "is a folder"), (tmp_path / "file" / "x", "nothing can be")):
+        assert main([*arguments, str(path)]) == 2
+        error_text = capsys.readouterr().err
+        assert f"{arguments[-1]} " in error_text
+        assert message in error_text
+        assert error_text.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -345,7 +345,7 @@ def test_commands_on_something_that_is_not_a_run_say_so(tmp_path, capsys, comman
 )
 def test_a_bad_setting_is_one_line(tmp_path, capsys, setting, message):
     assert train(tmp_path / "x", "--set", setting) == 2
-    said = capsys.readouterr().err
-    assert message in said
-    assert said.count("\n") == 1
+    error_text = capsys.readouterr().err
+    assert message in error_text
+    assert error_text.count("\n") == 1
     assert not (tmp_path / "x").exists()

@@ -49,20 +49,20 @@ def test_a_step_finds_its_programs_compiled(caplog):
 
 def test_a_run_that_stops_early_leaves_no_thread_behind(tmp_path, monkeypatch):
     """A process that ends while one of its threads compiles crashes, above all after Ctrl-C."""
-    begun = []
+    background_threads = []
 
     def slowly(*arguments, is_wanted=lambda: True, **others):
         if "threads" in others:  # the one in the background
-            begun.append(threading.current_thread())
-            until = time.monotonic() + 20
-            while is_wanted() and time.monotonic() < until:
+            background_threads.append(threading.current_thread())
+            deadline = time.monotonic() + 20
+            while is_wanted() and time.monotonic() < deadline:
                 time.sleep(0.01)
 
     monkeypatch.setattr(upcoming, "compile_step", slowly)
     fit(sphere_dataset(), tiny_config(*MONTE_CARLO), tmp_path, stop_after=3)
-    assert len(begun) == 1
-    begun[0].join(timeout=1)
-    assert not begun[0].is_alive()
+    assert len(background_threads) == 1
+    background_threads[0].join(timeout=1)
+    assert not background_threads[0].is_alive()
 
 
 NOTHING: Any = [object.__new__(kind) for kind in (TrainState, Batch, Pipeline, UpdateRule)]
@@ -109,12 +109,12 @@ def test_a_compilation_that_fails_is_told(monkeypatch):
 
 def test_no_thread_compiles_on_for_a_step_that_failed(monkeypatch):
     """The next training would wait for such a thread, and so would the end of the process."""
-    ended = []
+    completions = []
 
     class Slow(_Program):
         def compile(self):
             time.sleep(self.seconds)
-            ended.append(self.seconds)
+            completions.append(self.seconds)
             return self
 
     class Wrong(_Program):
@@ -124,15 +124,15 @@ def test_no_thread_compiles_on_for_a_step_that_failed(monkeypatch):
     monkeypatch.setattr(compilation, "require_program_memory", lambda *a: None)
     monkeypatch.setattr(compilation, "fits_twice", lambda program: True)
     monkeypatch.setattr(compilation, "THREADS", 2)
-    slow = [(Slow(fits=True, seconds=0.3 + 0.001 * number),) for number in range(8)]
-    programs = [(Wrong(fits=True, seconds=0.0),), *slow]
+    slow_programs = [(Slow(fits=True, seconds=0.3 + 0.001 * number),) for number in range(8)]
+    programs = [(Wrong(fits=True, seconds=0.0),), *slow_programs]
     monkeypatch.setattr(compilation, "train_step", lambda *a, run: run.all(*programs))
     with pytest.raises(ValueError, match="no"):
         compile_step(*NOTHING, threads=2)
-    count = len(ended)
+    count = len(completions)
     assert count <= 4  # those that had begun
     time.sleep(0.7)
-    assert len(ended) == count
+    assert len(completions) == count
 
 
 def test_an_error_in_the_background_reaches_who_asks():

@@ -30,9 +30,9 @@ from geosplat_jax.transport.monte_carlo import MonteCarloSettings
 @pytest.mark.parametrize("quality", QUALITIES)
 def test_every_preset_and_quality_survives_json_and_raises_no_warning(preset, quality):
     config = make_config(preset, quality)
-    again = config_from_dict(json.loads(json.dumps(config.to_dict())))
-    assert again == config
-    assert differences(config, again) == []
+    restored_config = config_from_dict(json.loads(json.dumps(config.to_dict())))
+    assert restored_config == config
+    assert differences(config, restored_config) == []
     assert config_warnings(config) == []
 
 
@@ -109,22 +109,26 @@ def test_the_originals_have_the_schedule_of_the_authors_code(preset):
     assert isinstance(refine.domain, PerPixel)
     assert refine.domain.points == {"paper": "splats", "code": "mesh"}[preset]
     assert {"sdf", "deform", "weights", "shift"} <= set(refine.frozen)
-    first, later = refine.rates_at(0), refine.rates_at(500)
+    first_rates, later_rates = refine.rates_at(0), refine.rates_at(500)
     expected = {
         "splat_means": 1.6e-4, "splat_scales": 5e-3, "splat_quats": 1e-3, "splat_normals": 1e-3,
         "splat_opacities": 5e-2, "splat_albedo": 5e-3, "splat_indirect": 2.5e-3,
         "roughness_metallic": 5e-4, "light": 1e-3, "exposure": 5e-4,
     }  # fmt: skip
-    assert {name: first[name] for name in expected} == pytest.approx(expected)
+    assert {name: first_rates[name] for name in expected} == pytest.approx(expected)
     for name in expected:
         decays = name in ("splat_means", "splat_normals", "light", "exposure")
-        assert later[name] == pytest.approx(first[name] * (0.5 if decays else 1.0), rel=1e-5)
+        assert later_rates[name] == pytest.approx(
+            first_rates[name] * (0.5 if decays else 1.0), rel=1e-5
+        )
 
 
 def test_the_weights_of_the_entropy_and_the_smoothness_follow_paper_and_code():
     split_sum, monte_carlo, _ = make_config("paper").stages
-    whole = [s.weights_at(n)["entropy"] for s in (split_sum, monte_carlo) for n in (0, 250, 500)]
-    assert whole == pytest.approx([0.2, 0.105, 0.01, 0.01, 0.01, 0.01])
+    entropy_weights = [
+        s.weights_at(n)["entropy"] for s in (split_sum, monte_carlo) for n in (0, 250, 500)
+    ]
+    assert entropy_weights == pytest.approx([0.2, 0.105, 0.01, 0.01, 0.01, 0.01])
     assert split_sum.weights_at(0)["smoothness_albedo"] == 0.03
     assert split_sum.weights_at(0)["light"] == monte_carlo.weights_at(0)["light"] == 0.15
     split_sum, monte_carlo, refine = make_config("code").stages
@@ -161,12 +165,12 @@ def test_priors_of_shiny_materials_change_the_rates_of_the_authors_code():
 
 def test_a_draft_of_the_originals_is_smaller_and_keeps_their_method():
     for preset in ("paper", "code"):
-        whole, draft = make_config(preset), make_config(preset, "draft")
-        assert draft.geometry.resolution < whole.geometry.resolution
-        assert draft.total_steps < whole.total_steps
-        assert draft.adapter == whole.adapter
-        assert draft.raster == whole.raster
-        assert [s.weights for s in draft.stages] == [s.weights for s in whole.stages]
+        full_config, draft_config = make_config(preset), make_config(preset, "draft")
+        assert draft_config.geometry.resolution < full_config.geometry.resolution
+        assert draft_config.total_steps < full_config.total_steps
+        assert draft_config.adapter == full_config.adapter
+        assert draft_config.raster == full_config.raster
+        assert [s.weights for s in draft_config.stages] == [s.weights for s in full_config.stages]
 
 
 def test_overrides_reach_nested_settings_and_keep_types():
@@ -187,8 +191,8 @@ def test_overrides_reach_nested_settings_and_keep_types():
 
 
 def test_a_number_sets_the_value_of_a_rate_or_a_weight_and_leaves_the_rest():
-    before = make_config()
-    after = make_config(
+    config = make_config()
+    changed_config = make_config(
         overrides=(
             "stages.monte_carlo.rates.albedo=0.5",
             "stages.split_sum.weights.entropy=0.3",
@@ -196,10 +200,12 @@ def test_a_number_sets_the_value_of_a_rate_or_a_weight_and_leaves_the_rest():
             "stages.split_sum.weights.indirect.end=0.25",
         )
     )
-    assert after.stages[1].rates["albedo"] == Rate(0.5, before.stages[1].rates["albedo"].warmup)
-    assert after.stages[0].weights["entropy"] == Schedule(0.3, 0.01, 0.5)
-    assert after.stages[0].weights["light"] == Schedule(0.15)
-    assert after.stages[0].weights["indirect"] == Schedule(0.0, 0.25)
+    assert changed_config.stages[1].rates["albedo"] == Rate(
+        0.5, config.stages[1].rates["albedo"].warmup
+    )
+    assert changed_config.stages[0].weights["entropy"] == Schedule(0.3, 0.01, 0.5)
+    assert changed_config.stages[0].weights["light"] == Schedule(0.15)
+    assert changed_config.stages[0].weights["indirect"] == Schedule(0.0, 0.25)
 
 
 def test_the_word_none_takes_a_value_away():
@@ -300,9 +306,9 @@ def test_bad_overrides_say_what_is_wrong(override, message):
 
 def test_every_bad_override_has_a_line_of_its_own():
     overrides = ("run.seed=-1", "stages.split_sum.steps=-1", "stages.monte_carlo.steps=-1")
-    with pytest.raises(ValueError, match=".") as caught:
+    with pytest.raises(ValueError, match=".") as error_info:
         make_config(overrides=overrides)
-    lines = str(caught.value).splitlines()
+    lines = str(error_info.value).splitlines()
     assert sorted(line.split(" must be ")[0] for line in lines) == [
         "run.seed",
         "stages.monte_carlo.steps",
@@ -339,9 +345,9 @@ def test_settings_of_earlier_versions_are_refused_with_their_new_names(old, now)
 
 
 def test_a_run_of_an_earlier_version_is_refused_with_the_first_new_name():
-    old = {"preset": "default", "rates": {"sdf": 0.01}, "run": {"steps": 5}, "kind": "hybrid"}
+    settings = {"preset": "default", "rates": {"sdf": 0.01}, "run": {"steps": 5}, "kind": "hybrid"}
     with pytest.raises(ValueError, match=r"3 settings are of an earlier version, the first: rates"):
-        config_from_dict(old)
+        config_from_dict(settings)
 
 
 def test_unknown_names_are_refused():
@@ -401,11 +407,11 @@ def test_stages_of_one_name_are_refused():
 
 
 def test_differences_name_the_setting_and_both_values():
-    first = make_config()
-    second = make_config(overrides=("stages.monte_carlo.rates.sdf=0.25",))
-    found = differences(first, second)
-    assert found == ["stages.monte_carlo.rates.sdf.value: 0.001 -> 0.25"]
-    assert differences(first, second, stages=["split_sum"]) == []
+    config = make_config()
+    changed_config = make_config(overrides=("stages.monte_carlo.rates.sdf=0.25",))
+    changes = differences(config, changed_config)
+    assert changes == ["stages.monte_carlo.rates.sdf.value: 0.001 -> 0.25"]
+    assert differences(config, changed_config, stages=["split_sum"]) == []
 
 
 @pytest.mark.parametrize(
@@ -494,18 +500,18 @@ def test_differences_name_the_setting_and_both_values():
     ],
 )
 def test_settings_without_effect_are_told(overrides, told):
-    found = config_warnings(make_config(overrides=overrides))
-    assert len(found) == len(told)
-    assert all(words in text for words, text in zip(told, found, strict=True))
+    warnings = config_warnings(make_config(overrides=overrides))
+    assert len(warnings) == len(told)
+    assert all(phrase in text for phrase, text in zip(told, warnings, strict=True))
 
 
 def test_whoever_reads_a_configuration_needs_no_other_module(tmp_path):
-    ball, written = tmp_path / "ball.ply", tmp_path / "config.json"
+    ball, config_path = tmp_path / "ball.ply", tmp_path / "config.json"
     trimesh.creation.icosphere(1).export(ball)
-    written.write_text(json.dumps(make_config("default", "standard", mesh=ball).to_dict()))
+    config_path.write_text(json.dumps(make_config("default", "standard", mesh=ball).to_dict()))
     script = (
         "import json, sys; from geosplat_jax.fit.config import config_from_dict; "
         "config_from_dict(json.load(open(sys.argv[1])))"
     )
-    done = subprocess.run([sys.executable, "-c", script, str(written)], capture_output=True)
-    assert done.returncode == 0, done.stderr.decode()[-500:]
+    process = subprocess.run([sys.executable, "-c", script, str(config_path)], capture_output=True)
+    assert process.returncode == 0, process.stderr.decode()[-500:]

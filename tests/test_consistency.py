@@ -64,48 +64,50 @@ def with_splats(body, **changes):
 
 def away_from(eye, body):
     """Unit directions from the eye to the splats."""
-    away = body.splats.means - jnp.asarray(eye)[None, :]
-    return away / jnp.linalg.norm(away, axis=1, keepdims=True)
+    offsets = body.splats.means - jnp.asarray(eye)[None, :]
+    return offsets / jnp.linalg.norm(offsets, axis=1, keepdims=True)
 
 
 def test_a_plane_is_what_its_splats_are(body, cameras):
     """Only distances differ, since that of a splat's mean is not that of the pixel's centre."""
-    found = measure(body, cameras)
-    assert found.pixels == 32 * 32
-    assert found.reflection_deg < 0.01
-    assert found.distance < 0.01
-    assert (found.uncovered, found.behind) == (0, 0)
+    figures = measure(body, cameras)
+    assert figures.pixels == 32 * 32
+    assert figures.reflection_deg < 0.01
+    assert figures.distance < 0.01
+    assert (figures.uncovered, figures.behind) == (0, 0)
 
 
 def test_normals_that_are_turned_turn_the_reflection_by_twice_as_much(body, cameras):
     eye = np.asarray(EYE) / np.linalg.norm(EYE)
     # The normal turns in the plane that holds the line of sight to the middle of the picture, where
     # the angle doubles exactly.
-    across = eye - eye[2] * np.array([0, 0, 1.0])
-    across /= np.linalg.norm(across)
+    tangent = eye - eye[2] * np.array([0, 0, 1.0])
+    tangent /= np.linalg.norm(tangent)
     angle = np.deg2rad(10.0)
-    normal = np.cos(angle) * np.array([0, 0, 1.0]) + np.sin(angle) * across
+    normal = np.cos(angle) * np.array([0, 0, 1.0]) + np.sin(angle) * tangent
     normals = jnp.broadcast_to(jnp.asarray(normal, jnp.float32), body.splats.normals.shape)
-    found = measure(with_splats(body, normals=normals), cameras)
-    assert found.reflection_deg == pytest.approx(20.0, abs=0.3)
+    figures = measure(with_splats(body, normals=normals), cameras)
+    assert figures.reflection_deg == pytest.approx(20.0, abs=0.3)
 
 
 def test_splats_that_sink_change_the_distance_by_as_much(body, cameras):
-    sunk = with_splats(body, means=body.splats.means + 0.1 * away_from(EYE, body))
-    raised = with_splats(body, means=body.splats.means - 0.1 * away_from(EYE, body))
-    far, near = (measure(b, cameras).distance for b in (sunk, raised))
+    sunk_body = with_splats(body, means=body.splats.means + 0.1 * away_from(EYE, body))
+    raised_body = with_splats(body, means=body.splats.means - 0.1 * away_from(EYE, body))
+    sunk_distance, raised_distance = (
+        measure(b, cameras).distance for b in (sunk_body, raised_body)
+    )
     # At a slant the nearer of two splats shows, so both surfaces are a little closer than the
     # means.
     assert body.diagonal == pytest.approx(np.sqrt(8))
-    assert 0.5 * (far + near) == pytest.approx(0.1 / body.diagonal, rel=0.05)
+    assert 0.5 * (sunk_distance + raised_distance) == pytest.approx(0.1 / body.diagonal, rel=0.05)
 
 
 def test_pixels_without_splats_are_told_and_not_compared(body, cameras):
     is_left = body.splats.means[:, 0] > 0
     opacities = jnp.where(is_left, body.splats.opacities, 0.0)
-    found = measure(with_splats(body, opacities=opacities), cameras)
-    assert 0.3 < found.uncovered < 0.7
-    assert found.pixels == pytest.approx((1 - found.uncovered) * 32 * 32)
+    figures = measure(with_splats(body, opacities=opacities), cameras)
+    assert 0.3 < figures.uncovered < 0.7
+    assert figures.pixels == pytest.approx((1 - figures.uncovered) * 32 * 32)
     with pytest.raises(ValueError, match="no view sees the mesh"):
         measure(with_splats(body, opacities=0 * opacities), cameras)
 
@@ -120,8 +122,8 @@ def test_backs_of_faces_are_told_and_not_compared(body, cameras):
 
 
 def test_buffers_grow(body, cameras):
-    small = pixel_errors(body, cameras, Capacities(visible=4096, hits=128, chunks=4096))
-    np.testing.assert_array_equal(small.coverage, pixel_errors(body, cameras).coverage)
+    errors = pixel_errors(body, cameras, Capacities(visible=4096, hits=128, chunks=4096))
+    np.testing.assert_array_equal(errors.coverage, pixel_errors(body, cameras).coverage)
 
 
 def test_rays_meet_what_a_ray_tracer_says(tmp_path):
@@ -130,23 +132,23 @@ def test_rays_meet_what_a_ray_tracer_says(tmp_path):
     ball.vertices *= 1 + 0.2 * np.sin(5 * ball.vertices[:, :1]) * np.cos(4 * ball.vertices[:, 1:2])
     body = body_of_mesh(load_mesh(saved(ball, tmp_path)))
     camera = cameras_around(box_of(load_mesh(tmp_path / "mesh.ply")), views=3, size=40)[1]
-    seen = see_mesh(body.vertices, body.faces, body.normals, camera)
+    mesh_view = see_mesh(body.vertices, body.faces, body.normals, camera)
     solid = trimesh.Trimesh(body.vertices, body.faces, process=False)
-    towards = seen.towards.reshape(-1, 3)
+    ray_directions = mesh_view.towards.reshape(-1, 3)
     eye = np.asarray(camera.centers, np.float64)
-    places, rays, rows = solid.ray.intersects_location(
-        np.repeat(eye, len(towards), axis=0), towards, multiple_hits=False
+    hit_points, rays, rows = solid.ray.intersects_location(
+        np.repeat(eye, len(ray_directions), axis=0), ray_directions, multiple_hits=False
     )
-    differ = seen.is_hit.ravel() ^ np.isin(np.arange(len(towards)), rays)
-    assert differ.sum() <= 2  # a ray along an edge of the outline may go either way
-    rays, places, rows = (x[seen.is_hit.ravel()[rays]] for x in (rays, places, rows))
-    ranges = np.linalg.norm(places - eye, axis=1)
-    np.testing.assert_allclose(seen.ranges.ravel()[rays], ranges, atol=2e-5)
-    shares = trimesh.triangles.points_to_barycentric(solid.triangles[rows], places)
+    is_different = mesh_view.is_hit.ravel() ^ np.isin(np.arange(len(ray_directions)), rays)
+    assert is_different.sum() <= 2  # a ray along an edge of the outline may go either way
+    rays, hit_points, rows = (x[mesh_view.is_hit.ravel()[rays]] for x in (rays, hit_points, rows))
+    ranges = np.linalg.norm(hit_points - eye, axis=1)
+    np.testing.assert_allclose(mesh_view.ranges.ravel()[rays], ranges, atol=2e-5)
+    shares = trimesh.triangles.points_to_barycentric(solid.triangles[rows], hit_points)
     normals = np.einsum("nk,nkd->nd", shares, body.normals[body.faces[rows]])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    np.testing.assert_allclose(seen.normals.reshape(-1, 3)[rays], normals, atol=2e-4)
-    assert seen.is_outside[seen.is_hit].all()
+    np.testing.assert_allclose(mesh_view.normals.reshape(-1, 3)[rays], normals, atol=2e-4)
+    assert mesh_view.is_outside[mesh_view.is_hit].all()
 
 
 def test_of_a_sheet_both_sides_are_outside_with_a_normal_of_their_own(tmp_path):
@@ -154,43 +156,43 @@ def test_of_a_sheet_both_sides_are_outside_with_a_normal_of_their_own(tmp_path):
     ball.update_faces(ball.triangles_center[:, 2] < 0.3)
     mesh = load_mesh(saved(ball, tmp_path))
     body, cameras = body_of_mesh(mesh), cameras_around(box_of(mesh), views=4, size=32)
-    one, both = (
-        [replace(body, is_two_sided=both).seen(camera) for camera in cameras]
-        for both in (False, True)
+    one_sided, two_sided = (
+        [replace(body, is_two_sided=two_sided).seen(camera) for camera in cameras]
+        for two_sided in (False, True)
     )
-    backs = 0
-    for single, double in zip(one, both, strict=True):
-        hit = single.is_hit
-        np.testing.assert_array_equal(double.is_outside, hit)
-        sign = np.where(single.is_outside, 1.0, -1.0)[..., None]
-        np.testing.assert_array_equal(double.normals, single.normals * sign)
-        towards = (double.normals * double.towards).sum(-1)[hit]
-        assert np.mean(towards < 0) > 0.98
-        backs += np.sum(hit & ~single.is_outside)
-    assert backs > 100
+    back_count = 0
+    for one_sided_view, two_sided_view in zip(one_sided, two_sided, strict=True):
+        hit = one_sided_view.is_hit
+        np.testing.assert_array_equal(two_sided_view.is_outside, hit)
+        sign = np.where(one_sided_view.is_outside, 1.0, -1.0)[..., None]
+        np.testing.assert_array_equal(two_sided_view.normals, one_sided_view.normals * sign)
+        cosines = (two_sided_view.normals * two_sided_view.towards).sum(-1)[hit]
+        assert np.mean(cosines < 0) > 0.98
+        back_count += np.sum(hit & ~one_sided_view.is_outside)
+    assert back_count > 100
 
 
 def test_seams_of_a_file_are_sewn(tmp_path):
     """A file that repeats the corners of every face gives the normals of the connected mesh."""
     ball = trimesh.creation.icosphere(subdivisions=2)
-    torn = trimesh.Trimesh(
+    torn_mesh = trimesh.Trimesh(
         ball.vertices[ball.faces].reshape(-1, 3),
         np.arange(3 * len(ball.faces)).reshape(-1, 3),
         process=False,
     )
-    mesh = load_mesh(saved(torn, tmp_path))
+    mesh = load_mesh(saved(torn_mesh, tmp_path))
     assert int(mesh.vertex_count) == len(ball.vertices)
-    whole = load_mesh(saved(ball, tmp_path, "whole.ply"))
-    normals = [body_of_mesh(m).normals for m in (mesh, whole)]
+    whole_mesh = load_mesh(saved(ball, tmp_path, "whole.ply"))
+    normals = [body_of_mesh(m).normals for m in (mesh, whole_mesh)]
     np.testing.assert_allclose(normals[0], normals[1], atol=1e-6)
 
 
 def test_what_is_a_share_of_the_box_follows_the_size_of_the_mesh(tmp_path):
-    small, large = (plane(4) for _ in range(2))
-    large.apply_scale(10.0)
+    small_mesh, large_mesh = (plane(4) for _ in range(2))
+    large_mesh.apply_scale(10.0)
     bodies = [
         body_of_mesh(load_mesh(saved(mesh, tmp_path, f"{k}.obj")))
-        for k, mesh in enumerate((small, large))
+        for k, mesh in enumerate((small_mesh, large_mesh))
     ]
     np.testing.assert_allclose(bodies[1].splats.scales, 10 * bodies[0].splats.scales, rtol=1e-5)
     assert bodies[1].near == pytest.approx(10 * bodies[0].near)
@@ -209,10 +211,10 @@ def test_constants_of_the_splats_change_what_is_found(tmp_path):
     """Wider splats on a curved ball change the reflection, although no normal is turned."""
     mesh = load_mesh(saved(trimesh.creation.icosphere(subdivisions=2), tmp_path))
     cameras = cameras_around(box_of(mesh), views=1, size=32)
-    wide = FaceSplats(AdapterConstants(alpha=(2.0, 5.0)))
-    found = [measure(body_of_mesh(mesh, model), cameras) for model in (FaceSplats(), wide)]
-    assert found[1].reflection_deg > 1.2 * found[0].reflection_deg
-    assert found[0].reflection_deg > 3.0
+    wide_splats = FaceSplats(AdapterConstants(alpha=(2.0, 5.0)))
+    figures = [measure(body_of_mesh(mesh, model), cameras) for model in (FaceSplats(), wide_splats)]
+    assert figures[1].reflection_deg > 1.2 * figures[0].reflection_deg
+    assert figures[0].reflection_deg > 3.0
 
 
 def said(capsys):
@@ -223,10 +225,10 @@ def test_the_command_takes_any_closed_mesh(tmp_path, capsys):
     path = saved(trimesh.creation.icosphere(subdivisions=2), tmp_path, "ball.stl")
     target = tmp_path / "found.json"
     assert main(["consistency", str(path), "--size", "32", "--json", str(target)]) == 0
-    found = json.loads(target.read_text())
-    assert f"{found['reflection_deg']:.3f} degrees" in capsys.readouterr().out
+    figures = json.loads(target.read_text())
+    assert f"{figures['reflection_deg']:.3f} degrees" in capsys.readouterr().out
     cameras = cameras_around(box_of(load_mesh(path)), size=32)
-    assert found["pixels"] == measure(body_of_mesh(load_mesh(path)), cameras).pixels
+    assert figures["pixels"] == measure(body_of_mesh(load_mesh(path)), cameras).pixels
 
 
 @pytest.mark.parametrize(

@@ -34,9 +34,9 @@ def test_a_corner_is_refused_before_anything_is_spent_where_it_has_to_be(corner,
     if not corner.is_refused:
         require_training_memory(config, dataset)
         return
-    with pytest.raises(TrainingError, match="GB of memory would be needed") as caught:
+    with pytest.raises(TrainingError, match="GB of memory would be needed") as error_info:
         require_training_memory(config, dataset)
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(error_info.value)
 
 
 @pytest.mark.slow
@@ -77,7 +77,9 @@ def test_extremes_train_to_finite_numbers(overrides, tmp_path):
     assert [line["step"] for line in lines] == [0, 1, 2, 3]
     assert all(np.isfinite(line["loss"]) and line["splats"] > 0 for line in lines)
     assert all(
-        need <= line["capacities"][name] for line in lines for name, need in line["usage"].items()
+        row_count <= line["capacities"][name]
+        for line in lines
+        for name, row_count in line["usage"].items()
     )
 
 
@@ -96,6 +98,6 @@ def test_extremes_train_to_finite_numbers(overrides, tmp_path):
 def test_the_study_calls_a_corner_what_it_is(found, said):
     found = {"steps": 20, "finite": True} | found
     assert extremes.verdict(extremes.CORNERS[0], found, 20) == said
-    refused = extremes.Corner("large", is_refused=True)
+    refused_corner = extremes.Corner("large", is_refused=True)
     is_trained = found["outcome"] == "trained"
-    assert (extremes.verdict(refused, found, 20) == "not refused") == is_trained
+    assert (extremes.verdict(refused_corner, found, 20) == "not refused") == is_trained

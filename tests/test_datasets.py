@@ -60,10 +60,10 @@ def sphere_view(pose):
     x, y = np.meshgrid(pixel, -pixel)
     rays = np.stack([x, y, -np.ones_like(x)], -1) @ pose[:3, :3].T
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    along = -rays @ pose[:3, 3]
-    inside = RADIUS**2 - DISTANCE**2 + along**2
-    alpha = (inside > 0.0).astype(np.float32)[..., None]
-    depth = along - np.sqrt(np.maximum(inside, 0.0))
+    closest_depth = -rays @ pose[:3, 3]
+    discriminant = RADIUS**2 - DISTANCE**2 + closest_depth**2
+    alpha = (discriminant > 0.0).astype(np.float32)[..., None]
+    depth = closest_depth - np.sqrt(np.maximum(discriminant, 0.0))
     normals = (pose[:3, 3] + depth[..., None] * rays) / RADIUS
     return alpha, np.where(alpha > 0, normals, 0.0).astype(np.float32)
 
@@ -163,13 +163,13 @@ WRITERS = {
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory):
     """One pristine scene of each layout."""
-    made = {}
+    roots = {}
     for layout, write in WRITERS.items():
         root = tmp_path_factory.mktemp(layout) / "ball"
         root.mkdir()
         write(root)
-        made[layout] = root
-    return made
+        roots[layout] = root
+    return roots
 
 
 @pytest.fixture
@@ -211,12 +211,12 @@ def test_an_object_far_from_the_origin_is_warned_of(blender):
         for frame in content["frames"]:
             frame["transform_matrix"][0][3] += by
 
-    told = "times its size away from the origin"
-    assert not any(told in text for text in load(blender).warnings)
+    message = "times its size away from the origin"
+    assert not any(message in text for text in load(blender).warnings)
     for name in ("transforms_train.json", "transforms_test.json"):
         edit(blender, lambda content: moved(content, 5e4), name=name)
     bounds = list(np.array(BOX) + [5e4, 0.0, 0.0])
-    assert any(told in text for text in load(blender, bounds=bounds).warnings)
+    assert any(message in text for text in load(blender, bounds=bounds).warnings)
 
 
 def test_cameras_on_one_side_only_are_warned_of(blender):
@@ -232,10 +232,10 @@ def test_cameras_on_one_side_only_are_warned_of(blender):
 def test_a_damaged_picture_is_one_line_and_the_decoder_is_silent(blender, spoil, capfd):
     path = blender / "train" / "r_1.png"
     path.write_bytes(spoil(path.read_bytes()))
-    with pytest.raises(ImageReadError) as caught:
+    with pytest.raises(ImageReadError) as error_info:
         load(blender)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert str(path) in str(error_info.value)
+    assert "\n" not in str(error_info.value)
     assert capfd.readouterr().err == ""
 
 
@@ -255,8 +255,8 @@ def test_only_the_lines_of_decoders_are_kept_away(capfd):
 def test_every_frame_has_its_own_angle_where_it_says_so(tmp_path):
     pose = np.eye(4).tolist()
     frames = [
-        {"file_path": f"r_{k}", "transform_matrix": pose, **own}
-        for k, own in enumerate(({}, {"camera_angle_x": 0.5}, {"camera_angle_x": 0.7}))
+        {"file_path": f"r_{k}", "transform_matrix": pose, **own_lens}
+        for k, own_lens in enumerate(({}, {"camera_angle_x": 0.5}, {"camera_angle_x": 0.7}))
     ]
     path = tmp_path / "transforms_train.json"
     path.write_text(json.dumps({"camera_angle_x": 0.6, "frames": frames}))
@@ -305,10 +305,10 @@ def test_cameras_use_opencv_axes_and_the_formula_of_blender(scenes):
 @pytest.mark.parametrize("layout", ["tensoir", "shiny_blender"])
 def test_normals_are_unit_and_in_world_axes(scenes, layout):
     normal = load(scenes[layout]).test.truth["normal"]
-    for read, pose in zip(normal, split_poses("test"), strict=True):
-        alpha, exact = sphere_view(pose)
-        np.testing.assert_allclose(read, exact, atol=2.5 * STEP)
-        np.testing.assert_allclose(np.linalg.norm(read, axis=-1), alpha[..., 0], atol=1e-5)
+    for actual, pose in zip(normal, split_poses("test"), strict=True):
+        alpha, expected = sphere_view(pose)
+        np.testing.assert_allclose(actual, expected, atol=2.5 * STEP)
+        np.testing.assert_allclose(np.linalg.norm(actual, axis=-1), alpha[..., 0], atol=1e-5)
 
 
 @pytest.mark.parametrize("layout", ["tensoir", "synthetic4relight"])
@@ -331,8 +331,8 @@ def test_relit_views_have_colour_and_alpha(scenes, layout, gains):
     assert set(test.relight) == set(gains)
     for light, gain in gains.items():
         np.testing.assert_array_equal(test.relight[light][..., 3], test.images[..., 3])
-        found = color_on_mask(test.relight[light])
-        np.testing.assert_allclose(found, gain * RADIANCE, atol=2 * STEP)
+        color = color_on_mask(test.relight[light])
+        np.testing.assert_allclose(color, gain * RADIANCE, atol=2 * STEP)
 
 
 @pytest.mark.parametrize("factor", [2, 4])
@@ -340,15 +340,15 @@ def test_relit_views_without_alpha_are_reduced_as_those_with_it(scenes, tmp_path
     """Their background, here white, must not be averaged into the rim."""
     root = shutil.copytree(scenes["synthetic4relight"], tmp_path / "ball")
     alphas = [read_image(path)[..., 3:] for path in sorted((root / "test").glob("*_rgba.png"))]
-    relit = []
+    relit_views = []
     for with_alpha in (True, False):
         for number, alpha in enumerate(alphas):
             path = root / "test_rli" / f"envmap6_{number:03d}.png"
             color = np.where(alpha > 0, read_image(path)[..., :3], 1.0)
             write_png(path, np.concatenate([color, alpha], -1) if with_alpha else color)
-        relit.append(load(root, downscale=factor).test.relight["envmap6"])
-    np.testing.assert_allclose(relit[1], relit[0], atol=1e-5)
-    rim = (relit[0][..., 3] > 0) & (relit[0][..., 3] < 1)
+        relit_views.append(load(root, downscale=factor).test.relight["envmap6"])
+    np.testing.assert_allclose(relit_views[1], relit_views[0], atol=1e-5)
+    rim = (relit_views[0][..., 3] > 0) & (relit_views[0][..., 3] < 1)
     assert rim.any()
 
 
@@ -371,11 +371,13 @@ def test_tensoir_needs_no_transforms_and_no_scene_file(scenes, tmp_path):
     root = tmp_path / "ball"
     root.mkdir()
     write_tensoir(root, with_transforms=False, with_scene=False)
-    found, listed = load(root), load(scenes["tensoir"])
-    np.testing.assert_allclose(found.train.camera_to_world, listed.train.camera_to_world)
-    np.testing.assert_array_equal(found.test.images, listed.test.images)
-    assert found.train.names == listed.train.names
-    assert found.train_light == "noon"
+    scanned_dataset, listed_dataset = load(root), load(scenes["tensoir"])
+    np.testing.assert_allclose(
+        scanned_dataset.train.camera_to_world, listed_dataset.train.camera_to_world
+    )
+    np.testing.assert_array_equal(scanned_dataset.test.images, listed_dataset.test.images)
+    assert scanned_dataset.train.names == listed_dataset.train.names
+    assert scanned_dataset.train_light == "noon"
 
 
 def test_bounds_are_those_of_the_object(scenes):
@@ -386,17 +388,19 @@ def test_bounds_are_those_of_the_object(scenes):
 
 
 def test_reduced_views_are_the_same_cameras(scenes):
-    full, half = (load(scenes["tensoir"], downscale=factor) for factor in (1, 2))
-    assert half.train.images.shape == (COUNTS["train"], SIZE // 2, SIZE // 2, 4)
+    full_dataset, half_dataset = (load(scenes["tensoir"], downscale=factor) for factor in (1, 2))
+    assert half_dataset.train.images.shape == (COUNTS["train"], SIZE // 2, SIZE // 2, 4)
     scale = np.array([[2.0], [2.0], [1.0]])
-    np.testing.assert_allclose(half.train.intrinsics * scale, full.train.intrinsics)
+    np.testing.assert_allclose(half_dataset.train.intrinsics * scale, full_dataset.train.intrinsics)
     np.testing.assert_allclose(
-        half.train.images[..., 3].mean(), full.train.images[..., 3].mean(), rtol=1e-6
+        half_dataset.train.images[..., 3].mean(),
+        full_dataset.train.images[..., 3].mean(),
+        rtol=1e-6,
     )
-    for key, values in half.test.truth.items():
-        assert values.shape[:3] == half.test.images.shape[:3], key
-    length = np.linalg.norm(half.test.truth["normal"], axis=-1)
-    np.testing.assert_allclose(length[half.test.masks], 1.0, atol=1e-5)
+    for key, values in half_dataset.test.truth.items():
+        assert values.shape[:3] == half_dataset.test.images.shape[:3], key
+    length = np.linalg.norm(half_dataset.test.truth["normal"], axis=-1)
+    np.testing.assert_allclose(length[half_dataset.test.masks], 1.0, atol=1e-5)
 
 
 @pytest.mark.parametrize("factor", [-1, 0, 10**6])
@@ -422,8 +426,14 @@ def test_limits_spread_over_the_views(scenes):
 
 def test_describe_tells_what_a_user_asks(scenes):
     text = describe(load(scenes["tensoir"]))
-    for part in ("8 views of 24 x 24", "albedo, normal, roughness", "night.hdr", "bounds", "noon"):
-        assert part in text
+    for phrase in (
+        "8 views of 24 x 24",
+        "albedo, normal, roughness",
+        "night.hdr",
+        "bounds",
+        "noon",
+    ):
+        assert phrase in text
 
 
 def test_ground_truth_is_read_when_first_asked_for(tensoir):
@@ -518,15 +528,15 @@ def test_every_layout_with_transforms_takes_a_whole_lens(scenes, tmp_path, layou
 
 def test_a_frame_may_have_a_lens_of_its_own(blender):
     edit(with_lens(blender, LENS), lambda c: c["frames"][2].update(fl_x=50.0, cx=11.0))
-    found = load(blender).train.intrinsics
-    np.testing.assert_array_equal(found[2], [[50.0, 0, 11.0], [0, 30.0, 10.25], [0, 0, 1.0]])
-    np.testing.assert_array_equal(found[[1, 3]], np.stack([INTRINSICS] * 2))
+    intrinsics = load(blender).train.intrinsics
+    np.testing.assert_array_equal(intrinsics[2], [[50.0, 0, 11.0], [0, 30.0, 10.25], [0, 0, 1.0]])
+    np.testing.assert_array_equal(intrinsics[[1, 3]], np.stack([INTRINSICS] * 2))
 
 
 def test_a_lens_of_larger_images_is_scaled_to_those_on_disk(blender):
     lens = {"fl_x": 80.0, "fl_y": 90.0, "cx": 27.0, "cy": 30.75, "w": 2 * SIZE, "h": 3 * SIZE}
-    found = load(with_lens(blender, lens)).train.intrinsics[0]
-    np.testing.assert_array_equal(found, INTRINSICS)
+    intrinsics = load(with_lens(blender, lens)).train.intrinsics[0]
+    np.testing.assert_array_equal(intrinsics, INTRINSICS)
 
 
 @pytest.mark.parametrize(
@@ -545,30 +555,30 @@ def test_images_of_another_shape_than_their_lens_are_noticed(tmp_path, width, he
         frames.append({"file_path": f"images/{number}.png", "transform_matrix": pose.tolist()})
     (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
     warnings = load_dataset(tmp_path, bounds=((-0.5,) * 3, (0.5,) * 3)).warnings
-    found = [warning for warning in warnings if "not in proportion" in warning]
-    assert len(found) == 2 * (said is not None)
-    assert all(said in warning for warning in found)
+    proportion_warnings = [warning for warning in warnings if "not in proportion" in warning]
+    assert len(proportion_warnings) == 2 * (said is not None)
+    assert all(said in warning for warning in proportion_warnings)
 
 
 def test_what_a_lens_leaves_out_is_square_and_centred(blender):
     lens = {"fl_x": 40.0, "w": SIZE, "h": SIZE, "k1": 0.0, "p2": 0}
-    found = load(with_lens(blender, lens)).train.intrinsics[0]
+    intrinsics = load(with_lens(blender, lens)).train.intrinsics[0]
     middle = SIZE / 2
-    np.testing.assert_array_equal(found, [[40.0, 0, middle], [0, 40.0, middle], [0, 0, 1.0]])
+    np.testing.assert_array_equal(intrinsics, [[40.0, 0, middle], [0, 40.0, middle], [0, 0, 1.0]])
 
 
 def test_a_vertical_angle_gives_the_vertical_focal_length(blender):
     with_lens(blender, {"camera_angle_x": 0.8, "camera_angle_y": 0.4, "w": SIZE, "h": SIZE})
-    found = load(blender).train.intrinsics[0]
-    assert found[0, 0] == pytest.approx(0.5 * SIZE / np.tan(0.4))
-    assert found[1, 1] == pytest.approx(0.5 * SIZE / np.tan(0.2))
+    intrinsics = load(blender).train.intrinsics[0]
+    assert intrinsics[0, 0] == pytest.approx(0.5 * SIZE / np.tan(0.4))
+    assert intrinsics[1, 1] == pytest.approx(0.5 * SIZE / np.tan(0.2))
 
 
 def test_an_angle_gives_the_focal_length_that_a_lens_lacks(blender):
     edit(blender, lambda content: content.update(cx=9.0, w=SIZE, h=SIZE))
     focal = 0.5 * SIZE / np.tan(0.5 * ANGLE)
-    found = load(blender).train.intrinsics[0]
-    np.testing.assert_allclose(found, [[focal, 0, 9.0], [0, focal, SIZE / 2], [0, 0, 1.0]])
+    intrinsics = load(blender).train.intrinsics[0]
+    np.testing.assert_allclose(intrinsics, [[focal, 0, 9.0], [0, focal, SIZE / 2], [0, 0, 1.0]])
 
 
 @pytest.mark.parametrize("error", [-0.009, 0.009])
@@ -590,17 +600,17 @@ def test_a_distorted_lens_bends_truth_and_images_alike(scenes, tmp_path):
     root = shutil.copytree(scenes["shiny_blender"], tmp_path / "ball")
     for name in ("transforms_train.json", "transforms_test.json"):
         edit(root, lambda content: content.update(k1=0.5), name=name)
-    straight, bent = load(scenes["shiny_blender"]).test, load(root).test
+    pinhole_views, distorted_views = load(scenes["shiny_blender"]).test, load(root).test
     # The ball's rim is 7 pixels from the axis, at a focal length of 33. The lens shows it further
     # out, so it is nearer to the axis in the pinhole image.
-    assert 0.8 < bent.images[..., 3].sum() / straight.images[..., 3].sum() < 0.99
-    assert bent.valid is not None
-    inside = bent.images[..., 3] > 0.999
-    normal = bent.truth["normal"]
+    assert 0.8 < distorted_views.images[..., 3].sum() / pinhole_views.images[..., 3].sum() < 0.99
+    assert distorted_views.valid is not None
+    inside = distorted_views.images[..., 3] > 0.999
+    normal = distorted_views.truth["normal"]
     np.testing.assert_allclose(np.linalg.norm(normal[inside], axis=-1), 1.0, atol=1e-5)
-    assert (normal[bent.images[..., 3] == 0] == 0).all()
-    towards = bent.camera_to_world[:, :3, 2]
-    facing = np.einsum("vhwc,vc->vhw", normal, towards)
+    assert (normal[distorted_views.images[..., 3] == 0] == 0).all()
+    view_directions = distorted_views.camera_to_world[:, :3, 2]
+    facing = np.einsum("vhwc,vc->vhw", normal, view_directions)
     assert (facing[inside] > 0).all()
 
 
@@ -629,14 +639,14 @@ def test_an_image_of_any_format_may_be_named_with_its_ending(blender):
 
 @pytest.mark.parametrize("key", list(LENS))
 def test_every_number_of_a_lens_is_checked(blender, key):
-    where = r"frame 2 of .*transforms_train\.json must be a positive"
+    location = r"frame 2 of .*transforms_train\.json must be a positive"
     with_lens(blender, LENS)
-    wrong = [0, -3.0, np.nan, np.inf, "wide", None, True, [1.0], 10**400]
-    for value in [*wrong, SIZE + 0.5] if key in ("w", "h") else wrong:
+    wrong_values = [0, -3.0, np.nan, np.inf, "wide", None, True, [1.0], 10**400]
+    for value in [*wrong_values, SIZE + 0.5] if key in ("w", "h") else wrong_values:
         edit(blender, lambda content, v=value: content["frames"][2].update({key: v}))
-        with pytest.raises(SceneError, match=f"'{key}' of {where}") as caught:
+        with pytest.raises(SceneError, match=f"'{key}' of {location}") as error_info:
             load(blender)
-        assert "\n" not in str(caught.value)
+        assert "\n" not in str(error_info.value)
 
 
 def test_a_lens_needs_the_size_of_its_image_and_a_focal_length(blender):
@@ -657,10 +667,10 @@ def test_an_angle_is_the_pinhole_lens_that_it_describes():
     angle = AngleLens(ANGLE)
     for width, height in ((SIZE, SIZE), (30, 20)):
         focal = 0.5 * width / np.tan(0.5 * ANGLE)
-        spelled = PinholeLens(focal, focal, width / 2, height / 2, width, height)
+        pinhole = PinholeLens(focal, focal, width / 2, height / 2, width, height)
         for factor in (1, 3):
             size = (factor * width, factor * height)
-            np.testing.assert_allclose(spelled.intrinsics(*size), angle.intrinsics(*size))
+            np.testing.assert_allclose(pinhole.intrinsics(*size), angle.intrinsics(*size))
     assert hash(angle) == hash(AngleLens(ANGLE))
 
 
@@ -668,31 +678,31 @@ def test_equal_views_have_one_fingerprint_and_others_another(scenes):
     views = load(scenes["nerf_synthetic"]).test
     text = views.fingerprint()
     assert load(scenes["nerf_synthetic"]).test.fingerprint() == text
-    moved = views.camera_to_world.copy()
-    moved[1, 0, 3] += 1e-9
-    longer = views.intrinsics.copy()
-    longer[2, 0, 0] += 1e-9
-    others = [
-        replace(views, camera_to_world=moved),
-        replace(views, intrinsics=longer),
+    moved_poses = views.camera_to_world.copy()
+    moved_poses[1, 0, 3] += 1e-9
+    longer_lenses = views.intrinsics.copy()
+    longer_lenses[2, 0, 0] += 1e-9
+    variants = [
+        replace(views, camera_to_world=moved_poses),
+        replace(views, intrinsics=longer_lenses),
         replace(views, names=("r_0", "r_2", "r_1")),
         replace(views, images=views.images[:, :-1]),
         replace(views, images=views.images[:, :, :-1]),
         load(scenes["nerf_synthetic"]).train,
     ]
-    assert len({text, *(other.fingerprint() for other in others)}) == len(others) + 1
+    assert len({text, *(variant.fingerprint() for variant in variants)}) == len(variants) + 1
 
 
 def test_a_dataset_remembers_how_it_was_read(scenes):
     corners = ((-1, -1.5, -1), (1, 1, np.float64(2.0)))
-    read = load_dataset(scenes["tensoir"], downscale=2, light="noon", bounds=corners)
+    dataset = load_dataset(scenes["tensoir"], downscale=2, light="noon", bounds=corners)
     options = {"downscale": 2, "light": "noon", "bounds": [-1.0, -1.5, -1.0, 1.0, 1.0, 2.0]}
-    assert read.options == options
+    assert dataset.options == options
     # The options pass through JSON, as in the record of a run.
-    again = load_recorded(scenes["tensoir"], json.loads(json.dumps(dict(read.options))))
-    assert again.options == options
-    assert again.train.fingerprint() == read.train.fingerprint()
-    np.testing.assert_array_equal(again.bounds, read.bounds)
+    reread_dataset = load_recorded(scenes["tensoir"], json.loads(json.dumps(dict(dataset.options))))
+    assert reread_dataset.options == options
+    assert reread_dataset.train.fingerprint() == dataset.train.fingerprint()
+    np.testing.assert_array_equal(reread_dataset.bounds, dataset.bounds)
 
 
 def test_the_options_of_a_plain_reading_leave_everything_open(blender):
@@ -760,15 +770,15 @@ def test_masks_that_are_numbers_or_colours_of_labels_are_noticed(scenes, tmp_pat
 @pytest.mark.parametrize(("name", "warns"), [("Display P3", True), ("sRGB IEC61966-2.1", False)])
 def test_photographs_of_a_wide_colour_space_are_warned_of(blender, name, warns):
     profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-    built_in = "sRGB built-in".encode("utf-16-be")
-    assert built_in in profile
+    built_in_name = "sRGB built-in".encode("utf-16-be")
+    assert built_in_name in profile
     path = blender / "train" / "r_0.png"
     with Image.open(path) as image:
-        renamed = profile.replace(built_in, name[:13].ljust(13).encode("utf-16-be"))
-        image.save(path, icc_profile=renamed)
-    said = [warning for warning in load(blender).warnings if "read as sRGB" in warning]
-    assert (len(said) == 1) == warns
-    assert all("Display P3" in warning for warning in said)
+        renamed_profile = profile.replace(built_in_name, name[:13].ljust(13).encode("utf-16-be"))
+        image.save(path, icc_profile=renamed_profile)
+    profile_warnings = [warning for warning in load(blender).warnings if "read as sRGB" in warning]
+    assert (len(profile_warnings) == 1) == warns
+    assert all("Display P3" in warning for warning in profile_warnings)
 
 
 def test_images_without_alpha_and_mask_are_refused(blender):
@@ -926,10 +936,10 @@ def test_names_that_no_file_can_have_are_refused(blender):
 
 
 def test_links_that_lead_out_of_the_scene_are_refused(blender):
-    outside = blender.parent / "outside.png"
-    write_png(outside, np.ones((SIZE, SIZE, 4), np.float32))
+    outside_path = blender.parent / "outside.png"
+    write_png(outside_path, np.ones((SIZE, SIZE, 4), np.float32))
     (blender / "train" / "r_3.png").unlink()
-    (blender / "train" / "r_3.png").symlink_to(outside)
+    (blender / "train" / "r_3.png").symlink_to(outside_path)
     with pytest.raises(SceneError, match="leaves the scene folder"):
         load(blender)
 
@@ -1001,10 +1011,10 @@ def test_truth_without_an_alpha_is_reduced_within_the_mask(scenes, tmp_path):
     root = shutil.copytree(scenes["shiny_blender"], tmp_path / "ball")
     normal = np.array([0.6, 0.0, 0.8], np.float32)
     for path in root.glob("test/*_normal.png"):
-        covered = read_linear(path.with_name(path.name.replace("_normal", "_alpha"))) > 0
-        shown = np.where(covered, 0.5 + 0.5 * normal, 0.0).astype(np.float32)
-        write_png(path, shown)
+        is_covered = read_linear(path.with_name(path.name.replace("_normal", "_alpha"))) > 0
+        normal_picture = np.where(is_covered, 0.5 + 0.5 * normal, 0.0).astype(np.float32)
+        write_png(path, normal_picture)
     views = load(root, downscale=2).test
-    found = views.truth["normal"][views.images[..., 3] > 0]
-    assert len(found) > 20
-    np.testing.assert_allclose(found, np.broadcast_to(normal, found.shape), atol=0.01)
+    normals = views.truth["normal"][views.images[..., 3] > 0]
+    assert len(normals) > 20
+    np.testing.assert_allclose(normals, np.broadcast_to(normal, normals.shape), atol=0.01)

@@ -58,16 +58,16 @@ def flat(asset):
 def test_attributes_that_do_not_vary_make_both_domains_agree(scene):
     """The camera is far away, so that the direction towards it does not vary either."""
     pipeline, asset, _ = scene
-    far = views_from([[2000.0, -1000.0, 700.0]], size=SIZE, field_of_view=6e-4).camera([0])
-    per_splat = images(pipeline, flat(asset), far, pipeline.domain)
-    per_pixel = images(pipeline, flat(asset), far, PerPixel())
+    far_camera = views_from([[2000.0, -1000.0, 700.0]], size=SIZE, field_of_view=6e-4).camera([0])
+    per_splat = images(pipeline, flat(asset), far_camera, pipeline.domain)
+    per_pixel = images(pipeline, flat(asset), far_camera, PerPixel())
     assert float(jnp.max(per_splat[1])) > 0.9
-    for name, found, expected in [
+    for name, actual, expected in [
         ("rgb", per_pixel[0], per_splat[0]),
         ("alpha", per_pixel[1], per_splat[1]),
         *((name, per_pixel[2][name], per_splat[2][name]) for name in ALL if name != "depth"),
     ]:
-        np.testing.assert_allclose(found, expected, atol=2e-3, err_msg=name)
+        np.testing.assert_allclose(actual, expected, atol=2e-3, err_msg=name)
 
 
 def test_the_domains_differ_where_normals_do(scene):
@@ -77,8 +77,8 @@ def test_the_domains_differ_where_normals_do(scene):
     shiny = replace(materials, roughness=jnp.full_like(materials.roughness, 0.15))
     asset = replace(asset, attributes=replace(asset.attributes, materials=shiny))
     per_splat, alpha, _ = images(pipeline, asset, camera, pipeline.domain, ())
-    per_pixel, same, _ = images(pipeline, asset, camera, PerPixel(), ())
-    np.testing.assert_array_equal(alpha, same)
+    per_pixel, per_pixel_alpha, _ = images(pipeline, asset, camera, PerPixel(), ())
+    np.testing.assert_array_equal(alpha, per_pixel_alpha)
     difference = float(jnp.max(jnp.abs(per_splat - per_pixel)))
     assert 1e-3 < difference < 0.2
 
@@ -87,8 +87,8 @@ def test_pixels_that_nothing_covers_are_black_and_have_finite_gradients(scene):
     pipeline, asset, camera = scene
 
     def brightness(normals):
-        moved = replace(asset, splats=replace(asset.splats, normals=normals))
-        return jnp.sum(images(pipeline, moved, camera, PerPixel(), ())[0])
+        changed_asset = replace(asset, splats=replace(asset.splats, normals=normals))
+        return jnp.sum(images(pipeline, changed_asset, camera, PerPixel(), ())[0])
 
     rgb, alpha, _ = images(pipeline, asset, camera, PerPixel(), ())
     assert bool(jnp.any(alpha == 0))
@@ -105,8 +105,10 @@ def test_opacity_moves_colours_only_where_the_coverage_is_differentiated(scene, 
     domain = PerPixel(detach_coverage=detach)
 
     def brightness(opacities):
-        moved = replace(flat(asset), splats=replace(flat(asset).splats, opacities=opacities))
-        rgb, alpha, _ = images(pipeline, moved, camera, domain, ())
+        changed_asset = replace(
+            flat(asset), splats=replace(flat(asset).splats, opacities=opacities)
+        )
+        rgb, alpha, _ = images(pipeline, changed_asset, camera, domain, ())
         share = jnp.where(alpha > 0.5, alpha, 1.0)
         return jnp.sum(jnp.where((alpha > 0.5)[..., None], rgb / share[..., None], 0.0))
 
@@ -166,15 +168,17 @@ def test_points_of_the_mesh_lie_on_it(traced):
     assert 40 < hit.sum() < SIZE**2
     np.testing.assert_allclose(radii[hit], 0.4, atol=0.02)  # chords of large faces
     assert np.all(radii[~hit] > 5)  # the blended position, where the ray misses
-    along = np.sum(np.asarray(points.outward)[hit] * np.asarray(points.positions)[hit], axis=1)
-    assert np.all(along > 0.35)
+    radial_distances = np.sum(
+        np.asarray(points.outward)[hit] * np.asarray(points.positions)[hit], axis=1
+    )
+    assert np.all(radial_distances > 0.35)
 
 
 def test_views_do_not_share_their_samples(traced):
     """Light gathered for splats says nothing about pixels, so none is gathered in advance."""
     pipeline, asset, camera = traced
-    adapted = replace(pipeline, domain=PerPixel())
+    per_pixel_pipeline = replace(pipeline, domain=PerPixel())
     illumination, _ = jax.jit(RenderPipeline.illuminate)(
-        adapted, asset, sky(), key=jax.random.key(0)
+        per_pixel_pipeline, asset, sky(), key=jax.random.key(0)
     )
     assert illumination.gathered is None

@@ -43,9 +43,9 @@ def rough_guides(height, width, seed=0, dtype=np.float32):
     normals /= np.sqrt((normals**2).sum(-1, keepdims=True))
     depth = 2 + 0.02 * rng.random((height, width))
     albedo = 0.5 + 0.1 * rng.random((height, width, 3))
-    covered = alpha[..., None]
+    coverage = alpha[..., None]
     return [
-        np.asarray(x, dtype) for x in (alpha, normals * covered, depth * alpha, albedo * covered)
+        np.asarray(x, dtype) for x in (alpha, normals * coverage, depth * alpha, albedo * coverage)
     ]
 
 
@@ -75,52 +75,56 @@ def composed_kernel(iterations):
 def dense_pass(light, alpha, normals, depth, albedo, spread, spec, focal):
     """Compute one pass in float64 from the formulas, pixel by pixel and tap by tap."""
     height, width = alpha.shape
-    covered = alpha > 0
-    divisor = np.where(covered, alpha, 1.0)
+    is_covered = alpha > 0
+    divisor = np.where(is_covered, alpha, 1.0)
     length = np.sqrt((normals**2).sum(-1, keepdims=True))
     unit = normals / np.where(length > 0, length, 1.0)
-    straight = albedo / divisor[..., None]
-    z = focal * np.log(np.where(covered, depth / divisor, 1e-20))
+    straight_albedo = albedo / divisor[..., None]
+    z = focal * np.log(np.where(is_covered, depth / divisor, 1e-20))
 
     def slope(y, x, dy, dx):
         def usable(j, i):
-            return 0 <= j < height and 0 <= i < width and covered[j, i]
+            return 0 <= j < height and 0 <= i < width and is_covered[j, i]
 
-        ahead = z[y + dy, x + dx] - z[y, x] if usable(y + dy, x + dx) else None
-        behind = z[y, x] - z[y - dy, x - dx] if usable(y - dy, x - dx) else None
-        if ahead is None or behind is None:
-            return (ahead or 0.0) + (behind or 0.0)
-        return min(ahead, behind, key=abs) if ahead * behind > 0 else 0.0
+        forward = z[y + dy, x + dx] - z[y, x] if usable(y + dy, x + dx) else None
+        backward = z[y, x] - z[y - dy, x - dx] if usable(y - dy, x - dx) else None
+        if forward is None or backward is None:
+            return (forward or 0.0) + (backward or 0.0)
+        return min(forward, backward, key=abs) if forward * backward > 0 else 0.0
 
     pixels = [(y, x) for y in range(height) for x in range(width)]
     gy = np.array([slope(y, x, 1, 0) for y, x in pixels]).reshape(height, width)
     gx = np.array([slope(y, x, 0, 1) for y, x in pixels]).reshape(height, width)
     cosine2 = 1 / (1 + gx**2 + gy**2)
     spline = {0: 3 / 8, 1: 1 / 4, 2: 1 / 16}
-    out = np.zeros_like(light)
+    result = np.zeros_like(light)
     for y, x in pixels:
-        total, weight_sum = np.zeros(light.shape[-1]), 0.0
+        light_sum, weight_sum = np.zeros(light.shape[-1]), 0.0
         for dy in range(-2, 3):
             for dx in range(-2, 3):
                 j, i = y + dy * spread, x + dx * spread
                 if not (0 <= j < height and 0 <= i < width):
                     continue
                 exponent = spec.normal_sharpness * ((unit[y, x] - unit[j, i]) ** 2).sum() / 2
-                exponent += ((straight[y, x] - straight[j, i]) ** 2).sum() / spec.albedo_sigma**2
+                exponent += (
+                    (straight_albedo[y, x] - straight_albedo[j, i]) ** 2
+                ).sum() / spec.albedo_sigma**2
                 if (dy, dx) != (0, 0):
                     up, right = dy * spread, dx * spread
-                    here = gy[y, x] * up + gx[y, x] * right
-                    there = gy[j, i] * up + gx[j, i] * right
-                    rise = 2 / (1 / here + 1 / there) if here * there > 0 else 0.0
-                    off = z[j, i] - z[y, x] - rise
+                    center_rise = gy[y, x] * up + gx[y, x] * right
+                    tap_rise = gy[j, i] * up + gx[j, i] * right
+                    rise = (
+                        2 / (1 / center_rise + 1 / tap_rise) if center_rise * tap_rise > 0 else 0.0
+                    )
+                    deviation = z[j, i] - z[y, x] - rise
                     tilt = max(cosine2[y, x], cosine2[j, i])
-                    exponent += off**2 * tilt / (spec.depth_sigma**2 * np.hypot(up, right))
+                    exponent += deviation**2 * tilt / (spec.depth_sigma**2 * np.hypot(up, right))
                 weight = spline[abs(dy)] * spline[abs(dx)] * np.exp(-exponent)
-                total += weight * light[j, i] * covered[j, i]
+                light_sum += weight * light[j, i] * is_covered[j, i]
                 weight_sum += weight * alpha[j, i]
-        if covered[y, x]:
-            out[y, x] = alpha[y, x] * total / weight_sum
-    return out
+        if is_covered[y, x]:
+            result[y, x] = alpha[y, x] * light_sum / weight_sum
+    return result
 
 
 @pytest.mark.parametrize("shape", [(9, 12), (3, 2)])
@@ -129,12 +133,12 @@ def test_two_passes_follow_the_formulas(shape):
     guides = rough_guides(*shape, dtype=np.float64)
     light = np.random.default_rng(1).random((*shape, 2)) * guides[0][..., None]
     with double_precision():
-        found = run(light, guides, spec, focal=focal)
+        actual = run(light, guides, spec, focal=focal)
     expected = light
     for spread in (1, 2):
         expected = dense_pass(expected, *guides, spread, spec, focal)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=DOUBLE_ROUNDING)
-    assert np.abs(found - light).max() > 0.05
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=DOUBLE_ROUNDING)
+    assert np.abs(actual - light).max() > 0.05
 
 
 def test_no_iterations_are_the_identity_bit_by_bit():
@@ -145,28 +149,28 @@ def test_no_iterations_are_the_identity_bit_by_bit():
 def test_constant_light_stays_and_holes_stay_empty():
     guides = rough_guides(12, 12)
     light = guides[0][..., None] * np.float32([0.25, 3.0])
-    found = run(light, guides)
-    np.testing.assert_allclose(found, light, rtol=0, atol=3.0 * ROUNDING)
+    filtered = run(light, guides)
+    np.testing.assert_allclose(filtered, light, rtol=0, atol=3.0 * ROUNDING)
     assert (guides[0] == 0).any()
-    np.testing.assert_array_equal(found[guides[0] == 0], 0.0)
+    np.testing.assert_array_equal(filtered[guides[0] == 0], 0.0)
 
 
 def test_light_where_nothing_is_does_not_bleed_in():
     guides = rough_guides(12, 12)
     light = guides[0][..., None] * np.ones(2, np.float32)
-    stray = np.where(guides[0][..., None] > 0, light, np.float32(1e6))
+    stray_light = np.where(guides[0][..., None] > 0, light, np.float32(1e6))
     # With every guide ignored, only the coverage keeps the stray light out.
     spec = DenoiseSpec(2, **OFF)
-    np.testing.assert_array_equal(run(stray, guides, spec), run(light, guides, spec))
+    np.testing.assert_array_equal(run(stray_light, guides, spec), run(light, guides, spec))
 
 
 def test_linear_in_the_light():
     rng, guides = np.random.default_rng(2), rough_guides(12, 10, dtype=np.float64)
     first, second = rng.normal(size=(2, 12, 10, 2))
     with double_precision():
-        together = run(2.5 * first - second, guides)
-        apart = 2.5 * run(first, guides) - run(second, guides)
-    np.testing.assert_allclose(together, apart, rtol=0, atol=DOUBLE_ROUNDING)
+        joint_result = run(2.5 * first - second, guides)
+        separate_sum = 2.5 * run(first, guides) - run(second, guides)
+    np.testing.assert_allclose(joint_result, separate_sum, rtol=0, atol=DOUBLE_ROUNDING)
 
 
 def test_pulled_back_cotangent_has_the_same_dot_product():
@@ -181,12 +185,14 @@ def test_pulled_back_cotangent_has_the_same_dot_product():
             _, pull = jax.vjp(lambda x: denoise(x, *constants, spec=spec), light)
             return pull(cotangent)[0]
 
-        pulled = pull_back(jnp.asarray(light), jnp.asarray(cotangent))
-        pushed = run(direction, guides, spec)
+        light_cotangent = pull_back(jnp.asarray(light), jnp.asarray(cotangent))
+        response = run(direction, guides, spec)
         np.testing.assert_allclose(
-            np.sum(np.asarray(pulled) * direction), np.sum(cotangent * pushed), rtol=1e-11
+            np.sum(np.asarray(light_cotangent) * direction),
+            np.sum(cotangent * response),
+            rtol=1e-11,
         )
-        assert np.linalg.norm(pulled) > 0.1 * np.linalg.norm(cotangent)
+        assert np.linalg.norm(light_cotangent) > 0.1 * np.linalg.norm(cotangent)
 
 
 @pytest.mark.parametrize("spread", [1, 4])
@@ -197,17 +203,19 @@ def test_hand_written_transpose_equals_automatic_differentiation(spread):
         taps = sum(abs(dy) * spread < 9 and abs(dx) * spread < 11 for dy, dx in _HALF_OF_TAPS)
         # Weights must vanish where the other pixel of a pair is outside the image.
         weights = rng.random((taps, 9, 11))
-        kept = [t for t in _HALF_OF_TAPS if abs(t[0]) * spread < 9 and abs(t[1]) * spread < 11]
-        for k, (dy, dx) in enumerate(kept):
+        inside_taps = [
+            t for t in _HALF_OF_TAPS if abs(t[0]) * spread < 9 and abs(t[1]) * spread < 11
+        ]
+        for k, (dy, dx) in enumerate(inside_taps):
             y, x = np.mgrid[:9, :11]
             y, x = y + dy * spread, x + dx * spread
             weights[k] *= (y < 9) & (x >= 0) & (x < 11)
         weights = jnp.asarray(weights)
-        pulled = [
+        cotangents = [
             jax.vjp(lambda v, gather=gather: gather(v, weights, spread), values)[1](cotangent)[0]
             for gather in (_gather, _gather_primal)
         ]
-    np.testing.assert_allclose(pulled[0], pulled[1], rtol=0, atol=DOUBLE_ROUNDING)
+    np.testing.assert_allclose(cotangents[0], cotangents[1], rtol=0, atol=DOUBLE_ROUNDING)
 
 
 def test_guides_carry_no_gradient_and_alpha_one_as_coverage():
@@ -233,12 +241,12 @@ def test_guides_carry_no_gradient_and_alpha_one_as_coverage():
 
         def along(step):
             scale = 1 + step * direction
-            moved = [inputs[1] * scale, inputs[2] * scale[..., None], inputs[3] * scale]
-            return objective(inputs[0], *moved, inputs[4] * scale[..., None], focal)
+            scaled_guides = [inputs[1] * scale, inputs[2] * scale[..., None], inputs[3] * scale]
+            return objective(inputs[0], *scaled_guides, inputs[4] * scale[..., None], focal)
 
         expected = (along(1e-5) - along(-1e-5)) / 2e-5
-        found = jnp.sum(gradients[1] * inputs[1] * direction)
-        np.testing.assert_allclose(found, expected, rtol=1e-8)
+        actual = jnp.sum(gradients[1] * inputs[1] * direction)
+        np.testing.assert_allclose(actual, expected, rtol=1e-8)
         assert abs(expected) > 0.01
 
 
@@ -246,14 +254,14 @@ def edge_guides(kind, size=24):
     """Guides of a wall whose right half differs in one of them."""
     alpha, normals, depth, albedo = flat_guides(size, size)
     normals, albedo = normals.copy(), albedo.copy()
-    right = np.arange(size) >= size // 2
+    is_right = np.arange(size) >= size // 2
     if kind == "normal":
-        normals[:, right] = [np.sqrt(0.5), 0.0, -np.sqrt(0.5)]
+        normals[:, is_right] = [np.sqrt(0.5), 0.0, -np.sqrt(0.5)]
     elif kind == "depth":
-        depth = depth * np.where(right, np.float32(1.5), np.float32(1))
+        depth = depth * np.where(is_right, np.float32(1.5), np.float32(1))
     elif kind == "albedo":
-        albedo[:, right] = [0.9, 0.5, 0.2]
-    return [alpha, normals, depth, albedo], right
+        albedo[:, is_right] = [0.9, 0.5, 0.2]
+    return [alpha, normals, depth, albedo], is_right
 
 
 ONE = {
@@ -266,26 +274,28 @@ ONE = {
 @pytest.mark.parametrize("kind", ONE)
 @pytest.mark.parametrize("transposed", [False, True])
 def test_light_does_not_cross_an_edge_of_one_guide(kind, transposed):
-    guides, right = edge_guides(kind)
-    light = np.where(right, 1.0, 0.0).astype(np.float32) * np.ones((24, 1), np.float32)
+    guides, is_right = edge_guides(kind)
+    light = np.where(is_right, 1.0, 0.0).astype(np.float32) * np.ones((24, 1), np.float32)
     if transposed:
         guides, light = [np.swapaxes(x, 0, 1) for x in guides], light.T
-    stopped = run(light[..., None], guides, DenoiseSpec(2, **(OFF | ONE[kind])))[..., 0]
-    np.testing.assert_allclose(stopped, light, rtol=0, atol=LEAK)
+    filtered = run(light[..., None], guides, DenoiseSpec(2, **(OFF | ONE[kind])))[..., 0]
+    np.testing.assert_allclose(filtered, light, rtol=0, atol=LEAK)
     # The light crosses the edge once that guide is ignored as well.
-    crossed = run(light[..., None], guides, DenoiseSpec(2, **OFF))[..., 0]
-    assert np.abs(crossed - light).max() > 0.3
+    unguided = run(light[..., None], guides, DenoiseSpec(2, **OFF))[..., 0]
+    assert np.abs(unguided - light).max() > 0.3
 
 
 def test_light_does_not_cross_a_jump_through_pixels_that_mix_both_sides():
-    guides, right = edge_guides("depth")
+    guides, is_right = edge_guides("depth")
     depth = guides[2].copy()
     depth[:, 12] = 0.5 * (depth[:, 11] + depth[:, 13])
-    light = np.where(right, 1.0, 0.0).astype(np.float32)[:, None] * np.ones((24, 1, 1), np.float32)
+    light = np.where(is_right, 1.0, 0.0).astype(np.float32)[:, None] * np.ones(
+        (24, 1, 1), np.float32
+    )
     # At this focal length, the jump in depth is as large as 24 pixels.
     guides[2], spec = depth, DenoiseSpec(2, **(OFF | ONE["depth"]))
-    found = run(light, guides, spec, focal=60.0)
-    np.testing.assert_allclose(found, light, rtol=0, atol=LEAK)
+    filtered = run(light, guides, spec, focal=60.0)
+    np.testing.assert_allclose(filtered, light, rtol=0, atol=LEAK)
 
 
 def tilted_depth(size, focal, tilt, offset=3.0):
@@ -303,23 +313,25 @@ def test_variance_of_noise_on_a_plane_falls_to_the_sum_of_squared_weights(iterat
     impulse = np.zeros((size, size, 1), np.float32)
     impulse[24, 24] = 1.0
     # Weights are symmetric and the divisors equal, so what spreads from a pixel is its kernel.
-    found = run(impulse, guides, DenoiseSpec(iterations), focal=focal)
+    response = run(impulse, guides, DenoiseSpec(iterations), focal=focal)
     kernel = composed_kernel(iterations)
     expected = np.sum(kernel**2) ** 2
-    stated = {1: 0.075, 2: 0.015, 3: 0.0036}
-    np.testing.assert_allclose(expected, stated[iterations], rtol=0.02)
+    stated_variances = {1: 0.075, 2: 0.015, 3: 0.0036}
+    np.testing.assert_allclose(expected, stated_variances[iterations], rtol=0.02)
     tolerance = 1e-5 if tilt == 0 else 0.02
-    np.testing.assert_allclose(np.sum(found.astype(np.float64) ** 2), expected, rtol=tolerance)
+    np.testing.assert_allclose(np.sum(response.astype(np.float64) ** 2), expected, rtol=tolerance)
 
 
 def test_noise_on_a_flat_wall_falls_by_the_stated_factor_and_keeps_its_mean():
     size, border = 49, 6
     noise = np.random.default_rng(6).normal(size=(40, size, size, 1)).astype(np.float32)
     guides = flat_guides(size, size)
-    found = np.stack([run(one, guides) for one in noise])[:, border:-border, border:-border]
+    filtered = np.stack([run(noise_image, guides) for noise_image in noise])[
+        :, border:-border, border:-border
+    ]
     # 55,000 values, of which about one in 66 is independent: 5 % of error at one sigma.
-    np.testing.assert_allclose(np.var(found), 0.01525, rtol=0.2)
-    assert abs(found.mean()) < 0.02
+    np.testing.assert_allclose(np.var(filtered), 0.01525, rtol=0.2)
+    assert abs(filtered.mean()) < 0.02
 
 
 def sphere_guides(size=49, radius=0.8):
@@ -342,9 +354,11 @@ def test_noise_on_a_sphere_falls_and_depth_stops_nothing_there():
     inside = guides[0] > 0
     noise = np.random.default_rng(7).normal(size=(10, 49, 49, 1)).astype(np.float32)
     noise = noise * inside[..., None]
-    smooth = np.stack([run(one, guides, focal=focal)[inside] for one in noise])
+    smooth = np.stack([run(noise_image, guides, focal=focal)[inside] for noise_image in noise])
     spec = DenoiseSpec(depth_sigma=np.inf)
-    without_depth = np.stack([run(one, guides, spec, focal=focal)[inside] for one in noise])
+    without_depth = np.stack(
+        [run(noise_image, guides, spec, focal=focal)[inside] for noise_image in noise]
+    )
     assert np.var(smooth) < 0.05
     assert np.var(smooth) < 1.1 * np.var(without_depth)
 
@@ -360,9 +374,9 @@ def test_order_of_rows_and_columns_does_not_matter():
     guides = rough_guides(12, 12)
     light = np.random.default_rng(9).random((12, 12, 2)).astype(np.float32)
     expected = run(light, guides)
-    for turn in (lambda x: x[::-1], lambda x: x[:, ::-1], lambda x: np.swapaxes(x, 0, 1)):
-        turned = run(np.ascontiguousarray(turn(light)), [turn(g).copy() for g in guides])
-        np.testing.assert_allclose(turned, turn(expected), rtol=0, atol=20 * ROUNDING)
+    for transform in (lambda x: x[::-1], lambda x: x[:, ::-1], lambda x: np.swapaxes(x, 0, 1)):
+        actual = run(np.ascontiguousarray(transform(light)), [transform(g).copy() for g in guides])
+        np.testing.assert_allclose(actual, transform(expected), rtol=0, atol=20 * ROUNDING)
 
 
 @pytest.mark.parametrize("shape", [(0, 5), (5, 0), (1, 1), (1, 6), (2, 3)])
@@ -370,8 +384,8 @@ def test_tiny_and_empty_images_are_finite(shape):
     alpha, normals, depth, albedo = flat_guides(*shape)
     light = np.full((*shape, 2), 0.5, np.float32)
     spec = DenoiseSpec(iterations=8)
-    found = run(light, [alpha, normals, depth, albedo], spec)
-    np.testing.assert_allclose(found, light, atol=ROUNDING)
+    filtered = run(light, [alpha, normals, depth, albedo], spec)
+    np.testing.assert_allclose(filtered, light, atol=ROUNDING)
 
 
 @cache
@@ -399,10 +413,10 @@ def test_default_focal_length_is_the_longer_side():
     light = np.random.default_rng(11).random((12, 10, 2))
     with double_precision():
         filtered = jax.jit(lambda *x: denoise(*x, spec=DenoiseSpec()))
-        found = filtered(*(jnp.asarray(x) for x in (light, *guides)))
-        explicit, longer = (run(light, guides, focal=focal) for focal in (12.0, 60.0))
-    np.testing.assert_allclose(found, explicit, rtol=0, atol=DOUBLE_ROUNDING)
-    assert np.abs(explicit - longer).max() > 1e-3
+        default_result = filtered(*(jnp.asarray(x) for x in (light, *guides)))
+        explicit_result, longer_result = (run(light, guides, focal=focal) for focal in (12.0, 60.0))
+    np.testing.assert_allclose(default_result, explicit_result, rtol=0, atol=DOUBLE_ROUNDING)
+    assert np.abs(explicit_result - longer_result).max() > 1e-3
 
 
 def test_views_of_a_batch_equal_single_ones_and_precision_is_kept():
@@ -413,8 +427,8 @@ def test_views_of_a_batch_equal_single_ones_and_precision_is_kept():
     batch = jax.jit(jax.vmap(filter_of(DenoiseSpec(1))))(jnp.asarray(lights), *stacked, focals)
     assert batch.dtype == jnp.float32
     for k, guides in enumerate(views):
-        single = run(lights[k], guides, DenoiseSpec(1), focal=float(focals[k]))
-        np.testing.assert_allclose(batch[k], single, rtol=0, atol=ROUNDING)
+        single_view = run(lights[k], guides, DenoiseSpec(1), focal=float(focals[k]))
+        np.testing.assert_allclose(batch[k], single_view, rtol=0, atol=ROUNDING)
 
 
 @pytest.mark.parametrize(

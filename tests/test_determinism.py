@@ -109,10 +109,14 @@ fit(sphere_dataset(), tiny_config(), Path(sys.argv[2]))
 @pytest.mark.long
 def test_another_process_trains_the_same_bits(tmp_path):
     """The other process compiles anew, with other addresses and another hash seed."""
-    here, there = tmp_path / "here", tmp_path / "there"
-    fit(sphere_dataset(), tiny_config(), here)
-    tests = str(Path(__file__).parent)
-    subprocess.run([sys.executable, "-c", _OTHER_PROCESS, tests, str(there)], check=True)
-    first, second = (load_trained(folder).params for folder in (here, there))
-    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+    own_folder, other_folder = tmp_path / "here", tmp_path / "there"
+    fit(sphere_dataset(), tiny_config(), own_folder)
+    tests_folder = str(Path(__file__).parent)
+    subprocess.run(
+        [sys.executable, "-c", _OTHER_PROCESS, tests_folder, str(other_folder)], check=True
+    )
+    own_params, other_params = (
+        load_trained(folder).params for folder in (own_folder, other_folder)
+    )
+    for a, b in zip(jax.tree.leaves(own_params), jax.tree.leaves(other_params), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -52,47 +52,49 @@ def finished(*processes, seconds=540):
 def test_two_devices_give_the_loss_and_the_gradient_of_one(tmp_path):
     """There are three views on two devices, and one view counts for less; the light is frozen."""
     finished(started("gradient", tmp_path))
-    found = np.load(tmp_path / "gradient.npz")
-    names = [name.removeprefix("one") for name in found if name.startswith("one")]
+    arrays = np.load(tmp_path / "gradient.npz")
+    names = [name.removeprefix("one") for name in arrays if name.startswith("one")]
     assert len(names) > 20
-    moving = 0
+    nonzero_count = 0
     for name in names:
-        one, two = found[f"one{name}"], found[f"two{name}"]
-        scale = np.abs(one).max() + 1e-12
-        np.testing.assert_allclose(two, one, rtol=2e-4, atol=2e-5 * scale)
-        moving += bool(np.any(one))
-    assert moving > 15
+        one_device, two_devices = arrays[f"one{name}"], arrays[f"two{name}"]
+        scale = np.abs(one_device).max() + 1e-12
+        np.testing.assert_allclose(two_devices, one_device, rtol=2e-4, atol=2e-5 * scale)
+        nonzero_count += bool(np.any(one_device))
+    assert nonzero_count > 15
     # The parameters of the devices must not diverge: both devices hold the same bits.
-    assert not found["apart"].any()
+    assert not arrays["apart"].any()
 
 
 @pytest.mark.slow
 @pytest.mark.long
 def test_two_hosts_grow_stop_resume_and_refuse_together(tmp_path):
     """Two processes go through a refusal, an overflow, Ctrl-C at one of them, and a checkpoint."""
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        port = free.getsockname()[1]
+    with socket.socket() as free_socket:
+        free_socket.bind(("localhost", 0))
+        port = free_socket.getsockname()[1]
     finished(*(started("train", tmp_path, port, host) for host in (0, 1)))
-    first, second = (json.loads((tmp_path / f"host{k}.json").read_text()) for k in (0, 1))
-    for host in (first, second):
+    first_host, second_host = (json.loads((tmp_path / f"host{k}.json").read_text()) for k in (0, 1))
+    for host in (first_host, second_host):
         assert "were given different things" in host["said"]["other settings"]
         assert host["said"]["stop"] == "Interrupted: stopped at step 2; continue with --resume"
         assert set(host["said"]) == {"other settings", "stop"}
         assert host["step"] == 4
     # Both began with the first host's buffers, and grew them to the same size in the same step.
-    assert first["sizes"] == second["sizes"]
-    grown = [(step, new) for step, old, new in first["sizes"] if new > old]
-    assert len(grown) == 1
-    assert grown[0][0] == 0
+    assert first_host["sizes"] == second_host["sizes"]
+    growths = [
+        (step, new_size) for step, old_size, new_size in first_host["sizes"] if new_size > old_size
+    ]
+    assert len(growths) == 1
+    assert growths[0][0] == 0
     a, b = (np.load(tmp_path / f"host{k}.npz") for k in (0, 1))
     for name in a:
         np.testing.assert_array_equal(a[name], b[name])
     lines = [json.loads(x) for x in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [0, 1, 2, 3]
-    alone = tmp_path / "alone"
-    fit(sphere_dataset(), tiny_config("stages.split_sum.batch_views=2"), alone)
-    text = (alone / "metrics.jsonl").read_text().splitlines()
+    alone_folder = tmp_path / "alone"
+    fit(sphere_dataset(), tiny_config("stages.split_sum.batch_views=2"), alone_folder)
+    text = (alone_folder / "metrics.jsonl").read_text().splitlines()
     assert [line["loss"] for line in lines] == pytest.approx(
         [json.loads(x)["loss"] for x in text], rel=1e-3
     )
@@ -100,13 +102,13 @@ def test_two_hosts_grow_stop_resume_and_refuse_together(tmp_path):
 
 def test_views_that_do_not_divide_are_filled_up_with_shares_of_nothing(monkeypatch):
     """Three views are shared out to two devices that are simulated on one."""
-    here = jax.devices()[0]
+    device = jax.devices()[0]
 
     class Two(ManyDevices):
         def __init__(self):
             self.mesh, self.count = None, 2
 
-        _mine = ((0, here), (1, here))
+        _mine = ((0, device), (1, device))
 
         def _copied(self, x):
             return x
@@ -115,7 +117,7 @@ def test_views_that_do_not_divide_are_filled_up_with_shares_of_nothing(monkeypat
     monkeypatch.setattr(
         jax,
         "make_array_from_single_device_arrays",
-        lambda shape, sharding, parts: jnp.concatenate(parts).reshape(shape),
+        lambda shape, sharding, arrays: jnp.concatenate(arrays).reshape(shape),
     )
     views = sphere_views(3, size=4)
     batch = Batch(
@@ -124,10 +126,10 @@ def test_views_that_do_not_divide_are_filled_up_with_shares_of_nothing(monkeypat
         jax.random.key(0),
         views=jnp.arange(3, dtype=jnp.int32),
     )
-    dealt = Two().share_out(batch).pictures
-    np.testing.assert_array_equal(dealt["views"], [[0, 2], [1, 2]])
-    np.testing.assert_allclose(dealt["shares"], [[1 / 3, 1 / 3], [1 / 3, 0.0]])
-    np.testing.assert_array_equal(dealt["image"][1, 0], views.images[1])
+    pictures = Two().share_out(batch).pictures
+    np.testing.assert_array_equal(pictures["views"], [[0, 2], [1, 2]])
+    np.testing.assert_allclose(pictures["shares"], [[1 / 3, 1 / 3], [1 / 3, 0.0]])
+    np.testing.assert_array_equal(pictures["image"][1, 0], views.images[1])
 
 
 def test_one_device_is_what_a_training_gets_that_asks_for_nothing():
@@ -135,11 +137,11 @@ def test_one_device_is_what_a_training_gets_that_asks_for_nothing():
 
 
 def test_more_devices_than_there_are_is_refused_in_one_line():
-    there = len(jax.local_devices())
+    device_count = len(jax.local_devices())
     with pytest.raises(
-        TrainingError, match=f"--devices {there + 1}: this process has {there}"
+        TrainingError, match=f"--devices {device_count + 1}: this process has {device_count}"
     ) as e:
-        choose_devices(there + 1)
+        choose_devices(device_count + 1)
     assert "\n" not in str(e.value)
 
 

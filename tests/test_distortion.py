@@ -96,57 +96,57 @@ def photograph(name, numbers):
 
 @pytest.mark.parametrize("name", ["OPENCV", "RADIAL", "OPENCV_FISHEYE"])
 def test_an_undistorted_photograph_is_that_of_a_pinhole(name):
-    ours, numbers = MODELS[name]
-    lookup = pinhole_lookup(ours, LENS, WIDTH, HEIGHT)
-    found = resample(photograph(name, numbers), lookup)
+    model, numbers = MODELS[name]
+    lookup = pinhole_lookup(model, LENS, WIDTH, HEIGHT)
+    actual = resample(photograph(name, numbers), lookup)
     expected = color(*pixel_plane())
     assert 0.8 < lookup.inside.mean() <= 1.0
     # Within half a pixel of the border, the last pixel stands for everything beyond its centre.
     is_inner = (np.abs(lookup.rows - HEIGHT / 2) < HEIGHT / 2 - 0.5) & (
         np.abs(lookup.columns - WIDTH / 2) < WIDTH / 2 - 0.5
     )
-    assert np.abs(found - expected)[is_inner].max() < TOLERANCE
-    assert (found[~lookup.inside] == 0.0).all()
+    assert np.abs(actual - expected)[is_inner].max() < TOLERANCE
+    assert (actual[~lookup.inside] == 0.0).all()
 
 
 @pytest.mark.parametrize("name", list(MODELS))
 def test_a_lens_shows_points_where_its_formula_says(name):
-    ours, numbers = MODELS[name]
+    model, numbers = MODELS[name]
     points = np.random.default_rng(0).uniform(-0.7, 0.7, (50, 2))
     points[0] = 0.0
-    found = np.stack(ours.distort(points[:, 0], points[:, 1]), -1)
+    actual = np.stack(model.distort(points[:, 0], points[:, 1]), -1)
     expected = [shown(name, numbers, *point) for point in points]
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(actual, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", list(MODELS))
 def test_a_lens_is_that_of_colmap(name):
     pycolmap = pytest.importorskip("pycolmap")
-    ours, numbers = MODELS[name]
+    model, numbers = MODELS[name]
     focal = [50.0] if "SIMPLE" in name or name.startswith("RADIAL") else [46.0, 50.0]
     camera = pycolmap.Camera(
         model=name, width=WIDTH, height=HEIGHT, params=[*focal, 22.5, 21.0, *numbers]
     )
     points = np.random.default_rng(1).uniform(-0.7, 0.7, (50, 2))
     expected = camera.img_from_cam(np.concatenate([points, np.ones((50, 1))], -1))
-    found = np.stack(ours.distort(points[:, 0], points[:, 1]), -1)
-    found = found * [focal[0], focal[-1]] + [22.5, 21.0]
-    np.testing.assert_allclose(found, expected, atol=1e-9)
+    actual = np.stack(model.distort(points[:, 0], points[:, 1]), -1)
+    actual = actual * [focal[0], focal[-1]] + [22.5, 21.0]
+    np.testing.assert_allclose(actual, expected, atol=1e-9)
 
 
 def test_where_the_polynomial_turns_back_nothing_is_seen_twice():
-    bent = Brown((-0.6,))
-    limit = largest_radius(bent, 10.0)
+    model = Brown((-0.6,))
+    limit = largest_radius(model, 10.0)
     assert limit == pytest.approx((1 / (3 * 0.6)) ** 0.5, rel=1e-2)  # where 1 - 1.8 r^2 is zero
     assert largest_radius(Brown((0.1,)), 10.0) == 10.0
-    wide = np.array([[12.0, 0.0, 24.0], [0.0, 12.0, 20.0], [0.0, 0.0, 1.0]])
-    lookup = pinhole_lookup(bent, wide, WIDTH, HEIGHT)
+    wide_intrinsics = np.array([[12.0, 0.0, 24.0], [0.0, 12.0, 20.0], [0.0, 0.0, 1.0]])
+    lookup = pinhole_lookup(model, wide_intrinsics, WIDTH, HEIGHT)
     x, y = np.meshgrid((np.arange(WIDTH) - 23.5) / 12, (np.arange(HEIGHT) - 19.5) / 12)
     # Points of the plane beyond the limit would fall on pixels of the photograph.
     is_beyond = np.hypot(x, y) > limit
-    within = (lookup.rows > 0) & (lookup.rows < HEIGHT)
-    within &= (lookup.columns > 0) & (lookup.columns < WIDTH)
-    assert (is_beyond & within).sum() > 100
+    is_within = (lookup.rows > 0) & (lookup.rows < HEIGHT)
+    is_within &= (lookup.columns > 0) & (lookup.columns < WIDTH)
+    assert (is_beyond & is_within).sum() > 100
     assert not lookup.inside[is_beyond].any()
     assert lookup.inside[np.hypot(x, y) < 0.95 * limit].all()
 
@@ -164,8 +164,10 @@ def test_samples_are_those_of_scipy(shape):
     pixels = rng.random((*shape, 3), np.float32)
     rows, columns = (rng.uniform(-1.0, n + 1.0, (37, 19)) for n in shape)
     lookup = Lookup(rows, columns, rng.random(rows.shape) > 0.2)
-    where = np.stack([rows, columns]) - 0.5
-    expected = [map_coordinates(pixels[..., c], where, order=1, mode="nearest") for c in range(3)]
+    coordinates = np.stack([rows, columns]) - 0.5
+    expected = [
+        map_coordinates(pixels[..., c], coordinates, order=1, mode="nearest") for c in range(3)
+    ]
     expected = np.where(lookup.inside[..., None], np.stack(expected, -1), 0.0)
     np.testing.assert_allclose(resample(pixels, lookup), expected, atol=1e-6)
 
@@ -175,41 +177,41 @@ def test_colour_behind_the_mask_does_not_bleed_in():
     pixels[:, : WIDTH // 2] = [5.0, 5.0, 5.0, 0.0]
     pixels[:, WIDTH // 2 :, :3] = 0.25
     lookup = pinhole_lookup(Brown((-0.2,)), LENS, WIDTH, HEIGHT)
-    found = resample(pixels, lookup)
-    has_color = found[..., 3] > 1e-3
-    assert ((found[..., 3] > 0.05) & (found[..., 3] < 0.95)).any()
-    np.testing.assert_allclose(found[has_color][:, :3], 0.25, atol=1e-4)
+    resampled = resample(pixels, lookup)
+    has_color = resampled[..., 3] > 1e-3
+    assert ((resampled[..., 3] > 0.05) & (resampled[..., 3] < 0.95)).any()
+    np.testing.assert_allclose(resampled[has_color][:, :3], 0.25, atol=1e-4)
 
 
 def test_a_sample_next_to_a_pixel_that_does_not_count_does_not_count():
     valid = np.ones((HEIGHT, WIDTH), bool)
     valid[20, 30] = False
-    bent = Brown((-0.2,))
-    lookup = pinhole_lookup(bent, LENS, WIDTH, HEIGHT)
+    model = Brown((-0.2,))
+    lookup = pinhole_lookup(model, LENS, WIDTH, HEIGHT)
     counts = resample_valid(valid, lookup)
-    near = (np.abs(lookup.rows - 20.5) < 0.9) & (np.abs(lookup.columns - 30.5) < 0.9)
-    assert near.any()
-    assert not counts[near].any()
-    far = (np.abs(lookup.rows - 20.5) > 1.01) | (np.abs(lookup.columns - 30.5) > 1.01)
-    np.testing.assert_array_equal(counts[far], lookup.inside[far])
+    is_near = (np.abs(lookup.rows - 20.5) < 0.9) & (np.abs(lookup.columns - 30.5) < 0.9)
+    assert is_near.any()
+    assert not counts[is_near].any()
+    is_far = (np.abs(lookup.rows - 20.5) > 1.01) | (np.abs(lookup.columns - 30.5) > 1.01)
+    np.testing.assert_array_equal(counts[is_far], lookup.inside[is_far])
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_pixels_of_a_photograph_are_found_in_the_pinhole_image(name):
     model, _ = MODELS[name]
-    where = photograph_lookup(model, LENS, WIDTH, HEIGHT)
-    x, y = (where.columns - LENS[0, 2]) / LENS[0, 0], (where.rows - LENS[1, 2]) / LENS[1, 1]
+    lookup = photograph_lookup(model, LENS, WIDTH, HEIGHT)
+    x, y = (lookup.columns - LENS[0, 2]) / LENS[0, 0], (lookup.rows - LENS[1, 2]) / LENS[1, 1]
     u, v = model.distort(x, y)
     columns, rows = LENS[0, 0] * u + LENS[0, 2], LENS[1, 1] * v + LENS[1, 2]
-    wanted = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    assert where.inside.mean() > 0.5
-    for found, expected in zip((columns, rows), wanted, strict=True):
-        np.testing.assert_allclose(found[where.inside], expected[where.inside], atol=0.02)
+    pixel_centers = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    assert lookup.inside.mean() > 0.5
+    for actual, expected in zip((columns, rows), pixel_centers, strict=True):
+        np.testing.assert_allclose(actual[lookup.inside], expected[lookup.inside], atol=0.02)
 
 
 def test_without_distortion_photograph_and_pinhole_image_are_one():
-    where = photograph_lookup(None, LENS, WIDTH, HEIGHT)
+    lookup = photograph_lookup(None, LENS, WIDTH, HEIGHT)
     columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    np.testing.assert_allclose(where.columns, columns)
-    np.testing.assert_allclose(where.rows, rows)
-    assert where.inside.all()
+    np.testing.assert_allclose(lookup.columns, columns)
+    np.testing.assert_allclose(lookup.rows, rows)
+    assert lookup.inside.all()

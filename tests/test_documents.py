@@ -38,37 +38,37 @@ def test_links_lead_to_files_and_headings(path):
         if target.startswith(("https://", "http://")):
             continue
         name, _, anchor = target.partition("#")
-        found = (path.parent / name).resolve() if name else path
-        assert found.exists(), f"{path.name} links to {target}, which is not there"
+        linked_path = (path.parent / name).resolve() if name else path
+        assert linked_path.exists(), f"{path.name} links to {target}, which is not there"
         if path.parent == DOCS:
-            assert DOCS in found.parents, f"{target} lies outside of the site"
+            assert DOCS in linked_path.parents, f"{target} lies outside of the site"
         if anchor:
-            assert anchor in headings(found), f"{path.name}: no heading for {target}"
+            assert anchor in headings(linked_path), f"{path.name}: no heading for {target}"
 
 
 @pytest.mark.parametrize("name", ["gradients.md", "numerics.md"])
 def test_tables_name_what_the_code_and_its_tests_have(name):
     """Rows name a function or constant and the tests for it, and all of these must exist."""
     files = sorted((ROOT / "geosplat_jax").rglob("*.py"))
-    tests = "".join(path.read_text() for path in sorted((ROOT / "tests").glob("test_*.py")))
+    test_source = "".join(path.read_text() for path in sorted((ROOT / "tests").glob("test_*.py")))
     text = (DOCS / name).read_text()
     rows = "\n".join(line for line in text.splitlines() if line.startswith("|"))
-    named = set(re.findall(r"`([a-z_]+)\.([A-Za-z_]+)`", rows))
-    assert len(named) > 5
-    for module, member in named - {("numerics", "py"), ("material", "position_gradient")}:
+    named_members = set(re.findall(r"`([a-z_]+)\.([A-Za-z_]+)`", rows))
+    assert len(named_members) > 5
+    for module, member in named_members - {("numerics", "py"), ("material", "position_gradient")}:
         sources = [path.read_text() for path in files if path.stem == module]
         assert sources, f"{name} names {module}.{member}, and there is no such module"
-        is_there = any(re.search(rf"^ *(def |class )?{member}\b", text, re.M) for text in sources)
-        assert is_there, f"{name} names {module}.{member}, which is not there"
+        is_defined = any(re.search(rf"^ *(def |class )?{member}\b", text, re.M) for text in sources)
+        assert is_defined, f"{name} names {module}.{member}, which is not there"
     for path in re.findall(r"`((?:tests|experiments|benchmarks)/[\w/]+\.py)`", text):
         assert (ROOT / path).exists(), f"{name} names {path}, which is not there"
     for test in re.findall(r"`([a-z_0-9]{30,})`", rows):
-        assert f"def test_{test}(" in tests, f"{name} names test_{test}, which is not there"
+        assert f"def test_{test}(" in test_source, f"{name} names test_{test}, which is not there"
 
 
 def test_every_page_is_in_the_site():
-    listed = set(re.findall(r": (\w+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M))
-    assert listed == {path.name for path in PAGES}
+    site_pages = set(re.findall(r": (\w+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M))
+    assert site_pages == {path.name for path in PAGES}
 
 
 def test_commands_in_the_tutorial_exist():

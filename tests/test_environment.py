@@ -68,11 +68,11 @@ def _reference_prefilter(texels, direction, roughness, factor):
     v = (np.arange(height) + 0.5) / height
     phi = (0.5 - (np.arange(width) + 0.5) / width) * 2 * np.pi
     theta, phi = np.meshgrid(v * np.pi, phi, indexing="ij")
-    fine = np.stack(
+    fine_directions = np.stack(
         [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1
     ).reshape(-1, 3)
-    kernel = ggx_lobe(fine @ direction, roughness) * np.sin(theta).ravel()
-    return kernel @ _reference_lookup(texels, *_reference_uv(fine)) / kernel.sum()
+    kernel = ggx_lobe(fine_directions @ direction, roughness) * np.sin(theta).ravel()
+    return kernel @ _reference_lookup(texels, *_reference_uv(fine_directions)) / kernel.sum()
 
 
 _compiled_prefilter = jax.jit(prefilter)
@@ -87,12 +87,12 @@ def _prefiltered(texels, spec=SMALL):
 def test_four_colours_lie_in_the_four_world_directions():
     red, green, blue, white = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1.0]])
     texels = np.empty((8, 16, 3))
-    for first, colour in ((6, red), (2, green), (10, white), (14, blue)):
-        texels[:, np.arange(first, first + 4) % 16] = colour
+    for column, colour in ((6, red), (2, green), (10, white), (14, blue)):
+        texels[:, np.arange(column, column + 4) % 16] = colour
     texels[0], texels[-1] = 2.0, 3.0
-    seen = lookup(jnp.asarray(texels, jnp.float32), jnp.asarray(AXES, jnp.float32))
+    colors = lookup(jnp.asarray(texels, jnp.float32), jnp.asarray(AXES, jnp.float32))
     sky, ground = np.full(3, 2.0), np.full(3, 3.0)
-    np.testing.assert_allclose(seen, [red, green, sky, blue, white, ground], atol=ROUNDING)
+    np.testing.assert_allclose(colors, [red, green, sky, blue, white, ground], atol=ROUNDING)
 
 
 def test_uv_follows_the_z_up_convention():
@@ -115,18 +115,18 @@ def test_y_up_and_z_up_worlds_share_the_image():
 def test_texel_directions_invert_uv_and_read_their_own_texel():
     directions = light_directions(16, 32).reshape(-1, 3)
     texels = _texels()
-    seen = lookup(jnp.asarray(texels, jnp.float32), directions)
-    np.testing.assert_allclose(seen, texels.reshape(-1, 3), atol=20 * ROUNDING)
+    radiance = lookup(jnp.asarray(texels, jnp.float32), directions)
+    np.testing.assert_allclose(radiance, texels.reshape(-1, 3), atol=20 * ROUNDING)
 
 
 def test_lookup_equals_bilinear_interpolation_in_numpy():
     directions, texels = _unit(2000, seed=2), _texels(9, 20, 5)
     expected = _reference_lookup(texels, *_reference_uv(directions))
     with double_precision():
-        seen = lookup(jnp.asarray(texels), jnp.asarray(directions))
-        np.testing.assert_allclose(seen, expected, atol=1e-12)
-    seen = lookup(jnp.asarray(texels, jnp.float32), jnp.asarray(directions, jnp.float32))
-    np.testing.assert_allclose(seen, expected, atol=20 * ROUNDING)
+        radiance = lookup(jnp.asarray(texels), jnp.asarray(directions))
+        np.testing.assert_allclose(radiance, expected, atol=1e-12)
+    radiance = lookup(jnp.asarray(texels, jnp.float32), jnp.asarray(directions, jnp.float32))
+    np.testing.assert_allclose(radiance, expected, atol=20 * ROUNDING)
 
 
 def test_the_seam_is_continuous():
@@ -168,18 +168,18 @@ def test_directions_on_poles_seam_and_zero_have_finite_gradients(count):
 def test_a_direction_at_the_pole_does_not_disturb_other_gradients():
     texels, directions = jnp.asarray(_texels(), jnp.float32), _unit(20, seed=3)
     gradient = jax.jit(jax.grad(lambda d: jnp.sum(jnp.sin(lookup(texels, d)))))
-    plain = gradient(jnp.asarray(directions, jnp.float32))
+    plain_gradient = gradient(jnp.asarray(directions, jnp.float32))
     directions[4] = [0, 0, 1]
-    mixed = gradient(jnp.asarray(directions, jnp.float32))
-    others = np.arange(20) != 4
-    np.testing.assert_array_equal(plain[others], mixed[others])
+    mixed_gradient = gradient(jnp.asarray(directions, jnp.float32))
+    is_other = np.arange(20) != 4
+    np.testing.assert_array_equal(plain_gradient[is_other], mixed_gradient[is_other])
 
 
 def test_a_quarter_turn_about_z_rolls_the_map():
     texels = _texels()
-    turn = jnp.asarray([[0, -1, 0], [1, 0, 0], [0, 0, 1]], jnp.float32)  # x to y
-    turned = rotate_light(EnvLight(jnp.asarray(texels, jnp.float32)), turn)
-    np.testing.assert_allclose(turned.radiance, np.roll(texels, -8, axis=1), atol=1e-4)
+    rotation = jnp.asarray([[0, -1, 0], [1, 0, 0], [0, 0, 1]], jnp.float32)  # x to y
+    turned_light = rotate_light(EnvLight(jnp.asarray(texels, jnp.float32)), rotation)
+    np.testing.assert_allclose(turned_light.radiance, np.roll(texels, -8, axis=1), atol=1e-4)
 
 
 def test_a_rotated_light_shines_from_the_rotated_direction():
@@ -188,10 +188,10 @@ def test_a_rotated_light_shines_from_the_rotated_direction():
     rotation = np.linalg.qr(np.random.default_rng(7).standard_normal((3, 3)))[0]
     rotation *= np.sign(np.linalg.det(rotation))
     light = EnvLight(jnp.asarray(smooth, jnp.float32))
-    turned = rotate_light(light, jnp.asarray(rotation, jnp.float32))
+    turned_light = rotate_light(light, jnp.asarray(rotation, jnp.float32))
     probes = _unit(300, seed=8)
     before = lookup(light.radiance, jnp.asarray(probes, jnp.float32))
-    after = lookup(turned.radiance, jnp.asarray(probes @ rotation.T, jnp.float32))
+    after = lookup(turned_light.radiance, jnp.asarray(probes @ rotation.T, jnp.float32))
     np.testing.assert_allclose(after, before, atol=0.02)  # half a texel at the poles is constant
 
 
@@ -199,22 +199,22 @@ def test_a_sun_keeps_its_flux_whatever_the_light_is_turned_by():
     """Texels are narrow near the poles: one sample per texel would meet a sun only by chance."""
     height, width = 64, 128
     solid_angles = np.asarray(environment.texel_solid_angles(height, width))
-    rng, changes = np.random.default_rng(9), {1: [], 4: []}
+    rng, flux_errors = np.random.default_rng(9), {1: [], 4: []}
     for _ in range(6):
         sun = np.zeros((height, width, 3), np.float32)
         sun[6, rng.integers(width)] = 100.0  # 72 degrees high
         rotation = np.linalg.qr(rng.standard_normal((3, 3)))[0]
         rotation *= np.sign(np.linalg.det(rotation))
-        for subsamples, found in changes.items():
-            turned = environment.rotate_light(
+        for subsamples, errors in flux_errors.items():
+            turned_light = environment.rotate_light(
                 EnvLight(jnp.asarray(sun)),
                 jnp.asarray(rotation, jnp.float32),
                 subsamples=subsamples,
             )
-            flux = np.sum(np.asarray(turned.radiance) * solid_angles[..., None])
-            found.append(abs(flux / np.sum(sun * solid_angles[..., None]) - 1))
-    assert max(changes[4]) < 0.03
-    assert max(changes[1]) > 0.1
+            flux = np.sum(np.asarray(turned_light.radiance) * solid_angles[..., None])
+            errors.append(abs(flux / np.sum(sun * solid_angles[..., None]) - 1))
+    assert max(flux_errors[4]) < 0.03
+    assert max(flux_errors[1]) > 0.1
 
 
 def test_downsampling_preserves_flux():
@@ -297,9 +297,9 @@ def test_diffuse_level_of_a_linear_light_is_analytic():
     directions = np.asarray(light_directions(32, 64))
     texels = np.repeat((1 + directions @ slope)[..., None], 3, axis=2)
     normals = _unit(200, seed=11)
-    seen = prefiltered_diffuse(_prefiltered(texels, spec), jnp.asarray(normals, jnp.float32))
+    diffuse = prefiltered_diffuse(_prefiltered(texels, spec), jnp.asarray(normals, jnp.float32))
     expected = 1 + 2 / 3 * normals @ slope
-    np.testing.assert_allclose(seen, np.repeat(expected[:, None], 3, axis=1), atol=5e-3)
+    np.testing.assert_allclose(diffuse, np.repeat(expected[:, None], 3, axis=1), atol=5e-3)
 
 
 def test_rougher_levels_are_smoother_and_keep_the_flux():
@@ -363,10 +363,10 @@ def test_filtered_lookup_reads_its_levels_and_blends_between_them():
     directions = jnp.asarray(_unit(100, seed=18), jnp.float32)
     by_level = [lookup(level, directions) for level in prefiltered.specular]
     for level, roughness in enumerate(SMALL.roughness):
-        seen = prefiltered_specular(prefiltered, directions, jnp.full(100, roughness))
-        np.testing.assert_allclose(seen, by_level[level], atol=ROUNDING)
-    between = prefiltered_specular(prefiltered, directions, jnp.full(100, 0.45))
-    np.testing.assert_allclose(between, 0.5 * (by_level[1] + by_level[2]), atol=ROUNDING)
+        radiance = prefiltered_specular(prefiltered, directions, jnp.full(100, roughness))
+        np.testing.assert_allclose(radiance, by_level[level], atol=ROUNDING)
+    blended_radiance = prefiltered_specular(prefiltered, directions, jnp.full(100, 0.45))
+    np.testing.assert_allclose(blended_radiance, 0.5 * (by_level[1] + by_level[2]), atol=ROUNDING)
     np.testing.assert_allclose(
         prefiltered_diffuse(prefiltered, directions), by_level[-1], atol=ROUNDING
     )

@@ -92,17 +92,17 @@ def test_highlights_brighter_than_white_are_compared_where_a_protocol_has_them()
     alpha = np.ones((24, 24), np.float32)
     view = RenderedView(np.minimum(linear, 1.0), alpha, linear, {})
     image = np.concatenate([linear, alpha[..., None]], axis=-1)
-    found = evaluate_module._view_metrics(view, image, None, None, protocol("orb"))
-    assert min(found[name] for name in ("nvs.psnr", "nvs.psnr_h", "nvs.psnr_l")) > 60
+    metrics = evaluate_module._view_metrics(view, image, None, None, protocol("orb"))
+    assert min(metrics[name] for name in ("nvs.psnr", "nvs.psnr_h", "nvs.psnr_l")) > 60
     dim = replace(view, linear=np.minimum(linear, 1.0))
-    found = evaluate_module._view_metrics(dim, image, None, None, protocol("orb"))
-    assert found["nvs.psnr"] > 60
-    assert max(found["nvs.psnr_h"], found["nvs.psnr_l"]) < 40
+    metrics = evaluate_module._view_metrics(dim, image, None, None, protocol("orb"))
+    assert metrics["nvs.psnr"] > 60
+    assert max(metrics["nvs.psnr_h"], metrics["nvs.psnr_l"]) < 40
 
 
 def straight(values, alpha):
-    covered = alpha[..., None] > 1e-4
-    return np.where(covered, values / np.where(covered, alpha[..., None], 1.0), 0.0)
+    is_covered = alpha[..., None] > 1e-4
+    return np.where(is_covered, values / np.where(is_covered, alpha[..., None], 1.0), 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -115,15 +115,16 @@ def views(run):
     renderer = Renderer.of(run, samples=SAMPLES)
 
     def pictures(renderer):
-        found = [renderer(cameras.camera([k])) for k in range(len(cameras))]
+        view_renders = [renderer(cameras.camera([k])) for k in range(len(cameras))]
         rgba = [
-            np.concatenate([straight(v.rgb, v.alpha), v.alpha[..., None]], axis=-1) for v in found
+            np.concatenate([straight(v.rgb, v.alpha), v.alpha[..., None]], axis=-1)
+            for v in view_renders
         ]
-        return found, np.stack(rgba).astype(np.float32)
+        return view_renders, np.stack(rgba).astype(np.float32)
 
-    rendered, images = pictures(renderer)
+    renders, images = pictures(renderer)
     truth = {
-        name: np.stack([straight(v.aovs[name], v.alpha) for v in rendered])
+        name: np.stack([straight(v.aovs[name], v.alpha) for v in renders])
         for name in ("albedo", "roughness", "metallic", "normal")
     }
     length = np.linalg.norm(truth["normal"], axis=-1, keepdims=True)
@@ -226,8 +227,8 @@ def test_the_files_are_written(perfect):
 def test_without_truth_there_are_no_metrics_of_it(run, views, tmp_path):
     """There are no sheets either, although an earlier evaluation has left one."""
     (tmp_path / "relight.png").write_bytes(b"of an earlier evaluation")
-    bare = replace(views, truth={}, relight={})
-    metrics = evaluate(run, bare, tmp_path)
+    bare_views = replace(views, truth={}, relight={})
+    metrics = evaluate(run, bare_views, tmp_path)
     assert set(metrics["mean"]) == NEW_VIEWS
     assert {path.name for path in tmp_path.iterdir()} == {
         *("metrics.json", "overview.png", "evaluation"),
@@ -248,10 +249,12 @@ def test_every_picture_is_there_for_itself_truth_beside_it(perfect):
     assert ("truth", "render") in pairs
     assert ("true albedo", "albedo, aligned") in pairs
     assert {"noon", "evening", "normal", "roughness", "metallic"} <= {name for _, name in pairs}
-    for true, found in pairs:
-        pixels = [np.asarray(Image.open(folder / files[name]), float) for name in (true, found)]
+    for true_name, other_name in pairs:
+        pixels = [
+            np.asarray(Image.open(folder / files[name]), float) for name in (true_name, other_name)
+        ]
         # The truth was rendered from the parameters, and both pictures are stored in 8 bits.
-        assert np.abs(pixels[0] - pixels[1]).mean() < 2, found
+        assert np.abs(pixels[0] - pixels[1]).mean() < 2, other_name
     assert list(gallery["lights"]) == ["true light", "light"]
     assert all((folder / file).is_file() for file in gallery["lights"].values())
     model = gallery["model"]
@@ -259,9 +262,9 @@ def test_every_picture_is_there_for_itself_truth_beside_it(perfect):
     assert (folder / model["mesh"]).read_bytes()[:4] == b"glTF"
     for file in model["lights"].values():
         assert read_image(folder / file).shape == (8, 16, 3)
-    seen = metrics["seen"]
-    assert (seen["asked"], seen["available"]) == (2, 2)
-    assert sum(part["share"] for part in seen["shares"]) == pytest.approx(1.0)
+    coverage = metrics["seen"]
+    assert (coverage["asked"], coverage["available"]) == (2, 2)
+    assert sum(entry["share"] for entry in coverage["shares"]) == pytest.approx(1.0)
 
 
 def test_relit_truth_without_its_map_is_left_out(run, views, tmp_path):
@@ -272,8 +275,8 @@ def test_relit_truth_without_its_map_is_left_out(run, views, tmp_path):
 
 
 def test_a_part_of_the_truth_gives_its_part_of_the_metrics(run, views, tmp_path):
-    part = replace(views, truth={"roughness": views.truth["roughness"]}, relight={})
-    mean = evaluate(run, part, tmp_path)["mean"]
+    partial_views = replace(views, truth={"roughness": views.truth["roughness"]}, relight={})
+    mean = evaluate(run, partial_views, tmp_path)["mean"]
     assert set(mean) == NEW_VIEWS | {"roughness.mse", "roughness.mse_full"}
     # Without a true albedo nothing is scaled.
     assert "albedo.scale_r" not in mean
@@ -286,27 +289,27 @@ def test_wrong_materials_are_seen(run, views, perfect, tmp_path):
         "roughness": views.truth["roughness"] * 0.5,
     }
     mean = evaluate(run, replace(views, truth=truth, relight={}), tmp_path)["mean"]
-    good = perfect[1]["mean"]
-    assert mean["albedo.psnr"] < 40 < good["albedo.psnr"]
+    perfect_mean = perfect[1]["mean"]
+    assert mean["albedo.psnr"] < 40 < perfect_mean["albedo.psnr"]
     inside = views.images[..., 3] > 0.5
     halves = [
-        np.mean((0.5 * rough[covered]) ** 2)
-        for rough, covered in zip(views.truth["roughness"], inside, strict=True)
+        np.mean((0.5 * rough[is_covered]) ** 2)
+        for rough, is_covered in zip(views.truth["roughness"], inside, strict=True)
     ]
     assert mean["roughness.mse"] == pytest.approx(np.mean(halves), rel=1e-3)
-    assert mean["metallic.mse"] == good["metallic.mse"]
+    assert mean["metallic.mse"] == perfect_mean["metallic.mse"]
 
 
 def test_protocols_change_their_looks_and_nothing_else(run, views, perfect, tmp_path):
     by_name = {"geosplatting": perfect[1]["mean"]}
     for name in PROTOCOLS[1:]:
         (tmp_path / name).mkdir()
-        found = evaluate(run, views, tmp_path / name, protocol=name)
-        assert found["protocol"] == name
-        assert found["notes"] != []
-        by_name[name] = found["mean"]
-    same = ("nvs.psnr", "nvs.ssim", "mask.iou", "normal.mae_full_deg", "roughness.mse")
-    for key in same:
+        metrics = evaluate(run, views, tmp_path / name, protocol=name)
+        assert metrics["protocol"] == name
+        assert metrics["notes"] != []
+        by_name[name] = metrics["mean"]
+    same_keys = ("nvs.psnr", "nvs.ssim", "mask.iou", "normal.mae_full_deg", "roughness.mse")
+    for key in same_keys:
         assert len({mean[key] for mean in by_name.values()}) == 1, key
     # This protocol alone compares unblended silhouettes with blended ones, which differ at edges.
     assert by_name["tensoir"]["relight.mean.psnr"] < 45
@@ -359,17 +362,17 @@ def test_an_unknown_protocol_is_refused_before_any_work(run, views, tmp_path):
 
 
 def test_the_preview_shows_truth_render_error_and_normals_and_says_when(run, views, monkeypatch):
-    told = {}
+    sheet_arguments = {}
 
     def sheet(rows, **words):
-        told.update(rows=rows, **words)
+        sheet_arguments.update(rows=rows, **words)
         return np.zeros((1, 1, 3), np.float32)
 
     monkeypatch.setattr(sheets, "overview_sheet", sheet)
     preview_image(run, views)
-    (row,) = told["rows"]
+    (row,) = sheet_arguments["rows"]
     assert list(row) == ["truth", "render", "error", "normal"]
     np.testing.assert_allclose(row["truth"], row["render"], atol=0.2)
     assert np.ptp(row["normal"]) > 0.3
-    assert told["title"] == "step 3, monte_carlo"
-    assert told["row_labels"] == ["view_0"]
+    assert sheet_arguments["title"] == "step 3, monte_carlo"
+    assert sheet_arguments["row_labels"] == ["view_0"]

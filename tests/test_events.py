@@ -25,7 +25,7 @@ def add_steps(folder, *steps):
 def events(folder):
     """Return steps and values by tag, as in the files; the value of a picture is its size."""
     kind = pytest.importorskip("tensorboardX.proto.event_pb2").Event
-    found = {}
+    entries = {}
     (path,) = (folder.path / "tensorboard").glob("events.*")
     data = path.read_bytes()
     while data:
@@ -33,11 +33,11 @@ def events(folder):
         event = kind.FromString(data[12 : 12 + length])
         data = data[16 + length :]
         for value in event.summary.value:
-            shown = value.simple_value
+            content = value.simple_value
             if value.HasField("image"):
-                shown = (value.image.height, value.image.width)
-            found.setdefault(value.tag, []).append((event.step, shown))
-    return found
+                content = (value.image.height, value.image.width)
+            entries.setdefault(value.tag, []).append((event.step, content))
+    return entries
 
 
 @pytest.fixture
@@ -59,16 +59,16 @@ def test_steps_and_previews_are_written_once_and_anew_after_a_resume(folder):
     log.note()
     log.note()
     log.close()
-    found = events(folder)
-    assert found["loss"] == [(0, 1.0), (1, 0.5)]
-    assert found["terms/l1"] == [(0, 0.25), (1, 0.25)]
-    assert found["preview"] == [(2, (4, 6))]
-    assert set(found) == {"loss", "terms/l1", "preview"}
+    entries = events(folder)
+    assert entries["loss"] == [(0, 1.0), (1, 0.5)]
+    assert entries["terms/l1"] == [(0, 0.25), (1, 0.25)]
+    assert entries["preview"] == [(2, (4, 6))]
+    assert set(entries) == {"loss", "terms/l1", "preview"}
     folder.metrics.unlink()
     add_steps(folder, 0, 3)
-    resumed = EventLog(folder)
-    resumed.note()
-    resumed.close()
+    resumed_log = EventLog(folder)
+    resumed_log.note()
+    resumed_log.close()
     assert [step for step, _ in events(folder)["loss"]] == [0, 3]
 
 

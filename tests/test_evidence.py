@@ -23,9 +23,11 @@ def ring(count, *, seed=None):
 
 
 def test_every_eighth_view_is_held_back_and_none_is_in_both():
-    used, held = every_nth(40, 8)
-    np.testing.assert_array_equal(held, [4, 12, 20, 28, 36])
-    np.testing.assert_array_equal(np.sort(np.concatenate([used, held])), np.arange(40))
+    used_views, held_back_views = every_nth(40, 8)
+    np.testing.assert_array_equal(held_back_views, [4, 12, 20, 28, 36])
+    np.testing.assert_array_equal(
+        np.sort(np.concatenate([used_views, held_back_views])), np.arange(40)
+    )
 
 
 def test_with_blocks_of_one_view_the_error_is_the_usual_one():
@@ -38,9 +40,9 @@ def test_a_view_that_is_there_four_times_tells_no_more_than_once():
     """The usual standard error would be half as large."""
     values = np.random.default_rng(0).normal(size=6)
     copies, blocks = np.repeat(values, 4), np.repeat(np.arange(6), 4)
-    once = clustered_error(values, np.arange(6))
-    assert clustered_error(copies, blocks) == pytest.approx(once, rel=1e-12)
-    assert clustered_error(copies, np.arange(24)) < 0.55 * once
+    single_error = clustered_error(values, np.arange(6))
+    assert clustered_error(copies, blocks) == pytest.approx(single_error, rel=1e-12)
+    assert clustered_error(copies, np.arange(24)) < 0.55 * single_error
 
 
 def test_the_error_covers_the_mean_as_often_as_it_says():
@@ -50,13 +52,13 @@ def test_the_error_covers_the_mean_as_often_as_it_says():
     """
     rng, sizes = np.random.default_rng(0), (1, 2, 3, 2, 4, 3, 2, 1, 3, 2)
     blocks = np.repeat(np.arange(len(sizes)), sizes)
-    hits, alone = [], []
+    hits, naive_hits = [], []
     for _ in range(2000):
         values = rng.normal(size=len(sizes))[blocks] + 0.2 * rng.normal(size=len(blocks))
         hits.append(abs(values.mean()) < clustered_error(values, blocks))
-        alone.append(abs(values.mean()) < clustered_error(values, np.arange(len(blocks))))
+        naive_hits.append(abs(values.mean()) < clustered_error(values, np.arange(len(blocks))))
     assert 0.60 < np.mean(hits) < 0.70
-    assert np.mean(alone) < 0.55
+    assert np.mean(naive_hits) < 0.55
 
 
 def test_one_block_says_nothing():
@@ -67,28 +69,30 @@ def test_one_block_says_nothing():
 def test_gains_are_paired():
     """Views differ by ten decibels and models by a twentieth, which only paired views can show."""
     rng, blocks = np.random.default_rng(0), np.arange(12)
-    smaller = rng.uniform(20, 40, 12)
-    larger = smaller + 0.05 + 0.02 * rng.normal(size=12)
-    found = compare(larger, [smaller], blocks)
-    assert found.gain == pytest.approx(0.05, abs=0.02)
-    assert found.standard_error < 0.01
-    assert found.is_kept
-    unpaired = math.hypot(clustered_error(larger, blocks), clustered_error(smaller, blocks))
-    assert unpaired > 10 * found.gain
+    smaller_scores = rng.uniform(20, 40, 12)
+    larger_scores = smaller_scores + 0.05 + 0.02 * rng.normal(size=12)
+    comparison = compare(larger_scores, [smaller_scores], blocks)
+    assert comparison.gain == pytest.approx(0.05, abs=0.02)
+    assert comparison.standard_error < 0.01
+    assert comparison.is_kept
+    unpaired_error = math.hypot(
+        clustered_error(larger_scores, blocks), clustered_error(smaller_scores, blocks)
+    )
+    assert unpaired_error > 10 * comparison.gain
     # The views must be the same ones, in the same order.
-    assert not compare(larger[::-1], [smaller], blocks).is_kept
+    assert not compare(larger_scores[::-1], [smaller_scores], blocks).is_kept
 
 
 def test_a_gain_below_the_spread_over_seeds_is_not_kept():
     views = np.linspace(20, 30, 8)
-    apart = [views, views + 0.6]
-    found = compare(views + 0.3, apart, np.arange(8))
-    assert found.standard_error < 1e-9
-    assert found.spread == pytest.approx(0.6 / math.sqrt(2))
-    assert not found.is_kept
-    assert compare(views + 0.5, apart, np.arange(8)).is_kept
+    seed_scores = [views, views + 0.6]
+    comparison = compare(views + 0.3, seed_scores, np.arange(8))
+    assert comparison.standard_error < 1e-9
+    assert comparison.spread == pytest.approx(0.6 / math.sqrt(2))
+    assert not comparison.is_kept
+    assert compare(views + 0.5, seed_scores, np.arange(8)).is_kept
     # The first seed is that of the larger model, and the gain is measured against it.
-    assert compare(views + 0.3, apart[::-1], np.arange(8)).gain == pytest.approx(-0.3)
+    assert compare(views + 0.3, seed_scores[::-1], np.arange(8)).gain == pytest.approx(-0.3)
 
 
 @pytest.mark.parametrize(

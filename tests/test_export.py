@@ -94,9 +94,9 @@ def test_glb_texture_shows_the_materials_at_every_vertex_and_face_centre(texture
     uv = np.concatenate([mesh.visual.uv, mesh.visual.uv[mesh.faces].mean(1)])
     albedo, roughness, metallic = materials(points)
     material = mesh.visual.material
-    seen = srgb_to_linear(sample(material.baseColorTexture, uv))
-    np.testing.assert_allclose(seen, albedo, atol=COLOR_TOLERANCE)
-    assert np.abs(seen - albedo).mean() < MEAN_COLOR_TOLERANCE
+    base_color = srgb_to_linear(sample(material.baseColorTexture, uv))
+    np.testing.assert_allclose(base_color, albedo, atol=COLOR_TOLERANCE)
+    assert np.abs(base_color - albedo).mean() < MEAN_COLOR_TOLERANCE
     flipped = srgb_to_linear(sample(material.baseColorTexture, uv * [1, -1] + [0, 1]))
     assert np.abs(flipped - albedo).mean() > 10 * MEAN_COLOR_TOLERANCE
     packed = sample(material.metallicRoughnessTexture, uv)
@@ -163,8 +163,8 @@ def test_vertex_colors_are_linear_floats(tmp_path):
     mesh = only_mesh(path)
     albedo, roughness, _ = materials(vertices)
     np.testing.assert_allclose(mesh.visual.vertex_attributes["color"], albedo, atol=1e-6)
-    written = np.ravel(mesh.vertex_attributes["_ROUGHNESS"])
-    np.testing.assert_allclose(written, roughness, atol=1e-6)
+    written_roughness = np.ravel(mesh.vertex_attributes["_ROUGHNESS"])
+    np.testing.assert_allclose(written_roughness, roughness, atol=1e-6)
     assert mesh.visual.material.roughnessFactor == pytest.approx(np.median(roughness), abs=1e-6)
 
 
@@ -183,24 +183,24 @@ def test_normals_of_a_turned_mesh_look_outward(tmp_path, sign):
 def test_inside_out_meshes_are_turned_and_open_ones_are_double_sided(tmp_path):
     vertices, faces, normals = sphere(1)
     arguments = (normals, materials)
-    turned = export.export_mesh_glb(
+    turned_info = export.export_mesh_glb(
         tmp_path / "in.glb", vertices, faces[:, ::-1], *arguments, vertex_colors=True
     )
-    assert turned["flipped"]
+    assert turned_info["flipped"]
     assert only_mesh(tmp_path / "in.glb").volume > 0
-    opened = export.export_mesh_glb(
+    open_info = export.export_mesh_glb(
         tmp_path / "open.glb", vertices, faces[:-1], *arguments, vertex_colors=True
     )
-    assert not opened["closed"]
+    assert not open_info["closed"]
     assert glb_tree(tmp_path / "open.glb")["materials"][0]["doubleSided"]
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
 def test_a_texture_does_not_depend_on_the_unit_of_the_scene(scale):
     vertices, faces, normals = sphere(2)
-    there = np.float32([3.0, -1.0, 2.0])
-    cut = meshes.unwrap(scale * (vertices + there), faces, normals, texture_size=64)
-    corners = cut.uv[cut.faces]
+    offset = np.float32([3.0, -1.0, 2.0])
+    charts = meshes.unwrap(scale * (vertices + offset), faces, normals, texture_size=64)
+    corners = charts.uv[charts.faces]
     (ax, ay), (bx, by) = (np.moveaxis(corners[:, k] - corners[:, 0], 1, 0) for k in (1, 2))
     area = 0.5 * np.abs(ax * by - ay * bx)
     assert area.sum() > 0.1
@@ -208,11 +208,11 @@ def test_a_texture_does_not_depend_on_the_unit_of_the_scene(scale):
 
 def test_degenerate_faces_are_dropped_before_unwrapping(tmp_path):
     vertices, faces, normals = sphere(1)
-    bad = np.array([[0, 0, 1], [2, 3, 2], [5, 5, 5]], np.int32)
+    degenerate_faces = np.array([[0, 0, 1], [2, 3, 2], [5, 5, 5]], np.int32)
     info = export.export_mesh_glb(
         tmp_path / "a.glb",
         vertices,
-        np.concatenate([bad, faces]),
+        np.concatenate([degenerate_faces, faces]),
         normals,
         materials,
         texture_size=64,
@@ -242,9 +242,9 @@ def test_an_obj_is_the_mesh_of_the_glb_with_the_same_textures(tmp_path):
         tmp_path / "mesh.glb", *sphere(), materials, texture_size=TEXTURE, obj_path=path
     )
     glb = only_mesh(tmp_path / "mesh.glb")
-    words = [line.split() for line in path.read_text().splitlines()]
+    tokens = [line.split() for line in path.read_text().splitlines()]
     columns = {
-        key: np.array([line[1:] for line in words if line[0] == key]) for key in ("v", "vt", "f")
+        key: np.array([line[1:] for line in tokens if line[0] == key]) for key in ("v", "vt", "f")
     }
     np.testing.assert_allclose(columns["v"].astype(float), glb.vertices, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(columns["vt"].astype(float), glb.visual.uv, rtol=1e-5, atol=1e-6)
@@ -273,16 +273,16 @@ def test_textures_of_another_format_leave_those_of_an_obj_alone(tmp_path):
         texture_size=TEXTURE,
         obj_path=tmp_path / "mesh.obj",
     )
-    before = {path: path.read_bytes() for path in tmp_path.glob("mesh_*.png")}
-    assert len(before) == 3
-    other = only_mesh(tmp_path / "mesh.glb")
-    other.visual.material.baseColorTexture = Image.new("RGB", (4, 4), (255, 0, 0))
-    stale = tmp_path / "mesh_usd_normal.png"
-    stale.write_bytes(b"of an earlier export")
-    written = export._write_textures(tmp_path / "mesh.usdc", other, mark="_usd")
-    assert {path: path.read_bytes() for path in before} == before
-    assert {path.name for path in tmp_path.glob("mesh_usd_*.png")} == set(written.values())
-    assert not stale.exists()
+    old_textures = {path: path.read_bytes() for path in tmp_path.glob("mesh_*.png")}
+    assert len(old_textures) == 3
+    other_mesh = only_mesh(tmp_path / "mesh.glb")
+    other_mesh.visual.material.baseColorTexture = Image.new("RGB", (4, 4), (255, 0, 0))
+    stale_path = tmp_path / "mesh_usd_normal.png"
+    stale_path.write_bytes(b"of an earlier export")
+    written_names = export._write_textures(tmp_path / "mesh.usdc", other_mesh, mark="_usd")
+    assert {path: path.read_bytes() for path in old_textures} == old_textures
+    assert {path.name for path in tmp_path.glob("mesh_usd_*.png")} == set(written_names.values())
+    assert not stale_path.exists()
 
 
 def test_a_usd_is_the_mesh_of_the_glb_and_its_material_reads_the_textures(tmp_path):
@@ -368,21 +368,21 @@ def bumpy(directions):
     frequency, height = 9.0, 0.02
     radius = 1 + height * np.sin(frequency * unit).sum(1)
     gradient = height * frequency * np.cos(frequency * unit)
-    across = gradient - (gradient * unit).sum(1, keepdims=True) * unit
-    normals = unit - across / radius[:, None]
+    tangent_gradient = gradient - (gradient * unit).sum(1, keepdims=True) * unit
+    normals = unit - tangent_gradient / radius[:, None]
     return unit * radius[:, None], normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
 def accessor(path, tree, number):
     """Read floats or indices of a GLB without a library."""
     data = path.read_bytes()
-    start = 20 + struct.unpack("<I", data[12:16])[0] + 8
-    found = tree["accessors"][number]
-    view = tree["bufferViews"][found["bufferView"]]
-    kind = {5126: "<f4", 5125: "<u4", 5123: "<u2"}[found["componentType"]]
-    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[found["type"]]
-    at = start + view.get("byteOffset", 0) + found.get("byteOffset", 0)
-    return np.frombuffer(data, kind, found["count"] * width, at).reshape(-1, width)
+    data_offset = 20 + struct.unpack("<I", data[12:16])[0] + 8
+    record = tree["accessors"][number]
+    view = tree["bufferViews"][record["bufferView"]]
+    kind = {5126: "<f4", 5125: "<u4", 5123: "<u2"}[record["componentType"]]
+    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[record["type"]]
+    offset = data_offset + view.get("byteOffset", 0) + record.get("byteOffset", 0)
+    return np.frombuffer(data, kind, record["count"] * width, offset).reshape(-1, width)
 
 
 def decoded_normals(path, count=4000):
@@ -401,9 +401,9 @@ def decoded_normals(path, count=4000):
     normal = at["NORMAL"] / np.linalg.norm(at["NORMAL"], axis=1, keepdims=True)
     tangent = at["TANGENT"][:, :3] / np.linalg.norm(at["TANGENT"][:, :3], axis=1, keepdims=True)
     bitangent = np.cross(normal, tangent) * np.sign(at["TANGENT"][:, 3:])
-    shown = texel[:, :1] * tangent + texel[:, 1:2] * bitangent + texel[:, 2:] * normal
-    shown /= np.linalg.norm(shown, axis=1, keepdims=True)
-    return to_z_up(at["POSITION"]), to_z_up(shown), to_z_up(normal)
+    mapped_normals = texel[:, :1] * tangent + texel[:, 1:2] * bitangent + texel[:, 2:] * normal
+    mapped_normals /= np.linalg.norm(mapped_normals, axis=1, keepdims=True)
+    return to_z_up(at["POSITION"]), to_z_up(mapped_normals), to_z_up(normal)
 
 
 def test_a_map_of_normals_gives_a_mesh_of_few_faces_the_look_of_the_fine_one(tmp_path):
@@ -418,15 +418,15 @@ def test_a_map_of_normals_gives_a_mesh_of_few_faces_the_look_of_the_fine_one(tmp
         obj_path=tmp_path / "mesh.obj",
     )
     assert info["faces"] == pytest.approx(1000, rel=0.02)
-    points, shown, plain = decoded_normals(path)
+    points, mapped_normals, mesh_normals = decoded_normals(path)
     expected = bumpy(points)[1]
 
-    def error(found):
-        return np.degrees(np.arccos(np.clip((found * expected).sum(1), -1, 1)))
+    def error(unit_normals):
+        return np.degrees(np.arccos(np.clip((unit_normals * expected).sum(1), -1, 1)))
 
     # Measured: .27 degrees with the map, 1.56 without.
-    assert np.median(error(shown)) < 0.6
-    assert np.median(error(shown)) < 0.5 * np.median(error(plain))
+    assert np.median(error(mapped_normals)) < 0.6
+    assert np.median(error(mapped_normals)) < 0.5 * np.median(error(mesh_normals))
     maps = (tmp_path / "mesh.mtl").read_text()
     assert "norm mesh_normal.png" in maps
     tangents = accessor(
@@ -455,39 +455,39 @@ def test_tangents_follow_u_and_the_bitangent_points_to_the_top_of_the_texture():
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     normals = np.tile([0, 0, 1.0], (4, 1))
     uv = np.array([[0, 1], [1, 1], [1, 0], [0, 0.0]])  # v runs down: y is up on the texture
-    found = baking.vertex_tangents(vertices, faces, normals, uv)
-    np.testing.assert_allclose(found, np.tile([1, 0, 0, 1.0], (4, 1)), atol=1e-6)
+    tangents = baking.vertex_tangents(vertices, faces, normals, uv)
+    np.testing.assert_allclose(tangents, np.tile([1, 0, 0, 1.0], (4, 1)), atol=1e-6)
     mirrored = baking.vertex_tangents(vertices, faces, normals, uv * [-1, 1] + [1, 0])
     np.testing.assert_allclose(mirrored, np.tile([-1, 0, 0, -1.0], (4, 1)), atol=1e-6)
-    nothing = baking.vertex_tangents(vertices, faces, normals, np.zeros((4, 2)))
-    np.testing.assert_allclose(np.linalg.norm(nothing[:, :3], axis=1), 1)
-    np.testing.assert_allclose((nothing[:, :3] * normals).sum(1), 0, atol=1e-6)
+    fallback_tangents = baking.vertex_tangents(vertices, faces, normals, np.zeros((4, 2)))
+    np.testing.assert_allclose(np.linalg.norm(fallback_tangents[:, :3], axis=1), 1)
+    np.testing.assert_allclose((fallback_tangents[:, :3] * normals).sum(1), 0, atol=1e-6)
 
 
 def test_tangents_are_those_of_mikktspace():
     # Two bent sheets, one of them with a mirrored texture, and their tangents by Mikkelsen's own
     # program (`mikktspace` 1.1.1 of npm, in WebAssembly; v runs upwards there, and downwards here).
-    with np.load(DATA / "mikktspace.npz") as known:
+    with np.load(DATA / "mikktspace.npz") as reference:
         names = ("vertices", "faces", "normals", "uv")
-        found = baking.vertex_tangents(*(known[name] for name in names))
-        np.testing.assert_allclose(found, known["tangents"], atol=1e-6)
-    assert set(found[:, 3]) == {-1.0, 1.0}
+        tangents = baking.vertex_tangents(*(reference[name] for name in names))
+        np.testing.assert_allclose(tangents, reference["tangents"], atol=1e-6)
+    assert set(tangents[:, 3]) == {-1.0, 1.0}
 
 
 def test_the_nearest_point_of_a_surface_is_that_of_all_its_faces():
     vertices, faces, normals = sphere(2)
     points = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
     surface = baking.FineSurface(vertices, normals, faces)
-    places, found = surface.nearest(points, points)
+    nearest_points, nearest_normals = surface.nearest(points, points)
     corners = vertices.astype(float)[faces]
-    for point, place in zip(points, places, strict=True):
-        close = trimesh.triangles.closest_point(
+    for point, nearest_point in zip(points, nearest_points, strict=True):
+        candidates = trimesh.triangles.closest_point(
             corners, np.tile(point.astype(float), (len(faces), 1))
         )
-        best = np.linalg.norm(close - point, axis=1).min()
-        assert np.linalg.norm(place - point) == pytest.approx(best, rel=1e-4)
-    towards = places / np.linalg.norm(places, axis=1, keepdims=True)
-    assert np.all((towards * found).sum(1) > 0.995)
+        best = np.linalg.norm(candidates - point, axis=1).min()
+        assert np.linalg.norm(nearest_point - point) == pytest.approx(best, rel=1e-4)
+    directions = nearest_points / np.linalg.norm(nearest_points, axis=1, keepdims=True)
+    assert np.all((directions * nearest_normals).sum(1) > 0.995)
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1e3])
@@ -496,11 +496,13 @@ def test_points_of_tiny_meshes_are_as_near_as_those_of_large_ones(scale):
     vertices, faces, normals = sphere(4)
     points = np.random.default_rng(0).normal(size=(200, 3))
     points *= (1.01 / np.linalg.norm(points, axis=1))[:, None]
-    expected, shown = baking.FineSurface(vertices, normals, faces).nearest(points, points)
+    expected, expected_normals = baking.FineSurface(vertices, normals, faces).nearest(
+        points, points
+    )
     surface = baking.FineSurface(scale * vertices, normals, faces)
-    places, found = surface.nearest(scale * points, points)
-    np.testing.assert_allclose(places, scale * expected, atol=1e-6 * scale)
-    np.testing.assert_allclose(found, shown, atol=1e-5)
+    nearest_points, nearest_normals = surface.nearest(scale * points, points)
+    np.testing.assert_allclose(nearest_points, scale * expected, atol=1e-6 * scale)
+    np.testing.assert_allclose(nearest_normals, expected_normals, atol=1e-5)
 
 
 def test_the_side_of_a_thin_wall_is_that_which_looks_the_same_way():
@@ -511,10 +513,10 @@ def test_the_side_of_a_thin_wall_is_that_which_looks_the_same_way():
         np.concatenate([normals, inside[1]]),
         np.concatenate([faces, inside[2] + len(vertices)]),
     )
-    asked = 0.98 * vertices  # nearer to the inner side
-    for towards in (normals, -normals):
-        found = wall.nearest(asked, towards)[1]
-        assert np.all((found * towards).sum(1) > 0.99)
+    queries = 0.98 * vertices  # nearer to the inner side
+    for directions in (normals, -normals):
+        nearest_normals = wall.nearest(queries, directions)[1]
+        assert np.all((nearest_normals * directions).sum(1) > 0.99)
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
@@ -522,12 +524,14 @@ def test_fewer_faces_are_as_good_in_any_unit(scale):
     """The library that simplifies meshes has thresholds in units of length."""
     pytest.importorskip("fast_simplification")
     vertices, faces, _ = sphere(4)
-    far = np.array([3.0, -2.0, 1.0])
+    offset = np.array([3.0, -2.0, 1.0])
     relief = vertices * (1.0 + 0.03 * np.sin(9.0 * vertices[:, :1]))
-    places, rows = baking.simplified(scale * (relief + far), faces, 1000)
-    assert len(rows) <= 1010
-    simple = baking.FineSurface(places / scale - far, places, rows)
-    error = np.linalg.norm(simple.nearest(relief, relief)[0] - relief, axis=1)
+    simple_vertices, simple_faces = baking.simplified(scale * (relief + offset), faces, 1000)
+    assert len(simple_faces) <= 1010
+    simple_surface = baking.FineSurface(
+        simple_vertices / scale - offset, simple_vertices, simple_faces
+    )
+    error = np.linalg.norm(simple_surface.nearest(relief, relief)[0] - relief, axis=1)
     # Measured: .0016 at every scale. Simplified in the unit of the file: .0023, .0018 and .0016.
     assert np.mean(error) < 1.7e-3
 
@@ -565,10 +569,10 @@ def test_the_khronos_validator_has_nothing_to_say(tmp_path, options):
     export.export_mesh_glb(path, *sphere(2), materials, **options)
     script = tmp_path / "validate.js"
     script.write_text(VALIDATOR)
-    said = subprocess.run(
+    report = subprocess.run(
         [node, script, package, path], capture_output=True, text=True, check=True, timeout=60
     ).stdout
-    assert json.loads(said)["messages"] == []
+    assert json.loads(report)["messages"] == []
 
 
 def test_unusable_meshes_are_refused_and_leave_no_file(tmp_path):
@@ -615,23 +619,25 @@ def test_chart_rasterisation_equals_brute_force():
     expected = np.full((40, 40), -1)
     for row, face in enumerate(faces):
         a, b, c = uv[face].astype(np.float64)
-        solved = np.linalg.solve(np.stack([b - a, c - a], -1), (centers - a)[..., None])[..., 0]
-        inside = np.all(solved > 0, -1) & (solved.sum(-1) < 1)
+        solutions = np.linalg.solve(np.stack([b - a, c - a], -1), (centers - a)[..., None])[..., 0]
+        inside = np.all(solutions > 0, -1) & (solutions.sum(-1) < 1)
         expected[inside] = row
     assert (expected >= 0).sum() > 100
     np.testing.assert_array_equal(face_rows, expected)
-    covered = face_rows >= 0
-    rebuilt = np.einsum("nk,nkd->nd", barycentrics[covered], uv[faces[face_rows[covered]]])
-    np.testing.assert_allclose(rebuilt, centers[covered], atol=1e-5)
+    is_covered = face_rows >= 0
+    rebuilt_centers = np.einsum(
+        "nk,nkd->nd", barycentrics[is_covered], uv[faces[face_rows[is_covered]]]
+    )
+    np.testing.assert_allclose(rebuilt_centers, centers[is_covered], atol=1e-5)
 
 
 def test_gutters_take_the_nearest_covered_texel():
     texture = np.arange(25, dtype=np.float32).reshape(5, 5, 1)
-    covered = np.zeros((5, 5), bool)
-    covered[1, 1] = covered[4, 4] = True
-    filled = meshes.fill_gutters(texture, covered)
-    assert filled[0, 0] == filled[1, 1] == 6
-    assert filled[4, 3] == 24
+    is_covered = np.zeros((5, 5), bool)
+    is_covered[1, 1] = is_covered[4, 4] = True
+    filled_texture = meshes.fill_gutters(texture, is_covered)
+    assert filled_texture[0, 0] == filled_texture[1, 1] == 6
+    assert filled_texture[4, 3] == 24
 
 
 def camera_at_distance_three(size=64):
@@ -645,46 +651,57 @@ def camera_at_distance_three(size=64):
 def test_rendered_normals_of_a_sphere_are_exact():
     vertices, faces, normals = sphere(4)
     camera = camera_at_distance_three()
-    drawn, alpha = meshes.render_mesh_normals(vertices, faces, normals, camera)
-    turned = (vertices, faces[:, ::-1], -normals)
+    rendered_normals, alpha = meshes.render_mesh_normals(vertices, faces, normals, camera)
+    turned_mesh = (vertices, faces[:, ::-1], -normals)
     np.testing.assert_allclose(
-        meshes.render_mesh_normals(*turned, camera, is_two_sided=True)[0], drawn, atol=1e-6
+        meshes.render_mesh_normals(*turned_mesh, camera, is_two_sided=True)[0],
+        rendered_normals,
+        atol=1e-6,
     )
-    np.testing.assert_allclose(meshes.render_mesh_normals(*turned, camera)[0], -drawn, atol=1e-6)
+    np.testing.assert_allclose(
+        meshes.render_mesh_normals(*turned_mesh, camera)[0], -rendered_normals, atol=1e-6
+    )
     grid = (np.stack(np.meshgrid(np.arange(64), np.arange(64)), -1) + 0.5 - 32) / (1.2 * 64)
     rays = np.concatenate([grid, np.ones((64, 64, 1))], -1)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    along = 3 * rays[..., 2]
-    discriminant = along**2 - (9 - 0.64)
+    closest_depth = 3 * rays[..., 2]
+    discriminant = closest_depth**2 - (9 - 0.64)
     hit = discriminant > 0.05
-    points = rays * (along - np.sqrt(np.maximum(discriminant, 0)))[..., None] - [0, 0, 3]
-    cosine = (drawn * points / 0.8).sum(-1)
+    points = rays * (closest_depth - np.sqrt(np.maximum(discriminant, 0)))[..., None] - [0, 0, 3]
+    cosine = (rendered_normals * points / 0.8).sum(-1)
     assert np.rad2deg(np.arccos(np.clip(cosine[hit], -1, 1))).max() < 1.0
     assert np.all(alpha[hit] == 1)
     assert np.all(alpha[discriminant < -0.1] == 0)
-    assert np.all(drawn[alpha == 0] == 0)
+    assert np.all(rendered_normals[alpha == 0] == 0)
 
 
 def test_the_nearest_of_two_surfaces_is_drawn_whatever_their_order():
     quad = np.array([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], np.float32)
     vertices = np.concatenate([quad, quad + np.float32([0, 0, 1])])
     normals = np.repeat(np.float32([[0, 0, -1], [1, 0, 0]]), 4, axis=0)
-    near = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    for faces in (np.concatenate([near, near + 4]), np.concatenate([near + 4, near])):
-        drawn, alpha = meshes.render_mesh_normals(
+    near_faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    for faces in (
+        np.concatenate([near_faces, near_faces + 4]),
+        np.concatenate([near_faces + 4, near_faces]),
+    ):
+        rendered_normals, alpha = meshes.render_mesh_normals(
             vertices, faces, normals, camera_at_distance_three(16)
         )
         assert np.all(alpha == 1)
-        np.testing.assert_allclose(drawn, np.broadcast_to([0.0, 0, -1], (16, 16, 3)), atol=1e-6)
+        np.testing.assert_allclose(
+            rendered_normals, np.broadcast_to([0.0, 0, -1], (16, 16, 3)), atol=1e-6
+        )
 
 
 def test_an_empty_or_hidden_mesh_gives_an_empty_picture():
     vertices, faces, normals = sphere(1)
     camera = camera_at_distance_three(8)
-    for chosen in (faces[:0], faces):
-        moved = vertices - np.float32([0, 0, 10])
-        drawn, alpha = meshes.render_mesh_normals(moved, chosen, normals, camera)
-        assert not drawn.any()
+    for mesh_faces in (faces[:0], faces):
+        hidden_vertices = vertices - np.float32([0, 0, 10])
+        rendered_normals, alpha = meshes.render_mesh_normals(
+            hidden_vertices, mesh_faces, normals, camera
+        )
+        assert not rendered_normals.any()
         assert not alpha.any()
 
 
@@ -731,8 +748,8 @@ def read_ply(path):
 
 
 def test_gaussian_ply_decodes_to_what_was_written(tmp_path):
-    given = gaussians()
-    export.export_gaussians_ply(tmp_path / "g.ply", **given)
+    splats = gaussians()
+    export.export_gaussians_ply(tmp_path / "g.ply", **splats)
     table = read_ply(tmp_path / "g.ply")
     order = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2".split()
     assert list(table) == [*order, "rot_0", "rot_1", "rot_2", "rot_3"]
@@ -740,40 +757,40 @@ def test_gaussian_ply_decodes_to_what_was_written(tmp_path):
     def columns(*names):
         return np.stack([table[name] for name in names], -1).astype(np.float64)
 
-    np.testing.assert_allclose(columns("x", "y", "z"), given["means"], atol=1e-6)
-    np.testing.assert_allclose(columns("nx", "ny", "nz"), given["normals"], atol=1e-6)
+    np.testing.assert_allclose(columns("x", "y", "z"), splats["means"], atol=1e-6)
+    np.testing.assert_allclose(columns("nx", "ny", "nz"), splats["normals"], atol=1e-6)
     scales = np.exp(columns("scale_0", "scale_1", "scale_2"))
-    np.testing.assert_allclose(scales, given["scales"], rtol=1e-5)
+    np.testing.assert_allclose(scales, splats["scales"], rtol=1e-5)
     opacity = 1 / (1 + np.exp(-columns("opacity")[:, 0]))
-    np.testing.assert_allclose(opacity, given["opacities"], atol=2e-6)
+    np.testing.assert_allclose(opacity, splats["opacities"], atol=2e-6)
     rgb = 0.5 + 0.28209479177387814 * columns("f_dc_0", "f_dc_1", "f_dc_2")
-    np.testing.assert_allclose(rgb, given["rgb"], atol=1e-6)
+    np.testing.assert_allclose(rgb, splats["rgb"], atol=1e-6)
     quats = columns("rot_0", "rot_1", "rot_2", "rot_3")
-    unit = given["quats"] / np.linalg.norm(given["quats"], axis=-1, keepdims=True)
+    unit = splats["quats"] / np.linalg.norm(splats["quats"], axis=-1, keepdims=True)
     np.testing.assert_allclose(quats, unit, atol=1e-6)
 
 
 def test_broken_gaussians_are_refused(tmp_path):
-    broken = gaussians()
-    broken["means"][3, 1] = np.inf
+    broken_splats = gaussians()
+    broken_splats["means"][3, 1] = np.inf
     with pytest.raises(ValueError, match="finite"):
-        export.export_gaussians_ply(tmp_path / "g.ply", **broken)
-    broken = gaussians()
-    broken["quats"][0] = 0
+        export.export_gaussians_ply(tmp_path / "g.ply", **broken_splats)
+    broken_splats = gaussians()
+    broken_splats["quats"][0] = 0
     with pytest.raises(ValueError, match="quats"):
-        export.export_gaussians_ply(tmp_path / "g.ply", **broken)
+        export.export_gaussians_ply(tmp_path / "g.ply", **broken_splats)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_failed_export_keeps_the_previous_file(tmp_path):
     path = tmp_path / "g.ply"
     export.export_gaussians_ply(path, **gaussians())
-    before = path.read_bytes()
-    broken = gaussians()
-    broken["rgb"][0] = np.nan
+    old_bytes = path.read_bytes()
+    broken_splats = gaussians()
+    broken_splats["rgb"][0] = np.nan
     with pytest.raises(ValueError, match="finite"):
-        export.export_gaussians_ply(path, **broken)
-    assert path.read_bytes() == before
+        export.export_gaussians_ply(path, **broken_splats)
+    assert path.read_bytes() == old_bytes
     assert list(tmp_path.iterdir()) == [path]
 
 

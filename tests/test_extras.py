@@ -12,9 +12,11 @@ pytestmark = pytest.mark.usefixtures("products_must_ask")
 
 def test_a_missing_package_is_named_with_the_extra_that_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
-    with pytest.raises(SceneError, match=r"^USD needs the package usd-core; install it with") as e:
+    with pytest.raises(
+        SceneError, match=r"^USD needs the package usd-core; install it with"
+    ) as error_info:
         optional_package("pxr", "USD", extra="usd", package="usd-core")
-    assert "pip install 'geosplat_jax[usd]'" in str(e.value)
+    assert "pip install 'geosplat_jax[usd]'" in str(error_info.value)
 
 
 @pytest.mark.parametrize(
@@ -30,10 +32,10 @@ def test_a_package_that_cannot_be_imported_is_not_called_missing(
 ):
     (tmp_path / "broken_package_of_the_test.py").write_text(source)
     monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(SceneError, match="is installed but cannot be imported") as e:
+    with pytest.raises(SceneError, match="is installed but cannot be imported") as error_info:
         optional_package("broken_package_of_the_test", "USD", extra="usd")
-    assert reason in str(e.value)
-    assert isinstance(e.value.__cause__, ImportError)
+    assert reason in str(error_info.value)
+    assert isinstance(error_info.value.__cause__, ImportError)
 
 
 def test_the_caller_chooses_the_class_of_the_error(monkeypatch):

@@ -103,23 +103,23 @@ def reference_duals(geometry, grid, surface, crosses):
     """
     count = int(surface.mesh.vertex_count)
     cell = np.asarray(surface.vertex_cells)[:count]
-    wide = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), geometry)
+    double_geometry = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), geometry)
     nx, ny, _ = grid.shape
     lowest = np.stack([cell % nx, cell // nx % ny, cell // (nx * ny)], axis=-1)
     vx, vy, _ = grid.vertex_shape
     corner = (lowest[:, None] + CORNERS) @ np.array([1, vx, vx * vy])
     positions = np.asarray(grid_vertices(grid), np.float64)[corner]
-    positions += 0.5 * float(grid.cell_size) * np.tanh(wide.deform[corner])
-    scaled = wide.sdf[corner] * (1 + 0.99 * np.tanh(wide.alpha[cell]))
+    positions += 0.5 * float(grid.cell_size) * np.tanh(double_geometry.deform[corner])
+    scaled = double_geometry.sdf[corner] * (1 + 0.99 * np.tanh(double_geometry.alpha[cell]))
     low, high = (scaled[:, EDGES[:, end]] for end in (0, 1))
-    used = np.asarray(crosses).T[:count]
-    is_usable = used & (np.maximum(np.abs(low), np.abs(high)) > 1e-12)
-    part = np.where(is_usable, low, -1.0) / np.where(is_usable, low - high, -2.0)
+    is_used = np.asarray(crosses).T[:count]
+    is_usable = is_used & (np.maximum(np.abs(low), np.abs(high)) > 1e-12)
+    fraction = np.where(is_usable, low, -1.0) / np.where(is_usable, low - high, -2.0)
     start, end = (positions[:, EDGES[:, side]] for side in (0, 1))
-    crossing = start + part[..., None] * (end - start)
-    weight = np.where(used, 1 + 0.99 * np.tanh(wide.beta[cell]), 0.0)
-    duals = np.einsum("ne,nec->nc", weight, crossing) / weight.sum(axis=1, keepdims=True)
-    return duals, crossing, used
+    crossings = start + fraction[..., None] * (end - start)
+    weight = np.where(is_used, 1 + 0.99 * np.tanh(double_geometry.beta[cell]), 0.0)
+    duals = np.einsum("ne,nec->nc", weight, crossings) / weight.sum(axis=1, keepdims=True)
+    return duals, crossings, is_used
 
 
 EXPONENTS = st.floats(-30, 10)
@@ -147,14 +147,14 @@ def test_dual_vertices_are_the_weighted_mean_of_crossings_over_40_decades(
     geometry = make_geometry(grid, sdf, weight=weight, deform=deform, seed=seed)
     surface, crosses = extract(geometry, grid)
     assert bool(fits(surface.usage, ROOM))
-    duals, crossing, used = reference_duals(geometry, grid, surface, crosses)
+    duals, crossings, is_used = reference_duals(geometry, grid, surface, crosses)
     count = len(duals)
     actual = np.asarray(surface.mesh.vertices)[:count]
     # A relative error of a crossing's weights moves it along its edge by as large a share.
     np.testing.assert_allclose(actual, duals, atol=2 * POSITION * 0.25)
     # Every vertex lies within the bounds of its crossings along each axis.
-    low = np.where(used[..., None], crossing, np.inf).min(axis=1)
-    high = np.where(used[..., None], crossing, -np.inf).max(axis=1)
+    low = np.where(is_used[..., None], crossings, np.inf).min(axis=1)
+    high = np.where(is_used[..., None], crossings, -np.inf).max(axis=1)
     slack = POSITION * 0.25
     assert (actual >= low - slack).all()
     assert (actual <= high + slack).all()
@@ -175,15 +175,22 @@ def test_gradients_over_40_decades_equal_those_in_float64():
         cases.append(make_geometry(grid, sdf, weight=weight, deform=deform, seed=seed))
     # The deviation, a sum of magnitudes, is left out: where crossings meet in a vertex of the grid,
     # distances are equal, and rounding decides on which side of its kink each term lies.
-    single = [differentiate(geometry, grid, 0.0)[1] for geometry in cases]
+    single_gradients = [differentiate(geometry, grid, 0.0)[1] for geometry in cases]
     with double_precision():
-        wide = make_grid(SHAPE, jnp.float64)
-        for geometry, got in zip(cases, single, strict=True):
-            lifted = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), jnp.float64), geometry)
-            expected = differentiate(lifted, wide, 0.0)[1]
-            for one, two in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
-                one, two = np.asarray(one, np.float64), np.asarray(two)
-                assert np.linalg.norm(one - two) <= GRADIENT * np.linalg.norm(two)
+        double_grid = make_grid(SHAPE, jnp.float64)
+        for geometry, single_gradient in zip(cases, single_gradients, strict=True):
+            double_geometry = jax.tree.map(
+                lambda leaf: jnp.asarray(np.asarray(leaf), jnp.float64), geometry
+            )
+            expected = differentiate(double_geometry, double_grid, 0.0)[1]
+            for single_leaf, double_leaf in zip(
+                jax.tree.leaves(single_gradient), jax.tree.leaves(expected), strict=True
+            ):
+                single_leaf = np.asarray(single_leaf, np.float64)
+                double_leaf = np.asarray(double_leaf)
+                assert np.linalg.norm(single_leaf - double_leaf) <= GRADIENT * np.linalg.norm(
+                    double_leaf
+                )
 
 
 @pytest.mark.parametrize("power", [-30, 33, 100])
@@ -192,27 +199,31 @@ def test_the_surface_does_not_know_the_unit_of_the_sdf(power):
     sdf = jnp.asarray(
         signs(grid) * np.random.default_rng(1).uniform(0.01, 1, grid.vertex_count), jnp.float32
     )
-    first = make_geometry(grid, sdf, weight=1.0, deform=1.0)
-    second = replace(first, sdf=sdf * jnp.float32(2.0**power))
-    _, gradient, surface = differentiate(first, grid)
-    _, other_gradient, other = differentiate(second, grid)
+    geometry = make_geometry(grid, sdf, weight=1.0, deform=1.0)
+    scaled_geometry = replace(geometry, sdf=sdf * jnp.float32(2.0**power))
+    _, gradient, surface = differentiate(geometry, grid)
+    _, scaled_gradient, scaled_surface = differentiate(scaled_geometry, grid)
     # A power of two only shifts exponents: equal to the last bit.
-    np.testing.assert_array_equal(other.mesh.vertices, surface.mesh.vertices)
-    np.testing.assert_array_equal(other_gradient.alpha, gradient.alpha)
+    np.testing.assert_array_equal(scaled_surface.mesh.vertices, surface.mesh.vertices)
+    np.testing.assert_array_equal(scaled_gradient.alpha, gradient.alpha)
     np.testing.assert_allclose(
-        np.asarray(other_gradient.sdf, np.float64) * 2.0**power, gradient.sdf, rtol=1e-5, atol=1e-6
+        np.asarray(scaled_gradient.sdf, np.float64) * 2.0**power, gradient.sdf, rtol=1e-5, atol=1e-6
     )
 
 
 @pytest.mark.parametrize("size", [1e-30, 1e-13])
 def test_an_sdf_without_size_is_crossed_at_midpoints_without_gradient(size):
     grid = make_grid(SHAPE)
-    tiny = make_geometry(grid, jnp.asarray(size * signs(grid), jnp.float32), weight=1.0, deform=1.0)
-    plain = replace(
-        tiny, sdf=jnp.asarray(signs(grid), jnp.float32), alpha=jnp.zeros_like(tiny.alpha)
+    tiny_geometry = make_geometry(
+        grid, jnp.asarray(size * signs(grid), jnp.float32), weight=1.0, deform=1.0
     )
-    _, gradient, surface = differentiate(tiny, grid)
-    _, plain_gradient, expected = differentiate(plain, grid)
+    plain_geometry = replace(
+        tiny_geometry,
+        sdf=jnp.asarray(signs(grid), jnp.float32),
+        alpha=jnp.zeros_like(tiny_geometry.alpha),
+    )
+    _, gradient, surface = differentiate(tiny_geometry, grid)
+    _, plain_gradient, expected = differentiate(plain_geometry, grid)
     np.testing.assert_array_equal(surface.mesh.faces, expected.mesh.faces)
     np.testing.assert_allclose(surface.mesh.vertices, expected.mesh.vertices, atol=POSITION)
     np.testing.assert_array_equal(gradient.sdf, 0.0)
@@ -291,24 +302,24 @@ def test_a_surface_cut_by_the_border_is_the_whole_one_inside_and_open_only_there
     sphere = sphere_sdf(whole_grid, radius=0.58)
     sphere = sphere + shift * jnp.sin(3 * grid_vertices(whole_grid)[:, 0])
     cube = np.asarray(sphere).reshape(7, 7, 7)[1:-1, 1:-1, 1:-1]
-    whole, _ = extract(initial_geometry(whole_grid, sphere), whole_grid)
+    whole_surface, _ = extract(initial_geometry(whole_grid, sphere), whole_grid)
     geometry = initial_geometry(part_grid, jnp.asarray(cube.reshape(-1)))
-    part, _ = extract(geometry, part_grid)
-    assert bool(fits(whole.usage, ROOM))
-    assert 0 < int(part.usage["quads"]) < int(whole.usage["quads"])
+    part_surface, _ = extract(geometry, part_grid)
+    assert bool(fits(whole_surface.usage, ROOM))
+    assert 0 < int(part_surface.usage["quads"]) < int(whole_surface.usage["quads"])
 
     def inside(face):
         """Whether every corner lies in the smaller grid, away from its border."""
         return all(max(map(abs, corner)) < 0.5 for corner in face)
 
-    expected = {face for face in face_positions(whole) if inside(face)}
-    assert face_positions(part) == expected
+    expected = {face for face in face_positions(whole_surface) if inside(face)}
+    assert face_positions(part_surface) == expected
     # Edges with one face lie between dual vertices of cells at the border.
-    faces = np.asarray(part.mesh.faces)[: int(part.mesh.face_count)]
+    faces = np.asarray(part_surface.mesh.faces)[: int(part_surface.mesh.face_count)]
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    unique, uses = np.unique(edges, axis=0, return_counts=True)
-    assert set(uses.tolist()) == {1, 2}
-    cell = np.asarray(part.vertex_cells)[unique[uses == 1]]
+    unique, use_counts = np.unique(edges, axis=0, return_counts=True)
+    assert set(use_counts.tolist()) == {1, 2}
+    cell = np.asarray(part_surface.vertex_cells)[unique[use_counts == 1]]
     coordinates = np.stack([cell % 4, cell // 4 % 4, cell // 16], axis=-1)
     assert ((coordinates == 0) | (coordinates == 3)).any(axis=-1).all()
 
@@ -319,20 +330,20 @@ def test_small_grids_have_one_quad_for_each_crossed_interior_edge(shape):
     for seed in range(3):
         sign = signs(grid, seed)
         inside = (sign < 0).reshape(grid.vertex_shape[::-1])
-        crossed = 0
+        crossing_count = 0
         for axis in range(3):
-            change = np.moveaxis(np.diff(inside, axis=axis), axis, 0)
-            crossed += int(change[:, 1:-1, 1:-1].sum())
+            is_changed = np.moveaxis(np.diff(inside, axis=axis), axis, 0)
+            crossing_count += int(is_changed[:, 1:-1, 1:-1].sum())
         geometry = make_geometry(grid, jnp.asarray(sign, jnp.float32), weight=50.0, seed=seed)
         surface, crosses = extract(geometry, grid)
-        assert int(surface.usage["quads"]) == crossed
-        assert int(surface.mesh.face_count) == 2 * crossed
+        assert int(surface.usage["quads"]) == crossing_count
+        assert int(surface.mesh.face_count) == 2 * crossing_count
         duals, _, _ = reference_duals(geometry, grid, surface, crosses)
         np.testing.assert_allclose(
             np.asarray(surface.mesh.vertices)[: len(duals)], duals, atol=POSITION
         )
     if min(shape) == 1:
-        assert crossed == 0 or shape == (2, 2, 1)
+        assert crossing_count == 0 or shape == (2, 2, 1)
 
 
 @pytest.mark.parametrize("size", [1e-30, 1.0, 1e10])
@@ -369,23 +380,23 @@ def test_entropy_at_the_extremes_is_that_of_its_definition(size):
 
 @pytest.mark.parametrize("size", [1e-30, 1e10])
 def test_resampling_keeps_the_sign_of_extreme_values_and_stays_in_range(size):
-    grid, finer = make_grid(SHAPE), replace(make_grid((8, 6, 10)), cell_size=jnp.float32(0.125))
+    grid, fine_grid = make_grid(SHAPE), replace(make_grid((8, 6, 10)), cell_size=jnp.float32(0.125))
     geometry = make_geometry(grid, jnp.asarray(size * signs(grid), jnp.float32), deform=50.0)
-    plain = replace(geometry, deform=jnp.zeros_like(geometry.deform))
+    undeformed = replace(geometry, deform=jnp.zeros_like(geometry.deform))
     carry = jax.jit(resample)
-    for source in (geometry, plain):
-        fresh = carry(source, grid, replace(finer, origin=grid.origin))
-        assert np.abs(np.asarray(fresh.sdf)).max() <= 2 * size * (1 + 10 * ROUNDING)
+    for source in (geometry, undeformed):
+        resampled = carry(source, grid, replace(fine_grid, origin=grid.origin))
+        assert np.abs(np.asarray(resampled.sdf)).max() <= 2 * size * (1 + 10 * ROUNDING)
     # Every second vertex coincides with an old one; values are in cells, which are half as large.
-    kept = np.asarray(fresh.sdf).reshape(11, 7, 9)[::2, ::2, ::2].reshape(-1)
-    np.testing.assert_allclose(kept, 2 * geometry.sdf, rtol=1e-5)
+    coinciding_values = np.asarray(resampled.sdf).reshape(11, 7, 9)[::2, ::2, ::2].reshape(-1)
+    np.testing.assert_allclose(coinciding_values, 2 * geometry.sdf, rtol=1e-5)
 
 
 def test_saturated_deformation_moves_by_exactly_half_a_cell():
     grid = make_grid(SHAPE)
     geometry = make_geometry(grid, jnp.zeros(grid.vertex_count), deform=50.0)
-    moves = deformed_vertices(geometry, grid) - grid_vertices(grid)
-    np.testing.assert_array_equal(moves, 0.125 * jnp.sign(geometry.deform))
+    displacements = deformed_vertices(geometry, grid) - grid_vertices(grid)
+    np.testing.assert_array_equal(displacements, 0.125 * jnp.sign(geometry.deform))
 
 
 # The adapter: one batch of separate triangles for every test, so that it compiles once
@@ -414,12 +425,12 @@ def rotated_needles(count):
     """Needles of aspect 1 to 1e6 in every direction, about 1 long."""
     rng = np.random.default_rng(1)
     height = 10.0 ** -np.linspace(0, 6, count)
-    flat = np.zeros((count, 3, 3))
-    flat[:, 1, 0] = 1.0
-    flat[:, 2, 0] = rng.uniform(0, 1, count)
-    flat[:, 2, 1] = height
-    turned = np.einsum("nij,nkj->nki", random_rotations(count), flat)
-    return np.float32(turned + 0.3).astype(np.float64), height
+    flat_needles = np.zeros((count, 3, 3))
+    flat_needles[:, 1, 0] = 1.0
+    flat_needles[:, 2, 0] = rng.uniform(0, 1, count)
+    flat_needles[:, 2, 1] = height
+    rotated = np.einsum("nij,nkj->nki", random_rotations(count), flat_needles)
+    return np.float32(rotated + 0.3).astype(np.float64), height
 
 
 def coincident(count):
@@ -453,11 +464,11 @@ def sample_batch(mesh, normals, *, sample, constants):
     def scalar(vertices, normals):
         splats = sample(replace(mesh, vertices=vertices), normals, constants=constants)
         matrices = quaternion_to_matrix(splats.quats)
-        parts = (splats.means, matrices, splats.scales, splats.normals)
+        values = (splats.means, matrices, splats.scales, splats.normals)
         rng, total = np.random.default_rng(3), jnp.zeros((), vertices.dtype)
-        for part in parts:
-            weights = rng.normal(size=part.shape)
-            total = total + jnp.sum(jnp.asarray(weights, part.dtype) * part)
+        for value in values:
+            weights = rng.normal(size=value.shape)
+            total = total + jnp.sum(jnp.asarray(weights, value.dtype) * value)
         return total, (splats, matrices)
 
     gradient, outputs = jax.grad(scalar, argnums=(0, 1), has_aux=True)(mesh.vertices, normals)
@@ -481,13 +492,15 @@ def both_precisions(triangles, sample, constants):
     single = run(jnp.float32)
     with double_precision():
         double = run(jnp.float64)
-    return [jax.tree.map(lambda x: np.asarray(x, np.float64), part) for part in (single, double)]
+    return [
+        jax.tree.map(lambda x: np.asarray(x, np.float64), outputs) for outputs in (single, double)
+    ]
 
 
 def rows_of(sample, mask):
     """Rows of splats that belong to the chosen faces."""
-    each = 6 if sample is face_splats else 3
-    return np.flatnonzero(np.repeat(mask, each))
+    splats_per_face = 6 if sample is face_splats else 3
+    return np.flatnonzero(np.repeat(mask, splats_per_face))
 
 
 def lengths_and_doubled_areas(triangles):
@@ -500,27 +513,27 @@ def lengths_and_doubled_areas(triangles):
 @pytest.mark.parametrize(("sample", "constants"), SAMPLINGS)
 def test_needles_and_specks_with_exact_edges_equal_float64(sample, constants):
     triangles = exact_triangles()
-    (one, frame, gradient), (two, wide_frame, wide_gradient) = both_precisions(
+    (single, frame, gradient), (double, wide_frame, wide_gradient) = both_precisions(
         triangles, sample, constants
     )
     sides, doubled = lengths_and_doubled_areas(triangles)
-    count, each = len(triangles), 6 if sample is face_splats else 3
-    rows = slice(0, each * count)
-    error = np.abs(one.means - two.means)[rows]
-    assert (error <= 4 * ROUNDING * np.repeat(sides.max(axis=1), each)[:, None]).all()
-    np.testing.assert_allclose(one.normals[rows], two.normals[rows], atol=1e-5)
+    count, splats_per_face = len(triangles), 6 if sample is face_splats else 3
+    rows = slice(0, splats_per_face * count)
+    error = np.abs(single.means - double.means)[rows]
+    assert (error <= 4 * ROUNDING * np.repeat(sides.max(axis=1), splats_per_face)[:, None]).all()
+    np.testing.assert_allclose(single.normals[rows], double.normals[rows], atol=1e-5)
     np.testing.assert_allclose(frame[rows], wide_frame[rows], atol=1e-5)
     # The smallest cross products have no direction. What remains is their size, which at the very
     # end leaves the range of float32.
     is_real = doubled > 1e-30
     rows = rows_of(sample, is_real)
-    np.testing.assert_allclose(one.scales[rows], two.scales[rows], rtol=1e-5)
+    np.testing.assert_allclose(single.scales[rows], double.scales[rows], rtol=1e-5)
     assert all(np.isfinite(leaf).all() for leaf in gradient)
     # The functional depends on the direction of the normal, so that its gradient grows as 1 /
     # height, to 1e19. Terms that cancel, such as a width when the short side is stretched, leave a
     # rounding of 1 / side.
     slack = ROUNDING / np.maximum(sides.min(axis=1), 1e-21)
-    normal = two.normals.reshape(-1, each, 3)[:count, :1]
+    normal = double.normals.reshape(-1, splats_per_face, 3)[:count, :1]
     for k in range(2):
         one_face, two_face = (
             x[k][: 3 * count].reshape(count, 3, 3) for x in (gradient, wide_gradient)
@@ -535,26 +548,28 @@ def test_needles_and_specks_with_exact_edges_equal_float64(sample, constants):
 @pytest.mark.parametrize(("sample", "constants"), SAMPLINGS)
 def test_needles_in_every_direction_are_exact_up_to_a_rounding_of_their_length(sample, constants):
     triangles, height = rotated_needles(FACES)
-    (one, frame, gradient), (two, wide_frame, _) = both_precisions(triangles, sample, constants)
-    each = 6 if sample is face_splats else 3
-    np.testing.assert_allclose(one.means, two.means, atol=4 * ROUNDING)
+    (single, frame, gradient), (double, wide_frame, _) = both_precisions(
+        triangles, sample, constants
+    )
+    splats_per_face = 6 if sample is face_splats else 3
+    np.testing.assert_allclose(single.means, double.means, atol=4 * ROUNDING)
     # Areas err by a rounding of the products of edges about 1 long.
     if sample is face_splats:
-        np.testing.assert_allclose(one.scales[:, 0], two.scales[:, 0], rtol=2e-6, atol=1e-12)
-        shares = [x.scales[:, 0] * x.scales[:, 1] for x in (one, two)]
+        np.testing.assert_allclose(single.scales[:, 0], double.scales[:, 0], rtol=2e-6, atol=1e-12)
+        shares = [x.scales[:, 0] * x.scales[:, 1] for x in (single, double)]
         np.testing.assert_allclose(*shares, rtol=1e-5, atol=ROUNDING)
     else:
-        areas = [x.scales[:, 0] ** 2 for x in (one, two)]
+        areas = [x.scales[:, 0] ** 2 for x in (single, double)]
         np.testing.assert_allclose(*areas, rtol=1e-5, atol=4 * ROUNDING)
     # Hence the normal is known to within a rounding of the length over the height.
-    tolerance = 10 * ROUNDING / np.repeat(height, each)
-    assert (np.linalg.norm(one.normals - two.normals, axis=1) <= tolerance + 1e-5).all()
+    tolerance = 10 * ROUNDING / np.repeat(height, splats_per_face)
+    assert (np.linalg.norm(single.normals - double.normals, axis=1) <= tolerance + 1e-5).all()
     # However wrong the normal is, the frame is a rotation.
     products = frame @ frame.transpose(0, 2, 1)
     np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), products.shape), atol=1e-5)
     if sample is vertex_splats or constants.shading_frame:
-        np.testing.assert_allclose(frame[:, :, 2], one.normals, atol=1e-5)
-    is_thick = np.repeat(height, each) > 1e-3
+        np.testing.assert_allclose(frame[:, :, 2], single.normals, atol=1e-5)
+    is_thick = np.repeat(height, splats_per_face) > 1e-3
     np.testing.assert_allclose(frame[is_thick], wide_frame[is_thick], atol=1e-3)
     assert all(np.isfinite(leaf).all() for leaf in gradient)
 
@@ -599,9 +614,9 @@ def test_triangles_with_coinciding_vertices_have_no_width_and_only_move(constant
     direction = triangles - np.roll(triangles, 1, axis=1)
     longest = np.take_along_axis(direction, sides.argmax(axis=1)[:, None, None], axis=1)
     unit = longest / np.maximum(sides.max(axis=1), 1e-30)[:, None, None]
-    along = np.abs(np.sum(matrices[..., 0] * unit, axis=-1))
+    cosines = np.abs(np.sum(matrices[..., 0] * unit, axis=-1))
     has_length = scales[..., 0] > 0
-    np.testing.assert_allclose(along[has_length], 1.0, atol=1e-5)
+    np.testing.assert_allclose(cosines[has_length], 1.0, atol=1e-5)
     # A triangle that is a point has neither size nor direction: only its six means have a gradient.
     weights = np.random.default_rng(3).normal(size=splats.means.shape).reshape(FACES, 6, 3)
     expected = np.zeros((FACES, 3, 3))
@@ -609,9 +624,9 @@ def test_triangles_with_coinciding_vertices_have_no_width_and_only_move(constant
         side = 0.5 * (1 - corner)
         shares = np.array([[corner, side, side], [side, side, corner], [side, corner, side]])
         expected += np.einsum("kv,fkc->fvc", shares, weights[:, 3 * ring : 3 * ring + 3])
-    got = np.asarray(gradient[0]).reshape(FACES, 3, 3)
-    assert np.isfinite(got).all()
-    np.testing.assert_allclose(got[~is_line], expected[~is_line], rtol=1e-5, atol=1e-6)
+    actual = np.asarray(gradient[0]).reshape(FACES, 3, 3)
+    assert np.isfinite(actual).all()
+    np.testing.assert_allclose(actual[~is_line], expected[~is_line], rtol=1e-5, atol=1e-6)
 
 
 def some_triangles():
@@ -624,35 +639,37 @@ def test_a_face_listed_twice_doubles_its_stars_and_a_reversed_twin_cancels_them(
     half = FACES // 2
     faces = mesh.faces[:half]
     twins = faces if twin == "same" else faces[:, ::-1]
-    twice = replace(mesh, faces=jnp.concatenate([faces, twins]))
-    once = replace(mesh, face_count=jnp.int32(half))
+    doubled_mesh = replace(mesh, faces=jnp.concatenate([faces, twins]))
+    single_mesh = replace(mesh, face_count=jnp.int32(half))
     results = [
         sample_batch(m, vertex_normals(m), sample=vertex_splats, constants=CODE)
-        for m in (once, twice)
+        for m in (single_mesh, doubled_mesh)
     ]
     (single, _, _), (double, _, gradient) = results
-    used = 3 * half
+    row_count = 3 * half
     if twin == "same":
-        np.testing.assert_allclose(double.normals[:used], single.normals[:used], atol=1e-6)
-        expected = np.sqrt(2) * np.asarray(single.scales[:used, :2])
-        np.testing.assert_allclose(double.scales[:used, :2], expected, rtol=1e-5)
+        np.testing.assert_allclose(
+            double.normals[:row_count], single.normals[:row_count], atol=1e-6
+        )
+        expected = np.sqrt(2) * np.asarray(single.scales[:row_count, :2])
+        np.testing.assert_allclose(double.scales[:row_count, :2], expected, rtol=1e-5)
     else:
         # Areas cancel up to the rounding of the products that make them.
         reach = np.linalg.norm(some_triangles(), axis=(1, 2))[:half].repeat(3)[:, None]
-        assert (np.asarray(double.scales[:used, :2]) <= np.sqrt(ROUNDING) * reach).all()
+        assert (np.asarray(double.scales[:row_count, :2]) <= np.sqrt(ROUNDING) * reach).all()
         assert np.isfinite(gradient[0]).all()
-    areas = face_normals_and_areas(twice)[1]
+    areas = face_normals_and_areas(doubled_mesh)[1]
     np.testing.assert_allclose(areas[half:], areas[:half], rtol=1e-5)
 
 
 def test_a_star_that_faces_away_has_no_footprint_and_no_pull():
     mesh = batch(some_triangles())
     normals = vertex_normals(mesh)
-    facing, _, _ = sample_batch(mesh, normals, sample=vertex_splats, constants=CODE)
-    away, _, gradient = sample_batch(mesh, -normals, sample=vertex_splats, constants=CODE)
-    assert (np.asarray(facing.scales[:, 0]) > 0).all()
-    np.testing.assert_array_equal(away.scales[:, :2], 0.0)
-    weights = np.random.default_rng(3).normal(size=away.means.shape)
+    facing_splats, _, _ = sample_batch(mesh, normals, sample=vertex_splats, constants=CODE)
+    away_splats, _, gradient = sample_batch(mesh, -normals, sample=vertex_splats, constants=CODE)
+    assert (np.asarray(facing_splats.scales[:, 0]) > 0).all()
+    np.testing.assert_array_equal(away_splats.scales[:, :2], 0.0)
+    weights = np.random.default_rng(3).normal(size=away_splats.means.shape)
     np.testing.assert_allclose(gradient[0], weights, rtol=1e-6)
 
 
@@ -660,14 +677,16 @@ def test_a_star_that_faces_away_has_no_footprint_and_no_pull():
 @pytest.mark.parametrize(("sample", "constants"), SAMPLINGS)
 def test_sampling_scales_with_the_mesh(sample, constants, power):
     triangles, factor = some_triangles(), 2.0**power
-    one, two = batch(triangles), batch(triangles * factor)
-    plain, frame, gradient = sample_batch(
-        one, vertex_normals(one), sample=sample, constants=constants
+    mesh, scaled_mesh = batch(triangles), batch(triangles * factor)
+    splats, frame, gradient = sample_batch(
+        mesh, vertex_normals(mesh), sample=sample, constants=constants
     )
-    scaled, other_frame, _ = sample_batch(
-        two, vertex_normals(two), sample=sample, constants=constants
+    scaled_splats, scaled_frame, _ = sample_batch(
+        scaled_mesh, vertex_normals(scaled_mesh), sample=sample, constants=constants
     )
-    np.testing.assert_array_equal(scaled.means, plain.means * factor)
-    np.testing.assert_allclose(scaled.scales[:, :2], plain.scales[:, :2] * factor, rtol=1e-6)
-    np.testing.assert_allclose(other_frame, frame, atol=1e-6)
-    np.testing.assert_allclose(scaled.normals, plain.normals, atol=1e-6)
+    np.testing.assert_array_equal(scaled_splats.means, splats.means * factor)
+    np.testing.assert_allclose(
+        scaled_splats.scales[:, :2], splats.scales[:, :2] * factor, rtol=1e-6
+    )
+    np.testing.assert_allclose(scaled_frame, frame, atol=1e-6)
+    np.testing.assert_allclose(scaled_splats.normals, splats.normals, atol=1e-6)

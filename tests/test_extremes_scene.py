@@ -86,8 +86,8 @@ def make_params(sdf=None):
     grid = scaled_pipeline(1.0).surface.grid
     if sdf is None:
         steps = np.moveaxis(np.indices(grid.vertex_shape)[::-1], 0, -1).reshape(-1, 3)
-        away = np.linalg.norm(steps - 0.5 * np.array(grid.shape), axis=-1)
-        sdf = away - 0.4 / float(grid.cell_size)
+        distances = np.linalg.norm(steps - 0.5 * np.array(grid.shape), axis=-1)
+        sdf = distances - 0.4 / float(grid.cell_size)
     geometry = initial_geometry(grid, jnp.asarray(sdf, jnp.float32))
     params = initial_params(geometry, CONFIG, jax.random.key(0))
 
@@ -160,10 +160,10 @@ def test_a_world_scaled_by_a_power_of_two_gives_the_same_bits(unit_scene, scale)
     )
     lengths = {"depth": picture.aovs["depth"] / np.float32(scale)}  # all else has no unit
     picture = replace(picture, aovs=picture.aovs | lengths)
-    for mine, theirs in zip(
+    for scaled_leaf, unit_leaf in zip(
         jax.tree.leaves((*scaled, picture)), jax.tree.leaves(unit_scene), strict=True
     ):
-        np.testing.assert_array_equal(np.asarray(mine), np.asarray(theirs))
+        np.testing.assert_array_equal(np.asarray(scaled_leaf), np.asarray(unit_leaf))
 
 
 @pytest.mark.parametrize("scale", DECIMALS)
@@ -177,32 +177,37 @@ def test_a_world_of_any_unit_gives_the_same_loss_picture_and_gradient(unit_scene
     for name in ("rgb", "alpha"):
         expected = getattr(unit_scene[3], name)
         np.testing.assert_allclose(getattr(output, name), expected, atol=ROUNDING)
-    for mine, theirs in zip(jax.tree.leaves(gradient), jax.tree.leaves(unit_scene[2]), strict=True):
-        assert norm(mine - theirs) <= GRADIENT * norm(theirs)
+    for scaled_leaf, unit_leaf in zip(
+        jax.tree.leaves(gradient), jax.tree.leaves(unit_scene[2]), strict=True
+    ):
+        assert norm(scaled_leaf - unit_leaf) <= GRADIENT * norm(unit_leaf)
 
 
 @pytest.mark.parametrize("sampling", ["face", "vertex"])
 def test_splats_grow_with_the_world(sampling):
     build = jax.jit(Pipeline.reconstruct, compiler_options=FAST)
     splats = {"face": FaceSplats, "vertex": VertexSplats}[sampling](CONFIG.adapter)
-    one, two = (
+    unit_asset, large_asset = (
         build(replace(scaled_pipeline(s), splats=splats), make_params()) for s in (1.0, 2.0**10)
     )
-    count = int(one.splats.count)
+    count = int(unit_asset.splats.count)
     assert count > 50
     for name in ("means", "scales", "anchors"):
-        small, large = (np.asarray(getattr(x.splats, name))[:count] for x in (one, two))
-        np.testing.assert_array_equal(large, small * np.float32(2.0**10))
-    assert float(one.splats.scales[0, 2]) == pytest.approx(
+        unit_rows, large_rows = (
+            np.asarray(getattr(x.splats, name))[:count] for x in (unit_asset, large_asset)
+        )
+        np.testing.assert_array_equal(large_rows, unit_rows * np.float32(2.0**10))
+    assert float(unit_asset.splats.scales[0, 2]) == pytest.approx(
         CONFIG.adapter.thickness * float(scaled_pipeline(1.0).surface.box.half_extent)
     )
-    parts = [
-        (x.attributes, x.splats.outward, x.splats.normals, x.splats.parents) for x in (one, two)
+    unitless_values = [
+        (x.attributes, x.splats.outward, x.splats.normals, x.splats.parents)
+        for x in (unit_asset, large_asset)
     ]
-    for a, b in zip(*map(jax.tree.leaves, parts), strict=True):
+    for a, b in zip(*map(jax.tree.leaves, unitless_values), strict=True):
         np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
     # The mean deviation of the surface is a length.
-    deviations = [float(x.surface.deviation) for x in (one, two)]
+    deviations = [float(x.surface.deviation) for x in (unit_asset, large_asset)]
     assert deviations[1] == deviations[0] * 2.0**10
 
 
@@ -247,10 +252,10 @@ def test_exported_scales_are_those_of_the_splats_in_any_unit(scale, tmp_path):
         normals=np.ones((2, 3)),
     )
     data = (tmp_path / "splats.ply").read_bytes().split(b"end_header\n")[1]
-    stored = np.frombuffer(data, "<f4").reshape(2, -1)[:, 10:13]  # logarithms
-    np.testing.assert_allclose(stored[0], np.log(scales[0]), rtol=1e-6)
-    assert np.all(np.isfinite(stored))
-    assert stored[1, 2] < stored[1, 0] - 10  # flat stays flat
+    log_scales = np.frombuffer(data, "<f4").reshape(2, -1)[:, 10:13]  # logarithms
+    np.testing.assert_allclose(log_scales[0], np.log(scales[0]), rtol=1e-6)
+    assert np.all(np.isfinite(log_scales))
+    assert log_scales[1, 2] < log_scales[1, 0] - 10  # flat stays flat
 
 
 @pytest.fixture(scope="module")
@@ -291,12 +296,14 @@ def test_training_takes_the_same_steps_in_any_unit(unit_run, scale, tmp_path):
     sign. So entries of the encodings may move the other way, which shows in the smoothness and
     nowhere else.
     """
-    for step, (mine, theirs) in enumerate(zip(run_of(scale, tmp_path), unit_run, strict=True)):
-        mine, theirs = numbers(mine), numbers(theirs)
-        assert mine.keys() == theirs.keys()
-        for name, value in theirs.items():
+    for step, (scaled_line, unit_line) in enumerate(
+        zip(run_of(scale, tmp_path), unit_run, strict=True)
+    ):
+        scaled_line, unit_line = numbers(scaled_line), numbers(unit_line)
+        assert scaled_line.keys() == unit_line.keys()
+        for name, value in unit_line.items():
             share = 0.1 if step > 0 and "smoothness" in name else 1e-3
-            assert mine[name] == pytest.approx(value, rel=share, abs=1e-6), (step, name)
+            assert scaled_line[name] == pytest.approx(value, rel=share, abs=1e-6), (step, name)
 
 
 # Lenses and images
@@ -315,8 +322,8 @@ def test_coverage_is_the_disc_of_the_sphere_through_any_lens(degrees, distance):
     lens = {"field_of_view": np.radians(degrees), "distance": distance}
     result = everything(scaled_pipeline(1.0), make_params(), make_batch(SIZE, **lens))
     assert_sound(*result)
-    covered = float(np.sum(result[-1].alpha))
-    assert covered == pytest.approx(disc_area(SIZE, **lens), rel=0.25)
+    covered_area = float(np.sum(result[-1].alpha))
+    assert covered_area == pytest.approx(disc_area(SIZE, **lens), rel=0.25)
     assert norm(result[2].geometry.sdf) > 0.0
 
 
@@ -355,8 +362,13 @@ def test_a_field_of_one_sign_has_no_surface_and_nothing_but_the_background(unit_
     assert float(report.terms["light"]) == pytest.approx(float(_light_of_black()), rel=1e-5)
     for image in jax.tree.leaves((output.rgb, output.alpha, output.aovs)):
         np.testing.assert_array_equal(np.asarray(image), 0.0)
-    seen = (gradient.geometry.sdf, gradient.geometry.deform, gradient.material, gradient.light)
-    for leaf in jax.tree.leaves((seen, gradient.log_exposure)):
+    visible_gradients = (
+        gradient.geometry.sdf,
+        gradient.geometry.deform,
+        gradient.material,
+        gradient.light,
+    )
+    for leaf in jax.tree.leaves((visible_gradients, gradient.log_exposure)):
         np.testing.assert_array_equal(np.asarray(leaf), 0.0)
 
 

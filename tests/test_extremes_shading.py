@@ -76,8 +76,8 @@ def assert_rows_close(single, double, *, rtol, atol=0.0):
     assert np.isfinite(single).all()
     error = np.linalg.norm(single - double, axis=1)
     bound = rtol * np.linalg.norm(double, axis=1) + atol
-    worst = int(np.argmax(error - bound))
-    assert error[worst] <= bound[worst], (worst, single[worst], double[worst])
+    worst_row = int(np.argmax(error - bound))
+    assert error[worst_row] <= bound[worst_row], (worst_row, single[worst_row], double[worst_row])
 
 
 @pytest.fixture(scope="module")
@@ -110,33 +110,35 @@ def test_gradients_of_reflectance_and_density_are_those_of_float64(pairs):
 
     (_, single), (value, double) = in_both(run, *pairs)
     rounding = 5e-7 * (1 + value)  # of the row's reflectance and density
-    for mine, exact in zip(jax.tree.leaves(single[:2]), jax.tree.leaves(double[:2]), strict=True):
-        assert_rows_close(mine, exact, rtol=1e-3, atol=rounding)
+    for single_leaf, double_leaf in zip(
+        jax.tree.leaves(single[:2]), jax.tree.leaves(double[:2]), strict=True
+    ):
+        assert_rows_close(single_leaf, double_leaf, rtol=1e-3, atol=rounding)
     materials, _, wi, wo = pairs
     # The half vector of nearly opposite directions turns up to a million times as fast as they do,
     # and a lobe of width alpha follows it.
     length = np.clip(np.linalg.norm(wi.astype(np.float64) + wo, axis=1), 1e-7, 1.0)
     alpha = np.asarray(bsdf.ggx_alpha(materials.roughness), np.float64)
     rounding = 2e-6 * (1 + value) * (1 + 1 / alpha) / length
-    for mine, exact in zip(single[2:], double[2:], strict=True):
-        assert_rows_close(mine, exact, rtol=1e-3, atol=rounding)
+    for single_leaf, double_leaf in zip(single[2:], double[2:], strict=True):
+        assert_rows_close(single_leaf, double_leaf, rtol=1e-3, atol=rounding)
 
 
 def test_directions_can_be_exchanged_at_any_angle(pairs):
     materials, normals, wi, wo = (typed(x, jnp.float32) for x in pairs)
     evaluate = jax.jit(bsdf.evaluate)
-    forth, back = evaluate(materials, normals, wi, wo), evaluate(materials, normals, wo, wi)
-    np.testing.assert_allclose(forth, back, rtol=1e-6)
+    forward, backward = evaluate(materials, normals, wi, wo), evaluate(materials, normals, wo, wi)
+    np.testing.assert_allclose(forward, backward, rtol=1e-6)
 
 
 def test_below_the_horizon_nothing_is_reflected_and_nothing_is_learned(pairs):
     materials, normals, wi, wo = typed(pairs, jnp.float32)
     gradient_of = jax.jit(jax.grad(lambda *a: jnp.sum(bsdf.evaluate(*a)), argnums=(0, 1, 2, 3)))
     gradient = gradient_of(materials, normals, wi, wo)
-    below = (np.asarray(wi)[:, 2] <= 0) | (np.asarray(wo)[:, 2] <= 0)
+    is_below = (np.asarray(wi)[:, 2] <= 0) | (np.asarray(wo)[:, 2] <= 0)
     for leaf in (jax.jit(bsdf.evaluate)(materials, normals, wi, wo), *jax.tree.leaves(gradient)):
-        np.testing.assert_array_equal(np.asarray(leaf)[below], 0.0)
-        assert np.any(np.asarray(leaf)[~below])
+        np.testing.assert_array_equal(np.asarray(leaf)[is_below], 0.0)
+        assert np.any(np.asarray(leaf)[~is_below])
 
 
 def test_the_coat_returns_at_most_what_the_visible_normals_send(pairs):
@@ -147,10 +149,10 @@ def test_the_coat_returns_at_most_what_the_visible_normals_send(pairs):
         albedo=jnp.ones_like(materials.albedo),
         metallic=jnp.ones_like(materials.metallic),
     )
-    sent = jax.jit(bsdf.pdf)(mirror, normals, wi, wo)  # a metal samples the coat alone
+    density = jax.jit(bsdf.pdf)(mirror, normals, wi, wo)  # a metal samples the coat alone
     _, specular = jax.jit(bsdf.evaluate_lobes)(materials, normals, wi, wo)
-    returned = np.asarray(specular)[:, 0] * np.maximum(np.asarray(wi)[:, 2], 0)
-    assert np.all(returned <= np.asarray(sent) * (1 + 1e-5))
+    specular_flux = np.asarray(specular)[:, 0] * np.maximum(np.asarray(wi)[:, 2], 0)
+    assert np.all(specular_flux <= np.asarray(density) * (1 + 1e-5))
 
 
 @jax.jit
@@ -188,9 +190,9 @@ def test_samples_are_unit_directions_of_bounded_weight(normal):
     assert density.min() >= 0.0
     # The coat has at least a tenth of the samples, so that a sample of grey weighs at most ten.
     assert np.all(value <= 10.001 * density[:, None])
-    above = (wi @ normal > 1e-5) & (np.asarray(wo, np.float64) @ normal > 0)
-    assert above.sum() > 300
-    assert density[above].min() > 0.0
+    is_above = (wi @ normal > 1e-5) & (np.asarray(wo, np.float64) @ normal > 0)
+    assert is_above.sum() > 300
+    assert density[is_above].min() > 0.0
 
 
 TINY = [(1, 2), (3, 4), (8, 16)]
@@ -234,12 +236,12 @@ def test_the_gradient_of_a_sun_is_the_adjoint(size):
     operators = prefilter_operators(LightSpec(*size, LEVELS))
     rng = np.random.default_rng(0)
     sun = suns(size)[size[0] // 2]
-    ones = jnp.asarray(rng.uniform(-1, 1, (4, *size, 3)), jnp.float32)
+    weights = jnp.asarray(rng.uniform(-1, 1, (4, *size, 3)), jnp.float32)
 
     @jax.jit
     def pair(texels):
-        through = lambda x: jnp.sum(prefilter(EnvLight(x), operators).specular * ones)  # noqa: E731
-        return jax.value_and_grad(through)(texels)
+        loss = lambda x: jnp.sum(prefilter(EnvLight(x), operators).specular * weights)  # noqa: E731
+        return jax.value_and_grad(loss)(texels)
 
     value, gradient = pair(sun)
     np.testing.assert_allclose(jnp.sum(gradient * sun), value, rtol=1e-4, atol=1e-6 * SUN)
@@ -257,18 +259,18 @@ def test_poles_seam_and_zero_read_their_texels_on_the_smallest_maps(size):
         loss = lambda t, p: jnp.sum(lookup(t, p))  # noqa: E731
         return lookup(texels, points), jax.grad(loss, argnums=(0, 1))(texels, points)
 
-    values, (into_texels, into_points) = read(texels, points)
+    values, (texel_gradient, point_gradient) = read(texels, points)
     seam_left = 0.5 * (np.asarray(texels)[:, 0] + np.asarray(texels)[:, -1])
     middle = 0.5 * (seam_left[(height - 1) // 2] + seam_left[height // 2])
     for row in (3, 4, 5, 6):
         np.testing.assert_allclose(values[row], middle, atol=ROUNDING)
     for row in (0, 1, 7):  # poles, and zero reads as the upper pole
-        first = np.asarray(texels)[-1 if row == 1 else 0]
-        assert np.all(values[row] >= first.min(0) - ROUNDING)
-        assert np.all(values[row] <= first.max(0) + ROUNDING)
-    np.testing.assert_allclose(jnp.sum(into_texels), 3 * len(POINTS), rtol=1e-6)
-    assert np.isfinite(into_points).all()
-    np.testing.assert_array_equal(into_points[7], 0.0)
+        pole_row = np.asarray(texels)[-1 if row == 1 else 0]
+        assert np.all(values[row] >= pole_row.min(0) - ROUNDING)
+        assert np.all(values[row] <= pole_row.max(0) + ROUNDING)
+    np.testing.assert_allclose(jnp.sum(texel_gradient), 3 * len(POINTS), rtol=1e-6)
+    assert np.isfinite(point_gradient).all()
+    np.testing.assert_array_equal(point_gradient[7], 0.0)
 
 
 def test_a_map_of_one_row_is_constant_in_elevation():
@@ -279,8 +281,8 @@ def test_a_map_of_one_row_is_constant_in_elevation():
         lookup(light.radiance, high), lookup(light.radiance, low), atol=ROUNDING
     )
     quarter = jnp.asarray([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    turned = rotate_light(light, quarter).radiance
-    np.testing.assert_allclose(turned, jnp.roll(light.radiance, -2, axis=1), atol=1e-5)
+    turned_radiance = rotate_light(light, quarter).radiance
+    np.testing.assert_allclose(turned_radiance, jnp.roll(light.radiance, -2, axis=1), atol=1e-5)
     np.testing.assert_array_equal(downsample_light(light, factor=1).radiance, light.radiance)
     with pytest.raises(ValueError, match="1 x 8 texels by 2"):
         downsample_light(light, factor=2)
@@ -323,24 +325,24 @@ def test_split_sum_is_that_of_float64_at_every_extreme(size):
     for leaf in jax.tree.leaves(gradient):
         assert np.isfinite(leaf).all()
     for name in ("albedo", "roughness", "metallic"):
-        mine, true = getattr(gradient[0], name), getattr(exact_gradient[0], name)
+        single_leaf, double_leaf = getattr(gradient[0], name), getattr(exact_gradient[0], name)
         # At n.v = 0 and at the roughness of a level, either one-sided slope is right, so these rows
         # are left out.
         smooth = (np.abs(cosine) > 1e-5) & ~np.isin(roughness, [0.0, 1.0])
-        assert_rows_close(mine[smooth], true[smooth], rtol=1e-3, atol=3e-5 * SUN)
+        assert_rows_close(single_leaf[smooth], double_leaf[smooth], rtol=1e-3, atol=3e-5 * SUN)
 
 
 def test_black_light_and_black_metal_shade_black():
     count = len(COSINES)
     views = jnp.asarray(direction(np.array(COSINES), np.zeros(count)))
     normals = jnp.broadcast_to(jnp.asarray([0.0, 0, 1]), (count, 3))
-    dark = prefilter(init_light(1, value=0.0), prefilter_operators(LightSpec(1, 2, LEVELS)))
+    black_light = prefilter(init_light(1, value=0.0), prefilter_operators(LightSpec(1, 2, LEVELS)))
     white = make_materials(np.ones(count), np.full(count, 0.5), np.zeros(count))
-    shaded = split_sum(white, normals, views, dark, fg_table())
+    shaded = split_sum(white, normals, views, black_light, fg_table())
     np.testing.assert_array_equal(shaded.rgb, 0.0)
-    lit = prefilter(init_light(1, value=1.0), prefilter_operators(LightSpec(1, 2, LEVELS)))
+    white_light = prefilter(init_light(1, value=1.0), prefilter_operators(LightSpec(1, 2, LEVELS)))
     metal = make_materials(np.zeros(count), np.full(count, 0.5), np.ones(count))
-    shaded = split_sum(metal, normals, views, lit, fg_table())
+    shaded = split_sum(metal, normals, views, white_light, fg_table())
     np.testing.assert_array_equal(shaded.diffuse, 0.0)
     _, bias = fg_lookup(fg_table(), jnp.abs(views[:, 2]), jnp.full((count,), 0.5))
     np.testing.assert_allclose(shaded.rgb[:, 0], bias, atol=ROUNDING)  # Fresnel at the rim only
@@ -355,8 +357,8 @@ def grid_points():
     one_axis = np.float32(sorted({0.0, 1.0, 0.3, *borders}))
     below, above = np.nextafter(one_axis, np.float32(-9)), np.nextafter(one_axis, np.float32(9))
     values = np.concatenate([one_axis, below, above, np.float32([-1e30, 1e30, -1e-30, 3.4e38])])
-    other = np.random.default_rng(4).permutation(values)
-    rows = np.stack([values, other, np.full_like(values, 0.3)], -1)
+    permuted = np.random.default_rng(4).permutation(values)
+    rows = np.stack([values, permuted, np.full_like(values, 0.3)], -1)
     return np.concatenate([rows, rows[:, [2, 0, 1]], rows[:, [1, 2, 0]]])
 
 
@@ -368,20 +370,20 @@ def test_huge_tables_are_interpolated_between_their_rows(size):
 
     @jax.jit
     def run(table, points):
-        out, back = jax.vjp(
+        encoded, back = jax.vjp(
             lambda t, p: encode(t, p, spec=GRID, position_gradient=True), table, points
         )
-        return out, *back(jnp.ones_like(out))
+        return encoded, *back(jnp.ones_like(encoded))
 
-    values, into_table, into_points = (np.asarray(x, np.float64) for x in run(table, points))
+    values, table_gradient, point_gradient = (np.asarray(x, np.float64) for x in run(table, points))
     assert np.abs(values).max() <= size * (1 + ROUNDING)
     clamped, *_ = run(table, jnp.clip(points, 0.0, 1.0))
     np.testing.assert_array_equal(values, np.asarray(clamped, np.float64))
     # Weights of a point sum to one in every level, and no table changes them.
-    np.testing.assert_allclose(into_table.sum(0), len(points) * GRID.levels, rtol=1e-5)
-    outside = (points < -1e-35) | (points > 1)  # XLA treats denormal numbers as zero
-    np.testing.assert_array_equal(into_points[outside], 0.0)
-    assert 0 < np.abs(into_points).max() <= 4 * size * sum(GRID.resolutions)
+    np.testing.assert_allclose(table_gradient.sum(0), len(points) * GRID.levels, rtol=1e-5)
+    is_outside = (points < -1e-35) | (points > 1)  # XLA treats denormal numbers as zero
+    np.testing.assert_array_equal(point_gradient[is_outside], 0.0)
+    assert 0 < np.abs(point_gradient).max() <= 4 * size * sum(GRID.resolutions)
     constant, _, slope = run(jnp.full_like(table, size), points)
     np.testing.assert_allclose(constant, size, rtol=ROUNDING)
     np.testing.assert_array_equal(slope, 0.0)
@@ -416,18 +418,18 @@ def test_saturated_attributes_are_at_their_limits_and_no_longer_learn(logit):
     box = Box(jnp.zeros(3), jnp.ones(()))
 
     def total(field):
-        found = attributes_at(field, points, box, spec=spec)
-        changes = smoothness(field, points, jnp.ones(40, bool), jax.random.key(2), box, spec=spec)
-        parts = jax.tree.leaves((found, changes))
-        return sum(jnp.sum(part) for part in parts), (found, changes)
+        attributes = attributes_at(field, points, box, spec=spec)
+        penalties = smoothness(field, points, jnp.ones(40, bool), jax.random.key(2), box, spec=spec)
+        outputs = jax.tree.leaves((attributes, penalties))
+        return sum(jnp.sum(output) for output in outputs), (attributes, penalties)
 
-    gradient, (found, changes) = jax.jit(jax.grad(total, has_aux=True))(field)
-    materials = found.materials
+    gradient, (attributes, penalties) = jax.jit(jax.grad(total, has_aux=True))(field)
+    materials = attributes.materials
     limit = 1.0 if logit > 0 else 0.0
-    for values in (materials.albedo, materials.metallic, found.shift):
+    for values in (materials.albedo, materials.metallic, attributes.shift):
         np.testing.assert_allclose(values, limit, atol=1e-20)
     np.testing.assert_allclose(materials.roughness, 0.1 + 0.9 * limit, rtol=ROUNDING)
-    assert all(float(change) <= 1e-20 for change in changes)
+    assert all(float(penalty) <= 1e-20 for penalty in penalties)
     for leaf in jax.tree.leaves(gradient):
         np.testing.assert_allclose(leaf, 0.0, atol=1e-17)
 
@@ -438,8 +440,8 @@ def test_transfer_curves_are_those_of_float64_from_black_to_the_sun():
     for curve in (linear_to_srgb, srgb_to_linear):
         together = lambda x, curve=curve: (curve(x), jax.grad(lambda v: jnp.sum(curve(v)))(x))  # noqa: E731
         single, double = in_both(together, values)
-        for mine, exact in zip(single, double, strict=True):
-            np.testing.assert_allclose(mine, exact, rtol=3e-5)
+        for actual, expected in zip(single, double, strict=True):
+            np.testing.assert_allclose(actual, expected, rtol=3e-5)
     np.testing.assert_allclose(linear_to_srgb(jnp.asarray([0.0, -1.0])), [0, -12.92], rtol=1e-6)
 
 
@@ -461,9 +463,9 @@ def test_the_tone_map_is_bounded_and_flat_where_nothing_is_left_to_see(log_expos
     np.testing.assert_allclose(gradient[0], exact_gradient[0], rtol=1e-4, atol=1e-7)
     np.testing.assert_allclose(gradient[1], exact_gradient[1], rtol=1e-4, atol=1e-5)
     if log_exposure <= 20.0:  # negative radiance, a ringing of the prefilter, passes through
-        below, _ = run(jnp.minimum(jnp.asarray(rgb), 0), jnp.float32(log_exposure))
+        negative_values, _ = run(jnp.minimum(jnp.asarray(rgb), 0), jnp.float32(log_exposure))
         expected = np.exp(log_exposure) * np.minimum(rgb, 0)
-        np.testing.assert_allclose(below, expected, rtol=1e-4, atol=ROUNDING)
+        np.testing.assert_allclose(negative_values, expected, rtol=1e-4, atol=ROUNDING)
 
 
 FLAT = [0.0, 1e-6, 0.5, 1.0, 10.0, 1e5]
@@ -480,8 +482,8 @@ def test_similarity_of_flat_images_is_that_of_their_means(shape):
     floor = 0.01**2
     expected = (2 * first * second + floor) / (first**2 + second**2 + floor)
     # For values beyond some tens of the data range, the variance of a flat image is mere rounding.
-    resolved = (np.maximum(first, second) <= 1.0) | (first == second)
-    np.testing.assert_allclose(values[resolved], expected[resolved], atol=2e-3)
+    is_resolved = (np.maximum(first, second) <= 1.0) | (first == second)
+    np.testing.assert_allclose(values[is_resolved], expected[is_resolved], atol=2e-3)
     for gradient in gradients:
         assert np.isfinite(gradient).all()
         equal = np.asarray(gradient)[(first == second) & (first <= 1.0)]

@@ -62,8 +62,8 @@ def draw(inputs, eligible, **settings):
     """
 
     def loss(inputs):
-        image, alpha, needed = rasterize(*inputs, eligible, **settings)
-        return scalar(image, alpha), (image, alpha, needed)
+        image, alpha, usage = rasterize(*inputs, eligible, **settings)
+        return scalar(image, alpha), (image, alpha, usage)
 
     (_, outputs), gradient = jax.value_and_grad(loss, has_aux=True)(inputs)
     return *outputs, gradient
@@ -104,12 +104,12 @@ def dense_float64(inputs, settings=None, *, eligible=None):
     eligible = np.ones(inputs[0].shape[0], bool) if eligible is None else np.asarray(eligible)
     settings = camera() if settings is None else settings
     with double_precision():
-        wide = tuple(jnp.asarray(np.asarray(x), jnp.float64) for x in inputs)
-        lifted = {
+        double_inputs = tuple(jnp.asarray(np.asarray(x), jnp.float64) for x in inputs)
+        double_settings = {
             k: v if isinstance(v, int) else jnp.asarray(np.asarray(v), jnp.float64)
             for k, v in settings.items()
         }
-        result = draw_dense(wide, jnp.asarray(eligible), **lifted)
+        result = draw_dense(double_inputs, jnp.asarray(eligible), **double_settings)
         return jax.tree.map(np.asarray, result)
 
 
@@ -117,8 +117,8 @@ def rows(*columns):
     """Pad given rows to the common count with copies of the first, and mask the copies."""
     count = len(columns[0])
     arrays = [np.asarray(c, np.float32) for c in columns]
-    filled = [np.concatenate([a, np.repeat(a[:1], COUNT - count, axis=0)]) for a in arrays]
-    return tuple(jnp.asarray(a) for a in filled), jnp.arange(COUNT) < count
+    padded_arrays = [np.concatenate([a, np.repeat(a[:1], COUNT - count, axis=0)]) for a in arrays]
+    return tuple(jnp.asarray(a) for a in padded_arrays), jnp.arange(COUNT) < count
 
 
 def one(mean, scale, opacity=1.0, *, quat=(1, 0, 0, 0), feature=(1.0, 1.0, 1.0)):
@@ -146,9 +146,9 @@ def assert_equals_dense(inputs, settings=None, *, gradient_tolerance=1e-3, **opt
     expected_image, expected_alpha, expected = dense_float64(inputs, settings, **options)
     np.testing.assert_allclose(image, expected_image, atol=FIELD)
     np.testing.assert_allclose(alpha, expected_alpha, atol=FIELD)
-    for got, wanted in zip(gradient, expected, strict=True):
-        error = np.linalg.norm(np.asarray(got, np.float64) - wanted)
-        assert error <= gradient_tolerance * np.linalg.norm(wanted)
+    for actual_leaf, expected_leaf in zip(gradient, expected, strict=True):
+        error = np.linalg.norm(np.asarray(actual_leaf, np.float64) - expected_leaf)
+        assert error <= gradient_tolerance * np.linalg.norm(expected_leaf)
     return image, alpha
 
 
@@ -158,10 +158,10 @@ forward = jax.jit(rasterize, static_argnames=STATIC)
 def assert_equals_textbook(inputs, settings, *, tile_size=4):
     """Compare images with NumPy, but no gradients: they take long to compile for every shape."""
     eligible = jnp.ones(inputs[0].shape[0], bool)
-    image, alpha, needed = forward(
+    image, alpha, usage = forward(
         *inputs, eligible, capacities=AMPLE, tile_size=tile_size, **settings
     )
-    assert overflowed(needed, AMPLE) == []
+    assert overflowed(usage, AMPLE) == []
     expected = numpy_image(inputs, settings)
     np.testing.assert_allclose(image, expected[0], atol=FIELD)
     np.testing.assert_allclose(alpha, expected[1], atol=FIELD)
@@ -216,7 +216,7 @@ def numpy_image(inputs, settings):
     opacities, features = (np.asarray(x, np.float64) for x in inputs[3:])
     shape = settings["height"], settings["width"]
     y, x = np.indices(shape) + 0.5
-    image, before = np.zeros((*shape, features.shape[1])), np.ones(shape)
+    image, transmittance = np.zeros((*shape, features.shape[1])), np.ones(shape)
     for row in np.argsort(depths, kind="stable"):
         if depths[row] <= 0.01:
             continue
@@ -225,19 +225,19 @@ def numpy_image(inputs, settings):
         sigma = 0.5 * np.einsum("hwi,ij,hwj->hw", offset, inverse, offset)
         raw = opacities[row] * compensation[row] * np.exp(-sigma)
         alpha = np.where(raw < MIN_ALPHA, 0.0, np.minimum(raw, MAX_ALPHA))
-        image += (alpha * before)[..., None] * features[row]
-        before *= 1 - alpha
-    return image, 1 - before
+        image += (alpha * transmittance)[..., None] * features[row]
+        transmittance *= 1 - alpha
+    return image, 1 - transmittance
 
 
 @partial(jax.jit, static_argnames=("height", "width"))
 def project_and_differentiate(inputs, **settings):
     def total(inputs):
         footprints = project(*inputs[:3], **settings)
-        parts = (footprints.means2d, footprints.conics, footprints.compensation[:, None])
+        outputs = (footprints.means2d, footprints.conics, footprints.compensation[:, None])
         rng = np.random.default_rng(1)
-        weights = [jnp.asarray(rng.normal(size=p.shape), p.dtype) for p in parts]
-        return sum(jnp.sum(w * p) for w, p in zip(weights, parts, strict=True)), footprints
+        weights = [jnp.asarray(rng.normal(size=p.shape), p.dtype) for p in outputs]
+        return sum(jnp.sum(w * p) for w, p in zip(weights, outputs, strict=True)), footprints
 
     gradient, footprints = jax.grad(total, has_aux=True)(inputs[:3])
     return footprints, gradient
@@ -273,11 +273,11 @@ def test_projection_equals_the_textbook_in_float64(field_of_view, exponents, dep
     np.testing.assert_allclose(footprints.means2d, pixels, rtol=1e-5, atol=1e-5 * SIZE)
     xx, xy, yy = (covariance[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     # A projected axis has the rounding errors of its whole length, even where it is foreshortened.
-    for got, wanted, square in zip(
+    for actual, expected, square in zip(
         footprints.covariances2d.T, (xx, xy, yy), (xx, np.sqrt(xx * yy), yy), strict=True
     ):
         limit = 1e-5 * square + 20 * ROUNDING * reach * np.sqrt(np.maximum(xx, yy))
-        assert (np.abs(np.asarray(got, np.float64) - wanted) <= limit).all()
+        assert (np.abs(np.asarray(actual, np.float64) - expected) <= limit).all()
     compensation = np.asarray(footprints.compensation)
     assert (compensation >= 0).all()
     assert (compensation <= 1 + 2 * ROUNDING).all()
@@ -289,12 +289,12 @@ def test_length_of_a_quaternion_changes_nothing_and_its_gradient_inversely(power
     inputs, settings = scene(3), camera()
     quats = inputs[1] / jnp.linalg.norm(inputs[1], axis=1, keepdims=True)
     length = np.float32(1.1 * 10.0**power)
-    changed = (inputs[0], quats * length, inputs[2])
+    scaled_inputs = (inputs[0], quats * length, inputs[2])
     footprints, gradient = project_and_differentiate((inputs[0], quats, inputs[2]), **settings)
-    other, other_gradient = project_and_differentiate(changed, **settings)
-    np.testing.assert_allclose(other.conics, footprints.conics, rtol=1e-4, atol=1e-5)
+    scaled_footprints, scaled_gradient = project_and_differentiate(scaled_inputs, **settings)
+    np.testing.assert_allclose(scaled_footprints.conics, footprints.conics, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(
-        np.asarray(other_gradient[1], np.float64) * length, gradient[1], rtol=1e-3, atol=1e-3
+        np.asarray(scaled_gradient[1], np.float64) * length, gradient[1], rtol=1e-3, atol=1e-3
     )
 
 
@@ -303,12 +303,12 @@ def test_a_zero_quaternion_is_the_identity_without_gradient_among_others():
     inputs = scene(4)
     zero = inputs[1].at[::3].set(0.0)
     unit = inputs[1].at[::3].set(jnp.array([1.0, 0, 0, 0]))
-    first = render((inputs[0], zero, *inputs[2:]))
-    second = render((inputs[0], unit, *inputs[2:]))
-    np.testing.assert_array_equal(first[0], second[0])
-    np.testing.assert_array_equal(first[3][1][::3], 0.0)
-    np.testing.assert_array_equal(first[3][0], second[3][0])
-    assert all_finite(first)
+    zero_result = render((inputs[0], zero, *inputs[2:]))
+    unit_result = render((inputs[0], unit, *inputs[2:]))
+    np.testing.assert_array_equal(zero_result[0], unit_result[0])
+    np.testing.assert_array_equal(zero_result[3][1][::3], 0.0)
+    np.testing.assert_array_equal(zero_result[3][0], unit_result[3][0])
+    assert all_finite(zero_result)
 
 
 # Images
@@ -388,11 +388,11 @@ def test_a_splat_on_a_pixel_centre_or_border_is_symmetric(offset):
     inputs, eligible = one([offset, offset, 0.0], 1.5, 0.8)
     _, alpha, _, _ = render(inputs, settings, eligible=eligible)
     middle = SIZE // 2
-    around = np.asarray(alpha)[1:, 1:] if offset else np.asarray(alpha)
+    window = np.asarray(alpha)[1:, 1:] if offset else np.asarray(alpha)
     # Off the axis of the camera, perspective leaves only the symmetries about diagonal and point.
-    mirrored = (around.T, around[::-1, ::-1], *(() if offset else (around[::-1], around[:, ::-1])))
-    for other in mirrored:
-        np.testing.assert_allclose(around, other, atol=2 * ROUNDING)
+    mirrored = (window.T, window[::-1, ::-1], *(() if offset else (window[::-1], window[:, ::-1])))
+    for mirror_image in mirrored:
+        np.testing.assert_allclose(window, mirror_image, atol=2 * ROUNDING)
     peak = np.asarray(alpha)[middle, middle]
     assert peak >= np.max(alpha) - 2 * ROUNDING
     assert (np.asarray(alpha) > peak - 1e-3).sum() == (4 if offset else 1)
@@ -416,13 +416,13 @@ def thousands_at_one_depth():
 @pytest.mark.slow
 def test_thousands_at_one_depth_are_composited_in_row_order():
     inputs, settings, room = thousands_at_one_depth()
-    image, alpha, needed, gradient = render(inputs, settings, capacities=room)
-    assert int(needed["visible"]) > 2000
+    image, alpha, usage, gradient = render(inputs, settings, capacities=room)
+    assert int(usage["visible"]) > 2000
     expected_image, expected_alpha, expected = dense_float64(inputs, settings)
     np.testing.assert_allclose(image, expected_image, atol=10 * FIELD)
     np.testing.assert_allclose(alpha, expected_alpha, atol=10 * FIELD)
-    for got, wanted in zip(gradient, expected, strict=True):
-        assert np.linalg.norm(got - wanted) <= 1e-3 * np.linalg.norm(wanted)
+    for actual_leaf, expected_leaf in zip(gradient, expected, strict=True):
+        assert np.linalg.norm(actual_leaf - expected_leaf) <= 1e-3 * np.linalg.norm(expected_leaf)
     backwards = tuple(x[::-1] for x in inputs)
     reverse_image, reverse_alpha, _, _ = render(backwards, settings, capacities=room)
     np.testing.assert_allclose(reverse_alpha, alpha, atol=10 * FIELD)
@@ -449,8 +449,8 @@ def test_coverage_behind_thousands_does_not_round_to_above_one(opacity):
 def test_opacity_at_its_borders(factor, is_seen):
     # The splat is so large that neither the low-pass filter nor the distance from its mean matters.
     inputs, eligible = one([0, 0, 0.0], 1e4, np.float32(MIN_ALPHA) * factor)
-    _, alpha, needed, gradient = render(inputs, eligible=eligible)
-    assert int(needed["visible"]) == int(is_seen)
+    _, alpha, usage, gradient = render(inputs, eligible=eligible)
+    assert int(usage["visible"]) == int(is_seen)
     expected = min(MIN_ALPHA * factor, MAX_ALPHA) if is_seen else 0.0
     np.testing.assert_allclose(alpha, expected, rtol=1e-5)
     if factor in (0.0, 0.99999, 255.0):
@@ -493,14 +493,14 @@ def test_coverage_stays_in_range_behind_any_number_of_layers(exponent, power, se
 
 def test_nothing_eligible_and_nothing_at_all_give_an_empty_image_and_no_gradient():
     inputs = scene(7)
-    image, alpha, needed, gradient = render(inputs, eligible=jnp.zeros(COUNT, bool))
-    assert not any(int(n) for n in jax.tree.leaves(needed))
+    image, alpha, usage, gradient = render(inputs, eligible=jnp.zeros(COUNT, bool))
+    assert not any(int(n) for n in jax.tree.leaves(usage))
     assert not any(np.any(leaf) for leaf in (image, alpha, *gradient))
     empty = tuple(x[:0] for x in inputs)
-    image, alpha, needed = forward(
+    image, alpha, usage = forward(
         *empty, jnp.ones(0, bool), capacities=AMPLE, tile_size=4, **camera()
     )
-    assert not any(int(n) for n in jax.tree.leaves(needed))
+    assert not any(int(n) for n in jax.tree.leaves(usage))
     assert not any(np.any(leaf) for leaf in (image, alpha))
 
 
@@ -536,14 +536,14 @@ def test_the_unit_of_the_world_does_not_matter(factor):
     scale = jnp.float32(factor)
     scaled = (inputs[0] * scale, inputs[1], inputs[2] * scale, *inputs[3:])
     matrix = settings["world_to_camera"].at[:3, 3].multiply(scale)
-    other, other_alpha, _, other_gradient = render(
+    scaled_image, scaled_alpha, _, scaled_gradient = render(
         scaled, settings | {"world_to_camera": matrix}, near=0.01 * min(factor, 1.0)
     )
     if np.log2(factor) % 1 == 0:  # only exponents change
-        np.testing.assert_array_equal(other, image)
-        np.testing.assert_array_equal(other_alpha, alpha)
-    np.testing.assert_allclose(other, image, atol=FIELD)
-    np.testing.assert_allclose(other_alpha, alpha, atol=FIELD)
+        np.testing.assert_array_equal(scaled_image, image)
+        np.testing.assert_array_equal(scaled_alpha, alpha)
+    np.testing.assert_allclose(scaled_image, image, atol=FIELD)
+    np.testing.assert_allclose(scaled_alpha, alpha, atol=FIELD)
     for k, power in enumerate((1, 0, 1, 0, 0)):
-        error = np.linalg.norm(np.asarray(other_gradient[k]) * factor**power - gradient[k])
+        error = np.linalg.norm(np.asarray(scaled_gradient[k]) * factor**power - gradient[k])
         assert error <= 1e-4 * np.linalg.norm(gradient[k])

@@ -39,23 +39,25 @@ def test_a_run_keeps_the_cameras_that_it_was_trained_with(dataset, tmp_path):
     file = tmp_path / "refined.json"
     file.write_text("cameras")
     options = {**dataset.options, "cameras": str(file), "cameras_digest": "abc"}
-    read = replace(dataset, options=options)
+    refined_dataset = replace(dataset, options=options)
     folder = RunFolder(tmp_path / "run")
     with folder.locked():
-        folder.begin(read, tiny_config(), replace=False)
+        folder.begin(refined_dataset, tiny_config(), replace=False)
     file.unlink()
-    moved = RunFolder(folder.path.rename(tmp_path / "moved"))
-    cameras = Path(moved.record()["dataset"]["cameras"])
-    assert cameras.parent == moved.path
+    moved_run = RunFolder(folder.path.rename(tmp_path / "moved"))
+    cameras = Path(moved_run.record()["dataset"]["cameras"])
+    assert cameras.parent == moved_run.path
     assert cameras.read_text() == "cameras"
-    moved.require_same_scene(read)
+    moved_run.require_same_scene(refined_dataset)
     with pytest.raises(RunError, match="with dataset"):
-        moved.require_same_scene(replace(read, options={**options, "cameras_digest": "other"}))
+        moved_run.require_same_scene(
+            replace(refined_dataset, options={**options, "cameras_digest": "other"})
+        )
     with pytest.raises(RunError, match="with dataset"):
-        moved.require_same_scene(dataset)
+        moved_run.require_same_scene(dataset)
     # A new run in its place, without such cameras, keeps none.
-    with moved.locked():
-        moved.begin(dataset, tiny_config(), replace=True)
+    with moved_run.locked():
+        moved_run.begin(dataset, tiny_config(), replace=True)
     assert not cameras.exists()
 
 
@@ -93,10 +95,10 @@ def test_a_folder_with_a_run_is_replaced_only_when_asked(run, dataset):
     (run.path / "notes.txt").write_text("mine")
     with pytest.raises(RunError, match=r"--resume, replace it with --force"), run.locked():
         run.begin(dataset, tiny_config(), replace=False)
-    other = tiny_config("run.seed=5")
+    other_config = tiny_config("run.seed=5")
     with run.locked():
-        run.begin(dataset, other, replace=True)
-    assert run.config() == other
+        run.begin(dataset, other_config, replace=True)
+    assert run.config() == other_config
     assert not run.metrics.exists()
     assert not (run.path / "metrics.json").exists()
     assert (run.path / "notes.txt").read_text() == "mine"
@@ -139,10 +141,10 @@ def test_a_file_half_written_by_a_process_that_was_killed_is_in_nobodys_way(data
 )
 def test_a_damaged_record_is_named_in_one_line(run, text, message):
     (run.path / "run.json").write_text(text)
-    with pytest.raises(RunError, match=message) as caught:
+    with pytest.raises(RunError, match=message) as error_info:
         run.config()
-    assert "run.json" in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert "run.json" in str(error_info.value)
+    assert "\n" not in str(error_info.value)
 
 
 def test_what_is_no_run_says_so(tmp_path):
@@ -159,22 +161,24 @@ def test_a_line_that_an_interruption_tore_is_left_out(run):
 
 
 def test_the_time_of_steps_that_are_made_again_stays_known(run):
-    for begun in range(3):  # each time killed before the checkpoint after step 5
+    for attempt in range(3):  # each time killed before the checkpoint after step 5
         with run.metrics.open("a") as file:
-            file.writelines(json.dumps({"step": s, "seconds": 2.0}) + "\n" for s in range(1, 5))
-        assert run.seconds_used() == 8.0 * (begun + 1)
+            file.writelines(
+                json.dumps({"step": step, "seconds": 2.0}) + "\n" for step in range(1, 5)
+            )
+        assert run.seconds_used() == 8.0 * (attempt + 1)
         run.keep_lines_before(1)
-        assert run.seconds_used() == 8.0 * (begun + 1)
+        assert run.seconds_used() == 8.0 * (attempt + 1)
     assert run.metric_lines() == []
 
 
 def test_what_was_planned_stays_known_when_settings_are_amended(run):
-    planned = run.config()
-    assert run.planned() == planned
+    initial_config = run.config()
+    assert run.planned() == initial_config
     for steps in (7, 5):
         run.amend(tiny_config(f"stages.split_sum.steps={steps}"))
         assert run.config().stages[0].steps == steps
-        assert run.planned() == planned
+        assert run.planned() == initial_config
 
 
 def test_an_accident_leaves_what_was_noted_of_the_training(run, monkeypatch):
@@ -197,8 +201,8 @@ def test_a_damaged_line_in_the_middle_is_an_error(run):
 
 
 def test_a_scene_that_has_moved_is_recognised_by_its_views(run, dataset, tmp_path):
-    moved = replace(dataset, root=tmp_path)
-    run.repoint(moved)
+    moved_dataset = replace(dataset, root=tmp_path)
+    run.repoint(moved_dataset)
     assert run.record()["scene"] == str(tmp_path.resolve())
     assert run.config() == tiny_config()
 
@@ -212,6 +216,8 @@ def test_another_scene_is_refused(run, dataset, change):
         views = replace(views, names=("a", "b"))
     elif change == "size":
         views = replace(views, images=views.images[:, :4])
-    other = replace(dataset, train=views, options={"downscale": 2} if change == "options" else {})
+    other_dataset = replace(
+        dataset, train=views, options={"downscale": 2} if change == "options" else {}
+    )
     with pytest.raises(RunError, match="was trained on"):
-        run.repoint(other)
+        run.repoint(other_dataset)

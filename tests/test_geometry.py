@@ -135,8 +135,8 @@ def test_patches_partition_the_crossing_edges():
         assert sum(patches) == sum(1 << e for e in crossing), case
         assert all(bits.bit_count() >= 3 for bits in patches), case
         for slot, bits in enumerate(patches):
-            own = [e for e in range(12) if bits >> e & 1]
-            assert all(PATCH_OF_EDGE[case, e] == slot for e in own), case
+            patch_edges = [e for e in range(12) if bits >> e & 1]
+            assert all(PATCH_OF_EDGE[case, e] == slot for e in patch_edges), case
 
 
 def test_patch_counts_are_those_of_dual_marching_cubes():
@@ -149,25 +149,27 @@ def test_patch_counts_are_those_of_dual_marching_cubes():
 def test_tables_are_symmetric_under_rotations_and_reflections():
     for permutation in ([1, 0, 2], [0, 2, 1], [2, 0, 1]):
         for flip in ([0, 0, 0], [1, 0, 0]):
-            moved = (CORNERS[:, permutation] ^ np.array(flip)) @ np.array([1, 2, 4])
-            image = [sum(1 << int(moved[c]) for c in range(8) if k >> c & 1) for k in range(256)]
-            assert np.array_equal(PATCH_COUNT[image], PATCH_COUNT)
+            corners = (CORNERS[:, permutation] ^ np.array(flip)) @ np.array([1, 2, 4])
+            mapped_cases = [
+                sum(1 << int(corners[c]) for c in range(8) if k >> c & 1) for k in range(256)
+            ]
+            assert np.array_equal(PATCH_COUNT[mapped_cases], PATCH_COUNT)
             is_problem = np.any(PROBLEM_OFFSET, axis=1)
-            assert np.array_equal(is_problem[image], is_problem)
+            assert np.array_equal(is_problem[mapped_cases], is_problem)
 
 
 def test_clashing_cases_have_one_ambiguous_face_and_their_complements_separate_it():
     is_problem = np.any(PROBLEM_OFFSET, axis=1)
     assert is_problem.sum() == 36  # C16 (24 orientations) and C19 (12)
     for case in np.flatnonzero(is_problem):
-        ambiguous = []
+        ambiguous_faces = []
         for axis in range(3):
             for side in range(2):
                 face = [c for c in range(8) if CORNERS[c, axis] == side]
                 inside = [c for c in face if case >> c & 1]
                 if len(inside) == 2 and (CORNERS[inside[0]] ^ CORNERS[inside[1]]).sum() == 2:
-                    ambiguous.append((axis, 2 * side - 1))
-        ((axis, side),) = ambiguous
+                    ambiguous_faces.append((axis, 2 * side - 1))
+        ((axis, side),) = ambiguous_faces
         assert PROBLEM_OFFSET[case, axis] == side
         face_edges = [e for e in range(12) if (CORNERS[EDGES[e], axis] == (side + 1) // 2).all()]
         assert len(set(PATCH_OF_EDGE[case, face_edges])) == 1
@@ -188,20 +190,20 @@ def load_oracle(name):
     order = np.lexsort(np.round((data["grid_vertices"] + 1) * resolution / 2).T)
     cells = np.argsort(np.argsort(order)[data["cube_vertices"][:, 0]])
     positions = data["grid_vertices"][order]
-    rest = np.round((positions + 1) * resolution / 2) * 2 / resolution - 1
-    moved = np.tanh(data["deform"][order])
-    absorbed = moved + (positions - rest) * resolution
+    rest_positions = np.round((positions + 1) * resolution / 2) * 2 / resolution - 1
+    offsets = np.tanh(data["deform"][order])
+    exact_offsets = offsets + (positions - rest_positions) * resolution
     weights = data["grad_weights"][cells]
     geometry = Geometry(
         sdf=jnp.asarray(data["sdf"][order]),
-        deform=jnp.asarray(np.arctanh(absorbed)),
+        deform=jnp.asarray(np.arctanh(exact_offsets)),
         alpha=jnp.asarray(data["alpha"][cells]),
         beta=jnp.asarray(data["beta"][cells][:, BETA_ORDER]),
         gamma=jnp.asarray(data["gamma"][cells]),
     )
     gradient = Geometry(
         sdf=jnp.asarray(data["grad_sdf"][order]),
-        deform=jnp.asarray(data["grad_deform"][order] * (1 - absorbed**2) / (1 - moved**2)),
+        deform=jnp.asarray(data["grad_deform"][order] * (1 - exact_offsets**2) / (1 - offsets**2)),
         alpha=jnp.asarray(weights[:, 12:20]),
         beta=jnp.asarray(weights[:, :12][:, BETA_ORDER]),
         gamma=jnp.asarray(weights[:, 20]),
@@ -245,9 +247,9 @@ def test_equals_the_original_in_values_and_gradients(name):
     )
     np.testing.assert_allclose(surface.deviation, data["l_dev"].mean(), atol=ORACLE_TOLERANCE)
     np.testing.assert_allclose(value, data["scalar"], rtol=ORACLE_TOLERANCE)
-    for leaf, wanted in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected), strict=True):
-        scale = max(1.0, np.abs(wanted).max())
-        np.testing.assert_allclose(leaf, wanted, atol=ORACLE_TOLERANCE * scale)
+    for leaf, reference in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected), strict=True):
+        scale = max(1.0, np.abs(reference).max())
+        np.testing.assert_allclose(leaf, reference, atol=ORACLE_TOLERANCE * scale)
 
 
 # Topology and orientation
@@ -281,8 +283,8 @@ def test_noise_contains_the_clashing_pairs():
         is_problem = PROBLEM_OFFSET[case].any(axis=-1)
         steps = PROBLEM_OFFSET[case][is_problem][:, ::-1]
         neighbour = np.argwhere(is_problem) + steps
-        valid = ((neighbour >= 0) & (neighbour < case.shape)).all(axis=1)
-        count += is_problem[tuple(neighbour[valid].T)].sum()
+        is_in_grid = ((neighbour >= 0) & (neighbour < case.shape)).all(axis=1)
+        count += is_problem[tuple(neighbour[is_in_grid].T)].sum()
     assert count >= 4
 
 
@@ -351,12 +353,12 @@ def test_padding_changes_neither_values_nor_gradients():
     grid = make_grid(SMALL_SHAPE)
     geometry = noisy_geometry(grid, closed=False)
     (value, padded), gradient = probe_gradient(geometry, grid, SMALL_ROOM, True)
-    fitting = Capacities(
+    capacities = Capacities(
         surface_cubes=int(padded.usage["surface_cubes"]),
         dual_vertices=int(padded.usage["dual_vertices"]),
         quads=int(padded.usage["quads"]),
     )
-    (exact_value, exact), exact_gradient = probe_gradient(geometry, grid, fitting, True)
+    (exact_value, exact), exact_gradient = probe_gradient(geometry, grid, capacities, True)
     vertices, faces = int(exact.mesh.vertex_count), int(exact.mesh.face_count)
     assert exact.mesh.vertices.shape[0] == vertices > 100
     assert exact.mesh.faces.shape[0] == faces
@@ -365,23 +367,25 @@ def test_padding_changes_neither_values_nor_gradients():
     np.testing.assert_array_equal(padded.mesh.vertices[vertices:], 0)
     np.testing.assert_array_equal(padded.mesh.faces[faces:], 0)
     np.testing.assert_allclose(value, exact_value, rtol=1e-5)
-    for one, two in zip(jax.tree.leaves(gradient), jax.tree.leaves(exact_gradient), strict=True):
-        np.testing.assert_allclose(one, two, rtol=1e-4, atol=2e-5)
+    for actual, expected in zip(
+        jax.tree.leaves(gradient), jax.tree.leaves(exact_gradient), strict=True
+    ):
+        np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=2e-5)
 
 
 @pytest.mark.slow
 def test_overflow_reports_the_true_counts():
     grid = make_grid((12, 11, 10))
     geometry = noisy_geometry(grid, seed=2)
-    truth = extract(geometry, grid, capacities=ROOM, training=True).usage
-    assert bool(fits(truth, ROOM))
-    needs = jax.tree.leaves(truth)
+    true_usage = extract(geometry, grid, capacities=ROOM, training=True).usage
+    assert bool(fits(true_usage, ROOM))
+    true_counts = jax.tree.leaves(true_usage)
     for name in ("surface_cubes", "dual_vertices", "quads"):
-        small = ROOM.resized(**{name: 128})
-        reported = extract(geometry, grid, capacities=small, training=True).usage
-        assert not bool(fits(reported, small))
-        assert [int(n) for n in jax.tree.leaves(reported)] == [int(n) for n in needs]
-        assert bool(fits(truth, grow(small, reported)))
+        capacities = ROOM.resized(**{name: 128})
+        reported_usage = extract(geometry, grid, capacities=capacities, training=True).usage
+        assert not bool(fits(reported_usage, capacities))
+        assert [int(n) for n in jax.tree.leaves(reported_usage)] == [int(n) for n in true_counts]
+        assert bool(fits(true_usage, grow(capacities, reported_usage)))
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -405,8 +409,8 @@ def test_jit_equals_eager():
     geometry = noisy_geometry(grid)
     (_, jitted), _ = probe_gradient(geometry, grid, SMALL_ROOM, True)
     eager = isosurface(geometry, grid, capacities=SMALL_ROOM, training=True)
-    for one, two in zip(jax.tree.leaves(jitted), jax.tree.leaves(eager), strict=True):
-        np.testing.assert_allclose(one, two, atol=1e-6)
+    for actual, expected in zip(jax.tree.leaves(jitted), jax.tree.leaves(eager), strict=True):
+        np.testing.assert_allclose(actual, expected, atol=1e-6)
 
 
 def test_dtype_in_is_dtype_out():
@@ -463,12 +467,12 @@ def test_extreme_values_stay_finite(size):
     grid = make_grid(SMALL_SHAPE)
     geometry = noisy_geometry(grid)
     sdf = jnp.where(geometry.sdf < 0, -size, size).astype(jnp.float32)
-    mixed = sdf.at[::3].set(geometry.sdf[::3])
-    for values in (sdf, mixed):
+    mixed_sdf = sdf.at[::3].set(geometry.sdf[::3])
+    for values in (sdf, mixed_sdf):
         for scale in (0.0, 100.0):
-            extreme = jax.tree.map(lambda leaf, scale=scale: scale * leaf, geometry)
-            extreme = replace(extreme, sdf=values)
-            (value, _), gradient = probe_gradient(extreme, grid, SMALL_ROOM, True)
+            extreme_geometry = jax.tree.map(lambda leaf, scale=scale: scale * leaf, geometry)
+            extreme_geometry = replace(extreme_geometry, sdf=values)
+            (value, _), gradient = probe_gradient(extreme_geometry, grid, SMALL_ROOM, True)
             assert np.isfinite(value)
             assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
@@ -535,21 +539,23 @@ def test_vertices_move_by_at_most_the_reach_of_the_grid_and_by_half_a_cell_by_de
     geometry = noisy_geometry(grid)
     step = float(grid.cell_size)
     for size in (1.0, 1e3):
-        moved = replace(geometry, deform=size * geometry.deform)
-        moves = np.asarray(deformed_vertices(moved, grid) - grid_vertices(grid))
-        assert np.abs(moves).max() <= share * step * (1 + 1e-5)
-        expected = share * step * np.tanh(np.asarray(moved.deform, np.float64))
-        np.testing.assert_allclose(moves, expected, atol=1e-6)
-    assert np.abs(moves).min() > 0.9 * share * step
+        scaled_geometry = replace(geometry, deform=size * geometry.deform)
+        displacements = np.asarray(deformed_vertices(scaled_geometry, grid) - grid_vertices(grid))
+        assert np.abs(displacements).max() <= share * step * (1 + 1e-5)
+        expected = share * step * np.tanh(np.asarray(scaled_geometry.deform, np.float64))
+        np.testing.assert_allclose(displacements, expected, atol=1e-6)
+    assert np.abs(displacements).min() > 0.9 * share * step
 
 
 def test_the_surface_is_that_of_vertices_moved_by_the_reach():
     """A smaller reach gives the same surface as the default one with smaller displacements."""
     grid, share = make_grid(SMALL_SHAPE), 0.25
     geometry = noisy_geometry(grid)
-    moves = share * np.tanh(np.asarray(geometry.deform, np.float64))
-    same = replace(geometry, deform=jnp.asarray(np.arctanh(moves / 0.5), jnp.float32))
-    expected = extract(same, grid, capacities=SMALL_ROOM, training=True)
+    displacements = share * np.tanh(np.asarray(geometry.deform, np.float64))
+    equal_geometry = replace(
+        geometry, deform=jnp.asarray(np.arctanh(displacements / 0.5), jnp.float32)
+    )
+    expected = extract(equal_geometry, grid, capacities=SMALL_ROOM, training=True)
     surface = extract(geometry, replace(grid, reach=share), capacities=SMALL_ROOM, training=True)
     np.testing.assert_array_equal(surface.mesh.faces, expected.mesh.faces)
     np.testing.assert_allclose(surface.mesh.vertices, expected.mesh.vertices, atol=1e-5)
@@ -571,8 +577,8 @@ def test_entropy_equals_its_definition(reduction):
         low, high = (
             np.take(sdf, np.arange(sdf.shape[axis])[s], axis) for s in (np.s_[:-1], np.s_[1:])
         )
-        differ = (low < 0) != (high < 0)
-        low, high = low[differ], high[differ]
+        is_crossed = (low < 0) != (high < 0)
+        low, high = low[is_crossed], high[is_crossed]
         terms.append(cross_entropy(low, high > 0) + cross_entropy(high, low > 0))
     expected = getattr(np.concatenate(terms), reduction)()
     actual = entropy_of(geometry, grid, reduction=reduction)
@@ -584,11 +590,11 @@ def test_the_sum_of_the_entropy_is_its_mean_times_the_number_of_crossed_edges():
     for seed in range(3):
         geometry = noisy_geometry(grid, seed=seed, closed=False)
         inside = np.asarray(geometry.sdf).reshape(grid.vertex_shape[::-1]) < 0
-        crossed = sum(int(np.diff(inside, axis=axis).sum()) for axis in range(3))
-        assert crossed > 20
+        crossed_count = sum(int(np.diff(inside, axis=axis).sum()) for axis in range(3))
+        assert crossed_count > 20
         total = entropy_of(geometry, grid, reduction="sum")
         mean = entropy_of(geometry, grid, reduction="mean")
-        np.testing.assert_allclose(total, crossed * mean, rtol=1e-5)
+        np.testing.assert_allclose(total, crossed_count * mean, rtol=1e-5)
         assert float(mean) == float(entropy_of(geometry, grid))
 
 
@@ -602,8 +608,8 @@ def test_weight_magnitude_is_the_mean_over_alpha_and_beta_and_gamma_has_no_part_
         slopes = np.sign(getattr(geometry, name)) / weights.size
         np.testing.assert_allclose(getattr(gradient, name), slopes, rtol=1e-5)
     np.testing.assert_array_equal(gradient.gamma, 0.0)
-    moved, _ = weights_gradient(replace(geometry, gamma=100 + geometry.gamma))
-    assert float(moved) == float(value)
+    shifted_value, _ = weights_gradient(replace(geometry, gamma=100 + geometry.gamma))
+    assert float(shifted_value) == float(value)
 
 
 # The surface as a part of the method
@@ -615,14 +621,14 @@ def test_the_penalties_of_flexicubes_are_entropy_deviation_and_weights(reduction
     geometry = noisy_geometry(grid)
     model = FlexiCubes(grid, reduction)
     surface = extract(geometry, grid, capacities=SMALL_ROOM, training=True)
-    found = penalties_of(model, geometry, surface)
-    assert set(found) == {"entropy", "deviation", "weights"}
-    assert float(found["entropy"]) == float(entropy_of(geometry, grid, reduction=reduction))
+    penalties = penalties_of(model, geometry, surface)
+    assert set(penalties) == {"entropy", "deviation", "weights"}
+    assert float(penalties["entropy"]) == float(entropy_of(geometry, grid, reduction=reduction))
     assert FlexiCubes(grid).entropy_reduction == "mean"
     # Lengths are in units of half the longest side of the box, which is 3 here.
-    np.testing.assert_allclose(found["deviation"], float(surface.deviation) / 1.5, rtol=1e-6)
+    np.testing.assert_allclose(penalties["deviation"], float(surface.deviation) / 1.5, rtol=1e-6)
     assert float(surface.deviation) > 0
-    np.testing.assert_allclose(found["weights"], weights_gradient(geometry)[0], rtol=1e-6)
+    np.testing.assert_allclose(penalties["weights"], weights_gradient(geometry)[0], rtol=1e-6)
 
 
 def test_the_final_mesh_has_two_triangles_a_quad_and_the_trained_one_four():
@@ -648,8 +654,8 @@ def test_the_final_mesh_has_two_triangles_a_quad_and_the_trained_one_four():
 
 def test_the_box_is_the_cube_around_the_grid():
     grid = make_grid((4, 2, 3), size=2.0)
-    moved = replace(grid, origin=grid.origin + jnp.array([1.0, 2.0, 3.0]))
-    box = FlexiCubes(moved).box
+    moved_grid = replace(grid, origin=grid.origin + jnp.array([1.0, 2.0, 3.0]))
+    box = FlexiCubes(moved_grid).box
     np.testing.assert_allclose(box.center, [1.0, 2.0, 3.0], atol=1e-6)
     np.testing.assert_allclose(box.half_extent, 1.0, rtol=1e-6)
 
@@ -662,21 +668,21 @@ def test_points_nearby_are_the_ends_of_crossed_edges():
     inside = np.asarray(geometry.sdf).reshape(grid.vertex_shape[::-1]) < 0
     ends = np.zeros(inside.shape, bool)
     for axis in range(3):
-        crossed = np.diff(inside, axis=axis)
+        is_crossed = np.diff(inside, axis=axis)
         for side in (slice(None, -1), slice(1, None)):
-            ends[(slice(None),) * axis + (side,)] |= crossed
+            ends[(slice(None),) * axis + (side,)] |= is_crossed
     np.testing.assert_array_equal(weights, ends.reshape(-1))
-    _, none = FlexiCubes(grid).nearby_points(replace(geometry, sdf=jnp.abs(geometry.sdf)))
-    np.testing.assert_array_equal(none, 0.0)
+    _, no_weights = FlexiCubes(grid).nearby_points(replace(geometry, sdf=jnp.abs(geometry.sdf)))
+    np.testing.assert_array_equal(no_weights, 0.0)
 
 
 def test_first_capacities_hold_a_surface_of_any_roughness():
     grid = make_grid(SMALL_SHAPE)
     for geometry in (noisy_geometry(grid), initial_geometry(grid, sphere_sdf(grid, radius=0.6))):
-        needed = extract(geometry, grid, capacities=SMALL_ROOM, training=True).usage
-        guess = FlexiCubes(grid).first_capacities(geometry)
-        assert bool(fits(needed, guess))
-        assert set(guess) == {"surface_cubes", "dual_vertices", "quads", "cell_patches"}
+        usage = extract(geometry, grid, capacities=SMALL_ROOM, training=True).usage
+        capacities = FlexiCubes(grid).first_capacities(geometry)
+        assert bool(fits(usage, capacities))
+        assert set(capacities) == {"surface_cubes", "dual_vertices", "quads", "cell_patches"}
 
 
 # Change of grid
@@ -684,21 +690,21 @@ def test_first_capacities_hold_a_surface_of_any_roughness():
 
 @pytest.mark.slow
 def test_resampling_keeps_a_sphere_a_sphere():
-    grid, finer = make_grid((12, 12, 12)), make_grid((18, 16, 20), size=2.2)
+    grid, finer_grid = make_grid((12, 12, 12)), make_grid((18, 16, 20), size=2.2)
     geometry = initial_geometry(grid, sphere_sdf(grid, radius=0.6))
     deform = jnp.asarray(np.random.default_rng(0).normal(size=geometry.deform.shape), jnp.float32)
-    wobbly = replace(geometry, deform=0.4 * deform)
+    wobbly_geometry = replace(geometry, deform=0.4 * deform)
     carry = jax.jit(resample)
     # The same sphere on the deformed grid.
-    sdf = (safe_norm(deformed_vertices(wobbly, grid)) - 0.6) / grid.cell_size
-    for source in (geometry, replace(wobbly, sdf=sdf)):
-        fresh = carry(source, grid, finer)
-        truth = sphere_sdf(finer, radius=0.6) * finer.cell_size
+    sdf = (safe_norm(deformed_vertices(wobbly_geometry, grid)) - 0.6) / grid.cell_size
+    for source in (geometry, replace(wobbly_geometry, sdf=sdf)):
+        new_geometry = carry(source, grid, finer_grid)
+        truth = sphere_sdf(finer_grid, radius=0.6) * finer_grid.cell_size
         is_near = jnp.abs(truth) < 0.2
         np.testing.assert_allclose(
-            (fresh.sdf * finer.cell_size)[is_near], truth[is_near], atol=0.05
+            (new_geometry.sdf * finer_grid.cell_size)[is_near], truth[is_near], atol=0.05
         )
-        mesh = to_trimesh(extract(fresh, finer, capacities=ROOM, training=False).mesh)
+        mesh = to_trimesh(extract(new_geometry, finer_grid, capacities=ROOM, training=False).mesh)
         radii = np.linalg.norm(mesh.vertices, axis=1)
         assert mesh.is_watertight
         assert abs(radii.mean() - 0.6) < 0.02

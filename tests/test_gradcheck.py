@@ -44,9 +44,9 @@ def marks(stage):
 )
 def test_every_gradient_agrees_with_differences(stage):
     rows = check_stage(stage)
-    failed = [row for row in rows if not passes(row)]
+    failing_rows = [row for row in rows if not passes(row)]
     assert rows
-    assert not failed, table(failed)
+    assert not failing_rows, table(failing_rows)
     # A table of zeros would pass, so many of the pairs must truly depend on each other.
     assert np.mean([row.norm > 0 for row in rows]) > 0.4
 
@@ -93,8 +93,8 @@ def test_a_fault_in_one_entry_is_found_and_located(fault):
     row = _only(_square_problem(factors))
     assert not passes(row)
     assert row.worst == "d y[4] / d x[4]"
-    found, claimed = row.worst_values
-    assert claimed == pytest.approx(fault * found, rel=1e-8)
+    numeric, analytic = row.worst_values
+    assert analytic == pytest.approx(fault * numeric, rel=1e-8)
     assert row.one_minus_cosine > 1e-13
 
 
@@ -132,12 +132,12 @@ def test_a_fault_in_a_sampled_group_is_found():
 
         return Problem("large", function, {"x": weights}, full=100)
 
-    right, wrong = _only(problem(np.ones(4000))), _only(problem(factors))
-    assert passes(right)
-    assert right.checked < right.total == 4000
-    assert not right.is_full
-    assert not passes(wrong)
-    assert wrong.along_gradient > 1e-4
+    right_row, wrong_row = _only(problem(np.ones(4000))), _only(problem(factors))
+    assert passes(right_row)
+    assert right_row.checked < right_row.total == 4000
+    assert not right_row.is_full
+    assert not passes(wrong_row)
+    assert wrong_row.along_gradient > 1e-4
 
 
 def test_steps_tell_truncation_from_rounding():
@@ -233,9 +233,9 @@ def test_an_unknown_stage_is_refused():
 def test_the_command_prints_the_table_and_writes_the_records(capsys, tmp_path):
     path = tmp_path / "rows.json"
     assert cli.main(["gradcheck", "light", "--json", str(path)]) == 0
-    printed = capsys.readouterr().out
-    assert "specular <- roughness" in printed
-    assert "float32" in printed
+    output = capsys.readouterr().out
+    assert "specular <- roughness" in output
+    assert "float32" in output
     records = json.loads(path.read_text())
     assert {record["stage"] for record in records} == {"light"}
     assert all(record["relative"] < 1e-6 for record in records)

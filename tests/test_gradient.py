@@ -23,8 +23,8 @@ def uneven(batch):
 
 def first_view(batch):
     """Return the batch without its second view."""
-    one = jax.tree.map(lambda leaf: leaf[:1], (batch.camera, batch.image, batch.valid))
-    camera, image, valid = one
+    view = jax.tree.map(lambda leaf: leaf[:1], (batch.camera, batch.image, batch.valid))
+    camera, image, valid = view
     return replace(batch, camera=camera, image=image, valid=valid)
 
 
@@ -50,21 +50,21 @@ def test_the_parts_of_monte_carlo_give_the_gradient_of_the_whole_loss():
     )
     batch = uneven(batch)
     (total, report), expected = evaluate(pipeline, params, batch)
-    (found_total, found_report), found = value_and_gradient(pipeline, params, batch, frozen=())
-    assert float(found_total) == pytest.approx(float(total), rel=1e-5)
-    assert_close(found_report, report)
-    assert_close(found, expected)
-    again = value_and_gradient(pipeline, params, batch, frozen=(), run=SideBySide())
-    for a, b in zip(jax.tree.leaves(again[1]), jax.tree.leaves(found), strict=True):
+    (actual_total, actual_report), actual = value_and_gradient(pipeline, params, batch, frozen=())
+    assert float(actual_total) == pytest.approx(float(total), rel=1e-5)
+    assert_close(actual_report, report)
+    assert_close(actual, expected)
+    parallel_result = value_and_gradient(pipeline, params, batch, frozen=(), run=SideBySide())
+    for a, b in zip(jax.tree.leaves(parallel_result[1]), jax.tree.leaves(actual), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 def test_two_programs_run_at_a_time_and_their_results_stay_in_order():
     """Each of the two waits for the other, so that one after the other they would never end."""
-    both = threading.Barrier(2, timeout=20)
+    barrier = threading.Barrier(2, timeout=20)
 
     def program(number):
-        both.wait()
+        barrier.wait()
         return number
 
     assert SideBySide().all(*((program, number) for number in range(4))) == [0, 1, 2, 3]
@@ -84,28 +84,28 @@ def test_accelerators_are_given_programs_without_waiting(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     run = ONE_DEVICE.runner(fits_twice=True)
     assert isinstance(run(Unfinished), Unfinished)
-    assert [type(one) for one in run.all((Unfinished,), (Unfinished,))] == [Unfinished] * 2
+    assert [type(result) for result in run.all((Unfinished,), (Unfinished,))] == [Unfinished] * 2
 
 
 @pytest.mark.parametrize("number", [0, 1])
 def test_a_program_that_fails_beside_another_is_told_when_both_have_ended(number):
-    ended = []
+    finished_numbers = []
 
-    def program(mine):
-        if mine == number:
+    def program(own_number):
+        if own_number == number:
             raise ValueError("no")
         time.sleep(0.05)
-        ended.append(mine)
+        finished_numbers.append(own_number)
 
     with pytest.raises(ValueError, match="no"):
         SideBySide().all((program, 0), (program, 1))
-    assert ended == [1 - number]
+    assert finished_numbers == [1 - number]
 
 
 @pytest.mark.parametrize("stage", ["split_sum", "monte_carlo"])
 def test_only_programs_that_sort_or_trace_rays_are_called_side_by_side(stage):
     _, pipeline, params, batch = problem(stage=stage)
-    together = []
+    parallel_programs = []
 
     class Noting(Runner):
         """Evaluates shapes only, and notes what could run side by side."""
@@ -114,12 +114,12 @@ def test_only_programs_that_sort_or_trace_rays_are_called_side_by_side(stage):
             return program.trace(*arguments).out_info
 
         def all(self, *calls):
-            together.extend(program.__name__ for program, *_ in calls)
+            parallel_programs.extend(program.__name__ for program, *_ in calls)
             return super().all(*calls)
 
     value_and_gradient(pipeline, params, batch, frozen=(), run=Noting())
     lists, views = ["_lists"] * 2, ["_lights", "_residual_lights", *["_view_gradient"] * 2]
-    assert together == (lists + views if stage == "monte_carlo" else lists)
+    assert parallel_programs == (lists + views if stage == "monte_carlo" else lists)
 
 
 def test_split_sum_by_parts_with_a_frozen_group():
@@ -128,11 +128,13 @@ def test_split_sum_by_parts_with_a_frozen_group():
     batch = uneven(batch)
     (total, report), expected = evaluate(pipeline, params, batch)
     frozen = ("sdf", "light")
-    (found_total, found_report), found = value_and_gradient(pipeline, params, batch, frozen=frozen)
-    assert float(found_total) == pytest.approx(float(total), rel=1e-5)
-    assert_close(found_report, report)
+    (actual_total, actual_report), actual = value_and_gradient(
+        pipeline, params, batch, frozen=frozen
+    )
+    assert float(actual_total) == pytest.approx(float(total), rel=1e-5)
+    assert_close(actual_report, report)
     for name, a, b in zip(
-        rate_groups(params), jax.tree.leaves(found), jax.tree.leaves(expected), strict=True
+        rate_groups(params), jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True
     ):
         if name in frozen:
             np.testing.assert_array_equal(a, 0.0)
@@ -144,14 +146,16 @@ def test_more_views_are_no_new_program_and_larger_lists_only_three():
     """Compiled programs are counted: those of a view serve every view."""
     _, pipeline, params, batch = problem(stage="split_sum")
     value_and_gradient(pipeline, params, first_view(batch), frozen=())
-    before = {name: getattr(gradient, name)._cache_size() for name in PROGRAMS}
+    cache_sizes = {name: getattr(gradient, name)._cache_size() for name in PROGRAMS}
     value_and_gradient(pipeline, params, batch, frozen=())
-    assert all(getattr(gradient, name)._cache_size() == before[name] for name in PER_VIEW)
-    larger = replace(pipeline, capacities=TIGHT.resized(hits=2 * TIGHT["hits"], chunks=4096))
-    before = {name: getattr(gradient, name)._cache_size() for name in PROGRAMS}
-    value_and_gradient(larger, params, batch, frozen=())
-    grown = {n for n in PROGRAMS if getattr(gradient, n)._cache_size() > before[n]}
-    assert grown == {"_lists", "_seen", "_view_gradient"}
+    assert all(getattr(gradient, name)._cache_size() == cache_sizes[name] for name in PER_VIEW)
+    larger_pipeline = replace(
+        pipeline, capacities=TIGHT.resized(hits=2 * TIGHT["hits"], chunks=4096)
+    )
+    cache_sizes = {name: getattr(gradient, name)._cache_size() for name in PROGRAMS}
+    value_and_gradient(larger_pipeline, params, batch, frozen=())
+    new_programs = {n for n in PROGRAMS if getattr(gradient, n)._cache_size() > cache_sizes[n]}
+    assert new_programs == {"_lists", "_seen", "_view_gradient"}
 
 
 PER_VIEW = ("_asset", "_lists", "_view_gradient")

@@ -34,8 +34,8 @@ def bumpy_torus(grid, *, deform=0.0, seed=0):
     ring = np.sqrt(x**2 + y**2) - 0.6
     values = np.sqrt(ring**2 + z**2) - 0.27 + 0.05 * np.sin(9 * x) * np.sin(8 * y)
     geometry = initial_geometry(grid, jnp.asarray(values / float(grid.cell_size), jnp.float32))
-    moved = rng.uniform(-deform, deform, geometry.deform.shape)
-    return replace(geometry, deform=jnp.asarray(moved, jnp.float32))
+    deformation = rng.uniform(-deform, deform, geometry.deform.shape)
+    return replace(geometry, deform=jnp.asarray(deformation, jnp.float32))
 
 
 def noise(grid, *, deform=0.0, seed=0):
@@ -44,8 +44,8 @@ def noise(grid, *, deform=0.0, seed=0):
     values = np.ones(grid.vertex_shape[::-1])
     values[:7, :7, :7] = rng.normal(size=(7, 7, 7))
     geometry = initial_geometry(grid, jnp.asarray(values.reshape(-1), jnp.float32))
-    moved = rng.uniform(-deform, deform, geometry.deform.shape)
-    return replace(geometry, deform=jnp.asarray(moved, jnp.float32))
+    deformation = rng.uniform(-deform, deform, geometry.deform.shape)
+    return replace(geometry, deform=jnp.asarray(deformation, jnp.float32))
 
 
 def traced(geometry, grid, capacities=AMPLE):
@@ -84,20 +84,22 @@ def test_every_ray_equals_brute_force(scene, kind, two_sided):
         jnp.ones((len(origins),), bool),
     )
     t_min = T_MIN * float(index.grid.cell_size)
-    distance, face, unclear = brute_force(
+    distance, face, is_unclear = brute_force(
         surface, *arguments[:2], source, two_sided=two_sided, t_min=t_min
     )
-    clear = ~unclear
-    assert clear.mean() > (0.5 if kind == "grazing" else 0.8)
-    found, hit = index.nearest(*arguments, two_sided=two_sided)
-    np.testing.assert_array_equal(np.asarray(hit)[clear] >= 0, face[clear] >= 0)
-    is_hit = clear & (face >= 0)
-    np.testing.assert_allclose(np.asarray(found)[is_hit], distance[is_hit], rtol=2e-4, atol=2e-5)
-    np.testing.assert_array_equal(np.asarray(hit)[is_hit], face[is_hit])
+    is_clear = ~is_unclear
+    assert is_clear.mean() > (0.5 if kind == "grazing" else 0.8)
+    hit_distance, hit_face = index.nearest(*arguments, two_sided=two_sided)
+    np.testing.assert_array_equal(np.asarray(hit_face)[is_clear] >= 0, face[is_clear] >= 0)
+    is_hit = is_clear & (face >= 0)
+    np.testing.assert_allclose(
+        np.asarray(hit_distance)[is_hit], distance[is_hit], rtol=2e-4, atol=2e-5
+    )
+    np.testing.assert_array_equal(np.asarray(hit_face)[is_hit], face[is_hit])
     any_hit = np.asarray(index.occluded(*arguments, two_sided=two_sided))
-    np.testing.assert_array_equal(any_hit[clear], face[clear] >= 0)
+    np.testing.assert_array_equal(any_hit[is_clear], face[is_clear] >= 0)
     assert 0.02 < np.mean(face >= 0) < 1.0
-    assert np.all(np.isinf(np.asarray(found)[np.asarray(hit) < 0]))
+    assert np.all(np.isinf(np.asarray(hit_distance)[np.asarray(hit_face) < 0]))
 
 
 def test_a_ray_meets_what_is_a_hundredth_of_a_cell_away_and_not_what_it_starts_on(torus):
@@ -107,9 +109,9 @@ def test_a_ray_meets_what_is_a_hundredth_of_a_cell_away_and_not_what_it_starts_o
     cell = float(index.grid.cell_size)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     # Only large triangles are used, whose centroids rays meet in spite of rounding.
-    large = np.linalg.norm(normals, axis=1) > 0.2 * cell**2
-    chosen = np.flatnonzero(large)[np.arange(RAYS) % large.sum()]
-    normal, middle = unit(normals[chosen]), corners[chosen].mean(axis=1)
+    is_large = np.linalg.norm(normals, axis=1) > 0.2 * cell**2
+    large_faces = np.flatnonzero(is_large)[np.arange(RAYS) % is_large.sum()]
+    normal, middle = unit(normals[large_faces]), corners[large_faces].mean(axis=1)
     for cells, is_met in ((1e-2, True), (2e-3, True), (2e-4, False)):
         distance, _ = index.nearest(
             jnp.asarray(middle + cells * cell * normal, jnp.float32),
@@ -117,8 +119,8 @@ def test_a_ray_meets_what_is_a_hundredth_of_a_cell_away_and_not_what_it_starts_o
             jnp.full((RAYS,), -1, jnp.int32),
             jnp.ones((RAYS,), bool),
         )
-        near = np.asarray(distance) < 0.1 * cell
-        assert near.mean() == (1.0 if is_met else 0.0)
+        is_near = np.asarray(distance) < 0.1 * cell
+        assert is_near.mean() == (1.0 if is_met else 0.0)
 
 
 @pytest.mark.parametrize("far", [30.0, 1000.0])
@@ -127,13 +129,13 @@ def test_a_ray_from_far_away_meets_what_one_from_nearby_does(torus, far):
     origins, directions, source, mask = _rays()
     start = origins - 3.0 * directions
     distance, face = index.nearest(start, directions, source, mask)
-    away, same = index.nearest(start - far * directions, directions, source, mask)
+    far_distance, far_face = index.nearest(start - far * directions, directions, source, mask)
     # Rounding may move a ray over an edge of a face, so that it meets another face.
-    is_same = np.asarray(same) == np.asarray(face)
+    is_same = np.asarray(far_face) == np.asarray(face)
     assert is_same.mean() > 0.97
     is_hit = is_same & (np.asarray(face) >= 0)
     assert 0.1 < is_hit.mean() < 1.0
-    difference = np.asarray(away - distance)[is_hit] - far
+    difference = np.asarray(far_distance - distance)[is_hit] - far
     assert np.abs(difference).max() < 1e-2 * float(index.grid.cell_size) + 4e-7 * far
 
 
@@ -147,12 +149,12 @@ def _rays(count=RAYS, seed=2):
 @pytest.mark.slow
 def test_masked_rays_hit_nothing_and_leave_the_others(torus):
     _, index = torus
-    origins, directions, source, everything = _rays()
+    origins, directions, source, full_mask = _rays()
     mask = jnp.asarray(np.random.default_rng(0).random(RAYS) < 0.5)
-    whole = index.occluded(origins, directions, source, everything)
-    part = index.occluded(origins, directions, source, mask)
-    np.testing.assert_array_equal(part, whole & mask)
-    assert bool(jnp.any(whole & ~mask))
+    occlusions = index.occluded(origins, directions, source, full_mask)
+    masked_occlusions = index.occluded(origins, directions, source, mask)
+    np.testing.assert_array_equal(masked_occlusions, occlusions & mask)
+    assert bool(jnp.any(occlusions & ~mask))
 
 
 @pytest.mark.slow
@@ -161,21 +163,21 @@ def test_rays_that_wait_for_others_hit_what_they_would_at_once(torus, monkeypatc
     _, index = torus
     *rays, _ = _rays(1500)
     rays.append(jnp.asarray(np.random.default_rng(0).random(1500) < 0.8))
-    whole = index.nearest(*rays)
+    expected = index.nearest(*rays)
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     monkeypatch.setattr(walking, "_LANES", 512)
     monkeypatch.setattr(walking, "_ACCELERATOR_LANES", 1024)
     monkeypatch.setattr(walking, "_ACCELERATOR_FEWEST_LANES", 128)
-    again = jax.jit(walking.trace, static_argnames=("two_sided", "any_hit"))
-    parts = again(index, *rays, two_sided=False, any_hit=False)
-    np.testing.assert_array_equal(whole[1], parts[1])
-    np.testing.assert_array_equal(whole[0], parts[0])
+    trace = jax.jit(walking.trace, static_argnames=("two_sided", "any_hit"))
+    actual = trace(index, *rays, two_sided=False, any_hit=False)
+    np.testing.assert_array_equal(expected[1], actual[1])
+    np.testing.assert_array_equal(expected[0], actual[0])
 
 
 def test_no_rays_and_no_surface_are_legal():
     grid = torus_grid()
-    empty = initial_geometry(grid, jnp.ones((grid.vertex_count,)))
-    _, index = traced(empty, grid)
+    empty_geometry = initial_geometry(grid, jnp.ones((grid.vertex_count,)))
+    _, index = traced(empty_geometry, grid)
     distance, face = index.nearest(*_rays())
     assert bool(jnp.all(jnp.isinf(distance)))
     assert bool(jnp.all(face == -1))
@@ -185,18 +187,20 @@ def test_no_rays_and_no_surface_are_legal():
 def test_a_ray_never_hits_the_face_it_starts_from(torus):
     surface, index = torus
     corners = triangles(surface)
-    chosen = np.random.default_rng(4).choice(len(corners), RAYS, replace=False)
-    corners = corners[chosen]
+    faces = np.random.default_rng(4).choice(len(corners), RAYS, replace=False)
+    corners = corners[faces]
     centres = corners.mean(axis=1)
     normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-    source = jnp.asarray(chosen, jnp.int32)
+    source = jnp.asarray(faces, jnp.int32)
     # Rays start just below a face and go through it: their own face is in the way, and is ignored.
     start = jnp.asarray(centres - 0.02 * normals, jnp.float32)
     arguments = (start, jnp.asarray(normals, jnp.float32))
-    everything = jnp.ones((len(corners),), bool)
-    _, with_source = index.nearest(*arguments, source, everything, two_sided=True)
-    _, without = index.nearest(*arguments, jnp.full_like(source, -1), everything, two_sided=True)
-    assert np.mean(np.asarray(without) == np.asarray(source)) > 0.9
+    full_mask = jnp.ones((len(corners),), bool)
+    _, with_source = index.nearest(*arguments, source, full_mask, two_sided=True)
+    _, without_source = index.nearest(
+        *arguments, jnp.full_like(source, -1), full_mask, two_sided=True
+    )
+    assert np.mean(np.asarray(without_source) == np.asarray(source)) > 0.9
     assert not np.any(np.asarray(with_source) == np.asarray(source))
 
 
@@ -204,16 +208,16 @@ def test_a_ray_never_hits_the_face_it_starts_from(torus):
 def test_overflow_reports_the_true_need_and_growing_cures_it(torus):
     grid = torus_grid()
     geometry = bumpy_torus(grid)
-    tight = AMPLE.resized(cell_patches=256)
-    _, index = traced(geometry, grid, tight)
-    assert not bool(fits(index.usage, tight))
-    assert overflowed(index.usage, tight) == ["cell_patches"]
-    enough = grow(tight, index.usage)
-    _, cured = traced(geometry, grid, enough)
-    assert int(cured.usage["cell_patches"]) == int(index.usage["cell_patches"])
-    assert bool(fits(cured.usage, enough))
-    _, ample = torus
-    np.testing.assert_array_equal(cured.occluded(*_rays()), ample.occluded(*_rays()))
+    tight_capacities = AMPLE.resized(cell_patches=256)
+    _, index = traced(geometry, grid, tight_capacities)
+    assert not bool(fits(index.usage, tight_capacities))
+    assert overflowed(index.usage, tight_capacities) == ["cell_patches"]
+    grown_capacities = grow(tight_capacities, index.usage)
+    _, grown_index = traced(geometry, grid, grown_capacities)
+    assert int(grown_index.usage["cell_patches"]) == int(index.usage["cell_patches"])
+    assert bool(fits(grown_index.usage, grown_capacities))
+    _, ample_index = torus
+    np.testing.assert_array_equal(grown_index.occluded(*_rays()), ample_index.occluded(*_rays()))
 
 
 def test_a_list_too_long_to_be_counted_is_refused(torus):
@@ -229,11 +233,13 @@ def test_a_scene_of_any_scale_gives_the_same_hits(torus):
     origins, directions, source, mask = _rays()
     distance, face = index.nearest(origins, directions, source, mask)
     for scale in (2.0**-10, 2.0**10):
-        scaled = Grid(grid.origin * scale, grid.cell_size * scale, grid.shape)
-        _, other = traced(geometry, scaled)
-        far, same = other.nearest(origins * scale, directions, source, mask)
-        np.testing.assert_array_equal(same, face)
-        np.testing.assert_array_equal(far, distance * scale)
+        scaled_grid = Grid(grid.origin * scale, grid.cell_size * scale, grid.shape)
+        _, scaled_index = traced(geometry, scaled_grid)
+        scaled_distance, scaled_face = scaled_index.nearest(
+            origins * scale, directions, source, mask
+        )
+        np.testing.assert_array_equal(scaled_face, face)
+        np.testing.assert_array_equal(scaled_distance, distance * scale)
 
 
 @pytest.mark.slow
@@ -267,9 +273,9 @@ def test_agrees_with_embree_on_a_hundred_thousand_rays():
     from trimesh.ray.ray_pyembree import RayMeshIntersector
 
     grid = torus_grid(24)
-    ample = Capacities(surface_cubes=4096, dual_vertices=4096, quads=4096, cell_patches=32768)
-    surface, index = traced(bumpy_torus(grid, deform=0.5), grid, ample)
-    assert bool(fits(index.usage, ample))
+    capacities = Capacities(surface_cubes=4096, dual_vertices=4096, quads=4096, cell_patches=32768)
+    surface, index = traced(bumpy_torus(grid, deform=0.5), grid, capacities)
+    assert bool(fits(index.usage, capacities))
     vertices = np.asarray(surface.mesh.vertices)
     faces = np.asarray(surface.mesh.faces)[: int(surface.mesh.face_count)]
     tracer = RayMeshIntersector(trimesh.Trimesh(vertices, faces, process=False))
@@ -277,7 +283,7 @@ def test_agrees_with_embree_on_a_hundred_thousand_rays():
     origins, directions, source = rays_of_kind("from the surface", surface, rng, 100_000)
     start = origins + 1e-3 * float(grid.cell_size) * directions
     expected = tracer.intersects_any(start, directions)
-    found = index.occluded(
+    actual = index.occluded(
         jnp.asarray(origins, jnp.float32),
         jnp.asarray(directions, jnp.float32),
         jnp.asarray(source, jnp.int32),
@@ -285,7 +291,7 @@ def test_agrees_with_embree_on_a_hundred_thousand_rays():
         two_sided=True,
     )
     assert 0.05 < expected.mean() < 0.5
-    assert np.mean(np.asarray(found) == expected) > 0.9985
+    assert np.mean(np.asarray(actual) == expected) > 0.9985
 
 
 def test_places_are_the_cells_that_points_lie_in():
@@ -295,7 +301,7 @@ def test_places_are_the_cells_that_points_lie_in():
     origin, cell = np.asarray(index.grid.origin), float(index.grid.cell_size)
     cells = np.stack([rng.integers(0, size, 200) for size in index.grid.shape], axis=1)
     points = origin + (cells + rng.uniform(0.01, 0.99, cells.shape)) * cell
-    found = index.places(jnp.asarray(points, jnp.float32), jnp.zeros(200, jnp.int32))
+    places = index.places(jnp.asarray(points, jnp.float32), jnp.zeros(200, jnp.int32))
     nx, ny, _ = index.grid.shape
-    np.testing.assert_array_equal(found, cells[:, 0] + nx * (cells[:, 1] + ny * cells[:, 2]))
+    np.testing.assert_array_equal(places, cells[:, 0] + nx * (cells[:, 1] + ny * cells[:, 2]))
     assert float(index.place_size) == cell

@@ -49,11 +49,11 @@ def _slow_row(spec, level, x, y, z):
     cells = spec.resolutions[level]
     if spec.is_dense[level]:
         return (z * (cells + 1) + y) * (cells + 1) + x
-    mixed = ((y * 2654435761) ^ (z * 805459861)) % 2**32
-    mixed = ((mixed ^ (mixed >> 15)) * 0x2C1B3C6D) % 2**32
+    hash_value = ((y * 2654435761) ^ (z * 805459861)) % 2**32
+    hash_value = ((hash_value ^ (hash_value >> 15)) * 0x2C1B3C6D) % 2**32
     offset_count = 2**spec.log2_entries - cells
     scale = np.float32(offset_count) * np.float32(2.0**-24)
-    return int(np.float32(mixed >> 8) * scale) + x
+    return int(np.float32(hash_value >> 8) * scale) + x
 
 
 def _slow_encode(table, points, spec):
@@ -167,31 +167,31 @@ def test_only_hashed_levels_collide_and_every_row_is_in_its_level():
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     rows = np.stack(_locate(jnp.asarray(grid, jnp.float32), spec).rows)
     for level, (first, count) in enumerate(zip(spec.first_rows, spec.entries, strict=True)):
-        own = rows[:, :, level] - first
-        assert own.min() >= 0
-        assert own.max() + 1 < count
-        usage = np.bincount(own.ravel(), minlength=count)
+        local_rows = rows[:, :, level] - first
+        assert local_rows.min() >= 0
+        assert local_rows.max() + 1 < count
+        usage = np.bincount(local_rows.ravel(), minlength=count)
         if spec.is_dense[level]:
             n = spec.resolutions[level]
             vertices = np.floor(grid * n).astype(int)
             expected = (vertices[:, 2] * (n + 1) + vertices[:, 1]) * (n + 1) + vertices[:, 0]
-            np.testing.assert_array_equal(own[0], expected)
+            np.testing.assert_array_equal(local_rows[0], expected)
         elif level == spec.levels - 1:
             # Only the ends of grid lines reach the ends of the table; the rest is used evenly.
             end = spec.resolutions[level]
-            middle = usage[end:-end]
-            assert middle.min() > 0
-            assert middle.max() < 3 * middle.mean()
+            inner_usage = usage[end:-end]
+            assert inner_usage.min() > 0
+            assert inner_usage.max() < 3 * inner_usage.mean()
 
 
 def _assert_equal_pullbacks(table, points, cotangent):
     ours = partial(hashgrid.encode, spec=SMALL, position_gradient=True)
     plain = partial(_reference_encode, spec=SMALL)
-    pulled = [
+    gradients = [
         jax.jit(lambda t, p, c, f=f: jax.vjp(f, t, p)[1](c))(table, points, cotangent)
         for f in (ours, plain)
     ]
-    for a, b in zip(*pulled, strict=True):
+    for a, b in zip(*gradients, strict=True):
         assert _relative(a, b) < EXACT
 
 
@@ -203,8 +203,8 @@ def test_the_full_jacobian_of_a_tiny_grid_equals_that_of_autodiff():
             partial(hashgrid.encode, spec=spec, position_gradient=True), argnums=(0, 1)
         )
         plain = jax.jacrev(partial(_reference_encode, spec=spec), argnums=(0, 1))
-        both = (jax.jit(ours)(table, points), jax.jit(plain)(table, points))
-        for a, b in zip(*both, strict=True):
+        jacobians = (jax.jit(ours)(table, points), jax.jit(plain)(table, points))
+        for a, b in zip(*jacobians, strict=True):
             np.testing.assert_allclose(a, b, atol=EXACT)
 
 
@@ -249,8 +249,8 @@ def test_a_point_that_is_not_a_number_spoils_only_its_own_row():
     points = _points(4).at[1].set(jnp.nan).at[2].set(jnp.inf)
     features = encode(table, points, spec=SMALL)
     assert bool(jnp.all(jnp.isnan(features[1])))
-    others = jnp.asarray([0, 2, 3])
-    assert bool(jnp.all(jnp.isfinite(features[others])))
+    other_rows = jnp.asarray([0, 2, 3])
+    assert bool(jnp.all(jnp.isfinite(features[other_rows])))
 
 
 def test_rows_with_zero_cotangent_leave_no_trace():

@@ -27,8 +27,8 @@ FOCAL = 0.45 * SIZE * DISTANCE
 
 def bowl(points):
     """Signed distance bound of half a ball, hollowed out from above."""
-    away = np.linalg.norm(points, axis=-1)
-    return np.maximum(np.maximum(away - OUTER, INNER - away), points[..., 2])
+    radius = np.linalg.norm(points, axis=-1)
+    return np.maximum(np.maximum(radius - OUTER, INNER - radius), points[..., 2])
 
 
 def half_ball(points):
@@ -72,13 +72,15 @@ def photographed(distance, color, *, count=COUNT):
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     images = []
     for pose in poses:
-        towards = rays @ pose[:3, :3].T
-        travelled = np.full((SIZE, SIZE, 1), DISTANCE - 1.5)
+        directions = rays @ pose[:3, :3].T
+        ray_lengths = np.full((SIZE, SIZE, 1), DISTANCE - 1.5)
         for _ in range(60):
-            points = pose[:3, 3] + travelled * towards
-            travelled = travelled + distance(points)[..., None]
-        hit = distance(points)[..., None] < 0.01
-        images.append(np.concatenate([np.where(hit, color(points, towards), 0.0), hit], -1))
+            points = pose[:3, 3] + ray_lengths * directions
+            ray_lengths = ray_lengths + distance(points)[..., None]
+        is_hit = distance(points)[..., None] < 0.01
+        images.append(
+            np.concatenate([np.where(is_hit, color(points, directions), 0.0), is_hit], -1)
+        )
     lens = np.array([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1.0]])
     return Views(
         names=tuple(f"view_{k}" for k in range(count)),
@@ -103,9 +105,9 @@ def found(grid, hull, sdf):
     """
     cell = float(grid.cell_size)
     distance = bowl(grid_points(grid)) / cell
-    hollow = (hull < 0) & (distance > 1.0)
-    cut = (hull < 0) & (sdf >= 0) & (distance < 0)
-    return (sdf[hollow] >= 0).mean(), -distance[cut].min(initial=0.0)
+    is_hollow = (hull < 0) & (distance > 1.0)
+    is_cut = (hull < 0) & (sdf >= 0) & (distance < 0)
+    return (sdf[is_hollow] >= 0).mean(), -distance[is_cut].min(initial=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -116,31 +118,31 @@ def open_bowl():
 def test_the_inside_of_a_bowl_is_found_and_its_wall_left(open_bowl):
     grid, hull, sdf = carved(open_bowl)
     assert ((hull < 0) & (bowl(grid_points(grid)) > 0)).sum() > 500
-    share, cut = found(grid, hull, sdf)
+    share, cut_depth = found(grid, hull, sdf)
     assert share > 0.8
-    assert cut < 1.0
+    assert cut_depth < 1.0
     # The outside of the wall is as it was; nothing is added.
-    beside = np.abs(hull) < 0.5
-    beside &= grid_points(grid)[:, 2] < -0.2
-    np.testing.assert_array_equal(sdf[beside], hull[beside])
+    is_outer_wall = np.abs(hull) < 0.5
+    is_outer_wall &= grid_points(grid)[:, 2] < -0.2
+    np.testing.assert_array_equal(sdf[is_outer_wall], hull[is_outer_wall])
     assert (sdf >= hull).all()
 
 
 def test_finer_grids_are_carved_by_what_a_coarse_one_shows(open_bowl):
     grid, hull, sdf = carved(open_bowl, resolution=60)
-    share, cut = found(grid, hull, sdf)
+    share, cut_depth = found(grid, hull, sdf)
     assert share > 0.8
-    assert cut < 2.0
+    assert cut_depth < 2.0
     assert (sdf >= hull).all()
 
 
 def test_values_near_the_new_surface_are_distances_in_cells(open_bowl):
     grid, hull, sdf = carved(open_bowl)
     distance = bowl(grid_points(grid)) / float(grid.cell_size)
-    axis = np.linalg.norm(grid_points(grid)[:, :2], axis=1) < 0.3
-    opened = axis & (hull < -2.0) & (np.abs(distance) < 2.0)
-    assert opened.sum() > 10
-    assert np.abs(sdf - distance)[opened].mean() < 1.0
+    is_near_axis = np.linalg.norm(grid_points(grid)[:, :2], axis=1) < 0.3
+    is_opened = is_near_axis & (hull < -2.0) & (np.abs(distance) < 2.0)
+    assert is_opened.sum() > 10
+    assert np.abs(sdf - distance)[is_opened].mean() < 1.0
 
 
 @pytest.fixture(scope="module")
@@ -171,8 +173,8 @@ def displaced(views, distance):
 def with_wide_masks(views, pixels):
     images = views.images.copy()
     for image, color in zip(images, np.random.default_rng(0).random((COUNT, 3)), strict=True):
-        wide = binary_dilation(image[..., 3] > 0.5, iterations=pixels)
-        image[wide & (image[..., 3] < 0.5)] = [*color, 1.0]
+        wide_mask = binary_dilation(image[..., 3] > 0.5, iterations=pixels)
+        image[wide_mask & (image[..., 3] < 0.5)] = [*color, 1.0]
     return replace(views, images=images)
 
 
@@ -189,30 +191,30 @@ def test_noise_and_small_differences_of_exposure_hide_no_hollow(open_bowl):
     noise = np.random.default_rng(1).normal(0.0, 0.03, open_bowl.images.shape)
     noisy = open_bowl.images + np.where(open_bowl.images[..., 3:] > 0, noise, 0.0) * [1, 1, 1, 0]
     views = replace(open_bowl, images=np.maximum(noisy, 0.0).astype(np.float32))
-    share, cut = found(*carved(exposed_at_random(views, 0.1)))
+    share, cut_depth = found(*carved(exposed_at_random(views, 0.1)))
     assert share > 0.8
-    assert cut < 1.0
+    assert cut_depth < 1.0
 
 
 def test_a_bowl_brighter_than_white_is_carved_alike(open_bowl):
     images = open_bowl.images * np.array([16.0, 16.0, 16.0, 1.0], np.float32)
-    share, cut = found(*carved(replace(open_bowl, images=images)))
+    share, cut_depth = found(*carved(replace(open_bowl, images=images)))
     assert share > 0.8
-    assert cut < 1.0
+    assert cut_depth < 1.0
 
 
 def test_pixels_that_do_not_count_say_nothing(open_bowl):
     images, valid = open_bowl.images.copy(), np.ones(open_bowl.images.shape[:3], np.float32)
     valid[:, : SIZE // 2, : SIZE // 2] = 0.0
     images[:, : SIZE // 2, : SIZE // 2, :3] = np.random.default_rng(0).random(3)
-    share, cut = found(*carved(replace(open_bowl, images=images, valid=valid)))
+    share, cut_depth = found(*carved(replace(open_bowl, images=images, valid=valid)))
     assert share > 0.6
-    assert cut < 1.0
+    assert cut_depth < 1.0
 
 
 def test_few_views_say_too_little(open_bowl):
-    few = photographed(bowl, painted, count=7)
-    _, hull, sdf = carved(few)
+    views = photographed(bowl, painted, count=7)
+    _, hull, sdf = carved(views)
     assert sdf is hull
 
 
@@ -227,11 +229,11 @@ def test_a_run_begins_with_the_hollow_unless_it_is_told_not_to(open_bowl):
         train_light=None,
         bounds=BOUNDS,
     )
-    opened, closed = (
+    open_sdf, closed_sdf = (
         FlexiCubesSettings(resolution=20, hollows=hollows).start(dataset, jax.random.key(0))[1].sdf
         for hollows in (True, False)
     )
-    assert ((opened >= 0) & (closed < 0)).sum() > 200
+    assert ((open_sdf >= 0) & (closed_sdf < 0)).sum() > 200
 
 
 def test_the_command_info_says_whether_there_is_a_hollow(open_bowl, closed_body):
@@ -239,5 +241,7 @@ def test_the_command_info_says_whether_there_is_a_hollow(open_bowl, closed_body)
     share = int(re.fullmatch(r"hollows: +1, at least (\d+)% of the visual hull: .*", line)[1])
     assert 5 < share < 60
     assert hollow_line(closed_body, BOUNDS).startswith("hollows:    none")
-    masked = replace(closed_body, images=0 * closed_body.images)
-    assert hollow_line(masked, BOUNDS).startswith("hollows:    not looked for: every mask is empty")
+    blank_views = replace(closed_body, images=0 * closed_body.images)
+    assert hollow_line(blank_views, BOUNDS).startswith(
+        "hollows:    not looked for: every mask is empty"
+    )

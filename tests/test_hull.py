@@ -60,8 +60,8 @@ def sphere_coverage(poses, intrinsics, center, radius, *, samples=4):
             ],
             -1,
         )
-        along = rays @ c
-        is_hit = along**2 > (rays**2).sum(-1) * (c @ c - radius**2)
+        projections = rays @ c
+        is_hit = projections**2 > (rays**2).sum(-1) * (c @ c - radius**2)
         masks.append(is_hit.reshape(SIZE, samples, SIZE, samples).mean((1, 3)))
     return np.stack(masks).astype(np.float32)
 
@@ -89,11 +89,11 @@ def test_distance_at_the_surface_is_accurate_to_a_fraction_of_a_pixel(sphere):
     pixel = DISTANCE / FOCAL
     for pose in poses[::7]:
         backward = -pose[2, :3]
-        across = np.cross(backward, np.random.default_rng(1).normal(size=(50, 3)))
-        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        perpendiculars = np.cross(backward, np.random.default_rng(1).normal(size=(50, 3)))
+        perpendiculars /= np.linalg.norm(perpendiculars, axis=1, keepdims=True)
         sine = RADIUS / DISTANCE
-        tangent = RADIUS * (sine * backward[None] + np.sqrt(1.0 - sine**2) * across)
-        distance = hull_distance(*sphere, tangent, tolerance=0.0)
+        tangent_points = RADIUS * (sine * backward[None] + np.sqrt(1.0 - sine**2) * perpendiculars)
+        distance = hull_distance(*sphere, tangent_points, tolerance=0.0)
         assert np.abs(distance).max() < 0.35 * pixel
 
 
@@ -156,18 +156,18 @@ def test_bounds_find_an_object_far_smaller_than_the_first_search_cell():
 
 def test_one_wrong_mask_does_not_carve_the_object(sphere):
     poses, intrinsics, masks = sphere
-    torn = masks.copy()
-    torn[3, SIZE // 2 :] = 0.0
+    torn_masks = masks.copy()
+    torn_masks[3, SIZE // 2 :] = 0.0
     points = np.random.default_rng(2).uniform(-0.4, 0.4, (500, 3))
-    assert not is_in_hull(poses, intrinsics, torn, points, tolerance=0.0).all()
-    assert is_in_hull(poses, intrinsics, torn, points, tolerance=1 / VIEW_COUNT).all()
+    assert not is_in_hull(poses, intrinsics, torn_masks, points, tolerance=0.0).all()
+    assert is_in_hull(poses, intrinsics, torn_masks, points, tolerance=1 / VIEW_COUNT).all()
 
 
 def test_a_view_with_an_empty_mask_is_ignored(sphere):
     poses, intrinsics, masks = sphere
-    blank = masks.copy()
-    blank[5] = 0.0
-    assert is_in_hull(poses, intrinsics, blank, np.zeros((1, 3)), tolerance=0.0).all()
+    blank_masks = masks.copy()
+    blank_masks[5] = 0.0
+    assert is_in_hull(poses, intrinsics, blank_masks, np.zeros((1, 3)), tolerance=0.0).all()
     with pytest.raises(ValueError, match="every mask is empty"):
         is_in_hull(poses, intrinsics, 0.0 * masks, np.zeros((1, 3)))
 
@@ -182,8 +182,8 @@ def test_a_view_says_nothing_about_what_it_does_not_see(sphere):
 
 
 def test_a_point_that_few_views_see_is_outside(sphere):
-    far = np.array([[0.0, 0.0, 50.0], [30.0, 0.0, 0.0]])
-    distance = hull_distance(*sphere, far)
+    far_points = np.array([[0.0, 0.0, 50.0], [30.0, 0.0, 0.0]])
+    distance = hull_distance(*sphere, far_points)
     assert (distance > 0.0).all()
     poses, _, _ = sphere
     eye = -poses[0, :3, :3].T @ poses[0, :3, 3]
@@ -206,16 +206,18 @@ def test_a_haze_of_compression_is_neither_object_nor_background(sphere):
     poses, pinholes, masks = sphere
     haze = np.random.default_rng(0).integers(0, 4, masks.shape) / 255.0
     points = grid_points(fit_grid((np.full(3, -1.2), np.full(3, 1.2)), 24))
-    clean = hull_distance(poses, pinholes, masks, points)
-    assert clean.min() < -0.6
-    hazes = [np.maximum(masks, haze), np.minimum(masks, 1.0 - haze), 0.985 * masks]
-    hazes.append(np.stack([through_jpeg(mask, quality=95) for mask in masks]))
-    for hazy in hazes:
-        found = hull_distance(poses, pinholes, hazy, points)
+    clean_distances = hull_distance(poses, pinholes, masks, points)
+    assert clean_distances.min() < -0.6
+    hazy_variants = [np.maximum(masks, haze), np.minimum(masks, 1.0 - haze), 0.985 * masks]
+    hazy_variants.append(np.stack([through_jpeg(mask, quality=95) for mask in masks]))
+    for hazy_masks in hazy_variants:
+        distances = hull_distance(poses, pinholes, hazy_masks, points)
         # A pixel is .044 wide at the sphere.
-        np.testing.assert_allclose(found, clean, atol=0.02)
+        np.testing.assert_allclose(distances, clean_distances, atol=0.02)
         for corner, expected in zip(
-            hull_bounds(poses, pinholes, hazy), hull_bounds(poses, pinholes, masks), strict=True
+            hull_bounds(poses, pinholes, hazy_masks),
+            hull_bounds(poses, pinholes, masks),
+            strict=True,
         ):
             np.testing.assert_allclose(corner, expected, atol=0.02)
 
@@ -230,21 +232,21 @@ def test_large_masks_are_reduced_without_moving_the_edge():
         hull_distance(poses, *views, points, tolerance=0.0)
         for views in ((intrinsics, masks), (scaled, large))
     )
-    near = np.isfinite(first + second) & (np.abs(first) < 0.1)
-    assert near.sum() > 50
-    assert np.abs(first[near] - second[near]).max() < 1.5 * DISTANCE / FOCAL
+    is_near = np.isfinite(first + second) & (np.abs(first) < 0.1)
+    assert is_near.sum() > 50
+    assert np.abs(first[is_near] - second[is_near]).max() < 1.5 * DISTANCE / FOCAL
 
 
 def test_views_that_bound_nothing_are_refused(sphere):
     poses, intrinsics, masks = sphere
     with pytest.raises(ValueError, match="parallel or there is only one view"):
         hull_bounds(poses[:1], intrinsics[:1], masks[:1])
-    small = sphere_coverage(poses, intrinsics, np.zeros(3), 0.3)
+    small_masks = sphere_coverage(poses, intrinsics, np.zeros(3), 0.3)
     # Neighbouring views put the object on opposite sides.
-    small[::2] = np.roll(small[::2], 22, axis=2)
-    small[1::2] = np.roll(small[1::2], -22, axis=2)
+    small_masks[::2] = np.roll(small_masks[::2], 22, axis=2)
+    small_masks[1::2] = np.roll(small_masks[1::2], -22, axis=2)
     with pytest.raises(ValueError, match="no volume in common"):
-        hull_bounds(poses, intrinsics, small, tolerance=0.0)
+        hull_bounds(poses, intrinsics, small_masks, tolerance=0.0)
 
 
 def test_a_grid_beside_the_object_is_refused(sphere):
@@ -301,30 +303,32 @@ def test_pixels_that_do_not_count_carve_nothing(sphere):
     valid = np.ones(masks.shape, np.float32)
     valid[:, :, 34:40] = 0.0
     valid[:, :6] = 0.0
-    hidden = (masks * valid).astype(np.float32)
-    before = hidden.copy()
+    visible_masks = (masks * valid).astype(np.float32)
+    original_masks = visible_masks.copy()
     settings = {"tolerance": 0.0, "seen_fraction": 0.25}
     inside = np.random.default_rng(0).normal(size=(400, 3))
     inside *= 0.97 * RADIUS / np.linalg.norm(inside, axis=1, keepdims=True)
     outside = inside * (1.2 / 0.97)
-    assert not is_in_hull(poses, intrinsics, hidden, inside, **settings).all()
-    assert is_in_hull(poses, intrinsics, hidden, inside, valid=valid, **settings).all()
-    assert is_in_hull(poses, intrinsics, hidden, outside, valid=valid, **settings).mean() < 0.02
-    lo, hi = hull_bounds(poses, intrinsics, hidden, valid=valid)
+    assert not is_in_hull(poses, intrinsics, visible_masks, inside, **settings).all()
+    assert is_in_hull(poses, intrinsics, visible_masks, inside, valid=valid, **settings).all()
+    assert (
+        is_in_hull(poses, intrinsics, visible_masks, outside, valid=valid, **settings).mean() < 0.02
+    )
+    lo, hi = hull_bounds(poses, intrinsics, visible_masks, valid=valid)
     exact = hull_bounds(poses, intrinsics, masks)
     np.testing.assert_allclose((lo, hi), exact, atol=0.1)
     grid = fit_grid(exact, 16)
-    sdf = hull_sdf(poses, intrinsics, hidden, grid, valid=valid)
+    sdf = hull_sdf(poses, intrinsics, visible_masks, grid, valid=valid)
     np.testing.assert_allclose(sdf, hull_sdf(poses, intrinsics, masks, grid), atol=1.0)
     # The masks that were given are not changed.
-    np.testing.assert_array_equal(hidden, before)
+    np.testing.assert_array_equal(visible_masks, original_masks)
 
 
 def test_where_all_pixels_count_the_hull_is_the_same(sphere):
     points = np.random.default_rng(3).uniform(-1.2, 1.2, (500, 3))
-    every = hull_distance(*sphere, points, valid=np.ones(sphere[2].shape, bool))
+    actual = hull_distance(*sphere, points, valid=np.ones(sphere[2].shape, bool))
     # This is another program, which may round differently.
-    np.testing.assert_allclose(every, hull_distance(*sphere, points), atol=1e-6)
+    np.testing.assert_allclose(actual, hull_distance(*sphere, points), atol=1e-6)
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
@@ -334,10 +338,10 @@ def test_what_all_cameras_look_at_is_the_middle_of_the_bounds(scale):
     lo, hi = sight_bounds(poses, intrinsics, height=SIZE, width=SIZE)
     np.testing.assert_allclose((lo + hi) / 2, center, atol=1e-9 * scale)
     # The corners of the cube are on the rim of what a camera shows.
-    corner = np.sqrt(3.0) * (hi - lo) / 2
-    np.testing.assert_allclose(corner, scale * DISTANCE * (SIZE / 2) / FOCAL, rtol=1e-9)
-    wide = intrinsics * np.array([[0.05], [0.05], [1.0]])
-    lo, hi = sight_bounds(poses, wide, height=SIZE, width=SIZE)
+    corner_distance = np.sqrt(3.0) * (hi - lo) / 2
+    np.testing.assert_allclose(corner_distance, scale * DISTANCE * (SIZE / 2) / FOCAL, rtol=1e-9)
+    wide_intrinsics = intrinsics * np.array([[0.05], [0.05], [1.0]])
+    lo, hi = sight_bounds(poses, wide_intrinsics, height=SIZE, width=SIZE)
     positions = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
     assert not ((positions > lo) & (positions < hi)).all(1).any()
 
@@ -346,8 +350,8 @@ def test_cameras_that_look_nowhere_in_common_are_refused():
     poses, intrinsics = cameras_around(np.zeros(3))
     with pytest.raises(ValueError, match="parallel"):
         sight_bounds(poses[[0, 0]], intrinsics[:2], height=SIZE, width=SIZE)
-    away = poses.copy()
+    turned_poses = poses.copy()
     turn = np.diag([1.0, -1.0, -1.0, 1.0])
-    away[:25] = turn @ poses[:25]
+    turned_poses[:25] = turn @ poses[:25]
     with pytest.raises(ValueError, match="25 of 40 cameras look away"):
-        sight_bounds(away, intrinsics, height=SIZE, width=SIZE)
+        sight_bounds(turned_poses, intrinsics, height=SIZE, width=SIZE)

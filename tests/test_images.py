@@ -32,9 +32,9 @@ def random_pixels(*shape, seed=0):
 def test_png_returns_what_was_written_within_half_a_step(tmp_path, bits, channels):
     pixels = random_pixels(5, 7, channels)
     write_png(tmp_path / "a.png", pixels, bits=bits)
-    read = read_image(tmp_path / "a.png")
-    assert read.dtype == np.float32
-    np.testing.assert_allclose(read, pixels, atol=0.5001 / (2**bits - 1))
+    image = read_image(tmp_path / "a.png")
+    assert image.dtype == np.float32
+    np.testing.assert_allclose(image, pixels, atol=0.5001 / (2**bits - 1))
 
 
 def test_png_keeps_straight_alpha_even_under_zero_alpha(tmp_path):
@@ -59,8 +59,8 @@ def test_exr_is_exact_and_straight_alpha_returns(tmp_path):
     rgba = random_pixels(4, 3, 4)
     write_exr(tmp_path / "rgba.exr", rgba)
     np.testing.assert_allclose(read_linear(tmp_path / "rgba.exr"), rgba, rtol=1e-6)
-    stored = read_image(tmp_path / "rgba.exr")[..., :3]
-    np.testing.assert_allclose(stored, rgba[..., :3] * rgba[..., 3:], rtol=1e-6)
+    stored_rgb = read_image(tmp_path / "rgba.exr")[..., :3]
+    np.testing.assert_allclose(stored_rgb, rgba[..., :3] * rgba[..., 3:], rtol=1e-6)
 
 
 def test_half_exr_is_within_half_precision(tmp_path):
@@ -72,8 +72,8 @@ def test_half_exr_is_within_half_precision(tmp_path):
 def test_hdr_is_linear_within_its_shared_exponent(tmp_path):
     rgb = 1e4 * random_pixels(4, 16, 3)
     write_hdr(tmp_path / "a.hdr", rgb)
-    read = read_linear(tmp_path / "a.hdr")
-    assert np.all(np.abs(read - rgb) <= RGBE_TOLERANCE * rgb.max(-1, keepdims=True))
+    image = read_linear(tmp_path / "a.hdr")
+    assert np.all(np.abs(image - rgb) <= RGBE_TOLERANCE * rgb.max(-1, keepdims=True))
 
 
 def test_the_transfer_curve_depends_on_the_format_and_can_be_overridden(tmp_path):
@@ -102,9 +102,9 @@ def test_jpeg_is_read_as_srgb_without_alpha(tmp_path):
     from PIL import Image
 
     Image.fromarray(np.full((8, 8, 3), 128, np.uint8)).save(tmp_path / "a.jpg", quality=95)
-    read = read_linear(tmp_path / "a.jpg")
-    assert read.shape == (8, 8, 3)
-    np.testing.assert_allclose(read, 0.2159, atol=0.01)
+    image = read_linear(tmp_path / "a.jpg")
+    assert image.shape == (8, 8, 3)
+    np.testing.assert_allclose(image, 0.2159, atol=0.01)
 
 
 def test_downscale_keeps_the_mean_of_premultiplied_colour():
@@ -143,9 +143,9 @@ def test_downscale_refuses_impossible_factors(factor):
 
 
 def test_a_missing_image_is_named(tmp_path):
-    with pytest.raises(MissingFileError, match=r"nowhere\.png does not exist") as caught:
+    with pytest.raises(MissingFileError, match=r"nowhere\.png does not exist") as error_info:
         read_image(tmp_path / "nowhere.png")
-    assert isinstance(caught.value, FileNotFoundError)
+    assert isinstance(error_info.value, FileNotFoundError)
 
 
 def test_a_folder_is_no_image(tmp_path):
@@ -191,10 +191,10 @@ def test_light_that_is_no_light_is_located(tmp_path, value, message):
 
 
 def test_nothing_wrong_is_written(tmp_path):
-    bad = np.full((2, 2, 3), np.nan, np.float32)
+    bad_pixels = np.full((2, 2, 3), np.nan, np.float32)
     for write, name in ((write_png, "a.png"), (write_exr, "a.exr"), (write_hdr, "a.hdr")):
         with pytest.raises(SceneError, match="not finite"):
-            write(tmp_path / name, bad)
+            write(tmp_path / name, bad_pixels)
     with pytest.raises(SceneError, match="negative"):
         write_hdr(tmp_path / "a.hdr", -np.ones((2, 2, 3), np.float32))
     with pytest.raises(SceneError, match=r"must end in \.png"):
@@ -255,9 +255,9 @@ def test_channels_beside_colour_and_alpha_are_refused(tmp_path, ending):
     assert sink.open(str(path), spec)
     assert sink.write_image(np.full((4, 6, 5), 0.5, np.float32))
     assert sink.close()
-    for read in (read_linear, read_stored):
+    for reader in (read_linear, read_stored):
         with pytest.raises(ImageReadError, match=rf"five\.{ending} has the channels R, G, B, A, "):
-            read(path)
+            reader(path)
 
 
 def test_a_part_of_a_frame_is_refused(tmp_path):
@@ -271,10 +271,10 @@ def write_tiff(path, pixels, numbers, *, associated=False):
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], numbers)
     if not associated:
         spec.attribute("oiio:UnassociatedAlpha", 1)
-    out = oiio.ImageOutput.create(str(path))
-    assert out.open(str(path), spec)
-    assert out.write_image(pixels)
-    out.close()
+    sink = oiio.ImageOutput.create(str(path))
+    assert sink.open(str(path), spec)
+    assert sink.write_image(pixels)
+    sink.close()
 
 
 @pytest.mark.parametrize("numbers", [oiio.HALF, oiio.FLOAT, oiio.DOUBLE])
@@ -295,9 +295,9 @@ def test_integers_of_tiff_are_srgb_of_any_depth(tmp_path, numbers):
 def test_colour_that_a_tiff_stores_multiplied_by_alpha_comes_back_straight(tmp_path, numbers):
     rgba = 0.2 + 0.8 * random_pixels(6, 5, 4)
     rgba[0, 0] = 0.0
-    stored = np.concatenate([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1)
-    write_tiff(tmp_path / "a.tif", stored, numbers, associated=True)
-    read = read_image(tmp_path / "a.tif")
-    np.testing.assert_allclose(read, rgba, atol=2e-2 if numbers == "uint8" else 1e-4)
+    stored_rgba = np.concatenate([rgba[..., :3] * rgba[..., 3:], rgba[..., 3:]], -1)
+    write_tiff(tmp_path / "a.tif", stored_rgba, numbers, associated=True)
+    image = read_image(tmp_path / "a.tif")
+    np.testing.assert_allclose(image, rgba, atol=2e-2 if numbers == "uint8" else 1e-4)
     write_tiff(tmp_path / "b.tif", rgba, numbers)
     np.testing.assert_allclose(read_image(tmp_path / "b.tif"), rgba, atol=2e-3)

@@ -82,9 +82,9 @@ def test_harmonics_have_their_known_values_in_the_usual_order():
         ],
         axis=1,
     )
-    found = harmonics(jnp.asarray(unit(50), jnp.float32))
-    assert found.dtype == jnp.float32
-    np.testing.assert_allclose(found, expected, atol=ROUNDING)
+    actual = harmonics(jnp.asarray(unit(50), jnp.float32))
+    assert actual.dtype == jnp.float32
+    np.testing.assert_allclose(actual, expected, atol=ROUNDING)
 
 
 def test_learned_numbers_are_those_that_a_model_reads():
@@ -98,9 +98,9 @@ def test_learned_numbers_are_those_that_a_model_reads():
     for model in (ConstantIndirect, HarmonicIndirect):
         assert model(jnp.zeros((2, model.outputs))).belongs_to_points
     for model, columns in ((TracedIndirect, 3), (RadiometricIndirect, 27)):
-        by_face = model(jnp.zeros((2, columns)))
-        assert by_face.reads_faces
-        assert not by_face.belongs_to_points
+        face_model = model(jnp.zeros((2, columns)))
+        assert face_model.reads_faces
+        assert not face_model.belongs_to_points
     assert not NO_INDIRECT.belongs_to_points
 
 
@@ -130,12 +130,12 @@ def test_constant_light_has_a_radiance_for_each_lobe_and_no_direction():
 def test_harmonic_light_varies_with_the_direction_colour_by_colour():
     values, directions = values_of(HarmonicIndirect), unit(RAYS, 3)
     basis = np.asarray(harmonics(jnp.asarray(directions, jnp.float32)), float)
-    raw = np.einsum("ncb,nb->nc", values.reshape(RAYS, 3, 9), basis)
+    logits = np.einsum("ncb,nb->nc", values.reshape(RAYS, 3, 9), basis)
     diffuse, specular = arriving(HarmonicIndirect, values, directions)
-    np.testing.assert_allclose(diffuse, 1 / (1 + np.exp(3 - raw)), atol=ROUNDING)
+    np.testing.assert_allclose(diffuse, 1 / (1 + np.exp(3 - logits)), atol=ROUNDING)
     np.testing.assert_array_equal(diffuse, specular)
-    other, _ = arriving(HarmonicIndirect, values)
-    assert np.max(np.abs(np.asarray(diffuse) - np.asarray(other))) > 0.01
+    other_diffuse, _ = arriving(HarmonicIndirect, values)
+    assert np.max(np.abs(np.asarray(diffuse) - np.asarray(other_diffuse))) > 0.01
 
 
 def test_traced_light_is_what_the_face_sends_and_black_where_none_is_known():
@@ -150,14 +150,16 @@ def test_faces_send_what_they_learned_towards_where_the_ray_comes_from():
     """Radiance is evaluated in the direction opposite to the ray; without a face it is black."""
     values, hits, directions = values_of(RadiometricIndirect), np.asarray(HITS), unit(RAYS, 3)
     diffuse, specular = arriving(RadiometricIndirect, values, directions, HITS)
-    own = values[np.maximum(hits, 0)].reshape(RAYS, 3, 9)
-    backwards = np.asarray(harmonics(jnp.asarray(-directions, jnp.float32)), float)
-    expected = np.log1p(np.exp(np.einsum("ncb,nb->nc", own, backwards) - 3))
+    face_values = values[np.maximum(hits, 0)].reshape(RAYS, 3, 9)
+    reverse_basis = np.asarray(harmonics(jnp.asarray(-directions, jnp.float32)), float)
+    expected = np.log1p(np.exp(np.einsum("ncb,nb->nc", face_values, reverse_basis) - 3))
     expected = np.where((hits >= 0)[:, None], expected, 0.0)
     np.testing.assert_allclose(diffuse, expected, atol=ROUNDING)
     np.testing.assert_array_equal(diffuse, specular)
-    forwards = learned_radiance(jnp.asarray(own.reshape(RAYS, 27)), jnp.asarray(directions))
-    assert np.max(np.abs(np.asarray(forwards) - expected)[hits >= 0]) > 0.01
+    forward_radiance = learned_radiance(
+        jnp.asarray(face_values.reshape(RAYS, 27)), jnp.asarray(directions)
+    )
+    assert np.max(np.abs(np.asarray(forward_radiance) - expected)[hits >= 0]) > 0.01
 
 
 def test_faces_without_points_have_learned_nothing_and_are_black():
@@ -197,10 +199,10 @@ def test_the_gradient_is_that_of_the_values_alone(model):
 
         @jax.jit
         def run(values, directions):
-            moves = step * jnp.eye(values.size).reshape(-1, *values.shape)
-            at = jax.vmap(lambda move: total(values + move, directions))
+            offsets = step * jnp.eye(values.size).reshape(-1, *values.shape)
+            totals_at = jax.vmap(lambda offset: total(values + offset, directions))
             gradient = jax.grad(total, argnums=(0, 1))(values, directions)
-            return gradient, (at(moves) - at(-moves)) / (2 * step)
+            return gradient, (totals_at(offsets) - totals_at(-offsets)) / (2 * step)
 
         (in_values, in_directions), expected = run(values, directions)
         np.testing.assert_allclose(in_values.reshape(-1), expected, atol=1e-9, rtol=1e-8)
@@ -219,11 +221,9 @@ def random_materials(count, seed=4):
 def points_on(faces, mask=None):
     """Points on these faces; their positions do not matter."""
     faces = np.asarray(faces)
-    nowhere = jnp.zeros((len(faces), 3))
+    zeros = jnp.zeros((len(faces), 3))
     mask = np.ones(len(faces), bool) if mask is None else mask
-    return SurfacePoints(
-        nowhere, nowhere, nowhere, jnp.asarray(faces, jnp.int32), jnp.asarray(mask)
-    )
+    return SurfacePoints(zeros, zeros, zeros, jnp.asarray(faces, jnp.int32), jnp.asarray(mask))
 
 
 def sent_by(materials, light):
@@ -232,8 +232,8 @@ def sent_by(materials, light):
     F0 is .04 without metal.
     """
     metallic, albedo = np.asarray(materials.metallic)[:, None], np.asarray(materials.albedo)
-    reflected = albedo * (1 - metallic) + 0.04 * (1 - metallic) + albedo * metallic
-    return reflected * np.asarray(light)
+    reflectance = albedo * (1 - metallic) + 0.04 * (1 - metallic) + albedo * metallic
+    return reflectance * np.asarray(light)
 
 
 def random_light(count, seed=5):
@@ -252,14 +252,14 @@ def random_light(count, seed=5):
 )
 def test_a_face_sends_the_mean_of_its_points_in_any_order_and_is_black_without_any(faces):
     materials, light = random_materials(18), random_light(18)
-    found = np.asarray(outgoing(materials, light, points_on(faces), face_count=5))
-    sent = sent_by(materials, light)
+    face_radiance = np.asarray(outgoing(materials, light, points_on(faces), face_count=5))
+    point_radiance = sent_by(materials, light)
     for face in range(5):
-        own = sent[faces == face]
-        if len(own):
-            np.testing.assert_allclose(found[face], own.mean(axis=0), rtol=1e-5)
+        own_radiance = point_radiance[faces == face]
+        if len(own_radiance):
+            np.testing.assert_allclose(face_radiance[face], own_radiance.mean(axis=0), rtol=1e-5)
         else:
-            np.testing.assert_array_equal(found[face], 0.0)
+            np.testing.assert_array_equal(face_radiance[face], 0.0)
     assert np.any(np.bincount(faces[faces >= 0], minlength=5) == 0)
 
 
@@ -268,23 +268,23 @@ def test_masked_points_do_not_count_and_black_ones_do():
     faces = np.random.default_rng(7).permutation(np.repeat([0, 1, 2], 6))
     mask = np.random.default_rng(8).uniform(size=18) < 0.5
     mask[faces == 2] = False
-    found = np.asarray(outgoing(materials, light, points_on(faces, mask), face_count=5))
-    dark = light.at[faces == 0].set(0.0)
-    darker = np.asarray(outgoing(materials, dark, points_on(faces, mask), face_count=5))
-    sent = sent_by(materials, light)
+    face_radiance = np.asarray(outgoing(materials, light, points_on(faces, mask), face_count=5))
+    dim_light = light.at[faces == 0].set(0.0)
+    dim_radiance = np.asarray(outgoing(materials, dim_light, points_on(faces, mask), face_count=5))
+    point_radiance = sent_by(materials, light)
     for face in (0, 1):
-        expected = sent[(faces == face) & mask].mean(axis=0)
-        np.testing.assert_allclose(found[face], expected, rtol=1e-5)
-    np.testing.assert_array_equal(found[2:], 0.0)
-    np.testing.assert_array_equal(darker[0], 0.0)
-    np.testing.assert_array_equal(darker[1:], found[1:])
-    one = np.flatnonzero((faces == 1) & mask)[0]
-    half = np.asarray(
-        outgoing(materials, light.at[one].set(0.0), points_on(faces, mask), face_count=5)
+        expected = point_radiance[(faces == face) & mask].mean(axis=0)
+        np.testing.assert_allclose(face_radiance[face], expected, rtol=1e-5)
+    np.testing.assert_array_equal(face_radiance[2:], 0.0)
+    np.testing.assert_array_equal(dim_radiance[0], 0.0)
+    np.testing.assert_array_equal(dim_radiance[1:], face_radiance[1:])
+    dark_point = np.flatnonzero((faces == 1) & mask)[0]
+    reduced_radiance = np.asarray(
+        outgoing(materials, light.at[dark_point].set(0.0), points_on(faces, mask), face_count=5)
     )
-    own = (faces == 1) & mask & (np.arange(18) != one)
-    expected = sent[own].sum(axis=0) / (own.sum() + 1)
-    np.testing.assert_allclose(half[1], expected, rtol=1e-5)
+    is_lit = (faces == 1) & mask & (np.arange(18) != dark_point)
+    expected = point_radiance[is_lit].sum(axis=0) / (is_lit.sum() + 1)
+    np.testing.assert_allclose(reduced_radiance[1], expected, rtol=1e-5)
 
 
 def test_outgoing_light_is_differentiable_in_material_and_light():

@@ -36,15 +36,15 @@ def four_sides(height=8, width=16):
 
 def test_equal_lights_are_equal_up_to_one_scale_a_channel():
     truth = four_sides()
-    found = light_metrics((truth / GAIN).astype(np.float32), truth)
-    np.testing.assert_allclose(found["light.scale"], GAIN, rtol=1e-5)
-    assert found["light.psnr"] > 120
-    assert found["light.correlation"] == pytest.approx(1.0, abs=1e-6)
-    assert found["light.direction_error_deg"] == pytest.approx(0.0, abs=1e-4)
-    assert found["light.yaw_error_deg"] == 0.0
-    assert found["light.yaw_correlation"] == pytest.approx(1.0, abs=1e-6)
-    assert found["light.mirrored_correlation"] < 0.99
-    assert found["light.is_mirrored"] is False
+    metrics = light_metrics((truth / GAIN).astype(np.float32), truth)
+    np.testing.assert_allclose(metrics["light.scale"], GAIN, rtol=1e-5)
+    assert metrics["light.psnr"] > 120
+    assert metrics["light.correlation"] == pytest.approx(1.0, abs=1e-6)
+    assert metrics["light.direction_error_deg"] == pytest.approx(0.0, abs=1e-4)
+    assert metrics["light.yaw_error_deg"] == 0.0
+    assert metrics["light.yaw_correlation"] == pytest.approx(1.0, abs=1e-6)
+    assert metrics["light.mirrored_correlation"] < 0.99
+    assert metrics["light.is_mirrored"] is False
 
 
 @pytest.mark.parametrize("degrees", [45.0, -90.0, 180.0])
@@ -53,22 +53,24 @@ def test_a_turned_light_shows_the_turn_that_undoes_it(degrees):
     angle = np.deg2rad(degrees)
     cos, sin = np.cos(angle), np.sin(angle)
     rotation = jnp.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], jnp.float32)
-    turned = np.asarray(jax.jit(rotate_light)(EnvLight(jnp.asarray(truth)), rotation).radiance)
-    found = light_metrics(turned, truth)
+    turned_light = np.asarray(
+        jax.jit(rotate_light)(EnvLight(jnp.asarray(truth)), rotation).radiance
+    )
+    metrics = light_metrics(turned_light, truth)
     expected = 180.0 if degrees == 180 else -degrees
-    assert found["light.yaw_error_deg"] == pytest.approx(expected)
-    assert found["light.yaw_correlation"] == pytest.approx(1.0, abs=1e-5)
-    assert found["light.is_mirrored"] is False
-    assert found["light.correlation"] < 0.9
-    assert found["light.direction_error_deg"] > 10
+    assert metrics["light.yaw_error_deg"] == pytest.approx(expected)
+    assert metrics["light.yaw_correlation"] == pytest.approx(1.0, abs=1e-5)
+    assert metrics["light.is_mirrored"] is False
+    assert metrics["light.correlation"] < 0.9
+    assert metrics["light.direction_error_deg"] > 10
 
 
 def test_a_mirrored_light_is_found_at_any_turn():
     truth = four_sides()
     for shift in (0, 3):
-        found = light_metrics(np.roll(truth[:, ::-1], shift, axis=1).copy(), truth)
-        assert found["light.is_mirrored"] is True
-        assert found["light.mirrored_correlation"] == pytest.approx(1.0, abs=1e-5)
+        metrics = light_metrics(np.roll(truth[:, ::-1], shift, axis=1).copy(), truth)
+        assert metrics["light.is_mirrored"] is True
+        assert metrics["light.mirrored_correlation"] == pytest.approx(1.0, abs=1e-5)
 
 
 def test_a_sun_does_not_hide_a_flip():
@@ -76,32 +78,32 @@ def test_a_sun_does_not_hide_a_flip():
     truth = four_sides(16, 32)
     truth[3, 5] = 2000.0
     noise = np.random.default_rng(3).lognormal(0.0, 0.2, truth.shape)
-    noisy = (truth * noise).astype(np.float32)
-    right = light_metrics(noisy, truth)
-    flipped = light_metrics(noisy[:, ::-1].copy(), truth)
-    assert right["light.is_mirrored"] is False
-    assert right["light.yaw_error_deg"] == 0.0
-    assert flipped["light.is_mirrored"] is True
+    noisy_light = (truth * noise).astype(np.float32)
+    metrics = light_metrics(noisy_light, truth)
+    flipped_metrics = light_metrics(noisy_light[:, ::-1].copy(), truth)
+    assert metrics["light.is_mirrored"] is False
+    assert metrics["light.yaw_error_deg"] == 0.0
+    assert flipped_metrics["light.is_mirrored"] is True
 
 
 def test_a_symmetric_light_is_not_called_mirrored():
     half = np.random.default_rng(4).uniform(0.1, 2.0, (8, 8, 3))
     light = np.concatenate([half, half[:, ::-1]], axis=1).astype(np.float32)
-    found = light_metrics(light, light)
-    assert found["light.is_mirrored"] is False
-    assert found["light.mirrored_correlation"] == pytest.approx(1.0, abs=1e-6)
+    metrics = light_metrics(light, light)
+    assert metrics["light.is_mirrored"] is False
+    assert metrics["light.mirrored_correlation"] == pytest.approx(1.0, abs=1e-6)
 
 
 def test_lights_without_direction_are_finite():
     truth = four_sides()
     uniform = np.asarray(init_light(8).radiance)
     for a, b in ((uniform, truth), (truth, uniform), (0 * uniform, truth), (uniform, 0 * uniform)):
-        found = light_metrics(a, b)
-        assert np.all(np.isfinite(list(found.values())[1:]))
-        assert found["light.direction_error_deg"] == 90.0
-        assert found["light.correlation"] == 0.0
-        assert found["light.yaw_error_deg"] == 0.0
-        assert found["light.is_mirrored"] is False
+        metrics = light_metrics(a, b)
+        assert np.all(np.isfinite(list(metrics.values())[1:]))
+        assert metrics["light.direction_error_deg"] == 90.0
+        assert metrics["light.correlation"] == 0.0
+        assert metrics["light.yaw_error_deg"] == 0.0
+        assert metrics["light.is_mirrored"] is False
     assert light_metrics(0 * uniform, truth)["light.scale"] == (1.0, 1.0, 1.0)
 
 
@@ -109,11 +111,13 @@ def test_light_psnr_and_scale_by_hand():
     # The map has one row, so both texels have the same solid angle.
     recovered = np.array([[[1.0] * 3, [2.0] * 3]], np.float32)
     truth = np.array([[[1.0] * 3, [1.0] * 3]], np.float32)
-    found = light_metrics(recovered, truth)
+    metrics = light_metrics(recovered, truth)
     scale = (1 + 2) / (1 + 4)
-    np.testing.assert_allclose(found["light.scale"], scale, rtol=1e-6)
+    np.testing.assert_allclose(metrics["light.scale"], scale, rtol=1e-6)
     errors = [scale / (1 + scale) - 0.5, 2 * scale / (1 + 2 * scale) - 0.5]
-    assert found["light.psnr"] == pytest.approx(decibels(np.mean(np.square(errors))), abs=DECIBELS)
+    assert metrics["light.psnr"] == pytest.approx(
+        decibels(np.mean(np.square(errors))), abs=DECIBELS
+    )
 
 
 def test_direction_error_is_the_angle_between_two_suns():
@@ -124,8 +128,8 @@ def test_direction_error_is_the_angle_between_two_suns():
         light[row, column] = 100.0
         maps.append(light)
     expected = np.rad2deg(np.arccos(directions[4, 5] @ directions[10, 20]))
-    found = light_metrics(maps[0] + np.float32(0.01), maps[1])
-    assert found["light.direction_error_deg"] == pytest.approx(expected, abs=0.1)
+    metrics = light_metrics(maps[0] + np.float32(0.01), maps[1])
+    assert metrics["light.direction_error_deg"] == pytest.approx(expected, abs=0.1)
 
 
 @pytest.mark.parametrize("size", [(4, 8), (3, 5), (8, 16), (11, 7)])
@@ -150,9 +154,9 @@ def test_resizing_by_whole_factors_is_downsampling():
 def test_the_truth_may_have_any_size():
     truth = four_sides(32, 64)
     small = resize_light(truth, 8, 16).astype(np.float32)
-    found = light_metrics(small, truth)
-    assert found["light.psnr"] > 120
-    assert found["light.yaw_error_deg"] == 0.0
+    metrics = light_metrics(small, truth)
+    assert metrics["light.psnr"] > 120
+    assert metrics["light.yaw_error_deg"] == 0.0
 
 
 def test_bad_lights_are_refused():

@@ -58,9 +58,9 @@ def test_the_seam_of_the_map_is_no_border():
     light = EnvLight(jnp.zeros((6, 10, 3)).at[2, 0].set(5.0).at[4, 9].set(2.0))
     density = np.asarray(light_sampler(light).density)
     for columns in (1, 5):
-        turned = EnvLight(jnp.roll(light.radiance, columns, axis=1))
-        found = np.asarray(light_sampler(turned).density)
-        np.testing.assert_allclose(found, np.roll(density, columns, axis=1), rtol=1e-5)
+        turned_light = EnvLight(jnp.roll(light.radiance, columns, axis=1))
+        turned_density = np.asarray(light_sampler(turned_light).density)
+        np.testing.assert_allclose(turned_density, np.roll(density, columns, axis=1), rtol=1e-5)
     # The density is also raised beside a bright texel, equally on both sides of the seam.
     np.testing.assert_allclose(density[2, 9], density[2, 1], rtol=1e-5)
 
@@ -73,8 +73,8 @@ def test_samples_are_unit_and_report_the_density_of_their_direction(name):
     np.testing.assert_allclose(lengths, 1.0, atol=2e-6)
     assert float(jnp.min(density)) > 0
     # By rounding, a sample close to a texel's border may be looked up in the neighbouring texel.
-    same = np.isclose(light_density(sampler, directions), density, rtol=1e-5)
-    assert same.mean() > 0.99
+    is_same = np.isclose(light_density(sampler, directions), density, rtol=1e-5)
+    assert is_same.mean() > 0.99
 
 
 def test_samples_follow_their_density():
@@ -88,17 +88,17 @@ def test_samples_follow_their_density():
     x, y, z = np.asarray(directions, np.float64).T
     column = np.floor((0.5 - np.arctan2(y, x) / (2 * np.pi)) * 2 * width).astype(int) % (2 * width)
     row = np.clip(np.floor(np.arccos(np.clip(z, -1, 1)) / np.pi * 2 * height), 0, 2 * height - 1)
-    found = np.bincount(row.astype(int) * 2 * width + column, minlength=4 * height * width)
+    counts = np.bincount(row.astype(int) * 2 * width + column, minlength=4 * height * width)
     edges = np.cos(np.pi * np.arange(2 * height + 1) / (2 * height))
-    fine = np.broadcast_to(
+    solid_angles = np.broadcast_to(
         (edges[:-1] - edges[1:])[:, None] * np.pi / width, (2 * height, 2 * width)
     )
     density = np.repeat(np.repeat(np.asarray(sampler.density), 2, 0), 2, 1)
-    expected = count * (density * fine).ravel()
-    kept = expected > 5
-    statistic = np.sum((found[kept] - expected[kept]) ** 2 / expected[kept])
-    assert chi2.sf(statistic, kept.sum() - 1) > 1e-3
-    assert found[~kept].sum() < 5 * (~kept).sum() + 50
+    expected = count * (density * solid_angles).ravel()
+    is_frequent = expected > 5
+    statistic = np.sum((counts[is_frequent] - expected[is_frequent]) ** 2 / expected[is_frequent])
+    assert chi2.sf(statistic, is_frequent.sum() - 1) > 1e-3
+    assert counts[~is_frequent].sum() < 5 * (~is_frequent).sum() + 50
 
 
 def test_the_density_is_positive_wherever_light_arrives():
@@ -110,11 +110,11 @@ def test_the_density_is_positive_wherever_light_arrives():
     directions = jnp.asarray(directions, jnp.float32)
     radiance = np.asarray(lookup(light.radiance, directions))[:, 0]
     density = np.asarray(light_density(sampler, directions))
-    lit = radiance > 0
-    assert lit.sum() > 20
+    is_lit = radiance > 0
+    assert is_lit.sum() > 20
     # The weight of a sample is bounded, so that light interpolated between texels makes no
     # fireflies.
-    weight = radiance[lit] / density[lit]
+    weight = radiance[is_lit] / density[is_lit]
     mean = float(jnp.sum(light.radiance[..., 0] * texel_solid_angles(16, 32)))
     assert weight.max() < 4.5 * mean
 
@@ -143,13 +143,13 @@ def test_the_search_finds_the_entry_of_every_number(width):
     tables[:, -1] = 1.0
     numbers = np.concatenate([rng.uniform(0, 1, 50), tables[0, :-1], [0.0]]).astype(np.float32)
     for row in range(3):
-        found, rest = _drawn(
+        entries, fractions = _drawn(
             jnp.asarray(tables), jnp.full(len(numbers), row, jnp.int32), jnp.asarray(numbers)
         )
-        np.testing.assert_array_equal(found, np.searchsorted(tables[row], numbers, side="right"))
-        lower = np.concatenate([[0.0], tables[row]])[np.asarray(found)]
-        share = tables[row][np.asarray(found)] - lower
-        np.testing.assert_allclose(lower + rest * share, numbers, atol=1e-6)
+        np.testing.assert_array_equal(entries, np.searchsorted(tables[row], numbers, side="right"))
+        lower = np.concatenate([[0.0], tables[row]])[np.asarray(entries)]
+        share = tables[row][np.asarray(entries)] - lower
+        np.testing.assert_allclose(lower + fractions * share, numbers, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["random", "sun", "flat"])
@@ -157,7 +157,7 @@ def test_a_sampled_flux_is_that_of_quadrature(name):
     light = LIGHTS[name]
     sampler = light_sampler(light)
     directions, density = sample_light(sampler, grid_uniforms(900))
-    found = jnp.mean(lookup(light.radiance, directions) / density[:, None], axis=0)
+    flux = jnp.mean(lookup(light.radiance, directions) / density[:, None], axis=0)
     # The reference is a midpoint rule on the bilinear map, with a grid far finer than the texels.
     rows, columns = 600, 1200
     polar = (np.arange(rows) + 0.5) / rows * np.pi
@@ -170,7 +170,7 @@ def test_a_sampled_flux_is_that_of_quadrature(name):
     values = np.asarray(lookup(light.radiance, jnp.asarray(points.reshape(-1, 3), jnp.float32)))
     weights = np.broadcast_to(sine * (np.pi / rows) * (2 * np.pi / columns), (rows, columns))
     expected = np.sum(values.astype(np.float64) * weights.reshape(-1, 1), axis=0)
-    np.testing.assert_allclose(found, expected, rtol=2e-3)
+    np.testing.assert_allclose(flux, expected, rtol=2e-3)
 
 
 def test_the_ends_of_the_unit_interval_are_legal():
@@ -214,8 +214,8 @@ def test_points_that_are_spread_evenly_take_noise_away_in_both_directions(axis):
 
     def variance(uniforms):
         directions, density = sample_light(light_sampler(light), uniforms.reshape(-1, 2))
-        seen = jnp.maximum(directions[:, axis], 0.0) / density
-        return float(jnp.var(jnp.mean(seen.reshape(uniforms.shape[:2]), axis=0)))
+        estimates = jnp.maximum(directions[:, axis], 0.0) / density
+        return float(jnp.var(jnp.mean(estimates.reshape(uniforms.shape[:2]), axis=0)))
 
     keys = jax.random.split(jax.random.key(0))
     offsets = jax.random.uniform(keys[0], (4000, 2))

@@ -70,13 +70,13 @@ def steps(monkeypatch):
     """Replace the real step by `Steps`, and skip planning and compilation."""
 
     def install(*needs):
-        told = Steps(*needs)
-        monkeypatch.setattr(loop_module, "train_step", told)
+        recorder = Steps(*needs)
+        monkeypatch.setattr(loop_module, "train_step", recorder)
         monkeypatch.setattr(loop_module, "compile_step", lambda *a, **k: True)
         monkeypatch.setattr(loop_module, "plan_capacities", lambda *a, **k: Capacities(hits=128))
         # Otherwise the next stage would be planned and compiled in the background.
         monkeypatch.setattr(loop_module.Loop, "_following", lambda *a: None)
-        return told
+        return recorder
 
     return install
 
@@ -89,12 +89,12 @@ def same(first, second):
 
 
 def test_a_step_that_overflows_is_repeated_with_the_same_batch(dataset, folder, steps):
-    told = steps(1, 500, 500, 1)
+    recorder = steps(1, 500, 500, 1)
     loop = new_loop(dataset, CONFIG, folder)
     for step in range(3):
         loop.prepare(step)
         loop.advance(step)
-    first, overflowed, repeated, last = told.batches
+    first, overflowed, repeated, last = recorder.batches
     assert same(overflowed, repeated)
     stage, seed = CONFIG.stages[0], CONFIG.run.seed
     for batch, step in ((first, 0), (overflowed, 1), (last, 2)):
@@ -102,8 +102,8 @@ def test_a_step_that_overflows_is_repeated_with_the_same_batch(dataset, folder, 
     assert not same(first, repeated)
     assert not same(repeated, last)
     assert loop.step == 3
-    assert told.pipelines[1].capacities["hits"] == 128
-    assert told.pipelines[2].capacities["hits"] >= 500
+    assert recorder.pipelines[1].capacities["hits"] == 128
+    assert recorder.pipelines[2].capacities["hits"] >= 500
 
 
 def test_programs_of_trainings_before_are_forgotten_before_a_training_compiles(
@@ -123,25 +123,25 @@ def test_programs_of_trainings_before_are_forgotten_before_a_training_compiles(
 
 
 def test_weights_and_rates_count_from_the_start_of_their_stage(dataset, folder, steps):
-    told = steps()
+    recorder = steps()
     loop = new_loop(dataset, CONFIG, folder)
     for step in (0, 3):
         loop.prepare(step)
         loop.advance(step)
-    later = CONFIG.stage("monte_carlo")
-    loop.stage, loop.pipeline = later, build_pipeline(CONFIG, later, loop.surface)
+    next_stage = CONFIG.stage("monte_carlo")
+    loop.stage, loop.pipeline = next_stage, build_pipeline(CONFIG, next_stage, loop.surface)
     for step in (6, 8):
         loop.prepare(step)
         loop.advance(step)
-    stages = [CONFIG.stages[0], CONFIG.stages[0], later, later]
-    for pipeline, rule, stage, since in zip(
-        told.pipelines, told.rules, stages, (0, 3, 0, 2), strict=True
+    stages = [CONFIG.stages[0], CONFIG.stages[0], next_stage, next_stage]
+    for pipeline, rule, stage, stage_step in zip(
+        recorder.pipelines, recorder.rules, stages, (0, 3, 0, 2), strict=True
     ):
         weights = {name: float(value) for name, value in pipeline.weights.items()}
-        assert weights == pytest.approx(stage.weights_at(since))
+        assert weights == pytest.approx(stage.weights_at(stage_step))
         rates = {name: float(value) for name, value in rule.rates.items()}
-        assert rates == pytest.approx(stage.rates_at(since))
-    entropies = [float(pipeline.weights["entropy"]) for pipeline in told.pipelines]
+        assert rates == pytest.approx(stage.rates_at(stage_step))
+    entropies = [float(pipeline.weights["entropy"]) for pipeline in recorder.pipelines]
     assert entropies == pytest.approx([0.2, 0.15, 0.4, 0.2])
 
 
@@ -167,9 +167,9 @@ def test_what_is_known_of_the_next_stage_is_kept_until_it_begins(dataset, folder
     """A run resumed at the end of a stage writes the same records as an uninterrupted run."""
     steps()
     loop = new_loop(dataset, CONFIG, folder)
-    noted = {"stage": "monte_carlo", "capacities": {"hits": 256}}
-    loop.to_come = NextStage(**noted)
-    assert loop.meta()["to_come"] == noted
+    record = {"stage": "monte_carlo", "capacities": {"hits": 256}}
+    loop.to_come = NextStage(**record)
+    assert loop.meta()["to_come"] == record
     loop.stage = CONFIG.stage("monte_carlo")
     assert loop.meta()["to_come"] is None
     assert loop._planned(None) == Capacities(hits=256)
@@ -179,13 +179,13 @@ def test_what_is_known_of_the_next_stage_is_kept_until_it_begins(dataset, folder
 def test_what_fails_for_the_next_stage_spares_the_checkpoints_of_this_one(dataset, folder, steps):
     steps()
     loop = new_loop(dataset, CONFIG, folder)
-    later = CONFIG.stage("monte_carlo")
+    next_stage = CONFIG.stage("monte_carlo")
 
     def out_of_memory():
         raise MemoryError("no room")
 
     upcoming = object.__new__(Upcoming)
-    upcoming.stage, upcoming._planned = later, in_background(out_of_memory)
+    upcoming.stage, upcoming._planned = next_stage, in_background(out_of_memory)
     loop.upcoming = upcoming
     assert loop.save().exists()
     upcoming._planned = in_background(lambda: Capacities(hits=256))
@@ -200,14 +200,14 @@ def test_a_run_goes_on_from_the_end_of_a_stage_where_that_is_newer(dataset, fold
         loop.prepare(step)
         loop.advance(step)
         if step == 2:
-            saved = loop.save()
+            path = loop.save()
     loop.save_end()
     resumed = resumed_loop(dataset, CONFIG, folder)
-    assert (resumed.step, resumed.stage, resumed.last_checkpoint) == (6, CONFIG.stages[0], saved)
+    assert (resumed.step, resumed.stage, resumed.last_checkpoint) == (6, CONFIG.stages[0], path)
     # The end of a stage is not used if the stage has another number of steps now.
-    longer = replace(CONFIG, stages=(replace(CONFIG.stages[0], steps=9), *CONFIG.stages[1:]))
-    folder.amend(longer)
-    assert resumed_loop(dataset, longer, folder).step == 3
+    longer_config = replace(CONFIG, stages=(replace(CONFIG.stages[0], steps=9), *CONFIG.stages[1:]))
+    folder.amend(longer_config)
+    assert resumed_loop(dataset, longer_config, folder).step == 3
 
 
 def test_what_a_stage_continues_gets_buffers_for_what_was_needed_of_late(dataset, folder, steps):
@@ -219,16 +219,16 @@ def test_what_a_stage_continues_gets_buffers_for_what_was_needed_of_late(dataset
     loop = new_loop(dataset, CONFIG, folder)
     sizes = {"hits": 4096, "quads": 4096, "visible": 128}
     pipeline = replace(loop.pipeline, capacities=Capacities(**sizes))
-    needed = {"hits": 1000, "quads": 1000, "visible": 127}
+    needs = {"hits": 1000, "quads": 1000, "visible": 127}
     stage, refine = CONFIG.stage("monte_carlo"), make_config("default", "draft").stage("refine")
-    found = continued(pipeline, needed, pipeline, stage)
-    assert 1100 <= found["hits"] == found["quads"] <= 1280
-    assert found["visible"] == 128
-    found = continued(pipeline, needed, pipeline, refine)
-    assert found["hits"] <= 1280
-    assert found["quads"] == 4096
-    others = replace(pipeline, splats=VertexSplats())
-    assert continued(pipeline, needed, others, stage) is None
+    capacities = continued(pipeline, needs, pipeline, stage)
+    assert 1100 <= capacities["hits"] == capacities["quads"] <= 1280
+    assert capacities["visible"] == 128
+    capacities = continued(pipeline, needs, pipeline, refine)
+    assert capacities["hits"] <= 1280
+    assert capacities["quads"] == 4096
+    vertex_pipeline = replace(pipeline, splats=VertexSplats())
+    assert continued(pipeline, needs, vertex_pipeline, stage) is None
 
 
 def test_what_was_needed_before_buffers_are_looked_at_is_not_forgotten(

@@ -67,16 +67,16 @@ def test_the_background_shows_only_where_coverage_differs():
     rgb = alpha[..., None] * jnp.full((1, 16, 16, 3), 0.3)
     image = jnp.concatenate([jnp.full((1, 16, 16, 3), 0.3), alpha[..., None]], axis=-1)
     for seed in (0, 1):
-        behind = uniform(seed, *rgb.shape)
-        images = compare(rgb, alpha, image, behind, None, srgb=False)
+        background = uniform(seed, *rgb.shape)
+        images = compare(rgb, alpha, image, background, None, srgb=False)
         assert float(image_l1(images)) == pytest.approx(0.0, abs=1e-7)
-        np.testing.assert_array_equal(images.predicted[0, 0, 0], behind[0, 0, 0])
+        np.testing.assert_array_equal(images.predicted[0, 0, 0], background[0, 0, 0])
 
 
 @pytest.mark.parametrize(("kind", "colours"), [("pixel", 512), ("view", 2), ("black", 1)])
 def test_backgrounds_differ_by_pixel_by_view_or_not_at_all(kind, colours):
-    behind = random_background(jax.random.key(0), (*SHAPE, 3), jnp.float32, kind)
-    assert len(np.unique(np.asarray(behind).reshape(-1, 3), axis=0)) == colours
+    background = random_background(jax.random.key(0), (*SHAPE, 3), jnp.float32, kind)
+    assert len(np.unique(np.asarray(background).reshape(-1, 3), axis=0)) == colours
 
 
 def test_encoded_images_are_compared_as_they_are_seen():
@@ -104,23 +104,23 @@ def test_colours_are_compared_linear_unless_the_objective_says_so():
     camera = Camera(jnp.eye(4)[None], jnp.eye(3)[None], 4, 4)
     view = Batch(camera, image, jax.random.key(0))
     output = RenderOutput(rgb, jnp.ones((1, 4, 4)), {}, {})
-    for objective, seen in (
+    for objective, transfer in (
         (Objective(), lambda colours: colours),
         (Objective(srgb=True), linear_to_srgb),
     ):
-        found = ViewInputs(view, output, rgb, jnp.zeros(()), objective, view.key).pair
-        np.testing.assert_allclose(found.predicted, seen(rgb), rtol=ROUNDING)
-        np.testing.assert_allclose(found.target, seen(image[..., :3]), rtol=ROUNDING)
+        pair = ViewInputs(view, output, rgb, jnp.zeros(()), objective, view.key).pair
+        np.testing.assert_allclose(pair.predicted, transfer(rgb), rtol=ROUNDING)
+        np.testing.assert_allclose(pair.target, transfer(image[..., :3]), rtol=ROUNDING)
 
 
 def test_pixels_that_do_not_count_change_no_term():
     """Pixels that are not valid may have any value, in the render or in the photograph."""
     valid = jnp.ones(SHAPE).at[:, :5].set(0.0)
-    spoiled = valid[..., None] == 0
+    is_spoiled = valid[..., None] == 0
 
     def terms(noise):
         images = comparison(valid)
-        return terms_of(replace_images(images, jnp.where(spoiled, noise, images.predicted)))
+        return terms_of(replace_images(images, jnp.where(is_spoiled, noise, images.predicted)))
 
     np.testing.assert_allclose(terms(0.0), terms(7.0), rtol=ROUNDING)
 
@@ -132,20 +132,20 @@ def replace_images(images: ImagePair, predicted):
 
 
 def test_where_all_pixels_count_a_mask_of_them_changes_nothing():
-    every, none = terms_of(comparison(jnp.ones(SHAPE))), terms_of(comparison(None))
-    np.testing.assert_allclose(every, none, rtol=ROUNDING)
+    masked, unmasked = terms_of(comparison(jnp.ones(SHAPE))), terms_of(comparison(None))
+    np.testing.assert_allclose(masked, unmasked, rtol=ROUNDING)
 
 
 def test_similarity_of_a_part_is_that_of_an_image_which_ends_there():
     a, b = (uniform(seed, 1, 40, 30, 3) for seed in (1, 2))
     valid = jnp.zeros((1, 40, 30)).at[:, 3:27, 5:28].set(1.0)
     zeros = jnp.zeros((1, 40, 30))
-    found, cropped = (
+    masked, cropped = (
         image_dissimilarity(ImagePair(x, y, zeros, zeros, v, jnp.zeros(())))
         for x, y, v in ((a, b, valid), (a[:, 3:27, 5:28], b[:, 3:27, 5:28], None))
     )
-    assert float(found) == pytest.approx(float(cropped), rel=1e-4)
-    assert float(found) > 0.5
+    assert float(masked) == pytest.approx(float(cropped), rel=1e-4)
+    assert float(masked) > 0.5
 
 
 def test_the_mean_is_over_the_pixels_that_count():
@@ -162,17 +162,17 @@ def one_pixel(colour, mask=1.0):
 
 def test_eq_18_compares_mean_light_with_the_largest_channel():
     diffuse, specular = jnp.full((1, 2, 2, 3), 0.1), jnp.full((1, 2, 2, 3), 0.2)
-    found = light_agreement(diffuse, specular, jnp.zeros(()), one_pixel((0.2, 0.6, 0.4)))
-    assert float(found) == pytest.approx(0.3 / 4, rel=1e-5)
+    agreement = light_agreement(diffuse, specular, jnp.zeros(()), one_pixel((0.2, 0.6, 0.4)))
+    assert float(agreement) == pytest.approx(0.3 / 4, rel=1e-5)
 
 
 def test_eq_18_looks_at_exposed_and_tone_mapped_light():
     """Twice the exposure is twice the light, until the tone map clips it."""
-    diffuse, nothing = jnp.full((1, 2, 2, 3), 0.2), jnp.zeros((1, 2, 2, 3))
+    diffuse, black = jnp.full((1, 2, 2, 3), 0.2), jnp.zeros((1, 2, 2, 3))
     image = one_pixel((0.4, 0.4, 0.4))
-    exposed = light_agreement(diffuse, nothing, jnp.log(2.0), image)
+    exposed = light_agreement(diffuse, black, jnp.log(2.0), image)
     assert float(exposed) == pytest.approx(0.0, abs=1e-5)
-    blinding = light_agreement(50 * diffuse, nothing, jnp.zeros(()), one_pixel((1.0, 1.0, 1.0)))
+    blinding = light_agreement(50 * diffuse, black, jnp.zeros(()), one_pixel((1.0, 1.0, 1.0)))
     clipped = tone_map(jnp.full((1, 3), 10.0), jnp.zeros(()))[0, 0]
     assert float(blinding) == pytest.approx(abs(float(clipped) - 1) / 4, abs=1e-6)
 

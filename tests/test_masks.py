@@ -84,15 +84,15 @@ def test_a_thick_wall_that_no_axis_follows_is_cut_off():
     behind = rng.uniform(-1.4, 1.4, (300, 3)) * [1.0, 1.0, 0.1] - [0.0, 0.0, 0.8]
     ball = on_ball(1500, radius=0.5)
     cloud = cloud_of(*(part @ turn.T for part in (ball, wall, behind)))
-    across = np.stack(np.meshgrid(np.linspace(-1, 1, 4), np.linspace(-1, 1, 4)), -1).reshape(-1, 2)
-    eyes = 4.0 * np.c_[0.6 * across, np.ones(16)] @ turn.T
+    grid = np.stack(np.meshgrid(np.linspace(-1, 1, 4), np.linspace(-1, 1, 4)), -1).reshape(-1, 2)
+    eyes = 4.0 * np.c_[0.6 * grid, np.ones(16)] @ turn.T
     proposal = propose_box(cloud, views_from(eyes, size=40, field_of_view=0.7))
     plane = proposal.plane
     assert plane is not None
     assert plane.normal @ turn[:, 2] > 0.999
-    above = plane.is_above(cloud.positions)
-    assert above[1500:].mean() < 0.1
-    assert above[:1500].mean() > 0.9
+    is_above = plane.is_above(cloud.positions)
+    assert is_above[1500:].mean() < 0.1
+    assert is_above[:1500].mean() > 0.9
     assert np.abs(proposal.lo).max() < 0.75
     assert np.abs(proposal.hi).max() < 0.75
 
@@ -110,8 +110,8 @@ def test_what_some_photographs_cut_off_belongs_to_the_object_where_it_is_connect
         on_ball(900, radius=0.12) * [1.0, 1.0, 0.0]
         + [0.0, 0.0, 1.0] * np.linspace(0.3, 1.25, 900)[:, None]
     )
-    apart = on_ball(900, (0.0, 1.1, 1.0), radius=0.15)
-    cloud = cloud_of(on_ball(1500, radius=0.5), rod, apart)
+    other_ball = on_ball(900, (0.0, 1.1, 1.0), radius=0.15)
+    cloud = cloud_of(on_ball(1500, radius=0.5), rod, other_ball)
     eyes = [[np.cos(a) * d, np.sin(a) * d, 0.2] for a in np.arange(0, 6, 0.5) for d in (2.2, 4.5)]
     views = views_from(np.array(eyes), size=40, field_of_view=0.8)
     share = np.mean([_tip_is_seen(views, index, [0.0, 0.0, 1.25]) for index in range(len(views))])
@@ -140,18 +140,18 @@ def test_faint_and_large_splats_do_not_make_a_box():
     fog = np.random.default_rng(3).uniform(-1.4, 1.4, (2000, 3))
     sizes = np.r_[np.full(500, 0.02), np.full(2000, 5.0), np.full(2000, 0.02)]
     positions = np.concatenate([ball, on_ball(2000, radius=1.2), fog])
-    for faint in (0.05, 0.12):
-        opacities = np.r_[np.full(2500, 0.9), np.full(2000, faint)]
+    for fog_opacity in (0.05, 0.12):
+        opacities = np.r_[np.full(2500, 0.9), np.full(2000, fog_opacity)]
         proposal = propose_box(Cloud(positions, opacities, sizes), ring())
         assert np.abs([proposal.lo, proposal.hi]).max() < 0.6
 
 
 def test_where_nothing_is_in_sight_there_is_no_box():
-    alone = ring(1)
+    single_view = ring(1)
     with pytest.raises(CaptureError, match="no opaque splat where the cameras look.*--box"):
         propose_box(cloud_of(on_ball(100, radius=40.0)), ring())
     with pytest.raises(CaptureError, match="what the cameras look at.*--box"):
-        propose_box(cloud_of(on_ball(100)), alone)
+        propose_box(cloud_of(on_ball(100)), single_view)
 
 
 def test_corners_of_a_box_belong_to_it():
@@ -161,18 +161,20 @@ def test_corners_of_a_box_belong_to_it():
 
 def a_ball_before_a_wall(opacity=0.999):
     """Splats of the ball of `test_captures`, and of a far larger ball around everything."""
-    count, beyond = 1200, 600
-    positions = np.concatenate([on_ball(count, CENTER, RADIUS - 0.11), on_ball(beyond, CENTER, 9)])
-    sizes = np.repeat([0.05, 0.7], [count, beyond])[:, None] * np.ones(3)
-    logits = np.full(count + beyond, np.log(opacity / (1 - opacity)))
+    count, outer_count = 1200, 600
+    positions = np.concatenate(
+        [on_ball(count, CENTER, RADIUS - 0.11), on_ball(outer_count, CENTER, 9)]
+    )
+    sizes = np.repeat([0.05, 0.7], [count, outer_count])[:, None] * np.ones(3)
+    logits = np.full(count + outer_count, np.log(opacity / (1 - opacity)))
     return Radiance(
         RadianceSplats(
             means=jnp.asarray(positions, jnp.float32),
             log_scales=jnp.asarray(np.log(sizes), jnp.float32),
-            quats=jnp.ones((count + beyond, 4), jnp.float32),
+            quats=jnp.ones((count + outer_count, 4), jnp.float32),
             opacity_logits=jnp.asarray(logits, jnp.float32),
-            base=jnp.zeros((count + beyond, 3), jnp.float32),
-            rest=jnp.zeros((count + beyond, 15, 3), jnp.float32),
+            base=jnp.zeros((count + outer_count, 3), jnp.float32),
+            rest=jnp.zeros((count + outer_count, 15, 3), jnp.float32),
         ),
         near=0.1,
         degree=0,
@@ -206,16 +208,16 @@ def test_masks_are_those_of_the_object_and_are_read_by_training(capture):
     root, run = capture
     report = make_masks(read(root), SETTINGS, run, box=BOX)
     dataset = load_dataset(root)
-    found = {
+    masks_by_name = {
         name: mask
         for views in (dataset.train, dataset.test)
         for name, mask in zip(views.names, views.masks, strict=True)
     }
     assert dataset.train.has_masks
-    assert len(found) == COUNT == report.masks
+    assert len(masks_by_name) == COUNT == report.masks
     overlaps = []
     for name, truth in truths().items():
-        mask = found[name][: truth.shape[0], : truth.shape[1]]
+        mask = masks_by_name[name][: truth.shape[0], : truth.shape[1]]
         overlaps.append((mask & truth).sum() / (mask | truth).sum())
         assert read_image(root / "masks" / f"{name}.png").shape[:2] == truth.shape
     # The ball is seventeen pixels wide, so its rim is a fifth of its area.
@@ -254,23 +256,23 @@ def test_masks_that_are_there_are_replaced_only_where_that_is_said(capture, monk
         make_masks(read(root), SETTINGS, run, box=BOX)
     make_masks(read(root), SETTINGS, run, box=BOX, force=True)
     assert read_image(root / "masks" / "view_04.png").mean() == 1.0
-    smaller = (CENTER - 1, CENTER + np.array([1.0, 1.0, 0.0]))
-    make_masks(read(root), SETTINGS, run, box=smaller, resume=True)
+    smaller_box = (CENTER - 1, CENTER + np.array([1.0, 1.0, 0.0]))
+    make_masks(read(root), SETTINGS, run, box=smaller_box, resume=True)
     assert 0.2 < read_image(root / "masks" / "view_04.png").mean() < 0.8
 
 
 def test_a_command_that_was_stopped_while_it_wrote_masks_goes_on(capture, monkeypatch):
     root, run = capture
-    write, written = masks_module.write_png, []
+    write, written_paths = masks_module.write_png, []
 
     def stopped(path, pixels):
-        if len(written) == 2:
+        if len(written_paths) == 2:
             raise KeyboardInterrupt
-        written.append(path)
+        written_paths.append(path)
         write(path, pixels)
 
-    with monkeypatch.context() as interrupted:
-        interrupted.setattr(masks_module, "write_png", stopped)
+    with monkeypatch.context() as patch:
+        patch.setattr(masks_module, "write_png", stopped)
         with pytest.raises(KeyboardInterrupt):
             make_masks(read(root), SETTINGS, run, box=BOX)
     assert len(list((root / "masks").iterdir())) == 2
@@ -287,8 +289,8 @@ def test_boxes_and_masks_that_leave_nothing_are_refused(capture, monkeypatch):
         make_masks(read(root), SETTINGS, run, box=(CENTER + 2, CENTER + 3))
     with pytest.raises(CaptureError, match="must be lo .* below hi"):
         make_masks(read(root), SETTINGS, run, box=(CENTER, CENTER))
-    faint = (np.zeros((COUNT, 28, 24, 3), np.float32), np.full((COUNT, 28, 24), 0.7, np.float32))
-    monkeypatch.setattr(masks_module, "render_views", lambda *a: faint)
+    render = (np.zeros((COUNT, 28, 24, 3), np.float32), np.full((COUNT, 28, 24), 0.7, np.float32))
+    monkeypatch.setattr(masks_module, "render_views", lambda *a: render)
     with pytest.raises(CaptureError, match="masks would leave nothing"):
         make_masks(read(root), SETTINGS, run, box=BOX)
     assert not (root / "masks").exists()
@@ -299,10 +301,10 @@ def test_scenes_whose_masks_would_not_be_read_are_refused(tmp_path):
     write_transforms(root)
     with pytest.raises(CaptureError, match="remove mask_path from transforms.json"):
         make_masks(read(root), SETTINGS, tmp_path / "run", force=True)
-    cut = tmp_path / "cut"
-    write_transforms(cut, masks=None, rgba=True)
+    cut_root = tmp_path / "cut"
+    write_transforms(cut_root, masks=None, rgba=True)
     with pytest.raises(CaptureError, match="cut out already"):
-        make_masks(read(cut), SETTINGS, tmp_path / "run")
+        make_masks(read(cut_root), SETTINGS, tmp_path / "run")
 
 
 def test_too_few_photographs_are_refused(capture):
@@ -341,12 +343,12 @@ def test_large_photographs_are_reduced(tmp_path):
 def test_the_command_prints_how_sure_it_is(capture, capsys):
     root, run = capture
     box = [str(x) for x in np.concatenate(BOX)]
-    asked = ["masks", str(root), "--output", str(run), "--steps", "1"]
-    assert cli.main([*asked, "--box", *box]) == 0
-    printed = capsys.readouterr().out
+    command = ["masks", str(root), "--output", str(run), "--steps", "1"]
+    assert cli.main([*command, "--box", *box]) == 0
+    output = capsys.readouterr().out
     for part in ("dB on views that are held back", "agreement:", "half-opaque", "masks.png"):
-        assert part in printed
-    assert cli.main(asked) == 2
+        assert part in output
+    assert cli.main(command) == 2
     assert "have a mask already" in capsys.readouterr().err
 
 
@@ -370,13 +372,13 @@ def test_specks_go_and_half_opaque_holes_are_filled():
     alpha[0, 1:3, 1:3] = 0.95  # a speck: 4 pixels of about 850
     alpha[1, 1:4, 36:39] = 0.95
     alpha[1, 5:35, 5:35] = 0.0  # only nine pixels are left, so they are no speck
-    before = alpha.copy()
-    found = masks_module.tidied(alpha)
-    np.testing.assert_array_equal(alpha, before)
-    expected = before.copy()
+    original = alpha.copy()
+    actual = masks_module.tidied(alpha)
+    np.testing.assert_array_equal(alpha, original)
+    expected = original.copy()
     expected[0, 10:14, 10:14] = 1.0
     expected[0, 1:3, 1:3] = 0.0
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(actual, expected)
     assert masks_module.tidied(np.zeros((1, 3, 3), np.float32)).max() == 0.0
 
 
@@ -386,15 +388,15 @@ def test_half_opaque_pixels_and_cut_masks_raise_warnings():
     alpha[:, :, 18:22] = 0.9
     alpha[:, 5:35, 12:18] = 0.5
     alpha[5] = 0.0
-    sure = masks_module.certainty(views, alpha, (np.full(3, -1.5), np.full(3, 1.5)))
+    certainty = masks_module.certainty(views, alpha, (np.full(3, -1.5), np.full(3, 1.5)))
     # Of the six half opaque columns, the one next to the mask is not counted.
-    assert sure.unsure == pytest.approx(30 * 5 / (40 * 4))
+    assert certainty.unsure == pytest.approx(30 * 5 / (40 * 4))
     # The rim of the mask has 2 x 40 and 2 x 2 pixels, of which eight lie on the border of the
     # image.
-    assert sure.cut == pytest.approx(8 / 84)
-    assert sure.empty == (views.names[5],)
-    assert sure.coverage == pytest.approx(5 / 6 * 0.1)
-    text = " ".join(sure.warnings())
+    assert certainty.cut == pytest.approx(8 / 84)
+    assert certainty.empty == (views.names[5],)
+    assert certainty.coverage == pytest.approx(5 / 6 * 0.1)
+    text = " ".join(certainty.warnings())
     for part in ("half opaque", "border of the image", "1 masks are empty"):
         assert part in text
     assert OPAQUE == 0.8

@@ -97,13 +97,13 @@ def test_parameters_are_those_of_the_model_alone():
 def test_attributes_vary_where_the_model_lets_them(settings, roughness_varies, metallic_varies):
     spec = spec_of(**settings, has_shift=False)
     points = jnp.asarray(np.random.default_rng(1).uniform(-1, 1, (20, 3)), jnp.float32)
-    found = jax.jit(partial(attributes_at, spec=spec))(lively(spec), points, BOX).materials
-    assert (float(jnp.ptp(found.roughness)) > 1e-3) == roughness_varies
-    assert (float(jnp.ptp(found.metallic)) > 1e-3) == metallic_varies
-    assert found.has_specular == (spec.specular != "none")
+    materials = jax.jit(partial(attributes_at, spec=spec))(lively(spec), points, BOX).materials
+    assert (float(jnp.ptp(materials.roughness)) > 1e-3) == roughness_varies
+    assert (float(jnp.ptp(materials.metallic)) > 1e-3) == metallic_varies
+    assert materials.has_specular == (spec.specular != "none")
     if spec.specular == "none":
-        np.testing.assert_array_equal(found.roughness, 1.0)
-        np.testing.assert_array_equal(found.metallic, 0.0)
+        np.testing.assert_array_equal(materials.roughness, 1.0)
+        np.testing.assert_array_equal(materials.metallic, 0.0)
 
 
 def test_one_roughness_starts_at_its_guess_and_learns():
@@ -111,8 +111,8 @@ def test_one_roughness_starts_at_its_guess_and_learns():
     field, points = lively(spec), jnp.zeros((1, 3))
 
     def roughness(logit):
-        moved = replace(field, roughness_logit=logit)
-        return attributes_at(moved, points, BOX, spec=spec).materials.roughness[0]
+        moved_field = replace(field, roughness_logit=logit)
+        return attributes_at(moved_field, points, BOX, spec=spec).materials.roughness[0]
 
     value, slope = jax.jit(jax.value_and_grad(roughness))(jnp.zeros(()))
     share = 1 / (1 + math.e)
@@ -140,16 +140,18 @@ def test_the_split_sum_of_a_lambertian_is_its_diffuse_part(scene):
     points, materials, light = scene
     operators, table = prefilter_operators(LIGHT), fg_table(cosines=5, roughnesses=5)
     wo = points.normals
-    whole = prefilter(light, operators)
+    prefiltered = prefilter(light, operators)
     level = prefilter(light, operators, diffuse_only=True)
     assert level.specular.shape[0] == 1
-    np.testing.assert_allclose(level.diffuse, whole.diffuse, rtol=ROUNDING)
-    both = split_sum(replace(materials, has_specular=True), points.normals, wo, whole, table)
-    alone = split_sum(materials, points.normals, wo, level, table)
-    np.testing.assert_allclose(alone.diffuse, both.diffuse, rtol=ROUNDING)
-    np.testing.assert_allclose(alone.rgb, alone.diffuse)
-    np.testing.assert_array_equal(alone.specular, 0.0)
-    assert float(jnp.min(both.specular)) > 0
+    np.testing.assert_allclose(level.diffuse, prefiltered.diffuse, rtol=ROUNDING)
+    glossy = split_sum(
+        replace(materials, has_specular=True), points.normals, wo, prefiltered, table
+    )
+    lambertian = split_sum(materials, points.normals, wo, level, table)
+    np.testing.assert_allclose(lambertian.diffuse, glossy.diffuse, rtol=ROUNDING)
+    np.testing.assert_allclose(lambertian.rgb, lambertian.diffuse)
+    np.testing.assert_array_equal(lambertian.specular, 0.0)
+    assert float(jnp.min(glossy.specular)) > 0
     baked = split_sum(materials, points.normals, wo, level, table, baked_diffuse=True)
     np.testing.assert_array_equal(baked.rgb, materials.albedo)
 
@@ -165,26 +167,26 @@ def test_monte_carlo_draws_nothing_for_a_lobe_that_is_not_there(scene):
         shaded = reflect(key, points, materials, wo, gathered, light, sampler, None, counts=counts)
         return shaded, gathered
 
-    both = replace(materials, has_specular=True)
-    (found, gathered), (expected, _) = jax.jit(lambda: (shade(materials), shade(both)))()
+    glossy = replace(materials, has_specular=True)
+    (actual, gathered), (expected, _) = jax.jit(lambda: (shade(materials), shade(glossy)))()
     assert gathered.radiance.shape == (COUNT, 0, 3)
-    np.testing.assert_allclose(found.diffuse, expected.diffuse, rtol=ROUNDING)
-    np.testing.assert_array_equal(found.rgb, found.diffuse)
-    np.testing.assert_array_equal(found.specular_light, 0.0)
+    np.testing.assert_allclose(actual.diffuse, expected.diffuse, rtol=ROUNDING)
+    np.testing.assert_array_equal(actual.rgb, actual.diffuse)
+    np.testing.assert_array_equal(actual.specular_light, 0.0)
     assert float(jnp.min(expected.specular)) > 0
     # Random numbers come from two keys: one for light and cosine samples, one for lobe samples.
-    counted = [len(operations("random_bits", lambda m=m: shade(m))) for m in (both, materials)]
-    assert counted == [2, 1]
+    draws = [len(operations("random_bits", lambda m=m: shade(m))) for m in (glossy, materials)]
+    assert draws == [2, 1]
 
 
 def test_what_rays_find_of_a_lambertian_is_lambertian(scene):
     points, materials, _ = scene
     assert not face_table(points, materials, 3).materials.has_specular
     white = jnp.ones((COUNT, 3))
-    sent = outgoing(materials, white, points, 3)
-    assert float(sent[0, 0]) == pytest.approx(float(materials.albedo[:2, 0].mean()), rel=1e-5)
-    shiny = outgoing(replace(materials, has_specular=True), white, points, 3)
-    np.testing.assert_allclose(shiny - sent, bsdf.DIELECTRIC_F0, atol=ROUNDING)
+    radiance = outgoing(materials, white, points, 3)
+    assert float(radiance[0, 0]) == pytest.approx(float(materials.albedo[:2, 0].mean()), rel=1e-5)
+    glossy_radiance = outgoing(replace(materials, has_specular=True), white, points, 3)
+    np.testing.assert_allclose(glossy_radiance - radiance, bsdf.DIELECTRIC_F0, atol=ROUNDING)
 
 
 def test_the_mesh_of_a_lambertian_run_is_rough_and_no_metal(tmp_path):
@@ -198,7 +200,7 @@ def test_the_mesh_of_a_lambertian_run_is_rough_and_no_metal(tmp_path):
     arrays = (np.asarray(x, np.float32) for x in (mesh.vertices, mesh.vertex_normals))
     vertices, normals = arrays
     export_mesh_glb(path, vertices, np.asarray(mesh.faces), normals, sampler, texture_size=32)
-    (written,) = trimesh.load(path).geometry.values()
-    packed = np.asarray(written.visual.material.metallicRoughnessTexture)
+    (loaded_mesh,) = trimesh.load(path).geometry.values()
+    packed = np.asarray(loaded_mesh.visual.material.metallicRoughnessTexture)
     np.testing.assert_array_equal(packed[..., 1], 255)
     np.testing.assert_array_equal(packed[..., 2], 0)

@@ -48,19 +48,19 @@ def points_in_the_box(count=60, seed=1):
 def test_attributes_lie_in_their_ranges(shared):
     spec = spec_of(shared=shared, bias=True)
     field = jax.tree.map(lambda leaf: 30 * leaf, lively(spec))
-    found = attributes_at(field, 3 * points_in_the_box(), BOX, spec=spec)
-    both = found.materials
+    attributes = attributes_at(field, 3 * points_in_the_box(), BOX, spec=spec)
+    material = attributes.materials
     for values, low in (
-        (both.albedo, 0.0),
-        (both.roughness, 0.1),
-        (both.metallic, 0.0),
-        (found.shift, 0.0),
+        (material.albedo, 0.0),
+        (material.roughness, 0.1),
+        (material.metallic, 0.0),
+        (attributes.shift, 0.0),
     ):
         assert float(jnp.min(values)) >= low - 1e-7
         assert float(jnp.max(values)) <= 1.0 + 1e-7
         assert values.dtype == jnp.float32
-    assert float(jnp.max(both.roughness)) - float(jnp.min(both.roughness)) > 0.5
-    assert found.indirect is None
+    assert float(jnp.max(material.roughness)) - float(jnp.min(material.roughness)) > 0.5
+    assert attributes.indirect is None
 
 
 def test_a_new_field_starts_at_its_initial_guess():
@@ -69,13 +69,13 @@ def test_a_new_field_starts_at_its_initial_guess():
     for kind in ("diffuse", "specular"):
         roughness, metallic = MATERIAL_PRIORS[kind]
         spec = spec_of(initial_roughness_logit=roughness, initial_metallic_logit=metallic)
-        found = attributes_at(field, points, BOX, spec=spec)
-        start = found.materials
-        np.testing.assert_allclose(start.albedo, 0.5, atol=RAW_TABLES)
+        attributes = attributes_at(field, points, BOX, spec=spec)
+        material = attributes.materials
+        np.testing.assert_allclose(material.albedo, 0.5, atol=RAW_TABLES)
         expected = 0.9 / (1 + np.exp(-roughness)) + 0.1
-        np.testing.assert_allclose(start.roughness, expected, atol=RAW_TABLES)
-        np.testing.assert_allclose(start.metallic, 1 / (1 + np.exp(-metallic)), atol=RAW_TABLES)
-        np.testing.assert_allclose(found.shift, 0.5, atol=RAW_TABLES)
+        np.testing.assert_allclose(material.roughness, expected, atol=RAW_TABLES)
+        np.testing.assert_allclose(material.metallic, 1 / (1 + np.exp(-metallic)), atol=RAW_TABLES)
+        np.testing.assert_allclose(attributes.shift, 0.5, atol=RAW_TABLES)
     shallow = attributes_at(field, points, BOX, spec=spec_of(initial_shift_logit=-1.1))
     np.testing.assert_allclose(shallow.shift, 1 / (1 + np.exp(1.1)), atol=RAW_TABLES)
 
@@ -104,10 +104,10 @@ def test_a_field_holds_only_what_the_model_uses():
 
 def test_what_a_field_lacks_is_absent_and_metallic_is_zero():
     spec = spec_of(has_metallic=False, has_shift=False)
-    found = attributes_at(lively(spec), points_in_the_box(), BOX, spec=spec)
-    np.testing.assert_array_equal(found.materials.metallic, 0.0)
-    assert found.shift is None
-    assert found.indirect is None
+    attributes = attributes_at(lively(spec), points_in_the_box(), BOX, spec=spec)
+    np.testing.assert_array_equal(attributes.materials.metallic, 0.0)
+    assert attributes.shift is None
+    assert attributes.indirect is None
 
 
 @pytest.mark.parametrize("shared", [False, True])
@@ -118,9 +118,9 @@ def test_every_parameter_receives_a_gradient(shared):
     @jax.jit
     @jax.grad
     def gradient(field, points):
-        found = materials.attributes_at(field, points, BOX, spec=spec)
-        assert found.indirect.shape == (60, 6)
-        return sum(jnp.sum(part**2) for part in jax.tree.leaves(found))
+        attributes = materials.attributes_at(field, points, BOX, spec=spec)
+        assert attributes.indirect.shape == (60, 6)
+        return sum(jnp.sum(part**2) for part in jax.tree.leaves(attributes))
 
     for leaf in jax.tree.leaves(gradient(field, points_in_the_box())):
         assert bool(jnp.all(jnp.isfinite(leaf)))
@@ -138,8 +138,8 @@ def test_points_outside_the_box_have_the_attributes_of_its_border():
     field = lively(spec)
     outside = BOX.center[None] + 3 * (points_in_the_box() - BOX.center[None])
     border = jnp.clip(outside, BOX.center[None] - 1.5, BOX.center[None] + 1.5)
-    found, expected = (attributes_at(field, x, BOX, spec=spec) for x in (outside, border))
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+    actual, expected = (attributes_at(field, x, BOX, spec=spec) for x in (outside, border))
+    for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=ROUNDING, atol=ROUNDING)
 
 
@@ -156,16 +156,16 @@ def test_attributes_pull_on_the_points_where_that_is_chosen_and_the_shift_never_
         rng = np.random.default_rng(0)
         unit = (rng.integers(0, 8, (20, 3)) + rng.uniform(0.2, 0.8, (20, 3))) / 8
         points = box.center[None, :] + 1.5 * jnp.asarray(2 * unit - 1)
-        along = jnp.asarray(rng.standard_normal(points.shape))
+        direction = jnp.asarray(rng.standard_normal(points.shape))
 
         def values(points, spec):
-            found = materials.attributes_at(field, points, box, spec=spec)
+            attributes = materials.attributes_at(field, points, box, spec=spec)
             return {
-                "albedo": jnp.sum(found.materials.albedo**2),
-                "roughness": jnp.sum(jnp.sin(found.materials.roughness)),
-                "metallic": jnp.sum(jnp.sin(found.materials.metallic)),
-                "shift": jnp.sum(found.shift**2),
-                "indirect": jnp.sum(jnp.sin(found.indirect)),
+                "albedo": jnp.sum(attributes.materials.albedo**2),
+                "roughness": jnp.sum(jnp.sin(attributes.materials.roughness)),
+                "metallic": jnp.sum(jnp.sin(attributes.materials.metallic)),
+                "shift": jnp.sum(attributes.shift**2),
+                "indirect": jnp.sum(jnp.sin(attributes.indirect)),
             }
 
         @partial(jax.jit, static_argnames="spec")
@@ -173,10 +173,10 @@ def test_attributes_pull_on_the_points_where_that_is_chosen_and_the_shift_never_
             return values(points, spec), jax.jacrev(values)(points, spec)
 
         _, pulls = values_and_gradients(points, spec)
-        ahead, _ = values_and_gradients(points + step * along, spec)
-        behind, _ = values_and_gradients(points - step * along, spec)
+        ahead, _ = values_and_gradients(points + step * direction, spec)
+        behind, _ = values_and_gradients(points - step * direction, spec)
         for name in ("albedo", "roughness", "metallic", "indirect"):
-            derivative = float(jnp.vdot(pulls[name], along))
+            derivative = float(jnp.vdot(pulls[name], direction))
             change = float(ahead[name] - behind[name]) / (2 * step)
             assert abs(derivative) > 1e-3
             np.testing.assert_allclose(derivative, change, rtol=DIFFERENCES)
@@ -184,12 +184,12 @@ def test_attributes_pull_on_the_points_where_that_is_chosen_and_the_shift_never_
         assert abs(float(ahead["shift"] - behind["shift"])) > 0.1 * step * float(ahead["shift"])
         np.testing.assert_array_equal(pulls["shift"], 0.0)
         # Without the position gradient nothing pulls on the points, and the values are the same.
-        off = replace(spec, position_gradient=False)
-        same, pulls = values_and_gradients(points, off)
+        detached_spec = replace(spec, position_gradient=False)
+        detached_values, pulls = values_and_gradients(points, detached_spec)
         ahead, _ = values_and_gradients(points, spec)
         for name, pull in pulls.items():
             np.testing.assert_array_equal(pull, 0.0)
-            np.testing.assert_allclose(same[name], ahead[name], rtol=1e-12)
+            np.testing.assert_allclose(detached_values[name], ahead[name], rtol=1e-12)
 
 
 def test_smoothness_is_zero_for_a_constant_field_and_positive_otherwise():
@@ -211,14 +211,16 @@ def test_smoothness_is_the_mean_of_the_absolute_changes_of_each_attribute():
     """The mean is over the points in the mask; the change of the albedo is summed over channels."""
     spec = spec_of()
     field, points, key = lively(spec), points_in_the_box(), jax.random.key(2)
-    moved = points + 0.05 * BOX.half_extent * jax.random.normal(key, points.shape)
-    here, there = (attributes_at(field, x, BOX, spec=spec).materials for x in (points, moved))
+    moved_points = points + 0.05 * BOX.half_extent * jax.random.normal(key, points.shape)
+    before, after = (
+        attributes_at(field, x, BOX, spec=spec).materials for x in (points, moved_points)
+    )
     mask = np.arange(60) < 40
-    found = smoothness(field, points, jnp.asarray(mask), key, BOX, spec=spec, std=0.05)
+    changes = smoothness(field, points, jnp.asarray(mask), key, BOX, spec=spec, std=0.05)
     for name in ("albedo", "roughness", "metallic"):
-        change = np.abs(np.asarray(getattr(here, name)) - np.asarray(getattr(there, name)))
+        change = np.abs(np.asarray(getattr(before, name)) - np.asarray(getattr(after, name)))
         expected = change.reshape(60, -1).sum(axis=1)[mask].mean()
-        np.testing.assert_allclose(getattr(found, name), expected, rtol=ROUNDING)
+        np.testing.assert_allclose(getattr(changes, name), expected, rtol=ROUNDING)
 
 
 @pytest.mark.parametrize("power", [0.5, 1.0])
@@ -236,21 +238,24 @@ def test_relative_smoothness_does_not_reward_a_darker_albedo(monkeypatch, power)
             field, points, mask, key, BOX, spec=spec, std=0.05, relative=relative
         )
 
-    whole = materials.materials_at
+    materials_at = materials.materials_at
 
     def scaled(*args, **settings):
-        found = whole(*args, **settings)
-        return replace(found, albedo=brightness * found.albedo)
+        material = materials_at(*args, **settings)
+        return replace(material, albedo=brightness * material.albedo)
 
     monkeypatch.setattr(materials, "materials_at", scaled)
-    moved = points + 0.05 * BOX.half_extent * jax.random.normal(key, points.shape)
-    here, there = (np.asarray(whole(field, x, BOX, spec=spec).albedo)[:40] for x in (points, moved))
+    moved_points = points + 0.05 * BOX.half_extent * jax.random.normal(key, points.shape)
+    before, after = (
+        np.asarray(materials_at(field, x, BOX, spec=spec).albedo)[:40]
+        for x in (points, moved_points)
+    )
     for factor in (1.0, 0.5, 0.02):
-        change = factor * np.abs(here - there).mean(axis=0)
-        mean = 0.5 * factor * (here + there).mean(axis=0)
-        found = changes(power, factor)
-        np.testing.assert_allclose(found.albedo, np.sum(change / (2 * mean) ** power), rtol=1e-5)
-        np.testing.assert_allclose(found.roughness, changes(0.0, 1.0).roughness, rtol=ROUNDING)
+        change = factor * np.abs(before - after).mean(axis=0)
+        mean = 0.5 * factor * (before + after).mean(axis=0)
+        terms = changes(power, factor)
+        np.testing.assert_allclose(terms.albedo, np.sum(change / (2 * mean) ** power), rtol=1e-5)
+        np.testing.assert_allclose(terms.roughness, changes(0.0, 1.0).roughness, rtol=ROUNDING)
 
     def pull(relative, factor):
         value, slope = jax.value_and_grad(lambda k: changes(relative, k).albedo)(factor)
@@ -268,9 +273,9 @@ def test_smoothness_without_points_is_zero_with_zero_gradient(relative):
     @jax.jit
     @jax.value_and_grad
     def total(field):
-        nothing, key = jnp.zeros(60, bool), jax.random.key(0)
+        empty_mask, key = jnp.zeros(60, bool), jax.random.key(0)
         return sum(
-            materials.smoothness(field, points, nothing, key, BOX, spec=spec, relative=relative)
+            materials.smoothness(field, points, empty_mask, key, BOX, spec=spec, relative=relative)
         )
 
     value, gradient = total(field)

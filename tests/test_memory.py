@@ -48,8 +48,8 @@ def byte_count(tree):
 
 
 def test_the_machine_has_memory():
-    known = memory_of_machine()
-    assert known is None or known > 10**8
+    machine_bytes = memory_of_machine()
+    assert machine_bytes is None or machine_bytes > 10**8
 
 
 def test_the_limit_of_a_container_counts_where_it_is_the_smaller_one(tmp_path, monkeypatch):
@@ -57,10 +57,10 @@ def test_the_limit_of_a_container_counts_where_it_is_the_smaller_one(tmp_path, m
     limited.write_text("1000000\n")
     unlimited.write_text("max\n")
     monkeypatch.setattr(memory, "_CONTAINER_LIMITS", (unlimited, tmp_path / "missing"))
-    whole = memory_of_machine()
-    if whole is None:
+    machine_bytes = memory_of_machine()
+    if machine_bytes is None:
         pytest.skip("this system does not tell how much memory it has")
-    assert whole > 10**8
+    assert machine_bytes > 10**8
     monkeypatch.setattr(memory, "_CONTAINER_LIMITS", (unlimited, limited))
     assert memory_of_machine() == 1_000_000
 
@@ -96,10 +96,10 @@ def test_a_refusal_names_the_largest_needs_first(machine):
 )
 def test_settings_that_cannot_fit_are_refused_by_their_names(machine, overrides, named):
     config, dataset = make_config(overrides=overrides), sphere_dataset(size=4)
-    with pytest.raises(TrainingError, match=r"\d GB of memory would be needed, and") as caught:
+    with pytest.raises(TrainingError, match=r"\d GB of memory would be needed, and") as error_info:
         require_training_memory(config, dataset)
-    assert f"there are 16.0 GB: {named} " in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert f"there are 16.0 GB: {named} " in str(error_info.value)
+    assert "\n" not in str(error_info.value)
 
 
 def test_a_program_that_does_not_fit_is_refused_once_it_is_compiled(machine):
@@ -117,9 +117,11 @@ def test_a_program_that_does_not_fit_is_refused_once_it_is_compiled(machine):
     assert fits_twice(compiled)
     for gigabytes, copies in ((0.0035, 1), (0.0045, 2)):
         machine(gigabytes)
-        with pytest.raises(TrainingError, match="the program program 0.0 GB; lower geom") as caught:
+        with pytest.raises(
+            TrainingError, match="the program program 0.0 GB; lower geom"
+        ) as error_info:
             require_program_memory("program", compiled, copies)
-        assert "\n" not in str(caught.value)
+        assert "\n" not in str(error_info.value)
 
 
 class Accelerator:
@@ -139,18 +141,18 @@ def test_an_accelerator_has_memory_of_its_own(machine, monkeypatch):
     """
     program = jax.jit(lambda x: jnp.sum(jnp.sort(jnp.outer(x, x), axis=0)))
     compiled = program.trace(jax.ShapeDtypeStruct((1000,), jnp.float32)).lower().compile()
-    there = [Accelerator(8 * GIGA, 3 * GIGA), Accelerator(4_500_000, 2**20)]
+    accelerators = [Accelerator(8 * GIGA, 3 * GIGA), Accelerator(4_500_000, 2**20)]
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(jax, "local_devices", lambda: there)
+    monkeypatch.setattr(jax, "local_devices", lambda: accelerators)
     machine(0.001)
     require_program_memory("program", compiled, 2)
     assert not fits_twice(compiled)
     assert peak_memory_mb() == 3 * GIGA // 2**20
-    there[1].stats["bytes_limit"] = 3_500_000
+    accelerators[1].stats["bytes_limit"] = 3_500_000
     with pytest.raises(TrainingError, match="there are 0.0 GB: the program program 0.0 GB"):
         require_program_memory("program", compiled)
-    there[:] = [there[1]]
-    there[0].stats = None  # some devices report no memory
+    accelerators[:] = [accelerators[1]]
+    accelerators[0].stats = None  # some devices report no memory
     require_program_memory("program", compiled)
     assert peak_memory_mb() == 0
 
@@ -158,8 +160,8 @@ def test_an_accelerator_has_memory_of_its_own(machine, monkeypatch):
 def test_a_limit_of_the_process_counts(monkeypatch):
     import resource
 
-    machine_has = memory_of_machine()
-    if machine_has is None:
+    machine_bytes = memory_of_machine()
+    if machine_bytes is None:
         pytest.skip("this system does not tell how much memory it has")
     monkeypatch.setattr(
         resource,
@@ -186,20 +188,22 @@ def test_every_preset_fits_into_eight_gigabytes_as_far_as_is_known(machine, pres
 def test_what_is_counted_is_what_a_training_makes():
     dataset = sphere_dataset(size=12)
     config = tiny_config("stages.split_sum.batch_views=2", "geometry.resolution=9")
-    counted = {need.what: need.byte_count for need in training_needs(config, dataset)}
+    byte_counts = {need.what: need.byte_count for need in training_needs(config, dataset)}
     surface, shape = config.geometry.start(dataset, jax.random.key(0))
     params = initial_params(shape, config, jax.random.key(0))
     state = initial_state(params)
     # The memory holds the parameters, both moments of Adam and a gradient. Exposure and counters
     # are scalars, which the tolerance covers.
-    learned = byte_count((state.params, state.optimizer)) + byte_count(params)
+    state_bytes = byte_count((state.params, state.optimizer)) + byte_count(params)
     operators = 2 * operator_bytes(config.light)
     parts = ("geometry", "light", "material.grid", "material.*_hidden")
-    assert sum(counted[part] for part in parts) - operators == pytest.approx(learned, abs=64)
-    assert counted["geometry"] == 4 * byte_count(params.geometry)
-    assert counted["material.grid"] >= 4 * byte_count(params.material.albedo_table)
-    assert counted["the photographs (--downscale)"] == 2 * dataset.train.images.nbytes
-    assert counted["stages.*.batch_views"] == 2 * 12 * 12 * 16
+    assert sum(byte_counts[part] for part in parts) - operators == pytest.approx(
+        state_bytes, abs=64
+    )
+    assert byte_counts["geometry"] == 4 * byte_count(params.geometry)
+    assert byte_counts["material.grid"] >= 4 * byte_count(params.material.albedo_table)
+    assert byte_counts["the photographs (--downscale)"] == 2 * dataset.train.images.nbytes
+    assert byte_counts["stages.*.batch_views"] == 2 * 12 * 12 * 16
     grid = fit_grid(dataset.bounds, 9)
     assert surface.grid.shape == grid.shape
 

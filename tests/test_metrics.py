@@ -161,8 +161,8 @@ def test_full_normal_mae_is_diluted_by_the_background():
 
 def test_full_normal_mae_punishes_a_wrong_silhouette():
     mask = np.zeros((6, 8), bool)
-    everywhere = np.ones((6, 8), bool)
-    full = normal_mae_deg(tilted(0.3), tilted(0.0), mask, everywhere, full=True)
+    predicted_mask = np.ones((6, 8), bool)
+    full = normal_mae_deg(tilted(0.3), tilted(0.0), mask, predicted_mask, full=True)
     assert float(full) == pytest.approx(np.rad2deg(0.3), abs=1e-3)
 
 
@@ -205,10 +205,10 @@ def test_median_scale_ignores_outliers_and_background():
 
 
 def test_composite_blends_by_alpha_for_every_kind_of_background():
-    rgb, behind = images(4, 5)
+    rgb, background = images(4, 5)
     alpha = np.linspace(0, 1, 20, dtype=np.float32).reshape(4, 5)
-    expected = rgb * alpha[..., None] + behind * (1 - alpha[..., None])
-    np.testing.assert_allclose(metrics.composite(rgb, alpha, behind), expected, atol=1e-6)
+    expected = rgb * alpha[..., None] + background * (1 - alpha[..., None])
+    np.testing.assert_allclose(metrics.composite(rgb, alpha, background), expected, atol=1e-6)
     white = metrics.composite(rgb, alpha, 1.0)
     np.testing.assert_allclose(
         white, metrics.composite(rgb, alpha, np.ones(3, np.float32)), atol=1e-6

@@ -81,16 +81,16 @@ def names_of(chosen):
 
 def test_parts_are_kept_for_what_they_gain(dataset, trainings, tmp_path):
     config = make_config(quality="draft")
-    chosen = choose_model(dataset, config, tmp_path / "run")
-    assert names_of(chosen) == ["specular", "metallic", "light"]
-    left_out = [part for part in LADDER if part.name not in names_of(chosen)]
-    assert chosen.config == without(config, left_out)
-    gains = {rung.part: rung.found.gain for rung in chosen.rungs if rung.found is not None}
+    choice = choose_model(dataset, config, tmp_path / "run")
+    assert names_of(choice) == ["specular", "metallic", "light"]
+    omitted_parts = [part for part in LADDER if part.name not in names_of(choice)]
+    assert choice.config == without(config, omitted_parts)
+    gains = {rung.part: rung.found.gain for rung in choice.rungs if rung.found is not None}
     assert gains["metallic"] == pytest.approx(0.5)
     assert gains["hash"] == pytest.approx(-0.1)
     # Without shadows nothing is blocked: indirect light is not even tried.
-    assert [rung.part for rung in chosen.rungs] == [name for name in NAMES if name != "indirect"]
-    record = json.loads(json.dumps(chosen.record()))
+    assert [rung.part for rung in choice.rungs] == [name for name in NAMES if name != "indirect"]
+    record = json.loads(json.dumps(choice.record()))
     assert record["trainings"] == sum("seed" in name for name in trainings.made)
     assert record["held_back"] == [f"view_{k}" for k in (4, 12, 20, 28, 36)]
     assert record["rungs"][0]["found"]["gain"] == pytest.approx(2.0)
@@ -99,13 +99,13 @@ def test_parts_are_kept_for_what_they_gain(dataset, trainings, tmp_path):
 def test_a_part_brings_along_what_it_needs(dataset, trainings, tmp_path):
     """On metal that is polished in places, one roughness gains nothing, but a field of it does."""
     trainings.gains, trainings.blocked = {"roughness": 1.0, "indirect": 0.3}, 0.1
-    chosen = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
-    assert names_of(chosen) == ["roughness", "shadows", "indirect"]
-    assert chosen.config.material.specular == "field"
-    (rung,) = (rung for rung in chosen.record()["rungs"] if rung["part"] == "roughness")
+    choice = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
+    assert names_of(choice) == ["roughness", "shadows", "indirect"]
+    assert choice.config.material.specular == "field"
+    (rung,) = (rung for rung in choice.record()["rungs"] if rung["part"] == "roughness")
     assert rung_row(rung)[-1] == "kept, with specular lobe, one roughness"
-    assert not chosen.config.material.has_metallic
-    assert chosen.config.stage("monte_carlo").transport.indirect == "constant"
+    assert not choice.config.material.has_metallic
+    assert choice.config.stage("monte_carlo").transport.indirect == "constant"
 
 
 @pytest.mark.parametrize(("share", "is_kept"), [(0.019, False), (0.021, True)])
@@ -115,99 +115,101 @@ def test_the_surface_decides_whether_there_are_shadows(
     """Photographs under one light cannot decide this: here they would favour the opposite."""
     trainings.gains = {"specular": 2.0, "shadows": -5.0 if is_kept else 5.0}
     trainings.blocked = share
-    chosen = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
-    assert names_of(chosen) == ["specular", *(["shadows"] if is_kept else [])]
-    (rung,) = (rung for rung in chosen.record()["rungs"] if rung["part"] == "shadows")
-    said = f"the surface blocks {100 * share:.1f} % of a uniform sky's light from itself"
-    assert rung_row(rung)[2:] == ("-", "-", f"{'kept' if is_kept else 'left out'}: {said}")
+    choice = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
+    assert names_of(choice) == ["specular", *(["shadows"] if is_kept else [])]
+    (rung,) = (rung for rung in choice.record()["rungs"] if rung["part"] == "shadows")
+    reason = f"the surface blocks {100 * share:.1f} % of a uniform sky's light from itself"
+    assert rung_row(rung)[2:] == ("-", "-", f"{'kept' if is_kept else 'left out'}: {reason}")
 
 
 def test_what_the_surface_blocks_is_noted_with_the_other_figures(
     dataset, trainings, tmp_path, monkeypatch
 ):
     """The choice must be repeatable without the first stage, whose folder is gone by then."""
-    looked = []
+    visited_folders = []
 
     def surface_of(folder):
         assert folder.is_dir()
-        looked.append(folder)
-        whole = SimpleNamespace(surface=None, capacities=None)
-        return SimpleNamespace(pipeline=whole, params=SimpleNamespace(geometry=None))
+        visited_folders.append(folder)
+        pipeline = SimpleNamespace(surface=None, capacities=None)
+        return SimpleNamespace(pipeline=pipeline, params=SimpleNamespace(geometry=None))
 
     monkeypatch.setattr(model_choice._Trials, "blocked_share", _BLOCKED_SHARE)
     monkeypatch.setattr(model_choice, "load_trained", surface_of)
     monkeypatch.setattr(model_choice, "blocked_share", lambda *unused: 0.3)
     config = make_config(quality="draft")
-    chosen = choose_model(dataset, config, tmp_path / "run")
-    assert "shadows" in names_of(chosen)
-    assert choose_model(dataset, config, tmp_path / "run", begin=Resume()) == chosen
-    assert len(looked) == 1
+    choice = choose_model(dataset, config, tmp_path / "run")
+    assert "shadows" in names_of(choice)
+    assert choose_model(dataset, config, tmp_path / "run", begin=Resume()) == choice
+    assert len(visited_folders) == 1
 
 
 def test_shadows_whose_training_fails_are_left_out(dataset, trainings, tmp_path):
     trainings.blocked, trainings.fails = 0.5, ("shadows",)
-    chosen = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
-    assert names_of(chosen) == ["specular", "metallic", "light"]
-    (rung,) = (rung for rung in chosen.record()["rungs"] if rung["part"] == "shadows")
+    choice = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
+    assert names_of(choice) == ["specular", "metallic", "light"]
+    (rung,) = (rung for rung in choice.record()["rungs"] if rung["part"] == "shadows")
     assert rung_row(rung)[-1] == "left out: the surface has exploded"
 
 
 def test_other_seeds_are_trained_for_gains_alone(dataset, trainings, tmp_path):
     choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
-    second = [name for name in trainings.made if name.endswith("seed_1")]
+    second_names = [name for name in trainings.made if name.endswith("seed_1")]
     # A second seed is trained only for the models that specular, metallic and light improved on.
-    assert second == ["smallest_seed_1", "specular_seed_1", "specular_metallic_seed_1"]
+    assert second_names == ["smallest_seed_1", "specular_seed_1", "specular_metallic_seed_1"]
     assert len(set(trainings.made)) == len(trainings.made)
     assert trainings.configs["smallest_seed_1"].run.seed == 1
 
 
 def test_a_gain_that_another_seed_makes_too_is_no_gain(dataset, trainings, tmp_path):
     trainings.seed_noise = 1.0
-    chosen = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
-    assert names_of(chosen) == ["specular"]
-    (metallic,) = (rung for rung in chosen.rungs if rung.part == "metallic")
+    choice = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
+    assert names_of(choice) == ["specular"]
+    (metallic,) = (rung for rung in choice.rungs if rung.part == "metallic")
     assert metallic.found.spread == pytest.approx(1 / np.sqrt(2))
 
 
 def test_trials_are_short_and_see_no_view_that_is_held_back(dataset, trainings, tmp_path):
     config = make_config()
     choose_model(dataset, config, tmp_path / "run", ModelChoice(steps=60))
-    held = {f"view_{k}" for k in (4, 12, 20, 28, 36)}
-    for seen in trainings.datasets:
-        assert len(seen.train) == 35
-        assert not held & set(seen.train.names)
+    held_views = {f"view_{k}" for k in (4, 12, 20, 28, 36)}
+    for trial_dataset in trainings.datasets:
+        assert len(trial_dataset.train) == 35
+        assert not held_views & set(trial_dataset.train.names)
     for name, trial in trainings.configs.items():
         (stage,) = trial.active_stages
         assert stage.steps == 60
         assert stage.batch_views == 2
         # The shortened schedules end with the same values as the full ones.
-        full = config.stage(stage.name)
+        full_stage = config.stage(stage.name)
         assert stage.progress(60) == pytest.approx(1.0)
-        assert stage.rates_at(60)["light"] == pytest.approx(full.rates_at(full.steps)["light"])
+        assert stage.rates_at(60)["light"] == pytest.approx(
+            full_stage.rates_at(full_stage.steps)["light"]
+        )
         is_first = name.startswith("first_stage")
         assert stage.name == ("split_sum" if is_first else "monte_carlo")
     # With finer cells the shape has another size, so it needs a first stage of its own.
-    first = [name for name in trainings.made if name.startswith("first_stage")]
-    assert first == ["first_stage", "first_stage_cells"]
+    first_stages = [name for name in trainings.made if name.startswith("first_stage")]
+    assert first_stages == ["first_stage", "first_stage_cells"]
     assert trainings.configs["first_stage"].geometry.resolution == 32
 
 
 @pytest.mark.parametrize("stop", range(0, 12, 2))
 def test_a_choice_that_was_stopped_goes_on_and_ends_alike(dataset, trainings, tmp_path, stop):
     config = make_config(quality="draft")
-    whole = choose_model(dataset, config, tmp_path / "whole")
+    whole_choice = choose_model(dataset, config, tmp_path / "whole")
     expected, trainings.made = trainings.made, []
     trainings.stops_at = stop
     with pytest.raises(Interrupted):
         choose_model(dataset, config, tmp_path / "run", begin=Resume())
     trainings.stops_at = None
-    again = choose_model(dataset, config, tmp_path / "run", begin=Resume())
+    resumed_choice = choose_model(dataset, config, tmp_path / "run", begin=Resume())
     assert trainings.made == expected
-    assert again.config == whole.config
-    assert replace(again, seconds=0.0) == replace(whole, seconds=0.0)
+    assert resumed_choice.config == whole_choice.config
+    assert replace(resumed_choice, seconds=0.0) == replace(whole_choice, seconds=0.0)
     # Only the figures remain, from which the choice can be repeated without training.
-    left = {path.name for path in choice_folder(tmp_path / "run").iterdir()}
-    assert left == {".lock", "choice.json"}
+    remaining_files = {path.name for path in choice_folder(tmp_path / "run").iterdir()}
+    assert remaining_files == {".lock", "choice.json"}
     choose_model(dataset, config, tmp_path / "run", begin=Resume())
     assert trainings.made == expected
 
@@ -217,122 +219,124 @@ def test_a_choice_is_not_mixed_with_another(dataset, trainings, tmp_path):
     choose_model(dataset, config, tmp_path / "run")
     with pytest.raises(RunError, match="continue it with --resume, or replace it with --force"):
         choose_model(dataset, config, tmp_path / "run")
-    other = make_config(quality="draft", overrides=("run.seed=5",))
+    other_config = make_config(quality="draft", overrides=("run.seed=5",))
     with pytest.raises(RunError, match="begun with other settings or other views"):
-        choose_model(dataset, other, tmp_path / "run", begin=Resume())
-    before = len(trainings.made)
-    choose_model(dataset, other, tmp_path / "run", begin=Anew(replace=True))
-    assert len(trainings.made) == 2 * before
+        choose_model(dataset, other_config, tmp_path / "run", begin=Resume())
+    training_count = len(trainings.made)
+    choose_model(dataset, other_config, tmp_path / "run", begin=Anew(replace=True))
+    assert len(trainings.made) == 2 * training_count
     path = choice_folder(tmp_path / "run") / "choice.json"
     state = json.loads(path.read_text())
     state["trainings"]["smallest_seed_0"]["psnr"].pop()
     for text in ("{", "[]", json.dumps({**state, "trainings": 5}), json.dumps(state)):
         path.write_text(text)
         with pytest.raises(RunError, match=r"choice\.json is damaged"):
-            choose_model(dataset, other, tmp_path / "run", begin=Resume())
+            choose_model(dataset, other_config, tmp_path / "run", begin=Resume())
 
 
 def test_a_choice_of_other_photographs_is_not_gone_on_with(dataset, trainings, tmp_path):
     config = make_config(quality="draft")
     choose_model(dataset, config, tmp_path / "run")
-    darker = replace(dataset, train=replace(dataset.train, images=0.2 * dataset.train.images))
-    for other in (darker, replace(dataset, options={"downscale": 2})):
+    dark_dataset = replace(dataset, train=replace(dataset.train, images=0.2 * dataset.train.images))
+    for other_dataset in (dark_dataset, replace(dataset, options={"downscale": 2})):
         with pytest.raises(RunError, match="other settings or other views, or these were read"):
-            choose_model(other, config, tmp_path / "run", begin=Resume())
+            choose_model(other_dataset, config, tmp_path / "run", begin=Resume())
     with locked_folder(choice_folder(tmp_path / "run"), own=choice_folder(tmp_path / "run")):
         with pytest.raises(RunError, match="another process is writing"):
             choose_model(dataset, config, tmp_path / "run", begin=Anew(replace=True))
 
 
 def test_a_run_is_replaced_only_once_the_choice_is_possible(dataset, trainings, tmp_path):
-    old = RunFolder(tmp_path / "run")
-    with old.locked():
-        old.begin(dataset, tiny_config(), replace=False)
-    few = sphere_dataset(count=6, size=8)
-    letter = choice_folder(old.path) / "letter.txt"
+    run = RunFolder(tmp_path / "run")
+    with run.locked():
+        run.begin(dataset, tiny_config(), replace=False)
+    small_dataset = sphere_dataset(count=6, size=8)
+    letter = choice_folder(run.path) / "letter.txt"
     letter.parent.mkdir()
     letter.write_text("dear")
-    for scene, error in ((few, ValueError), (dataset, RunError)):
+    for scene, error in ((small_dataset, ValueError), (dataset, RunError)):
         with pytest.raises(error):
-            choose_model(scene, make_config(quality="draft"), old.path, begin=Anew(replace=True))
-        assert old.exists
+            choose_model(scene, make_config(quality="draft"), run.path, begin=Anew(replace=True))
+        assert run.exists
     letter.unlink()
     trainings.stops_at = 0
     with pytest.raises(Interrupted):
-        choose_model(dataset, make_config(quality="draft"), old.path, begin=Anew(replace=True))
-    assert not old.exists
+        choose_model(dataset, make_config(quality="draft"), run.path, begin=Anew(replace=True))
+    assert not run.exists
 
 
 def test_a_folder_of_somebody_else_is_left_alone(dataset, trainings, tmp_path):
     folder = choice_folder(tmp_path / "run")
     folder.mkdir()
     (folder / "letter.txt").write_text("dear")
-    for replaced in (False, True):
+    for is_replaced in (False, True):
         with pytest.raises(RunError, match="holds other files"):
-            choose_model(dataset, tiny_config(), tmp_path / "run", begin=Anew(replace=replaced))
+            choose_model(dataset, tiny_config(), tmp_path / "run", begin=Anew(replace=is_replaced))
     assert (folder / "letter.txt").read_text() == "dear"
     assert not trainings.made
 
 
 def test_a_part_whose_training_fails_is_left_out_and_says_so(dataset, trainings, tmp_path):
     trainings.fails = ("metallic",)
-    chosen = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
-    assert names_of(chosen) == ["specular", "light"]
-    (rung,) = (rung for rung in chosen.record()["rungs"] if rung["part"] == "metallic")
+    choice = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
+    assert names_of(choice) == ["specular", "light"]
+    (rung,) = (rung for rung in choice.record()["rungs"] if rung["part"] == "metallic")
     assert rung["note"] == "the surface has exploded"
     assert rung_row(rung)[-1] == "left out: the surface has exploded"
     # The part that failed is not tried again.
-    before = len(trainings.made)
-    again = choose_model(dataset, make_config(quality="draft"), tmp_path / "run", begin=Resume())
-    assert len(trainings.made) == before
-    assert again == chosen
+    training_count = len(trainings.made)
+    resumed_choice = choose_model(
+        dataset, make_config(quality="draft"), tmp_path / "run", begin=Resume()
+    )
+    assert len(trainings.made) == training_count
+    assert resumed_choice == choice
 
 
 def test_a_seed_whose_training_fails_says_nothing(dataset, trainings, tmp_path):
     trainings.fails = ("specular_metallic_seed_1",)
-    chosen = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
+    choice = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
     assert "specular_metallic_seed_1" in trainings.made
-    assert names_of(chosen) == ["specular", "metallic", "light"]
+    assert names_of(choice) == ["specular", "metallic", "light"]
 
 
 def test_too_few_views_are_refused(trainings, tmp_path):
-    few = sphere_dataset(count=16, size=8)
+    small_dataset = sphere_dataset(count=16, size=8)
     with pytest.raises(ValueError, match="holds back every 8th of 16 training views"):
-        choose_model(few, tiny_config(), tmp_path / "run")
+        choose_model(small_dataset, tiny_config(), tmp_path / "run")
     assert not trainings.made
 
 
 def test_a_trial_takes_shape_and_light_over_and_begins_with_a_new_material():
     pipeline, params = ball(tiny_config())
-    _, fresh = ball(tiny_config("light.height=4", "light.width=8"), radius=0.3)
+    _, fresh_params = ball(tiny_config("light.height=4", "light.width=8"), radius=0.3)
     rows = jnp.linspace(0.0, 1.0, 8)[:, None, None]
-    trained = replace(
+    trained_params = replace(
         params,
         light=EnvLight(jnp.broadcast_to(rows, (8, 16, 3))),
         log_exposure=jnp.asarray(0.25),
     )
-    begun = Start(pipeline.surface, trained).applied(fresh)
-    assert begun.geometry is trained.geometry
-    assert begun.material is fresh.material
-    assert float(begun.log_exposure) == 0.25
-    assert begun.light.radiance.shape == (4, 8, 3)
-    np.testing.assert_allclose(begun.light.radiance.mean(), 0.5, atol=1e-6)
-    assert np.all(np.diff(np.asarray(begun.light.radiance[:, 0, 0])) > 0.1)
+    trial_params = Start(pipeline.surface, trained_params).applied(fresh_params)
+    assert trial_params.geometry is trained_params.geometry
+    assert trial_params.material is fresh_params.material
+    assert float(trial_params.log_exposure) == 0.25
+    assert trial_params.light.radiance.shape == (4, 8, 3)
+    np.testing.assert_allclose(trial_params.light.radiance.mean(), 0.5, atol=1e-6)
+    assert np.all(np.diff(np.asarray(trial_params.light.radiance[:, 0, 0])) > 0.1)
 
 
 def test_some_views_are_those_views_reduced(dataset):
     views = dataset.train
-    half = np.zeros((40, 8, 8), np.float32)
-    half[:, :, :5] = 1.0
-    counted = replace(views, valid=half, images=views.images * half[..., None])
-    found = some_views(counted, [3, 7], factor=2)
-    assert found.names == ("view_3", "view_7")
-    assert found.images.shape == (2, 4, 4, 4)
+    half_mask = np.zeros((40, 8, 8), np.float32)
+    half_mask[:, :, :5] = 1.0
+    masked_views = replace(views, valid=half_mask, images=views.images * half_mask[..., None])
+    reduced_views = some_views(masked_views, [3, 7], factor=2)
+    assert reduced_views.names == ("view_3", "view_7")
+    assert reduced_views.images.shape == (2, 4, 4, 4)
     # A reduced pixel is valid where all pixels that it covers are.
-    np.testing.assert_array_equal(found.valid[:, 0], [[1, 1, 0, 0]] * 2)
-    np.testing.assert_array_equal(found.images[:, :, 2:], 0.0)
-    np.testing.assert_allclose(found.intrinsics[:, :2], 0.5 * views.intrinsics[[3, 7], :2])
-    np.testing.assert_array_equal(found.camera_to_world, views.camera_to_world[[3, 7]])
+    np.testing.assert_array_equal(reduced_views.valid[:, 0], [[1, 1, 0, 0]] * 2)
+    np.testing.assert_array_equal(reduced_views.images[:, :, 2:], 0.0)
+    np.testing.assert_allclose(reduced_views.intrinsics[:, :2], 0.5 * views.intrinsics[[3, 7], :2])
+    np.testing.assert_array_equal(reduced_views.camera_to_world, views.camera_to_world[[3, 7]])
 
 
 @pytest.mark.parametrize("options", [["--budget", "5min"], ["--from", "run", "--stage", "refine"]])
@@ -371,9 +375,9 @@ def test_a_model_is_chosen_recorded_and_trained_on_all_views(tmp_path, capsys):
         gs.train(duck, output, config, model="auto", listener=_StoppedAt(6), downscale=8)
     assert not output.exists()
     assert cli.main(command) == 0
-    said = capsys.readouterr().err
-    assert "inward shift" in said
-    assert "set by hand" in said
+    messages = capsys.readouterr().err
+    assert "inward shift" in messages
+    assert "set by hand" in messages
     run = gs.Run(output)
     record = run.folder.record()["model"]
     assert [rung["part"] for rung in record["rungs"]] == ["shift"]
@@ -382,10 +386,12 @@ def test_a_model_is_chosen_recorded_and_trained_on_all_views(tmp_path, capsys):
     assert len(run.dataset.train) == 40
     assert load_trained(output).step == config.total_steps
     # A finished choice is not repeated: the run keeps its model.
-    measured = (choice_folder(output) / "choice.json").stat().st_mtime_ns
+    modification_time = (choice_folder(output) / "choice.json").stat().st_mtime_ns
     assert cli.main(["train", str(duck), "--output", str(output), "--resume"]) == 0
-    assert (choice_folder(output) / "choice.json").stat().st_mtime_ns == measured
+    assert (choice_folder(output) / "choice.json").stat().st_mtime_ns == modification_time
     # The run also keeps its model when the settings that it was chosen from are given again.
-    for named in (None, config):
-        again = gs.train(duck, output, named, begin=gs.Resume(), model="auto", downscale=8)
-        assert again.config == run.config
+    for passed_config in (None, config):
+        same_run = gs.train(
+            duck, output, passed_config, begin=gs.Resume(), model="auto", downscale=8
+        )
+        assert same_run.config == run.config

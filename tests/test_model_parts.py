@@ -28,14 +28,14 @@ def changed_by(name, config):
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_smaller_model_has_settings_that_can_be_written_and_trained(preset, quality):
     config = make_config(preset, quality)
-    offered = offered_parts(config)
-    for count in range(len(offered) + 1):
-        smaller = without(config, offered[count:])
+    parts = offered_parts(config)
+    for count in range(len(parts) + 1):
+        smaller = without(config, parts[count:])
         assert config_from_dict(smaller.to_dict()) == smaller
-        found = {part.name for part in offered_parts(smaller)}
-        left = {part.name for part in offered[:count]}
+        offered_names = {part.name for part in offered_parts(smaller)}
+        remaining_names = {part.name for part in parts[:count]}
         # Parts that are chosen by size can be reduced once more.
-        assert left <= found <= left | {"hash", "light", "cells"}
+        assert remaining_names <= offered_names <= remaining_names | {"hash", "light", "cells"}
         assert config_warnings(smaller) == config_warnings(config)
 
 
@@ -58,11 +58,11 @@ def test_what_needs_another_part_is_taken_out_with_its_own_settings_only():
     assert changed_by("specular", config) == {"material.specular"}
     assert changed_by("roughness", config) == {"material.specular"}
     assert changed_by("metallic", config) == {"material.has_metallic"}
-    dark = LADDER[NAMES.index("indirect")].removed(config)
-    transport = dark.stage("monte_carlo").transport
+    direct_config = LADDER[NAMES.index("indirect")].removed(config)
+    transport = direct_config.stage("monte_carlo").transport
     assert isinstance(transport, MonteCarloSettings)
     assert (transport.indirect, transport.occlusion) == ("none", True)
-    assert "indirect" not in dark.stage("monte_carlo").weights
+    assert "indirect" not in direct_config.stage("monte_carlo").weights
 
 
 @pytest.mark.parametrize(
@@ -78,8 +78,8 @@ def test_what_needs_another_part_is_taken_out_with_its_own_settings_only():
     ],
 )
 def test_what_was_set_by_hand_is_not_chosen(paths, missing):
-    offered = {part.name for part in offered_parts(make_config(), paths)}
-    assert offered == set(NAMES) - missing
+    offered_names = {part.name for part in offered_parts(make_config(), paths)}
+    assert offered_names == set(NAMES) - missing
 
 
 @pytest.mark.parametrize(
@@ -92,8 +92,8 @@ def test_what_was_set_by_hand_is_not_chosen(paths, missing):
     ],
 )
 def test_parts_that_settings_lack_or_never_use_are_not_offered(overrides, missing):
-    offered = {part.name for part in offered_parts(make_config(overrides=overrides))}
-    assert offered == set(NAMES) - missing
+    offered_names = {part.name for part in offered_parts(make_config(overrides=overrides))}
+    assert offered_names == set(NAMES) - missing
 
 
 def test_what_is_left_out_has_no_parameters():
@@ -107,8 +107,8 @@ def test_what_is_left_out_has_no_parameters():
         return sum(leaf.size for leaf in jax.tree.leaves(params))
 
     sizes = [count(LADDER[n:]) for n in range(len(LADDER) + 1)]
-    grows = {name: b > a for name, a, b in zip(NAMES, sizes, sizes[1:], strict=False)}
-    assert grows == {
+    adds_parameters = {name: b > a for name, a, b in zip(NAMES, sizes, sizes[1:], strict=False)}
+    assert adds_parameters == {
         **dict.fromkeys(("specular", "roughness", "metallic", "shift", "hash", "light"), True),
         **dict.fromkeys(("shadows", "indirect", "cells"), False),
     }

@@ -32,11 +32,13 @@ def shade(key, points, materials, wo, light, index, indirect=NO_INDIRECT, *, cou
     cosine = jnp.sum(points.normals * wo, axis=-1, keepdims=True)
     points = replace(points, normals=jnp.where(cosine < 0, -points.normals, points.normals))
     sampler = light_sampler(light)
-    how = {"counts": counts, "finds_nearest": isinstance(indirect, TracedIndirect)}
+    options = {"counts": counts, "finds_nearest": isinstance(indirect, TracedIndirect)}
     shared_key, own_key = jax.random.split(key)
-    samples = draw_samples(shared_key, points, sampler, index, **how)
+    samples = draw_samples(shared_key, points, sampler, index, **options)
     gathered = gather(points, samples, light, indirect)
-    return reflect(own_key, points, materials, wo, gathered, light, sampler, index, indirect, **how)
+    return reflect(
+        own_key, points, materials, wo, gathered, light, sampler, index, indirect, **options
+    )
 
 
 shade_jitted = jax.jit(shade, static_argnames=("counts",))
@@ -85,9 +87,9 @@ def quadrature(points, materials, wo, light, rows):
     def one(args):
         materials, normal, view = args
         count = wi.shape[0]
-        rows_of = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), materials)
+        material_rows = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), materials)
         normals, views = (jnp.broadcast_to(x, (count, 3)) for x in (normal, view))
-        diffuse, specular = bsdf.evaluate_lobes(rows_of, normals, wi, views)
+        diffuse, specular = bsdf.evaluate_lobes(material_rows, normals, wi, views)
         cosines = jnp.maximum(wi @ normal, 0.0)[:, None]
         return jnp.sum((diffuse + specular) * cosines * radiance, axis=0)
 
@@ -130,10 +132,12 @@ def many_estimates(number, *arguments, counts):
 @pytest.mark.parametrize("name", COUNTS)
 def test_the_estimate_is_the_integral(name, integral):
     points, materials, wo, light = scene()
-    found = shade_jitted(jax.random.key(0), points, materials, wo, light, None, counts=COUNTS[name])
+    estimate = shade_jitted(
+        jax.random.key(0), points, materials, wo, light, None, counts=COUNTS[name]
+    )
     # There are two thousand samples per point.
-    assert relative(found.rgb, integral) < (0.006 if name == "both" else 0.03)
-    np.testing.assert_allclose(found.rgb, found.diffuse + found.specular, rtol=1e-6)
+    assert relative(estimate.rgb, integral) < (0.006 if name == "both" else 0.03)
+    np.testing.assert_allclose(estimate.rgb, estimate.diffuse + estimate.specular, rtol=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -152,9 +156,11 @@ def test_the_estimate_has_no_bias_at_one_sample_of_each_kind(integral, single_sa
 
 def test_the_error_falls_with_the_samples(integral, single_samples):
     """It falls at least with the inverse root of their number; stratification may do better."""
-    sixteen = many_estimates(64, *scene(), counts=SampleCounts(16, 16, 16))
-    few, many = (np.sqrt(np.mean((x - integral) ** 2)) for x in (single_samples, sixteen))
-    assert many < 0.27 * few  # a quarter of the error
+    sixteen_samples = many_estimates(64, *scene(), counts=SampleCounts(16, 16, 16))
+    single_error, sixteen_error = (
+        np.sqrt(np.mean((x - integral) ** 2)) for x in (single_samples, sixteen_samples)
+    )
+    assert sixteen_error < 0.27 * single_error  # a quarter of the error
 
 
 @pytest.mark.slow
@@ -165,19 +171,19 @@ def test_combining_is_never_much_worse_than_the_better_technique():
     sun = EnvLight(jnp.full((8, 16, 3), 0.01).at[2, 5].set(50.0))
     glossy = replace(materials, roughness=jnp.full((POINTS,), 0.15), metallic=jnp.ones((POINTS,)))
     rough = replace(materials, roughness=jnp.ones((POINTS,)), metallic=jnp.zeros((POINTS,)))
-    for chosen, chosen_light, rows in ((glossy, light, 480), (rough, sun, 240)):
-        arguments = (points, chosen, wo, chosen_light)
+    for case_materials, case_light, rows in ((glossy, light, 480), (rough, sun, 240)):
+        arguments = (points, case_materials, wo, case_light)
         expected = np.asarray(quadrature(*arguments, rows=rows))
 
         def error(counts, arguments=arguments, expected=expected):
             return np.mean((many_estimates(32, *arguments, counts=counts) - expected) ** 2)
 
-        both = error(SampleCounts(8, 8, 8))
-        alone = [error(SampleCounts(16, 0, 0)), error(SampleCounts(0, 16, 16))]
+        combined_error = error(SampleCounts(8, 8, 8))
+        single_errors = [error(SampleCounts(16, 0, 0)), error(SampleCounts(0, 16, 16))]
         # Combined, each technique has half of the samples, and the error of stratified samples
         # falls faster than the inverse root of their number.
-        assert both < 8 * min(alone)
-        assert both < 0.2 * max(alone)
+        assert combined_error < 8 * min(single_errors)
+        assert combined_error < 0.2 * max(single_errors)
 
 
 def white(materials):
@@ -189,11 +195,11 @@ def test_a_white_furnace():
     points, materials, wo, _ = scene()
     light = EnvLight(jnp.ones((8, 16, 3)))
     key = jax.random.key(0)
-    found = shade_jitted(key, points, white(materials), wo, light, None, counts=MANY)
-    np.testing.assert_allclose(found.diffuse_light, 1.0, rtol=0.01)
-    np.testing.assert_allclose(found.diffuse, 1.0, rtol=0.01)
-    assert float(jnp.max(found.specular_light)) < 1.02
-    assert float(jnp.min(found.specular_light)) > 0.3
+    estimate = shade_jitted(key, points, white(materials), wo, light, None, counts=MANY)
+    np.testing.assert_allclose(estimate.diffuse_light, 1.0, rtol=0.01)
+    np.testing.assert_allclose(estimate.diffuse, 1.0, rtol=0.01)
+    assert float(jnp.max(estimate.specular_light)) < 1.02
+    assert float(jnp.min(estimate.specular_light)) > 0.3
 
 
 def test_normals_that_face_away_are_flipped_to_the_viewer():
@@ -205,9 +211,11 @@ def test_normals_that_face_away_are_flipped_to_the_viewer():
     def specular(normals):
         samples = draw_samples(jax.random.key(0), points, sampler, None, counts=counts)
         gathered = gather(points, samples, light)
-        turned = replace(points, normals=normals)
+        turned_points = replace(points, normals=normals)
         key = jax.random.key(1)
-        return reflect(key, turned, materials, wo, gathered, light, sampler, None, counts=counts)
+        return reflect(
+            key, turned_points, materials, wo, gathered, light, sampler, None, counts=counts
+        )
 
     first, second = specular(points.normals), specular(-points.normals)
     assert float(jnp.min(first.specular)) > 0
@@ -224,8 +232,8 @@ def ball_index():
 
     @jax.jit
     def build(shape):
-        found = surface.extract(shape, capacities=capacities)
-        return surface.ray_index(found, capacities=capacities), found.usage
+        isosurface = surface.extract(shape, capacities=capacities)
+        return surface.ray_index(isosurface, capacities=capacities), isosurface.usage
 
     index, usage = build(shape)
     assert fits({**usage, **index.usage}, capacities)
@@ -237,8 +245,8 @@ def test_a_ball_overhead_takes_its_solid_angle_of_the_light(ball_index):
     points, materials, _, _ = scene()
     distance = np.linspace(0.9, 2.0, POINTS)
     up = jnp.broadcast_to(jnp.asarray([0.0, 0.0, 1.0]), (POINTS, 3))
-    below = jnp.asarray(-distance[:, None], jnp.float32) * up
-    points = replace(points, positions=below, normals=up, outward=up)
+    positions = jnp.asarray(-distance[:, None], jnp.float32) * up
+    points = replace(points, positions=positions, normals=up, outward=up)
     key, arguments = jax.random.key(0), (points, materials, up, EnvLight(jnp.ones((8, 16, 3))))
     # Blocked directions have the radiance of the indirect light: sigmoid(30 - 3) is 1, and
     # sigmoid(-30 - 3) is 0.
@@ -269,8 +277,8 @@ def test_without_occlusion_rays_that_are_there_for_others_block_nothing(ball_ind
     """There may be rays only because a shading domain finds the mesh with them."""
     count = 50
     up = jnp.tile(jnp.asarray([[0.0, 0, 1]]), (count, 1))
-    nowhere = jnp.full((count,), -1, jnp.int32)
-    points = SurfacePoints(-0.9 * up, up, up, nowhere, jnp.ones(count, bool))
+    no_faces = jnp.full((count,), -1, jnp.int32)
+    points = SurfacePoints(-0.9 * up, up, up, no_faces, jnp.ones(count, bool))
     materials = Materials(jnp.full((count, 3), 0.5), jnp.full(count, 0.5), jnp.zeros(count))
     attributes = Attributes(materials, None, None)
     light = EnvLight(jnp.ones((8, 16, 3)))
@@ -293,24 +301,26 @@ def test_chunks_and_masks_change_nothing_for_the_others(ball_index, monkeypatch)
     points, materials, wo, light = scene()
     points, materials, wo = repeated((points, materials, wo), 50)  # 600 points
     points = replace(points, positions=-0.9 * points.outward)  # below the ball
-    number, counts = jnp.arange(600), SampleCounts(2, 2, 2)
+    indices, counts = jnp.arange(600), SampleCounts(2, 2, 2)
 
     def shaded(mask):
         """Shade with shadows in the diffuse light only, since rays take long to compile."""
-        chosen, sampler = replace(points, mask=mask), light_sampler(light)
-        first, second = jax.random.split(jax.random.key(0))
-        samples = draw_samples(first, chosen, sampler, ball_index, counts=counts)
-        gathered = gather(chosen, samples, light)
-        return reflect(second, chosen, materials, wo, gathered, light, sampler, None, counts=counts)
+        masked_points, sampler = replace(points, mask=mask), light_sampler(light)
+        shared_key, own_key = jax.random.split(jax.random.key(0))
+        samples = draw_samples(shared_key, masked_points, sampler, ball_index, counts=counts)
+        gathered = gather(masked_points, samples, light)
+        return reflect(
+            own_key, masked_points, materials, wo, gathered, light, sampler, None, counts=counts
+        )
 
-    whole = jax.jit(lambda mask: shaded(mask))(jnp.ones(600, bool))
+    expected = jax.jit(lambda mask: shaded(mask))(jnp.ones(600, bool))
     monkeypatch.setattr(sampling, "_RAYS_AT_ONCE", 0)
     # Chunks have 256 points. The mask has every second point of the first chunk, none of the
     # second, and all of the third.
-    mask = jnp.where(number < 256, number % 2 == 0, number >= 512)
+    mask = jnp.where(indices < 256, indices % 2 == 0, indices >= 512)
     in_chunks = jax.jit(lambda mask: shaded(mask))
-    parts, masked = in_chunks(jnp.ones(600, bool)), in_chunks(mask)
-    for a, b, c in zip(*map(jax.tree.leaves, (whole, parts, masked)), strict=True):
+    chunked, masked = in_chunks(jnp.ones(600, bool)), in_chunks(mask)
+    for a, b, c in zip(*map(jax.tree.leaves, (expected, chunked, masked)), strict=True):
         assert a.shape == (600, 3)
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
         np.testing.assert_array_equal(b[mask], c[mask])
@@ -337,8 +347,8 @@ def test_the_gradient_estimates_the_derivative_of_the_integral():
         materials, light = inputs
         return jnp.mean(quadrature(points, materials, wo, light, rows=120))
 
-    found, expected = (jax.jit(jax.grad(f))((materials, light)) for f in (estimate, exact))
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+    actual, expected = (jax.jit(jax.grad(f))((materials, light)) for f in (estimate, exact))
+    for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
         size = float(jnp.sqrt(jnp.sum(b**2)))
         assert float(jnp.sqrt(jnp.sum((a - b) ** 2))) < 0.06 * size
 
@@ -349,9 +359,13 @@ def test_sampling_itself_carries_no_gradient():
     @jax.jit
     @partial(jax.grad, argnums=(0, 1, 2))
     def gradients(materials, light, normals):
-        moved = replace(points, normals=normals)
+        turned_points = replace(points, normals=normals)
         samples = draw_samples(
-            jax.random.key(0), moved, light_sampler(light), None, counts=SampleCounts(2, 2, 2)
+            jax.random.key(0),
+            turned_points,
+            light_sampler(light),
+            None,
+            counts=SampleCounts(2, 2, 2),
         )
         mirrored = bsdf.sample_specular(
             materials.roughness, normals, wo, jnp.full((POINTS, 2), 0.3)

@@ -51,28 +51,28 @@ def blurred(frames):
 def test_gif_keeps_frames_rate_and_colours_and_loops_for_ever(tmp_path):
     frames = ramp_frames()
     write_movie(tmp_path / "new" / "film.gif", frames, frames_per_second=25)
-    found, durations, loop = read_gif(tmp_path / "new" / "film.gif")
-    assert found.shape == (5, 40, 60, 3)
+    decoded_frames, durations, loop = read_gif(tmp_path / "new" / "film.gif")
+    assert decoded_frames.shape == (5, 40, 60, 3)
     assert durations == [40] * 5
     assert loop == 0
-    assert np.abs(blurred(found) - blurred(np.stack(frames))).max() < 0.03
-    assert np.sqrt(np.mean((found - np.stack(frames)) ** 2)) < 0.03
-    np.testing.assert_array_equal(found[:, :3], 1.0)
+    assert np.abs(blurred(decoded_frames) - blurred(np.stack(frames))).max() < 0.03
+    assert np.sqrt(np.mean((decoded_frames - np.stack(frames)) ** 2)) < 0.03
+    np.testing.assert_array_equal(decoded_frames[:, :3], 1.0)
     assert os.listdir(tmp_path / "new") == ["film.gif"]
 
 
 def test_gif_gradients_are_dithered_not_banded(tmp_path):
     # 3 x 4096 colours: far more than a palette holds.
-    level = np.linspace(0, 1, 64)
-    red, green = np.meshgrid(level, level)
+    levels = np.linspace(0, 1, 64)
+    red, green = np.meshgrid(levels, levels)
     frames = [np.stack([red, green, np.full_like(red, b)], -1) for b in (0.0, 0.5, 1.0)]
     write_movie(tmp_path / "film.gif", frames, frames_per_second=10)
-    found, _, _ = read_gif(tmp_path / "film.gif")
+    decoded_frames, _, _ = read_gif(tmp_path / "film.gif")
     inner = np.s_[:, 1:-1, 1:-1]
-    errors = (blurred(found) - blurred(np.stack(frames)))[inner]
+    errors = (blurred(decoded_frames) - blurred(np.stack(frames)))[inner]
     assert np.sqrt(np.mean(errors**2)) < 0.03
-    raw = found - np.stack(frames)
-    assert np.sqrt(np.mean(raw**2)) > 1.5 * np.sqrt(np.mean(errors**2))
+    raw_errors = decoded_frames - np.stack(frames)
+    assert np.sqrt(np.mean(raw_errors**2)) > 1.5 * np.sqrt(np.mean(errors**2))
 
 
 def test_gif_colours_that_fit_a_palette_are_exact_and_still_in_all_frames(tmp_path):
@@ -80,20 +80,20 @@ def test_gif_colours_that_fit_a_palette_are_exact_and_still_in_all_frames(tmp_pa
     colors = rng.integers(0, 256, (40, 3)).astype(np.float32) / 255
     frames = [colors[rng.integers(0, 40, (20, 24))] for _ in range(4)]
     write_movie(tmp_path / "film.gif", frames, frames_per_second=10)
-    found, _, _ = read_gif(tmp_path / "film.gif")
-    np.testing.assert_allclose(found, np.stack(frames), atol=1e-6)
+    decoded_frames, _, _ = read_gif(tmp_path / "film.gif")
+    np.testing.assert_allclose(decoded_frames, np.stack(frames), atol=1e-6)
 
 
 def test_frames_may_be_made_when_they_are_asked_for(tmp_path):
     """Only one frame exists as floats at a time, however long the film is."""
-    frames, alive = ramp_frames(5), []
+    frames, references = ramp_frames(5), []
 
     def made():
         for frame in frames:
-            alive.append(weakref.ref(one := frame.copy()))
-            yield one
-            del one
-            assert sum(ref() is not None for ref in alive) <= 1
+            references.append(weakref.ref(frame_copy := frame.copy()))
+            yield frame_copy
+            del frame_copy
+            assert sum(reference() is not None for reference in references) <= 1
 
     write_movie(tmp_path / "lazy.gif", made(), frames_per_second=10)
     write_movie(tmp_path / "film.gif", frames, frames_per_second=10)
@@ -105,8 +105,8 @@ def test_palette_of_a_long_film_is_made_from_all_columns(tmp_path, monkeypatch):
     colors = np.linspace(0, 1, 32).astype(np.float32)
     frames = [np.tile(colors[None, :, None], (32, 1, 3)) * [1.0, 1.0, k / 2] for k in range(3)]
     write_movie(tmp_path / "film.gif", frames, frames_per_second=10)
-    found, _, _ = read_gif(tmp_path / "film.gif")
-    np.testing.assert_allclose(found, np.rint(np.stack(frames) * 255) / 255, atol=0.01)
+    decoded_frames, _, _ = read_gif(tmp_path / "film.gif")
+    np.testing.assert_allclose(decoded_frames, np.rint(np.stack(frames) * 255) / 255, atol=0.01)
 
 
 @pytest.mark.parametrize("rate", [7, 24, 30, 50])
@@ -122,16 +122,16 @@ def test_gif_of_equal_frames_and_of_one_frame_keep_their_time(tmp_path):
     frame = ramp_frames(1)[0]
     for count in (1, 3):
         write_movie(tmp_path / "film.gif", [frame] * count, frames_per_second=10)
-        found, durations, _ = read_gif(tmp_path / "film.gif")
+        decoded_frames, durations, _ = read_gif(tmp_path / "film.gif")
         assert sum(durations) == 100 * count
-        assert np.abs(found - frame).max() < 0.2
+        assert np.abs(decoded_frames - frame).max() < 0.2
 
 
 def test_upper_case_suffix_jax_arrays_and_values_outside_are_accepted(tmp_path):
     frames = [jnp.full((4, 4, 3), value) for value in (-0.5, 1.5)]
     write_movie(str(tmp_path / "film.GIF"), frames, frames_per_second=10)
-    found, _, _ = read_gif(tmp_path / "film.GIF")
-    np.testing.assert_array_equal(found[:, 0, 0, 0], [0.0, 1.0])
+    decoded_frames, _, _ = read_gif(tmp_path / "film.GIF")
+    np.testing.assert_array_equal(decoded_frames[:, 0, 0, 0], [0.0, 1.0])
 
 
 @pytest.mark.parametrize(
@@ -178,9 +178,9 @@ def install_fake(folder, monkeypatch, body, *, encoder="libx264"):
     """
     folder.mkdir()
     program = folder / "ffmpeg"
-    listed = f"if '-encoders' in sys.argv:\n    sys.exit(print(' V....D {encoder} H.264'))\n"
-    begin = f"#!{sys.executable}\nimport json, sys\nfrom pathlib import Path\n"
-    program.write_text(f"{begin}{listed}{body}\n")
+    listing = f"if '-encoders' in sys.argv:\n    sys.exit(print(' V....D {encoder} H.264'))\n"
+    header = f"#!{sys.executable}\nimport json, sys\nfrom pathlib import Path\n"
+    program.write_text(f"{header}{listing}{body}\n")
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setenv("PATH", str(folder))
 
@@ -201,19 +201,19 @@ def test_encoder_receives_even_frames_and_h264_settings(tmp_path, monkeypatch):
     frames = ramp_frames(3, 5, 7)
     assert has_encoder(".mp4")
     write_movie(tmp_path / "film.mp4", frames, frames_per_second=24)
-    received = np.frombuffer((tmp_path / "film.mp4").read_bytes(), np.uint8).reshape(3, 6, 8, 3)
-    bytes_ = np.rint(np.stack(frames) * 255).astype(np.uint8)
-    np.testing.assert_array_equal(received[:, :5, :7], bytes_)
-    np.testing.assert_array_equal(received[:, 5, :7], bytes_[:, 4])
-    np.testing.assert_array_equal(received[:, :, 7], received[:, :, 6])
+    actual = np.frombuffer((tmp_path / "film.mp4").read_bytes(), np.uint8).reshape(3, 6, 8, 3)
+    expected = np.rint(np.stack(frames) * 255).astype(np.uint8)
+    np.testing.assert_array_equal(actual[:, :5, :7], expected)
+    np.testing.assert_array_equal(actual[:, 5, :7], expected[:, 4])
+    np.testing.assert_array_equal(actual[:, :, 7], actual[:, :, 6])
     arguments = json.loads((tmp_path / "bin" / "arguments.json").read_text())
     assert "-y" in arguments
-    following = dict(zip(arguments, arguments[1:], strict=False))
-    assert following["-s"] == "8x6"
-    assert following["-framerate"] == "24"
-    assert following["-c:v"] == "libx264"
+    options = dict(zip(arguments, arguments[1:], strict=False))
+    assert options["-s"] == "8x6"
+    assert options["-framerate"] == "24"
+    assert options["-c:v"] == "libx264"
     # The pixel formats of input and output are both given; the dictionary holds the output's.
-    assert following["-pix_fmt"] == "yuv420p"
+    assert options["-pix_fmt"] == "yuv420p"
     assert arguments.index("rgb24") < arguments.index("-i") < arguments.index("yuv420p")
     assert sorted(os.listdir(tmp_path)) == ["bin", "film.mp4"]
 
@@ -294,13 +294,13 @@ def test_mp4_decodes_to_the_frames(tmp_path):
         if "Unknown encoder" not in str(error):
             raise
         pytest.skip(f"this ffmpeg has no H.264 encoder: {error}")
-    decoded = subprocess.run(
+    raw_video = subprocess.run(
         ["ffmpeg", "-loglevel", "error", "-i", str(path)]
         + ["-vf", "scale=in_color_matrix=bt709,format=rgb24", "-f", "rawvideo", "pipe:1"],
         check=True,
         capture_output=True,
     ).stdout
-    found = np.frombuffer(decoded, np.uint8).reshape(-1, 42, 62, 3) / 255
-    assert found.shape[0] == 6
-    assert np.abs(found[:, :41, :61] - np.stack(frames)).mean() < 0.015
-    assert np.abs(found[:, :3] - 1).max() < 0.03
+    decoded_frames = np.frombuffer(raw_video, np.uint8).reshape(-1, 42, 62, 3) / 255
+    assert decoded_frames.shape[0] == 6
+    assert np.abs(decoded_frames[:, :41, :61] - np.stack(frames)).mean() < 0.015
+    assert np.abs(decoded_frames[:, :3] - 1).max() < 0.03

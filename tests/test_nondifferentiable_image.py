@@ -80,11 +80,11 @@ def test_the_near_plane_ends_a_splat_and_its_gradient():
     def mean(depth):
         return _projected(jnp.asarray(0.1), depth, _quat()).means2d[0, 0]
 
-    in_front = [
+    is_in_front = [
         bool(_projected(jnp.asarray(0.1), jnp.asarray(d), _quat()).is_in_front[0])
         for d in (0.5 - 1e-9, 0.5, 0.5 + 1e-9)
     ]
-    assert in_front == [False, False, True]
+    assert is_in_front == [False, False, True]
     # In front of the plane the slope is the true one. On the plane and behind it, the depth is 1
     # and has no slope.
     assert float(mean(0.5 + 1e-9)) == pytest.approx(8 + 20 * 0.1 / 0.5)
@@ -103,18 +103,18 @@ def test_the_clamp_of_the_field_of_view_is_continuous_with_the_mean_of_both_slop
     left, right = (one_sided(variance, jnp.asarray(edge), s) for s in (-STEP, STEP))
     assert left > 1e-2
     assert right == pytest.approx(0, abs=1e-6)
-    returned = float(jax.grad(variance)(edge))
+    gradient = float(jax.grad(variance)(edge))
     # Rounding of x / z decides on which side it is; exactly on the edge the clamp passes half.
-    assert min(abs(returned - c * left) for c in (0.0, 0.5, 1.0)) < 1e-5
+    assert min(abs(gradient - c * left) for c in (0.0, 0.5, 1.0)) < 1e-5
     # The mean itself is not clamped.
     assert_smooth_at(lambda x: _projected(x, jnp.asarray(2.0), _quat()).means2d[0, 0], [edge])
 
 
 def test_a_zero_quaternion_is_a_point_without_limit():
-    turned = jnp.array([0.6, 0.0, 0.0, 0.8])
+    quaternion = jnp.array([0.6, 0.0, 0.0, 0.8])
 
     def conic(length):
-        return _projected(jnp.asarray(0.1), jnp.asarray(2.0), length * turned).conics[0, 0]
+        return _projected(jnp.asarray(0.1), jnp.asarray(2.0), length * quaternion).conics[0, 0]
 
     assert_smooth_at(conic, [1e-3, 1.0])
     assert float(conic(1e-9)) == pytest.approx(float(conic(1.0)))
@@ -182,10 +182,10 @@ def test_below_the_alpha_threshold_a_pixel_and_its_gradient_are_zero():
         value, (slope, _, _) = seen((opacity, 0.0))
         return value, slope[0]
 
-    (above, slope), (below, none) = (alone(MIN_ALPHA * (1 + s)) for s in (1e-9, -1e-9))
+    (above, slope), (below, slope_below) = (alone(MIN_ALPHA * (1 + s)) for s in (1e-9, -1e-9))
     assert above == pytest.approx(MIN_ALPHA)
     assert slope == pytest.approx(1.0)
-    assert below == none == 0
+    assert below == slope_below == 0
     # Exactly on the threshold, rounding of exp(log) decides between the two.
     on, slope_on = alone(MIN_ALPHA)
     assert (on, slope_on) == (0.0, 0.0) or (on, slope_on) == pytest.approx((MIN_ALPHA, 1.0))
@@ -280,9 +280,9 @@ def test_culling_a_flat_splat_at_right_angles_changes_nothing_that_was_seen():
     assert float(flat(RIGHT_ANGLE - 0.2)) > 0.5
     # Coverage falls continuously, except for a last step of one alpha threshold per pixel.
     tilts = RIGHT_ANGLE - np.logspace(-1, -6, 60)
-    seen = np.array([float(flat(t)) for t in tilts])
-    assert seen[-1] == 0
-    assert np.all(-np.diff(seen) < 0.5)
+    coverages = np.array([float(flat(t)) for t in tilts])
+    assert coverages[-1] == 0
+    assert np.all(-np.diff(coverages) < 0.5)
     assert [float(flat(RIGHT_ANGLE + t)) for t in (-1e-3, 0.0, 1e-3)] == [0.0, 0.0, 0.0]
 
 
@@ -332,14 +332,14 @@ def test_the_knee_of_srgb_is_continuous_and_its_slopes_differ_by_two_percent():
 def test_the_floor_of_variances_is_no_kink_of_the_similarity():
     """The variance of a flat image is at the floor, where its own slope is zero as well."""
     rng = np.random.default_rng(0)
-    towards = jnp.asarray(rng.standard_normal((12, 12, 3)))
+    direction = jnp.asarray(rng.standard_normal((12, 12, 3)))
     flat = jnp.full((12, 12, 3), 0.4)
     textured = jnp.asarray(rng.uniform(size=(12, 12, 3)))
-    for other in (flat, flat + 0.2, textured):
+    for target in (flat, flat + 0.2, textured):
 
         @jax.jit
-        def similarity(change, other=other):
-            return ssim(flat + change * towards, other)
+        def similarity(change, target=target):
+            return ssim(flat + change * direction, target)
 
         assert_smooth_at(similarity, [0.0, 1e-3], step=1e-8, tolerance=1e-4)
 
@@ -425,8 +425,8 @@ def test_random_picks_move_with_the_count_and_carry_no_gradient():
     def slope(shift, position_gradient):
         points = jax.random.uniform(jax.random.key(3), (16, 3), jnp.float64) + shift
         mask, key = jnp.ones((16,), bool), jax.random.key(2)
-        moving = replace(spec, position_gradient=position_gradient)
-        return sum(smoothness(field, points, mask, key, box, spec=moving))
+        field_spec = replace(spec, position_gradient=position_gradient)
+        return sum(smoothness(field, points, mask, key, box, spec=field_spec))
 
     assert slope(0.0, False) == 0
     assert slope(0.0, True) != 0

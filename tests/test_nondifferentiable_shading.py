@@ -54,11 +54,15 @@ def test_roughness_has_its_upper_slope_above_the_floor_and_none_on_it():
 
 @pytest.mark.parametrize("which", ["light", "viewer"])
 def test_reflectance_jumps_at_the_horizon_and_reflected_light_does_not(which):
-    other = direction_at(jnp.asarray(0.7)) * jnp.array([[-1.0, 1.0, 1.0]])
+    fixed_direction = direction_at(jnp.asarray(0.7)) * jnp.array([[-1.0, 1.0, 1.0]])
 
     @jax.jit
     def reflectance(cosine):
-        pair = (direction_at(cosine), other) if which == "light" else (other, direction_at(cosine))
+        pair = (
+            (direction_at(cosine), fixed_direction)
+            if which == "light"
+            else (fixed_direction, direction_at(cosine))
+        )
         return bsdf.evaluate(material(), up(), *pair)[0, 1]
 
     def reflected(cosine):
@@ -139,8 +143,8 @@ def test_the_flip_of_a_normal_jumps_in_the_diffuse_part_only():
     slope = jax.jit(jax.jacfwd(sums))
     for tilt in (-1e-3, 1e-3):
         for side in (-STEP, STEP):
-            found = np.asarray(sums(tilt + side) - sums(tilt)) / side
-            np.testing.assert_allclose(slope(tilt), found, rtol=1e-4, atol=1e-5)
+            numeric_slope = np.asarray(sums(tilt + side) - sums(tilt)) / side
+            np.testing.assert_allclose(slope(tilt), numeric_slope, rtol=1e-4, atol=1e-5)
     # At right angles the specular part has its own kink, in the table: see the test below.
     right = float(sums(STEP)[0] - sums(0.0)[0]) / STEP
     np.testing.assert_allclose(slope(0.0)[0], right, rtol=1e-4)
@@ -155,15 +159,15 @@ def test_levels_of_roughness_are_kinks_and_their_ends_are_flat():
 
     read_at = lambda r: read(jnp.asarray(r))  # noqa: E731
     # Slopes within the three intervals.
-    inner = [float(jax.grad(read_at)(r)) for r in (0.15, 0.45, 0.8)]
-    for edge, width, left, right in ((0.3, 0.3, *inner[:2]), (0.6, 0.3, *inner[1:])):
-        upper = 0.3 if edge == 0.3 else 0.4
+    inner_slopes = [float(jax.grad(read_at)(r)) for r in (0.15, 0.45, 0.8)]
+    for edge, width, left, right in ((0.3, 0.3, *inner_slopes[:2]), (0.6, 0.3, *inner_slopes[1:])):
+        upper_width = 0.3 if edge == 0.3 else 0.4
         # On the border the values are those of the upper interval, and the rate of the level index
         # is the mean of both sides.
-        expected = right * upper * 0.5 * (1 / width + 1 / upper)
+        expected = right * upper_width * 0.5 * (1 / width + 1 / upper_width)
         assert_kink(read_at, edge, left=left, right=right, returned=expected, tolerance=1e-5)
-    assert_kink(read_at, 0.0, left=0.0, right=inner[0], returned="mean")
-    assert_kink(read_at, 1.0, left=inner[2], right=0.0, returned="mean")
+    assert_kink(read_at, 0.0, left=0.0, right=inner_slopes[0], returned="mean")
+    assert_kink(read_at, 1.0, left=inner_slopes[2], right=0.0, returned="mean")
     assert jax.grad(read_at)(-0.1) == jax.grad(read_at)(1.1) == 0
 
 
@@ -174,11 +178,11 @@ def test_the_fg_table_has_a_kink_at_every_node_and_flat_ends():
         return fg_lookup(table, cosine.reshape(1), jnp.array([0.4]))[0][0]
 
     read_at = jax.jit(lambda c: read(jnp.asarray(c)))
-    inner = [float(jax.grad(read_at)(c)) for c in (0.1, 0.3, 0.6, 0.9)]
-    for node, left, right in zip((0.25, 0.5, 0.75), inner, inner[1:], strict=False):
+    inner_slopes = [float(jax.grad(read_at)(c)) for c in (0.1, 0.3, 0.6, 0.9)]
+    for node, left, right in zip((0.25, 0.5, 0.75), inner_slopes, inner_slopes[1:], strict=False):
         assert_kink(read_at, node, left=left, right=right, returned="right")
-    assert_kink(read_at, 0.0, left=0.0, right=inner[0], returned="mean")
-    assert_kink(read_at, 1.0, left=inner[-1], right=0.0, returned="mean")
+    assert_kink(read_at, 0.0, left=0.0, right=inner_slopes[0], returned="mean")
+    assert_kink(read_at, 1.0, left=inner_slopes[-1], right=0.0, returned="mean")
 
 
 def test_the_light_has_kinks_at_the_centres_of_its_texels():
@@ -193,8 +197,8 @@ def test_the_light_has_kinks_at_the_centres_of_its_texels():
     centre = (0.5 - 2.5 / 8) * 2 * np.pi
     left, right = (one_sided(read, jnp.asarray(centre + s), s) for s in (-STEP, STEP))
     assert abs(left - right) > 1e-2
-    returned = float(jax.grad(read)(centre))
-    assert min(abs(returned - left), abs(returned - right)) < 1e-6
+    gradient = float(jax.grad(read)(centre))
+    assert min(abs(gradient - left), abs(gradient - right)) < 1e-6
     assert float(read(centre + 1e-9)) == pytest.approx(float(read(centre - 1e-9)), abs=1e-8)
     assert_smooth_at(read, [centre - 1e-2, centre + 1e-2])
 
@@ -207,13 +211,13 @@ def test_beyond_the_first_and_last_row_the_light_is_flat_in_elevation():
         return lookup(texels, jnp.stack([jnp.sin(polar), 0 * polar, jnp.cos(polar)])[None])[0, 0]
 
     row = np.pi / 12
-    inner = one_sided(read, jnp.asarray(row), STEP)
-    assert abs(inner) > 1e-2
+    inner_slope = one_sided(read, jnp.asarray(row), STEP)
+    assert abs(inner_slope) > 1e-2
     assert one_sided(read, jnp.asarray(row), -STEP) == pytest.approx(0, abs=1e-6)
     assert jax.grad(read)(row - 1e-3) == pytest.approx(0, abs=1e-9)
     # Exactly on the row, rounding decides on which side it is, or the clamp passes half.
-    returned = float(jax.grad(read)(row))
-    assert min(abs(returned - c * inner) for c in (0.0, 0.5, 1.0)) < 1e-5
+    gradient = float(jax.grad(read)(row))
+    assert min(abs(gradient - c * inner_slope) for c in (0.0, 0.5, 1.0)) < 1e-5
 
 
 @pytest.mark.parametrize("ratio", [0.1, 0.5, 1.0, 2.0])
@@ -226,17 +230,17 @@ def test_near_a_pole_the_gradient_of_the_azimuth_is_capped(ratio):
     cap = min(ratio, 1.0)
     np.testing.assert_allclose(slopes[0, 1], true_u * cap**2, rtol=1e-9)
     np.testing.assert_allclose(slopes[1, 0], true_v * cap, rtol=1e-9)
-    moved = direction_to_uv(point.at[1].add(1e-9))
-    found = float((moved - direction_to_uv(point))[0]) / 1e-9
-    np.testing.assert_allclose(found, true_u, rtol=1e-5)
+    moved_uv = direction_to_uv(point.at[1].add(1e-9))
+    numeric_slope = float((moved_uv - direction_to_uv(point))[0]) / 1e-9
+    np.testing.assert_allclose(numeric_slope, true_u, rtol=1e-5)
 
 
 def test_at_a_pole_the_azimuth_jumps_and_the_gradient_is_zero():
-    at_pole = jnp.array([0.0, 0.0, 1.0])
-    slopes = jax.jacfwd(direction_to_uv)(at_pole)
+    pole = jnp.array([0.0, 0.0, 1.0])
+    slopes = jax.jacfwd(direction_to_uv)(pole)
     np.testing.assert_array_equal(slopes, np.zeros((2, 3)))
-    around = [direction_to_uv(at_pole.at[0].set(s * 1e-9))[0] for s in (-1.0, 1.0)]
-    assert abs(float(around[0] - around[1])) == pytest.approx(0.5)
+    azimuths = [direction_to_uv(pole.at[0].set(s * 1e-9))[0] for s in (-1.0, 1.0)]
+    assert abs(float(azimuths[0] - azimuths[1])) == pytest.approx(0.5)
 
 
 def test_the_floor_of_the_light_is_a_projection_after_the_step_and_no_kink():
@@ -256,8 +260,8 @@ def test_the_floor_of_the_light_is_a_projection_after_the_step_and_no_kink():
         light=EnvLight(radiance - 0.5),
         log_exposure=jnp.asarray(0.0),
     )
-    still = jax.tree.map(jnp.zeros_like, params)
+    zero_directions = jax.tree.map(jnp.zeros_like, params)
     rates = dict.fromkeys(rate_groups(params), jnp.asarray(1.0))
     rule = UpdateRule(rates, jnp.asarray(0.0), jnp.asarray(0.0), jnp.asarray(0.01))
-    moved = _moved(params, still, rule).light.radiance
-    np.testing.assert_array_equal(moved, np.maximum(radiance - 0.5, 0.01))
+    new_radiance = _moved(params, zero_directions, rule).light.radiance
+    np.testing.assert_array_equal(new_radiance, np.maximum(radiance - 0.5, 0.01))

@@ -80,8 +80,8 @@ class _Varied:
     def _at(self, value):
         array = getattr(self.geometry, self.name).at[self.entry].set(value)
         geometry = replace(self.geometry, **{self.name: array})
-        where = (self.grid.origin, self.grid.cell_size)
-        return _area(geometry, *where, shape=self.grid.shape, training=self.training)
+        placement = (self.grid.origin, self.grid.cell_size)
+        return _area(geometry, *placement, shape=self.grid.shape, training=self.training)
 
     def area(self, value):
         return float(self._at(value)[0][0])
@@ -114,8 +114,8 @@ def test_where_a_vertex_changes_sign_the_surface_jumps_by_less_than_a_cell():
     assert 0.05 < _largest_gap(below.mesh, on.mesh) / float(grid.cell_size) < 1.0
     # The gradient ignores the jump: it is the slope on the side of the point itself.
     for value, side in ((-1e-3, -1), (-1e-3, 1), (1e-3, -1), (1e-3, 1), (0.0, 1)):
-        found = one_sided(varied.area, value, side * STEP)
-        np.testing.assert_allclose(varied.slope(value), found, rtol=1e-4, atol=1e-6)
+        numeric_slope = one_sided(varied.area, value, side * STEP)
+        np.testing.assert_allclose(varied.slope(value), numeric_slope, rtol=1e-4, atol=1e-6)
     assert varied.slope(0.0) != 0
 
 
@@ -137,9 +137,9 @@ def test_an_edge_without_size_is_cut_in_the_middle_and_does_not_pull():
         assert slope == 0
     # Just above the threshold the slope is the true one, of order 1 / |sdf|.
     upper = jnp.asarray(_SDF_EPSILON / 3)
-    found = one_sided(by_upper, upper, 1e-6 * _SDF_EPSILON)
-    np.testing.assert_allclose(jax.grad(by_upper)(upper), found, rtol=1e-4)
-    assert abs(found) > 1e11
+    numeric_slope = one_sided(by_upper, upper, 1e-6 * _SDF_EPSILON)
+    np.testing.assert_allclose(jax.grad(by_upper)(upper), numeric_slope, rtol=1e-4)
+    assert abs(numeric_slope) > 1e11
 
 
 def test_the_choice_of_a_diagonal_jumps_and_has_no_gradient():
@@ -161,8 +161,8 @@ def test_the_choice_of_a_diagonal_jumps_and_has_no_gradient():
     # In training, the centre of a quad blends both diagonals, and gamma has its slope at the tie.
     blended = _Varied(grid, geometry, "gamma", cell, training=True)
     for side in (-STEP, STEP):
-        found = one_sided(blended.area, 0.0, side)
-        np.testing.assert_allclose(blended.slope(0.0), found, rtol=1e-2)
+        numeric_slope = one_sided(blended.area, 0.0, side)
+        np.testing.assert_allclose(blended.slope(0.0), numeric_slope, rtol=1e-2)
     assert blended.slope(0.0) != 0
 
 
@@ -189,8 +189,8 @@ def test_raw_weights_start_on_the_kink_of_their_magnitude():
     np.testing.assert_array_equal(gradient.gamma, 0.0)  # the magnitude excludes gamma
 
     def magnitude(value):
-        moved = replace(geometry, beta=geometry.beta.at[3, 2].set(value))
-        return count * weight_magnitude(moved)
+        moved_geometry = replace(geometry, beta=geometry.beta.at[3, 2].set(value))
+        return count * weight_magnitude(moved_geometry)
 
     assert_kink(magnitude, 0.0, left=-1.0, right=1.0, returned=AT_ZERO_OF_ABS)
 
@@ -202,8 +202,8 @@ def test_entropy_jumps_where_a_vertex_changes_sign_and_is_smooth_beside():
 
     @jax.jit
     def entropy(value):
-        moved = replace(geometry, sdf=geometry.sdf.at[vertex].set(value))
-        return sdf_entropy(moved, grid, reduction="sum")
+        moved_geometry = replace(geometry, sdf=geometry.sdf.at[vertex].set(value))
+        return sdf_entropy(moved_geometry, grid, reduction="sum")
 
     # The sum has one term per crossed edge, so it jumps with their number.
     assert abs(float(entropy(0.0) - entropy(-1e-9))) > 0.1
@@ -228,8 +228,8 @@ def test_a_face_without_area_is_the_kink_of_its_area_and_has_no_gradient():
 
     assert_kink(area, 0.0, left=-0.5, right=0.5, returned=0.0)
     facing = jax.jit(lambda height: face_normals_and_areas(_triangle(height))[0][0, 2])
-    normal = [facing(h) for h in (-1e-9, 0.0, 1e-9)]
-    np.testing.assert_allclose(normal, [-1.0, 0.0, 1.0])
+    normals = [facing(h) for h in (-1e-9, 0.0, 1e-9)]
+    np.testing.assert_allclose(normals, [-1.0, 0.0, 1.0])
 
     @jax.jit
     def width(height):
@@ -263,18 +263,18 @@ def test_a_quaternion_may_change_its_sign_but_its_rotation_and_gradient_go_on():
         below, above = quaternion(jnp.asarray(angle - 1e-9)), quaternion(jnp.asarray(angle + 1e-9))
         np.testing.assert_allclose(above, sign * below, atol=1e-8)
         for turn in (-1e-9, 0.0, 1e-9):
-            at = jnp.asarray(angle + turn)
+            turned_angle = jnp.asarray(angle + turn)
             c, s = np.cos(angle + turn), np.sin(angle + turn)
             expected = [[1, 0, 0], [0, c, -s], [0, s, c]]
             slope = [[0, 0, 0], [0, -s, -c], [0, c, -s]]
-            np.testing.assert_allclose(rotation(at), expected, atol=1e-12)
-            np.testing.assert_allclose(slope_of(at), slope, atol=1e-12)
+            np.testing.assert_allclose(rotation(turned_angle), expected, atol=1e-12)
+            np.testing.assert_allclose(slope_of(turned_angle), slope, atol=1e-12)
 
 
 def test_the_tangent_frame_of_a_round_splat_jumps_and_its_image_does_not():
     def normal_at(tilt):
-        across = jnp.sqrt(1 - tilt**2)
-        return jnp.stack([0.6 * across, 0.8 * across, tilt])
+        cosine = jnp.sqrt(1 - tilt**2)
+        return jnp.stack([0.6 * cosine, 0.8 * cosine, tilt])
 
     below, above = (frame_from_normal(normal_at(jnp.asarray(t)))[0] for t in (-1e-9, 1e-9))
     assert float(jnp.sum(below * above)) < 0.5
@@ -297,9 +297,9 @@ def test_the_tangent_frame_of_a_round_splat_jumps_and_its_image_does_not():
         )
         return jnp.concatenate([footprints.conics[0], footprints.compensation])
 
-    at = [conic(jnp.asarray(t)) for t in (-1e-9, 0.0, 1e-9)]
-    np.testing.assert_allclose(at[0], at[1], atol=1e-7)
-    np.testing.assert_allclose(at[2], at[1], atol=1e-7)
+    conics = [conic(jnp.asarray(t)) for t in (-1e-9, 0.0, 1e-9)]
+    np.testing.assert_allclose(conics[0], conics[1], atol=1e-7)
+    np.testing.assert_allclose(conics[2], conics[1], atol=1e-7)
     slope = jax.jit(jax.jacfwd(conic))
     slopes = [slope(jnp.asarray(t)) for t in (-1e-9, 0.0, 1e-9)]
     np.testing.assert_allclose(slopes[0], slopes[1], rtol=1e-6, atol=1e-7)
@@ -348,10 +348,10 @@ def test_the_faces_of_the_unit_cube_pass_half_the_gradient():
 def test_a_rectifier_at_zero_passes_nothing():
     field = init_materials(jax.random.key(0), MaterialSpec(grid=GRID, albedo_hidden=(4,)))
     head = jax.tree.map(lambda x: x.astype(jnp.float64), field.albedo_head)
-    towards = jnp.array([1.0, 0.5])
+    direction = jnp.array([1.0, 0.5])
 
     def output(x):
-        return apply_mlp(head, (x * towards)[None])[0, 0]
+        return apply_mlp(head, (x * direction)[None])[0, 0]
 
     left, right = (one_sided(output, jnp.asarray(0.0), s) for s in (-STEP, STEP))
     assert_kink(output, 0.0, left=left, right=right, returned=0.0)
@@ -367,8 +367,8 @@ def test_pixels_that_agree_stand_on_the_kink_of_l1():
 
     @jax.jit
     def l1(change):
-        moved = rgb.at[0, 3, 4, 1].add(change)
-        images = compare(moved, alpha, image, jnp.zeros_like(rgb), None, srgb=False)
+        moved_rgb = rgb.at[0, 3, 4, 1].add(change)
+        images = compare(moved_rgb, alpha, image, jnp.zeros_like(rgb), None, srgb=False)
         return rgb.size * image_l1(images)
 
     assert l1(0.0) == 0
@@ -380,8 +380,8 @@ def test_light_equal_to_the_value_of_the_image_stands_on_a_kink():
     diffuse = jnp.zeros((1, 2, 2, 3))
 
     def term(change):
-        moved = diffuse.at[0, 0, 1, 2].add(change)
-        return 12 * light_agreement(moved, 0 * diffuse, jnp.asarray(0.0), image)
+        moved_diffuse = diffuse.at[0, 0, 1, 2].add(change)
+        return 12 * light_agreement(moved_diffuse, 0 * diffuse, jnp.asarray(0.0), image)
 
     assert term(0.0) == 0
     assert jax.grad(term)(0.0) == AT_ZERO_OF_ABS
@@ -393,16 +393,16 @@ def test_light_equal_to_the_value_of_the_image_stands_on_a_kink():
 def test_smoothness_of_equal_attributes_has_no_gradient_between_its_slopes():
     spec = MaterialSpec(grid=GRID, albedo_hidden=(4,), surface_hidden=(4,), shared=True)
     field = jax.tree.map(lambda x: x.astype(jnp.float64), init_materials(jax.random.key(0), spec))
-    empty = replace(field, albedo_table=jnp.zeros_like(field.albedo_table))
+    empty_field = replace(field, albedo_table=jnp.zeros_like(field.albedo_table))
     points = jax.random.uniform(jax.random.key(1), (16, 3), jnp.float64)
 
     @jax.jit
     def term(change):
         # The features form a ramp over the rows of the table, so that neighbours differ.
-        ramp = jnp.arange(empty.albedo_table.shape[0]) / empty.albedo_table.shape[0]
-        moved = replace(empty, albedo_table=change * jnp.stack([ramp, ramp], axis=-1))
+        ramp = jnp.arange(empty_field.albedo_table.shape[0]) / empty_field.albedo_table.shape[0]
+        moved_field = replace(empty_field, albedo_table=change * jnp.stack([ramp, ramp], axis=-1))
         mask, key, box = jnp.ones((16,), bool), jax.random.key(2), unit_box()
-        return sum(smoothness(moved, points, mask, key, box, spec=spec, std=0.1))
+        return sum(smoothness(moved_field, points, mask, key, box, spec=spec, std=0.1))
 
     assert term(0.0) == 0
     # Features of zero are also at the kinks of the rectifiers, which pass no gradient.

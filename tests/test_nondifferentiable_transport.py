@@ -61,7 +61,7 @@ def sky(radiance=RADIANCE):
 
 def test_the_edge_of_a_face_jumps_and_carries_no_gradient():
     """The face tilts until it hides a direction that the shading normal still sees."""
-    drawn = samples([0.0, 0.8, -0.6], [0.0, 0.0, 1.0])
+    light_samples = samples([0.0, 0.8, -0.6], [0.0, 0.0, 1.0])
     edge = float(np.arctan2(0.6, 0.8))  # tilt at which the first sample lies in the face
     normal = leaning(jnp.asarray(1.2))
 
@@ -69,8 +69,8 @@ def test_the_edge_of_a_face_jumps_and_carries_no_gradient():
     @jax.value_and_grad
     def light(tilt):
         points = point(normal, leaning(tilt))
-        hits = cast(points, jnp.moveaxis(drawn.directions, 1, 0), None)
-        return jnp.sum(gather(points, replace(drawn, hits=hits.T), sky()).diffuse_light)
+        hits = cast(points, jnp.moveaxis(light_samples.directions, 1, 0), None)
+        return jnp.sum(gather(points, replace(light_samples, hits=hits.T), sky()).diffuse_light)
 
     below, on, above = (float(light(jnp.asarray(edge + s))[0]) for s in (-1e-9, 0.0, 1e-9))
     cosine = float(normal @ jnp.asarray([0.0, 0.8, -0.6]))
@@ -83,12 +83,12 @@ def test_the_edge_of_a_face_jumps_and_carries_no_gradient():
 
 
 def test_the_horizon_of_the_shading_normal_is_a_kink():
-    drawn = samples([0.0, 1.0, 0.0])
+    light_samples = samples([0.0, 1.0, 0.0])
 
     def light(tilt):
         """Without tilt the sample lies in the horizon; with a positive tilt the normal faces it."""
         points = point(leaning(tilt), leaning(tilt))
-        return jnp.sum(gather(points, drawn, sky()).diffuse_light)
+        return jnp.sum(gather(points, light_samples, sky()).diffuse_light)
 
     slope = 3 * 2.0 * RADIANCE / np.pi
     assert_kink(light, 0.0, left=0.0, right=slope, returned="mean")
@@ -96,7 +96,7 @@ def test_the_horizon_of_the_shading_normal_is_a_kink():
 
 def test_the_flip_of_a_normal_jumps_in_the_specular_part_only():
     """A normal that faces away reflects the light from behind; its irradiance does not change."""
-    drawn = samples([0.0, 0.6, 0.8], [0.0, 0.6, -0.8])
+    light_samples = samples([0.0, 0.6, 0.8], [0.0, 0.6, -0.8])
     radiance = jnp.concatenate([jnp.full((2, 8, 3), 3.0), jnp.full((2, 8, 3), 1.0)])
     light, viewer = EnvLight(radiance), jnp.asarray([[0.0, 1.0, 0.0]])
     sampler = light_sampler(light)
@@ -104,15 +104,15 @@ def test_the_flip_of_a_normal_jumps_in_the_specular_part_only():
     @jax.jit
     def shaded(tilt):
         points = point(leaning(tilt), leaning(tilt))
-        gathered = gather(points, drawn, light)
+        gathered = gather(points, light_samples, light)
         key = jax.random.key(0)
         return reflect(
             key, points, material(), viewer, gathered, light, sampler, None, counts=COUNTS
         )
 
     def sums(tilt):
-        found = shaded(tilt)
-        return jnp.stack([jnp.sum(found.diffuse), jnp.sum(found.specular)])
+        shading = shaded(tilt)
+        return jnp.stack([jnp.sum(shading.diffuse), jnp.sum(shading.specular)])
 
     below, above = (np.asarray(sums(jnp.asarray(t))) for t in (-1e-9, 1e-9))
     assert above[0] == pytest.approx(below[0], rel=1e-6)
@@ -120,5 +120,5 @@ def test_the_flip_of_a_normal_jumps_in_the_specular_part_only():
     slope = jax.jit(jax.jacfwd(sums))
     for tilt in (-1e-2, 1e-2):
         for side in (-STEP, STEP):
-            found = np.asarray(sums(tilt + side) - sums(tilt)) / side
-            np.testing.assert_allclose(slope(tilt), found, rtol=1e-4, atol=1e-5)
+            numeric_slope = np.asarray(sums(tilt + side) - sums(tilt)) / side
+            np.testing.assert_allclose(slope(tilt), numeric_slope, rtol=1e-4, atol=1e-5)

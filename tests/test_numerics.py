@@ -61,13 +61,13 @@ def test_normalize_and_its_gradient_are_exact_over_40_decades():
 @pytest.mark.parametrize("function", [safe_norm, safe_normalize])
 def test_a_zero_row_is_zero_and_does_not_disturb_the_others(function):
     _, x = _vectors_over_decades(2)
-    keep = np.arange(len(x)) != 7
-    with_zero = np.where(keep[:, None], x, 0.0)
+    is_kept = np.arange(len(x)) != 7
+    with_zero = np.where(is_kept[:, None], x, 0.0)
     value = lambda v: jnp.sum(jnp.sin(function(v)))  # noqa: E731
     full, holed = jnp.asarray(x, jnp.float32), jnp.asarray(with_zero, jnp.float32)
-    np.testing.assert_array_equal(function(full)[keep], function(holed)[keep])
+    np.testing.assert_array_equal(function(full)[is_kept], function(holed)[is_kept])
     full_gradient, holed_gradient = jax.grad(value)(full), jax.grad(value)(holed)
-    np.testing.assert_array_equal(full_gradient[keep], holed_gradient[keep])
+    np.testing.assert_array_equal(full_gradient[is_kept], holed_gradient[is_kept])
     np.testing.assert_array_equal(function(holed)[7], 0.0)
     np.testing.assert_array_equal(holed_gradient[7], 0.0)
 
@@ -125,10 +125,12 @@ def test_square_root_is_exact_and_flat_below_zero():
 @pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0])
 def test_power_is_exact_and_flat_below_zero(exponent):
     x = jnp.asarray([-1.0, 0.0, 1e-30, 4.0, 1e30], jnp.float32)
-    positive, counts = np.maximum(np.asarray(x, np.float64), 0.0), np.asarray(x) > 0
+    positive, is_positive = np.maximum(np.asarray(x, np.float64), 0.0), np.asarray(x) > 0
     expected = np.ones(5) if exponent == 0 else positive**exponent
     np.testing.assert_allclose(safe_power(x, exponent), expected, rtol=RELATIVE)
-    slopes = np.where(counts, exponent * np.where(counts, positive, 1.0) ** (exponent - 1), 0.0)
+    slopes = np.where(
+        is_positive, exponent * np.where(is_positive, positive, 1.0) ** (exponent - 1), 0.0
+    )
     gradient = jax.grad(lambda v: jnp.sum(safe_power(v, exponent)))(x)
     np.testing.assert_allclose(gradient, slopes, rtol=RELATIVE)
 

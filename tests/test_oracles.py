@@ -62,11 +62,11 @@ def assert_gradients(got, data):
     """Compare a dictionary of gradients with the stored ones, array by array."""
     expected = unpacked(data, "grad")
     assert got.keys() == expected.keys()
-    for name, wanted in expected.items():
-        if not wanted.any():
+    for name, reference in expected.items():
+        if not reference.any():
             np.testing.assert_array_equal(got[name], 0.0, err_msg=name)
             continue
-        assert relative(got[name], wanted) < GRADIENT_TOLERANCE, name
+        assert relative(got[name], reference) < GRADIENT_TOLERANCE, name
 
 
 def puller(function):
@@ -97,12 +97,12 @@ def pull_back(function, inputs, cotangents):
 
 @pytest.mark.parametrize("name", CASES)
 def test_stored_files_are_what_the_references_say(name):
-    stored, made = load(name), CASES[name]()
-    assert stored.keys() == made.keys()
-    for key, value in made.items():
+    stored_arrays, computed_arrays = load(name), CASES[name]()
+    assert stored_arrays.keys() == computed_arrays.keys()
+    for key, value in computed_arrays.items():
         scale = max(1.0, np.abs(value).max(initial=0.0))
         np.testing.assert_allclose(
-            stored[key], value, rtol=0, atol=REPRODUCTION_TOLERANCE * scale, err_msg=key
+            stored_arrays[key], value, rtol=0, atol=REPRODUCTION_TOLERANCE * scale, err_msg=key
         )
 
 
@@ -130,9 +130,9 @@ def test_complex_steps_agree_with_differences(name):
         directions[key] = random.normal(size=gradient.shape)
         directions[key] /= np.linalg.norm(directions[key])
         expected = difference(scalar, inputs, directions, step=DIFFERENCE_STEP.get(name, 1e-3))
-        got = np.sum(gradient * directions[key])
+        actual = np.sum(gradient * directions[key])
         scale = max(np.linalg.norm(gradient), 1e-3)
-        assert abs(got - expected) < DIFFERENCE_TOLERANCE * scale, key
+        assert abs(actual - expected) < DIFFERENCE_TOLERANCE * scale, key
 
 
 # Isosurface
@@ -144,15 +144,15 @@ def test_patches_of_all_cases_are_the_closed_lines_on_the_cell():
     for case in range(256):
         inside = [bool(case >> c & 1) for c in range(8)]
         for cut_around, row in ((True, case), (False, 255 - case)):
-            walked = {frozenset(loop) for loop in flexicubes.patches(inside, cut_around)}
-            tabled = {
+            slow_patches = {frozenset(loop) for loop in flexicubes.patches(inside, cut_around)}
+            table_patches = {
                 frozenset(edges[e] for e in range(12) if bits >> e & 1)
                 for bits in PATCH_EDGES[row].tolist()
                 if bits
             }
-            assert walked == tabled, case
-        steps = [(a, (s + 1) // 2) for a, s in enumerate(PROBLEM_OFFSET[case].tolist()) if s]
-        assert flexicubes.pinched_faces(inside) == steps, case
+            assert slow_patches == table_patches, case
+        faces = [(a, (s + 1) // 2) for a, s in enumerate(PROBLEM_OFFSET[case].tolist()) if s]
+        assert flexicubes.pinched_faces(inside) == faces, case
 
 
 def face_set(faces):
@@ -191,9 +191,9 @@ def test_isosurface_equals_the_slow_one(name):
         distance, row = cKDTree(vertices[:count]).query(data["out_vertices"])
         assert distance.max() < VALUE_TOLERANCE
         assert len(set(row)) == count
-        placed = np.zeros(vertices.shape)
-        placed[row] = cotangents["vertices"]
-        _, gradient = pull(inputs, cotangents | {"vertices": placed})
+        vertex_cotangents = np.zeros(vertices.shape)
+        vertex_cotangents[row] = cotangents["vertices"]
+        _, gradient = pull(inputs, cotangents | {"vertices": vertex_cotangents})
     assert int(surface.usage["dual_vertices"]) == int(data["out_dual_count"])
     assert set(row[: int(data["out_dual_count"])]) == set(range(int(data["out_dual_count"])))
     faces = np.asarray(surface.mesh.faces)[: int(surface.mesh.face_count)]
@@ -224,9 +224,11 @@ def test_projection_equals_the_slow_one():
         )
     np.testing.assert_array_equal(np.flatnonzero(footprints.is_in_front), visible)
     for name in ("means2d", "conics", "depths", "compensation"):
-        got = np.asarray(getattr(footprints, name))[visible]
+        actual = np.asarray(getattr(footprints, name))[visible]
         scale = max(1.0, np.abs(data[f"out_{name}"]).max())
-        np.testing.assert_allclose(got, data[f"out_{name}"], rtol=0, atol=VALUE_TOLERANCE * scale)
+        np.testing.assert_allclose(
+            actual, data[f"out_{name}"], rtol=0, atol=VALUE_TOLERANCE * scale
+        )
 
 
 def test_image_and_its_gradients_equal_the_slow_ones():
@@ -236,13 +238,13 @@ def test_image_and_its_gradients_equal_the_slow_ones():
     assert min(data["gap_cut"], data["gap_clamp"]) > 1e-6
 
     def draw(inputs):
-        image, alpha, needed = rasterize(
+        image, alpha, usage = rasterize(
             **inputs,
             is_eligible=jnp.ones(inputs["means"].shape[0], bool),
             capacities=ROOM,
             **SPLAT_FRAME,
         )
-        return {"image": image, "alpha": alpha, "usage": needed}
+        return {"image": image, "alpha": alpha, "usage": usage}
 
     with double_precision():
         values, gradient = pull_back(draw, unpacked(data, "in"), unpacked(data, "cotangent"))
@@ -256,9 +258,9 @@ def test_image_and_its_gradients_equal_the_slow_ones():
 
 
 def assert_values(got, data):
-    for name, wanted in unpacked(data, "out").items():
+    for name, reference in unpacked(data, "out").items():
         np.testing.assert_allclose(
-            got[name], wanted, rtol=VALUE_TOLERANCE, atol=VALUE_TOLERANCE, err_msg=name
+            got[name], reference, rtol=VALUE_TOLERANCE, atol=VALUE_TOLERANCE, err_msg=name
         )
 
 
@@ -278,8 +280,8 @@ def test_splats_of_a_mesh_equal_the_slow_ones():
                 f"{preset}_scales": splats.scales,
                 f"{preset}_normals": splats.normals,
             }
-        rounds = vertex_splats(mesh, inputs["normals"], constants=CODE)
-        return result | {"vertex_radii": rounds.scales[:, 0]}
+        round_splats = vertex_splats(mesh, inputs["normals"], constants=CODE)
+        return result | {"vertex_radii": round_splats.scales[:, 0]}
 
     with double_precision():
         values, gradient = pull_back(outputs, unpacked(data, "in"), unpacked(data, "cotangent"))
@@ -309,7 +311,7 @@ def test_reflectance_equals_the_slow_one():
     assert_gradients(gradient, data)
     # Mirror-like rows dominate the norm, so every row must also agree by itself.
     for name in gradient:
-        for got, wanted in zip(np.asarray(gradient[name]), data[f"grad_{name}"], strict=True):
-            assert np.linalg.norm(got - wanted) <= GRADIENT_TOLERANCE * max(
-                1.0, np.linalg.norm(wanted)
+        for actual, reference in zip(np.asarray(gradient[name]), data[f"grad_{name}"], strict=True):
+            assert np.linalg.norm(actual - reference) <= GRADIENT_TOLERANCE * max(
+                1.0, np.linalg.norm(reference)
             )

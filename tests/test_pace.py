@@ -22,11 +22,11 @@ def paced(seconds, total):
     """Estimates of the time left, before and after each of some items that took ``seconds``."""
     clock = Clock()
     pace = TimeLeft(clock)
-    found = [pace.left(0, total)]
-    for done, length in enumerate(seconds, 1):
+    estimates = [pace.left(0, total)]
+    for done_count, length in enumerate(seconds, 1):
         clock.now += length
-        found.append(pace.left(done, total))
-    return found
+        estimates.append(pace.left(done_count, total))
+    return estimates
 
 
 def test_the_first_item_which_compiles_says_nothing_of_the_others():
@@ -49,11 +49,11 @@ def test_items_that_are_told_together_share_their_time():
 
 
 def test_counting_goes_from_nothing_to_all():
-    told = []
-    found = list(counted("abc", "letters", lambda *words: told.append(words)))
-    assert found == ["a", "b", "c"]
-    assert told == [("letters", done, 3) for done in range(4)]
-    assert list(counted("abc", "letters", None)) == found
+    calls = []
+    items = list(counted("abc", "letters", lambda *words: calls.append(words)))
+    assert items == ["a", "b", "c"]
+    assert calls == [("letters", done_count, 3) for done_count in range(4)]
+    assert list(counted("abc", "letters", None)) == items
 
 
 @pytest.mark.parametrize(
@@ -68,8 +68,8 @@ def test_a_log_file_gets_the_beginning_the_end_and_a_line_now_and_then(capsys, m
     clock = Clock()
     monkeypatch.setattr(display.time, "perf_counter", clock)
     with display.WorkDisplay(bars=False) as show:
-        for done in range(8):
-            show("views", done, 7)
+        for done_count in range(8):
+            show("views", done_count, 7)
             clock.now += 4.0
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "views: 0 of 7, the first one compiles"
@@ -83,10 +83,10 @@ def test_a_terminal_shows_a_bar_for_each_part(capsys):
         show("views", 0, 2)
         show("views", 2, 2)
         show("mesh", 1, 1)
-    said = capsys.readouterr().err
-    assert "views" in said
-    assert "2/2" in said
-    assert "mesh" in said
+    output = capsys.readouterr().err
+    assert "views" in output
+    assert "2/2" in output
+    assert "mesh" in output
 
 
 def test_a_compilation_is_announced_with_its_usual_time_and_then_with_the_last(capsys, monkeypatch):
@@ -107,10 +107,10 @@ def test_a_compilation_is_announced_with_its_usual_time_and_then_with_the_last(c
         clock.now += 33.0
         show.on_step(progress)
         show.on_compile("monte_carlo")
-    said = capsys.readouterr().err
-    assert "compiling stage split_sum, usually" in said
-    assert "measuring the pace" in said
-    assert "compiling stage monte_carlo, the last took 33 s" in said
+    output = capsys.readouterr().err
+    assert "compiling stage split_sum, usually" in output
+    assert "measuring the pace" in output
+    assert "compiling stage monte_carlo, the last took 33 s" in output
 
 
 def test_the_steps_become_a_table_in_which_nothing_is_lost(tmp_path):

@@ -99,23 +99,25 @@ def html(tmp_path_factory):
 @pytest.fixture
 def small(monkeypatch):
     """Pages without the large scripts, which take a second to parse."""
-    whole = page._web
-    monkeypatch.setattr(page, "_web", lambda name: "" if name.endswith("min.js") else whole(name))
+    read_web_file = page._web
+    monkeypatch.setattr(
+        page, "_web", lambda name: "" if name.endswith("min.js") else read_web_file(name)
+    )
 
 
 def test_the_page_says_why_the_model_is_what_it_is(tmp_path, small):
-    evaluated = make_run(tmp_path / "duck")
-    assert "Model</h2>" not in report_html([evaluated])
+    run = make_run(tmp_path / "duck")
+    assert "Model</h2>" not in report_html([run])
     path = tmp_path / "duck" / "run.json"
-    found = {"gain": 1.25, "standard_error": 0.5, "spread": 0.0}
+    measurement = {"gain": 1.25, "standard_error": 0.5, "spread": 0.0}
     rung = {"part": "metallic", "title": "metallic", "smaller": 30.0, "larger": 31.25}
     rungs = [
-        {**rung, "found": found, "is_kept": True, "note": ""},
+        {**rung, "found": measurement, "is_kept": True, "note": ""},
         {**rung, "title": "shift", "found": None, "is_kept": False, "note": "<x>"},
     ]
     model = {"rungs": rungs, "by_hand": [], "held_back": ["a", "b"], "trainings": 7, "seconds": 9.0}
     path.write_text(json.dumps({**json.loads(path.read_text()), "model": model}))
-    html = report_html([evaluated])
+    html = report_html([run])
     cells = ["metallic", "30.00 dB", "31.25 dB", "+1.25 +- 0.50 dB", "kept"]
     assert "".join(f"<td>{cell}</td>" for cell in cells) in html
     assert "<td>shift</td><td>30.00 dB</td><td>-</td><td>-</td><td>left out: &lt;x&gt;</td>" in html
@@ -163,19 +165,19 @@ def test_the_page_holds_the_object_its_pictures_and_its_numbers(html):
         assert len(stack.findall("input[@type='range']")) == 1
     captions = [caption.text for caption in tree.findall(".//figcaption")]
     assert captions == ["error", "albedo", "seen by", "truth", "found"]
-    said = texts_of(tree)
-    for words in (
+    page_text = texts_of(tree)
+    for phrase in (
         *("31.2500", "PSNR", "dB", "degrees", "Protocol geosplatting", "New light: noon"),
         *("12,345 triangles", "32 of 40 were asked", "none: 25.0 %", "2,500 MB", "a note"),
         *("run.seed", "jax 0.10", "Licences of the embedded", "took 600 s"),
     ):
-        assert words in said, words
+        assert phrase in page_text, phrase
     data = json.loads(tree.find(".//script[@id='data']").text)
     (run,) = data["runs"]
     assert run["step"][-1] == STEPS - 1
     assert [len(run[key]) for key in ("loss", "psnr", "splats", "memory")] == [len(run["step"])] * 4
     assert [stage["name"] for stage in run["stages"]] == ["split_sum", "monte_carlo"]
-    assert "n-th step is drawn" in said
+    assert "n-th step is drawn" in page_text
 
 
 @pytest.mark.usefixtures("small")
@@ -209,7 +211,7 @@ def test_several_runs_are_compared_and_the_better_figure_is_marked(tmp_path):
     assert marks["normal.mae_masked_deg"] == [True, False]
     assert [cell.text for cell in rows["albedo.psnr"]] == ["–", "20.0000"]
     assert marks["albedo.psnr"] == [False, False]
-    assert [head.text for head in tree.findall(".//h2[@class='run']")] == ["a/run", "b/run"]
+    assert [heading.text for heading in tree.findall(".//h2[@class='run']")] == ["a/run", "b/run"]
 
 
 @pytest.mark.usefixtures("small")
@@ -232,9 +234,9 @@ def test_a_run_without_an_evaluation_has_a_page_that_says_so(tmp_path):
     run = make_run(tmp_path / "run")
     (run.results / "metrics.json").unlink()
     shutil.rmtree(run.results / "evaluation")
-    said = texts_of(parsed(report_html([run])))
-    assert "Not evaluated yet" in said
-    assert "took 600 s" in said
+    page_text = texts_of(parsed(report_html([run])))
+    assert "Not evaluated yet" in page_text
+    assert "took 600 s" in page_text
 
 
 @pytest.mark.usefixtures("small")
@@ -266,10 +268,10 @@ def test_the_command_writes_the_page_beside_the_run(tmp_path, capsys):
     assert main(["report", str(runs[0].folder)]) == 0
     assert "report.html" in capsys.readouterr().out
     assert (tmp_path / "a" / "report.html").stat().st_size > 1_000_000
-    both = [str(run.folder) for run in runs]
-    assert main(["report", *both]) == 2
+    run_folders = [str(run.folder) for run in runs]
+    assert main(["report", *run_folders]) == 2
     assert "needs --output" in capsys.readouterr().err
-    assert main(["report", *both, "--output", str(tmp_path / "both.html")]) == 0
+    assert main(["report", *run_folders, "--output", str(tmp_path / "both.html")]) == 0
     assert "2 runs compared" in (tmp_path / "both.html").read_text()
     assert main(["report", str(tmp_path)]) == 2
     assert "is not a run" in capsys.readouterr().err
@@ -289,8 +291,8 @@ def test_the_command_writes_the_page_beside_the_run(tmp_path, capsys):
     ],
 )
 def test_figures_have_names_and_units(key, group, label, unit, better):
-    found = figure(key)
-    assert (found.group, found.label, found.unit, found.better) == (group, label, unit, better)
+    entry = figure(key)
+    assert (entry.group, entry.label, entry.unit, entry.better) == (group, label, unit, better)
 
 
 def test_the_command_of_the_report_makes_the_same_settings():
@@ -301,29 +303,29 @@ def test_the_command_of_the_report_makes_the_same_settings():
     record = {"scene": "/a b", "dataset": {"downscale": 2, "light": "x y", "bounds": None}}
     text, is_whole = command(record, config)
     assert is_whole
-    words = re.findall(r"--set '?([^ ']+)", text)
-    assert make_config("default", "draft", overrides=tuple(words)) == config
+    assignments = re.findall(r"--set '?([^ ']+)", text)
+    assert make_config("default", "draft", overrides=tuple(assignments)) == config
     assert "'/a b'" in text
     assert "--light 'x y'" in text
     assert "--bounds" not in text
     # If no option of the command expresses a setting, the command counts as incomplete.
-    for more in ({"train_views": 4}, {"layout": "colmap"}, {"mask_files": False}):
-        reading = {**record["dataset"], **more}
-        assert not command({**record, "dataset": reading}, config)[1]
+    for extra_options in ({"train_views": 4}, {"layout": "colmap"}, {"mask_files": False}):
+        dataset = {**record["dataset"], **extra_options}
+        assert not command({**record, "dataset": dataset}, config)[1]
 
 
 def test_settings_between_two_levels_are_said_beside_the_standard_ones():
     """Such settings come from a budget, and no quality level names them."""
     config = between_qualities(0.6)
-    changed = changed_from_preset(config)
-    assert changed["geometry.resolution"] == (48, config.geometry.resolution)
-    assert "quality" not in changed
+    changes = changed_from_preset(config)
+    assert changes["geometry.resolution"] == (48, config.geometry.resolution)
+    assert "quality" not in changes
     text, is_whole = command({"scene": "s", "dataset": {}}, config)
     assert is_whole
     assert "--quality standard" in text
-    words = re.findall(r"--set '?([^ ']+)", text)
-    again = make_config("default", "standard", overrides=tuple(words))
-    assert replace(again, quality=config.quality) == config
+    assignments = re.findall(r"--set '?([^ ']+)", text)
+    rebuilt_config = make_config("default", "standard", overrides=tuple(assignments))
+    assert replace(rebuilt_config, quality=config.quality) == config
 
 
 def test_the_command_of_a_run_from_a_mesh_names_the_file(tmp_path):
@@ -341,8 +343,8 @@ def test_the_command_of_a_run_from_a_mesh_names_the_file(tmp_path):
 def test_settings_that_options_cannot_say_are_not_pretended(monkeypatch):
     config = make_config("default", "draft", overrides=("run.seed=3",))
     assert command({"scene": "s", "dataset": {}}, config)[1]
-    for unsayable in ("nothing", "7"):  # one is refused, the other read as another value
-        monkeypatch.setattr(facts, "as_written", lambda value, text=unsayable: text)
+    for spelling in ("nothing", "7"):  # one is refused, the other read as another value
+        monkeypatch.setattr(facts, "as_written", lambda value, text=spelling: text)
         text, is_whole = command({"scene": "s", "dataset": {}}, config)
         assert not is_whole
         assert "--set" not in text
@@ -368,9 +370,9 @@ def test_different_indirect_light_under_new_lights_is_said(tmp_path):
         metrics["relight_indirect"] = indirect
         (tmp_path / name / "metrics.json").write_text(json.dumps(metrics))
         runs.append(Evaluated.of(RunFolder(tmp_path / name)))
-    told = "relit with different indirect light"
-    assert told not in report_html(runs[:2])
-    assert told in report_html(runs)
+    warning = "relit with different indirect light"
+    assert warning not in report_html(runs[:2])
+    assert warning in report_html(runs)
 
 
 def test_long_curves_are_thinned_and_keep_their_ends():
@@ -378,10 +380,10 @@ def test_long_curves_are_thinned_and_keep_their_ends():
         {"step": n, "stage": "a", "loss": float("nan"), "psnr": 1.0, "splats": 1, "seconds": 2.0}
         for n in range(2001)
     ]
-    found = curves(lines)
-    assert found["every"] == 3
-    assert (found["step"][0], found["step"][-1]) == (0, 2000)
-    assert set(found["loss"]) == {None}
+    thinned_curves = curves(lines)
+    assert thinned_curves["every"] == 3
+    assert (thinned_curves["step"][0], thinned_curves["step"][-1]) == (0, 2000)
+    assert set(thinned_curves["loss"]) == {None}
     assert stage_times(lines)[0]["seconds"] == 4002.0
     assert curves([])["step"] == []
 

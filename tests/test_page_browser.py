@@ -73,10 +73,10 @@ ASK = """<script>
 
 
 def browser():
-    found = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None:
+    executable = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if executable is None:
         pytest.skip(f"no browser: none of {', '.join(BROWSERS)} is on the PATH")
-    return found
+    return executable
 
 
 def ball(points):
@@ -88,15 +88,15 @@ def ball(points):
 
 def asked(command, page):
     """Return the answer of the page; None where the browser closed it before there was one."""
-    printed = subprocess.run(
+    dom = subprocess.run(
         [*command, "--virtual-time-budget=60000", "--dump-dom", page.as_uri()],
         capture_output=True,
         text=True,
         timeout=120,
         check=True,
     ).stdout
-    found = re.search(r'<pre id="answer">(.*?)</pre>', printed, re.DOTALL)
-    return json.loads(found[1]) if found else None
+    match = re.search(r'<pre id="answer">(.*?)</pre>', dom, re.DOTALL)
+    return json.loads(match[1]) if match else None
 
 
 @pytest.mark.slow
@@ -108,12 +108,14 @@ def test_the_page_works_in_a_browser(tmp_path):
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     export_mesh_glb(glb, vertices, faces, 2 * vertices, ball, texture_size=64)
     html = report_html([run])
-    asking = html.replace("<head>", f"<head>{LISTEN}", 1).replace("</body>", f"{ASK}</body>")
+    instrumented_html = html.replace("<head>", f"<head>{LISTEN}", 1).replace(
+        "</body>", f"{ASK}</body>"
+    )
     page = tmp_path / "asking.html"
-    page.write_text(asking)
+    page.write_text(instrumented_html)
     # Virtual time does not wait for rendering, so on a busy machine some attempts come too early.
-    for number in range(5):
-        answer = asked([command, *FLAGS, f"--user-data-dir={tmp_path / str(number)}"], page)
+    for attempt in range(5):
+        answer = asked([command, *FLAGS, f"--user-data-dir={tmp_path / str(attempt)}"], page)
         if answer is not None and answer["colors"] > 50:
             break
     assert answer is not None, "the page did not answer"

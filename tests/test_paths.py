@@ -42,14 +42,14 @@ class Plates(RayIndex):
     def nearest(self, origins, directions, source, mask, *, two_sided=False):
         height = directions[:, 2]
         distance = 1.0 / jnp.maximum(jnp.abs(height), 1e-3)
-        place = origins[:, :2] + distance[:, None] * directions[:, :2]
+        positions = origins[:, :2] + distance[:, None] * directions[:, :2]
         # Holes are squares with sides of .01, placed by an integer hash, which no compiler rounds.
-        x, y = jnp.floor(100.0 * place).astype(jnp.int32).T
-        mixed = x * jnp.int32(73856093) ^ y * jnp.int32(19349663)
-        mixed = (mixed ^ (mixed >> 13)) * jnp.int32(1274126177)
-        is_there = ((mixed >> 8 & 0xFFFF) < int(COVER * 65536)) | (height < 0)
+        x, y = jnp.floor(100.0 * positions).astype(jnp.int32).T
+        hashes = x * jnp.int32(73856093) ^ y * jnp.int32(19349663)
+        hashes = (hashes ^ (hashes >> 13)) * jnp.int32(1274126177)
+        is_solid = ((hashes >> 8 & 0xFFFF) < int(COVER * 65536)) | (height < 0)
         face = jnp.where(height > 0, 1, 0).astype(jnp.int32)
-        is_hit = mask & is_there
+        is_hit = mask & is_solid
         return jnp.where(is_hit, distance, jnp.inf), jnp.where(is_hit, face, -1)
 
     def occluded(self, origins, directions, source, mask, *, two_sided=False):
@@ -58,13 +58,13 @@ class Plates(RayIndex):
 
 def plate_points(count=POINTS, seed=0):
     """Points on the floor, except for the last one, which is on the ceiling."""
-    places = np.random.default_rng(seed).uniform(-3, 3, (count, 3))
-    places[:, 2], places[-1, 2] = 0, 1
+    positions = np.random.default_rng(seed).uniform(-3, 3, (count, 3))
+    positions[:, 2], positions[-1, 2] = 0, 1
     normals = np.tile([0.0, 0, 1], (count, 1))
     normals[-1] *= -1
     faces = np.zeros(count, np.int32)
     faces[-1] = 1
-    vectors = (jnp.asarray(x, jnp.float32) for x in (places, normals, normals))
+    vectors = (jnp.asarray(x, jnp.float32) for x in (positions, normals, normals))
     return SurfacePoints(*vectors, jnp.asarray(faces), jnp.ones(count, bool))
 
 
@@ -117,16 +117,16 @@ def paths():
     """Segments of paths of three vertices that start on the floor, with ``wo`` and the mask."""
     wo, _, _ = (x.reshape(-1, *x.shape[2:]) for x in ceiling_hits())
     starts = jnp.repeat(plate_points().positions, RAYS, axis=0)
-    faces, real = jnp.zeros(len(wo), jnp.int32), jnp.ones(len(wo), bool)
-    draw = jax.jit(lambda tracer: tracer.draw(starts, faces, wo, real))
-    return draw(tracer(3)), wo, real
+    faces, mask = jnp.zeros(len(wo), jnp.int32), jnp.ones(len(wo), bool)
+    draw = jax.jit(lambda tracer: tracer.draw(starts, faces, wo, mask))
+    return draw(tracer(3)), wo, mask
 
 
 @pytest.fixture(scope="module")
 def radiance(paths):
     """Radiance that paths bring, by their number of vertices."""
-    legs, wo, real = paths
-    run = jax.jit(lambda tracer: [tracer.evaluate(legs[:k], wo, real) for k in (1, 3)])
+    legs, wo, mask = paths
+    run = jax.jit(lambda tracer: [tracer.evaluate(legs[:k], wo, mask) for k in (1, 3)])
     return dict(zip((1, 3), map(np.asarray, run(tracer(3))), strict=True))
 
 
@@ -137,8 +137,8 @@ def test_light_between_plates_is_the_partial_sum_of_its_bounces(radiance, vertic
     assert error < 0.005
     assert abs(values.mean() - expected(vertices)[1]) <= STANDARD_ERRORS * error
     if vertices == 3:
-        for wrong in (expected(1)[1], expected(5)[1], expected(3, 0.95 * ALBEDO)[1]):
-            assert abs(values.mean() - wrong) > STANDARD_ERRORS * error
+        for wrong_mean in (expected(1)[1], expected(5)[1], expected(3, 0.95 * ALBEDO)[1]):
+            assert abs(values.mean() - wrong_mean) > STANDARD_ERRORS * error
 
 
 def test_the_error_falls_as_the_root_of_the_number_of_paths(radiance):
@@ -152,63 +152,65 @@ def test_the_error_falls_as_the_root_of_the_number_of_paths(radiance):
 
 
 def test_white_plates_send_out_no_more_than_they_receive(paths):
-    legs, wo, real = paths
-    found = jax.jit(lambda tracer: tracer.evaluate(legs, wo, real))(tracer(3, albedo=1.0))
-    assert 0.3 < float(jnp.mean(found)) < 1.0
+    legs, wo, mask = paths
+    values = jax.jit(lambda tracer: tracer.evaluate(legs, wo, mask))(tracer(3, albedo=1.0))
+    assert 0.3 < float(jnp.mean(values)) < 1.0
 
 
 def test_only_rays_that_hit_go_on_and_each_gets_its_own_light():
     """Rays that hit the ceiling bring its radiance; the others bring nothing."""
     wi, hits, distances = ceiling_hits()
-    one = tracer(2)
-    brought = jax.jit(lambda tracer: tracer.followed(plate_points(), wi, hits, distances).values)
-    found = np.asarray(brought(one))
+    path_tracer = tracer(2)
+    follow = jax.jit(lambda tracer: tracer.followed(plate_points(), wi, hits, distances).values)
+    ray_radiance = np.asarray(follow(path_tracer))
     is_hit = np.asarray(hits) >= 0
-    np.testing.assert_array_equal(found[~is_hit], 0.0)
-    values = found[is_hit][:, 1]
+    np.testing.assert_array_equal(ray_radiance[~is_hit], 0.0)
+    values = ray_radiance[is_hit][:, 1]
     error = values.std() / np.sqrt(len(values))
     assert abs(values.mean() - expected(2)[0]) <= STANDARD_ERRORS * error
     with pytest.raises(ValueError, match="nearest hits"):
-        one.followed(plate_points(), wi, hits, None)
+        path_tracer.followed(plate_points(), wi, hits, None)
 
 
 def test_without_rays_nothing_is_followed_and_rows_that_are_no_points_are_not():
     wi, hits, distances = ceiling_hits()
-    none = tracer(2).followed(plate_points(), wi[:, :0], hits[:, :0], distances[:, :0])
-    assert none.values.shape == (POINTS, 0, 3)
-    half = jnp.arange(POINTS) < POINTS // 2
-    points = eqx.tree_at(lambda p: p.mask, plate_points(), half)
-    found = tracer(2).followed(points, wi, hits, distances).values
-    np.testing.assert_array_equal(found[POINTS // 2 :], 0.0)
-    assert float(jnp.max(found[: POINTS // 2])) > 0
+    empty_result = tracer(2).followed(plate_points(), wi[:, :0], hits[:, :0], distances[:, :0])
+    assert empty_result.values.shape == (POINTS, 0, 3)
+    is_first_half = jnp.arange(POINTS) < POINTS // 2
+    points = eqx.tree_at(lambda p: p.mask, plate_points(), is_first_half)
+    values = tracer(2).followed(points, wi, hits, distances).values
+    np.testing.assert_array_equal(values[POINTS // 2 :], 0.0)
+    assert float(jnp.max(values[: POINTS // 2])) > 0
 
 
 def test_what_is_differentiated_at_later_vertices_is_a_setting(paths):
-    legs, wo, real = paths
-    base = tracer(1)
+    legs, wo, mask = paths
+    base_tracer = tracer(1)
 
     def total(inputs, gradient):
         table, light = inputs
-        one = replace(base, table=table, light=light, gradient=gradient)
-        return jnp.sum(one.evaluate(legs[:1], wo, real))
+        path_tracer = replace(base_tracer, table=table, light=light, gradient=gradient)
+        return jnp.sum(path_tracer.evaluate(legs[:1], wo, mask))
 
     run = jax.jit(jax.value_and_grad(total), static_argnums=1)
-    inputs = (base.table, base.light)
+    inputs = (base_tracer.table, base_tracer.light)
     for gradient, moves_light, moves_table in (
         ("none", False, False),
         ("light", True, False),
         ("all", True, True),
     ):
-        value, (by_table, by_light) = run(inputs, gradient)
+        value, (table_gradient, light_gradient) = run(inputs, gradient)
         assert float(value) != 0.0
         # The result is linear in the light, and in the albedo of a single vertex.
-        parts = (
-            (by_light.radiance * base.light.radiance, moves_light),
-            (by_table.materials.albedo * base.table.materials.albedo, moves_table),
+        products = (
+            (light_gradient.radiance * base_tracer.light.radiance, moves_light),
+            (table_gradient.materials.albedo * base_tracer.table.materials.albedo, moves_table),
         )
-        for part, moves in parts:
-            assert float(jnp.sum(part)) == pytest.approx(float(value) if moves else 0.0, rel=1e-4)
-        assert bool(jnp.any(by_table.normals != 0)) == moves_table
+        for product, moves in products:
+            assert float(jnp.sum(product)) == pytest.approx(
+                float(value) if moves else 0.0, rel=1e-4
+            )
+        assert bool(jnp.any(table_gradient.normals != 0)) == moves_table
 
 
 def test_a_face_is_the_mean_of_its_points_and_black_without_any():
@@ -230,11 +232,15 @@ def test_a_face_is_the_mean_of_its_points_and_black_without_any():
     table = jax.jit(face_table, static_argnums=2)(points, materials, 5)
     assert isinstance(table, FaceTable)
     for face in (0, 2, 3):
-        own = (faces == face) & mask
-        assert own.any()
-        np.testing.assert_allclose(table.materials.albedo[face], albedo[own].mean(0), rtol=1e-5)
-        np.testing.assert_allclose(table.materials.metallic[face], metallic[own].mean(), rtol=1e-5)
-        mean = normals[own].mean(0)
+        is_on_face = (faces == face) & mask
+        assert is_on_face.any()
+        np.testing.assert_allclose(
+            table.materials.albedo[face], albedo[is_on_face].mean(0), rtol=1e-5
+        )
+        np.testing.assert_allclose(
+            table.materials.metallic[face], metallic[is_on_face].mean(), rtol=1e-5
+        )
+        mean = normals[is_on_face].mean(0)
         np.testing.assert_allclose(table.normals[face], mean / np.linalg.norm(mean), rtol=1e-5)
     for face in (1, 4):
         for values in jax.tree.leaves(table):
@@ -253,8 +259,8 @@ def test_settings_name_what_they_refuse_and_survive_json():
     ]:
         with pytest.raises(ValueError, match=message):
             PathSettings(**values)
-    chosen = PathSettings(bounce_count=5, later_gradient="all", light_count=3)
-    assert from_plain(Holder, to_plain(Holder(chosen))).transport == chosen
+    path_settings = PathSettings(bounce_count=5, later_gradient="all", light_count=3)
+    assert from_plain(Holder, to_plain(Holder(path_settings))).transport == path_settings
 
 
 def test_a_stage_chooses_paths_and_they_say_what_they_need():
@@ -263,9 +269,9 @@ def test_a_stage_chooses_paths_and_they_say_what_they_need():
         "stages.monte_carlo.transport.bounce_count=3",
         "stages.monte_carlo.transport.later_gradient=light",
     )
-    found = config.stage("monte_carlo").transport
-    assert found == PathSettings(bounce_count=3, later_gradient="light")
-    transport = found.build(LightSpec())
+    path_settings = config.stage("monte_carlo").transport
+    assert path_settings == PathSettings(bounce_count=3, later_gradient="light")
+    transport = path_settings.build(LightSpec())
     assert transport.needs_key
     assert transport.uses_rays
     assert transport.needs_every_point
@@ -273,7 +279,7 @@ def test_a_stage_chooses_paths_and_they_say_what_they_need():
     assert (images.light_count, images.bounce_count, images.later_gradient) == (7, 3, "none")
     residual = transport.for_residual()
     assert (residual.settings.specular_count, residual.settings.bounce_count) == (2, 3)
-    assert replace(found, residual_count=0).build(LightSpec()).for_residual() is None
+    assert replace(path_settings, residual_count=0).build(LightSpec()).for_residual() is None
     attributes = Attributes(one_material(POINTS), None, None)
     with pytest.raises(ValueError, match="key"):
         transport.prepare(None, plate_points(), attributes, white_sky(), Plates())

@@ -77,66 +77,71 @@ def test_values_are_those_of_the_files_to_the_bit(capture, bits, suffix):
         np.testing.assert_array_equal(image, values_of_files(folder, name, suffix))
     # Only pixels of the object are stored: three colours in the bit depth of the file, and alpha in
     # 8 bits.
-    covered = len(train) * 20 * 24
-    assert train.images.nbytes == covered * (3 * bits // 8 + 1)
+    covered_count = len(train) * 20 * 24
+    assert train.images.nbytes == covered_count * (3 * bits // 8 + 1)
 
 
 def test_what_does_not_fit_is_read_again_and_its_alpha_is_not(capture, monkeypatch):
     folder = capture()
-    whole = np.asarray(read(folder).train.images)
+    expected_images = np.asarray(read(folder).train.images)
     monkeypatch.setitem(KEPT_BYTES, "train", 3 * 20 * 24 * 3)
     train = read(folder).train
     images = train.images
     assert images.read_again_count == len(train) - 3
-    np.testing.assert_array_equal(images, whole)
-    np.testing.assert_array_equal(images[[4, 1]], whole[[4, 1]])
+    np.testing.assert_array_equal(images, expected_images)
+    np.testing.assert_array_equal(images[[4, 1]], expected_images[[4, 1]])
     for file in (folder / "images").iterdir():
         file.unlink()
-    np.testing.assert_array_equal(train.alphas, whole[..., 3])
+    np.testing.assert_array_equal(train.alphas, expected_images[..., 3])
     with pytest.raises(SceneError, match=r"images/.*\.png does not exist"):
         np.asarray(images)
 
 
 def test_reduced_and_undistorted_photographs_are_read_again_alike(capture, monkeypatch):
     folder = capture(lens={"k1": 0.3})
-    kept = read(folder, downscale=2).train
-    assert kept.valid is not None
+    kept_views = read(folder, downscale=2).train
+    assert kept_views.valid is not None
     monkeypatch.setitem(KEPT_BYTES, "train", 0)
-    again = read(folder, downscale=2).train
-    assert (kept.images.read_again_count, again.images.read_again_count) == (0, len(again))
-    np.testing.assert_array_equal(kept.images, again.images)
-    np.testing.assert_array_equal(kept.valid, again.valid)
+    reread_views = read(folder, downscale=2).train
+    assert (kept_views.images.read_again_count, reread_views.images.read_again_count) == (
+        0,
+        len(reread_views),
+    )
+    np.testing.assert_array_equal(kept_views.images, reread_views.images)
+    np.testing.assert_array_equal(kept_views.valid, reread_views.valid)
 
 
 def test_windows_and_exposures_are_parts_and_quotients_of_the_whole(capture):
     train = read(capture(lens={"k1": 0.3})).train
     windows, share = around_object(train, largest=0.9)
     assert share < 0.9
-    moved = (train.intrinsics - windows.intrinsics)[:, :2, 2].astype(int)
-    for index, (column, row) in enumerate(moved):
+    offsets = (train.intrinsics - windows.intrinsics)[:, :2, 2].astype(int)
+    for index, (column, row) in enumerate(offsets):
         rows, columns = slice(row, row + windows.height), slice(column, column + windows.width)
         np.testing.assert_array_equal(windows.images[index], train.images[index][rows, columns])
         np.testing.assert_array_equal(windows.valid[index], train.valid[index][rows, columns])
     assert windows.images.nbytes == train.images.nbytes
     camera = RefinedCamera(np.eye(4), train.intrinsics[0], 1.25, 0.0, 0.0, 1, True)
     split = RefinedSplit(WIDTH, HEIGHT, dict.fromkeys(train.names, camera))
-    exposed = with_cameras(train, split, "file").images
-    np.testing.assert_array_equal(exposed[2][..., :3], train.images[2][..., :3] / np.float32(1.25))
-    np.testing.assert_array_equal(exposed[2][..., 3], train.images[2][..., 3])
+    exposed_images = with_cameras(train, split, "file").images
+    np.testing.assert_array_equal(
+        exposed_images[2][..., :3], train.images[2][..., :3] / np.float32(1.25)
+    )
+    np.testing.assert_array_equal(exposed_images[2][..., 3], train.images[2][..., 3])
 
 
 def photographs(rng, shape=(4, 7, 9)):
     """Photographs whose stored parts lie anywhere, one of them empty; and the same as an array."""
-    whole = np.zeros((*shape, 4), np.float32)
-    whole[0, 2:5, 3:9] = rng.random((3, 6, 4), np.float32) + 0.1
-    whole[1] = rng.random(shape[1:] + (4,), np.float32) + 0.1
-    whole[3, :1, :1] = 0.5
-    parts = PartsInMemory(len(whole), 10_000)
-    for index, image in enumerate(whole):
+    array = np.zeros((*shape, 4), np.float32)
+    array[0, 2:5, 3:9] = rng.random((3, 6, 4), np.float32) + 0.1
+    array[1] = rng.random(shape[1:] + (4,), np.float32) + 0.1
+    array[3, :1, :1] = 0.5
+    parts = PartsInMemory(len(array), 10_000)
+    for index, image in enumerate(array):
         parts.add(index, Part.of(image[..., :3], image[..., 3]))
     return parts.photographs(
         *shape[1:], read=lambda index: pytest.fail("read again"), threads=1
-    ), whole
+    ), array
 
 
 KEYS = [0, -1, np.int64(2), slice(None), slice(1, 3), slice(0, 0), [2, 0], np.array([3, 3])]
@@ -146,21 +151,21 @@ KEYS += [(..., 3), (slice(None), 2), (1, 4), (slice(0, 2), 1, 2), (np.array([0, 
 
 @pytest.mark.parametrize("key", KEYS, ids=str)
 def test_indexing_is_that_of_an_array(key):
-    stack, whole = photographs(np.random.default_rng(0))
-    np.testing.assert_array_equal(stack[key], whole[key])
+    stack, array = photographs(np.random.default_rng(0))
+    np.testing.assert_array_equal(stack[key], array[key])
     assert stack[key].dtype == np.float32
 
 
 def test_windows_may_reach_beyond_a_part_or_miss_it():
-    stack, whole = photographs(np.random.default_rng(1))
+    stack, array = photographs(np.random.default_rng(1))
     corners = np.array([[1, 2], [3, 4], [0, 0], [2, 3]])
     windows = stack.windows(corners, 3, 4)
     for index, (row, column) in enumerate(corners):
-        expected = whole[index, row : row + 3, column : column + 4]
+        expected = array[index, row : row + 3, column : column + 4]
         np.testing.assert_array_equal(windows[index], expected)
         np.testing.assert_array_equal(windows.alphas[index], expected[..., 3])
-    twice = windows.windows(np.ones((4, 2), int), 2, 2)
-    np.testing.assert_array_equal(twice, np.asarray(windows)[:, 1:3, 1:3])
+    nested_windows = windows.windows(np.ones((4, 2), int), 2, 2)
+    np.testing.assert_array_equal(nested_windows, np.asarray(windows)[:, 1:3, 1:3])
     with pytest.raises(IndexError):
         stack[4]
 
@@ -180,6 +185,6 @@ def test_an_array_of_images_is_looked_at_and_not_copied(capture):
     train = read(capture()).train
     array = np.asarray(train.images)
     windows, _ = around_object(replace(train, images=array), largest=0.9)
-    again, _ = around_object(train, largest=0.9)
-    np.testing.assert_array_equal(windows.images, again.images)
+    expected_windows, _ = around_object(train, largest=0.9)
+    np.testing.assert_array_equal(windows.images, expected_windows.images)
     assert Photographs.of(array).nbytes == array.nbytes

@@ -71,16 +71,18 @@ def test_large_pictures_are_reduced_in_proportion(monkeypatch):
 
 def test_titles_labels_notes_and_light_add_room_and_ink():
     rows = [{"truth": flat(0.5, 100, 100), "render": flat(0.7, 100, 100)}] * 3
-    plain = pictures.overview_sheet(rows)
+    plain_sheet = pictures.overview_sheet(rows)
     light = np.ones((16, 32, 3), np.float32)
-    full = pictures.overview_sheet(
+    full_sheet = pictures.overview_sheet(
         rows, lights={"light": light}, title="Spot", row_labels=["0", "1", "2"], notes=["PSNR 30"]
     )
-    assert full.shape[0] >= plain.shape[0] + 100
-    assert full.shape[1] > plain.shape[1]
-    title = full[: pictures._TITLE_HEIGHT, :80]
+    assert full_sheet.shape[0] >= plain_sheet.shape[0] + 100
+    assert full_sheet.shape[1] > plain_sheet.shape[1]
+    title = full_sheet[: pictures._TITLE_HEIGHT, :80]
     assert np.any(title > 0.5)
-    np.testing.assert_array_equal(find(full, [0.7] * 3)[1] - find(full, [0.7] * 3)[0], 308)
+    np.testing.assert_array_equal(
+        find(full_sheet, [0.7] * 3)[1] - find(full_sheet, [0.7] * 3)[0], 308
+    )
 
 
 def test_columns_are_as_wide_as_their_names():
@@ -95,13 +97,13 @@ def test_columns_are_as_wide_as_their_names():
 def test_scales_and_several_lights_stand_below_with_their_titles():
     rows = [{name: flat(0.5, 64, 100) for name in "abcd"}]
     lights = {"true light": flat(0.1, 8, 16), "light": flat(0.2, 8, 16)}
-    plain = pictures.overview_sheet(rows)
+    plain_sheet = pictures.overview_sheet(rows)
     sheet = pictures.overview_sheet(rows, lights=lights, scales=[ERROR])
     # Each light is exposed by itself, so that both have the same grey here.
     strips = find(sheet, pictures.tone_map_light(lights["light"])[0, 0])
     assert strips[3] - strips[2] > 2 * 200
     bar = find(sheet, ERROR.colors[-1])
-    assert bar[0] > strips[1] > plain.shape[0] - 2 * pictures._MARGIN
+    assert bar[0] > strips[1] > plain_sheet.shape[0] - 2 * pictures._MARGIN
     ink = np.any(sheet[bar[0] : bar[1], bar[3] + 4 : bar[3] + 60] != SHEET, axis=-1)
     assert ink.any()
 
@@ -122,16 +124,16 @@ def test_normals_map_to_the_usual_colors_at_any_length():
     expected = [[0.5, 0.5, 1], [0, 0.5, 0.5], [0.5, 1, 0.5]]
     np.testing.assert_allclose(colors[0, :3], expected, atol=1e-6)
     np.testing.assert_allclose(colors[0, 3], CELL, atol=1e-6)
-    half = pictures.normals_to_rgb(0.5 * normals, np.full((1, 4), 0.5, np.float32))
-    np.testing.assert_allclose(half[0, 0], (np.array([0.5, 0.5, 1]) + CELL) / 2, atol=1e-6)
+    half_colors = pictures.normals_to_rgb(0.5 * normals, np.full((1, 4), 0.5, np.float32))
+    np.testing.assert_allclose(half_colors[0, 0], (np.array([0.5, 0.5, 1]) + CELL) / 2, atol=1e-6)
 
 
 def sphere_normals(size=64):
     x, y = (np.stack(np.meshgrid(np.arange(size), np.arange(size))) + 0.5) / size * 2 - 1
-    inside = x**2 + y**2 < 1
+    is_inside = x**2 + y**2 < 1
     z = -np.sqrt(np.maximum(1 - x**2 - y**2, 0))
-    normals = np.where(inside[..., None], np.stack([x, y, z], -1), 0).astype(np.float32)
-    return normals, inside.astype(np.float32)
+    normals = np.where(is_inside[..., None], np.stack([x, y, z], -1), 0).astype(np.float32)
+    return normals, is_inside.astype(np.float32)
 
 
 def test_clay_is_lit_from_the_upper_left_and_finite():
@@ -146,18 +148,18 @@ def test_clay_is_lit_from_the_upper_left_and_finite():
 def test_light_display_does_not_depend_on_its_unit(scale):
     rng = np.random.default_rng(0)
     radiance = rng.lognormal(size=(8, 16, 3)).astype(np.float32)
-    shown = pictures.tone_map_light(radiance)
+    display = pictures.tone_map_light(radiance)
     np.testing.assert_allclose(
-        pictures.tone_map_light(radiance * np.float32(scale)), shown, atol=1e-4
+        pictures.tone_map_light(radiance * np.float32(scale)), display, atol=1e-4
     )
-    assert 0.2 < shown.mean() < 0.8
+    assert 0.2 < display.mean() < 0.8
 
 
 def test_light_display_survives_suns_and_darkness():
     radiance = np.full((8, 16, 3), 0.1, np.float32)
     radiance[2, 3] = 1e5
-    shown = pictures.tone_map_light(radiance)
-    assert np.all(np.isfinite(shown))
-    assert shown[2, 3].min() == pytest.approx(1.0)
-    assert 0.3 < shown[0, 0, 0] < 0.7
+    display = pictures.tone_map_light(radiance)
+    assert np.all(np.isfinite(display))
+    assert display[2, 3].min() == pytest.approx(1.0)
+    assert 0.3 < display[0, 0, 0] < 0.7
     assert not pictures.tone_map_light(np.zeros((4, 8, 3), np.float32)).any()

@@ -80,9 +80,9 @@ def problem(*overrides, stage="monte_carlo"):
         log_exposure=jnp.asarray(0.1),
     )
     views = sphere_views(2, size=14)
-    everywhere = jnp.ones(views.images.shape[:3])
+    all_valid = jnp.ones(views.images.shape[:3])
     batch = Batch(
-        views.camera([0, 1]), jnp.asarray(views.images), jax.random.key(1), valid=everywhere
+        views.camera([0, 1]), jnp.asarray(views.images), jax.random.key(1), valid=all_valid
     )
     return config, replace(pipeline, capacities=TIGHT), params, batch
 
@@ -146,32 +146,34 @@ def test_the_loss_is_finite_and_pulls_on_everything(stage):
 
 def test_a_larger_weight_is_a_larger_share_and_compiles_nothing(stage):
     _, pipeline, params, batch, ((total, report), _) = stage
-    before = evaluate._cache_size()
+    cache_size = evaluate._cache_size()
     weights = {**pipeline.weights, "mask": pipeline.weights["mask"] + 1.0}
-    (other, _), _ = evaluate(replace(pipeline, weights=weights), params, batch)
-    assert float(other - total) == pytest.approx(float(report.terms["mask"]), rel=1e-3, abs=1e-6)
-    assert evaluate._cache_size() == before
+    (larger_total, _), _ = evaluate(replace(pipeline, weights=weights), params, batch)
+    assert float(larger_total - total) == pytest.approx(
+        float(report.terms["mask"]), rel=1e-3, abs=1e-6
+    )
+    assert evaluate._cache_size() == cache_size
 
 
 def test_the_key_decides_every_sample(stage):
-    settings, pipeline, params, batch, first = stage
-    again = evaluate(pipeline, params, batch)
-    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
+    settings, pipeline, params, batch, first_result = stage
+    second_result = evaluate(pipeline, params, batch)
+    for a, b in zip(jax.tree.leaves(first_result), jax.tree.leaves(second_result), strict=True):
         np.testing.assert_array_equal(a, b)
     (total, report), _ = evaluate(pipeline, params, replace(batch, key=jax.random.key(5)))
-    before = first[0][1].terms
-    assert float(total) != float(first[0][0])
+    first_terms = first_result[0][1].terms
+    assert float(total) != float(first_result[0][0])
     # Background and smoothness are random; the surface is not, nor is light without samples.
-    assert float(report.terms["mask"]) == float(before["mask"])
-    assert float(report.terms["deviation"]) == float(before["deviation"])
+    assert float(report.terms["mask"]) == float(first_terms["mask"])
+    assert float(report.terms["deviation"]) == float(first_terms["deviation"])
     is_sampled = settings.name == "monte_carlo"
-    assert (float(report.terms["light"]) != float(before["light"])) is is_sampled
+    assert (float(report.terms["light"]) != float(first_terms["light"])) is is_sampled
 
 
 def test_the_report_of_several_views_is_their_mean_with_the_larger_needs():
     def report(value, hits, chunks):
-        needs = {"hits": jnp.int32(hits), "chunks": jnp.int32(chunks)}
-        return ViewReport({"l1": jnp.float32(value)}, jnp.float32(10 * value), needs)
+        usage = {"hits": jnp.int32(hits), "chunks": jnp.int32(chunks)}
+        return ViewReport({"l1": jnp.float32(value)}, jnp.float32(10 * value), usage)
 
     share = jnp.float32(0.5)
     mean = report(1.0, 7, 2).times(share).plus(report(3.0, 5, 9).times(share))
@@ -183,13 +185,13 @@ def test_the_report_of_several_views_is_their_mean_with_the_larger_needs():
 def test_what_is_in_pixels_that_do_not_count_does_not_matter(second):
     _, pipeline, params, batch = second
     valid = batch.valid.at[:, :5].set(0.0)
-    found = []
-    for spoilt in (0.0, jnp.nan, jnp.inf):
-        image = jnp.where(valid[..., None] > 0, batch.image, spoilt)
-        changed = replace(batch, image=image, valid=valid)
-        (total, report), gradient = evaluate(pipeline, params, changed)
-        found.append(jax.tree.leaves((total, report.psnr, gradient)))
-    for leaves in zip(*found, strict=True):
+    results = []
+    for filler in (0.0, jnp.nan, jnp.inf):
+        image = jnp.where(valid[..., None] > 0, batch.image, filler)
+        changed_batch = replace(batch, image=image, valid=valid)
+        (total, report), gradient = evaluate(pipeline, params, changed_batch)
+        results.append(jax.tree.leaves((total, report.psnr, gradient)))
+    for leaves in zip(*results, strict=True):
         assert np.all(np.isfinite(leaves[0]))
         np.testing.assert_array_equal(leaves[0], leaves[1])
         np.testing.assert_array_equal(leaves[0], leaves[2])
@@ -199,21 +201,21 @@ def test_the_near_plane_is_measured_in_the_box():
     """The near plane scales with the box, so that results do not depend on units."""
     pipeline, _ = ball(tiny_config("geometry.resolution=6"))
     camera = views_from([[2.0, 0.0, 0.0]]).camera([0])
-    near = pipeline.raster.near * float(pipeline.surface.box.half_extent)
-    assert abs(near / pipeline.raster.near - 1.0) > 0.2
-    depths = np.array([0.9, 1.1]) * near
+    near_distance = pipeline.raster.near * float(pipeline.surface.box.half_extent)
+    assert abs(near_distance / pipeline.raster.near - 1.0) > 0.2
+    depths = np.array([0.9, 1.1]) * near_distance
     means = jnp.asarray([[2.0 - depth, 0.0, 0.0] for depth in depths], jnp.float32)
-    ones = jnp.ones((2, 3), jnp.float32)
-    found = pipeline.project(means, jnp.ones((2, 4), jnp.float32), ones, camera)
-    np.testing.assert_allclose(found.depths, depths, rtol=1e-3)
-    np.testing.assert_array_equal(found.is_in_front, [False, True])
+    scales = jnp.ones((2, 3), jnp.float32)
+    footprints = pipeline.project(means, jnp.ones((2, 4), jnp.float32), scales, camera)
+    np.testing.assert_allclose(footprints.depths, depths, rtol=1e-3)
+    np.testing.assert_array_equal(footprints.is_in_front, [False, True])
 
 
 def test_an_unknown_term_is_refused_by_name(second):
     _, pipeline, params, batch = second
-    wrong = replace(pipeline, weights={"colour": jnp.float32(1.0)})
+    wrong_pipeline = replace(pipeline, weights={"colour": jnp.float32(1.0)})
     with pytest.raises(ValueError, match="unknown term of the loss 'colour'; expected some of"):
-        jax.eval_shape(wrong.loss, params, batch)
+        jax.eval_shape(wrong_pipeline.loss, params, batch)
 
 
 def test_unknown_aovs_are_refused_before_anything_is_built(second):
@@ -224,16 +226,18 @@ def test_unknown_aovs_are_refused_before_anything_is_built(second):
 
 def test_an_empty_surface_shows_the_background_and_has_zero_gradient():
     _, pipeline, params, batch = problem(stage="split_sum")
-    gone = replace(params, geometry=replace(params.geometry, sdf=jnp.abs(params.geometry.sdf) + 1))
+    empty_params = replace(
+        params, geometry=replace(params.geometry, sdf=jnp.abs(params.geometry.sdf) + 1)
+    )
     # Regularisers of the surface's weights have a gradient with and without a surface.
     weights = {**pipeline.weights, "weights": jnp.float32(0.0)}
-    (total, report), gradient = evaluate(replace(pipeline, weights=weights), gone, batch)
+    (total, report), gradient = evaluate(replace(pipeline, weights=weights), empty_params, batch)
     assert np.isfinite(total)
     assert int(report.splat_count) == 0
     assert float(report.terms["indirect"]) == 0.0
     for leaf in jax.tree.leaves(gradient):
         np.testing.assert_array_equal(np.asarray(leaf), 0.0)
-    output = draw(pipeline, gone, batch.camera, aov_names=AOVS)
+    output = draw(pipeline, empty_params, batch.camera, aov_names=AOVS)
     np.testing.assert_array_equal(np.asarray(output.alpha), 0.0)
     np.testing.assert_array_equal(np.asarray(output.rgb), 0.0)
 
@@ -247,11 +251,11 @@ def test_eq_18_takes_what_the_specular_lobe_really_adds():
         aovs["diffuse"], aovs["specular_radiance"], params.log_exposure, batch.image
     )
     assert float(report.terms["light"]) == pytest.approx(float(expected), rel=1e-5)
-    inside = np.asarray(batch.image[..., 3]) > 0.5
-    added, mirrored = (
-        np.asarray(aovs[n])[inside].mean() for n in ("specular_radiance", "specular")
+    is_inside = np.asarray(batch.image[..., 3]) > 0.5
+    added_light, mirrored_light = (
+        np.asarray(aovs[n])[is_inside].mean() for n in ("specular_radiance", "specular")
     )
-    assert 0 < added < 0.8 * mirrored
+    assert 0 < added_light < 0.8 * mirrored_light
 
 
 def test_a_rendered_sphere_covers_its_disc_and_its_normals_face_the_camera():
@@ -263,8 +267,8 @@ def test_a_rendered_sphere_covers_its_disc_and_its_normals_face_the_camera():
     assert alpha[0, 0] == 0.0
     # Four pixels around the middle are averaged, since cells are as large as pixels here.
     normal = np.asarray(output.aovs["normal"][0, 6:8, 6:8]).sum((0, 1)) / alpha[6:8, 6:8].sum()
-    towards = np.asarray(batch.camera.centers[0])
-    assert normal @ towards / np.linalg.norm(towards) > 0.9
+    camera_center = np.asarray(batch.camera.centers[0])
+    assert normal @ camera_center / np.linalg.norm(camera_center) > 0.9
 
 
 def with_settings(pipeline, **changes):
@@ -279,18 +283,18 @@ def test_a_residual_of_its_own_has_its_own_samples(second):
     """The loss has the value of the second image; terms without samples keep their gradient."""
     _, pipeline, params, batch = second
     (total, report), gradient = evaluate(pipeline, params, batch)
-    apart = with_settings(pipeline, residual_count=1)
-    (other_total, other), other_gradient = evaluate(apart, params, batch)
-    assert float(other.terms["l1"]) != float(report.terms["l1"])
+    residual_pipeline = with_settings(pipeline, residual_count=1)
+    (other_total, other_report), other_gradient = evaluate(residual_pipeline, params, batch)
+    assert float(other_report.terms["l1"]) != float(report.terms["l1"])
     assert float(other_total) != float(total)
     # Eq. 18 and the mask term use the image that is differentiated.
     for name in ("light", "mask"):
-        assert float(other.terms[name]) == pytest.approx(float(report.terms[name]), rel=1e-6)
+        assert float(other_report.terms[name]) == pytest.approx(float(report.terms[name]), rel=1e-6)
     for name, group in groups_of(other_gradient).items():
-        before = np.concatenate([np.ravel(x) for x in jax.tree.leaves(groups_of(gradient)[name])])
-        after = np.concatenate([np.ravel(x) for x in jax.tree.leaves(group)])
-        assert np.all(np.isfinite(after)), name
-        assert np.any(before != after), name
+        values = np.concatenate([np.ravel(x) for x in jax.tree.leaves(groups_of(gradient)[name])])
+        other_values = np.concatenate([np.ravel(x) for x in jax.tree.leaves(group)])
+        assert np.all(np.isfinite(other_values)), name
+        assert np.any(values != other_values), name
 
 
 @pytest.mark.slow
@@ -304,8 +308,8 @@ def test_a_residual_of_its_own_takes_the_bias_from_the_gradient(second):
     _, pipeline, params, batch = second
     params = replace(params, light=EnvLight(0.3 * params.light.radiance))
     keys = jax.random.split(jax.random.key(11), 300)
-    exact = with_settings(pipeline, light_count=32, diffuse_count=32, specular_count=32)
-    images = [draw(exact, params, batch.camera, key=key) for key in keys[:24]]
+    exact_pipeline = with_settings(pipeline, light_count=32, diffuse_count=32, specular_count=32)
+    images = [draw(exact_pipeline, params, batch.camera, key=key) for key in keys[:24]]
     alpha = images[0].alpha
     mean = jnp.mean(jnp.stack([image.rgb for image in images]), axis=0)
     mean = jnp.exp(params.log_exposure) * mean / jnp.maximum(alpha[..., None], 1e-6)
@@ -324,18 +328,18 @@ def test_a_residual_of_its_own_takes_the_bias_from_the_gradient(second):
         @jax.jit
         def pull(pipeline, key):
             def total(light):
-                seen = replace(batch, image=photograph, key=key)
-                return pipeline.loss(replace(params, light=light), seen)[0]
+                photograph_batch = replace(batch, image=photograph, key=key)
+                return pipeline.loss(replace(params, light=light), photograph_batch)[0]
 
             return jnp.sum(params.light.radiance * jax.grad(total)(params.light).radiance)
 
         return np.array([float(pull(noisy, key)) for key in keys])
 
-    same, apart = pulls(0), pulls(1)
+    shared_pulls, separate_pulls = pulls(0), pulls(1)
     # Both use the same samples for the derivative, so the difference cancels their noise.
-    bias = same - apart
+    bias = shared_pulls - separate_pulls
     assert bias.mean() > 3 * bias.std() / np.sqrt(len(keys))
-    assert abs(apart.mean()) < 3.5 * apart.std() / np.sqrt(len(keys))
+    assert abs(separate_pulls.mean()) < 3.5 * separate_pulls.std() / np.sqrt(len(keys))
 
 
 DIFFERENCES = {
@@ -360,14 +364,16 @@ def test_the_gradient_of_the_whole_loss_agrees_with_differences(kind):
         assert bool(fits(report.usage, TIGHT))
 
         def total(material, light, exposure):
-            moved = replace(params, material=material, light=light, log_exposure=exposure)
-            return value_of(pipeline, moved, batch)[0]
+            moved_params = replace(params, material=material, light=light, log_exposure=exposure)
+            return value_of(pipeline, moved_params, batch)[0]
 
-        point = (params.material, params.light, params.log_exposure)
+        parameters = (params.material, params.light, params.log_exposure)
         slopes = (gradient.material, gradient.light, gradient.log_exposure)
-        leaves, structure = jax.tree.flatten(point)
-        paths = [jax.tree_util.keystr(p) for p, _ in jax.tree_util.tree_flatten_with_path(point)[0]]
-        checked = 0
+        leaves, structure = jax.tree.flatten(parameters)
+        paths = [
+            jax.tree_util.keystr(p) for p, _ in jax.tree_util.tree_flatten_with_path(parameters)[0]
+        ]
+        checked_count = 0
         for index, (path, leaf, slope) in enumerate(
             zip(paths, leaves, jax.tree.leaves(slopes), strict=True)
         ):
@@ -377,24 +383,24 @@ def test_the_gradient_of_the_whole_loss_agrees_with_differences(kind):
             step = 1e-6
 
             def at(size, index=index, direction=direction):
-                moved = list(leaves)
-                moved[index] = moved[index] + size * direction
-                return float(total(*jax.tree.unflatten(structure, moved)))
+                moved_leaves = list(leaves)
+                moved_leaves[index] = moved_leaves[index] + size * direction
+                return float(total(*jax.tree.unflatten(structure, moved_leaves)))
 
-            found = (at(step) - at(-step)) / (2 * step)
+            difference = (at(step) - at(-step)) / (2 * step)
             expected = float(jnp.sum(slope * direction))
-            assert found == pytest.approx(expected, rel=1e-5, abs=2e-9), path
-            checked += abs(expected) > 1e-5
-        assert checked >= 5
+            assert difference == pytest.approx(expected, rel=1e-5, abs=2e-9), path
+            checked_count += abs(expected) > 1e-5
+        assert checked_count >= 5
 
 
-def _in_double(parts):
+def _in_double(tree):
     """Floats of pipeline, parameters and batch as float64."""
 
     def convert(leaf):
         return jnp.asarray(leaf, jnp.float64) if leaf.dtype == jnp.float32 else leaf
 
-    return jax.tree.map(convert, parts)
+    return jax.tree.map(convert, tree)
 
 
 def _free_direction(kind, path, direction):
@@ -424,15 +430,15 @@ def test_a_step_that_lacks_room_for_rays_changes_nothing_and_succeeds_with_it(se
         rule = update_rule(config, settings, params, 0)
         return train_step(state, batch, replace(pipeline, capacities=capacities), rule)
 
-    cramped = TIGHT.resized(cell_patches=64)
-    state, report = step(cramped)
+    small_capacities = TIGHT.resized(cell_patches=64)
+    state, report = step(small_capacities)
     assert not bool(report.fits)
     assert int(state.step) == 0
     for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(initial_state(params)), strict=True):
         np.testing.assert_array_equal(a, b)
-    needed = report.loss.usage
-    assert overflowed(needed, cramped) == ["cell_patches"]
-    state, report = step(grow(cramped, needed))
+    usage = report.loss.usage
+    assert overflowed(usage, small_capacities) == ["cell_patches"]
+    state, report = step(grow(small_capacities, usage))
     assert bool(report.fits)
     assert bool(report.finite)
     assert int(state.step) == 1

@@ -38,13 +38,13 @@ def photograph(pose, texture):
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
     rays = np.stack([x / FOCAL, -y / FOCAL, -np.ones_like(x)], -1) @ pose[:3, :3].T
     origin = pose[:3, 3]
-    ground, wall = -origin[2] / rays[..., 2], (0.8 - origin[1]) / rays[..., 1]
-    depths = [np.where(depth > 0, depth, np.inf) for depth in (ground, wall)]
+    ground_depth, wall_depth = -origin[2] / rays[..., 2], (0.8 - origin[1]) / rays[..., 1]
+    depths = [np.where(depth > 0, depth, np.inf) for depth in (ground_depth, wall_depth)]
     depth = np.minimum(np.minimum(*depths), 50.0)
-    point = origin + depth[..., None] * rays
-    shift = np.where(depths[0] < depths[1], point[..., 1], 3.0 + point[..., 2])
-    where = np.stack([40.0 * (point[..., 0] + 4.0), 40.0 * (shift + 3.0)])
-    return map_coordinates(texture, where, order=1, mode="wrap")
+    points = origin + depth[..., None] * rays
+    shift = np.where(depths[0] < depths[1], points[..., 1], 3.0 + points[..., 2])
+    texel_positions = np.stack([40.0 * (points[..., 0] + 4.0), 40.0 * (shift + 3.0)])
+    return map_coordinates(texture, texel_positions, order=1, mode="wrap")
 
 
 @pytest.fixture(scope="module")
@@ -63,9 +63,9 @@ def room(tmp_path_factory):
 def found_room(room):
     """The room with its cameras, the report on them, and the progress of the search."""
     pytest.importorskip("pycolmap")
-    parts = []
-    report = find_poses(room, on_progress=lambda *done: parts.append(done))
-    return room, report, parts
+    updates = []
+    report = find_poses(room, on_progress=lambda *done: updates.append(done))
+    return room, report, updates
 
 
 def refuses(root, message, error=SceneError, **arguments):
@@ -141,23 +141,25 @@ def test_photographs_stored_on_their_side_are_turned_up():
     pose = level_poses(np.array([[0.0, -1.0, 0.0]]))[0]
     # In orientation 6 the left column of the stored pixels is the top; in 8 the right one is.
     for orientation, axis, sign in ((1, 1, 1), (3, 1, -1), (6, 0, -1), (8, 0, 1)):
-        stored = _upright(pose, orientation)
-        np.testing.assert_allclose(stored[:3, 1], sign * pose[:3, axis], atol=1e-12)
-        assert np.linalg.det(stored[:3, :3]) == pytest.approx(1.0)
+        stored_pose = _upright(pose, orientation)
+        np.testing.assert_allclose(stored_pose[:3, 1], sign * pose[:3, axis], atol=1e-12)
+        assert np.linalg.det(stored_pose[:3, :3]) == pytest.approx(1.0)
 
 
 def test_photographs_of_a_room_give_its_cameras(found_room):
-    room, report, parts = found_room
+    room, report, updates = found_room
     assert (report.registered, report.missing) == (COUNT, ())
     assert report.error < 0.6
-    assert [part for part, done, total in parts if done == total] == [*report.seconds]
+    assert [phase for phase, done_count, total in updates if done_count == total] == [
+        *report.seconds
+    ]
     dataset = load_dataset(room)
     assert dataset.layout == "colmap"
     views = dataset.train
     # Both sets of cameras are aligned to the same world, so that they can be compared directly.
-    true = moved(cameras(), align_world(cameras(), np.zeros((1, 3))))
-    chosen = [int(name) for name in views.names]
-    np.testing.assert_allclose(views.camera_to_world, true[chosen], atol=DISTANCE)
+    true_poses = moved(cameras(), align_world(cameras(), np.zeros((1, 3))))
+    view_indices = [int(name) for name in views.names]
+    np.testing.assert_allclose(views.camera_to_world, true_poses[view_indices], atol=DISTANCE)
     assert views.intrinsics[0, 0, 0] == pytest.approx(FOCAL, rel=DISTANCE)
 
 
@@ -165,10 +167,10 @@ def test_the_same_photographs_give_the_same_model(found_room, tmp_path):
     room, _, _ = found_room
     for path in (room / "images").iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
-    first = {path.name: path.read_bytes() for path in (room / "sparse" / "0").iterdir()}
+    expected_files = {path.name: path.read_bytes() for path in (room / "sparse" / "0").iterdir()}
     find_poses(tmp_path)
-    found = {path.name: path.read_bytes() for path in (tmp_path / "sparse" / "0").iterdir()}
-    assert found == first
+    files = {path.name: path.read_bytes() for path in (tmp_path / "sparse" / "0").iterdir()}
+    assert files == expected_files
     assert len(load_dataset(tmp_path).train) == 7
 
 

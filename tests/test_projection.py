@@ -91,10 +91,10 @@ def test_covariance_is_the_linearised_image_of_the_splat(x64):
     np.testing.assert_allclose(yy, expected[:, 1, 1], rtol=1e-10)
     np.testing.assert_allclose(footprints.means2d, jax.vmap(pixel)(means), rtol=1e-12)
     # A splat that is spread over a larger area is fainter by the ratio of the areas.
-    sharp = expected - LOW_PASS_VARIANCE * jnp.eye(2)[None]
-    shares = jnp.linalg.det(sharp) / jnp.linalg.det(expected)
-    np.testing.assert_allclose(footprints.compensation**2, shares, rtol=1e-6, atol=1e-12)
-    assert float(jnp.min(shares)) < 0.9
+    sharp_covariances = expected - LOW_PASS_VARIANCE * jnp.eye(2)[None]
+    area_ratios = jnp.linalg.det(sharp_covariances) / jnp.linalg.det(expected)
+    np.testing.assert_allclose(footprints.compensation**2, area_ratios, rtol=1e-6, atol=1e-12)
+    assert float(jnp.min(area_ratios)) < 0.9
 
 
 def test_conic_inverts_the_covariance(x64):
@@ -108,19 +108,21 @@ def test_conic_inverts_the_covariance(x64):
 
 def test_flat_splats_keep_their_digits_in_float32():
     means, quats, scales = random_splats(2, 200, jnp.float32)
-    flat = scales * jnp.array([[1.0, 1.0, 1e-4]], jnp.float32)
+    flat_scales = scales * jnp.array([[1.0, 1.0, 1e-4]], jnp.float32)
     settings = camera(jnp.float32)
-    footprints = project(means, quats, flat, **settings)
+    footprints = project(means, quats, flat_scales, **settings)
     # The reference is the same in float64 NumPy, with the determinant as a cross product.
     rotation = np.asarray(quaternion_to_matrix(quats), np.float64)
-    axes = rotation * np.asarray(flat, np.float64)[:, None, :]
-    point = np.asarray(means, np.float64) + np.array([0, 0, 3.0])
+    axes = rotation * np.asarray(flat_scales, np.float64)[:, None, :]
+    points = np.asarray(means, np.float64) + np.array([0, 0, 3.0])
     focal = np.asarray(settings["intrinsics"], np.float64)[[0, 1], [0, 1]]
-    slope = point[:, :2] / point[:, 2:]
-    row = (focal / point[:, 2:])[..., None] * (axes[:, :2] - slope[..., None] * axes[:, 2:])
-    sharp = np.sum(np.cross(row[:, 0], row[:, 1]) ** 2, -1)
+    slope = points[:, :2] / points[:, 2:]
+    row = (focal / points[:, 2:])[..., None] * (axes[:, :2] - slope[..., None] * axes[:, 2:])
+    determinants = np.sum(np.cross(row[:, 0], row[:, 1]) ** 2, -1)
     trace = np.sum(row**2, axis=(1, 2))
-    expected = np.sqrt(sharp / (sharp + LOW_PASS_VARIANCE * trace + LOW_PASS_VARIANCE**2))
+    expected = np.sqrt(
+        determinants / (determinants + LOW_PASS_VARIANCE * trace + LOW_PASS_VARIANCE**2)
+    )
     np.testing.assert_allclose(footprints.compensation, expected, rtol=1e-4, atol=1e-6)
 
 

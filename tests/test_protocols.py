@@ -83,13 +83,15 @@ def test_tensoir_takes_the_scale_from_twenty_views():
     # A view between the twenty does not count under `tensoir`, but does under `irgs`.
     truth = flat([0.5, 0.5, 0.5], (41, 1, 1))
     truth[1::2] = 1.0
-    ones = np.ones((41, 1, 1), np.float32)
+    coverage = np.ones((41, 1, 1), np.float32)
     albedo = flat([0.25, 0.25, 0.25], (41, 1, 1))
     truth[40] = 1.0
     np.testing.assert_allclose(
-        protocol_metrics.albedo_scale(TENSOIR, albedo, ones, truth, ones), 2.0
+        protocol_metrics.albedo_scale(TENSOIR, albedo, coverage, truth, coverage), 2.0
     )
-    np.testing.assert_allclose(protocol_metrics.albedo_scale(IRGS, albedo, ones, truth, ones), 4.0)
+    np.testing.assert_allclose(
+        protocol_metrics.albedo_scale(IRGS, albedo, coverage, truth, coverage), 4.0
+    )
 
 
 @pytest.mark.parametrize("name", PICTURES)
@@ -120,8 +122,8 @@ def test_least_squares_sees_spill_outside_the_mask_and_the_median_does_not():
     truth = flat([0.4, 0.4, 0.4]) * mask[..., None]
     albedo = flat([0.4, 0.4, 0.4])
     alpha = np.ones_like(mask)
-    least = protocol_metrics.albedo_scale(GEOSPLATTING, albedo, alpha, truth, mask)
-    np.testing.assert_allclose(least, 0.5, rtol=1e-6)
+    scale = protocol_metrics.albedo_scale(GEOSPLATTING, albedo, alpha, truth, mask)
+    np.testing.assert_allclose(scale, 0.5, rtol=1e-6)
     for row in (TENSOIR, IRGS):
         np.testing.assert_allclose(
             protocol_metrics.albedo_scale(row, albedo, alpha, truth, mask), 1.0, rtol=1e-6
@@ -137,10 +139,10 @@ def test_median_scale_is_of_straight_values_and_robust():
     alpha[0, 1, :2] = albedo[0, 1, :2] = 0  # nothing was drawn in two others
     scale = protocol_metrics.albedo_scale(IRGS, albedo, alpha, truth, mask)
     np.testing.assert_allclose(scale, 2.0, rtol=1e-5)
-    nothing = protocol_metrics.albedo_scale(IRGS, 0 * albedo, 0 * alpha, truth, mask)
-    np.testing.assert_array_equal(nothing, np.ones(3))
-    black = protocol_metrics.albedo_scale(GEOSPLATTING, 0 * albedo, 0 * alpha, truth, mask)
-    np.testing.assert_array_equal(black, np.ones(3))
+    empty_scale = protocol_metrics.albedo_scale(IRGS, 0 * albedo, 0 * alpha, truth, mask)
+    np.testing.assert_array_equal(empty_scale, np.ones(3))
+    black_scale = protocol_metrics.albedo_scale(GEOSPLATTING, 0 * albedo, 0 * alpha, truth, mask)
+    np.testing.assert_array_equal(black_scale, np.ones(3))
 
 
 def test_albedo_metrics_by_hand():
@@ -155,9 +157,9 @@ def test_albedo_metrics_by_hand():
         (IRGS, lambda v: v),
     ):
         error = (encode(0.2) - encode(0.5)) ** 2
-        measured = protocol_metrics.albedo_metrics(row, albedo, mask, truth, mask, scale)
-        assert measured["albedo.psnr"] == pytest.approx(decibels(error / 2), abs=DECIBELS)
-        assert measured["albedo.psnr_masked"] == pytest.approx(decibels(error), abs=DECIBELS)
+        figures = protocol_metrics.albedo_metrics(row, albedo, mask, truth, mask, scale)
+        assert figures["albedo.psnr"] == pytest.approx(decibels(error / 2), abs=DECIBELS)
+        assert figures["albedo.psnr_masked"] == pytest.approx(decibels(error), abs=DECIBELS)
 
 
 def test_only_geosplatting_counts_albedo_beside_the_object():
@@ -165,12 +167,12 @@ def test_only_geosplatting_counts_albedo_beside_the_object():
     truth = flat([0.5, 0.5, 0.5]) * mask[..., None]
     albedo = flat([0.5, 0.5, 0.5])
     alpha = np.ones_like(mask)
-    measured = [
+    psnr_values = [
         protocol_metrics.albedo_metrics(row, albedo, alpha, truth, mask, np.ones(3))["albedo.psnr"]
         for row in (GEOSPLATTING, TENSOIR, IRGS)
     ]
-    assert measured[0] == pytest.approx(decibels(srgb(0.5) ** 2 / 2), abs=DECIBELS)
-    assert measured[1:] == pytest.approx([200.0, 200.0], abs=DECIBELS)
+    assert psnr_values[0] == pytest.approx(decibels(srgb(0.5) ** 2 / 2), abs=DECIBELS)
+    assert psnr_values[1:] == pytest.approx([200.0, 200.0], abs=DECIBELS)
 
 
 def test_backgrounds_differ_where_coverage_is_partial():
@@ -179,9 +181,9 @@ def test_backgrounds_differ_where_coverage_is_partial():
     mask, alpha = flat(1.0), flat(0.6)
     truth = flat([0.5, 0.5, 0.5])
     albedo = truth * alpha[..., None]
-    measured = protocol_metrics.albedo_metrics(GEOSPLATTING, albedo, alpha, truth, mask, np.ones(3))
+    figures = protocol_metrics.albedo_metrics(GEOSPLATTING, albedo, alpha, truth, mask, np.ones(3))
     expected = decibels((0.4 * srgb(0.5)) ** 2)
-    assert measured["albedo.psnr"] == pytest.approx(expected, abs=DECIBELS)
+    assert figures["albedo.psnr"] == pytest.approx(expected, abs=DECIBELS)
     image = np.concatenate([truth, mask[..., None]], -1)
     white = decibels((0.4 * (1 - srgb(0.5))) ** 2)
     psnr = [protocol_metrics.relight_metrics(row, albedo, alpha, image)["psnr"] for row in ROWS]
@@ -189,25 +191,25 @@ def test_backgrounds_differ_where_coverage_is_partial():
     # with the true mask.
     assert psnr == pytest.approx([white, 200.0, 200.0], abs=DECIBELS)
     alpha[:] = 0.4
-    thin = protocol_metrics.relight_metrics(TENSOIR, truth * 0.4, alpha, image)["psnr"]
-    assert thin == pytest.approx(decibels((1 - srgb(0.5)) ** 2), abs=DECIBELS)
+    thin_psnr = protocol_metrics.relight_metrics(TENSOIR, truth * 0.4, alpha, image)["psnr"]
+    assert thin_psnr == pytest.approx(decibels((1 - srgb(0.5)) ** 2), abs=DECIBELS)
 
 
 def test_albedo_similarity_sees_the_background():
     albedo, alpha, truth, mask = scene(views=1)
-    inside = mask[0, ..., None] > 0.5
-    for row, behind, encode in (
+    is_inside = mask[0, ..., None] > 0.5
+    for row, background, encode in (
         (GEOSPLATTING, 0.0, srgb),
         (TENSOIR, 1.0, lambda v: v ** (1 / 2.2)),
         (IRGS, 0.0, lambda v: v),
     ):
         pictures = [
-            np.where(inside, encode(np.clip(x[0], 0, 1)), behind).astype(np.float32)
+            np.where(is_inside, encode(np.clip(x[0], 0, 1)), background).astype(np.float32)
             for x in (albedo, truth)
         ]
-        measured = protocol_metrics.albedo_metrics(row, albedo, alpha, truth, mask, np.ones(3))
+        figures = protocol_metrics.albedo_metrics(row, albedo, alpha, truth, mask, np.ones(3))
         expected = float(ssim(*map(jnp.asarray, pictures)))
-        assert measured["albedo.ssim"] == pytest.approx(expected, abs=1e-5)
+        assert figures["albedo.ssim"] == pytest.approx(expected, abs=1e-5)
 
 
 def test_pooled_and_mean_of_images_differ():
@@ -238,39 +240,41 @@ def test_pooled_and_mean_of_images_differ():
 def test_a_gain_of_the_prediction_changes_nothing_after_the_scale(name):
     albedo, alpha, truth, mask = scene()
     row = protocol(name)
-    measured = []
+    figures = []
     for gain in (np.ones(3), np.array([0.3, 1.0, 4.0])):
         predicted = (albedo * gain).astype(np.float32)
         scale = protocol_metrics.albedo_scale(row, predicted, alpha, truth, mask)
-        measured.append(protocol_metrics.albedo_metrics(row, predicted, alpha, truth, mask, scale))
-    same(*measured, rel=1e-4)
-    assert 15 < measured[0]["albedo.psnr_masked"] < 40
-    assert measured[0]["albedo.psnr"] > measured[0]["albedo.psnr_masked"]
+        figures.append(protocol_metrics.albedo_metrics(row, predicted, alpha, truth, mask, scale))
+    same(*figures, rel=1e-4)
+    assert 15 < figures[0]["albedo.psnr_masked"] < 40
+    assert figures[0]["albedo.psnr"] > figures[0]["albedo.psnr_masked"]
 
 
 @pytest.mark.parametrize("name", PICTURES)
 def test_masked_metrics_ignore_the_background(name):
     albedo, alpha, truth, mask = scene(views=1)
-    outside = mask < 0.5
-    spoiled, spilled = albedo.copy(), alpha.copy()
-    spoiled[outside], spilled[outside] = 0.7, 1.0
+    is_outside = mask < 0.5
+    spoiled_albedo, spilled_alpha = albedo.copy(), alpha.copy()
+    spoiled_albedo[is_outside], spilled_alpha[is_outside] = 0.7, 1.0
     row = protocol(name)
     image = np.concatenate([truth, mask[..., None]], -1)
-    for clean, dirty in (
+    for clean_metrics, spoiled_metrics in (
         (
             protocol_metrics.albedo_metrics(row, albedo, alpha, truth, mask, GAIN),
-            protocol_metrics.albedo_metrics(row, spoiled, spilled, truth, mask, GAIN),
+            protocol_metrics.albedo_metrics(row, spoiled_albedo, spilled_alpha, truth, mask, GAIN),
         ),
         (
             protocol_metrics.relight_metrics(row, albedo, alpha, image),
-            protocol_metrics.relight_metrics(row, spoiled, spilled, image),
+            protocol_metrics.relight_metrics(row, spoiled_albedo, spilled_alpha, image),
         ),
     ):
-        for key in (key for key in clean if key.endswith("_masked")):
-            assert dirty[key] == pytest.approx(clean[key], abs=1e-4), key
-        whole = next(key for key in clean if key.endswith("psnr"))
-        is_cut = name == "irgs" or (name == "tensoir" and whole == "albedo.psnr")
-        assert (dirty[whole] == pytest.approx(clean[whole], abs=1e-4)) == is_cut
+        for key in (key for key in clean_metrics if key.endswith("_masked")):
+            assert spoiled_metrics[key] == pytest.approx(clean_metrics[key], abs=1e-4), key
+        psnr_key = next(key for key in clean_metrics if key.endswith("psnr"))
+        is_cut = name == "irgs" or (name == "tensoir" and psnr_key == "albedo.psnr")
+        assert (
+            spoiled_metrics[psnr_key] == pytest.approx(clean_metrics[psnr_key], abs=1e-4)
+        ) == is_cut
 
 
 @pytest.mark.parametrize("name", PICTURES)
@@ -312,29 +316,29 @@ def test_relight_encodings_by_hand():
     rgb = flat([0.2, 0.2, 0.2]) * mask[..., None]
     for row in (GEOSPLATTING, TENSOIR, IRGS):
         error = (srgb(0.2) - srgb(0.5)) ** 2
-        measured = protocol_metrics.relight_metrics(row, rgb, mask, image)
-        assert measured["psnr"] == pytest.approx(decibels(error / 2), abs=DECIBELS)
-        assert measured["psnr_masked"] == pytest.approx(decibels(error), abs=DECIBELS)
+        figures = protocol_metrics.relight_metrics(row, rgb, mask, image)
+        assert figures["psnr"] == pytest.approx(decibels(error / 2), abs=DECIBELS)
+        assert figures["psnr_masked"] == pytest.approx(decibels(error), abs=DECIBELS)
 
 
 def test_material_metrics_by_hand():
     mask, alpha = left_half((2, 4, 4)), flat(0.5, (2, 4, 4))
     materials = {"roughness": flat(0.2, (2, 4, 4)), "metallic": flat(0.0, (2, 4, 4))}
     truth = {"roughness": 0.6 * mask}
-    measured = protocol_metrics.material_metrics(materials, alpha, truth, mask)
-    assert measured == {
+    figures = protocol_metrics.material_metrics(materials, alpha, truth, mask)
+    assert figures == {
         # Inside the mask, straight .4 is compared with .6. Over the whole image, premultiplied .2
         # is compared with .6 inside and with 0 outside.
         "roughness.mse": pytest.approx(0.04),
         "roughness.mse_full": pytest.approx((0.16 + 0.04) / 2),
     }
     mask[1] = truth["roughness"][1] = 0
-    measured = protocol_metrics.material_metrics(materials, alpha, truth, mask)
-    assert measured["roughness.mse"] == pytest.approx(0.04)
+    figures = protocol_metrics.material_metrics(materials, alpha, truth, mask)
+    assert figures["roughness.mse"] == pytest.approx(0.04)
     truth["metallic"] = mask * 1.0
-    measured = protocol_metrics.material_metrics(materials, alpha, truth, mask)
-    assert measured["metallic.mse"] == pytest.approx(1.0)
-    assert measured["metallic.mse_full"] == pytest.approx(0.25)
+    figures = protocol_metrics.material_metrics(materials, alpha, truth, mask)
+    assert figures["metallic.mse"] == pytest.approx(1.0)
+    assert figures["metallic.mse_full"] == pytest.approx(0.25)
     with pytest.raises(ValueError, match="no predicted one"):
         protocol_metrics.material_metrics({}, alpha, truth, mask)
 
@@ -343,10 +347,12 @@ def test_empty_views_are_left_out():
     albedo, alpha, truth, mask = scene(views=2)
     mask[1] = truth[1] = 0
     for row in ROWS:
-        one = protocol_metrics.albedo_metrics(row, albedo[:1], alpha[:1], truth[:1], mask[:1], GAIN)
-        two = protocol_metrics.albedo_metrics(row, albedo, alpha, truth, mask, GAIN)
+        first_metrics = protocol_metrics.albedo_metrics(
+            row, albedo[:1], alpha[:1], truth[:1], mask[:1], GAIN
+        )
+        both_metrics = protocol_metrics.albedo_metrics(row, albedo, alpha, truth, mask, GAIN)
         for key in ("albedo.psnr_masked", "albedo.ssim_masked"):
-            assert two[key] == pytest.approx(one[key], abs=1e-4)
+            assert both_metrics[key] == pytest.approx(first_metrics[key], abs=1e-4)
         np.testing.assert_allclose(
             protocol_metrics.albedo_scale(row, albedo, alpha, truth, mask),
             protocol_metrics.albedo_scale(row, albedo[:1], alpha[:1], truth[:1], mask[:1]),
@@ -356,12 +362,12 @@ def test_empty_views_are_left_out():
 
 def test_views_without_any_object_are_refused():
     albedo, alpha, truth, mask = scene(views=2)
-    nothing, image = 0 * mask, np.zeros((*mask.shape, 4), np.float32)
+    empty_mask, image = 0 * mask, np.zeros((*mask.shape, 4), np.float32)
     calls = [
-        lambda: protocol_metrics.albedo_scale(TENSOIR, albedo, alpha, truth, nothing),
-        lambda: protocol_metrics.albedo_metrics(IRGS, albedo, alpha, truth, nothing, GAIN),
+        lambda: protocol_metrics.albedo_scale(TENSOIR, albedo, alpha, truth, empty_mask),
+        lambda: protocol_metrics.albedo_metrics(IRGS, albedo, alpha, truth, empty_mask, GAIN),
         lambda: protocol_metrics.relight_metrics(GEOSPLATTING, albedo, alpha, image),
-        lambda: protocol_metrics.material_metrics({}, alpha, {}, nothing),
+        lambda: protocol_metrics.material_metrics({}, alpha, {}, empty_mask),
     ]
     for call in calls:
         with pytest.raises(ValueError, match="no pixel of the 2 views"):
@@ -400,30 +406,32 @@ def test_wrong_shapes_and_values_that_are_not_finite_are_refused():
 
 
 def test_new_views_are_encoded_before_they_are_laid_over_white():
-    half, image = flat(0.5, (4, 4)), np.ones((4, 4, 4), np.float32)
+    alpha, image = flat(0.5, (4, 4)), np.ones((4, 4, 4), np.float32)
     image[..., :3], image[..., 3] = 0.2, 0.8
-    measured = protocol_metrics.new_view_metrics(
-        half[..., None] * flat([0.3] * 3, (4, 4)), half, image
+    figures = protocol_metrics.new_view_metrics(
+        alpha[..., None] * flat([0.3] * 3, (4, 4)), alpha, image
     )
-    shown, true = 0.5 * srgb(0.3) + 0.5, 0.8 * srgb(0.2) + 0.2
+    shown_value, true_value = 0.5 * srgb(0.3) + 0.5, 0.8 * srgb(0.2) + 0.2
     for name in ("nvs.psnr", "nvs.psnr_masked"):
-        assert measured[name] == pytest.approx(decibels((shown - true) ** 2), abs=DECIBELS)
+        assert figures[name] == pytest.approx(
+            decibels((shown_value - true_value) ** 2), abs=DECIBELS
+        )
 
 
 def test_new_views_without_an_object_have_no_masked_metrics():
-    empty = np.zeros((12, 12), np.float32)
+    alpha = np.zeros((12, 12), np.float32)
     image = np.zeros((12, 12, 4), np.float32)
-    measured = protocol_metrics.new_view_metrics(image[..., :3], empty, image)
-    assert measured == {"nvs.psnr": pytest.approx(200.0), "nvs.ssim": pytest.approx(1.0)}
+    figures = protocol_metrics.new_view_metrics(image[..., :3], alpha, image)
+    assert figures == {"nvs.psnr": pytest.approx(200.0), "nvs.ssim": pytest.approx(1.0)}
     with pytest.raises(ValueError, match="image must be"):
-        protocol_metrics.new_view_metrics(image[..., :3], empty, image[..., :3])
+        protocol_metrics.new_view_metrics(image[..., :3], alpha, image[..., :3])
 
 
 def test_masked_ssim_is_what_the_protocols_print():
     albedo, alpha, truth, mask = scene(views=1)
-    measured = protocol_metrics.albedo_metrics(IRGS, albedo, alpha, truth, mask, np.ones(3))
+    figures = protocol_metrics.albedo_metrics(IRGS, albedo, alpha, truth, mask, np.ones(3))
     expected = ssim_masked(np.clip(albedo[0], 0, 1), truth[0], mask[0])
-    assert measured["albedo.ssim_masked"] == pytest.approx(float(expected), abs=1e-5)
+    assert figures["albedo.ssim_masked"] == pytest.approx(float(expected), abs=1e-5)
 
 
 def spoiled(views=2, size=26):
@@ -446,78 +454,91 @@ def cut(maps, columns):
 def test_figures_are_those_of_the_pixels_that_count_alone(name):
     row = protocol(name)
     valid, maps = spoiled()
-    one = [values[:1] for values in maps]
-    small = cut(maps, 13)
-    found = protocol_metrics.albedo_metrics(row, *one, GAIN, valid[:1])
-    expected = protocol_metrics.albedo_metrics(row, *small, GAIN)
+    first_view = [values[:1] for values in maps]
+    small_maps = cut(maps, 13)
+    figures = protocol_metrics.albedo_metrics(row, *first_view, GAIN, valid[:1])
+    expected = protocol_metrics.albedo_metrics(row, *small_maps, GAIN)
     # Windows of SSIM also see invalid pixels near the border, so only means over pixels are equal.
     for key in ("albedo.psnr", "albedo.psnr_masked"):
-        assert found[key] == pytest.approx(expected[key], abs=DECIBELS)
-    assert 0 < found["albedo.ssim"] < 1
+        assert figures[key] == pytest.approx(expected[key], abs=DECIBELS)
+    assert 0 < figures["albedo.ssim"] < 1
     assert (
-        found["albedo.psnr"] < protocol_metrics.albedo_metrics(row, *one, GAIN)["albedo.psnr"] - 2
+        figures["albedo.psnr"]
+        < protocol_metrics.albedo_metrics(row, *first_view, GAIN)["albedo.psnr"] - 2
     )
 
     def rgba(maps):
         _, _, truth, mask = maps
         return np.concatenate([truth, mask[..., None]], -1)
 
-    lit = protocol_metrics.relight_metrics(row, one[0], one[1], rgba(one), valid[:1])
-    other = protocol_metrics.relight_metrics(row, small[0], small[1], rgba(small))
-    assert lit["psnr"] == pytest.approx(other["psnr"], abs=DECIBELS)
-    new = protocol_metrics.new_view_metrics(one[0][0], one[1][0], rgba(one)[0], valid[0])
-    other = protocol_metrics.new_view_metrics(small[0][0], small[1][0], rgba(small)[0])
-    assert new["nvs.psnr"] == pytest.approx(other["nvs.psnr"], abs=DECIBELS)
+    relit_metrics = protocol_metrics.relight_metrics(
+        row, first_view[0], first_view[1], rgba(first_view), valid[:1]
+    )
+    small_metrics = protocol_metrics.relight_metrics(
+        row, small_maps[0], small_maps[1], rgba(small_maps)
+    )
+    assert relit_metrics["psnr"] == pytest.approx(small_metrics["psnr"], abs=DECIBELS)
+    view_metrics = protocol_metrics.new_view_metrics(
+        first_view[0][0], first_view[1][0], rgba(first_view)[0], valid[0]
+    )
+    small_metrics = protocol_metrics.new_view_metrics(
+        small_maps[0][0], small_maps[1][0], rgba(small_maps)[0]
+    )
+    assert view_metrics["nvs.psnr"] == pytest.approx(small_metrics["nvs.psnr"], abs=DECIBELS)
 
 
 def test_materials_and_pooled_errors_weigh_the_pixels_that_count():
     valid, (albedo, alpha, truth, mask) = spoiled()
-    rough = {"roughness": albedo[..., 0]}
-    known = {"roughness": truth[..., 0]}
-    found = protocol_metrics.material_metrics(rough, alpha, known, mask, valid)
+    materials = {"roughness": albedo[..., 0]}
+    true_materials = {"roughness": truth[..., 0]}
+    figures = protocol_metrics.material_metrics(materials, alpha, true_materials, mask, valid)
     squared = (albedo[..., 0] - truth[..., 0]) ** 2
     means = [squared[view][valid[view] == 1].mean() for view in range(2)]
-    assert found["roughness.mse_full"] == pytest.approx(np.mean(means), rel=1e-5)
+    assert figures["roughness.mse_full"] == pytest.approx(np.mean(means), rel=1e-5)
     # tensoir pools the squared error of all pixels on white, gamma 2.2.
-    found = protocol_metrics.albedo_metrics(TENSOIR, albedo, alpha, truth, mask, np.ones(3), valid)
-    inside = mask[..., None]
-    error = inside * (np.clip(albedo, 0, 1) ** (1 / 2.2) - truth ** (1 / 2.2)) ** 2
+    figures = protocol_metrics.albedo_metrics(
+        TENSOIR, albedo, alpha, truth, mask, np.ones(3), valid
+    )
+    coverage = mask[..., None]
+    error = coverage * (np.clip(albedo, 0, 1) ** (1 / 2.2) - truth ** (1 / 2.2)) ** 2
     expected = decibels(error.sum() / (3 * valid.sum()))
-    assert found["albedo.psnr"] == pytest.approx(expected, abs=DECIBELS)
+    assert figures["albedo.psnr"] == pytest.approx(expected, abs=DECIBELS)
 
 
 def test_where_all_pixels_count_the_figures_are_the_same():
     maps = scene(2, 16)
-    every = np.ones((2, 16, 16), np.float32)
-    found = protocol_metrics.albedo_metrics(GEOSPLATTING, *maps, GAIN, every)
-    same(found, protocol_metrics.albedo_metrics(GEOSPLATTING, *maps, GAIN), rel=1e-5)
+    all_valid = np.ones((2, 16, 16), np.float32)
+    figures = protocol_metrics.albedo_metrics(GEOSPLATTING, *maps, GAIN, all_valid)
+    same(figures, protocol_metrics.albedo_metrics(GEOSPLATTING, *maps, GAIN), rel=1e-5)
 
 
 def test_coverage_where_pixels_do_not_count_is_refused():
     valid, maps = spoiled()
     _, whole_alpha, _, whole_mask = scene(2, 26)
     albedo, alpha, truth, mask = maps
-    for wrong in ((albedo, whole_alpha, truth, mask), (albedo, alpha, truth, whole_mask)):
+    for wrong_maps in ((albedo, whole_alpha, truth, mask), (albedo, alpha, truth, whole_mask)):
         with pytest.raises(ValueError, match="must be zero on pixels that do not count"):
-            protocol_metrics.albedo_metrics(GEOSPLATTING, *wrong, GAIN, valid)
+            protocol_metrics.albedo_metrics(GEOSPLATTING, *wrong_maps, GAIN, valid)
     with pytest.raises(ValueError, match="valid must be"):
         protocol_metrics.albedo_metrics(GEOSPLATTING, *maps, GAIN, valid[:, :5])
 
 
 def orb_by_hand(rgb, image, *, largest, is_brightened, is_encoded):
     """One figure of Stanford-ORB for one image, implemented a second time."""
-    inside = minimum_filter((image[..., 3] > 0.5).astype(int), 5, mode="nearest") == 1
-    found, true = (np.where(inside[..., None], x[..., :3], 0).astype(float) for x in (rgb, image))
+    is_inside = minimum_filter((image[..., 3] > 0.5).astype(int), 5, mode="nearest") == 1
+    predicted, truth = (
+        np.where(is_inside[..., None], x[..., :3], 0).astype(float) for x in (rgb, image)
+    )
     if is_brightened:
-        gain = srgb(np.clip(true, 0, 1)).mean() / np.clip(true, 0, 1).mean()
-        found, true = gain * found, gain * true
+        gain = srgb(np.clip(truth, 0, 1)).mean() / np.clip(truth, 0, 1).mean()
+        predicted, truth = gain * predicted, gain * truth
     for channel in range(3):
-        f, t = found[inside][:, channel], true[inside][:, channel]
-        found[..., channel] *= np.dot(f, t) / np.dot(f, f)
-    pair = [np.clip(x, 0, largest) for x in (found, true)]
+        f, t = predicted[is_inside][:, channel], truth[is_inside][:, channel]
+        predicted[..., channel] *= np.dot(f, t) / np.dot(f, f)
+    pair = [np.clip(x, 0, largest) for x in (predicted, truth)]
     if is_encoded:
         pair = [srgb(x) for x in pair]
-    grey = 0.5 * inside[..., None]
+    grey = 0.5 * is_inside[..., None]
     return max(decibels(np.mean((x - pair[1]) ** 2)) for x in (pair[0], grey))
 
 
@@ -532,7 +553,7 @@ def bright_scene(views=2, size=24):
 
 def test_figures_of_stanford_orb_are_those_of_its_formula():
     rgb, alpha, image = bright_scene()
-    measured = protocol_metrics.relight_metrics(ORB, rgb, alpha, image)
+    figures = protocol_metrics.relight_metrics(ORB, rgb, alpha, image)
     kinds = {
         "psnr_h": {"largest": 4.0, "is_brightened": True, "is_encoded": False},
         "psnr_l": {"largest": 1.0, "is_brightened": False, "is_encoded": True},
@@ -541,27 +562,29 @@ def test_figures_of_stanford_orb_are_those_of_its_formula():
         name: [orb_by_hand(*pair, **kind) for pair in zip(rgb, image, strict=True)]
         for name, kind in kinds.items()
     }
-    same(measured, {name: np.mean(values) for name, values in by_hand.items()}, abs=DECIBELS)
-    new = protocol_metrics.new_view_metrics(rgb[0], alpha[0], image[0], rendition=ORB.new_views)
-    same(new, {f"nvs.{name}": values[0] for name, values in by_hand.items()}, abs=DECIBELS)
+    same(figures, {name: np.mean(values) for name, values in by_hand.items()}, abs=DECIBELS)
+    view_metrics = protocol_metrics.new_view_metrics(
+        rgb[0], alpha[0], image[0], rendition=ORB.new_views
+    )
+    same(view_metrics, {f"nvs.{name}": values[0] for name, values in by_hand.items()}, abs=DECIBELS)
     albedo, alpha, truth, mask = scene(1, 24)
-    measured = protocol_metrics.albedo_metrics(ORB, albedo, alpha, truth, mask, np.ones(3))
+    figures = protocol_metrics.albedo_metrics(ORB, albedo, alpha, truth, mask, np.ones(3))
     image = np.concatenate([truth, mask[..., None]], -1)
     linear = {"largest": 1.0, "is_brightened": False, "is_encoded": False}
     expected = orb_by_hand(albedo[0], image[0], **linear)
-    assert measured == {"albedo.psnr": pytest.approx(expected, abs=DECIBELS)}
+    assert figures == {"albedo.psnr": pytest.approx(expected, abs=DECIBELS)}
 
 
 def test_stanford_orb_sees_neither_a_gain_nor_the_rim():
     rgb, alpha, image = bright_scene()
-    before = protocol_metrics.relight_metrics(ORB, rgb, alpha, image)
-    gained = (rgb * np.array([0.2, 1.0, 3.0])).astype(np.float32)
-    inside = np.stack([protocol_metrics.eroded(view > 0.5) for view in image[..., 3]])
-    gained[~inside] = 5.0
-    same(protocol_metrics.relight_metrics(ORB, gained, alpha, image), before, abs=DECIBELS)
-    gained[inside] = 5.0
-    after = protocol_metrics.relight_metrics(ORB, gained, alpha, image)
-    assert all(after[name] < before[name] - 1 for name in before)
+    figures = protocol_metrics.relight_metrics(ORB, rgb, alpha, image)
+    scaled_rgb = (rgb * np.array([0.2, 1.0, 3.0])).astype(np.float32)
+    is_inside = np.stack([protocol_metrics.eroded(view > 0.5) for view in image[..., 3]])
+    scaled_rgb[~is_inside] = 5.0
+    same(protocol_metrics.relight_metrics(ORB, scaled_rgb, alpha, image), figures, abs=DECIBELS)
+    scaled_rgb[is_inside] = 5.0
+    worse_metrics = protocol_metrics.relight_metrics(ORB, scaled_rgb, alpha, image)
+    assert all(worse_metrics[name] < figures[name] - 1 for name in figures)
 
 
 def test_a_mask_is_eroded_by_two_pixels_but_not_from_the_border():
@@ -574,11 +597,11 @@ def test_a_mask_is_eroded_by_two_pixels_but_not_from_the_border():
 
 def test_stanford_orb_counts_no_image_below_grey():
     rgb, alpha, image = bright_scene(1)
-    black = protocol_metrics.relight_metrics(ORB, np.zeros_like(rgb), alpha, image)
-    inside = protocol_metrics.eroded(image[0, ..., 3] > 0.5)[..., None]
-    true = srgb(np.clip(np.where(inside, image[0, ..., :3], 0), 0, 1))
-    assert black["psnr_l"] == pytest.approx(
-        decibels(np.mean((0.5 * inside - true) ** 2)), abs=DECIBELS
+    black_metrics = protocol_metrics.relight_metrics(ORB, np.zeros_like(rgb), alpha, image)
+    is_inside = protocol_metrics.eroded(image[0, ..., 3] > 0.5)[..., None]
+    truth = srgb(np.clip(np.where(is_inside, image[0, ..., :3], 0), 0, 1))
+    assert black_metrics["psnr_l"] == pytest.approx(
+        decibels(np.mean((0.5 * is_inside - truth) ** 2)), abs=DECIBELS
     )
 
 
@@ -586,9 +609,15 @@ def test_stanford_orb_means_over_the_pixels_that_count():
     rgb, alpha, image = bright_scene(1, 24)
     valid = np.ones(alpha.shape, np.float32)
     valid[:, :3] = 0
-    kept = valid[..., None]
-    half = protocol_metrics.relight_metrics(ORB, rgb * kept, alpha * valid, image * kept, valid)
-    whole = protocol_metrics.relight_metrics(ORB, rgb * kept, alpha * valid, image * kept)
+    weights = valid[..., None]
+    valid_metrics = protocol_metrics.relight_metrics(
+        ORB, rgb * weights, alpha * valid, image * weights, valid
+    )
+    all_metrics = protocol_metrics.relight_metrics(
+        ORB, rgb * weights, alpha * valid, image * weights
+    )
     # The same error is averaged over fewer pixels.
-    for name in whole:
-        assert whole[name] - half[name] == pytest.approx(-decibels(24 / 21), abs=DECIBELS)
+    for name in all_metrics:
+        assert all_metrics[name] - valid_metrics[name] == pytest.approx(
+            -decibels(24 / 21), abs=DECIBELS
+        )

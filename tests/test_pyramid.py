@@ -63,10 +63,10 @@ def test_the_gradient_of_a_level_is_that_of_the_light_that_it_makes(params):
 
 
 def test_what_a_region_agrees_on_is_a_step_of_all_levels(params):
-    whole = from_levels(steps_of(params, 1.0, 1.0, 1.0), jnp.float32(0.4)).light.radiance
-    np.testing.assert_allclose(whole, 1.2, rtol=1e-6)
-    alone = from_levels(steps_of(params, 1.0, None, None), jnp.float32(0.4)).light.radiance
-    np.testing.assert_allclose(alone, 0.4, rtol=1e-6)
+    all_levels = from_levels(steps_of(params, 1.0, 1.0, 1.0), jnp.float32(0.4)).light.radiance
+    np.testing.assert_allclose(all_levels, 1.2, rtol=1e-6)
+    one_level = from_levels(steps_of(params, 1.0, None, None), jnp.float32(0.4)).light.radiance
+    np.testing.assert_allclose(one_level, 0.4, rtol=1e-6)
 
 
 def test_a_level_is_interpolated_around_the_seam_and_not_over_the_poles(params):
@@ -81,7 +81,9 @@ def test_a_level_is_interpolated_around_the_seam_and_not_over_the_poles(params):
 
 def test_without_a_share_texels_make_the_whole_step(params):
     steps = steps_of(params, 0.5, 1.0, 1.0)
-    found = from_levels(steps, jnp.float32(0.0))
-    np.testing.assert_array_equal(found.light.radiance, 0.5)
-    for a, b in zip(jax.tree.leaves(found.geometry), jax.tree.leaves(params.geometry), strict=True):
+    moved_params = from_levels(steps, jnp.float32(0.0))
+    np.testing.assert_array_equal(moved_params.light.radiance, 0.5)
+    for a, b in zip(
+        jax.tree.leaves(moved_params.geometry), jax.tree.leaves(params.geometry), strict=True
+    ):
         np.testing.assert_array_equal(a, b)

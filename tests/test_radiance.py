@@ -79,16 +79,16 @@ def scipy_harmonics(directions):
     for degree in range(4):
         for order in range(-degree, degree + 1):
             value = sph_harm_y(degree, abs(order), polar, azimuth)
-            part = value.imag if order < 0 else value.real
+            component = value.imag if order < 0 else value.real
             sign = (-1.0) ** order  # without the phase of Condon and Shortley
-            columns.append(part * (1.0 if order == 0 else np.sqrt(2.0) * sign))
+            columns.append(component * (1.0 if order == 0 else np.sqrt(2.0) * sign))
     return np.stack(columns, -1)
 
 
 def test_harmonics_equal_those_of_scipy():
     directions = unit(200)
-    found = harmonics(jnp.asarray(directions, jnp.float32), degree=3)
-    np.testing.assert_allclose(found, scipy_harmonics(directions), atol=2 * ROUNDING)
+    values = harmonics(jnp.asarray(directions, jnp.float32), degree=3)
+    np.testing.assert_allclose(values, scipy_harmonics(directions), atol=2 * ROUNDING)
     np.testing.assert_array_equal(harmonic_degrees(3), [0, 1, 1, 1, *[2] * 5, *[3] * 7])
 
 
@@ -111,41 +111,41 @@ def test_gradient_of_the_colours_equals_differences():
         rng = np.random.default_rng(2)
         for _ in range(3):
             step = jax.tree.map(lambda x: jnp.asarray(rng.standard_normal(x.shape)), gradient)
-            at = [
+            arguments = [
                 jax.tree.map(lambda x, d, h=h: x + h * d, (splats, center), step)
                 for h in (1e-6, -1e-6)
             ]
-            difference = (total(*at[0]) - total(*at[1])) / 2e-6
-            along = sum(
+            difference = (total(*arguments[0]) - total(*arguments[1])) / 2e-6
+            derivative = sum(
                 jnp.vdot(g, d)
                 for g, d in zip(jax.tree.leaves(gradient), jax.tree.leaves(step), strict=True)
             )
-            assert float(along) == pytest.approx(float(difference), rel=1e-6)
+            assert float(derivative) == pytest.approx(float(difference), rel=1e-6)
 
 
 def test_higher_harmonics_are_left_out_until_they_are_asked_for():
     splats, center = some_splats(), jnp.asarray([0.0, -3.0, 0.0])
-    flat = replace(splats, rest=jnp.zeros_like(splats.rest))
+    flat_splats = replace(splats, rest=jnp.zeros_like(splats.rest))
     np.testing.assert_allclose(
         seen_from(splats, center, degree=0),
         np.maximum(0.5 + CONSTANT * np.asarray(splats.base), 0.0),
         atol=ROUNDING,
     )
-    seen = [np.asarray(seen_from(splats, center, degree=d)) for d in (1, 2, 3)]
-    assert all(np.abs(a - b).max() > 0.05 for a, b in zip(seen, seen[1:], strict=False))
+    colors = [np.asarray(seen_from(splats, center, degree=d)) for d in (1, 2, 3)]
+    assert all(np.abs(a - b).max() > 0.05 for a, b in zip(colors, colors[1:], strict=False))
     np.testing.assert_array_equal(
-        seen_from(flat, center, degree=3), seen_from(flat, center, degree=0)
+        seen_from(flat_splats, center, degree=3), seen_from(flat_splats, center, degree=0)
     )
 
 
 def test_padding_does_not_change_the_image():
     splats = some_splats(ROWS)
-    other = jax.tree.map(lambda x: x.at[40:].set(x[: ROWS - 40]), splats)
+    repadded_splats = jax.tree.map(lambda x: x.at[40:].set(x[: ROWS - 40]), splats)
     camera = camera_at([0.0, -3.0, 0.4])
     image = render(splats, 40, camera)[0]
     assert float(image.max()) > 0.1
-    np.testing.assert_array_equal(render(other, 40, camera)[0], image)
-    assert np.abs(np.asarray(render(other, ROWS, camera)[0]) - image).max() > 0.01
+    np.testing.assert_array_equal(render(repadded_splats, 40, camera)[0], image)
+    assert np.abs(np.asarray(render(repadded_splats, ROWS, camera)[0]) - image).max() > 0.01
 
 
 def camera_at(center, size=49, focal=30.0):
@@ -163,16 +163,16 @@ def camera_at(center, size=49, focal=30.0):
 def test_scales_of_several_splats_are_those_of_the_binomial_sum(opacity):
     # Terms of the sum of Eq. 9 alternate in sign, so it is computed in double precision, up to 20.
     for sharers in (1, 2, 5, 20):
-        shared = 1.0 - (1.0 - opacity) ** (1.0 / sharers)
+        split_opacity = 1.0 - (1.0 - opacity) ** (1.0 / sharers)
         total = sum(
-            comb(i - 1, k) * (-1.0) ** k * shared ** (k + 1) / np.sqrt(k + 1)
+            comb(i - 1, k) * (-1.0) ** k * split_opacity ** (k + 1) / np.sqrt(k + 1)
             for i in range(1, sharers + 1)
             for k in range(i)
         )
         with double_precision():
-            one, number = jnp.asarray([opacity]), jnp.asarray([float(sharers)])
-            found = shared_scale_factor(one, shared_opacity(one, number), number)
-        assert float(found[0]) == pytest.approx(opacity / total, rel=QUADRATURE)
+            opacities, counts = jnp.asarray([opacity]), jnp.asarray([float(sharers)])
+            factors = shared_scale_factor(opacities, shared_opacity(opacities, counts), counts)
+        assert float(factors[0]) == pytest.approx(opacity / total, rel=QUADRATURE)
 
 
 def one_splat():
@@ -190,19 +190,24 @@ def one_splat():
 
 @pytest.mark.parametrize("sharers", [2, 6])
 def test_relocation_keeps_the_image_of_the_splat_that_it_shares(sharers):
-    camera, before, row = camera_at([0.0, -3.0, 0.0]), one_splat(), jnp.arange(ROWS)
-    free = (row > 0) & (row < sharers)
-    after, is_changed = relocate(before, free, row == 0, jax.random.key(0))
+    camera, splats, row = camera_at([0.0, -3.0, 0.0]), one_splat(), jnp.arange(ROWS)
+    is_free = (row > 0) & (row < sharers)
+    moved_splats, is_changed = relocate(splats, is_free, row == 0, jax.random.key(0))
     assert int(is_changed.sum()) == sharers
-    unscaled = replace(after, log_scales=before.log_scales)
-    one = np.asarray(render(before, 1, camera)[1])
-    many, lazy = (np.asarray(render(x, sharers, camera)[1]) for x in (after, unscaled))
+    unscaled = replace(moved_splats, log_scales=splats.log_scales)
+    single_image = np.asarray(render(splats, 1, camera)[1])
+    shared_image, unscaled_image = (
+        np.asarray(render(x, sharers, camera)[1]) for x in (moved_splats, unscaled)
+    )
     middle = 24
-    assert many[middle, middle] == pytest.approx(one[middle, middle], abs=0.01)
+    assert shared_image[middle, middle] == pytest.approx(single_image[middle, middle], abs=0.01)
     # The integral along a line through the middle is preserved, but not every value.
-    assert many[middle].sum() == pytest.approx(one[middle].sum(), rel=0.01)
-    assert lazy[middle].sum() > 1.05 * one[middle].sum()
-    assert np.abs(many - one).mean() < 0.5 * np.abs(lazy - one).mean()
+    assert shared_image[middle].sum() == pytest.approx(single_image[middle].sum(), rel=0.01)
+    assert unscaled_image[middle].sum() > 1.05 * single_image[middle].sum()
+    assert (
+        np.abs(shared_image - single_image).mean()
+        < 0.5 * np.abs(unscaled_image - single_image).mean()
+    )
 
 
 def test_dead_splats_go_to_live_ones_in_proportion_to_their_opacity():
@@ -213,36 +218,38 @@ def test_dead_splats_go_to_live_ones_in_proportion_to_their_opacity():
     opacity[1] = 0.2
     logits = jnp.asarray(np.log(opacity / (1 - opacity)), jnp.float32)
     splats = replace(splats, opacity_logits=logits)
-    live = jnp.asarray(row < 3000)
-    moved, is_changed = relocate(
-        splats, jnp.asarray((row >= 2) & (row < 3000)), live, jax.random.key(1)
+    is_live = jnp.asarray(row < 3000)
+    moved_splats, is_changed = relocate(
+        splats, jnp.asarray((row >= 2) & (row < 3000)), is_live, jax.random.key(1)
     )
-    at = np.asarray(moved.means)
-    shares = [np.all(at[2:3000] == np.asarray(splats.means)[k], axis=1).mean() for k in (0, 1)]
+    positions = np.asarray(moved_splats.means)
+    shares = [
+        np.all(positions[2:3000] == np.asarray(splats.means)[k], axis=1).mean() for k in (0, 1)
+    ]
     assert sum(shares) == 1.0
     assert shares[0] == pytest.approx(0.75, abs=0.04)
     assert bool(is_changed[:3000].all())
     assert not bool(is_changed[3000:].any())
-    np.testing.assert_array_equal(at[3000:], np.asarray(splats.means)[3000:])
+    np.testing.assert_array_equal(positions[3000:], np.asarray(splats.means)[3000:])
     # Copies equal their source after its own change.
-    first = int(np.argmax(np.all(at[2:] == at[0], axis=1))) + 2
-    assert float(moved.opacity_logits[first]) == float(moved.opacity_logits[0])
+    copy_row = int(np.argmax(np.all(positions[2:] == positions[0], axis=1))) + 2
+    assert float(moved_splats.opacity_logits[copy_row]) == float(moved_splats.opacity_logits[0])
 
 
 def test_rows_without_weight_are_never_drawn():
     """With so many rows, cumulative sums in float32 may grow at such rows, and fall at others."""
     rng = np.random.default_rng(0)
     weights = jnp.asarray(rng.uniform(size=300_000) * (rng.uniform(size=300_000) > 0.3), "f4")
-    drawn = jax.jit(_drawn_rows, static_argnums=2)(weights, jax.random.key(0), 300_000)
-    assert float(jnp.min(weights[drawn])) > 0
+    rows = jax.jit(_drawn_rows, static_argnums=2)(weights, jax.random.key(0), 300_000)
+    assert float(jnp.min(weights[rows])) > 0
 
 
 def test_nothing_is_relocated_where_nothing_lives():
     splats = replace(some_splats(ROWS), opacity_logits=jnp.full((ROWS,), -9.0))
-    everywhere = jnp.ones((ROWS,), bool)
-    moved, is_changed = relocate(splats, everywhere, everywhere, jax.random.key(0))
+    all_rows = jnp.ones((ROWS,), bool)
+    moved_splats, is_changed = relocate(splats, all_rows, all_rows, jax.random.key(0))
     assert not bool(is_changed.any())
-    jax.tree.map(np.testing.assert_array_equal, moved, splats)
+    jax.tree.map(np.testing.assert_array_equal, moved_splats, splats)
 
 
 def test_noise_is_shaped_like_the_splat_and_spares_opaque_ones():
@@ -260,8 +267,8 @@ def test_noise_is_shaped_like_the_splat_and_spares_opaque_ones():
     gate = 1.0 / (1.0 + np.exp(100.0 * (1.0 / (1.0 + np.exp(9.0)) - 0.005)))
     # After a quarter turn about z the long axis lies along y. Noise is Sigma xi, with a deviation
     # of s^2.
-    spread = noise[: count // 2].std(0)
-    np.testing.assert_allclose(spread, 2.0 * gate * np.array([0.04, 0.25, 0.01]), rtol=0.03)
+    deviations = noise[: count // 2].std(0)
+    np.testing.assert_allclose(deviations, 2.0 * gate * np.array([0.04, 0.25, 0.01]), rtol=0.03)
     assert np.abs(noise[count // 2 :]).max() < 1e-12
 
 
@@ -282,14 +289,14 @@ def scene_views(count=9, size=32):
         rays = np.stack([x, y, -np.ones_like(x)], -1) @ pose[:3, :3].T
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         color = 0.3 + 0.2 * rays
-        for middle, paint in (
+        for ball_center, ball_color in (
             ((0.0, 0.0, 0.0), (0.9, 0.5, 0.1)),
             ((0.6, 0.3, 0.2), (0.1, 0.3, 0.9)),
         ):
-            away = pose[:3, 3] - np.asarray(middle)
-            along = rays @ away
-            hit = along**2 - away @ away + 0.45**2 > 0
-            color = np.where(hit[..., None], paint, color)
+            offset = pose[:3, 3] - np.asarray(ball_center)
+            projections = rays @ offset
+            is_hit = projections**2 - offset @ offset + 0.45**2 > 0
+            color = np.where(is_hit[..., None], ball_color, color)
         images.append(np.concatenate([color, np.ones((size, size, 1))], -1))
     intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
     return Views(
@@ -335,7 +342,7 @@ def test_training_lowers_the_loss_and_fills_the_capacity(trained):
 
 @pytest.mark.slow
 def test_resumed_training_equals_the_uninterrupted_one(trained, tmp_path):
-    _, _, whole = trained
+    _, _, full_run = trained
     steps = []
     for stop in (31, None):
         train_radiance(
@@ -347,7 +354,7 @@ def test_resumed_training_equals_the_uninterrupted_one(trained, tmp_path):
             on_step=lambda progress: steps.append(progress.step),
         )
     assert steps == list(range(1, 61))
-    paths = [latest_checkpoint(folder / "checkpoints") for folder in (whole, tmp_path / "run")]
+    paths = [latest_checkpoint(folder / "checkpoints") for folder in (full_run, tmp_path / "run")]
     first, second = (np.load(path) for path in paths)
     names = [name for name in first.files if name != "__meta__"]
     assert any("rest" in name for name in names)
@@ -360,23 +367,25 @@ def test_a_folder_with_splats_is_neither_replaced_nor_continued_with_others(trai
     _, _, folder = trained
     with pytest.raises(RunError, match="--resume"):
         train_radiance(scene_views(), TINY, folder)
-    other = replace(TINY, capacity=80)
+    other_settings = replace(TINY, capacity=80)
     with pytest.raises(RunError, match="other views or settings"):
-        train_radiance(scene_views(), other, folder, resume=True)
+        train_radiance(scene_views(), other_settings, folder, resume=True)
 
 
 def test_rates_decay_and_degrees_rise_by_the_schedule():
     settings = RadianceSettings(steps=2001)
     rates = RadianceRates()
-    first, half, last = (weights_at(settings, step) for step in (0, 1000, 2000))
+    first, middle, last = (weights_at(settings, step) for step in (0, 1000, 2000))
     assert float(first.rates["means"]) == pytest.approx(4 * rates.means)
-    assert float(half.rates["means"]) == pytest.approx(4 * (rates.means * rates.means_last) ** 0.5)
+    assert float(middle.rates["means"]) == pytest.approx(
+        4 * (rates.means * rates.means_last) ** 0.5
+    )
     assert float(last.rates["means"]) == pytest.approx(4 * rates.means_last)
-    assert float(half.noise) == pytest.approx(5e5 * float(half.rates["means"]))
-    assert [int(w.degree) for w in (first, half, last)] == [0, 1, 2]
+    assert float(middle.noise) == pytest.approx(5e5 * float(middle.rates["means"]))
+    assert [int(w.degree) for w in (first, middle, last)] == [0, 1, 2]
     assert float(last.rates["rest"]) == float(first.rates["rest"])
-    when = [step for step in range(2002) if relocates_after(settings, step)]
-    assert when == list(range(500, 1601, 100))
+    relocation_steps = [step for step in range(2002) if relocates_after(settings, step)]
+    assert relocation_steps == list(range(500, 1601, 100))
 
 
 def test_random_points_are_seen_with_their_colour():
@@ -386,13 +395,13 @@ def test_random_points_are_seen_with_their_colour():
     local = local + views.world_to_camera[:, None, :3, 3]
     pixel = np.einsum("vij,vnj->vni", views.intrinsics, local)
     pixel = pixel[..., :2] / pixel[..., 2:]
-    seen = (local[..., 2] > 0) & (pixel > 0).all(-1) & (pixel < views.width).all(-1)
-    assert seen.any(0).all()
-    assert np.where(seen, local[..., 2], 0.0).max() > 20
-    column, row = np.where(seen[..., None], pixel, 0).astype(int).transpose(2, 0, 1)
-    shown = encode_srgb(views.images[np.arange(len(views))[:, None], row, column, :3])
-    differs = np.abs(shown - points.colors).max(-1)
-    np.testing.assert_allclose(np.where(seen, differs, np.inf).min(0), 0.0, atol=ROUNDING)
+    is_seen = (local[..., 2] > 0) & (pixel > 0).all(-1) & (pixel < views.width).all(-1)
+    assert is_seen.any(0).all()
+    assert np.where(is_seen, local[..., 2], 0.0).max() > 20
+    column, row = np.where(is_seen[..., None], pixel, 0).astype(int).transpose(2, 0, 1)
+    image_colors = encode_srgb(views.images[np.arange(len(views))[:, None], row, column, :3])
+    differences = np.abs(image_colors - points.colors).max(-1)
+    np.testing.assert_allclose(np.where(is_seen, differences, np.inf).min(0), 0.0, atol=ROUNDING)
 
 
 def test_random_points_come_from_pixels_that_count():
@@ -421,8 +430,8 @@ def test_points_come_first_and_are_as_large_as_their_neighbours_are_far():
     np.testing.assert_allclose(
         colors_seen_from(splats, jnp.zeros(3), degree=0)[:27], points.colors, atol=ROUNDING
     )
-    few, total = first_splats(views, points, RadianceSettings(capacity=8))
-    assert (few.capacity, total) == (8, 8)
+    small_splats, small_count = first_splats(views, points, RadianceSettings(capacity=8))
+    assert (small_splats.capacity, small_count) == (8, 8)
 
 
 def some_of(views, chosen):
@@ -468,20 +477,20 @@ def test_ply_has_the_standard_layout(tmp_path):
         *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
     ]
     rows = trimesh.load(path).metadata["_ply_raw"]["vertex"]["data"]
-    found = {name: np.asarray(rows[name], float).reshape(7) for name in names}
+    columns = {name: np.asarray(rows[name], float).reshape(7) for name in names}
     center = np.array([0.3, -4.0, 1.0])
-    seen = viewers_color(found, center)
+    colors = viewers_color(columns, center)
     expected = colors_seen_from(splats, jnp.asarray(center, jnp.float32), degree=3)
-    np.testing.assert_allclose(seen, expected, atol=1e-5)
-    np.testing.assert_allclose(found["opacity"], splats.opacity_logits, atol=1e-4)
-    np.testing.assert_allclose(found["scale_1"], splats.log_scales[:, 1], atol=1e-5)
+    np.testing.assert_allclose(colors, expected, atol=1e-5)
+    np.testing.assert_allclose(columns["opacity"], splats.opacity_logits, atol=1e-4)
+    np.testing.assert_allclose(columns["scale_1"], splats.log_scales[:, 1], atol=1e-5)
 
 
 def viewers_color(found, center):
     """Colour from the file's columns by the formulas of Kerbl et al. (utils/sh_utils.py)."""
     mean = np.stack([found[axis] for axis in "xyz"], -1)
-    towards = mean - center
-    x, y, z = (towards / np.linalg.norm(towards, axis=-1, keepdims=True)).T
+    view_vectors = mean - center
+    x, y, z = (view_vectors / np.linalg.norm(view_vectors, axis=-1, keepdims=True)).T
     xx, yy, zz = x * x, y * y, z * z
     basis = [
         -0.4886025119029199 * y,

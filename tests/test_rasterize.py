@@ -80,8 +80,8 @@ def loss_and_gradient(inputs, eligible, **settings):
     """Return `scalar`, (image, alpha, usage) and the gradient; most tests share one compilation."""
 
     def loss(inputs):
-        image, alpha, needed = rasterize(*inputs, eligible, **settings)
-        return scalar(image, alpha), (image, alpha, needed)
+        image, alpha, usage = rasterize(*inputs, eligible, **settings)
+        return scalar(image, alpha), (image, alpha, usage)
 
     (value, images), gradient = jax.value_and_grad(loss, has_aux=True)(inputs)
     return value, images, gradient
@@ -98,8 +98,8 @@ def differentiate(inputs, *, eligible=None, capacities=AMPLE):
 def padded(*rows):
     """Pad the rows to 40 with copies of the first one; also return the mask of the given rows."""
     count = rows[0].shape[0]
-    filled = tuple(jnp.concatenate([x, jnp.repeat(x[:1], 40 - count, axis=0)]) for x in rows)
-    return filled, jnp.arange(40) < count
+    padded_rows = tuple(jnp.concatenate([x, jnp.repeat(x[:1], 40 - count, axis=0)]) for x in rows)
+    return padded_rows, jnp.arange(40) < count
 
 
 def dense(inputs, settings):
@@ -149,13 +149,13 @@ def test_image_and_gradients_match_the_oracle(name, x64):
     capacities = Capacities(visible=2048, hits=16384, chunks=4096)
 
     def loss(inputs):
-        image, alpha, needed = draw(inputs, settings, capacities=capacities)
+        image, alpha, usage = draw(inputs, settings, capacities=capacities)
         value = jnp.sum(image * data["cotangent_image"])
-        return value + jnp.sum(alpha * data["cotangent_alpha"]), (image, alpha, needed)
+        return value + jnp.sum(alpha * data["cotangent_alpha"]), (image, alpha, usage)
 
     inputs = tuple(data[k] for k in keys)
-    gradient, (image, alpha, needed) = jax.jit(jax.grad(loss, has_aux=True))(inputs)
-    assert overflowed(needed, capacities) == []
+    gradient, (image, alpha, usage) = jax.jit(jax.grad(loss, has_aux=True))(inputs)
+    assert overflowed(usage, capacities) == []
     np.testing.assert_allclose(image, data["image"], atol=ORACLE_TOLERANCE)
     np.testing.assert_allclose(alpha, data["alpha"], atol=ORACLE_TOLERANCE)
     expected = tuple(data[f"grad_{k}"] for k in keys)
@@ -179,12 +179,12 @@ def test_equals_dense_compositing(height, width, tile_size, channels, x64):
         jax.jit(jax.value_and_grad(partial(loss, render), has_aux=True))(inputs)
         for render in (tiled, partial(dense, settings=settings))
     ]
-    (_, (image, alpha, [needed])), got = results[0]
+    (_, (image, alpha, [tile_usage])), gradients = results[0]
     (_, (expected_image, expected_alpha, _)), expected = results[1]
-    assert overflowed(needed, AMPLE) == []
+    assert overflowed(tile_usage, AMPLE) == []
     np.testing.assert_allclose(image, expected_image, atol=REFERENCE_TOLERANCE)
     np.testing.assert_allclose(alpha, expected_alpha, atol=REFERENCE_TOLERANCE)
-    assert_close_gradients(got, expected, relative=1e-10, cosine=1e-12)
+    assert_close_gradients(gradients, expected, relative=1e-10, cosine=1e-12)
     # Alpha is the composite of a constant feature.
     np.testing.assert_allclose(image[..., -1], alpha, atol=1e-13)
     assert float(alpha.min()) >= 0.0
@@ -195,9 +195,9 @@ def test_custom_vjp_equals_autodiff_for_every_input_of_the_compositor(x64):
     settings = camera(jnp.float64, 16, 16)
     shape = {"height": 16, "width": 16}
     means, quats, scales, opacities, features = scene(2, 60, jnp.float64)
-    everything = project(means, quats, scales, **settings)
+    all_footprints = project(means, quats, scales, **settings)
     lists = jax.jit(find_visible, static_argnames=STATIC)(
-        everything, opacities, jnp.ones(60, bool), tile_size=4, capacities=AMPLE, **shape
+        all_footprints, opacities, jnp.ones(60, bool), tile_size=4, capacities=AMPLE, **shape
     )
     rows = [gather_visible(lists.index, x) for x in (means, quats, scales, opacities, features)]
     footprints = project(*rows[:3], **settings)
@@ -206,16 +206,16 @@ def test_custom_vjp_equals_autodiff_for_every_input_of_the_compositor(x64):
 
     def loss(render, arguments):
         *fields, opacities, features = arguments
-        changed = replace(footprints, **dict(zip(names, fields, strict=True)))
-        return scalar(*render(changed, opacities, features))
+        changed_footprints = replace(footprints, **dict(zip(names, fields, strict=True)))
+        return scalar(*render(changed_footprints, opacities, features))
 
     def tiled(*a):
         return composite(*a, lists, tile_size=4, **shape)
 
     arguments = (*(getattr(footprints, name) for name in names), rows[3], rows[4])
-    got = jax.jit(jax.grad(partial(loss, tiled)))(arguments)
+    gradients = jax.jit(jax.grad(partial(loss, tiled)))(arguments)
     expected = jax.jit(jax.grad(partial(loss, partial(_reference_composite, **shape))))(arguments)
-    assert_close_gradients(got, expected, relative=1e-10, cosine=1e-12)
+    assert_close_gradients(gradients, expected, relative=1e-10, cosine=1e-12)
 
 
 def test_gradients_match_finite_differences_along_random_directions(x64):
@@ -237,10 +237,10 @@ def test_gradients_match_finite_differences_along_random_directions(x64):
     step = 1e-6
     for _ in range(4):
         direction = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), arguments)
-        ahead, _ = loss(*jax.tree.map(lambda x, d: x + step * d, arguments, direction))
-        behind, _ = loss(*jax.tree.map(lambda x, d: x - step * d, arguments, direction))
+        forward, _ = loss(*jax.tree.map(lambda x, d: x + step * d, arguments, direction))
+        backward, _ = loss(*jax.tree.map(lambda x, d: x - step * d, arguments, direction))
         products = jax.tree.map(lambda g, d: jnp.sum(g * d), gradient, direction)
-        expected = (ahead - behind) / (2 * step)
+        expected = (forward - backward) / (2 * step)
         np.testing.assert_allclose(sum(jax.tree.leaves(products)), expected, rtol=1e-6)
 
 
@@ -257,23 +257,23 @@ def test_float32_gradients_stay_close_behind_opaque_layers():
         rng.uniform(size=(count, 3)),
     )
     inputs = tuple(jnp.asarray(a, jnp.float32) for a in arrays)
-    filled, eligible = padded(*inputs)
-    _, _, gradient = differentiate(filled, eligible=eligible)
-    got = [x[:count] for x in gradient]
+    padded_inputs, eligible = padded(*inputs)
+    _, _, gradient = differentiate(padded_inputs, eligible=eligible)
+    gradients = [x[:count] for x in gradient]
     expected = jax.jit(jax.grad(lambda x: scalar(*dense(x, settings))))(inputs)
     visible = np.abs(np.asarray(expected[4])) > 0
     assert visible.all()
     # The tolerance is relative for each row: the last sheet gets 1e-28 of the light, and its
     # gradient must still be right.
-    np.testing.assert_allclose(got[4], expected[4], rtol=1e-3)
-    assert_close_gradients(got[3], expected[3], relative=1e-4, cosine=1e-6)
+    np.testing.assert_allclose(gradients[4], expected[4], rtol=1e-3)
+    assert_close_gradients(gradients[3], expected[3], relative=1e-4, cosine=1e-6)
 
 
 def test_padding_does_not_change_image_or_gradients():
     inputs = scene(7, 40, jnp.float32)
-    double = Capacities(visible=1024, hits=16384, chunks=4096)
+    larger_capacities = Capacities(visible=1024, hits=16384, chunks=4096)
     _, images, gradients = differentiate(inputs)
-    _, other_images, other_gradients = differentiate(inputs, capacities=double)
+    _, other_images, other_gradients = differentiate(inputs, capacities=larger_capacities)
     for a, b in zip(images[:2], other_images[:2], strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
     assert_close_gradients(gradients, other_gradients, relative=1e-5, cosine=1e-9)
@@ -304,20 +304,20 @@ def test_overflow_is_reported_with_true_counts():
         width=24,
         tile_size=4,
     )
-    needed = find(capacities=AMPLE).usage
-    assert bool(fits(needed, AMPLE))
-    tight = AMPLE.resized(hits=64)
-    reported = find(capacities=tight).usage
-    assert int(reported["hits"]) == int(needed["hits"])
-    assert overflowed(reported, tight) == ["hits"]
-    tight = AMPLE.resized(chunks=64)
-    reported = find(capacities=tight).usage
-    assert int(reported["chunks"]) == int(needed["chunks"])
-    assert overflowed(reported, tight) == ["chunks"]
-    tight = AMPLE.resized(visible=64)
-    reported = find(capacities=tight).usage
-    assert int(reported["visible"]) == int(needed["visible"]) > 64
-    assert "visible" in overflowed(reported, tight)
+    usage = find(capacities=AMPLE).usage
+    assert bool(fits(usage, AMPLE))
+    small_capacities = AMPLE.resized(hits=64)
+    reported_usage = find(capacities=small_capacities).usage
+    assert int(reported_usage["hits"]) == int(usage["hits"])
+    assert overflowed(reported_usage, small_capacities) == ["hits"]
+    small_capacities = AMPLE.resized(chunks=64)
+    reported_usage = find(capacities=small_capacities).usage
+    assert int(reported_usage["chunks"]) == int(usage["chunks"])
+    assert overflowed(reported_usage, small_capacities) == ["chunks"]
+    small_capacities = AMPLE.resized(visible=64)
+    reported_usage = find(capacities=small_capacities).usage
+    assert int(reported_usage["visible"]) == int(usage["visible"]) > 64
+    assert "visible" in overflowed(reported_usage, small_capacities)
 
 
 def test_an_astronomic_number_of_hits_saturates_instead_of_wrapping():
@@ -347,8 +347,10 @@ def test_an_astronomic_number_of_hits_saturates_instead_of_wrapping():
 def test_depth_order_is_exact_and_ties_keep_row_order(dtype, x64):
     rng = np.random.default_rng(10)
     # Neighbouring floats are repeated, which only an exact, stable sort orders correctly.
-    base = np.nextafter(np.full(50, 2.0, dtype), np.inf, dtype=dtype)
-    depths = np.concatenate([base, np.full(50, 2.0), rng.uniform(0.02, 1e6, 100)]).astype(dtype)
+    next_depths = np.nextafter(np.full(50, 2.0, dtype), np.inf, dtype=dtype)
+    depths = np.concatenate([next_depths, np.full(50, 2.0), rng.uniform(0.02, 1e6, 100)]).astype(
+        dtype
+    )
     depths = rng.permutation(depths)
     count = len(depths)
     footprints = Footprints(
@@ -400,9 +402,9 @@ def test_hits_sort_alike_whether_or_not_tile_and_rank_fit_one_word(rank_count):
 @pytest.mark.parametrize("shift", [(0.0, 0.0, -10.0), (1e4, 0.0, 0.0)])
 def test_nothing_visible_gives_an_empty_image_and_zero_gradients(shift):
     inputs = scene(13, 40, jnp.float32)
-    moved = (inputs[0] + jnp.array([shift], jnp.float32), *inputs[1:])
-    _, (image, alpha, needed), gradient = differentiate(moved)
-    assert int(needed["visible"]) == int(needed["hits"]) == int(needed["chunks"]) == 0
+    moved_inputs = (inputs[0] + jnp.array([shift], jnp.float32), *inputs[1:])
+    _, (image, alpha, usage), gradient = differentiate(moved_inputs)
+    assert int(usage["visible"]) == int(usage["hits"]) == int(usage["chunks"]) == 0
     for leaf in (image, alpha, *gradient):
         assert not bool(jnp.any(leaf))
 
@@ -415,8 +417,8 @@ def test_opacity_zero_is_culled_and_opacity_one_is_clamped():
         jnp.array([0.0, 1.0]),
         jnp.ones((2, 3)),
     )
-    _, (image, alpha, needed), gradient = differentiate(inputs, eligible=eligible)
-    assert int(needed["visible"]) == 1
+    _, (image, alpha, usage), gradient = differentiate(inputs, eligible=eligible)
+    assert int(usage["visible"]) == 1
     np.testing.assert_allclose(alpha, MAX_ALPHA, rtol=1e-6)
     np.testing.assert_allclose(image, MAX_ALPHA, rtol=1e-6)
     assert all_finite(gradient)
@@ -450,9 +452,9 @@ def test_tile_size_does_not_change_the_image(x64):
 
 
 def test_float32_stays_float32():
-    _, (image, alpha, needed), gradient = differentiate(scene(16, 40, jnp.float32))
+    _, (image, alpha, usage), gradient = differentiate(scene(16, 40, jnp.float32))
     assert {leaf.dtype for leaf in (image, alpha, *gradient)} == {jnp.dtype("float32")}
-    assert {leaf.dtype for leaf in needed.values()} == {jnp.dtype("int32")}
+    assert {leaf.dtype for leaf in usage.values()} == {jnp.dtype("int32")}
 
 
 @pytest.mark.slow
@@ -485,12 +487,14 @@ def test_tiles_list_the_splats_that_their_pixels_may_see_and_hardly_any_other():
     """This matters for thin ellipses: the bounding box of a diagonal one meets every tile."""
     count, size, tile = 300, 96, 8
     rng = np.random.default_rng(5)
-    long, thin = rng.uniform(2.0, 25.0, count), rng.uniform(0.3, 2.0, count)
+    major_radii, minor_radii = rng.uniform(2.0, 25.0, count), rng.uniform(0.3, 2.0, count)
     angle = rng.uniform(0, np.pi, count)
     axis = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    across = np.stack([-axis[:, 1], axis[:, 0]], axis=-1)
-    squares = long[:, None, None] ** 2 * axis[:, :, None] * axis[:, None, :]
-    covariance = squares + thin[:, None, None] ** 2 * across[:, :, None] * across[:, None, :]
+    minor_axis = np.stack([-axis[:, 1], axis[:, 0]], axis=-1)
+    squares = major_radii[:, None, None] ** 2 * axis[:, :, None] * axis[:, None, :]
+    covariance = (
+        squares + minor_radii[:, None, None] ** 2 * minor_axis[:, :, None] * minor_axis[:, None, :]
+    )
     conic = np.linalg.inv(covariance)
     upper = (slice(None), [0, 0, 1], [0, 1, 1])
     means = rng.uniform(-10, size + 10, (count, 2))
@@ -518,16 +522,16 @@ def test_tiles_list_the_splats_that_their_pixels_may_see_and_hardly_any_other():
         np.asarray(x) for x in (lists.index, lists.chunk_ranks, lists.chunk_tiles)
     )
     slot, chunk = np.nonzero(ranks < capacities["visible"])
-    listed = np.zeros((count, (size // tile) ** 2), bool)
-    listed[index[ranks[slot, chunk]], tiles[chunk]] = True
+    is_listed = np.zeros((count, (size // tile) ** 2), bool)
+    is_listed[index[ranks[slot, chunk]], tiles[chunk]] = True
 
     x, y = np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5)
     offset = np.stack([x, y], axis=-1)[None] - means[:, None, None]
     sigma = 0.5 * np.einsum("nhwi,nij,nhwj->nhw", offset, conic, offset)
     is_seen = opacities[:, None, None] * np.exp(-sigma) >= MIN_ALPHA
     blocks = is_seen.reshape(count, size // tile, tile, size // tile, tile)
-    needed = blocks.any(axis=(2, 4)).reshape(count, -1)
-    assert not np.any(needed & ~listed)
+    is_needed = blocks.any(axis=(2, 4)).reshape(count, -1)
+    assert not np.any(is_needed & ~is_listed)
     # A listed ellipse may pass between the centres of the pixels of a tile.
-    assert listed.sum() < 1.1 * needed.sum()
-    assert int(lists.usage["hits"]) > 1.3 * listed.sum()
+    assert is_listed.sum() < 1.1 * is_needed.sum()
+    assert int(lists.usage["hits"]) > 1.3 * is_listed.sum()

@@ -58,8 +58,8 @@ def four_colours(height=16):
     azimuth = (0.5 - (np.arange(width) + 0.5) / width) * 2 * np.pi
     texels = np.zeros((height, width, 3))
     for column, angle in enumerate(azimuth):
-        towards = np.array([np.cos(angle), np.sin(angle), 0.0])
-        side = max(AXES, key=lambda name, towards=towards: towards @ AXES[name])
+        direction = np.array([np.cos(angle), np.sin(angle), 0.0])
+        side = max(AXES, key=lambda name, direction=direction: direction @ AXES[name])
         texels[:, column] = SIDES[side]
     texels[polar < np.pi / 6] = 1.0
     texels[polar > 5 * np.pi / 6] = 0.0
@@ -92,14 +92,14 @@ def mirror(light):
 
 def hue(colour):
     """Colour without its white part, normalised to unit length."""
-    bare = np.asarray(colour, float) - np.min(colour)
-    return bare / np.linalg.norm(bare)
+    chroma = np.asarray(colour, float) - np.min(colour)
+    return chroma / np.linalg.norm(chroma)
 
 
 def has_colour(found, expected, factor=1.7):
     """Whether the lit channels of a colour exceed all its other channels by a factor."""
-    lit = np.asarray(expected) > 0.5
-    return np.min(np.asarray(found)[lit]) > factor * np.max(np.asarray(found)[~lit])
+    is_lit = np.asarray(expected) > 0.5
+    return np.min(np.asarray(found)[is_lit]) > factor * np.max(np.asarray(found)[~is_lit])
 
 
 def where_the_surface_faces(view, direction):
@@ -121,9 +121,9 @@ def test_every_side_of_a_ball_has_the_colour_that_shines_on_it(kind, request):
     relit = request.getfixturevalue(kind)
     for side, axis in AXES.items():
         view = relit(camera_from(3 * axis))
-        found = where_the_surface_faces(view, axis)
-        assert has_colour(found, SIDES[side]), side
-        assert np.max(found) > 0.4
+        colour = where_the_surface_faces(view, axis)
+        assert has_colour(colour, SIDES[side]), side
+        assert np.max(colour) > 0.4
 
 
 def test_a_matt_ball_shows_the_irradiance_of_the_map(matt):
@@ -133,17 +133,17 @@ def test_a_matt_ball_shows_the_irradiance_of_the_map(matt):
     polar = (np.arange(height) + 0.5) / height * np.pi
     azimuth = (0.5 - (np.arange(width) + 0.5) / width) * 2 * np.pi
     polar, azimuth = np.meshgrid(polar, azimuth, indexing="ij")
-    towards = np.stack(
+    directions = np.stack(
         [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1
     )
-    share = np.sin(polar) * (np.pi / height) * (2 * np.pi / width) / np.pi
+    weights = np.sin(polar) * (np.pi / height) * (2 * np.pi / width) / np.pi
     for axis in AXES.values():
-        cosine = np.maximum(towards @ axis, 0)
-        expected = 0.95 * np.sum((share * cosine)[..., None] * texels, axis=(0, 1))
-        found = where_the_surface_faces(matt(camera_from(3 * axis)), axis)
+        cosine = np.maximum(directions @ axis, 0)
+        expected = 0.95 * np.sum((weights * cosine)[..., None] * texels, axis=(0, 1))
+        colour = where_the_surface_faces(matt(camera_from(3 * axis)), axis)
         # A pixel mixes splats whose normals differ by some twenty degrees, and the specular lobe
         # adds 4 %.
-        np.testing.assert_allclose(found, expected, atol=0.08)
+        np.testing.assert_allclose(colour, expected, atol=0.08)
 
 
 def test_a_camera_between_two_sides_sees_both_where_they_are(matt):
@@ -151,8 +151,8 @@ def test_a_camera_between_two_sides_sees_both_where_they_are(matt):
     for eye in ([2.2, -2.2, 0.5], [2.2, -2.2, 0.0]):
         view = matt(camera_from(eye))
         for side in ("+x", "-y"):
-            found = where_the_surface_faces(view, AXES[side])
-            assert has_colour(found, SIDES[side], 1.4), side
+            colour = where_the_surface_faces(view, AXES[side])
+            assert has_colour(colour, SIDES[side], 1.4), side
         right, left = view.rgb[:, SIZE // 2 :].sum((0, 1)), view.rgb[:, : SIZE // 2].sum((0, 1))
         assert right[0] > 1.3 * left[0]
         assert left[1] > 1.3 * right[1]
@@ -160,16 +160,16 @@ def test_a_camera_between_two_sides_sees_both_where_they_are(matt):
 
 def test_a_mirror_shows_the_sky_above_and_the_dark_ground_below(mirror):
     view = mirror(camera_from([3.0, 0.01, 0.0]))
-    covered = view.alpha > 0.9
-    rows = np.flatnonzero(covered.any(axis=1))
-    straight = view.rgb / np.maximum(view.alpha, 0.5)[..., None]
+    is_covered = view.alpha > 0.9
+    rows = np.flatnonzero(is_covered.any(axis=1))
+    straight_rgb = view.rgb / np.maximum(view.alpha, 0.5)[..., None]
     middle = SIZE // 2
 
     # A surface whose normal leans upwards by 45 degrees reflects the zenith to a level camera.
     def at(lean):
         normal = np.array([np.cos(lean), 0.0, np.sin(lean)])
-        score = np.where(covered, view.aovs["normal"] @ normal, -np.inf)
-        return straight.reshape(-1, 3)[np.argmax(score)]
+        score = np.where(is_covered, view.aovs["normal"] @ normal, -np.inf)
+        return straight_rgb.reshape(-1, 3)[np.argmax(score)]
 
     assert rows[0] < middle < rows[-1]
     assert np.min(at(np.pi / 4)) > 0.6
@@ -177,18 +177,18 @@ def test_a_mirror_shows_the_sky_above_and_the_dark_ground_below(mirror):
 
 
 def test_turning_the_light_by_a_quarter_moves_red_from_x_to_y(light, matt):
-    turned = rotate_light(light, jnp.asarray(about_z(np.pi / 2), jnp.float32))
-    seen = lookup(turned.radiance, jnp.asarray(np.stack(list(AXES.values())), jnp.float32))
-    for name, colour in zip(AXES, seen, strict=True):
-        came_from = about_z(-np.pi / 2) @ AXES[name]
-        side = max(AXES, key=lambda n, d=came_from: d @ AXES[n])
+    turned_light = rotate_light(light, jnp.asarray(about_z(np.pi / 2), jnp.float32))
+    colours = lookup(turned_light.radiance, jnp.asarray(np.stack(list(AXES.values())), jnp.float32))
+    for name, colour in zip(AXES, colours, strict=True):
+        old_direction = about_z(-np.pi / 2) @ AXES[name]
+        side = max(AXES, key=lambda n, d=old_direction: d @ AXES[n])
         np.testing.assert_allclose(colour, SIDES[side], atol=1e-3)
-    np.testing.assert_allclose(seen[list(AXES).index("+y")], RED, atol=1e-3)
-    view = matt.under(turned)(camera_from([0.0, 3.0, 0.0]))
+    np.testing.assert_allclose(colours[list(AXES).index("+y")], RED, atol=1e-3)
+    view = matt.under(turned_light)(camera_from([0.0, 3.0, 0.0]))
     assert has_colour(where_the_surface_faces(view, AXES["+y"]), RED)
     # The renderer with the first light still shows yellow there.
-    before = matt(camera_from([0.0, 3.0, 0.0]))
-    assert has_colour(where_the_surface_faces(before, AXES["+y"]), YELLOW)
+    first_view = matt(camera_from([0.0, 3.0, 0.0]))
+    assert has_colour(where_the_surface_faces(first_view, AXES["+y"]), YELLOW)
 
 
 def nothing(size=SIZE):
@@ -210,25 +210,25 @@ def test_the_background_towards_a_side_has_its_colour(light, side):
 def test_the_background_is_upright_and_not_mirrored(light):
     """In a view of 120 degrees towards +x, yellow (+y) is left, green (-y) right, white above."""
     camera = camera_from([-3.0, 0.0, 0.0], field_of_view=2 * np.arctan(np.sqrt(3)))
-    shown = picture(nothing(), camera, light, "light")
+    image = picture(nothing(), camera, light, "light")
     middle = SIZE // 2
-    np.testing.assert_allclose(shown[middle, 0], YELLOW, atol=2e-3)
-    np.testing.assert_allclose(shown[middle, -1], GREEN, atol=2e-3)
-    np.testing.assert_allclose(shown[middle, middle], RED, atol=2e-3)
+    np.testing.assert_allclose(image[middle, 0], YELLOW, atol=2e-3)
+    np.testing.assert_allclose(image[middle, -1], GREEN, atol=2e-3)
+    np.testing.assert_allclose(image[middle, middle], RED, atol=2e-3)
     steep = camera_from([-0.5, 0.0, -3.0])
     np.testing.assert_allclose(picture(nothing(), steep, light, "light"), 1.0, atol=2e-3)
 
 
 def test_the_background_is_the_environment_in_the_direction_of_every_pixel(light):
     camera = camera_from([1.0, -2.0, 0.7], field_of_view=1.2)
-    shown = picture(nothing(), camera, light, "light")
+    image = picture(nothing(), camera, light, "light")
     pose = views_from([[1.0, -2.0, 0.7]], size=SIZE, field_of_view=1.2).camera_to_world[0]
     for row, column in ((0, 0), (3, 12), (15, 7)):
         focal = float(camera.intrinsics[0, 0, 0])
         ray = np.array([(column + 0.5 - SIZE / 2) / focal, -(row + 0.5 - SIZE / 2) / focal, -1.0])
         ray = pose[:3, :3] @ ray / np.linalg.norm(ray)
         expected = lookup(light.radiance, jnp.asarray(ray[None], jnp.float32))[0]
-        np.testing.assert_allclose(shown[row, column], encode_srgb(np.asarray(expected)), atol=2e-3)
+        np.testing.assert_allclose(image[row, column], encode_srgb(np.asarray(expected)), atol=2e-3)
 
 
 def test_pictures_lie_over_white_and_black_and_refuse_other_names(light):
@@ -245,30 +245,32 @@ def test_pictures_lie_over_white_and_black_and_refuse_other_names(light):
 
 def test_a_written_map_is_read_back_the_right_way_round(tmp_path):
     write_hdr(tmp_path / "four.hdr", 3 * four_colours())
-    found = load_light(tmp_path / "four.hdr").radiance
-    assert found.dtype == jnp.float32
-    seen = lookup(found, jnp.asarray(np.stack([*AXES.values(), [0, 0, 1.0], [0, 0, -1.0]]), "f4"))
+    radiance = load_light(tmp_path / "four.hdr").radiance
+    assert radiance.dtype == jnp.float32
+    colours = lookup(
+        radiance, jnp.asarray(np.stack([*AXES.values(), [0, 0, 1.0], [0, 0, -1.0]]), "f4")
+    )
     # RGBE has eight bits; radiance above one must survive.
     np.testing.assert_allclose(
-        seen, 3 * np.stack([*SIDES.values(), np.ones(3), np.zeros(3)]), atol=0.05
+        colours, 3 * np.stack([*SIDES.values(), np.ones(3), np.zeros(3)]), atol=0.05
     )
 
 
 def test_large_maps_are_reduced_in_place_and_keep_their_flux(tmp_path):
     rng = np.random.default_rng(0)
     write_hdr(tmp_path / "four.hdr", four_colours(32) * rng.uniform(0.5, 1.5, (32, 64, 1)))
-    whole, small = (load_light(tmp_path / "four.hdr", largest=n).radiance for n in (32, 8))
-    assert small.shape == (8, 16, 3)
+    full_map, small_map = (load_light(tmp_path / "four.hdr", largest=n).radiance for n in (32, 8))
+    assert small_map.shape == (8, 16, 3)
     for side, axis in AXES.items():
-        seen = np.asarray(lookup(small, jnp.asarray(axis[None], jnp.float32))[0])
-        assert hue(seen) @ hue(SIDES[side]) > 0.999
+        colour = np.asarray(lookup(small_map, jnp.asarray(axis[None], jnp.float32))[0])
+        assert hue(colour) @ hue(SIDES[side]) > 0.999
     flux = [
         np.sum(
             np.asarray(x) * np.sin((np.arange(len(x)) + 0.5) * np.pi / len(x))[:, None, None],
             (0, 1),
         )
         * (np.pi / len(x)) ** 2
-        for x in (whole, small)
+        for x in (full_map, small_map)
     ]
     np.testing.assert_allclose(flux[1], flux[0], rtol=0.02)
 
@@ -316,8 +318,8 @@ def test_a_black_light_is_told(tmp_path):
 
 def test_an_image_of_eight_bits_is_taken_as_srgb(tmp_path):
     write_png(tmp_path / "grey.png", np.full((4, 8, 3), 0.5, np.float32))
-    found = load_light(tmp_path / "grey.png").radiance
-    np.testing.assert_allclose(found, (0.502 + 0.055) ** 2.4 / 1.055**2.4, atol=1e-3)
+    radiance = load_light(tmp_path / "grey.png").radiance
+    np.testing.assert_allclose(radiance, (0.502 + 0.055) ** 2.4 / 1.055**2.4, atol=1e-3)
 
 
 def test_movies_that_cannot_be_written_are_refused_before_anything_is_rendered(tmp_path):
@@ -334,14 +336,18 @@ def test_the_orbit_goes_counter_clockwise_and_keeps_distance_and_view():
     eye = center + [2.0, 0.0, 1.0]
     camera = camera_from(eye)
     for angle in (0.0, 0.3, np.pi / 2, np.pi):
-        moved = orbit(camera, center, angle)
+        moved_camera = orbit(camera, center, angle)
         expected = center + about_z(angle) @ (eye - center)
-        np.testing.assert_allclose(moved.centers[0], expected, atol=1e-5)
-        assert np.linalg.norm(moved.centers[0] - center) == pytest.approx(np.sqrt(5), rel=1e-5)
+        np.testing.assert_allclose(moved_camera.centers[0], expected, atol=1e-5)
+        assert np.linalg.norm(moved_camera.centers[0] - center) == pytest.approx(
+            np.sqrt(5), rel=1e-5
+        )
         # The centre of the orbit keeps its place in camera axes.
-        point = np.asarray([*center, 1.0], np.float32)
-        here, there = (np.asarray(x.world_to_camera[0]) @ point for x in (moved, camera))
-        np.testing.assert_allclose(here, there, atol=1e-5)
+        center_point = np.asarray([*center, 1.0], np.float32)
+        moved_point, original_point = (
+            np.asarray(x.world_to_camera[0]) @ center_point for x in (moved_camera, camera)
+        )
+        np.testing.assert_allclose(moved_point, original_point, atol=1e-5)
     # A quarter turn moves the camera from +x to +y.
     quarter = orbit(camera_from([3.0, 0.0, 0.0]), np.zeros(3), np.pi / 2)
     np.testing.assert_allclose(quarter.centers[0], [0, 3, 0], atol=1e-5)
@@ -350,17 +356,17 @@ def test_the_orbit_goes_counter_clockwise_and_keeps_distance_and_view():
 def test_the_orbit_of_camera_and_light_together_changes_no_background(light):
     camera = camera_from([2.0, 1.0, 0.4], field_of_view=1.0)
     angle = np.pi / 4  # four columns of the map: nothing is interpolated
-    turned = rotate_light(light, jnp.asarray(about_z(angle), jnp.float32))
-    first = picture(nothing(), camera, light, "light")
-    second = picture(nothing(), orbit(camera, np.zeros(3), angle), turned, "light")
-    np.testing.assert_allclose(second, first, atol=5e-3)
+    turned_light = rotate_light(light, jnp.asarray(about_z(angle), jnp.float32))
+    first_picture = picture(nothing(), camera, light, "light")
+    second_picture = picture(nothing(), orbit(camera, np.zeros(3), angle), turned_light, "light")
+    np.testing.assert_allclose(second_picture, first_picture, atol=5e-3)
 
 
 def test_movies_of_small_views_are_enlarged_and_those_of_large_ones_are_not():
-    small = relight._for_movies(camera_from([3.0, 0.0, 0.0]))
-    assert max(small.width, small.height) == 384
-    large = replace(camera_from([3.0, 0.0, 0.0]), width=500)
-    assert relight._for_movies(large) is large
+    small_camera = relight._for_movies(camera_from([3.0, 0.0, 0.0]))
+    assert max(small_camera.width, small_camera.height) == 384
+    large_camera = replace(camera_from([3.0, 0.0, 0.0]), width=500)
+    assert relight._for_movies(large_camera) is large_camera
 
 
 def test_relighting_writes_stills_and_movies(light, matt, tmp_path, monkeypatch):
@@ -369,8 +375,8 @@ def test_relighting_writes_stills_and_movies(light, matt, tmp_path, monkeypatch)
         views_from([[3.0, 0.0, 0.5], [0.0, 3.0, 0.5]], size=SIZE), names=("a/first", "second")
     )
     options = RelightOptions(turntable=2, rotate_env=2, suffix=".gif", frames_per_second=10.0)
-    written = relight_views(matt, light, shots_of(views), tmp_path, options)
-    assert [path.name for path in written] == [
+    paths = relight_views(matt, light, shots_of(views), tmp_path, options)
+    assert [path.name for path in paths] == [
         "a_first_rgba.png",
         "a_first.png",
         "second_rgba.png",
@@ -378,16 +384,16 @@ def test_relighting_writes_stills_and_movies(light, matt, tmp_path, monkeypatch)
         "turntable.gif",
         "rotate_env.gif",
     ]
-    assert all(path.parent == tmp_path for path in written)
-    rgba = np.asarray(Image.open(written[0]))
-    shown = np.asarray(Image.open(written[1]), float) / 255
+    assert all(path.parent == tmp_path for path in paths)
+    rgba = np.asarray(Image.open(paths[0]))
+    still = np.asarray(Image.open(paths[1]), float) / 255
     assert rgba.shape == (SIZE, SIZE, 4)
     assert rgba[0, 0, 3] == 0
     assert rgba[SIZE // 2, SIZE // 2, 3] > 200
     # In this view towards -x, the background is blue, and the front of the ball is red.
-    assert hue(shown[0, 0]) @ hue(BLUE) > 0.97
-    assert has_colour(shown[SIZE // 2, SIZE // 2], RED, 1.2)
-    for path in written[4:]:
+    assert hue(still[0, 0]) @ hue(BLUE) > 0.97
+    assert has_colour(still[SIZE // 2, SIZE // 2], RED, 1.2)
+    for path in paths[4:]:
         with Image.open(path) as film:
             assert film.n_frames == 2
             frames = []
@@ -396,24 +402,26 @@ def test_relighting_writes_stills_and_movies(light, matt, tmp_path, monkeypatch)
                 frames.append(np.asarray(film.convert("RGB"), float) / 255)
         # Half a turn of the camera shows the blue side of the ball; half a turn of the light brings
         # blue light to the side in view.
-        first, second = (frame[SIZE // 2, SIZE // 2] for frame in frames)
-        assert has_colour(first, RED, 1.2)
-        assert has_colour(second, BLUE, 1.2)
+        first_colour, second_colour = (frame[SIZE // 2, SIZE // 2] for frame in frames)
+        assert has_colour(first_colour, RED, 1.2)
+        assert has_colour(second_colour, BLUE, 1.2)
 
 
 def test_without_movies_only_stills_are_written(light, matt, tmp_path):
     views = views_from([[3.0, 0.0, 0.5]], size=SIZE)
-    written = relight_views(
+    paths = relight_views(
         matt, light, shots_of(views), tmp_path, RelightOptions(background="white")
     )
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(p.name for p in written)
-    assert len(written) == 2
-    assert np.all(np.asarray(Image.open(written[1]))[0, 0] == 255)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(p.name for p in paths)
+    assert len(paths) == 2
+    assert np.all(np.asarray(Image.open(paths[1]))[0, 0] == 255)
 
 
 def test_the_movie_is_an_mp4_only_where_one_can_be_made(monkeypatch):
-    for found, expected in ((True, ".mp4"), (False, ".gif")):
-        monkeypatch.setattr("geosplat_jax.report.relight.has_encoder", lambda suffix, f=found: f)
+    for is_available, expected in ((True, ".mp4"), (False, ".gif")):
+        monkeypatch.setattr(
+            "geosplat_jax.report.relight.has_encoder", lambda suffix, f=is_available: f
+        )
         assert RelightOptions().movie_suffix() == expected
     assert RelightOptions(suffix=".gif").movie_suffix() == ".gif"
 

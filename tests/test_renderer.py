@@ -54,8 +54,8 @@ def sky(scale=1.0, seed=0):
 
 def second_stage(config, pipeline):
     """The pipeline of the second stage, on the surface of another pipeline."""
-    built = build_pipeline(config, config.stage("monte_carlo"), pipeline.surface)
-    return replace(built, capacities=AMPLE)
+    stage_pipeline = build_pipeline(config, config.stage("monte_carlo"), pipeline.surface)
+    return replace(stage_pipeline, capacities=AMPLE)
 
 
 @pytest.fixture(scope="module")
@@ -77,8 +77,8 @@ def in_second_stage(matt):
     """Pipeline and parameters of the second stage, with bright indirect light."""
     pipeline, params = matt
     params = begin_stage(params, pipeline, CONFIG, CONFIG.stage("monte_carlo"))
-    *first, last = params.material.indirect_head
-    head = (*first, replace(last, bias=jnp.full_like(last.bias, 4.0)))
+    *hidden_layers, last_layer = params.material.indirect_head
+    head = (*hidden_layers, replace(last_layer, bias=jnp.full_like(last_layer.bias, 4.0)))
     material = replace(params.material, indirect_head=head)
     return second_stage(CONFIG, pipeline), replace(params, material=material)
 
@@ -118,26 +118,27 @@ def test_the_renderer_of_the_first_stage_is_the_training_render_tone_mapped(matt
 @pytest.mark.slow
 def test_too_small_buffers_grow_and_change_no_pixel(matt, camera):
     pipeline, params = matt
-    tight = Capacities(**dict.fromkeys(BUFFERS, 128))
-    ample, grown = (
-        Renderer(replace(pipeline, capacities=size), params)(camera) for size in (AMPLE, tight)
+    small_capacities = Capacities(**dict.fromkeys(BUFFERS, 128))
+    ample_view, grown_view = (
+        Renderer(replace(pipeline, capacities=capacities), params)(camera)
+        for capacities in (AMPLE, small_capacities)
     )
     # Programs of other sizes are fused differently, which changes the last bit of float32.
-    np.testing.assert_allclose(grown.rgb, ample.rgb, atol=1e-6)
-    np.testing.assert_allclose(grown.alpha, ample.alpha, atol=1e-6)
+    np.testing.assert_allclose(grown_view.rgb, ample_view.rgb, atol=1e-6)
+    np.testing.assert_allclose(grown_view.alpha, ample_view.alpha, atol=1e-6)
     for name in EVALUATION_AOVS:
-        np.testing.assert_allclose(grown.aovs[name], ample.aovs[name], atol=2e-6)
+        np.testing.assert_allclose(grown_view.aovs[name], ample_view.aovs[name], atol=2e-6)
 
 
 def test_the_program_of_assets_serves_every_light(direct, matt):
     """It does not depend on the transport, its samples, or the light."""
     renderer = Renderer(direct, matt[1], samples=32)
     renderer.asset()
-    before = renderer_module._reconstruct._cache_size()
+    cache_size = renderer_module._reconstruct._cache_size()
     renderer.relit(sky(seed=3), indirect="unshadowed").asset()
     Renderer(direct, replace(matt[1], light=sky(2.0)), samples=64).asset()
     Renderer(*matt).asset()
-    assert renderer_module._reconstruct._cache_size() == before
+    assert renderer_module._reconstruct._cache_size() == cache_size
 
 
 def test_lists_have_grown_before_the_largest_program_is_compiled(matt, monkeypatch):
@@ -149,15 +150,17 @@ def test_lists_have_grown_before_the_largest_program_is_compiled(matt, monkeypat
 
     monkeypatch.setattr(renderer_module, "_render_lit", render_lit)
     pipeline, params = matt
-    tight = replace(pipeline, capacities=AMPLE.resized(hits=128))
-    renderer = Renderer(tight, params)
-    large = views_from([[2.2, -1.8, 1.0]], size=2 * SIZE).camera()
-    with pytest.raises(Reached) as reached:
-        renderer(large)
-    unlit = replace(tight.unlit(), capacities=AMPLE)
-    needed = int(renderer_module._needs(unlit, renderer.asset().splats, large)["hits"])
-    assert needed > 128
-    assert reached.value.args[0]["hits"] >= needed
+    small_pipeline = replace(pipeline, capacities=AMPLE.resized(hits=128))
+    renderer = Renderer(small_pipeline, params)
+    large_camera = views_from([[2.2, -1.8, 1.0]], size=2 * SIZE).camera()
+    with pytest.raises(Reached) as failure:
+        renderer(large_camera)
+    unlit_pipeline = replace(small_pipeline.unlit(), capacities=AMPLE)
+    needed_hits = int(
+        renderer_module._needs(unlit_pipeline, renderer.asset().splats, large_camera)["hits"]
+    )
+    assert needed_hits > 128
+    assert failure.value.args[0]["hits"] >= needed_hits
 
 
 def test_no_samples_are_refused(matt):
@@ -175,9 +178,9 @@ def test_samples_are_rounded_up_to_equal_passes(matt, asked, drawn):
 def noise(pipeline, params, camera, samples):
     """Standard deviation over seeds, averaged over the pixels of the object."""
     views = [Renderer(pipeline, params, samples=samples, seed=seed)(camera) for seed in range(3)]
-    solid = views[0].alpha > 0.9
-    assert solid.sum() > 10
-    return float(np.mean(np.std([view.rgb[solid] for view in views], axis=0)))
+    is_opaque = views[0].alpha > 0.9
+    assert is_opaque.sum() > 10
+    return float(np.mean(np.std([view.rgb[is_opaque] for view in views], axis=0)))
 
 
 @pytest.mark.parametrize(
@@ -191,19 +194,19 @@ def noise(pipeline, params, camera, samples):
 def test_the_noise_falls_with_the_samples(direct, camera, material):
     _, params = ball_of_one_material(CONFIG, **material)
     params = replace(params, light=sky())
-    few, many = (noise(direct, params, camera, samples) for samples in (32, 128))
+    coarse_noise, fine_noise = (noise(direct, params, camera, samples) for samples in (32, 128))
     # Four times the samples would halve the noise. Highlights get no further passes once the splats
     # of a pixel average to so little noise.
-    assert 0 < many < max(0.75 * few, 0.002)
+    assert 0 < fine_noise < max(0.75 * coarse_noise, 0.002)
 
 
 def test_the_same_seed_gives_the_same_image_and_another_one_does_not(direct, matt, camera):
-    first, again, other = (
+    first_view, repeated_view, other_view = (
         Renderer(direct, matt[1], samples=32, seed=seed)(camera) for seed in (0, 0, 1)
     )
-    assert_same_view(first, again)
-    assert np.any(first.rgb != other.rgb)
-    np.testing.assert_array_equal(first.aovs["albedo"], other.aovs["albedo"])
+    assert_same_view(first_view, repeated_view)
+    assert np.any(first_view.rgb != other_view.rgb)
+    np.testing.assert_array_equal(first_view.aovs["albedo"], other_view.aovs["albedo"])
 
 
 def test_relighting_does_not_know_the_light_and_exposure_of_the_training(
@@ -211,67 +214,72 @@ def test_relighting_does_not_know_the_light_and_exposure_of_the_training(
 ):
     """Relighting also ignores the learned indirect light, and the stage in which a run stopped."""
     pipeline, params = in_second_stage
-    changed = replace(params, light=sky(3.0, seed=9), log_exposure=jnp.float32(-1.0))
-    learned = Renderer(pipeline, changed, samples=32)
-    assert_same_view(relit(camera), learned.relit(sky(seed=3), indirect="unshadowed")(camera))
+    changed_params = replace(params, light=sky(3.0, seed=9), log_exposure=jnp.float32(-1.0))
+    learned_renderer = Renderer(pipeline, changed_params, samples=32)
+    assert_same_view(
+        relit(camera), learned_renderer.relit(sky(seed=3), indirect="unshadowed")(camera)
+    )
 
 
 def test_another_light_changes_the_colours_alone(relit, camera):
-    before = relit(camera)
-    other = relit.under(sky(seed=5))
-    view = other(camera)
-    np.testing.assert_array_equal(view.alpha, before.alpha)
+    first_view = relit(camera)
+    other_renderer = relit.under(sky(seed=5))
+    view = other_renderer(camera)
+    np.testing.assert_array_equal(view.alpha, first_view.alpha)
     for name in EVALUATION_AOVS:
-        np.testing.assert_array_equal(view.aovs[name], before.aovs[name])
-    assert np.mean(np.abs(view.rgb - before.rgb)) > 1e-3
+        np.testing.assert_array_equal(view.aovs[name], first_view.aovs[name])
+    assert np.mean(np.abs(view.rgb - first_view.rgb)) > 1e-3
     # The first renderer still has its own light.
-    assert_same_view(relit(camera), before)
+    assert_same_view(relit(camera), first_view)
 
 
 def test_another_light_is_the_same_as_relighting_with_it(matt, relit, camera):
-    directly = Renderer(*matt, samples=32).relit(sky(seed=5), indirect="unshadowed")
-    assert_same_view(relit.under(sky(seed=5))(camera), directly(camera))
+    direct_renderer = Renderer(*matt, samples=32).relit(sky(seed=5), indirect="unshadowed")
+    assert_same_view(relit.under(sky(seed=5))(camera), direct_renderer(camera))
 
 
 def test_what_a_renderer_has_planned_binds_no_other(relit):
     """`under` keeps the plan; otherwise each frame under a turning light would grow its buffers."""
-    other = relit.under(sky(seed=6))
-    other.plan(views_from([[2.2, -1.8, 1.0]], size=200).camera())
-    assert other._pipeline.capacities != relit._pipeline.capacities
-    assert relit.under(sky(seed=6))._planned == relit._planned != other._planned
-    assert other.under(sky(seed=7))._pipeline.capacities == other._pipeline.capacities
+    other_renderer = relit.under(sky(seed=6))
+    other_renderer.plan(views_from([[2.2, -1.8, 1.0]], size=200).camera())
+    assert other_renderer._pipeline.capacities != relit._pipeline.capacities
+    assert relit.under(sky(seed=6))._planned == relit._planned != other_renderer._planned
+    assert (
+        other_renderer.under(sky(seed=7))._pipeline.capacities
+        == other_renderer._pipeline.capacities
+    )
 
 
 def test_light_enters_linearly_at_exposure_one(relit, camera):
     """Twice the light is twice the radiance: the same samples, and no exposure."""
-    single, double = relit(camera), relit.under(sky(2.0, seed=3))(camera)
-    assert double.rgb.max() < 0.9
-    np.testing.assert_allclose(double.rgb, 2 * single.rgb, rtol=1e-3, atol=1e-4)
+    single_view, doubled_view = relit(camera), relit.under(sky(2.0, seed=3))(camera)
+    assert doubled_view.rgb.max() < 0.9
+    np.testing.assert_allclose(doubled_view.rgb, 2 * single_view.rgb, rtol=1e-3, atol=1e-4)
 
 
 def test_a_matt_ball_under_uniform_light_has_the_radiance_of_its_albedo(relit, camera):
     uniform = EnvLight(jnp.full((8, 16, 3), 0.5, jnp.float32))
     view = relit.under(uniform)(camera)
-    straight = (view.rgb / np.maximum(view.alpha, 0.5)[..., None])[view.alpha > 0.95]
+    straight_rgb = (view.rgb / np.maximum(view.alpha, 0.5)[..., None])[view.alpha > 0.95]
     # The diffuse lobe gives .3, and the specular one a few percent of .5.
-    assert 0.29 < straight.mean() < 0.36
+    assert 0.29 < straight_rgb.mean() < 0.36
 
 
 def test_the_scale_multiplies_the_albedo(matt, camera):
-    base = Renderer(*matt, samples=32)
+    base_renderer = Renderer(*matt, samples=32)
     scale = np.array([0.5, 1.0, 0.25])
-    black, whole, scaled = (
-        base.relit(sky(seed=3), albedo_scale=factors, indirect="unshadowed")(camera)
+    black_view, full_view, scaled_view = (
+        base_renderer.relit(sky(seed=3), albedo_scale=factors, indirect="unshadowed")(camera)
         for factors in (np.zeros(3), np.ones(3), scale)
     )
     np.testing.assert_allclose(
-        scaled.aovs["albedo"], scale * whole.aovs["albedo"], rtol=1e-5, atol=1e-6
+        scaled_view.aovs["albedo"], scale * full_view.aovs["albedo"], rtol=1e-5, atol=1e-6
     )
     # With a dielectric, only the diffuse lobe is proportional to the albedo; the samples are the
     # same.
-    diffuse = whole.rgb - black.rgb
-    np.testing.assert_allclose(scaled.rgb, black.rgb + scale * diffuse, atol=2e-4)
-    np.testing.assert_array_equal(scaled.aovs["roughness"], whole.aovs["roughness"])
+    diffuse = full_view.rgb - black_view.rgb
+    np.testing.assert_allclose(scaled_view.rgb, black_view.rgb + scale * diffuse, atol=2e-4)
+    np.testing.assert_array_equal(scaled_view.aovs["roughness"], full_view.aovs["roughness"])
 
 
 def test_light_for_relighting_is_traced_and_learns_nothing():
@@ -303,16 +311,16 @@ def test_the_mesh_is_trimmed_and_lies_on_the_ball(relit):
 def test_pictures_have_straight_alpha_and_no_colour_behind_nothing():
     alpha = np.array([[0.0, 0.5, 1.0]], np.float32)
     rgb = np.array([[[0.0] * 3, [0.25] * 3, [0.5] * 3]], np.float32)
-    found = straight_rgba(RenderedView(rgb, alpha, rgb, {}))
-    np.testing.assert_array_equal(found[0, :, 3], alpha[0])
-    np.testing.assert_array_equal(found[0, 0, :3], 0.0)
-    np.testing.assert_allclose(found[0, 1, :3], found[0, 2, :3], rtol=1e-6)
+    rgba = straight_rgba(RenderedView(rgb, alpha, rgb, {}))
+    np.testing.assert_array_equal(rgba[0, :, 3], alpha[0])
+    np.testing.assert_array_equal(rgba[0, 0, :3], 0.0)
+    np.testing.assert_allclose(rgba[0, 1, :3], rgba[0, 2, :3], rtol=1e-6)
 
 
 def test_renders_and_photographs_are_shown_on_white_alike():
     alpha = np.array([[0.0, 0.5, 1.0]], np.float32)
-    straight = np.full((1, 3, 3), 0.5, np.float32)
-    shown = render_on_white(straight * alpha[..., None], alpha)
-    np.testing.assert_array_equal(shown[0, :, 0], to_picture(np.array([1.0, 0.75, 0.5])))
-    photograph = np.concatenate([straight, alpha[..., None]], axis=-1)
-    np.testing.assert_array_equal(photograph_on_white(photograph), shown)
+    straight_rgb = np.full((1, 3, 3), 0.5, np.float32)
+    picture = render_on_white(straight_rgb * alpha[..., None], alpha)
+    np.testing.assert_array_equal(picture[0, :, 0], to_picture(np.array([1.0, 0.75, 0.5])))
+    photograph = np.concatenate([straight_rgb, alpha[..., None]], axis=-1)
+    np.testing.assert_array_equal(photograph_on_white(photograph), picture)

@@ -85,18 +85,18 @@ def truth():
 
 def irradiance(normals, largest_x):
     """Irradiance / pi in green by brute force: 40 x 40 bilinear lookups per texel."""
-    fine = 40 * ROWS
-    directions = np.asarray(light_directions(fine, 2 * fine), float).reshape(-1, 3)
-    share = np.asarray(texel_solid_angles(fine, 2 * fine), float)
-    share = np.broadcast_to(share, (fine, 2 * fine)).reshape(-1)
+    row_count = 40 * ROWS
+    directions = np.asarray(light_directions(row_count, 2 * row_count), float).reshape(-1, 3)
+    solid_angles = np.asarray(texel_solid_angles(row_count, 2 * row_count), float)
+    solid_angles = np.broadcast_to(solid_angles, (row_count, 2 * row_count)).reshape(-1)
     radiance = reservoirs.lookup(sky().radiance, jnp.asarray(directions, jnp.float32))
     green = np.asarray(radiance, float)[:, 1]
-    found = []
+    values = []
     for normal, largest in zip(normals, largest_x, strict=True):
         cosine = np.maximum(directions @ normal, 0)
         is_open = directions[:, 0] <= largest
-        found.append(np.sum(green * cosine * is_open * share) / np.pi)
-    return np.array(found)
+        values.append(np.sum(green * cosine * is_open * solid_angles) / np.pi)
+    return np.array(values)
 
 
 @partial(jax.jit, static_argnames=("spec",))
@@ -104,13 +104,13 @@ def one_step(key, store, spec):
     """Return the estimates of one step, (points,), and the store that it leaves."""
     points, light, index = scene(), sky(), Wall()
     sampler = light_sampler(light)
-    found = resample(key, points, light, sampler, index, store, spec=spec, count=COUNT)
-    hits = cast(points, jnp.moveaxis(found.directions, 1, 0), index).T
+    samples = resample(key, points, light, sampler, index, store, spec=spec, count=COUNT)
+    hits = cast(points, jnp.moveaxis(samples.directions, 1, 0), index).T
     if store is not None:
-        store = kept(store, points, found, hits, index, spec=spec)
-    radiance = reservoirs.lookup(light.radiance, found.directions.reshape(-1, 3))[:, 1]
-    cosine = jnp.sum(points.normals[:, None] * found.directions, axis=-1)
-    value = radiance.reshape(POINTS, COUNT) * jnp.maximum(cosine, 0.0) * found.weights
+        store = kept(store, points, samples, hits, index, spec=spec)
+    radiance = reservoirs.lookup(light.radiance, samples.directions.reshape(-1, 3))[:, 1]
+    cosine = jnp.sum(points.normals[:, None] * samples.directions, axis=-1)
+    value = radiance.reshape(POINTS, COUNT) * jnp.maximum(cosine, 0.0) * samples.weights
     return jnp.mean(jnp.where(hits == OPEN, value, 0.0), axis=1) / jnp.pi, store
 
 
@@ -119,11 +119,11 @@ def errors(spec, seed=0):
     store = empty_store(spec, COUNT) if spec.reuse_steps else None
     for step in range(STEPS):
         key = jax.random.fold_in(jax.random.key(seed), step)
-        found, store = one_step(key, store, spec)
-    found = np.asarray(found, float).reshape(GROUPS, -1, KINDS).mean(axis=1)
+        estimates, store = one_step(key, store, spec)
+    estimates = np.asarray(estimates, float).reshape(GROUPS, -1, KINDS).mean(axis=1)
     expected = truth()
-    error = found.std(axis=0) / np.sqrt(GROUPS)
-    return (found.mean(axis=0) - expected) / expected, error / expected
+    error = estimates.std(axis=0) / np.sqrt(GROUPS)
+    return (estimates.mean(axis=0) - expected) / expected, error / expected
 
 
 PLAIN = ReservoirSettings(candidates=4, slots=32_768)
@@ -153,27 +153,27 @@ def test_the_mean_over_seeds_is_brute_force(how):
 def test_which_neighbour_is_asked_does_not_decide_what_is_chosen():
     # Two groups of points in a row, so that the side of a neighbour tells its group. With one
     # sample of one neighbour, both choices take equally many random bits.
-    each, keys = 12, 20_000
-    normals = np.repeat([[0, 0, 1], [0.77, 0, 0.64]], each, axis=0)
+    group_size, keys = 12, 20_000
+    normals = np.repeat([[0, 0, 1], [0.77, 0, 0.64]], group_size, axis=0)
     normals = jnp.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True), jnp.float32)
-    count, light, wall = 2 * each, sky(), 0.3  # no target function knows the wall
+    count, light, largest_x = 2 * group_size, sky(), 0.3  # no target function knows the wall
     faces = jnp.arange(count, dtype=jnp.int32)
     points = SurfacePoints(jnp.zeros_like(normals), normals, normals, faces, faces >= 0)
     sampler, spec = light_sampler(light), replace(PLAIN, candidates=2, neighbors=1)
 
     def estimate(key):
-        found = resample(key, points, light, sampler, None, None, spec=spec, count=1)
-        radiance = reservoirs.lookup(light.radiance, found.directions[:, 0])[:, 1]
-        cosine = jnp.maximum(jnp.sum(normals * found.directions[:, 0], axis=-1), 0.0)
-        is_open = found.directions[:, 0, 0] <= wall
-        return jnp.where(is_open, radiance * cosine * found.weights[:, 0] / jnp.pi, 0.0)
+        samples = resample(key, points, light, sampler, None, None, spec=spec, count=1)
+        radiance = reservoirs.lookup(light.radiance, samples.directions[:, 0])[:, 1]
+        cosine = jnp.maximum(jnp.sum(normals * samples.directions[:, 0], axis=-1), 0.0)
+        is_open = samples.directions[:, 0, 0] <= largest_x
+        return jnp.where(is_open, radiance * cosine * samples.weights[:, 0] / jnp.pi, 0.0)
 
-    drawn = jax.random.split(jax.random.key(0), keys)
-    found = jax.jit(lambda keys: jax.lax.map(estimate, keys, batch_size=500))(drawn)
-    found = np.asarray(found, float)
-    expected = irradiance(np.asarray(normals, float), np.full(count, wall))
-    error = found.std(axis=0) / np.sqrt(keys) / expected
-    bias = found.mean(axis=0) / expected - 1
+    random_keys = jax.random.split(jax.random.key(0), keys)
+    estimates = jax.jit(lambda keys: jax.lax.map(estimate, keys, batch_size=500))(random_keys)
+    estimates = np.asarray(estimates, float)
+    expected = irradiance(np.asarray(normals, float), np.full(count, largest_x))
+    error = estimates.std(axis=0) / np.sqrt(keys) / expected
+    bias = estimates.mean(axis=0) / expected - 1
     assert np.all(error < 0.03)
     assert np.all(np.abs(bias) <= STANDARD_ERRORS * error), bias / error
 
@@ -193,10 +193,10 @@ def test_a_fault_shows(monkeypatch, fault):
         monkeypatch.setattr(reservoirs, "_balance", equal)
         spec = REUSE["steps and neighbours"]
     else:
-        own = reservoirs._own
+        original_own = reservoirs._own
 
         def faulty(*args):
-            directions, weights = own(*args)
+            directions, weights = original_own(*args)
             return directions, weights * (PLAIN.candidates / (PLAIN.candidates - 1))
 
         monkeypatch.setattr(reservoirs, "_own", faulty)
@@ -218,29 +218,32 @@ def shaded(key, carry, settings):
     materials = Materials(jnp.full((POINTS, 3), 0.5), jnp.full(POINTS, 0.6), jnp.ones(POINTS))
     # Blocked directions have a radiance of sigmoid(2 - 3); the default would be sigmoid(0 - 3).
     attributes = Attributes(materials, None, jnp.full((POINTS, 6), 2.0))
-    first, second = jax.random.split(key)
-    prepared, carry = transport.prepare(first, points, attributes, sky(), Wall(), carry)
+    prepare_key, shade_key = jax.random.split(key)
+    lights, carry = transport.prepare(prepare_key, points, attributes, sky(), Wall(), carry)
     wo = points.normals
-    found = transport.shade(second, points, attributes, wo, prepared, Wall())
-    return found.diffuse_light, found.specular, carry
+    shading = transport.shade(shade_key, points, attributes, wo, lights, Wall())
+    return shading.diffuse_light, shading.specular, carry
 
 
 @pytest.mark.slow
 def test_blocked_directions_are_counted_once_when_reservoirs_leave_them_out():
     """Both lobes, with light from blocked directions, agree with plain samples on average."""
-    reuse = replace(REUSE["both, shadows traced"], neighbors=0)
-    reused = replace(MONTE_CARLO, reservoirs=reuse)
-    plain = shaded(jax.random.key(5), None, MONTE_CARLO)[:2]
-    carry = reused.build(LightSpec()).first_carry()
+    reservoir_settings = replace(REUSE["both, shadows traced"], neighbors=0)
+    transport_settings = replace(MONTE_CARLO, reservoirs=reservoir_settings)
+    plain_colours = shaded(jax.random.key(5), None, MONTE_CARLO)[:2]
+    carry = transport_settings.build(LightSpec()).first_carry()
     for step in range(3):
-        *found, carry = shaded(jax.random.key(step), carry, reused)
-    for one, other in zip(plain, found, strict=True):
-        one, other = (
-            np.asarray(x, float)[:, 1].reshape(GROUPS, -1, KINDS).mean(axis=1) for x in (one, other)
+        *reused_colours, carry = shaded(jax.random.key(step), carry, transport_settings)
+    for plain_means, reused_means in zip(plain_colours, reused_colours, strict=True):
+        plain_means, reused_means = (
+            np.asarray(x, float)[:, 1].reshape(GROUPS, -1, KINDS).mean(axis=1)
+            for x in (plain_means, reused_means)
         )
-        error = np.sqrt((one.var(axis=0) + other.var(axis=0)) / GROUPS)
-        assert np.all(error < 0.02 * one.mean(axis=0))
-        assert np.all(np.abs(one.mean(axis=0) - other.mean(axis=0)) < STANDARD_ERRORS * error)
+        error = np.sqrt((plain_means.var(axis=0) + reused_means.var(axis=0)) / GROUPS)
+        assert np.all(error < 0.02 * plain_means.mean(axis=0))
+        assert np.all(
+            np.abs(plain_means.mean(axis=0) - reused_means.mean(axis=0)) < STANDARD_ERRORS * error
+        )
 
 
 def test_normals_that_face_away_lose_no_highlight_to_reservoirs():
@@ -251,8 +254,8 @@ def test_normals_that_face_away_lose_no_highlight_to_reservoirs():
         vector = [np.sin(np.radians(angle)), 0.0, np.cos(np.radians(angle))]
         return jnp.tile(jnp.asarray([vector], jnp.float32), (count, 1))
 
-    nowhere = jnp.full((count,), -1, jnp.int32)
-    points = SurfacePoints(0 * rows(0), rows(0), rows(10), nowhere, jnp.ones(count, bool))
+    no_faces = jnp.full((count,), -1, jnp.int32)
+    points = SurfacePoints(0 * rows(0), rows(0), rows(10), no_faces, jnp.ones(count, bool))
     metal = Materials(jnp.full((count, 3), 0.8), jnp.full(count, 0.6), jnp.ones(count))
     attributes, light = Attributes(metal, None, None), EnvLight(jnp.ones((8, 16, 3)))
 
@@ -266,12 +269,14 @@ def test_normals_that_face_away_lose_no_highlight_to_reservoirs():
             lights, _ = transport.prepare(key, points, attributes, light, None)
             return transport.shade(key, points, attributes, rows(93), lights, None).specular
 
-        found = np.asarray(shade(jax.random.key(1)), float)[:, 0]
-        return found.mean(), found.std() / np.sqrt(count)
+        values = np.asarray(shade(jax.random.key(1)), float)[:, 0]
+        return values.mean(), values.std() / np.sqrt(count)
 
-    (plain, first), (chosen, second) = specular(0), specular(8)
-    assert abs(plain - chosen) < STANDARD_ERRORS * np.hypot(first, second)
-    assert plain > 10 * np.hypot(first, second)
+    (plain_mean, plain_error), (resampled_mean, resampled_error) = specular(0), specular(8)
+    assert abs(plain_mean - resampled_mean) < STANDARD_ERRORS * np.hypot(
+        plain_error, resampled_error
+    )
+    assert plain_mean > 10 * np.hypot(plain_error, resampled_error)
 
 
 def test_what_a_place_kept_is_used_only_nearby_and_on_a_surface_of_that_direction():
@@ -279,40 +284,45 @@ def test_what_a_place_kept_is_used_only_nearby_and_on_a_surface_of_that_directio
     spec = replace(REUSE["steps"], candidates=4, confidence=0.5)
     points, light, index = scene(), sky(), Wall()
     store = empty_store(spec, COUNT)
-    how = {"spec": spec, "count": COUNT}
+    options = {"spec": spec, "count": COUNT}
     run = jax.jit(
         lambda key, points, store: resample(
-            key, points, light, light_sampler(light), index, store, **how
+            key, points, light, light_sampler(light), index, store, **options
         )
     )
-    first = run(jax.random.key(0), points, store)
-    np.testing.assert_array_equal(first.confidences, 4.0)
+    first_samples = run(jax.random.key(0), points, store)
+    np.testing.assert_array_equal(first_samples.confidences, 4.0)
     hits = jnp.full((POINTS, COUNT), OPEN, jnp.int32)
-    store = jax.jit(partial(kept, spec=spec))(store, points, first, hits, index)
-    moved = replace(points, positions=points.positions.at[:, 1].add(1.0))
-    far = replace(points, positions=points.positions.at[:, 1].add(5.0))
-    turned = replace(points, normals=-points.normals)
-    for now, is_used in ((points, True), (moved, True), (far, False), (turned, False)):
-        found = np.asarray(run(jax.random.key(1), now, store).confidences)
+    store = jax.jit(partial(kept, spec=spec))(store, points, first_samples, hits, index)
+    moved_points = replace(points, positions=points.positions.at[:, 1].add(1.0))
+    far_points = replace(points, positions=points.positions.at[:, 1].add(5.0))
+    turned_points = replace(points, normals=-points.normals)
+    for current_points, is_used in (
+        (points, True),
+        (moved_points, True),
+        (far_points, False),
+        (turned_points, False),
+    ):
+        confidences = np.asarray(run(jax.random.key(1), current_points, store).confidences)
         # Because of lanes and collisions, some places lie in slots that other places took.
-        assert (np.mean(found == 6.0) > 0.5) == is_used
-        assert set(np.unique(found)) <= ({4.0, 6.0} if is_used else {4.0})
+        assert (np.mean(confidences == 6.0) > 0.5) == is_used
+        assert set(np.unique(confidences)) <= ({4.0, 6.0} if is_used else {4.0})
     # A step that sees no point leaves the store as it is.
-    unseen = replace(points, mask=jnp.zeros(POINTS, bool))
-    same = jax.jit(partial(kept, spec=spec))(store, unseen, first, hits, index)
-    for one, other in zip(jax.tree.leaves(store), jax.tree.leaves(same), strict=True):
-        np.testing.assert_array_equal(one, other)
+    unseen_points = replace(points, mask=jnp.zeros(POINTS, bool))
+    same_store = jax.jit(partial(kept, spec=spec))(store, unseen_points, first_samples, hits, index)
+    for leaf, other_leaf in zip(jax.tree.leaves(store), jax.tree.leaves(same_store), strict=True):
+        np.testing.assert_array_equal(leaf, other_leaf)
 
 
 def test_settings_refuse_what_would_lose_light():
-    kept_open = ReservoirSettings(candidates=2, visibility="traced")
+    traced_settings = ReservoirSettings(candidates=2, visibility="traced")
     with pytest.raises(ValueError, match="raise diffuse_count and specular_count"):
-        MonteCarloSettings(diffuse_count=0, specular_count=0, reservoirs=kept_open)
+        MonteCarloSettings(diffuse_count=0, specular_count=0, reservoirs=traced_settings)
     assert MonteCarloSettings(reservoirs=PLAIN).build(LightSpec()).first_carry() is None
-    reused = MonteCarloSettings(reservoirs=REUSE["steps"], light_count=3).build(LightSpec())
-    assert reused.first_carry().reservoirs.directions.shape == (32_768, 3, 3)
-    assert reused.for_each_view().first_carry() is None
-    assert reused.for_images(4).settings.reservoirs == ReservoirSettings()
+    transport = MonteCarloSettings(reservoirs=REUSE["steps"], light_count=3).build(LightSpec())
+    assert transport.first_carry().reservoirs.directions.shape == (32_768, 3, 3)
+    assert transport.for_each_view().first_carry() is None
+    assert transport.for_images(4).settings.reservoirs == ReservoirSettings()
 
 
 @pytest.mark.slow
@@ -329,10 +339,12 @@ def test_a_run_with_paths_and_reservoirs_resumes_bit_for_bit(tmp_path):
         "run.checkpoint_every=1",
     )
     dataset = sphere_dataset(count=3, size=12)
-    whole = fit(dataset, config, tmp_path / "whole")
+    whole_state = fit(dataset, config, tmp_path / "whole")
     fit(dataset, config, tmp_path / "parts", stop_after=2)
-    parts = fit(dataset, config, tmp_path / "parts", begin=Resume())
-    assert float(jnp.max(whole.carry.reservoirs.confidences)) > 3
-    assert jax.tree.structure(whole) == jax.tree.structure(parts)
-    for one, other in zip(jax.tree.leaves(whole), jax.tree.leaves(parts), strict=True):
-        np.testing.assert_array_equal(np.asarray(one), np.asarray(other))
+    resumed_state = fit(dataset, config, tmp_path / "parts", begin=Resume())
+    assert float(jnp.max(whole_state.carry.reservoirs.confidences)) > 3
+    assert jax.tree.structure(whole_state) == jax.tree.structure(resumed_state)
+    for leaf, other_leaf in zip(
+        jax.tree.leaves(whole_state), jax.tree.leaves(resumed_state), strict=True
+    ):
+        np.testing.assert_array_equal(np.asarray(leaf), np.asarray(other_leaf))

@@ -36,8 +36,10 @@ def test_matrices_are_rotations():
 
 
 def test_a_quarter_turn_about_z_takes_x_to_y():
-    half = np.pi / 4
-    matrix = quaternion_to_matrix(jnp.asarray([np.cos(half), 0, 0, np.sin(half)], jnp.float32))
+    half_angle = np.pi / 4
+    matrix = quaternion_to_matrix(
+        jnp.asarray([np.cos(half_angle), 0, 0, np.sin(half_angle)], jnp.float32)
+    )
     np.testing.assert_allclose(matrix @ jnp.asarray([1.0, 0, 0]), [0, 1, 0], atol=ROUNDING)
 
 
@@ -50,10 +52,12 @@ def test_length_and_sign_of_a_quaternion_do_not_matter():
 def test_conversion_to_quaternions_inverts_conversion_to_matrices():
     quats = _quaternions()
     unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-    back = np.asarray(matrix_to_quaternion(quaternion_to_matrix(jnp.asarray(unit, jnp.float32))))
-    sign = np.sign(np.sum(back * unit, axis=1, keepdims=True))
-    np.testing.assert_allclose(back * sign, unit, atol=ROUNDING)
-    largest = np.take_along_axis(back, np.abs(back).argmax(1)[:, None], 1)
+    restored_quats = np.asarray(
+        matrix_to_quaternion(quaternion_to_matrix(jnp.asarray(unit, jnp.float32)))
+    )
+    sign = np.sign(np.sum(restored_quats * unit, axis=1, keepdims=True))
+    np.testing.assert_allclose(restored_quats * sign, unit, atol=ROUNDING)
+    largest = np.take_along_axis(restored_quats, np.abs(restored_quats).argmax(1)[:, None], 1)
     assert np.all(largest > 0)
 
 
@@ -102,8 +106,10 @@ def test_angles_are_accurate_when_tiny_and_when_nearly_opposite():
     angles = np.array([0.0, 1e-6, 1e-3, 0.5, np.pi / 2, np.pi - 1e-3, np.pi])
     first = np.broadcast_to([1.0, 0, 0], (angles.size, 3))
     second = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
-    measured = angle_between(jnp.asarray(first, jnp.float32), jnp.asarray(second, jnp.float32))
-    np.testing.assert_allclose(measured, angles, rtol=1e-4, atol=1e-7)
+    measured_angles = angle_between(
+        jnp.asarray(first, jnp.float32), jnp.asarray(second, jnp.float32)
+    )
+    np.testing.assert_allclose(measured_angles, angles, rtol=1e-4, atol=1e-7)
 
 
 def test_angles_have_finite_gradients_at_both_ends():

@@ -25,16 +25,16 @@ def command(*arguments):
 
 
 def train_arguments(scene, output):
-    settings = [part for setting in SETTINGS for part in ("--set", setting)]
+    settings = [argument for setting in SETTINGS for argument in ("--set", setting)]
     return ("train", scene, "--output", output, "--downscale", 8, *settings)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A folder whose name looks like markup, with the scene beside it."""
-    base = tmp_path_factory.mktemp("runs") / "a [bold]name[/]"
-    shutil.copytree(DUCK, base / "duck")
-    return base
+    parent = tmp_path_factory.mktemp("runs") / "a [bold]name[/]"
+    shutil.copytree(DUCK, parent / "duck")
+    return parent
 
 
 @pytest.fixture(scope="module")
@@ -84,19 +84,19 @@ def test_a_preview_that_fails_is_told_of_and_ends_nothing(tmp_path, monkeypatch)
 
 
 def test_a_quality_beside_settings_or_a_budget_is_refused(folder):
-    for others in ({"config": make_config()}, {"budget": gs.Budget(600.0)}):
+    for extra_arguments in ({"config": make_config()}, {"budget": gs.Budget(600.0)}):
         with pytest.raises(TypeError, match="leave quality out"):
-            gs.train(folder / "duck", folder / "none", quality="high", **others)
+            gs.train(folder / "duck", folder / "none", quality="high", **extra_arguments)
 
 
 def test_a_refused_choice_leaves_the_run_that_it_was_to_replace(tmp_path):
-    few = sphere_dataset(count=6, size=8)
-    old = RunFolder(tmp_path / "run")
-    with old.locked():
-        old.begin(few, make_config(overrides=TINY), replace=False)
+    small_dataset = sphere_dataset(count=6, size=8)
+    old_folder = RunFolder(tmp_path / "run")
+    with old_folder.locked():
+        old_folder.begin(small_dataset, make_config(overrides=TINY), replace=False)
     with pytest.raises(ValueError, match="holds back every 8th of 6"):
-        gs.train(few, old.path, model="auto", begin=gs.Anew(replace=True))
-    assert old.exists
+        gs.train(small_dataset, old_folder.path, model="auto", begin=gs.Anew(replace=True))
+    assert old_folder.exists
 
 
 def test_a_dataset_is_not_read_again(folder):
@@ -108,12 +108,12 @@ def test_a_dataset_is_not_read_again(folder):
 
 def test_a_run_reads_the_views_that_it_was_trained_with(folder):
     dataset = gs.load_dataset(folder / "duck", downscale=8, train_views=5, test_views=2)
-    begun = RunFolder(folder / "few")
-    with begun.locked():
-        begun.begin(dataset, gs.make_config(overrides=SETTINGS), replace=False)
-    again = gs.Run(folder / "few").dataset
-    assert again.train.names == dataset.train.names
-    assert (len(again.train), len(again.test)) == (5, 2)
+    run_folder = RunFolder(folder / "few")
+    with run_folder.locked():
+        run_folder.begin(dataset, gs.make_config(overrides=SETTINGS), replace=False)
+    reread_dataset = gs.Run(folder / "few").dataset
+    assert reread_dataset.train.names == dataset.train.names
+    assert (len(reread_dataset.train), len(reread_dataset.test)) == (5, 2)
 
 
 def test_folders_may_be_texts(run, tmp_path):
@@ -122,9 +122,9 @@ def test_folders_may_be_texts(run, tmp_path):
 
 
 def test_the_time_of_a_training_is_that_of_all_its_sessions(run):
-    before = run.folder.training()["seconds_total"]
+    seconds_before = run.folder.training()["seconds_total"]
     gs.train(run.dataset, run.folder.path, run.folder.config(), begin=gs.Resume())
-    assert run.folder.training()["seconds_total"] > before
+    assert run.folder.training()["seconds_total"] > seconds_before
 
 
 def test_a_folder_that_is_taken_is_told_of_before_cameras_are_refined(run, folder, capsys):
@@ -165,56 +165,58 @@ def test_metrics_are_there_after_an_evaluation_and_not_before(commanded, capsys)
 def test_consistency_is_printed_and_written(commanded, capsys, tmp_path):
     target = tmp_path / "consistency.json"
     assert command("consistency", commanded.folder, "--json", target) == 0
-    found = json.loads(target.read_text())
-    assert f"{found['reflection_deg']:.3f} degrees" in capsys.readouterr().out
-    assert found["pixels"] > 100
-    assert 0 < found["reflection_deg"] < 60
+    figures = json.loads(target.read_text())
+    assert f"{figures['reflection_deg']:.3f} degrees" in capsys.readouterr().out
+    assert figures["pixels"] > 100
+    assert 0 < figures["reflection_deg"] < 60
 
 
 def test_what_a_stage_ended_with_is_evaluated_into_its_folder(commanded, capsys):
-    end = commanded.folder.end_of("split_sum")
+    end_folder = commanded.folder.end_of("split_sum")
     assert command("evaluate", commanded.folder, "--stage", "split_sum") == 2
     assert "is the last stage of" in " ".join(capsys.readouterr().err.split())
     assert command("evaluate", commanded.folder, "--stage", "split") == 2
     assert "has the stages split_sum" in " ".join(capsys.readouterr().err.split())
-    shutil.copytree(commanded.folder.checkpoints, end)
-    whole = (commanded.folder.path / "metrics.json").read_bytes()
+    shutil.copytree(commanded.folder.checkpoints, end_folder)
+    metrics_bytes = (commanded.folder.path / "metrics.json").read_bytes()
     assert command("evaluate", commanded.folder, "--stage", "split_sum", "--samples", 4) == 0
-    assert json.loads((end / "metrics.json").read_text())["mean"] == commanded.metrics["mean"]
-    assert (commanded.folder.path / "metrics.json").read_bytes() == whole
+    assert (
+        json.loads((end_folder / "metrics.json").read_text())["mean"] == commanded.metrics["mean"]
+    )
+    assert (commanded.folder.path / "metrics.json").read_bytes() == metrics_bytes
 
 
 def test_a_second_training_into_the_folder_is_refused_and_force_replaces_it(
     run, commanded, folder, capsys
 ):
-    before = commanded.folder.record()
+    old_record = commanded.folder.record()
     arguments = train_arguments(folder / "duck", folder / "command")
     assert command(*arguments) == 2
     assert "--force" in " ".join(capsys.readouterr().err.split())
-    assert commanded.folder.record() == before
+    assert commanded.folder.record() == old_record
     assert command(*arguments, "--force", "--seed", 7) == 0
     assert commanded.folder.config().run.seed == 7
 
 
 def test_a_scene_that_has_moved_is_found_again_with_the_option(run, folder, capsys):
-    moved = folder / "moved"
-    shutil.copytree(folder / "duck", moved / "duck")
+    moved_folder = folder / "moved"
+    shutil.copytree(folder / "duck", moved_folder / "duck")
     record = run.folder.record()
-    gone = {**record, "scene": str(folder / "nowhere")}
-    (run.folder.path / "run.json").write_text(json.dumps(gone))
+    stale_record = {**record, "scene": str(folder / "nowhere")}
+    (run.folder.path / "run.json").write_text(json.dumps(stale_record))
     assert command("render", run.folder, "--output", folder / "views") == 2
     assert "--scene" in capsys.readouterr().err
-    again = gs.Run(run.folder.path, scene=moved / "duck")
-    assert again.folder.record()["scene"] == str((moved / "duck").resolve())
+    reopened_run = gs.Run(run.folder.path, scene=moved_folder / "duck")
+    assert reopened_run.folder.record()["scene"] == str((moved_folder / "duck").resolve())
     assert len(gs.Run(run.folder.path).dataset.train) == 40
     (run.folder.path / "run.json").write_text(json.dumps(record))
 
 
 def test_every_setting_is_listed_with_its_default_range_and_meaning(capsys):
     assert command("settings", "geometry.resolution", "--quality", "draft") == 0
-    shown = " ".join(capsys.readouterr().out.split())
-    assert "geometry.resolution 32 >= 5, <= 512" in shown
-    assert "longest side" in shown
+    output = " ".join(capsys.readouterr().out.split())
+    assert "geometry.resolution 32 >= 5, <= 512" in output
+    assert "longest side" in output
     assert command("settings", "nothing") == 2
     # Output that is not a terminal is not wrapped, so that grep finds whole paths.
     assert command("settings", "stages.monte_carlo") == 0

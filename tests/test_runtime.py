@@ -10,28 +10,28 @@ from geosplat_jax.fit import runtime
 
 @pytest.fixture
 def cache_setting():
-    before = jax.config.jax_compilation_cache_dir
+    previous_directory = jax.config.jax_compilation_cache_dir
     yield
-    jax.config.update("jax_compilation_cache_dir", before)
+    jax.config.update("jax_compilation_cache_dir", previous_directory)
 
 
 def test_the_cache_is_kept_apart_by_version_and_processor(monkeypatch, tmp_path, cache_setting):
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    places = []
+    directories = []
     for flags in ("flags: avx2", "flags: avx512"):
         monkeypatch.setattr(runtime, "_cpu_flags", lambda flags=flags: flags)
         runtime.enable_compilation_cache()
-        places.append(jax.config.jax_compilation_cache_dir)
-    assert places[0] != places[1]
-    assert all(place.startswith(str(tmp_path)) for place in places)
+        directories.append(jax.config.jax_compilation_cache_dir)
+    assert directories[0] != directories[1]
+    assert all(directory.startswith(str(tmp_path)) for directory in directories)
 
 
 def test_a_cache_chosen_by_the_user_is_respected(monkeypatch, cache_setting):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/elsewhere")
-    before = jax.config.jax_compilation_cache_dir
+    previous_directory = jax.config.jax_compilation_cache_dir
     runtime.enable_compilation_cache()
-    assert jax.config.jax_compilation_cache_dir == before
+    assert jax.config.jax_compilation_cache_dir == previous_directory
 
 
 def test_programs_are_forgotten_when_they_hold_too_many_maps(monkeypatch):

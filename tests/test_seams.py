@@ -47,19 +47,19 @@ class EveryTriangle(RayIndex):
 
     def nearest(self, origins, directions, source, mask, *, two_sided=False):
         a, b, c = (self.mesh.vertices[self.mesh.faces[:, k]] for k in range(3))
-        edge, other = (b - a)[None], (c - a)[None]
-        across = jnp.cross(directions[:, None], other)
-        volume = jnp.sum(edge * across, axis=-1)
+        first_edge, second_edge = (b - a)[None], (c - a)[None]
+        direction_cross = jnp.cross(directions[:, None], second_edge)
+        volume = jnp.sum(first_edge * direction_cross, axis=-1)
         is_facing = jnp.abs(volume) > 1e-9 if two_sided else volume > 1e-9
         scale = 1.0 / jnp.where(is_facing, volume, 1.0)
-        start = origins[:, None] - a[None]
-        u = jnp.sum(start * across, axis=-1) * scale
-        turned = jnp.cross(start, jnp.broadcast_to(edge, start.shape))
-        v = jnp.sum(directions[:, None] * turned, axis=-1) * scale
-        at = jnp.sum(other * turned, axis=-1) * scale
-        own = jnp.arange(self.face_capacity, dtype=jnp.int32)[None] == source[:, None]
-        is_hit = is_facing & (u >= 0) & (v >= 0) & (u + v <= 1) & (at > 1e-5) & ~own
-        distance = jnp.where(is_hit & mask[:, None], at, jnp.inf)
+        offset = origins[:, None] - a[None]
+        u = jnp.sum(offset * direction_cross, axis=-1) * scale
+        offset_cross = jnp.cross(offset, jnp.broadcast_to(first_edge, offset.shape))
+        v = jnp.sum(directions[:, None] * offset_cross, axis=-1) * scale
+        ray_distance = jnp.sum(second_edge * offset_cross, axis=-1) * scale
+        is_source = jnp.arange(self.face_capacity, dtype=jnp.int32)[None] == source[:, None]
+        is_hit = is_facing & (u >= 0) & (v >= 0) & (u + v <= 1) & (ray_distance > 1e-5) & ~is_source
+        distance = jnp.where(is_hit & mask[:, None], ray_distance, jnp.inf)
         face = jnp.argmin(distance, axis=1).astype(jnp.int32)
         nearest = jnp.min(distance, axis=1)
         return nearest, jnp.where(jnp.isfinite(nearest), face, -1)
@@ -119,8 +119,8 @@ class TrianglesSettings(SurfaceSettings, kind="triangles"):
 
     def _make(self):
         ball = trimesh.creation.icosphere(subdivisions=2, radius=self.radius)
-        home = jnp.asarray(ball.vertices, jnp.float32)
-        return Triangles(jnp.asarray(ball.faces, jnp.int32), home), Corners(home)
+        vertices = jnp.asarray(ball.vertices, jnp.float32)
+        return Triangles(jnp.asarray(ball.faces, jnp.int32), vertices), Corners(vertices)
 
     def start(self, dataset, key):
         return self._make()
@@ -153,9 +153,9 @@ class Lamp(Transport):
         return jnp.float32(0.0)
 
     def prepare(self, key, points, attributes, light, index, carry=None):
-        seen = jnp.float32(0.0) if carry is None else carry
-        brightness = jnp.mean(light.radiance) * (1.0 + self.growth * seen)
-        return LampLight(brightness), seen + 1.0
+        step_count = jnp.float32(0.0) if carry is None else carry
+        brightness = jnp.mean(light.radiance) * (1.0 + self.growth * step_count)
+        return LampLight(brightness), step_count + 1.0
 
     def shade(self, key, points, attributes, wo, illumination, index):
         facing = jnp.abs(jnp.sum(points.normals * wo, axis=-1, keepdims=True))
@@ -220,21 +220,25 @@ def dataset():
 def mesh_config():
     """Three stages on the triangles: split sum, Monte Carlo with rays, and the lamp."""
     config = tiny_config(*MONTE_CARLO, "stages.split_sum.steps=3")
-    shared = {"corners": Rate(1e-3)}
+    shared_rates = {"corners": Rate(1e-3)}
     weights = ("entropy", "deviation", "weights")
 
     def on_mesh(stage):
         rates = {n: r for n, r in stage.rates.items() if n not in ("sdf", "deform", "weights")}
-        kept = {name: w for name, w in stage.weights.items() if name not in weights}
-        return replace(stage, rates={**rates, **shared}, weights={**kept, "offset": Schedule(0.1)})
+        kept_weights = {name: w for name, w in stage.weights.items() if name not in weights}
+        return replace(
+            stage,
+            rates={**rates, **shared_rates},
+            weights={**kept_weights, "offset": Schedule(0.1)},
+        )
 
     stages = tuple(map(on_mesh, config.stages))
-    third = replace(
+    third_stage = replace(
         THIRD,
         rates={**stages[0].rates, "albedo": Rate(0.0)},
         weights={**THIRD.weights, "offset": Schedule(0.1)},
     )
-    return replace(config, geometry=TrianglesSettings(), stages=(*stages, third))
+    return replace(config, geometry=TrianglesSettings(), stages=(*stages, third_stage))
 
 
 @pytest.fixture(scope="module")
@@ -270,13 +274,15 @@ def test_the_carry_counts_the_steps_of_its_stage(run):
 
 def test_entering_and_freezing_do_what_the_stage_says(dataset, run):
     folder, state = run
-    before = load_trained(folder, stage="monte_carlo")
-    assert before.stage.name == "monte_carlo"
+    trained_before = load_trained(folder, stage="monte_carlo")
+    assert trained_before.stage.name == "monte_carlo"
     # The light was quartered, then trained; the albedo was frozen.
-    share = float(jnp.mean(state.params.light.radiance) / jnp.mean(before.params.light.radiance))
-    assert 0.15 < share < 0.4
+    brightness_ratio = float(
+        jnp.mean(state.params.light.radiance) / jnp.mean(trained_before.params.light.radiance)
+    )
+    assert 0.15 < brightness_ratio < 0.4
     np.testing.assert_array_equal(
-        state.params.material.albedo_table, before.params.material.albedo_table
+        state.params.material.albedo_table, trained_before.params.material.albedo_table
     )
 
 
@@ -290,8 +296,8 @@ def test_resuming_in_any_stage_equals_the_run_in_one_go(dataset, run, tmp_path, 
 
 
 def test_the_stages_before_another_one_can_be_taken_from_a_run(dataset, run, tmp_path):
-    taken = fit(dataset, mesh_config(), tmp_path / "run", begin=TakeOver(run[0], "lamp"))
-    assert_same(run[1], taken)
+    state = fit(dataset, mesh_config(), tmp_path / "run", begin=TakeOver(run[0], "lamp"))
+    assert_same(run[1], state)
     assert [line["step"] for line in lines_of(tmp_path / "run")] == [6, 7, 8]
     with pytest.raises(TrainingError, match="is the first stage"):
         fit(dataset, mesh_config(), tmp_path / "x", begin=TakeOver(run[0], "split_sum"))

@@ -103,17 +103,17 @@ def test_settings_of_every_kind_survive_json(room):
     ],
 )
 def test_the_first_mistake_is_named_by_its_path_in_one_line(values, message):
-    with pytest.raises(ValueError, match=".") as caught:
+    with pytest.raises(ValueError, match=".") as error_info:
         from_plain(Room, values)
-    assert str(caught.value).startswith(message)
-    assert "\n" not in str(caught.value)
+    assert str(error_info.value).startswith(message)
+    assert "\n" not in str(error_info.value)
 
 
 def test_every_mistake_has_a_line_of_its_own():
     lamp = {"kind": "strip", "lengths": [1.0, -1.0, 1e31]}
-    with pytest.raises(ValueError, match=".") as caught:
+    with pytest.raises(ValueError, match=".") as error_info:
         from_plain(Room, {"doors": 2**31, "windows": 1, "lamp": lamp}, "house")
-    assert sorted(str(caught.value).splitlines()) == [
+    assert sorted(str(error_info.value).splitlines()) == [
         "house.doors must be less than 2**31, got 2147483648",
         "house.lamp.lengths.1 must be greater than or equal to 0, got -1.0",
         "house.lamp.lengths.2 must be 0, or between 1e-30 and 1e+30 in size, for single "
@@ -134,11 +134,11 @@ def test_every_mistake_has_a_line_of_its_own():
     ],
 )
 def test_values_are_checked_in_one_line_wherever_settings_are_made(make, message):
-    with pytest.raises(ValueError, match=".") as caught:
+    with pytest.raises(ValueError, match=".") as error_info:
         make()
-    assert str(caught.value).startswith(message)
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 400
+    assert str(error_info.value).startswith(message)
+    assert "\n" not in str(error_info.value)
+    assert len(str(error_info.value)) < 400
 
 
 @settings

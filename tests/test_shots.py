@@ -31,8 +31,8 @@ def angle_of(camera):
 def write_cameras(folder, **keys):
     poses = DATASET.train.camera_to_world[:2]
     frames = [
-        {"file_path": f"./path/{number}", "transform_matrix": pose.tolist()}
-        for number, pose in enumerate(poses)
+        {"file_path": f"./path/{index}", "transform_matrix": pose.tolist()}
+        for index, pose in enumerate(poses)
     ]
     path = folder / "path.json"
     path.write_text(json.dumps({**keys, "frames": frames}))
@@ -42,42 +42,44 @@ def write_cameras(folder, **keys):
 def test_the_views_of_a_split_are_its_cameras():
     shots = Cameras("train").shots(DATASET, CENTER)
     assert [shot.name for shot in shots] == list(DATASET.train.names)
-    for number, shot in enumerate(shots):
-        expected = DATASET.train.camera([number])
+    for view_index, shot in enumerate(shots):
+        expected = DATASET.train.camera([view_index])
         np.testing.assert_array_equal(shot.camera.world_to_camera, expected.world_to_camera)
         np.testing.assert_array_equal(shot.camera.intrinsics, expected.intrinsics)
 
 
 def test_size_and_angle_change_the_image_and_not_the_place():
-    (first, *_) = Cameras("train").shots(DATASET, CENTER)
-    (other, *_) = Cameras("train", size=60, field_of_view=90.0).shots(DATASET, CENTER)
-    assert max(other.camera.width, other.camera.height) == 60
-    assert angle_of(other.camera) == pytest.approx(90.0, abs=1e-3)
-    assert angle_of(first.camera) != pytest.approx(90.0, abs=1)
-    np.testing.assert_array_equal(other.camera.world_to_camera, first.camera.world_to_camera)
+    (first_shot, *_) = Cameras("train").shots(DATASET, CENTER)
+    (resized_shot, *_) = Cameras("train", size=60, field_of_view=90.0).shots(DATASET, CENTER)
+    assert max(resized_shot.camera.width, resized_shot.camera.height) == 60
+    assert angle_of(resized_shot.camera) == pytest.approx(90.0, abs=1e-3)
+    assert angle_of(first_shot.camera) != pytest.approx(90.0, abs=1)
+    np.testing.assert_array_equal(
+        resized_shot.camera.world_to_camera, first_shot.camera.world_to_camera
+    )
 
 
 def test_an_angle_keeps_the_shape_of_pixels_and_the_axis_of_the_lens():
     camera = DATASET.train.camera([0])
-    uneven = jnp.asarray([[[40.0, 0, 11], [0, 50.0, 13], [0, 0, 1]]], jnp.float32)
-    turned = with_field_of_view(replace(camera, intrinsics=uneven), 60.0)
-    found = np.asarray(turned.intrinsics[0])
-    assert angle_of(turned) == pytest.approx(60.0, abs=1e-3)
-    assert found[1, 1] / found[0, 0] == pytest.approx(50 / 40)
-    np.testing.assert_allclose(found[:2, 2], [11, 13])
+    intrinsics = jnp.asarray([[[40.0, 0, 11], [0, 50.0, 13], [0, 0, 1]]], jnp.float32)
+    zoomed_camera = with_field_of_view(replace(camera, intrinsics=intrinsics), 60.0)
+    zoomed_intrinsics = np.asarray(zoomed_camera.intrinsics[0])
+    assert angle_of(zoomed_camera) == pytest.approx(60.0, abs=1e-3)
+    assert zoomed_intrinsics[1, 1] / zoomed_intrinsics[0, 0] == pytest.approx(50 / 40)
+    np.testing.assert_allclose(zoomed_intrinsics[:2, 2], [11, 13])
 
 
 def test_a_turntable_is_a_circle_around_the_object_that_begins_at_the_first_camera():
     center = np.array([0.1, -0.2, 0.3])
-    first = eyes(Cameras("train").shots(DATASET, center))[0]
+    first_position = eyes(Cameras("train").shots(DATASET, center))[0]
     shots = Cameras("train", turntable=4).shots(DATASET, center)
-    places = eyes(shots)
-    np.testing.assert_allclose(places[0], first, atol=1e-5)
-    radius = np.linalg.norm((places - center)[:, :2], axis=1)
+    positions = eyes(shots)
+    np.testing.assert_allclose(positions[0], first_position, atol=1e-5)
+    radius = np.linalg.norm((positions - center)[:, :2], axis=1)
     np.testing.assert_allclose(radius, radius[0], atol=1e-5)
-    np.testing.assert_allclose(places[:, 2], first[2], atol=1e-5)
-    across = (places[0] + places[2])[:2] / 2
-    np.testing.assert_allclose(across, center[:2], atol=1e-5)
+    np.testing.assert_allclose(positions[:, 2], first_position[2], atol=1e-5)
+    midpoint = (positions[0] + positions[2])[:2] / 2
+    np.testing.assert_allclose(midpoint, center[:2], atol=1e-5)
 
 
 def test_cameras_of_a_file_have_its_poses_and_its_lens(tmp_path):
@@ -111,10 +113,10 @@ def test_a_bent_lens_is_refused(tmp_path):
 
 
 def test_a_scene_without_test_views_says_what_to_do():
-    bare = replace(DATASET, test=no_views(DATASET.train))
+    bare_dataset = replace(DATASET, test=no_views(DATASET.train))
     with pytest.raises(RunError, match="no test views; use --views train.*--cameras FILE"):
-        Cameras("test").shots(bare, CENTER)
-    assert len(Cameras(None).shots(bare, CENTER)) == len(bare.train)
+        Cameras("test").shots(bare_dataset, CENTER)
+    assert len(Cameras(None).shots(bare_dataset, CENTER)) == len(bare_dataset.train)
 
 
 @pytest.mark.parametrize(
@@ -148,7 +150,7 @@ def test_names_of_files_are_all_different():
 def rendered():
     rng = np.random.default_rng(0)
     alpha = np.array([[0.0, 0.25], [0.5, 1.0]], np.float32)
-    straight = {
+    straight_aovs = {
         "albedo": rng.uniform(0.1, 0.9, (2, 2, 3)),
         "roughness": rng.uniform(0.1, 0.9, (2, 2, 1)),
         "metallic": rng.uniform(0.1, 0.9, (2, 2, 1)),
@@ -157,45 +159,47 @@ def rendered():
     }
     rgb = rng.uniform(0.1, 4.0, (2, 2, 3))
     linear = (rgb * alpha[..., None]).astype(np.float32)
-    blended = {name: (v * alpha[..., None]).astype(np.float32) for name, v in straight.items()}
-    view = RenderedView(np.minimum(linear, 1.0), alpha, linear, blended)
-    return view, rgb, straight
+    blended_aovs = {
+        name: (v * alpha[..., None]).astype(np.float32) for name, v in straight_aovs.items()
+    }
+    view = RenderedView(np.minimum(linear, 1.0), alpha, linear, blended_aovs)
+    return view, rgb, straight_aovs
 
 
 def test_floats_are_straight_linear_values_and_zero_beside_the_object(tmp_path):
     """This also holds for colours brighter than white."""
-    view, rgb, straight = rendered()
+    view, rgb, straight_aovs = rendered()
     assert np.max(rgb[view.alpha > 0]) > 2.0
     names = ("albedo", "roughness", "metallic", "normal", "depth")
-    written = Images(names, exr=True).write(tmp_path, "v", view)
-    assert {path.name for path in written} == {path.name for path in tmp_path.iterdir()}
-    covered = view.alpha[..., None] > 0
+    paths = Images(names, exr=True).write(tmp_path, "v", view)
+    assert {path.name for path in paths} == {path.name for path in tmp_path.iterdir()}
+    is_covered = view.alpha[..., None] > 0
     for name in names:
-        found = read_linear(tmp_path / f"v_{name}.exr")
-        np.testing.assert_allclose(found, np.where(covered, straight[name], 0), rtol=1e-5)
-    found = read_linear(tmp_path / "v_rgba.exr")
-    np.testing.assert_allclose(found[..., 3], view.alpha)
-    np.testing.assert_allclose(found[..., :3], np.where(covered, rgb, 0), rtol=1e-5)
+        pixels = read_linear(tmp_path / f"v_{name}.exr")
+        np.testing.assert_allclose(pixels, np.where(is_covered, straight_aovs[name], 0), rtol=1e-5)
+    pixels = read_linear(tmp_path / "v_rgba.exr")
+    np.testing.assert_allclose(pixels[..., 3], view.alpha)
+    np.testing.assert_allclose(pixels[..., :3], np.where(is_covered, rgb, 0), rtol=1e-5)
 
 
 def test_pictures_are_what_viewers_expect_and_depth_is_never_rounded(tmp_path):
-    view, _, straight = rendered()
+    view, _, straight_aovs = rendered()
     Images(("albedo", "roughness", "normal", "depth")).write(tmp_path, "v", view)
     assert {path.name for path in tmp_path.iterdir()} == {
         *("v_rgba.png", "v_albedo.png", "v_roughness.png", "v_normal.png", "v_depth.exr"),
     }
-    covered = view.alpha > 0
+    is_covered = view.alpha > 0
     albedo = read_image(tmp_path / "v_albedo.png")
-    expected = encode_srgb(straight["albedo"].astype(np.float32))
-    np.testing.assert_allclose(albedo[covered][:, :3], expected[covered], atol=1 / 255)
+    expected = encode_srgb(straight_aovs["albedo"].astype(np.float32))
+    np.testing.assert_allclose(albedo[is_covered][:, :3], expected[is_covered], atol=1 / 255)
     roughness = read_image(tmp_path / "v_roughness.png")
     np.testing.assert_allclose(
-        roughness[covered][:, 0], straight["roughness"][covered][:, 0], atol=1 / 255
+        roughness[is_covered][:, 0], straight_aovs["roughness"][is_covered][:, 0], atol=1 / 255
     )
     np.testing.assert_allclose(roughness[..., -1], view.alpha, atol=1 / 255)
     normal = read_image(tmp_path / "v_normal.png")
-    unit = 2 * normal[covered][:, :3] - 1
-    np.testing.assert_allclose(unit, straight["normal"][covered], atol=1.01 / 255)
+    unit = 2 * normal[is_covered][:, :3] - 1
+    np.testing.assert_allclose(unit, straight_aovs["normal"][is_covered], atol=1.01 / 255)
     np.testing.assert_allclose(normal[..., 3], view.alpha, atol=1 / 255)
 
 

@@ -84,13 +84,13 @@ def _hemisphere(polar_count, azimuth_count):
 def _specular_brdf(light, view, roughness):
     """Evaluate D G / (4 n.l n.v) and Schlick's (1 - v.h)^5 about the normal +z, textbook form."""
     alpha2 = roughness**4
-    half = light + view
-    half /= np.linalg.norm(half, axis=1, keepdims=True)
-    n_l, n_v, n_h = light[:, 2], view[2], half[:, 2]
+    half_vectors = light + view
+    half_vectors /= np.linalg.norm(half_vectors, axis=1, keepdims=True)
+    n_l, n_v, n_h = light[:, 2], view[2], half_vectors[:, 2]
     ndf = alpha2 / (np.pi * (n_h**2 * (alpha2 - 1) + 1) ** 2)
     smith = [np.sqrt(1 + alpha2 * (1 / c**2 - 1)) - 1 for c in (n_l, n_v)]
     shadowing = 1 / (1 + 0.5 * smith[0] + 0.5 * smith[1])
-    return ndf * shadowing / (4 * n_l * n_v), (1 - half @ view) ** 5
+    return ndf * shadowing / (4 * n_l * n_v), (1 - half_vectors @ view) ** 5
 
 
 @pytest.mark.parametrize("roughness", [0.35, 0.6, 1.0])
@@ -100,8 +100,8 @@ def test_directional_albedo_equals_direct_integration_of_the_brdf(n_dot_v, rough
     view = np.array([np.sqrt(1 - n_dot_v**2), 0, n_dot_v])
     brdf, fresnel = _specular_brdf(light, view, roughness)
     expected = [np.sum(brdf * (1 - fresnel) * weights), np.sum(brdf * fresnel * weights)]
-    measured = directional_albedo(np.array(n_dot_v), np.array(roughness))
-    np.testing.assert_allclose(measured, expected, atol=FG_QUADRATURE)
+    actual = directional_albedo(np.array(n_dot_v), np.array(roughness))
+    np.testing.assert_allclose(actual, expected, atol=FG_QUADRATURE)
 
 
 def test_directional_albedo_never_creates_energy_and_is_lossless_when_smooth():
@@ -116,18 +116,20 @@ def test_the_table_interpolates_the_directional_albedo():
     rng = np.random.default_rng(1)
     n_dot_v, roughness = rng.uniform(0.02, 1, 300), rng.uniform(0.08, 1, 300)
     expected = directional_albedo(n_dot_v, roughness)
-    seen = fg_lookup(
+    actual = fg_lookup(
         fg_table(), jnp.asarray(n_dot_v, jnp.float32), jnp.asarray(roughness, jnp.float32)
     )
-    np.testing.assert_allclose(np.stack(seen, axis=1), expected, atol=FG_TABLE)
+    np.testing.assert_allclose(np.stack(actual, axis=1), expected, atol=FG_TABLE)
 
 
 def test_table_arguments_outside_the_unit_square_are_clamped_with_finite_gradients():
     n_dot_v = jnp.asarray([-1.0, 0.0, 1.0, 2.0, 0.5])
     roughness = jnp.asarray([0.5, -1.0, 0.0, 1.0, 2.0])
-    seen = fg_lookup(fg_table(), n_dot_v, roughness)
-    inside = fg_lookup(fg_table(), jnp.clip(n_dot_v, 0.0, 1.0), jnp.clip(roughness, 0.0, 1.0))
-    np.testing.assert_array_equal(seen, inside)
+    values = fg_lookup(fg_table(), n_dot_v, roughness)
+    clamped_values = fg_lookup(
+        fg_table(), jnp.clip(n_dot_v, 0.0, 1.0), jnp.clip(roughness, 0.0, 1.0)
+    )
+    np.testing.assert_array_equal(values, clamped_values)
     gradients = jax.grad(lambda c, r: sum(map(jnp.sum, fg_lookup(fg_table(), c, r))), (0, 1))(
         n_dot_v, roughness
     )
@@ -179,10 +181,12 @@ def test_a_diffuse_sphere_equals_direct_integration():
     normals = np.asarray(light_directions(8, 16), np.float64).reshape(-1, 3)
     # Direct integration takes every texel of a map that is four times finer as a small light
     # source.
-    fine = np.asarray(light_directions(128, 256), np.float64).reshape(-1, 3)
-    radiance = np.asarray(lookup(light.radiance, jnp.asarray(fine, jnp.float32)), np.float64)
+    fine_directions = np.asarray(light_directions(128, 256), np.float64).reshape(-1, 3)
+    radiance = np.asarray(
+        lookup(light.radiance, jnp.asarray(fine_directions, jnp.float32)), np.float64
+    )
     radiance *= np.asarray(texel_solid_angles(128, 256), np.float64).reshape(-1, 1)
-    expected = 0.6 * np.maximum(normals @ fine.T, 0) @ radiance / np.pi
+    expected = 0.6 * np.maximum(normals @ fine_directions.T, 0) @ radiance / np.pi
     shaded = shade(
         _constant(len(normals), albedo=0.6, roughness=1.0),
         jnp.asarray(normals, jnp.float32),
@@ -224,14 +228,15 @@ def test_normals_facing_away_are_flipped_only_when_two_sided():
     light = prefiltered(_light(8), prefilter_operators(SPEC))
 
     def run(normals, **settings):
-        normals, towards = jnp.asarray(normals, jnp.float32), jnp.asarray(views, jnp.float32)
-        return shade(materials, normals, towards, light, fg_table(), **settings).rgb
+        normals = jnp.asarray(normals, jnp.float32)
+        view_directions = jnp.asarray(views, jnp.float32)
+        return shade(materials, normals, view_directions, light, fg_table(), **settings).rgb
 
     np.testing.assert_allclose(run(normals), run(-normals), atol=ROUNDING)
     np.testing.assert_allclose(run(normals), run(normals, two_sided=False), atol=ROUNDING)
-    away = run(-normals, two_sided=False)
-    assert np.all(np.isfinite(away))
-    assert np.max(np.abs(away - run(-normals))) > 0.05
+    one_sided_rgb = run(-normals, two_sided=False)
+    assert np.all(np.isfinite(one_sided_rgb))
+    assert np.max(np.abs(one_sided_rgb - run(-normals))) > 0.05
 
 
 def test_baked_diffuse_is_not_multiplied_by_the_light():
@@ -280,17 +285,22 @@ def test_padding_rows_do_not_disturb_the_others():
     materials, light = _materials(2 * count), prefiltered(_light(16), prefilter_operators(SPEC))
     normals, views = _unit(2 * count, 17), _unit(2 * count, 18)
     normals[count:] = 0.0
-    others = np.where(np.arange(2 * count)[:, None] < count, normals, _unit(2 * count, 22))
-    padding, others, views = (jnp.asarray(x, jnp.float32) for x in (normals, others, views))
+    filled_normals = np.where(np.arange(2 * count)[:, None] < count, normals, _unit(2 * count, 22))
+    padding, filled_normals, views = (
+        jnp.asarray(x, jnp.float32) for x in (normals, filled_normals, views)
+    )
 
     @jax.jit
     @partial(jax.grad, argnums=(0, 1))
     def gradient(materials, normals):
         return jnp.sum(split_sum(materials, normals, views, light, fg_table()).rgb[:count])
 
-    padded, plain = gradient(materials, padding), gradient(materials, others)
-    for with_padding, without in zip(jax.tree.leaves(padded), jax.tree.leaves(plain), strict=True):
-        np.testing.assert_allclose(with_padding[:count], without[:count], atol=ROUNDING)
+    padded_gradient = gradient(materials, padding)
+    plain_gradient = gradient(materials, filled_normals)
+    for with_padding, without_padding in zip(
+        jax.tree.leaves(padded_gradient), jax.tree.leaves(plain_gradient), strict=True
+    ):
+        np.testing.assert_allclose(with_padding[:count], without_padding[:count], atol=ROUNDING)
         np.testing.assert_array_equal(with_padding[count:], 0.0)
 
 
@@ -310,8 +320,8 @@ def test_compiled_equals_eager_and_precision_in_is_precision_out():
             table,
         )
 
-    given = arguments(jnp.float32)
-    eager, compiled = jax.tree.leaves(run(*given)), jax.tree.leaves(jax.jit(run)(*given))
+    inputs = arguments(jnp.float32)
+    eager, compiled = jax.tree.leaves(run(*inputs)), jax.tree.leaves(jax.jit(run)(*inputs))
     for first, second in zip(eager, compiled, strict=True):
         assert first.dtype == second.dtype == jnp.float32
         np.testing.assert_allclose(first, second, atol=ROUNDING)

@@ -35,26 +35,26 @@ def test_a_stage_keeps_or_redraws_the_albedo_as_asked(shared, fresh):
         *(() if fresh else ("stages.monte_carlo.enter=[]",)),
     )
     pipeline, params = ball(config)
-    begun = _begun(config, params, pipeline)
+    begun_params = _begun(config, params, pipeline)
 
     def same(a, b):
         pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
         return all(np.array_equal(x, y) for x, y in pairs)
 
-    before, after = params.material, begun.material
-    assert same(before.albedo_head, after.albedo_head) is not fresh
+    old_material, new_material = params.material, begun_params.material
+    assert same(old_material.albedo_head, new_material.albedo_head) is not fresh
     # A shared encoding cannot be initialised again for the albedo alone.
-    assert same(before.albedo_table, after.albedo_table) is (shared or not fresh)
-    assert same(before.surface_table, after.surface_table)
-    assert same(before.surface_head, after.surface_head)
-    assert same(before.shift_head, after.shift_head)
+    assert same(old_material.albedo_table, new_material.albedo_table) is (shared or not fresh)
+    assert same(old_material.surface_table, new_material.surface_table)
+    assert same(old_material.surface_head, new_material.surface_head)
+    assert same(old_material.shift_head, new_material.shift_head)
     assert same(
         (params.geometry, params.light, params.log_exposure),
-        (begun.geometry, begun.light, begun.log_exposure),
+        (begun_params.geometry, begun_params.light, begun_params.log_exposure),
     )
-    assert before.indirect_head is None
-    assert after.indirect_head[-1].weights.shape[1] == 6
-    assert same(_begun(config, params, pipeline), begun)
+    assert old_material.indirect_head is None
+    assert new_material.indirect_head[-1].weights.shape[1] == 6
+    assert same(_begun(config, params, pipeline), begun_params)
 
 
 def _varied_ball(*overrides, radius=0.4):
@@ -67,25 +67,29 @@ def _varied_ball(*overrides, radius=0.4):
 
 
 def _albedo(params, points, pipeline):
-    look = partial(jax.jit, static_argnames=("spec",))(materials_at)
+    evaluate = partial(jax.jit, static_argnames=("spec",))(materials_at)
     points = jnp.asarray(points, jnp.float32)
-    materials = look(params.material, points, pipeline.surface.box, spec=pipeline.fields)
+    materials = evaluate(params.material, points, pipeline.surface.box, spec=pipeline.fields)
     return np.asarray(materials.albedo)
 
 
 def test_a_fresh_albedo_is_the_mean_of_the_stage_before_beside_the_surface():
     config, pipeline, params = _varied_ball()
-    begun = _begun(config, params, pipeline)
+    begun_params = _begun(config, params, pipeline)
     grid = pipeline.surface.grid
     points = np.asarray(grid_vertices(grid))
-    inside = np.asarray(params.geometry.sdf) < 0
-    near = np.linalg.norm(points[:, None] - points[None], axis=-1) < 1.01 * float(grid.cell_size)
-    beside = np.any(near & (inside[:, None] != inside[None]), axis=1)
-    assert 20 < beside.sum() < len(points) - 20
-    before = _albedo(params, points, pipeline)
-    assert np.std(before[beside], axis=0).min() > 0.01
-    after = _albedo(begun, np.random.default_rng(0).uniform(-0.6, 0.6, (50, 3)), pipeline)
-    np.testing.assert_allclose(after, np.tile(before[beside].mean(axis=0), (50, 1)), rtol=1e-5)
+    is_inside = np.asarray(params.geometry.sdf) < 0
+    is_near = np.linalg.norm(points[:, None] - points[None], axis=-1) < 1.01 * float(grid.cell_size)
+    is_beside = np.any(is_near & (is_inside[:, None] != is_inside[None]), axis=1)
+    assert 20 < is_beside.sum() < len(points) - 20
+    old_albedo = _albedo(params, points, pipeline)
+    assert np.std(old_albedo[is_beside], axis=0).min() > 0.01
+    new_albedo = _albedo(
+        begun_params, np.random.default_rng(0).uniform(-0.6, 0.6, (50, 3)), pipeline
+    )
+    np.testing.assert_allclose(
+        new_albedo, np.tile(old_albedo[is_beside].mean(axis=0), (50, 1)), rtol=1e-5
+    )
 
 
 @pytest.mark.parametrize(
@@ -98,8 +102,8 @@ def test_a_fresh_albedo_is_the_mean_of_the_stage_before_beside_the_surface():
 def test_a_fresh_albedo_is_grey_where_asked_and_where_there_is_no_surface(override, radius):
     """The first case asks for grey; in the second there is no mean over an empty surface."""
     config, pipeline, params = _varied_ball(override, radius=radius)
-    begun = _begun(config, params, pipeline)
-    np.testing.assert_allclose(_albedo(begun, np.zeros((4, 3)), pipeline), 0.5, rtol=1e-6)
+    begun_params = _begun(config, params, pipeline)
+    np.testing.assert_allclose(_albedo(begun_params, np.zeros((4, 3)), pipeline), 0.5, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -115,10 +119,12 @@ def test_a_head_of_indirect_light_is_kept_where_it_means_the_same(after, is_kept
         f"stages.refine.transport.indirect={after}",
     )
     pipeline, params = ball(config, stage="monte_carlo")
-    begun = begin_stage(params, pipeline, config, config.stage("refine"))
-    before, found = (x.material.indirect_head[-1].weights for x in (params, begun))
-    assert found.shape[1] == (6 if after == "constant" else 27)
-    assert np.array_equal(before, found) is is_kept
+    begun_params = begin_stage(params, pipeline, config, config.stage("refine"))
+    old_weights, new_weights = (
+        x.material.indirect_head[-1].weights for x in (params, begun_params)
+    )
+    assert new_weights.shape[1] == (6 if after == "constant" else 27)
+    assert np.array_equal(old_weights, new_weights) is is_kept
 
 
 @pytest.mark.parametrize("quality", QUALITIES)
@@ -205,9 +211,12 @@ def test_a_run_goes_through_both_stages(whole):
     assert all(np.isfinite(line["loss"]) for line in lines)
     assert ["cell_patches" in line["usage"] for line in lines] == [False] * 3 + [True] * 3
     # The second stage starts with buffers for what the first one needed, and adds new ones.
-    before, after = lines[2]["capacities"], lines[3]["capacities"]
-    assert set(after) - set(before) == {"cell_patches"}
-    assert all(lines[2]["usage"][name] <= after[name] <= size for name, size in before.items())
+    old_capacities, new_capacities = lines[2]["capacities"], lines[3]["capacities"]
+    assert set(new_capacities) - set(old_capacities) == {"cell_patches"}
+    assert all(
+        lines[2]["usage"][name] <= new_capacities[name] <= size
+        for name, size in old_capacities.items()
+    )
     for name in ("term.indirect", "term.light"):
         assert [line.get(name, 0) > 0 for line in lines] == [False] * 3 + [True] * 3
     assert int(state.step) == 6
@@ -225,11 +234,11 @@ def test_resuming_in_either_stage_and_between_them_equals_the_run_in_one_go(
     fit(dataset, tiny_config(*RUN), tmp_path, stop_after=stop)
     assert load_trained(tmp_path).stage.name == ("split_sum" if stop <= 3 else "monte_carlo")
     assert_same(whole[1], fit(dataset, tiny_config(*RUN), tmp_path, begin=Resume()))
-    wanted, found = (
+    expected, actual = (
         [(line["step"], line["stage"], line["loss"]) for line in lines_of(folder)]
         for folder in (whole[0], tmp_path)
     )
-    assert found == wanted
+    assert actual == expected
 
 
 @pytest.mark.slow
@@ -242,17 +251,17 @@ def test_the_first_stage_of_another_run_can_be_taken_over_bit_for_bit(
     )
     assert [line["step"] for line in lines_of(tmp_path)] == [3, 4, 5]
     # This also holds for a run stopped before its first step: its own folder has what it took over.
-    early = tmp_path.parent / f"{tmp_path.name}_early"
+    early_folder = tmp_path.parent / f"{tmp_path.name}_early"
 
     def stop(*arguments, **others):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(loop_module, "train_step", stop)
     with pytest.raises(Interrupted):
-        fit(dataset, tiny_config(*RUN), early, begin=TakeOver(folder, "monte_carlo"))
+        fit(dataset, tiny_config(*RUN), early_folder, begin=TakeOver(folder, "monte_carlo"))
     monkeypatch.undo()
-    assert_same(state, fit(dataset, tiny_config(*RUN), early, begin=Resume()))
-    assert [line["step"] for line in lines_of(early)] == [3, 4, 5]
+    assert_same(state, fit(dataset, tiny_config(*RUN), early_folder, begin=Resume()))
+    assert [line["step"] for line in lines_of(early_folder)] == [3, 4, 5]
     assert [line["loss"] for line in lines_of(tmp_path)] == [
         line["loss"] for line in lines_of(folder)[3:]
     ]
@@ -261,16 +270,23 @@ def test_the_first_stage_of_another_run_can_be_taken_over_bit_for_bit(
 @pytest.mark.slow
 def test_a_run_that_ended_with_its_first_stage_can_be_taken_further(dataset, whole, tmp_path):
     """The later stages of the first run may differ; here it had none."""
-    first, later = tmp_path / "first", tmp_path / "later"
-    fit(dataset, tiny_config(*RUN, "stages.monte_carlo.steps=0"), first)
-    assert not (first / "stages").exists()
+    first_folder, later_folder = tmp_path / "first", tmp_path / "later"
+    fit(dataset, tiny_config(*RUN, "stages.monte_carlo.steps=0"), first_folder)
+    assert not (first_folder / "stages").exists()
     assert_same(
-        whole[1], fit(dataset, tiny_config(*RUN), later, begin=TakeOver(first, "monte_carlo"))
+        whole[1],
+        fit(dataset, tiny_config(*RUN), later_folder, begin=TakeOver(first_folder, "monte_carlo")),
     )
     # A run that took over a stage can be resumed as well.
-    third = tmp_path / "third"
-    fit(dataset, tiny_config(*RUN), third, begin=TakeOver(first, "monte_carlo"), stop_after=4)
-    assert_same(whole[1], fit(dataset, tiny_config(*RUN), third, begin=Resume()))
+    third_folder = tmp_path / "third"
+    fit(
+        dataset,
+        tiny_config(*RUN),
+        third_folder,
+        begin=TakeOver(first_folder, "monte_carlo"),
+        stop_after=4,
+    )
+    assert_same(whole[1], fit(dataset, tiny_config(*RUN), third_folder, begin=Resume()))
 
 
 @pytest.mark.slow
@@ -300,11 +316,11 @@ def test_another_first_stage_is_refused_by_name(dataset, whole, tmp_path):
             begin=TakeOver(tmp_path / "nowhere", "monte_carlo"),
         )
     fit(dataset, tiny_config(*RUN), tmp_path / "d", stop_after=2)
-    other = tmp_path / "other"
+    other_folder = tmp_path / "other"
     with pytest.raises(
         TrainingError, match="at step 2, in the stage split_sum, not at the end of split_sum"
     ):
-        fit(dataset, tiny_config(*RUN), other, begin=TakeOver(tmp_path / "d", "monte_carlo"))
+        fit(dataset, tiny_config(*RUN), other_folder, begin=TakeOver(tmp_path / "d", "monte_carlo"))
 
 
 @pytest.mark.slow
@@ -317,15 +333,17 @@ def test_taking_over_everything_there_is_to_train_is_refused(dataset, whole, tmp
 def test_a_surface_that_vanishes_later_is_put_back_as_its_stage_began(
     dataset, whole, tmp_path, monkeypatch
 ):
-    advance, emptied = loop_module.Loop.advance, []
+    advance, geometries = loop_module.Loop.advance, []
 
     def sabotage(self, step):
-        if step == 3 and not emptied:
-            emptied.append(self.state.params.geometry)
-            gone = replace(emptied[0], sdf=jnp.abs(emptied[0].sdf) + 1.0)
+        if step == 3 and not geometries:
+            geometries.append(self.state.params.geometry)
+            empty_geometry = replace(geometries[0], sdf=jnp.abs(geometries[0].sdf) + 1.0)
             # This is a copy, since the step consumes the buffers of its arguments.
-            emptied[0] = jax.tree.map(np.array, emptied[0])
-            self.state = replace(self.state, params=replace(self.state.params, geometry=gone))
+            geometries[0] = jax.tree.map(np.array, geometries[0])
+            self.state = replace(
+                self.state, params=replace(self.state.params, geometry=empty_geometry)
+            )
         return advance(self, step)
 
     monkeypatch.setattr(loop_module.Loop, "advance", sabotage)
@@ -336,13 +354,13 @@ def test_a_surface_that_vanishes_later_is_put_back_as_its_stage_began(
         begin=TakeOver(whole[0], "monte_carlo"),
         stop_after=4,
     )
-    assert_same(state.params.geometry, emptied[0])
-    resumed = loop_module.resumed_loop(dataset, tiny_config(*RUN), RunFolder(tmp_path))
-    assert_same(resumed.fallback.shape, emptied[0])
+    assert_same(state.params.geometry, geometries[0])
+    loop = loop_module.resumed_loop(dataset, tiny_config(*RUN), RunFolder(tmp_path))
+    assert_same(loop.fallback.shape, geometries[0])
 
 
 @pytest.mark.slow
 def test_resuming_a_later_stage_with_another_setting_of_it_is_refused(dataset, whole):
-    changed = tiny_config(*RUN, OTHER)
+    changed_config = tiny_config(*RUN, OTHER)
     with pytest.raises(TrainingError, match=r"monte_carlo\.rates\.sdf\.value: .* -> 0\.5"):
-        fit(dataset, changed, whole[0], begin=Resume())
+        fit(dataset, changed_config, whole[0], begin=Resume())

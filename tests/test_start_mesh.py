@@ -58,42 +58,48 @@ def fit_to(path, views, *, edge_pixels=4.0, most_faces=10_000):
 @pytest.mark.parametrize("name", ["mesh.ply", "mesh.obj", "mesh.glb", "mesh.stl"])
 def test_every_format_gives_the_same_closed_mesh(tmp_path, name):
     vertices, faces = ball()
-    stored = to_gltf_axes(vertices) if name.endswith("glb") else vertices
-    mesh = read(written(tmp_path, stored, faces, name))
+    stored_vertices = to_gltf_axes(vertices) if name.endswith("glb") else vertices
+    mesh = read(written(tmp_path, stored_vertices, faces, name))
     assert mesh.is_closed
     assert len(mesh.faces) == 80
     assert len(mesh.vertices) == 42
     assert signed_volume(mesh.vertices, mesh.faces) > 0
     order = np.lexsort(np.round(vertices, 5).T)
-    found = mesh.vertices[np.lexsort(np.round(mesh.vertices, 5).T)]
-    np.testing.assert_allclose(found, vertices[order], atol=2e-6)
+    sorted_vertices = mesh.vertices[np.lexsort(np.round(mesh.vertices, 5).T)]
+    np.testing.assert_allclose(sorted_vertices, vertices[order], atol=2e-6)
 
 
 def test_what_is_no_surface_is_dropped_and_said(tmp_path):
     vertices, faces = ball()
-    away = np.array([[9.0, 9, 9]])
-    doubled = np.concatenate([vertices, vertices[:1] + 1e-9, away])
-    split = np.where((faces == 0) & (np.arange(80) < 40)[:, None], len(vertices), faces)
-    middle = [[3, 3, 7], [0, 42, 5]]  # faces with two corners at the same place
-    again = [faces[7], faces[9][::-1]]
-    mesh = read(written(tmp_path, doubled, np.concatenate([split, middle, again])))
+    far_vertex = np.array([[9.0, 9, 9]])
+    doubled_vertices = np.concatenate([vertices, vertices[:1] + 1e-9, far_vertex])
+    split_faces = np.where((faces == 0) & (np.arange(80) < 40)[:, None], len(vertices), faces)
+    degenerate_faces = [[3, 3, 7], [0, 42, 5]]  # faces with two corners at the same place
+    duplicate_faces = [faces[7], faces[9][::-1]]
+    mesh = read(
+        written(
+            tmp_path,
+            doubled_vertices,
+            np.concatenate([split_faces, degenerate_faces, duplicate_faces]),
+        )
+    )
     assert mesh.is_closed
     assert len(mesh.faces) == 80
     notes = " ".join(mesh.notes)
-    for said in (
+    for phrase in (
         "84 faces of",
         "1 duplicate vertices merged",
         "2 faces without area dropped",
         "2 duplicate faces dropped",
         "1 unused vertices dropped",
     ):
-        assert said in notes
+        assert phrase in notes
 
 
 def test_a_mesh_that_is_inside_out_is_turned(tmp_path):
     vertices, faces = ball()
-    right = read(written(tmp_path, vertices, faces))
-    assert not any("turned" in note for note in right.notes)
+    outward_mesh = read(written(tmp_path, vertices, faces))
+    assert not any("turned" in note for note in outward_mesh.notes)
     mesh = read(written(tmp_path, vertices, faces[:, ::-1]))
     assert signed_volume(mesh.vertices, mesh.faces) > 0
     assert any("inside out" in note for note in mesh.notes)
@@ -111,18 +117,18 @@ def test_faces_that_are_wound_against_each_other_are_wound_alike(tmp_path):
 def test_an_open_mesh_is_wound_alike_where_that_is_possible(tmp_path):
     body = trimesh.creation.icosphere(subdivisions=2, radius=RADIUS)
     faces = np.array(body.faces[body.triangles_center[:, 2] > 0.1])
-    mixed = np.where((np.arange(len(faces)) % 3 == 0)[:, None], faces[:, ::-1], faces)
-    mesh = read(written(tmp_path, body.vertices, mixed))
+    mixed_faces = np.where((np.arange(len(faces)) % 3 == 0)[:, None], faces[:, ::-1], faces)
+    mesh = read(written(tmp_path, body.vertices, mixed_faces))
     assert not mesh.is_closed
-    outward = np.einsum("fd,fd->f", normals_of(mesh), mesh.vertices[mesh.faces].mean(axis=1))
-    assert (outward > 0).all()  # as most faces were
+    cosines = np.einsum("fd,fd->f", normals_of(mesh), mesh.vertices[mesh.faces].mean(axis=1))
+    assert (cosines > 0).all()  # as most faces were
     assert any("now alike" in note for note in mesh.notes)
     # A band with a half turn, which has no orientation.
-    around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    across = np.array([-0.2, 0.2])[:, None]
-    radius = 1 + across * np.cos(0.5 * around)
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    offsets = np.array([-0.2, 0.2])[:, None]
+    radius = 1 + offsets * np.cos(0.5 * angles)
     band = np.stack(
-        [radius * np.cos(around), radius * np.sin(around), across * np.sin(0.5 * around)], axis=-1
+        [radius * np.cos(angles), radius * np.sin(angles), offsets * np.sin(0.5 * angles)], axis=-1
     ).reshape(-1, 3)
     first, last = np.arange(24), np.roll(np.arange(24), -1)
     upper, end = first + 24, last + 24
@@ -141,31 +147,33 @@ def test_corners_that_rounding_has_moved_are_one(tmp_path, jitter):
     soup = soup + np.random.default_rng(0).uniform(-jitter, jitter, soup.shape)
     np.testing.assert_array_equal(np.arange(len(soup)).reshape(-1, 3)[:2], [[0, 1, 2], [3, 4, 5]])
     mesh = start_mesh.StartMesh(soup, np.arange(len(soup)).reshape(-1, 3))
-    found = start_mesh._cleaned(mesh, "x")
-    assert found.is_closed
-    assert len(found.vertices) == len(vertices)
+    cleaned_mesh = start_mesh._cleaned(mesh, "x")
+    assert cleaned_mesh.is_closed
+    assert len(cleaned_mesh.vertices) == len(vertices)
 
 
 def test_a_flag_with_a_front_and_a_back_stays_and_a_wall_between_rooms_goes(tmp_path):
     vertices, faces = ball(2)
-    flag = np.array([[0.5, 0, 0], [1.2, 0, 0], [1.2, 0, 0.4], [0.5, 0, 0.4]])
-    sides = np.array([[0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0]]) + len(vertices)
-    both = np.concatenate([vertices, flag]), np.concatenate([faces, sides])
-    mesh = read(written(tmp_path, *both, "flag.ply"))
+    flag_vertices = np.array([[0.5, 0, 0], [1.2, 0, 0], [1.2, 0, 0.4], [0.5, 0, 0.4]])
+    flag_faces = np.array([[0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0]]) + len(vertices)
+    combined_mesh = np.concatenate([vertices, flag_vertices]), np.concatenate([faces, flag_faces])
+    mesh = read(written(tmp_path, *combined_mesh, "flag.ply"))
     assert len(mesh.faces) == len(faces) + 2
     assert mesh.vertices[:, 0].max() == pytest.approx(1.2)
     assert not mesh.is_closed
     rooms = [trimesh.creation.box(bounds=[[x, 0, 0], [x + 1, 1, 1]]) for x in (0, 1)]
     mesh = read(written(tmp_path, rooms[0].vertices, rooms[0].faces, "room.ply"))
     assert len(mesh.faces) == 12
-    two = trimesh.util.concatenate(rooms)
-    faces, wall = np.array(two.faces), np.isclose(two.triangles_center[:, 0], 1.0)
+    two_rooms = trimesh.util.concatenate(rooms)
+    faces, is_wall = np.array(two_rooms.faces), np.isclose(two_rooms.triangles_center[:, 0], 1.0)
     # Both sides of the wall have the same diagonal.
-    corners = {tuple(p): n for n, p in enumerate(np.round(two.vertices, 6).tolist())}
+    corners = {tuple(p): n for n, p in enumerate(np.round(two_rooms.vertices, 6).tolist())}
     a, b, c, d = (corners[1.0, y, z] for y, z in ((0, 0), (1, 0), (1, 1), (0, 1)))
     panels = np.array([[a, b, c], [a, c, d], [c, b, a], [d, c, a]])
     mesh = read(
-        written(tmp_path, two.vertices, np.concatenate([faces[~wall], panels]), "rooms.ply")
+        written(
+            tmp_path, two_rooms.vertices, np.concatenate([faces[~is_wall], panels]), "rooms.ply"
+        )
     )
     assert mesh.is_closed
     assert len(mesh.faces) == 20
@@ -205,8 +213,8 @@ def test_corners_on_a_straight_side_and_lines_that_go_on_are_no_faults(tmp_path)
     path = tmp_path / "plate.obj"
     for seed in range(40):
         turn = trimesh.transformations.random_rotation_matrix(np.random.default_rng(seed).random(3))
-        places = outline @ turn[:3, :3].T
-        lines = [f"v {x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in places]
+        positions = outline @ turn[:3, :3].T
+        lines = [f"v {x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in positions]
         path.write_text("".join(lines) + "f 1/1 2/2 3/3 \\\n4/4 5/5\n")
         _require_convex(path)
     path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3 # a b\nf 1 2 3 x\n")
@@ -230,20 +238,20 @@ def test_meshes_that_cannot_be_used_are_refused(tmp_path, monkeypatch):
         read(str(cloud))
     with pytest.raises(ValueError, match="found no triangle with an area"):
         read(written(tmp_path, np.ones((3, 3)), [[0, 1, 2]], "point.ply"))
-    broken = vertices.copy()
-    broken[5, 1] = np.nan
+    broken_vertices = vertices.copy()
+    broken_vertices[5, 1] = np.nan
     with pytest.raises(
         ValueError, match="1 of 42 vertices are not finite numbers, the first is nu"
     ):
-        read(written(tmp_path, broken, faces, "nan.ply"))
+        read(written(tmp_path, broken_vertices, faces, "nan.ply"))
     path = written(tmp_path, vertices, faces)
     digest = digest_of(path)
     written(tmp_path, 2 * vertices, faces)
     with pytest.raises(ValueError, match="is not the mesh that it was"):
         read_start(path, digest)
     # Ten million faces by broadcasting, which takes no memory.
-    many = np.broadcast_to(np.array([[0, 1, 2]], np.int32), (10_000_000, 3))
-    monkeypatch.setattr(start_mesh, "read_mesh", lambda path: (vertices, many))
+    many_faces = np.broadcast_to(np.array([[0, 1, 2]], np.int32), (10_000_000, 3))
+    monkeypatch.setattr(start_mesh, "read_mesh", lambda path: (vertices, many_faces))
     read_start.cache_clear()
     with pytest.raises(ValueError, match="10000000 faces, more than 5000000; decimate it first"):
         read(path)
@@ -276,8 +284,8 @@ def test_pixels_that_do_not_count_say_nothing_against_a_mesh(views):
     valid[:, :16] = 0.0
     images = np.array(views.images)
     images[valid == 0] = 0.0
-    found = agreement_with_views(points, replace(views, images=images, valid=valid))
-    assert found > 0.8 * agreement_with_views(points, views)
+    agreement = agreement_with_views(points, replace(views, images=images, valid=valid))
+    assert agreement > 0.8 * agreement_with_views(points, views)
 
 
 def test_our_own_obj_and_what_else_says_so_is_turned_from_y_up(tmp_path):
@@ -295,32 +303,32 @@ def test_our_own_obj_and_what_else_says_so_is_turned_from_y_up(tmp_path):
 
 def test_a_mesh_with_y_up_that_does_not_say_so_is_refused_with_the_cure(tmp_path):
     vertices, faces = ball(3, radius=0.2)
-    tall = vertices * [1.0, 1.0, 8.0]
-    points = look_at_poses(6)
+    tall_vertices = vertices * [1.0, 1.0, 8.0]
+    poses = look_at_poses(6)
     rows = np.arange(64) + 0.5
     images = np.zeros((6, 64, 64, 4), np.float32)
     lens = np.array([[60.0, 0, 32], [0, 60, 32], [0, 0, 1]])
     views = Views(
-        names=tuple(map(str, range(6))), camera_to_world=points,
+        names=tuple(map(str, range(6))), camera_to_world=poses,
         intrinsics=np.repeat(lens[None], 6, 0), images=images,
     )  # fmt: skip
-    for number in range(6):
-        pose = views.world_to_camera[number]
-        dense = 0.2 * trimesh.creation.icosphere(subdivisions=5).vertices * [1.0, 1.0, 8.0]
-        local = dense @ pose[:3, :3].T + pose[:3, 3]
+    for view_index in range(6):
+        pose = views.world_to_camera[view_index]
+        dense_points = 0.2 * trimesh.creation.icosphere(subdivisions=5).vertices * [1.0, 1.0, 8.0]
+        local = dense_points @ pose[:3, :3].T + pose[:3, 3]
         pixel = (local @ lens.T)[:, :2] / local[:, 2:]
         column, row = np.clip(pixel.astype(int), 0, len(rows) - 1).T
-        images[number, row, column] = 1.0
-    assert fit_to(written(tmp_path, tall, faces), views).is_closed
-    lying = written(tmp_path, to_gltf_axes(tall), faces, "lying.ply")
+        images[view_index, row, column] = 1.0
+    assert fit_to(written(tmp_path, tall_vertices, faces), views).is_closed
+    lying_path = written(tmp_path, to_gltf_axes(tall_vertices), faces, "lying.ply")
     with pytest.raises(ValueError, match="fit if it were turned to have z up"):
-        fit_to(lying, views)
+        fit_to(lying_path, views)
 
 
 def test_agreement_falls_with_the_size_to_either_side(views):
     points = RADIUS * trimesh.creation.icosphere(subdivisions=4).vertices
-    right = agreement_with_views(points, views)
-    assert right > 0.8
+    agreement = agreement_with_views(points, views)
+    assert agreement > 0.8
     for factor in (0.5, 2.0):
         assert agreement_with_views(factor * points, views) < 0.3
     # A mesh that is a tenth too thick still agrees enough to start from.
@@ -340,34 +348,34 @@ def test_coarse_meshes_are_divided_and_fine_ones_decimated(monkeypatch):
             mesh.vertices[mesh.faces[:, 0]] - mesh.vertices[mesh.faces[:, 1]], axis=1
         ).mean()
     )
-    same = sized(mesh, edge, most_faces=1000, path="x")
-    assert same is mesh
-    finer = sized(mesh, edge / 4.5, most_faces=10_000, path="x")
-    assert len(finer.faces) == 16 * 80
-    assert finer.is_closed
-    assert any("divided to 16" in note for note in finer.notes)
+    same_mesh = sized(mesh, edge, most_faces=1000, path="x")
+    assert same_mesh is mesh
+    fine_mesh = sized(mesh, edge / 4.5, most_faces=10_000, path="x")
+    assert len(fine_mesh.faces) == 16 * 80
+    assert fine_mesh.is_closed
+    assert any("divided to 16" in note for note in fine_mesh.notes)
     # The limit also holds for subdivision.
     assert len(sized(mesh, edge / 4.5, most_faces=400, path="x").faces) == 320
 
     def halved(vertices, faces, face_count):
-        assert face_count < 0.8 * len(finer.faces)
+        assert face_count < 0.8 * len(fine_mesh.faces)
         return mesh.vertices, mesh.faces
 
     monkeypatch.setattr(start_mesh, "simplified", halved)
-    coarser = sized(finer, edge, most_faces=10_000, path="x")
-    assert len(coarser.faces) == 80
-    assert any("decimated to 80 faces" in note for note in coarser.notes)
+    coarse_mesh = sized(fine_mesh, edge, most_faces=10_000, path="x")
+    assert len(coarse_mesh.faces) == 80
+    assert any("decimated to 80 faces" in note for note in coarse_mesh.notes)
 
     monkeypatch.undo()
     monkeypatch.setitem(sys.modules, "fast_simplification", None)
     assert any(
-        "to decimate it, pip" in n for n in sized(finer, edge, most_faces=2000, path="x").notes
+        "to decimate it, pip" in n for n in sized(fine_mesh, edge, most_faces=2000, path="x").notes
     )
     with pytest.raises(ValueError, match="1280 faces, more than geometry.max_faces = 1000"):
-        sized(finer, edge, most_faces=1000, path="x")
+        sized(fine_mesh, edge, most_faces=1000, path="x")
     # It is also refused if it has only few faces too many, of the size that is wanted.
     with pytest.raises(ValueError, match="1280 faces, more than geometry.max_faces = 1200"):
-        sized(finer, edge / 4.5, most_faces=1200, path="x")
+        sized(fine_mesh, edge / 4.5, most_faces=1200, path="x")
 
 
 @pytest.mark.parametrize(
@@ -381,49 +389,49 @@ def test_coarse_meshes_are_divided_and_fine_ones_decimated(monkeypatch):
 )
 def test_long_edges_are_split_and_the_surface_stays(body):
     vertices, faces = np.array(body.vertices), np.array(body.faces)
-    found = split_long_edges(vertices, faces, longest=0.11, most_faces=10**6)
-    assert longest_edge(*found) <= 0.11
-    assert start_mesh.StartMesh(*found).is_closed
-    assert nondegenerate(*found).all()
-    assert surface_area(*found) == pytest.approx(surface_area(vertices, faces), rel=1e-9)
-    assert signed_volume(*found) == pytest.approx(signed_volume(vertices, faces), rel=1e-9)
+    split_mesh = split_long_edges(vertices, faces, longest=0.11, most_faces=10**6)
+    assert longest_edge(*split_mesh) <= 0.11
+    assert start_mesh.StartMesh(*split_mesh).is_closed
+    assert nondegenerate(*split_mesh).all()
+    assert surface_area(*split_mesh) == pytest.approx(surface_area(vertices, faces), rel=1e-9)
+    assert signed_volume(*split_mesh) == pytest.approx(signed_volume(vertices, faces), rel=1e-9)
     # The original corners keep their rows.
-    assert np.array_equal(found[0][: len(vertices)], vertices)
+    assert np.array_equal(split_mesh[0][: len(vertices)], vertices)
 
 
 def test_of_an_open_mesh_the_border_is_split_too():
     vertices = np.array([[0.0, 0, 0], [3.0, 0, 0], [0, 1.0, 0]])
-    found = split_long_edges(vertices, np.array([[0, 1, 2]]), longest=0.5, most_faces=1000)
-    assert longest_edge(*found) <= 0.5
-    assert surface_area(*found) == pytest.approx(1.5)
+    split_mesh = split_long_edges(vertices, np.array([[0, 1, 2]]), longest=0.5, most_faces=1000)
+    assert longest_edge(*split_mesh) <= 0.5
+    assert surface_area(*split_mesh) == pytest.approx(1.5)
 
 
 def test_splitting_ends_before_there_are_too_many_faces():
     body = trimesh.creation.cylinder(radius=0.1, height=2.0, sections=24)
     vertices, faces = np.array(body.vertices), np.array(body.faces)
-    some = split_long_edges(vertices, faces, longest=0.01, most_faces=500)
-    assert len(faces) < len(some[1]) <= 500
-    assert start_mesh.StartMesh(*some).is_closed
+    split_mesh = split_long_edges(vertices, faces, longest=0.01, most_faces=500)
+    assert len(faces) < len(split_mesh[1]) <= 500
+    assert start_mesh.StartMesh(*split_mesh).is_closed
 
 
 def test_long_faces_of_a_mesh_with_enough_of_them_are_split():
     body = trimesh.creation.cylinder(radius=0.2, height=2.0, sections=200)
     mesh = start_mesh.StartMesh(np.array(body.vertices), np.array(body.faces))
-    even = sized(mesh, 0.07, most_faces=100_000, path="x")
-    assert longest_edge(even.vertices, even.faces) <= 2 * 0.07
-    assert [note for note in even.notes if "long faces split" in note] == list(even.notes)
-    some = sized(mesh, 0.07, most_faces=2000, path="x")
-    assert len(some.faces) <= 2000
-    assert any("stay longer than pixels need" in note for note in some.notes)
+    even_mesh = sized(mesh, 0.07, most_faces=100_000, path="x")
+    assert longest_edge(even_mesh.vertices, even_mesh.faces) <= 2 * 0.07
+    assert [note for note in even_mesh.notes if "long faces split" in note] == list(even_mesh.notes)
+    limited_mesh = sized(mesh, 0.07, most_faces=2000, path="x")
+    assert len(limited_mesh.faces) <= 2000
+    assert any("stay longer than pixels need" in note for note in limited_mesh.notes)
 
 
 def test_a_fine_mesh_is_truly_decimated():
     pytest.importorskip("fast_simplification", reason="the extra mesh is not installed")
     mesh = start_mesh.StartMesh(*ball(4))
-    coarser = sized(mesh, 0.1, most_faces=10_000, path="x")
-    assert 200 < len(coarser.faces) < 1000
-    assert coarser.is_closed
-    radii = np.linalg.norm(coarser.vertices, axis=1)
+    coarse_mesh = sized(mesh, 0.1, most_faces=10_000, path="x")
+    assert 200 < len(coarse_mesh.faces) < 1000
+    assert coarse_mesh.is_closed
+    radii = np.linalg.norm(coarse_mesh.vertices, axis=1)
     assert np.abs(radii - RADIUS).max() < 0.05 * RADIUS
 
 
@@ -431,8 +439,8 @@ def test_a_vertex_of_no_face_may_lie_anywhere(tmp_path):
     """Such a vertex does not affect the size of the mesh, and may be NaN."""
     ball = trimesh.creation.icosphere(2, 1.0)
     faces = ball.faces[: len(ball.faces) // 2]
-    for place in ([0.0, 0.0, 0.0], [np.nan] * 3):
-        vertices = np.concatenate([ball.vertices + [5e5, 4e6, 0.0], [place]])
+    for position in ([0.0, 0.0, 0.0], [np.nan] * 3):
+        vertices = np.concatenate([ball.vertices + [5e5, 4e6, 0.0], [position]])
         path = tmp_path / "ball.ply"
         trimesh.Trimesh(vertices, faces, process=False).export(path)
         assert len(read_start(str(path), digest_of(path)).faces) == len(faces)

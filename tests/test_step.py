@@ -68,26 +68,28 @@ def test_a_stage_that_lacks_a_rate_is_refused_by_the_name_of_the_group(params):
 def test_a_step_goes_against_the_direction_at_the_rate_of_the_group(params):
     directions = jax.tree.map(jnp.ones_like, params)
     rates = {name: jnp.float32(0.001 * k) for k, name in enumerate(CONFIG.rate_groups, 1)}
-    moved = _moved(params, directions, rule(rates=rates))
-    for old, new, name in zip(
-        jax.tree.leaves(params), jax.tree.leaves(moved), rate_groups(params), strict=True
+    moved_params = _moved(params, directions, rule(rates=rates))
+    for old_leaf, new_leaf, name in zip(
+        jax.tree.leaves(params), jax.tree.leaves(moved_params), rate_groups(params), strict=True
     ):
-        np.testing.assert_allclose(new - old, -rates[name], atol=2e-6)
+        np.testing.assert_allclose(new_leaf - old_leaf, -rates[name], atol=2e-6)
 
 
 def test_light_steps_grow_with_its_brightness_and_stop_at_its_floor(params):
     radiance = params.light.radiance.at[0, 0].set(20.0).at[1, 1].set(0.0)
     params = replace(params, light=replace(params.light, radiance=radiance))
     directions = jax.tree.map(jnp.ones_like, params)
-    moved = _moved(params, directions, rule(light_knee=jnp.float32(0.5)))
+    moved_params = _moved(params, directions, rule(light_knee=jnp.float32(0.5)))
     # The step at the knee is twice that in the dark; far above, it is proportional to the radiance.
     expected = np.maximum(radiance - 0.01 * (1 + radiance / 0.5), 0.0)
-    np.testing.assert_allclose(moved.light.radiance, expected, atol=1e-5)
-    floored = _moved(params, directions, rule(smallest_light=jnp.float32(0.3)))
-    assert float(jnp.min(floored.light.radiance)) == pytest.approx(0.3)
-    still = jax.tree.map(jnp.zeros_like, params)
-    frozen = _moved(params, still, rule(smallest_light=jnp.float32(0.3), frozen=("light",)))
-    np.testing.assert_array_equal(frozen.light.radiance, radiance)
+    np.testing.assert_allclose(moved_params.light.radiance, expected, atol=1e-5)
+    floored_params = _moved(params, directions, rule(smallest_light=jnp.float32(0.3)))
+    assert float(jnp.min(floored_params.light.radiance)) == pytest.approx(0.3)
+    zero_directions = jax.tree.map(jnp.zeros_like, params)
+    frozen_params = _moved(
+        params, zero_directions, rule(smallest_light=jnp.float32(0.3), frozen=("light",))
+    )
+    np.testing.assert_array_equal(frozen_params.light.radiance, radiance)
 
 
 class Bowl(Pipeline):
@@ -100,8 +102,8 @@ class Bowl(Pipeline):
         """Evaluate the distance of exposure and light."""
         error = params.log_exposure - self.target
         total = error**2 + jnp.mean((params.light.radiance - 1.0) ** 2)
-        zero, needed = jnp.int32(0), {"hits": self.need}
-        return total, LossReport({"l1": total}, total, zero, zero, needed, batch.carry + 1)
+        zero, usage = jnp.int32(0), {"hits": self.need}
+        return total, LossReport({"l1": total}, total, zero, zero, usage, batch.carry + 1)
 
 
 @pytest.fixture
@@ -121,11 +123,11 @@ def run_step(params, *, target=1.0, need=1, frozen=(), carry=0):
     views = sphere_views(1, size=4)
     batch = Batch(views.camera([0]), jnp.asarray(views.images[:1]), jax.random.key(0))
     state = initial_state(jax.tree.map(jnp.copy, params), carry=jnp.int32(carry))
-    whole, _ = ball(CONFIG, stage="monte_carlo")
+    ball_pipeline, _ = ball(CONFIG, stage="monte_carlo")
     pipeline = Bowl(
-        whole.surface,
-        whole.transport,
-        whole.fields,
+        ball_pipeline.surface,
+        ball_pipeline.transport,
+        ball_pipeline.fields,
         capacities=Capacities(hits=4),
         target=jnp.float32(target),
         need=jnp.int32(need),
@@ -140,8 +142,8 @@ def test_a_sound_step_lowers_the_loss_counts_and_carries_on(params):
     assert bool(report.finite)
     # Adam's first step has the size of the rate, towards the target.
     assert float(state.params.log_exposure) == pytest.approx(0.01, rel=1e-4)
-    nearer = float(jnp.mean((state.params.light.radiance - 1.0) ** 2))
-    assert nearer < float(jnp.mean((params.light.radiance - 1.0) ** 2))
+    light_error = float(jnp.mean((state.params.light.radiance - 1.0) ** 2))
+    assert light_error < float(jnp.mean((params.light.radiance - 1.0) ** 2))
     assert int(state.step) == 1
     assert int(state.carry) == 1
 
@@ -152,8 +154,8 @@ def test_a_step_that_overflows_or_is_not_finite_changes_nothing(params, broken):
     state, report = run_step(params, carry=3, **broken)
     assert bool(report.fits) is ("need" not in broken)
     assert bool(report.finite) is ("target" not in broken)
-    before = initial_state(params, carry=jnp.int32(3))
-    for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(before), strict=True):
+    expected_state = initial_state(params, carry=jnp.int32(3))
+    for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(expected_state), strict=True):
         np.testing.assert_array_equal(a, b)
 
 

@@ -43,14 +43,14 @@ def stopped(handler="", ends="False"):
     assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"
     process.send_signal(signal.SIGINT)
-    began = time.monotonic()
-    _, said = process.communicate(timeout=60)
-    return process.returncode, said, time.monotonic() - began
+    start_time = time.monotonic()
+    _, error_text = process.communicate(timeout=60)
+    return process.returncode, error_text, time.monotonic() - start_time
 
 
 def test_a_program_that_swallows_ctrl_c_ends_all_the_same():
-    status, said, seconds = stopped()
-    assert (status, said) == (130, "stopped\n")
+    status, error_text, seconds = stopped()
+    assert (status, error_text) == (130, "stopped\n")
     assert seconds < 15
 
 
@@ -69,10 +69,10 @@ with stopping.stops_soon(with_process={alone}) as say_stopped:
     except KeyboardInterrupt:
         say_stopped()
 """
-    for alone, status in ((True, 130), (False, 0)):
-        text = program.format(alone=alone)
-        done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True)
-        assert (done.returncode, done.stderr) == (status, "stopped\n")
+    for is_alone, status in ((True, 130), (False, 0)):
+        text = program.format(alone=is_alone)
+        process = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True)
+        assert (process.returncode, process.stderr) == (status, "stopped\n")
 
 
 def test_ctrl_c_that_a_callback_swallows_is_raised_again():
@@ -93,8 +93,8 @@ with stopping.stops_soon(with_process=False):
     except KeyboardInterrupt:
         print("heard")
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "heard\n", "")
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (process.returncode, process.stdout, process.stderr) == (0, "heard\n", "")
 
 
 def test_ctrl_c_after_the_end_of_a_command_is_silent():
@@ -107,14 +107,14 @@ atexit.register(signal.raise_signal, signal.SIGINT)
 with stopping.stops_soon(with_process=True):
     pass
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (process.returncode, process.stderr) == (-signal.SIGINT, "")
 
 
 def test_a_handler_of_its_own_is_left_alone():
-    note = "asked = []; signal.signal(signal.SIGINT, lambda number, frame: asked.append(1))"
-    wait = "asked and (time.sleep(0.6) or True)"
-    assert stopped(note, wait)[:2] == (0, "")
+    handler = "asked = []; signal.signal(signal.SIGINT, lambda number, frame: asked.append(1))"
+    condition = "asked and (time.sleep(0.6) or True)"
+    assert stopped(handler, condition)[:2] == (0, "")
 
 
 REQUEST = """
@@ -127,8 +127,11 @@ is_asked = requests.__enter__()
 
 def test_a_training_says_at_once_that_it_will_stop():
     """A user who gets no reply during a compilation would press Ctrl-C again, and lose steps."""
-    status, said, _ = stopped(REQUEST, "is_asked() and (time.sleep(0.6) or True)")
-    assert (status, said) == (0, "stopping after this step; press Ctrl-C again to stop at once\n")
+    status, error_text, _ = stopped(REQUEST, "is_asked() and (time.sleep(0.6) or True)")
+    assert (status, error_text) == (
+        0,
+        "stopping after this step; press Ctrl-C again to stop at once\n",
+    )
 
 
 def test_the_second_ctrl_c_ends_a_training_that_cannot_hear():
@@ -144,10 +147,10 @@ with stopping.stops_soon(with_process=True), stop_requests():
     while True:
         hashlib.pbkdf2_hmac("sha256", b"", b"", 100_000_000)
 """
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60
     )
-    assert (done.returncode, done.stderr.splitlines()[1:]) == (130, ["stopped"])
+    assert (process.returncode, process.stderr.splitlines()[1:]) == (130, ["stopped"])
 
 
 @pytest.mark.parametrize("command", ["info", "evaluate", "export"])
@@ -174,10 +177,10 @@ def test_memory_that_runs_out_is_one_line_and_a_status(error, tmp_path, monkeypa
 
 
 def test_a_command_is_called_again_in_one_process_and_leaves_nothing(capsys):
-    before = signal.getsignal(signal.SIGINT)
+    previous_handler = signal.getsignal(signal.SIGINT)
     for _ in range(2):
         assert cli.main(["info", "nowhere"]) == 2
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(signal.SIGINT) is previous_handler
     assert signal.set_wakeup_fd(-1) == -1
 
 
@@ -185,16 +188,16 @@ def test_the_command_listens_before_it_imports_what_takes_seconds():
     program = (
         "import sys, geosplat_jax.cli; print([n for n in ('jax', 'numpy') if n in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert (done.stdout, done.stderr) == ("[]\n", "")
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (process.stdout, process.stderr) == ("[]\n", "")
 
 
 def test_public_names_are_those_of_their_modules():
     import geosplat_jax
 
     for name in geosplat_jax.__all__:
-        found = getattr(geosplat_jax, name)
-        assert found.__name__ == name
+        member = getattr(geosplat_jax, name)
+        assert member.__name__ == name
         assert name in dir(geosplat_jax)
     assert set(geosplat_jax._WHERE) == set(geosplat_jax.__all__)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):

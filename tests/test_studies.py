@@ -43,9 +43,9 @@ def test_every_study_says_how_it_is_called(name, monkeypatch, capsys):
     if not hasattr(module, "main"):
         return
     monkeypatch.setattr(sys, "argv", [f"{name}.py", "--help"])
-    with pytest.raises(SystemExit) as ended:
+    with pytest.raises(SystemExit) as program_exit:
         module.main()
-    assert ended.value.code == 0
+    assert program_exit.value.code == 0
     assert f"usage: {name}.py" in capsys.readouterr().out
 
 
@@ -70,17 +70,17 @@ def test_the_chain_of_the_study_of_precision_is_the_render():
         expected = pipeline.render(params, camera).rgb[0]
         return expected, precision.chain(params, camera, pipeline)["image"]
 
-    expected, found = both(pipeline, params, camera)
+    expected, image = both(pipeline, params, camera)
     assert float(np.max(expected)) > 0.1
-    assert precision.errors(found, expected)["l2"] < IMAGE
+    assert precision.errors(image, expected)["l2"] < IMAGE
 
 
 def test_a_stage_for_the_light_leaves_all_other_stages_as_they_are():
     config = make_config(quality="draft")
-    found = light.with_light_stage(config, steps=60, rate=0.02)
-    assert [s.name for s in found.stages] == ["split_sum", "light", "monte_carlo", "refine"]
-    assert [s for s in found.stages if s.name != "light"] == list(config.stages)
-    stage = found.stage("light")
+    new_config = light.with_light_stage(config, steps=60, rate=0.02)
+    assert [s.name for s in new_config.stages] == ["split_sum", "light", "monte_carlo", "refine"]
+    assert [s for s in new_config.stages if s.name != "light"] == list(config.stages)
+    stage = new_config.stage("light")
     rates = {name: rate.value for name, rate in stage.rates.items() if rate.value}
     assert (stage.steps, rates) == (60, {"light": 0.02, "exposure": 0.01})
 
@@ -108,17 +108,17 @@ def test_earlier_runs_are_opened_where_they_are_those_that_are_wanted(tmp_path):
     steps = tiny_config("stages.split_sum.steps=5")
     with pytest.raises(SystemExit, match=r"stages\.split_sum\.steps: 4 -> 5"):
         earlier_runs.open_run(folder, steps, dataset)
-    turned = replace(
+    flipped_views = replace(
         dataset.train, camera_to_world=np.flip(dataset.train.camera_to_world, axis=0).copy()
     )
-    others = {
+    changed_datasets = {
         "dataset {'downscale': 2}": replace(dataset, options={"downscale": 1}),
         "scene: ": replace(dataset, root=tmp_path / "other"),
-        "with views ": replace(dataset, train=turned),
+        "with views ": replace(dataset, train=flipped_views),
     }
-    for said, other in others.items():
-        with pytest.raises(SystemExit, match=said):
-            earlier_runs.open_run(folder, config, other)
+    for message, changed_dataset in changed_datasets.items():
+        with pytest.raises(SystemExit, match=message):
+            earlier_runs.open_run(folder, config, changed_dataset)
 
 
 def _cameras(dataset, folder, quality):

@@ -105,10 +105,10 @@ class Fakes:
         self.first_stages[label] = first_stage
         if label in self.broken:
             raise RuntimeError(f"no luck with {label}")
-        first = config.first_step(first_stage) if first_stage else 0
+        first_step = config.first_step(first_stage) if first_stage else 0
         lines = [
             {"step": k, "stage": config.stage_at(k).name, "seconds": 0.5}
-            for k in range(first, config.total_steps)
+            for k in range(first_step, config.total_steps)
         ]
         text = "".join(json.dumps(line) + "\n" for line in lines)
         (folder / "metrics.jsonl").write_text(text)
@@ -215,16 +215,16 @@ def test_a_scene_that_is_not_there_is_named(tmp_path, capsys):
 )
 def test_a_stage_is_shared_where_only_later_ones_differ(override, shares):
     two_stages = ("stages.refine.steps=0",)
-    base = make_config(quality="draft", overrides=two_stages)
+    base_config = make_config(quality="draft", overrides=two_stages)
     config = make_config(quality="draft", overrides=(*two_stages, override))
-    shared = shared_stages(config, [base])
-    assert shared == (beginning(base, 1) if shares else None)
+    common_stages = shared_stages(config, [base_config])
+    assert common_stages == (beginning(base_config, 1) if shares else None)
 
 
 def _several_stages(preset, quality, *, material_prior, mesh, overrides):
     """Stand in for `make_config`: overrides are stages, ``a=3`` for three steps of stage a."""
-    named = [text.split("=") for text in overrides]
-    return Config(stages=tuple(Stage(name=name, steps=int(steps)) for name, steps in named))
+    pairs = [text.split("=") for text in overrides]
+    return Config(stages=tuple(Stage(name=name, steps=int(steps)) for name, steps in pairs))
 
 
 def _parts(tmp_path, monkeypatch, **runs):
@@ -233,8 +233,8 @@ def _parts(tmp_path, monkeypatch, **runs):
     tables = [
         f"[[run]]\nname = {name!r}\nset = {stages.split()}\n" for name, stages in runs.items()
     ]
-    head = "title = 'x'\nscenes = ['one']\nfigures = ['f']\n"
-    sweep = read_sweep(_write(tmp_path, head + "".join(tables)))
+    header = "title = 'x'\nscenes = ['one']\nfigures = ['f']\n"
+    sweep = read_sweep(_write(tmp_path, header + "".join(tables)))
     return [
         (part.folder, part.source, part.first_stage, part.run is not None)
         for part in parts_of(sweep).values()
@@ -271,8 +271,8 @@ def test_stages_that_nobody_else_has_are_not_trained_apart(tmp_path, monkeypatch
 
 
 def test_a_source_that_was_not_asked_for_is_trained_but_not_evaluated(tmp_path):
-    short = '\n[[run]]\nname = "short"\nset = ["stages.monte_carlo.steps=0"]\n'
-    _write(tmp_path, SWEEP + short)
+    short_run = '\n[[run]]\nname = "short"\nset = ["stages.monte_carlo.steps=0"]\n'
+    _write(tmp_path, SWEEP + short_run)
     fakes = Fakes()
     assert _run(tmp_path, fakes, "--only", "full", "--scene", "one") == 0
     assert fakes.trained == [("one/short", False, None), ("one/full", False, "short")]
@@ -298,8 +298,8 @@ def test_every_run_of_every_scene_is_trained_and_evaluated_once(tmp_path):
     assert ("one/no-shadow", "none") in fakes.evaluated
     assert ("one/full", "traced") in fakes.evaluated
     assert len(fakes.evaluated) == 10
-    first = json.loads((tmp_path / "runs" / "one" / SHARED / "run.json").read_text())
-    assert list(first["config"]["stages"]) == ["split_sum"]
+    record = json.loads((tmp_path / "runs" / "one" / SHARED / "run.json").read_text())
+    assert list(record["config"]["stages"]) == ["split_sum"]
     assert fakes.first_stages["one/few"] == "monte_carlo"
     assert fakes.first_stages["one/coarse"] is None
 
@@ -317,18 +317,18 @@ def test_a_finished_sweep_does_nothing_and_only_the_chosen_runs_are_made(tmp_pat
 
 
 def test_runs_with_the_same_settings_are_made_once(tmp_path):
-    again = (
+    sweep_text = (
         SWEEP + '\n[[run]]\nname = "again"\nset = ["stages.monte_carlo.transport.occlusion=true"]\n'
     )
-    _write(tmp_path, again)
+    _write(tmp_path, sweep_text)
     fakes = Fakes()
     assert _run(tmp_path, fakes, "--only", "again", "--scene", "one") == 0
     assert [label for label, *_ in fakes.trained] == [f"one/{SHARED}", "one/full"]
     record = json.loads((tmp_path / "runs" / "sweep.json").read_text())
     assert {r["name"]: r["same_as"] for r in record["runs"]}["again"] == "full"
     # With another evaluation it is a run of its own.
-    other = again + 'evaluate = { relight_indirect = "none" }\n'
-    sweep = read_sweep(_write(tmp_path, other))
+    other_text = sweep_text + 'evaluate = { relight_indirect = "none" }\n'
+    sweep = read_sweep(_write(tmp_path, other_text))
     assert homes(sweep)["again"] == "again"
 
 
@@ -337,9 +337,9 @@ def test_finished_runs_with_other_settings_stop_the_sweep_and_say_so(tmp_path, c
     assert _run(tmp_path, Fakes(), "--only", "few", "--scene", "one") == 0
     fakes = Fakes()
     assert _run(tmp_path, fakes, "--set", "stages.monte_carlo.batch_views=3") == 2
-    said = capsys.readouterr().err
-    assert "one/few: stages.monte_carlo.batch_views: 2 -> 3" in said
-    assert "Take another --output" in said
+    error_text = capsys.readouterr().err
+    assert "one/few: stages.monte_carlo.batch_views: 2 -> 3" in error_text
+    assert "Take another --output" in error_text
     assert fakes.trained == []
     path = tmp_path / "runs" / "one" / "few" / "metrics.json"
     figures = json.loads(path.read_text())
@@ -353,8 +353,8 @@ def test_runs_start_from_the_mesh_in_their_scenes_folder(tmp_path, capsys):
     for scene, text in (("one", "a mesh"), ("two", "another mesh")):
         (tmp_path / "scenes" / scene / "mesh.ply").write_text(text)
     fakes = Fakes()
-    some = ["--only", "full", "few", "--mesh", "mesh.ply"]
-    assert _run(tmp_path, fakes, *some) == 0
+    selection = ["--only", "full", "few", "--mesh", "mesh.ply"]
+    assert _run(tmp_path, fakes, *selection) == 0
     starts = {}
     for scene in ("one", "two"):
         record = json.loads((tmp_path / "runs" / scene / "few" / "run.json").read_text())
@@ -365,10 +365,10 @@ def test_runs_start_from_the_mesh_in_their_scenes_folder(tmp_path, capsys):
     assert "--mesh mesh.ply" in text
     assert "other settings" not in text
     (tmp_path / "scenes" / "one" / "mesh.ply").write_text("a third mesh")
-    assert _run(tmp_path, Fakes(), *some) == 2
+    assert _run(tmp_path, Fakes(), *selection) == 2
     assert "geometry.digest" in capsys.readouterr().err
     (tmp_path / "scenes" / "one" / "mesh.ply").unlink()
-    assert _run(tmp_path, Fakes(), *some) == 2
+    assert _run(tmp_path, Fakes(), *selection) == 2
     assert "there is no mesh file" in capsys.readouterr().err
 
 
@@ -386,9 +386,9 @@ def test_the_report_notices_a_start_from_another_mesh(tmp_path):
 def test_settings_of_later_stages_leave_the_shared_ones_as_they_are(tmp_path, capsys):
     _write(tmp_path)
     assert _run(tmp_path, Fakes(), "--only", "few", "--scene", "one") == 0
-    more = ["--set", "stages.monte_carlo.batch_views=3", "--only", "many", "--scene", "one"]
+    selection = ["--set", "stages.monte_carlo.batch_views=3", "--only", "many", "--scene", "one"]
     fakes = Fakes()
-    assert _run(tmp_path, fakes, *more) == 0
+    assert _run(tmp_path, fakes, *selection) == 0
     assert fakes.trained == [("one/many", False, SHARED)]
     # Changed settings of the shared stage itself are refused.
     path = tmp_path / "runs" / "one" / SHARED / "run.json"
@@ -396,22 +396,22 @@ def test_settings_of_later_stages_leave_the_shared_ones_as_they_are(tmp_path, ca
     record["config"]["stages"]["split_sum"]["rates"]["sdf"]["value"] = 0.5
     path.write_text(json.dumps(record))
     assert _run(tmp_path, fakes, "--only", "full", "--scene", "one") == 2
-    said = capsys.readouterr().err
-    assert f"one/{SHARED}: stages.split_sum.rates.sdf.value: 0.5 -> " in said
+    error_text = capsys.readouterr().err
+    assert f"one/{SHARED}: stages.split_sum.rates.sdf.value: 0.5 -> " in error_text
     assert len(fakes.trained) == 1
 
 
 def test_an_interrupted_run_goes_on_from_its_checkpoint_or_starts_anew(tmp_path):
     _write(tmp_path)
-    broken = Fakes(broken=["one/full", "one/few"])
-    assert _run(tmp_path, broken, "--scene", "one") == 1
-    full = tmp_path / "runs" / "one" / "full"
-    save_checkpoint(full / "checkpoints", 2, tree={"x": np.zeros(2)}, meta={})
+    broken_fakes = Fakes(broken=["one/full", "one/few"])
+    assert _run(tmp_path, broken_fakes, "--scene", "one") == 1
+    full_folder = tmp_path / "runs" / "one" / "full"
+    save_checkpoint(full_folder / "checkpoints", 2, tree={"x": np.zeros(2)}, meta={})
     (tmp_path / "runs" / "one" / "few" / "metrics.jsonl").write_text("{}\n")
     fakes = Fakes()
     assert _run(tmp_path, fakes, "--scene", "one") == 0
     assert fakes.trained == [("one/full", True, None), ("one/few", False, SHARED)]
-    assert not (full / "error.txt").exists()
+    assert not (full_folder / "error.txt").exists()
 
 
 def test_an_interrupted_evaluation_is_repeated_without_training(tmp_path):
@@ -427,8 +427,8 @@ def test_an_interrupted_evaluation_is_repeated_without_training(tmp_path):
 def test_an_evaluation_of_what_was_replaced_vouches_for_no_other(tmp_path):
     """An evaluation that fails after its figures is unfinished, whatever was there before."""
     _write(tmp_path)
-    some = ["--only", "full", "--scene", "one"]
-    assert _run(tmp_path, Fakes(), *some) == 0
+    selection = ["--only", "full", "--scene", "one"]
+    assert _run(tmp_path, Fakes(), *selection) == 0
     (tmp_path / "runs" / "one" / "full" / "training.json").unlink()
 
     class Dying(Fakes):
@@ -436,14 +436,14 @@ def test_an_evaluation_of_what_was_replaced_vouches_for_no_other(tmp_path):
             super().evaluate(folder, **arguments)
             raise RuntimeError("no room for pictures")
 
-    assert _run(tmp_path, Dying(), *some) == 1
+    assert _run(tmp_path, Dying(), *selection) == 1
     fakes = Fakes()
-    assert _run(tmp_path, fakes, *some) == 0
+    assert _run(tmp_path, fakes, *selection) == 0
     assert (fakes.trained, fakes.evaluated) == ([], [("one/full", "traced")])
 
 
 def test_an_evaluation_reads_the_images_that_it_is_told_to(tmp_path, monkeypatch):
-    seen = []
+    evaluations = []
 
     class Opened:
         dataset = "as trained on"
@@ -452,23 +452,23 @@ def test_an_evaluation_reads_the_images_that_it_is_told_to(tmp_path, monkeypatch
             self.folder = SimpleNamespace(record=lambda: {"scene": "a scene"})
 
         def evaluate(self, **arguments):
-            seen.append((self.dataset, arguments))
+            evaluations.append((self.dataset, arguments))
 
     monkeypatch.setattr(runner, "Run", Opened)
     monkeypatch.setattr(runner, "load_recorded", lambda scene, reading: (scene, reading))
     runner._evaluate(tmp_path, {"downscale": 3}, samples=2)
     runner._evaluate(tmp_path, samples=4)
-    other = ("a scene", {"downscale": 3})
-    assert seen == [(other, {"samples": 2}), ("as trained on", {"samples": 4})]
+    other_dataset = ("a scene", {"downscale": 3})
+    assert evaluations == [(other_dataset, {"samples": 2}), ("as trained on", {"samples": 4})]
 
 
 def test_files_that_no_run_wrote_are_left_alone(tmp_path):
     _write(tmp_path)
-    precious = tmp_path / "runs" / "one" / "full" / "previews" / "precious.png"
-    precious.parent.mkdir(parents=True)
-    precious.write_text("data")
+    foreign_file = tmp_path / "runs" / "one" / "full" / "previews" / "precious.png"
+    foreign_file.parent.mkdir(parents=True)
+    foreign_file.write_text("data")
     assert _run(tmp_path, Fakes(), "--only", "full", "--scene", "one") == 1
-    assert precious.read_text() == "data"
+    assert foreign_file.read_text() == "data"
 
 
 def test_a_failed_run_stops_only_those_that_need_it(tmp_path, capsys):
@@ -479,10 +479,10 @@ def test_a_failed_run_stops_only_those_that_need_it(tmp_path, capsys):
     assert f"no luck with one/{SHARED}" in (runs / "one" / SHARED / "error.txt").read_text()
     assert "stages to take over failed" in (runs / "one" / "full" / "error.txt").read_text()
     assert "no luck with two/no-shadow" in (runs / "two" / "no-shadow" / "error.txt").read_text()
-    done = {label for label, _ in fakes.evaluated}
-    assert done == {"one/coarse", "two/full", "two/coarse", "two/few", "two/many"}
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last.startswith(f"6 of 12 failed: one/{SHARED}, one/full")
+    evaluated_labels = {label for label, _ in fakes.evaluated}
+    assert evaluated_labels == {"one/coarse", "two/full", "two/coarse", "two/few", "two/many"}
+    last_line = capsys.readouterr().err.splitlines()[-1]
+    assert last_line.startswith(f"6 of 12 failed: one/{SHARED}, one/full")
 
 
 def test_a_trained_run_is_evaluated_without_its_source(tmp_path):
@@ -511,7 +511,7 @@ def test_ctrl_c_ends_the_sweep_with_its_own_status(tmp_path, capsys):
 def test_being_ended_is_as_ctrl_c_while_runs_go_on(tmp_path):
     """Schedulers end a job with SIGTERM."""
     _write(tmp_path)
-    before, handlers = signal.getsignal(signal.SIGTERM), []
+    previous_handler, handlers = signal.getsignal(signal.SIGTERM), []
 
     def stop(job):
         handlers.append(signal.getsignal(signal.SIGTERM))
@@ -519,7 +519,7 @@ def test_being_ended_is_as_ctrl_c_while_runs_go_on(tmp_path):
 
     assert runner.main(_arguments(tmp_path), start=stop) == 130
     assert handlers == [signal.default_int_handler]
-    assert signal.getsignal(signal.SIGTERM) == before
+    assert signal.getsignal(signal.SIGTERM) == previous_handler
 
 
 @pytest.mark.parametrize(
@@ -529,14 +529,14 @@ def test_being_ended_is_as_ctrl_c_while_runs_go_on(tmp_path):
 def test_ctrl_c_asks_for_a_checkpoint_and_a_second_one_ends_the_process(
     tmp_path, monkeypatch, interruptions, calls
 ):
-    made = []
+    children = []
 
     class Child:
         returncode = 130
 
         def __init__(self, command, **options):
             self.calls, self.left, self.options = [], interruptions, options
-            made.append(self)
+            children.append(self)
 
         def __enter__(self):
             return self
@@ -564,9 +564,9 @@ def test_ctrl_c_asks_for_a_checkpoint_and_a_second_one_ends_the_process(
     job = Job("one/full", "scene", str(tmp_path / "full"), {}, {}, None, None, None)
     with pytest.raises(KeyboardInterrupt):
         runner.in_a_process(job)
-    assert made[0].calls == calls
+    assert children[0].calls == calls
     # The child has its own session; otherwise the terminal's Ctrl-C would reach it a second time.
-    assert made[0].options["start_new_session"]
+    assert children[0].options["start_new_session"]
 
 
 @pytest.mark.parametrize(
@@ -592,9 +592,9 @@ def test_the_bundled_sweeps_are_sound():
     configs = {run.name: sweep.config(run) for run in sweep.runs}
     assert homes(sweep)["indirect-constant"] == "full"
     sources = {part.folder: part.source for part in parts_of(sweep).values()}
-    alone = {SHARED, "no-culling"}
-    assert {name for name, source in sources.items() if source is None} == alone
-    assert {sources[name] for name in sources if name not in alone} == {SHARED}
+    independent_runs = {SHARED, "no-culling"}
+    assert {name for name, source in sources.items() if source is None} == independent_runs
+    assert {sources[name] for name in sources if name not in independent_runs} == {SHARED}
     stages = {name: config.stage("monte_carlo") for name, config in configs.items()}
     points = {run.x: stages[run.name].transport for run in sweep.runs if run.x}
     assert sorted(points) == [2, 4, 8, 32, 128]
@@ -612,8 +612,8 @@ def test_the_bundled_sweeps_are_sound():
     configs = {run.name: priors.config(run) for run in priors.runs}
     assert [name for name, config in configs.items() if not config.material.bias] == ["no-biases"]
     powers = {n: config.objective.relative_albedo for n, config in configs.items()}
-    others = {name: power for name, power in powers.items() if power != 0.5}
-    assert others == {"absolute-albedo": 0, "relative-albedo": 1}
+    other_powers = {name: power for name, power in powers.items() if power != 0.5}
+    assert other_powers == {"absolute-albedo": 0, "relative-albedo": 1}
 
 
 def test_the_ablation_of_the_paper_changes_what_its_rows_say():
@@ -621,15 +621,15 @@ def test_the_ablation_of_the_paper_changes_what_its_rows_say():
     configs = {run.name: sweep.config(run) for run in sweep.runs}
     stages = {name: [s.name for s in config.active_stages] for name, config in configs.items()}
     assert stages["no-refinement"] == stages["full"][:-1]
-    changed = {name: differences(configs["full"], config) for name, config in configs.items()}
-    assert {line.split(":")[0] for line in changed["no-occlusion"]} == {
+    changes = {name: differences(configs["full"], config) for name, config in configs.items()}
+    assert {line.split(":")[0] for line in changes["no-occlusion"]} == {
         "stages.monte_carlo.transport.occlusion",
         "stages.refine.transport.occlusion",
     }
-    assert {line.split(":")[1].strip() for line in changed["no-indirect"]} == {
+    assert {line.split(":")[1].strip() for line in changes["no-indirect"]} == {
         "'constant' -> 'none'"
     }
-    assert {line.split(":")[0] for line in changed["no-alignment"]} == {
+    assert {line.split(":")[0] for line in changes["no-alignment"]} == {
         "stages.split_sum.splats.kind",
         "stages.monte_carlo.splats.kind",
     }
@@ -666,9 +666,9 @@ def _report(folder, *more):
 def test_the_report_has_the_figures_and_their_differences(tmp_path):
     _hand_made(tmp_path)
     text = _report(tmp_path)
-    one, summary = _rows(text, "one"), _rows(text, "Summary")
-    assert one["run"][:3] == ["nvs.psnr ↑", "roughness.mse ↓", "monte_carlo, s"]
-    assert one["full"] == ["30.00", "0.0200", "1.50", "0.500", "1234"]
+    scene_rows, summary = _rows(text, "one"), _rows(text, "Summary")
+    assert scene_rows["run"][:3] == ["nvs.psnr ↑", "roughness.mse ↓", "monte_carlo, s"]
+    assert scene_rows["full"] == ["30.00", "0.0200", "1.50", "0.500", "1234"]
     assert _rows(text, "two")["no-shadow"][:2] == ["29.50", "0.0100"]
     assert summary["full (reference)"] == ["30.50", "0.0150", "1.50", "0.500", "1234"]
     assert summary["no-shadow"] == ["−1.50", "+0.0000", "×1.00", "×1.00", "×1.00"]
@@ -694,8 +694,8 @@ def _other_seed(folder, name, psnr):
 
 def test_other_seeds_give_a_spread_of_paired_differences(tmp_path):
     _hand_made(tmp_path)
-    other = _other_seed(tmp_path, "again", (30.5, 32.5))
-    text = _report(tmp_path, "--seeds", other)
+    other_runs = _other_seed(tmp_path, "again", (30.5, 32.5))
+    text = _report(tmp_path, "--seeds", other_runs)
     seeds = _rows(text, "Seeds")
     # Means are over both scenes: the reference has 30.5 and 32.5, no-shadow differs by -1.5 and -2.
     assert seeds["full (reference)"] == ["31.50 ± 1.41", "0.0150 (1 seed)"]
@@ -713,10 +713,10 @@ def test_seeds_of_another_sweep_are_refused(tmp_path, capsys):
 
 def test_seeds_on_images_of_another_size_are_refused(tmp_path, capsys):
     _write(tmp_path)
-    some = ["--only", "full", "--scene", "one"]
-    assert _run(tmp_path, Fakes(), *some) == 0
-    again = ["--output", str(tmp_path / "again"), "--set", SEED, "--downscale", "2"]
-    assert _run(tmp_path, Fakes(), *some, *again) == 0
+    selection = ["--only", "full", "--scene", "one"]
+    assert _run(tmp_path, Fakes(), *selection) == 0
+    other_seed = ["--output", str(tmp_path / "again"), "--set", SEED, "--downscale", "2"]
+    assert _run(tmp_path, Fakes(), *selection, *other_seed) == 0
     command = [str(tmp_path / "runs"), "--output", str(tmp_path / "x.md")]
     assert report.main([*command, "--seeds", str(tmp_path / "again")]) == 2
     assert "sizes of images" in capsys.readouterr().err
@@ -739,9 +739,9 @@ def test_seeds_on_images_of_another_size_are_refused(tmp_path, capsys):
 )
 def test_runs_on_other_images_than_the_last_are_listed(tmp_path, first, others, said):
     _write(tmp_path)
-    other = tmp_path / "other" / "scenes"
-    (other / "one").mkdir(parents=True)
-    others = [str(other) if part == "OTHER" else part for part in others]
+    other_scenes = tmp_path / "other" / "scenes"
+    (other_scenes / "one").mkdir(parents=True)
+    others = [str(other_scenes) if part == "OTHER" else part for part in others]
     assert _run(tmp_path, Fakes(), "--scene", "one", "--only", first) == 0
     assert "instead of" not in _report(tmp_path)
     assert _run(tmp_path, Fakes(), "--scene", "one", *others) == 0
@@ -831,8 +831,8 @@ def test_curves_are_drawn_and_linked(tmp_path):
     _hand_made(tmp_path)
     text = _report(tmp_path, "--plots", str(tmp_path / "docs" / "images"))
     assert "![study_light](images/study_light.png)" in text
-    picture = tmp_path / "docs" / "images" / "study_light.png"
-    assert picture.read_bytes().startswith(b"\x89PNG")
+    plot_path = tmp_path / "docs" / "images" / "study_light.png"
+    assert plot_path.read_bytes().startswith(b"\x89PNG")
     assert "Missing and failed" not in text
 
 
@@ -843,13 +843,13 @@ def test_the_smoke_sweep_runs_for_real(tmp_path):
     command = [sys.executable, str(ROOT / "experiments" / "run.py"), str(SWEEPS / "smoke.toml")]
     command += ["--scenes", str(ROOT / "examples"), "--output", str(runs)]
     command += ["--only", "full", "more-samples"]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    process = subprocess.run(command, capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
     lines = (runs / "duck" / "more-samples" / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["stage"] for line in lines] == ["monte_carlo"] * 2
-    again = subprocess.run(command, capture_output=True, text=True)
-    assert again.returncode == 0
-    assert again.stderr.count("finished already") == 2
+    second_process = subprocess.run(command, capture_output=True, text=True)
+    assert second_process.returncode == 0
+    assert second_process.stderr.count("finished already") == 2
     assert report.main([str(runs), "--output", str(output)]) == 0
     text = output.read_text()
     summary = _rows(text, "Summary")

@@ -50,9 +50,9 @@ def rewrite(run, change, *, compression=zipfile.ZIP_STORED):
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     header = json.loads(np.load(io.BytesIO(members["__meta__.npy"])).tobytes())
-    changed = change(members, header)
-    if changed is not None:
-        text = changed if isinstance(changed, str) else json.dumps(changed)
+    new_header = change(members, header)
+    if new_header is not None:
+        text = new_header if isinstance(new_header, str) else json.dumps(new_header)
         members["__meta__.npy"] = npy(np.frombuffer(text.encode(), np.uint8))
     with zipfile.ZipFile(path, "w", compression) as archive:
         for name, content in members.items():
@@ -112,15 +112,15 @@ CHANGES = {
 @pytest.mark.parametrize(("change", "message"), CHANGES.values(), ids=CHANGES)
 def test_a_changed_checkpoint_is_refused_by_its_file(run, change, message):
     path = rewrite(run, change)
-    with pytest.raises((CheckpointError, RunError, TrainingError), match=message) as caught:
+    with pytest.raises((CheckpointError, RunError, TrainingError), match=message) as error_info:
         load_trained(run)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert str(path) in str(error_info.value)
+    assert "\n" not in str(error_info.value)
 
 
 def larger(members, _):
-    small = npy(np.zeros(3, np.float32))
-    members[f"{SDF}.npy"] = small.replace(b"(3,), }           ", b"(300000000000,), }")
+    array_bytes = npy(np.zeros(3, np.float32))
+    members[f"{SDF}.npy"] = array_bytes.replace(b"(3,), }           ", b"(300000000000,), }")
 
 
 UNREADABLE = {
@@ -154,9 +154,9 @@ def test_a_checkpoint_that_cannot_be_read_is_passed_over(run, change):
 )
 def test_an_array_that_is_not_what_it_says_costs_no_memory(run, change, message):
     path = rewrite(run, lambda members, header: change(members, header) and None)
-    with pytest.raises(CheckpointError, match=message) as caught:
+    with pytest.raises(CheckpointError, match=message) as error_info:
         load_trained(run)
-    assert str(path) in str(caught.value)
+    assert str(path) in str(error_info.value)
 
 
 def test_a_compressed_checkpoint_is_not_unfolded(run):
@@ -170,10 +170,10 @@ def test_a_compressed_checkpoint_is_not_unfolded(run):
 def test_a_record_that_is_none_is_refused_by_its_file(run, text):
     path = run.path / "run.json"
     path.write_text(text, encoding="latin-1")
-    with pytest.raises(RunError, match="run.json") as caught:
+    with pytest.raises(RunError, match="run.json") as error_info:
         Run(run.path)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert str(path) in str(error_info.value)
+    assert "\n" not in str(error_info.value)
 
 
 @pytest.mark.parametrize(
@@ -193,9 +193,9 @@ def test_a_record_that_is_none_is_refused_by_its_file(run, text):
 def test_a_record_of_impossible_values_is_refused_by_its_file(run, name, value, message):
     path = run.path / "run.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), name: value}))
-    with pytest.raises(RunError, match=f"{path} is damaged: {message}") as caught:
+    with pytest.raises(RunError, match=f"{path} is damaged: {message}") as error_info:
         Run(run.path)
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(error_info.value)
 
 
 @pytest.mark.parametrize("value", [None, [], {"stages": None}, {"run": {"seed": -1}}])
@@ -217,9 +217,9 @@ def test_what_a_training_noted_is_refused_where_it_is_damaged(run):
 def test_a_run_that_is_damaged_is_one_line_on_the_command_line(run, capsys):
     rewrite(run, CHANGES["negative grid"][0])
     assert main(["export", str(run.path)]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("error: checkpoint ")
-    assert said.count("\n") == 1
+    error_text = capsys.readouterr().err
+    assert error_text.startswith("error: checkpoint ")
+    assert error_text.count("\n") == 1
     latest_checkpoint(run.checkpoints).write_bytes(b"hello")
     assert main(["export", str(run.path)]) == 2
     first, second = capsys.readouterr().err.splitlines()
@@ -237,8 +237,8 @@ def test_whole_numbers_beyond_floating_point_are_infinite():
     """Then the check for finite numbers names the entry; Python's own error names nothing."""
     assert parse_json(f"[{10**200}]") == [10**200]
     for sign, digits in (("", 400), ("-", 400), ("", 5000)):
-        (found,) = parse_json(f"[{sign}1{'0' * digits}]")
-        assert found == float(f"{sign}inf")
+        (number,) = parse_json(f"[{sign}1{'0' * digits}]")
+        assert number == float(f"{sign}inf")
 
 
 def test_documents_that_are_nested_too_deeply_are_one_line():

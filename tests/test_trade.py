@@ -117,21 +117,21 @@ def _rows(text, heading):
 def test_factors_are_of_the_quality_level_and_images_of_other_sizes_share_nothing(tmp_path):
     sweep = read_sweep(_write(tmp_path, SWEEP))
     configs = {run.name: sweep.config(run) for run in sweep.runs}
-    base = configs["base"]
-    cells = base.geometry.resolution
+    base_config = configs["base"]
+    cells = base_config.geometry.resolution
     assert configs["half"].geometry.resolution == round(cells / 2)
     assert read_sweep(_write(tmp_path, SWEEP), quality="standard").quality == "standard"
-    light = base.stage("monte_carlo").transport.light_count
+    light = base_config.stage("monte_carlo").transport.light_count
     assert configs["many"].stage("monte_carlo").transport.light_count == 4 * light
     assert configs["few"].stage("monte_carlo").transport.light_count == max(1, light // 2)
     sources = {part.folder: part.source for part in parts_of(sweep).values()}
-    shared = "_base.split_sum"
+    shared_folder = "_base.split_sum"
     assert sources == {
-        shared: None,
-        "base": shared,
+        shared_folder: None,
+        "base": shared_folder,
         "half": None,
-        "few": shared,
-        "many": shared,
+        "few": shared_folder,
+        "many": shared_folder,
         "coarse": None,
     }
     jobs = plan(sweep, tmp_path, tmp_path, scenes=["one"], names=[run.name for run in sweep.runs])
@@ -159,16 +159,21 @@ def test_a_bad_factor_is_one_error(tmp_path, capsys, old, new, said):
 def test_the_sweep_of_all_knobs_is_sound():
     for quality in ("draft", "standard"):
         sweep = read_sweep(SWEEPS / "trade.toml", quality=quality)
-        where = homes(sweep)
+        home_names = homes(sweep)
         configs = {run.name: sweep.config(run) for run in sweep.runs}
         assert len({run.group for run in sweep.runs if run.x is not None}) >= 14
         # Most runs differ from the base; settings that a quality level already has are trained
         # once.
-        assert sum(where[name] == "base" for name in where) <= 4
+        assert sum(home_names[name] == "base" for name in home_names) <= 4
         linear = configs["decay-linear"].stage("split_sum")
         assert linear.decay == "linear"
-        twice, base = (configs[n].stage("split_sum") for n in ("steps-split-sum-2", "base"))
-        assert (twice.steps, twice.half_life) == (2 * base.steps, 2 * base.half_life)
+        doubled_stage, base_stage = (
+            configs[n].stage("split_sum") for n in ("steps-split-sum-2", "base")
+        )
+        assert (doubled_stage.steps, doubled_stage.half_life) == (
+            2 * base_stage.steps,
+            2 * base_stage.half_life,
+        )
 
 
 def test_rates_fall_along_a_line_to_the_end_of_their_stage():
@@ -176,9 +181,9 @@ def test_rates_fall_along_a_line_to_the_end_of_their_stage():
     stage = Stage(steps=10, decay="linear", rates=rates)
     assert [stage.rates_at(k)["sdf"] for k in (0, 5, 10)] == [2.0, 1.0, 0.0]
     # A higher pace goes through the line faster, and still ends at zero.
-    hurried = Stage(steps=6, decay="linear", rates=rates, pace=({"step": 2, "speed": 2.0},))
-    assert hurried.rates_at(4)["sdf"] == pytest.approx(2.0 * 0.4)
-    assert hurried.rates_at(6)["sdf"] == 0.0
+    faster_stage = Stage(steps=6, decay="linear", rates=rates, pace=({"step": 2, "speed": 2.0},))
+    assert faster_stage.rates_at(4)["sdf"] == pytest.approx(2.0 * 0.4)
+    assert faster_stage.rates_at(6)["sdf"] == 0.0
     assert Stage(steps=10, half_life=5.0, rates=rates).rates_at(5)["sdf"] == 1.0
 
 
@@ -187,26 +192,26 @@ def test_the_tables_say_decibels_per_second_and_the_front(tmp_path, capsys):
     fakes = Trained()
     assert runner.main(_arguments(tmp_path), start=fakes.start) == 0
     assert ("one/coarse", "traced", {"bounds": None, "downscale": 1, "light": None}) in [
-        one for one in fakes.evaluated
+        evaluation for evaluation in fakes.evaluated
     ]
     assert trade.main([str(tmp_path / "runs")]) == 0
     text = capsys.readouterr().out
     sweep = read_sweep(tmp_path / "sweep.toml")
-    base = sweep.config(sweep.runs[0])
-    cells, light = base.geometry.resolution, base.stages[1].transport.light_count
+    base_config = sweep.config(sweep.runs[0])
+    cells, light = base_config.geometry.resolution, base_config.stages[1].transport.light_count
     # Runs that differ only in samples share 90 steps, and have 30 steps of their own.
     seconds = 0.01 * cells * (90 + 30 * light)
-    many = _rows(text, "samples")["4 (many)"]
-    more = 0.01 * cells * 30 * 3 * light
-    assert many[0] == f"×{(seconds + more) / seconds:.2f}"
-    assert many[1] != many[0]
-    assert many[2] == "×4.00"
+    many_row = _rows(text, "samples")["4 (many)"]
+    extra_seconds = 0.01 * cells * 30 * 3 * light
+    assert many_row[0] == f"×{(seconds + extra_seconds) / seconds:.2f}"
+    assert many_row[1] != many_row[0]
+    assert many_row[2] == "×4.00"
     # Each sample adds one decibel in one scene, and two in the other.
-    assert many[3] == f"+{4.5 * light:.2f} ± {1.5 * light:.2f}"
-    assert many[-1] == f"{4.5 * light / more:+.4f}"
-    half = _rows(text, "cells")["0.5 (half)"]
-    lost = (cells - round(cells / 2)) / 8
-    assert half[-1] == f"{lost / (seconds * (1 - round(cells / 2) / cells)):+.4f}"
+    assert many_row[3] == f"+{4.5 * light:.2f} ± {1.5 * light:.2f}"
+    assert many_row[-1] == f"{4.5 * light / extra_seconds:+.4f}"
+    half_row = _rows(text, "cells")["0.5 (half)"]
+    lost_decibels = (cells - round(cells / 2)) / 8
+    assert half_row[-1] == f"{lost_decibels / (seconds * (1 - round(cells / 2) / cells)):+.4f}"
     front = _rows(text, "The front")
     assert [name for name in front if name not in ("run", "---")] == ["half", "few", "base", "many"]
     assert front["base"][0] == f"{seconds:.0f}"
@@ -228,8 +233,8 @@ def _record(scenes):
         {"name": "base", "title": "as ever", "x": None, "group": "x"},
         {"name": "more", "title": "more of it", "x": 2.0, "group": "knob"},
     ]
-    about = {"title": "A trade", "quality": "draft", "figures": ["nvs.psnr"]}
-    return {**about, "runs": runs, "scenes": scenes}
+    header = {"title": "A trade", "quality": "draft", "figures": ["nvs.psnr"]}
+    return {**header, "runs": runs, "scenes": scenes}
 
 
 def _more(scenes, *seeds):
@@ -237,14 +242,14 @@ def _more(scenes, *seeds):
 
     ``seeds`` : by scene, the points of the base and of the value; None for a missing point.
     """
-    repeated = [
+    points_by_seed = [
         {
-            name: {scene: both[k] for scene, both in points.items() if both[k] is not None}
+            name: {scene: pair[k] for scene, pair in points.items() if pair[k] is not None}
             for k, name in enumerate(("base", "more"))
         }
         for points in seeds
     ]
-    text = trade.compose(_record(list(scenes)), repeated)
+    text = trade.compose(_record(list(scenes)), points_by_seed)
     return _rows(text, "knob")["2 (more)"], text
 
 
@@ -252,35 +257,36 @@ def test_an_error_is_that_over_scenes_of_means_over_seeds():
     """Two seeds of a scene share its peculiarities, so they do not count as two scenes."""
     # Scenes differ by far more than the change does; the change brings 0, 1 and 2.
     levels = {"a": (20.0, 20.0), "b": (30.0, 31.0), "c": (40.0, 42.0)}
-    seed = {scene: tuple(_point(psnr) for psnr in both) for scene, both in levels.items()}
+    seed = {scene: tuple(_point(psnr) for psnr in psnr_pair) for scene, psnr_pair in levels.items()}
     row, text = _more("abc", seed, seed)
     assert row[3] == f"+1.00 ± {1 / 3**0.5:.2f}"
     assert row[4] == row[3]
     assert "over the scenes, of means over the seeds" in text
     # With one seed less, the mean of a scene is less certain, but the scene counts as much.
-    without_last = {**seed, "c": (seed["c"][0], None)}
-    row, _ = _more("abc", seed, without_last)
+    incomplete_seed = {**seed, "c": (seed["c"][0], None)}
+    row, _ = _more("abc", seed, incomplete_seed)
     assert row[3] == f"+1.00 ± {1 / 3**0.5:.2f} (5 of 6)"
 
 
 def test_a_run_is_compared_with_the_base_of_its_own_seed_and_one_scene_has_seeds():
-    first = {"a": (_point(20.0), _point(21.0))}
-    second = {"a": (_point(30.0), _point(33.0))}
-    row, text = _more("a", first, second)
+    first_seed = {"a": (_point(20.0), _point(21.0))}
+    second_seed = {"a": (_point(30.0), _point(33.0))}
+    row, text = _more("a", first_seed, second_seed)
     # Differences of 1 and 3, whose standard deviation is the root of 2.
     assert row[3] == "+2.00 ± 1.00"
     assert "over the seeds, since there is one scene" in text
-    row, _ = _more("a", first)
+    row, _ = _more("a", first_seed)
     assert row[3] == "+1.00"
 
 
 def test_costs_are_ratios_of_a_run_to_the_base():
-    base, more = _point(20.0, whole=100.0), _point(21.0, seconds=20.0, whole=50.0, memory=1500.0)
-    row, text = _more("a", {"a": (base, more)})
+    base_point = _point(20.0, whole=100.0)
+    changed_point = _point(21.0, seconds=20.0, whole=50.0, memory=1500.0)
+    row, text = _more("a", {"a": (base_point, changed_point)})
     assert row[:3] == ["×2.00", "×0.50", "×1.50"]
     assert row[-1] == "+0.1000"
-    head = _rows(text, "knob")["value"]
-    assert head[:3] == ["seconds, ratio", "whole seconds, ratio", "memory, ratio"]
+    header = _rows(text, "knob")["value"]
+    assert header[:3] == ["seconds, ratio", "whole seconds, ratio", "memory, ratio"]
 
 
 @pytest.mark.parametrize(
@@ -301,8 +307,8 @@ def test_decibels_per_second_stand_where_one_is_paid_with_the_other(psnr, second
 
 
 def test_a_missing_figure_leaves_a_scene_out_and_is_said():
-    whole = (_point(20.0), _point(22.0, seconds=20.0))
-    row, text = _more("ab", {"a": whole, "b": (_point(20.0), _point(None, seconds=400.0))})
+    point_pair = (_point(20.0), _point(22.0, seconds=20.0))
+    row, text = _more("ab", {"a": point_pair, "b": (_point(20.0), _point(None, seconds=400.0))})
     assert row[3:5] == ["+2.00 (1 of 2)"] * 2
     # The scene without the figure does not contribute its seconds either.
     assert row[-1] == "+0.2000"
@@ -330,13 +336,15 @@ def test_what_a_run_compiles_is_no_part_of_its_cost(tmp_path):
     """All runs share a cache of programs, so the first one compiles for the others."""
     steps = [f"stages.{s}.steps={n}" for s, n in zip(STAGES, (3, 0, 0), strict=True)]
     points = {}
-    for name, every, first in (("base", 1, 91.0), ("more", 2, 1.0)):
-        config = make_config(quality="draft", overrides=(*steps, f"run.preview_every={every}"))
-        _left(tmp_path / "one", name, config, [(first, 500), (1.0, 2000), (1.0, 800)])
+    for name, preview_interval, first_seconds in (("base", 1, 91.0), ("more", 2, 1.0)):
+        config = make_config(
+            quality="draft", overrides=(*steps, f"run.preview_every={preview_interval}")
+        )
+        _left(tmp_path / "one", name, config, [(first_seconds, 500), (1.0, 2000), (1.0, 800)])
         times = trade.stage_times(tmp_path / "one")
-        seconds, steady, memory = times[trade._identity(config, 1, 1)]
-        assert (seconds, steady, memory) == (first + 2.0, 3.0, 2000)
-        points[name] = trade.Point(seconds, steady, memory, {"nvs.psnr": 20.0})
+        seconds, steady_seconds, memory = times[trade._identity(config, 1, 1)]
+        assert (seconds, steady_seconds, memory) == (first_seconds + 2.0, 3.0, 2000)
+        points[name] = trade.Point(seconds, steady_seconds, memory, {"nvs.psnr": 20.0})
     row, _ = _more("a", {"a": (points["base"], points["more"])})
     assert row[0] == "×1.00"
     assert row[1] == f"×{3 / 93:.2f}"
@@ -358,12 +366,12 @@ def test_a_run_that_is_being_written_is_read_and_a_damaged_one_left_out(tmp_path
 
 def test_a_command_on_a_cluster_ends_with_its_job(monkeypatch):
     """The child process is terminated, and has ended when the job ends."""
-    started = []
+    children = []
 
     class Child(subprocess.Popen):
         def __init__(self, *arguments, **options):
             super().__init__(*arguments, **options)
-            started.append(self)
+            children.append(self)
 
     def interrupted(*words, **options):
         raise KeyboardInterrupt
@@ -373,20 +381,20 @@ def test_a_command_on_a_cluster_ends_with_its_job(monkeypatch):
     program = "import time; print('here', flush=True); time.sleep(600)"
     with pytest.raises(KeyboardInterrupt):
         cluster.Command([sys.executable, "-c", program])()
-    assert started[0].returncode == -signal.SIGTERM
+    assert children[0].returncode == -signal.SIGTERM
 
 
 def test_figures_on_images_of_another_size_are_another_evaluation(tmp_path, capsys):
     """A run that is trained on reduced images is still evaluated on the images of the sweep."""
     _write(tmp_path, SWEEP)
-    some = _arguments(tmp_path, "--scene", "one", "--only")
-    assert runner.main([*some, "coarse"], start=Trained().start) == 0
-    assert runner.main([*some, "half", "--downscale", "4"], start=Trained().start) == 0
+    selection = _arguments(tmp_path, "--scene", "one", "--only")
+    assert runner.main([*selection, "coarse"], start=Trained().start) == 0
+    assert runner.main([*selection, "half", "--downscale", "4"], start=Trained().start) == 0
     sweep = trade.report._read_sweep(tmp_path / "runs")
     entry = trade.report.read_entries(tmp_path / "runs", sweep)["one"]["coarse"]
     assert entry.problem == "evaluated on images reduced by 1 instead of 4"
     capsys.readouterr()
-    assert runner.main([*some, "coarse", "--downscale", "4"], start=Trained().start) == 2
+    assert runner.main([*selection, "coarse", "--downscale", "4"], start=Trained().start) == 2
     assert "one/coarse: evaluate.downscale: 1 -> 4" in capsys.readouterr().err
 
 
@@ -414,11 +422,11 @@ def test_a_front_holds_what_nothing_beats():
 def test_combinations_keep_what_the_base_sets(tmp_path):
     text = SWEEP.replace('name = "base"\n', 'name = "base"\nset = ["run.preview_every=7"]\n')
     sweep = read_sweep(_write(tmp_path, text))
-    joint = halving.joint_runs(sweep, 6, seed=0)
-    assert joint
-    assert all("run.preview_every=7" in run.overrides for run in joint)
-    assert all(run.title for run in joint)
-    settings = [halving._settings_of(sweep, run) for run in (*joint, *sweep.runs)]
+    combinations = halving.joint_runs(sweep, 6, seed=0)
+    assert combinations
+    assert all("run.preview_every=7" in run.overrides for run in combinations)
+    assert all(run.title for run in combinations)
+    settings = [halving._settings_of(sweep, run) for run in (*combinations, *sweep.runs)]
     assert len(set(settings)) == len(settings)
 
 
@@ -445,13 +453,15 @@ def test_halving_trains_many_a_little_and_few_in_full(tmp_path, monkeypatch):
         for record in records
     ]
     assert steps == [{"split_sum": 30, "monte_carlo": 10}, {"split_sum": 90, "monte_carlo": 30}]
-    lives = [record["runs"][0]["config"]["stages"]["split_sum"]["half_life"] for record in records]
-    assert lives[0] == pytest.approx(lives[1] / 3)
+    half_lives = [
+        record["runs"][0]["config"]["stages"]["split_sum"]["half_life"] for record in records
+    ]
+    assert half_lives[0] == pytest.approx(half_lives[1] / 3)
     assert "## The front" in (tmp_path / "out" / "front.md").read_text()
     # The same command finds everything done.
-    trained = len(fakes.trained)
+    trained_count = len(fakes.trained)
     assert halving.main(command) == 0
-    assert len(fakes.trained) == trained
+    assert len(fakes.trained) == trained_count
 
 
 def test_what_fails_in_the_last_rung_is_in_the_status(tmp_path, monkeypatch, capsys):
@@ -508,24 +518,24 @@ def test_runs_on_a_cluster_wait_for_their_sources_and_go_on(tmp_path, capsys, mo
     command = _arguments(tmp_path, "--scene", "one", "--cluster", "local", "--parallel", "3")
     command += ["--only", "base", "half", "few"]
     assert runner.main(command) == 1
-    said = capsys.readouterr().err
-    assert said.count("submitted as") == 4
-    assert "1 of 4 failed: one/half" in said
+    error_text = capsys.readouterr().err
+    assert error_text.count("submitted as") == 4
+    assert "1 of 4 failed: one/half" in error_text
     assert "no luck" in (tmp_path / "runs" / "one" / "half" / "error.txt").read_text()
     script.write_text(FAKE_JOB.replace('"half"', '"none"'))
     assert runner.main(command) == 0
-    said = capsys.readouterr().err
-    assert said.count("finished already") == 2
-    assert said.count("submitted as") == 1
+    error_text = capsys.readouterr().err
+    assert error_text.count("finished already") == 2
+    assert error_text.count("submitted as") == 1
 
 
 def test_a_cluster_that_is_half_asked_for_is_refused(tmp_path, capsys):
     _write(tmp_path, SWEEP)
-    for more, said in (
+    for options, message in (
         (["--parallel", "2"], "belong to --cluster"),
         (["--cluster-set", "a=1"], "belong to --cluster"),
         (["--cluster", "local", "--parallel", "0"], "at least 1"),
         (["--cluster", "local", "--cluster-set", "a"], "reads NAME=VALUE"),
     ):
-        assert runner.main(_arguments(tmp_path, *more), start=Fakes().start) == 2
-        assert said in capsys.readouterr().err
+        assert runner.main(_arguments(tmp_path, *options), start=Fakes().start) == 2
+        assert message in capsys.readouterr().err

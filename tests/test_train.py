@@ -60,11 +60,11 @@ class _Stopped(Listener):
 @pytest.fixture(scope="module")
 def finished(dataset, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "run"
-    told = _Notes()
-    state = fit(dataset, tiny_config(), folder, listener=told)
-    assert told.compiled[0] == ("split_sum", 0)
-    assert {stage for stage, _ in told.compiled} == {"split_sum"}
-    return folder, state, told.steps
+    notes = _Notes()
+    state = fit(dataset, tiny_config(), folder, listener=notes)
+    assert notes.compiled[0] == ("split_sum", 0)
+    assert {stage for stage, _ in notes.compiled} == {"split_sum"}
+    return folder, state, notes.steps
 
 
 def _lines(folder):
@@ -90,15 +90,15 @@ def test_training_reports_every_step_and_lowers_the_loss(finished):
 
 def test_the_same_seed_gives_the_same_parameters(dataset, finished, tmp_path):
     _, state, _ = finished
-    again = fit(dataset, tiny_config(), tmp_path)
-    _assert_same(state, again)
+    repeated_state = fit(dataset, tiny_config(), tmp_path)
+    _assert_same(state, repeated_state)
 
 
 def test_buffers_are_made_smaller_only_where_steps_follow(dataset, tmp_path, monkeypatch):
-    asked = []
+    peaks = []
 
     def shrink(capacities, peak):
-        asked.append(peak["visible"])
+        peaks.append(peak["visible"])
         return capacities
 
     monkeypatch.setattr(loop_module.capacity_module, "shrink", shrink)
@@ -106,26 +106,28 @@ def test_buffers_are_made_smaller_only_where_steps_follow(dataset, tmp_path, mon
     monkeypatch.setattr(loop_module, "_WORTH", 2)
     fit(dataset, tiny_config(), tmp_path)
     # The buffers are checked after the second of four steps, and not after the last.
-    assert len(asked) == 1
-    assert asked[0] > 0
+    assert len(peaks) == 1
+    assert peaks[0] > 0
 
 
 def test_resuming_equals_the_uninterrupted_run_bit_for_bit(dataset, finished, tmp_path):
     _, state, _ = finished
     fit(dataset, tiny_config(), tmp_path, stop_after=2)
     assert load_trained(tmp_path).step == 2
-    resumed = fit(dataset, tiny_config(), tmp_path, begin=Resume())
-    _assert_same(state, resumed)
+    resumed_state = fit(dataset, tiny_config(), tmp_path, begin=Resume())
+    _assert_same(state, resumed_state)
     assert [line["step"] for line in _lines(tmp_path)] == [0, 1, 2, 3]
 
 
 def test_every_step_is_told_with_its_stage(finished):
-    *_, seen = finished
-    assert [(p.step, p.steps, p.stage) for p in seen] == [(k, 4, "split_sum") for k in (1, 2, 3, 4)]
-    assert isinstance(seen[0], Progress)
+    *_, updates = finished
+    assert [(p.step, p.steps, p.stage) for p in updates] == [
+        (k, 4, "split_sum") for k in (1, 2, 3, 4)
+    ]
+    assert isinstance(updates[0], Progress)
     # The first step compiles, so it gives no estimate of the time left.
-    assert seen[0].seconds_left is None
-    assert seen[-1].seconds_left == 0.0
+    assert updates[0].seconds_left is None
+    assert updates[-1].seconds_left == 0.0
 
 
 def test_the_time_left_comes_from_steps_that_do_not_compile():
@@ -155,9 +157,9 @@ def test_a_run_can_be_loaded_for_rendering(finished):
 
 def test_resuming_with_another_configuration_names_the_difference(dataset, finished):
     folder, _, _ = finished
-    changed = tiny_config("stages.split_sum.rates.sdf=0.5")
+    changed_config = tiny_config("stages.split_sum.rates.sdf=0.5")
     with pytest.raises(TrainingError, match=r"split_sum\.rates\.sdf\.value: .* -> 0\.5"):
-        fit(dataset, changed, folder, begin=Resume())
+        fit(dataset, changed_config, folder, begin=Resume())
 
 
 def test_a_second_training_into_a_folder_is_refused_and_harms_nothing(dataset, finished):
@@ -199,9 +201,9 @@ def test_an_overflowing_step_is_repeated_and_equals_one_with_ample_room(
         loop_module, "plan_capacities", lambda *a, **k: plan(*a, **k).resized(hits=128)
     )
     fit(dataset, tiny_config(), tmp_path)
-    ample, tight = _lines(folder), _lines(tmp_path)
-    assert tight[0]["capacities"]["hits"] > 128
-    for first, second in zip(ample, tight, strict=True):
+    ample_lines, tight_lines = _lines(folder), _lines(tmp_path)
+    assert tight_lines[0]["capacities"]["hits"] > 128
+    for first, second in zip(ample_lines, tight_lines, strict=True):
         # With other buffer sizes, sums have another order, so values are equal up to rounding.
         assert second["loss"] == pytest.approx(first["loss"], rel=1e-4)
         assert second["faces"] == first["faces"]
@@ -209,23 +211,25 @@ def test_an_overflowing_step_is_repeated_and_equals_one_with_ample_room(
 
 def test_a_whole_run_compiles_the_step_once(dataset, tmp_path):
     programs = (_asset, _view_gradient, _back, _update)
-    before = [program._cache_size() for program in programs]
+    cache_sizes = [program._cache_size() for program in programs]
     fit(dataset, tiny_config("run.seed=3"), tmp_path)
     # Weights and rates change at every step, but need no new program.
-    for program, count in zip(programs, before, strict=True):
+    for program, count in zip(programs, cache_sizes, strict=True):
         assert program._cache_size() - count <= 1
 
 
 def test_a_vanished_surface_is_put_back(dataset, tmp_path, monkeypatch):
     advance = loop_module.Loop.advance
-    emptied = []
+    emptied_steps = []
 
     def sabotage(self, step):
-        if step == 1 and not emptied:
-            emptied.append(step)
+        if step == 1 and not emptied_steps:
+            emptied_steps.append(step)
             geometry = self.state.params.geometry
-            gone = replace(geometry, sdf=jnp.abs(geometry.sdf) + 1.0)
-            self.state = replace(self.state, params=replace(self.state.params, geometry=gone))
+            empty_geometry = replace(geometry, sdf=jnp.abs(geometry.sdf) + 1.0)
+            self.state = replace(
+                self.state, params=replace(self.state.params, geometry=empty_geometry)
+            )
         return advance(self, step)
 
     monkeypatch.setattr(loop_module.Loop, "advance", sabotage)
@@ -241,8 +245,8 @@ def test_a_surface_that_keeps_vanishing_stops_the_run(dataset, tmp_path, monkeyp
 
     def sabotage(self, step):
         geometry = self.state.params.geometry
-        gone = replace(geometry, sdf=jnp.abs(geometry.sdf) + 1.0)
-        self.state = replace(self.state, params=replace(self.state.params, geometry=gone))
+        empty_geometry = replace(geometry, sdf=jnp.abs(geometry.sdf) + 1.0)
+        self.state = replace(self.state, params=replace(self.state.params, geometry=empty_geometry))
         return advance(self, step)
 
     monkeypatch.setattr(loop_module.Loop, "advance", sabotage)
@@ -265,9 +269,9 @@ def test_a_number_that_is_not_finite_stops_and_names_step_term_and_checkpoint(
         return replace(batch, image=batch.image.at[0, 0, 0, 0].set(jnp.nan))
 
     monkeypatch.setattr(loop_module, "make_batch", spoiled)
-    with pytest.raises(TrainingError, match=r"step 2: the term .*l1.* not finite") as caught:
+    with pytest.raises(TrainingError, match=r"step 2: the term .*l1.* not finite") as error_info:
         fit(dataset, tiny_config(), tmp_path)
-    assert "checkpoint_00000002" in str(caught.value)
+    assert "checkpoint_00000002" in str(error_info.value)
     trained = load_trained(tmp_path)
     assert trained.step == 2
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(trained.params))
@@ -283,19 +287,19 @@ def test_memory_that_runs_out_is_one_line_and_loses_nothing(
 ):
     advance = loop_module.Loop.advance
 
-    def exhausted(self, at):
-        if at == step:
+    def exhausted(self, current_step):
+        if current_step == step:
             raise error
-        return advance(self, at)
+        return advance(self, current_step)
 
     with monkeypatch.context() as patch:
         patch.setattr(loop_module.Loop, "advance", exhausted)
-        with pytest.raises(TrainingError, match="^memory ran out .*--downscale") as caught:
+        with pytest.raises(TrainingError, match="^memory ran out .*--downscale") as error_info:
             fit(dataset, tiny_config(), tmp_path)
-    assert "\n" not in str(caught.value)
-    assert ("--resume" in str(caught.value)) == (step > 0)
-    begin = Resume() if step else Anew()
-    assert int(fit(dataset, tiny_config(), tmp_path, begin=begin).step) == 4
+    assert "\n" not in str(error_info.value)
+    assert ("--resume" in str(error_info.value)) == (step > 0)
+    beginning = Resume() if step else Anew()
+    assert int(fit(dataset, tiny_config(), tmp_path, begin=beginning).step) == 4
 
 
 def test_other_errors_of_the_runtime_are_not_taken_for_memory(dataset, tmp_path, monkeypatch):
@@ -308,11 +312,11 @@ def test_other_errors_of_the_runtime_are_not_taken_for_memory(dataset, tmp_path,
 
 
 def test_stopping_writes_a_checkpoint(dataset, tmp_path, monkeypatch):
-    asked = iter([False, True])
+    answers = iter([False, True])
 
     @contextmanager
     def requests():
-        yield lambda: next(asked)
+        yield lambda: next(answers)
 
     monkeypatch.setattr(train_module, "stop_requests", requests)
     with pytest.raises(Interrupted, match="--resume"):
@@ -321,10 +325,10 @@ def test_stopping_writes_a_checkpoint(dataset, tmp_path, monkeypatch):
 
 
 def test_views_come_in_shuffled_epochs_that_depend_on_seed_and_step_alone():
-    seen = [view_indices(step, view_count=5, batch_views=2, seed=1) for step in range(5)]
-    assert sorted(np.concatenate(seen).tolist()) == sorted(list(range(5)) * 2)
-    again = view_indices(3, view_count=5, batch_views=2, seed=1)
-    np.testing.assert_array_equal(again, seen[3])
+    batches = [view_indices(step, view_count=5, batch_views=2, seed=1) for step in range(5)]
+    assert sorted(np.concatenate(batches).tolist()) == sorted(list(range(5)) * 2)
+    repeated_batch = view_indices(3, view_count=5, batch_views=2, seed=1)
+    np.testing.assert_array_equal(repeated_batch, batches[3])
     assert view_indices(0, view_count=2, batch_views=8, seed=0).shape == (2,)
 
 
@@ -332,13 +336,14 @@ def test_photographs_end_at_white_as_renders_do(dataset):
     stage = tiny_config().stages[0]
     images = np.array(dataset.train.images)
     images[:, 3, 4, :3] = 1.0
-    brighter = images.copy()
-    brighter[:, 3, 4, :3] = 7.0
-    white, beyond = (
-        make_batch(replace(dataset.train, images=x), 0, stage, seed=0) for x in (images, brighter)
+    bright_images = images.copy()
+    bright_images[:, 3, 4, :3] = 7.0
+    white_batch, bright_batch = (
+        make_batch(replace(dataset.train, images=x), 0, stage, seed=0)
+        for x in (images, bright_images)
     )
-    np.testing.assert_array_equal(white.image, images[np.asarray(white.views)])
-    np.testing.assert_array_equal(beyond.image, white.image)
+    np.testing.assert_array_equal(white_batch.image, images[np.asarray(white_batch.views)])
+    np.testing.assert_array_equal(bright_batch.image, white_batch.image)
 
 
 def test_a_batch_knows_its_views_and_the_pixels_that_count(dataset):

@@ -84,10 +84,10 @@ def bowl(ball):
     asset = build(pipeline, replace(params, geometry=shape))
     assert fits(asset.usage, CAPACITIES), asset.usage
     anchors, outward = np.asarray(asset.splats.anchors), np.asarray(asset.splats.outward)
-    inside = np.asarray(asset.splats.mask) & (np.linalg.norm(anchors, axis=1) < 0.4)
-    inside &= (np.sum(anchors * outward, axis=1) < 0) & (anchors[:, 2] < 0)
-    assert inside.sum() > 100
-    return asset, inside
+    is_inside = np.asarray(asset.splats.mask) & (np.linalg.norm(anchors, axis=1) < 0.4)
+    is_inside &= (np.sum(anchors * outward, axis=1) < 0) & (anchors[:, 2] < 0)
+    assert is_inside.sum() > 100
+    return asset, is_inside
 
 
 def test_settings_name_what_they_refuse():
@@ -111,17 +111,17 @@ def test_an_unknown_transport_is_refused_by_the_names_of_the_known_ones():
     assert set(TransportSettings.kinds) >= {"monte_carlo", "split_sum"}
     with pytest.raises(ValueError, match=r"transport.*monte_carlo.*split_sum.*'photons'"):
         from_plain(Holder, {"transport": {"kind": "photons"}})
-    found = from_plain(Holder, {"transport": {"kind": "monte_carlo", "light_count": 3}})
-    assert found.transport == MonteCarloSettings(light_count=3)
+    holder = from_plain(Holder, {"transport": {"kind": "monte_carlo", "light_count": 3}})
+    assert holder.transport == MonteCarloSettings(light_count=3)
 
 
 def test_what_a_transport_needs_follows_from_its_choices():
-    plain = split_sum()
-    assert not plain.needs_key
-    assert not plain.uses_rays
-    assert not plain.needs_every_point
-    assert plain.filter_inputs == ()
-    assert plain.for_residual() is None
+    split_transport = split_sum()
+    assert not split_transport.needs_key
+    assert not split_transport.uses_rays
+    assert not split_transport.needs_every_point
+    assert split_transport.filter_inputs == ()
+    assert split_transport.for_residual() is None
     assert few().needs_key
     assert few().uses_rays
     assert not few(occlusion=False).uses_rays
@@ -143,12 +143,14 @@ def test_what_a_transport_needs_follows_from_its_choices():
 
 
 def test_images_to_look_at_are_made_without_the_shortcuts_of_training():
-    trained = few(shares_views=False, denoise=DenoiseSpec(iterations=2), indirect="traced")
-    assert trained.for_images(5) == few(
+    training_transport = few(
+        shares_views=False, denoise=DenoiseSpec(iterations=2), indirect="traced"
+    )
+    assert training_transport.for_images(5) == few(
         light_count=5, diffuse_count=5, specular_count=5, indirect="traced"
     )
-    plain = split_sum()
-    assert plain.for_images(5) is plain
+    split_transport = split_sum()
+    assert split_transport.for_images(5) is split_transport
 
 
 @pytest.mark.parametrize("kind", ["traced", "radiometric"])
@@ -177,60 +179,66 @@ def rows_of(asset, count):
     points, attributes = jax.tree.map(
         lambda x: x[:count], (asset.splats.points(), asset.attributes)
     )
-    towards = np.asarray(points.normals) + [0.3, -0.2, 0.4]
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    return points, attributes, jnp.asarray(towards, jnp.float32)
+    view_directions = np.asarray(points.normals) + [0.3, -0.2, 0.4]
+    view_directions /= np.linalg.norm(view_directions, axis=1, keepdims=True)
+    return points, attributes, jnp.asarray(view_directions, jnp.float32)
 
 
 @pytest.mark.parametrize("make", [split_sum, few])
 def test_what_was_prepared_for_all_points_serves_any_rows_of_them(ball, make):
     """Rows beyond the last are padding, which has no light and does no harm."""
     (_, _, asset), transport = ball, make()
-    points, attributes, towards = rows_of(asset, 60)
-    first, second = jax.random.split(jax.random.key(0))
-    lit = prepare(transport, first, points, attributes, sky(), asset.index)
+    points, attributes, view_directions = rows_of(asset, 60)
+    prepare_key, shade_key = jax.random.split(jax.random.key(0))
+    illumination = prepare(transport, prepare_key, points, attributes, sky(), asset.index)
     rows = np.random.default_rng(0).permutation(60)
     rows[::9] = 60
-    real = rows < 60
+    is_real = rows < 60
 
     @jax.jit
     def shade(rows):
         take = lambda x: x.at[rows].get(mode="fill", fill_value=0)  # noqa: E731
-        chosen, own, wo = jax.tree.map(take, (points, attributes, towards))
-        return transport.shade(second, chosen, own, wo, lit.take(rows), asset.index)
+        row_points, row_attributes, wo = jax.tree.map(take, (points, attributes, view_directions))
+        return transport.shade(
+            shade_key, row_points, row_attributes, wo, illumination.take(rows), asset.index
+        )
 
-    whole, some = shade(jnp.arange(60)), shade(jnp.asarray(rows))
-    assert np.all(np.isfinite(some.rgb))
-    lights = np.asarray(some.diffuse_light)
-    np.testing.assert_allclose(lights[real], whole.diffuse_light[rows[real]], rtol=1e-5)
-    assert np.mean(lights[real]) > 0.2
+    all_shading, row_shading = shade(jnp.arange(60)), shade(jnp.asarray(rows))
+    assert np.all(np.isfinite(row_shading.rgb))
+    lights = np.asarray(row_shading.diffuse_light)
+    np.testing.assert_allclose(lights[is_real], all_shading.diffuse_light[rows[is_real]], rtol=1e-5)
+    assert np.mean(lights[is_real]) > 0.2
     if transport.needs_key:
-        np.testing.assert_array_equal(some.rgb[~real], 0.0)
+        np.testing.assert_array_equal(row_shading.rgb[~is_real], 0.0)
     else:  # nothing of the split sum depends on other points
-        np.testing.assert_allclose(some.rgb[real], whole.rgb[rows[real]], rtol=1e-5)
+        np.testing.assert_allclose(
+            row_shading.rgb[is_real], all_shading.rgb[rows[is_real]], rtol=1e-5
+        )
 
 
 @pytest.mark.slow
 def test_sharing_samples_between_views_does_not_change_the_mean(ball):
     """Means over many keys agree within their standard error."""
-    points, attributes, towards = rows_of(ball[2], 60)
-    index, number = ball[2].index, 400
+    points, attributes, view_directions = rows_of(ball[2], 60)
+    index, key_count = ball[2].index, 400
 
     def estimates(shares):
         transport = few(shares_views=shares)
 
         def one(key):
-            first, second = jax.random.split(key)
-            lit, _ = transport.prepare(first, points, attributes, sky(), index)
-            return transport.shade(second, points, attributes, towards, lit, index).rgb
+            prepare_key, shade_key = jax.random.split(key)
+            illumination, _ = transport.prepare(prepare_key, points, attributes, sky(), index)
+            return transport.shade(
+                shade_key, points, attributes, view_directions, illumination, index
+            ).rgb
 
-        keys = jax.random.split(jax.random.key(int(shares)), number)
-        found = jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=100))(keys)
-        return np.asarray(found, float)
+        keys = jax.random.split(jax.random.key(int(shares)), key_count)
+        values = jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=100))(keys)
+        return np.asarray(values, float)
 
-    shared, own = estimates(True), estimates(False)
-    error = shared.mean(axis=0) - own.mean(axis=0)
-    scores = error / np.sqrt((shared.var(axis=0) + own.var(axis=0)) / number)
+    shared_values, own_values = estimates(True), estimates(False)
+    error = shared_values.mean(axis=0) - own_values.mean(axis=0)
+    scores = error / np.sqrt((shared_values.var(axis=0) + own_values.var(axis=0)) / key_count)
     assert np.all(np.asarray(points.mask))
     assert np.max(np.abs(scores)) < 5
     assert np.mean(scores**2) < 2
@@ -238,22 +246,26 @@ def test_sharing_samples_between_views_does_not_change_the_mean(ball):
 
 @pytest.mark.slow
 def test_two_views_see_the_same_diffuse_light_only_where_they_share_samples(ball):
-    points, attributes, towards = rows_of(ball[2], 60)
-    twice = jnp.concatenate([jnp.arange(60), jnp.arange(60)])
-    viewers = jnp.concatenate([towards, points.normals])
+    points, attributes, view_directions = rows_of(ball[2], 60)
+    repeated_rows = jnp.concatenate([jnp.arange(60), jnp.arange(60)])
+    viewers = jnp.concatenate([view_directions, points.normals])
     lights = []
     for shares in (True, False):
         transport = few(shares_views=shares)
 
         @jax.jit
-        def diffuse_light(first, second, transport=transport):
-            lit, _ = transport.prepare(first, points, attributes, sky(), ball[2].index)
-            rows = jax.tree.map(lambda x: x[twice], (points, attributes))
-            found = transport.shade(second, *rows, viewers, lit.take(twice), ball[2].index)
-            return found.diffuse_light
+        def diffuse_light(prepare_key, shade_key, transport=transport):
+            illumination, _ = transport.prepare(
+                prepare_key, points, attributes, sky(), ball[2].index
+            )
+            rows = jax.tree.map(lambda x: x[repeated_rows], (points, attributes))
+            shading = transport.shade(
+                shade_key, *rows, viewers, illumination.take(repeated_rows), ball[2].index
+            )
+            return shading.diffuse_light
 
-        found = diffuse_light(*jax.random.split(jax.random.key(0)))
-        lights.append(np.asarray(found).reshape(2, 60, 3))
+        values = diffuse_light(*jax.random.split(jax.random.key(0)))
+        lights.append(np.asarray(values).reshape(2, 60, 3))
     np.testing.assert_array_equal(lights[0][0], lights[0][1])
     assert np.mean(np.abs(lights[1][0] - lights[1][1])) > 0.01
 
@@ -267,28 +279,39 @@ def test_without_occlusion_it_is_the_estimator_without_a_surface(ball):
     asset = build(replace(pipeline, transport=transport), params)
     assert asset.index is None
     assert "cell_patches" not in asset.usage
-    points, attributes, towards = rows_of(asset, 120)
-    light, first, second = sky(), jax.random.key(0), jax.random.key(1)
+    points, attributes, view_directions = rows_of(asset, 120)
+    light, prepare_key, shade_key = sky(), jax.random.key(0), jax.random.key(1)
 
     @jax.jit
     def both(light, points, attributes):
-        lit, _ = transport.prepare(first, points, attributes, light, None)
-        found = transport.shade(second, points, attributes, towards, lit, None)
+        illumination, _ = transport.prepare(prepare_key, points, attributes, light, None)
+        shading = transport.shade(
+            shade_key, points, attributes, view_directions, illumination, None
+        )
         sampler, indirect = light_sampler(light), ConstantIndirect(attributes.indirect)
         counts = SampleCounts(1, 1, 1)
-        samples = draw_samples(first, points, sampler, None, counts=counts)
-        gathered = gather(points, samples, light, indirect)
-        own = jax.random.split(second)[0]
-        materials, how = attributes.materials, {"counts": counts}
+        samples = draw_samples(prepare_key, points, sampler, None, counts=counts)
+        gathered_light = gather(points, samples, light, indirect)
+        reflect_key = jax.random.split(shade_key)[0]
+        materials, options = attributes.materials, {"counts": counts}
         expected = reflect(
-            own, points, materials, towards, gathered, light, sampler, None, indirect, **how
+            reflect_key,
+            points,
+            materials,
+            view_directions,
+            gathered_light,
+            light,
+            sampler,
+            None,
+            indirect,
+            **options,
         )
-        return found, expected
+        return shading, expected
 
-    found, expected = both(light, points, attributes)
-    for a, b in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
+    shading, expected = both(light, points, attributes)
+    for a, b in zip(*map(jax.tree.leaves, (shading, expected)), strict=True):
         np.testing.assert_allclose(a, b, rtol=ROUNDING, atol=1e-6)
-    assert float(jnp.max(found.rgb)) > 0.1
+    assert float(jnp.max(shading.rgb)) > 0.1
 
 
 @pytest.fixture(scope="module")
@@ -318,17 +341,19 @@ def bowl_light(bowl_lit):
 
 def test_parts_that_are_averaged_can_be_put_back(ball, bowl_lit):
     """Samples have two such parts, diffuse light and light sent by faces; maps have none."""
-    maps = prepare(split_sum(), None, *arguments_of(ball[2]))
-    sampled = bowl_lit(0.5, 0.0, indirect="traced")
-    for lit, count in ((maps, 0), (sampled, 2)):
-        parts = lit.averaged_parts()
+    map_light = prepare(split_sum(), None, *arguments_of(ball[2]))
+    sampled_light = bowl_lit(0.5, 0.0, indirect="traced")
+    for illumination, count in ((map_light, 0), (sampled_light, 2)):
+        parts = illumination.averaged_parts()
         assert len(jax.tree.leaves(parts)) == count
-        doubled = lit.with_parts(jax.tree.map(lambda x: 2 * x, parts))
-        for a, b in zip(*map(jax.tree.leaves, (doubled.averaged_parts(), parts)), strict=True):
+        doubled_light = illumination.with_parts(jax.tree.map(lambda x: 2 * x, parts))
+        for a, b in zip(
+            *map(jax.tree.leaves, (doubled_light.averaged_parts(), parts)), strict=True
+        ):
             np.testing.assert_array_equal(a, 2 * b)
-        same = doubled.with_parts(parts)
-        assert jax.tree.structure(same) == jax.tree.structure(lit)
-        for a, b in zip(*map(jax.tree.leaves, (same, lit)), strict=True):
+        restored_light = doubled_light.with_parts(parts)
+        assert jax.tree.structure(restored_light) == jax.tree.structure(illumination)
+        for a, b in zip(*map(jax.tree.leaves, (restored_light, illumination)), strict=True):
             np.testing.assert_array_equal(a, b)
 
 
@@ -343,24 +368,24 @@ def test_surfaces_that_reflect_nothing_send_no_traced_light(bowl_light):
 
 def test_every_bounce_adds_light_and_none_passes_the_furnace(bowl, bowl_light):
     """Albedo .96 and the specular 4 % reflect everything: in the limit the light is 1."""
-    _, inside = bowl
+    _, is_inside = bowl
     dark = bowl_light(0.96, 0.0, indirect="none")
     levels = [dark] + [
         bowl_light(0.96, 0.0, indirect="traced", bounces=bounces) for bounces in (1, 4)
     ]
-    for before, after in zip(levels[:-1], levels[1:], strict=True):
-        assert np.all(after >= before - 1e-6)
-        assert after[inside].mean() > before[inside].mean() + 0.005
+    for lower, higher in zip(levels[:-1], levels[1:], strict=True):
+        assert np.all(higher >= lower - 1e-6)
+        assert higher[is_inside].mean() > lower[is_inside].mean() + 0.005
     assert levels[-1].max() <= 1 + 1e-5
     # The bowl blocks much of the sky from its inside, and bounces bring most of it back.
-    assert dark[inside].mean() < 0.75
-    assert 1 - levels[-1][inside].mean() < 0.4 * (1 - dark[inside].mean())
+    assert dark[is_inside].mean() < 0.75
+    assert 1 - levels[-1][is_inside].mean() < 0.4 * (1 - dark[is_inside].mean())
 
 
 def test_grey_surfaces_keep_what_they_absorb(bowl, bowl_light):
-    _, inside = bowl
+    _, is_inside = bowl
     white, grey, dark = (
-        bowl_light(albedo, 0.0, indirect=kind)[inside].mean()
+        bowl_light(albedo, 0.0, indirect=kind)[is_inside].mean()
         for albedo, kind in ((0.96, "traced"), (0.4, "traced"), (0.4, "none"))
     )
     assert dark < grey < white
@@ -371,8 +396,8 @@ def test_grey_surfaces_keep_what_they_absorb(bowl, bowl_light):
 def learning(asset, values):
     """Return attributes whose points have all learned the same coefficients."""
     rows = asset.splats.opacities.shape[0]
-    learned = jnp.broadcast_to(jnp.asarray(values, jnp.float32), (rows, 27))
-    return replace(asset.attributes, indirect=learned)
+    coefficients = jnp.broadcast_to(jnp.asarray(values, jnp.float32), (rows, 27))
+    return replace(asset.attributes, indirect=coefficients)
 
 
 # The harmonic of degree 0 makes a radiance that is the same in all directions.
@@ -406,23 +431,25 @@ def test_disagreement_is_the_squared_difference_and_moves_what_it_should(ball, m
             indirect=values + jnp.asarray(level)[None, :],
         )
         points = asset.splats.points()
-        lit, _ = transport.prepare(jax.random.key(0), points, attributes, light, asset.index)
+        illumination, _ = transport.prepare(
+            jax.random.key(0), points, attributes, light, asset.index
+        )
         return transport.disagreement(
-            jax.random.key(1), points, attributes, lit, asset.index, count=256
+            jax.random.key(1), points, attributes, illumination, asset.index, count=256
         )
 
     zeros = jnp.zeros((asset.splats.opacities.shape[0], 27))
-    found = {}
+    errors = {}
     for level in (0.3, 0.54, 0.9):
         values = jnp.asarray(even_radiance(level), jnp.float32)
-        found[level], (in_values, in_albedo) = run(zeros, materials.albedo, values)
+        errors[level], (in_values, in_albedo) = run(zeros, materials.albedo, values)
         # The gradient moves the mean towards the light that is sent, .54 with the specular 4 %.
         pull = float(jnp.sum(in_values @ jnp.asarray(np.tile(EVEN, 3), jnp.float32)))
         assert level == 0.54 or np.sign(pull) == np.sign(level - 0.54)
         assert bool(jnp.any(in_albedo != 0)) == (moves == "both")
-    assert found[0.3] == pytest.approx(0.24**2, rel=0.25)
-    assert found[0.9] == pytest.approx(0.36**2, rel=0.25)
-    assert found[0.54] < 0.01
+    assert errors[0.3] == pytest.approx(0.24**2, rel=0.25)
+    assert errors[0.9] == pytest.approx(0.36**2, rel=0.25)
+    assert errors[0.54] < 0.01
 
 
 @pytest.mark.slow
@@ -439,7 +466,7 @@ def test_faces_that_agree_with_themselves_send_the_light_of_many_bounces(bowl, m
     monkeypatch.setattr(bsdf, "specular_lobe", matt)
     for module in (bsdf, indirect_module):
         monkeypatch.setattr(module, "specular_f0", lambda albedo, metallic: jnp.zeros_like(albedo))
-    asset, inside = bowl
+    asset, is_inside = bowl
     light, points = sky(), asset.splats.points()
     attributes = replace(
         asset.attributes,
@@ -456,11 +483,18 @@ def test_faces_that_agree_with_themselves_send_the_light_of_many_bounces(bowl, m
     @jax.jit
     def step(values, state, key):
         def disagreement(values):
-            first, second = jax.random.split(key)
-            told = replace(attributes, indirect=values)
-            lit, _ = transport.prepare(first, points, told, light, asset.index)
+            prepare_key, shade_key = jax.random.split(key)
+            known_attributes = replace(attributes, indirect=values)
+            illumination, _ = transport.prepare(
+                prepare_key, points, known_attributes, light, asset.index
+            )
             value = transport.disagreement(
-                second, points, told, lit, asset.index, count=values.shape[0]
+                shade_key,
+                points,
+                known_attributes,
+                illumination,
+                asset.index,
+                count=values.shape[0],
             )
             return value * values.shape[0]
 
@@ -470,17 +504,19 @@ def test_faces_that_agree_with_themselves_send_the_light_of_many_bounces(bowl, m
     values = jnp.zeros((points.mask.shape[0], 27))
     state = rule.init(values)
     with jax.numpy_dtype_promotion("standard"):  # for the counter of Optax
-        for number in range(300):
-            values, state = step(values, state, jax.random.key(number))
-    found = []
-    for chosen, told in (
+        for iteration in range(300):
+            values, state = step(values, state, jax.random.key(iteration))
+    means = []
+    for estimator, known_attributes in (
         (transport, replace(attributes, indirect=values)),
         (few(indirect="traced", bounces=8, **counts), attributes),
         (few(**counts), attributes),
     ):
-        lit = prepare(chosen, jax.random.key(5), points, told, light, asset.index)
-        found.append(np.asarray(lit.gathered.diffuse_light)[inside].mean())
-    learned, traced, direct = found
+        illumination = prepare(
+            estimator, jax.random.key(5), points, known_attributes, light, asset.index
+        )
+        means.append(np.asarray(illumination.gathered.diffuse_light)[is_inside].mean())
+    learned, traced, direct = means
     assert traced - direct > 0.1 * direct
     assert learned - direct == pytest.approx(traced - direct, rel=0.1)
 
@@ -506,36 +542,36 @@ def pictures(ball):
 @pytest.mark.long
 def test_splats_that_no_view_sees_need_no_light_of_their_own(pictures):
     """Rendering leaves them out; lighting every splat gives the same image."""
-    found, params, camera, pipeline = pictures
+    render, params, camera, pipeline = pictures
 
     @jax.jit
     def with_light_everywhere(pipeline, params):
         asset = pipeline.reconstruct(params)
         light_key, view_key = jax.random.split(jax.random.key(0))
-        lit, _ = pipeline.illuminate(asset, params.light, key=light_key)
-        return pipeline.render_lit(asset, lit, camera, key=view_key).rgb
+        illumination, _ = pipeline.illuminate(asset, params.light, key=light_key)
+        return pipeline.render_lit(asset, illumination, camera, key=view_key).rgb
 
-    everywhere = with_light_everywhere(pipeline, params)
-    np.testing.assert_allclose(found(0).rgb, everywhere, rtol=ROUNDING, atol=1e-6)
+    expected_rgb = with_light_everywhere(pipeline, params)
+    np.testing.assert_allclose(render(0).rgb, expected_rgb, rtol=ROUNDING, atol=1e-6)
 
 
 @pytest.mark.slow
 @pytest.mark.long
 def test_the_denoiser_brings_the_image_closer_and_leaves_its_outline(pictures):
     """Errors are against the mean over many keys, in pixels of the object."""
-    found = pictures[0]
-    noisy = [found(key) for key in range(4)]
-    reference = np.mean([found(key).rgb for key in range(10, 50)], axis=0)
-    smooth = [found(key, denoise=DenoiseSpec(iterations=1)) for key in range(4)]
-    solid = np.asarray(noisy[0].alpha) > 0.9
+    render = pictures[0]
+    noisy_outputs = [render(key) for key in range(4)]
+    reference = np.mean([render(key).rgb for key in range(10, 50)], axis=0)
+    smooth_outputs = [render(key, denoise=DenoiseSpec(iterations=1)) for key in range(4)]
+    is_opaque = np.asarray(noisy_outputs[0].alpha) > 0.9
 
     def error(outputs):
-        return np.sqrt(np.mean([(np.asarray(o.rgb) - reference)[solid] ** 2 for o in outputs]))
+        return np.sqrt(np.mean([(np.asarray(o.rgb) - reference)[is_opaque] ** 2 for o in outputs]))
 
     # Normals of a ball of 20 pixels turn by 11 degrees from pixel to pixel, so few neighbours
     # count.
-    assert error(smooth) < 0.9 * error(noisy)
-    np.testing.assert_array_equal(smooth[0].alpha, noisy[0].alpha)
+    assert error(smooth_outputs) < 0.9 * error(noisy_outputs)
+    np.testing.assert_array_equal(smooth_outputs[0].alpha, noisy_outputs[0].alpha)
 
 
 def test_the_filter_without_passes_is_the_identity_to_the_bit():
@@ -548,18 +584,18 @@ def test_the_filter_without_passes_is_the_identity_to_the_bit():
     alpha = jnp.asarray(rng.uniform(0, 1, (9, 7)), jnp.float32).at[:2].set(0.0)
     focal = jnp.asarray(20.0)
     run = jax.jit(denoised, static_argnames="spec")
-    same = run(images, alpha, spec=DenoiseSpec(iterations=0), focal=focal)
+    same_images = run(images, alpha, spec=DenoiseSpec(iterations=0), focal=focal)
     for name, image in images.items():
-        np.testing.assert_array_equal(same[name], image)
-    idle = few(denoise=DenoiseSpec(iterations=0, albedo_sigma=5.0, normal_sharpness=1.0))
-    for transport in (idle, split_sum()):
+        np.testing.assert_array_equal(same_images[name], image)
+    idle_transport = few(denoise=DenoiseSpec(iterations=0, albedo_sigma=5.0, normal_sharpness=1.0))
+    for transport in (idle_transport, split_sum()):
         assert transport.filtered(images, alpha, focal) is images
-    other = run(images, alpha, spec=DenoiseSpec(iterations=1), focal=focal)
-    assert set(other) == set(images)
+    filtered_images = run(images, alpha, spec=DenoiseSpec(iterations=1), focal=focal)
+    assert set(filtered_images) == set(images)
     for name in ("rgb", "diffuse", "specular"):
-        assert np.any(other[name] != images[name])
+        assert np.any(filtered_images[name] != images[name])
     for name in ("albedo", "normal", "depth", "metallic", "specular_radiance"):
-        np.testing.assert_array_equal(other[name], images[name])
+        np.testing.assert_array_equal(filtered_images[name], images[name])
 
 
 @pytest.mark.slow
@@ -568,23 +604,23 @@ def test_paths_over_two_surfaces_bring_what_traced_light_brings(ball, bowl, monk
     """Reflectance is made equal in all directions, as traced light assumes it to be."""
 
     def matt(materials, normals, wi, wo):
-        sent = materials.albedo * (1 - materials.metallic)[:, None]
-        sent = sent + bsdf.specular_f0(materials.albedo, materials.metallic)
-        return sent / np.pi
+        reflectance = materials.albedo * (1 - materials.metallic)[:, None]
+        reflectance = reflectance + bsdf.specular_f0(materials.albedo, materials.metallic)
+        return reflectance / np.pi
 
     monkeypatch.setattr(bsdf, "evaluate", matt)
-    asset, inside = bowl
+    asset, is_inside = bowl
     counts = {"light_count": 5, "diffuse_count": 5, "specular_count": 1}
-    found = []
+    lights = []
     for transport in (
         few(indirect="traced", **counts),
         PathSettings(bounce_count=2, **counts).build(LIGHT),
         few(**counts),
     ):
         points, attributes = asset.splats.points(), asset.attributes
-        prepared = prepare(transport, jax.random.key(2), points, attributes, sky(), asset.index)
-        found.append(np.asarray(prepared.gathered.diffuse_light)[inside])
-    traced, paths, direct = found
-    extra = np.mean(traced - direct)
-    assert extra > 0.05 * np.mean(direct)
-    assert np.mean(paths - direct) == pytest.approx(extra, rel=0.05)
+        illumination = prepare(transport, jax.random.key(2), points, attributes, sky(), asset.index)
+        lights.append(np.asarray(illumination.gathered.diffuse_light)[is_inside])
+    traced, paths, direct = lights
+    indirect_mean = np.mean(traced - direct)
+    assert indirect_mean > 0.05 * np.mean(direct)
+    assert np.mean(paths - direct) == pytest.approx(indirect_mean, rel=0.05)

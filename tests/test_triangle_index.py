@@ -35,13 +35,13 @@ def bumpy_ball():
 def soup():
     """Triangles without any order: large ones, tiny ones, slivers, one without area."""
     rng = np.random.default_rng(7)
-    middle = rng.uniform(-1, 1, (FACES, 1, 3))
-    size = np.where(np.arange(FACES) % 40 == 0, 2.0, 0.15)[:, None, None]
-    corners = middle + size * rng.normal(size=(FACES, 3, 3))
+    centers = rng.uniform(-1, 1, (FACES, 1, 3))
+    sizes = np.where(np.arange(FACES) % 40 == 0, 2.0, 0.15)[:, None, None]
+    corners = centers + sizes * rng.normal(size=(FACES, 3, 3))
     corners[1::50, 2] = corners[1::50, 0] + 0.03 * rng.normal(size=(len(corners[1::50]), 3))
     corners[5] = corners[5, :1]
-    crowded = slice(200, 240)
-    corners[crowded] = 0.3 + 0.02 * rng.normal(size=(40, 3, 3))
+    crowded_rows = slice(200, 240)
+    corners[crowded_rows] = 0.3 + 0.02 * rng.normal(size=(40, 3, 3))
     return corners.reshape(-1, 3), np.arange(3 * FACES).reshape(-1, 3)
 
 
@@ -92,7 +92,7 @@ def test_every_ray_equals_brute_force(scene, kind, two_sided):
     t_min = T_MIN * float(index.grid.cell_size)
     # Both sides of a sheet share their plane, so a ray that starts on one side misses the other.
     twins = np.where(source >= FACES, source - FACES, np.where(source >= 0, source + FACES, -1))
-    distance, face, unclear = brute_force(
+    distance, face, is_unclear = brute_force(
         surface,
         *rays[:2],
         source,
@@ -100,17 +100,19 @@ def test_every_ray_equals_brute_force(scene, kind, two_sided):
         t_min=t_min,
         also=twins if index.is_sheet else source,
     )
-    clear = ~unclear
-    assert clear.mean() > (0.5 if kind == "grazing" else 0.8)
-    found, hit = index.nearest(*rays, two_sided=two_sided)
-    np.testing.assert_array_equal(np.asarray(hit)[clear] >= 0, face[clear] >= 0)
-    is_hit = clear & (face >= 0)
-    np.testing.assert_allclose(np.asarray(found)[is_hit], distance[is_hit], rtol=2e-4, atol=2e-5)
-    np.testing.assert_array_equal(np.asarray(hit)[is_hit], face[is_hit])
-    any_hit = np.asarray(index.occluded(*rays, two_sided=two_sided))
-    np.testing.assert_array_equal(any_hit[clear], face[clear] >= 0)
+    is_clear = ~is_unclear
+    assert is_clear.mean() > (0.5 if kind == "grazing" else 0.8)
+    actual_distance, actual_face = index.nearest(*rays, two_sided=two_sided)
+    np.testing.assert_array_equal(np.asarray(actual_face)[is_clear] >= 0, face[is_clear] >= 0)
+    is_hit = is_clear & (face >= 0)
+    np.testing.assert_allclose(
+        np.asarray(actual_distance)[is_hit], distance[is_hit], rtol=2e-4, atol=2e-5
+    )
+    np.testing.assert_array_equal(np.asarray(actual_face)[is_hit], face[is_hit])
+    is_occluded = np.asarray(index.occluded(*rays, two_sided=two_sided))
+    np.testing.assert_array_equal(is_occluded[is_clear], face[is_clear] >= 0)
     assert 0.02 < np.mean(face >= 0)
-    assert np.all(np.isinf(np.asarray(found)[np.asarray(hit) < 0]))
+    assert np.all(np.isinf(np.asarray(actual_distance)[np.asarray(actual_face) < 0]))
 
 
 def test_a_sheet_says_which_of_its_sides_is_met():
@@ -127,24 +129,24 @@ def test_a_sheet_says_which_of_its_sides_is_met():
     assert np.unique(np.asarray(face)[RAYS // 2 :]).tolist() == [FACES]
     # Neither side blocks a ray that starts on one of them.
     starts = np.tile([[0.3, 0.1, 1e-2]], (RAYS, 1)), np.tile([[0.0, 0.0, -1.0]], (RAYS, 1))
-    for own, hits in ((-1, True), (0, False), (FACES, False), (1, True)):
-        found = index.occluded(*as_rays(*starts, np.full(RAYS, own)))
-        assert bool(found.all()) is hits
-        assert bool(found.any()) is hits
+    for source_face, hits in ((-1, True), (0, False), (FACES, False), (1, True)):
+        is_occluded = index.occluded(*as_rays(*starts, np.full(RAYS, source_face)))
+        assert bool(is_occluded.all()) is hits
+        assert bool(is_occluded.any()) is hits
 
 
 @pytest.mark.slow
 def test_overflow_reports_the_true_need_and_growing_cures_it(ball):
-    mesh, ample = ball
-    tight = Capacities(triangle_boxes=512, triangle_cells=128, cell_triangles=1)
-    index = index_of(*mesh, is_sheet=False, capacities=tight)
-    assert {"triangle_boxes", "cell_triangles"} <= set(overflowed(index.usage, tight))
-    capacities = tight
+    mesh, ample_index = ball
+    small_capacities = Capacities(triangle_boxes=512, triangle_cells=128, cell_triangles=1)
+    index = index_of(*mesh, is_sheet=False, capacities=small_capacities)
+    assert {"triangle_boxes", "cell_triangles"} <= set(overflowed(index.usage, small_capacities))
+    capacities = small_capacities
     for _ in range(4):
         capacities = grow(capacities, index.usage)
         index = index_of(*mesh, is_sheet=False, capacities=capacities)
     assert not overflowed(index.usage, capacities)
-    for name, count in ample.usage.items():
+    for name, count in ample_index.usage.items():
         assert int(index.usage[name]) == int(count)
 
 
@@ -156,8 +158,8 @@ def test_a_list_too_long_to_be_counted_is_refused(ball):
 
 
 def test_more_cells_than_can_be_counted_are_refused_and_not_wrapped(ball):
-    whole = np.array([[0.0, 0, 0], [99, 0, 99], [0, 99, 99]])
-    corners = jnp.asarray(np.repeat(whole[:, :, None], 4400, axis=2), jnp.float32)
+    cell_ranges = np.array([[0.0, 0, 0], [99, 0, 99], [0, 99, 99]])
+    corners = jnp.asarray(np.repeat(cell_ranges[:, :, None], 4400, axis=2), jnp.float32)
     assert 4400 * 100**3 % 2**32 < 2**31  # wrapped to 32 bits, it would look like a small count
     assert int(triangle_index._boxed(corners, 8)[2]) == 2**31 - 1
     mesh, _ = ball
@@ -173,14 +175,18 @@ def test_the_grid_follows_the_vertices_wherever_they_go(ball):
     distance, face = index.nearest(*as_rays(origins, directions, np.full(RAYS, -1)))
     assert 0.1 < np.mean(np.asarray(face) >= 0) < 0.9
     # Scaling by a power of two rounds nothing, so the hits are the same to the bit.
-    scale, move = 2.0**10, np.array([4096.0, 0.0, -8192.0])
-    far = index_of(scale * vertices + 0 * move, faces, is_sheet=False)
-    found, same = far.nearest(*as_rays(scale * origins, directions, np.full(RAYS, -1)))
-    np.testing.assert_array_equal(same, face)
-    np.testing.assert_allclose(found, scale * np.asarray(distance), rtol=1e-6)
-    near = index_of(vertices + move / 4096, faces, is_sheet=False)
-    found, same = near.nearest(*as_rays(origins + move / 4096, directions, np.full(RAYS, -1)))
-    assert np.mean(np.asarray(same) == np.asarray(face)) > 0.99
+    scale, offset = 2.0**10, np.array([4096.0, 0.0, -8192.0])
+    far_index = index_of(scale * vertices + 0 * offset, faces, is_sheet=False)
+    moved_distance, moved_face = far_index.nearest(
+        *as_rays(scale * origins, directions, np.full(RAYS, -1))
+    )
+    np.testing.assert_array_equal(moved_face, face)
+    np.testing.assert_allclose(moved_distance, scale * np.asarray(distance), rtol=1e-6)
+    near_index = index_of(vertices + offset / 4096, faces, is_sheet=False)
+    moved_distance, moved_face = near_index.nearest(
+        *as_rays(origins + offset / 4096, directions, np.full(RAYS, -1))
+    )
+    assert np.mean(np.asarray(moved_face) == np.asarray(face)) > 0.99
 
 
 def test_masked_rays_hit_nothing_and_no_rays_are_legal(ball):
@@ -188,9 +194,9 @@ def test_masked_rays_hit_nothing_and_no_rays_are_legal(ball):
     rng = np.random.default_rng(3)
     rays = rng.uniform(-1, 1, (RAYS, 3)), unit(rng.normal(size=(RAYS, 3))), np.full(RAYS, -1)
     mask = jnp.asarray(rng.random(RAYS) < 0.5)
-    whole = index.occluded(*as_rays(*rays))
-    np.testing.assert_array_equal(index.occluded(*as_rays(*rays, mask=mask)), whole & mask)
-    assert bool(jnp.any(whole & ~mask))
+    is_hit = index.occluded(*as_rays(*rays))
+    np.testing.assert_array_equal(index.occluded(*as_rays(*rays, mask=mask)), is_hit & mask)
+    assert bool(jnp.any(is_hit & ~mask))
 
 
 @pytest.mark.parametrize(
@@ -200,8 +206,8 @@ def test_masked_rays_hit_nothing_and_no_rays_are_legal(ball):
 def test_cells_are_neither_none_nor_too_many(stretch, edges):
     vertices, faces = soup()
     vertices = vertices.reshape(-1, 3, 3)
-    middle = vertices.mean(axis=1, keepdims=True)
-    vertices = ((middle + edges * (vertices - middle)) * stretch).reshape(-1, 3)
+    centers = vertices.mean(axis=1, keepdims=True)
+    vertices = ((centers + edges * (vertices - centers)) * stretch).reshape(-1, 3)
     shape = cells_for(vertices, faces)
     assert min(shape) >= 3
     assert np.prod(shape) <= 1.1 * 2**20
@@ -223,9 +229,9 @@ def test_agrees_with_embree_on_a_hundred_thousand_rays():
     tracer = RayMeshIntersector(trimesh.Trimesh(vertices, faces, process=False))
     rng = np.random.default_rng(3)
     origins, directions, source = rays_of_kind("from the surface", surface, rng, 100_000)
-    start = origins + T_MIN * float(index.grid.cell_size) * directions
-    expected = tracer.intersects_any(start, directions)
+    starts = origins + T_MIN * float(index.grid.cell_size) * directions
+    expected = tracer.intersects_any(starts, directions)
     trace = partial(index.occluded, two_sided=True)
-    found = trace(*as_rays(origins, directions, source))
+    is_occluded = trace(*as_rays(origins, directions, source))
     assert 0.02 < expected.mean() < 0.5
-    assert np.mean(np.asarray(found) == expected) > 0.9985
+    assert np.mean(np.asarray(is_occluded) == expected) > 0.9985

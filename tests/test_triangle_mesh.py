@@ -37,8 +37,8 @@ def bowl():
     """The lower two thirds of a ball; the border is not planar."""
     vertices, faces = ball()
     faces = faces[vertices[faces][..., 2].mean(axis=1) < 0.15]
-    used, rows = np.unique(faces, return_inverse=True)
-    return vertices[used], rows.reshape(-1, 3).astype(np.int32)
+    kept_rows, rows = np.unique(faces, return_inverse=True)
+    return vertices[kept_rows], rows.reshape(-1, 3).astype(np.int32)
 
 
 def moved(model, seed=0, size=0.1):
@@ -57,36 +57,40 @@ def penalties_of(model, shape):
 
 def slow_penalties(model, shape):
     """Penalties by their definitions, face by face and vertex by vertex, in float64."""
-    half, unit = float(model.box.half_extent), float(model.unit)
-    home = np.asarray(model.home, np.float64)
-    now = home + half * np.asarray(shape.offsets, np.float64)
+    half_extent, unit = float(model.box.half_extent), float(model.unit)
+    rest_positions = np.asarray(model.home, np.float64)
+    positions = rest_positions + half_extent * np.asarray(shape.offsets, np.float64)
     edges, normals = {}, []
-    for number, (a, b, c) in enumerate(np.asarray(model.faces)):
-        normal = np.cross(now[b] - now[a], now[c] - now[a])
+    for face_index, (a, b, c) in enumerate(np.asarray(model.faces)):
+        normal = np.cross(positions[b] - positions[a], positions[c] - positions[a])
         normals.append(normal / np.linalg.norm(normal))
         for start, end in ((a, b), (b, c), (c, a)):
-            way = (min(start, end), max(start, end))
-            edges.setdefault(way, []).append((number, start < end))
-    around = {v: set() for v in range(len(now))}
-    border = {v for edge, sides in edges.items() if len(sides) == 1 for v in edge}
-    for edge, sides in edges.items():
-        for v, other in (edge, edge[::-1]):
-            if v not in border or len(sides) == 1:
-                around[v].add(other)
-    umbrella = [now[sorted(around[v])].mean(axis=0) - now[v] for v in around]
+            edge_key = (min(start, end), max(start, end))
+            edges.setdefault(edge_key, []).append((face_index, start < end))
+    neighbors = {v: set() for v in range(len(positions))}
+    border = {v for edge, edge_faces in edges.items() if len(edge_faces) == 1 for v in edge}
+    for edge, edge_faces in edges.items():
+        for v, neighbor in (edge, edge[::-1]):
+            if v not in border or len(edge_faces) == 1:
+                neighbors[v].add(neighbor)
+    umbrella = [positions[sorted(neighbors[v])].mean(axis=0) - positions[v] for v in neighbors]
     cosines = [
         normals[s[0][0]] @ normals[s[1][0]] * (1 if s[0][1] != s[1][1] else -1)
         for s in edges.values()
         if len(s) == 2
     ]
-    change = [np.linalg.norm(now[a] - now[b]) - np.linalg.norm(home[a] - home[b]) for a, b in edges]
-    lengths = [np.linalg.norm(home[a] - home[b]) for a, b in edges]
+    length_changes = [
+        np.linalg.norm(positions[a] - positions[b])
+        - np.linalg.norm(rest_positions[a] - rest_positions[b])
+        for a, b in edges
+    ]
+    lengths = [np.linalg.norm(rest_positions[a] - rest_positions[b]) for a, b in edges]
     np.testing.assert_allclose(unit, np.mean(lengths), rtol=1e-5)
     return {
         "laplacian": np.mean(np.sum(np.square(umbrella), axis=1)) / unit**2,
         "normal_consistency": np.mean(1 - np.array(cosines)),
-        "edge_length": np.mean(np.square(change)) / unit**2,
-        "offset": np.mean(np.sum((now - home) ** 2, axis=1)) / unit**2,
+        "edge_length": np.mean(np.square(length_changes)) / unit**2,
+        "offset": np.mean(np.sum((positions - rest_positions) ** 2, axis=1)) / unit**2,
     }
 
 
@@ -104,50 +108,50 @@ def wound_badly(mesh):
 def test_penalties_are_those_of_their_definitions(mesh, is_sheet):
     model = TriangleMesh.of(*mesh, is_sheet=is_sheet)
     shape = moved(model)
-    found, expected = penalties_of(model, shape), slow_penalties(model, shape)
-    assert set(found) == set(expected)
+    actual, expected = penalties_of(model, shape), slow_penalties(model, shape)
+    assert set(actual) == set(expected)
     for name, value in expected.items():
         assert value > 1e-3
-        assert found[name] == pytest.approx(value, rel=2e-4), name
+        assert actual[name] == pytest.approx(value, rel=2e-4), name
 
 
 def test_penalties_know_neither_the_scale_nor_the_place_of_a_scene():
     vertices, faces = bowl()
-    one = TriangleMesh.of(vertices, faces, is_sheet=True)
-    other = TriangleMesh.of(300 * vertices + 70, faces, is_sheet=True)
-    shape = moved(one)
-    for name, value in penalties_of(one, shape).items():
-        assert penalties_of(other, shape)[name] == pytest.approx(value, rel=1e-3)
+    model = TriangleMesh.of(vertices, faces, is_sheet=True)
+    scaled_model = TriangleMesh.of(300 * vertices + 70, faces, is_sheet=True)
+    shape = moved(model)
+    for name, value in penalties_of(model, shape).items():
+        assert penalties_of(scaled_model, shape)[name] == pytest.approx(value, rel=1e-3)
 
 
 def test_nothing_changes_at_the_start_and_flat_surfaces_cost_nothing():
     vertices, faces = ball()
     model = TriangleMesh.of(vertices, faces, is_sheet=False)
-    start = penalties_of(model, model.start)
-    assert start["offset"] == 0
-    assert start["edge_length"] < 1e-10
+    start_penalties = penalties_of(model, model.start)
+    assert start_penalties["offset"] == 0
+    assert start_penalties["edge_length"] < 1e-10
     grid = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0)), -1).reshape(-1, 2)
     square = trimesh.Trimesh(np.c_[grid, 0 * grid[:, 0]], _grid_faces(5), process=False)
-    flat = TriangleMesh.of(np.array(square.vertices), np.array(square.faces), is_sheet=True)
-    found = penalties_of(flat, flat.start)
-    assert found["normal_consistency"] < 1e-6
+    flat_model = TriangleMesh.of(np.array(square.vertices), np.array(square.faces), is_sheet=True)
+    flat_penalties = penalties_of(flat_model, flat_model.start)
+    assert flat_penalties["normal_consistency"] < 1e-6
     # Every vertex inside or along a side is the mean of its neighbours; the four corners are half a
     # diagonal away from the mean of theirs.
-    corner = 0.5 / float(flat.unit) ** 2
-    assert found["laplacian"] == pytest.approx(4 * corner / 25, rel=1e-4)
+    corner = 0.5 / float(flat_model.unit) ** 2
+    assert flat_penalties["laplacian"] == pytest.approx(4 * corner / 25, rel=1e-4)
 
 
 def _grid_faces(n):
     corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
-    first = np.stack([corner, corner + 1, corner + n + 1], -1)
-    return np.concatenate([first, np.stack([corner, corner + n + 1, corner + n], -1)])
+    lower_faces = np.stack([corner, corner + 1, corner + n + 1], -1)
+    return np.concatenate([lower_faces, np.stack([corner, corner + n + 1, corner + n], -1)])
 
 
 def test_a_mesh_with_an_edge_of_three_faces_has_no_wings_there():
     fan = np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]])
-    near = connectivity(fan)
-    assert len(near.edges) == 7
-    assert len(near.wings) == 0
+    adjacency = connectivity(fan)
+    assert len(adjacency.edges) == 7
+    assert len(adjacency.wings) == 0
 
 
 def test_faces_without_height_do_not_pull_on_their_neighbours():
@@ -155,16 +159,16 @@ def test_faces_without_height_do_not_pull_on_their_neighbours():
     vertices, faces = ball(2)
     split = np.arange(0, len(faces), 40)
     middles = vertices[faces[split]][:, :2].mean(axis=1)
-    added = len(vertices) + np.arange(len(split))
+    added_rows = len(vertices) + np.arange(len(split))
     first, second, third = faces[split].T
     rows = [
         np.delete(faces, split, axis=0),
-        np.stack([first, added, third], axis=1),
-        np.stack([added, second, third], axis=1),
-        np.stack([first, second, added], axis=1),
+        np.stack([first, added_rows, third], axis=1),
+        np.stack([added_rows, second, third], axis=1),
+        np.stack([first, second, added_rows], axis=1),
     ]
-    places = np.concatenate([vertices, middles])
-    model = TriangleMesh.of(places, np.concatenate(rows), is_sheet=False)
+    positions = np.concatenate([vertices, middles])
+    model = TriangleMesh.of(positions, np.concatenate(rows), is_sheet=False)
 
     @jax.jit
     @jax.grad
@@ -172,9 +176,9 @@ def test_faces_without_height_do_not_pull_on_their_neighbours():
         surface = model.extract(shape, capacities=Capacities())
         return model.penalties(shape, surface)["normal_consistency"]
 
-    found = np.linalg.norm(np.asarray(gradient(moved(model, size=1e-4)).offsets), axis=1)
-    others = np.delete(np.arange(len(vertices)), np.unique(faces[split]))
-    assert found.max() < 20 * np.median(found[others])
+    gradient_norms = np.linalg.norm(np.asarray(gradient(moved(model, size=1e-4)).offsets), axis=1)
+    other_rows = np.delete(np.arange(len(vertices)), np.unique(faces[split]))
+    assert gradient_norms.max() < 20 * np.median(gradient_norms[other_rows])
     assert len(model.wings) == 3 * len(model.faces) // 2 - 3 * len(split)
 
 
@@ -212,19 +216,21 @@ def files(tmp_path_factory):
 
 def test_presets_give_the_rates_of_their_surface_to_the_vertices(files):
     for preset in ("default", "paper", "code"):
-        plain, config = make_config(preset), make_config(preset, mesh=files["ball"])
+        plain_config, config = make_config(preset), make_config(preset, mesh=files["ball"])
         assert config.geometry.kind == "mesh"
         assert config.raster.cull_backfaces
-        for before, stage in zip(plain.stages, config.stages, strict=True):
-            moves = before.rates["sdf"].value > 0
+        for plain_stage, stage in zip(plain_config.stages, config.stages, strict=True):
+            moves = plain_stage.rates["sdf"].value > 0
             assert (stage.rates["vertices"].value > 0) == moves
             assert ("laplacian" in stage.weights) == moves
             assert not {"sdf", "deform", "weights"} & set(stage.rates)
             assert not {"entropy", "deviation", "weights"} & set(stage.weights)
             assert stage.vertex_fraction == 0 or preset == "default"
         assert config_from_dict(json.loads(json.dumps(config.to_dict()))) == config
-    given = make_config(mesh=files["ball"], overrides=("stages.split_sum.rates.vertices=0.5",))
-    assert given.stages[0].rates["vertices"].value == 0.5
+    changed_config = make_config(
+        mesh=files["ball"], overrides=("stages.split_sum.rates.vertices=0.5",)
+    )
+    assert changed_config.stages[0].rates["vertices"].value == 0.5
     with pytest.raises(ValueError, match="there is no mesh file"):
         make_config(mesh="nowhere.ply")
 
@@ -236,46 +242,46 @@ def leaves_equal(first, second):
 
 def test_a_run_starts_from_the_file_says_so_and_resumes_bit_for_bit(dataset, files, tmp_path):
     config = make_config(mesh=files["ball"], overrides=SMALL)
-    whole = fit(dataset, config, tmp_path / "whole")
+    whole_state = fit(dataset, config, tmp_path / "whole")
     lines = [json.loads(x) for x in (tmp_path / "whole/metrics.jsonl").read_text().splitlines()]
     assert {line["faces"] for line in lines} == {80}
     assert {"term.laplacian", "term.normal_consistency"} <= set(lines[0])
     assert all(np.isfinite(line["loss"]) for line in lines)
     # Four steps move vertices by about the rate each, in half extents of the box.
-    assert 3e-3 < float(jnp.max(jnp.abs(whole.params.geometry.offsets))) < 2e-2
+    assert 3e-3 < float(jnp.max(jnp.abs(whole_state.params.geometry.offsets))) < 2e-2
     record = json.loads((tmp_path / "whole/run.json").read_text())
     assert record["config"]["geometry"]["path"] == str(Path(files["ball"]).resolve())
     assert len(record["config"]["geometry"]["digest"]) == 16
     assert any("start: 42 vertices, 80 faces, one side" in note for note in record["notes"])
     copy = tmp_path / "copy.ply"
     copy.write_bytes(Path(files["ball"]).read_bytes())
-    moved = make_config(mesh=copy, overrides=SMALL)
-    fit(dataset, moved, tmp_path / "halves", stop_after=2)
+    copy_config = make_config(mesh=copy, overrides=SMALL)
+    fit(dataset, copy_config, tmp_path / "halves", stop_after=2)
     # Resuming needs neither the file nor its name.
     copy.unlink()
     read_start.cache_clear()
-    given = make_config(mesh=mesh_of_run(RunFolder(tmp_path / "halves")), overrides=SMALL)
-    leaves_equal(whole, fit(dataset, given, tmp_path / "halves", begin=Resume()))
+    resumed_config = make_config(mesh=mesh_of_run(RunFolder(tmp_path / "halves")), overrides=SMALL)
+    leaves_equal(whole_state, fit(dataset, resumed_config, tmp_path / "halves", begin=Resume()))
     # Reading a finished run does not need the file either.
     trained = Run(tmp_path / "whole").trained
-    leaves_equal(trained.params, whole.params)
+    leaves_equal(trained.params, whole_state.params)
     vertices, faces, _ = Run(tmp_path / "whole").renderer().mesh()
     assert (len(vertices), len(faces)) == (42, 80)
 
 
 def test_a_mesh_that_cannot_be_used_stops_before_anything_is_written(dataset, files, tmp_path):
-    large = tmp_path / "large.ply"
+    large_path = tmp_path / "large.ply"
     vertices, faces = read_mesh(files["ball"])
-    trimesh.Trimesh(100 * vertices, faces, process=False).export(large)
-    config = make_config(mesh=large, overrides=SMALL)
+    trimesh.Trimesh(100 * vertices, faces, process=False).export(large_path)
+    config = make_config(mesh=large_path, overrides=SMALL)
     with pytest.raises(TrainingError, match=r"if it were 0\.01 times as large"):
         fit(dataset, config, tmp_path / "run")
     assert not (tmp_path / "run/run.json").exists()
-    changed = with_mesh(make_config(overrides=TINY), large)
-    large.write_bytes(Path(files["ball"]).read_bytes())
+    changed_config = with_mesh(make_config(overrides=TINY), large_path)
+    large_path.write_bytes(Path(files["ball"]).read_bytes())
     read_start.cache_clear()
     with pytest.raises(TrainingError, match="is not the mesh that it was"):
-        fit(dataset, changed, tmp_path / "run")
+        fit(dataset, changed_config, tmp_path / "run")
 
 
 def test_the_inward_shift_of_a_mesh_starts_smaller_unless_it_was_set(files):

@@ -66,10 +66,10 @@ def test_a_look_that_stays_is_drawn_ever_better_and_then_no_more(clock):
 def test_what_moves_is_drawn_at_the_best_level_that_keeps_up(clock):
     ladder = Ladder(clock=clock)
     seconds = {QUICK: 0.05, GOOD: 0.2, BEST: 2.0}
-    for number in range(2):  # the first picture of a level does not count as its pace
-        drawn(ladder, clock, moved(number), seconds=seconds)
-        drawn(ladder, clock, moved(number), seconds=seconds, wait=1.0)
-    assert [ladder.next(moved(number)) for number in range(2, 5)] == [GOOD] * 3
+    for index in range(2):  # the first picture of a level does not count as its pace
+        drawn(ladder, clock, moved(index), seconds=seconds)
+        drawn(ladder, clock, moved(index), seconds=seconds, wait=1.0)
+    assert [ladder.next(moved(index)) for index in range(2, 5)] == [GOOD] * 3
     ladder.note(GOOD, 1.0)  # the machine has become busy
     assert ladder.next(moved(9)) == QUICK
 
@@ -89,19 +89,23 @@ def test_a_compilation_does_not_count_as_a_pace(clock):
 
 
 def test_the_camera_of_a_look_fills_the_window_whatever_its_shape():
-    wide, square = (replace(LOOK, aspect=aspect).camera(GOOD) for aspect in (2.0, 1.0))
-    for camera in (wide, square):
+    wide_camera, square_camera = (
+        replace(LOOK, aspect=aspect).camera(GOOD) for aspect in (2.0, 1.0)
+    )
+    for camera in (wide_camera, square_camera):
         np.testing.assert_allclose(camera.centers[0], LOOK.position, atol=1e-6)
         # The origin is in the middle of the image; z points up, to smaller rows.
-        middle, above = (
+        center_pixel, upper_pixel = (
             np.asarray(camera.intrinsics[0] @ (camera.world_to_camera[0] @ jnp.array(p))[:3])
             for p in ([0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.5, 1.0])
         )
-        np.testing.assert_allclose(middle[:2] / middle[2], [192, 128], atol=1e-3)
-        assert above[1] / above[2] < 127
-        half = np.arctan(0.5 * GOOD.height / float(camera.intrinsics[0, 1, 1]))
-        assert 2 * half == pytest.approx(LOOK.field_of_view)
-    assert float(square.intrinsics[0, 0, 0] / wide.intrinsics[0, 0, 0]) == pytest.approx(2.0)
+        np.testing.assert_allclose(center_pixel[:2] / center_pixel[2], [192, 128], atol=1e-3)
+        assert upper_pixel[1] / upper_pixel[2] < 127
+        half_angle = np.arctan(0.5 * GOOD.height / float(camera.intrinsics[0, 1, 1]))
+        assert 2 * half_angle == pytest.approx(LOOK.field_of_view)
+    assert float(
+        square_camera.intrinsics[0, 0, 0] / wide_camera.intrinsics[0, 0, 0]
+    ) == pytest.approx(2.0)
 
 
 TINY_LEVELS = (Level(12, 8, 1), Level(24, 16, 2))
@@ -113,9 +117,9 @@ def make_trained(step=7):
     radiance[:, :8] = 0.6
     box = Box(jnp.zeros(3), jnp.float32(0.6))
     params = SimpleNamespace(light=EnvLight(jnp.asarray(radiance)), log_exposure=0.0)
-    parts = {"params": params, "pipeline": SimpleNamespace(surface=SimpleNamespace(box=box))}
+    fields = {"params": params, "pipeline": SimpleNamespace(surface=SimpleNamespace(box=box))}
     trained = object.__new__(Trained)
-    for name, value in {**parts, "step": step}.items():
+    for name, value in {**fields, "step": step}.items():
         object.__setattr__(trained, name, value)
     return trained
 
@@ -156,9 +160,9 @@ class Recorder(Renderer):
         y, x = np.mgrid[: camera.height, : camera.width] + 0.5
         radius = np.hypot(x - 0.5 * camera.width, y - 0.5 * camera.height)
         alpha = np.where(radius < 0.4 * camera.height, 0.9, 0.0).astype(np.float32)
-        shown = {"albedo": [0.6] * 3, "roughness": [0.8], "metallic": [0.25]}
-        shown |= {"normal": [0.0, -1.0, 0.0], "depth": [2.6]}
-        aovs = {name: alpha[..., None] * np.float32(value) for name, value in shown.items()}
+        aov_values = {"albedo": [0.6] * 3, "roughness": [0.8], "metallic": [0.25]}
+        aov_values |= {"normal": [0.0, -1.0, 0.0], "depth": [2.6]}
+        aovs = {name: alpha[..., None] * np.float32(value) for name, value in aov_values.items()}
         grey = 0.5 * np.stack([alpha] * 3, -1)
         return RenderedView(grey, alpha, grey, aovs)
 
@@ -179,26 +183,26 @@ def middle(picture):
 
 def test_every_mode_shows_what_it_says(recorded):
     painter, _ = recorded
-    shown = {mode: painter.paint(replace(LOOK, mode=mode), TINY_LEVELS[1]) for mode in MODES}
-    for mode, picture in shown.items():
+    pictures = {mode: painter.paint(replace(LOOK, mode=mode), TINY_LEVELS[1]) for mode in MODES}
+    for mode, picture in pictures.items():
         assert picture.rgb.shape == (16, 24, 3), mode
         assert picture.step == 7
         assert picture.depth[8, 12] == pytest.approx(2.6)
         assert picture.depth[0, 0] > 100
     # Nine tenths come from the sRGB value of .6, or from the numbers; the rest is the grey
     # background.
-    np.testing.assert_allclose(middle(shown["albedo"]), 0.9 * 0.797 + 0.02, atol=0.01)
-    np.testing.assert_allclose(middle(shown["roughness"]), 0.9 * 0.8 + 0.02, atol=0.01)
-    np.testing.assert_allclose(middle(shown["metallic"]), 0.9 * 0.25 + 0.02, atol=0.01)
-    np.testing.assert_allclose(middle(shown["normal"]), [0.46, 0.01, 0.46], atol=0.02)
-    np.testing.assert_array_equal(shown["render"].rgb[0, 0], 255)
-    near, far = (
+    np.testing.assert_allclose(middle(pictures["albedo"]), 0.9 * 0.797 + 0.02, atol=0.01)
+    np.testing.assert_allclose(middle(pictures["roughness"]), 0.9 * 0.8 + 0.02, atol=0.01)
+    np.testing.assert_allclose(middle(pictures["metallic"]), 0.9 * 0.25 + 0.02, atol=0.01)
+    np.testing.assert_allclose(middle(pictures["normal"]), [0.46, 0.01, 0.46], atol=0.02)
+    np.testing.assert_array_equal(pictures["render"].rgb[0, 0], 255)
+    near_picture, far_picture = (
         painter.paint(replace(LOOK, mode="depth", position=(0.0, -y, 0.0)), TINY_LEVELS[1])
         for y in (2.6, 3.4)
     )
     # The scale follows the distance of the camera to the box: seen from further away, a depth of
     # 2.6 is at the front of the box.
-    assert middle(far).sum() > middle(near).sum() + 0.3
+    assert middle(far_picture).sum() > middle(near_picture).sum() + 0.3
 
 
 def test_lights_are_swapped_turned_and_scaled(recorded):
@@ -211,33 +215,35 @@ def test_lights_are_swapped_turned_and_scaled(recorded):
     ]
     for look in looks:
         painter.paint(look, TINY_LEVELS[1])
-    found, sky, turned, dimmed = (light for light, _ in log)
-    assert isinstance(found, str)
+    trained_light, sky, turned_light, dimmed_light = (light for light, _ in log)
+    assert isinstance(trained_light, str)
     assert [samples for _, samples in log] == [2] * 4
-    half = sky.shape[1] // 2
-    assert sky[:, 4 : half - 4].min() > 0.99
-    assert sky[:, half + 4 : -4].max() < 0.01
+    half_width = sky.shape[1] // 2
+    assert sky[:, 4 : half_width - 4].min() > 0.99
+    assert sky[:, half_width + 4 : -4].max() < 0.01
     # The light turns counter-clockwise seen from above; columns run the other way.
-    np.testing.assert_allclose(turned, 2.0 * np.roll(sky, -half // 2, axis=1), atol=1e-3)
-    assert dimmed.mean() == pytest.approx(0.2, abs=0.01)  # half of the trained light
-    assert dimmed.shape == sky.shape
+    np.testing.assert_allclose(
+        turned_light, 2.0 * np.roll(sky, -half_width // 2, axis=1), atol=1e-3
+    )
+    assert dimmed_light.mean() == pytest.approx(0.2, abs=0.01)  # half of the trained light
+    assert dimmed_light.shape == sky.shape
 
 
 def test_a_camera_that_moves_keeps_the_light_it_has(recorded, monkeypatch):
     painter, _ = recorded
-    made = []
-    monkeypatch.setattr(Recorder, "under", lambda self, light: made.append(1) or self)
+    calls = []
+    monkeypatch.setattr(Recorder, "under", lambda self, light: calls.append(1) or self)
     for y in (-3.0, -3.5, -4.0):
         look = replace(LOOK, light="sky", position=(0.0, y, 0.0))
         painter.paint(look, TINY_LEVELS[0])
-    first = len(made)
+    first_count = len(calls)
     painter.paint(replace(look, turn=5.0), TINY_LEVELS[0])
-    assert (first, len(made)) == (2, 3)  # two for the first light, one for the turn
+    assert (first_count, len(calls)) == (2, 3)  # two for the first light, one for the turn
 
 
 def test_a_newer_checkpoint_is_drawn_without_being_asked_for(monkeypatch, clock):
     monkeypatch.setattr(painting, "Renderer", SimpleNamespace(of=lambda trained: Recorder([])))
-    newer = make_trained(9)
+    newer_trained = make_trained(9)
     watch = Watch(make_trained())
     viewer = Viewer(watch, {}, levels=TINY_LEVELS, clock=clock)
     assert viewer.lights == (AS_TRAINED,)
@@ -248,7 +254,7 @@ def test_a_newer_checkpoint_is_drawn_without_being_asked_for(monkeypatch, clock)
     assert viewer.draw(1, LOOK) is None
     assert viewer.draw(2, LOOK).step == 7  # another client
     assert not viewer.refresh()
-    watch.waiting.append(newer)
+    watch.waiting.append(newer_trained)
     assert viewer.refresh()
     assert viewer.draw(1, LOOK).step == 9
     viewer.leave(1)
@@ -291,20 +297,20 @@ def test_lights_come_from_files_and_folders(tmp_path):
     lights = load_lights(files, {"b": tmp_path / "a.hdr"})
     assert {light.radiance.shape for light in lights.values()} == {(128, 256, 3)}
     assert float(lights["b"].radiance.mean()) == pytest.approx(1.0, abs=0.01)
-    other = tmp_path / "other"
-    other.mkdir()
+    other_folder = tmp_path / "other"
+    other_folder.mkdir()
     with pytest.raises(SceneError, match="holds no environment map"):
-        light_files([other])
-    shutil.copy(tmp_path / "a.hdr", other)
+        light_files([other_folder])
+    shutil.copy(tmp_path / "a.hdr", other_folder)
     with pytest.raises(SceneError, match="have the same name"):
-        load_lights([*files, other / "a.hdr"], {})
+        load_lights([*files, other_folder / "a.hdr"], {})
 
 
 def test_a_viewer_that_cannot_start_says_why(monkeypatch):
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
+    with socket.socket() as busy_socket:
+        busy_socket.bind(("127.0.0.1", 0))
+        busy_socket.listen()
+        port = busy_socket.getsockname()[1]
         with pytest.raises(ViewerError, match=f"port {port} cannot be used .*--port"):
             require_free_port(port)
     with pytest.raises(ViewerError, match="from 1 to 65535, got 0"):

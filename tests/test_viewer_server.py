@@ -85,9 +85,9 @@ def server(watch, views, monkeypatch):
         with serving.socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             port = probe.getsockname()[1]
-        made = ViewerServer(Viewer(watch, {}), views, port=port)
-        yield made
-        made.stop()
+        viewer_server = ViewerServer(Viewer(watch, {}), views, port=port)
+        yield viewer_server
+        viewer_server.stop()
 
 
 @pytest.mark.filterwarnings("ignore")

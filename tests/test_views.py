@@ -16,9 +16,9 @@ def test_a_point_on_the_ray_of_a_pixel_appears_there_at_its_depth():
     rays = np.column_stack([pixels, np.ones(50)]) @ np.linalg.inv(INTRINSICS).T
     local = depth[:, None] * rays
     points = (local - pose[:3, 3]) @ pose[:3, :3]
-    shown, along = project(points, pose, INTRINSICS)
-    np.testing.assert_allclose(shown, pixels, atol=1e-9)
-    np.testing.assert_allclose(along, local, atol=1e-9)
+    projected_pixels, camera_points = project(points, pose, INTRINSICS)
+    np.testing.assert_allclose(projected_pixels, pixels, atol=1e-9)
+    np.testing.assert_allclose(camera_points, local, atol=1e-9)
 
 
 def test_what_is_not_in_front_of_a_camera_is_in_no_image():

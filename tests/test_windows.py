@@ -23,49 +23,52 @@ SIZE = 160
 @pytest.fixture(scope="module")
 def views():
     """A small ball in large photographs, never in the middle."""
-    centred = sphere_views(4, size=SIZE, radius=0.15)
+    centred_views = sphere_views(4, size=SIZE, radius=0.15)
     shifts = ((30, -20), (-25, 10), (0, 40), (-40, -40))
-    images, intrinsics = np.zeros_like(centred.images), centred.intrinsics.copy()
+    images, intrinsics = np.zeros_like(centred_views.images), centred_views.intrinsics.copy()
     for index, (rows, columns) in enumerate(shifts):
-        images[index] = np.roll(centred.images[index], (rows, columns), axis=(0, 1))
+        images[index] = np.roll(centred_views.images[index], (rows, columns), axis=(0, 1))
         intrinsics[index, :2, 2] += (columns, rows)
-    return replace(centred, images=images, intrinsics=intrinsics)
+    return replace(centred_views, images=images, intrinsics=intrinsics)
 
 
 def test_windows_hold_the_whole_object_and_a_margin(views):
     windows, share = around_object(views, largest=0.5)
     assert share == windows.height * windows.width / SIZE**2 < 0.4
-    covered = views.images[..., 3] > 0
-    inside = windows.images[..., 3] > 0
-    assert inside.sum() == covered.sum() > 0
+    is_covered = views.images[..., 3] > 0
+    is_in_window = windows.images[..., 3] > 0
+    assert is_in_window.sum() == is_covered.sum() > 0
     rim = MARGIN
-    assert not inside[:, :rim].any()
-    assert not inside[:, -rim:].any()
-    assert not inside[:, :, :rim].any()
-    assert not inside[:, :, -rim:].any()
+    assert not is_in_window[:, :rim].any()
+    assert not is_in_window[:, -rim:].any()
+    assert not is_in_window[:, :, :rim].any()
+    assert not is_in_window[:, :, -rim:].any()
 
 
 def test_a_pixel_of_a_window_has_the_ray_that_it_had(views):
     windows, _ = around_object(views, largest=0.5)
     for index in range(len(views)):
         # Take the first covered pixel in both images.
-        whole = np.argwhere(views.images[index, ..., 3] > 0)[0]
-        cut = np.argwhere(windows.images[index, ..., 3] > 0)[0]
+        photograph_pixel = np.argwhere(views.images[index, ..., 3] > 0)[0]
+        window_pixel = np.argwhere(windows.images[index, ..., 3] > 0)[0]
         rays = [
             np.linalg.inv(k[index]) @ np.array([column + 0.5, row + 0.5, 1.0])
-            for k, (row, column) in ((views.intrinsics, whole), (windows.intrinsics, cut))
+            for k, (row, column) in (
+                (views.intrinsics, photograph_pixel),
+                (windows.intrinsics, window_pixel),
+            )
         ]
         np.testing.assert_allclose(rays[0], rays[1], rtol=1e-9, atol=1e-9)
         np.testing.assert_array_equal(
-            views.images[index][tuple(whole)], windows.images[index][tuple(cut)]
+            views.images[index][tuple(photograph_pixel)], windows.images[index][tuple(window_pixel)]
         )
 
 
 def test_large_objects_keep_their_photographs(views):
     assert around_object(views, largest=0.0) == (views, 1.0)
     assert around_object(views, largest=0.05) == (views, 1.0)
-    bare = replace(views, has_masks=False)
-    assert around_object(bare, largest=1.0) == (bare, 1.0)
+    bare_views = replace(views, has_masks=False)
+    assert around_object(bare_views, largest=1.0) == (bare_views, 1.0)
 
 
 def test_pixels_that_do_not_count_stay_what_they_are(views):
@@ -88,17 +91,19 @@ def test_a_view_without_the_object_has_a_window_in_its_middle(views):
 def test_a_mean_over_a_window_is_that_over_the_photograph(views):
     windows, share = around_object(views, largest=0.5)
 
-    def terms(shown):
-        image = jnp.asarray(shown.images)
+    def terms(split):
+        image = jnp.asarray(split.images)
         mask, color = image[..., 3], image[..., :3] * image[..., 3:]
-        compared = ImagePair(0.8 * color, color, 0.9 * mask, mask, None, jnp.zeros(()))
-        return np.array([image_l1(compared), mask_error(compared), image_dissimilarity(compared)])
+        pair = ImagePair(0.8 * color, color, 0.9 * mask, mask, None, jnp.zeros(()))
+        return np.array([image_l1(pair), mask_error(pair), image_dissimilarity(pair)])
 
     # SSIM is averaged over the pixels whose window of 11 x 11 pixels fits into the image.
-    inner = (windows.height - 10) * (windows.width - 10) / (SIZE - 10) ** 2
-    whole = terms(views)
-    assert (whole > 0).all()
-    np.testing.assert_allclose(np.array([share, share, inner]) * terms(windows), whole, rtol=1e-5)
+    inner_share = (windows.height - 10) * (windows.width - 10) / (SIZE - 10) ** 2
+    photograph_terms = terms(views)
+    assert (photograph_terms > 0).all()
+    np.testing.assert_allclose(
+        np.array([share, share, inner_share]) * terms(windows), photograph_terms, rtol=1e-5
+    )
 
 
 def test_terms_of_pixels_count_by_their_share_of_the_photograph():
@@ -107,22 +112,22 @@ def test_terms_of_pixels_count_by_their_share_of_the_photograph():
         "stages.split_sum.weights.encoded_l1=0.4",
     )
     pipeline, _ = ball(config)
-    whole, cut = (
+    full_weights, window_weights = (
         pipeline_at(pipeline, config, config.stages[0], 0, share=share).weights
         for share in (1.0, 0.25)
     )
-    assert {"encoded_l1", "albedo_smoothness"} <= whole.keys()
-    for name, weight in whole.items():
+    assert {"encoded_l1", "albedo_smoothness"} <= full_weights.keys()
+    for name, weight in full_weights.items():
         expected = 0.25 if name in ("l1", "ssim", "mask", "encoded_l1") else 1.0
-        assert float(cut[name]) == pytest.approx(expected * float(weight))
+        assert float(window_weights[name]) == pytest.approx(expected * float(weight))
 
 
 def test_differences_inside_the_mask_are_those_of_the_photograph(views):
     windows, share = around_object(views, largest=0.5)
     assert share < 0.4
 
-    def smoothness(shown):
-        images = jnp.asarray(np.array(shown.images))
+    def smoothness(split):
+        images = jnp.asarray(np.array(split.images))
         return float(edge_aware_smoothness(images[..., :3] ** 2, images, relative=0.5))
 
     assert smoothness(windows) == pytest.approx(smoothness(views), rel=1e-5)
@@ -141,10 +146,10 @@ def test_a_share_counts_the_pixels_that_count(views):
     views = replace(views, valid=valid)
     windows, share = around_object(views, largest=0.5)
 
-    def error(shown):
-        images, counts = jnp.asarray(np.array(shown.images)), jnp.asarray(np.array(shown.valid))
+    def error(split):
+        images, counts = jnp.asarray(np.array(split.images)), jnp.asarray(np.array(split.valid))
         mask, color = images[..., 3], images[..., :3] * images[..., 3:]
-        compared = ImagePair(0.8 * color, color, mask, mask, counts, jnp.zeros(()))
-        return float(image_l1(compared))
+        pair = ImagePair(0.8 * color, color, mask, mask, counts, jnp.zeros(()))
+        return float(image_l1(pair))
 
     assert share * error(windows) == pytest.approx(error(views), rel=0.02)

@@ -38,13 +38,13 @@ def face_splats(points, normals, *, preset):
             delta = weighted(b[k] - b[j], points)
             normal = normalize(weighted(middle, normals))
             up = normalize(area_vector) if preset == "code" else normal
-            along = normalize(delta - dot(delta, up) * up)
+            tangent = normalize(delta - dot(delta, up) * up)
             means.append(weighted(middle, points))  # Eq. 8
             shading.append(normal)
             scale_x = ALPHA[ring] * length(delta) / 2  # Eq. 9
             scale_y = 2 * area / (BETA[ring] * length(delta))  # Eq. 10
             scales.append([scale_x, scale_y, THICKNESS + 0 * area])
-            columns = (along, cross(up, along), up)  # Eq. 11
+            columns = (tangent, cross(up, tangent), up)  # Eq. 11
             rotations.append([[column[i] for column in columns] for i in range(3)])
     return {
         "means": np.array(means),
@@ -56,11 +56,14 @@ def face_splats(points, normals, *, preset):
 
 def mesh_splats(vertices, normals, *, faces, preset):
     """Splats of all faces, six a face in their order."""
-    parts = [
+    splats_by_face = [
         face_splats([vertices[n] for n in face], [normals[n] for n in face], preset=preset)
         for face in faces
     ]
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return {
+        name: np.concatenate([splats[name] for splats in splats_by_face])
+        for name in splats_by_face[0]
+    }
 
 
 def vertex_radii(vertices, normals, *, faces):

@@ -26,8 +26,8 @@ def evaluate(albedo, roughness, metallic, normal, wi, wo):
     alpha = floored * floored
     half = normalize(light + view)
     cosine_h = dot(n, half)
-    spread = cosine_h * cosine_h * (alpha * alpha - 1) + 1
-    distribution = alpha * alpha / (np.pi * spread * spread)
+    denominator = cosine_h * cosine_h * (alpha * alpha - 1) + 1
+    distribution = alpha * alpha / (np.pi * denominator * denominator)
     masking = 1 / (1 + smith_lambda(cosine_i, alpha) + smith_lambda(cosine_o, alpha))
     f0 = 0.04 * (1 - metallic) + albedo * metallic
     fresnel = f0 + (1 - f0) * (1 - dot(light, half)) ** 5

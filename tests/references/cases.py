@@ -135,13 +135,13 @@ def splat_case():
     random = np.random.RandomState(4)
     cotangents = {k: coarse(random.normal(size=outputs[k].shape)) for k in ("image", "alpha")}
     gradients = gradient(lambda **x: contract(cotangents, draw(**x)), inputs)
-    visible = sorted(outputs["footprints"])
+    visible_rows = sorted(outputs["footprints"])
     footprints = {
-        name: np.array([outputs["footprints"][n][name] for n in visible])
+        name: np.array([outputs["footprints"][n][name] for n in visible_rows])
         for name in ("means2d", "conics", "depths", "compensation", "clamped_axes")
     }
     values = {k: outputs[k] for k in ("image", "alpha")} | footprints
-    return packed(inputs, values, cotangents, gradients, visible=visible, **outputs["events"])
+    return packed(inputs, values, cotangents, gradients, visible=visible_rows, **outputs["events"])
 
 
 # Adapter
@@ -219,14 +219,17 @@ def bsdf_case():
     outputs = bsdf.evaluate_rows(**inputs)
     random = np.random.RandomState(8)
     cotangents = {k: coarse(random.normal(size=v.shape)) for k, v in outputs.items()}
-    parts = []
+    row_gradients = []
     for n in range(64):  # the rows are independent of each other
         row = {k: v[n : n + 1] for k, v in inputs.items()}
         weight = {k: v[n : n + 1] for k, v in cotangents.items()}
-        parts.append(
+        row_gradients.append(
             gradient(lambda weight=weight, **x: contract(weight, bsdf.evaluate_rows(**x)), row)
         )
-    gradients = {name: np.concatenate([part[name] for part in parts]) for name in inputs}
+    gradients = {
+        name: np.concatenate([row_gradient[name] for row_gradient in row_gradients])
+        for name in inputs
+    }
     return packed(inputs, outputs, cotangents, gradients)
 
 

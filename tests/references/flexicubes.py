@@ -34,10 +34,10 @@ def pairs_on_face(corners, inside, cut_around):
     ``inside`` equals ``cut_around``.
     """
     sides = [tuple(sorted((corners[n], corners[(n + 1) % 4]))) for n in range(4)]
-    crossed = [n for n in range(4) if inside[sides[n][0]] != inside[sides[n][1]]]
-    if len(crossed) == 2:
-        return [(sides[crossed[0]], sides[crossed[1]])]
-    if len(crossed) == 4:
+    crossed_sides = [n for n in range(4) if inside[sides[n][0]] != inside[sides[n][1]]]
+    if len(crossed_sides) == 2:
+        return [(sides[crossed_sides[0]], sides[crossed_sides[1]])]
+    if len(crossed_sides) == 4:
         return [(sides[n - 1], sides[n]) for n in range(4) if inside[corners[n]] == cut_around]
     return []
 
@@ -48,12 +48,14 @@ def patches(inside, cut_around=True):
     for face in range(6):
         for first, second in pairs_on_face(around_face(face // 2, face % 2), inside, cut_around):
             partner[face, first], partner[face, second] = second, first
-    faces_of = {edge: [face for face, other in partner if other == edge] for _, edge in partner}
+    faces_of = {
+        edge: [face for face, joined_edge in partner if joined_edge == edge] for _, edge in partner
+    }
     loops = []
-    for start in sorted(faces_of):
-        if any(start in loop for loop in loops):
+    for start_edge in sorted(faces_of):
+        if any(start_edge in loop for loop in loops):
             continue
-        loop, edge, face = [], start, faces_of[start][0]
+        loop, edge, face = [], start_edge, faces_of[start_edge][0]
         while edge not in loop:
             loop.append(edge)
             edge = partner[face, edge]  # across this face ...
@@ -68,13 +70,13 @@ def pinched_faces(inside):
     If both cells at such a face were like this (the cases C16 and C19 of FlexiCubes), four quads
     would meet in the one edge between their dual vertices.
     """
-    found = []
+    faces = []
     for face in range(6):
         pairs = pairs_on_face(around_face(face // 2, face % 2), inside, True)
-        touched = {edge for pair in pairs for edge in pair}
-        if len(pairs) == 2 and any(touched <= set(loop) for loop in patches(inside)):
-            found.append((face // 2, face % 2))
-    return found
+        touched_edges = {edge for pair in pairs for edge in pair}
+        if len(pairs) == 2 and any(touched_edges <= set(loop) for loop in patches(inside)):
+            faces.append((face // 2, face % 2))
+    return faces
 
 
 def cell_corners(cell):
@@ -85,15 +87,17 @@ def cell_patches(inside, shape):
     """Patches of every cell, {cell: [edges, ...]}, and the cells that were changed for a clash."""
     cells = [(i, j, k) for k in range(shape[2]) for j in range(shape[1]) for i in range(shape[0])]
     signs = {cell: [inside[corner] for corner in cell_corners(cell)] for cell in cells}
-    result, changed = {}, []
+    result, changed_cells = {}, []
     for cell in cells:
         clashes = False
         for axis, side in pinched_faces(signs[cell]):
-            other = tuple(x + (2 * side - 1) * (a == axis) for a, x in enumerate(cell))
-            clashes |= other in signs and (axis, 1 - side) in pinched_faces(signs[other])
+            adjacent_cell = tuple(x + (2 * side - 1) * (a == axis) for a, x in enumerate(cell))
+            clashes |= adjacent_cell in signs and (axis, 1 - side) in pinched_faces(
+                signs[adjacent_cell]
+            )
         result[cell] = patches(signs[cell], cut_around=not clashes)
-        changed += [cell] * clashes
-    return result, changed
+        changed_cells += [cell] * clashes
+    return result, changed_cells
 
 
 def zero_crossing(start, end, low, high):
@@ -113,8 +117,8 @@ def dual_vertex(loop, values, positions, alpha, beta):
     vertex = total / weight
     distances = []
     for a, b in loop:
-        plain = zero_crossing(positions[a], positions[b], values[a], values[b])
-        distances.append(length(plain - vertex))
+        plain_crossing = zero_crossing(positions[a], positions[b], values[a], values[b])
+        distances.append(length(plain_crossing - vertex))
     mean = sum(distances) / len(distances)
     return vertex, [magnitude(distance - mean) for distance in distances]
 
@@ -133,8 +137,8 @@ def quads(inside, shape, patch_of):
                 cell = list(lower)
                 cell[u] += du
                 cell[v] += dv
-                start = -du * 2**u - dv * 2**v  # the edge's lower end, as a corner of this cell
-                corners.append(patch_of.get((tuple(cell), (start, start + 2**axis))))
+                corner = -du * 2**u - dv * 2**v  # the edge's lower end, as a corner of this cell
+                corners.append(patch_of.get((tuple(cell), (corner, corner + 2**axis))))
             if None in corners:
                 continue  # at the border of the grid
             # Counter-clockwise seen from the upper end; the surface must face what is outside.
@@ -146,11 +150,11 @@ def fans(corners_of_quads, vertices, gammas, middle):
     """Four triangles a quad, around a centre that blends the middles of both diagonals."""
     centres, faces = [], []
     for a, b, c, d in corners_of_quads:
-        first, second = gammas[a] * gammas[c], gammas[b] * gammas[d]
+        weight_ac, weight_bd = gammas[a] * gammas[c], gammas[b] * gammas[d]
         offsets = [(vertices[m] + vertices[n]) / 2 - middle for m, n in ((a, c), (b, d))]
-        blended = first * offsets[0] + second * offsets[1]
+        blended = weight_ac * offsets[0] + weight_bd * offsets[1]
         row = len(vertices) + len(centres)
-        centres.append(middle + blended / (first + second + SPLIT_EPSILON))
+        centres.append(middle + blended / (weight_ac + weight_bd + SPLIT_EPSILON))
         faces += [(p, q, row) for p, q in ((a, b), (b, c), (c, d), (d, a))]
     return centres, faces
 
@@ -159,9 +163,9 @@ def halves(corners_of_quads, gammas):
     """Two triangles a quad, along the diagonal with the larger weight."""
     faces = []
     for a, b, c, d in corners_of_quads:
-        first, second = real(gammas[a] * gammas[c]), real(gammas[b] * gammas[d])
-        assert not math.isclose(first, second, rel_tol=1e-6), "the split is a tie"
-        faces += [(a, b, c), (a, c, d)] if first > second else [(a, b, d), (b, c, d)]
+        weight_ac, weight_bd = real(gammas[a] * gammas[c]), real(gammas[b] * gammas[d])
+        assert not math.isclose(weight_ac, weight_bd, rel_tol=1e-6), "the split is a tie"
+        faces += [(a, b, c), (a, c, d)] if weight_ac > weight_bd else [(a, b, d), (b, c, d)]
     return faces
 
 
@@ -176,14 +180,14 @@ def isosurface(sdf, deform, alpha, beta, gamma, origin, cell_size, *, shape, tra
     number of dual vertices (which come first), and the cells changed for a clash.
     """
     vertices_along = [n + 1 for n in shape]
-    number, position, inside = {}, {}, {}
+    vertex_numbers, positions, inside = {}, {}, {}
     for k, j, i in np.ndindex(*vertices_along[::-1]):
         n = i + vertices_along[0] * (j + vertices_along[1] * k)
-        number[i, j, k], inside[i, j, k] = n, real(sdf[n]) < 0
-        moved = [x + 0.5 * np.tanh(deform[n][a]) for a, x in enumerate((i, j, k))]
-        position[i, j, k] = np.array([origin[a] + cell_size * moved[a] for a in range(3)])
+        vertex_numbers[i, j, k], inside[i, j, k] = n, real(sdf[n]) < 0
+        coordinates = [x + 0.5 * np.tanh(deform[n][a]) for a, x in enumerate((i, j, k))]
+        positions[i, j, k] = np.array([origin[a] + cell_size * coordinates[a] for a in range(3)])
 
-    loops, changed = cell_patches(inside, shape)
+    loops, changed_cells = cell_patches(inside, shape)
     vertices, gammas, patch_of, deviations = [], [], {}, []
     for cell, cell_loops in loops.items():
         n = cell[0] + shape[0] * (cell[1] + shape[1] * cell[2])
@@ -191,8 +195,8 @@ def isosurface(sdf, deform, alpha, beta, gamma, origin, cell_size, *, shape, tra
         for loop in cell_loops:
             vertex, deviation = dual_vertex(
                 loop,
-                [sdf[number[corner]] for corner in corners],
-                [position[corner] for corner in corners],
+                [sdf[vertex_numbers[corner]] for corner in corners],
+                [positions[corner] for corner in corners],
                 [np.tanh(w) * 0.99 + 1 for w in alpha[n]],
                 [np.tanh(w) * 0.99 + 1 for w in beta[n]],
             )
@@ -214,7 +218,7 @@ def isosurface(sdf, deform, alpha, beta, gamma, origin, cell_size, *, shape, tra
         "faces": np.array(faces),
         "deviation": np.array(sum(deviations) / len(deviations)),
         "dual_count": dual_count,
-        "changed": changed,
+        "changed": changed_cells,
     }
 
 

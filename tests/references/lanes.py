@@ -57,15 +57,17 @@ def gradient(function, inputs):
     """
     result = {}
     for name, value in inputs.items():
-        flat = []
+        flat_gradient = []
         for start in range(0, value.size, LANES):
             count = min(LANES, value.size - start)
-            moved = {key: np.repeat(x[..., None], count, axis=-1) for key, x in inputs.items()}
+            complex_inputs = {
+                key: np.repeat(x[..., None], count, axis=-1) for key, x in inputs.items()
+            }
             step = np.zeros((value.size, count))
             step[start + np.arange(count), np.arange(count)] = STEP
-            moved[name] = moved[name] + 1j * step.reshape(*value.shape, count)
-            flat.append(np.imag(np.broadcast_to(function(**moved), count)) / STEP)
-        result[name] = np.concatenate(flat).reshape(value.shape)
+            complex_inputs[name] = complex_inputs[name] + 1j * step.reshape(*value.shape, count)
+            flat_gradient.append(np.imag(np.broadcast_to(function(**complex_inputs), count)) / STEP)
+        result[name] = np.concatenate(flat_gradient).reshape(value.shape)
     return result
 
 
@@ -73,11 +75,11 @@ def difference(function, inputs, directions, *, step=1e-3):
     """Derivative along a direction by central differences, extrapolated twice (Richardson)."""
 
     def central(size):
-        ends = [
+        values = [
             function(**{k: x + sign * size * directions[k] for k, x in inputs.items()})
             for sign in (1, -1)
         ]
-        return (ends[0] - ends[1]) / (2 * size)
+        return (values[0] - values[1]) / (2 * size)
 
     table = [central(step / 2**k) for k in range(3)]
     for order in (1, 2):

@@ -25,14 +25,14 @@ def brute_force(surface, origins, directions, source, *, two_sided, t_min, also=
     normal = np.cross(b - a, c - a)
     distance = np.full(len(origins), np.inf)
     face = np.full(len(origins), -1)
-    unclear = np.zeros(len(origins), bool)
+    is_unclear = np.zeros(len(origins), bool)
     origins, directions = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
     for ray, (o, d) in enumerate(zip(origins, directions, strict=True)):
-        along = normal @ d
+        denominators = normal @ d
         size = np.linalg.norm(normal, axis=1)
-        usable = np.abs(along) > 1e-12 * size
+        is_usable = np.abs(denominators) > 1e-12 * size
         with np.errstate(divide="ignore", invalid="ignore"):
-            t = np.where(usable, np.sum(normal * (a - o), axis=1) / along, np.inf)
+            t = np.where(is_usable, np.sum(normal * (a - o), axis=1) / denominators, np.inf)
             p = o + np.where(np.isfinite(t), t, 0)[:, None] * d
             squared = np.sum(normal**2, axis=1)
             w = np.stack(
@@ -44,19 +44,19 @@ def brute_force(surface, origins, directions, source, *, two_sided, t_min, also=
             ) / np.where(squared > 0, squared, 1)
         margin = np.min(w, axis=0)
         # Seen at a slant, an error across the ray moves the point of a triangle further.
-        slack = EDGE * size / np.maximum(np.abs(along), np.maximum(1e-12 * size, 1e-300))
-        ahead = np.isfinite(t) & (t > 0.5 * t_min) & (np.arange(len(a)) != source[ray])
-        ahead &= np.arange(len(a)) != also[ray]
-        allowed = np.ones(len(a), bool) if two_sided else along < 0
-        hit = ahead & allowed & (margin >= 0) & (t > t_min)
-        close = ahead & (np.abs(margin) < slack) & (np.max(np.abs(w), axis=0) < 1 + slack)
-        close |= ahead & (margin > -slack) & (np.abs(t - t_min) < 0.05 * t_min)
-        close |= (np.abs(along) < 1e-3 * size) & (margin > -1)
-        if hit.any():
-            face[ray] = np.argmin(np.where(hit, t, np.inf))
+        slack = EDGE * size / np.maximum(np.abs(denominators), np.maximum(1e-12 * size, 1e-300))
+        is_ahead = np.isfinite(t) & (t > 0.5 * t_min) & (np.arange(len(a)) != source[ray])
+        is_ahead &= np.arange(len(a)) != also[ray]
+        is_facing = np.ones(len(a), bool) if two_sided else denominators < 0
+        is_hit = is_ahead & is_facing & (margin >= 0) & (t > t_min)
+        is_close = is_ahead & (np.abs(margin) < slack) & (np.max(np.abs(w), axis=0) < 1 + slack)
+        is_close |= is_ahead & (margin > -slack) & (np.abs(t - t_min) < 0.05 * t_min)
+        is_close |= (np.abs(denominators) < 1e-3 * size) & (margin > -1)
+        if is_hit.any():
+            face[ray] = np.argmin(np.where(is_hit, t, np.inf))
             distance[ray] = t[face[ray]]
-        unclear[ray] = np.any(close & (t <= distance[ray] * (1 + 1e-5) + 1e-6))
-    return distance, face, unclear
+        is_unclear[ray] = np.any(is_close & (t <= distance[ray] * (1 + 1e-5) + 1e-6))
+    return distance, face, is_unclear
 
 
 def unit(vectors):
@@ -66,17 +66,17 @@ def unit(vectors):
 def rays_of_kind(kind, surface, rng, count):
     """Origins, directions and source faces."""
     corners = triangles(surface)
-    nowhere = np.full(count, -1)
+    no_faces = np.full(count, -1)
     if kind == "through the box":
-        return rng.uniform(-1.5, 1.5, (count, 3)), unit(rng.normal(size=(count, 3))), nowhere
+        return rng.uniform(-1.5, 1.5, (count, 3)), unit(rng.normal(size=(count, 3))), no_faces
     if kind == "along axes":
         axis = np.eye(3)[rng.integers(0, 3, count)] * rng.choice([-1.0, 1.0], (count, 1))
-        return rng.uniform(-1.0, 1.0, (count, 3)) - 2.0 * axis, axis, nowhere
+        return rng.uniform(-1.0, 1.0, (count, 3)) - 2.0 * axis, axis, no_faces
     if kind == "along planes":
         directions = rng.normal(size=(count, 3))
         directions[np.arange(count), rng.integers(0, 3, count)] = 0.0
         directions = unit(directions)
-        return rng.uniform(-0.8, 0.8, (count, 3)) - 1.5 * directions, directions, nowhere
+        return rng.uniform(-0.8, 0.8, (count, 3)) - 1.5 * directions, directions, no_faces
     faces = rng.integers(0, len(corners), count)
     weights = rng.dirichlet([1, 1, 1], count)
     origins = np.einsum("nk,nkd->nd", weights, corners[faces])
@@ -85,6 +85,6 @@ def rays_of_kind(kind, surface, rng, count):
     directions = unit(rng.normal(size=(count, 3)))
     directions *= np.where(np.sum(directions * normals, axis=1) < 0, -1, 1)[:, None]
     if kind == "grazing":
-        flat = directions - np.sum(directions * normals, axis=1, keepdims=True) * normals
-        directions = unit(unit(flat) + 0.02 * normals)
+        tangents = directions - np.sum(directions * normals, axis=1, keepdims=True) * normals
+        directions = unit(unit(tangents) + 0.02 * normals)
     return origins, directions, faces

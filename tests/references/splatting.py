@@ -41,24 +41,23 @@ def clamp(x, low, high):
 
 def project(mean, quat, scale, world_to_camera, intrinsics, *, height, width):
     """Footprint of one splat: means2d, conics (xx, xy, yy), depths, compensation."""
-    turn = world_to_camera[:3, :3]
+    camera_rotation = world_to_camera[:3, :3]
     x, y, z = (
-        sum(turn[i, j] * mean[j] for j in range(3)) + world_to_camera[i, 3] for i in range(3)
+        sum(camera_rotation[i, j] * mean[j] for j in range(3)) + world_to_camera[i, 3]
+        for i in range(3)
     )
     fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
 
     # The Jacobian of (x/z, y/z), at a point moved to within 1.3 times the field of view.
-    beyond_x = (FIELD_OF_VIEW - 1) * 0.5 * width / fx
-    beyond_y = (FIELD_OF_VIEW - 1) * 0.5 * height / fy
+    margin_x = (FIELD_OF_VIEW - 1) * 0.5 * width / fx
+    margin_y = (FIELD_OF_VIEW - 1) * 0.5 * height / fy
     plain_x, plain_y = x / z, y / z
-    slope_x = clamp(plain_x, -cx / fx - beyond_x, (width - cx) / fx + beyond_x)
-    slope_y = clamp(plain_y, -cy / fy - beyond_y, (height - cy) / fy + beyond_y)
-    nothing = 0 * z
-    jacobian = np.array(
-        [[fx / z, nothing, -fx * slope_x / z], [nothing, fy / z, -fy * slope_y / z]]
-    )
+    slope_x = clamp(plain_x, -cx / fx - margin_x, (width - cx) / fx + margin_x)
+    slope_y = clamp(plain_y, -cy / fy - margin_y, (height - cy) / fy + margin_y)
+    zero = 0 * z
+    jacobian = np.array([[fx / z, zero, -fx * slope_x / z], [zero, fy / z, -fy * slope_y / z]])
 
-    axes = product(turn, rotation(quat))
+    axes = product(camera_rotation, rotation(quat))
     axes = np.array([[axes[i, j] * scale[j] for j in range(3)] for i in range(3)])
     covariance = product(axes, transpose(axes))
     image = product(product(jacobian, covariance), transpose(jacobian))
@@ -94,8 +93,8 @@ def render(
     (H, W); the footprints of the visible rows; how often the thresholds acted on a pair of a
     splat and a pixel, and the smallest relative distance to them.
     """
-    turn, shift = world_to_camera[2, :3], world_to_camera[2, 3]
-    depths = [real(sum(turn[j] * mean[j] for j in range(3)) + shift) for mean in means]
+    depth_axis, depth_offset = world_to_camera[2, :3], world_to_camera[2, 3]
+    depths = [real(sum(depth_axis[j] * mean[j] for j in range(3)) + depth_offset) for mean in means]
     order = [n for n in np.argsort(depths, kind="stable") if depths[n] > near]
     frame = {"height": height, "width": width}
     footprints = {
