@@ -5,12 +5,10 @@ import sys
 from pathlib import Path
 
 # Set before jax reads it. The tests check laws, not speed: code that the compiler has not optimized
-# keeps them as well, and the tests take two thirds of the time. Three quarters of a compilation are
-# the lowering of fusions, so single instructions are not wrapped as fusions, either.
+# keeps them as well, and the tests take two thirds of the time.
 os.environ.setdefault(
     "XLA_FLAGS",
-    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-    " --xla_disable_hlo_passes=fusion-wrapper",
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true",
 )
 
 import jax

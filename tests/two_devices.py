@@ -13,7 +13,6 @@ from pathlib import Path
 
 os.environ["XLA_FLAGS"] = (
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-    " --xla_disable_hlo_passes=fusion-wrapper"
 )
 
 import jax
