@@ -298,7 +298,7 @@ def read_sweep(
     config_options = {
         "preset": values.get("preset", "default"),
         "quality": quality or values.get("quality", "standard"),
-        "material_prior": values.get("material_prior", "hybrid"),
+        "material_prior": values.get("material_prior"),
         "overrides": (*values.get("set", ()), *overrides),
     }
     mesh = values.get("mesh", "") if mesh is None else mesh
@@ -314,7 +314,7 @@ def read_sweep(
         file=path.name,
         title=values["title"],
         about=values.get("about", "").strip(),
-        **config_options,
+        **config_options | {"material_prior": base.material_prior},
         scenes=tuple(values["scenes"]),
         figures=tuple(values["figures"]),
         samples=values.get("samples", DEFAULT_SAMPLES),

@@ -33,7 +33,7 @@ def rounds_folder(output: str | Path) -> Path:
     return folder_beside(output, "cameras")
 
 
-def round_config(material_prior: str = "hybrid", *, seed: int | None = None) -> Config:
+def round_config(material_prior: str | None = None, *, seed: int | None = None) -> Config:
     """Return the settings of a round: a draft with half its split sum and no refinement.
 
     What rounds recover was measured with these settings (docs/cameras.md); longer rounds and free

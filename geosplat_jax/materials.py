@@ -39,13 +39,15 @@ MATERIAL_PRIORS: dict[str, tuple[float, float]] = {
     "hybrid": (-3.0, -3.0),
     "specular": (-3.0, 0.0),
     "glossy": (-3.0, 0.0),
+    "satin": (-1.2, -3.0),
     "neutral": (-1.2, -1.0),
 }
 """Initial logits (roughness, metallic) for a guess about the material, by name.
 
-All but ``neutral`` are those of the authors' code. ``neutral`` starts at roughness .31 and metallic
-.27, which is nearer to most objects. A logit of 0 starts at roughness 0.55 or metallic 0.5; one of
--3 at roughness 0.14 or metallic 0.05.
+All but ``satin`` and ``neutral`` are those of the authors' code. These two start at roughness .31,
+which is nearer to most objects: ``satin`` as a dielectric (metallic .05), ``neutral`` between
+dielectrics and metals (.27). A logit of 0 starts at roughness 0.55 or metallic 0.5; one of -3 at
+roughness 0.14 or metallic 0.05.
 """
 
 

@@ -465,7 +465,7 @@ def plan_training(
     scene: str | Path | Dataset,
     budget: Budget,
     *,
-    material_prior: str = "hybrid",
+    material_prior: str | None = None,
     mesh: str | Path | MeshSettings | None = None,
     overrides: Sequence[str] = (),
     downscale: int | None = None,

@@ -20,7 +20,13 @@ from geosplat_jax.fit.config import (
     moved_setting,
     parse_override,
 )
-from geosplat_jax.fit.presets import PRESETS, QUALITIES, make_config
+from geosplat_jax.fit.presets import (
+    PRESET_PRIORS,
+    PRESETS,
+    QUALITIES,
+    between_qualities,
+    make_config,
+)
 from geosplat_jax.losses import Schedule
 from geosplat_jax.materials import MATERIAL_PRIORS
 from geosplat_jax.transport.monte_carlo import MonteCarloSettings
@@ -363,6 +369,19 @@ def test_a_prior_sets_the_first_roughness_and_metallic(prior):
     material = make_config(material_prior=prior).material
     logits = (material.initial_roughness_logit, material.initial_metallic_logit)
     assert logits == MATERIAL_PRIORS[prior]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("quality", QUALITIES)
+def test_without_a_prior_a_preset_takes_its_own(preset, quality):
+    config = make_config(preset, quality)
+    assert config == make_config(preset, quality, material_prior=PRESET_PRIORS[preset])
+    assert config.material_prior == ("satin" if preset == "default" else "hybrid")
+
+
+def test_between_qualities_the_prior_is_that_of_the_default_preset():
+    assert between_qualities(0.5).material_prior == "satin"
+    assert between_qualities(0.5, material_prior="neutral").material_prior == "neutral"
 
 
 def test_an_override_is_toml_or_a_bare_word():

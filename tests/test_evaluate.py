@@ -331,6 +331,36 @@ def test_a_view_without_an_object_has_no_part_in_masked_metrics(run, views, tmp_
         assert metrics["mean"][key] == with_object[key]
 
 
+def test_a_view_without_an_object_has_no_part_in_means(run, views, tmp_path):
+    def hidden(values):
+        values = np.array(values)
+        values[1] = 0.0
+        return values
+
+    # The second camera looks away, so that its render is as empty as its photograph.
+    poses = np.array(views.camera_to_world)
+    poses[1, :3, :3] = poses[1, :3, :3] @ np.diag([-1.0, 1.0, -1.0])
+    true_albedo = views.truth["albedo"][:, ::-1]  # upside down, so that there are errors
+    partly_empty = replace(
+        views,
+        camera_to_world=poses,
+        images=hidden(views.images),
+        truth={"albedo": hidden(true_albedo), "roughness": hidden(0.5 * views.truth["roughness"])},
+        relight={"noon": hidden(0.9 * views.relight["noon"])},
+    )
+    metrics = evaluate(run, partly_empty, tmp_path)
+    with_object, empty = metrics["views"]
+    assert empty["nvs.psnr"] > 150
+    for key in NEW_VIEWS:
+        assert metrics["mean"][key] == with_object[key]
+    for key in ("albedo.psnr", "relight.noon.psnr"):
+        assert 5 < metrics["mean"][key] < 60  # half of 200 dB would be more
+    errors = 0.5 * views.truth["roughness"][0] * views.images[0, ..., 3:]
+    expected = pytest.approx(np.mean(errors**2), rel=1e-3)
+    assert metrics["mean"]["roughness.mse_full"] == expected
+    assert f"{views.names[1]}: the mask is empty, so it has no part in means" in metrics["notes"]
+
+
 def test_pixels_that_do_not_count_have_no_part_in_any_figure(run, views, perfect, tmp_path):
     valid = np.ones(views.masks.shape, np.float32)
     valid[:, :, :7] = 0.0

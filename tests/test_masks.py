@@ -1,5 +1,6 @@
 """Masks of captures: the proposed box, the written files, and refused input."""
 
+import shlex
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -25,6 +26,7 @@ from geosplat_jax.capture.masks import OPAQUE, choose_factor, make_masks, photog
 from geosplat_jax.capture.settings import RadianceSettings
 from geosplat_jax.capture.start import CaptureError
 from geosplat_jax.capture.training import Radiance
+from geosplat_jax.fit.folder import RunError
 from geosplat_jax.fit.train import TrainingError
 from geosplat_jax.io.dataset import load_dataset
 from geosplat_jax.io.frames import Frame
@@ -186,7 +188,12 @@ def capture(tmp_path, monkeypatch):
     """A capture without masks; known splats stand in for the training of splats."""
     root = tmp_path / "scene"
     write_transforms(root, masks=None)
-    monkeypatch.setattr(masks_module, "train_radiance", lambda *a, **b: a_ball_before_a_wall())
+
+    def train_radiance(views, settings, folder, **options):
+        (folder / masks_module.RECORD).write_text("{}")
+        return a_ball_before_a_wall()
+
+    monkeypatch.setattr(masks_module, "train_radiance", train_radiance)
     monkeypatch.setattr(masks_module, "quality", lambda *a: np.array([20.0, 22.0]))
     (tmp_path / "run").mkdir()
     return root, tmp_path / "run"
@@ -283,6 +290,18 @@ def test_a_command_that_was_stopped_while_it_wrote_masks_goes_on(capture, monkey
     assert not list(run.glob("*begun*"))
 
 
+def test_only_one_process_writes_the_masks_of_a_folder(capture, monkeypatch):
+    root, run = capture
+
+    def written_by_two(radiance, views):
+        with pytest.raises(RunError, match="another process is writing"):
+            make_masks(read(root), SETTINGS, run, box=BOX, resume=True)
+        return np.array([20.0])
+
+    monkeypatch.setattr(masks_module, "quality", written_by_two)
+    assert make_masks(read(root), SETTINGS, run, box=BOX).masks == COUNT
+
+
 def test_boxes_and_masks_that_leave_nothing_are_refused(capture, monkeypatch):
     root, run = capture
     with pytest.raises(CaptureError, match="holds no splat; most of them lie between"):
@@ -348,6 +367,10 @@ def test_the_command_prints_how_sure_it_is(capture, capsys):
     output = capsys.readouterr().out
     for part in ("dB on views that are held back", "agreement:", "half-opaque", "masks.png"):
         assert part in output
+    again = shlex.join(["geosplat-jax", *command])
+    assert f"next: geosplat-jax train {root}; if not: {again} --resume --box ..." in output
+    assert cli.main([*command, "--resume", "--box", *box]) == 0
+    capsys.readouterr()
     assert cli.main(command) == 2
     assert "have a mask already" in capsys.readouterr().err
 
@@ -380,6 +403,19 @@ def test_specks_go_and_half_opaque_holes_are_filled():
     expected[0, 1:3, 1:3] = 0.0
     np.testing.assert_array_equal(actual, expected)
     assert masks_module.tidied(np.zeros((1, 3, 3), np.float32)).max() == 0.0
+
+
+def test_masks_are_cut_where_a_photograph_ends_within_its_canvas():
+    views = replace(ring(6), has_masks=False)
+    alpha = np.zeros((6, 40, 40), np.float32)
+    alpha[:, 10:20, 20:30] = 0.9
+    valid = np.zeros(alpha.shape, np.float32)
+    box = (np.full(3, -1.5), np.full(3, 1.5))
+    for columns, rows, length in ((31, 40, 0), (30, 40, 10), (30, 20, 19)):
+        valid[:] = 0.0
+        valid[:, :rows, :columns] = 1.0
+        certainty = masks_module.certainty(replace(views, valid=valid), alpha, box)
+        assert certainty.cut == pytest.approx(length / 36)
 
 
 def test_half_opaque_pixels_and_cut_masks_raise_warnings():

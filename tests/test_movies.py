@@ -127,6 +127,18 @@ def test_gif_of_equal_frames_and_of_one_frame_keep_their_time(tmp_path):
         assert np.abs(decoded_frames - frame).max() < 0.2
 
 
+def test_a_still_longer_than_gif_can_store_is_refused(tmp_path):
+    path, still, other = tmp_path / "a.gif", np.zeros((4, 5, 3)), np.ones((4, 5, 3))
+    write_movie(path, [other, *65 * [still], other, still], frames_per_second=0.1)
+    with Image.open(path) as film:
+        film.seek(1)
+        assert film.info["duration"] == 650_000
+    before = path.read_bytes()
+    with pytest.raises(SceneError, match="one picture for more than 655 s"):
+        write_movie(path, [other, *66 * [still], other], frames_per_second=0.1)
+    assert path.read_bytes() == before
+
+
 def test_upper_case_suffix_jax_arrays_and_values_outside_are_accepted(tmp_path):
     frames = [jnp.full((4, 4, 3), value) for value in (-0.5, 1.5)]
     write_movie(str(tmp_path / "film.GIF"), frames, frames_per_second=10)

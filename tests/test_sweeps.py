@@ -608,6 +608,7 @@ def test_the_bundled_sweeps_are_sound():
     assert stages["albedo-kept"].enter == ()
     assert read_sweep(SWEEPS / "smoke.toml").scenes == ("duck",)
     priors = read_sweep(SWEEPS / "priors.toml")
+    assert (sweep.material_prior, priors.material_prior) == ("satin", "hybrid")
     assert len(priors.runs) == 21
     configs = {run.name: priors.config(run) for run in priors.runs}
     assert [name for name, config in configs.items() if not config.material.bias] == ["no-biases"]

@@ -26,6 +26,7 @@ from geosplat_jax.capture.box import (
 from geosplat_jax.capture.settings import RadianceSettings
 from geosplat_jax.capture.start import CaptureError, require_trainable
 from geosplat_jax.capture.training import (
+    RECORD,
     Radiance,
     quality,
     render_views,
@@ -33,6 +34,7 @@ from geosplat_jax.capture.training import (
 )
 from geosplat_jax.core.harmonics import CONSTANT
 from geosplat_jax.core.types import Bounds
+from geosplat_jax.fit.folder import locked_folder
 from geosplat_jax.fit.listener import Progress
 from geosplat_jax.io.agreement import agreement
 from geosplat_jax.io.dataset import LAYOUTS, Dataset, recognise_layout
@@ -195,7 +197,6 @@ def make_masks(
     folder = Path(folder)
     frames = _frames(dataset)
     require_trainable(dataset.train)
-    files = [mask_file(dataset.root, frame.image) for frame in frames]
     _require_free(frames, folder, resume=resume, force=force)
     if box is not None and not (np.asarray(box[0]) < np.asarray(box[1])).all():
         raise CaptureError(f"the box must be lo (x, y, z) below hi (x, y, z), got {box}")
@@ -208,10 +209,28 @@ def make_masks(
         replace_run=force,
         on_step=on_step,
     )
+    with locked_folder(folder, own=folder / RECORD):
+        return _write_masks(
+            radiance, dataset, frames, folder, box=box, downscale=downscale, seed=settings.seed
+        )
+
+
+def _write_masks(
+    radiance: Radiance,
+    dataset: Dataset,
+    frames: Sequence[Frame],
+    folder: Path,
+    *,
+    box: Bounds | None,
+    downscale: int,
+    seed: int,
+) -> MaskReport:
+    """Write splats, masks, sheet and report, see `make_masks`."""
+    files = [mask_file(dataset.root, frame.image) for frame in frames]
     write_splats(radiance, folder / "splats.ply")
     psnr = float(quality(radiance, dataset.test).mean()) if len(dataset.test) else None
     views = _all_views(dataset)
-    clipped, (lo, hi), plane = _clipped(radiance, dataset.train, box, settings.seed)
+    clipped, (lo, hi), plane = _clipped(radiance, dataset.train, box, seed)
     write_splats(clipped, folder / "object.ply")
     alpha = _alphas(clipped, views, (lo, hi))
     # A command that is stopped between the first mask and the report can be resumed.
@@ -447,6 +466,12 @@ def photograph_mask(
     return resample(mask, reduced_lookup)[..., 0] > COVERED
 
 
+def _surrounded(pixels: Bool[np.ndarray, "V H W"]) -> Bool[np.ndarray, "V H W"]:
+    """Find the pixels whose four neighbours are all set; there are none beyond the border."""
+    padded = np.pad(pixels, ((0, 0), (1, 1), (1, 1)))
+    return padded[:, :-2, 1:-1] & padded[:, 2:, 1:-1] & padded[:, 1:-1, :-2] & padded[:, 1:-1, 2:]
+
+
 def certainty(views: Views, alpha: Float[np.ndarray, "V H W"], box: Bounds) -> Certainty:
     """Measure how sure masks are.
 
@@ -458,13 +483,11 @@ def certainty(views: Views, alpha: Float[np.ndarray, "V H W"], box: Bounds) -> C
     """
     masks = alpha > OPAQUE
     mask_area = int(masks.sum())
-    rims = (masks[:, 0], masks[:, -1], masks[:, :, 0], masks[:, :, -1])
-    border_count = sum(int(rim.sum()) for rim in rims)
-    around = np.pad(masks, ((0, 0), (1, 1), (1, 1)))
-    interior = around.copy()
-    for axis, step in ((1, 1), (1, -1), (2, 1), (2, -1)):
-        interior &= np.roll(around, step, axis)
-    rim = mask_area - int(interior.sum())
+    # Photographs end where pixels do not count, too: at padding, and at the border of an
+    # undistorted image.
+    counts = np.ones(masks.shape, bool) if views.valid is None else np.asarray(views.valid) > 0
+    border_count = int((masks & ~_surrounded(counts)).sum())
+    rim = int((masks & ~_surrounded(masks)).sum())
     rgba = np.concatenate([views.images[..., :3], masks[..., None].astype(np.float32)], axis=-1)
     masked = replace(views, images=rgba, has_masks=True)
     shares = agreement(masked, box)

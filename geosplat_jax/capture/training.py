@@ -567,7 +567,7 @@ def render_views(
 def quality(radiance: Radiance, views: Views) -> Float[np.ndarray, " V"]:
     """Return the PSNR of renders against photographs, (V,) decibels, in sRGB over black."""
     rgb, _ = render_views(radiance, views.camera())
-    truth = np.asarray(linear_to_srgb(jnp.asarray(views.images[..., :3])))
+    truth = np.asarray(linear_to_srgb(jnp.asarray(views.clipped(range(len(views)))[..., :3])))
     renders = np.clip(rgb, 0.0, 1.0)
     valid = np.ones(renders.shape[:3], np.float32) if views.valid is None else views.valid
     return np.array([float(psnr(*view)) for view in zip(renders, truth, valid, strict=True)])

@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 from geosplat_jax.capture.settings import RadianceSettings
 from geosplat_jax.fit.budget import parse_duration, parse_memory
-from geosplat_jax.fit.presets import PRESETS, QUALITIES
+from geosplat_jax.fit.presets import PRESET_PRIORS, PRESETS, QUALITIES
 from geosplat_jax.gradcheck.report import STAGES
 from geosplat_jax.io.poses import PoseSettings
 from geosplat_jax.materials import MATERIAL_PRIORS
@@ -494,8 +494,8 @@ def _add_config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--material-prior",
         choices=sorted(MATERIAL_PRIORS),
-        default="hybrid",
-        help="where roughness and metallic start (default: %(default)s)",
+        help="where roughness and metallic start (default: "
+        f"{PRESET_PRIORS['default']}; {PRESET_PRIORS['paper']} with the presets paper and code)",
     )
     parser.add_argument(
         "--set",

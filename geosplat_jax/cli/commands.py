@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import shlex
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from rich.text import Text
 
 from geosplat_jax.capture.masks import choose_factor, make_masks
 from geosplat_jax.capture.settings import RadianceSettings
+from geosplat_jax.cli.arguments import command_line
 from geosplat_jax.cli.display import ProgressDisplay, WorkDisplay, say, say_refined
 from geosplat_jax.cli.training import UsageError, config_from, require_place, scene_options, train
 from geosplat_jax.core.settings import as_written
@@ -130,10 +132,21 @@ def _masks(arguments: argparse.Namespace) -> None:
         )
     print("\n".join(report.lines()))
     print(f"sheet: {folder / 'masks.png'}; splats: {folder / 'splats.ply'}")
+    scene, options = str(arguments.scene), _masks_options(arguments)
     print(
-        "look at the sheet; if it is right, next: geosplat-jax train "
-        f"{arguments.scene}; if not: geosplat-jax masks {arguments.scene} --resume --box ..."
+        f"look at the sheet; if it is right, next: {shlex.join(['geosplat-jax', 'train', scene])}; "
+        f"if not: {shlex.join(['geosplat-jax', 'masks', scene, *options])} --resume --box ..."
     )
+
+
+def _masks_options(arguments: argparse.Namespace) -> list[str]:
+    """Return the options that another call needs to continue with the same splats."""
+    defaults = command_line().parse_args(["masks", str(arguments.scene)])
+    options: list[str] = []
+    for name in ("output", "steps", "splats", "downscale", "seed"):
+        if getattr(arguments, name) != getattr(defaults, name):
+            options += [f"--{name}", str(getattr(arguments, name))]
+    return options
 
 
 def _settings(arguments: argparse.Namespace) -> None:

@@ -156,7 +156,7 @@ def plan(
     size: tuple[int, int],
     *,
     slowness: float,
-    material_prior: str = "hybrid",
+    material_prior: str | None = None,
     mesh: str | Path | MeshSettings | None = None,
     overrides: Sequence[str] = (),
     downscale: int | None = None,

@@ -36,6 +36,8 @@ from geosplat_jax.transport.split_sum import SplitSumSettings
 
 PRESETS = ("default", "paper", "code")
 QUALITIES = ("draft", "standard", "high")
+PRESET_PRIORS = {"default": "satin", "paper": "hybrid", "code": "hybrid"}
+"""The material prior of each preset, where none is asked for."""
 BETWEEN = "between"
 """The label of settings that lie between the quality levels."""
 SPLIT_SUM, MONTE_CARLO, REFINE = "split_sum", "monte_carlo", "refine"
@@ -500,7 +502,7 @@ _ORIGINAL_DRAFT: dict[str, Any] = {
 def between_qualities(
     place: float,
     *,
-    material_prior: str = "hybrid",
+    material_prior: str | None = None,
     mesh: str | Path | MeshSettings | None = None,
     overrides: tuple[str, ...] = (),
 ) -> Config:
@@ -545,7 +547,7 @@ def make_config(
     preset: str = "default",
     quality: str = "standard",
     *,
-    material_prior: str = "hybrid",
+    material_prior: str | None = None,
     mesh: str | Path | MeshSettings | None = None,
     overrides: tuple[str, ...] = (),
 ) -> Config:
@@ -556,7 +558,8 @@ def make_config(
     preset : one of `PRESETS`.
     quality : one of `QUALITIES`. For the presets ``paper`` and ``code``, ``draft`` is a smaller
         version, and ``standard`` and ``high`` both stand for the original numbers.
-    material_prior : where roughness and metallic start, one of `materials.MATERIAL_PRIORS`.
+    material_prior : where roughness and metallic start, one of `materials.MATERIAL_PRIORS`; by
+        default that of the preset, see `PRESET_PRIORS`.
     mesh : file of a mesh to start from, see `with_mesh`.
     overrides : ``section.field=value`` strings, applied last.
 
@@ -570,6 +573,7 @@ def make_config(
         raise ValueError(f"preset must be one of {PRESETS}, got {preset!r}")
     if quality not in QUALITIES:
         raise ValueError(f"quality must be one of {QUALITIES}, got {quality!r}")
+    material_prior = PRESET_PRIORS[preset] if material_prior is None else material_prior
     if material_prior not in MATERIAL_PRIORS:
         raise ValueError(
             f"material_prior must be one of {sorted(MATERIAL_PRIORS)}, got {material_prior!r}"

@@ -30,6 +30,7 @@ _MAX_GIF_RATE, _MAX_MP4_RATE = 50.0, 1000.0
 
 # GIF counts hundredths of a second in sixteen bits.
 _MIN_RATE = 0.1
+_LONGEST_GIF_FRAME = 10 * (2**16 - 1)  # milliseconds
 
 # The shared palette is computed from at most this many pixels, spread over the whole film.
 _PALETTE_PIXELS = 1_000_000
@@ -131,12 +132,23 @@ def _gif_durations(count: int, rate: float) -> list[int]:
 
 def _write_gif(path: Path, frames: list[UInt8[np.ndarray, "H W 3"]], rate: float) -> None:
     palette = _shared_palette(frames)
+    durations = _gif_durations(len(frames), rate)
 
     def indexed() -> Iterator[Image.Image]:
-        for frame in frames:
-            yield Image.fromarray(frame).quantize(
+        shown, milliseconds = b"", 0  # of the frame that equal ones become a part of
+        for frame, duration in zip(frames, durations, strict=True):
+            image = Image.fromarray(frame).quantize(
                 palette=palette, dither=Image.Dither.FLOYDSTEINBERG
             )
+            pixels = image.tobytes()
+            milliseconds = milliseconds + duration if pixels == shown else duration
+            if milliseconds > _LONGEST_GIF_FRAME:
+                raise SceneError(
+                    f"{path} would show one picture for more than {_LONGEST_GIF_FRAME // 1000} s, "
+                    "the longest that GIF can store; give more frames per second, or write .mp4"
+                )
+            shown = pixels
+            yield image
 
     images = indexed()
     with written_aside(path) as temporary_path:
@@ -145,7 +157,7 @@ def _write_gif(path: Path, frames: list[UInt8[np.ndarray, "H W 3"]], rate: float
             format="GIF",
             save_all=True,
             append_images=images,
-            duration=_gif_durations(len(frames), rate),
+            duration=durations,
             loop=0,
             optimize=False,
         )
@@ -257,7 +269,8 @@ def write_movie(
     Raises
     ------
     SceneError : an unknown suffix, an unusable rate, no frames, or a frame of a wrong shape or
-        type, of another size, or with values that are not finite.
+        type, of another size, or with values that are not finite; a GIF in which equal frames
+        last longer than 655 seconds.
     MissingEncoderError : MP4 without an ``ffmpeg`` that has libx264.
     OSError : the file cannot be written.
     """

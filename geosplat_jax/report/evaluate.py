@@ -277,7 +277,8 @@ class _Measured(NamedTuple):
     Attributes
     ----------
     views : metrics of every view.
-    mean : mean over the views of every metric, and metrics over all views, by name.
+    mean : by name, the mean of every metric over the views with an object, and metrics of all views
+        together.
     rendered : see `_Rendered`.
     albedo_scale : (3,) factors that the albedo is aligned to the truth with.
     relit : pictures by title under each light, for every view that is shown.
@@ -288,6 +289,14 @@ class _Measured(NamedTuple):
     rendered: _Rendered
     albedo_scale: np.ndarray
     relit: list[dict[str, np.ndarray]]
+
+
+def _with_object(lines: list[dict[str, Any]], views: Views) -> list[dict[str, Any]]:
+    """Return the lines of the views whose mask is not empty; all lines, if every mask is.
+
+    Where neither mask nor render has an object, two equal backgrounds would count as 200 dB.
+    """
+    return [line for k, line in enumerate(lines) if views.mask(k).any()] or lines
 
 
 def _measure(
@@ -308,8 +317,9 @@ def _measure(
     )
     rendered = _render_all(renderer, views, sheet_indices, protocol, on_progress)
     lines = rendered.metrics
-    names = dict.fromkeys(key for line in lines for key in line if key != "view")
-    mean = {key: float(np.mean([line[key] for line in lines if key in line])) for key in names}
+    compared = _with_object(lines, views)
+    names = dict.fromkeys(key for line in compared for key in line if key != "view")
+    mean = {key: float(np.mean([line[key] for line in compared if key in line])) for key in names}
     materials, scale = _material_metrics(protocol, rendered, views)
     compiled.result()
     relights, relit_rows = _relight_metrics(
@@ -401,10 +411,10 @@ def evaluate_run(
 
     Writes ``metrics.json``, ``overview.png`` and, where the scene has the ground truth,
     ``materials.png`` and ``relight.png``; also every picture as a file (see `gallery`). New views
-    are always compared in sRGB on white; their metrics are means over the images. Normals are
-    compared twice: over the pixels of the mask, and over all pixels, with (0, 0, 1) as normal of
-    the background. Pixels that do not count are left out of all metrics, and are empty on the
-    sheets. All other choices are those of the protocol, see `protocols`.
+    are always compared in sRGB on white; their metrics are means over the images in which the mask
+    is not empty. Normals are compared twice: over the pixels of the mask, and over all pixels, with
+    (0, 0, 1) as normal of the background. Pixels that do not count are left out of all metrics, and
+    are empty on the sheets. All other choices are those of the protocol, see `protocols`.
 
     Parameters
     ----------
@@ -426,6 +436,8 @@ def evaluate_run(
     radiance = np.asarray(trained.params.light.radiance)
     results = _measure(renderer, truth, options, radiance, on_progress)
     unmapped_lights = sorted(set(truth.views.relight) - set(truth.lights))
+    compared = {line["view"] for line in _with_object(results.views, truth.views)}
+    empty_views = [name for name in truth.views.names if name not in compared]
     metrics = {
         "protocol": options.protocol,
         "notes": [
@@ -434,6 +446,7 @@ def evaluate_run(
                 f"{name}: images but no environment map, so no relit metrics"
                 for name in unmapped_lights
             ),
+            *(f"{name}: the mask is empty, so it has no part in means" for name in empty_views),
         ],
         "mean": results.mean,
         "views": results.views,

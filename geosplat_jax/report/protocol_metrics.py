@@ -235,15 +235,20 @@ def _compare(
     """Compute PSNR and SSIM of linear images, whole and masked, or the figures of the rendition.
 
     Predictions are premultiplied by ``alpha``, truths are straight. With ``is_pooled`` there is one
-    PSNR of the error over all images, otherwise the mean of the PSNR of each.
+    PSNR of the error over all images, otherwise the mean of the PSNR of each. Images without an
+    object have no part, unless none has one.
     """
     if isinstance(rendition, ScaledRendition):
         return _compare_scaled(predictions, truths, mask, rendition, valid)
     errors, similarities, masked_errors, masked_similarities, counts = [], [], [], [], []
     totals = []
     valid_masks = [None] * len(mask) if valid is None else valid
+    is_empty = not (mask > MASK_THRESHOLD).any()
     views = zip(predictions, alpha, truths, mask, valid_masks, strict=True)
     for prediction, predicted_alpha, truth, coverage, valid_mask in views:
+        inside = coverage > MASK_THRESHOLD
+        if not (inside.any() or is_empty):
+            continue
         silhouettes = {
             "alpha": np.clip(predicted_alpha, 0.0, 1.0),
             "solid": predicted_alpha > MASK_THRESHOLD,
@@ -261,7 +266,6 @@ def _compare(
         totals.append(
             coverage.size if valid_mask is None else int((valid_mask > MASK_THRESHOLD).sum())
         )
-        inside = coverage > MASK_THRESHOLD
         if inside.any():
             masked_errors.append(float(_mse(predicted, true, inside)))
             masked_similarities.append(float(_ssim_masked(predicted, true, inside)))
@@ -346,9 +350,9 @@ def albedo_metrics(
     Returns
     -------
     ``albedo.psnr`` (dB) and ``albedo.ssim`` of whole images, ``albedo.psnr_masked`` and
-    ``albedo.ssim_masked`` over the pixels of the mask. A pixel of the mask that the prediction does
-    not cover shows the background, or black in protocols that use the true mask as silhouette.
-    Protocol ``orb`` has ``albedo.psnr`` only.
+    ``albedo.ssim_masked`` over the pixels of the mask, all over the images with an object. A pixel
+    of the mask that the prediction does not cover shows the background, or black in protocols that
+    use the true mask as silhouette. Protocol ``orb`` has ``albedo.psnr`` only.
 
     Raises
     ------
@@ -395,9 +399,9 @@ def material_metrics(
     -------
     ``roughness.mse`` of straight values over the pixels of the mask, where a pixel that the
     prediction does not cover counts as zero; the mean over the images with an object.
-    ``roughness.mse_full`` of premultiplied values over whole images, on black; the mean over all
-    images, which is about the former times the object's share of the image. Likewise
-    ``metallic.mse`` and ``metallic.mse_full``.
+    ``roughness.mse_full`` of premultiplied values over these images as a whole, on black, which is
+    about the former times the object's share of the image. Likewise ``metallic.mse`` and
+    ``metallic.mse_full``.
 
     Raises
     ------
@@ -416,14 +420,15 @@ def material_metrics(
         predicted, true = materials[name], truth[name]
         _require(alpha.shape, **{f"predicted {name}": predicted, f"true {name}": true})
         squared = (straight(predicted, alpha) - straight(true, mask)) ** 2
+        has_object = inside.any(axis=(1, 2))
         views = [
             np.mean(errors[is_object], dtype=float)
-            for errors, is_object in zip(squared, inside, strict=True)
-            if is_object.any()
+            for errors, is_object in zip(squared[has_object], inside[has_object], strict=True)
         ]
         metrics[f"{name}.mse"] = float(np.mean(views))
         error_sums = np.sum((predicted - true) ** 2, axis=(1, 2), dtype=float, where=is_valid)
-        metrics[f"{name}.mse_full"] = float(np.mean(error_sums / is_valid.sum(axis=(1, 2))))
+        full_errors = error_sums / is_valid.sum(axis=(1, 2))
+        metrics[f"{name}.mse_full"] = float(np.mean(full_errors[has_object]))
     return metrics
 
 
@@ -449,7 +454,8 @@ def relight_metrics(
     Returns
     -------
     ``psnr`` (dB) and ``ssim`` of whole images, ``psnr_masked`` and ``ssim_masked`` over the pixels
-    of the mask, all means over the images. Protocol ``orb`` has ``psnr_h`` and ``psnr_l`` instead.
+    of the mask, all means over the images with an object. Protocol ``orb`` has ``psnr_h`` and
+    ``psnr_l`` instead.
 
     Raises
     ------
