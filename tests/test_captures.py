@@ -367,6 +367,26 @@ def test_images_are_reduced_to_half_a_cell(scenes):
             chosen(root, *([2] if chosen is choose_downscale else []), layout="nope")
 
 
+def test_bad_masks_among_the_views_that_choose_the_size_do_not_stop_it(
+    scenes, tmp_path, monkeypatch
+):
+    root = shutil.copytree(scenes["stanford_orb"], tmp_path / "ball")
+    monkeypatch.setattr("geosplat_jax.io.dataset._COARSE_VIEWS", 1)
+    assert choose_downscale(root, 2) == choose_downscale(scenes["stanford_orb"], 2)
+    monkeypatch.undo()
+    mask = root / "test_mask" / "0000.png"
+    write_png(mask, 0.0 * read_image(mask))
+    assert any("is empty" in line for line in load_dataset(root).warnings)
+    assert choose_downscale(root, 2) == choose_downscale(scenes["stanford_orb"], 2)
+
+
+def test_the_size_of_every_photograph_is_known(scenes):
+    views = load_dataset(scenes["transforms"]).train
+    numbers = [int(name.removeprefix("view_")) for name in views.names]
+    np.testing.assert_array_equal(views.sizes, [size_of(number) for number in numbers])
+    assert len({tuple(size) for size in views.sizes}) > 1
+
+
 def test_the_size_that_was_chosen_is_said(scenes, capsys):
     assert cli.main(["info", str(scenes["idr"]), "--downscale", "auto"]) == 0
     captured = capsys.readouterr()
@@ -464,7 +484,10 @@ def test_pixels_that_do_not_count_are_apart_from_the_mask(copied):
     valid[4:9, 6:11] = 0.0
     write_png(root / "valid" / "view_05.png", valid)
     # Masks with this name, as instant-ngp has them, mark the moving pixels, which do not count.
-    write_png(root / "images" / "dynamic_mask_view_06.png", 1.0 - valid)
+    moving = (1.0 - valid) * np.float32(
+        [0.0, 0.0, 1.0]
+    )  # black is what counts, whatever the colour
+    write_png(root / "images" / "dynamic_mask_view_06.png", moving)
     for factor in (1, 2):
         views = load(root, downscale=factor).train
         for name in ("view_05", "view_06"):

@@ -348,6 +348,12 @@ def test_relit_views_without_alpha_are_reduced_as_those_with_it(scenes, tmp_path
             write_png(path, np.concatenate([color, alpha], -1) if with_alpha else color)
         relit_views.append(load(root, downscale=factor).test.relight["envmap6"])
     np.testing.assert_allclose(relit_views[1], relit_views[0], atol=1e-5)
+    # An alpha of one everywhere separates nothing.
+    for path in sorted((root / "test_rli").glob("envmap6_*.png")):
+        color = read_image(path)
+        write_png(path, np.concatenate([color, np.ones_like(color[..., :1])], -1))
+    opaque = load(root, downscale=factor).test.relight["envmap6"]
+    np.testing.assert_array_equal(opaque, relit_views[1])
     rim = (relit_views[0][..., 3] > 0) & (relit_views[0][..., 3] < 1)
     assert rim.any()
 
@@ -526,6 +532,12 @@ def test_every_layout_with_transforms_takes_a_whole_lens(scenes, tmp_path, layou
         np.testing.assert_array_equal(views.intrinsics, np.stack([INTRINSICS] * len(views)))
 
 
+@pytest.mark.parametrize("cx", [-10.0, 0, 3.0 * SIZE])
+def test_a_principal_point_may_lie_outside_of_the_image(blender, cx):
+    views = load(with_lens(blender, {**LENS, "cx": cx}), bounds=(-np.ones(3), np.ones(3))).train
+    assert (views.intrinsics[:, 0, 2] == cx).all()
+
+
 def test_a_frame_may_have_a_lens_of_its_own(blender):
     edit(with_lens(blender, LENS), lambda c: c["frames"][2].update(fl_x=50.0, cx=11.0))
     intrinsics = load(blender).train.intrinsics
@@ -639,9 +651,12 @@ def test_an_image_of_any_format_may_be_named_with_its_ending(blender):
 
 @pytest.mark.parametrize("key", list(LENS))
 def test_every_number_of_a_lens_is_checked(blender, key):
-    location = r"frame 2 of .*transforms_train\.json must be a positive"
+    kind = "finite" if key in ("cx", "cy") else "positive"
+    location = rf"frame 2 of .*transforms_train\.json must be a {kind}"
     with_lens(blender, LENS)
-    wrong_values = [0, -3.0, np.nan, np.inf, "wide", None, True, [1.0], 10**400]
+    wrong_values = [np.nan, np.inf, "wide", None, True, [1.0], 10**400]
+    if kind == "positive":
+        wrong_values += [0, -3.0]
     for value in [*wrong_values, SIZE + 0.5] if key in ("w", "h") else wrong_values:
         edit(blender, lambda content, v=value: content["frames"][2].update({key: v}))
         with pytest.raises(SceneError, match=f"'{key}' of {location}") as error_info:

@@ -331,17 +331,30 @@ def test_where_all_pixels_count_the_hull_is_the_same(sphere):
     np.testing.assert_allclose(actual, hull_distance(*sphere, points), atol=1e-6)
 
 
+SIZES = np.full((VIEW_COUNT, 2), float(SIZE))
+
+
+def test_photographs_of_several_sizes_show_what_each_of_them_shows():
+    poses, intrinsics = cameras_around(np.zeros(3))
+    sizes = SIZES.copy()
+    sizes[::2, 0] /= 2
+    sizes[1::2, 1] /= 2
+    lo, hi = sight_bounds(poses, intrinsics, sizes=sizes)
+    whole_lo, whole_hi = sight_bounds(poses, intrinsics, sizes=SIZES)
+    np.testing.assert_allclose(hi - lo, (whole_hi - whole_lo) / 2)
+
+
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 def test_what_all_cameras_look_at_is_the_middle_of_the_bounds(scale):
     center = scale * np.array([5.0, -3.0, 2.0])
     poses, intrinsics = cameras_around(center, scale=scale)
-    lo, hi = sight_bounds(poses, intrinsics, height=SIZE, width=SIZE)
+    lo, hi = sight_bounds(poses, intrinsics, sizes=SIZES)
     np.testing.assert_allclose((lo + hi) / 2, center, atol=1e-9 * scale)
     # The corners of the cube are on the rim of what a camera shows.
     corner_distance = np.sqrt(3.0) * (hi - lo) / 2
     np.testing.assert_allclose(corner_distance, scale * DISTANCE * (SIZE / 2) / FOCAL, rtol=1e-9)
     wide_intrinsics = intrinsics * np.array([[0.05], [0.05], [1.0]])
-    lo, hi = sight_bounds(poses, wide_intrinsics, height=SIZE, width=SIZE)
+    lo, hi = sight_bounds(poses, wide_intrinsics, sizes=SIZES)
     positions = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
     assert not ((positions > lo) & (positions < hi)).all(1).any()
 
@@ -349,9 +362,9 @@ def test_what_all_cameras_look_at_is_the_middle_of_the_bounds(scale):
 def test_cameras_that_look_nowhere_in_common_are_refused():
     poses, intrinsics = cameras_around(np.zeros(3))
     with pytest.raises(ValueError, match="parallel"):
-        sight_bounds(poses[[0, 0]], intrinsics[:2], height=SIZE, width=SIZE)
+        sight_bounds(poses[[0, 0]], intrinsics[:2], sizes=SIZES[:2])
     turned_poses = poses.copy()
     turn = np.diag([1.0, -1.0, -1.0, 1.0])
     turned_poses[:25] = turn @ poses[:25]
     with pytest.raises(ValueError, match="25 of 40 cameras look away"):
-        sight_bounds(turned_poses, intrinsics, height=SIZE, width=SIZE)
+        sight_bounds(turned_poses, intrinsics, sizes=SIZES)

@@ -401,6 +401,7 @@ def test_rates_decay_and_degrees_rise_by_the_schedule():
 def test_random_points_are_seen_with_their_colour():
     views = scene_views()
     points = random_points(views, 300, np.random.default_rng(0))
+    assert random_points(views, 0, np.random.default_rng(0)).positions.shape == (0, 3)
     local = np.einsum("vij,nj->vni", views.world_to_camera[:, :3, :3], points.positions)
     local = local + views.world_to_camera[:, None, :3, 3]
     pixel = np.einsum("vij,vnj->vni", views.intrinsics, local)

@@ -172,9 +172,7 @@ def _search(views: Views) -> Bounds:
     ------
     ValueError : the cameras do not look at one place.
     """
-    lo, hi = sight_bounds(
-        views.world_to_camera, views.intrinsics, height=views.height, width=views.width
-    )
+    lo, hi = sight_bounds(views.world_to_camera, views.intrinsics, sizes=views.sizes)
     middle = 0.5 * (lo + hi)
     clearance = np.abs(views.camera_to_world[:, :3, 3] - middle).max(1).min()
     half_extent = min(np.sqrt(3.0) * 0.5 * float((hi - lo).max()), _FREE * float(clearance))
@@ -182,11 +180,12 @@ def _search(views: Views) -> Bounds:
 
 
 def _seen_share(positions: np.ndarray, views: Views) -> Float[np.ndarray, " N"]:
-    """Share of the cameras that have a point in their image."""
+    """Share of the cameras that have a point in their photograph."""
     count = np.zeros(len(positions))
-    for pose, lens in zip(views.world_to_camera, views.intrinsics, strict=True):
+    cameras = zip(views.world_to_camera, views.intrinsics, views.sizes, strict=True)
+    for pose, lens, (height, width) in cameras:
         pixels, _ = project(positions, pose, lens)
-        count += in_image(pixels, height=views.height, width=views.width)
+        count += in_image(pixels, height=int(height), width=int(width))
     return count / len(views)
 
 

@@ -112,7 +112,11 @@ def random_points(views: Views, count: int, rng: np.random.Generator) -> Points:
     camera_points *= [1.0, -1.0, -1.0]
     poses = views.camera_to_world[view]
     positions = np.einsum("nij,nj->ni", poses[:, :3, :3], camera_points) + poses[:, :3, 3]
-    return Points(positions, np.asarray(encode_srgb(views.images[view, row, column, :3])))
+    colors = np.zeros((count, 3), np.float32)
+    for index in np.unique(view):  # one photograph at a time, since all may not fit into memory
+        is_here = view == index
+        colors[is_here] = views.images[index][row[is_here], column[is_here], :3]
+    return Points(positions, np.asarray(encode_srgb(colors)))
 
 
 def _drawn_pixels(

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -315,9 +316,11 @@ def choose_downscale(path: str | Path, cells: int, **options: Any) -> Downscale:
     # Refined cameras belong to images of one size, and would change the factor little.
     excluded_names = ("cameras", "train_views", "test_views")
     reading_options = {name: value for name, value in options.items() if name not in excluded_names}
-    dataset = load_dataset(
-        path, **reading_options, downscale=coarse_factor, train_views=_COARSE_VIEWS, test_views=1
-    )
+    read = partial(load_dataset, path, **reading_options, downscale=coarse_factor)
+    try:
+        dataset = read(train_views=_COARSE_VIEWS, test_views=1)
+    except SceneError:
+        dataset = read()  # a scene may have too many bad views among a few, but not among all
     lo, hi = dataset.bounds
     views = dataset.train
     distance = np.linalg.norm(views.camera_to_world[:, :3, 3] - 0.5 * (lo + hi), axis=1)
@@ -381,7 +384,7 @@ def object_bounds(views: Views, *, margin: float = 0.02) -> Bounds:
     cameras = (views.world_to_camera, views.intrinsics)
     try:
         if not views.has_masks:
-            return sight_bounds(*cameras, height=views.height, width=views.width)
+            return sight_bounds(*cameras, sizes=views.sizes)
         return hull_bounds(*cameras, views.alphas, valid=views.valid, margin=margin)
     except ValueError as error:
         raise SceneError(f"cannot find the object: {error}") from error

@@ -93,7 +93,14 @@ def checked_lens(values: Mapping[str, Any], where: str) -> Lens:
         is out of range.
     """
     distortion = _checked_distortion(values, where)
-    lengths = {key: checked_length(values[key], key, where) for key in _LENS_KEYS if key in values}
+    lengths = {
+        # Principal points of crops may lie outside of the image.
+        key: (checked_coefficient if key in ("cx", "cy") else checked_length)(
+            values[key], key, where
+        )
+        for key in _LENS_KEYS
+        if key in values
+    }
     angle = None
     if "camera_angle_x" in values:
         angle = checked_angle(values["camera_angle_x"], where)

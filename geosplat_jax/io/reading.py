@@ -5,7 +5,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
@@ -114,7 +114,7 @@ def read_photograph(frame: Frame) -> Photograph:
     is_opaque = is_whole and frame.mask is None
     leaves_file = frame.mask is not None and alpha is not None and not is_whole
     if frame.mask is not None and not leaves_file:
-        alpha = _read_mask(frame.mask, pixels, may_be_alpha=True)
+        alpha = _read_mask(frame.mask, pixels, channels="alpha")
     has_mask = alpha is not None
     if alpha is None:
         alpha = np.full(pixels.shape[:2], 255, np.uint8)
@@ -126,7 +126,7 @@ def read_photograph(frame: Frame) -> Photograph:
     if frame.valid is not None:
         valid &= values_of(_read_mask(frame.valid, pixels), is_srgb=False) > COVERED
     if frame.ignored is not None:
-        valid &= _read_mask(frame.ignored, pixels) == 0
+        valid &= _read_mask(frame.ignored, pixels, channels="any") == 0
     if not valid.all():
         alpha = np.where(valid, alpha, np.zeros((), alpha.dtype))
     # In place, since copies of a large photograph take longer than to decode it.
@@ -140,17 +140,21 @@ def _value(number: Any) -> float:
 
 
 def _read_mask(
-    path: Path, rgb: np.ndarray, *, may_be_alpha: bool = False
+    path: Path, rgb: np.ndarray, *, channels: Literal["first", "alpha", "any"] = "first"
 ) -> Shaped[np.ndarray, "H W"]:
-    """Read channel 0 of a mask file of the image's size, in the numbers of the file.
+    """Read a mask file of the image's size, in the numbers of the file.
 
-    ``may_be_alpha`` : use the alpha channel instead, if there is one that is not one everywhere.
+    ``channels`` : ``first`` takes channel 0; ``alpha`` takes the alpha channel instead, if there is
+    one that is not one everywhere; ``any`` takes the largest of the colour channels.
     """
     mask = read_stored(path)
     if mask.dtype == np.float32:
         mask = linear_values(mask, path, is_srgb=False)
     has_alpha = mask.shape[-1] in (2, 4) and _value(mask[..., -1].min()) < 1.0
-    mask = np.ascontiguousarray(mask[..., -1 if may_be_alpha and has_alpha else 0])
+    if channels == "any":
+        mask = mask[..., : mask.shape[-1] - 1 if mask.shape[-1] in (2, 4) else None].max(-1)
+    else:
+        mask = np.ascontiguousarray(mask[..., -1 if channels == "alpha" and has_alpha else 0])
     if mask.shape[:2] != rgb.shape[:2]:
         raise SceneError(
             f"mask {path} is {mask.shape[1]} x {mask.shape[0]} pixels, but its image is "

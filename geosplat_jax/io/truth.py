@@ -93,6 +93,8 @@ def _for_reduction(reading: Reading, frame: Frame, pixels: np.ndarray, path: Pat
     Without alpha, resampling would mix the background into the outline of the object.
     """
     pixels = as_rgba_or_rgb(pixels)
+    if pixels.shape[-1] == 4 and pixels[..., 3].min() >= 1.0:
+        pixels = pixels[..., :3]  # such an alpha separates nothing; photographs are read likewise
     is_resampled = reading.factor > 1 or frame.lens.distortion is not None
     if not is_resampled or pixels.shape[-1] == 4:
         return pixels

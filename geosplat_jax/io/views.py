@@ -144,6 +144,19 @@ class Views:
         return np.array([float(np.count_nonzero(valid)) for valid in self.valid])
 
     @property
+    def sizes(self) -> Float[np.ndarray, "V 2"]:
+        """Height and width of every photograph, which may be less than those of the images."""
+        if self.valid is None:
+            return np.tile(np.array([self.height, self.width], float), (len(self), 1))
+
+        def size(is_counted: np.ndarray) -> list[int]:
+            """Return where the last row and the last column with such a pixel end."""
+            ends = (np.flatnonzero(is_counted.any(axis)).max(initial=-1) + 1 for axis in (1, 0))
+            return [int(end) for end in ends]
+
+        return np.array([size(np.asarray(valid) > 0) for valid in self.valid], float)
+
+    @property
     def world_to_camera(self) -> Float[np.ndarray, "V 4 4"]:
         """Rigid transforms to OpenCV camera axes, (V, 4, 4) float64."""
         # Multiplied from the right, which changes the axes of the camera and not of the world.

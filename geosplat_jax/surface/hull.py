@@ -140,8 +140,7 @@ def sight_bounds(
     world_to_camera: Float[np.ndarray, "V 4 4"],
     intrinsics: Float[np.ndarray, "V 3 3"],
     *,
-    height: int,
-    width: int,
+    sizes: Float[np.ndarray, "V 2"],
 ) -> Bounds:
     """Find a cube around what all cameras look at, where there are no masks.
 
@@ -153,7 +152,7 @@ def sight_bounds(
     ----------
     world_to_camera : (V, 4, 4) rigid.
     intrinsics : (V, 3, 3) pixels.
-    height, width : size of the images, pixels.
+    sizes : (V, 2) height and width of the images, pixels.
 
     Returns
     -------
@@ -174,6 +173,7 @@ def sight_bounds(
             "axes are nearest to: check that the poses are camera-to-world, or give the bounds"
         )
     lens = np.asarray(intrinsics, np.float64)[is_ahead]
+    height, width = np.asarray(sizes, np.float64)[is_ahead].T
     visible_extents = depth[is_ahead] * np.minimum(
         0.5 * width / lens[:, 0, 0], 0.5 * height / lens[:, 1, 1]
     )
@@ -513,7 +513,7 @@ def meeting_point(
     matrix = projectors.sum(0)
     if np.linalg.cond(matrix) > 1e6:
         raise ValueError(
-            "the lines of sight are parallel or there is only one view, so the masks do not bound "
+            "the lines of sight are parallel or there is only one view, so they do not bound "
             "a volume; give the bounds"
         )
     return np.linalg.solve(matrix, np.einsum("vij,vj->i", projectors, centers))
