@@ -205,6 +205,14 @@ def test_every_mode_shows_what_it_says(recorded):
     assert middle(far_picture).sum() > middle(near_picture).sum() + 0.3
 
 
+def test_of_objects_that_are_too_far_for_a_browser_no_depth_is_sent(recorded, monkeypatch):
+    painter, _ = recorded
+    monkeypatch.setattr(painting, "_BEHIND_EVERYTHING", 2.7)
+    assert painter.paint(LOOK, TINY_LEVELS[0]).depth.max() == np.float32(2.7)
+    monkeypatch.setattr(painting, "_BEHIND_EVERYTHING", 2.5)
+    assert painter.paint(LOOK, TINY_LEVELS[0]).depth is None
+
+
 def test_lights_are_swapped_turned_and_scaled(recorded):
     painter, log = recorded
     looks = [

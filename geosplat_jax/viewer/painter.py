@@ -39,14 +39,15 @@ class Picture:
     Attributes
     ----------
     rgb : (H, W, 3) sRGB, bytes.
-    depth : (H, W) depth along the camera's axis, world units; large on the background.
+    depth : (H, W) depth along the camera's axis, world units; large on the background. None where
+        the object is too far away for a browser; overlays then lie in front of it.
     level : quality of the picture.
     step : training step of the parameters.
     seconds : time that drawing took.
     """
 
     rgb: UInt8[np.ndarray, "H W 3"]
-    depth: Float[np.ndarray, "H W"]
+    depth: Float[np.ndarray, "H W"] | None
     level: Level
     step: int
     seconds: float
@@ -130,9 +131,11 @@ class Painter:
         else:
             rgb = self._aov(look, view)
         depth = straight(view.aovs["depth"], view.alpha)[..., 0]
+        depth = np.where(view.alpha > 0.5, depth, 0.0).astype(np.float32)
+        is_too_far = depth.max() >= _BEHIND_EVERYTHING
         return Picture(
             np.round(255.0 * rgb).astype(np.uint8),
-            np.where(view.alpha > 0.5, depth, _BEHIND_EVERYTHING).astype(np.float32),
+            None if is_too_far else np.where(depth > 0.0, depth, np.float32(_BEHIND_EVERYTHING)),
             level,
             self.trained.step,
             time.perf_counter() - start_time,
