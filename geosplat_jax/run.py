@@ -469,6 +469,7 @@ def plan_training(
     mesh: str | Path | MeshSettings | None = None,
     overrides: Sequence[str] = (),
     downscale: int | None = None,
+    layout: str | None = None,
     light: str | None = None,
 ) -> Plan:
     """Choose settings for a budget on this machine, whose speed is measured first.
@@ -477,7 +478,7 @@ def plan_training(
     ----------
     scene : folder, or a dataset; the photographs of a dataset are not reduced any further.
     budget, material_prior, mesh, overrides, downscale : see `budget.plan`.
-    light : name of the light of the photographs, where the scene has a choice.
+    layout, light : see `load_dataset`.
 
     Raises
     ------
@@ -489,7 +490,7 @@ def plan_training(
     if isinstance(scene, Dataset):
         size, downscale = (scene.train.height, scene.train.width), 1
     else:
-        size = photograph_size(scene, light=light)
+        size = photograph_size(scene, layout=layout, light=light)
     return plan(
         budget,
         size,
@@ -648,7 +649,7 @@ def _as_it_began(order: _Order, folder: RunFolder, *, chooses: bool) -> _Order:
     """Complete the order to continue a run with the settings of that run.
 
     Settings that were chosen for the run's model or budget stay, unless the order has others. The
-    pace has changed those of a budget since, so they are compared with the planned ones.
+    pace may have changed those of a budget since, so the planned ones count as well.
     """
     if chooses and not folder.has_chosen_model:
         raise RunError(
@@ -660,7 +661,7 @@ def _as_it_began(order: _Order, folder: RunFolder, *, chooses: bool) -> _Order:
         raise RunError(f"the run in {folder} was begun without a budget; leave that out")
     keeps_model = folder.has_chosen_model and (config is None or chooses)
     has_budget = folder.budget() is not None
-    if keeps_model or (has_budget and config in (None, folder.planned())):
+    if keeps_model or (has_budget and config in (None, folder.planned(), folder.config())):
         config, reading = folder.config(), folder.record()["dataset"]
         budget = folder.budget() or budget
     has_own_mesh = config is not None and isinstance(config.geometry, MeshSettings)
@@ -680,6 +681,7 @@ def _settled(
             budget,
             mesh=mesh,
             downscale=reading.get("downscale"),
+            layout=reading.get("layout"),
             light=reading.get("light"),
         )
         return training_plan.config, budget, {**reading, "downscale": training_plan.downscale}

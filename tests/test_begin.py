@@ -6,6 +6,7 @@ What is trained is tested in `test_train.py`, `test_stages.py` and `test_seams.p
 from pathlib import Path
 
 import pytest
+from support import sphere_dataset, tiny_config
 
 from geosplat_jax.cli.arguments import command_line
 from geosplat_jax.cli.training import begin_from
@@ -13,7 +14,10 @@ from geosplat_jax.fit.begin import ANEW, Anew, Resume, TakeOver
 from geosplat_jax.fit.evidence import Rung
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.listener import NOBODY, Listener, Listeners, Progress
+from geosplat_jax.fit.loop import Loop
+from geosplat_jax.fit.train import fit
 from geosplat_jax.fit.trained import Trained
+from geosplat_jax.io.checkpoints import CheckpointError
 
 
 @pytest.mark.parametrize(
@@ -36,6 +40,28 @@ def test_only_resuming_goes_on_with_a_run_and_only_where_there_is_one(tmp_path):
     assert [beginning.goes_on(run) for beginning in beginnings] == [False, False, False, True]
     assert [beginning.replace for beginning in beginnings] == [False, True, False, False]
     assert [beginning.takes_over for beginning in beginnings] == [False, False, True, False]
+
+
+class _FullDisk(Loop):
+    """A loop whose first checkpoint cannot be written."""
+
+    def __init__(self):
+        pass
+
+    def save_end(self):
+        raise CheckpointError("cannot write: no space left")
+
+
+class _TakeOverOntoAFullDisk(TakeOver):
+    def first_loop(self, dataset, config, run, devices):
+        return _FullDisk()
+
+
+def test_a_run_that_could_not_store_what_it_took_over_leaves_its_folder_free(tmp_path):
+    begin = _TakeOverOntoAFullDisk("a", "monte_carlo")
+    with pytest.raises(CheckpointError, match="no space left"):
+        fit(sphere_dataset(count=2, size=8), tiny_config(), tmp_path / "run", begin=begin)
+    assert not RunFolder(tmp_path / "run").exists
 
 
 EVENTS = {

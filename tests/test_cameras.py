@@ -307,6 +307,20 @@ def test_an_error_that_does_not_fall_leaves_the_camera(monkeypatch, subject, vie
     np.testing.assert_array_equal(camera.world_to_camera, views.world_to_camera[0])
 
 
+def test_without_masks_the_cameras_stay(monkeypatch, subject, views):
+    def refine_view(*arguments):
+        raise AssertionError("a whole photograph was taken for the object")
+
+    monkeypatch.setattr(cameras_module, "refine_view", refine_view)
+    progress = []
+    split = refine_views(subject, replace(views, has_masks=False), EXACT, on_view=progress.append)
+    assert len(progress) == len(split.cameras) == len(views)
+    for index, name in enumerate(views.names):
+        camera = split.cameras[name]
+        assert (camera.accepted, camera.note) == (False, "there are no masks")
+        np.testing.assert_array_equal(camera.world_to_camera, views.world_to_camera[index])
+
+
 def test_zero_parameters_are_the_camera_and_turns_are_about_the_box(views):
     box = Box(jnp.asarray([0.1, -0.2, 0.05]), jnp.asarray(0.5))
     same_camera, log_exposure = moved_camera(views.camera(), jnp.zeros(8), box)

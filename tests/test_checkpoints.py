@@ -2,6 +2,7 @@
 
 import errno
 import os
+import stat
 
 import jax
 import jax.numpy as jnp
@@ -115,6 +116,19 @@ def test_a_full_disk_keeps_the_previous_checkpoint(tmp_path, monkeypatch, moment
     assert names(tmp_path) == [previous.name]
     assert latest_checkpoint(tmp_path) == previous
     assert_same_bits(load_checkpoint(previous, like=tree)[0], tree)
+
+
+def test_a_disk_that_flushes_files_only_is_good_enough(tmp_path, monkeypatch):
+    flush = os.fsync
+
+    def flush_files(handle):
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        flush(handle)
+
+    monkeypatch.setattr(checkpoints.os, "fsync", flush_files)
+    path = save_checkpoint(tmp_path, 1, tree={"w": jnp.ones(3)}, meta={}, keep=1)
+    assert latest_checkpoint(tmp_path) == path
 
 
 def test_a_write_that_reads_back_wrong_is_refused(tmp_path, monkeypatch):

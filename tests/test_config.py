@@ -290,6 +290,7 @@ def test_another_kind_replaces_a_section():
         ("material.grid.levels=1000000000", r"material\.grid\.levels must be less than or equal"),
         ("stages.monte_carlo.transport.light_count=5000", r"transport\.light_count must be less"),
         ("stages.refine.vertex_fraction=0.5", r"refine\.vertex_fraction: free splats are no samp"),
+        ("stages.monte_carlo.vertex_fraction=0.999", r"monte_carlo\.vertex_fraction: no step sam"),
         ("run.seed", "section.field=value"),
         ("..=3", "section.field=value"),
         ("adapter.alpha.x=1", r"^adapter\.alpha must be"),

@@ -10,7 +10,12 @@ import numpy as np
 import pytest
 from support import sphere_dataset, tiny_config
 
+from geosplat_jax.fit.config import Budget
 from geosplat_jax.fit.folder import RunError, RunFolder
+from geosplat_jax.fit.planning import TrainingError
+from geosplat_jax.fit.trained import load_trained
+from geosplat_jax.io.checkpoints import save_checkpoint
+from geosplat_jax.run import _as_it_began, _Order
 
 
 @pytest.fixture
@@ -179,6 +184,40 @@ def test_what_was_planned_stays_known_when_settings_are_amended(run):
         run.amend(tiny_config(f"stages.split_sum.steps={steps}"))
         assert run.config().stages[0].steps == steps
         assert run.planned() == initial_config
+
+
+def test_linked_folders_of_a_run_are_unlinked_when_it_is_replaced(run, dataset, tmp_path):
+    elsewhere = tmp_path / "scratch"
+    elsewhere.mkdir()
+    (elsewhere / "a.npz").write_text("")
+    (run.path / "checkpoints").symlink_to(elsewhere)
+    run.clear()
+    assert not run.exists
+    assert not (run.path / "checkpoints").exists()
+    assert [file.name for file in elsewhere.iterdir()] == ["a.npz"]
+
+
+def test_a_stage_that_has_not_ended_is_named(dataset, tmp_path):
+    run = RunFolder(tmp_path / "run")
+    with run.locked():
+        run.begin(dataset, tiny_config("stages.monte_carlo.steps=2"), replace=False)
+    with pytest.raises(TrainingError, match="holds no checkpoint"):
+        load_trained(run, stage="split_sum")
+    save_checkpoint(run.path / "checkpoints", 1, tree={"w": np.ones(3)}, meta={})
+    with pytest.raises(TrainingError, match="the stage split_sum of .* has not ended yet"):
+        load_trained(run, stage="split_sum")
+
+
+def test_the_settings_of_a_run_with_a_budget_keep_its_budget(dataset, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    with folder.locked():
+        folder.begin(dataset, tiny_config(), replace=False, budget=Budget(60.0))
+        folder.amend(tiny_config("stages.split_sum.steps=2"))
+    for config in (None, folder.planned(), folder.config()):
+        order = _as_it_began(_Order(config, None, None, {}), folder, chooses=False)
+        assert (order.budget, order.config) == (Budget(60.0), folder.config())
+    other = tiny_config("stages.split_sum.steps=3")
+    assert _as_it_began(_Order(other, None, None, {}), folder, chooses=False).budget is None
 
 
 def test_an_accident_leaves_what_was_noted_of_the_training(run, monkeypatch):

@@ -12,6 +12,7 @@ from support import TINY, sphere_dataset
 import geosplat_jax as gs
 from geosplat_jax import cli
 from geosplat_jax import run as run_module
+from geosplat_jax.fit.config import Budget
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.presets import make_config
 
@@ -87,6 +88,21 @@ def test_a_quality_beside_settings_or_a_budget_is_refused(folder):
     for extra_arguments in ({"config": make_config()}, {"budget": gs.Budget(600.0)}):
         with pytest.raises(TypeError, match="leave quality out"):
             gs.train(folder / "duck", folder / "none", quality="high", **extra_arguments)
+
+
+def test_a_budget_is_planned_for_the_photographs_of_the_layout_that_is_asked_for(
+    tmp_path, monkeypatch
+):
+    asked = []
+
+    def photograph_size(path, **options):
+        asked.append(options)
+        raise RuntimeError("as far as this test goes")
+
+    monkeypatch.setattr(run_module, "photograph_size", photograph_size)
+    with pytest.raises(RuntimeError, match="as far as"):
+        gs.train(tmp_path, tmp_path / "run", budget=Budget(60.0), layout="idr", light="noon")
+    assert asked == [{"layout": "idr", "light": "noon"}]
 
 
 def test_a_refused_choice_leaves_the_run_that_it_was_to_replace(tmp_path):

@@ -424,8 +424,8 @@ def refine_views(
 ) -> RefinedSplit:
     """Refine the camera and the exposure of every view (host side).
 
-    A view keeps its camera, with a note of the reason, if its render or its mask shows nothing, or
-    if its error did not fall.
+    A view keeps its camera, with a note of the reason, if there are no masks, if its render or its
+    mask shows nothing, or if its error did not fall.
 
     Parameters
     ----------
@@ -440,6 +440,12 @@ def refine_views(
     """
     how, cameras = how or CameraSettings(), {}
     for index, name in enumerate(views.names):
+        if not views.has_masks:
+            # Alpha is one everywhere, and the object would be enlarged to fill the photograph.
+            cameras[name] = _kept(views, index, "there are no masks")
+            if on_view is not None:
+                on_view(ViewProgress(index + 1, len(views), name, cameras[name]))
+            continue
         valid = np.ones((views.height, views.width), np.float32)
         photograph = PosedPhotograph(
             camera=views.camera([index]),
@@ -454,22 +460,28 @@ def refine_views(
     return RefinedSplit(views.width, views.height, cameras)
 
 
+def _kept(
+    views: Views, index: int, note: str, *, rms: float = 0.0, iterations: int = 0
+) -> RefinedCamera:
+    """Return the initial camera of a view; ``rms`` is its error, and stays what it was."""
+    return RefinedCamera(
+        world_to_camera=views.world_to_camera[index],
+        intrinsics=views.intrinsics[index],
+        exposure=1.0 if views.exposure is None else float(views.exposure[index]),
+        residual_before=rms,
+        residual_after=rms,
+        iterations=iterations,
+        accepted=False,
+        note=note,
+        white_balance=np.ones(3) if views.white_balance is None else views.white_balance[index],
+    )
+
+
 def _refined(result: Found, views: Views, index: int) -> RefinedCamera:
     """Return the refined camera of a view, or the initial one where refinement did not help."""
     note = _refusal(result)
-    exposure = 1.0 if views.exposure is None else float(views.exposure[index])
-    balance = np.ones(3) if views.white_balance is None else views.white_balance[index]
-    initial_rms = float(result.before.rms)
-    initial_camera = RefinedCamera(
-        world_to_camera=views.world_to_camera[index],
-        intrinsics=views.intrinsics[index],
-        exposure=exposure,
-        residual_before=initial_rms,
-        residual_after=initial_rms,
-        iterations=int(result.iterations),
-        accepted=False,
-        note=note,
-        white_balance=balance,
+    initial_camera = _kept(
+        views, index, note, rms=float(result.before.rms), iterations=int(result.iterations)
     )
     if note:
         return initial_camera
@@ -482,10 +494,11 @@ def _refined(result: Found, views: Views, index: int) -> RefinedCamera:
         initial_camera,
         world_to_camera=pose,
         intrinsics=lens,
-        exposure=exposure * float(np.exp(UNIT * float(result.parameters[7]))),
+        exposure=initial_camera.exposure * float(np.exp(UNIT * float(result.parameters[7]))),
         residual_after=float(result.after.rms),
         accepted=True,
-        white_balance=balance * np.exp(np.asarray(log_balance(UNIT * result.parameters), float)),
+        white_balance=initial_camera.white_balance
+        * np.exp(np.asarray(log_balance(UNIT * result.parameters), float)),
     )
 
 

@@ -132,6 +132,11 @@ class Stage:
         """Return the share of the schedules that is done after ``step`` steps, from 0 to 1."""
         return self.position(step) / max(self.position(self.steps), 1.0)
 
+    @property
+    def ends_with_vertices(self) -> bool:
+        """Whether even the last step samples vertices (Eq. 12)."""
+        return self.progress(self.steps - 1) < self.vertex_fraction
+
     def weights_at(self, step: int) -> dict[str, float]:
         """Weights by term, ``step`` steps after the stage's start.
 
@@ -259,6 +264,12 @@ class Config:
             raise ValueError(
                 f"stages.{earlier_stages[-1].name}.splats: {stage.splats.kind} splats, which "
                 f"stages.{stage.name} has, start from the six splats of every face; set it to face"
+            )
+        if earlier_stages[-1].ends_with_vertices:
+            raise ValueError(
+                f"stages.{earlier_stages[-1].name}.vertex_fraction: no step samples faces, but "
+                f"{stage.splats.kind} splats, which stages.{stage.name} has, start from those of "
+                "the last step; lower it"
             )
         if stage.vertex_fraction:
             raise ValueError(

@@ -370,7 +370,7 @@ class RunFolder:
         """Remove what training and evaluation wrote, and nothing else."""
         for name in _OWN:
             path = self.path / name
-            if path.is_dir():
+            if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)
             else:
                 path.unlink(missing_ok=True)

@@ -31,6 +31,7 @@ from geosplat_jax.fit.runtime import peak_memory_mb
 from geosplat_jax.fit.stages import require_rates
 from geosplat_jax.fit.step import StepReport, TrainState
 from geosplat_jax.fit.trained import Trained, load_trained
+from geosplat_jax.io.checkpoints import CheckpointError
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.memory import is_out_of_memory
 
@@ -48,6 +49,17 @@ __all__ = [
     "fit",
     "load_trained",
 ]
+
+
+_FAILURES = (
+    ValueError,
+    TrainingError,
+    CheckpointError,
+    OSError,
+    MemoryError,
+    jax.errors.JaxRuntimeError,
+)
+"""Errors after which a run that has made no step leaves its folder free."""
 
 
 class Interrupted(Exception):
@@ -252,7 +264,7 @@ def fit(
             raise Interrupted(
                 f"stopped at once; continue with --resume from the last checkpoint in {run}"
             ) from None
-        except (ValueError, TrainingError, MemoryError, jax.errors.JaxRuntimeError) as error:
+        except _FAILURES as error:
             if has_begun and not run.metric_lines():
                 run.clear()  # not one step was made: the folder is free again
             if not is_out_of_memory(error):

@@ -178,6 +178,11 @@ def load_trained(folder: str | Path | RunFolder, *, stage: str | None = None) ->
     """
     run = folder if isinstance(folder, RunFolder) else RunFolder(folder)
     path = latest_checkpoint(_checkpoints(run, stage))
+    if path is None and stage is not None and latest_checkpoint(_checkpoints(run, None)):
+        raise TrainingError(
+            f"the stage {stage} of {run} has not ended yet; continue the training with --resume, "
+            "or leave the stage out"
+        )
     if path is None:
         raise TrainingError(
             f"{run} holds no checkpoint that can be read; is it the output of a training run?"

@@ -8,6 +8,7 @@ back; only then is it renamed, and older ones are removed. So there is a whole c
 moment.
 """
 
+import errno
 import json
 import math
 import os
@@ -359,11 +360,18 @@ def _remove(path: Path) -> None:
     path.unlink(missing_ok=True)
 
 
+_CANNOT_SYNC_FOLDERS = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
+"""Errors of file systems that can flush files only; the file itself has been flushed."""
+
+
 def _sync_folder(folder: Path) -> None:
     """Flush the renaming to the disk, on systems that let a folder be opened."""
     if os.name == "posix":
         handle = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(handle)
+        except OSError as error:
+            if error.errno not in _CANNOT_SYNC_FOLDERS:
+                raise
         finally:
             os.close(handle)
