@@ -186,6 +186,27 @@ def test_what_was_planned_stays_known_when_settings_are_amended(run):
         assert run.planned() == initial_config
 
 
+def test_what_other_commands_left_in_the_folder_is_in_nobodys_way(run, dataset):
+    (run.path / "renders").mkdir()
+    for _ in range(2):  # the training that should follow may be interrupted, and be made again
+        run.make_room(replace=True)
+        assert not run.exists
+    with run.locked():
+        run.require_free(replace=False)
+        run.begin(dataset, tiny_config(), replace=False)
+        run.clear()  # as when not one step could be made
+    with run.locked():
+        run.begin(dataset, tiny_config(), replace=False)
+    assert sorted(file.name for file in run.path.iterdir()) == [".lock", "renders", "run.json"]
+
+
+def test_a_folder_of_others_is_refused_before_any_work(tmp_path):
+    (tmp_path / "thesis.tex").write_text("")
+    for prepare in (RunFolder(tmp_path).require_free, RunFolder(tmp_path).make_room):
+        with pytest.raises(RunError, match=r"holds other files, for example thesis\.tex"):
+            prepare(replace=True)
+
+
 def test_linked_folders_of_a_run_are_unlinked_when_it_is_replaced(run, dataset, tmp_path):
     elsewhere = tmp_path / "scratch"
     elsewhere.mkdir()

@@ -1,7 +1,6 @@
 """Options of the commands: one function for each command or group of options."""
 
 import argparse
-import importlib.metadata
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any, get_args
 from geosplat_jax.capture.settings import RadianceSettings
 from geosplat_jax.fit.budget import parse_duration, parse_memory
 from geosplat_jax.fit.presets import PRESET_PRIORS, PRESETS, QUALITIES
+from geosplat_jax.fit.runtime import installed_versions
 from geosplat_jax.gradcheck.report import STAGES
 from geosplat_jax.io.poses import PoseSettings
 from geosplat_jax.materials import MATERIAL_PRIORS
@@ -49,9 +49,7 @@ def command_line() -> argparse.ArgumentParser:
         description="Photographs in; mesh, PBR materials and light out.",
         epilog="`geosplat-jax COMMAND --help` says what a command takes, and ends with an example.",
     )
-    parser.add_argument(
-        "--version", action="version", version=importlib.metadata.version("geosplat_jax")
-    )
+    parser.add_argument("--version", action="version", version=installed_versions()["geosplat_jax"])
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     info = _command(commands, "info", "say what was recognised in a scene folder")

@@ -16,10 +16,8 @@
 """
 
 import csv
-import importlib.metadata
 import json
 import os
-import platform
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -31,11 +29,11 @@ from filelock import FileLock, Timeout
 
 from geosplat_jax.core.settings import PositiveCount, first_line, from_plain, settings
 from geosplat_jax.fit.config import Budget, Config, config_from_dict
+from geosplat_jax.fit.runtime import installed_versions
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.images import is_left_aside, written_aside
 
-_PACKAGES = ("jax", "jaxlib", "numpy", "optax", "geosplat_jax")
 EVENTS = "tensorboard"
 """Name of the folder of event files."""
 CAMERAS = "given_cameras.json"
@@ -51,6 +49,8 @@ the others belong to a run."""
 
 
 _LOCK = ".lock"
+_FREED = ".freed"
+"""Marks a folder whose run was removed, where files that other commands wrote into it are left."""
 
 
 class RunError(RuntimeError):
@@ -144,17 +144,21 @@ def locked_folder(path: Path, *, own: Path) -> Iterator[None]:
 
 def _require_own(path: Path, own: Path) -> None:
     """Refuse a folder in which somebody else's files lie."""
-    if own.exists() or not path.exists():
+    if own.exists() or (path / _FREED).exists() or not path.exists():
         return
     if not path.is_dir():
         raise RunError(f"{path} exists already, and is no folder; choose another")
-    files = (file for file in path.iterdir() if not is_left_aside(file))
-    foreign_names = sorted(file.name for file in files if file.name != _LOCK)
-    if foreign_names:
+    if foreign_names := _foreign_names(path):
         raise RunError(
             f"{path} exists already and holds other files, for example {foreign_names[0]}; choose "
             "an empty folder"
         )
+
+
+def _foreign_names(path: Path) -> list[str]:
+    """Return the sorted names in a folder that are neither a lock, a mark nor left aside."""
+    names = (file.name for file in path.iterdir() if not is_left_aside(file))
+    return sorted(name for name in names if name not in (_LOCK, _FREED))
 
 
 class RunFolder:
@@ -262,13 +266,14 @@ class RunFolder:
             yield
 
     def require_free(self, *, replace: bool) -> None:
-        """Refuse a folder that holds a run, unless that is to be replaced.
+        """Refuse a folder that holds other files, or a run, unless that is to be replaced.
 
         Raises
         ------
         RunError
-            If there is a run and ``replace`` is not set.
+            If there is a run and ``replace`` is not set, or there are other files but no run.
         """
+        _require_own(self.path, self._record_path)
         if self.exists and not replace:
             raise RunError(
                 f"{self.path} holds a run; continue it with --resume, replace it with --force, or "
@@ -350,6 +355,7 @@ class RunFolder:
         cameras = dataset.options.get("cameras")
         camera_bytes = None if cameras is None else Path(cameras).read_bytes()
         self.clear()
+        (self.path / _FREED).unlink(missing_ok=True)
         if camera_bytes is not None:
             (self.path / CAMERAS).write_bytes(camera_bytes)
         self._write_record(
@@ -359,10 +365,7 @@ class RunFolder:
                 **({} if budget is None else {"budget": asdict(budget)}),
                 **({} if model is None else {"model": model}),
                 "notes": [*dataset.notes, *config.geometry.notes(dataset)],
-                "versions": {
-                    "python": platform.python_version(),
-                    **{name: importlib.metadata.version(name) for name in _PACKAGES},
-                },
+                "versions": installed_versions(),
             }
         )
 
@@ -374,6 +377,8 @@ class RunFolder:
                 shutil.rmtree(path)
             else:
                 path.unlink(missing_ok=True)
+        if self.path.exists() and _foreign_names(self.path):
+            (self.path / _FREED).touch()
 
     def repoint(self, dataset: Dataset) -> None:
         """Record where the scene of the run is now, if it has moved since the training.

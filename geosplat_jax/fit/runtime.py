@@ -26,6 +26,23 @@ _MOST_MAPS = 65_530
 memory."""
 
 
+_PACKAGES = ("jax", "jaxlib", "numpy", "optax", "geosplat_jax")
+
+
+def installed_versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that results depend on, by name.
+
+    Where this package runs from its sources without an installation, its version is unknown.
+    """
+    versions = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return versions
+
+
 def release_programs_when_crowded() -> bool:
     """Release compiled programs if half of the allowed memory maps are used; tell if so.
 

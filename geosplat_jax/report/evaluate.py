@@ -3,9 +3,7 @@
 Everything here runs on the host around `renderer.Renderer`.
 """
 
-import importlib.metadata
 import json
-import platform
 import time
 from collections.abc import Mapping
 from concurrent.futures import Future
@@ -16,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from geosplat_jax.core.types import EnvLight
-from geosplat_jax.fit.runtime import in_background, peak_memory_mb
+from geosplat_jax.fit.runtime import in_background, installed_versions, peak_memory_mb
 from geosplat_jax.fit.train import Trained
 from geosplat_jax.io.images import written_aside
 from geosplat_jax.io.views import Views
@@ -37,7 +35,6 @@ from geosplat_jax.report.scales import error_map
 from geosplat_jax.report.sheets import Shown
 from geosplat_jax.report.trust import sightings
 
-_PACKAGES = ("jax", "jaxlib", "numpy", "optax", "geosplat_jax")
 _MATERIALS = ("roughness", "metallic")
 
 
@@ -453,10 +450,7 @@ def evaluate_run(
         "samples": options.samples,
         "samples_drawn": renderer.samples,
         "relight_indirect": options.relight_indirect,
-        "versions": {
-            "python": platform.python_version(),
-            **{package: importlib.metadata.version(package) for package in _PACKAGES},
-        },
+        "versions": installed_versions(),
         "seed": trained.config.run.seed,
         "config": trained.config.to_dict(),
         **meta,

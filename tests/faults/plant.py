@@ -26,8 +26,11 @@ LIST = Path(__file__).with_name("faults.toml")
 WANTED = 0.9
 """Share of the faults that the default tests have to notice."""
 
-_BESIDE = ("benchmarks", "docs", "examples", "experiments", "pyproject.toml", "README.md")
-"""Files and folders that tests read, apart from the package and the tests themselves."""
+_BESIDE = (
+    *("benchmarks", "examples", "experiments"),
+    *("CONTRIBUTING.md", "README.md", "mkdocs.yml", "pyproject.toml"),
+)
+"""Files and folders that tests read, apart from what is copied."""
 
 _PASSED, _FAILED = 0, 1
 """Exit statuses of pytest; any other status means that the tests did not run."""
@@ -90,7 +93,7 @@ def read_faults() -> list[Fault]:
 def copied(folder: Path) -> Path:
     """Copy the package and its tests into a folder, and link the other files that tests read."""
     ignored = shutil.ignore_patterns("__pycache__")
-    for name in (PACKAGE, "tests"):
+    for name in (PACKAGE, "docs", "tests"):  # links between documents must not lead out of docs
         shutil.copytree(ROOT / name, folder / name, ignore=ignored)
     for name in _BESIDE:
         (folder / name).symlink_to(ROOT / name)
