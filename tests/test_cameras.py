@@ -54,7 +54,11 @@ from geosplat_jax.run import Run
 pytestmark = pytest.mark.usefixtures("products_must_ask")
 
 DUCK = Path(__file__).resolve().parents[1] / "examples" / "duck"
-CONFIG = tiny_config("geometry.resolution=8", "material.bias=true")
+CONFIG = tiny_config(
+    "geometry.resolution=8",
+    "material.bias=true",
+    "material.initial_roughness_logit=-3.0",  # highlights tell where the camera is
+)
 STEPS = (*TINY, "stages.split_sum.steps=2")
 SIZE = 32
 BOUNDS = (np.full(3, -0.6), np.full(3, 0.6))
