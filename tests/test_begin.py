@@ -15,7 +15,7 @@ from geosplat_jax.fit.evidence import Rung
 from geosplat_jax.fit.folder import RunFolder
 from geosplat_jax.fit.listener import NOBODY, Listener, Listeners, Progress
 from geosplat_jax.fit.loop import Loop
-from geosplat_jax.fit.train import fit
+from geosplat_jax.fit.train import TrainingError, fit
 from geosplat_jax.fit.trained import Trained
 from geosplat_jax.io.checkpoints import CheckpointError
 
@@ -59,7 +59,7 @@ class _TakeOverOntoAFullDisk(TakeOver):
 
 def test_a_run_that_could_not_store_what_it_took_over_leaves_its_folder_free(tmp_path):
     begin = _TakeOverOntoAFullDisk("a", "monte_carlo")
-    with pytest.raises(CheckpointError, match="no space left"):
+    with pytest.raises(TrainingError, match="no space left.*give the same command again"):
         fit(sphere_dataset(count=2, size=8), tiny_config(), tmp_path / "run", begin=begin)
     assert not RunFolder(tmp_path / "run").exists
 

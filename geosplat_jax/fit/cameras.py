@@ -440,24 +440,25 @@ def refine_views(
     """
     how, cameras = how or CameraSettings(), {}
     for index, name in enumerate(views.names):
-        if not views.has_masks:
-            # Alpha is one everywhere, and the object would be enlarged to fill the photograph.
+        if views.has_masks:
+            result, capacities = refine_view(subject, _photograph(views, index), how)
+            subject = replace(subject, pipeline=replace(subject.pipeline, capacities=capacities))
+            cameras[name] = _refined(result, views, index)
+        else:  # alpha is one everywhere: the object would be enlarged to fill the photograph
             cameras[name] = _kept(views, index, "there are no masks")
-            if on_view is not None:
-                on_view(ViewProgress(index + 1, len(views), name, cameras[name]))
-            continue
-        valid = np.ones((views.height, views.width), np.float32)
-        photograph = PosedPhotograph(
-            camera=views.camera([index]),
-            image=jnp.asarray(views.clipped([index])[0]),
-            valid=jnp.asarray(valid if views.valid is None else views.valid[index]),
-        )
-        result, capacities = refine_view(subject, photograph, how)
-        subject = replace(subject, pipeline=replace(subject.pipeline, capacities=capacities))
-        cameras[name] = _refined(result, views, index)
         if on_view is not None:
             on_view(ViewProgress(index + 1, len(views), name, cameras[name]))
     return RefinedSplit(views.width, views.height, cameras)
+
+
+def _photograph(views: Views, index: int) -> PosedPhotograph:
+    """Return a view with its initial camera."""
+    valid = np.ones((views.height, views.width), np.float32)
+    return PosedPhotograph(
+        camera=views.camera([index]),
+        image=jnp.asarray(views.clipped([index])[0]),
+        valid=jnp.asarray(valid if views.valid is None else views.valid[index]),
+    )
 
 
 def _kept(

@@ -267,9 +267,19 @@ def fit(
         except _FAILURES as error:
             if has_begun and not run.metric_lines():
                 run.clear()  # not one step was made: the folder is free again
+                if isinstance(error, CheckpointError):
+                    raise TrainingError(_cannot_store(run, error)) from error
             if not is_out_of_memory(error):
                 raise
             raise TrainingError(_out_of_memory(run, error)) from error
+
+
+def _cannot_store(run: RunFolder, error: CheckpointError) -> str:
+    """Say in one line why a run could not begin, and what to do; resuming would begin anew."""
+    return (
+        f"cannot store what {run} begins with ({error.__cause__ or error}); no step was made. Free "
+        "disk space, then give the same command again"
+    )
 
 
 def _out_of_memory(run: RunFolder, error: Exception) -> str:

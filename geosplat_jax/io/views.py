@@ -145,7 +145,7 @@ class Views:
 
     @property
     def sizes(self) -> Float[np.ndarray, "V 2"]:
-        """Height and width of every photograph, which may be less than those of the images."""
+        """Height and width up to the last pixel of each view that counts, (V, 2)."""
         if self.valid is None:
             return np.tile(np.array([self.height, self.width], float), (len(self), 1))
 
