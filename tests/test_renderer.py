@@ -141,14 +141,16 @@ def test_the_program_of_assets_serves_every_light(direct, matt):
     assert renderer_module._reconstruct._cache_size() == cache_size
 
 
+class Reached(Exception):
+    """The capacities that a program would have been compiled for."""
+
+
+def reached(pipeline, *arguments, **named):
+    raise Reached(pipeline.capacities)
+
+
 def test_lists_have_grown_before_the_largest_program_is_compiled(matt, monkeypatch):
-    class Reached(Exception):
-        pass
-
-    def render_lit(pipeline, *arguments, **named):
-        raise Reached(pipeline.capacities)
-
-    monkeypatch.setattr(renderer_module, "_render_lit", render_lit)
+    monkeypatch.setattr(renderer_module, "_render_lit", reached)
     pipeline, params = matt
     small_pipeline = replace(pipeline, capacities=AMPLE.resized(hits=128))
     renderer = Renderer(small_pipeline, params)
@@ -161,6 +163,17 @@ def test_lists_have_grown_before_the_largest_program_is_compiled(matt, monkeypat
     )
     assert needed_hits > 128
     assert failure.value.args[0]["hits"] >= needed_hits
+
+
+def test_buffers_that_training_did_not_need_begin_as_the_surface_estimates(matt, monkeypatch):
+    """Without rays in training there is no size for their lists, which may fit few sizes."""
+    pipeline, params = matt
+    sizes = {name: size for name, size in AMPLE.items() if name != "cell_patches"}
+    monkeypatch.setattr(renderer_module, "_reconstruct", reached)
+    with pytest.raises(Reached) as failure:
+        renderer_module.build_asset(replace(pipeline, capacities=Capacities(**sizes)), params)
+    guess = pipeline.surface.first_capacities(params.geometry)["cell_patches"]
+    assert dict(failure.value.args[0]) == {**sizes, "cell_patches": guess}
 
 
 def test_no_samples_are_refused(matt):

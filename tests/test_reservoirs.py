@@ -325,6 +325,24 @@ def test_settings_refuse_what_would_lose_light():
     assert transport.for_images(4).settings.reservoirs == ReservoirSettings()
 
 
+def test_samples_are_plain_where_views_share_none():
+    """Traced indirect light draws samples for the faces even then."""
+    points, light = jax.tree.map(lambda leaf: leaf[:KINDS], scene()), sky()
+
+    def samples(spec):
+        settings = MonteCarloSettings(shares_views=False, reservoirs=spec)
+        transport = settings.build(LightSpec())
+        options = {"carry": None, "finds_nearest": False}
+        key, sampler = jax.random.key(0), light_sampler(light)
+        return transport._draw_shared(key, points, light, sampler, None, **options)[0]
+
+    plain_samples, other_samples = samples(ReservoirSettings()), samples(PLAIN)
+    for leaf, other_leaf in zip(
+        jax.tree.leaves(plain_samples), jax.tree.leaves(other_samples), strict=True
+    ):
+        np.testing.assert_array_equal(leaf, other_leaf)
+
+
 @pytest.mark.slow
 @pytest.mark.long
 def test_a_run_with_paths_and_reservoirs_resumes_bit_for_bit(tmp_path):

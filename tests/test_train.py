@@ -311,8 +311,9 @@ def test_other_errors_of_the_runtime_are_not_taken_for_memory(dataset, tmp_path,
         fit(dataset, tiny_config(), tmp_path)
 
 
-def test_stopping_writes_a_checkpoint(dataset, tmp_path, monkeypatch):
-    answers = iter([False, True])
+@pytest.mark.parametrize("step", [2, 4], ids=["halfway", "in the last step"])
+def test_stopping_writes_a_checkpoint_and_is_told(step, dataset, tmp_path, monkeypatch):
+    answers = iter([False] * (step - 1) + [True])
 
     @contextmanager
     def requests():
@@ -321,7 +322,7 @@ def test_stopping_writes_a_checkpoint(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(train_module, "stop_requests", requests)
     with pytest.raises(Interrupted, match="--resume"):
         fit(dataset, tiny_config("run.checkpoint_every=100"), tmp_path)
-    assert load_trained(tmp_path).step == 2
+    assert load_trained(tmp_path).step == step
 
 
 def test_views_come_in_shuffled_epochs_that_depend_on_seed_and_step_alone():

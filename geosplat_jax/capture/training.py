@@ -472,13 +472,11 @@ def train_radiance(
                     else None
                 )
                 on_step(_progress(loop, report, now - start_time, seconds_left))
-            if (
-                steps_done % settings.checkpoint_every == 0
-                or steps_done == last
-                or stop_requested()
-            ):
+            is_stopped = stop_requested()
+            is_due = steps_done % settings.checkpoint_every == 0 or steps_done == last
+            if is_due or is_stopped:
                 loop.save()
-            if stop_requested() and steps_done < last:
+            if is_stopped:
                 raise Interrupted(f"stopped at step {steps_done}; continue with --resume")
         return loop.result()
 

@@ -402,7 +402,8 @@ def _train(
                 or is_stopped
             ):
                 loop.save()
-            if is_stopped and steps_done < final_step:
+            # After the last step too: a caller may have more to do, such as another round.
+            if is_stopped:
                 raise Interrupted(f"stopped at step {steps_done}; continue with --resume")
             preview_interval = config.run.preview_every
             is_early = steps_done == preview_interval // _FIRST_PREVIEW

@@ -102,7 +102,9 @@ def build_asset(pipeline: Pipeline, params: Params) -> Asset:
         asset = _reconstruct(replace(unlit, capacities=capacities), params)
         return asset, asset.usage
 
-    return capacity_module.retry(attempt, pipeline.capacities)[0]
+    # A pipeline that traced no rays so far has no sizes for their index.
+    guess = {**pipeline.surface.first_capacities(params.geometry), **pipeline.capacities}
+    return capacity_module.retry(attempt, Capacities(**guess))[0]
 
 
 def relight_transport(indirect: str = "traced") -> MonteCarloSettings | PathSettings:
@@ -354,12 +356,12 @@ class Renderer:
     def __call__(self, camera: Camera) -> RenderedView:
         """Render the single view of ``camera``, with every AOV of the evaluation."""
         illuminations = self._illuminated()
-        outputs = [self._render(camera, illuminations[0], 0)]
-        for pass_index in range(1, self._passes_needed(outputs[0])):
+        first_output = self._render(camera, illuminations[0], 0)
+        pass_count, total = self._passes_needed(first_output), first_output.rgb[0]
+        for pass_index in range(1, pass_count):
             illumination = illuminations[pass_index % len(illuminations)]
-            outputs.append(self._render(camera, illumination, pass_index))
-        linear = jnp.mean(jnp.stack([output.rgb[0] for output in outputs]), axis=0)
-        first_output = outputs[0]
+            total = total + self._render(camera, illumination, pass_index).rgb[0]
+        linear = total / pass_count
         return RenderedView(
             np.asarray(tone_map(linear, self._log_exposure)),
             np.asarray(first_output.alpha[0]),

@@ -168,7 +168,7 @@ class SampledTransport(Transport):
         """Draw and trace the samples that views share; also return the carry of the next step."""
         spec, counts = self.settings.reservoirs, self._counts
         options: dict[str, Any] = {"counts": counts, "finds_nearest": finds_nearest}
-        if not spec.candidates or not counts.light:
+        if not self.settings.chooses_samples:
             return draw_samples(key, points, sampler, index, **options), carry
         own_key, key = jax.random.split(key)
         reservoirs = resample(
