@@ -110,9 +110,14 @@ def test_a_fresh_albedo_is_grey_where_asked_and_where_there_is_no_surface(overri
     ("after", "is_kept"), [("harmonics", True), ("radiometric", False), ("constant", False)]
 )
 def test_a_head_of_indirect_light_is_kept_where_it_means_the_same(after, is_kept):
-    """Harmonics (arriving light) and radiometric (sent light) have equally many coefficients."""
+    """Harmonics (arriving light) and radiometric (sent light) have equally many coefficients.
+
+    The encoding that a head reads is kept with it, whatever happens to the albedo.
+    """
     config = tiny_config(
         "geometry.resolution=6",
+        "material.shared=false",
+        'stages.refine.enter=[{kind="fresh_albedo"}]',
         "stages.monte_carlo.steps=1",
         "stages.monte_carlo.transport.indirect=harmonics",
         "stages.refine.steps=1",
@@ -125,6 +130,9 @@ def test_a_head_of_indirect_light_is_kept_where_it_means_the_same(after, is_kept
     )
     assert new_weights.shape[1] == (6 if after == "constant" else 27)
     assert np.array_equal(old_weights, new_weights) is is_kept
+    old_table, new_table = (x.material.albedo_table for x in (params, begun_params))
+    assert np.array_equal(old_table, new_table) is is_kept
+    assert not begun_params.material.albedo_head[-1].weights.any()
 
 
 @pytest.mark.parametrize("quality", QUALITIES)

@@ -80,7 +80,8 @@ class Entry(Variant, abc.ABC):
 
         Parameters
         ----------
-        params : parameters that the stage before ended with.
+        params : parameters that the stage before ended with, with a head of indirect light only
+            where the next stage keeps it.
         pipeline : pipeline of the stage before.
         key : random key of new values.
         """
@@ -90,7 +91,7 @@ class Entry(Variant, abc.ABC):
 class FreshAlbedo(Entry, kind="fresh_albedo"):
     """Start with a new albedo field of one colour, so that no shadow is left in it.
 
-    Where one encoding feeds all heads, only the albedo's head is drawn anew.
+    Where the encoding of albedo feeds heads that stay, only the albedo's head is drawn anew.
     """
 
     colour: Literal["mean", "grey"] = "mean"
@@ -98,13 +99,14 @@ class FreshAlbedo(Entry, kind="fresh_albedo"):
     brightness of the light; grey is for an old field that stored radiance."""
 
     def apply(self, params: Params, pipeline: Pipeline, key: Key[Array, ""]) -> Params:
-        """Return parameters with a new albedo head, and a new table where it is not shared."""
+        """Return parameters with a new albedo head, and a new table where no other head reads it."""
         colour = jnp.full((3,), _GREY)
         if self.colour == "mean":
             colour = mean_albedo(params, pipeline)
         field = params.material
         new_field = init_materials(key, pipeline.fields)
-        table = field.albedo_table if pipeline.fields.shared else new_field.albedo_table
+        is_needed = pipeline.fields.shared or field.indirect_head is not None
+        table = field.albedo_table if is_needed else new_field.albedo_table
         head = _one_colour(new_field.albedo_head, colour)
         return replace(params, material=replace(field, albedo_table=table, albedo_head=head))
 
@@ -158,12 +160,13 @@ def enter_stage(
     The first parameters of the next stage.
     """
     entry_key, indirect_key = jax.random.split(key)
-    head = params.material.indirect_head
-    if head is None or not indirect.goes_on:
-        head = init_indirect_head(indirect_key, pipeline.fields, indirect.outputs)
-    params = replace(params, material=replace(params.material, indirect_head=head))
+    if not indirect.goes_on:
+        params = replace(params, material=replace(params.material, indirect_head=None))
     for number, entry in enumerate(entries):
         params = entry.apply(params, pipeline, jax.random.fold_in(entry_key, number))
+    if params.material.indirect_head is None:
+        head = init_indirect_head(indirect_key, pipeline.fields, indirect.outputs)
+        params = replace(params, material=replace(params.material, indirect_head=head))
     splat_parameters = splats.begin(lambda: _placed(pipeline, params), pipeline.surface.box)
     return replace(params, splats=splat_parameters)
 
