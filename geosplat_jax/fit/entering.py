@@ -99,7 +99,7 @@ class FreshAlbedo(Entry, kind="fresh_albedo"):
     brightness of the light; grey is for an old field that stored radiance."""
 
     def apply(self, params: Params, pipeline: Pipeline, key: Key[Array, ""]) -> Params:
-        """Return parameters with a new albedo head, and a new table where no other head reads it."""
+        """Return parameters with a new albedo head, and a new table if no other head reads it."""
         colour = jnp.full((3,), _GREY)
         if self.colour == "mean":
             colour = mean_albedo(params, pipeline)
