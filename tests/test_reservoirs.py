@@ -279,6 +279,21 @@ def test_normals_that_face_away_lose_no_highlight_to_reservoirs():
     assert plain_mean > 10 * np.hypot(plain_error, resampled_error)
 
 
+@pytest.mark.parametrize("brightness", [0.0, 1.0])
+def test_a_black_sky_has_samples_for_what_is_sent_back(brightness):
+    """Weights times cosine add up to the integral of the cosine, which is pi."""
+    points, light = scene(), EnvLight(jnp.full((8, 16, 3), brightness))
+    samples = jax.jit(
+        lambda key: resample(
+            key, points, light, light_sampler(light), None, None, spec=PLAIN, count=COUNT
+        )
+    )(jax.random.key(0))
+    cosine = np.sum(np.asarray(points.normals)[:, None] * samples.directions, axis=-1)
+    estimates = np.asarray(np.maximum(cosine, 0.0) * samples.weights, float).mean(axis=1)
+    error = estimates.std() / np.sqrt(POINTS)
+    assert abs(estimates.mean() - np.pi) < STANDARD_ERRORS * error < 0.2
+
+
 def test_what_a_place_kept_is_used_only_nearby_and_on_a_surface_of_that_direction():
     """It counts at most half as much as the four candidates of the step, as the setting says."""
     spec = replace(REUSE["steps"], candidates=4, confidence=0.5)

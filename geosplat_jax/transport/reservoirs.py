@@ -145,9 +145,13 @@ def _slots(keys: Int[Array, " N"], count: int) -> Int[Array, " N"]:
 
 
 def _brightness(light: EnvLight, directions: Float[Array, "... 3"]) -> Float[Array, "..."]:
-    """Brightness of the sky in directions, never 0 unless the whole sky is black."""
+    """Brightness of the sky in directions, never 0; that of a black sky is 1.
+
+    Samples that no reservoir chooses would be missing where blocked directions send light back.
+    """
     brightness = luminance(lookup(light.radiance, directions.reshape(-1, 3)))
-    floor = _DIMMEST * jnp.mean(luminance(light.radiance))
+    mean = jnp.mean(luminance(light.radiance))
+    floor = jnp.where(mean > 0.0, _DIMMEST * mean, 1.0)
     return jnp.maximum(brightness, floor).reshape(directions.shape[:-1])
 
 
