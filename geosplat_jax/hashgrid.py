@@ -74,11 +74,6 @@ class HashGridSpec:
                 f"a grid line of {self.resolutions[-1]} cells takes more than half of "
                 f"2**{self.log2_entries} rows; raise log2_entries or lower finest"
             )
-        if self.total_entries >= 2**31:
-            raise ValueError(
-                f"all levels have {self.total_entries} rows, and 32 bits count fewer than "
-                f"{2**31}; lower levels or log2_entries"
-            )
 
     @property
     def resolutions(self) -> tuple[int, ...]:

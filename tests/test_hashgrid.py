@@ -100,11 +100,10 @@ def test_levels_that_fit_are_dense_and_the_others_have_full_tables():
         {"features": 0},
         {"coarsest": 8, "finest": 4},
         {"log2_entries": 8, "finest": 200},
-        {"levels": 64, "log2_entries": 26, "coarsest": 2000, "finest": 2**24},
     ],
 )
 def test_impossible_sizes_are_refused(sizes):
-    with pytest.raises(ValueError, match=r"than or equal to 1|must be|takes more than|32 bits"):
+    with pytest.raises(ValueError, match=r"greater than or equal to 1|must be|takes more than"):
         HashGridSpec(**sizes)
 
 

@@ -379,7 +379,7 @@ class Renderer:
         covered_pixels, splat_count = float(jnp.sum(output.alpha)), int(output.usage["visible"])
         sample_count = _SPECULAR_SAMPLES_PER_PIXEL * covered_pixels
         pass_count = math.ceil(sample_count / max(splat_count * self._pass_samples, 1))
-        return min(pass_count, len(self._illuminations))
+        return max(min(pass_count, len(self._illuminations)), 1)
 
     @property
     def is_two_sided(self) -> bool:
