@@ -545,7 +545,13 @@ def test_needles_and_specks_with_exact_edges_equal_float64(sample, constants):
         assert (error <= 1e-4 * scale + slack)[is_real].all()
 
 
-@pytest.mark.parametrize(("sample", "constants"), SAMPLINGS)
+@pytest.mark.parametrize(
+    ("sample", "constants"),
+    [
+        pytest.param(face_splats, PAPER, id="paper", marks=pytest.mark.slow),
+        *SAMPLINGS[1:],
+    ],
+)
 def test_needles_in_every_direction_are_exact_up_to_a_rounding_of_their_length(sample, constants):
     triangles, height = rotated_needles(FACES)
     (single, frame, gradient), (double, wide_frame, _) = both_precisions(

@@ -321,6 +321,7 @@ def test_images_of_any_shape_equal_the_textbook(height, width, tile_size):
     assert_sane(image, alpha, np.ones(3))
 
 
+@pytest.mark.slow
 def test_an_image_that_no_tile_divides_has_the_gradient_of_dense_compositing():
     assert_equals_dense(scene(5))
 

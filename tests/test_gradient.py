@@ -102,6 +102,7 @@ def test_a_program_that_fails_beside_another_is_told_when_both_have_ended(number
     assert finished_numbers == [1 - number]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["split_sum", "monte_carlo"])
 def test_only_programs_that_sort_or_trace_rays_are_called_side_by_side(stage):
     _, pipeline, params, batch = problem(stage=stage)
@@ -142,6 +143,7 @@ def test_split_sum_by_parts_with_a_frozen_group():
             assert_close(a, b)
 
 
+@pytest.mark.slow
 def test_more_views_are_no_new_program_and_larger_lists_only_three():
     """Compiled programs are counted: those of a view serve every view."""
     _, pipeline, params, batch = problem(stage="split_sum")

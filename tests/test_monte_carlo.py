@@ -296,6 +296,7 @@ def test_without_occlusion_rays_that_are_there_for_others_block_nothing(ball_ind
     assert float(jnp.mean(shaded(ball_index, True))) < 0.8 * float(jnp.mean(shaded(None, False)))
 
 
+@pytest.mark.slow
 def test_chunks_and_masks_change_nothing_for_the_others(ball_index, monkeypatch):
     """Points in chunks have the same values as all points at once; masked points are black."""
     points, materials, wo, light = scene()

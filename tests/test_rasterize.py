@@ -163,7 +163,8 @@ def test_image_and_gradients_match_the_oracle(name, x64):
 
 
 @pytest.mark.parametrize(
-    ("height", "width", "tile_size", "channels"), [(13, 9, 5, 7), (1, 1, 4, 3)]
+    ("height", "width", "tile_size", "channels"),
+    [(13, 9, 5, 7), pytest.param(1, 1, 4, 3, marks=pytest.mark.slow)],
 )
 def test_equals_dense_compositing(height, width, tile_size, channels, x64):
     settings = camera(jnp.float64, height, width)

@@ -185,7 +185,13 @@ def test_assumed_visibility_is_biased_as_it_says():
     assert np.min(bias / error) < -2 * STANDARD_ERRORS, (bias, error)
 
 
-@pytest.mark.parametrize("fault", ["shares by confidence alone", "wrong number of candidates"])
+@pytest.mark.parametrize(
+    "fault",
+    [
+        pytest.param("shares by confidence alone", marks=pytest.mark.slow),
+        "wrong number of candidates",
+    ],
+)
 def test_a_fault_shows(monkeypatch, fault):
     jax.clear_caches()
     if fault == "shares by confidence alone":

@@ -430,6 +430,7 @@ def test_combinations_keep_what_the_base_sets(tmp_path):
     assert len(set(settings)) == len(settings)
 
 
+@pytest.mark.slow
 def test_halving_trains_many_a_little_and_few_in_full(tmp_path, monkeypatch):
     path, fakes = _write(tmp_path, SWEEP), Trained()
     monkeypatch.setattr(halving.search, "__defaults__", (fakes.run_jobs,))

@@ -357,6 +357,7 @@ def test_parts_that_are_averaged_can_be_put_back(ball, bowl_lit):
             np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_surfaces_that_reflect_nothing_send_no_traced_light(bowl_light):
     """A dielectric always reflects 4 %; only a metal of albedo 0 is black."""
     np.testing.assert_array_equal(
@@ -409,7 +410,8 @@ def even_radiance(level):
     return np.tile((np.log(np.expm1(level)) + 3) * EVEN, 3)
 
 
-@pytest.mark.parametrize("moves", ["learned", pytest.param("both", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("moves", ["learned", "both"])
 def test_disagreement_is_the_squared_difference_and_moves_what_it_should(ball, moves):
     """A ball does not occlude itself; a matt one sends its albedo times the light, which is 1."""
     _, _, asset = ball
