@@ -533,7 +533,8 @@ def train(
     budget : time and memory that the training may take. Without ``config``, settings are chosen
         that fit both (`plan_training`). The numbers of steps are adapted during the training, so
         that it ends in time. A run that is resumed keeps its budget, less the time that it has
-        used; a run that began without a budget cannot get one.
+        used, and without ``config`` also its settings and how its scene was read; a run that began
+        without a budget cannot get one.
     model : ``auto``, or a `ModelChoice`: train the smallest model that explains the scene, see
         `model_choice.choose_model`. Parts of ``config`` whose settings differ from its preset, or
         that `ModelChoice.by_hand` names, stay as they are. A run that is resumed keeps its model.
@@ -553,7 +554,7 @@ def train(
     ------
     TypeError
         On any other keyword, on options of reading together with a dataset, which has been read
-        already, and on a quality together with a config or a budget.
+        already, and on a quality together with a config, a budget or a run that keeps its settings.
     SceneError, RunError, TrainingError, Interrupted
         See `load_dataset` and `fit.train.fit`.
     ValueError
@@ -576,6 +577,10 @@ def train(
     order = _Order(config, mesh, budget, reading)
     if is_resumed:
         order = _as_it_began(order, folder, chooses=model is not None)
+        if quality is not None and order.config is not None:
+            raise TypeError(
+                f"the run in {folder} keeps the settings that were chosen for it; leave quality out"
+            )
     config, budget, reading = _settled(order, scene, quality=quality or "standard")
     dataset = scene if isinstance(scene, Dataset) else load_recorded(scene, reading)
     evidence = None

@@ -495,6 +495,8 @@ def test_python_resumes_a_budget_with_the_same_call_or_a_shorter_one(
     same_settings = {"config": config, "budget": Budget(60.0)} if names_settings else {}
     with pytest.raises(RunError, match="without choosing a model"):
         train(dataset, tmp_path / "run", begin=Resume(), model="auto")
+    with pytest.raises(TypeError, match="keeps the settings .* leave quality out"):
+        train(dataset, tmp_path / "run", begin=Resume(), quality="draft")
     run = train(dataset, tmp_path / "run", begin=Resume(), **same_settings)
     assert run.config != config
     assert run.trained.step == run.config.total_steps
