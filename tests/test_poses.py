@@ -12,7 +12,7 @@ from geosplat_jax import cli
 from geosplat_jax.io.alignment import align_world
 from geosplat_jax.io.dataset import load_dataset
 from geosplat_jax.io.images import MissingFileError, SceneError, write_png
-from geosplat_jax.io.poses import PoseError, _Matches, _pairs, _upright, find_poses
+from geosplat_jax.io.poses import PoseError, _Matches, _pairs, _upright, _write, find_poses
 
 HEIGHT, WIDTH, FOCAL = 150, 200, 190.0
 # Error of cameras that follow from some thousand features, each found to a third of a pixel.
@@ -178,3 +178,24 @@ def test_photographs_that_show_nothing_are_refused_with_advice(tmp_path):
     pytest.importorskip("pycolmap")
     refuses(photographs(tmp_path, 6, size=(40, 40)), "only 0 of 6 .*few details", PoseError)
     assert not (tmp_path / "sparse").exists()
+
+
+class OneFile:
+    """A model of COLMAP, as far as it is written."""
+
+    def write(self, folder):
+        (folder / "cameras.bin").write_bytes(b"new")
+
+
+@pytest.mark.parametrize("has_target", [True, False])
+def test_a_model_is_replaced_where_its_link_leads(tmp_path, has_target):
+    target, link = tmp_path / "elsewhere" / "model", tmp_path / "sparse" / "0"
+    link.parent.mkdir()
+    link.symlink_to(target)
+    if has_target:
+        target.mkdir(parents=True)
+        (target / "images.bin").write_bytes(b"old")
+    _write(OneFile(), link)
+    assert link.is_symlink()
+    assert [path.name for path in target.iterdir()] == ["cameras.bin"]
+    assert [path.name for path in target.parent.iterdir()] == ["model"]

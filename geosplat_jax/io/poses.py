@@ -394,7 +394,8 @@ def _align(colmap: ModuleType, model: Any, images: Path) -> None:
 
 
 def _write(model: Any, folder: Path) -> None:
-    """Write a model to a temporary folder, then replace an existing one by it."""
+    """Write a model to a temporary folder, then replace an existing one by it; links are kept."""
+    folder = folder.resolve()
     temporary_folder = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(temporary_folder, ignore_errors=True)
     temporary_folder.mkdir(parents=True)
