@@ -7,7 +7,8 @@ steps, and with schedules shortened accordingly. The best third is trained again
 many steps, and so on; the last rung trains in full. Candidates of a rung share the stages that they
 have in common. The best candidates are those of the front of quality and seconds, then those of
 the front of the rest, and so on, until the places are taken. The same command continues where it
-was stopped; each ``DIR/rung_K`` is a sweep of its own, and ``DIR/front.md`` is written at the end.
+was stopped, and ``--cluster`` is as in `run`; each ``DIR/rung_K`` is a sweep of its own, and
+``DIR/front.md`` is written at the end.
 """
 
 import argparse
@@ -17,9 +18,9 @@ import random
 import signal
 import statistics
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import run as runner
 import trade
@@ -149,7 +150,7 @@ def rung_factors(rungs: int, keep: float) -> list[float]:
 
 
 def search(
-    sweep: Sweep, arguments: argparse.Namespace, run_jobs: Any = runner.run_jobs
+    sweep: Sweep, arguments: argparse.Namespace, do_jobs: Callable[[list[Job]], list[Job]]
 ) -> tuple[Sweep, Path, list[Job]]:
     """Train all rungs; return the sweep of the last one, its folder, and its jobs that failed.
 
@@ -170,7 +171,7 @@ def search(
         runner.check_folders(jobs)
         command = f"python experiments/halving.py {arguments.sweep.name}"
         runner.write_record(rung_sweep, arguments.scenes, folder, command)
-        failures = run_jobs(jobs)
+        failures = do_jobs(jobs)
         if factor == 1.0:
             return rung_sweep, folder, failures
         values = full_costs(folder, rung_sweep, factor)
@@ -184,7 +185,9 @@ def search(
     raise AssertionError("the last rung trains in full")
 
 
-def main(argv: list[str] | None = None) -> int:
+def main(
+    argv: list[str] | None = None, *, start: Callable[[Job], None] = runner.in_a_process
+) -> int:
     """Search; 0, 1 if runs of the last rung failed, 2 on a wrong call, 130 if interrupted."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("sweep", type=Path, help="whose runs and groups are the candidates")
@@ -196,6 +199,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the combinations")
     parser.add_argument("--quality", choices=QUALITIES, help="instead of the sweep's")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="S.F=VALUE")
+    runner.add_cluster_options(parser)
     arguments = parser.parse_args(argv)
     previous_handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
@@ -204,7 +208,8 @@ def main(argv: list[str] | None = None) -> int:
         sweep = read_sweep(
             arguments.sweep, overrides=arguments.overrides, quality=arguments.quality
         )
-        last_sweep, folder, failures = search(sweep, arguments)
+        do_jobs = runner.jobs_runner(arguments, start=start)
+        last_sweep, folder, failures = search(sweep, arguments, do_jobs)
         record = trade.report._read_sweep(folder)
         text = trade.compose(record, [trade.read_points(folder, record)])
     except (SweepError, ReportError, OSError) as error:

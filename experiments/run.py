@@ -19,6 +19,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -154,6 +155,8 @@ def execute(
         # Written last: an evaluation without this file was interrupted.
         text = json.dumps(_evaluation_of(job), indent=2) + "\n"
         (folder / "evaluation.json").write_text(text)
+    # Another process may have failed meanwhile, because this one holds the folder.
+    (folder / "error.txt").unlink(missing_ok=True)
 
 
 def _say(text: str) -> None:
@@ -251,14 +254,46 @@ def run_jobs(jobs: list[Job], *, start: Callable[[Job], None] = in_a_process) ->
     return failures
 
 
-def cluster_of(arguments: argparse.Namespace) -> Any:
-    """Return the executor that the options ask for; None to do jobs here, one after the other.
+def add_cluster_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that `jobs_runner` takes from the command line."""
+    parser.add_argument(
+        "--cluster", choices=("slurm", "local"), help="hand the runs to submitit (extra `cluster`)"
+    )
+    parser.add_argument(
+        "--parallel", type=int, default=1, metavar="N", help="with --cluster: runs at a time"
+    )
+    parser.add_argument(
+        "--cluster-set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a parameter of submitit's executor: slurm_partition=cpu, timeout_min=600, mem_gb=16",
+    )
+
+
+def jobs_runner(
+    arguments: argparse.Namespace, *, start: Callable[[Job], None] = in_a_process
+) -> Callable[[list[Job]], list[Job]]:
+    """Return what does jobs and returns those that failed: `run_on_cluster` or `run_jobs`.
+
+    Parameters
+    ----------
+    arguments : with the options of `add_cluster_options`.
+    start : see `run_jobs`.
 
     Raises
     ------
     SweepError
         If submitit is missing or refuses a parameter, or an option is not valid.
     """
+    executor = _cluster_of(arguments)
+    if executor is None:
+        return partial(run_jobs, start=start)
+    return partial(run_on_cluster, executor=executor, parallel=arguments.parallel)
+
+
+def _cluster_of(arguments: argparse.Namespace) -> Any:
+    """Return the executor that the options ask for, or None; see `jobs_runner`."""
     if arguments.parallel < 1:
         raise SweepError(f"--parallel must be at least 1, got {arguments.parallel}")
     if arguments.cluster is None:
@@ -413,19 +448,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--downscale", type=int, metavar="N", help="reduce the images; instead of the sweep's"
     )
-    parser.add_argument(
-        "--cluster", choices=("slurm", "local"), help="hand the runs to submitit (extra `cluster`)"
-    )
-    parser.add_argument(
-        "--parallel", type=int, default=1, metavar="N", help="with --cluster: runs at a time"
-    )
-    parser.add_argument(
-        "--cluster-set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="a parameter of submitit's executor: slurm_partition=cpu, timeout_min=600, mem_gb=16",
-    )
+    add_cluster_options(parser)
     return parser
 
 
@@ -455,7 +478,7 @@ def main(argv: list[str] | None = None, *, start: Callable[[Job], None] = in_a_p
             mesh=arguments.mesh,
             downscale=arguments.downscale,
         )
-        executor = cluster_of(arguments)
+        do_jobs = jobs_runner(arguments, start=start)
         scenes = _chosen(arguments.scene, sweep.scenes, "--scene")
         names = _chosen(arguments.only, (run.name for run in sweep.runs), "--only")
         for scene in scenes:
@@ -469,10 +492,7 @@ def main(argv: list[str] | None = None, *, start: Callable[[Job], None] = in_a_p
         return 2
     previous_handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        if executor is None:
-            failures = run_jobs(jobs, start=start)
-        else:
-            failures = run_on_cluster(jobs, executor, parallel=arguments.parallel)
+        failures = do_jobs(jobs)
     except KeyboardInterrupt:
         _say("interrupted; the same command goes on from the last checkpoint")
         return 130

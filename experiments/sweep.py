@@ -118,7 +118,8 @@ def in_scene(config: Config, scene: Path) -> Config:
     """
     if not isinstance(config.geometry, MeshSettings):
         return config
-    path = (scene / config.geometry.path).resolve()
+    # A link to a file of another name is not followed, since reports know the name in the sweep.
+    path = scene.resolve() / config.geometry.path
     try:
         return replace(
             config, geometry=replace(config.geometry, path=str(path), digest=digest_of(path))

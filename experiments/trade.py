@@ -109,8 +109,12 @@ def read_points(folder: Path, sweep: dict[str, Any]) -> dict[str, dict[str, Poin
 
 
 def quality_figures(sweep: dict[str, Any]) -> list[str]:
-    """Return the names of the figures in decibels, whose mean is the quality."""
-    names = [name for name in sweep["figures"] if name.endswith("psnr") and "light." not in name]
+    """Return the names of the figures in decibels, whose mean is the quality.
+
+    That of the light itself is left out, since an object says little about much of its light.
+    """
+    figures = sweep["figures"]
+    names = [name for name in figures if name.endswith("psnr") and not name.startswith("light.")]
     if not names:
         raise ReportError("the sweep has no figure in decibels; add nvs.psnr to its figures")
     return names

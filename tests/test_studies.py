@@ -16,12 +16,15 @@ STUDIES = Path(__file__).resolve().parents[1] / "experiments" / "studies"
 sys.path.insert(0, str(STUDIES))
 
 import cameras  # noqa: E402
+import drift  # noqa: E402
 import earlier_runs  # noqa: E402
 import existing_mesh  # noqa: E402
 import light  # noqa: E402
+import models  # noqa: E402
 import precision  # noqa: E402
 import resolution  # noqa: E402
 
+from benchmarks import suite  # noqa: E402
 from geosplat_jax.fit.folder import RunFolder  # noqa: E402
 from geosplat_jax.fit.presets import make_config  # noqa: E402
 
@@ -158,3 +161,40 @@ def test_studies_open_runs_with_their_settings_and_no_others(tmp_path, open_with
     assert open_with(dataset, tmp_path / "run", "draft").dataset is dataset
     with pytest.raises(SystemExit, match="holds a run with other settings"):
         open_with(dataset, tmp_path / "run", "standard")
+
+
+def test_the_study_of_models_takes_no_runs_of_another_call(tmp_path):
+    call = {"quality": "draft", "steps": 100}
+    models.require_same_call(tmp_path / "out", "matt", call)
+    (tmp_path / "out" / "matt").mkdir()
+    models.require_same_call(tmp_path / "out", "matt", call)
+    with pytest.raises(SystemExit, match="not .*standard"):
+        models.require_same_call(tmp_path / "out", "matt", call | {"quality": "standard"})
+    (tmp_path / "out" / "metal").mkdir()
+    with pytest.raises(SystemExit, match="unknown options"):
+        models.require_same_call(tmp_path / "out", "metal", call)
+
+
+def test_runs_with_one_name_in_two_folders_have_rows_of_their_own(tmp_path, monkeypatch, capsys):
+    folders = [tmp_path / scene / "full" for scene in ("spot", "knight")]
+    values = dict(zip(folders, (0.25, 0.5), strict=True))
+    monkeypatch.setattr(sys, "argv", ["drift.py", *map(str, folders)])
+    monkeypatch.setattr(drift, "of_run", lambda folder: (values[folder],) * 5)
+    monkeypatch.setattr(drift, "enable_compilation_cache", lambda: None)
+    drift.main()
+    text = capsys.readouterr().out
+    assert "spot/full | 0.2500" in text
+    assert "knight/full | 0.5000" in text
+
+
+@pytest.mark.parametrize(("saved", "status"), [("run.whole_draft_ms", 0), ("trace.other_ms", 1)])
+def test_the_gate_asks_only_for_benchmarks_that_are_run(tmp_path, monkeypatch, saved, status):
+    entry = {"ms": 5.0, "ratio": 1.0}
+    baseline = tmp_path / "baseline.json"
+    measured = [f"{name}.x_ms" for name in ("rasterize", "geometry", "hashgrid", "step", "trace")]
+    baseline.write_text(json.dumps({"results": dict.fromkeys([*measured, saved], entry)}))
+    monkeypatch.setattr(suite, "BASELINE", baseline)
+    monkeypatch.setattr(suite, "measure", lambda name, benchmark: {f"{name}.x_ms": entry})
+    monkeypatch.setattr(suite, "enable_compilation_cache", lambda: None)
+    monkeypatch.setattr(sys, "argv", ["suite", "--gate", "1.6"])
+    assert suite.main() == status

@@ -372,6 +372,22 @@ def test_runs_start_from_the_mesh_in_their_scenes_folder(tmp_path, capsys):
     assert "there is no mesh file" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["mesh.ply", "../mesh.ply"])
+def test_a_mesh_may_be_a_link_or_lie_beside_the_scenes(tmp_path, name):
+    _write(tmp_path, FROM_MESH)
+    stored_file = tmp_path / "store" / "4f2a"
+    stored_file.parent.mkdir()
+    stored_file.write_text("a mesh")
+    for scene in ("one", "two"):
+        path = tmp_path / "scenes" / scene / name
+        if not path.exists():
+            path.symlink_to(stored_file)
+    assert _run(tmp_path, Fakes(), "--mesh", name) == 0
+    text = _report(tmp_path)
+    assert "other settings" not in text
+    assert "30.00" in text
+
+
 def test_the_report_notices_a_start_from_another_mesh(tmp_path):
     _write(tmp_path, FROM_MESH)
     for scene in ("one", "two"):
@@ -483,6 +499,19 @@ def test_a_failed_run_stops_only_those_that_need_it(tmp_path, capsys):
     assert evaluated_labels == {"one/coarse", "two/full", "two/coarse", "two/few", "two/many"}
     last_line = capsys.readouterr().err.splitlines()[-1]
     assert last_line.startswith(f"6 of 12 failed: one/{SHARED}, one/full")
+
+
+def test_a_run_that_was_refused_elsewhere_meanwhile_is_no_failure(tmp_path):
+    """Another process that wants the folder of a run fails, and says so in that folder."""
+    _write(tmp_path)
+
+    class Watched(Fakes):
+        def evaluate(self, folder, **arguments):
+            super().evaluate(folder, **arguments)
+            (folder / "error.txt").write_text("another process is writing to this folder")
+
+    assert _run(tmp_path, Watched(), "--only", "few", "--scene", "one") == 0
+    assert not (tmp_path / "runs" / "one" / "few" / "error.txt").exists()
 
 
 def test_a_trained_run_is_evaluated_without_its_source(tmp_path):

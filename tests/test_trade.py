@@ -100,11 +100,6 @@ class Trained(Fakes):
         figures["mean"] = {"nvs.psnr": psnr, "normal.mae_masked_deg": 5.0}
         (folder / "metrics.json").write_text(json.dumps(figures))
 
-    def run_jobs(self, jobs):
-        failed = runner.run_jobs(jobs, start=self.start)
-        assert failed == []
-        return failed
-
 
 def _rows(text, heading):
     lines = text.split(f"# {heading}\n")[1].split("\n#")[0].splitlines()
@@ -409,6 +404,13 @@ def test_a_run_from_a_mesh_is_that_of_the_sweep_which_names_its_file():
     assert of("/scenes/one/other.ply", "abc") != of("mesh.ply")
 
 
+def test_the_quality_of_a_run_counts_new_light_but_not_the_light_itself():
+    record = {"figures": ["nvs.psnr", "relight.mean.psnr", "light.psnr", "normal.mae_masked_deg"]}
+    assert trade.quality_figures(record) == ["nvs.psnr", "relight.mean.psnr"]
+    with pytest.raises(trade.ReportError, match="no figure in decibels"):
+        trade.quality_figures({"figures": ["light.psnr"]})
+
+
 def test_a_front_holds_what_nothing_beats():
     points = {"a": (1.0, 1.0), "b": (2.0, 3.0), "c": (2.0, 2.0), "d": (3.0, 2.5), "e": (4.0, 3.5)}
     assert trade.pareto(points) == ["a", "b", "e"]
@@ -431,12 +433,11 @@ def test_combinations_keep_what_the_base_sets(tmp_path):
 
 
 @pytest.mark.slow
-def test_halving_trains_many_a_little_and_few_in_full(tmp_path, monkeypatch):
+def test_halving_trains_many_a_little_and_few_in_full(tmp_path):
     path, fakes = _write(tmp_path, SWEEP), Trained()
-    monkeypatch.setattr(halving.search, "__defaults__", (fakes.run_jobs,))
     command = [str(path), "--scenes", str(tmp_path / "scenes"), "--output", str(tmp_path / "out")]
     command += ["--joint", "4", "--rungs", "2"]
-    assert halving.main(command) == 0
+    assert halving.main(command, start=fakes.start) == 0
     records = [
         json.loads((tmp_path / "out" / f"rung_{k}" / "sweep.json").read_text()) for k in (0, 1)
     ]
@@ -461,25 +462,20 @@ def test_halving_trains_many_a_little_and_few_in_full(tmp_path, monkeypatch):
     assert "## The front" in (tmp_path / "out" / "front.md").read_text()
     # The same command finds everything done.
     trained_count = len(fakes.trained)
-    assert halving.main(command) == 0
+    assert halving.main(command, start=fakes.start) == 0
     assert len(fakes.trained) == trained_count
 
 
-def test_what_fails_in_the_last_rung_is_in_the_status(tmp_path, monkeypatch, capsys):
+def test_what_fails_in_the_last_rung_is_in_the_status(tmp_path, capsys):
     path, fakes = _write(tmp_path, SWEEP), Trained()
     fakes.broken = {"one/half"}
-
-    def run_jobs(jobs):
-        return runner.run_jobs(jobs, start=fakes.start)
-
-    monkeypatch.setattr(halving.search, "__defaults__", (run_jobs,))
     command = [str(path), "--scenes", str(tmp_path / "scenes"), "--output", str(tmp_path / "out")]
     command += ["--joint", "0", "--rungs", "1"]
-    assert halving.main(command) == 1
+    assert halving.main(command, start=fakes.start) == 1
     assert "1 of the last rung failed, and are not compared: one/half" in capsys.readouterr().err
     assert "half (1 of 2)" in (tmp_path / "out" / "front.md").read_text()
     fakes.broken = set()
-    assert halving.main(command) == 0
+    assert halving.main(command, start=fakes.start) == 0
 
 
 FAKE_JOB = """
@@ -538,5 +534,7 @@ def test_a_cluster_that_is_half_asked_for_is_refused(tmp_path, capsys):
         (["--cluster", "local", "--parallel", "0"], "at least 1"),
         (["--cluster", "local", "--cluster-set", "a"], "reads NAME=VALUE"),
     ):
-        assert runner.main(_arguments(tmp_path, *options), start=Fakes().start) == 2
-        assert message in capsys.readouterr().err
+        command = _arguments(tmp_path, *options)
+        for main in (runner.main, halving.main):
+            assert main(command, start=Fakes().start) == 2
+            assert message in capsys.readouterr().err

@@ -178,11 +178,14 @@ def main() -> None:
         rows.append((run, gauge, [name, *cells]))
         if number == arguments.rounds:
             break
-        path = run.folder.path / "cameras.json"
+        kind = "balanced" if arguments.white_balance else "refined"
+        path = run.folder.path / f"cameras_{kind}.json"
         if not path.exists():
             began = time.perf_counter()
             run.refine_cameras(
-                splits=("train",), how=CameraSettings(white_balance=arguments.white_balance)
+                path,
+                splits=("train",),
+                how=CameraSettings(white_balance=arguments.white_balance),
             )
             print(f"{name}: refined in {time.perf_counter() - began:.0f} s", flush=True)
         split = read_cameras(path)["train"]

@@ -68,7 +68,8 @@ def main() -> None:
     enable_compilation_cache()
     print(f"| | {' | '.join(COLUMNS)} |")
     print("|---" * (len(COLUMNS) + 1) + "|")
-    drifts = {folder.name: of_run(folder) for folder in arguments.runs}
+    # In the folder of a sweep, runs of different scenes have the same name.
+    drifts = {str(folder): of_run(folder) for folder in arguments.runs}
     for name, values in {**drifts, **PAPER}.items():
         print(f"| {name} | {' | '.join(f'{value:.4f}' for value in values)} |")
 

@@ -203,9 +203,10 @@ def main() -> None:
     rows, columns = {"black": compared(black, truth)}, []
     for folder in arguments.runs:
         views = rendered_by_run(folder, arguments.views, arguments.samples)
-        rows[folder.name] = compared(views, truth)
+        name = str(folder)  # runs of another seed or scene have the same last name
+        rows[name] = compared(views, truth)
         columns.append(views[0])
-        print(folder.name, rows[folder.name], file=sys.stderr, flush=True)
+        print(name, rows[name], file=sys.stderr, flush=True)
     names = list(rows["black"])
     for cells in (["run", *names], ["---"] * (1 + len(names))):
         print(f"| {' | '.join(cells)} |")

@@ -24,6 +24,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +40,7 @@ from geosplat_jax.fit.runtime import enable_compilation_cache
 from geosplat_jax.fit.stages import build_pipeline, initial_params
 from geosplat_jax.geometry import FlexiCubes, initial_geometry
 from geosplat_jax.io.dataset import Dataset
+from geosplat_jax.io.images import written_aside
 from geosplat_jax.io.views import Views
 from geosplat_jax.model_choice import ModelChoice
 from geosplat_jax.render import Asset
@@ -237,6 +239,40 @@ def relit_decibels(run: Run, truth: Renderer, views: Views) -> float:
     return float(np.mean(scores))
 
 
+def require_same_call(output: Path, name: str, call: dict[str, Any]) -> None:
+    """Record how a scene's runs are made, or refuse runs that were made otherwise.
+
+    A resumed run with a chosen model keeps the settings that it was begun with, so these cannot be
+    compared with the wanted ones.
+
+    Parameters
+    ----------
+    output : folder of the study; the record is ``NAME.json`` in it.
+    name : name of the scene.
+    call : options of the study that the runs depend on.
+
+    Raises
+    ------
+    SystemExit
+        If there are runs of this scene with other options, or without a record.
+    """
+    path = output / f"{name}.json"
+    if path.exists():
+        recorded_call = json.loads(path.read_text())
+    elif (output / name).exists():
+        recorded_call = None
+    else:
+        output.mkdir(parents=True, exist_ok=True)
+        with written_aside(path) as temporary_path:
+            temporary_path.write_text(json.dumps(call) + "\n")
+        return
+    if recorded_call != call:
+        raise SystemExit(
+            f"error: {output / name} was made with {recorded_call or 'unknown options'}, "
+            f"not {call}; take another --output"
+        )
+
+
 def main() -> None:
     """Choose, train and print."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -251,7 +287,9 @@ def main() -> None:
     enable_compilation_cache()
     retain_freed_memory()
     config = make_config(quality=arguments.quality, overrides=("stages.refine.steps=0",))
+    call = {key: getattr(arguments, key) for key in ("quality", "steps", "size", "views")}
     for name in arguments.scenes.split(","):
+        require_same_call(arguments.output, name, call)
         dataset = make_scene(name, size=arguments.size, count=arguments.views)
         relit_truth = truth_of(name, OTHER_LIGHT)
         model = ModelChoice(steps=arguments.steps)
