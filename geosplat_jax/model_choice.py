@@ -36,6 +36,7 @@ from geosplat_jax.fit.train import TrainingError, fit, load_trained
 from geosplat_jax.io.dataset import Dataset
 from geosplat_jax.io.documents import parse_json
 from geosplat_jax.io.images import written_aside
+from geosplat_jax.io.memory import is_out_of_memory
 from geosplat_jax.io.views import Views, some_views
 from geosplat_jax.report.renderer import Renderer, photograph_on_white, render_on_white
 
@@ -57,6 +58,8 @@ itself."""
 
 _SIZES = ("shift", "hash", "light")
 """Parts that the first stage, which all trials share, does without."""
+
+_UNTRIED = "untried, since it changes no stage of the trials"
 
 _STATE = "choice.json"
 
@@ -193,6 +196,8 @@ def _tried(
     """
     smaller = [trials.decibels(kept_names, 0)]
     smaller_mean = float(np.mean(smaller[0]))
+    if trials.are_alike(kept_names, trial_names):
+        return Rung(part.name, part.title, smaller_mean, None, None, True, _UNTRIED)
     try:
         larger = trials.decibels(trial_names, 0)
     except TrainingError as error:
@@ -225,7 +230,7 @@ def _seen_on_surface(
     smaller_mean = float(np.mean(trials.decibels(kept_names, 0)))
     share = trials.blocked_share()
     note = f"the surface blocks {100 * share:.1f} % of a uniform sky's light from itself"
-    if share > _BLOCKED:
+    if share > _BLOCKED and not trials.are_alike(kept_names, trial_names):
         try:
             trials.decibels(trial_names, 0)
         except TrainingError as error:
@@ -254,12 +259,15 @@ class _Trials:
         stages = [stage for stage in config.active_stages if not stage.splats.takes_over]
         if not stages:
             raise ValueError("there is no model to choose: no stage has steps")
-        used, held = every_nth(len(dataset.train), how.hold_back)
+        # On a view without the object, a single covered pixel would weigh some hundred decibels.
+        shown = np.flatnonzero(dataset.train.coverage > 0.0)
+        held = shown[every_nth(len(shown), how.hold_back)[1]]
+        used = np.setdiff1d(np.arange(len(dataset.train)), held)
         if len(held) < _FEWEST_HELD:
             raise ValueError(
-                f"choosing a model holds back every {how.hold_back}th of {len(dataset.train)} "
-                f"training views; that makes {len(held)}, and at least {_FEWEST_HELD} are needed: "
-                "take more photographs, or train without --model auto"
+                f"choosing a model holds back every {how.hold_back}th of {len(shown)} "
+                f"training views with an object; that makes {len(held)}, and at least "
+                f"{_FEWEST_HELD} are needed: take more photographs, or train without --model auto"
             )
         self.how, self._config, self._folder, self._listener = how, config, folder, listener
         self._first, self._last = stages[0], stages[-1]
@@ -302,6 +310,11 @@ class _Trials:
     def model(self, kept: Collection[str]) -> Config:
         """Return the settings with only the named ones of the parts to choose."""
         return without(self._config, [part for part in self._offered if part.name not in kept])
+
+    def are_alike(self, names: Collection[str], others: Collection[str]) -> bool:
+        """Tell whether two models have the same trials, since only other stages tell them apart."""
+        first, second = (self._trial(self.model(kept), self._last, 0) for kept in (names, others))
+        return first == second
 
     def open(self, begin: Begin) -> None:
         """Begin a choice, or read one that is there already.
@@ -395,7 +408,7 @@ class _Trials:
         Raises
         ------
         TrainingError
-            If its training fails, or has failed before.
+            If its training fails, or has failed before for another reason than a lack of memory.
         """
         name = f"{_name_of(kept)}_seed_{seed}"
         if name not in self._measured:
@@ -408,6 +421,8 @@ class _Trials:
                 self._fit(config, folder, start)
                 measurement["psnr"] = self._measure(folder).tolist()
             except TrainingError as error:
+                if error.__cause__ is not None and is_out_of_memory(error.__cause__):
+                    raise  # and go on from the last checkpoint when there is more memory
                 measurement["failure"] = str(error)
             measurement["seconds"] = round(time.perf_counter() - start_time, 2)
             self._measured[name] = measurement

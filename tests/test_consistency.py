@@ -121,6 +121,12 @@ def test_backs_of_faces_are_told_and_not_compared(body, cameras):
         measure(replace(body, faces=body.faces[:, ::-1]), cameras)
 
 
+def test_an_empty_surface_is_refused_in_one_line(body, cameras):
+    empty_body = replace(body, faces=body.faces[:0])
+    with pytest.raises(ValueError, match="is the surface empty"):
+        measure(empty_body, cameras)
+
+
 def test_buffers_grow(body, cameras):
     errors = pixel_errors(body, cameras, Capacities(visible=4096, hits=128, chunks=4096))
     np.testing.assert_array_equal(errors.coverage, pixel_errors(body, cameras).coverage)

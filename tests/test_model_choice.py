@@ -39,14 +39,14 @@ class _Trainings:
     """Stand-in for training and rendering: the quality of views follows from a model's parts.
 
     ``gains`` : decibels that each part adds. ``made`` : names of the trainings, in order.
-    ``fails`` : parts whose trainings fail. ``stops_at`` : number of the training that is
-    interrupted.
+    ``fails`` : parts whose trainings fail, because of ``cause``. ``stops_at`` : number of the
+    training that is interrupted.
     """
 
     def __init__(self, monkeypatch, gains):
         self.gains, self.made, self.configs, self.fails, self.stops_at = gains, [], {}, (), None
         self.datasets = []
-        self.seed_noise, self.blocked = 0.0, 0.0
+        self.seed_noise, self.blocked, self.cause = 0.0, 0.0, None
         monkeypatch.setattr(model_choice, "fit", self._fit)
         monkeypatch.setattr(model_choice, "_start_of", lambda folder: object.__new__(Start))
         monkeypatch.setattr(model_choice._Trials, "_measure", self._measure)
@@ -61,7 +61,7 @@ class _Trainings:
         self.datasets.append(dataset)
         folder.mkdir(parents=True, exist_ok=True)
         if any(part in folder.name for part in self.fails):
-            raise TrainingError("the surface has exploded")
+            raise TrainingError("the surface has exploded") from self.cause
 
     def _measure(self, folder):
         parts, seed = folder.name.split("_seed_")
@@ -237,7 +237,8 @@ def test_a_choice_is_not_mixed_with_another(dataset, trainings, tmp_path):
 def test_a_choice_of_other_photographs_is_not_gone_on_with(dataset, trainings, tmp_path):
     config = make_config(quality="draft")
     choose_model(dataset, config, tmp_path / "run")
-    dark_dataset = replace(dataset, train=replace(dataset.train, images=0.2 * dataset.train.images))
+    images = dataset.train.images * np.array([0.2, 0.2, 0.2, 1.0], np.float32)
+    dark_dataset = replace(dataset, train=replace(dataset.train, images=images))
     for other_dataset in (dark_dataset, replace(dataset, options={"downscale": 2})):
         with pytest.raises(RunError, match="other settings or other views, or these were read"):
             choose_model(other_dataset, config, tmp_path / "run", begin=Resume())
@@ -297,6 +298,42 @@ def test_a_seed_whose_training_fails_says_nothing(dataset, trainings, tmp_path):
     choice = choose_model(dataset, make_config(quality="draft"), tmp_path / "run")
     assert "specular_metallic_seed_1" in trainings.made
     assert names_of(choice) == ["specular", "metallic", "light"]
+
+
+def test_a_lack_of_memory_is_not_remembered(dataset, trainings, tmp_path):
+    config = make_config(quality="draft")
+    trainings.fails, trainings.cause = ("metallic",), MemoryError("no room")
+    choice = choose_model(dataset, config, tmp_path / "run")
+    assert names_of(choice) == ["specular", "light"]
+    trainings.fails = ("smallest",)
+    with pytest.raises(TrainingError, match="exploded"):
+        choose_model(dataset, config, tmp_path / "other")
+    assert (choice_folder(tmp_path / "other") / "smallest_seed_0").is_dir()
+    trainings.fails = ()
+    for name in ("run", "other"):
+        resumed_choice = choose_model(dataset, config, tmp_path / name, begin=Resume())
+        assert names_of(resumed_choice) == ["specular", "metallic", "light"]
+
+
+def test_parts_that_no_trial_contains_are_kept_untried(dataset, trainings, tmp_path):
+    """Without the Monte Carlo stage, only the refinement has shadows and indirect light."""
+    trainings.blocked = 0.5
+    config = make_config(quality="draft", overrides=("stages.monte_carlo.steps=0",))
+    choice = choose_model(dataset, config, tmp_path / "run")
+    assert {"shadows", "indirect"} <= set(names_of(choice))
+    (rung,) = (rung for rung in choice.record()["rungs"] if rung["part"] == "indirect")
+    assert rung_row(rung)[-1] == "kept: untried, since it changes no stage of the trials"
+    assert choice.config.stage("refine").transport.indirect == "constant"
+
+
+def test_views_without_the_object_are_not_held_back(dataset, trainings, tmp_path):
+    images = dataset.train.images.copy()
+    images[[4, 12]] = 0.0
+    empty_views = replace(dataset, train=replace(dataset.train, images=images))
+    choice = choose_model(empty_views, make_config(quality="draft"), tmp_path / "run")
+    assert choice.held_back == tuple(f"view_{k}" for k in (5, 14, 22, 30, 38))
+    assert len(trainings.datasets[0].train) == 35
+    assert {"view_4", "view_12"} <= set(trainings.datasets[0].train.names)
 
 
 def test_too_few_views_are_refused(trainings, tmp_path):

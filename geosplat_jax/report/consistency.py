@@ -96,7 +96,9 @@ class Body:
 
     @property
     def diagonal(self) -> float:
-        """Diagonal of the mesh's bounding box, world units."""
+        """Diagonal of the mesh's bounding box, world units; 1 if the mesh has no faces."""
+        if not len(self.faces):
+            return 1.0
         corners = self.vertices[self.faces].reshape(-1, 3)
         return float(_length(np.ptp(corners.astype(np.float64), axis=0)[None])[0])
 
