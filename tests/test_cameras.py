@@ -549,6 +549,13 @@ def test_a_tint_of_all_training_views_is_the_lights():
     np.testing.assert_allclose(balance, gains[3] / gains[:3].mean(axis=0), rtol=1e-12)
 
 
+def test_a_tint_of_test_views_alone_is_their_own():
+    """The light is found from other photographs, so it cannot take this tint."""
+    tinted_camera = a_camera(many_views(3), white_balance=np.array([1.1, 1.0, 0.9]))
+    splits = {"test": RefinedSplit(SIZE, SIZE, {"0": tinted_camera})}
+    assert with_mean_balance(splits) == splits
+
+
 def test_a_torn_and_a_missing_file_are_one_line(file, tmp_path):
     path, *_ = file
     path.write_text(path.read_text()[:100])

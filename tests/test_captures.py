@@ -456,6 +456,36 @@ def test_an_alpha_that_is_one_in_all_photographs_cuts_nothing_out(tmp_path):
     assert load(tmp_path).train.has_masks
 
 
+def test_an_opaque_alpha_stands_for_no_mask_file(tmp_path):
+    write_transforms(tmp_path)
+    for path in (tmp_path / "images").iterdir():
+        write_png(path, np.concatenate([read_image(path), np.ones((*size(path), 1))], -1))
+    assert load(tmp_path).train.has_masks
+    path = tmp_path / "transforms.json"
+    content = json.loads(path.read_text())
+    (frame,) = (x for x in content["frames"] if x["file_path"].endswith("view_04.png"))
+    del frame["mask_path"]
+    (tmp_path / "masks" / "view_04.png").unlink(missing_ok=True)
+    path.write_text(json.dumps(content))
+    refuses(tmp_path, r"view_04\.png has no alpha channel and there is no mask file")
+
+
+@pytest.mark.parametrize("number", [1, 8])
+def test_a_close_up_of_either_split_lies_outside_of_the_box(tmp_path, number):
+    """Every eighth photograph is a test view; without masks the box must not depend on that."""
+    write_transforms(tmp_path, masks=None)
+    path = tmp_path / "transforms.json"
+    content = json.loads(path.read_text())
+    pose = np.array(content["frames"][number]["transform_matrix"])
+    near = CENTER + 0.15 * (pose[:3, 3] - CENTER)
+    pose[:3, 3] = near
+    content["frames"][number]["transform_matrix"] = pose.tolist()
+    path.write_text(json.dumps(content))
+    lo, hi = load_dataset(tmp_path).bounds
+    assert not ((near > lo) & (near < hi)).all()
+    np.testing.assert_allclose((lo + hi) / 2, CENTER, atol=1e-6)
+
+
 def size(path):
     return read_image(path).shape[:2]
 
@@ -468,7 +498,11 @@ def test_masks_of_dtu_belong_to_the_images_by_number(copied):
     actual = load(root).train
     assert actual.has_masks
     np.testing.assert_array_equal(actual.images, expected.images)
-    (root / "mask" / "m003.png").unlink()
+    # Without leading zeros, the tenth mask comes before the second in the order of names.
+    for number, path in enumerate(sorted((root / "mask").iterdir())):
+        path.rename(path.with_name(f"{number + 5}.png"))
+    np.testing.assert_array_equal(load(root).train.images, expected.images)
+    (root / "mask" / "8.png").unlink()
     refuses(root, "has 9 masks for 10 images")
 
 

@@ -1,8 +1,12 @@
 """Images are written and read back, and downscaling keeps light and edges."""
 
+import io
+import struct
+
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from PIL import Image
 
 from geosplat_jax.io import images
 from geosplat_jax.io.images import (
@@ -12,9 +16,12 @@ from geosplat_jax.io.images import (
     decode_srgb,
     downscale,
     encode_srgb,
+    image_orientation,
+    image_size,
     read_image,
     read_linear,
     read_stored,
+    wide_color_profile,
     write_exr,
     write_hdr,
     write_png,
@@ -99,12 +106,69 @@ def test_srgb_on_the_host_inverts_itself():
 
 
 def test_jpeg_is_read_as_srgb_without_alpha(tmp_path):
-    from PIL import Image
-
     Image.fromarray(np.full((8, 8, 3), 128, np.uint8)).save(tmp_path / "a.jpg", quality=95)
     image = read_linear(tmp_path / "a.jpg")
     assert image.shape == (8, 8, 3)
     np.testing.assert_allclose(image, 0.2159, atol=0.01)
+
+
+def _jpeg(pixels, xmp=""):
+    """Return the bytes of a JPEG, with XMP in its first segment if there is any."""
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "JPEG", quality=95)
+    content = file.getvalue()
+    if not xmp:
+        return content
+    body = b"http://ns.adobe.com/xap/1.0/\0" + xmp.encode()
+    return content[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + content[2:]
+
+
+def _xmp(attributes, content=""):
+    """Return a packet of XMP with one description."""
+    names = {
+        "rdf": "http://www.w3.org/1999/02/22-rdf-syntax-ns#",
+        "hdrgm": "http://ns.adobe.com/hdr-gain-map/1.0/",
+        "Container": "http://ns.google.com/photos/1.0/container/",
+        "Item": "http://ns.google.com/photos/1.0/container/item/",
+    }
+    spaces = " ".join(f'xmlns:{name}="{uri}"' for name, uri in names.items())
+    return (
+        f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF {spaces}>'
+        f"<rdf:Description {attributes}>{content}</rdf:Description></rdf:RDF></x:xmpmeta>"
+    )
+
+
+def _with_gain_map(pixels, gain):
+    """Return the bytes of an Ultra HDR file: a JPEG, and a second one with factors up to 4."""
+    limits = 'hdrgm:GainMapMin="0" hdrgm:GainMapMax="2" hdrgm:Gamma="1" hdrgm:OffsetSDR="0"'
+    limits += ' hdrgm:OffsetHDR="0" hdrgm:HDRCapacityMin="0" hdrgm:HDRCapacityMax="2"'
+    second = _jpeg(gain, _xmp(f'hdrgm:Version="1.0" {limits} hdrgm:BaseRenditionIsHDR="False"'))
+    items = "".join(
+        '<rdf:li rdf:parseType="Resource"><Container:Item Item:Mime="image/jpeg" '
+        f"{attributes}/></rdf:li>"
+        for attributes in (
+            'Item:Semantic="Primary"',
+            f'Item:Semantic="GainMap" Item:Length="{len(second)}"',
+        )
+    )
+    directory = f"<Container:Directory><rdf:Seq>{items}</rdf:Seq></Container:Directory>"
+    return _jpeg(pixels, _xmp('hdrgm:Version="1.0"', directory)) + second
+
+
+def test_of_a_photograph_with_a_gain_map_the_ordinary_picture_is_read(tmp_path):
+    ramp = np.tile(np.linspace(0, 255, 96).astype(np.uint8)[None, :, None], (64, 1, 3))
+    (tmp_path / "plain.jpg").write_bytes(_jpeg(ramp))
+    path = tmp_path / "hdr.JPG"
+    path.write_bytes(_with_gain_map(ramp, ramp[..., 0]))
+    stored = read_stored(path)
+    assert stored.dtype == np.uint8
+    np.testing.assert_array_equal(stored, read_stored(tmp_path / "plain.jpg"))
+    assert image_size(path) == (64, 96)
+    assert image_orientation(path) == 1
+    assert wide_color_profile(path) is None
+    path.write_bytes(path.read_bytes()[:1500])
+    with pytest.raises(ImageReadError, match="damaged or truncated"):
+        read_stored(path)
 
 
 def test_downscale_keeps_the_mean_of_premultiplied_colour():

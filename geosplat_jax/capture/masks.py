@@ -303,8 +303,8 @@ def _frames(dataset: Dataset) -> list[Frame]:
 
     Raises
     ------
-    CaptureError : the images are cut out already, or the scene's files name other masks, so that
-        new ones would not be read.
+    CaptureError : the images are cut out already, or the scene has masks in other places, so that
+        new ones might not be read.
     """
     listing = LAYOUTS[dataset.layout].list_frames(dataset.root, light=None)
     if not listing.is_capture:
@@ -318,8 +318,9 @@ def _frames(dataset: Dataset) -> list[Frame]:
         mask_path = beside_images(dataset.root, frame.image, MASK_FOLDERS)
         if frame.mask is not None and frame.mask != mask_path:
             raise CaptureError(
-                f"the files of the scene name the mask {frame.mask} for {frame.image.name}, which "
-                "would be read instead of a new one; remove mask_path from transforms.json"
+                f"the scene gives {frame.image.name} the mask {frame.mask}, which does not lie "
+                "where a new one would; move such masks away, or remove mask_path from "
+                "transforms.json"
             )
     return frames
 

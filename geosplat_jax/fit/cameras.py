@@ -506,22 +506,22 @@ def _refined(result: Found, views: Views, index: int) -> RefinedCamera:
 def with_mean_balance(splits: Mapping[str, RefinedSplit]) -> dict[str, RefinedSplit]:
     """Divide the factors of white balance by their mean over the training views.
 
-    A tint of all photographs cannot be told from a tint of the light; only differences between
-    views belong to the views.
+    A tint of all photographs that the light is found from cannot be told from a tint of the light;
+    only differences between views belong to the views.
 
     Parameters
     ----------
     splits : refined splits by name. All are divided by the same mean: that over the views of
-        ``train``, or of the first split where there is no ``train``.
+        ``train``. Without ``train`` they stay, since other views cannot change the light.
 
     Returns
     -------
     The splits with the new factors, by name.
     """
-    reference_split = splits.get("train", next(iter(splits.values())))
-    mean_balance = np.mean(
-        [camera.white_balance for camera in reference_split.cameras.values()], axis=0
-    )
+    if "train" not in splits:
+        return dict(splits)
+    training_cameras = splits["train"].cameras.values()
+    mean_balance = np.mean([camera.white_balance for camera in training_cameras], axis=0)
 
     def divided(split: RefinedSplit) -> RefinedSplit:
         cameras = {

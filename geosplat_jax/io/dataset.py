@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from geosplat_jax.core.types import Bounds
 from geosplat_jax.io.cameras import cameras_digest, read_cameras, with_cameras
@@ -184,7 +185,10 @@ def load_dataset(
             splits[split] = with_cameras(splits[split], refined_splits[split], str(cameras))
     if unmasked_splits := [name for name, views in splits.items() if not views.has_masks]:
         warnings.append(f"the {' and '.join(unmasked_splits)} views have no masks; {_NEEDS_MASKS}")
-    box = object_bounds(splits["train"]) if bounds is None else _checked_bounds(bounds)
+    if bounds is None:
+        box = object_bounds(splits["train"], others=splits["test"].camera_to_world[:, :3, 3])
+    else:
+        box = _checked_bounds(bounds)
     _check_box(splits, box, warnings)
     return Dataset(
         name=root.resolve().name,
@@ -362,7 +366,9 @@ def recognise_layout(root: Path) -> str:
     )
 
 
-def object_bounds(views: Views, *, margin: float = 0.02) -> Bounds:
+def object_bounds(
+    views: Views, *, margin: float = 0.02, others: Float[np.ndarray, "N 3"] | None = None
+) -> Bounds:
     """Find a box around the object, from the masks or else from the lines of sight.
 
     With masks it is the box of the visual hull, `hull.hull_bounds`; without masks it surrounds what
@@ -372,6 +378,8 @@ def object_bounds(views: Views, *, margin: float = 0.02) -> Bounds:
     ----------
     views : the training views.
     margin : added on every side of the hull, as a share of its longest side.
+    others : (N, 3) centres of further cameras, world. A box of the lines of sight leaves them
+        outside; the hull of masks lies where the object is, whatever the cameras.
 
     Returns
     -------
@@ -384,7 +392,7 @@ def object_bounds(views: Views, *, margin: float = 0.02) -> Bounds:
     cameras = (views.world_to_camera, views.intrinsics)
     try:
         if not views.has_masks:
-            return sight_bounds(*cameras, sizes=views.sizes)
+            return sight_bounds(*cameras, sizes=views.sizes, others=others)
         return hull_bounds(*cameras, views.alphas, valid=views.valid, margin=margin)
     except ValueError as error:
         raise SceneError(f"cannot find the object: {error}") from error

@@ -19,9 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 import OpenImageIO as oiio
 from jaxtyping import Float, Shaped
+from PIL.JpegImagePlugin import JpegImageFile
 from skimage.transform import downscale_local_mean
 
 from geosplat_jax.core.color import linear_to_srgb, srgb_to_linear
+from geosplat_jax.io import gain_maps
 from geosplat_jax.io.memory import Need, memory_refusal
 
 LINEAR_FORMATS = frozenset({".exr", ".hdr"})
@@ -66,19 +68,70 @@ def is_left_aside(path: Path) -> bool:
     return re.fullmatch(r"\..*\.\d+\.partial(\..*)?", path.name) is not None
 
 
-def _opened(path: Path) -> Any:
-    """Open an image; `MissingFileError` or `ImageReadError` where that cannot be done."""
+def _require_file(path: Path) -> None:
+    """Refuse a path that leads to no file."""
     if path.is_dir():
         raise SceneError(f"{path} is a folder; an image is expected in its place")
     if not path.is_file():
         raise MissingFileError(f"image {path} does not exist; check the scene folder is complete")
+
+
+def _opened(path: Path) -> Any:
+    """Open an image; `ImageReadError` where that cannot be done."""
     # Without this hint the library multiplies colour by alpha on reading.
     hint = oiio.ImageSpec()
     hint.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), hint)
     if source is None:
-        raise ImageReadError(f"{path} is not a readable image ({_last_error()}); replace the file")
+        raise _unreadable(path, _last_error())
     return source
+
+
+@contextmanager
+def _base_picture(path: Path) -> Iterator[JpegImageFile | None]:
+    """Provide the ordinary JPEG of a file with a gain map, or None; see `gain_maps`."""
+    _require_file(path)
+    try:
+        picture = gain_maps.base_picture(path)
+    except (OSError, SyntaxError) as error:
+        raise _unreadable(path, str(error)) from error
+    try:
+        yield picture
+    finally:
+        if picture is not None:
+            picture.close()
+
+
+class _Header(NamedTuple):
+    """What is known of an image before its pixels are read."""
+
+    height: int
+    width: int
+    orientation: int
+    profile: str
+
+
+def _header(path: Path) -> _Header:
+    """Read the header of an image; `MissingFileError` or `ImageReadError` if there is none."""
+    with _base_picture(path) as picture:
+        if picture is not None:
+            return _Header(
+                picture.height,
+                picture.width,
+                gain_maps.orientation(picture),
+                gain_maps.profile_name(picture),
+            )
+    source = _opened(path)
+    try:
+        spec = source.spec()
+        return _Header(
+            spec.height,
+            spec.width,
+            spec.get_int_attribute("Orientation", 1),
+            spec.get_string_attribute("ICCProfile:profile_description"),
+        )
+    finally:
+        source.close()
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
@@ -88,12 +141,8 @@ def image_size(path: str | Path) -> tuple[int, int]:
     ------
     MissingFileError, ImageReadError
     """
-    source = _opened(Path(path))
-    try:
-        spec = source.spec()
-        return spec.height, spec.width
-    finally:
-        source.close()
+    header = _header(Path(path))
+    return header.height, header.width
 
 
 def image_orientation(path: str | Path) -> int:
@@ -105,11 +154,7 @@ def image_orientation(path: str | Path) -> int:
     ------
     MissingFileError, ImageReadError
     """
-    source = _opened(Path(path))
-    try:
-        return source.spec().get_int_attribute("Orientation", 1)
-    finally:
-        source.close()
+    return _header(Path(path)).orientation
 
 
 def wide_color_profile(path: str | Path) -> str | None:
@@ -121,11 +166,7 @@ def wide_color_profile(path: str | Path) -> str | None:
     ------
     MissingFileError, ImageReadError
     """
-    source = _opened(Path(path))
-    try:
-        name = source.spec().get_string_attribute("ICCProfile:profile_description")
-    finally:
-        source.close()
+    name = _header(Path(path)).profile
     return name if _WIDE.search(name) else None
 
 
@@ -155,13 +196,16 @@ def read_stored(path: str | Path) -> Shaped[np.ndarray, "H W C"]:
     -------
     (H, W, C) uint8 or uint16 where the file has integers (the upper 16 of 32 bits), and float32
     where it has floats, as `read_image` returns it. Alpha is straight, except in OpenEXR, whose
-    colour is premultiplied.
+    colour is premultiplied. Gain maps are ignored, see `gain_maps`.
 
     Raises
     ------
     MissingFileError, ImageReadError
     """
     path = Path(path)
+    with _base_picture(path) as picture:
+        if picture is not None:
+            return _base_pixels(picture, path)
     source = _opened(path)
     try:
         spec = source.spec()
@@ -172,14 +216,32 @@ def read_stored(path: str | Path) -> Shaped[np.ndarray, "H W C"]:
     finally:
         source.close()
     if pixels is None or problem:
-        raise ImageReadError(
-            f"{path} is damaged or truncated ({_one_line(problem)}); replace the file"
-        )
+        raise _damaged(path, problem)
     _require_plain(layout, path)
     pixels = np.ascontiguousarray(pixels)
     if layout.is_associated and path.suffix.lower() in (".tif", ".tiff"):
         pixels[..., :-1] = _divided_by_alpha(pixels)
     return pixels
+
+
+def _base_pixels(picture: JpegImageFile, path: Path) -> Shaped[np.ndarray, "H W c"]:
+    """Decode the ordinary JPEG of a file with a gain map: grey or RGB of 8 bits."""
+    _require_room_for_pixels(picture.width, picture.height, 3, path)
+    try:
+        pixels = np.array(picture if picture.mode == "L" else picture.convert("RGB"))
+    except (OSError, SyntaxError) as error:
+        raise _damaged(path, str(error)) from error
+    return pixels.reshape(*pixels.shape[:2], -1)
+
+
+def _damaged(path: Path, problem: str) -> ImageReadError:
+    return ImageReadError(
+        f"{path} is damaged or truncated ({_one_line(problem)}); replace the file"
+    )
+
+
+def _unreadable(path: Path, problem: str) -> ImageReadError:
+    return ImageReadError(f"{path} is not a readable image ({problem}); replace the file")
 
 
 def _divided_by_alpha(pixels: Shaped[np.ndarray, "H W C"]) -> Shaped[np.ndarray, "H W c"]:
@@ -249,7 +311,12 @@ def require_room(needs: Sequence[Need], cure: str) -> None:
 def _require_room_for(layout: "_Layout", path: Path) -> None:
     """Refuse an image that, by its header, does not fit into the memory."""
     width, height = layout.shown[2:]
-    byte_count = reading_bytes(width, height, len(layout.channels))
+    _require_room_for_pixels(width, height, len(layout.channels), path)
+
+
+def _require_room_for_pixels(width: int, height: int, channels: int, path: Path) -> None:
+    """Refuse an image of this size if it does not fit into the memory."""
+    byte_count = reading_bytes(width, height, channels)
     require_room(
         [Need(f"{path} of {width} x {height} pixels", byte_count)], "write a smaller image"
     )

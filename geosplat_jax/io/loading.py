@@ -296,6 +296,12 @@ def _have_masks(frames: Sequence[Frame], traits: Sequence[_Traits], *, is_captur
         # An object may fill a photograph, but if it fills all of them, none was cut out.
         return False
     has_mask = np.array([view_traits.has_mask for view_traits in traits])
+    if any(
+        frame.mask is not None and not view_traits.leaves_file
+        for frame, view_traits in zip(frames, traits, strict=True)
+    ):
+        # Where masks are files, an opaque alpha channel is no mask: the file is missing.
+        has_mask &= ~np.array([view_traits.is_opaque for view_traits in traits])
     if has_mask.any() and not has_mask.all():
         raise SceneError(_no_mask(frames[int(np.argmin(has_mask))]))
     return bool(has_mask.all())

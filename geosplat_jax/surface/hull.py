@@ -141,6 +141,7 @@ def sight_bounds(
     intrinsics: Float[np.ndarray, "V 3 3"],
     *,
     sizes: Float[np.ndarray, "V 2"],
+    others: Float[np.ndarray, "N 3"] | None = None,
 ) -> Bounds:
     """Find a cube around what all cameras look at, where there are no masks.
 
@@ -153,6 +154,7 @@ def sight_bounds(
     world_to_camera : (V, 4, 4) rigid.
     intrinsics : (V, 3, 3) pixels.
     sizes : (V, 2) height and width of the images, pixels.
+    others : (N, 3) centres of further cameras that are to lie outside, world.
 
     Returns
     -------
@@ -177,7 +179,8 @@ def sight_bounds(
     visible_extents = depth[is_ahead] * np.minimum(
         0.5 * width / lens[:, 0, 0], 0.5 * height / lens[:, 1, 1]
     )
-    clearance = np.abs(centers - center).max(1).min()
+    outside = centers if others is None else np.concatenate([centers, others])
+    clearance = np.abs(outside - center).max(1).min()
     # The cube's corners lie sqrt(3) as far from its centre as its faces.
     half = min(float(np.median(visible_extents)) / np.sqrt(3.0), 0.9 * clearance)
     return center - half, center + half

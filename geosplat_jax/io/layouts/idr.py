@@ -72,7 +72,7 @@ def list_idr(root: Path, *, light: str | None = None) -> Listing:
 
 
 def _masks(root: Path, images: list[Path]) -> list[Path | None]:
-    """Pair masks with images by number if no mask is named after its image.
+    """Pair masks with images in the order of their numbers if no mask is named after its image.
 
     Scenes of DTU have ``image/000000.png`` beside ``mask/000.png``. If masks are named after their
     images, or there are none, all results are None: `captured_frame` finds masks by name.
@@ -90,7 +90,17 @@ def _masks(root: Path, images: list[Path]) -> list[Path | None]:
             f"{folder} has {len(files)} masks for {len(images)} images, and none is named after "
             "its image; they belong together by number"
         )
-    return [*files]
+    masks: list[Path | None] = [None] * len(images)
+    by_number = sorted(range(len(images)), key=lambda k: _number(images[k]))
+    for k, file in zip(by_number, sorted(files, key=_number), strict=True):
+        masks[k] = file
+    return masks
+
+
+def _number(path: Path) -> tuple[int, str]:
+    """Return the last number in a file's name, to sort by, and the name."""
+    digits = re.findall(r"\d+", path.stem)
+    return (int(digits[-1]) if digits else -1, path.stem)
 
 
 _DAMAGES = (OSError, ValueError, EOFError, KeyError, TypeError, RuntimeError)
