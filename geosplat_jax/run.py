@@ -247,7 +247,7 @@ class Run:
             If a file of a run is damaged.
         """
         runs = [Evaluated.of(run.folder) for run in (self, *others)]
-        return write_report(Path(output or self.folder.path / REPORT), runs)
+        return write_report(Path(output or self.folder.path / REPORT).expanduser(), runs)
 
     def consistency(self, *, stage: str | None = None, size: int | None = None) -> Consistency:
         """Measure how well the splats represent the mesh, over the test views.
@@ -373,7 +373,7 @@ class Run:
         RunError
             If no split has views, or the run was trained with the cameras in ``output``.
         """
-        path = Path(output or self.folder.path / "cameras.json")
+        path = Path(output or self.folder.path / "cameras.json").expanduser()
         own_cameras = self.dataset.options.get("cameras")
         if own_cameras is not None and Path(own_cameras) == path.resolve():
             raise RunError(

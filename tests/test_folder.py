@@ -109,6 +109,36 @@ def test_a_folder_with_a_run_is_replaced_only_when_asked(run, dataset):
     assert (run.path / "notes.txt").read_text() == "mine"
 
 
+def test_a_record_that_cannot_be_written_costs_no_run(run, dataset):
+    run.metrics.write_text('{"step": 0}\n')
+    strange_dataset = replace(dataset, options={"downscale": np.int64(8)})
+    with pytest.raises(TypeError, match="not JSON serializable"), run.locked():
+        run.begin(strange_dataset, tiny_config(), replace=True)
+    assert run.metrics.exists()
+    assert run.exists
+
+
+def test_cameras_that_cannot_be_stored_leave_a_folder_that_can_be_replaced(
+    dataset, tmp_path, monkeypatch
+):
+    file = tmp_path / "refined.json"
+    file.write_text("cameras")
+    options = {**dataset.options, "cameras": str(file), "cameras_digest": "abc"}
+    folder = RunFolder(tmp_path / "run")
+
+    def full_disk(path, content):
+        raise OSError(28, "No space left on device")
+
+    dataset = replace(dataset, options=options)
+    with monkeypatch.context() as patched, folder.locked():
+        patched.setattr(Path, "write_bytes", full_disk)
+        with pytest.raises(OSError, match="No space"):
+            folder.begin(dataset, tiny_config(), replace=False)
+    with folder.locked():
+        folder.begin(dataset, tiny_config(), replace=True)
+    assert Path(folder.record()["dataset"]["cameras"]).read_text() == "cameras"
+
+
 def test_a_folder_with_other_files_is_never_used(dataset, tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
     folder = RunFolder(tmp_path)

@@ -37,6 +37,20 @@ def dataset():
     return sphere_dataset(count=5, size=8)
 
 
+def test_free_splats_are_not_planned_while_vertices_are_sampled():
+    """They take over the six splats of every face, of which there are none so long."""
+    config = tiny_config(
+        "stages.split_sum.vertex_fraction=0.6",
+        "stages.split_sum.steps=10",
+        "stages.refine.steps=2",
+        "stages.refine.transport.kind=split_sum",
+    )
+    loop = object.__new__(loop_module.Loop)
+    loop.config, loop.stage = config, config.stage("split_sum")
+    is_planned = [loop._following(step) is not None for step in range(10)]
+    assert is_planned == [False] * 6 + [True] * 4
+
+
 @pytest.fixture
 def folder(dataset, tmp_path):
     run = RunFolder(tmp_path / "run")

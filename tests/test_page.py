@@ -314,6 +314,13 @@ def test_the_command_of_the_report_makes_the_same_settings():
         assert not command({**record, "dataset": dataset}, config)[1]
 
 
+def test_labels_of_ones_own_are_compared_with_the_defaults():
+    """In Python, the names of preset, quality and prior are free."""
+    config = make_config("default", "standard", overrides=("run.seed=3",))
+    config = replace(config, preset="mine", quality="fast", material_prior="dull")
+    assert changed_from_preset(config) == {"run.seed": (0, 3)}
+
+
 def test_settings_between_two_levels_are_said_beside_the_standard_ones():
     """Such settings come from a budget, and no quality level names them."""
     config = between_qualities(0.6)

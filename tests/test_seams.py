@@ -24,6 +24,8 @@ from geosplat_jax.core.types import Box, Mesh, learned
 from geosplat_jax.fit.begin import Resume, TakeOver
 from geosplat_jax.fit.config import Rate, Stage, config_from_dict
 from geosplat_jax.fit.entering import Entry
+from geosplat_jax.fit.presets import make_config
+from geosplat_jax.fit.stages import require_rates
 from geosplat_jax.fit.surfaces import SurfaceSettings
 from geosplat_jax.fit.train import TrainingError, fit, load_trained
 from geosplat_jax.geometry import FlexiCubes, initial_geometry, sphere_sdf
@@ -252,6 +254,23 @@ def test_settings_of_strange_kinds_survive_json():
     assert config_from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
+def test_another_kind_of_surface_can_be_set():
+    """Rates and weights of the surface that it replaces go with that; where it is frozen, it is."""
+    rates = [f"stages.{k}.rates.corners.value=0.01" for k in ("split_sum", "monte_carlo")]
+    config = make_config(overrides=(*rates, "geometry.kind=triangles"))
+    assert config.geometry == TrianglesSettings()
+    assert [stage.rates["corners"].value for stage in config.stages] == [0.01, 0.01, 0.0]
+    assert "sdf" not in config.stages[0].rates
+    assert "entropy" not in config.stages[0].weights
+    require_rates(config)
+    # The kind that a preset has anyway changes nothing.
+    assert make_config(overrides=("geometry.kind=flexicubes",)) == make_config()
+    with pytest.raises(ValueError, match="unknown setting stages.split_sum.rates.sdf"):
+        make_config(overrides=("geometry.kind=triangles", "stages.split_sum.rates.sdf.value=0.1"))
+    unrefined_config = make_config(overrides=("stages.refine.splats.kind=face",))
+    assert "splat_albedo" not in unrefined_config.stage("refine").rates
+
+
 def test_a_mesh_trains_through_three_stages(run):
     folder, state = run
     lines = lines_of(folder)
@@ -299,6 +318,17 @@ def test_the_stages_before_another_one_can_be_taken_from_a_run(dataset, run, tmp
     state = fit(dataset, mesh_config(), tmp_path / "run", begin=TakeOver(run[0], "lamp"))
     assert_same(run[1], state)
     assert [line["step"] for line in lines_of(tmp_path / "run")] == [6, 7, 8]
+    # Of the stages that it took over, the run holds only the end of the last one.
+    assert load_trained(tmp_path / "run", stage="monte_carlo").step == 6
+    with pytest.raises(TrainingError, match="took this stage over from another run"):
+        load_trained(tmp_path / "run", stage="split_sum")
+    with pytest.raises(TrainingError, match="took this stage over from another run"):
+        fit(
+            dataset,
+            mesh_config(),
+            tmp_path / "x",
+            begin=TakeOver(tmp_path / "run", "monte_carlo"),
+        )
     with pytest.raises(TrainingError, match="is the first stage"):
         fit(dataset, mesh_config(), tmp_path / "x", begin=TakeOver(run[0], "split_sum"))
 

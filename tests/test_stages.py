@@ -230,6 +230,11 @@ def test_a_run_goes_through_both_stages(whole):
     assert int(state.step) == 6
     trained = load_trained(folder)
     assert (trained.stage.name, trained.step) == ("monte_carlo", 6)
+    first = load_trained(folder, stage="split_sum")
+    for end in (trained, first):
+        last_weights = end.stage.weights_at(end.stage.steps - 1)
+        assert {n: float(w) for n, w in end.pipeline.weights.items()} == pytest.approx(last_weights)
+    assert first.stage.weights_at(0) != first.stage.weights_at(2)
     assert trained.config == tiny_config(*RUN)
     assert_same(trained.params, state.params)
 

@@ -10,6 +10,7 @@ from jax.errors import JaxRuntimeError
 
 from geosplat_jax import cli
 from geosplat_jax.cli import calling
+from geosplat_jax.fit.train import stop_requests
 
 SWALLOWS = """
 import signal, sys, time
@@ -123,6 +124,16 @@ requests = stop_requests()
 is_asked = requests.__enter__()
 """
 """Code of a training that is in the middle of a long operation."""
+
+
+def test_a_handler_that_python_did_not_install_is_left_alone(monkeypatch):
+    """An embedding program may have it; Python cannot put it back."""
+    previous_handler = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(signal, "getsignal", lambda number: None)
+    with stop_requests() as is_asked:
+        assert not is_asked()
+        monkeypatch.undo()
+        assert signal.getsignal(signal.SIGTERM) is previous_handler
 
 
 def test_a_training_says_at_once_that_it_will_stop():

@@ -132,10 +132,14 @@ class Stage:
         """Return the share of the schedules that is done after ``step`` steps, from 0 to 1."""
         return self.position(step) / max(self.position(self.steps), 1.0)
 
+    def samples_vertices(self, step: int) -> bool:
+        """Whether the stage samples vertices (Eq. 12) ``step`` steps after its start."""
+        return self.progress(step) < self.vertex_fraction
+
     @property
     def ends_with_vertices(self) -> bool:
-        """Whether even the last step samples vertices (Eq. 12)."""
-        return self.progress(self.steps - 1) < self.vertex_fraction
+        """Whether even the last step samples vertices."""
+        return self.samples_vertices(self.steps - 1)
 
     def weights_at(self, step: int) -> dict[str, float]:
         """Weights by term, ``step`` steps after the stage's start.

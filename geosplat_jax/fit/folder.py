@@ -354,20 +354,22 @@ class RunFolder:
         self.require_free(replace=replace)
         cameras = dataset.options.get("cameras")
         camera_bytes = None if cameras is None else Path(cameras).read_bytes()
+        record = {
+            **_scene_of(dataset),
+            "config": config.to_dict(),
+            **({} if budget is None else {"budget": asdict(budget)}),
+            **({} if model is None else {"model": model}),
+            "notes": [*dataset.notes, *config.geometry.notes(dataset)],
+            "versions": installed_versions(),
+        }
+        json.dumps(record)  # a record that cannot be written must not cost the old run
         self.clear()
-        (self.path / _FREED).unlink(missing_ok=True)
+        # The record is first: from then on, whatever fails below can be replaced or resumed.
+        self._write_record(record)
         if camera_bytes is not None:
-            (self.path / CAMERAS).write_bytes(camera_bytes)
-        self._write_record(
-            {
-                **_scene_of(dataset),
-                "config": config.to_dict(),
-                **({} if budget is None else {"budget": asdict(budget)}),
-                **({} if model is None else {"model": model}),
-                "notes": [*dataset.notes, *config.geometry.notes(dataset)],
-                "versions": installed_versions(),
-            }
-        )
+            with written_aside(self.path / CAMERAS) as temporary_path:
+                temporary_path.write_bytes(camera_bytes)
+        (self.path / _FREED).unlink(missing_ok=True)
 
     def clear(self) -> None:
         """Remove what training and evaluation wrote, and nothing else."""

@@ -50,6 +50,7 @@ from geosplat_jax.fit.trained import (
     NextStage,
     read_checkpoint,
     read_description,
+    taken_over,
 )
 from geosplat_jax.fit.upcoming import Ends, Upcoming, continued
 from geosplat_jax.io.checkpoints import latest_checkpoint, read_step, save_checkpoint
@@ -286,11 +287,13 @@ class Loop:
         )
 
     def _following(self, step: int) -> Stage | None:
-        """Return the next stage, where its beginning is near."""
+        """Return the next stage, where its beginning is near and can be planned."""
         stages = self.config.active_stages
         number = stages.index(self.stage) + 1
         if number == len(stages):
             return None
+        if stages[number].splats.takes_over and self.stage.samples_vertices(self._since(step)):
+            return None  # it takes over the splats of faces, which are not there yet
         ahead = min(_LOOK_AHEAD, 3 * self.stage.steps // 4)
         is_near = step >= self.config.first_step(stages[number].name) - ahead
         return stages[number] if is_near else None
@@ -659,6 +662,8 @@ def adopted_loop(
         )
     tree, description = read_checkpoint(path, source_config)
     steps_done, end = int(tree["state"].step), config.first_step(name)
+    if steps_done > end:
+        raise TrainingError(taken_over(source, previous.name))
     if description.stage != previous.name or steps_done != end:
         raise TrainingError(
             f"{path} is at step {steps_done}, in the stage {description.stage}, not at the end of "

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from geosplat_jax.adapter import AdapterConstants
+from geosplat_jax.core.settings import to_plain
 from geosplat_jax.deferred import PerPixel
 from geosplat_jax.fit.config import (
     Config,
@@ -26,7 +27,7 @@ from geosplat_jax.fit.start_mesh import MeshSettings
 from geosplat_jax.fit.surfaces import FlexiCubesSettings
 from geosplat_jax.hashgrid import HashGridSpec
 from geosplat_jax.io.start_mesh import digest_of
-from geosplat_jax.losses import Objective, Schedule
+from geosplat_jax.losses import Objective, Schedule, term_names
 from geosplat_jax.materials import MATERIAL_PRIORS, MaterialSpec
 from geosplat_jax.refinement import FreeSplatSettings
 from geosplat_jax.render import RasterSettings
@@ -593,6 +594,30 @@ def make_config(
     return _finished(merge(config.to_dict(), changes), mesh, overrides)
 
 
+def _of_kinds(values: dict[str, Any], preset: Config) -> Config:
+    """Return the settings of a preset with other kinds of parts.
+
+    Rates and weights of parts that the new kinds do not have are left out. Where the surface of the
+    preset was frozen, that of another kind is frozen as well; elsewhere its rates are to be given.
+    """
+    stages = values["stages"]
+    bare_stages = {
+        name: {**stage, "steps": 0, "rates": {}, "weights": {}} for name, stage in stages.items()
+    }
+    bare_config = config_from_dict({**values, "stages": bare_stages})
+    weight_names = (*term_names(), *bare_config.geometry.penalty_names)
+    surface_groups = preset.geometry.rate_groups
+    new_groups = set(bare_config.geometry.rate_groups) - set(surface_groups)
+    fitting_stages = {}
+    for name, stage in stages.items():
+        is_frozen = set(surface_groups) <= set(preset.stage(name).frozen)
+        new_rates = {group: to_plain(Rate(0.0)) for group in new_groups if is_frozen}
+        rates = {name: x for name, x in stage["rates"].items() if name in bare_config.rate_groups}
+        weights = {name: x for name, x in stage["weights"].items() if name in weight_names}
+        fitting_stages[name] = {**stage, "rates": rates | new_rates, "weights": weights}
+    return config_from_dict({**values, "stages": fitting_stages})
+
+
 def _finished(
     values: dict[str, Any],
     mesh: str | Path | MeshSettings | None,
@@ -606,10 +631,11 @@ def _finished(
     # strictly.
     names = [text.partition("=")[0].strip() for text in overrides]
     if any(name.endswith(".kind") for name in names):
+        preset = config_from_dict(values)
         for name, override in zip(names, overrides, strict=True):
             if name.endswith((".kind", ".steps")):
                 values = merge(values, parse_override(override))
-        values = config_from_dict(values).to_dict()
+        values = _of_kinds(values, preset).to_dict()
     for override in overrides:
         values = merge(values, parse_override(override))
     return config_from_dict(values)

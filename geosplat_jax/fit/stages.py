@@ -58,8 +58,7 @@ def pipeline_at(
         name: weight * share if name in PIXEL_MEANS else weight
         for name, weight in stage.weights_at(step).items()
     }
-    samples_vertices = stage.progress(step) < stage.vertex_fraction
-    splats = VertexSplatSettings() if samples_vertices else stage.splats
+    splats = VertexSplatSettings() if stage.samples_vertices(step) else stage.splats
     return replace(pipeline, splats=splats.build(config.adapter), weights=_arrays(weights))
 
 

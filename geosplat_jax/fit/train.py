@@ -95,6 +95,8 @@ def stop_requests() -> Iterator[Callable[[], bool]]:
     """
     request, previous_handlers = _StopRequest(), {}
     for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is None:
+            continue  # a handler that was not installed from Python could not be put back
         try:
             previous_handlers[number] = signal.signal(number, request)
         except ValueError:

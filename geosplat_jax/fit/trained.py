@@ -12,13 +12,14 @@ from geosplat_jax.fit.config import Config, Stage, config_from_dict
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.memory import require_rendering_memory
 from geosplat_jax.fit.planning import TrainingError
-from geosplat_jax.fit.stages import build_pipeline, template_params
+from geosplat_jax.fit.stages import build_pipeline, pipeline_at, template_params
 from geosplat_jax.fit.step import initial_state
 from geosplat_jax.io.checkpoints import (
     CheckpointError,
     latest_checkpoint,
     load_checkpoint,
     read_meta,
+    read_step,
 )
 from geosplat_jax.pipeline import Pipeline
 from geosplat_jax.render import Params
@@ -158,6 +159,14 @@ def _checkpoints(run: RunFolder, stage: str | None) -> Path:
     return run.end_of(stage)
 
 
+def taken_over(run: RunFolder, stage: str) -> str:
+    """Say why a run that has passed a stage does not hold its end."""
+    return (
+        f"{run} holds no checkpoint of the end of {stage}, since it took this stage over from "
+        "another run; give that run instead"
+    )
+
+
 def load_trained(folder: str | Path | RunFolder, *, stage: str | None = None) -> Trained:
     """Read the last good checkpoint of a run, or the one that a stage ended with.
 
@@ -178,7 +187,11 @@ def load_trained(folder: str | Path | RunFolder, *, stage: str | None = None) ->
     """
     run = folder if isinstance(folder, RunFolder) else RunFolder(folder)
     path = latest_checkpoint(_checkpoints(run, stage))
-    if path is None and stage is not None and latest_checkpoint(_checkpoints(run, None)):
+    last_path = latest_checkpoint(run.checkpoints)
+    if path is None and stage is not None and last_path is not None:
+        config = run.config()
+        if read_step(last_path) > config.first_step(stage) + config.stage(stage).steps:
+            raise TrainingError(taken_over(run, stage))
         raise TrainingError(
             f"the stage {stage} of {run} has not ended yet; continue the training with --resume, "
             "or leave the stage out"
@@ -195,5 +208,9 @@ def load_trained(folder: str | Path | RunFolder, *, stage: str | None = None) ->
     current = config.stage(description.stage)
     step = int(tree["state"].step)
     pipeline = build_pipeline(config, current, tree["surface"])
-    pipeline = replace(pipeline, capacities=Capacities(**description.capacities))
+    weights = pipeline_at(
+        pipeline, config, current, max(step - config.first_step(current.name) - 1, 0)
+    ).weights
+    capacities = Capacities(**description.capacities)
+    pipeline = replace(pipeline, capacities=capacities, weights=weights)
     return Trained(config, current, tree["state"].params, pipeline, step)

@@ -159,8 +159,8 @@ def load_dataset(
         raise MissingFileError(f"scene folder {root} does not exist")
     arguments = {
         "layout": layout,
-        "train_views": train_views,
-        "test_views": test_views,
+        "train_views": None if train_views is None else int(train_views),
+        "test_views": None if test_views is None else int(test_views),
         "mask_files": mask_files,
     }
     layout = _layout_of(root, layout)
@@ -202,7 +202,7 @@ def load_dataset(
         warnings=tuple(warnings),
         notes=listing.notes,
         options={
-            "downscale": downscale,
+            "downscale": int(downscale),
             "light": light,
             "bounds": None if bounds is None else np.ravel(bounds).tolist(),
             **({} if cameras is None else _recorded(cameras)),

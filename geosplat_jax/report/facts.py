@@ -14,9 +14,10 @@ import numpy as np
 
 from geosplat_jax.core.settings import as_written
 from geosplat_jax.fit.config import Config, changed_settings
-from geosplat_jax.fit.presets import BETWEEN, make_config
+from geosplat_jax.fit.presets import BETWEEN, PRESETS, QUALITIES, make_config
 from geosplat_jax.fit.start_mesh import MeshSettings
 from geosplat_jax.io.dataset import READING
+from geosplat_jax.materials import MATERIAL_PRIORS
 from geosplat_jax.report.protocols import NEW_VIEWS, Protocol, Rendition, ScaledRendition, protocol
 
 _MEASURES = {
@@ -182,16 +183,24 @@ def _level_of(config: Config) -> str:
 
 
 def _preset_of(config: Config, overrides: Sequence[str] = ()) -> Config:
-    """Return the preset of ``config`` at its level, labelled with the quality of ``config``."""
-    geometry = config.geometry
+    """Return the preset of ``config`` at its level, with the labels of ``config``.
+
+    Labels are free texts in Python; in place of unknown ones the defaults are compared with.
+    """
+    geometry, level = config.geometry, _level_of(config)
     preset = make_config(
-        config.preset,
-        _level_of(config),
-        material_prior=config.material_prior,
+        config.preset if config.preset in PRESETS else PRESETS[0],
+        level if level in QUALITIES else "standard",
+        material_prior=config.material_prior if config.material_prior in MATERIAL_PRIORS else None,
         mesh=geometry if isinstance(geometry, MeshSettings) else None,
         overrides=tuple(overrides),
     )
-    return replace(preset, quality=config.quality)
+    return replace(
+        preset,
+        preset=config.preset,
+        quality=config.quality,
+        material_prior=config.material_prior,
+    )
 
 
 def changed_from_preset(config: Config) -> dict[str, tuple[Any, Any]]:
