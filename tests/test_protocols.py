@@ -310,6 +310,40 @@ def test_relit_values_are_clipped_before_encoding():
     assert psnr == pytest.approx(decibels(0.25**2 / 3), abs=DECIBELS)
 
 
+def test_irgs_takes_the_mean_of_the_decibels_of_the_channels():
+    mask, error = flat(1.0, (2, 4, 4)), np.array([0.05, 0.03, 0.01])
+    truth = flat([0.5, 0.5, 0.5], (2, 4, 4))
+    albedo = (truth + error).astype(np.float32)
+    by_channel, pooled = np.mean(decibels(error**2)), decibels(np.mean(error**2))
+    image = np.concatenate([truth, mask[..., None]], -1)
+    encoded_error = srgb(0.5 + error) - srgb(0.5)
+    for row, is_by_channel in ((IRGS, True), (GEOSPLATTING, False)):
+        row = dataclasses.replace(row, albedo=dataclasses.replace(row.albedo, encoding="linear"))
+        figures = protocol_metrics.albedo_metrics(row, albedo, mask, truth, mask, np.ones(3))
+        expected = by_channel if is_by_channel else pooled
+        assert figures["albedo.psnr"] == pytest.approx(expected, abs=DECIBELS)
+        assert figures["albedo.psnr_masked"] == pytest.approx(expected, abs=DECIBELS)
+        squares = encoded_error**2
+        expected = np.mean(decibels(squares)) if is_by_channel else decibels(np.mean(squares))
+        figures = protocol_metrics.relight_metrics(row, albedo, mask, image)
+        assert figures["psnr"] == pytest.approx(expected, abs=DECIBELS)
+
+
+def test_irgs_takes_the_scale_from_pixels_with_all_channels():
+    """On a yellow object the median ratio of blue would be zero, and relit images without blue."""
+    mask, truth = flat(1.0, (1, 5, 1)), flat([0.6, 0.5, 0.0], (1, 5, 1))
+    truth[:, 3:] = 0.4
+    albedo = flat([0.3, 0.3, 0.2], (1, 5, 1))
+    scales = [
+        protocol_metrics.albedo_scale(row, albedo, mask, truth, mask) for row in (TENSOIR, IRGS)
+    ]
+    np.testing.assert_allclose(scales[0], [2.0, 5 / 3, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(scales[1], [4 / 3, 4 / 3, 2.0], rtol=1e-6)
+    truth[:, 3:] = [0.6, 0.5, 0.0]
+    scale = protocol_metrics.albedo_scale(IRGS, albedo, mask, truth, mask)
+    np.testing.assert_allclose(scale, [2.0, 5 / 3, 0.0], rtol=1e-6)
+
+
 def test_relight_encodings_by_hand():
     mask = left_half()
     image = np.concatenate([flat([0.5, 0.5, 0.5]) * mask[..., None], mask[..., None]], -1)
@@ -526,7 +560,7 @@ def test_coverage_where_pixels_do_not_count_is_refused():
         protocol_metrics.albedo_metrics(GEOSPLATTING, *maps, GAIN, valid[:, :5])
 
 
-def orb_by_hand(rgb, image, *, largest, is_brightened, is_encoded):
+def orb_by_hand(rgb, image, *, largest, is_brightened, is_encoded, is_scaled=True):
     """One figure of Stanford-ORB for one image, implemented a second time."""
     is_inside = minimum_filter((image[..., 3] > 0.5).astype(int), 5, mode="nearest") == 1
     predicted, truth = (
@@ -535,7 +569,7 @@ def orb_by_hand(rgb, image, *, largest, is_brightened, is_encoded):
     if is_brightened:
         gain = srgb(np.clip(truth, 0, 1)).mean() / np.clip(truth, 0, 1).mean()
         predicted, truth = gain * predicted, gain * truth
-    for channel in range(3):
+    for channel in range(3 if is_scaled else 0):
         f, t = predicted[is_inside][:, channel], truth[is_inside][:, channel]
         predicted[..., channel] *= np.dot(f, t) / np.dot(f, f)
     pair = [np.clip(x, 0, largest) for x in (predicted, truth)]
@@ -569,7 +603,12 @@ def test_figures_of_stanford_orb_are_those_of_its_formula():
     view_metrics = protocol_metrics.new_view_metrics(
         rgb[0], alpha[0], image[0], rendition=ORB.new_views
     )
-    same(view_metrics, {f"nvs.{name}": values[0] for name, values in by_hand.items()}, abs=DECIBELS)
+    unscaled = {
+        f"nvs.{name}": orb_by_hand(rgb[0], image[0], **kind, is_scaled=False)
+        for name, kind in kinds.items()
+    }
+    same(view_metrics, unscaled, abs=DECIBELS)
+    assert all(by_hand[name][0] > unscaled[f"nvs.{name}"] + 1 for name in kinds)
     albedo, alpha, truth, mask = scene(1, 24)
     figures = protocol_metrics.albedo_metrics(ORB, albedo, alpha, truth, mask, np.ones(3))
     image = np.concatenate([truth, mask[..., None]], -1)

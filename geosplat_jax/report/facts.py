@@ -101,7 +101,8 @@ def _rendition(rendition: Rendition | ScaledRendition) -> str:
         return "on the object alone, each channel of each image scaled by least squares"
     encodings = {"linear": "in linear light", "srgb": "in sRGB", "gamma22": "after gamma 2.2"}
     grey = {0.0: "black", 1.0: "white"}.get(rendition.background, f"grey {rendition.background:g}")
-    return f"{encodings[rendition.encoding]} on {grey}"
+    channels = ", by the mean PSNR of the channels" if rendition.is_by_channel else ""
+    return f"{encodings[rendition.encoding]} on {grey}{channels}"
 
 
 def protocol_text(name: str) -> str:

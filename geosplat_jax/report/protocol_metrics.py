@@ -99,7 +99,8 @@ def albedo_scale(
     ----------
     protocol : protocol whose ``albedo_scale`` and ``scale_views`` are used. ``least_squares`` fits
         premultiplied maps, that is on black; ``median`` takes the ratio of *straight* values over
-        the pixels of the mask that the prediction covers.
+        the pixels of the mask that the prediction covers, with ``scale_skips_black`` only where
+        every channel of the truth is above zero, if there is such a pixel.
     albedo : (V, H, W, 3) linear, premultiplied by ``alpha``.
     alpha : (V, H, W) predicted coverage.
     truth : (V, H, W, 3) linear, premultiplied by ``mask``.
@@ -123,6 +124,9 @@ def albedo_scale(
     is_covered = inside & (alpha[view_indices] > _SMALLEST_ALPHA)
     if not is_covered.any():
         return np.ones(3)
+    if protocol.scale_skips_black:
+        is_colored = is_covered & (truth[view_indices] > 0).all(axis=-1)
+        is_covered = is_colored if is_colored.any() else is_covered
     predicted = straight(albedo[view_indices][is_covered], alpha[view_indices][is_covered])
     true = straight(truth[view_indices][is_covered], mask[view_indices][is_covered])
     return np.asarray(albedo_scale_median(predicted, true, np.ones(len(true), bool)), float)
@@ -170,6 +174,8 @@ def scaled_psnr(
     truth: Float[np.ndarray, "H W 3"],
     inside: Bool[np.ndarray, "H W"],
     counted: Bool[np.ndarray, "H W"],
+    *,
+    is_scaled: bool,
 ) -> float:
     """Compute one figure of Stanford-ORB for one image, in dB; see `ScaledRendition`.
 
@@ -179,6 +185,7 @@ def scaled_psnr(
     rgb, truth : (H, W, 3) linear.
     inside : (H, W) eroded mask, not empty.
     counted : (H, W) pixels that errors are averaged over.
+    is_scaled : whether the channels of the image are scaled.
     """
     predicted = np.where(inside[..., None], rgb, 0.0).astype(float)
     true = np.maximum(np.where(inside[..., None], truth, 0.0).astype(float), 0.0)
@@ -189,10 +196,11 @@ def scaled_psnr(
             encode_srgb(clipped_truth).sum() / total if total > 1e-8 * clipped_truth.size else 1.0
         )
         predicted, true = gain * predicted, gain * true
-    power = (predicted**2).sum(axis=(0, 1))
-    is_lit = power > 1e-6
-    scale = np.where(is_lit, (predicted * true).sum(axis=(0, 1)) / np.where(is_lit, power, 1), 1)
-    images = [np.clip(x, 0.0, figure.largest) for x in (scale * predicted, true)]
+    if is_scaled:
+        power = (predicted**2).sum(axis=(0, 1))
+        is_lit, products = power > 1e-6, (predicted * true).sum(axis=(0, 1))
+        predicted = predicted * np.where(is_lit, products / np.where(is_lit, power, 1), 1)
+    images = [np.clip(x, 0.0, figure.largest) for x in (predicted, true)]
     if figure.is_encoded:
         images = [np.asarray(encode_srgb(x), float) for x in images]
     grey = np.where(inside[..., None], 0.5, 0.0)
@@ -216,10 +224,21 @@ def _compare_scaled(
         inside = eroded(coverage > MASK_THRESHOLD)
         if inside.any():
             for figure in rendition.figures:
+                pixels = (prediction, truth, inside, valid_mask)
                 psnr_values[figure.name].append(
-                    scaled_psnr(figure, prediction, truth, inside, valid_mask)
+                    scaled_psnr(figure, *pixels, is_scaled=rendition.is_scaled)
                 )
     return {name: float(np.mean(values)) for name, values in psnr_values.items() if values}
+
+
+def _errors(
+    predicted: np.ndarray, true: np.ndarray, counted: np.ndarray | None, rendition: Rendition
+) -> list[float]:
+    """Return the mean squared errors of a picture: of each channel, or a single one of all."""
+    pairs = [(predicted, true)]
+    if rendition.is_by_channel:
+        pairs = [(predicted[..., k : k + 1], true[..., k : k + 1]) for k in range(3)]
+    return [float(_mse(*pair, counted)) for pair in pairs]
 
 
 def _compare(
@@ -258,7 +277,7 @@ def _compare(
             straight(prediction, predicted_alpha), silhouettes[rendition.silhouette], rendition
         )
         true = _picture(truth, coverage, rendition)
-        errors.append(float(_mse(predicted, true, valid_mask)))
+        errors.append(_errors(predicted, true, valid_mask, rendition))
         if valid_mask is None:
             similarities.append(float(_ssim(predicted, true)))
         else:
@@ -267,13 +286,13 @@ def _compare(
             coverage.size if valid_mask is None else int((valid_mask > MASK_THRESHOLD).sum())
         )
         if inside.any():
-            masked_errors.append(float(_mse(predicted, true, inside)))
+            masked_errors.append(_errors(predicted, true, inside, rendition))
             masked_similarities.append(float(_ssim_masked(predicted, true, inside)))
             counts.append(int(inside.sum()))
 
-    def decibels(values: list[float], weights: list[int]) -> float:
-        pooled = [float(np.average(values, weights=weights))] if is_pooled else values
-        return float(np.mean([float(psnr_of_mse(value)) for value in pooled]))
+    def decibels(values: list[list[float]], weights: list[int]) -> float:
+        pooled = [np.average(values, axis=0, weights=weights)] if is_pooled else values
+        return float(np.mean([float(psnr_of_mse(value)) for value in np.ravel(pooled)]))
 
     metrics = {"psnr": decibels(errors, totals), "ssim": float(np.mean(similarities))}
     if counts:

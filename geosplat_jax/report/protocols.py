@@ -14,7 +14,7 @@ from jaxtyping import Int
 
 @dataclass(frozen=True)
 class Rendition:
-    """How linear colours become pictures before they are compared.
+    """How linear colours become pictures, and how these are compared.
 
     Attributes
     ----------
@@ -24,11 +24,14 @@ class Rendition:
         own alpha; ``solid`` shows it unblended where its alpha exceeds one half; ``mask`` blends it
         by the true mask, so that predictions outside of the object do not count. The truth is
         always blended by its mask.
+    is_by_channel : whether the PSNR of an image is the mean of the PSNR of its channels; otherwise
+        it is that of the mean error of all channels, which is never higher.
     """
 
     encoding: Literal["linear", "srgb", "gamma22"]
     background: float
     silhouette: Literal["alpha", "solid", "mask"]
+    is_by_channel: bool = False
 
 
 @dataclass(frozen=True)
@@ -52,20 +55,22 @@ class ScaledFigure:
 
 @dataclass(frozen=True)
 class ScaledRendition:
-    """How Stanford-ORB compares images: on the object alone, after a scale for each image.
+    """How Stanford-ORB compares images: on the object alone, and most of them after a scale.
 
-    The true mask is eroded by 5 x 5 pixels, and pixels outside are black in both images. Each
-    channel of each image is scaled by least squares over the pixels inside. Errors are means over
-    *all* pixels, that is those over the object times its share of the image. The PSNR of an image
-    is at least that of a uniform grey of 0.5 inside the mask. The benchmark's images have 512 x 512
-    pixels.
+    The true mask is eroded by 5 x 5 pixels, and pixels outside are black in both images. Errors are
+    means over *all* pixels, that is those over the object times its share of the image. The PSNR of
+    an image is at least that of a uniform grey of 0.5 inside the mask. The benchmark's images have
+    512 x 512 pixels.
 
     Attributes
     ----------
     figures : figures that are computed.
+    is_scaled : whether each channel of each image is scaled by least squares over the pixels
+        inside. The benchmark scales albedo and relit images, but no new views.
     """
 
     figures: tuple[ScaledFigure, ...]
+    is_scaled: bool = True
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,7 @@ class Protocol:
     name : one of `PROTOCOLS`.
     albedo_scale : ``least_squares`` for each view, averaged over the views, or ``median`` of the
         ratios of all pixels; always per channel, in linear colour.
+    scale_skips_black : whether ``median`` leaves out pixels whose true albedo is zero in a channel.
     scale_views : number of views, spread evenly, that the scale is fitted to; None for all.
     albedo, relight : renditions of albedo and of relit images.
     albedo_is_pooled : whether the PSNR of albedo is that of the error over all images; otherwise,
@@ -93,13 +99,12 @@ class Protocol:
     relight: Rendition | ScaledRendition
     lpips_nets: tuple[str, ...]
     new_views: ScaledRendition | None = None
+    scale_skips_black: bool = False
 
 
-_ORB_IMAGES = ScaledRendition(
-    (
-        ScaledFigure("psnr_h", 4.0, is_brightened=True, is_encoded=False),
-        ScaledFigure("psnr_l", 1.0, is_brightened=False, is_encoded=True),
-    )
+_ORB_FIGURES = (
+    ScaledFigure("psnr_h", 4.0, is_brightened=True, is_encoded=False),
+    ScaledFigure("psnr_l", 1.0, is_brightened=False, is_encoded=True),
 )
 
 
@@ -128,10 +133,11 @@ PROTOCOL: Mapping[str, Protocol] = {
             name="irgs",
             albedo_scale="median",
             scale_views=None,
-            albedo=Rendition("linear", 0.0, "mask"),
+            albedo=Rendition("linear", 0.0, "mask", is_by_channel=True),
             albedo_is_pooled=False,
-            relight=Rendition("srgb", 0.0, "mask"),
+            relight=Rendition("srgb", 0.0, "mask", is_by_channel=True),
             lpips_nets=("vgg",),
+            scale_skips_black=True,
         ),
         Protocol(
             name="orb",
@@ -141,9 +147,9 @@ PROTOCOL: Mapping[str, Protocol] = {
                 (ScaledFigure("psnr", 1.0, is_brightened=False, is_encoded=False),)
             ),
             albedo_is_pooled=False,
-            relight=_ORB_IMAGES,
+            relight=ScaledRendition(_ORB_FIGURES),
             lpips_nets=("vgg",),
-            new_views=_ORB_IMAGES,
+            new_views=ScaledRendition(_ORB_FIGURES, is_scaled=False),
         ),
     )
 }
