@@ -86,7 +86,7 @@ def run():
 
 
 def test_highlights_brighter_than_white_are_compared_where_a_protocol_has_them():
-    """Stanford-ORB compares them; the sRGB pictures of all protocols are clipped at white."""
+    """One figure of Stanford-ORB compares them; pictures in sRGB are clipped at white."""
     linear = np.full((24, 24, 3), 0.3, np.float32)
     linear[8:14, 8:14] = 3.0
     alpha = np.ones((24, 24), np.float32)
@@ -96,8 +96,8 @@ def test_highlights_brighter_than_white_are_compared_where_a_protocol_has_them()
     assert min(metrics[name] for name in ("nvs.psnr", "nvs.psnr_h", "nvs.psnr_l")) > 60
     dim = replace(view, linear=np.minimum(linear, 1.0))
     metrics = evaluate_module._view_metrics(dim, image, None, None, protocol("orb"))
-    assert metrics["nvs.psnr"] > 60
-    assert max(metrics["nvs.psnr_h"], metrics["nvs.psnr_l"]) < 40
+    assert min(metrics["nvs.psnr"], metrics["nvs.psnr_l"]) > 60
+    assert metrics["nvs.psnr_h"] < 40
 
 
 def straight(values, alpha):

@@ -30,7 +30,7 @@ _PACKED = frozenset(
 )
 # A face thinner than this share of the bounding box's diagonal has no usable normal or chart.
 _DEGENERATE_HEIGHT = 1e-7
-# Texels between charts in the packer's own atlas. That comes out larger than asked for, so 1.6 texels
+# Texels between charts in the packer's own atlas. It comes out larger than asked for, so 1.6 texels
 # are left in a texture of 128 and 3 in one of 1024: room for bilinear taps, and there for mipmaps.
 _CHART_PADDING = 4
 # A chart holds at most this share of the area, and on average this many faces: the time to flatten
