@@ -262,6 +262,10 @@ class SplatModel(abc.ABC):
         del parameters
         return attributes
 
+    def without_indirect(self, parameters: Any) -> Any:
+        """Return what the splats have learned themselves, but no indirect light."""
+        return parameters
+
     def settle(self, splats: Splats, surface: Surface, attributes: Attributes) -> Splats:
         """Move the splats by their attributes, such as the inward shift; by default not at all."""
         del surface, attributes

@@ -186,6 +186,10 @@ class FreeSplats(SplatModel):
             indirect = parameters.indirect
         return replace(attributes, materials=materials, indirect=indirect)
 
+    def without_indirect(self, parameters: FreeSplatParameters) -> FreeSplatParameters:
+        """See `SplatModel.without_indirect`."""
+        return replace(parameters, indirect=None)
+
 
 @settings
 class FreeSplatSettings(SplatSettings, kind="free"):

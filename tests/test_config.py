@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -481,7 +482,7 @@ def test_differences_name_the_setting_and_both_values():
         ),
         (
             ('stages.split_sum.domain={kind="per_pixel",points="mesh"}',),
-            ["stages.split_sum.domain.points has no effect"],
+            ["stages.split_sum.domain.points has no effect in training"],
         ),
         (("stages.monte_carlo.transport.reservoirs.visibility=traced",), ["without candidates"]),
         (
@@ -535,3 +536,14 @@ def test_whoever_reads_a_configuration_needs_no_other_module(tmp_path):
     )
     process = subprocess.run([sys.executable, "-c", script, str(config_path)], capture_output=True)
     assert process.returncode == 0, process.stderr.decode()[-500:]
+
+
+def test_indirect_light_that_a_stage_in_between_drops_is_said():
+    config = make_config(overrides=("stages.refine.steps=0",))
+    split_sum, monte_carlo = config.stage("split_sum"), config.stage("monte_carlo")
+    stages = (monte_carlo, split_sum, replace(monte_carlo, name="again"))
+    message = "stages.split_sum has no indirect light: the indirect light that monte_carlo learned"
+    assert any(message in text for text in config_warnings(replace(config, stages=stages)))
+    usual_stages = (split_sum, monte_carlo, replace(monte_carlo, name="again"))
+    usual_warnings = config_warnings(replace(config, stages=usual_stages))
+    assert not any("no indirect light" in text for text in usual_warnings)

@@ -15,7 +15,7 @@ from geosplat_jax.fit.begin import Resume, TakeOver
 from geosplat_jax.fit.config import Rate, Stage
 from geosplat_jax.fit.folder import RunError, RunFolder
 from geosplat_jax.fit.presets import PRESETS, QUALITIES, make_config
-from geosplat_jax.fit.stages import begin_stage, require_rates
+from geosplat_jax.fit.stages import begin_stage, build_pipeline, require_rates
 from geosplat_jax.fit.train import Interrupted, TrainingError, fit, load_trained
 from geosplat_jax.materials import materials_at
 from geosplat_jax.surface.grids import grid_vertices
@@ -133,6 +133,31 @@ def test_a_head_of_indirect_light_is_kept_where_it_means_the_same(after, is_kept
     old_table, new_table = (x.material.albedo_table for x in (params, begun_params))
     assert np.array_equal(old_table, new_table) is is_kept
     assert not begun_params.material.albedo_head[-1].weights.any()
+
+
+@pytest.mark.parametrize("after", ["harmonics", "constant"])
+def test_free_splats_forget_indirect_light_that_means_something_else(after):
+    """A second stage of free splats takes over what the first one has learned, if it can."""
+    config = tiny_config(
+        "geometry.resolution=6",
+        "stages.monte_carlo.steps=1",
+        "stages.monte_carlo.transport.indirect=harmonics",
+        "stages.refine.steps=1",
+        "stages.refine.transport.indirect=harmonics",
+    )
+    refine = config.stage("refine")
+    again = replace(refine, name="again", transport=replace(refine.transport, indirect=after))
+    config = replace(config, stages=(*config.stages, again))
+    pipeline, params = ball(config, stage="monte_carlo")
+    refined = begin_stage(params, pipeline, config, refine)
+    learned = jnp.full_like(refined.splats.indirect, 7.0)
+    refined = replace(refined, splats=replace(refined.splats, indirect=learned))
+    refined_pipeline = replace(
+        build_pipeline(config, refine, pipeline.surface), capacities=pipeline.capacities
+    )
+    begun = begin_stage(refined, refined_pipeline, config, again)
+    assert begun.splats.indirect.shape[1] == (27 if after == "harmonics" else 6)
+    assert bool((begun.splats.indirect == 7.0).all()) is (after == "harmonics")
 
 
 @pytest.mark.parametrize("quality", QUALITIES)

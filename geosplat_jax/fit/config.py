@@ -601,8 +601,8 @@ def config_warnings(config: Config) -> list[str]:
             )
         if stage.domain.uses_rays and stage.transport.blocked_light is None:
             warnings.append(
-                f"stages.{stage.name}.domain.points has no effect: the stage traces no rays from "
-                "points"
+                f"stages.{stage.name}.domain.points has no effect in training: the stage traces no "
+                "rays from points"
             )
         if stage.transport.chooses_samples and not stage.domain.shades_splats:
             warnings.append(
@@ -615,11 +615,20 @@ def config_warnings(config: Config) -> list[str]:
 
 def _changes_of_blocked_light(config: Config) -> list[str]:
     """Describe where a stage drops the indirect light that the stage before it has learned."""
-    tracing_stages = [stage for stage in config.active_stages if stage.transport.blocked_light]
-    return [
-        f"stages.{after.name}.transport.{after.transport.blocked_light} takes the place of "
-        f"stages.{before.name}.transport.{before.transport.blocked_light}: the indirect light that "
-        f"{before.name} learned, if any, is dropped; give both stages the same setting"
-        for before, after in pairwise(tracing_stages)
-        if before.transport.blocked_light != after.transport.blocked_light
-    ]
+    stages, warnings = config.active_stages, []
+    tracing_stages = [stage for stage in stages if stage.transport.blocked_light]
+    for before, after in pairwise(tracing_stages):
+        lost_light = f"the indirect light that {before.name} learned, if any, is dropped"
+        if before.transport.blocked_light != after.transport.blocked_light:
+            warnings.append(
+                f"stages.{after.name}.transport.{after.transport.blocked_light} takes the place of "
+                f"stages.{before.name}.transport.{before.transport.blocked_light}: {lost_light}; "
+                "give both stages the same setting"
+            )
+        elif before.transport.indirect_outputs and stages.index(after) > stages.index(before) + 1:
+            between = stages[stages.index(before) + 1].name
+            warnings.append(
+                f"stages.{between} has no indirect light: {lost_light}, and {after.name} begins "
+                "with new one; give both stages the same setting"
+            )
+    return warnings

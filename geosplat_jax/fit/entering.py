@@ -143,7 +143,8 @@ def enter_stage(
     """Turn the parameters that a stage ends with into those that the next one starts with.
 
     Parameters that no entry changes stay as they are. The head of indirect light is replaced, by
-    none or a new one, unless it keeps its meaning. Free splats get parameters of their own.
+    none or a new one, unless it keeps its meaning; what free splats have learned of indirect light
+    is then forgotten as well. Free splats get parameters of their own.
 
     Parameters
     ----------
@@ -161,7 +162,11 @@ def enter_stage(
     """
     entry_key, indirect_key = jax.random.split(key)
     if not indirect.goes_on:
-        params = replace(params, material=replace(params.material, indirect_head=None))
+        params = replace(
+            params,
+            material=replace(params.material, indirect_head=None),
+            splats=pipeline.splats.without_indirect(params.splats),
+        )
     for number, entry in enumerate(entries):
         params = entry.apply(params, pipeline, jax.random.fold_in(entry_key, number))
     if params.material.indirect_head is None:

@@ -466,8 +466,8 @@ def _refuse_blended_points(config: Config) -> None:
     for stage in config.active_stages:
         if not stage.domain.shades_splats and not stage.domain.uses_rays:
             raise TrainingError(
-                f"stages.{stage.name}.domain: rays would start at blended positions of splats, "
-                "which lie behind the faces of an open mesh; set "
+                f"stages.{stage.name}.domain: rays, of the training or of relighting, would start "
+                "at blended positions of splats, which lie behind the faces of an open mesh; set "
                 f"stages.{stage.name}.domain.points=mesh, or geometry.sides=one"
             )
 
