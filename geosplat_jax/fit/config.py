@@ -628,7 +628,7 @@ def _changes_of_blocked_light(config: Config) -> list[str]:
         elif before.transport.indirect_outputs and stages.index(after) > stages.index(before) + 1:
             between = stages[stages.index(before) + 1].name
             warnings.append(
-                f"stages.{between} has no indirect light: {lost_light}, and {after.name} begins "
-                "with new one; give both stages the same setting"
+                f"stages.{between} has no indirect light: {lost_light}, and {after.name} learns "
+                "it anew; give both stages the same setting"
             )
     return warnings

@@ -23,7 +23,7 @@ from geosplat_jax.report.assets import MODEL_TEXTURE, MaterialSampler, write_mod
 from geosplat_jax.report.light_metrics import light_metrics
 from geosplat_jax.report.metrics import MASK_THRESHOLD, mask_iou, normal_mae_deg
 from geosplat_jax.report.pace import OnProgress, counted
-from geosplat_jax.report.protocols import Protocol, Rendition, ScaledRendition
+from geosplat_jax.report.protocols import ObjectRendition, Protocol, Rendition
 from geosplat_jax.report.renderer import (
     DEFAULT_SAMPLES,
     RenderedView,
@@ -52,9 +52,9 @@ def _where_counted(view: RenderedView, valid: np.ndarray | None) -> RenderedView
     )
 
 
-def _compared(view: RenderedView, rendition: Rendition | ScaledRendition) -> np.ndarray:
+def _compared(view: RenderedView, rendition: Rendition | ObjectRendition) -> np.ndarray:
     """Return the colours that a rendition compares: exposed radiance, or the tone-mapped image."""
-    return view.linear if isinstance(rendition, ScaledRendition) else view.rgb
+    return view.linear if isinstance(rendition, ObjectRendition) else view.rgb
 
 
 def _valid(views: Views, index: int) -> np.ndarray | None:

@@ -18,7 +18,7 @@ from geosplat_jax.fit.presets import BETWEEN, PRESETS, QUALITIES, make_config
 from geosplat_jax.fit.start_mesh import MeshSettings
 from geosplat_jax.io.dataset import READING
 from geosplat_jax.materials import MATERIAL_PRIORS
-from geosplat_jax.report.protocols import NEW_VIEWS, Protocol, Rendition, ScaledRendition, protocol
+from geosplat_jax.report.protocols import NEW_VIEWS, ObjectRendition, Protocol, Rendition, protocol
 
 _MEASURES = {
     "psnr": ("PSNR", "dB", "higher"),
@@ -95,9 +95,9 @@ def figure(key: str) -> Figure:
     return Figure(key, title, ", ".join([label, *qualifiers]), unit, better)
 
 
-def _rendition(rendition: Rendition | ScaledRendition) -> str:
+def _rendition(rendition: Rendition | ObjectRendition) -> str:
     """Say how pictures are compared."""
-    if isinstance(rendition, ScaledRendition):
+    if isinstance(rendition, ObjectRendition):
         return "on the object alone, each channel of each image scaled by least squares"
     encodings = {"linear": "in linear light", "srgb": "in sRGB", "gamma22": "after gamma 2.2"}
     grey = {0.0: "black", 1.0: "white"}.get(rendition.background, f"grey {rendition.background:g}")

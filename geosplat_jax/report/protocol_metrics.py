@@ -36,10 +36,10 @@ from geosplat_jax.report.metrics import (
 )
 from geosplat_jax.report.protocols import (
     NEW_VIEWS,
+    ObjectFigure,
+    ObjectRendition,
     Protocol,
     Rendition,
-    ScaledFigure,
-    ScaledRendition,
     scale_views,
 )
 
@@ -168,8 +168,8 @@ def eroded(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     return binary_erosion(mask, np.ones((5, 5), bool), border_value=1)
 
 
-def scaled_psnr(
-    figure: ScaledFigure,
+def object_psnr(
+    figure: ObjectFigure,
     rgb: Float[np.ndarray, "H W 3"],
     truth: Float[np.ndarray, "H W 3"],
     inside: Bool[np.ndarray, "H W"],
@@ -177,7 +177,7 @@ def scaled_psnr(
     *,
     is_scaled: bool,
 ) -> float:
-    """Compute one figure of Stanford-ORB for one image, in dB; see `ScaledRendition`.
+    """Compute one figure of Stanford-ORB for one image, in dB; see `ObjectRendition`.
 
     Parameters
     ----------
@@ -208,14 +208,14 @@ def scaled_psnr(
     return float(psnr_of_mse(min(errors)))
 
 
-def _compare_scaled(
+def _compare_objects(
     predictions: Iterable[np.ndarray],
     truths: Iterable[np.ndarray],
     mask: np.ndarray,
-    rendition: ScaledRendition,
+    rendition: ObjectRendition,
     valid: np.ndarray | None,
 ) -> dict[str, float]:
-    """Average figures over the images whose eroded mask is not empty; see `ScaledRendition`."""
+    """Average figures over the images whose eroded mask is not empty; see `ObjectRendition`."""
     psnr_values: dict[str, list[float]] = {figure.name: [] for figure in rendition.figures}
     valid_masks = np.ones(mask.shape, bool) if valid is None else valid > MASK_THRESHOLD
     for prediction, truth, coverage, valid_mask in zip(
@@ -226,7 +226,7 @@ def _compare_scaled(
             for figure in rendition.figures:
                 pixels = (prediction, truth, inside, valid_mask)
                 psnr_values[figure.name].append(
-                    scaled_psnr(figure, *pixels, is_scaled=rendition.is_scaled)
+                    object_psnr(figure, *pixels, is_scaled=rendition.is_scaled)
                 )
     return {name: float(np.mean(values)) for name, values in psnr_values.items() if values}
 
@@ -247,7 +247,7 @@ def _compare(
     truths: Iterable[np.ndarray],
     mask: np.ndarray,
     *,
-    rendition: Rendition | ScaledRendition,
+    rendition: Rendition | ObjectRendition,
     is_pooled: bool,
     valid: np.ndarray | None,
 ) -> dict[str, float]:
@@ -257,8 +257,8 @@ def _compare(
     PSNR of the error over all images, otherwise the mean of the PSNR of each. Images without an
     object have no part, unless none has one.
     """
-    if isinstance(rendition, ScaledRendition):
-        return _compare_scaled(predictions, truths, mask, rendition, valid)
+    if isinstance(rendition, ObjectRendition):
+        return _compare_objects(predictions, truths, mask, rendition, valid)
     errors, similarities, masked_errors, masked_similarities, counts = [], [], [], [], []
     totals = []
     valid_masks = [None] * len(mask) if valid is None else valid
@@ -305,7 +305,7 @@ def _compare_images(
     rgb: np.ndarray,
     alpha: np.ndarray,
     image: np.ndarray,
-    rendition: Rendition | ScaledRendition,
+    rendition: Rendition | ObjectRendition,
     valid: np.ndarray | None,
 ) -> dict[str, float]:
     """Compare premultiplied renders with straight RGBA images, (V, H, W, 3 and 4)."""
@@ -320,14 +320,14 @@ def new_view_metrics(
     alpha: Float[np.ndarray, "..."],
     image: Float[np.ndarray, "..."],
     valid: Shaped[np.ndarray, "..."] | None = None,
-    rendition: Rendition | ScaledRendition = NEW_VIEWS,
+    rendition: Rendition | ObjectRendition = NEW_VIEWS,
 ) -> dict[str, float]:
     """Compare one view under the training light with its photograph.
 
     Parameters
     ----------
     rgb : (H, W, 3) linear, exposed and tone mapped, premultiplied by ``alpha``; clipped here. For a
-        `ScaledRendition` it must not be tone mapped, since colours brighter than white are
+        `ObjectRendition` it must not be tone mapped, since colours brighter than white are
         compared too.
     alpha : (H, W) predicted coverage.
     image : (H, W, 4) photograph, linear, *straight* alpha, which is the mask.
@@ -338,7 +338,7 @@ def new_view_metrics(
     -------
     ``nvs.psnr`` (dB) and ``nvs.ssim`` of the whole image; ``nvs.psnr_masked`` and
     ``nvs.ssim_masked`` over the pixels of the mask, unless it is empty. For a
-    `ScaledRendition` its figures, such as ``nvs.psnr_h``, if the eroded mask is not empty.
+    `ObjectRendition` its figures, such as ``nvs.psnr_h``, if the eroded mask is not empty.
 
     Raises
     ------
@@ -464,7 +464,7 @@ def relight_metrics(
     ----------
     protocol : protocol whose ``relight`` is used.
     rgb : (V, H, W, 3) linear, premultiplied by ``alpha``, rendered with the albedo times its
-        `albedo_scale` at exposure 1; clipped here. For a `ScaledRendition` it must not be tone
+        `albedo_scale` at exposure 1; clipped here. For a `ObjectRendition` it must not be tone
         mapped.
     alpha : (V, H, W) predicted coverage.
     image : (V, H, W, 4) true image, linear, *straight* alpha, which is the mask.

@@ -35,7 +35,7 @@ class Rendition:
 
 
 @dataclass(frozen=True)
-class ScaledFigure:
+class ObjectFigure:
     """One figure of Stanford-ORB.
 
     Attributes
@@ -54,7 +54,7 @@ class ScaledFigure:
 
 
 @dataclass(frozen=True)
-class ScaledRendition:
+class ObjectRendition:
     """How Stanford-ORB compares images: on the object alone, and most of them after a scale.
 
     The true mask is eroded by 5 x 5 pixels, and pixels outside are black in both images. Errors are
@@ -69,7 +69,7 @@ class ScaledRendition:
         inside. The benchmark scales albedo and relit images, but no new views.
     """
 
-    figures: tuple[ScaledFigure, ...]
+    figures: tuple[ObjectFigure, ...]
     is_scaled: bool = True
 
 
@@ -94,17 +94,17 @@ class Protocol:
     name: str
     albedo_scale: Literal["least_squares", "median"]
     scale_views: int | None
-    albedo: Rendition | ScaledRendition
+    albedo: Rendition | ObjectRendition
     albedo_is_pooled: bool
-    relight: Rendition | ScaledRendition
+    relight: Rendition | ObjectRendition
     lpips_nets: tuple[str, ...]
-    new_views: ScaledRendition | None = None
+    new_views: ObjectRendition | None = None
     scale_skips_black: bool = False
 
 
 _ORB_FIGURES = (
-    ScaledFigure("psnr_h", 4.0, is_brightened=True, is_encoded=False),
-    ScaledFigure("psnr_l", 1.0, is_brightened=False, is_encoded=True),
+    ObjectFigure("psnr_h", 4.0, is_brightened=True, is_encoded=False),
+    ObjectFigure("psnr_l", 1.0, is_brightened=False, is_encoded=True),
 )
 
 
@@ -143,13 +143,13 @@ PROTOCOL: Mapping[str, Protocol] = {
             name="orb",
             albedo_scale="least_squares",
             scale_views=None,
-            albedo=ScaledRendition(
-                (ScaledFigure("psnr", 1.0, is_brightened=False, is_encoded=False),)
+            albedo=ObjectRendition(
+                (ObjectFigure("psnr", 1.0, is_brightened=False, is_encoded=False),)
             ),
             albedo_is_pooled=False,
-            relight=ScaledRendition(_ORB_FIGURES),
+            relight=ObjectRendition(_ORB_FIGURES),
             lpips_nets=("vgg",),
-            new_views=ScaledRendition(_ORB_FIGURES, is_scaled=False),
+            new_views=ObjectRendition(_ORB_FIGURES, is_scaled=False),
         ),
     )
 }
